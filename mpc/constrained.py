@@ -1,0 +1,108 @@
+"""The constrained MPC: one QP per period.  Eqs. (27)-(29)."""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+
+from mpc.condensed import require_bounds
+from mpc.prediction import rollout
+from mpc.problem import Problem
+from mpc.qp import Solution
+from mpc.solvers import QPSolver
+from quadsim.controller import SOLVED, Command
+from quadsim.errors import PlanExhaustedError
+from quadsim.state import Array
+
+BOUND_TOLERANCE: Final = 1e-6
+"""How far outside its hard bounds [rad/s] an answer may be and still count as in bounds; it is then moved onto them."""
+
+
+class ConstrainedMPC:
+    """Solves Eq. (27) each period and sends the first action of the optimal plan.
+
+    Only an answer that is solved, finite and within the hard input bounds is used.  Otherwise the previous plan,
+    shifted by one step, is held (fallback level 1) for as long as it lasts, and then the flight is given up.
+    """
+
+    name: Final = "constrained"
+
+    def __init__(self, problem: Problem, solver: QPSolver) -> None:
+        self.problem = problem
+        self._solver = solver
+        self._bounds = require_bounds(problem)
+        self._before = problem.model.u_bar
+        self._plan: Array | None = None
+        self._held = 0
+
+    @property
+    def solver(self) -> str:
+        """Name of the QP solver."""
+        return self._solver.name
+
+    @property
+    def horizon(self) -> int:
+        """N, samples of preview."""
+        return self.problem.horizon
+
+    def reset(self, speeds: Array) -> None:
+        """Start anew after the command u(-1) (4,) [rad/s]."""
+        self._before = np.array(speeds, float)
+        self._plan = None
+        self._held = 0
+
+    def step(self, time: float, state: Array, reference: Array) -> Command:
+        """One QP; see `quadsim.controller.Controller.step`.
+
+        Raises:
+            PlanExhaustedError: the solver failed and no step of a previous plan is left.
+        """
+        desired = self.problem.objective.desired(reference)
+        answer = self._solver.solve(state, desired, self._before)
+        lower, upper = self._reach()
+        problem = _rejection(answer.solution, answer.plan, lower, upper)
+        if problem is None:
+            self._plan, self._held = answer.plan, 0
+        elif self._plan is None or self._held + 1 >= self.horizon:
+            held = f"after holding the last plan for {self._held} periods" if self._held else "with no plan to hold"
+            raise PlanExhaustedError(f"the solver answered {problem!r} {held}", time=time)
+        else:
+            self._held += 1
+        speeds = np.clip(self._plan[self._held], lower, upper)
+        self._before = speeds
+        solution = answer.solution
+        return Command(
+            speeds=speeds.copy(),
+            plan=np.concatenate([self._plan[self._held :], np.repeat(self._plan[-1:], self._held, axis=0)]),
+            status=problem or SOLVED,
+            iterations=solution.iterations,
+            active=solution.active if problem is None else 0,
+            fallback=int(problem is not None),
+            primal_residual=solution.primal_residual,
+            dual_residual=solution.dual_residual,
+            solve_s=solution.solve_s,
+        )
+
+    def predict(self, states: Array, plans: Array) -> Array:
+        """See `quadsim.controller.Controller.predict`."""
+        return rollout(self.problem.model, states, plans)
+
+    def _reach(self) -> tuple[Array, Array]:
+        """The speeds (4,) that the hard input bounds leave for this period, Eqs. (15) and (20)."""
+        bounds = self._bounds
+        lower = np.maximum(bounds.u_min, self._before + bounds.delta_min)
+        upper = np.minimum(bounds.u_max, self._before + bounds.delta_max)
+        return lower, upper
+
+
+def _rejection(solution: Solution, plan: Array, lower: Array, upper: Array) -> str | None:
+    """Why an answer must not reach the plant, or None."""
+    if solution.status != SOLVED:
+        return solution.status
+    if not np.all(np.isfinite(plan)):
+        return "not_finite"
+    first = plan[0]
+    if np.any(first < lower - BOUND_TOLERANCE) or np.any(first > upper + BOUND_TOLERANCE):
+        return "out_of_bounds"
+    return None

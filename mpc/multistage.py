@@ -1,0 +1,192 @@
+"""The same optimisation with a structure: partially condensed into stages of a few steps each.
+
+A condensed QP is dense; one with all states as variables is large.  In between, the horizon is cut into stages of M
+steps.  The variables, in stage order, are
+
+    v_0 | s_1, v_1 | s_2, v_2 | ...
+
+with s_j the state at the start of stage j (s_0 = xi(k) is known) and v_j = u - u_bar for its steps.  Within a stage
+the states are condensed as in Eq. (2); between stages s_{j+1} = Phi_M s_j + Psi_M v_j is an equality row.  All
+matrices are block banded, which a multistage factorisation exploits: its cost grows linearly with the horizon.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from scipy import sparse
+from scipy.sparse import csc_matrix
+
+from mpc.condensed import require_bounds
+from mpc.constraints import slew_matrix
+from mpc.prediction import Prediction, prediction
+from mpc.problem import Bounds, Objective, Problem
+from mpc.qp import QP, Vectors
+from quadsim.state import Array
+
+STEPS_PER_STAGE: Final = 5
+"""M, the fastest of 1 to 25 for the paper's case; see docs/performance.md."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Multistage:
+    """The partially condensed QP; see the module.
+
+    Attributes:
+        qp: block-banded sparse matrices, vectors for xi(k) = 0, y_d = 0, u(k-1) = u_bar.
+        u_bar: (nu,) the equilibrium input [rad/s].
+        input_index: (N nu,) where the inputs are in x, in time order.
+        c_state, c_desired: gradient's slopes in xi(k) and y_d.
+        b_state: equality right side's slope in xi(k).
+        h_state: output rows' shift by the free response of the first stage, for xi(k).
+        first_slew: rows of G that hold u(k) - u(k-1).
+    """
+
+    qp: QP
+    u_bar: Array
+    input_index: np.ndarray[tuple[int], np.dtype[np.int64]]
+    c_state: Array
+    c_desired: csc_matrix
+    b_state: Array
+    h_state: Array
+    first_slew: slice
+
+    def vectors(self, state: Array, desired: Array, u_before: Array) -> Vectors:
+        """See `mpc.qp.Formulation.vectors`."""
+        c = self.c_desired @ desired.ravel()
+        c[: self.c_state.shape[0]] += self.c_state @ state
+        b = np.zeros_like(self.qp.b)
+        b[: self.b_state.shape[0]] = self.b_state @ state
+        h_l, h_u = self.qp.h_l.copy(), self.qp.h_u.copy()
+        rows = self.h_state.shape[0]
+        free = self.h_state @ state
+        h_l[:rows] -= free
+        h_u[:rows] -= free
+        h_l[self.first_slew] += u_before - self.u_bar
+        h_u[self.first_slew] += u_before - self.u_bar
+        return Vectors(c=c, b=b, h_l=h_l, h_u=h_u)
+
+    def inputs(self, x: Array) -> Array:
+        """See `mpc.qp.Formulation.inputs`."""
+        return x[self.input_index].reshape(-1, self.u_bar.size) + self.u_bar
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Stage:
+    """One stage's dense blocks over [s_j, v_j]; the first stage has no s_0 and keeps its columns for xi(k) apart."""
+
+    hessian: Array
+    gradient_desired: Array
+    end: Array
+    outputs: Array
+
+
+def multistage(problem: Problem, *, steps_per_stage: int = STEPS_PER_STAGE) -> Multistage:
+    """Build the structured QP of a constrained problem.
+
+    Args:
+        problem: a problem with bounds.
+        steps_per_stage: M; the last stage is shorter where M does not divide the horizon.
+
+    Raises:
+        ValueError: the problem has no bounds.
+    """
+    bounds = require_bounds(problem)
+    model, N = problem.model, problem.horizon
+    n, nu = model.n, model.nu
+    lengths = [min(steps_per_stage, N - start) for start in range(0, N, steps_per_stage)]
+    built = {length: _stage(prediction(model, length), problem.objective, bounds, length) for length in set(lengths)}
+    stages = [built[length] for length in lengths]
+
+    first = stages[0]
+    hessians = [first.hessian[n:, n:], *(stage.hessian for stage in stages[1:])]
+    gradients = [first.gradient_desired[n:], *(stage.gradient_desired for stage in stages[1:])]
+    outputs = [first.outputs[:, n:], *(stage.outputs for stage in stages[1:])]
+    variables = _variable_index(lengths, n, nu)
+    input_index = np.concatenate(variables.inputs)
+    slews = csc_matrix(slew_matrix(N, nu))
+    size = variables.size
+    output_rows = sparse.block_diag(outputs, format="csc")
+    slew_rows = slews @ _selection(input_index, size)
+    return Multistage(
+        qp=QP(
+            P=csc_matrix(sparse.block_diag(hessians)),
+            c=np.zeros(size),
+            A=_dynamics(stages, variables, n),
+            b=np.zeros(n * (len(stages) - 1)),
+            G=csc_matrix(sparse.vstack([output_rows, slew_rows])),
+            h_l=np.concatenate([np.tile(bounds.y_min, N), np.tile(bounds.delta_min, N)]),
+            h_u=np.concatenate([np.tile(bounds.y_max, N), np.tile(bounds.delta_max, N)]),
+            x_l=_box(bounds.u_min - model.u_bar, input_index, N, size, -np.inf),
+            x_u=_box(bounds.u_max - model.u_bar, input_index, N, size, np.inf),
+        ),
+        u_bar=model.u_bar,
+        input_index=input_index,
+        c_state=first.hessian[n:, :n],
+        c_desired=csc_matrix(sparse.block_diag(gradients)),
+        b_state=first.end[:, :n] if len(stages) > 1 else np.zeros((0, n)),
+        h_state=first.outputs[:, :n],
+        first_slew=slice(output_rows.shape[0], output_rows.shape[0] + nu),
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class _VariableIndex:
+    """Where each stage's state and inputs are in x."""
+
+    states: list[np.ndarray[tuple[int], np.dtype[np.int64]]]
+    inputs: list[np.ndarray[tuple[int], np.dtype[np.int64]]]
+    size: int
+
+
+def _variable_index(lengths: list[int], n: int, nu: int) -> _VariableIndex:
+    states, inputs, at = [], [], 0
+    for j, length in enumerate(lengths):
+        states.append(np.arange(at, at + n) if j else np.arange(0))
+        at += states[-1].size
+        inputs.append(np.arange(at, at + length * nu))
+        at += length * nu
+    return _VariableIndex(states=states, inputs=inputs, size=at)
+
+
+def _stage(maps: Prediction, objective: Objective, bounds: Bounds, length: int) -> _Stage:
+    """Blocks of a stage of `length` steps: cost, end state and outputs as functions of [s_j, v_j]."""
+    states = np.hstack([maps.Phi, maps.Psi])
+    n = maps.Phi.shape[1]
+    regulated = np.kron(np.eye(length), objective.C_r) @ states
+    weighted = np.kron(np.eye(length), objective.Q_y) @ regulated
+    hessian = 2.0 * regulated.T @ weighted
+    hessian[n:, n:] += 2.0 * np.kron(np.eye(length), objective.Q_u)
+    return _Stage(
+        hessian=0.5 * (hessian + hessian.T),
+        gradient_desired=-2.0 * weighted.T,
+        end=states[-n:],
+        outputs=np.kron(np.eye(length), bounds.C_c) @ states,
+    )
+
+
+def _dynamics(stages: list[_Stage], variables: _VariableIndex, n: int) -> csc_matrix:
+    """Rows s_{j+1} - Phi_M s_j - Psi_M v_j = 0, the known s_0 moved to the right side."""
+    rows = sparse.lil_matrix((n * (len(stages) - 1), variables.size))
+    for j, stage in enumerate(stages[:-1]):
+        row = slice(j * n, (j + 1) * n)
+        if j:
+            rows[row, variables.states[j]] = -stage.end[:, :n]
+        rows[row, variables.inputs[j]] = -stage.end[:, n:]
+        rows[row, variables.states[j + 1]] = np.eye(n)
+    return csc_matrix(rows)
+
+
+def _selection(index: np.ndarray[tuple[int], np.dtype[np.int64]], size: int) -> csc_matrix:
+    ones = np.ones(index.size)
+    return csc_matrix((ones, (np.arange(index.size), index)), shape=(index.size, size))
+
+
+def _box(
+    bound: Array, index: np.ndarray[tuple[int], np.dtype[np.int64]], horizon: int, size: int, free: float
+) -> Array:
+    box = np.full(size, free)
+    box[index] = np.tile(bound, horizon)
+    return box

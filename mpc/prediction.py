@@ -1,0 +1,60 @@
+"""The prediction map.  Eqs. (2)-(3)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from mpc.model import LinearModel
+from quadsim.state import Array
+
+
+@dataclass(frozen=True, kw_only=True)
+class Prediction:
+    """Stacked future states [xi(k+1); ...; xi(k+N)] = Phi xi(k) + Psi (u - u_bar).
+
+    The paper's Phi_i and Psi_i are the i-th block rows; its selections Pi_i are the block columns themselves.
+
+    Attributes:
+        Phi: (N n, n).
+        Psi: (N n, N nu), block lower triangular.
+    """
+
+    Phi: Array
+    Psi: Array
+
+
+def prediction(model: LinearModel, horizon: int) -> Prediction:
+    """Build Phi and Psi for a horizon of N steps, from A^i and A^i B."""
+    n, nu = model.n, model.nu
+    Phi = np.empty((horizon, n, n))
+    responses = np.empty((horizon, n, nu))  # A^i B
+    power = np.eye(n)
+    for i in range(horizon):
+        responses[i] = power @ model.B
+        power = model.A @ power
+        Phi[i] = power
+    Psi = np.zeros((horizon, n, horizon, nu))
+    for i in range(horizon):
+        Psi[i, :, : i + 1] = responses[i::-1].transpose(1, 0, 2)
+    return Prediction(Phi=Phi.reshape(horizon * n, n), Psi=Psi.reshape(horizon * n, horizon * nu))
+
+
+def rollout(model: LinearModel, states: Array, plans: Array) -> Array:
+    """Predicted states of many plans at once, by recursion rather than by Phi and Psi.
+
+    Args:
+        model: the linear model.
+        states: (K, n) states to start from.
+        plans: (K, N, nu) inputs.
+
+    Returns:
+        (K, N, n) states xi(k+1) .. xi(k+N).
+    """
+    predicted = np.empty((*plans.shape[:2], model.n))
+    state = states
+    for i in range(plans.shape[1]):
+        state = state @ model.A.T + (plans[:, i] - model.u_bar) @ model.B.T
+        predicted[:, i] = state
+    return predicted

@@ -1,0 +1,70 @@
+"""What the two PIQP back ends share: settings, statuses, copies, counting active constraints."""
+
+from __future__ import annotations
+
+import time as clock
+from typing import Any, Final
+
+import numpy as np
+import piqp
+
+from mpc.qp import QP, Solution, Vectors
+from quadsim.controller import SOLVED
+
+MAX_ITERATIONS: Final = 100
+"""Cap for hopeless data (NaN runs PIQP to its limit); the paper's QPs take 7 to 20."""
+
+STATUS: Final = {
+    piqp.PIQP_SOLVED: SOLVED,
+    piqp.PIQP_MAX_ITER_REACHED: "max_iterations",
+    piqp.PIQP_PRIMAL_INFEASIBLE: "primal_infeasible",
+    piqp.PIQP_DUAL_INFEASIBLE: "dual_infeasible",
+    piqp.PIQP_NUMERICS: "numerics",
+    piqp.PIQP_UNSOLVED: "unsolved",
+    piqp.PIQP_INVALID_SETTINGS: "invalid_settings",
+}
+
+
+def configure(solver: Any) -> None:
+    """Settings common to both back ends; tolerances stay PIQP's own (1e-8 absolute, 1e-9 relative)."""
+    solver.settings.max_iter = MAX_ITERATIONS
+
+
+def setup(solver: Any, qp: QP) -> None:
+    """Hand the whole QP over; a PIQP solver must see every vector it will later be updated with."""
+    solver.setup(qp.P, qp.c, qp.A, qp.b, qp.G, qp.h_l, qp.h_u, qp.x_l, qp.x_u)
+
+
+def solve(solver: Any, vectors: Vectors) -> Solution:
+    """Update the vectors, solve, copy everything out.
+
+    PIQP's result arrays are views that the next solve overwrites, and a failed solve leaves a finite x: the
+    status is the only thing to go by.  Sizes are ours to get right, since a wrong one keeps the old data silently.
+    """
+    started = clock.perf_counter()
+    solver.update(c=vectors.c, b=vectors.b, h_l=vectors.h_l, h_u=vectors.h_u)
+    status = solver.solve()
+    elapsed = clock.perf_counter() - started
+    result = solver.result
+    # At an interior-point optimum a constraint is active where its multiplier exceeds its slack.
+    active = sum(
+        int(np.count_nonzero(multiplier > slack))
+        for multiplier, slack in (
+            (result.z_l, result.s_l),
+            (result.z_u, result.s_u),
+            (result.z_bl, result.s_bl),
+            (result.z_bu, result.s_bu),
+        )
+    )
+    return Solution(
+        x=result.x.copy(),
+        y=result.y.copy(),
+        z=result.z_u - result.z_l,
+        z_box=result.z_bu - result.z_bl,
+        status=STATUS[status],
+        iterations=int(result.info.iter),
+        active=active,
+        primal_residual=float(result.info.primal_res),
+        dual_residual=float(result.info.dual_res),
+        solve_s=elapsed,
+    )

@@ -1,0 +1,93 @@
+"""The unconstrained MPC: a constant gain.  Eqs. (21)-(26)."""
+
+from __future__ import annotations
+
+import time as clock
+from dataclasses import dataclass
+from typing import Final
+
+import scipy.linalg
+
+from mpc.cost import cost
+from mpc.prediction import prediction, rollout
+from mpc.problem import Problem
+from quadsim.controller import Command
+from quadsim.state import Array
+
+
+@dataclass(frozen=True, kw_only=True)
+class Gains:
+    """u_opt(k) = K_N xi(k) + G_N y_d + L_N u_bar.  Eq. (23).
+
+    Attributes:
+        K_N: (nu, n).  Eq. (24).
+        G_N: (nu, N n_r).  Eq. (25).
+        L_N: (nu, nu).  Eq. (26); the identity, once F3 has its sign and the linearisation its offset.
+    """
+
+    K_N: Array
+    G_N: Array
+    L_N: Array
+
+
+@dataclass(frozen=True, kw_only=True)
+class SequenceGains:
+    """The whole optimal sequence u_opt = K xi(k) + G y_d + L u_bar of Eq. (22), all N steps.
+
+    Attributes:
+        K: (N nu, n).
+        G: (N nu, N n_r).
+        L: (N nu, nu).
+    """
+
+    K: Array
+    G: Array
+    L: Array
+
+    def first(self) -> Gains:
+        """The gains of the first action, by Pi_1."""
+        nu = self.L.shape[1]
+        return Gains(K_N=self.K[:nu], G_N=self.G[:nu], L_N=self.L[:nu])
+
+
+def sequence_gains(problem: Problem) -> SequenceGains:
+    """Solve Eq. (21) for the optimal sequence; bounds of the problem are left aside."""
+    terms = cost(prediction(problem.model, problem.horizon), problem.objective)
+    factor = scipy.linalg.cho_factor(terms.H)
+    return SequenceGains(
+        K=-scipy.linalg.cho_solve(factor, terms.F1),
+        G=-scipy.linalg.cho_solve(factor, terms.F2),
+        L=-scipy.linalg.cho_solve(factor, terms.F3 + terms.F4),
+    )
+
+
+class UnconstrainedMPC:
+    """The linear feedback law of Eq. (23), which also reports the rest of its optimal sequence."""
+
+    name: Final = "unconstrained"
+    solver: Final = ""
+
+    def __init__(self, problem: Problem) -> None:
+        self.problem = problem
+        self.gains = sequence_gains(problem)
+        self._offset = self.gains.L @ problem.model.u_bar
+
+    @property
+    def horizon(self) -> int:
+        """N, samples of preview."""
+        return self.problem.horizon
+
+    def reset(self, speeds: Array) -> None:
+        """Nothing to forget: the law has no memory."""
+
+    def step(self, time: float, state: Array, reference: Array) -> Command:
+        """Evaluate Eq. (22); see `quadsim.controller.Controller.step`."""
+        started = clock.perf_counter()
+        desired = self.problem.objective.desired(reference)
+        sequence = self.gains.K @ state + self.gains.G @ desired.ravel() + self._offset
+        plan = sequence.reshape(self.horizon, -1)
+        return Command(speeds=plan[0].copy(), plan=plan, solve_s=clock.perf_counter() - started)
+
+    def predict(self, states: Array, plans: Array) -> Array:
+        """See `quadsim.controller.Controller.predict`."""
+        return rollout(self.problem.model, states, plans)

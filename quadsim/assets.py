@@ -1,0 +1,35 @@
+"""Where the data files are: beside the package when installed from a wheel, else in the checkout."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from quadsim.errors import FileError, UnknownNameError
+
+
+def models_dir() -> Path:
+    """The folder with `quadrotor.xml` and the vehicle files."""
+    package = Path(__file__).resolve().parent
+    for candidate in (package / "models", package.parent / "models"):
+        if (candidate / "quadrotor.xml").is_file():
+            return candidate
+    raise FileError(package / "models", "quadrotor.xml is missing: the installation is incomplete, reinstall quadsim")
+
+
+def vehicle_names() -> list[str]:
+    """Names of the vehicles that ship, sorted."""
+    return sorted(path.stem for path in models_dir().glob("*.toml"))
+
+
+def vehicle_path(name: str, relative_to: Path | None = None) -> Path:
+    """The vehicle file for a shipped name or a path ending in `.toml` (relative paths also against `relative_to`)."""
+    if name.endswith(".toml"):
+        candidates = [Path(name)] if relative_to is None else [relative_to / name, Path(name)]
+        for candidate in candidates:
+            if candidate.is_file():
+                return candidate
+        raise FileError(name, "no such vehicle file")
+    path = models_dir() / f"{name}.toml"
+    if not path.is_file():
+        raise UnknownNameError("vehicle", name, vehicle_names(), hint="or give a path ending in .toml")
+    return path

@@ -1,0 +1,196 @@
+"""Limits -> signed margins, at the control samples and at the physics rate, per constraint.
+
+A QP bounds the samples of a linear model; a vehicle has to hold its limits in between as well.  The audit therefore
+reads the plant at the physics rate, and states its tolerances: a verdict is `margin >= -tolerance`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from quadsim.errors import ParameterError, UnknownNameError
+from quadsim.flightlog import ControlLog, FlightLog, PlantLog
+from quadsim.state import INDEX, REFERENCE_NAMES, REFERENCE_STATES, STATE_NAMES, STATE_UNITS, Array
+
+_DISPLAY: Final = {"rad": ("deg", math.degrees(1.0)), "rad/s": ("deg/s", math.degrees(1.0))}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Signal:
+    """Something that can be limited: its unit in limits, and how to take it from a log.
+
+    Attributes:
+        unit: unit of the limit, e.g. `deg`.
+        sampled: log -> (K,) or (K, j) values at the control samples, in `unit`.
+        plant: log -> (M,) or (M, j) values at the physics rate, or None for what exists at samples only.
+    """
+
+    unit: str
+    sampled: Callable[[ControlLog], Array]
+    plant: Callable[[PlantLog], Array] | None
+
+
+def _state_signal(name: str, unit: str) -> Signal:
+    shown, scale = _DISPLAY.get(unit, (unit, 1.0))
+    i = INDEX[name]
+    return Signal(unit=shown, sampled=lambda log: scale * log.state[:, i], plant=lambda log: scale * log.state[:, i])
+
+
+def _error_signal(j: int) -> Signal:
+    i = REFERENCE_STATES[j]
+    shown, scale = _DISPLAY.get(STATE_UNITS[i], (STATE_UNITS[i], 1.0))
+    return Signal(unit=shown, sampled=lambda log: scale * (log.state[:, i] - log.reference[:, j]), plant=None)
+
+
+def _tilt(state: Array) -> Array:
+    cosine = np.cos(state[:, INDEX["roll"]]) * np.cos(state[:, INDEX["pitch"]])
+    return np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
+
+
+SIGNALS: Final[dict[str, Signal]] = {
+    **{name: _state_signal(name, unit) for name, unit in zip(STATE_NAMES, STATE_UNITS, strict=True)},
+    **{f"{name}_error": _error_signal(j) for j, name in enumerate(REFERENCE_NAMES)},
+    "tilt": Signal(unit="deg", sampled=lambda log: _tilt(log.state), plant=lambda log: _tilt(log.state)),
+    "speed": Signal(unit="rad/s", sampled=lambda log: log.speeds, plant=lambda log: log.speeds),
+    "slew": Signal(unit="rad/s", sampled=lambda log: log.slews, plant=None),
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Limit:
+    """A bound on one signal, with the tolerances of its verdict.
+
+    Attributes:
+        name: the constraint's name in tables and files.
+        signal: a key of `SIGNALS`; `slew` is the command's step per period, `speed` and `slew` hold for every rotor.
+        lower: smallest value allowed, in the signal's unit; -inf for none.
+        upper: largest value allowed; inf for none.
+        tolerance: how far beyond the bound the plant may go, at the physics rate.
+        tolerance_sampled: how far beyond the bound the control samples may go; at most `tolerance`.
+        required: whether the scenario demands it; a limit that is not required is measured and reported alone.
+        start: first time [s] at which it holds.
+        stop: last time [s] at which it holds.
+    """
+
+    name: str
+    signal: str
+    lower: float = -math.inf
+    upper: float = math.inf
+    tolerance: float = 0.0
+    tolerance_sampled: float = 0.0
+    required: bool = True
+    start: float = 0.0
+    stop: float = math.inf
+
+    def __post_init__(self) -> None:
+        if self.signal not in SIGNALS:
+            raise UnknownNameError("signal", self.signal, SIGNALS)
+        if not self.lower < self.upper:
+            raise ParameterError(f"constraint {self.name}", "lower", self.lower, f"below upper = {self.upper}")
+        if not 0.0 <= self.tolerance_sampled <= self.tolerance < math.inf:
+            rule = f"between 0 and tolerance = {self.tolerance}"
+            raise ParameterError(f"constraint {self.name}", "tolerance_sampled", self.tolerance_sampled, rule)
+        if not self.start <= self.stop:
+            raise ParameterError(f"constraint {self.name}", "start", self.start, f"at most stop = {self.stop}")
+
+    @property
+    def unit(self) -> str:
+        """Unit of the bounds, tolerances and margins."""
+        return SIGNALS[self.signal].unit
+
+    def margin(self, values: Array) -> Array:
+        """(K,) signed distance to the nearer bound, the smallest over rotors; negative = violated."""
+        margin = np.minimum(values - self.lower, self.upper - values)
+        return margin if margin.ndim == 1 else margin.min(axis=1)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Finding:
+    """What the audit found for one limit; margins and peaks in the limit's unit.
+
+    Attributes:
+        limit: the limit audited.
+        peak_sampled: the value nearest to (or furthest beyond) a bound at the control samples.
+        peak_plant: the same at the physics rate; equal to `peak_sampled` for signals that exist at samples only.
+        worst_margin_sampled: smallest signed margin at the control samples.
+        worst_margin: smallest signed margin at the physics rate (which includes the samples).
+        worst_time: when that was [s].
+        time_violated: time spent beyond bound plus tolerance [s].
+    """
+
+    limit: Limit
+    peak_sampled: float
+    peak_plant: float
+    worst_margin_sampled: float
+    worst_margin: float
+    worst_time: float
+    time_violated: float
+
+    @property
+    def satisfied(self) -> bool:
+        """Whether the limit held, within its tolerances, at the samples and between them."""
+        return bool(
+            self.worst_margin_sampled >= -self.limit.tolerance_sampled and self.worst_margin >= -self.limit.tolerance
+        )
+
+
+def margins_sampled(limit: Limit, log: FlightLog) -> Array:
+    """(K,) signed margins of a limit at the control samples, NaN outside its time window."""
+    return _windowed(limit, log.control.t, limit.margin(SIGNALS[limit.signal].sampled(log.control)))
+
+
+def audit(log: FlightLog, limits: tuple[Limit, ...]) -> tuple[Finding, ...]:
+    """Hold a flight against its limits.
+
+    Args:
+        log: a flight whose plant rows are at the physics rate.
+        limits: what to hold it against.
+
+    Returns:
+        One finding per limit, in order.
+    """
+    return tuple(_find(log, limit) for limit in limits)
+
+
+def _windowed(limit: Limit, t: Array, margins: Array) -> Array:
+    return np.where((t >= limit.start - 1e-9) & (t <= limit.stop + 1e-9), margins, np.nan)
+
+
+def _find(log: FlightLog, limit: Limit) -> Finding:
+    signal = SIGNALS[limit.signal]
+    sampled_t, sampled = log.control.t, signal.sampled(log.control)
+    peak_sampled, margin_sampled, time_sampled = _worst(limit, sampled_t, sampled)
+    if signal.plant is None:
+        t, values = sampled_t, sampled
+        peak, margin, time = peak_sampled, margin_sampled, time_sampled
+    else:
+        t, values = log.plant.t, signal.plant(log.plant)
+        peak, margin, time = _worst(limit, t, values)
+    margins = _windowed(limit, t, limit.margin(values))
+    spacing = float(t[1] - t[0]) if t.size > 1 else 0.0
+    return Finding(
+        limit=limit,
+        peak_sampled=peak_sampled,
+        peak_plant=peak,
+        worst_margin_sampled=margin_sampled,
+        worst_margin=margin,
+        worst_time=time,
+        time_violated=float(np.count_nonzero(margins < -limit.tolerance)) * spacing,
+    )
+
+
+def _worst(limit: Limit, t: Array, values: Array) -> tuple[float, float, float]:
+    """Value, margin and time where the margin is smallest; NaN when the window is empty."""
+    columns = values if values.ndim == 2 else values[:, None]
+    inside = (t >= limit.start - 1e-9) & (t <= limit.stop + 1e-9)
+    if not inside.any():
+        return math.nan, math.nan, math.nan
+    columns, t = columns[inside], t[inside]
+    margins = np.minimum(columns - limit.lower, limit.upper - columns)
+    row, column = np.unravel_index(int(np.argmin(margins)), margins.shape)
+    return float(columns[row, column]), float(margins[row, column]), float(t[row])

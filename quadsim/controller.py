@@ -1,0 +1,94 @@
+"""What a controller is to the testbed: one protocol, one answer per control period."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final, Protocol
+
+import numpy as np
+
+from quadsim.state import Array
+
+SOLVED: Final = "solved"
+LARGEST_SPEED: Final = 1e5
+"""Largest magnitude of a rotor speed command [rad/s] that is taken for a command rather than for a fault."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Command:
+    """A controller's answer for one period, and how it was found.
+
+    Attributes:
+        speeds: (4,) rotor speeds to hold for the period [rad/s].
+        plan: (N, 4) planned speeds, `plan[0]` being this period's [rad/s].
+        status: `solved`, or the back end's name for what went wrong.
+        iterations: solver iterations; 0 for a closed form.
+        active: number of constraints active at the optimum.
+        fallback: 0 when `speeds` is this period's optimum, higher = deeper; 1 = the shifted previous plan.
+        slack: largest softening of an output bound [rad]; 0 while all bounds are hard.
+        primal_residual: largest constraint violation the back end reports [its own scaling].
+        dual_residual: largest gradient of the Lagrangian the back end reports.
+        solve_s: wall time inside the solver [s].
+    """
+
+    speeds: Array
+    plan: Array
+    status: str = SOLVED
+    iterations: int = 0
+    active: int = 0
+    fallback: int = 0
+    slack: float = 0.0
+    primal_residual: float = 0.0
+    dual_residual: float = 0.0
+    solve_s: float = 0.0
+
+
+class Controller(Protocol):
+    """A feedback law run once per control period.
+
+    Attributes:
+        name: short name of the law.
+        solver: name of the back end; empty for a closed form.
+        horizon: N, how many samples of preview `step` is given.
+    """
+
+    @property
+    def name(self) -> str: ...
+
+    @property
+    def solver(self) -> str: ...
+
+    @property
+    def horizon(self) -> int: ...
+
+    def reset(self, speeds: Array) -> None:
+        """Forget the past: the next step is the first, after `speeds` u(-1) (4,) [rad/s]."""
+        ...
+
+    def step(self, time: float, state: Array, reference: Array) -> Command:
+        """The command for the period that starts now.
+
+        Args:
+            time: t_k [s], for messages.
+            state: (12,) measured state xi(k).
+            reference: (N, 4) filtered x, y, z [m], yaw [rad] at t_{k+1} .. t_{k+N}.
+
+        Raises:
+            FlightError: no command can be given.
+        """
+        ...
+
+    def predict(self, states: Array, plans: Array) -> Array:
+        """Predicted states (K, N, 12) for K measured states (K, 12) and plans (K, N, 4), as the controller saw them."""
+        ...
+
+
+def check_command(speeds: Array) -> str | None:
+    """What is wrong with rotor speeds that are about to reach the plant, or None."""
+    if np.shape(speeds) != (4,):
+        return f"the command has shape {np.shape(speeds)}, not (4,)"
+    if not np.all(np.isfinite(speeds)):
+        return f"the command is not finite: {np.asarray(speeds).tolist()}"
+    if np.max(np.abs(speeds)) > LARGEST_SPEED:
+        return f"the command is beyond any rotor's speed: {np.asarray(speeds).tolist()}"
+    return None

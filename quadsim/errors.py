@@ -1,0 +1,113 @@
+"""Every error the project raises: what was given, what is allowed, what to try.
+
+Two families hang from one root. `InputError` is the user's to mend (exit status 2); `FlightError` is something
+that happened in flight: it ends the flight, is recorded with it as its reason, and gives exit status 1.
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable
+from pathlib import Path
+
+
+class QuadsimError(Exception):
+    """Root of all errors raised on purpose; `exit_status` is what the command line returns for it."""
+
+    exit_status = 2
+
+
+class InputError(QuadsimError, ValueError):
+    """The input was wrong; the message is one a person can act on."""
+
+
+class ParameterError(InputError):
+    """A parameter is outside what is allowed.
+
+    Attributes:
+        owner: the thing the parameter belongs to, e.g. `vehicle`.
+        name: the parameter.
+        value: what was given.
+        rule: what is allowed, as the end of "must be ...".
+    """
+
+    def __init__(self, owner: str, name: str, value: object, rule: str) -> None:
+        super().__init__(f"{owner}.{name} must be {rule}; got {value!r}")
+        self.owner, self.name, self.value, self.rule = owner, name, value, rule
+
+
+class UnknownNameError(InputError):
+    """A name that is not one of a known set; the message lists the set and the nearest member."""
+
+    def __init__(self, kind: str, name: str, allowed: Iterable[str], hint: str = "") -> None:
+        self.kind, self.name, self.allowed = kind, name, tuple(sorted(allowed))
+        near = difflib.get_close_matches(name, self.allowed, n=1)
+        guess = f"; did you mean {near[0]!r}?" if near else ""
+        tail = f"; {hint}" if hint else ""
+        super().__init__(f"no {kind} named {name!r}{guess} (there are: {', '.join(self.allowed)}){tail}")
+
+
+class FileError(InputError):
+    """A file that is missing, unreadable or malformed."""
+
+    def __init__(self, path: Path | str, problem: str) -> None:
+        super().__init__(f"{path}: {problem}")
+        self.path, self.problem = Path(path), problem
+
+
+class OutputError(QuadsimError, OSError):
+    """Results cannot be written: directory not writable, disk full; nothing is left behind."""
+
+    def __init__(self, path: Path | str, problem: str) -> None:
+        super().__init__(f"cannot write {path}: {problem}")
+        self.path, self.problem = Path(path), problem
+
+
+class RenderingUnavailableError(QuadsimError):
+    """Neither EGL nor OSMesa can render on this machine."""
+
+    def __init__(self, tried: dict[str, str]) -> None:
+        details = "; ".join(f"{backend}: {problem}" for backend, problem in tried.items())
+        super().__init__(
+            f"no off-screen OpenGL on this machine ({details}). Install one with "
+            "'apt-get install --no-install-recommends libegl1 libgl1 libgl1-mesa-dri' (or 'libosmesa6'), "
+            "or run with --no-video"
+        )
+        self.tried = tried
+
+
+class ViewerUnavailableError(QuadsimError):
+    """The rerun viewer cannot be started here."""
+
+
+class FlightError(QuadsimError):
+    """Something that ends a flight; it becomes the flight's recorded reason.
+
+    Attributes:
+        time: simulated time [s] at which it happened.
+    """
+
+    exit_status = 1
+
+    def __init__(self, message: str, *, time: float) -> None:
+        super().__init__(f"at t = {time:.3f} s: {message}")
+        self.time = time
+
+
+class DivergenceError(FlightError):
+    """The plant's state became non-finite, left every plausible range, or MuJoCo reported a numerical warning."""
+
+
+class CommandError(FlightError):
+    """A command that must not reach the plant: wrong shape, non-finite or negative rotor speeds."""
+
+
+class PlanExhaustedError(FlightError):
+    """The solver failed and no step of the last good plan is left to hold."""
+
+
+class InterruptedFlightError(FlightError):
+    """The person flying pressed Ctrl-C."""
+
+    def __init__(self, *, time: float) -> None:
+        super().__init__("interrupted (Ctrl-C)", time=time)

@@ -1,0 +1,251 @@
+"""One flight as stacked arrays with units, and its Parquet files.
+
+Three tables, as in the file contract: what happened once per control period (`flight.parquet`), what a clock measured
+(`timing.parquet`, the only one that differs between two equal flights), and the plant between commands
+(`plant.parquet`).  A fourth, `horizon.parquet`, keeps the predicted positions of every period for pictures.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from quadsim.errors import FileError
+from quadsim.state import REFERENCE_NAMES, REFERENCE_UNITS, STATE_NAMES, STATE_UNITS, Array
+from quadsim.vehicle import N_ROTORS
+
+FLIGHT_FILE: Final = "flight.parquet"
+TIMING_FILE: Final = "timing.parquet"
+PLANT_FILE: Final = "plant.parquet"
+HORIZON_FILE: Final = "horizon.parquet"
+
+ROTORS: Final = range(1, N_ROTORS + 1)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ControlLog:
+    """One row per control period k, taken at t_k; K rows.
+
+    Attributes:
+        t: (K,) [s].
+        state: (K, 12) measured state, units of `STATE_UNITS`.
+        reference: (K, 4) filtered reference x, y, z [m], yaw [rad] at t_k.
+        speeds: (K, 4) commanded rotor speeds held from t_k on [rad/s].
+        speeds_before: (4,) u(-1), the command before the first [rad/s].
+        status: K texts, `solved` or what the back end said instead.
+        iterations: (K,) solver iterations.
+        active: (K,) constraints active at the optimum.
+        fallback: (K,) 0 none, higher = deeper.
+        slack: (K,) largest softening of an output bound [rad].
+        primal_residual: (K,) as reported by the back end.
+        dual_residual: (K,) as reported by the back end.
+    """
+
+    t: Array
+    state: Array
+    reference: Array
+    speeds: Array
+    speeds_before: Array
+    status: tuple[str, ...]
+    iterations: np.ndarray[Any, np.dtype[np.int64]]
+    active: np.ndarray[Any, np.dtype[np.int64]]
+    fallback: np.ndarray[Any, np.dtype[np.int64]]
+    slack: Array
+    primal_residual: Array
+    dual_residual: Array
+
+    @property
+    def slews(self) -> Array:
+        """(K, 4) command steps u(k) - u(k-1) [rad/s per period], Eq. (15)."""
+        return np.diff(self.speeds, axis=0, prepend=self.speeds_before[None, :])
+
+
+@dataclass(frozen=True, kw_only=True)
+class TimingLog:
+    """What a clock measured, per control period."""
+
+    t: Array
+    solve_ms: Array
+    step_ms: Array
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlantLog:
+    """The plant between commands; M rows, the first at t = 0 before the first command.
+
+    Attributes:
+        t: (M,) [s].
+        state: (M, 12) true state, yaw unwrapped.
+        speeds: (M, 4) rotor speeds that act from t on [rad/s]; the last row repeats the one before.
+    """
+
+    t: Array
+    state: Array
+    speeds: Array
+
+    def every(self, stride: int) -> PlantLog:
+        """Each `stride`-th row, from the first on."""
+        return PlantLog(t=self.t[::stride], state=self.state[::stride], speeds=self.speeds[::stride])
+
+
+@dataclass(frozen=True, kw_only=True)
+class FlightLog:
+    """A whole flight, or as much of one as was flown.
+
+    Attributes:
+        control: one row per control period.
+        timing: clock times, one row per control period.
+        plant: the plant, at the physics rate after a flight, at the log rate when read from a file.
+        predicted: (K, N, 3) float32 positions [m] predicted at each period for t_{k+1} .. t_{k+N}, or None.
+        reason: why the flight ended early; None when it was completed.
+        interrupted: whether the person flying ended it.
+    """
+
+    control: ControlLog
+    timing: TimingLog
+    plant: PlantLog
+    predicted: np.ndarray[Any, np.dtype[np.float32]] | None = None
+    reason: str | None = None
+    interrupted: bool = False
+
+    @property
+    def status(self) -> str:
+        """`completed` or `aborted`."""
+        return "completed" if self.reason is None else "aborted"
+
+
+_Column = tuple[str, str, Any]
+
+
+def _state_columns(state: Array) -> list[_Column]:
+    return [(name, unit, state[:, i]) for i, (name, unit) in enumerate(zip(STATE_NAMES, STATE_UNITS, strict=True))]
+
+
+def _table(columns: Sequence[_Column], metadata: Mapping[str, str]) -> pa.Table:
+    arrays, schema = [], []
+    for name, unit, values in columns:
+        array = values if isinstance(values, pa.Array) else pa.array(values)
+        arrays.append(array)
+        schema.append(pa.field(name, array.type, nullable=False, metadata={"unit": unit}))
+    return pa.Table.from_arrays(arrays, schema=pa.schema(schema, metadata=dict(metadata)))
+
+
+def _flight_table(log: ControlLog, metadata: Mapping[str, str]) -> pa.Table:
+    references = zip(REFERENCE_NAMES, REFERENCE_UNITS, strict=True)
+    columns: list[_Column] = [
+        ("t", "s", log.t),
+        *_state_columns(log.state),
+        *((f"ref_{name}", unit, log.reference[:, i]) for i, (name, unit) in enumerate(references)),
+        *((f"u{i}", "rad/s", log.speeds[:, i - 1]) for i in ROTORS),
+        ("status", "-", pa.array(log.status, pa.string())),
+        ("iterations", "-", log.iterations),
+        ("active", "-", log.active),
+        ("fallback", "-", log.fallback),
+        ("slack", "rad", log.slack),
+        ("primal_residual", "-", log.primal_residual),
+        ("dual_residual", "-", log.dual_residual),
+    ]
+    before = ",".join(repr(float(speed)) for speed in log.speeds_before)
+    return _table(columns, {**metadata, "speeds_before": before})
+
+
+def _plant_table(log: PlantLog, metadata: Mapping[str, str]) -> pa.Table:
+    speeds = [(f"w{i}", "rad/s", log.speeds[:, i - 1]) for i in ROTORS]
+    return _table([("t", "s", log.t), *_state_columns(log.state), *speeds], metadata)
+
+
+def _timing_table(log: TimingLog, metadata: Mapping[str, str]) -> pa.Table:
+    return _table([("t", "s", log.t), ("solve_ms", "ms", log.solve_ms), ("step_ms", "ms", log.step_ms)], metadata)
+
+
+def _horizon_table(
+    t: Array, predicted: np.ndarray[Any, np.dtype[np.float32]], metadata: Mapping[str, str]
+) -> pa.Table:
+    horizon = predicted.shape[1]
+    lists = (pa.FixedSizeListArray.from_arrays(predicted[:, :, i].ravel(), horizon) for i in range(3))
+    return _table([("t", "s", t), *((f"predicted_{axis}", "m", a) for axis, a in zip("xyz", lists, strict=True))], metadata)
+
+
+def write_log(directory: Path, log: FlightLog, *, plant_stride: int, metadata: Mapping[str, str]) -> None:
+    """Write a flight's Parquet files into an existing directory.
+
+    Args:
+        directory: where `flight.parquet`, `timing.parquet`, `plant.parquet` and `horizon.parquet` go.
+        log: the flight.
+        plant_stride: physics steps per row of `plant.parquet`.
+        metadata: texts kept in each file's schema; no clock reading belongs here.
+    """
+    tables = {
+        FLIGHT_FILE: _flight_table(log.control, metadata),
+        TIMING_FILE: _timing_table(log.timing, metadata),
+        PLANT_FILE: _plant_table(log.plant.every(plant_stride), metadata),
+    }
+    if log.predicted is not None:
+        tables[HORIZON_FILE] = _horizon_table(log.control.t, log.predicted, metadata)
+    for name, table in tables.items():
+        pq.write_table(table, directory / name, compression="zstd")
+
+
+def _read(path: Path) -> pa.Table:
+    try:
+        return pq.read_table(path, memory_map=False)
+    except (OSError, pa.ArrowInvalid) as error:
+        raise FileError(path, f"is not a readable Parquet file ({error})") from error
+
+
+def _stack(table: pa.Table, names: Sequence[str]) -> Array:
+    return np.stack([table.column(name).to_numpy() for name in names], axis=1)
+
+
+def read_log(directory: Path, *, reason: str | None = None) -> FlightLog:
+    """Read a flight back; the plant's rows are at the log rate.
+
+    Args:
+        directory: a run directory.
+        reason: the flight's reason for ending early, which stands in its summary.
+
+    Raises:
+        FileError: a file is missing or damaged.
+    """
+    flight, timing, plant = (_read(directory / name) for name in (FLIGHT_FILE, TIMING_FILE, PLANT_FILE))
+    try:
+        before = np.array([float(text) for text in flight.schema.metadata[b"speeds_before"].decode().split(",")])
+        scalars = {
+            field.name: flight.column(field.name).to_numpy()
+            for field in fields(ControlLog)
+            if field.name not in ("state", "reference", "speeds", "speeds_before", "status")
+        }
+        control = ControlLog(
+            state=_stack(flight, STATE_NAMES),
+            reference=_stack(flight, [f"ref_{name}" for name in REFERENCE_NAMES]),
+            speeds=_stack(flight, [f"u{i}" for i in ROTORS]),
+            speeds_before=before,
+            status=tuple(flight.column("status").to_pylist()),
+            **scalars,
+        )
+        plant_log = PlantLog(
+            t=plant.column("t").to_numpy(),
+            state=_stack(plant, STATE_NAMES),
+            speeds=_stack(plant, [f"w{i}" for i in ROTORS]),
+        )
+        timing_log = TimingLog(**{name: timing.column(name).to_numpy() for name in ("t", "solve_ms", "step_ms")})
+    except (KeyError, ValueError) as error:
+        raise FileError(directory, f"lacks a column of the flight log ({error})") from error
+    return FlightLog(
+        control=control, timing=timing_log, plant=plant_log, predicted=_read_predicted(directory), reason=reason
+    )
+
+
+def _read_predicted(directory: Path) -> np.ndarray[Any, np.dtype[np.float32]] | None:
+    path = directory / HORIZON_FILE
+    if not path.exists():
+        return None
+    table = _read(path)
+    columns = [table.column(f"predicted_{axis}").combine_chunks() for axis in "xyz"]
+    return np.stack([column.flatten().to_numpy().reshape(len(column), -1) for column in columns], axis=-1)

@@ -1,0 +1,220 @@
+"""One directory per run: complete or not there at all, with a SHA-256 per file."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+import math
+import os
+import shutil
+import tempfile
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Final
+
+from quadsim.audit import Finding, Limit
+from quadsim.errors import FileError, OutputError
+from quadsim.flightlog import FlightLog, read_log
+from quadsim.vehicle import Vehicle
+
+SUMMARY_FILE: Final = "summary.json"
+SCENARIO_FILE: Final = "scenario.toml"
+RECORDING_FILE: Final = "flight.rrd"
+VIDEO_FILE: Final = "flight.mp4"
+FIGURES_DIR: Final = "figures"
+
+_FREE_BYTES_NEEDED: Final = 16 * 1024 * 1024
+
+
+@dataclass(frozen=True, kw_only=True)
+class Run:
+    """A finished run, read back from its directory.
+
+    Attributes:
+        directory: where it is.
+        summary: `summary.json`.
+        log: the flight, its plant rows at the log rate.
+        vehicle: the vehicle flown.
+        limits: the constraints it was audited against.
+    """
+
+    directory: Path
+    summary: dict[str, Any]
+    log: FlightLog
+    vehicle: Vehicle
+    limits: tuple[Limit, ...]
+
+    @property
+    def name(self) -> str:
+        """The scenario's name."""
+        return str(self.summary["scenario"])
+
+
+def vehicle_to_json(vehicle: Vehicle) -> dict[str, Any]:
+    """The vehicle's numbers for `summary.json`."""
+    return asdict(vehicle)
+
+
+def limit_to_json(finding: Finding) -> dict[str, Any]:
+    """One entry of `constraints` in `summary.json`; an absent bound, or a window the flight never reached, is null."""
+    limit = finding.limit
+
+    def finite(value: float) -> float | None:
+        return value if math.isfinite(value) else None
+
+    return {
+        "name": limit.name,
+        "signal": limit.signal,
+        "unit": limit.unit,
+        "lower": finite(limit.lower),
+        "upper": finite(limit.upper),
+        "tolerance": limit.tolerance,
+        "tolerance_sampled": limit.tolerance_sampled,
+        "required": limit.required,
+        "start": limit.start,
+        "stop": finite(limit.stop),
+        "peak_sampled": finite(finding.peak_sampled),
+        "peak_plant": finite(finding.peak_plant),
+        "worst_margin_sampled": finite(finding.worst_margin_sampled),
+        "worst_margin": finite(finding.worst_margin),
+        "worst_time": finite(finding.worst_time),
+        "time_violated": finding.time_violated,
+        "satisfied": finding.satisfied,
+    }
+
+
+def limit_from_json(entry: Mapping[str, Any]) -> Limit:
+    """The limit that `limit_to_json` wrote."""
+    infinite = {"lower": -float("inf"), "upper": float("inf"), "stop": float("inf")}
+    keys = ("name", "signal", "tolerance", "tolerance_sampled", "required", "start")
+    bounds = {key: infinite[key] if entry[key] is None else entry[key] for key in infinite}
+    return Limit(**{key: entry[key] for key in keys}, **bounds)
+
+
+def write_json(path: Path, data: Mapping[str, Any]) -> None:
+    """Write strict JSON (no NaN) with a newline at the end."""
+    path.write_text(json.dumps(data, indent=2, allow_nan=False) + "\n", encoding="utf-8")
+
+
+def write_json_atomically(path: Path, data: Mapping[str, Any]) -> None:
+    """Replace a JSON file in one step.
+
+    Raises:
+        OutputError: it cannot be written; the old one is still there.
+    """
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.partial")
+    try:
+        write_json(temporary, data)
+        temporary.replace(path)
+    except OSError as error:
+        raise OutputError(path, error.strerror or str(error)) from error
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def is_run(directory: Path) -> bool:
+    """Whether a path is a run directory."""
+    return (directory / SUMMARY_FILE).is_file()
+
+
+def read_summary(directory: Path) -> dict[str, Any]:
+    """`summary.json` of a run directory.
+
+    Raises:
+        FileError: there is none, or it is not one of ours.
+    """
+    path = directory / SUMMARY_FILE
+    try:
+        summary = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
+        raise FileError(path, f"is not a run's summary ({error})") from error
+    if not isinstance(summary, dict) or not {"scenario", "constraints", "vehicle", "status"} <= summary.keys():
+        raise FileError(path, "is not a run's summary: it lacks scenario, status, constraints or vehicle")
+    return summary
+
+
+def load_run(directory: Path) -> Run:
+    """Read a run back.
+
+    Raises:
+        FileError: a file is missing or damaged.
+    """
+    summary = read_summary(directory)
+    return Run(
+        directory=directory,
+        summary=summary,
+        log=read_log(directory, reason=summary.get("reason")),
+        vehicle=Vehicle(**summary["vehicle"]),
+        limits=tuple(limit_from_json(entry) for entry in summary["constraints"]),
+    )
+
+
+def file_hashes(directory: Path) -> dict[str, str]:
+    """SHA-256 of every file below a directory but the summary, by relative path, sorted."""
+    paths = sorted(path for path in directory.rglob("*") if path.is_file() and path.name != SUMMARY_FILE)
+    return {
+        path.relative_to(directory).as_posix(): "sha256:" + hashlib.sha256(path.read_bytes()).hexdigest()
+        for path in paths
+    }
+
+
+def refresh_hashes(directory: Path) -> None:
+    """Record the hashes of a run's files again, after a product such as the video was added."""
+    summary = read_summary(directory)
+    write_json_atomically(directory / SUMMARY_FILE, {**summary, "files": file_hashes(directory)})
+
+
+def damaged_files(directory: Path, summary: Mapping[str, Any]) -> list[str]:
+    """Files named in the summary that are missing or whose SHA-256 is not the recorded one."""
+    found = file_hashes(directory)
+    return [name for name, digest in summary.get("files", {}).items() if found.get(name) != digest]
+
+
+@contextlib.contextmanager
+def writing(target: Path) -> Iterator[Path]:
+    """A directory to fill, which becomes `target` when the block ends well and vanishes when it does not.
+
+    An existing run (or empty directory) at `target` is replaced; anything else there is refused.
+
+    Raises:
+        OutputError: the place cannot be written, is nearly full, or holds something that is not a run.
+    """
+    target = Path(target)
+    try:
+        occupied = target.exists() and not (target.is_dir() and (is_run(target) or not any(target.iterdir())))
+        if occupied:
+            raise OutputError(target, "something that is not a run is already there; choose another --out")
+        target.parent.mkdir(parents=True, exist_ok=True)
+        if shutil.disk_usage(target.parent).free < _FREE_BYTES_NEEDED:
+            raise OutputError(target, "the disk is full")
+        temporary = Path(tempfile.mkdtemp(prefix=f".{target.name}.", suffix=".partial", dir=target.parent))
+    except OutputError:
+        raise
+    except OSError as error:
+        raise OutputError(target, error.strerror or str(error)) from error
+    try:
+        temporary.chmod(0o755)
+        yield temporary
+        _replace(temporary, target)
+    except OSError as error:
+        if isinstance(error, OutputError):
+            raise
+        raise OutputError(target, error.strerror or str(error)) from error
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
+
+
+def _replace(temporary: Path, target: Path) -> None:
+    if not target.exists():
+        temporary.rename(target)
+        return
+    old = temporary.with_suffix(".old")
+    os.rename(target, old)
+    try:
+        temporary.rename(target)
+    except OSError:
+        os.rename(old, target)
+        raise
+    shutil.rmtree(old, ignore_errors=True)

@@ -1,0 +1,120 @@
+"""The 12-state of the paper: order, names, units, and attitude kinematics.
+
+The state vector is xi = [x vx y vy z vz roll roll_rate pitch pitch_rate yaw yaw_rate] (Sec. 2.3), positions and
+velocities in the world frame (z up), attitude as Z-Y-X Euler angles (body_to_world = Rz(yaw) Ry(pitch) Rx(roll)),
+and **Euler-angle rates**, not body rates. All functions take arrays with any leading dimensions.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+STATE_NAMES: Final = (
+    "x", "vx", "y", "vy", "z", "vz",
+    "roll", "roll_rate", "pitch", "pitch_rate", "yaw", "yaw_rate",
+)  # fmt: skip
+STATE_UNITS: Final = ("m", "m/s") * 3 + ("rad", "rad/s") * 3
+INDEX: Final = {name: i for i, name in enumerate(STATE_NAMES)}
+N_STATES: Final = len(STATE_NAMES)
+
+POSITION: Final = (0, 2, 4)
+VELOCITY: Final = (1, 3, 5)
+EULER: Final = (6, 8, 10)
+EULER_RATE: Final = (7, 9, 11)
+
+REFERENCE_NAMES: Final = ("x", "y", "z", "yaw")
+REFERENCE_UNITS: Final = ("m", "m", "m", "rad")
+REFERENCE_STATES: Final = tuple(INDEX[name] for name in REFERENCE_NAMES)
+
+
+def quaternion_to_euler(quaternion: Array) -> Array:
+    """Roll, pitch, yaw [rad] of unit quaternions.
+
+    Args:
+        quaternion: (..., 4), scalar first (w, x, y, z), body to world.
+
+    Returns:
+        (..., 3): roll and yaw in (-pi, pi], pitch in [-pi/2, pi/2].
+    """
+    w, x, y, z = np.moveaxis(np.asarray(quaternion, float), -1, 0)
+    roll = np.arctan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y))
+    pitch = np.arcsin(np.clip(2.0 * (w * y - z * x), -1.0, 1.0))
+    yaw = np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+    return np.stack([roll, pitch, yaw], axis=-1)
+
+
+def euler_to_quaternion(euler: Array) -> Array:
+    """Unit quaternions (..., 4), scalar first, body to world, of roll, pitch, yaw (..., 3) [rad]."""
+    half = 0.5 * np.asarray(euler, float)
+    (cr, cp, cy), (sr, sp, sy) = np.moveaxis(np.cos(half), -1, 0), np.moveaxis(np.sin(half), -1, 0)
+    return np.stack(
+        [
+            cr * cp * cy + sr * sp * sy,
+            sr * cp * cy - cr * sp * sy,
+            cr * sp * cy + sr * cp * sy,
+            cr * cp * sy - sr * sp * cy,
+        ],
+        axis=-1,
+    )
+
+
+def body_to_euler_rates(euler: Array, body_rates: Array) -> Array:
+    """Euler-angle rates [rad/s] from body rates (p, q, r).
+
+    d(roll)/dt = p + (q sin(roll) + r cos(roll)) tan(pitch), and so on; singular at pitch = +-90 deg, where the
+    result is not finite.  The paper (Sec. 2.2) takes the two sets of rates as equal, which holds at small angles only.
+    """
+    roll, pitch = euler[..., 0], euler[..., 1]
+    p, q, r = np.moveaxis(np.asarray(body_rates, float), -1, 0)
+    lateral = q * np.sin(roll) + r * np.cos(roll)
+    return np.stack(
+        [p + lateral * np.tan(pitch), q * np.cos(roll) - r * np.sin(roll), lateral / np.cos(pitch)], axis=-1
+    )
+
+
+def euler_to_body_rates(euler: Array, euler_rates: Array) -> Array:
+    """Body rates (p, q, r) [rad/s] from Euler-angle rates; the inverse of `body_to_euler_rates`."""
+    roll, pitch = euler[..., 0], euler[..., 1]
+    roll_rate, pitch_rate, yaw_rate = np.moveaxis(np.asarray(euler_rates, float), -1, 0)
+    return np.stack(
+        [
+            roll_rate - yaw_rate * np.sin(pitch),
+            pitch_rate * np.cos(roll) + yaw_rate * np.cos(pitch) * np.sin(roll),
+            -pitch_rate * np.sin(roll) + yaw_rate * np.cos(pitch) * np.cos(roll),
+        ],
+        axis=-1,
+    )
+
+
+def body_to_world(euler: Array) -> Array:
+    """Rotation matrices (..., 3, 3) from body to world for roll, pitch, yaw (..., 3) [rad]."""
+    (cr, cp, cy), (sr, sp, sy) = np.moveaxis(np.cos(euler), -1, 0), np.moveaxis(np.sin(euler), -1, 0)
+    rows = [
+        [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
+        [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
+        [-sp, cp * sr, cp * cr],
+    ]
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def make_state(
+    *,
+    position: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    euler: tuple[float, float, float] = (0.0, 0.0, 0.0),
+) -> Array:
+    """A state at rest at `position` [m, world] with attitude roll, pitch, yaw `euler` [rad]."""
+    state = np.zeros(N_STATES)
+    state[list(POSITION)] = position
+    state[list(EULER)] = euler
+    return state
+
+
+def read_only(array: Array) -> Array:
+    """The same array, marked read-only: what is stored is never changed afterwards."""
+    array.flags.writeable = False
+    return array

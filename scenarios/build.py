@@ -1,0 +1,135 @@
+"""From a scenario file to the things that fly: vehicle, plant, reference, controller, limits."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, Final
+
+import numpy as np
+
+from mpc.constrained import ConstrainedMPC
+from mpc.model import hover_model
+from mpc.problem import Bounds, Objective, Problem
+from mpc.solvers import QPSolver
+from mpc.unconstrained import UnconstrainedMPC
+from quadsim.assets import vehicle_path
+from quadsim.audit import Limit
+from quadsim.controller import Controller
+from quadsim.plant import Plant
+from quadsim.state import INDEX, N_STATES, STATE_NAMES, Array, make_state
+from quadsim.vehicle import N_ROTORS, Vehicle, load_vehicle
+from scenarios.references import Window, smooth, steps
+from scenarios.spec import ANGLES, ConstrainedSpec, Scenario, WindowSpec
+
+CONTROLLERS: Final = {
+    "unconstrained": "the paper's Sec. 4: a constant gain from the unconstrained optimum",
+    "constrained": "the paper's Sec. 5: one QP per period, tilt, rotor speeds and their steps bounded",
+}
+
+
+def build_vehicle(scenario: Scenario) -> Vehicle:
+    """The vehicle file with the scenario's overrides."""
+    return load_vehicle(vehicle_path(scenario.vehicle.file), scenario.vehicle.overrides())
+
+
+def resolve(scenario: Scenario, vehicle: Vehicle) -> Scenario:
+    """The scenario with every number of its vehicle written out, so that its file alone defines the flight."""
+    numbers: dict[str, Any] = {
+        name: list(value) if isinstance(value, tuple) else value
+        for name in type(scenario.vehicle).model_fields
+        if name != "file" and (value := getattr(vehicle, name)) is not None
+    }
+    return scenario.model_copy(update={"vehicle": scenario.vehicle.model_copy(update=numbers)})
+
+
+def build_plant(scenario: Scenario, vehicle: Vehicle) -> Plant:
+    """The simulated vehicle."""
+    return Plant(vehicle, timestep=scenario.plant.timestep, limit_speeds=scenario.plant.limit_speeds)
+
+
+def build_initial_state(scenario: Scenario) -> Array:
+    """(12,) state at t = 0."""
+    x, y, z = scenario.initial.position
+    roll, pitch, yaw = np.radians(scenario.initial.euler)
+    return make_state(position=(x, y, z), euler=(roll, pitch, yaw))
+
+
+def build_reference(scenario: Scenario, samples: int) -> Array:
+    """(samples, 4) filtered reference x, y, z [m], yaw [rad] at t_k = k tau_s.  Eqs. (30)-(31)."""
+    spec, period = scenario.reference, scenario.control_period
+    t = np.arange(samples) * period
+    x, y, z = scenario.initial.position
+
+    def channel(windows: list[WindowSpec], elsewhere: float, scale: float = 1.0) -> Array:
+        held = [Window(start=window.start, stop=window.stop, value=scale * window.value) for window in windows]
+        raw = steps(t, held, elsewhere)
+        return smooth(raw, initial=elsewhere, response_time=spec.response_time, period=period)
+
+    yaw = channel(spec.yaw, 0.0, math.radians(1.0))
+    return np.stack([channel(spec.x, x), channel(spec.y, y), channel(spec.z, z), yaw], axis=1)
+
+
+def build_problem(scenario: Scenario, vehicle: Vehicle) -> Problem:
+    """The controller's optimisation."""
+    spec = scenario.controller
+    regulated = [name for name in STATE_NAMES if name in spec.output_weights]
+    objective = Objective(
+        C_r=_selection(regulated),
+        Q_y=np.diag([spec.output_weights[name] for name in regulated]),
+        Q_u=np.diag(np.broadcast_to(np.asarray(spec.input_weights.speed, float), N_ROTORS)),
+    )
+    bounds = _build_bounds(spec) if isinstance(spec, ConstrainedSpec) else None
+    model = hover_model(vehicle, scenario.control_period)
+    return Problem(model=model, horizon=spec.horizon, objective=objective, bounds=bounds)
+
+
+def build_controller(scenario: Scenario, vehicle: Vehicle) -> Controller:
+    """The controller, set up and ready to be flown."""
+    problem = build_problem(scenario, vehicle)
+    if isinstance(scenario.controller, ConstrainedSpec):
+        return ConstrainedMPC(problem, QPSolver(scenario.controller.solver, problem))
+    return UnconstrainedMPC(problem)
+
+
+def build_limits(scenario: Scenario) -> tuple[Limit, ...]:
+    """What the flight is audited against."""
+
+    def or_infinite(value: float | None, sign: float) -> float:
+        return sign * math.inf if value is None else value
+
+    return tuple(
+        Limit(
+            name=spec.name,
+            signal=spec.signal,
+            lower=or_infinite(spec.lower, -1.0),
+            upper=or_infinite(spec.upper, 1.0),
+            tolerance=spec.tolerance,
+            tolerance_sampled=spec.tolerance_sampled,
+            required=spec.required,
+            start=spec.start,
+            stop=or_infinite(spec.stop, 1.0),
+        )
+        for spec in scenario.constraints
+    )
+
+
+def _selection(names: list[str]) -> Array:
+    """Rows of the identity that pick states by name."""
+    return np.eye(N_STATES)[[INDEX[name] for name in names]]
+
+
+def _build_bounds(spec: ConstrainedSpec) -> Bounds:
+    constrained = [name for name in STATE_NAMES if name in spec.output_bounds]
+    scale = np.array([math.radians(1.0) if name in ANGLES else 1.0 for name in constrained])
+    pairs = np.array([spec.output_bounds[name] for name in constrained], float).reshape(-1, 2)
+    lower_speed, upper_speed = spec.input_bounds.speed
+    lower_slew, upper_slew = spec.input_bounds.slew
+    return Bounds(
+        C_c=_selection(constrained),
+        y_min=scale * pairs[:, 0],
+        y_max=scale * pairs[:, 1],
+        delta_min=np.full(N_ROTORS, lower_slew),
+        delta_max=np.full(N_ROTORS, upper_slew),
+        u_min=np.full(N_ROTORS, lower_speed),
+        u_max=np.full(N_ROTORS, upper_speed),
+    )

@@ -1,0 +1,100 @@
+"""The `quadsim` command: parses the line, runs one command, turns errors into messages and exit statuses.
+
+Exit status: 0 done; 1 a required constraint is violated, or the flight was aborted or interrupted; 2 the input was
+wrong.  Nothing heavy is imported before a command runs, so that `quadsim --help` answers at once.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+
+from quadsim import __version__
+from quadsim.errors import QuadsimError
+
+EXIT_DONE, EXIT_FAILED, EXIT_WRONG_INPUT = 0, 1, 2
+
+
+def make_parser() -> argparse.ArgumentParser:
+    """The command line's grammar."""
+    parser = argparse.ArgumentParser(
+        prog="quadsim",
+        description="Fly model predictive controllers of quadrotors in MuJoCo; record, film and audit every flight.",
+        epilog="exit status: 0 done; 1 a required constraint is violated or the flight was aborted; 2 wrong input",
+    )
+    parser.add_argument("--version", action="version", version=f"quadsim {__version__}")
+    commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
+
+    listing = commands.add_parser("list", help="scenarios, vehicles, controllers and solvers, one line each")
+    listing.add_argument("--json", action="store_true", help="as JSON on stdout")
+
+    run = commands.add_parser("run", help="fly one scenario and write its run directory")
+    _add_scenario(run)
+    run.add_argument("--out", metavar="DIR", help="run directory (default: runs/SCENARIO)")
+    _add_settings(run)
+    for product in ("video", "recording", "figures"):
+        run.add_argument(f"--{product}", action=argparse.BooleanOptionalAction, default=True, help=f"make the {product}")
+    run.add_argument("--json", action="store_true", help="print the summary alone, as JSON on stdout")
+
+    check = commands.add_parser("check", help="audit a scenario (flown first) or a finished run; exit 1 if it fails")
+    check.add_argument("target", metavar="SCENARIO_OR_RUN", help="library name, TOML file, or run directory")
+    _add_settings(check)
+    check.add_argument("--junit", metavar="FILE", help="also write the verdicts as JUnit XML")
+    check.add_argument("--json", action="store_true", help="print the summary alone, as JSON on stdout")
+
+    compare = commands.add_parser("compare", help="flights side by side: table, figures, HTML page")
+    compare.add_argument("targets", metavar="RUN_OR_SCENARIO", nargs="+", help="run directories, or scenarios to fly")
+    compare.add_argument("--out", metavar="DIR", required=True, help="directory of the page")
+    compare.add_argument("--markdown", action="store_true", help="print the table as Markdown")
+
+    video = commands.add_parser("video", help="film a finished run")
+    video.add_argument("run", metavar="RUN", help="run directory")
+    video.add_argument("--out", metavar="FILE", help="MP4 or GIF file (default: RUN/flight.mp4)")
+    video.add_argument("--workers", type=int, metavar="N", help="rendering processes (default: one per core)")
+
+    view = commands.add_parser("view", help="open a run's recording in the rerun viewer")
+    view.add_argument("run", metavar="RUN", help="run directory or .rrd file")
+    view.add_argument("--web", action="store_true", help="serve the viewer to a browser instead")
+
+    doctor = commands.add_parser("doctor", help="what this machine can do")
+    doctor.add_argument("--json", action="store_true", help="as JSON on stdout")
+    return parser
+
+
+def _add_scenario(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("scenario", metavar="SCENARIO", help="library name, or path to a TOML file")
+
+
+def _add_settings(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--set",
+        dest="settings",
+        metavar="KEY=VALUE",
+        action="append",
+        default=[],
+        help="replace a field of the scenario, e.g. --set controller.horizon=30; may be repeated",
+    )
+    parser.add_argument("--seed", type=int, metavar="N", help="replace the scenario's seed")
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command line; returns the exit status."""
+    options = make_parser().parse_args(arguments)
+    try:
+        from scenarios import commands
+
+        return commands.COMMANDS[options.command](options)
+    except QuadsimError as error:
+        print(f"quadsim: {error}", file=sys.stderr)
+        return error.exit_status
+    except KeyboardInterrupt:
+        print("quadsim: interrupted (Ctrl-C); nothing half written was left behind", file=sys.stderr)
+        return EXIT_FAILED
+    except BrokenPipeError:
+        sys.stderr.close()  # the reader of our output went away, e.g. `quadsim list | head`
+        return EXIT_DONE
+
+
+if __name__ == "__main__":
+    sys.exit(main())

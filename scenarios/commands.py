@@ -1,0 +1,172 @@
+"""What each command of `quadsim` does."""
+
+from __future__ import annotations
+
+import json
+from argparse import Namespace
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Final
+
+from mpc.solvers import SOLVERS
+from quadsim import rundir
+from quadsim.assets import vehicle_names, vehicle_path
+from quadsim.errors import FileError, InputError, OutputError, ParameterError
+from quadsim.vehicle import load_vehicle
+from scenarios import console, runner
+from scenarios.build import CONTROLLERS
+from scenarios.cli import EXIT_DONE, EXIT_FAILED
+from scenarios.junit import write_junit
+from scenarios.runner import Outputs
+from scenarios.spec import Scenario, load_scenario, scenario_names
+
+
+def list_everything(options: Namespace) -> int:
+    """`quadsim list`."""
+    sections = {
+        "scenarios": {name: load_scenario(name).description for name in scenario_names()},
+        "vehicles": {name: load_vehicle(vehicle_path(name)).description for name in vehicle_names()},
+        "controllers": dict(CONTROLLERS),
+        "solvers": {name: entry.description for name, entry in SOLVERS.items()},
+    }
+    if options.json:
+        print(json.dumps(sections, indent=2))
+    else:
+        console.print_listing(sections)
+    return EXIT_DONE
+
+
+def run(options: Namespace) -> int:
+    """`quadsim run`."""
+    scenario = _load(options.scenario, options)
+    target = Path(options.out) if options.out else Path("runs") / scenario.name
+    outputs = Outputs(video=options.video, recording=options.recording, figures=options.figures)
+    with console.progress_bars(enabled=not options.json) as progress:
+        flight = runner.run(scenario, target, outputs, progress)
+    _print_summary(rundir.read_summary(target), options, where=str(target))
+    return EXIT_DONE if flight.satisfied else EXIT_FAILED
+
+
+def check(options: Namespace) -> int:
+    """`quadsim check`."""
+    if Path(options.target).is_dir():
+        if options.settings or options.seed is not None:
+            raise ParameterError("command line", "--set", options.settings, "absent when a finished run is checked")
+        summary = _read_intact_summary(Path(options.target))
+    else:
+        scenario = _load(options.target, options)
+        with console.progress_bars(enabled=not options.json) as progress:
+            summary = runner.summarise(runner.fly_scenario(scenario, progress))
+    if options.junit:
+        write_junit(summary, Path(options.junit))
+    _print_summary(summary, options)
+    return EXIT_DONE if summary["satisfied"] else EXIT_FAILED
+
+
+def compare(options: Namespace) -> int:
+    """`quadsim compare`."""
+    from quadsim.comparison import comparison_rows, to_markdown
+    from quadsim.report import write_comparison
+
+    target = Path(options.out)
+    directories = [Path(name) if Path(name).is_dir() else _fly_for_comparison(name, target) for name in options.targets]
+    runs = [rundir.load_run(directory) for directory in directories]
+    page = write_comparison(runs, target)
+    rows = comparison_rows(runs)
+    if options.markdown:
+        print(to_markdown(rows, [item.name for item in runs]))
+    else:
+        console.print_comparison(rows, [item.name for item in runs], str(page))
+    return EXIT_DONE
+
+
+def video(options: Namespace) -> int:
+    """`quadsim video`."""
+    from quadsim.video import render_gif, render_video
+
+    directory = Path(options.run)
+    rundir.read_summary(directory)
+    path = Path(options.out) if options.out else directory / rundir.VIDEO_FILE
+    if options.workers is not None and options.workers < 1:
+        raise ParameterError("command line", "--workers", options.workers, "at least 1")
+    if path.suffix not in (".mp4", ".gif"):
+        raise ParameterError("command line", "--out", options.out, "a file ending in .mp4 or .gif")
+    with console.progress_bars(enabled=True) as progress:
+        if path.suffix == ".gif":
+            render_gif(directory, path)
+        else:
+            render_video(
+                directory,
+                path,
+                workers=options.workers,
+                progress=lambda done, total: progress("video", done, total),
+            )
+    if path.parent.resolve() == directory.resolve():
+        rundir.refresh_hashes(directory)
+    print(f"written to {path}")
+    return EXIT_DONE
+
+
+def view(options: Namespace) -> int:
+    """`quadsim view`."""
+    from quadsim.recording import open_viewer
+
+    path = Path(options.run)
+    recording = path / rundir.RECORDING_FILE if path.is_dir() else path
+    if not recording.is_file():
+        raise FileError(recording, "no such recording; run the scenario with --recording")
+    open_viewer(recording, web=options.web)
+    return EXIT_DONE
+
+
+def doctor(options: Namespace) -> int:
+    """`quadsim doctor`."""
+    from scenarios.doctor import examine
+
+    findings = examine()
+    if options.json:
+        print(json.dumps(findings, indent=2))
+    else:
+        console.print_listing(findings)
+    return EXIT_DONE
+
+
+COMMANDS: Final[dict[str, Callable[[Namespace], int]]] = {
+    "list": list_everything,
+    "run": run,
+    "check": check,
+    "compare": compare,
+    "video": video,
+    "view": view,
+    "doctor": doctor,
+}
+
+
+def _load(name: str, options: Namespace) -> Scenario:
+    settings = [*options.settings] if options.seed is None else [*options.settings, f"seed={options.seed}"]
+    if Path(name).is_dir():
+        raise InputError(f"{name} is a directory; give a scenario's name or its TOML file")
+    return load_scenario(name, settings)
+
+
+def _read_intact_summary(directory: Path) -> dict[str, Any]:
+    summary = rundir.read_summary(directory)
+    damaged = rundir.damaged_files(directory, summary)
+    if damaged:
+        raise FileError(directory, f"{', '.join(damaged)} missing or not the files that the summary was made from")
+    return summary
+
+
+def _fly_for_comparison(name: str, target: Path) -> Path:
+    scenario = load_scenario(name)
+    directory = target.parent / f"{target.name}-runs" / scenario.name
+    with console.progress_bars(enabled=True) as progress:
+        runner.run(scenario, directory, Outputs(), progress)
+    return directory
+
+
+def _print_summary(summary: dict[str, Any], options: Namespace, where: str | None = None) -> None:
+    if options.json:
+        print(json.dumps(summary, indent=2))
+    else:
+        console.print_summary(summary, where)

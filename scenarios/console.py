@@ -1,0 +1,166 @@
+"""What the command line prints: tables and progress bars.  Tables go to stdout, progress to stderr."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+from rich.box import SIMPLE_HEAD
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.table import Table
+
+from quadsim.comparison import Row
+from scenarios import runner
+
+
+def print_listing(sections: Mapping[str, Mapping[str, str]]) -> None:
+    """Names with one line each, by section."""
+    console = _console()
+    for title, entries in sections.items():
+        table = Table(title=title, title_justify="left", title_style="bold", box=None, show_header=False, padding=(0, 2))
+        table.add_column(no_wrap=True, style="cyan")
+        table.add_column()
+        for name, line in entries.items():
+            table.add_row(name, line)
+        console.print(table)
+        console.print()
+
+
+def print_summary(summary: Mapping[str, Any], where: str | None) -> None:
+    """A flight's outcome, tracking, audit and solver, from its summary."""
+    console = _console()
+    console.print(f"[bold]{summary['scenario']}[/bold]  {outcome(summary)}  {summary['duration']:.2f} s flown")
+    if summary["tracking"]:
+        console.print(_tracking_table(summary["tracking"]))
+    if summary["constraints"]:
+        console.print(audit_table(summary["constraints"]))
+    if summary["tracking"]:
+        console.print(_controller_line(summary))
+    if where is not None:
+        console.print(f"written to [bold]{where}[/bold]", soft_wrap=True)
+
+
+def outcome(summary: Mapping[str, Any]) -> str:
+    """Completed or aborted with its reason, and the verdict on the required constraints."""
+    if summary["status"] != "completed":
+        return f"[red]aborted[/red]: {summary['reason']}"
+    if summary["satisfied"]:
+        return "[green]completed, every required constraint holds[/green]"
+    return "[red]completed, a required constraint is violated[/red]"
+
+
+def audit_table(constraints: Sequence[Mapping[str, Any]]) -> Table:
+    """Every constraint with its bounds, peaks, margin, tolerances and verdict."""
+    caption = "tolerance: at the samples / at the physics rate"
+    if any(not entry["required"] for entry in constraints):
+        caption += ";  * reported, not required by the scenario"
+    table = _table("audit at the physics rate", caption=caption)
+    table.add_column("constraint", no_wrap=True)
+    for name in ("bounds", "sampled", "plant", "margin", "beyond s", "tolerance"):
+        table.add_column(name, justify="right", no_wrap=True)
+    table.add_column("verdict", no_wrap=True)
+    for entry in constraints:
+        table.add_row(
+            f"{entry['name']} [{entry['unit']}]".replace("[", r"\["),
+            f"{_number(entry['lower'])}..{_number(entry['upper'])}",
+            _number(entry["peak_sampled"]),
+            _number(entry["peak_plant"]),
+            _number(entry["worst_margin"]),
+            _number(entry["time_violated"]),
+            f"{_number(entry['tolerance_sampled'])}/{_number(entry['tolerance'])}",
+            _verdict(entry),
+        )
+    return table
+
+
+def _verdict(entry: Mapping[str, Any]) -> str:
+    if entry["satisfied"]:
+        return "[green]holds[/green]"
+    return "[red]VIOLATED[/red]" if entry["required"] else "[yellow]exceeded*[/yellow]"
+
+
+def _tracking_table(tracking: Mapping[str, Any]) -> Table:
+    table = _table("tracking, real minus filtered reference")
+    table.add_column("")
+    for channel, unit in tracking["unit"].items():
+        table.add_column(rf"{channel} \[{unit}]", justify="right")
+    for name in ("rmse", "max_error", "final_error", "overshoot"):
+        table.add_row(name.replace("_", " "), *(f"{tracking[name][channel]:.4g}" for channel in tracking["unit"]))
+    return table
+
+
+def _controller_line(summary: Mapping[str, Any]) -> str:
+    control, controller = summary["control"], summary["controller"]
+    statuses = ", ".join(f"{count} {status}" for status, count in controller["statuses"].items())
+    times = controller["step_ms"]
+    how = f"{controller['name']} MPC" + (f" by {controller['solver']}" if controller["solver"] else "")
+    return (
+        f"{how}: {statuses}; step p50 {times['p50']:.3f}, p99 {times['p99']:.3f}, max {times['max']:.3f} ms "
+        f"of {controller['deadline_ms']:g} ms\n"
+        f"rotor speeds {control['speed_min']:.2f} .. {control['speed_max']:.2f} rad/s, "
+        f"steps {control['slew_min']:.2f} .. {control['slew_max']:.2f} rad/s per period; "
+        f"simulated in {summary['wall_s']['simulate']:.2f} s"
+    )
+
+
+def print_comparison(rows: Sequence[Row], names: Sequence[str], where: str) -> None:
+    """The comparison's rows side by side."""
+    console = _console()
+    table = _table("comparison")
+    table.add_column("", no_wrap=True)
+    for name in names:
+        table.add_column(name, justify="right")
+    group = ""
+    for row in rows:
+        if row.group != group:
+            group = row.group
+            table.add_section()
+            table.add_row(f"[bold]{group}[/bold]")
+        label = f"{row.label} [{row.unit}]" if row.unit else row.label
+        table.add_row(label.replace("[", r"\["), *row.values)
+    console.print(table)
+    console.print(f"written to [bold]{where}[/bold]", soft_wrap=True)
+
+
+def _number(value: float | None) -> str:
+    return "-" if value is None else f"{value:.4g}".replace("e-0", "e-")
+
+
+def _table(title: str, caption: str | None = None) -> Table:
+    return Table(
+        title=title,
+        title_justify="left",
+        title_style="bold",
+        caption=caption,
+        caption_justify="left",
+        box=SIMPLE_HEAD,
+        padding=(0, 1, 0, 0),
+        pad_edge=False,
+    )
+
+
+def _console() -> Console:
+    """Stdout; wide enough for the tables where it is a file or a pipe."""
+    console = Console(highlight=False)
+    return console if console.is_terminal else Console(highlight=False, width=120)
+
+
+@contextlib.contextmanager
+def progress_bars(*, enabled: bool) -> Iterator[runner.Progress]:
+    """Progress bars on stderr, one per stage; nothing when not enabled or not on a terminal."""
+    console = Console(stderr=True)
+    if not enabled or not console.is_terminal:
+        yield runner.silent
+        return
+    columns = (TextColumn("{task.description:<10}"), BarColumn(), TextColumn("{task.percentage:>3.0f} %"))
+    with Progress(*columns, TimeElapsedColumn(), TimeRemainingColumn(), console=console, transient=True) as bars:
+        tasks: dict[str, TaskID] = {}
+
+        def report(stage: str, done: int, total: int) -> None:
+            if stage not in tasks:
+                tasks[stage] = bars.add_task(stage, total=total)
+            bars.update(tasks[stage], completed=done, total=total)
+
+        yield report

@@ -1,0 +1,61 @@
+"""What the vehicle is asked to do.  Eqs. (30)-(31)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from quadsim.state import Array
+
+
+@dataclass(frozen=True, kw_only=True)
+class Window:
+    """A value held strictly between two instants, as in Eq. (30).
+
+    Attributes:
+        start: [s], excluded; at the instant itself the reference is elsewhere's value.
+        stop: [s], excluded.
+        value: [m], or [rad] for yaw.
+    """
+
+    start: float
+    stop: float
+    value: float
+
+
+def steps(t: Array, windows: Sequence[Window], elsewhere: float) -> Array:
+    """Piecewise constant reference (M,) at times t (M,): each window's value inside it, `elsewhere` outside all.
+
+    Eq. (30) prints strict inequalities on both sides of each switching instant; the instant itself is taken as
+    outside the window.
+    """
+    values = np.full(t.shape, elsewhere)
+    at = np.round(t, 9)
+    for window in windows:
+        values[(at > window.start) & (at < window.stop)] = window.value
+    return values
+
+
+def smooth(values: Array, *, initial: float, response_time: float, period: float) -> Array:
+    """First-order filter F(x(k)) = x(k) + exp(-3 tau_s / tau_r) (F(x(k-1)) - x(k)).  Eq. (31).
+
+    The paper prints x(k-1) on the right; a first-order lag needs the previous *filtered* value there.
+
+    Args:
+        values: (M,) the unfiltered reference.
+        initial: filtered value before the first sample; the paper's flights start from the initial position.
+        response_time: tau_r [s], 95 % of a step; 0 for no filter.
+        period: tau_s [s].
+    """
+    if response_time == 0.0:
+        return values.copy()
+    keep = math.exp(-3.0 * period / response_time)
+    filtered = np.empty_like(values)
+    last = initial
+    for k, value in enumerate(values):
+        last = value + keep * (last - value)
+        filtered[k] = last
+    return filtered

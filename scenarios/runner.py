@@ -1,0 +1,216 @@
+"""The composition root: fly a scenario, audit it, write everything a person opens."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import os
+import platform
+import time as clock
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+from threadpoolctl import threadpool_limits
+
+from quadsim import __version__, metrics, rundir
+from quadsim.audit import Finding, audit
+from quadsim.flightlog import FlightLog, write_log
+from quadsim.loop import fly
+from quadsim.vehicle import Vehicle
+from scenarios.build import (
+    build_controller,
+    build_initial_state,
+    build_limits,
+    build_plant,
+    build_reference,
+    build_vehicle,
+    resolve,
+)
+from scenarios.spec import Scenario
+
+PACKAGES: Final = ("mujoco", "numpy", "scipy", "piqp", "rerun-sdk", "imageio", "pyarrow", "matplotlib")
+
+Progress = Callable[[str, int, int], None]
+"""Told (what, done, total) as long work goes on."""
+
+
+def silent(stage: str, done: int, total: int) -> None:
+    """Report progress to nobody."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Outputs:
+    """Which files a run makes besides its summary, scenario and Parquet tables."""
+
+    video: bool = True
+    recording: bool = True
+    figures: bool = True
+
+
+@dataclass(frozen=True, kw_only=True)
+class Flight:
+    """A flown scenario, in memory.
+
+    Attributes:
+        scenario: resolved, with every vehicle number in it.
+        vehicle: what was flown.
+        log: the flight, plant rows at the physics rate.
+        findings: the audit, one per constraint of the scenario.
+        simulate_s: wall time of the closed loop alone [s].
+    """
+
+    scenario: Scenario
+    vehicle: Vehicle
+    log: FlightLog
+    findings: tuple[Finding, ...]
+    simulate_s: float
+
+    @property
+    def satisfied(self) -> bool:
+        """Whether the flight was completed and every required constraint held."""
+        return self.log.reason is None and all(
+            finding.satisfied for finding in self.findings if finding.limit.required
+        )
+
+
+def fly_scenario(scenario: Scenario, progress: Progress = silent) -> Flight:
+    """Fly a scenario and audit it, writing nothing.
+
+    Linear algebra is held to one thread: the matrices are small, and results do not depend on the core count.
+    """
+    vehicle = build_vehicle(scenario)
+    with threadpool_limits(limits=1):
+        controller = build_controller(scenario, vehicle)
+        with build_plant(scenario, vehicle) as plant:
+            started = clock.perf_counter()
+            log = fly(
+                plant,
+                controller,
+                build_reference(scenario, scenario.periods + controller.horizon),
+                initial_state=build_initial_state(scenario),
+                initial_speeds=plant.hover_speeds,
+                periods=scenario.periods,
+                steps_per_period=scenario.steps_per_period,
+                progress=lambda done: progress("flight", done, scenario.periods),
+            )
+            simulate_s = clock.perf_counter() - started
+    return Flight(
+        scenario=resolve(scenario, vehicle),
+        vehicle=vehicle,
+        log=log,
+        findings=audit(log, build_limits(scenario)),
+        simulate_s=simulate_s,
+    )
+
+
+def run(scenario: Scenario, target: Path, outputs: Outputs, progress: Progress = silent) -> Flight:
+    """Fly a scenario and write its run directory, which appears complete or not at all.
+
+    A flight that its pilot interrupted is written without its video.
+
+    Raises:
+        RenderingUnavailableError: a video is wanted and cannot be made; nothing was flown.
+        OutputError: the directory cannot be written; nothing is left there.
+    """
+    started = clock.perf_counter()
+    if outputs.video:
+        from quadsim.video import rendering_backend
+
+        rendering_backend()
+    with rundir.writing(target) as directory:
+        flight = fly_scenario(scenario, progress)
+        write_flight(flight, directory)
+        _write_products(flight, directory, outputs, progress)
+        summary = summarise(flight)
+        summary["wall_s"]["total"] = clock.perf_counter() - started
+        summary["files"] = rundir.file_hashes(directory)
+        rundir.write_json(directory / rundir.SUMMARY_FILE, summary)
+    return flight
+
+
+def write_flight(flight: Flight, directory: Path) -> None:
+    """Write the scenario, the Parquet tables and a summary, which is all that pictures are made from."""
+    scenario = flight.scenario
+    (directory / rundir.SCENARIO_FILE).write_text(scenario.to_toml(), encoding="utf-8")
+    metadata = {"scenario": scenario.name, "seed": str(scenario.seed)}
+    write_log(directory, flight.log, plant_stride=scenario.plant_stride, metadata=metadata)
+    rundir.write_json(directory / rundir.SUMMARY_FILE, summarise(flight))
+
+
+def summarise(flight: Flight) -> dict[str, Any]:
+    """`summary.json` of a flight, but for the hashes of its files and the total wall time."""
+    scenario, log = flight.scenario, flight.log
+    numbers = metrics.flight_numbers(log, deadline_ms=1e3 * scenario.control_period)
+    solver = getattr(scenario.controller, "solver", "")
+    return {
+        "scenario": scenario.name,
+        "description": scenario.description,
+        "status": log.status,
+        "reason": log.reason,
+        "satisfied": flight.satisfied,
+        "duration": log.control.t.size * scenario.control_period,
+        "seed": scenario.seed,
+        "tracking": numbers["tracking"],
+        "constraints": [rundir.limit_to_json(finding) for finding in flight.findings],
+        "control": numbers["control"],
+        "controller": {
+            "name": scenario.controller.type,
+            "solver": solver,
+            "horizon": scenario.controller.horizon,
+            **numbers["controller"],
+        },
+        "vehicle": rundir.vehicle_to_json(flight.vehicle),
+        "wall_s": {"simulate": flight.simulate_s, "total": flight.simulate_s},
+        "versions": versions(),
+        "machine": machine(),
+        "files": {},
+    }
+
+
+def versions() -> dict[str, str]:
+    """Versions of what the numbers depend on."""
+    packages = {name: importlib.metadata.version(name) for name in PACKAGES}
+    return {"quadsim": __version__, "python": platform.python_version(), **packages}
+
+
+def machine() -> dict[str, Any]:
+    """What a reader of timings has to know."""
+    return {"system": platform.platform(), "processor": processor_name(), "cores": os.cpu_count()}
+
+
+def processor_name() -> str:
+    """The processor's model, as far as the system tells."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+    except OSError:
+        return platform.processor() or platform.machine()
+    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    return names[0] if names else platform.machine()
+
+
+def _write_products(flight: Flight, directory: Path, outputs: Outputs, progress: Progress) -> None:
+    """Recording, figures and video, each made from the files that are already there."""
+    run = rundir.load_run(directory)
+    if outputs.recording:
+        from quadsim.recording import write_recording
+
+        progress("recording", 0, 1)
+        write_recording(run, directory / rundir.RECORDING_FILE)
+        progress("recording", 1, 1)
+    if not run.log.control.t.size:
+        return
+    if outputs.figures:
+        from quadsim.figures import write_figures
+
+        progress("figures", 0, 1)
+        write_figures(run, directory / rundir.FIGURES_DIR)
+        progress("figures", 1, 1)
+    if outputs.video and not flight.log.interrupted:
+        from quadsim.video import render_video
+
+        render_video(
+            directory,
+            directory / rundir.VIDEO_FILE,
+            progress=lambda done, total: progress("video", done, total),
+        )
