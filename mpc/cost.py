@@ -38,7 +38,7 @@ class Cost:
 
 def cost(maps: Prediction, objective: Objective) -> Cost:
     """Build H and F1 to F4 from the prediction map and the weights."""
-    n_r, n = objective.C_r.shape
+    n = objective.C_r.shape[1]
     nu = objective.Q_u.shape[0]
     horizon = maps.Phi.shape[0] // n
     outputs_of_inputs = _apply_blockwise(objective.C_r, maps.Psi, horizon)  # C_r Psi_i, stacked

@@ -32,7 +32,7 @@ class Objective:
             raise ParameterError("controller", "C_r", self.C_r.shape, f"of shape ({self.Q_y.shape[0]}, n)")
 
     def desired(self, reference: Array) -> Array:
-        """The desired outputs y_r^d (..., n_r) of a reference (..., 4) for x, y, z, yaw; other states are wanted at 0."""
+        """Desired outputs y_r^d (..., n_r) of a reference (..., 4) for x, y, z, yaw; other states are wanted at 0."""
         return reference @ self.C_r[:, REFERENCE_STATES].T
 
 

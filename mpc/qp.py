@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Protocol
+from typing import Protocol, TypeAlias
 
 import numpy as np
 from scipy.sparse import csc_matrix
@@ -11,7 +11,7 @@ from scipy.sparse import csc_matrix
 from mpc.problem import Problem
 from quadsim.state import Array
 
-Matrix = Array | csc_matrix
+Matrix: TypeAlias = Array | csc_matrix
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -76,14 +76,12 @@ class Solution:
 
 
 class Formulation(Protocol):
-    """One way to write an MPC's optimisation as a QP.
-
-    Attributes:
-        qp: the matrices, which never change, with vectors for a zero state.
-    """
+    """One way to write an MPC's optimisation as a QP whose matrices never change."""
 
     @property
-    def qp(self) -> QP: ...
+    def qp(self) -> QP:
+        """The matrices, with vectors for a zero state."""
+        ...
 
     def vectors(self, state: Array, desired: Array, u_before: Array) -> Vectors:
         """The QP's vectors for xi(k) (n,), y_d (N, n_r) and u(k-1) (nu,)."""
@@ -109,7 +107,9 @@ class Backend(Protocol):
 class FormulationBuilder(Protocol):
     """Builds a formulation for a constrained problem."""
 
-    def __call__(self, problem: Problem) -> Formulation: ...
+    def __call__(self, problem: Problem) -> Formulation:
+        """Build it."""
+        ...
 
 
 @dataclass(frozen=True, kw_only=True)

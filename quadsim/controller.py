@@ -44,22 +44,22 @@ class Command:
 
 
 class Controller(Protocol):
-    """A feedback law run once per control period.
-
-    Attributes:
-        name: short name of the law.
-        solver: name of the back end; empty for a closed form.
-        horizon: N, how many samples of preview `step` is given.
-    """
+    """A feedback law run once per control period."""
 
     @property
-    def name(self) -> str: ...
+    def name(self) -> str:
+        """Short name of the law."""
+        ...
 
     @property
-    def solver(self) -> str: ...
+    def solver(self) -> str:
+        """Name of the QP solver; empty for a closed form."""
+        ...
 
     @property
-    def horizon(self) -> int: ...
+    def horizon(self) -> int:
+        """N, how many samples of preview `step` is given."""
+        ...
 
     def reset(self, speeds: Array) -> None:
         """Forget the past: the next step is the first, after `speeds` u(-1) (4,) [rad/s]."""

@@ -164,12 +164,12 @@ def _timing_table(log: TimingLog, metadata: Mapping[str, str]) -> pa.Table:
     return _table([("t", "s", log.t), ("solve_ms", "ms", log.solve_ms), ("step_ms", "ms", log.step_ms)], metadata)
 
 
-def _horizon_table(
-    t: Array, predicted: np.ndarray[Any, np.dtype[np.float32]], metadata: Mapping[str, str]
-) -> pa.Table:
+def _horizon_table(t: Array, predicted: np.ndarray[Any, np.dtype[np.float32]], metadata: Mapping[str, str]) -> pa.Table:
     horizon = predicted.shape[1]
     lists = (pa.FixedSizeListArray.from_arrays(predicted[:, :, i].ravel(), horizon) for i in range(3))
-    return _table([("t", "s", t), *((f"predicted_{axis}", "m", a) for axis, a in zip("xyz", lists, strict=True))], metadata)
+    return _table(
+        [("t", "s", t), *((f"predicted_{axis}", "m", a) for axis, a in zip("xyz", lists, strict=True))], metadata
+    )
 
 
 def write_log(directory: Path, log: FlightLog, *, plant_stride: int, metadata: Mapping[str, str]) -> None:
@@ -248,4 +248,5 @@ def _read_predicted(directory: Path) -> np.ndarray[Any, np.dtype[np.float32]] | 
         return None
     table = _read(path)
     columns = [table.column(f"predicted_{axis}").combine_chunks() for axis in "xyz"]
-    return np.stack([column.flatten().to_numpy().reshape(len(column), -1) for column in columns], axis=-1)
+    shape = (table.num_rows, columns[0].type.list_size)  # also right for a flight of no period
+    return np.stack([column.flatten().to_numpy().reshape(shape) for column in columns], axis=-1)

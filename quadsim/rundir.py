@@ -10,7 +10,7 @@ import os
 import shutil
 import tempfile
 from collections.abc import Iterator, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any, Final
 
@@ -87,10 +87,9 @@ def limit_to_json(finding: Finding) -> dict[str, Any]:
 
 def limit_from_json(entry: Mapping[str, Any]) -> Limit:
     """The limit that `limit_to_json` wrote."""
-    infinite = {"lower": -float("inf"), "upper": float("inf"), "stop": float("inf")}
-    keys = ("name", "signal", "tolerance", "tolerance_sampled", "required", "start")
-    bounds = {key: infinite[key] if entry[key] is None else entry[key] for key in infinite}
-    return Limit(**{key: entry[key] for key in keys}, **bounds)
+    absent = {"lower": -math.inf, "upper": math.inf, "stop": math.inf}
+    values: dict[str, Any] = {field.name: entry[field.name] for field in fields(Limit)}
+    return Limit(**values | {name: bound for name, bound in absent.items() if values[name] is None})
 
 
 def write_json(path: Path, data: Mapping[str, Any]) -> None:
@@ -211,10 +210,10 @@ def _replace(temporary: Path, target: Path) -> None:
         temporary.rename(target)
         return
     old = temporary.with_suffix(".old")
-    os.rename(target, old)
+    target.rename(old)
     try:
         temporary.rename(target)
     except OSError:
-        os.rename(old, target)
+        old.rename(target)
         raise
     shutil.rmtree(old, ignore_errors=True)

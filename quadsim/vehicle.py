@@ -94,7 +94,7 @@ class Vehicle:
 
     @property
     def drag_coefficient(self) -> float:
-        """d [N m s^2/rad^2]."""
+        """Drag coefficient d [N m s^2/rad^2]."""
         return self.drag_to_thrust * self.thrust_coefficient
 
     @property

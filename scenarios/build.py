@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any, Final
 
 import numpy as np
@@ -57,7 +58,7 @@ def build_initial_state(scenario: Scenario) -> Array:
 def build_reference(scenario: Scenario, samples: int) -> Array:
     """(samples, 4) filtered reference x, y, z [m], yaw [rad] at t_k = k tau_s.  Eqs. (30)-(31)."""
     spec, period = scenario.reference, scenario.control_period
-    t = np.arange(samples) * period
+    t = np.arange(samples, dtype=np.float64) * period
     x, y, z = scenario.initial.position
 
     def channel(windows: list[WindowSpec], elsewhere: float, scale: float = 1.0) -> Array:
@@ -113,7 +114,7 @@ def build_limits(scenario: Scenario) -> tuple[Limit, ...]:
     )
 
 
-def _selection(names: list[str]) -> Array:
+def _selection(names: Sequence[str]) -> Array:
     """Rows of the identity that pick states by name."""
     return np.eye(N_STATES)[[INDEX[name] for name in names]]
 

@@ -34,7 +34,9 @@ def make_parser() -> argparse.ArgumentParser:
     run.add_argument("--out", metavar="DIR", help="run directory (default: runs/SCENARIO)")
     _add_settings(run)
     for product in ("video", "recording", "figures"):
-        run.add_argument(f"--{product}", action=argparse.BooleanOptionalAction, default=True, help=f"make the {product}")
+        run.add_argument(
+            f"--{product}", action=argparse.BooleanOptionalAction, default=True, help=f"make the {product}"
+        )
     run.add_argument("--json", action="store_true", help="print the summary alone, as JSON on stdout")
 
     check = commands.add_parser("check", help="audit a scenario (flown first) or a finished run; exit 1 if it fails")

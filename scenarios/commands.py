@@ -11,7 +11,7 @@ from typing import Any, Final
 from mpc.solvers import SOLVERS
 from quadsim import rundir
 from quadsim.assets import vehicle_names, vehicle_path
-from quadsim.errors import FileError, InputError, OutputError, ParameterError
+from quadsim.errors import FileError, InputError, ParameterError
 from quadsim.vehicle import load_vehicle
 from scenarios import console, runner
 from scenarios.build import CONTROLLERS
@@ -65,8 +65,9 @@ def check(options: Namespace) -> int:
 
 def compare(options: Namespace) -> int:
     """`quadsim compare`."""
-    from quadsim.comparison import comparison_rows, to_markdown
     from quadsim.report import write_comparison
+
+    from quadsim.comparison import comparison_rows, to_markdown
 
     target = Path(options.out)
     directories = [Path(name) if Path(name).is_dir() else _fly_for_comparison(name, target) for name in options.targets]

@@ -19,7 +19,9 @@ def print_listing(sections: Mapping[str, Mapping[str, str]]) -> None:
     """Names with one line each, by section."""
     console = _console()
     for title, entries in sections.items():
-        table = Table(title=title, title_justify="left", title_style="bold", box=None, show_header=False, padding=(0, 2))
+        table = Table(
+            title=title, title_justify="left", title_style="bold", box=None, show_header=False, padding=(0, 2)
+        )
         table.add_column(no_wrap=True, style="cyan")
         table.add_column()
         for name, line in entries.items():

@@ -69,9 +69,7 @@ class Flight:
     @property
     def satisfied(self) -> bool:
         """Whether the flight was completed and every required constraint held."""
-        return self.log.reason is None and all(
-            finding.satisfied for finding in self.findings if finding.limit.required
-        )
+        return self.log.reason is None and all(finding.satisfied for finding in self.findings if finding.limit.required)
 
 
 def fly_scenario(scenario: Scenario, progress: Progress = silent) -> Flight:

@@ -201,7 +201,9 @@ class ConstraintSpec(_Spec):
         if self.lower is not None and self.upper is not None and self.lower >= self.upper:
             raise ValueError(f"lower must be below upper = {self.upper}; got {self.lower}")
         if self.tolerance_sampled > self.tolerance:
-            raise ValueError(f"tolerance_sampled must be at most tolerance = {self.tolerance}; got {self.tolerance_sampled}")
+            raise ValueError(
+                f"tolerance_sampled must be at most tolerance = {self.tolerance}; got {self.tolerance_sampled}"
+            )
         if self.stop is not None and self.stop < self.start:
             raise ValueError(f"stop must be at least start = {self.start}; got {self.stop}")
         return self

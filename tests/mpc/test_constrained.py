@@ -1,0 +1,104 @@
+"""Eqs. (27)-(29): the constrained controller, and what it does when its solver fails."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from support import paper_problem, paper_reference
+
+from mpc.constrained import ConstrainedMPC
+from mpc.solvers import Answer, QPSolver
+from quadsim.controller import Command
+from quadsim.errors import PlanExhaustedError
+from quadsim.state import Array
+
+STATE = np.zeros(12)
+STATE[10] = np.pi / 6
+
+
+class FaultySolver(QPSolver):
+    """The real solver, whose answers are spoilt in chosen calls."""
+
+    def __init__(self, faults: dict[int, str], horizon: int = 50) -> None:
+        self.problem = paper_problem("paper-constrained", f"controller.horizon={horizon}")
+        super().__init__("piqp-multistage", self.problem)
+        self.faults, self.calls = faults, 0
+
+    def solve(self, state: Array, desired: Array, u_before: Array) -> Answer:
+        answer = super().solve(state, desired, u_before)
+        fault = self.faults.get(self.calls)
+        self.calls += 1
+        if fault == "not_finite":
+            return replace(answer, plan=answer.plan * np.nan)
+        if fault == "out_of_bounds":
+            return replace(answer, plan=answer.plan + 100.0)
+        if fault is not None:
+            return replace(answer, solution=replace(answer.solution, status=fault), plan=answer.plan * 0.0)
+        return answer
+
+
+def fly(faults: dict[int, str], periods: int, horizon: int = 50) -> list[Command]:
+    solver = FaultySolver(faults, horizon)
+    controller = ConstrainedMPC(solver.problem, solver)
+    controller.reset(solver.problem.model.u_bar)
+    reference = paper_reference(periods + horizon + 1)
+    return [controller.step(0.05 * k, STATE, reference[k + 1 : k + 1 + horizon]) for k in range(periods)]
+
+
+def test_commands_respect_their_hard_bounds_exactly() -> None:
+    commands = fly({}, 12)
+    speeds = np.array([command.speeds for command in commands])
+    slews = np.diff(speeds, axis=0, prepend=paper_problem().model.u_bar[None])
+    assert speeds.min() >= 0.0
+    assert speeds.max() <= 250.0
+    assert slews.min() >= -10.0 - 1e-12
+    assert slews.max() <= 5.0 + 1e-12
+    assert slews.max() == pytest.approx(5.0)  # the climb wants more
+    assert {command.status for command in commands} == {"solved"}
+    assert commands[0].active > 0
+
+
+@pytest.mark.parametrize("fault", ["primal_infeasible", "max_iterations", "numerics", "not_finite", "out_of_bounds"])
+def test_anything_but_a_good_answer_holds_the_shifted_plan(fault: str) -> None:
+    commands = fly({3: fault, 4: fault}, 6)
+    last_good = commands[2].plan
+    np.testing.assert_allclose(commands[3].speeds, last_good[1], atol=1e-6)
+    np.testing.assert_allclose(commands[4].speeds, last_good[2], atol=1e-6)
+    np.testing.assert_allclose(commands[4].plan[:48], last_good[2:], atol=1e-12)
+    assert [command.fallback for command in commands] == [0, 0, 0, 1, 1, 0]
+    assert [command.status for command in commands] == ["solved"] * 3 + [fault] * 2 + ["solved"]
+    assert commands[5].fallback == 0  # recovery is automatic
+
+
+def test_an_exhausted_plan_ends_the_flight_with_its_reason() -> None:
+    horizon = 5
+    faults = dict.fromkeys(range(1, 100), "numerics")
+    assert len(fly(faults, horizon, horizon)) == horizon  # one solved, four held
+    with pytest.raises(PlanExhaustedError, match=r"at t = 0\.250 s: the solver answered 'numerics' after holding .* 4"):
+        fly(faults, horizon + 1, horizon)
+
+
+def test_a_failure_in_the_first_period_has_no_plan_to_hold() -> None:
+    with pytest.raises(PlanExhaustedError, match="with no plan to hold"):
+        fly({0: "primal_infeasible"}, 1)
+
+
+def test_reset_forgets_the_plan() -> None:
+    solver = FaultySolver({1: "numerics"})
+    controller = ConstrainedMPC(solver.problem, solver)
+    reference = paper_reference(60)[1:51]
+    controller.reset(solver.problem.model.u_bar)
+    controller.step(0.0, STATE, reference)
+    controller.reset(solver.problem.model.u_bar)
+    with pytest.raises(PlanExhaustedError):
+        controller.step(0.0, STATE, reference)
+
+
+def test_back_ends_do_not_accept_a_measured_nan() -> None:
+    solver = FaultySolver({})
+    controller = ConstrainedMPC(solver.problem, solver)
+    controller.reset(solver.problem.model.u_bar)
+    with pytest.raises(PlanExhaustedError):
+        controller.step(0.0, STATE * np.nan, paper_reference(60)[1:51])

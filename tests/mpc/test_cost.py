@@ -1,0 +1,67 @@
+"""Eqs. (5)-(10): the condensed cost against the sum it condenses."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from support import paper_problem, random_problem
+
+from mpc.cost import cost
+from mpc.prediction import prediction, rollout
+from mpc.problem import Problem
+from quadsim.state import Array, make_state
+
+
+def eq_5(problem: Problem, state: Array, plan: Array, desired: Array) -> float:
+    """The cost as printed, summed step by step."""
+    objective, u_bar = problem.objective, problem.model.u_bar
+    total = 0.0
+    for xi, u, y_d in zip(rollout(problem.model, state[None], plan[None])[0], plan, desired, strict=True):
+        error, effort = objective.C_r @ xi - y_d, u - u_bar
+        total += error @ objective.Q_y @ error + effort @ objective.Q_u @ effort
+    return float(total)
+
+
+@pytest.mark.parametrize("horizon", [1, 3, 12])
+def test_condensed_cost_differs_from_eq_5_by_a_constant(horizon: int) -> None:
+    rng = np.random.default_rng(horizon)
+    problem = random_problem(rng, horizon=horizon)
+    terms = cost(prediction(problem.model, horizon), problem.objective)
+    state, desired = rng.normal(size=3), rng.normal(size=(horizon, 3))
+    gradient = terms.gradient(state, desired, problem.model.u_bar)
+    differences = []
+    for _ in range(5):
+        plan = rng.normal(size=(horizon, 2)) * 3.0
+        u = plan.ravel()
+        differences.append(eq_5(problem, state, plan, desired) - (0.5 * u @ terms.H @ u + gradient @ u))
+    np.testing.assert_allclose(differences, differences[0], rtol=1e-9)
+
+
+def test_hessian_is_symmetric_positive_definite() -> None:
+    problem = paper_problem()
+    H = cost(prediction(problem.model, problem.horizon), problem.objective).H
+    np.testing.assert_array_equal(H, H.T)
+    assert np.linalg.eigvalsh(H)[0] >= 2 * 0.01 * (1 - 1e-9)  # 2 Q_u is a lower bound
+
+
+def test_f3_is_minus_twice_q_u_repeated() -> None:
+    """Erratum of Eq. (10), which prints +2."""
+    problem = paper_problem()
+    terms = cost(prediction(problem.model, problem.horizon), problem.objective)
+    np.testing.assert_array_equal(terms.F3, np.tile(-2.0 * problem.objective.Q_u, (problem.horizon, 1)))
+
+
+@pytest.mark.parametrize("name", ["paper-constrained", "paper-unconstrained"])
+def test_at_hover_on_the_reference_the_optimum_is_u_bar(name: str) -> None:
+    problem = paper_problem(name)
+    terms = cost(prediction(problem.model, problem.horizon), problem.objective)
+    hover = make_state(position=(3.0, -4.0, 10.0))
+    desired = np.tile(problem.objective.C_r @ hover, (problem.horizon, 1))
+    u_bar = problem.model.u_bar
+    optimum = np.linalg.solve(terms.H, -terms.gradient(hover, desired, u_bar)).reshape(-1, 4)
+    np.testing.assert_allclose(optimum, np.tile(u_bar, (problem.horizon, 1)), atol=1e-4)
+    # With the sign that Eq. (10) prints, and no offset of the linearisation, it would be -u_bar instead.
+    as_printed = terms.F1 @ hover + terms.F2 @ desired.ravel() - (terms.F3 - terms.F4) @ u_bar
+    as_printed = np.linalg.solve(terms.H, -as_printed).reshape(-1, 4)
+    assert np.abs(as_printed - u_bar).max() > 100.0
+    assert as_printed[-1, 0] < 0.0

@@ -1,0 +1,171 @@
+"""Eq. (27): both formulations of the QP, against the KKT conditions, a second solver and each other."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import osqp
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy import sparse
+from support import paper_problem, paper_reference, random_problem
+
+from mpc.condensed import condensed
+from mpc.multistage import multistage
+from mpc.problem import Problem
+from mpc.qp import QP, Backend, Formulation, Solution, Vectors, kkt_residuals
+from mpc.solvers import SOLVERS, QPSolver
+from mpc.solvers.piqp_dense import PiqpDense
+from mpc.solvers.piqp_sparse import PiqpMultistage
+from quadsim.controller import SOLVED
+from quadsim.errors import UnknownNameError
+from quadsim.state import Array
+from scenarios.runner import Flight
+
+STATE = np.zeros(12)
+STATE[10] = np.pi / 6
+
+
+def flight_queries(flight: Flight, problem: Problem, stride: int) -> list[tuple[Array, Array, Array]]:
+    """(xi(k), y_d, u(k-1)) of every `stride`-th period of a flight."""
+    log, N = flight.log.control, problem.horizon
+    reference = paper_reference(log.t.size + N)
+    before = np.vstack([log.speeds_before, log.speeds[:-1]])
+    return [
+        (log.state[k], problem.objective.desired(reference[k + 1 : k + 1 + N]), before[k])
+        for k in range(0, log.t.size, stride)
+    ]
+
+
+@pytest.mark.parametrize("name", sorted(SOLVERS))
+def test_kkt_conditions_hold_over_the_flight(constrained_flight: Flight, name: str) -> None:
+    problem = paper_problem()
+    formulation, backend = SOLVERS[name].formulate(problem), SOLVERS[name].backend()
+    backend.setup(formulation.qp)
+    active = 0
+    for query in flight_queries(constrained_flight, problem, stride=20):
+        vectors = formulation.vectors(*query)
+        solution = backend.solve(vectors)
+        assert solution.status == SOLVED
+        residuals = kkt_residuals(formulation.qp.with_vectors(vectors), solution)
+        assert residuals.primal < 1e-6
+        assert residuals.stationarity < 1e-4  # gradients are of order 1e4
+        assert residuals.complementarity < 1e-4  # multipliers reach 1e3
+        assert residuals.dual == 0.0
+        active += solution.active
+    assert active > 100  # the flight does press against its bounds
+
+
+def test_first_input_agrees_with_osqp(constrained_flight: Flight) -> None:
+    """A second solver, of another family, on the paper's condensed QP."""
+    problem = paper_problem()
+    ours, formulation = QPSolver("piqp-multistage", problem), condensed(problem)
+    for query in flight_queries(constrained_flight, problem, stride=150):
+        qp = formulation.qp.with_vectors(formulation.vectors(*query))
+        other = osqp.OSQP()
+        other.setup(
+            sparse.csc_matrix(qp.P),
+            qp.c,
+            sparse.csc_matrix(np.vstack([qp.G, np.eye(qp.c.size)])),
+            np.concatenate([qp.h_l, qp.x_l]),
+            np.concatenate([qp.h_u, qp.x_u]),
+            eps_abs=1e-9,
+            eps_rel=1e-9,
+            max_iter=200_000,
+            polishing=True,
+            verbose=False,
+        )
+        answer = other.solve(raise_error=True)
+        assert answer.info.status.startswith("solved")
+        np.testing.assert_allclose(ours.solve(*query).plan[0], answer.x[:4], atol=1e-3)
+
+
+@pytest.mark.parametrize("steps", [1, 3, 5, 7, 50, 80])
+def test_every_stage_length_gives_the_condensed_optimum(steps: int) -> None:
+    problem = paper_problem()
+    reference = paper_reference(60)[1:51]
+    plans = []
+    for formulation, backend in (
+        (condensed(problem), PiqpDense()),
+        (multistage(problem, steps_per_stage=steps), PiqpMultistage()),
+    ):
+        backend.setup(formulation.qp)
+        vectors = formulation.vectors(STATE, problem.objective.desired(reference), problem.model.u_bar)
+        solution = backend.solve(vectors)
+        assert solution.status == SOLVED
+        plans.append(formulation.inputs(solution.x))
+    np.testing.assert_allclose(plans[1], plans[0], atol=1e-3)
+
+
+def solved(formulation: Formulation, backend: Backend, query: tuple[Array, Array, Array]) -> tuple[QP, Solution]:
+    backend.setup(formulation.qp)
+    vectors: Vectors = formulation.vectors(*query)
+    return formulation.qp.with_vectors(vectors), backend.solve(vectors)
+
+
+@settings(max_examples=60, deadline=None)
+@given(seed=st.integers(0, 2**32 - 1), horizon=st.integers(1, 25), n=st.integers(1, 5), steps=st.integers(1, 9))
+def test_random_systems_give_one_optimum_in_both_forms(seed: int, horizon: int, n: int, steps: int) -> None:
+    """Random stable systems, weights, bounds and horizons; u(k-1) inside its bounds."""
+    rng = np.random.default_rng(seed)
+    problem = random_problem(rng, horizon=horizon, n=n, nu=int(rng.integers(1, 4)), n_c=int(rng.integers(0, 3)))
+    assert problem.bounds is not None
+    before = rng.uniform(problem.bounds.u_min, problem.bounds.u_max)
+    query = (rng.normal(size=n) * 0.3, rng.normal(size=(horizon, n)), before)
+    dense, structured = condensed(problem), multistage(problem, steps_per_stage=steps)
+    qp, one = solved(dense, PiqpDense(), query)
+    other_qp, two = solved(structured, PiqpMultistage(), query)
+    assert (one.status == SOLVED) == (two.status == SOLVED)  # feasibility is no matter of form
+    if one.status != SOLVED:
+        return
+    for program, solution in ((qp, one), (other_qp, two)):
+        scale = max(1.0, float(np.abs(solution.z).max(initial=0.0)))
+        assert kkt_residuals(program, solution).worst < 1e-4 * scale
+    np.testing.assert_allclose(structured.inputs(two.x), dense.inputs(one.x), atol=1e-3)
+
+
+def test_kkt_residuals_see_every_kind_of_fault() -> None:
+    problem = paper_problem()
+    formulation, backend = condensed(problem), PiqpDense()
+    query = (STATE, problem.objective.desired(paper_reference(60)[1:51]), problem.model.u_bar)
+    qp, solution = solved(formulation, backend, query)
+    assert kkt_residuals(qp, solution).worst < 1e-3
+    assert kkt_residuals(qp, replace(solution, x=solution.x + 1.0)).stationarity > 0.1
+    assert kkt_residuals(qp, replace(solution, x=solution.x * 3.0)).primal > 1.0
+    assert kkt_residuals(qp, replace(solution, z=solution.z + 1.0)).complementarity > 1.0
+    unbounded = replace(qp, x_u=np.full_like(qp.x_u, np.inf))
+    assert kkt_residuals(unbounded, replace(solution, z_box=solution.z_box + 1.0)).dual > 0.9
+
+
+def test_an_infeasible_problem_is_not_called_solved() -> None:
+    problem = paper_problem()
+    tilted = STATE.copy()
+    tilted[6], tilted[7] = np.radians(30.0), 5.0
+    desired = problem.objective.desired(np.zeros((50, 4)))
+    for name in SOLVERS:
+        solution = QPSolver(name, problem).solve(tilted, desired, problem.model.u_bar).solution
+        assert solution.status in {"primal_infeasible", "max_iterations", "numerics"}
+
+
+def test_answers_are_copies_that_the_next_solve_leaves_alone() -> None:
+    problem = paper_problem()
+    solver = QPSolver("piqp-multistage", problem)
+    desired = problem.objective.desired(paper_reference(60)[1:51])
+    first = solver.solve(STATE, desired, problem.model.u_bar)
+    kept = first.plan.copy(), first.solution.x.copy(), first.solution.y.copy()
+    solver.solve(-STATE, -desired, problem.model.u_bar)
+    for now, then in zip((first.plan, first.solution.x, first.solution.y), kept, strict=True):
+        np.testing.assert_array_equal(now, then)
+
+
+def test_unknown_solver_lists_those_there_are() -> None:
+    with pytest.raises(UnknownNameError, match=r"no solver named 'piqp-dens'; did you mean 'piqp-dense'"):
+        QPSolver("piqp-dens", paper_problem())
+
+
+@pytest.mark.parametrize("build", [condensed, multistage])
+def test_a_problem_without_bounds_needs_no_qp(build: object) -> None:
+    with pytest.raises(ValueError, match="needs a problem with bounds"):
+        build(paper_problem("paper-unconstrained"))  # type: ignore[operator]

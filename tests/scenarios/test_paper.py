@@ -1,0 +1,141 @@
+"""The paper's results, turned into numbers and held."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from quadsim.audit import Finding
+from scenarios import runner
+from scenarios.runner import Flight
+from scenarios.spec import load_scenario, scenario_names
+
+SAMPLED, PLANT = 0.01, 0.05
+"""How far beyond 5 deg roll and pitch may go [deg]: at the control samples, and at the physics rate."""
+
+
+def findings(flight: Flight) -> dict[str, Finding]:
+    return {finding.limit.name: finding for finding in flight.findings}
+
+
+def assert_constrained_flight_holds(flight: Flight, *, plant_tolerance: float) -> None:
+    control, found = flight.log.control, findings(flight)
+    assert flight.log.status == "completed"
+    assert control.status == ("solved",) * 1200
+    assert control.fallback.max() == 0
+    for angle in ("roll", "pitch"):
+        assert found[angle].worst_margin_sampled >= -SAMPLED
+        assert found[angle].worst_margin >= -plant_tolerance
+    assert control.speeds.min() >= -1e-6
+    assert control.speeds.max() <= 250.0 + 1e-6
+    assert control.slews.min() >= -10.0 - 1e-6
+    assert control.slews.max() <= 5.0 + 1e-6
+    climbing = control.t < 10.0
+    assert control.speeds[climbing].max() == pytest.approx(250.0, abs=1e-6)  # upper bound active in the take-off
+    error = control.state[-1, [0, 2, 4, 10]] - control.reference[-1]
+    assert np.abs(error).max() < 0.01
+
+
+def test_constrained_flight_keeps_every_bound_and_arrives(constrained_flight: Flight) -> None:
+    assert_constrained_flight_holds(constrained_flight, plant_tolerance=PLANT)
+    assert constrained_flight.satisfied
+    assert constrained_flight.log.plant.t.size == 60_001  # audited at the physics rate
+
+
+@pytest.mark.parametrize("arm_length", [0.2, 0.3, 0.5])
+@pytest.mark.parametrize("drag_to_thrust", [0.012, 0.024, 0.048])
+def test_it_holds_over_the_parameters_the_paper_leaves_out(arm_length: float, drag_to_thrust: float) -> None:
+    settings = [f"vehicle.arm_length={arm_length}", f"vehicle.drag_to_thrust={drag_to_thrust}"]
+    flight = runner.fly_scenario(load_scenario("paper-constrained", settings))
+    assert_constrained_flight_holds(flight, plant_tolerance=0.1)
+
+
+def test_unconstrained_flight_tracks_and_leaves_every_bound(unconstrained_flight: Flight) -> None:
+    control, found = unconstrained_flight.log.control, findings(unconstrained_flight)
+    error = control.state[:, [0, 2, 4, 10]] - control.reference
+    assert np.abs(error[-1]).max() < 0.01
+    assert np.sqrt(np.mean(error[:, :3] ** 2, axis=0)).max() < 0.5
+    for name in ("roll", "pitch", "speed", "slew"):
+        assert not found[name].satisfied
+        assert not found[name].limit.required
+        assert found[name].time_violated > 0.0
+    assert unconstrained_flight.satisfied  # it promised none of them
+    entries = {entry["name"]: entry for entry in runner.summarise(unconstrained_flight)["constraints"]}
+    assert entries["roll"]["worst_margin"] == pytest.approx(-4.48, abs=0.01)
+    assert entries["speed"]["worst_margin"] == pytest.approx(-121.7, abs=0.1)
+
+
+def test_clipped_flight_shows_what_a_real_rotor_would_do() -> None:
+    flight = runner.fly_scenario(load_scenario("paper-unconstrained-clipped"))
+    assert flight.log.control.speeds.max() > 300.0
+    assert flight.log.plant.speeds.max() == 250.0
+    assert flight.satisfied
+
+
+def test_constraints_make_the_profile_smoother(constrained_flight: Flight, unconstrained_flight: Flight) -> None:
+    """Sec. 7 says so; total variation of the commands says by how much."""
+
+    def total_variation(flight: Flight) -> float:
+        return float(np.abs(flight.log.control.slews).sum())
+
+    def largest_step(flight: Flight) -> float:
+        return float(np.abs(flight.log.control.slews).max())
+
+    assert largest_step(constrained_flight) < 0.1 * largest_step(unconstrained_flight)
+    assert total_variation(constrained_flight) < 2.0 * total_variation(unconstrained_flight)
+
+
+def test_both_solvers_fly_the_same_commands(constrained_flight: Flight) -> None:
+    dense = runner.fly_scenario(load_scenario("paper-constrained", ["controller.solver=piqp-dense"]))
+    difference = np.abs(dense.log.control.speeds - constrained_flight.log.control.speeds).max()
+    assert difference < 1e-2
+    assert dense.satisfied
+
+
+@pytest.mark.parametrize("name", scenario_names())
+def test_every_scenario_of_the_library_keeps_what_it_promises(name: str) -> None:
+    flight = runner.fly_scenario(load_scenario(name))
+    assert flight.log.status == "completed", flight.log.reason
+    assert flight.findings, "a scenario must be audited against something"
+    violated = [finding.limit.name for finding in flight.findings if finding.limit.required and not finding.satisfied]
+    assert violated == []
+    assert np.all(np.isfinite(flight.log.plant.state))
+
+
+def test_every_solve_is_recorded_with_residuals_and_times(constrained_flight: Flight) -> None:
+    control, timing = constrained_flight.log.control, constrained_flight.log.timing
+    assert np.all(control.iterations > 0)
+    assert control.primal_residual.max() < 1e-6
+    assert control.dual_residual.max() < 1e-4
+    assert np.all(timing.solve_ms > 0.0)
+    assert np.all(timing.step_ms > timing.solve_ms)
+    assert control.active.max() > 50
+
+
+def test_other_cases_fly_too() -> None:
+    """Nothing of the paper's case is built in: another vehicle, period, horizon, outputs and bounds."""
+    settings = [
+        "vehicle.mass=2.0",
+        "vehicle.rotor_azimuths=[45, -45, -135, 135]",
+        "control_period=0.04",
+        "plant.timestep=0.002",
+        "log_rate=100",
+        "duration=16",
+        "controller.horizon=37",
+        "controller.output_weights.vx=2.0",
+        "controller.output_bounds.pitch=[-8, 3]",
+        "controller.output_bounds.yaw=[-20, 40]",
+        "constraints.pitch.lower=-8",
+        "constraints.pitch.upper=3",
+        "constraints.arrival_x.required=false",
+        "constraints.arrival_x.required=false",
+        "constraints.arrival_y.required=false",
+        "constraints.arrival_z.required=false",
+        "constraints.arrival_yaw.required=false",
+    ]
+    flight = runner.fly_scenario(load_scenario("paper-constrained", settings))
+    assert flight.log.control.status == ("solved",) * 400
+    assert flight.satisfied
+    pitch = np.degrees(flight.log.control.state[:, 8])
+    assert pitch.max() == pytest.approx(3.0, abs=0.01)  # its own bound, active
+    assert pitch.min() == pytest.approx(-8.0, abs=0.01)
