@@ -56,6 +56,7 @@ SIGNALS: Final[dict[str, Signal]] = {
     **{name: _state_signal(name, unit) for name, unit in zip(STATE_NAMES, STATE_UNITS, strict=True)},
     **{f"{name}_error": _error_signal(j) for j, name in enumerate(REFERENCE_NAMES)},
     "tilt": Signal(unit="deg", sampled=lambda log: _tilt(log.state), plant=lambda log: _tilt(log.state)),
+    # Commanded at the samples, acting in between: they differ where rotors saturate.
     "speed": Signal(unit="rad/s", sampled=lambda log: log.speeds, plant=lambda log: log.speeds),
     "slew": Signal(unit="rad/s", sampled=lambda log: log.slews, plant=None),
 }
@@ -118,7 +119,7 @@ class Finding:
         peak_sampled: the value nearest to (or furthest beyond) a bound at the control samples.
         peak_plant: the same at the physics rate; equal to `peak_sampled` for signals that exist at samples only.
         worst_margin_sampled: smallest signed margin at the control samples.
-        worst_margin: smallest signed margin at the physics rate (which includes the samples).
+        worst_margin: smallest signed margin at the physics rate.
         worst_time: when that was [s].
         time_violated: time spent beyond bound plus tolerance [s].
     """

@@ -65,19 +65,18 @@ def check(options: Namespace) -> int:
 
 def compare(options: Namespace) -> int:
     """`quadsim compare`."""
+    from quadsim.comparison import comparison_rows, run_names, to_markdown
     from quadsim.report import write_comparison
-
-    from quadsim.comparison import comparison_rows, to_markdown
 
     target = Path(options.out)
     directories = [Path(name) if Path(name).is_dir() else _fly_for_comparison(name, target) for name in options.targets]
     runs = [rundir.load_run(directory) for directory in directories]
     page = write_comparison(runs, target)
-    rows = comparison_rows(runs)
+    rows, names = comparison_rows(runs), run_names(runs)
     if options.markdown:
-        print(to_markdown(rows, [item.name for item in runs]))
+        print(to_markdown(rows, names))
     else:
-        console.print_comparison(rows, [item.name for item in runs], str(page))
+        console.print_comparison(rows, names, str(page))
     return EXIT_DONE
 
 

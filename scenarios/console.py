@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any
+from typing import Any, Final
 
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
+from rich.markup import escape
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
-from quadsim.comparison import Row
+from quadsim.comparison import Cell, Mark, Row
 from scenarios import runner
 
 
@@ -65,7 +66,7 @@ def audit_table(constraints: Sequence[Mapping[str, Any]]) -> Table:
     table.add_column("verdict", no_wrap=True)
     for entry in constraints:
         table.add_row(
-            f"{entry['name']} [{entry['unit']}]".replace("[", r"\["),
+            escape(f"{entry['name']} [{entry['unit']}]"),
             f"{_number(entry['lower'])}..{_number(entry['upper'])}",
             _number(entry["peak_sampled"]),
             _number(entry["peak_plant"]),
@@ -87,7 +88,7 @@ def _tracking_table(tracking: Mapping[str, Any]) -> Table:
     table = _table("tracking, real minus filtered reference")
     table.add_column("")
     for channel, unit in tracking["unit"].items():
-        table.add_column(rf"{channel} \[{unit}]", justify="right")
+        table.add_column(escape(f"{channel} [{unit}]"), justify="right")
     for name in ("rmse", "max_error", "final_error", "overshoot"):
         table.add_row(name.replace("_", " "), *(f"{tracking[name][channel]:.4g}" for channel in tracking["unit"]))
     return table
@@ -121,9 +122,17 @@ def print_comparison(rows: Sequence[Row], names: Sequence[str], where: str) -> N
             table.add_section()
             table.add_row(f"[bold]{group}[/bold]")
         label = f"{row.label} [{row.unit}]" if row.unit else row.label
-        table.add_row(label.replace("[", r"\["), *row.values)
+        table.add_row(escape(label), *(_cell(cell) for cell in row.cells))
     console.print(table)
     console.print(f"written to [bold]{where}[/bold]", soft_wrap=True)
+
+
+_STYLES: Final = {Mark.BEST: "bold", Mark.GOOD: "green", Mark.WARN: "yellow", Mark.BAD: "red"}
+
+
+def _cell(cell: Cell) -> str:
+    style = _STYLES.get(cell.mark)
+    return f"[{style}]{escape(cell.text)}[/{style}]" if style else escape(cell.text)
 
 
 def _number(value: float | None) -> str:

@@ -1,0 +1,49 @@
+"""The numbers in the documents are today's."""
+
+from __future__ import annotations
+
+import importlib.util
+import re
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+from scenarios.runner import Flight
+
+ROOT = Path(__file__).resolve().parent.parent
+
+
+@pytest.fixture(scope="module")
+def numbers() -> ModuleType:
+    """docs/make_numbers.py, which is a script and not in a package."""
+    spec = importlib.util.spec_from_file_location("make_numbers", ROOT / "docs" / "make_numbers.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_results_in_the_readme_are_what_the_flights_give(
+    numbers: ModuleType, constrained_flight: Flight, unconstrained_flight: Flight
+) -> None:
+    flights = {
+        "paper-unconstrained": unconstrained_flight,
+        "paper-unconstrained-clipped": numbers.fly("paper-unconstrained-clipped"),
+        "paper-constrained": constrained_flight,
+    }
+    table = numbers.markdown(numbers.results(flights))
+    for document in ("README.md", "docs/numbers.md"):
+        assert table in (ROOT / document).read_text(encoding="utf-8"), f"{document} is out of date: make numbers"
+
+
+def test_convergence_in_the_documents_is_what_the_gains_give(numbers: ModuleType) -> None:
+    assert numbers.markdown(numbers.lqr_convergence()) in (ROOT / "docs/numbers.md").read_text(encoding="utf-8")
+
+
+def test_documents_link_to_files_that_exist() -> None:
+    for document in [*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md")]:
+        for target in re.findall(r"\]\(([^)#]+)\)", document.read_text(encoding="utf-8")):
+            if "://" not in target:
+                assert (document.parent / target).exists(), f"{document.name} links to {target}"
