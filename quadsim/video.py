@@ -1,0 +1,221 @@
+"""A run directory -> a film of its flight, rendered after the flight in child processes.
+
+The caller never touches OpenGL: each child (`quadsim.render_worker`) gets its own environment, renders and encodes a
+run of frames, and one more joins the pieces without encoding again.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import itertools
+import json
+import os
+import selectors
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import IO, Final
+
+from quadsim.errors import OutputError, ParameterError, RenderingUnavailableError
+from quadsim.footage import Shot, film_span
+from quadsim.rundir import Run, load_run
+
+BACKENDS: Final = ("egl", "osmesa")
+"""What can render without a screen, in the order tried."""
+_WORKER: Final = (sys.executable, "-m", "quadsim.render_worker")
+_PROBE_SECONDS: Final = 60.0
+_FEWEST_FRAMES: Final = 30
+"""A further worker is not worth its start for fewer frames than these."""
+
+Progress = Callable[[int, int], None]
+
+
+def rendering_backend() -> str:
+    """The OpenGL back end, `egl` or `osmesa`, that renders on this machine; MUJOCO_GL says which to try first.
+
+    Raises:
+        RenderingUnavailableError: none does; it tells what each one said.
+    """
+    preferred = os.environ.get("MUJOCO_GL", "").strip().lower()
+    tried: dict[str, str] = {}
+    for backend in sorted(BACKENDS, key=lambda name: name != preferred):
+        try:
+            subprocess.run(
+                [*_WORKER, "probe"], env=_environment(backend), check=True, capture_output=True, timeout=_PROBE_SECONDS
+            )
+        except subprocess.CalledProcessError as error:
+            tried[backend] = _last_line(error.stderr)
+        except subprocess.TimeoutExpired:
+            tried[backend] = f"gave no picture within {_PROBE_SECONDS:g} s"
+        else:
+            return backend
+    raise RenderingUnavailableError(tried)
+
+
+def render_video(
+    run_directory: Path,
+    path: Path,
+    *,
+    workers: int | None = None,
+    progress: Progress | None = None,
+    width: int = 1280,
+    height: int = 720,
+    fps: int = 30,
+    start: float = 0.0,
+    stop: float | None = None,
+    speed: float = 1.0,
+) -> None:
+    """Film a run as an MP4 (H.264, 4:2:0), which appears at `path` complete or not at all.
+
+    Args:
+        run_directory: a run with its summary and Parquet files.
+        path: the MP4 to write; one that is there is replaced.
+        workers: rendering processes, at most; the machine's cores when None.
+        progress: called with frames done and frames in all, in the caller's thread.
+        width: [pixels], even.
+        height: [pixels], even.
+        fps: frames per second.
+        start: first simulated time shown [s].
+        stop: last simulated time shown [s]; the flight's end when None.
+        speed: simulated seconds per second of film.
+
+    Raises:
+        FileError: the run cannot be read, or holds nothing to film.
+        OutputError: the film cannot be written, or a renderer failed; nothing is left behind.
+        ParameterError: a size, rate or time that cannot be.
+        RenderingUnavailableError: this machine cannot render.
+    """
+    shot = _plan(load_run(run_directory), start, stop, Shot(
+        run=str(run_directory), width=width, height=height, fps=fps, speed=speed, count=1
+    ))  # fmt: skip
+    with _staging(path) as folder:
+        _film(shot, folder / "film.mp4", _worker_count(workers), progress)
+        (folder / "film.mp4").replace(path)
+
+
+def render_gif(
+    run_directory: Path,
+    path: Path,
+    *,
+    width: int = 480,
+    fps: int = 8,
+    start: float = 0.0,
+    stop: float | None = None,
+    speed: float = 6.0,
+    workers: int | None = None,
+) -> None:
+    """Film a run as a small looping GIF in 16:9, a time-lapse by default; arguments and errors as `render_video`.
+
+    It is rendered at twice its size, with large captions, and scaled down, which smooths its edges.
+    """
+    shot = _plan(load_run(run_directory), start, stop, Shot(
+        run=str(run_directory), width=2 * width, height=2 * round(width * 9 / 16), fps=fps, speed=speed, count=1,
+        compact=True,
+    ))  # fmt: skip
+    with _staging(path) as folder:
+        backend = _film(shot, folder / "film.mp4", _worker_count(workers), None)
+        _work([("gif", str(folder / "film.mp4"), str(folder / "film.gif"), str(width))], backend, folder)
+        (folder / "film.gif").replace(path)
+
+
+def _plan(run: Run, start: float, stop: float | None, shot: Shot) -> Shot:
+    first, last = film_span(run)
+    stop = last if stop is None else min(stop, last)
+    if not first <= start <= stop:
+        raise ParameterError("film", "start", start, f"between {first:g} s and its stop at {stop:g} s")
+    return replace(shot, start=start, count=max(1, round((stop - start) * shot.fps / shot.speed)))
+
+
+def _worker_count(workers: int | None) -> int:
+    if workers is None:
+        return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    if workers < 1:
+        raise ParameterError("film", "workers", workers, "at least 1")
+    return workers
+
+
+def _film(shot: Shot, path: Path, workers: int, progress: Progress | None) -> str:
+    """Film a shot in pieces and join them; the back end that did it."""
+    backend = rendering_backend()
+    pieces = max(1, min(workers, shot.count // _FEWEST_FRAMES))
+    edges = [shot.count * piece // pieces for piece in range(pieces + 1)]
+    shots = [replace(shot, first=a, count=b - a) for a, b in itertools.pairwise(edges)]
+    names = [f"piece{piece}.mp4" for piece in range(pieces)]
+    tasks = [
+        ("film", json.dumps(part.to_json()), str(path.parent / name)) for part, name in zip(shots, names, strict=True)
+    ]
+    _work(tasks, backend, path.parent, None if progress is None else lambda done: progress(done, shot.count))
+    listing = path.parent / "pieces.txt"
+    listing.write_text("".join(f"file '{name}'\n" for name in names), encoding="utf-8")
+    _work([("join", str(listing), str(path))], backend, path.parent)
+    return backend
+
+
+class _WorkerFailure(Exception):
+    """A worker ended badly; the text is its last line."""
+
+
+@contextlib.contextmanager
+def _staging(path: Path) -> Iterator[Path]:
+    """A folder beside `path` that is gone when the block ends; what fails inside becomes an `OutputError`."""
+    try:
+        with tempfile.TemporaryDirectory(prefix=f".{path.name}.", suffix=".partial", dir=path.parent) as folder:
+            yield Path(folder).resolve()
+    except _WorkerFailure as failure:
+        raise OutputError(path, f"the renderer failed: {failure}") from failure
+    except OSError as error:
+        raise OutputError(path, error.strerror or str(error)) from error
+
+
+def _environment(backend: str) -> dict[str, str]:
+    packages = os.pathsep.join(filter(None, (str(Path(__file__).resolve().parents[1]), os.environ.get("PYTHONPATH"))))
+    return {**os.environ, "MUJOCO_GL": backend, "PYOPENGL_PLATFORM": backend, "PYTHONPATH": packages}
+
+
+def _work(
+    tasks: Sequence[Sequence[str]], backend: str, folder: Path, report: Callable[[int], None] | None = None
+) -> None:
+    """Run worker tasks side by side; when one fails, or anything is raised here, the others are killed.
+
+    Args:
+        tasks: arguments of each worker.
+        backend: OpenGL back end.
+        folder: where the workers' stderr goes.
+        report: called with the sum of the last numbers that the workers printed.
+
+    Raises:
+        _WorkerFailure: a worker failed.
+    """
+    with contextlib.ExitStack() as stack:
+        watched = stack.enter_context(selectors.DefaultSelector())
+        logs: list[IO[bytes]] = []
+        done = [0] * len(tasks)
+        for i, task in enumerate(tasks):
+            logs.append(stack.enter_context((folder / f"worker{i}.log").open("w+b")))
+            process = stack.enter_context(
+                subprocess.Popen([*_WORKER, *task], env=_environment(backend), stdout=subprocess.PIPE, stderr=logs[i])
+            )
+            stack.callback(process.kill)  # runs before Popen's own exit, which waits; kills none that has ended
+            assert process.stdout is not None
+            watched.register(process.stdout, selectors.EVENT_READ, (i, process))
+        while watched.get_map():
+            for key, _ in watched.select():
+                i, process = key.data
+                line = process.stdout.readline()
+                if line:
+                    done[i] = int(line)
+                    if report is not None:
+                        report(sum(done))
+                    continue
+                watched.unregister(process.stdout)
+                if process.wait() != 0:
+                    logs[i].seek(0)
+                    raise _WorkerFailure(_last_line(logs[i].read()))
+
+
+def _last_line(text: bytes) -> str:
+    lines = text.decode(errors="replace").strip().splitlines()
+    return lines[-1].strip() if lines else "it ended without a word"

@@ -1,0 +1,322 @@
+"""Films: the numbers behind the frames, the captions, and the MP4 and GIF that come out of the child processes."""
+
+from __future__ import annotations
+
+import gc
+import os
+import subprocess
+import sys
+import warnings
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import imageio.v3 as iio
+import imageio_ffmpeg
+import numpy as np
+import pytest
+
+from quadsim import video
+from quadsim.audit import audit
+from quadsim.errors import FileError, OutputError, ParameterError, RenderingUnavailableError
+from quadsim.flightlog import write_log
+from quadsim.footage import Shot, make_footage, thin
+from quadsim.overlay import RED, Overlay
+from quadsim.rundir import Run, load_run, write_json
+from quadsim.state import EULER, POSITION, body_to_world
+from quadsim.video import render_gif, render_video, rendering_backend
+
+
+@pytest.fixture(scope="module")
+def backend() -> str:
+    try:
+        return rendering_backend()
+    except RenderingUnavailableError as error:
+        pytest.skip(str(error))
+
+
+@pytest.fixture(scope="module")
+def film(backend: str, short_run: Run, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[tuple[int, int]]]:
+    """The first two seconds in two pieces, and the progress that was reported."""
+    path, reports = tmp_path_factory.mktemp("film") / "flight.mp4", []
+    render_video(
+        short_run.directory, path, workers=2, stop=2.0, progress=lambda done, total: reports.append((done, total))
+    )
+    return path, reports
+
+
+def decode(path: Path) -> np.ndarray:
+    """All frames of an MP4; imageio leaves ffmpeg's pipes to the garbage collector."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", ResourceWarning)
+        frames = iio.imread(path, plugin="FFMPEG")
+        gc.collect()
+    return frames
+
+
+def metadata(path: Path) -> dict[str, Any]:
+    """What ffmpeg says about an MP4."""
+    reader = imageio_ffmpeg.read_frames(path)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", ResourceWarning)
+        meta = next(reader)
+        reader.close()
+        del reader
+        gc.collect()
+    return meta
+
+
+def rewrite(run: Run, directory: Path, rows: int, *, states: float = 1.0) -> Path:
+    """A copy of a run, aborted after `rows` control periods, its plant states multiplied by `states`."""
+    directory.mkdir()
+    control, plant = run.log.control, run.log.plant
+    cut = {
+        name: getattr(control, name)[:rows]
+        for name in (
+            "t", "state", "reference", "speeds", "status", "iterations", "active", "fallback", "slack",
+            "primal_residual", "dual_residual",
+        )
+    }  # fmt: skip
+    last = np.searchsorted(plant.t, 0.05 * rows + 1e-9, side="right")
+    log = replace(
+        run.log,
+        control=replace(control, **cut),
+        timing=replace(run.log.timing, **{n: getattr(run.log.timing, n)[:rows] for n in ("t", "solve_ms", "step_ms")}),
+        plant=replace(plant, t=plant.t[:last], state=states * plant.state[:last], speeds=plant.speeds[:last]),
+        predicted=None if run.log.predicted is None else run.log.predicted[:rows],
+        reason="lost on purpose",
+    )
+    write_log(directory, log, plant_stride=1, metadata={})
+    write_json(directory / "summary.json", {**run.summary, "status": "aborted", "reason": log.reason})
+    return directory
+
+
+def test_the_film_has_the_frames_asked_for(film: tuple[Path, list[tuple[int, int]]]):
+    path, _ = film
+    frames, meta = decode(path), metadata(path)
+    assert frames.shape == (60, 720, 1280, 3)
+    assert meta["fps"] == 30.0
+    assert meta["codec"] == "h264"
+    assert meta["pix_fmt"].startswith("yuv420p")
+    sky, ground = frames[:, 60:100, 500:780].mean(axis=(1, 2)), frames[:, 500:540, 500:780].mean(axis=(1, 2))
+    assert (sky[:, 2] > sky[:, 0] + 15.0).all()  # a blue sky above a grey floor, in every frame of both pieces
+    assert (np.ptp(ground, axis=1) < 40.0).all()
+    assert ground.min() > 60.0
+    moved = np.abs(frames[30].astype(int) - frames[0]).mean()
+    assert moved > 2.0
+    assert path.stat().st_size < 2_000_000
+
+
+def test_the_index_stands_before_the_pictures(film: tuple[Path, list[tuple[int, int]]]):
+    data = film[0].read_bytes()
+    assert data.index(b"moov") < data.index(b"mdat")  # a browser can start before it has the whole file
+
+
+def test_progress_counts_up_to_all_frames_and_nothing_else_is_left(film: tuple[Path, list[tuple[int, int]]]):
+    path, reports = film
+    done = [count for count, _ in reports]
+    assert done == sorted(done)
+    assert reports[-1] == (60, 60)
+    assert [entry.name for entry in path.parent.iterdir()] == ["flight.mp4"]
+
+
+def test_the_callers_environment_is_untouched(backend: str, short_run: Run, tmp_path: Path):
+    before = dict(os.environ)
+    render_video(short_run.directory, tmp_path / "film.mp4", width=320, height=180, fps=5, stop=1.0)
+    assert dict(os.environ) == before
+    assert decode(tmp_path / "film.mp4").shape == (5, 180, 320, 3)
+
+
+def test_a_gif_is_small_and_moves(backend: str, short_run: Run, tmp_path: Path):
+    render_gif(short_run.directory, tmp_path / "film.gif", width=320, fps=4, stop=3.0, speed=3.0)
+    frames = iio.imread(tmp_path / "film.gif")
+    assert frames.shape[:3] == (4, 180, 320)
+    assert np.abs(frames[3].astype(int) - frames[0]).mean() > 2.0
+    assert (tmp_path / "film.gif").stat().st_size < 200_000
+
+
+@pytest.mark.parametrize(("rows", "states"), [(1, 1.0), (20, 1e5)], ids=["one-period", "lost-far-away"])
+def test_aborted_flights_can_be_filmed(backend: str, short_run: Run, tmp_path: Path, rows: int, states: float):
+    directory = rewrite(short_run, tmp_path / "aborted", rows, states=states)
+    render_video(directory, tmp_path / "film.mp4", width=320, height=180, fps=10, workers=1)
+    frames = decode(tmp_path / "film.mp4")
+    assert len(frames) == max(1, round(0.05 * rows * 10))
+    assert frames.mean() > 30.0
+
+
+def test_a_flight_without_a_single_period_is_refused(short_run: Run, tmp_path: Path):
+    directory = rewrite(short_run, tmp_path / "empty", 0)
+    with pytest.raises(FileError, match="nothing to film"):
+        render_video(directory, tmp_path / "film.mp4")
+    assert not (tmp_path / "film.mp4").exists()
+
+
+def test_without_a_backend_the_error_lists_what_was_tried(
+    short_run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(video, "BACKENDS", ("direct3d", "carrier-pigeon"))
+    with pytest.raises(RenderingUnavailableError, match=r"libegl1.*--no-video") as caught:
+        render_video(short_run.directory, tmp_path / "film.mp4", stop=0.5)
+    assert set(caught.value.tried) == {"direct3d", "carrier-pigeon"}
+    assert "direct3d" in caught.value.tried["direct3d"]  # MuJoCo's own complaint
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_users_backend_is_tried_first(monkeypatch: pytest.MonkeyPatch):
+    asked: list[str] = []
+
+    def run(_: object, *, env: dict[str, str], **__: object) -> None:
+        asked.append(env["MUJOCO_GL"])
+        assert env["PYOPENGL_PLATFORM"] == env["MUJOCO_GL"]
+        if env["MUJOCO_GL"] == "osmesa":
+            raise subprocess.CalledProcessError(1, "probe", stderr=b"Traceback\nImportError: no OSMesa here\n")
+
+    monkeypatch.setenv("MUJOCO_GL", "osmesa")
+    monkeypatch.setattr(subprocess, "run", run)
+    assert rendering_backend() == "egl"
+    assert asked == ["osmesa", "egl"]
+
+
+@pytest.fixture
+def fake_worker(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Workers that report one frame; the one that renders the first frames then waits, another fails."""
+    script = (
+        "import json, sys, time\n"
+        "if sys.argv[1] == 'probe': sys.exit()\n"
+        "print(1, flush=True)\n"
+        "open(sys.argv[3], 'w').write('half a film')\n"
+        "if json.loads(sys.argv[2])['first'] == 0: time.sleep(600)\n"
+        "sys.exit('Traceback ...\\nGLError: the picture is lost')\n"
+    )
+    monkeypatch.setattr(video, "_WORKER", (sys.executable, "-c", script))
+
+
+@pytest.mark.usefixtures("fake_worker")
+def test_a_failing_worker_stops_the_others_and_leaves_nothing(short_run: Run, tmp_path: Path):
+    target = tmp_path / "film.mp4"
+    target.write_bytes(b"an older film")
+    with pytest.raises(OutputError, match="renderer failed: GLError: the picture is lost") as caught:
+        render_video(short_run.directory, target, workers=2)
+    assert caught.value.path == target
+    assert [entry.name for entry in tmp_path.iterdir()] == ["film.mp4"]
+    assert target.read_bytes() == b"an older film"
+
+
+@pytest.mark.usefixtures("fake_worker")
+def test_ctrl_c_kills_the_workers(short_run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    started: list[subprocess.Popen[bytes]] = []
+    popen = subprocess.Popen
+
+    def spy(*arguments: object, **options: object) -> subprocess.Popen[bytes]:
+        started.append(popen(*arguments, **options))
+        return started[-1]
+
+    def interrupt(_: int, __: int) -> None:
+        raise KeyboardInterrupt
+
+    rendering_backend()  # the probe is not one of the workers to be watched
+    monkeypatch.setattr(video, "rendering_backend", lambda: "egl")
+    monkeypatch.setattr(subprocess, "Popen", spy)
+    with pytest.raises(KeyboardInterrupt):
+        render_video(short_run.directory, tmp_path / "film.mp4", workers=2, progress=interrupt)
+    assert len(started) == 2
+    assert all(process.returncode is not None for process in started)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_film_goes_nowhere_without_a_folder(short_run: Run, tmp_path: Path):
+    with pytest.raises(OutputError, match="No such file"):
+        render_video(short_run.directory, tmp_path / "missing" / "film.mp4", stop=0.1)
+
+
+@pytest.mark.parametrize(
+    ("options", "rule"),
+    [
+        ({"width": 641}, "even"),
+        ({"height": 90}, "at least 180"),
+        ({"fps": 0}, "at least 1"),
+        ({"workers": 0}, "at least 1"),
+        ({"speed": 0.0}, "positive"),
+        ({"start": 7.0}, "between 0 s"),
+    ],
+)
+def test_impossible_films_are_refused(short_run: Run, tmp_path: Path, options: dict[str, float], rule: str):
+    with pytest.raises(ParameterError, match=rule):
+        render_video(short_run.directory, tmp_path / "film.mp4", **options)
+
+
+def test_a_shot_tells_its_times():
+    shot = Shot(run="x", fps=10, start=2.0, speed=4.0, first=5, count=3)
+    assert shot.times == pytest.approx([4.0, 4.4, 4.8])
+    assert Shot(**shot.to_json()) == shot
+
+
+def test_footage_meets_the_plant_at_its_rows_and_halfway_between(short_run: Run):
+    plant = short_run.log.plant
+    rows = np.array([10, 200, 777])
+    at = make_footage(short_run, plant.t[rows])
+    assert at.position == pytest.approx(plant.state[rows][:, POSITION])
+    x, y, z, w = at.quaternion[:, 1], at.quaternion[:, 2], at.quaternion[:, 3], at.quaternion[:, 0]
+    up = np.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)], axis=1)
+    assert up == pytest.approx(body_to_world(plant.state[rows][:, EULER])[:, :, 2])
+    between = make_footage(short_run, 0.5 * (plant.t[rows] + plant.t[rows + 1]))
+    assert between.position == pytest.approx(0.5 * (plant.state[rows] + plant.state[rows + 1])[:, POSITION])
+    assert np.linalg.norm(between.quaternion, axis=1) == pytest.approx(np.ones(3))
+
+
+def test_footage_knows_its_period_and_the_worst_margin_so_far(short_run: Run):
+    footage = make_footage(short_run, np.array([0.0, 0.049, 0.05, 3.0, 6.0]))
+    assert footage.period.tolist() == [0, 0, 1, 60, len(short_run.log.control.t) - 1]
+    assert footage.turned[-1] == pytest.approx(np.sum(0.05 * short_run.log.control.speeds, axis=0), rel=1e-2)
+    findings = audit(short_run.log, short_run.limits)
+    for track, finding in zip(footage.margins, findings, strict=True):
+        assert track.worst[-1] == pytest.approx(finding.worst_margin, nan_ok=True)
+
+
+def test_the_camera_is_smooth_and_never_far(short_run: Run):
+    times = np.arange(0.0, 6.0, 1 / 30)
+    footage = make_footage(short_run, times)
+    reach = np.abs(footage.aim - footage.position).max()
+    assert 0.0 < reach <= 0.6 * short_run.vehicle.arm_length + 1e-12
+
+
+def test_thinning_keeps_the_path_within_its_tolerance():
+    angle = np.linspace(0.0, np.pi, 2000)
+    arc = np.stack([np.cos(angle), np.sin(angle), 0.0 * angle], axis=1)
+    kept = thin(arc, 0.01)
+    assert kept[0] == 0
+    assert kept[-1] == 1999
+    assert len(kept) < 30
+    sagitta = 1.0 - np.cos(0.5 * np.diff(angle[kept]))
+    assert sagitta.max() <= 0.01 + 1e-9
+    assert thin(np.zeros((5, 3)), 0.01).tolist() == [0, 4]
+    assert thin(np.zeros((1, 3)), 0.01).tolist() == [0]
+
+
+def test_captions_turn_red_when_a_limit_breaks(short_run: Run):
+    def reds(run: Run) -> int:
+        footage = make_footage(run, np.array([1.0]))
+        blank = np.full((720, 1280, 3), 128, np.uint8)
+        picture = Overlay(run, footage, width=1280, height=720).draw(blank, 0)
+        return int(np.count_nonzero((picture == RED).all(axis=-1)))
+
+    tight = tuple(
+        replace(limit, upper=100.0, tolerance=0.0, tolerance_sampled=0.0) if limit.signal == "speed" else limit
+        for limit in short_run.limits
+    )
+    assert reds(short_run) == 0
+    assert reds(replace(short_run, limits=tight)) > 1000  # four bars, four numbers, one row of the table
+
+
+def test_captions_fit_pictures_of_other_sizes(short_run: Run):
+    footage = make_footage(short_run, np.array([0.5]))
+    for width, height, compact in ((320, 180, False), (1920, 1080, False), (640, 480, False), (960, 540, True)):
+        blank = np.full((height, width, 3), 128, np.uint8)
+        picture = Overlay(short_run, footage, width=width, height=height, compact=compact).draw(blank, 0)
+        assert picture.shape == (height, width, 3)
+        assert 0.02 < np.mean(picture != 128) < 0.6
+
+
+def test_a_run_that_is_not_one_is_refused(tmp_path: Path):
+    with pytest.raises(FileError, match="not a run's summary"):
+        load_run(tmp_path)
