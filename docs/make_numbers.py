@@ -6,10 +6,6 @@ README.md.  Rows that no clock decides are also held by tests/test_documents.py.
 
 from __future__ import annotations
 
-import subprocess
-import sys
-import tempfile
-import time as clock
 from dataclasses import replace
 from pathlib import Path
 
@@ -64,6 +60,7 @@ def results(flights: dict[str, Flight]) -> Table:
     rows.append(("speeds within 0 .. 250 rad/s", *(margin(flight, "speed") for flight in every)))
     rows.append(("steps within -10 .. 5 rad/s", *(margin(flight, "slew") for flight in every)))
     rows.append(("highest rotor speed acting [rad/s]", *(f"{flight.log.plant.speeds.max():.1f}" for flight in every)))
+    rows.append(("largest step commanded [rad/s]", *(f"{np.abs(f.log.control.slews).max():.1f}" for f in every)))
     rows.append(
         ("total variation of the commands [rad/s]", *(f"{np.abs(f.log.control.slews).sum():.0f}" for f in every))
     )
@@ -133,29 +130,6 @@ def prediction_errors(vehicle: Vehicle) -> Table:
     return rows
 
 
-def times(flights: dict[str, Flight]) -> Table:
-    """What a clock says on this machine."""
-    rows: Table = [("measured on this machine", "value")]
-    for name, flight in flights.items():
-        step = runner.summarise(flight)["controller"]["step_ms"]
-        told = " / ".join(f"{step[measure]:.2f}" for measure in ("p50", "p99", "max"))
-        rows.append((f"{name}: 60 s of flight simulated in", f"{flight.simulate_s:.2f} s"))
-        rows.append((f"{name}: controller step, median / p99 / max", f"{told} ms"))
-    with tempfile.TemporaryDirectory() as scratch:
-        run = f"{scratch}/run"
-        for label, arguments in (
-            ("`quadsim --help`", ["--help"]),
-            ("`quadsim run paper-constrained --no-video`", ["run", "paper-constrained", "--no-video", "--out", run]),
-            ("`quadsim video` of the same 60 s, 1280x720 at 30 fps", ["video", run]),
-        ):
-            started = clock.perf_counter()
-            subprocess.run(
-                [sys.executable, "-m", "scenarios.cli", *arguments], check=True, capture_output=True, cwd=ROOT
-            )
-            rows.append((label, f"{clock.perf_counter() - started:.2f} s"))
-    return rows
-
-
 def markdown(rows: Table) -> str:
     """Rows as a Markdown table, the first as its head."""
     lines = ["| " + " | ".join(row) + " |" for row in rows]
@@ -174,21 +148,18 @@ def main() -> None:
     flights = {name: fly(name) for name in names}
     constrained = flights["paper-constrained"]
     table = markdown(results(flights))
-    machine = runner.machine()
     page = [
         "# The numbers\n\nMade by `make numbers`; nothing here is typed by hand.\n",
         f"## The paper's flights\n\n{table}",
         "A bound that is *held* may still be exceeded between the samples, by what stands in brackets; the audit's\n"
-        "tolerance for it is 0.05 deg. `left by` gives the worst excess and the seconds beyond bound and tolerance, at\n"
-        "the physics rate; for steps, which exist once per period, at the samples.\n",
+        "tolerance for it is 0.05 deg. `left by` gives the worst excess and the seconds beyond bound and tolerance,\n"
+        "at the physics rate; for steps, which exist once per period, at the samples.\n",
         f"## Over the parameters the paper leaves out\n\n{markdown(sensitivity())}",
         f"## K_N against the discrete LQR gain\n\n{markdown(lqr_convergence())}",
         f"## Linear prediction against MuJoCo near hover\n\n{markdown(prediction_errors(constrained.vehicle))}",
         "The error falls by four as the deviation halves: quadratically.\n",
-        "## The two solvers\n\nLargest difference between the commands of `piqp-dense` and `piqp-multistage` over the whole\n"
-        f"constrained flight: {solver_difference(constrained):.1e} rad/s.\n",
-        f"## Times\n\n{markdown(times(flights))}",
-        f"{machine['processor']}, {machine['cores']} cores, no GPU; one run, so read them as orders of magnitude.\n",
+        "## The two solvers\n\nLargest difference between the commands of `piqp-dense` and `piqp-multistage` over\n"
+        f"the whole constrained flight: {solver_difference(constrained):.1e} rad/s.\n",
     ]
     (ROOT / "docs" / "numbers.md").write_text("\n".join(page), encoding="utf-8")
     readme = ROOT / "README.md"
