@@ -9,7 +9,7 @@ import math
 import os
 import shutil
 import tempfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any, Final
@@ -25,6 +25,9 @@ RECORDING_FILE: Final = "flight.rrd"
 VIDEO_FILE: Final = "flight.mp4"
 FIGURES_DIR: Final = "figures"
 
+_SUMMARY_KEYS: Final = {
+    "scenario", "status", "reason", "satisfied", "duration", "tracking", "constraints", "control", "controller", "vehicle",
+}  # fmt: skip
 _FREE_BYTES_NEEDED: Final = 16 * 1024 * 1024
 
 
@@ -129,8 +132,9 @@ def read_summary(directory: Path) -> dict[str, Any]:
         summary = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
         raise FileError(path, f"is not a run's summary ({error})") from error
-    if not isinstance(summary, dict) or not {"scenario", "constraints", "vehicle", "status"} <= summary.keys():
-        raise FileError(path, "is not a run's summary: it lacks scenario, status, constraints or vehicle")
+    missing = _SUMMARY_KEYS - summary.keys() if isinstance(summary, dict) else _SUMMARY_KEYS
+    if missing:
+        raise FileError(path, f"is not a run's summary: it lacks {', '.join(sorted(missing))}")
     return summary
 
 
@@ -172,19 +176,21 @@ def damaged_files(directory: Path, summary: Mapping[str, Any]) -> list[str]:
 
 
 @contextlib.contextmanager
-def writing(target: Path) -> Iterator[Path]:
+def writing(target: Path, replaces: Callable[[Path], bool] = is_run) -> Iterator[Path]:
     """A directory to fill, which becomes `target` when the block ends well and vanishes when it does not.
 
-    An existing run (or empty directory) at `target` is replaced; anything else there is refused.
+    Args:
+        target: the directory to make.
+        replaces: whether a directory that is already there, and not empty, may go: an earlier one of the same kind.
 
     Raises:
-        OutputError: the place cannot be written, is nearly full, or holds something that is not a run.
+        OutputError: the place cannot be written, is nearly full, or holds something else.
     """
     target = Path(target)
     try:
-        occupied = target.exists() and not (target.is_dir() and (is_run(target) or not any(target.iterdir())))
+        occupied = target.exists() and not (target.is_dir() and (replaces(target) or not any(target.iterdir())))
         if occupied:
-            raise OutputError(target, "something that is not a run is already there; choose another --out")
+            raise OutputError(target, "something else is already there; choose another --out")
         target.parent.mkdir(parents=True, exist_ok=True)
         if shutil.disk_usage(target.parent).free < _FREE_BYTES_NEEDED:
             raise OutputError(target, "the disk is full")

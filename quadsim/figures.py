@@ -1,0 +1,263 @@
+"""A finished run -> the paper's figures, as PNG and SVG.
+
+The same flight gives the same bytes: no date, no random identifiers, no global state of matplotlib.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from quadsim.audit import SIGNALS, Limit
+from quadsim.comparison import distinct_courses, run_names
+from quadsim.errors import OutputError
+from quadsim.palette import BOUND, REFERENCE, line_colour
+from quadsim.rundir import Run
+from quadsim.state import REFERENCE_NAMES
+from quadsim.vehicle import N_ROTORS
+
+if TYPE_CHECKING:
+    from matplotlib.artist import Artist
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+    from matplotlib.typing import RcKeyType
+
+PAPER_FIGURES: Final = {"paper-unconstrained": (2, 3), "paper-constrained": (4, 5)}
+"""Numbers in the paper of the figures of states and of inputs, by scenario."""
+
+_DPI: Final = 160
+_STYLE: Final[dict[RcKeyType, Any]] = {
+    "axes.axisbelow": True,
+    "axes.edgecolor": "#5b6067",
+    "axes.grid": True,
+    "axes.labelsize": 9.5,
+    "axes.spines.right": False,
+    "axes.spines.top": False,
+    "font.size": 9.0,
+    "grid.color": "#e3e5e8",
+    "grid.linewidth": 0.7,
+    "legend.frameon": False,
+    "lines.linewidth": 1.3,
+    "path.simplify_threshold": 0.2,
+    "svg.fonttype": "none",
+    "svg.hashsalt": "quadsim",
+    "text.parse_math": False,
+    "xtick.color": "#5b6067",
+    "xtick.labelcolor": "#1c1e21",
+    "ytick.color": "#5b6067",
+    "ytick.labelcolor": "#1c1e21",
+}
+
+
+def write_figures(run: Run, directory: Path) -> list[Path]:
+    """Draw one run: states and inputs in the paper's arrangement, and the solve times.
+
+    The two scenarios of the paper carry its figure numbers in their file names, e.g. `figure4_states.png`.
+
+    Args:
+        run: the run.
+        directory: where the files go; made when it is not there.
+
+    Returns:
+        The files written, PNG and SVG of each figure; none when no control period was flown.
+
+    Raises:
+        OutputError: the directory cannot be written.
+    """
+    if not run.log.control.t.size:
+        return []
+    states, inputs = PAPER_FIGURES.get(run.name, (None, None))
+    return _write(
+        {
+            _file_name("states", states): lambda: _draw_states(run),
+            _file_name("inputs", inputs): lambda: _draw_inputs(run),
+            "solve_times": lambda: _draw_solve_times(run),
+        },
+        directory,
+    )
+
+
+def comparison_figure(runs: Sequence[Run], directory: Path) -> list[Path]:
+    """Overlay runs: position, roll and pitch, and between which speeds the rotors turned.
+
+    Args:
+        runs: one or more; they need not be of one course or one vehicle.
+        directory: where `comparison.png` and `comparison.svg` go; made when it is not there.
+
+    Returns:
+        The two files.
+
+    Raises:
+        OutputError: the directory cannot be written.
+    """
+    return _write({"comparison": lambda: _draw_comparison(runs)}, directory)
+
+
+def _file_name(content: str, number: int | None) -> str:
+    return content if number is None else f"figure{number}_{content}"
+
+
+def _write(drawings: Mapping[str, Callable[[], Figure]], directory: Path) -> list[Path]:
+    import matplotlib
+
+    paths = []
+    try:
+        directory.mkdir(parents=True, exist_ok=True)
+        with matplotlib.rc_context(_STYLE):
+            for name, draw in drawings.items():
+                figure = draw()
+                png, svg = directory / f"{name}.png", directory / f"{name}.svg"
+                figure.savefig(png, dpi=_DPI)
+                figure.savefig(svg, metadata={"Date": None})
+                paths += [png, svg]
+    except OSError as error:
+        raise OutputError(directory, error.strerror or str(error)) from error
+    return paths
+
+
+def _new_figure(title: str, width: float, height: float) -> Figure:
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(width, height), layout="constrained")
+    figure.suptitle(title, x=0.01, ha="left", fontsize=11.0, fontweight="bold")
+    return figure
+
+
+def _title(run: Run, what: str) -> str:
+    ended = "" if run.log.reason is None else " (aborted)"
+    return f"{run.name}{ended}: {what}"
+
+
+def _draw_states(run: Run) -> Figure:
+    figure = _new_figure(_title(run, "position and attitude"), 9.6, 6.4)
+    panels = figure.subplots(3, 2, sharex=True)
+    shown: dict[str, Artist] = {}
+    for column, names in enumerate((("x", "y", "z"), ("roll", "pitch", "yaw"))):
+        for axes, name in zip(panels[:, column], names, strict=True):
+            shown["flight"] = _draw_plant(axes, run, name, line_colour(0))
+            shown |= _draw_reference(axes, run, name)
+            shown |= _draw_bounds(axes, run.limits, name, _end(run))
+            axes.set_ylabel(f"{name} [{SIGNALS[name].unit}]")
+    _finish(figure, panels[-1], shown, _end(run))
+    return figure
+
+
+def _draw_inputs(run: Run) -> Figure:
+    figure = _new_figure(_title(run, "rotor speeds and their steps"), 9.6, 5.6)
+    panels = figure.subplots(2, 1, sharex=True)
+    shown: dict[str, Artist] = {}
+    labels = {"speed": "rotor speed [rad/s]", "slew": "step per period [rad/s]"}
+    for axes, (name, label) in zip(panels, labels.items(), strict=True):
+        values = SIGNALS[name].sampled(run.log.control)
+        for rotor in range(N_ROTORS):
+            width = 2.2 - 0.5 * rotor  # where rotors turn alike, each is seen beneath the next
+            shown[f"rotor {rotor + 1}"] = axes.plot(
+                run.log.control.t, values[:, rotor], color=line_colour(rotor), drawstyle="steps-post", linewidth=width
+            )[0]
+        shown |= _draw_bounds(axes, run.limits, name, _end(run))
+        axes.set_ylabel(label)
+    _finish(figure, panels[-1:], shown, _end(run))
+    return figure
+
+
+def _draw_solve_times(run: Run) -> Figure:
+    figure = _new_figure(_title(run, "time to compute a command"), 9.6, 6.0)
+    times, iterations, active = figure.subplots(3, 1, sharex=True, height_ratios=(2.4, 1.0, 1.0))
+    timing, control = run.log.timing, run.log.control
+    deadline = run.summary["controller"]["deadline_ms"]
+    for i, (name, values) in enumerate({"whole step": timing.step_ms, "solver alone": timing.solve_ms}.items()):
+        p50, p99 = np.percentile(values, [50, 99])
+        label = f"{name}: median {p50:.3g}, p99 {p99:.3g}, max {values.max():.3g} ms"
+        shown = values > 0.0  # a clock may read 0, which has no place on a logarithmic axis
+        times.plot(timing.t[shown], values[shown], ".", markersize=2.5, color=line_colour(i), label=label)
+    times.axhline(deadline, color=BOUND, linestyle="--", linewidth=1.1, label=f"deadline: {deadline:g} ms")
+    times.set_yscale("log")
+    times.yaxis.set_major_formatter("{x:g}")
+    times.set_ylabel("time [ms]")
+    iterations.plot(control.t, control.iterations, drawstyle="steps-post", color=line_colour(2), linewidth=1.0)
+    active.plot(control.t, control.active, drawstyle="steps-post", color=line_colour(3), linewidth=1.0)
+    for axes, label in ((iterations, "iterations"), (active, "active constraints")):
+        axes.set_ylabel(label)
+        top = max(1.0, axes.get_ylim()[1])
+        axes.set_ylim(-0.05 * top, top)
+        axes.locator_params(axis="y", integer=True, min_n_ticks=1)
+    times.legend(
+        loc="lower left", bbox_to_anchor=(0.0, 1.0), borderaxespad=0.2, ncols=3, fontsize=8.2, columnspacing=1.2
+    )
+    _finish(figure, (active,), {}, _end(run))
+    return figure
+
+
+def _draw_comparison(runs: Sequence[Run]) -> Figure:
+    figure = _new_figure("", 9.6, 6.4)
+    panels = figure.subplots(3, 2, sharex=True)
+    signals = dict(zip(("x", "y", "z", "roll", "pitch", "speed"), panels.T.flat, strict=True))
+    end = max(_end(run) for run in runs)
+    shown: dict[str, Artist] = {}
+    for run in distinct_courses(runs):
+        for name in ("x", "y", "z"):
+            shown |= _draw_reference(signals[name], run, name)
+    for i, (label, run) in enumerate(zip(run_names(runs), runs, strict=True)):
+        colour = line_colour(i)
+        for name in ("x", "y", "z", "roll", "pitch"):
+            shown[label] = _draw_plant(signals[name], run, name, colour)
+        t, speeds = run.log.control.t, run.log.control.speeds
+        signals["speed"].fill_between(
+            t, speeds.min(axis=1), speeds.max(axis=1), step="post", color=colour, alpha=0.6, linewidth=0.9
+        )
+    limits = [limit for run in runs for limit in run.limits]
+    for name, axes in signals.items():
+        shown |= _draw_bounds(axes, limits, name, end)
+        axes.set_ylabel(f"{name} [{SIGNALS[name].unit}]")
+    signals["speed"].set_ylabel("lowest to highest\nrotor speed [rad/s]")
+    _finish(figure, panels[-1], shown, end)
+    return figure
+
+
+def _draw_plant(axes: Axes, run: Run, name: str, colour: str) -> Artist:
+    """Draw a signal of the plant; returns the legend's entry for it."""
+    signal = SIGNALS[name].plant
+    assert signal is not None, name
+    return axes.plot(run.log.plant.t, signal(run.log.plant), color=colour)[0]
+
+
+def _draw_reference(axes: Axes, run: Run, name: str) -> dict[str, Artist]:
+    """Draw the filtered reference of a signal that has one; returns the legend's entry for it."""
+    if name not in REFERENCE_NAMES:
+        return {}
+    values = run.log.control.reference[:, REFERENCE_NAMES.index(name)]
+    shown = np.degrees(values) if SIGNALS[name].unit == "deg" else values
+    line = axes.plot(run.log.control.t, shown, color=REFERENCE, linestyle=(0, (5, 2)), linewidth=1.1)[0]
+    return {"reference, filtered": line}
+
+
+def _end(run: Run) -> float:
+    """Last time of the flight [s]."""
+    return float(run.log.plant.t[-1])
+
+
+def _draw_bounds(axes: Axes, limits: Sequence[Limit], signal: str, end: float) -> dict[str, Artist]:
+    """Draw the bounds on a signal over the times they hold for; returns the legend's entry for them."""
+    bounds = {
+        (bound, limit.start, min(limit.stop, end)): None
+        for limit in limits
+        for bound in (limit.lower, limit.upper)
+        if limit.signal == signal and limit.start < end and np.isfinite(bound)
+    }
+    shown: dict[str, Artist] = {}
+    for bound, start, stop in bounds:
+        shown["bound"] = axes.hlines(bound, start, stop, color=BOUND, linestyle="--", linewidth=1.1)
+    return shown
+
+
+def _finish(figure: Figure, bottom: Sequence[Axes], shown: Mapping[str, Artist], end: float) -> None:
+    """Label the time axes and put the legend above all panels, where it hides nothing."""
+    for axes in bottom:
+        axes.set_xlabel("time [s]")
+        axes.set_xlim(-0.008 * end, end or 1.0)  # a peak in the first period stands clear of the axis
+    figure.align_ylabels()
+    if shown:
+        figure.legend(list(shown.values()), list(shown), loc="outside upper right", ncols=len(shown))

@@ -1,0 +1,114 @@
+"""The figures: there, not blank, of the right content, and the same bytes each time."""
+
+import dataclasses
+import xml.etree.ElementTree as ElementTree
+from pathlib import Path
+
+import numpy as np
+import pytest
+from matplotlib.image import imread
+
+from quadsim.audit import Limit
+from quadsim.errors import OutputError
+from quadsim.figures import comparison_figure, write_figures
+from quadsim.palette import BOUND
+from quadsim.rundir import Run
+
+
+@pytest.fixture(scope="module")
+def figures(short_run: Run, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    return {path.name: path for path in write_figures(short_run, tmp_path_factory.mktemp("figures") / "new")}
+
+
+def texts(svg: Path) -> set[str]:
+    return {
+        text for element in ElementTree.parse(svg).iter("{http://www.w3.org/2000/svg}text") if (text := element.text)
+    }
+
+
+def lines_of_colour(svg: Path, colour: str) -> int:
+    return svg.read_text().count(f"stroke: {colour}")
+
+
+def named(run: Run, scenario: str) -> Run:
+    return dataclasses.replace(run, summary={**run.summary, "scenario": scenario})
+
+
+def test_the_papers_scenario_gives_the_papers_figure_numbers(figures: dict[str, Path]) -> None:
+    assert list(figures) == [
+        f"{name}.{kind}" for name in ("figure4_states", "figure5_inputs", "solve_times") for kind in ("png", "svg")
+    ]
+
+
+def test_another_scenario_gives_plain_names(short_run: Run, tmp_path: Path) -> None:
+    stems = [path.stem for path in write_figures(named(short_run, "hover"), tmp_path)]
+    assert stems == ["states", "states", "inputs", "inputs", "solve_times", "solve_times"]
+
+
+def test_pictures_are_large_and_not_blank(figures: dict[str, Path]) -> None:
+    for path in figures.values():
+        if path.suffix == ".png":
+            picture = imread(path)[..., :3]
+            assert picture.shape[1] >= 1400
+            assert 0.01 < np.mean(np.any(picture < 0.95, axis=-1)) < 0.5
+
+
+@pytest.mark.parametrize(
+    ("name", "expected"),
+    [
+        (
+            "figure4_states",
+            {"x [m]", "y [m]", "z [m]", "roll [deg]", "pitch [deg]", "yaw [deg]", "reference, filtered"},
+        ),
+        ("figure5_inputs", {"rotor speed [rad/s]", "step per period [rad/s]", "rotor 1", "rotor 4", "bound"}),
+        ("solve_times", {"time [ms]", "iterations", "active constraints", "deadline: 50 ms"}),
+    ],
+)
+def test_panels_and_units_are_labelled(figures: dict[str, Path], name: str, expected: set[str]) -> None:
+    assert expected | {"time [s]"} <= texts(figures[f"{name}.svg"])
+
+
+def test_bounds_are_drawn_where_the_flight_has_them(short_run: Run, figures: dict[str, Path], tmp_path: Path) -> None:
+    bounds_and_legend = 2 * 2 + 1
+    assert lines_of_colour(figures["figure4_states.svg"], BOUND) == bounds_and_legend
+    assert lines_of_colour(figures["figure5_inputs.svg"], BOUND) == bounds_and_legend
+    free = dataclasses.replace(short_run, limits=())
+    states = tmp_path / "figure4_states.svg"
+    assert states in write_figures(free, tmp_path)
+    assert lines_of_colour(states, BOUND) == 0
+    assert "bound" not in texts(states)
+
+
+def test_a_bound_that_begins_after_the_flight_is_left_out(short_run: Run, tmp_path: Path) -> None:
+    late = dataclasses.replace(short_run, limits=(Limit(name="late", signal="roll", upper=5.0, start=100.0),))
+    write_figures(late, tmp_path)
+    assert lines_of_colour(tmp_path / "figure4_states.svg", BOUND) == 0
+
+
+def test_the_same_flight_gives_the_same_bytes(short_run: Run, figures: dict[str, Path], tmp_path: Path) -> None:
+    for again in write_figures(short_run, tmp_path):
+        assert again.read_bytes() == figures[again.name].read_bytes(), again.name
+
+
+def test_an_aborted_flight_is_drawn_as_far_as_it_went(short_run: Run, tmp_path: Path) -> None:
+    log = dataclasses.replace(short_run.log, reason="at t = 6.000 s: lost")
+    write_figures(dataclasses.replace(short_run, log=log), tmp_path)
+    assert "paper-constrained (aborted): position and attitude" in texts(tmp_path / "figure4_states.svg")
+
+
+def test_no_figures_without_a_control_period(empty_run: Run, tmp_path: Path) -> None:
+    assert write_figures(empty_run, tmp_path) == []
+
+
+def test_a_comparison_names_every_run_once(short_run: Run, tmp_path: Path) -> None:
+    png, svg = comparison_figure([short_run, named(short_run, "other $x$ <b>")], tmp_path)
+    assert png.name == "comparison.png"
+    assert {"paper-constrained", "other $x$ <b>", "bound", "roll [deg]"} <= texts(svg)
+    bounds_of_roll_pitch_speed_and_legend = 3 * 2 + 1
+    assert lines_of_colour(svg, BOUND) == bounds_of_roll_pitch_speed_and_legend
+
+
+def test_a_place_that_cannot_be_written_is_reported(short_run: Run, tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("in the way")
+    with pytest.raises(OutputError, match="cannot write"):
+        write_figures(short_run, tmp_path / "file" / "figures")
