@@ -26,7 +26,8 @@ VIDEO_FILE: Final = "flight.mp4"
 FIGURES_DIR: Final = "figures"
 
 _SUMMARY_KEYS: Final = {
-    "scenario", "status", "reason", "satisfied", "duration", "tracking", "constraints", "control", "controller", "vehicle",
+    "scenario", "status", "reason", "satisfied", "duration",
+    "tracking", "constraints", "control", "controller", "vehicle",
 }  # fmt: skip
 _FREE_BYTES_NEEDED: Final = 16 * 1024 * 1024
 

@@ -56,18 +56,18 @@ def outcome(summary: Mapping[str, Any]) -> str:
 
 def audit_table(constraints: Sequence[Mapping[str, Any]]) -> Table:
     """Every constraint with its bounds, peaks, margin, tolerances and verdict."""
-    caption = "tolerance: at the samples / at the physics rate"
+    caption = "beyond: seconds; tolerance: at the samples / at the physics rate"
     if any(not entry["required"] for entry in constraints):
         caption += ";  * reported, not required by the scenario"
     table = _table("audit at the physics rate", caption=caption)
     table.add_column("constraint", no_wrap=True)
-    for name in ("bounds", "sampled", "plant", "margin", "beyond s", "tolerance"):
+    for name in ("bounds", "sampled", "plant", "margin", "beyond", "tolerance"):
         table.add_column(name, justify="right", no_wrap=True)
     table.add_column("verdict", no_wrap=True)
     for entry in constraints:
         table.add_row(
             escape(f"{entry['name']} [{entry['unit']}]"),
-            f"{_number(entry['lower'])}..{_number(entry['upper'])}",
+            _range(entry["lower"], entry["upper"]),
             _number(entry["peak_sampled"]),
             _number(entry["peak_plant"]),
             _number(entry["worst_margin"]),
@@ -136,7 +136,13 @@ def _cell(cell: Cell) -> str:
 
 
 def _number(value: float | None) -> str:
-    return "-" if value is None else f"{value:.4g}".replace("e-0", "e-")
+    return "-" if value is None else f"{value:.3g}".replace("e-0", "e-")
+
+
+def _range(lower: float | None, upper: float | None) -> str:
+    if lower is not None and upper is not None and lower == -upper:
+        return f"±{_number(upper)}"
+    return f"{_number(lower)}..{_number(upper)}"
 
 
 def _table(title: str, caption: str | None = None) -> Table:
@@ -147,7 +153,7 @@ def _table(title: str, caption: str | None = None) -> Table:
         caption=caption,
         caption_justify="left",
         box=SIMPLE_HEAD,
-        padding=(0, 1, 0, 0),
+        padding=0,
         pad_edge=False,
     )
 

@@ -7,11 +7,11 @@ import shutil
 import time as clock
 
 import numpy as np
-from quadsim.recording import viewer_problem
 
 from mpc.solvers import SOLVERS
 from quadsim.controller import SOLVED
 from quadsim.errors import QuadsimError
+from quadsim.recording import viewer_problem
 from quadsim.vehicle import N_ROTORS
 from quadsim.video import rendering_backend
 from scenarios import runner
