@@ -1,0 +1,105 @@
+"""The layout a recording opens on: nothing is left to be clicked or unfolded."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from quadsim.audit import Limit
+from quadsim.recording.look import FRONT_PANELS, PANELS, TIMELINE
+from quadsim.rundir import Run
+from quadsim.state import POSITION, REFERENCE_NAMES, Array
+
+if TYPE_CHECKING:
+    import rerun.blueprint as rrb
+
+
+def blueprint(run: Run) -> rrb.Blueprint:
+    """Course, vehicle and summary on the left, plots on the right; nothing is left to be clicked or unfolded."""
+    import rerun.blueprint as rrb
+
+    end, limits = float(run.log.plant.t[-1]), run.limits
+    plots = [_plot(title, _contents(names, limits), end) for title, names in PANELS.items()]
+    margins = [
+        _plot(f"Margins [{unit}]", [f"margins/{limit.name}" for limit in limits if limit.unit == unit], end)
+        for unit in dict.fromkeys(limit.unit for limit in limits)
+    ]
+    times = _plot("Computation", ["solver/solve_ms", "solver/step_ms", "solver/deadline_ms"], end)
+    work = _plot("Solver", ["solver/iterations", "solver/active"], end)
+    failures = _plot("Fallback and slack", ["solver/fallback", "solver/slack"], end)
+    lanes = [f"verdicts/{limit.name}" for limit in limits if limit.start == 0.0]
+    verdicts = rrb.StateTimelineView(name="Constraints on the whole flight", contents=lanes)
+    events = rrb.TextLogView(name="Events", origin="/events")
+    behind = run.vehicle.arm_length * np.array([-3.0, -3.5, 2.2])
+    return rrb.Blueprint(
+        rrb.Horizontal(
+            rrb.Vertical(
+                _view("Course", "/world", *_overview(run)),
+                rrb.Horizontal(
+                    _view("Vehicle", "/world/vehicle", behind, np.zeros(3)),
+                    rrb.TextDocumentView(name="Summary", origin="/summary"),
+                ),
+                row_shares=[3, 2],
+            ),
+            rrb.Tabs(
+                rrb.Grid(*plots[:FRONT_PANELS], verdicts, times, grid_columns=2, name="Flight"),
+                rrb.Grid(*plots[FRONT_PANELS:], grid_columns=2, name="More signals"),
+                rrb.Grid(*margins, work, failures, events, grid_columns=2, name="Margins and solver"),
+            ),
+            column_shares=[4, 5],
+        ),
+        rrb.TimePanel(state="collapsed", timeline=TIMELINE, play_state="playing", loop_mode="all"),
+        rrb.BlueprintPanel(state="collapsed"),
+        rrb.SelectionPanel(state="collapsed"),
+        auto_layout=False,
+        auto_views=False,
+    )
+
+
+def _overview(run: Run) -> tuple[Array, Array]:
+    """Where the eye is and where it looks [m] to see the whole course."""
+    points = np.concatenate([run.log.plant.state[:, POSITION], run.log.control.reference[:, :3]])
+    points = points[np.isfinite(points).all(axis=1)]  # a flight that diverged ends in anything
+    low, high = points.min(axis=0), points.max(axis=0)
+    centre, size = (low + high) / 2, max(float(np.linalg.norm(high - low)), 10 * run.vehicle.arm_length)
+    return centre + size * np.array([0.35, -0.9, 0.3]), centre
+
+
+def _view(name: str, origin: str, eye: Array, target: Array) -> rrb.Spatial3DView:
+    """The scene as seen from a point that stands still in the frame of `origin`; the ground is drawn in the world's."""
+    import rerun.blueprint as rrb
+
+    start, now = rrb.TimeRangeBoundary.infinite(), rrb.TimeRangeBoundary.cursor_relative()
+    return rrb.Spatial3DView(
+        name=name,
+        origin=origin,
+        contents="/world/**",
+        line_grid=rrb.LineGrid3D(visible=origin == "/world", spacing=1.0),
+        eye_controls=rrb.EyeControls3D(position=eye, look_target=target),
+        overrides={"/world/flown": rrb.VisibleTimeRanges(timeline=TIMELINE, start=start, end=now)},
+    )
+
+
+def _contents(names: Sequence[str], limits: Iterable[Limit]) -> list[str]:
+    """The entities drawn together: some signals, their references and their bounds."""
+    return [
+        *(f"signals/{name}" for name in names),
+        *(f"reference/{name}" for name in names if name in REFERENCE_NAMES),
+        *(f"limits/{limit.name}" for limit in limits if limit.signal in names),
+    ]
+
+
+def _plot(title: str, contents: Sequence[str], end: float) -> rrb.TimeSeriesView:
+    """Curves over the whole flight, up to `end` [s], and the legend to their right."""
+    import rerun as rr
+    import rerun.blueprint as rrb
+
+    first, last = (rr.TimeRangeBoundary.absolute(seconds=seconds) for seconds in (0.0, 1.4 * max(end, 1e-3)))
+    return rrb.TimeSeriesView(
+        name=title,
+        contents=list(contents),
+        plot_legend=rrb.PlotLegend("RightTop"),
+        axis_x=rrb.TimeAxis(view_range=rr.TimeRange(start=first, end=last)),
+    )
