@@ -92,12 +92,12 @@ class Limit:
         if self.signal not in SIGNALS:
             raise UnknownNameError("signal", self.signal, SIGNALS)
         if not self.lower < self.upper:
-            raise ParameterError(f"constraint {self.name}", "lower", self.lower, f"below upper = {self.upper}")
+            raise ParameterError(f"constraints.{self.name}", "lower", self.lower, f"below upper = {self.upper}")
         if not 0.0 <= self.tolerance_sampled <= self.tolerance < math.inf:
             rule = f"between 0 and tolerance = {self.tolerance}"
-            raise ParameterError(f"constraint {self.name}", "tolerance_sampled", self.tolerance_sampled, rule)
+            raise ParameterError(f"constraints.{self.name}", "tolerance_sampled", self.tolerance_sampled, rule)
         if not self.start <= self.stop:
-            raise ParameterError(f"constraint {self.name}", "start", self.start, f"at most stop = {self.stop}")
+            raise ParameterError(f"constraints.{self.name}", "start", self.start, f"at most stop = {self.stop}")
 
     @property
     def unit(self) -> str:

@@ -25,14 +25,14 @@ class ParameterError(InputError):
     """A parameter is outside what is allowed.
 
     Attributes:
-        owner: the thing the parameter belongs to, e.g. `vehicle`.
+        owner: the thing the parameter belongs to, e.g. `vehicle`; empty for an option of the command line.
         name: the parameter.
         value: what was given.
         rule: what is allowed, as the end of "must be ...".
     """
 
     def __init__(self, owner: str, name: str, value: object, rule: str) -> None:
-        super().__init__(f"{owner}.{name} must be {rule}; got {value!r}")
+        super().__init__(f"{owner + '.' if owner else ''}{name} must be {rule}; got {value!r}")
         self.owner, self.name, self.value, self.rule = owner, name, value, rule
 
 

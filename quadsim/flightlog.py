@@ -195,7 +195,7 @@ def write_log(directory: Path, log: FlightLog, *, plant_stride: int, metadata: M
 def _read(path: Path) -> pa.Table:
     try:
         return pq.read_table(path, memory_map=False)
-    except (OSError, pa.ArrowInvalid) as error:
+    except (OSError, pa.ArrowException) as error:
         raise FileError(path, f"is not a readable Parquet file ({error})") from error
 
 
@@ -215,7 +215,7 @@ def read_log(directory: Path, *, reason: str | None = None) -> FlightLog:
     """
     flight, timing, plant = (_read(directory / name) for name in (FLIGHT_FILE, TIMING_FILE, PLANT_FILE))
     try:
-        before = np.array([float(text) for text in flight.schema.metadata[b"speeds_before"].decode().split(",")])
+        before = np.array([float(text) for text in (flight.schema.metadata or {})[b"speeds_before"].split(b",")])
         scalars = {
             field.name: flight.column(field.name).to_numpy()
             for field in fields(ControlLog)
@@ -235,11 +235,12 @@ def read_log(directory: Path, *, reason: str | None = None) -> FlightLog:
             speeds=_stack(plant, [f"w{i}" for i in ROTORS]),
         )
         timing_log = TimingLog(**{name: timing.column(name).to_numpy() for name in ("t", "solve_ms", "step_ms")})
-    except (KeyError, ValueError) as error:
+        predicted = _read_predicted(directory)
+    except FileError:
+        raise
+    except (AttributeError, KeyError, ValueError) as error:
         raise FileError(directory, f"lacks a column of the flight log ({error})") from error
-    return FlightLog(
-        control=control, timing=timing_log, plant=plant_log, predicted=_read_predicted(directory), reason=reason
-    )
+    return FlightLog(control=control, timing=timing_log, plant=plant_log, predicted=predicted, reason=reason)
 
 
 def _read_predicted(directory: Path) -> np.ndarray[Any, np.dtype[np.float32]] | None:

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from quadsim.controller import SOLVED
 from quadsim.flightlog import ControlLog, FlightLog, TimingLog
 from quadsim.state import REFERENCE_NAMES, REFERENCE_STATES, REFERENCE_UNITS, Array
 
@@ -49,14 +50,21 @@ def percentiles(values: Array) -> dict[str, float]:
 
 
 def controller(log: ControlLog, timing: TimingLog, deadline_ms: float) -> dict[str, Any]:
-    """Counts of solver statuses and fallbacks, iterations, residuals, and times against the deadline [ms]."""
+    """Counts of solver statuses and fallbacks, iterations, residuals, and times against the deadline [ms].
+
+    Residuals are those of the periods solved: a back end that gave up may report none, or infinite ones.
+    """
+    solved = np.array([status == SOLVED for status in log.status])
     return {
         "statuses": dict(sorted(Counter(log.status).items())),
         "fallbacks": {str(level): count for level, count in sorted(Counter(log.fallback.tolist()).items())},
         "iterations": {"mean": float(log.iterations.mean()), "max": int(log.iterations.max())},
         "active_max": int(log.active.max()),
         "active_periods": int(np.count_nonzero(log.active)),
-        "residual_max": {"primal": float(log.primal_residual.max()), "dual": float(log.dual_residual.max())},
+        "residual_max": {
+            "primal": float(np.max(log.primal_residual[solved], initial=0.0)),
+            "dual": float(np.max(log.dual_residual[solved], initial=0.0)),
+        },
         "solve_ms": percentiles(timing.solve_ms),
         "step_ms": percentiles(timing.step_ms),
         "deadline_ms": deadline_ms,

@@ -25,10 +25,19 @@ RECORDING_FILE: Final = "flight.rrd"
 VIDEO_FILE: Final = "flight.mp4"
 FIGURES_DIR: Final = "figures"
 
-_SUMMARY_KEYS: Final = {
-    "scenario", "status", "reason", "satisfied", "duration",
-    "tracking", "constraints", "control", "controller", "vehicle",
-}  # fmt: skip
+_SUMMARY_TYPES: Final = {
+    "scenario": str,
+    "status": str,
+    "reason": str | None,
+    "satisfied": bool,
+    "duration": float,
+    "tracking": dict,
+    "constraints": list,
+    "control": dict,
+    "controller": dict,
+    "vehicle": dict,
+    "files": dict,
+}
 _FREE_BYTES_NEEDED: Final = 16 * 1024 * 1024
 
 
@@ -97,29 +106,34 @@ def limit_from_json(entry: Mapping[str, Any]) -> Limit:
 
 
 def write_json(path: Path, data: Mapping[str, Any]) -> None:
-    """Write strict JSON (no NaN) with a newline at the end."""
-    path.write_text(json.dumps(data, indent=2, allow_nan=False) + "\n", encoding="utf-8")
+    """Write strict JSON (no NaN), in one step; see `write_atomically`."""
+    write_atomically(path, json.dumps(data, indent=2, allow_nan=False) + "\n")
 
 
-def write_json_atomically(path: Path, data: Mapping[str, Any]) -> None:
-    """Replace a JSON file in one step.
+def write_atomically(path: Path, text: str) -> None:
+    """Write or replace a text file in one step.
 
     Raises:
-        OutputError: it cannot be written; the old one is still there.
+        OutputError: it cannot be written; what was there is still there.
     """
     temporary = path.with_name(f".{path.name}.{os.getpid()}.partial")
     try:
-        write_json(temporary, data)
+        temporary.write_text(text, encoding="utf-8")
         temporary.replace(path)
     except OSError as error:
         raise OutputError(path, error.strerror or str(error)) from error
     finally:
-        temporary.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):
+            temporary.unlink(missing_ok=True)
 
 
 def is_run(directory: Path) -> bool:
-    """Whether a path is a run directory."""
-    return (directory / SUMMARY_FILE).is_file()
+    """Whether a path is a run directory: one with a summary of ours, since others write a `summary.json` too."""
+    try:
+        read_summary(directory)
+    except FileError:
+        return False
+    return True
 
 
 def read_summary(directory: Path) -> dict[str, Any]:
@@ -133,9 +147,11 @@ def read_summary(directory: Path) -> dict[str, Any]:
         summary = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
         raise FileError(path, f"is not a run's summary ({error})") from error
-    missing = _SUMMARY_KEYS - summary.keys() if isinstance(summary, dict) else _SUMMARY_KEYS
-    if missing:
-        raise FileError(path, f"is not a run's summary: it lacks {', '.join(sorted(missing))}")
+    if not isinstance(summary, dict):
+        raise FileError(path, "is not a run's summary: it is no table")
+    wrong = [name for name, kind in _SUMMARY_TYPES.items() if not isinstance(summary.get(name, ...), kind)]
+    if wrong:
+        raise FileError(path, f"is not a run's summary: it lacks or misstates {', '.join(wrong)}")
     return summary
 
 
@@ -146,13 +162,13 @@ def load_run(directory: Path) -> Run:
         FileError: a file is missing or damaged.
     """
     summary = read_summary(directory)
-    return Run(
-        directory=directory,
-        summary=summary,
-        log=read_log(directory, reason=summary.get("reason")),
-        vehicle=Vehicle(**summary["vehicle"]),
-        limits=tuple(limit_from_json(entry) for entry in summary["constraints"]),
-    )
+    try:
+        vehicle = Vehicle(**summary["vehicle"])
+        limits = tuple(limit_from_json(entry) for entry in summary["constraints"])
+    except (KeyError, TypeError, ValueError) as error:
+        raise FileError(directory / SUMMARY_FILE, f"is damaged ({error})") from error
+    log = read_log(directory, reason=summary["reason"])
+    return Run(directory=directory, summary=summary, log=log, vehicle=vehicle, limits=limits)
 
 
 def file_hashes(directory: Path) -> dict[str, str]:
@@ -167,18 +183,20 @@ def file_hashes(directory: Path) -> dict[str, str]:
 def refresh_hashes(directory: Path) -> None:
     """Record the hashes of a run's files again, after a product such as the video was added."""
     summary = read_summary(directory)
-    write_json_atomically(directory / SUMMARY_FILE, {**summary, "files": file_hashes(directory)})
+    write_json(directory / SUMMARY_FILE, {**summary, "files": file_hashes(directory)})
 
 
 def damaged_files(directory: Path, summary: Mapping[str, Any]) -> list[str]:
     """Files named in the summary that are missing or whose SHA-256 is not the recorded one."""
     found = file_hashes(directory)
-    return [name for name, digest in summary.get("files", {}).items() if found.get(name) != digest]
+    return [name for name, digest in summary["files"].items() if found.get(name) != digest]
 
 
 @contextlib.contextmanager
 def writing(target: Path, replaces: Callable[[Path], bool] = is_run) -> Iterator[Path]:
     """A directory to fill, which becomes `target` when the block ends well and vanishes when it does not.
+
+    Parents that are missing are made, and vanish with it.
 
     Args:
         target: the directory to make.
@@ -188,28 +206,33 @@ def writing(target: Path, replaces: Callable[[Path], bool] = is_run) -> Iterator
         OutputError: the place cannot be written, is nearly full, or holds something else.
     """
     target = Path(target)
+    missing: list[Path] = []
+    temporary: Path | None = None
     try:
         occupied = target.exists() and not (target.is_dir() and (replaces(target) or not any(target.iterdir())))
         if occupied:
             raise OutputError(target, "something else is already there; choose another --out")
+        files = [parent for parent in target.parents if parent.is_file()]
+        if files:
+            raise OutputError(target, f"{files[0]} is a file")
+        missing = [parent for parent in target.parents if not parent.exists()]
         target.parent.mkdir(parents=True, exist_ok=True)
         if shutil.disk_usage(target.parent).free < _FREE_BYTES_NEEDED:
             raise OutputError(target, "the disk is full")
         temporary = Path(tempfile.mkdtemp(prefix=f".{target.name}.", suffix=".partial", dir=target.parent))
+        temporary.chmod(0o755)
+        yield temporary
+        _replace(temporary, target)
     except OutputError:
         raise
     except OSError as error:
         raise OutputError(target, error.strerror or str(error)) from error
-    try:
-        temporary.chmod(0o755)
-        yield temporary
-        _replace(temporary, target)
-    except OSError as error:
-        if isinstance(error, OutputError):
-            raise
-        raise OutputError(target, error.strerror or str(error)) from error
     finally:
-        shutil.rmtree(temporary, ignore_errors=True)
+        if temporary is not None:
+            shutil.rmtree(temporary, ignore_errors=True)
+        for parent in missing:  # from the innermost outwards; one that is not empty stays
+            with contextlib.suppress(OSError):
+                parent.rmdir()
 
 
 def _replace(temporary: Path, target: Path) -> None:

@@ -15,6 +15,8 @@ from quadsim.errors import FileError, ParameterError, UnknownNameError
 from quadsim.state import Array
 
 N_ROTORS: Final = 4
+SMALLEST, LARGEST = 1e-12, 1e6
+"""Magnitudes that a vehicle's numbers may have; MuJoCo refuses smaller inertias, and arithmetic larger ones."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -73,7 +75,9 @@ class Vehicle:
             raise ParameterError(
                 "vehicle", "inertia", self.inertia, "such that no moment exceeds the sum of the other two"
             )
-        if abs(np.linalg.det(self.allocation / self.allocation.max(axis=1, keepdims=True))) < 1e-9:
+        b, d = self.thrust_coefficient, self.drag_coefficient
+        scale = np.array([b, b * self.arm_length, b * self.arm_length, d])
+        if abs(np.linalg.det(self.allocation / scale[:, None])) < 1e-9:
             raise ParameterError(
                 "vehicle", "rotor_azimuths", self.rotor_azimuths, "a layout that controls roll, pitch, yaw and thrust"
             )
@@ -83,6 +87,8 @@ class Vehicle:
             raise ParameterError("vehicle", name, value, "a finite number")
         if positive and value <= 0.0:
             raise ParameterError("vehicle", name, value, "positive")
+        if abs(value) > LARGEST or (positive and value < SMALLEST):
+            raise ParameterError("vehicle", name, value, f"between {SMALLEST:g} and {LARGEST:g}")
 
     def _check_vector(self, name: str, length: int, *, positive: bool) -> None:
         value = getattr(self, name)

@@ -16,6 +16,7 @@ from mpc.unconstrained import UnconstrainedMPC
 from quadsim.assets import vehicle_path
 from quadsim.audit import Limit
 from quadsim.controller import Controller
+from quadsim.errors import InputError
 from quadsim.plant import Plant
 from quadsim.state import INDEX, N_STATES, STATE_NAMES, Array, make_state
 from quadsim.vehicle import N_ROTORS, Vehicle, load_vehicle
@@ -85,11 +86,21 @@ def build_problem(scenario: Scenario, vehicle: Vehicle) -> Problem:
 
 
 def build_controller(scenario: Scenario, vehicle: Vehicle) -> Controller:
-    """The controller, set up and ready to be flown."""
+    """The controller, set up and ready to be flown.
+
+    Raises:
+        InputError: no gain can be computed from these numbers.
+    """
     problem = build_problem(scenario, vehicle)
     if isinstance(scenario.controller, ConstrainedSpec):
         return ConstrainedMPC(problem, QPSolver(scenario.controller.solver, problem))
-    return UnconstrainedMPC(problem)
+    try:
+        return UnconstrainedMPC(problem)
+    except np.linalg.LinAlgError as error:
+        raise InputError(
+            "the controller's gain cannot be computed: its weights and the vehicle's numbers are too many orders of "
+            f"magnitude apart ({error})"
+        ) from error
 
 
 def build_limits(scenario: Scenario) -> tuple[Limit, ...]:

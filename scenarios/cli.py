@@ -7,6 +7,8 @@ wrong.  Nothing heavy is imported before a command runs, so that `quadsim --help
 from __future__ import annotations
 
 import argparse
+import os
+import signal
 import sys
 from collections.abc import Sequence
 
@@ -83,19 +85,23 @@ def _add_settings(parser: argparse.ArgumentParser) -> None:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line; returns the exit status."""
     options = make_parser().parse_args(arguments)
+    if arguments is None:  # as a process of its own: being told to stop is Ctrl-C, and leaves nothing half written
+        signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         from scenarios import commands
 
-        return commands.COMMANDS[options.command](options)
+        status = commands.COMMANDS[options.command](options)
+        sys.stdout.flush()
+        return status
     except QuadsimError as error:
         print(f"quadsim: {error}", file=sys.stderr)
         return error.exit_status
     except KeyboardInterrupt:
         print("quadsim: interrupted (Ctrl-C); nothing half written was left behind", file=sys.stderr)
         return EXIT_FAILED
-    except BrokenPipeError:
-        sys.stderr.close()  # the reader of our output went away, e.g. `quadsim list | head`
-        return EXIT_DONE
+    except BrokenPipeError:  # the reader of our output went away, e.g. `quadsim check RUN | head`: no verdict was read
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return EXIT_FAILED
 
 
 if __name__ == "__main__":

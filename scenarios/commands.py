@@ -51,7 +51,7 @@ def check(options: Namespace) -> int:
     """`quadsim check`."""
     if Path(options.target).is_dir():
         if options.settings or options.seed is not None:
-            raise ParameterError("command line", "--set", options.settings, "absent when a finished run is checked")
+            raise ParameterError("", "--set", options.settings, "absent when a finished run is checked")
         summary = _read_intact_summary(Path(options.target))
     else:
         scenario = _load(options.target, options)
@@ -88,9 +88,9 @@ def video(options: Namespace) -> int:
     rundir.read_summary(directory)
     path = Path(options.out) if options.out else directory / rundir.VIDEO_FILE
     if options.workers is not None and options.workers < 1:
-        raise ParameterError("command line", "--workers", options.workers, "at least 1")
+        raise ParameterError("", "--workers", options.workers, "at least 1")
     if path.suffix not in (".mp4", ".gif"):
-        raise ParameterError("command line", "--out", options.out, "a file ending in .mp4 or .gif")
+        raise ParameterError("", "--out", options.out, "a file ending in .mp4 or .gif")
     with console.progress_bars(enabled=True) as progress:
         if path.suffix == ".gif":
             render_gif(directory, path)
@@ -154,7 +154,7 @@ def _read_intact_summary(directory: Path) -> dict[str, Any]:
     damaged = rundir.damaged_files(directory, summary)
     if damaged:
         raise FileError(directory, f"{', '.join(damaged)} missing or not the files that the summary was made from")
-    return summary
+    return rundir.load_run(directory).summary
 
 
 def _fly_for_comparison(name: str, target: Path) -> Path:

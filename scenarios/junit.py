@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
 
-from quadsim.errors import OutputError
+from quadsim.rundir import write_atomically
 
 
 def write_junit(summary: Mapping[str, Any], path: Path) -> None:
@@ -33,14 +33,11 @@ def write_junit(summary: Mapping[str, Any], path: Path) -> None:
             ElementTree.SubElement(case, "system-out").text = sentence
         else:
             ElementTree.SubElement(case, "failure", message=sentence)
-    try:
-        ElementTree.ElementTree(suite).write(path, encoding="utf-8", xml_declaration=True)
-    except OSError as error:
-        raise OutputError(path, error.strerror or str(error)) from error
+    write_atomically(path, ElementTree.tostring(suite, encoding="unicode", xml_declaration=True))
 
 
 def _sentence(entry: Mapping[str, Any]) -> str:
-    if entry["worst_margin"] is None:
+    if entry["worst_margin"] is None or entry["worst_margin_sampled"] is None:
         return "the flight ended before the constraint's time window"
     return (
         f"worst margin {entry['worst_margin']:.6g} {entry['unit']} at t = {entry['worst_time']:.3f} s "

@@ -147,7 +147,7 @@ def summarise(flight: Flight) -> dict[str, Any]:
         "status": log.status,
         "reason": log.reason,
         "satisfied": flight.satisfied,
-        "duration": log.control.t.size * scenario.control_period,
+        "duration": round(log.control.t.size * scenario.control_period, 9),
         "seed": scenario.seed,
         "tracking": numbers["tracking"],
         "constraints": [rundir.limit_to_json(finding) for finding in flight.findings],

@@ -6,11 +6,11 @@ import difflib
 import tomllib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any, Final, Literal
+from typing import Annotated, Any, Final, Literal, get_args
 
 import tomli_w
 from annotated_types import Len
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, Discriminator, Field, Tag, ValidationError, model_validator
 from pydantic_core import ErrorDetails
 
 from mpc.solvers import SOLVERS
@@ -22,11 +22,24 @@ from quadsim.state import STATE_NAMES, STATE_UNITS
 LIBRARY: Final = Path(__file__).resolve().parent / "library"
 LARGEST_HORIZON: Final = 1000
 LONGEST_FLIGHT: Final = 86_400.0
+MOST_STEPS: Final = 10_000_000
+"""Physics steps, and planned steps (periods times horizon), that one flight may take: each is held in memory."""
 
-Positive = Annotated[float, Field(gt=0.0)]
-Triple = Annotated[list[float], Len(3, 3)]
-Quadruple = Annotated[list[float], Len(4, 4)]
-Pair = Annotated[list[float], Len(2, 2)]
+Number = Annotated[float, Field(ge=-1e6, le=1e6)]
+Weight = Annotated[float, Field(gt=0.0, le=1e12)]
+Triple = Annotated[list[Number], Len(3, 3)]
+Quadruple = Annotated[list[Number], Len(4, 4)]
+Pair = Annotated[list[Number], Len(2, 2)]
+
+
+def _number_or_list(value: object) -> str:
+    return "list" if isinstance(value, list) else "number"
+
+
+Weights = Annotated[
+    Annotated[Weight, Tag("number")] | Annotated[list[Weight], Len(4, 4), Tag("list")], Discriminator(_number_or_list)
+]
+"""One weight for all rotors, or one each."""
 
 
 class ScenarioError(InputError):
@@ -42,6 +55,8 @@ class ScenarioError(InputError):
 
 
 class _Spec(BaseModel):
+    """A table of the file.  What a validator raises starts with the name of the field, for `_describe` to complete."""
+
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True, allow_inf_nan=False)
 
 
@@ -86,20 +101,21 @@ class InitialSpec(_Spec):
 class PlantSpec(_Spec):
     """The simulated vehicle."""
 
-    timestep: Annotated[float, Field(gt=0.0, le=0.01, description="physics step [s]")] = 1e-3
+    timestep: Annotated[float, Field(ge=1e-6, le=0.01, description="physics step [s]")] = 1e-3
     limit_speeds: bool = Field(default=False, description="whether rotors saturate at the vehicle's speed range")
 
 
 class WindowSpec(_Spec):
     """A value held strictly between two instants.  Eq. (30)."""
 
-    start: float = Field(description="[s]")
-    stop: float = Field(description="[s]")
-    value: float = Field(description="[m], or [deg] for yaw")
+    start: Number = Field(description="[s]")
+    stop: Number = Field(description="[s]")
+    value: Number = Field(description="[m], or [deg] for yaw")
 
     @model_validator(mode="after")
     def _check(self) -> WindowSpec:
-        _require_ordered("start, stop", (self.start, self.stop))
+        if not self.start < self.stop:
+            raise ValueError(f"start must be below stop = {self.stop}; got {self.start}")
         return self
 
 
@@ -116,7 +132,7 @@ class ReferenceSpec(_Spec):
 class InputWeightsSpec(_Spec):
     """Diagonal of Q_u."""
 
-    speed: Positive | Annotated[list[Positive], Len(4, 4)] = Field(description="for all rotors, or one each")
+    speed: Weights
 
 
 class InputBoundsSpec(_Spec):
@@ -141,12 +157,12 @@ def _known_states(values: Mapping[str, object], name: str) -> None:
         if key not in STATE_NAMES:
             near = difflib.get_close_matches(key, STATE_NAMES, n=1)
             guess = f"; did you mean {near[0]!r}?" if near else ""
-            raise ValueError(f"{name} may name only states ({', '.join(STATE_NAMES)}); got {key!r}{guess}")
+            raise ValueError(f"{name}.{key} is not a state{guess} (there are: {', '.join(STATE_NAMES)})")
 
 
 class _ControllerSpec(_Spec):
     horizon: Annotated[int, Field(ge=1, le=LARGEST_HORIZON, description="N, control periods")]
-    output_weights: Annotated[dict[str, Positive], Len(1)] = Field(description="C_r by its keys, diagonal of Q_y")
+    output_weights: Annotated[dict[str, Weight], Len(1)] = Field(description="C_r by its keys, diagonal of Q_y")
     input_weights: InputWeightsSpec
 
     @model_validator(mode="after")
@@ -175,7 +191,7 @@ class ConstrainedSpec(_ControllerSpec):
         for name, pair in self.output_bounds.items():
             _require_ordered(f"output_bounds.{name}", pair)
         if self.solver not in SOLVERS:
-            raise ValueError(str(UnknownNameError("solver", self.solver, SOLVERS)))
+            raise ValueError(f"solver: {UnknownNameError('solver', self.solver, SOLVERS)}")
         return self
 
 
@@ -184,20 +200,20 @@ class ConstraintSpec(_Spec):
 
     name: Annotated[str, Field(pattern=r"^[A-Za-z0-9_.-]+$")]
     signal: str
-    lower: float | None = None
-    upper: float | None = None
-    tolerance: Annotated[float, Field(ge=0.0, description="at the physics rate")] = 0.0
-    tolerance_sampled: Annotated[float, Field(ge=0.0, description="at the control samples")] = 0.0
+    lower: Number | None = None
+    upper: Number | None = None
+    tolerance: Annotated[float, Field(ge=0.0, le=1e6, description="at the physics rate")] = 0.0
+    tolerance_sampled: Annotated[float, Field(ge=0.0, le=1e6, description="at the control samples")] = 0.0
     required: bool = Field(default=True, description="false: measured and reported, never a failure")
-    start: float = Field(default=0.0, description="first time it holds [s]")
-    stop: float | None = Field(default=None, description="last time it holds [s]")
+    start: Number = Field(default=0.0, description="first time it holds [s]")
+    stop: Number | None = Field(default=None, description="last time it holds [s]")
 
     @model_validator(mode="after")
     def _check(self) -> ConstraintSpec:
         if self.signal not in SIGNALS:
-            raise ValueError(str(UnknownNameError("signal", self.signal, SIGNALS)))
+            raise ValueError(f"signal: {UnknownNameError('signal', self.signal, SIGNALS)}")
         if self.lower is None and self.upper is None:
-            raise ValueError("lower or upper must be given")
+            raise ValueError("lower must be given, or upper, or both")
         if self.lower is not None and self.upper is not None and self.lower >= self.upper:
             raise ValueError(f"lower must be below upper = {self.upper}; got {self.lower}")
         if self.tolerance_sampled > self.tolerance:
@@ -217,7 +233,7 @@ class Scenario(_Spec):
     duration: Annotated[float, Field(gt=0.0, le=LONGEST_FLIGHT, description="[s]")]
     control_period: Annotated[float, Field(gt=0.0, le=10.0, description="tau_s [s]")]
     seed: Annotated[int, Field(ge=0)] = 0
-    log_rate: Annotated[float, Field(gt=0.0, description="rows of plant.parquet per second [Hz]")] = 200.0
+    log_rate: Annotated[float, Field(ge=0.01, le=1e6, description="rows of plant.parquet per second [Hz]")] = 200.0
     vehicle: VehicleSpec
     initial: InitialSpec = InitialSpec()
     plant: PlantSpec = PlantSpec()
@@ -239,6 +255,12 @@ class Scenario(_Spec):
                 given = self.log_rate if name == "log_rate" else value
                 period = "have a period that is" if name == "log_rate" else "be"
                 raise ValueError(f"{name} must {period} a whole multiple of {what} = {unit} s; got {given}") from error
+        for what, count in (
+            ("physics steps", self.periods * self.steps_per_period),
+            ("planned steps", self.periods * self.controller.horizon),
+        ):
+            if count > MOST_STEPS:
+                raise ValueError(f"duration must make at most {MOST_STEPS} {what}; got {count} of them")
         names = [constraint.name for constraint in self.constraints]
         if len(set(names)) < len(names):
             raise ValueError(f"constraints must have distinct names; got {names}")
@@ -324,7 +346,7 @@ def parse_scenario(data: Mapping[str, Any], *, source: str = "scenario", directo
     try:
         scenario = Scenario.model_validate(dict(data))
     except ValidationError as error:
-        problems = [_describe(details) for details in error.errors(include_url=False)]
+        problems = [_describe(details, data) for details in error.errors(include_url=False)]
         raise ScenarioError(source, problems) from error
     file = scenario.vehicle.file
     if directory is not None and file.endswith(".toml") and (directory / file).is_file():
@@ -342,7 +364,7 @@ def apply_setting(data: dict[str, Any], setting: str) -> None:
     path, equals, text = setting.partition("=")
     keys = path.strip().split(".")
     if not equals or not all(keys):
-        raise ParameterError("command line", "--set", setting, "of the form dotted.path=value")
+        raise ParameterError("", "--set", setting, "of the form dotted.path=value")
     try:
         value: Any = tomllib.loads(f"value = {text.strip()}")["value"]
     except tomllib.TOMLDecodeError:
@@ -356,29 +378,29 @@ def apply_setting(data: dict[str, Any], setting: str) -> None:
                 raise UnknownNameError(f"entry of {'.'.join(keys[:depth])}", key, allowed)
             table = named[0]
         elif not isinstance(table, dict):
-            raise ParameterError("command line", "--set", setting, f"a path to a field; {keys[depth - 1]} has none")
+            raise ParameterError("", "--set", setting, f"a path to a field; {keys[depth - 1]} has none")
         elif depth == len(keys) - 1:
             table[key] = value
         else:
             table = table.setdefault(key, {})
 
 
-def _describe(details: ErrorDetails) -> str:
+def _describe(details: ErrorDetails, data: Mapping[str, Any]) -> str:
     """One line about one field: its name, what is allowed, what was given."""
-    location = [str(part) for part in details["loc"] if not _is_union_member(str(part))]
+    location = _location(details["loc"], data)
     field = ".".join(location)
     kind, given, context = details["type"], details["input"], details.get("ctx", {})
     if kind.startswith("union_tag"):
         given = given.get("type") if isinstance(given, dict) else given
     if kind == "missing":
-        return f"{field} is missing"
+        return f"{'.'.join([*location, str(details['loc'][-1])])} is missing"
     if kind == "extra_forbidden":
-        near = difflib.get_close_matches(location[-1], _siblings(location[:-1]), n=1)
+        allowed = _siblings(details["loc"][:-1])
+        near = difflib.get_close_matches(location[-1], allowed, n=1)
         guess = f"; did you mean {near[0]!r}?" if near else ""
-        return f"{field} is not a field of the scenario file{guess}"
+        return f"{field} is not a field of the scenario file{guess} (there are: {', '.join(allowed)})"
     if kind == "value_error":
-        reason = str(context.get("error", details["msg"]))
-        return f"{field}: {reason}" if field else reason
+        return ".".join([*location, str(context["error"])])
     rules = {
         "greater_than": "> {gt}",
         "greater_than_equal": ">= {ge}",
@@ -391,8 +413,9 @@ def _describe(details: ErrorDetails) -> str:
         "list_type": "a list",
         "dict_type": "a table",
         "model_type": "a table",
-        "too_short": "a list of at least {min_length}",
-        "too_long": "a list of at most {max_length}",
+        "model_attributes_type": "a table",
+        "too_short": "of {min_length} or more entries",
+        "too_long": "of {max_length} or fewer entries",
         "string_pattern_mismatch": "of the form {pattern}",
         "union_tag_invalid": "one of {expected_tags} in its field type",
         "union_tag_not_found": "a table with a field type",
@@ -401,21 +424,37 @@ def _describe(details: ErrorDetails) -> str:
     return f"{field} must be {rule}; got {given!r}"
 
 
-def _is_union_member(part: str) -> bool:
-    """Whether a part of a location is pydantic's label for a member of a union rather than a field."""
-    return part in ("unconstrained", "constrained") or part.startswith(("constrained-", "list["))
+def _location(path: Sequence[int | str], data: Any) -> list[str]:
+    """Names from the root to a field: pydantic's path less its labels of union members, a named entry by its name."""
+    names: list[str] = []
+    for part in path:
+        if isinstance(part, int):
+            data = data[part]
+            name = data.get("name") if isinstance(data, dict) else None
+            names.append(name if isinstance(name, str) else str(part))
+        elif isinstance(data, Mapping) and part in data:
+            data = data[part]
+            names.append(part)
+    return names
 
 
-def _siblings(location: Sequence[str]) -> list[str]:
+def _siblings(path: Sequence[int | str]) -> list[str]:
     """Field names allowed at a place in the file, for guessing what was meant."""
     models: list[type[BaseModel]] = [Scenario]
-    for part in location:
-        found = []
-        for model in models:
-            if part in model.model_fields:
-                found += _models_in(model.model_fields[part].annotation)
-        models = found or models
-    return [name for model in models for name in model.model_fields]
+    for part in path:
+        inner = [
+            model
+            for outer in models
+            if part in outer.model_fields
+            for model in _models_in(outer.model_fields[str(part)].annotation)
+        ]
+        tagged = [
+            model
+            for model in models
+            if "type" in model.model_fields and part in get_args(model.model_fields["type"].annotation)
+        ]
+        models = inner or tagged or models
+    return list(dict.fromkeys(name for model in models for name in model.model_fields))
 
 
 def _models_in(annotation: Any) -> list[type[BaseModel]]:

@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
 import numpy as np
 
 from mpc.model import LinearModel
 from mpc.problem import Bounds, Objective, Problem
-from quadsim.state import Array
+from quadsim.flightlog import ControlLog, FlightLog, PlantLog, TimingLog
+from quadsim.state import INDEX, N_STATES, Array
+from quadsim.vehicle import N_ROTORS
 from scenarios.build import build_problem, build_reference, build_vehicle
 from scenarios.spec import load_scenario
 
@@ -44,3 +50,72 @@ def _random_definite(rng: np.random.Generator, size: int) -> Array:
     factor = rng.normal(size=(size, size))
     matrix = factor @ factor.T + 0.1 * np.eye(size)
     return 0.5 * (matrix + matrix.T)
+
+
+def scenario_table() -> dict[str, Any]:
+    """A small, right scenario file as nested tables, with an entry of every kind; defaults are left out."""
+    return {
+        "name": "small",
+        "description": "one second of everything",
+        "duration": 1.0,
+        "control_period": 0.05,
+        "vehicle": {"file": "lopes2011", "mass": 4.5},
+        "reference": {"response_time": 1.0, "x": [{"start": 0.0, "stop": 0.5, "value": 1.0}]},
+        "controller": {
+            "type": "constrained",
+            "horizon": 10,
+            "output_weights": {"x": 1.0, "y": 1.0, "z": 1.0, "yaw": 1.0},
+            "input_weights": {"speed": [0.01, 0.01, 0.01, 0.01]},
+            "output_bounds": {"roll": [-5.0, 5.0]},
+            "input_bounds": {"speed": [0.0, 250.0], "slew": [-10.0, 5.0]},
+        },
+        "constraints": [{"name": "roll", "signal": "roll", "lower": -5.0, "upper": 5.0, "tolerance": 0.1}],
+    }
+
+
+def small_log(periods: int = 4, *, steps: int = 5, seed: int = 0, reason: str | None = None) -> FlightLog:
+    """A made-up flight of 0.1 s periods with `steps` physics steps each, every array filled with its own numbers."""
+    rng = np.random.default_rng(seed)
+    t = np.round(0.1 * np.arange(periods), 9)
+    rows = periods * steps + 1
+    return FlightLog(
+        control=ControlLog(
+            t=t,
+            state=rng.normal(size=(periods, N_STATES)),
+            reference=rng.normal(size=(periods, 4)),
+            speeds=rng.uniform(100.0, 250.0, (periods, N_ROTORS)),
+            speeds_before=np.array([192.8, 192.9, 193.0, 193.1]),
+            status=tuple("solved" if k % 2 == 0 else "max_iterations" for k in range(periods)),
+            iterations=rng.integers(1, 30, periods),
+            active=rng.integers(0, 30, periods),
+            fallback=rng.integers(0, 2, periods),
+            slack=rng.uniform(size=periods),
+            primal_residual=rng.uniform(size=periods),
+            dual_residual=rng.uniform(size=periods),
+        ),
+        timing=TimingLog(t=t, solve_ms=rng.uniform(size=periods), step_ms=rng.uniform(1.0, 2.0, periods)),
+        plant=PlantLog(
+            t=np.round(0.1 / steps * np.arange(rows), 9),
+            state=rng.normal(size=(rows, N_STATES)),
+            speeds=rng.uniform(100.0, 250.0, (rows, N_ROTORS)),
+        ),
+        predicted=rng.normal(size=(periods, 6, 3)).astype(np.float32) if periods else None,
+        reason=reason,
+    )
+
+
+def logged(state_name: str, *, samples: Sequence[float], plant: Sequence[float]) -> FlightLog:
+    """A made-up flight where one state is as given, in its own unit, and all else is zero.
+
+    One sample per 0.1 s; plant rows spread evenly, the first at t = 0, the last at the end of the last period.
+    """
+    steps, rest = divmod(len(plant) - 1, len(samples))
+    assert rest == 0, "plant rows must be a whole number per period, plus one"
+    log = small_log(len(samples), steps=steps)
+    control = replace(
+        log.control, state=np.zeros_like(log.control.state), reference=np.zeros_like(log.control.reference)
+    )
+    flown = replace(log.plant, state=np.zeros_like(log.plant.state))
+    control.state[:, INDEX[state_name]] = samples
+    flown.state[:, INDEX[state_name]] = plant
+    return replace(log, control=control, plant=flown)

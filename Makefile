@@ -1,0 +1,107 @@
+# quadsim: set-up and everyday commands; `make help` lists them.
+# Needs Debian or Ubuntu, make and Python 3.11 or later.  Whatever else is missing is installed: packages into .venv,
+# at the versions of constraints.txt, and system libraries through apt when run as root (else the command is printed).
+
+.NOTPARALLEL:
+.DEFAULT_GOAL := help
+.PHONY: help setup demo test check format types build numbers pins clean
+
+VENV := .venv
+PY := $(VENV)/bin/python
+QUADSIM := $(VENV)/bin/quadsim
+RUNS := runs
+OPTIONS ?=
+WORKERS ?= 2
+
+SUPPORTED := import sys; sys.exit(sys.version_info < (3, 11))
+CANDIDATES := python3.13 python3.12 python3.11 python3
+PYTHON ?= $(firstword $(foreach name,$(CANDIDATES),$(shell $(name) -c '$(SUPPORTED)' 2>/dev/null && echo $(name))))
+
+RENDERS := $(PY) -c 'from quadsim.video import rendering_backend; rendering_backend()' 2>/dev/null
+HAS_BROWSER := { command -v chromium || command -v chromium-browser || command -v google-chrome; } >/dev/null
+PIP_INSTALL := $(PY) -m pip install --quiet --disable-pip-version-check --constraint constraints.txt
+
+# $(call quietly,COMMAND,ADVICE): runs a command silently; if it fails, shows its last errors, then the advice.
+quietly = { said=$$({ $(1); } 2>&1) || { echo "$$said" | grep -iE '^(E:|error)' | tail -n 3; echo "$(2)"; false; } >&2; }
+
+# $(call apt,PACKAGES): installs system packages as root, else says how to.
+apt = if [ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null; then \
+	echo "Installing $(1)" && $(call quietly,apt-get -qq update && DEBIAN_FRONTEND=noninteractive \
+		apt-get -qq install --yes --no-install-recommends $(1),Could not install $(1) through apt.); \
+	else echo "Missing on this machine; run: sudo apt-get install --no-install-recommends $(1)" >&2; false; fi
+
+help:  ## list these targets
+	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "make %-9s %s\n", $$1, $$2 }' Makefile
+
+setup: $(VENV)/.installed $(VENV)/.renders  ## make .venv with everything pinned, ready for the others
+
+demo: setup  ## fly the paper's two flights and compare them, under runs/ (OPTIONS=--no-video to do without films)
+	@$(QUADSIM) run paper-unconstrained --out $(RUNS)/paper-unconstrained $(OPTIONS)
+	@$(QUADSIM) run paper-constrained --out $(RUNS)/paper-constrained $(OPTIONS)
+	@$(QUADSIM) compare $(RUNS)/paper-unconstrained $(RUNS)/paper-constrained --out $(RUNS)/comparison
+	@echo "Done. Open $(RUNS)/comparison/index.html in a browser."
+
+test: export OMP_NUM_THREADS := 1
+test: export OPENBLAS_NUM_THREADS := 1
+test: export MKL_NUM_THREADS := 1
+test: setup $(VENV)/.browser  ## run every test (OPTIONS="-k audit" for some)
+	@$(PY) -m pytest -q -n $(WORKERS) --dist loadscope $(OPTIONS)
+
+check: setup  ## lint, formatting and types
+	@$(PY) -m ruff check
+	@$(PY) -m ruff format --check
+	@$(PY) -m mypy
+
+format: setup  ## format the code and mend what ruff can
+	@$(PY) -m ruff check --fix
+	@$(PY) -m ruff format
+
+types: setup  ## types alone
+	@$(PY) -m mypy
+
+build: setup  ## source archive and wheel in dist/; the wheel is installed alone and flown
+	@rm -rf dist
+	@$(call quietly,$(PY) -m build --no-isolation,The packages could not be built: $(PY) -m build --no-isolation says why.)
+	@$(PY) -m pytest -q tests/test_packaging.py
+	@ls dist
+
+numbers: setup  ## remake the numbers in README.md and docs/
+	@$(PY) docs/make_numbers.py
+	@$(PY) docs/make_performance.py
+
+pins: $(VENV)/.python  ## resolve every package anew, at its newest, into constraints.txt
+	@fresh=$$(mktemp -d) && trap 'rm -rf "$$fresh"' EXIT && fresh_python="$$fresh/bin/python" && \
+	$(PYTHON) -m venv "$$fresh" && \
+	$(call quietly,"$$fresh_python" -m pip install --quiet --upgrade pip \
+		&& "$$fresh_python" -m pip install --quiet . --group dev,The packages could not be resolved.) && \
+	{ echo "# What setup installs, dependencies of dependencies included.  Made by 'make pins'; not edited by hand." && \
+	"$$fresh_python" -m pip freeze --all --exclude quadsim --exclude setuptools; } >"$$fresh/pins" && \
+	cp "$$fresh/pins" constraints.txt
+
+clean:  ## remove all that was made, except runs/
+	rm -rf $(VENV) dist .pytest_cache .ruff_cache .mypy_cache .hypothesis
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +
+
+# Set-up: each step leaves a stamp in .venv, so that it is done once, and again when what it depends on changes.
+
+$(VENV)/.python:
+	@[ -n "$(PYTHON)" ] && $(PYTHON) -c '$(SUPPORTED)' 2>/dev/null || { echo "quadsim needs Python 3.11 or later:" \
+		"sudo apt-get install python3 python3-venv, or name one: make PYTHON=/path/to/python3.12 ..." >&2; false; }
+	@$(PYTHON) -c 'import ensurepip, venv' 2>/dev/null || \
+		{ $(call apt,$$($(PYTHON) -c 'import sys; print("python%d.%d-venv" % sys.version_info[:2])')); }
+	@$(call quietly,$(PYTHON) -m venv --clear $(VENV),$(VENV) could not be made.)
+	@touch $@
+
+$(VENV)/.installed: $(VENV)/.python pyproject.toml constraints.txt
+	@echo "Installing quadsim and its packages into $(VENV); the first time takes a minute or two"
+	@$(call quietly,$(PIP_INSTALL) $$(grep '^pip==' constraints.txt) && $(PIP_INSTALL) --group dev && \
+		$(PIP_INSTALL) --no-build-isolation --editable .,The packages could not be installed. With a network at hand: make setup)
+	@touch $@
+
+$(VENV)/.renders: $(VENV)/.installed
+	@if $(RENDERS) || { { $(call apt,libegl1 libgl1 libgl1-mesa-dri); } && $(RENDERS); }; then touch $@; \
+	else echo "Until then no films are made, and their tests are skipped. Without films: make demo OPTIONS=--no-video" >&2; fi
+
+$(VENV)/.browser: $(VENV)/.installed
+	@if $(HAS_BROWSER) || { { $(call apt,chromium); } && $(HAS_BROWSER); }; then touch $@; \
+	else echo "Until then the tests that open the comparison page in a browser are skipped." >&2; fi

@@ -1,0 +1,473 @@
+"""The command line: what each command prints, its exit status, and one clear message for every wrong input."""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time as clock
+from collections.abc import Callable
+from pathlib import Path
+from xml.etree import ElementTree
+
+import pytest
+
+from mpc.solvers import SOLVERS
+from quadsim import __version__, rundir
+from quadsim.assets import vehicle_names
+from quadsim.errors import QuadsimError, RenderingUnavailableError
+from scenarios.cli import EXIT_DONE, EXIT_FAILED, EXIT_WRONG_INPUT, main
+from scenarios.spec import LIBRARY, scenario_names
+
+ROOT = Path(__file__).resolve().parents[2]
+TABLES = ("--no-video", "--no-recording", "--no-figures")
+SHORT = ("--set", "duration=0.5")
+CONTRACT = {"scenario", "status", "reason", "duration", "seed", "tracking", "constraints", "control", "controller"}
+CONTRACT |= {"wall_s", "versions", "machine", "files"}
+
+
+@pytest.fixture
+def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """An empty working directory."""
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+@pytest.fixture(scope="module")
+def hover_directory(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A finished run that holds every constraint."""
+    directory = tmp_path_factory.mktemp("runs") / "hover"
+    assert main(["run", "hover", *SHORT, *TABLES, "--out", str(directory), "--json"]) == EXIT_DONE
+    return directory
+
+
+def left_in(directory: Path) -> list[str]:
+    return sorted(path.relative_to(directory).as_posix() for path in directory.rglob("*"))
+
+
+# --- list, version, doctor -----------------------------------------------------------------------------------------
+
+
+def test_list_names_everything_with_one_line_each(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["list"]) == EXIT_DONE
+    printed = capsys.readouterr()
+    lines = {line.split()[0]: line.split(maxsplit=1)[1:] for line in printed.out.splitlines() if line.strip()}
+    for name in (*scenario_names(), *vehicle_names(), *SOLVERS, "unconstrained", "constrained"):
+        assert len(lines[name][0]) > 10
+    assert printed.err == ""
+
+
+def test_list_as_json(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["list", "--json"]) == EXIT_DONE
+    listed = json.loads(capsys.readouterr().out)
+    assert list(listed) == ["scenarios", "vehicles", "controllers", "solvers"]
+    assert list(listed["scenarios"]) == scenario_names()
+    assert list(listed["solvers"]) == list(SOLVERS)
+
+
+def test_version(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as caught:
+        main(["--version"])
+    assert caught.value.code == EXIT_DONE
+    assert capsys.readouterr().out == f"quadsim {__version__}\n"
+
+
+def test_doctor_tries_every_solver(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["doctor", "--json"]) == EXIT_DONE
+    found = json.loads(capsys.readouterr().out)
+    assert list(found) == ["machine", "packages", "rendering", "viewer", "solvers"]
+    assert list(found["solvers"]) == list(SOLVERS)
+    assert all(line.startswith("works: ") for line in found["solvers"].values())
+
+
+# --- run -----------------------------------------------------------------------------------------------------------
+
+
+def test_run_prints_tables_and_where_the_files_are(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["run", "hover", *SHORT, *TABLES]) == EXIT_DONE
+    printed = capsys.readouterr()
+    for part in ("hover  completed, every required constraint holds  0.50 s flown", "rmse", "roll [deg]", "holds"):
+        assert part in printed.out
+    assert "written to runs/hover" in printed.out
+    assert printed.err == ""
+    assert rundir.is_run(here / "runs" / "hover")
+
+
+def test_run_prints_nothing_but_the_summary_as_json(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["run", "hover", *SHORT, *TABLES, "--out", "x", "--json"]) == EXIT_DONE
+    printed = capsys.readouterr()
+    summary = json.loads(printed.out)
+    assert summary == rundir.read_summary(here / "x")
+    assert summary.keys() >= CONTRACT
+    assert printed.err == ""
+
+
+def test_settings_and_seed_reach_the_flight(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    settings = ["--set", "controller.horizon=12", "--set", "vehicle.mass=4.2", "--seed", "9"]
+    assert main(["run", "hover", *SHORT, *TABLES, *settings, "--json"]) == EXIT_DONE
+    summary = json.loads(capsys.readouterr().out)
+    assert summary["controller"]["horizon"] == 12
+    assert summary["vehicle"]["mass"] == 4.2
+    assert summary["seed"] == 9
+
+
+def test_a_file_of_ones_own_is_flown(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    text = (LIBRARY / "hover.toml").read_text().replace('name = "hover"', 'name = "mine"', 1)
+    (here / "my.toml").write_text(text)
+    assert main(["run", "my.toml", *SHORT, *TABLES, "--json"]) == EXIT_DONE
+    assert rundir.read_summary(here / "runs" / "mine")["scenario"] == "mine"
+
+
+def test_a_violated_constraint_is_status_1_and_the_run_is_kept(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["run", "hover", *SHORT, *TABLES, "--set", "constraints.speed.upper=150.0"]) == EXIT_FAILED
+    printed = capsys.readouterr()
+    assert "completed, a required constraint is violated" in printed.out
+    assert printed.out.count("VIOLATED") == 1
+    assert printed.err == ""
+    assert rundir.is_run(here / "runs" / "hover")
+
+
+def test_a_violated_constraint_that_is_not_required_is_status_0(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    settings = ["--set", "constraints.speed.upper=150.0", "--set", "constraints.speed.required=false"]
+    assert main(["run", "hover", *SHORT, *TABLES, *settings]) == EXIT_DONE
+    assert "exceeded*" in capsys.readouterr().out
+
+
+def test_an_aborted_flight_is_status_1_with_its_reason(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["run", "hover", *SHORT, *TABLES, "--set", "initial.euler=[60.0, 0.0, 0.0]"]) == EXIT_FAILED
+    assert "aborted: at t = 0.000 s: the solver answered 'primal_infeasible'" in capsys.readouterr().out
+    assert rundir.read_summary(here / "runs" / "hover")["status"] == "aborted"
+
+
+# --- check ---------------------------------------------------------------------------------------------------------
+
+
+def test_check_flies_a_scenario_and_writes_nothing(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["check", "hover", *SHORT]) == EXIT_DONE
+    assert main(["check", "hover", *SHORT, "--set", "constraints.speed.upper=150.0"]) == EXIT_FAILED
+    assert capsys.readouterr().out.count("VIOLATED") == 1
+    assert left_in(here) == []
+
+
+def test_check_reads_a_finished_run(
+    hover_directory: Path, short_run_directory: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["check", str(hover_directory), "--json"]) == EXIT_DONE
+    assert json.loads(capsys.readouterr().out) == rundir.read_summary(hover_directory)
+    # Six seconds never reach the windows of the arrival, and what was not reached was not held.
+    assert main(["check", str(short_run_directory)]) == EXIT_FAILED
+    assert "VIOLATED" in capsys.readouterr().out
+
+
+def test_check_writes_its_verdicts_as_junit(
+    hover_directory: Path, short_run_directory: Path, here: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    suites = []
+    for directory in (hover_directory, short_run_directory):
+        main(["check", str(directory), "--junit", "verdicts.xml"])
+        suites.append(ElementTree.parse("verdicts.xml").getroot())
+    assert [(suite.tag, suite.get("tests"), suite.get("failures")) for suite in suites] == [
+        ("testsuite", "8", "0"),
+        ("testsuite", "9", "4"),
+    ]
+    for suite in suites:
+        cases = suite.findall("testcase")
+        assert len(cases) == int(suite.get("tests", ""))
+        assert [case.get("name") for case in cases][:3] == ["flight", "roll", "pitch"]
+        assert len(suite.findall("testcase/failure")) == int(suite.get("failures", ""))
+    assert suites[0].findtext("testcase[@name='roll']/system-out", "").startswith("worst margin 5 deg at t = ")
+    (failure, *_) = suites[1].findall("testcase/failure")
+    assert failure.get("message") == "the flight ended before the constraint's time window"
+    assert left_in(here) == ["verdicts.xml"]
+
+
+def test_junit_tells_an_aborted_flight_with_its_reason(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    settings = ["--set", "initial.euler=[60.0, 0.0, 0.0]", "--junit", "verdicts.xml"]
+    assert main(["check", "hover", *SHORT, *settings]) == EXIT_FAILED
+    failure = ElementTree.parse("verdicts.xml").find("testcase[@name='flight']/failure")
+    assert failure is not None
+    assert failure.get("message", "").startswith("at t = 0.000 s: the solver answered 'primal_infeasible'")
+
+
+# --- compare, video, view ------------------------------------------------------------------------------------------
+
+
+def test_compare_makes_a_page_and_prints_a_table(
+    hover_directory: Path, short_run_directory: Path, here: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    runs = [str(short_run_directory), str(hover_directory)]
+    assert main(["compare", *runs, "--out", "page", "--markdown"]) == EXIT_DONE
+    header = capsys.readouterr().out.splitlines()[0]
+    assert "paper-constrained" in header
+    assert "hover" in header
+    assert (here / "page" / "index.html").is_file()
+
+
+def test_a_film_beside_a_run_is_not_hashed_and_one_in_it_is(
+    hover_directory: Path, here: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    shutil.copytree(hover_directory, "run")
+    monkeypatch.setattr("quadsim.video.render_video", lambda _, path, **__: path.write_bytes(b"film"))
+    assert main(["video", "run", "--out", "beside.mp4"]) == EXIT_DONE
+    assert "flight.mp4" not in rundir.read_summary(here / "run")["files"]
+    assert main(["video", "run"]) == EXIT_DONE
+    assert "flight.mp4" in rundir.read_summary(here / "run")["files"]
+    assert main(["check", "run"]) == EXIT_DONE
+    assert "written to run/flight.mp4" in capsys.readouterr().out
+
+
+# --- wrong input: status 2, one message, no traceback, nothing made ------------------------------------------------
+
+RUN = ["run", "hover", *SHORT, *TABLES]
+WRONG: dict[str, tuple[list[str], str]] = {
+    "no such scenario": (["run", "hovr"], "no scenario named 'hovr'; did you mean 'hover'?"),
+    "no such file": (["run", "gone.toml"], "gone.toml: no such scenario file"),
+    "a directory": (["run", "folder"], "folder is a directory; give a scenario's name or its TOML file"),
+    "not TOML": (["run", "bad.toml"], "bad.toml: is not valid TOML: "),
+    "a misspelt field": ([*RUN, "--set", "controller.horizn=3"], "controller.horizn is not a field of the scenario"),
+    "horizon 0": ([*RUN, "--set", "controller.horizon=0"], "controller.horizon must be >= 1; got 0"),
+    "no mass": ([*RUN, "--set", "vehicle.mass=0"], "vehicle.mass must be positive; got 0.0"),
+    "a negative mass": ([*RUN, "--set", "vehicle.mass=-4"], "vehicle.mass must be positive; got -4.0"),
+    "a weight of 0": ([*RUN, "--set", "controller.output_weights.z=0"], "controller.output_weights.z must be > 0.0"),
+    "a negative weight": ([*RUN, "--set", "controller.input_weights.speed=-1"], "input_weights.speed must be > 0.0"),
+    "crossed output bounds": (
+        [*RUN, "--set", "controller.output_bounds.roll=[5, -5]"],
+        "controller.output_bounds.roll must have its lower bound below its upper; got [5.0, -5.0]",
+    ),
+    "crossed speeds": ([*RUN, "--set", "vehicle.speed_min=300"], "vehicle.speed_min must be below speed_max = 250.0"),
+    "a period between steps": (
+        [*RUN, "--set", "control_period=0.0503"],
+        "control_period must be a whole multiple of the physics step plant.timestep = 0.001 s; got 0.0503",
+    ),
+    "no solver": ([*RUN, "--set", "controller.solver=osqp"], "no solver named 'osqp' (there are: piqp-dense,"),
+    "no vehicle": (
+        [*RUN, "--set", "vehicle.file=lopez2011"],
+        "no vehicle named 'lopez2011'; did you mean 'lopes2011'?",
+    ),
+    "a setting without a value": ([*RUN, "--set", "duration"], "--set must be of the form dotted.path=value"),
+    "a negative seed": ([*RUN, "--seed", "-1"], "seed must be >= 0; got -1"),
+    "out below a file": ([*RUN, "--out", "file/run"], "cannot write file/run: file is a file"),
+    "out is a file": ([*RUN, "--out", "file"], "cannot write file: something else is already there"),
+    "out is no run": ([*RUN, "--out", "folder"], "cannot write folder: something else is already there"),
+    "out cannot be written": ([*RUN, "--out", "/proc/quadsim/run"], "cannot write /proc/quadsim/run: "),
+    "out has too long a name": ([*RUN, "--out", "x" * 300], ": File name too long"),
+    "check of nothing": (["check", "gone"], "no scenario named 'gone'"),
+    "check of no run": (["check", "folder"], "folder/summary.json: is not a run's summary"),
+    "check of a run with settings": (["check", "folder", "--seed", "1"], "absent when a finished run is checked"),
+    "junit below a file": (["check", "hover", *SHORT, "--junit", "file/v.xml"], "cannot write file/v.xml: "),
+    "compare of nothing": (["compare", "gone", "--out", "page"], "no scenario named 'gone'"),
+    "compare of no run": (["compare", "folder", "--out", "page"], "folder/summary.json: is not a run's summary"),
+    "video of nothing": (["video", "gone"], "gone/summary.json: is not a run's summary"),
+    "view of nothing": (["view", "gone"], "gone: no such recording; run the scenario with --recording"),
+    "view of a run without one": (["view", "folder"], "folder/flight.rrd: no such recording"),
+}
+
+
+@pytest.mark.parametrize(("arguments", "message"), WRONG.values(), ids=WRONG)
+def test_wrong_input_is_status_2_with_one_message_and_leaves_nothing(
+    here: Path, capsys: pytest.CaptureFixture[str], arguments: list[str], message: str
+) -> None:
+    (here / "folder").mkdir()
+    (here / "folder" / "theirs.txt").write_text("theirs")
+    (here / "file").write_text("mine")
+    (here / "bad.toml").write_text("name = ")
+    before = left_in(here)
+    assert main(arguments) == EXIT_WRONG_INPUT
+    printed = capsys.readouterr()
+    assert printed.out == ""
+    assert printed.err.startswith("quadsim: ")
+    assert message in printed.err
+    assert len(printed.err.splitlines()) == 1
+    assert left_in(here) == before
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ([], "the following arguments are required: COMMAND"),
+        (["fly"], "invalid choice: 'fly'"),
+        (["run"], "the following arguments are required: SCENARIO"),
+        (["run", "hover", "--fast"], "unrecognized arguments: --fast"),
+        (["run", "hover", "--seed", "many"], "argument --seed: invalid int value: 'many'"),
+        (["compare", "hover"], "the following arguments are required: --out"),
+    ],
+)
+def test_a_wrong_command_line_is_status_2(
+    here: Path, capsys: pytest.CaptureFixture[str], arguments: list[str], message: str
+) -> None:
+    with pytest.raises(SystemExit) as caught:
+        main(arguments)
+    assert caught.value.code == EXIT_WRONG_INPUT
+    assert message in capsys.readouterr().err
+    assert left_in(here) == []
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--workers", "0"], "--workers must be at least 1; got 0"),
+        (["--out", "film.avi"], "--out must be a file ending in .mp4 or .gif; got 'film.avi'"),
+    ],
+)
+def test_wrong_options_of_video_are_refused(
+    hover_directory: Path, here: Path, capsys: pytest.CaptureFixture[str], options: list[str], message: str
+) -> None:
+    assert main(["video", str(hover_directory), *options]) == EXIT_WRONG_INPUT
+    assert capsys.readouterr().err == f"quadsim: {message}\n"
+    assert left_in(here) == []
+
+
+def delete(directory: Path) -> None:
+    (directory / "plant.parquet").unlink()
+
+
+def cut_off(directory: Path) -> None:
+    path = directory / "plant.parquet"
+    path.write_bytes(path.read_bytes()[:-50])
+
+
+def flip_a_bit(directory: Path) -> None:
+    path = directory / "plant.parquet"
+    content = bytearray(path.read_bytes())
+    content[len(content) // 2] ^= 1
+    path.write_bytes(content)
+
+
+@pytest.mark.parametrize("damage", [delete, cut_off, flip_a_bit])
+def test_check_finds_a_damaged_file(
+    hover_directory: Path, here: Path, capsys: pytest.CaptureFixture[str], damage: Callable[[Path], None]
+) -> None:
+    shutil.copytree(hover_directory, "run")
+    damage(here / "run")
+    assert main(["check", "run"]) == EXIT_WRONG_INPUT
+    printed = capsys.readouterr()
+    assert printed.err == "quadsim: run: plant.parquet missing or not the files that the summary was made from\n"
+    assert printed.out == ""
+
+
+def test_a_run_that_needs_a_film_is_refused_before_it_is_flown_where_nothing_renders(
+    here: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def nothing_renders() -> str:
+        raise RenderingUnavailableError({"egl": "no libEGL", "osmesa": "no libOSMesa"})
+
+    monkeypatch.setattr("quadsim.video.rendering_backend", nothing_renders)
+    a_day = ["--set", "duration=86400", "--set", "plant.timestep=0.01", "--set", "log_rate=100"]
+    assert main(["run", "hover", *a_day]) == EXIT_WRONG_INPUT
+    printed = capsys.readouterr()
+    assert printed.err.startswith(
+        "quadsim: no off-screen OpenGL on this machine (egl: no libEGL; osmesa: no libOSMesa)"
+    )
+    assert "or run with --no-video" in printed.err
+    assert left_in(here) == []
+    assert main(["run", "hover", *SHORT, *TABLES, "--json"]) == EXIT_DONE  # which works
+
+
+@pytest.mark.parametrize("free", [0, 2**20])
+def test_a_full_disk_is_status_2_and_leaves_nothing(
+    here: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], free: int
+) -> None:
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: shutil._ntuple_diskusage(2**30, 2**30 - free, free))
+    assert main([*RUN, "--out", "new/run"]) == EXIT_WRONG_INPUT
+    assert capsys.readouterr().err == "quadsim: cannot write new/run: the disk is full\n"
+    assert left_in(here) == []
+
+
+def test_a_disk_that_fills_up_in_the_writing_is_status_2_and_leaves_nothing(
+    here: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def full(*_: object, **__: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr("pyarrow.parquet.write_table", full)
+    assert main([*RUN, "--out", "new/run"]) == EXIT_WRONG_INPUT
+    assert capsys.readouterr().err == "quadsim: cannot write new/run: No space left on device\n"
+    assert left_in(here) == []
+
+
+# --- as a process of its own ---------------------------------------------------------------------------------------
+
+
+def environment() -> dict[str, str]:
+    return os.environ | {"PYTHONPATH": str(ROOT)}
+
+
+def quadsim(*arguments: str, cwd: Path) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "scenarios.cli", *arguments]
+    return subprocess.run(command, cwd=cwd, env=environment(), capture_output=True, text=True, check=False, timeout=60)
+
+
+def test_a_process_says_one_thing_and_shows_no_traceback(tmp_path: Path) -> None:
+    done = quadsim("run", "hover", "--set", "controller.horizon=0", cwd=tmp_path)
+    assert (done.returncode, done.stdout) == (EXIT_WRONG_INPUT, "")
+    assert done.stderr == "quadsim: hover.toml: controller.horizon must be >= 1; got 0\n"
+    assert left_in(tmp_path) == []
+
+
+@pytest.mark.parametrize("options", [[], ["--json"]])
+def test_a_reader_that_goes_away_gets_no_traceback_and_no_status_0(options: list[str]) -> None:
+    """`quadsim list | true`."""
+    command = [sys.executable, "-m", "scenarios.cli", "list", *options]
+    process = subprocess.Popen(command, env=environment(), stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    assert process.stdout is not None
+    assert process.stderr is not None
+    process.stdout.close()
+    said = process.stderr.read()
+    process.stderr.close()
+    assert (process.wait(timeout=60), said) == (EXIT_FAILED, b"")
+
+
+@pytest.mark.parametrize("stop", [signal.SIGINT, signal.SIGTERM])
+def test_a_long_flight_that_is_stopped_is_kept_up_to_there(tmp_path: Path, stop: signal.Signals) -> None:
+    process = subprocess.Popen(
+        [sys.executable, "-m", "scenarios.cli", "run", "hover", *TABLES, "--set", "duration=1800", "--out", "run"],
+        cwd=tmp_path,
+        env=environment(),
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),  # a shell's `&` has it ignored
+    )
+    deadline = clock.monotonic() + 30.0
+    while not list(tmp_path.glob(".run.*.partial")):
+        assert clock.monotonic() < deadline, "the flight did not begin"
+        clock.sleep(0.02)
+    clock.sleep(1.5)
+    process.send_signal(stop)
+    out, err = process.communicate(timeout=30)
+    assert (process.returncode, err) == (EXIT_FAILED, "")
+    assert "interrupted (Ctrl-C)" in out
+    assert [path.name for path in tmp_path.iterdir()] == ["run"]
+    run = rundir.load_run(tmp_path / "run")
+    assert run.summary["status"] == "aborted"
+    assert run.summary["reason"].endswith("interrupted (Ctrl-C)")
+    assert 0.0 < run.summary["duration"] < 1800.0
+    assert run.log.control.t.size * 0.05 == pytest.approx(run.summary["duration"])
+    assert run.log.plant.t[-1] == pytest.approx(run.summary["duration"])
+    assert rundir.damaged_files(run.directory, run.summary) == []
+
+
+def test_ctrl_c_outside_a_flight_is_status_1_and_leaves_nothing(
+    here: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def interrupted(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("quadsim.figures.write_figures", interrupted)
+    assert main(["run", "hover", *SHORT, "--no-video", "--no-recording"]) == EXIT_FAILED
+    assert capsys.readouterr().err == "quadsim: interrupted (Ctrl-C); nothing half written was left behind\n"
+    assert left_in(here) == []
+
+
+def test_a_defect_of_our_own_shows_its_traceback(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def broken(*_: object, **__: object) -> None:
+        raise ZeroDivisionError
+
+    assert not issubclass(ZeroDivisionError, QuadsimError)
+    monkeypatch.setattr("scenarios.runner.fly", broken)
+    with pytest.raises(ZeroDivisionError):
+        main(["check", "hover"])

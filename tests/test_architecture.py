@@ -1,0 +1,158 @@
+"""Who may import whom, and when: the arrows between the packages, and a command line that answers at once."""
+
+from __future__ import annotations
+
+import ast
+import re
+import subprocess
+import sys
+import time as clock
+import tomllib
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parent.parent
+PACKAGES = ("quadsim", "mpc", "scenarios")
+MPC_MAY_IMPORT = {"quadsim.vehicle", "quadsim.state", "quadsim.errors", "quadsim.controller"}
+RENDER_WORKER = "quadsim.render_worker"
+"""Only ever run as a child process, so it alone may import at its top what is heavy."""
+OF_ONE_ROOM = ("rerun", "imageio", "imageio_ffmpeg", "matplotlib", "plotly", "jinja2", "dask")
+IMPORT_NAMES = {"pillow": "PIL", "rerun-sdk": "rerun"}
+"""Distributions whose import name is not their own."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Import:
+    """One module named by one import statement."""
+
+    importer: str
+    imported: str
+    at_start: bool
+    """Carried out as the importer is: neither in a function nor under TYPE_CHECKING."""
+
+    @property
+    def room(self) -> str:
+        """The module of the first level that the importer is, or is part of, e.g. `quadsim.recording`."""
+        return ".".join(self.importer.split(".")[:2])
+
+    @property
+    def library(self) -> str:
+        return self.imported.partition(".")[0]
+
+
+def modules() -> dict[str, Path]:
+    """Our modules by dotted name."""
+    files = [path for package in PACKAGES for path in (ROOT / package).rglob("*.py")]
+    return {".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__"): path for path in files}
+
+
+def imports_of(importer: str, source: str, ours: set[str]) -> Iterator[Import]:
+    """Every import of a module's source; `from package import module` names the module."""
+
+    def visit(node: ast.AST, at_start: bool) -> Iterator[Import]:
+        names: list[str] = []
+        if isinstance(node, ast.Import):
+            names = [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{importer} imports relatively; name the package"
+            members = [f"{node.module}.{alias.name}" for alias in node.names]
+            names = [member if member in ours else str(node.module) for member in members]
+        yield from (Import(importer=importer, imported=name, at_start=at_start) for name in names)
+        typing_only = isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING"
+        later = isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda) or typing_only
+        for child in ast.iter_child_nodes(node):
+            yield from visit(child, at_start and not later)
+
+    yield from visit(ast.parse(source), True)
+
+
+@pytest.fixture(scope="module")
+def imports() -> list[Import]:
+    ours = modules()
+    found = [item for name, path in ours.items() for item in imports_of(name, path.read_text(), set(ours))]
+    assert {item.importer.partition(".")[0] for item in found} == set(PACKAGES)
+    return found
+
+
+def loaded_by(code: str) -> set[str]:
+    """Top-level names of all modules that a fresh interpreter has loaded after some code."""
+    report = "import sys\nprint(*{name.partition('.')[0] for name in sys.modules}, file=sys.stderr)"
+    command = [sys.executable, "-c", f"{code}\n{report}"]
+    return set(subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True).stderr.split())
+
+
+def declared() -> set[str]:
+    """Import names of the run-time dependencies in pyproject.toml."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    names = [re.split(r"[<>=!~\[; ]", requirement, maxsplit=1)[0] for requirement in project["dependencies"]]
+    return {IMPORT_NAMES.get(name, name.replace("-", "_")) for name in names}
+
+
+def test_imports_are_told_apart() -> None:
+    source = (
+        "import a.b\nfrom typing import TYPE_CHECKING\nif TYPE_CHECKING:\n    import c\nelse:\n    pass\n"
+        "class K:\n    import d\n    def f(self):\n        from quadsim import state, __version__\n"
+    )
+    found = {(item.imported, item.at_start) for item in imports_of("x", source, {"quadsim", "quadsim.state"})}
+    assert found == {
+        ("a.b", True),
+        ("typing", True),
+        ("c", False),
+        ("d", True),
+        ("quadsim.state", False),
+        ("quadsim", False),
+    }
+
+
+def test_the_testbed_imports_nothing_of_ours(imports: list[Import]) -> None:
+    assert not [i for i in imports if i.importer.startswith("quadsim") and i.library in {"mpc", "scenarios", "piqp"}]
+
+
+def test_controllers_know_vehicle_state_errors_and_protocol_alone(imports: list[Import]) -> None:
+    named = {i.imported for i in imports if i.importer.startswith("mpc")}
+    assert {name for name in named if name.startswith(("quadsim", "scenarios"))} <= MPC_MAY_IMPORT
+    assert "mujoco" not in {name.partition(".")[0] for name in named}
+
+
+def test_controllers_run_without_a_simulator() -> None:
+    loaded = loaded_by("import " + ", ".join(name for name in modules() if name.startswith("mpc")))
+    assert {"mpc", "quadsim", "piqp"} <= loaded
+    assert not loaded & {"mujoco", "scenarios", "pydantic", *OF_ONE_ROOM}
+
+
+@pytest.mark.parametrize("library", OF_ONE_ROOM)
+def test_a_library_for_outputs_is_imported_in_one_room_and_late(library: str, imports: list[Import]) -> None:
+    uses = [item for item in imports if item.library == library]
+    assert len({item.room for item in uses}) <= 1
+    assert not [item for item in uses if item.at_start and item.importer != RENDER_WORKER]
+
+
+def test_the_render_worker_is_imported_by_nobody(imports: list[Import]) -> None:
+    assert RENDER_WORKER in modules()
+    assert RENDER_WORKER not in {item.imported for item in imports}
+
+
+def test_what_is_imported_is_what_is_declared(imports: list[Import]) -> None:
+    assert {item.library for item in imports} - set(sys.stdlib_module_names) - set(PACKAGES) == declared()
+
+
+def test_help_loads_no_library() -> None:
+    loaded = loaded_by("import scenarios.cli\ntry: scenarios.cli.main(['--help'])\nexcept SystemExit: pass")
+    assert "scenarios" in loaded
+    assert not loaded & declared()
+
+
+def test_help_answers_at_once() -> None:
+    """The best of five starts: a busy machine is slow now and then, slow imports are so each time."""
+    times = []
+    for _ in range(5):
+        started = clock.perf_counter()
+        done = subprocess.run(
+            [sys.executable, "-m", "scenarios.cli", "--help"], cwd=ROOT, capture_output=True, check=True
+        )
+        times.append(clock.perf_counter() - started)
+        assert b"usage: quadsim" in done.stdout
+    assert min(times) < 0.5

@@ -1,0 +1,108 @@
+"""The commands in the documents exist, and run as they are printed."""
+
+from __future__ import annotations
+
+import re
+import shlex
+import shutil
+import subprocess
+import time as clock
+from argparse import Namespace
+from pathlib import Path
+
+import pytest
+
+from quadsim.errors import RenderingUnavailableError
+from quadsim.video import rendering_backend
+from scenarios.cli import EXIT_DONE, main, make_parser
+from scenarios.commands import COMMANDS
+from scenarios.spec import load_scenario
+
+ROOT = Path(__file__).resolve().parent.parent
+ADDED = {"run": ("--no-video",)}
+"""What makes a command cheap enough to run here."""
+
+
+DOCUMENTS = "\n".join((ROOT / name).read_text() for name in ("README.md", "CONTRIBUTING.md"))
+LINES = [
+    line.strip()
+    for block in re.findall(r"^```sh\n(.*?)^```", DOCUMENTS, re.DOTALL | re.MULTILINE)
+    for line in block.splitlines()
+]
+QUADSIM = [line.partition("#")[0].strip() for line in LINES if line.startswith("quadsim ")]
+RUNNABLE = [line for line in QUADSIM if not line.startswith("quadsim view")]  # `view` opens a window and stays
+
+
+def arguments_of(line: str) -> list[str]:
+    """A command line's words after the command itself, without its comment."""
+    return shlex.split(line, comments=True)[1:]
+
+
+def promised_file(options: Namespace) -> Path | None:
+    """What a command writes, as the documents tell it."""
+    match options.command:
+        case "run":
+            return Path(options.out or f"runs/{options.scenario}") / "summary.json"
+        case "check":
+            return Path(options.junit)
+        case "compare":
+            return Path(options.out) / "index.html"
+        case "video":
+            return Path(options.run) / "flight.mp4"
+    return None
+
+
+@pytest.fixture
+def workplace(short_run_directory: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The working directory after `make demo`, with a shorter flight in the place of both."""
+    for name in ("paper-unconstrained", "paper-constrained"):
+        shutil.copytree(short_run_directory, tmp_path / "runs" / name)
+    monkeypatch.chdir(tmp_path)
+
+
+def test_every_command_is_documented_and_every_documented_one_exists() -> None:
+    assert len(QUADSIM) >= 5
+    assert {make_parser().parse_args(arguments_of(line)).command for line in QUADSIM} == set(COMMANDS)
+
+
+@pytest.mark.parametrize("line", QUADSIM)
+def test_documented_scenarios_and_settings_are_valid(line: str) -> None:
+    options = make_parser().parse_args(arguments_of(line))
+    scenario = getattr(options, "scenario", None) or getattr(options, "target", None)
+    if scenario is not None:
+        load_scenario(scenario, options.settings)
+
+
+@pytest.mark.usefixtures("workplace")
+@pytest.mark.parametrize("line", RUNNABLE)
+def test_documented_command_runs(line: str, capsys: pytest.CaptureFixture[str]) -> None:
+    arguments = arguments_of(line)
+    if arguments[0] == "video":
+        try:
+            rendering_backend()
+        except RenderingUnavailableError as error:
+            pytest.skip(str(error))
+    started = clock.time()
+    assert main([*arguments, *ADDED.get(arguments[0], ())]) == EXIT_DONE
+    assert capsys.readouterr().out
+    promised = promised_file(make_parser().parse_args(arguments))
+    assert promised is None or promised.stat().st_mtime >= started - 0.1
+
+
+def test_documented_make_targets_exist() -> None:
+    blocks = {
+        target
+        for line in LINES
+        if line.startswith("make ")
+        for target in re.findall(r" ([a-z]+)\b", line.partition("#")[0])
+    }
+    named = blocks | set(re.findall(r"`make ([a-z]+)", DOCUMENTS))
+    assert {"demo", "test", "setup", "check", "numbers"} <= named
+    said = subprocess.run(
+        ["make", "--no-print-directory", "help"], cwd=ROOT, capture_output=True, text=True, check=True
+    )
+    offered = re.findall(r"^make (\w+) +\S", said.stdout, re.MULTILINE)
+    phony = re.search(r"^\.PHONY: (.+)$", (ROOT / "Makefile").read_text(), re.MULTILINE)
+    assert phony is not None
+    assert sorted(offered) == sorted(phony[1].split())
+    assert named <= set(offered)

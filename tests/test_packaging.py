@@ -1,0 +1,130 @@
+"""The wheel is complete: installed alone and outside the checkout it flies.  Pins and version numbers agree."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import subprocess
+import sys
+import sysconfig
+import tarfile
+import tomllib
+import venv
+import zipfile
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+from quadsim import __version__
+
+ROOT = Path(__file__).resolve().parent.parent
+PACKAGES = ("quadsim", "mpc", "scenarios")
+DATA = ("*.py", "py.typed", "*.toml", "*.xml", "*.j2", "*.css", "*.js")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Archives:
+    """What a build made."""
+
+    wheel: Path
+    sdist: Path
+
+
+@pytest.fixture(scope="module")
+def archives(tmp_path_factory: pytest.TempPathFactory) -> Archives:
+    """The source archive, and the wheel built from that archive, not from the checkout."""
+    directory = tmp_path_factory.mktemp("dist")
+    command: list[str | Path] = [sys.executable, "-m", "build", "--no-isolation", "--outdir", directory, ROOT]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout + done.stderr
+    (wheel,), (sdist,) = directory.glob("*.whl"), directory.glob("*.tar.gz")
+    return Archives(wheel=wheel, sdist=sdist)
+
+
+@pytest.fixture(scope="module")
+def installed(archives: Archives, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """`bin` of an environment with the wheel in it, and of this one's packages all but the checkout.
+
+    The packages come from a path file, which is read without the path files beside them: no editable install follows.
+    """
+    home = tmp_path_factory.mktemp("environment")
+    venv.create(home)
+    python = home / "bin" / "python"
+    command: list[str | Path] = [sys.executable, "-m", "pip", "--python", python, "install", "--no-index", "--no-deps"]
+    subprocess.run([*command, archives.wheel], check=True, capture_output=True)
+    (site,) = home.glob("lib/python*/site-packages")
+    (site / "dependencies.pth").write_text(sysconfig.get_path("purelib") + "\n")
+    return home / "bin"
+
+
+def run_alone(command: list[str | Path], directory: Path) -> str:
+    """Standard output of a command in a directory, with nothing that leads back to the checkout."""
+    environment = {name: value for name, value in os.environ.items() if not name.startswith("PYTHON")}
+    done = subprocess.run(command, cwd=directory, env=environment, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def test_wheel_holds_every_file_of_the_packages(archives: Archives) -> None:
+    files = {path for package in PACKAGES for pattern in DATA for path in (ROOT / package).rglob(pattern)}
+    expected = {path.relative_to(ROOT).as_posix() for path in files}
+    expected |= {f"quadsim/models/{path.name}" for path in (ROOT / "models").iterdir()}
+    with zipfile.ZipFile(archives.wheel) as wheel:
+        held = {name for name in wheel.namelist() if ".dist-info/" not in name}
+    assert held == expected
+    assert {"quadsim/models/quadrotor.xml", "quadsim/py.typed", "scenarios/library/hover.toml"} <= held
+    assert any(name.startswith("quadsim/templates/") for name in held)
+
+
+def test_source_archive_can_be_built_and_tested_from(archives: Archives) -> None:
+    with tarfile.open(archives.sdist) as sdist:
+        held = {name.partition("/")[2] for name in sdist.getnames()}
+    assert {"Makefile", "constraints.txt", "README.md", "LICENSE", "CITATION.cff", "tests/conftest.py"} <= held
+    assert not [name for name in held if "__pycache__" in name or name.startswith(("runs/", ".venv/"))]
+
+
+def test_wheel_flies_alone(installed: Path, tmp_path: Path) -> None:
+    code = "import quadsim, mpc, scenarios; print(quadsim.__file__, mpc.__file__, scenarios.__file__)"
+    places = run_alone([installed / "python", "-c", code], tmp_path).split()
+    assert all(Path(place).is_relative_to(installed.parent) for place in places), places
+
+    assert "paper-constrained" in run_alone([installed / "quadsim", "list"], tmp_path)
+
+    flight = ["run", "hover", "--no-video", "--no-recording", "--no-figures", "--json"]
+    summary = json.loads(run_alone([installed / "quadsim", *flight], tmp_path))
+    assert summary["status"] == "completed"
+    assert summary["satisfied"]
+    assert (tmp_path / "runs" / "hover" / "flight.parquet").is_file()
+
+    run_alone([installed / "quadsim", "compare", "runs/hover", "--out", "page"], tmp_path)
+    assert (tmp_path / "page" / "index.html").is_file()
+
+
+def test_version_is_the_same_everywhere(archives: Archives) -> None:
+    said = subprocess.run(
+        [sys.executable, "-m", "scenarios.cli", "--version"], cwd=ROOT, capture_output=True, text=True
+    )
+    changes = re.search(r"^## \[(.+?)\]", (ROOT / "CHANGELOG.md").read_text(), re.MULTILINE)
+    citation = re.search(r"^version: (.+)$", (ROOT / "CITATION.cff").read_text(), re.MULTILINE)
+    assert changes is not None
+    assert citation is not None
+    assert said.stdout.strip() == f"quadsim {__version__}"
+    assert archives.wheel.name == f"quadsim-{__version__}-py3-none-any.whl"
+    assert (changes[1], citation[1]) == (__version__, __version__)
+
+
+def test_every_requirement_is_pinned() -> None:
+    lines = (ROOT / "constraints.txt").read_text().splitlines()
+    pins = [line for line in lines if not line.startswith("#")]
+    assert [pin for pin in pins if not re.fullmatch(r"[\w.-]+==\w[\w.]*", pin)] == []
+    pyproject = tomllib.loads((ROOT / "pyproject.toml").read_text())
+    required = [*pyproject["project"]["dependencies"], *pyproject["dependency-groups"]["dev"]]
+    names = {plain(re.split(r"[<>=]", requirement, maxsplit=1)[0]) for requirement in required}
+    assert names - {plain(pin.partition("==")[0]) for pin in pins} == set()
+
+
+def plain(name: str) -> str:
+    """A distribution's name as indexes compare it."""
+    return re.sub(r"[-_.]+", "-", name).lower()
