@@ -17,9 +17,10 @@ SUPPORTED := import sys; sys.exit(sys.version_info < (3, 11))
 CANDIDATES := python3.13 python3.12 python3.11 python3
 PYTHON ?= $(firstword $(foreach name,$(CANDIDATES),$(shell $(name) -c '$(SUPPORTED)' 2>/dev/null && echo $(name))))
 
+PIP_INSTALL := $(PY) -m pip install --quiet --disable-pip-version-check
+NOT_INSTALLED := The packages could not be installed. With a network at hand: make setup
 RENDERS := $(PY) -c 'from quadsim.video import rendering_backend; rendering_backend()' 2>/dev/null
 HAS_BROWSER := { command -v chromium || command -v chromium-browser || command -v google-chrome; } >/dev/null
-PIP_INSTALL := $(PY) -m pip install --quiet --disable-pip-version-check --constraint constraints.txt
 
 # $(call quietly,COMMAND,ADVICE): runs a command silently; if it fails, shows its last errors, then the advice.
 quietly = { said=$$({ $(1); } 2>&1) || { echo "$$said" | grep -iE '^(E:|error)' | tail -n 3; echo "$(2)"; false; } >&2; }
@@ -94,8 +95,9 @@ $(VENV)/.python:
 
 $(VENV)/.installed: $(VENV)/.python pyproject.toml constraints.txt
 	@echo "Installing quadsim and its packages into $(VENV); the first time takes a minute or two"
-	@$(call quietly,$(PIP_INSTALL) $$(grep '^pip==' constraints.txt) && $(PIP_INSTALL) --group dev && \
-		$(PIP_INSTALL) --no-build-isolation --editable .,The packages could not be installed. With a network at hand: make setup)
+	@$(call quietly,$(PIP_INSTALL) $$(grep '^pip==' constraints.txt) && \
+		$(PIP_INSTALL) --constraint constraints.txt --group dev && \
+		$(PIP_INSTALL) --constraint constraints.txt --no-build-isolation --editable .,$(NOT_INSTALLED))
 	@touch $@
 
 $(VENV)/.renders: $(VENV)/.installed

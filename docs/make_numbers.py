@@ -20,8 +20,8 @@ from quadsim.state import make_state
 from quadsim.vehicle import Vehicle
 from scenarios import runner
 from scenarios.build import build_problem, build_vehicle
+from scenarios.loading import load_scenario
 from scenarios.runner import Flight
-from scenarios.spec import load_scenario
 
 ROOT = Path(__file__).resolve().parent.parent
 BEGIN, END = "<!-- results: made by `make numbers` -->", "<!-- results end -->"

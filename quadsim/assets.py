@@ -1,8 +1,10 @@
-"""Where the data files are: beside the package when installed from a wheel, else in the checkout."""
+"""The data files: where they are, in a wheel or in a checkout, and how they are read."""
 
 from __future__ import annotations
 
+import tomllib
 from pathlib import Path
+from typing import Any
 
 from quadsim.errors import FileError, UnknownNameError
 
@@ -33,3 +35,17 @@ def vehicle_path(name: str, relative_to: Path | None = None) -> Path:
     if not path.is_file():
         raise UnknownNameError("vehicle", name, vehicle_names(), hint="or give a path ending in .toml")
     return path
+
+
+def read_toml(path: Path) -> dict[str, Any]:
+    """A TOML file's tables.
+
+    Raises:
+        FileError: it is missing, unreadable or not TOML.
+    """
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError) as error:
+        raise FileError(path, f"cannot be read ({error})") from error
+    except tomllib.TOMLDecodeError as error:
+        raise FileError(path, f"is not valid TOML: {error}") from error

@@ -223,8 +223,10 @@ def writing(target: Path, replaces: Callable[[Path], bool] = is_run) -> Iterator
         temporary.chmod(0o755)
         yield temporary
         _replace(temporary, target)
-    except OutputError:
-        raise
+    except OutputError as error:
+        if temporary is None or not error.path.is_relative_to(temporary):
+            raise
+        raise OutputError(target / error.path.relative_to(temporary), error.problem) from error
     except OSError as error:
         raise OutputError(target, error.strerror or str(error)) from error
     finally:

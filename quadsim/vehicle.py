@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -11,6 +10,7 @@ from typing import Any, Final
 
 import numpy as np
 
+from quadsim.assets import read_toml
 from quadsim.errors import FileError, ParameterError, UnknownNameError
 from quadsim.state import Array
 
@@ -135,12 +135,7 @@ def load_vehicle(path: Path, overrides: Mapping[str, Any] | None = None) -> Vehi
         ParameterError: a value is not possible.
         UnknownNameError: an override names no parameter.
     """
-    try:
-        data = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError) as error:
-        raise FileError(path, f"cannot be read ({error})") from error
-    except tomllib.TOMLDecodeError as error:
-        raise FileError(path, f"is not valid TOML: {error}") from error
+    data = read_toml(path)
     units = VEHICLE_UNITS
     values: dict[str, Any] = {}
     for key, entry in data.items():

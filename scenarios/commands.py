@@ -17,8 +17,9 @@ from scenarios import console, runner
 from scenarios.build import CONTROLLERS
 from scenarios.cli import EXIT_DONE, EXIT_FAILED
 from scenarios.junit import write_junit
+from scenarios.loading import load_scenario, scenario_names
 from scenarios.runner import Outputs
-from scenarios.spec import Scenario, load_scenario, scenario_names
+from scenarios.spec import Scenario
 
 
 def list_everything(options: Namespace) -> int:

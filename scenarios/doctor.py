@@ -16,7 +16,7 @@ from quadsim.vehicle import N_ROTORS
 from quadsim.video import rendering_backend
 from scenarios import runner
 from scenarios.build import build_controller, build_initial_state, build_reference, build_vehicle
-from scenarios.spec import load_scenario
+from scenarios.loading import load_scenario
 
 
 def examine() -> dict[str, dict[str, str]]:

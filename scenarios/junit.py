@@ -33,7 +33,7 @@ def write_junit(summary: Mapping[str, Any], path: Path) -> None:
             ElementTree.SubElement(case, "system-out").text = sentence
         else:
             ElementTree.SubElement(case, "failure", message=sentence)
-    write_atomically(path, ElementTree.tostring(suite, encoding="unicode", xml_declaration=True))
+    write_atomically(path, ElementTree.tostring(suite, encoding="utf-8", xml_declaration=True).decode())
 
 
 def _sentence(entry: Mapping[str, Any]) -> str:

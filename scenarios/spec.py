@@ -3,23 +3,19 @@
 from __future__ import annotations
 
 import difflib
-import tomllib
 from collections.abc import Mapping, Sequence
-from pathlib import Path
-from typing import Annotated, Any, Final, Literal, get_args
+from typing import Annotated, Any, Final, Literal
 
 import tomli_w
 from annotated_types import Len
-from pydantic import BaseModel, ConfigDict, Discriminator, Field, Tag, ValidationError, model_validator
-from pydantic_core import ErrorDetails
+from pydantic import BaseModel, ConfigDict, Discriminator, Field, Tag, model_validator
 
 from mpc.solvers import SOLVERS
 from quadsim.audit import SIGNALS
-from quadsim.errors import FileError, InputError, ParameterError, UnknownNameError
+from quadsim.errors import ParameterError, UnknownNameError
 from quadsim.plant import steps_per_period
 from quadsim.state import STATE_NAMES, STATE_UNITS
 
-LIBRARY: Final = Path(__file__).resolve().parent / "library"
 LARGEST_HORIZON: Final = 1000
 LONGEST_FLIGHT: Final = 86_400.0
 MOST_STEPS: Final = 10_000_000
@@ -40,18 +36,6 @@ Weights = Annotated[
     Annotated[Weight, Tag("number")] | Annotated[list[Weight], Len(4, 4), Tag("list")], Discriminator(_number_or_list)
 ]
 """One weight for all rotors, or one each."""
-
-
-class ScenarioError(InputError):
-    """A scenario file that cannot be flown.
-
-    Attributes:
-        problems: one line per field, each naming it, what was given and what is allowed.
-    """
-
-    def __init__(self, source: str, problems: Sequence[str]) -> None:
-        super().__init__(f"{source}: " + "\n  ".join(problems))
-        self.source, self.problems = source, tuple(problems)
 
 
 class _Spec(BaseModel):
@@ -288,176 +272,3 @@ class Scenario(_Spec):
 
 ANGLES: Final = frozenset(name for name, unit in zip(STATE_NAMES, STATE_UNITS, strict=True) if unit.startswith("rad"))
 """States that scenario files give in degrees (per second)."""
-
-
-def scenario_names() -> list[str]:
-    """Names of the scenarios that ship, sorted."""
-    return sorted(path.stem for path in LIBRARY.glob("*.toml"))
-
-
-def scenario_path(name: str) -> Path:
-    """The file of a library name, or the path itself when it ends in `.toml`.
-
-    Raises:
-        FileError, UnknownNameError: there is none.
-    """
-    if name.endswith(".toml"):
-        if not Path(name).is_file():
-            raise FileError(name, "no such scenario file")
-        return Path(name)
-    if name not in scenario_names():
-        raise UnknownNameError("scenario", name, scenario_names(), hint="or give a path ending in .toml")
-    return LIBRARY / f"{name}.toml"
-
-
-def load_scenario(name: str, settings: Sequence[str] = ()) -> Scenario:
-    """Read and check a scenario.
-
-    Args:
-        name: a library name, or a path ending in `.toml`.
-        settings: `dotted.path=value` texts that replace or add fields, values as in TOML.
-
-    Raises:
-        InputError: the file is missing or malformed, or a field is not allowed.
-    """
-    path = scenario_path(name)
-    try:
-        data = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError) as error:
-        raise FileError(path, f"cannot be read ({error})") from error
-    except tomllib.TOMLDecodeError as error:
-        raise FileError(path, f"is not valid TOML: {error}") from error
-    for setting in settings:
-        apply_setting(data, setting)
-    return parse_scenario(data, source=path.name, directory=path.parent)
-
-
-def parse_scenario(data: Mapping[str, Any], *, source: str = "scenario", directory: Path | None = None) -> Scenario:
-    """Check a scenario given as nested tables.
-
-    Args:
-        data: the parsed TOML.
-        source: what to call it in messages.
-        directory: where relative vehicle paths are looked up, besides the working directory.
-
-    Raises:
-        ScenarioError: naming every field that is wrong.
-    """
-    try:
-        scenario = Scenario.model_validate(dict(data))
-    except ValidationError as error:
-        problems = [_describe(details, data) for details in error.errors(include_url=False)]
-        raise ScenarioError(source, problems) from error
-    file = scenario.vehicle.file
-    if directory is not None and file.endswith(".toml") and (directory / file).is_file():
-        absolute = str((directory / file).resolve())
-        scenario = scenario.model_copy(update={"vehicle": scenario.vehicle.model_copy(update={"file": absolute})})
-    return scenario
-
-
-def apply_setting(data: dict[str, Any], setting: str) -> None:
-    """Apply one `dotted.path=value` to a scenario's tables; entries of `constraints` are addressed by their name.
-
-    Raises:
-        ParameterError: the text is not of that form, or the path goes through something that is no table.
-    """
-    path, equals, text = setting.partition("=")
-    keys = path.strip().split(".")
-    if not equals or not all(keys):
-        raise ParameterError("", "--set", setting, "of the form dotted.path=value")
-    try:
-        value: Any = tomllib.loads(f"value = {text.strip()}")["value"]
-    except tomllib.TOMLDecodeError:
-        value = text.strip()
-    table: Any = data
-    for depth, key in enumerate(keys):
-        if isinstance(table, list):
-            named = [entry for entry in table if isinstance(entry, dict) and entry.get("name") == key]
-            if not named:
-                allowed = [str(entry.get("name")) for entry in table if isinstance(entry, dict)]
-                raise UnknownNameError(f"entry of {'.'.join(keys[:depth])}", key, allowed)
-            table = named[0]
-        elif not isinstance(table, dict):
-            raise ParameterError("", "--set", setting, f"a path to a field; {keys[depth - 1]} has none")
-        elif depth == len(keys) - 1:
-            table[key] = value
-        else:
-            table = table.setdefault(key, {})
-
-
-def _describe(details: ErrorDetails, data: Mapping[str, Any]) -> str:
-    """One line about one field: its name, what is allowed, what was given."""
-    location = _location(details["loc"], data)
-    field = ".".join(location)
-    kind, given, context = details["type"], details["input"], details.get("ctx", {})
-    if kind.startswith("union_tag"):
-        given = given.get("type") if isinstance(given, dict) else given
-    if kind == "missing":
-        return f"{'.'.join([*location, str(details['loc'][-1])])} is missing"
-    if kind == "extra_forbidden":
-        allowed = _siblings(details["loc"][:-1])
-        near = difflib.get_close_matches(location[-1], allowed, n=1)
-        guess = f"; did you mean {near[0]!r}?" if near else ""
-        return f"{field} is not a field of the scenario file{guess} (there are: {', '.join(allowed)})"
-    if kind == "value_error":
-        return ".".join([*location, str(context["error"])])
-    rules = {
-        "greater_than": "> {gt}",
-        "greater_than_equal": ">= {ge}",
-        "less_than_equal": "<= {le}",
-        "finite_number": "a finite number",
-        "float_type": "a number",
-        "int_type": "a whole number",
-        "string_type": "a text",
-        "bool_type": "true or false",
-        "list_type": "a list",
-        "dict_type": "a table",
-        "model_type": "a table",
-        "model_attributes_type": "a table",
-        "too_short": "of {min_length} or more entries",
-        "too_long": "of {max_length} or fewer entries",
-        "string_pattern_mismatch": "of the form {pattern}",
-        "union_tag_invalid": "one of {expected_tags} in its field type",
-        "union_tag_not_found": "a table with a field type",
-    }
-    rule = rules[kind].format(**context) if kind in rules else details["msg"]
-    return f"{field} must be {rule}; got {given!r}"
-
-
-def _location(path: Sequence[int | str], data: Any) -> list[str]:
-    """Names from the root to a field: pydantic's path less its labels of union members, a named entry by its name."""
-    names: list[str] = []
-    for part in path:
-        if isinstance(part, int):
-            data = data[part]
-            name = data.get("name") if isinstance(data, dict) else None
-            names.append(name if isinstance(name, str) else str(part))
-        elif isinstance(data, Mapping) and part in data:
-            data = data[part]
-            names.append(part)
-    return names
-
-
-def _siblings(path: Sequence[int | str]) -> list[str]:
-    """Field names allowed at a place in the file, for guessing what was meant."""
-    models: list[type[BaseModel]] = [Scenario]
-    for part in path:
-        inner = [
-            model
-            for outer in models
-            if part in outer.model_fields
-            for model in _models_in(outer.model_fields[str(part)].annotation)
-        ]
-        tagged = [
-            model
-            for model in models
-            if "type" in model.model_fields and part in get_args(model.model_fields["type"].annotation)
-        ]
-        models = inner or tagged or models
-    return list(dict.fromkeys(name for model in models for name in model.model_fields))
-
-
-def _models_in(annotation: Any) -> list[type[BaseModel]]:
-    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
-        return [annotation]
-    return [model for argument in getattr(annotation, "__args__", ()) for model in _models_in(argument)]

@@ -2,17 +2,23 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import pytest
+from hypothesis import settings
 
 from quadsim import rundir
 from quadsim.rundir import Run
 from quadsim.vehicle import Vehicle
 from scenarios import runner
 from scenarios.build import build_vehicle
+from scenarios.loading import load_scenario
 from scenarios.runner import Flight, Outputs
-from scenarios.spec import load_scenario
+
+# Examples are not timed: a busy machine is no failure.  On CI they are the same ones each time.
+settings.register_profile("quadsim", deadline=None, derandomize="CI" in os.environ)
+settings.load_profile("quadsim")
 
 NO_PRODUCTS = Outputs(video=False, recording=False, figures=False)
 

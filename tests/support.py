@@ -14,7 +14,7 @@ from quadsim.flightlog import ControlLog, FlightLog, PlantLog, TimingLog
 from quadsim.state import INDEX, N_STATES, Array
 from quadsim.vehicle import N_ROTORS
 from scenarios.build import build_problem, build_reference, build_vehicle
-from scenarios.spec import load_scenario
+from scenarios.loading import load_scenario
 
 
 def paper_problem(name: str = "paper-constrained", *settings: str) -> Problem:

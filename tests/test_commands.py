@@ -16,7 +16,7 @@ from quadsim.errors import RenderingUnavailableError
 from quadsim.video import rendering_backend
 from scenarios.cli import EXIT_DONE, main, make_parser
 from scenarios.commands import COMMANDS
-from scenarios.spec import load_scenario
+from scenarios.loading import load_scenario
 
 ROOT = Path(__file__).resolve().parent.parent
 ADDED = {"run": ("--no-video",)}

@@ -105,7 +105,7 @@ def solved(formulation: Formulation, backend: Backend, query: tuple[Array, Array
     return formulation.qp.with_vectors(vectors), backend.solve(vectors)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(seed=st.integers(0, 2**32 - 1), horizon=st.integers(1, 25), n=st.integers(1, 5), steps=st.integers(1, 9))
 def test_random_systems_give_one_optimum_in_both_forms(seed: int, horizon: int, n: int, steps: int) -> None:
     """Random stable systems, weights, bounds and horizons; u(k-1) inside its bounds."""

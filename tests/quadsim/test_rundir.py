@@ -63,6 +63,14 @@ def test_a_disk_that_fills_up_is_said_and_leaves_nothing(tmp_path: Path) -> None
     assert listing(tmp_path) == []
 
 
+def test_a_file_in_it_that_cannot_be_written_is_named_as_if_it_were_there(tmp_path: Path) -> None:
+    with pytest.raises(OutputError) as caught, rundir.writing(tmp_path / "run") as partial:
+        raise OutputError(partial / "figures" / "a.png", "no ink")
+    assert str(caught.value) == f"cannot write {tmp_path}/run/figures/a.png: no ink"
+    assert caught.value.path == tmp_path / "run" / "figures" / "a.png"
+    assert listing(tmp_path) == []
+
+
 def test_a_full_disk_is_said_before_anything_is_done(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(shutil, "disk_usage", lambda _: shutil._ntuple_diskusage(10**9, 10**9 - 4096, 4096))
     with pytest.raises(OutputError, match="the disk is full"), rundir.writing(tmp_path / "new" / "run"):

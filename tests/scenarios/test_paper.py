@@ -7,8 +7,8 @@ import pytest
 
 from quadsim.audit import Finding
 from scenarios import runner
+from scenarios.loading import load_scenario, scenario_names
 from scenarios.runner import Flight
-from scenarios.spec import load_scenario, scenario_names
 
 SAMPLED, PLANT = 0.01, 0.05
 """How far beyond 5 deg roll and pitch may go [deg]: at the control samples, and at the physics rate."""

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from scenarios.build import build_reference
+from scenarios.loading import load_scenario
 from scenarios.references import Window, smooth, steps
-from scenarios.spec import load_scenario
 
 PERIOD = 0.05
 

@@ -18,8 +18,8 @@ from quadsim.flightlog import FLIGHT_FILE, HORIZON_FILE, PLANT_FILE, TIMING_FILE
 from quadsim.rundir import Run
 from scenarios import runner
 from scenarios.build import build_controller, build_vehicle
+from scenarios.loading import load_scenario, parse_scenario
 from scenarios.runner import Outputs
-from scenarios.spec import load_scenario, parse_scenario
 
 TABLES = Outputs(video=False, recording=False, figures=False)
 SHORT = "duration=0.5"

@@ -20,17 +20,9 @@ from quadsim.audit import SIGNALS
 from quadsim.errors import FileError, InputError, ParameterError, UnknownNameError
 from quadsim.state import STATE_NAMES
 from scenarios.build import build_limits, build_vehicle, resolve
-from scenarios.spec import (
-    LIBRARY,
-    MOST_STEPS,
-    Scenario,
-    ScenarioError,
-    apply_setting,
-    load_scenario,
-    parse_scenario,
-    scenario_names,
-    scenario_path,
-)
+from scenarios.loading import LIBRARY, apply_setting, load_scenario, parse_scenario, scenario_names, scenario_path
+from scenarios.problems import ScenarioError
+from scenarios.spec import MOST_STEPS, Scenario
 
 
 def reread(scenario: Scenario) -> Scenario:
@@ -409,7 +401,7 @@ def tables(draw: st.DrawFn) -> dict[str, Any]:
     }
 
 
-@settings(deadline=None, max_examples=60)
+@settings(max_examples=60)
 @given(table=tables())
 def test_any_right_file_parses_and_comes_back_from_its_text(table: dict[str, Any]) -> None:
     scenario = parse_scenario(table)
@@ -426,7 +418,7 @@ def leaves(table: Any, path: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
     return [found for key, value in items for found in [(*path, key), *leaves(value, (*path, key))]]
 
 
-@settings(deadline=None, max_examples=150)
+@settings(max_examples=150)
 @given(data=st.data())
 def test_a_file_with_anything_anywhere_is_either_right_or_named_as_wrong(data: st.DataObject) -> None:
     """Whatever is put wherever: a scenario that its text gives again, or one typed error that names the field."""

@@ -1,0 +1,107 @@
+"""Scenario files found, read, changed field by field, and checked."""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Final
+
+from pydantic import ValidationError
+
+from quadsim.assets import read_toml
+from quadsim.errors import FileError, ParameterError, UnknownNameError
+from scenarios.problems import ScenarioError, describe
+from scenarios.spec import Scenario
+
+LIBRARY: Final = Path(__file__).resolve().parent / "library"
+
+
+def scenario_names() -> list[str]:
+    """Names of the scenarios that ship, sorted."""
+    return sorted(path.stem for path in LIBRARY.glob("*.toml"))
+
+
+def scenario_path(name: str) -> Path:
+    """The file of a library name, or the path itself when it ends in `.toml`.
+
+    Raises:
+        FileError, UnknownNameError: there is none.
+    """
+    if name.endswith(".toml"):
+        if not Path(name).is_file():
+            raise FileError(name, "no such scenario file")
+        return Path(name)
+    if name not in scenario_names():
+        raise UnknownNameError("scenario", name, scenario_names(), hint="or give a path ending in .toml")
+    return LIBRARY / f"{name}.toml"
+
+
+def load_scenario(name: str, settings: Sequence[str] = ()) -> Scenario:
+    """Read and check a scenario.
+
+    Args:
+        name: a library name, or a path ending in `.toml`.
+        settings: `dotted.path=value` texts that replace or add fields, values as in TOML.
+
+    Raises:
+        InputError: the file is missing or malformed, or a field is not allowed.
+    """
+    path = scenario_path(name)
+    data = read_toml(path)
+    for setting in settings:
+        apply_setting(data, setting)
+    return parse_scenario(data, source=path.name, directory=path.parent)
+
+
+def parse_scenario(data: Mapping[str, Any], *, source: str = "scenario", directory: Path | None = None) -> Scenario:
+    """Check a scenario given as nested tables.
+
+    Args:
+        data: the parsed TOML.
+        source: what to call it in messages.
+        directory: where relative vehicle paths are looked up, besides the working directory.
+
+    Raises:
+        ScenarioError: naming every field that is wrong.
+    """
+    try:
+        scenario = Scenario.model_validate(dict(data))
+    except ValidationError as error:
+        problems = [describe(details, data) for details in error.errors(include_url=False)]
+        raise ScenarioError(source, problems) from error
+    file = scenario.vehicle.file
+    if directory is not None and file.endswith(".toml") and (directory / file).is_file():
+        absolute = str((directory / file).resolve())
+        scenario = scenario.model_copy(update={"vehicle": scenario.vehicle.model_copy(update={"file": absolute})})
+    return scenario
+
+
+def apply_setting(data: dict[str, Any], setting: str) -> None:
+    """Apply one `dotted.path=value` to a scenario's tables; entries of `constraints` are addressed by their name.
+
+    Raises:
+        ParameterError: the text is not of that form, or the path goes through something that is no table.
+    """
+    path, equals, text = setting.partition("=")
+    keys = path.strip().split(".")
+    if not equals or not all(keys):
+        raise ParameterError("", "--set", setting, "of the form dotted.path=value")
+    try:
+        value: Any = tomllib.loads(f"value = {text.strip()}")["value"]
+    except tomllib.TOMLDecodeError:
+        value = text.strip()
+    table: Any = data
+    for depth, key in enumerate(keys):
+        if isinstance(table, list):
+            named = [entry for entry in table if isinstance(entry, dict) and entry.get("name") == key]
+            if not named:
+                allowed = [str(entry.get("name")) for entry in table if isinstance(entry, dict)]
+                raise UnknownNameError(f"entry of {'.'.join(keys[:depth])}", key, allowed)
+            table = named[0]
+        elif not isinstance(table, dict):
+            raise ParameterError("", "--set", setting, f"a path to a field; {keys[depth - 1]} has none")
+        elif depth == len(keys) - 1:
+            table[key] = value
+        else:
+            table = table.setdefault(key, {})
