@@ -38,6 +38,7 @@ def test_tracking_errors_are_real_minus_reference() -> None:
         ([0.0, 1.0, 3.0, 2.0], [0.0, 2.0, 2.0, 2.0], 1.0),  # above the highest reference
         ([0.0, -0.5, 1.0, 2.0], [0.0, 2.0, 2.0, 2.0], 0.5),  # below where it started
         ([5.0, 4.0, 2.0, 2.0], [2.0, 2.0, 2.0, 2.0], 0.0),  # coming from outside the reference is none
+        ([-1.0, 0.0, 2.0, 2.0], [2.0, 2.0, 2.0, 2.0], 0.0),
         ([5.0, 4.0, 2.0, 1.75], [2.0, 2.0, 2.0, 2.0], 0.25),
     ],
 )

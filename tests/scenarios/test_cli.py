@@ -185,6 +185,16 @@ def test_check_writes_its_verdicts_as_junit(
     assert left_in(here) == ["verdicts.xml"]
 
 
+def test_junit_passes_what_is_not_required_and_tells_what_was_measured(
+    here: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    settings = ["--set", "constraints.speed.upper=150.0", "--set", "constraints.speed.required=false"]
+    assert main(["check", "hover", *SHORT, *settings, "--junit", "verdicts.xml"]) == EXIT_DONE
+    suite = ElementTree.parse("verdicts.xml").getroot()
+    assert suite.get("failures") == "0"
+    assert suite.findtext("testcase[@name='speed']/system-out", "").startswith("worst margin -42.8")
+
+
 def test_junit_tells_an_aborted_flight_with_its_reason(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
     settings = ["--set", "initial.euler=[60.0, 0.0, 0.0]", "--junit", "verdicts.xml"]
     assert main(["check", "hover", *SHORT, *settings]) == EXIT_FAILED
@@ -355,8 +365,13 @@ def test_a_run_that_needs_a_film_is_refused_before_it_is_flown_where_nothing_ren
     def nothing_renders() -> str:
         raise RenderingUnavailableError({"egl": "no libEGL", "osmesa": "no libOSMesa"})
 
+    def flown(*_: object) -> None:
+        pytest.fail("it must not be flown")
+
     monkeypatch.setattr("quadsim.video.rendering_backend", nothing_renders)
-    assert main(["run", "hover", "--set", "duration=7200"]) == EXIT_WRONG_INPUT
+    with monkeypatch.context() as grounded:
+        grounded.setattr("scenarios.runner.fly_scenario", flown)
+        assert main(["run", "hover"]) == EXIT_WRONG_INPUT
     printed = capsys.readouterr()
     assert printed.err.startswith(
         "quadsim: no off-screen OpenGL on this machine (egl: no libEGL; osmesa: no libOSMesa)"
