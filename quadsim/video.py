@@ -11,6 +11,7 @@ import itertools
 import json
 import os
 import selectors
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -27,6 +28,7 @@ BACKENDS: Final = ("egl", "osmesa")
 """What can render without a screen, in the order tried."""
 _WORKER: Final = (sys.executable, "-m", "quadsim.render_worker")
 _PROBE_SECONDS: Final = 60.0
+_LEAST_FREE_BYTES: Final = 1024 * 1024
 _FEWEST_FRAMES: Final = 30
 """A further worker is not worth its start for fewer frames than these."""
 
@@ -213,9 +215,15 @@ def _work(
                 watched.unregister(process.stdout)
                 if process.wait() != 0:
                     logs[i].seek(0)
-                    raise _WorkerFailure(_last_line(logs[i].read()))
+                    raise _WorkerFailure(_why(logs[i].read(), folder))
 
 
 def _last_line(text: bytes) -> str:
     lines = text.decode(errors="replace").strip().splitlines()
     return lines[-1].strip() if lines else "it ended without a word"
+
+
+def _why(said: bytes, folder: Path) -> str:
+    """Why a worker failed; on a full disk it could not even write that down."""
+    full = shutil.disk_usage(folder).free < _LEAST_FREE_BYTES
+    return "the disk is full" if full else _last_line(said)

@@ -9,6 +9,7 @@ import sys
 import warnings
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import imageio.v3 as iio
@@ -189,6 +190,16 @@ def fake_worker(monkeypatch: pytest.MonkeyPatch) -> None:
         "sys.exit('Traceback ...\\nGLError: the picture is lost')\n"
     )
     monkeypatch.setattr(video, "_WORKER", (sys.executable, "-c", script))
+
+
+@pytest.mark.usefixtures("fake_worker")
+def test_a_worker_that_fails_on_a_full_disk_is_told_so(
+    short_run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(video.shutil, "disk_usage", lambda folder: SimpleNamespace(free=0))
+    with pytest.raises(OutputError, match="renderer failed: the disk is full"):
+        render_video(short_run.directory, tmp_path / "film.mp4", workers=2)
+    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.usefixtures("fake_worker")
