@@ -92,8 +92,8 @@ def test_discretisation_is_the_limit_of_mujocos_transition_derivatives(vehicle: 
         assert error_one < 2e-2
         assert error_two == pytest.approx(error_one / 2, rel=0.05)  # first order, as the integrator
     # Order-one error cancels in 2 fine - coarse; what remains is of second order in the physics step.
-    np.testing.assert_allclose(2 * fine[0] - coarse[0], exact.A, atol=2e-5)
-    np.testing.assert_allclose(2 * fine[1] - coarse[1], exact.B, atol=2e-5)
+    np.testing.assert_allclose(2 * fine[0] - coarse[0], exact.A, atol=1e-6)
+    np.testing.assert_allclose(2 * fine[1] - coarse[1], exact.B, atol=1e-6)
 
 
 def test_discretisation_matches_central_differences_of_the_plant_itself(vehicle: Vehicle) -> None:
