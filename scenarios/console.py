@@ -108,23 +108,24 @@ def _controller_line(summary: Mapping[str, Any]) -> str:
     )
 
 
+_BRIEF: Final = ("outcome", "required constraints", "RMS error", "verdict", "statuses", "whole step, m")
+"""How the labels begin of the rows that a terminal shows; the page and its `comparison.md` have them all."""
+
+
 def print_comparison(rows: Sequence[Row], names: Sequence[str], where: str) -> None:
-    """The comparison's rows side by side."""
+    """The comparison's answers side by side: outcomes, tracking, verdicts, times."""
     console = _console()
     table = _table("comparison")
     table.add_column("", no_wrap=True)
     for name in names:
         table.add_column(name, justify="right")
-    group = ""
     for row in rows:
-        if row.group != group:
-            group = row.group
-            table.add_section()
-            table.add_row(f"[bold]{group}[/bold]")
-        label = f"{row.label} [{row.unit}]" if row.unit else row.label
-        table.add_row(escape(label), *(_cell(cell) for cell in row.cells))
+        if row.label.startswith(_BRIEF):
+            label = row.group if row.headline else row.label
+            unit = f" [{row.unit}]" if row.unit else ""
+            table.add_row(escape(label + unit), *(_cell(cell) for cell in row.cells))
     console.print(table)
-    console.print(f"written to [bold]{where}[/bold]", soft_wrap=True)
+    console.print(f"every number, plots and films: [bold]{where}[/bold]", soft_wrap=True)
 
 
 _STYLES: Final = {Mark.BEST: "bold", Mark.GOOD: "green", Mark.WARN: "yellow", Mark.BAD: "red"}
