@@ -18,7 +18,7 @@ from mpc.prediction import rollout
 from mpc.unconstrained import sequence_gains
 from quadsim.airframe import compile_model, rotor_thrusts
 from quadsim.plant import Plant
-from quadsim.state import REFERENCE_STATES, make_state
+from quadsim.state import REFERENCE_STATES, Array, make_state
 from quadsim.vehicle import Vehicle
 from scenarios import runner
 from scenarios.build import build_problem, build_vehicle
@@ -26,6 +26,10 @@ from scenarios.loading import load_scenario
 from scenarios.runner import Flight
 
 ROOT = Path(__file__).resolve().parent.parent
+PERIOD = 0.05
+MUJOCO_ORDER = [0, 6, 1, 7, 2, 8, 3, 9, 4, 10, 5, 11]
+"""Where the paper's states are among MuJoCo's tangent coordinates (positions, rotations, then their rates)."""
+
 Table = list[tuple[str, ...]]
 
 
@@ -109,49 +113,57 @@ def lqr_convergence() -> Table:
     return rows
 
 
+def prediction_error(vehicle: Vehicle, steps: int, size: float) -> float:
+    """Largest difference between the linear prediction and MuJoCo after a deviation of relative size `size`."""
+    model = hover_model(vehicle, PERIOD)
+    rng = np.random.default_rng(7)
+    state = make_state(position=(1.0, 2.0, 3.0)) + 0.1 * size * rng.uniform(-1, 1, 12)
+    plan = model.u_bar + 0.5 * size * rng.uniform(-1, 1, (steps, 4))
+    flown = []
+    with Plant(vehicle) as plant:
+        plant.reset(state)
+        for speeds in plan:
+            plant.advance(speeds, 50)
+            flown.append(plant.state())
+    return float(np.abs(rollout(model, state[None], plan[None])[0] - np.array(flown)).max())
+
+
 def prediction_errors(vehicle: Vehicle) -> Table:
     """Linear prediction against MuJoCo for ever smaller deviations from hover."""
-    model = hover_model(vehicle, 0.05)
     rows: Table = [("size of the deviation", "after 1 step", "after 50 steps")]
     for size in (0.1, 0.05, 0.025, 0.0125):
-        errors = []
-        for steps in (1, 50):
-            rng = np.random.default_rng(7)
-            state = make_state(position=(1.0, 2.0, 3.0)) + 0.1 * size * rng.uniform(-1, 1, 12)
-            plan = model.u_bar + 0.5 * size * rng.uniform(-1, 1, (steps, 4))
-            flown = []
-            with Plant(vehicle) as plant:
-                plant.reset(state)
-                for speeds in plan:
-                    plant.advance(speeds, 50)
-                    flown.append(plant.state())
-            errors.append(np.abs(rollout(model, state[None], plan[None])[0] - np.array(flown)).max())
-        rows.append((f"{size:g}", *(f"{error:.2e}" for error in errors)))
+        rows.append((f"{size:g}", *(f"{prediction_error(vehicle, steps, size):.2e}" for steps in (1, 50))))
     return rows
 
 
-def transition_difference(vehicle: Vehicle) -> float:
-    """Largest difference of A and B from `mjd_transitionFD` of the compiled model, over one control period.
+def mujoco_transition(vehicle: Vehicle, timestep: float) -> tuple[Array, Array]:
+    """A and B over one control period by `mjd_transitionFD` at hover, in the paper's coordinates.
 
-    MuJoCo differentiates its first-order Euler step alone; its error is taken to the limit of a vanishing step by
-    Richardson extrapolation from 1 ms and 0.5 ms.
+    MuJoCo does not differentiate its Runge-Kutta steps, so these are of its first-order Euler integrator.
     """
-    exact = hover_model(vehicle, 0.05)
-    order = [0, 6, 1, 7, 2, 8, 3, 9, 4, 10, 5, 11]  # MuJoCo's tangent coordinates in the paper's order
-    limits = [np.zeros((12, 12)), np.zeros((12, 4))]
-    for timestep, weight in ((1e-3, -1.0), (5e-4, 2.0)):
-        model = compile_model(vehicle, timestep=timestep)
-        model.opt.integrator = mujoco.mjtIntegrator.mjINT_EULER
-        data = mujoco.MjData(model)
-        data.ctrl[:] = rotor_thrusts(vehicle, np.full(4, vehicle.hover_speed))
-        A, B = np.zeros((12, 12)), np.zeros((12, 4))
-        mujoco.mjd_transitionFD(model, data, 1e-6, True, A, B, None, None)
-        A, B = A[np.ix_(order, order)], B[order] * 2.0 * vehicle.thrust_coefficient * vehicle.hover_speed
-        whole = [np.eye(12), np.zeros((12, 4))]
-        for _ in range(round(0.05 / timestep)):
-            whole = [A @ whole[0], A @ whole[1] + B]
-        limits = [limit + weight * part for limit, part in zip(limits, whole, strict=True)]
-    return float(max(np.abs(limits[0] - exact.A).max(), np.abs(limits[1] - exact.B).max()))
+    model = compile_model(vehicle, timestep=timestep)
+    model.opt.integrator = mujoco.mjtIntegrator.mjINT_EULER
+    data = mujoco.MjData(model)
+    data.ctrl[:] = rotor_thrusts(vehicle, np.full(4, vehicle.hover_speed))
+    A, B = np.zeros((12, 12)), np.zeros((12, 4))
+    mujoco.mjd_transitionFD(model, data, 1e-6, True, A, B, None, None)
+    A = A[np.ix_(MUJOCO_ORDER, MUJOCO_ORDER)]
+    B = B[MUJOCO_ORDER] * 2.0 * vehicle.thrust_coefficient * vehicle.hover_speed  # thrust slope dT/dw = 2 b w
+    whole_A, whole_B = np.eye(12), np.zeros((12, 4))
+    for _ in range(round(PERIOD / timestep)):
+        whole_A, whole_B = A @ whole_A, A @ whole_B + B
+    return whole_A, whole_B
+
+
+def transition_difference(vehicle: Vehicle) -> float:
+    """Largest difference of A and B from MuJoCo's, in the limit of a vanishing step (Richardson extrapolation)."""
+    exact, coarse, fine = (
+        hover_model(vehicle, PERIOD),
+        mujoco_transition(vehicle, 1e-3),
+        mujoco_transition(vehicle, 5e-4),
+    )
+    limits = (2.0 * two - one for one, two in zip(coarse, fine, strict=True))
+    return float(max(np.abs(limit - part).max() for limit, part in zip(limits, (exact.A, exact.B), strict=True)))
 
 
 def targets(constrained: Flight, sweep: Table) -> Table:

@@ -8,15 +8,13 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from enum import StrEnum
 from typing import Any, Final
 
 import numpy as np
 
 from quadsim.rundir import Run
+from quadsim.table import ABSENT, Cell, Mark, Row, format_number
 
-ABSENT: Final = "-"
 TRACKING_MEASURES: Final = {
     "rmse": "RMS error",
     "max_error": "largest error",
@@ -24,43 +22,6 @@ TRACKING_MEASURES: Final = {
     "overshoot": "overshoot",
 }
 TIME_MEASURES: Final = {"p50": "median", "p95": "95th percentile", "p99": "99th percentile", "max": "maximum"}
-
-
-class Mark(StrEnum):
-    """What a reader should see in a cell at a glance."""
-
-    NONE = ""
-    BEST = "best"
-    GOOD = "good"
-    WARN = "warn"
-    BAD = "bad"
-
-
-@dataclass(frozen=True, kw_only=True)
-class Cell:
-    """One run's value in a row, as text."""
-
-    text: str = ABSENT
-    mark: Mark = Mark.NONE
-
-
-@dataclass(frozen=True, kw_only=True)
-class Row:
-    """One quantity, across all runs.
-
-    Attributes:
-        group: the heading it stands under.
-        label: the quantity.
-        unit: its unit; empty when it has none.
-        cells: one per run, in order.
-        headline: whether it is its group's answer in one line: the verdict on a constraint.
-    """
-
-    group: str
-    label: str
-    unit: str = ""
-    cells: tuple[Cell, ...]
-    headline: bool = False
 
 
 def run_names(runs: Sequence[Run]) -> tuple[str, ...]:
@@ -92,21 +53,6 @@ def comparison_rows(runs: Sequence[Run]) -> list[Row]:
         *_solver_rows(summaries),
         *_time_rows(summaries),
     ]
-
-
-def to_markdown(rows: Sequence[Row], names: Sequence[str]) -> str:
-    """A Markdown table of the rows: headlines and the best values in bold type."""
-
-    def line(*texts: str) -> str:
-        return "| " + " | ".join(text.replace("|", r"\|") for text in texts) + " |"
-
-    lines = [line("", "", *names), line("---", "---", *("---:" for _ in names))]
-    group = ""
-    for row in rows:
-        cells = [f"**{cell.text}**" if row.headline or cell.mark is Mark.BEST else cell.text for cell in row.cells]
-        lines.append(line(f"**{row.group}**" if row.group != group else "", _with_unit(row), *cells))
-        group = row.group
-    return "\n".join(lines) + "\n"
 
 
 def outcome(summary: Mapping[str, Any]) -> Cell:
@@ -219,16 +165,6 @@ def _time_rows(summaries: Sequence[_Summary]) -> Iterator[Row]:
     yield row("with all files", "s", ("wall_s", "total"))
 
 
-def format_number(value: float | None) -> str:
-    """Four significant digits, or two where it takes an exponent; `-` for None."""
-    if value is None:
-        return ABSENT
-    size = abs(value)
-    if 1e4 <= size < 1e7:
-        return f"{value:.0f}"
-    return f"{value:.4g}" if size == 0.0 or 1e-3 <= size < 1e7 else f"{value:.1e}"
-
-
 def _get(data: Any, *keys: str) -> Any:
     """A nested value, or None where a key is missing: a run that ended at once has no numbers."""
     for key in keys:
@@ -239,10 +175,6 @@ def _get(data: Any, *keys: str) -> Any:
 def present_keys(summaries: Sequence[_Summary], *path: str) -> list[str]:
     """Keys that any summary has at a path, in order."""
     return list(dict.fromkeys(key for summary in summaries for key in _get(summary, *path) or {}))
-
-
-def _with_unit(row: Row) -> str:
-    return f"{row.label} [{row.unit}]" if row.unit else row.label
 
 
 def _counts(counts: Mapping[str, int] | None) -> str:

@@ -9,13 +9,13 @@ from quadsim.comparison import (
     distinct_courses,
     format_bounds,
     format_excess,
-    format_number,
     is_completed,
     present_keys,
     run_names,
     tracking_values,
 )
 from quadsim.rundir import Run
+from quadsim.table import format_number
 
 _Summary = Mapping[str, Any]
 _Named = Sequence[tuple[str, _Summary]]

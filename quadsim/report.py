@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, Final
 from urllib.parse import quote
 
-from quadsim.comparison import Cell, comparison_rows, outcome, required, run_names, to_markdown
+from quadsim.comparison import comparison_rows, outcome, required, run_names
 from quadsim.errors import OutputError, ParameterError
 from quadsim.figures import comparison_figure
 from quadsim.flightlog import FLIGHT_FILE, HORIZON_FILE, PLANT_FILE, TIMING_FILE
@@ -19,6 +19,7 @@ from quadsim.narrative import comparison_sentences
 from quadsim.palette import line_colour
 from quadsim.plots import comparison_plots, plotly_script
 from quadsim.rundir import FIGURES_DIR, RECORDING_FILE, SCENARIO_FILE, SUMMARY_FILE, VIDEO_FILE, Run, writing
+from quadsim.table import Cell, to_markdown
 
 PAGE_FILE: Final = "index.html"
 TABLE_FILE: Final = "comparison.md"

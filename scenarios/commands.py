@@ -66,8 +66,9 @@ def check(options: Namespace) -> int:
 
 def compare(options: Namespace) -> int:
     """`quadsim compare`."""
-    from quadsim.comparison import comparison_rows, run_names, to_markdown
+    from quadsim.comparison import comparison_rows, run_names
     from quadsim.report import write_comparison
+    from quadsim.table import to_markdown
 
     target = Path(options.out)
     directories = [Path(name) if Path(name).is_dir() else _fly_for_comparison(name, target) for name in options.targets]

@@ -12,7 +12,7 @@ from rich.markup import escape
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
-from quadsim.comparison import Cell, Mark, Row
+from quadsim.table import Cell, Mark, Row
 from scenarios import runner
 
 

@@ -2,31 +2,18 @@
 
 from __future__ import annotations
 
-import importlib.util
 import re
 from pathlib import Path
-from types import ModuleType
 
-import pytest
+import make_numbers as numbers
 
 from scenarios.runner import Flight
 
 ROOT = Path(__file__).resolve().parent.parent
 
 
-@pytest.fixture(scope="module")
-def numbers() -> ModuleType:
-    """docs/make_numbers.py, which is a script and not in a package."""
-    spec = importlib.util.spec_from_file_location("make_numbers", ROOT / "docs" / "make_numbers.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
 def test_results_in_the_readme_are_what_the_flights_give(
-    numbers: ModuleType, constrained_flight: Flight, unconstrained_flight: Flight
+    constrained_flight: Flight, unconstrained_flight: Flight
 ) -> None:
     flights = {
         "paper-unconstrained": unconstrained_flight,
@@ -38,7 +25,7 @@ def test_results_in_the_readme_are_what_the_flights_give(
         assert table in (ROOT / document).read_text(encoding="utf-8"), f"{document} is out of date: make numbers"
 
 
-def test_targets_in_the_readme_are_met_and_todays(numbers: ModuleType, constrained_flight: Flight) -> None:
+def test_targets_in_the_readme_are_met_and_todays(constrained_flight: Flight) -> None:
     table = numbers.markdown(numbers.targets(constrained_flight, numbers.sensitivity()))
     readme = (ROOT / "README.md").read_text(encoding="utf-8")
     # The last digits of residues near rounding are the processor's; everything else is to be found as it stands.
@@ -46,7 +33,7 @@ def test_targets_in_the_readme_are_met_and_todays(numbers: ModuleType, constrain
     assert [line for line in stable if line not in readme] == []
 
 
-def test_convergence_in_the_documents_is_what_the_gains_give(numbers: ModuleType) -> None:
+def test_convergence_in_the_documents_is_what_the_gains_give() -> None:
     assert numbers.markdown(numbers.lqr_convergence()) in (ROOT / "docs/numbers.md").read_text(encoding="utf-8")
 
 

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from make_numbers import prediction_error
 from support import paper_problem, random_problem
 
-from mpc.model import hover_model
 from mpc.prediction import prediction, rollout
-from quadsim.plant import Plant
-from quadsim.state import Array, make_state
 from quadsim.vehicle import Vehicle
 
 
@@ -31,22 +29,6 @@ def test_blocks_are_those_of_eq_3() -> None:
     np.testing.assert_array_equal(Psi[2, :, 2], model.B)
     assert not Psi[1, :, 2:].any()  # the future does not act on the past
     np.testing.assert_allclose(maps.Phi[:12], model.A)
-
-
-def prediction_error(vehicle: Vehicle, steps: int, size: float) -> float:
-    """Largest difference between the linear prediction and MuJoCo after a deviation of relative size `size`."""
-    model = hover_model(vehicle, 0.05)
-    rng = np.random.default_rng(7)
-    state = make_state(position=(1.0, 2.0, 3.0)) + size * rng.uniform(-1, 1, 12) * 0.1
-    plan = model.u_bar + size * rng.uniform(-1, 1, (steps, 4)) * 0.5
-    predicted: Array = rollout(model, state[None], plan[None])[0]
-    with Plant(vehicle) as plant:
-        plant.reset(state)
-        flown = []
-        for speeds in plan:
-            plant.advance(speeds, 50)
-            flown.append(plant.state())
-    return float(np.abs(predicted - np.array(flown)).max())
 
 
 @pytest.mark.parametrize(("steps", "largest"), [(1, 1e-4), (50, 1e-2)])

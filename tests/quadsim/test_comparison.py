@@ -7,17 +7,10 @@ from typing import Any
 
 import pytest
 
-from quadsim.comparison import (
-    Mark,
-    Row,
-    comparison_rows,
-    distinct_courses,
-    format_number,
-    run_names,
-    to_markdown,
-)
+from quadsim.comparison import comparison_rows, distinct_courses, run_names
 from quadsim.narrative import comparison_sentences
 from quadsim.rundir import Run
+from quadsim.table import Mark, Row, format_number, to_markdown
 
 
 @pytest.fixture
