@@ -81,6 +81,8 @@ def audit_table(constraints: Sequence[Mapping[str, Any]]) -> Table:
 def _verdict(entry: Mapping[str, Any]) -> str:
     if entry["satisfied"]:
         return "[green]holds[/green]"
+    if entry["worst_margin_sampled"] is None and (entry["worst_margin"] or 0.0) >= -entry["tolerance"]:
+        return "[red]not reached[/red]"  # the flight ended before its time window, or before its first period
     return "[red]VIOLATED[/red]" if entry["required"] else "[yellow]exceeded*[/yellow]"
 
 
@@ -137,7 +139,9 @@ def _cell(cell: Cell) -> str:
 
 
 def _number(value: float | None) -> str:
-    return "-" if value is None else f"{value:.3g}".replace("e-0", "e-")
+    if value is None:
+        return "-"
+    return f"{value:.0f}" if 1e3 <= abs(value) < 1e5 else f"{value:.3g}".replace("e-0", "e-")
 
 
 def _range(lower: float | None, upper: float | None) -> str:
