@@ -18,11 +18,11 @@ from quadsim.state import Array
 class Condensed:
     """min 1/2 u' H u + F(k)' u over u = [u(k); ...; u(k+N-1)], with the paper's row pairs as two-sided rows.
 
-    Every vector is affine in p = [xi(k); y_d; u(k-1)]:  c = c_p p + c_0, and so on.
-
     Attributes:
-        qp: H, the upper halves of A_ineq, and the box; vectors for p = 0.
+        qp: H, the upper halves of A_ineq, and the box; vectors for xi(k), y_d and u(k-1) all zero.
         nu: number of inputs.
+        c_p: (N nu, n + N n_r) slope of c in [xi(k); y_d], which is [F1 F2].
+        h_p: (rows, n + nu) slope of h_l and h_u in [xi(k); u(k-1)], which is [G1 G2].
     """
 
     qp: QP
@@ -32,12 +32,9 @@ class Condensed:
 
     def vectors(self, state: Array, desired: Array, u_before: Array) -> Vectors:
         """See `mpc.qp.Formulation.vectors`."""
-        parameters = np.concatenate([state, desired.ravel(), u_before])
-        moving = np.concatenate([state, u_before])
-        shift = self.h_p @ moving
-        return Vectors(
-            c=self.c_p @ parameters + self.qp.c, b=self.qp.b, h_l=self.qp.h_l + shift, h_u=self.qp.h_u + shift
-        )
+        c = self.qp.c + self.c_p @ np.concatenate([state, desired.ravel()])
+        shift = self.h_p @ np.concatenate([state, u_before])
+        return Vectors(c=c, b=self.qp.b, h_l=self.qp.h_l + shift, h_u=self.qp.h_u + shift)
 
     def inputs(self, x: Array) -> Array:
         """See `mpc.qp.Formulation.inputs`."""
@@ -71,7 +68,7 @@ def condensed(problem: Problem) -> Condensed:
             x_u=rows.u_max,
         ),
         nu=model.nu,
-        c_p=np.hstack([terms.F1, terms.F2, np.zeros((size, model.nu))]),
+        c_p=np.hstack([terms.F1, terms.F2]),
         h_p=np.hstack([rows.G1[upper], rows.G2[upper]]),
     )
 

@@ -22,8 +22,9 @@ BOUND_TOLERANCE: Final = 1e-6
 class ConstrainedMPC:
     """Solves Eq. (27) each period and sends the first action of the optimal plan.
 
-    Only an answer that is solved, finite and within the hard input bounds is used.  Otherwise the previous plan,
-    shifted by one step, is held (fallback level 1) for as long as it lasts, and then the flight is given up.
+    Only an answer that is solved, finite, and whose first action is within the hard input bounds is used.  Otherwise
+    the previous plan, shifted by one step, is held (fallback level 1) for as long as it lasts, and then the flight is
+    given up.
     """
 
     name: Final = "constrained"

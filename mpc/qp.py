@@ -131,7 +131,7 @@ class KKTResiduals:
     @property
     def worst(self) -> float:
         """The largest of the four."""
-        return max(self.stationarity, self.primal, self.complementarity, self.dual)
+        return float(np.max([self.stationarity, self.primal, self.complementarity, self.dual]))
 
 
 def kkt_residuals(qp: QP, solution: Solution) -> KKTResiduals:
@@ -147,7 +147,7 @@ def kkt_residuals(qp: QP, solution: Solution) -> KKTResiduals:
     violation = np.concatenate([lower - values, values - upper, np.abs(qp.A @ x - qp.b)])
     return KKTResiduals(
         stationarity=_largest(gradient),
-        primal=max(0.0, float(np.max(violation, initial=0.0))),
+        primal=float(np.max(violation, initial=0.0)),  # NaN stays NaN
         complementarity=_largest(multipliers * distance),
         dual=_largest(np.where(bounded, 0.0, multipliers)),
     )

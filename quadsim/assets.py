@@ -23,14 +23,16 @@ def vehicle_names() -> list[str]:
     return sorted(path.stem for path in models_dir().glob("*.toml"))
 
 
-def vehicle_path(name: str, relative_to: Path | None = None) -> Path:
-    """The vehicle file for a shipped name or a path ending in `.toml` (relative paths also against `relative_to`)."""
+def vehicle_path(name: str) -> Path:
+    """The vehicle file for a shipped name or a path ending in `.toml`.
+
+    Raises:
+        FileError, UnknownNameError: there is none.
+    """
     if name.endswith(".toml"):
-        candidates = [Path(name)] if relative_to is None else [relative_to / name, Path(name)]
-        for candidate in candidates:
-            if candidate.is_file():
-                return candidate
-        raise FileError(name, "no such vehicle file")
+        if not Path(name).is_file():
+            raise FileError(name, "no such vehicle file")
+        return Path(name)
     path = models_dir() / f"{name}.toml"
     if not path.is_file():
         raise UnknownNameError("vehicle", name, vehicle_names(), hint="or give a path ending in .toml")

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 
@@ -134,15 +134,18 @@ class Finding:
 
     @property
     def satisfied(self) -> bool:
-        """Whether the limit held, within its tolerances, at the samples and between them."""
-        return bool(
-            self.worst_margin_sampled >= -self.limit.tolerance_sampled and self.worst_margin >= -self.limit.tolerance
-        )
+        """Whether the limit held, within its tolerances, at the samples and between them.
+
+        A window that the flight did not reach was not held; one that fell between two samples is judged by the plant.
+        """
+        broken_at_samples = self.worst_margin_sampled < -self.limit.tolerance_sampled
+        return self.worst_margin >= -self.limit.tolerance and not broken_at_samples
 
 
 def margins_sampled(limit: Limit, log: FlightLog) -> Array:
     """(K,) signed margins of a limit at the control samples, NaN outside its time window."""
-    return _windowed(limit, log.control.t, limit.margin(SIGNALS[limit.signal].sampled(log.control)))
+    margins = limit.margin(SIGNALS[limit.signal].sampled(log.control))
+    return np.where(_inside(limit, log.control.t), margins, np.nan)
 
 
 def audit(log: FlightLog, limits: tuple[Limit, ...]) -> tuple[Finding, ...]:
@@ -158,40 +161,36 @@ def audit(log: FlightLog, limits: tuple[Limit, ...]) -> tuple[Finding, ...]:
     return tuple(_find(log, limit) for limit in limits)
 
 
-def _windowed(limit: Limit, t: Array, margins: Array) -> Array:
-    return np.where((t >= limit.start - 1e-9) & (t <= limit.stop + 1e-9), margins, np.nan)
+def _inside(limit: Limit, t: Array) -> np.ndarray[Any, np.dtype[np.bool_]]:
+    return (t >= limit.start - 1e-9) & (t <= limit.stop + 1e-9)
 
 
 def _find(log: FlightLog, limit: Limit) -> Finding:
     signal = SIGNALS[limit.signal]
-    sampled_t, sampled = log.control.t, signal.sampled(log.control)
-    peak_sampled, margin_sampled, time_sampled = _worst(limit, sampled_t, sampled)
-    if signal.plant is None:
-        t, values = sampled_t, sampled
-        peak, margin, time = peak_sampled, margin_sampled, time_sampled
-    else:
+    t, values = log.control.t, signal.sampled(log.control)
+    sampled = peak, margin, time = _worst(limit, t, values)
+    if signal.plant is not None and t.size:  # before the first period nothing was flown
         t, values = log.plant.t, signal.plant(log.plant)
         peak, margin, time = _worst(limit, t, values)
-    margins = _windowed(limit, t, limit.margin(values))
-    spacing = float(t[1] - t[0]) if t.size > 1 else 0.0
+    beyond = _inside(limit, t) & (limit.margin(values) < -limit.tolerance)
+    held = np.diff(t, append=log.plant.t[-1:])  # each value stands until the next, the last until the flight's end
     return Finding(
         limit=limit,
-        peak_sampled=peak_sampled,
+        peak_sampled=sampled[0],
         peak_plant=peak,
-        worst_margin_sampled=margin_sampled,
+        worst_margin_sampled=sampled[1],
         worst_margin=margin,
         worst_time=time,
-        time_violated=float(np.count_nonzero(margins < -limit.tolerance)) * spacing,
+        time_violated=round(float(held[beyond].sum()), 9) + 0.0,
     )
 
 
 def _worst(limit: Limit, t: Array, values: Array) -> tuple[float, float, float]:
     """Value, margin and time where the margin is smallest; NaN when the window is empty."""
-    columns = values if values.ndim == 2 else values[:, None]
-    inside = (t >= limit.start - 1e-9) & (t <= limit.stop + 1e-9)
+    inside = _inside(limit, t)
     if not inside.any():
         return math.nan, math.nan, math.nan
-    columns, t = columns[inside], t[inside]
-    margins = np.minimum(columns - limit.lower, limit.upper - columns)
-    row, column = np.unravel_index(int(np.argmin(margins)), margins.shape)
-    return float(columns[row, column]), float(margins[row, column]), float(t[row])
+    t, columns = t[inside], values[inside].reshape(np.count_nonzero(inside), -1)
+    row = int(np.argmin(limit.margin(columns)))
+    column = int(np.argmin(np.minimum(columns[row] - limit.lower, limit.upper - columns[row])))
+    return float(columns[row, column]), float(limit.margin(columns)[row]), float(t[row])

@@ -63,11 +63,14 @@ def outcome(summary: Mapping[str, Any]) -> Cell:
 
 
 def required(summary: Mapping[str, Any]) -> Cell:
-    """The verdict on the constraints that the scenario demands, naming those that are violated."""
+    """The verdict on the constraints that the scenario demands, naming those that do not hold."""
     demanded = [entry for entry in summary["constraints"] if entry["required"]]
-    broken = [entry["name"] for entry in demanded if not entry["satisfied"]]
-    if broken:
-        return Cell(text=f"violated: {', '.join(broken)}", mark=Mark.BAD)
+    failed = [entry for entry in demanded if not entry["satisfied"]]
+    missed = [entry["name"] for entry in failed if entry["worst_margin"] is None]
+    broken = [entry["name"] for entry in failed if entry["worst_margin"] is not None]
+    told = [f"{what}: {', '.join(names)}" for what, names in (("violated", broken), ("not reached", missed)) if names]
+    if told:
+        return Cell(text="; ".join(told), mark=Mark.BAD)
     return Cell(text=f"all {len(demanded)} hold", mark=Mark.GOOD) if demanded else Cell(text="none")
 
 

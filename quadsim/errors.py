@@ -99,7 +99,7 @@ class DivergenceError(FlightError):
 
 
 class CommandError(FlightError):
-    """A command that must not reach the plant: wrong shape, non-finite or negative rotor speeds."""
+    """A command that must not reach the plant: wrong shape, non-finite, or beyond any rotor's speed."""
 
 
 class PlanExhaustedError(FlightError):

@@ -25,6 +25,7 @@ TIMING_FILE: Final = "timing.parquet"
 PLANT_FILE: Final = "plant.parquet"
 HORIZON_FILE: Final = "horizon.parquet"
 
+_COUNTS: Final = ("iterations", "active", "fallback")
 ROTORS: Final = range(1, N_ROTORS + 1)
 
 
@@ -200,7 +201,11 @@ def _read(path: Path) -> pa.Table:
 
 
 def _stack(table: pa.Table, names: Sequence[str]) -> Array:
-    return np.stack([table.column(name).to_numpy() for name in names], axis=1)
+    return np.stack([_numbers(table, name) for name in names], axis=1)
+
+
+def _numbers(table: pa.Table, name: str, kind: type = np.float64) -> np.ndarray[Any, Any]:
+    return np.asarray(table.column(name).to_numpy(), dtype=kind)
 
 
 def read_log(directory: Path, *, reason: str | None = None) -> FlightLog:
@@ -217,7 +222,7 @@ def read_log(directory: Path, *, reason: str | None = None) -> FlightLog:
     try:
         before = np.array([float(text) for text in (flight.schema.metadata or {})[b"speeds_before"].split(b",")])
         scalars = {
-            field.name: flight.column(field.name).to_numpy()
+            field.name: _numbers(flight, field.name, np.int64 if field.name in _COUNTS else np.float64)
             for field in fields(ControlLog)
             if field.name not in ("state", "reference", "speeds", "speeds_before", "status")
         }
@@ -230,15 +235,15 @@ def read_log(directory: Path, *, reason: str | None = None) -> FlightLog:
             **scalars,
         )
         plant_log = PlantLog(
-            t=plant.column("t").to_numpy(),
+            t=_numbers(plant, "t"),
             state=_stack(plant, STATE_NAMES),
             speeds=_stack(plant, [f"w{i}" for i in ROTORS]),
         )
-        timing_log = TimingLog(**{name: timing.column(name).to_numpy() for name in ("t", "solve_ms", "step_ms")})
+        timing_log = TimingLog(**{name: _numbers(timing, name) for name in ("t", "solve_ms", "step_ms")})
         predicted = _read_predicted(directory)
     except FileError:
         raise
-    except (AttributeError, KeyError, ValueError) as error:
+    except (AttributeError, KeyError, TypeError, ValueError) as error:
         raise FileError(directory, f"lacks a column of the flight log ({error})") from error
     return FlightLog(control=control, timing=timing_log, plant=plant_log, predicted=predicted, reason=reason)
 

@@ -11,7 +11,7 @@ from quadsim.controller import Command, Controller
 from quadsim.errors import FlightError, InterruptedFlightError
 from quadsim.flightlog import ControlLog, FlightLog, PlantLog, TimingLog
 from quadsim.plant import Plant, physics_to_state
-from quadsim.state import N_STATES, Array
+from quadsim.state import INDEX, N_STATES, Array
 from quadsim.vehicle import N_ROTORS
 
 
@@ -81,7 +81,13 @@ def fly(
             solve_ms=np.array([1e3 * command.solve_s for command in commands]),
             step_ms=1e3 * np.array(step_s),
         ),
-        plant=_plant_log(physics[: flown * steps_per_period + 1], applied[:flown], initial_speeds, plant.timestep),
+        plant=_plant_log(
+            physics[: flown * steps_per_period + 1],
+            applied[:flown],
+            initial_speeds=initial_speeds,
+            initial_yaw=float(initial_state[INDEX["yaw"]]),
+            timestep=plant.timestep,
+        ),
         predicted=_predict(controller, control.state, commands),
         reason=None if ended is None else str(ended),
         interrupted=isinstance(ended, InterruptedFlightError),
@@ -110,12 +116,14 @@ def _control_log(
     )
 
 
-def _plant_log(physics: Array, applied: Array, initial_speeds: Array, timestep: float) -> PlantLog:
+def _plant_log(
+    physics: Array, applied: Array, *, initial_speeds: Array, initial_yaw: float, timestep: float
+) -> PlantLog:
     steps = (physics.shape[0] - 1) // max(len(applied), 1)
     last = applied[-1:] if len(applied) else initial_speeds[None, :]
     return PlantLog(
         t=_times(physics.shape[0], timestep),
-        state=physics_to_state(physics),
+        state=physics_to_state(physics, initial_yaw),
         speeds=np.concatenate([np.repeat(applied, steps, axis=0), last]),
     )
 

@@ -52,11 +52,12 @@ def steps_per_period(control_period: float, timestep: float) -> int:
     return steps
 
 
-def physics_to_state(physics: Array) -> Array:
+def physics_to_state(physics: Array, yaw: float = 0.0) -> Array:
     """The paper's state from MuJoCo's.
 
     Args:
         physics: (M, 14) time, position (world), quaternion wxyz, velocity (world), angular rates (body).
+        yaw: near which turn the first row's yaw is [rad].
 
     Returns:
         (M, 12) states with Euler-angle rates (Sec. 2.2 takes body rates for them; see `quadsim.state`), yaw
@@ -67,7 +68,8 @@ def physics_to_state(physics: Array) -> Array:
     state[:, POSITION] = physics[:, 1:4]
     state[:, VELOCITY] = physics[:, 8:11]
     state[:, EULER_RATE] = body_to_euler_rates(euler, physics[:, 11:14])
-    euler[:, 2] = np.unwrap(euler[:, 2])
+    turns = round((yaw - float(euler[0, 2])) / (2.0 * math.pi)) if len(euler) and math.isfinite(euler[0, 2]) else 0
+    euler[:, 2] = np.unwrap(euler[:, 2]) + 2.0 * math.pi * turns
     state[:, EULER] = euler
     return state
 
@@ -75,7 +77,7 @@ def physics_to_state(physics: Array) -> Array:
 class Plant:
     """A vehicle in MuJoCo: fourth-order Runge-Kutta at a fixed step, rotor speeds held between commands.
 
-    Use as a context manager; it owns a thread pool.
+    Use as a context manager; it owns native memory.
 
     Attributes:
         vehicle: what flies.
@@ -141,9 +143,8 @@ class Plant:
 
     def state(self) -> Array:
         """(12,) the true state now, yaw unwrapped since the last reset."""
-        state = physics_to_state(self._physics)[0]
-        turns = round((self._yaw - state[10]) / (2.0 * math.pi))
-        self._yaw = state[10] = state[10] + 2.0 * math.pi * turns
+        state = physics_to_state(self._physics, self._yaw)[0]
+        self._yaw = float(state[EULER[2]])
         return state
 
     def applied(self, speeds: Array) -> Array:

@@ -136,6 +136,15 @@ def is_run(directory: Path) -> bool:
     return True
 
 
+def holds_run_alone(directory: Path) -> bool:
+    """Whether a directory is a run and holds no file but the run's own, so that it may be replaced."""
+    try:
+        own = {SUMMARY_FILE, *read_summary(directory)["files"]}
+    except FileError:
+        return False
+    return all(path.relative_to(directory).as_posix() in own for path in directory.rglob("*") if path.is_file())
+
+
 def read_summary(directory: Path) -> dict[str, Any]:
     """`summary.json` of a run directory.
 
@@ -143,6 +152,8 @@ def read_summary(directory: Path) -> dict[str, Any]:
         FileError: there is none, or it is not one of ours.
     """
     path = directory / SUMMARY_FILE
+    if not path.is_file():
+        raise FileError(directory, f"is not a run directory: it has no {SUMMARY_FILE}")
     try:
         summary = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
@@ -193,7 +204,7 @@ def damaged_files(directory: Path, summary: Mapping[str, Any]) -> list[str]:
 
 
 @contextlib.contextmanager
-def writing(target: Path, replaces: Callable[[Path], bool] = is_run) -> Iterator[Path]:
+def writing(target: Path, replaces: Callable[[Path], bool] = holds_run_alone) -> Iterator[Path]:
     """A directory to fill, which becomes `target` when the block ends well and vanishes when it does not.
 
     Parents that are missing are made, and vanish with it.
@@ -217,9 +228,9 @@ def writing(target: Path, replaces: Callable[[Path], bool] = is_run) -> Iterator
             raise OutputError(target, f"{files[0]} is a file")
         missing = [parent for parent in target.parents if not parent.exists()]
         target.parent.mkdir(parents=True, exist_ok=True)
-        if shutil.disk_usage(target.parent).free < _FREE_BYTES_NEEDED:
-            raise OutputError(target, "the disk is full")
         temporary = Path(tempfile.mkdtemp(prefix=f".{target.name}.", suffix=".partial", dir=target.parent))
+        if shutil.disk_usage(temporary).free < _FREE_BYTES_NEEDED:
+            raise OutputError(target, "the disk is full")
         temporary.chmod(0o755)
         yield temporary
         _replace(temporary, target)

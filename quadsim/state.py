@@ -39,7 +39,7 @@ def quaternion_to_euler(quaternion: Array) -> Array:
         quaternion: (..., 4), scalar first (w, x, y, z), body to world.
 
     Returns:
-        (..., 3): roll and yaw in (-pi, pi], pitch in [-pi/2, pi/2].
+        (..., 3): roll and yaw in [-pi, pi], pitch in [-pi/2, pi/2].
     """
     w, x, y, z = np.moveaxis(np.asarray(quaternion, float), -1, 0)
     roll = np.arctan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y))
@@ -67,7 +67,8 @@ def body_to_euler_rates(euler: Array, body_rates: Array) -> Array:
     """Euler-angle rates [rad/s] from body rates (p, q, r).
 
     d(roll)/dt = p + (q sin(roll) + r cos(roll)) tan(pitch), and so on; singular at pitch = +-90 deg, where the
-    result is not finite.  The paper (Sec. 2.2) takes the two sets of rates as equal, which holds at small angles only.
+    result grows without bound.  The paper (Sec. 2.2) takes the two sets of rates as equal, which holds at small
+    angles only.
     """
     roll, pitch = euler[..., 0], euler[..., 1]
     p, q, r = np.moveaxis(np.asarray(body_rates, float), -1, 0)

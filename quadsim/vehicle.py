@@ -77,10 +77,15 @@ class Vehicle:
             )
         b, d = self.thrust_coefficient, self.drag_coefficient
         scale = np.array([b, b * self.arm_length, b * self.arm_length, d])
-        if abs(np.linalg.det(self.allocation / scale[:, None])) < 1e-9:
+        unit_allocation = self.allocation / scale[:, None]
+        if abs(np.linalg.det(unit_allocation)) < 1e-9:
             raise ParameterError(
                 "vehicle", "rotor_azimuths", self.rotor_azimuths, "a layout that controls roll, pitch, yaw and thrust"
             )
+        if np.abs(unit_allocation[1:].sum(axis=1)).max() > 1e-9:
+            layout = {"rotor_azimuths": self.rotor_azimuths, "rotor_spins": self.rotor_spins}
+            rule = "a layout whose torques cancel when all rotors turn alike, so that it can hover"
+            raise ParameterError("vehicle", "rotor_azimuths, rotor_spins", layout, rule)
 
     def _check_number(self, name: str, value: object, *, positive: bool) -> None:
         if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):

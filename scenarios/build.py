@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
@@ -19,7 +20,7 @@ from quadsim.controller import Controller
 from quadsim.errors import InputError
 from quadsim.plant import Plant
 from quadsim.state import INDEX, N_STATES, STATE_NAMES, Array, make_state
-from quadsim.vehicle import N_ROTORS, Vehicle, load_vehicle
+from quadsim.vehicle import N_ROTORS, VEHICLE_UNITS, Vehicle, load_vehicle
 from scenarios.references import Window, smooth, steps
 from scenarios.spec import ANGLES, ConstrainedSpec, Scenario, WindowSpec
 
@@ -30,8 +31,15 @@ CONTROLLERS: Final = {
 
 
 def build_vehicle(scenario: Scenario) -> Vehicle:
-    """The vehicle file with the scenario's overrides."""
-    return load_vehicle(vehicle_path(scenario.vehicle.file), scenario.vehicle.overrides())
+    """The vehicle file with the scenario's overrides; a resolved scenario has every number, and needs no file."""
+    file, overrides = scenario.vehicle.file, scenario.vehicle.overrides()
+    try:
+        path = vehicle_path(file)
+    except InputError:
+        if not overrides.keys() >= VEHICLE_UNITS.keys():
+            raise
+        return Vehicle(name=Path(file).stem, **overrides)
+    return load_vehicle(path, overrides)
 
 
 def resolve(scenario: Scenario, vehicle: Vehicle) -> Scenario:

@@ -1,6 +1,6 @@
 """The `quadsim` command: parses the line, runs one command, turns errors into messages and exit statuses.
 
-Exit status: 0 done; 1 a required constraint is violated, or the flight was aborted or interrupted; 2 the input was
+Exit status: 0 done; 1 a required constraint does not hold, or the flight was aborted or interrupted; 2 the input was
 wrong.  Nothing heavy is imported before a command runs, so that `quadsim --help` answers at once.
 """
 
@@ -23,7 +23,8 @@ def make_parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="quadsim",
         description="Fly model predictive controllers of quadrotors in MuJoCo; record, film and audit every flight.",
-        epilog="exit status: 0 done; 1 a required constraint is violated or the flight was aborted; 2 wrong input",
+        epilog="exit status: 0 done; 1 a required constraint does not hold, or the flight was aborted or interrupted; "
+        "2 wrong input",
     )
     parser.add_argument("--version", action="version", version=f"quadsim {__version__}")
     commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
@@ -33,7 +34,7 @@ def make_parser() -> argparse.ArgumentParser:
 
     run = commands.add_parser("run", help="fly one scenario and write its run directory")
     _add_scenario(run)
-    run.add_argument("--out", metavar="DIR", help="run directory (default: runs/SCENARIO)")
+    run.add_argument("--out", metavar="DIR", help="run directory, replacing an earlier run (default: runs/SCENARIO)")
     _add_settings(run)
     for product in ("video", "recording", "figures"):
         run.add_argument(
@@ -79,7 +80,8 @@ def _add_settings(parser: argparse.ArgumentParser) -> None:
         default=[],
         help="replace a field of the scenario, e.g. --set controller.horizon=30; may be repeated",
     )
-    parser.add_argument("--seed", type=int, metavar="N", help="replace the scenario's seed")
+    seed_help = "replace the scenario's seed; it is recorded, and nothing is random yet"
+    parser.add_argument("--seed", type=int, metavar="N", help=seed_help)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -100,8 +102,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print("quadsim: interrupted (Ctrl-C); nothing half written was left behind", file=sys.stderr)
         return EXIT_FAILED
     except BrokenPipeError:  # the reader of our output went away, e.g. `quadsim check RUN | head`: no verdict was read
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        _silence_stdout()
         return EXIT_FAILED
+    except OSError as error:  # ours are QuadsimErrors: this one is stdout's
+        print(f"quadsim: cannot write the output: {error.strerror or error}", file=sys.stderr)
+        _silence_stdout()
+        return EXIT_WRONG_INPUT
+
+
+def _silence_stdout() -> None:
+    """Send the rest of stdout nowhere, so that Python does not fail on it at its exit."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 if __name__ == "__main__":

@@ -52,7 +52,8 @@ def check(options: Namespace) -> int:
     """`quadsim check`."""
     if Path(options.target).is_dir():
         if options.settings or options.seed is not None:
-            raise ParameterError("", "--set", options.settings, "absent when a finished run is checked")
+            option, value = ("--set", options.settings) if options.settings else ("--seed", options.seed)
+            raise ParameterError("", option, value, "absent when a finished run is checked")
         summary = _read_intact_summary(Path(options.target))
     else:
         scenario = _load(options.target, options)
@@ -115,8 +116,12 @@ def view(options: Namespace) -> int:
 
     path = Path(options.run)
     recording = path / rundir.RECORDING_FILE if path.is_dir() else path
+    if not path.exists():
+        raise FileError(path, "no such run or recording")
     if not recording.is_file():
-        raise FileError(recording, "no such recording; run the scenario with --recording")
+        raise FileError(path, f"has no {rundir.RECORDING_FILE}; run the scenario again without --no-recording")
+    if recording.suffix != ".rrd":
+        raise FileError(path, "is no recording; give a run directory or a file ending in .rrd")
     open_viewer(recording, web=options.web)
     return EXIT_DONE
 

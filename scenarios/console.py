@@ -51,7 +51,7 @@ def outcome(summary: Mapping[str, Any]) -> str:
         return f"[red]aborted[/red]: {summary['reason']}"
     if summary["satisfied"]:
         return "[green]completed, every required constraint holds[/green]"
-    return "[red]completed, a required constraint is violated[/red]"
+    return "[red]completed, a required constraint does not hold[/red]"
 
 
 def audit_table(constraints: Sequence[Mapping[str, Any]]) -> Table:
@@ -81,8 +81,8 @@ def audit_table(constraints: Sequence[Mapping[str, Any]]) -> Table:
 def _verdict(entry: Mapping[str, Any]) -> str:
     if entry["satisfied"]:
         return "[green]holds[/green]"
-    if entry["worst_margin_sampled"] is None and (entry["worst_margin"] or 0.0) >= -entry["tolerance"]:
-        return "[red]not reached[/red]"  # the flight ended before its time window, or before its first period
+    if entry["worst_margin"] is None:
+        return "[red]not reached[/red]"  # the flight ended before its time window
     return "[red]VIOLATED[/red]" if entry["required"] else "[yellow]exceeded*[/yellow]"
 
 
@@ -104,7 +104,7 @@ def _controller_line(summary: Mapping[str, Any]) -> str:
     return (
         f"{how}: {statuses}; step p50 {times['p50']:.3f}, p99 {times['p99']:.3f}, max {times['max']:.3f} ms "
         f"of {controller['deadline_ms']:g} ms\n"
-        f"rotor speeds {control['speed_min']:.2f} .. {control['speed_max']:.2f} rad/s, "
+        f"commanded speeds {control['speed_min']:.2f} .. {control['speed_max']:.2f} rad/s, "
         f"steps {control['slew_min']:.2f} .. {control['slew_max']:.2f} rad/s per period; "
         f"simulated in {summary['wall_s']['simulate']:.2f} s"
     )

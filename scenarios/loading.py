@@ -94,6 +94,9 @@ def apply_setting(data: dict[str, Any], setting: str) -> None:
     table: Any = data
     for depth, key in enumerate(keys):
         if isinstance(table, list):
+            if depth == len(keys) - 1:
+                rule = f"a path to a field; {'.'.join(keys)} is an entry of a list"
+                raise ParameterError("", "--set", setting, rule)
             named = [entry for entry in table if isinstance(entry, dict) and entry.get("name") == key]
             if not named:
                 allowed = [str(entry.get("name")) for entry in table if isinstance(entry, dict)]

@@ -62,6 +62,9 @@ def describe(details: ErrorDetails, data: Mapping[str, Any]) -> str:
         return f"{field} is not a field of the scenario file{guess} (there are: {', '.join(allowed)})"
     if kind == "value_error":
         return ".".join([*location, str(context["error"])])
+    if kind in ("too_short", "too_long") and isinstance(given, list) and location[-1] != "output_weights":
+        length = context.get("min_length", context.get("max_length"))
+        return f"{field} must be a list of {length} numbers; got {given!r}"
     rule = _RULES[kind].format(**context) if kind in _RULES else details["msg"]
     return f"{field} must be {rule}; got {given!r}"
 

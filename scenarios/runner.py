@@ -57,6 +57,8 @@ class Flight:
         vehicle: what was flown.
         log: the flight, plant rows at the physics rate.
         findings: the audit, one per constraint of the scenario.
+        controller: name of the control law.
+        solver: name of its QP solver; empty for a closed form.
         simulate_s: wall time of the closed loop alone [s].
     """
 
@@ -64,6 +66,8 @@ class Flight:
     vehicle: Vehicle
     log: FlightLog
     findings: tuple[Finding, ...]
+    controller: str
+    solver: str
     simulate_s: float
 
     @property
@@ -98,6 +102,8 @@ def fly_scenario(scenario: Scenario, progress: Progress = silent) -> Flight:
         vehicle=vehicle,
         log=log,
         findings=audit(log, build_limits(scenario)),
+        controller=controller.name,
+        solver=controller.solver,
         simulate_s=simulate_s,
     )
 
@@ -140,7 +146,6 @@ def summarise(flight: Flight) -> dict[str, Any]:
     """`summary.json` of a flight, but for the hashes of its files and the total wall time."""
     scenario, log = flight.scenario, flight.log
     numbers = metrics.flight_numbers(log, deadline_ms=1e3 * scenario.control_period)
-    solver = getattr(scenario.controller, "solver", "")
     return {
         "scenario": scenario.name,
         "description": scenario.description,
@@ -153,8 +158,8 @@ def summarise(flight: Flight) -> dict[str, Any]:
         "constraints": [rundir.limit_to_json(finding) for finding in flight.findings],
         "control": numbers["control"],
         "controller": {
-            "name": scenario.controller.type,
-            "solver": solver,
+            "name": flight.controller,
+            "solver": flight.solver,
             "horizon": scenario.controller.horizon,
             **numbers["controller"],
         },

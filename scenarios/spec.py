@@ -39,7 +39,10 @@ Weights = Annotated[
 
 
 class _Spec(BaseModel):
-    """A table of the file.  What a validator raises starts with the name of the field, for `_describe` to complete."""
+    """A table of the file.
+
+    What a validator raises starts with the name of the field, for `scenarios.problems.describe` to complete.
+    """
 
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True, allow_inf_nan=False)
 

@@ -12,7 +12,10 @@ from mpc.qp import QP, Solution, Vectors
 from quadsim.controller import SOLVED
 
 MAX_ITERATIONS: Final = 100
-"""Cap for hopeless data (NaN runs PIQP to its limit); the paper's QPs take 7 to 20."""
+"""Cap for hopeless data (NaN runs PIQP to its limit); the paper's QPs take 7 to 22."""
+
+ACTIVE_SLACK: Final = 1e-6
+"""Distance to a bound (rad or rad/s) below which a constraint may count as active."""
 
 STATUS: Final = {
     piqp.PIQP_SOLVED: SOLVED,
@@ -46,9 +49,9 @@ def solve(solver: Any, vectors: Vectors) -> Solution:
     status = solver.solve()
     elapsed = clock.perf_counter() - started
     result = solver.result
-    # At an interior-point optimum a constraint is active where its multiplier exceeds its slack.
+    # At an interior-point optimum a constraint is active where its multiplier exceeds its slack, and that is small.
     active = sum(
-        int(np.count_nonzero(multiplier > slack))
+        int(np.count_nonzero((multiplier > slack) & (slack < ACTIVE_SLACK)))
         for multiplier, slack in (
             (result.z_l, result.s_l),
             (result.z_u, result.s_u),

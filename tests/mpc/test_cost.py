@@ -60,8 +60,7 @@ def test_at_hover_on_the_reference_the_optimum_is_u_bar(name: str) -> None:
     u_bar = problem.model.u_bar
     optimum = np.linalg.solve(terms.H, -terms.gradient(hover, desired, u_bar)).reshape(-1, 4)
     np.testing.assert_allclose(optimum, np.tile(u_bar, (problem.horizon, 1)), atol=1e-4)
-    # With the sign that Eq. (10) prints, and no offset of the linearisation, it would be -u_bar instead.
-    as_printed = terms.F1 @ hover + terms.F2 @ desired.ravel() - (terms.F3 - terms.F4) @ u_bar
-    as_printed = np.linalg.solve(terms.H, -as_printed).reshape(-1, 4)
-    assert np.abs(as_printed - u_bar).max() > 100.0
-    assert as_printed[-1, 0] < 0.0
+    # With the sign that Eq. (10) prints, and no offset of the linearisation, the last inputs tend to -u_bar.
+    as_printed = terms.F1 @ hover + terms.F2 @ desired.ravel() - terms.F3 @ u_bar
+    last = np.linalg.solve(terms.H, -as_printed)[-4:]
+    np.testing.assert_allclose(last, -u_bar, rtol=0.1)

@@ -179,3 +179,18 @@ def test_an_unknown_signal_is_answered_with_those_there_are() -> None:
         UnknownNameError, match=r"^no signal named 'rol'; did you mean 'roll'\? \(there are: .*tilt.*\)$"
     ):
         Limit(name="roll", signal="rol", upper=1.0)
+
+
+def test_a_window_between_two_samples_is_judged_by_the_plant() -> None:
+    log = small_log(4)
+    limit = Limit(name="any", signal="x", lower=-1e9, upper=1e9, start=0.06, stop=0.09)
+    (finding,) = audit(log, (limit,))
+    assert np.isnan(finding.worst_margin_sampled)
+    assert finding.satisfied
+
+
+def test_a_limit_broken_all_the_time_is_broken_for_as_long_as_the_flight() -> None:
+    log = small_log(4)
+    limits = tuple(Limit(name=name, signal=name, lower=1e8) for name in ("x", "slew"))
+    for finding in audit(log, limits):
+        assert finding.time_violated == pytest.approx(log.plant.t[-1])

@@ -43,14 +43,14 @@ class Scripted:
         return np.repeat(states[:, None, :], plans.shape[1], axis=1)
 
 
-def fly_scripted(vehicle: Vehicle, controller: Controller) -> FlightLog:
+def fly_scripted(vehicle: Vehicle, controller: Controller, *, yaw: float = 0.0) -> FlightLog:
     reference = np.arange((PERIODS + HORIZON) * 4.0).reshape(-1, 4)
     with Plant(vehicle) as plant:
         return fly(
             plant,
             controller,
             reference,
-            initial_state=make_state(),
+            initial_state=make_state(euler=(0.0, 0.0, yaw)),
             initial_speeds=plant.hover_speeds,
             periods=PERIODS,
             steps_per_period=STEPS,
@@ -74,6 +74,13 @@ def test_samples_plant_and_commands_line_up(vehicle: Vehicle, speeds: Array) -> 
     np.testing.assert_array_equal(log.control.slews[0], speeds[0] - vehicle.hover_speed)
     assert log.predicted is not None
     assert log.predicted.shape == (PERIODS, HORIZON, 3)
+
+
+@pytest.mark.parametrize("yaw", [0.0, 3.5, -3.3, 7.0])
+def test_samples_and_plant_agree_on_the_turn_of_yaw(vehicle: Vehicle, speeds: Array, yaw: float) -> None:
+    log = fly_scripted(vehicle, Scripted(speeds), yaw=yaw)
+    assert log.control.state[0, 10] == pytest.approx(yaw)
+    np.testing.assert_allclose(log.plant.state[:-1:STEPS], log.control.state, atol=1e-12)
 
 
 def test_preview_starts_one_period_ahead(vehicle: Vehicle, speeds: Array) -> None:

@@ -133,6 +133,13 @@ def test_what_is_not_a_run_is_never_replaced(tmp_path: Path, content: str) -> No
     assert (tmp_path / "theirs" / "summary.json").read_text() == content
 
 
+def test_a_run_with_something_of_ones_own_in_it_is_never_replaced(copied: Path) -> None:
+    (copied / "notes.txt").write_text("mine")
+    with pytest.raises(OutputError, match="something else is already there"):
+        write_half(copied, AssertionError)
+    assert (copied / "notes.txt").read_text() == "mine"
+
+
 def test_a_file_is_never_replaced(tmp_path: Path) -> None:
     (tmp_path / "run").write_text("mine")
     with pytest.raises(OutputError, match="something else is already there"), rundir.writing(tmp_path / "run"):
@@ -219,7 +226,7 @@ def test_what_is_no_summary_is_refused(copied: Path, content: bytes) -> None:
 
 
 def test_a_directory_without_a_summary_is_no_run(tmp_path: Path) -> None:
-    with pytest.raises(FileError, match=r"summary\.json: is not a run's summary .*No such file"):
+    with pytest.raises(FileError, match=r"is not a run directory: it has no summary\.json"):
         rundir.read_summary(tmp_path)
     assert not rundir.is_run(tmp_path)
     assert not rundir.is_run(tmp_path / "nowhere")

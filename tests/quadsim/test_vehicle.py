@@ -155,3 +155,11 @@ def test_a_file_that_cannot_be_read_is_named(tmp_path: Path) -> None:
     (tmp_path / "bytes.toml").write_bytes(b"\xff\xfe")
     with pytest.raises(FileError, match=r"bytes\.toml: cannot be read"):
         load_vehicle(tmp_path / "bytes.toml")
+
+
+@pytest.mark.parametrize(
+    "changes", [{"rotor_azimuths": (0.0, -90.0, 180.0, 45.0)}, {"rotor_spins": (1, 1, 1, -1)}], ids=["arms", "spins"]
+)
+def test_a_layout_that_would_turn_in_hover_is_refused(vehicle: Vehicle, changes: dict[str, tuple[float, ...]]) -> None:
+    with pytest.raises(ParameterError, match="whose torques cancel when all rotors turn alike"):
+        dataclasses.replace(vehicle, **changes)

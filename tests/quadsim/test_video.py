@@ -329,5 +329,5 @@ def test_captions_fit_pictures_of_other_sizes(short_run: Run):
 
 
 def test_a_run_that_is_not_one_is_refused(tmp_path: Path):
-    with pytest.raises(FileError, match="not a run's summary"):
+    with pytest.raises(FileError, match="is not a run directory"):
         load_run(tmp_path)

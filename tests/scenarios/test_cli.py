@@ -125,7 +125,7 @@ def test_a_file_of_ones_own_is_flown(here: Path, capsys: pytest.CaptureFixture[s
 def test_a_violated_constraint_is_status_1_and_the_run_is_kept(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["run", "hover", *SHORT, *TABLES, "--set", "constraints.speed.upper=150.0"]) == EXIT_FAILED
     printed = capsys.readouterr()
-    assert "completed, a required constraint is violated" in printed.out
+    assert "completed, a required constraint does not hold" in printed.out
     assert printed.out.count("VIOLATED") == 1
     assert printed.err == ""
     assert rundir.is_run(here / "runs" / "hover")
@@ -266,14 +266,17 @@ WRONG: dict[str, tuple[list[str], str]] = {
     "out cannot be written": ([*RUN, "--out", "/proc/quadsim/run"], "cannot write /proc/quadsim/run: "),
     "out has too long a name": ([*RUN, "--out", "x" * 300], ": File name too long"),
     "check of nothing": (["check", "gone"], "no scenario named 'gone'"),
-    "check of no run": (["check", "folder"], "folder/summary.json: is not a run's summary"),
+    "check of no run": (["check", "folder"], "folder: is not a run directory"),
     "check of a run with settings": (["check", "folder", "--seed", "1"], "absent when a finished run is checked"),
     "junit below a file": (["check", "hover", *SHORT, "--junit", "file/v.xml"], "cannot write file/v.xml: "),
     "compare of nothing": (["compare", "gone", "--out", "page"], "no scenario named 'gone'"),
-    "compare of no run": (["compare", "folder", "--out", "page"], "folder/summary.json: is not a run's summary"),
-    "video of nothing": (["video", "gone"], "gone/summary.json: is not a run's summary"),
-    "view of nothing": (["view", "gone"], "gone: no such recording; run the scenario with --recording"),
-    "view of a run without one": (["view", "folder"], "folder/flight.rrd: no such recording"),
+    "compare of no run": (["compare", "folder", "--out", "page"], "folder: is not a run directory"),
+    "video of nothing": (["video", "gone"], "gone: is not a run directory"),
+    "view of nothing": (["view", "gone"], "gone: no such run or recording"),
+    "view of a run without one": (
+        ["view", "folder"],
+        "folder: has no flight.rrd; run the scenario again without --no-recording",
+    ),
 }
 
 
@@ -485,3 +488,17 @@ def test_a_defect_of_our_own_shows_its_traceback(here: Path, monkeypatch: pytest
     monkeypatch.setattr("scenarios.runner.fly", broken)
     with pytest.raises(ZeroDivisionError):
         main(["check", "hover"])
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="there is no /dev/full to write to")
+def test_output_that_cannot_be_written_is_said() -> None:
+    with Path("/dev/full").open("w") as full:
+        command = [sys.executable, "-m", "scenarios.cli", "list", "--json"]
+        done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, cwd=ROOT)
+    assert done.stderr == "quadsim: cannot write the output: No space left on device\n"
+    assert done.returncode == EXIT_WRONG_INPUT
+
+
+def test_a_seed_means_nothing_to_a_finished_run(hover_directory: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["check", str(hover_directory), "--seed", "3"]) == EXIT_WRONG_INPUT
+    assert capsys.readouterr().err == "quadsim: --seed must be absent when a finished run is checked; got 3\n"

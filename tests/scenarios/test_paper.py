@@ -82,7 +82,7 @@ def test_constraints_make_the_profile_smoother(constrained_flight: Flight, uncon
         return float(np.abs(flight.log.control.slews).max())
 
     assert largest_step(constrained_flight) < 0.1 * largest_step(unconstrained_flight)
-    assert total_variation(constrained_flight) < 2.0 * total_variation(unconstrained_flight)
+    assert total_variation(constrained_flight) < total_variation(unconstrained_flight)  # by 2 % only
 
 
 def test_both_solvers_fly_the_same_commands(constrained_flight: Flight) -> None:
@@ -127,7 +127,6 @@ def test_other_cases_fly_too() -> None:
         "controller.output_bounds.yaw=[-20, 40]",
         "constraints.pitch.lower=-8",
         "constraints.pitch.upper=3",
-        "constraints.arrival_x.required=false",
         "constraints.arrival_x.required=false",
         "constraints.arrival_y.required=false",
         "constraints.arrival_z.required=false",

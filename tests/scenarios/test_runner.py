@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import tomllib
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from quadsim import loop, rundir
+from quadsim.assets import vehicle_path
 from quadsim.errors import InputError, OutputError
 from quadsim.flightlog import FLIGHT_FILE, HORIZON_FILE, PLANT_FILE, TIMING_FILE
 from quadsim.rundir import Run
@@ -167,10 +169,8 @@ def test_any_horizon_flies(name: str, horizon: int) -> None:
 
 def test_a_second_run_replaces_the_first(tmp_path: Path) -> None:
     run(tmp_path / "run", SHORT)
-    (tmp_path / "run" / "notes.txt").write_text("from the first")
     assert run(tmp_path / "run", SHORT, "seed=1").summary["seed"] == 1
     assert [path.name for path in tmp_path.iterdir()] == ["run"]
-    assert not (tmp_path / "run" / "notes.txt").exists()
 
 
 # --- flights that end early ----------------------------------------------------------------------------------------
@@ -295,3 +295,14 @@ def test_outputs_are_made_as_asked_for(tmp_path: Path) -> None:
     }  # fmt: skip
     assert list((tmp_path / "run" / "figures").glob("*.png"))
     assert rundir.damaged_files(tmp_path / "run", rundir.read_summary(tmp_path / "run")) == []
+
+
+def test_a_resolved_scenario_flies_without_its_vehicle_file(tmp_path: Path) -> None:
+    file = tmp_path / "mine.toml"
+    file.write_text(vehicle_path("lopes2011").read_text().replace('name = "lopes2011"', 'name = "mine"'))
+    settings = [f"vehicle.file={file}", "vehicle.mass=4.2", "duration=0.5"]
+    first = runner.fly_scenario(load_scenario("hover", settings))
+    file.unlink()
+    again = runner.fly_scenario(parse_scenario(tomllib.loads(first.scenario.to_toml())))
+    assert again.vehicle == replace(first.vehicle, description="")
+    assert again.log.control.speeds.tolist() == first.log.control.speeds.tolist()

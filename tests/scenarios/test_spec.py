@@ -99,8 +99,8 @@ WRONG = {
     "vehicle=3": "vehicle must be a table; got 3",
     "vehicle.file=3": "vehicle.file must be a text; got 3",
     "vehicle.mass=heavy": "vehicle.mass must be a number; got 'heavy'",
-    "vehicle.inertia=[1, 1]": "vehicle.inertia must be of 3 or more entries; got [1, 1]",
-    "vehicle.rotor_spins=[1, 1, 1, 1, 1]": "vehicle.rotor_spins must be of 4 or fewer entries; got [1, 1, 1, 1, 1]",
+    "vehicle.inertia=[1, 1]": "vehicle.inertia must be a list of 3 numbers; got [1, 1]",
+    "vehicle.rotor_spins=[1, 1, 1, 1, 1]": "vehicle.rotor_spins must be a list of 4 numbers; got [1, 1, 1, 1, 1]",
     "initial.position=[0, nan, 0]": "initial.position.1 must be a finite number; got nan",
     "initial.position=[0, 1e7, 0]": "initial.position.1 must be <= 1000000.0; got 10000000.0",
     "plant.timestep=0": "plant.timestep must be >= 1e-06; got 0",
@@ -122,11 +122,11 @@ WRONG = {
     "controller.output_weights.zz=1": "controller.output_weights.zz is not a state; did you mean 'z'? (there are: ...",
     "controller.input_weights.speed=-1": "controller.input_weights.speed must be > 0.0; got -1",
     "controller.input_weights.speed=big": "controller.input_weights.speed must be a number; got 'big'",
-    "controller.input_weights.speed=[1, 2]": "controller.input_weights.speed must be of 4 or more entries; got [1, 2]",
+    "controller.input_weights.speed=[1, 2]": "controller.input_weights.speed must be a list of 4 numbers; got [1, 2]",
     "controller.input_weights.speed=[1, 2, 0, 1]": "controller.input_weights.speed.2 must be > 0.0; got 0",
     "controller.solver=osqp": "controller.solver: no solver named 'osqp' (there are: piqp-dense, piqp-multistage)",
     "controller.output_bounds.rol=[0, 1]": "controller.output_bounds.rol is not a state; did you mean 'roll'? ...",
-    "controller.output_bounds.roll=[-5]": "controller.output_bounds.roll must be of 2 or more entries; got [-5]",
+    "controller.output_bounds.roll=[-5]": "controller.output_bounds.roll must be a list of 2 numbers; got [-5]",
     "constraints=3": "constraints must be a list; got 3",
     "constraints=[3]": "constraints.0 must be a table; got 3",
     "constraints.roll.tolerance=-1": "constraints.roll.tolerance must be >= 0.0; got -1",
@@ -445,3 +445,10 @@ def test_a_file_with_anything_anywhere_is_either_right_or_named_as_wrong(data: s
         return
     assert str(path[0]) in message
     assert "Input should" not in message, "pydantic's own words"
+
+
+def test_a_setting_that_names_a_whole_entry_of_a_list_is_refused() -> None:
+    with pytest.raises(
+        ParameterError, match=r"--set must be a path to a field; constraints\.roll is an entry of a list"
+    ):
+        load_scenario("paper-constrained", ["constraints.roll=5"])
