@@ -244,7 +244,7 @@ def read_log(directory: Path, *, reason: str | None = None) -> FlightLog:
     except FileError:
         raise
     except (AttributeError, KeyError, TypeError, ValueError) as error:
-        raise FileError(directory, f"lacks a column of the flight log ({error})") from error
+        raise FileError(directory, f"lacks or misstates a column of the flight log ({error})") from error
     return FlightLog(control=control, timing=timing_log, plant=plant_log, predicted=predicted, reason=reason)
 
 

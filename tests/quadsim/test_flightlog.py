@@ -143,5 +143,15 @@ def test_a_damaged_file_is_named_wherever_it_is_damaged(short_run_directory: Pat
 def test_a_foreign_table_is_refused(tmp_path: Path, name: str) -> None:
     write(tmp_path, small_log())
     pq.write_table(pa.table({"t": [0.0, 1.0], "predicted_x": ["a", "b"]}), tmp_path / name)
-    with pytest.raises(FileError, match="lacks a column of the flight log"):
+    with pytest.raises(FileError, match="lacks or misstates a column of the flight log"):
+        read_log(tmp_path)
+
+
+@pytest.mark.parametrize(("name", "column"), [(FLIGHT_FILE, "x"), (FLIGHT_FILE, "iterations"), (PLANT_FILE, "t")])
+def test_a_column_of_texts_is_refused(tmp_path: Path, name: str, column: str) -> None:
+    write(tmp_path, small_log())
+    table = pq.read_table(tmp_path / name)
+    texts = pa.array(["no number"] * table.num_rows)
+    pq.write_table(table.set_column(table.schema.get_field_index(column), column, texts), tmp_path / name)
+    with pytest.raises(FileError, match="lacks or misstates a column of the flight log"):
         read_log(tmp_path)
