@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import itertools
 import re
 import subprocess
 import sys
@@ -85,9 +86,10 @@ def loaded_by(code: str) -> set[str]:
 
 
 def declared() -> set[str]:
-    """Import names of the run-time dependencies in pyproject.toml."""
+    """Import names of the run-time dependencies in pyproject.toml, optional ones included."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-    names = [re.split(r"[<>=!~\[; ]", requirement, maxsplit=1)[0] for requirement in project["dependencies"]]
+    requirements = [*project["dependencies"], *itertools.chain(*project["optional-dependencies"].values())]
+    names = [re.split(r"[<>=!~\[; ]", requirement, maxsplit=1)[0] for requirement in requirements]
     return {IMPORT_NAMES.get(name, name.replace("-", "_")) for name in names}
 
 

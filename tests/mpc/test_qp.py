@@ -16,7 +16,7 @@ from mpc.condensed import condensed
 from mpc.multistage import multistage
 from mpc.problem import Problem
 from mpc.qp import QP, Backend, Formulation, Solution, Vectors, kkt_residuals
-from mpc.solvers import SOLVERS, QPSolver
+from mpc.solvers import SOLVERS, QPSolver, make_backend
 from mpc.solvers.piqp_dense import PiqpDense
 from mpc.solvers.piqp_sparse import PiqpMultistage
 from quadsim.controller import SOLVED
@@ -42,7 +42,7 @@ def flight_queries(flight: Flight, problem: Problem, stride: int) -> list[tuple[
 @pytest.mark.parametrize("name", sorted(SOLVERS))
 def test_kkt_conditions_hold_over_the_flight(constrained_flight: Flight, name: str) -> None:
     problem = paper_problem()
-    formulation, backend = SOLVERS[name].formulate(problem), SOLVERS[name].backend()
+    formulation, backend = SOLVERS[name].formulate(problem), make_backend(name)
     backend.setup(formulation.qp)
     active = 0
     for query in flight_queries(constrained_flight, problem, stride=20):
