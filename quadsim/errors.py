@@ -59,7 +59,7 @@ class MissingPackageError(InputError):
     """Something asked for needs an optional package that is not installed; the message says how to get it."""
 
     def __init__(self, what: str, package: str, *, extra: str) -> None:
-        super().__init__(f"{what} needs the package {package!r}, which is not installed: pip install 'quadsim[{extra}]'")
+        super().__init__(f"{what} needs the package {package!r}: pip install 'quadsim[{extra}]'")
         self.what, self.package, self.extra = what, package, extra
 
 
