@@ -4,7 +4,7 @@
 
 .NOTPARALLEL:
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test check format types build numbers pins clean
+.PHONY: help setup demo test peers check format types build numbers verification pins clean
 
 VENV := .venv
 PY := $(VENV)/bin/python
@@ -32,7 +32,7 @@ apt = if [ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null; then \
 	else echo "Missing on this machine; run: sudo apt-get install --no-install-recommends $(1)" >&2; false; fi
 
 help:  ## list these targets
-	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "make %-9s %s\n", $$1, $$2 }' Makefile
+	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "make %-12s %s\n", $$1, $$2 }' Makefile
 
 setup: $(VENV)/.installed $(VENV)/.renders  ## make .venv with everything pinned, ready for the others
 
@@ -42,11 +42,14 @@ demo: setup  ## fly the paper's two flights and compare them, under runs/ (OPTIO
 	@$(QUADSIM) compare $(RUNS)/paper-unconstrained $(RUNS)/paper-constrained --out $(RUNS)/comparison
 	@echo "Done. Open $(RUNS)/comparison/index.html in a browser."
 
-test: export OMP_NUM_THREADS := 1
-test: export OPENBLAS_NUM_THREADS := 1
-test: export MKL_NUM_THREADS := 1
-test: setup $(VENV)/.browser  ## run every test (OPTIONS="-k audit" for some)
+test peers verification: export OMP_NUM_THREADS := 1
+test peers verification: export OPENBLAS_NUM_THREADS := 1
+test peers verification: export MKL_NUM_THREADS := 1
+test: setup $(VENV)/.browser  ## run every test that needs no peer (OPTIONS="-k audit" for some)
 	@$(PY) -m pytest -q -n $(WORKERS) --dist loadscope $(OPTIONS)
+
+peers: setup $(VENV)/.peers  ## install the peers and every solver, and hold quadsim against them
+	@$(PY) -m pytest -q -n $(WORKERS) --dist loadscope tests/peers $(OPTIONS)
 
 check: setup  ## lint, formatting and types
 	@$(PY) -m ruff check
@@ -66,16 +69,19 @@ build: setup  ## source archive and wheel in dist/; the wheel is installed alone
 	@$(PY) -m pytest -q tests/test_packaging.py
 	@ls dist
 
-numbers: setup  ## remake the numbers in README.md and docs/
+numbers: setup $(VENV)/.peers  ## remake the numbers in README.md and docs/, but for those of the peers
 	@$(PY) docs/make_numbers.py
 	@$(PY) docs/make_performance.py
+
+verification: setup $(VENV)/.peers  ## remake docs/verification.md and its table in README.md
+	@PYTHONPATH=tests $(PY) docs/make_verification.py
 
 pins: $(VENV)/.python  ## resolve every package anew, at its newest, into constraints.txt
 	@fresh=$$(mktemp -d) && trap 'rm -rf "$$fresh"' EXIT && fresh_python="$$fresh/bin/python" && \
 	$(PYTHON) -m venv "$$fresh" && \
 	$(call quietly,"$$fresh_python" -m pip install --quiet --upgrade pip \
-		&& "$$fresh_python" -m pip install --quiet . --group dev,The packages could not be resolved.) && \
-	{ echo "# What setup installs, dependencies of dependencies included.  Made by 'make pins'; not edited by hand." && \
+		&& "$$fresh_python" -m pip install --quiet '.[solvers]' --group dev --group peers,The packages could not be resolved.) && \
+	{ echo "# What setup and peers install, dependencies of dependencies included.  Made by 'make pins'; not edited by hand." && \
 	"$$fresh_python" -m pip freeze --all --exclude quadsim --exclude setuptools; } >"$$fresh/pins" && \
 	cp "$$fresh/pins" constraints.txt
 
@@ -98,6 +104,12 @@ $(VENV)/.installed: $(VENV)/.python pyproject.toml constraints.txt
 	@$(call quietly,$(PIP_INSTALL) $$(grep '^pip==' constraints.txt) && \
 		$(PIP_INSTALL) --constraint constraints.txt --group dev && \
 		$(PIP_INSTALL) --constraint constraints.txt --no-build-isolation --editable .,$(NOT_INSTALLED))
+	@touch $@
+
+$(VENV)/.peers: $(VENV)/.installed
+	@echo "Installing the peers and the other QP solvers into $(VENV)"
+	@$(call quietly,$(PIP_INSTALL) --constraint constraints.txt --group peers && \
+		$(PIP_INSTALL) --constraint constraints.txt --no-build-isolation --editable '.[solvers]',$(NOT_INSTALLED))
 	@touch $@
 
 $(VENV)/.renders: $(VENV)/.installed

@@ -1,11 +1,14 @@
-"""Remake every number that README.md and docs/numbers.md report: `make numbers`.
+"""Remake every number that README.md, docs/numbers.md and docs/constraints-cost.md report: `make numbers`.
 
-Flies the paper's scenarios, measures, and writes docs/numbers.md whole and the results table between the markers of
-README.md.  Rows that no clock decides are also held by tests/test_documents.py.
+Flies the paper's scenarios, measures, and writes both pages whole, the figures of the second, and the tables between
+the markers of README.md.  Rows that no clock decides are also held by tests/test_documents.py.
 """
 
 from __future__ import annotations
 
+import shutil
+import tempfile
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,11 +20,16 @@ from mpc.model import hover_model
 from mpc.prediction import rollout
 from mpc.unconstrained import sequence_gains
 from quadsim.airframe import compile_model, rotor_thrusts
+from quadsim.controller import ACCEPTED
+from quadsim.cost import CostStudy, Variation, cost_markdown, cost_sentences
+from quadsim.figures import write_cost_figures
+from quadsim.metrics import percentiles
 from quadsim.plant import Plant
 from quadsim.state import REFERENCE_STATES, Array, make_state
 from quadsim.vehicle import Vehicle
 from scenarios import runner
 from scenarios.build import build_problem, build_vehicle
+from scenarios.cost import study_cost
 from scenarios.loading import load_scenario
 from scenarios.runner import Flight
 
@@ -65,38 +73,16 @@ def results(flights: dict[str, Flight]) -> Table:
     rows.append(("steps within -10 .. 5 rad/s", *(margin(flight, "slew") for flight in every)))
     rows.append(("highest rotor speed acting [rad/s]", *(f"{flight.log.plant.speeds.max():.1f}" for flight in every)))
     rows.append(("largest step commanded [rad/s]", *(f"{np.abs(f.log.control.slews).max():.1f}" for f in every)))
-    rows.append(
-        ("total variation of the commands [rad/s]", *(f"{np.abs(f.log.control.slews).sum():.0f}" for f in every))
-    )
-    solved = (f"{flight.log.control.status.count('solved')} of {flight.log.control.t.size}" for flight in every)
-    rows.append(("periods solved", *solved))
+    variation = (f"{summary['control']['total_variation']:.0f}" for summary in numbers)
+    rows.append(("total variation of the commands [rad/s]", *variation))
+    found = (f"{count_optimal(flight)} of {flight.log.control.t.size}" for flight in every)
+    rows.append(("periods with their optimum found", *found))
     return rows
 
 
-def sensitivity() -> Table:
-    """The constrained flight over the two parameters the paper leaves out."""
-    rows: Table = [
-        (
-            "L [m]",
-            "d/b [m]",
-            "solved",
-            "beyond 5 deg at samples [deg]",
-            "beyond 5 deg at 1 kHz [deg]",
-            "RMS error z [m]",
-        )
-    ]
-    for arm in (0.2, 0.3, 0.5):
-        for drag in (0.012, 0.024, 0.048):
-            flight = fly("paper-constrained", f"vehicle.arm_length={arm}", f"vehicle.drag_to_thrust={drag}")
-            tilt = [finding for finding in flight.findings if finding.limit.name in ("roll", "pitch")]
-            sampled, plant = (
-                max(-getattr(finding, name) for finding in tilt) for name in ("worst_margin_sampled", "worst_margin")
-            )
-            control = flight.log.control
-            rmse = np.sqrt(np.mean((control.state[:, 4] - control.reference[:, 2]) ** 2))
-            solved = f"{control.status.count('solved')} of {control.t.size}"
-            rows.append((f"{arm}", f"{drag}", solved, f"{sampled:.4f}", f"{plant:.3f}", f"{rmse:.3f}"))
-    return rows
+def count_optimal(flight: Flight) -> int:
+    """Periods whose command is their optimum: found by the QP, or by the unconstrained optimum that is feasible."""
+    return sum(status in ACCEPTED for status in flight.log.control.status)
 
 
 def lqr_convergence() -> Table:
@@ -166,7 +152,7 @@ def transition_difference(vehicle: Vehicle) -> float:
     return float(max(np.abs(limit - part).max() for limit, part in zip(limits, (exact.A, exact.B), strict=True)))
 
 
-def targets(constrained: Flight, sweep: Table) -> Table:
+def targets(constrained: Flight, variations: Sequence[Variation]) -> Table:
     """What was asked of the flights and of the mathematics, and what is measured."""
     found = {finding.limit.name: finding for finding in constrained.findings}
     tilt, inputs = [found["roll"], found["pitch"]], [found["speed"], found["slew"]]
@@ -174,21 +160,73 @@ def targets(constrained: Flight, sweep: Table) -> Table:
     end = np.abs(control.state[-1, list(REFERENCE_STATES)] - control.reference[-1]).max()
     gains, errors = lqr_convergence(), prediction_errors(constrained.vehicle)
     orders = [np.log2(float(errors[-2][i]) / float(errors[-1][i])) for i in (1, 2)]
+    varied = max(variation.outcome.numbers["tilt_plant"] for variation in variations)
     beyond = max(0.0, *(-min(finding.worst_margin, finding.worst_margin_sampled) for finding in inputs))
     return [
         ("paper-constrained, and the mathematics", "asked", "measured"),
         ("roll, pitch beyond 5 deg at the samples", "<= 0.01 deg", f"{-min(f.worst_margin_sampled for f in tilt):.4f}"),
         ("roll, pitch beyond 5 deg at 1 kHz", "<= 0.05 deg", f"{-min(f.worst_margin for f in tilt):.3f}"),
-        ("the same over L and d/b, worst of nine", "<= 0.1 deg", max(row[4] for row in sweep[1:])),
+        ("the same over L and d/b, worst of nine", "<= 0.1 deg", f"{varied - 5.0:.3f}"),
         ("speeds and steps beyond their bounds", "<= 1e-6 rad/s", f"{beyond:.1g}"),
         ("highest speed in the take-off", "250 rad/s", f"{control.speeds[control.t < 10.0].max():.6f}"),
         ("largest error of x, y, z [m], yaw [rad] at the end", "<= 0.01", f"{end:.0e}"),
-        ("QPs solved", "1200", str(control.status.count("solved"))),
+        ("solved, or the unconstrained optimum feasible", "1200", str(count_optimal(constrained))),
         ("commands of the two solvers differ by", "<= 0.01 rad/s", f"{solver_difference(constrained):.4f}"),
         ("K_N from the LQR's gain, N = 100, relative", "< 1e-3", gains[-1][1]),
         ("A, B from `mjd_transitionFD`", "-", f"{transition_difference(constrained.vehicle):.0e}"),
         ("order of the prediction error, 1 and 50 steps", "2", " and ".join(f"{order:.2f}" for order in orders)),
     ]
+
+
+def answer(study: CostStudy) -> Table:
+    """What constraints cost and what they buy, in a few lines."""
+
+    def pair(label: str, keys: Sequence[str], form: str = ".3g") -> tuple[str, ...]:
+        flights = (study.constrained, study.unconstrained)
+        return (label, *(", ".join(format(flight.numbers[key], form) for key in keys) for flight in flights))
+
+    gain, flown, *by_qp = study.contenders
+    times = {contender.name: percentiles(contender.step_ms) for contender in study.contenders}
+    told = {
+        name: ", ".join(f"{float(format(found[key], '.2g')):g}" for key in ("p50", "p99", "max"))
+        for name, found in times.items()
+    }
+    lost = [f"{point.value:g}" for point in study.horizons.points if not point.unconstrained.completed]
+    kept = [f"{point.value:g}" for point in study.horizons.points if not point.constrained.completed]
+    rows: Table = [
+        (f"{study.name}, same weights and horizon", "with its constraints", "without"),
+        pair("RMS error x, y, z [m]", ("rmse_x", "rmse_y", "rmse_z")),
+        pair("peak roll or pitch [deg]", ("tilt_plant",)),
+        pair("highest speed, largest step [rad/s]", ("speed_max", "step_max")),
+        pair("total variation of the commands [rad/s]", ("total_variation",), ".0f"),
+        ("periods without a QP", f"{flown.shortcut.sum()} of {flown.shortcut.size}", "all"),
+        ("horizons N at which the vehicle is lost", ", ".join(kept) or "none", ", ".join(lost) or "none"),
+        ("controller step: median, p99, max [ms]", told[flown.name], told[gain.name]),
+        ("largest loop rate [Hz]", *(f"{each.rate('max'):.0f}" for each in (flown, gain))),
+    ]
+    rows += [(f"{each.name} in every period: the same [ms]", told[each.name], "-") for each in by_qp]
+    return rows
+
+
+def write_cost(study: CostStudy) -> None:
+    """docs/constraints-cost.md with its figures, and the answer in README.md."""
+    docs, sentences = ROOT / "docs", cost_sentences(study)
+    with tempfile.TemporaryDirectory() as scratch:
+        drawn = [path for path in write_cost_figures(study, Path(scratch)) if path.suffix == ".svg"]
+        for path in drawn:
+            shutil.copyfile(path, docs / path.name)
+    page = [
+        "# What do constraints cost?\n\nMade by `make numbers` on one machine "
+        f"({study.machine['processor']}, {study.machine['cores']} cores); nothing here is typed by hand. The same "
+        "section, with plots\nto zoom into, is on the page of `quadsim compare paper-unconstrained paper-constrained "
+        "--out DIR`.\n",
+        "The paper leaves the question open. It compares two controllers that differ in weights and horizon as well "
+        "as in\nconstraints; here the constrained one is held against itself without them.\n",
+        cost_markdown(study, sentences),
+        *(f"![{path.stem}]({path.name})\n" for path in drawn),
+    ]
+    (docs / "constraints-cost.md").write_text("\n".join(page), encoding="utf-8")
+    replace_in_readme("cost", markdown(answer(study)))
 
 
 def markdown(rows: Table) -> str:
@@ -197,10 +235,10 @@ def markdown(rows: Table) -> str:
     return "\n".join([lines[0], "|" + " --- |" * len(rows[0]), *lines[1:]]) + "\n"
 
 
-def replace_in_readme(name: str, table: str) -> None:
-    """Put a table between the markers of that name in README.md."""
+def replace_in_readme(name: str, table: str, *, command: str = "make numbers") -> None:
+    """Put a table between the markers of that name in README.md, which also name the command that makes it."""
     readme = ROOT / "README.md"
-    begin, end = f"<!-- {name}: made by `make numbers` -->", f"<!-- {name} end -->"
+    begin, end = f"<!-- {name}: made by `{command}` -->", f"<!-- {name} end -->"
     head, _, rest = readme.read_text(encoding="utf-8").partition(begin)
     _, _, tail = rest.partition(end)
     readme.write_text(f"{head}{begin}\n\n{table}\n{end}{tail}", encoding="utf-8")
@@ -217,14 +255,16 @@ def main() -> None:
     names = ("paper-unconstrained", "paper-unconstrained-clipped", "paper-constrained")
     flights = {name: fly(name) for name in names}
     constrained = flights["paper-constrained"]
-    table, sweep = markdown(results(flights)), sensitivity()
+    table = markdown(results(flights))
+    study = study_cost(load_scenario("paper-constrained"), [load_scenario("paper-unconstrained")])
     page = [
         "# The numbers\n\nMade by `make numbers`; nothing here is typed by hand.\n",
         f"## The paper's flights\n\n{table}",
         "A bound that is *held* may still be exceeded between the samples, by what stands in brackets; the audit's\n"
         "tolerance for it is 0.05 deg. `left by` gives the worst excess and the seconds beyond bound and tolerance,\n"
         "at the physics rate; for steps, which exist once per period, at the samples.\n",
-        f"## Over the parameters the paper leaves out\n\n{markdown(sweep)}",
+        "The same over the parameters that the paper leaves out, L and d/b, is in\n"
+        "[constraints-cost.md](constraints-cost.md).\n",
         f"## K_N against the discrete LQR gain\n\n{markdown(lqr_convergence())}",
         f"## Linear prediction against MuJoCo near hover\n\n{markdown(prediction_errors(constrained.vehicle))}",
         "The error falls by four as the deviation halves: quadratically.\n",
@@ -233,7 +273,8 @@ def main() -> None:
     ]
     (ROOT / "docs" / "numbers.md").write_text("\n".join(page), encoding="utf-8")
     replace_in_readme("results", table)
-    replace_in_readme("targets", markdown(targets(constrained, sweep)))
+    replace_in_readme("targets", markdown(targets(constrained, study.variations)))
+    write_cost(study)
 
 
 if __name__ == "__main__":

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time as clock
 from typing import Final
 
 import numpy as np
@@ -10,8 +11,9 @@ from mpc.condensed import require_bounds
 from mpc.prediction import rollout
 from mpc.problem import Problem
 from mpc.qp import Solution
+from mpc.shortcut import make_shortcut
 from mpc.solvers import QPSolver
-from quadsim.controller import SOLVED, Command
+from quadsim.controller import SOLVED, UNCONSTRAINED, Command
 from quadsim.errors import PlanExhaustedError
 from quadsim.state import Array
 
@@ -22,16 +24,23 @@ BOUND_TOLERANCE: Final = 1e-6
 class ConstrainedMPC:
     """Solves Eq. (27) each period and sends the first action of the optimal plan.
 
-    Only an answer that is solved, finite, and whose first action is within the hard input bounds is used.  Otherwise
-    the previous plan, shifted by one step, is held (fallback level 1) for as long as it lasts, and then the flight is
-    given up.
+    Where the unconstrained optimum satisfies every constraint it is the solution, and no QP is solved: the status is
+    then `unconstrained`.  Only a QP's answer that is solved, finite, and whose first action is within the hard input
+    bounds is used.  Otherwise the previous plan, shifted by one step, is held (fallback level 1) for as long as it
+    lasts, and then the flight is given up.
+
+    Args:
+        problem: with bounds.
+        solver: set up for the same problem.
+        shortcut: whether to try the unconstrained optimum first; the commands are the same, found later.
     """
 
     name: Final = "constrained"
 
-    def __init__(self, problem: Problem, solver: QPSolver) -> None:
+    def __init__(self, problem: Problem, solver: QPSolver, *, shortcut: bool = True) -> None:
         self.problem = problem
         self._solver = solver
+        self._shortcut = make_shortcut(problem) if shortcut else None
         self._bounds = require_bounds(problem)
         self._before = problem.model.u_bar
         self._plan: Array | None = None
@@ -54,12 +63,30 @@ class ConstrainedMPC:
         self._held = 0
 
     def step(self, time: float, state: Array, reference: Array) -> Command:
-        """One QP; see `quadsim.controller.Controller.step`.
+        """One QP at most; see `quadsim.controller.Controller.step`.
 
         Raises:
             PlanExhaustedError: the solver failed and no step of a previous plan is left.
         """
         desired = self.problem.objective.desired(reference)
+        return self._without_qp(state, desired) or self._with_qp(time, state, desired)
+
+    def predict(self, states: Array, plans: Array) -> Array:
+        """See `quadsim.controller.Controller.predict`."""
+        return rollout(self.problem.model, states, plans)
+
+    def _without_qp(self, state: Array, desired: Array) -> Command | None:
+        if self._shortcut is None:
+            return None
+        started = clock.perf_counter()
+        plan = self._shortcut.plan(state, desired, self._before)
+        if plan is None:
+            return None
+        self._plan, self._held, self._before = plan, 0, plan[0].copy()
+        solve_s = clock.perf_counter() - started
+        return Command(speeds=plan[0].copy(), plan=plan, status=UNCONSTRAINED, solve_s=solve_s)
+
+    def _with_qp(self, time: float, state: Array, desired: Array) -> Command:
         answer = self._solver.solve(state, desired, self._before)
         lower, upper = self._reach()
         problem = _rejection(answer.solution, answer.plan, lower, upper)
@@ -70,12 +97,12 @@ class ConstrainedMPC:
             raise PlanExhaustedError(f"the solver answered {problem!r} {held}", time=time)
         else:
             self._held += 1
-        speeds = np.clip(self._plan[self._held], lower, upper)
+        speeds = np.minimum(np.maximum(self._plan[self._held], lower), upper)
         self._before = speeds
         solution = answer.solution
         return Command(
             speeds=speeds.copy(),
-            plan=np.concatenate([self._plan[self._held :], np.repeat(self._plan[-1:], self._held, axis=0)]),
+            plan=self._plan if problem is None else _shifted(self._plan, self._held),
             status=problem or SOLVED,
             iterations=solution.iterations,
             active=solution.active if problem is None else 0,
@@ -85,10 +112,6 @@ class ConstrainedMPC:
             solve_s=solution.solve_s,
         )
 
-    def predict(self, states: Array, plans: Array) -> Array:
-        """See `quadsim.controller.Controller.predict`."""
-        return rollout(self.problem.model, states, plans)
-
     def _reach(self) -> tuple[Array, Array]:
         """The speeds (4,) that the hard input bounds leave for this period, Eqs. (15) and (20)."""
         bounds = self._bounds
@@ -97,13 +120,17 @@ class ConstrainedMPC:
         return lower, upper
 
 
+def _shifted(plan: Array, steps: int) -> Array:
+    """What is left of a plan (N, nu) after some steps, its last input held."""
+    return np.concatenate([plan[steps:], np.repeat(plan[-1:], steps, axis=0)])
+
+
 def _rejection(solution: Solution, plan: Array, lower: Array, upper: Array) -> str | None:
     """Why an answer must not reach the plant, or None."""
     if solution.status != SOLVED:
         return solution.status
-    if not np.all(np.isfinite(plan)):
+    if not np.isfinite(plan).all():
         return "not_finite"
-    first = plan[0]
-    if np.any(first < lower - BOUND_TOLERANCE) or np.any(first > upper + BOUND_TOLERANCE):
+    if np.maximum(lower - plan[0], plan[0] - upper).max() > BOUND_TOLERANCE:
         return "out_of_bounds"
     return None

@@ -28,6 +28,8 @@ from quadsim.state import Array
 
 STEPS_PER_STAGE: Final = 5
 """M, the fastest of 1 to 25 for the paper's case; see docs/performance.md."""
+ROUNDING: Final = 1e-14
+"""Entries below this fraction of the largest of their row and of their column are products of rounding: left out."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -88,7 +90,8 @@ def multistage(problem: Problem, *, steps_per_stage: int = STEPS_PER_STAGE) -> M
 
     Args:
         problem: a problem with bounds.
-        steps_per_stage: M; the last stage is shorter where M does not divide the horizon.
+        steps_per_stage: M.  The first stage has no state among its variables and takes as many more steps as there is
+            room for in blocks of the others' size; the last stage takes what is left.
 
     Raises:
         ValueError: the problem has no bounds.
@@ -96,7 +99,7 @@ def multistage(problem: Problem, *, steps_per_stage: int = STEPS_PER_STAGE) -> M
     bounds = require_bounds(problem)
     model, N = problem.model, problem.horizon
     n, nu = model.n, model.nu
-    lengths = [min(steps_per_stage, N - start) for start in range(0, N, steps_per_stage)]
+    lengths = _stage_lengths(N, steps_per_stage, more_at_first=n // nu)
     built = {length: _stage(prediction(model, length), problem.objective, bounds, length) for length in set(lengths)}
     stages = [built[length] for length in lengths]
 
@@ -112,11 +115,11 @@ def multistage(problem: Problem, *, steps_per_stage: int = STEPS_PER_STAGE) -> M
     slew_rows = slews @ _selection(input_index, size)
     return Multistage(
         qp=QP(
-            P=csc_matrix(sparse.block_diag(hessians)),
+            P=_without_rounding(csc_matrix(sparse.block_diag(hessians))),
             c=np.zeros(size),
-            A=_dynamics(stages, variables, n),
+            A=_without_rounding(_dynamics(stages, variables, n)),
             b=np.zeros(n * (len(stages) - 1)),
-            G=csc_matrix(sparse.vstack([output_rows, slew_rows])),
+            G=_without_rounding(csc_matrix(sparse.vstack([output_rows, slew_rows]))),
             h_l=np.concatenate([np.tile(bounds.y_min, N), np.tile(bounds.delta_min, N)]),
             h_u=np.concatenate([np.tile(bounds.y_max, N), np.tile(bounds.delta_max, N)]),
             x_l=_box(bounds.u_min - model.u_bar, input_index, N, size, -np.inf),
@@ -130,6 +133,22 @@ def multistage(problem: Problem, *, steps_per_stage: int = STEPS_PER_STAGE) -> M
         h_state=first.outputs[:, :n],
         first_slew=slice(output_rows.shape[0], output_rows.shape[0] + nu),
     )
+
+
+def _stage_lengths(horizon: int, steps: int, *, more_at_first: int) -> list[int]:
+    first = min(steps + more_at_first, horizon) if steps > 1 else 1
+    return [first, *(min(steps, horizon - start) for start in range(first, horizon, steps))]
+
+
+def _without_rounding(matrix: csc_matrix) -> csc_matrix:
+    """The matrix without entries that would be zero in exact arithmetic: axes that do not meet, say, or cos(90 deg)."""
+    size = abs(matrix).tocoo()
+    if not size.nnz:
+        return matrix
+    largest = np.minimum(size.max(axis=1).toarray()[size.row, 0], size.max(axis=0).toarray()[0, size.col])
+    kept = size.data > ROUNDING * largest
+    entries = matrix.tocoo()
+    return csc_matrix((entries.data[kept], (entries.row[kept], entries.col[kept])), shape=matrix.shape)
 
 
 @dataclass(frozen=True, kw_only=True)

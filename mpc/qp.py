@@ -58,8 +58,8 @@ class Solution:
         status: `solved`, or the back end's name for what went wrong.
         iterations: of the back end.
         active: inequality rows and box entries active at the point.
-        primal_residual: as the back end reports it.
-        dual_residual: as the back end reports it.
+        primal_residual: as the back end reports it; NaN where it reports none.
+        dual_residual: likewise.
         solve_s: wall time inside the back end, updates included [s].
     """
 

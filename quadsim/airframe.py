@@ -14,6 +14,7 @@ from quadsim.vehicle import N_ROTORS, Vehicle
 
 BODY: Final = "quadrotor"
 FLOOR: Final = "floor"
+IMU: Final = "imu"
 ROTOR_NAMES: Final = tuple(f"rotor{i}" for i in range(1, N_ROTORS + 1))
 ARM_NAMES: Final = tuple(f"arm{i}" for i in range(1, N_ROTORS + 1))
 PROPELLER_NAMES: Final = tuple(f"propeller{i}" for i in range(1, N_ROTORS + 1))
@@ -22,6 +23,12 @@ DRAWN_ARM: Final = 0.3
 """Arm length [m] for which `quadrotor.xml` is drawn."""
 _WIDEST_DISC: Final = 0.48
 """Largest radius of a rotor disc, in distances between neighbouring rotors: discs never meet."""
+_IDLE: Final = (
+    mujoco.mjtDisableBit.mjDSBL_CONSTRAINT,
+    mujoco.mjtDisableBit.mjDSBL_SPRING,
+    mujoco.mjtDisableBit.mjDSBL_DAMPER,
+)
+"""Stages of MuJoCo's step with nothing to do for a free body that meets nothing: a sixth of its time."""
 
 
 def build_spec(vehicle: Vehicle, *, visuals: bool = True) -> mujoco.MjSpec:
@@ -32,8 +39,9 @@ def build_spec(vehicle: Vehicle, *, visuals: bool = True) -> mujoco.MjSpec:
 
     Args:
         vehicle: the numbers.
-        visuals: whether to keep what is there to be looked at (geoms, lights, cameras), fitted to the vehicle's arms.
-            None of it has mass or meets anything, but it costs half as much time per step again.
+        visuals: whether to keep what is there to be looked at and read (geoms, lights, cameras, sensors), fitted to the
+            vehicle's arms.  None of it moves the vehicle: without it every state is the same to the last bit, in half
+            the time.
     """
     spec = mujoco.MjSpec.from_file(str(models_dir() / "quadrotor.xml"))
     spec.option.gravity = [0.0, 0.0, -vehicle.gravity]
@@ -48,7 +56,7 @@ def build_spec(vehicle: Vehicle, *, visuals: bool = True) -> mujoco.MjSpec:
     if visuals:
         _fit_drawing(spec, vehicle)
     else:
-        _strip_drawing(spec)
+        _strip(spec)
     return spec
 
 
@@ -101,8 +109,11 @@ def _scale(elements: Sequence[mujoco.MjsGeom | mujoco.MjsCamera | mujoco.MjsBody
             element.fromto *= scale
 
 
-def _strip_drawing(spec: mujoco.MjSpec) -> None:
+def _strip(spec: mujoco.MjSpec) -> None:
+    """Leave what moves: one free body, its rotors, and of each step only what acts on it."""
     arms = [spec.body(name) for name in ARM_NAMES]  # with what hangs on them
-    rest = [*spec.worldbody.geoms, *spec.body(BODY).geoms, *spec.cameras, *spec.lights]
-    for element in [*arms, *rest, *spec.materials, *spec.textures]:
+    rest = [*spec.worldbody.geoms, *spec.body(BODY).geoms, *spec.cameras, *spec.lights, *spec.sensors]
+    for element in [*arms, *rest, spec.site(IMU), *spec.materials, *spec.textures]:
         spec.delete(element)
+    for idle in _IDLE:
+        spec.option.disableflags |= int(idle)

@@ -101,6 +101,18 @@ def _tracking_rows(summaries: Sequence[_Summary]) -> Iterator[Row]:
             unit, values = tracking_values(summaries, measure, channel)
             cells = _best_smallest(summaries, values)
             yield Row(group="Tracking", label=f"{label}, {channel}", unit=unit, cells=cells)
+    yield from _settling_rows(summaries)
+
+
+def _settling_rows(summaries: Sequence[_Summary]) -> Iterator[Row]:
+    """One row per step of the courses; `-` where an output does not settle or a run has no such step."""
+    settled = [
+        {(entry["channel"], entry["time"]): entry["settled"] for entry in _get(summary, "tracking", "settling") or ()}
+        for summary in summaries
+    ]
+    for channel, time in dict.fromkeys(step for steps in settled for step in steps):
+        cells = _best_smallest(summaries, [steps.get((channel, time)) for steps in settled])
+        yield Row(group="Tracking", label=f"settling, {channel} at {time:g} s", unit="s", cells=cells)
 
 
 def tracking_values(summaries: Sequence[_Summary], measure: str, channel: str) -> tuple[str, list[float | None]]:
@@ -133,6 +145,7 @@ def _command_rows(summaries: Sequence[_Summary]) -> Iterator[Row]:
         "speed_max": "highest rotor speed",
         "slew_min": "largest step down, per period",
         "slew_max": "largest step up, per period",
+        "total_variation": "total variation",
     }
     for key, label in labels.items():
         cells = tuple(Cell(text=format_number(_get(summary, "control", key))) for summary in summaries)

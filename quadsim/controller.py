@@ -10,6 +10,11 @@ import numpy as np
 from quadsim.state import Array
 
 SOLVED: Final = "solved"
+"""Status of a period whose optimum a QP solver found."""
+UNCONSTRAINED: Final = "unconstrained"
+"""Status of a period whose unconstrained optimum satisfies every constraint, and so is the constrained one too."""
+ACCEPTED: Final = frozenset({SOLVED, UNCONSTRAINED})
+"""The statuses whose command is the period's optimum."""
 LARGEST_SPEED: Final = 1e5
 """Largest magnitude of a rotor speed command [rad/s] that is taken for a command rather than for a fault."""
 
@@ -21,7 +26,7 @@ class Command:
     Attributes:
         speeds: (4,) rotor speeds to hold for the period [rad/s].
         plan: (N, 4) planned speeds, `plan[0]` being this period's [rad/s].
-        status: `solved`, or the back end's name for what went wrong.
+        status: `solved` or `unconstrained` (`ACCEPTED`), or the back end's name for what went wrong.
         iterations: solver iterations; 0 for a closed form.
         active: number of constraints active at the optimum.
         fallback: 0 when `speeds` is this period's optimum, higher = deeper; 1 = the shifted previous plan.

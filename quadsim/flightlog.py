@@ -39,7 +39,7 @@ class ControlLog:
         reference: (K, 4) filtered reference x, y, z [m], yaw [rad] at t_k.
         speeds: (K, 4) commanded rotor speeds held from t_k on [rad/s].
         speeds_before: (4,) u(-1), the command before the first [rad/s].
-        status: K texts, `solved` or what the back end said instead.
+        status: K texts, one of `quadsim.controller.ACCEPTED` or what the back end said instead.
         iterations: (K,) solver iterations.
         active: (K,) constraints active at the optimum.
         fallback: (K,) 0 none, higher = deeper.

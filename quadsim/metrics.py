@@ -2,14 +2,39 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
-from typing import Any
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Final
 
 import numpy as np
 
-from quadsim.controller import SOLVED
+from quadsim.controller import ACCEPTED
 from quadsim.flightlog import ControlLog, FlightLog, TimingLog
-from quadsim.state import REFERENCE_NAMES, REFERENCE_STATES, REFERENCE_UNITS, Array
+from quadsim.state import INDEX, REFERENCE_NAMES, REFERENCE_STATES, REFERENCE_UNITS, Array
+
+SETTLING_BAND: Final = 0.05
+"""Half width of the band an output has to stay in to be settled, as a share of the step."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class CourseStep:
+    """A step that the unfiltered course takes in one channel; angles in rad, lengths in m.
+
+    Attributes:
+        channel: `x`, `y`, `z` or `yaw`.
+        time: when the course steps [s].
+        before: the value before; at the start of a flight, where the vehicle is.
+        after: the value after.
+        until: when the controller first sees the channel's next step coming, or else the flight is planned to end [s].
+    """
+
+    channel: str
+    time: float
+    before: float
+    after: float
+    until: float
 
 
 def tracking(log: ControlLog) -> dict[str, Any]:
@@ -33,13 +58,59 @@ def tracking(log: ControlLog) -> dict[str, Any]:
     }
 
 
+def settling(t: Array, outputs: Array, steps: Sequence[CourseStep]) -> list[dict[str, Any]]:
+    """How long each step of the course takes until the output has settled.
+
+    The settling time runs from the step of the unfiltered course to the first control sample from which on the output
+    stays within `SETTLING_BAND` of the step around its new value.  Samples are looked at up to `until`: a controller
+    with a preview moves before the next step, on purpose.  What steps of the other channels disturb does count.  None
+    where the output does not settle in that time, or the flight ended before it was over.
+
+    Args:
+        t: (K,) control samples [s].
+        outputs: (K, 4) x, y, z [m], yaw [rad].
+        steps: of the course.
+
+    Returns:
+        One entry per step, in order: the step's own values, and `settled` [s].
+    """
+    period = t[1] - t[0] if t.size > 1 else math.inf
+    entries = []
+    for step in steps:
+        held = (t >= step.time - 1e-9) & (t <= step.until + 1e-9)
+        error = outputs[held, REFERENCE_NAMES.index(step.channel)] - step.after
+        outside = np.flatnonzero(np.abs(error) > SETTLING_BAND * abs(step.after - step.before))
+        first = outside[-1] + 1 if outside.size else 0
+        flown = t.size > 0 and t[-1] + period > step.until - 1e-9
+        settled = round(float(t[held][first] - step.time), 9) if flown and first < error.size else None
+        entries.append(
+            {
+                "channel": step.channel,
+                "time": step.time,
+                "before": step.before,
+                "after": step.after,
+                "settled": settled,
+            }
+        )
+    return entries
+
+
+def peak_tilt(state: Array) -> float:
+    """The largest magnitude that roll or pitch reaches in states (K, 12) [deg]; each is bounded by itself, Eq. (35)."""
+    return float(np.degrees(np.abs(state[:, [INDEX["roll"], INDEX["pitch"]]]).max()))
+
+
 def control(log: ControlLog) -> dict[str, float]:
-    """Extremes of the commanded speeds [rad/s] and of their steps per period [rad/s], over all rotors."""
+    """Extremes of the commanded speeds [rad/s] and of their steps per period [rad/s], over all rotors.
+
+    `total_variation` is the sum of the magnitudes of all steps of all rotors [rad/s].
+    """
     return {
         "speed_min": float(log.speeds.min()),
         "speed_max": float(log.speeds.max()),
         "slew_min": float(log.slews.min()),
         "slew_max": float(log.slews.max()),
+        "total_variation": float(np.abs(log.slews).sum()),
     }
 
 
@@ -52,9 +123,10 @@ def percentiles(values: Array) -> dict[str, float]:
 def controller(log: ControlLog, timing: TimingLog, deadline_ms: float) -> dict[str, Any]:
     """Counts of solver statuses and fallbacks, iterations, residuals, and times against the deadline [ms].
 
-    Residuals are those of the periods solved: a back end that gave up may report none, or infinite ones.
+    Residuals are those of the periods whose optimum was found: a back end that gave up may report none, or infinite
+    ones.
     """
-    solved = np.array([status == SOLVED for status in log.status])
+    found = np.array([status in ACCEPTED for status in log.status])
     return {
         "statuses": dict(sorted(Counter(log.status).items())),
         "fallbacks": {str(level): count for level, count in sorted(Counter(log.fallback.tolist()).items())},
@@ -62,8 +134,8 @@ def controller(log: ControlLog, timing: TimingLog, deadline_ms: float) -> dict[s
         "active_max": int(log.active.max()),
         "active_periods": int(np.count_nonzero(log.active)),
         "residual_max": {
-            "primal": float(np.max(log.primal_residual[solved], initial=0.0)),
-            "dual": float(np.max(log.dual_residual[solved], initial=0.0)),
+            "primal": _largest_reported(log.primal_residual[found]),
+            "dual": _largest_reported(log.dual_residual[found]),
         },
         "solve_ms": percentiles(timing.solve_ms),
         "step_ms": percentiles(timing.step_ms),
@@ -72,12 +144,27 @@ def controller(log: ControlLog, timing: TimingLog, deadline_ms: float) -> dict[s
     }
 
 
-def flight_numbers(log: FlightLog, deadline_ms: float) -> dict[str, Any]:
-    """`tracking`, `control` and `controller` of a summary; each is empty when no period was flown."""
+def _largest_reported(residuals: Array) -> float | None:
+    """The largest residual; None for a back end that reports none, 0 where there was nothing to report."""
+    largest = float(np.max(residuals, initial=0.0))
+    return None if math.isnan(largest) else largest
+
+
+def flight_numbers(log: FlightLog, deadline_ms: float, course: Sequence[CourseStep] = ()) -> dict[str, Any]:
+    """`tracking`, `control` and `controller` of a summary; each is empty when no period was flown.
+
+    Args:
+        log: the flight.
+        deadline_ms: the control period [ms].
+        course: the steps that `tracking.settling` tells of.
+    """
     if not log.control.t.size:
         return {"tracking": {}, "control": {}, "controller": {}}
     return {
-        "tracking": tracking(log.control),
+        "tracking": {
+            **tracking(log.control),
+            "settling": settling(log.control.t, log.control.state[:, REFERENCE_STATES], course),
+        },
         "control": control(log.control),
         "controller": controller(log.control, log.timing, deadline_ms),
     }

@@ -11,7 +11,7 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from quadsim.audit import Limit
-from quadsim.controller import SOLVED
+from quadsim.controller import ACCEPTED
 from quadsim.footage import Footage
 from quadsim.rundir import Run
 from quadsim.state import INDEX, REFERENCE_NAMES, REFERENCE_STATES, Array
@@ -130,11 +130,11 @@ class Overlay:
         lines: list[tuple[str, float, Colour]] = [(self._run.name, 21, WHITE)]
         if self._compact:
             return [*lines, (f"t = {time:.1f} s", 17, GREY)]
-        solved = control.status[k] == SOLVED and control.fallback[k] == 0
+        good = control.status[k] in ACCEPTED and control.fallback[k] == 0
         report = control.status[k] + (f" (fallback {control.fallback[k]})" if control.fallback[k] else "")
         if control.iterations[k]:
             report += f"  ·  {control.iterations[k]} iterations  ·  {control.active[k]} active"
-        lines += [(self._subtitle, 14, GREY), (f"t = {time:.2f} s", 20, WHITE), (report, 14, GREEN if solved else RED)]
+        lines += [(self._subtitle, 14, GREY), (f"t = {time:.2f} s", 20, WHITE), (report, 14, GREEN if good else RED)]
         reason = self._run.log.reason
         if reason is not None and time >= control.t[-1]:
             lines.append((f"aborted {reason}"[:100], 15, RED))

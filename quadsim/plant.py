@@ -30,7 +30,7 @@ from quadsim.vehicle import N_ROTORS, Vehicle
 _FULL: Final = int(mujoco.mjtState.mjSTATE_FULLPHYSICS)
 _CONTROL: Final = int(mujoco.mjtState.mjSTATE_CTRL)
 _PLAUSIBLE: Final = 1e6
-"""Largest magnitude of any position [m], speed [m/s] or rate [rad/s] taken for flight rather than divergence."""
+"""Largest magnitude of any time [s], position [m], speed [m/s] or rate [rad/s] taken for flight, not divergence."""
 _NUMERICAL_WARNINGS: Final = (
     mujoco.mjtWarning.mjWARN_BADQPOS,
     mujoco.mjtWarning.mjWARN_BADQVEL,
@@ -68,8 +68,10 @@ def physics_to_state(physics: Array, yaw: float = 0.0) -> Array:
     state[:, POSITION] = physics[:, 1:4]
     state[:, VELOCITY] = physics[:, 8:11]
     state[:, EULER_RATE] = body_to_euler_rates(euler, physics[:, 11:14])
+    if len(euler) > 1:
+        euler[:, 2] = np.unwrap(euler[:, 2])
     turns = round((yaw - float(euler[0, 2])) / (2.0 * math.pi)) if len(euler) and math.isfinite(euler[0, 2]) else 0
-    euler[:, 2] = np.unwrap(euler[:, 2]) + 2.0 * math.pi * turns
+    euler[:, 2] += 2.0 * math.pi * turns
     state[:, EULER] = euler
     return state
 
@@ -192,16 +194,13 @@ class Plant:
         return states[0]
 
     def _check(self, trajectory: Array) -> None:
-        finite = np.isfinite(trajectory).all(axis=1) & (np.abs(trajectory[:, 1:]) < _PLAUSIBLE).all(axis=1)
-        if not finite.all():
-            time = self.time + self.timestep * (1 + int(np.argmin(finite)))
+        if not np.abs(trajectory).max() < _PLAUSIBLE:  # as NaN is not
+            plausible = (np.abs(trajectory) < _PLAUSIBLE).all(axis=1)
+            time = self.time + self.timestep * (1 + int(np.argmin(plausible)))
             raise DivergenceError("the plant diverged: its state is not finite or beyond all plausibility", time=time)
-        raised = [name for name, count in self._warnings() if count]
-        if raised:
+        counts = self._data.warning.number
+        if counts.any() and (raised := [kind.name for kind in _NUMERICAL_WARNINGS if counts[int(kind)]]):
             raise DivergenceError(f"the plant diverged: MuJoCo reports {', '.join(raised)}", time=self.time)
-
-    def _warnings(self) -> list[tuple[str, int]]:
-        return [(kind.name, int(self._data.warning[int(kind)].number)) for kind in _NUMERICAL_WARNINGS]
 
 
 def _discard(message: str) -> None:

@@ -12,17 +12,29 @@ from typing import Any, Final
 from urllib.parse import quote
 
 from quadsim.comparison import comparison_rows, outcome, required, run_names
+from quadsim.cost import CostStudy, cost_markdown, cost_sentences, cost_tables
 from quadsim.errors import OutputError, ParameterError
-from quadsim.figures import comparison_figure
+from quadsim.figures import comparison_figure, write_cost_figures
 from quadsim.flightlog import FLIGHT_FILE, HORIZON_FILE, PLANT_FILE, TIMING_FILE
 from quadsim.narrative import comparison_sentences
 from quadsim.palette import line_colour
-from quadsim.plots import comparison_plots, plotly_script
-from quadsim.rundir import FIGURES_DIR, RECORDING_FILE, SCENARIO_FILE, SUMMARY_FILE, VIDEO_FILE, Run, writing
-from quadsim.table import Cell, to_markdown
+from quadsim.plots import Plot, comparison_plots, cost_plots, plotly_script
+from quadsim.rundir import (
+    FIGURES_DIR,
+    RECORDING_FILE,
+    SCENARIO_FILE,
+    SUMMARY_FILE,
+    VIDEO_FILE,
+    Run,
+    write_json,
+    writing,
+)
+from quadsim.table import Cell, Grid, to_markdown
 
 PAGE_FILE: Final = "index.html"
 TABLE_FILE: Final = "comparison.md"
+COST_FILE: Final = "cost.json"
+COST_TABLES_FILE: Final = "cost.md"
 
 _TEMPLATES: Final = Path(__file__).resolve().parent / "templates"
 _MARK: Final = '<meta name="generator" content="quadsim comparison">'
@@ -54,15 +66,28 @@ class _RunView:
     files: tuple[tuple[str, str], ...]
 
 
-def write_comparison(runs: Sequence[Run], directory: Path) -> Path:
+@dataclass(frozen=True, kw_only=True)
+class _CostView:
+    """What the page's template is told of a study of costs; the targets of `files` are relative URLs."""
+
+    name: str
+    sentences: tuple[str, ...]
+    tables: tuple[Grid, ...]
+    plots: tuple[Plot, ...]
+    files: tuple[tuple[str, str], ...]
+
+
+def write_comparison(runs: Sequence[Run], directory: Path, study: CostStudy | None = None) -> Path:
     """Write a comparison of runs, which appears complete or not at all.
 
     The directory holds `index.html`, the overlay `comparison.png` and `.svg`, the table `comparison.md`, and of each
-    run its video `NAME.mp4` and a folder `NAME` of its other files; it can be moved or zipped as it is.
+    run its video `NAME.mp4` and a folder `NAME` of its other files; it can be moved or zipped as it is.  A study of
+    what constraints cost adds a section to the page, `cost.json`, `cost.md` and the figures `cost_*.png` and `.svg`.
 
     Args:
         runs: one or more; aborted ones, and ones without video, recording or constraints, are welcome.
         directory: what to write; an earlier comparison or an empty directory there is replaced.
+        study: what constraints cost on the course of these runs, where that was studied.
 
     Returns:
         The page, `directory/index.html`.
@@ -92,6 +117,7 @@ def write_comparison(runs: Sequence[Run], directory: Path) -> Path:
             sentences=comparison_sentences(runs),
             groups=[(group, list(of_group)) for group, of_group in itertools.groupby(rows, lambda row: row.group)],
             plots=comparison_plots(runs),
+            cost=None if study is None else _place_study(study, partial),
             plotly=plotly_script(),
             figure="comparison.svg",
             table=TABLE_FILE,
@@ -160,6 +186,26 @@ def _place(run: Run, name: str, folder: str, colour: str, page_directory: Path) 
         made_with=_made_with(run),
         video=None if video is None else quote(video),
         files=tuple(files),
+    )
+
+
+def _place_study(study: CostStudy, page_directory: Path) -> _CostView:
+    """Write a study's files beside the page, and say what the page is to show of it."""
+    sentences = cost_sentences(study)
+    write_json(page_directory / COST_FILE, study.to_json())
+    text = f"# What do constraints cost?\n\n{cost_markdown(study, sentences)}"
+    (page_directory / COST_TABLES_FILE).write_text(text, encoding="utf-8")
+    figures = [path for path in write_cost_figures(study, page_directory) if path.suffix == ".svg"]
+    return _CostView(
+        name=study.name,
+        sentences=tuple(sentences),
+        tables=tuple(cost_tables(study)),
+        plots=tuple(cost_plots(study)),
+        files=(
+            (COST_FILE, COST_FILE),
+            (COST_TABLES_FILE, COST_TABLES_FILE),
+            *((f"figure: {path.stem}", path.name) for path in figures),
+        ),
     )
 
 

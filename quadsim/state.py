@@ -41,11 +41,12 @@ def quaternion_to_euler(quaternion: Array) -> Array:
     Returns:
         (..., 3): roll and yaw in [-pi, pi], pitch in [-pi/2, pi/2].
     """
-    w, x, y, z = np.moveaxis(np.asarray(quaternion, float), -1, 0)
-    roll = np.arctan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y))
-    pitch = np.arcsin(np.clip(2.0 * (w * y - z * x), -1.0, 1.0))
-    yaw = np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
-    return np.stack([roll, pitch, yaw], axis=-1)
+    w, x, y, z = _entries(quaternion)
+    euler = np.empty((*x.shape, 3))
+    euler[..., 0] = np.arctan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y))
+    euler[..., 1] = np.arcsin(np.clip(2.0 * (w * y - z * x), -1.0, 1.0))
+    euler[..., 2] = np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+    return euler
 
 
 def euler_to_quaternion(euler: Array) -> Array:
@@ -70,12 +71,15 @@ def body_to_euler_rates(euler: Array, body_rates: Array) -> Array:
     result grows without bound.  The paper (Sec. 2.2) takes the two sets of rates as equal, which holds at small
     angles only.
     """
-    roll, pitch = euler[..., 0], euler[..., 1]
-    p, q, r = np.moveaxis(np.asarray(body_rates, float), -1, 0)
-    lateral = q * np.sin(roll) + r * np.cos(roll)
-    return np.stack(
-        [p + lateral * np.tan(pitch), q * np.cos(roll) - r * np.sin(roll), lateral / np.cos(pitch)], axis=-1
-    )
+    roll, pitch, _ = _entries(euler)
+    p, q, r = _entries(body_rates)
+    sin_roll, cos_roll = np.sin(roll), np.cos(roll)
+    lateral = q * sin_roll + r * cos_roll
+    rates = np.empty((*lateral.shape, 3))
+    rates[..., 0] = p + lateral * np.tan(pitch)
+    rates[..., 1] = q * cos_roll - r * sin_roll
+    rates[..., 2] = lateral / np.cos(pitch)
+    return rates
 
 
 def euler_to_body_rates(euler: Array, euler_rates: Array) -> Array:
@@ -113,6 +117,12 @@ def make_state(
     state[list(POSITION)] = position
     state[list(EULER)] = euler
     return state
+
+
+def _entries(vectors: Array) -> tuple[Array, ...]:
+    """The entries of vectors (..., m), each of shape (...)."""
+    array = np.asarray(vectors, float)
+    return tuple(array[..., i] for i in range(array.shape[-1]))
 
 
 def read_only(array: Array) -> Array:

@@ -47,19 +47,46 @@ class Row:
     headline: bool = False
 
 
+@dataclass(frozen=True, kw_only=True)
+class Grid:
+    """A table of cases: a head, and a line of cells for each case, the first of which names it.
+
+    Attributes:
+        key: its identifier in a page.
+        title: its heading.
+        head: what stands above each column.
+        lines: cells of each case, as many as there are columns.
+        note: what a reader has to know of it.
+    """
+
+    key: str
+    title: str
+    head: tuple[str, ...]
+    lines: tuple[tuple[Cell, ...], ...]
+    note: str = ""
+
+
 def to_markdown(rows: Sequence[Row], names: Sequence[str]) -> str:
     """A Markdown table of the rows: headlines and the best values in bold type."""
-
-    def line(*texts: str) -> str:
-        return "| " + " | ".join(text.replace("|", r"\|") for text in texts) + " |"
-
-    lines = [line("", "", *names), line("---", "---", *("---:" for _ in names))]
+    lines = [_markdown_line("", "", *names), _markdown_line("---", "---", *("---:" for _ in names))]
     group = ""
     for row in rows:
         cells = [f"**{cell.text}**" if row.headline or cell.mark is Mark.BEST else cell.text for cell in row.cells]
-        lines.append(line(f"**{row.group}**" if row.group != group else "", _with_unit(row), *cells))
+        lines.append(_markdown_line(f"**{row.group}**" if row.group != group else "", _with_unit(row), *cells))
         group = row.group
     return "\n".join(lines) + "\n"
+
+
+def grid_to_markdown(grid: Grid) -> str:
+    """A Markdown table of the grid: the best values in bold type."""
+    lines = [_markdown_line(*grid.head), _markdown_line("---", *("---:" for _ in grid.head[1:]))]
+    for cells in grid.lines:
+        lines.append(_markdown_line(*(f"**{cell.text}**" if cell.mark is Mark.BEST else cell.text for cell in cells)))
+    return "\n".join(lines) + "\n"
+
+
+def _markdown_line(*texts: str) -> str:
+    return "| " + " | ".join(text.replace("|", r"\|") for text in texts) + " |"
 
 
 def format_number(value: float | None) -> str:

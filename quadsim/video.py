@@ -57,6 +57,19 @@ def rendering_backend() -> str:
     raise RenderingUnavailableError(tried)
 
 
+def worker_count(frames: int, most: int | None = None) -> int:
+    """How many processes render a film of so many frames: `most`, or the usable cores, as far as that pays.
+
+    Raises:
+        ParameterError: there is to be none.
+    """
+    if most is None:
+        most = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    if most < 1:
+        raise ParameterError("film", "workers", most, "at least 1")
+    return max(1, min(most, frames // _FEWEST_FRAMES))
+
+
 def render_video(
     run_directory: Path,
     path: Path,
@@ -94,7 +107,7 @@ def render_video(
         run=str(run_directory), width=width, height=height, fps=fps, speed=speed, count=1
     ))  # fmt: skip
     with _staging(path) as folder:
-        _film(shot, folder / "film.mp4", _worker_count(workers), progress)
+        _film(shot, folder / "film.mp4", workers, progress)
         (folder / "film.mp4").replace(path)
 
 
@@ -118,7 +131,7 @@ def render_gif(
         compact=True,
     ))  # fmt: skip
     with _staging(path) as folder:
-        backend = _film(shot, folder / "film.mp4", _worker_count(workers), None)
+        backend = _film(shot, folder / "film.mp4", workers, None)
         _work([("gif", str(folder / "film.mp4"), str(folder / "film.gif"), str(width))], backend, folder)
         (folder / "film.gif").replace(path)
 
@@ -131,18 +144,10 @@ def _plan(run: Run, start: float, stop: float | None, shot: Shot) -> Shot:
     return replace(shot, start=start, count=max(1, round((stop - start) * shot.fps / shot.speed)))
 
 
-def _worker_count(workers: int | None) -> int:
-    if workers is None:
-        return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    if workers < 1:
-        raise ParameterError("film", "workers", workers, "at least 1")
-    return workers
-
-
-def _film(shot: Shot, path: Path, workers: int, progress: Progress | None) -> str:
+def _film(shot: Shot, path: Path, workers: int | None, progress: Progress | None) -> str:
     """Film a shot in pieces and join them; the back end that did it."""
+    pieces = worker_count(shot.count, workers)
     backend = rendering_backend()
-    pieces = max(1, min(workers, shot.count // _FEWEST_FRAMES))
     edges = [shot.count * piece // pieces for piece in range(pieces + 1)]
     shots = [replace(shot, first=a, count=b - a) for a, b in itertools.pairwise(edges)]
     names = [f"piece{piece}.mp4" for piece in range(pieces)]

@@ -18,10 +18,11 @@ from quadsim.assets import vehicle_path
 from quadsim.audit import Limit
 from quadsim.controller import Controller
 from quadsim.errors import InputError
+from quadsim.metrics import CourseStep
 from quadsim.plant import Plant
-from quadsim.state import INDEX, N_STATES, STATE_NAMES, Array, make_state
+from quadsim.state import INDEX, N_STATES, REFERENCE_NAMES, STATE_NAMES, Array, make_state
 from quadsim.vehicle import N_ROTORS, VEHICLE_UNITS, Vehicle, load_vehicle
-from scenarios.references import Window, smooth, steps
+from scenarios.references import Window, smooth, steps, switches
 from scenarios.spec import ANGLES, ConstrainedSpec, Scenario, WindowSpec
 
 CONTROLLERS: Final = {
@@ -66,17 +67,26 @@ def build_initial_state(scenario: Scenario) -> Array:
 
 def build_reference(scenario: Scenario, samples: int) -> Array:
     """(samples, 4) filtered reference x, y, z [m], yaw [rad] at t_k = k tau_s.  Eqs. (30)-(31)."""
-    spec, period = scenario.reference, scenario.control_period
+    response_time, period = scenario.reference.response_time, scenario.control_period
     t = np.arange(samples, dtype=np.float64) * period
-    x, y, z = scenario.initial.position
+    channels = [
+        smooth(steps(t, windows, elsewhere), initial=elsewhere, response_time=response_time, period=period)
+        for windows, elsewhere in _course(scenario)
+    ]
+    return np.stack(channels, axis=1)
 
-    def channel(windows: list[WindowSpec], elsewhere: float, scale: float = 1.0) -> Array:
-        held = [Window(start=window.start, stop=window.stop, value=scale * window.value) for window in windows]
-        raw = steps(t, held, elsewhere)
-        return smooth(raw, initial=elsewhere, response_time=spec.response_time, period=period)
 
-    yaw = channel(spec.yaw, 0.0, math.radians(1.0))
-    return np.stack([channel(spec.x, x), channel(spec.y, y), channel(spec.z, z), yaw], axis=1)
+def build_course_steps(scenario: Scenario) -> tuple[CourseStep, ...]:
+    """The steps of the unfiltered course, channel by channel; a start away from the course is a step at 0."""
+    preview = scenario.controller.horizon * scenario.control_period
+    starts = (*scenario.initial.position, math.radians(scenario.initial.euler[2]))
+    found = []
+    for name, (windows, elsewhere), start in zip(REFERENCE_NAMES, _course(scenario), starts, strict=True):
+        flown = [step for step in switches(windows, elsewhere, initial=start) if step[0] < scenario.duration]
+        ends = [*(time - preview for time, _, _ in flown[1:]), scenario.duration]
+        for (time, before, after), until in zip(flown, ends, strict=False):
+            found.append(CourseStep(channel=name, time=time, before=before, after=after, until=until))
+    return tuple(found)
 
 
 def build_problem(scenario: Scenario, vehicle: Vehicle) -> Problem:
@@ -101,7 +111,8 @@ def build_controller(scenario: Scenario, vehicle: Vehicle) -> Controller:
     """
     problem = build_problem(scenario, vehicle)
     if isinstance(scenario.controller, ConstrainedSpec):
-        return ConstrainedMPC(problem, QPSolver(scenario.controller.solver, problem))
+        solver = QPSolver(scenario.controller.solver, problem)
+        return ConstrainedMPC(problem, solver, shortcut=scenario.controller.shortcut)
     try:
         return UnconstrainedMPC(problem)
     except np.linalg.LinAlgError as error:
@@ -136,6 +147,17 @@ def build_limits(scenario: Scenario) -> tuple[Limit, ...]:
 def _selection(names: Sequence[str]) -> Array:
     """Rows of the identity that pick states by name."""
     return np.eye(N_STATES)[[INDEX[name] for name in names]]
+
+
+def _course(scenario: Scenario) -> list[tuple[list[Window], float]]:
+    """Windows of x, y, z [m] and yaw [rad], each with the value outside them."""
+    spec = scenario.reference
+    x, y, z = scenario.initial.position
+
+    def held(windows: list[WindowSpec], scale: float = 1.0) -> list[Window]:
+        return [Window(start=window.start, stop=window.stop, value=scale * window.value) for window in windows]
+
+    return [(held(spec.x), x), (held(spec.y), y), (held(spec.z), z), (held(spec.yaw, math.radians(1.0)), 0.0)]
 
 
 def _build_bounds(spec: ConstrainedSpec) -> Bounds:

@@ -7,6 +7,7 @@ wrong.  Nothing heavy is imported before a command runs, so that `quadsim --help
 from __future__ import annotations
 
 import argparse
+import gc
 import os
 import signal
 import sys
@@ -51,6 +52,13 @@ def make_parser() -> argparse.ArgumentParser:
     compare = commands.add_parser("compare", help="flights side by side: table, figures, HTML page")
     compare.add_argument("targets", metavar="RUN_OR_SCENARIO", nargs="+", help="run directories, or scenarios to fly")
     compare.add_argument("--out", metavar="DIR", required=True, help="directory of the page")
+    compare.add_argument(
+        "--cost",
+        action=argparse.BooleanOptionalAction,
+        default=None,
+        help="study what constraints cost; takes a minute (default: where a constrained and an unconstrained "
+        "controller fly the same course of at most 120 s)",
+    )
     compare.add_argument("--markdown", action="store_true", help="print the table as Markdown")
 
     video = commands.add_parser("video", help="film a finished run")
@@ -62,9 +70,56 @@ def make_parser() -> argparse.ArgumentParser:
     view.add_argument("run", metavar="RUN", help="run directory or .rrd file")
     view.add_argument("--web", action="store_true", help="serve the viewer to a browser instead")
 
+    _add_bench(commands.add_parser("bench", help="measure this machine: QP solvers, a flight, a film"))
+
     doctor = commands.add_parser("doctor", help="what this machine can do")
     doctor.add_argument("--json", action="store_true", help="as JSON on stdout")
     return parser
+
+
+def _add_bench(bench: argparse.ArgumentParser) -> None:
+    kinds = bench.add_subparsers(dest="kind", metavar="WHAT", required=True)
+
+    solvers = kinds.add_parser("solvers", help="every installed QP solver on the queries of one flight, in one run")
+    solvers.add_argument("--out", metavar="DIR", default="runs/bench-solvers", help="directory (default: %(default)s)")
+    solvers.add_argument("--repeats", type=int, metavar="N", default=5, help="ask each question so often (default: 5)")
+    solvers.add_argument(
+        "--horizons",
+        type=_whole_numbers,
+        metavar="N,N,...",
+        default=[10, 20, 50, 100, 200],
+        help="horizons for the growth of the step, or none (default: 10,20,50,100,200)",
+    )
+    solvers.add_argument(
+        "--solver",
+        dest="solvers",
+        metavar="NAME",
+        action="append",
+        help="time this one; may be repeated (default: all)",
+    )
+    solvers.add_argument(
+        "--stride", type=int, metavar="N", default=1, help="ask 20 periods of each so many times 20 (default: 1, all)"
+    )
+
+    flight = kinds.add_parser("flight", help="where the time of a flight goes")
+    flight.add_argument("--repeats", type=int, metavar="N", default=5, help="flights (default: 5)")
+
+    render = kinds.add_parser("render", help="what a film costs")
+    render.add_argument("--seconds", type=float, metavar="S", default=4.0, help="of film (default: 4)")
+    render.add_argument("--workers", type=int, metavar="N", help="rendering processes (default: one per core)")
+
+    for kind in (solvers, flight, render):
+        kind.add_argument("--scenario", metavar="SCENARIO", default="paper-constrained", help="(default: %(default)s)")
+        _add_settings(kind)
+        kind.add_argument("--json", action="store_true", help="print what was measured alone, as JSON on stdout")
+
+
+def _whole_numbers(text: str) -> list[int]:
+    """Numbers between commas; `none` for no number."""
+    try:
+        return [] if text == "none" else [int(part) for part in text.split(",")]
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"must be whole numbers between commas, or none; got {text!r}") from None
 
 
 def _add_scenario(parser: argparse.ArgumentParser) -> None:
@@ -89,6 +144,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = make_parser().parse_args(arguments)
     if arguments is None:  # as a process of its own: being told to stop is Ctrl-C, and leaves nothing half written
         signal.signal(signal.SIGTERM, signal.default_int_handler)
+        gc.set_threshold(100_000, 50, 100)  # a command makes few cycles: looking for them less often saves 5 % of a run
     try:
         from scenarios import commands
 

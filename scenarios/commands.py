@@ -12,6 +12,7 @@ from mpc.solvers import SOLVERS
 from quadsim import rundir
 from quadsim.assets import vehicle_names, vehicle_path
 from quadsim.errors import FileError, InputError, ParameterError
+from quadsim.table import Grid
 from quadsim.vehicle import load_vehicle
 from scenarios import console, runner
 from scenarios.build import CONTROLLERS
@@ -28,7 +29,7 @@ def list_everything(options: Namespace) -> int:
         "scenarios": {name: load_scenario(name).description for name in scenario_names()},
         "vehicles": {name: load_vehicle(vehicle_path(name)).description for name in vehicle_names()},
         "controllers": dict(CONTROLLERS),
-        "solvers": {name: entry.description for name, entry in SOLVERS.items()},
+        "solvers": {name: entry.line for name, entry in SOLVERS.items()},
     }
     if options.json:
         print(json.dumps(sections, indent=2))
@@ -70,11 +71,18 @@ def compare(options: Namespace) -> int:
     from quadsim.comparison import comparison_rows, run_names
     from quadsim.report import write_comparison
     from quadsim.table import to_markdown
+    from scenarios.cost import find_study, study_cost
 
     target = Path(options.out)
+    studied = find_study(options.targets, asked=options.cost)
     directories = [Path(name) if Path(name).is_dir() else _fly_for_comparison(name, target) for name in options.targets]
     runs = [rundir.load_run(directory) for directory in directories]
-    page = write_comparison(runs, target)
+    study = None
+    if studied:
+        constrained, *others = studied
+        with console.progress_bars(enabled=True) as progress:
+            study = study_cost(constrained, others, progress=progress)
+    page = write_comparison(runs, target, study)
     rows, names = comparison_rows(runs), run_names(runs)
     if options.markdown:
         print(to_markdown(rows, names))
@@ -138,6 +146,59 @@ def doctor(options: Namespace) -> int:
     return EXIT_DONE
 
 
+def bench(options: Namespace) -> int:
+    """`quadsim bench`."""
+    scenario = _load(options.scenario, options)
+    with console.progress_bars(enabled=not options.json) as progress:
+        measured, tables, where = _BENCHES[options.kind](scenario, options, progress)
+    if options.json:
+        print(json.dumps(measured, indent=2))
+    else:
+        console.print_grids(tables, where)
+    return EXIT_DONE
+
+
+_Benched = tuple[dict[str, Any], list[Grid], str | None]
+"""What was measured, as plain values and as tables, and where it was written."""
+
+
+def _bench_solvers(scenario: Scenario, options: Namespace, progress: runner.Progress) -> _Benched:
+    from quadsim.bench import solver_tables
+    from scenarios.bench.solvers import bench_solvers, is_bench, write_bench
+
+    target = Path(options.out)
+    with rundir.writing(target, replaces=is_bench) as directory:
+        measured = bench_solvers(
+            scenario,
+            repeats=options.repeats,
+            horizons=options.horizons,
+            solvers=tuple(options.solvers or SOLVERS),
+            stride=options.stride,
+            progress=progress,
+        )
+        write_bench(measured, directory)
+    return measured.to_json(), solver_tables(measured), str(target)
+
+
+def _bench_flight(scenario: Scenario, options: Namespace, progress: runner.Progress) -> _Benched:
+    from quadsim.bench import flight_tables
+    from scenarios.bench.flight import bench_flight
+
+    profile = bench_flight(scenario, repeats=options.repeats, progress=progress)
+    return profile.to_json(), flight_tables(profile), None
+
+
+def _bench_render(scenario: Scenario, options: Namespace, progress: runner.Progress) -> _Benched:
+    from quadsim.bench import render_tables
+    from scenarios.bench.render import bench_render
+
+    profile = bench_render(scenario, seconds=options.seconds, workers=options.workers, progress=progress)
+    return profile.to_json(), render_tables(profile), None
+
+
+_BENCHES: Final = {"solvers": _bench_solvers, "flight": _bench_flight, "render": _bench_render}
+
+
 COMMANDS: Final[dict[str, Callable[[Namespace], int]]] = {
     "list": list_everything,
     "run": run,
@@ -145,6 +206,7 @@ COMMANDS: Final[dict[str, Callable[[Namespace], int]]] = {
     "compare": compare,
     "video": video,
     "view": view,
+    "bench": bench,
     "doctor": doctor,
 }
 

@@ -12,7 +12,7 @@ from rich.markup import escape
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
-from quadsim.table import Cell, Mark, Row
+from quadsim.table import Cell, Grid, Mark, Row
 from scenarios import runner
 
 
@@ -128,6 +128,21 @@ def print_comparison(rows: Sequence[Row], names: Sequence[str], where: str) -> N
             table.add_row(escape(label + unit), *(_cell(cell) for cell in row.cells))
     console.print(table)
     console.print(f"every number, plots and films: [bold]{where}[/bold]", soft_wrap=True)
+
+
+def print_grids(grids: Sequence[Grid], where: str | None) -> None:
+    """Tables of cases, one below the other, with what a reader has to know of each."""
+    console = _console()
+    for grid in grids:
+        table = _table(grid.title, caption=escape(grid.note.replace("`", "")) or None)
+        for i, name in enumerate(grid.head):
+            table.add_column(escape(name), justify="right" if i else "left", no_wrap=not i)
+        for line in grid.lines:
+            table.add_row(*(_cell(cell) for cell in line))
+        console.print(table)
+        console.print()
+    if where is not None:
+        console.print(f"written to [bold]{where}[/bold]", soft_wrap=True)
 
 
 _STYLES: Final = {Mark.BEST: "bold", Mark.GOOD: "green", Mark.WARN: "yellow", Mark.BAD: "red"}

@@ -31,7 +31,7 @@ def examine() -> dict[str, dict[str, str]]:
         "packages": runner.versions(),
         "rendering": {"video": _rendering()},
         "viewer": {"native": viewer_problem() or "can be opened", "browser": "quadsim view RUN --web"},
-        "solvers": {name: _try_solver(name) for name in SOLVERS},
+        "solvers": {name: _try_solver(name) if entry.installed else entry.line for name, entry in SOLVERS.items()},
     }
 
 
@@ -44,7 +44,7 @@ def _rendering() -> str:
 
 def _try_solver(name: str) -> str:
     """Solve the first step of the paper's constrained flight."""
-    scenario = load_scenario("paper-constrained", [f"controller.solver={name}"])
+    scenario = load_scenario("paper-constrained", [f"controller.solver={name}", "controller.shortcut=false"])
     vehicle = build_vehicle(scenario)
     started = clock.perf_counter()
     controller = build_controller(scenario, vehicle)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -37,6 +38,21 @@ def steps(t: Array, windows: Sequence[Window], elsewhere: float) -> Array:
     for window in windows:
         values[(at > window.start) & (at < window.stop)] = window.value
     return values
+
+
+def switches(windows: Sequence[Window], elsewhere: float, *, initial: float) -> list[tuple[float, float, float]]:
+    """Where a piecewise constant reference steps: time [s], value before and value after, in order of time.
+
+    Args:
+        windows: as for `steps`; of windows that overlap, the last holds.
+        elsewhere: the value outside all windows.
+        initial: where the output is at time 0, from which the first step is counted.
+    """
+    instants = sorted({max(0.0, instant) for window in windows for instant in (window.start, window.stop)} | {0.0})
+    held = [[window.value for window in windows if window.start <= t < window.stop] for t in instants]
+    values = [initial, *(values[-1] if values else elsewhere for values in held)]
+    found = zip(instants, itertools.pairwise(values), strict=True)
+    return [(time, before, after) for time, (before, after) in found if before != after]
 
 
 def smooth(values: Array, *, initial: float, response_time: float, period: float) -> Array:

@@ -20,6 +20,7 @@ from quadsim.loop import fly
 from quadsim.vehicle import Vehicle
 from scenarios.build import (
     build_controller,
+    build_course_steps,
     build_initial_state,
     build_limits,
     build_plant,
@@ -145,7 +146,8 @@ def write_flight(flight: Flight, directory: Path) -> None:
 def summarise(flight: Flight) -> dict[str, Any]:
     """`summary.json` of a flight, but for the hashes of its files and the total wall time."""
     scenario, log = flight.scenario, flight.log
-    numbers = metrics.flight_numbers(log, deadline_ms=1e3 * scenario.control_period)
+    course = build_course_steps(scenario)
+    numbers = metrics.flight_numbers(log, deadline_ms=1e3 * scenario.control_period, course=course)
     return {
         "scenario": scenario.name,
         "description": scenario.description,

@@ -169,6 +169,9 @@ class ConstrainedSpec(_ControllerSpec):
 
     type: Literal["constrained"]
     solver: str = Field(default="piqp-multistage", description="a name from `quadsim list`")
+    shortcut: bool = Field(
+        default=True, description="take the unconstrained optimum where no constraint bars it; exact"
+    )
     output_bounds: dict[str, Pair] = Field(default={}, description="C_c by its keys; deg for angles, deg/s for rates")
     input_bounds: InputBoundsSpec
 

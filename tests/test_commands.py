@@ -19,7 +19,13 @@ from scenarios.commands import COMMANDS
 from scenarios.loading import load_scenario
 
 ROOT = Path(__file__).resolve().parent.parent
-ADDED = {"run": ("--no-video",)}
+SHORT = ("--set", "duration=1.0", "--set", "controller.horizon=5")
+ADDED = {
+    "run": ("--no-video",),
+    "bench solvers": (*SHORT, "--repeats", "1", "--horizons", "none"),
+    "bench flight": (*SHORT, "--repeats", "1"),
+    "bench render": (*SHORT, "--seconds", "0.2"),
+}
 """What makes a command cheap enough to run here."""
 
 
@@ -49,6 +55,8 @@ def promised_file(options: Namespace) -> Path | None:
             return Path(options.out) / "index.html"
         case "video":
             return Path(options.run) / "flight.mp4"
+        case "bench" if options.kind == "solvers":
+            return Path(options.out) / "bench.json"
     return None
 
 
@@ -77,13 +85,14 @@ def test_documented_scenarios_and_settings_are_valid(line: str) -> None:
 @pytest.mark.parametrize("line", RUNNABLE)
 def test_documented_command_runs(line: str, capsys: pytest.CaptureFixture[str]) -> None:
     arguments = arguments_of(line)
-    if arguments[0] == "video":
+    command = " ".join(arguments[: 2 if arguments[0] == "bench" else 1])
+    if command in ("video", "bench render"):
         try:
             rendering_backend()
         except RenderingUnavailableError as error:
             pytest.skip(str(error))
     started = clock.time()
-    assert main([*arguments, *ADDED.get(arguments[0], ())]) == EXIT_DONE
+    assert main([*arguments, *ADDED.get(command, ())]) == EXIT_DONE
     assert capsys.readouterr().out
     promised = promised_file(make_parser().parse_args(arguments))
     assert promised is None or promised.stat().st_mtime >= started - 0.1

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import os
 import re
@@ -82,6 +83,7 @@ def test_source_archive_can_be_built_and_tested_from(archives: Archives) -> None
     with tarfile.open(archives.sdist) as sdist:
         held = {name.partition("/")[2] for name in sdist.getnames()}
     assert {"Makefile", "constraints.txt", "README.md", "LICENSE", "CITATION.cff", "tests/conftest.py"} <= held
+    assert {".ci/run", "tests/peers/conftest.py", "docs/make_verification.py", "docs/verification.md"} <= held
     assert not [name for name in held if "__pycache__" in name or name.startswith(("runs/", ".venv/"))]
 
 
@@ -120,7 +122,8 @@ def test_every_requirement_is_pinned() -> None:
     pins = [line for line in lines if not line.startswith("#")]
     assert [pin for pin in pins if not re.fullmatch(r"[\w.-]+==\w[\w.]*", pin)] == []
     pyproject = tomllib.loads((ROOT / "pyproject.toml").read_text())
-    required = [*pyproject["project"]["dependencies"], *pyproject["dependency-groups"]["dev"]]
+    project, groups = pyproject["project"], pyproject["dependency-groups"]
+    required = itertools.chain(project["dependencies"], *project["optional-dependencies"].values(), *groups.values())
     names = {plain(re.split(r"[<>=]", requirement, maxsplit=1)[0]) for requirement in required}
     assert names - {plain(pin.partition("==")[0]) for pin in pins} == set()
 

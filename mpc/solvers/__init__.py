@@ -5,13 +5,17 @@ from __future__ import annotations
 import importlib
 import importlib.metadata
 import importlib.util
+import math
 from dataclasses import dataclass
+from functools import partial
 from typing import Final
+
+import numpy as np
 
 from mpc.condensed import condensed
 from mpc.multistage import multistage
 from mpc.problem import Problem
-from mpc.qp import Backend, Formulation, FormulationBuilder, Solution
+from mpc.qp import QP, Backend, Formulation, FormulationBuilder, Solution, Vectors
 from quadsim.errors import MissingPackageError, UnknownNameError
 from quadsim.state import Array
 
@@ -26,6 +30,7 @@ class SolverEntry:
         package: distribution that it needs, for its version.
         module: what that distribution is imported as.
         description: one line.
+        extra: the extra of this project that installs the package; empty for one that is always there.
     """
 
     formulate: FormulationBuilder
@@ -33,6 +38,7 @@ class SolverEntry:
     package: str
     module: str
     description: str
+    extra: str = "solvers"
 
     @property
     def installed(self) -> bool:
@@ -44,6 +50,11 @@ class SolverEntry:
         """Version of the installed package."""
         return importlib.metadata.version(self.package)
 
+    @property
+    def line(self) -> str:
+        """The description, and how to install what is missing."""
+        return self.description if self.installed else f"not installed: pip install 'quadsim[{self.extra}]'"
+
 
 SOLVERS: Final[dict[str, SolverEntry]] = {
     "piqp-multistage": SolverEntry(
@@ -52,6 +63,15 @@ SOLVERS: Final[dict[str, SolverEntry]] = {
         package="piqp",
         module="piqp",
         description="PIQP, multistage, partially condensed (default)",
+        extra="",
+    ),
+    "piqp-multistage-1": SolverEntry(
+        formulate=partial(multistage, steps_per_stage=1),
+        backend="mpc.solvers.piqp_sparse:PiqpMultistage",
+        package="piqp",
+        module="piqp",
+        description="PIQP, multistage, one stage per step",
+        extra="",
     ),
     "piqp-dense": SolverEntry(
         formulate=condensed,
@@ -59,6 +79,57 @@ SOLVERS: Final[dict[str, SolverEntry]] = {
         package="piqp",
         module="piqp",
         description="PIQP, dense Cholesky, on the paper's condensed matrices",
+        extra="",
+    ),
+    "daqp": SolverEntry(
+        formulate=condensed,
+        backend="mpc.solvers.daqp_dense:DaqpDense",
+        package="daqp",
+        module="daqp",
+        description="DAQP, dual active set, condensed, warm-started",
+        extra="daqp",
+    ),
+    "osqp": SolverEntry(
+        formulate=condensed,
+        backend="mpc.solvers.osqp_sparse:OsqpSparse",
+        package="osqp",
+        module="osqp",
+        description="OSQP, operator splitting, condensed, warm-started",
+    ),
+    "clarabel": SolverEntry(
+        formulate=multistage,
+        backend="mpc.solvers.clarabel_sparse:ClarabelSparse",
+        package="clarabel",
+        module="clarabel",
+        description="Clarabel, interior point, partially condensed",
+    ),
+    "proxqp": SolverEntry(
+        formulate=condensed,
+        backend="mpc.solvers.proxqp_dense:ProxqpDense",
+        package="proxsuite",
+        module="proxsuite",
+        description="ProxQP, proximal augmented Lagrangian, dense, condensed",
+    ),
+    "quadprog": SolverEntry(
+        formulate=condensed,
+        backend="mpc.solvers.quadprog_dense:QuadprogDense",
+        package="quadprog",
+        module="quadprog",
+        description="quadprog, Goldfarb and Idnani's dual active set, condensed",
+    ),
+    "highs": SolverEntry(
+        formulate=condensed,
+        backend="mpc.solvers.highs_sparse:HighsSparse",
+        package="highspy",
+        module="highspy",
+        description="HiGHS, active set, condensed; fails on most of the paper's QPs",
+    ),
+    "qpoases": SolverEntry(
+        formulate=condensed,
+        backend="mpc.solvers.qpoases_dense:QpoasesDense",
+        package="casadi",
+        module="casadi",
+        description="qpOASES through CasADi, the paper's own solver, condensed, warm-started",
     ),
 }
 
@@ -74,7 +145,7 @@ def make_backend(name: str) -> Backend:
         raise UnknownNameError("solver", name, SOLVERS)
     entry = SOLVERS[name]
     if not entry.installed:
-        raise MissingPackageError(f"the solver {name!r}", entry.package, extra="solvers")
+        raise MissingPackageError(f"the solver {name!r}", entry.package, extra=entry.extra)
     module, _, kind = entry.backend.partition(":")
     backend: Backend = getattr(importlib.import_module(module), kind)()
     return backend
@@ -103,6 +174,36 @@ class QPSolver:
         self._backend.setup(self.formulation.qp)
 
     def solve(self, state: Array, desired: Array, u_before: Array) -> Answer:
-        """Solve for xi(k) (n,), y_d (N, n_r) and u(k-1) (nu,)."""
-        solution = self._backend.solve(self.formulation.vectors(state, desired, u_before))
+        """Solve for xi(k) (n,), y_d (N, n_r) and u(k-1) (nu,).
+
+        Data that is not finite is answered with the status `invalid_data`: no back end can be trusted to notice.
+        """
+        vectors = self.formulation.vectors(state, desired, u_before)
+        solution = self._backend.solve(vectors) if _valid(vectors) else _refusal(self.formulation.qp)
         return Answer(plan=self.formulation.inputs(solution.x), solution=solution)
+
+
+def _valid(vectors: Vectors) -> bool:
+    """Whether gradient and equalities are finite and bounds are bounds; sums and extremes are NaN if any entry is."""
+    return bool(
+        math.isfinite(vectors.c.sum())
+        and math.isfinite(vectors.b.sum())
+        and vectors.h_l.max(initial=-math.inf) < math.inf
+        and vectors.h_u.min(initial=math.inf) > -math.inf
+    )
+
+
+def _refusal(qp: QP) -> Solution:
+    """What is answered without asking a back end."""
+    return Solution(
+        x=np.full_like(qp.c, math.nan),
+        y=np.full_like(qp.b, math.nan),
+        z=np.full_like(qp.h_l, math.nan),
+        z_box=np.full_like(qp.c, math.nan),
+        status="invalid_data",
+        iterations=0,
+        active=0,
+        primal_residual=math.nan,
+        dual_residual=math.nan,
+        solve_s=0.0,
+    )

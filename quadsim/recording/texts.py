@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from quadsim.controller import SOLVED
+from quadsim.controller import ACCEPTED
 from quadsim.recording.look import time_column
 from quadsim.rundir import Run
 
@@ -22,7 +22,7 @@ def send_texts(recording: rr.RecordingStream, run: Run) -> None:
     log, end = run.log.control, float(run.log.plant.t[-1])
     answers = list(zip(log.status, log.fallback.tolist(), strict=True))
     events = [
-        (float(t), f"{status}, fallback {fallback}", "INFO" if (status, fallback) == (SOLVED, 0) else "WARN")
+        (float(t), f"{status}, fallback {fallback}", "INFO" if status in ACCEPTED and not fallback else "WARN")
         for t, before, (status, fallback) in zip(log.t, [None, *answers], answers, strict=False)
         if (status, fallback) != before
     ]

@@ -100,7 +100,7 @@ def test_what_is_seen_weighs_nothing_and_meets_nothing():
 
 def test_the_physics_model_has_nothing_to_look_at_and_flies_the_same():
     bare, drawn = compile_model(LOPES), compile_model(LOPES, visuals=True)
-    assert (bare.ngeom, bare.nbody, bare.ntex, bare.ncam, bare.nlight) == (0, 2, 0, 0, 0)
+    assert (bare.ngeom, bare.nbody, bare.ntex, bare.ncam, bare.nlight, bare.nsensor) == (0, 2, 0, 0, 0, 0)
     states = []
     for model in (bare, drawn):
         data = mujoco.MjData(model)
@@ -111,7 +111,7 @@ def test_the_physics_model_has_nothing_to_look_at_and_flies_the_same():
 
 
 def test_sensors_agree_with_the_state():
-    model = compile_model(LOPES)
+    model = compile_model(LOPES, visuals=True)
     data = mujoco.MjData(model)
     data.qpos[:] = [1.0, -2.0, 3.0, *np.array([0.9, 0.1, -0.3, 0.2]) / np.linalg.norm([0.9, 0.1, -0.3, 0.2])]
     data.qvel[:] = [0.5, 0.6, -0.7, 0.3, -0.2, 0.1]

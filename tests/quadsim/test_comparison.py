@@ -52,6 +52,29 @@ def test_values_are_the_summarys_with_angles_in_degrees(short_run: Run) -> None:
     assert row(rows, "bounds", "Constraint arrival_x").cells[0].text == "-0.01 .. 0.01, from 59 s"
 
 
+def test_settling_has_a_row_for_each_step_of_the_courses(short_run: Run) -> None:
+    def entry(channel: str, time: float, settled: float | None) -> dict[str, Any]:
+        return {"channel": channel, "time": time, "before": 0.0, "after": 1.0, "settled": settled}
+
+    def with_settling(*entries: dict[str, Any]) -> Run:
+        summary: dict[str, Any] = copy.deepcopy(short_run.summary)
+        summary["tracking"]["settling"] = list(entries)
+        return dataclasses.replace(short_run, summary=summary)
+
+    older: dict[str, Any] = copy.deepcopy(short_run.summary)
+    del older["tracking"]["settling"]
+    rows = comparison_rows(
+        [
+            with_settling(entry("x", 10.0, 4.05), entry("z", 0.0, 5.0)),
+            with_settling(entry("x", 10.0, 5.7), entry("z", 0.0, None)),
+            dataclasses.replace(short_run, summary=older),
+        ]
+    )
+    assert [cell.text for cell in row(rows, "settling, x at 10 s").cells] == ["4.05", "5.7", "-"]
+    assert marks(row(rows, "settling, x at 10 s")) == [Mark.BEST, Mark.NONE, Mark.NONE]
+    assert [cell.text for cell in row(rows, "settling, z at 0 s").cells] == ["5", "-", "-"]
+
+
 def test_the_best_is_marked_only_where_runs_differ(short_run: Run, worse_run: Run) -> None:
     rows = comparison_rows([worse_run, short_run])
     assert marks(row(rows, "RMS error, x")) == [Mark.NONE, Mark.BEST]

@@ -12,6 +12,8 @@ from support import small_log
 
 from quadsim import metrics
 from quadsim.flightlog import ControlLog, TimingLog
+from quadsim.metrics import CourseStep
+from quadsim.state import Array
 
 
 def control(z: list[float], reference: list[float]) -> ControlLog:
@@ -53,8 +55,70 @@ def test_extremes_of_speeds_and_steps() -> None:
     log.speeds[:] = 200.0
     log.speeds[1, 2] = 230.0
     log.speeds_before[:] = 195.0
-    expected = {"speed_min": 200.0, "speed_max": 230.0, "slew_min": -30.0, "slew_max": 30.0}
-    assert metrics.control(log) == expected
+    extremes = {"speed_min": 200.0, "speed_max": 230.0, "slew_min": -30.0, "slew_max": 30.0}
+    # Four rotors step from 195 to 200; then one goes to 230 and back.
+    assert metrics.control(log) == {**extremes, "total_variation": 4 * 5.0 + 30.0 + 30.0}
+
+
+def settled(t: Array, x: Array, *, before: float, after: float, start: float = 0.0, until: float) -> float | None:
+    """Settling time of x [m], all other channels at rest."""
+    outputs = np.zeros((t.size, 4))
+    outputs[:, 0] = x
+    step = CourseStep(channel="x", time=start, before=before, after=after, until=until)
+    (entry,) = metrics.settling(t, outputs, [step])
+    assert {name: entry[name] for name in ("channel", "time", "before", "after")} == {
+        "channel": "x", "time": start, "before": before, "after": after,
+    }  # fmt: skip
+    return entry["settled"]
+
+
+@pytest.mark.parametrize("tau", [0.1, 0.7, 2.0])
+@pytest.mark.parametrize(("before", "after"), [(0.0, 10.0), (3.0, -1.0)])
+def test_a_first_order_response_settles_after_tau_ln_20(tau: float, before: float, after: float) -> None:
+    """exp(-t / tau) = 0.05 at t = tau ln 20, whatever the step; the first sample from then on counts."""
+    period, start = 0.05, 2.0
+    t = np.arange(400) * period
+    x = np.where(t < start, before, after + (before - after) * np.exp(-(t - start) / tau))
+    expected = period * math.ceil(tau * math.log(20.0) / period)
+    found = settled(t, x, before=before, after=after, start=start, until=20.0)
+    assert found == pytest.approx(expected, abs=1e-9)
+
+
+def test_an_oscillation_settles_when_its_envelope_has() -> None:
+    """The extremes of 1 - exp(-t / 2) cos(pi t), near each whole second, are within 5 % from 2 ln 20 = 5.99 s on."""
+    t = np.arange(2000) * 0.01
+    x = 1.0 - np.exp(-0.5 * t) * np.cos(np.pi * t)
+    last = t[np.abs(x - 1.0) > 0.05][-1]
+    assert 5.0 < last < 2.0 * math.log(20.0)
+    assert settled(t, x, before=0.0, after=1.0, until=20.0) == pytest.approx(last + 0.01)
+
+
+def test_an_output_that_leaves_the_band_again_has_not_settled_before() -> None:
+    t = np.arange(10.0)
+    x = np.array([0.0, 1.0, 1.0, 1.0, 0.9, 1.0, 1.0, 1.0, 1.0, 1.0])
+    assert settled(t, x, before=0.0, after=1.0, until=10.0) == 5.0
+    assert settled(t, x, before=0.0, after=1.0, until=3.0) == 1.0  # what comes after is the next step's
+    assert settled(t, np.where(t < 9.0, x, 0.5), before=0.0, after=1.0, until=10.0) is None
+
+
+def test_the_band_is_a_share_of_the_step() -> None:
+    t = np.arange(4.0)
+    assert settled(t, np.array([0.0, 9.4, 9.6, 9.6]), before=0.0, after=10.0, until=4.0) == 2.0
+    assert settled(t, np.array([9.0, 9.4, 9.6, 9.6]), before=9.0, after=10.0, until=4.0) is None
+
+
+def test_a_flight_that_ended_before_has_not_settled() -> None:
+    t, x = np.arange(5.0), np.array([0.0, 1.0, 1.0, 1.0, 1.0])
+    assert settled(t, x, before=0.0, after=1.0, until=5.0) == 1.0
+    assert settled(t, x, before=0.0, after=1.0, until=6.0) is None
+    assert settled(t, x, before=0.0, after=1.0, start=7.0, until=9.0) is None
+    assert settled(t[:0], x[:0], before=0.0, after=1.0, until=5.0) is None
+
+
+def test_peak_tilt_is_the_larger_of_roll_and_pitch() -> None:
+    state = np.zeros((3, 12))
+    state[1, 6], state[2, 8], state[2, 10] = math.radians(3.0), math.radians(-7.0), 2.0
+    assert metrics.peak_tilt(state) == pytest.approx(7.0)
 
 
 def test_percentiles() -> None:
@@ -65,7 +129,7 @@ def test_percentiles() -> None:
 def test_the_controllers_counts_and_times() -> None:
     log = replace(
         small_log(4).control,
-        status=("solved", "max_iterations", "solved", "solved"),
+        status=("solved", "max_iterations", "unconstrained", "solved"),
         fallback=np.array([0, 1, 0, 0]),
         iterations=np.array([3, 100, 4, 5]),
         active=np.array([0, 0, 7, 2]),
@@ -74,20 +138,25 @@ def test_the_controllers_counts_and_times() -> None:
     )
     timing = TimingLog(t=log.t, solve_ms=np.array([1.0, 2.0, 3.0, 4.0]), step_ms=np.array([50.0, 50.1, 3.0, 70.0]))
     numbers = metrics.controller(log, timing, deadline_ms=50.0)
-    assert numbers["statuses"] == {"max_iterations": 1, "solved": 3}
+    assert numbers["statuses"] == {"max_iterations": 1, "solved": 2, "unconstrained": 1}
     assert numbers["fallbacks"] == {"0": 3, "1": 1}
     assert numbers["iterations"] == {"mean": 28.0, "max": 100}
     assert (numbers["active_max"], numbers["active_periods"]) == (7, 2)
     assert numbers["solve_ms"]["p50"] == 2.5
     assert numbers["step_ms"]["max"] == 70.0
     assert (numbers["deadline_ms"], numbers["deadline_misses"]) == (50.0, 2)
-    assert numbers["residual_max"] == {"primal": 3e-9, "dual": 2e-8}  # of the periods solved
+    assert numbers["residual_max"] == {"primal": 3e-9, "dual": 2e-8}  # of the periods with an optimum
     json.dumps(numbers, allow_nan=False)
 
 
 def test_nothing_solved_has_no_residual() -> None:
     log = replace(small_log(2).control, status=("numerics", "numerics"), primal_residual=np.full(2, math.nan))
     assert metrics.controller(log, small_log(2).timing, 50.0)["residual_max"] == {"primal": 0.0, "dual": 0.0}
+
+
+def test_a_back_end_that_reports_no_residual_has_none() -> None:
+    log = replace(small_log(2).control, status=("solved", "solved"), primal_residual=np.array([math.nan, 0.0]))
+    assert metrics.controller(log, small_log(2).timing, 50.0)["residual_max"]["primal"] is None
 
 
 def test_a_flight_of_no_period_has_no_numbers() -> None:

@@ -17,6 +17,7 @@ import rerun as rr
 from rerun.chunk import RrdReader
 
 from quadsim.audit import SIGNALS, Limit, margins_sampled
+from quadsim.controller import SOLVED, UNCONSTRAINED
 from quadsim.errors import FileError, OutputError, ViewerUnavailableError
 from quadsim.recording import layout, open_viewer, texts, viewer_problem, world, write_recording
 from quadsim.recording import viewer as viewer_module
@@ -207,21 +208,26 @@ def test_times_are_held_against_the_deadline(content: Content, short_run: Run) -
 
 def test_events_tell_each_change_of_the_solver_and_the_end(record: Callable[[Run], Content], short_run: Run) -> None:
     control = short_run.log.control
-    status, fallback = list(control.status), control.fallback.copy()
+    status, fallback = [SOLVED] * control.t.size, control.fallback.copy()
+    status[20:30] = [UNCONSTRAINED] * 10
     status[40:43], fallback[40:43] = ["infeasible"] * 3, [1, 1, 2]
     changed = dataclasses.replace(control, status=tuple(status), fallback=fallback)
     log = dataclasses.replace(short_run.log, control=changed, reason="the battery fell off")
     content = record(dataclasses.replace(short_run, log=log))
     texts = [row[0] for row in content.rows("/events", "text")]
     levels = [row[0] for row in content.rows("/events", "level")]
-    assert texts[1:] == [
+    assert texts == [
+        "solved, fallback 0",
+        "unconstrained, fallback 0",
+        "solved, fallback 0",
         "infeasible, fallback 1",
         "infeasible, fallback 2",
         "solved, fallback 0",
         "aborted: the battery fell off",
     ]
-    assert levels == ["INFO", "WARN", "WARN", "INFO", "ERROR"]
-    np.testing.assert_allclose(content.times("/events"), [0.0, 2.0, 2.1, 2.15, log.plant.t[-1]], atol=1e-9)
+    assert levels == ["INFO", "INFO", "INFO", "WARN", "WARN", "INFO", "ERROR"]
+    times = [0.0, 1.0, 1.5, 2.0, 2.1, 2.15, log.plant.t[-1]]
+    np.testing.assert_allclose(content.times("/events"), times, atol=1e-9)
 
 
 def test_the_summary_prints_each_verdict_with_its_tolerance(content: Content, short_run: Run) -> None:

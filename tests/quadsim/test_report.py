@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from quadsim.cost import CostStudy
 from quadsim.errors import OutputError, ParameterError
 from quadsim.plots import comparison_plots, thin
 from quadsim.report import is_comparison, write_comparison
@@ -26,10 +27,12 @@ PROBE = """<script>
   await new Promise((done) => setTimeout(done, 500));
   const panels = ["attitude", "speeds", "slews", "times"].map((id) => document.getElementById(id));
   const seen = panels[0].data.filter((trace) => trace.legendgroup).map((trace) => String(trace.visible ?? true));
+  const costs = ["cost-steps", "cost-tilt", "cost-horizon"];
   const report = document.createElement("output");
   report.textContent = [
     "ranges " + panels.map((panel) => panel.layout.xaxis.range.join("-")).join(" "),
     "visible " + seen.join(" "),
+    "costs " + costs.map((id) => document.querySelectorAll(`#${id} .trace`).length).join(" "),
     "svgs " + document.querySelectorAll(".main-svg .trace").length,
     "buttons " + [...document.querySelectorAll(".modebar-btn")].map((button) => button.dataset.title).join(","),
   ].join("; ");
@@ -96,6 +99,24 @@ def test_the_text_gives_outcomes_reasons_and_numbers(filmed_run: Run, aborted_ru
     assert "This run has no video" in text
     assert "paper-constrained/flight.rrd" in text
     assert "lost/flight.rrd" not in text
+
+
+def test_a_study_of_costs_has_a_section_and_files(short_run: Run, cost_study: CostStudy, tmp_path: Path) -> None:
+    hostile = dataclasses.replace(cost_study, name=HOSTILE)
+    page = write_comparison([short_run], tmp_path / "out", hostile)
+    text = without_scripts(page.read_text())
+    assert "What do constraints cost?" in text
+    assert "&lt;script&gt;alert(1)" in text
+    assert text.count('<table class="grid">') == 5
+    assert text.count('<details class="folded" open>') == 2
+    assert '<td class="bad">lost at 0.5 s</td>' in text
+    assert {path.name for path in page.parent.iterdir() if path.name.startswith("cost")} == {
+        *("cost.json", "cost.md"),
+        *(f"cost_{what}.{kind}" for what in ("steps", "tilt", "horizon") for kind in ("png", "svg")),
+    }
+    for url in re.findall(r'(?:href|src)="([^"#]+)"', text):
+        assert url == "data:," or (page.parent / url).is_file(), url
+    assert "What do constraints cost?" not in write_comparison([short_run], tmp_path / "without").read_text()
 
 
 def test_nothing_is_fetched(short_run: Run, tmp_path: Path) -> None:
@@ -185,8 +206,10 @@ def test_many_runs_keep_the_page_small(short_run: Run) -> None:
     assert sum(len(plot.json) for plot in comparison_plots([long] * 10)) < 3e6
 
 
-def test_a_browser_draws_the_page_and_has_no_complaint(short_run: Run, aborted_run: Run, tmp_path: Path) -> None:
-    page = write_comparison([renamed(short_run, HOSTILE), aborted_run], tmp_path / "out")
+def test_a_browser_draws_the_page_and_has_no_complaint(
+    short_run: Run, aborted_run: Run, cost_study: CostStudy, tmp_path: Path
+) -> None:
+    page = write_comparison([renamed(short_run, HOSTILE), aborted_run], tmp_path / "out", cost_study)
     page.write_text(page.read_text().replace("</body>", f"{PROBE}</body>"))
     dom, console = open_page(page, tmp_path / "profile")
     assert console == []
@@ -194,6 +217,7 @@ def test_a_browser_draws_the_page_and_has_no_complaint(short_run: Run, aborted_r
     assert "ranges 1-2 1-2 1-2 1-2" in report
     assert "visible false true false true" in report
     assert int(re.findall(r"svgs (\d+)", report)[0]) > 40
+    assert "costs 3 16 16" in report  # the contenders, and the curves of six panels
     assert set(re.findall(r"buttons ([^;]*)", report)[0].split(",")) == {
         *("Download plot as a PNG", "Zoom", "Pan", "Zoom in", "Zoom out", "Autoscale", "Reset axes"),
         *("Orbital rotation", "Turntable rotation", "Reset camera to default", "Reset camera to last save"),

@@ -19,10 +19,11 @@ import pytest
 
 from quadsim import video
 from quadsim.audit import audit
+from quadsim.controller import SOLVED, UNCONSTRAINED
 from quadsim.errors import FileError, OutputError, ParameterError, RenderingUnavailableError
 from quadsim.flightlog import write_log
 from quadsim.footage import Shot, make_footage, thin
-from quadsim.overlay import RED, Overlay
+from quadsim.overlay import GREEN, RED, Overlay
 from quadsim.rundir import Run, load_run, write_json
 from quadsim.state import EULER, POSITION, body_to_world
 from quadsim.video import render_gif, render_video, rendering_backend
@@ -304,19 +305,29 @@ def test_thinning_keeps_the_path_within_its_tolerance():
     assert thin(np.zeros((1, 3)), 0.01).tolist() == [0]
 
 
-def test_captions_turn_red_when_a_limit_breaks(short_run: Run):
-    def reds(run: Run) -> int:
-        footage = make_footage(run, np.array([1.0]))
-        blank = np.full((720, 1280, 3), 128, np.uint8)
-        picture = Overlay(run, footage, width=1280, height=720).draw(blank, 0)
-        return int(np.count_nonzero((picture == RED).all(axis=-1)))
+def pixels(run: Run, colour: tuple[int, int, int]) -> int:
+    """How much of a frame at 1 s the captions fill with a colour."""
+    footage = make_footage(run, np.array([1.0]))
+    blank = np.full((720, 1280, 3), 128, np.uint8)
+    picture = Overlay(run, footage, width=1280, height=720).draw(blank, 0)
+    return int(np.count_nonzero((picture == colour).all(axis=-1)))
 
+
+@pytest.mark.parametrize(("status", "good"), [(SOLVED, True), (UNCONSTRAINED, True), ("infeasible", False)])
+def test_captions_tell_an_optimum_from_a_failure(short_run: Run, status: str, good: bool):
+    control = replace(short_run.log.control, status=(status,) * short_run.log.control.t.size)
+    run = replace(short_run, log=replace(short_run.log, control=control))
+    assert (pixels(run, GREEN) > pixels(run, RED)) == good
+    assert (pixels(run, RED) == 0) == good
+
+
+def test_captions_turn_red_when_a_limit_breaks(short_run: Run):
     tight = tuple(
         replace(limit, upper=100.0, tolerance=0.0, tolerance_sampled=0.0) if limit.signal == "speed" else limit
         for limit in short_run.limits
     )
-    assert reds(short_run) == 0
-    assert reds(replace(short_run, limits=tight)) > 1000  # four bars, four numbers, one row of the table
+    assert pixels(short_run, RED) == 0
+    assert pixels(replace(short_run, limits=tight), RED) > 1000  # four bars, four numbers, one row of the table
 
 
 def test_captions_fit_pictures_of_other_sizes(short_run: Run):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import importlib.util
 import json
 import os
 import shutil
@@ -253,7 +254,7 @@ WRONG: dict[str, tuple[list[str], str]] = {
         [*RUN, "--set", "control_period=0.0503"],
         "control_period must be a whole multiple of the physics step plant.timestep = 0.001 s; got 0.0503",
     ),
-    "no solver": ([*RUN, "--set", "controller.solver=osqp"], "no solver named 'osqp' (there are: piqp-dense,"),
+    "no solver": ([*RUN, "--set", "controller.solver=gurobi"], "no solver named 'gurobi' (there are: clarabel, daqp,"),
     "no vehicle": (
         [*RUN, "--set", "vehicle.file=lopez2011"],
         "no vehicle named 'lopez2011'; did you mean 'lopes2011'?",
@@ -502,3 +503,18 @@ def test_output_that_cannot_be_written_is_said() -> None:
 def test_a_seed_means_nothing_to_a_finished_run(hover_directory: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["check", str(hover_directory), "--seed", "3"]) == EXIT_WRONG_INPUT
     assert capsys.readouterr().err == "quadsim: --seed must be absent when a finished run is checked; got 3\n"
+
+
+@pytest.mark.parametrize("extra", ["daqp", "solvers"])
+def test_a_solver_that_is_not_installed_is_named_with_its_remedy(
+    extra: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    name = {"daqp": "daqp", "solvers": "osqp"}[extra]
+    real = importlib.util.find_spec
+    monkeypatch.setattr(importlib.util, "find_spec", lambda module: None if module == name else real(module))
+    out = tmp_path / "run"
+    assert main(["run", "hover", "--set", f"controller.solver={name}", "--no-video", "--out", str(out)]) == 2
+    assert f"needs the package '{name}': pip install 'quadsim[{extra}]'" in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
+    assert main(["list", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["solvers"][name] == f"not installed: pip install 'quadsim[{extra}]'"

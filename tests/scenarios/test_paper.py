@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from quadsim.audit import Finding
+from quadsim.controller import ACCEPTED, SOLVED, UNCONSTRAINED
 from scenarios import runner
 from scenarios.loading import load_scenario, scenario_names
 from scenarios.runner import Flight
@@ -21,7 +22,8 @@ def findings(flight: Flight) -> dict[str, Finding]:
 def assert_constrained_flight_holds(flight: Flight, *, plant_tolerance: float) -> None:
     control, found = flight.log.control, findings(flight)
     assert flight.log.status == "completed"
-    assert control.status == ("solved",) * 1200
+    assert len(control.status) == 1200
+    assert set(control.status) <= ACCEPTED
     assert control.fallback.max() == 0
     for angle in ("roll", "pitch"):
         assert found[angle].worst_margin_sampled >= -SAMPLED
@@ -104,7 +106,11 @@ def test_every_scenario_of_the_library_keeps_what_it_promises(name: str) -> None
 
 def test_every_solve_is_recorded_with_residuals_and_times(constrained_flight: Flight) -> None:
     control, timing = constrained_flight.log.control, constrained_flight.log.timing
-    assert np.all(control.iterations > 0)
+    by_qp = np.array([status == SOLVED for status in control.status])
+    assert set(control.status) == {SOLVED, UNCONSTRAINED}
+    assert 400 < np.count_nonzero(by_qp) < 800  # in about half of the periods the unconstrained optimum is feasible
+    assert np.all((control.iterations > 0) == by_qp)
+    assert np.all(control.active[~by_qp] == 0)
     assert control.primal_residual.max() < 1e-6
     assert control.dual_residual.max() < 1e-4
     assert np.all(timing.solve_ms > 0.0)
@@ -133,7 +139,8 @@ def test_other_cases_fly_too() -> None:
         "constraints.arrival_yaw.required=false",
     ]
     flight = runner.fly_scenario(load_scenario("paper-constrained", settings))
-    assert flight.log.control.status == ("solved",) * 400
+    assert len(flight.log.control.status) == 400
+    assert set(flight.log.control.status) <= ACCEPTED
     assert flight.satisfied
     pitch = np.degrees(flight.log.control.state[:, 8])
     assert pitch.max() == pytest.approx(3.0, abs=0.01)  # its own bound, active

@@ -7,9 +7,10 @@ import math
 import numpy as np
 import pytest
 
-from scenarios.build import build_reference
+from quadsim.metrics import CourseStep, settling
+from scenarios.build import build_course_steps, build_reference
 from scenarios.loading import load_scenario
-from scenarios.references import Window, smooth, steps
+from scenarios.references import Window, smooth, steps, switches
 
 PERIOD = 0.05
 
@@ -35,6 +36,40 @@ def test_later_windows_win_where_they_overlap() -> None:
 
 def test_no_window_leaves_an_axis_where_it_is() -> None:
     np.testing.assert_array_equal(steps(np.arange(4.0), [], -3.5), np.full(4, -3.5))
+
+
+def test_a_course_switches_where_its_value_does() -> None:
+    windows = [Window(start=0.0, stop=4.0, value=1.0), Window(start=1.0, stop=3.0, value=2.0)]
+    found = switches(windows, 0.0, initial=0.0)
+    assert found == [(0.0, 0.0, 1.0), (1.0, 1.0, 2.0), (3.0, 2.0, 1.0), (4.0, 1.0, 0.0)]
+    touching = [Window(start=-1.0, stop=2.0, value=5.0), Window(start=2.0, stop=3.0, value=5.0)]
+    assert switches(touching, 0.0, initial=5.0) == [(3.0, 5.0, 0.0)]
+    assert switches([], 0.0, initial=0.5) == [(0.0, 0.5, 0.0)]
+
+
+def test_the_steps_of_the_papers_course() -> None:
+    """A step is watched until the next is within the preview of 50 periods, 2.5 s; yaw starts 30 deg off its course."""
+    found = build_course_steps(load_scenario("paper-constrained"))
+    rows = [(step.channel, step.time, step.before, step.after, step.until) for step in found]
+    assert rows == [
+        *(("x", 10.0, 0.0, 10.0, 37.5), ("x", 40.0, 10.0, 0.0, 60.0)),
+        *(("y", 20.0, 0.0, 10.0, 37.5), ("y", 40.0, 10.0, 0.0, 60.0)),
+        *(("z", 0.0, 0.0, 10.0, 37.5), ("z", 40.0, 10.0, 0.0, 60.0)),
+        ("yaw", 0.0, math.radians(30.0), 0.0, 60.0),
+    ]
+    short = build_course_steps(load_scenario("paper-constrained", ["duration=15"]))
+    assert [(step.channel, step.until) for step in short] == [("x", 15.0), ("z", 15.0), ("yaw", 15.0)]
+
+
+def test_the_filtered_reference_settles_in_its_response_time() -> None:
+    """exp(-3) is just below 5 %; the step down is taken a sample earlier than the step up, Eq. (30)."""
+    steps_of_z = [
+        CourseStep(channel="z", time=0.0, before=0.0, after=10.0, until=37.5),
+        CourseStep(channel="z", time=40.0, before=10.0, after=0.0, until=60.0),
+    ]
+    t = PERIOD * np.arange(1200)
+    entries = settling(t, build_reference(load_scenario("paper-constrained"), t.size), steps_of_z)
+    assert [entry["settled"] for entry in entries] == [5.0, 4.95]
 
 
 def test_the_filter_is_the_first_order_lag_in_closed_form() -> None:

@@ -1,17 +1,17 @@
-"""Runs -> zoomable plots for the comparison page: all runs overlaid, one colour each, linked time axes."""
+"""Runs -> plots of their flights: all runs overlaid, one colour each, linked time axes."""
 
 from __future__ import annotations
 
 import html
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
 from quadsim.audit import SIGNALS
 from quadsim.comparison import distinct_courses, run_names
-from quadsim.palette import BOUND, REFERENCE, line_colour
+from quadsim.palette import REFERENCE, line_colour
+from quadsim.plots.panels import BOTTOM, PANEL_HEIGHT, TOP, Plot, draw_bound, finished, panels, place
 from quadsim.rundir import Run
 from quadsim.state import POSITION, REFERENCE_NAMES, Array
 from quadsim.vehicle import N_ROTORS
@@ -22,27 +22,6 @@ if TYPE_CHECKING:
 _MOST_POINTS: Final = 3000
 _POINTS_OF_ALL_RUNS: Final = 12_000
 """Points that one quantity may have over all runs: keeps a page of two runs near 6 MB, and of ten below 8 MB."""
-_PANEL_HEIGHT: Final = 210
-_TOP, _BOTTOM = 34, 46
-
-
-@dataclass(frozen=True, kw_only=True)
-class Plot:
-    """One figure of the page.
-
-    Attributes:
-        key: its identifier in the page.
-        title: its heading.
-        height: its height [pixels].
-        timed: whether its horizontal axes are time, linked with those of the other plots.
-        json: the figure as plotly's JSON, safe inside a script element.
-    """
-
-    key: str
-    title: str
-    height: int
-    timed: bool
-    json: str
 
 
 def comparison_plots(runs: Sequence[Run]) -> list[Plot]:
@@ -50,13 +29,6 @@ def comparison_plots(runs: Sequence[Run]) -> list[Plot]:
     flown = [(i, name, run) for i, (name, run) in enumerate(zip(run_names(runs), runs, strict=True))]
     flown = [(i, name, run) for i, name, run in flown if run.log.control.t.size]
     return list(_Plotter(flown).plots()) if flown else []
-
-
-def plotly_script() -> str:
-    """plotly.js itself, to stand inside a page that must work offline."""
-    from plotly.offline import get_plotlyjs
-
-    return str(get_plotlyjs())
 
 
 def thin(values: Array, points: int) -> np.ndarray[Any, np.dtype[np.intp]]:
@@ -100,7 +72,7 @@ class _Plotter:
         yield self._path()
 
     def _states(self, key: str, title: str, names: Sequence[str]) -> Plot:
-        figure = _panels([f"{name} [{SIGNALS[name].unit}]" for name in names])
+        figure = panels([f"{name} [{SIGNALS[name].unit}]" for name in names])
         for panel, name in enumerate(names):
             signal = SIGNALS[name].plant
             assert signal is not None, name
@@ -111,7 +83,7 @@ class _Plotter:
         return self._timed(figure, key, title)
 
     def _inputs(self, key: str, title: str, name: str, labels: Sequence[str]) -> Plot:
-        figure = _panels(labels)
+        figure = panels(labels)
         for panel in range(N_ROTORS):
             for i, label, run in self._runs:
                 values = SIGNALS[name].sampled(run.log.control)[:, panel]
@@ -121,7 +93,7 @@ class _Plotter:
 
     def _times(self) -> Plot:
         labels = ("whole step [ms]", "solver alone [ms]", "solver iterations", "active constraints")
-        figure = _panels(labels)
+        figure = panels(labels)
         for i, label, run in self._runs:
             timing, control = run.log.timing, run.log.control
             for panel, values in enumerate((timing.step_ms, timing.solve_ms)):
@@ -130,9 +102,9 @@ class _Plotter:
             for panel, counts in enumerate((control.iterations, control.active), start=2):
                 self._line(figure, panel, i, label, control.t, counts.astype(float), shape="hv")
         for panel in (0, 1):
-            figure.update_yaxes(type="log", dtick=1, **_place(panel))
+            figure.update_yaxes(type="log", dtick=1, **place(panel))
         for deadline in {float(run.summary["controller"]["deadline_ms"]) for _, _, run in self._runs}:
-            _bound(figure, 0, deadline, 0.0, self._end)
+            draw_bound(figure, 0, deadline, 0.0, self._end)
         return self._timed(figure, "times", "Time to compute a command, against its deadline")
 
     def _path(self) -> Plot:
@@ -152,7 +124,7 @@ class _Plotter:
         axes = {f"{name}axis": {"title": {"text": f"{name} [m]"}} for name in "xyz"}
         camera = {"eye": {"x": 1.2, "y": -1.7, "z": 0.8}, "center": {"x": 0.0, "y": 0.0, "z": -0.12}}
         figure.update_layout(scene={"aspectmode": "data", "camera": camera, **axes}, margin=dict.fromkeys("lrtb", 0))
-        return _finished(figure, "path", "Path in space", height=560, timed=False)
+        return finished(figure, "path", "Path in space", height=560, timed=False)
 
     def _line(
         self,
@@ -178,7 +150,7 @@ class _Plotter:
                 marker={"color": line_colour(i), "size": 3.5},
                 **_identity(i, label),
             ),
-            **_place(panel),
+            **place(panel),
         )
 
     def _references(self, figure: Figure, panel: int, name: str) -> None:
@@ -191,7 +163,7 @@ class _Plotter:
             kept = thin(values, self._points)
             x, y = run.log.control.t[kept].astype(np.float32), values[kept].astype(np.float32)
             line = {"color": REFERENCE, "width": 1.6, "dash": "dash"}
-            figure.add_trace(Scatter(x=x, y=y, mode="lines", line=line, name="reference"), **_place(panel))
+            figure.add_trace(Scatter(x=x, y=y, mode="lines", line=line, name="reference"), **place(panel))
 
     def _bounds(self, figure: Figure, panel: int, signal: str) -> None:
         """Each distinct bound on a signal, once, over the times it holds for."""
@@ -203,51 +175,17 @@ class _Plotter:
             if limit.signal == signal and limit.start < self._end and np.isfinite(bound)
         }
         for bound, start, stop in bounds:
-            _bound(figure, panel, bound, start, stop)
+            draw_bound(figure, panel, bound, start, stop)
 
     def _timed(self, figure: Figure, key: str, title: str) -> Plot:
         rows = len(figure.layout.annotations) // 2
         figure.update_xaxes(range=[-0.01 * self._end, self._end], showticklabels=True)
         figure.update_xaxes(title={"text": "time [s]", "standoff": 6}, row=rows)
-        figure.update_layout(margin={"l": 52, "r": 12, "t": _TOP, "b": _BOTTOM}, hovermode="x unified", dragmode="zoom")
+        figure.update_layout(margin={"l": 52, "r": 12, "t": TOP, "b": BOTTOM}, hovermode="x unified", dragmode="zoom")
         figure.update_annotations(font={"size": 13})
-        return _finished(figure, key, title, height=rows * _PANEL_HEIGHT + _TOP + _BOTTOM, timed=True)
-
-
-def _panels(labels: Sequence[str]) -> Figure:
-    """An empty figure of two columns, its panels named row by row."""
-    from plotly.subplots import make_subplots
-
-    rows = len(labels) // 2
-    return make_subplots(
-        rows=rows,
-        cols=2,
-        subplot_titles=list(labels),
-        shared_xaxes="all",
-        horizontal_spacing=0.06,
-        vertical_spacing=0.14 / max(rows - 1, 1),
-    )
-
-
-def _place(panel: int) -> dict[str, int]:
-    return {"row": panel // 2 + 1, "col": panel % 2 + 1}
+        return finished(figure, key, title, height=rows * PANEL_HEIGHT + TOP + BOTTOM, timed=True)
 
 
 def _identity(i: int, label: str) -> dict[str, Any]:
     """Name and toggle of a run's line; plotly reads names as HTML."""
     return {"name": html.escape(label), "legendgroup": f"run{i}"}
-
-
-def _bound(figure: Figure, panel: int, bound: float, start: float, stop: float) -> None:
-    from plotly.graph_objects import Scatter
-
-    line = {"color": BOUND, "width": 1.4, "dash": "dash"}
-    x, y = [start, stop], [bound, bound]
-    figure.add_trace(Scatter(x=x, y=y, mode="lines", line=line, name="bound", hoverinfo="skip"), **_place(panel))
-
-
-def _finished(figure: Figure, key: str, title: str, *, height: int, timed: bool) -> Plot:
-    """The figure without plotly's own template and legend: the page gives its colours and its toggles."""
-    figure.update_layout(template="none", showlegend=False, height=height)
-    text = str(figure.to_json()).replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
-    return Plot(key=key, title=title, height=height, timed=timed, json=text)

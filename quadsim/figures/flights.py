@@ -1,19 +1,16 @@
-"""A finished run -> the paper's figures, as PNG and SVG.
-
-The same flight gives the same bytes: no date, no random identifiers, no global state of matplotlib.
-"""
+"""A finished run -> the paper's figures, and several runs overlaid."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
 from quadsim.audit import SIGNALS, Limit
 from quadsim.comparison import distinct_courses, run_names
-from quadsim.errors import OutputError
+from quadsim.figures.canvas import new_figure, write_drawings
 from quadsim.palette import BOUND, REFERENCE, line_colour
 from quadsim.rundir import Run
 from quadsim.state import REFERENCE_NAMES
@@ -23,33 +20,9 @@ if TYPE_CHECKING:
     from matplotlib.artist import Artist
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
-    from matplotlib.typing import RcKeyType
 
 PAPER_FIGURES: Final = {"paper-unconstrained": (2, 3), "paper-constrained": (4, 5)}
 """Numbers in the paper of the figures of states and of inputs, by scenario."""
-
-_DPI: Final = 160
-_STYLE: Final[dict[RcKeyType, Any]] = {
-    "axes.axisbelow": True,
-    "axes.edgecolor": "#5b6067",
-    "axes.grid": True,
-    "axes.labelsize": 9.5,
-    "axes.spines.right": False,
-    "axes.spines.top": False,
-    "font.size": 9.0,
-    "grid.color": "#e3e5e8",
-    "grid.linewidth": 0.7,
-    "legend.frameon": False,
-    "lines.linewidth": 1.3,
-    "path.simplify_threshold": 0.2,
-    "svg.fonttype": "none",
-    "svg.hashsalt": "quadsim",
-    "text.parse_math": False,
-    "xtick.color": "#5b6067",
-    "xtick.labelcolor": "#1c1e21",
-    "ytick.color": "#5b6067",
-    "ytick.labelcolor": "#1c1e21",
-}
 
 
 def write_figures(run: Run, directory: Path) -> list[Path]:
@@ -70,7 +43,7 @@ def write_figures(run: Run, directory: Path) -> list[Path]:
     if not run.log.control.t.size:
         return []
     states, inputs = PAPER_FIGURES.get(run.name, (None, None))
-    return _write(
+    return write_drawings(
         {
             _file_name("states", states): lambda: _draw_states(run),
             _file_name("inputs", inputs): lambda: _draw_inputs(run),
@@ -93,37 +66,11 @@ def comparison_figure(runs: Sequence[Run], directory: Path) -> list[Path]:
     Raises:
         OutputError: the directory cannot be written.
     """
-    return _write({"comparison": lambda: _draw_comparison(runs)}, directory)
+    return write_drawings({"comparison": lambda: _draw_comparison(runs)}, directory)
 
 
 def _file_name(content: str, number: int | None) -> str:
     return content if number is None else f"figure{number}_{content}"
-
-
-def _write(drawings: Mapping[str, Callable[[], Figure]], directory: Path) -> list[Path]:
-    import matplotlib
-
-    paths = []
-    try:
-        directory.mkdir(parents=True, exist_ok=True)
-        with matplotlib.rc_context(_STYLE):
-            for name, draw in drawings.items():
-                figure = draw()
-                png, svg = directory / f"{name}.png", directory / f"{name}.svg"
-                figure.savefig(png, dpi=_DPI)
-                figure.savefig(svg, metadata={"Date": None})
-                paths += [png, svg]
-    except OSError as error:
-        raise OutputError(directory, error.strerror or str(error)) from error
-    return paths
-
-
-def _new_figure(title: str, width: float, height: float) -> Figure:
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(width, height), layout="constrained")
-    figure.suptitle(title, x=0.01, ha="left", fontsize=11.0, fontweight="bold")
-    return figure
 
 
 def _title(run: Run, what: str) -> str:
@@ -132,7 +79,7 @@ def _title(run: Run, what: str) -> str:
 
 
 def _draw_states(run: Run) -> Figure:
-    figure = _new_figure(_title(run, "position and attitude"), 9.6, 6.4)
+    figure = new_figure(_title(run, "position and attitude"), 9.6, 6.4)
     panels = figure.subplots(3, 2, sharex=True)
     shown: dict[str, Artist] = {}
     for column, names in enumerate((("x", "y", "z"), ("roll", "pitch", "yaw"))):
@@ -146,7 +93,7 @@ def _draw_states(run: Run) -> Figure:
 
 
 def _draw_inputs(run: Run) -> Figure:
-    figure = _new_figure(_title(run, "rotor speeds and their steps"), 9.6, 5.6)
+    figure = new_figure(_title(run, "rotor speeds and their steps"), 9.6, 5.6)
     panels = figure.subplots(2, 1, sharex=True)
     shown: dict[str, Artist] = {}
     labels = {"speed": "rotor speed [rad/s]", "slew": "step per period [rad/s]"}
@@ -164,7 +111,7 @@ def _draw_inputs(run: Run) -> Figure:
 
 
 def _draw_solve_times(run: Run) -> Figure:
-    figure = _new_figure(_title(run, "time to compute a command"), 9.6, 6.0)
+    figure = new_figure(_title(run, "time to compute a command"), 9.6, 6.0)
     times, iterations, active = figure.subplots(3, 1, sharex=True, height_ratios=(2.4, 1.0, 1.0))
     timing, control = run.log.timing, run.log.control
     deadline = run.summary["controller"]["deadline_ms"]
@@ -192,7 +139,7 @@ def _draw_solve_times(run: Run) -> Figure:
 
 
 def _draw_comparison(runs: Sequence[Run]) -> Figure:
-    figure = _new_figure("", 9.6, 6.4)
+    figure = new_figure("", 9.6, 6.4)
     panels = figure.subplots(3, 2, sharex=True)
     signals = dict(zip(("x", "y", "z", "roll", "pitch", "speed"), panels.T.flat, strict=True))
     end = max(_end(run) for run in runs)

@@ -1,0 +1,91 @@
+"""The unconstrained optimum where it is the constrained one: an exact way around the QP."""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+import scipy.linalg
+
+from mpc.condensed import require_bounds
+from mpc.prediction import prediction
+from mpc.problem import Problem
+from mpc.unconstrained import sequence_gains
+from quadsim.state import Array
+
+LARGEST_MAP: Final = 2**20
+"""Entries of the map beyond which evaluating it costs what it saves; 50 steps of the paper's problem have 64 k."""
+
+
+class Shortcut:
+    """Evaluates Eq. (22), the optimal sequence without constraints, and keeps it when it satisfies all of them.
+
+    The cost is strictly convex, so its minimiser, if feasible, is the one and only solution of Eq. (27).  Sequence
+    and predicted outputs are affine in xi(k) and y_d,
+
+        [u_opt; y_c] = W [xi(k); y_d] + w,
+
+    so that one matrix-vector product and a few comparisons decide.  All that is computed is written into buffers.
+    """
+
+    def __init__(self, problem: Problem) -> None:
+        bounds, model, N = require_bounds(problem), problem.model, problem.horizon
+        gains, maps = sequence_gains(problem), prediction(model, N)
+        K, G, offset = gains.K, gains.G, gains.L @ model.u_bar
+
+        def outputs(states: Array) -> Array:
+            """C_c applied to every predicted state in the columns of (N n, m)."""
+            return (bounds.C_c @ states.reshape(N, model.n, -1)).reshape(N * bounds.y_min.size, -1)
+
+        deviation = (offset - np.tile(model.u_bar, N))[:, None]
+        self._map = np.block([[K, G], [outputs(maps.Phi + maps.Psi @ K), outputs(maps.Psi @ G)]])
+        self._offset = np.concatenate([offset, outputs(maps.Psi @ deviation)[:, 0]])
+        self._lower = np.concatenate([np.tile(bounds.u_min, N), np.tile(bounds.y_min, N)])
+        self._upper = np.concatenate([np.tile(bounds.u_max, N), np.tile(bounds.y_max, N)])
+        self._bounds = bounds
+        self._query = np.empty(self._map.shape[1])
+        self._values = np.empty(self._map.shape[0])
+        self._plan = self._values[: N * model.nu].reshape(N, model.nu)  # a view
+        self._slews = np.empty((N, model.nu))
+
+    def plan(self, state: Array, desired: Array, u_before: Array) -> Array | None:
+        """The optimal inputs (N, nu) [rad/s] where no constraint stands in their way, else None.
+
+        Args:
+            state: xi(k) (n,).
+            desired: y_d (N, n_r).
+            u_before: u(k-1) (nu,).
+        """
+        self._query[: state.size] = state
+        self._query[state.size :] = desired.ravel()
+        np.dot(self._map, self._query, out=self._values)
+        self._values += self._offset
+        if not _within(self._lower, self._values, self._upper):
+            return None
+        np.subtract(self._plan[0], u_before, out=self._slews[0])
+        np.subtract(self._plan[1:], self._plan[:-1], out=self._slews[1:])
+        if not _within(self._bounds.delta_min, self._slews, self._bounds.delta_max):
+            return None
+        return self._plan.copy()
+
+
+def make_shortcut(problem: Problem) -> Shortcut | None:
+    """The problem's shortcut, or None where there is no good one.
+
+    The map grows with the square of the horizon, the QP in proportion to it: beyond `LARGEST_MAP` entries the shortcut
+    is none.  Weights that are too many orders of magnitude apart leave no Cholesky factor to compute it from.
+    """
+    bounds, nu = require_bounds(problem), problem.model.nu
+    rows = problem.horizon * (nu + bounds.y_min.size)
+    columns = problem.model.n + problem.horizon * problem.objective.Q_y.shape[0]
+    if rows * columns > LARGEST_MAP:
+        return None
+    try:
+        return Shortcut(problem)
+    except scipy.linalg.LinAlgError:
+        return None
+
+
+def _within(lower: Array, values: Array, upper: Array) -> bool:
+    """Whether all values are within their bounds; NaN is not."""
+    return bool(((lower <= values) & (values <= upper)).all())

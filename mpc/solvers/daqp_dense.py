@@ -1,0 +1,68 @@
+"""DAQP: a dual active-set method that factorises the Hessian once and starts from the last active set.
+
+Arnström, Bemporad and Axehill, A Dual Active-Set Solver for Embedded Quadratic Programming Using Recursive LDL'
+Updates, IEEE TAC 2022.
+"""
+
+from __future__ import annotations
+
+import time as clock
+from typing import Final
+
+import daqp
+import numpy as np
+
+from mpc.qp import QP, Solution, Vectors
+from mpc.solvers import _common
+from quadsim.controller import SOLVED
+
+SETTINGS: Final = {
+    "primal_tol": 1e-8,  # rad or rad/s; its own 1e-6 is as fast
+    "iter_limit": 5000,  # changes of the active set; the paper's QPs take 1 to 250
+}
+
+STATUS: Final = {
+    1: SOLVED,
+    -1: "primal_infeasible",
+    -2: "cycling",
+    -3: "dual_infeasible",
+    -4: "max_iterations",
+    -5: "non_convex",
+    -6: "overdetermined_start",
+    -7: "max_time",
+}
+_EQUALITY: Final = 5
+"""How DAQP marks a row that is always active."""
+
+
+class DaqpDense:
+    """Back end for dense QPs; see `mpc.qp.Backend`."""
+
+    def __init__(self) -> None:
+        self._model = daqp.Model()
+        self._model.settings = SETTINGS
+
+    def setup(self, qp: QP) -> None:
+        """See `mpc.qp.Backend.setup`."""
+        self._qp = qp
+        start = _common.start(qp)
+        sense = np.zeros(qp.c.size + qp.h_l.size + qp.b.size, dtype=np.intc)
+        sense[qp.c.size + qp.h_l.size :] = _EQUALITY
+        hessian, rows = _common.dense(qp.P), _common.dense(_common.rows(qp))
+        self._model.setup(hessian, qp.c.copy(), rows, _common.upper(qp, start), _common.lower(qp, start), sense)
+
+    def solve(self, vectors: Vectors) -> Solution:
+        """See `mpc.qp.Backend.solve`."""
+        qp = self._qp
+        started = clock.perf_counter()
+        self._model.update(f=vectors.c, bupper=_common.upper(qp, vectors), blower=_common.lower(qp, vectors))
+        x, _, flag, info = self._model.solve()
+        elapsed = clock.perf_counter() - started
+        return _common.solution(
+            qp,
+            x=x,
+            multipliers=info["lam"],
+            status=STATUS.get(flag, f"daqp_{flag}"),
+            iterations=info["iterations"],
+            solve_s=elapsed,
+        )

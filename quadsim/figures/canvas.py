@@ -1,0 +1,77 @@
+"""What all figures share: their style, and how they are saved."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+from quadsim.errors import OutputError
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+    from matplotlib.typing import RcKeyType
+
+DPI: Final = 160
+STYLE: Final[dict[RcKeyType, Any]] = {
+    "axes.axisbelow": True,
+    "axes.edgecolor": "#5b6067",
+    "axes.grid": True,
+    "axes.labelsize": 9.5,
+    "axes.spines.right": False,
+    "axes.spines.top": False,
+    "font.size": 9.0,
+    "grid.color": "#e3e5e8",
+    "grid.linewidth": 0.7,
+    "legend.frameon": False,
+    "lines.linewidth": 1.3,
+    "path.simplify_threshold": 0.2,
+    "svg.fonttype": "none",
+    "svg.hashsalt": "quadsim",
+    "text.parse_math": False,
+    "xtick.color": "#5b6067",
+    "xtick.labelcolor": "#1c1e21",
+    "ytick.color": "#5b6067",
+    "ytick.labelcolor": "#1c1e21",
+}
+
+
+def write_drawings(drawings: Mapping[str, Callable[[], Figure]], directory: Path) -> list[Path]:
+    """Draw figures by name and save each as PNG and SVG.
+
+    Args:
+        drawings: what draws each figure, by the name of its files; called in the style of all figures.
+        directory: where the files go; made when it is not there.
+
+    Returns:
+        The files written, PNG and SVG of each figure.
+
+    Raises:
+        OutputError: the directory cannot be written.
+    """
+    import matplotlib
+
+    paths = []
+    try:
+        directory.mkdir(parents=True, exist_ok=True)
+        with matplotlib.rc_context(STYLE):
+            for name, draw in drawings.items():
+                figure = draw()
+                png, svg = directory / f"{name}.png", directory / f"{name}.svg"
+                figure.draw_without_rendering()  # finds the layout, once for both files
+                figure.set_layout_engine(None)
+                figure.savefig(png, dpi=DPI)
+                figure.savefig(svg, metadata={"Date": None})
+                paths += [png, svg]
+    except OSError as error:
+        raise OutputError(directory, error.strerror or str(error)) from error
+    return paths
+
+
+def new_figure(title: str, width: float, height: float) -> Figure:
+    """An empty figure of so many inches, its title in the corner."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(width, height), layout="constrained")
+    figure.suptitle(title, x=0.01, ha="left", fontsize=11.0, fontweight="bold")
+    return figure

@@ -1,0 +1,1 @@
+"""`quadsim bench`: QP solvers, flights and films measured on this machine."""

@@ -1,0 +1,293 @@
+"""`quadsim bench solvers`: every QP solver there is, on the queries of one flight."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from mpc.condensed import condensed
+from mpc.multistage import STEPS_PER_STAGE, multistage
+from mpc.problem import Problem
+from mpc.qp import Backend, Formulation, Vectors
+from mpc.solvers import SOLVERS
+from mpc.solvers.piqp_dense import PiqpDense
+from mpc.solvers.piqp_sparse import PiqpMultistage
+from quadsim import rundir
+from quadsim.bench import Contender, Growth, SolverBench, StageLength, solver_tables
+from quadsim.controller import UNCONSTRAINED
+from quadsim.errors import InputError, ParameterError, UnknownNameError
+from quadsim.state import Array
+from quadsim.table import Grid, grid_to_markdown
+from scenarios.bench.contenders import Entry, StepEntrant, entries, judge, reference_optima
+from scenarios.bench.race import race, stretches
+from scenarios.build import build_problem
+from scenarios.queries import Queries, recorded
+from scenarios.runner import Flight, Progress, fly_scenario, machine, silent, versions
+from scenarios.spec import LARGEST_HORIZON, ConstrainedSpec, Scenario
+
+RESULTS_FILE: Final = "bench.json"
+TABLES_FILE: Final = "solvers.md"
+FORMAT: Final = "quadsim bench solvers"
+"""What `bench.json` says it is."""
+
+REPEATS: Final = 5
+HORIZONS: Final = (10, 20, 50, 100, 200)
+GROWTH_STRIDE: Final = 6
+"""One stretch of so many is asked at each horizon and of each form of the QP."""
+STEPS_TRIED: Final = (1, 2, 3, 4, 5, 6, 8, 10, 13, 17, 25)
+LONGEST_PASS: Final = 20.0
+"""A contender whose first pass takes longer [s] is timed once."""
+PATIENCE: Final = 60.0
+"""A contender that takes longer for the questions at one horizon [s] is dropped."""
+
+
+def bench_solvers(
+    scenario: Scenario,
+    *,
+    repeats: int = REPEATS,
+    horizons: Sequence[int] = HORIZONS,
+    solvers: Sequence[str] = tuple(SOLVERS),
+    stride: int = 1,
+    progress: Progress = silent,
+) -> SolverBench:
+    """Fly a scenario, and put its queries to the controller as it is flown and to every solver without the shortcut.
+
+    Args:
+        scenario: by a constrained controller.
+        repeats: how often each question is put, at most.
+        horizons: N for the growth; empty for none.
+        solvers: names in `SOLVERS`; those that are not installed are left out.
+        stride: one stretch of 20 periods of so many is asked; of the growth and the forms, one of six of those.
+        progress: told how far it is.
+
+    Raises:
+        InputError: an argument is wrong, or the flight is not one by a constrained controller.
+    """
+    spec = _check(scenario, repeats, horizons, solvers, stride)
+    flight = fly_scenario(scenario, progress)
+    if not flight.log.control.t.size:
+        raise InputError(
+            f"{scenario.name}: there is nothing to time, since not one period was flown: {flight.log.reason}"
+        )
+    problem = build_problem(scenario, flight.vehicle)
+    rng = np.random.default_rng(scenario.seed)
+    taking_part = entries(spec.solver, solvers)
+    contenders, asked, reference_kkt = _time_contenders(
+        flight, problem, taking_part, repeats=repeats, stride=stride, rng=rng, progress=progress
+    )
+    few = stretches(flight.log.control.t.size, stride * GROWTH_STRIDE)
+    growth = _growth(flight, problem, taking_part, horizons, few, repeats=repeats, rng=rng, progress=progress)
+    return SolverBench(
+        scenario=scenario.name,
+        horizon=problem.horizon,
+        deadline_ms=1e3 * scenario.control_period,
+        asked=asked,
+        flown=flight.log.control.t.size,
+        contenders=contenders,
+        left_out={name: SOLVERS[name].line for name in solvers if not SOLVERS[name].installed},
+        growth=growth,
+        growth_asked=sum(map(len, few)),
+        stages=_stages(flight, problem, few, repeats=repeats, rng=rng, progress=progress),
+        default_steps=STEPS_PER_STAGE,
+        reference_kkt=reference_kkt,
+        versions=versions(),
+        machine=machine(),
+    )
+
+
+def write_bench(bench: SolverBench, directory: Path) -> None:
+    """Write `bench.json`, `solvers.md`, `solvers.png` and `solvers.svg` into a directory.
+
+    Raises:
+        OutputError: it cannot be written.
+    """
+    from quadsim.figures import write_solver_figure
+
+    rundir.write_json(directory / RESULTS_FILE, {"format": FORMAT, **bench.to_json()})
+    (directory / TABLES_FILE).write_text(bench_markdown(bench), encoding="utf-8")
+    write_solver_figure(bench, directory)
+
+
+def bench_markdown(bench: SolverBench) -> str:
+    """All tables of a bench with their notes."""
+    return f"# The solvers on {bench.scenario}\n\n" + "\n".join(map(section, solver_tables(bench)))
+
+
+def section(grid: Grid) -> str:
+    """A table under its title, with its note, as Markdown."""
+    return f"## {grid.title}\n\n{grid_to_markdown(grid)}\n{grid.note}".rstrip() + "\n"
+
+
+def is_bench(directory: Path) -> bool:
+    """Whether a directory holds an earlier bench and nothing else."""
+    own = {RESULTS_FILE, TABLES_FILE, "solvers.png", "solvers.svg"}
+    try:
+        said = (directory / RESULTS_FILE).read_text(encoding="utf-8")[:100]
+    except (OSError, UnicodeDecodeError):
+        return False
+    return f'"format": "{FORMAT}"' in said and {path.name for path in directory.iterdir()} <= own
+
+
+def _check(
+    scenario: Scenario, repeats: int, horizons: Sequence[int], solvers: Sequence[str], stride: int
+) -> ConstrainedSpec:
+    for name in solvers:
+        if name not in SOLVERS:
+            raise UnknownNameError("solver", name, SOLVERS)
+    for option, value in (("--repeats", repeats), ("--stride", stride)):
+        if value < 1:
+            raise ParameterError("", option, value, "at least 1")
+    if any(not 1 <= N <= LARGEST_HORIZON for N in horizons):
+        raise ParameterError("", "--horizons", list(horizons), f"between 1 and {LARGEST_HORIZON} each")
+    if not isinstance(scenario.controller, ConstrainedSpec):
+        raise InputError(f"{scenario.name} is flown without a QP; choose a scenario with a constrained controller")
+    return scenario.controller
+
+
+def _time_contenders(
+    flight: Flight,
+    problem: Problem,
+    taking_part: Sequence[Entry],
+    *,
+    repeats: int,
+    stride: int,
+    rng: np.random.Generator,
+    progress: Progress,
+) -> tuple[tuple[Contender, ...], int, float]:
+    """Every contender, the number of periods asked, and the worst KKT residual of the reference."""
+    queries = recorded(flight.scenario, flight.log.control, problem.horizon)
+    asked = stretches(queries.t.size, stride)
+    periods = [period for stretch in asked for period in stretch]
+    reference = reference_optima(problem, queries, periods)
+    entrants = {entry.name: StepEntrant(entry, problem, queries) for entry in taking_part}
+    laps = race(
+        entrants,
+        asked,
+        repeats=repeats,
+        rng=rng,
+        longest_pass=LONGEST_PASS,
+        progress=lambda done, total: progress("contenders", done, total),
+    )
+    contenders = tuple(
+        Contender(
+            name=name,
+            solver=entrant.entry.solver,
+            package=_package(entrant.entry.solver),
+            shortcut=entrant.entry.shortcut,
+            repeats=laps[name].ms.shape[0],
+            step_ms=laps[name].best,
+            raw_max_ms=float(laps[name].ms.max()),
+            **vars(judge(entrant, queries, periods, reference)),
+        )
+        for name, entrant in entrants.items()
+    )
+    return contenders, len(periods), reference.kkt
+
+
+def _package(solver: str) -> str:
+    entry = SOLVERS[solver]
+    return f"{entry.package} {entry.version}"
+
+
+def _growth(
+    flight: Flight,
+    problem: Problem,
+    taking_part: Sequence[Entry],
+    horizons: Sequence[int],
+    asked: Sequence[range],
+    *,
+    repeats: int,
+    rng: np.random.Generator,
+    progress: Progress,
+) -> tuple[Growth, ...]:
+    """Every contender at each N, until one would hardly keep up with the flight at the next."""
+    grown: dict[str, list[Array]] = {entry.name: [] for entry in taking_part}
+    dropped: dict[str, str] = {}
+    deadline_ms = 1e3 * flight.scenario.control_period
+    for N in sorted(set(horizons)):
+        queries = recorded(flight.scenario, flight.log.control, N)
+        longer = replace(problem, horizon=N)
+        racing = [entry for entry in taking_part if entry.name not in dropped]
+        laps = race(
+            {entry.name: StepEntrant(entry, longer, queries) for entry in racing},
+            asked,
+            repeats=repeats,
+            rng=rng,
+            longest_pass=LONGEST_PASS,
+            patience=PATIENCE,
+            progress=lambda done, total, N=N: progress(f"N = {N}", done, total),  # type: ignore[misc]
+        )
+        for entry in racing:
+            if entry.name not in laps:
+                dropped[entry.name] = f"more than {PATIENCE:g} s for them at N = {N}"
+                continue
+            best = laps[entry.name].best
+            grown[entry.name].append(np.percentile(best, [50, 99]))
+            if (p95 := np.percentile(best, 95)) > 0.5 * deadline_ms:
+                dropped[entry.name] = f"p95 of {p95:.0f} ms at N = {N}, beyond half the control period"
+    return tuple(
+        Growth(
+            name=name,
+            horizons=tuple(sorted(set(horizons))[: len(times)]),
+            p50=tuple(float(p50) for p50, _ in times),
+            p99=tuple(float(p99) for _, p99 in times),
+            dropped=dropped.get(name, "") if len(times) < len(set(horizons)) else "",
+        )
+        for name, times in grown.items()
+        if times
+    )
+
+
+class _QPEntrant:
+    """A form of the QP with its back end, without a controller around it."""
+
+    def __init__(self, formulation: Formulation, backend: Backend, problem: Problem, queries: Queries) -> None:
+        self.formulation, self._backend, self._problem, self._queries = formulation, backend, problem, queries
+        backend.setup(formulation.qp)
+
+    def prepare(self, period: int) -> None:
+        """See `scenarios.bench.race.Entrant.prepare`."""
+        queries, problem = self._queries, self._problem
+        desired = problem.objective.desired(queries.reference[period + 1 : period + 1 + problem.horizon])
+        self._vectors: Vectors = self.formulation.vectors(queries.state[period], desired, queries.speeds_before[period])
+
+    def answer(self) -> None:
+        """See `scenarios.bench.race.Entrant.answer`."""
+        self._backend.solve(self._vectors)
+
+
+def _stages(
+    flight: Flight,
+    problem: Problem,
+    asked: Sequence[range],
+    *,
+    repeats: int,
+    rng: np.random.Generator,
+    progress: Progress,
+) -> tuple[StageLength, ...]:
+    """The QP alone, condensed and cut into stages of M steps, on the periods whose QP has active constraints."""
+    log = flight.log.control
+    queries = recorded(flight.scenario, log, problem.horizon)
+    entrants: dict[int | None, _QPEntrant] = {None: _QPEntrant(condensed(problem), PiqpDense(), problem, queries)}
+    for length in sorted({*STEPS_TRIED, STEPS_PER_STAGE}):
+        form = multistage(problem, steps_per_stage=length)
+        entrants[length] = _QPEntrant(form, PiqpMultistage(), problem, queries)
+    laps = race(
+        {str(steps): entrant for steps, entrant in entrants.items()},
+        asked,
+        repeats=repeats,
+        rng=rng,
+        progress=lambda done, total: progress("stages", done, total),
+    )
+    solved = np.array([log.status[period] != UNCONSTRAINED for stretch in asked for period in stretch])
+    counted = solved if solved.any() else np.ones_like(solved)
+    found = []
+    for steps, entrant in entrants.items():
+        p50, p99 = np.percentile(laps[str(steps)].best[counted], [50, 99])
+        size = entrant.formulation.qp.c.size
+        found.append(StageLength(steps=steps, variables=size, p50=float(p50), p99=float(p99)))
+    return tuple(found)

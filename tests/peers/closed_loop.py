@@ -1,0 +1,129 @@
+"""Closed loop: the paper's constrained flight, by the same controller, on MuJoCo and on RotorPy."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from peers.checks import Check
+from peers.rotorpy_plant import RotorPyPlant
+
+from quadsim.audit import audit
+from quadsim.flightlog import FlightLog
+from quadsim.loop import fly
+from quadsim.metrics import tracking
+from quadsim.plant import Plant
+from scenarios.build import (
+    build_controller,
+    build_initial_state,
+    build_limits,
+    build_plant,
+    build_reference,
+    build_vehicle,
+)
+from scenarios.loading import load_scenario
+from scenarios.spec import Scenario
+
+SCENARIO: Final = "paper-constrained"
+HEAD: Final = ("", "on MuJoCo", "on RotorPy", "difference")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Quantity:
+    """One number of a flight on each plant."""
+
+    name: str
+    unit: str
+    mujoco: float
+    rotorpy: float
+
+    @property
+    def difference(self) -> float:
+        """How far the two are apart."""
+        return abs(self.mujoco - self.rotorpy)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ClosedLoop:
+    """What was found.
+
+    Attributes:
+        scenario: what was flown.
+        mujoco: the flight on our plant.
+        rotorpy: the flight on RotorPy's.
+    """
+
+    scenario: Scenario
+    mujoco: FlightLog
+    rotorpy: FlightLog
+
+    @property
+    def peaks(self) -> tuple[Quantity, ...]:
+        """The largest roll and pitch at the samples and at 1 kHz, signed, as the audit reports them [deg]."""
+        limits = build_limits(self.scenario)
+        pairs = zip(audit(self.mujoco, limits), audit(self.rotorpy, limits), strict=True)
+        return tuple(
+            Quantity(
+                name=f"peak {ours.limit.name} {where}", unit="deg", mujoco=getattr(ours, of), rotorpy=getattr(its, of)
+            )
+            for ours, its in pairs
+            if ours.limit.signal in ("roll", "pitch")
+            for where, of in (("at the samples", "peak_sampled"), ("at 1 kHz", "peak_plant"))
+        )
+
+    @property
+    def rmse(self) -> tuple[Quantity, ...]:
+        """Tracking errors."""
+        ours, its = tracking(self.mujoco.control), tracking(self.rotorpy.control)
+        return tuple(
+            Quantity(name=f"RMS error {name}", unit=unit, mujoco=ours["rmse"][name], rotorpy=its["rmse"][name])
+            for name, unit in ours["unit"].items()
+        )
+
+    @property
+    def rows(self) -> tuple[tuple[str, ...], ...]:
+        """Peaks and errors under `HEAD`."""
+        return tuple(
+            (f"{each.name} [{each.unit}]", f"{each.mujoco:.6f}", f"{each.rotorpy:.6f}", f"{each.difference:.1e}")
+            for each in (*self.peaks, *self.rmse)
+        )
+
+    @property
+    def checks(self) -> tuple[Check, ...]:
+        """Peaks and errors, then everything: each state at each millisecond, each command."""
+
+        def largest(quantities: tuple[Quantity, ...]) -> float:
+            return max(quantity.difference for quantity in quantities)
+
+        states = float(np.abs(self.mujoco.plant.state - self.rotorpy.plant.state).max())
+        commands = float(np.abs(self.mujoco.control.speeds - self.rotorpy.control.speeds).max())
+        return (
+            Check(what="flight: peaks", peer="rotorpy", measured=largest(self.peaks), allowed=1e-6, unit="deg"),
+            Check(what="flight: RMS errors", peer="rotorpy", measured=largest(self.rmse), allowed=1e-6, unit="m, rad"),
+            Check(what="flight: states at 1 kHz", peer="rotorpy", measured=states, allowed=1e-6, unit="SI"),
+            Check(what="flight: commands", peer="rotorpy", measured=commands, allowed=1e-6, unit="rad/s"),
+        )
+
+
+def measure() -> ClosedLoop:
+    """Fly the scenario on both plants."""
+    scenario = load_scenario(SCENARIO)
+    vehicle = build_vehicle(scenario)
+    with build_plant(scenario, vehicle) as plant:
+        mujoco = fly_on(plant, scenario)
+    return ClosedLoop(scenario=scenario, mujoco=mujoco, rotorpy=fly_on(RotorPyPlant(vehicle), scenario))
+
+
+def fly_on(plant: Plant | RotorPyPlant, scenario: Scenario) -> FlightLog:
+    """Fly a scenario on a plant, with a controller of its own."""
+    controller = build_controller(scenario, plant.vehicle)
+    return fly(
+        plant,
+        controller,
+        build_reference(scenario, scenario.periods + controller.horizon),
+        initial_state=build_initial_state(scenario),
+        initial_speeds=np.full(4, plant.vehicle.hover_speed),
+        periods=scenario.periods,
+        steps_per_period=scenario.steps_per_period,
+    )

@@ -1,0 +1,57 @@
+"""The constrained QP against qpmpc's."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from peers.checks import Check
+from peers.constrained_qp import OURS, ConstrainedQP, QpmpcController
+from peers.recorded import Query
+from support import paper_problem
+
+from mpc.problem import Problem
+from mpc.solvers import QPSolver
+from quadsim.controller import UNCONSTRAINED
+from quadsim.errors import ParameterError
+
+
+def test_first_inputs_are_the_same(
+    against_qpmpc: ConstrainedQP, hold: Callable[[Check], None], told: Callable[[tuple[str, ...]], None]
+) -> None:
+    assert against_qpmpc.differences.size == 1200
+    assert against_qpmpc.constrained.sum() > 300, "hardly a constraint is active: little is compared"
+    hold(against_qpmpc.check)
+    told(against_qpmpc.check.row)
+
+
+def test_the_shortcut_was_taken_where_no_constraint_is_active(
+    against_qpmpc: ConstrainedQP, queries: tuple[Query, ...]
+) -> None:
+    taken = [query.status == UNCONSTRAINED for query in queries]
+    np.testing.assert_array_equal(~against_qpmpc.constrained, taken)
+
+
+def test_the_page_tells_how_many_are_constrained(against_qpmpc: ConstrainedQP, page: str) -> None:
+    assert f"In {against_qpmpc.constrained.sum()} of the {against_qpmpc.differences.size} periods" in page
+
+
+def test_a_reference_one_sample_late_is_seen(problem: Problem, queries: tuple[Query, ...]) -> None:
+    """The index of the targets, which a constant reference would not tell."""
+    peer, ours = QpmpcController(problem), QPSolver(OURS, problem)
+    late = [replace(query, desired=np.roll(query.desired, 1, axis=0)) for query in queries[::100]]
+    differences = [
+        np.abs(peer.speeds(peer.solve(wrong)) - ours.solve(query.state, query.desired, query.u_before).plan[0]).max()
+        for wrong, query in zip(late, queries[::100], strict=True)
+    ]
+    assert max(differences) > 0.1
+
+
+def test_weights_that_qpmpc_cannot_take_are_refused() -> None:
+    problem = paper_problem()
+    weights = problem.objective.Q_u + 1e-3
+    coupled = replace(problem, objective=replace(problem.objective, Q_u=weights))
+    with pytest.raises(ParameterError, match="Q_u must be diagonal, to be rebuilt in qpmpc"):
+        QpmpcController(coupled)
