@@ -29,6 +29,10 @@ class QP:
     """min 1/2 x' P x + c' x  subject to  A x = b,  h_l <= G x <= h_u,  x_l <= x <= x_u.
 
     Matrices are dense or sparse (csc); bounds may be infinite.  Eq. (27), with rows bounded from both sides.
+
+    Attributes:
+        seldom: how many rows, the last of G, hardly ever bind.  A hint: a back end may leave them out at first, since
+            an optimum that satisfies them all the same is the optimum.
     """
 
     P: Matrix
@@ -40,6 +44,7 @@ class QP:
     h_u: Array
     x_l: Array
     x_u: Array
+    seldom: int = 0
 
     def with_vectors(self, vectors: Vectors) -> QP:
         """The same matrices and box with other vectors."""

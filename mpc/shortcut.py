@@ -25,7 +25,7 @@ class Shortcut:
 
         [u_opt; y_c] = W [xi(k); y_d] + w,
 
-    so that one matrix-vector product and a few comparisons decide.  All that is computed is written into buffers.
+    so that matrix-vector products and a few comparisons decide.  All that is computed is written into buffers.
     """
 
     def __init__(self, problem: Problem) -> None:
@@ -38,14 +38,15 @@ class Shortcut:
             return (bounds.C_c @ states.reshape(N, model.n, -1)).reshape(N * bounds.y_min.size, -1)
 
         deviation = (offset - np.tile(model.u_bar, N))[:, None]
-        self._map = np.block([[K, G], [outputs(maps.Phi + maps.Psi @ K), outputs(maps.Psi @ G)]])
-        self._offset = np.concatenate([offset, outputs(maps.Psi @ deviation)[:, 0]])
-        self._lower = np.concatenate([np.tile(bounds.u_min, N), np.tile(bounds.y_min, N)])
-        self._upper = np.concatenate([np.tile(bounds.u_max, N), np.tile(bounds.y_max, N)])
+        self._inputs = _Affine(np.hstack([K, G]), offset, np.tile(bounds.u_min, N), np.tile(bounds.u_max, N))
+        self._outputs = _Affine(
+            np.hstack([outputs(maps.Phi + maps.Psi @ K), outputs(maps.Psi @ G)]),
+            outputs(maps.Psi @ deviation)[:, 0],
+            np.tile(bounds.y_min, N),
+            np.tile(bounds.y_max, N),
+        )
         self._bounds = bounds
-        self._query = np.empty(self._map.shape[1])
-        self._values = np.empty(self._map.shape[0])
-        self._plan = self._values[: N * model.nu].reshape(N, model.nu)  # a view
+        self._query = np.empty(K.shape[1] + G.shape[1])
         self._slews = np.empty((N, model.nu))
 
     def plan(self, state: Array, desired: Array, u_before: Array) -> Array | None:
@@ -58,15 +59,31 @@ class Shortcut:
         """
         self._query[: state.size] = state
         self._query[state.size :] = desired.ravel()
-        np.dot(self._map, self._query, out=self._values)
-        self._values += self._offset
-        if not _within(self._lower, self._values, self._upper):
+        if self._outputs.within_bounds(self._query) is None:  # first, as they bar the way most often
             return None
-        np.subtract(self._plan[0], u_before, out=self._slews[0])
-        np.subtract(self._plan[1:], self._plan[:-1], out=self._slews[1:])
+        sequence = self._inputs.within_bounds(self._query)
+        if sequence is None:
+            return None
+        plan = sequence.reshape(self._slews.shape)
+        np.subtract(plan[0], u_before, out=self._slews[0])
+        np.subtract(plan[1:], plan[:-1], out=self._slews[1:])
         if not _within(self._bounds.delta_min, self._slews, self._bounds.delta_max):
             return None
-        return self._plan.copy()
+        return plan.copy()
+
+
+class _Affine:
+    """Values M q + m of a query q, between bounds."""
+
+    def __init__(self, matrix: Array, offset: Array, lower: Array, upper: Array) -> None:
+        self._matrix, self._offset, self._lower, self._upper = matrix, offset, lower, upper
+        self._values = np.empty(offset.size)
+
+    def within_bounds(self, query: Array) -> Array | None:
+        """The values, in a buffer that the next call overwrites, or None where one is out of its bounds."""
+        np.dot(self._matrix, query, out=self._values)
+        self._values += self._offset
+        return self._values if _within(self._lower, self._values, self._upper) else None
 
 
 def make_shortcut(problem: Problem) -> Shortcut | None:

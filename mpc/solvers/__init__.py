@@ -15,7 +15,7 @@ import numpy as np
 from mpc.condensed import condensed
 from mpc.multistage import multistage
 from mpc.problem import Problem
-from mpc.qp import QP, Backend, Formulation, FormulationBuilder, Solution, Vectors
+from mpc.qp import QP, Backend, Formulation, FormulationBuilder, Solution
 from quadsim.errors import MissingPackageError, UnknownNameError
 from quadsim.state import Array
 
@@ -179,18 +179,9 @@ class QPSolver:
         Data that is not finite is answered with the status `invalid_data`: no back end can be trusted to notice.
         """
         vectors = self.formulation.vectors(state, desired, u_before)
-        solution = self._backend.solve(vectors) if _valid(vectors) else _refusal(self.formulation.qp)
+        valid = math.isfinite(state.sum() + desired.sum() + u_before.sum())
+        solution = self._backend.solve(vectors) if valid else _refusal(self.formulation.qp)
         return Answer(plan=self.formulation.inputs(solution.x), solution=solution)
-
-
-def _valid(vectors: Vectors) -> bool:
-    """Whether gradient and equalities are finite and bounds are bounds; sums and extremes are NaN if any entry is."""
-    return bool(
-        math.isfinite(vectors.c.sum())
-        and math.isfinite(vectors.b.sum())
-        and vectors.h_l.max(initial=-math.inf) < math.inf
-        and vectors.h_u.min(initial=math.inf) > -math.inf
-    )
 
 
 def _refusal(qp: QP) -> Solution:

@@ -28,10 +28,10 @@ STATUS: Final = {
 }
 
 
-TOLERANCE: Final = 7e-9
+TOLERANCE: Final = 3e-9
 """Absolute; PIQP's own is 1e-8.  Next to a constraint that is hardly active the inputs converge as its square root: at
-1e-8 a first input of the paper's flight is 1.1e-3 rad/s from the optimum, at 7e-9 none is more than 7e-4, at 3e-9 none
-more than 3e-4, for one more iteration in the slowest steps."""
+1e-8 a first input of the paper's flight is 1.1e-3 rad/s from the optimum, at 3e-9 none is more than 3e-4, for one more
+iteration in the slowest steps."""
 
 
 def configure(solver: Any) -> None:
@@ -46,11 +46,12 @@ def setup(solver: Any, qp: QP) -> None:
     solver.setup(qp.P, qp.c, qp.A, qp.b, qp.G, qp.h_l, qp.h_u, qp.x_l, qp.x_u)
 
 
-def solve(solver: Any, vectors: Vectors) -> Solution:
+def solve(solver: Any, vectors: Vectors, *, rows: int) -> Solution:
     """Update the vectors, solve, copy everything out.
 
     PIQP's result arrays are views that the next solve overwrites, and a failed solve leaves a finite x: the
     status is the only thing to go by.  Sizes are ours to get right, since a wrong one keeps the old data silently.
+    Multipliers are filled up to `rows` with zeros: those of rows that the solver was not given.
     """
     started = clock.perf_counter()
     solver.update(c=vectors.c, b=vectors.b, h_l=vectors.h_l, h_u=vectors.h_u)
@@ -67,10 +68,12 @@ def solve(solver: Any, vectors: Vectors) -> Solution:
             (result.z_bu, result.s_bu),
         )
     )
+    z = np.zeros(rows)
+    np.subtract(result.z_u, result.z_l, out=z[: vectors.h_l.size])
     return Solution(
         x=result.x.copy(),
         y=result.y.copy(),
-        z=result.z_u - result.z_l,
+        z=z,
         z_box=result.z_bu - result.z_bl,
         status=STATUS[status],
         iterations=int(result.info.iter),

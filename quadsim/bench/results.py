@@ -75,6 +75,7 @@ class Growth:
 
     Attributes:
         name: the contender.
+        kind: which of its steps: those by the `QP`, those by the `shortcut`; empty for all of them.
         horizons: N, as far as it went.
         p50, p99: whole step at each N [ms].
         dropped: why it went no further; empty for one that went all the way.
@@ -84,7 +85,13 @@ class Growth:
     horizons: tuple[int, ...]
     p50: tuple[float, ...]
     p99: tuple[float, ...]
+    kind: str = ""
     dropped: str = ""
+
+    @property
+    def label(self) -> str:
+        """The contender, and which of its steps."""
+        return f"{self.name}, by the {self.kind}" if self.kind else self.name
 
     def exponent(self, quantile: str) -> float | None:
         """A in time ~ N^a, by least squares over the logarithms for N >= `FITTED_FROM`; None below three horizons."""

@@ -123,9 +123,9 @@ def _how(bench: SolverBench) -> str:
 
 
 def _growth(bench: SolverBench) -> Grid:
-    horizons = max((growth.horizons for growth in bench.growth), key=len)
+    horizons = sorted({N for growth in bench.growth for N in growth.horizons})
     head = ("p50 / p99 of the whole step [ms]", *(f"N = {N}" for N in horizons), "growth")
-    dropped = [f"{growth.name}: {growth.dropped}" for growth in bench.growth if growth.dropped]
+    dropped = dict.fromkeys(f"{growth.name}: {growth.dropped}" for growth in bench.growth if growth.dropped)
     note = (
         f"{bench.growth_asked} control periods at each N, the problem and its reference made anew; growth: the "
         f"exponents of N that fit p50 and p99 from N = {FITTED_FROM} on."
@@ -140,11 +140,11 @@ def _growth(bench: SolverBench) -> Grid:
 
 
 def _growth_line(growth: Growth, horizons: Sequence[int]) -> tuple[Cell, ...]:
-    pairs = [f"{_milliseconds(p50)} / {_milliseconds(p99)}" for p50, p99 in zip(growth.p50, growth.p99, strict=True)]
-    pairs += [ABSENT] * (len(horizons) - len(pairs))
+    times = dict(zip(growth.horizons, zip(growth.p50, growth.p99, strict=True), strict=True))
+    pairs = [" / ".join(map(_milliseconds, times[N])) if N in times else ABSENT for N in horizons]
     exponents = [growth.exponent(name) for name in ("p50", "p99")]
     fitted = [f"{exponent:.2f}" for exponent in exponents if exponent is not None]
-    return _line(growth.name, *pairs, " / ".join(fitted) or ABSENT)
+    return _line(growth.label, *pairs, " / ".join(fitted) or ABSENT)
 
 
 def _stages(bench: SolverBench) -> Grid:

@@ -92,6 +92,12 @@ class StepEntrant:
         if self._period is not None:
             self.answers.setdefault(self._period, (self._command, self.solver.last))
 
+    def shortcuts(self, periods: Sequence[int]) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
+        """Which periods were answered by the shortcut."""
+        self.keep()
+        commands = [self.answers[period][0] for period in periods]
+        return np.array([command is not None and command.status == UNCONSTRAINED for command in commands])
+
 
 @dataclass(frozen=True, kw_only=True)
 class Reference:

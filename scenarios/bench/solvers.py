@@ -20,7 +20,6 @@ from quadsim import rundir
 from quadsim.bench import Contender, Growth, SolverBench, StageLength, solver_tables
 from quadsim.controller import UNCONSTRAINED
 from quadsim.errors import InputError, ParameterError, UnknownNameError
-from quadsim.state import Array
 from quadsim.table import Grid, grid_to_markdown
 from scenarios.bench.contenders import Entry, StepEntrant, entries, judge, reference_optima
 from scenarios.bench.race import race, stretches
@@ -204,16 +203,21 @@ def _growth(
     rng: np.random.Generator,
     progress: Progress,
 ) -> tuple[Growth, ...]:
-    """Every contender at each N, until one would hardly keep up with the flight at the next."""
-    grown: dict[str, list[Array]] = {entry.name: [] for entry in taking_part}
+    """Every contender at each N, until one would hardly keep up with the flight at the next.
+
+    Steps by the QP and steps by the shortcut are told apart: their shares change with N.
+    """
+    grown: dict[tuple[str, str], list[tuple[int, float, float]]] = {}
     dropped: dict[str, str] = {}
+    periods = [period for stretch in asked for period in stretch]
     deadline_ms = 1e3 * flight.scenario.control_period
     for N in sorted(set(horizons)):
         queries = recorded(flight.scenario, flight.log.control, N)
         longer = replace(problem, horizon=N)
         racing = [entry for entry in taking_part if entry.name not in dropped]
+        entrants = {entry.name: StepEntrant(entry, longer, queries) for entry in racing}
         laps = race(
-            {entry.name: StepEntrant(entry, longer, queries) for entry in racing},
+            entrants,
             asked,
             repeats=repeats,
             rng=rng,
@@ -226,19 +230,23 @@ def _growth(
                 dropped[entry.name] = f"more than {PATIENCE:g} s for them at N = {N}"
                 continue
             best = laps[entry.name].best
-            grown[entry.name].append(np.percentile(best, [50, 99]))
+            short = entrants[entry.name].shortcuts(periods)
+            for kind, chosen in (("QP", ~short), ("shortcut", short)) if entry.shortcut else (("", ~short),):
+                if chosen.any():
+                    p50, p99 = np.percentile(best[chosen], [50, 99])
+                    grown.setdefault((entry.name, kind), []).append((N, float(p50), float(p99)))
             if (p95 := np.percentile(best, 95)) > 0.5 * deadline_ms:
                 dropped[entry.name] = f"p95 of {p95:.0f} ms at N = {N}, beyond half the control period"
     return tuple(
         Growth(
             name=name,
-            horizons=tuple(sorted(set(horizons))[: len(times)]),
-            p50=tuple(float(p50) for p50, _ in times),
-            p99=tuple(float(p99) for _, p99 in times),
-            dropped=dropped.get(name, "") if len(times) < len(set(horizons)) else "",
+            kind=kind,
+            horizons=tuple(N for N, _, _ in times),
+            p50=tuple(p50 for _, p50, _ in times),
+            p99=tuple(p99 for _, _, p99 in times),
+            dropped=dropped.get(name, "") if times[-1][0] < max(horizons) else "",
         )
-        for name, times in grown.items()
-        if times
+        for (name, kind), times in grown.items()
     )
 
 

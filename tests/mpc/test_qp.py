@@ -144,3 +144,75 @@ def test_answers_are_copies_that_the_next_solve_leaves_alone() -> None:
 def test_a_problem_without_bounds_needs_no_qp(build: object) -> None:
     with pytest.raises(ValueError, match="needs a problem with bounds"):
         build(paper_problem("paper-unconstrained"))  # type: ignore[operator]
+
+
+def tight_slews(horizon: int = 50) -> Problem:
+    """The paper's problem with rotors so slow that the whole plan is bound by them."""
+    problem = paper_problem("paper-constrained", f"controller.horizon={horizon}")
+    assert problem.bounds is not None
+    return replace(problem, bounds=replace(problem.bounds, delta_min=np.full(4, -0.2), delta_max=np.full(4, 0.2)))
+
+
+def test_rows_left_out_at_first_are_found_where_they_bind() -> None:
+    """Slews late in the plan seldom bind; where they do, the answer is that of the whole QP, and tells its cost."""
+    problem = tight_slews()
+    query = np.zeros(12), problem.objective.desired(paper_reference(51)[1:]), problem.model.u_bar
+    formulation, backend = multistage(problem), PiqpMultistage()
+    backend.setup(formulation.qp)
+    vectors = formulation.vectors(*query)
+    solution = backend.solve(vectors)
+    late = solution.z[-formulation.qp.seldom :]
+    assert np.abs(late).max() > 1.0
+    assert kkt_residuals(formulation.qp.with_vectors(vectors), solution).worst < 1e-4
+    whole = PiqpMultistage()
+    whole.setup(replace(formulation.qp, seldom=0))
+    alone = whole.solve(vectors)
+    np.testing.assert_array_equal(solution.x, alone.x)
+    assert solution.iterations > alone.iterations
+
+
+def test_rows_left_out_at_first_do_not_bind_over_the_flight(constrained_flight: Flight) -> None:
+    """And then one smaller QP gives the whole one's solution."""
+    problem = paper_problem()
+    formulation = multistage(problem)
+    assert formulation.qp.seldom == 4 * (50 - 32)
+    once, whole = PiqpMultistage(), PiqpMultistage()
+    once.setup(formulation.qp)
+    whole.setup(replace(formulation.qp, seldom=0))
+    for query in flight_queries(constrained_flight, problem, stride=25):
+        vectors = formulation.vectors(*query)
+        solution, alone = once.solve(vectors), whole.solve(vectors)
+        assert solution.z.shape == alone.z.shape
+        assert not solution.z[-formulation.qp.seldom :].any()
+        assert kkt_residuals(formulation.qp.with_vectors(vectors), solution).worst < 1e-4
+        np.testing.assert_allclose(formulation.inputs(solution.x)[0], formulation.inputs(alone.x)[0], atol=1e-3)
+
+
+def test_first_inputs_are_exact_over_the_flight(constrained_flight: Flight) -> None:
+    """Within 1e-3 rad/s of an active-set solver's, which ends at a vertex and not near one."""
+    problem = paper_problem()
+    ours, exact = QPSolver("piqp-multistage", problem), QPSolver("daqp", problem)
+    queries = flight_queries(constrained_flight, problem, stride=2)
+    errors = [np.abs(ours.solve(*query).plan[0] - exact.solve(*query).plan[0]).max() for query in queries]
+    assert max(errors) < 1e-3
+
+
+@pytest.mark.parametrize("steps", [1, 4, 5, 50, 60])
+def test_stages_cover_the_horizon(steps: int) -> None:
+    """Whatever M, and whatever is left for the first stage and the last, the QP is the same."""
+    problem = paper_problem()
+    query = np.zeros(12), problem.objective.desired(paper_reference(51)[1:]), problem.model.u_bar
+    expected = QPSolver("piqp-dense", problem).solve(*query).plan
+    formulation, backend = multistage(problem, steps_per_stage=steps), PiqpMultistage()
+    backend.setup(formulation.qp)
+    solution = backend.solve(formulation.vectors(*query))
+    np.testing.assert_allclose(formulation.inputs(solution.x)[0], expected[0], atol=1e-3)
+    np.testing.assert_allclose(formulation.inputs(solution.x), expected, atol=0.05)
+
+
+def test_products_of_rounding_are_left_out() -> None:
+    """Rotors on body x do not roll the vehicle, though cos(90 deg) is not zero in binary."""
+    qp = multistage(paper_problem()).qp
+    outputs = abs(qp.G[:100]).tocsr()
+    for row in (outputs[i].data for i in range(outputs.shape[0]) if outputs[i].nnz):
+        assert row.min() > 1e-12 * row.max()
