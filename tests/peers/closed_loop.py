@@ -85,7 +85,7 @@ class ClosedLoop:
     def rows(self) -> tuple[tuple[str, ...], ...]:
         """Peaks and errors under `HEAD`."""
         return tuple(
-            (f"{each.name} [{each.unit}]", f"{each.mujoco:.6f}", f"{each.rotorpy:.6f}", f"{each.difference:.1e}")
+            (f"{each.name} [{each.unit}]", f"{each.mujoco:.4f}", f"{each.rotorpy:.4f}", f"{each.difference:.1e}")
             for each in (*self.peaks, *self.rmse)
         )
 
