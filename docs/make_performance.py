@@ -79,7 +79,8 @@ def page(bench: SolverBench, flight: FlightProfile, film: RenderProfile, command
             "![Time of a whole controller step of every contender, and its growth with the horizon](solvers.png)\n",
             *(section(grid) for grid in others),
             *(section(grid) for grid in flight_tables(flight)),
-            f"Before, at commit {BEFORE_COMMIT}, when every period had its QP (step: median 1.0 ms, p99 1.5 ms):\n\n"
+            f"Before, at commit {BEFORE_COMMIT}, when every period had its QP (step: median 1.0 ms, p99 1.5 ms); "
+            "measured then, on a machine of the same kind, not in this run:\n\n"
             f"{markdown(BEFORE)}",
             *(section(grid) for grid in render_tables(film)),
             f"## Whole commands\n\n{commands}",

@@ -33,7 +33,8 @@ INTRODUCTION = """\
 Is it right? Here quadsim is held against software that nobody here wrote, by figures that anyone can remake.
 `make peers` installs the peers at the versions of `constraints.txt` and holds every check below;
 `make verification` measures them again and writes this page. The code is in [tests/peers](../tests/peers), one file per
-comparison. A page that is not today's, in versions or in magnitudes, fails `make peers`.
+comparison. A page whose versions or digits are not today's fails `make peers`; figures that rounding decides may differ
+tenfold, or be below 1e-7, and the rows of the solvers that fail now and then, osqp and highs, may be another day's.
 """
 
 
@@ -122,8 +123,8 @@ an active-set method, exact to rounding). For x_(j+1) = A x_j + B v_j qpmpc mini
 Both are asked what the controller was asked in each period of `{recorded.SCENARIO}`: state, desired outputs, input
 before. In {measured.constrained.sum()} of the {measured.differences.size} periods a constraint is active;
 exactly in the others the controller took the unconstrained optimum, without a QP. `{constrained_qp.OURS}`, the default
-solver, differs by at most {measured.check.row[2]}, where it stops iterating; how near the two problems themselves are,
-the active-set solvers in the next table show.
+solver, differs by at most {measured.checks[0].row[2]}, where it stops iterating; how near the two problems
+themselves are, the active-set solvers in the next table show.
 """
 
 
@@ -159,7 +160,7 @@ def main() -> None:
         *plant.checks,
         *flight.checks,
         *(check for comparison in gains for check in comparison.checks),
-        qp.check,
+        *qp.checks,
     ]
     table = markdown([HEAD, *(check.row for check in checks)])
     page = [

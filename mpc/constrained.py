@@ -1,4 +1,4 @@
-"""The constrained MPC: one QP per period.  Eqs. (27)-(29)."""
+"""The constrained MPC: at most one QP per period.  Eqs. (27)-(29)."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ BOUND_TOLERANCE: Final = 1e-6
 
 
 class ConstrainedMPC:
-    """Solves Eq. (27) each period and sends the first action of the optimal plan.
+    """Finds the optimum of Eq. (27) each period and sends the first action of the optimal plan.
 
     Where the unconstrained optimum satisfies every constraint it is the solution, and no QP is solved: the status is
     then `unconstrained`.  Only a QP's answer that is solved, finite, and whose first action is within the hard input

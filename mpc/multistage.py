@@ -93,8 +93,8 @@ def multistage(problem: Problem, *, steps_per_stage: int = STEPS_PER_STAGE) -> M
 
     Args:
         problem: a problem with bounds.
-        steps_per_stage: M.  The first stage has no state among its variables and takes as many more steps as there is
-            room for in blocks of the others' size; the last stage takes what is left.
+        steps_per_stage: M.  The first stage has no state among its variables and, where M > 1, takes as many more steps
+            as there is room for in blocks of the others' size; the last stage takes what is left.
 
     Raises:
         ValueError: the problem has no bounds.

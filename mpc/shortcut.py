@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Final
 
 import numpy as np
-import scipy.linalg
 
 from mpc.condensed import require_bounds
 from mpc.prediction import prediction
@@ -14,7 +13,11 @@ from mpc.unconstrained import sequence_gains
 from quadsim.state import Array
 
 LARGEST_MAP: Final = 2**20
-"""Entries of the map beyond which evaluating it costs what it saves; 50 steps of the paper's problem have 64 k."""
+"""Entries beyond which there is no shortcut: 8 MiB, as much as a core's caches hold.  50 steps of the paper's problem
+have 64 k entries, 200 steps 970 k."""
+ROUNDING: Final = 1e-2
+"""Error of L_N u_bar [rad/s], whose value is known, beyond which rounding is taken to have spoilt the gains.  That of
+K_N xi(k), on deviations and not on the whole speed, is a hundredth of it."""
 
 
 class Shortcut:
@@ -23,7 +26,7 @@ class Shortcut:
     The cost is strictly convex, so its minimiser, if feasible, is the one and only solution of Eq. (27).  Sequence
     and predicted outputs are affine in xi(k) and y_d,
 
-        [u_opt; y_c] = W [xi(k); y_d] + w,
+        [u_opt; y_c] = W [xi(k); y_d] + [u_bar; 0],
 
     so that matrix-vector products and a few comparisons decide.  All that is computed is written into buffers.
     """
@@ -31,17 +34,18 @@ class Shortcut:
     def __init__(self, problem: Problem) -> None:
         bounds, model, N = require_bounds(problem), problem.model, problem.horizon
         gains, maps = sequence_gains(problem), prediction(model, N)
-        K, G, offset = gains.K, gains.G, gains.L @ model.u_bar
+        K, G, hover = gains.K, gains.G, np.tile(model.u_bar, N)
+        if not np.abs(gains.L @ model.u_bar - hover).max() < ROUNDING:
+            raise np.linalg.LinAlgError("the Hessian is too ill-conditioned")
 
         def outputs(states: Array) -> Array:
             """C_c applied to every predicted state in the columns of (N n, m)."""
-            return (bounds.C_c @ states.reshape(N, model.n, -1)).reshape(N * bounds.y_min.size, -1)
+            return (bounds.C_c @ states.reshape(N, model.n, -1)).reshape(N * bounds.y_min.size, states.shape[1])
 
-        deviation = (offset - np.tile(model.u_bar, N))[:, None]
-        self._inputs = _Affine(np.hstack([K, G]), offset, np.tile(bounds.u_min, N), np.tile(bounds.u_max, N))
+        self._inputs = _Affine(np.hstack([K, G]), hover, np.tile(bounds.u_min, N), np.tile(bounds.u_max, N))
         self._outputs = _Affine(
             np.hstack([outputs(maps.Phi + maps.Psi @ K), outputs(maps.Psi @ G)]),
-            outputs(maps.Psi @ deviation)[:, 0],
+            np.zeros(N * bounds.y_min.size),
             np.tile(bounds.y_min, N),
             np.tile(bounds.y_max, N),
         )
@@ -89,8 +93,9 @@ class _Affine:
 def make_shortcut(problem: Problem) -> Shortcut | None:
     """The problem's shortcut, or None where there is no good one.
 
-    The map grows with the square of the horizon, the QP in proportion to it: beyond `LARGEST_MAP` entries the shortcut
-    is none.  Weights that are too many orders of magnitude apart leave no Cholesky factor to compute it from.
+    The map grows with the square of the horizon, the QP in proportion to it: beyond `LARGEST_MAP` entries there is
+    none.  Nor is there where the Hessian is so ill-conditioned, by a long horizon or weights far apart, that the gains
+    are not exact.
     """
     bounds, nu = require_bounds(problem), problem.model.nu
     rows = problem.horizon * (nu + bounds.y_min.size)
@@ -99,7 +104,7 @@ def make_shortcut(problem: Problem) -> Shortcut | None:
         return None
     try:
         return Shortcut(problem)
-    except scipy.linalg.LinAlgError:
+    except np.linalg.LinAlgError:
         return None
 
 

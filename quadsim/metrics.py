@@ -64,7 +64,8 @@ def settling(t: Array, outputs: Array, steps: Sequence[CourseStep]) -> list[dict
     The settling time runs from the step of the unfiltered course to the first control sample from which on the output
     stays within `SETTLING_BAND` of the step around its new value.  Samples are looked at up to `until`: a controller
     with a preview moves before the next step, on purpose.  What steps of the other channels disturb does count.  None
-    where the output does not settle in that time, or the flight ended before it was over.
+    where the output does not settle in that time, the flight ended before it was over, or there is no such time, the
+    next step coming into view at once.
 
     Args:
         t: (K,) control samples [s].
@@ -74,14 +75,14 @@ def settling(t: Array, outputs: Array, steps: Sequence[CourseStep]) -> list[dict
     Returns:
         One entry per step, in order: the step's own values, and `settled` [s].
     """
-    period = t[1] - t[0] if t.size > 1 else math.inf
+    period = t[1] - t[0] if t.size > 1 else 0.0
     entries = []
     for step in steps:
         held = (t >= step.time - 1e-9) & (t <= step.until + 1e-9)
         error = outputs[held, REFERENCE_NAMES.index(step.channel)] - step.after
         outside = np.flatnonzero(np.abs(error) > SETTLING_BAND * abs(step.after - step.before))
         first = outside[-1] + 1 if outside.size else 0
-        flown = t.size > 0 and t[-1] + period > step.until - 1e-9
+        flown = t.size > 1 and t[-1] + period > step.until - 1e-9
         settled = round(float(t[held][first] - step.time), 9) if flown and first < error.size else None
         entries.append(
             {

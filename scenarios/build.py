@@ -27,7 +27,7 @@ from scenarios.spec import ANGLES, ConstrainedSpec, Scenario, WindowSpec
 
 CONTROLLERS: Final = {
     "unconstrained": "the paper's Sec. 4: a constant gain from the unconstrained optimum",
-    "constrained": "the paper's Sec. 5: one QP per period, tilt, rotor speeds and their steps bounded",
+    "constrained": "the paper's Sec. 5: at most one QP per period, tilt, rotor speeds and their steps bounded",
 }
 
 

@@ -74,6 +74,11 @@ def compare(options: Namespace) -> int:
     from scenarios.cost import find_study, study_cost
 
     target = Path(options.out)
+    for name in options.targets:  # what is wrong with any of them is said before the first is flown
+        if Path(name).is_dir():
+            rundir.read_summary(Path(name))
+        else:
+            load_scenario(name)
     studied = find_study(options.targets, asked=options.cost)
     directories = [Path(name) if Path(name).is_dir() else _fly_for_comparison(name, target) for name in options.targets]
     runs = [rundir.load_run(directory) for directory in directories]

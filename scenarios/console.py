@@ -26,7 +26,7 @@ def print_listing(sections: Mapping[str, Mapping[str, str]]) -> None:
         table.add_column(no_wrap=True, style="cyan")
         table.add_column()
         for name, line in entries.items():
-            table.add_row(name, line)
+            table.add_row(name, escape(line))
         console.print(table)
         console.print()
 

@@ -14,7 +14,7 @@ from typing import Any, Final
 import numpy as np
 
 from mpc.constrained import ConstrainedMPC
-from mpc.solvers import QPSolver
+from mpc.solvers import SOLVERS, QPSolver, make_backend
 from mpc.unconstrained import UnconstrainedMPC
 from quadsim import metrics
 from quadsim.controller import Controller
@@ -43,7 +43,7 @@ REPEATS: Final = 3
 SWEEP_REPEATS: Final = 2
 SWEEP_STRIDE: Final = 3
 """Of a flight in a sweep, each period of so many is timed."""
-LONGEST_PASS: Final = 4.0
+LONGEST_PASS: Final = 20.0
 """A contender that takes longer than this for all periods of a flight [s] is timed once."""
 LONGEST_UNASKED: Final = 120.0
 """A course that takes longer than this [s] is studied only when that is asked for: it is flown about thirty times."""
@@ -84,13 +84,17 @@ def find_study(targets: Sequence[str], *, asked: bool | None) -> list[Scenario]:
         if asked:
             raise InputError("--cost needs a flight by a constrained controller among those that are compared")
         return []
+    assert isinstance(constrained.controller, ConstrainedSpec)
     others = [
         each
         for each in scenarios
         if isinstance(each.controller, UnconstrainedSpec) and _course(each) == _course(constrained)
     ]
-    if asked is None and (not others or constrained.duration > LONGEST_UNASKED):
+    flyable = SOLVERS[constrained.controller.solver].installed
+    if asked is None and (not others or constrained.duration > LONGEST_UNASKED or not flyable):
         return []
+    if not flyable:
+        make_backend(constrained.controller.solver)  # says what is missing, before anything is flown
     return [constrained, *others]
 
 
@@ -134,7 +138,7 @@ def study_cost(
     tilted = {tilt: _with_tilt(constrained, tilt) for tilt in sorted({*tilts} | ({own_tilt} if own_tilt else set()))}
     shortened = {n: _with_controller(constrained, horizon=n) for n in sorted({*horizons, spec.horizon})}
     varied = _variants(constrained, arm_lengths, drags)
-    apart = {each.name: each for each in others if not _is_counterpart(each, constrained)}
+    apart = _named([each for each in others if not _is_counterpart(each, constrained)])
 
     wanted = [*shortened.values(), *tilted.values(), *varied.values()]
     wanted += [_without_constraints(each) for each in (constrained, *shortened.values())] + [*apart.values()]
@@ -288,7 +292,24 @@ def _own_tilt(spec: ConstrainedSpec) -> float | None:
 
 
 def _course(scenario: Scenario) -> tuple[Any, ...]:
-    return scenario.reference, scenario.initial, scenario.duration, scenario.control_period
+    """What two flights must share to be compared by their controllers."""
+    return (
+        scenario.reference,
+        scenario.initial,
+        scenario.duration,
+        scenario.control_period,
+        scenario.plant,
+        build_vehicle(scenario),
+    )
+
+
+def _named(scenarios: Sequence[Scenario]) -> dict[str, Scenario]:
+    """Scenarios by name, those that share one numbered."""
+    named: dict[str, Scenario] = {}
+    for each in scenarios:
+        shared = sum(each.name == other.name for other in named.values())
+        named[f"{each.name} ({shared + 1})" if shared else each.name] = each
+    return named
 
 
 def _is_counterpart(scenario: Scenario, constrained: Scenario) -> bool:

@@ -12,7 +12,7 @@ from mpc.qp import QP, Solution, Vectors
 from quadsim.controller import SOLVED
 
 MAX_ITERATIONS: Final = 100
-"""Cap for hopeless data (NaN runs PIQP to its limit); the paper's QPs take 7 to 22."""
+"""Cap for hopeless data (NaN runs PIQP to its limit); the paper's QPs take 8 to 23."""
 
 ACTIVE_SLACK: Final = 1e-6
 """Distance to a bound (rad or rad/s) below which a constraint may count as active."""
@@ -29,9 +29,9 @@ STATUS: Final = {
 
 
 TOLERANCE: Final = 1e-9
-"""Absolute; PIQP's own is 1e-8.  Next to a constraint that is hardly active the inputs converge as its square root: over
-the paper's flight, one form of the QP or another has a first input 1e-3 rad/s from the optimum at 1e-8 and at 3e-9; at
-1e-9 all are within 3e-4, for one more iteration."""
+"""Absolute; PIQP's own is 1e-8.  Next to a constraint that is hardly active the inputs converge as its square root:
+over the paper's flight, one form of the QP or another has a first input 1e-3 rad/s from the optimum at 1e-8 and at
+3e-9; at 1e-9 all are within 3e-4, for one more iteration."""
 
 
 def configure(solver: Any) -> None:

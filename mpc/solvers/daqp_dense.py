@@ -18,7 +18,7 @@ from quadsim.controller import SOLVED
 
 SETTINGS: Final = {
     "primal_tol": 1e-8,  # rad or rad/s; its own 1e-6 is as fast
-    "iter_limit": 5000,  # changes of the active set; the paper's QPs take 1 to 250
+    "iter_limit": 5000,  # changes of the active set; the paper's QPs take 1 to 180
 }
 
 STATUS: Final = {

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from typing import Any, Final
 
 import numpy as np
@@ -78,6 +78,7 @@ class Growth:
         kind: which of its steps: those by the `QP`, those by the `shortcut`; empty for all of them.
         horizons: N, as far as it went.
         p50, p99: whole step at each N [ms].
+        failures: periods that the contender left without their optimum, by the N at which it did.
         dropped: why it went no further; empty for one that went all the way.
     """
 
@@ -86,6 +87,7 @@ class Growth:
     p50: tuple[float, ...]
     p99: tuple[float, ...]
     kind: str = ""
+    failures: Mapping[int, int] = field(default_factory=dict)
     dropped: str = ""
 
     @property

@@ -163,8 +163,8 @@ def _sweep(sweep: Sweep, key: str, title: str) -> Grid:
         note=(
             "solved, unconstrained, held: periods answered by the QP, by an unconstrained optimum within every bound, "
             "and by an earlier plan where the QP has no solution. active: share of periods with an active constraint. "
-            "settling: of the slowest step in x, y or z. step: timed on the flight's own queries. Bold: the flight "
-            "that is studied."
+            "settling: of the slowest step in x, y or z, judged until the controller sees the next one coming, which a "
+            "longer horizon does sooner. step: timed on the flight's own queries. Bold: the flight that is studied."
         ),
     )
 

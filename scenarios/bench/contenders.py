@@ -39,12 +39,12 @@ class Entry:
         return f"{self.solver} + shortcut" if self.shortcut else self.solver
 
 
-def entries(default: str, solvers: Sequence[str]) -> list[Entry]:
+def entries(default: Entry, solvers: Sequence[str]) -> list[Entry]:
     """The default first, then each installed solver alone, then those that are shown with the shortcut as well."""
     installed = [name for name in solvers if SOLVERS[name].installed]
     alone = [Entry(solver=name, shortcut=False) for name in installed]
-    both = [Entry(solver=name, shortcut=True) for name in installed if name in WITH_SHORTCUT and name != default]
-    return [Entry(solver=default, shortcut=True), *alone, *both]
+    both = [Entry(solver=name, shortcut=True) for name in installed if name in WITH_SHORTCUT]
+    return [default, *(entry for entry in (*alone, *both) if entry != default)]
 
 
 class _Witnessed(QPSolver):
@@ -98,6 +98,12 @@ class StepEntrant:
         commands = [self.answers[period][0] for period in periods]
         return np.array([command is not None and command.status == UNCONSTRAINED for command in commands])
 
+    def failures(self, periods: Sequence[int]) -> int:
+        """How many periods were left without their optimum."""
+        self.keep()
+        commands = [self.answers[period][0] for period in periods]
+        return sum(command is None or command.status not in ACCEPTED for command in commands)
+
 
 @dataclass(frozen=True, kw_only=True)
 class Reference:
@@ -121,7 +127,7 @@ def reference_optima(problem: Problem, queries: Queries, periods: Sequence[int])
         vectors = formulation.vectors(*_query(problem, queries, period))
         qp = formulation.qp.with_vectors(vectors)
         optimum = polish(qp, backend.solve(vectors))
-        worst = float(np.fmax(worst, kkt_residuals(qp, optimum).worst))
+        worst = float(np.maximum(worst, kkt_residuals(qp, optimum).worst))  # NaN stays NaN
         inputs[period] = formulation.inputs(optimum.x)[0]
     return Reference(inputs=inputs, kkt=worst)
 

@@ -14,7 +14,7 @@ from threadpoolctl import threadpool_limits
 from quadsim.audit import audit
 from quadsim.bench import FlightProfile
 from quadsim.controller import Controller
-from quadsim.errors import ParameterError
+from quadsim.errors import InputError, ParameterError
 from quadsim.flightlog import FlightLog
 from quadsim.loop import fly
 from quadsim.plant import Plant
@@ -66,6 +66,7 @@ def bench_flight(scenario: Scenario, *, repeats: int = REPEATS, progress: Progre
 
     Raises:
         ParameterError: no repeat is asked for.
+        InputError: the flight does not go to its end.
     """
     if repeats < 1:
         raise ParameterError("", "--repeats", repeats, "at least 1")
@@ -83,6 +84,8 @@ def bench_flight(scenario: Scenario, *, repeats: int = REPEATS, progress: Progre
                 wall.append(_fly(scenario, plant, controller, reference)[0])
                 timed.physics_s = timed.measurement_s = 0.0
                 whole, log = _fly(scenario, timed, controller, reference)
+                if log.reason is not None:
+                    raise InputError(f"{scenario.name}: a flight that is lost cannot be timed: {log.reason}")
                 profiles.append(_pieces(whole, log, timed))
                 started = clock.perf_counter()
                 audit(log, limits)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import tempfile
 import time as clock
 from pathlib import Path
@@ -37,8 +38,8 @@ def bench_render(
     if workers is not None and workers < 1:
         raise ParameterError("", "--workers", workers, "at least 1")
     period = scenario.control_period
-    if not period <= seconds:
-        raise ParameterError("", "--seconds", seconds, f"at least one control period, {period} s")
+    if not period <= seconds < math.inf:
+        raise ParameterError("", "--seconds", seconds, f"finite, and at least one control period, {period} s")
     backend = rendering_backend()
     periods = min(scenario.periods, round(seconds / period))
     short = scenario.model_copy(update={"duration": round(periods * period, 9)})

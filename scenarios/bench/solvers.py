@@ -18,7 +18,6 @@ from mpc.solvers.piqp_dense import PiqpDense
 from mpc.solvers.piqp_sparse import PiqpMultistage
 from quadsim import rundir
 from quadsim.bench import Contender, Growth, SolverBench, StageLength, solver_tables
-from quadsim.controller import UNCONSTRAINED
 from quadsim.errors import InputError, ParameterError, UnknownNameError
 from quadsim.table import Grid, grid_to_markdown
 from scenarios.bench.contenders import Entry, StepEntrant, entries, judge, reference_optima
@@ -33,7 +32,7 @@ TABLES_FILE: Final = "solvers.md"
 FORMAT: Final = "quadsim bench solvers"
 """What `bench.json` says it is."""
 
-REPEATS: Final = 5
+REPEATS: Final = 3
 HORIZONS: Final = (10, 20, 50, 100, 200)
 GROWTH_STRIDE: Final = 6
 """One stretch of so many is asked at each horizon and of each form of the QP."""
@@ -74,7 +73,7 @@ def bench_solvers(
         )
     problem = build_problem(scenario, flight.vehicle)
     rng = np.random.default_rng(scenario.seed)
-    taking_part = entries(spec.solver, solvers)
+    taking_part = entries(Entry(solver=spec.solver, shortcut=spec.shortcut), solvers)
     contenders, asked, reference_kkt = _time_contenders(
         flight, problem, taking_part, repeats=repeats, stride=stride, rng=rng, progress=progress
     )
@@ -208,6 +207,7 @@ def _growth(
     Steps by the QP and steps by the shortcut are told apart: their shares change with N.
     """
     grown: dict[tuple[str, str], list[tuple[int, float, float]]] = {}
+    failures: dict[str, dict[int, int]] = {}
     dropped: dict[str, str] = {}
     periods = [period for stretch in asked for period in stretch]
     deadline_ms = 1e3 * flight.scenario.control_period
@@ -230,6 +230,8 @@ def _growth(
                 dropped[entry.name] = f"more than {PATIENCE:g} s for them at N = {N}"
                 continue
             best = laps[entry.name].best
+            if failed := entrants[entry.name].failures(periods):
+                failures.setdefault(entry.name, {})[N] = failed
             short = entrants[entry.name].shortcuts(periods)
             for kind, chosen in (("QP", ~short), ("shortcut", short)) if entry.shortcut else (("", ~short),):
                 if chosen.any():
@@ -244,6 +246,7 @@ def _growth(
             horizons=tuple(N for N, _, _ in times),
             p50=tuple(p50 for _, p50, _ in times),
             p99=tuple(p99 for _, _, p99 in times),
+            failures=failures.get(name, {}),
             dropped=dropped.get(name, "") if times[-1][0] < max(horizons) else "",
         )
         for (name, kind), times in grown.items()
@@ -291,8 +294,8 @@ def _stages(
         rng=rng,
         progress=lambda done, total: progress("stages", done, total),
     )
-    solved = np.array([log.status[period] != UNCONSTRAINED for stretch in asked for period in stretch])
-    counted = solved if solved.any() else np.ones_like(solved)
+    active = np.array([log.active[period] > 0 for stretch in asked for period in stretch])
+    counted = active if active.any() else np.ones_like(active)
     found = []
     for steps, entrant in entrants.items():
         p50, p99 = np.percentile(laps[str(steps)].best[counted], [50, 99])

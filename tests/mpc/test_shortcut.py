@@ -127,7 +127,7 @@ def test_a_measured_nan_is_never_feasible() -> None:
     assert shortcut.plan(np.zeros(12), desired, hover * np.nan) is None
 
 
-def test_there_is_none_where_it_would_cost_more_than_it_saves(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_there_is_none_where_its_map_is_too_large(monkeypatch: pytest.MonkeyPatch) -> None:
     assert make_shortcut(replace(paper_problem(), horizon=200)) is not None
     assert make_shortcut(replace(paper_problem(), horizon=250)) is None
     problem = paper_problem()
@@ -165,3 +165,36 @@ def test_steps_leave_no_memory_behind_and_allocate_nothing_large(height: float) 
     assert status == (SOLVED if height else UNCONSTRAINED)
     assert after - before < 2_000  # flat: less than 40 bytes a step
     assert peak - before < 64_000  # the condensed H alone has 320 kB
+
+
+def test_without_output_bounds_the_inputs_decide() -> None:
+    problem = paper_problem("paper-constrained", "controller.output_bounds={}")
+    shortcut, far = Shortcut(problem), np.zeros(12)
+    assert shortcut.plan(far, np.zeros((50, 4)), problem.model.u_bar) is not None
+    far[4] = -100.0
+    assert shortcut.plan(far, np.zeros((50, 4)), problem.model.u_bar) is None
+
+
+@pytest.mark.parametrize("horizon", [50, 100, 200])
+def test_it_is_exact_over_long_horizons(horizon: int) -> None:
+    """Hover on the reference is u_bar throughout; a little beside it, the plan is the QP's."""
+    problem = replace(paper_problem(), horizon=horizon)
+    shortcut, desired = Shortcut(problem), np.zeros((horizon, 4))
+    hover = shortcut.plan(np.zeros(12), desired, problem.model.u_bar)
+    assert hover is not None
+    np.testing.assert_allclose(hover, np.tile(problem.model.u_bar, (horizon, 1)), atol=1e-9)
+    state = np.zeros(12)
+    state[[0, 2, 4, 6, 8]] = [0.02, -0.03, -0.05, 0.002, -0.003]
+    plan = shortcut.plan(state, desired, problem.model.u_bar)
+    answer = QPSolver("piqp-multistage", problem).solve(state, desired, problem.model.u_bar)
+    assert plan is not None
+    np.testing.assert_allclose(plan[0], answer.plan[0], atol=1e-4)
+
+
+def test_there_is_none_where_rounding_has_spoilt_the_gains() -> None:
+    """A long horizon and inputs that cost next to nothing: cond(H) nears what double precision holds."""
+    settings = ("controller.horizon=200", "controller.input_weights.speed=1e-5")
+    problem = paper_problem("paper-constrained", *settings)
+    assert make_shortcut(problem) is None
+    with pytest.raises(np.linalg.LinAlgError):
+        Shortcut(problem)

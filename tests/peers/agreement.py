@@ -111,9 +111,14 @@ def measure(name: str, problem: Problem, queries: Sequence[Query], reference: Ar
         failures=len(asked) - len(residuals),
         difference=float(np.max(differences, initial=0.0)),
         residuals=KKTResiduals(
-            stationarity=max((each.stationarity for each in residuals), default=0.0),
-            primal=max((each.primal for each in residuals), default=0.0),
-            complementarity=max((each.complementarity for each in residuals), default=0.0),
-            dual=max((each.dual for each in residuals), default=0.0),
+            stationarity=_worst([each.stationarity for each in residuals]),
+            primal=_worst([each.primal for each in residuals]),
+            complementarity=_worst([each.complementarity for each in residuals]),
+            dual=_worst([each.dual for each in residuals]),
         ),
     )
+
+
+def _worst(figures: list[float]) -> float:
+    """The largest; NaN if any is."""
+    return float(np.max(figures, initial=0.0))

@@ -99,19 +99,30 @@ class ConstrainedQP:
 
     Attributes:
         speeds: (K, 4) the first inputs of qpmpc's plans [rad/s]; NaN where it found none.
-        differences: (K,) of ours from them, the largest over the rotors [rad/s].
+        differences: (K,) of our QP's first inputs from them, the largest over the rotors [rad/s].
+        flown: (K,) the same of what the controller flew, found with or without a QP [rad/s].
         constrained: (K,) whether a constraint is active at qpmpc's optimum.
     """
 
     speeds: Array
     differences: Array
+    flown: Array
     constrained: np.ndarray[tuple[int], np.dtype[np.bool_]]
 
     @property
-    def check(self) -> Check:
-        """The largest difference of all, NaN if there was no solution."""
-        what = f"constrained QP: first input, {self.differences.size} periods"
-        return Check(what=what, peer="qpmpc", measured=float(self.differences.max()), allowed=1e-3, unit="rad/s")
+    def checks(self) -> tuple[Check, ...]:
+        """The largest differences of all, NaN if there was no solution."""
+        named = {"first input of the QP": self.differences, "command flown": self.flown}
+        return tuple(
+            Check(
+                what=f"constrained: {name}, {differences.size} periods",
+                peer="qpmpc",
+                measured=float(differences.max()),
+                allowed=1e-3,
+                unit="rad/s",
+            )
+            for name, differences in named.items()
+        )
 
 
 def measure(problem: Problem, queries: Sequence[Query]) -> ConstrainedQP:
@@ -123,6 +134,7 @@ def measure(problem: Problem, queries: Sequence[Query]) -> ConstrainedQP:
     return ConstrainedQP(
         speeds=speeds,
         differences=np.abs(speeds - answers).max(axis=1),
+        flown=np.abs(speeds - np.array([query.speeds for query in queries])).max(axis=1),
         constrained=np.array([plan.qpsol.z is not None and plan.qpsol.z.max() > ACTIVE for plan in plans]),
     )
 

@@ -23,24 +23,32 @@ class Query:
         state: (12,) xi(k).
         desired: (N, n_r) y_d(k+1) .. y_d(k+N).
         u_before: (4,) u(k-1) [rad/s].
-        status: what the controller answered.
+        status: how the controller found its answer.
+        speeds: (4,) the answer, u(k) [rad/s].
     """
 
     state: Array
     desired: Array
     u_before: Array
     status: str
+    speeds: Array
 
 
 def record() -> tuple[Problem, tuple[Query, ...]]:
     """Fly the scenario; the optimisation, and every period's query."""
     flight = fly_scenario(load_scenario(SCENARIO))
+    log = flight.log.control
     problem = build_problem(flight.scenario, flight.vehicle)
-    asked = recorded(flight.scenario, flight.log.control, problem.horizon)
-    statuses = flight.log.control.status
+    asked = recorded(flight.scenario, log, problem.horizon)
     desired = problem.objective.desired(asked.reference)
     queries = tuple(
-        Query(state=state, desired=desired[k + 1 : k + 1 + problem.horizon], u_before=u_before, status=status)
-        for k, (state, u_before, status) in enumerate(zip(asked.state, asked.speeds_before, statuses, strict=True))
+        Query(
+            state=asked.state[k],
+            desired=desired[k + 1 : k + 1 + problem.horizon],
+            u_before=asked.speeds_before[k],
+            status=log.status[k],
+            speeds=log.speeds[k],
+        )
+        for k in range(log.t.size)
     )
     return problem, queries

@@ -23,8 +23,9 @@ def test_first_inputs_are_the_same(
 ) -> None:
     assert against_qpmpc.differences.size == 1200
     assert against_qpmpc.constrained.sum() > 300, "hardly a constraint is active: little is compared"
-    hold(against_qpmpc.check)
-    told(against_qpmpc.check.row)
+    for check in against_qpmpc.checks:
+        hold(check)
+        told(check.row)
 
 
 def test_the_shortcut_was_taken_where_no_constraint_is_active(

@@ -107,6 +107,10 @@ def test_the_band_is_a_share_of_the_step() -> None:
     assert settled(t, np.array([9.0, 9.4, 9.6, 9.6]), before=9.0, after=10.0, until=4.0) is None
 
 
+def test_one_sample_settles_nothing() -> None:
+    assert settled(np.zeros(1), np.zeros(1), before=1.0, after=0.0, until=40.0) is None
+
+
 def test_a_flight_that_ended_before_has_not_settled() -> None:
     t, x = np.arange(5.0), np.array([0.0, 1.0, 1.0, 1.0, 1.0])
     assert settled(t, x, before=0.0, after=1.0, until=5.0) == 1.0

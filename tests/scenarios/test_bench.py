@@ -24,7 +24,7 @@ from quadsim.bench import (
 )
 from quadsim.errors import InputError, RenderingUnavailableError
 from quadsim.video import rendering_backend, worker_count
-from scenarios.bench.contenders import StepEntrant, entries, judge, reference_optima
+from scenarios.bench.contenders import Entry, StepEntrant, entries, judge, reference_optima
 from scenarios.bench.flight import bench_flight
 from scenarios.bench.race import race, stretches
 from scenarios.bench.solvers import bench_solvers, is_bench
@@ -240,7 +240,7 @@ def test_a_solver_that_is_not_installed_is_named_and_left_out(monkeypatch: pytes
         (["flight", "--repeats", "0"], "--repeats must be at least 1; got 0"),
         (["flight", "--set", "duration=-1"], "duration must be > 0"),
         (["render", "--workers", "0"], "--workers must be at least 1; got 0"),
-        (["render", "--seconds", "0"], "--seconds must be at least one control period"),
+        (["render", "--seconds", "0"], "--seconds must be finite, and at least one control period"),
     ],
 )
 def test_wrong_input_is_named(
@@ -325,4 +325,20 @@ def test_bench_flight_prints_json_alone(capsys: pytest.CaptureFixture[str]) -> N
 
 def test_every_solver_has_a_place_in_the_bench() -> None:
     installed = [name for name, entry in SOLVERS.items() if entry.installed]
-    assert {entry.solver for entry in entries("piqp-multistage", tuple(SOLVERS))} == set(installed)
+    default = Entry(solver="piqp-multistage", shortcut=True)
+    assert {entry.solver for entry in entries(default, tuple(SOLVERS))} == set(installed)
+    assert entries(replace(default, shortcut=False), ["piqp-multistage"]) == [replace(default, shortcut=False)]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["flight", "--set", "initial.euler=[80,0,0]"], "a flight that is lost cannot be timed"),
+        (["render", "--seconds", "inf"], "--seconds must be finite"),
+    ],
+)
+def test_what_cannot_be_timed_is_refused(
+    arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["bench", *arguments]) == EXIT_WRONG_INPUT
+    assert message in capsys.readouterr().err

@@ -237,6 +237,7 @@ RUN = ["run", "hover", *SHORT, *TABLES]
 WRONG: dict[str, tuple[list[str], str]] = {
     "no such scenario": (["run", "hovr"], "no scenario named 'hovr'; did you mean 'hover'?"),
     "no such file": (["run", "gone.toml"], "gone.toml: no such scenario file"),
+    "one scenario of two": (["compare", "hover", "nope", "--out", "page"], "no scenario named 'nope'"),
     "a directory": (["run", "folder"], "folder is a directory; give a scenario's name or its TOML file"),
     "not TOML": (["run", "bad.toml"], "bad.toml: is not valid TOML: "),
     "a misspelt field": ([*RUN, "--set", "controller.horizn=3"], "controller.horizn is not a field of the scenario"),
@@ -518,3 +519,5 @@ def test_a_solver_that_is_not_installed_is_named_with_its_remedy(
     assert list(tmp_path.iterdir()) == []
     assert main(["list", "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["solvers"][name] == f"not installed: pip install 'quadsim[{extra}]'"
+    assert main(["list"]) == 0
+    assert f"quadsim[{extra}]" in capsys.readouterr().out

@@ -11,7 +11,7 @@ import pytest
 from mpc.solvers import SOLVERS
 from quadsim import rundir
 from quadsim.cost import CostStudy
-from quadsim.errors import InputError
+from quadsim.errors import InputError, MissingPackageError
 from scenarios import cost, runner
 from scenarios.build import build_controller, build_vehicle
 from scenarios.cli import EXIT_DONE, EXIT_WRONG_INPUT, main
@@ -52,6 +52,21 @@ def untimed(study: CostStudy) -> dict[str, Any]:
 def test_the_study_is_the_same_however_many_processes_fly(study: CostStudy) -> None:
     again = study_cost(scenario(), [scenario(name="paper-unconstrained")], workers=2, **SMALL)
     assert untimed(again) == untimed(study)
+
+
+def test_runs_can_be_compared_without_the_solver_that_flew_them(monkeypatch: pytest.MonkeyPatch) -> None:
+    targets = ["paper-constrained", "paper-unconstrained"]
+    assert find_study(targets, asked=None)
+    monkeypatch.setattr(type(SOLVERS["daqp"]), "installed", False)
+    assert find_study(targets, asked=None) == []
+    with pytest.raises(MissingPackageError, match="needs the package 'piqp'"):
+        find_study(targets, asked=True)
+
+
+def test_flights_of_one_name_are_told_apart() -> None:
+    slower = scenario("controller.horizon=12", name="paper-unconstrained")
+    study = study_cost(scenario(), [scenario(name="paper-unconstrained"), slower], workers=1, **SMALL)
+    assert list(study.others) == ["paper-unconstrained", "paper-unconstrained (2)"]
 
 
 def test_the_flight_is_the_scenarios_own(study: CostStudy) -> None:
