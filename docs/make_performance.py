@@ -24,6 +24,8 @@ from scenarios.loading import load_scenario
 ROOT = Path(__file__).resolve().parent.parent
 SCENARIO = "paper-constrained"
 
+REPEATS = 5
+
 BEFORE_COMMIT = "bfa97b8"
 BEFORE: Table = [
     ("60 s of paper-constrained", "time [s]"),
@@ -39,31 +41,36 @@ step had a median of 1.0 ms and a p99 of 1.5 ms."""
 
 
 def whole_commands(flight: FlightProfile, film: RenderProfile) -> Table:
-    """What a person waits for."""
+    """What a person waits for: the best of a few times, but for the film, whose time is long enough."""
     rows: Table = [
-        ("what a person waits for", "asked", "measured [s]"),
+        ("what a person waits for, at best", "asked", "measured [s]"),
         ("60 s of constrained flight simulated, one core", "<= 1.2 s", f"{flight.best:.2f}"),
     ]
     with tempfile.TemporaryDirectory() as scratch:
-        for label, asked, arguments in (
-            ("`quadsim --help`", "<= 0.3 s", ["--help"]),
+        for label, asked, repeats, arguments in (
+            ("`quadsim --help`", "<= 0.3 s", REPEATS, ["--help"]),
             (
                 f"`quadsim run {SCENARIO} --no-video`",
                 "<= 4 s",
+                REPEATS,
                 ["run", SCENARIO, "--no-video", "--out", f"{scratch}/run"],
             ),
             (
                 f"`quadsim video`: the same 60 s, 1280x720 at 30 fps, {film.workers} cores",
                 "<= 60 s",
+                1,
                 ["video", f"{scratch}/run"],
             ),
         ):
-            started = clock.perf_counter()
-            subprocess.run(
-                [sys.executable, "-m", "scenarios.cli", *arguments], check=True, capture_output=True, cwd=ROOT
-            )
-            rows.append((label, asked, f"{clock.perf_counter() - started:.2f}"))
+            rows.append((label, asked, f"{min(_wall_s(arguments) for _ in range(repeats)):.2f}"))
     return rows
+
+
+def _wall_s(arguments: list[str]) -> float:
+    """Wall time of one `quadsim` command [s]."""
+    started = clock.perf_counter()
+    subprocess.run([sys.executable, "-m", "scenarios.cli", *arguments], check=True, capture_output=True, cwd=ROOT)
+    return clock.perf_counter() - started
 
 
 def page(bench: SolverBench, flight: FlightProfile, film: RenderProfile, commands: str) -> str:
