@@ -1,0 +1,7 @@
+"""The scenario file: what it may say, checked field by field; one module per table."""
+
+from scenarios.spec.controller import ANGLES, LARGEST_HORIZON, ConstrainedSpec, UnconstrainedSpec
+from scenarios.spec.course import WindowSpec
+from scenarios.spec.scenario import MOST_STEPS, Scenario
+
+__all__ = ["ANGLES", "LARGEST_HORIZON", "MOST_STEPS", "ConstrainedSpec", "Scenario", "UnconstrainedSpec", "WindowSpec"]
