@@ -24,6 +24,7 @@ from quadsim.footage import Footage, Shot, make_footage, thin
 from quadsim.overlay import Overlay, Picture
 from quadsim.rundir import Run, load_run
 from quadsim.state import Array
+from quadsim.vehicle import Vehicle
 
 TRAIL_SECONDS: Final = 12.0
 """How long the path flown stays in sight [s]."""
@@ -33,6 +34,12 @@ CAMERA_AZIMUTH: Final = 125.0
 CAMERA_ELEVATION: Final = -18.0
 BLADE_SLOWDOWN: Final = 20.0
 """Blades are drawn turning this much slower than they do, so that an eye can follow."""
+PORTRAIT_DISTANCE: Final = 3.3
+"""From camera to vehicle in a portrait, in arm lengths; its azimuth and elevation below in degrees."""
+PORTRAIT_AZIMUTH: Final = -150.0
+PORTRAIT_ELEVATION: Final = -28.0
+PORTRAIT_SQUARE: Final = 0.1
+"""Side of a portrait's floor squares [m]."""
 _DEEPEST_FLOOR: Final = 30.0
 """The floor lies below the whole flight, but no deeper than this [m]."""
 _LONGEST_ARROW: Final = 2.5
@@ -183,6 +190,29 @@ def make_gif(source: Path, path: Path, width: int) -> None:
     _ffmpeg("-i", str(source), "-filter_complex", f"{picture};{dither}", "-loop", "0", str(path))
 
 
+def draw_portrait(vehicle: Vehicle, path: Path, width: int, height: int) -> None:
+    """Draw a vehicle standing on a floor of 10 cm squares, seen from its front left."""
+    model = compile_model(vehicle, visuals=True)
+    model.vis.global_.offwidth, model.vis.global_.offheight = width, height
+    model.mat_texrepeat[model.material(FLOOR).id] = 0.5 / PORTRAIT_SQUARE  # the texture is two squares wide
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    camera = mujoco.MjvCamera()
+    camera.distance = PORTRAIT_DISTANCE * vehicle.arm_length
+    camera.azimuth, camera.elevation = PORTRAIT_AZIMUTH, PORTRAIT_ELEVATION
+    camera.lookat[2] = 0.5 * float(model.geom(FLOOR).pos[2])
+    with mujoco.Renderer(model, height, width) as renderer:
+        scene = renderer.scene
+        scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = 0  # too coarse for what is small: a disc on the floor instead
+        renderer.update_scene(data, camera)
+        size, place = np.array([0.9, 0.002, 0.0]) * vehicle.arm_length, np.array([0.0, 0.0, model.geom(FLOOR).pos[2]])
+        shadow = scene.geoms[scene.ngeom]
+        kind = mujoco.mjtGeom.mjGEOM_CYLINDER
+        mujoco.mjv_initGeom(shadow, kind, size, place, np.eye(3).ravel(), np.array(_SHADOW_COLOUR, np.float32))
+        scene.ngeom += 1
+        imageio.imwrite(path, renderer.render())
+
+
 def probe() -> None:
     """Render one tiny picture, and fail unless there is something in it."""
     model = mujoco.MjModel.from_xml_string(
@@ -204,7 +234,7 @@ def _ffmpeg(*arguments: str) -> None:
 
 
 def main(arguments: list[str]) -> None:
-    """Do one task: `probe`, `film SHOT MP4`, `join LIST MP4` or `gif MP4 GIF WIDTH`."""
+    """Do one task: `probe`, `film SHOT MP4`, `join LIST MP4`, `gif MP4 GIF WIDTH` or `portrait VEHICLE PNG W H`."""
     match arguments:
         case ["probe"]:
             probe()
@@ -215,6 +245,8 @@ def main(arguments: list[str]) -> None:
             join(Path(segments), Path(path))
         case ["gif", source, path, width]:
             make_gif(Path(source), Path(path), int(width))
+        case ["portrait", vehicle, path, width, height]:
+            draw_portrait(Vehicle(**json.loads(vehicle)), Path(path), int(width), int(height))
         case _:
             raise SystemExit(main.__doc__)
 

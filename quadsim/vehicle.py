@@ -39,9 +39,18 @@ class Vehicle:
         drag_to_thrust: d / b [m].
         speed_min: lowest rotor speed the actuators can hold [rad/s].
         speed_max: highest rotor speed the actuators can hold [rad/s].
+        rotor_rise: time constant of a rotor's speed when it rises, first order [s].
+        rotor_fall: the same when it falls [s].
+        rotor_inertia: of one rotor about its axis [kg m^2].
+        rotor_radius: R [m].
+        rotor_drag: linear drag of one rotor, force -rotor_drag w v_perp on it, v_perp its velocity through the air in
+            the rotor's plane [N s^2/(m rad)] (Martin and Salaun, 2010; Furrer et al., 2016).
+        body_drag: C_d A along body x, y and z [m^2].
+
+    What stands in `OPTIONAL_PARAMETERS` is None where its file does not give it.
 
     Raises:
-        ParameterError: a value is not finite or not possible.
+        ParameterError: a value is not finite or not possible, or the vehicle cannot hover within its rotors' range.
     """
 
     name: str
@@ -56,6 +65,12 @@ class Vehicle:
     drag_to_thrust: float
     speed_min: float
     speed_max: float
+    rotor_rise: float | None = None
+    rotor_fall: float | None = None
+    rotor_inertia: float | None = None
+    rotor_radius: float | None = None
+    rotor_drag: float | None = None
+    body_drag: tuple[float, float, float] | None = None
 
     def __post_init__(self) -> None:
         for name in ("mass", "gravity", "arm_length", "thrust_coefficient", "drag_to_thrust", "speed_max"):
@@ -68,6 +83,11 @@ class Vehicle:
         self._check_vector("inertia", 3, positive=True)
         self._check_vector("rotor_azimuths", N_ROTORS, positive=False)
         self._check_vector("rotor_spins", N_ROTORS, positive=False)
+        for name in OPTIONAL_PARAMETERS:
+            if name == "body_drag" and self.body_drag is not None:
+                self._check_vector(name, 3, positive=True)
+            elif getattr(self, name) is not None:
+                self._check_number(name, getattr(self, name), positive=True)
         if any(abs(spin) != 1 for spin in self.rotor_spins):
             raise ParameterError("vehicle", "rotor_spins", self.rotor_spins, "four values, each 1 or -1")
         ixx, iyy, izz = self.inertia
@@ -75,6 +95,10 @@ class Vehicle:
             raise ParameterError(
                 "vehicle", "inertia", self.inertia, "such that no moment exceeds the sum of the other two"
             )
+        self._check_layout()
+        self._check_hover()
+
+    def _check_layout(self) -> None:
         b, d = self.thrust_coefficient, self.drag_coefficient
         scale = np.array([b, b * self.arm_length, b * self.arm_length, d])
         unit_allocation = self.allocation / scale[:, None]
@@ -86,6 +110,21 @@ class Vehicle:
             layout = {"rotor_azimuths": self.rotor_azimuths, "rotor_spins": self.rotor_spins}
             rule = "a layout whose torques cancel when all rotors turn alike, so that it can hover"
             raise ParameterError("vehicle", "rotor_azimuths, rotor_spins", layout, rule)
+
+    def _check_hover(self) -> None:
+        hover, weight = self.hover_speed, self.mass * self.gravity
+        for name, sign, side in (("speed_max", 1.0, "no lower than"), ("speed_min", -1.0, "no higher than")):
+            speed = getattr(self, name)
+            if sign * (hover - speed) > 0.0:
+                lift = N_ROTORS * self.thrust_coefficient * speed**2
+                raise ParameterError(
+                    "vehicle",
+                    name,
+                    speed,
+                    f"{side} its hover speed, {hover:.6g} rad/s, or it cannot hover (rotors hold {self.speed_min:g} to "
+                    f"{self.speed_max:g} rad/s; {self.mass:g} kg weigh {weight:.4g} N, the rotors lift {lift:.4g} N at "
+                    f"{speed:g} rad/s)",
+                )
 
     def _check_number(self, name: str, value: object, *, positive: bool) -> None:
         if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
@@ -140,32 +179,43 @@ def load_vehicle(path: Path, overrides: Mapping[str, Any] | None = None) -> Vehi
         ParameterError: a value is not possible.
         UnknownNameError: an override names no parameter.
     """
-    data = read_toml(path)
-    units = VEHICLE_UNITS
-    values: dict[str, Any] = {}
-    for key, entry in data.items():
-        if key in ("name", "description"):
-            if not isinstance(entry, str):
-                raise ParameterError("vehicle", key, entry, "a text")
-            values[key] = entry
-            continue
-        if key not in units:
-            raise UnknownNameError("vehicle parameter", key, units, hint=f"in {path}")
-        if not isinstance(entry, dict) or set(entry) != {"value", "unit", "source"}:
-            raise ParameterError("vehicle", key, entry, "a table with exactly value, unit and source")
-        if entry["unit"] != units[key]:
-            raise ParameterError("vehicle", f"{key}.unit", entry["unit"], f"{units[key]!r}")
-        if not isinstance(entry["source"], str) or not entry["source"].strip():
-            raise ParameterError("vehicle", f"{key}.source", entry["source"], "a text saying where the number is from")
-        values[key] = entry["value"]
+    texts, entries = _read_entries(path)
+    values: dict[str, Any] = {**texts, **{key: entry["value"] for key, entry in entries.items()}}
     for key, value in (overrides or {}).items():
-        if key not in units:
-            raise UnknownNameError("vehicle parameter", key, units)
+        if key not in VEHICLE_UNITS:
+            raise UnknownNameError("vehicle parameter", key, VEHICLE_UNITS)
         values[key] = value
-    missing = [name for name in ("name", *units) if name not in values]
+    missing = [name for name in ("name", *VEHICLE_UNITS) if name not in values and name not in OPTIONAL_PARAMETERS]
     if missing:
         raise FileError(path, f"lacks {', '.join(missing)}")
     return Vehicle(**values)
+
+
+def vehicle_sources(path: Path) -> dict[str, str]:
+    """Where each parameter of a vehicle file is from, in the file's order; arguments and errors as `load_vehicle`."""
+    return {key: entry["source"] for key, entry in _read_entries(path)[1].items()}
+
+
+def _read_entries(path: Path) -> tuple[dict[str, str], dict[str, dict[str, Any]]]:
+    """What a vehicle file says of itself, and its parameters, each with value, unit and source."""
+    texts: dict[str, str] = {}
+    entries: dict[str, dict[str, Any]] = {}
+    for key, entry in read_toml(path).items():
+        if key in ("name", "description"):
+            if not isinstance(entry, str):
+                raise ParameterError("vehicle", key, entry, "a text")
+            texts[key] = entry
+            continue
+        if key not in VEHICLE_UNITS:
+            raise UnknownNameError("vehicle parameter", key, VEHICLE_UNITS, hint=f"in {path}")
+        if not isinstance(entry, dict) or set(entry) != {"value", "unit", "source"}:
+            raise ParameterError("vehicle", key, entry, "a table with exactly value, unit and source")
+        if entry["unit"] != VEHICLE_UNITS[key]:
+            raise ParameterError("vehicle", f"{key}.unit", entry["unit"], f"{VEHICLE_UNITS[key]!r}")
+        if not isinstance(entry["source"], str) or not entry["source"].strip():
+            raise ParameterError("vehicle", f"{key}.source", entry["source"], "a text saying where the number is from")
+        entries[key] = entry
+    return texts, entries
 
 
 VEHICLE_UNITS: Final[dict[str, str]] = {
@@ -179,5 +229,13 @@ VEHICLE_UNITS: Final[dict[str, str]] = {
     "drag_to_thrust": "m",
     "speed_min": "rad/s",
     "speed_max": "rad/s",
+    "rotor_rise": "s",
+    "rotor_fall": "s",
+    "rotor_inertia": "kg m^2",
+    "rotor_radius": "m",
+    "rotor_drag": "N s^2/(m rad)",
+    "body_drag": "m^2",
 }
+OPTIONAL_PARAMETERS: Final = tuple(field.name for field in fields(Vehicle) if field.default is None)
+"""Parameters that a vehicle file may leave out."""
 assert set(VEHICLE_UNITS) == {field.name for field in fields(Vehicle)} - {"name", "description"}

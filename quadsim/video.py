@@ -22,7 +22,8 @@ from typing import IO, Final
 
 from quadsim.errors import OutputError, ParameterError, RenderingUnavailableError
 from quadsim.footage import Shot, film_span
-from quadsim.rundir import Run, load_run
+from quadsim.rundir import Run, load_run, vehicle_to_json
+from quadsim.vehicle import Vehicle
 
 BACKENDS: Final = ("egl", "osmesa")
 """What can render without a screen, in the order tried."""
@@ -134,6 +135,26 @@ def render_gif(
         backend = _film(shot, folder / "film.mp4", workers, None)
         _work([("gif", str(folder / "film.mp4"), str(folder / "film.gif"), str(width))], backend, folder)
         (folder / "film.gif").replace(path)
+
+
+def render_portrait(vehicle: Vehicle, path: Path, *, width: int = 1280, height: int = 720) -> None:
+    """Draw a vehicle standing on a floor of 10 cm squares, as a PNG that appears at `path` complete or not at all.
+
+    Args:
+        vehicle: what is drawn.
+        path: the PNG to write; one that is there is replaced.
+        width: [pixels].
+        height: [pixels].
+
+    Raises:
+        OutputError: the picture cannot be written, or the renderer failed; nothing is left behind.
+        RenderingUnavailableError: this machine cannot render.
+    """
+    with _staging(path) as folder:
+        numbers = json.dumps(vehicle_to_json(vehicle))
+        task = ("portrait", numbers, str(folder / "portrait.png"), str(width), str(height))
+        _work([task], rendering_backend(), folder)
+        (folder / "portrait.png").replace(path)
 
 
 def _plan(run: Run, start: float, stop: float | None, shot: Shot) -> Shot:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 import tomllib
 from pathlib import Path
 from typing import Any
@@ -12,9 +13,20 @@ import pytest
 
 from quadsim.assets import models_dir, vehicle_names, vehicle_path
 from quadsim.errors import FileError, InputError, ParameterError, UnknownNameError
-from quadsim.vehicle import VEHICLE_UNITS, Vehicle, load_vehicle
+from quadsim.rundir import vehicle_to_json
+from quadsim.vehicle import OPTIONAL_PARAMETERS, VEHICLE_UNITS, Vehicle, load_vehicle, vehicle_sources
 
 FILE = vehicle_path("lopes2011")
+TOO_LOW = "vehicle.speed_max must be no lower than its hover speed"
+TOO_HIGH = "vehicle.speed_min must be no higher than its hover speed"
+CANNOT_HOVER = (
+    "192.8 rad/s, or it cannot hover (rotors hold 0 to 150 rad/s; 4 kg weigh 39.24 N, the rotors lift 23.75 N at 150 "
+    "rad/s)",
+    "272.66 rad/s, or it cannot hover (rotors hold 0 to 250 rad/s; 8 kg weigh 78.48 N, the rotors lift 65.98 N at 250 "
+    "rad/s)",
+    "192.8 rad/s, or it cannot hover (rotors hold 200 to 250 rad/s; 4 kg weigh 39.24 N, the rotors lift 42.23 N at 200 "
+    "rad/s)",
+)
 
 
 def test_it_hovers_at_the_speed_of_table_1(vehicle: Vehicle) -> None:
@@ -57,6 +69,20 @@ def test_rotors_sit_on_the_axes(vehicle: Vehicle) -> None:
         ({"mass": 1e-13}, "vehicle.mass must be between 1e-12 and 1e+06; got 1e-13"),
         ({"gravity": 1e7}, "vehicle.gravity must be between 1e-12 and 1e+06; got 10000000.0"),
         ({"speed_min": -1.0}, "vehicle.speed_min must be >= 0 rad/s; got -1.0"),
+        (
+            {"speed_max": 150.0},
+            f"{TOO_LOW}, {CANNOT_HOVER[0]}; got 150.0",
+        ),
+        ({"mass": 8.0}, f"{TOO_LOW}, {CANNOT_HOVER[1]}; got 250.0"),
+        (
+            {"speed_min": 200.0},
+            f"{TOO_HIGH}, {CANNOT_HOVER[2]}; got 200.0",
+        ),
+        *(({name: 0.0}, f"vehicle.{name} must be positive; got 0.0") for name in OPTIONAL_PARAMETERS[:-1]),
+        ({"rotor_rise": -0.02}, "vehicle.rotor_rise must be positive; got -0.02"),
+        ({"rotor_fall": np.nan}, "vehicle.rotor_fall must be a finite number; got nan"),
+        ({"body_drag": 0.01}, "vehicle.body_drag must be a list of 3 numbers; got 0.01"),
+        ({"body_drag": (0.01, 0.01, 0.0)}, "vehicle.body_drag must be positive; got 0.0"),
         ({"speed_min": 250.0}, "vehicle.speed_min must be below speed_max = 250.0; got 250.0"),
         ({"inertia": (0.03, 0.03)}, "vehicle.inertia must be a list of 3 numbers; got (0.03, 0.03)"),
         ({"inertia": 0.03}, "vehicle.inertia must be a list of 3 numbers; got 0.03"),
@@ -96,17 +122,66 @@ def test_any_layout_that_can_be_controlled_is_taken(vehicle: Vehicle, azimuths: 
 @pytest.mark.parametrize("name", vehicle_names())
 def test_every_vehicle_that_ships_gives_each_number_with_unit_and_source(name: str) -> None:
     data = tomllib.loads((models_dir() / f"{name}.toml").read_text(encoding="utf-8"))
-    assert set(data) == {"name", "description", *VEHICLE_UNITS}
+    required = {"name", "description", *VEHICLE_UNITS} - set(OPTIONAL_PARAMETERS)
+    assert required <= set(data) <= required | set(OPTIONAL_PARAMETERS)
     assert data["name"] == name
-    for key, unit in VEHICLE_UNITS.items():
-        assert data[key]["unit"] == unit
-        assert len(data[key]["source"]) > 5
-    assert load_vehicle(vehicle_path(name)).name == name
+    sources = vehicle_sources(vehicle_path(name))
+    assert list(sources) == [key for key in VEHICLE_UNITS if key in data]
+    for key, source in sources.items():
+        assert data[key]["unit"] == VEHICLE_UNITS[key]
+        assert source == data[key]["source"]
+        assert len(source) > 5
+    vehicle = load_vehicle(vehicle_path(name))
+    assert vehicle.name == name
+    for key in OPTIONAL_PARAMETERS:
+        assert (getattr(vehicle, key) is None) == (key not in data)
+
+
+@pytest.mark.parametrize(
+    ("name", "hover", "thrust_to_weight"),
+    [("crazyflie2", 1697.0, 2.17), ("hummingbird", 453.2, 3.42), ("lopes2011", 192.8, 1.68)],
+)
+def test_shipped_vehicles_hover_as_published(name: str, hover: float, thrust_to_weight: float) -> None:
+    """Bitcraze measures 58 g of thrust on 27 g; RotorS's Hummingbird weighs 0.716 kg on b = 8.54858e-6."""
+    vehicle = load_vehicle(vehicle_path(name))
+    assert vehicle.hover_speed == pytest.approx(hover, rel=1e-3)
+    assert (vehicle.speed_max / vehicle.hover_speed) ** 2 == pytest.approx(thrust_to_weight, rel=5e-3)
+
+
+@pytest.mark.parametrize(
+    ("name", "turning"),
+    [
+        # CrazyS: front right and back left counter-clockwise.  RotorS: front and back clockwise.
+        ("crazyflie2", {(1, -1): "ccw", (-1, -1): "cw", (-1, 1): "ccw", (1, 1): "cw"}),
+        ("hummingbird", {(1, 0): "cw", (0, 1): "ccw", (-1, 0): "cw", (0, -1): "ccw"}),
+    ],
+)
+def test_rotors_turn_as_published(name: str, turning: dict[tuple[int, int], str]) -> None:
+    vehicle = load_vehicle(vehicle_path(name))
+    found = {
+        (round(float(np.sign(x))), round(float(np.sign(y)))): "cw" if spin > 0 else "ccw"  # torque opposes turning
+        for (x, y, _), spin in zip(vehicle.rotor_positions, vehicle.rotor_spins, strict=True)
+    }
+    assert found == turning
+    np.testing.assert_allclose(np.hypot(*vehicle.rotor_positions[:, :2].T), vehicle.arm_length)
+
+
+@pytest.mark.parametrize("name", vehicle_names())
+def test_a_vehicle_survives_json(name: str) -> None:
+    vehicle = load_vehicle(vehicle_path(name))
+    assert Vehicle(**json.loads(json.dumps(vehicle_to_json(vehicle)))) == vehicle
+
+
+def test_a_vehicle_may_hover_at_the_ends_of_its_range(vehicle: Vehicle) -> None:
+    hover = vehicle.hover_speed
+    assert dataclasses.replace(vehicle, speed_max=hover).speed_max == hover
+    assert dataclasses.replace(vehicle, speed_min=hover).speed_min == hover
 
 
 def test_overrides_replace_the_files_numbers() -> None:
-    vehicle = load_vehicle(FILE, {"mass": 5.0, "inertia": [0.04, 0.04, 0.07]})
+    vehicle = load_vehicle(FILE, {"mass": 5.0, "inertia": [0.04, 0.04, 0.07], "body_drag": [0.01, 0.02, 0.03]})
     assert (vehicle.mass, vehicle.inertia, vehicle.gravity) == (5.0, (0.04, 0.04, 0.07), 9.81)
+    assert (vehicle.body_drag, vehicle.rotor_rise) == ((0.01, 0.02, 0.03), None)
     with pytest.raises(UnknownNameError, match=r"^no vehicle parameter named 'mas'; did you mean 'mass'\?"):
         load_vehicle(FILE, {"mas": 5.0})
 
