@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 from quadsim.metrics import CourseStep, settling
-from scenarios.build import build_course_steps, build_reference
+from scenarios.courses import build_course_steps, build_reference
+from scenarios.courses.smoothing import smooth
+from scenarios.courses.steps import Window, steps, switches
 from scenarios.loading import load_scenario
-from scenarios.references import Window, smooth, steps, switches
 
 PERIOD = 0.05
 

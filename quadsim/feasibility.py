@@ -1,0 +1,264 @@
+"""What a course asks of a vehicle, before it is flown: differential flatness.
+
+A quadrotor's attitude, rates, torques and rotor speeds follow from where it shall be, its yaw, and their derivatives
+(Mellinger & Kumar 2011, Sec. III).  Derivatives are central differences at the control period: of the samples that a
+controller is given, nothing in between is known to it, and a corner asks for what turns it within a period.  Three
+places are left out, where differences would be numbers without a meaning:
+
+- around a jump of the course itself no acceleration is counted (hover is taken);
+- around a kink, where the velocity or its derivative may jump, no torque is counted;
+- wind and drag.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from quadsim.state import (
+    EULER,
+    EULER_RATE,
+    INDEX,
+    N_STATES,
+    POSITION,
+    STATE_UNITS,
+    VELOCITY,
+    Array,
+    euler_to_body_rates,
+)
+from quadsim.vehicle import Vehicle
+
+STENCIL: Final = 2
+"""Samples on either side that a torque depends on."""
+TOLERANCE: Final = 1e-6
+"""How far beyond a bound a demand may go, relative to the bound and absolute: rounding in the differences."""
+_DISPLAY: Final = {"rad": ("deg", math.degrees(1.0)), "rad/s": ("deg/s", math.degrees(1.0))}
+
+Mask = NDArray[np.bool_]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Demand:
+    """What flying a course exactly would take, at K samples.
+
+    Attributes:
+        state: (K, 12) the states of `quadsim.state`, SI.
+        acceleration: (K, 3) world [m/s^2].
+        thrust: (K,) of all rotors together [N].
+        torque: (K, 3) body [N m]; 0 around kinks and jumps.
+        speeds: (K, 4) rotor speeds [rad/s]; negative where a rotor would have to push down, -sqrt(-w^2).
+        slews: (K - 1, 4) their steps from sample to sample, NaN where a torque is left out on either side [rad/s].
+    """
+
+    state: Array
+    acceleration: Array
+    thrust: Array
+    torque: Array
+    speeds: Array
+    slews: Array
+
+    @property
+    def tilt(self) -> Array:
+        """(K,) angle between the thrust and the vertical [rad]."""
+        roll, pitch = self.state[:, INDEX["roll"]], self.state[:, INDEX["pitch"]]
+        return np.arccos(np.clip(np.cos(roll) * np.cos(pitch), -1.0, 1.0))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Feasibility:
+    """A course held against a vehicle's limits and a controller's bounds; peaks over the whole course.
+
+    Attributes:
+        tilt: largest [deg].
+        velocity: largest magnitude [m/s].
+        acceleration: largest magnitude [m/s^2].
+        yaw: largest magnitude [deg]; a model linearised at zero yaw holds near 0.
+        yaw_rate: largest magnitude [deg/s].
+        rotor_min: lowest rotor speed [rad/s]; negative where a rotor would have to push down.
+        rotor_max: highest rotor speed [rad/s].
+        thrust_to_weight: largest.
+        jumps: times at which the course itself jumps [s]; the peaks leave them out.
+        problems: what is beyond a limit or a bound, a line each; empty for a course that can be flown exactly.
+        sentence: all this for a person.
+    """
+
+    tilt: float
+    velocity: float
+    acceleration: float
+    yaw: float
+    yaw_rate: float
+    rotor_min: float
+    rotor_max: float
+    thrust_to_weight: float
+    jumps: tuple[float, ...]
+    problems: tuple[str, ...]
+    sentence: str
+
+
+def demand(
+    course: Array, period: float, vehicle: Vehicle, *, jumps: Mask | None = None, kinks: Mask | None = None
+) -> Demand:
+    """What flying a sampled course exactly would take.
+
+    With f = a + g e_z, and a frame turned by the yaw psi, the thrust is m |f| along body z = f / |f|, so that
+    roll = asin(-f_y / |f|), pitch = atan2(f_x, f_z).  Body rates are those of the attitudes half a period before and
+    after, and tau = J d(w)/dt + w x J w; rotor speeds come from thrust and torque by the inverse allocation.
+
+    Args:
+        course: (K + 4, 4) x, y, z [m], yaw [rad], world, two samples before the first of interest and two after the
+            last.
+        period: of the samples [s].
+        vehicle: mass, inertia, gravity, rotors.
+        jumps: (K + 3,) whether the course jumps between a sample and the next.
+        kinks: (K + 3,) whether its velocity, or the derivative of that, may jump there.
+    """
+    intervals = course.shape[0] - 1
+    jumps = np.zeros(intervals, bool) if jumps is None else jumps
+    kinks = jumps if kinks is None else jumps | kinks
+    velocity = np.diff(course, axis=0) / period
+    usable = ~(jumps[1:] | jumps[:-1])
+    acceleration = np.where(usable[:, None], np.diff(velocity[:, :3], axis=0) / period, 0.0)
+    pushed = acceleration + np.array([0.0, 0.0, vehicle.gravity])
+    force = np.linalg.norm(pushed, axis=1)
+    euler = _attitudes(pushed, course[1:-1, 3])
+
+    euler_rates = np.diff(euler, axis=0) / period
+    body_rates = euler_to_body_rates(0.5 * (euler[1:] + euler[:-1]), euler_rates)
+    smooth = ~(kinks[3:] | kinks[2:-1] | kinks[1:-2] | kinks[:-3])
+    inertia = np.array(vehicle.inertia)
+    rates = 0.5 * (body_rates[1:] + body_rates[:-1])
+    torque = inertia * np.diff(body_rates, axis=0) / period + np.cross(rates, inertia * rates)
+    torque = np.where(smooth[:, None], torque, 0.0)
+
+    inner = slice(1, -1)
+    wrench = np.column_stack([vehicle.mass * force[inner], torque])
+    squared = np.linalg.solve(vehicle.allocation, wrench.T).T
+    speeds = np.sign(squared) * np.sqrt(np.abs(squared))
+    between = smooth[1:] & smooth[:-1]
+
+    state = np.zeros((smooth.size, N_STATES))
+    mean_velocity = 0.5 * (velocity[1:] + velocity[:-1])
+    state[:, POSITION] = course[STENCIL:-STENCIL, :3]
+    state[:, VELOCITY] = np.where(usable[:, None], mean_velocity[:, :3], 0.0)[inner]
+    state[:, EULER] = euler[inner]
+    turning = usable[2:] & usable[1:-1] & usable[:-2]
+    state[:, EULER_RATE] = np.where(turning[:, None], 0.5 * (euler_rates[1:] + euler_rates[:-1]), 0.0)
+    return Demand(
+        state=state,
+        acceleration=acceleration[inner],
+        thrust=wrench[:, 0],
+        torque=torque,
+        speeds=speeds,
+        slews=np.where(between[:, None], np.diff(speeds, axis=0), np.nan),
+    )
+
+
+def assess(
+    needed: Demand,
+    vehicle: Vehicle,
+    *,
+    bounds: Mapping[str, tuple[float, float]] | None = None,
+    jumps: Sequence[float] = (),
+) -> Feasibility:
+    """Hold a demand against the vehicle's rotor speeds and a controller's bounds.
+
+    Args:
+        needed: the demand.
+        vehicle: its rotor limits.
+        bounds: lower and upper bound by name, a state of `quadsim.state` in SI, `speed` [rad/s] of the rotors or `slew`
+            [rad/s per period].
+        jumps: times [s] at which the course jumps.
+    """
+    bounds = bounds or {}
+    rotor = (float(needed.speeds.min()), float(needed.speeds.max()))
+    tilt = math.degrees(float(needed.tilt.max()))
+    yaw = math.degrees(float(np.abs(needed.state[:, INDEX["yaw"]]).max()))
+    problems = _problems(needed, vehicle, bounds)
+    velocity = float(np.linalg.norm(needed.state[:, VELOCITY], axis=1).max())
+    return Feasibility(
+        tilt=tilt,
+        velocity=velocity,
+        acceleration=float(np.linalg.norm(needed.acceleration, axis=1).max()),
+        yaw=yaw,
+        yaw_rate=math.degrees(float(np.abs(needed.state[:, INDEX["yaw_rate"]]).max())),
+        rotor_min=rotor[0],
+        rotor_max=rotor[1],
+        thrust_to_weight=float(needed.thrust.max()) / (vehicle.mass * vehicle.gravity),
+        jumps=tuple(jumps),
+        problems=problems,
+        sentence=_sentence(tilt, velocity, yaw, rotor, vehicle, bounds, jumps, problems),
+    )
+
+
+def to_json(feasibility: Feasibility) -> dict[str, Any]:
+    """The finding for `summary.json`."""
+    found = asdict(feasibility)
+    return {**found, "jumps": list(feasibility.jumps), "problems": list(feasibility.problems)}
+
+
+def _attitudes(pushed: Array, yaw: Array) -> Array:
+    """(M, 3) roll, pitch, yaw [rad] whose body z is along the specific force (M, 3) [m/s^2]."""
+    cos, sin = np.cos(yaw), np.sin(yaw)
+    forward = cos * pushed[:, 0] + sin * pushed[:, 1]
+    left = cos * pushed[:, 1] - sin * pushed[:, 0]
+    pitch = np.arctan2(forward, pushed[:, 2])
+    roll = np.arctan2(-left, np.hypot(forward, pushed[:, 2]))
+    return np.stack([roll, pitch, yaw], axis=1)
+
+
+def _problems(needed: Demand, vehicle: Vehicle, bounds: Mapping[str, tuple[float, float]]) -> tuple[str, ...]:
+    """A line for each side of a limit or bound that the demand leaves."""
+    least, most = vehicle.speed_min, vehicle.speed_max
+    found = _beyond("rotor speed", "rad/s", needed.speeds, (least, most), "limit")
+    for name, (lower, upper) in bounds.items():
+        if name == "speed":  # where the vehicle's limit is as narrow, it has been named
+            tighter = (lower if lower > least else -math.inf, upper if upper < most else math.inf)
+            found += _beyond("rotor speed", "rad/s", needed.speeds, tighter, "bound")
+        elif name == "slew":
+            slews = needed.slews[np.isfinite(needed.slews)]
+            found += _beyond("change of rotor speed", "rad/s per period", slews, (lower, upper), "bound")
+        else:
+            unit, scale = _DISPLAY.get(STATE_UNITS[INDEX[name]], (STATE_UNITS[INDEX[name]], 1.0))
+            values = scale * needed.state[:, INDEX[name]]
+            found += _beyond(name, unit, values, (scale * lower, scale * upper), "bound")
+    return tuple(found)
+
+
+def _beyond(name: str, unit: str, values: Array, allowed: tuple[float, float], kind: str) -> list[str]:
+    if not values.size:
+        return []
+    (lower, upper), low, high = allowed, float(values.min()), float(values.max())
+    found = []
+    if high > upper + TOLERANCE * (1.0 + abs(upper)):
+        found.append(f"{name} up to {high:.4g} {unit} ({kind} {upper:.4g})")
+    if low < lower - TOLERANCE * (1.0 + abs(lower)):
+        found.append(f"{name} down to {low:.4g} {unit} ({kind} {lower:.4g})")
+    return found
+
+
+def _sentence(
+    tilt: float,
+    velocity: float,
+    yaw: float,
+    rotor: tuple[float, float],
+    vehicle: Vehicle,
+    bounds: Mapping[str, tuple[float, float]],
+    jumps: Sequence[float],
+    problems: Sequence[str],
+) -> str:
+    tilts = [math.degrees(abs(side)) for name in ("roll", "pitch") if name in bounds for side in bounds[name]]
+    allowed = f" (bound {min(tilts):.4g} deg)" if tilts else ""
+    times = ", ".join(f"{time:g}" for time in jumps[:4]) + (", ..." if len(jumps) > 4 else "")
+    turned = f", a yaw of {round(yaw, 1):g} deg" if yaw > 0.5 else ""
+    subject = f"The course steps (at t = {times} s); what is left asks" if jumps else "The course asks"
+    asked = (
+        f"{subject} for up to {round(tilt, 2):g} deg of tilt{allowed}, {round(velocity, 2):g} m/s{turned}, "
+        f"and rotor speeds of {rotor[0]:.4g} to {rotor[1]:.4g} rad/s "
+        f"(limits {vehicle.speed_min:.4g} and {vehicle.speed_max:.4g} rad/s)."
+    )
+    return f"{asked} It cannot be followed exactly: {'; '.join(problems)}." if problems else asked

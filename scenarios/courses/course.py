@@ -1,0 +1,64 @@
+"""What a course is: a position and a yaw at any time."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from quadsim.state import Array
+
+
+@dataclass(frozen=True, kw_only=True)
+class Path:
+    """Poses from a beginning at time 0 to an end.
+
+    Attributes:
+        pose: times (M,) within [0, duration] [s] -> (M, 4) x, y, z [m], yaw [rad], world.
+        duration: [s].
+        kinks: times [s] at which the velocity, or its derivative, may jump.
+    """
+
+    pose: Callable[[Array], Array]
+    duration: float
+    kinks: tuple[float, ...] = ()
+
+
+@dataclass(frozen=True, kw_only=True)
+class Course:
+    """What is asked of the vehicle, before the filter of Eq. (31).
+
+    Attributes:
+        sample: times (M,) >= 0 [s] of the flight -> (M, 4) x, y, z [m], yaw [rad], world.
+        initial: (4,) what it is before the flight, and where the filter starts.
+        jumps: times [s] at which the pose itself jumps.
+        kinks: times [s] at which the velocity, or its derivative, may jump.
+    """
+
+    sample: Callable[[Array], Array]
+    initial: Array
+    jumps: tuple[float, ...] = ()
+    kinks: tuple[float, ...] = ()
+
+
+def begin(path: Path, *, start: float, initial: Array) -> Course:
+    """The course that is `initial` (4,) until `start` [s], then the path, and stays at the path's end.
+
+    A path that begins elsewhere makes the course jump at its start.
+    """
+
+    def sample(t: Array) -> Array:
+        since = t - start
+        poses = path.pose(np.clip(since, 0.0, path.duration))
+        # The start is on the path, whatever the rounding of a control period's multiples.
+        return np.where((since < -1e-9)[:, None], initial, poses)
+
+    elsewhere = not np.allclose(path.pose(np.zeros(1))[0], initial, rtol=0.0, atol=1e-9)
+    ends = {0.0, path.duration}  # a path need not begin or end at rest
+    return Course(
+        sample=sample,
+        initial=initial,
+        jumps=(start,) if elsewhere else (),
+        kinks=tuple(start + time for time in sorted(ends | set(path.kinks))),
+    )

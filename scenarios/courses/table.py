@@ -1,0 +1,122 @@
+"""Courses from a CSV file."""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+import io
+import math
+from dataclasses import dataclass
+from pathlib import Path as FilePath
+from typing import Final
+
+import numpy as np
+
+from quadsim.errors import FileError
+from quadsim.state import Array
+from scenarios.courses.course import Path
+from scenarios.courses.legs import polyline
+
+POSE_HEADER: Final = ("t", "x", "y", "z", "yaw")
+VELOCITY_HEADER: Final = ("vx", "vy", "vz")
+LARGEST: Final = 1e6
+"""Largest magnitude of a number in the table, as in the scenario file."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Table:
+    """A course's rows.
+
+    Attributes:
+        t: (n,) increasing, the first at least 0 [s].
+        poses: (n, 4) x, y, z [m], yaw [rad], yaw unwrapped.
+        velocities: (n, 3) [m/s]; None where the file has none.
+        sha256: hash of the file.
+    """
+
+    t: Array
+    poses: Array
+    velocities: Array | None
+    sha256: str
+
+
+def read_table(path: FilePath) -> Table:
+    """Read a file with the header `t,x,y,z,yaw` or `t,x,y,z,yaw,vx,vy,vz`, yaw in radians.
+
+    Yaw that changes by more than half a turn between rows is taken as wrapped, and unwrapped.
+
+    Raises:
+        FileError: naming the row (the header is row 1) and the column that is wrong.
+    """
+    try:
+        content = path.read_bytes()
+        rows = list(csv.reader(io.StringIO(content.decode("utf-8-sig"), newline=""), strict=True))
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise FileError(path, f"cannot be read ({error})") from error
+    while rows and not rows[-1]:
+        rows.pop()
+    header = tuple(rows[0]) if rows else ()
+    if header not in (POSE_HEADER, POSE_HEADER + VELOCITY_HEADER):
+        wanted = f"{','.join(POSE_HEADER)} or {','.join(POSE_HEADER + VELOCITY_HEADER)}"
+        raise FileError(path, f"row 1: the header must be {wanted}; got {','.join(header)!r}")
+    if len(rows) < 3:
+        raise FileError(path, f"must have 2 or more rows below its header; got {len(rows) - 1}")
+    numbers = np.array([_parse_row(path, number, row, header) for number, row in enumerate(rows[1:], start=2)])
+    t = numbers[:, 0]
+    if t[0] < 0.0:
+        raise FileError(path, f"row 2, column t: must be >= 0; got {rows[1][0]}")
+    (late,) = np.nonzero(np.diff(t) <= 0.0)
+    if late.size:
+        number = int(late[0]) + 3
+        rule = f"must be above that of the row before = {rows[number - 2][0]}"
+        raise FileError(path, f"row {number}, column t: {rule}; got {rows[number - 1][0]}")
+    poses = numbers[:, 1:5].copy()
+    poses[:, 3] = np.unwrap(poses[:, 3])
+    velocities = numbers[:, 5:] if len(header) > len(POSE_HEADER) else None
+    return Table(t=t, poses=poses, velocities=velocities, sha256=hashlib.sha256(content).hexdigest())
+
+
+def through_rows(table: Table) -> Path:
+    """A path from the first row, whose time becomes 0, to the last.
+
+    Straight lines between rows, or where the table has velocities the cubics that meet them (cubic Hermite
+    interpolation); yaw is straight either way.
+    """
+    t = table.t - table.t[0]
+    straight = polyline(t, table.poses)
+    if table.velocities is None:
+        return straight
+    velocities = table.velocities
+
+    def pose(times: Array) -> Array:
+        i = np.clip(np.searchsorted(t, times, side="right") - 1, 0, t.size - 2)
+        h = (t[i + 1] - t[i])[:, None]
+        s = (times - t[i])[:, None] / h
+        before, after = table.poses[i, :3], table.poses[i + 1, :3]
+        poses = straight.pose(times)
+        poses[:, :3] = (
+            (1.0 + 2.0 * s) * (1.0 - s) ** 2 * before
+            + s**2 * (3.0 - 2.0 * s) * after
+            + h * s * (1.0 - s) * ((1.0 - s) * velocities[i] - s * velocities[i + 1])
+        )
+        return poses
+
+    return Path(pose=pose, duration=straight.duration, kinks=straight.kinks)
+
+
+def _parse_row(path: FilePath, number: int, row: list[str], header: tuple[str, ...]) -> list[float]:
+    if len(row) != len(header):
+        raise FileError(path, f"row {number}: must have {len(header)} cells ({','.join(header)}); got {len(row)}")
+    values = []
+    for name, cell in zip(header, row, strict=True):
+        place = f"row {number}, column {name}"
+        if not cell.strip():
+            raise FileError(path, f"{place}: is empty")
+        try:
+            value = float(cell)
+        except ValueError:
+            raise FileError(path, f"{place}: must be a number; got {cell!r}") from None
+        if not math.isfinite(value) or abs(value) > LARGEST:
+            raise FileError(path, f"{place}: must be a finite number within +-{LARGEST:g}; got {cell!r}")
+        values.append(value)
+    return values

@@ -1,0 +1,131 @@
+"""Circle, helix and figure eight: their shape, their speed, and how they begin and end."""
+
+from __future__ import annotations
+
+import math
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from quadsim.state import Array
+from scenarios.courses.course import Path
+from scenarios.courses.loops import Loop, circle, figure_eight, fly_round, ramped
+
+CENTRE = np.array([1.0, -2.0, 3.0])
+THETA = np.linspace(0.0, 4.0 * math.pi, 801)
+LOOPS = {
+    "circle": circle(centre=CENTRE, radius=2.0, angle=0.3),
+    "clockwise": circle(centre=CENTRE, radius=2.0, angle=0.3, clockwise=True),
+    "helix": circle(centre=CENTRE, radius=2.0, climb_per_turn=1.5),
+    "eight": figure_eight(centre=CENTRE, half_length=3.0, half_width=1.5, angle=0.7),
+    "clockwise eight": figure_eight(centre=CENTRE, half_length=3.0, half_width=1.5, angle=-2.0, clockwise=True),
+    "thin eight": figure_eight(centre=CENTRE, half_length=3.0, half_width=0.1),
+}
+
+
+def flown(loop: Loop, *, ramp: float = 2.0, yaw: float = 0.0, along: bool = False) -> Path:
+    return fly_round(loop, turn_time=10.0, turns=2.0, ramp=ramp, yaw=yaw, along=along)
+
+
+def derivative(values: Array, step: float) -> Array:
+    return (values[2:] - values[:-2]) / (2.0 * step)
+
+
+def test_a_circle_has_its_radius_and_begins_at_its_angle() -> None:
+    for name, turn in (("circle", 1.0), ("clockwise", -1.0)):
+        position = LOOPS[name].position(THETA) - CENTRE
+        np.testing.assert_allclose(np.hypot(position[:, 0], position[:, 1]), 2.0, rtol=1e-14)
+        np.testing.assert_array_equal(position[:, 2], 0.0)
+        angles = np.unwrap(np.arctan2(position[:, 1], position[:, 0]))
+        np.testing.assert_allclose(angles, 0.3 + turn * THETA, atol=1e-12)
+
+
+def test_a_helix_climbs_by_its_pitch_per_turn() -> None:
+    position = LOOPS["helix"].position(np.array([0.0, math.pi, 4.0 * math.pi]))
+    np.testing.assert_allclose(position[:, 2] - CENTRE[2], [0.0, 0.75, 3.0])
+
+
+def test_a_figure_eight_is_the_lemniscate_of_gerono() -> None:
+    """With y scaled to b = a / 2, its implicit equation is x^4 = a^2 (x^2 - y^2)."""
+    loop = figure_eight(centre=np.zeros(3), half_length=3.0, half_width=1.0)
+    x, y, z = loop.position(THETA).T
+    y = 1.5 * y
+    np.testing.assert_allclose(x**4, 9.0 * (x**2 - y**2), atol=1e-12)
+    assert not z.any()
+    assert x.max() == pytest.approx(3.0)
+    assert (y / 1.5).max() == pytest.approx(1.0, rel=1e-4)
+    first = slice(1, 200)  # the half at positive x, counter-clockwise about its middle
+    assert np.all(np.diff(np.unwrap(np.arctan2(y[first], x[first] - 1.5))) > 0.0)
+
+
+@pytest.mark.parametrize("name", LOOPS)
+def test_the_heading_is_the_direction_of_travel_and_has_no_jumps(name: str) -> None:
+    loop, step = LOOPS[name], THETA[1]
+    velocity, heading = derivative(loop.position(THETA), step), loop.heading(THETA)
+    np.testing.assert_allclose(np.diff(heading), np.diff(np.unwrap(heading)), atol=1e-12)
+    error = heading[1:-1] - np.arctan2(velocity[:, 1], velocity[:, 0])
+    np.testing.assert_allclose(np.remainder(error + 1.0, math.tau), 1.0, atol=0.01)
+
+
+@given(
+    rate=st.floats(0.01, 10.0),
+    ramp=st.floats(0.05, 20.0),
+    extra=st.floats(0.0, 50.0),
+    part=st.floats(0.0, 1.0),
+)
+def test_a_ramped_angle_begins_and_ends_at_rest_and_takes_its_time(
+    rate: float, ramp: float, extra: float, part: float
+) -> None:
+    total = rate * ramp + extra
+    duration = total / rate + ramp
+    t = np.array([0.0, 0.5 * duration, duration, part * duration, (1.0 - part) * duration])
+    angle = ramped(t, rate=rate, total=total, ramp=ramp)
+    np.testing.assert_allclose(angle[:3], [0.0, 0.5 * total, total], rtol=1e-9, atol=1e-9)
+    assert angle[3] + angle[4] == pytest.approx(total, rel=1e-9)
+
+
+def test_the_rate_of_a_ramped_angle_is_the_known_polynomial() -> None:
+    rate, ramp, total, h = 0.7, 2.0, 4.0, 1e-4
+    t = np.arange(0.0, total / rate + ramp, h)
+    found = derivative(ramped(t, rate=rate, total=total, ramp=ramp), h)
+    s = np.clip(np.minimum(t, total / rate + ramp - t)[1:-1] / ramp, 0.0, 1.0)
+    expected = rate * (35 * s**4 - 84 * s**5 + 70 * s**6 - 20 * s**7)
+    np.testing.assert_allclose(found, expected, atol=1e-8)
+
+
+def test_the_snap_of_a_ramped_angle_is_continuous_and_the_next_derivative_is_not() -> None:
+    h, values = 2e-3, []
+    t = np.arange(-3, 3001) * h
+    angle = np.where(t < 0.0, 0.0, ramped(np.maximum(t, 0.0), rate=1.0, total=20.0, ramp=2.0))
+    for k, size in ((4, 1.0 / 2.0**3), (5, 1.0 / 2.0**4)):
+        jumps = np.abs(np.diff(np.diff(angle, n=k)[:20] / h**k)).max() / size
+        values.append(jumps)
+    assert values[0] < 2.0
+    assert values[1] > 100.0
+
+
+@pytest.mark.parametrize("ramp", [0.0, 2.0])
+def test_two_turns_take_two_turn_times_and_a_ramp_and_end_where_they_began(ramp: float) -> None:
+    path = flown(LOOPS["circle"], ramp=ramp)
+    assert path.duration == pytest.approx(20.0 + ramp)
+    begun, ended = path.pose(np.array([0.0, path.duration]))
+    np.testing.assert_allclose(begun, ended, atol=1e-12)
+    h = 1e-3
+    cruise = np.arange(3.0, 15.0, h)
+    speed = np.linalg.norm(derivative(path.pose(cruise)[:, :3], h), axis=1)
+    np.testing.assert_allclose(speed, math.tau * 2.0 / 10.0, rtol=1e-6)
+
+
+@pytest.mark.parametrize(("given_yaw", "along"), [(0.4, False), (-7.0, False), (6.0, True), (-9.5, True)])
+def test_yaw_is_held_or_follows_the_path_from_the_nearest_turn(given_yaw: float, along: bool) -> None:
+    loop = LOOPS["eight"]
+    yaw = flown(loop, yaw=given_yaw, along=along).pose(np.linspace(0.0, 22.0, 500))[:, 3]
+    if not along:
+        np.testing.assert_array_equal(yaw, given_yaw)
+        return
+    assert abs(yaw[0] - given_yaw) <= math.pi
+    assert all(abs(after - before) < 0.2 for before, after in pairwise(yaw))
+    assert math.remainder(yaw[0] - loop.heading(np.zeros(1))[0], math.tau) == pytest.approx(0.0, abs=1e-12)

@@ -1,0 +1,167 @@
+"""The smoothest polynomials: closed form, optimality, and an independent solution of the whole KKT system."""
+
+from __future__ import annotations
+
+import itertools
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from quadsim.state import Array
+from scenarios.courses.minimum_snap import ACCELERATION, SNAP, PiecewisePolynomial, minimum_snap, smoothest
+
+TIMES = np.array([0.0, 1.5, 2.0, 5.0, 6.2])
+VALUES = np.array([[0.0, 1.0], [2.0, -1.0], [1.0, 0.5], [4.0, 3.0], [0.0, 0.0]])
+durations = st.lists(st.floats(0.1, 10.0), min_size=2, max_size=5)
+
+
+def cost(curve: PiecewisePolynomial, order: int) -> float:
+    """The integral of the squared derivative, by Gauss-Legendre quadrature, exact for these polynomials."""
+    nodes, weights = np.polynomial.legendre.leggauss(10)
+    total = 0.0
+    for start, stop in zip(curve.knots[:-1], curve.knots[1:], strict=True):
+        t = start + 0.5 * (stop - start) * (nodes + 1.0)
+        total += 0.5 * (stop - start) * float(weights @ (curve(t, order) ** 2).sum(axis=1))
+    return total
+
+
+def kkt_solution(times: Array, values: Array, order: int) -> Array:
+    """(n, 2 order, c) coefficients in t - t_i: min c'Qc, A c = b, with all conditions as rows of A, solved as one."""
+    n, p = times.size - 1, 2 * order
+    powers = np.arange(p)
+
+    def row(segment: int, t: float, k: int) -> Array:
+        found = np.zeros(n * p)
+        found[segment * p : (segment + 1) * p] = [math.perm(i, k) * t ** (i - k) if i >= k else 0.0 for i in powers]
+        return found
+
+    Q = np.zeros((n * p, n * p))
+    rows, right = [], []
+    for i, T in enumerate(np.diff(times)):
+        for a in range(order, p):
+            for b in range(order, p):
+                degree = a + b - 2 * order + 1
+                Q[i * p + a, i * p + b] = math.perm(a, order) * math.perm(b, order) * T**degree / degree
+        rows += [row(i, 0.0, 0), row(i, T, 0)]
+        right += [values[i], values[i + 1]]
+        for k in range(1, order):
+            if i == 0:
+                rows.append(row(0, 0.0, k))
+            rows.append(row(i, T, k) - (row(i + 1, 0.0, k) if i + 1 < n else 0.0))
+            right += [0.0 * values[0]] * (2 if i == 0 else 1)
+    A = np.array(rows)
+    kkt = np.block([[Q, A.T], [A, np.zeros((len(A), len(A)))]])
+    solution = np.linalg.solve(kkt, np.vstack([np.zeros((n * p, values.shape[1])), np.array(right)]))
+    return solution[: n * p].reshape(n, p, -1)
+
+
+def test_one_segment_from_rest_to_rest_is_the_known_polynomial() -> None:
+    curve = smoothest(np.array([2.0, 5.0]), np.array([[1.0], [3.0]]), SNAP)
+    t = np.linspace(2.0, 5.0, 31)
+    s = (t - 2.0) / 3.0
+    np.testing.assert_allclose(
+        curve(t)[:, 0], 1.0 + 2.0 * (35 * s**4 - 84 * s**5 + 70 * s**6 - 20 * s**7), rtol=0, atol=1e-12
+    )
+
+
+def test_one_segment_of_least_acceleration_is_the_known_cubic() -> None:
+    curve = smoothest(np.array([0.0, 2.0]), np.array([[0.0], [1.0]]), ACCELERATION)
+    s = np.linspace(0.0, 1.0, 21)
+    np.testing.assert_allclose(curve(2.0 * s)[:, 0], 3.0 * s**2 - 2.0 * s**3, rtol=0, atol=1e-14)
+
+
+@pytest.mark.parametrize("order", [ACCELERATION, SNAP])
+def test_the_whole_kkt_system_has_the_same_solution(order: int) -> None:
+    curve = smoothest(TIMES, VALUES, order)
+    expected = kkt_solution(TIMES, VALUES, order)
+    for i, duration in enumerate(np.diff(TIMES)):
+        scale = duration ** np.arange(2 * order)
+        np.testing.assert_allclose(curve.coefficients[i], scale[:, None] * expected[i], rtol=1e-6, atol=1e-8)
+
+
+@pytest.mark.parametrize("order", [ACCELERATION, SNAP])
+def test_it_passes_its_points_at_rest_at_both_ends(order: int) -> None:
+    curve = smoothest(TIMES, VALUES, order)
+    np.testing.assert_allclose(curve(TIMES), VALUES, rtol=0, atol=1e-12)
+    for k in range(1, order):
+        np.testing.assert_allclose(curve(TIMES[[0, -1]], k), 0.0, atol=1e-10)
+
+
+@pytest.mark.parametrize("order", [ACCELERATION, SNAP])
+def test_its_derivatives_are_continuous_as_far_as_an_optimum_is(order: int) -> None:
+    """Up to 2 order - 2, though continuity was asked up to order - 1 alone; the next one jumps."""
+    curve = smoothest(TIMES, VALUES, order)
+    for k in range(2 * order):
+        size = np.abs(curve(np.linspace(0.0, TIMES[-1], 400), k)).max()
+        jumps = np.abs(curve(TIMES[1:-1] - 1e-9, k) - curve(TIMES[1:-1], k)).max() / size
+        assert jumps < 1e-6 if k <= 2 * order - 2 else jumps > 1e-2
+
+
+def test_derivatives_are_those_of_finite_differences() -> None:
+    curve, t, h = smoothest(TIMES, VALUES, SNAP), np.linspace(0.1, 6.1, 37), 1e-5
+    for k in range(5):
+        differences = (curve(t + h, k) - curve(t - h, k)) / (2.0 * h)
+        np.testing.assert_allclose(curve(t, k + 1), differences, rtol=1e-6, atol=1e-4)
+
+
+@given(seed=st.integers(0, 2**32 - 1), order=st.sampled_from([ACCELERATION, SNAP]), gaps=durations)
+def test_nothing_that_meets_the_conditions_costs_less(seed: int, order: int, gaps: list[float]) -> None:
+    """Adding any curve that is 0 at the points and at rest at the ends: the cost grows by that curve's own."""
+    rng = np.random.default_rng(seed)
+    times = np.concatenate([[0.0], np.cumsum(gaps)])
+    best = smoothest(times, rng.normal(size=(times.size, 1)), order)
+    bump = np.zeros((len(gaps), 2 * order + 2, 1))  # s^order (1 - s)^order: 0 with order - 1 derivatives at both ends
+    shape = np.polynomial.polynomial.polymul(np.eye(order + 1)[order], np.polynomial.polynomial.polypow([1, -1], order))
+    bump[:, : shape.size, 0] = rng.normal(size=(len(gaps), 1)) * shape
+    added = PiecewisePolynomial(knots=times, coefficients=bump)
+    padded = np.zeros_like(bump)
+    padded[:, : 2 * order] = best.coefficients
+    both = PiecewisePolynomial(knots=times, coefficients=padded + bump)
+    assert cost(both, order) == pytest.approx(cost(best, order) + cost(added, order), rel=1e-6)
+
+
+@pytest.mark.parametrize("k", [1, 2, 3])
+def test_perturbing_a_derivative_at_a_point_costs_more(k: int) -> None:
+    """Through the derivatives at the points themselves: pieces rebuilt with one of them changed."""
+    best = smoothest(TIMES, VALUES, SNAP)
+    for change in (-0.1, 0.1):
+        pieces = []
+        for i, (start, stop) in enumerate(itertools.pairwise(TIMES)):
+            T, powers = stop - start, np.arange(8)
+            rows = [[math.perm(p, d) * s ** (p - d) if p >= d else 0 for p in powers] for s in (0, 1) for d in range(4)]
+            ends = np.array([T**d * best(np.array([t]), d)[0] for t in (start, stop) for d in range(4)])
+            if i in (1, 2):  # the point between segments 1 and 2
+                ends[(4 if i == 1 else 0) + k] += T**k * change
+            pieces.append(np.linalg.solve(np.array(rows, float), ends))
+        changed = PiecewisePolynomial(knots=TIMES, coefficients=np.array(pieces))
+        np.testing.assert_allclose(changed(TIMES), VALUES, atol=1e-10)
+        assert cost(changed, SNAP) > cost(best, SNAP) * (1.0 + 1e-9)
+
+
+def test_time_in_other_units_is_the_same_curve() -> None:
+    slow, fast = smoothest(1e4 * TIMES, VALUES, SNAP), smoothest(1e-4 * TIMES, VALUES, SNAP)
+    s = np.linspace(0.0, TIMES[-1], 50)
+    np.testing.assert_allclose(slow(1e4 * s), fast(1e-4 * s), rtol=1e-9, atol=1e-9)
+
+
+def test_segments_of_very_different_durations_stay_accurate() -> None:
+    """A hundred-fold ratio, against the curve flown backwards."""
+    times = np.array([0.0, 10.0, 10.1, 20.0])
+    values = np.array([[0.0], [1.0], [1.02], [0.0]])
+    forth = smoothest(times, values, SNAP)
+    back = smoothest(20.0 - times[::-1], values[::-1], SNAP)
+    t = np.linspace(0.0, 20.0, 101)
+    np.testing.assert_allclose(forth(t), back(20.0 - t), rtol=0.0, atol=5e-6)
+
+
+def test_a_path_has_the_snap_of_its_position_and_the_acceleration_of_its_yaw() -> None:
+    start, poses = np.array([0.0, 0.0, 1.0, 0.0]), np.array([[1.0, 2.0, 3.0, 1.0], [4.0, 0.0, 1.0, -1.0]])
+    path = minimum_snap(start, poses, [2.0, 5.0])
+    assert path.duration == 5.0
+    assert path.kinks == ()
+    np.testing.assert_allclose(path.pose(np.array([0.0, 2.0, 5.0])), [start, *poses], atol=1e-12)
+    t, knots = np.linspace(0.0, 5.0, 20), np.array([0.0, 2.0, 5.0])
+    np.testing.assert_allclose(path.pose(t)[:, 3], smoothest(knots, np.array([[0.0], [1], [-1]]), 2)(t)[:, 0])
