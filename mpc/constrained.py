@@ -13,7 +13,7 @@ from mpc.problem import Problem
 from mpc.qp import Solution
 from mpc.shortcut import make_shortcut
 from mpc.solvers import QPSolver
-from quadsim.controller import SOLVED, UNCONSTRAINED, Command
+from quadsim.controller import GROUNDED, SOLVED, UNCONSTRAINED, Command, Moment, Phase, stopped
 from quadsim.errors import PlanExhaustedError
 from quadsim.state import Array
 
@@ -62,18 +62,29 @@ class ConstrainedMPC:
         self._plan = None
         self._held = 0
 
-    def step(self, time: float, state: Array, reference: Array) -> Command:
+    def step(self, now: Moment, state: Array, reference: Array) -> Command:
         """One QP at most; see `quadsim.controller.Controller.step`.
+
+        While landed the rotors are taken to their lowest speed as fast as their bounds allow.
 
         Raises:
             PlanExhaustedError: the solver failed and no step of a previous plan is left.
         """
+        if now.acting is not None:
+            self._before = now.acting
+        if now.phase in GROUNDED:
+            return self._stop(now.phase)
         desired = self.problem.objective.desired(reference)
-        return self._without_qp(state, desired) or self._with_qp(time, state, desired)
+        return self._without_qp(state, desired) or self._with_qp(now.time, state, desired)
 
     def predict(self, states: Array, plans: Array) -> Array:
         """See `quadsim.controller.Controller.predict`."""
         return rollout(self.problem.model, states, plans)
+
+    def _stop(self, phase: Phase) -> Command:
+        lower, _ = self._reach()
+        self._before, self._plan, self._held = lower, None, 0
+        return stopped(lower.copy(), self.horizon, phase)
 
     def _without_qp(self, state: Array, desired: Array) -> Command | None:
         if self._shortcut is None:

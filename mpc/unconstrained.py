@@ -6,12 +6,13 @@ import time as clock
 from dataclasses import dataclass
 from typing import Final
 
+import numpy as np
 import scipy.linalg
 
 from mpc.cost import cost
 from mpc.prediction import prediction, rollout
 from mpc.problem import Problem
-from quadsim.controller import Command
+from quadsim.controller import GROUNDED, Command, Moment, stopped
 from quadsim.state import Array
 
 
@@ -80,8 +81,10 @@ class UnconstrainedMPC:
     def reset(self, speeds: Array) -> None:
         """Nothing to forget: the law has no memory."""
 
-    def step(self, time: float, state: Array, reference: Array) -> Command:
-        """Evaluate Eq. (22); see `quadsim.controller.Controller.step`."""
+    def step(self, now: Moment, state: Array, reference: Array) -> Command:
+        """Evaluate Eq. (22), rotors off while landed; see `quadsim.controller.Controller.step`."""
+        if now.phase in GROUNDED:
+            return stopped(np.zeros(self.problem.model.nu), self.horizon, now.phase)
         started = clock.perf_counter()
         desired = self.problem.objective.desired(reference)
         sequence = self.gains.K @ state + self.gains.G @ desired.ravel() + self._offset

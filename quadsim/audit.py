@@ -15,7 +15,17 @@ import numpy as np
 
 from quadsim.errors import ParameterError, UnknownNameError
 from quadsim.flightlog import ControlLog, FlightLog, PlantLog
-from quadsim.state import INDEX, REFERENCE_NAMES, REFERENCE_STATES, STATE_NAMES, STATE_UNITS, Array
+from quadsim.state import (
+    EULER,
+    INDEX,
+    POSITION,
+    REFERENCE_NAMES,
+    REFERENCE_STATES,
+    STATE_NAMES,
+    STATE_UNITS,
+    Array,
+    tilt,
+)
 
 _DISPLAY: Final = {"rad": ("deg", math.degrees(1.0)), "rad/s": ("deg/s", math.degrees(1.0))}
 
@@ -38,24 +48,31 @@ class Signal:
 def _state_signal(name: str, unit: str) -> Signal:
     shown, scale = _DISPLAY.get(unit, (unit, 1.0))
     i = INDEX[name]
-    return Signal(unit=shown, sampled=lambda log: scale * log.state[:, i], plant=lambda log: scale * log.state[:, i])
+    return Signal(unit=shown, sampled=lambda log: scale * log.truth[:, i], plant=lambda log: scale * log.state[:, i])
 
 
 def _error_signal(j: int) -> Signal:
     i = REFERENCE_STATES[j]
     shown, scale = _DISPLAY.get(STATE_UNITS[i], (STATE_UNITS[i], 1.0))
-    return Signal(unit=shown, sampled=lambda log: scale * (log.state[:, i] - log.reference[:, j]), plant=None)
+    return Signal(unit=shown, sampled=lambda log: scale * (log.truth[:, i] - log.reference[:, j]), plant=None)
 
 
-def _tilt(state: Array) -> Array:
-    cosine = np.cos(state[:, INDEX["roll"]]) * np.cos(state[:, INDEX["pitch"]])
-    return np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
+_ESTIMATED: Final = tuple(STATE_NAMES[i] for i in (*POSITION, *EULER))
+
+
+def _estimate_error_signal(name: str) -> Signal:
+    i = INDEX[name]
+    shown, scale = _DISPLAY.get(STATE_UNITS[i], (STATE_UNITS[i], 1.0))
+    return Signal(unit=shown, sampled=lambda log: scale * (log.state[:, i] - log.truth[:, i]), plant=None)
 
 
 SIGNALS: Final[dict[str, Signal]] = {
     **{name: _state_signal(name, unit) for name, unit in zip(STATE_NAMES, STATE_UNITS, strict=True)},
     **{f"{name}_error": _error_signal(j) for j, name in enumerate(REFERENCE_NAMES)},
-    "tilt": Signal(unit="deg", sampled=lambda log: _tilt(log.state), plant=lambda log: _tilt(log.state)),
+    **{f"{name}_estimate_error": _estimate_error_signal(name) for name in _ESTIMATED},
+    "tilt": Signal(
+        unit="deg", sampled=lambda log: np.degrees(tilt(log.truth)), plant=lambda log: np.degrees(tilt(log.state))
+    ),
     # Commanded at the samples, acting in between: they differ where rotors saturate.
     "speed": Signal(unit="rad/s", sampled=lambda log: log.speeds, plant=lambda log: log.speeds),
     "slew": Signal(unit="rad/s", sampled=lambda log: log.slews, plant=None),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from enum import StrEnum
 from typing import Final, Protocol
 
 import numpy as np
@@ -15,8 +16,37 @@ UNCONSTRAINED: Final = "unconstrained"
 """Status of a period whose unconstrained optimum satisfies every constraint, and so is the constrained one too."""
 ACCEPTED: Final = frozenset({SOLVED, UNCONSTRAINED})
 """The statuses whose command is the period's optimum."""
+MISSED: Final = "missed"
+"""Status of a period whose command came after the next period's begin: the one before it went on acting."""
 LARGEST_SPEED: Final = 1e5
 """Largest magnitude of a rotor speed command [rad/s] that is taken for a command rather than for a fault."""
+
+
+class Phase(StrEnum):
+    """Where a flight stands with the ground; without a ground it is `flying` throughout."""
+
+    LANDED = "landed"
+    """On the ground, rotors off or on their way there."""
+    ARMED = "armed"
+    """On the ground, rotors spinning up for take-off."""
+    FLYING = "flying"
+    CRASHED = "crashed"
+    """Something other than the feet touched the ground; what follows is recorded, not controlled."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Moment:
+    """When a controller is asked, and what it may know besides the measured state.
+
+    Attributes:
+        time: t_k [s].
+        phase: where the flight stands with the ground.
+        acting: (4,) command in force at t_k, u(k-1) [rad/s]; None where it is the controller's own last one.
+    """
+
+    time: float = 0.0
+    phase: Phase = Phase.FLYING
+    acting: Array | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -26,7 +56,8 @@ class Command:
     Attributes:
         speeds: (4,) rotor speeds to hold for the period [rad/s].
         plan: (N, 4) planned speeds, `plan[0]` being this period's [rad/s].
-        status: `solved` or `unconstrained` (`ACCEPTED`), or the back end's name for what went wrong.
+        status: `solved` or `unconstrained` (`ACCEPTED`), `landed` or `crashed` where rotors are stopped, or what the
+            back end calls what went wrong.
         iterations: solver iterations; 0 for a closed form.
         active: number of constraints active at the optimum.
         fallback: 0 when `speeds` is this period's optimum, higher = deeper; 1 = the shifted previous plan.
@@ -46,6 +77,15 @@ class Command:
     primal_residual: float = 0.0
     dual_residual: float = 0.0
     solve_s: float = 0.0
+
+
+GROUNDED: Final = frozenset({Phase.LANDED, Phase.CRASHED})
+"""The phases in which a controller stops the rotors instead of flying."""
+
+
+def stopped(speeds: Array, horizon: int, phase: Phase) -> Command:
+    """The command of a controller whose rotors stand still, or are about to: `speeds` (4,), status `phase`."""
+    return Command(speeds=speeds, plan=np.tile(speeds, (horizon, 1)), status=str(phase))
 
 
 class Controller(Protocol):
@@ -70,11 +110,11 @@ class Controller(Protocol):
         """Forget the past: the next step is the first, after `speeds` u(-1) (4,) [rad/s]."""
         ...
 
-    def step(self, time: float, state: Array, reference: Array) -> Command:
+    def step(self, now: Moment, state: Array, reference: Array) -> Command:
         """The command for the period that starts now.
 
         Args:
-            time: t_k [s], for messages.
+            now: when it is, and where the flight stands.
             state: (12,) measured state xi(k).
             reference: (N, 4) filtered x, y, z [m], yaw [rad] at t_{k+1} .. t_{k+N}.
 

@@ -25,6 +25,12 @@ TIMING_FILE: Final = "timing.parquet"
 PLANT_FILE: Final = "plant.parquet"
 HORIZON_FILE: Final = "horizon.parquet"
 
+WRENCH: Final = {**{f"force_{axis}": "N" for axis in "xyz"}, **{f"torque_{axis}": "N m" for axis in "xyz"}}
+"""Columns of the external force, world, and torque, body frame, with their units; only where there is any."""
+WIND: Final = {f"wind_{axis}": "m/s" for axis in "xyz"}
+"""Columns of the wind, world, with their units; only where there is any."""
+_TRUE: Final = "true_"
+"""How the columns of the true state begin, which are there where the measured one differs."""
 _COUNTS: Final = ("iterations", "active", "fallback")
 ROTORS: Final = range(1, N_ROTORS + 1)
 
@@ -35,31 +41,42 @@ class ControlLog:
 
     Attributes:
         t: (K,) [s].
-        state: (K, 12) measured state, units of `STATE_UNITS`.
+        state: (K, 12) state as measured, which is what the controller was told; units of `STATE_UNITS`.
+        truth: (K, 12) state as it was; the same where measurement is perfect.
         reference: (K, 4) filtered reference x, y, z [m], yaw [rad] at t_k.
-        speeds: (K, 4) commanded rotor speeds held from t_k on [rad/s].
+        speeds: (K, 4) commanded rotor speeds in force at the period's end [rad/s].
         speeds_before: (4,) u(-1), the command before the first [rad/s].
-        status: K texts, one of `quadsim.controller.ACCEPTED` or what the back end said instead.
+        status: K texts, one of `quadsim.controller.ACCEPTED` or what was instead; see `quadsim.controller.Command`.
+        phase: K texts, where the flight stood with the ground; see `quadsim.controller.Phase`.
         iterations: (K,) solver iterations.
         active: (K,) constraints active at the optimum.
         fallback: (K,) 0 none, higher = deeper.
         slack: (K,) largest softening of an output bound [rad].
         primal_residual: (K,) as reported by the back end.
         dual_residual: (K,) as reported by the back end.
+        delay: (K,) simulated time from the measurement to the command [s].
     """
 
     t: Array
     state: Array
+    truth: Array
     reference: Array
     speeds: Array
     speeds_before: Array
     status: tuple[str, ...]
+    phase: tuple[str, ...]
     iterations: np.ndarray[Any, np.dtype[np.int64]]
     active: np.ndarray[Any, np.dtype[np.int64]]
     fallback: np.ndarray[Any, np.dtype[np.int64]]
     slack: Array
     primal_residual: Array
     dual_residual: Array
+    delay: Array
+
+    @property
+    def measured_perfectly(self) -> bool:
+        """Whether the controller was told the truth throughout."""
+        return self.state is self.truth or bool(np.array_equal(self.state, self.truth))
 
     @property
     def slews(self) -> Array:
@@ -83,16 +100,26 @@ class PlantLog:
     Attributes:
         t: (M,) [s].
         state: (M, 12) true state, yaw unwrapped.
-        speeds: (M, 4) rotor speeds that act from t on [rad/s]; the last row repeats the one before.
+        speeds: (M, 4) rotor speeds from t on [rad/s]; rotors that lag pass through them.
+        wrench: (M, 6) external force, world [N], and torque, body frame [N m], from t on; None where there is none.
+        wind: (M, 3) velocity of the air, world [m/s]; None without wind.
     """
 
     t: Array
     state: Array
     speeds: Array
+    wrench: Array | None = None
+    wind: Array | None = None
 
     def every(self, stride: int) -> PlantLog:
         """Each `stride`-th row, from the first on."""
-        return PlantLog(t=self.t[::stride], state=self.state[::stride], speeds=self.speeds[::stride])
+        return PlantLog(
+            t=self.t[::stride],
+            state=self.state[::stride],
+            speeds=self.speeds[::stride],
+            wrench=None if self.wrench is None else self.wrench[::stride],
+            wind=None if self.wind is None else self.wind[::stride],
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -124,8 +151,9 @@ class FlightLog:
 _Column = tuple[str, str, Any]
 
 
-def _state_columns(state: Array) -> list[_Column]:
-    return [(name, unit, state[:, i]) for i, (name, unit) in enumerate(zip(STATE_NAMES, STATE_UNITS, strict=True))]
+def _state_columns(state: Array, prefix: str = "") -> list[_Column]:
+    named = zip(STATE_NAMES, STATE_UNITS, strict=True)
+    return [(prefix + name, unit, state[:, i]) for i, (name, unit) in enumerate(named)]
 
 
 def _table(columns: Sequence[_Column], metadata: Mapping[str, str]) -> pa.Table:
@@ -145,12 +173,15 @@ def _flight_table(log: ControlLog, metadata: Mapping[str, str]) -> pa.Table:
         *((f"ref_{name}", unit, log.reference[:, i]) for i, (name, unit) in enumerate(references)),
         *((f"u{i}", "rad/s", log.speeds[:, i - 1]) for i in ROTORS),
         ("status", "-", pa.array(log.status, pa.string())),
+        ("phase", "-", pa.array(log.phase, pa.string())),
         ("iterations", "-", log.iterations),
         ("active", "-", log.active),
         ("fallback", "-", log.fallback),
         ("slack", "rad", log.slack),
         ("primal_residual", "-", log.primal_residual),
         ("dual_residual", "-", log.dual_residual),
+        ("delay", "s", log.delay),
+        *([] if log.measured_perfectly else _state_columns(log.truth, _TRUE)),
     ]
     before = ",".join(repr(float(speed)) for speed in log.speeds_before)
     return _table(columns, {**metadata, "speeds_before": before})
@@ -158,7 +189,12 @@ def _flight_table(log: ControlLog, metadata: Mapping[str, str]) -> pa.Table:
 
 def _plant_table(log: PlantLog, metadata: Mapping[str, str]) -> pa.Table:
     speeds = [(f"w{i}", "rad/s", log.speeds[:, i - 1]) for i in ROTORS]
-    return _table([("t", "s", log.t), *_state_columns(log.state), *speeds], metadata)
+    columns = [("t", "s", log.t), *_state_columns(log.state), *speeds]
+    if log.wrench is not None:
+        columns += [(name, unit, log.wrench[:, i]) for i, (name, unit) in enumerate(WRENCH.items())]
+    if log.wind is not None:
+        columns += [(name, unit, log.wind[:, i]) for i, (name, unit) in enumerate(WIND.items())]
+    return _table(columns, metadata)
 
 
 def _timing_table(log: TimingLog, metadata: Mapping[str, str]) -> pa.Table:
@@ -204,6 +240,10 @@ def _stack(table: pa.Table, names: Sequence[str]) -> Array:
     return np.stack([_numbers(table, name) for name in names], axis=1)
 
 
+def _stack_if_there(table: pa.Table, names: Sequence[str]) -> Array | None:
+    return _stack(table, names) if set(names) <= set(table.column_names) else None
+
+
 def _numbers(table: pa.Table, name: str, kind: type = np.float64) -> np.ndarray[Any, Any]:
     return np.asarray(table.column(name).to_numpy(), dtype=kind)
 
@@ -224,20 +264,26 @@ def read_log(directory: Path, *, reason: str | None = None) -> FlightLog:
         scalars = {
             field.name: _numbers(flight, field.name, np.int64 if field.name in _COUNTS else np.float64)
             for field in fields(ControlLog)
-            if field.name not in ("state", "reference", "speeds", "speeds_before", "status")
+            if field.name not in ("state", "truth", "reference", "speeds", "speeds_before", "status", "phase")
         }
+        state = _stack(flight, STATE_NAMES)
+        truth = _stack_if_there(flight, [_TRUE + name for name in STATE_NAMES])
         control = ControlLog(
-            state=_stack(flight, STATE_NAMES),
+            state=state,
+            truth=state if truth is None else truth,
             reference=_stack(flight, [f"ref_{name}" for name in REFERENCE_NAMES]),
             speeds=_stack(flight, [f"u{i}" for i in ROTORS]),
             speeds_before=before,
             status=tuple(flight.column("status").to_pylist()),
+            phase=tuple(flight.column("phase").to_pylist()),
             **scalars,
         )
         plant_log = PlantLog(
             t=_numbers(plant, "t"),
             state=_stack(plant, STATE_NAMES),
             speeds=_stack(plant, [f"w{i}" for i in ROTORS]),
+            wrench=_stack_if_there(plant, list(WRENCH)),
+            wind=_stack_if_there(plant, list(WIND)),
         )
         timing_log = TimingLog(**{name: _numbers(timing, name) for name in ("t", "solve_ms", "step_ms")})
         predicted = _read_predicted(directory)

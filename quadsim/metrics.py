@@ -5,14 +5,26 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any, Final
+from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from quadsim.controller import ACCEPTED
+from quadsim.controller import ACCEPTED, MISSED, Phase
 from quadsim.flightlog import ControlLog, FlightLog, TimingLog
-from quadsim.state import INDEX, REFERENCE_NAMES, REFERENCE_STATES, REFERENCE_UNITS, Array
+from quadsim.phase import clearance, takeoff_time, touchdown
+from quadsim.state import (
+    INDEX,
+    REFERENCE_NAMES,
+    REFERENCE_STATES,
+    REFERENCE_UNITS,
+    STATE_NAMES,
+    STATE_UNITS,
+    Array,
+)
+
+if TYPE_CHECKING:
+    from quadsim.airframe import Outline
 
 SETTLING_BAND: Final = 0.05
 """Half width of the band an output has to stay in to be settled, as a share of the step."""
@@ -44,7 +56,7 @@ def tracking(log: ControlLog) -> dict[str, Any]:
         `rmse`, `max_error` (largest magnitude), `final_error` (last sample, signed) and `overshoot` (how far the
         channel leaves the range spanned by its reference and its start), each by channel x, y, z [m], yaw [rad].
     """
-    state = log.state[:, REFERENCE_STATES]
+    state = log.truth[:, REFERENCE_STATES]
     error = state - log.reference
     lowest = np.minimum(log.reference.min(axis=0), state[0])
     highest = np.maximum(log.reference.max(axis=0), state[0])
@@ -145,6 +157,48 @@ def controller(log: ControlLog, timing: TimingLog, deadline_ms: float) -> dict[s
     }
 
 
+def computation(log: ControlLog) -> dict[str, Any]:
+    """Simulated times from measurement to command [ms], and how many commands came too late to be used."""
+    return {
+        "delay_ms": percentiles(1e3 * log.delay),
+        "missed": sum(status == MISSED for status in log.status),
+    }
+
+
+def estimation(log: ControlLog) -> dict[str, Any]:
+    """Errors of what the controller was told, told minus true, by state: RMS, and the largest magnitude.
+
+    Samples that are no numbers, as a failed sensor gives them, are counted and left out.
+    """
+    error = log.state - log.truth
+    finite = np.isfinite(error)
+    counted = np.maximum(finite.sum(axis=0), 1)
+    known = np.where(finite, error, 0.0)
+    return {
+        "unit": dict(zip(STATE_NAMES, STATE_UNITS, strict=True)),
+        "rmse": dict(zip(STATE_NAMES, np.sqrt((known**2).sum(axis=0) / counted).tolist(), strict=True)),
+        "max_error": dict(zip(STATE_NAMES, np.abs(known).max(axis=0).tolist(), strict=True)),
+        "not_finite": int(np.count_nonzero(~finite.all(axis=1))),
+    }
+
+
+def ground(log: FlightLog, outline: Outline) -> dict[str, Any]:
+    """How the flight left the ground and met it again, from plant rows at the physics rate.
+
+    Returns:
+        `takeoff_time` [s], `touchdown` (`time` [s], `speed` and `horizontal_speed` [m/s], `tilt` [deg]), each None
+        where there was none; `phase`, the last one; `crashed`.
+    """
+    clearances = clearance(log.plant.state, outline.feet, outline.foot_radius, outline.floor)
+    met = touchdown(log.plant.t, log.plant.state, clearances)
+    return {
+        "takeoff_time": takeoff_time(log.plant.t, clearances),
+        "touchdown": None if met is None else asdict(met),
+        "phase": log.control.phase[-1] if log.control.phase else None,
+        "crashed": str(Phase.CRASHED) in log.control.phase,
+    }
+
+
 def _largest_reported(residuals: Array) -> float | None:
     """The largest residual; None for a back end that reports none, 0 where there was nothing to report."""
     largest = float(np.max(residuals, initial=0.0))
@@ -164,7 +218,7 @@ def flight_numbers(log: FlightLog, deadline_ms: float, course: Sequence[CourseSt
     return {
         "tracking": {
             **tracking(log.control),
-            "settling": settling(log.control.t, log.control.state[:, REFERENCE_STATES], course),
+            "settling": settling(log.control.t, log.control.truth[:, REFERENCE_STATES], course),
         },
         "control": control(log.control),
         "controller": controller(log.control, log.timing, deadline_ms),

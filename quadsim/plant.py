@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from dataclasses import dataclass
 from types import TracebackType
-from typing import Final
+from typing import Final, Protocol
 
 import mujoco
 import numpy as np
 from mujoco.rollout import Rollout
 
-from quadsim.airframe import compile_model, rotor_thrusts
+from quadsim.airframe import BODY, compile_model, outline
 from quadsim.controller import check_command
+from quadsim.effects import Effects, RotorChange
+from quadsim.effects.forces import StepForces, midway
+from quadsim.effects.load import Payload, apply_mass, mass_properties
 from quadsim.errors import CommandError, DivergenceError, ParameterError
 from quadsim.state import (
     EULER,
@@ -76,27 +81,102 @@ def physics_to_state(physics: Array, yaw: float = 0.0) -> Array:
     return state
 
 
-class Plant:
-    """A vehicle in MuJoCo: fourth-order Runge-Kutta at a fixed step, rotor speeds held between commands.
+_CALM: Final = Effects()
 
-    Use as a context manager; it owns native memory.
+
+class Wind(Protocol):
+    """The air's motion along a flight; see `quadsim.effects.wind.WindField`."""
+
+    def reset(self) -> None:
+        """Start again with the same wind."""
+        ...
+
+    def advance(self, steps: int) -> Array:
+        """(steps, 3) wind velocity at the middle of each of the next physics steps, world frame [m/s]."""
+        ...
+
+
+@dataclass(frozen=True, kw_only=True)
+class Stretch:
+    """What happened over a number of physics steps; M rows, one per step.
 
     Attributes:
-        vehicle: what flies.
+        physics: (M, 14) MuJoCo's state after each step; see `physics_to_state`.
+        speeds: (M, 4) rotor speeds at the start of each step [rad/s].
+        wrench: (M, 6) force, world [N], and torque, body frame about its origin [N m], of all effects but contact, over
+            each step; None where no effect makes any.
+        wind: (M, 3) velocity of the air in the middle of each step, world [m/s]; None without wind.
+    """
+
+    physics: Array
+    speeds: Array
+    wrench: Array | None
+    wind: Array | None
+
+    @staticmethod
+    def join(parts: Sequence[Stretch]) -> Stretch:
+        """Stretches one after the other as one."""
+        if len(parts) == 1:
+            return parts[0]
+
+        def stack(name: str) -> Array | None:
+            arrays = [getattr(part, name) for part in parts]
+            return None if arrays[0] is None else np.concatenate(arrays)
+
+        physics, speeds = (np.concatenate([getattr(part, name) for part in parts]) for name in ("physics", "speeds"))
+        return Stretch(physics=physics, speeds=speeds, wrench=stack("wrench"), wind=stack("wind"))
+
+
+class Plant:
+    """A vehicle in MuJoCo: fourth-order Runge-Kutta at a fixed step, commands held in between.
+
+    Without effects rotors have their commanded speed at once, and a whole hold is one call of MuJoCo.  With effects
+    that depend on how the vehicle moves, each step is taken by itself, with forces evaluated in its middle (second
+    order).  Use as a context manager; it owns native memory.
+
+    Attributes:
+        vehicle: what flies, as its file says.
         timestep: physics step [s].
+        effects: what acts on it.
         model: the compiled model, not to be changed.
     """
 
-    def __init__(self, vehicle: Vehicle, *, timestep: float = 1e-3, limit_speeds: bool = False) -> None:
+    def __init__(
+        self,
+        vehicle: Vehicle,
+        *,
+        timestep: float = 1e-3,
+        limit_speeds: bool = False,
+        effects: Effects = _CALM,
+        wind: Wind | None = None,
+        rng: np.random.Generator | None = None,
+    ) -> None:
         self.vehicle = vehicle
         self.timestep = timestep
-        self.model = compile_model(vehicle, timestep=timestep, limit_speeds=limit_speeds)
+        self.effects = effects
+        self.model = compile_model(
+            vehicle,
+            timestep=timestep,
+            limit_speeds=limit_speeds,
+            contact=effects.contact,
+            reweighed=effects.reweighs,
+            body_drag=effects.body_drag,
+            air_density=effects.air_density,
+        )
         self._speed_range = (vehicle.speed_min, vehicle.speed_max) if limit_speeds else (0.0, math.inf)
         self._data = mujoco.MjData(self.model)
         mujoco.set_mju_user_warning(_discard)
         self._rollout = Rollout(nthread=0)
         self._physics = np.zeros((1, mujoco.mj_stateSize(self.model, _FULL)))
         self._yaw = 0.0
+        self._wind = wind
+        self._by_step = effects.follows_state or wind is not None
+        self._forces = StepForces(vehicle, effects, outline(vehicle).floor if effects.rotor_radius else 0.0)
+        changes = sorted(effects.changes, key=lambda change: change.time)
+        self._changes = [(math.ceil(change.time / timestep - 1e-6), change) for change in changes]
+        self._rng = rng if rng is not None else np.random.default_rng(0)
+        self._rng_start = self._rng.bit_generator.state
+        self.reset(np.zeros(N_STATES))
 
     def __enter__(self) -> Plant:
         return self
@@ -121,8 +201,17 @@ class Plant:
         """(14,) copy of MuJoCo's own state; see `physics_to_state`."""
         return self._physics[0].copy()
 
-    def reset(self, state: Array) -> None:
-        """Put the vehicle at a state (12,) at time zero.
+    @property
+    def speeds(self) -> Array:
+        """(4,) rotor speeds now [rad/s]."""
+        return self._speeds.copy()
+
+    def reset(self, state: Array, speeds: Array | None = None) -> None:
+        """Put the vehicle at a state at time zero, and everything that acts on it back to its start.
+
+        Args:
+            state: (12,).
+            speeds: (4,) rotor speeds [rad/s]; hover where absent.
 
         Raises:
             ParameterError: the state is not 12 finite numbers.
@@ -142,6 +231,16 @@ class Plant:
             ]
         )
         self._yaw = float(euler[2])
+        self._step = 0
+        self._pending = list(self._changes)
+        self._speeds = self.hover_speeds if speeds is None else np.array(speeds, float)
+        self._efficiency = np.array(self.effects.efficiency)
+        self._velocity_before = self._physics[0, 8:].tolist()
+        if self.effects.reweighs:
+            self._carry(list(self.effects.load.payloads))
+        self._rng.bit_generator.state = self._rng_start
+        if self._wind is not None:
+            self._wind.reset()
 
     def state(self) -> Array:
         """(12,) the true state now, yaw unwrapped since the last reset."""
@@ -150,18 +249,15 @@ class Plant:
         return state
 
     def applied(self, speeds: Array) -> Array:
-        """The rotor speeds (4,) [rad/s] that a command makes: it saturates at what the rotors can do, and at zero."""
+        """The rotor speeds (4,) [rad/s] that a command asks for: it saturates at what rotors can do, and at zero."""
         return np.clip(speeds, *self._speed_range)
 
-    def advance(self, speeds: Array, steps: int) -> Array:
-        """Hold rotor speeds for a number of physics steps.
+    def advance(self, speeds: Array, steps: int) -> Stretch:
+        """Hold a command for a number of physics steps.
 
         Args:
             speeds: (4,) commanded rotor speeds [rad/s].
-            steps: physics steps.
-
-        Returns:
-            (steps, 14) MuJoCo's state after each step; see `physics_to_state`.
+            steps: physics steps, at least 1.
 
         Raises:
             CommandError: the command is not four finite numbers; nothing moved.
@@ -170,21 +266,61 @@ class Plant:
         problem = check_command(speeds)
         if problem is not None:
             raise CommandError(problem, time=self.time)
-        thrusts = rotor_thrusts(self.vehicle, self.applied(speeds))
-        control = np.broadcast_to(thrusts, (1, steps, N_ROTORS))
-        trajectory: Array = self._run(control, steps)
+        target = self.applied(speeds)
+        parts, end = [], self._step + steps
+        while self._step < end:
+            self._change()
+            until = min(end, self._pending[0][0]) if self._pending else end
+            parts.append(self._hold(target, until - self._step))
+        return Stretch.join(parts)
+
+    def _change(self) -> None:
+        """Let happen what is due before the next step."""
+        while self._pending and self._pending[0][0] <= self._step:
+            _, change = self._pending.pop(0)
+            if isinstance(change, RotorChange):
+                self._efficiency[change.rotor - 1] = change.efficiency
+            else:
+                self._carry([] if change.payload is None else [*self._payloads, change.payload])
+
+    def _carry(self, payloads: list[Payload]) -> None:
+        self._payloads = payloads
+        apply_mass(self.model, BODY, mass_properties(self.vehicle, self.effects.load, payloads))
+
+    def _hold(self, target: Array, steps: int) -> Stretch:
+        """Advance while nothing but the vehicle and the air changes."""
+        rotors, timestep = self.effects.rotors, self.timestep
+        if rotors is None:
+            before = middle = np.broadcast_to(target, (steps, N_ROTORS))
+            slopes = np.zeros((steps, N_ROTORS))
+            self._speeds = target
+        else:
+            edges = timestep * np.arange(steps + 1, dtype=np.float64)
+            at_edges, _ = rotors.respond(self._speeds, target, edges)
+            middle, slopes = rotors.respond(self._speeds, target, edges[:-1] + 0.5 * timestep)
+            before, self._speeds = at_edges[:-1], at_edges[-1]
+        thrusts = self._efficiency * self.vehicle.thrust_coefficient * np.square(middle)
+        wrench = wind = None
+        if self._by_step:
+            wind = None if self._wind is None else self._wind.advance(steps)
+            trajectory, wrench = self._take_steps(thrusts, middle, slopes, wind)
+        else:
+            trajectory = self._run(thrusts)
         self._check(trajectory)
         self._physics[0] = trajectory[-1]
-        return trajectory
+        self._step += steps
+        return Stretch(physics=trajectory, speeds=before, wrench=wrench, wind=wind)
 
-    def _run(self, control: Array, steps: int) -> Array:
+    def _run(self, thrusts: Array) -> Array:
+        """All steps in one call: thrusts (M, 4) [N] -> states (M, 14)."""
+        steps = len(thrusts)
         states = np.empty((1, steps, self._physics.shape[1]))
         sensors = np.empty((1, steps, self.model.nsensordata))
         self._rollout.rollout(
             [self.model],
             [self._data],
             self._physics,
-            np.ascontiguousarray(control),
+            np.ascontiguousarray(thrusts[None]),
             control_spec=_CONTROL,
             skip_checks=True,
             nstep=steps,
@@ -192,6 +328,46 @@ class Plant:
             sensordata=sensors,
         )
         return states[0]
+
+    def _take_steps(self, thrusts: Array, speeds: Array, slopes: Array, wind: Array | None) -> tuple[Array, Array]:
+        """One step after the other, each with the forces of its middle: states (M, 14) and wrenches (M, 6)."""
+        model, data, timestep = self.model, self._data, self.timestep
+        qpos, qvel, applied, control, fluid = data.qpos, data.qvel, data.qfrc_applied, data.ctrl, data.qfrc_fluid
+        mujoco.mj_setState(model, data, self._physics[0], _FULL)
+        steps = len(thrusts)
+        trajectory, wrench = np.empty((steps, self._physics.shape[1])), np.empty((steps, 6))
+        noise = self._draw_disturbance(steps)
+        air = np.zeros((steps, 3)) if wind is None else wind
+        moving_air = wind is not None and self.effects.body_drag is not None
+        velocity_before = self._velocity_before
+        rows = zip(thrusts, speeds.tolist(), slopes.tolist(), air.tolist(), noise, strict=True)
+        for i, (thrust, speed, slope, breeze, push) in enumerate(rows):
+            velocity = qvel.tolist()
+            motion = midway(qpos.tolist(), velocity, velocity_before, timestep)
+            velocity_before = velocity
+            applied[:] = self._forces.wrench(motion, speed, slope, breeze)
+            applied += push
+            control[:] = thrust if self.effects.rotor_radius is None else thrust * self._forces.lift(motion)
+            if moving_air:
+                model.opt.wind[:] = breeze
+            mujoco.mj_step(model, data)
+            row = trajectory[i]
+            row[0], row[1:8], row[8:14] = data.time, qpos, qvel
+            wrench[i] = applied
+            wrench[i] += fluid
+        self._velocity_before = velocity_before
+        return trajectory, wrench
+
+    def _draw_disturbance(self, steps: int) -> Array:
+        """(steps, 6) force, world [N], and torque, body [N m], of the disturbance over each step."""
+        disturbance = self.effects.disturbance
+        if disturbance is None:
+            return np.zeros((steps, 6))
+        constant = np.array([*disturbance.force, *disturbance.torque])
+        density = np.repeat([disturbance.force_noise, disturbance.torque_noise], 3)
+        if not density.any():
+            return np.tile(constant, (steps, 1))
+        return constant + density / math.sqrt(self.timestep) * self._rng.standard_normal((steps, 6))
 
     def _check(self, trajectory: Array) -> None:
         if not np.abs(trajectory).max() < _PLAUSIBLE:  # as NaN is not

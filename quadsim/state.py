@@ -107,6 +107,13 @@ def body_to_world(euler: Array) -> Array:
     return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
 
 
+def tilt(states: Array) -> Array:
+    """(M,) angle between the thrust axis and the vertical [rad] of states (M, 12)."""
+    cosine = np.cos(states[:, INDEX["roll"]]) * np.cos(states[:, INDEX["pitch"]])
+    angle: Array = np.arccos(np.clip(cosine, -1.0, 1.0))
+    return angle
+
+
 def make_state(
     *,
     position: tuple[float, float, float] = (0.0, 0.0, 0.0),

@@ -14,16 +14,20 @@ from mpc.model import hover_model
 from mpc.problem import Bounds, Objective, Problem
 from mpc.solvers import QPSolver
 from mpc.unconstrained import UnconstrainedMPC
+from quadsim.airframe import outline
 from quadsim.assets import vehicle_path
 from quadsim.audit import Limit
 from quadsim.controller import Controller
 from quadsim.errors import InputError
-from quadsim.metrics import CourseStep
+from quadsim.phase import PhaseMonitor
 from quadsim.plant import Plant
-from quadsim.state import INDEX, N_STATES, REFERENCE_NAMES, STATE_NAMES, Array, make_state
-from quadsim.vehicle import N_ROTORS, VEHICLE_UNITS, Vehicle, load_vehicle
-from scenarios.references import Window, smooth, steps, switches
-from scenarios.spec import ANGLES, ConstrainedSpec, Scenario, WindowSpec
+from quadsim.state import INDEX, N_STATES, STATE_NAMES, Array, make_state
+from quadsim.vehicle import N_ROTORS, OPTIONAL_PARAMETERS, VEHICLE_UNITS, Vehicle, load_vehicle
+from scenarios.courses import build_course_steps as build_course_steps
+from scenarios.courses import build_reference as build_reference
+from scenarios.effects import build_effects, build_wind, resolve_effects
+from scenarios.randomness import generator
+from scenarios.spec import ANGLES, ConstrainedSpec, Scenario
 
 CONTROLLERS: Final = {
     "unconstrained": "the paper's Sec. 4: a constant gain from the unconstrained optimum",
@@ -37,25 +41,49 @@ def build_vehicle(scenario: Scenario) -> Vehicle:
     try:
         path = vehicle_path(file)
     except InputError:
-        if not overrides.keys() >= VEHICLE_UNITS.keys():
+        if not overrides.keys() >= VEHICLE_UNITS.keys() - set(OPTIONAL_PARAMETERS):
             raise
         return Vehicle(name=Path(file).stem, **overrides)
     return load_vehicle(path, overrides)
 
 
 def resolve(scenario: Scenario, vehicle: Vehicle) -> Scenario:
-    """The scenario with every number of its vehicle written out, so that its file alone defines the flight."""
+    """The scenario with every number that it leaves to its vehicle written out: its file alone defines the flight."""
     numbers: dict[str, Any] = {
         name: list(value) if isinstance(value, tuple) else value
         for name in type(scenario.vehicle).model_fields
         if name != "file" and (value := getattr(vehicle, name)) is not None
     }
-    return scenario.model_copy(update={"vehicle": scenario.vehicle.model_copy(update=numbers)})
+    return scenario.model_copy(
+        update={
+            "vehicle": scenario.vehicle.model_copy(update=numbers),
+            "effects": resolve_effects(scenario.effects, vehicle),
+        }
+    )
 
 
-def build_plant(scenario: Scenario, vehicle: Vehicle) -> Plant:
-    """The simulated vehicle."""
-    return Plant(vehicle, timestep=scenario.plant.timestep, limit_speeds=scenario.plant.limit_speeds)
+def build_plant(scenario: Scenario, vehicle: Vehicle, kind: type[Plant] = Plant) -> Plant:
+    """The simulated vehicle, and what acts on it.
+
+    Raises:
+        ParameterError: a combination of effects is not possible.
+    """
+    return kind(
+        vehicle,
+        timestep=scenario.plant.timestep,
+        limit_speeds=scenario.plant.limit_speeds,
+        effects=build_effects(scenario, vehicle),
+        wind=build_wind(scenario, vehicle),
+        rng=generator(scenario.seed, "disturbance"),
+    )
+
+
+def build_ground(scenario: Scenario, vehicle: Vehicle) -> PhaseMonitor | None:
+    """What knows where the flight stands with the ground; None where there is none."""
+    ground = scenario.effects.ground
+    if ground is None or not ground.contact:
+        return None
+    return PhaseMonitor(outline(vehicle), period=scenario.control_period)
 
 
 def build_initial_state(scenario: Scenario) -> Array:
@@ -65,28 +93,9 @@ def build_initial_state(scenario: Scenario) -> Array:
     return make_state(position=(x, y, z), euler=(roll, pitch, yaw))
 
 
-def build_reference(scenario: Scenario, samples: int) -> Array:
-    """(samples, 4) filtered reference x, y, z [m], yaw [rad] at t_k = k tau_s.  Eqs. (30)-(31)."""
-    response_time, period = scenario.reference.response_time, scenario.control_period
-    t = np.arange(samples, dtype=np.float64) * period
-    channels = [
-        smooth(steps(t, windows, elsewhere), initial=elsewhere, response_time=response_time, period=period)
-        for windows, elsewhere in _course(scenario)
-    ]
-    return np.stack(channels, axis=1)
-
-
-def build_course_steps(scenario: Scenario) -> tuple[CourseStep, ...]:
-    """The steps of the unfiltered course, channel by channel; a start away from the course is a step at 0."""
-    preview = scenario.controller.horizon * scenario.control_period
-    starts = (*scenario.initial.position, math.radians(scenario.initial.euler[2]))
-    found = []
-    for name, (windows, elsewhere), start in zip(REFERENCE_NAMES, _course(scenario), starts, strict=True):
-        flown = [step for step in switches(windows, elsewhere, initial=start) if step[0] < scenario.duration]
-        ends = [*(time - preview for time, _, _ in flown[1:]), scenario.duration]
-        for (time, before, after), until in zip(flown, ends, strict=False):
-            found.append(CourseStep(channel=name, time=time, before=before, after=after, until=until))
-    return tuple(found)
+def build_initial_speeds(scenario: Scenario, vehicle: Vehicle) -> Array:
+    """(4,) u(-1), and the rotor speeds at t = 0 [rad/s]."""
+    return np.full(N_ROTORS, 0.0 if scenario.initial.cold else vehicle.hover_speed)
 
 
 def build_problem(scenario: Scenario, vehicle: Vehicle) -> Problem:
@@ -147,17 +156,6 @@ def build_limits(scenario: Scenario) -> tuple[Limit, ...]:
 def _selection(names: Sequence[str]) -> Array:
     """Rows of the identity that pick states by name."""
     return np.eye(N_STATES)[[INDEX[name] for name in names]]
-
-
-def _course(scenario: Scenario) -> list[tuple[list[Window], float]]:
-    """Windows of x, y, z [m] and yaw [rad], each with the value outside them."""
-    spec = scenario.reference
-    x, y, z = scenario.initial.position
-
-    def held(windows: list[WindowSpec], scale: float = 1.0) -> list[Window]:
-        return [Window(start=window.start, stop=window.stop, value=scale * window.value) for window in windows]
-
-    return [(held(spec.x), x), (held(spec.y), y), (held(spec.z), z), (held(spec.yaw, math.radians(1.0)), 0.0)]
 
 
 def _build_bounds(spec: ConstrainedSpec) -> Bounds:

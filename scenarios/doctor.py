@@ -9,7 +9,7 @@ import time as clock
 import numpy as np
 
 from mpc.solvers import SOLVERS
-from quadsim.controller import SOLVED
+from quadsim.controller import SOLVED, Moment
 from quadsim.errors import QuadsimError
 from quadsim.recording import viewer_problem
 from quadsim.vehicle import N_ROTORS
@@ -51,7 +51,7 @@ def _try_solver(name: str) -> str:
     built = clock.perf_counter()
     controller.reset(np.full(N_ROTORS, vehicle.hover_speed))
     reference = build_reference(scenario, controller.horizon + 1)[1:]
-    command = controller.step(0.0, build_initial_state(scenario), reference)
+    command = controller.step(Moment(), build_initial_state(scenario), reference)
     verdict = "works" if command.status == SOLVED else f"answers {command.status}"
     setup_ms, step_ms = 1e3 * (built - started), 1e3 * (clock.perf_counter() - built)
     return f"{verdict}: set up in {setup_ms:.0f} ms, first step in {step_ms:.1f} ms"

@@ -3,20 +3,19 @@
 from __future__ import annotations
 
 import contextlib
-import gc
 import time as clock
 from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from threadpoolctl import threadpool_limits
 
-from quadsim.controller import Controller
+from quadsim.controller import Controller, Moment
 from quadsim.errors import FlightError
 from quadsim.flightlog import ControlLog
 from quadsim.state import Array
 from scenarios.build import build_reference
 from scenarios.spec import Scenario
+from scenarios.timing import undisturbed
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -64,22 +63,15 @@ def time_steps(
         no command.
     """
     step_ms, statuses = [], []
-    collecting = gc.isenabled()
-    gc.collect()
-    gc.disable()
-    try:
-        with threadpool_limits(limits=1):
-            for k in range(0, queries.t.size, stride):
-                controller.reset(queries.speeds_before[k])
-                reference = queries.reference[k + 1 : k + 1 + controller.horizon]
-                time, state, status = float(queries.t[k]), queries.state[k], "failed"
-                started = clock.perf_counter()
-                with contextlib.suppress(FlightError):
-                    status = controller.step(time, state, reference).status
-                step_ms.append(1e3 * (clock.perf_counter() - started))
-                statuses.append(status)
-                progress()
-    finally:
-        if collecting:
-            gc.enable()
+    with undisturbed():
+        for k in range(0, queries.t.size, stride):
+            controller.reset(queries.speeds_before[k])
+            reference = queries.reference[k + 1 : k + 1 + controller.horizon]
+            now, state, status = Moment(time=float(queries.t[k])), queries.state[k], "failed"
+            started = clock.perf_counter()
+            with contextlib.suppress(FlightError):
+                status = controller.step(now, state, reference).status
+            step_ms.append(1e3 * (clock.perf_counter() - started))
+            statuses.append(status)
+            progress()
     return np.array(step_ms), tuple(statuses)

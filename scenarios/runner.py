@@ -2,33 +2,40 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib.metadata
 import os
 import platform
 import time as clock
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Final
 
 from threadpoolctl import threadpool_limits
 
 from quadsim import __version__, metrics, rundir
+from quadsim.airframe import outline
 from quadsim.audit import Finding, audit
+from quadsim.estimation import Tally
+from quadsim.feasibility import to_json as feasibility_to_json
 from quadsim.flightlog import FlightLog, write_log
-from quadsim.loop import fly
+from quadsim.sensing import SensorName
 from quadsim.vehicle import Vehicle
 from scenarios.build import (
     build_controller,
     build_course_steps,
-    build_initial_state,
     build_limits,
     build_plant,
     build_reference,
     build_vehicle,
     resolve,
 )
-from scenarios.spec import Scenario
+from scenarios.courses import report
+from scenarios.effects import build_computation
+from scenarios.flying import fly_once
+from scenarios.navigation import build_navigation
+from scenarios.spec import Scenario, Verdict
 
 PACKAGES: Final = ("mujoco", "numpy", "scipy", "piqp", "rerun-sdk", "imageio", "pyarrow", "matplotlib")
 
@@ -61,6 +68,7 @@ class Flight:
         controller: name of the control law.
         solver: name of its QP solver; empty for a closed form.
         simulate_s: wall time of the closed loop alone [s].
+        tallies: what became of each sensor's samples in the estimator; empty without one.
     """
 
     scenario: Scenario
@@ -70,11 +78,19 @@ class Flight:
     controller: str
     solver: str
     simulate_s: float
+    tallies: Mapping[SensorName, Tally]
 
     @property
     def satisfied(self) -> bool:
         """Whether the flight was completed and every required constraint held."""
         return self.log.reason is None and all(finding.satisfied for finding in self.findings if finding.limit.required)
+
+    @property
+    def outcome(self) -> Verdict:
+        """The verdict in one word; `lost` is a flight that was aborted, whoever ended it."""
+        if self.log.reason is not None:
+            return "lost"
+        return "satisfied" if self.satisfied else "violated"
 
 
 def fly_scenario(scenario: Scenario, progress: Progress = silent) -> Flight:
@@ -86,15 +102,16 @@ def fly_scenario(scenario: Scenario, progress: Progress = silent) -> Flight:
     with threadpool_limits(limits=1):
         controller = build_controller(scenario, vehicle)
         with build_plant(scenario, vehicle) as plant:
+            navigation = build_navigation(scenario, vehicle)
             started = clock.perf_counter()
-            log = fly(
+            reference = build_reference(scenario, scenario.periods + controller.horizon)
+            log = fly_once(
+                scenario,
+                vehicle,
                 plant,
                 controller,
-                build_reference(scenario, scenario.periods + controller.horizon),
-                initial_state=build_initial_state(scenario),
-                initial_speeds=plant.hover_speeds,
-                periods=scenario.periods,
-                steps_per_period=scenario.steps_per_period,
+                reference,
+                navigation=navigation,
                 progress=lambda done: progress("flight", done, scenario.periods),
             )
             simulate_s = clock.perf_counter() - started
@@ -106,6 +123,7 @@ def fly_scenario(scenario: Scenario, progress: Progress = silent) -> Flight:
         controller=controller.name,
         solver=controller.solver,
         simulate_s=simulate_s,
+        tallies={} if navigation is None else navigation.tallies,
     )
 
 
@@ -147,6 +165,8 @@ def summarise(flight: Flight) -> dict[str, Any]:
     """`summary.json` of a flight, but for the hashes of its files and the total wall time."""
     scenario, log = flight.scenario, flight.log
     course = build_course_steps(scenario)
+    ground = scenario.effects.ground
+    flown = log.control.t.size > 0
     numbers = metrics.flight_numbers(log, deadline_ms=1e3 * scenario.control_period, course=course)
     return {
         "scenario": scenario.name,
@@ -154,8 +174,12 @@ def summarise(flight: Flight) -> dict[str, Any]:
         "status": log.status,
         "reason": log.reason,
         "satisfied": flight.satisfied,
+        "group": scenario.group,
+        "expected": scenario.expect,
+        "as_expected": flight.outcome == scenario.expect and not log.interrupted,
         "duration": round(log.control.t.size * scenario.control_period, 9),
         "seed": scenario.seed,
+        "course": feasibility_to_json(report(scenario, flight.vehicle)),
         "tracking": numbers["tracking"],
         "constraints": [rundir.limit_to_json(finding) for finding in flight.findings],
         "control": numbers["control"],
@@ -165,12 +189,20 @@ def summarise(flight: Flight) -> dict[str, Any]:
             "horizon": scenario.controller.horizon,
             **numbers["controller"],
         },
+        **({"computation": metrics.computation(log.control)} if flown and build_computation(scenario) else {}),
+        **({} if log.control.measured_perfectly else {"estimation": _estimation(flight)}),
+        **({"ground": metrics.ground(log, outline(flight.vehicle))} if flown and ground and ground.contact else {}),
         "vehicle": rundir.vehicle_to_json(flight.vehicle),
         "wall_s": {"simulate": flight.simulate_s, "total": flight.simulate_s},
         "versions": versions(),
         "machine": machine(),
         "files": {},
     }
+
+
+def _estimation(flight: Flight) -> dict[str, Any]:
+    samples = {str(name): asdict(tally) for name, tally in flight.tallies.items()}
+    return {**metrics.estimation(flight.log.control), "samples": samples}
 
 
 def versions() -> dict[str, str]:
@@ -194,24 +226,33 @@ def processor_name() -> str:
     return names[0] if names else platform.machine()
 
 
+def usable_cores() -> int:
+    """Cores that this process may run on."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
 def _write_products(flight: Flight, directory: Path, outputs: Outputs, progress: Progress) -> None:
     """Recording, figures and video, each made from the files that are already there."""
     run = rundir.load_run(directory)
+    flown = bool(run.log.control.t.size)
+    with contextlib.ExitStack() as beside:
+        if outputs.recording:
+            from quadsim.recording import recording_aside, write_recording
+
+            progress("recording", 0, 1)
+            if outputs.figures and flown and usable_cores() > 1:  # while the figures are drawn: a tenth of a short run
+                beside.enter_context(recording_aside(directory))
+            else:
+                write_recording(run, directory / rundir.RECORDING_FILE)
+        if outputs.figures and flown:
+            from quadsim.figures import write_figures
+
+            progress("figures", 0, 1)
+            write_figures(run, directory / rundir.FIGURES_DIR)
+            progress("figures", 1, 1)
     if outputs.recording:
-        from quadsim.recording import write_recording
-
-        progress("recording", 0, 1)
-        write_recording(run, directory / rundir.RECORDING_FILE)
         progress("recording", 1, 1)
-    if not run.log.control.t.size:
-        return
-    if outputs.figures:
-        from quadsim.figures import write_figures
-
-        progress("figures", 0, 1)
-        write_figures(run, directory / rundir.FIGURES_DIR)
-        progress("figures", 1, 1)
-    if outputs.video and not flight.log.interrupted:
+    if outputs.video and flown and not flight.log.interrupted:
         from quadsim.video import render_video
 
         render_video(

@@ -82,22 +82,27 @@ def small_log(periods: int = 4, *, steps: int = 5, seed: int = 0, reason: str | 
         control=ControlLog(
             t=t,
             state=rng.normal(size=(periods, N_STATES)),
+            truth=rng.normal(size=(periods, N_STATES)),
             reference=rng.normal(size=(periods, 4)),
             speeds=rng.uniform(100.0, 250.0, (periods, N_ROTORS)),
             speeds_before=np.array([192.8, 192.9, 193.0, 193.1]),
             status=tuple("solved" if k % 2 == 0 else "max_iterations" for k in range(periods)),
+            phase=tuple("flying" if k else "armed" for k in range(periods)),
             iterations=rng.integers(1, 30, periods),
             active=rng.integers(0, 30, periods),
             fallback=rng.integers(0, 2, periods),
             slack=rng.uniform(size=periods),
             primal_residual=rng.uniform(size=periods),
             dual_residual=rng.uniform(size=periods),
+            delay=rng.uniform(0.0, 0.05, periods),
         ),
         timing=TimingLog(t=t, solve_ms=rng.uniform(size=periods), step_ms=rng.uniform(1.0, 2.0, periods)),
         plant=PlantLog(
             t=np.round(0.1 / steps * np.arange(rows), 9),
             state=rng.normal(size=(rows, N_STATES)),
             speeds=rng.uniform(100.0, 250.0, (rows, N_ROTORS)),
+            wrench=rng.normal(size=(rows, 6)),
+            wind=rng.normal(size=(rows, 3)),
         ),
         predicted=rng.normal(size=(periods, 6, 3)).astype(np.float32) if periods else None,
         reason=reason,
@@ -113,7 +118,10 @@ def logged(state_name: str, *, samples: Sequence[float], plant: Sequence[float])
     assert rest == 0, "plant rows must be a whole number per period, plus one"
     log = small_log(len(samples), steps=steps)
     control = replace(
-        log.control, state=np.zeros_like(log.control.state), reference=np.zeros_like(log.control.reference)
+        log.control,
+        state=(state := np.zeros_like(log.control.state)),
+        truth=state,
+        reference=np.zeros_like(log.control.reference),
     )
     flown = replace(log.plant, state=np.zeros_like(log.plant.state))
     control.state[:, INDEX[state_name]] = samples

@@ -15,7 +15,7 @@ from mpc.polish import polish
 from mpc.problem import Problem
 from mpc.qp import QP, Solution, kkt_residuals
 from mpc.solvers import SOLVERS, Answer, QPSolver, make_backend
-from quadsim.controller import ACCEPTED, SOLVED, UNCONSTRAINED, Command
+from quadsim.controller import ACCEPTED, SOLVED, UNCONSTRAINED, Command, Moment
 from quadsim.errors import FlightError
 from quadsim.state import Array
 from scenarios.queries import Queries
@@ -77,7 +77,7 @@ class StepEntrant:
         queries = self._queries
         self._controller.reset(queries.speeds_before[period])
         reference = queries.reference[period + 1 : period + 1 + self.problem.horizon]
-        self._query = (float(queries.t[period]), queries.state[period], reference)
+        self._query = (Moment(time=float(queries.t[period])), queries.state[period], reference)
         self._command, self.solver.last = None, None
 
     def answer(self) -> None:

@@ -16,17 +16,18 @@ from quadsim.bench import FlightProfile
 from quadsim.controller import Controller
 from quadsim.errors import InputError, ParameterError
 from quadsim.flightlog import FlightLog
-from quadsim.loop import fly
-from quadsim.plant import Plant
+from quadsim.plant import Plant, Stretch
 from quadsim.state import Array
+from quadsim.vehicle import Vehicle
 from scenarios.build import (
     build_controller,
-    build_initial_state,
     build_limits,
     build_plant,
     build_reference,
     build_vehicle,
 )
+from scenarios.flying import fly_once
+from scenarios.navigation import build_navigation
 from scenarios.runner import Progress, machine, silent
 from scenarios.spec import Scenario
 
@@ -47,7 +48,7 @@ class _TimedPlant(Plant):
         finally:
             self.measurement_s += clock.perf_counter() - started
 
-    def advance(self, speeds: Array, steps: int) -> Array:
+    def advance(self, speeds: Array, steps: int) -> Stretch:
         """See `quadsim.plant.Plant.advance`."""
         started = clock.perf_counter()
         try:
@@ -77,13 +78,14 @@ def bench_flight(scenario: Scenario, *, repeats: int = REPEATS, progress: Progre
         plant, limits = build_plant(scenario, vehicle), build_limits(scenario)
         reference = build_reference(scenario, scenario.periods + controller.horizon)
         setup_s = clock.perf_counter() - started
-        timed = _TimedPlant(vehicle, timestep=scenario.plant.timestep, limit_speeds=scenario.plant.limit_speeds)
+        timed = build_plant(scenario, vehicle, _TimedPlant)
+        assert isinstance(timed, _TimedPlant)
         wall, profiles, audits = [], [], []
         with plant, timed:
             for done in range(repeats):
-                wall.append(_fly(scenario, plant, controller, reference)[0])
+                wall.append(_fly(scenario, vehicle, plant, controller, reference)[0])
                 timed.physics_s = timed.measurement_s = 0.0
-                whole, log = _fly(scenario, timed, controller, reference)
+                whole, log = _fly(scenario, vehicle, timed, controller, reference)
                 if log.reason is not None:
                     raise InputError(f"{scenario.name}: a flight that is lost cannot be timed: {log.reason}")
                 profiles.append(_pieces(whole, log, timed))
@@ -105,18 +107,13 @@ def bench_flight(scenario: Scenario, *, repeats: int = REPEATS, progress: Progre
     )
 
 
-def _fly(scenario: Scenario, plant: Plant, controller: Controller, reference: Array) -> tuple[float, FlightLog]:
+def _fly(
+    scenario: Scenario, vehicle: Vehicle, plant: Plant, controller: Controller, reference: Array
+) -> tuple[float, FlightLog]:
     """Wall time [s] of the closed loop, and what was flown."""
     started = clock.perf_counter()
-    log = fly(
-        plant,
-        controller,
-        reference,
-        initial_state=build_initial_state(scenario),
-        initial_speeds=plant.hover_speeds,
-        periods=scenario.periods,
-        steps_per_period=scenario.steps_per_period,
-    )
+    navigation = build_navigation(scenario, vehicle)
+    log = fly_once(scenario, vehicle, plant, controller, reference, navigation=navigation)
     return clock.perf_counter() - started, log
 
 

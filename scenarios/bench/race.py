@@ -7,18 +7,17 @@ random order.  A stretch begins with the period before it, which is not timed.
 
 from __future__ import annotations
 
-import contextlib
 import gc
 import math
 import time as clock
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final, Protocol
 
 import numpy as np
-from threadpoolctl import threadpool_limits
 
 from quadsim.state import Array
+from scenarios.timing import undisturbed
 
 STRETCH: Final = 20
 """Consecutive periods that a contender answers before it is the next one's turn."""
@@ -99,22 +98,6 @@ def race(
                     progress(done, total)
     progress(total, total)
     return {name: Laps(ms=np.array(laps)) for name, laps in passes.items()}
-
-
-@contextlib.contextmanager
-def undisturbed() -> Iterator[None]:
-    """Linear algebra on one thread; no garbage collection but where it is asked for, and none of what is there now."""
-    collecting = gc.isenabled()
-    gc.collect()
-    gc.freeze()
-    gc.disable()
-    try:
-        with threadpool_limits(limits=1):
-            yield
-    finally:
-        gc.unfreeze()
-        if collecting:
-            gc.enable()
 
 
 def _turn(entrant: Entrant, stretch: range, left_ms: float) -> list[float]:

@@ -2,6 +2,16 @@
 
 from scenarios.spec.controller import ANGLES, LARGEST_HORIZON, ConstrainedSpec, UnconstrainedSpec
 from scenarios.spec.course import WindowSpec
-from scenarios.spec.scenario import MOST_STEPS, Scenario
+from scenarios.spec.scenario import MOST_STEPS, Group, Scenario, Verdict
 
-__all__ = ["ANGLES", "LARGEST_HORIZON", "MOST_STEPS", "ConstrainedSpec", "Scenario", "UnconstrainedSpec", "WindowSpec"]
+__all__ = [
+    "ANGLES",
+    "LARGEST_HORIZON",
+    "MOST_STEPS",
+    "ConstrainedSpec",
+    "Group",
+    "Scenario",
+    "UnconstrainedSpec",
+    "Verdict",
+    "WindowSpec",
+]

@@ -8,21 +8,26 @@ from pydantic import Field, model_validator
 
 from quadsim.audit import SIGNALS
 from quadsim.errors import UnknownNameError
-from scenarios.spec.base import Number, Spec
+from scenarios.spec.base import NonNegative, Number, Spec
 
 
 class ConstraintSpec(Spec):
-    """What the flight is audited against; see `quadsim.audit.Limit`."""
+    """Bounds on a signal of the flight; see `quadsim.audit.Limit`."""
 
-    name: Annotated[str, Field(pattern=r"^[A-Za-z0-9_.-]+$")]
-    signal: str
-    lower: Number | None = None
-    upper: Number | None = None
-    tolerance: Annotated[float, Field(ge=0.0, le=1e6, description="at the physics rate")] = 0.0
-    tolerance_sampled: Annotated[float, Field(ge=0.0, le=1e6, description="at the control samples")] = 0.0
+    name: Annotated[str, Field(pattern=r"^[A-Za-z0-9_.-]+$")] = Field(description="what reports call it")
+    signal: str = Field(
+        description="what is bounded: " + ", ".join(f"{name} [{signal.unit}]" for name, signal in SIGNALS.items()),
+        json_schema_extra={"enum": [*SIGNALS]},
+    )
+    lower: Number | None = Field(default=None, description="[unit of the signal] lower bound")
+    upper: Number | None = Field(default=None, description="[unit of the signal] upper bound")
+    tolerance: NonNegative = Field(default=0.0, description="[unit of the signal] allowed beyond, at the physics rate")
+    tolerance_sampled: NonNegative = Field(
+        default=0.0, description="[unit of the signal] allowed beyond, at the control samples"
+    )
     required: bool = Field(default=True, description="false: measured and reported, never a failure")
-    start: Number = Field(default=0.0, description="first time it holds [s]")
-    stop: Number | None = Field(default=None, description="last time it holds [s]")
+    start: Number = Field(default=0.0, description="[s] first time it holds")
+    stop: Number | None = Field(default=None, description="[s] last time it holds; absent: the flight's end")
 
     @model_validator(mode="after")
     def _check(self) -> ConstraintSpec:

@@ -32,16 +32,16 @@ Weights = Annotated[
 
 
 class InputWeightsSpec(Spec):
-    """Diagonal of Q_u."""
+    """What it costs to move the rotor speeds away from hover."""
 
-    speed: Weights
+    speed: Weights = Field(description="[1/(rad/s)^2] diagonal of Q_u: one weight for all rotors, or a list of four")
 
 
 class InputBoundsSpec(Spec):
     """Hard bounds on the rotor speeds and their steps, for every rotor."""
 
-    speed: Pair = Field(description="u_min, u_max [rad/s].  Eq. (20)")
-    slew: Pair = Field(description="delta_min, delta_max [rad/s per period].  Eq. (15)")
+    speed: Pair = Field(description="[rad/s] u_min, u_max of every rotor.  Eq. (20)")
+    slew: Pair = Field(description="[rad/s per period] delta_min, delta_max of every rotor.  Eq. (15)")
 
     @model_validator(mode="after")
     def _check(self) -> InputBoundsSpec:
@@ -63,8 +63,10 @@ def _known_states(values: Mapping[str, object], name: str) -> None:
 
 
 class _ControllerSpec(Spec):
-    horizon: Annotated[int, Field(ge=1, le=LARGEST_HORIZON, description="N, control periods")]
-    output_weights: Annotated[dict[str, Weight], Len(1)] = Field(description="C_r by its keys, diagonal of Q_y")
+    horizon: Annotated[int, Field(ge=1, le=LARGEST_HORIZON)] = Field(description="[periods] N, how far it looks ahead")
+    output_weights: Annotated[dict[str, Weight], Len(1)] = Field(
+        description="diagonal of Q_y [1/unit of the state^2, rad for angles]; the states named here are C_r"
+    )
     input_weights: InputWeightsSpec
 
     @model_validator(mode="after")
@@ -74,20 +76,26 @@ class _ControllerSpec(Spec):
 
 
 class UnconstrainedSpec(_ControllerSpec):
-    """The paper's Sec. 4."""
+    """The paper's unconstrained MPC, a constant gain (Sec. 4)."""
 
-    type: Literal["unconstrained"]
+    type: Literal["unconstrained"] = Field(description="the control law, by its name in `quadsim list`")
 
 
 class ConstrainedSpec(_ControllerSpec):
-    """The paper's Sec. 5."""
+    """The paper's constrained MPC, at most one QP per period (Sec. 5)."""
 
-    type: Literal["constrained"]
-    solver: str = Field(default="piqp-multistage", description="a name from `quadsim list`")
+    type: Literal["constrained"] = Field(description="the control law, by its name in `quadsim list`")
+    solver: str = Field(
+        default="piqp-multistage",
+        description="QP solver, by its name in `quadsim list`",
+        json_schema_extra={"enum": [*SOLVERS]},
+    )
     shortcut: bool = Field(
         default=True, description="take the unconstrained optimum where no constraint bars it; exact"
     )
-    output_bounds: dict[str, Pair] = Field(default={}, description="C_c by its keys; deg for angles, deg/s for rates")
+    output_bounds: dict[str, Pair] = Field(
+        default={}, description="[deg, deg/s, m, m/s] y_c_min, y_c_max; the states named here are C_c"
+    )
     input_bounds: InputBoundsSpec
 
     @model_validator(mode="after")

@@ -2,40 +2,71 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Final
+from typing import Annotated, Final, Literal, get_args
 
-import tomli_w
 from pydantic import Field, model_validator
 
 from quadsim.errors import ParameterError
 from quadsim.plant import steps_per_period
 from scenarios.spec.base import Spec
+from scenarios.spec.computation import ComputationSpec
 from scenarios.spec.constraint import ConstraintSpec
 from scenarios.spec.controller import ConstrainedSpec, UnconstrainedSpec
 from scenarios.spec.course import ReferenceSpec
+from scenarios.spec.effects import EffectsSpec
+from scenarios.spec.events import Event, PayloadDropEvent, PayloadPickupEvent, SensorFaultEvent
+from scenarios.spec.sensors import EstimatorSpec, SensorsSpec, check_sensing
 from scenarios.spec.start import InitialSpec, PlantSpec
 from scenarios.spec.vehicle import VehicleSpec
+from scenarios.writing import to_toml
 
 LONGEST_FLIGHT: Final = 86_400.0
 MOST_STEPS: Final = 10_000_000
 """Physics steps, and planned steps (periods times horizon), that one flight may take: each is held in memory."""
 
 
-class Scenario(Spec):
-    """A whole scenario file."""
+Group = Literal["paper", "courses", "air", "faults", "ground", "sensors", "other"]
+Verdict = Literal["satisfied", "violated", "lost"]
 
-    name: Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9._-]*$", max_length=80)]
-    description: str
-    duration: Annotated[float, Field(gt=0.0, le=LONGEST_FLIGHT, description="[s]")]
-    control_period: Annotated[float, Field(gt=0.0, le=10.0, description="tau_s [s]")]
-    seed: Annotated[int, Field(ge=0)] = 0
-    log_rate: Annotated[float, Field(ge=0.01, le=1e6, description="rows of plant.parquet per second [Hz]")] = 200.0
+
+class Scenario(Spec):
+    """A flight: what flies, where, by which controller, and what is required of it."""
+
+    name: Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9._-]*$", max_length=80)] = Field(
+        description="letters a-z, digits and . _ -; names the run's directory"
+    )
+    description: str = Field(description="one line for `quadsim list`")
+    group: Group = Field(default="other", description="where `quadsim list` shows it: " + ", ".join(get_args(Group)))
+    expect: Verdict = Field(
+        default="satisfied",
+        description="its verdict, if all is right: satisfied (flown to its end, every required constraint holds), "
+        "violated (one does not), lost (the flight is aborted)",
+    )
+    duration: Annotated[float, Field(gt=0.0, le=LONGEST_FLIGHT)] = Field(
+        description="[s] simulated time, a whole number of control periods"
+    )
+    control_period: Annotated[float, Field(gt=0.0, le=10.0)] = Field(
+        description="[s] tau_s, time for which a command is held, a whole number of physics steps"
+    )
+    seed: Annotated[int, Field(ge=0)] = Field(default=0, description="of everything random; recorded with the flight")
+    log_rate: Annotated[float, Field(ge=0.01, le=1e6)] = Field(
+        default=200.0, description="[Hz] rows of plant.parquet; the audit sees every physics step"
+    )
     vehicle: VehicleSpec
     initial: InitialSpec = InitialSpec()
     plant: PlantSpec = PlantSpec()
     reference: ReferenceSpec
     controller: Annotated[UnconstrainedSpec | ConstrainedSpec, Field(discriminator="type")]
-    constraints: list[ConstraintSpec] = []
+    effects: EffectsSpec = EffectsSpec()
+    computation: ComputationSpec | None = Field(default=None, description="absent: commands take no time")
+    sensors: SensorsSpec | None = Field(default=None, description="absent: the controller is told the true state")
+    estimator: EstimatorSpec | None = Field(
+        default=None, description="absent: the controller is told what the sensors say, as it arrives"
+    )
+    events: list[Event] = Field(default=[], description="what happens on the way")
+    constraints: list[ConstraintSpec] = Field(
+        default=[], description="what the flight is audited against; signals and their units are those of the audit"
+    )
 
     @model_validator(mode="after")
     def _check(self) -> Scenario:
@@ -57,10 +88,31 @@ class Scenario(Spec):
         ):
             if count > MOST_STEPS:
                 raise ValueError(f"duration must make at most {MOST_STEPS} {what}; got {count} of them")
+        self._check_events()
+        if self.initial.cold and not (self.effects.ground is not None and self.effects.ground.contact):
+            raise ValueError("initial.cold must be false where effects.ground gives no floor to stand on; got true")
+        check_sensing(self.sensors, self.estimator, timestep=self.plant.timestep)
         names = [constraint.name for constraint in self.constraints]
         if len(set(names)) < len(names):
             raise ValueError(f"constraints must have distinct names; got {names}")
         return self
+
+    def _check_events(self) -> None:
+        carried = len(self.effects.load.payloads) if self.effects.load is not None else 0
+        for i, event in sorted(enumerate(self.events), key=lambda entry: entry[1].at):
+            if event.at >= self.duration:
+                raise ValueError(f"events.{i}.at must be before the flight's end, {self.duration} s; got {event.at}")
+            if isinstance(event, PayloadPickupEvent):
+                carried += 1
+            elif isinstance(event, PayloadDropEvent):
+                if not carried:
+                    raise ValueError(f"events.{i}.type must not be payload_drop at {event.at} s: nothing is carried")
+                carried = 0
+            elif isinstance(event, SensorFaultEvent) and self.estimator is not None:
+                present = [] if self.sensors is None else [str(name) for name in self.sensors.present()]
+                if event.sensor not in present:
+                    rule = f"one that the estimator has, of {', '.join(present)}"
+                    raise ValueError(f"events.{i}.sensor must be {rule}; got {event.sensor!r}")
 
     @property
     def periods(self) -> int:
@@ -78,5 +130,5 @@ class Scenario(Spec):
         return steps_per_period(1.0 / self.log_rate, self.plant.timestep)
 
     def to_toml(self) -> str:
-        """The resolved file: every field, defaults included; parsing it gives this scenario again."""
-        return tomli_w.dumps(self.model_dump(exclude_none=True))
+        """The resolved file: every field, defaults included, with comments; parsing it gives this scenario again."""
+        return to_toml(self)

@@ -10,10 +10,13 @@ from scenarios.spec.base import Spec, Triple
 
 
 class InitialSpec(Spec):
-    """Where the flight starts, at rest; the command before the first is hover."""
+    """Where the flight starts, at rest."""
 
-    position: Triple = Field(default=[0.0, 0.0, 0.0], description="x, y, z [m], world")
-    euler: Triple = Field(default=[0.0, 0.0, 0.0], description="roll, pitch, yaw [deg]")
+    position: Triple = Field(default=[0.0, 0.0, 0.0], description="[m] x, y, z in the world frame")
+    euler: Triple = Field(default=[0.0, 0.0, 0.0], description="[deg] roll, pitch, yaw")
+    cold: bool = Field(
+        default=False, description="whether it starts on the ground with rotors at rest, u(-1) = 0; else from hover"
+    )
 
     @model_validator(mode="after")
     def _check(self) -> InitialSpec:
@@ -25,5 +28,7 @@ class InitialSpec(Spec):
 class PlantSpec(Spec):
     """The simulated vehicle."""
 
-    timestep: Annotated[float, Field(ge=1e-6, le=0.01, description="physics step [s]")] = 1e-3
-    limit_speeds: bool = Field(default=False, description="whether rotors saturate at the vehicle's speed range")
+    timestep: Annotated[float, Field(ge=1e-6, le=0.01)] = Field(default=1e-3, description="[s] physics step")
+    limit_speeds: bool = Field(
+        default=False, description="whether rotors saturate at the vehicle's speed_min and speed_max"
+    )

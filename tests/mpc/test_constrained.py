@@ -10,7 +10,7 @@ from support import paper_problem, paper_reference
 
 from mpc.constrained import ConstrainedMPC
 from mpc.solvers import Answer, QPSolver
-from quadsim.controller import Command
+from quadsim.controller import Command, Moment
 from quadsim.errors import PlanExhaustedError
 from quadsim.state import Array
 
@@ -44,7 +44,7 @@ def fly(faults: dict[int, str], periods: int, horizon: int = 50) -> list[Command
     controller = ConstrainedMPC(solver.problem, solver)
     controller.reset(solver.problem.model.u_bar)
     reference = paper_reference(periods + horizon + 1)
-    return [controller.step(0.05 * k, STATE, reference[k + 1 : k + 1 + horizon]) for k in range(periods)]
+    return [controller.step(Moment(time=0.05 * k), STATE, reference[k + 1 : k + 1 + horizon]) for k in range(periods)]
 
 
 def test_commands_respect_their_hard_bounds_exactly() -> None:
@@ -90,10 +90,10 @@ def test_reset_forgets_the_plan() -> None:
     controller = ConstrainedMPC(solver.problem, solver)
     reference = paper_reference(60)[1:51]
     controller.reset(solver.problem.model.u_bar)
-    controller.step(0.0, STATE, reference)
+    controller.step(Moment(), STATE, reference)
     controller.reset(solver.problem.model.u_bar)
     with pytest.raises(PlanExhaustedError):
-        controller.step(0.0, STATE, reference)
+        controller.step(Moment(), STATE, reference)
 
 
 def test_back_ends_do_not_accept_a_measured_nan() -> None:
@@ -101,4 +101,4 @@ def test_back_ends_do_not_accept_a_measured_nan() -> None:
     controller = ConstrainedMPC(solver.problem, solver)
     controller.reset(solver.problem.model.u_bar)
     with pytest.raises(PlanExhaustedError):
-        controller.step(0.0, STATE * np.nan, paper_reference(60)[1:51])
+        controller.step(Moment(), STATE * np.nan, paper_reference(60)[1:51])

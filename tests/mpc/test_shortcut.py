@@ -19,7 +19,7 @@ from mpc.problem import Problem
 from mpc.shortcut import Shortcut, make_shortcut
 from mpc.solvers import QPSolver
 from mpc.unconstrained import sequence_gains
-from quadsim.controller import SOLVED, UNCONSTRAINED
+from quadsim.controller import SOLVED, UNCONSTRAINED, Moment
 from quadsim.state import Array
 from scenarios.runner import Flight
 
@@ -111,7 +111,7 @@ def test_commands_with_and_without_it_are_the_same(constrained_flight: Flight) -
         commands = []
         for controller in (with_it, without):
             controller.reset(log.speeds[k - 1])
-            commands.append(controller.step(0.05 * k, log.state[k], reference[k + 1 : k + 51]))
+            commands.append(controller.step(Moment(time=0.05 * k), log.state[k], reference[k + 1 : k + 51]))
         statuses.add((commands[0].status, commands[1].status))
         np.testing.assert_allclose(commands[0].speeds, commands[1].speeds, atol=1e-4)
     assert statuses == {(SOLVED, SOLVED), (UNCONSTRAINED, SOLVED)}
@@ -148,16 +148,16 @@ def test_steps_leave_no_memory_behind_and_allocate_nothing_large(height: float) 
     reference = np.tile([0.0, 0.0, height, 0.0], (50, 1))
     state = np.zeros(12)
     for _ in range(5):
-        controller.step(0.0, state, reference)
+        controller.step(Moment(), state, reference)
         controller.reset(problem.model.u_bar)
     tracemalloc.start()
     try:
-        status = controller.step(0.0, state, reference).status
+        status = controller.step(Moment(), state, reference).status
         controller.reset(problem.model.u_bar)
         before, _ = tracemalloc.get_traced_memory()
         tracemalloc.reset_peak()
         for _ in range(50):
-            controller.step(0.0, state, reference)
+            controller.step(Moment(), state, reference)
             controller.reset(problem.model.u_bar)
         after, peak = tracemalloc.get_traced_memory()
     finally:

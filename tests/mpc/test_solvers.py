@@ -17,7 +17,7 @@ from mpc.solvers import SOLVERS, QPSolver, make_backend
 from mpc.solvers.daqp_dense import DaqpDense
 from mpc.solvers.osqp_sparse import OsqpSparse
 from mpc.solvers.piqp_dense import PiqpDense
-from quadsim.controller import SOLVED
+from quadsim.controller import SOLVED, Moment
 from quadsim.errors import MissingPackageError, PlanExhaustedError, UnknownNameError
 from scenarios import runner
 from scenarios.loading import load_scenario
@@ -65,7 +65,7 @@ def test_data_that_is_not_finite_reaches_no_back_end(place: int, spoilt: float) 
     controller = ConstrainedMPC(problem, solver, shortcut=False)
     controller.reset(problem.model.u_bar)
     with pytest.raises(PlanExhaustedError, match="invalid_data"):
-        controller.step(0.0, np.full(12, np.nan), paper_reference(51)[1:])
+        controller.step(Moment(), np.full(12, np.nan), paper_reference(51)[1:])
 
 
 @pytest.mark.parametrize("kind", [DaqpDense, OsqpSparse])

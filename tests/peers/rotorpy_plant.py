@@ -17,7 +17,7 @@ from rotorpy.vehicles.multirotor import Multirotor
 from scipy.integrate import solve_ivp
 
 from quadsim.errors import ParameterError
-from quadsim.plant import physics_to_state
+from quadsim.plant import Stretch, physics_to_state
 from quadsim.state import EULER, EULER_RATE, POSITION, VELOCITY, Array, euler_to_body_rates, euler_to_quaternion
 from quadsim.vehicle import N_ROTORS, Vehicle
 
@@ -75,8 +75,14 @@ class RotorPyPlant:
         """(14,) the state now, in MuJoCo's order."""
         return _to_physics(np.array([self._time]), self._vector[None])[0]
 
-    def reset(self, state: Array) -> None:
-        """Put the vehicle at a state (12,) at time zero, in still air."""
+    @property
+    def speeds(self) -> Array:
+        """(4,) rotor speeds now [rad/s]."""
+        return self._vector[16:].copy()
+
+    def reset(self, state: Array, speeds: Array | None = None) -> None:
+        """Put the vehicle at a state (12,) at time zero, in still air, its rotors at speeds (4,) [rad/s]."""
+        self._vector[16:] = self.vehicle.hover_speed if speeds is None else speeds
         euler = state[list(EULER)]
         self._vector[:13] = np.concatenate(
             [
@@ -98,8 +104,8 @@ class RotorPyPlant:
         """The rotor speeds (4,) [rad/s] that a command makes."""
         return np.maximum(speeds, 0.0)
 
-    def advance(self, speeds: Array, steps: int) -> Array:
-        """Hold rotor speeds (4,) [rad/s], and return (steps, 14) states in MuJoCo's order.
+    def advance(self, speeds: Array, steps: int) -> Stretch:
+        """Hold rotor speeds (4,) [rad/s], and return the states in MuJoCo's order.
 
         RotorPy's `step` integrates the same function in the same way, but gives the end of the hold alone.
         """
@@ -117,7 +123,7 @@ class RotorPyPlant:
         vectors[:, 6:10] /= np.linalg.norm(vectors[:, 6:10], axis=1, keepdims=True)
         physics = _to_physics(self._time + t, vectors)
         self._time, self._vector = float(physics[-1, 0]), vectors[-1].copy()
-        return physics
+        return Stretch(physics=physics, speeds=np.tile(held, (steps, 1)), wrench=None, wind=None)
 
 
 def _to_physics(t: Array, vectors: Array) -> Array:

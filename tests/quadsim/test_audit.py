@@ -119,7 +119,7 @@ def test_units_of_signals() -> None:
 @given(roll=st.floats(-80.0, 80.0), pitch=st.floats(-80.0, 80.0))
 def test_tilt_is_the_angle_between_thrust_and_vertical(roll: float, pitch: float) -> None:
     log = small_log(1)
-    log.control.state[0, [6, 8]] = np.radians([roll, pitch])
+    log.control.truth[0, [6, 8]] = np.radians([roll, pitch])
     expected = math.degrees(math.acos(math.cos(math.radians(roll)) * math.cos(math.radians(pitch))))
     assert SIGNALS["tilt"].sampled(log.control)[0] == pytest.approx(expected)
 
@@ -127,7 +127,7 @@ def test_tilt_is_the_angle_between_thrust_and_vertical(roll: float, pitch: float
 @pytest.mark.parametrize(("axis", "state", "scale"), [("x", 0, 1.0), ("yaw", 10, 180.0 / math.pi)])
 def test_errors_are_real_minus_reference_at_the_samples(axis: str, state: int, scale: float) -> None:
     log = small_log(3)
-    errors = scale * (log.control.state[:, state] - log.control.reference[:, {"x": 0, "yaw": 3}[axis]])
+    errors = scale * (log.control.truth[:, state] - log.control.reference[:, {"x": 0, "yaw": 3}[axis]])
     finding = find(log, Limit(name="error", signal=f"{axis}_error", upper=0.0))
     assert finding.peak_sampled == finding.peak_plant == pytest.approx(errors.max())
     assert finding.worst_time == log.control.t[np.argmax(errors)]

@@ -18,13 +18,16 @@ from quadsim.flightlog import FLIGHT_FILE, HORIZON_FILE, PLANT_FILE, TIMING_FILE
 UNITS = {
     FLIGHT_FILE: (
         "t=s x=m vx=m/s y=m vy=m/s z=m vz=m/s roll=rad roll_rate=rad/s pitch=rad pitch_rate=rad/s yaw=rad "
-        "yaw_rate=rad/s ref_x=m ref_y=m ref_z=m ref_yaw=rad u1=rad/s u2=rad/s u3=rad/s u4=rad/s status=- "
-        "iterations=- active=- fallback=- slack=rad primal_residual=- dual_residual=-"
+        "yaw_rate=rad/s ref_x=m ref_y=m ref_z=m ref_yaw=rad u1=rad/s u2=rad/s u3=rad/s u4=rad/s status=- phase=- "
+        "iterations=- active=- fallback=- slack=rad primal_residual=- dual_residual=- delay=s "
+        "true_x=m true_vx=m/s true_y=m true_vy=m/s true_z=m true_vz=m/s true_roll=rad true_roll_rate=rad/s "
+        "true_pitch=rad true_pitch_rate=rad/s true_yaw=rad true_yaw_rate=rad/s"
     ),
     TIMING_FILE: "t=s solve_ms=ms step_ms=ms",
     PLANT_FILE: (
         "t=s x=m vx=m/s y=m vy=m/s z=m vz=m/s roll=rad roll_rate=rad/s pitch=rad pitch_rate=rad/s yaw=rad "
-        "yaw_rate=rad/s w1=rad/s w2=rad/s w3=rad/s w4=rad/s"
+        "yaw_rate=rad/s w1=rad/s w2=rad/s w3=rad/s w4=rad/s force_x=N force_y=N force_z=N torque_x=N m torque_y=N m "
+        "torque_z=N m wind_x=m/s wind_y=m/s wind_z=m/s"
     ),
     HORIZON_FILE: "t=s predicted_x=m predicted_y=m predicted_z=m",
 }
@@ -81,6 +84,20 @@ def test_every_column_has_its_unit(tmp_path: Path, name: str) -> None:
     assert " ".join(f"{field.name}={field.metadata[b'unit'].decode()}" for field in schema) == UNITS[name]
     assert schema.metadata[b"scenario"] == b"made-up"
     assert schema.metadata[b"seed"] == b"3"
+
+
+def test_what_a_flight_does_not_have_takes_no_column(tmp_path: Path) -> None:
+    log = small_log()
+    control = dataclasses.replace(log.control, truth=log.control.state)
+    plain = dataclasses.replace(log, control=control, plant=dataclasses.replace(log.plant, wrench=None, wind=None))
+    write(tmp_path, plain)
+    assert not [name for name in pq.read_schema(tmp_path / FLIGHT_FILE).names if name.startswith("true_")]
+    assert pq.read_schema(tmp_path / PLANT_FILE).names[-1] == "w4"
+    back = read_log(tmp_path)
+    assert back.plant.wrench is None
+    assert back.plant.wind is None
+    np.testing.assert_array_equal(back.control.truth, log.control.state)
+    assert back.control.measured_perfectly
 
 
 def test_equal_flights_give_equal_bytes(tmp_path: Path) -> None:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import pytest
 
-from quadsim.controller import Command, Controller
+from quadsim.controller import Command, Controller, Moment
 from quadsim.errors import PlanExhaustedError
 from quadsim.flightlog import FlightLog
 from quadsim.loop import fly
@@ -32,9 +32,9 @@ class Scripted:
     def reset(self, speeds: Array) -> None:
         self.seen = []
 
-    def step(self, time: float, state: Array, reference: Array) -> Command:
+    def step(self, now: Moment, state: Array, reference: Array) -> Command:
         k = len(self.seen)
-        self.seen.append((time, state, reference))
+        self.seen.append((now.time, state, reference))
         if k in self.raises:
             raise self.raises[k]
         return Command(speeds=self.speeds[k], plan=np.tile(self.speeds[k], (HORIZON, 1)))

@@ -21,7 +21,7 @@ def control(z: list[float], reference: list[float]) -> ControlLog:
     log = small_log(len(z)).control
     state, wanted = np.zeros_like(log.state), np.zeros_like(log.reference)
     state[:, 4], wanted[:, 2] = z, reference
-    return replace(log, state=state, reference=wanted)
+    return replace(log, truth=state, reference=wanted)
 
 
 def test_tracking_errors_are_real_minus_reference() -> None:

@@ -1,0 +1,98 @@
+"""What the vehicle really weighs: errors of mass and inertia, a shifted centre of mass, payloads."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+
+from quadsim.errors import ParameterError
+from quadsim.state import Array
+from quadsim.vehicle import Vehicle
+
+
+@dataclass(frozen=True, kw_only=True)
+class Payload:
+    """A point mass fixed to the vehicle.
+
+    Attributes:
+        mass: [kg].
+        position: (x, y, z) in the body frame [m].
+    """
+
+    mass: float
+    position: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.mass < np.inf:
+            raise ParameterError("effects.load.payloads", "mass", self.mass, "positive and finite")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Load:
+    """How the vehicle that flies differs from its file, which the controller goes on believing.
+
+    Attributes:
+        mass_factor: real mass over the file's.
+        inertia_factor: real moments of inertia over the file's, about the body axes.
+        centre_of_mass: where it really is, in the body frame [m].
+        payloads: what it carries from the start.
+    """
+
+    mass_factor: float = 1.0
+    inertia_factor: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    centre_of_mass: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    payloads: tuple[Payload, ...] = ()
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.mass_factor < np.inf:
+            raise ParameterError("effects.load", "mass_factor", self.mass_factor, "positive and finite")
+        if not all(0.0 < factor < np.inf for factor in self.inertia_factor):
+            rule = "three positive and finite numbers"
+            raise ParameterError("effects.load", "inertia_factor", self.inertia_factor, rule)
+
+
+@dataclass(frozen=True, kw_only=True)
+class MassProperties:
+    """A rigid body's mass [kg], centre of mass (3,) [m] and inertia (3, 3) about that centre [kg m^2]; body axes."""
+
+    mass: float
+    centre: Array
+    inertia: Array
+
+
+def mass_properties(vehicle: Vehicle, load: Load, payloads: Sequence[Payload]) -> MassProperties:
+    """The vehicle with its errors, and what it carries, as one body.
+
+    The parallel-axis theorem: I = sum_i (I_i + m_i (|r_i|^2 1 - r_i r_i')), r_i from the common centre of mass to each
+    part's.
+
+    Raises:
+        ParameterError: the moments of inertia are those of no rigid body.
+    """
+    own = np.diag(np.array(vehicle.inertia) * load.inertia_factor)
+    if 2.0 * own.max() > np.trace(own) * (1.0 + 1e-12):
+        rule = f"such that no moment of {np.diagonal(own).tolist()} kg m^2 exceeds the sum of the other two"
+        raise ParameterError("effects.load", "inertia_factor", list(load.inertia_factor), rule)
+    masses = np.array([vehicle.mass * load.mass_factor, *(payload.mass for payload in payloads)])
+    places = np.array([load.centre_of_mass, *(payload.position for payload in payloads)], float)
+    total = float(masses.sum())
+    centre = masses @ places / total
+    inertia = own
+    for mass, arm in zip(masses, places - centre, strict=True):
+        inertia = inertia + mass * (arm @ arm * np.eye(3) - np.outer(arm, arm))
+    return MassProperties(mass=total, centre=centre, inertia=inertia)
+
+
+def apply_mass(model: mujoco.MjModel, body: str, properties: MassProperties) -> None:
+    """Give a body of a compiled model its mass; velocities are those of the moment, as if it had been so all along."""
+    i = model.body(body).id
+    moments, axes = np.linalg.eigh(properties.inertia)
+    axes[:, 2] *= np.sign(np.linalg.det(axes))  # a rotation, not a reflection
+    model.body_mass[i] = properties.mass
+    model.body_ipos[i] = properties.centre
+    model.body_inertia[i] = moments
+    mujoco.mju_mat2Quat(model.body_iquat[i], axes.ravel())
+    mujoco.mj_setConst(model, mujoco.MjData(model))

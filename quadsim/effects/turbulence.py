@@ -1,0 +1,170 @@
+"""Continuous turbulence: the Dryden spectra of MIL-F-8785C at low altitude, sampled exactly.
+
+The turbulence is a frozen field (Taylor's hypothesis) that the mean wind carries past the vehicle at the airspeed V:
+a wave number Omega [rad/m] is met at the frequency V Omega / (2 pi) [Hz].  Its spectra are one-sided, and integrate to
+sigma^2 over Omega > 0 (Sec. 3.7.1.2):
+
+    Phi_u = sigma_u^2 (2 L_u / pi) / (1 + (L_u Omega)^2)
+    Phi_v = sigma_v^2 (L_v / pi) (1 + 3 (L_v Omega)^2) / (1 + (L_v Omega)^2)^2,    Phi_w likewise
+
+which are those of white noise of unit intensity behind the filters, with tau = L / V,
+
+    H_u(s) = sigma_u sqrt(2 tau_u) / (1 + tau_u s)
+    H_v(s) = sigma_v sqrt(tau_v) (1 + sqrt(3) tau_v s) / (1 + tau_v s)^2,           H_w likewise
+
+and belong to the autocovariances sigma_u^2 exp(-|t| / tau_u) and sigma_v^2 (1 - |t| / (2 tau_v)) exp(-|t| / tau_v).
+
+The rotational gusts p, q, r of the specification stand for the change of the field over a wing span.  They are left
+out: a quadrotor is much smaller than the scale lengths.
+"""
+
+from __future__ import annotations
+
+import copy
+import math
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from quadsim.errors import ParameterError
+from quadsim.state import Array
+
+LOWEST, HIGHEST = 3.048, 304.8
+"""Heights [m] between which the low-altitude model holds: 10 and 1000 ft (Figs. 10 and 11)."""
+_METRES_PER_FOOT: Final = 0.3048
+_BLOCK: Final = 4096
+"""Samples made at a time: their number is fixed, so that it makes no difference how many are asked for at once."""
+_OUTPUT: Final = np.array([[1.0, *2 * [math.sqrt(1.5)]], [0.0, *2 * [(1.0 - math.sqrt(3.0)) / math.sqrt(2.0)]]])
+"""(2, 3) what the states a and b of `discretise` give to u, v, w at unit sigma; from the partial fractions of H."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Dryden:
+    """Strength and size of the turbulence, MIL-F-8785C, Sec. 3.7.3.4; the order of axes is u, v, w.
+
+    u is along the mean wind, v across it and horizontal, w vertical.
+
+    Attributes:
+        altitude: h, height above the ground [m].
+        wind_speed_20ft: W20, mean wind speed 20 ft (6.1 m) above the ground [m/s]; turbulence is light, moderate and
+            severe at 15, 30 and 45 knots (7.7, 15.4 and 23.2 m/s, Fig. 9).
+        airspeed: V, at which the field passes the vehicle [m/s]; in hover, the speed of the mean wind.
+
+    Raises:
+        ParameterError: the altitude is outside the model, the wind speed negative, or the airspeed not positive.
+    """
+
+    altitude: float
+    wind_speed_20ft: float
+    airspeed: float
+
+    def __post_init__(self) -> None:
+        if not LOWEST <= self.altitude <= HIGHEST:
+            rule = f"between {LOWEST} and {HIGHEST} m (10 to 1000 ft), where the model of MIL-F-8785C holds"
+            raise ParameterError("turbulence", "altitude", self.altitude, rule)
+        if not 0.0 <= self.wind_speed_20ft < math.inf:
+            raise ParameterError("turbulence", "wind_speed_20ft", self.wind_speed_20ft, "a finite speed >= 0 m/s")
+        if not 0.0 < self.airspeed < math.inf:
+            raise ParameterError("turbulence", "airspeed", self.airspeed, "a finite speed > 0 m/s")
+
+    @property
+    def lengths(self) -> Array:
+        """(3,) scale lengths [m]: L_u = L_v = h / (0.177 + 0.000823 h)^1.2 and L_w = h, there in feet."""
+        horizontal = self.altitude / self._height_term**1.2
+        return np.array([horizontal, horizontal, self.altitude])
+
+    @property
+    def intensities(self) -> Array:
+        """(3,) standard deviations [m/s]: sigma_w = 0.1 W20, sigma_u = sigma_v = sigma_w / (0.177 + 0.000823 h)^0.4."""
+        vertical = 0.1 * self.wind_speed_20ft
+        horizontal = vertical / self._height_term**0.4
+        return np.array([horizontal, horizontal, vertical])
+
+    @property
+    def _height_term(self) -> float:
+        return 0.177 + 0.000823 * self.altitude / _METRES_PER_FOOT
+
+
+class Turbulence:
+    """The turbulence that passes a vehicle, an evolving state; stationary from its first sample on.
+
+    Args:
+        dryden: its strength and size.
+        timestep: time between samples [s].
+        rng: its randomness; a child of it is used, so that others may draw from it at any time.
+    """
+
+    def __init__(self, dryden: Dryden, *, timestep: float, rng: np.random.Generator) -> None:
+        self._intensities = dryden.intensities
+        self._steps = [discretise(timestep * dryden.airspeed / length) for length in dryden.lengths]
+        (self._source,) = rng.spawn(1)
+        self.reset()
+
+    def reset(self) -> None:
+        """Rewind: the same turbulence again."""
+        self._rng = copy.deepcopy(self._source)
+        first, second = self._rng.standard_normal((2, 3))
+        self._state = np.stack([first, 0.5 * (first + second)])  # of the stationary covariance [[1, 1/2], [1/2, 1/2]]
+        self._block, self._used = np.empty((0, 3)), 0
+
+    def advance(self, steps: int) -> Array:
+        """(steps, 3) the next samples of u, v, w [m/s]."""
+        samples = np.empty((steps, 3))
+        made = 0
+        while made < steps:
+            if self._used == len(self._block):
+                self._block, self._used = self._next_block(), 0
+            taken = min(steps - made, len(self._block) - self._used)
+            samples[made : made + taken] = self._block[self._used : self._used + taken]
+            self._used, made = self._used + taken, made + taken
+        return samples
+
+    def _next_block(self) -> Array:
+        noise = self._rng.standard_normal((3, 2, _BLOCK))
+        block = np.empty((_BLOCK, 3))
+        for axis, (transition, factor) in enumerate(self._steps):
+            before = self._state[:, axis]
+            drive_a, drive_b = factor @ noise[axis]
+            a = _first_order(transition[0, 0], drive_a, before[0])
+            drive_b += transition[1, 0] * np.concatenate([before[:1], a[:-1]])
+            b = _first_order(transition[1, 1], drive_b, before[1])
+            block[:, axis] = self._intensities[axis] * (_OUTPUT[0, axis] * a + _OUTPUT[1, axis] * b)
+            self._state[:, axis] = a[-1], b[-1]
+        return block
+
+
+def discretise(ratio: float) -> tuple[Array, Array]:
+    """One exact time step of the filters' states a and b, which are the same for all axes but for their time.
+
+    White noise n of unit intensity drives, in the time s = t / tau,
+
+        da/ds = -a + sqrt(2) n,    db/ds = a - b
+
+    of which u / sigma_u = a and v / sigma_v = sqrt(3/2) a + (1 - sqrt(3)) / sqrt(2) b.  What the noise adds over a step
+    has the covariance (Van Loan's integral, in closed form)
+
+        Q = [[P(1, 2 r), P(2, 2 r) / 2], [P(2, 2 r) / 2, P(3, 2 r) / 2]]
+
+    with P the regularised lower incomplete gamma function, which keeps all its digits where r is small.
+
+    Args:
+        ratio: r, the step divided by tau = L / V; positive.
+
+    Returns:
+        (2, 2) transition of (a, b), and (2, 2) lower triangular factor of Q: what to multiply independent standard
+        normal numbers with.
+    """
+    from scipy.special import gammainc
+
+    transition = math.exp(-ratio) * np.array([[1.0, 0.0], [ratio, 1.0]])
+    q_aa, q_ab, q_bb = gammainc([1.0, 2.0, 3.0], 2.0 * ratio) * [1.0, 0.5, 0.5]
+    return transition, np.linalg.cholesky(np.array([[q_aa, q_ab], [q_ab, q_bb]]))
+
+
+def _first_order(pole: float, drive: Array, before: float) -> Array:
+    """y(k) = pole y(k-1) + drive(k), from y = `before` on; the filter's package takes half a second to load."""
+    from scipy.signal import lfilter
+
+    filtered: Array = lfilter([1.0], [1.0, -pole], drive, zi=[pole * before])[0]
+    return filtered

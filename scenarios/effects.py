@@ -1,0 +1,197 @@
+"""From `[effects]`, `[computation]` and `[[events]]` to what acts on the flight."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, TypeVar
+
+from quadsim.computation import Computation, Stall
+from quadsim.effects import Disturbance, Effects, Load, Payload, PayloadChange, RotorChange, RotorDynamics
+from quadsim.effects.gust import Gust, Velocity
+from quadsim.effects.turbulence import Dryden
+from quadsim.effects.wind import WindChange, WindField
+from quadsim.errors import ParameterError
+from quadsim.vehicle import N_ROTORS, Vehicle
+from scenarios.randomness import generator
+from scenarios.spec import Scenario
+from scenarios.spec.base import Spec
+from scenarios.spec.effects import AirSpec, EffectsSpec, GroundSpec, LoadSpec, PayloadSpec, RotorsSpec
+from scenarios.spec.events import (
+    GustEvent,
+    PayloadDropEvent,
+    PayloadPickupEvent,
+    RotorLossEvent,
+    StallEvent,
+    WindEvent,
+)
+
+Table = TypeVar("Table", bound=Spec)
+
+
+def resolve_effects(spec: EffectsSpec, vehicle: Vehicle) -> EffectsSpec:
+    """The effects with every size that is left to the vehicle written out.
+
+    Raises:
+        ParameterError: a size is needed that neither the scenario nor the vehicle gives.
+    """
+    changes: dict[str, Any] = {}
+    if spec.rotors is not None:
+        changes["rotors"] = _filled(
+            spec.rotors, rise=vehicle.rotor_rise, fall=vehicle.rotor_fall, inertia=vehicle.rotor_inertia or 0.0
+        )
+    if spec.air is not None:
+        body = None if vehicle.body_drag is None else list(vehicle.body_drag)
+        air = _filled(spec.air, rotor_drag=vehicle.rotor_drag or 0.0, body_drag=body)
+        if air.turbulence is not None:
+            carried = _filled(air.turbulence, airspeed=math.hypot(*air.wind))
+            air = air.model_copy(update={"turbulence": carried})
+        changes["air"] = air
+    if spec.ground is not None and spec.ground.effect:
+        ground = _filled(spec.ground, rotor_radius=vehicle.rotor_radius)
+        if ground.rotor_radius is None:
+            rule = f"given for the ground effect, as the vehicle {vehicle.name!r} states none"
+            raise ParameterError("effects.ground", "rotor_radius", None, rule)
+        changes["ground"] = ground
+    return spec.model_copy(update=changes)
+
+
+def build_effects(scenario: Scenario, vehicle: Vehicle) -> Effects:
+    """What acts on the plant, but for the wind.
+
+    Raises:
+        ParameterError: a combination is not possible.
+    """
+    spec = resolve_effects(scenario.effects, vehicle)
+    air = spec.air or AirSpec()
+    ground = spec.ground or GroundSpec(contact=False)
+    rotors = spec.rotors or RotorsSpec()
+    efficiency = _quadruple(rotors.efficiency)
+    return Effects(
+        rotors=_rotor_dynamics(rotors),
+        efficiency=efficiency,
+        rotor_drag=air.rotor_drag or 0.0,
+        body_drag=None if air.body_drag is None else _triple(air.body_drag),
+        air_density=air.density,
+        rotor_radius=ground.rotor_radius if ground.effect else None,
+        contact=ground.contact,
+        load=_load(spec.load or LoadSpec()),
+        disturbance=_disturbance(spec),
+        changes=_changes(scenario, efficiency),
+    )
+
+
+def build_wind(scenario: Scenario, vehicle: Vehicle) -> WindField | None:
+    """The motion of the air, or None where it stands still throughout.
+
+    Raises:
+        ParameterError: there is wind, and nothing that it could push.
+    """
+    air = resolve_effects(scenario.effects, vehicle).air or AirSpec()
+    gusts = tuple(
+        Gust(start=event.at, duration=event.duration, velocity=_triple(event.velocity))
+        for event in scenario.events
+        if isinstance(event, GustEvent)
+    )
+    changes = tuple(
+        WindChange(time=event.at, velocity=_triple(event.velocity))
+        for event in scenario.events
+        if isinstance(event, WindEvent)
+    )
+    turbulence = None
+    if air.turbulence is not None and air.turbulence.airspeed is not None:
+        turbulence = Dryden(
+            altitude=air.turbulence.altitude,
+            wind_speed_20ft=air.turbulence.wind_speed_20ft,
+            airspeed=air.turbulence.airspeed,
+        )
+    if not any(air.wind) and not gusts and not changes and turbulence is None:
+        return None
+    if not air.rotor_drag and air.body_drag is None:
+        rule = f"positive, or body_drag given, for the wind to push: the vehicle {vehicle.name!r} states no drag"
+        raise ParameterError("effects.air", "rotor_drag", air.rotor_drag or 0.0, rule)
+    return WindField(
+        mean=_triple(air.wind),
+        gusts=gusts,
+        changes=changes,
+        turbulence=turbulence,
+        timestep=scenario.plant.timestep,
+        rng=generator(scenario.seed, "wind"),
+    )
+
+
+def build_computation(scenario: Scenario) -> Computation | None:
+    """How long commands take, or None where they take no time."""
+    stalls = tuple(
+        Stall(start=event.at, duration=event.duration) for event in scenario.events if isinstance(event, StallEvent)
+    )
+    spec = scenario.computation
+    if spec is None:
+        return Computation(stalls=stalls) if stalls else None
+    return Computation(fixed=spec.delay, per_iteration=spec.per_iteration, jitter=spec.jitter, stalls=stalls)
+
+
+def _filled(table: Table, **values: Any) -> Table:
+    """A table with the fields that are absent taken from elsewhere."""
+    return table.model_copy(update={name: value for name, value in values.items() if getattr(table, name) is None})
+
+
+def _rotor_dynamics(spec: RotorsSpec) -> RotorDynamics | None:
+    dynamics = RotorDynamics(
+        rise=spec.rise or 0.0,
+        fall=spec.fall or 0.0,
+        acceleration=math.inf if spec.acceleration is None else spec.acceleration,
+        inertia=spec.inertia or 0.0,
+    )
+    return None if dynamics == RotorDynamics() else dynamics
+
+
+def _load(spec: LoadSpec) -> Load:
+    return Load(
+        mass_factor=spec.mass_factor,
+        inertia_factor=_triple(spec.inertia_factor),
+        centre_of_mass=_triple(spec.centre_of_mass),
+        payloads=tuple(_payload(payload) for payload in spec.payloads),
+    )
+
+
+def _payload(spec: PayloadSpec | PayloadPickupEvent) -> Payload:
+    return Payload(mass=spec.mass, position=_triple(spec.position))
+
+
+def _disturbance(spec: EffectsSpec) -> Disturbance | None:
+    if spec.disturbance is None:
+        return None
+    return Disturbance(
+        force=_triple(spec.disturbance.force),
+        torque=_triple(spec.disturbance.torque),
+        force_noise=spec.disturbance.force_noise,
+        torque_noise=spec.disturbance.torque_noise,
+    )
+
+
+def _changes(
+    scenario: Scenario, efficiency: tuple[float, float, float, float]
+) -> tuple[RotorChange | PayloadChange, ...]:
+    found: list[RotorChange | PayloadChange] = []
+    for event in scenario.events:
+        if isinstance(event, RotorLossEvent):
+            whole = efficiency[event.rotor - 1]
+            found.append(RotorChange(time=event.at, rotor=event.rotor, efficiency=whole * (1.0 - event.loss)))
+            if event.duration is not None:
+                found.append(RotorChange(time=event.at + event.duration, rotor=event.rotor, efficiency=whole))
+        elif isinstance(event, PayloadPickupEvent):
+            found.append(PayloadChange(time=event.at, payload=_payload(event)))
+        elif isinstance(event, PayloadDropEvent):
+            found.append(PayloadChange(time=event.at, payload=None))
+    return tuple(found)
+
+
+def _triple(values: list[float]) -> Velocity:
+    x, y, z = values
+    return x, y, z
+
+
+def _quadruple(values: list[float]) -> tuple[float, float, float, float]:
+    a, b, c, d = values
+    assert N_ROTORS == 4
+    return a, b, c, d
