@@ -12,9 +12,15 @@ from pathlib import Path
 
 
 class QuadsimError(Exception):
-    """Root of all errors raised on purpose; `exit_status` is what the command line returns for it."""
+    """Root of all errors raised on purpose; `exit_status` is what the command line returns for it.
+
+    Errors cross from one process to another: they pickle whole, whatever their constructors ask for.
+    """
 
     exit_status = 2
+
+    def __reduce__(self) -> tuple[object, ...]:
+        return _restore, (type(self), self.args, self.__dict__)
 
 
 class InputError(QuadsimError, ValueError):
@@ -119,3 +125,11 @@ class InterruptedFlightError(FlightError):
 
     def __init__(self, *, time: float) -> None:
         super().__init__("interrupted (Ctrl-C)", time=time)
+
+
+def _restore(kind: type[QuadsimError], arguments: tuple[object, ...], values: dict[str, object]) -> QuadsimError:
+    """An error as it was, its message and its values, without making it anew from them."""
+    error = kind.__new__(kind)
+    error.args = arguments
+    error.__dict__.update(values)
+    return error

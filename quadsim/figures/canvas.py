@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from quadsim.errors import OutputError
+from quadsim.rundir import Run
 
 if TYPE_CHECKING:
+    from matplotlib.artist import Artist
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
     from matplotlib.typing import RcKeyType
 
@@ -75,3 +78,24 @@ def new_figure(title: str, width: float, height: float) -> Figure:
     figure = Figure(figsize=(width, height), layout="constrained")
     figure.suptitle(title, x=0.01, ha="left", fontsize=11.0, fontweight="bold")
     return figure
+
+
+def run_title(run: Run, what: str) -> str:
+    """Title of a figure of one run."""
+    ended = "" if run.log.reason is None else " (aborted)"
+    return f"{run.name}{ended}: {what}"
+
+
+def run_end(run: Run) -> float:
+    """Last time of the flight [s]."""
+    return float(run.log.plant.t[-1])
+
+
+def finish_figure(figure: Figure, bottom: Sequence[Axes], shown: Mapping[str, Artist], end: float) -> None:
+    """Label the time axes and put the legend above all panels, where it hides nothing."""
+    for axes in bottom:
+        axes.set_xlabel("time [s]")
+        axes.set_xlim(-0.008 * end, end or 1.0)  # a peak in the first period stands clear of the axis
+    figure.align_ylabels()
+    if shown:
+        figure.legend(list(shown.values()), list(shown), loc="outside upper right", ncols=len(shown))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -10,7 +10,8 @@ import numpy as np
 
 from quadsim.audit import SIGNALS, Limit
 from quadsim.comparison import distinct_courses, run_names
-from quadsim.figures.canvas import new_figure, write_drawings
+from quadsim.figures.canvas import finish_figure, new_figure, run_end, run_title, write_drawings
+from quadsim.figures.effects import draw_effects, has_effects
 from quadsim.palette import BOUND, REFERENCE, line_colour
 from quadsim.rundir import Run
 from quadsim.state import REFERENCE_NAMES
@@ -26,7 +27,7 @@ PAPER_FIGURES: Final = {"paper-unconstrained": (2, 3), "paper-constrained": (4, 
 
 
 def write_figures(run: Run, directory: Path) -> list[Path]:
-    """Draw one run: states and inputs in the paper's arrangement, and the solve times.
+    """Draw one run: states and inputs in the paper's arrangement, the solve times, and its effects where it has any.
 
     The two scenarios of the paper carry its figure numbers in their file names, e.g. `figure4_states.png`.
 
@@ -43,14 +44,14 @@ def write_figures(run: Run, directory: Path) -> list[Path]:
     if not run.log.control.t.size:
         return []
     states, inputs = PAPER_FIGURES.get(run.name, (None, None))
-    return write_drawings(
-        {
-            _file_name("states", states): lambda: _draw_states(run),
-            _file_name("inputs", inputs): lambda: _draw_inputs(run),
-            "solve_times": lambda: _draw_solve_times(run),
-        },
-        directory,
-    )
+    drawings = {
+        _file_name("states", states): lambda: _draw_states(run),
+        _file_name("inputs", inputs): lambda: _draw_inputs(run),
+        "solve_times": lambda: _draw_solve_times(run),
+    }
+    if has_effects(run):
+        drawings["effects"] = lambda: draw_effects(run)
+    return write_drawings(drawings, directory)
 
 
 def comparison_figure(runs: Sequence[Run], directory: Path) -> list[Path]:
@@ -73,27 +74,22 @@ def _file_name(content: str, number: int | None) -> str:
     return content if number is None else f"figure{number}_{content}"
 
 
-def _title(run: Run, what: str) -> str:
-    ended = "" if run.log.reason is None else " (aborted)"
-    return f"{run.name}{ended}: {what}"
-
-
 def _draw_states(run: Run) -> Figure:
-    figure = new_figure(_title(run, "position and attitude"), 9.6, 6.4)
+    figure = new_figure(run_title(run, "position and attitude"), 9.6, 6.4)
     panels = figure.subplots(3, 2, sharex=True)
     shown: dict[str, Artist] = {}
     for column, names in enumerate((("x", "y", "z"), ("roll", "pitch", "yaw"))):
         for axes, name in zip(panels[:, column], names, strict=True):
             shown["flight"] = _draw_plant(axes, run, name, line_colour(0))
             shown |= _draw_reference(axes, run, name)
-            shown |= _draw_bounds(axes, run.limits, name, _end(run))
+            shown |= _draw_bounds(axes, run.limits, name, run_end(run))
             axes.set_ylabel(f"{name} [{SIGNALS[name].unit}]")
-    _finish(figure, panels[-1], shown, _end(run))
+    finish_figure(figure, panels[-1], shown, run_end(run))
     return figure
 
 
 def _draw_inputs(run: Run) -> Figure:
-    figure = new_figure(_title(run, "rotor speeds and their steps"), 9.6, 5.6)
+    figure = new_figure(run_title(run, "rotor speeds and their steps"), 9.6, 5.6)
     panels = figure.subplots(2, 1, sharex=True)
     shown: dict[str, Artist] = {}
     labels = {"speed": "rotor speed [rad/s]", "slew": "step per period [rad/s]"}
@@ -104,14 +100,14 @@ def _draw_inputs(run: Run) -> Figure:
             shown[f"rotor {rotor + 1}"] = axes.plot(
                 run.log.control.t, values[:, rotor], color=line_colour(rotor), drawstyle="steps-post", linewidth=width
             )[0]
-        shown |= _draw_bounds(axes, run.limits, name, _end(run))
+        shown |= _draw_bounds(axes, run.limits, name, run_end(run))
         axes.set_ylabel(label)
-    _finish(figure, panels[-1:], shown, _end(run))
+    finish_figure(figure, panels[-1:], shown, run_end(run))
     return figure
 
 
 def _draw_solve_times(run: Run) -> Figure:
-    figure = new_figure(_title(run, "time to compute a command"), 9.6, 6.0)
+    figure = new_figure(run_title(run, "time to compute a command"), 9.6, 6.0)
     times, iterations, active = figure.subplots(3, 1, sharex=True, height_ratios=(2.4, 1.0, 1.0))
     timing, control = run.log.timing, run.log.control
     deadline = run.summary["controller"]["deadline_ms"]
@@ -134,7 +130,7 @@ def _draw_solve_times(run: Run) -> Figure:
     times.legend(
         loc="lower left", bbox_to_anchor=(0.0, 1.0), borderaxespad=0.2, ncols=3, fontsize=8.2, columnspacing=1.2
     )
-    _finish(figure, (active,), {}, _end(run))
+    finish_figure(figure, (active,), {}, run_end(run))
     return figure
 
 
@@ -142,7 +138,7 @@ def _draw_comparison(runs: Sequence[Run]) -> Figure:
     figure = new_figure("", 9.6, 6.4)
     panels = figure.subplots(3, 2, sharex=True)
     signals = dict(zip(("x", "y", "z", "roll", "pitch", "speed"), panels.T.flat, strict=True))
-    end = max(_end(run) for run in runs)
+    end = max(run_end(run) for run in runs)
     shown: dict[str, Artist] = {}
     for run in distinct_courses(runs):
         for name in ("x", "y", "z"):
@@ -160,7 +156,7 @@ def _draw_comparison(runs: Sequence[Run]) -> Figure:
         shown |= _draw_bounds(axes, limits, name, end)
         axes.set_ylabel(f"{name} [{SIGNALS[name].unit}]")
     signals["speed"].set_ylabel("lowest to highest\nrotor speed [rad/s]")
-    _finish(figure, panels[-1], shown, end)
+    finish_figure(figure, panels[-1], shown, end)
     return figure
 
 
@@ -181,11 +177,6 @@ def _draw_reference(axes: Axes, run: Run, name: str) -> dict[str, Artist]:
     return {"reference, filtered": line}
 
 
-def _end(run: Run) -> float:
-    """Last time of the flight [s]."""
-    return float(run.log.plant.t[-1])
-
-
 def _draw_bounds(axes: Axes, limits: Sequence[Limit], signal: str, end: float) -> dict[str, Artist]:
     """Draw the bounds on a signal over the times they hold for; returns the legend's entry for them."""
     bounds = {
@@ -198,13 +189,3 @@ def _draw_bounds(axes: Axes, limits: Sequence[Limit], signal: str, end: float) -
     for bound, start, stop in bounds:
         shown["bound"] = axes.hlines(bound, start, stop, color=BOUND, linestyle="--", linewidth=1.1)
     return shown
-
-
-def _finish(figure: Figure, bottom: Sequence[Axes], shown: Mapping[str, Artist], end: float) -> None:
-    """Label the time axes and put the legend above all panels, where it hides nothing."""
-    for axes in bottom:
-        axes.set_xlabel("time [s]")
-        axes.set_xlim(-0.008 * end, end or 1.0)  # a peak in the first period stands clear of the axis
-    figure.align_ylabels()
-    if shown:
-        figure.legend(list(shown.values()), list(shown), loc="outside upper right", ncols=len(shown))

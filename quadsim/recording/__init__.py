@@ -2,13 +2,15 @@
 
 Everything stands on one timeline, `sim_time`, the simulated time:
 
-    world/...           vehicle, thrusts, flown path, reference, and the horizon predicted at each control period
+    world/...           vehicle, thrusts, external force, flown path, reference, and the horizon predicted at each
+                        control period
     signals/NAME        what can be limited, by the names and in the units of `quadsim.audit.SIGNALS`
     reference/NAME      what x, y, z and yaw should be
     limits/NAME         the bounds, drawn with their signal
     margins/NAME        signed distance to the nearer bound at the control samples; negative = violated
     verdicts/NAME       what that says: holds, active, violated
     solver/NAME         what each step of the controller took and answered
+    effects/NAME        external force and torque, wind, commands that rotors do not follow at once; where there are any
     events, summary     texts
 """
 
@@ -23,7 +25,8 @@ import numpy as np
 
 from quadsim.errors import OutputError
 from quadsim.palette import line_colour
-from quadsim.recording.curves import send_limit, send_signals, send_solver
+from quadsim.recording.aside import recording_aside
+from quadsim.recording.curves import send_effects, send_limit, send_signals, send_solver
 from quadsim.recording.layout import blueprint
 from quadsim.recording.look import on_screen
 from quadsim.recording.texts import send_texts
@@ -31,7 +34,7 @@ from quadsim.recording.viewer import open_viewer, viewer_problem
 from quadsim.recording.world import send_airframe, send_scene
 from quadsim.rundir import Run
 
-__all__ = ["open_viewer", "viewer_problem", "write_recording"]
+__all__ = ["open_viewer", "recording_aside", "viewer_problem", "write_recording"]
 
 
 def write_recording(run: Run, path: Path) -> None:
@@ -77,6 +80,7 @@ def _encode(run: Run, path: Path) -> bytes:
             peers = [peer.name for peer in run.limits if peer.unit == limit.unit]  # in one plot of margins
             send_limit(recording, limit, run.log, on_screen(line_colour(peers.index(limit.name))))
         send_solver(recording, run)
+        send_effects(recording, run.log)
         send_texts(recording, run)
         return bytes(memory.drain_as_bytes())
     finally:

@@ -1,4 +1,4 @@
-"""What is seen in the plots: signals, references, bounds, margins, verdicts, and the solver."""
+"""What is seen in the plots: signals, references, bounds, margins, verdicts, the solver, and effects."""
 
 from __future__ import annotations
 
@@ -9,10 +9,12 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from quadsim.audit import SIGNALS, Limit, margins_sampled
+from quadsim.effect_curves import commanded_speeds, effect_curves
 from quadsim.flightlog import FlightLog
 from quadsim.recording.look import BOUND, PANELS, REFERENCE, SERIES, VERDICTS, Colour, time_column
 from quadsim.rundir import Run
 from quadsim.state import REFERENCE_NAMES, Array
+from quadsim.vehicle import N_ROTORS
 
 if TYPE_CHECKING:
     import rerun as rr
@@ -86,6 +88,17 @@ def send_solver(recording: rr.RecordingStream, run: Run) -> None:
     if deadline is not None:
         ends = run.log.plant.t[[0, -1]]
         _send_curves(recording, "solver/deadline_ms", ends, np.full(2, deadline), {"deadline [ms]": BOUND})
+
+
+def send_effects(recording: rr.RecordingStream, log: FlightLog) -> None:
+    """External force and torque and the wind, and the commands of rotors that turn otherwise; what there is of it."""
+    for entry in effect_curves(log):
+        labels = {f"{axis} [{entry.unit}]": colour for axis, colour in zip("xyz", SERIES, strict=False)}
+        _send_curves(recording, f"effects/{entry.key}", log.plant.t, entry.values, labels)
+    commanded = commanded_speeds(log)
+    if commanded is not None:
+        labels = {f"rotor {i}, commanded [rad/s]": REFERENCE for i in range(1, N_ROTORS + 1)}
+        _send_curves(recording, "effects/commanded", log.plant.t, commanded, labels, stepped=True)
 
 
 def _send_curves(

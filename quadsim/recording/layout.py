@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from quadsim.audit import Limit
+from quadsim.effect_curves import commanded_speeds, effect_curves
 from quadsim.recording.look import FRONT_PANELS, PANELS, TIMELINE
 from quadsim.rundir import Run
 from quadsim.state import POSITION, REFERENCE_NAMES, Array
@@ -32,6 +33,7 @@ def blueprint(run: Run) -> rrb.Blueprint:
     lanes = [f"verdicts/{limit.name}" for limit in limits if limit.start == 0.0]
     verdicts = rrb.StateTimelineView(name="Constraints on the whole flight", contents=lanes)
     events = rrb.TextLogView(name="Events", origin="/events")
+    effects = [_plot(title, contents, end) for title, contents in _effects(run).items()]
     behind = run.vehicle.arm_length * np.array([-3.0, -3.5, 2.2])
     return rrb.Blueprint(
         rrb.Horizontal(
@@ -47,6 +49,7 @@ def blueprint(run: Run) -> rrb.Blueprint:
                 rrb.Grid(*plots[:FRONT_PANELS], verdicts, times, grid_columns=2, name="Flight"),
                 rrb.Grid(*plots[FRONT_PANELS:], grid_columns=2, name="More signals"),
                 rrb.Grid(*margins, work, failures, events, grid_columns=2, name="Margins and solver"),
+                *([rrb.Grid(*effects, grid_columns=2, name="Effects")] if effects else []),
             ),
             column_shares=[4, 5],
         ),
@@ -80,6 +83,15 @@ def _view(name: str, origin: str, eye: Array, target: Array) -> rrb.Spatial3DVie
         eye_controls=rrb.EyeControls3D(position=eye, look_target=target),
         overrides={"/world/flown": rrb.VisibleTimeRanges(timeline=TIMELINE, start=start, end=now)},
     )
+
+
+def _effects(run: Run) -> dict[str, list[str]]:
+    """Titles and entities of the plots of what acted beyond the paper's model; none in its own flights."""
+    titles = {
+        f"{entry.title[0].upper()}{entry.title[1:]}": [f"effects/{entry.key}"] for entry in effect_curves(run.log)
+    }
+    lagging = {"Rotor speeds, commanded and acting": ["effects/commanded", "signals/speed"]}
+    return (lagging if commanded_speeds(run.log) is not None else {}) | titles
 
 
 def _contents(names: Sequence[str], limits: Iterable[Limit]) -> list[str]:

@@ -11,6 +11,7 @@ from quadsim.recording.look import (
     AXES,
     CARBON,
     FLOWN,
+    FORCE,
     FORWARD,
     METAL,
     PREDICTED,
@@ -28,6 +29,8 @@ from quadsim.vehicle import N_ROTORS, Vehicle
 if TYPE_CHECKING:
     import rerun as rr
 
+_FORCE_SCALE: Final = 5.0
+"""How many times longer an external force is drawn than a thrust of its size: it would vanish inside the hull."""
 _DRAWN_ARM: Final = 0.3
 """Arm length [m] for which the airframe's parts are measured, as in `models/quadrotor.xml`."""
 
@@ -102,6 +105,8 @@ def send_scene(recording: rr.RecordingStream, run: Run) -> None:
     recording.send_columns("world/vehicle", [time_column(plant.t)], rr.Transform3D.columns(translation=position))
     recording.send_columns("world/vehicle/body", [time_column(plant.t)], rr.Transform3D.columns(quaternion=attitude))
     recording.send_columns("world/vehicle/body/thrust", [time_column(plant.t)], arrows)
+    if plant.wrench is not None and np.any(plant.wrench[:, :3]):
+        _send_force(recording, run.vehicle, plant.t, plant.wrench[:, :3])
 
     if control.t.size:
         starts = np.searchsorted(plant.t, control.t - 1e-9)
@@ -115,6 +120,18 @@ def send_scene(recording: rr.RecordingStream, run: Run) -> None:
         recording.send_columns(
             "world/horizon", [time_column(control.t)], rr.LineStrips3D.columns(strips=list(horizons))
         )
+
+
+def _send_force(recording: rr.RecordingStream, vehicle: Vehicle, t: Array, force: Array) -> None:
+    """The external force (M, 3) [N] as an arrow in the world frame that moves with the vehicle."""
+    import rerun as rr
+
+    entity, unit = "world/vehicle/external_force", vehicle.arm_length / _DRAWN_ARM
+    above_the_discs = [0.0, 0.0, 0.08 * unit]
+    look = rr.Arrows3D.from_fields(origins=above_the_discs, radii=0.01 * unit, colors=FORCE)
+    scale = _FORCE_SCALE * vehicle.arm_length / (vehicle.mass * vehicle.gravity / N_ROTORS)
+    recording.log(entity, look, static=True)
+    recording.send_columns(entity, [time_column(t)], rr.Arrows3D.columns(vectors=scale * force))
 
 
 def _log_lines(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import pickle
 from pathlib import Path
 
 import pytest
@@ -15,6 +16,7 @@ from quadsim.errors import (
     FlightError,
     InputError,
     InterruptedFlightError,
+    MissingPackageError,
     OutputError,
     ParameterError,
     PlanExhaustedError,
@@ -26,6 +28,36 @@ from quadsim.errors import (
 
 EVERY = [kind for _, kind in inspect.getmembers(errors, inspect.isclass) if kind.__module__ == errors.__name__]
 FLIGHT = {FlightError, DivergenceError, CommandError, PlanExhaustedError, InterruptedFlightError}
+
+
+SAMPLES: list[QuadsimError] = [
+    QuadsimError("a"),
+    InputError("a"),
+    ParameterError("vehicle", "mass", -1.0, "positive"),
+    UnknownNameError("solver", "piqp-dens", ["piqp-dense"], hint="see quadsim list"),
+    FileError("a/b.toml", "no such file"),
+    MissingPackageError("solver 'daqp'", "daqp", extra="daqp"),
+    OutputError("a/b.toml", "the disk is full"),
+    RenderingUnavailableError({"egl": "no libEGL"}),
+    ViewerUnavailableError("a"),
+    FlightError("lost", time=1.0),
+    DivergenceError("lost", time=1.0),
+    CommandError("not finite", time=1.0),
+    PlanExhaustedError("no plan", time=1.0),
+    InterruptedFlightError(time=1.0),
+]
+
+
+@pytest.mark.parametrize("error", SAMPLES, ids=lambda error: type(error).__name__)
+def test_every_error_comes_whole_from_another_process(error: QuadsimError) -> None:
+    again = pickle.loads(pickle.dumps(error))
+    assert type(again) is type(error)
+    assert (str(again), again.args, vars(again)) == (str(error), error.args, vars(error))
+    assert str(again)
+
+
+def test_no_error_is_forgotten_here() -> None:
+    assert {type(error) for error in SAMPLES} == set(EVERY)
 
 
 @pytest.mark.parametrize("kind", EVERY)

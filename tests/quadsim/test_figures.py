@@ -11,6 +11,8 @@ from matplotlib.image import imread
 from quadsim.audit import Limit
 from quadsim.errors import OutputError
 from quadsim.figures import comparison_figure, write_figures
+from quadsim.figures.canvas import write_drawings
+from quadsim.figures.effects import draw_effects, has_effects
 from quadsim.palette import BOUND
 from quadsim.rundir import Run
 
@@ -94,6 +96,51 @@ def test_an_aborted_flight_is_drawn_as_far_as_it_went(short_run: Run, tmp_path: 
     log = dataclasses.replace(short_run.log, reason="at t = 6.000 s: lost")
     write_figures(dataclasses.replace(short_run, log=log), tmp_path)
     assert "paper-constrained (aborted): position and attitude" in texts(tmp_path / "figure4_states.svg")
+
+
+def test_an_ideal_flight_has_no_figure_of_effects(figures: dict[str, Path]) -> None:
+    assert "effects.png" not in figures
+
+
+def with_effects(run: Run, *, wrench: bool = False, wind: bool = False, lag: bool = False, told: bool = False) -> Run:
+    """The flight as if it had met with some effects."""
+    plant, control = run.log.plant, run.log.control
+    rng = np.random.default_rng(0)
+    if wrench:
+        plant = dataclasses.replace(plant, wrench=rng.normal(size=(plant.t.size, 6)))
+    if wind:
+        plant = dataclasses.replace(plant, wind=rng.normal(size=(plant.t.size, 3)))
+    if lag:
+        plant = dataclasses.replace(plant, speeds=plant.speeds + 1.0)
+    if told:
+        control = dataclasses.replace(control, state=control.state + 0.01)
+    return dataclasses.replace(run, log=dataclasses.replace(run.log, plant=plant, control=control))
+
+
+SPEEDS = {"rotor 1 [rad/s]", "rotor 4 [rad/s]", "commanded", "acting"}
+FORCES = {"external force, world", "[N]", "external torque, body", "[N m]", "x", "y", "z"}
+AIR = {"wind, world", "[m/s]", "x", "y", "z"}
+TOLD = {"position as told,", "less the true one [m]", "less the true one [deg]", "x", "y", "z", "roll", "yaw"}
+
+
+@pytest.mark.parametrize(("effect", "expected"), [("lag", SPEEDS), ("wrench", FORCES), ("wind", AIR), ("told", TOLD)])
+def test_effects_are_drawn_where_there_are_any(short_run: Run, tmp_path: Path, effect: str, expected: set[str]) -> None:
+    """Each by itself, with its panels and no others."""
+    run = with_effects(short_run, **{effect: True})
+    assert has_effects(run)
+    write_drawings({"effects": lambda: draw_effects(run)}, tmp_path)
+    found = texts(tmp_path / "effects.svg")
+    assert expected | {"time [s]", "paper-constrained: effects"} <= found
+    others = (SPEEDS | FORCES | AIR | TOLD) - expected
+    assert not others & found
+
+
+def test_all_effects_are_drawn_together(short_run: Run, tmp_path: Path) -> None:
+    run = with_effects(short_run, wrench=True, wind=True, lag=True, told=True)
+    assert tmp_path / "effects.png" in write_figures(run, tmp_path)
+    assert texts(tmp_path / "effects.svg") >= SPEEDS | FORCES | AIR | TOLD
+    picture = imread(tmp_path / "effects.png")[..., :3]
+    assert 0.01 < np.mean(np.any(picture < 0.95, axis=-1)) < 0.5
 
 
 def test_no_figures_without_a_control_period(empty_run: Run, tmp_path: Path) -> None:

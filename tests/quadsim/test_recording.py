@@ -206,6 +206,45 @@ def test_times_are_held_against_the_deadline(content: Content, short_run: Run) -
     np.testing.assert_array_equal(np.ravel(content.rows("/solver/active", "scalars")), short_run.log.control.active)
 
 
+def test_an_ideal_flight_has_no_effects(content: Content) -> None:
+    assert not [entity for entity in content.entities if "effects" in entity or "external_force" in entity]
+
+
+def test_forces_torques_wind_and_lagging_rotors_have_their_curves(
+    record: Callable[[Run], Content], short_run: Run
+) -> None:
+    plant, rng = short_run.log.plant, np.random.default_rng(0)
+    wrench, wind = rng.normal(size=(plant.t.size, 6)), rng.normal(size=(plant.t.size, 3))
+    plant = dataclasses.replace(plant, speeds=plant.speeds - 1.0, wrench=wrench, wind=wind)
+    run = dataclasses.replace(short_run, log=dataclasses.replace(short_run.log, plant=plant))
+    content = record(run)
+    for name, expected in {"force": wrench[:, :3], "torque": wrench[:, 3:], "wind": wind}.items():
+        np.testing.assert_array_equal(content.rows(f"/effects/{name}", "scalars"), expected)
+        np.testing.assert_allclose(content.times(f"/effects/{name}"), plant.t, atol=1e-9)
+    np.testing.assert_allclose(content.rows("/effects/commanded", "scalars"), plant.speeds + 1.0, atol=1e-9)
+    arrows = np.array(content.rows("/world/vehicle/external_force", "vectors"))[:, 0]
+    vehicle = run.vehicle
+    as_thrusts = vehicle.arm_length * 4.0 * wrench[:, :3] / (vehicle.mass * vehicle.gravity)
+    np.testing.assert_allclose(arrows, world._FORCE_SCALE * as_thrusts, rtol=1e-5, atol=1e-9)
+    assert layout._effects(run) == {
+        "Rotor speeds, commanded and acting": ["effects/commanded", "signals/speed"],
+        "External force, world": ["effects/force"],
+        "External torque, body": ["effects/torque"],
+        "Wind, world": ["effects/wind"],
+    }
+    assert "Effects" in "".join(
+        str(column)
+        for chunk in content.reader.stream(store=content.reader.blueprints()[0]).to_chunks()
+        for column in chunk.to_record_batch().columns
+    )
+
+
+def test_a_force_that_is_nowhere_is_not_drawn(record: Callable[[Run], Content], short_run: Run) -> None:
+    plant = dataclasses.replace(short_run.log.plant, wrench=np.zeros((short_run.log.plant.t.size, 6)))
+    content = record(dataclasses.replace(short_run, log=dataclasses.replace(short_run.log, plant=plant)))
+    assert not [entity for entity in content.entities if "effects" in entity or "external_force" in entity]
+
+
 def test_events_tell_each_change_of_the_solver_and_the_end(record: Callable[[Run], Content], short_run: Run) -> None:
     control = short_run.log.control
     status, fallback = [SOLVED] * control.t.size, control.fallback.copy()
