@@ -10,12 +10,14 @@ import pytest
 
 from mpc.solvers import SOLVERS
 from quadsim import rundir
+from quadsim.controller import Moment
 from quadsim.cost import CostStudy
 from quadsim.errors import InputError, MissingPackageError
-from scenarios import cost, runner
+from scenarios import runner
 from scenarios.build import build_controller, build_vehicle
 from scenarios.cli import EXIT_DONE, EXIT_WRONG_INPUT, main
 from scenarios.cost import find_study, fly_variations, study_cost
+from scenarios.cost.variants import without_constraints
 from scenarios.loading import load_scenario
 from scenarios.queries import recorded, time_steps
 from scenarios.spec import Scenario
@@ -95,7 +97,7 @@ def test_the_counterpart_has_the_same_weights_and_no_constraints(study: CostStud
 
 def test_a_compared_counterpart_is_not_told_twice() -> None:
     own = scenario()
-    free = cost._without_constraints(own).model_copy(update={"name": "counterpart"})
+    free = without_constraints(own).model_copy(update={"name": "counterpart"})
     few = {**SMALL, "tilts": (), "horizons": (), "arm_lengths": (), "solvers": ()}
     assert study_cost(own, [free], workers=1, **few).others == {}
 
@@ -142,7 +144,7 @@ def test_a_replay_gives_the_commands_of_the_flight() -> None:
     controller = build_controller(own, build_vehicle(own))
     for k in range(80):
         controller.reset(queries.speeds_before[k])
-        command = controller.step(queries.t[k], queries.state[k], queries.reference[k + 1 : k + 11])
+        command = controller.step(Moment(time=queries.t[k]), queries.state[k], queries.reference[k + 1 : k + 11])
         np.testing.assert_allclose(command.speeds, flight.log.control.speeds[k], atol=1e-6)
     times, statuses = time_steps(controller, queries, stride=3)
     assert times.shape == (27,)
@@ -203,7 +205,7 @@ def test_a_study_is_made_where_its_question_is_posed(runs: dict[str, str]) -> No
 
 
 def test_a_long_course_is_studied_only_when_asked_for(runs: dict[str, str], monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(cost, "LONGEST_UNASKED", 3.0)
+    monkeypatch.setattr("scenarios.cost.study.LONGEST_UNASKED", 3.0)
     both = [runs["paper-constrained"], runs["paper-unconstrained"]]
     assert find_study(both, asked=None) == []
     assert len(find_study(both, asked=True)) == 2

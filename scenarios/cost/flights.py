@@ -1,0 +1,171 @@
+"""Flights as a study holds them, flown over processes, and what their controllers' steps take."""
+
+from __future__ import annotations
+
+import multiprocessing
+import signal
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from mpc.constrained import ConstrainedMPC
+from mpc.solvers import QPSolver
+from mpc.unconstrained import UnconstrainedMPC
+from quadsim import metrics
+from quadsim.controller import Controller
+from quadsim.cost import Contender, Outcome
+from quadsim.errors import MissingPackageError
+from quadsim.flightlog import ControlLog, FlightLog
+from quadsim.state import REFERENCE_STATES, Array
+from scenarios.build import build_controller, build_course_steps, build_problem, build_vehicle
+from scenarios.queries import recorded, time_steps
+from scenarios.runner import Progress, fly_scenario, usable_cores
+from scenarios.spec import Scenario
+
+REPEATS: Final = 3
+SWEEP_REPEATS: Final = 2
+SWEEP_STRIDE: Final = 3
+"""Of a flight in a sweep, each period of so many is timed."""
+LONGEST_PASS: Final = 20.0
+"""A contender that takes longer than this for all periods of a flight [s] is timed once."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Flown:
+    """A flight as a worker process hands it back."""
+
+    outcome: Outcome
+    control: ControlLog
+
+
+def key(scenario: Scenario) -> str:
+    """The same for equal scenarios, and different for others."""
+    return scenario.model_dump_json()
+
+
+def fly(scenario: Scenario) -> Flown:
+    """Fly a scenario, here."""
+    flight = fly_scenario(scenario)
+    return Flown(outcome=_outcome(scenario, flight.log), control=flight.log.control)
+
+
+def _outcome(scenario: Scenario, log: FlightLog) -> Outcome:
+    control = log.control
+    outputs = control.truth[:, REFERENCE_STATES]
+    return Outcome(
+        reason=log.reason,
+        flown=round(control.t.size * scenario.control_period, 9),
+        statuses={status: control.status.count(status) for status in sorted(set(control.status))},
+        fallbacks=int(np.count_nonzero(control.fallback)),
+        active=int(np.count_nonzero(control.active)),
+        numbers=_numbers(log) if control.t.size else {},
+        settling=metrics.settling(control.t, outputs, build_course_steps(scenario)),
+    )
+
+
+def _numbers(log: FlightLog) -> dict[str, float]:
+    """A value for each of `quadsim.cost.MEASURES`."""
+    tracking, control = metrics.tracking(log.control), metrics.control(log.control)
+    rmse = tracking["rmse"]
+    return {
+        "tilt_sampled": metrics.peak_tilt(log.control.truth),
+        "tilt_plant": metrics.peak_tilt(log.plant.state),
+        **{f"rmse_{axis}": rmse[axis] for axis in "xyz"},
+        "rmse_yaw": float(np.degrees(rmse["yaw"])),
+        "end_error": max(abs(error) for error in tracking["final_error"].values()),
+        "speed_max": control["speed_max"],
+        "step_max": max(-control["slew_min"], control["slew_max"]),
+        "total_variation": control["total_variation"],
+    }
+
+
+def fly_all(
+    scenarios: Sequence[Scenario], flown: Mapping[str, Flown], workers: int | None, progress: Progress
+) -> dict[str, Flown]:
+    """Fly what was not flown yet, over processes; results, with those given, by `key`."""
+    results = dict(flown)
+    wanted = {name: scenario for scenario in scenarios if (name := key(scenario)) not in results}
+    context = multiprocessing.get_context("spawn")  # a fork would take over whatever threads hold
+    pool = ProcessPoolExecutor(workers or usable_cores(), mp_context=context, initializer=_leave_interrupts_to_parent)
+    try:
+        futures = {pool.submit(fly, scenario): name for name, scenario in wanted.items()}
+        for done, future in enumerate(as_completed(futures), start=1):
+            results[futures[future]] = future.result()
+            progress("flights", done, len(futures))
+    finally:
+        pool.shutdown(cancel_futures=True)
+    return results
+
+
+def _leave_interrupts_to_parent() -> None:
+    """Ctrl-C reaches every process of a terminal; the parent alone is to say so."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
+def time_contenders(
+    scenario: Scenario, log: ControlLog, solvers: Sequence[str], progress: Progress
+) -> tuple[tuple[Contender, ...], dict[str, str]]:
+    """Everything that can compute a command, timed on the queries of a flight; and what could not take part."""
+    if not log.t.size:
+        return (), {}
+    vehicle = build_vehicle(scenario)
+    problem = build_problem(scenario, vehicle)
+    controllers: dict[str, Controller] = {
+        "unconstrained gain": UnconstrainedMPC(problem),
+        "constrained, as flown": build_controller(scenario, vehicle),
+    }
+    left_out = {}
+    for solver in solvers:
+        try:
+            controllers[f"QP by {solver}"] = ConstrainedMPC(problem, QPSolver(solver, problem), shortcut=False)
+        except MissingPackageError as error:
+            left_out[solver] = str(error)
+    queries = recorded(scenario, log, problem.horizon)
+    total, done = REPEATS * len(controllers) * log.t.size, 0
+    passes: dict[str, list[tuple[Array, tuple[str, ...]]]] = {name: [] for name in controllers}
+
+    def report() -> None:
+        nonlocal done
+        done += 1
+        progress("steps", done, total)
+
+    for _ in range(REPEATS):
+        for name, controller in controllers.items():
+            if any(step_ms.sum() > 1e3 * LONGEST_PASS for step_ms, _ in passes[name]):
+                done += log.t.size
+            else:
+                passes[name].append(time_steps(controller, queries, progress=report))
+    progress("steps", total, total)
+    contenders = (
+        Contender(
+            name=name,
+            step_ms=np.min([step_ms for step_ms, _ in timed], axis=0),
+            statuses=timed[0][1],
+            repeats=len(timed),
+        )
+        for name, timed in passes.items()
+    )
+    return tuple(contenders), left_out
+
+
+def time_flights(
+    scenarios: Sequence[Scenario], flown: Mapping[str, Flown], progress: Progress
+) -> dict[str, dict[str, float]]:
+    """Median, percentiles and maximum of each flight's controller step [ms], by `key`.
+
+    A flight of not one period has none.
+    """
+    wanted = {key(scenario): scenario for scenario in scenarios}
+    timed: dict[str, dict[str, float]] = {}
+    for done, (name, scenario) in enumerate(wanted.items()):
+        log = flown[name].control
+        if log.t.size:
+            controller = build_controller(scenario, build_vehicle(scenario))
+            queries = recorded(scenario, log, controller.horizon)
+            passes = [time_steps(controller, queries, stride=SWEEP_STRIDE)[0] for _ in range(SWEEP_REPEATS)]
+            timed[name] = metrics.percentiles(np.min(passes, axis=0))
+        progress("sweeps", done + 1, len(wanted))
+    return timed
