@@ -70,6 +70,18 @@ def make_parser() -> argparse.ArgumentParser:
     view.add_argument("run", metavar="RUN", help="run directory or .rrd file")
     view.add_argument("--web", action="store_true", help="serve the viewer to a browser instead")
 
+    scenario = commands.add_parser(
+        "scenario", help="print a scenario with all defaults and comments: a start for yours"
+    )
+    scenario.add_argument("scenario", metavar="SCENARIO", nargs="?", help="library name, or path to a TOML file")
+    _add_settings(scenario)
+    scenario.add_argument("--schema", action="store_true", help="print the JSON Schema of scenario files instead")
+
+    vehicle = commands.add_parser("vehicle", help="a vehicle's derived figures, its parameters' sources, its picture")
+    vehicle.add_argument("vehicle", metavar="VEHICLE", help="a shipped vehicle's name, or path to a TOML file")
+    vehicle.add_argument("--out", metavar="FILE", help="PNG file to draw it to, on a floor of 10 cm squares")
+    vehicle.add_argument("--json", action="store_true", help="as JSON on stdout")
+
     _add_bench(commands.add_parser("bench", help="measure this machine: QP solvers, a flight, a film"))
 
     doctor = commands.add_parser("doctor", help="what this machine can do")
@@ -135,8 +147,7 @@ def _add_settings(parser: argparse.ArgumentParser) -> None:
         default=[],
         help="replace a field of the scenario, e.g. --set controller.horizon=30; may be repeated",
     )
-    seed_help = "replace the scenario's seed; it is recorded, and nothing is random yet"
-    parser.add_argument("--seed", type=int, metavar="N", help=seed_help)
+    parser.add_argument("--seed", type=int, metavar="N", help="replace the scenario's seed, of everything random in it")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

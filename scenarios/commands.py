@@ -4,37 +4,43 @@ from __future__ import annotations
 
 import json
 from argparse import Namespace
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, get_args
 
 from mpc.solvers import SOLVERS
 from quadsim import rundir
 from quadsim.assets import vehicle_names, vehicle_path
 from quadsim.errors import FileError, InputError, ParameterError
 from quadsim.table import Grid
-from quadsim.vehicle import load_vehicle
+from quadsim.vehicle import load_vehicle, vehicle_sources
 from scenarios import console, runner
-from scenarios.build import CONTROLLERS
+from scenarios.build import CONTROLLERS, build_vehicle, resolve
 from scenarios.cli import EXIT_DONE, EXIT_FAILED
+from scenarios.courses import report
 from scenarios.junit import write_junit
 from scenarios.loading import load_scenario, scenario_names
 from scenarios.runner import Outputs
-from scenarios.spec import Scenario
+from scenarios.spec import Group, Scenario
 
 
 def list_everything(options: Namespace) -> int:
     """`quadsim list`."""
+    scenarios = [load_scenario(name) for name in scenario_names()]
     sections = {
-        "scenarios": {name: load_scenario(name).description for name in scenario_names()},
         "vehicles": {name: load_vehicle(vehicle_path(name)).description for name in vehicle_names()},
         "controllers": dict(CONTROLLERS),
         "solvers": {name: entry.line for name, entry in SOLVERS.items()},
     }
     if options.json:
-        print(json.dumps(sections, indent=2))
+        about = {
+            "scenarios": {each.name: each.description for each in scenarios},
+            "groups": {each.name: each.group for each in scenarios},
+            "expected": {each.name: each.expect for each in scenarios},
+        }
+        print(json.dumps({**about, **sections}, indent=2))
     else:
-        console.print_listing(sections)
+        console.print_listing({**_by_group(scenarios), **sections})
     return EXIT_DONE
 
 
@@ -43,6 +49,7 @@ def run(options: Namespace) -> int:
     scenario = _load(options.scenario, options)
     target = Path(options.out) if options.out else Path("runs") / scenario.name
     outputs = Outputs(video=options.video, recording=options.recording, figures=options.figures)
+    _announce(scenario, options)
     with console.progress_bars(enabled=not options.json) as progress:
         flight = runner.run(scenario, target, outputs, progress)
     _print_summary(rundir.read_summary(target), options, where=str(target))
@@ -58,6 +65,7 @@ def check(options: Namespace) -> int:
         summary = _read_intact_summary(Path(options.target))
     else:
         scenario = _load(options.target, options)
+        _announce(scenario, options)
         with console.progress_bars(enabled=not options.json) as progress:
             summary = runner.summarise(runner.fly_scenario(scenario, progress))
     if options.junit:
@@ -139,6 +147,42 @@ def view(options: Namespace) -> int:
     return EXIT_DONE
 
 
+def scenario(options: Namespace) -> int:
+    """`quadsim scenario`."""
+    if options.schema:
+        from scenarios.schema import scenario_schema
+
+        print(json.dumps(scenario_schema(), indent=2))
+        return EXIT_DONE
+    if options.scenario is None:
+        raise InputError(
+            f"scenario needs a name or a TOML file, or --schema (there are: {', '.join(scenario_names())})"
+        )
+    loaded = _load(options.scenario, options)
+    print(resolve(loaded, build_vehicle(loaded)).to_toml(), end="")
+    return EXIT_DONE
+
+
+def vehicle(options: Namespace) -> int:
+    """`quadsim vehicle`."""
+    from scenarios.vehicle_sheet import make_sheet, sheet_tables, sheet_to_json
+
+    path = vehicle_path(options.vehicle)
+    loaded, sources = load_vehicle(path), vehicle_sources(path)
+    if options.out is not None:
+        from quadsim.video import render_portrait
+
+        if Path(options.out).suffix != ".png":
+            raise ParameterError("", "--out", options.out, "a file ending in .png")
+        render_portrait(loaded, Path(options.out))
+    sheet = make_sheet(loaded)
+    if options.json:
+        print(json.dumps(sheet_to_json(loaded, sheet, sources), indent=2))
+    else:
+        console.print_grids(sheet_tables(loaded, sheet, sources), options.out, prose=("unit", "source"))
+    return EXIT_DONE
+
+
 def doctor(options: Namespace) -> int:
     """`quadsim doctor`."""
     from scenarios.doctor import examine
@@ -204,6 +248,9 @@ def _bench_render(scenario: Scenario, options: Namespace, progress: runner.Progr
 _BENCHES: Final = {"solvers": _bench_solvers, "flight": _bench_flight, "render": _bench_render}
 
 
+_MEANT: Final = {"violated": "  (meant to violate a constraint)", "lost": "  (meant to be lost)"}
+"""What `quadsim list` says of a scenario that is to defeat its controller."""
+
 COMMANDS: Final[dict[str, Callable[[Namespace], int]]] = {
     "list": list_everything,
     "run": run,
@@ -211,9 +258,26 @@ COMMANDS: Final[dict[str, Callable[[Namespace], int]]] = {
     "compare": compare,
     "video": video,
     "view": view,
+    "scenario": scenario,
+    "vehicle": vehicle,
     "bench": bench,
     "doctor": doctor,
 }
+
+
+def _by_group(scenarios: Sequence[Scenario]) -> dict[str, dict[str, str]]:
+    """One line per scenario, by group; those that are to defeat their controller say so."""
+    found: dict[str, dict[str, str]] = {}
+    for group in get_args(Group):
+        lines = {each.name: each.description + _MEANT.get(each.expect, "") for each in scenarios if each.group == group}
+        found |= {f"scenarios: {group}": lines} if lines else {}
+    return found
+
+
+def _announce(scenario: Scenario, options: Namespace) -> None:
+    """Say what the course asks for, before it is flown; the summary says it again."""
+    if not options.json:
+        console.print_notice(report(scenario, build_vehicle(scenario)).sentence)
 
 
 def _load(name: str, options: Namespace) -> Scenario:

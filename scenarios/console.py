@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator, Mapping, Sequence
+import math
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from typing import Any, Final
 
 from rich.box import SIMPLE_HEAD
@@ -35,23 +36,38 @@ def print_summary(summary: Mapping[str, Any], where: str | None) -> None:
     """A flight's outcome, tracking, audit and solver, from its summary."""
     console = _console()
     console.print(f"[bold]{summary['scenario']}[/bold]  {outcome(summary)}  {summary['duration']:.2f} s flown")
+    if "course" in summary:
+        console.print(escape(summary["course"]["sentence"]), soft_wrap=True)
     if summary["tracking"]:
         console.print(_tracking_table(summary["tracking"]))
     if summary["constraints"]:
         console.print(audit_table(summary["constraints"]))
     if summary["tracking"]:
         console.print(_controller_line(summary))
+    for line in _effect_lines(summary):
+        console.print(line)
     if where is not None:
         console.print(f"written to [bold]{where}[/bold]", soft_wrap=True)
 
 
+def print_notice(text: str) -> None:
+    """Tell a person at a terminal something that work begins with."""
+    console = Console(stderr=True, highlight=False)
+    if console.is_terminal:
+        console.print(escape(text), soft_wrap=True)
+
+
 def outcome(summary: Mapping[str, Any]) -> str:
-    """Completed or aborted with its reason, and the verdict on the required constraints."""
+    """Completed or aborted with its reason, the verdict on the required constraints, and whether that was expected."""
+    expected, as_expected = summary.get("expected", "satisfied"), summary.get("as_expected", True)
+    remark = ""
+    if expected != "satisfied":
+        remark = ", as the scenario expects" if as_expected else f", where the scenario expects it {expected}"
+    colour = "green" if as_expected and (remark or summary["satisfied"]) else "red"
     if summary["status"] != "completed":
-        return f"[red]aborted[/red]: {summary['reason']}"
-    if summary["satisfied"]:
-        return "[green]completed, every required constraint holds[/green]"
-    return "[red]completed, a required constraint does not hold[/red]"
+        return f"[{colour}]aborted{remark}[/{colour}]: {summary['reason']}"
+    verdict = "every required constraint holds" if summary["satisfied"] else "a required constraint does not hold"
+    return f"[{colour}]completed, {verdict}{remark}[/{colour}]"
 
 
 def audit_table(constraints: Sequence[Mapping[str, Any]]) -> Table:
@@ -110,6 +126,32 @@ def _controller_line(summary: Mapping[str, Any]) -> str:
     )
 
 
+def _effect_lines(summary: Mapping[str, Any]) -> Iterator[str]:
+    """What a flight's effects did, where it has them: ground, late commands, errors of the estimate."""
+    if "ground" in summary:
+        ground = summary["ground"]
+        left = "never left it" if ground["takeoff_time"] is None else f"left it at {ground['takeoff_time']:.2f} s"
+        touch = ground["touchdown"]
+        met = ""
+        if touch is not None:
+            met = (
+                f", met it at {touch['time']:.2f} s with {touch['speed']:.3g} m/s down, "
+                f"{touch['horizontal_speed']:.3g} m/s along and {touch['tilt']:.3g} deg of tilt"
+            )
+        yield f"ground: {left}{met}; {ground['phase']} at the end"
+    if "computation" in summary:
+        delay = summary["computation"]["delay_ms"]
+        yield (
+            f"simulated computation: p50 {delay['p50']:.3g}, p99 {delay['p99']:.3g}, max {delay['max']:.3g} ms; "
+            f"{summary['computation']['missed']} commands too late to be used"
+        )
+    if "estimation" in summary:
+        rmse = summary["estimation"]["rmse"]
+        lengths = ", ".join(f"{name} {rmse[name]:.3g}" for name in ("x", "y", "z"))
+        angles = ", ".join(f"{name} {math.degrees(rmse[name]):.3g}" for name in ("roll", "pitch", "yaw"))
+        yield f"RMS error of what the controller was told: {lengths} m; {angles} deg"
+
+
 _BRIEF: Final = ("outcome", "required constraints", "RMS error", "verdict", "statuses", "whole step, m")
 """How the labels begin of the rows that a terminal shows; the page and its `comparison.md` have them all."""
 
@@ -130,13 +172,13 @@ def print_comparison(rows: Sequence[Row], names: Sequence[str], where: str) -> N
     console.print(f"every number, plots and films: [bold]{where}[/bold]", soft_wrap=True)
 
 
-def print_grids(grids: Sequence[Grid], where: str | None) -> None:
-    """Tables of cases, one below the other, with what a reader has to know of each."""
+def print_grids(grids: Sequence[Grid], where: str | None, *, prose: Collection[str] = ()) -> None:
+    """Tables of cases, one below the other, with what a reader has to know of each; `prose` names columns of words."""
     console = _console()
     for grid in grids:
         table = _table(grid.title, caption=escape(grid.note.replace("`", "")) or None)
         for i, name in enumerate(grid.head):
-            table.add_column(escape(name), justify="right" if i else "left", no_wrap=not i)
+            table.add_column(escape(name), justify="right" if i and name not in prose else "left", no_wrap=not i)
         for line in grid.lines:
             table.add_row(*(_cell(cell) for cell in line))
         console.print(table)

@@ -9,10 +9,12 @@ from typing import Any, Final
 
 from pydantic import ValidationError
 
-from quadsim.assets import read_toml
 from quadsim.errors import FileError, ParameterError, UnknownNameError
+from scenarios.bases import read_scenario
+from scenarios.courses.build import located
 from scenarios.problems import ScenarioError, describe
 from scenarios.spec import Scenario
+from scenarios.spec.course import CsvSpec
 
 LIBRARY: Final = Path(__file__).resolve().parent / "library"
 
@@ -38,7 +40,7 @@ def scenario_path(name: str) -> Path:
 
 
 def load_scenario(name: str, settings: Sequence[str] = ()) -> Scenario:
-    """Read and check a scenario.
+    """Read and check a scenario, merged over its `base` where it has one.
 
     Args:
         name: a library name, or a path ending in `.toml`.
@@ -48,7 +50,7 @@ def load_scenario(name: str, settings: Sequence[str] = ()) -> Scenario:
         InputError: the file is missing or malformed, or a field is not allowed.
     """
     path = scenario_path(name)
-    data = read_toml(path)
+    data = read_scenario(path, scenario_path)
     for setting in settings:
         apply_setting(data, setting)
     return parse_scenario(data, source=path.name, directory=path.parent)
@@ -60,10 +62,11 @@ def parse_scenario(data: Mapping[str, Any], *, source: str = "scenario", directo
     Args:
         data: the parsed TOML.
         source: what to call it in messages.
-        directory: where relative vehicle paths are looked up, besides the working directory.
+        directory: where relative paths of vehicles and courses are looked up, besides the working directory.
 
     Raises:
         ScenarioError: naming every field that is wrong.
+        FileError: the course's table is wrong.
     """
     try:
         scenario = Scenario.model_validate(dict(data))
@@ -74,11 +77,16 @@ def parse_scenario(data: Mapping[str, Any], *, source: str = "scenario", directo
     if directory is not None and file.endswith(".toml") and (directory / file).is_file():
         absolute = str((directory / file).resolve())
         scenario = scenario.model_copy(update={"vehicle": scenario.vehicle.model_copy(update={"file": absolute})})
+    if directory is not None and isinstance(scenario.reference, CsvSpec):
+        scenario = scenario.model_copy(update={"reference": located(scenario.reference, directory)})
     return scenario
 
 
 def apply_setting(data: dict[str, Any], setting: str) -> None:
-    """Apply one `dotted.path=value` to a scenario's tables; entries of `constraints` are addressed by their name.
+    """Apply one `dotted.path=value` to a scenario's tables.
+
+    An entry of a list of tables is addressed by its name, as in `constraints.roll.upper`, or, where it has none, by its
+    index, as in `events.0.at`.
 
     Raises:
         ParameterError: the text is not of that form, or the path goes through something that is no table.
@@ -97,11 +105,12 @@ def apply_setting(data: dict[str, Any], setting: str) -> None:
             if depth == len(keys) - 1:
                 rule = f"a path to a field; {'.'.join(keys)} is an entry of a list"
                 raise ParameterError("", "--set", setting, rule)
-            named = [entry for entry in table if isinstance(entry, dict) and entry.get("name") == key]
-            if not named:
-                allowed = [str(entry.get("name")) for entry in table if isinstance(entry, dict)]
-                raise UnknownNameError(f"entry of {'.'.join(keys[:depth])}", key, allowed)
-            table = named[0]
+            entries = {str(entry.get("name", i)): entry for i, entry in enumerate(table) if isinstance(entry, dict)}
+            if not entries:
+                raise ParameterError("", "--set", setting, f"a path to a field; {keys[depth - 1]} has none")
+            if key not in entries:
+                raise UnknownNameError(f"entry of {'.'.join(keys[:depth])}", key, entries)
+            table = entries[key]
         elif not isinstance(table, dict):
             raise ParameterError("", "--set", setting, f"a path to a field; {keys[depth - 1]} has none")
         elif depth == len(keys) - 1:

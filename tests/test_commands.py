@@ -40,8 +40,9 @@ RUNNABLE = [line for line in QUADSIM if not line.startswith("quadsim view")]  # 
 
 
 def arguments_of(line: str) -> list[str]:
-    """A command line's words after the command itself, without its comment."""
-    return shlex.split(line, comments=True)[1:]
+    """A command line's words after the command itself, without its comment and where its output goes."""
+    words = shlex.split(line, comments=True)[1:]
+    return words[: words.index(">")] if ">" in words else words
 
 
 def promised_file(options: Namespace) -> Path | None:

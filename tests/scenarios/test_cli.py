@@ -22,7 +22,7 @@ from quadsim import __version__, rundir
 from quadsim.assets import vehicle_names
 from quadsim.errors import QuadsimError, RenderingUnavailableError
 from scenarios.cli import EXIT_DONE, EXIT_FAILED, EXIT_WRONG_INPUT, main
-from scenarios.loading import LIBRARY, scenario_names
+from scenarios.loading import LIBRARY, load_scenario, scenario_names
 
 ROOT = Path(__file__).resolve().parents[2]
 TABLES = ("--no-video", "--no-recording", "--no-figures")
@@ -65,9 +65,58 @@ def test_list_names_everything_with_one_line_each(capsys: pytest.CaptureFixture[
 def test_list_as_json(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["list", "--json"]) == EXIT_DONE
     listed = json.loads(capsys.readouterr().out)
-    assert list(listed) == ["scenarios", "vehicles", "controllers", "solvers"]
-    assert list(listed["scenarios"]) == scenario_names()
+    assert list(listed) == ["scenarios", "groups", "expected", "vehicles", "controllers", "solvers"]
+    assert list(listed["scenarios"]) == list(listed["groups"]) == list(listed["expected"]) == scenario_names()
+    assert listed["groups"]["paper-constrained"] == "paper"
+    assert listed["expected"]["paper-constrained"] == "satisfied"
     assert list(listed["solvers"]) == list(SOLVERS)
+
+
+def test_list_shows_scenarios_by_group_and_what_is_to_defeat_the_controller(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    meant = {"a": ("faults", "lost"), "b": ("air", "violated"), "c": ("air", "satisfied")}
+    made = {
+        name: load_scenario("hover", [f"name={name}", "description=d", f"group={group}", f"expect={expect}"])
+        for name, (group, expect) in meant.items()
+    }
+    monkeypatch.setattr("scenarios.commands.scenario_names", lambda: list(made))
+    monkeypatch.setattr("scenarios.commands.load_scenario", lambda name: made[name])
+    assert main(["list"]) == EXIT_DONE
+    lines = [" ".join(line.split()) for line in capsys.readouterr().out.splitlines()]
+    assert lines[: lines.index("vehicles")] == [
+        "scenarios: air",
+        "b d (meant to violate a constraint)",
+        "c d",
+        "",
+        "scenarios: faults",
+        "a d (meant to be lost)",
+        "",
+    ]
+
+
+# --- scenario ------------------------------------------------------------------------------------------------------
+
+
+def test_a_printed_scenario_is_a_file_of_ones_own(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["scenario", "hover", *SHORT, "--set", "vehicle.mass=4.2", "--seed", "7"]) == EXIT_DONE
+    printed = capsys.readouterr()
+    assert printed.err == ""
+    assert "mass = 4.2" in printed.out
+    assert "inertia = [0.033, 0.033, 0.066]" in printed.out
+    assert "# [s] physics step" in printed.out
+    (here / "mine.toml").write_text(printed.out)
+    assert main(["scenario", "mine.toml"]) == EXIT_DONE
+    assert capsys.readouterr().out == printed.out
+    assert load_scenario("mine.toml").seed == 7
+    assert main(["run", "mine.toml", *TABLES, "--out", "run"]) == EXIT_DONE
+    assert (here / "run" / "scenario.toml").read_text() == printed.out
+
+
+@pytest.mark.parametrize("name", [[], ["hover"]])
+def test_the_schema_is_printed_as_json(name: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["scenario", *name, "--schema"]) == EXIT_DONE
+    assert json.loads(capsys.readouterr().out)["title"] == "A quadsim scenario"
 
 
 def test_version(capsys: pytest.CaptureFixture[str]) -> None:
@@ -137,6 +186,34 @@ def test_a_violated_constraint_that_is_not_required_is_status_0(here: Path, caps
     settings = ["--set", "constraints.speed.upper=150.0", "--set", "constraints.speed.required=false"]
     assert main(["run", "hover", *SHORT, *TABLES, *settings]) == EXIT_DONE
     assert "exceeded*" in capsys.readouterr().out
+
+
+VIOLATED = ["--set", "constraints.speed.upper=150.0"]
+LOST = ["--set", "initial.euler=[60.0, 0.0, 0.0]"]
+
+
+@pytest.mark.parametrize(
+    ("settings", "expect", "as_expected", "line"),
+    [
+        ([], "violated", False, "completed, every required constraint holds, where the scenario expects it violated"),
+        (VIOLATED, "satisfied", False, "completed, a required constraint does not hold  0.50 s"),
+        (VIOLATED, "violated", True, "completed, a required constraint does not hold, as the scenario expects"),
+        (VIOLATED, "lost", False, "completed, a required constraint does not hold, where the scenario expects it lost"),
+        (LOST, "satisfied", False, "aborted: at t = 0.000 s"),
+        (LOST, "lost", True, "aborted, as the scenario expects: at t = 0.000 s"),
+    ],
+)
+def test_the_outcome_is_held_against_what_the_scenario_expects(
+    here: Path, capsys: pytest.CaptureFixture[str], settings: list[str], expect: str, as_expected: bool, line: str
+) -> None:
+    """What was expected changes no exit status: 0 is for constraints that hold."""
+    status = EXIT_FAILED if settings else EXIT_DONE
+    arguments = ["hover", *SHORT, *settings, "--set", f"expect={expect}"]
+    assert main(["check", *arguments]) == status
+    assert line in capsys.readouterr().out
+    assert main(["check", *arguments, "--json"]) == status
+    summary = json.loads(capsys.readouterr().out)
+    assert (summary["group"], summary["expected"], summary["as_expected"]) == ("courses", expect, as_expected)
 
 
 def test_an_aborted_flight_is_status_1_with_its_reason(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -239,6 +316,8 @@ WRONG: dict[str, tuple[list[str], str]] = {
     "no such scenario": (["run", "hovr"], "no scenario named 'hovr'; did you mean 'hover'?"),
     "no such file": (["run", "gone.toml"], "gone.toml: no such scenario file"),
     "one scenario of two": (["compare", "hover", "nope", "--out", "page"], "no scenario named 'nope'"),
+    "a scenario without a name": (["scenario"], "scenario needs a name or a TOML file, or --schema (there are: "),
+    "a scenario that is not there": (["scenario", "hovr"], "no scenario named 'hovr'; did you mean 'hover'?"),
     "a directory": (["run", "folder"], "folder is a directory; give a scenario's name or its TOML file"),
     "not TOML": (["run", "bad.toml"], "bad.toml: is not valid TOML: "),
     "a misspelt field": ([*RUN, "--set", "controller.horizn=3"], "controller.horizn is not a field of the scenario"),
@@ -488,7 +567,7 @@ def test_a_defect_of_our_own_shows_its_traceback(here: Path, monkeypatch: pytest
         raise ZeroDivisionError
 
     assert not issubclass(ZeroDivisionError, QuadsimError)
-    monkeypatch.setattr("scenarios.runner.fly", broken)
+    monkeypatch.setattr("scenarios.flying.fly", broken)
     with pytest.raises(ZeroDivisionError):
         main(["check", "hover"])
 

@@ -33,7 +33,8 @@ UPSIDE = "initial.euler=[60.0, 0.0, 0.0]"
 TOO_WEAK = [
     "duration=10",
     "plant.limit_speeds=true",
-    "vehicle.speed_max=150.0",
+    "vehicle.speed_max=192.801",  # just enough to hover: height that is lost never comes back
+    "initial.euler=[4.9, 0.0, 30.0]",
     "controller.horizon=10",
     "controller.output_bounds.z=[-1.0, 20.0]",
 ]
@@ -200,7 +201,7 @@ def test_a_flight_that_cannot_begin_is_recorded_with_its_reason(tmp_path: Path) 
 
 
 def test_a_flight_lost_on_the_way_is_recorded_up_to_there(tmp_path: Path) -> None:
-    """Rotors too weak to hover, which the controller does not know: it falls below its bound, and gives up."""
+    """Rotors too weak to climb, which the controller does not know: it falls below its bound, and gives up."""
     flown = run(tmp_path / "run", *TOO_WEAK)
     periods = flown.log.control.t.size
     assert 0 < periods < 200
@@ -209,6 +210,13 @@ def test_a_flight_lost_on_the_way_is_recorded_up_to_there(tmp_path: Path) -> Non
     assert flown.summary["duration"] == flown.log.plant.t[-1] == pytest.approx(0.05 * periods)
     assert flown.summary["controller"]["fallbacks"] == {"0": periods - 9, "1": 9}
     assert flown.log.plant.state[-1, 4] < -1.0
+
+
+def test_a_flight_that_was_interrupted_is_not_what_any_scenario_expects(tmp_path: Path) -> None:
+    scenario = load_scenario("hover", [SHORT, "expect=lost"])
+    flight = runner.run(scenario, tmp_path / "run", TABLES, interrupt_after(3))
+    assert flight.outcome == "lost"
+    assert rundir.read_summary(tmp_path / "run")["as_expected"] is False
 
 
 def test_ctrl_c_in_flight_keeps_what_was_flown(tmp_path: Path) -> None:
@@ -280,7 +288,7 @@ def test_a_run_whose_products_cannot_be_finished_leaves_the_earlier_one(
 
     monkeypatch.setattr("quadsim.figures.write_figures", failing)
     with pytest.raises((OutputError, KeyboardInterrupt)):
-        runner.run(load_scenario("hover", [SHORT]), tmp_path / "run", Outputs(video=False, recording=False))
+        runner.run(load_scenario("hover", [SHORT]), tmp_path / "run", Outputs(video=False))
     assert rundir.read_summary(tmp_path / "run") == earlier.summary
     assert [path.name for path in tmp_path.iterdir()] == ["run"]
 
@@ -297,7 +305,21 @@ def test_a_defect_of_our_own_is_not_taken_for_a_flight(tmp_path: Path, monkeypat
     assert list(tmp_path.iterdir()) == []
 
 
-def test_outputs_are_made_as_asked_for(tmp_path: Path) -> None:
+@pytest.mark.parametrize("cores", [1, 2])
+def test_a_recording_that_cannot_be_made_leaves_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, cores: int
+) -> None:
+    monkeypatch.setattr(runner, "usable_cores", lambda: cores)
+    monkeypatch.setenv("RERUN", "off")
+    with pytest.raises(OutputError, match=r"run/flight\.rrd: rerun is switched off by the environment variable RERUN$"):
+        runner.run(load_scenario("hover", [SHORT]), tmp_path / "new" / "run", Outputs(video=False))
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("cores", [1, 2])
+def test_outputs_are_made_as_asked_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, cores: int) -> None:
+    """Where there are cores for it, the recording by a process of its own."""
+    monkeypatch.setattr(runner, "usable_cores", lambda: cores)
     runner.run(load_scenario("hover", [SHORT]), tmp_path / "run", Outputs(video=False))
     names = {path.name for path in (tmp_path / "run").iterdir()}
     assert names == {

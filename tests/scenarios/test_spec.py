@@ -19,6 +19,7 @@ from quadsim.assets import vehicle_path
 from quadsim.audit import SIGNALS
 from quadsim.errors import FileError, InputError, ParameterError, UnknownNameError
 from quadsim.state import STATE_NAMES
+from quadsim.vehicle import OPTIONAL_PARAMETERS, VEHICLE_UNITS
 from scenarios.build import build_limits, build_vehicle, resolve
 from scenarios.loading import LIBRARY, apply_setting, load_scenario, parse_scenario, scenario_names, scenario_path
 from scenarios.problems import ScenarioError
@@ -40,15 +41,18 @@ def test_every_file_of_the_library_comes_back_from_its_resolved_text(name: str) 
     assert reread(scenario) == scenario
     assert reread(resolved) == resolved
     assert build_vehicle(reread(resolved)) == build_vehicle(scenario)
-    assert all(value is not None for value in resolved.vehicle.model_dump().values())  # its file alone defines it
+    numbers = resolved.vehicle.overrides()  # its file alone defines it
+    assert numbers.keys() >= VEHICLE_UNITS.keys() - set(OPTIONAL_PARAMETERS)
+    assert set(numbers) == {key for key in VEHICLE_UNITS if getattr(build_vehicle(scenario), key) is not None}
 
 
 def test_defaults_are_written_out() -> None:
     table = tomllib.loads(parse_scenario(scenario_table()).to_toml())
     assert table["seed"] == 0
+    assert (table["group"], table["expect"]) == ("other", "satisfied")
     assert table["log_rate"] == 200.0
     assert table["plant"] == {"timestep": 0.001, "limit_speeds": False}
-    assert table["initial"] == {"position": [0.0, 0.0, 0.0], "euler": [0.0, 0.0, 0.0]}
+    assert table["initial"] == {"position": [0.0, 0.0, 0.0], "euler": [0.0, 0.0, 0.0], "cold": False}
     assert table["controller"]["solver"] == "piqp-multistage"
 
 
@@ -93,6 +97,9 @@ WRONG = {
     "duration=-1.0": "duration must be > 0.0; got -1.0",
     "duration=1e9": "duration must be <= 86400.0; got 1000000000.0",
     "control_period=0": "control_period must be > 0.0; got 0",
+    "group=nowhere": "group must be one of 'paper', 'courses', 'air', 'faults', 'ground', 'sensors' or 'other'; ...",
+    "expect=fine": "expect must be one of 'satisfied', 'violated' or 'lost'; got 'fine'",
+    "name='" + 81 * "a" + "'": "name must be a text of 80 or fewer characters; got '" + 81 * "a" + "'",
     "seed=-1": "seed must be >= 0; got -1",
     "seed=1.5": "seed must be a whole number; got 1.5",
     "log_rate=0": "log_rate must be >= 0.01; got 0",
@@ -274,7 +281,8 @@ def test_a_file_that_is_no_scenario_is_refused(tmp_path: Path, content: bytes, p
 
 def test_an_unknown_vehicle_is_answered_with_those_there_are() -> None:
     with pytest.raises(
-        UnknownNameError, match=r"no vehicle named 'lopes'; did you mean 'lopes2011'\? \(there are: lopes2011"
+        UnknownNameError,
+        match=r"no vehicle named 'lopes'; did you mean 'lopes2011'\? \(there are: crazyflie2, hummingbird, lopes2011",
     ):
         build_vehicle(load_scenario("hover", ["vehicle.file=lopes"]))
 
@@ -445,6 +453,28 @@ def test_a_file_with_anything_anywhere_is_either_right_or_named_as_wrong(data: s
         return
     assert str(path[0]) in message
     assert "Input should" not in message, "pydantic's own words"
+
+
+EVENT = '{type="gust", at=0.1, duration=0.2, velocity=[1.0, 0.0, 0.0]}'
+
+
+def test_an_entry_without_a_name_is_set_by_its_index() -> None:
+    both = f"events=[{EVENT}, {EVENT}]"
+    scenario = load_scenario("hover", [both, "events.1.at=3", "events.1.velocity=[0, 2, 0]"])
+    assert [event.at for event in scenario.events] == [0.1, 3.0]
+    with pytest.raises(UnknownNameError, match=r"^no entry of events named '2' \(there are: 0, 1\)$"):
+        load_scenario("hover", [both, "events.2.at=3"])
+    with pytest.raises(ScenarioError, match=r"events\.1\.at must be a number; got 'late'"):
+        load_scenario("hover", [both, "events.1.at=late"])
+
+
+@pytest.mark.parametrize("setting", ["initial.position.0.x=3", "events.0.at=3"])
+def test_a_setting_does_not_go_through_a_list_that_holds_no_tables(setting: str) -> None:
+    field = setting.split(".0.")[0].rpartition(".")[2]
+    table: dict[str, Any] = {"initial": {"position": [0.0, 0.0, 0.0]}, "events": []}
+    with pytest.raises(ParameterError) as caught:
+        apply_setting(table, setting)
+    assert str(caught.value) == f"--set must be a path to a field; {field} has none; got {setting!r}"
 
 
 def test_a_setting_that_names_a_whole_entry_of_a_list_is_refused() -> None:
