@@ -71,6 +71,7 @@ build: setup  ## source archive and wheel in dist/; the wheel is installed alone
 
 numbers: setup $(VENV)/.peers  ## remake the numbers in README.md and docs/, but for those of the peers
 	@$(PY) docs/make_numbers.py
+	@$(PY) docs/make_scenarios.py
 	@$(PY) docs/make_performance.py
 
 verification: setup $(VENV)/.peers  ## remake docs/verification.md and its table in README.md

@@ -5,6 +5,7 @@ Everything is measured by `quadsim bench`; here it becomes a page.
 
 from __future__ import annotations
 
+import math
 import subprocess
 import sys
 import tempfile
@@ -20,6 +21,7 @@ from scenarios.bench.flight import bench_flight
 from scenarios.bench.render import bench_render
 from scenarios.bench.solvers import bench_solvers, section, write_bench
 from scenarios.loading import load_scenario
+from scenarios.runner import fly_scenario
 
 ROOT = Path(__file__).resolve().parent.parent
 SCENARIO = "paper-constrained"
@@ -38,6 +40,55 @@ BEFORE: Table = [
 ]
 """Measured at `BEFORE_COMMIT`, before the shortcut, on a machine of the kind of the page's other numbers; there the
 step had a median of 1.0 ms and a p99 of 1.5 ms."""
+
+
+AIR = ["effects.air.rotor_drag=3e-4", "effects.air.wind=[3.0, 0.0, 0.0]"]
+LAG = ["effects.rotors.rise=0.02", "effects.rotors.fall=0.02"]
+GPS = ["sensors.position={rate=20, noise=0.5, delay=0.11}", "sensors.attitude={rate=100, noise=1.0}"]
+EFFECTS = {
+    "none": [],
+    "rotor lag": LAG,
+    "rotor lag and inertia": [*LAG, "effects.rotors.inertia=1e-4"],
+    "rotor drag, steady wind": AIR,
+    "the same, body drag, turbulence": [
+        *AIR,
+        "effects.air.body_drag=[0.02, 0.02, 0.05]",
+        "effects.air.turbulence={wind_speed_20ft=7.7}",
+    ],
+    "ground": ["effects.ground={contact=true}"],
+    "ground, ground effect": ["effects.ground={contact=true, effect=true}"],
+    "four sensors, no estimator": [
+        *(f"sensors.{name}={{rate=100, noise=0.01}}" for name in ("position", "velocity", "attitude", "rates"))
+    ],
+    "position and attitude sensor, estimator": [*GPS, "estimator={type='error_state'}"],
+    "the same with a gyro of 200 Hz": [
+        *GPS,
+        "sensors.rates={rate=200, noise=0.3}",
+        "estimator={type='error_state'}",
+    ],
+}
+"""Effects whose cost is measured, as settings of the scenario; the first is what the others are compared with."""
+
+
+EFFECTS_NOTE = (
+    "The paper's unconstrained controller in hover, so that little but the plant is left; best of five, in turns, "
+    "scaled to 60 s.\nWithout effects a control period is one call of MuJoCo; what depends on the vehicle's motion "
+    "takes each physics step by itself,\nfrom Python."
+)
+
+
+def effect_costs() -> Table:
+    """What effects cost a flight of 20 s in hover; best of `REPEATS`, in turns."""
+    hover = ["duration=20.0", "reference.x=[]", "reference.y=[]", "reference.z=[]", "initial.position=[0.0, 0.0, 2.0]"]
+    scenarios = {name: load_scenario("paper-unconstrained", [*hover, *extra]) for name, extra in EFFECTS.items()}
+    best = dict.fromkeys(EFFECTS, math.inf)
+    for _ in range(REPEATS):
+        for name, scenario in scenarios.items():
+            best[name] = min(best[name], fly_scenario(scenario).simulate_s)
+    rows: Table = [("effects", "60 s of flight [s]", "ratio")]
+    for name, seconds in best.items():
+        rows.append((name, f"{3.0 * seconds:.2f}", f"{seconds / best['none']:.2f}"))
+    return rows
 
 
 def whole_commands(flight: FlightProfile, film: RenderProfile) -> Table:
@@ -73,7 +124,7 @@ def _wall_s(arguments: list[str]) -> float:
     return clock.perf_counter() - started
 
 
-def page(bench: SolverBench, flight: FlightProfile, film: RenderProfile, commands: str) -> str:
+def page(bench: SolverBench, flight: FlightProfile, film: RenderProfile, commands: str, effects: str) -> str:
     """The whole page."""
     contenders, *others = solver_tables(bench)
     machine = bench.machine
@@ -89,6 +140,7 @@ def page(bench: SolverBench, flight: FlightProfile, film: RenderProfile, command
             f"Before, at commit {BEFORE_COMMIT}, when every period had its QP (step: median 1.0 ms, p99 1.5 ms); "
             "measured then, on a machine of the same kind, not in this run:\n\n"
             f"{markdown(BEFORE)}",
+            f"## What effects cost\n\n{EFFECTS_NOTE}\n\n{effects}",
             *(section(grid) for grid in render_tables(film)),
             f"## Whole commands\n\n{commands}",
         ]
@@ -99,13 +151,13 @@ def main() -> None:
     """Measure everything and write it."""
     scenario = load_scenario(SCENARIO)
     flight, film = bench_flight(scenario), bench_render(scenario)
-    commands = markdown(whole_commands(flight, film))
+    commands, effects = markdown(whole_commands(flight, film)), markdown(effect_costs())
     bench = bench_solvers(scenario)
     with tempfile.TemporaryDirectory() as scratch:
         write_bench(bench, Path(scratch))
         figure = Image.open(Path(scratch) / "solvers.png").convert("RGB")
         figure.quantize(64, dither=Image.Dither.NONE).save(ROOT / "docs" / "solvers.png", optimize=True)
-    (ROOT / "docs" / "performance.md").write_text(page(bench, flight, film, commands), encoding="utf-8")
+    (ROOT / "docs" / "performance.md").write_text(page(bench, flight, film, commands, effects), encoding="utf-8")
     replace_in_readme("times", commands)
     replace_in_readme("solvers", grid_to_markdown(solver_tables(bench)[0]))
 

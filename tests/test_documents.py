@@ -11,7 +11,7 @@ from quadsim.cost import cost_tables
 from quadsim.table import grid_to_markdown
 from scenarios.cost import fly_variations, study_cost
 from scenarios.loading import load_scenario
-from scenarios.runner import Flight
+from scenarios.runner import Flight, fly_scenario
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -63,6 +63,15 @@ def test_the_readme_has_the_table_of_the_verification_page() -> None:
     table = readme.partition("<!-- verification: made by `make verification` -->")[2].partition("<!-- ")[0].strip()
     assert table.startswith("| check | peer | measured | allowed |")
     assert table in page
+
+
+def test_the_example_in_the_page_on_effects_is_a_scenario(tmp_path: Path) -> None:
+    page = (ROOT / "docs/effects.md").read_text(encoding="utf-8")
+    (example,) = re.findall(r"```toml\n(.*?)```", page, flags=re.DOTALL)
+    (tmp_path / "gusty.toml").write_text(example, encoding="utf-8")
+    scenario = load_scenario(str(tmp_path / "gusty.toml"), ["duration=16.0"])
+    assert scenario.effects.air is not None
+    assert fly_scenario(scenario).log.plant.wind is not None
 
 
 def test_documents_link_to_files_that_exist() -> None:

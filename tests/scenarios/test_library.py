@@ -1,0 +1,302 @@
+"""Every scenario that ships: finite, reproducible to the byte, with the verdict that its file states."""
+
+from __future__ import annotations
+
+import math
+import tomllib
+from collections.abc import Callable
+from dataclasses import fields
+from pathlib import Path
+from typing import get_args
+
+import numpy as np
+import pytest
+from make_scenarios import HEAD, PAGE, TITLES, nearest, row
+
+from quadsim.controller import ACCEPTED, MISSED
+from quadsim.flightlog import FLIGHT_FILE, PLANT_FILE, FlightLog, PlantLog, write_log
+from scenarios import runner
+from scenarios.courses.table import read_table
+from scenarios.loading import LIBRARY, load_scenario, parse_scenario, scenario_names
+from scenarios.runner import Flight
+from scenarios.spec import Group, Scenario
+
+ALREADY_FLOWN = {"paper-constrained": "constrained_flight", "paper-unconstrained": "unconstrained_flight"}
+"""Fixtures of the whole session."""
+LONGEST_DESCRIPTION = 100
+
+
+@pytest.fixture(scope="module", params=scenario_names())
+def flight(request: pytest.FixtureRequest) -> Flight:
+    """Each scenario, flown once for the tests that ask for it one after another."""
+    name = request.param
+    return request.getfixturevalue(ALREADY_FLOWN[name]) if name in ALREADY_FLOWN else fly(load_scenario(name))
+
+
+def fly(scenario: Scenario, *, seed: int | None = None) -> Flight:
+    return runner.fly_scenario(scenario if seed is None else scenario.model_copy(update={"seed": seed}))
+
+
+def written(flight: Flight, directory: Path) -> tuple[bytes, bytes]:
+    """flight.parquet and plant.parquet as bytes, without the seed's name in them."""
+    directory.mkdir()
+    write_log(directory, flight.log, plant_stride=flight.scenario.plant_stride, metadata={})
+    return (directory / FLIGHT_FILE).read_bytes(), (directory / PLANT_FILE).read_bytes()
+
+
+def draws(scenario: Scenario) -> bool:
+    """Whether anything in the scenario is random."""
+    air, disturbance = scenario.effects.air, scenario.effects.disturbance
+    return (
+        scenario.sensors is not None
+        or scenario.estimator is not None
+        or (scenario.computation is not None and scenario.computation.jitter > 0.0)
+        or (air is not None and air.turbulence is not None)
+        or (disturbance is not None and disturbance.force_noise + disturbance.torque_noise > 0.0)
+    )
+
+
+def error(flight: Flight, channel: str) -> float:
+    """Real minus reference at the last sample."""
+    return float(runner.summarise(flight)["tracking"]["final_error"][channel])
+
+
+def estimation_rmse(log: FlightLog, columns: list[int]) -> float:
+    return float(np.sqrt(np.mean((log.control.state - log.control.truth)[20:, columns] ** 2)))
+
+
+# What the comments and descriptions of some files say in words.
+
+
+def lag20_is_infeasible(flight: Flight) -> None:
+    assert "primal_infeasible" in str(flight.log.reason)
+    first = flight.log.control.t[flight.log.control.status.index("primal_infeasible")]
+    assert 7.5 < first < 10.0  # once the step in x at 10 s is in view
+
+
+def heavy_stays_low(flight: Flight) -> None:
+    assert error(flight, "z") == pytest.approx(-0.399, abs=0.002)
+    assert abs(error(flight, "x")) < 0.01
+
+
+def yaw_180_runs_away(flight: Flight) -> None:
+    assert math.hypot(error(flight, "x"), error(flight, "y")) > 20.0
+    assert abs(error(flight, "yaw")) < math.radians(1.0)
+
+
+def wind_leaves_an_offset(flight: Flight) -> None:
+    assert error(flight, "x") == pytest.approx(0.146, abs=0.002)
+
+
+def gust_leaves_none(flight: Flight) -> None:
+    errors = flight.log.control.truth[:, [0, 2]] - flight.log.control.reference[:, :2]
+    assert np.linalg.norm(errors, axis=1).max() > 0.2
+    assert abs(error(flight, "x")) < 1e-3
+
+
+def payload_drop_ends_the_error(flight: Flight) -> None:
+    log = flight.log.control
+    assert log.truth[log.t == 2.9, 4] == pytest.approx(0.8, abs=0.02)
+    assert abs(error(flight, "z")) < 1e-3
+
+
+def worn_rotor_stays_aside(flight: Flight) -> None:
+    assert error(flight, "y") == pytest.approx(-0.68, abs=0.01)
+
+
+def stall_misses_sixteen(flight: Flight) -> None:
+    assert flight.log.control.status.count(MISSED) == 16
+
+
+def jitter_misses_one_in_twenty(flight: Flight) -> None:
+    share = flight.log.control.status.count(MISSED) / flight.log.control.t.size
+    assert share == pytest.approx(math.exp(-3.0), abs=3.0 * math.sqrt(0.05 / 400))
+
+
+def lands_gently(flight: Flight) -> None:
+    ground = runner.summarise(flight)["ground"]
+    assert ground["phase"] == "landed"
+    assert not ground["crashed"]
+    assert 0.0 < ground["touchdown"]["speed"] < 0.5
+    assert ground["touchdown"]["tilt"] < 1.0
+    assert 1.5 < ground["takeoff_time"] < 3.0
+    assert flight.log.control.speeds_before.max() == 0.0
+    assert flight.log.plant.speeds[-1].max() == 0.0
+
+
+def lands_hard(flight: Flight) -> None:
+    ground = runner.summarise(flight)["ground"]
+    assert ground["touchdown"]["speed"] == pytest.approx(1.9, abs=0.05)
+    assert ground["phase"] == "landed"
+
+
+def ground_lifts(flight: Flight) -> None:
+    assert error(flight, "z") == pytest.approx(0.030, abs=0.001)
+
+
+def capture_is_within_four_millimetres(flight: Flight) -> None:
+    assert 0.002 < estimation_rmse(flight.log, [0, 2, 4]) < 0.005
+
+
+def raw_sensors_move_the_rotors(flight: Flight) -> None:
+    assert np.abs(flight.log.control.slews).mean() > 5.0
+
+
+def satellites_are_filtered(flight: Flight) -> None:
+    assert 0.05 < estimation_rmse(flight.log, [0, 2, 4]) < 0.3  # of 0.5 m
+
+
+def frozen_position_is_believed(flight: Flight) -> None:
+    errors = flight.log.control.state - flight.log.control.truth
+    assert np.abs(errors[:, 0]).max() > 1.0
+    assert abs(error(flight, "x")) < 0.1
+
+
+def nothing_is_solved_without_a_position(flight: Flight) -> None:
+    control = flight.log.control
+    blind = np.isnan(control.state).any(axis=1)
+    assert np.count_nonzero(blind) == 10
+    assert np.array_equal(blind, control.fallback == 1)
+
+
+def outage_is_bridged(flight: Flight) -> None:
+    t = flight.log.control.t
+    errors = np.abs(flight.log.control.state - flight.log.control.truth)[:, [0, 2, 4]].max(axis=1)
+    assert errors[(t > 5.0) & (t < 6.0)].max() > errors[(t > 3.0) & (t < 4.0)].max()
+    assert errors[t > 8.0].max() < 0.6
+
+
+SHOWN: dict[str, Callable[[Flight], None]] = {
+    "paper-constrained-lag20": lag20_is_infeasible,
+    "paper-constrained-heavy": heavy_stays_low,
+    "yaw-180": yaw_180_runs_away,
+    "steady-wind": wind_leaves_an_offset,
+    "gust": gust_leaves_none,
+    "payload-drop": payload_drop_ends_the_error,
+    "worn-rotor": worn_rotor_stays_aside,
+    "stalled-solver": stall_misses_sixteen,
+    "late-commands": jitter_misses_one_in_twenty,
+    "take-off-and-landing": lands_gently,
+    "hard-landing": lands_hard,
+    "ground-effect": ground_lifts,
+    "motion-capture": capture_is_within_four_millimetres,
+    "outliers": capture_is_within_four_millimetres,
+    "gyro-bias": capture_is_within_four_millimetres,
+    "raw-sensors": raw_sensors_move_the_rotors,
+    "satellite-navigation": satellites_are_filtered,
+    "frozen-position": frozen_position_is_believed,
+    "nan-position": nothing_is_solved_without_a_position,
+    "gps-outage": outage_is_bridged,
+}
+
+
+def test_it_has_the_verdict_that_its_file_states(flight: Flight) -> None:
+    broken = {f.limit.name: f.worst_margin for f in flight.findings if f.limit.required and not f.satisfied}
+    assert flight.findings, "a scenario must be audited against something"
+    assert flight.outcome == flight.scenario.expect, f"{flight.log.reason or ''} {broken}"
+
+
+def test_every_number_in_its_log_is_finite(flight: Flight) -> None:
+    control, plant = flight.log.control, flight.log.plant
+    told = control.state.copy()
+    if flight.scenario.name == "nan-position":  # what the sensor said then; nothing else
+        told[np.ix_((control.t > 2.99) & (control.t < 3.51), [0, 2, 4])] = 0.0
+        assert np.isnan(control.state).any()
+    assert np.isfinite(told).all()
+    for name in ("t", "truth", "reference", "speeds", "slack", "delay"):
+        assert np.isfinite(getattr(control, name)).all(), name
+    found = np.array([status in ACCEPTED for status in control.status])
+    assert np.isfinite(control.primal_residual[found]).all()
+    assert np.isfinite(control.dual_residual[found]).all()
+    for field in fields(PlantLog):
+        values = getattr(plant, field.name)
+        assert values is None or np.isfinite(values).all(), field.name
+
+
+def test_it_is_reproducible_and_its_seed_counts_where_something_is_random(flight: Flight, tmp_path: Path) -> None:
+    """Where nothing is random, the second flight has another seed, and still the same bytes."""
+    first = written(flight, tmp_path / "first")
+    if draws(flight.scenario):
+        assert written(fly(flight.scenario), tmp_path / "again") == first
+        other = written(fly(flight.scenario, seed=flight.scenario.seed + 1), tmp_path / "other")
+        assert all(ours != theirs for ours, theirs in zip(first, other, strict=True))
+    else:
+        assert written(fly(flight.scenario, seed=flight.scenario.seed + 1), tmp_path / "again") == first
+
+
+def test_it_shows_what_its_file_says(flight: Flight) -> None:
+    if flight.scenario.name in SHOWN:
+        SHOWN[flight.scenario.name](flight)
+
+
+def test_its_resolved_file_gives_it_again(flight: Flight) -> None:
+    assert parse_scenario(tomllib.loads(flight.scenario.to_toml())) == flight.scenario
+
+
+def test_its_line_in_the_documents_is_todays(flight: Flight) -> None:
+    line = "| " + " | ".join(row(flight)) + " |"
+    assert line in PAGE.read_text(encoding="utf-8").splitlines(), "docs/scenarios.md is out of date: make numbers"
+
+
+def test_there_are_scenarios_of_every_group() -> None:
+    groups = [load_scenario(name).group for name in scenario_names()]
+    assert len(groups) >= 25
+    for group in (group for group in get_args(Group) if group != "other"):
+        assert groups.count(group) >= 3, group
+    assert "other" not in groups
+    assert set(TITLES) == set(groups)
+
+
+def test_those_that_are_meant_to_defeat_the_papers_controller_are_there() -> None:
+    assert load_scenario("paper-constrained-lag20").expect == "lost"
+    assert load_scenario("paper-constrained-heavy").expect == "violated"
+    assert load_scenario("yaw-180").expect == "violated"
+
+
+def test_every_claim_is_of_a_scenario_that_there_is() -> None:
+    assert set(SHOWN) <= set(scenario_names())
+
+
+@pytest.mark.parametrize("name", scenario_names())
+def test_a_file_is_named_for_its_scenario_and_described_in_a_line(name: str) -> None:
+    data = tomllib.loads((LIBRARY / f"{name}.toml").read_text(encoding="utf-8"))
+    assert data["name"] == name
+    assert "\n" not in data["description"]
+    assert 20 <= len(data["description"]) <= LONGEST_DESCRIPTION
+    assert "group" in data
+
+
+def test_no_two_scenarios_are_described_alike() -> None:
+    descriptions = [load_scenario(name).description for name in scenario_names()]
+    assert len(set(descriptions)) == len(descriptions)
+
+
+def test_the_page_has_every_scenario_once() -> None:
+    lines = PAGE.read_text(encoding="utf-8").splitlines()
+    named = [line.split("`")[1] for line in lines if line.startswith("| `")]
+    assert sorted(named) == scenario_names()
+    assert lines.count("| " + " | ".join(HEAD) + " |") == len(TITLES)
+
+
+def test_nearest_is_the_constraint_with_the_least_left_of_its_range(
+    constrained_flight: Flight, unconstrained_flight: Flight
+) -> None:
+    """The constrained flight touches its bounds on tilt; the unconstrained one is required to arrive alone."""
+    name, left, unit = nearest(constrained_flight).split(" ")
+    assert name in ("roll", "pitch")
+    assert (float(left), unit) == (pytest.approx(-0.04, abs=0.011), "deg")
+    assert nearest(unconstrained_flight).startswith("arrival_")
+
+
+def test_the_trefoils_table_is_that_of_its_formula() -> None:
+    table = read_table(LIBRARY / "csv-trefoil.csv")
+    a, h, c = 0.5, 1.5, 0.3
+    s = table.t / 30.0
+    p, rate = 2.0 * np.pi * (10.0 * s**3 - 15.0 * s**4 + 6.0 * s**5), 2.0 * np.pi * s**2 * (1.0 - s) ** 2
+    x, y = a * (np.sin(p) + 2.0 * np.sin(2.0 * p)), a * (np.cos(p) - 2.0 * np.cos(2.0 * p))
+    vx, vy = a * (np.cos(p) + 4.0 * np.cos(2.0 * p)) * rate, a * (4.0 * np.sin(2.0 * p) - np.sin(p)) * rate
+    poses = np.stack([x, y, h - c * np.sin(3.0 * p), 0.2 * np.sin(p)], axis=1)
+    assert np.array_equal(table.t, np.arange(61) * 0.5)
+    np.testing.assert_allclose(table.poses, poses, rtol=0.0, atol=1e-9)
+    velocities = np.stack([vx, vy, -3.0 * c * np.cos(3.0 * p) * rate], axis=1)
+    np.testing.assert_allclose(table.velocities, velocities, rtol=0.0, atol=1e-9)
