@@ -14,7 +14,8 @@ from quadsim.computation import Computation
 from quadsim.controller import MISSED, Command, Controller, Moment, Phase
 from quadsim.errors import FlightError, InterruptedFlightError
 from quadsim.flightlog import ControlLog, FlightLog, PlantLog, TimingLog
-from quadsim.plant import Plant, Stretch, physics_to_state
+from quadsim.physics import Stretch, physics_to_state
+from quadsim.plant import Plant
 from quadsim.state import INDEX, N_STATES, Array
 from quadsim.vehicle import N_ROTORS
 

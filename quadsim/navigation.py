@@ -79,7 +79,7 @@ class Navigation:
         """Start again, with the same draws.
 
         Args:
-            physics: (14,) MuJoCo's state at t = 0; see `quadsim.plant.physics_to_state`.
+            physics: (14,) MuJoCo's state at t = 0; see `quadsim.physics.physics_to_state`.
             speeds: (4,) rotor speeds in force [rad/s].
             yaw: near which turn the yaw is [rad].
         """

@@ -19,7 +19,7 @@ _COLUMNS = {
     SensorName.ATTITUDE: slice(4, 8),
     SensorName.RATES: slice(11, 14),
 }
-"""Where a sensor's quantity stands in MuJoCo's state; see `quadsim.plant.physics_to_state`."""
+"""Where a sensor's quantity stands in MuJoCo's state; see `quadsim.physics.physics_to_state`."""
 
 
 Flags = NDArray[np.bool_]

@@ -16,7 +16,8 @@ from quadsim.bench import FlightProfile
 from quadsim.controller import Controller
 from quadsim.errors import InputError, ParameterError
 from quadsim.flightlog import FlightLog
-from quadsim.plant import Plant, Stretch
+from quadsim.physics import Stretch
+from quadsim.plant import Plant
 from quadsim.state import Array
 from quadsim.vehicle import Vehicle
 from scenarios.build import (

@@ -7,7 +7,7 @@ from typing import Annotated, Final, Literal, get_args
 from pydantic import Field, model_validator
 
 from quadsim.errors import ParameterError
-from quadsim.plant import steps_per_period
+from quadsim.physics import steps_per_period
 from scenarios.spec.base import Spec
 from scenarios.spec.computation import ComputationSpec
 from scenarios.spec.constraint import ConstraintSpec

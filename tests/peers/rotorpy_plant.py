@@ -17,7 +17,7 @@ from rotorpy.vehicles.multirotor import Multirotor
 from scipy.integrate import solve_ivp
 
 from quadsim.errors import ParameterError
-from quadsim.plant import Stretch, physics_to_state
+from quadsim.physics import Stretch, physics_to_state
 from quadsim.state import EULER, EULER_RATE, POSITION, VELOCITY, Array, euler_to_body_rates, euler_to_quaternion
 from quadsim.vehicle import N_ROTORS, Vehicle
 

@@ -11,7 +11,8 @@ import pytest
 from quadsim.errors import ParameterError
 from quadsim.estimation import EstimatorSettings
 from quadsim.navigation import Navigation
-from quadsim.plant import Plant, physics_to_state
+from quadsim.physics import physics_to_state
+from quadsim.plant import Plant
 from quadsim.sensing import FaultKind, Sensor, SensorFault, SensorName
 from quadsim.state import INDEX, Array, make_state
 from quadsim.vehicle import Vehicle

@@ -10,7 +10,8 @@ from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
 from quadsim.errors import CommandError, DivergenceError, ParameterError
-from quadsim.plant import Plant, physics_to_state, steps_per_period
+from quadsim.physics import physics_to_state, steps_per_period
+from quadsim.plant import Plant
 from quadsim.state import Array, make_state
 from quadsim.vehicle import Vehicle
 

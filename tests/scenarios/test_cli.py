@@ -80,8 +80,8 @@ def test_list_shows_scenarios_by_group_and_what_is_to_defeat_the_controller(
         name: load_scenario("hover", [f"name={name}", "description=d", f"group={group}", f"expect={expect}"])
         for name, (group, expect) in meant.items()
     }
-    monkeypatch.setattr("scenarios.commands.scenario_names", lambda: list(made))
-    monkeypatch.setattr("scenarios.commands.load_scenario", lambda name: made[name])
+    monkeypatch.setattr("scenarios.commands.catalogue.scenario_names", lambda: list(made))
+    monkeypatch.setattr("scenarios.commands.catalogue.load_scenario", lambda name: made[name])
     assert main(["list"]) == EXIT_DONE
     lines = [" ".join(line.split()) for line in capsys.readouterr().out.splitlines()]
     assert lines[: lines.index("vehicles")] == [

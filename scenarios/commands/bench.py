@@ -1,0 +1,69 @@
+"""`quadsim bench`."""
+
+from __future__ import annotations
+
+import json
+from argparse import Namespace
+from pathlib import Path
+from typing import Any, Final
+
+from mpc.solvers import SOLVERS
+from quadsim import rundir
+from quadsim.table import Grid
+from scenarios import console, runner
+from scenarios.cli import EXIT_DONE
+from scenarios.commands.common import load
+from scenarios.spec import Scenario
+
+
+def bench(options: Namespace) -> int:
+    """`quadsim bench`."""
+    scenario = load(options.scenario, options)
+    with console.progress_bars(enabled=not options.json) as progress:
+        measured, tables, where = _BENCHES[options.kind](scenario, options, progress)
+    if options.json:
+        print(json.dumps(measured, indent=2))
+    else:
+        console.print_grids(tables, where)
+    return EXIT_DONE
+
+
+_Benched = tuple[dict[str, Any], list[Grid], str | None]
+"""What was measured, as plain values and as tables, and where it was written."""
+
+
+def _bench_solvers(scenario: Scenario, options: Namespace, progress: runner.Progress) -> _Benched:
+    from quadsim.bench import solver_tables
+    from scenarios.bench.solvers import bench_solvers, is_bench, write_bench
+
+    target = Path(options.out)
+    with rundir.writing(target, replaces=is_bench) as directory:
+        measured = bench_solvers(
+            scenario,
+            repeats=options.repeats,
+            horizons=options.horizons,
+            solvers=tuple(options.solvers or SOLVERS),
+            stride=options.stride,
+            progress=progress,
+        )
+        write_bench(measured, directory)
+    return measured.to_json(), solver_tables(measured), str(target)
+
+
+def _bench_flight(scenario: Scenario, options: Namespace, progress: runner.Progress) -> _Benched:
+    from quadsim.bench import flight_tables
+    from scenarios.bench.flight import bench_flight
+
+    profile = bench_flight(scenario, repeats=options.repeats, progress=progress)
+    return profile.to_json(), flight_tables(profile), None
+
+
+def _bench_render(scenario: Scenario, options: Namespace, progress: runner.Progress) -> _Benched:
+    from quadsim.bench import render_tables
+    from scenarios.bench.render import bench_render
+
+    profile = bench_render(scenario, seconds=options.seconds, workers=options.workers, progress=progress)
+    return profile.to_json(), render_tables(profile), None
+
+
+_BENCHES: Final = {"solvers": _bench_solvers, "flight": _bench_flight, "render": _bench_render}

@@ -1,0 +1,100 @@
+"""`quadsim list`, `scenario`, `vehicle` and `doctor`: what there is, and what it says."""
+
+from __future__ import annotations
+
+import json
+from argparse import Namespace
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Final, get_args
+
+from mpc.solvers import SOLVERS
+from quadsim.assets import vehicle_names, vehicle_path
+from quadsim.errors import InputError, ParameterError
+from quadsim.vehicle import load_vehicle, vehicle_sources
+from scenarios import console
+from scenarios.build import CONTROLLERS, build_vehicle, resolve
+from scenarios.cli import EXIT_DONE
+from scenarios.commands.common import load
+from scenarios.loading import load_scenario, scenario_names
+from scenarios.spec import Group, Scenario
+
+_MEANT: Final = {"violated": "  (meant to violate a constraint)", "lost": "  (meant to be lost)"}
+"""What `quadsim list` says of a scenario that is to defeat its controller."""
+
+
+def list_everything(options: Namespace) -> int:
+    """`quadsim list`."""
+    scenarios = [load_scenario(name) for name in scenario_names()]
+    sections = {
+        "vehicles": {name: load_vehicle(vehicle_path(name)).description for name in vehicle_names()},
+        "controllers": dict(CONTROLLERS),
+        "solvers": {name: entry.line for name, entry in SOLVERS.items()},
+    }
+    if options.json:
+        about = {
+            "scenarios": {each.name: each.description for each in scenarios},
+            "groups": {each.name: each.group for each in scenarios},
+            "expected": {each.name: each.expect for each in scenarios},
+        }
+        print(json.dumps({**about, **sections}, indent=2))
+    else:
+        console.print_listing({**_by_group(scenarios), **sections})
+    return EXIT_DONE
+
+
+def scenario(options: Namespace) -> int:
+    """`quadsim scenario`."""
+    if options.schema:
+        from scenarios.schema import scenario_schema
+
+        print(json.dumps(scenario_schema(), indent=2))
+        return EXIT_DONE
+    if options.scenario is None:
+        raise InputError(
+            f"scenario needs a name or a TOML file, or --schema (there are: {', '.join(scenario_names())})"
+        )
+    loaded = load(options.scenario, options)
+    print(resolve(loaded, build_vehicle(loaded)).to_toml(), end="")
+    return EXIT_DONE
+
+
+def vehicle(options: Namespace) -> int:
+    """`quadsim vehicle`."""
+    from scenarios.vehicle_sheet import make_sheet, sheet_tables, sheet_to_json
+
+    path = vehicle_path(options.vehicle)
+    loaded, sources = load_vehicle(path), vehicle_sources(path)
+    if options.out is not None:
+        from quadsim.video import render_portrait
+
+        if Path(options.out).suffix != ".png":
+            raise ParameterError("", "--out", options.out, "a file ending in .png")
+        render_portrait(loaded, Path(options.out))
+    sheet = make_sheet(loaded)
+    if options.json:
+        print(json.dumps(sheet_to_json(loaded, sheet, sources), indent=2))
+    else:
+        console.print_grids(sheet_tables(loaded, sheet, sources), options.out, prose=("unit", "source"))
+    return EXIT_DONE
+
+
+def doctor(options: Namespace) -> int:
+    """`quadsim doctor`."""
+    from scenarios.doctor import examine
+
+    findings = examine()
+    if options.json:
+        print(json.dumps(findings, indent=2))
+    else:
+        console.print_listing(findings)
+    return EXIT_DONE
+
+
+def _by_group(scenarios: Sequence[Scenario]) -> dict[str, dict[str, str]]:
+    """One line per scenario, by group; those that are to defeat their controller say so."""
+    found: dict[str, dict[str, str]] = {}
+    for group in get_args(Group):
+        lines = {each.name: each.description + _MEANT.get(each.expect, "") for each in scenarios if each.group == group}
+        found |= {f"scenarios: {group}": lines} if lines else {}
+    return found

@@ -1,0 +1,33 @@
+"""What several commands do: read a scenario with its settings, print a summary."""
+
+from __future__ import annotations
+
+import json
+from argparse import Namespace
+from pathlib import Path
+from typing import Any
+
+from quadsim.errors import InputError
+from scenarios import console
+from scenarios.loading import load_scenario
+from scenarios.spec import Scenario
+
+
+def load(name: str, options: Namespace) -> Scenario:
+    """The scenario of that name, with the settings and the seed of the command line.
+
+    Raises:
+        InputError: it cannot be flown.
+    """
+    settings = [*options.settings] if options.seed is None else [*options.settings, f"seed={options.seed}"]
+    if Path(name).is_dir():
+        raise InputError(f"{name} is a directory; give a scenario's name or its TOML file")
+    return load_scenario(name, settings)
+
+
+def print_summary(summary: dict[str, Any], options: Namespace, where: str | None = None) -> None:
+    """A flight's summary, for a person or as JSON."""
+    if options.json:
+        print(json.dumps(summary, indent=2))
+    else:
+        console.print_summary(summary, where)

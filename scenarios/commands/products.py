@@ -1,0 +1,54 @@
+"""`quadsim video` and `view`."""
+
+from __future__ import annotations
+
+from argparse import Namespace
+from pathlib import Path
+
+from quadsim import rundir
+from quadsim.errors import FileError, ParameterError
+from scenarios import console
+from scenarios.cli import EXIT_DONE
+
+
+def video(options: Namespace) -> int:
+    """`quadsim video`."""
+    from quadsim.video import render_gif, render_video
+
+    directory = Path(options.run)
+    rundir.read_summary(directory)
+    path = Path(options.out) if options.out else directory / rundir.VIDEO_FILE
+    if options.workers is not None and options.workers < 1:
+        raise ParameterError("", "--workers", options.workers, "at least 1")
+    if path.suffix not in (".mp4", ".gif"):
+        raise ParameterError("", "--out", options.out, "a file ending in .mp4 or .gif")
+    with console.progress_bars(enabled=True) as progress:
+        if path.suffix == ".gif":
+            render_gif(directory, path)
+        else:
+            render_video(
+                directory,
+                path,
+                workers=options.workers,
+                progress=lambda done, total: progress("video", done, total),
+            )
+    if path.parent.resolve() == directory.resolve():
+        rundir.refresh_hashes(directory)
+    print(f"written to {path}")
+    return EXIT_DONE
+
+
+def view(options: Namespace) -> int:
+    """`quadsim view`."""
+    from quadsim.recording import open_viewer
+
+    path = Path(options.run)
+    recording = path / rundir.RECORDING_FILE if path.is_dir() else path
+    if not path.exists():
+        raise FileError(path, "no such run or recording")
+    if not recording.is_file():
+        raise FileError(path, f"has no {rundir.RECORDING_FILE}; run the scenario again without --no-recording")
+    if recording.suffix != ".rrd":
+        raise FileError(path, "is no recording; give a run directory or a file ending in .rrd")
+    open_viewer(recording, web=options.web)
+    return EXIT_DONE
