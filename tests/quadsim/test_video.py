@@ -7,7 +7,7 @@ import os
 import subprocess
 import sys
 import warnings
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -73,12 +73,8 @@ def rewrite(run: Run, directory: Path, rows: int, *, states: float = 1.0) -> Pat
     directory.mkdir()
     control, plant = run.log.control, run.log.plant
     cut = {
-        name: getattr(control, name)[:rows]
-        for name in (
-            "t", "state", "reference", "speeds", "status", "iterations", "active", "fallback", "slack",
-            "primal_residual", "dual_residual",
-        )
-    }  # fmt: skip
+        field.name: getattr(control, field.name)[:rows] for field in fields(control) if field.name != "speeds_before"
+    }
     last = np.searchsorted(plant.t, 0.05 * rows + 1e-9, side="right")
     log = replace(
         run.log,
