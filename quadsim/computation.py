@@ -24,8 +24,8 @@ class Computation:
     """How long the controller's computer takes from a measurement to the command, seconds of simulated time.
 
     The sum of a fixed part, a part per solver iteration, an exponentially distributed part, and the wait for the end of
-    a stall.  A command that is not there when the next period begins has missed its deadline: it is dropped, and the
-    one before it goes on acting.
+    a stall.  A command that comes after the next period's begin has missed its deadline: it is dropped, and the one
+    before it goes on acting.
 
     Attributes:
         fixed: [s].

@@ -88,11 +88,11 @@ def fly(
             step_s = clock.perf_counter() - started
             delay = 0.0 if computation is None else computation.delay(now.time, command, draws)
             wait = math.ceil(delay / plant.timestep - 1e-6)
-            missed = wait >= steps_per_period
+            missed = wait > steps_per_period  # one that comes just in time acts from the next period on
             holds = [(acting, min(wait, steps_per_period))] if wait else []
             if not missed:
                 acting = command.speeds
-                holds.append((acting, steps_per_period - wait))
+                holds += [(acting, steps_per_period - wait)] if wait < steps_per_period else []
             flown = [(plant.advance(speeds, steps), speeds) for speeds, steps in holds]
             if navigation is not None:
                 for stretch, speeds in flown:

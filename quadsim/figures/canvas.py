@@ -6,6 +6,9 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
+import numpy as np
+
+from quadsim.curves import least_range
 from quadsim.errors import OutputError
 from quadsim.rundir import Run
 
@@ -89,6 +92,15 @@ def run_title(run: Run, what: str) -> str:
 def run_end(run: Run) -> float:
     """Last time of the flight [s]."""
     return float(run.log.plant.t[-1])
+
+
+def keep_least_span(axes: Axes, unit: str) -> None:
+    """Widen the vertical axis of a panel whose curves and bounds all stand still; see `quadsim.curves`."""
+    curves = [np.asarray(line.get_ydata(), float) for line in axes.get_lines()]
+    curves += [np.asarray(axes.dataLim.intervaly)] if axes.collections else []
+    ends = least_range(curves, unit)
+    if ends is not None:
+        axes.set_ylim(*ends)
 
 
 def finish_figure(figure: Figure, bottom: Sequence[Axes], shown: Mapping[str, Artist], end: float) -> None:

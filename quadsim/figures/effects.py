@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
 from quadsim.audit import SIGNALS
 from quadsim.effect_curves import commanded_speeds, effect_curves
-from quadsim.figures.canvas import finish_figure, new_figure, run_end, run_title
+from quadsim.figures.canvas import finish_figure, keep_least_span, new_figure, run_end, run_title
 from quadsim.palette import REFERENCE, line_colour
 from quadsim.rundir import Run
 from quadsim.state import Array
@@ -36,7 +37,7 @@ def draw_effects(run: Run) -> Figure:
     halves = [] if commanded is None else [_ROTORS[:2], _ROTORS[2:]]
     halves += [] if log.control.measured_perfectly else [tuple(_ERRORS)]
     wholes = [(entry.key, entry.key) for entry in curves]
-    figure = new_figure(run_title(run, "effects"), 9.6, 1.1 + 1.7 * len(halves + wholes))
+    figure = new_figure(run_title(run, "effects"), 9.6, 1.1 + 1.9 * len(halves + wholes))
     panels = figure.subplot_mosaic([list(row) for row in halves + wholes], sharex=True)
     shown: dict[str, Artist] = {}
     if commanded is not None:
@@ -47,16 +48,15 @@ def draw_effects(run: Run) -> Figure:
             shown["acting"] = panels[name].plot(log.plant.t, turned, color=line_colour(0), linewidth=1.0)[0]
             panels[name].set_ylabel(f"{name} [rad/s]")
     for entry in curves:
-        lines = _draw_axes(panels[entry.key], log.plant.t, entry.values)
-        shown |= dict(zip("xyz", lines, strict=True))
-        panels[entry.key].set_ylabel(f"{entry.title}\n[{entry.unit}]")
+        _draw_triple(panels[entry.key], log.plant.t, entry.values, "xyz", f"{entry.title}\n[{entry.unit}]")
+        keep_least_span(panels[entry.key], entry.unit)
     if not log.control.measured_perfectly:
         for what, names in _ERRORS.items():
             signals = [SIGNALS[f"{name}_estimate_error"] for name in names]
             values = np.stack([signal.sampled(log.control) for signal in signals], axis=1)
-            lines = _draw_axes(panels[what], log.control.t, values, drawstyle="steps-post")
-            shown |= dict(zip(names, lines, strict=True))
-            panels[what].set_ylabel(f"{what} as told,\nless the true one [{signals[0].unit}]")
+            label = f"{what} as told,\nless the true one [{signals[0].unit}]"
+            _draw_triple(panels[what], log.control.t, values, names, label, drawstyle="steps-post")
+            keep_least_span(panels[what], signals[0].unit)
     bottom = [panels[name] for rows in (halves, wholes) if rows for name in dict.fromkeys(rows[-1])]
     for axes in bottom:
         axes.tick_params(labelbottom=True)
@@ -64,8 +64,9 @@ def draw_effects(run: Run) -> Figure:
     return figure
 
 
-def _draw_axes(axes: Axes, t: Array, values: Array, **style: Any) -> list[Artist]:
-    """Draw three curves (M, 3) in the colours of x, y, z; returns the legend's entries for them."""
-    return [
-        axes.plot(t, column, color=line_colour(1 + i), linewidth=1.0, **style)[0] for i, column in enumerate(values.T)
-    ]
+def _draw_triple(axes: Axes, t: Array, values: Array, names: Sequence[str], label: str, **style: Any) -> None:
+    """Draw three curves (M, 3), with the panel's own legend above it, where it hides nothing."""
+    for i, (name, column) in enumerate(zip(names, values.T, strict=True)):
+        axes.plot(t, column, color=line_colour(1 + i), linewidth=1.0, label=name, **style)
+    axes.set_ylabel(label)
+    axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), borderaxespad=0.1, ncols=3)

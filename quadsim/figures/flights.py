@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
@@ -10,7 +11,15 @@ import numpy as np
 
 from quadsim.audit import SIGNALS, Limit
 from quadsim.comparison import distinct_courses, run_names
-from quadsim.figures.canvas import finish_figure, new_figure, run_end, run_title, write_drawings
+from quadsim.curves import break_at_wraps
+from quadsim.figures.canvas import (
+    finish_figure,
+    keep_least_span,
+    new_figure,
+    run_end,
+    run_title,
+    write_drawings,
+)
 from quadsim.figures.effects import draw_effects, has_effects
 from quadsim.palette import BOUND, REFERENCE, line_colour
 from quadsim.rundir import Run
@@ -81,9 +90,11 @@ def _draw_states(run: Run) -> Figure:
     for column, names in enumerate((("x", "y", "z"), ("roll", "pitch", "yaw"))):
         for axes, name in zip(panels[:, column], names, strict=True):
             shown["flight"] = _draw_plant(axes, run, name, line_colour(0))
+            shown |= _draw_told(axes, run, name)
             shown |= _draw_reference(axes, run, name)
             shown |= _draw_bounds(axes, run.limits, name, run_end(run))
             axes.set_ylabel(f"{name} [{SIGNALS[name].unit}]")
+            keep_least_span(axes, SIGNALS[name].unit)
     finish_figure(figure, panels[-1], shown, run_end(run))
     return figure
 
@@ -102,6 +113,7 @@ def _draw_inputs(run: Run) -> Figure:
             )[0]
         shown |= _draw_bounds(axes, run.limits, name, run_end(run))
         axes.set_ylabel(label)
+        keep_least_span(axes, SIGNALS[name].unit)
     finish_figure(figure, panels[-1:], shown, run_end(run))
     return figure
 
@@ -155,6 +167,7 @@ def _draw_comparison(runs: Sequence[Run]) -> Figure:
     for name, axes in signals.items():
         shown |= _draw_bounds(axes, limits, name, end)
         axes.set_ylabel(f"{name} [{SIGNALS[name].unit}]")
+        keep_least_span(axes, SIGNALS[name].unit)
     signals["speed"].set_ylabel("lowest to highest\nrotor speed [rad/s]")
     finish_figure(figure, panels[-1], shown, end)
     return figure
@@ -164,7 +177,18 @@ def _draw_plant(axes: Axes, run: Run, name: str, colour: str) -> Artist:
     """Draw a signal of the plant; returns the legend's entry for it."""
     signal = SIGNALS[name].plant
     assert signal is not None, name
-    return axes.plot(run.log.plant.t, signal(run.log.plant), color=colour)[0]
+    drawn = break_at_wraps(run.log.plant.t, signal(run.log.plant), SIGNALS[name].unit)
+    return axes.plot(*drawn, color=colour)[0]
+
+
+def _draw_told(axes: Axes, run: Run, name: str) -> dict[str, Artist]:
+    """Draw a state as the controller was told it, where that was not the truth; returns the legend's entry for it."""
+    control, signal = run.log.control, SIGNALS[name]
+    if control.measured_perfectly:
+        return {}
+    told = signal.sampled(dataclasses.replace(control, truth=control.state))
+    drawn = break_at_wraps(control.t, told, signal.unit)
+    return {"as told": axes.plot(*drawn, color=line_colour(1), linewidth=0.6)[0]}
 
 
 def _draw_reference(axes: Axes, run: Run, name: str) -> dict[str, Artist]:

@@ -99,6 +99,18 @@ def test_a_missed_deadline_leaves_the_last_command_acting(vehicle: Vehicle, spee
     assert numbers["delay_ms"]["max"] == pytest.approx(120.0)
 
 
+def test_a_command_just_in_time_acts_a_period_later(vehicle: Vehicle, speeds: Array) -> None:
+    controller = Scripted(speeds)
+    with Plant(vehicle) as plant:
+        log = fly_scripted(plant, controller, computation=Computation(fixed=PERIOD))
+        hover = plant.hover_speeds
+    assert MISSED not in log.control.status
+    acting = np.concatenate([hover[None], speeds[:-1]])
+    np.testing.assert_array_equal(log.plant.speeds[:-1], np.repeat(acting, STEPS, axis=0))
+    np.testing.assert_array_equal([moment.acting for moment in controller.moments], acting)
+    np.testing.assert_array_equal(log.control.speeds, speeds)
+
+
 def test_iterations_cost_simulated_time(vehicle: Vehicle, speeds: Array) -> None:
     with Plant(vehicle) as plant:
         log = fly_scripted(plant, Scripted(speeds), computation=Computation(per_iteration=0.004))
