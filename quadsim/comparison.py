@@ -12,6 +12,15 @@ from typing import Any, Final
 
 import numpy as np
 
+from quadsim.conditions import (
+    Summary,
+    computation_rows,
+    course_rows,
+    estimation_rows,
+    ground_rows,
+    nested,
+    verdict_cell,
+)
 from quadsim.rundir import Run
 from quadsim.table import ABSENT, Cell, Mark, Row, format_number
 
@@ -47,10 +56,14 @@ def comparison_rows(runs: Sequence[Run]) -> list[Row]:
     summaries = [run.summary for run in runs]
     return [
         *_flight_rows(runs),
+        *course_rows(summaries),
         *_tracking_rows(summaries),
         *_constraint_rows(summaries),
+        *ground_rows(summaries),
+        *estimation_rows(summaries),
         *_command_rows(summaries),
         *_solver_rows(summaries),
+        *computation_rows(summaries),
         *_time_rows(summaries),
     ]
 
@@ -74,9 +87,6 @@ def required(summary: Mapping[str, Any]) -> Cell:
     return Cell(text=f"all {len(demanded)} hold", mark=Mark.GOOD) if demanded else Cell(text="none")
 
 
-_Summary = Mapping[str, Any]
-
-
 def _flight_rows(runs: Sequence[Run]) -> Iterator[Row]:
     def row(label: str, cell: Callable[[Run], Cell], unit: str = "") -> Row:
         return Row(group="Flight", label=label, unit=unit, cells=tuple(cell(run) for run in runs))
@@ -85,6 +95,7 @@ def _flight_rows(runs: Sequence[Run]) -> Iterator[Row]:
         return lambda run: Cell(text=str(value(run)))
 
     yield row("outcome", lambda run: outcome(run.summary))
+    yield row("verdict on the flight", lambda run: verdict_cell(run.summary))
     yield row("required constraints", lambda run: required(run.summary))
     yield row("time flown", lambda run: Cell(text=format_number(run.summary.get("duration"))), "s")
     yield row("controller", text(lambda run: run.summary["controller"].get("name", ABSENT)))
@@ -95,7 +106,7 @@ def _flight_rows(runs: Sequence[Run]) -> Iterator[Row]:
     yield row("seed", text(lambda run: run.summary.get("seed", ABSENT)))
 
 
-def _tracking_rows(summaries: Sequence[_Summary]) -> Iterator[Row]:
+def _tracking_rows(summaries: Sequence[Summary]) -> Iterator[Row]:
     for measure, label in TRACKING_MEASURES.items():
         for channel in present_keys(summaries, "tracking", measure):
             unit, values = tracking_values(summaries, measure, channel)
@@ -104,10 +115,10 @@ def _tracking_rows(summaries: Sequence[_Summary]) -> Iterator[Row]:
     yield from _settling_rows(summaries)
 
 
-def _settling_rows(summaries: Sequence[_Summary]) -> Iterator[Row]:
+def _settling_rows(summaries: Sequence[Summary]) -> Iterator[Row]:
     """One row per step of the courses; `-` where an output does not settle or a run has no such step."""
     settled = [
-        {(entry["channel"], entry["time"]): entry["settled"] for entry in _get(summary, "tracking", "settling") or ()}
+        {(entry["channel"], entry["time"]): entry["settled"] for entry in nested(summary, "tracking", "settling") or ()}
         for summary in summaries
     ]
     for channel, time in dict.fromkeys(step for steps in settled for step in steps):
@@ -115,16 +126,16 @@ def _settling_rows(summaries: Sequence[_Summary]) -> Iterator[Row]:
         yield Row(group="Tracking", label=f"settling, {channel} at {time:g} s", unit="s", cells=cells)
 
 
-def tracking_values(summaries: Sequence[_Summary], measure: str, channel: str) -> tuple[str, list[float | None]]:
+def tracking_values(summaries: Sequence[Summary], measure: str, channel: str) -> tuple[str, list[float | None]]:
     """Unit and values of one tracking measure; angles in degrees."""
-    units = {_get(summary, "tracking", "unit", channel) for summary in summaries} - {None}
-    values = [_get(summary, "tracking", measure, channel) for summary in summaries]
+    units = {nested(summary, "tracking", "unit", channel) for summary in summaries} - {None}
+    values = [nested(summary, "tracking", measure, channel) for summary in summaries]
     if units == {"rad"}:
         return "deg", [None if value is None else math.degrees(value) for value in values]
     return "/".join(sorted(units)), values
 
 
-def _constraint_rows(summaries: Sequence[_Summary]) -> Iterator[Row]:
+def _constraint_rows(summaries: Sequence[Summary]) -> Iterator[Row]:
     audits = [{entry["name"]: entry for entry in summary["constraints"]} for summary in summaries]
     for name in dict.fromkeys(name for audit in audits for name in audit):
         entries = [audit.get(name) for audit in audits]
@@ -139,7 +150,7 @@ def _constraint_rows(summaries: Sequence[_Summary]) -> Iterator[Row]:
             )
 
 
-def _command_rows(summaries: Sequence[_Summary]) -> Iterator[Row]:
+def _command_rows(summaries: Sequence[Summary]) -> Iterator[Row]:
     labels = {
         "speed_min": "lowest rotor speed",
         "speed_max": "highest rotor speed",
@@ -148,75 +159,72 @@ def _command_rows(summaries: Sequence[_Summary]) -> Iterator[Row]:
         "total_variation": "total variation",
     }
     for key, label in labels.items():
-        cells = tuple(Cell(text=format_number(_get(summary, "control", key))) for summary in summaries)
+        cells = tuple(Cell(text=format_number(nested(summary, "control", key))) for summary in summaries)
         yield Row(group="Commands", label=label, unit="rad/s", cells=cells)
 
 
-def _solver_rows(summaries: Sequence[_Summary]) -> Iterator[Row]:
-    def row(label: str, cell: Callable[[_Summary], Cell]) -> Row:
+def _solver_rows(summaries: Sequence[Summary]) -> Iterator[Row]:
+    def row(label: str, cell: Callable[[Summary], Cell]) -> Row:
         return Row(group="Solver", label=label, cells=tuple(cell(summary["controller"]) for summary in summaries))
 
     yield row("statuses", lambda controller: Cell(text=_counts(controller.get("statuses"))))
     yield row("periods by fallback level", lambda controller: Cell(text=_counts(controller.get("fallbacks"))))
-    yield row("iterations, mean", lambda controller: Cell(text=format_number(_get(controller, "iterations", "mean"))))
-    yield row("iterations, most", lambda controller: Cell(text=format_number(_get(controller, "iterations", "max"))))
+    yield row("iterations, mean", lambda controller: Cell(text=format_number(nested(controller, "iterations", "mean"))))
+    yield row("iterations, most", lambda controller: Cell(text=format_number(nested(controller, "iterations", "max"))))
     yield row("active constraints, most", lambda controller: Cell(text=format_number(controller.get("active_max"))))
 
 
-def _time_rows(summaries: Sequence[_Summary]) -> Iterator[Row]:
+def _time_rows(summaries: Sequence[Summary]) -> Iterator[Row]:
     for clock, what in {"step_ms": "whole step", "solve_ms": "solver alone"}.items():
         for measure, label in TIME_MEASURES.items():
-            values = [_get(summary, "controller", clock, measure) for summary in summaries]
+            values = [nested(summary, "controller", clock, measure) for summary in summaries]
             yield Row(group="Time", label=f"{what}, {label}", unit="ms", cells=_best_smallest(summaries, values))
 
     def row(label: str, unit: str, keys: tuple[str, str]) -> Row:
-        cells = tuple(Cell(text=format_number(_get(summary, *keys))) for summary in summaries)
+        cells = tuple(Cell(text=format_number(nested(summary, *keys))) for summary in summaries)
         return Row(group="Time", label=label, unit=unit, cells=cells)
 
     yield row("deadline", "ms", ("controller", "deadline_ms"))
-    misses = [_get(summary, "controller", "deadline_misses") for summary in summaries]
+    misses = [nested(summary, "controller", "deadline_misses") for summary in summaries]
     cells = tuple(Cell(text=format_number(value), mark=Mark.BAD if value else Mark.NONE) for value in misses)
     yield Row(group="Time", label="deadline misses", cells=cells)
     yield row("simulated in", "s", ("wall_s", "simulate"))
     yield row("with all files", "s", ("wall_s", "total"))
 
 
-def _get(data: Any, *keys: str) -> Any:
-    """A nested value, or None where a key is missing: a run that ended at once has no numbers."""
-    for key in keys:
-        data = data.get(key) if isinstance(data, Mapping) else None
-    return data
-
-
-def present_keys(summaries: Sequence[_Summary], *path: str) -> list[str]:
+def present_keys(summaries: Sequence[Summary], *path: str) -> list[str]:
     """Keys that any summary has at a path, in order."""
-    return list(dict.fromkeys(key for summary in summaries for key in _get(summary, *path) or {}))
+    return list(dict.fromkeys(key for summary in summaries for key in nested(summary, *path) or {}))
 
 
 def _counts(counts: Mapping[str, int] | None) -> str:
     return ", ".join(f"{name}: {count}" for name, count in counts.items()) if counts else ABSENT
 
 
-def is_completed(summary: _Summary) -> bool:
+def is_completed(summary: Summary) -> bool:
     """Whether the flight was flown to its end."""
     return bool(summary["status"] == "completed")
 
 
-def format_bounds(entry: _Summary) -> str:
-    """Bounds of a constraint and the times it holds for, e.g. `-5 .. 5` or `-0.01 .. 0.01, from 59 s`."""
-    lower, upper = (ABSENT if entry[key] is None else format_number(entry[key]) for key in ("lower", "upper"))
+def format_bounds(entry: Summary, unit: str = "") -> str:
+    """Bounds of a constraint and the times it holds for, e.g. `-5 .. 5`, `at least -0.5` or `0 .. 1 m, from 59 s`."""
+    lower, upper = entry["lower"], entry["upper"]
+    if lower is None or upper is None:
+        bounds = f"at least {format_number(lower)}" if upper is None else f"at most {format_number(upper)}"
+    else:
+        bounds = f"{format_number(lower)} .. {format_number(upper)}"
     window = "" if not entry["start"] and entry["stop"] is None else f", from {entry['start']:g} s"
     window += "" if entry["stop"] is None else f" to {entry['stop']:g} s"
-    return f"{lower} .. {upper}{window}"
+    return f"{bounds} {unit}".rstrip() + window
 
 
-def _verdict(entry: _Summary) -> str:
+def _verdict(entry: Summary) -> str:
     """The verdict and the tolerances it stands on, e.g. `holds (tolerance 0.01 / 0.05 deg)`."""
     tolerance = f"tolerance {entry['tolerance_sampled']:g} / {entry['tolerance']:g} {entry['unit']}"
     return f"{_finding(entry)} ({tolerance})"
 
 
-def _finding(entry: _Summary) -> str:
+def _finding(entry: Summary) -> str:
     if entry["worst_margin"] is None:
         return "not reached"
     if entry["satisfied"]:
@@ -224,33 +232,33 @@ def _finding(entry: _Summary) -> str:
     return f"violated {format_excess(entry)}" if entry["required"] else f"exceeded {format_excess(entry)}, not required"
 
 
-def format_excess(entry: _Summary) -> str:
+def format_excess(entry: Summary) -> str:
     """How far a constraint was exceeded; says so where that was at the samples alone, in what was commanded."""
     at_samples = entry["worst_margin"] >= -entry["tolerance"]
     margin = entry["worst_margin_sampled"] if at_samples else entry["worst_margin"]
     return f"by {format_number(-margin)} {entry['unit']}{' at the samples' if at_samples else ''}"
 
 
-def _verdict_mark(entry: _Summary) -> Mark:
+def _verdict_mark(entry: Summary) -> Mark:
     if entry["satisfied"]:
         return Mark.GOOD
     return Mark.BAD if entry["required"] else Mark.WARN
 
 
-def _margin_cell(key: str, tolerance: str) -> Callable[[_Summary], Cell]:
-    def cell(entry: _Summary) -> Cell:
+def _margin_cell(key: str, tolerance: str) -> Callable[[Summary], Cell]:
+    def cell(entry: Summary) -> Cell:
         beyond = entry[key] is not None and entry[key] < -entry[tolerance]
         return Cell(text=format_number(entry[key]), mark=_verdict_mark(entry) if beyond else Mark.NONE)
 
     return cell
 
 
-def _violation_cell(entry: _Summary) -> Cell:
+def _violation_cell(entry: Summary) -> Cell:
     seconds = entry["time_violated"]
     return Cell(text=format_number(seconds), mark=_verdict_mark(entry) if seconds > 0.0 else Mark.NONE)
 
 
-def _best_smallest(summaries: Sequence[_Summary], values: Sequence[float | None]) -> tuple[Cell, ...]:
+def _best_smallest(summaries: Sequence[Summary], values: Sequence[float | None]) -> tuple[Cell, ...]:
     """Cells with the value nearest to zero marked, among the flights that were completed and when they differ."""
     texts = [format_number(value) for value in values]
     eligible = {
@@ -263,11 +271,11 @@ def _best_smallest(summaries: Sequence[_Summary], values: Sequence[float | None]
     return tuple(Cell(text=text, mark=Mark.BEST if i in best else Mark.NONE) for i, text in enumerate(texts))
 
 
-def _number_cell(key: str) -> Callable[[_Summary], Cell]:
+def _number_cell(key: str) -> Callable[[Summary], Cell]:
     return lambda entry: Cell(text=format_number(entry[key]))
 
 
-_CONSTRAINT_ROWS: Final[tuple[tuple[str, str | None, Callable[[_Summary], Cell]], ...]] = (
+_CONSTRAINT_ROWS: Final[tuple[tuple[str, str | None, Callable[[Summary], Cell]], ...]] = (
     ("verdict", "", lambda entry: Cell(text=_verdict(entry), mark=_verdict_mark(entry))),
     ("bounds", None, lambda entry: Cell(text=format_bounds(entry))),
     ("peak at the samples", None, _number_cell("peak_sampled")),

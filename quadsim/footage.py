@@ -100,6 +100,8 @@ class Footage:
         path_times: (P,) times of the flown path's points [s], at most a second apart.
         path: (P, 3) flown path of the whole flight [m], thinned where it is straight.
         course: (Q, 3) reference path of the whole flight [m], thinned.
+        wind: (F, 3) velocity of the air, world [m/s]; None without wind.
+        force: (F, 3) external force, world [N]; None where there is none.
     """
 
     times: Array
@@ -114,6 +116,8 @@ class Footage:
     path_times: Array
     path: Array
     course: Array
+    wind: Array | None
+    force: Array | None
 
 
 def film_span(run: Run) -> tuple[float, float]:
@@ -149,6 +153,7 @@ def make_footage(run: Run, times: Array) -> Footage:
     steps = np.diff(plant.t, prepend=plant.t[:1])[:, None]
     turned = np.cumsum(steps * np.abs(plant.speeds), axis=0)
     course = control.reference[:, :3]
+    force = None if plant.wrench is None else plant.wrench[:, :3]
     return Footage(
         times=times,
         period=_row_before(control.t, times),
@@ -162,6 +167,8 @@ def make_footage(run: Run, times: Array) -> Footage:
         path_times=plant.t[path_rows],
         path=positions[path_rows],
         course=course[thin(course, tolerance)],
+        wind=None if plant.wind is None else plant.wind[row],
+        force=None if force is None or not np.any(force) else force[row],
     )
 
 

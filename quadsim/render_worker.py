@@ -20,8 +20,10 @@ import mujoco
 import numpy as np
 
 from quadsim.airframe import FLOOR, PROPELLER_NAMES, compile_model
+from quadsim.controller import Phase
 from quadsim.footage import Footage, Shot, make_footage, thin
-from quadsim.overlay import Overlay, Picture
+from quadsim.overlay import Overlay
+from quadsim.pen import Picture
 from quadsim.rundir import Run, load_run
 from quadsim.state import Array
 from quadsim.vehicle import Vehicle
@@ -131,9 +133,11 @@ class Stage:
             self._connect(mujoco.mjtGeom.mjGEOM_CAPSULE, 0.030 * self._arm, start, stop, colour)
 
     def _draw_horizon(self, i: int) -> None:
-        if self._run.log.predicted is None:
+        k = self._footage.period[i]
+        # A prediction knows no ground: from there it would fall through it.
+        if self._run.log.predicted is None or self._run.log.control.phase[k] != Phase.FLYING:
             return
-        predicted = self._run.log.predicted[self._footage.period[i]].astype(float)
+        predicted = self._run.log.predicted[k].astype(float)
         predicted = predicted[thin(predicted, 0.02 * self._arm)]
         for start, stop in itertools.pairwise(predicted):
             self._connect(mujoco.mjtGeom.mjGEOM_CAPSULE, 0.028 * self._arm, start, stop, _HORIZON_COLOUR)

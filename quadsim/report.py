@@ -12,6 +12,7 @@ from typing import Any, Final
 from urllib.parse import quote
 
 from quadsim.comparison import comparison_rows, outcome, required, run_names
+from quadsim.conditions import verdict_cell
 from quadsim.cost import CostStudy, cost_markdown, cost_sentences, cost_tables
 from quadsim.errors import OutputError, ParameterError
 from quadsim.figures import comparison_figure, write_cost_figures
@@ -60,6 +61,7 @@ class _RunView:
     description: str
     outcome: Cell
     required: Cell
+    verdict: Cell
     vehicle: str
     made_with: str
     video: str | None
@@ -182,6 +184,7 @@ def _place(run: Run, name: str, folder: str, colour: str, page_directory: Path) 
         description=run.summary.get("description", ""),
         outcome=outcome(run.summary),
         required=required(run.summary),
+        verdict=verdict_cell(run.summary),
         vehicle=f"Vehicle: {run.vehicle.description or run.vehicle.name}, {run.vehicle.mass:g} kg",
         made_with=_made_with(run),
         video=None if video is None else quote(video),

@@ -182,13 +182,13 @@ def _draw_plant(axes: Axes, run: Run, name: str, colour: str) -> Artist:
 
 
 def _draw_told(axes: Axes, run: Run, name: str) -> dict[str, Artist]:
-    """Draw a state as the controller was told it, where that was not the truth; returns the legend's entry for it."""
+    """Draw a state as the controller was told it, beneath the true one; none where it was the true one."""
     control, signal = run.log.control, SIGNALS[name]
     if control.measured_perfectly:
         return {}
     told = signal.sampled(dataclasses.replace(control, truth=control.state))
     drawn = break_at_wraps(control.t, told, signal.unit)
-    return {"as told": axes.plot(*drawn, color=line_colour(1), linewidth=0.6)[0]}
+    return {"as told": axes.plot(*drawn, color=line_colour(1), linewidth=0.7, zorder=1.9)[0]}
 
 
 def _draw_reference(axes: Axes, run: Run, name: str) -> dict[str, Artist]:

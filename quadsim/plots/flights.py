@@ -10,8 +10,9 @@ import numpy as np
 
 from quadsim.audit import SIGNALS
 from quadsim.comparison import distinct_courses, run_names
+from quadsim.curves import break_at_wraps
 from quadsim.palette import REFERENCE, line_colour
-from quadsim.plots.panels import BOTTOM, PANEL_HEIGHT, TOP, Plot, draw_bound, finished, panels, place
+from quadsim.plots.panels import BOTTOM, PANEL_HEIGHT, TOP, Plot, draw_bound, finished, keep_least_span, panels, place
 from quadsim.rundir import Run
 from quadsim.state import POSITION, REFERENCE_NAMES, Array
 from quadsim.vehicle import N_ROTORS
@@ -35,20 +36,22 @@ def thin(values: Array, points: int) -> np.ndarray[Any, np.dtype[np.intp]]:
     """Indices of at most about `points` values: the lowest and highest of each stretch, so that no peak is lost.
 
     Args:
-        values: (K,).
+        values: (K,); what is not finite is a gap.
         points: how many to keep; all are kept where K is no larger.
 
     Returns:
-        Rising indices, the first and last included.
+        Rising indices, the first, the last, and all gaps included.
     """
     if values.size <= points:
         return np.arange(values.size)
+    gaps = np.flatnonzero(~np.isfinite(values))
+    values = np.nan_to_num(values, posinf=0.0, neginf=0.0)
     stride = -(-2 * values.size // points)
     rows = -(-values.size // stride)
     stretches = np.pad(values, (0, rows * stride - values.size), mode="edge").reshape(rows, stride)
     starts = stride * np.arange(rows)
     kept = np.concatenate([[0, values.size - 1], starts + stretches.argmin(axis=1), starts + stretches.argmax(axis=1)])
-    return np.unique(np.minimum(kept, values.size - 1))
+    return np.unique(np.minimum(np.concatenate([kept, gaps]), values.size - 1))
 
 
 class _Plotter:
@@ -78,8 +81,10 @@ class _Plotter:
             assert signal is not None, name
             self._references(figure, panel, name)
             for i, label, run in self._runs:
-                self._line(figure, panel, i, label, run.log.plant.t, signal(run.log.plant))
+                drawn = break_at_wraps(run.log.plant.t, signal(run.log.plant), SIGNALS[name].unit)
+                self._line(figure, panel, i, label, *drawn)
             self._bounds(figure, panel, name)
+            keep_least_span(figure, panel, SIGNALS[name].unit)
         return self._timed(figure, key, title)
 
     def _inputs(self, key: str, title: str, name: str, labels: Sequence[str]) -> Plot:
@@ -89,6 +94,7 @@ class _Plotter:
                 values = SIGNALS[name].sampled(run.log.control)[:, panel]
                 self._line(figure, panel, i, label, run.log.control.t, values, shape="hv")
             self._bounds(figure, panel, name)
+            keep_least_span(figure, panel, SIGNALS[name].unit)
         return self._timed(figure, key, title)
 
     def _times(self) -> Plot:

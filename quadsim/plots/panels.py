@@ -6,6 +6,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
+import numpy as np
+
+from quadsim.curves import least_range
 from quadsim.palette import BOUND
 
 if TYPE_CHECKING:
@@ -70,6 +73,13 @@ def draw_bound(figure: Figure, panel: int, bound: float, start: float, stop: flo
     line = {"color": BOUND, "width": 1.4, "dash": "dash"}
     x, y = [start, stop], [bound, bound]
     figure.add_trace(Scatter(x=x, y=y, mode="lines", line=line, name="bound", hoverinfo="skip"), **place(panel))
+
+
+def keep_least_span(figure: Figure, panel: int, unit: str) -> None:
+    """Widen the vertical axis of a panel whose curves and bounds all stand still; see `quadsim.curves`."""
+    ends = least_range([np.asarray(trace.y, float) for trace in figure.select_traces(**place(panel))], unit)
+    if ends is not None:
+        figure.update_yaxes(autorangeoptions={"include": ends}, **place(panel))
 
 
 def finished(figure: Figure, key: str, title: str, *, height: int, timed: bool) -> Plot:

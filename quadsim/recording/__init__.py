@@ -2,8 +2,8 @@
 
 Everything stands on one timeline, `sim_time`, the simulated time:
 
-    world/...           vehicle, thrusts, external force, flown path, reference, and the horizon predicted at each
-                        control period
+    world/...           vehicle, thrusts, external force, wind, flown path, reference, and the horizon predicted at each
+                        control period of flight
     signals/NAME        what can be limited, by the names and in the units of `quadsim.audit.SIGNALS`
     reference/NAME      what x, y, z and yaw should be
     limits/NAME         the bounds, drawn with their signal

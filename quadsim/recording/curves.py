@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from quadsim.audit import SIGNALS, Limit, margins_sampled
+from quadsim.curves import break_at_wraps
 from quadsim.effect_curves import commanded_speeds, effect_curves
 from quadsim.flightlog import FlightLog
 from quadsim.recording.look import BOUND, PANELS, REFERENCE, SERIES, VERDICTS, Colour, time_column
@@ -33,6 +34,7 @@ def send_signals(recording: rr.RecordingStream, log: FlightLog) -> None:
             else:
                 t, values = log.plant.t, signal.plant(log.plant)
             if values.ndim == 1:
+                t, values = break_at_wraps(t, values, signal.unit)
                 _send_curves(recording, f"signals/{name}", t, values, {f"{name} [{signal.unit}]": colour})
             else:
                 rotors = {f"rotor {i} [{signal.unit}]": shade for i, shade in enumerate(SERIES, start=1)}

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from quadsim.audit import Limit
+from quadsim.audit import SIGNALS, Limit
+from quadsim.curves import least_range
 from quadsim.effect_curves import commanded_speeds, effect_curves
 from quadsim.recording.look import FRONT_PANELS, PANELS, TIMELINE
 from quadsim.rundir import Run
@@ -22,7 +24,9 @@ def blueprint(run: Run) -> rrb.Blueprint:
     import rerun.blueprint as rrb
 
     end, limits = float(run.log.plant.t[-1]), run.limits
-    plots = [_plot(title, _contents(names, limits), end) for title, names in PANELS.items()]
+    plots = [
+        _plot(title, _contents(names, limits), end, ends=_least_range(run, names)) for title, names in PANELS.items()
+    ]
     margins = [
         _plot(f"Margins [{unit}]", [f"margins/{limit.name}" for limit in limits if limit.unit == unit], end)
         for unit in dict.fromkeys(limit.unit for limit in limits)
@@ -63,10 +67,14 @@ def blueprint(run: Run) -> rrb.Blueprint:
 
 def _overview(run: Run) -> tuple[Array, Array]:
     """Where the eye is and where it looks [m] to see the whole course."""
-    points = np.concatenate([run.log.plant.state[:, POSITION], run.log.control.reference[:, :3]])
-    points = points[np.isfinite(points).all(axis=1)]  # a flight that diverged ends in anything
-    low, high = points.min(axis=0), points.max(axis=0)
-    centre, size = (low + high) / 2, max(float(np.linalg.norm(high - low)), 10 * run.vehicle.arm_length)
+    path, course = run.log.plant.state[:, POSITION], run.log.control.reference[:, :3]
+    path = path[np.isfinite(path).all(axis=1)]  # a flight that diverged ends in anything
+    course = course if len(course) else path
+    low, high, least = course.min(axis=0), course.max(axis=0), 10 * run.vehicle.arm_length
+    slack = max(float((high - low).max()), least)
+    path = np.clip(path, low - slack, high + slack)  # a lost vehicle leaves the picture
+    low, high = np.minimum(low, path.min(axis=0)), np.maximum(high, path.max(axis=0))
+    centre, size = (low + high) / 2, max(float(np.linalg.norm(high - low)), least)
     return centre + size * np.array([0.35, -0.9, 0.3]), centre
 
 
@@ -103,8 +111,21 @@ def _contents(names: Sequence[str], limits: Iterable[Limit]) -> list[str]:
     ]
 
 
-def _plot(title: str, contents: Sequence[str], end: float) -> rrb.TimeSeriesView:
-    """Curves over the whole flight, up to `end` [s], and the legend to their right."""
+def _least_range(run: Run, names: Sequence[str]) -> tuple[float, float] | None:
+    """Ends of the axis of signals that stand still, with their references and bounds; see `quadsim.curves`."""
+    control, unit = run.log.control, SIGNALS[names[0]].unit
+    scale = math.degrees(1.0) if unit == "deg" else 1.0
+    signals = [SIGNALS[name] for name in names]
+    curves = [entry.plant(run.log.plant) if entry.plant else entry.sampled(control) for entry in signals]
+    curves += [scale * control.reference[:, REFERENCE_NAMES.index(name)] for name in names if name in REFERENCE_NAMES]
+    curves += [np.array([limit.lower, limit.upper]) for limit in run.limits if limit.signal in names]
+    return least_range(curves, unit)
+
+
+def _plot(
+    title: str, contents: Sequence[str], end: float, ends: tuple[float, float] | None = None
+) -> rrb.TimeSeriesView:
+    """Curves over the whole flight, up to `end` [s], and the legend to their right; `ends` of the vertical axis."""
     import rerun as rr
     import rerun.blueprint as rrb
 
@@ -113,5 +134,6 @@ def _plot(title: str, contents: Sequence[str], end: float) -> rrb.TimeSeriesView
         name=title,
         contents=list(contents),
         plot_legend=rrb.PlotLegend("RightTop"),
+        axis_y=None if ends is None else rrb.ScalarAxis(range=ends),
         axis_x=rrb.TimeAxis(view_range=rr.TimeRange(start=first, end=last)),
     )

@@ -51,6 +51,7 @@ METAL: Final = (150, 155, 165, 255)
 SHELL: Final = (235, 238, 242, 255)
 FORWARD: Final = (245, 110, 30, 255)
 FORCE: Final = (225, 90, 200, 255)
+WIND: Final = (110, 220, 225, 255)
 AXES: Final = ((230, 90, 90, 255), (90, 200, 110, 255), (90, 140, 250, 255))
 
 VERDICTS: Final = {

@@ -7,7 +7,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from quadsim.controller import ACCEPTED
+from quadsim.comparison import tracking_values
+from quadsim.controller import ACCEPTED, Phase
+from quadsim.narrative import condition_sentences
 from quadsim.recording.look import time_column
 from quadsim.rundir import Run
 
@@ -22,14 +24,31 @@ def send_texts(recording: rr.RecordingStream, run: Run) -> None:
     log, end = run.log.control, float(run.log.plant.t[-1])
     answers = list(zip(log.status, log.fallback.tolist(), strict=True))
     events = [
-        (float(t), f"{status}, fallback {fallback}", "INFO" if status in ACCEPTED and not fallback else "WARN")
+        (
+            float(t),
+            f"{status}, fallback {fallback}",
+            "INFO" if status in ACCEPTED | {Phase.LANDED} and not fallback else "WARN",
+        )
         for t, before, (status, fallback) in zip(log.t, [None, *answers], answers, strict=False)
         if (status, fallback) != before
     ]
+    events += _phase_changes(run)
     events.append((end, _outcome(run), "INFO" if run.log.reason is None else "ERROR"))
-    times, texts, levels = zip(*events, strict=True)
+    times, texts, levels = zip(*sorted(events, key=lambda event: event[0]), strict=True)
     recording.log("summary", rr.TextDocument(_summary(run), media_type=rr.MediaType.MARKDOWN), static=True)
     recording.send_columns("events", [time_column(np.array(times))], rr.TextLog.columns(text=texts, level=levels))
+
+
+def _phase_changes(run: Run) -> list[tuple[float, str, str]]:
+    """Time, text and level of each change of the phase, in a flight that has a ground."""
+    control = run.log.control
+    if all(phase == Phase.FLYING for phase in control.phase):
+        return []
+    return [
+        (float(t), f"phase: {phase}", "WARN" if phase == Phase.CRASHED else "INFO")
+        for t, before, phase in zip(control.t, [None, *control.phase], control.phase, strict=False)
+        if phase != before
+    ]
 
 
 def _outcome(run: Run) -> str:
@@ -45,8 +64,11 @@ def _summary(run: Run) -> str:
     if not all(entry["required"] for entry in constraints):
         lines += ["In brackets: measured, not required.", ""]
     if tracking:
-        errors = (f"{name} {error:.3g} {tracking['unit'][name]}" for name, error in tracking["rmse"].items())
+        measured = {name: tracking_values([run.summary], "rmse", name) for name in tracking["rmse"]}
+        errors = (f"{name} {_number(values[0])} {unit}" for name, (unit, values) in measured.items())
         lines += [f"Tracking error, RMS: {', '.join(errors)}.", ""]
+    for sentence in condition_sentences([(run.name, run.summary)]):
+        lines += [sentence, ""]
     if "step_ms" in control:
         step = control["step_ms"]
         lines += [

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
+from quadsim.controller import Phase
 from quadsim.recording.look import (
     AXES,
     CARBON,
@@ -19,6 +20,7 @@ from quadsim.recording.look import (
     SERIES,
     SHELL,
     WHOLE_PATH,
+    WIND,
     Colour,
     time_column,
 )
@@ -31,6 +33,8 @@ if TYPE_CHECKING:
 
 _FORCE_SCALE: Final = 5.0
 """How many times longer an external force is drawn than a thrust of its size: it would vanish inside the hull."""
+_WIND_LENGTH: Final = 1.5
+"""How long a flight's strongest wind is drawn, in arm lengths."""
 _DRAWN_ARM: Final = 0.3
 """Arm length [m] for which the airframe's parts are measured, as in `models/quadrotor.xml`."""
 
@@ -91,7 +95,10 @@ def send_scene(recording: rr.RecordingStream, run: Run) -> None:
 
     control, plant = run.log.control, run.log.plant
     position = plant.state[:, POSITION]
-    axes = rr.Arrows3D(origins=np.zeros((3, 3)), vectors=np.eye(3), radii=0.02, colors=AXES, labels=["x", "y", "z"])
+    thickness = min(0.02, 0.06 * run.vehicle.arm_length)
+    axes = rr.Arrows3D(
+        origins=np.zeros((3, 3)), vectors=np.eye(3), radii=thickness, colors=AXES, labels=["x", "y", "z"]
+    )
     recording.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
     recording.log("world/axes", axes, static=True)
     _log_lines(recording, "world/reference", REFERENCE, 1.2, _dashes(control.reference[:, :3]))
@@ -107,6 +114,8 @@ def send_scene(recording: rr.RecordingStream, run: Run) -> None:
     recording.send_columns("world/vehicle/body/thrust", [time_column(plant.t)], arrows)
     if plant.wrench is not None and np.any(plant.wrench[:, :3]):
         _send_force(recording, run.vehicle, plant.t, plant.wrench[:, :3])
+    if plant.wind is not None and np.any(plant.wind):
+        _send_wind(recording, run.vehicle, plant.t, plant.wind)
 
     if control.t.size:
         starts = np.searchsorted(plant.t, control.t - 1e-9)
@@ -116,10 +125,11 @@ def send_scene(recording: rr.RecordingStream, run: Run) -> None:
         recording.send_columns("world/flown", [time_column(plant.t[ends])], rr.LineStrips3D.columns(strips=pieces))
     if control.t.size and run.log.predicted is not None:
         horizons = np.concatenate([control.state[:, None, POSITION], run.log.predicted], axis=1)
+        flying = np.array([phase == Phase.FLYING for phase in control.phase])
+        # A prediction knows no ground: from there it would fall through it.
+        shown = [horizon if aloft else horizon[:0] for horizon, aloft in zip(horizons, flying, strict=True)]
         _log_lines(recording, "world/horizon", PREDICTED, 2.5)
-        recording.send_columns(
-            "world/horizon", [time_column(control.t)], rr.LineStrips3D.columns(strips=list(horizons))
-        )
+        recording.send_columns("world/horizon", [time_column(control.t)], rr.LineStrips3D.columns(strips=shown))
 
 
 def _send_force(recording: rr.RecordingStream, vehicle: Vehicle, t: Array, force: Array) -> None:
@@ -132,6 +142,19 @@ def _send_force(recording: rr.RecordingStream, vehicle: Vehicle, t: Array, force
     scale = _FORCE_SCALE * vehicle.arm_length / (vehicle.mass * vehicle.gravity / N_ROTORS)
     recording.log(entity, look, static=True)
     recording.send_columns(entity, [time_column(t)], rr.Arrows3D.columns(vectors=scale * force))
+
+
+def _send_wind(recording: rr.RecordingStream, vehicle: Vehicle, t: Array, wind: Array) -> None:
+    """The wind (M, 3) [m/s] as an arrow in the world frame that meets the vehicle from upwind."""
+    import rerun as rr
+
+    entity, unit = "world/vehicle/wind", vehicle.arm_length / _DRAWN_ARM
+    look = rr.Arrows3D.from_fields(radii=0.01 * unit, colors=WIND)
+    vectors = _WIND_LENGTH * vehicle.arm_length / float(np.linalg.norm(wind, axis=1).max()) * wind
+    above_the_discs = np.array([0.0, 0.0, 0.08 * unit])
+    recording.log(entity, look, static=True)
+    columns = rr.Arrows3D.columns(vectors=vectors, origins=above_the_discs - 1.3 * vectors)
+    recording.send_columns(entity, [time_column(t)], columns)
 
 
 def _log_lines(

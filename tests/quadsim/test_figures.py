@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 from matplotlib.image import imread
 
 from quadsim.audit import Limit
@@ -13,8 +14,9 @@ from quadsim.errors import OutputError
 from quadsim.figures import comparison_figure, write_figures
 from quadsim.figures.canvas import write_drawings
 from quadsim.figures.effects import draw_effects, has_effects
-from quadsim.palette import BOUND
+from quadsim.palette import BOUND, line_colour
 from quadsim.rundir import Run
+from quadsim.state import INDEX
 
 
 @pytest.fixture(scope="module")
@@ -159,3 +161,51 @@ def test_a_place_that_cannot_be_written_is_reported(short_run: Run, tmp_path: Pa
     (tmp_path / "file").write_text("in the way")
     with pytest.raises(OutputError, match="cannot write"):
         write_figures(short_run, tmp_path / "file" / "figures")
+
+
+def standing(run: Run) -> Run:
+    """The flight as if it had stood still but for rounding, and not been held to anything."""
+    rng = np.random.default_rng(0)
+    plant = dataclasses.replace(run.log.plant, state=1e-12 * rng.normal(size=run.log.plant.state.shape))
+    control = dataclasses.replace(run.log.control, reference=np.zeros_like(run.log.control.reference))
+    return dataclasses.replace(run, limits=(), log=dataclasses.replace(run.log, plant=plant, control=control))
+
+
+def test_rounding_is_drawn_as_a_level_line(short_run: Run, tmp_path: Path) -> None:
+    write_figures(standing(short_run), tmp_path)
+    found = texts(tmp_path / "figure4_states.svg")
+    assert {"0.004", "0.04"} <= found, "metres and degrees"
+    assert not any(text.startswith("1e") for text in found)
+
+
+def test_a_roll_that_wraps_is_no_line_across_the_panel(
+    short_run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    state = short_run.log.plant.state.copy()
+    state[:, INDEX["roll"]] = (4.0 * short_run.log.plant.t + np.pi) % (2.0 * np.pi) - np.pi
+    log = dataclasses.replace(short_run.log, plant=dataclasses.replace(short_run.log.plant, state=state))
+    drawn: list[Figure] = []
+    monkeypatch.setattr(Figure, "savefig", lambda self, *_args, **_options: drawn.append(self))
+    write_figures(dataclasses.replace(short_run, log=log), tmp_path)
+    (roll,) = (axes for axes in drawn[0].axes if axes.get_ylabel() == "roll [deg]")
+    values = np.asarray(roll.get_lines()[0].get_ydata())
+    assert np.nanmax(values) - np.nanmin(values) > 350.0
+    assert np.nanmax(np.abs(np.diff(values))) < 10.0
+
+
+def test_states_are_drawn_as_told_beside_the_true_ones(
+    short_run: Run, figures: dict[str, Path], tmp_path: Path
+) -> None:
+    assert "as told" not in texts(figures["figure4_states.svg"])
+    write_figures(with_effects(short_run, told=True), tmp_path)
+    assert {"flight", "as told"} <= texts(tmp_path / "figure4_states.svg")
+    told = lines_of_colour(tmp_path / "figure4_states.svg", line_colour(1))
+    assert told - lines_of_colour(figures["figure4_states.svg"], line_colour(1)) == 6 + 1, "six panels and the legend"
+
+
+def test_each_panel_of_effects_has_a_legend_of_its_own(short_run: Run) -> None:
+    figure = draw_effects(with_effects(short_run, wind=True, told=True))
+    legends = {axes.get_ylabel().split()[0]: axes.get_legend() for axes in figure.axes}
+    named = {what: [text.get_text() for text in legend.get_texts()] for what, legend in legends.items() if legend}
+    assert named == {"wind,": ["x", "y", "z"], "position": ["x", "y", "z"], "attitude": ["roll", "pitch", "yaw"]}
+    assert not figure.legends

@@ -23,7 +23,7 @@ from quadsim.recording import layout, open_viewer, texts, viewer_problem, world,
 from quadsim.recording import viewer as viewer_module
 from quadsim.recording.look import PANELS, TIMELINE, VERDICTS
 from quadsim.rundir import Run
-from quadsim.state import EULER, POSITION, body_to_world
+from quadsim.state import EULER, INDEX, POSITION, body_to_world
 
 
 class Content:
@@ -195,7 +195,7 @@ def test_a_run_without_limits(record: Callable[[Run], Content], short_run: Run) 
     run = dataclasses.replace(with_limits(short_run), summary={**short_run.summary, "constraints": []})
     content = record(run)
     assert not [entity for entity in content.entities if entity.startswith(("/limits", "/margins", "/verdicts"))]
-    assert "constraint" not in content.rows("/summary", "text")[0][0]
+    assert "| constraint |" not in content.rows("/summary", "text")[0][0]
 
 
 def test_times_are_held_against_the_deadline(content: Content, short_run: Run) -> None:
@@ -267,6 +267,77 @@ def test_events_tell_each_change_of_the_solver_and_the_end(record: Callable[[Run
     assert levels == ["INFO", "INFO", "INFO", "WARN", "WARN", "INFO", "ERROR"]
     times = [0.0, 1.0, 1.5, 2.0, 2.1, 2.15, log.plant.t[-1]]
     np.testing.assert_allclose(content.times("/events"), times, atol=1e-9)
+
+
+def on_the_ground(run: Run, *phases: str) -> Run:
+    """The flight as if its first periods had been of other phases."""
+    control = run.log.control
+    phase = (*phases, *("flying",) * (control.t.size - len(phases)))
+    return dataclasses.replace(run, log=dataclasses.replace(run.log, control=dataclasses.replace(control, phase=phase)))
+
+
+def test_events_tell_the_phases_of_a_flight_with_a_ground(record: Callable[[Run], Content], short_run: Run) -> None:
+    content = record(on_the_ground(short_run, *["landed"] * 5, *["armed"] * 5))
+    times, rows = content.times("/events"), content.rows("/events", "text")
+    told = {round(float(time), 9): row[0] for time, row in zip(times, rows, strict=True) if "phase" in row[0]}
+    assert told == {0.0: "phase: landed", 0.25: "phase: armed", 0.5: "phase: flying"}
+    assert np.all(np.diff(times) >= 0.0)
+    assert [level for _, text, level in texts._phase_changes(on_the_ground(short_run, "crashed"))] == ["WARN", "INFO"]
+
+
+def test_no_horizon_is_drawn_on_the_ground(record: Callable[[Run], Content], short_run: Run) -> None:
+    content = record(on_the_ground(short_run, "landed", "armed"))
+    strips = content.rows("/world/horizon", "strips")
+    assert [len(row[0]) for row in strips[:2]] == [0, 0]
+    assert len(strips[2][0]) > 10
+
+
+def test_the_wind_is_an_arrow_that_meets_the_vehicle(record: Callable[[Run], Content], short_run: Run) -> None:
+    t = short_run.log.plant.t
+    wind = np.outer(1.0 + np.sin(t), [3.0, -4.0, 0.0])
+    plant = dataclasses.replace(short_run.log.plant, wind=wind)
+    content = record(dataclasses.replace(short_run, log=dataclasses.replace(short_run.log, plant=plant)))
+    vectors = np.array(content.rows("/world/vehicle/wind", "vectors"))[:, 0]
+    origins = np.array(content.rows("/world/vehicle/wind", "origins"))[:, 0]
+    longest = 1.5 * short_run.vehicle.arm_length
+    np.testing.assert_allclose(vectors, longest * wind / np.linalg.norm(wind, axis=1).max(), atol=1e-6)
+    tips = (origins + vectors)[:, :2]
+    np.testing.assert_allclose(tips, -0.3 * vectors[:, :2], atol=1e-6)
+
+
+def test_a_roll_that_wraps_has_gaps(record: Callable[[Run], Content], short_run: Run) -> None:
+    plant = short_run.log.plant
+    state = plant.state.copy()
+    state[:, INDEX["roll"]] = (4.0 * plant.t) % (2.0 * np.pi) - np.pi
+    turned = dataclasses.replace(short_run.log, plant=dataclasses.replace(plant, state=state))
+    drawn = np.ravel(record(dataclasses.replace(short_run, log=turned)).rows("/signals/roll", "scalars"))
+    assert np.nanmax(np.abs(np.diff(drawn))) < 10.0
+    assert np.count_nonzero(np.isnan(drawn)) == 3
+
+
+def test_a_lost_vehicle_leaves_the_picture(short_run: Run) -> None:
+    state = short_run.log.plant.state.copy()
+    state[-1, POSITION] += (0.0, 0.0, -1e4)
+    log = dataclasses.replace(short_run.log, plant=dataclasses.replace(short_run.log.plant, state=state))
+    eye, target = layout._overview(dataclasses.replace(short_run, log=log))
+    course = short_run.log.control.reference[:, :3]
+    assert np.linalg.norm(eye - target) < 5.0 * np.linalg.norm(np.ptp(course, axis=0)) + 20.0
+
+
+def test_the_axis_of_what_stands_still_has_the_least_span(short_run: Run) -> None:
+    assert layout._least_range(short_run, ("x", "y", "z")) is None
+    assert layout._least_range(short_run, ("roll", "pitch")) is None
+    assert layout._least_range(short_run, ("x_estimate_error",)) == (-0.005, 0.005)
+
+
+def test_the_summary_tells_what_the_flight_met(short_run: Run) -> None:
+    summary = {**short_run.summary, "expected": "lost", "as_expected": False}
+    summary["course"] = {"sentence": "The course asks for nothing."}
+    text = texts._summary(dataclasses.replace(short_run, summary=summary))
+    assert "its scenario states the verdict lost." in text
+    assert "paper-constrained: the course asks for nothing." in text
+    yaw = math.degrees(short_run.summary["tracking"]["rmse"]["yaw"])
+    assert f"yaw {yaw:.3g} deg" in text
 
 
 def test_the_summary_prints_each_verdict_with_its_tolerance(content: Content, short_run: Run) -> None:

@@ -1,6 +1,7 @@
 """The comparison page: complete or not there, escaped, offline, and without a complaint from a browser."""
 
 import dataclasses
+import json
 import os
 import re
 import shutil
@@ -194,6 +195,37 @@ def test_thinning_keeps_ends_and_extremes() -> None:
     assert np.all(np.diff(kept) > 0)
     assert {0, values.size - 1, int(values.argmin()), int(values.argmax())} <= set(kept.tolist())
     assert np.array_equal(thin(values[:300], 300), np.arange(300))
+
+
+def test_thinning_keeps_gaps() -> None:
+    values = np.sin(np.arange(10_000.0))
+    values[[10, 5000]] = np.nan
+    kept = thin(values, 500)
+    assert kept.size <= 504
+    assert {10, 5000} <= set(kept.tolist())
+    assert np.nanmax(values[kept]) == np.nanmax(values)
+
+
+def test_the_page_tells_the_verdict_against_the_one_expected(short_run: Run, tmp_path: Path) -> None:
+    summary = {**short_run.summary, "expected": "lost", "as_expected": False, "constraints": []}
+    page = write_comparison([dataclasses.replace(short_run, summary=summary)], tmp_path / "out").read_text()
+    assert 'verdict:\n      <span class="bad">satisfied, expected: lost</span>' in page
+
+
+def test_plots_of_what_stands_still_have_a_least_span(short_run: Run) -> None:
+    plant = short_run.log.plant
+    still = dataclasses.replace(plant, state=np.full_like(plant.state, 1e-9))
+    control = dataclasses.replace(short_run.log.control, reference=np.zeros_like(short_run.log.control.reference))
+    log = dataclasses.replace(short_run.log, plant=still, control=control)
+    course, *_ = comparison_plots([dataclasses.replace(short_run, limits=(), log=log)])
+    layout = json.loads(course.json)["layout"]
+    assert [layout[axis]["autorangeoptions"]["include"] for axis in ("yaxis", "yaxis4")] == [
+        [-0.005, 0.005],
+        [-0.05, 0.05],
+    ]
+    moving, *_ = comparison_plots([short_run])
+    axes = json.loads(moving.json)["layout"]
+    assert [axis for axis in ("yaxis3", "yaxis4") if "autorangeoptions" in axes[axis]] == [], "z and yaw move"
 
 
 def test_many_runs_keep_the_page_small(short_run: Run) -> None:

@@ -19,11 +19,12 @@ import pytest
 
 from quadsim import video
 from quadsim.audit import audit
-from quadsim.controller import SOLVED, UNCONSTRAINED
+from quadsim.controller import MISSED, SOLVED, UNCONSTRAINED
 from quadsim.errors import FileError, OutputError, ParameterError, RenderingUnavailableError
 from quadsim.flightlog import write_log
 from quadsim.footage import Shot, make_footage, thin
-from quadsim.overlay import GREEN, RED, Overlay
+from quadsim.overlay import Overlay
+from quadsim.pen import CYAN, GREEN, RED, VIOLET, Colour
 from quadsim.rundir import Run, load_run, write_json
 from quadsim.state import EULER, POSITION, body_to_world
 from quadsim.video import render_gif, render_video, rendering_backend
@@ -309,12 +310,63 @@ def pixels(run: Run, colour: tuple[int, int, int]) -> int:
     return int(np.count_nonzero((picture == colour).all(axis=-1)))
 
 
-@pytest.mark.parametrize(("status", "good"), [(SOLVED, True), (UNCONSTRAINED, True), ("infeasible", False)])
+@pytest.mark.parametrize(
+    ("status", "good"),
+    [
+        (SOLVED, True),
+        (UNCONSTRAINED, True),
+        ("landed", True),
+        ("crashed", False),
+        (MISSED, False),
+        ("infeasible", False),
+    ],
+)
 def test_captions_tell_an_optimum_from_a_failure(short_run: Run, status: str, good: bool):
     control = replace(short_run.log.control, status=(status,) * short_run.log.control.t.size)
     run = replace(short_run, log=replace(short_run.log, control=control))
     assert (pixels(run, GREEN) > pixels(run, RED)) == good
     assert (pixels(run, RED) == 0) == good
+
+
+def test_captions_tell_the_phase_where_there_is_a_ground(short_run: Run):
+    def at_phase(*phases: str) -> Run:
+        control = short_run.log.control
+        phase = (*phases, *("flying",) * (control.t.size - len(phases)))
+        return replace(short_run, log=replace(short_run.log, control=replace(control, phase=phase)))
+
+    without = pixels(at_phase(), GREEN)
+    assert pixels(at_phase("landed"), GREEN) > without, "told throughout a flight with a ground"
+    assert pixels(at_phase("landed"), GREEN) != pixels(at_phase(*("armed",) * 40), GREEN)
+
+
+@pytest.mark.parametrize(("entry", "columns", "colour"), [("wind", 3, CYAN), ("wrench", 6, VIOLET)])
+def test_captions_tell_the_wind_and_the_external_force(short_run: Run, entry: str, columns: int, colour: Colour):
+    def acting(x: float) -> Run:
+        plant = short_run.log.plant
+        values = np.zeros((plant.t.size, columns))
+        values[:, 0] = x * (plant.t >= 0.5)
+        return replace(short_run, log=replace(short_run.log, plant=replace(plant, **{entry: values})))
+
+    assert pixels(short_run, colour) == 0
+    eastward, westward = pixels(acting(3.0), colour), pixels(acting(-3.0), colour)
+    assert eastward > 100
+    assert westward == pytest.approx(eastward, abs=15), "the arrow's edges are rounded otherwise"
+    calm = make_footage(acting(3.0), np.array([0.4, 0.6]))
+    shown = calm.wind if entry == "wind" else calm.force
+    assert shown is not None
+    np.testing.assert_array_equal(shown[:, 0], [0.0, 3.0])
+
+
+def test_arrows_on_the_map_point_where_the_wind_blows(short_run: Run):
+    plant = short_run.log.plant
+    wind = np.tile([0.0, 2.0, 0.0], (plant.t.size, 1))
+    run = replace(short_run, log=replace(short_run.log, plant=replace(plant, wind=wind)))
+    blank = np.full((720, 1280, 3), 128, np.uint8)
+    picture = Overlay(run, make_footage(run, np.array([0.0])), width=1280, height=720).draw(blank, 0)
+    rows, columns = np.nonzero((picture[:206, 1028:] == CYAN).all(axis=-1))
+    assert np.ptp(rows) > 25 > np.ptp(columns), "y is up on the map"
+    widest = [np.count_nonzero(rows == row) for row in (rows.min() + 3, rows.max() - 3)]
+    assert widest[0] > widest[1], "the head is above"
 
 
 def test_captions_turn_red_when_a_limit_breaks(short_run: Run):
