@@ -53,12 +53,14 @@ class Outline:
         foot_radius: [m].
         hull: (P, 3) points of what must not touch: the rims of the rotor discs and the underside [m].
         floor: height of the floor [m].
+        disc: height of the rotor discs above the origin [m].
     """
 
     feet: Array
     foot_radius: float
     hull: Array
     floor: float
+    disc: float
 
 
 def outline(vehicle: Vehicle) -> Outline:
@@ -76,6 +78,7 @@ def outline(vehicle: Vehicle) -> Outline:
         foot_radius=float(model.geom(FOOT_NAMES[0]).size[0]),
         hull=np.concatenate([*discs, battery[None, :]]),
         floor=float(model.geom(FLOOR).pos[2]),
+        disc=float(data.geom(DISC_NAMES[0]).xpos[2]),
     )
 
 

@@ -49,7 +49,7 @@ class Computation:
         taken = self.fixed + self.per_iteration * command.iterations
         if self.jitter:
             taken += rng.exponential(self.jitter)
-        for stall in self.stalls:
+        for stall in sorted(self.stalls, key=lambda stall: stall.start):
             if time < stall.start + stall.duration and time + taken >= stall.start:
                 taken = max(taken, stall.start + stall.duration - time)
         return taken

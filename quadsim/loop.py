@@ -93,7 +93,7 @@ def fly(
             if not missed:
                 acting = command.speeds
                 holds += [(acting, steps_per_period - wait)] if wait < steps_per_period else []
-            flown = [(plant.advance(speeds, steps), speeds) for speeds, steps in holds]
+            flown = [(plant.advance(speeds, steps), plant.applied(speeds)) for speeds, steps in holds]
             if navigation is not None:
                 for stretch, speeds in flown:
                     navigation.advance(stretch.physics, np.broadcast_to(speeds, (len(stretch.physics), N_ROTORS)))

@@ -12,7 +12,7 @@ import numpy as np
 
 from quadsim.controller import ACCEPTED, MISSED, Phase
 from quadsim.flightlog import ControlLog, FlightLog, TimingLog
-from quadsim.phase import clearance, takeoff_time, touchdown
+from quadsim.phase import AIRBORNE, clearance, takeoff_time, touchdown
 from quadsim.state import (
     INDEX,
     REFERENCE_NAMES,
@@ -186,13 +186,16 @@ def ground(log: FlightLog, outline: Outline) -> dict[str, Any]:
     """How the flight left the ground and met it again, from plant rows at the physics rate.
 
     Returns:
-        `takeoff_time` [s], `touchdown` (`time` [s], `speed` and `horizontal_speed` [m/s], `tilt` [deg]), each None
+        `started`, `landed` or `flying`; `takeoff_time` [s]; `touchdown`, of feet or hull (`time` [s], `speed` and
+        `horizontal_speed` [m/s], `tilt` [deg]), each None
         where there was none; `phase`, the last one; `crashed`.
     """
-    clearances = clearance(log.plant.state, outline.feet, outline.foot_radius, outline.floor)
+    feet = clearance(log.plant.state, outline.feet, outline.foot_radius, outline.floor)
+    clearances = np.minimum(feet, clearance(log.plant.state, outline.hull, 0.0, outline.floor))
     met = touchdown(log.plant.t, log.plant.state, clearances)
     return {
-        "takeoff_time": takeoff_time(log.plant.t, clearances),
+        "started": str(Phase.LANDED) if feet[0] <= AIRBORNE else str(Phase.FLYING),
+        "takeoff_time": takeoff_time(log.plant.t, feet),
         "touchdown": None if met is None else asdict(met),
         "phase": log.control.phase[-1] if log.control.phase else None,
         "crashed": str(Phase.CRASHED) in log.control.phase,

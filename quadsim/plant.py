@@ -100,7 +100,8 @@ class Plant:
         self._yaw = 0.0
         self._wind = wind
         self._by_step = effects.follows_state or wind is not None
-        self._forces = StepForces(vehicle, effects, outline(vehicle).floor if effects.rotor_radius else 0.0)
+        shape = outline(vehicle)
+        self._forces = StepForces(vehicle, effects, floor=shape.floor, disc=shape.disc)
         changes = sorted(effects.changes, key=lambda change: change.time)
         self._changes = [(math.ceil(change.time / timestep - 1e-6), change) for change in changes]
         self._rng = rng if rng is not None else np.random.default_rng(0)
@@ -269,14 +270,16 @@ class Plant:
         air = np.zeros((steps, 3)) if wind is None else wind
         moving_air = wind is not None and self.effects.body_drag is not None
         velocity_before = self._velocity_before
-        rows = zip(thrusts, speeds.tolist(), slopes.tolist(), air.tolist(), noise, strict=True)
+        there = self._efficiency > 0.0  # a lost propeller neither drags nor carries momentum
+        turning, changing = (speeds * there).tolist(), (slopes * there).tolist()
+        rows = zip(thrusts.tolist(), turning, changing, air.tolist(), noise, strict=True)
         for i, (thrust, speed, slope, breeze, push) in enumerate(rows):
             velocity = qvel.tolist()
             motion = midway(qpos.tolist(), velocity, velocity_before, timestep)
             velocity_before = velocity
-            applied[:] = self._forces.wrench(motion, speed, slope, breeze)
+            applied[:] = self._forces.wrench(motion, thrust, speed, slope, breeze)
             applied += push
-            control[:] = thrust if self.effects.rotor_radius is None else thrust * self._forces.lift(motion)
+            control[:] = thrust
             if moving_air:
                 model.opt.wind[:] = breeze
             mujoco.mj_step(model, data)

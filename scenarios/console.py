@@ -130,7 +130,9 @@ def _effect_lines(summary: Mapping[str, Any]) -> Iterator[str]:
     """What a flight's effects did, where it has them: ground, late commands, errors of the estimate."""
     if "ground" in summary:
         ground = summary["ground"]
-        left = "never left it" if ground["takeoff_time"] is None else f"left it at {ground['takeoff_time']:.2f} s"
+        left = "started in the air" if ground["started"] == "flying" else "never left it"
+        if ground["takeoff_time"] is not None:
+            left = f"left it at {ground['takeoff_time']:.2f} s"
         touch = ground["touchdown"]
         met = ""
         if touch is not None:

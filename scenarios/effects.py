@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from typing import Any, TypeVar
 
 from quadsim.computation import Computation, Stall
@@ -80,13 +81,31 @@ def build_effects(scenario: Scenario, vehicle: Vehicle) -> Effects:
     )
 
 
+def moving_air(scenario: Scenario, vehicle: Vehicle) -> AirSpec | None:
+    """The resolved air where it moves at some time of the flight, or None where it stands still throughout.
+
+    Raises:
+        ParameterError: there is wind, and nothing that it could push.
+    """
+    air = resolve_effects(scenario.effects, vehicle).air or AirSpec()
+    blown = any(isinstance(event, GustEvent | WindEvent) for event in scenario.events)
+    if not (any(air.wind) or air.turbulence is not None or blown):
+        return None
+    if not air.rotor_drag and air.body_drag is None:
+        rule = f"positive, or body_drag given, for the wind to push: the vehicle {vehicle.name!r} states no drag"
+        raise ParameterError("effects.air", "rotor_drag", air.rotor_drag or 0.0, rule)
+    return air
+
+
 def build_wind(scenario: Scenario, vehicle: Vehicle) -> WindField | None:
     """The motion of the air, or None where it stands still throughout.
 
     Raises:
         ParameterError: there is wind, and nothing that it could push.
     """
-    air = resolve_effects(scenario.effects, vehicle).air or AirSpec()
+    air = moving_air(scenario, vehicle)
+    if air is None:
+        return None
     gusts = tuple(
         Gust(start=event.at, duration=event.duration, velocity=_triple(event.velocity))
         for event in scenario.events
@@ -104,11 +123,6 @@ def build_wind(scenario: Scenario, vehicle: Vehicle) -> WindField | None:
             wind_speed_20ft=air.turbulence.wind_speed_20ft,
             airspeed=air.turbulence.airspeed,
         )
-    if not any(air.wind) and not gusts and not changes and turbulence is None:
-        return None
-    if not air.rotor_drag and air.body_drag is None:
-        rule = f"positive, or body_drag given, for the wind to push: the vehicle {vehicle.name!r} states no drag"
-        raise ParameterError("effects.air", "rotor_drag", air.rotor_drag or 0.0, rule)
     return WindField(
         mean=_triple(air.wind),
         gusts=gusts,
@@ -172,18 +186,27 @@ def _disturbance(spec: EffectsSpec) -> Disturbance | None:
 def _changes(
     scenario: Scenario, efficiency: tuple[float, float, float, float]
 ) -> tuple[RotorChange | PayloadChange, ...]:
-    found: list[RotorChange | PayloadChange] = []
+    found: list[RotorChange | PayloadChange] = [*_losses(scenario, efficiency)]
     for event in scenario.events:
-        if isinstance(event, RotorLossEvent):
-            whole = efficiency[event.rotor - 1]
-            found.append(RotorChange(time=event.at, rotor=event.rotor, efficiency=whole * (1.0 - event.loss)))
-            if event.duration is not None:
-                found.append(RotorChange(time=event.at + event.duration, rotor=event.rotor, efficiency=whole))
-        elif isinstance(event, PayloadPickupEvent):
+        if isinstance(event, PayloadPickupEvent):
             found.append(PayloadChange(time=event.at, payload=_payload(event)))
         elif isinstance(event, PayloadDropEvent):
             found.append(PayloadChange(time=event.at, payload=None))
     return tuple(found)
+
+
+def _losses(scenario: Scenario, efficiency: tuple[float, float, float, float]) -> Iterator[RotorChange]:
+    """Each rotor's share whenever one of its losses begins or ends: the product of what all losses in force leave."""
+    losses = [event for event in scenario.events if isinstance(event, RotorLossEvent)]
+    for rotor, worn in enumerate(efficiency, start=1):
+        spans = [
+            (loss.at, math.inf if loss.duration is None else loss.at + loss.duration, 1.0 - loss.loss)
+            for loss in losses
+            if loss.rotor == rotor
+        ]
+        for time in sorted({time for start, stop, _ in spans for time in (start, stop) if time < math.inf}):
+            left = math.prod(share for start, stop, share in spans if start <= time < stop)
+            yield RotorChange(time=time, rotor=rotor, efficiency=worn * left)
 
 
 def _triple(values: list[float]) -> Velocity:

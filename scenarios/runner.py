@@ -17,6 +17,7 @@ from threadpoolctl import threadpool_limits
 from quadsim import __version__, metrics, rundir
 from quadsim.airframe import outline
 from quadsim.audit import Finding, audit
+from quadsim.controller import Phase
 from quadsim.estimation import Tally
 from quadsim.feasibility import to_json as feasibility_to_json
 from quadsim.flightlog import FlightLog, write_log
@@ -82,8 +83,9 @@ class Flight:
 
     @property
     def satisfied(self) -> bool:
-        """Whether the flight was completed and every required constraint held."""
-        return self.log.reason is None and all(finding.satisfied for finding in self.findings if finding.limit.required)
+        """Whether the flight was completed without a crash, and every required constraint held."""
+        whole = self.log.reason is None and str(Phase.CRASHED) not in self.log.control.phase
+        return whole and all(finding.satisfied for finding in self.findings if finding.limit.required)
 
     @property
     def outcome(self) -> Verdict:

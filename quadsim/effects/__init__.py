@@ -48,7 +48,10 @@ class Disturbance:
 
 @dataclass(frozen=True, kw_only=True)
 class RotorChange:
-    """From `time` [s] on, a rotor gives the share `efficiency` of the thrust and torque that its speed would give."""
+    """From `time` [s] on, a rotor gives the share `efficiency` of the thrust and torque that its speed would give.
+
+    At 0 it has lost its propeller: it drags no more either, and carries no momentum.
+    """
 
     time: float
     rotor: int

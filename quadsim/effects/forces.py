@@ -69,31 +69,46 @@ class StepForces:
       linear in the air speed at these Reynolds numbers, so it is computed here.
     - Gyroscopic and spin-up torque of rotors with inertia, -(d/dt + rates x) h z_b, with the angular momentum
       h = -sum_i spin_i J_r w_i of rotors that turn against their reaction torque.
-    - Ground effect on each rotor's thrust, by its own height; see `quadsim.effects.ground_effect`.
+    - Ground effect: what each rotor's thrust gains, by the height of its own disc; its torque gains nothing, as the
+      ratio is that of thrusts at the same power.  See `quadsim.effects.ground_effect`.
 
     The quadratic drag of the body is MuJoCo's own; see `quadsim.airframe.build_spec`.
     """
 
-    def __init__(self, vehicle: Vehicle, effects: Effects, floor: float) -> None:
+    def __init__(self, vehicle: Vehicle, effects: Effects, *, floor: float, disc: float) -> None:
+        """Set up.
+
+        Args:
+            vehicle: whose rotors they are.
+            effects: what acts on it.
+            floor: height of the ground, world [m].
+            disc: height of the rotor discs, body frame [m].
+        """
         self._drag = effects.rotor_drag
         self._inertia = effects.rotors.inertia if effects.rotors is not None else 0.0
         self._radius = effects.rotor_radius
-        self._floor = floor
+        self._floor, self._disc = floor, disc
         self._places: list[tuple[float, float]] = [(x, y) for x, y, _ in vehicle.rotor_positions.tolist()]
         self._spins = vehicle.rotor_spins
 
     def wrench(
-        self, motion: Motion, speeds: Sequence[float], accelerations: Sequence[float], wind: Sequence[float]
+        self,
+        motion: Motion,
+        thrusts: Sequence[float],
+        speeds: Sequence[float],
+        accelerations: Sequence[float],
+        wind: Sequence[float],
     ) -> tuple[float, float, float, float, float, float]:
         """Force in the world frame [N] and torque in the body frame about its origin [N m].
 
         Args:
             motion: of the vehicle.
+            thrusts: (4,) that the rotors would have far from the ground [N].
             speeds: (4,) rotor speeds [rad/s].
             accelerations: (4,) of the rotors [rad/s^2].
             wind: (3,) velocity of the air, world frame [m/s].
         """
-        (r00, r01, _), (r10, r11, _), (r20, r21, _) = motion.rotation
+        (r00, r01, r02), (r10, r11, r12), (r20, r21, r22) = motion.rotation
         p, q, r = motion.rates
         fx = fy = fz = tx = ty = tz = 0.0
         if self._drag:
@@ -113,15 +128,16 @@ class StepForces:
             tx -= q * momentum
             ty += p * momentum
             tz += self._inertia * sum(spin * slope for spin, slope in zip(self._spins, accelerations, strict=True))
+        if self._radius is not None:
+            above = motion.position[2] - self._floor + r22 * self._disc
+            lift = 0.0
+            for (x, y), thrust in zip(self._places, thrusts, strict=True):
+                gain = thrust * (thrust_ratio(above + r20 * x + r21 * y, self._radius) - 1.0)
+                lift += gain
+                tx += y * gain
+                ty -= x * gain
+            fx, fy, fz = fx + r02 * lift, fy + r12 * lift, fz + r22 * lift
         return fx, fy, fz, tx, ty, tz
-
-    def lift(self, motion: Motion) -> list[float]:
-        """Factors (4) by which the ground's nearness raises each rotor's thrust."""
-        if self._radius is None:
-            return [1.0] * len(self._places)
-        r20, r21, _ = motion.rotation[2]
-        above = motion.position[2] - self._floor
-        return [thrust_ratio(above + r20 * x + r21 * y, self._radius) for x, y in self._places]
 
 
 def _rotation(w: float, x: float, y: float, z: float) -> Matrix:

@@ -62,11 +62,13 @@ class Dryden:
     def __post_init__(self) -> None:
         if not LOWEST <= self.altitude <= HIGHEST:
             rule = f"between {LOWEST} and {HIGHEST} m (10 to 1000 ft), where the model of MIL-F-8785C holds"
-            raise ParameterError("turbulence", "altitude", self.altitude, rule)
+            raise ParameterError("effects.air.turbulence", "altitude", self.altitude, rule)
         if not 0.0 <= self.wind_speed_20ft < math.inf:
-            raise ParameterError("turbulence", "wind_speed_20ft", self.wind_speed_20ft, "a finite speed >= 0 m/s")
+            raise ParameterError(
+                "effects.air.turbulence", "wind_speed_20ft", self.wind_speed_20ft, "a finite speed >= 0 m/s"
+            )
         if not 0.0 < self.airspeed < math.inf:
-            raise ParameterError("turbulence", "airspeed", self.airspeed, "a finite speed > 0 m/s")
+            raise ParameterError("effects.air.turbulence", "airspeed", self.airspeed, "a finite speed > 0 m/s")
 
     @property
     def lengths(self) -> Array:

@@ -144,6 +144,20 @@ def test_the_controller_is_told_what_the_sensors_say(vehicle: Vehicle, speeds: A
     assert numbers["not_finite"] == 0
 
 
+def test_the_estimator_is_told_what_rotors_can_do_of_the_command(vehicle: Vehicle) -> None:
+    told: list[Array] = []
+
+    class Witness(Navigation):
+        def advance(self, physics: Array, commands: Array) -> None:
+            told.append(commands[0].copy())
+            super().advance(physics, commands)
+
+    navigation = Witness(vehicle, timestep=1e-3, sensors=[], rng=np.random.default_rng(0))
+    with Plant(vehicle, limit_speeds=True) as plant:
+        fly_scripted(plant, Scripted(np.full((2, 4), 300.0)), navigation=navigation)
+    np.testing.assert_array_equal(told, np.full((2, 4), vehicle.speed_max))
+
+
 def test_a_sensor_that_says_no_number_is_counted(vehicle: Vehicle, speeds: Array) -> None:
     fault = SensorFault(sensor=SensorName.RATES, kind=FaultKind.NAN, start=0.1, stop=0.2)
     navigation = Navigation(vehicle, timestep=1e-3, sensors=[], rng=np.random.default_rng(0), faults=[fault])
@@ -208,7 +222,12 @@ def test_a_capsized_vehicle_lies_on_the_ground_and_has_crashed(vehicle: Vehicle)
     assert log.control.phase[-1] == "crashed"
     assert log.control.status[-1] == "crashed"
     assert log.plant.state[-1, 4] > -0.14
-    assert ground(log, outline(vehicle))["crashed"]
+    numbers = ground(log, outline(vehicle))
+    assert numbers["crashed"]
+    assert numbers["started"] == "flying"
+    assert numbers["takeoff_time"] is None
+    assert numbers["touchdown"]["tilt"] > 60.0
+    assert numbers["touchdown"]["speed"] > 0.5
 
 
 def test_a_sliding_vehicle_is_stopped_by_friction(vehicle: Vehicle) -> None:

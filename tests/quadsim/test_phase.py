@@ -14,7 +14,8 @@ FEET = np.array([[0.2, 0.0, -0.12], [-0.2, 0.0, -0.12], [0.0, 0.2, -0.12], [0.0,
 RADIUS = 0.01
 FLOOR = -0.13
 """At rest on its feet the vehicle's origin is at z = 0."""
-OUTLINE = Outline(feet=FEET, foot_radius=RADIUS, hull=np.array([[0.4, 0.0, 0.03], [-0.4, 0.0, 0.03]]), floor=FLOOR)
+HULL = np.array([[0.4, 0.0, 0.03], [-0.4, 0.0, 0.03]])
+OUTLINE = Outline(feet=FEET, foot_radius=RADIUS, hull=HULL, floor=FLOOR, disc=0.03)
 PERIOD = 0.05
 
 
@@ -117,7 +118,7 @@ def test_a_hull_that_touches_is_a_crash_for_good(monitor: PhaseMonitor, before: 
 @pytest.mark.parametrize(("roll", "crashed"), [(59.0, False), (61.0, True), (-61.0, True)])
 def test_feet_that_touch_at_a_steep_tilt_are_a_crash(roll: float, crashed: bool) -> None:
     """A hull of one point in the middle leaves the verdict to feet and tilt."""
-    outline = Outline(feet=FEET, foot_radius=RADIUS, hull=np.array([[0.0, 0.0, 0.5]]), floor=FLOOR)
+    outline = Outline(feet=FEET, foot_radius=RADIUS, hull=np.array([[0.0, 0.0, 0.5]]), floor=FLOOR, disc=0.03)
     state = at(0.0, roll=roll)
     state[INDEX["z"]] -= clearance(state[None], FEET, RADIUS, FLOOR)[0]
     touching, free = state, state + np.eye(12)[INDEX["z"]]
@@ -127,7 +128,7 @@ def test_feet_that_touch_at_a_steep_tilt_are_a_crash(roll: float, crashed: bool)
 
 def test_the_resting_height_follows_from_the_outline() -> None:
     """On a floor 10 m up, a reference at 10.04 m of the origin stays on the ground."""
-    raised = Outline(feet=FEET, foot_radius=RADIUS, hull=OUTLINE.hull, floor=FLOOR + 10.0)
+    raised = Outline(feet=FEET, foot_radius=RADIUS, hull=OUTLINE.hull, floor=FLOOR + 10.0, disc=0.03)
     monitor = PhaseMonitor(raised, period=PERIOD)
     assert phases(monitor, [(at(10.0), to(10.04)), (at(10.0), to(10.06))]) == ["landed", "armed"]
 

@@ -131,7 +131,7 @@ def lands_hard(flight: Flight) -> None:
 
 
 def ground_lifts(flight: Flight) -> None:
-    assert error(flight, "z") == pytest.approx(0.030, abs=0.001)
+    assert error(flight, "z") == pytest.approx(0.0243, abs=0.001)
 
 
 def capture_is_within_four_millimetres(flight: Flight) -> None:

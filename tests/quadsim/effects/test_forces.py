@@ -137,13 +137,43 @@ def test_white_noise_walks_as_a_random_walk(vehicle: Vehicle) -> None:
 
 
 def test_ground_effect_lifts_by_cheeseman_and_bennett(vehicle: Vehicle) -> None:
-    radius, height = 0.2, 0.15
+    """Each rotor by the height of its own disc; torques about z stay those of the rotors alone."""
+    radius, height, roll = 0.2, 0.15, 0.3
+    speeds = vehicle.hover_speed * np.array([1.05, 0.95, 1.05, 0.95])
     with Plant(vehicle, effects=Effects(rotor_radius=radius, contact=True)) as plant:
-        plant.reset(make_state(position=(0.0, 0.0, height)))
-        slope = plant.advance(plant.hover_speeds, 1).physics[0, 10] / 1e-3
-    above = height + 0.132  # the floor, where the drawing has it
-    ratio = 1.0 / (1.0 - (radius / (4.0 * above)) ** 2)
-    assert slope == pytest.approx((ratio - 1.0) * vehicle.gravity, rel=1e-6)
+        plant.reset(make_state(position=(0.0, 0.0, height), euler=(roll, 0.0, 0.0)), speeds)
+        stretch = plant.advance(speeds, 1)
+    floor, disc = -0.132, 0.034  # where the drawing has them
+    above = height - floor + disc * math.cos(roll) + vehicle.rotor_positions[:, 1] * math.sin(roll)
+    gains = vehicle.thrust_coefficient * speeds**2 * (1.0 / (1.0 - (radius / (4.0 * above)) ** 2) - 1.0)
+    assert stretch.wrench is not None
+    up = np.array([0.0, -math.sin(roll), math.cos(roll)])
+    np.testing.assert_allclose(stretch.wrench[0, :3], gains.sum() * up, rtol=1e-9, atol=1e-12)
+    torque = [gains @ vehicle.rotor_positions[:, 1], -gains @ vehicle.rotor_positions[:, 0], 0.0]
+    np.testing.assert_allclose(stretch.wrench[0, 3:], torque, rtol=1e-9, atol=1e-12)
+    yaw_torque = vehicle.drag_coefficient * (np.array(vehicle.rotor_spins) @ speeds**2)
+    assert stretch.physics[0, 13] == pytest.approx(1e-3 * yaw_torque / vehicle.inertia[2], rel=1e-3)
+
+
+def test_a_lost_propeller_neither_drags_nor_carries_momentum(vehicle: Vehicle) -> None:
+    effects = Effects(rotor_drag=3e-4, efficiency=(0.0,) * 4, rotors=RotorDynamics(rise=0.05, fall=0.05, inertia=1e-3))
+    start = moving(vx=5.0, yaw_rate=1.0)
+    start[7] = 0.5
+    with Plant(vehicle, effects=effects) as plant:
+        plant.reset(start)
+        wrench = plant.advance(1.1 * plant.hover_speeds, 10).wrench
+    np.testing.assert_array_equal(wrench, np.zeros((10, 6)))
+
+
+def test_a_second_flight_meets_the_same_wind(vehicle: Vehicle) -> None:
+    gust = Gust(start=0.02, duration=0.1, velocity=(0.0, 5.0, 0.0))
+    with Plant(vehicle, effects=Effects(rotor_drag=1e-3), wind=still_air((1.0, 0.0, 0.0), gust)) as plant:
+        winds = []
+        for _ in range(2):
+            plant.reset(HIGH)
+            winds.append(plant.advance(plant.hover_speeds, 80).wind)
+    np.testing.assert_array_equal(winds[0], winds[1])
+    assert np.ptp(winds[0]) > 1.0
 
 
 def test_forces_are_of_second_order_in_the_step(vehicle: Vehicle) -> None:
