@@ -127,6 +127,8 @@ class Vehicle:
                 )
 
     def _check_number(self, name: str, value: object, *, positive: bool) -> None:
+        if isinstance(value, int) and abs(value) > LARGEST:  # of any length: more than a float, or a text, can hold
+            value = math.copysign(math.inf, value > 0 or -1)
         if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
             raise ParameterError("vehicle", name, value, "a finite number")
         if positive and value <= 0.0:

@@ -5,10 +5,15 @@ from __future__ import annotations
 import copy
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 from quadsim.assets import read_toml
-from quadsim.errors import FileError, ParameterError
+from quadsim.errors import FileError, InputError, ParameterError
+
+LARGEST_FILE: Final = 4_000_000
+"""Size [bytes] of the largest file that is read; the longest scenario there can be is smaller."""
+DEEPEST: Final = 20
+"""Tables and lists within one another; a scenario has a third of them."""
 
 
 def read_scenario(path: Path, find: Callable[[str], Path], *, above: tuple[Path, ...] = ()) -> dict[str, Any]:
@@ -20,10 +25,10 @@ def read_scenario(path: Path, find: Callable[[str], Path], *, above: tuple[Path,
         above: the files that led here.
 
     Raises:
-        FileError: a file is missing, is not TOML, or is its own base in the end.
+        FileError: a file is missing, too large, is not TOML, or is its own base in the end.
         ParameterError: `base` is not a text.
     """
-    data = read_toml(path)
+    data = _read(path)
     if "base" not in data:
         return data
     name = data.pop("base")
@@ -64,11 +69,41 @@ def merge(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
     return merged
 
 
+def is_deeper(value: Any, levels: int) -> bool:
+    """Whether tables and lists stand within one another more than so many levels deep."""
+    layer = [value]
+    for _ in range(levels + 1):
+        layer = [
+            inner
+            for each in layer
+            if isinstance(each, dict | list)
+            for inner in (each.values() if isinstance(each, dict) else each)
+        ]
+    return bool(layer)
+
+
+def _read(path: Path) -> dict[str, Any]:
+    """A file's tables, if a person can have meant it as a scenario."""
+    try:
+        size = path.stat().st_size
+        if size > LARGEST_FILE:
+            raise FileError(path, f"must be of {LARGEST_FILE} or fewer bytes; got {size}")
+        data = read_toml(path)
+    except InputError:
+        raise
+    except (RecursionError, ValueError) as error:  # nested too deep, or a number of thousands of digits
+        raise FileError(path, f"is not valid TOML: {error}") from error
+    if is_deeper(data, DEEPEST):
+        raise FileError(path, f"must have at most {DEEPEST} tables and lists within one another")
+    return data
+
+
 def _named(value: Any) -> bool:
-    """Whether a value is a list of tables that all have names."""
-    return (
-        isinstance(value, list) and bool(value) and all(isinstance(entry, dict) and "name" in entry for entry in value)
-    )
+    """Whether a value is a list of tables that all have names, each its own."""
+    if not (isinstance(value, list) and value and all(isinstance(entry, dict) for entry in value)):
+        return False
+    names = [entry.get("name") for entry in value]
+    return all(isinstance(name, str) for name in names) and len(set(names)) == len(names)
 
 
 def _locate(data: dict[str, Any], directory: Path) -> None:

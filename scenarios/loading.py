@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import tomllib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -10,7 +11,8 @@ from typing import Any, Final
 from pydantic import ValidationError
 
 from quadsim.errors import FileError, ParameterError, UnknownNameError
-from scenarios.bases import read_scenario
+from scenarios.bases import DEEPEST, is_deeper, read_scenario
+from scenarios.checking import check_parts
 from scenarios.courses.build import located
 from scenarios.problems import ScenarioError, describe
 from scenarios.spec import Scenario
@@ -40,20 +42,25 @@ def scenario_path(name: str) -> Path:
 
 
 def load_scenario(name: str, settings: Sequence[str] = ()) -> Scenario:
-    """Read and check a scenario, merged over its `base` where it has one.
+    """Read and check a scenario, merged over its `base` where it has one, with the vehicle and the course it names.
 
     Args:
         name: a library name, or a path ending in `.toml`.
         settings: `dotted.path=value` texts that replace or add fields, values as in TOML.
 
     Raises:
-        InputError: the file is missing or malformed, or a field is not allowed.
+        InputError: the file is missing or malformed, a field is not allowed, or what it names cannot be flown so.
     """
-    path = scenario_path(name)
-    data = read_scenario(path, scenario_path)
-    for setting in settings:
-        apply_setting(data, setting)
-    return parse_scenario(data, source=path.name, directory=path.parent)
+    try:
+        path = scenario_path(name)
+        data = read_scenario(path, scenario_path)
+        for setting in settings:
+            apply_setting(data, setting)
+        scenario = parse_scenario(data, source=path.name, directory=path.parent)
+        check_parts(scenario)
+    except OSError as error:  # of looking whether a file is there, e.g. under a name longer than the system takes
+        raise FileError(str(error.filename)[:100], f"cannot be read ({error.strerror})") from error
+    return scenario
 
 
 def parse_scenario(data: Mapping[str, Any], *, source: str = "scenario", directory: Path | None = None) -> Scenario:
@@ -95,10 +102,11 @@ def apply_setting(data: dict[str, Any], setting: str) -> None:
     keys = path.strip().split(".")
     if not equals or not all(keys):
         raise ParameterError("", "--set", setting, "of the form dotted.path=value")
-    try:
-        value: Any = tomllib.loads(f"value = {text.strip()}")["value"]
-    except tomllib.TOMLDecodeError:
-        value = text.strip()
+    if keys == ["base"]:
+        raise ParameterError("", "--set", setting, "of a field other than base, which only a file can have")
+    value = _parse_value(text.strip())
+    if len(keys) > DEEPEST or is_deeper(value, DEEPEST):
+        raise ParameterError("", "--set", setting[:100], f"of at most {DEEPEST} tables and lists within one another")
     table: Any = data
     for depth, key in enumerate(keys):
         if isinstance(table, list):
@@ -117,3 +125,13 @@ def apply_setting(data: dict[str, Any], setting: str) -> None:
             table[key] = value
         else:
             table = table.setdefault(key, {})
+
+
+def _parse_value(text: str) -> Any:
+    """A value of TOML, or the text itself where it is none."""
+    # RecursionError: lists within lists without end; ValueError: not TOML, or a number of thousands of digits.
+    with contextlib.suppress(RecursionError, ValueError):
+        table = tomllib.loads(f"value = {text}")
+        if table.keys() == {"value"}:
+            return table["value"]
+    return text

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import datetime
 import difflib
 from collections.abc import Iterable, Mapping, Sequence
+from itertools import islice
 from typing import Any, Final
 
 from pydantic import BaseModel
@@ -39,6 +41,12 @@ _RULES: Final = {
     "union_tag_not_found": "a table with a field {discriminator}",
 }
 """How pydantic's kinds of error end the sentence "must be ..."."""
+_MOST_LINES: Final = 20
+"""Problems that one message names; it only counts the rest."""
+_MOST_ENTRIES: Final = 10
+_LONGEST: Final = 200
+"""Entries, and characters, that a message shows of what was given."""
+_DEEPEST_SHOWN: Final = 4
 
 
 class ScenarioError(InputError):
@@ -49,7 +57,9 @@ class ScenarioError(InputError):
     """
 
     def __init__(self, source: str, problems: Sequence[str]) -> None:
-        super().__init__(f"{source}: " + "\n  ".join(problems))
+        unsaid = len(problems) - _MOST_LINES
+        lines = [*problems[:_MOST_LINES], *([f"and {unsaid} more"] if unsaid > 0 else [])]
+        super().__init__(f"{source}: " + "\n  ".join(lines))
         self.source, self.problems = source, tuple(problems)
 
 
@@ -67,12 +77,16 @@ def describe(details: ErrorDetails, data: Mapping[str, Any], root: type[BaseMode
         return f"{field} is missing"
     if kind == "extra_forbidden":
         allowed = find(details["loc"][:-1], data, root).fields
+        if root is Scenario and len(place.names) == 1 and field != "base":
+            allowed += ("base",)  # which is gone once a file has been merged over its base
         guess = _guess(place.names[-1], allowed)
         return f"{field} is not a field of the scenario file{guess} (there are: {', '.join(allowed)})"
     if kind == "value_error":
         return ".".join([*place.names, str(context["error"])])
     if kind in ("too_short", "too_long") and place.exact_length is not None:
-        return f"{field} must be a list of {place.exact_length} {place.entries}; got {given!r}"
+        return f"{field} must be a list of {place.exact_length} {place.entries}; got {shown(given)}"
+    if kind == "too_long":
+        return f"{field} must be {_RULES[kind].format(**context)}; got {len(given)}"
     guess = ""
     if kind.startswith("union_tag"):
         quoted = context["discriminator"]  # in quotes where it is a field's name, and else a function of the spec's
@@ -80,7 +94,28 @@ def describe(details: ErrorDetails, data: Mapping[str, Any], root: type[BaseMode
         given = given.get(name) if isinstance(given, Mapping) else given
         guess = _guess(given, context.get("expected_tags", "").strip("'").split("', '"))
     rule = _RULES[kind].format(**context) if kind in _RULES else details["msg"]
-    return f"{field} must be {rule}; got {given!r}{guess}"
+    return f"{field} must be {rule}; got {shown(given)}{guess}"
+
+
+def shown(value: object, depth: int = _DEEPEST_SHOWN) -> str:
+    """What was given, as it would be written in Python, cut to what a line can take."""
+    if isinstance(value, datetime.date | datetime.time):
+        text = value.isoformat()
+    elif isinstance(value, int) and value.bit_length() > 64:  # Python does not write out very long ones
+        text = f"a whole number of {value.bit_length()} bits"
+    elif isinstance(value, str):
+        text = repr(value[: _LONGEST + 1])
+    elif isinstance(value, Mapping | list) and depth == 0:
+        text = "..."
+    elif isinstance(value, Mapping):
+        entries = [f"{shown(key)}: {shown(each, depth - 1)}" for key, each in islice(value.items(), _MOST_ENTRIES)]
+        text = "{" + ", ".join([*entries, *(["..."] if len(value) > _MOST_ENTRIES else [])]) + "}"
+    elif isinstance(value, list):
+        entries = [shown(each, depth - 1) for each in value[:_MOST_ENTRIES]]
+        text = "[" + ", ".join([*entries, *(["..."] if len(value) > _MOST_ENTRIES else [])]) + "]"
+    else:
+        text = repr(value)
+    return text if len(text) <= _LONGEST else text[: _LONGEST - 3] + "..."
 
 
 def _guess(given: object, allowed: Iterable[str]) -> str:

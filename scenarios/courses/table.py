@@ -7,12 +7,13 @@ import hashlib
 import io
 import math
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path as FilePath
 from typing import Final
 
 import numpy as np
 
-from quadsim.errors import FileError
+from quadsim.errors import FileError, InputError
 from quadsim.state import Array
 from scenarios.courses.course import Path
 from scenarios.courses.legs import polyline
@@ -21,6 +22,10 @@ POSE_HEADER: Final = ("t", "x", "y", "z", "yaw")
 VELOCITY_HEADER: Final = ("vx", "vy", "vz")
 LARGEST: Final = 1e6
 """Largest magnitude of a number in the table, as in the scenario file."""
+MOST_ROWS: Final = 200_000
+"""Rows below the header: 200 s at 1 kHz.  Each is held in memory."""
+LARGEST_FILE: Final = 64_000_000
+"""Size [bytes] of the largest file that is read."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,18 +54,27 @@ def read_table(path: FilePath) -> Table:
         FileError: naming the row (the header is row 1) and the column that is wrong.
     """
     try:
+        if path.exists() and not path.is_file():
+            raise FileError(path, "cannot be read (it is not a file)")
+        if (size := path.stat().st_size) > LARGEST_FILE:
+            raise FileError(path, f"must be of {LARGEST_FILE} or fewer bytes; got {size}")
         content = path.read_bytes()
-        rows = list(csv.reader(io.StringIO(content.decode("utf-8-sig"), newline=""), strict=True))
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        lines = csv.reader(io.StringIO(content.decode("utf-8-sig"), newline=""), strict=True)
+        rows = list(islice(lines, MOST_ROWS + 2))
+    except InputError:
+        raise
+    except (OSError, ValueError, csv.Error) as error:
         raise FileError(path, f"cannot be read ({error})") from error
     while rows and not rows[-1]:
         rows.pop()
     header = tuple(rows[0]) if rows else ()
     if header not in (POSE_HEADER, POSE_HEADER + VELOCITY_HEADER):
         wanted = f"{','.join(POSE_HEADER)} or {','.join(POSE_HEADER + VELOCITY_HEADER)}"
-        raise FileError(path, f"row 1: the header must be {wanted}; got {','.join(header)!r}")
+        raise FileError(path, f"row 1: the header must be {wanted}; got {_short(','.join(header))}")
     if len(rows) < 3:
         raise FileError(path, f"must have 2 or more rows below its header; got {len(rows) - 1}")
+    if len(rows) > MOST_ROWS + 1:
+        raise FileError(path, f"must have {MOST_ROWS} or fewer rows below its header")
     numbers = np.array([_parse_row(path, number, row, header) for number, row in enumerate(rows[1:], start=2)])
     t = numbers[:, 0]
     if t[0] < 0.0:
@@ -113,10 +127,16 @@ def _parse_row(path: FilePath, number: int, row: list[str], header: tuple[str, .
         if not cell.strip():
             raise FileError(path, f"{place}: is empty")
         try:
+            if "_" in cell:  # which Python reads over
+                raise ValueError
             value = float(cell)
         except ValueError:
-            raise FileError(path, f"{place}: must be a number; got {cell!r}") from None
+            raise FileError(path, f"{place}: must be a number; got {_short(cell)}") from None
         if not math.isfinite(value) or abs(value) > LARGEST:
-            raise FileError(path, f"{place}: must be a finite number within +-{LARGEST:g}; got {cell!r}")
+            raise FileError(path, f"{place}: must be a finite number within +-{LARGEST:g}; got {_short(cell)}")
         values.append(value)
     return values
+
+
+def _short(text: str) -> str:
+    return repr(text if len(text) <= 60 else text[:57] + "...")

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Annotated
+from typing import Annotated, Final
 
 from annotated_types import Len
 from pydantic import BaseModel, ConfigDict, Field
+
+MOST_ENTRIES: Final = 1000
+"""Of a list of tables."""
 
 Number = Annotated[float, Field(ge=-1e6, le=1e6)]
 NonNegative = Annotated[float, Field(ge=0.0, le=1e6)]

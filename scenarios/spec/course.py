@@ -7,9 +7,10 @@ from collections.abc import Sequence
 from itertools import pairwise
 from typing import Annotated, Final, Literal
 
+from annotated_types import MaxLen
 from pydantic import Discriminator, Field, Tag, model_validator
 
-from scenarios.spec.base import NonNegative, Number, Pair, Positive, Spec, Triple
+from scenarios.spec.base import MOST_ENTRIES, NonNegative, Number, Pair, Positive, Spec, Triple
 
 MOST_POINTS: Final = 200
 """Points or turns of one course; a longer one is a table, `type = "csv"`."""
@@ -35,6 +36,9 @@ class WindowSpec(Spec):
         return self
 
 
+Windows = Annotated[list[WindowSpec], MaxLen(MOST_ENTRIES)]
+
+
 class _CourseSpec(Spec):
     response_time: NonNegative = Field(default=0.0, description="[s] tau_r of Eq. (31); 0 for no filter")
 
@@ -49,10 +53,10 @@ class StepsSpec(_CourseSpec):
     """Steps of Eq. (30); outside its windows an axis stays at its initial position, and yaw at 0."""
 
     type: Literal["steps"] = Field(default="steps", description="kind of course: values held in windows of time")
-    x: list[WindowSpec] = Field(default=[], description="[m] windows of the x axis, world")
-    y: list[WindowSpec] = Field(default=[], description="[m] windows of the y axis, world")
-    z: list[WindowSpec] = Field(default=[], description="[m] windows of the z axis, world")
-    yaw: list[WindowSpec] = Field(default=[], description="[deg] windows of the yaw angle")
+    x: Windows = Field(default=[], description="[m] windows of the x axis, world")
+    y: Windows = Field(default=[], description="[m] windows of the y axis, world")
+    z: Windows = Field(default=[], description="[m] windows of the z axis, world")
+    yaw: Windows = Field(default=[], description="[deg] windows of the yaw angle")
 
 
 class WaypointSpec(Spec):

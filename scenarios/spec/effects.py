@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import math
 from typing import Annotated
 
-from annotated_types import Len
+from annotated_types import Len, MaxLen
 from pydantic import Field, model_validator
 
 from quadsim.effects import SEA_LEVEL_DENSITY
 from quadsim.effects.turbulence import HIGHEST, LOWEST
-from scenarios.spec.base import Fraction, NonNegative, Positive, Spec, Triple
+from scenarios.spec.base import MOST_ENTRIES, Fraction, NonNegative, Positive, Spec, Triple
+
+SLOWEST_AIRSPEED, FASTEST_AIRSPEED = 0.01, 200.0
+"""[m/s] at which turbulence may pass; at the slower one, it takes hours."""
 
 Factor = Annotated[float, Field(ge=0.05, le=20.0)]
 
@@ -47,7 +51,7 @@ class TurbulenceSpec(Spec):
     wind_speed_20ft: Annotated[float, Field(ge=0.0, le=100.0)] = Field(
         description="[m/s] mean wind 6.1 m above the ground, for the intensities; 7.7 is light, 15.4 moderate"
     )
-    airspeed: Annotated[float, Field(gt=0.0, le=200.0)] | None = Field(
+    airspeed: Annotated[float, Field(ge=SLOWEST_AIRSPEED, le=FASTEST_AIRSPEED)] | None = Field(
         default=None, description="[m/s] at which the turbulence passes the vehicle; absent: the mean wind's speed"
     )
 
@@ -68,9 +72,11 @@ class AirSpec(Spec):
 
     @model_validator(mode="after")
     def _check(self) -> AirSpec:
-        if self.turbulence is not None and self.turbulence.airspeed is None and not any(self.wind):
+        carried = self.turbulence is None or self.turbulence.airspeed is not None
+        if not carried and not SLOWEST_AIRSPEED <= math.hypot(*self.wind) <= FASTEST_AIRSPEED:
             raise ValueError(
-                "turbulence.airspeed must be given where there is no mean wind to carry the turbulence past"
+                f"turbulence.airspeed must be given where no mean wind of {SLOWEST_AIRSPEED:g} to {FASTEST_AIRSPEED:g} "
+                f"m/s carries the turbulence past; got a wind of {self.wind}"
             )
         return self
 
@@ -100,7 +106,9 @@ class LoadSpec(Spec):
         default=[1.0, 1.0, 1.0], description="[-] real moments of inertia over the file's, about body x, y, z"
     )
     centre_of_mass: Triple = Field(default=[0.0, 0.0, 0.0], description="[m] where it really is, body frame")
-    payloads: list[PayloadSpec] = Field(default=[], description="what it carries from the start")
+    payloads: Annotated[list[PayloadSpec], MaxLen(MOST_ENTRIES)] = Field(
+        default=[], description="what it carries from the start"
+    )
 
 
 class DisturbanceSpec(Spec):

@@ -78,6 +78,8 @@ class SensorFaultEvent(_Event):
             raise ValueError(f"offset must be given where fault is 'bias', and nowhere else; got {self.offset}")
         if self.axes is not None and self.fault != "nan":
             raise ValueError(f"axes must be absent where fault is not 'nan'; got {self.axes}")
+        if self.axes is not None and len(set(self.axes)) < len(self.axes):
+            raise ValueError(f"axes must be different ones; got {self.axes}")
         return self
 
 

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from typing import Annotated, Final, Literal, get_args
 
+from annotated_types import MaxLen
 from pydantic import Field, model_validator
 
 from quadsim.errors import ParameterError
 from quadsim.physics import steps_per_period
-from scenarios.spec.base import Spec
+from scenarios.spec.base import MOST_ENTRIES, Spec
 from scenarios.spec.computation import ComputationSpec
 from scenarios.spec.constraint import ConstraintSpec
 from scenarios.spec.controller import ConstrainedSpec, UnconstrainedSpec
@@ -21,6 +22,8 @@ from scenarios.spec.vehicle import VehicleSpec
 from scenarios.writing import to_toml
 
 LONGEST_FLIGHT: Final = 86_400.0
+LARGEST_SEED: Final = 2**63 - 1
+"""The largest whole number that every reader of TOML takes."""
 MOST_STEPS: Final = 10_000_000
 """Physics steps, and planned steps (periods times horizon), that one flight may take: each is held in memory."""
 
@@ -40,7 +43,7 @@ class Scenario(Spec):
     expect: Verdict = Field(
         default="satisfied",
         description="its verdict, if all is right: satisfied (flown to its end, every required constraint holds), "
-        "violated (one does not), lost (the flight is aborted)",
+        "violated (one does not, or the vehicle crashes), lost (the flight is aborted)",
     )
     duration: Annotated[float, Field(gt=0.0, le=LONGEST_FLIGHT)] = Field(
         description="[s] simulated time, a whole number of control periods"
@@ -48,7 +51,9 @@ class Scenario(Spec):
     control_period: Annotated[float, Field(gt=0.0, le=10.0)] = Field(
         description="[s] tau_s, time for which a command is held, a whole number of physics steps"
     )
-    seed: Annotated[int, Field(ge=0)] = Field(default=0, description="of everything random; recorded with the flight")
+    seed: Annotated[int, Field(ge=0, le=LARGEST_SEED)] = Field(
+        default=0, description="of everything random; recorded with the flight"
+    )
     log_rate: Annotated[float, Field(ge=0.01, le=1e6)] = Field(
         default=200.0, description="[Hz] rows of plant.parquet; the audit sees every physics step"
     )
@@ -63,8 +68,8 @@ class Scenario(Spec):
     estimator: EstimatorSpec | None = Field(
         default=None, description="absent: the controller is told what the sensors say, as it arrives"
     )
-    events: list[Event] = Field(default=[], description="what happens on the way")
-    constraints: list[ConstraintSpec] = Field(
+    events: Annotated[list[Event], MaxLen(MOST_ENTRIES)] = Field(default=[], description="what happens on the way")
+    constraints: Annotated[list[ConstraintSpec], MaxLen(MOST_ENTRIES)] = Field(
         default=[], description="what the flight is audited against; signals and their units are those of the audit"
     )
 

@@ -46,10 +46,10 @@ class OutliersSpec(Spec):
 
 
 class _SensorSpec(Spec):
-    rate: Annotated[float, Field(ge=0.01, le=1e6)] = Field(
+    rate: Annotated[float, Field(ge=0.01, le=1e4)] = Field(
         description="[Hz] samples per second, the first at t = 0; a divisor of the physics rate"
     )
-    delay: NonNegative = Field(
+    delay: Annotated[float, Field(ge=0.0, le=10.0)] = Field(
         default=0.0, description="[s] from taking a sample to its arrival, a whole number of physics steps"
     )
     dropout: Fraction = Field(default=0.0, description="[-] probability of a sample being lost")

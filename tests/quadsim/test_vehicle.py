@@ -238,3 +238,17 @@ def test_a_file_that_cannot_be_read_is_named(tmp_path: Path) -> None:
 def test_a_layout_that_would_turn_in_hover_is_refused(vehicle: Vehicle, changes: dict[str, tuple[float, ...]]) -> None:
     with pytest.raises(ParameterError, match="whose torques cancel when all rotors turn alike"):
         dataclasses.replace(vehicle, **changes)
+
+
+@pytest.mark.parametrize("text", ["value = " + "[" * 5000, "value = " + "9" * 5000])
+def test_what_python_cannot_read_is_told(tmp_path: Path, text: str) -> None:
+    (tmp_path / "v.toml").write_text(f"[mass]\n{text}\n", encoding="utf-8")
+    with pytest.raises(FileError, match=r"v\.toml: is not valid TOML"):
+        load_vehicle(tmp_path / "v.toml")
+
+
+def test_a_number_of_thousands_of_digits_is_refused(tmp_path: Path) -> None:
+    text = vehicle_path("lopes2011").read_text(encoding="utf-8").replace("value = 4.0", f"value = 0x{'f' * 5000}")
+    (tmp_path / "v.toml").write_text("\ufeff" + text, encoding="utf-8")
+    with pytest.raises(ParameterError, match=r"vehicle\.mass must be a finite number; got inf"):
+        load_vehicle(tmp_path / "v.toml")

@@ -460,7 +460,8 @@ EVENT = '{type="gust", at=0.1, duration=0.2, velocity=[1.0, 0.0, 0.0]}'
 
 def test_an_entry_without_a_name_is_set_by_its_index() -> None:
     both = f"events=[{EVENT}, {EVENT}]"
-    scenario = load_scenario("hover", [both, "events.1.at=3", "events.1.velocity=[0, 2, 0]"])
+    drag = "effects.air.rotor_drag=1e-4"
+    scenario = load_scenario("hover", [drag, both, "events.1.at=3", "events.1.velocity=[0, 2, 0]"])
     assert [event.at for event in scenario.events] == [0.1, 3.0]
     with pytest.raises(UnknownNameError, match=r"^no entry of events named '2' \(there are: 0, 1\)$"):
         load_scenario("hover", [both, "events.2.at=3"])
