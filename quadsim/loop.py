@@ -96,7 +96,8 @@ def fly(
             flown = [(plant.advance(speeds, steps), plant.applied(speeds)) for speeds, steps in holds]
             if navigation is not None:
                 for stretch, speeds in flown:
-                    navigation.advance(stretch.physics, np.broadcast_to(speeds, (len(stretch.physics), N_ROTORS)))
+                    held = np.broadcast_to(speeds, (len(stretch.physics), N_ROTORS))
+                    navigation.advance(stretch.physics, held, standing=phase in (Phase.LANDED, Phase.ARMED))
             samples.append(
                 Sample(
                     command=command,

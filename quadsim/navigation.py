@@ -95,19 +95,20 @@ class Navigation:
         if self._filter is not None:
             self._filter.advance(np.empty((0, len(speeds))), self._arrived(), first=0)
 
-    def advance(self, physics: Array, commands: Array) -> None:
+    def advance(self, physics: Array, commands: Array, *, standing: bool = False) -> None:
         """Take note of a stretch of flight.
 
         Args:
             physics: (M, 14) the true state after each physics step.
             commands: (M, 4) rotor speeds in force during each of these steps [rad/s].
+            standing: whether the feet stood on the ground when the stretch began, as a land detector has it.
         """
         if not len(physics):
             return
         first, self._step, self._physics = self._step, self._step + len(physics), physics[-1].copy()
         self._receive(physics, first + 1)
         if self._filter is not None:
-            self._filter.advance(commands, self._arrived(), first)
+            self._filter.advance(commands, self._arrived(), first, standing=standing)
 
     def state(self) -> Array:
         """(12,) what the controller is told now: paper's order, yaw unwrapped."""

@@ -2,7 +2,8 @@
 
 The filter stands at the fusion horizon, now less the largest delay: every sample taken before has arrived and has been
 used, in the order of the time stamps.  What has arrived since is kept, and each time an estimate is asked for it is
-used on a copy that runs on to now; so a late sample corrects the past it belongs to.
+used on a copy that runs on to now; so a late sample corrects the past it belongs to.  Rotor speeds, and whether the
+vehicle stood, are kept likewise for each step since the horizon.
 """
 
 from __future__ import annotations
@@ -17,8 +18,9 @@ from scipy.special import chdtri
 
 from quadsim.errors import ParameterError
 from quadsim.estimation.estimate import N_ERRORS, Estimate, retract
-from quadsim.estimation.prediction import drive, motion_model, predict
+from quadsim.estimation.prediction import Drive, drive, motion_model, predict
 from quadsim.estimation.settings import EstimatorSettings
+from quadsim.estimation.standing import lifts, stand
 from quadsim.estimation.update import doubt, update
 from quadsim.sensing import AXES, Sample, Sensor, SensorName
 from quadsim.state import Array
@@ -120,7 +122,8 @@ class ErrorStateFilter:
         estimate = Estimate(mean=retract(mean, error), covariance=np.diag(np.square(self._initial())))
         tallies = {name: Tally() for name in self._variances}
         self._track = _Track(step=0, estimate=estimate, tallies=tallies)
-        self._starts, self._speeds, self._drives = [0], [speeds.copy()], [drive(self._model, speeds)]
+        self._starts, self._speeds, self._standing = [0], speeds.copy(), False
+        self._drives: list[Drive | None] = [drive(self._model, speeds)]
         self._waiting: list[Sample] = []
 
     def _initial(self) -> Array:
@@ -133,19 +136,24 @@ class ErrorStateFilter:
         """What became of each sensor's samples, those after the fusion horizon not yet counted."""
         return {name: replace(tally) for name, tally in self._track.tallies.items()}
 
-    def advance(self, commands: Array, samples: Iterable[Sample], first: int) -> None:
+    def advance(self, commands: Array, samples: Iterable[Sample], first: int, *, standing: bool = False) -> None:
         """Take note of a stretch of flight and run the filter on to the fusion horizon.
 
         Args:
             commands: (M, 4) rotor speeds in force during each physics step [rad/s].
             samples: what has arrived meanwhile, in any order.
             first: number of the first of these physics steps.
+            standing: whether a land detector has seen the vehicle on the ground when the stretch began; it has left
+                the ground once the believed thrust exceeds its weight.
         """
-        changed = np.flatnonzero(np.any(commands != np.vstack([self._speeds[-1], commands[:-1]]), axis=1))
-        for i in changed.tolist():
+        changed = np.any(commands != np.vstack([self._speeds, commands[:-1]]), axis=1)
+        changed[:1] |= standing is not self._standing
+        for i in np.flatnonzero(changed).tolist():
+            driven = drive(self._model, commands[i])
             self._starts.append(first + i)
-            self._speeds.append(commands[i].copy())
-            self._drives.append(drive(self._model, commands[i]))
+            self._drives.append(None if standing and not lifts(self._model, driven) else driven)
+        if len(commands):
+            self._speeds, self._standing = commands[-1].copy(), standing
         horizon = first + len(commands) - self._horizon
         for sample in samples:
             if np.abs(sample.value).max() < _LARGEST:  # as NaN is not
@@ -157,7 +165,7 @@ class ErrorStateFilter:
         self._run(self._track, self._waiting[:ripe])
         del self._waiting[:ripe]
         kept = bisect.bisect_right(self._starts, self._track.step) - 1
-        del self._starts[:kept], self._speeds[:kept], self._drives[:kept]
+        del self._starts[:kept], self._drives[:kept]
 
     def estimate(self, step: int) -> Estimate:
         """What is believed at a physics step, no earlier than the last one told of."""
@@ -175,7 +183,11 @@ class ErrorStateFilter:
         while track.step < step:
             i = bisect.bisect_right(self._starts, track.step) - 1
             until = min(step, track.step + self._stride, *self._starts[i + 1 : i + 2])
-            after = predict(self._model, track.estimate, self._drives[i], (until - track.step) * self._timestep)
+            driven, duration = self._drives[i], (until - track.step) * self._timestep
+            if driven is None:
+                after = stand(self._model, track.estimate, duration)
+            else:
+                after = predict(self._model, track.estimate, driven, duration)
             if not _plausible(after):
                 # Nothing is known any more: stay where it was, as unsure as at the start, and let the sensors speak.
                 after = Estimate(mean=track.estimate.mean, covariance=np.diag(np.square(self._initial())))
@@ -183,8 +195,9 @@ class ErrorStateFilter:
 
     def _use(self, track: _Track, sample: Sample) -> None:
         name, tally = sample.sensor, track.tallies[sample.sensor]
-        if sample.taken - track.refused.get(name, sample.taken) >= self._patience > 0.0:
-            track.estimate = doubt(track.estimate, name, sample.value)
+        refused = sample.taken - track.refused.get(name, sample.taken)
+        if refused >= self._patience > 0.0:
+            track.estimate = doubt(track.estimate, name, sample.value, refused * self._timestep)
         after, distance = update(track.estimate, name, sample.value, self._variances[name], self._gate)
         if after is track.estimate:
             tally.rejected += 1

@@ -37,6 +37,13 @@ _BLOCKS: Final = {
     SensorName.RATES: (RATES, GYRO_BIAS),
 }
 """The parts of the error whose sum a sensor sees."""
+_LEADS: Final = {
+    SensorName.POSITION: (VELOCITY,),
+    SensorName.VELOCITY: (),
+    SensorName.ATTITUDE: (RATES, GYRO_BIAS),
+    SensorName.RATES: (),
+}
+"""The parts whose errors add up in it over time; the gyro's bias does by way of the rates, which follow the gyro."""
 
 
 def _observation(name: SensorName) -> Array:
@@ -87,15 +94,24 @@ def update(estimate: Estimate, name: SensorName, value: Array, variance: Array, 
     return Estimate(mean=retract(estimate.mean, gain @ residual), covariance=0.5 * (P + P.T)), distance
 
 
-def doubt(estimate: Estimate, name: SensorName, value: Array) -> Estimate:
+def doubt(estimate: Estimate, name: SensorName, value: Array, refused: float) -> Estimate:
     """The estimate with its variance widened by as much as a sample disagrees with it, so that the sample passes.
 
-    For the way back after divergence: the innovation squared is added to the variance of all that the sensor sees.
+    For the way back after divergence: the innovation squared is added to the variance of all that the sensor sees, and
+    (innovation / time)^2 to that of the rates of change which may have led it astray in the meantime.
+
+    Args:
+        estimate: what is believed.
+        name: which sensor.
+        value: (3,) its sample.
+        refused: for how long all its samples have been refused [s].
     """
     covariance = estimate.covariance.copy()
-    squares = np.square(innovation(name, estimate.mean, value))
+    squares = np.diag(np.square(innovation(name, estimate.mean, value)))
     for block in _BLOCKS[name]:
-        covariance[block, block] += np.diag(squares)
+        covariance[block, block] += squares
+    for block in _LEADS[name]:
+        covariance[block, block] += squares / refused**2
     return Estimate(mean=estimate.mean, covariance=covariance)
 
 

@@ -15,6 +15,7 @@ from make_scenarios import HEAD, PAGE, TITLES, nearest, row
 
 from quadsim.controller import ACCEPTED, MISSED
 from quadsim.flightlog import FLIGHT_FILE, PLANT_FILE, FlightLog, PlantLog, write_log
+from quadsim.state import INDEX
 from scenarios import runner
 from scenarios.courses.table import read_table
 from scenarios.loading import LIBRARY, load_scenario, parse_scenario, scenario_names
@@ -124,6 +125,15 @@ def lands_gently(flight: Flight) -> None:
     assert flight.log.plant.speeds[-1].max() == 0.0
 
 
+def lands_by_estimate(flight: Flight) -> None:
+    ground, log = runner.summarise(flight)["ground"], flight.log.control
+    assert ground["phase"] == "landed"
+    assert 0.0 < ground["touchdown"]["speed"] < 0.5
+    assert ground["touchdown"]["tilt"] < 2.0
+    assert np.abs(log.state - log.truth)[log.t >= 1.0, INDEX["vz"]].max() < 0.3
+    assert runner.summarise(flight)["estimation"]["samples"]["position"]["rejected"] < 20
+
+
 def lands_hard(flight: Flight) -> None:
     ground = runner.summarise(flight)["ground"]
     assert ground["touchdown"]["speed"] == pytest.approx(1.9, abs=0.05)
@@ -178,6 +188,7 @@ SHOWN: dict[str, Callable[[Flight], None]] = {
     "late-commands": jitter_misses_one_in_twenty,
     "take-off-and-landing": lands_gently,
     "hard-landing": lands_hard,
+    "landing-by-estimate": lands_by_estimate,
     "ground-effect": ground_lifts,
     "motion-capture": capture_is_within_four_millimetres,
     "outliers": capture_is_within_four_millimetres,

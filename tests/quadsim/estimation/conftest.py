@@ -83,9 +83,10 @@ def run(
     seed: int,
     believed: tuple[Sensor, ...] | None = None,
     chunk: int = 50,
+    standing: range = range(0),
     **faults: Any,
 ) -> tuple[ErrorStateFilter, Array, Array, list[float]]:
-    """One seed through sensors and filter.
+    """One seed through sensors and filter, which is told that the vehicle stands in chunks that begin in `standing`.
 
     Returns:
         The filter, its errors (K, 15) against the truth after each `chunk` steps, gyro bias included, its standard
@@ -107,7 +108,8 @@ def run(
         stop = first + chunk
         rows = motion.physics[seed, first + 1 : stop + 1]
         in_flight += [sample for sampler in samplers for sample in sampler.sample(rows, first + 1)]
-        filter_.advance(motion.commands[first:stop], [s for s in in_flight if s.arrival <= stop], first)
+        arrived = [s for s in in_flight if s.arrival <= stop]
+        filter_.advance(motion.commands[first:stop], arrived, first, standing=first in standing)
         in_flight = [s for s in in_flight if s.arrival > stop]
         estimate = filter_.estimate(stop)
         true = motion.bias_free_mean(seed, stop)

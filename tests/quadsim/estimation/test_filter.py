@@ -166,6 +166,36 @@ def test_a_sensor_refused_for_long_is_believed_again(gentle: Any, run_filter: SI
         assert tally.rejected == (20 if believed else 51)
 
 
+def test_a_velocity_far_off_is_found_again(gentle: Any, run_filter: SIMULATE) -> None:
+    """A collision at 1 s that no model knows of; from positions alone, once they have been refused for 0.5 s."""
+    physics = gentle.physics.copy()
+    after = np.arange(2000)[:, None] * 1e-3
+    physics[:, 1001:, 8:11] += [5.0, 0.0, -7.0]
+    physics[:, 1001:, 1:4] += after * [5.0, 0.0, -7.0]
+    settings = replace(SETTINGS, patience=0.5)
+    sensors = (POSITION, ATTITUDE, RATES)
+    filter_, errors, deviations, _ = run_filter(replace(gentle, physics=physics), sensors, settings, seed=0)
+    assert np.abs(errors[28, 3:6]).max() > 4.0  # at 1.45 s, still unbelieved
+    assert np.all(np.abs(errors[42:, :6]) < 5.0 * deviations[42:, :6])  # from 2.15 s on
+    assert np.abs(errors[-1, 3:6]).max() < 0.3
+    assert filter_.tallies[SensorName.POSITION].rejected <= 11
+
+
+def test_a_gyro_that_comes_to_be_far_off_is_found_out(gentle: Any, run_filter: SIMULATE) -> None:
+    """20 times the bias reckoned with: it is the attitude that is refused, as the rates follow the gyro."""
+    shifted = SensorFault(
+        sensor=SensorName.RATES, kind=FaultKind.BIAS, start=0.0, offset=tuple(np.radians([10.0, -10.0, 10.0]))
+    )
+    stubborn, patient = (
+        run_filter(gentle, SENSORS, replace(SETTINGS, patience=patience), seed=1, faults=(shifted,))
+        for patience in (0.0, 0.5)
+    )
+    assert np.degrees(np.abs(stubborn[1][-1, 6:9])).max() > 10.0
+    assert np.degrees(np.abs(patient[1][-20:, 6:9])).max() < 2.0
+    found = patient[1][-1, 12:15] + shifted.offset  # what is left of the bias and the fault's together
+    assert np.degrees(np.abs(found)).max() < 0.5
+
+
 def test_it_never_fails_nor_answers_with_nan(vehicle: Vehicle) -> None:
     """Samples of any size, and a vehicle driven into a spin that no rotor could give it."""
     rng = np.random.default_rng(0)

@@ -75,10 +75,32 @@ def test_a_sample_outside_the_gate_changes_nothing(estimate: Estimate) -> None:
 @pytest.mark.parametrize("name", list(SensorName))
 def test_doubt_lets_any_sample_pass_and_keeps_the_mean(name: SensorName, estimate: Estimate) -> None:
     far = np.array([0.4, 0.3, -2.0]) if name is SensorName.ATTITUDE else np.array([500.0, -300.0, 200.0])
-    widened = doubt(estimate, name, far)
+    widened = doubt(estimate, name, far, 2.0)
     assert np.array_equal(widened.mean, estimate.mean)
     assert np.linalg.eigvalsh(widened.covariance).min() > -1e-9
     after, distance = update(widened, name, far, R, 3.0)
     assert distance < 3.0
     left = innovation(name, after.mean, far)
     assert np.linalg.norm(left) < 0.1 * np.linalg.norm(innovation(name, estimate.mean, far)) + 0.1
+
+
+@pytest.mark.parametrize(
+    ("name", "seen", "leading"),
+    [
+        (SensorName.POSITION, [0], [3]),
+        (SensorName.VELOCITY, [3], []),
+        (SensorName.ATTITUDE, [6], [9, 12]),
+        (SensorName.RATES, [9, 12], []),
+    ],
+)
+def test_doubt_is_of_what_led_astray_too(
+    name: SensorName, seen: list[int], leading: list[int], estimate: Estimate
+) -> None:
+    """The variance of a rate of change grows by the square of the innovation over the time it took to come about."""
+    far = np.array([0.4, 0.3, -2.0])
+    squares = np.square(innovation(name, estimate.mean, far))
+    expected = np.zeros(15)
+    for start, share in [*((i, 1.0) for i in seen), *((i, 0.25) for i in leading)]:
+        expected[start : start + 3] = share * squares
+    added = doubt(estimate, name, far, 2.0).covariance - estimate.covariance
+    np.testing.assert_allclose(added, np.diag(expected), atol=1e-12)
