@@ -18,6 +18,7 @@ from scenarios.cli import EXIT_DONE
 from scenarios.commands.common import load
 from scenarios.loading import load_scenario, scenario_names
 from scenarios.spec import Group, Scenario
+from scenarios.spec.course import CsvSpec
 
 _MEANT: Final = {"violated": "  (meant to violate a constraint)", "lost": "  (meant to be lost)"}
 """What `quadsim list` says of a scenario that is to defeat its controller."""
@@ -55,7 +56,10 @@ def scenario(options: Namespace) -> int:
             f"scenario needs a name or a TOML file, or --schema (there are: {', '.join(scenario_names())})"
         )
     loaded = load(options.scenario, options)
-    print(resolve(loaded, build_vehicle(loaded)).to_toml(), end="")
+    resolved = resolve(loaded, build_vehicle(loaded))
+    if isinstance(resolved.reference, CsvSpec):  # a start for one's own may have a table of its own
+        resolved = resolved.model_copy(update={"reference": resolved.reference.model_copy(update={"sha256": None})})
+    print(resolved.to_toml(), end="")
     return EXIT_DONE
 
 

@@ -601,3 +601,10 @@ def test_a_solver_that_is_not_installed_is_named_with_its_remedy(
     assert json.loads(capsys.readouterr().out)["solvers"][name] == f"not installed: pip install 'quadsim[{extra}]'"
     assert main(["list"]) == 0
     assert f"quadsim[{extra}]" in capsys.readouterr().out
+
+
+def test_a_printed_scenario_is_not_bound_to_its_table(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["scenario", "csv-trefoil"]) == EXIT_DONE
+    printed = tomllib.loads(capsys.readouterr().out)
+    assert "sha256" not in printed["reference"]
+    assert Path(printed["reference"]["file"]).name == "csv-trefoil.csv"
