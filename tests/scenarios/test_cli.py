@@ -11,6 +11,7 @@ import signal
 import subprocess
 import sys
 import time as clock
+import tomllib
 from collections.abc import Callable
 from pathlib import Path
 from xml.etree import ElementTree
