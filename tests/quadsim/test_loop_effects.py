@@ -148,9 +148,9 @@ def test_the_estimator_is_told_what_rotors_can_do_of_the_command(vehicle: Vehicl
     told: list[Array] = []
 
     class Witness(Navigation):
-        def advance(self, physics: Array, commands: Array) -> None:
+        def advance(self, physics: Array, commands: Array, *, standing: bool = False) -> None:
             told.append(commands[0].copy())
-            super().advance(physics, commands)
+            super().advance(physics, commands, standing=standing)
 
     navigation = Witness(vehicle, timestep=1e-3, sensors=[], rng=np.random.default_rng(0))
     with Plant(vehicle, limit_speeds=True) as plant:
