@@ -1,0 +1,73 @@
+"""What actuators can take: rotor speeds and their steps, as the one place where a command is put within bounds."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from quadsim.errors import ParameterError
+from quadsim.state import Array
+from quadsim.vehicle import N_ROTORS
+
+BOUND_TOLERANCE: Final = 1e-6
+"""How far outside its bounds [rad/s] an answer may be and still count as in bounds; it is then moved onto them."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ActuatorBounds:
+    """Hard bounds on rotor speeds, Eq. (20), and on their steps from one period to the next, Eq. (15).
+
+    Attributes:
+        u_min, u_max: (4,) speeds [rad/s], finite.
+        delta_min, delta_max: (4,) steps u(k) - u(k-1) [rad/s]; infinite where there is no bound.
+
+    Raises:
+        ParameterError: bounds that are not four numbers each, are not in order, or that forbid holding a speed.
+    """
+
+    u_min: Array
+    u_max: Array
+    delta_min: Array
+    delta_max: Array
+
+    def __post_init__(self) -> None:
+        for name in ("u_min", "u_max", "delta_min", "delta_max"):
+            bound = np.asarray(getattr(self, name), float)
+            if bound.shape != (N_ROTORS,) or np.isnan(bound).any():
+                raise ParameterError("controller", name, getattr(self, name), f"{N_ROTORS} numbers")
+            object.__setattr__(self, name, bound)
+        if not (np.isfinite(self.u_min).all() and np.isfinite(self.u_max).all() and np.all(self.u_min < self.u_max)):
+            raise ParameterError("controller", "u_min", self.u_min, f"finite and below a finite u_max = {self.u_max}")
+        if not np.all((self.delta_min <= 0.0) & (self.delta_max >= 0.0)):
+            rule = f"<= 0 and delta_max = {self.delta_max} >= 0, so that a speed can be held"
+            raise ParameterError("controller", "delta_min", self.delta_min, rule)
+
+    def reach(self, before: Array) -> tuple[Array, Array]:
+        """The lowest and highest speeds (4,) [rad/s] after a command `before` (4,).
+
+        A command outside the speed bounds, as of rotors that stand still, leaves no speed within both; then those on
+        the speeds hold, and those on the steps do not.
+        """
+        lower = np.minimum(np.maximum(before + self.delta_min, self.u_min), self.u_max)
+        upper = np.minimum(np.maximum(before + self.delta_max, self.u_min), self.u_max)
+        return lower, upper
+
+    def clip(self, speeds: Array, before: Array) -> Array:
+        """The speeds (4,) in reach of `before` that are nearest to `speeds` [rad/s]."""
+        lower, upper = self.reach(before)
+        return np.minimum(np.maximum(speeds, lower), upper)
+
+    def clip_plan(self, plan: Array, before: Array) -> Array:
+        """A plan (N, 4) with each row in reach of the one before it, the first of `before`.
+
+        Steps that are so but for rounding stay as they are.
+        """
+        steps = np.diff(plan, axis=0, prepend=before[None])
+        if np.maximum(self.delta_min - steps, steps - self.delta_max).max() <= BOUND_TOLERANCE:
+            return np.minimum(np.maximum(plan, self.u_min), self.u_max)
+        clipped = np.empty_like(plan)
+        for i, speeds in enumerate(plan):
+            clipped[i] = before = self.clip(speeds, before)
+        return clipped

@@ -1,0 +1,281 @@
+"""The fallback contract: what is flown when a controller has no good answer.
+
+Each period, the first of these that can be had:
+
+0. the inner controller's answer, if its status is one of `ACCEPTED` and it is finite and within the actuators' bounds;
+1. its last good plan, shifted by the periods since, with an LQR correction towards the states that the plan foresees,
+   while it is not too old and the vehicle not too far from it;
+2. level hover by LQR: velocity to zero, then the place held; height and yaw held from the start;
+3. descent: the same, sinking at a steady speed, once level 2 has lasted too long.
+
+The inner controller is asked again in every period in which the state is known, so that recovery is automatic.  It is
+told the command in force each time, so that its own bounds on steps refer to what acts, whoever commanded it.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from dataclasses import dataclass, fields, replace
+from typing import Final
+
+import numpy as np
+
+from mpc.actuators import BOUND_TOLERANCE, ActuatorBounds
+from mpc.hover import HoverLaw
+from mpc.model import LinearModel
+from mpc.prediction import rollout
+from mpc.reckoning import PLAUSIBLE, DeadReckoning
+from quadsim.controller import ACCEPTED, GROUNDED, Command, Controller, Moment, Phase, check_command, stopped
+from quadsim.errors import FlightError, ParameterError
+from quadsim.state import EULER, EULER_RATE, INDEX, N_STATES, POSITION, REFERENCE_STATES, VELOCITY, Array
+from quadsim.vehicle import N_ROTORS
+
+FAILURES: Final[tuple[type[Exception], ...]] = (FlightError, np.linalg.LinAlgError, ArithmeticError, RuntimeError)
+"""What numerics and compiled back ends raise.  A programmer's mistakes (`TypeError`, `KeyError`, ...) end the run."""
+_MISTAKES: Final = (NotImplementedError, RecursionError)
+"""Kinds of `RuntimeError` that are a programmer's, too."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class FallbackSettings:
+    """When the next level takes over; validated when made.
+
+    Attributes:
+        unseen: longest time that predictions stand in for a missing measurement before level 2 [s].
+        plan_age: longest time on one shifted plan [s]; its horizon, where that is shorter.
+        position, velocity, angle, rate: largest distance from that plan in any channel [m], [m/s], [rad], [rad/s].
+        hover: longest time on level 2 before the descent [s].
+        sink: speed of the descent [m/s].
+        tilt: largest tilt that levels 1 to 3 ask for [rad]; beside the plan's own on level 1.
+        settled: horizontal speed above which level 2 brakes without a place to go back to [m/s].
+    """
+
+    unseen: float = 1.5
+    plan_age: float = 1.0
+    position: float = 0.5
+    velocity: float = 1.0
+    angle: float = 0.2
+    rate: float = 1.0
+    hover: float = 5.0
+    sink: float = 0.5
+    tilt: float = math.radians(10.0)
+    settled: float = 0.3
+
+    def __post_init__(self) -> None:
+        for item in fields(self):
+            value = getattr(self, item.name)
+            if not 0.0 < value < math.inf:
+                raise ParameterError("controller", f"fallback.{item.name}", value, "positive and finite")
+
+    @property
+    def distance(self) -> Array:
+        """(12,) largest distance from a plan's states."""
+        distance = np.empty(N_STATES)
+        for rows, size in (
+            (POSITION, self.position),
+            (VELOCITY, self.velocity),
+            (EULER, self.angle),
+            (EULER_RATE, self.rate),
+        ):
+            distance[list(rows)] = size
+        return distance
+
+
+_USUAL: Final = FallbackSettings()
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Good:
+    """The last accepted answer, and the state (12,) it was found for."""
+
+    state: Array
+    plan: Array
+
+
+class Guarded:
+    """A controller that keeps the fallback contract, whatever the one inside it does.
+
+    A command that is not finite or not within the bounds cannot leave it.  While all is well, the inner controller's
+    commands pass unchanged.
+
+    Attributes:
+        inner: the controller asked first.
+        law: what levels 1 to 3 are made of.
+
+    Args:
+        inner: reached through the protocol alone; one that falls back by itself does no harm, as only its accepted
+            answers are used.
+        model: the hover model of the control period; see `mpc.model.hover_model`.
+        bounds: hard bounds that every command keeps.
+        settings: when the next level takes over.
+        failures: exceptions of the inner controller that count as a failed period; their names become its status.
+
+    Raises:
+        ParameterError: the model is not a quadrotor's.
+    """
+
+    def __init__(
+        self,
+        inner: Controller,
+        model: LinearModel,
+        *,
+        bounds: ActuatorBounds,
+        settings: FallbackSettings = _USUAL,
+        failures: tuple[type[Exception], ...] = FAILURES,
+    ) -> None:
+        self.inner = inner
+        self.law = HoverLaw(model, tilt=settings.tilt)
+        self._model, self._bounds, self._settings, self._failures = model, bounds, settings, failures
+        self._distance = settings.distance
+        self._reckoning = DeadReckoning(model)
+        self._good: _Good | None
+        self._foreseen: Array | None
+        self._target: Array | None
+        self.reset(model.u_bar)
+
+    @property
+    def name(self) -> str:
+        """Name of the law inside."""
+        return self.inner.name
+
+    @property
+    def solver(self) -> str:
+        """Name of the QP solver."""
+        return self.inner.solver
+
+    @property
+    def horizon(self) -> int:
+        """N, samples of preview."""
+        return self.inner.horizon
+
+    def reset(self, speeds: Array) -> None:
+        """Start anew after the command u(-1) (4,) [rad/s]."""
+        usable = check_command(speeds) is None
+        self._before = np.array(speeds, float) if usable else self._model.u_bar.copy()
+        self._reckoning.reset()
+        self._forget()
+        self.inner.reset(self._before.copy())
+
+    def step(self, now: Moment, state: Array, reference: Array) -> Command:
+        """The first level's command that can be had; see `quadsim.controller.Controller.step`.
+
+        Whatever becomes of the inner controller, this raises none of its `failures`.  While grounded, rotors are taken
+        to their lowest speed as fast as the bounds allow.
+        """
+        acting = self._before if now.acting is None or check_command(now.acting) is not None else now.acting
+        known = self._reckoning.complete(state, acting, free=now.phase is Phase.FLYING)
+        status, answer = self._ask(replace(now, acting=acting.copy()), known, reference)
+        if now.phase in GROUNDED:
+            self._forget()
+            command = stopped(self._bounds.reach(acting)[0], self.horizon, now.phase)
+        elif answer is None or status not in ACCEPTED:
+            command = self._fall_back(status, answer, known, acting)
+        else:
+            self._forget()
+            command = self._accept(answer, acting)
+            self._good = _Good(state=known, plan=command.plan)
+        self._before = command.speeds.copy()
+        return command
+
+    def predict(self, states: Array, plans: Array) -> Array:
+        """See `quadsim.controller.Controller.predict`; by the hover model where the inner controller cannot."""
+        try:
+            predicted = self.inner.predict(states, plans)
+        except self._failures as error:
+            _raise_mistake(error)
+        else:
+            if np.shape(predicted) == (*plans.shape[:2], N_STATES):
+                return predicted
+        return rollout(self._model, states, plans)
+
+    def _forget(self) -> None:
+        """Leave every fallback level."""
+        self._good, self._foreseen, self._age = None, None, 0
+        self._target, self._hovered = None, 0
+
+    def _ask(self, now: Moment, known: Array, reference: Array) -> tuple[str, Command | None]:
+        """The inner controller's answer where one was given, and its status: an accepted one is good to fly."""
+        assert now.acting is not None
+        if self._model.period * float(self._reckoning.unseen.max()) > self._settings.unseen:
+            return "state_unknown", None
+        shape = (self.horizon, len(REFERENCE_STATES))
+        if np.shape(reference) != shape or not (np.abs(reference) <= PLAUSIBLE[list(REFERENCE_STATES)]).all():
+            return "invalid_reference", None
+        try:
+            answer = self.inner.step(now, known.copy(), reference)
+        except self._failures as error:
+            _raise_mistake(error)
+            return _snake_case(type(error).__name__), None
+        if answer.status not in ACCEPTED:
+            return answer.status, answer
+        return self._rejection(answer, now.acting) or answer.status, answer
+
+    def _rejection(self, answer: Command, acting: Array) -> str | None:
+        """Why an answer that claims to be good is not, or None."""
+        if np.shape(answer.speeds) != (N_ROTORS,) or np.shape(answer.plan) != (self.horizon, N_ROTORS):
+            return "wrong_shape"
+        if not (np.isfinite(answer.speeds).all() and np.isfinite(answer.plan).all()):
+            return "not_finite"
+        lower, upper = self._bounds.reach(acting)
+        if np.maximum(lower - answer.speeds, answer.speeds - upper).max() > BOUND_TOLERANCE:
+            return "out_of_bounds"
+        return None
+
+    def _accept(self, answer: Command, acting: Array) -> Command:
+        """A good answer, moved onto its bounds; so is what it plans for later, which may act unasked."""
+        speeds = self._bounds.clip(answer.speeds, acting)
+        later = self._bounds.clip_plan(answer.plan[1:], speeds) if self.horizon > 1 else answer.plan[1:]
+        return replace(answer, speeds=speeds, plan=np.concatenate([speeds[None], later]), fallback=0)
+
+    def _fall_back(self, status: str, answer: Command | None, known: Array, acting: Array) -> Command:
+        self._age += 1
+        plan, level = self._shifted(known, acting, lost=status == "state_unknown"), 1
+        if plan is None:
+            plan, level = self._hover(known, acting)
+        spent = answer or Command(speeds=plan[0], plan=plan)
+        return replace(spent, speeds=plan[0].copy(), plan=plan, status=status, active=0, slack=0.0, fallback=level)
+
+    def _shifted(self, known: Array, acting: Array, *, lost: bool) -> Array | None:
+        """What is left of the last good plan (N, 4), corrected now; None once it is of no use, and then for good."""
+        good, age = self._good, self._age
+        if good is None:
+            return None
+        if self._foreseen is None:
+            self._foreseen = self.predict(good.state[None], good.plan[None])[0]
+        deviation = known - self._foreseen[min(age, self.horizon) - 1]  # row i is of the state i + 1 periods later
+        old = age >= self.horizon or age * self._model.period > self._settings.plan_age + 1e-9
+        if lost or old or not (np.abs(deviation) <= self._distance).all():
+            self._good = None
+            return None
+        plan = np.concatenate([good.plan[age:], np.repeat(good.plan[-1:], age, axis=0)])
+        plan[0] += self.law.correction(deviation, float(known[INDEX["yaw"]]))
+        return self._bounds.clip_plan(plan, acting)
+
+    def _hover(self, known: Array, acting: Array) -> tuple[Array, int]:
+        """The plan (N, 4) of level hover or descent, and its level."""
+        settings, period = self._settings, self._model.period
+        if self._target is None:
+            self._target = np.zeros(N_STATES)
+            for name in ("x", "y", "z", "yaw"):
+                self._target[INDEX[name]] = known[INDEX[name]]
+        x, y, z = POSITION
+        if math.hypot(known[INDEX["vx"]], known[INDEX["vy"]]) > settings.settled:
+            self._target[[x, y]] = known[[x, y]]
+        sinking = self._hovered * period >= settings.hover - 1e-9
+        if sinking:
+            self._target[INDEX["vz"]] = -settings.sink
+            self._target[z] -= settings.sink * period
+        self._hovered += 1
+        return self.law.plan(known, self._target, acting, self._bounds, self.horizon), 3 if sinking else 2
+
+
+def _raise_mistake(error: Exception) -> None:
+    """Let a programmer's mistake through."""
+    if isinstance(error, _MISTAKES):
+        raise error
+
+
+def _snake_case(name: str) -> str:
+    """`PlanExhaustedError` as `plan_exhausted_error`."""
+    return re.sub(r"(?<=[a-z])(?=[A-Z])", "_", name).lower()

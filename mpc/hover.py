@@ -1,0 +1,152 @@
+"""Level hover by LQR: what a vehicle falls back on, and what brings it back onto a plan.
+
+The gain is that of the infinite horizon on the hover model, in the frame turned by the heading: there the model at zero
+yaw holds for any yaw.  Weights are those of Bryson's rule (Bryson and Ho, "Applied Optimal Control", 1975, Sec. 5.2),
+one over the square of the largest acceptable value, on states and on the *accelerations* that inputs make, not on rotor
+speeds: the closed loop is then the same for every vehicle.
+
+    acceleration = -K (xi - xi_target)    u = u_feedforward + S^-1 acceleration
+
+S takes rotor speeds to accelerations along z and about x, y, z.  K acts on horizontal errors through the tilt that it
+asks for, tilt* = -(k_p e_p + k_v e_v) / k_tilt, which is bounded here: exactly the LQR within the bound, and no more
+tilt than that beyond.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Final
+
+import numpy as np
+import scipy.linalg
+
+from mpc.actuators import ActuatorBounds
+from mpc.model import LinearModel
+from quadsim.errors import ParameterError
+from quadsim.state import EULER, EULER_RATE, INDEX, N_STATES, POSITION, VELOCITY, Array, read_only
+from quadsim.vehicle import N_ROTORS
+
+ACCEPTABLE_POSITION: Final = 0.5
+"""[m]"""
+ACCEPTABLE_VELOCITY: Final = 1.0
+"""[m/s]"""
+ACCEPTABLE_TILT: Final = 0.2
+"""[rad], yaw as well."""
+ACCEPTABLE_RATE: Final = 1.0
+"""[rad/s]"""
+ACCEPTABLE_ACCELERATION: Final = (2.0, 8.0, 8.0, 2.0)
+"""Along z [m/s^2], about x, y and z [rad/s^2]."""
+LARGEST_CLIMB: Final = 2.0
+"""Acceleration along z [m/s^2] beyond which height does not pull: rotors keep the range that levels the vehicle."""
+LARGEST_TURN: Final = 2.0
+"""The same of yaw [rad/s^2]."""
+
+_ACCELERATED: Final = [INDEX[name] for name in ("vz", "roll_rate", "pitch_rate", "yaw_rate")]
+_SIDEWAYS: Final = [INDEX[name] for name in ("x", "vx", "y", "vy")]
+_TILTS: Final = [INDEX["roll"], INDEX["pitch"]]
+_ROLL_PITCH: Final = [1, 2]
+"""Rows of an acceleration (4,)."""
+
+
+def require_quadrotor(model: LinearModel) -> None:
+    """Refuse a model of anything but the twelve states and four rotors.
+
+    Raises:
+        ParameterError: it has other states or inputs.
+    """
+    if (model.n, model.nu) != (N_STATES, N_ROTORS):
+        rule = f"one of {N_STATES} states and {N_ROTORS} inputs"
+        raise ParameterError("controller", "model", f"{model.n} states and {model.nu} inputs", rule)
+
+
+def turn(yaw: float) -> Array:
+    """(12, 12) matrix T that turns positions and velocities by a yaw [rad]: from the heading frame to the world's."""
+    T = np.eye(N_STATES)
+    cosine, sine = math.cos(yaw), math.sin(yaw)
+    for x, y in ((INDEX["x"], INDEX["y"]), (INDEX["vx"], INDEX["vy"])):
+        T[x, x] = T[y, y] = cosine
+        T[x, y], T[y, x] = -sine, sine
+    return T
+
+
+def advance(model: LinearModel, state: Array, speeds: Array) -> Array:
+    """The state (12,) a period later, by the hover model T A T' xi + T B (u - u_bar) in the heading frame."""
+    T = turn(float(state[INDEX["yaw"]]))
+    return T @ (model.A @ (T.T @ state) + model.B @ (speeds - model.u_bar))
+
+
+class HoverLaw:
+    """The LQR of hover, set up once.
+
+    Attributes:
+        model: the hover model.
+        gain: (4, 12) K, from errors in the heading frame to accelerations.
+        slope: (4, 4) S, accelerations per rotor speed [(m/s^2)/(rad/s)], [1/s].
+        tilt: largest roll and pitch asked for together [rad].
+
+    Args:
+        model: see `mpc.model.hover_model`.
+        tilt: [rad].
+
+    Raises:
+        ParameterError: the model is not a quadrotor's, or the tilt is not between 0 and 90 deg.
+    """
+
+    def __init__(self, model: LinearModel, *, tilt: float) -> None:
+        require_quadrotor(model)
+        if not 0.0 < tilt < 0.5 * math.pi:
+            raise ParameterError("controller", "tilt", tilt, "between 0 and pi/2 rad")
+        self.model, self.tilt = model, tilt
+        # Rates and vz integrate accelerations alone, so that their rows of B are the period times the slope.
+        self.slope = read_only(model.B[_ACCELERATED] / model.period)
+        self._inverse = np.linalg.inv(self.slope)
+        acceptable = np.empty(N_STATES)
+        for group, size in (
+            (POSITION, ACCEPTABLE_POSITION),
+            (VELOCITY, ACCEPTABLE_VELOCITY),
+            (EULER, ACCEPTABLE_TILT),
+            (EULER_RATE, ACCEPTABLE_RATE),
+        ):
+            acceptable[list(group)] = size
+        pushed = model.B @ self._inverse  # xi(k+1) = A xi(k) + pushed acceleration
+        Q, R = np.diag(acceptable**-2.0), np.diag(np.array(ACCEPTABLE_ACCELERATION) ** -2.0)
+        P = scipy.linalg.solve_discrete_are(model.A, pushed, Q, R)
+        self.gain = read_only(np.linalg.solve(R + pushed.T @ P @ pushed, pushed.T @ P @ model.A))
+        rows = self.gain[_ROLL_PITCH]
+        self._lean = np.linalg.solve(rows[:, _TILTS], rows[:, _SIDEWAYS])
+
+    def correction(self, error: Array, yaw: float) -> Array:
+        """What to add to the rotor speeds (4,) [rad/s].
+
+        Args:
+            error: (12,) measured minus wanted state.
+            yaw: measured [rad].
+        """
+        error = turn(yaw).T @ error
+        lean = -self._lean @ error[_SIDEWAYS]
+        lean *= min(1.0, self.tilt / max(float(np.hypot(*lean)), self.tilt))
+        error[_SIDEWAYS] = 0.0
+        error[_TILTS] -= lean
+        acceleration = -self.gain @ error
+        acceleration[0] = np.clip(acceleration[0], -LARGEST_CLIMB, LARGEST_CLIMB)
+        acceleration[3] = np.clip(acceleration[3], -LARGEST_TURN, LARGEST_TURN)
+        return self._inverse @ acceleration
+
+    def plan(self, state: Array, target: Array, before: Array, bounds: ActuatorBounds, horizon: int) -> Array:
+        """The speeds (N, 4) [rad/s] of the next periods, as the model foresees them.
+
+        Args:
+            state: (12,) now.
+            target: (12,) wanted now; its velocity moves it on.
+            before: (4,) command in force [rad/s].
+            bounds: that the speeds keep.
+            horizon: N.
+        """
+        plan = np.empty((horizon, N_ROTORS))
+        target = target.copy()
+        for i in range(horizon):
+            wanted = self.model.u_bar + self.correction(state - target, float(state[INDEX["yaw"]]))
+            plan[i] = before = bounds.clip(wanted, before)
+            state = advance(self.model, state, before)
+            target[list(POSITION)] += self.model.period * target[list(VELOCITY)]
+        return plan

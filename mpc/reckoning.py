@@ -1,0 +1,158 @@
+"""Dead reckoning: a whole state from one whose measured channels are partly missing.
+
+A channel that is not finite, beyond all plausibility, or frozen is missing.  Its place takes its conditional mean,
+given the channels that are there: the hover model predicts the state under the command in force, and a Kalman filter
+whose only measurements are the remaining channels corrects it (Simon, "Optimal State Estimation", 2006, Sec. 5.1; the
+process noise is an acceleration, constant over a period and white from one to the next, Bar-Shalom, Li and Kirubarajan,
+"Estimation with Applications to Tracking and Navigation", 2001, Sec. 6.3.2).  Channels that are there are passed on as
+measured, so that nothing changes while all are.
+
+A group of three channels is frozen when it repeats the last period's numbers to the last bit, though the prediction has
+left them.  The numbers of a sensor slower than the controller are so between its samples, and predicted then.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mpc.hover import advance, require_quadrotor, turn
+from mpc.model import LinearModel
+from quadsim.state import (
+    EULER,
+    EULER_RATE,
+    INDEX,
+    N_STATES,
+    POSITION,
+    VELOCITY,
+    Array,
+    euler_to_body_rates,
+    read_only,
+)
+
+Flags = NDArray[np.bool_]
+
+_GROUPS: Final = tuple(np.array(group) for group in (POSITION, VELOCITY, EULER, EULER_RATE))
+_ANGLES, _RATES = _GROUPS[2:]
+_TURNING: Final = np.array(EULER + EULER_RATE)
+
+
+def _by_group(values: tuple[float, float, float, float]) -> Array:
+    """(12,) one value for position, velocity, angles and their rates each."""
+    channels = np.empty(N_STATES)
+    for group, value in zip(_GROUPS, values, strict=True):
+        channels[group] = value
+    return read_only(channels)
+
+
+PLAUSIBLE: Final = _by_group((1e5, 1e3, 1e3, 1e3))
+"""Largest magnitudes taken for a measurement [m, m/s, rad, rad/s]; a yaw counts its turns."""
+UNMOVED: Final = _by_group((1e-3, 5e-3, 1e-3, 2e-2))
+"""Distance of the prediction from numbers repeated to the last bit from which on they are frozen [same]."""
+NOISE: Final = _by_group((0.01, 0.02, 0.005, 0.02))
+"""Standard deviations ascribed to measured channels [same]."""
+ACCELERATION: Final = (1.0, 2.0)
+"""Standard deviations of what the model leaves out [m/s^2, rad/s^2]."""
+UNKNOWN: Final = _by_group((100.0, 10.0, 1.0, 1.0))
+"""Standard deviations before anything was measured [m, m/s, rad, rad/s]."""
+
+
+class DeadReckoning:
+    """Completes one state after the other, one per control period.
+
+    Attributes:
+        unseen: (12,) periods since each channel was last measured; infinite before it ever was.
+
+    Args:
+        model: see `mpc.model.hover_model`.
+
+    Raises:
+        ParameterError: the model is not a quadrotor's.
+    """
+
+    def __init__(self, model: LinearModel) -> None:
+        require_quadrotor(model)
+        self._model = model
+        self._measured_covariance = read_only(np.diag(NOISE**2))
+        self._process = read_only(_process_noise(model.period))
+        self.reset()
+
+    def reset(self) -> None:
+        """Nothing was measured yet: at rest and level at the origin, for all that is known."""
+        self._state = np.zeros(N_STATES)
+        self._covariance: Array = np.diag(UNKNOWN**2)
+        self._last = np.full(N_STATES, np.nan)
+        self._last_body_rates = np.full(3, np.nan)
+        self.unseen = np.full(N_STATES, np.inf)
+
+    def complete(self, measured: Array, acting: Array, *, free: bool = True) -> Array:
+        """The whole state (12,) now.
+
+        Args:
+            measured: (12,) what was measured, in part perhaps not finite; of another shape, nothing was.
+            acting: (4,) rotor speeds in force since the last state [rad/s].
+            free: whether the vehicle flies, so that the model tells how it moves; nothing counts as frozen else.
+        """
+        if np.shape(measured) != (N_STATES,):
+            measured = np.full(N_STATES, np.nan)
+        seen = np.abs(measured) <= PLAUSIBLE  # as NaN is not
+        repeated = self._repeats(measured, seen)
+        if seen.all() and not (free and repeated.any()):
+            return self._take(measured)
+        predicted = advance(self._model, self._state, acting)
+        if free:
+            distant = np.abs(predicted - measured) > UNMOVED
+            for group in _GROUPS:
+                seen[group] &= not (repeated[group].all() and distant[group].any())
+            if seen.all():
+                return self._take(measured)
+        self._correct(predicted, measured, seen)
+        self.unseen = np.where(seen, 0.0, self.unseen + 1.0)
+        return self._state.copy()
+
+    def _take(self, measured: Array) -> Array:
+        self._state = np.array(measured, float)
+        self._covariance = self._measured_covariance
+        self.unseen = np.zeros(N_STATES)
+        return self._state.copy()
+
+    def _repeats(self, measured: Array, seen: Flags) -> Flags:
+        """(12,) which channels have the numbers of the period before.
+
+        Rates are compared as the body's too, which a gyro measures: Euler-angle rates change with the attitude.
+        """
+        repeated = np.asarray(measured == self._last)
+        body_rates = np.full(3, np.nan)
+        if seen[_TURNING].all():
+            body_rates = euler_to_body_rates(measured[_ANGLES], measured[_RATES])
+        if (np.abs(body_rates - self._last_body_rates) <= 1e-12 + 1e-9 * np.abs(body_rates)).all():
+            repeated[_RATES] = True
+        self._last, self._last_body_rates = np.array(measured, float), body_rates
+        return repeated
+
+    def _correct(self, predicted: Array, measured: Array, seen: Flags) -> None:
+        T = turn(float(self._state[INDEX["yaw"]]))
+        A = T @ self._model.A @ T.T
+        P = A @ self._covariance @ A.T + self._process
+        there = np.flatnonzero(seen)
+        innovation = measured[there] - predicted[there]
+        rows = P[there]
+        S = rows[:, there] + self._measured_covariance[np.ix_(there, there)]
+        K = np.linalg.solve(S, rows).T
+        self._state = predicted + K @ innovation
+        self._state[there] = measured[there]
+        np.clip(self._state, -PLAUSIBLE, PLAUSIBLE, out=self._state)
+        P = P - K @ rows
+        self._covariance = 0.5 * (P + P.T)
+
+
+def _process_noise(period: float) -> Array:
+    """(12, 12) g g' sigma^2 with g = [tau^2 / 2, tau] for each of the six pairs of a coordinate and its rate."""
+    Q = np.zeros((N_STATES, N_STATES))
+    gain = np.array([0.5 * period**2, period])
+    for first in range(0, N_STATES, 2):
+        sigma = ACCELERATION[first >= EULER[0]]
+        Q[first : first + 2, first : first + 2] = sigma**2 * np.outer(gain, gain)
+    return Q
