@@ -1,0 +1,1 @@
+"""Feedback laws to compare an MPC with: LQR, cascaded PID, geometric control on SE(3)."""

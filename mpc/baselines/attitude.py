@@ -1,0 +1,100 @@
+"""Attitudes as rotation matrices: what a thrust direction and a heading ask for, and how far away they are."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from quadsim.state import Array
+
+
+def hat(vector: Array) -> Array:
+    """Skew matrix (3, 3) of the cross product with a vector: times b it gives vector x b."""
+    x, y, z = vector
+    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+
+
+def vee(matrix: Array) -> Array:
+    """(3,) inverse of `hat`, of the skew part of a matrix (3, 3)."""
+    skew = 0.5 * (matrix - matrix.T)
+    return np.array([skew[2, 1], skew[0, 2], skew[1, 0]])
+
+
+def limit_force(force: Array, *, least: float, tilt: float) -> Array:
+    """A force (3,) [N], world, that a vehicle may be asked for: up by `least` [N], leant by `tilt` [rad] at most.
+
+    The vertical part is kept where it is enough; the horizontal part keeps its direction.
+    """
+    upward = max(float(force[2]), least)
+    horizontal = math.hypot(force[0], force[1])
+    allowed = upward * math.tan(tilt)
+    share = 1.0 if horizontal <= allowed else allowed / horizontal
+    return np.array([share * force[0], share * force[1], upward])
+
+
+def attitude_for(force: Array, yaw: float) -> Array:
+    """(3, 3) body to world with body z along `force` (3,), which points upward, and Euler yaw `yaw` [rad].
+
+    Body x is y_C x z normalised, y_C = (-sin yaw, cos yaw, 0): PX4's construction.
+    """
+    z = force / np.linalg.norm(force)
+    x = np.cross([-math.sin(yaw), math.cos(yaw), 0.0], z)
+    x /= np.linalg.norm(x)
+    return np.stack([x, np.cross(z, x), z], axis=1)
+
+
+def prioritised_error(attitude: Array, wanted: Array, yaw_weight: float) -> Array:
+    """Attitude error (3,) about the body axes [rad for small errors], heading last.
+
+    2 sgn(q_0) times the vector part of the error quaternion q = q_tilt q_yaw: the shortest rotation that brings body z
+    where it is wanted, then the rest, a turn about it of which only the share `yaw_weight` is asked for.  Brescianini,
+    Hehn, D'Andrea, "Nonlinear quadrocopter attitude control", ETH Zurich, 2013; PX4's AttitudeControl.  The yaw part
+    is divided by the weight, so that small errors of all three axes count alike.
+
+    Args:
+        attitude: (3, 3) R, body to world.
+        wanted: (3, 3) R_d, body to world.
+        yaw_weight: in (0, 1].
+    """
+    thrust = attitude.T @ wanted[:, 2]  # where body z is to go, seen from the body
+    cosine = float(np.clip(thrust[2], -1.0, 1.0))
+    if cosine > -1.0 + 1e-9:
+        w = math.sqrt(0.5 * (1.0 + cosine))
+        x, y = -thrust[1] / (2.0 * w), thrust[0] / (2.0 * w)
+        cross = hat(np.array([-thrust[1], thrust[0], 0.0]))
+        tilting = np.eye(3) + cross + cross @ cross / (1.0 + cosine)
+    else:  # upside down: every axis is as short, and roll is taken
+        w, x, y = 0.0, 1.0, 0.0
+        tilting = np.diag([1.0, -1.0, -1.0])
+    tilted = attitude @ tilting
+    turn = math.atan2(wanted[:, 0] @ tilted[:, 1], wanted[:, 0] @ tilted[:, 0])
+    half = 0.5 * yaw_weight * turn
+    c, s = math.cos(half), math.sin(half)
+    return 2.0 * np.array([x * c + y * s, y * c - x * s, w * s / yaw_weight])
+
+
+def attitude_error_function(attitude: Array, wanted: Array) -> float:
+    """Psi(R, R_d) = tr(I - R_d' R) / 2, in [0, 2].  Lee, Leok, McClamroch (2010)."""
+    return 0.5 * (3.0 - float(np.trace(wanted.T @ attitude)))
+
+
+def attitude_error(attitude: Array, wanted: Array) -> Array:
+    """e_R = (R_d' R - R' R_d)^vee / 2 (3,).  Lee, Leok, McClamroch (2010)."""
+    return vee(wanted.T @ attitude)
+
+
+def rate_error(attitude: Array, rates: Array, wanted: Array, wanted_rates: Array) -> Array:
+    """e_Omega = Omega - R' R_d Omega_d (3,) [rad/s].  Lee, Leok, McClamroch (2010)."""
+    error: Array = rates - attitude.T @ wanted @ wanted_rates
+    return error
+
+
+def unit_derivatives(v: Array, v1: Array, v2: Array) -> tuple[Array, Array, Array]:
+    """Direction v / |v| and its first two derivatives (3,), from v (3,), which is not zero, and its own."""
+    length = np.linalg.norm(v)
+    u = v / length
+    along = u @ v1
+    u1 = (v1 - along * u) / length
+    u2 = (v2 - (u1 @ v1 + u @ v2) * u - 2.0 * along * u1) / length
+    return u, u1, u2

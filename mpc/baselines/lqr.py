@@ -1,0 +1,201 @@
+"""The linear-quadratic regulator over an infinite horizon, which follows a moving reference."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import Final
+
+import numpy as np
+import scipy.linalg
+
+from mpc.baselines.allocation import allocate, make_allocation
+from mpc.baselines.limits import (
+    InputBounds,
+    require_finite,
+    require_within,
+    stop,
+)
+from mpc.baselines.preview import differentiator, wrapped
+from mpc.heading import predict_in_heading_frame, turn_horizontally
+from mpc.model import LinearModel, hover_model
+from mpc.problem import Objective
+from quadsim.controller import GROUNDED, Command, Moment
+from quadsim.errors import ParameterError
+from quadsim.state import INDEX, N_STATES, REFERENCE_STATES, STATE_NAMES, VELOCITY, Array, read_only
+from quadsim.vehicle import N_ROTORS, Vehicle
+
+LARGEST_DEVIATIONS: Final = {
+    "x": 0.5, "vx": 2.0, "y": 0.5, "vy": 2.0, "z": 0.1, "vz": 1.0,
+    "roll": 0.3, "roll_rate": 1.5, "pitch": 0.3, "pitch_rate": 1.5, "yaw": 0.5, "yaw_rate": 3.0,
+}  # fmt: skip
+"""Deviations that weigh alike, each in its state's unit, and alike with `SPEED_SHARE`; see `bryson_objective`."""
+HORIZONTAL: Final = [INDEX[name] for name in ("x", "vx", "y", "vy")]
+TILT: Final = [INDEX[name] for name in ("roll", "pitch")]
+SPEED_SHARE: Final = 0.05
+"""Deviation of a rotor's speed from hover that weighs as much, as a share of the hover speed."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class LQRSettings:
+    """What an LQR is made from.
+
+    Attributes:
+        period: tau_s [s].
+        objective: weights of one period of the infinite sum; `bryson_objective` gives some for any vehicle.
+        horizon: N, samples of preview; they tell the reference's velocity, and N periods are planned.
+        heading_frame: whether errors are turned into axes along the measured yaw, so that any heading flies.
+        tilt_max: largest tilt that errors of x, y and their rates ask for [deg], or None.  The law is linear: without a
+            limit a large error asks for more tilt than the model, or the vehicle, stands.
+        bounds: what commands are held to; the law itself knows none.
+
+    Raises:
+        ParameterError: the tilt is out of range.
+    """
+
+    period: float
+    objective: Objective
+    horizon: int = 10
+    heading_frame: bool = True
+    tilt_max: float | None = 30.0
+    bounds: InputBounds = field(default_factory=InputBounds)
+
+    def __post_init__(self) -> None:
+        if self.tilt_max is not None:
+            require_within("tilt_max", self.tilt_max, 0.1, 80.0)
+
+
+def bryson_objective(vehicle: Vehicle) -> Objective:
+    """Weights 1 / (largest deviation)^2 of every state and input: Bryson's rule (Bryson and Ho, 1975)."""
+    deviations = np.array([LARGEST_DEVIATIONS[name] for name in STATE_NAMES])
+    speed = SPEED_SHARE * vehicle.hover_speed
+    return Objective(C_r=np.eye(N_STATES), Q_y=np.diag(deviations**-2.0), Q_u=np.eye(N_ROTORS) / speed**2)
+
+
+def lqr_gain(model: LinearModel, objective: Objective) -> Array:
+    """K (nu, n) of u = u_bar - K (xi - xi_r), which minimises the sum of xi' C_r' Q_y C_r xi + u' Q_u u for ever.
+
+    K = (Q_u + B' P B)^-1 B' P A, P the solution of the discrete algebraic Riccati equation.
+
+    Raises:
+        ParameterError: there is no such gain, as where an unstable state is not weighted.
+    """
+    A, B, Q_u = model.A, model.B, objective.Q_u
+    Q = objective.C_r.T @ objective.Q_y @ objective.C_r
+    try:
+        P = scipy.linalg.solve_discrete_are(A, B, Q, Q_u)
+        K = scipy.linalg.solve(Q_u + B.T @ P @ B, B.T @ P @ A, assume_a="pos")
+        stable = float(np.abs(np.linalg.eigvals(A - B @ K)).max()) < 1.0
+    except (np.linalg.LinAlgError, ValueError):
+        stable = False
+    if not stable:
+        rule = "such that every state it leaves free comes to rest: weigh x, y, z and yaw"
+        raise ParameterError("controller", "objective", np.diag(Q).tolist(), rule)
+    return read_only(np.asarray(K))
+
+
+class LQR:
+    """u = u_bar - K (xi - xi_r), the reference's state xi_r being its pose and velocity, upright.
+
+    Heading errors count the short way round.  Speeds that leave the bounds are held to them as `allocate` says; thrust,
+    roll and pitch torque go before yaw.
+
+    Args:
+        vehicle: what is believed to fly.
+        settings: see there.
+    """
+
+    name: Final = "lqr"
+    solver: Final = ""
+
+    def __init__(self, vehicle: Vehicle, settings: LQRSettings) -> None:
+        self.settings = settings
+        self.model = hover_model(vehicle, settings.period)
+        self.gain = lqr_gain(self.model, settings.objective)
+        self._operator = differentiator(settings.horizon, settings.period)
+        self._allocation = make_allocation(vehicle)
+        self._tilt_asked = np.linalg.pinv(self.gain[:, TILT]) @ self.gain[:, HORIZONTAL]
+        self._before = self.model.u_bar
+
+    @property
+    def horizon(self) -> int:
+        """N, samples of preview."""
+        return self.settings.horizon
+
+    def reset(self, speeds: Array) -> None:
+        """Start anew after the command u(-1) (4,) [rad/s]."""
+        self._before = np.array(speeds, float)
+
+    def step(self, now: Moment, state: Array, reference: Array) -> Command:
+        """The law's command and the model's forecast of the next; see `quadsim.controller.Controller.step`.
+
+        Raises:
+            CommandError: the state or the reference is not finite.
+        """
+        before = self._before if now.acting is None else now.acting
+        if now.phase in GROUNDED:
+            command = stop(now, self.settings.bounds, before, self.horizon)
+        else:
+            require_finite(now, state, reference)
+            plan = self._plan(state, reference, before)
+            command = Command(speeds=plan[0].copy(), plan=plan)
+        self._before = command.speeds
+        return command
+
+    def predict(self, states: Array, plans: Array) -> Array:
+        """See `quadsim.controller.Controller.predict`."""
+        return predict_in_heading_frame(self.model, states, plans)
+
+    def _plan(self, state: Array, reference: Array, before: Array) -> Array:
+        """(N, 4) commands: the law's now, held to the bounds, then those of the closed loop of the model."""
+        targets = self._targets(state, reference)
+        xi = state
+        if self.settings.heading_frame:
+            turn = -float(state[INDEX["yaw"]])
+            xi, targets = (
+                turn_horizontally(state, np.array(turn)),
+                turn_horizontally(targets, np.full(len(targets), turn)),
+            )
+        plan = np.empty((self.horizon, N_ROTORS))
+        for i in range(self.horizon):
+            speeds = self.model.u_bar - self.gain @ self._limited(xi - targets[i])
+            lower, upper = self.settings.bounds.reach(before)
+            # The mixer's priorities matter for what is flown; the forecast is held to the bounds rotor by rotor.
+            plan[i] = self._held(speeds, lower, upper) if i == 0 else np.clip(speeds, lower, upper)
+            before = plan[i]
+            xi = self.model.A @ xi + self.model.B @ (plan[i] - self.model.u_bar)
+        return plan
+
+    def _targets(self, state: Array, reference: Array) -> Array:
+        """(N, 12) reference states at t_k .. t_{k+N-1}, yaw at t_k less than half a turn from the measured one."""
+        (value, rate, acceleration), period = self._operator @ reference, self.settings.period
+        poses = np.concatenate([value[None], reference[:-1]])
+        rates = rate + period * np.arange(self.horizon)[:, None] * acceleration
+        targets = np.zeros((self.horizon, N_STATES))
+        targets[:, REFERENCE_STATES] = poses
+        targets[:, [*VELOCITY, INDEX["yaw_rate"]]] = rates
+        yaw = float(state[INDEX["yaw"]])
+        targets[:, INDEX["yaw"]] += yaw + wrapped(value[3] - yaw) - value[3]
+        return targets
+
+    def _limited(self, error: Array) -> Array:
+        """The error (12,), its horizontal part scaled down where it asks for more tilt than allowed.
+
+        K e = K_tilt (tilt + G e_horizontal) + ..., so -G e_horizontal is the tilt that the law steers to.
+        """
+        if self.settings.tilt_max is None:
+            return error
+        asked = float(np.linalg.norm(self._tilt_asked @ error[HORIZONTAL]))
+        allowed = math.radians(self.settings.tilt_max)
+        if asked <= allowed:
+            return error
+        limited = error.copy()
+        limited[HORIZONTAL] *= allowed / asked
+        return limited
+
+    def _held(self, speeds: Array, lower: Array, upper: Array) -> Array:
+        """Speeds (4,) between `lower` and `upper` (4,) [rad/s] that give the wrench of `speeds`, or nearly so."""
+        if ((lower <= speeds) & (speeds <= upper)).all():
+            return speeds
+        # Thrust goes with the square; a speed below zero asks for what no rotor gives, and counts with its sign.
+        return allocate(self._allocation, self._allocation.M @ (speeds * np.abs(speeds)), lower, upper)

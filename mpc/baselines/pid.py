@@ -1,0 +1,162 @@
+"""Cascaded PID, as autopilots fly it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import Final
+
+import numpy as np
+
+from mpc.baselines.allocation import make_allocation
+from mpc.baselines.bandwidths import Bandwidths, bandwidths, lag_to_allow_for
+from mpc.baselines.cascade import Gains, fly_cascade, fresh_memory, make_body
+from mpc.baselines.limits import (
+    InputBounds,
+    held_for_a_period,
+    require_finite,
+    require_positive,
+    require_within,
+    stop,
+)
+from mpc.baselines.preview import differentiator, target_of
+from mpc.heading import predict_in_heading_frame
+from mpc.model import hover_model
+from quadsim.controller import GROUNDED, Command, Moment, Phase
+from quadsim.state import Array
+from quadsim.vehicle import Vehicle
+
+
+@dataclass(frozen=True, kw_only=True)
+class PIDSettings:
+    """What a cascade is made from; `pid_settings` derives it from a vehicle and a period.
+
+    Attributes:
+        period: tau_s [s].
+        bandwidths: proportional gains of the loops [1/s].
+        velocity_integral: integral over proportional gain of the velocity loop [1/s]; 0 for none.
+        rate_integral: the same of the rate loop [1/s].
+        velocity_derivative: share of the measured acceleration that is taken back.
+        rate_derivative: share of the measured angular acceleration that is taken back; late by a period, less than 1.
+        yaw_weight: share of the heading error asked for while turning the thrust; PX4's MC_YAW_WEIGHT.
+        tilt_max: largest tilt asked for [deg]; PX4's MPC_TILTMAX_AIR.
+        velocity_max: largest velocity asked for, horizontal and vertical [m/s]; PX4's MPC_XY_VEL_MAX.
+        rate_max: largest body rates asked for, roll, pitch, yaw [deg/s]; PX4's MC_ROLLRATE_MAX and so on.
+        horizon: N, samples of preview; they tell the reference's velocity and acceleration.
+        bounds: what commands are held to.
+    """
+
+    period: float
+    bandwidths: Bandwidths
+    velocity_integral: float = 0.4
+    rate_integral: float = 0.5
+    velocity_derivative: float = 0.1
+    rate_derivative: float = 0.05
+    yaw_weight: float = 0.4
+    tilt_max: float = 45.0
+    velocity_max: float = 12.0
+    rate_max: tuple[float, float, float] = (220.0, 220.0, 200.0)
+    horizon: int = 10
+    bounds: InputBounds = field(default_factory=InputBounds)
+
+    def __post_init__(self) -> None:
+        require_positive("period", self.period)
+        require_positive("velocity_max", self.velocity_max)
+        for name in ("velocity_integral", "rate_integral"):
+            require_within(name, getattr(self, name), 0.0, 1.0 / self.period)
+        for name in ("velocity_derivative", "rate_derivative"):
+            require_within(name, getattr(self, name), 0.0, 0.9)
+        require_within("yaw_weight", self.yaw_weight, 0.05, 1.0)
+        require_within("tilt_max", self.tilt_max, 0.1, 80.0)
+        for rate in self.rate_max:
+            require_positive("rate_max", rate)
+
+
+def pid_settings(vehicle: Vehicle, *, period: float, lag: float | None = None, **others: object) -> PIDSettings:
+    """Settings whose gains follow from the period, and the lag [s] to allow for; see `bandwidths`.
+
+    Args:
+        vehicle: what is believed to fly.
+        period: tau_s [s].
+        lag: of rotors and computation; `lag_to_allow_for` where absent.
+        others: fields of `PIDSettings`.
+    """
+    allowed = lag_to_allow_for(vehicle, period) if lag is None else lag
+    speeds = bandwidths(period=period, lag=allowed)
+    values: dict[str, object] = {
+        "velocity_integral": 0.25 * speeds.position,
+        "rate_integral": 0.5 * speeds.position,
+        **others,
+    }
+    return PIDSettings(period=period, bandwidths=speeds, **values)  # type: ignore[arg-type]
+
+
+class CascadedPID:
+    """Position P, velocity PID, attitude P by quaternions, rate PID, mixer; see `mpc.baselines.cascade`.
+
+    Args:
+        vehicle: what is believed to fly.
+        settings: see there.
+    """
+
+    name: Final = "pid"
+    solver: Final = ""
+
+    def __init__(self, vehicle: Vehicle, settings: PIDSettings) -> None:
+        self.settings = settings
+        self.model = hover_model(vehicle, settings.period)
+        self.gains = Gains(
+            bandwidths=settings.bandwidths,
+            velocity_integral=settings.velocity_integral,
+            rate_integral=settings.rate_integral,
+            velocity_derivative=settings.velocity_derivative,
+            rate_derivative=settings.rate_derivative,
+            yaw_weight=settings.yaw_weight,
+            tilt_max=math.radians(settings.tilt_max),
+            velocity_max=settings.velocity_max,
+            rate_max=tuple(np.radians(settings.rate_max).tolist()),
+        )
+        highest = vehicle.speed_max if settings.bounds.speed is None else settings.bounds.speed[1]
+        self.body = make_body(vehicle, make_allocation(vehicle), highest)
+        self._operator = differentiator(settings.horizon, settings.period)
+        self.reset(self.model.u_bar)
+
+    @property
+    def horizon(self) -> int:
+        """N, samples of preview."""
+        return self.settings.horizon
+
+    def reset(self, speeds: Array) -> None:
+        """Start anew after the command u(-1) (4,) [rad/s]."""
+        self._before = np.array(speeds, float)
+        self._memory = fresh_memory()
+
+    def step(self, now: Moment, state: Array, reference: Array) -> Command:
+        """One period of all loops, integrals at rest while on the ground; see `quadsim.controller.Controller.step`.
+
+        Raises:
+            CommandError: the state or the reference is not finite.
+        """
+        before = self._before if now.acting is None else now.acting
+        if now.phase in GROUNDED:
+            command = stop(now, self.settings.bounds, before, self.horizon)
+            self.reset(command.speeds)
+            return command
+        require_finite(now, state, reference)
+        lower, upper = self.settings.bounds.reach(before)
+        self._before, self._memory = fly_cascade(
+            self.gains,
+            self.body,
+            self._memory,
+            state,
+            target_of(reference, self._operator),
+            lower=lower,
+            upper=upper,
+            period=self.settings.period,
+            integrate=now.phase is Phase.FLYING,
+        )
+        return Command(speeds=self._before.copy(), plan=held_for_a_period(self._before, self.model, self.horizon))
+
+    def predict(self, states: Array, plans: Array) -> Array:
+        """See `quadsim.controller.Controller.predict`."""
+        return predict_in_heading_frame(self.model, states, plans)

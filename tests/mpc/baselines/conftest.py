@@ -1,0 +1,83 @@
+"""What the baselines' tests build: three vehicles, three laws, short flights."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from support import paper_reference
+
+from mpc.baselines.geometric import GeometricController, geometric_settings
+from mpc.baselines.limits import InputBounds
+from mpc.baselines.lqr import LQR, LQRSettings, bryson_objective
+from mpc.baselines.pid import CascadedPID, pid_settings
+from quadsim.assets import vehicle_path
+from quadsim.controller import Controller
+from quadsim.effects import Effects
+from quadsim.flightlog import FlightLog
+from quadsim.loop import fly
+from quadsim.plant import Plant
+from quadsim.state import Array
+from quadsim.vehicle import Vehicle, load_vehicle
+
+PERIOD = 0.05
+LAWS = ("lqr", "pid", "geometric")
+
+Build = Callable[..., Any]
+Fly = Callable[..., FlightLog]
+
+
+@pytest.fixture(params=["lopes2011", "hummingbird", "crazyflie2"])
+def craft(request: pytest.FixtureRequest) -> Vehicle:
+    return load_vehicle(vehicle_path(request.param))
+
+
+@pytest.fixture(params=LAWS)
+def law(request: pytest.FixtureRequest) -> str:
+    return request.param
+
+
+@pytest.fixture
+def build() -> Build:
+    """A law by name with its defaults for a vehicle; speeds within the vehicle's range unless told otherwise."""
+
+    def build_law(law: str, vehicle: Vehicle, **others: Any) -> Any:
+        others.setdefault("bounds", InputBounds(speed=(vehicle.speed_min, vehicle.speed_max)))
+        if law == "lqr":
+            return LQR(vehicle, LQRSettings(period=PERIOD, objective=bryson_objective(vehicle), **others))
+        if law == "pid":
+            return CascadedPID(vehicle, pid_settings(vehicle, period=PERIOD, **others))
+        return GeometricController(vehicle, geometric_settings(vehicle, period=PERIOD, **others))
+
+    return build_law
+
+
+@pytest.fixture
+def fly_from() -> Fly:
+    """A flight from a state; by default along the paper's course, whose height steps by 10 m at once."""
+
+    def fly_law(
+        controller: Controller,
+        vehicle: Vehicle,
+        state: Array,
+        *,
+        periods: int,
+        course: Array | None = None,
+        effects: Effects | None = None,
+    ) -> FlightLog:
+        samples = periods + controller.horizon
+        reference = paper_reference(samples) if course is None else np.tile(course, (samples, 1))
+        with Plant(vehicle, effects=effects or Effects(), limit_speeds=True) as plant:
+            return fly(
+                plant,
+                controller,
+                reference,
+                initial_state=state,
+                initial_speeds=plant.hover_speeds,
+                periods=periods,
+                steps_per_period=50,
+            )
+
+    return fly_law

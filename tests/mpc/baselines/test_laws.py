@@ -1,0 +1,190 @@
+"""What all three laws have in common: hover, signs at any heading, refusals, bounds."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from mpc.baselines.geometric import geometric_settings
+from mpc.baselines.limits import InputBounds
+from mpc.baselines.pid import pid_settings
+from quadsim.controller import Moment, Phase
+from quadsim.errors import CommandError, ParameterError
+from quadsim.state import INDEX, make_state
+from quadsim.vehicle import Vehicle
+
+Build = Callable[..., Any]
+HEADINGS = [0.0, 90.0, 180.0, -135.0]
+
+
+def held(controller: Any, pose: Any) -> np.ndarray:
+    return np.tile(np.asarray(pose, float), (controller.horizon, 1))
+
+
+def first_wrench(controller: Any, vehicle: Vehicle, state: np.ndarray, pose: Any) -> np.ndarray:
+    """[U, tau_x, tau_y, tau_z] that a fresh controller commands at once."""
+    controller.reset(np.full(4, vehicle.hover_speed))
+    return vehicle.allocation @ controller.step(Moment(), state, held(controller, pose)).speeds ** 2
+
+
+@pytest.mark.parametrize("yaw", HEADINGS)
+def test_at_rest_on_the_reference_the_command_is_hover(law: str, craft: Vehicle, build: Build, yaw: float) -> None:
+    psi = math.radians(yaw)
+    state = make_state(position=(1.0, -2.0, 3.0), euler=(0.0, 0.0, psi))
+    controller = build(law, craft)
+    for turns in (-1, 0, 2):  # the plant unwraps yaw, the reference may not
+        command = controller.step(Moment(), state, held(controller, [1.0, -2.0, 3.0, psi + 2.0 * math.pi * turns]))
+        np.testing.assert_allclose(command.speeds, craft.hover_speed, rtol=1e-9)
+        assert command.plan.shape == (controller.horizon, 4)
+        np.testing.assert_array_equal(command.plan[0], command.speeds)
+        np.testing.assert_allclose(
+            controller.predict(state[None], command.plan[None])[0], np.tile(state, (controller.horizon, 1)), atol=1e-6
+        )
+
+
+@pytest.mark.parametrize("yaw", HEADINGS)
+def test_errors_are_answered_the_right_way_at_any_heading(law: str, craft: Vehicle, build: Build, yaw: float) -> None:
+    """A target ahead pitches forward, tau_y > 0; one to the left rolls left, tau_x < 0; up is thrust."""
+    psi = math.radians(yaw)
+    controller, state = build(law, craft), make_state(euler=(0.0, 0.0, psi))
+    weight = craft.mass * craft.gravity
+    for offset, axis, sign in (((1.0, 0.0), 2, 1.0), ((0.0, 1.0), 1, -1.0)):
+        x = 0.2 * (math.cos(psi) * offset[0] - math.sin(psi) * offset[1])
+        y = 0.2 * (math.sin(psi) * offset[0] + math.cos(psi) * offset[1])
+        wrench = first_wrench(controller, craft, state, [x, y, 0.0, psi])
+        assert sign * wrench[axis] > 1e-4 * weight * craft.arm_length
+        assert abs(wrench[3 - axis]) < 1e-6 * weight * craft.arm_length
+    assert first_wrench(controller, craft, state, [0.0, 0.0, 0.1, psi])[0] > 1.005 * weight
+    assert first_wrench(controller, craft, state, [0.0, 0.0, 0.0, psi + 0.1])[3] > 0.0
+    assert first_wrench(controller, craft, state, [0.0, 0.0, 0.0, psi + 2.0 * math.pi - 0.1])[3] < 0.0
+
+
+def test_without_its_heading_frame_the_lqr_pushes_the_wrong_way_round(vehicle: Vehicle, build: Build) -> None:
+    state, pose = make_state(euler=(0.0, 0.0, math.pi)), [-0.2, 0.0, 0.0, math.pi]
+    assert first_wrench(build("lqr", vehicle), vehicle, state, pose)[2] > 0.0
+    assert first_wrench(build("lqr", vehicle, heading_frame=False), vehicle, state, pose)[2] < 0.0
+
+
+def test_a_target_that_moves_is_followed_with_its_velocity(law: str, craft: Vehicle, build: Build) -> None:
+    """Beside a target and as fast, there is nothing to correct."""
+    controller = build(law, craft)
+    state = make_state(euler=(0.0, 0.0, 0.5))
+    state[[INDEX["vx"], INDEX["vy"], INDEX["vz"]]] = 0.4, -0.3, 0.2
+    t = 0.05 * np.arange(1, controller.horizon + 1)
+    reference = np.stack([0.4 * t, -0.3 * t, 0.2 * t, np.full_like(t, 0.5)], axis=1)
+    command = controller.step(Moment(), state, reference)
+    np.testing.assert_allclose(command.speeds, craft.hover_speed, rtol=1e-6)
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf])
+def test_a_state_or_reference_that_is_not_finite_is_refused_and_forgotten(
+    law: str, vehicle: Vehicle, build: Build, value: float
+) -> None:
+    controller, other = build(law, vehicle), build(law, vehicle)
+    state, pose = make_state(position=(0.1, 0.2, 0.3)), [0.0, 0.0, 0.0, 0.1]
+    broken = state.copy()
+    broken[INDEX["vx"]] = value
+    with pytest.raises(CommandError, match="no command from a measured state whose vx is not finite"):
+        controller.step(Moment(time=1.0), broken, held(controller, pose))
+    with pytest.raises(CommandError, match="no command from a reference that is not finite"):
+        controller.step(Moment(time=1.0), state, held(controller, [value, 0.0, 0.0, 0.0]))
+    answers = [one.step(Moment(), state, held(one, pose)).speeds for one in (controller, other)]
+    np.testing.assert_array_equal(*answers)
+
+
+@pytest.mark.parametrize("phase", [Phase.LANDED, Phase.CRASHED])
+def test_on_the_ground_rotors_are_stopped_as_fast_as_slews_allow(
+    law: str, vehicle: Vehicle, build: Build, phase: Phase
+) -> None:
+    bounds = InputBounds(speed=(20.0, 250.0), slew=(-10.0, 5.0))
+    controller = build(law, vehicle, bounds=bounds)
+    controller.reset(np.array([100.0, 25.0, 20.0, 200.0]))
+    command = controller.step(Moment(phase=phase), np.full(12, math.nan), held(controller, np.zeros(4)))
+    np.testing.assert_array_equal(command.speeds, [90.0, 20.0, 20.0, 190.0])
+    assert command.status == str(phase)
+    command = controller.step(Moment(phase=phase), np.zeros(12), held(controller, np.zeros(4)))
+    np.testing.assert_array_equal(command.speeds, [80.0, 20.0, 20.0, 180.0])
+    free = build(law, vehicle, bounds=InputBounds())
+    command = free.step(Moment(phase=phase), np.zeros(12), held(free, np.zeros(4)))
+    np.testing.assert_array_equal(command.speeds, 0.0)
+
+
+@pytest.mark.parametrize("law", ["pid", "geometric"])
+def test_integrals_wait_for_the_flight(law: str, vehicle: Vehicle, build: Build) -> None:
+    """Armed on the ground an error that cannot be mended is not summed; in flight it is."""
+    others = {"integral": True} if law == "geometric" else {}
+    state, pose = make_state(), [0.05, 0.0, 0.05, 0.0]
+    answers = {}
+    for phase in (Phase.ARMED, Phase.FLYING):
+        controller = build(law, vehicle, **others)
+        answers[phase] = [controller.step(Moment(phase=phase), state, held(controller, pose)).speeds for _ in range(20)]
+    np.testing.assert_allclose(answers[Phase.ARMED][-1], answers[Phase.ARMED][0], rtol=1e-12)
+    assert answers[Phase.FLYING][-1].sum() > answers[Phase.FLYING][0].sum() + 0.5
+
+
+@settings(max_examples=25, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(seed=st.integers(0, 2**32 - 1), size=st.sampled_from([0.1, 1.0, 10.0]))
+def test_any_state_gets_a_command_within_speeds_and_slews(
+    law: str, vehicle: Vehicle, build: Build, seed: int, size: float
+) -> None:
+    rng = np.random.default_rng(seed)
+    controller = build(law, vehicle, bounds=InputBounds(speed=(0.0, 250.0), slew=(-10.0, 5.0)))
+    before = rng.uniform(0.0, 250.0, 4)
+    controller.reset(before)
+    for _ in range(3):
+        state, pose = size * rng.normal(size=12), size * rng.normal(size=4)
+        speeds = controller.step(Moment(), state, held(controller, pose)).speeds
+        assert np.isfinite(speeds).all()
+        assert speeds.min() >= 0.0
+        assert speeds.max() <= 250.0
+        assert (speeds - before).min() >= -10.0 - 1e-9
+        assert (speeds - before).max() <= 5.0 + 1e-9
+        before = speeds
+
+
+def test_the_command_in_force_is_what_slews_count_from(law: str, vehicle: Vehicle, build: Build) -> None:
+    controller = build(law, vehicle, bounds=InputBounds(speed=(0.0, 250.0), slew=(-10.0, 5.0)))
+    late = Moment(acting=np.full(4, 100.0))
+    speeds = controller.step(late, make_state(), held(controller, [0.0, 0.0, 5.0, 0.0])).speeds
+    np.testing.assert_allclose(speeds, 105.0)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"velocity_max": 0.0}, "velocity_max must be positive"),
+        ({"velocity_integral": -1.0}, "velocity_integral must be between 0 and 20"),
+        ({"rate_integral": math.nan}, "rate_integral must be between 0 and 20"),
+        ({"rate_derivative": 1.0}, "rate_derivative must be between 0 and 0.9"),
+        ({"velocity_derivative": 1.0}, "velocity_derivative must be between 0 and 0.9"),
+        ({"yaw_weight": 0.0}, "yaw_weight must be between 0.05 and 1"),
+        ({"tilt_max": 90.0}, "tilt_max must be between 0.1 and 80"),
+        ({"rate_max": (220.0, 0.0, 200.0)}, "rate_max must be positive"),
+    ],
+)
+def test_wrong_settings_of_the_cascade_are_named(vehicle: Vehicle, change: dict[str, Any], message: str) -> None:
+    with pytest.raises(ParameterError, match=message):
+        pid_settings(vehicle, period=0.05, **change)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"k_x": 0.0}, "k_x must be positive"),
+        ({"k_i": -1.0}, "k_i must be at least 0 and finite"),
+        ({"k_I": math.nan}, "k_I must be at least 0 and finite"),
+        ({"sigma": math.inf}, "sigma must be positive and finite"),
+        ({"yaw_share": 2.0}, "yaw_share must be between 0.05 and 1"),
+        ({"tilt_max": 90.0}, "tilt_max must be between 0.1 and 80"),
+        ({"period": 0.0}, "period must be positive"),
+    ],
+)
+def test_wrong_settings_of_geometric_control_are_named(vehicle: Vehicle, change: dict[str, Any], message: str) -> None:
+    with pytest.raises(ParameterError, match=message):
+        geometric_settings(vehicle, **{"period": 0.05, **change})

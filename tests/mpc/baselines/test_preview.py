@@ -1,0 +1,49 @@
+"""Derivatives of a reference from its preview."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from mpc.baselines.preview import differentiator, target_of, wrapped
+from quadsim.errors import ParameterError
+
+
+@pytest.mark.parametrize("samples", [3, 10, 25])
+def test_a_parabola_is_told_exactly(samples: int) -> None:
+    t = 0.1 * np.arange(1, samples + 1)
+    reference = np.stack([1.0 + 2.0 * t - 3.0 * t**2, 4.0 * t, t**2, 0.5 - t + 0.25 * t**2], axis=1)
+    target = target_of(reference, differentiator(samples, 0.1))
+    np.testing.assert_allclose(target.position, [1.0, 0.0, 0.0], atol=1e-10)
+    np.testing.assert_allclose(target.velocity, [2.0, 4.0, 0.0], atol=1e-10)
+    np.testing.assert_allclose(target.acceleration, [-6.0, 0.0, 2.0], atol=1e-9)
+    assert (target.yaw, target.yaw_rate, target.yaw_acceleration) == pytest.approx((0.5, -1.0, 0.5))
+
+
+def test_three_samples_give_the_ordinary_second_difference() -> None:
+    np.testing.assert_allclose(differentiator(3, 0.1)[2], np.array([1.0, -2.0, 1.0]) / 0.01, rtol=1e-9)
+
+
+def test_a_jump_of_the_velocity_becomes_a_hump_of_its_area() -> None:
+    """Summed over the flight, the acceleration fed forward is the jump; it never pulls the other way."""
+    period, samples = 0.05, 10
+    ramp = np.maximum(0.0, 6.0 * period * (np.arange(80) - 40))
+    operator = differentiator(samples, period)
+    accelerations = np.array([operator[2] @ ramp[k + 1 : k + 1 + samples] for k in range(80 - samples)])
+    assert accelerations.sum() * period == pytest.approx(6.0)
+    assert accelerations.min() > -1e-9
+    assert accelerations.max() < 0.25 * 6.0 / period
+
+
+@pytest.mark.parametrize(("angle", "expected"), [(3.5, 3.5 - 2.0 * math.pi), (-4.0, 2.0 * math.pi - 4.0), (1.0, 1.0)])
+def test_headings_wrap_to_the_short_way(angle: float, expected: float) -> None:
+    assert wrapped(angle) == pytest.approx(expected)
+
+
+def test_a_preview_too_short_or_without_period_is_refused() -> None:
+    with pytest.raises(ParameterError, match=r"controller\.horizon must be at least 3"):
+        differentiator(2, 0.05)
+    with pytest.raises(ParameterError, match=r"controller\.period must be positive"):
+        differentiator(5, 0.0)
