@@ -1,0 +1,113 @@
+"""What the model does not explain: a force and a torque, estimated from how the vehicle moved.
+
+Each of the three velocities and three body rates has a scalar disturbance of its own, an acceleration d that stays as
+it is but for a random walk,
+
+    v(k+1) = v(k) + model + tau_s d(k) + w_v,    d(k+1) = d(k) + w_d,    measured: v(k) + noise,
+
+estimated by the steady-state Kalman filter of that pair.  With the estimate in the prediction and in the steady state
+that the controller aims at, tracking has no steady error (Maeder, Borrelli & Morari 2009, "Linear offset-free Model
+Predictive Control"; Pannocchia & Rawlings 2003).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, fields
+from typing import Final
+
+import numpy as np
+import scipy.linalg
+
+from quadsim.errors import ParameterError
+from quadsim.state import EULER, EULER_RATE, VELOCITY, Array, euler_to_body_rates
+
+_VELOCITY: Final = list(VELOCITY)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ObserverSettings:
+    """Tuning of the disturbance observer: how much of a surprise is noise, and how fast disturbances change.
+
+    Only ratios matter.  At a period of 50 ms the defaults have nine tenths of a step of the force within 2.4 s and of
+    the torque within 1.25 s: well below the bandwidth of the loop, so that rotors which lag otherwise than stated do
+    not make the two fight.  With them and a move weight of 10 or more, the paper's course is flown with 100 ms of lag
+    where 50 ms are stated; with that of 10 and a torque_walk of 0.35, it is lost.
+
+    Attributes:
+        velocity_noise: of a measured velocity [m/s].
+        rate_noise: of a measured body rate [rad/s].
+        velocity_walk: unexplained change of a velocity in a period that is no lasting force [m/s].
+        rate_walk: the same of a body rate [rad/s].
+        force_walk: change of the force's acceleration in a period [m/s^2].
+        torque_walk: change of the torque's angular acceleration in a period [rad/s^2].
+        largest_force: no larger acceleration is ever believed [m/s^2].
+        largest_torque: no larger angular acceleration [rad/s^2].
+    """
+
+    velocity_noise: float = 0.05
+    rate_noise: float = 0.05
+    velocity_walk: float = 0.05
+    rate_walk: float = 0.05
+    force_walk: float = 0.1
+    torque_walk: float = 0.2
+    largest_force: float = 5.0
+    largest_torque: float = 30.0
+
+    def __post_init__(self) -> None:
+        for item in fields(self):
+            value = getattr(self, item.name)
+            if not 0.0 < value < math.inf:
+                raise ParameterError("controller.offset_free", item.name, value, "positive and finite")
+
+
+def observer_gain(period: float, *, noise: float, walk: float, change: float) -> tuple[float, float]:
+    """Gains (of v, of d) of the steady-state Kalman filter of one pair, on the surprise in v.
+
+    Args:
+        period: tau_s [s].
+        noise: standard deviation of what is measured.
+        walk: of w_v.
+        change: of w_d.
+    """
+    A, C = np.array([[1.0, period], [0.0, 1.0]]), np.array([[1.0, 0.0]])
+    P = scipy.linalg.solve_discrete_are(A.T, C.T, np.diag([walk**2, change**2]), np.array([[noise**2]]))
+    gain = (P @ C.T / (C @ P @ C.T + noise**2)).ravel()
+    return float(gain[0]), float(gain[1])
+
+
+class DisturbanceObserver:
+    """The six filters, an evolving state.
+
+    What is predicted starts from what was measured a period ago, so that the estimate of v itself is not kept: noise
+    of a measurement enters twice, with opposite signs, and the gains are those for twice its variance.
+    """
+
+    def __init__(self, settings: ObserverSettings, period: float) -> None:
+        doubled = math.sqrt(2.0)
+        _, force = observer_gain(
+            period,
+            noise=doubled * settings.velocity_noise,
+            walk=settings.velocity_walk,
+            change=settings.force_walk,
+        )
+        _, torque = observer_gain(
+            period, noise=doubled * settings.rate_noise, walk=settings.rate_walk, change=settings.torque_walk
+        )
+        self._gain = np.repeat([force, torque], 3)
+        self._largest = np.repeat([settings.largest_force, settings.largest_torque], 3)
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget: nothing disturbs."""
+        self.estimate = np.zeros(6)
+        """(6,) acceleration, world [m/s^2], and angular acceleration, body [rad/s^2]."""
+
+    def update(self, measured: Array, predicted: Array) -> None:
+        """Take note of a measured state (12,) and of what was predicted for it (12,), disturbances included."""
+        surprise = np.concatenate([(measured - predicted)[_VELOCITY], _body_rates(measured) - _body_rates(predicted)])
+        self.estimate = np.clip(self.estimate + self._gain * surprise, -self._largest, self._largest)
+
+
+def _body_rates(state: Array) -> Array:
+    return euler_to_body_rates(state[list(EULER)], state[list(EULER_RATE)])

@@ -1,0 +1,59 @@
+"""The parts of the robust controller, each with a setting of its own."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from enum import StrEnum
+
+from mpc.observer import ObserverSettings
+from mpc.penalty import Penalty
+from quadsim.errors import ParameterError
+from quadsim.state import Array
+
+
+class Linearisation(StrEnum):
+    """Where the prediction is linearised."""
+
+    HOVER = "hover"
+    """At hover, once: the paper's model, turned by the yaw where the heading frame is on."""
+    STATE = "state"
+    """At the present state, each period: successive linearisation."""
+    TRAJECTORY = "trajectory"
+    """Along the last plan, each period: one step of sequential quadratic programming, the real-time iteration."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RobustSettings:
+    """The parts of the robust controller; each absent or off unless given.
+
+    Attributes:
+        penalty: what leaving an output bound costs; None for hard output bounds.
+        rotor_lag: time constant of the rotor speeds that the prediction knows [s]; 0 for none.
+        delay: time from measurement to command that the prediction bridges [s].
+        observer: tuning of the disturbance observer; None for no offset-free tracking.
+        heading: whether the hover model is turned by the yaw.  The weights of x and y are then those forward and to the
+            left; where these differ, flights to different headings do.
+        largest_turn: how far the prediction is asked to turn at once [rad], from the present yaw or from one period to
+            the next; it goes on from there.  Of no effect on the hover model without `heading`.
+        move_weight: Q_d (4, 4), of a command's change from one period to the next; None for none.
+        linearisation: where the prediction is linearised.
+        margins: (N, n_c) by which the output bounds are drawn in; None for none.
+    """
+
+    penalty: Penalty | None = None
+    rotor_lag: float = 0.0
+    delay: float = 0.0
+    observer: ObserverSettings | None = None
+    heading: bool = False
+    largest_turn: float = 0.5
+    move_weight: Array | None = None
+    linearisation: Linearisation = Linearisation.HOVER
+    margins: Array | None = None
+
+    def __post_init__(self) -> None:
+        for name in ("rotor_lag", "delay"):
+            if not 0.0 <= getattr(self, name) < math.inf:
+                raise ParameterError("controller", name, getattr(self, name), "at least 0 s and finite")
+        if not 0.0 < self.largest_turn < math.inf:
+            raise ParameterError("controller", "largest_turn", self.largest_turn, "positive and finite")

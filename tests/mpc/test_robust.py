@@ -1,0 +1,489 @@
+"""The robust controller, each part by itself: against the paper's, against the plant's own equations, by symmetry."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from support import paper_problem, paper_reference
+
+from mpc.constrained import ConstrainedMPC
+from mpc.equilibrium import equilibrium
+from mpc.heading import turn_horizontally
+from mpc.linearise import linearise
+from mpc.model import hover_model
+from mpc.nonlinear import NonlinearModel, advance, derivative, nonlinear_model
+from mpc.observer import ObserverSettings
+from mpc.penalty import Penalty
+from mpc.robust import Linearisation, RobustMPC, RobustSettings, _hover_matrices
+from mpc.solvers import QPSolver
+from quadsim.controller import SOLVED, Moment, Phase
+from quadsim.effects.rotors import RotorDynamics
+from quadsim.errors import ParameterError
+from quadsim.state import INDEX, Array, make_state
+from quadsim.vehicle import Vehicle
+from scenarios.build import build_plant, build_problem, build_reference, build_vehicle
+from scenarios.flying import fly_once
+from scenarios.loading import load_scenario
+from scenarios.runner import Flight
+
+PERIOD = 0.05
+SOFT = Penalty(l1=np.full(2, 2e5), l2=np.full(2, 1e4))
+EVERYTHING: dict[str, Any] = {
+    "penalty": SOFT,
+    "rotor_lag": 0.03,
+    "delay": 0.02,
+    "observer": ObserverSettings(force_walk=0.25, torque_walk=0.5),
+    "heading": True,
+    "move_weight": np.eye(4),
+}
+HOLD = np.zeros((50, 4))
+
+
+def moving(velocity: tuple[float, float, float], **place: Any) -> Array:
+    state = make_state(**place)
+    state[[INDEX["vx"], INDEX["vy"], INDEX["vz"]]] = velocity
+    return state
+
+
+def robust(vehicle: Vehicle, *, horizon: int = 50, weight: float = 0.01, **settings: Any) -> RobustMPC:
+    problem = paper_problem()
+    assert problem.bounds is not None
+    return RobustMPC(
+        vehicle,
+        period=PERIOD,
+        horizon=horizon,
+        objective=replace(problem.objective, Q_u=weight * np.eye(4)),
+        bounds=problem.bounds,
+        settings=RobustSettings(**settings),
+    )
+
+
+def flown(
+    controller: RobustMPC, plant: NonlinearModel, state: Array, reference: Array, periods: int
+) -> Iterator[tuple[Array, Array]]:
+    """States (12,) at the samples and the commands given there; the plant's commands act the stated delay later."""
+    delay = controller.settings.delay
+    acting = np.full(4, controller._nominal.u_bar)
+    controller.reset(acting)
+    x = np.concatenate([state, acting])[: plant.n]
+    for k in range(periods):
+        command = controller.step(
+            Moment(time=k * PERIOD, acting=acting), x[:12], reference[k + 1 : k + 1 + controller.horizon]
+        )
+        assert command.status == SOLVED
+        yield x[:12].copy(), command.speeds
+        for duration, speeds in ((delay, acting), (PERIOD - delay, command.speeds)):
+            if duration > 0.0:
+                x = advance(replace(plant, period=duration), x, speeds)
+        acting = command.speeds
+
+
+def moments(flight: Flight, first: int, periods: int) -> Iterator[tuple[Moment, Array, Array]]:
+    """What a controller was told in successive periods of a flight."""
+    log = flight.log.control
+    reference, before = paper_reference(log.t.size + 50), np.vstack([log.speeds_before, log.speeds[:-1]])
+    for k in range(first, first + periods):
+        yield Moment(time=log.t[k], acting=before[k]), log.state[k], reference[k + 1 : k + 51]
+
+
+def test_without_parts_it_is_the_papers_controller(constrained_flight: Flight, vehicle: Vehicle) -> None:
+    """100 periods in which the tilt bound is active at times, with yaw on its way from 30 deg to 0."""
+    problem = paper_problem()
+    paper, ours = ConstrainedMPC(problem, QPSolver("piqp-multistage", problem)), robust(vehicle)
+    active = 0
+    for moment, state, reference in moments(constrained_flight, 180, 100):
+        expected, command = paper.step(moment, state, reference), ours.step(moment, state, reference)
+        np.testing.assert_allclose(command.speeds, expected.speeds, atol=5e-3)
+        active += command.active
+    assert active > 100
+
+
+def test_the_hover_matrices_are_the_papers_without_lag_and_the_nonlinear_models_with(vehicle: Vehicle) -> None:
+    A, B = _hover_matrices(vehicle, nonlinear_model(vehicle, PERIOD))
+    model = hover_model(vehicle, PERIOD)
+    np.testing.assert_array_equal(A, model.A)
+    np.testing.assert_array_equal(B, model.B)
+    lagging = nonlinear_model(vehicle, PERIOD, substeps=20, rotor_lag=0.03)
+    x, u = equilibrium(lagging)
+    for ours, exact in zip(_hover_matrices(vehicle, lagging), linearise(lagging, x[None], u[None])[:2], strict=True):
+        np.testing.assert_allclose(ours, exact[0], atol=1e-7)
+
+
+# Soft bounds
+
+
+def test_soft_bounds_are_hard_ones_wherever_these_can_be_kept(constrained_flight: Flight, vehicle: Vehicle) -> None:
+    hard, soft = robust(vehicle), robust(vehicle, penalty=SOFT)
+    active = 0
+    for moment, state, reference in moments(constrained_flight, 190, 40):
+        strict, lenient = hard.step(moment, state, reference), soft.step(moment, state, reference)
+        assert strict.status == lenient.status == SOLVED
+        assert lenient.slack < 1e-7
+        np.testing.assert_allclose(lenient.speeds, strict.speeds, atol=5e-3)
+        active += strict.active
+    assert active > 100
+
+
+def test_soft_bounds_that_cannot_be_kept_are_left_by_no_more_than_must_be(vehicle: Vehicle) -> None:
+    """The largest slack is that of the next sample, which inputs hardly reach; ten times the price changes nothing."""
+    tilted = make_state(euler=(math.radians(12.0), 0.0, 0.0))
+    now = Moment(acting=np.full(4, vehicle.hover_speed))
+    assert robust(vehicle).step(now, tilted, HOLD).status != SOLVED
+    soft = robust(vehicle, penalty=SOFT).step(now, tilted, HOLD)
+    dearer = robust(vehicle, penalty=Penalty(l1=10.0 * SOFT.l1, l2=SOFT.l2)).step(now, tilted, HOLD)
+    assert soft.status == dearer.status == SOLVED
+    assert math.radians(6.0) < soft.slack < math.radians(7.0)
+    assert soft.slack == pytest.approx(dearer.slack, abs=1e-5)
+
+
+# Lag
+
+
+def test_rotors_are_followed_as_the_plants_own_lag(vehicle: Vehicle) -> None:
+    """Through commands in flight, one that is refused, and rotors that are stopped; to the instant the delay later."""
+    lag, delay = 0.03, 0.02
+    controller, rotors = robust(vehicle, rotor_lag=lag, delay=delay), RotorDynamics(rise=lag, fall=lag)
+    speeds, before = np.full(4, 150.0), np.full(4, 150.0)
+    controller.reset(speeds)
+    rng = np.random.default_rng(3)
+    for k in range(8):
+        acting = 150.0 + 10.0 * rng.normal(size=4)
+        state = np.full(12, math.nan) if k == 3 else np.zeros(12)
+        phase = Phase.LANDED if k == 5 else Phase.FLYING
+        # Since the last call's end, `before` has acted to the end of its period, as has `acting` since its beginning.
+        controller.step(Moment(acting=acting, phase=phase), state, HOLD)
+        speeds = rotors.respond(speeds, acting, np.array([PERIOD]))[0][0]
+        np.testing.assert_allclose(controller._rotors, speeds, atol=1e-9)
+        before = acting
+    assert np.abs(speeds - before).max() > 0.1
+
+
+def test_along_the_last_plan_the_prediction_is_the_nonlinear_models(vehicle: Vehicle) -> None:
+    """But for what one iteration leaves: little from the third period on, and nothing once the vehicle has settled."""
+    plant = nonlinear_model(vehicle, PERIOD, rotor_lag=0.03)
+    known = robust(vehicle, rotor_lag=0.03, penalty=SOFT, linearisation=Linearisation.TRAJECTORY)
+    start = make_state(position=(0.3, -0.2, 0.1), euler=(0.0, 0.0, 0.4))
+    errors = []
+    for state, _ in flown(known, plant, start, np.zeros((90, 4)), 24):
+        assert known._plan is not None
+        x = np.concatenate([state, known._rotors])
+        x = [x := advance(plant, x, inputs) for inputs in known._plan[1][:11]]
+        errors.append(np.abs(np.array(x) - known._plan[0][:11])[:, :12].max(axis=1))
+    assert np.max(errors[2:]) < 8e-4
+    assert np.max(np.array(errors)[2:, 0]) < 1e-5
+    assert np.max(errors[18:]) < 1e-5
+
+
+# Offset-free tracking
+
+
+@pytest.mark.parametrize("yaw", [0.0, 2.0])
+@pytest.mark.parametrize("linearisation", list(Linearisation))
+def test_rest_under_a_disturbance_is_an_equilibrium(vehicle: Vehicle, yaw: float, linearisation: Linearisation) -> None:
+    """Also of the controller: told that it rests where it shall, it commands what holds it there."""
+    model = nonlinear_model(vehicle, PERIOD, rotor_lag=0.03)
+    model = replace(model, acceleration=np.array([0.4, -0.3, 0.5]), angular_acceleration=np.array([0.5, -0.3, 0.1]))
+    x, u = equilibrium(model, yaw)
+    world = turn_horizontally(x, np.array(yaw))
+    world[INDEX["yaw"]] = yaw
+    np.testing.assert_allclose(derivative(model, world, u), 0.0, atol=1e-12)
+    controller = robust(vehicle, rotor_lag=0.03, heading=True, observer=ObserverSettings(), linearisation=linearisation)
+    controller.reset(u)
+    assert controller._observer is not None
+    controller._observer.estimate = np.concatenate([model.acceleration, model.angular_acceleration])
+    reference = np.tile([0.0, 0.0, 0.0, yaw], (50, 1))
+    np.testing.assert_allclose(controller.step(Moment(acting=u), world[:12], reference).speeds, u, atol=1e-4)
+
+
+@pytest.mark.parametrize("linearisation", [Linearisation.HOVER, Linearisation.TRAJECTORY])
+def test_constant_forces_torques_and_mass_leave_no_steady_error(vehicle: Vehicle, linearisation: Linearisation) -> None:
+    force, torque = np.array([0.3, -0.2, 0.25]), np.array([0.5, -0.3, 0.1])
+    reference = np.tile([0.0, 0.0, 0.0, 0.5], (300, 1))
+    settings: dict[str, Any] = {**EVERYTHING, "rotor_lag": 0.0, "delay": 0.0, "linearisation": linearisation}
+    disturbed = replace(nonlinear_model(vehicle, PERIOD), acceleration=force, angular_acceleration=torque)
+    heavy = nonlinear_model(replace(vehicle, mass=1.2 * vehicle.mass), PERIOD)
+    start = make_state(euler=(0.0, 0.0, 0.5))
+    controller = robust(vehicle, horizon=40, weight=0.01, **settings)
+    *_, (end, _) = flown(controller, disturbed, start, reference, 240)
+    np.testing.assert_allclose(end[[0, 2, 4, 10]], reference[0], atol=1e-3)
+    np.testing.assert_allclose(controller.disturbance, np.concatenate([force, torque]), atol=1e-3)
+    *_, (end, _) = flown(controller, heavy, start, reference, 240)
+    np.testing.assert_allclose(end[[0, 2, 4, 10]], reference[0], atol=1e-3)
+    *_, (end, _) = flown(
+        robust(vehicle, horizon=40, weight=0.01, **{**settings, "observer": None}), disturbed, start, reference, 60
+    )
+    assert np.abs(end[[0, 2, 4]]).max() > 0.05
+
+
+def test_what_is_stated_is_not_taken_for_a_disturbance(vehicle: Vehicle) -> None:
+    """Lag, delay and tilt are all in what the observer expects."""
+    plant = nonlinear_model(vehicle, PERIOD, rotor_lag=0.03)
+    controller = robust(vehicle, **EVERYTHING)
+    start = moving((0.3, -0.2, 0.1), euler=(0.05, -0.03, 2.0))
+    moved = [state for state, _ in flown(controller, plant, start, np.zeros((80, 4)), 20)]
+    np.testing.assert_allclose(controller.disturbance, 0.0, atol=1e-4)
+    assert np.abs(np.diff(moved, axis=0)[:, [7, 9, 11]]).max() > 0.05
+
+
+def test_nothing_is_learned_on_the_ground_or_from_what_is_no_number(vehicle: Vehicle) -> None:
+    controller = robust(vehicle, **EVERYTHING)
+    acting = np.full(4, vehicle.hover_speed)
+    pushed = moving((0.0, 0.0, 0.2))
+    for state, phase in (
+        (np.zeros(12), Phase.ARMED),
+        (pushed, Phase.FLYING),
+        (np.full(12, math.nan), Phase.FLYING),
+        (pushed, Phase.FLYING),
+    ):
+        controller.step(Moment(acting=acting, phase=phase), state, HOLD)
+        np.testing.assert_array_equal(controller.disturbance, 0.0)
+    controller.step(Moment(acting=acting), np.zeros(12), HOLD)
+    assert controller.disturbance[2] < -0.1
+    controller.step(Moment(acting=acting, phase=Phase.LANDED), pushed, HOLD)
+    np.testing.assert_array_equal(controller.disturbance, 0.0)
+
+
+# Heading
+
+
+@pytest.mark.parametrize("linearisation", list(Linearisation))
+def test_a_flight_turned_by_any_yaw_is_the_same_flight(vehicle: Vehicle, linearisation: Linearisation) -> None:
+    """With a side force and a torque to learn, lag, delay and a turn on the way."""
+    turn = 2.5
+    plant = nonlinear_model(vehicle, PERIOD, rotor_lag=0.03)
+    plant = replace(plant, angular_acceleration=np.array([0.5, -0.3, 0.1]))
+    start = moving((0.1, 0.3, 0.0), position=(0.4, -0.2, 0.1), euler=(0.02, -0.03, -0.2))
+    course = np.zeros((80, 4))
+    course[:, 0] = 0.02 * np.arange(80)
+    course[:, 3] = np.minimum(0.02 * np.arange(80), 0.6)
+    turned_course = course.copy()
+    turned_course[:, 0], turned_course[:, 1] = math.cos(turn) * course[:, 0], math.sin(turn) * course[:, 0]
+    turned_course[:, 3] += turn
+    turned_start = turn_horizontally(start, np.array(turn))
+    turned_start[INDEX["yaw"]] += turn
+    force = make_state(position=(0.3, -0.2, 0.1))
+    turned_force = turn_horizontally(force, np.array(turn))
+    flights = []
+    for x, reference, push in ((start, course, force), (turned_start, turned_course, turned_force)):
+        controller = robust(vehicle, **{**EVERYTHING, "linearisation": linearisation})
+        pushed = replace(plant, acceleration=push[[0, 2, 4]])
+        flights.append([np.array(part) for part in zip(*flown(controller, pushed, x, reference, 30), strict=True)])
+    (states, commands), (turned_states, turned_commands) = flights
+    back = turn_horizontally(turned_states, np.full(30, -turn))
+    back[:, INDEX["yaw"]] -= turn
+    # Where it is linearised anew, the QP itself is turned: then it is solved to its tolerance only.
+    np.testing.assert_allclose(back, states, atol=1e-6 if linearisation is Linearisation.HOVER else 1e-4)
+    np.testing.assert_allclose(turned_commands, commands, atol=1e-2)
+
+
+def test_far_from_its_yaw_the_vehicle_is_asked_for_a_part_of_the_turn_at_once(vehicle: Vehicle) -> None:
+    """Half a turn away asks for no more than the largest turn does; so do jumps on the way."""
+    far, near, jumping, twice = (HOLD.copy() for _ in range(4))
+    far[:, 3], near[:, 3] = math.pi, 0.02
+    jumping[0, 3], jumping[1:, 3] = 0.02, -4.0
+    twice[0, 3] = 0.02
+    controller = robust(vehicle, heading=True, weight=0.1, largest_turn=0.02)
+
+    def asked(reference: Array) -> Array:
+        controller.reset(np.full(4, vehicle.hover_speed))
+        return controller.step(Moment(), np.zeros(12), reference).plan
+
+    np.testing.assert_allclose(asked(far), asked(near), atol=1e-9)
+    np.testing.assert_allclose(asked(jumping), asked(twice), atol=1e-9)
+    assert 0.1 < np.abs(asked(near)[0] - vehicle.hover_speed).max() < 4.0  # not at the bound on its step
+
+
+# Delay
+
+
+@pytest.mark.parametrize("delay", [0.02, PERIOD])
+@pytest.mark.parametrize("rotor_lag", [0.0, 0.03])
+def test_a_delay_is_answered_from_where_the_vehicle_will_be(vehicle: Vehicle, delay: float, rotor_lag: float) -> None:
+    """As by a controller without delay that is asked there and then."""
+    model = nonlinear_model(vehicle, PERIOD, rotor_lag=rotor_lag or None)
+    state = moving((0.5, 0.0, 0.2), position=(0.3, -0.2, 0.1), euler=(0.02, -0.03, 0.4))
+    before, acting = np.full(4, vehicle.hover_speed), vehicle.hover_speed + np.array([1.0, -2.0, 3.0, -1.0])
+    late = robust(vehicle, delay=delay, rotor_lag=rotor_lag, heading=True)
+    late.reset(before)
+    # A ramp, so that the instants of the reference count as well.
+    ramp = 0.05 * np.arange(51.0)[:, None] * np.array([1.0, 0.5, 0.2, 0.1])
+    command = late.step(Moment(acting=acting), state, ramp[:50])
+    rotors = acting + (before - acting) * math.exp(-(PERIOD - delay) / rotor_lag) if rotor_lag else acting
+    there = advance(replace(model, period=delay), np.concatenate([state, rotors])[: model.n], acting)
+    prompt = robust(vehicle, rotor_lag=rotor_lag, heading=True)
+    prompt.reset(before)
+    shifted = ramp[:50] + delay / PERIOD * np.diff(ramp, axis=0)
+    shifted[-1] = ramp[49]
+    np.testing.assert_allclose(
+        command.speeds, prompt.step(Moment(acting=acting), there[:12], shifted).speeds, atol=1e-3
+    )
+
+
+# Statuses
+
+
+@pytest.mark.parametrize("linearisation", list(Linearisation))
+@pytest.mark.parametrize("value", [math.nan, math.inf, -1e6, 1e200])
+def test_numbers_out_of_hand_are_refused_and_forgotten(
+    vehicle: Vehicle, linearisation: Linearisation, value: float
+) -> None:
+    acting = np.full(4, vehicle.hover_speed)
+    controller = robust(vehicle, **{**EVERYTHING, "linearisation": linearisation})
+    for channel in (1, 4, 7, 8, 11):
+        controller.reset(acting)
+        controller.step(Moment(acting=acting), np.zeros(12), HOLD)
+        spoilt = np.zeros(12)
+        spoilt[channel] = value
+        command = controller.step(Moment(acting=acting), spoilt, HOLD)
+        assert command.status != SOLVED
+        np.testing.assert_array_equal(command.plan, np.tile(acting, (50, 1)))
+        after = controller.step(Moment(acting=acting), np.zeros(12), HOLD)
+        assert after.status == SOLVED
+        assert np.isfinite(controller.disturbance).all()
+    wrong = HOLD.copy()
+    wrong[7, 2] = value
+    assert controller.step(Moment(acting=acting), np.zeros(12), wrong).status == "invalid_data"
+
+
+@pytest.mark.parametrize("delay", [0.0, 0.02])
+@pytest.mark.parametrize("linearisation", list(Linearisation))
+def test_numbers_that_get_out_of_hand_on_the_way_spoil_nothing(
+    vehicle: Vehicle, linearisation: Linearisation, delay: float
+) -> None:
+    """Rates that no vehicle has, though a sensor might say so, overflow within a period of integration."""
+    acting = np.full(4, vehicle.hover_speed)
+    controller = robust(vehicle, **{**EVERYTHING, "linearisation": linearisation, "delay": delay})
+    for channel in (7, 9, 11):
+        spun = np.zeros(12)
+        spun[[channel, 8]] = 1e3, 1.5
+        for state in (np.zeros(12), spun, np.zeros(12)):
+            last = controller.step(Moment(acting=acting), state, HOLD)
+        assert last.status == SOLVED
+        assert np.isfinite(controller.disturbance).all()
+
+
+def test_what_is_not_solved_holds_the_command_in_force_and_says_so(vehicle: Vehicle) -> None:
+    controller = robust(vehicle)
+    acting = np.full(4, 120.0)
+    tilted = make_state(euler=(math.radians(30.0), 0.0, 0.0))
+    command = controller.step(Moment(acting=acting), tilted, HOLD)
+    assert command.status in {"primal_infeasible", "max_iterations", "numerics"}
+    assert command.active == 0
+    np.testing.assert_array_equal(command.plan, np.tile(acting, (50, 1)))
+    assert controller.step(Moment(acting=acting), np.zeros(12), HOLD).status == SOLVED
+
+
+@pytest.mark.parametrize("phase", [Phase.LANDED, Phase.CRASHED])
+def test_on_the_ground_rotors_are_stopped_as_fast_as_allowed(vehicle: Vehicle, phase: Phase) -> None:
+    controller = robust(vehicle, **EVERYTHING)
+    controller.reset(np.full(4, 15.0))
+    stops = [controller.step(Moment(phase=phase), np.zeros(12), HOLD) for _ in range(3)]
+    assert {command.status for command in stops} == {str(phase)}
+    assert [command.speeds.tolist() for command in stops] == [[5.0] * 4, [0.0] * 4, [0.0] * 4]
+
+
+def test_its_own_last_command_acts_where_none_is_told(vehicle: Vehicle) -> None:
+    told, untold = robust(vehicle, **EVERYTHING), robust(vehicle, **EVERYTHING)
+    state = make_state(position=(0.0, 0.0, -3.0))
+    acting = np.full(4, vehicle.hover_speed)
+    for controller in (told, untold):
+        controller.reset(acting)
+    for _ in range(4):
+        expected = told.step(Moment(acting=acting), state, HOLD)
+        np.testing.assert_array_equal(untold.step(Moment(), state, HOLD).speeds, expected.speeds)
+        assert np.all(expected.speeds <= acting + 5.0)
+        acting = expected.speeds
+    assert acting.min() > vehicle.hover_speed + 10.0
+
+
+def test_reset_starts_anew(vehicle: Vehicle) -> None:
+    controller = robust(vehicle, **{**EVERYTHING, "linearisation": Linearisation.TRAJECTORY})
+    plant = replace(nonlinear_model(vehicle, PERIOD), acceleration=np.array([0.3, 0.0, 0.2]))
+    start, reference = make_state(position=(0.2, 0.0, 0.0)), np.zeros((60, 4))
+    first, again = (np.array([u for _, u in flown(controller, plant, start, reference, 6)]) for _ in range(2))
+    np.testing.assert_allclose(again, first, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"rotor_lag": -0.1}, r"controller\.rotor_lag must be at least 0 s and finite; got -0\.1"),
+        ({"delay": math.inf}, r"controller\.delay must be at least 0 s and finite; got inf"),
+        ({"delay": 0.06}, r"controller\.delay must be at most the control period of 0\.05 s; got 0\.06"),
+        ({"largest_turn": 0.0}, r"controller\.largest_turn must be positive and finite; got 0\.0"),
+        ({"move_weight": np.eye(3)}, r"controller\.move_weight must be a symmetric matrix of shape \(4, 4\) without"),
+        ({"margins": np.zeros((49, 2))}, r"controller\.margins must be finite numbers >= 0 of shape \(50, 2\)"),
+    ],
+)
+def test_impossible_settings_are_refused(vehicle: Vehicle, settings: dict[str, Any], message: str) -> None:
+    with pytest.raises(ParameterError, match=message):
+        robust(vehicle, **settings)
+
+
+# Successive linearisation
+
+
+def test_a_yaw_counted_from_another_turn_changes_nothing(vehicle: Vehicle) -> None:
+    """Between two periods an estimator may count 2 pi more; the plan is then linearised about along with it."""
+    plain, counted = (robust(vehicle, penalty=SOFT, linearisation=Linearisation.TRAJECTORY) for _ in range(2))
+    state = make_state(position=(0.3, -0.2, 0.1), euler=(0.05, -0.04, 0.4))
+    for _ in range(3):
+        first = [controller.step(Moment(), state, HOLD).speeds for controller in (plain, counted)]
+        np.testing.assert_array_equal(first[0], first[1])
+    turned, reference = state.copy(), HOLD.copy()
+    turned[INDEX["yaw"]] += math.tau
+    reference[:, 3] += math.tau
+    expected = plain.step(Moment(), state, HOLD).speeds
+    np.testing.assert_allclose(counted.step(Moment(), turned, reference).speeds, expected, atol=1e-4)
+
+
+def eight(linearisation: Linearisation, *settings: str) -> tuple[float, float]:
+    """RMSE of the position [m] and largest tilt [deg] of a Hummingbird on a figure eight, its heading frame on."""
+    bounds = [f"controller.output_bounds.{name}=[-40.0,40.0]" for name in ("roll", "pitch")]
+    scenario = load_scenario("hummingbird-figure-eight", [*bounds, "duration=8.0", "controller.horizon=20", *settings])
+    vehicle = build_vehicle(scenario)
+    problem = build_problem(scenario, vehicle)
+    assert problem.bounds is not None
+    controller = RobustMPC(
+        vehicle,
+        period=scenario.control_period,
+        horizon=problem.horizon,
+        objective=problem.objective,
+        bounds=problem.bounds,
+        settings=RobustSettings(penalty=SOFT, heading=True, linearisation=linearisation),
+    )
+    with build_plant(scenario, vehicle) as plant:
+        log = fly_once(
+            scenario, vehicle, plant, controller, build_reference(scenario, scenario.periods + 20), navigation=None
+        )
+    assert log.reason is None
+    assert set(log.control.status) == {SOLVED}
+    errors = log.control.truth[:, [0, 2, 4]] - log.control.reference[:, :3]
+    euler = log.plant.state[:, [INDEX["roll"], INDEX["pitch"]]]
+    tilt = math.degrees(np.arccos(np.cos(euler).prod(axis=1)).max())
+    return math.sqrt((errors**2).sum(axis=1).mean()), tilt
+
+
+@pytest.mark.parametrize(
+    "course",
+    [
+        ("reference.period=5.4", "controller.input_weights.speed=1e-6"),
+        (
+            "reference.length=8.0",
+            "reference.period=7.7",
+            "reference.yaw_along_path=true",
+            "controller.output_weights.yaw=1.0",
+            "controller.input_weights.speed=1e-5",
+        ),
+    ],
+    ids=["yaw-held", "yaw-along"],
+)
+def test_a_figure_eight_at_30_deg_is_flown_three_times_as_well_as_by_the_hover_model(course: tuple[str, ...]) -> None:
+    (linear, _), (iterated, tilt) = (eight(kind, *course) for kind in (Linearisation.HOVER, Linearisation.TRAJECTORY))
+    assert 28.0 < tilt < 36.0
+    assert iterated < linear / 3.0

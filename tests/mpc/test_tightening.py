@@ -1,0 +1,319 @@
+"""Margins of output bounds: closed forms, the worst of disturbances, and flights that keep bounds at every instant."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+import scipy.linalg
+from support import paper_problem
+
+from mpc.model import discretise
+from mpc.nonlinear import derivative, nonlinear_model
+from mpc.observer import ObserverSettings
+from mpc.problem import Bounds
+from mpc.robust import RobustMPC, RobustSettings
+from mpc.stagewise import Penalty
+from mpc.tightening import (
+    ERROR_SHARE,
+    LARGEST_SHARE,
+    SPEED_SHARE,
+    TighteningSettings,
+    between_samples,
+    correction,
+    growth,
+    lagging_model,
+    margins,
+    observed,
+)
+from quadsim.errors import ParameterError
+from quadsim.state import INDEX, Array
+from quadsim.vehicle import Vehicle
+from scenarios.build import build_plant, build_problem, build_reference
+from scenarios.flying import fly_once
+from scenarios.loading import load_scenario
+
+PERIOD = 0.05
+HORIZON = 50
+LIMIT = math.radians(5.0)
+DOUBLE_INTEGRATOR = (
+    np.array([[0.0, 1.0], [0.0, 0.0]]),
+    np.array([[0.0], [1.0]]),
+    np.array([[1.0, 0.0]]),
+    np.array([[0.0], [1.0]]),
+)
+
+
+@cache
+def tilt_bounds() -> Bounds:
+    bounds = paper_problem().bounds
+    assert bounds is not None
+    return bounds
+
+
+def tilt_margins(
+    vehicle: Vehicle, settings: TighteningSettings | None = None, *, rotor_lag: float = 0.0, delay: float = 0.0
+) -> Array:
+    settings = TighteningSettings() if settings is None else settings
+    return margins(
+        vehicle,
+        period=PERIOD,
+        horizon=HORIZON,
+        bounds=tilt_bounds(),
+        settings=settings,
+        rotor_lag=rotor_lag,
+        delay=delay,
+    )
+
+
+# Closed forms
+
+
+def test_output_passes_samples_of_a_parabola_by_that_much() -> None:
+    t = np.linspace(0.0, PERIOD, 1001)
+    assert between_samples(3.0, PERIOD) == pytest.approx((1.5 * t * (PERIOD - t)).max(), rel=1e-9)
+
+
+@pytest.mark.parametrize("delay", [0.0, 0.02])
+def test_uncorrected_error_of_a_double_integrator_grows_with_the_square_of_time(delay: float) -> None:
+    A, B, C, E = DOUBLE_INTEGRATOR
+    found = growth(A, B, C, 0.7 * E, np.zeros((1, 2)), period=PERIOD, horizon=6, delay=delay)
+    times = delay + PERIOD * np.arange(1, 7)
+    np.testing.assert_allclose(found[:, 0], 0.7 * times**2 / 2.0, rtol=1e-12)
+
+
+def test_deadbeat_correction_of_a_double_integrator_ends_the_growth_after_two_periods() -> None:
+    A, B, C, E = DOUBLE_INTEGRATOR
+    K = np.array([[1.0 / PERIOD**2, 1.5 / PERIOD]])
+    found = growth(A, B, C, E, K, period=PERIOD, horizon=5)
+    np.testing.assert_allclose(found[:, 0], PERIOD**2 * np.array([0.5, 1.0, 1.0, 1.0, 1.0]), rtol=1e-9)
+
+
+# The worst of disturbances
+
+
+def errors(vehicle: Vehicle, w: Array, *, rotor_lag: float, delay: float, substeps: int) -> Array:
+    """Roll and pitch (steps, 2, M) of the error, simulated under M courses of the disturbance w (steps, 6, M).
+
+    It is measured at each period's start, predicted over the delay, and answered from then on for a period.
+    """
+    bounds = tilt_bounds()
+    A, B, E = lagging_model(vehicle, rotor_lag)
+    C = np.hstack([bounds.C_c, np.zeros((2, len(A) - 12))])
+    T = observed(A, C)
+    scaled = C @ T / (ERROR_SHARE * LIMIT)
+    K = correction(*discretise(T.T @ A @ T, T.T @ B, PERIOD), scaled, SPEED_SHARE * vehicle.hover_speed) @ T.T
+    step = PERIOD / substeps
+    late = round(delay / step)
+    A_d, inputs = discretise(A, np.hstack([B, E]), step)
+    A_late, B_late = discretise(A, B, delay)
+    e, acting, coming = np.zeros((len(A), w.shape[2])), np.zeros((4, w.shape[2])), np.zeros((4, w.shape[2]))
+    outputs = np.empty((len(w), 2, w.shape[2]))
+    for i, pushed in enumerate(w):
+        if i % substeps == 0:
+            if late == substeps:
+                acting = coming
+            coming = -K @ (A_late @ e + B_late @ acting)
+        if i % substeps == late:
+            acting = coming
+        e = A_d @ e + inputs @ np.concatenate([acting, pushed])
+        outputs[i] = C @ e
+    return outputs
+
+
+@pytest.mark.parametrize(("rotor_lag", "delay"), [(0.0, 0.0), (0.05, 0.0), (0.0, 0.02), (0.05, 0.05)])
+def test_margin_is_what_the_worst_disturbance_does_and_no_more(
+    vehicle: Vehicle, rotor_lag: float, delay: float
+) -> None:
+    largest, substeps, periods, about_x = np.repeat([0.5, 0.3], 3), 50, 10, 3
+    settings = TighteningSettings(acceleration=0.5, angular_acceleration=0.3, turning=0.0)
+    found = tilt_margins(vehicle, settings, rotor_lag=rotor_lag, delay=delay)
+    late = round(delay / PERIOD * substeps)
+    length = periods * substeps + late
+
+    def respond(w: Array) -> Array:
+        return errors(vehicle, w, rotor_lag=rotor_lag, delay=delay, substeps=substeps)
+
+    # What a push during each step does to roll at the end tells the worst course of pushes.
+    single = np.zeros((length, 6, length))
+    single[range(length), about_x, range(length)] = 1.0
+    worst = np.zeros((length, 6, 1))
+    worst[:, about_x, 0] = 0.3 * np.sign(respond(single)[-1, 0])
+    assert respond(worst)[-1, 0, 0] == pytest.approx(found[periods - 1, 0], rel=2e-3)
+
+    rng = np.random.default_rng(0)
+    for hold in (1, 10, substeps, 4 * substeps):
+        signs = rng.choice([-1.0, 1.0], (-(-length // hold), 6, 50)).repeat(hold, axis=0)[:length]
+        samples = np.abs(respond(largest[:, None] * signs)[late + substeps - 1 :: substeps])
+        assert (samples <= found[:periods, :, None] * (1.0 + 1e-9)).all()
+
+
+# What margins depend on
+
+
+def test_without_disturbance_only_the_way_between_samples_is_left(vehicle: Vehicle) -> None:
+    undisturbed = TighteningSettings(acceleration=0.0, angular_acceleration=0.0, turning=2.0)
+    np.testing.assert_allclose(tilt_margins(vehicle, undisturbed), 2.0 * PERIOD**2 / 8.0, rtol=1e-12)
+
+
+@pytest.mark.parametrize("rotor_lag", [0.0, 0.05])
+def test_margins_grow_over_the_horizon_and_saturate(vehicle: Vehicle, rotor_lag: float) -> None:
+    found = tilt_margins(vehicle, rotor_lag=rotor_lag)
+    assert found.shape == (HORIZON, 2)
+    assert (np.diff(found, axis=0) >= 0.0).all()
+    np.testing.assert_allclose(found[20], found[-1], rtol=1e-2)
+    np.testing.assert_allclose(found[:, 0], found[:, 1], rtol=1e-9)  # roll and pitch are alike
+
+
+def test_margins_grow_with_disturbance_lag_and_delay(vehicle: Vehicle) -> None:
+    least = tilt_margins(vehicle, TighteningSettings(angular_acceleration=0.2))
+    for more in (
+        tilt_margins(vehicle, TighteningSettings(angular_acceleration=0.3)),
+        tilt_margins(vehicle, TighteningSettings(angular_acceleration=0.2, turning=4.0)),
+        tilt_margins(vehicle, TighteningSettings(angular_acceleration=0.2), delay=0.02),
+    ):
+        assert (more > least).all()
+    lagging = tilt_margins(vehicle, TighteningSettings(angular_acceleration=0.2), rotor_lag=0.05)
+    np.testing.assert_allclose(lagging[0], least[0])  # nothing answers within a period
+    assert (lagging[1:] > least[1:]).all()
+
+
+def test_growth_is_proportional_to_the_disturbance(vehicle: Vehicle) -> None:
+    once, thrice = (tilt_margins(vehicle, TighteningSettings(angular_acceleration=w, turning=0.0)) for w in (0.2, 0.6))
+    np.testing.assert_allclose(thrice, 3.0 * once, rtol=1e-12)
+
+
+def test_margins_of_the_defaults_leave_nine_tenths_of_the_tilt(vehicle: Vehicle) -> None:
+    for rotor_lag, delay in ((0.0, 0.0), (0.05, 0.0), (0.0, 0.05)):
+        assert (tilt_margins(vehicle, rotor_lag=rotor_lag, delay=delay) < 0.1 * LIMIT).all()
+
+
+def test_wind_draws_in_bounds_of_velocity_and_not_those_of_tilt(vehicle: Vehicle) -> None:
+    still, windy = TighteningSettings(acceleration=0.0), TighteningSettings(acceleration=1.0)
+    np.testing.assert_allclose(tilt_margins(vehicle, windy), tilt_margins(vehicle, still), rtol=1e-9)
+    velocity = np.zeros((1, 12))
+    velocity[0, INDEX["vx"]] = 1.0
+    bounds = replace(tilt_bounds(), C_c=velocity, y_min=np.array([-3.0]), y_max=np.array([3.0]))
+
+    def drawn_in(settings: TighteningSettings) -> Array:
+        return margins(vehicle, period=PERIOD, horizon=HORIZON, bounds=bounds, settings=settings)
+
+    first = drawn_in(windy)[0] - drawn_in(still)[0]
+    np.testing.assert_allclose(first, PERIOD)  # v = w t before anything answers
+
+
+@pytest.mark.parametrize(("names", "rotor_lag", "count"), [(("roll",), 0.0, 2), (("roll",), 0.05, 3), (("x",), 0.0, 4)])
+def test_outputs_observe_no_more_than_their_own_chain(
+    vehicle: Vehicle, names: tuple[str, ...], rotor_lag: float, count: int
+) -> None:
+    A, _, _ = lagging_model(vehicle, rotor_lag)
+    C = np.zeros((len(names), len(A)))
+    C[range(len(names)), [INDEX[name] for name in names]] = 1.0
+    basis = observed(A, C)
+    assert basis.shape == (len(A), count)
+    np.testing.assert_allclose(basis.T @ basis, np.eye(count), atol=1e-12)
+    # Nothing outside the basis ever shows in the outputs.
+    for t in (0.05, 1.0):
+        seen = C @ scipy.linalg.expm(A * t)
+        np.testing.assert_allclose(seen @ basis @ basis.T, seen, atol=1e-9)
+
+
+def test_lagging_model_is_the_derivative_of_the_nonlinear_one_at_hover(vehicle: Vehicle) -> None:
+    model = nonlinear_model(vehicle, PERIOD, rotor_lag=0.03)
+    x, u = np.concatenate([np.zeros(12), np.full(4, vehicle.hover_speed)]), np.full(4, vehicle.hover_speed)
+    A, B, E = lagging_model(vehicle, 0.03)
+    h = 1e-4
+
+    def slope(x: Array, u: Array, w: Array) -> Array:
+        return derivative(replace(model, acceleration=w[:3], angular_acceleration=w[3:]), x, u)
+
+    point = np.concatenate([x, u, np.zeros(6)])
+    columns = []
+    for step in h * np.eye(len(point)):
+        ahead, behind = (slope(*np.split(q, [16, 20])) for q in (point + step, point - step))
+        columns.append((ahead - behind) / (2.0 * h))
+    np.testing.assert_allclose(np.hstack([A, B, E]), np.stack(columns, axis=1), atol=1e-6)
+
+
+# Errors
+
+
+@pytest.mark.parametrize("name", ["acceleration", "angular_acceleration", "turning"])
+@pytest.mark.parametrize("value", [-0.1, math.inf, math.nan])
+def test_settings_name_the_number_that_is_impossible(name: str, value: float) -> None:
+    with pytest.raises(ParameterError, match=rf"controller\.tightening\.{name} must be at least 0 and finite"):
+        TighteningSettings(**{name: value})
+
+
+def test_disturbances_too_large_for_the_bounds_are_refused(vehicle: Vehicle) -> None:
+    rule = rf"tightening must be smaller: output \d, bounded to 0\.0873 .* at most {LARGEST_SHARE:g} of that is allowed"
+    with pytest.raises(ParameterError, match=rule):
+        tilt_margins(vehicle, TighteningSettings(angular_acceleration=20.0))
+
+
+def test_bound_on_one_side_only_is_refused(vehicle: Vehicle) -> None:
+    bounds = replace(tilt_bounds(), y_max=np.array([LIMIT, np.inf]))
+    with pytest.raises(ParameterError, match="output_bounds must be finite on both sides"):
+        margins(vehicle, period=PERIOD, horizon=HORIZON, bounds=bounds, settings=TighteningSettings())
+
+
+# Flights
+
+WIND = "effects.air={rotor_drag=3e-4, wind=[1.0, 0.0, 0.0]}"
+PUSH = "effects.disturbance={force=[0.3, 0.2, 0.0], torque=[0.0099, -0.0099, 0.003]}"  # 0.3 rad/s^2 of roll and pitch
+_LOSSES = ((10.3, 1, 0.4), (11.2, 3, 0.6), (12.0, 1, 1.2), (13.0, 3, 0.8))
+CHANGING = "events=[{}]".format(  # 0.27 rad/s^2 of pitch each, to either side
+    ", ".join(
+        f'{{type="rotor_loss", at={at}, rotor={rotor}, loss=0.003, duration={lasts}}}' for at, rotor, lasts in _LOSSES
+    )
+)
+LAG = 0.05
+LAGGING = (f"effects.rotors.rise={LAG}", f"effects.rotors.fall={LAG}")
+
+
+def peak_tilt(vehicle: Vehicle, *sets: str, tight: bool = True, rotor_lag: float = 0.0) -> float:
+    """Largest roll or pitch [rad] over the paper's first 13.5 s, at the physics rate."""
+    scenario = load_scenario("paper-constrained", ["duration=13.5", *sets])
+    problem = build_problem(scenario, vehicle)
+    assert problem.bounds is not None
+    controller = RobustMPC(
+        vehicle,
+        period=PERIOD,
+        horizon=HORIZON,
+        objective=replace(problem.objective, Q_u=0.1 * np.eye(4)),
+        bounds=problem.bounds,
+        settings=RobustSettings(
+            penalty=Penalty(l1=np.full(2, 2e5), l2=np.full(2, 1e4)),
+            rotor_lag=rotor_lag,
+            observer=ObserverSettings(),
+            heading=True,
+            move_weight=20.0 * np.eye(4),
+            margins=tilt_margins(vehicle, rotor_lag=rotor_lag) if tight else None,
+        ),
+    )
+    reference = build_reference(scenario, scenario.periods + HORIZON)
+    with build_plant(scenario, vehicle) as plant:
+        log = fly_once(scenario, vehicle, plant, controller, reference, navigation=None)
+    assert log.reason is None
+    assert len(log.plant.t) > 13_499  # each physics step
+    return float(np.abs(log.plant.state[:, [INDEX["roll"], INDEX["pitch"]]]).max())
+
+
+def test_without_margins_the_tilt_passes_its_bound(vehicle: Vehicle) -> None:
+    assert peak_tilt(vehicle, CHANGING, tight=False) > LIMIT
+
+
+@pytest.mark.parametrize(
+    ("sets", "rotor_lag"),
+    [((), 0.0), ((WIND, PUSH, *LAGGING), LAG), ((CHANGING,), 0.0)],
+    ids=["nominal", "wind, push and lag", "changing"],
+)
+def test_with_margins_the_tilt_stays_within_its_bound_at_every_instant(
+    vehicle: Vehicle, sets: tuple[str, ...], rotor_lag: float
+) -> None:
+    peak = peak_tilt(vehicle, *sets, rotor_lag=rotor_lag)
+    assert peak <= LIMIT
+    assert peak > 0.9 * LIMIT  # and is not bought by staying far away
