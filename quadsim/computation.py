@@ -24,20 +24,23 @@ class Computation:
     """How long the controller's computer takes from a measurement to the command, seconds of simulated time.
 
     The sum of a fixed part, a part per solver iteration, an exponentially distributed part, and the wait for the end of
-    a stall.  A command that comes after the next period's begin has missed its deadline: it is dropped, and the one
-    before it goes on acting.
+    a stall.  A command that comes after the next period's begin has missed its deadline and is dropped.  What acts
+    until one comes is the command before it or, with `plan`, the next step of the last plan that came in time: where
+    commands are due `fixed` after their measurement, the actuators' side has that plan and goes on by it.
 
     Attributes:
         fixed: [s].
         per_iteration: [s] for each iteration that the solver reports.
         jitter: mean of the random part [s]; exponential, as the wait for a busy processor is.
         stalls: when the computer answers nothing.
+        plan: whether the last plan is gone on with while no command has come.
     """
 
     fixed: float = 0.0
     per_iteration: float = 0.0
     jitter: float = 0.0
     stalls: tuple[Stall, ...] = ()
+    plan: bool = False
 
     def __post_init__(self) -> None:
         for name in ("fixed", "per_iteration", "jitter"):

@@ -124,7 +124,10 @@ class Controller(Protocol):
         ...
 
     def predict(self, states: Array, plans: Array) -> Array:
-        """Predicted states (K, N, 12) for K measured states (K, 12) and plans (K, N, 4), as the controller saw them."""
+        """Predicted states (K, N, 12) for K measured states (K, 12) and plans (K, N, 4), as the controller saw them.
+
+        For pictures alone.  A controller without a model may lack it, and then flies without `horizon.parquet`.
+        """
         ...
 
 

@@ -73,6 +73,7 @@ def fly(
     start = plant.physics
     samples: list[Sample] = []
     acting = np.array(initial_speeds, float)
+    plan, age = acting[None], 0  # the last plan that came in time, and how many periods ago
     draws = rng if rng is not None else np.random.default_rng(0)
     ended: FlightError | None = None
     try:
@@ -89,10 +90,17 @@ def fly(
             delay = 0.0 if computation is None else computation.delay(now.time, command, draws)
             wait = math.ceil(delay / plant.timestep - 1e-6)
             missed = wait > steps_per_period  # one that comes just in time acts from the next period on
-            holds = [(acting, min(wait, steps_per_period))] if wait else []
-            if not missed:
-                acting = command.speeds
-                holds += [(acting, steps_per_period - wait)] if wait < steps_per_period else []
+            due = min(wait, steps_per_period)
+            if computation is not None and computation.plan:
+                due = min(due, math.ceil(computation.fixed / plant.timestep - 1e-6))
+            holds = [(acting, due), (_next_row(plan, age), min(wait, steps_per_period) - due)]
+            if missed:
+                age += 1
+                acting = holds[1][0] if holds[1][1] else acting
+            else:
+                acting, plan, age = command.speeds, command.plan, 0
+                holds.append((acting, steps_per_period - wait))
+            holds = [(speeds, steps) for speeds, steps in holds if steps > 0]
             flown = [(plant.advance(speeds, steps), plant.applied(speeds)) for speeds, steps in holds]
             if navigation is not None:
                 for stretch, speeds in flown:
@@ -158,6 +166,12 @@ class Sample:
     rotors: Array
 
 
+def _next_row(plan: Array, age: int) -> Array:
+    """What a plan (N, 4) has for the period after its first and `age` more; its last row beyond its end."""
+    row: Array = plan[min(age + 1, len(plan) - 1)]
+    return row
+
+
 def _control_log(
     samples: list[Sample], states: Array, truth: Array, reference: Array, initial_speeds: Array, period: float
 ) -> ControlLog:
@@ -210,7 +224,8 @@ def _times(count: int, spacing: float) -> Array:
 
 
 def _predict(controller: Controller, states: Array, commands: list[Command]) -> np.ndarray | None:
-    if not commands:
+    predict = getattr(controller, "predict", None)  # a controller without a model has none
+    if not commands or predict is None:
         return None
     plans = np.stack([command.plan for command in commands])
-    return np.ascontiguousarray(controller.predict(states, plans)[:, :, [0, 2, 4]], dtype=np.float32)
+    return np.ascontiguousarray(predict(states, plans)[:, :, [0, 2, 4]], dtype=np.float32)

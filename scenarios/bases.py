@@ -9,6 +9,7 @@ from typing import Any, Final
 
 from quadsim.assets import read_toml
 from quadsim.errors import FileError, InputError, ParameterError
+from scenarios.spec.own import located
 
 LARGEST_FILE: Final = 4_000_000
 """Size [bytes] of the largest file that is read; the longest scenario there can be is smaller."""
@@ -95,6 +96,8 @@ def _read(path: Path) -> dict[str, Any]:
         raise FileError(path, f"is not valid TOML: {error}") from error
     if is_deeper(data, DEEPEST):
         raise FileError(path, f"must have at most {DEEPEST} tables and lists within one another")
+    if isinstance(data.get("controller"), str):  # its name alone, which a table over it, or a setting, adds to
+        data["controller"] = {"type": data["controller"]}
     return data
 
 
@@ -112,3 +115,5 @@ def _locate(data: dict[str, Any], directory: Path) -> None:
         file = data.get(table, {}).get(field) if isinstance(data.get(table), dict) else None
         if isinstance(file, str) and (directory / file).is_file():
             data[table][field] = str((directory / file).resolve())
+    if "controller" in data:
+        data["controller"] = located(data["controller"], directory)

@@ -3,35 +3,36 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 
-from mpc.constrained import ConstrainedMPC
-from mpc.model import hover_model
-from mpc.problem import Bounds, Objective, Problem
-from mpc.solvers import QPSolver
-from mpc.unconstrained import UnconstrainedMPC
+from mpc.problem import Problem
 from quadsim.airframe import outline
 from quadsim.assets import vehicle_path
 from quadsim.audit import Limit
 from quadsim.controller import Controller
-from quadsim.errors import InputError
+from quadsim.errors import InputError, ParameterError
 from quadsim.phase import PhaseMonitor
 from quadsim.plant import Plant
-from quadsim.state import INDEX, N_STATES, STATE_NAMES, Array, make_state
+from quadsim.state import Array, make_state
 from quadsim.vehicle import N_ROTORS, OPTIONAL_PARAMETERS, VEHICLE_UNITS, Vehicle, load_vehicle
+from scenarios.controllers import make_controller, make_problem
 from scenarios.courses import build_course_steps as build_course_steps
 from scenarios.courses import build_reference as build_reference
 from scenarios.effects import build_effects, build_wind, resolve_effects
 from scenarios.randomness import generator
-from scenarios.spec import ANGLES, ConstrainedSpec, Scenario
+from scenarios.spec import Scenario
+from scenarios.spec.optimisation import WeightedSpec
 
 CONTROLLERS: Final = {
     "unconstrained": "the paper's Sec. 4: a constant gain from the unconstrained optimum",
     "constrained": "the paper's Sec. 5: at most one QP per period, tilt, rotor speeds and their steps bounded",
+    "robust": "constrained, with soft bounds, rotor lag, delay, disturbances, heading and more, each switched on alone",
+    "lqr": "infinite-horizon LQR on the hover model, following the reference's velocity",
+    "pid": "cascaded PID, as autopilots fly it",
+    "geometric": "geometric tracking control on SE(3)",
 }
 
 
@@ -99,36 +100,24 @@ def build_initial_speeds(scenario: Scenario, vehicle: Vehicle) -> Array:
 
 
 def build_problem(scenario: Scenario, vehicle: Vehicle) -> Problem:
-    """The controller's optimisation."""
+    """The controller's optimisation.
+
+    Raises:
+        InputError: the controller has none.
+    """
     spec = scenario.controller
-    regulated = [name for name in STATE_NAMES if name in spec.output_weights]
-    objective = Objective(
-        C_r=_selection(regulated),
-        Q_y=np.diag([spec.output_weights[name] for name in regulated]),
-        Q_u=np.diag(np.broadcast_to(np.asarray(spec.input_weights.speed, float), N_ROTORS)),
-    )
-    bounds = _build_bounds(spec) if isinstance(spec, ConstrainedSpec) else None
-    model = hover_model(vehicle, scenario.control_period)
-    return Problem(model=model, horizon=spec.horizon, objective=objective, bounds=bounds)
+    if not isinstance(spec, WeightedSpec):
+        raise ParameterError("controller", "type", spec.type, "one that minimises over a horizon")
+    return make_problem(spec, vehicle, scenario.control_period)
 
 
 def build_controller(scenario: Scenario, vehicle: Vehicle) -> Controller:
     """The controller, set up and ready to be flown.
 
     Raises:
-        InputError: no gain can be computed from these numbers.
+        InputError: it cannot be made from these numbers, or its code cannot be found or called.
     """
-    problem = build_problem(scenario, vehicle)
-    if isinstance(scenario.controller, ConstrainedSpec):
-        solver = QPSolver(scenario.controller.solver, problem)
-        return ConstrainedMPC(problem, solver, shortcut=scenario.controller.shortcut)
-    try:
-        return UnconstrainedMPC(problem)
-    except np.linalg.LinAlgError as error:
-        raise InputError(
-            "the controller's gain cannot be computed: its weights and the vehicle's numbers are too many orders of "
-            f"magnitude apart ({error})"
-        ) from error
+    return make_controller(scenario.controller, vehicle, scenario.control_period)
 
 
 def build_limits(scenario: Scenario) -> tuple[Limit, ...]:
@@ -150,26 +139,4 @@ def build_limits(scenario: Scenario) -> tuple[Limit, ...]:
             stop=or_infinite(spec.stop, 1.0),
         )
         for spec in scenario.constraints
-    )
-
-
-def _selection(names: Sequence[str]) -> Array:
-    """Rows of the identity that pick states by name."""
-    return np.eye(N_STATES)[[INDEX[name] for name in names]]
-
-
-def _build_bounds(spec: ConstrainedSpec) -> Bounds:
-    constrained = [name for name in STATE_NAMES if name in spec.output_bounds]
-    scale = np.array([math.radians(1.0) if name in ANGLES else 1.0 for name in constrained])
-    pairs = np.array([spec.output_bounds[name] for name in constrained], float).reshape(-1, 2)
-    lower_speed, upper_speed = spec.input_bounds.speed
-    lower_slew, upper_slew = spec.input_bounds.slew
-    return Bounds(
-        C_c=_selection(constrained),
-        y_min=scale * pairs[:, 0],
-        y_max=scale * pairs[:, 1],
-        delta_min=np.full(N_ROTORS, lower_slew),
-        delta_max=np.full(N_ROTORS, upper_slew),
-        u_min=np.full(N_ROTORS, lower_speed),
-        u_max=np.full(N_ROTORS, upper_speed),
     )

@@ -141,7 +141,9 @@ def build_computation(scenario: Scenario) -> Computation | None:
     spec = scenario.computation
     if spec is None:
         return Computation(stalls=stalls) if stalls else None
-    return Computation(fixed=spec.delay, per_iteration=spec.per_iteration, jitter=spec.jitter, stalls=stalls)
+    return Computation(
+        fixed=spec.delay, per_iteration=spec.per_iteration, jitter=spec.jitter, stalls=stalls, plan=spec.plan
+    )
 
 
 def _filled(table: Table, **values: Any) -> Table:

@@ -17,6 +17,7 @@ from scenarios.courses.build import located
 from scenarios.problems import ScenarioError, describe
 from scenarios.spec import Scenario
 from scenarios.spec.course import CsvSpec
+from scenarios.spec.own import located as located_controller
 
 LIBRARY: Final = Path(__file__).resolve().parent / "library"
 
@@ -69,12 +70,15 @@ def parse_scenario(data: Mapping[str, Any], *, source: str = "scenario", directo
     Args:
         data: the parsed TOML.
         source: what to call it in messages.
-        directory: where relative paths of vehicles and courses are looked up, besides the working directory.
+        directory: where relative paths of vehicles and courses are looked up, besides the working directory, and the
+            module of a controller that is not ours.
 
     Raises:
         ScenarioError: naming every field that is wrong.
         FileError: the course's table is wrong.
     """
+    if directory is not None and "controller" in data:
+        data = {**data, "controller": located_controller(data["controller"], directory)}
     try:
         scenario = Scenario.model_validate(dict(data))
     except ValidationError as error:

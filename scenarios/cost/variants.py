@@ -39,6 +39,7 @@ def with_vehicles(
 def without_constraints(scenario: Scenario) -> Scenario:
     """The counterpart: same weights and horizon, flown by the unconstrained controller."""
     spec = scenario.controller
+    assert isinstance(spec, ConstrainedSpec)
     free = UnconstrainedSpec(
         type="unconstrained",
         horizon=spec.horizon,

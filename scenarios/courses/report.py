@@ -12,7 +12,8 @@ from quadsim.feasibility import STENCIL, Feasibility, Mask, assess, demand
 from quadsim.state import Array
 from quadsim.vehicle import Vehicle
 from scenarios.courses.build import build_course, filtered, initial_pose
-from scenarios.spec import ANGLES, ConstrainedSpec, Scenario
+from scenarios.spec import ANGLES, Scenario
+from scenarios.spec.optimisation import BoundedSpec
 
 
 def report(scenario: Scenario, vehicle: Vehicle) -> Feasibility:
@@ -58,7 +59,7 @@ def _isolated(kinks: Sequence[float], period: float) -> Array:
 def _bounds(scenario: Scenario) -> dict[str, tuple[float, float]]:
     """The controller's bounds, SI."""
     spec = scenario.controller
-    if not isinstance(spec, ConstrainedSpec):
+    if not isinstance(spec, BoundedSpec):
         return {}
     scales = {name: math.radians(1.0) if name in ANGLES else 1.0 for name in spec.output_bounds}
     bounds = {name: (scales[name] * lower, scales[name] * upper) for name, (lower, upper) in spec.output_bounds.items()}

@@ -2,86 +2,28 @@
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Mapping
-from typing import Annotated, Final, Literal
+from typing import Annotated, Any, Literal
 
-from annotated_types import Len
-from pydantic import Discriminator, Field, Tag, model_validator
+from pydantic import BeforeValidator, Discriminator, Field, Tag, model_validator
+from pydantic_core import PydanticCustomError
 
 from mpc.solvers import SOLVERS
 from quadsim.errors import UnknownNameError
-from quadsim.state import STATE_NAMES, STATE_UNITS
-from scenarios.spec.base import Pair, Spec, require_ordered
-
-LARGEST_HORIZON: Final = 1000
-ANGLES: Final = frozenset(name for name, unit in zip(STATE_NAMES, STATE_UNITS, strict=True) if unit.startswith("rad"))
-"""States that scenario files give in degrees (per second)."""
-
-Weight = Annotated[float, Field(gt=0.0, le=1e12)]
+from scenarios.spec.baselines import GeometricSpec, LQRSpec, PIDSpec
+from scenarios.spec.fallback import FallbackSpec
+from scenarios.spec.optimisation import BoundedSpec, WeightedSpec
+from scenarios.spec.own import FORM, LAWS, OwnSpec, is_own
+from scenarios.spec.robust import RobustSpec
 
 
-def _number_or_list(value: object) -> str:
-    return "list" if isinstance(value, list) else "number"
-
-
-Weights = Annotated[
-    Annotated[Weight, Tag("number")] | Annotated[list[Weight], Len(4, 4), Tag("list")], Discriminator(_number_or_list)
-]
-"""One weight for all rotors, or one each."""
-
-
-class InputWeightsSpec(Spec):
-    """What it costs to move the rotor speeds away from hover."""
-
-    speed: Weights = Field(description="[1/(rad/s)^2] diagonal of Q_u: one weight for all rotors, or a list of four")
-
-
-class InputBoundsSpec(Spec):
-    """Hard bounds on the rotor speeds and their steps, for every rotor."""
-
-    speed: Pair = Field(description="[rad/s] u_min, u_max of every rotor.  Eq. (20)")
-    slew: Pair = Field(description="[rad/s per period] delta_min, delta_max of every rotor.  Eq. (15)")
-
-    @model_validator(mode="after")
-    def _check(self) -> InputBoundsSpec:
-        require_ordered("speed", self.speed)
-        require_ordered("slew", self.slew)
-        if self.speed[0] < 0.0:
-            raise ValueError(f"speed must have a lower bound >= 0 rad/s; got {self.speed}")
-        if not self.slew[0] <= 0.0 <= self.slew[1]:
-            raise ValueError(f"slew must allow a speed to be held, so contain 0; got {self.slew}")
-        return self
-
-
-def _known_states(values: Mapping[str, object], name: str) -> None:
-    for key in values:
-        if key not in STATE_NAMES:
-            near = difflib.get_close_matches(key, STATE_NAMES, n=1)
-            guess = f"; did you mean {near[0]!r}?" if near else ""
-            raise ValueError(f"{name}.{key} is not a state{guess} (there are: {', '.join(STATE_NAMES)})")
-
-
-class _ControllerSpec(Spec):
-    horizon: Annotated[int, Field(ge=1, le=LARGEST_HORIZON)] = Field(description="[periods] N, how far it looks ahead")
-    output_weights: Annotated[dict[str, Weight], Len(1)] = Field(
-        description="diagonal of Q_y [1/unit of the state^2, rad for angles]; the states named here are C_r"
-    )
-    input_weights: InputWeightsSpec
-
-    @model_validator(mode="after")
-    def _check_outputs(self) -> _ControllerSpec:
-        _known_states(self.output_weights, "output_weights")
-        return self
-
-
-class UnconstrainedSpec(_ControllerSpec):
+class UnconstrainedSpec(WeightedSpec):
     """The paper's unconstrained MPC, a constant gain (Sec. 4)."""
 
     type: Literal["unconstrained"] = Field(description="the control law, by its name in `quadsim list`")
 
 
-class ConstrainedSpec(_ControllerSpec):
+class ConstrainedSpec(BoundedSpec):
     """The paper's constrained MPC, at most one QP per period (Sec. 5)."""
 
     type: Literal["constrained"] = Field(description="the control law, by its name in `quadsim list`")
@@ -93,16 +35,43 @@ class ConstrainedSpec(_ControllerSpec):
     shortcut: bool = Field(
         default=True, description="take the unconstrained optimum where no constraint bars it; exact"
     )
-    output_bounds: dict[str, Pair] = Field(
-        default={}, description="[deg, deg/s, m, m/s] y_c_min, y_c_max; the states named here are C_c"
+    fallback: FallbackSpec | None = Field(
+        default=None, description="absent: the last plan is held, shifted, and then the flight is given up"
     )
-    input_bounds: InputBoundsSpec
 
     @model_validator(mode="after")
     def _check(self) -> ConstrainedSpec:
-        _known_states(self.output_bounds, "output_bounds")
-        for name, pair in self.output_bounds.items():
-            require_ordered(f"output_bounds.{name}", pair)
         if self.solver not in SOLVERS:
             raise ValueError(f"solver: {UnknownNameError('solver', self.solver, SOLVERS)}")
         return self
+
+
+def _law(controller: object) -> str | None:
+    """Which of the laws below a table is of; what is neither ours nor code is left for the message."""
+    given = controller.get("type") if isinstance(controller, Mapping) else getattr(controller, "type", None)
+    if not isinstance(given, str):
+        return None
+    return given if given in LAWS or not is_own(given) else FORM
+
+
+def _spelt_out(controller: Any) -> Any:
+    """A law's name alone as the table that it stands for."""
+    if isinstance(controller, str):
+        return {"type": controller}
+    if not isinstance(controller, Mapping | WeightedSpec | LQRSpec | PIDSpec | GeometricSpec | OwnSpec):
+        raise PydanticCustomError("controller", "a table or a controller's name")
+    return controller
+
+
+_Table = Annotated[
+    Annotated[UnconstrainedSpec, Tag("unconstrained")]
+    | Annotated[ConstrainedSpec, Tag("constrained")]
+    | Annotated[RobustSpec, Tag("robust")]
+    | Annotated[LQRSpec, Tag("lqr")]
+    | Annotated[PIDSpec, Tag("pid")]
+    | Annotated[GeometricSpec, Tag("geometric")]
+    | Annotated[OwnSpec, Tag(FORM)],
+    Discriminator(_law),
+]
+ControllerSpec = Annotated[_Table, BeforeValidator(_spelt_out, json_schema_input_type=_Table | str)]
+"""Any of the laws, told apart by its type; one whose fields all have defaults may be given by its name alone."""

@@ -12,7 +12,7 @@ from quadsim.physics import steps_per_period
 from scenarios.spec.base import MOST_ENTRIES, Spec
 from scenarios.spec.computation import ComputationSpec
 from scenarios.spec.constraint import ConstraintSpec
-from scenarios.spec.controller import ConstrainedSpec, UnconstrainedSpec
+from scenarios.spec.controller import ControllerSpec
 from scenarios.spec.course import ReferenceSpec
 from scenarios.spec.effects import EffectsSpec
 from scenarios.spec.events import Event, PayloadDropEvent, PayloadPickupEvent, SensorFaultEvent
@@ -61,7 +61,7 @@ class Scenario(Spec):
     initial: InitialSpec = InitialSpec()
     plant: PlantSpec = PlantSpec()
     reference: ReferenceSpec
-    controller: Annotated[UnconstrainedSpec | ConstrainedSpec, Field(discriminator="type")]
+    controller: ControllerSpec
     effects: EffectsSpec = EffectsSpec()
     computation: ComputationSpec | None = Field(default=None, description="absent: commands take no time")
     sensors: SensorsSpec | None = Field(default=None, description="absent: the controller is told the true state")

@@ -99,6 +99,29 @@ def test_a_missed_deadline_leaves_the_last_command_acting(vehicle: Vehicle, spee
     assert numbers["delay_ms"]["max"] == pytest.approx(120.0)
 
 
+def test_a_late_command_leaves_the_plan_going_on(vehicle: Vehicle, speeds: Array) -> None:
+    """Due after 10 ms, stalled over periods 2 to 4: the plan of period 1 goes on from when each command was due."""
+
+    class Planner(Scripted):
+        def step(self, now: Moment, state: Array, reference: Array) -> Command:
+            command = super().step(now, state, reference)
+            plan = command.speeds + np.arange(4.0)[:, None]
+            return Command(speeds=command.speeds, plan=plan)
+
+    computation = Computation(fixed=0.01, stalls=(Stall(start=0.1, duration=0.125),), plan=True)
+    with Plant(vehicle) as plant:
+        log = fly_scripted(plant, Planner(speeds, horizon=4), computation=computation)
+    acting = log.plant.speeds[:-1].reshape(-1, STEPS, 4)
+    for k, before, late in ((2, 0.0, 1.0), (3, 1.0, 2.0)):
+        np.testing.assert_array_equal(acting[k, :10], np.tile(speeds[1] + before, (10, 1)))
+        np.testing.assert_array_equal(acting[k, 10:], np.tile(speeds[1] + late, (40, 1)))
+    np.testing.assert_array_equal(acting[4, :10], np.tile(speeds[1] + 2.0, (10, 1)))
+    np.testing.assert_array_equal(acting[4, 10:25], np.tile(speeds[1] + 3.0, (15, 1)))
+    np.testing.assert_array_equal(acting[4, 25:], np.tile(speeds[4], (25, 1)))
+    assert [status == MISSED for status in log.control.status[:6]] == [False, False, True, True, False, False]
+    np.testing.assert_array_equal(log.control.speeds[2:5], [speeds[1] + 1.0, speeds[1] + 2.0, speeds[4]])
+
+
 def test_a_command_just_in_time_acts_a_period_later(vehicle: Vehicle, speeds: Array) -> None:
     controller = Scripted(speeds)
     with Plant(vehicle) as plant:

@@ -1,0 +1,33 @@
+"""A controller in thirty lines: PD on position and on attitude, with the course's motion and the weight fed forward."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from quadsim.controller import Moment
+from quadsim.state import POSITION, VELOCITY
+from quadsim.vehicle import Vehicle
+
+Array = NDArray[np.float64]
+
+
+class MyController:
+    """Errors ask for an acceleration, that for roll and pitch, and these for torques; gains are per unit mass."""
+
+    def __init__(self, vehicle: Vehicle, period: float, horizon: int, stiffness: float = 1.5, lead: int = 8) -> None:
+        self.vehicle, self.period, self.stiffness, self.lead = vehicle, period, stiffness, min(lead, horizon - 3)
+        self.inertia = np.array([vehicle.mass, *vehicle.inertia])
+        self.to_squares = np.linalg.inv(vehicle.allocation)  # from thrust and torques to squared rotor speeds
+
+    def step(self, now: Moment, state: Array, reference: Array) -> Array:
+        """Four rotor speeds [rad/s] for a state (12,) and the next N samples of the course (N, 4)."""
+        (roll, pitch, yaw), rates, g = state[[6, 8, 10]], state[[7, 9, 11]], self.vehicle.gravity
+        velocity = np.diff(reference[:, :3], axis=0) / self.period
+        a = (velocity[self.lead + 1] - velocity[self.lead]) / self.period  # the tilt that gives it takes a while
+        a += self.stiffness * (reference[0, :3] - state[list(POSITION)] - self.period * velocity[0])
+        a += 2.0 * np.sqrt(self.stiffness) * (velocity[0] - state[list(VELOCITY)])
+        forward, left = a[0] * np.cos(yaw) + a[1] * np.sin(yaw), a[1] * np.cos(yaw) - a[0] * np.sin(yaw)
+        turn = (reference[0, 3] - yaw + np.pi) % (2.0 * np.pi) - np.pi
+        errors = np.array([np.clip(-left / g, -0.3, 0.3) - roll, np.clip(forward / g, -0.3, 0.3) - pitch, 0.1 * turn])
+        up = (g + a[2]) / (np.cos(roll) * np.cos(pitch))
+        wrench = self.inertia * [up, *(20.0 * errors - 8.0 * rates)]
+        return np.sqrt(np.clip(self.to_squares @ wrench, 0.0, 500.0**2))
