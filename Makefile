@@ -4,7 +4,7 @@
 
 .NOTPARALLEL:
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test peers check format types build numbers verification pins clean
+.PHONY: help setup demo test peers check format types build numbers verification robustness soak pins clean
 
 VENV := .venv
 PY := $(VENV)/bin/python
@@ -42,9 +42,9 @@ demo: setup  ## fly the paper's two flights and compare them, under runs/ (OPTIO
 	@$(QUADSIM) compare $(RUNS)/paper-unconstrained $(RUNS)/paper-constrained --out $(RUNS)/comparison
 	@echo "Done. Open $(RUNS)/comparison/index.html in a browser."
 
-test peers verification: export OMP_NUM_THREADS := 1
-test peers verification: export OPENBLAS_NUM_THREADS := 1
-test peers verification: export MKL_NUM_THREADS := 1
+test peers verification robustness soak: export OMP_NUM_THREADS := 1
+test peers verification robustness soak: export OPENBLAS_NUM_THREADS := 1
+test peers verification robustness soak: export MKL_NUM_THREADS := 1
 test: setup $(VENV)/.browser  ## run every test that needs no peer (OPTIONS="-k audit" for some)
 	@$(PY) -m pytest -q -n $(WORKERS) --dist loadscope $(OPTIONS)
 
@@ -76,6 +76,12 @@ numbers: setup $(VENV)/.peers  ## remake the numbers in README.md and docs/, but
 
 verification: setup $(VENV)/.peers  ## remake docs/verification.md and its table in README.md
 	@PYTHONPATH=tests $(PY) docs/make_verification.py
+
+robustness: setup  ## remake docs/robustness.md: the ladder of mismatches and 50 faults, some ten minutes
+	@PYTHONPATH=tests $(PY) docs/make_robustness.py
+
+soak: setup  ## one simulated hour on end: memory and step time have to stay as they were
+	@$(PY) tests/soak.py --minutes 60
 
 pins: $(VENV)/.python  ## resolve every package anew, at its newest, into constraints.txt
 	@fresh=$$(mktemp -d) && trap 'rm -rf "$$fresh"' EXIT && fresh_python="$$fresh/bin/python" && \

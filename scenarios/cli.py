@@ -82,7 +82,7 @@ def make_parser() -> argparse.ArgumentParser:
     vehicle.add_argument("--out", metavar="FILE", help="PNG file to draw it to, on a floor of 10 cm squares")
     vehicle.add_argument("--json", action="store_true", help="as JSON on stdout")
 
-    _add_bench(commands.add_parser("bench", help="measure this machine: QP solvers, a flight, a film"))
+    _add_bench(commands.add_parser("bench", help="measure QP solvers, a flight, a film, and what controllers survive"))
 
     doctor = commands.add_parser("doctor", help="what this machine can do")
     doctor.add_argument("--json", action="store_true", help="as JSON on stdout")
@@ -120,7 +120,12 @@ def _add_bench(bench: argparse.ArgumentParser) -> None:
     render.add_argument("--seconds", type=float, metavar="S", default=4.0, help="of film (default: 4)")
     render.add_argument("--workers", type=int, metavar="N", help="rendering processes (default: one per core)")
 
-    for kind in (solvers, flight, render):
+    ladder = kinds.add_parser("ladder", help="what each controller survives, from rotor lag to a worn rotor")
+    ladder.add_argument("--out", metavar="DIR", default="runs/bench-ladder", help="directory (default: %(default)s)")
+    ladder.add_argument("--workers", type=int, metavar="N", help="processes (default: one per core)")
+    ladder.add_argument("--quick", action="store_true", help="three controllers, three conditions, 12 s each")
+
+    for kind in (solvers, flight, render, ladder):
         kind.add_argument("--scenario", metavar="SCENARIO", default="paper-constrained", help="(default: %(default)s)")
         _add_settings(kind)
         kind.add_argument("--json", action="store_true", help="print what was measured alone, as JSON on stdout")

@@ -25,6 +25,7 @@ ADDED = {
     "bench solvers": (*SHORT, "--repeats", "1", "--horizons", "none"),
     "bench flight": (*SHORT, "--repeats", "1"),
     "bench render": (*SHORT, "--seconds", "0.2"),
+    "bench ladder": ("--set", "controller.horizon=5"),
 }
 """What makes a command cheap enough to run here."""
 

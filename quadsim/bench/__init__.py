@@ -1,5 +1,7 @@
 """What `quadsim bench` measures, as data, and the tables made from it."""
 
+from quadsim.bench.ladder import Ladder, LadderFlight
+from quadsim.bench.ladder_tables import ladder_legend, ladder_tables
 from quadsim.bench.results import (
     Contender,
     FlightProfile,
@@ -16,12 +18,16 @@ __all__ = [
     "Contender",
     "FlightProfile",
     "Growth",
+    "Ladder",
+    "LadderFlight",
     "RenderProfile",
     "SolverBench",
     "StageLength",
     "Target",
     "flight_tables",
     "flight_targets",
+    "ladder_legend",
+    "ladder_tables",
     "render_tables",
     "render_targets",
     "solver_tables",

@@ -66,4 +66,26 @@ def _bench_render(scenario: Scenario, options: Namespace, progress: runner.Progr
     return profile.to_json(), render_tables(profile), None
 
 
-_BENCHES: Final = {"solvers": _bench_solvers, "flight": _bench_flight, "render": _bench_render}
+def _bench_ladder(scenario: Scenario, options: Namespace, progress: runner.Progress) -> _Benched:
+    from quadsim.bench import ladder_tables
+    from scenarios.bench.ladder import climb, is_ladder, write_ladder
+
+    target = Path(options.out)
+    with rundir.writing(target, replaces=is_ladder) as directory:
+        ladder = climb(
+            options.scenario,
+            [*options.settings, f"seed={scenario.seed}"],
+            quick=options.quick,
+            workers=options.workers,
+            progress=progress,
+        )
+        write_ladder(ladder, directory)
+    return ladder.to_json(), ladder_tables(ladder), str(target)
+
+
+_BENCHES: Final = {
+    "solvers": _bench_solvers,
+    "flight": _bench_flight,
+    "render": _bench_render,
+    "ladder": _bench_ladder,
+}

@@ -1,0 +1,136 @@
+"""Remake docs/robustness.md and its figure: `make robustness`.
+
+The ladder is `quadsim bench ladder`; the faults are those of tests/fault_injection.py, fifty for each controller.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from fault_injection import AFTER, CONTROLLERS, NEAR, SOON, Consequence, draw, inject_all
+from PIL import Image
+
+from mpc.tightening import TighteningSettings
+from quadsim.bench import Ladder, LadderFlight, ladder_legend, ladder_tables
+from quadsim.bench.ladder_tables import ARRIVED
+from quadsim.table import Cell, Grid
+from scenarios.bench.climbers import FULL
+from scenarios.bench.ladder import climb, write_ladder
+from scenarios.bench.solvers import section
+
+ROOT = Path(__file__).resolve().parent.parent
+FAULTS = 50
+RESTLESS = ("wind 3 m/s", "sensor noise", "all by half")
+"""Conditions that never leave the vehicle at rest."""
+STATED = TighteningSettings()
+QUICK_ENOUGH = 6.0
+"""What the step is to take at p99 [ms]."""
+
+
+def asked(ladder: Ladder) -> Grid:
+    """What the full robust controller is to do, and does."""
+    flights = {condition: ladder.flights[FULL, condition] for condition in ladder.conditions}
+    calm = {condition: flight for condition, flight in flights.items() if condition not in RESTLESS}
+    bound = ladder.tilt_bound
+    lines = (
+        ("survives every condition", _failing(flights, lambda flight: flight.survived)),
+        (
+            f"ends within {ARRIVED:g} m of the reference, but for {', '.join(RESTLESS)}",
+            _failing(calm, lambda flight: flight.survived and (flight.end_error or 0.0) <= ARRIVED),
+        ),
+        (
+            f"keeps roll and pitch within {bound:g} deg at the physics rate",
+            _failing(flights, lambda flight: flight.survived and flight.violated == 0.0),
+        ),
+        (
+            f"takes at most {QUICK_ENOUGH:g} ms of processor time for a step, at p99",
+            _failing(flights, lambda flight: (flight.step_p99 or 0.0) <= QUICK_ENOUGH),
+        ),
+    )
+    return Grid(
+        key="asked",
+        title=f"What is asked of {FULL}",
+        head=("asked", "does so"),
+        lines=tuple((Cell(text=what), Cell(text=found)) for what, found in lines),
+        note=f"Disturbances beyond the sizes that the tightening states, {STATED.acceleration:g} m/s^2 and "
+        f"{STATED.angular_acceleration:g} rad/s^2, may tilt it further: a rotor that loses 20 % makes 17 rad/s^2.",
+    )
+
+
+def _failing(flights: dict[str, LadderFlight], holds: Callable[[LadderFlight], bool]) -> str:
+    failing = [condition for condition, flight in flights.items() if not holds(flight)]
+    return f"not in: {', '.join(failing)}" if failing else f"in all {len(flights)}"
+
+
+def fault_tables(found: Sequence[Consequence]) -> list[Grid]:
+    """What came of the faults: a line per kind, for each controller."""
+    grids = []
+    for controller in CONTROLLERS:
+        kinds: dict[str, list[Consequence]] = {}
+        for each in found:
+            if each.injection.controller == controller:
+                kinds.setdefault(each.injection.fault.name, []).append(each)
+        lines = []
+        for name, cases in sorted(kinds.items()):
+            starts = ", ".join(f"{case.injection.start:.2f}" for case in cases)
+            texts = (
+                name,
+                starts,
+                f"{sum(case.harmless for case in cases)} of {len(cases)}",
+                str(max(case.fallback for case in cases)),
+                f"{max(case.furthest for case in cases):.4f}",
+                f"{max(case.back for case in cases):.2f}",
+            )
+            lines.append(tuple(Cell(text=text) for text in texts))
+        grids.append(
+            Grid(
+                key=f"faults-{controller}",
+                title=f"Faults in the flight of the {controller} controller, guarded",
+                head=("fault", "at [s]", "harmless", "deepest fallback", "furthest [m]", "back after [s]"),
+                lines=tuple(lines),
+            )
+        )
+    return grids
+
+
+def page(ladder: Ladder, found: Sequence[Consequence]) -> str:
+    """The whole page."""
+    harmless = sum(each.harmless for each in found)
+    return "\n".join(
+        [
+            "# Robustness\n\nMade by `make robustness`; the ladder alone is `quadsim bench ladder`, on "
+            f"{ladder.scenario}, {ladder.duration:g} s.\n\n{ladder_legend(ladder)}",
+            "![Each controller in each condition: distance at the end, and peak tilt](ladder.png)\n",
+            section(asked(ladder)),
+            "LQR, PID and geometric control fly with up to 20 deg of tilt and no bound on steps of the rotor speeds, "
+            "so their errors are not to be\ncompared with those at 5 deg. Their gains were tuned on the nominal course "
+            "and a few rungs; the robust controller's input and move\nweight and its observer on the rungs of this "
+            "ladder.\n",
+            *(section(grid) for grid in ladder_tables(ladder)),
+            f"## Faults\n\n{harmless} of {len(found)} are harmless: no exception; every command finite and within its "
+            f"bounds on speeds and steps; the vehicle back within {NEAR:g} m of the same flight without the fault "
+            f"{SOON:g} s after its beginning, and until {AFTER:g} s after it. The reference is no measure: in the "
+            "climb, at its bounds, the vehicle is metres behind it. Kinds and instants are drawn from a seed. A failed "
+            "solver's answer is NaN throughout; the QP is solved in every period, the shortcut being off.\n",
+            *(section(grid) for grid in fault_tables(found)),
+            "## Soak\n\n`make soak` flies the full robust controller for a simulated hour on end, and asks for memory "
+            "flat to 1 % and steps as quick as at the beginning, to 10 %; the tests do so for five minutes.\n",
+        ]
+    )
+
+
+def main() -> None:
+    """Fly everything and write it."""
+    ladder = climb()
+    found = inject_all(draw(FAULTS))
+    with tempfile.TemporaryDirectory() as scratch:
+        write_ladder(ladder, Path(scratch))
+        figure = Image.open(Path(scratch) / "ladder.png").convert("RGB")
+        figure.quantize(32, dither=Image.Dither.NONE).save(ROOT / "docs" / "ladder.png", optimize=True)
+    (ROOT / "docs" / "robustness.md").write_text(page(ladder, found), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()

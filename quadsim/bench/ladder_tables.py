@@ -1,0 +1,101 @@
+"""The tables of the mismatch ladder: a line per condition, a column per controller."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Final
+
+from quadsim.bench.ladder import ASTRAY, OVERTURNED, Ladder, LadderFlight
+from quadsim.table import ABSENT, Cell, Grid, Mark, format_number
+
+ARRIVED: Final = 0.05
+"""Distance from the reference at the end [m] that counts as arrived."""
+FAR: Final = 0.5
+"""The same that a reader should notice [m]."""
+TILT_TOLERANCE: Final = 0.05
+"""How far beyond its bound tilt may be before a reader should notice [deg]; the paper scenarios' own tolerance."""
+
+
+def ladder_tables(ladder: Ladder) -> list[Grid]:
+    """The tables of a ladder."""
+    bound = ladder.tilt_bound
+    return [
+        _grid(
+            ladder,
+            "end",
+            "Distance from the reference at the end, m",
+            _end,
+            f"Lost: the flight was aborted at that time. Fell over: beyond {OVERTURNED:g} deg. Astray: beyond "
+            f"{ASTRAY:g} m at the end. Bold: at most {ARRIVED:g} m.",
+        ),
+        _grid(
+            ladder,
+            "tilt",
+            f"Peak tilt at the physics rate, deg; the bound is {bound:g}",
+            lambda flight: _tilt(flight, bound),
+            "The larger of |roll| and |pitch|. Bold: within the bound, tolerance 0.",
+        ),
+        _grid(
+            ladder,
+            "violated",
+            f"Time with roll or pitch beyond {bound:g} deg, s",
+            lambda flight: Cell(text=format_number(flight.violated)),
+            "At the physics rate, tolerance 0.",
+        ),
+        _grid(ladder, "rmse", "RMS tracking errors x, y, z, m", _rmse, "Against the filtered reference."),
+        _grid(
+            ladder,
+            "fallbacks",
+            "Periods not flown by the controller's own optimum",
+            lambda flight: Cell(text=str(flight.fallbacks), mark=Mark.WARN if flight.fallbacks else Mark.NONE),
+            "By an earlier plan or, deeper, by level hover.",
+        ),
+        _grid(
+            ladder,
+            "step",
+            "99th percentile of the controller's step, ms",
+            lambda flight: Cell(text=ABSENT if flight.step_p99 is None else f"{flight.step_p99:.2f}"),
+            "Processor time, as several flights share the machine.",
+        ),
+    ]
+
+
+def ladder_legend(ladder: Ladder) -> str:
+    """What controllers and conditions are, as Markdown lists."""
+    lines = ["Controllers:", ""]
+    lines += [f"- **{name}**: {about}" for name, about in ladder.controllers.items()]
+    lines += ["", "Conditions:", ""]
+    lines += [f"- **{name}**: {about}" for name, about in ladder.conditions.items()]
+    return "\n".join(lines) + "\n"
+
+
+def _grid(ladder: Ladder, key: str, title: str, cell: Callable[[LadderFlight], Cell], note: str) -> Grid:
+    def shown(flight: LadderFlight) -> Cell:
+        return cell(flight) if flight.survived else Cell(text=flight.fate, mark=Mark.BAD)
+
+    lines = tuple(
+        (
+            Cell(text=condition),
+            *(shown(ladder.flights[controller, condition]) for controller in ladder.controllers),
+        )
+        for condition in ladder.conditions
+    )
+    return Grid(key=key, title=title, head=("", *ladder.controllers), lines=lines, note=note)
+
+
+def _end(flight: LadderFlight) -> Cell:
+    assert flight.end_error is not None
+    mark = Mark.BEST if flight.end_error <= ARRIVED else Mark.WARN if flight.end_error > FAR else Mark.NONE
+    return Cell(text=f"{flight.end_error:.3f}", mark=mark)
+
+
+def _tilt(flight: LadderFlight, bound: float) -> Cell:
+    assert flight.peak_tilt is not None
+    tilt = flight.peak_tilt
+    mark = Mark.BEST if tilt <= bound else Mark.WARN if tilt > bound + TILT_TOLERANCE else Mark.NONE
+    return Cell(text=f"{tilt:.3f}" if abs(tilt - bound) < 1.0 else f"{tilt:.1f}", mark=mark)
+
+
+def _rmse(flight: LadderFlight) -> Cell:
+    assert flight.rmse is not None
+    return Cell(text=", ".join(f"{flight.rmse[axis]:.2f}" for axis in "xyz"))

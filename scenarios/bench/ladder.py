@@ -1,0 +1,191 @@
+"""`quadsim bench ladder`: what each controller survives, condition by condition."""
+
+from __future__ import annotations
+
+import itertools
+import time as clock
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from threadpoolctl import threadpool_limits
+
+from quadsim import metrics, rundir
+from quadsim.bench import Ladder, LadderFlight, ladder_legend, ladder_tables
+from quadsim.controller import Command, Controller, Moment
+from quadsim.errors import ParameterError
+from quadsim.flightlog import FlightLog
+from quadsim.state import INDEX, POSITION, Array
+from scenarios.bench.climbers import CLIMBERS, QUICK_CLIMBERS, equip, tilt_bound
+from scenarios.bench.processes import answer_all
+from scenarios.bench.rungs import CONDITIONS, QUICK_CONDITIONS
+from scenarios.bench.solvers import section
+from scenarios.build import build_controller, build_plant, build_reference, build_vehicle
+from scenarios.flying import fly_once
+from scenarios.loading import load_scenario
+from scenarios.navigation import build_navigation
+from scenarios.runner import Progress, machine, silent
+from scenarios.spec import Scenario
+
+FORMAT: Final = "quadsim bench ladder"
+RESULTS_FILE: Final = "ladder.json"
+TABLES_FILE: Final = "ladder.md"
+QUICK_DURATION: Final = 12.0
+"""Of the flights of a quick ladder [s]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Cell:
+    """One flight of the ladder, as a worker process is asked for it."""
+
+    scenario: str
+    settings: tuple[str, ...]
+    controller: str
+    condition: str
+
+
+def climb(
+    scenario: str = "paper-constrained",
+    settings: Sequence[str] = (),
+    *,
+    quick: bool = False,
+    workers: int | None = None,
+    progress: Progress = silent,
+) -> Ladder:
+    """Fly every controller in every condition.
+
+    Flights are spread over processes; but for step times, results are the same however many there are.
+
+    Args:
+        scenario: a constrained one whose bounds on roll and pitch are the same: a library name, or a file.
+        settings: of it, before those of the conditions.
+        quick: three controllers, three conditions, short flights.
+        workers: processes; one per usable core by default.
+        progress: told how far it is.
+
+    Raises:
+        InputError: the scenario cannot be flown so, or the number of processes is none.
+    """
+    if workers is not None and workers < 1:
+        raise ParameterError("", "--workers", workers, "at least 1")
+    if quick:
+        settings = [*settings, f"duration={QUICK_DURATION}"]
+    controllers = QUICK_CLIMBERS if quick else tuple(CLIMBERS)
+    conditions = QUICK_CONDITIONS if quick else tuple(CONDITIONS)
+    flown = load_scenario(scenario, settings)
+    bound = tilt_bound(flown)
+    cells = [
+        Cell(scenario=scenario, settings=tuple(settings), controller=controller, condition=condition)
+        for controller, condition in itertools.product(controllers, conditions)
+    ]
+    for cell in cells[: len(conditions)]:
+        _varied(cell)  # one that cannot be flown is refused here, before anything is
+    flights = answer_all(
+        fly_cell, cells, workers=workers, progress=lambda done, total: progress("flights", done, total)
+    )
+    return Ladder(
+        scenario=flown.name,
+        duration=flown.duration,
+        tilt_bound=bound,
+        controllers={name: CLIMBERS[name].about for name in controllers},
+        conditions={name: CONDITIONS[name].about for name in conditions},
+        flights={(cell.controller, cell.condition): flight for cell, flight in zip(cells, flights, strict=True)},
+        machine=machine(),
+    )
+
+
+def fly_cell(cell: Cell) -> LadderFlight:
+    """Fly one controller in one condition, here."""
+    varied = _varied(cell)
+    scenario = equip(varied, cell.controller, CONDITIONS[cell.condition])
+    vehicle = build_vehicle(scenario)
+    with threadpool_limits(limits=1):
+        controller = _Timed(build_controller(scenario, vehicle))
+        with build_plant(scenario, vehicle) as plant:
+            log = fly_once(
+                scenario,
+                vehicle,
+                plant,
+                controller,
+                build_reference(scenario, scenario.periods + controller.horizon),
+                navigation=build_navigation(scenario, vehicle),
+            )
+    return _judge(log, controller.step_s, tilt_bound(varied), scenario)
+
+
+class _Timed:
+    """A controller, with a clock around its steps that stands still while other processes run."""
+
+    def __init__(self, inner: Controller) -> None:
+        self.inner = inner
+        self.name, self.solver, self.horizon = inner.name, inner.solver, inner.horizon
+        self.step_s: list[float] = []
+
+    def reset(self, speeds: Array) -> None:
+        """See `quadsim.controller.Controller.reset`."""
+        self.inner.reset(speeds)
+
+    def step(self, now: Moment, state: Array, reference: Array) -> Command:
+        """See `quadsim.controller.Controller.step`."""
+        started = clock.thread_time()
+        command = self.inner.step(now, state, reference)
+        self.step_s.append(clock.thread_time() - started)
+        return command
+
+    def predict(self, states: Array, plans: Array) -> Array:
+        """See `quadsim.controller.Controller.predict`."""
+        return self.inner.predict(states, plans)
+
+
+def _varied(cell: Cell) -> Scenario:
+    return load_scenario(cell.scenario, [*cell.settings, *CONDITIONS[cell.condition].settings])
+
+
+def _judge(log: FlightLog, step_s: Sequence[float], bound: float, scenario: Scenario) -> LadderFlight:
+    control = log.control
+    flown = bool(control.t.size)
+    end = control.truth[-1, list(POSITION)] - control.reference[-1, :3] if flown else None
+    # A row of the plant stands for the step that follows it; the last has none.
+    tilts = np.degrees(np.abs(log.plant.state[:-1, [INDEX["roll"], INDEX["pitch"]]]).max(axis=1))
+    violated = np.count_nonzero(tilts > bound) * scenario.plant.timestep
+    return LadderFlight(
+        reason=log.reason,
+        flown=round(control.t.size * scenario.control_period, 9),
+        rmse={axis: metrics.tracking(control)["rmse"][axis] for axis in "xyz"} if flown else None,
+        end_error=None if end is None else float(np.linalg.norm(end)),
+        peak_tilt=metrics.peak_tilt(log.plant.state) if flown else None,
+        violated=round(float(violated), 9),
+        fallbacks=int(np.count_nonzero(control.fallback)),
+        step_p99=metrics.percentiles(1e3 * np.array(step_s))["p99"] if flown else None,
+    )
+
+
+def write_ladder(ladder: Ladder, directory: Path) -> None:
+    """Write `ladder.json`, `ladder.md`, `ladder.png` and `ladder.svg` into a directory.
+
+    Raises:
+        OutputError: it cannot be written.
+    """
+    from quadsim.figures import write_ladder_figure
+
+    rundir.write_json(directory / RESULTS_FILE, {"format": FORMAT, **ladder.to_json()})
+    rundir.write_atomically(directory / TABLES_FILE, ladder_markdown(ladder))
+    write_ladder_figure(ladder, directory)
+
+
+def ladder_markdown(ladder: Ladder) -> str:
+    """All tables of a ladder, under what its controllers and conditions are."""
+    sections = "\n".join(map(section, ladder_tables(ladder)))
+    return f"# The ladder on {ladder.scenario}, {ladder.duration:g} s\n\n{ladder_legend(ladder)}\n{sections}"
+
+
+def is_ladder(directory: Path) -> bool:
+    """Whether a directory holds an earlier ladder and nothing else."""
+    own = {RESULTS_FILE, TABLES_FILE, "ladder.png", "ladder.svg"}
+    try:
+        said = (directory / RESULTS_FILE).read_text(encoding="utf-8")[:100]
+    except (OSError, UnicodeDecodeError):
+        return False
+    return f'"format": "{FORMAT}"' in said and {path.name for path in directory.iterdir()} <= own
