@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-import contextlib
-import tomllib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
 from pydantic import ValidationError
 
-from quadsim.errors import FileError, ParameterError, UnknownNameError
-from scenarios.bases import DEEPEST, is_deeper, read_scenario
+from quadsim.errors import FileError, UnknownNameError
+from scenarios.bases import read_scenario
 from scenarios.checking import check_parts
 from scenarios.courses.build import located
 from scenarios.problems import ScenarioError, describe
+from scenarios.settings import apply_setting
 from scenarios.spec import Scenario
 from scenarios.spec.course import CsvSpec
 from scenarios.spec.own import located as located_controller
@@ -91,51 +90,3 @@ def parse_scenario(data: Mapping[str, Any], *, source: str = "scenario", directo
     if directory is not None and isinstance(scenario.reference, CsvSpec):
         scenario = scenario.model_copy(update={"reference": located(scenario.reference, directory)})
     return scenario
-
-
-def apply_setting(data: dict[str, Any], setting: str) -> None:
-    """Apply one `dotted.path=value` to a scenario's tables.
-
-    An entry of a list of tables is addressed by its name, as in `constraints.roll.upper`, or, where it has none, by its
-    index, as in `events.0.at`.
-
-    Raises:
-        ParameterError: the text is not of that form, or the path goes through something that is no table.
-    """
-    path, equals, text = setting.partition("=")
-    keys = path.strip().split(".")
-    if not equals or not all(keys):
-        raise ParameterError("", "--set", setting, "of the form dotted.path=value")
-    if keys == ["base"]:
-        raise ParameterError("", "--set", setting, "of a field other than base, which only a file can have")
-    value = _parse_value(text.strip())
-    if len(keys) > DEEPEST or is_deeper(value, DEEPEST):
-        raise ParameterError("", "--set", setting[:100], f"of at most {DEEPEST} tables and lists within one another")
-    table: Any = data
-    for depth, key in enumerate(keys):
-        if isinstance(table, list):
-            if depth == len(keys) - 1:
-                rule = f"a path to a field; {'.'.join(keys)} is an entry of a list"
-                raise ParameterError("", "--set", setting, rule)
-            entries = {str(entry.get("name", i)): entry for i, entry in enumerate(table) if isinstance(entry, dict)}
-            if not entries:
-                raise ParameterError("", "--set", setting, f"a path to a field; {keys[depth - 1]} has none")
-            if key not in entries:
-                raise UnknownNameError(f"entry of {'.'.join(keys[:depth])}", key, entries)
-            table = entries[key]
-        elif not isinstance(table, dict):
-            raise ParameterError("", "--set", setting, f"a path to a field; {keys[depth - 1]} has none")
-        elif depth == len(keys) - 1:
-            table[key] = value
-        else:
-            table = table.setdefault(key, {})
-
-
-def _parse_value(text: str) -> Any:
-    """A value of TOML, or the text itself where it is none."""
-    # RecursionError: lists within lists without end; ValueError: not TOML, or a number of thousands of digits.
-    with contextlib.suppress(RecursionError, ValueError):
-        table = tomllib.loads(f"value = {text}")
-        if table.keys() == {"value"}:
-            return table["value"]
-    return text

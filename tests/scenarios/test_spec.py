@@ -21,8 +21,9 @@ from quadsim.errors import FileError, InputError, ParameterError, UnknownNameErr
 from quadsim.state import STATE_NAMES
 from quadsim.vehicle import OPTIONAL_PARAMETERS, VEHICLE_UNITS
 from scenarios.build import build_limits, build_vehicle, resolve
-from scenarios.loading import LIBRARY, apply_setting, load_scenario, parse_scenario, scenario_names, scenario_path
+from scenarios.loading import LIBRARY, load_scenario, parse_scenario, scenario_names, scenario_path
 from scenarios.problems import ScenarioError
+from scenarios.settings import apply_setting
 from scenarios.spec import MOST_STEPS, Scenario
 
 
@@ -469,13 +470,20 @@ def test_an_entry_without_a_name_is_set_by_its_index() -> None:
         load_scenario("hover", [both, "events.1.at=late"])
 
 
-@pytest.mark.parametrize("setting", ["initial.position.0.x=3", "events.0.at=3"])
-def test_a_setting_does_not_go_through_a_list_that_holds_no_tables(setting: str) -> None:
-    field = setting.split(".0.")[0].rpartition(".")[2]
+@pytest.mark.parametrize(("setting", "field"), [("initial.position.0.x=3", "0"), ("events.0.at=3", "events")])
+def test_a_setting_goes_through_tables_and_lists_alone(setting: str, field: str) -> None:
     table: dict[str, Any] = {"initial": {"position": [0.0, 0.0, 0.0]}, "events": []}
     with pytest.raises(ParameterError) as caught:
         apply_setting(table, setting)
     assert str(caught.value) == f"--set must be a path to a field; {field} has none; got {setting!r}"
+
+
+def test_a_number_of_a_list_is_set_by_its_index() -> None:
+    assert load_scenario("hover", ["initial.euler.2=30.0"]).initial.euler == [0.0, 0.0, 30.0]
+    with pytest.raises(UnknownNameError, match=r"^no entry of initial\.euler named '3' \(there are: 0, 1, 2\)$"):
+        load_scenario(
+            "hover", ["initial.position=[0.0, 0.0, 1.0]", "initial.euler=[0.0, 0.0, 0.0]", "initial.euler.3=1"]
+        )
 
 
 def test_a_setting_that_names_a_whole_entry_of_a_list_is_refused() -> None:
