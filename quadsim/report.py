@@ -8,7 +8,7 @@ import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 from urllib.parse import quote
 
 from quadsim.comparison import comparison_rows, outcome, required, run_names
@@ -18,6 +18,7 @@ from quadsim.errors import OutputError, ParameterError
 from quadsim.figures import comparison_figure, write_cost_figures
 from quadsim.flightlog import FLIGHT_FILE, HORIZON_FILE, PLANT_FILE, TIMING_FILE
 from quadsim.narrative import comparison_sentences
+from quadsim.page import PAGE_FILE, is_page, render_page
 from quadsim.palette import line_colour
 from quadsim.plots import Plot, comparison_plots, cost_plots, plotly_script
 from quadsim.rundir import (
@@ -32,13 +33,11 @@ from quadsim.rundir import (
 )
 from quadsim.table import Cell, Grid, to_markdown
 
-PAGE_FILE: Final = "index.html"
 TABLE_FILE: Final = "comparison.md"
 COST_FILE: Final = "cost.json"
 COST_TABLES_FILE: Final = "cost.md"
 
-_TEMPLATES: Final = Path(__file__).resolve().parent / "templates"
-_MARK: Final = '<meta name="generator" content="quadsim comparison">'
+_KIND: Final = "comparison"
 _FILES: Final = {
     SUMMARY_FILE: "summary (JSON)",
     SCENARIO_FILE: "scenario (TOML)",
@@ -113,14 +112,17 @@ def write_comparison(runs: Sequence[Run], directory: Path, study: CostStudy | No
             _place(run, name, folder, line_colour(i), partial)
             for i, (run, name, folder) in enumerate(zip(runs, names, _folder_names(names), strict=True))
         ]
-        page = _render(
+        plots = comparison_plots(runs)
+        page = render_page(
+            "comparison.html.j2",
+            _KIND,
             title=" and ".join(names) if len(names) < 3 else f"{len(names)} runs: {', '.join(names)}",
             runs=views,
             sentences=comparison_sentences(runs),
             groups=[(group, list(of_group)) for group, of_group in itertools.groupby(rows, lambda row: row.group)],
-            plots=comparison_plots(runs),
+            plots=plots,
             cost=None if study is None else _place_study(study, partial),
-            plotly=plotly_script(),
+            plotly=plotly_script() if plots or study is not None else "",
             figure="comparison.svg",
             table=TABLE_FILE,
         )
@@ -130,24 +132,7 @@ def write_comparison(runs: Sequence[Run], directory: Path, study: CostStudy | No
 
 def is_comparison(directory: Path) -> bool:
     """Whether a directory holds a comparison that `write_comparison` wrote."""
-    page = directory / PAGE_FILE
-    if not page.is_file():
-        return False
-    with page.open(encoding="utf-8", errors="replace") as file:
-        return _MARK in file.read(1024)
-
-
-def _render(**context: Any) -> str:
-    from jinja2 import Environment, FileSystemLoader, StrictUndefined
-
-    environment = Environment(
-        loader=FileSystemLoader(_TEMPLATES),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    return environment.get_template("comparison.html.j2").render(context)
+    return is_page(directory, _KIND)
 
 
 def _folder_names(names: Sequence[str]) -> list[str]:

@@ -11,13 +11,15 @@ ABSENT: Final = "-"
 
 
 class Mark(StrEnum):
-    """What a reader should see in a cell at a glance."""
+    """What a reader should see in a cell at a glance; words and commands are set otherwise than numbers."""
 
     NONE = ""
     BEST = "best"
     GOOD = "good"
     WARN = "warn"
     BAD = "bad"
+    TEXT = "text"
+    CODE = "code"
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -46,18 +46,22 @@ def plotly_script() -> str:
     return str(get_plotlyjs())
 
 
-def panels(labels: Sequence[str]) -> Figure:
-    """An empty figure of two columns, its panels named row by row."""
+def panels(labels: Sequence[str], *, shared: bool = True) -> Figure:
+    """An empty figure of two columns, its panels named row by row; they share their horizontal axes, or have own ones.
+
+    The last place stays empty where the labels are odd in number.
+    """
     from plotly.subplots import make_subplots
 
-    rows = len(labels) // 2
+    rows = -(-len(labels) // 2)
     return make_subplots(
         rows=rows,
         cols=2,
         subplot_titles=list(labels),
-        shared_xaxes="all",
+        shared_xaxes="all" if shared else False,
         horizontal_spacing=0.06,
-        vertical_spacing=0.14 / max(rows - 1, 1),
+        vertical_spacing=0.14 / max(rows - 1, 1) if shared else 0.22 / rows,
+        specs=[[{}, {} if 2 * row + 1 < len(labels) else None] for row in range(rows)],
     )
 
 

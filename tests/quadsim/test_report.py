@@ -2,14 +2,13 @@
 
 import dataclasses
 import json
-import os
 import re
 import shutil
-import subprocess
 from pathlib import Path
 
 import numpy as np
 import pytest
+from browser import open_page
 
 from quadsim.cost import CostStudy
 from quadsim.errors import OutputError, ParameterError
@@ -18,8 +17,6 @@ from quadsim.report import is_comparison, write_comparison
 from quadsim.rundir import Run
 
 HOSTILE = "<script>alert(1)</script> & \"more\" 'quoted'"
-ADVICE = ("GL Driver Message", "willReadFrequently")
-"""What Chromium says of the speed of plotly.js without a graphics card; a page cannot mend it."""
 PROBE = """<script>
 (async () => {
   while (!("drawn" in document.documentElement.dataset)) await new Promise((done) => setTimeout(done, 50));
@@ -60,23 +57,6 @@ def renamed(run: Run, scenario: str) -> Run:
 
 def without_scripts(page: str) -> str:
     return re.sub(r"<script.*?</script>", "", page, flags=re.DOTALL)
-
-
-def open_page(page: Path, profile: Path) -> tuple[str, list[str]]:
-    """The page as headless Chromium builds it, and what its console said."""
-    browser = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
-    if browser is None:
-        pytest.skip("no Chromium here: install the package 'chromium' to open the page in a browser")
-    command = [
-        *(browser, "--headless", "--no-sandbox", "--no-first-run", "--disable-quic", "--enable-unsafe-swiftshader"),
-        *("--disable-background-networking", "--disable-component-update", "--disable-sync", "--disable-extensions"),
-        *(f"--user-data-dir={profile}", "--enable-logging=stderr", "--virtual-time-budget=20000", "--dump-dom"),
-        page.as_uri(),
-    ]
-    environment = {**os.environ, "LC_ALL": "C.UTF-8"}
-    done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=True, env=environment)
-    said = [line for line in done.stderr.splitlines() if "CONSOLE" in line]
-    return done.stdout, [line for line in said if not any(advice in line for advice in ADVICE)]
 
 
 def test_the_page_stands_beside_its_files(filmed_run: Run, aborted_run: Run, tmp_path: Path) -> None:

@@ -1,0 +1,55 @@
+"""Two campaigns compared -> one directory to open and share."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Final
+
+from quadsim.campaign.comparison import Comparison
+from quadsim.campaign.comparison_tables import comparison_markdown, comparison_tables, pairing
+from quadsim.page import PAGE_FILE, is_page, render_page
+from quadsim.plots import plotly_script
+from quadsim.plots.campaign import comparison_margins_plot
+from quadsim.rundir import write_json, writing
+
+COMPARISON_FILE: Final = "comparison.json"
+TABLE_FILE: Final = "comparison.md"
+
+_KIND: Final = "campaign comparison"
+
+
+def write_comparison_report(comparison: Comparison, directory: Path) -> Path:
+    """Write `index.html`, `comparison.json` and `comparison.md`, which appear together or not at all.
+
+    Args:
+        comparison: what to tell.
+        directory: what to write; an earlier comparison of campaigns or an empty directory there is replaced.
+
+    Returns:
+        The page.
+
+    Raises:
+        OutputError: the directory cannot be written, or holds something else.
+    """
+    plot = comparison_margins_plot(comparison)
+    with writing(directory, replaces=is_comparison_report) as partial:
+        write_json(partial / COMPARISON_FILE, comparison.to_json())
+        (partial / TABLE_FILE).write_text(comparison_markdown(comparison), encoding="utf-8")
+        page = render_page(
+            "campaign_comparison.html.j2",
+            _KIND,
+            title=f"{comparison.names[1]} against {comparison.names[0]}",
+            comparison=comparison,
+            pairing=pairing(comparison),
+            tables=comparison_tables(comparison),
+            plot=plot,
+            files=(COMPARISON_FILE, TABLE_FILE),
+            plotly=plotly_script() if plot else "",
+        )
+        (partial / PAGE_FILE).write_text(page, encoding="utf-8")
+    return directory / PAGE_FILE
+
+
+def is_comparison_report(directory: Path) -> bool:
+    """Whether a directory holds a comparison of campaigns that `write_comparison_report` wrote."""
+    return is_page(directory, _KIND)

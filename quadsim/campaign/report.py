@@ -1,0 +1,124 @@
+"""A campaign -> a page that works offline, and its figure."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Final
+from urllib.parse import quote
+
+import pyarrow as pa
+
+from quadsim.campaign.curves import margins, thinning
+from quadsim.campaign.estimates import Summary
+from quadsim.campaign.sentences import campaign_sentences, verdict_sentence
+from quadsim.campaign.tables import (
+    constraint_table,
+    driver_table,
+    event_table,
+    level_tables,
+    manifest_table,
+    metric_table,
+    worst_table,
+)
+from quadsim.campaign.wording import count_of
+from quadsim.errors import OutputError
+from quadsim.figures.campaign import write_campaign_figure
+from quadsim.page import PAGE_FILE, render_page
+from quadsim.plots import plotly_script
+from quadsim.plots.campaign import campaign_plots
+from quadsim.rundir import write_atomically
+from quadsim.table import Mark
+
+_FILES: Final = {
+    "campaign.toml": "campaign (TOML)",
+    "scenario.toml": "scenario (TOML)",
+    "flights.parquet": "flights (Parquet)",
+    "timing.parquet": "clock times (Parquet)",
+    "summary.json": "summary (JSON)",
+    "manifest.json": "manifest (JSON)",
+    "campaign.png": "figure (PNG)",
+    "campaign.svg": "figure (SVG)",
+}
+"""What the page links to, where it is there, and under which name."""
+
+
+def write_report(
+    directory: Path,
+    *,
+    table: pa.Table,
+    summary: Summary,
+    manifest: Mapping[str, Any],
+    name: str,
+    description: str = "",
+    failure: Sequence[str] = (),
+) -> Path:
+    """Write `index.html`, `campaign.png` and `campaign.svg` into a campaign's directory, replacing earlier ones.
+
+    Args:
+        directory: of the campaign; it is there, and the page names it in its commands as it is given here.
+        table: `flights.parquet`.
+        summary: `quadsim.campaign.estimates.estimate` of that table.
+        manifest: how the campaign was made; nested tables are fine.
+        name: the campaign's.
+        description: what it is, in a line.
+        failure: the events that count as failure.
+
+    Returns:
+        The page.
+
+    Raises:
+        OutputError: the directory cannot be written; earlier files are still there.
+    """
+    _write_figure(name, table, summary, directory)
+    plots = campaign_plots(table, summary)
+    page = render_page(
+        "campaign.html.j2",
+        "campaign",
+        title=name,
+        description=description,
+        verdict=verdict_sentence(summary),
+        mark=_mark(summary),
+        sentences=campaign_sentences(summary),
+        events=event_table(summary, failure),
+        constraints=constraint_table(summary),
+        metrics=metric_table(summary),
+        drivers=driver_table(summary),
+        levels=level_tables(summary),
+        worst=worst_table(summary, str(directory)),
+        manifest=manifest_table(manifest),
+        plots=plots,
+        at_foot=_at_foot(table),
+        thinning=thinning(table),
+        files=[(label, quote(file)) for file, label in _FILES.items() if (directory / file).is_file()],
+        plotly=plotly_script() if plots else "",
+    )
+    write_atomically(directory / PAGE_FILE, page)
+    return directory / PAGE_FILE
+
+
+def _mark(summary: Summary) -> Mark:
+    if not summary["flights"]:
+        return Mark.NONE
+    return Mark.BAD if summary["events"]["failure"]["count"] else Mark.GOOD
+
+
+def _at_foot(table: pa.Table) -> str:
+    """Which flights scatters draw at their foot, as a sentence; empty where there are none."""
+    drawn = margins(table)
+    if drawn is None or not drawn.at_foot:
+        return ""
+    return f"At the foot: {count_of(drawn.at_foot, 'flight')} with a margin below {drawn.lowest:.3g}, or none."
+
+
+def _write_figure(name: str, table: pa.Table, summary: Summary, directory: Path) -> None:
+    """Draw beside the place, and put each file there in one step."""
+    try:
+        with tempfile.TemporaryDirectory(prefix=".figure.", dir=directory) as beside:
+            for path in write_campaign_figure(name, table, summary, Path(beside)):
+                path.replace(directory / path.name)
+    except OutputError as error:
+        raise OutputError(directory, error.problem) from error
+    except OSError as error:
+        raise OutputError(directory, error.strerror or str(error)) from error

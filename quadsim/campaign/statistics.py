@@ -1,0 +1,245 @@
+"""How sure an answer from many flights is: intervals, rank correlations, and paired comparisons.
+
+Flights are taken as independent draws.  Draws spread evenly (Latin hypercube, Sobol', Halton) make estimates vary less
+than that, so that the intervals are then wider than they need be.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+from scipy import optimize, stats
+
+from quadsim.state import Array
+
+CONFIDENCE: Final = 0.95
+_EXACT_UP_TO: Final = 8
+"""Pairs up to which all permutations are counted for a rank correlation's p-value; 8! = 40 320."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Proportion:
+    """A share of flights, with its Clopper-Pearson intervals.
+
+    Attributes:
+        count: flights in which it happened.
+        flights: of how many.
+        share: count / flights; None of no flights.
+        lower: lower end of the two-sided interval.
+        upper: upper end of the two-sided interval.
+        upper_one_sided: what the share is at most, with all the doubt on that side.
+    """
+
+    count: int
+    flights: int
+    share: float | None
+    lower: float
+    upper: float
+    upper_one_sided: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class Correlation:
+    """Spearman's rank correlation.
+
+    Attributes:
+        rho: from -1 to 1.
+        p: two-sided p-value of no association.
+        flights: pairs it was taken over.
+    """
+
+    rho: float
+    p: float
+    flights: int
+
+
+@dataclass(frozen=True, kw_only=True)
+class PairedDifference:
+    """The differences b - a of pairs.
+
+    Attributes:
+        pairs: how many.
+        mean: their mean; None of no pairs.
+        lower: lower end of the mean's t interval; None of fewer than two pairs.
+        upper: its upper end.
+        median: their median.
+        median_lower: lower end of the median's distribution-free interval; None where too few pairs give none.
+        median_upper: its upper end.
+    """
+
+    pairs: int
+    mean: float | None
+    lower: float | None
+    upper: float | None
+    median: float | None
+    median_lower: float | None
+    median_upper: float | None
+
+
+def upper_bounds(counts: Array, trials: Array, confidence: float = CONFIDENCE) -> Array:
+    """(K,) one-sided upper bounds on proportions: the largest p that gives so few with probability 1 - confidence.
+
+    Source: Clopper and Pearson, Biometrika 26 (1934); 1 where all happened, and of no trials.
+    """
+    counts, trials = np.asarray(counts, float), np.asarray(trials, float)
+    some = counts < trials
+    bounds = stats.beta.ppf(confidence, counts + 1.0, np.where(some, trials - counts, 1.0))
+    return np.where(some, bounds, 1.0)
+
+
+def lower_bounds(counts: Array, trials: Array, confidence: float = CONFIDENCE) -> Array:
+    """(K,) one-sided lower bounds on proportions; 0 where none happened."""
+    counts, trials = np.asarray(counts, float), np.asarray(trials, float)
+    return 1.0 - upper_bounds(trials - counts, trials, confidence)
+
+
+def upper_bound(count: int, trials: int, confidence: float = CONFIDENCE) -> float:
+    """One proportion's one-sided upper bound; see `upper_bounds`."""
+    return float(upper_bounds(np.array([count]), np.array([trials]), confidence)[0])
+
+
+def lower_bound(count: int, trials: int, confidence: float = CONFIDENCE) -> float:
+    """One proportion's one-sided lower bound; see `lower_bounds`."""
+    return float(lower_bounds(np.array([count]), np.array([trials]), confidence)[0])
+
+
+def proportion(count: int, flights: int, confidence: float = CONFIDENCE) -> Proportion:
+    """A share of flights with its two-sided interval and its one-sided upper bound, all Clopper-Pearson."""
+    either = 0.5 * (1.0 + confidence)
+    return Proportion(
+        count=count,
+        flights=flights,
+        share=count / flights if flights else None,
+        lower=lower_bound(count, flights, either),
+        upper=upper_bound(count, flights, either),
+        upper_one_sided=upper_bound(count, flights, confidence),
+    )
+
+
+def rank_correlation(x: Array, y: Array) -> Correlation | None:
+    """Spearman's rank correlation of pairs, ties at their mean rank.
+
+    The p-value counts all permutations of up to 8 pairs, and is from Student's t beyond.
+
+    Args:
+        x: (K,); pairs with a NaN do not count, infinities have their rank.
+        y: (K,).
+
+    Returns:
+        None of fewer than three pairs, or where one side is always the same.
+    """
+    kept = ~(np.isnan(x) | np.isnan(y))
+    x, y = stats.rankdata(x[kept]), stats.rankdata(y[kept])
+    if x.size < 3 or np.ptp(x) == 0.0 or np.ptp(y) == 0.0:
+        return None
+    if x.size > _EXACT_UP_TO:
+        found = stats.spearmanr(x, y)
+        return Correlation(rho=float(found.statistic), p=float(found.pvalue), flights=x.size)
+    centred = y - y.mean()
+    scale = float(np.linalg.norm(x - x.mean()) * np.linalg.norm(centred))
+
+    def statistic(ranks: Array, axis: int = -1) -> Any:
+        return np.sum(ranks * centred, axis=axis) / scale
+
+    test = stats.permutation_test((x,), statistic, permutation_type="pairings", vectorized=True, n_resamples=np.inf)
+    return Correlation(rho=float(test.statistic), p=float(test.pvalue), flights=x.size)
+
+
+def holm(p_values: Sequence[float]) -> list[float]:
+    """P-values of several tests, corrected so that the chance of any false find stays at the level.
+
+    Source: Holm, Scandinavian Journal of Statistics 6 (1979).
+    """
+    order = np.argsort(p_values, kind="stable")
+    factors = len(p_values) - np.arange(len(p_values))
+    corrected = np.minimum(1.0, np.maximum.accumulate(factors * np.asarray(p_values, float)[order]))
+    return [float(p) for p in corrected[np.argsort(order, kind="stable")]]
+
+
+def mcnemar(only_a: int, only_b: int) -> float:
+    """Two-sided p-value of McNemar's exact test: the discordant pairs are equally likely to be of either kind.
+
+    Args:
+        only_a: pairs in which it happened to the first alone.
+        only_b: pairs in which it happened to the second alone.
+    """
+    discordant = only_a + only_b
+    return float(stats.binomtest(only_a, discordant).pvalue) if discordant else 1.0
+
+
+def paired_shares(only_a: int, only_b: int, pairs: int, confidence: float = CONFIDENCE) -> tuple[float, float]:
+    """Interval of the difference of paired proportions, share of b - share of a: Tango's score interval.
+
+    It holds every difference that a score test does not reject; with no difference, that is McNemar's test.
+    Source: Tango, Statistics in Medicine 17 (1998).
+
+    Args:
+        only_a: pairs in which it happened to the first alone.
+        only_b: pairs in which it happened to the second alone.
+        pairs: all pairs, at least one.
+        confidence: of the interval.
+    """
+    z = float(stats.norm.ppf(0.5 * (1.0 + confidence)))
+    estimate = (only_b - only_a) / pairs
+
+    def excess(difference: float) -> float:
+        """How far the score statistic is beyond z, without its denominator."""
+        spread = _score_variance(difference, only_a, only_b, pairs)
+        return abs(only_b - only_a - pairs * difference) - z * math.sqrt(max(spread, 0.0))
+
+    def end(limit: float) -> float:
+        if excess(limit) <= 0.0:
+            return limit
+        beside = estimate + 1e-7 * (limit - estimate)  # at the estimate itself both terms may be 0
+        return float(optimize.brentq(excess, beside, limit, xtol=1e-14))
+
+    return end(-1.0), end(1.0)
+
+
+def _score_variance(difference: float, only_a: int, only_b: int, pairs: int) -> float:
+    """Variance of only_b - only_a where the true difference is the one given, by its restricted likelihood."""
+    square = 2.0 * pairs
+    linear = -only_b - only_a + (2.0 * pairs - only_b + only_a) * difference
+    constant = -only_a * difference * (1.0 - difference)
+    root = math.sqrt(max(linear * linear - 4.0 * square * constant, 0.0))
+    share_a = (root - linear) / (2.0 * square)
+    return pairs * (2.0 * share_a + difference * (1.0 - difference))
+
+
+def paired_difference(a: Array, b: Array, confidence: float = CONFIDENCE) -> PairedDifference:
+    """Mean and median of b - a, each with its interval.
+
+    The mean's is Student's t interval.  The median's has order statistics at its ends, by inverting the sign test, and
+    asks nothing of the distribution (Conover, Practical Nonparametric Statistics, 1999, 3.2).
+
+    Args:
+        a: (K,) finite.
+        b: (K,) finite.
+        confidence: of each interval.
+    """
+    differences = np.asarray(b, float) - np.asarray(a, float)
+    n = differences.size
+    if not n:
+        return PairedDifference(
+            pairs=0, mean=None, lower=None, upper=None, median=None, median_lower=None, median_upper=None
+        )
+    mean = float(differences.mean())
+    half = None
+    if n > 1:
+        spread = float(differences.std(ddof=1)) / math.sqrt(n)
+        half = float(stats.t.ppf(0.5 * (1.0 + confidence), n - 1)) * spread
+    ends = stats.quantile_test(differences, q=0.0, p=0.5).confidence_interval(confidence)
+    median_lower, median_upper = (float(end) if math.isfinite(end) else None for end in ends)
+    return PairedDifference(
+        pairs=n,
+        mean=mean,
+        lower=None if half is None else mean - half,
+        upper=None if half is None else mean + half,
+        median=float(np.median(differences)),
+        median_lower=median_lower,
+        median_upper=median_upper,
+    )

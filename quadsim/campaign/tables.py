@@ -1,0 +1,193 @@
+"""A campaign's summary and manifest -> tables."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+from quadsim.campaign.curves import ALPHA, drivers, label
+from quadsim.campaign.estimates import Summary
+from quadsim.campaign.wording import interval, p_value, percent
+from quadsim.table import ABSENT, Cell, Grid, Mark, format_number
+
+_BAD = ("lost", "error", "violated")
+
+
+def event_table(summary: Summary, failure: Sequence[str] = ()) -> Grid:
+    """How often each event happened; `failure` names the events that count as failure."""
+    lines = tuple(
+        _line(name, str(found["count"]), *_shares(found), percent(found["upper_one_sided"]))
+        for name, found in summary["events"].items()
+    )
+    sure = f"{100.0 * summary['confidence']:g} %"
+    counted = f" ({', '.join(failure)})" if failure else ""
+    return Grid(
+        key="events",
+        title="How often",
+        head=("event", "flights", "share", f"{sure} interval", f"at most, with {sure}"),
+        lines=lines,
+        note=(
+            f"Failure: what the campaign counts as such{counted}. Violation: a required constraint did not hold or was "
+            "not reached, or the flight was lost or raised an error. Intervals are Clopper-Pearson's: two-sided, and "
+            "one-sided in the last column. They take flights as independent draws; draws spread evenly (Latin "
+            "hypercube, Sobol', Halton) make the estimates more precise than that, and a grid gives the share over its "
+            "own points."
+        ),
+    )
+
+
+def constraint_table(summary: Summary) -> Grid:
+    """How often each constraint did not hold, and by how much at worst."""
+    lines = []
+    for name, found in summary["constraints"].items():
+        failed = found["not_satisfied"]
+        mark = Mark.BAD if failed["count"] else Mark.NONE
+        margin = ABSENT if found["worst_margin"] is None else f"{format_number(found['worst_margin'])} {found['unit']}"
+        flight = ABSENT if found["worst_flight"] is None else str(found["worst_flight"])
+        count = Cell(text=str(failed["count"]), mark=mark)
+        lines.append((Cell(text=name), count, *_line(*_shares(failed), margin, flight)))
+    return Grid(
+        key="constraints",
+        title="Constraints",
+        head=(
+            *("constraint", "flights that did not hold it", "share"),
+            *(f"{100.0 * summary['confidence']:g} % interval", "worst margin", "in flight"),
+        ),
+        lines=tuple(lines),
+        note="Margins are signed, at the physics rate and without the tolerance; negative is beyond the bound. A "
+        "constraint whose time window a flight did not reach was not held.",
+    )
+
+
+def metric_table(summary: Summary) -> Grid:
+    """How every metric is distributed."""
+    measures = ("mean", "sd", "min", "p5", "p50", "p95", "p99", "max")
+    lines = tuple(
+        _line(
+            label(name, found["unit"]),
+            *(format_number(found[measure]) for measure in measures),
+            str(found["flights"]),
+        )
+        for name, found in summary["metrics"].items()
+    )
+    return Grid(
+        key="metrics",
+        title="All metrics",
+        head=("metric", *measures, "flights"),
+        lines=lines,
+        note="Over the flights that have the number, lost ones included. worst_margin: the smallest margin of the "
+        "required constraints, tolerance included, as a share of half the constraint's band: 1 in the middle, 0 at the "
+        "end of what is allowed, negative beyond.",
+    )
+
+
+def driver_table(summary: Summary) -> Grid:
+    """How each drawn number goes with the worst margin and with failure."""
+    lines = []
+    for driver in drivers(summary):
+        found = summary["parameters"][driver.name]
+        cells = [Cell(text=label(driver.name, found["unit"]))]
+        for outcome in ("worst_margin", "failed"):
+            correlation = found.get(outcome)
+            if correlation is None:
+                cells += _line(ABSENT, ABSENT)
+                continue
+            mark = Mark.BEST if correlation["p_holm"] < ALPHA else Mark.NONE
+            cells += [
+                Cell(text=f"{correlation['rho']:+.2f}", mark=mark),
+                Cell(text=p_value(correlation["p_holm"])),
+            ]
+        lines.append(tuple(cells))
+    return Grid(
+        key="drivers-table",
+        title="Rank correlations",
+        head=("drawn number", "with the worst margin", "after Holm", "with failure", "after Holm"),
+        lines=tuple(lines),
+        note=(
+            f"Spearman's; bold: beyond chance at {100.0 * ALPHA:g} % over all parameters (Holm). A flight that was "
+            "lost before it had a margin ranks below all others. A parameter that does harm at both of its ends has a "
+            "small rank correlation: look at its scatter."
+        ),
+    )
+
+
+def level_tables(summary: Summary) -> list[Grid]:
+    """How often flights failed with each name or truth value that was drawn."""
+    grids: list[Grid] = []
+    for name, found in summary["parameters"].items():
+        if found["kind"] == "number" or not found["levels"]:
+            continue
+        lines = tuple(
+            _line(level, f"{share['count']} of {share['flights']}", *_shares(share))
+            for level, share in found["levels"].items()
+        )
+        head = (name, "failed", "share", f"{100.0 * summary['confidence']:g} % interval")
+        grids.append(Grid(key=f"levels-{len(grids)}", title=f"Failures by {name}", head=head, lines=lines))
+    return grids
+
+
+def worst_table(summary: Summary, directory: str) -> Grid:
+    """The worst flights, and how to fly each again."""
+    names = list(summary["parameters"])
+    lines = []
+    for flight in summary["worst"]:
+        verdict = flight["verdict"]
+        mark = Mark.BAD if verdict in _BAD else Mark.NONE
+        lines.append(
+            (
+                Cell(text=str(flight["flight"])),
+                Cell(text=verdict, mark=mark),
+                *_line(format_number(flight["worst_margin"]), flight["worst_constraint"] or ABSENT),
+                *_line(format_number(flight["duration"])),
+                Cell(text=replay_command(directory, flight["flight"]), mark=Mark.CODE),
+                *_line(*(_value(flight["draws"][name]) for name in names)),
+                Cell(text=flight["reason"] or ABSENT, mark=Mark.TEXT),
+            )
+        )
+    return Grid(
+        key="worst",
+        title="Worst flights",
+        head=("flight", "verdict", "worst margin", "constraint", "flown [s]", "fly it again", *names, "reason"),
+        lines=tuple(lines),
+        note="Lost flights first, then those that raised an error, violated a constraint, and held all; among these, "
+        "failed ones first, then the smaller worst margin.",
+    )
+
+
+def manifest_table(manifest: Mapping[str, Any]) -> Grid:
+    """How the campaign was made, a line for each entry."""
+    lines = tuple((Cell(text=key), Cell(text=value, mark=Mark.TEXT)) for key, value in _flat(manifest))
+    return Grid(key="manifest", title="How it was made", head=("", ""), lines=lines)
+
+
+def replay_command(directory: str, flight: int) -> str:
+    """The command that flies one flight of a campaign again."""
+    return f"quadsim replay {shlex.quote(directory)} --flight {flight}"
+
+
+def _flat(entries: Mapping[str, Any], head: str = "") -> Iterator[tuple[str, str]]:
+    for key, value in entries.items():
+        name = f"{head}{key}"
+        if isinstance(value, Mapping):
+            yield from _flat(value, f"{name}.")
+        elif isinstance(value, list | tuple):
+            yield name, ", ".join(map(_value, value)) or ABSENT
+        else:
+            yield name, _value(value)
+
+
+def _value(value: Any) -> str:
+    if value is None:
+        return ABSENT
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    return format_number(value) if isinstance(value, float) else str(value)
+
+
+def _shares(found: Mapping[str, Any]) -> tuple[str, str]:
+    return percent(found["share"]), interval(found["lower"], found["upper"])
+
+
+def _line(*texts: str) -> tuple[Cell, ...]:
+    return tuple(Cell(text=text) for text in texts)

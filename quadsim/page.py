@@ -1,0 +1,39 @@
+"""Pages that open without a network: one template for their frame, and a mark by which they are known again."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, Final
+
+PAGE_FILE: Final = "index.html"
+
+_TEMPLATES: Final = Path(__file__).resolve().parent / "templates"
+
+
+def render_page(template: str, kind: str, **context: Any) -> str:
+    """A page from its template; whatever the context holds is text, unless the template says otherwise.
+
+    Args:
+        template: its file in `quadsim/templates`.
+        kind: what the page is, e.g. `comparison`; see `is_page`.
+        context: what the template is told.
+    """
+    from jinja2 import Environment, FileSystemLoader, StrictUndefined
+
+    environment = Environment(
+        loader=FileSystemLoader(_TEMPLATES),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    return environment.get_template(template).render(kind=kind, **context)
+
+
+def is_page(directory: Path, kind: str) -> bool:
+    """Whether a directory holds a page of that kind that we wrote."""
+    page = directory / PAGE_FILE
+    if not page.is_file():
+        return False
+    with page.open(encoding="utf-8", errors="replace") as file:
+        return f'<meta name="generator" content="quadsim {kind}">' in file.read(1024)

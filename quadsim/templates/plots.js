@@ -1,0 +1,70 @@
+// Plots: one colour scheme with the page, one time range for all, one switch per run.
+const plots = [...document.querySelectorAll(".plot")];
+const timed = plots.filter((plot) => "timed" in plot.dataset);
+const dark = matchMedia("(prefers-color-scheme: dark)");
+const config = { responsive: true, displaylogo: false, modeBarButtonsToRemove: ["select2d", "lasso2d", "sendChartToCloud"] };
+
+function pageColours(layout) {
+  const style = getComputedStyle(document.documentElement);
+  const colour = (name) => style.getPropertyValue(name).trim();
+  const patch = {
+    paper_bgcolor: "rgba(0,0,0,0)",
+    plot_bgcolor: "rgba(0,0,0,0)",
+    "font.color": colour("--text"),
+    "hoverlabel.bgcolor": colour("--raised"),
+    "hoverlabel.font.color": colour("--text"),
+    "modebar.bgcolor": "rgba(0,0,0,0)",
+    "modebar.color": colour("--quiet"),
+    "modebar.activecolor": colour("--text"),
+  };
+  const axes = Object.keys(layout).filter((key) => /^[xy]axis/.test(key));
+  if (layout.scene) axes.push("scene.xaxis", "scene.yaxis", "scene.zaxis");
+  for (const axis of axes) {
+    patch[`${axis}.gridcolor`] = colour("--line");
+    patch[`${axis}.zerolinecolor`] = colour("--line");
+    patch[`${axis}.linecolor`] = colour("--quiet");
+  }
+  return patch;
+}
+
+let linking = false;
+
+async function followTime(source, event) {
+  if (linking || !Object.keys(event).some((key) => key.startsWith("xaxis"))) return;
+  linking = true;
+  const range = [...source.layout.xaxis.range];
+  await Promise.all(timed.filter((plot) => plot !== source).map((plot) => Plotly.relayout(plot, { "xaxis.range": range })));
+  linking = false;
+}
+
+function showRun(group, visible) {
+  for (const plot of plots) {
+    const traces = plot.data.flatMap((trace, i) => (trace.legendgroup === group ? [i] : []));
+    if (traces.length) Plotly.restyle(plot, { visible }, traces);
+  }
+}
+
+function hasWebGl() {
+  return Boolean(document.createElement("canvas").getContext("webgl2"));
+}
+
+async function drawPlots() {
+  for (const plot of plots) {
+    const figure = JSON.parse(document.getElementById(`${plot.id}-figure`).textContent);
+    if (figure.layout.scene && !hasWebGl()) {
+      plot.style.height = "auto";
+      plot.textContent = "This plot needs WebGL, which this browser does not offer.";
+      plot.classList.add("quiet");
+      plots.splice(plots.indexOf(plot), 1);
+      continue;
+    }
+    await Plotly.newPlot(plot, figure.data, figure.layout, config);
+    await Plotly.relayout(plot, pageColours(figure.layout));
+  }
+  for (const plot of timed) plot.on("plotly_relayout", (event) => followTime(plot, event));
+  for (const box of document.querySelectorAll("[data-run]")) {
+    box.addEventListener("change", () => showRun(box.dataset.run, box.checked));
+  }
+  dark.addEventListener("change", () => plots.forEach((plot) => Plotly.relayout(plot, pageColours(plot.layout))));
+  document.documentElement.dataset.drawn = plots.length;
+}

@@ -1,0 +1,92 @@
+"""A flight's row, and rows as a table."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import pyarrow as pa
+import pytest
+
+from quadsim.audit import Finding, Limit, audit
+from quadsim.campaign.table import failed_row, flown_row, make_schema, make_table, split_times, unit_of, worst_margin
+from quadsim.rundir import Run
+
+ROLL = Limit(name="roll", signal="roll", lower=-5.0, upper=5.0, tolerance=0.5)
+SPEED = Limit(name="speed", signal="speed", lower=0.0, upper=250.0)
+
+
+def finding(limit: Limit, margin: float) -> Finding:
+    return Finding(
+        limit=limit,
+        peak_sampled=0.0,
+        peak_plant=0.0,
+        worst_margin_sampled=margin,
+        worst_margin=margin,
+        worst_time=0.0,
+        time_violated=0.0,
+    )
+
+
+def test_a_row_has_what_the_schema_says(short_run: Run) -> None:
+    schema = make_schema({"mass": pa.float64(), "kind": pa.string()}, short_run.limits)
+    row = flown_row(short_run.log, audit(short_run.log, short_run.limits), verdict="violated", wall_s=1.5)
+    known = {"flight", "seed", "draw.mass", "draw.kind", "failed"}
+    assert {*row} | known == {*schema.names}
+    table = make_table([{**row, "flight": 2, "seed": 1, "failed": True}], schema)
+    assert table.schema == schema
+    assert table["duration"].to_pylist() == [6.0]
+    assert table["draw.mass"].to_pylist() == [None]
+    assert (unit_of(table, "margin.roll"), unit_of(table, "rmse.x"), unit_of(table, "verdict")) == ("deg", "m", "-")
+
+
+def test_a_row_tells_what_the_summary_tells(short_run: Run) -> None:
+    row = flown_row(short_run.log, audit(short_run.log, short_run.limits), verdict="satisfied", wall_s=0.0)
+    summary = short_run.summary
+    assert row["rmse.z"] == summary["tracking"]["rmse"]["z"]
+    assert row["slew_max"] == summary["control"]["slew_max"]
+    assert row["iterations.max"] == summary["controller"]["iterations"]["max"]
+    assert row["unsolved_periods"] == 0
+    assert row["margin.arrival_x"] is None, "a window that was not reached"
+    assert row["satisfied.arrival_x"] is False
+
+
+def test_a_flight_that_raised_has_a_row_too(short_run: Run) -> None:
+    schema = make_schema({}, short_run.limits)
+    table = make_table([{"flight": 0, "seed": 0, "failed": True} | failed_row("boom")], schema)
+    assert table.select(["status", "verdict", "reason", "violated"]).to_pylist() == [
+        {"status": "error", "verdict": "error", "reason": "boom", "violated": True}
+    ]
+    assert table["rmse.x"].null_count == 1
+
+
+def test_rows_are_sorted_and_clock_times_stand_apart(short_run: Run) -> None:
+    schema = make_schema({}, short_run.limits)
+    rows = [{"flight": k, "seed": k, "failed": False, "wall_s": 1.0} | failed_row("x") for k in (2, 0, 1)]
+    flights, times = split_times(make_table(rows, schema))
+    assert flights["flight"].to_pylist() == [0, 1, 2]
+    assert times.column_names == ["flight", "wall_s", "step_p50_ms", "step_p99_ms"]
+    assert not {"wall_s", "step_p50_ms"} & {*flights.column_names}
+
+
+@pytest.mark.parametrize(
+    ("findings", "expected"),
+    [
+        ([], (None, None)),
+        ([finding(ROLL, 4.5)], (1.0, "roll")),
+        ([finding(ROLL, -0.5)], (0.0, "roll")),
+        ([finding(ROLL, -3.0)], (-0.5, "roll")),
+        ([finding(replace(ROLL, required=False), -3.0)], (None, None)),
+        ([finding(ROLL, math.nan)], (None, None)),
+        ([finding(ROLL, 4.5), finding(SPEED, 0.0)], (1.0, "roll")),
+        ([finding(ROLL, 4.5), finding(SPEED, -12.5)], (-0.1, "speed")),
+        ([finding(replace(ROLL, lower=-math.inf), -3.0)], (-0.5, "roll")),
+        ([finding(replace(ROLL, lower=-math.inf, upper=0.0), -3.0)], (-2.5, "roll")),
+    ],
+)
+def test_the_worst_margin_is_a_share_of_half_the_band(
+    findings: list[Finding], expected: tuple[float | None, str | None]
+) -> None:
+    share, name = worst_margin(findings)
+    assert name == expected[1]
+    assert share == (None if expected[0] is None else pytest.approx(expected[0]))
