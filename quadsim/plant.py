@@ -226,9 +226,10 @@ class Plant:
             self._speeds = target
         else:
             edges = timestep * np.arange(steps + 1, dtype=np.float64)
-            at_edges, _ = rotors.respond(self._speeds, target, edges)
-            middle, slopes = rotors.respond(self._speeds, target, edges[:-1] + 0.5 * timestep)
-            before, self._speeds = at_edges[:-1], at_edges[-1]
+            times = np.concatenate([edges, edges[:-1] + 0.5 * timestep])
+            speeds, slopes = rotors.respond(self._speeds, target, times)
+            before, self._speeds = speeds[:steps].copy(), speeds[steps].copy()
+            middle, slopes = speeds[steps + 1 :], slopes[steps + 1 :]
         thrusts = self._efficiency * self.vehicle.thrust_coefficient * np.square(middle)
         wrench = wind = None
         if self._by_step:
@@ -266,35 +267,39 @@ class Plant:
         mujoco.mj_setState(model, data, self._physics[0], _FULL)
         steps = len(thrusts)
         trajectory, wrench = np.empty((steps, self._physics.shape[1])), np.empty((steps, 6))
+        positions, velocities = trajectory[:, 1:8], trajectory[:, 8:]
         noise = self._draw_disturbance(steps)
         air = np.zeros((steps, 3)) if wind is None else wind
-        moving_air = wind is not None and self.effects.body_drag is not None
+        drags = self.effects.body_drag is not None
+        moving_air = wind is not None and drags
         velocity_before = self._velocity_before
         there = self._efficiency > 0.0  # a lost propeller neither drags nor carries momentum
-        turning, changing = (speeds * there).tolist(), (slopes * there).tolist()
-        rows = zip(thrusts.tolist(), turning, changing, air.tolist(), noise, strict=True)
-        for i, (thrust, speed, slope, breeze, push) in enumerate(rows):
+        of_rotors = self._forces.of_rotors(speeds * there, slopes * there).tolist()
+        forces, step = self._forces.wrench, mujoco.mj_step
+        for i, (thrust, rotors, breeze) in enumerate(zip(thrusts.tolist(), of_rotors, air.tolist(), strict=True)):
             velocity = qvel.tolist()
             motion = midway(qpos.tolist(), velocity, velocity_before, timestep)
             velocity_before = velocity
-            applied[:] = self._forces.wrench(motion, thrust, speed, slope, breeze)
-            applied += push
+            applied[:] = forces(motion, thrust, rotors, breeze)
+            if noise is not None:
+                applied += noise[i]
             control[:] = thrust
             if moving_air:
                 model.opt.wind[:] = breeze
-            mujoco.mj_step(model, data)
-            row = trajectory[i]
-            row[0], row[1:8], row[8:14] = data.time, qpos, qvel
-            wrench[i] = applied
-            wrench[i] += fluid
+            step(model, data)
+            positions[i], velocities[i], wrench[i] = qpos, qvel, applied
+            if drags:
+                wrench[i] += fluid
         self._velocity_before = velocity_before
+        start = self._physics[0, :1]
+        trajectory[:, 0] = np.add.accumulate(np.concatenate([start, np.full(steps, timestep)]))[1:]
         return trajectory, wrench
 
-    def _draw_disturbance(self, steps: int) -> Array:
-        """(steps, 6) force, world [N], and torque, body [N m], of the disturbance over each step."""
+    def _draw_disturbance(self, steps: int) -> Array | None:
+        """(steps, 6) force, world [N], and torque, body [N m], of the disturbance over each step; None without one."""
         disturbance = self.effects.disturbance
         if disturbance is None:
-            return np.zeros((steps, 6))
+            return None
         constant = np.array([*disturbance.force, *disturbance.torque])
         density = np.repeat([disturbance.force_noise, disturbance.torque_noise], 3)
         if not density.any():

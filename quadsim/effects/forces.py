@@ -1,34 +1,37 @@
 """Forces that follow from how the vehicle moves, evaluated once per physics step.
 
 Written with plain numbers: it runs a thousand times per simulated second, where small arrays would cost more than all
-of MuJoCo's step.
+of MuJoCo's step.  What follows from the rotors alone is worked out beforehand for many steps at once.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
 
 from quadsim.effects import Effects
 from quadsim.effects.ground_effect import thrust_ratio
-from quadsim.vehicle import Vehicle
+from quadsim.state import Array
+from quadsim.vehicle import N_ROTORS, Vehicle
 
 Vector = tuple[float, float, float]
 Matrix = tuple[Vector, Vector, Vector]
+Wrench = tuple[float, float, float, float, float, float]
 
 
-@dataclass(frozen=True, slots=True)
-class Motion:
+class Motion(NamedTuple):
     """The vehicle at an instant.
 
     Attributes:
-        position: of the body frame's origin, world [m].
+        height: of the body frame's origin, world [m].
         rotation: body to world, by rows.
         velocity: of that origin, world [m/s].
         rates: body rates [rad/s].
     """
 
-    position: Vector
+    height: float
     rotation: Matrix
     velocity: Vector
     rates: Vector
@@ -46,18 +49,20 @@ def midway(qpos: Sequence[float], qvel: Sequence[float], qvel_before: Sequence[f
         qvel_before: the same a step ago.
         timestep: [s].
     """
-    vx, vy, vz, p, q, r = (now + 0.5 * (now - before) for now, before in zip(qvel, qvel_before, strict=True))
+    vx, vy, vz, p, q, r = qvel
+    ux, uy, uz, a, b, c = qvel_before
+    vx, vy, vz = vx + 0.5 * (vx - ux), vy + 0.5 * (vy - uy), vz + 0.5 * (vz - uz)
+    p, q, r = p + 0.5 * (p - a), q + 0.5 * (q - b), r + 0.5 * (r - c)
+    _, _, height, w, x, y, z = qpos
     half = 0.5 * timestep
-    position = (qpos[0] + half * vx, qpos[1] + half * vy, qpos[2] + half * vz)
-    w, x, y, z = qpos[3:]
     quarter = 0.5 * half  # dq/dt = q * (0, rates) / 2
-    turned = (
+    rotation = _rotation(
         w - quarter * (x * p + y * q + z * r),
         x + quarter * (w * p + y * r - z * q),
         y + quarter * (w * q + z * p - x * r),
         z + quarter * (w * r + x * q - y * p),
     )
-    return Motion(position, _rotation(*turned), (vx, vy, vz), (p, q, r))
+    return Motion(height + half * vz, rotation, (vx, vy, vz), (p, q, r))
 
 
 class StepForces:
@@ -84,52 +89,62 @@ class StepForces:
             floor: height of the ground, world [m].
             disc: height of the rotor discs, body frame [m].
         """
-        self._drag = effects.rotor_drag
         self._inertia = effects.rotors.inertia if effects.rotors is not None else 0.0
+        self._drag = effects.rotor_drag
         self._radius = effects.rotor_radius
         self._floor, self._disc = floor, disc
         self._places: list[tuple[float, float]] = [(x, y) for x, y, _ in vehicle.rotor_positions.tolist()]
-        self._spins = vehicle.rotor_spins
+        k, spins = self._drag, np.array(vehicle.rotor_spins, float)
+        x, y = vehicle.rotor_positions[:, 0], vehicle.rotor_positions[:, 1]
+        share = [np.full(N_ROTORS, k), k * x, k * y, k * (x * x + y * y), -self._inertia * spins]
+        self._of_speed = np.stack(share, axis=1)  # (4, 5) what each rotor adds to a row of `of_rotors`, per rad/s
+        self._of_slope = self._inertia * spins  # (4,) per rad/s^2
+
+    def of_rotors(self, speeds: Array, accelerations: Array) -> Array:
+        """What the forces take from the rotors, whatever the motion.
+
+        Args:
+            speeds: (M, 4) rotor speeds [rad/s].
+            accelerations: (M, 4) of the rotors [rad/s^2].
+
+        Returns:
+            (M, 6) drag coefficients D = sum_i k w_i [kg/s] and their moments sum_i x_i k w_i, sum_i y_i k w_i [kg m/s]
+            and sum_i (x_i^2 + y_i^2) k w_i [kg m^2/s]; angular momentum h [N m s]; spin-up torque -dh/dt [N m].
+        """
+        rows = np.zeros((len(speeds), 6))
+        for of_speed, of_slope, speed, slope in zip(
+            self._of_speed, self._of_slope, speeds.T, accelerations.T, strict=True
+        ):
+            rows[:, :5] += speed[:, None] * of_speed
+            rows[:, 5] += of_slope * slope
+        return rows
 
     def wrench(
-        self,
-        motion: Motion,
-        thrusts: Sequence[float],
-        speeds: Sequence[float],
-        accelerations: Sequence[float],
-        wind: Sequence[float],
-    ) -> tuple[float, float, float, float, float, float]:
+        self, motion: Motion, thrusts: Sequence[float], of_rotors: Sequence[float], wind: Sequence[float]
+    ) -> Wrench:
         """Force in the world frame [N] and torque in the body frame about its origin [N m].
 
         Args:
             motion: of the vehicle.
             thrusts: (4,) that the rotors would have far from the ground [N].
-            speeds: (4,) rotor speeds [rad/s].
-            accelerations: (4,) of the rotors [rad/s^2].
+            of_rotors: (6,) a row of `of_rotors`.
             wind: (3,) velocity of the air, world frame [m/s].
         """
-        (r00, r01, r02), (r10, r11, r12), (r20, r21, r22) = motion.rotation
-        p, q, r = motion.rates
-        fx = fy = fz = tx = ty = tz = 0.0
+        height, ((r00, r01, r02), (r10, r11, r12), (r20, r21, r22)), (vx, vy, vz), (p, q, r) = motion
+        drag, drag_x, drag_y, drag_xy, momentum, tz = of_rotors
+        fx = fy = fz = tx = ty = 0.0
         if self._drag:
-            ax, ay, az = (v - w for v, w in zip(motion.velocity, wind, strict=True))
-            along_x = r00 * ax + r10 * ay + r20 * az
-            along_y = r01 * ax + r11 * ay + r21 * az
-            bx = by = 0.0
-            for (x, y), speed in zip(self._places, speeds, strict=True):
-                hold = self._drag * speed
-                fxi, fyi = -hold * (along_x - r * y), -hold * (along_y + r * x)
-                bx += fxi
-                by += fyi
-                tz += x * fyi - y * fxi
+            air_x, air_y, air_z = wind
+            vx, vy, vz = vx - air_x, vy - air_y, vz - air_z
+            along_x = r00 * vx + r10 * vy + r20 * vz
+            along_y = r01 * vx + r11 * vy + r21 * vz
+            bx, by = drag_y * r - drag * along_x, -drag_x * r - drag * along_y
+            tz = tz + drag_y * along_x - drag_x * along_y - drag_xy * r
             fx, fy, fz = r00 * bx + r01 * by, r10 * bx + r11 * by, r20 * bx + r21 * by
         if self._inertia:
-            momentum = -self._inertia * sum(spin * speed for spin, speed in zip(self._spins, speeds, strict=True))
-            tx -= q * momentum
-            ty += p * momentum
-            tz += self._inertia * sum(spin * slope for spin, slope in zip(self._spins, accelerations, strict=True))
+            tx, ty = -q * momentum, p * momentum
         if self._radius is not None:
-            above = motion.position[2] - self._floor + r22 * self._disc
+            above = height - self._floor + r22 * self._disc
             lift = 0.0
             for (x, y), thrust in zip(self._places, thrusts, strict=True):
                 gain = thrust * (thrust_ratio(above + r20 * x + r21 * y, self._radius) - 1.0)
@@ -142,9 +157,11 @@ class StepForces:
 
 def _rotation(w: float, x: float, y: float, z: float) -> Matrix:
     """Body to world, of a quaternion that need not be of unit length."""
-    s = 2.0 / (w * w + x * x + y * y + z * z)
+    xx, yy, zz = x * x, y * y, z * z
+    wx, wy, wz, xy, xz, yz = w * x, w * y, w * z, x * y, x * z, y * z
+    s = 2.0 / (w * w + xx + yy + zz)
     return (
-        (1.0 - s * (y * y + z * z), s * (x * y - w * z), s * (x * z + w * y)),
-        (s * (x * y + w * z), 1.0 - s * (x * x + z * z), s * (y * z - w * x)),
-        (s * (x * z - w * y), s * (y * z + w * x), 1.0 - s * (x * x + y * y)),
+        (1.0 - s * (yy + zz), s * (xy - wz), s * (xz + wy)),
+        (s * (xy + wz), 1.0 - s * (xx + zz), s * (yz - wx)),
+        (s * (xz - wy), s * (yz + wx), 1.0 - s * (xx + yy)),
     )
