@@ -4,7 +4,7 @@
 
 .NOTPARALLEL:
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test peers check format types build numbers verification robustness soak pins clean
+.PHONY: help setup demo test peers check format types build numbers verification robustness soak campaigns kills pins clean
 
 VENV := .venv
 PY := $(VENV)/bin/python
@@ -42,9 +42,9 @@ demo: setup  ## fly the paper's two flights and compare them, under runs/ (OPTIO
 	@$(QUADSIM) compare $(RUNS)/paper-unconstrained $(RUNS)/paper-constrained --out $(RUNS)/comparison
 	@echo "Done. Open $(RUNS)/comparison/index.html in a browser."
 
-test peers verification robustness soak: export OMP_NUM_THREADS := 1
-test peers verification robustness soak: export OPENBLAS_NUM_THREADS := 1
-test peers verification robustness soak: export MKL_NUM_THREADS := 1
+test peers verification robustness soak campaigns kills: export OMP_NUM_THREADS := 1
+test peers verification robustness soak campaigns kills: export OPENBLAS_NUM_THREADS := 1
+test peers verification robustness soak campaigns kills: export MKL_NUM_THREADS := 1
 test: setup $(VENV)/.browser  ## run every test that needs no peer (OPTIONS="-k audit" for some)
 	@$(PY) -m pytest -q -n $(WORKERS) --dist loadscope $(OPTIONS)
 
@@ -82,6 +82,12 @@ robustness: setup  ## remake docs/robustness.md: the ladder of mismatches and 50
 
 soak: setup  ## one simulated hour on end: memory and step time have to stay as they were
 	@$(PY) tests/soak.py --minutes 60
+
+campaigns: setup  ## fly the campaigns that ship and remake docs/paper-robustness.md, some fifty minutes; goes on with what is there
+	@$(PY) docs/make_campaigns.py
+
+kills: setup  ## kill a campaign's processes a hundred times: nothing may be lost, or there twice
+	@$(PY) tests/campaign_kills.py
 
 pins: $(VENV)/.python  ## resolve every package anew, at its newest, into constraints.txt
 	@fresh=$$(mktemp -d) && trap 'rm -rf "$$fresh"' EXIT && fresh_python="$$fresh/bin/python" && \

@@ -41,7 +41,7 @@ def read_scenario(path: Path, find: Callable[[str], Path], *, above: tuple[Path,
     if base.resolve() in chain:
         raise FileError(path, f"is its own base: {' -> '.join([*(file.name for file in chain), base.name])}")
     inherited = read_scenario(base, find, above=chain)
-    _locate(inherited, base.parent)
+    locate(inherited, base.parent)
     # The base's place in the library is its own.
     return merge({key: value for key, value in inherited.items() if key not in ("group", "expect")}, data)
 
@@ -109,8 +109,8 @@ def _named(value: Any) -> bool:
     return all(isinstance(name, str) for name in names) and len(set(names)) == len(names)
 
 
-def _locate(data: dict[str, Any], directory: Path) -> None:
-    """Make paths that are relative to a base's folder independent of it."""
+def locate(data: dict[str, Any], directory: Path) -> None:
+    """Make paths that are relative to a file's folder independent of it, in place."""
     for table, field in (("vehicle", "file"), ("reference", "file")):
         file = data.get(table, {}).get(field) if isinstance(data.get(table), dict) else None
         if isinstance(file, str) and (directory / file).is_file():

@@ -50,17 +50,17 @@ def build_vehicle(scenario: Scenario) -> Vehicle:
 
 def resolve(scenario: Scenario, vehicle: Vehicle) -> Scenario:
     """The scenario with every number that it leaves to its vehicle written out: its file alone defines the flight."""
+    return resolve_vehicle(scenario, vehicle).model_copy(update={"effects": resolve_effects(scenario.effects, vehicle)})
+
+
+def resolve_vehicle(scenario: Scenario, vehicle: Vehicle) -> Scenario:
+    """The scenario with the numbers of its vehicle's file in it; effects go on taking theirs from the vehicle."""
     numbers: dict[str, Any] = {
         name: list(value) if isinstance(value, tuple) else value
         for name in type(scenario.vehicle).model_fields
         if name != "file" and (value := getattr(vehicle, name)) is not None
     }
-    return scenario.model_copy(
-        update={
-            "vehicle": scenario.vehicle.model_copy(update=numbers),
-            "effects": resolve_effects(scenario.effects, vehicle),
-        }
-    )
+    return scenario.model_copy(update={"vehicle": scenario.vehicle.model_copy(update=numbers)})
 
 
 def build_plant(scenario: Scenario, vehicle: Vehicle, kind: type[Plant] = Plant) -> Plant:

@@ -7,7 +7,6 @@ wrong.  Nothing heavy is imported before a command runs, so that `quadsim --help
 from __future__ import annotations
 
 import argparse
-import gc
 import os
 import signal
 import sys
@@ -15,6 +14,7 @@ from collections.abc import Sequence
 
 from quadsim import __version__
 from quadsim.errors import QuadsimError
+from scenarios.garbage import collect_rarely
 
 EXIT_DONE, EXIT_FAILED, EXIT_WRONG_INPUT = 0, 1, 2
 
@@ -37,10 +37,7 @@ def make_parser() -> argparse.ArgumentParser:
     _add_scenario(run)
     run.add_argument("--out", metavar="DIR", help="run directory, replacing an earlier run (default: runs/SCENARIO)")
     _add_settings(run)
-    for product in ("video", "recording", "figures"):
-        run.add_argument(
-            f"--{product}", action=argparse.BooleanOptionalAction, default=True, help=f"make the {product}"
-        )
+    _add_products(run)
     run.add_argument("--json", action="store_true", help="print the summary alone, as JSON on stdout")
 
     check = commands.add_parser("check", help="audit a scenario (flown first) or a finished run; exit 1 if it fails")
@@ -49,8 +46,13 @@ def make_parser() -> argparse.ArgumentParser:
     check.add_argument("--junit", metavar="FILE", help="also write the verdicts as JUnit XML")
     check.add_argument("--json", action="store_true", help="print the summary alone, as JSON on stdout")
 
-    compare = commands.add_parser("compare", help="flights side by side: table, figures, HTML page")
-    compare.add_argument("targets", metavar="RUN_OR_SCENARIO", nargs="+", help="run directories, or scenarios to fly")
+    compare = commands.add_parser("compare", help="flights, or two campaigns, side by side: table, figures, HTML page")
+    compare.add_argument(
+        "targets",
+        metavar="RUN_OR_SCENARIO",
+        nargs="+",
+        help="run directories, scenarios to fly, or the directories of two campaigns",
+    )
     compare.add_argument("--out", metavar="DIR", required=True, help="directory of the page")
     compare.add_argument(
         "--cost",
@@ -82,11 +84,56 @@ def make_parser() -> argparse.ArgumentParser:
     vehicle.add_argument("--out", metavar="FILE", help="PNG file to draw it to, on a floor of 10 cm squares")
     vehicle.add_argument("--json", action="store_true", help="as JSON on stdout")
 
+    _add_campaign(commands.add_parser("campaign", help="fly a scenario many times, what may vary drawn at random"))
+
+    replay = commands.add_parser("replay", help="fly one flight of a campaign again, with all outputs")
+    replay.add_argument("campaign", metavar="CAMPAIGN", help="a campaign's directory")
+    which = replay.add_mutually_exclusive_group()
+    which.add_argument("--worst", action="store_true", help="the worst flight (the default)")
+    which.add_argument("--flight", type=int, metavar="N", help="that flight")
+    replay.add_argument("--out", metavar="DIR", help="run directory (default: runs/CAMPAIGN-N)")
+    _add_products(replay)
+    replay.add_argument("--json", action="store_true", help="print the summary alone, as JSON on stdout")
+
     _add_bench(commands.add_parser("bench", help="measure QP solvers, a flight, a film, and what controllers survive"))
 
     doctor = commands.add_parser("doctor", help="what this machine can do")
     doctor.add_argument("--json", action="store_true", help="as JSON on stdout")
     return parser
+
+
+def _add_campaign(campaign: argparse.ArgumentParser) -> None:
+    campaign.add_argument("file", metavar="FILE", help="library name, or path to a TOML file")
+    campaign.add_argument("--out", metavar="DIR", help="campaign's directory (default: runs/campaigns/NAME)")
+    campaign.add_argument("--workers", type=int, metavar="N", help="processes (default: one per core)")
+    campaign.add_argument(
+        "--cluster",
+        metavar="ADDRESS",
+        help="fly on a Dask cluster: a scheduler's address, tcp://HOST:PORT, or a TOML file that describes a batch "
+        "system's jobs",
+    )
+    campaign.add_argument("--resume", action="store_true", help="go on with what is there")
+    campaign.add_argument("--flights", type=int, metavar="N", help="so many instead of the file's")
+    campaign.add_argument(
+        "--until-width",
+        type=float,
+        metavar="W",
+        help="stop once the 95 %% interval of the failure probability is as narrow as this, e.g. 0.05",
+    )
+    campaign.add_argument(
+        "--require",
+        dest="requirements",
+        metavar="REQUIREMENT",
+        action="append",
+        default=[],
+        help='exit 1 unless the flights support it, e.g. "P(violation) < 0.01 @ 95%%"; may be repeated',
+    )
+    campaign.add_argument(
+        "--report", action=argparse.BooleanOptionalAction, default=True, help="write the report, an HTML page"
+    )
+    campaign.add_argument("--junit", metavar="FILE", help="also write the requirements' verdicts as JUnit XML")
+    _add_settings(campaign)
+    campaign.add_argument("--json", action="store_true", help="print the summary alone, as JSON on stdout")
 
 
 def _add_bench(bench: argparse.ArgumentParser) -> None:
@@ -125,7 +172,18 @@ def _add_bench(bench: argparse.ArgumentParser) -> None:
     ladder.add_argument("--workers", type=int, metavar="N", help="processes (default: one per core)")
     ladder.add_argument("--quick", action="store_true", help="three controllers, three conditions, 12 s each")
 
-    for kind in (solvers, flight, render, ladder):
+    campaign = kinds.add_parser("campaign", help="what many flights cost, by one worker and by two")
+    campaign.add_argument("--flights", type=int, metavar="N", default=12, help="per worker and round (default: 12)")
+    campaign.add_argument("--rounds", type=int, metavar="N", default=3, help="of one worker and two (default: 3)")
+    campaign.add_argument(
+        "--sizes",
+        type=_whole_numbers,
+        metavar="N,N,...",
+        default=[10, 100, 1000, 10000],
+        help="flights of ever larger campaigns, or none (default: 10,100,1000,10000)",
+    )
+
+    for kind in (solvers, flight, render, ladder, campaign):
         kind.add_argument("--scenario", metavar="SCENARIO", default="paper-constrained", help="(default: %(default)s)")
         _add_settings(kind)
         kind.add_argument("--json", action="store_true", help="print what was measured alone, as JSON on stdout")
@@ -143,6 +201,13 @@ def _add_scenario(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("scenario", metavar="SCENARIO", help="library name, or path to a TOML file")
 
 
+def _add_products(parser: argparse.ArgumentParser) -> None:
+    for product in ("video", "recording", "figures"):
+        parser.add_argument(
+            f"--{product}", action=argparse.BooleanOptionalAction, default=True, help=f"make the {product}"
+        )
+
+
 def _add_settings(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--set",
@@ -152,7 +217,7 @@ def _add_settings(parser: argparse.ArgumentParser) -> None:
         default=[],
         help="replace a field of the scenario, e.g. --set controller.horizon=30; may be repeated",
     )
-    parser.add_argument("--seed", type=int, metavar="N", help="replace the scenario's seed, of everything random in it")
+    parser.add_argument("--seed", type=int, metavar="N", help="replace the seed, of everything random in it")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -160,7 +225,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = make_parser().parse_args(arguments)
     if arguments is None:  # as a process of its own: being told to stop is Ctrl-C, and leaves nothing half written
         signal.signal(signal.SIGTERM, signal.default_int_handler)
-        gc.set_threshold(100_000, 50, 100)  # a command makes few cycles: looking for them less often saves 5 % of a run
+        collect_rarely()  # saves 5 % of a run
     try:
         from scenarios import commands
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -23,17 +23,24 @@ def write_junit(summary: Mapping[str, Any], path: Path) -> None:
         (entry["name"], entry["satisfied"] or not entry["required"], _sentence(entry))
         for entry in summary["constraints"]
     ]
-    failures = sum(not passed for _, passed, _ in cases)
-    suite = ElementTree.Element(
-        "testsuite", name=f"quadsim.{summary['scenario']}", tests=str(len(cases)), failures=str(failures)
-    )
-    for name, passed, sentence in cases:
-        case = ElementTree.SubElement(suite, "testcase", classname=f"quadsim.{summary['scenario']}", name=name)
+    write_cases(summary["scenario"], cases, path)
+
+
+def write_cases(suite: str, cases: Sequence[tuple[str, bool, str]], path: Path) -> None:
+    """Write test cases of a suite: the name of each, whether it passes, and what is said of it.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    name, failures = f"quadsim.{suite}", sum(not passed for _, passed, _ in cases)
+    root = ElementTree.Element("testsuite", name=name, tests=str(len(cases)), failures=str(failures))
+    for case_name, passed, sentence in cases:
+        case = ElementTree.SubElement(root, "testcase", classname=name, name=case_name)
         if passed:
             ElementTree.SubElement(case, "system-out").text = sentence
         else:
             ElementTree.SubElement(case, "failure", message=sentence)
-    write_atomically(path, ElementTree.tostring(suite, encoding="utf-8", xml_declaration=True).decode())
+    write_atomically(path, ElementTree.tostring(root, encoding="utf-8", xml_declaration=True).decode())
 
 
 def _sentence(entry: Mapping[str, Any]) -> str:

@@ -63,13 +63,16 @@ class ScenarioError(InputError):
         self.source, self.problems = source, tuple(problems)
 
 
-def describe(details: ErrorDetails, data: Mapping[str, Any], root: type[BaseModel] = Scenario) -> str:
+def describe(
+    details: ErrorDetails, data: Mapping[str, Any], root: type[BaseModel] = Scenario, *, file: str = "scenario"
+) -> str:
     """One line about one field: its name, what is allowed, what was given.
 
     Args:
         details: what pydantic found.
         data: the file.
         root: what the file is to be.
+        file: what such a file is called.
     """
     place = find(details["loc"], data, root)
     field, kind, given, context = ".".join(place.names), details["type"], details["input"], {**details.get("ctx", {})}
@@ -77,10 +80,10 @@ def describe(details: ErrorDetails, data: Mapping[str, Any], root: type[BaseMode
         return f"{field} is missing"
     if kind == "extra_forbidden":
         allowed = find(details["loc"][:-1], data, root).fields
-        if root is Scenario and len(place.names) == 1 and field != "base":
+        if len(place.names) == 1 and field != "base":
             allowed += ("base",)  # which is gone once a file has been merged over its base
         guess = _guess(place.names[-1], allowed)
-        return f"{field} is not a field of the scenario file{guess} (there are: {', '.join(allowed)})"
+        return f"{field} is not a field of the {file} file{guess} (there are: {', '.join(allowed)})"
     if kind == "value_error":
         return ".".join([*place.names, str(context["error"])])
     if kind in ("too_short", "too_long") and place.exact_length is not None:

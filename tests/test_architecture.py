@@ -22,7 +22,17 @@ PACKAGES = ("quadsim", "mpc", "scenarios")
 MPC_MAY_IMPORT = {"quadsim.vehicle", "quadsim.state", "quadsim.errors", "quadsim.controller"}
 RENDER_WORKER = "quadsim.render_worker"
 """Only ever run as a child process, so it alone may import at its top what is heavy."""
-OF_ONE_ROOM = ("rerun", "imageio", "imageio_ffmpeg", "matplotlib", "plotly", "jinja2", "dask")
+OF_ONE_ROOM = (
+    "rerun",
+    "imageio",
+    "imageio_ffmpeg",
+    "matplotlib",
+    "plotly",
+    "jinja2",
+    "dask",
+    "dask_jobqueue",
+    "distributed",
+)
 IMPORT_NAMES = {"pillow": "PIL", "rerun-sdk": "rerun"}
 """Distributions whose import name is not their own."""
 

@@ -26,6 +26,8 @@ ADDED = {
     "bench flight": (*SHORT, "--repeats", "1"),
     "bench render": (*SHORT, "--seconds", "0.2"),
     "bench ladder": ("--set", "controller.horizon=5"),
+    "campaign": ("--set", "duration=1.0", "--flights", "2", "--no-report", "--out", "campaign"),
+    "replay": ("--no-video", "--no-recording", "--no-figures"),
 }
 """What makes a command cheap enough to run here."""
 
@@ -63,11 +65,20 @@ def promised_file(options: Namespace) -> Path | None:
 
 
 @pytest.fixture
-def workplace(short_run_directory: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The working directory after `make demo`, with a shorter flight in the place of both."""
+def workplace(short_run_directory: Path, campaign: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The working directory after `make demo`, with a shorter flight in the place of both, and after a campaign."""
+    shutil.copytree(campaign, tmp_path / "runs" / "campaigns" / campaign.name)
     for name in ("paper-unconstrained", "paper-constrained"):
         shutil.copytree(short_run_directory, tmp_path / "runs" / name)
     monkeypatch.chdir(tmp_path)
+
+
+@pytest.fixture(scope="session")
+def campaign(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The campaign of the README, shorter and of fewer flights."""
+    directory = tmp_path_factory.mktemp("campaign") / "paper-robustness"
+    assert main(["campaign", "paper-robustness", *ADDED["campaign"][:-1], str(directory)]) == EXIT_DONE
+    return directory
 
 
 def test_every_command_is_documented_and_every_documented_one_exists() -> None:

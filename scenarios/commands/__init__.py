@@ -7,6 +7,7 @@ from collections.abc import Callable
 from typing import Final
 
 from scenarios.commands.bench import bench
+from scenarios.commands.campaigns import campaign, replay
 from scenarios.commands.catalogue import doctor, list_everything, scenario, vehicle
 from scenarios.commands.flights import check, compare, run
 from scenarios.commands.products import video, view
@@ -20,6 +21,8 @@ COMMANDS: Final[dict[str, Callable[[Namespace], int]]] = {
     "view": view,
     "scenario": scenario,
     "vehicle": vehicle,
+    "campaign": campaign,
+    "replay": replay,
     "bench": bench,
     "doctor": doctor,
 }

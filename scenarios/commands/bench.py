@@ -83,9 +83,20 @@ def _bench_ladder(scenario: Scenario, options: Namespace, progress: runner.Progr
     return ladder.to_json(), ladder_tables(ladder), str(target)
 
 
+def _bench_campaign(scenario: Scenario, options: Namespace, progress: runner.Progress) -> _Benched:
+    from quadsim.bench import campaign_tables
+    from scenarios.bench.campaign import bench_campaign
+
+    profile = bench_campaign(
+        scenario, flights=options.flights, rounds=options.rounds, sizes=options.sizes, progress=progress
+    )
+    return profile.to_json(), campaign_tables(profile), None
+
+
 _BENCHES: Final = {
     "solvers": _bench_solvers,
     "flight": _bench_flight,
     "render": _bench_render,
     "ladder": _bench_ladder,
+    "campaign": _bench_campaign,
 }

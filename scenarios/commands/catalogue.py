@@ -14,6 +14,7 @@ from quadsim.errors import InputError, ParameterError
 from quadsim.vehicle import load_vehicle, vehicle_sources
 from scenarios import console
 from scenarios.build import CONTROLLERS, build_vehicle, resolve
+from scenarios.campaign.plan import campaign_names, read_campaign
 from scenarios.cli import EXIT_DONE
 from scenarios.commands.common import load
 from scenarios.loading import load_scenario, scenario_names
@@ -28,6 +29,7 @@ def list_everything(options: Namespace) -> int:
     """`quadsim list`."""
     scenarios = [load_scenario(name) for name in scenario_names()]
     sections = {
+        "campaigns": {name: read_campaign(name)["description"] for name in campaign_names()},
         "vehicles": {name: load_vehicle(vehicle_path(name)).description for name in vehicle_names()},
         "controllers": dict(CONTROLLERS),
         "solvers": {name: entry.line for name, entry in SOLVERS.items()},

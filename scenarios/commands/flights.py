@@ -10,7 +10,9 @@ from quadsim import rundir
 from quadsim.errors import FileError, ParameterError
 from scenarios import console, runner
 from scenarios.build import build_vehicle
+from scenarios.campaign.manifest import is_campaign
 from scenarios.cli import EXIT_DONE, EXIT_FAILED
+from scenarios.commands.campaigns import compare_campaigns
 from scenarios.commands.common import load, print_summary
 from scenarios.courses import report
 from scenarios.junit import write_junit
@@ -56,6 +58,8 @@ def compare(options: Namespace) -> int:
     from quadsim.table import to_markdown
     from scenarios.cost import find_study, study_cost
 
+    if any(is_campaign(Path(name)) for name in options.targets):
+        return compare_campaigns(options)
     target = Path(options.out)
     for name in options.targets:  # what is wrong with any of them is said before the first is flown
         if Path(name).is_dir():

@@ -1,0 +1,111 @@
+"""Fly the campaigns that ship, and remake docs/paper-robustness.md with its figures: `make campaigns`.
+
+The flights take about an hour on two cores.  They are kept under runs/campaigns/, and gone on with where they were
+stopped; remove that folder to fly them all anew.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from make_numbers import replace_in_readme
+from PIL import Image
+
+from quadsim.campaign.comparison import compare
+from quadsim.campaign.comparison_tables import comparison_tables, pairing
+from quadsim.campaign.sentences import campaign_sentences, verdict_sentence
+from quadsim.campaign.tables import constraint_table, driver_table, event_table, worst_table
+from quadsim.table import Cell, Grid, grid_to_markdown
+from scenarios.bench.solvers import section
+from scenarios.campaign.console import progress
+from scenarios.campaign.local import LocalEngine
+from scenarios.campaign.plan import load_plan
+from scenarios.campaign.run import Result, fly_campaign
+
+ROOT = Path(__file__).resolve().parent.parent
+NAMES = ("paper-robustness", "paper-robustness-robust")
+PAGE = "paper-robustness"
+
+
+def fly(name: str) -> Result:
+    """One campaign, or what is missing of it."""
+    with progress(enabled=True) as watch:
+        return fly_campaign(load_plan(name), Path("runs") / "campaigns" / name, LocalEngine(), resume=True, watch=watch)
+
+
+def violations(results: list[Result]) -> Grid:
+    """Both campaigns in a line each: how often a bound was left, and how often that is at most."""
+    lines = []
+    for result in results:
+        events = result.summary["events"]
+        found, lost = events["violation"], events["lost"]
+        texts = (
+            result.summary["campaign"],
+            str(found["flights"]),
+            str(lost["count"]),
+            str(found["count"]),
+            f"{100 * found['share']:.1f} %",
+            f"{100 * found['lower']:.1f} to {100 * found['upper']:.1f} %",
+            f"{100 * found['upper_one_sided']:.1f} %",
+        )
+        lines.append(tuple(Cell(text=text) for text in texts))
+    return Grid(
+        key="violations",
+        title="How often a required constraint does not hold",
+        head=("campaign", "flights", "lost", "violated, or lost", "share", "95 % interval", "at most, with 95 %"),
+        lines=tuple(lines),
+        note="Intervals are Clopper-Pearson's; the last column is one-sided.",
+    )
+
+
+def part(result: Result) -> str:
+    """One campaign's section."""
+    name, summary = result.summary["campaign"], result.summary
+    told = " ".join([verdict_sentence(summary) + ".", *campaign_sentences(summary)])
+    tables = (
+        event_table(summary),
+        constraint_table(summary),
+        driver_table(summary),
+        worst_table(summary, f"runs/campaigns/{name}"),
+    )
+    return "\n".join(
+        [
+            f"## {name}\n\n{told}\n",
+            f"![{name}: convergence, margins, what drives them](campaign-{name}.png)\n",
+            *(section(grid).replace("## ", "### ", 1) for grid in tables),
+        ]
+    )
+
+
+def page(results: list[Result]) -> str:
+    """The whole page."""
+    comparison = compare(results[0].table, results[1].table, NAMES)
+    machine = results[0].manifest["machine"]
+    return "\n".join(
+        [
+            "# The paper's controller, and the robust one, a thousand times\n\nMade by `make campaigns` "
+            f"({machine['processor']}, {machine['cores']} cores), from the campaigns that ship. What is drawn, from "
+            "where, stands in\n[paper-robustness](../scenarios/campaigns/paper-robustness.toml);\n"
+            "[paper-robustness-robust](../scenarios/campaigns/paper-robustness-robust.toml) has the same draws for the "
+            "robust controller. How campaigns work: [campaigns.md](campaigns.md).\n",
+            section(violations(results)),
+            f"## The one against the other\n\n{comparison.sentence} {pairing(comparison)}\n",
+            *(section(grid).replace("## ", "### ", 1) for grid in comparison_tables(comparison)),
+            *(part(result) for result in results),
+        ]
+    )
+
+
+def main() -> None:
+    """Fly, and write."""
+    results = [fly(name) for name in NAMES]
+    for name, result in zip(NAMES, results, strict=True):
+        figure = Image.open(result.directory / "campaign.png").convert("RGB")
+        target = ROOT / "docs" / f"campaign-{name}.png"
+        figure.quantize(32, dither=Image.Dither.NONE).save(target, optimize=True)
+    (ROOT / "docs" / f"{PAGE}.md").write_text(page(results), encoding="utf-8")
+    replace_in_readme("campaigns", grid_to_markdown(violations(results)), command="make campaigns")
+
+
+if __name__ == "__main__":
+    main()

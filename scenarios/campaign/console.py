@@ -1,0 +1,98 @@
+"""What the command line prints of campaigns: progress on stderr, answers on stdout."""
+
+from __future__ import annotations
+
+import contextlib
+import datetime
+import time as clock
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from typing import Any, Final
+
+from rich.console import Console
+from rich.markup import escape
+from rich.progress import BarColumn, Progress, TextColumn
+
+from quadsim.campaign.comparison import Comparison
+from quadsim.campaign.comparison_tables import comparison_tables, pairing
+from quadsim.campaign.gate import Judgement
+from quadsim.campaign.sentences import campaign_sentences, verdict_sentence
+from quadsim.campaign.statistics import proportion
+from quadsim.campaign.tables import constraint_table, event_table, worst_table
+from quadsim.campaign.wording import interval
+from scenarios import console
+from scenarios.campaign.run import Standing, Watch
+
+MOST_LINES: Final = 8
+"""Of a table on the terminal; the report has them all."""
+LINE_EVERY: Final = 30.0
+"""Between two lines of progress where stderr is no terminal [s]."""
+
+
+@contextlib.contextmanager
+def progress(*, enabled: bool) -> Iterator[Watch]:
+    """A bar on stderr, or a line now and then where that is no terminal, as in the log of a batch job."""
+    stderr = Console(stderr=True, highlight=False)
+    if not enabled:
+        yield lambda standing: None
+    elif stderr.is_terminal:
+        columns = (TextColumn("flights"), BarColumn(), TextColumn("{task.description}"))
+        with Progress(*columns, console=stderr, transient=True) as bars:
+            bar = bars.add_task("starting")
+            yield lambda standing: bars.update(
+                bar, completed=standing.flown, total=standing.flights, description=describe(standing)
+            )
+    else:
+        told = clock.perf_counter()
+
+        def tell(standing: Standing) -> None:
+            nonlocal told
+            if clock.perf_counter() - told > LINE_EVERY or standing.flown == standing.flights:
+                told = clock.perf_counter()
+                stderr.print(describe(standing), soft_wrap=True)
+
+        yield tell
+
+
+def describe(standing: Standing) -> str:
+    """How far it is, how fast, until when, and how it looks."""
+    share = proportion(standing.failed, standing.flown)
+    left = (standing.flights - standing.flown) / standing.rate if standing.rate else 0.0
+    ends = interval(share.lower, share.upper)
+    return (
+        f"{standing.flown}/{standing.flights}, {standing.rate:.2f}/s, {datetime.timedelta(seconds=round(left))} left; "
+        f"{standing.failed} failed ({ends})"
+    )
+
+
+def print_campaign(
+    summary: Mapping[str, Any], failure: Sequence[str], judgements: Sequence[Judgement], where: str
+) -> None:
+    """What came of a campaign."""
+    stdout = Console(highlight=False)
+    stdout.print(f"[bold]{escape(summary['campaign'])}[/bold]: {escape(verdict_sentence(summary))}", soft_wrap=True)
+    for sentence in campaign_sentences(summary):
+        stdout.print(escape(sentence), soft_wrap=True)
+    tables = [event_table(summary, failure), constraint_table(summary), worst_table(summary, where)]
+    brief = [replace(grid, note="", lines=grid.lines[:MOST_LINES]) for grid in tables if grid.lines]
+    console.print_grids(brief, None, prose=("constraint", "fly it again", "reason"))
+    for judgement in judgements:
+        colour = "green" if judgement.holds else "red"
+        stdout.print(f"[{colour}]{escape(judgement.sentence)}[/{colour}]", soft_wrap=True)
+    stdout.print(f"written to [bold]{escape(where)}[/bold]", soft_wrap=True)
+
+
+def print_replay(number: int, row: Mapping[str, Any], differing: Sequence[str]) -> None:
+    """Whether a replayed flight gave the campaign's numbers."""
+    stdout = Console(highlight=False)
+    if differing:
+        stdout.print(f"[red]flight {number} differs from the campaign's in {escape(', '.join(differing))}[/red]")
+    else:
+        stdout.print(f"flight {number}: {len(row)} columns, each the same as in the campaign")
+
+
+def print_comparison(comparison: Comparison, where: str) -> None:
+    """Whether one campaign is better than another."""
+    stdout = Console(highlight=False)
+    stdout.print(escape(f"{comparison.sentence} {pairing(comparison)}"), soft_wrap=True)
+    console.print_grids(comparison_tables(comparison), where)

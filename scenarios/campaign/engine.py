@@ -1,0 +1,113 @@
+"""What flies the flights of a campaign: protocols of engines and of pilots, and how much work is handed out at once."""
+
+from __future__ import annotations
+
+import pickle
+import time as clock
+from collections.abc import Generator, Sequence
+from typing import Final, NamedTuple, Protocol
+
+from quadsim.campaign.table import Row
+from quadsim.errors import QuadsimError
+
+MOST_DEATHS: Final = 10
+"""Processes that may die while they fly a flight before it is given up: more than die by chance in one flight."""
+CHUNK_S: Final = 10.0
+"""Work handed out at once [s]: long against what handing it out costs, short against a campaign."""
+
+
+class EngineError(QuadsimError):
+    """The engine cannot go on; what it has answered stands."""
+
+
+class Pilot(Protocol):
+    """Flies flights, known by their numbers; pickled, and sent to each process once."""
+
+    def fly(self, flight: int) -> Row:
+        """The row of a flight; plain values."""
+        ...
+
+    def lost(self, flight: int, reason: str) -> Row:
+        """The row of a flight that nobody came back from: its process died, or `fly` raised."""
+        ...
+
+
+class Engine(Protocol):
+    """Has flights flown.
+
+    Attributes:
+        name: for the manifest.
+        workers: processes that fly at the same time.
+    """
+
+    name: str
+
+    @property
+    def workers(self) -> int:
+        """See the class."""
+        ...
+
+    def answers(self, pilot: Pilot, flights: Sequence[int]) -> Generator[Row]:
+        """The rows, each flight's exactly once, in whatever order they come; closing the iterator stops all work.
+
+        Args:
+            pilot: flies them.
+            flights: no two alike.
+
+        Raises:
+            EngineError: there is nobody left to fly.
+        """
+        ...
+
+
+class Answer(NamedTuple):
+    """What became of a flight, and the seconds it took."""
+
+    row: Row
+    seconds: float
+
+
+def fly_one(pilot: Pilot, flight: int) -> Answer:
+    """Fly a flight; an exception makes it lost, and is the reason."""
+    started = clock.perf_counter()
+    try:
+        row = pilot.fly(flight)
+        pickle.dumps(row)  # it has to get home
+    except (Exception, SystemExit) as error:  # SystemExit: a controller that is not ours may ask to leave
+        row = pilot.lost(flight, said(error))
+    return Answer(row, clock.perf_counter() - started)
+
+
+def said(error: BaseException) -> str:
+    """An exception in one line."""
+    return " ".join(f"{type(error).__name__}: {error}".split())
+
+
+class Pace:
+    """How long flights take, measured as they are answered, and so how many to hand out at once."""
+
+    def __init__(self) -> None:
+        self._seconds, self._flights = 0.0, 0
+
+    def note(self, answer: Answer) -> None:
+        """Take one more flight into account."""
+        self._seconds += answer.seconds
+        self._flights += 1
+
+    def flights_in(self, seconds: float) -> int:
+        """Flights that take so long [s]; none while nothing is known."""
+        return int(seconds * self._flights / max(self._seconds, 1e-9))
+
+    def chunk(self, waiting: int, workers: int) -> int:
+        """Flights to hand to one worker: fewer near the end, so that all finish together.
+
+        Args:
+            waiting: flights not handed out.
+            workers: those who share them.
+        """
+        return max(1, min(self.flights_in(CHUNK_S), fair_share(waiting, workers)))
+
+
+def fair_share(waiting: int, workers: int) -> int:
+    """Half of an equal share of what waits: so much a worker may take without making the others wait in the end."""
+    return waiting // (2 * max(workers, 1))

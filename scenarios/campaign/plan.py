@@ -1,0 +1,223 @@
+"""A campaign ready to be flown: its file, its scenario, and from these the scenario of each flight."""
+
+from __future__ import annotations
+
+import copy
+import tomllib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Final
+
+import pyarrow as pa
+from pydantic import ValidationError
+
+from quadsim.campaign.events import Event, parse_event
+from quadsim.campaign.table import DRAW, TIMING, Row, make_schema
+from quadsim.errors import FileError, InputError, ParameterError, UnknownNameError
+from scenarios.bases import locate, merge, read_scenario
+from scenarios.build import build_limits, build_vehicle, resolve_vehicle
+from scenarios.campaign.draws import Draws, extremes
+from scenarios.campaign.spec import CampaignSpec, Value, VarySpec
+from scenarios.checking import check_parts
+from scenarios.loading import parse_scenario, scenario_path
+from scenarios.problems import ScenarioError, describe
+from scenarios.settings import apply_setting, get_field, set_field
+from scenarios.spec import Scenario
+
+LIBRARY: Final = Path(__file__).resolve().parent.parent / "campaigns"
+
+
+@dataclass(frozen=True)
+class Plan:
+    """A campaign's file and the scenario that its flights differ from.
+
+    Attributes:
+        spec: the file.
+        scenario: with the file's changes, and every number of its vehicle, in it.
+    """
+
+    spec: CampaignSpec
+    scenario: Scenario
+
+    @cached_property
+    def draws(self) -> Draws:
+        """What is random about it."""
+        return Draws(self.spec)
+
+    @cached_property
+    def schema(self) -> pa.Schema:
+        """The columns of its results."""
+        kinds = {entry.name: _column_type(entry) for entry in self.spec.vary}
+        return make_schema(kinds, build_limits(self.scenario))
+
+    @property
+    def columns(self) -> list[str]:
+        """The columns that events may be about: all but clock times."""
+        clocks = {name for name, _ in TIMING}
+        return [name for name in self.schema.names if name not in clocks]
+
+    @cached_property
+    def failure(self) -> tuple[Event, ...]:
+        """The events of which any one makes a flight fail."""
+        try:
+            return tuple(parse_event(text, self.columns) for text in self.spec.failure)
+        except UnknownNameError as error:
+            raise InputError(f"failure: {error}") from error
+
+    @cached_property
+    def _data(self) -> dict[str, Any]:
+        return tomllib.loads(self.scenario.to_toml())
+
+    def of(self, flight: int) -> Scenario:
+        """The scenario of one flight.
+
+        Raises:
+            InputError: what was drawn cannot be flown.
+        """
+        values = self.draws.values(flight)
+        changes = [(entry, values[entry.name]) for entry in self.spec.vary]
+        name = f"{self.spec.name}-{flight}"[:80]
+        return self._varied(changes, name=name, seed=self.draws.seed(flight))
+
+    def identity(self, flight: int) -> Row:
+        """The columns that tell one flight from the others."""
+        drawn = {DRAW + name: _cell(value) for name, value in self.draws.values(flight).items()}
+        return {"flight": flight, "seed": self.draws.seed(flight), **drawn}
+
+    def check(self) -> None:
+        """Refuse, before anything is flown, what cannot be.
+
+        Raises:
+            InputError: a value of an entry of `[[vary]]`, at the end of its range, cannot be flown; or a failure event
+                is about a column that the results do not have.
+        """
+        _ = self.failure
+        for entry in self.spec.vary:
+            for value in extremes(entry):
+                try:
+                    check_parts(self._varied([(entry, value)], name=self.scenario.name, seed=0))
+                except ScenarioError as error:
+                    raise ScenarioError(f"vary.{entry.name} at {value!r}", error.problems) from error
+                except InputError as error:
+                    said = str(error)
+                    where = "" if said.startswith("vary.") else f"vary.{entry.name} at {value!r}: "
+                    raise InputError(where + said) from error
+
+    def _varied(self, changes: Sequence[tuple[VarySpec, Value]], *, name: str, seed: int) -> Scenario:
+        data: dict[str, Any] = merge(self._data, {})
+        for entry, value in changes:
+            for field in entry.fields:
+                set_field(data, field, self._scaled(entry, field, value), asked=f"vary.{entry.name}.fields")
+        return parse_scenario({**data, "name": name, "seed": seed}, source=name)
+
+    def _scaled(self, entry: VarySpec, field: str, value: Value) -> Value:
+        if not entry.relative:
+            return value
+        given = get_field(merge(self._data, {}), field)
+        if isinstance(given, bool) or not isinstance(given, int | float):
+            if given is None:
+                self._varied([(entry.model_copy(update={"relative": False}), value)], name=self.scenario.name, seed=0)
+            rule = f"false where the scenario has no number at {field}"
+            raise ParameterError(f"vary.{entry.name}", "relative", True, rule)
+        if isinstance(value, bool) or not isinstance(value, int | float):
+            raise ParameterError(f"vary.{entry.name}", "relative", True, "false where what is drawn is no number")
+        return value * given
+
+
+def campaign_names() -> list[str]:
+    """Names of the campaigns that ship, sorted."""
+    return sorted(path.stem for path in LIBRARY.glob("*.toml"))
+
+
+def campaign_path(name: str) -> Path:
+    """The file of a campaign that ships, or the path itself when it ends in `.toml`.
+
+    Raises:
+        FileError, UnknownNameError: there is none.
+    """
+    if name.endswith(".toml"):
+        if not Path(name).is_file():
+            raise FileError(name, "no such campaign file")
+        return Path(name)
+    if name not in campaign_names():
+        raise UnknownNameError("campaign", name, campaign_names(), hint="or give a path ending in .toml")
+    return LIBRARY / f"{name}.toml"
+
+
+def read_campaign(name: str) -> dict[str, Any]:
+    """The tables of a campaign's file, merged over its base's.
+
+    Raises:
+        FileError, UnknownNameError: there is none, or it cannot be read.
+    """
+    try:
+        return read_scenario(campaign_path(name), campaign_path)
+    except OSError as error:
+        raise FileError(str(error.filename)[:100], f"cannot be read ({error.strerror})") from error
+
+
+def load_plan(name: str, settings: Sequence[str] = (), *, flights: int | None = None, seed: int | None = None) -> Plan:
+    """Read and check a campaign, with the scenario it names.
+
+    Args:
+        name: of one that ships, or a path ending in `.toml`.
+        settings: `dotted.path=value` texts that change fields of the scenario, after the file's own.
+        flights: instead of the file's.
+        seed: instead of the file's.
+
+    Raises:
+        InputError: the file is missing or malformed, a field is not allowed, or what it varies cannot be flown.
+    """
+    path, data = campaign_path(name), read_campaign(name)
+    data |= {key: value for key, value in (("flights", flights), ("seed", seed)) if value is not None}
+    spec = parse_campaign(data, source=path.name)
+    plan = Plan(spec=spec, scenario=_scenario(spec, path, settings))
+    plan.check()
+    return plan
+
+
+def parse_campaign(data: Mapping[str, Any], *, source: str) -> CampaignSpec:
+    """Check a campaign given as nested tables.
+
+    Raises:
+        ScenarioError: naming every field that is wrong.
+    """
+    try:
+        return CampaignSpec.model_validate(dict(data))
+    except ValidationError as error:
+        found = error.errors(include_url=False)
+        problems = [describe(details, data, CampaignSpec, file="campaign") for details in found]
+        raise ScenarioError(source, problems) from error
+
+
+def _scenario(spec: CampaignSpec, path: Path, settings: Sequence[str]) -> Scenario:
+    """The scenario of a campaign's file, with its changes and then those of the command line."""
+    beside = path.parent / spec.scenario
+    file = beside if spec.scenario.endswith(".toml") and beside.is_file() else scenario_path(spec.scenario)
+    changes = copy.deepcopy(spec.set)
+    locate(changes, path.parent)
+    data = merge(read_scenario(file, scenario_path), changes)
+    for setting in settings:
+        apply_setting(data, setting)
+    try:
+        scenario = parse_scenario(data, source=f"{path.name}, {file.name}", directory=file.parent)
+    except OSError as error:
+        raise FileError(str(error.filename)[:100], f"cannot be read ({error.strerror})") from error
+    check_parts(scenario)
+    return resolve_vehicle(scenario, build_vehicle(scenario))
+
+
+def _column_type(entry: VarySpec) -> pa.DataType:
+    first = extremes(entry)[0]
+    if isinstance(first, bool):
+        return pa.bool_()
+    return pa.float64() if isinstance(first, int | float) else pa.string()
+
+
+def _cell(value: Value) -> Value | str:
+    """A drawn value as it stands in the results: lists as texts, whole numbers as numbers."""
+    if isinstance(value, bool | str):
+        return value
+    return str(value) if isinstance(value, list) else float(value)

@@ -1,0 +1,68 @@
+"""A flight of a campaign flown again, with everything a run directory has, and held against its row."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from quadsim.campaign.estimates import worst_flight
+from quadsim.campaign.store import FLIGHTS_FILE
+from quadsim.campaign.table import TIMING, read_table
+from quadsim.errors import ParameterError
+from scenarios.campaign.manifest import stored_plan
+from scenarios.campaign.pilot import row_of
+from scenarios.runner import Flight, Outputs, Progress, run, silent
+from scenarios.spec import Scenario
+
+
+@dataclass(frozen=True, kw_only=True)
+class Recorded:
+    """A flight of a finished campaign.
+
+    Attributes:
+        number: which.
+        row: its row of `flights.parquet`.
+        scenario: what was flown.
+    """
+
+    number: int
+    row: Mapping[str, Any]
+    scenario: Scenario
+
+
+def recorded_flight(directory: Path, number: int | None) -> Recorded:
+    """A flight of a campaign's directory; the worst one where no number is given.
+
+    Raises:
+        InputError: there is no such flight, or what was drawn for it cannot be flown.
+        FileError: the directory is no campaign, or not a finished one.
+    """
+    plan = stored_plan(directory)
+    table = read_table(directory / FLIGHTS_FILE)
+    number = worst_flight(table) if number is None else number
+    flights = table["flight"].to_pylist()
+    if number not in flights:
+        raise ParameterError("", "--flight", number, f"one of the flights 0 to {flights[-1]} of {directory}")
+    row = table.slice(flights.index(number), 1).to_pylist()[0]
+    return Recorded(number=number, row=row, scenario=plan.of(number))
+
+
+def replay(recorded: Recorded, target: Path, outputs: Outputs, progress: Progress = silent) -> tuple[Flight, list[str]]:
+    """Fly it again and write its run directory.
+
+    Args:
+        recorded: the flight.
+        target: the run directory.
+        outputs: see `scenarios.runner.run`.
+        progress: see `scenarios.runner.run`.
+
+    Returns:
+        The flight, and the columns of the campaign's table that it does not agree with, bit for bit; none, on the same
+        machine with the same code.
+    """
+    flight = run(recorded.scenario, target, outputs, progress)
+    again = {**recorded.row, **row_of(flight, 0.0)}
+    clocks = {name for name, _ in TIMING}
+    return flight, [name for name, value in recorded.row.items() if name not in clocks and again[name] != value]

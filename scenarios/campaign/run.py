@@ -1,0 +1,236 @@
+"""A campaign flown: an engine flies what is missing, its answers are kept as they come, the whole is summed up."""
+
+from __future__ import annotations
+
+import time as clock
+from collections.abc import Callable
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import pyarrow as pa
+
+from quadsim.campaign.estimates import estimate
+from quadsim.campaign.report import write_report
+from quadsim.campaign.statistics import proportion
+from quadsim.campaign.store import Store, locked
+from quadsim.campaign.table import Row
+from quadsim.errors import OutputError, ParameterError
+from quadsim.rundir import file_hashes, write_json
+from scenarios.campaign import manifest as records
+from scenarios.campaign.engine import Engine
+from scenarios.campaign.pilot import CampaignPilot
+from scenarios.campaign.plan import Plan
+
+SUMMARY_FILE: Final = "summary.json"
+FLUSH_S: Final = 5.0
+"""How long an answer may wait in memory before it is on the disk [s]."""
+CHECK_EVERY: Final = 10
+"""Flights after which the interval is looked at again, where it decides when to stop."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Standing:
+    """How far a campaign is.
+
+    Attributes:
+        flown: flights that are there.
+        flights: that there are to be.
+        failed: of those flown.
+        rate: flights per second of this session; 0 before the first.
+    """
+
+    flown: int
+    flights: int
+    failed: int
+    rate: float
+
+
+Watch = Callable[[Standing], None]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Result:
+    """What came of a campaign.
+
+    Attributes:
+        directory: where everything is.
+        manifest: what was flown, with what.
+        table: `flights.parquet`.
+        summary: `summary.json`.
+    """
+
+    directory: Path
+    manifest: dict[str, Any]
+    table: pa.Table
+    summary: dict[str, Any]
+
+
+def fly_campaign(
+    plan: Plan,
+    directory: Path,
+    engine: Engine,
+    *,
+    resume: bool = False,
+    until_width: float | None = None,
+    report: bool = True,
+    watch: Watch = lambda standing: None,
+) -> Result:
+    """Fly a campaign, or what is missing of it.
+
+    Each flight's row is the same whoever flies it, in whatever order; so is the table of all.  Whatever ends this
+    early, what was flown stays, and `resume` goes on with it.
+
+    Args:
+        plan: the campaign.
+        directory: where its results go.
+        engine: who flies.
+        resume: whether to go on with what the directory holds; without it there must be nothing there.
+        until_width: width of the 95 % interval of the failure probability, from 0 to 1, at which to stop.
+        report: whether to write the page and its figure.
+        watch: told how far it is, as answers come.
+
+    Raises:
+        InputError: another campaign is there.
+        OutputError: the directory cannot be written, or another process flies there.
+        KeyboardInterrupt: a person stopped it; what was flown is there.
+    """
+    if until_width is not None and not 0.0 < until_width < 1.0:
+        raise ParameterError("", "--until-width", until_width, "between 0 and 1")
+    _require_place(directory, resume=resume)
+    with locked(directory):
+        manifest = _open(plan, directory)
+        progress = _Progress(plan, directory, until_width=until_width, watch=watch)
+        session: dict[str, Any] = {"engine": engine.name, "workers": engine.workers, "flights": 0, "wall_s": 0.0}
+        manifest["sessions"].append(session)
+        try:
+            progress.fly(engine)
+        except BaseException:
+            manifest["status"] = "interrupted"
+            raise
+        finally:
+            session |= {"flights": progress.flown, "wall_s": clock.perf_counter() - progress.started}
+            manifest["flown"] = progress.done
+            records.write(manifest, directory)
+        return _conclude(plan, directory, progress, manifest, report=report)
+
+
+class _Progress:
+    """A session: what is there, what is still to be flown, and what is waiting to be written."""
+
+    def __init__(self, plan: Plan, directory: Path, *, until_width: float | None, watch: Watch) -> None:
+        self.store = Store(directory, plan.schema)
+        self.wanted = plan.spec.flights
+        self.flown = 0
+        self.started = clock.perf_counter()
+        self._plan, self._width, self._watch = plan, until_width, watch
+        self._outcomes = np.full(plan.spec.flights, -1, np.int8)  # not flown, passed, failed
+        self._checked = 0
+        self._waiting: list[Row] = []
+        self._flushed = clock.perf_counter()
+        there = self.store.table().select(["flight", "failed"])
+        self._note(there["flight"].to_numpy(), there["failed"].to_numpy(zero_copy_only=False))
+
+    @property
+    def done(self) -> int:
+        """Flights that are there and count."""
+        return int(np.count_nonzero(self._outcomes[: self.wanted] >= 0))
+
+    def fly(self, engine: Engine) -> None:
+        """Fly what is missing, until nothing is, or the interval is narrow enough."""
+        if self._is_sure():
+            return
+        missing = np.flatnonzero(self._outcomes < 0).tolist()
+        if not missing:
+            return
+        try:
+            answers = engine.answers(CampaignPilot(self._plan), missing)
+            with closing(answers):
+                for row in answers:
+                    self._keep(row)
+                    if self._is_sure():
+                        return
+        finally:
+            self._flush()
+
+    def _keep(self, row: Row) -> None:
+        self._waiting.append(row)
+        self.flown += 1
+        self._note(row["flight"], row["failed"])
+        if clock.perf_counter() - self._flushed > FLUSH_S:
+            self._flush()
+        elapsed = clock.perf_counter() - self.started
+        failed = int(np.count_nonzero(self._outcomes == 1))
+        there = int(np.count_nonzero(self._outcomes >= 0))
+        self._watch(Standing(flown=there, flights=self.wanted, failed=failed, rate=self.flown / elapsed))
+
+    def _flush(self) -> None:
+        waiting, self._waiting = self._waiting, []
+        self._flushed = clock.perf_counter()
+        self.store.append(waiting)
+
+    def _note(self, flights: Any, failed: Any) -> None:
+        self._outcomes[np.asarray(flights, int)] = np.asarray(failed, np.int8)
+
+    def _is_sure(self) -> bool:
+        """Whether the interval is narrow enough after the first n flights, for the smallest such n.
+
+        Only flights without a gap before them count, so that the answer does not depend on which came back first.
+        """
+        if self._width is None:
+            return False
+        gaps = np.flatnonzero(self._outcomes < 0)
+        whole = int(gaps[0]) if gaps.size else self._outcomes.size
+        for count in range(self._checked + CHECK_EVERY, whole + 1, CHECK_EVERY):
+            self._checked = count
+            share = proportion(int(np.count_nonzero(self._outcomes[:count] == 1)), count)
+            if share.upper - share.lower <= self._width:
+                self.wanted = count
+                return True
+        return False
+
+
+def _require_place(directory: Path, *, resume: bool) -> None:
+    """A directory that this campaign may use."""
+    try:
+        directory.mkdir(parents=True, exist_ok=True)
+        entries = {path.name for path in directory.iterdir()}
+    except OSError as error:
+        raise OutputError(directory, error.strerror or str(error)) from error
+    if records.is_campaign(directory) and not resume:
+        raise OutputError(directory, "a campaign is already there; go on with it by --resume, or choose another --out")
+    begun = {records.CAMPAIGN_FILE, records.SCENARIO_FILE, ".lock"}  # by a process that died before its manifest
+    if not records.is_campaign(directory) and entries - begun:
+        raise OutputError(directory, "something else is already there; choose another --out")
+
+
+def _open(plan: Plan, directory: Path) -> dict[str, Any]:
+    """The manifest of a campaign that begins, or goes on."""
+    if not records.is_campaign(directory):
+        return records.begin(plan, directory)
+    before = records.require_same(plan, directory)
+    return records.begin(plan, directory, before["sessions"])
+
+
+def _conclude(plan: Plan, directory: Path, progress: _Progress, manifest: dict[str, Any], *, report: bool) -> Result:
+    """Final tables, estimates and report."""
+    table = progress.store.close(progress.wanted)
+    summary = {"campaign": plan.spec.name, "scenario": plan.scenario.name, **estimate(table)}
+    write_json(directory / SUMMARY_FILE, summary)
+    if report:
+        write_report(
+            directory,
+            table=table,
+            summary=summary,
+            manifest=manifest,
+            name=plan.spec.name,
+            description=plan.spec.description,
+            failure=plan.spec.failure,
+        )
+    ours = {name: digest for name, digest in file_hashes(directory).items() if not name.startswith(".")}
+    manifest["files"] = {name: digest for name, digest in ours.items() if name != records.MANIFEST_FILE}
+    manifest["status"] = "complete" if progress.wanted == plan.spec.flights else "stopped"
+    records.write(manifest, directory)
+    return Result(directory=directory, manifest=manifest, table=table, summary=summary)

@@ -1,0 +1,115 @@
+"""`quadsim campaign` and `replay`, and `compare` of two campaigns."""
+
+from __future__ import annotations
+
+import json
+import sys
+from argparse import Namespace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from quadsim import rundir
+from quadsim.errors import InputError, ParameterError
+from scenarios import console
+from scenarios.campaign.manifest import read_manifest
+from scenarios.cli import EXIT_DONE, EXIT_FAILED
+from scenarios.commands.common import print_summary
+from scenarios.junit import write_cases
+from scenarios.runner import Outputs
+
+if TYPE_CHECKING:
+    from scenarios.campaign.engine import Engine
+
+
+def campaign(options: Namespace) -> int:
+    """`quadsim campaign`."""
+    from quadsim.campaign.events import parse_event
+    from quadsim.campaign.gate import judge, parse_requirement
+    from scenarios.campaign.console import print_campaign, progress
+    from scenarios.campaign.plan import load_plan
+    from scenarios.campaign.run import fly_campaign
+
+    requirements = [parse_requirement(text) for text in options.requirements]
+    plan = load_plan(options.file, options.settings, flights=options.flights, seed=options.seed)
+    for requirement in requirements:
+        parse_event(requirement.event.text, plan.columns)
+    target = Path(options.out) if options.out else Path("runs") / "campaigns" / plan.spec.name
+    engine = _engine(options)
+    try:
+        with progress(enabled=not options.json) as watch:
+            result = fly_campaign(
+                plan,
+                target,
+                engine,
+                resume=options.resume,
+                until_width=options.until_width,
+                report=options.report,
+                watch=watch,
+            )
+    except KeyboardInterrupt:
+        print(f"quadsim: interrupted (Ctrl-C); {target} has what was flown, --resume goes on with it", file=sys.stderr)
+        return EXIT_FAILED
+    judgements = [judge(result.table, requirement) for requirement in requirements]
+    if options.junit:
+        cases = [(judgement.requirement.text, judgement.holds, judgement.sentence) for judgement in judgements]
+        write_cases(plan.spec.name, cases, Path(options.junit))
+    if options.json:
+        gate = [judgement.to_json() for judgement in judgements]
+        print(json.dumps({**result.summary, "requirements": gate}, indent=2))
+    else:
+        print_campaign(result.summary, plan.spec.failure, judgements, str(target))
+    return EXIT_DONE if all(judgement.holds for judgement in judgements) else EXIT_FAILED
+
+
+def _engine(options: Namespace) -> Engine:
+    """Who flies the campaign."""
+    from scenarios.campaign.local import LocalEngine
+
+    if options.cluster is None:
+        return LocalEngine(options.workers)
+    from scenarios.campaign.cluster import DaskEngine
+
+    if options.workers is not None:
+        raise ParameterError("", "--workers", options.workers, "absent where --cluster says who flies")
+    return DaskEngine(options.cluster)
+
+
+def replay(options: Namespace) -> int:
+    """`quadsim replay`."""
+    from scenarios.campaign.console import print_replay
+    from scenarios.campaign.replay import recorded_flight
+    from scenarios.campaign.replay import replay as fly_again
+
+    directory = Path(options.campaign)
+    flight = recorded_flight(directory, options.flight)
+    target = Path(options.out) if options.out else Path("runs") / flight.scenario.name
+    outputs = Outputs(video=options.video, recording=options.recording, figures=options.figures)
+    with console.progress_bars(enabled=not options.json) as progress:
+        _, differing = fly_again(flight, target, outputs, progress)
+    print_summary(rundir.read_summary(target), options, where=str(target))
+    if not options.json:
+        print_replay(flight.number, flight.row, differing)
+    return EXIT_FAILED if differing else EXIT_DONE
+
+
+def compare_campaigns(options: Namespace) -> int:
+    """`quadsim compare` of two campaigns, flight by flight."""
+    from quadsim.campaign.comparison import compare
+    from quadsim.campaign.comparison_report import write_comparison_report
+    from quadsim.campaign.store import FLIGHTS_FILE
+    from quadsim.campaign.table import read_table
+    from scenarios.campaign.console import print_comparison
+
+    if len(options.targets) != 2:
+        raise InputError(f"compare takes two campaigns, each by itself, not {len(options.targets)}")
+    if options.cost:
+        raise ParameterError("", "--cost", True, "absent when campaigns are compared")
+    first, second = (Path(name) for name in options.targets)
+    names = (str(read_manifest(first)["name"]), str(read_manifest(second)["name"]))
+    comparison = compare(read_table(first / FLIGHTS_FILE), read_table(second / FLIGHTS_FILE), names)
+    page = write_comparison_report(comparison, Path(options.out))
+    if options.markdown:
+        print(comparison.to_markdown())
+    else:
+        print_comparison(comparison, str(page))
+    return EXIT_DONE

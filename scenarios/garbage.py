@@ -1,0 +1,10 @@
+"""How often Python looks for cycles of objects that nobody holds any more."""
+
+from __future__ import annotations
+
+import gc
+
+
+def collect_rarely() -> None:
+    """Look for them less often in this process: flights make few of them, and looking takes time."""
+    gc.set_threshold(100_000, 50, 100)

@@ -1,0 +1,149 @@
+"""A campaign whose processes are killed at random instants: nothing is lost, nothing there twice, the totals the same.
+
+    python tests/campaign_kills.py --kills 100 --flights 200
+
+SIGKILL takes, in random order, the workers, the server they are started from, and the campaign's own process; after
+that one's death the campaign goes on with --resume.  At the end the table has to be, byte for byte, that of a campaign
+that nobody disturbed.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import subprocess
+import sys
+import tempfile
+import time as clock
+from collections import Counter
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import psutil
+import pyarrow.parquet as pq
+
+CAMPAIGN = """
+name = "killed"
+scenario = "paper-constrained"
+flights = {flights}
+failure = ["lost", "rmse.z > 0.36"]
+set = {{ duration = {duration}, constraints = [] }}
+
+[[vary]]
+name = "mass"
+fields = ["effects.load.mass_factor"]
+distribution = "uniform"
+low = 0.9
+high = 1.1
+"""
+CHANCES = {"campaign": 0.1, "server": 0.1, "worker": 0.8}
+"""Of what is killed: the campaign's own process, one that it starts workers from, or a worker."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Outcome:
+    """What came of it.
+
+    Attributes:
+        kills: by what was killed.
+        lost: flights that are not in the table.
+        doubled: flights that are there more than once.
+        same: whether the table is, byte for byte, that of an undisturbed campaign.
+        seconds: wall time of the disturbed one [s].
+    """
+
+    kills: Counter[str]
+    lost: int
+    doubled: int
+    same: bool
+    seconds: float
+
+
+def kill_and_resume(directory: Path, *, kills: int, flights: int, duration: float, pause: float, seed: int) -> Outcome:
+    """Fly a campaign twice, once undisturbed.
+
+    Args:
+        directory: an empty one.
+        kills: how many processes to kill.
+        flights: of the campaign.
+        duration: of each [s].
+        pause: mean time between kills [s].
+        seed: of when and what to kill.
+
+    Raises:
+        RuntimeError: the campaign was over before all the kills, or did not end by itself.
+    """
+    file = directory / "killed.toml"
+    file.write_text(CAMPAIGN.format(flights=flights, duration=duration), encoding="utf-8")
+    command = [sys.executable, "-m", "scenarios.cli", "campaign", str(file), "--workers", "2", "--json", "--no-report"]
+    subprocess.run([*command, "--out", str(directory / "calm")], check=True, stdout=subprocess.DEVNULL)
+    rng = np.random.default_rng(seed)
+    killed: Counter[str] = Counter()
+    disturbed = [*command, "--out", str(directory / "disturbed"), "--resume"]
+    started = clock.perf_counter()
+    campaign = subprocess.Popen(disturbed, stdout=subprocess.DEVNULL)
+    try:
+        while killed.total() < kills:
+            clock.sleep(rng.exponential(pause))
+            if campaign.poll() == 0:
+                raise RuntimeError(f"the campaign was over after {killed.total()} kills; fly more or longer flights")
+            what = _kill_one(campaign, rng)
+            if what is not None:
+                killed[what] += 1
+            if campaign.poll() is not None:
+                campaign = subprocess.Popen(disturbed, stdout=subprocess.DEVNULL)
+        if campaign.wait(timeout=600.0) != 0:
+            raise RuntimeError(f"the campaign ended with exit status {campaign.returncode}")
+    finally:
+        campaign.kill()
+    seconds = clock.perf_counter() - started
+    calm, table = (directory / name / "flights.parquet" for name in ("calm", "disturbed"))
+    counts = Counter(pq.read_table(table)["flight"].to_pylist())
+    return Outcome(
+        kills=killed,
+        lost=len(set(range(flights)) - set(counts)),
+        doubled=sum(count > 1 for count in counts.values()),
+        same=calm.read_bytes() == table.read_bytes(),
+        seconds=seconds,
+    )
+
+
+def _kill_one(campaign: subprocess.Popen[bytes], rng: np.random.Generator) -> str | None:
+    """Kill one process at random; None where it was gone already."""
+    with contextlib.suppress(psutil.NoSuchProcess):
+        parent = psutil.Process(campaign.pid)
+        below = parent.children(recursive=True)
+        processes = {
+            "campaign": [parent],
+            "server": [child for child in below if child.ppid() == parent.pid],
+            "worker": [child for child in below if child.ppid() != parent.pid],
+        }
+        what = str(rng.choice(list(CHANCES), p=list(CHANCES.values())))
+        if processes[what]:
+            processes[what][rng.integers(len(processes[what]))].kill()
+            if what == "campaign":
+                campaign.wait()
+            return what
+    return None
+
+
+def main() -> int:
+    """The command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--kills", type=int, default=100)
+    parser.add_argument("--flights", type=int, default=200)
+    parser.add_argument("--duration", type=float, default=60.0, help="of a flight [s]")
+    parser.add_argument("--pause", type=float, default=1.0, help="mean time between kills [s]")
+    parser.add_argument("--seed", type=int, default=0)
+    options = parser.parse_args()
+    with tempfile.TemporaryDirectory() as directory:
+        outcome = kill_and_resume(Path(directory), **vars(options))
+    what = ", ".join(f"{count} of a {name}" for name, count in outcome.kills.items())
+    print(f"{outcome.kills.total()} kills ({what}) during {options.flights} flights, {outcome.seconds:.0f} s:")
+    print(f"{outcome.lost} lost, {outcome.doubled} twice, totals {'the same' if outcome.same else 'DIFFERENT'}")
+    return 0 if outcome.same and not outcome.lost and not outcome.doubled else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

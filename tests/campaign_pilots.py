@@ -1,0 +1,82 @@
+"""A pilot that needs no simulator and tells who flew what, and a look at who is still there."""
+
+from __future__ import annotations
+
+import os
+import time as clock
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import psutil
+
+from quadsim.campaign.table import Row
+
+
+@dataclass(frozen=True, kw_only=True)
+class ToyPilot:
+    """Flies by computing for a while.
+
+    Attributes:
+        seconds: processor time of a flight [s].
+        asleep: seconds in which it does nothing, after that.
+        kills: signals by flight that end the process each time.
+        kills_once: files by flight; if one is not there, it is made, and the process killed by SIGKILL.
+        raises: exceptions by flight.
+        diary: takes a line with flight and process as each flight begins.
+    """
+
+    seconds: float = 0.0
+    asleep: float = 0.0
+    kills: Mapping[int, int] = field(default_factory=dict)
+    kills_once: Mapping[int, Path] = field(default_factory=dict)
+    raises: Mapping[int, BaseException] = field(default_factory=dict)
+    diary: Path | None = None
+
+    def fly(self, flight: int) -> Row:
+        if self.diary is not None:
+            with self.diary.open("a") as diary:
+                diary.write(f"{flight} {os.getpid()}\n")
+        started = clock.thread_time()
+        while clock.thread_time() - started < self.seconds:
+            pass
+        clock.sleep(self.asleep)
+        once = self.kills_once.get(flight)
+        if once is not None and not once.exists():
+            once.touch()
+            os.kill(os.getpid(), 9)
+        if flight in self.kills:
+            os.kill(os.getpid(), self.kills[flight])
+        if flight in self.raises:
+            raise self.raises[flight]
+        return value_of(flight) | {"process": os.getpid()}
+
+    def lost(self, flight: int, reason: str) -> Row:
+        return {"flight": flight, "value": None, "reason": reason}
+
+
+def value_of(flight: int) -> Row:
+    """What a flight that comes home answers, but for who flew it."""
+    return {"flight": flight, "value": flight * flight / 7.0, "reason": None}
+
+
+def known(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Rows in the order of the flights, without who flew them."""
+    bare = [{key: value for key, value in row.items() if key != "process"} for row in rows]
+    return sorted(bare, key=lambda row: row["flight"])
+
+
+def until(holds: Callable[[], bool], seconds: float = 8.0) -> bool:
+    """Whether something becomes true before long."""
+    end = clock.monotonic() + seconds
+    while not holds():
+        if clock.monotonic() > end:
+            return False
+        clock.sleep(0.02)
+    return True
+
+
+def living(pids: set[int]) -> set[int]:
+    """Those that run; what only waits for its parent to notice its end does not."""
+    return {pid for pid in pids if psutil.pid_exists(pid) and psutil.Process(pid).status() != psutil.STATUS_ZOMBIE}

@@ -1,0 +1,153 @@
+"""`quadsim campaign`, `replay`, and `compare` of campaigns, as a person calls them."""
+
+from __future__ import annotations
+
+import json
+import signal
+import subprocess
+import sys
+import time as clock
+from pathlib import Path
+from xml.etree import ElementTree
+
+import pytest
+import tomlkit
+
+from scenarios.cli import EXIT_DONE, EXIT_FAILED, EXIT_WRONG_INPUT, main
+
+MASS = {
+    "name": "mass",
+    "fields": ["effects.load.mass_factor"],
+    "distribution": "uniform",
+    "low": 0.5,
+    "high": 1.5,
+}
+CAMPAIGN = {
+    "name": "little",
+    "scenario": "hover",
+    "flights": 6,
+    "failure": ["lost", "max_error.z > 0.2"],
+    "set": {"duration": 0.5, "constraints": []},
+    "vary": [MASS],
+}
+BARE = ("--no-video", "--no-recording", "--no-figures")
+
+
+@pytest.fixture(scope="module")
+def flown(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A directory with two campaigns on the same draws, and their files; the second is lighter."""
+    here = tmp_path_factory.mktemp("campaigns")
+    for name, base in (("first", 0.0), ("second", 0.05)):
+        path = here / f"{name}.toml"
+        changed = {"duration": 0.5, "constraints": [], "initial": {"position": [0.0, 0.0, base]}}
+        path.write_text(tomlkit.dumps({**CAMPAIGN, "name": name, "set": changed}), encoding="utf-8")
+        assert main(["campaign", str(path), "--out", str(here / name), "--workers", "2"]) == EXIT_DONE
+    return here
+
+
+@pytest.fixture
+def file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    path = tmp_path / "little.toml"
+    path.write_text(tomlkit.dumps(CAMPAIGN), encoding="utf-8")
+    return path
+
+
+def test_a_campaign_says_how_often_and_how_sure(file: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["campaign", str(file), "--no-report"]) == EXIT_DONE
+    said = capsys.readouterr()
+    assert "of 6 flights failed" in said.out
+    assert "95 % interval" in said.out
+    assert "quadsim replay runs/campaigns/little --flight" in said.out
+    assert "6/6" in said.err
+    assert (file.parent / "runs" / "campaigns" / "little" / "flights.parquet").is_file()
+
+
+def test_the_summary_alone_as_json(file: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["campaign", str(file), "--json", "--no-report", "--flights", "2", "--seed", "9"]) == EXIT_DONE
+    said = capsys.readouterr()
+    assert json.loads(said.out)["flights"] == 2
+    assert said.err == ""
+
+
+def test_a_requirement_decides_the_exit_status(file: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    options = ["--no-report", "--require", "P(lost) < 0.5 @ 95%", "--junit", "gate.xml"]
+    assert main(["campaign", str(file), *options]) == EXIT_DONE
+    assert main(["campaign", str(file), "--resume", *options, "--require", "P(lost) < 0.01 @ 95%"]) == EXIT_FAILED
+    assert "It takes at least 299 flights" in capsys.readouterr().out.replace("\n", " ")
+    suite = ElementTree.parse("gate.xml").getroot()
+    assert (suite.get("tests"), suite.get("failures")) == ("2", "1")
+
+
+def test_a_campaign_has_its_report(flown: Path) -> None:
+    page = (flown / "first" / "index.html").read_text(encoding="utf-8")
+    assert "first" in page
+    assert (flown / "first" / "campaign.png").is_file()
+
+
+def test_a_replay_gives_the_same_numbers(
+    flown: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main(["replay", str(flown / "first"), "--flight", "2", *BARE]) == EXIT_DONE
+    assert "each the same as in the campaign" in capsys.readouterr().out
+    assert json.loads((tmp_path / "runs" / "first-2" / "summary.json").read_text())["scenario"] == "first-2"
+
+
+def test_two_campaigns_are_compared_flight_by_flight(
+    flown: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    arguments = ["compare", str(flown / "first"), str(flown / "second"), "--out", str(tmp_path / "pairs")]
+    assert main(arguments) == EXIT_DONE
+    said = " ".join(capsys.readouterr().out.split())
+    assert "of 6 paired flights" in said
+    assert "all of mass" in said
+    assert (tmp_path / "pairs" / "index.html").is_file()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["campaign", "gone.toml"], "gone.toml: no such campaign file"),
+        (["campaign", "little.toml", "--workers", "0"], "workers must be 1 or more; got 0"),
+        (["campaign", "little.toml", "--flights", "0"], "flights must be >= 1; got 0"),
+        (["campaign", "little.toml", "--until-width", "2"], "--until-width must be between 0 and 1; got 2.0"),
+        (["campaign", "little.toml", "--require", "P(lost) < 2 @ 95%"], "requirement 'P(lost) < 2 @ 95%'"),
+        (["campaign", "little.toml", "--require", "P(rmse.q > 1) < 0.1 @ 95%"], "no column named 'rmse.q'"),
+        (["campaign", "little.toml", "--require", "lost < 1%"], "must read P(EVENT) OP SHARE @ CONFIDENCE%"),
+        (["campaign", "little.toml", "--set", "duratoin=1"], "duratoin is not a field of the scenario file"),
+        (["campaign", "little.toml", "--cluster", "gone.toml"], "gone.toml"),
+        (["replay", "little.toml"], "is not a campaign"),
+        (["compare", "{flown}/first", "--out", "pairs"], "compare takes two campaigns, each by itself, not 1"),
+        (["compare", "{flown}/first", "hover", "--out", "pairs"], "hover: is not a campaign"),
+        (["compare", "{flown}/first", "{flown}/second", "--cost", "--out", "pairs"], "--cost must be absent"),
+        (["replay", "{flown}/first", "--flight", "6"], "--flight must be one of the flights 0 to 5"),
+    ],
+)
+def test_wrong_input_is_status_2_with_one_message_and_flies_nothing(
+    flown: Path, file: Path, capsys: pytest.CaptureFixture[str], arguments: list[str], message: str
+) -> None:
+    before = {path.name for path in file.parent.iterdir()}
+    assert main([each.replace("{flown}", str(flown)) for each in arguments]) == EXIT_WRONG_INPUT
+    said = capsys.readouterr()
+    assert said.out == ""
+    assert said.err.startswith("quadsim: ")
+    assert message in said.err
+    assert {path.name for path in file.parent.iterdir()} == before
+
+
+def test_ctrl_c_keeps_what_was_flown(file: Path) -> None:
+    command = [sys.executable, "-m", "scenarios.cli", "campaign", str(file), "--out", "c", "--flights", "2000"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as campaign:
+        parts = file.parent / "c" / "parts"
+        while not (parts.is_dir() and any(parts.iterdir())):
+            assert campaign.poll() is None
+            clock.sleep(0.1)
+        campaign.send_signal(signal.SIGINT)
+        _, said = campaign.communicate(timeout=30.0)
+        assert campaign.returncode == EXIT_FAILED
+    assert "interrupted (Ctrl-C); c has what was flown, --resume goes on with it" in said
+    assert "Traceback" not in said
+    manifest = json.loads((file.parent / "c" / "manifest.json").read_text())
+    assert manifest["status"] == "interrupted"
+    assert 0 < manifest["flown"] < 2000

@@ -1,0 +1,224 @@
+"""Campaign files: what is read from them, the scenario of each flight, and what is refused before anything flies."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+import tomlkit
+
+from quadsim.errors import FileError, InputError, UnknownNameError
+from scenarios.campaign.plan import Plan, campaign_names, campaign_path, load_plan
+
+MASS = {
+    "name": "mass",
+    "fields": ["effects.load.mass_factor"],
+    "distribution": "uniform",
+    "low": 0.9,
+    "high": 1.1,
+}
+BASE: dict[str, Any] = {"name": "c", "scenario": "hover", "flights": 3, "vary": [MASS]}
+
+
+def write(directory: Path, data: dict[str, Any], name: str = "campaign.toml") -> Path:
+    path = directory / name
+    path.write_text(tomlkit.dumps(data), encoding="utf-8")
+    return path
+
+
+def plan(directory: Path, **changes: Any) -> Plan:
+    data = {key: value for key, value in {**BASE, **changes}.items() if value is not None}
+    return load_plan(str(write(directory, data)))
+
+
+def varied(**changes: Any) -> list[dict[str, Any]]:
+    return [{key: value for key, value in {**MASS, **changes}.items() if value is not None}]
+
+
+# --- what is flown -------------------------------------------------------------------------------------------------
+
+
+def test_each_flight_has_its_own_name_seed_and_values(tmp_path: Path) -> None:
+    made = plan(tmp_path)
+    scenarios = [made.of(flight) for flight in range(3)]
+    assert [each.name for each in scenarios] == ["c-0", "c-1", "c-2"]
+    assert len({each.seed for each in scenarios}) == 3
+    factors = [each.effects.load.mass_factor for each in scenarios if each.effects.load is not None]
+    assert len(set(factors)) == 3
+    assert all(0.9 <= factor <= 1.1 for factor in factors)
+    assert [made.identity(flight)["draw.mass"] for flight in range(3)] == factors
+
+
+def test_one_value_goes_to_all_of_its_fields_and_relative_ones_multiply(tmp_path: Path) -> None:
+    vary = varied(
+        low=0.9,
+        high=0.99,
+        fields=["vehicle.arm_length", "vehicle.inertia.2", "controller.output_weights.x"],
+        relative=True,
+        name="size",
+    )
+    made = plan(tmp_path, vary=vary, scenario="paper-constrained")
+    base, flown = made.scenario, made.of(1)
+    factor = made.identity(1)["draw.size"]
+    assert base.vehicle.arm_length is not None
+    assert base.vehicle.inertia is not None
+    assert flown.vehicle.arm_length == pytest.approx(factor * base.vehicle.arm_length)
+    assert flown.vehicle.inertia == pytest.approx([*base.vehicle.inertia[:2], factor * base.vehicle.inertia[2]])
+
+
+def test_set_is_merged_over_the_scenario(tmp_path: Path) -> None:
+    made = plan(tmp_path, set={"duration": 2.0, "constraints": [{"name": "yaw", "signal": "yaw", "upper": 3.0}]})
+    assert made.scenario.duration == 2.0
+    names = [constraint.name for constraint in made.scenario.constraints]
+    assert "yaw" in names
+    assert len(names) > 1
+
+
+def test_settings_of_the_command_line_come_last(tmp_path: Path) -> None:
+    path = write(tmp_path, {**BASE, "set": {"duration": 2.0}})
+    made = load_plan(str(path), ["duration=3.0"], flights=7, seed=5)
+    assert (made.scenario.duration, made.spec.flights, made.spec.seed) == (3.0, 7, 5)
+
+
+def test_a_scenario_beside_the_campaign_is_found(tmp_path: Path) -> None:
+    write(tmp_path, {"base": "hover", "name": "mine", "duration": 1.0}, "mine.toml")
+    assert plan(tmp_path, scenario="mine.toml").scenario.duration == 1.0
+
+
+def test_a_campaign_says_only_how_it_differs_from_its_base(tmp_path: Path) -> None:
+    write(tmp_path, BASE, "first.toml")
+    heavier = {"base": "first.toml", "name": "heavier", "vary": [{"name": "mass", "high": 1.5}]}
+    made = load_plan(str(write(tmp_path, heavier)))
+    assert made.spec.name == "heavier"
+    assert [(entry.name, getattr(entry, "low", None), getattr(entry, "high", None)) for entry in made.spec.vary] == [
+        ("mass", 0.9, 1.5)
+    ]
+
+
+def test_the_resolved_file_is_the_same_campaign(tmp_path: Path) -> None:
+    made = plan(tmp_path, sampling="sobol", failure=["lost", "rmse.z > 0.5"])
+    (tmp_path / "again.toml").write_text(made.spec.to_toml(), encoding="utf-8")
+    assert load_plan(str(tmp_path / "again.toml")).spec == made.spec
+
+
+def test_a_flight_does_not_change_the_plan(tmp_path: Path) -> None:
+    made = plan(tmp_path)
+    first = made.of(0)
+    made.of(1)
+    assert made.of(0) == first
+
+
+@pytest.mark.parametrize("name", campaign_names())
+def test_every_campaign_that_ships_can_be_flown(name: str) -> None:
+    made = load_plan(name)
+    assert made.spec.name == name
+    assert made.of(0) != made.of(1)
+
+
+def test_campaigns_on_the_same_draws_differ_in_their_controller_alone() -> None:
+    paper, robust = load_plan("paper-robustness"), load_plan("paper-robustness-robust")
+    assert [paper.identity(k) for k in range(20)] == [robust.identity(k) for k in range(20)]
+    same = robust.of(3).model_copy(update={"controller": paper.of(3).controller, "name": paper.of(3).name})
+    assert same == paper.of(3)
+
+
+# --- what is refused -----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"flights": 0}, r"flights must be >= 1; got 0"),
+        ({"flights": None}, r"flights is missing"),
+        ({"flights": 2.5}, r"flights must be a whole number; got 2\.5"),
+        ({"fligths": 3}, r"fligths is not a field of the campaign file; did you mean 'flights'\?"),
+        ({"name": "A b"}, r"name must be of the form"),
+        ({"seed": -1}, r"seed must be >= 0; got -1"),
+        ({"sampling": "lhs"}, r"sampling must be one of 'random', 'latin_hypercube'"),
+        ({"failure": []}, r"failure must be of 1 or more entries"),
+        ({"failure": ["lots"]}, r"failure has an entry 'lots' that is no event: .*did you mean 'lost'\?"),
+        ({"failure": ["failure"]}, r"failure has an entry 'failure' that is no event"),
+        ({"failure": ["rmse.q > 1"]}, r"failure: no column named 'rmse\.q'; did you mean"),
+        ({"failure": ["wall_s > 1"]}, r"failure: no column named 'wall_s'"),
+        ({"vary": varied(low=1.1, high=0.9)}, r"vary\.mass\.low must be below high; got 1\.1 and 0\.9"),
+        ({"vary": varied(low=1.0, high=1.0)}, r"vary\.mass\.low must be below high"),
+        ({"vary": varied(low=None)}, r"vary\.mass\.low is missing"),
+        ({"vary": varied(low="1")}, r"vary\.mass\.low must be a number; got '1'"),
+        ({"vary": varied(distribution="unifrom")}, r"vary\.mass must be one of .*; did you mean 'uniform'\?"),
+        ({"vary": varied(distribution="log_uniform", low=0.0)}, r"vary\.mass\.low must be > 0\.0; got 0\.0"),
+        ({"vary": varied(fields=[])}, r"vary\.mass\.fields must be of 1 or more entries"),
+        ({"vary": varied(fields=["seed"])}, r"vary\.mass\.fields must not have seed"),
+        ({"vary": varied() * 2}, r"vary must have distinct names"),
+        (
+            {"vary": varied(distribution="normal", mean=1.0, deviation=0.0, low=None, high=None)},
+            r"vary\.mass\.deviation must be > 0\.0; got 0\.0",
+        ),
+        (
+            {"vary": varied(distribution="normal", mean=0.0, deviation=1.0, low=20.0, high=30.0)},
+            r"vary\.mass\.mean must be within 8 standard deviations of the range 20 to 30",
+        ),
+        (
+            {"vary": varied(distribution="choice", values=[], low=None, high=None)},
+            r"vary\.mass\.values must be of 1 or more entries",
+        ),
+        (
+            {"vary": varied(distribution="choice", values=[1.0, "a"], low=None, high=None)},
+            r"vary\.mass\.values must all be of one kind",
+        ),
+        (
+            {"vary": varied(distribution="choice", values=[1.0, 1.0], low=None, high=None)},
+            r"vary\.mass\.values must be distinct",
+        ),
+        (
+            {"vary": varied(distribution="choice", values=[1.0], weights=[0.5, 0.5], low=None, high=None)},
+            r"vary\.mass\.weights must be as many as values, 1; got 2",
+        ),
+        (
+            {"vary": varied(distribution="choice", values=[1.0], weights=[0.0], low=None, high=None)},
+            r"vary\.mass\.weights must not all be 0",
+        ),
+        (
+            {"vary": varied(distribution="grid", values=[1.0, 1.1], low=None, high=None)},
+            r"flights must be a multiple of the 2 combinations of its grids; got 3",
+        ),
+        ({"scenario": "hoover"}, r"no scenario named 'hoover'; did you mean 'hover'\?"),
+        ({"set": {"duration": -1.0}}, r"duration must be > 0"),
+        ({"set": {"effects": {"laod": {}}}}, r"effects\.laod is not a field of the scenario file; did you mean 'load'"),
+        # of what varies, with the value at which it goes wrong
+        (
+            {"vary": varied(fields=["effects.load.mass_fator"])},
+            r"vary\.mass at 0\.9: effects\.load\.mass_fator is not a field of the scenario file; did you mean",
+        ),
+        ({"vary": varied(low=0.01)}, r"vary\.mass at 0\.01: effects\.load\.mass_factor must be >= 0\.05; got 0\.01"),
+        ({"vary": varied(fields=["duration.x"])}, r"vary\.mass\.fields must be a path to a field; duration has none"),
+        ({"vary": varied(fields=["initial.euler.3"])}, r"no entry of initial\.euler named '3' \(there are: 0, 1, 2\)"),
+        ({"vary": varied(fields=["controller"])}, r"controller must be a table or a controller.s name; got 0\.9"),
+        (
+            {"vary": varied(fields=["vehicle.mas"], relative=True)},
+            r"vehicle\.mas is not a field of the scenario file; did you mean 'mass'",
+        ),
+        (
+            {"vary": varied(fields=["effects.load.mass_factor"], relative=True)},
+            r"vary\.mass\.relative must be false where the scenario has no number at effects\.load\.mass_factor",
+        ),
+        ({"vary": varied(fields=["vehicle.mass"], low=20.0, high=30.0)}, r"vary\.mass at 20\.0: .*hover"),
+    ],
+)
+def test_a_malformed_campaign_is_refused_with_its_field(tmp_path: Path, changes: dict[str, Any], message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        plan(tmp_path, **changes)
+
+
+def test_a_missing_or_unknown_campaign_is_named(tmp_path: Path) -> None:
+    with pytest.raises(FileError, match="no such campaign file"):
+        load_plan(str(tmp_path / "gone.toml"))
+    with pytest.raises(UnknownNameError, match="no campaign named 'paper-robustnes'; did you mean 'paper-robustness'"):
+        campaign_path("paper-robustnes")
+
+
+def test_a_file_that_is_no_toml_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "bad.toml"
+    path.write_text("name = [", encoding="utf-8")
+    with pytest.raises(FileError, match="is not valid TOML"):
+        load_plan(str(path))

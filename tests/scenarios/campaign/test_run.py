@@ -1,0 +1,269 @@
+"""Whole campaigns of short flights: the same results whoever flies them, nothing lost, and wrong uses refused."""
+
+from __future__ import annotations
+
+import functools
+import json
+from collections.abc import Generator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+import tomlkit
+
+from quadsim.campaign.table import Row, read_table
+from quadsim.errors import InputError, OutputError, ParameterError
+from scenarios.campaign import manifest as records
+from scenarios.campaign import run as module
+from scenarios.campaign.engine import Pilot
+from scenarios.campaign.local import LocalEngine
+from scenarios.campaign.manifest import read_manifest
+from scenarios.campaign.plan import Plan, load_plan
+from scenarios.campaign.replay import recorded_flight, replay
+from scenarios.campaign.run import SUMMARY_FILE, Result, Standing
+from scenarios.runner import Outputs
+
+CAMPAIGN: dict[str, Any] = {
+    "name": "little",
+    "scenario": "hover",
+    "flights": 12,
+    "seed": 4,
+    "failure": ["lost", "max_error.z > 0.2"],
+    "set": {"duration": 0.5, "constraints": []},
+    "vary": [
+        {
+            "name": "mass",
+            "fields": ["effects.load.mass_factor"],
+            "distribution": "uniform",
+            "low": 0.5,
+            "high": 1.5,
+        },
+    ],
+}
+
+
+fly_campaign = functools.partial(module.fly_campaign, report=False)
+
+
+@dataclass
+class Alone:
+    """An engine of this process: backwards or not, and stopped by an exception after so many flights."""
+
+    backwards: bool = False
+    stops_after: int | None = None
+    stopped_by: type[BaseException] = KeyboardInterrupt
+    name: str = "alone"
+    workers: int = 1
+
+    def answers(self, pilot: Pilot, flights: Sequence[int]) -> Generator[Row, None, None]:
+        ordered = list(reversed(flights)) if self.backwards else list(flights)
+        for i, flight in enumerate(ordered):
+            if i == self.stops_after:
+                raise self.stopped_by
+            yield pilot.fly(flight)
+
+
+def make_plan(directory: Path, **changes: Any) -> Plan:
+    path = directory / "little.toml"
+    path.write_text(tomlkit.dumps({**CAMPAIGN, **changes}), encoding="utf-8")
+    return load_plan(str(path))
+
+
+@pytest.fixture
+def plan(tmp_path: Path) -> Plan:
+    return make_plan(tmp_path)
+
+
+def content(result: Result) -> tuple[bytes, bytes]:
+    return (result.directory / "flights.parquet").read_bytes(), (result.directory / SUMMARY_FILE).read_bytes()
+
+
+def test_results_are_the_same_bytes_whoever_flies(plan: Plan, tmp_path: Path) -> None:
+    engines = {"forwards": Alone(), "backwards": Alone(backwards=True), "two": LocalEngine(2), "one": LocalEngine(1)}
+    results = [fly_campaign(plan, tmp_path / name, engine) for name, engine in engines.items()]
+    assert len({content(result) for result in results}) == 1
+    assert results[0].table.num_rows == 12
+    assert 0 < sum(results[0].table["failed"].to_pylist()) < 12
+
+
+@pytest.mark.parametrize("ended_by", [KeyboardInterrupt, RuntimeError])
+def test_what_was_flown_stays_and_the_rest_follows(plan: Plan, tmp_path: Path, ended_by: type[BaseException]) -> None:
+    whole = fly_campaign(plan, tmp_path / "whole", Alone())
+    with pytest.raises(ended_by):
+        fly_campaign(plan, tmp_path / "again", Alone(backwards=True, stops_after=5, stopped_by=ended_by))
+    manifest = read_manifest(tmp_path / "again")
+    assert (manifest["status"], manifest["flown"]) == ("interrupted", 5)
+    seen: list[Standing] = []
+    resumed = fly_campaign(plan, tmp_path / "again", Alone(), resume=True, watch=seen.append)
+    assert [standing.flown for standing in seen] == list(range(6, 13))
+    assert content(resumed) == content(whole)
+    assert [session["flights"] for session in resumed.manifest["sessions"]] == [5, 7]
+
+
+def test_resuming_a_finished_campaign_flies_nothing(plan: Plan, tmp_path: Path) -> None:
+    whole = fly_campaign(plan, tmp_path / "c", Alone())
+    before = content(whole)
+    assert content(fly_campaign(plan, tmp_path / "c", Alone(stops_after=0), resume=True)) == before
+
+
+def test_more_flights_may_follow(plan: Plan, tmp_path: Path) -> None:
+    fly_campaign(plan, tmp_path / "c", Alone())
+    more = make_plan(tmp_path, flights=15)
+    grown = fly_campaign(more, tmp_path / "c", Alone(), resume=True)
+    assert content(grown) == content(fly_campaign(more, tmp_path / "d", Alone()))
+    assert grown.manifest["flights"] == grown.manifest["flown"] == 15
+
+
+def test_a_flight_that_raises_is_a_result(tmp_path: Path) -> None:
+    (tmp_path / "fails.py").write_text(
+        "class Fails:\n    def __init__(self, vehicle, **numbers):\n        raise ZeroDivisionError('of its own')\n",
+        encoding="utf-8",
+    )
+    plan = make_plan(tmp_path, set={"duration": 0.5, "constraints": [], "controller": "fails:Fails"})
+    table = fly_campaign(plan, tmp_path / "c", Alone()).table
+    assert set(table["verdict"].to_pylist()) == {"error"}
+    assert all("ZeroDivisionError" in reason for reason in table["reason"].to_pylist()), table["reason"].to_pylist()
+    assert all(table["failed"].to_pylist())
+
+
+def test_it_stops_when_the_interval_is_narrow_enough_at_the_same_flight(tmp_path: Path) -> None:
+    plan = make_plan(tmp_path, flights=60)
+    results = [
+        fly_campaign(plan, tmp_path / name, engine, until_width=0.5)
+        for name, engine in {"one": Alone(), "two": LocalEngine(2)}.items()
+    ]
+    assert content(results[0]) == content(results[1])
+    flown = results[0].table.num_rows
+    assert flown in (10, 20, 30)
+    assert results[0].manifest["status"] == "stopped"
+    share = results[0].summary["events"]["failure"]
+    assert share["upper"] - share["lower"] <= 0.5
+    resumed = fly_campaign(plan, tmp_path / "one", Alone(), resume=True)
+    assert (resumed.table.num_rows, resumed.manifest["status"]) == (60, "complete")
+
+
+@pytest.mark.parametrize("width", [0.0, 1.0, -0.1])
+def test_a_width_that_is_no_share_is_refused(plan: Plan, tmp_path: Path, width: float) -> None:
+    with pytest.raises(ParameterError, match=r"--until-width must be between 0 and 1"):
+        fly_campaign(plan, tmp_path / "c", Alone(), until_width=width)
+    assert not (tmp_path / "c").exists()
+
+
+def test_a_manifest_says_what_was_flown(plan: Plan, tmp_path: Path) -> None:
+    result = module.fly_campaign(plan, tmp_path / "c", Alone())
+    manifest = read_manifest(result.directory)
+    assert manifest == result.manifest
+    assert (manifest["name"], manifest["status"], manifest["flights"]) == ("little", "complete", 12)
+    assert {"campaign.toml", "scenario.toml", "flights.parquet", "index.html"} <= set(manifest["files"])
+    assert manifest["versions"]["mujoco"]
+    assert manifest["code"].startswith("sha256:")
+    assert json.loads((result.directory / SUMMARY_FILE).read_text())["flights"] == 12
+
+
+# --- what is refused -----------------------------------------------------------------------------------------------
+
+
+def test_a_campaign_is_not_flown_over_without_asking(plan: Plan, tmp_path: Path) -> None:
+    fly_campaign(plan, tmp_path / "c", Alone())
+    with pytest.raises(OutputError, match="a campaign is already there; go on with it by --resume"):
+        fly_campaign(plan, tmp_path / "c", Alone())
+
+
+def test_a_directory_of_something_else_is_left_alone(plan: Plan, tmp_path: Path) -> None:
+    (tmp_path / "c").mkdir()
+    (tmp_path / "c" / "thesis.tex").write_text("years of work")
+    for resume in (False, True):
+        with pytest.raises(OutputError, match="something else is already there"):
+            fly_campaign(plan, tmp_path / "c", Alone(), resume=resume)
+    assert [path.name for path in (tmp_path / "c").iterdir()] == ["thesis.tex"]
+
+
+@pytest.mark.parametrize(
+    ("changes", "named"),
+    [
+        ({"seed": 5}, "seed"),
+        ({"flights": 11}, "flights"),
+        ({"failure": ["lost"]}, "failure"),
+        ({"set": {"duration": 1.0, "constraints": []}}, "scenario"),
+        ({"vary": []}, "vary"),
+    ],
+)
+def test_another_campaign_does_not_go_on_with_it(
+    plan: Plan, tmp_path: Path, changes: dict[str, Any], named: str
+) -> None:
+    fly_campaign(plan, tmp_path / "c", Alone())
+    with pytest.raises(InputError, match=rf"its {named} differs from the one there"):
+        fly_campaign(make_plan(tmp_path, **changes), tmp_path / "c", Alone(), resume=True)
+
+
+def test_a_latin_hypercube_does_not_grow(tmp_path: Path) -> None:
+    fly_campaign(make_plan(tmp_path, sampling="latin_hypercube"), tmp_path / "c", Alone())
+    more = make_plan(tmp_path, sampling="latin_hypercube", flights=15)
+    with pytest.raises(InputError, match="more flights may follow, except of a latin_hypercube"):
+        fly_campaign(more, tmp_path / "c", Alone(), resume=True)
+
+
+def test_other_code_does_not_go_on_with_it(plan: Plan, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    fly_campaign(plan, tmp_path / "c", Alone())
+    monkeypatch.setattr(records, "code_digest", lambda: "sha256:other")
+    with pytest.raises(InputError, match="code are not what flew the first flights"):
+        fly_campaign(plan, tmp_path / "c", Alone(), resume=True)
+
+
+def test_a_full_disk_ends_it_with_a_message_and_resuming_completes_it(
+    plan: Plan, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole = fly_campaign(plan, tmp_path / "whole", Alone())
+
+    def full(self: Any, rows: Sequence[Row]) -> None:
+        raise OutputError("part", "No space left on device")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(module.Store, "append", full)
+        with pytest.raises(OutputError, match="No space left on device"):
+            fly_campaign(plan, tmp_path / "c", Alone())
+    assert content(fly_campaign(plan, tmp_path / "c", Alone(), resume=True)) == content(whole)
+
+
+# --- replay --------------------------------------------------------------------------------------------------------
+
+
+def test_a_replayed_flight_gives_the_campaigns_numbers(plan: Plan, tmp_path: Path) -> None:
+    result = fly_campaign(plan, tmp_path / "c", LocalEngine(2))
+    worst = recorded_flight(tmp_path / "c", None)
+    assert worst.number == result.summary["worst"][0]["flight"]
+    for number in (None, 0, 7):
+        recorded = recorded_flight(tmp_path / "c", number)
+        outputs = Outputs(video=False, recording=False, figures=False)
+        flight, differing = replay(recorded, tmp_path / "runs" / recorded.scenario.name, outputs)
+        assert differing == []
+        assert flight.log.control.t.size == 10
+        assert (tmp_path / "runs" / recorded.scenario.name / "summary.json").is_file()
+
+
+def test_a_replay_tells_when_numbers_differ(plan: Plan, tmp_path: Path) -> None:
+    fly_campaign(plan, tmp_path / "c", Alone())
+    recorded = recorded_flight(tmp_path / "c", 3)
+    other = recorded.__class__(number=3, row={**recorded.row, "rmse.z": 0.0}, scenario=recorded.scenario)
+    _, differing = replay(other, tmp_path / "run", Outputs(video=False, recording=False, figures=False))
+    assert differing == ["rmse.z"]
+
+
+def test_a_flight_that_there_is_not_is_named(plan: Plan, tmp_path: Path) -> None:
+    fly_campaign(plan, tmp_path / "c", Alone())
+    with pytest.raises(ParameterError, match=r"--flight must be one of the flights 0 to 11 of .*; got 12"):
+        recorded_flight(tmp_path / "c", 12)
+
+
+def test_a_campaign_whose_files_were_changed_is_not_replayed(plan: Plan, tmp_path: Path) -> None:
+    fly_campaign(plan, tmp_path / "c", Alone())
+    path = tmp_path / "c" / "scenario.toml"
+    path.write_text(path.read_text().replace("duration = 0.5", "duration = 0.6"))
+    with pytest.raises(InputError, match=r"scenario\.toml: is missing or not the file that was flown"):
+        recorded_flight(tmp_path / "c", 0)
+
+
+def test_the_table_reads_back(plan: Plan, tmp_path: Path) -> None:
+    result = fly_campaign(plan, tmp_path / "c", Alone())
+    assert read_table(tmp_path / "c" / "flights.parquet").equals(result.table)
