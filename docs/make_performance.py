@@ -15,11 +15,21 @@ from pathlib import Path
 from make_numbers import Table, markdown, replace_in_readme
 from PIL import Image
 
-from quadsim.bench import FlightProfile, RenderProfile, SolverBench, flight_tables, render_tables, solver_tables
+from quadsim.bench import (
+    FlightProfile,
+    RenderProfile,
+    SolverBench,
+    campaign_tables,
+    flight_tables,
+    render_tables,
+    solver_tables,
+)
 from quadsim.table import grid_to_markdown
+from scenarios.bench.campaign import bench_campaign
 from scenarios.bench.flight import bench_flight
 from scenarios.bench.render import bench_render
 from scenarios.bench.solvers import bench_solvers, section, write_bench
+from scenarios.bench.together import bench_together, saving_rows
 from scenarios.loading import load_scenario
 from scenarios.runner import fly_scenario
 
@@ -77,6 +87,15 @@ EFFECTS_NOTE = (
 )
 
 
+TOGETHER_NOTE = (
+    "Several flights' physics steps taken as one batch of MuJoCo's, the forces between its steps evaluated for all "
+    "vehicles at once,\nagainst one by one; processor time. The numbers are the same to the bit. A QP, sensors and the "
+    "log belong to one flight. The ratio\nis that of whole flights, if all but the stepping costs the same in company; "
+    "the logs of flights in the air together have to fit\ninto a worker's memory. So campaigns fly one by one. "
+    "`scenarios/bench/together.py` measures it."
+)
+
+
 def effect_costs() -> Table:
     """What effects cost a flight of 20 s in hover; best of `REPEATS`, in turns."""
     hover = ["duration=20.0", "reference.x=[]", "reference.y=[]", "reference.z=[]", "initial.position=[0.0, 0.0, 2.0]"]
@@ -124,7 +143,20 @@ def _wall_s(arguments: list[str]) -> float:
     return clock.perf_counter() - started
 
 
-def page(bench: SolverBench, flight: FlightProfile, film: RenderProfile, commands: str, effects: str) -> str:
+def campaigns() -> str:
+    """What many flights cost, and what flying them together would save."""
+    tables = campaign_tables(bench_campaign(load_scenario(SCENARIO)))
+    return "\n".join(
+        [
+            *(section(grid) for grid in tables),
+            f"## What flying together would save\n\n{TOGETHER_NOTE}\n\n{markdown(saving_rows(bench_together()))}",
+        ]
+    )
+
+
+def page(
+    bench: SolverBench, flight: FlightProfile, film: RenderProfile, commands: str, effects: str, campaigns: str
+) -> str:
     """The whole page."""
     contenders, *others = solver_tables(bench)
     machine = bench.machine
@@ -132,7 +164,7 @@ def page(bench: SolverBench, flight: FlightProfile, film: RenderProfile, command
         [
             "# Performance\n\nMade by `make numbers` on one machine "
             f"({machine['processor']}, {machine['cores']} cores, no GPU); each table in one run: read the ratios.\n"
-            f"`quadsim bench solvers`, `quadsim bench flight` and `quadsim bench render` measure the same on yours.\n",
+            f"`quadsim bench solvers`, `flight`, `render` and `campaign` measure the same on yours.\n",
             section(contenders),
             "![Time of a whole controller step of every contender, and its growth with the horizon](solvers.png)\n",
             *(section(grid) for grid in others),
@@ -141,6 +173,7 @@ def page(bench: SolverBench, flight: FlightProfile, film: RenderProfile, command
             "measured then, on a machine of the same kind, not in this run:\n\n"
             f"{markdown(BEFORE)}",
             f"## What effects cost\n\n{EFFECTS_NOTE}\n\n{effects}",
+            campaigns,
             *(section(grid) for grid in render_tables(film)),
             f"## Whole commands\n\n{commands}",
         ]
@@ -157,7 +190,9 @@ def main() -> None:
         write_bench(bench, Path(scratch))
         figure = Image.open(Path(scratch) / "solvers.png").convert("RGB")
         figure.quantize(64, dither=Image.Dither.NONE).save(ROOT / "docs" / "solvers.png", optimize=True)
-    (ROOT / "docs" / "performance.md").write_text(page(bench, flight, film, commands, effects), encoding="utf-8")
+    (ROOT / "docs" / "performance.md").write_text(
+        page(bench, flight, film, commands, effects, campaigns()), encoding="utf-8"
+    )
     replace_in_readme("times", commands)
     replace_in_readme("solvers", grid_to_markdown(solver_tables(bench)[0]))
 

@@ -23,7 +23,7 @@ def solver_tables(bench: SolverBench) -> list[Grid]:
         _contenders(bench),
         *([_growth(bench)] if bench.growth else []),
         *([_stages(bench)] if bench.stages else []),
-        _targets("Asked of the solvers, and measured", solver_targets(bench)),
+        targets_table("Asked of the solvers, and measured", solver_targets(bench)),
     ]
 
 
@@ -31,12 +31,12 @@ def flight_tables(profile: FlightProfile) -> list[Grid]:
     """Where the time of a flight goes, and what was asked."""
     whole = sum(profile.pieces.values())
     pieces = [(name, seconds) for name, seconds in profile.pieces.items()]
-    lines = [_line(name, f"{seconds:.3f}", f"{100 * seconds / whole:.0f} %") for name, seconds in pieces]
-    lines.append(_line("the flight, with clocks in it", f"{whole:.3f}", "100 %"))
-    lines.append(_line(f"the flight, best of {profile.repeats}", f"{profile.best:.3f}", ABSENT))
-    lines.append(_line("the flight, median", f"{profile.median:.3f}", ABSENT))
-    lines.append(_line("set-up before it", f"{profile.setup_s:.3f}", ABSENT))
-    lines.append(_line("audit after it", f"{profile.audit_s:.3f}", ABSENT))
+    lines = [line(name, f"{seconds:.3f}", f"{100 * seconds / whole:.0f} %") for name, seconds in pieces]
+    lines.append(line("the flight, with clocks in it", f"{whole:.3f}", "100 %"))
+    lines.append(line(f"the flight, best of {profile.repeats}", f"{profile.best:.3f}", ABSENT))
+    lines.append(line("the flight, median", f"{profile.median:.3f}", ABSENT))
+    lines.append(line("set-up before it", f"{profile.setup_s:.3f}", ABSENT))
+    lines.append(line("audit after it", f"{profile.audit_s:.3f}", ABSENT))
     place = "on one core" if profile.cores == 1 else "on whatever cores the system gives"
     grid = Grid(
         key="flight",
@@ -45,7 +45,7 @@ def flight_tables(profile: FlightProfile) -> list[Grid]:
         lines=tuple(lines),
         note=f"Solver: {profile.solver or 'none, a gain'}; {place}; pieces are medians over {profile.repeats} flights.",
     )
-    return [grid, _targets("Asked of a flight, and measured", flight_targets(profile))]
+    return [grid, targets_table("Asked of a flight, and measured", flight_targets(profile))]
 
 
 def render_tables(profile: RenderProfile) -> list[Grid]:
@@ -55,14 +55,14 @@ def render_tables(profile: RenderProfile) -> list[Grid]:
         title="What a film costs",
         head=(f"{profile.width}x{profile.height} at {profile.fps} fps, through {profile.backend.upper()}", ""),
         lines=(
-            _line("frames filmed", str(profile.frames)),
-            _line("rendering processes", str(profile.workers)),
-            _line("wall time per frame, all processes together [ms]", f"{profile.frame_ms:.1f}"),
-            _line("wall time before the first frame [s]", f"{profile.start_s:.2f}"),
-            _line("60 s of film [s]", f"{profile.film_s(60.0):.1f}"),
+            line("frames filmed", str(profile.frames)),
+            line("rendering processes", str(profile.workers)),
+            line("wall time per frame, all processes together [ms]", f"{profile.frame_ms:.1f}"),
+            line("wall time before the first frame [s]", f"{profile.start_s:.2f}"),
+            line("60 s of film [s]", f"{profile.film_s(60.0):.1f}"),
         ),
     )
-    return [grid, _targets("Asked of a film, and measured", render_targets(profile))]
+    return [grid, targets_table("Asked of a film, and measured", render_targets(profile))]
 
 
 def _contenders(bench: SolverBench) -> Grid:
@@ -156,7 +156,7 @@ def _growth_line(growth: Growth, horizons: Sequence[int]) -> tuple[Cell, ...]:
     pairs = [" / ".join(map(_milliseconds, times[N])) if N in times else ABSENT for N in horizons]
     exponents = [growth.exponent(name) for name in ("p50", "p99")]
     fitted = [f"{exponent:.2f}" for exponent in exponents if exponent is not None]
-    return _line(growth.label, *pairs, " / ".join(fitted) or ABSENT)
+    return line(growth.label, *pairs, " / ".join(fitted) or ABSENT)
 
 
 def _stages(bench: SolverBench) -> Grid:
@@ -166,7 +166,7 @@ def _stages(bench: SolverBench) -> Grid:
         name = "condensed, dense" if stage.steps is None else str(stage.steps)
         mark = Mark.BEST if stage is default else Mark.NONE
         label = f"{name} (default)" if stage is default else name
-        cells = _line(str(stage.variables), f"{stage.p50:.2f}", f"{stage.p99:.2f}", f"{stage.p50 / default.p50:.2f}")
+        cells = line(str(stage.variables), f"{stage.p50:.2f}", f"{stage.p99:.2f}", f"{stage.p50 / default.p50:.2f}")
         lines.append((Cell(text=label, mark=mark), *cells))
     return Grid(
         key="stages",
@@ -178,14 +178,15 @@ def _stages(bench: SolverBench) -> Grid:
     )
 
 
-def _targets(title: str, targets: Sequence[Target]) -> Grid:
+def targets_table(title: str, targets: Sequence[Target]) -> Grid:
+    """What was asked, what was measured, and whether it is met."""
     return Grid(
         key="targets",
         title=title,
         head=("quantity", "asked", "measured", "verdict"),
         lines=tuple(
             (
-                *_line(target.what, target.asked, target.measured),
+                *line(target.what, target.asked, target.measured),
                 Cell(text="met" if target.met else "missed", mark=Mark.GOOD if target.met else Mark.BAD),
             )
             for target in targets
@@ -193,7 +194,8 @@ def _targets(title: str, targets: Sequence[Target]) -> Grid:
     )
 
 
-def _line(*texts: str) -> tuple[Cell, ...]:
+def line(*texts: str) -> tuple[Cell, ...]:
+    """Texts as the cells of a row."""
     return tuple(Cell(text=text) for text in texts)
 
 

@@ -8,6 +8,7 @@ import math
 import time as clock
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -17,13 +18,15 @@ from quadsim.bench import (
     Growth,
     RenderProfile,
     SolverBench,
+    campaign_tables,
     flight_tables,
     render_tables,
     solver_tables,
     solver_targets,
 )
-from quadsim.errors import InputError, RenderingUnavailableError
+from quadsim.errors import InputError, ParameterError, RenderingUnavailableError
 from quadsim.video import rendering_backend, worker_count
+from scenarios.bench.campaign import bench_campaign
 from scenarios.bench.contenders import Entry, StepEntrant, entries, judge, reference_optima
 from scenarios.bench.flight import bench_flight
 from scenarios.bench.race import race, stretches
@@ -342,3 +345,35 @@ def test_what_cannot_be_timed_is_refused(
 ) -> None:
     assert main(["bench", *arguments]) == EXIT_WRONG_INPUT
     assert message in capsys.readouterr().err
+
+
+# --- campaigns -----------------------------------------------------------------------------------------------------
+
+
+def test_what_a_campaign_costs_is_measured_and_told() -> None:
+    told: list[tuple[int, int]] = []
+    profile = bench_campaign(
+        load_scenario("hover", ["duration=2.0"]),
+        flights=6,
+        rounds=1,
+        sizes=(3, 30),
+        progress=lambda stage, done, total: told.append((done, total)),
+    )
+    assert told == [(1, 4), (2, 4), (3, 4), (4, 4)]
+    one, two = profile.rounds[0]
+    assert (one.flights, one.workers, two.flights, two.workers) == (6, 1, 12, 2)
+    for run in (one, two, *profile.growing):
+        assert 0.0 < run.busy_s < run.workers * run.wall_s
+        assert run.bytes > 1000
+        assert 0.0 < run.overhead < 1.0
+    assert [run.flights for run in profile.growing] == [3, 30]
+    rounds, growth, targets = campaign_tables(profile)
+    assert (len(rounds.lines), len(growth.lines), len(targets.lines)) == (2, 2, 4)
+    assert len(campaign_tables(replace(profile, growing=()))) == 2
+    assert profile.to_json()["per_core_hour"] == pytest.approx(3600.0 * one.rate)
+
+
+@pytest.mark.parametrize("options", [{"flights": 0}, {"rounds": 0}, {"sizes": (0, 3)}])
+def test_a_campaign_of_nothing_is_refused(options: dict[str, Any]) -> None:
+    with pytest.raises(ParameterError, match=rf"--{next(iter(options))} must be at least 1; got 0"):
+        bench_campaign(load_scenario("hover"), **options)
