@@ -60,7 +60,8 @@ class Command:
             back end calls what went wrong.
         iterations: solver iterations; 0 for a closed form.
         active: number of constraints active at the optimum.
-        fallback: 0 when `speeds` is this period's optimum, higher = deeper; 1 = the shifted previous plan.
+        fallback: 0 when `speeds` is this period's optimum, higher = deeper; 1 = the shifted previous plan, or
+            the last command, where that goes on for one that missed its deadline.
         slack: largest softening of an output bound [rad]; 0 while all bounds are hard.
         primal_residual: largest constraint violation the back end reports [its own scaling].
         dual_residual: largest gradient of the Lagrangian the back end reports.

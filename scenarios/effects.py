@@ -16,6 +16,7 @@ from quadsim.vehicle import N_ROTORS, Vehicle
 from scenarios.randomness import generator
 from scenarios.spec import Scenario
 from scenarios.spec.base import Spec
+from scenarios.spec.computation import ComputationSpec
 from scenarios.spec.effects import AirSpec, EffectsSpec, GroundSpec, LoadSpec, PayloadSpec, RotorsSpec
 from scenarios.spec.events import (
     GustEvent,
@@ -25,6 +26,7 @@ from scenarios.spec.events import (
     StallEvent,
     WindEvent,
 )
+from scenarios.spec.fallback import FallbackSpec
 
 Table = TypeVar("Table", bound=Spec)
 
@@ -139,11 +141,22 @@ def build_computation(scenario: Scenario) -> Computation | None:
         Stall(start=event.at, duration=event.duration) for event in scenario.events if isinstance(event, StallEvent)
     )
     spec = scenario.computation
-    if spec is None:
-        return Computation(stalls=stalls) if stalls else None
+    if spec is None and not stalls:
+        return None
+    spec = spec or ComputationSpec()
     return Computation(
-        fixed=spec.delay, per_iteration=spec.per_iteration, jitter=spec.jitter, stalls=stalls, plan=spec.plan
+        fixed=spec.delay,
+        per_iteration=spec.per_iteration,
+        jitter=spec.jitter,
+        stalls=stalls,
+        plan=_has_fallback(scenario) if spec.plan is None else spec.plan,
     )
+
+
+def _has_fallback(scenario: Scenario) -> bool:
+    """Whether the controller is within the fallback contract."""
+    fallback = getattr(scenario.controller, "fallback", None)
+    return isinstance(fallback, FallbackSpec) and fallback.enabled
 
 
 def _filled(table: Table, **values: Any) -> Table:

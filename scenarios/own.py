@@ -9,6 +9,7 @@ import inspect
 import sys
 import traceback
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -21,12 +22,16 @@ from quadsim.state import Array
 from quadsim.vehicle import N_ROTORS, Vehicle
 from scenarios.spec.own import ENTRY_POINTS, GIVEN, OwnSpec
 
+_WHOLE, _REAL = ("iterations", "active", "fallback"), ("slack", "primal_residual", "dual_residual", "solve_s")
+"""What else a command has: whole numbers, and numbers."""
+
 
 class OwnController:
     """A controller with a `step` alone, or more, as the testbed wants it.
 
     What it lacks is filled in: `name` by its class's, `solver` by none, `reset` by nothing.  A step may answer with
-    four speeds instead of a `Command`.  It gets copies of what it is told.  `predict` is there where it has one.
+    four speeds instead of a `Command`.  It gets copies of what it is told, and its answers are copied.  `predict` is
+    there where it has one.
 
     Args:
         law: has step(now, state, reference).
@@ -38,7 +43,7 @@ class OwnController:
     def __init__(self, law: Any, horizon: int) -> None:
         self._law, self.horizon = law, horizon
         if hasattr(law, "predict"):
-            self.predict = law.predict
+            self.predict = self._predict
 
     @property
     def name(self) -> str:
@@ -59,19 +64,63 @@ class OwnController:
         """See `quadsim.controller.Controller.step`.
 
         Raises:
-            CommandError: what it answered is neither a command nor four speeds.
+            CommandError: what it answered is neither a command nor four speeds, or a command with parts of other types
+                or shapes.
         """
-        answer = self._law.step(now, state.copy(), reference.copy())
+        acting = None if now.acting is None else now.acting.copy()
+        answer = self._law.step(replace(now, acting=acting), state.copy(), reference.copy())
         if isinstance(answer, Command):
-            return answer
-        try:
-            speeds = np.array(answer, float)
-        except (TypeError, ValueError):
-            speeds = np.empty(0)
-        if speeds.shape != (N_ROTORS,):
+            return self._checked(answer, now.time)
+        speeds = _numbers(answer)
+        if speeds is None or speeds.shape != (N_ROTORS,):
             problem = f"{self.name} answered {answer!r:.100}, which is neither a Command nor {N_ROTORS} rotor speeds"
             raise CommandError(problem, time=now.time)
         return Command(speeds=speeds, plan=np.tile(speeds, (self.horizon, 1)))
+
+    def _predict(self, states: Array, plans: Array) -> Array:
+        """See `quadsim.controller.Controller.predict`.
+
+        Raises:
+            InputError: what it gives has another shape.
+        """
+        answer = self._law.predict(states.copy(), plans.copy())
+        shape = (*plans.shape[:2], states.shape[1])
+        predicted = _numbers(answer)
+        if predicted is None or predicted.shape != shape:
+            given = type(answer).__name__ if predicted is None else f"numbers of shape {predicted.shape}"
+            raise InputError(f"controller.type: predict of {self.name} must give numbers of shape {shape}; got {given}")
+        return predicted
+
+    def _checked(self, answer: Command, time: float) -> Command:
+        """A copy of a command, whose arrays its law may write over, with everything of its type and shape."""
+
+        def refuse(name: str, rule: str) -> CommandError:
+            given = f"{getattr(answer, name)!r:.80}"
+            problem = f"{self.name} answered a Command whose {name} must be {rule}; got {given}"
+            return CommandError(problem, time=time)
+
+        speeds, plan = _numbers(answer.speeds), _numbers(answer.plan)
+        if speeds is None or speeds.shape != (N_ROTORS,):
+            raise refuse("speeds", f"{N_ROTORS} numbers")
+        if plan is None or plan.shape != (self.horizon, N_ROTORS):
+            raise refuse("plan", f"numbers of shape {(self.horizon, N_ROTORS)}")
+        if not isinstance(answer.status, str):
+            raise refuse("status", "a text")
+        for name in _WHOLE:
+            if not isinstance(getattr(answer, name), int | np.integer):
+                raise refuse(name, "a whole number")
+        for name in _REAL:
+            if not isinstance(getattr(answer, name), int | float | np.integer | np.floating):
+                raise refuse(name, "a number")
+        return replace(answer, speeds=speeds, plan=plan)
+
+
+def _numbers(given: Any) -> Array | None:
+    """A copy as an array of numbers, or None where it holds anything else."""
+    try:
+        return np.array(given, float)
+    except (TypeError, ValueError):
+        return None
 
 
 def build_own(spec: OwnSpec, vehicle: Vehicle, period: float) -> Controller:

@@ -16,8 +16,9 @@ class ComputationSpec(Spec):
 
     delay: Seconds = Field(default=0.0, description="[s] fixed part")
     per_iteration: Seconds = Field(default=0.0, description="[s] for each iteration of the solver")
-    plan: bool = Field(
-        default=False,
-        description="whether the last plan is gone on with while a command is late; else the last command is held",
+    plan: bool | None = Field(
+        default=None,
+        description="whether the last plan is gone on with while a command is late; else the last command is held; "
+        "absent: true with a controller within the fallback contract",
     )
     jitter: Seconds = Field(default=0.0, description="[s] mean of an exponentially distributed part")

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from quadsim.computation import Computation, Stall
+from quadsim.controller import MISSED, Command, Controller, Moment
 from quadsim.effects import (
     Disturbance,
     Effects,
@@ -18,9 +19,11 @@ from quadsim.effects import (
     RotorDynamics,
 )
 from quadsim.errors import ParameterError
+from quadsim.state import Array
 from quadsim.vehicle import Vehicle
-from scenarios.build import build_vehicle
+from scenarios.build import build_controller, build_plant, build_reference, build_vehicle
 from scenarios.effects import build_computation, build_effects, build_wind, resolve_effects
+from scenarios.flying import fly_once
 from scenarios.loading import load_scenario
 from scenarios.spec import Scenario
 
@@ -157,6 +160,55 @@ def test_computation_takes_its_times_and_stalls() -> None:
     assert build_computation(scenario(stall)[0]) == Computation(stalls=(Stall(start=1.0, duration=0.2),))
     loaded, _ = scenario("computation={delay=0.01, per_iteration=1e-4, jitter=0.002}")
     assert build_computation(loaded) == Computation(fixed=0.01, per_iteration=1e-4, jitter=0.002)
+
+
+@pytest.mark.parametrize(
+    ("name", "settings", "expected"),
+    [
+        ("robust", [], True),
+        ("robust", ["controller.fallback.enabled=false"], False),
+        ("robust", ["computation={plan=false}"], False),
+        ("paper-constrained", [], False),
+        ("paper-constrained", ["controller.fallback={}"], True),
+        ("paper-constrained", ["computation={plan=true}"], True),
+        ("paper-unconstrained", [], False),
+    ],
+)
+def test_within_the_fallback_contract_a_missed_deadline_applies_the_plan(
+    name: str, settings: list[str], expected: bool
+) -> None:
+    loaded = load_scenario(name, [events(event(type="stall", at=1.0, duration=0.2)), *settings])
+    computation = build_computation(loaded)
+    assert computation is not None
+    assert computation.plan is expected
+
+
+def test_a_stalled_robust_controller_is_flown_by_its_last_plan() -> None:
+    stalled = load_scenario("robust", ["duration=2.0", events(event(type="stall", at=1.0, duration=0.12))])
+    controller = Spy(build_controller(stalled, vehicle := build_vehicle(stalled)))
+    reference = build_reference(stalled, stalled.periods + controller.horizon)
+    with build_plant(stalled, vehicle) as plant:
+        log = fly_once(stalled, vehicle, plant, controller, reference, navigation=None)
+    missed = [k for k, status in enumerate(log.control.status) if status == MISSED]
+    assert missed == [20, 21]
+    for k in missed:
+        np.testing.assert_array_equal(log.control.speeds[k], controller.plans[19][k - 19])
+        assert np.abs(log.control.speeds[k] - log.control.speeds[19]).max() > 1e-3, "the last command, held"
+
+
+class Spy:
+    """A controller whose plans are kept."""
+
+    def __init__(self, law: Controller) -> None:
+        self._law, self.plans = law, list[Array]()
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._law, name)
+
+    def step(self, now: Moment, state: Array, reference: Array) -> Command:
+        command = self._law.step(now, state, reference)
+        self.plans.append(command.plan.copy())
+        return command
 
 
 def test_wind_that_nothing_meets_is_refused() -> None:

@@ -6,14 +6,17 @@ import itertools
 import re
 import sys
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from importlib import metadata
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from quadsim.controller import Command, Moment
 from quadsim.errors import CommandError, InputError
+from quadsim.state import Array
 from scenarios.build import build_controller, build_vehicle
 from scenarios.cli import main
 from scenarios.loading import load_scenario
@@ -205,6 +208,60 @@ def test_an_answer_that_is_no_command_ends_the_flight_with_that_reason(written: 
 def test_speeds_that_are_no_numbers_never_reach_the_plant(written: Write) -> None:
     flight = fly_scenario(load_scenario(written(HOVER.replace("self.speeds\n", "self.speeds * np.nan\n"))))
     assert flight.log.reason == "at t = 0.000 s: the command is not finite: [nan, nan, nan, nan]"
+
+
+class Answers:
+    """A law that writes over what it is told and what it answered, and answers a command changed in one part."""
+
+    def __init__(self, **changes: Any) -> None:
+        self._speeds, self._plan, self._changes = np.full(4, 190.0), np.full((3, 4), 190.0), changes
+
+    def step(self, now: Moment, state: Array, reference: Array) -> Command:
+        assert now.acting is not None
+        for told in (now.acting, state, reference):
+            told[:] = 7.0
+        self._speeds += 1.0
+        self._plan += 1.0
+        return replace(Command(speeds=self._speeds, plan=self._plan), **self._changes)
+
+    def predict(self, states: Array, plans: Array) -> Any:
+        return self._changes.get("predicted", np.zeros((len(states), 3, 12)))
+
+
+def test_what_it_writes_over_is_its_own() -> None:
+    law, acting, state, reference = OwnController(Answers(), 3), np.ones(4), np.ones(12), np.ones((3, 4))
+    first, second = (law.step(Moment(acting=acting), state, reference) for _ in range(2))
+    assert {*acting, *state, *reference.ravel()} == {1.0}
+    assert (first.speeds[0], second.speeds[0]) == (191.0, 192.0)
+    assert (first.plan[0, 0], second.plan[0, 0]) == (191.0, 192.0)
+
+
+@pytest.mark.parametrize(
+    ("part", "given", "rule"),
+    [
+        ("speeds", np.zeros(3), "4 numbers"),
+        ("speeds", "fast", "4 numbers"),
+        ("speeds", None, "4 numbers"),
+        ("plan", np.zeros((0, 4)), r"numbers of shape \(3, 4\)"),
+        ("plan", None, r"numbers of shape \(3, 4\)"),
+        ("plan", np.zeros((2, 4)), r"numbers of shape \(3, 4\)"),
+        ("status", None, "a text"),
+        ("fallback", None, "a whole number"),
+        ("iterations", 2.5, "a whole number"),
+        ("slack", "none", "a number"),
+    ],
+)
+def test_a_command_with_a_wrong_part_is_refused_by_its_name(part: str, given: Any, rule: str) -> None:
+    law = OwnController(Answers(**{part: given}), 3)
+    with pytest.raises(CommandError, match=rf"Answers answered a Command whose {part} must be {rule}; got "):
+        law.step(Moment(acting=np.ones(4)), np.zeros(12), np.zeros((3, 4)))
+
+
+@pytest.mark.parametrize("given", [None, np.zeros((1, 3, 12)), np.zeros((2, 12))])
+def test_a_prediction_of_another_shape_is_refused(given: Any) -> None:
+    law = OwnController(Answers(predicted=given), 3)
+    with pytest.raises(InputError, match=r"predict of Answers must give numbers of shape \(2, 3, 12\); got "):
+        law.predict(np.zeros((2, 12)), np.zeros((2, 3, 4)))
 
 
 def test_its_own_flight_errors_end_the_flight() -> None:
