@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 
+from mpc.problem import Bounds
 from quadsim.errors import ParameterError
 from quadsim.state import Array
-from quadsim.vehicle import N_ROTORS
+from quadsim.vehicle import N_ROTORS, Vehicle
 
 BOUND_TOLERANCE: Final = 1e-6
 """How far outside its bounds [rad/s] an answer may be and still count as in bounds; it is then moved onto them."""
@@ -20,7 +22,7 @@ class ActuatorBounds:
     """Hard bounds on rotor speeds, Eq. (20), and on their steps from one period to the next, Eq. (15).
 
     Attributes:
-        u_min, u_max: (4,) speeds [rad/s], finite.
+        u_min, u_max: (4,) speeds [rad/s], finite and not negative: rotors turn one way.
         delta_min, delta_max: (4,) steps u(k) - u(k-1) [rad/s]; infinite where there is no bound.
 
     Raises:
@@ -40,9 +42,27 @@ class ActuatorBounds:
             object.__setattr__(self, name, bound)
         if not (np.isfinite(self.u_min).all() and np.isfinite(self.u_max).all() and np.all(self.u_min < self.u_max)):
             raise ParameterError("controller", "u_min", self.u_min, f"finite and below a finite u_max = {self.u_max}")
+        if self.u_min.min() < 0.0:
+            raise ParameterError("controller", "u_min", self.u_min, "at least 0 rad/s: rotors turn one way")
         if not np.all((self.delta_min <= 0.0) & (self.delta_max >= 0.0)):
             rule = f"<= 0 and delta_max = {self.delta_max} >= 0, so that a speed can be held"
             raise ParameterError("controller", "delta_min", self.delta_min, rule)
+
+    @classmethod
+    def alike(cls, speed: tuple[float, float], slew: tuple[float, float] = (-math.inf, math.inf)) -> ActuatorBounds:
+        """The same (lower, upper) bounds of speed and of its step for every rotor [rad/s]."""
+        (u_min, u_max), (down, up) = (np.full((2, N_ROTORS), np.reshape(pair, (2, 1))) for pair in (speed, slew))
+        return cls(u_min=u_min, u_max=u_max, delta_min=down, delta_max=up)
+
+    @classmethod
+    def of(cls, bounds: Bounds) -> ActuatorBounds:
+        """Those of an optimisation."""
+        return cls(u_min=bounds.u_min, u_max=bounds.u_max, delta_min=bounds.delta_min, delta_max=bounds.delta_max)
+
+    @classmethod
+    def of_vehicle(cls, vehicle: Vehicle) -> ActuatorBounds:
+        """The speeds that its rotors hold, and no bounds on steps."""
+        return cls.alike((vehicle.speed_min, vehicle.speed_max))
 
     def reach(self, before: Array) -> tuple[Array, Array]:
         """The lowest and highest speeds (4,) [rad/s] after a command `before` (4,).

@@ -1,4 +1,4 @@
-"""Where a vehicle rests against a constant disturbance: the target of offset-free tracking.
+"""Where a vehicle rests against a constant disturbance: the target of offset-free tracking, and of every fallback.
 
 At rest thrust holds what gravity and the disturbance's acceleration a leave over, and torques hold its angular
 acceleration alpha:
@@ -9,36 +9,78 @@ acceleration alpha:
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass, field, replace
 from typing import Final
 
 import numpy as np
 
 from mpc.nonlinear import NonlinearModel
+from quadsim.errors import ParameterError
 from quadsim.state import INDEX, N_STATES, Array
+from quadsim.vehicle import N_ROTORS
 
 LEAST_LIFT: Final = 0.1
 """Share of the weight that thrust holds at least: no rest is upside down."""
+_ROLL, _PITCH = INDEX["roll"], INDEX["pitch"]
 
 
-def equilibrium(model: NonlinearModel, yaw: float = 0.0) -> tuple[Array, Array]:
-    """Rest at the origin under the model's disturbance, seen from axes turned by the yaw, where yaw itself is 0.
+@dataclass(frozen=True, kw_only=True)
+class Trim:
+    """What rest takes of a vehicle, for all that is known now.
+
+    Attributes:
+        speeds: (4,) of the rotors [rad/s].
+        lift: (3,) along which thrust points, world frame, of any length; upwards.
+        twist: (3,) angular acceleration, body frame, over the acceleration by thrust that brings it about [1/m].
+
+    Raises:
+        ParameterError: they are not as many finite numbers, or lift does not point upwards.
+    """
+
+    speeds: Array
+    lift: Array
+    twist: Array = field(default_factory=lambda: np.zeros(3))
+
+    def __post_init__(self) -> None:
+        if np.shape(self.speeds) != (N_ROTORS,) or not np.isfinite(self.speeds).all():
+            raise ParameterError("trim", "speeds", self.speeds, f"{N_ROTORS} finite numbers")
+        if np.shape(self.lift) != (3,) or not (np.isfinite(self.lift).all() and self.lift[2] > 0.0):
+            raise ParameterError("trim", "lift", self.lift, "three finite numbers, the last one positive")
+        if np.shape(self.twist) != (3,) or not np.isfinite(self.twist).all():
+            raise ParameterError("trim", "twist", self.twist, "three finite numbers")
+
+    def lean(self, yaw: float) -> tuple[float, float]:
+        """Roll and pitch at rest with a yaw [rad]."""
+        x, y, up = self.lift.tolist()
+        cosine, sine = math.cos(yaw), math.sin(yaw)
+        forward, left = cosine * x + sine * y, cosine * y - sine * x
+        return -math.atan2(left, math.hypot(forward, up)), math.atan2(forward, up)
+
+    def state(self, yaw: float = 0.0, n: int = N_STATES) -> Array:
+        """(n,) rest at the origin, seen from axes turned by the yaw [rad], where yaw is 0; rotor speeds last."""
+        state = np.zeros(n)
+        state[_ROLL], state[_PITCH] = self.lean(yaw)
+        state[N_STATES:] = self.speeds[: n - N_STATES]
+        return state
+
+
+def twisted(model: NonlinearModel, twist: Array) -> NonlinearModel:
+    """The model whose thrust brings about an angular acceleration; see `Trim.twist`."""
+    effectiveness = model.effectiveness.copy()
+    effectiveness[1:] += np.outer(twist, effectiveness[0])
+    return replace(model, effectiveness=effectiveness)
+
+
+def equilibrium(model: NonlinearModel, twist: Array | None = None) -> Trim:
+    """What rest takes under the model's disturbance; a rotor that would have to pull stands still.
 
     Args:
-        model: with its disturbance in the world frame.
-        yaw: of the axes [rad].
-
-    Returns:
-        State (n,) and inputs (4,) [rad/s]; a rotor that would have to pull stands still.
+        model: the model, `twisted` where it is.
+        twist: by what.
     """
-    a_x, a_y, a_z = model.acceleration
-    cosine, sine = math.cos(yaw), math.sin(yaw)
-    forward, left = -cosine * a_x - sine * a_y, sine * a_x - cosine * a_y
+    a_x, a_y, a_z = model.acceleration.tolist()
     up = max(model.gravity - a_z, LEAST_LIFT * model.gravity)
-    thrust = math.sqrt(forward**2 + left**2 + up**2)
+    thrust = math.hypot(a_x, a_y, up)
     drive = np.concatenate([[thrust], -model.angular_acceleration])
     speeds = np.sqrt(np.maximum(np.linalg.solve(model.effectiveness, drive), 0.0))
-    state = np.zeros(model.n)
-    state[INDEX["roll"]] = -math.asin(left / thrust)
-    state[INDEX["pitch"]] = math.atan2(forward, up)
-    state[N_STATES:] = speeds[: model.n - N_STATES]
-    return state, speeds
+    return Trim(speeds=speeds, lift=np.array([-a_x, -a_y, up]), twist=np.zeros(3) if twist is None else twist)

@@ -9,7 +9,11 @@ Each period, the first of these that can be had:
 3. descent: the same, sinking at a steady speed, once level 2 has lasted too long.
 
 The inner controller is asked again in every period in which the state is known, so that recovery is automatic.  It is
-told the command in force each time, so that its own bounds on steps refer to what acts, whoever commanded it.
+told the command in force each time, so that its own bounds on steps refer to what acts, whoever commanded it, and which
+channels of the state are predicted rather than measured (`mpc.reckoning.Reckoned`).
+
+One that estimates what disturbs the vehicle says what holds it at rest by an attribute `trim` (`mpc.equilibrium.Trim`).
+Levels 1 to 3, and predictions of what is not measured, start from it; it stays as it was while nothing is measured.
 """
 
 from __future__ import annotations
@@ -22,10 +26,11 @@ from typing import Final
 import numpy as np
 
 from mpc.actuators import BOUND_TOLERANCE, ActuatorBounds
+from mpc.equilibrium import Trim
+from mpc.heading import anchored, predict_in_heading_frame
 from mpc.hover import HoverLaw
 from mpc.model import LinearModel
-from mpc.prediction import rollout
-from mpc.reckoning import PLAUSIBLE, DeadReckoning
+from mpc.reckoning import PLAUSIBLE, DeadReckoning, Reckoned
 from quadsim.controller import ACCEPTED, GROUNDED, Command, Controller, Moment, Phase, check_command, stopped
 from quadsim.errors import FlightError, ParameterError
 from quadsim.state import EULER, EULER_RATE, INDEX, N_STATES, POSITION, REFERENCE_STATES, VELOCITY, Array
@@ -129,6 +134,7 @@ class Guarded:
         self._model, self._bounds, self._settings, self._failures = model, bounds, settings, failures
         self._distance = settings.distance
         self._reckoning = DeadReckoning(model)
+        self._level = Trim(speeds=model.u_bar, lift=np.array([0.0, 0.0, 1.0]))
         self._good: _Good | None
         self._foreseen: Array | None
         self._target: Array | None
@@ -164,8 +170,9 @@ class Guarded:
         to their lowest speed as fast as the bounds allow.
         """
         acting = self._before if now.acting is None or check_command(now.acting) is not None else now.acting
-        known = self._reckoning.complete(state, acting, free=now.phase is Phase.FLYING)
-        status, answer = self._ask(replace(now, acting=acting.copy()), known, reference)
+        known = self._reckoning.complete(state, acting, self.trim, free=now.phase is Phase.FLYING)
+        told = Reckoned(**{**vars(now), "acting": acting.copy(), "unseen": self._reckoning.unseen.copy()})
+        status, answer = self._ask(told, known, reference)
         if now.phase in GROUNDED:
             self._forget()
             command = stopped(self._bounds.reach(acting)[0], self.horizon, now.phase)
@@ -178,6 +185,16 @@ class Guarded:
         self._before = command.speeds.copy()
         return command
 
+    @property
+    def trim(self) -> Trim:
+        """What holds the vehicle at rest, as the inner controller believes; level hover where it does not say."""
+        try:
+            trim = getattr(self.inner, "trim", None)
+        except self._failures as error:
+            _raise_mistake(error)
+            trim = None
+        return trim if isinstance(trim, Trim) else self._level
+
     def predict(self, states: Array, plans: Array) -> Array:
         """See `quadsim.controller.Controller.predict`; by the hover model where the inner controller cannot."""
         try:
@@ -187,14 +204,14 @@ class Guarded:
         else:
             if np.shape(predicted) == (*plans.shape[:2], N_STATES):
                 return predicted
-        return rollout(self._model, states, plans)
+        return predict_in_heading_frame(anchored(self._model, self.trim), states, plans, self.trim)
 
     def _forget(self) -> None:
         """Leave every fallback level."""
         self._good, self._foreseen, self._age = None, None, 0
         self._target, self._hovered = None, 0
 
-    def _ask(self, now: Moment, known: Array, reference: Array) -> tuple[str, Command | None]:
+    def _ask(self, now: Reckoned, known: Array, reference: Array) -> tuple[str, Command | None]:
         """The inner controller's answer where one was given, and its status: an accepted one is good to fly."""
         assert now.acting is not None
         if self._model.period * float(self._reckoning.unseen.max()) > self._settings.unseen:
@@ -267,7 +284,8 @@ class Guarded:
             self._target[INDEX["vz"]] = -settings.sink
             self._target[z] -= settings.sink * period
         self._hovered += 1
-        return self.law.plan(known, self._target, acting, self._bounds, self.horizon), 3 if sinking else 2
+        plan = self.law.plan(known, self._target, acting, self._bounds, self.horizon, self.trim)
+        return plan, 3 if sinking else 2
 
 
 def _raise_mistake(error: Exception) -> None:

@@ -1,33 +1,77 @@
-"""Axes turned by the heading: at hover the vehicle moves alike for any yaw, and the model at zero yaw holds there."""
+"""Axes turned by the heading: at hover the vehicle moves alike for any yaw, and the model at zero yaw holds there.
+
+It is anchored where the vehicle rests, (x_s, u_s) of `mpc.equilibrium`: in axes turned by the yaw
+
+    x(k+1) = x_s + A (x(k) - x_s) + B (u(k) - u_s).
+"""
 
 from __future__ import annotations
 
+from dataclasses import replace
+from typing import Final
+
 import numpy as np
 
+from mpc.equilibrium import Trim
 from mpc.model import LinearModel
 from mpc.prediction import rollout
-from quadsim.state import INDEX, Array
+from quadsim.state import INDEX, N_STATES, Array
+
+_YAW: Final = INDEX["yaw"]
+_ACCELERATED: Final = [INDEX[name] for name in ("vz", "roll_rate", "pitch_rate", "yaw_rate")]
 
 
 def turn_horizontally(states: Array, angles: Array) -> Array:
-    """States (..., n) whose horizontal positions and velocities are turned by `angles` (...,) [rad] about world z."""
+    """States (..., n), positions and velocities turned about world z by angles [rad] that broadcast to (...,)."""
     turned = np.array(states, float)
-    cosine, sine = np.cos(angles), np.sin(angles)
-    for x, y in (("x", "y"), ("vx", "vy")):
-        i, j = INDEX[x], INDEX[y]
-        turned[..., i] = cosine * states[..., i] - sine * states[..., j]
-        turned[..., j] = sine * states[..., i] + cosine * states[..., j]
+    cosine, sine = np.cos(angles)[..., None], np.sin(angles)[..., None]
+    along, across = states[..., 0:2], states[..., 2:4]  # x and vx, y and vy
+    turned[..., 0:2] = cosine * along - sine * across
+    turned[..., 2:4] = sine * along + cosine * across
     return turned
 
 
-def predict_in_heading_frame(model: LinearModel, states: Array, plans: Array) -> Array:
+def turn(yaw: float) -> Array:
+    """(12, 12) matrix T that turns positions and velocities by a yaw [rad]: from the heading frame to the world's."""
+    return turn_horizontally(np.eye(N_STATES), np.array(yaw)).T
+
+
+def slope(model: LinearModel) -> Array:
+    """(4, 4) accelerations along z and about x, y, z per rotor speed [(m/s^2)/(rad/s)], [1/s]."""
+    # Rates and vz integrate accelerations alone, so that their rows of B are the period times the slope.
+    accelerations: Array = model.B[_ACCELERATED] / model.period
+    return accelerations
+
+
+def anchored(model: LinearModel, trim: Trim) -> LinearModel:
+    """The hover model linearised at the trim's speeds, as thrust goes with their squares, with what thrust twists."""
+    B = model.B * (trim.speeds / model.u_bar)
+    if trim.twist.any():
+        there = slope(model)
+        brought = np.outer(np.append(0.0, trim.twist), there[0] * (trim.speeds / model.u_bar))
+        B += model.B @ np.linalg.solve(there, brought)
+    return replace(model, B=B, u_bar=trim.speeds)
+
+
+def predict_in_heading_frame(model: LinearModel, states: Array, plans: Array, trim: Trim | None = None) -> Array:
     """Predicted states (K, N, 12) of the linear model turned by each measured yaw.
 
     Args:
-        model: at zero yaw.
+        model: at zero yaw; as at hover, or `anchored`.
         states: (K, 12).
         plans: (K, N, 4) [rad/s].
+        trim: where it is anchored; at level hover where absent.
     """
-    yaws = states[:, INDEX["yaw"]]
-    predicted = rollout(model, turn_horizontally(states, -yaws), plans)
-    return turn_horizontally(predicted, np.broadcast_to(yaws[:, None], predicted.shape[:2]))
+    yaws = states[:, _YAW]
+    seen = turn_horizontally(states, -yaws)
+    if trim is None:
+        predicted = rollout(model, seen, plans)
+    else:
+        rest = np.array([trim.state(yaw) for yaw in yaws.tolist()])
+        predicted = rollout(replace(model, u_bar=trim.speeds), seen - rest, plans) + rest[:, None]
+    return turn_horizontally(predicted, yaws[:, None])
+
+
+def advance(model: LinearModel, state: Array, speeds: Array, trim: Trim) -> Array:
+    """The state (12,) a period later under speeds (4,) [rad/s], by the anchored model in the heading frame."""
+    return predict_in_heading_frame(anchored(model, trim), state[None], speeds[None, None], trim)[0, 0]

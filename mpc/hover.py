@@ -5,10 +5,11 @@ yaw holds for any yaw.  Weights are those of Bryson's rule (Bryson and Ho, "Appl
 one over the square of the largest acceptable value, on states and on the *accelerations* that inputs make, not on rotor
 speeds: the closed loop is then the same for every vehicle.
 
-    acceleration = -K (xi - xi_target)    u = u_feedforward + S^-1 acceleration
+    acceleration = -K (xi - xi_target)    u = u_s + S^-1 acceleration
 
-S takes rotor speeds to accelerations along z and about x, y, z.  K acts on horizontal errors through the tilt that it
-asks for, tilt* = -(k_p e_p + k_v e_v) / k_tilt, which is bounded here: exactly the LQR within the bound, and no more
+u_s holds the vehicle at rest against what is known to disturb it; see `mpc.equilibrium.Trim`.  S takes rotor speeds to
+accelerations along z and about x, y, z.  K acts on horizontal errors through the tilt that it asks for, beside that at
+rest, tilt* = -(k_p e_p + k_v e_v) / k_tilt.  The sum is bounded here: exactly the LQR within the bound, and no more
 tilt than that beyond.
 """
 
@@ -21,6 +22,8 @@ import numpy as np
 import scipy.linalg
 
 from mpc.actuators import ActuatorBounds
+from mpc.equilibrium import Trim
+from mpc.heading import anchored, slope, turn_horizontally
 from mpc.model import LinearModel
 from quadsim.errors import ParameterError
 from quadsim.state import EULER, EULER_RATE, INDEX, N_STATES, POSITION, VELOCITY, Array, read_only
@@ -37,11 +40,13 @@ ACCEPTABLE_RATE: Final = 1.0
 ACCEPTABLE_ACCELERATION: Final = (2.0, 8.0, 8.0, 2.0)
 """Along z [m/s^2], about x, y and z [rad/s^2]."""
 LARGEST_CLIMB: Final = 2.0
-"""Acceleration along z [m/s^2] beyond which height does not pull: rotors keep the range that levels the vehicle."""
+"""Acceleration along z [m/s^2], beside what rest takes, beyond which height does not pull: rotors keep the range that
+levels the vehicle."""
 LARGEST_TURN: Final = 2.0
 """The same of yaw [rad/s^2]."""
 
-_ACCELERATED: Final = [INDEX[name] for name in ("vz", "roll_rate", "pitch_rate", "yaw_rate")]
+_POSITION: Final = list(POSITION)
+_VELOCITY: Final = list(VELOCITY)
 _SIDEWAYS: Final = [INDEX[name] for name in ("x", "vx", "y", "vy")]
 _TILTS: Final = [INDEX["roll"], INDEX["pitch"]]
 _ROLL_PITCH: Final = [1, 2]
@@ -59,29 +64,13 @@ def require_quadrotor(model: LinearModel) -> None:
         raise ParameterError("controller", "model", f"{model.n} states and {model.nu} inputs", rule)
 
 
-def turn(yaw: float) -> Array:
-    """(12, 12) matrix T that turns positions and velocities by a yaw [rad]: from the heading frame to the world's."""
-    T = np.eye(N_STATES)
-    cosine, sine = math.cos(yaw), math.sin(yaw)
-    for x, y in ((INDEX["x"], INDEX["y"]), (INDEX["vx"], INDEX["vy"])):
-        T[x, x] = T[y, y] = cosine
-        T[x, y], T[y, x] = -sine, sine
-    return T
-
-
-def advance(model: LinearModel, state: Array, speeds: Array) -> Array:
-    """The state (12,) a period later, by the hover model T A T' xi + T B (u - u_bar) in the heading frame."""
-    T = turn(float(state[INDEX["yaw"]]))
-    return T @ (model.A @ (T.T @ state) + model.B @ (speeds - model.u_bar))
-
-
 class HoverLaw:
     """The LQR of hover, set up once.
 
     Attributes:
         model: the hover model.
         gain: (4, 12) K, from errors in the heading frame to accelerations.
-        slope: (4, 4) S, accelerations per rotor speed [(m/s^2)/(rad/s)], [1/s].
+        slope: (4, 4) S; see `mpc.heading.slope`.
         tilt: largest roll and pitch asked for together [rad].
 
     Args:
@@ -97,8 +86,7 @@ class HoverLaw:
         if not 0.0 < tilt < 0.5 * math.pi:
             raise ParameterError("controller", "tilt", tilt, "between 0 and pi/2 rad")
         self.model, self.tilt = model, tilt
-        # Rates and vz integrate accelerations alone, so that their rows of B are the period times the slope.
-        self.slope = read_only(model.B[_ACCELERATED] / model.period)
+        self.slope = read_only(slope(model))
         self._inverse = np.linalg.inv(self.slope)
         acceptable = np.empty(N_STATES)
         for group, size in (
@@ -116,37 +104,48 @@ class HoverLaw:
         self._lean = np.linalg.solve(rows[:, _TILTS], rows[:, _SIDEWAYS])
 
     def correction(self, error: Array, yaw: float) -> Array:
-        """What to add to the rotor speeds (4,) [rad/s].
+        """What to add to the rotor speeds (4,) [rad/s] to come closer to a state that the vehicle moves through.
 
         Args:
             error: (12,) measured minus wanted state.
             yaw: measured [rad].
         """
-        error = turn(yaw).T @ error
-        lean = -self._lean @ error[_SIDEWAYS]
-        lean *= min(1.0, self.tilt / max(float(np.hypot(*lean)), self.tilt))
-        error[_SIDEWAYS] = 0.0
-        error[_TILTS] -= lean
-        acceleration = -self.gain @ error
-        acceleration[0] = np.clip(acceleration[0], -LARGEST_CLIMB, LARGEST_CLIMB)
-        acceleration[3] = np.clip(acceleration[3], -LARGEST_TURN, LARGEST_TURN)
-        return self._inverse @ acceleration
+        return self._inverse @ self._acceleration(turn_horizontally(error, np.array(-yaw)), np.zeros(2))
 
-    def plan(self, state: Array, target: Array, before: Array, bounds: ActuatorBounds, horizon: int) -> Array:
-        """The speeds (N, 4) [rad/s] of the next periods, as the model foresees them.
+    def plan(
+        self, state: Array, target: Array, before: Array, bounds: ActuatorBounds, horizon: int, trim: Trim
+    ) -> Array:
+        """The speeds (N, 4) [rad/s] of the next periods, as the model foresees them, turned by the present yaw.
 
         Args:
             state: (12,) now.
-            target: (12,) wanted now; its velocity moves it on.
+            target: (12,) wanted now, level; its velocity moves it on.
             before: (4,) command in force [rad/s].
             bounds: that the speeds keep.
             horizon: N.
+            trim: what holds the vehicle at rest.
         """
+        model, yaw = anchored(self.model, trim), float(state[INDEX["yaw"]])
+        A, B = model.A, model.B
+        rest = trim.state(yaw)
+        drift = rest - A @ rest - B @ trim.speeds
+        state, target = turn_horizontally(np.array([state, target]), np.array(-yaw))
         plan = np.empty((horizon, N_ROTORS))
-        target = target.copy()
         for i in range(horizon):
-            wanted = self.model.u_bar + self.correction(state - target, float(state[INDEX["yaw"]]))
+            wanted = trim.speeds + self._inverse @ self._acceleration(state - target, rest[_TILTS])
             plan[i] = before = bounds.clip(wanted, before)
-            state = advance(self.model, state, before)
-            target[list(POSITION)] += self.model.period * target[list(VELOCITY)]
+            state = A @ state + B @ before + drift
+            target[_POSITION] += self.model.period * target[_VELOCITY]
         return plan
+
+    def _acceleration(self, error: Array, rest: Array) -> Array:
+        """-K error (4,) in the heading frame, within its limits; roll and pitch (2,) at rest belong to no error."""
+        lean = rest - self._lean @ error[_SIDEWAYS]
+        lean *= min(1.0, self.tilt / max(math.hypot(*lean), self.tilt))
+        error = error.copy()
+        error[_SIDEWAYS] = 0.0
+        error[_TILTS] -= lean
+        acceleration: Array = -self.gain @ error
+        acceleration[0] = min(max(acceleration[0], -LARGEST_CLIMB), LARGEST_CLIMB)
+        acceleration[3] = min(max(acceleration[3], -LARGEST_TURN), LARGEST_TURN)
+        return acceleration

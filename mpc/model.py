@@ -42,11 +42,15 @@ class LinearModel:
         return self.B.shape[1]
 
 
-def continuous_model(vehicle: Vehicle) -> tuple[Array, Array]:
+def continuous_model(vehicle: Vehicle, rotor_lag: float = 0.0) -> tuple[Array, Array]:
     """Jacobians (A_c, B_c) of the nonlinear model of Sec. 2.2 at hover with zero yaw.
 
+    Args:
+        vehicle: the numbers.
+        rotor_lag: T of dw/dt = (u - w) / T [s], whose rotor speeds w are four more states; 0 for none.
+
     Returns:
-        (12, 12) and (12, 4): d(xi)/dt = A_c (xi - xi_bar) + B_c (u - u_bar).
+        (12, 12) and (12, 4): d(xi)/dt = A_c (xi - xi_bar) + B_c (u - u_bar); with lag (16, 16) and (16, 4).
     """
     A, B = np.zeros((N_STATES, N_STATES)), np.zeros((N_STATES, N_ROTORS))
     for name in ("x", "y", "z", "roll", "pitch", "yaw"):
@@ -57,7 +61,10 @@ def continuous_model(vehicle: Vehicle) -> tuple[Array, Array]:
     wrench_slope = 2.0 * vehicle.hover_speed * vehicle.allocation
     resistance = np.array([vehicle.mass, *vehicle.inertia])
     B[[INDEX[name] for name in ("vz", "roll_rate", "pitch_rate", "yaw_rate")]] = wrench_slope / resistance[:, None]
-    return A, B
+    if rotor_lag == 0.0:
+        return A, B
+    follow = np.eye(N_ROTORS) / rotor_lag
+    return np.block([[A, B], [np.zeros((N_ROTORS, N_STATES)), -follow]]), np.vstack([np.zeros_like(B), follow])
 
 
 def discretise(A_c: Array, B_c: Array, period: float) -> tuple[Array, Array]:

@@ -1,7 +1,9 @@
 """What the model does not explain: a force and a torque, estimated from how the vehicle moved.
 
-Each of the three velocities and three body rates has a scalar disturbance of its own, an acceleration d that stays as
-it is but for a random walk,
+Forces act along world x and y, and along the thrust axis: another mass, worn rotors or thinner air change what thrust
+does, wherever it points.  Torques about the body's axes are proportional to thrust, as those of a worn rotor or of an
+offset centre of mass are.  Each of these three velocities and of the three body rates has a scalar disturbance of its
+own, an acceleration d that stays as it is but for a random walk,
 
     v(k+1) = v(k) + model + tau_s d(k) + w_v,    d(k+1) = d(k) + w_d,    measured: v(k) + noise,
 
@@ -23,6 +25,9 @@ from quadsim.errors import ParameterError
 from quadsim.state import EULER, EULER_RATE, VELOCITY, Array, euler_to_body_rates
 
 _VELOCITY: Final = list(VELOCITY)
+_EULER: Final = list(EULER)
+_UPRIGHT: Final = 0.1
+"""Smallest vertical part of the thrust axis by which a change of vertical speed is told to be thrust's."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -31,8 +36,7 @@ class ObserverSettings:
 
     Only ratios matter.  At a period of 50 ms the defaults have nine tenths of a step of the force within 2.4 s and of
     the torque within 1.25 s: well below the bandwidth of the loop, so that rotors which lag otherwise than stated do
-    not make the two fight.  With them and a move weight of 10 or more, the paper's course is flown with 100 ms of lag
-    where 50 ms are stated; with that of 10 and a torque_walk of 0.35, it is lost.
+    not make the two fight.
 
     Attributes:
         velocity_noise: of a measured velocity [m/s].
@@ -101,13 +105,25 @@ class DisturbanceObserver:
     def reset(self) -> None:
         """Forget: nothing disturbs."""
         self.estimate = np.zeros(6)
-        """(6,) acceleration, world [m/s^2], and angular acceleration, body [rad/s^2]."""
+        """(6,) acceleration along world x and y and along thrust [m/s^2], and angular acceleration, body, while thrust
+        holds the weight [rad/s^2]."""
 
     def update(self, measured: Array, predicted: Array) -> None:
         """Take note of a measured state (12,) and of what was predicted for it (12,), disturbances included."""
-        surprise = np.concatenate([(measured - predicted)[_VELOCITY], _body_rates(measured) - _body_rates(predicted)])
+        velocity = (measured - predicted)[_VELOCITY]
+        along = velocity[2] / max(thrust_axis(measured)[2], _UPRIGHT)
+        velocity = np.append(velocity[:2] - along * thrust_axis(measured)[:2], along)
+        surprise = np.concatenate([velocity, _body_rates(measured) - _body_rates(predicted)])
         self.estimate = np.clip(self.estimate + self._gain * surprise, -self._largest, self._largest)
 
 
+def thrust_axis(state: Array) -> Array:
+    """(3,) unit vector along which rotors push, in the world frame, of a state (12,)."""
+    roll, pitch, yaw = state[_EULER].tolist()
+    ahead, left = math.cos(roll) * math.sin(pitch), -math.sin(roll)
+    cosine, sine = math.cos(yaw), math.sin(yaw)
+    return np.array([cosine * ahead - sine * left, sine * ahead + cosine * left, math.cos(roll) * math.cos(pitch)])
+
+
 def _body_rates(state: Array) -> Array:
-    return euler_to_body_rates(state[list(EULER)], state[list(EULER_RATE)])
+    return euler_to_body_rates(state[_EULER], state[list(EULER_RATE)])

@@ -1,7 +1,8 @@
 """Dead reckoning: a whole state from one whose measured channels are partly missing.
 
 A channel that is not finite, beyond all plausibility, or frozen is missing.  Its place takes its conditional mean,
-given the channels that are there: the hover model predicts the state under the command in force, and a Kalman filter
+given the channels that are there: the hover model, anchored where the vehicle rests for all that is known
+(`mpc.equilibrium`), predicts the state under the command in force, and a Kalman filter
 whose only measurements are the remaining channels corrects it (Simon, "Optimal State Estimation", 2006, Sec. 5.1; the
 process noise is an acceleration, constant over a period and white from one to the next, Bar-Shalom, Li and Kirubarajan,
 "Estimation with Applications to Tracking and Navigation", 2001, Sec. 6.3.2).  Channels that are there are passed on as
@@ -13,13 +14,17 @@ left them.  The numbers of a sensor slower than the controller are so between it
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mpc.hover import advance, require_quadrotor, turn
+from mpc.equilibrium import Trim
+from mpc.heading import advance, turn
+from mpc.hover import require_quadrotor
 from mpc.model import LinearModel
+from quadsim.controller import Moment
 from quadsim.state import (
     EULER,
     EULER_RATE,
@@ -47,7 +52,7 @@ def _by_group(values: tuple[float, float, float, float]) -> Array:
     return read_only(channels)
 
 
-PLAUSIBLE: Final = _by_group((1e5, 1e3, 1e3, 1e3))
+PLAUSIBLE: Final = _by_group((1e5, 1e3, 1e5, 1e3))
 """Largest magnitudes taken for a measurement [m, m/s, rad, rad/s]; a yaw counts its turns."""
 UNMOVED: Final = _by_group((1e-3, 5e-3, 1e-3, 2e-2))
 """Distance of the prediction from numbers repeated to the last bit from which on they are frozen [same]."""
@@ -57,6 +62,17 @@ ACCELERATION: Final = (1.0, 2.0)
 """Standard deviations of what the model leaves out [m/s^2, rad/s^2]."""
 UNKNOWN: Final = _by_group((100.0, 10.0, 1.0, 1.0))
 """Standard deviations before anything was measured [m, m/s, rad, rad/s]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Reckoned(Moment):
+    """A moment whose state may in part be predicted rather than measured.
+
+    Attributes:
+        unseen: (12,) periods since each channel was measured; 0 for one that is.
+    """
+
+    unseen: Array
 
 
 class DeadReckoning:
@@ -87,12 +103,13 @@ class DeadReckoning:
         self._last_body_rates = np.full(3, np.nan)
         self.unseen = np.full(N_STATES, np.inf)
 
-    def complete(self, measured: Array, acting: Array, *, free: bool = True) -> Array:
+    def complete(self, measured: Array, acting: Array, trim: Trim, *, free: bool = True) -> Array:
         """The whole state (12,) now.
 
         Args:
             measured: (12,) what was measured, in part perhaps not finite; of another shape, nothing was.
             acting: (4,) rotor speeds in force since the last state [rad/s].
+            trim: what holds the vehicle at rest.
             free: whether the vehicle flies, so that the model tells how it moves; nothing counts as frozen else.
         """
         if np.shape(measured) != (N_STATES,):
@@ -101,7 +118,7 @@ class DeadReckoning:
         repeated = self._repeats(measured, seen)
         if seen.all() and not (free and repeated.any()):
             return self._take(measured)
-        predicted = advance(self._model, self._state, acting)
+        predicted = advance(self._model, self._state, acting, trim)
         if free:
             distant = np.abs(predicted - measured) > UNMOVED
             for group in _GROUPS:

@@ -19,28 +19,33 @@ from typing import Final
 import numpy as np
 
 from mpc.actuators import BOUND_TOLERANCE, ActuatorBounds
-from mpc.equilibrium import equilibrium
-from mpc.heading import predict_in_heading_frame, turn_horizontally
+from mpc.equilibrium import Trim, equilibrium, twisted
+from mpc.heading import anchored, predict_in_heading_frame, slope, turn_horizontally
 from mpc.linearise import linearise
 from mpc.model import continuous_model, discretise, hover_model
 from mpc.nonlinear import NonlinearModel, advance, nonlinear_model
-from mpc.observer import DisturbanceObserver
+from mpc.observer import DisturbanceObserver, thrust_axis
 from mpc.observer import ObserverSettings as ObserverSettings
 from mpc.problem import Bounds, Objective
 from mpc.qp import Solution
-from mpc.reckoning import PLAUSIBLE
+from mpc.reckoning import PLAUSIBLE, Reckoned
 from mpc.robust_settings import Linearisation as Linearisation
 from mpc.robust_settings import RobustSettings as RobustSettings
 from mpc.stagewise import StagewiseAnswer, StagewiseQP
 from quadsim.controller import GROUNDED, SOLVED, Command, Moment, Phase, stopped
 from quadsim.errors import ParameterError
-from quadsim.state import INDEX, N_STATES, REFERENCE_STATES, Array
+from quadsim.state import EULER, EULER_RATE, INDEX, N_STATES, REFERENCE_STATES, VELOCITY, Array
 from quadsim.vehicle import N_ROTORS, Vehicle
 
 TOLERANCE: Final = 1e-8
 """PIQP's own.  A tenth of it, as for the paper's QP, takes three of twenty iterations more where tilt is at its bound,
 and on the paper's course changes no command by more than 1e-4 rad/s."""
+LONGEST_SPAN: Final = 0.25
+"""Longest time between two measured states [s] for their difference to tell of a disturbance; a sensor of 4 Hz."""
+_SAME_TIME: Final = 1e-6
+"""[s]"""
 _YAW: Final = INDEX["yaw"]
+_MOVING: Final = [*VELOCITY, *EULER, *EULER_RATE]
 _REFERENCE: Final = list(REFERENCE_STATES)
 
 
@@ -49,6 +54,9 @@ class RobustMPC:
 
     It keeps no plan for bad times: what is not solved is said so by the status, with the command in force, for
     `mpc.fallback.Guarded` to act on.
+
+    Attributes:
+        trim: what holds the vehicle at rest against the disturbance that is estimated.
 
     Args:
         vehicle: what is believed to fly.
@@ -80,10 +88,9 @@ class RobustMPC:
         self.settings, self.horizon, self._period = settings, horizon, period
         self._nominal = hover_model(vehicle, period)
         self._model = nonlinear_model(vehicle, period, rotor_lag=settings.rotor_lag or None)
+        self._inverse = np.linalg.inv(slope(self._nominal))
         self._objective = objective
-        self._actuators = ActuatorBounds(
-            u_min=bounds.u_min, u_max=bounds.u_max, delta_min=bounds.delta_min, delta_max=bounds.delta_max
-        )
+        self._actuators = ActuatorBounds.of(bounds)
         n = self._model.n
         self._qp = StagewiseQP(
             horizon,
@@ -107,32 +114,38 @@ class RobustMPC:
         # Rotor speeds and state at the instant from which this period's command acts, the delay after its beginning.
         self._rotors = self._acting.copy()
         self._ahead: Array | None = None
+        self._asked = self._measured = -math.inf
         self._plan: tuple[Array, Array] | None = None
-        if self._observer is not None:
-            self._observer.reset()
+        self._forget()
 
     @np.errstate(over="ignore", invalid="ignore", divide="ignore")  # numbers out of hand are refused, not warned of
     def step(self, now: Moment, state: Array, reference: Array) -> Command:
         """See `quadsim.controller.Controller.step`.
 
         Numbers that are not finite, not `mpc.reckoning.PLAUSIBLE`, or lead to such are answered with the status
-        `invalid_data`, and nothing is learned from them.
+        `invalid_data`, and nothing is learned from them.  Nor is anything from a state that is in part predicted
+        (`mpc.reckoning.Reckoned`), nor from the first measured one after more than `LONGEST_SPAN` of such, or after a
+        pause: `now.time` has to be a period later than last time.
         """
         if now.acting is not None:
             self._acting = np.array(now.acting, float)
         rest = self._period - self.settings.delay
-        ahead, before = self._ahead, self._rotors
+        ahead, before, asked = self._ahead, self._rotors, self._asked
         rotors = _spun(self._model, before, self._acting, rest)
         self._rotors = _spun(self._model, rotors, self._acting, self.settings.delay)
-        self._ahead = None
+        self._ahead, self._asked = None, now.time
         if now.phase in GROUNDED:
             return self._stop(now.phase)
         if not ((np.abs(state) <= PLAUSIBLE).all() and (np.abs(reference) <= PLAUSIBLE[_REFERENCE]).all()):
             return self._refuse("invalid_data")
-        if self._observer is not None and ahead is not None and now.phase is Phase.FLYING:
+        if ahead is None or abs(now.time - asked - self._period) > _SAME_TIME:
+            self._measured = -math.inf
+        span = self._span(now)
+        if self._observer is not None and ahead is not None and span <= LONGEST_SPAN and now.phase is Phase.FLYING:
             expected = self._after(rest, ahead, before)
             if np.isfinite(expected).all():
                 self._observer.update(state, expected)
+                self._believe()
         x0 = self._after(self.settings.delay, state, rotors)
         if not np.isfinite(x0).all():
             return self._refuse("invalid_data")
@@ -150,21 +163,57 @@ class RobustMPC:
     def predict(self, states: Array, plans: Array) -> Array:
         """See `quadsim.controller.Controller.predict`.
 
-        It is always the hover model that predicts, turned by each yaw: a plan flown without feedback may take the
-        nonlinear one past a pitch of 90 deg, where its Euler angles end.
+        It is always the hover model that predicts, turned by each yaw, with the disturbance estimated last: a plan
+        flown without feedback may take the nonlinear one past a pitch of 90 deg, where its Euler angles end.
         """
-        return predict_in_heading_frame(self._nominal, states, plans)
+        if self.settings.linearisation is Linearisation.HOVER:
+            return predict_in_heading_frame(self._nominal, states, plans, replace(self.trim, speeds=self._balanced()))
+        return predict_in_heading_frame(anchored(self._nominal, self.trim), states, plans, self.trim)
 
     @property
     def disturbance(self) -> Array:
-        """(6,) estimated acceleration, world [m/s^2], and angular acceleration, body [rad/s^2]."""
-        return np.zeros(6) if self._observer is None else self._observer.estimate.copy()
+        """(6,) estimated acceleration at rest, world [m/s^2], and angular acceleration, body [rad/s^2]."""
+        thrust = self._model.effectiveness[0] @ np.square(self.trim.speeds)
+        return np.concatenate([self._resting.acceleration, thrust * self.trim.twist])
+
+    def _forget(self) -> None:
+        """Believe in no disturbance."""
+        if self._observer is not None:
+            self._observer.reset()
+        self._believe()
+
+    def _believe(self) -> None:
+        """Rest against the disturbance that is estimated now."""
+        if self._observer is None:
+            self._twisted = self._resting = self._model
+            self.trim: Trim = equilibrium(self._model)
+            return
+        estimate = self._observer.estimate
+        twist = estimate[3:] / self._model.gravity
+        lift = np.array([-estimate[0], -estimate[1], self._model.gravity])
+        self._twisted = twisted(self._model, twist)
+        self._resting = self._disturbed(lift / math.hypot(*lift), self._period)
+        self.trim = equilibrium(self._resting, twist)
+
+    def _disturbed(self, axis: Array, period: float) -> NonlinearModel:
+        """The model of a period [s], disturbed as is estimated, with thrust along an axis (3,) of the world."""
+        if self._observer is None:
+            return replace(self._model, period=period)
+        acceleration = self._observer.estimate[2] * axis
+        acceleration[:2] += self._observer.estimate[:2]
+        return replace(self._twisted, acceleration=acceleration, period=period)
+
+    def _span(self, now: Moment) -> float:
+        """Time since the last measured state [s]; infinite after a pause, or where the present one is not measured."""
+        if isinstance(now, Reckoned) and now.unseen[_MOVING].any():
+            return math.inf
+        span, self._measured = now.time - self._measured, now.time
+        return span - _SAME_TIME
 
     def _stop(self, phase: Phase) -> Command:
         self._acting, _ = self._actuators.reach(self._acting)
         self._plan = None
-        if self._observer is not None:
-            self._observer.reset()
+        self._forget()
         return stopped(self._acting.copy(), self.horizon, phase)
 
     def _refuse(self, status: str, solution: Solution | None = None) -> Command:
@@ -189,13 +238,9 @@ class RobustMPC:
         """State (12,) some time [s] after a state (12,) with such rotor speeds (4,), under the command in force."""
         if time <= 1e-9:
             return state
-        model = replace(self._disturbed(self._model), period=time)
+        model = self._disturbed(thrust_axis(state), time)
         end = advance(model, np.concatenate([state, rotors])[: model.n], self._acting)
         return end[:N_STATES]
-
-    def _disturbed(self, model: NonlinearModel) -> NonlinearModel:
-        estimate = self.disturbance
-        return replace(model, acceleration=estimate[:3], angular_acceleration=estimate[3:])
 
     def _later(self, reference: Array) -> Array:
         """The reference (N, 4) at the instants that the prediction is for, the delay later."""
@@ -203,25 +248,34 @@ class RobustMPC:
         return reference + self.settings.delay / self._period * (later - reference)
 
     def _solve(self, x0: Array, reference: Array) -> StagewiseAnswer:
-        model, yaw = self._disturbed(self._model), float(x0[_YAW])
+        yaw = float(x0[_YAW])
         if self.settings.linearisation is not Linearisation.HOVER:
-            _, u_s = equilibrium(model)
             desired = self._objective.desired(_turning(reference, yaw, self.settings.largest_turn))
-            return self._qp.solve(*self._relinearised(model, x0), x0, desired, self._acting, u_s)
+            return self._qp.solve(*self._relinearised(x0), x0, desired, self._acting, self.trim.speeds)
         if not self.settings.heading:
             yaw = 0.0
         else:
             reference = _turning(reference, yaw, self.settings.largest_turn)
             x0 = turn_horizontally(x0, np.array(-yaw))
             x0[_YAW] = 0.0
-        x_s, u_s = equilibrium(model, yaw)
+        u_s = self._balanced()
+        x_s = self.trim.state(yaw, self._model.n)
+        x_s[N_STATES:] = u_s[: self._model.n - N_STATES]
         held, N = self._hover, self.horizon
         c = np.broadcast_to(x_s - held.A[0] @ x_s - held.B[0] @ u_s, (N, x_s.size))
         desired = self._objective.desired(_seen_from(reference, yaw))
         return self._qp.solve_prepared(held, c, x0, desired, self._acting, u_s)
 
-    def _relinearised(self, model: NonlinearModel, x0: Array) -> tuple[Array, Array, Array]:
+    def _balanced(self) -> Array:
+        """(4,) speeds at rest [rad/s] that also balance what thrust twists now, which the hover matrices leave out."""
+        thrust = self._model.effectiveness[0]
+        excess = thrust @ np.square(self._rotors) - thrust @ np.square(self.trim.speeds)
+        balanced: Array = self.trim.speeds - self._inverse[:, 1:] @ (excess * self.trim.twist)
+        return balanced
+
+    def _relinearised(self, x0: Array) -> tuple[Array, Array, Array]:
         """A (N, n, n), B (N, n, 4), c (N, n) of the predicted steps."""
+        model = self._disturbed(thrust_axis(x0), self._period)
         if self.settings.linearisation is Linearisation.STATE or self._plan is None:
             A, B, c = linearise(model, x0[None], self._acting[None])
             return np.repeat(A, self.horizon, 0), np.repeat(B, self.horizon, 0), np.repeat(c, self.horizon, 0)
@@ -249,12 +303,7 @@ def _command(plan: Array, status: str, solution: Solution, slack: float = 0.0) -
 
 def _hover_matrices(vehicle: Vehicle, model: NonlinearModel) -> tuple[Array, Array]:
     """A (n, n), B (n, 4) at hover with zero yaw: Eq. (1), or with d(w)/dt = (u - w) / tau_r between."""
-    A_c, B_c = continuous_model(vehicle)
-    if model.rotor_lag is not None:
-        follow = np.eye(N_ROTORS) / model.rotor_lag
-        A_c = np.block([[A_c, B_c], [np.zeros((N_ROTORS, N_STATES)), -follow]])
-        B_c = np.concatenate([np.zeros((N_STATES, N_ROTORS)), follow])
-    return discretise(A_c, B_c, model.period)
+    return discretise(*continuous_model(vehicle, model.rotor_lag or 0.0), model.period)
 
 
 def _spun(model: NonlinearModel, rotors: Array, command: Array, time: float) -> Array:

@@ -1,7 +1,9 @@
 """How far output bounds must be drawn in for a vehicle that is disturbed, and watched at every instant.
 
-Let the vehicle differ from its prediction by accelerations w of at most a stated size.  Following a plan with the
-correction -K e at each sample, the error e after i periods is bounded in each output by
+Let the vehicle differ from its prediction by accelerations w of at most a stated size.  Where the prediction holds an
+estimate of the disturbance, itself within the stated bounds, a disturbance that changes sign is w = 2 times these away
+from it, and that is what is counted then.  Following a plan with the correction -K e at each sample, the error e after
+i periods is bounded in each output by
 
     r_i = int_0^d |C e^(A_c s) E| w ds + sum_{j=0}^{i-1} int_0^tau |C (A - B K)^j e^(A_c (s + d)) E| w ds,
 
@@ -35,7 +37,7 @@ from mpc.model import continuous_model, discretise
 from mpc.problem import Bounds
 from quadsim.errors import ParameterError
 from quadsim.state import INDEX, N_STATES, Array, read_only
-from quadsim.vehicle import N_ROTORS, Vehicle
+from quadsim.vehicle import Vehicle
 
 LARGEST_SHARE: Final = 0.5
 """Of the room on either side of the middle of an output's bounds, no more is given up."""
@@ -43,6 +45,8 @@ ERROR_SHARE: Final = 0.1
 """Output error, as a share of that room, to which the correction answers..."""
 SPEED_SHARE: Final = 0.025
 """...with about this share of the hover speed (Bryson's rule; Bryson and Ho, 1975, "Applied Optimal Control")."""
+SHORTEST_LAG: Final = 1e-4
+"""Time constant of rotors [s] below which gains cannot be computed; far below any period."""
 
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(16)
 _ACCELERATED: Final = [INDEX[name] for name in ("vx", "vy", "vz", "roll_rate", "pitch_rate", "yaw_rate")]
@@ -52,17 +56,13 @@ _ACCELERATED: Final = [INDEX[name] for name in ("vx", "vy", "vz", "roll_rate", "
 class TighteningSettings:
     """Stated bounds, the same along and about each axis; what exceeds them is not answered for.
 
-    The defaults draw the paper's tilt of 5 deg in by 0.09 deg at first and 0.16 deg in the end; with rotors that lag by
-    50 ms it is 0.28 deg, and 0.33 deg with a delay of 50 ms.
-
-    What the prediction leaves out counts as well, but is small while the tilt is: 0.07 rad/s^2 over the paper's
-    course.  What the observer knows of a disturbance no longer counts, but a change of its estimate does.
+    What the prediction leaves out, as of tilted thrust or of rotors that lag otherwise, counts as a disturbance.
 
     Attributes:
         acceleration: of the disturbance, each component along the model's axes [m/s^2].
         angular_acceleration: of the disturbance, each component about them [rad/s^2].
-        turning: the largest d2y/dt2 of an output at its bound, [rad/s^2] of an angle; the paper's course has 1.5, and
-            inputs alone would allow far more.
+        turning: the largest d2y/dt2 of an output at its bound, [rad/s^2] of an angle; inputs alone would allow far
+            more.
     """
 
     acceleration: float = 0.5
@@ -85,6 +85,7 @@ def margins(
     settings: TighteningSettings,
     rotor_lag: float = 0.0,
     delay: float = 0.0,
+    estimated: bool = False,
 ) -> Array:
     """By how much the bounds of each output must be drawn in at each predicted state, (N, n_c) in its unit.
 
@@ -94,19 +95,23 @@ def margins(
         horizon: N.
         bounds: of outputs of the 12 states.
         settings: stated bounds.
-        rotor_lag: time constant that the prediction knows [s]; 0 for none.
+        rotor_lag: time constant that the prediction knows [s]; 0 for none, else at least `SHORTEST_LAG`.
         delay: d [s], between measuring and acting.
+        estimated: whether the prediction holds an estimate of the disturbance, which may be wrong by twice its bounds.
 
     Raises:
-        ParameterError: an output is bounded on one side only, or too narrowly for these disturbances.
+        ParameterError: an output is bounded on one side only, or too narrowly for these disturbances; or the lag is too
+            short.
     """
-    A, B, E = lagging_model(vehicle, rotor_lag)
+    if 0.0 < rotor_lag < SHORTEST_LAG:
+        raise ParameterError("controller", "rotor_lag", rotor_lag, f"0, or at least {SHORTEST_LAG:g} s")
+    A, B, E = disturbed_model(vehicle, rotor_lag)
     C = np.hstack([bounds.C_c, np.zeros((len(bounds.C_c), len(A) - N_STATES))])
     room = 0.5 * (bounds.y_max - bounds.y_min)
     if not np.isfinite(room).all():
         sides = np.stack([bounds.y_min, bounds.y_max]).tolist()
         raise ParameterError("controller", "output_bounds", sides, "finite on both sides, to be drawn in")
-    largest = np.repeat([settings.acceleration, settings.angular_acceleration], 3)
+    largest = (2.0 if estimated else 1.0) * np.repeat([settings.acceleration, settings.angular_acceleration], 3)
     basis = observed(A, C)
     A, B, C, E = basis.T @ A @ basis, basis.T @ B, C @ basis, basis.T @ E
     K = correction(*discretise(A, B, period), C / (ERROR_SHARE * room)[:, None], SPEED_SHARE * vehicle.hover_speed)
@@ -153,20 +158,15 @@ def growth(
     return np.asarray(unanswered + np.cumsum(terms, axis=0))
 
 
-def lagging_model(vehicle: Vehicle, rotor_lag: float) -> tuple[Array, Array, Array]:
+def disturbed_model(vehicle: Vehicle, rotor_lag: float) -> tuple[Array, Array, Array]:
     """(n, n), (n, 4) and (n, 6): dx/dt = A x + B u + E w at hover, of 12 states, or of 16 where rotors lag [s].
 
     w is acceleration along the axes and angular acceleration about them.
     """
-    A_c, B_c = continuous_model(vehicle)
-    E_c = np.zeros((N_STATES, len(_ACCELERATED)))
-    E_c[_ACCELERATED, range(len(_ACCELERATED))] = 1.0
-    if rotor_lag == 0.0:
-        return A_c, B_c, E_c
-    follow = np.eye(N_ROTORS) / rotor_lag
-    A = np.block([[A_c, B_c], [np.zeros((N_ROTORS, N_STATES)), -follow]])
-    B = np.vstack([np.zeros((N_STATES, N_ROTORS)), follow])
-    return A, B, np.vstack([E_c, np.zeros((N_ROTORS, len(_ACCELERATED)))])
+    A, B = continuous_model(vehicle, rotor_lag)
+    E = np.zeros((len(A), len(_ACCELERATED)))
+    E[_ACCELERATED, range(len(_ACCELERATED))] = 1.0
+    return A, B, E
 
 
 def observed(A: Array, C: Array) -> Array:

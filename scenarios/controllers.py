@@ -17,7 +17,7 @@ from mpc.problem import Bounds, Objective, Problem
 from mpc.robust import Linearisation, RobustMPC, RobustSettings
 from mpc.solvers import QPSolver
 from mpc.stagewise import Penalty
-from mpc.tightening import TighteningSettings, margins
+from mpc.tightening import SHORTEST_LAG, TighteningSettings, margins
 from mpc.unconstrained import UnconstrainedMPC
 from quadsim.controller import Controller
 from quadsim.errors import InputError, ParameterError
@@ -102,13 +102,10 @@ def guarded(law: Controller, spec: BoundedSpec, fallback: FallbackSpec, vehicle:
     """The law within the fallback contract; the law itself where that is switched off."""
     if not fallback.enabled:
         return law
-    bounds = make_bounds(spec)
     return Guarded(
         law,
         hover_model(vehicle, period),
-        bounds=ActuatorBounds(
-            u_min=bounds.u_min, u_max=bounds.u_max, delta_min=bounds.delta_min, delta_max=bounds.delta_max
-        ),
+        bounds=ActuatorBounds.of(make_bounds(spec)),
         settings=FallbackSettings(
             unseen=fallback.unseen,
             plan_age=fallback.plan_age,
@@ -160,6 +157,7 @@ def _robust(spec: RobustSpec, vehicle: Vehicle, period: float) -> RobustMPC:
             settings=TighteningSettings(**tightening.model_dump()),
             rotor_lag=rotor_lag,
             delay=spec.delay,
+            estimated=offset_free is not None,
         ),
     )
     return RobustMPC(
@@ -175,12 +173,11 @@ def _robust(spec: RobustSpec, vehicle: Vehicle, period: float) -> RobustMPC:
 def _baseline(spec: LQRSpec | PIDSpec | GeometricSpec, vehicle: Vehicle, period: float) -> Controller:
     # Late: these alone need scipy.optimize, which would delay the start of every command.
     from mpc.baselines.geometric import GeometricController, geometric_settings
-    from mpc.baselines.limits import InputBounds
     from mpc.baselines.lqr import LQR, LQRSettings, bryson_objective
     from mpc.baselines.pid import CascadedPID, pid_settings
 
     held = spec.input_bounds
-    bounds = InputBounds() if held is None else InputBounds(speed=_pair(held.speed), slew=_pair(held.slew))
+    bounds = None if held is None else ActuatorBounds.alike(_pair(held.speed), _pair(held.slew))
     if isinstance(spec, LQRSpec):
         objective = (
             make_objective(spec.output_weights, spec.input_weights)
@@ -213,6 +210,9 @@ def _rotor_lag(spec: RobustSpec, vehicle: Vehicle) -> float:
         return spec.rotor_lag
     if vehicle.rotor_rise is None:
         rule = f"a number of seconds where the vehicle has no rotor_rise, and {vehicle.name} has none"
+        raise ParameterError("controller", "rotor_lag", spec.rotor_lag, rule)
+    if 0.0 < vehicle.rotor_rise < SHORTEST_LAG:
+        rule = f"a number of seconds where the vehicle's rotor_rise is below {SHORTEST_LAG:g} s, as {vehicle.name}'s is"
         raise ParameterError("controller", "rotor_lag", spec.rotor_lag, rule)
     return vehicle.rotor_rise
 

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator
-from dataclasses import dataclass
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from functools import cache, partial
 from typing import Any, Final
 from unittest import mock
@@ -16,8 +17,11 @@ from mpc.fallback import Guarded
 from mpc.solvers import _piqp
 from quadsim.controller import SOLVED, Command, Controller, Moment
 from quadsim.flightlog import FlightLog
+from quadsim.physics import Stretch
+from quadsim.plant import Plant
 from quadsim.sensing import SensorName
 from quadsim.state import POSITION, Array
+from quadsim.vehicle import N_ROTORS, Vehicle
 from scenarios.bench.climbers import FULL, equip
 from scenarios.bench.processes import answer_all
 from scenarios.bench.rungs import CONDITIONS
@@ -25,16 +29,25 @@ from scenarios.build import build_controller, build_plant, build_problem, build_
 from scenarios.flying import fly_once
 from scenarios.loading import load_scenario
 from scenarios.navigation import build_navigation
+from scenarios.spec import Scenario
 
+PERIOD: Final = 0.05
+"""Of control [s]."""
 CONTROLLERS: Final = ("robust", "paper")
 """The full robust controller, and the paper's; both guarded."""
+DISTURBANCES: Final = ("mass +30 %", "mass -30 %", "worn rotor", "lag 50 ms")
+"""In which the robust controller meets faults, beside the nominal condition.  The paper's is lost in two of them."""
+EARLIEST: Final = {"worn rotor": 14.0}
+"""Instant from which on there are faults, where that is later than else [s]: one thing fails at a time."""
 NEAR: Final = 0.1
 """Distance from the flight without the fault that counts as back [m].  The reference is no measure: in the climb, at
 its bounds, the vehicle is metres behind it."""
 SOON: Final = 10.0
-"""Time from the fault's beginning in which the vehicle has to be back [s]."""
+"""Time from the fault's end in which the vehicle has to be back [s]."""
 AFTER: Final = 12.0
-"""Time flown from the fault's beginning [s]."""
+"""Time flown from the fault's end [s]."""
+LAST: Final = 60.0
+"""Time at which the paper's course ends [s]."""
 STATUSES: Final = tuple(sorted({*_piqp.STATUS.values()} - {SOLVED}))
 
 
@@ -44,45 +57,54 @@ class Fault:
 
     Attributes:
         name: what it is.
+        duration: from its beginning to its end [s].
         statuses: what the solver answers, period by period, instead of its optimum; all it gives is NaN then.
         events: entries of the scenario's events, but for their time; as TOML.
     """
 
     name: str
+    duration: float
     statuses: tuple[str, ...] = ()
     events: tuple[str, ...] = ()
+
+
+def failing(name: str, statuses: Sequence[str]) -> Fault:
+    """The solver answers these in successive periods."""
+    return Fault(name=f"solver: {name}", duration=PERIOD * len(statuses), statuses=tuple(statuses))
 
 
 def faults() -> tuple[Fault, ...]:
     """Each status of PIQP, ten failures on end, a stall, NaN in each measured number, frozen sensors, all at once."""
 
-    def sensed(sensor: str, kind: str, duration: float) -> str:
-        return f"type='sensor_fault', sensor='{sensor}', fault='{kind}', duration={duration}"
+    def sensed(name: str, kind: str, duration: float, sensors: Sequence[str], axis: str = "") -> Fault:
+        what = f"fault='{kind}', duration={duration}" + (f", axes=['{axis}']" if axis else "")
+        events = tuple(f"type='sensor_fault', sensor='{sensor}', {what}" for sensor in sensors)
+        return Fault(name=f"{name} for {duration:g} s", duration=duration, events=events)
 
     return (
-        *(Fault(name=f"solver: {status}", statuses=(status,)) for status in STATUSES),
-        Fault(name="solver: 10 failures on end", statuses=("numerics",) * 10),
-        Fault(name="computer: stalls for 100 ms", events=("type='stall', duration=0.1",)),
-        *(
-            Fault(name=f"{sensor} {axis}: NaN for 1 s", events=(f"{sensed(sensor, 'nan', 1.0)}, axes=['{axis}']",))
-            for sensor in SensorName
-            for axis in "xyz"
-        ),
-        *(Fault(name=f"{sensor}: frozen for 0.5 s", events=(sensed(sensor, "freeze", 0.5),)) for sensor in SensorName),
-        *(
-            Fault(name=f"all sensors: {what}", events=tuple(sensed(sensor, kind, duration) for sensor in SensorName))
-            for what, kind, duration in (("NaN for 1 s", "nan", 1.0), ("frozen for 0.5 s", "freeze", 0.5))
-        ),
+        *(failing(status, (status,)) for status in STATUSES),
+        failing("10 failures on end", ("numerics",) * 10),
+        Fault(name="computer: stalls for 100 ms", duration=0.1, events=("type='stall', duration=0.1",)),
+        *(sensed(f"{sensor} {axis}: NaN", "nan", 1.0, (sensor,), axis) for sensor in SensorName for axis in "xyz"),
+        *(sensed(f"{sensor}: frozen", "freeze", 0.5, (sensor,)) for sensor in SensorName),
+        sensed("all sensors: NaN", "nan", 1.0, tuple(SensorName)),
+        sensed("all sensors: frozen", "freeze", 0.5, tuple(SensorName)),
     )
 
 
 @dataclass(frozen=True, kw_only=True)
 class Injection:
-    """A fault in a flight: of which controller, and when [s]."""
+    """A fault in a flight: of which controller, when [s], and under which of `scenarios.bench.rungs.CONDITIONS`."""
 
     controller: str
     fault: Fault
     start: float
+    condition: str = "nominal"
+
+    @property
+    def stop(self) -> float:
+        """The fault's end [s]."""
+        return self.start + self.fault.duration
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -92,11 +114,11 @@ class Consequence:
     Attributes:
         injection: what was done.
         reason: why the flight ended early; None when it did not.
-        finite: whether every command was finite.
-        within: whether every command kept its bounds on speeds and steps.
+        finite: whether everything that the plant was given was finite.
+        within: whether it kept the bounds on speeds and steps.
         fallback: deepest level.
         furthest: largest distance from the flight without the fault [m].
-        back: time from the fault's beginning to the last instant out of `NEAR` [s]; 0 for none.
+        back: time from the fault's end to the last instant out of `NEAR` [s]; 0 for none.
     """
 
     injection: Injection
@@ -113,17 +135,39 @@ class Consequence:
         return self.reason is None and self.finite and self.within and self.back <= SOON
 
 
-def draw(count: int, *, seed: int = 0, earliest: float = 1.0, latest: float = 47.0) -> list[Injection]:
-    """Faults of all kinds, in turns in a random order, at so many random instants; each for both controllers."""
+def draw(count: int, *, seed: int = 0, earliest: float = 1.0, latest: float = LAST - AFTER - 1.0) -> list[Injection]:
+    """Faults of all kinds, in turns in a random order, at so many random instants; each for both controllers.
+
+    The robust controller meets each kind under a disturbance first, then in all conditions in turns.
+    """
     rng = np.random.default_rng(seed)
     kinds = faults()
-    order = [kinds[i] for _ in range(-(-count // len(kinds))) for i in rng.permutation(len(kinds))][:count]
-    starts = 0.05 * rng.integers(round(20 * earliest), round(20 * latest), count, endpoint=True)
-    return [
-        Injection(controller=controller, fault=fault, start=round(float(start), 9))
-        for controller in CONTROLLERS
-        for fault, start in zip(order, starts, strict=True)
-    ]
+    injections = []
+    for k, i in enumerate(
+        np.concatenate([rng.permutation(len(kinds)) for _ in range(-(-count // len(kinds)))])[:count]
+    ):
+        conditions = DISTURBANCES if k < len(kinds) else ("nominal", *DISTURBANCES)
+        condition = conditions[k % len(conditions)]
+        first = max(earliest, EARLIEST.get(condition, 0.0))
+        start = round(PERIOD * int(rng.integers(round(first / PERIOD), round(latest / PERIOD), endpoint=True)), 9)
+        injections.append(Injection(controller="robust", fault=kinds[i], start=start, condition=condition))
+    return [*injections, *(replace(each, controller="paper", condition="nominal") for each in injections)]
+
+
+def draw_flight(controller: str, condition: str, count: int, *, seed: int) -> list[Injection]:
+    """So many different faults for one flight, over all of it, each after what came of the one before."""
+    rng = np.random.default_rng(seed)
+    kinds = faults()
+    chosen = [kinds[i] for i in rng.permutation(len(kinds))[:count]]
+    earliest = max(1.0, EARLIEST.get(condition, 0.0))
+    slack = LAST - earliest - sum(fault.duration + SOON for fault in chosen)
+    waits = np.diff(np.sort(rng.uniform(0.0, slack, count)), prepend=0.0)
+    injections, free = [], earliest
+    for fault, wait in zip(chosen, waits, strict=True):
+        start = PERIOD * math.floor((free + wait) / PERIOD)
+        injections.append(Injection(controller=controller, fault=fault, start=round(start, 9), condition=condition))
+        free += wait + fault.duration + SOON
+    return injections
 
 
 def inject_all(injections: list[Injection], **options: Any) -> list[Consequence]:
@@ -131,63 +175,96 @@ def inject_all(injections: list[Injection], **options: Any) -> list[Consequence]
     return answer_all(inject, injections, **options)
 
 
-def inject(injection: Injection, *, longest: float = 60.0) -> Consequence:
-    """Fly one of them, until `AFTER` from its beginning; the flight without it lasts `longest` [s]."""
-    fault, start = injection.fault, injection.start
-    events = ", ".join(f"{{at={start}, {event}}}" for event in fault.events)
-    log = _fly(injection.controller, start + AFTER, (f"events=[{events}]",), fault.statuses, start)
-    sound = _sound_flight(injection.controller, longest)
+def inject(injection: Injection, *, longest: float = LAST) -> Consequence:
+    """Fly one of them, until `AFTER` from its end; the flight without it lasts `longest` [s]."""
+    return fly_with([injection], longest=longest)[0]
+
+
+def fly_with(injections: Sequence[Injection], *, longest: float = LAST) -> list[Consequence]:
+    """Fly several in one flight, of the same controller and condition, in the order of their instants.
+
+    Each is judged until the next begins.
+    """
+    first, last = injections[0], injections[-1]
+    duration = min(last.stop + AFTER, LAST)
+    log, given = _fly(first.controller, first.condition, duration, injections)
+    sound, _ = _sound_flight(first.controller, first.condition, longest)
     control = log.control
     there = sound.control.truth[: control.t.size, list(POSITION)]
     gap = np.linalg.norm(control.truth[:, list(POSITION)] - there, axis=1)
-    out = control.t[gap > NEAR]
+    finite, within = judge(given)
+    consequences = []
+    for injection, until in zip(injections, [*(each.start for each in injections[1:]), math.inf], strict=True):
+        rows = (control.t >= injection.start - 1e-9) & (control.t < until - 1e-9)
+        out = control.t[rows][gap[rows] > NEAR]
+        consequences.append(
+            Consequence(
+                injection=injection,
+                reason=log.reason,
+                finite=finite,
+                within=within,
+                fallback=int(control.fallback[rows].max(initial=0)),
+                furthest=float(gap[rows].max(initial=0.0)),
+                back=max(0.0, round(float(out[-1] - injection.stop), 9)) if out.size else 0.0,
+            )
+        )
+    return consequences
+
+
+def judge(given: Array) -> tuple[bool, bool]:
+    """Whether commands (M, 4), in the order in which they acted, are finite, and within the paper's bounds."""
     bounds = build_problem(*_built()).bounds
     assert bounds is not None
-    speeds, steps = control.speeds, control.slews
-    inside = [speeds - bounds.u_min, bounds.u_max - speeds, steps - bounds.delta_min, bounds.delta_max - steps]
-    return Consequence(
-        injection=injection,
-        reason=log.reason,
-        finite=bool(np.isfinite(speeds).all()),
-        within=bool(min(part.min() for part in inside) >= -1e-6),
-        fallback=int(control.fallback.max()),
-        furthest=float(gap.max()),
-        back=round(float(out[-1] - start), 9) if out.size else 0.0,
-    )
+    before = np.full((1, N_ROTORS), _built()[1].hover_speed)
+    steps = np.diff(np.concatenate([before, given]), axis=0)
+    margins = [given - bounds.u_min, bounds.u_max - given, steps - bounds.delta_min, bounds.delta_max - steps]
+    return bool(np.isfinite(given).all()), all(bool((margin >= -1e-6).all()) for margin in margins)  # as NaN is not
+
+
+@contextlib.contextmanager
+def recorded(plant: Plant) -> Iterator[list[Array]]:
+    """Everything (4,) that the plant is told to hold, before it looks at it."""
+    given: list[Array] = []
+    real = plant.advance
+
+    def advance(speeds: Array, steps: int) -> Stretch:
+        given.append(np.array(speeds, float))
+        return real(speeds, steps)
+
+    with mock.patch.object(plant, "advance", advance):
+        yield given
 
 
 @cache
-def _built() -> Any:
+def _built() -> tuple[Scenario, Vehicle]:
     scenario = load_scenario("paper-constrained")
     return scenario, build_vehicle(scenario)
 
 
 @cache
-def _sound_flight(controller: str, duration: float) -> FlightLog:
-    return _fly(controller, duration, (), (), 0.0)
+def _sound_flight(controller: str, condition: str, duration: float) -> tuple[FlightLog, Array]:
+    return _fly(controller, condition, duration, ())
 
 
-def _fly(
-    controller: str, duration: float, events: tuple[str, ...], statuses: tuple[str, ...], start: float
-) -> FlightLog:
-    """A flight; without the shortcut, so that there is a QP to fail in every period."""
-    settings = ("controller.shortcut=false", "controller.fallback.enabled=true", *events)
-    scenario = load_scenario("paper-constrained", (f"duration={round(duration, 9)}", *settings))
+def _fly(controller: str, condition: str, duration: float, injections: Sequence[Injection]) -> tuple[FlightLog, Array]:
+    """A flight, and what the plant was given (M, 4); without the shortcut, so that there is a QP in every period."""
+    settings = (f"duration={round(duration, 9)}", "controller.shortcut=false", "controller.fallback.enabled=true")
+    scenario = load_scenario("paper-constrained", (*settings, *CONDITIONS[condition].settings))
+    events = [f"{{at={each.start}, {event}}}" for each in injections for event in each.fault.events]
+    faulty = load_scenario("paper-constrained", (settings[0], f"events=[{', '.join(events)}]"))
     if controller == "robust":
-        scenario = equip(scenario, FULL, CONDITIONS["nominal"])
+        scenario = equip(scenario, FULL, CONDITIONS[condition])
+    scenario = scenario.model_copy(update={"events": [*scenario.events, *faulty.events]})
     vehicle = build_vehicle(scenario)
     with threadpool_limits(limits=1), _failing_solver() as solver, build_plant(scenario, vehicle) as plant:
         guarded = build_controller(scenario, vehicle)
         assert isinstance(guarded, Guarded)
-        guarded.inner = _Watched(guarded.inner, solver, start, scenario.control_period, statuses)
-        return fly_once(
-            scenario,
-            vehicle,
-            plant,
-            guarded,
-            build_reference(scenario, scenario.periods + guarded.horizon),
-            navigation=build_navigation(scenario, vehicle),
-        )
+        guarded.inner = _Watched(guarded.inner, solver, injections)
+        reference = build_reference(scenario, scenario.periods + guarded.horizon)
+        navigation = build_navigation(scenario, vehicle)
+        with recorded(plant) as given:
+            log = fly_once(scenario, vehicle, plant, guarded, reference, navigation=navigation)
+    return log, np.array(given)
 
 
 class _FailingSolver:
@@ -213,15 +290,17 @@ def _failing_solver() -> Iterator[_FailingSolver]:
 class _Watched:
     """A controller whose solver fails in chosen periods."""
 
-    def __init__(
-        self, inner: Controller, solver: _FailingSolver, start: float, period: float, statuses: tuple[str, ...]
-    ) -> None:
-        self.inner, self._solver, self._start, self._period, self._statuses = inner, solver, start, period, statuses
+    def __init__(self, inner: Controller, solver: _FailingSolver, injections: Sequence[Injection]) -> None:
+        self.inner, self._solver = inner, solver
+        self._statuses = {
+            round(each.start / PERIOD) + k: status
+            for each in injections
+            for k, status in enumerate(each.fault.statuses)
+        }
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self.inner, name)
 
     def step(self, now: Moment, state: Array, reference: Array) -> Command:
-        since = round((now.time - self._start) / self._period)
-        self._solver.status = self._statuses[since] if 0 <= since < len(self._statuses) else SOLVED
+        self._solver.status = self._statuses.get(round(now.time / PERIOD), SOLVED)
         return self.inner.step(now, state, reference)

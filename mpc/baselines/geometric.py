@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 
+from mpc.actuators import ActuatorBounds
 from mpc.baselines.allocation import allocate, make_allocation
 from mpc.baselines.bandwidths import SEPARATION, YAW_SHARE, lag_to_allow_for
 from mpc.baselines.limits import (
-    InputBounds,
     held_for_a_period,
     require_finite,
     require_positive,
@@ -48,7 +48,7 @@ class GeometricSettings:
         sigma_R: largest angular acceleration that the second asks for, each axis [rad/s^2].
         tilt_max: largest tilt of the wanted force [deg]; Lee et al. (2010) know none.
         horizon: N, samples of preview; they tell the reference's velocity and acceleration.
-        bounds: what commands are held to.
+        bounds: what commands are held to; None for the speeds that the rotors hold.
     """
 
     period: float
@@ -65,7 +65,7 @@ class GeometricSettings:
     sigma_R: float = 5.0
     tilt_max: float = 45.0
     horizon: int = 10
-    bounds: InputBounds = field(default_factory=InputBounds)
+    bounds: ActuatorBounds | None = None
 
     def __post_init__(self) -> None:
         for name in ("period", "k_x", "k_v", "k_R", "k_Omega", "c_1", "c_2", "sigma", "sigma_R"):
@@ -125,6 +125,7 @@ class GeometricController:
 
     def __init__(self, vehicle: Vehicle, settings: GeometricSettings) -> None:
         self.settings = settings
+        self.bounds = ActuatorBounds.of_vehicle(vehicle) if settings.bounds is None else settings.bounds
         self.vehicle = vehicle
         self.model = hover_model(vehicle, settings.period)
         self.gains = Gains(
@@ -164,13 +165,13 @@ class GeometricController:
         """
         before = self._before if now.acting is None else now.acting
         if now.phase in GROUNDED:
-            command = stop(now, self.settings.bounds, before, self.horizon)
+            command = stop(now, self.bounds, before, self.horizon)
             self.reset(command.speeds)
             return command
         require_finite(now, state, reference)
         motion, target = motion_of(state), target_of(reference, self._operator)
         wrench, wanted = geometric_wrench(self.gains, self.vehicle, motion, target, self._integrals)
-        lower, upper = self.settings.bounds.reach(before)
+        lower, upper = self.bounds.reach(before)
         speeds = allocate(self._allocation, wrench, lower, upper)
         given = np.allclose(self._allocation.M @ speeds**2, wrench, rtol=0.0, atol=1e-6 * self._allocation.scale.max())
         if given and now.phase is Phase.FLYING:

@@ -1,55 +1,16 @@
-"""What a baseline's rotor speeds are held to, and what they have in common with every controller's answer."""
+"""What the baselines have in common: checks of their settings and measurements, and plain answers."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 
+from mpc.actuators import ActuatorBounds
 from mpc.model import LinearModel
 from quadsim.controller import Command, Moment, stopped
 from quadsim.errors import CommandError, ParameterError
 from quadsim.state import STATE_NAMES, Array
-
-Pair = tuple[float, float]
-
-
-@dataclass(frozen=True, kw_only=True)
-class InputBounds:
-    """Bounds on rotor speeds; None for no bound.
-
-    Attributes:
-        speed: (lower, upper) of u(k) [rad/s].
-        slew: (lower, upper) of u(k) - u(k-1) [rad/s].
-
-    Raises:
-        ParameterError: a pair is not two finite numbers in order, a speed is negative, or a slew leaves out 0.
-    """
-
-    speed: Pair | None = None
-    slew: Pair | None = None
-
-    def __post_init__(self) -> None:
-        for name in ("speed", "slew"):
-            pair = getattr(self, name)
-            if pair is None:
-                continue
-            if len(pair) != 2 or not all(math.isfinite(value) for value in pair) or not pair[0] < pair[1]:
-                raise ParameterError("controller", name, pair, "two finite numbers, the lower one first")
-        if self.speed is not None and self.speed[0] < 0.0:
-            raise ParameterError("controller", "speed", self.speed, "at least 0 rad/s")
-        if self.slew is not None and not self.slew[0] <= 0.0 <= self.slew[1]:
-            raise ParameterError("controller", "slew", self.slew, "one that a held speed, 0, is within")
-
-    def reach(self, before: Array) -> tuple[Array, Array]:
-        """The lowest and highest speeds (4,) after u(k-1) = `before` (4,) [rad/s]; rotors turn one way, so 0 at least.
-
-        Where both cannot hold, as after a command outside `speed`, `speed` holds.
-        """
-        low, high = self.speed or (0.0, math.inf)
-        down, up = self.slew or (-math.inf, math.inf)
-        return np.clip(before + down, low, high), np.clip(before + up, low, high)
 
 
 def require_positive(name: str, value: float) -> None:
@@ -85,7 +46,7 @@ def require_finite(now: Moment, state: Array, reference: Array) -> None:
         raise CommandError("no command from a reference that is not finite", time=now.time)
 
 
-def stop(now: Moment, bounds: InputBounds, before: Array, horizon: int) -> Command:
+def stop(now: Moment, bounds: ActuatorBounds, before: Array, horizon: int) -> Command:
     """The command on the ground: to the lowest speed, as fast as the bounds allow from `before` (4,) [rad/s]."""
     return stopped(bounds.reach(before)[0], horizon, now.phase)
 

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 import scipy.linalg
 
+from mpc.actuators import ActuatorBounds
 from mpc.baselines.allocation import allocate, make_allocation
 from mpc.baselines.limits import (
-    InputBounds,
     require_finite,
     require_within,
     stop,
@@ -47,7 +47,7 @@ class LQRSettings:
         heading_frame: whether errors are turned into axes along the measured yaw, so that any heading flies.
         tilt_max: largest tilt that errors of x, y and their rates ask for [deg], or None.  The law is linear: without a
             limit a large error asks for more tilt than the model, or the vehicle, stands.
-        bounds: what commands are held to; the law itself knows none.
+        bounds: what commands are held to, the law itself knowing none; None for the speeds that the rotors hold.
 
     Raises:
         ParameterError: the tilt is out of range.
@@ -58,7 +58,7 @@ class LQRSettings:
     horizon: int = 10
     heading_frame: bool = True
     tilt_max: float | None = 30.0
-    bounds: InputBounds = field(default_factory=InputBounds)
+    bounds: ActuatorBounds | None = None
 
     def __post_init__(self) -> None:
         if self.tilt_max is not None:
@@ -110,6 +110,7 @@ class LQR:
 
     def __init__(self, vehicle: Vehicle, settings: LQRSettings) -> None:
         self.settings = settings
+        self.bounds = ActuatorBounds.of_vehicle(vehicle) if settings.bounds is None else settings.bounds
         self.model = hover_model(vehicle, settings.period)
         self.gain = lqr_gain(self.model, settings.objective)
         self._operator = differentiator(settings.horizon, settings.period)
@@ -134,7 +135,7 @@ class LQR:
         """
         before = self._before if now.acting is None else now.acting
         if now.phase in GROUNDED:
-            command = stop(now, self.settings.bounds, before, self.horizon)
+            command = stop(now, self.bounds, before, self.horizon)
         else:
             require_finite(now, state, reference)
             plan = self._plan(state, reference, before)
@@ -159,7 +160,7 @@ class LQR:
         plan = np.empty((self.horizon, N_ROTORS))
         for i in range(self.horizon):
             speeds = self.model.u_bar - self.gain @ self._limited(xi - targets[i])
-            lower, upper = self.settings.bounds.reach(before)
+            lower, upper = self.bounds.reach(before)
             # The mixer's priorities matter for what is flown; the forecast is held to the bounds rotor by rotor.
             plan[i] = self._held(speeds, lower, upper) if i == 0 else np.clip(speeds, lower, upper)
             before = plan[i]

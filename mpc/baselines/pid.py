@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 
+from mpc.actuators import ActuatorBounds
 from mpc.baselines.allocation import make_allocation
 from mpc.baselines.bandwidths import Bandwidths, bandwidths, lag_to_allow_for
 from mpc.baselines.cascade import Gains, fly_cascade, fresh_memory, make_body
 from mpc.baselines.limits import (
-    InputBounds,
     held_for_a_period,
     require_finite,
     require_positive,
@@ -43,7 +43,7 @@ class PIDSettings:
         velocity_max: largest velocity asked for, horizontal and vertical [m/s]; PX4's MPC_XY_VEL_MAX.
         rate_max: largest body rates asked for, roll, pitch, yaw [deg/s]; PX4's MC_ROLLRATE_MAX and so on.
         horizon: N, samples of preview; they tell the reference's velocity and acceleration.
-        bounds: what commands are held to.
+        bounds: what commands are held to; None for the speeds that the rotors hold.
     """
 
     period: float
@@ -57,7 +57,7 @@ class PIDSettings:
     velocity_max: float = 12.0
     rate_max: tuple[float, float, float] = (220.0, 220.0, 200.0)
     horizon: int = 10
-    bounds: InputBounds = field(default_factory=InputBounds)
+    bounds: ActuatorBounds | None = None
 
     def __post_init__(self) -> None:
         require_positive("period", self.period)
@@ -104,6 +104,7 @@ class CascadedPID:
 
     def __init__(self, vehicle: Vehicle, settings: PIDSettings) -> None:
         self.settings = settings
+        self.bounds = ActuatorBounds.of_vehicle(vehicle) if settings.bounds is None else settings.bounds
         self.model = hover_model(vehicle, settings.period)
         self.gains = Gains(
             bandwidths=settings.bandwidths,
@@ -116,8 +117,7 @@ class CascadedPID:
             velocity_max=settings.velocity_max,
             rate_max=tuple(np.radians(settings.rate_max).tolist()),
         )
-        highest = vehicle.speed_max if settings.bounds.speed is None else settings.bounds.speed[1]
-        self.body = make_body(vehicle, make_allocation(vehicle), highest)
+        self.body = make_body(vehicle, make_allocation(vehicle), float(self.bounds.u_max.min()))
         self._operator = differentiator(settings.horizon, settings.period)
         self.reset(self.model.u_bar)
 
@@ -139,11 +139,11 @@ class CascadedPID:
         """
         before = self._before if now.acting is None else now.acting
         if now.phase in GROUNDED:
-            command = stop(now, self.settings.bounds, before, self.horizon)
+            command = stop(now, self.bounds, before, self.horizon)
             self.reset(command.speeds)
             return command
         require_finite(now, state, reference)
-        lower, upper = self.settings.bounds.reach(before)
+        lower, upper = self.bounds.reach(before)
         self._before, self._memory = fly_cascade(
             self.gains,
             self.body,

@@ -19,7 +19,8 @@ class _BaselineSpec(Spec):
         default=10, description="[periods] N, of the reference seen ahead, which tell its velocity and acceleration"
     )
     input_bounds: InputBoundsSpec | None = Field(
-        default=None, description="what commands are held to; absent: speeds at least 0, and nothing else"
+        default=None,
+        description="what commands are held to; absent: the speeds that the vehicle's rotors hold, and any step",
     )
 
 

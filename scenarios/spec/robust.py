@@ -7,7 +7,7 @@ from typing import Annotated, Final, Literal
 from pydantic import Discriminator, Field, Tag, model_validator
 
 from mpc.observer import ObserverSettings
-from mpc.tightening import TighteningSettings
+from mpc.tightening import SHORTEST_LAG, TighteningSettings
 from scenarios.spec.base import NonNegative, Positive, Spec
 from scenarios.spec.fallback import FallbackSpec
 from scenarios.spec.optimisation import BoundedSpec, Weight
@@ -34,7 +34,8 @@ class SoftSpec(Spec):
     linear: Annotated[float, Field(ge=0.0, le=1e12)] = Field(
         default=2e5,
         description="[1/unit of the state, rad for angles] l1, of leaving a bound at all: exact where it is above the "
-        "multipliers that hard bounds would have, 1.4e5 at most on the paper's course",
+        "multipliers that hard bounds would have, as 1e8 nearly always is; but what is nearly hard fights back as hard "
+        "where the model errs",
     )
     quadratic: Annotated[float, Field(ge=0.0, le=1e12)] = Field(
         default=1e4, description="[1/unit of the state^2, rad for angles] l2, of leaving it far"
@@ -66,7 +67,8 @@ class TighteningSpec(Spec):
     """Output bounds drawn in, so that they hold under disturbances within stated bounds, and between samples."""
 
     acceleration: NonNegative = Field(
-        default=_TIGHTENING.acceleration, description="[m/s^2] bound on a disturbance's acceleration, world frame"
+        default=_TIGHTENING.acceleration,
+        description="[m/s^2] bound on a disturbance's acceleration along each axis, world frame",
     )
     angular_acceleration: NonNegative = Field(
         default=_TIGHTENING.angular_acceleration, description="[rad/s^2] the same of angular ones, body frame"
@@ -84,7 +86,8 @@ class RobustSpec(BoundedSpec):
     soft: SoftSpec | None = None
     rotor_lag: Lag = Field(
         default=0.0,
-        description='[s] time constant of the rotor speeds that is predicted; "vehicle": the rotor_rise of the vehicle',
+        description="[s] time constant of the rotor speeds that is predicted, 0 for none; "
+        '"vehicle": the rotor_rise of the vehicle',
     )
     delay: Seconds = Field(
         default=0.0, description="[s] known time from measurement to command that is predicted through"
@@ -108,6 +111,8 @@ class RobustSpec(BoundedSpec):
 
     @model_validator(mode="after")
     def _check(self) -> RobustSpec:
+        if self.rotor_lag != "vehicle" and 0.0 < self.rotor_lag < SHORTEST_LAG:
+            raise ValueError(f"rotor_lag must be 0, or at least {SHORTEST_LAG:g} s; got {self.rotor_lag:g}")
         if self.tightening is not None and not self.output_bounds:
             raise ValueError("tightening must be absent where there are no output_bounds to draw in")
         return self

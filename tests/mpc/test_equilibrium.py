@@ -8,17 +8,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mpc.equilibrium import LEAST_LIFT, equilibrium
+from mpc.equilibrium import LEAST_LIFT, Trim, equilibrium, twisted
 from mpc.heading import turn_horizontally
 from mpc.nonlinear import derivative, nonlinear_model
-from quadsim.state import INDEX
+from quadsim.errors import ParameterError
+from quadsim.state import INDEX, Array
 from quadsim.vehicle import Vehicle
 
 
 def test_undisturbed_it_is_hover(vehicle: Vehicle) -> None:
-    x, u = equilibrium(nonlinear_model(vehicle, 0.05))
-    np.testing.assert_array_equal(x, 0.0)
-    np.testing.assert_allclose(u, vehicle.hover_speed, rtol=1e-12)
+    rest = equilibrium(nonlinear_model(vehicle, 0.05))
+    np.testing.assert_array_equal(rest.state(), 0.0)
+    np.testing.assert_allclose(rest.speeds, vehicle.hover_speed, rtol=1e-12)
 
 
 @pytest.mark.parametrize("yaw", [0.0, 2.0, -3.0])
@@ -31,10 +32,10 @@ def test_the_nonlinear_model_rests_there(vehicle: Vehicle, yaw: float, rotor_lag
             acceleration=rng.uniform(-4.0, 4.0, 3),
             angular_acceleration=rng.uniform(-1.0, 1.0, 3),
         )
-        x, u = equilibrium(model, yaw)
-        world = turn_horizontally(x, np.array(yaw))
+        rest = equilibrium(model)
+        world = turn_horizontally(rest.state(yaw, model.n), np.array(yaw))
         world[INDEX["yaw"]] = yaw
-        np.testing.assert_allclose(derivative(model, world, u), 0.0, atol=1e-11)
+        np.testing.assert_allclose(derivative(model, world, rest.speeds), 0.0, atol=1e-11)
 
 
 def test_what_is_beyond_the_rotors_stays_finite_and_upright(vehicle: Vehicle) -> None:
@@ -43,11 +44,34 @@ def test_what_is_beyond_the_rotors_stays_finite_and_upright(vehicle: Vehicle) ->
         acceleration=np.array([1.0, 1.0, 30.0]),
         angular_acceleration=np.array([0.0, 0.0, 500.0]),
     )
-    x, u = equilibrium(model)
-    assert np.abs(x).max() < 0.5 * math.pi
-    assert u.min() == 0.0
-    assert np.isfinite(u).all()
+    rest = equilibrium(model)
+    assert np.abs(rest.state()).max() < 0.5 * math.pi
+    assert rest.speeds.min() == 0.0
+    assert np.isfinite(rest.speeds).all()
     lift = math.dist((0.0, 0.0, 0.0), (1.0, 1.0, LEAST_LIFT * vehicle.gravity))
-    assert np.sum(model.effectiveness[0] * equilibrium(replace(model, angular_acceleration=np.zeros(3)))[1] ** 2) == (
-        pytest.approx(lift)
-    )
+    still = replace(model, angular_acceleration=np.zeros(3))
+    assert model.effectiveness[0] @ equilibrium(still).speeds ** 2 == pytest.approx(lift)
+
+
+def test_a_twisted_model_turns_as_its_thrust_pushes(vehicle: Vehicle) -> None:
+    twist, speeds = np.array([0.3, -0.2, 0.1]), np.array([180.0, 200.0, 190.0, 210.0])
+    plain = nonlinear_model(vehicle, 0.05)
+    turned = twisted(plain, twist).effectiveness @ speeds**2 - plain.effectiveness @ speeds**2
+    assert turned[0] == 0.0
+    np.testing.assert_allclose(turned[1:], twist * (plain.effectiveness[0] @ speeds**2), rtol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"speeds": np.full(3, 190.0)}, r"trim\.speeds must be 4 finite numbers"),
+        ({"speeds": np.full(4, math.nan)}, r"trim\.speeds must be 4 finite numbers"),
+        ({"lift": np.zeros(2)}, r"trim\.lift must be three finite numbers, the last one positive"),
+        ({"lift": np.array([0.0, 0.0, math.inf])}, r"trim\.lift must be three finite numbers"),
+        ({"twist": np.full(3, math.nan)}, r"trim\.twist must be three finite numbers"),
+        ({"lift": np.array([0.0, 1.0, 0.0])}, r"trim\.lift must be .* the last one positive; got"),
+    ],
+)
+def test_an_impossible_trim_is_refused(change: dict[str, Array], message: str) -> None:
+    with pytest.raises(ParameterError, match=message):
+        Trim(**{"speeds": np.full(4, 190.0), "lift": np.array([0.0, 0.0, 1.0]), **change})

@@ -18,20 +18,22 @@ from support import paper_problem, paper_reference
 
 from mpc.actuators import ActuatorBounds
 from mpc.constrained import ConstrainedMPC
+from mpc.equilibrium import Trim
 from mpc.fallback import FAILURES, FallbackSettings, Guarded
+from mpc.heading import advance as advance_from
+from mpc.heading import predict_in_heading_frame, turn
 from mpc.hover import (
     ACCEPTABLE_ACCELERATION,
     ACCEPTABLE_POSITION,
     ACCEPTABLE_RATE,
     ACCEPTABLE_TILT,
     ACCEPTABLE_VELOCITY,
+    LARGEST_CLIMB,
     HoverLaw,
-    advance,
-    turn,
 )
 from mpc.model import LinearModel, hover_model
 from mpc.problem import Problem
-from mpc.reckoning import PLAUSIBLE, DeadReckoning
+from mpc.reckoning import PLAUSIBLE, DeadReckoning, Reckoned
 from mpc.solvers import Answer, QPSolver
 from mpc.solvers._piqp import STATUS
 from quadsim.airframe import outline
@@ -70,6 +72,23 @@ def bounds() -> ActuatorBounds:
     hard = problem().bounds
     assert hard is not None
     return ActuatorBounds(u_min=hard.u_min, u_max=hard.u_max, delta_min=hard.delta_min, delta_max=hard.delta_max)
+
+
+@cache
+def level() -> Trim:
+    """Of the undisturbed vehicle."""
+    return Trim(speeds=model().u_bar, lift=np.array([0.0, 0.0, 1.0]))
+
+
+@cache
+def pressed() -> Trim:
+    """Of a vehicle that is heavier than believed, blown along x and turned about its own."""
+    return Trim(speeds=model().u_bar + np.array([27.0, 31.0, 27.0, 23.0]), lift=np.array([-0.3, 0.0, 9.81]))
+
+
+def advance(state: Array, speeds: Array, trim: Trim | None = None) -> Array:
+    """The state (12,) a period later, undisturbed unless told otherwise."""
+    return advance_from(model(), state, speeds, trim or level())
 
 
 def random_state(seed: int, scale: float = 0.1) -> Array:
@@ -165,9 +184,7 @@ def test_law_and_prediction_turn_with_the_heading(yaw: float) -> None:
     state[INDEX["yaw"]] = 0.0
     ahead = np.zeros(12)
     ahead[INDEX["yaw"]] = yaw
-    np.testing.assert_allclose(
-        advance(model(), T @ state + ahead, speeds), T @ advance(model(), state, speeds) + ahead, atol=1e-12
-    )
+    np.testing.assert_allclose(advance(T @ state + ahead, speeds), T @ advance(state, speeds) + ahead, atol=1e-12)
 
 
 def test_far_away_the_law_asks_for_its_tilt_and_no_more() -> None:
@@ -184,9 +201,8 @@ def test_far_away_the_law_asks_for_its_tilt_and_no_more() -> None:
 def test_the_law_s_plan_is_its_closed_loop() -> None:
     law, state, target = HoverLaw(model(), tilt=0.2), random_state(4, 0.05), np.zeros(12)
     target[INDEX["vz"]] = -0.5
-    plan = law.plan(state, target, model().u_bar, bounds(), 200)
-    for speeds in plan:
-        state = advance(model(), state, speeds)
+    plan = law.plan(state, target, model().u_bar, bounds(), 200, level())
+    state = predict_in_heading_frame(model(), state[None], plan[None], level())[0, -1]
     assert state[INDEX["vz"]] == pytest.approx(-0.5, abs=1e-3)
     assert state[INDEX["z"]] == pytest.approx(-0.5 * 200 * PERIOD, abs=1e-2)
     np.testing.assert_allclose(np.delete(state, [INDEX["z"], INDEX["vz"]]), 0.0, atol=1e-3)
@@ -213,7 +229,7 @@ def moving(periods: int, *, acceleration: float = 0.0) -> tuple[Array, Array]:
     speeds = model().u_bar + np.random.default_rng(5).uniform(-1.0, 1.0, (periods, 4))
     states = [random_state(6)]
     for command in speeds:
-        states.append(advance(model(), states[-1], command))
+        states.append(advance(states[-1], command))
         states[-1][INDEX["vx"]] += acceleration * PERIOD
     return np.array(states), speeds
 
@@ -221,11 +237,11 @@ def moving(periods: int, *, acceleration: float = 0.0) -> tuple[Array, Array]:
 def reckon(states: Array, speeds: Array, missing: Sequence[int], *, value: float = math.nan) -> Array:
     """What is made of states whose channels go missing after the first."""
     reckoning = DeadReckoning(model())
-    known = [reckoning.complete(states[0], model().u_bar)]
+    known = [reckoning.complete(states[0], model().u_bar, level())]
     for state, command in zip(states[1:], speeds, strict=True):
         measured = state.copy()
         measured[list(missing)] = value
-        known.append(reckoning.complete(measured, command))
+        known.append(reckoning.complete(measured, command, level()))
     return np.array(known)
 
 
@@ -262,39 +278,39 @@ def test_the_channels_that_are_there_correct_what_is_missing() -> None:
 def test_frozen_numbers_are_missing_ones(group: Sequence[int]) -> None:
     states, speeds = moving(20)
     reckoning = DeadReckoning(model())
-    reckoning.complete(states[0], model().u_bar)
+    reckoning.complete(states[0], model().u_bar, level())
     for state, command in zip(states[1:], speeds, strict=True):
         measured = state.copy()
         measured[list(group)] = states[0][list(group)]
-        known = reckoning.complete(measured, command)
+        known = reckoning.complete(measured, command, level())
         np.testing.assert_allclose(known, state, atol=5e-2)  # until the prediction has left the numbers, they are taken
     assert reckoning.unseen[list(group)].min() > 0
-    assert reckoning.complete(state + 1e-6, command).tolist() == (state + 1e-6).tolist()
+    assert reckoning.complete(state + 1e-6, command, level()).tolist() == (state + 1e-6).tolist()
     assert not reckoning.unseen.any()
 
 
 def test_a_vehicle_at_rest_or_on_the_ground_is_not_frozen() -> None:
     reckoning, rest = DeadReckoning(model()), np.zeros(12)
     for _ in range(3):
-        reckoning.complete(rest, model().u_bar)
+        reckoning.complete(rest, model().u_bar, level())
     assert not reckoning.unseen.any()
     for _ in range(3):
-        reckoning.complete(rest, np.zeros(4), free=False)
+        reckoning.complete(rest, np.zeros(4), level(), free=False)
     assert not reckoning.unseen.any()
-    reckoning.complete(rest, np.zeros(4))
+    reckoning.complete(rest, np.zeros(4), level())
     assert reckoning.unseen.any()
 
 
 def test_what_was_missing_for_long_is_found_again_from_the_rest() -> None:
     reckoning = DeadReckoning(model())
     for _ in range(4000):
-        reckoning.complete(np.full(12, math.nan), model().u_bar)
+        reckoning.complete(np.full(12, math.nan), model().u_bar, level())
     states, speeds = moving(100)
     tilting = [INDEX[name] for name in ("roll", "roll_rate", "pitch", "pitch_rate")]  # seen in how it moves
     for state, command in zip(states, speeds, strict=False):
         measured = state.copy()
         measured[tilting] = math.nan
-        known = reckoning.complete(measured, command)
+        known = reckoning.complete(measured, command, level())
     np.testing.assert_allclose(known[tilting], state[tilting], atol=0.05)
 
 
@@ -302,7 +318,7 @@ def test_nothing_measured_ever_stays_finite() -> None:
     reckoning, rng = DeadReckoning(model()), np.random.default_rng(7)
     for k in range(3000):
         seen = rng.normal(size=12) if k % 500 == 0 else np.zeros(3)
-        known = reckoning.complete(seen, rng.uniform(-1e5, 1e5, 4))
+        known = reckoning.complete(seen, rng.uniform(-1e5, 1e5, 4), level())
         assert (np.abs(known) <= PLAUSIBLE).all()
 
 
@@ -340,7 +356,7 @@ class Scripted:
         for k, state in enumerate(states):
             now = state
             for i, speeds in enumerate(plans[k]):
-                now = predicted[k, i] = advance(model(), now, speeds)
+                now = predicted[k, i] = advance(now, speeds)
         return predicted
 
 
@@ -363,7 +379,7 @@ def following(guarded: Guarded, periods: int) -> list[Command]:
     state, commands = np.zeros(12), []
     for _ in range(periods):
         commands.append(ask(guarded, state))
-        state = advance(model(), state, commands[-1].speeds)
+        state = advance(state, commands[-1].speeds)
     return commands
 
 
@@ -509,7 +525,7 @@ def test_hover_brakes_then_holds_place_height_and_heading() -> None:
     state[[INDEX["vx"], INDEX["z"], INDEX["yaw"]]] = 2.0, 5.0, 2.5
     track = []
     for _ in range(250):
-        state = advance(model(), state, ask(guarded, state).speeds)
+        state = advance(state, ask(guarded, state).speeds)
         track.append(state)
     np.testing.assert_allclose(state[[INDEX["z"], INDEX["yaw"]]], [5.0, 2.5], atol=1e-3)
     np.testing.assert_allclose(state[list(VELOCITY)], 0.0, atol=2e-3)
@@ -523,7 +539,7 @@ def test_descent_sinks_at_its_speed() -> None:
     assert [command.fallback for command in commands] == 20 * [2] + 130 * [3]
     state = np.zeros(12)
     for command in commands:
-        state = advance(model(), state, command.speeds)
+        state = advance(state, command.speeds)
     assert state[INDEX["vz"]] == pytest.approx(-0.4, abs=1e-3)
     assert state[INDEX["z"]] == pytest.approx(-0.4 * 130 * PERIOD, abs=0.02)
 
@@ -596,6 +612,134 @@ def test_prediction_is_the_inner_controller_s_where_it_has_one() -> None:
 
     inner.predict = broken  # type: ignore[method-assign]
     assert guarded.predict(states, plans).shape == (1, 30, 12)
+
+
+# --- what is believed to disturb the vehicle
+
+
+class Pressed(Scripted):
+    """Knows what presses the vehicle, and plans what holds it at rest."""
+
+    trim = pressed()
+
+    def step(self, now: Moment, state: Array, reference: Array) -> Command:
+        plan = np.tile(self.trim.speeds, (self.horizon, 1))
+        answer = super().step(now, state, reference)
+        return replace(answer, speeds=plan[0], plan=plan)
+
+    def predict(self, states: Array, plans: Array) -> Array:
+        raise ZeroDivisionError
+
+
+def at_rest(yaw: float) -> Array:
+    """Under `pressed`, at the origin, headed anywhere."""
+    rest = turn(yaw) @ pressed().state(yaw)
+    rest[INDEX["yaw"]] = yaw
+    return rest
+
+
+@pytest.mark.parametrize("yaw", [0.0, 2.0])
+def test_every_level_holds_what_presses_the_vehicle(yaw: float) -> None:
+    guarded = guard(Pressed(failing(range(1, 200))))
+    guarded.reset(pressed().speeds)
+    state, levels = at_rest(yaw), []
+    for _ in range(200):
+        command = ask(guarded, state)
+        levels.append(command.fallback)
+        state = advance(state, command.speeds, pressed())
+        if command.fallback < 3:
+            np.testing.assert_allclose(state, at_rest(yaw), atol=1e-9)
+    assert sorted(set(levels)) == [0, 1, 2, 3]
+    assert state[INDEX["vz"]] == pytest.approx(-0.5, abs=1e-3)
+    np.testing.assert_allclose(np.delete(state - at_rest(yaw), [INDEX["z"], INDEX["vz"]]), 0.0, atol=1e-3)
+
+
+def test_without_that_it_would_be_pressed_away() -> None:
+    inner = Pressed(failing(range(1, 200)))
+    inner.trim = level()
+    guarded = guard(inner)
+    guarded.reset(pressed().speeds)
+    state = at_rest(0.0)
+    for _ in range(120):
+        state = advance(state, ask(guarded, state).speeds, pressed())
+    assert np.abs(state - at_rest(0.0))[list(POSITION)].max() > 1.0
+
+
+def test_height_pulls_beside_what_holds_the_vehicle() -> None:
+    """At most by `LARGEST_CLIMB`, whatever rest takes."""
+    law, far = HoverLaw(model(), tilt=0.2), at_rest(0.0)
+    far[INDEX["z"]] = -100.0
+    free = ActuatorBounds(u_min=np.zeros(4), u_max=np.full(4, 1e3), delta_min=[-1e3] * 4, delta_max=[1e3] * 4)
+    pulled = law.plan(far, np.zeros(12), pressed().speeds, free, 1, pressed())[0] - pressed().speeds
+    assert (law.slope @ pulled)[0] == pytest.approx(LARGEST_CLIMB)
+
+
+def test_missing_channels_follow_what_presses_the_vehicle() -> None:
+    inner = Pressed()
+    guarded = guard(inner)
+    guarded.reset(pressed().speeds)
+    state = at_rest(2.0) + 0.01
+    for k in range(25):
+        ask(guarded, state if k < 3 else np.full(12, math.nan))
+        np.testing.assert_allclose(inner.asked[-1][1], state, atol=1e-9)
+        state = advance(state, pressed().speeds, pressed())
+
+
+def test_what_was_believed_last_holds_while_nothing_is_measured() -> None:
+    inner = Pressed()
+    guarded = guard(inner)
+    guarded.reset(pressed().speeds)
+    state = at_rest(0.0)
+    for k in range(100):
+        command = ask(guarded, state if k < 3 else np.full(12, math.nan))
+        state = advance(state, command.speeds, pressed())
+    assert command.status == "state_unknown"
+    assert len(inner.asked) < 40
+    np.testing.assert_allclose(state, at_rest(0.0), atol=1e-9)
+
+
+@pytest.mark.parametrize("trim", [None, 3.0, "absent", RuntimeError("no")])
+def test_a_controller_that_does_not_say_hovers_level(trim: Any) -> None:
+    class Silent(Scripted):
+        def __getattr__(self, name: str) -> Any:
+            if trim == "absent" or name != "trim":
+                raise AttributeError(name)
+            if isinstance(trim, Exception):
+                raise trim
+            return trim
+
+    guarded = guard(Silent())
+    np.testing.assert_array_equal(guarded.trim.speeds, model().u_bar)
+    assert guarded.trim.lean(0.0) == (0.0, 0.0)
+
+
+def test_the_controller_is_told_what_is_predicted() -> None:
+    inner = Scripted()
+    guarded = guard(inner)
+    partly = np.zeros(12)
+    partly[INDEX["vz"]] = math.nan
+    for time, state in enumerate((np.zeros(12), partly, partly, np.zeros(12))):
+        ask(guarded, state, time=float(time))
+    told = [now for now, _ in inner.asked]
+    assert all(isinstance(now, Reckoned) for now in told)
+    assert [now.time for now in told] == [0.0, 1.0, 2.0, 3.0]
+    unseen = np.array([now.unseen for now in told if isinstance(now, Reckoned)])
+    assert unseen[:, INDEX["vz"]].tolist() == [0.0, 1.0, 2.0, 0.0]
+    assert not np.delete(unseen, INDEX["vz"], axis=1).any()
+
+
+def test_its_own_predictions_turn_with_the_heading() -> None:
+    states, plans = np.array([at_rest(2.0), at_rest(-1.0)]), np.tile(pressed().speeds, (2, 30, 1))
+    np.testing.assert_allclose(guard(Pressed()).predict(states, plans), states[:, None].repeat(30, 1), atol=1e-9)
+
+
+@pytest.mark.parametrize("turns", [200, -10_000])
+def test_a_yaw_counts_its_turns(turns: int) -> None:
+    state = np.zeros(12)
+    state[INDEX["yaw"]] = math.tau * turns
+    reference = np.zeros((30, 4))
+    reference[:, 3] = math.tau * turns
+    assert guard(Scripted()).step(Moment(), state, reference).status == "solved"
 
 
 @pytest.mark.parametrize("name", ["unseen", "plan_age", "position", "hover", "sink", "settled"])

@@ -7,9 +7,9 @@ import math
 import numpy as np
 import pytest
 
-from mpc.observer import DisturbanceObserver, ObserverSettings, observer_gain
+from mpc.observer import DisturbanceObserver, ObserverSettings, observer_gain, thrust_axis
 from quadsim.errors import ParameterError
-from quadsim.state import EULER, EULER_RATE, VELOCITY, Array, body_to_euler_rates, make_state
+from quadsim.state import EULER, EULER_RATE, VELOCITY, Array, body_to_euler_rates, body_to_world, make_state
 
 PERIOD = 0.05
 LEVEL = make_state()
@@ -120,6 +120,29 @@ def test_torque_is_about_the_bodys_axes_at_any_attitude() -> None:
     observer.update(after, before)
     assert observer.estimate[4] > 0.0
     np.testing.assert_allclose(np.delete(observer.estimate, 4), 0.0, atol=1e-12)
+
+
+def test_thrust_that_is_other_than_believed_pushes_along_its_axis() -> None:
+    """However the vehicle is tilted: what a wrong mass does is no force sideways."""
+    euler = np.array([0.2, -0.3, 2.0])
+    axis = body_to_world(euler)[:, 2]
+    observer = DisturbanceObserver(ObserverSettings(), PERIOD)
+    before = make_state(euler=(0.2, -0.3, 2.0))
+    np.testing.assert_allclose(thrust_axis(before), axis, atol=1e-12)
+    after = before.copy()
+    after[list(VELOCITY)] += 0.01 * axis
+    observer.update(after, before)
+    assert observer.estimate[2] > 0.0
+    np.testing.assert_allclose(np.delete(observer.estimate, 2), 0.0, atol=1e-12)
+
+
+def test_a_force_sideways_is_found_in_world_axes() -> None:
+    before = make_state(euler=(0.2, -0.3, 2.0))
+    after = before.copy()
+    after[list(VELOCITY)] += 0.01 * np.array([1.0, -2.0, 0.0])
+    observer = DisturbanceObserver(ObserverSettings(), PERIOD)
+    observer.update(after, before)
+    np.testing.assert_allclose(observer.estimate[:3] / observer.estimate[0], [1.0, -2.0, 0.0], atol=1e-9)
 
 
 def test_no_more_is_believed_than_the_largest() -> None:

@@ -19,12 +19,13 @@ from mpc.model import hover_model
 from mpc.nonlinear import NonlinearModel, advance, derivative, nonlinear_model
 from mpc.observer import ObserverSettings
 from mpc.penalty import Penalty
+from mpc.reckoning import Reckoned
 from mpc.robust import Linearisation, RobustMPC, RobustSettings, _hover_matrices
 from mpc.solvers import QPSolver
 from quadsim.controller import SOLVED, Moment, Phase
 from quadsim.effects.rotors import RotorDynamics
 from quadsim.errors import ParameterError
-from quadsim.state import INDEX, Array, make_state
+from quadsim.state import INDEX, POSITION, Array, make_state
 from quadsim.vehicle import Vehicle
 from scenarios.build import build_plant, build_problem, build_reference, build_vehicle
 from scenarios.flying import fly_once
@@ -83,6 +84,13 @@ def flown(
         acting = command.speeds
 
 
+def believing(controller: RobustMPC, estimate: Array) -> None:
+    """Let it have estimated (6,)."""
+    assert controller._observer is not None
+    controller._observer.estimate = estimate
+    controller._believe()
+
+
 def moments(flight: Flight, first: int, periods: int) -> Iterator[tuple[Moment, Array, Array]]:
     """What a controller was told in successive periods of a flight."""
     log = flight.log.control
@@ -109,7 +117,8 @@ def test_the_hover_matrices_are_the_papers_without_lag_and_the_nonlinear_models_
     np.testing.assert_array_equal(A, model.A)
     np.testing.assert_array_equal(B, model.B)
     lagging = nonlinear_model(vehicle, PERIOD, substeps=20, rotor_lag=0.03)
-    x, u = equilibrium(lagging)
+    rest = equilibrium(lagging)
+    x, u = rest.state(n=16), rest.speeds
     for ours, exact in zip(_hover_matrices(vehicle, lagging), linearise(lagging, x[None], u[None])[:2], strict=True):
         np.testing.assert_allclose(ours, exact[0], atol=1e-7)
 
@@ -186,16 +195,16 @@ def test_along_the_last_plan_the_prediction_is_the_nonlinear_models(vehicle: Veh
 @pytest.mark.parametrize("linearisation", list(Linearisation))
 def test_rest_under_a_disturbance_is_an_equilibrium(vehicle: Vehicle, yaw: float, linearisation: Linearisation) -> None:
     """Also of the controller: told that it rests where it shall, it commands what holds it there."""
+    controller = robust(vehicle, rotor_lag=0.03, heading=True, observer=ObserverSettings(), linearisation=linearisation)
+    believing(controller, np.array([0.4, -0.3, 0.5, 0.5, -0.3, 0.1]))
+    force, torque = np.split(controller.disturbance, 2)
     model = nonlinear_model(vehicle, PERIOD, rotor_lag=0.03)
-    model = replace(model, acceleration=np.array([0.4, -0.3, 0.5]), angular_acceleration=np.array([0.5, -0.3, 0.1]))
-    x, u = equilibrium(model, yaw)
-    world = turn_horizontally(x, np.array(yaw))
+    model = replace(model, acceleration=force, angular_acceleration=torque)
+    world, u = turn_horizontally(controller.trim.state(yaw, 16), np.array(yaw)), controller.trim.speeds
     world[INDEX["yaw"]] = yaw
     np.testing.assert_allclose(derivative(model, world, u), 0.0, atol=1e-12)
-    controller = robust(vehicle, rotor_lag=0.03, heading=True, observer=ObserverSettings(), linearisation=linearisation)
     controller.reset(u)
-    assert controller._observer is not None
-    controller._observer.estimate = np.concatenate([model.acceleration, model.angular_acceleration])
+    believing(controller, np.array([0.4, -0.3, 0.5, 0.5, -0.3, 0.1]))
     reference = np.tile([0.0, 0.0, 0.0, yaw], (50, 1))
     np.testing.assert_allclose(controller.step(Moment(acting=u), world[:12], reference).speeds, u, atol=1e-4)
 
@@ -230,22 +239,113 @@ def test_what_is_stated_is_not_taken_for_a_disturbance(vehicle: Vehicle) -> None
     assert np.abs(np.diff(moved, axis=0)[:, [7, 9, 11]]).max() > 0.05
 
 
+@pytest.mark.parametrize("factor", [0.7, 1.3])
+def test_a_wrong_mass_is_no_force_sideways(vehicle: Vehicle, factor: float) -> None:
+    """On a course that tilts the vehicle to and fro; in rest it is all in what thrust does."""
+    heavy = nonlinear_model(replace(vehicle, mass=factor * vehicle.mass), PERIOD)
+    reference = np.zeros((200, 4))
+    reference[60:120, 0] = 2.0
+    controller = robust(vehicle, weight=0.1, penalty=SOFT, observer=ObserverSettings(), move_weight=20.0 * np.eye(4))
+    believing(controller, np.zeros(6))
+    tilts, sideways = [], []
+    for state, _ in flown(controller, heavy, make_state(), reference, 150):
+        tilts.append(abs(state[INDEX["pitch"]]))
+        sideways.append(np.abs(controller.disturbance[:2]).max())
+    assert max(tilts) > math.radians(3.0)
+    assert max(sideways) < 0.02
+    assert controller.disturbance[2] == pytest.approx(vehicle.gravity * (1.0 - factor), abs=0.05)
+
+
+@pytest.mark.parametrize("linearisation", list(Linearisation))
+def test_what_a_worn_rotor_does_is_known_at_any_thrust(vehicle: Vehicle, linearisation: Linearisation) -> None:
+    """Climbing with more thrust, it turns the vehicle more, by as much: nothing is left to learn."""
+    worn = nonlinear_model(vehicle, PERIOD)
+    worn = replace(worn, effectiveness=worn.effectiveness * [1.0, 0.8, 1.0, 1.0])
+    reference = np.zeros((400, 4))
+    reference[260:, 2] = 10.0
+    controller = robust(
+        vehicle, weight=0.1, penalty=SOFT, observer=ObserverSettings(), linearisation=linearisation, heading=True
+    )
+    torques, thrusts = [], []
+    for k, (_, speeds) in enumerate(flown(controller, worn, make_state(), reference, 280)):
+        if k >= 200:
+            assert controller._observer is not None
+            torques.append(controller._observer.estimate[3])
+            thrusts.append(np.sum(speeds**2) / np.sum(controller.trim.speeds**2))
+    assert np.ptp(thrusts) > 0.5
+    assert np.ptp(torques) < 0.05 * np.mean(torques)
+
+
 def test_nothing_is_learned_on_the_ground_or_from_what_is_no_number(vehicle: Vehicle) -> None:
     controller = robust(vehicle, **EVERYTHING)
     acting = np.full(4, vehicle.hover_speed)
     pushed = moving((0.0, 0.0, 0.2))
-    for state, phase in (
-        (np.zeros(12), Phase.ARMED),
-        (pushed, Phase.FLYING),
-        (np.full(12, math.nan), Phase.FLYING),
-        (pushed, Phase.FLYING),
+    for k, (state, phase) in enumerate(
+        (
+            (np.zeros(12), Phase.ARMED),
+            (pushed, Phase.FLYING),
+            (np.full(12, math.nan), Phase.FLYING),
+            (pushed, Phase.FLYING),
+        )
     ):
-        controller.step(Moment(acting=acting, phase=phase), state, HOLD)
+        controller.step(Moment(time=k * PERIOD, acting=acting, phase=phase), state, HOLD)
         np.testing.assert_array_equal(controller.disturbance, 0.0)
-    controller.step(Moment(acting=acting), np.zeros(12), HOLD)
+    controller.step(Moment(time=4 * PERIOD, acting=acting), np.zeros(12), HOLD)
     assert controller.disturbance[2] < -0.1
-    controller.step(Moment(acting=acting, phase=Phase.LANDED), pushed, HOLD)
+    controller.step(Moment(time=5 * PERIOD, acting=acting, phase=Phase.LANDED), pushed, HOLD)
     np.testing.assert_array_equal(controller.disturbance, 0.0)
+
+
+@pytest.mark.parametrize("gap", [0, 2, 40])
+def test_nothing_is_learned_over_a_pause(vehicle: Vehicle, gap: int) -> None:
+    """What was expected a period later says nothing of any other instant."""
+    controller, acting = robust(vehicle, **EVERYTHING), np.full(4, vehicle.hover_speed)
+    controller.step(Moment(time=1.0, acting=acting), np.zeros(12), HOLD)
+    controller.step(Moment(time=1.0 + gap * PERIOD, acting=acting), moving((0.0, 0.0, 0.2)), HOLD)
+    np.testing.assert_array_equal(controller.disturbance, 0.0)
+
+
+@pytest.mark.parametrize(("predicted", "learned"), [(0, True), (4, True), (5, False), (30, False)])
+def test_predicted_states_teach_nothing_and_long_spans_of_them_neither(
+    vehicle: Vehicle, predicted: int, learned: bool
+) -> None:
+    """From a slow sensor's next measurement it learns; after a longer outage it starts anew."""
+    controller, acting = robust(vehicle, **EVERYTHING), np.full(4, vehicle.hover_speed)
+    measured, guessed = np.zeros(12), np.zeros(12)
+    guessed[INDEX["vx"]] = 1.0
+    times = PERIOD * np.arange(predicted + 3)
+    controller.step(Reckoned(time=times[0], acting=acting, unseen=measured), np.zeros(12), HOLD)
+    for time in times[1 : predicted + 1]:
+        controller.step(Reckoned(time=time, acting=acting, unseen=guessed), moving((0.3, 0.0, 0.0)), HOLD)
+        np.testing.assert_array_equal(controller.disturbance, 0.0)
+    controller.step(Reckoned(time=times[-2], acting=acting, unseen=measured), moving((0.1, 0.0, 0.0)), HOLD)
+    assert controller.disturbance.any() == learned
+    before = controller.disturbance
+    controller.step(Reckoned(time=times[-1], acting=acting, unseen=measured), np.zeros(12), HOLD)
+    assert np.abs(controller.disturbance - before).max() > 0.0
+
+
+def test_a_position_that_is_predicted_hides_no_disturbance(vehicle: Vehicle) -> None:
+    controller, acting = robust(vehicle, **EVERYTHING), np.full(4, vehicle.hover_speed)
+    unseen = np.zeros(12)
+    unseen[list(POSITION)] = 7.0
+    for k, speed in enumerate((0.0, 0.2)):
+        controller.step(Reckoned(time=k * PERIOD, acting=acting, unseen=unseen), moving((0.0, 0.0, speed)), HOLD)
+    assert controller.disturbance[2] > 0.1
+
+
+def test_predictions_and_trim_are_of_what_is_believed(vehicle: Vehicle) -> None:
+    controller = robust(vehicle, observer=ObserverSettings(), heading=True)
+    np.testing.assert_allclose(controller.trim.speeds, vehicle.hover_speed, rtol=1e-12)
+    estimate = np.array([0.0, 0.0, -2.9, 0.5, 0.0, 0.0])
+    believing(controller, estimate)
+    controller.reset(controller.trim.speeds)
+    believing(controller, estimate)
+    plan = np.tile(controller.trim.speeds, (1, 50, 1))
+    np.testing.assert_allclose(controller.predict(np.zeros((1, 12)), plan), 0.0, atol=1e-9)
+    assert controller.trim.speeds.min() > vehicle.hover_speed + 15.0
+    controller.reset(np.full(4, vehicle.hover_speed))
+    np.testing.assert_allclose(controller.trim.speeds, vehicle.hover_speed, rtol=1e-12)
 
 
 # Heading

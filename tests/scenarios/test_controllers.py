@@ -13,6 +13,7 @@ import pytest
 from jsonschema import Draft202012Validator
 from pydantic import Tag
 
+from mpc.actuators import ActuatorBounds
 from mpc.baselines.geometric import GeometricController
 from mpc.baselines.lqr import LQR, bryson_objective
 from mpc.baselines.pid import CascadedPID
@@ -24,7 +25,7 @@ from mpc.robust import Linearisation, RobustMPC, RobustSettings
 from mpc.solvers import QPSolver
 from mpc.tightening import TighteningSettings, margins
 from mpc.unconstrained import UnconstrainedMPC
-from quadsim.controller import Controller
+from quadsim.controller import SOLVED, Controller, Moment
 from quadsim.errors import ParameterError
 from scenarios.build import (
     CONTROLLERS,
@@ -136,6 +137,8 @@ def test_of_the_robust_controller_every_part_is_absent_unless_given() -> None:
     assert same(robust().settings, usual)
 
 
+LEVEL = {"roll": [-5.0, 5.0], "pitch": [-5.0, 5.0]}
+HOVER = 192.8
 BOUNDS = Bounds(
     C_c=np.eye(12)[[6, 8]],
     y_min=np.radians([-5.0, -6.0]),
@@ -168,6 +171,35 @@ def test_soft_bounds_have_their_penalties() -> None:
     np.testing.assert_array_equal([penalty.l1, penalty.l2], [[3.0, 3.0], [1e4, 1e4]])
 
 
+@pytest.mark.parametrize("parts", [{}, {"rotor_lag": 0.05}, {"rotor_lag": 0.05, "tightening": {}, "offset_free": {}}])
+def test_at_a_price_that_is_high_enough_soft_bounds_are_hard_ones_from_any_state_that_has_a_way_out(
+    parts: dict[str, Any],
+) -> None:
+    """At the default one they are nearly always, and left by half a degree at most."""
+    usual = {**ROBUST, "horizon": 50, "heading": True, "move_weight": 20.0, "output_bounds": LEVEL}
+    prices: tuple[dict[str, Any], ...] = ({}, {"soft": {"linear": 1e8}}, {"soft": {}})
+    hard, soft, default = (robust(**{**usual, **parts, **price}) for price in prices)
+    rng, reference, feasible, pressing, slacks = np.random.default_rng(0), np.zeros((50, 4)), 0, 0, []
+    scale = np.array([10.0, 2.0, 10.0, 2.0, 10.0, 2.0, math.radians(5.0), 0.4, math.radians(5.0), 0.4, 1.0, 0.0])
+    for _ in range(150):
+        state, speeds = scale * rng.uniform(-1.0, 1.0, 12), HOVER + rng.uniform(-8.0, 8.0, 4)
+        for law in (hard, soft, default):
+            law.reset(speeds)
+        strict, lenient, usually = (law.step(Moment(acting=speeds), state, reference) for law in (hard, soft, default))
+        assert {lenient.status, usually.status} == {SOLVED}
+        if strict.status != SOLVED:
+            continue
+        feasible += 1
+        pressing += strict.active > 20
+        assert lenient.slack < 1e-7
+        np.testing.assert_allclose(lenient.speeds, strict.speeds, atol=2e-3)
+        slacks.append(usually.slack)
+    assert feasible > 100
+    assert pressing > 50
+    assert np.mean(np.array(slacks) > 1e-7) < 0.12
+    assert max(slacks) < math.radians(0.5)
+
+
 def test_tightening_is_that_of_the_stated_bounds_lag_and_delay() -> None:
     drawn_in = robust(tightening={"acceleration": 0.2, "turning": 1.0}, rotor_lag=0.02, delay=0.01).settings.margins
     expected = margins(
@@ -181,6 +213,11 @@ def test_tightening_is_that_of_the_stated_bounds_lag_and_delay() -> None:
     )
     assert drawn_in is not None
     np.testing.assert_array_equal(drawn_in, expected)
+    doubled = robust(tightening={"acceleration": 0.2, "angular_acceleration": 1.0}).settings.margins
+    learning = robust(tightening={"acceleration": 0.1}, offset_free={}).settings.margins
+    assert doubled is not None
+    assert learning is not None
+    np.testing.assert_allclose(learning, doubled, rtol=1e-12)
 
 
 def test_weights_and_bounds_arrive_in_si_units() -> None:
@@ -198,6 +235,13 @@ def test_the_vehicles_lag_is_its_rotor_rise() -> None:
     assert isinstance(law, RobustMPC)
     assert law.settings.rotor_lag == vehicle.rotor_rise
     assert vehicle.rotor_rise
+
+
+def test_a_vehicle_whose_lag_is_too_short_is_refused() -> None:
+    one = scenario({**ROBUST, "rotor_lag": "vehicle"})
+    quick = replace(build_vehicle(one), rotor_rise=1e-9)
+    with pytest.raises(ParameterError, match=r"rotor_lag must be .* where the vehicle's rotor_rise is below 0\.0001 s"):
+        build_controller(one, quick)
 
 
 def test_a_vehicle_without_a_lag_has_none_to_give() -> None:
@@ -293,7 +337,7 @@ def test_fields_of_the_baselines_arrive() -> None:
     assert isinstance(pid, CascadedPID)
     assert isinstance(geometric, GeometricController)
     for law in (lqr, pid, geometric):
-        assert (law.settings.bounds.speed, law.settings.bounds.slew) == ((1.0, 300.0), (-20.0, 30.0))
+        assert same(law.settings.bounds, ActuatorBounds.alike((1.0, 300.0), (-20.0, 30.0)))
         assert (law.settings.tilt_max, law.horizon) == (12.0, 7)
     vehicle = build_vehicle(scenario("lqr"))
     assert same(lqr.settings.objective, bryson_objective(vehicle))
@@ -311,6 +355,7 @@ def test_fields_of_the_baselines_arrive() -> None:
 
 WRONG = {
     "controller.rotor_lag=-1": "controller.rotor_lag must be >= 0.0; got -1",
+    "controller.rotor_lag=1e-9": "controller.rotor_lag must be 0, or at least 0.0001 s; got 1e-09",
     "controller.rotor_lag=rotor": "controller.rotor_lag must be one of 'vehicle'; got 'rotor'",
     "controller.delay=-1": "controller.delay must be >= 0.0; got -1",
     "controller.soft.linear=-1": "controller.soft.linear must be >= 0.0; got -1",

@@ -10,7 +10,6 @@ import pytest
 from support import paper_reference
 
 from mpc.baselines.geometric import GeometricController, geometric_settings
-from mpc.baselines.limits import InputBounds
 from mpc.baselines.lqr import LQR, LQRSettings, bryson_objective
 from mpc.baselines.pid import CascadedPID, pid_settings
 from quadsim.assets import vehicle_path
@@ -41,10 +40,9 @@ def law(request: pytest.FixtureRequest) -> str:
 
 @pytest.fixture
 def build() -> Build:
-    """A law by name with its defaults for a vehicle; speeds within the vehicle's range unless told otherwise."""
+    """A law by name with its defaults for a vehicle."""
 
     def build_law(law: str, vehicle: Vehicle, **others: Any) -> Any:
-        others.setdefault("bounds", InputBounds(speed=(vehicle.speed_min, vehicle.speed_max)))
         if law == "lqr":
             return LQR(vehicle, LQRSettings(period=PERIOD, objective=bryson_objective(vehicle), **others))
         if law == "pid":

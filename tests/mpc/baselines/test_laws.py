@@ -11,8 +11,8 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from mpc.actuators import ActuatorBounds
 from mpc.baselines.geometric import geometric_settings
-from mpc.baselines.limits import InputBounds
 from mpc.baselines.pid import pid_settings
 from quadsim.controller import Moment, Phase
 from quadsim.errors import CommandError, ParameterError
@@ -102,7 +102,7 @@ def test_a_state_or_reference_that_is_not_finite_is_refused_and_forgotten(
 def test_on_the_ground_rotors_are_stopped_as_fast_as_slews_allow(
     law: str, vehicle: Vehicle, build: Build, phase: Phase
 ) -> None:
-    bounds = InputBounds(speed=(20.0, 250.0), slew=(-10.0, 5.0))
+    bounds = ActuatorBounds.alike((20.0, 250.0), (-10.0, 5.0))
     controller = build(law, vehicle, bounds=bounds)
     controller.reset(np.array([100.0, 25.0, 20.0, 200.0]))
     command = controller.step(Moment(phase=phase), np.full(12, math.nan), held(controller, np.zeros(4)))
@@ -110,7 +110,7 @@ def test_on_the_ground_rotors_are_stopped_as_fast_as_slews_allow(
     assert command.status == str(phase)
     command = controller.step(Moment(phase=phase), np.zeros(12), held(controller, np.zeros(4)))
     np.testing.assert_array_equal(command.speeds, [80.0, 20.0, 20.0, 180.0])
-    free = build(law, vehicle, bounds=InputBounds())
+    free = build(law, vehicle)
     command = free.step(Moment(phase=phase), np.zeros(12), held(free, np.zeros(4)))
     np.testing.assert_array_equal(command.speeds, 0.0)
 
@@ -134,7 +134,7 @@ def test_any_state_gets_a_command_within_speeds_and_slews(
     law: str, vehicle: Vehicle, build: Build, seed: int, size: float
 ) -> None:
     rng = np.random.default_rng(seed)
-    controller = build(law, vehicle, bounds=InputBounds(speed=(0.0, 250.0), slew=(-10.0, 5.0)))
+    controller = build(law, vehicle, bounds=ActuatorBounds.alike((0.0, 250.0), (-10.0, 5.0)))
     before = rng.uniform(0.0, 250.0, 4)
     controller.reset(before)
     for _ in range(3):
@@ -148,8 +148,22 @@ def test_any_state_gets_a_command_within_speeds_and_slews(
         before = speeds
 
 
+@pytest.mark.parametrize("size", [1e2, 1e4, 1e6])
+def test_without_bounds_of_its_own_it_commands_what_the_rotors_hold(
+    law: str, craft: Vehicle, build: Build, size: float
+) -> None:
+    rng, controller = np.random.default_rng(0), build(law, craft)
+    extremes = []
+    for _ in range(30):
+        state, pose = size * rng.normal(size=12), size * rng.normal(size=4)
+        extremes.append(controller.step(Moment(), state, held(controller, pose)).speeds)
+    assert np.min(extremes) >= craft.speed_min
+    assert np.max(extremes) <= craft.speed_max
+    assert np.max(extremes) > 1.1 * craft.hover_speed
+
+
 def test_the_command_in_force_is_what_slews_count_from(law: str, vehicle: Vehicle, build: Build) -> None:
-    controller = build(law, vehicle, bounds=InputBounds(speed=(0.0, 250.0), slew=(-10.0, 5.0)))
+    controller = build(law, vehicle, bounds=ActuatorBounds.alike((0.0, 250.0), (-10.0, 5.0)))
     late = Moment(acting=np.full(4, 100.0))
     speeds = controller.step(late, make_state(), held(controller, [0.0, 0.0, 5.0, 0.0])).speeds
     np.testing.assert_allclose(speeds, 105.0)
