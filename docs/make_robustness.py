@@ -9,6 +9,7 @@ import tempfile
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
+import numpy as np
 from fault_injection import AFTER, CONTROLLERS, NEAR, SOON, Consequence, draw, inject_all
 from PIL import Image
 
@@ -18,7 +19,10 @@ from quadsim.bench.ladder_tables import ARRIVED
 from quadsim.table import Cell, Grid
 from scenarios.bench.climbers import FULL
 from scenarios.bench.ladder import climb, write_ladder
+from scenarios.bench.rungs import WORN
 from scenarios.bench.solvers import section
+from scenarios.build import build_vehicle
+from scenarios.loading import load_scenario
 
 ROOT = Path(__file__).resolve().parent.parent
 FAULTS = 50
@@ -54,9 +58,18 @@ def asked(ladder: Ladder) -> Grid:
         title=f"What is asked of {FULL}",
         head=("asked", "does so"),
         lines=tuple((Cell(text=what), Cell(text=found)) for what, found in lines),
-        note=f"Disturbances beyond the sizes that the tightening states, {STATED.acceleration:g} m/s^2 and "
-        f"{STATED.angular_acceleration:g} rad/s^2, may tilt it further: a rotor that loses 20 % makes 17 rad/s^2.",
+        note="Disturbances beyond the size that the tightening states for those about each axis, "
+        f"{STATED.angular_acceleration:g} rad/s^2, may tilt it further: a rotor that loses {100 * WORN:g} % makes "
+        f"{worn_rotor():.0f} rad/s^2 at hover, and half of that in all by half. Measurement noise is not counted. "
+        "Steps are timed in further flights, one process at a time.",
     )
+
+
+def worn_rotor() -> float:
+    """Angular acceleration [rad/s^2] that the worn rotor makes at hover, about the axis where it is larger."""
+    vehicle = build_vehicle(load_scenario("paper-constrained"))
+    torques = WORN * vehicle.hover_speed**2 * np.abs(vehicle.allocation[1:3, 1])
+    return float((torques / vehicle.inertia[:2]).max())
 
 
 def _failing(flights: dict[str, LadderFlight], holds: Callable[[LadderFlight], bool]) -> str:

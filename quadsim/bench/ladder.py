@@ -24,7 +24,7 @@ class LadderFlight:
         peak_tilt: largest magnitude of roll or pitch at the physics rate [deg].
         violated: time at the physics rate with roll or pitch beyond its bound, tolerance 0 [s].
         fallbacks: periods not flown by the controller's own optimum.
-        step_p99: 99th percentile of the processor time of the controller's step [ms].
+        step_p99: 99th percentile of the processor time of the controller's step [ms]; None where it was not timed.
     """
 
     reason: str | None

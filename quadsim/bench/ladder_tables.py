@@ -55,7 +55,7 @@ def ladder_tables(ladder: Ladder) -> list[Grid]:
             "step",
             "99th percentile of the controller's step, ms",
             lambda flight: Cell(text=ABSENT if flight.step_p99 is None else f"{flight.step_p99:.2f}"),
-            "Processor time, as several flights share the machine.",
+            f"Processor time, of flights flown once more for it, one process at a time; {ABSENT} where none was.",
         ),
     ]
 

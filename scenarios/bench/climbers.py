@@ -137,6 +137,10 @@ CLIMBERS: Final = {
         about="and bounds drawn in for what may disturb it, and for what happens between samples",
         spec=_robust(offset_free=OBSERVER, tightening=TighteningSpec()),
     ),
+    "+ LTV": Climber(
+        about="as + offset-free, linearised at the present state in each period",
+        spec=_robust(offset_free=OBSERVER, linearisation="state"),
+    ),
     "+ iteration": Climber(
         about="as + offset-free, linearised along its last plan: the real-time iteration",
         spec=_robust(offset_free=OBSERVER, linearisation="trajectory"),

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import itertools
 import time as clock
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
@@ -18,7 +18,7 @@ from quadsim.controller import Command, Controller, Moment
 from quadsim.errors import ParameterError
 from quadsim.flightlog import FlightLog
 from quadsim.state import INDEX, POSITION, Array
-from scenarios.bench.climbers import CLIMBERS, QUICK_CLIMBERS, equip, tilt_bound
+from scenarios.bench.climbers import CLIMBERS, FULL, QUICK_CLIMBERS, equip, tilt_bound
 from scenarios.bench.processes import answer_all
 from scenarios.bench.rungs import CONDITIONS, QUICK_CONDITIONS
 from scenarios.bench.solvers import section
@@ -56,7 +56,8 @@ def climb(
 ) -> Ladder:
     """Fly every controller in every condition.
 
-    Flights are spread over processes; but for step times, results are the same however many there are.
+    Flights are spread over processes; results are the same however many there are.  Steps are timed in further flights,
+    one process at a time: those of `FULL` in every condition, and of every controller in the first one.
 
     Args:
         scenario: a constrained one whose bounds on roll and pitch are the same: a library name, or a file.
@@ -82,16 +83,23 @@ def climb(
     ]
     for cell in cells[: len(conditions)]:
         _varied(cell)  # one that cannot be flown is refused here, before anything is
-    flights = answer_all(
-        fly_cell, cells, workers=workers, progress=lambda done, total: progress("flights", done, total)
-    )
+    timed = [cell for cell in cells if cell.controller == FULL or cell.condition == conditions[0]]
+
+    def told(stage: str) -> Callable[[int, int], None]:
+        return lambda done, total: progress(stage, done, total)
+
+    flights = dict(zip(cells, answer_all(fly_cell, cells, workers=workers, progress=told("flights")), strict=True))
+    alone = dict(zip(timed, answer_all(fly_cell, timed, workers=1, progress=told("step times")), strict=True))
     return Ladder(
         scenario=flown.name,
         duration=flown.duration,
         tilt_bound=bound,
         controllers={name: CLIMBERS[name].about for name in controllers},
         conditions={name: CONDITIONS[name].about for name in conditions},
-        flights={(cell.controller, cell.condition): flight for cell, flight in zip(cells, flights, strict=True)},
+        flights={
+            (cell.controller, cell.condition): replace(flight, step_p99=alone[cell].step_p99 if cell in alone else None)
+            for cell, flight in flights.items()
+        },
         machine=machine(),
     )
 

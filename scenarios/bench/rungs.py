@@ -5,6 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Final
 
+WORN: Final = 0.2
+"""Share of its thrust and torque that the worn rotor loses."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class Condition:
@@ -39,7 +42,7 @@ def _noise(share: float) -> tuple[str, ...]:
 
 
 def _worn(share: float) -> tuple[str, ...]:
-    return (f"events=[{{type='rotor_loss', at=12.0, rotor=2, loss={0.2 * share}}}]",)
+    return (f"events=[{{type='rotor_loss', at=12.0, rotor=2, loss={WORN * share}}}]",)
 
 
 CONDITIONS: Final = {
@@ -62,7 +65,9 @@ CONDITIONS: Final = {
         "standard deviation",
         settings=_noise(1.0),
     ),
-    "worn rotor": Condition(about="rotor 2 loses 20 % of thrust and torque at 12 s, for good", settings=_worn(1.0)),
+    "worn rotor": Condition(
+        about=f"rotor 2 loses {100 * WORN:g} % of thrust and torque at 12 s, for good", settings=_worn(1.0)
+    ),
     "yaw 180 deg": Condition(
         about="starts half a turn away from the heading that it is to have",
         settings=("initial.euler=[0.0, 0.0, 180.0]",),

@@ -131,6 +131,7 @@ def test_parts_are_switched_on_one_after_another() -> None:
     assert parts("+ model") == (0.025, 0.01, True, False, False, "hover")
     assert parts("+ offset-free") == (0.025, 0.01, True, True, False, "hover")
     assert parts("+ tightening") == (0.025, 0.01, True, True, True, "hover")
+    assert parts("+ LTV") == (0.025, 0.01, True, True, False, "state")
     assert parts("+ iteration") == (0.025, 0.01, True, True, False, "trajectory")
     assert equip(scenario, "paper", CONDITIONS["nominal"]) == scenario
 
@@ -181,6 +182,21 @@ def test_results_do_not_depend_on_processes(quick: Ladder) -> None:
     assert replace(quick.flights[name], step_p99=None) == replace(alone, step_p99=None)
     assert len(quick.flights) == 9
     assert [*quick.flights] == [(a, b) for a in quick.controllers for b in quick.conditions]
+
+
+def test_steps_are_timed_of_the_full_controller_and_in_the_first_condition(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each question is answered at once here, its answer marked with the number of processes that were to be used."""
+    asked: list[tuple[int | None, int]] = []
+
+    def answer(ask: object, cells: list[Cell], *, workers: int | None, progress: object) -> list[LadderFlight]:
+        asked.append((workers, len(cells)))
+        return [replace(WELL, step_p99=float(workers or 0)) for _ in cells]
+
+    monkeypatch.setattr("scenarios.bench.ladder.answer_all", answer)
+    ladder = climb(workers=2)
+    assert asked == [(2, len(CLIMBERS) * len(CONDITIONS)), (1, len(CLIMBERS) + len(CONDITIONS) - 1)]
+    for (controller, condition), flight in ladder.flights.items():
+        assert flight.step_p99 == (1.0 if controller == FULL or condition == "nominal" else None)
 
 
 def test_a_ladder_is_written_whole_and_replaces_its_own_kind(quick: Ladder, tmp_path: Path) -> None:
