@@ -17,12 +17,29 @@ DEEPEST: Final = 20
 """Tables and lists within one another; a scenario has a third of them."""
 
 
-def read_scenario(path: Path, find: Callable[[str], Path], *, above: tuple[Path, ...] = ()) -> dict[str, Any]:
+def locate_files(data: dict[str, Any], directory: Path) -> None:
+    """Make paths that are relative to a file's folder independent of it, in place."""
+    for table, field in (("vehicle", "file"), ("reference", "file")):
+        file = data.get(table, {}).get(field) if isinstance(data.get(table), dict) else None
+        if isinstance(file, str) and (directory / file).is_file():
+            data[table][field] = str((directory / file).resolve())
+    if "controller" in data:
+        data["controller"] = located(data["controller"], directory)
+
+
+def read_scenario(
+    path: Path,
+    find: Callable[[str], Path],
+    *,
+    locate: Callable[[dict[str, Any], Path], None] = locate_files,
+    above: tuple[Path, ...] = (),
+) -> dict[str, Any]:
     """A scenario file's tables, merged over those of its base, and that one's base, and so on.
 
     Args:
         path: the file.
         find: from a name to the file it means; see `scenarios.loading.scenario_path`.
+        locate: makes the paths in a base independent of its folder, in place.
         above: the files that led here.
 
     Raises:
@@ -40,7 +57,7 @@ def read_scenario(path: Path, find: Callable[[str], Path], *, above: tuple[Path,
     chain = (*above, path.resolve())
     if base.resolve() in chain:
         raise FileError(path, f"is its own base: {' -> '.join([*(file.name for file in chain), base.name])}")
-    inherited = read_scenario(base, find, above=chain)
+    inherited = read_scenario(base, find, locate=locate, above=chain)
     locate(inherited, base.parent)
     # The base's place in the library is its own.
     return merge({key: value for key, value in inherited.items() if key not in ("group", "expect")}, data)
@@ -107,13 +124,3 @@ def _named(value: Any) -> bool:
         return False
     names = [entry.get("name") for entry in value]
     return all(isinstance(name, str) for name in names) and len(set(names)) == len(names)
-
-
-def locate(data: dict[str, Any], directory: Path) -> None:
-    """Make paths that are relative to a file's folder independent of it, in place."""
-    for table, field in (("vehicle", "file"), ("reference", "file")):
-        file = data.get(table, {}).get(field) if isinstance(data.get(table), dict) else None
-        if isinstance(file, str) and (directory / file).is_file():
-            data[table][field] = str((directory / file).resolve())
-    if "controller" in data:
-        data["controller"] = located(data["controller"], directory)

@@ -51,6 +51,11 @@ class OwnController:
         return str(getattr(self._law, "name", type(self._law).__name__))
 
     @property
+    def module(self) -> str:
+        """The module that its code is in."""
+        return type(self._law).__module__
+
+    @property
     def solver(self) -> str:
         """Its QP solver; empty where it names none."""
         return str(getattr(self._law, "solver", ""))

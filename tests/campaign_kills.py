@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import signal
 import subprocess
 import sys
 import tempfile
@@ -92,6 +93,8 @@ def kill_and_resume(directory: Path, *, kills: int, flights: int, duration: floa
             if what is not None:
                 killed[what] += 1
             if campaign.poll() is not None:
+                if campaign.returncode != -signal.SIGKILL:
+                    raise RuntimeError(f"the campaign ended with exit status {campaign.returncode}")
                 campaign = subprocess.Popen(disturbed, stdout=subprocess.DEVNULL)
         if campaign.wait(timeout=600.0) != 0:
             raise RuntimeError(f"the campaign ended with exit status {campaign.returncode}")

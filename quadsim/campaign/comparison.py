@@ -13,7 +13,7 @@ from typing import Any, Final
 import numpy as np
 import pyarrow as pa
 
-from quadsim.campaign.columns import draw_names, numbers, texts
+from quadsim.campaign.columns import constraint_names, draw_names, numbers, texts
 from quadsim.campaign.curves import ALPHA
 from quadsim.campaign.events import Flags, parse_event
 from quadsim.campaign.paired_margins import ShownMargins, paired_margins
@@ -171,19 +171,27 @@ class Comparison:
         return comparison_markdown(self)
 
 
-def compare(table_a: pa.Table, table_b: pa.Table, names: tuple[str, str]) -> Comparison:
+def compare(
+    table_a: pa.Table,
+    table_b: pa.Table,
+    names: tuple[str, str],
+    failures: tuple[Sequence[str], Sequence[str]] | None = None,
+) -> Comparison:
     """Compare two campaigns, pairing their flights by number.
 
     Args:
         table_a: `flights.parquet` of the first.
         table_b: of the second.
         names: of the first and the second; where they are the same, the comparison tells them apart as such.
+        failures: the events that each counts as failure; None where they are known to be the same.
 
     Raises:
-        InputError: they have no flight in common, or a pair differs in its seed or in a value that both drew.
+        InputError: they count other events as failure, or have other constraints; they have no flight in common; or a
+            pair differs in its seed or in a value that both drew.
     """
     if names[0] == names[1]:
         names = (f"{names[0]} (first)", f"{names[1]} (second)")
+    _require_same_questions(table_a, table_b, names, failures)
     shared = np.intersect1d(numbers(table_a, "flight"), numbers(table_b, "flight"))
     if not shared.size:
         raise InputError(f"campaigns {names[0]!r} and {names[1]!r} have no flight of one number: nothing can be paired")
@@ -210,6 +218,25 @@ def compare(table_a: pa.Table, table_b: pa.Table, names: tuple[str, str]) -> Com
         ),
         shown_margins=paired_margins(a, b, events["failure"], names),
     )
+
+
+def _require_same_questions(
+    a: pa.Table, b: pa.Table, names: Sequence[str], failures: tuple[Sequence[str], Sequence[str]] | None
+) -> None:
+    if failures is not None:
+        first, second = (sorted({parse_event(text).text for text in events}) for events in failures)
+        if first != second:
+            raise InputError(
+                f"{names[0]!r} counts {', '.join(first)} as failure, and {names[1]!r} {', '.join(second)}: only "
+                "campaigns with the same failure events can be compared; fly one of them again with the other's"
+            )
+    only = [sorted(set(constraint_names(one)) - set(constraint_names(other))) for one, other in ((a, b), (b, a))]
+    for name, own in zip(names, only, strict=True):
+        if own:
+            raise InputError(
+                f"{name!r} alone has the constraints {', '.join(own)}: only campaigns that are audited against the "
+                "same constraints can be compared"
+            )
 
 
 def _require_alike(a: pa.Table, b: pa.Table, column: str, names: Sequence[str]) -> None:

@@ -94,6 +94,7 @@ class Driver:
     """How a drawn number goes with an outcome: rank correlations, None where there is none to tell."""
 
     name: str
+    label: str
     with_margin: float | None
     with_failure: float | None
     margin_is_sure: bool
@@ -133,16 +134,15 @@ def clouds(table: pa.Table) -> list[Cloud]:
     found = []
     for name in draw_names(table):
         column = DRAW + name
+        told = label(name, unit_of(table, column))
         if is_number(table, column):
-            found.append(
-                Cloud(name=name, label=label(name, unit_of(table, column)), x=numbers(table, column), names=())
-            )
+            found.append(Cloud(name=name, label=told, x=numbers(table, column), names=()))
             continue
         values = texts(table, column)
         names = tuple(sorted(set(values)))
         spread = np.random.default_rng(0).uniform(-0.3, 0.3, values.size)  # as every time
         x = np.array([names.index(value) for value in values], float) + spread
-        found.append(Cloud(name=name, label=name, x=x, names=names))
+        found.append(Cloud(name=name, label=told, x=x, names=names))
     return found
 
 
@@ -199,6 +199,7 @@ def drivers(summary: Summary) -> list[Driver]:
         found.append(
             Driver(
                 name=name,
+                label=label(name, parameter["unit"]),
                 with_margin=None if margin is None else margin["rho"],
                 with_failure=None if failed is None else failed["rho"],
                 margin_is_sure=margin is not None and margin["p_holm"] < ALPHA,

@@ -39,6 +39,8 @@ Summary = Mapping[str, Any]
 WORST_FLIGHTS: Final = 10
 _WORSE: Final = {"lost": 0, "error": 1, "violated": 2, "satisfied": 3}
 _CURVE_POINTS: Final = 80
+_GROUPS: Final = ((50, 5), (12, 3))
+"""Flights from which a drawn number's values are looked at in so many groups of about equal size."""
 
 
 def estimate(table: pa.Table) -> dict[str, Any]:
@@ -46,9 +48,10 @@ def estimate(table: pa.Table) -> dict[str, Any]:
 
     Keys: `flights`; `confidence` of every interval; `verdicts`, flights of each; `events` and `constraints`, by name,
     as proportions (`quadsim.campaign.statistics.Proportion`), a constraint's being that it did not hold or was not
-    reached; `metrics`, over the flights that have each; `parameters`, the rank correlation of each drawn number with
-    the worst margin and with failure, or the failures by level of what is drawn from names; `worst`, the ten worst
-    flights; `convergence` of the shares of failure and violation over the first n flights.
+    reached; `metrics`, over the flights that have each; `parameters`, of each drawn number the rank correlation with
+    the worst margin and with failure, and the failures by `groups` of its values from the lowest on, or the failures
+    by level of what is drawn from names; `worst`, the ten worst flights; `convergence` of the shares of failure and
+    violation over the first n flights.
 
     Args:
         table: `flights.parquet`; of no flights as well.
@@ -153,7 +156,8 @@ def _parameters(table: pa.Table) -> dict[str, Any]:
     drawn = [name for name in names if is_number(table, DRAW + name)]
     found: dict[str, Any] = {name: _levels(table, name, failed) for name in names if name not in drawn}
     for name in drawn:
-        found[name] = {"kind": "number", "unit": unit_of(table, DRAW + name)}
+        values = numbers(table, DRAW + name)
+        found[name] = {"kind": "number", "unit": unit_of(table, DRAW + name), "groups": _groups(values, failed)}
     for outcome, values in outcomes.items():
         correlations = {name: rank_correlation(numbers(table, DRAW + name), values) for name in drawn}
         for name, correlation in _corrected(correlations).items():
@@ -173,6 +177,22 @@ def _levels(table: pa.Table, name: str, failed: Flags) -> dict[str, Any]:
     levels = texts(table, DRAW + name)
     shares = {level: _share(failed[levels == level]) for level in sorted(set(levels))}
     return {"kind": "name", "unit": unit_of(table, DRAW + name), "levels": shares}
+
+
+def _groups(values: Array, failed: Flags) -> list[dict[str, Any]]:
+    """Failures by thirds or fifths of a drawn number, or by its values where these are no more; none of few flights."""
+    there = np.isfinite(values)
+    values, failed = values[there], failed[there]
+    size = next((groups for flights, groups in _GROUPS if values.size >= flights), 0)
+    if not size:
+        return []
+    distinct = np.unique(values)
+    cuts = distinct[1:] if distinct.size <= size else np.quantile(values, np.arange(1, size) / size)
+    group = np.searchsorted(cuts, values, side="right")
+    return [
+        {"low": float(values[of].min()), "high": float(values[of].max()), **_share(failed[of])}
+        for of in (group == k for k in np.unique(group))
+    ]
 
 
 def _flight(table: pa.Table, row: int) -> dict[str, Any]:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 import operator
 import re
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
@@ -36,6 +36,8 @@ _OPERATIONS: Final[dict[str, Callable[[Any, Any], Any]]] = {
     ">": operator.gt,
     ">=": operator.ge,
 }
+_NEVER_COMPARED: Final = ("flight", "seed", "failed")
+"""Columns that tell flights apart, or what other events make of them."""
 _COMPARISON: Final = re.compile(r"(?P<column>[^<>=]*?)\s*(?P<operation><=|>=|<|>)\s*(?P<number>[^<>=]*)")
 
 EVENT_NAMES: Final = tuple(_NAMED)
@@ -76,7 +78,7 @@ class Event:
         if self.operation == "==":
             return bool(value == self.value)
         if isinstance(value, str):
-            raise InputError(f"event {self.text!r} compares with a number; the column {self.column_name!r} holds text")
+            raise _no_number(self.text, self.column_name)
         return math.isnan(value) or bool(_OPERATIONS[self.operation](value, self.value))
 
     def column(self, table: pa.Table) -> Flags:
@@ -88,19 +90,22 @@ class Event:
         """
         if self.column_name not in table.column_names:
             raise UnknownNameError("column", self.column_name, table.column_names)
+        if self.operation != "==" and not _is_number(table.schema.field(self.column_name).type):
+            raise _no_number(self.text, self.column_name)
         return np.array([self.holds({self.column_name: value}) for value in table[self.column_name].to_pylist()], bool)
 
 
-def parse_event(text: str, columns: Iterable[str] | None = None) -> Event:
+def parse_event(text: str, columns: Mapping[str, pa.DataType] | pa.Schema | None = None) -> Event:
     """An event from its text.
 
     Args:
         text: `failure`, `violation`, `lost`, `crash` or `error`, where `failed`, `violated` and `crashed` mean the same
             as their nouns; or `COLUMN OP NUMBER` with one of `< <= > >=`, e.g. `rmse.z > 0.5`.
-        columns: those that a comparison may name; None for any.
+        columns: those that a comparison may name, with their types, or the schema of a table; None for any.
 
     Raises:
         UnknownNameError: no event has that name, or there is no such column.
+        InputError: a comparison is with a column that holds text, or with `flight`, `seed` or `failed`.
         ParameterError: what is compared with is not a finite number.
     """
     text = " ".join(text.split())
@@ -113,8 +118,12 @@ def parse_event(text: str, columns: Iterable[str] | None = None) -> Event:
         hint = "or a comparison, COLUMN OP NUMBER with < <= > or >=, such as 'rmse.z > 0.5'"
         raise UnknownNameError("event", text, {*_NAMED, *_SPELLINGS}, hint=hint)
     column = found["column"]
-    if columns is not None and column not in (known := tuple(columns)):
-        raise UnknownNameError("column", column, known)
+    if column in _NEVER_COMPARED:
+        raise InputError(
+            f"event {text!r} must compare a column that measures a flight, such as rmse.z; {column!r} does not"
+        )
+    if columns is not None:
+        _require_number(column, columns, text)
     number = _number(found["number"], text)
     return Event(
         text=f"{column} {found['operation']} {number:.15g}",
@@ -122,6 +131,25 @@ def parse_event(text: str, columns: Iterable[str] | None = None) -> Event:
         operation=found["operation"],
         value=number,
     )
+
+
+def _require_number(column: str, columns: Mapping[str, pa.DataType] | pa.Schema, event: str) -> None:
+    kinds = columns if isinstance(columns, Mapping) else dict(zip(columns.names, columns.types, strict=True))
+    if column not in kinds:
+        raise UnknownNameError("column", column, [name for name, kind in kinds.items() if _is_number(kind)])
+    if not _is_number(kinds[column]):
+        raise _no_number(event, column)
+
+
+def _is_number(kind: pa.DataType) -> bool:
+    """Whether a column's values, numbers or truth values, can be compared with a number."""
+    from pyarrow import types
+
+    return bool(types.is_boolean(kind) or types.is_integer(kind) or types.is_floating(kind))
+
+
+def _no_number(event: str, column: str) -> InputError:
+    return InputError(f"event {event!r} compares with a number; the column {column!r} holds text")
 
 
 def _number(given: str, event: str) -> float:

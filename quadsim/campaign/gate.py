@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import re
 from dataclasses import asdict, dataclass
+from decimal import Decimal
 from typing import Any, Final
 
 import pyarrow as pa
@@ -15,6 +16,10 @@ from quadsim.campaign.wording import count_of, percent
 from quadsim.errors import InputError, ParameterError
 
 EXAMPLE: Final = "P(violation) < 0.01 @ 95%"
+_SHARES: Final = (Decimal("1e-9"), 1 - Decimal("1e-9"))
+_CONFIDENCES: Final = (Decimal("0.5"), Decimal("0.999999"))
+_MOST_TOLD: Final = 10**9
+"""Flights beyond which it is only told that it takes more."""
 _FORM: Final = re.compile(
     r"P\s*\((?P<event>[^()]*)\)\s*(?P<operation><=|>=|<|>)\s*(?P<share>[^<>=@]+?)\s*@\s*(?P<confidence>[^@%]+?)\s*%",
     re.IGNORECASE,
@@ -29,8 +34,8 @@ class Requirement:
         text: as it was given.
         event: whose probability.
         operation: `<`, `<=`, `>` or `>=`.
-        share: the limit on the probability, above 0 and below 1.
-        confidence: of the one-sided bound, from 0.5 to below 1.
+        share: the limit on the probability, from 1e-9 to 1 - 1e-9.
+        confidence: of the one-sided bound, from 0.5 to 0.999999.
     """
 
     text: str
@@ -85,10 +90,10 @@ class Judgement:
         )
         if self.flights >= self.least_flights:
             return told
-        return (
-            f"{told} It takes at least {count_of(self.least_flights, 'flight')}, "
-            f"{'none' if asked.at_most else 'all'} of them with that event."
-        )
+        least = f"at least {count_of(self.least_flights, 'flight')}"
+        if self.least_flights > _MOST_TOLD:
+            least = f"more than {_MOST_TOLD:,} flights"
+        return f"{told} It takes {least}, {'none' if asked.at_most else 'all'} of them with that event."
 
     def to_json(self) -> dict[str, Any]:
         """Plain data for `summary.json`."""
@@ -101,7 +106,8 @@ def parse_requirement(text: str) -> Requirement:
 
     Args:
         text: `P(EVENT) OP SHARE @ CONFIDENCE%`: an event as `quadsim.campaign.events.parse_event` takes it, one of
-            `< <= > >=`, a share above 0 and below 1 or in percent, and the confidence in percent.
+            `< <= > >=`, a share from 1e-9 to 1 - 1e-9, as such or in percent, and the confidence, from 50 to
+            99.9999 percent.
 
     Raises:
         InputError: it is not of that form.
@@ -116,8 +122,8 @@ def parse_requirement(text: str) -> Requirement:
             f"{EXAMPLE!r}"
         )
     owner = f"requirement {text!r}"
-    share = _number(owner, "share", found["share"], low=0.0, low_included=False)
-    confidence = _number(owner, "confidence", found["confidence"] + "%", low=0.5, low_included=True)
+    share = _number(owner, "share", found["share"], *_SHARES)
+    confidence = _number(owner, "confidence", found["confidence"] + "%", *_CONFIDENCES)
     return Requirement(
         text=text,
         event=parse_event(found["event"].strip()),
@@ -157,14 +163,13 @@ def judge(table: pa.Table, requirement: Requirement) -> Judgement:
 def least_flights(requirement: Requirement) -> int:
     """The smallest number of flights that can support a requirement, all of them as it wishes.
 
-    With n such flights the bound is (1 - confidence)^(1/n) from the far end: n = ln(1 - confidence) / ln(1 - share).
+    With n such flights the bound is (1 - confidence)^(1/n) from the far end, which asks for
+    n = ln(1 - confidence) / ln(1 - share); at a tie, the bound itself as it is computed decides.
     """
-    missing = 1.0 - requirement.confidence
-    kept = 1.0 - requirement.share if requirement.at_most else requirement.share
-    n = max(1, math.floor(math.log(missing) / math.log(kept)) - 1)
-    while not requirement.supported_by(_best_bound(requirement, n)):
-        n += 1
-    return n
+    kept = math.log1p(-requirement.share) if requirement.at_most else math.log(requirement.share)
+    n = max(1, math.ceil(math.log1p(-requirement.confidence) / kept))
+    near = range(max(1, n - 1), n + 2)
+    return next((k for k in near if requirement.supported_by(_best_bound(requirement, k))), n)
 
 
 def _best_bound(requirement: Requirement, n: int) -> float:
@@ -173,14 +178,18 @@ def _best_bound(requirement: Requirement, n: int) -> float:
     return lower_bound(n, n, requirement.confidence)
 
 
-def _number(owner: str, name: str, given: str, *, low: float, low_included: bool) -> float:
+def _number(owner: str, name: str, given: str, low: Decimal, high: Decimal) -> float:
     """A share of one, given as such or in percent."""
-    rule = f"{'from' if low_included else 'above'} {100 * low:g}% and below 100%"
-    digits, in_percent = given.removesuffix("%").strip(), given.endswith("%")
+    in_percent = given.endswith("%")
+    if in_percent:
+        rule = f"from {(100 * low).normalize():f}% to {(100 * high).normalize():f}%"
+    else:
+        rule = f"a number from {low} to {high}".lower()
     try:
-        value = float(digits) / (100.0 if in_percent else 1.0)
-    except ValueError:
-        value = math.nan
-    if not (low <= value < 1.0 if low_included else low < value < 1.0):
-        raise ParameterError(owner, name, given, rule if in_percent else "a number above 0 and below 1")
-    return value
+        value = Decimal(given.removesuffix("%").strip()) / (100 if in_percent else 1)
+        allowed = low <= value <= high
+    except ArithmeticError:
+        allowed = False
+    if not allowed:
+        raise ParameterError(owner, name, given, rule)
+    return float(value)

@@ -17,9 +17,11 @@ from quadsim.campaign.tables import (
     constraint_table,
     driver_table,
     event_table,
+    group_table,
     level_tables,
     manifest_table,
     metric_table,
+    worst_draws_table,
     worst_table,
 )
 from quadsim.campaign.wording import count_of
@@ -85,8 +87,11 @@ def write_report(
         constraints=constraint_table(summary),
         metrics=metric_table(summary),
         drivers=driver_table(summary),
+        groups=group_table(summary),
         levels=level_tables(summary),
+        lost=summary["verdicts"]["lost"],
         worst=worst_table(summary, str(directory)),
+        worst_draws=worst_draws_table(summary),
         manifest=manifest_table(manifest),
         plots=plots,
         at_foot=_at_foot(table),

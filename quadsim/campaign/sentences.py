@@ -2,20 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from typing import Any, Final
 
 from quadsim.campaign.curves import ALPHA
 from quadsim.campaign.estimates import Summary
-from quadsim.campaign.wording import count_of, p_value, percent, share_with_interval
+from quadsim.campaign.wording import count_of, listing, p_value, percent, share_with_interval
 from quadsim.table import format_number
 
 _OUTCOMES = {"worst_margin": "The worst margin", "failed": "Failure"}
 _VERDICTS = {
     "satisfied": "held every required constraint",
-    "violated": "violated at least one",
+    "violated": "violated a required constraint",
     "lost": "were lost",
     "error": "raised an error",
 }
+_MOST_NAMED: Final = 4
 
 
 def verdict_sentence(summary: Summary) -> str:
@@ -31,7 +33,11 @@ def campaign_sentences(summary: Summary) -> list[str]:
 
 
 def _outcomes(summary: Summary) -> Iterator[str]:
-    parts = [f"{count} {_VERDICTS[verdict]}" for verdict, count in summary["verdicts"].items() if count]
+    told = {verdict: count for verdict, count in summary["verdicts"].items() if count}
+    parts = [
+        f"{count} {_VERDICTS[verdict].replace('were', 'was') if count == 1 else _VERDICTS[verdict]}"
+        for verdict, count in told.items()
+    ]
     if len(parts) == 1 and summary["flights"] > 1:
         yield f"All {parts[0].replace(' ', ' flights ', 1)}."
     elif parts:
@@ -42,29 +48,41 @@ def _bounds(summary: Summary) -> Iterator[str]:
     if not summary["flights"]:
         return
     events = summary["events"]
-    parts = [f"{percent(events['failure']['upper_one_sided'])} fail"]
+    parts = [f"{_bound(events['failure'])} fail"]
     if events["violation"]["count"] != events["failure"]["count"]:
-        parts.append(f"{percent(events['violation']['upper_one_sided'])} violate a required constraint")
+        parts.append(f"{_bound(events['violation'])} violate a required constraint")
     each = " each" if len(parts) > 1 else ""
     yield (
-        f"With {100.0 * summary['confidence']:g} % confidence{each}, at most {' and at most '.join(parts)} "
-        "(one-sided Clopper-Pearson)."
+        f"With {100.0 * summary['confidence']:g} % confidence{each}, {' and '.join(parts)} (one-sided Clopper-Pearson)."
     )
+
+
+def _bound(event: Mapping[str, Any]) -> str:
+    """The one-sided bound that says more: from below where most flights had the event."""
+    if event["share"] > 0.5:
+        return f"at least {percent(event['lower_one_sided'])}"
+    return f"at most {percent(event['upper_one_sided'])}"
 
 
 def _constraints(summary: Summary) -> Iterator[str]:
     broken = {name: found for name, found in summary["constraints"].items() if found["not_satisfied"]["count"]}
     if not broken:
         return
-    name, found = max(broken.items(), key=lambda item: item[1]["not_satisfied"]["count"])
+    most = max(found["not_satisfied"]["count"] for found in broken.values())
+    names = [name for name, found in broken.items() if found["not_satisfied"]["count"] == most]
+    found = broken[names[0]]
     share = share_with_interval(found["not_satisfied"], summary["confidence"])
+    if len(names) > 1:
+        listed = listing(names, most=_MOST_NAMED)
+        yield f"What most often does not hold is {listed}, each in {share} of all flights."
+        return
     margin = (
         f"; its worst margin is {format_number(found['worst_margin'])} {found['unit']}, in flight "
         f"{found['worst_flight']}"
         if found["worst_margin"] is not None
         else ""
     )
-    yield f"What most often does not hold is {name}, in {share} of all flights{margin}."
+    yield f"What most often does not hold is {names[0]}, in {share} of all flights{margin}."
 
 
 def _drivers(summary: Summary) -> Iterator[str]:
@@ -87,7 +105,10 @@ def _worst(summary: Summary) -> Iterator[str]:
         return
     worst = summary["worst"][0]
     margin = worst["worst_margin"]
-    told = (
-        f", with a worst margin of {format_number(margin)} ({worst['worst_constraint']})" if margin is not None else ""
-    )
+    if margin is None:
+        told = ""
+    elif worst["verdict"] == "lost" and margin >= 0.0:
+        told = " before any required constraint was violated"
+    else:
+        told = f", with a worst margin of {format_number(margin)} ({worst['worst_constraint']})"
     yield f"The worst flight is number {worst['flight']}: {worst['verdict']}{told}."

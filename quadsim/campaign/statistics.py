@@ -31,6 +31,7 @@ class Proportion:
         share: count / flights; None of no flights.
         lower: lower end of the two-sided interval.
         upper: upper end of the two-sided interval.
+        lower_one_sided: what the share is at least, with all the doubt on that side.
         upper_one_sided: what the share is at most, with all the doubt on that side.
     """
 
@@ -39,6 +40,7 @@ class Proportion:
     share: float | None
     lower: float
     upper: float
+    lower_one_sided: float
     upper_one_sided: float
 
 
@@ -108,7 +110,7 @@ def lower_bound(count: int, trials: int, confidence: float = CONFIDENCE) -> floa
 
 
 def proportion(count: int, flights: int, confidence: float = CONFIDENCE) -> Proportion:
-    """A share of flights with its two-sided interval and its one-sided upper bound, all Clopper-Pearson."""
+    """A share of flights with its two-sided interval and its one-sided bounds, all Clopper-Pearson."""
     either = 0.5 * (1.0 + confidence)
     return Proportion(
         count=count,
@@ -116,6 +118,7 @@ def proportion(count: int, flights: int, confidence: float = CONFIDENCE) -> Prop
         share=count / flights if flights else None,
         lower=lower_bound(count, flights, either),
         upper=upper_bound(count, flights, either),
+        lower_one_sided=lower_bound(count, flights, confidence),
         upper_one_sided=upper_bound(count, flights, confidence),
     )
 

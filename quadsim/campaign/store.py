@@ -43,12 +43,19 @@ def locked(directory: Path) -> Iterator[None]:
     except OSError as error:
         raise OutputError(directory, error.strerror or str(error)) from error
     try:
-        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        _hold(handle, directory)
         yield
-    except BlockingIOError as error:
-        raise OutputError(directory, "another campaign is being flown there") from error
     finally:
         os.close(handle)
+
+
+def _hold(handle: int, directory: Path) -> None:
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError as error:
+        raise OutputError(directory, "another campaign is being flown there") from error
+    except OSError as error:  # of a file system that knows no locks
+        raise OutputError(directory, f"cannot be held for one campaign alone ({error.strerror})") from error
 
 
 class Store:
@@ -79,6 +86,11 @@ class Store:
         whole = pa.concat_tables(tables)
         _, first = np.unique(whole["flight"].to_numpy(), return_index=True)
         return whole.take(first)
+
+    def counted(self) -> int:
+        """Flights of the final table that is there; 0 where there is none."""
+        path = self._directory / FLIGHTS_FILE
+        return read_table(path).num_rows if path.is_file() else 0
 
     def append(self, rows: Sequence[Row]) -> None:
         """Add rows in one step.

@@ -62,11 +62,11 @@ TIMING: Final = (("wall_s", "s"), ("step_p50_ms", "ms"), ("step_p99_ms", "ms"))
 """What a clock measured of a flight, with units; it stands in a table of its own."""
 
 
-def make_schema(draws: Mapping[str, pa.DataType], limits: Sequence[Limit]) -> pa.Schema:
+def make_schema(draws: Mapping[str, tuple[pa.DataType, str]], limits: Sequence[Limit]) -> pa.Schema:
     """The columns of a campaign, clock times last.
 
     Args:
-        draws: the drawn parameters' names and types.
+        draws: type and unit, `-` for none, of each drawn parameter, by name.
         limits: what its flights are audited against.
     """
     tracked = [
@@ -86,7 +86,7 @@ def make_schema(draws: Mapping[str, pa.DataType], limits: Sequence[Limit]) -> pa
     columns = [
         ("flight", "-", pa.int64()),
         ("seed", "-", pa.int64()),
-        *((DRAW + name, "-", kind) for name, kind in draws.items()),
+        *((DRAW + name, unit, kind) for name, (kind, unit) in draws.items()),
         *_HEAD,
         *tracked,
         *_COMMANDS,
@@ -132,9 +132,10 @@ def failed_row(reason: str) -> Row:
 def worst_margin(findings: Iterable[Finding]) -> tuple[float | None, str | None]:
     """The smallest margin of the required constraints, tolerance included, as a share of half its band, and whose.
 
-    1 is the middle of a band, 0 the end of what is allowed; of a bound with one side alone, the share is of the bound's
-    own magnitude.  A command at its own bound is no near miss: constraints of `speed` and `slew` count once they are
-    violated.  None where no such constraint was reached.
+    At the physics rate or at the control samples, each with its own tolerance, whichever is smaller: it is negative
+    where a constraint that was reached did not hold.  1 is the middle of a band, 0 the end of what is allowed; of a
+    bound with one side alone, the share is of the bound's own magnitude.  A command at its own bound is no near miss:
+    constraints of `speed` and `slew` count once they are violated.  None where no such constraint was reached.
     """
     shares = [
         (share, finding.limit.name)
@@ -146,9 +147,9 @@ def worst_margin(findings: Iterable[Finding]) -> tuple[float | None, str | None]
 
 
 def make_table(rows: Iterable[Row], schema: pa.Schema) -> pa.Table:
-    """Rows as a table, sorted by flight; what a row lacks is null."""
+    """Rows as a table, sorted by flight; what a row lacks is null, and text that is no Unicode has backslashes."""
     ordered = sorted(rows, key=lambda row: row["flight"])
-    columns = [pa.array([row.get(field.name) for row in ordered], field.type) for field in schema]
+    columns = [pa.array([_storable(row.get(field.name)) for row in ordered], field.type) for field in schema]
     return pa.Table.from_arrays(columns, schema=schema)
 
 
@@ -210,7 +211,14 @@ def _share(finding: Finding) -> float:
         half = 0.5 * (upper - lower)
     else:
         half = abs(lower if math.isfinite(lower) else upper) or 1.0
-    return (finding.worst_margin + finding.limit.tolerance) / half
+    at_physics_rate = finding.worst_margin + finding.limit.tolerance
+    at_samples = finding.worst_margin_sampled + finding.limit.tolerance_sampled
+    return float(np.fmin(at_physics_rate, at_samples) if math.isfinite(at_physics_rate) else at_physics_rate) / half
+
+
+def _storable(value: object) -> object:
+    """A text without lone surrogates, which no file holds; all else as it is."""
+    return value.encode("utf-8", "backslashreplace").decode() if isinstance(value, str) else value
 
 
 def _finite(value: float) -> float | None:

@@ -12,12 +12,19 @@ from quadsim.campaign.wording import interval, p_value, percent
 from quadsim.table import ABSENT, Cell, Grid, Mark, format_number
 
 _BAD = ("lost", "error", "violated")
+_GROUPS = {
+    3: ("lowest third", "middle", "highest third"),
+    5: ("lowest fifth", "second", "third", "fourth", "highest fifth"),
+}
 
 
 def event_table(summary: Summary, failure: Sequence[str] = ()) -> Grid:
     """How often each event happened; `failure` names the events that count as failure."""
     lines = tuple(
-        _line(name, str(found["count"]), *_shares(found), percent(found["upper_one_sided"]))
+        _line(
+            *(name, str(found["count"]), *_shares(found)),
+            *(percent(found["lower_one_sided"]), percent(found["upper_one_sided"])),
+        )
         for name, found in summary["events"].items()
     )
     sure = f"{100.0 * summary['confidence']:g} %"
@@ -25,12 +32,12 @@ def event_table(summary: Summary, failure: Sequence[str] = ()) -> Grid:
     return Grid(
         key="events",
         title="How often",
-        head=("event", "flights", "share", f"{sure} interval", f"at most, with {sure}"),
+        head=("event", "flights", "share", f"{sure} interval", f"at least, with {sure}", f"at most, with {sure}"),
         lines=lines,
         note=(
             f"Failure: what the campaign counts as such{counted}. Violation: a required constraint did not hold or was "
             "not reached, or the flight was lost or raised an error. Intervals are Clopper-Pearson's: two-sided, and "
-            "one-sided in the last column. They take flights as independent draws; draws spread evenly (Latin "
+            "one-sided in the last two columns. They take flights as independent draws; draws spread evenly (Latin "
             "hypercube, Sobol', Halton) make the estimates more precise than that, and a grid gives the share over its "
             "own points."
         ),
@@ -56,7 +63,8 @@ def constraint_table(summary: Summary) -> Grid:
         ),
         lines=tuple(lines),
         note="Margins are signed, at the physics rate and without the tolerance; negative is beyond the bound. A "
-        "constraint whose time window a flight did not reach was not held.",
+        "constraint whose time window a flight did not reach was not held. Margins of a lost flight end where it was "
+        "aborted: what came after is not in them.",
     )
 
 
@@ -78,7 +86,7 @@ def metric_table(summary: Summary) -> Grid:
         lines=lines,
         note="Over the flights that have the number, lost ones included. worst_margin: the smallest margin of the "
         "required constraints, tolerance included, as a share of half the constraint's band: 1 in the middle, 0 at the "
-        "end of what is allowed, negative beyond.",
+        "end of what is allowed, negative beyond. What is measured of a lost flight ends where it was aborted.",
     )
 
 
@@ -87,7 +95,7 @@ def driver_table(summary: Summary) -> Grid:
     lines = []
     for driver in drivers(summary):
         found = summary["parameters"][driver.name]
-        cells = [Cell(text=label(driver.name, found["unit"]))]
+        cells = [Cell(text=driver.label)]
         for outcome in ("worst_margin", "failed"):
             correlation = found.get(outcome)
             if correlation is None:
@@ -112,10 +120,38 @@ def driver_table(summary: Summary) -> Grid:
     )
 
 
+def group_table(summary: Summary) -> Grid:
+    """How often flights failed over each drawn number, from its lowest values on; of none or all failed, no lines."""
+    failure = summary["events"]["failure"]
+    told = {
+        name: found
+        for name, found in summary["parameters"].items()
+        if found.get("groups") and 0 < failure["count"] < failure["flights"]
+    }
+    size = max((len(found["groups"]) for found in told.values()), default=0)
+    lines = tuple(
+        _line(
+            label(name, found["unit"]),
+            *(_group(group) for group in found["groups"]),
+            *[ABSENT] * (size - len(found["groups"])),
+        )
+        for name, found in told.items()
+    )
+    return Grid(
+        key="groups",
+        title="Failures over each drawn number",
+        head=("drawn number", *_GROUPS.get(size, [f"{k + 1}." for k in range(size)])),
+        lines=lines,
+        note="Share of failed flights among those with such a value; flights are in groups of about equal size, or by "
+        f"value where there are few values. Over all flights it is {percent(failure['share'])}.",
+    )
+
+
 def level_tables(summary: Summary) -> list[Grid]:
     """How often flights failed with each name or truth value that was drawn."""
     grids: list[Grid] = []
-    for name, found in summary["parameters"].items():
+    for parameter, found in summary["parameters"].items():
+        name = label(parameter, found["unit"])
         if found["kind"] == "number" or not found["levels"]:
             continue
         lines = tuple(
@@ -128,30 +164,41 @@ def level_tables(summary: Summary) -> list[Grid]:
 
 
 def worst_table(summary: Summary, directory: str) -> Grid:
-    """The worst flights, and how to fly each again."""
-    names = list(summary["parameters"])
-    lines = []
-    for flight in summary["worst"]:
-        verdict = flight["verdict"]
-        mark = Mark.BAD if verdict in _BAD else Mark.NONE
-        lines.append(
-            (
-                Cell(text=str(flight["flight"])),
-                Cell(text=verdict, mark=mark),
-                *_line(format_number(flight["worst_margin"]), flight["worst_constraint"] or ABSENT),
-                *_line(format_number(flight["duration"])),
-                Cell(text=replay_command(directory, flight["flight"]), mark=Mark.CODE),
-                *_line(*(_value(flight["draws"][name]) for name in names)),
-                Cell(text=flight["reason"] or ABSENT, mark=Mark.TEXT),
-            )
+    """The worst flights, and how to fly one again."""
+    worst = summary["worst"]
+    lines = tuple(
+        (
+            Cell(text=str(flight["flight"])),
+            Cell(text=flight["verdict"], mark=Mark.BAD if flight["verdict"] in _BAD else Mark.NONE),
+            *_line(format_number(flight["worst_margin"]), flight["worst_constraint"] or ABSENT),
+            *_line(format_number(flight["duration"])),
+            Cell(text=flight["reason"] or ABSENT, mark=Mark.TEXT),
         )
+        for flight in worst
+    )
+    again = f" To fly one of them again: {replay_command(directory, worst[0]['flight'])}" if worst else ""
     return Grid(
         key="worst",
         title="Worst flights",
-        head=("flight", "verdict", "worst margin", "constraint", "flown [s]", "fly it again", *names, "reason"),
-        lines=tuple(lines),
+        head=("flight", "verdict", "worst margin", "constraint", "flown [s]", "reason"),
+        lines=lines,
         note="Lost flights first, then those that raised an error, violated a constraint, and held all; among these, "
-        "failed ones first, then the smaller worst margin.",
+        "failed ones first, then the smaller worst margin. Margins of a lost flight end where it was aborted." + again,
+    )
+
+
+def worst_draws_table(summary: Summary) -> Grid:
+    """What was drawn for the worst flights, a column for each."""
+    worst = summary["worst"]
+    lines = tuple(
+        _line(label(name, found["unit"]), *(_value(flight["draws"][name]) for flight in worst))
+        for name, found in summary["parameters"].items()
+    )
+    return Grid(
+        key="worst-draws",
+        title="What was drawn for them",
+        head=("flight", *(str(flight["flight"]) for flight in worst)),
+        lines=lines if worst else (),
     )
 
 
@@ -183,6 +230,11 @@ def _value(value: Any) -> str:
     if isinstance(value, bool):
         return "true" if value else "false"
     return format_number(value) if isinstance(value, float) else str(value)
+
+
+def _group(group: Mapping[str, Any]) -> str:
+    low, high = format_number(group["low"]), format_number(group["high"])
+    return f"{low if low == high else f'{low} to {high}'}: {percent(group['share'])}"
 
 
 def _shares(found: Mapping[str, Any]) -> tuple[str, str]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
 from quadsim.table import ABSENT
@@ -35,6 +35,12 @@ def signed_interval(lower: float, upper: float) -> str:
 def count_of(count: int, thing: str) -> str:
     """So many things: `1 flight`, `12 flights`."""
     return f"{count} {thing}{'' if count == 1 else 's'}"
+
+
+def listing(names: Sequence[str], most: int) -> str:
+    """Names in a sentence, `a, b and c`, the last of too many as a count: `a, b and 7 others`."""
+    shown = list(names) if len(names) <= most else [*names[: most - 1], f"{len(names) - most + 1} others"]
+    return " and ".join(filter(None, [", ".join(shown[:-1]), shown[-1]]))
 
 
 def share_with_interval(found: Mapping[str, Any], confidence: float) -> str:

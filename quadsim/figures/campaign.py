@@ -126,7 +126,7 @@ def _draw_drivers(axes: Axes, summary: Summary) -> None:
             bar.set_alpha(1.0 if sure else 0.35)
     axes.axvline(0.0, color="#5b6067", linewidth=0.8)
     axes.set_xlim(-1.0, 1.0)
-    axes.set_yticks(rows, [driver.name for driver in told])
+    axes.set_yticks(rows, [driver.label for driver in told])
     axes.grid(axis="y", visible=False)
     axes.set_xlabel("pale: not beyond chance (5 %, Holm)")
     axes.legend(handles=keys, fontsize=8.0)

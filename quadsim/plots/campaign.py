@@ -171,7 +171,7 @@ def _histograms(drawn: list[Histogram], keys: tuple[tuple[str, str], ...]) -> Pl
 def _drivers(told: list[Driver]) -> Plot:
     from plotly.graph_objects import Bar, Figure
 
-    names = [html.escape(driver.name) for driver in told]
+    names = [html.escape(driver.label) for driver in told]
     figure = Figure()
     for outcome, colour in OUTCOMES.items():
         of_margin = outcome == "with the worst margin"
@@ -215,7 +215,11 @@ def _scatter(table: pa.Table, parameters: list[Cloud], drawn: Margins) -> Plot:
                     name=verdict,
                     marker={"color": colour, "size": 4.5, "opacity": 0.7, "symbol": SYMBOLS[verdict]},
                     hovertemplate="flight %{customdata}: %{fullData.name}<br>"
-                    + ("margin %{y:.3g}" if cloud.names else f"{html.escape(cloud.name)} %{{x:.4g}}, margin %{{y:.3g}}")
+                    + (
+                        "margin %{y:.3g}"
+                        if cloud.names
+                        else f"{html.escape(cloud.label)} %{{x:.4g}}, margin %{{y:.3g}}"
+                    )
                     + "<extra></extra>",
                 ),
                 **place(panel),

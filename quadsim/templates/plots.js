@@ -2,7 +2,9 @@
 const plots = [...document.querySelectorAll(".plot")];
 const timed = plots.filter((plot) => "timed" in plot.dataset);
 const dark = matchMedia("(prefers-color-scheme: dark)");
-const config = { responsive: true, displaylogo: false, modeBarButtonsToRemove: ["select2d", "lasso2d", "sendChartToCloud"] };
+const narrow = matchMedia("(max-width: 40rem)").matches;
+const config = { responsive: true, displaylogo: false, displayModeBar: narrow ? false : "hover",
+  modeBarButtonsToRemove: ["select2d", "lasso2d", "sendChartToCloud"] };
 
 function pageColours(layout) {
   const style = getComputedStyle(document.documentElement);

@@ -20,6 +20,7 @@ from threadpoolctl import threadpool_limits
 from quadsim import __version__
 from quadsim.campaign.table import Row
 from quadsim.errors import MissingPackageError, ParameterError
+from scenarios.campaign.code import code_digest
 from scenarios.campaign.engine import MOST_DEATHS, Answer, EngineError, Pace, Pilot, fly_one, said
 from scenarios.campaign.jobs import Jobs, read_jobs, submit
 from scenarios.garbage import collect_rarely
@@ -138,8 +139,9 @@ def _unpickled(pickled: bytes) -> Pilot:
 
 @cache
 def versions() -> dict[str, str]:
-    """Versions of what decides a flight's numbers."""
-    return {"quadsim": __version__, **{name: importlib.metadata.version(name) for name in _DECIDE_NUMBERS}}
+    """Versions of what decides a flight's numbers, our own code by its digest."""
+    packages = {name: importlib.metadata.version(name) for name in _DECIDE_NUMBERS}
+    return {"quadsim": f"{__version__}, {code_digest()[:19]}", **packages}
 
 
 class _Flights:
@@ -236,6 +238,7 @@ class _Flights:
         except (OSError, TimeoutError):  # whoever had them died, and nobody else does
             self._waiting.extendleft(reversed(chunk))
             return []
+        self._waiting.extendleft(reversed(chunk[len(answers) :]))  # of a chunk that was called off, and yet came
         for answer in answers:
             self._pace.note(answer)
         return [answer.row for answer in answers]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import datetime
+import re
 import time as clock
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
@@ -18,13 +19,17 @@ from quadsim.campaign.comparison_tables import comparison_tables, pairing
 from quadsim.campaign.gate import Judgement
 from quadsim.campaign.sentences import campaign_sentences, verdict_sentence
 from quadsim.campaign.statistics import proportion
-from quadsim.campaign.tables import constraint_table, event_table, worst_table
+from quadsim.campaign.tables import constraint_table, event_table, replay_command, worst_table
 from quadsim.campaign.wording import interval
+from quadsim.table import Grid
 from scenarios import console
 from scenarios.campaign.run import Standing, Watch
 
 MOST_LINES: Final = 8
 """Of a table on the terminal; the report has them all."""
+LEAST_WORDS, MOST_WORDS = 20, 60
+"""Characters of a reason on the terminal, as there is room."""
+_TIME: Final = re.compile(r"^at t = \S+ s: ")
 LINE_EVERY: Final = 30.0
 """Between two lines of progress where stderr is no terminal [s]."""
 
@@ -75,11 +80,30 @@ def print_campaign(
         stdout.print(escape(sentence), soft_wrap=True)
     tables = [event_table(summary, failure), constraint_table(summary), worst_table(summary, where)]
     brief = [replace(grid, note="", lines=grid.lines[:MOST_LINES]) for grid in tables if grid.lines]
-    console.print_grids(brief, None, prose=("constraint", "fly it again", "reason"))
+    shown = [_with_short_ends(grid, stdout.width) if grid.key == "worst" else grid for grid in brief]
+    console.print_grids(shown, None, prose=("constraint", "reason"))
+    if summary["worst"]:
+        command = replay_command(where, summary["worst"][0]["flight"])
+        stdout.print(f"to fly one of them again: [bold]{escape(command)}[/bold]", soft_wrap=True)
     for judgement in judgements:
         colour = "green" if judgement.holds else "red"
         stdout.print(f"[{colour}]{escape(judgement.sentence)}[/{colour}]", soft_wrap=True)
     stdout.print(f"written to [bold]{escape(where)}[/bold]", soft_wrap=True)
+
+
+def _with_short_ends(grid: Grid, width: int) -> Grid:
+    """A table whose last column, of words, stays in a line each on a terminal so wide."""
+    others = zip(grid.head[:-1], *(line[:-1] for line in grid.lines), strict=True)
+    taken = sum(2 + max(len(head), *(len(cell.text) for cell in cells)) for head, *cells in others)
+    room = max(LEAST_WORDS, min(MOST_WORDS, width - taken))
+    lines = tuple((*line[:-1], replace(line[-1], text=_shortened(line[-1].text, room))) for line in grid.lines)
+    return replace(grid, lines=lines)
+
+
+def _shortened(text: str, room: int) -> str:
+    """A reason in one line, without its time, which stands beside it."""
+    line = _TIME.sub("", " ".join(text.split()))
+    return line if len(line) <= room else f"{line[: room - 3]}..."
 
 
 def print_replay(number: int, row: Mapping[str, Any], differing: Sequence[str]) -> None:

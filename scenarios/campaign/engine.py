@@ -79,8 +79,9 @@ def fly_one(pilot: Pilot, flight: int) -> Answer:
 
 
 def said(error: BaseException) -> str:
-    """An exception in one line."""
-    return " ".join(f"{type(error).__name__}: {error}".split())
+    """An exception in one line of printable text."""
+    text = " ".join(f"{type(error).__name__}: {error}".split())
+    return "".join(sign if sign.isprintable() else ascii(sign)[1:-1] for sign in text)
 
 
 class Pace:

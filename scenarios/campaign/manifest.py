@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import functools
 import hashlib
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final
 
-from quadsim.assets import models_dir
-from quadsim.errors import FileError, InputError
+from quadsim.errors import FileError, InputError, OutputError
 from quadsim.rundir import write_atomically, write_json
+from scenarios.campaign.code import code_digest, controller_digest
 from scenarios.campaign.plan import Plan, load_plan
 from scenarios.campaign.spec import CampaignSpec
 from scenarios.runner import machine, versions
@@ -20,26 +19,31 @@ MANIFEST_FILE: Final = "manifest.json"
 CAMPAIGN_FILE: Final = "campaign.toml"
 SCENARIO_FILE: Final = "scenario.toml"
 FORMAT: Final = "quadsim campaign"
-_KEYS: Final = {"format": str, "name": str, "status": str, "flights": int, "flown": int, "sessions": list}
-_ROOT: Final = Path(__file__).resolve().parents[2]
-_PACKAGES: Final = ("quadsim", "mpc", "scenarios")
+_KEYS: Final = {
+    "format": str,
+    "name": str,
+    "status": str,
+    "flights": int,
+    "flown": int,
+    "files": dict,
+    "sessions": list,
+}
 
 
-def begin(plan: Plan, directory: Path, sessions: Sequence[Mapping[str, Any]] = ()) -> dict[str, Any]:
+def begin(plan: Plan, directory: Path) -> dict[str, Any]:
     """Write the files that define a campaign; its manifest comes last.
-
-    Args:
-        plan: the campaign.
-        directory: it is there already.
-        sessions: what was flown of it before.
 
     Returns:
         The manifest.
 
     Raises:
-        OutputError: they cannot be written.
+        OutputError: they cannot be written, or files of these names that say something else are there.
     """
     texts = _texts(plan)
+    for name, text in texts.items():
+        path = directory / name
+        if path.exists() and path.read_bytes() != text.encode():
+            raise OutputError(path, "is there already, and is no file of this campaign; choose another --out")
     for name, text in texts.items():
         write_atomically(directory / name, text)
     manifest: dict[str, Any] = {
@@ -51,11 +55,43 @@ def begin(plan: Plan, directory: Path, sessions: Sequence[Mapping[str, Any]] = (
         "flights": plan.spec.flights,
         "flown": 0,
         "files": {name: _digest(text.encode()) for name, text in texts.items()},
-        "code": code_digest(),
-        "versions": versions(),
-        "machine": machine(),
-        "sessions": [*sessions],
+        **_flown_by(plan),
+        "sessions": [],
     }
+    write(manifest, directory)
+    return manifest
+
+
+def go_on(plan: Plan, directory: Path, *, flying: bool) -> dict[str, Any]:
+    """The manifest of a campaign that is gone on with, maybe by more flights; see `require_same`.
+
+    Args:
+        plan: the campaign.
+        directory: where it is.
+        flying: whether anything is missing that has to be flown.
+
+    Raises:
+        FileError: there is none, or it is damaged.
+        InputError: other code would go on with it.
+        OutputError: it cannot be written.
+    """
+    manifest = read_manifest(directory)
+    if flying:
+        found = _flown_by(plan)
+        differing = [name for name in ("code", "controller", "versions") if manifest.get(name) != found[name]]
+        if differing:
+            raise InputError(
+                f"{directory}: --resume goes on with the same code alone, and this one differs from what flew the "
+                f"first flights ({', '.join(differing)}): half of the numbers would be another program's; choose "
+                "another --out"
+            )
+    texts = _texts(plan)
+    files = {**manifest["files"], **{name: _digest(text.encode()) for name, text in texts.items()}}
+    manifest |= {"status": "running", "flights": plan.spec.flights, "files": files, "files_before": manifest["files"]}
+    write(manifest, directory)
+    for name, text in texts.items():
+        write_atomically(directory / name, text)
+    del manifest["files_before"]
     write(manifest, directory)
     return manifest
 
@@ -69,20 +105,19 @@ def write(manifest: Mapping[str, Any], directory: Path) -> None:
     write_json(directory / MANIFEST_FILE, manifest)
 
 
-def require_same(plan: Plan, directory: Path) -> dict[str, Any]:
-    """The manifest of a campaign that is to go on.
+def require_same(plan: Plan, directory: Path) -> None:
+    """Refuse to go on with a campaign by another one.
 
     Raises:
         FileError: there is none, or it is damaged.
-        InputError: it is another campaign, or other code would go on with it.
+        InputError: it is another one.
     """
-    manifest = read_manifest(directory)
     known = stored_plan(directory)
-    differing = [name for name in CampaignSpec.model_fields if getattr(_own(plan), name) != getattr(known.spec, name)]
+    differing = [name for name in CampaignSpec.model_fields if getattr(_own(plan), name) != getattr(_own(known), name)]
     grows = plan.spec.sampling != "latin_hypercube" and plan.spec.flights >= known.spec.flights
     if differing == ["flights"] and grows:
         differing = []
-    if known.scenario != plan.scenario.model_copy(update={"name": known.scenario.name}):
+    if known.scenario != plan.scenario:
         differing.append("scenario")
     if differing:
         rule = "; more flights may follow, except of a latin_hypercube" if differing == ["flights"] else ""
@@ -90,14 +125,16 @@ def require_same(plan: Plan, directory: Path) -> dict[str, Any]:
             f"{directory}: --resume goes on with the same campaign alone, and its {', '.join(differing)} differs from "
             f"the one there{rule}; choose another --out"
         )
-    found = {"code": code_digest(), "versions": versions()}
-    differing = [name for name, value in found.items() if manifest.get(name) != value]
-    if differing:
-        raise InputError(
-            f"{directory}: --resume goes on with the same code alone, and {' and '.join(differing)} are not what flew "
-            "the first flights: half of the numbers would be of another program; choose another --out"
-        )
-    return manifest
+
+
+def _flown_by(plan: Plan) -> dict[str, Any]:
+    """What numbers come from besides the campaign's own files."""
+    return {
+        "code": code_digest(),
+        "controller": controller_digest(plan.scenario),
+        "versions": versions(),
+        "machine": machine(),
+    }
 
 
 def read_manifest(directory: Path) -> dict[str, Any]:
@@ -139,24 +176,13 @@ def stored_plan(directory: Path) -> Plan:
         FileError: it is none, or a file is missing or not the one that was flown.
     """
     manifest = read_manifest(directory)
+    before = manifest.get("files_before", {})  # where a process died while it made a campaign grow
     for name in (CAMPAIGN_FILE, SCENARIO_FILE):
         path = directory / name
-        if not path.is_file() or _digest(path.read_bytes()) != manifest["files"].get(name):
+        known = [files.get(name) for files in (manifest["files"], before) if isinstance(files, dict)]
+        if not path.is_file() or _digest(path.read_bytes()) not in known:
             raise FileError(path, "is missing or not the file that was flown")
     return load_plan(str(directory / CAMPAIGN_FILE))
-
-
-@functools.cache
-def code_digest() -> str:
-    """SHA-256 of everything of ours that numbers come from: code, models, scenarios."""
-    digest = hashlib.sha256()
-    folders = [*(_ROOT / package for package in _PACKAGES), models_dir()]
-    for folder in folders:
-        for path in sorted(folder.rglob("*")):
-            if path.suffix in (".py", ".toml", ".xml") and path.is_file():
-                digest.update(f"{folder.name}/{path.relative_to(folder).as_posix()}\0".encode())
-                digest.update(path.read_bytes())
-    return f"sha256:{digest.hexdigest()}"
 
 
 def _texts(plan: Plan) -> Mapping[str, str]:

@@ -6,6 +6,7 @@ import time as clock
 
 from quadsim.campaign.table import Row, failed_row, flown_row
 from quadsim.errors import QuadsimError
+from scenarios.campaign.engine import said
 from scenarios.campaign.plan import Plan
 from scenarios.runner import Flight, fly_scenario
 
@@ -28,7 +29,7 @@ class CampaignPilot:
         except QuadsimError as error:
             return self._row(flight, failed_row(str(error)))
         except Exception as error:  # of a controller that is not ours, say: the campaign goes on without it
-            return self._row(flight, failed_row(f"{type(error).__name__}: {error}"))
+            return self._row(flight, failed_row(said(error)))
         return self._row(flight, row_of(flown, clock.perf_counter() - started))
 
     def lost(self, flight: int, reason: str) -> Row:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -16,7 +15,7 @@ from pydantic import ValidationError
 from quadsim.campaign.events import Event, parse_event
 from quadsim.campaign.table import DRAW, TIMING, Row, make_schema
 from quadsim.errors import FileError, InputError, ParameterError, UnknownNameError
-from scenarios.bases import locate, merge, read_scenario
+from scenarios.bases import locate_files, merge, read_scenario
 from scenarios.build import build_limits, build_vehicle, resolve_vehicle
 from scenarios.campaign.draws import Draws, extremes
 from scenarios.campaign.spec import CampaignSpec, Value, VarySpec
@@ -26,6 +25,8 @@ from scenarios.problems import ScenarioError, describe
 from scenarios.settings import apply_setting, get_field, set_field
 from scenarios.spec import Scenario
 
+FIRST: Final = 5
+"""Flights of which one at least has to be possible."""
 LIBRARY: Final = Path(__file__).resolve().parent.parent / "campaigns"
 
 
@@ -49,21 +50,21 @@ class Plan:
     @cached_property
     def schema(self) -> pa.Schema:
         """The columns of its results."""
-        kinds = {entry.name: _column_type(entry) for entry in self.spec.vary}
+        kinds = {entry.name: (_column_type(entry), entry.unit) for entry in self.spec.vary}
         return make_schema(kinds, build_limits(self.scenario))
 
     @property
-    def columns(self) -> list[str]:
-        """The columns that events may be about: all but clock times."""
-        clocks = {name for name, _ in TIMING}
-        return [name for name in self.schema.names if name not in clocks]
+    def columns(self) -> dict[str, pa.DataType]:
+        """The columns that events may be about, with their types: all but clock times and what only counts flights."""
+        others = {*(name for name, _ in TIMING), "flight", "seed", "failed"}
+        return {field.name: field.type for field in self.schema if field.name not in others}
 
     @cached_property
     def failure(self) -> tuple[Event, ...]:
         """The events of which any one makes a flight fail."""
         try:
             return tuple(parse_event(text, self.columns) for text in self.spec.failure)
-        except UnknownNameError as error:
+        except InputError as error:
             raise InputError(f"failure: {error}") from error
 
     @cached_property
@@ -78,7 +79,7 @@ class Plan:
         """
         values = self.draws.values(flight)
         changes = [(entry, values[entry.name]) for entry in self.spec.vary]
-        name = f"{self.spec.name}-{flight}"[:80]
+        name = f"{self.spec.name[:70]}-{flight}"
         return self._varied(changes, name=name, seed=self.draws.seed(flight))
 
     def identity(self, flight: int) -> Row:
@@ -90,8 +91,8 @@ class Plan:
         """Refuse, before anything is flown, what cannot be.
 
         Raises:
-            InputError: a value of an entry of `[[vary]]`, at the end of its range, cannot be flown; or a failure event
-                is about a column that the results do not have.
+            InputError: a value of an entry of `[[vary]]`, at the end of its range, cannot be flown; none of the first
+                flights can; or a failure event is about a column that the results do not have.
         """
         _ = self.failure
         for entry in self.spec.vary:
@@ -104,6 +105,17 @@ class Plan:
                     said = str(error)
                     where = "" if said.startswith("vary.") else f"vary.{entry.name} at {value!r}: "
                     raise InputError(where + said) from error
+        refusals = [self._refusal(flight) for flight in range(min(FIRST, self.spec.flights))]
+        if all(refusals):
+            raise InputError(f"none of the first {len(refusals)} flights can be flown, the first since {refusals[0]}")
+
+    def _refusal(self, flight: int) -> InputError | None:
+        """Why a flight cannot be flown; None where it can."""
+        try:
+            check_parts(self.of(flight))
+        except InputError as error:
+            return error
+        return None
 
     def _varied(self, changes: Sequence[tuple[VarySpec, Value]], *, name: str, seed: int) -> Scenario:
         data: dict[str, Any] = merge(self._data, {})
@@ -153,7 +165,10 @@ def read_campaign(name: str) -> dict[str, Any]:
         FileError, UnknownNameError: there is none, or it cannot be read.
     """
     try:
-        return read_scenario(campaign_path(name), campaign_path)
+        path = campaign_path(name)
+        data = read_scenario(path, campaign_path, locate=_locate)
+        _locate(data, path.parent)
+        return data
     except OSError as error:
         raise FileError(str(error.filename)[:100], f"cannot be read ({error.strerror})") from error
 
@@ -194,12 +209,16 @@ def parse_campaign(data: Mapping[str, Any], *, source: str) -> CampaignSpec:
 
 def _scenario(spec: CampaignSpec, path: Path, settings: Sequence[str]) -> Scenario:
     """The scenario of a campaign's file, with its changes and then those of the command line."""
-    beside = path.parent / spec.scenario
-    file = beside if spec.scenario.endswith(".toml") and beside.is_file() else scenario_path(spec.scenario)
-    changes = copy.deepcopy(spec.set)
-    locate(changes, path.parent)
-    data = merge(read_scenario(file, scenario_path), changes)
+    file = scenario_path(spec.scenario)
+    data = merge(read_scenario(file, scenario_path), spec.set)
+    drawn = {field: entry.name for entry in spec.vary if not entry.relative for field in entry.fields}
     for setting in settings:
+        field = setting.partition("=")[0].strip()
+        if field in drawn or field == "seed":
+            rule = "of a field that flights do not have each of their own; " + (
+                "give --seed" if field == "seed" else f"{drawn[field]} draws {field}"
+            )
+            raise ParameterError("", "--set", setting, rule)
         apply_setting(data, setting)
     try:
         scenario = parse_scenario(data, source=f"{path.name}, {file.name}", directory=file.parent)
@@ -207,6 +226,15 @@ def _scenario(spec: CampaignSpec, path: Path, settings: Sequence[str]) -> Scenar
         raise FileError(str(error.filename)[:100], f"cannot be read ({error.strerror})") from error
     check_parts(scenario)
     return resolve_vehicle(scenario, build_vehicle(scenario))
+
+
+def _locate(data: dict[str, Any], directory: Path) -> None:
+    """Make the paths in a campaign's tables independent of its folder, in place."""
+    file, changes = data.get("scenario"), data.get("set")
+    if isinstance(file, str) and file.endswith(".toml") and (directory / file).is_file():
+        data["scenario"] = str((directory / file).resolve())
+    if isinstance(changes, dict):
+        locate_files(changes, directory)
 
 
 def _column_type(entry: VarySpec) -> pa.DataType:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time as clock
 from collections.abc import Callable
 from contextlib import closing
@@ -11,13 +12,14 @@ from typing import Any, Final
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 
 from quadsim.campaign.estimates import estimate
 from quadsim.campaign.report import write_report
 from quadsim.campaign.statistics import proportion
 from quadsim.campaign.store import Store, locked
 from quadsim.campaign.table import Row
-from quadsim.errors import OutputError, ParameterError
+from quadsim.errors import InputError, OutputError, ParameterError
 from quadsim.rundir import file_hashes, write_json
 from scenarios.campaign import manifest as records
 from scenarios.campaign.engine import Engine
@@ -25,10 +27,11 @@ from scenarios.campaign.pilot import CampaignPilot
 from scenarios.campaign.plan import Plan
 
 SUMMARY_FILE: Final = "summary.json"
+REPORT_FILES: Final = ("index.html", "campaign.png", "campaign.svg")
 FLUSH_S: Final = 5.0
 """How long an answer may wait in memory before it is on the disk [s]."""
 CHECK_EVERY: Final = 10
-"""Flights after which the interval is looked at again, where it decides when to stop."""
+"""Flights after which the interval is looked at again, where it decides when to stop; of grids, whole turns."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -93,18 +96,24 @@ def fly_campaign(
         watch: told how far it is, as answers come.
 
     Raises:
-        InputError: another campaign is there.
+        InputError: another campaign is there, or `until_width` would leave out flights that are there.
         OutputError: the directory cannot be written, or another process flies there.
         KeyboardInterrupt: a person stopped it; what was flown is there.
     """
     if until_width is not None and not 0.0 < until_width < 1.0:
         raise ParameterError("", "--until-width", until_width, "between 0 and 1")
+    session: dict[str, Any] = {"engine": engine.name, "workers": engine.workers, "flights": 0, "wall_s": None}
     _require_place(directory, resume=resume)
     with locked(directory):
-        manifest = _open(plan, directory)
+        going_on = records.is_campaign(directory)
+        if going_on:
+            records.require_same(plan, directory)
         progress = _Progress(plan, directory, until_width=until_width, watch=watch)
-        session: dict[str, Any] = {"engine": engine.name, "workers": engine.workers, "flights": 0, "wall_s": 0.0}
+        manifest = (
+            records.go_on(plan, directory, flying=progress.missing) if going_on else records.begin(plan, directory)
+        )
         manifest["sessions"].append(session)
+        records.write(manifest, directory)
         try:
             progress.fly(engine)
         except BaseException:
@@ -131,7 +140,14 @@ class _Progress:
         self._waiting: list[Row] = []
         self._flushed = clock.perf_counter()
         there = self.store.table().select(["flight", "failed"])
-        self._note(there["flight"].to_numpy(), there["failed"].to_numpy(zero_copy_only=False))
+        self._counted = self.store.counted()
+        within = there.filter(pc.less(there["flight"], plan.spec.flights))
+        self._note(within["flight"].to_numpy(), within["failed"].to_numpy(zero_copy_only=False))
+
+    @property
+    def missing(self) -> bool:
+        """Whether there is anything to fly."""
+        return bool((self._outcomes < 0).any()) and not self._is_sure()
 
     @property
     def done(self) -> int:
@@ -139,12 +155,17 @@ class _Progress:
         return int(np.count_nonzero(self._outcomes[: self.wanted] >= 0))
 
     def fly(self, engine: Engine) -> None:
-        """Fly what is missing, until nothing is, or the interval is narrow enough."""
-        if self._is_sure():
+        """Fly what is missing, until nothing is, or the interval is narrow enough.
+
+        Raises:
+            InputError: it is so before flights that a finished campaign has.
+        """
+        if self._is_sure() and self.wanted < self._counted:
+            given = f"the interval is as narrow after {self.wanted} of the {self._counted} flights that are there"
+            raise InputError(f"--until-width would leave out flights: {given}; go on without it")
+        if not self.missing:
             return
         missing = np.flatnonzero(self._outcomes < 0).tolist()
-        if not missing:
-            return
         try:
             answers = engine.answers(CampaignPilot(self._plan), missing)
             with closing(answers):
@@ -181,9 +202,12 @@ class _Progress:
         """
         if self._width is None:
             return False
+        if self.wanted < self._outcomes.size:
+            return True
         gaps = np.flatnonzero(self._outcomes < 0)
         whole = int(gaps[0]) if gaps.size else self._outcomes.size
-        for count in range(self._checked + CHECK_EVERY, whole + 1, CHECK_EVERY):
+        every = math.lcm(CHECK_EVERY, self._plan.spec.cells)  # whole turns of the grids
+        for count in range(self._checked + every, whole + 1, every):
             self._checked = count
             share = proportion(int(np.count_nonzero(self._outcomes[:count] == 1)), count)
             if share.upper - share.lower <= self._width:
@@ -202,16 +226,9 @@ def _require_place(directory: Path, *, resume: bool) -> None:
     if records.is_campaign(directory) and not resume:
         raise OutputError(directory, "a campaign is already there; go on with it by --resume, or choose another --out")
     begun = {records.CAMPAIGN_FILE, records.SCENARIO_FILE, ".lock"}  # by a process that died before its manifest
-    if not records.is_campaign(directory) and entries - begun:
+    others = {name for name in entries - begun if not (name.startswith(".") and name.endswith(".partial"))}
+    if not records.is_campaign(directory) and others:
         raise OutputError(directory, "something else is already there; choose another --out")
-
-
-def _open(plan: Plan, directory: Path) -> dict[str, Any]:
-    """The manifest of a campaign that begins, or goes on."""
-    if not records.is_campaign(directory):
-        return records.begin(plan, directory)
-    before = records.require_same(plan, directory)
-    return records.begin(plan, directory, before["sessions"])
 
 
 def _conclude(plan: Plan, directory: Path, progress: _Progress, manifest: dict[str, Any], *, report: bool) -> Result:
@@ -219,6 +236,8 @@ def _conclude(plan: Plan, directory: Path, progress: _Progress, manifest: dict[s
     table = progress.store.close(progress.wanted)
     summary = {"campaign": plan.spec.name, "scenario": plan.scenario.name, **estimate(table)}
     write_json(directory / SUMMARY_FILE, summary)
+    for path in (*directory.glob(".*.partial"), *(directory / name for name in REPORT_FILES)):
+        path.unlink(missing_ok=True)  # what others left half written, and an earlier report
     if report:
         write_report(
             directory,

@@ -17,7 +17,8 @@ from scenarios.writing import to_toml
 
 MOST_FLIGHTS: Final = 1_000_000
 
-Value = bool | int | Number | str | list[Number]
+Whole = Annotated[int, Field(ge=-LARGEST_SEED, le=LARGEST_SEED)]
+Value = bool | Whole | Number | str | list[Number]
 """What can be drawn from a list: whatever a field of a scenario may be, but for tables."""
 Values = Annotated[list[Value], MinLen(1), MaxLen(MOST_ENTRIES)]
 
@@ -32,6 +33,7 @@ class _VarySpec(Spec):
         description="dotted paths into the scenario that all get the drawn value, as for --set; an entry of a list by "
         "its name or index"
     )
+    unit: Annotated[str, Field(max_length=20)] = Field(default="-", description="of the values, for tables and plots")
     relative: bool = Field(default=False, description="whether the drawn number multiplies what the scenario has")
 
 
@@ -156,9 +158,13 @@ class CampaignSpec(Spec):
         names = [entry.name for entry in self.vary]
         if len(set(names)) < len(names):
             raise ValueError(f"vary must have distinct names; got {names}")
-        for entry in self.vary:
-            if "seed" in entry.fields:
-                raise ValueError(f"vary.{entry.name}.fields must not have seed: every flight has one of its own")
+        self._check_fields()
+        grids = [entry.name for entry in self.vary if isinstance(entry, GridSpec)]
+        if grids and self.sampling in ("sobol", "halton"):
+            rule = (
+                f"random or latin_hypercube where there are grids ({', '.join(grids)}), whose turns go with its points"
+            )
+            raise ValueError(f"sampling must be {rule}; got {self.sampling!r}")
         cells = self.cells
         if self.flights % cells:
             rule = f"a multiple of the {cells} combinations of its grids"
@@ -170,6 +176,19 @@ class CampaignSpec(Spec):
             except InputError as error:
                 raise ValueError(f"failure has an entry {text!r} that is no event: {error}") from error
         return self
+
+    def _check_fields(self) -> None:
+        """Refuse fields that two entries draw, and those that are not for drawing."""
+        owners: dict[str, str] = {}
+        for entry in self.vary:
+            for field in entry.fields:
+                if field == "seed":
+                    raise ValueError(f"vary.{entry.name}.fields must not have seed: every flight has one of its own")
+                if field.split(".")[-1] == "name":
+                    raise ValueError(f"vary.{entry.name}.fields must not have {field}: results are told by names")
+                if field in owners:
+                    raise ValueError(f"vary.{entry.name}.fields must not have {field}, which {owners[field]} draws")
+                owners[field] = entry.name
 
     @property
     def cells(self) -> int:

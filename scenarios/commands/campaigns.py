@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from quadsim import rundir
-from quadsim.errors import InputError, ParameterError
+from quadsim.errors import InputError, OutputError, ParameterError
 from scenarios import console
-from scenarios.campaign.manifest import read_manifest
+from scenarios.campaign.manifest import read_manifest, stored_plan
 from scenarios.cli import EXIT_DONE, EXIT_FAILED
 from scenarios.commands.common import print_summary
 from scenarios.junit import write_cases
@@ -30,6 +30,10 @@ def campaign(options: Namespace) -> int:
     from scenarios.campaign.run import fly_campaign
 
     requirements = [parse_requirement(text) for text in options.requirements]
+    if options.junit and not requirements:
+        raise ParameterError("", "--junit", options.junit, "given with --require, whose verdicts it is to hold")
+    if options.junit and not Path(options.junit).parent.is_dir():
+        raise OutputError(options.junit, "there is no such folder")
     plan = load_plan(options.file, options.settings, flights=options.flights, seed=options.seed)
     for requirement in requirements:
         parse_event(requirement.event.text, plan.columns)
@@ -106,7 +110,8 @@ def compare_campaigns(options: Namespace) -> int:
         raise ParameterError("", "--cost", True, "absent when campaigns are compared")
     first, second = (Path(name) for name in options.targets)
     names = (str(read_manifest(first)["name"]), str(read_manifest(second)["name"]))
-    comparison = compare(read_table(first / FLIGHTS_FILE), read_table(second / FLIGHTS_FILE), names)
+    failures = (stored_plan(first).spec.failure, stored_plan(second).spec.failure)
+    comparison = compare(read_table(first / FLIGHTS_FILE), read_table(second / FLIGHTS_FILE), names, failures)
     page = write_comparison_report(comparison, Path(options.out))
     if options.markdown:
         print(comparison.to_markdown())

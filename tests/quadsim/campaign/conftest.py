@@ -17,10 +17,12 @@ LIMITS = (
     Limit(name="slew", signal="slew", lower=-6.0, upper=6.0, required=False),
 )
 DRAWS = {
-    **dict.fromkeys(("mass", "inertia", "lag", "wind", "noise", "yaw"), pa.float64()),
-    "horizon": pa.int64(),
-    "solver": pa.string(),
-    "payload": pa.bool_(),
+    **dict.fromkeys(("mass", "inertia", "noise", "yaw"), (pa.float64(), "-")),
+    "lag": (pa.float64(), "s"),
+    "wind": (pa.float64(), "m/s"),
+    "horizon": (pa.int64(), "-"),
+    "solver": (pa.string(), "-"),
+    "payload": (pa.bool_(), "-"),
 }
 
 MakeCampaign = Callable[..., pa.Table]

@@ -84,6 +84,22 @@ def test_other_draws_are_refused(thousand: pa.Table) -> None:
         compare(head, changed(head, "seed", [1, 10001, 10002, 10003, 10004]), NAMES)
 
 
+def test_other_definitions_of_failure_are_refused(thousand: pa.Table, better: pa.Table) -> None:
+    same = (["violated", "rmse.z>0.5"], ["rmse.z > 0.50", "violation"])
+    assert compare(thousand, better, NAMES, failures=same) == compare(thousand, better, NAMES)
+    said = "'paper' counts violation as failure, and 'robust' lost, rmse.z > 0.5: only campaigns with the same failure"
+    with pytest.raises(InputError, match=said):
+        compare(thousand, better, NAMES, failures=(["violated"], ["rmse.z > 0.5", "lost"]))
+
+
+def test_other_constraints_are_refused(thousand: pa.Table, better: pa.Table) -> None:
+    names = [name.replace(".slew", ".tilt") for name in better.column_names]
+    with pytest.raises(InputError, match="'paper' alone has the constraints slew: only campaigns that are audited"):
+        compare(thousand, better.rename_columns(names), NAMES)
+    with pytest.raises(InputError, match="'robust' alone has the constraints slew"):
+        compare(thousand.drop_columns(["satisfied.slew"]), better, NAMES)
+
+
 def test_flights_of_other_numbers_are_refused(thousand: pa.Table) -> None:
     with pytest.raises(InputError, match="have no flight of one number"):
         compare(thousand.slice(0, 5), thousand.slice(5, 5), NAMES)

@@ -11,6 +11,7 @@ ROW = {
     **{"failed": False, "violated": True, "crashed": False, "verdict": "lost"},
     **{"rmse.z": 0.4, "margin.roll-rate": -1.0, "iterations.max": 12, "gone": None},
 }
+KINDS = {"rmse.z": pa.float64(), "iterations.max": pa.int64(), "crashed": pa.bool_(), "verdict": pa.string()}
 
 
 @pytest.mark.parametrize(
@@ -69,13 +70,17 @@ def test_an_unknown_event_names_the_nearest() -> None:
 
 def test_an_unknown_column_names_the_nearest() -> None:
     with pytest.raises(UnknownNameError, match=r"no column named 'rmse.zz'; did you mean 'rmse.z'\?"):
-        parse_event("rmse.zz > 1", columns=ROW)
+        parse_event("rmse.zz > 1", columns=KINDS)
     event = parse_event("rmse.zz > 1")
     with pytest.raises(UnknownNameError, match=r"no column named 'rmse\.zz'"):
         event.holds(ROW)
     with pytest.raises(UnknownNameError, match=r"no column named 'rmse\.zz'"):
         event.column(pa.table({"rmse.z": [1.0]}))
-    assert parse_event("rmse.z > 1", columns=iter(ROW)).column_name == "rmse.z"
+    assert parse_event("rmse.z > 1", columns=KINDS).column_name == "rmse.z"
+    assert parse_event("rmse.z > 1", columns=pa.schema(KINDS)).column_name == "rmse.z"
+    with pytest.raises(UnknownNameError) as raised:
+        parse_event("rmse.zz > 1", columns=KINDS)
+    assert raised.value.allowed == ("crashed", "iterations.max", "rmse.z"), "those that a number compares with"
 
 
 @pytest.mark.parametrize("number", ["", "high", "nan", "inf", "0.5 m"])
@@ -87,6 +92,19 @@ def test_a_comparison_needs_a_number(number: str) -> None:
 def test_text_is_no_number() -> None:
     with pytest.raises(InputError, match="the column 'verdict' holds text"):
         parse_event("verdict > 1").holds(ROW)
+    for columns in (KINDS, pa.schema(KINDS)):
+        with pytest.raises(InputError, match="event 'verdict > 1' compares with a number; the column 'verdict' holds"):
+            parse_event("verdict > 1", columns=columns)
+    for verdicts in ([], [None], ["lost"]):
+        with pytest.raises(InputError, match="the column 'verdict' holds text"):
+            parse_event("verdict > 1").column(pa.table({"verdict": pa.array(verdicts, pa.string())}))
+
+
+@pytest.mark.parametrize("column", ["flight", "seed", "failed"])
+def test_what_measures_no_flight_is_not_compared(column: str) -> None:
+    for columns in (None, {column: pa.int64()}):
+        with pytest.raises(InputError, match=f"must compare a column that measures a flight.*'{column}' does not"):
+            parse_event(f"{column} >= 1", columns)
 
 
 def test_names_are_those_of_the_summary() -> None:

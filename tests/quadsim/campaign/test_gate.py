@@ -1,7 +1,10 @@
 """The gate: what it reads, when it holds, and how many flights it takes."""
 
+import numpy as np
 import pyarrow as pa
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from scipy import stats
 
 from quadsim.campaign.gate import judge, least_flights, parse_requirement
@@ -32,12 +35,17 @@ def test_another_form_is_refused(text: str) -> None:
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("P(lost) < 0 @ 95%", "share must be a number above 0 and below 1; got '0'"),
-        ("P(lost) < 1 @ 95%", "share must be a number above 0 and below 1; got '1'"),
-        ("P(lost) < few @ 95%", "share must be a number above 0 and below 1; got 'few'"),
-        ("P(lost) < 100% @ 95%", "share must be above 0% and below 100%; got '100%'"),
+        ("P(lost) < 0 @ 95%", "share must be a number from 1e-9 to 0.999999999; got '0'"),
+        ("P(lost) < 1 @ 95%", "share must be a number from 1e-9 to 0.999999999; got '1'"),
+        ("P(lost) < few @ 95%", "share must be a number from 1e-9 to 0.999999999; got 'few'"),
+        ("P(lost) < 100% @ 95%", "share must be from 0.0000001% to 99.9999999%; got '100%'"),
         ("P(lost) < nan @ 95%", "share must be"),
-        ("P(lost) < 0.1 @ 100%", "confidence must be from 50% and below 100%; got '100%'"),
+        ("P(lost) < inf @ 95%", "share must be"),
+        ("P(lost) < 1e-17 @ 95%", "share must be"),
+        ("P(lost) < 1e-9999999999999999999 @ 95%", "share must be"),
+        ("P(lost) > 0.99999999999999 @ 95%", "share must be"),
+        ("P(lost) < 0.1 @ 100%", "confidence must be from 50% to 99.9999%; got '100%'"),
+        ("P(lost) < 0.1 @ 99.99999999%", "confidence must be"),
         ("P(lost) < 0.1 @ 49%", "confidence must be"),
         ("P(lost) < 0.1 @ most%", "confidence must be"),
     ],
@@ -81,6 +89,33 @@ def test_the_least_number_is_the_least(text: str) -> None:
 
     assert enough(found)
     assert found == 1 or not enough(found - 1)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "P(violation) < 1e-9 @ 99.9999%",
+        "P(violation) > 0.999999999 @ 99.9999%",
+        "P(violated) >= 99.9999999% @ 99.9999%",
+    ],
+)
+def test_the_most_that_can_be_asked_is_told(text: str) -> None:
+    asked = parse_requirement(text)
+    assert least_flights(asked) == pytest.approx(6.0 * np.log(10.0) * 1e9, rel=1e-6)
+    assert "It takes more than 1,000,000,000 flights, " in judge(flown(3, 0), asked).sentence
+
+
+@given(
+    share=st.floats(1e-5, 1.0 - 1e-5),
+    confidence=st.floats(50.0, 99.9999),
+    operation=st.sampled_from(["<", "<=", ">", ">="]),
+)
+def test_the_least_number_supports_and_one_less_does_not(share: float, confidence: float, operation: str) -> None:
+    asked = parse_requirement(f"P(violation) {operation} {share!r} @ {confidence!r}%")
+    n = least_flights(asked)
+    assert judge(flown(n, 0 if asked.at_most else n), asked).holds if n < 1000 else n > 1
+    exact = np.log1p(-asked.confidence) / (np.log1p(-share) if asked.at_most else np.log(share))
+    assert exact - 1e-6 * n <= n <= exact + 1.0 + 1e-6 * n
 
 
 def test_too_few_flights_are_told() -> None:

@@ -68,6 +68,8 @@ def test_the_page_tells_what_the_flights_show(thousand: pa.Table, tmp_path: Path
     assert f"quadsim replay &#39;{directory}&#39; --flight {worst}<" in text
     for heading in ("How often", "Constraints", "Distributions", "What drives failure", "Worst flights"):
         assert f"<h2>{heading}</h2>" in text
+    for table in ("Failures over each drawn number", "What was drawn for them"):
+        assert f"<span>{table}</span>" in text
     assert "<dt>versions.numpy</dt><dd>2</dd>" in text
     assert {path.name for path in directory.iterdir()} == {
         *("index.html", "campaign.png", "campaign.svg", "flights.parquet"),
@@ -87,6 +89,8 @@ def test_campaigns_of_every_kind_have_a_page(make_campaign: MakeCampaign, tmp_pa
     assert f'<p class="verdict {mark}">{failed} of {flights} flight' in text
     assert "nan" not in text.lower().replace("dominan", "")
     assert ('class="plot"' in text) is (flights > 0)
+    lost = "lost" in table["verdict"].to_pylist()
+    assert ("What is measured of a lost flight, its margins too, ends where it was aborted." in text) is lost
 
 
 def test_a_campaign_without_required_constraints_has_a_page(thousand: pa.Table, tmp_path: Path) -> None:

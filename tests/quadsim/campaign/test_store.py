@@ -17,7 +17,7 @@ from quadsim.campaign.store import FLIGHTS_FILE, PARTS_DIR, TIMES_FILE, Store, l
 from quadsim.campaign.table import Row, failed_row, make_schema, read_table
 from quadsim.errors import FileError, OutputError
 
-SCHEMA = make_schema({"mass": pa.float64()}, [])
+SCHEMA = make_schema({"mass": (pa.float64(), "kg")}, [])
 
 
 def row(flight: int) -> Row:

@@ -7,21 +7,24 @@ from dataclasses import replace
 
 import pyarrow as pa
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from quadsim.audit import Finding, Limit, audit
 from quadsim.campaign.table import failed_row, flown_row, make_schema, make_table, split_times, unit_of, worst_margin
 from quadsim.rundir import Run
 
 ROLL = Limit(name="roll", signal="roll", lower=-5.0, upper=5.0, tolerance=0.5)
+MARGINS = st.floats(-20.0, 20.0, width=32)
 SPEED = Limit(name="speed", signal="speed", lower=0.0, upper=250.0)
 
 
-def finding(limit: Limit, margin: float) -> Finding:
+def finding(limit: Limit, margin: float, sampled: float | None = None) -> Finding:
     return Finding(
         limit=limit,
         peak_sampled=0.0,
         peak_plant=0.0,
-        worst_margin_sampled=margin,
+        worst_margin_sampled=margin if sampled is None else sampled,
         worst_margin=margin,
         worst_time=0.0,
         time_violated=0.0,
@@ -29,7 +32,7 @@ def finding(limit: Limit, margin: float) -> Finding:
 
 
 def test_a_row_has_what_the_schema_says(short_run: Run) -> None:
-    schema = make_schema({"mass": pa.float64(), "kind": pa.string()}, short_run.limits)
+    schema = make_schema({"mass": (pa.float64(), "kg"), "kind": (pa.string(), "-")}, short_run.limits)
     row = flown_row(short_run.log, audit(short_run.log, short_run.limits), verdict="violated", wall_s=1.5)
     known = {"flight", "seed", "draw.mass", "draw.kind", "failed"}
     assert {*row} | known == {*schema.names}
@@ -37,7 +40,8 @@ def test_a_row_has_what_the_schema_says(short_run: Run) -> None:
     assert table.schema == schema
     assert table["duration"].to_pylist() == [6.0]
     assert table["draw.mass"].to_pylist() == [None]
-    assert (unit_of(table, "margin.roll"), unit_of(table, "rmse.x"), unit_of(table, "verdict")) == ("deg", "m", "-")
+    units = {name: unit_of(table, name) for name in ("margin.roll", "rmse.x", "verdict", "draw.mass", "draw.kind")}
+    assert units == {"margin.roll": "deg", "rmse.x": "m", "verdict": "-", "draw.mass": "kg", "draw.kind": "-"}
 
 
 def test_a_row_tells_what_the_summary_tells(short_run: Run) -> None:
@@ -73,15 +77,18 @@ def test_rows_are_sorted_and_clock_times_stand_apart(short_run: Run) -> None:
     ("findings", "expected"),
     [
         ([], (None, None)),
-        ([finding(ROLL, 4.5)], (1.0, "roll")),
-        ([finding(ROLL, -0.5)], (0.0, "roll")),
-        ([finding(ROLL, -3.0)], (-0.5, "roll")),
+        ([finding(ROLL, 4.5, 5.0)], (1.0, "roll")),
+        ([finding(ROLL, -0.5, 0.0)], (0.0, "roll")),
+        ([finding(ROLL, 0.0, -0.5)], (-0.1, "roll")),
+        ([finding(ROLL, 4.5, math.nan)], (1.0, "roll")),
+        ([finding(replace(ROLL, tolerance_sampled=0.25), 0.0, -0.5)], (-0.05, "roll")),
+        ([finding(ROLL, -3.0, -2.0)], (-0.5, "roll")),
         ([finding(replace(ROLL, required=False), -3.0)], (None, None)),
         ([finding(ROLL, math.nan)], (None, None)),
-        ([finding(ROLL, 4.5), finding(SPEED, 0.0)], (1.0, "roll")),
-        ([finding(ROLL, 4.5), finding(SPEED, -12.5)], (-0.1, "speed")),
-        ([finding(replace(ROLL, lower=-math.inf), -3.0)], (-0.5, "roll")),
-        ([finding(replace(ROLL, lower=-math.inf, upper=0.0), -3.0)], (-2.5, "roll")),
+        ([finding(ROLL, 4.5, 5.0), finding(SPEED, 0.0)], (1.0, "roll")),
+        ([finding(ROLL, 4.5, 5.0), finding(SPEED, -12.5)], (-0.1, "speed")),
+        ([finding(replace(ROLL, lower=-math.inf), -3.0, -2.5)], (-0.5, "roll")),
+        ([finding(replace(ROLL, lower=-math.inf, upper=0.0), -3.0, -2.5)], (-2.5, "roll")),
     ],
 )
 def test_the_worst_margin_is_a_share_of_half_the_band(
@@ -90,3 +97,29 @@ def test_the_worst_margin_is_a_share_of_half_the_band(
     share, name = worst_margin(findings)
     assert name == expected[1]
     assert share == (None if expected[0] is None else pytest.approx(expected[0]))
+
+
+@given(
+    margin=MARGINS,
+    sampled=MARGINS | st.just(math.nan),
+    tolerances=st.tuples(*[st.floats(0.0, 5.0, width=32)] * 2),
+    signal=st.sampled_from(["roll", "speed"]),
+    lower=st.sampled_from([-5.0, -math.inf]),
+)
+def test_the_worst_margin_is_negative_where_a_constraint_that_was_reached_did_not_hold(
+    margin: float, sampled: float, tolerances: tuple[float, float], signal: str, lower: float
+) -> None:
+    inner, outer = sorted(tolerances)
+    limit = Limit(name="a", signal=signal, lower=lower, upper=5.0, tolerance=outer, tolerance_sampled=inner)
+    found = finding(limit, margin, sampled)
+    share, _ = worst_margin([found])
+    assert (share is not None and share < 0.0) is not found.satisfied
+
+
+def test_text_that_is_no_unicode_is_stored() -> None:
+    schema = make_schema({"kind": (pa.string(), "-")}, [])
+    rows = [{"flight": 0, "draw.kind": "\udc80", **failed_row("no file a\udcff \u00e4\n")}]
+    table = make_table(rows, schema)
+    assert table.select(["draw.kind", "reason"]).to_pylist() == [
+        {"draw.kind": "\\udc80", "reason": "no file a\\udcff \u00e4\n"}
+    ]

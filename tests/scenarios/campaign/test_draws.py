@@ -19,7 +19,7 @@ SAMPLINGS = ("random", "latin_hypercube", "sobol", "halton")
 
 
 def campaign(*vary: dict[str, Any], flights: int = 400, seed: int = 1, sampling: str = "random") -> CampaignSpec:
-    entries = [{"name": f"p{i}", "fields": ["vehicle.mass"], **entry} for i, entry in enumerate(vary)]
+    entries = [{"name": f"p{i}", "fields": [f"vehicle.inertia.{i}"], **entry} for i, entry in enumerate(vary)]
     data = {"name": "c", "scenario": "hover", "flights": flights, "seed": seed, "sampling": sampling, "vary": entries}
     return parse_campaign(data, source="test")
 

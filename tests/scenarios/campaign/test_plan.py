@@ -182,6 +182,21 @@ def test_campaigns_on_the_same_draws_differ_in_their_controller_alone() -> None:
             {"vary": varied(distribution="grid", values=[1.0, 1.1], low=None, high=None)},
             r"flights must be a multiple of the 2 combinations of its grids; got 3",
         ),
+        (
+            {"vary": varied(distribution="grid", values=[1.0], low=None, high=None), "sampling": "sobol"},
+            r"sampling must be random or latin_hypercube where there are grids \(mass\)",
+        ),
+        (
+            {"vary": [*varied(), *varied(name="again")]},
+            r"vary\.again\.fields must not have effects\.load\.mass_factor, which mass draws",
+        ),
+        ({"vary": varied(fields=["constraints.x.name"])}, r"vary\.mass\.fields must not have constraints\.x\.name"),
+        (
+            {"vary": varied(fields=["duration"], low=0.5, high=1.0)},
+            r"none of the first 3 flights can be flown, the first since .*duration must be a whole multiple",
+        ),
+        ({"failure": ["failed > 0"]}, r"failure has an entry 'failed > 0' that is no event"),
+        ({"failure": ["status > 0"]}, r"failure: .*the column 'status' holds text"),
         ({"scenario": "hoover"}, r"no scenario named 'hoover'; did you mean 'hover'\?"),
         ({"set": {"duration": -1.0}}, r"duration must be > 0"),
         ({"set": {"effects": {"laod": {}}}}, r"effects\.laod is not a field of the scenario file; did you mean 'load'"),
@@ -222,3 +237,20 @@ def test_a_file_that_is_no_toml_is_refused(tmp_path: Path) -> None:
     path.write_text("name = [", encoding="utf-8")
     with pytest.raises(FileError, match="is not valid TOML"):
         load_plan(str(path))
+
+
+@pytest.mark.parametrize(
+    ("setting", "rule"),
+    [("effects.load.mass_factor=1.2", "mass draws effects.load.mass_factor"), ("seed=7", "give --seed")],
+)
+def test_a_setting_that_flights_have_each_of_their_own_is_refused(tmp_path: Path, setting: str, rule: str) -> None:
+    with pytest.raises(InputError, match=rule):
+        load_plan(str(write(tmp_path, BASE)), [setting])
+
+
+def test_a_base_in_another_folder_brings_its_scenario(tmp_path: Path) -> None:
+    (tmp_path / "sub").mkdir()
+    write(tmp_path, {"base": "hover", "name": "mine", "duration": 1.0}, "mine.toml")
+    write(tmp_path, {**BASE, "scenario": "mine.toml"}, "first.toml")
+    derived = write(tmp_path / "sub", {"base": "../first.toml", "name": "second"}, "second.toml")
+    assert load_plan(str(derived)).scenario.duration == 1.0

@@ -117,13 +117,15 @@ def test_more_flights_may_follow(plan: Plan, tmp_path: Path) -> None:
 
 def test_a_flight_that_raises_is_a_result(tmp_path: Path) -> None:
     (tmp_path / "fails.py").write_text(
-        "class Fails:\n    def __init__(self, vehicle, **numbers):\n        raise ZeroDivisionError('of its own')\n",
+        "class Fails:\n"
+        "    def __init__(self, vehicle, **numbers):\n        pass\n"
+        "    def step(self, now, state, reference):\n        raise ZeroDivisionError('of its\\n\\x1b own')\n",
         encoding="utf-8",
     )
     plan = make_plan(tmp_path, set={"duration": 0.5, "constraints": [], "controller": "fails:Fails"})
     table = fly_campaign(plan, tmp_path / "c", Alone()).table
     assert set(table["verdict"].to_pylist()) == {"error"}
-    assert all("ZeroDivisionError" in reason for reason in table["reason"].to_pylist()), table["reason"].to_pylist()
+    assert set(table["reason"].to_pylist()) == {"ZeroDivisionError: of its \\x1b own"}
     assert all(table["failed"].to_pylist())
 
 
@@ -207,8 +209,83 @@ def test_a_latin_hypercube_does_not_grow(tmp_path: Path) -> None:
 def test_other_code_does_not_go_on_with_it(plan: Plan, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     fly_campaign(plan, tmp_path / "c", Alone())
     monkeypatch.setattr(records, "code_digest", lambda: "sha256:other")
-    with pytest.raises(InputError, match="code are not what flew the first flights"):
-        fly_campaign(plan, tmp_path / "c", Alone(), resume=True)
+    with pytest.raises(InputError, match=r"this one differs from what flew the first flights \(code\)"):
+        fly_campaign(make_plan(tmp_path, flights=13), tmp_path / "c", Alone(), resume=True)
+    kept = fly_campaign(plan, tmp_path / "c", Alone(), resume=True)
+    assert kept.manifest["code"] != "sha256:other", "nothing is missing: what flew it stays there"
+
+
+def test_another_controller_of_ones_own_does_not_go_on_with_it(tmp_path: Path) -> None:
+    code = "class Hovers:\n    def __init__(self, vehicle, **numbers):\n        self.speeds = [{speed}] * 4\n"
+    code += "    def step(self, now, state, reference):\n        return self.speeds\n"
+    (tmp_path / "hovers.py").write_text(code.format(speed="vehicle.hover_speed"), encoding="utf-8")
+    changed = {"set": {"duration": 0.5, "constraints": [], "controller": "hovers:Hovers"}, "flights": 2}
+    fly_campaign(make_plan(tmp_path, **changed), tmp_path / "c", Alone())
+    (tmp_path / "hovers.py").write_text(code.format(speed="vehicle.hover_speed + 1.0"), encoding="utf-8")
+    with pytest.raises(InputError, match=r"differs from what flew the first flights \(controller\)"):
+        fly_campaign(make_plan(tmp_path, **{**changed, "flights": 3}), tmp_path / "c", Alone(), resume=True)
+
+
+def test_a_narrow_interval_does_not_take_flights_away(plan: Plan, tmp_path: Path) -> None:
+    fly_campaign(plan, tmp_path / "c", Alone())
+    with pytest.raises(InputError, match=r"--until-width would leave out flights: .* after 10 of the 12 flights"):
+        fly_campaign(plan, tmp_path / "c", Alone(), resume=True, until_width=0.7)
+    assert read_table(tmp_path / "c" / "flights.parquet").num_rows == 12
+
+
+def test_grids_are_gone_through_in_whole_turns(tmp_path: Path) -> None:
+    grid = {"name": "turn", "fields": ["initial.euler.2"], "distribution": "grid", "values": [0.0, 1.0, 2.0]}
+    plan = make_plan(tmp_path, flights=60, vary=[grid], failure=["lost"])
+    result = fly_campaign(plan, tmp_path / "c", Alone(), until_width=0.3)
+    drawn = result.table["draw.turn"].to_pylist()
+    assert {drawn.count(value) for value in (0.0, 1.0, 2.0)} == {10}
+
+
+@pytest.mark.parametrize("dies_after", ["manifest.json", "campaign.toml"])
+def test_dying_while_it_grows_locks_nothing_out(
+    plan: Plan, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, dies_after: str
+) -> None:
+    fly_campaign(plan, tmp_path / "c", Alone())
+    more = make_plan(tmp_path, flights=15)
+
+    def then_dies(write: Any) -> Any:
+        def written(path: Path, content: Any) -> None:
+            write(path, content)
+            if path.name == dies_after:
+                raise KeyboardInterrupt
+
+        return written
+
+    with monkeypatch.context() as patch:
+        patch.setattr(records, "write_json", then_dies(records.write_json))
+        patch.setattr(records, "write_atomically", then_dies(records.write_atomically))
+        with pytest.raises(KeyboardInterrupt):
+            fly_campaign(more, tmp_path / "c", Alone(), resume=True)
+    assert fly_campaign(more, tmp_path / "c", Alone(), resume=True).table.num_rows == 15
+
+
+def test_files_of_ones_own_are_not_written_over(tmp_path: Path) -> None:
+    (tmp_path / "mine").mkdir()
+    path = tmp_path / "mine" / "campaign.toml"
+    path.write_text("# by hand\n" + tomlkit.dumps(CAMPAIGN), encoding="utf-8")
+    before = path.read_text()
+    for resume in (False, True):
+        with pytest.raises(OutputError, match="is no file of this campaign"):
+            fly_campaign(load_plan(str(path)), tmp_path / "mine", Alone(), resume=resume)
+    assert path.read_text() == before
+
+
+def test_what_a_killed_process_left_half_written_does_not_bar_the_way(plan: Plan, tmp_path: Path) -> None:
+    (tmp_path / "c").mkdir()
+    (tmp_path / "c" / ".campaign.toml.123.partial").write_text("name = ")
+    result = fly_campaign(plan, tmp_path / "c", Alone())
+    assert not list(result.directory.glob(".*.partial"))
+
+
+def test_a_report_of_fewer_flights_goes(plan: Plan, tmp_path: Path) -> None:
+    module.fly_campaign(plan, tmp_path / "c", Alone())
+    fly_campaign(make_plan(tmp_path, flights=14), tmp_path / "c", Alone(), resume=True)
+    assert not (tmp_path / "c" / "index.html").exists()
 
 
 def test_a_full_disk_ends_it_with_a_message_and_resuming_completes_it(
