@@ -121,7 +121,7 @@ def fly(
             if progress is not None:
                 progress(k + 1)
     except FlightError as error:
-        ended = error
+        ended = error.with_traceback(None)  # which would hold this frame, and all that was flown, in a cycle
     except KeyboardInterrupt:
         ended = InterruptedFlightError(time=len(samples) * period)
     count = len(samples)

@@ -23,7 +23,7 @@ from quadsim.errors import MissingPackageError, ParameterError
 from scenarios.campaign.code import code_digest
 from scenarios.campaign.engine import MOST_DEATHS, Answer, EngineError, Pace, Pilot, fly_one, said
 from scenarios.campaign.jobs import Jobs, read_jobs, submit
-from scenarios.garbage import collect_rarely
+from scenarios.garbage import collect_rarely, settle
 
 PATIENCE_S: Final = 60.0
 PATIENCE_WITH_JOBS_S: Final = 86400.0
@@ -132,8 +132,9 @@ def fly_chunk(pickled: bytes, chunk: Sequence[int], expected: Mapping[str, str])
 @lru_cache(maxsize=1)
 def _unpickled(pickled: bytes) -> Pilot:
     """What a worker does once."""
-    collect_rarely()
     pilot: Pilot = pickle.loads(pickled)
+    collect_rarely()
+    settle()
     return pilot
 
 

@@ -14,7 +14,7 @@ from typing import NamedTuple
 from threadpoolctl import threadpool_limits
 
 from scenarios.campaign.engine import Answer, Pilot, fly_one, said
-from scenarios.garbage import collect_rarely
+from scenarios.garbage import collect_rarely, settle
 
 
 class Ready(NamedTuple):
@@ -51,6 +51,7 @@ def serve(pipe: Connection, folder: str) -> None:
             pilot: Pilot = pickle.loads(inbox.get())
         except Exception as error:
             return _tell(pipe, Unfit(said(error)))
+        settle()
         _tell(pipe, Ready())
         while True:
             chunk: list[int] = pickle.loads(inbox.get())

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import gc
+import math
+import weakref
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -127,3 +130,18 @@ def test_ctrl_c_is_recorded(vehicle: Vehicle, speeds: Array) -> None:
 def test_a_bug_in_a_controller_is_not_swallowed(vehicle: Vehicle, speeds: Array) -> None:
     with pytest.raises(ZeroDivisionError):
         fly_scripted(vehicle, Scripted(speeds, raises={2: ZeroDivisionError()}))
+
+
+def test_a_flight_that_ended_early_is_let_go_at_once(vehicle: Vehicle, speeds: Array) -> None:
+    """Without waiting for Python to look for cycles: a campaign's worker would hold hundreds of them."""
+    speeds[3] = math.nan
+    gc.collect()
+    gc.disable()
+    try:
+        log = fly_scripted(vehicle, Scripted(speeds))
+        assert log.reason is not None
+        states = weakref.ref(log.plant.state)
+        del log
+        assert states() is None
+    finally:
+        gc.enable()
