@@ -21,6 +21,7 @@ from quadsim.table import Cell, Grid, grid_to_markdown
 from scenarios.bench.solvers import section
 from scenarios.campaign.console import progress
 from scenarios.campaign.local import LocalEngine
+from scenarios.campaign.manifest import read_manifest
 from scenarios.campaign.plan import load_plan
 from scenarios.campaign.run import Result, fly_campaign
 

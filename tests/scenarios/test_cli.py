@@ -22,6 +22,7 @@ from mpc.solvers import SOLVERS
 from quadsim import __version__, rundir
 from quadsim.assets import vehicle_names
 from quadsim.errors import QuadsimError, RenderingUnavailableError
+from scenarios.campaign.plan import campaign_names
 from scenarios.cli import EXIT_DONE, EXIT_FAILED, EXIT_WRONG_INPUT, main
 from scenarios.loading import LIBRARY, load_scenario, scenario_names
 
@@ -58,7 +59,7 @@ def test_list_names_everything_with_one_line_each(capsys: pytest.CaptureFixture[
     assert main(["list"]) == EXIT_DONE
     printed = capsys.readouterr()
     lines = {line.split()[0]: line.split(maxsplit=1)[1:] for line in printed.out.splitlines() if line.strip()}
-    for name in (*scenario_names(), *vehicle_names(), *SOLVERS, "unconstrained", "constrained"):
+    for name in (*scenario_names(), *campaign_names(), *vehicle_names(), *SOLVERS, "unconstrained", "constrained"):
         assert len(lines[name][0]) > 10
     assert printed.err == ""
 
@@ -66,10 +67,11 @@ def test_list_names_everything_with_one_line_each(capsys: pytest.CaptureFixture[
 def test_list_as_json(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["list", "--json"]) == EXIT_DONE
     listed = json.loads(capsys.readouterr().out)
-    assert list(listed) == ["scenarios", "groups", "expected", "vehicles", "controllers", "solvers"]
+    assert list(listed) == ["scenarios", "groups", "expected", "campaigns", "vehicles", "controllers", "solvers"]
     assert list(listed["scenarios"]) == list(listed["groups"]) == list(listed["expected"]) == scenario_names()
     assert listed["groups"]["paper-constrained"] == "paper"
     assert listed["expected"]["paper-constrained"] == "satisfied"
+    assert list(listed["campaigns"]) == campaign_names()
     assert list(listed["solvers"]) == list(SOLVERS)
 
 
@@ -85,7 +87,7 @@ def test_list_shows_scenarios_by_group_and_what_is_to_defeat_the_controller(
     monkeypatch.setattr("scenarios.commands.catalogue.load_scenario", lambda name: made[name])
     assert main(["list"]) == EXIT_DONE
     lines = [" ".join(line.split()) for line in capsys.readouterr().out.splitlines()]
-    assert lines[: lines.index("vehicles")] == [
+    assert lines[: lines.index("campaigns")] == [
         "scenarios: air",
         "b d (meant to violate a constraint)",
         "c d",

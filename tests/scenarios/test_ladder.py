@@ -236,9 +236,10 @@ def test_the_page_says_what_is_met_and_what_is_not() -> None:
     found = fault_injection.Consequence(
         injection=injection, reason=None, finite=True, within=True, fallback=1, furthest=0.2, back=10.5
     )
-    page = make_robustness.page(ladder, [found, replace(found, back=4.0)])
+    windy = replace(injection, start=4.5, condition="wind 3 m/s")
+    page = make_robustness.page(ladder, [found, replace(found, injection=windy, back=4.0)])
     assert "1 of 2 are harmless" in page
-    assert f"| {fault.name} | 3.00, 3.00 | 1 of 2 | 1 | 0.2000 | 10.50 |" in page
+    assert f"| {fault.name} | 3.00 (nominal), 4.50 (wind 3 m/s) | 1 of 2 | 1 | 0.2000 | 10.50 |" in page
 
 
 def test_a_scenario_without_such_bounds_is_refused() -> None:

@@ -26,10 +26,27 @@ from scenarios.campaign.cluster import DaskEngine, versions
 from scenarios.campaign.engine import EngineError
 from scenarios.campaign.jobs import Jobs, job_script, read_jobs, submit
 from scenarios.campaign.local import LocalEngine
+from scenarios.campaign.plan import load_plan
+from scenarios.campaign.run import SUMMARY_FILE, Standing, fly_campaign
 
 ROOT = Path(__file__).resolve().parents[3]
 FLIGHTS = range(40)
 ALL = [value_of(flight) for flight in FLIGHTS]
+LITTLE = """
+name = "little"
+scenario = "hover"
+flights = 16
+seed = 4
+failure = ["lost", "max_error.z > 0.2"]
+set = { duration = 0.5, constraints = [] }
+
+[[vary]]
+name = "mass"
+fields = ["effects.load.mass_factor"]
+distribution = "uniform"
+low = 0.5
+high = 1.5
+"""
 SLURM = '[slurm]\njobs = 2\ncores = 1\nmemory = "1GB"\nqueue = "short"\nwalltime = "00:10:00"\n'
 
 
@@ -79,6 +96,32 @@ def test_a_worker_killed_in_mid_campaign_costs_nothing_but_time(two_workers: str
     assert len({row["process"] for row in rows}) >= 2
     assert killed
     assert not living({killed})
+
+
+def test_a_campaign_whose_worker_is_killed_ends_in_the_same_bytes(two_workers: str, tmp_path: Path) -> None:
+    plan = load_plan(str(write(tmp_path / "little.toml", LITTLE)))
+    killed: list[int] = []
+    with distributed.Client(two_workers, set_as_default=False) as client:
+        client.wait_for_workers(2, timeout=30.0)
+        processes: dict[str, int] = client.run(os.getpid)
+
+        def busy() -> list[int]:
+            return [processes[address] for address, tasks in client.processing().items() if tasks]
+
+        def kill_one(standing: Standing) -> None:
+            if 4 <= standing.flown < 12 and not killed:
+                assert until(lambda: bool(busy()))
+                killed.append(busy()[0])
+                os.kill(killed[0], signal.SIGKILL)
+
+        disturbed = fly_campaign(plan, tmp_path / "dask", DaskEngine(two_workers), report=False, watch=kill_one)
+    calm = fly_campaign(plan, tmp_path / "one", LocalEngine(1), report=False)
+    assert len(processes) == 2
+    assert killed
+    assert not living({*killed})
+    assert [session["engine"] for session in disturbed.manifest["sessions"]] == ["dask"]
+    for name in ("flights.parquet", SUMMARY_FILE):
+        assert (disturbed.directory / name).read_bytes() == (calm.directory / name).read_bytes()
 
 
 def test_a_flight_that_always_kills_its_worker_is_lost_in_the_end(monkeypatch: pytest.MonkeyPatch) -> None:
