@@ -5,17 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 from scipy.sparse import csc_matrix
 
 from mpc.problem import Bounds
 from quadsim.state import Array
-
-SLACK_UNIT: Final = 0.01
-"""A slack is so many times its variable.  At prices that are exact PIQP then takes fewer iterations, and leaves smaller
-dual residuals, which it measures against the largest price."""
 
 Indices = np.ndarray[Any, np.dtype[np.int64]]
 
@@ -136,7 +132,7 @@ class Rows:
 
     Attributes:
         C: (n_rows, n) per predicted state.
-        slack: (n_rows, n_s) what its slacks' variables add.
+        slack: (n_rows, n_s) its slacks' signs.
         outputs: (N, n_rows) where these rows are.
         limited: which inputs have bounds on their slews.
         slews: where the rows u(i) - u(i-1) are.
@@ -168,7 +164,7 @@ def constraint_rows(at: Layout, bounds: Bounds, *, soft: bool, margins: Array | 
     if soft:
         upper, lower = np.flatnonzero(above), np.flatnonzero(below)
         kept = np.concatenate([upper, lower])
-        slack = SLACK_UNIT * np.concatenate([-np.eye(len(below))[upper], np.eye(len(below))[lower]])
+        slack = np.concatenate([-np.eye(len(below))[upper], np.eye(len(below))[lower]])
         y_min = np.concatenate([np.full(upper.size, -math.inf), bounds.y_min[lower]])
         y_max = np.concatenate([bounds.y_max[upper], np.full(lower.size, math.inf)])
     else:

@@ -5,8 +5,7 @@ As in `mpc.multistage` the horizon is cut into stages of a few steps each, the v
     v_0, e_0 | s_1, v_1, e_1 | s_2, v_2, e_2 | ... | s_J, e_J
 
 with s_j the state at the start of stage j (s_0 = x(k) is known, s_J = x(k+N)), v_j = u - u_ref of its steps and, where
-output bounds are soft, e_j the slacks of its states (over `mpc.stages.SLACK_UNIT`).  States inside a stage are
-condensed.  Minimised is
+output bounds are soft, e_j the slacks of its states.  States inside a stage are condensed.  Minimised is
 
     sum_i |C_r x(k+i) - y_d(i)|^2_Qy + |u(k+i-1) - u_ref(i)|^2_Qu + |u(k+i-1) - u(k+i-2)|^2_Qd
           + l1' e(i) + |e(i)|^2_l2,  i = 1 .. N,
@@ -30,7 +29,7 @@ from mpc.problem import Bounds, Objective
 from mpc.qp import QP, Solution, Vectors
 from mpc.solvers import _piqp
 from mpc.stagematrices import Matrices, MatrixBuilder, condense
-from mpc.stages import SLACK_UNIT, constraint_rows, layout
+from mpc.stages import constraint_rows, layout
 from quadsim.errors import ParameterError
 from quadsim.state import Array
 
@@ -125,9 +124,7 @@ class StagewiseQP:
         self._move_weight = 2.0 * (np.zeros((nu, nu)) if move_weight is None else move_weight)
         self._rows = rows = constraint_rows(at, bounds, soft=penalty is not None, margins=margins)
         self._penalty = penalty
-        l1, l2 = (
-            (np.zeros(0), np.zeros(0)) if penalty is None else (SLACK_UNIT * penalty.l1, SLACK_UNIT**2 * penalty.l2)
-        )
+        l1, l2 = (np.zeros(0), np.zeros(0)) if penalty is None else (penalty.l1, penalty.l2)
         self._builder = MatrixBuilder(
             at, rows, self._regulated, 2.0 * objective.Q_u, self._move_weight, 2.0 * np.tile(l2, N)
         )
@@ -201,7 +198,7 @@ class StagewiseQP:
         return StagewiseAnswer(
             plan=x[at.inputs] + program.u_reference,
             states=np.concatenate([first, later.reshape(-1, at.n), x[at.starts[-1:]]]),
-            slack=np.zeros((at.N, self._n_c)) if self._penalty is None else SLACK_UNIT * x[at.slacks],
+            slack=np.zeros((at.N, self._n_c)) if self._penalty is None else x[at.slacks],
             solution=solution,
         )
 

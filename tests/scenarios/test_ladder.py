@@ -7,6 +7,7 @@ import math
 import time as clock
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import fault_injection
 import make_robustness
@@ -18,7 +19,7 @@ from quadsim.bench import Ladder, LadderFlight, ladder_legend, ladder_tables
 from quadsim.errors import InputError, ParameterError
 from quadsim.table import Mark
 from scenarios.bench.climbers import CLIMBERS, FULL, equip, tilt_bound
-from scenarios.bench.ladder import Cell, climb, fly_cell, is_ladder, ladder_markdown, write_ladder
+from scenarios.bench.ladder import Cell, climb, fly_cell, is_ladder, ladder_markdown, time_cell, write_ladder
 from scenarios.bench.processes import answer_all
 from scenarios.bench.rungs import CONDITIONS
 from scenarios.cli import EXIT_DONE, EXIT_WRONG_INPUT, main
@@ -188,9 +189,9 @@ def test_steps_are_timed_of_the_full_controller_and_in_the_first_condition(monke
     """Each question is answered at once here, its answer marked with the number of processes that were to be used."""
     asked: list[tuple[int | None, int]] = []
 
-    def answer(ask: object, cells: list[Cell], *, workers: int | None, progress: object) -> list[LadderFlight]:
+    def answer(ask: object, cells: list[Cell], *, workers: int | None, progress: object) -> list[Any]:
         asked.append((workers, len(cells)))
-        return [replace(WELL, step_p99=float(workers or 0)) for _ in cells]
+        return [float(workers or 0) for _ in cells] if ask is time_cell else [WELL for _ in cells]
 
     monkeypatch.setattr("scenarios.bench.ladder.answer_all", answer)
     ladder = climb(workers=2)
