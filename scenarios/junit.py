@@ -2,12 +2,29 @@
 
 from __future__ import annotations
 
+import tempfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
 
+from quadsim.errors import OutputError
 from quadsim.rundir import write_atomically
+
+
+def require_place(path: Path) -> None:
+    """Refuse a place where no verdicts can be written, before anything flies for them.
+
+    Raises:
+        OutputError: it is a folder, or no file can be made beside it.
+    """
+    if path.is_dir():
+        raise OutputError(path, "is a folder")
+    try:
+        with tempfile.TemporaryFile(dir=path.parent):
+            pass
+    except OSError as error:
+        raise OutputError(path, error.strerror or str(error)) from error
 
 
 def write_junit(summary: Mapping[str, Any], path: Path) -> None:

@@ -9,6 +9,7 @@ import platform
 import time as clock
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any, Final
 
@@ -218,6 +219,7 @@ def machine() -> dict[str, Any]:
     return {"system": platform.platform(), "processor": processor_name(), "cores": os.cpu_count()}
 
 
+@cache
 def processor_name() -> str:
     """The processor's model, as far as the system tells."""
     try:

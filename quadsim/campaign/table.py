@@ -58,8 +58,13 @@ _COMMANDS: Final = (
 _WORST: Final = (("worst_margin", "-", pa.float64()), ("worst_constraint", "-", pa.string()))
 _COMMANDED: Final = ("speed", "slew")
 """Signals that the controller sets itself."""
-TIMING: Final = (("wall_s", "s"), ("step_p50_ms", "ms"), ("step_p99_ms", "ms"))
-"""What a clock measured of a flight, with units; it stands in a table of its own."""
+TIMING: Final = (
+    ("machine", "-", pa.string()),
+    ("wall_s", "s", pa.float64()),
+    ("step_p50_ms", "ms", pa.float64()),
+    ("step_p99_ms", "ms", pa.float64()),
+)
+"""What a clock measured of a flight, and where; it stands in a table of its own."""
 
 
 def make_schema(draws: Mapping[str, tuple[pa.DataType, str]], limits: Sequence[Limit]) -> pa.Schema:
@@ -92,12 +97,12 @@ def make_schema(draws: Mapping[str, tuple[pa.DataType, str]], limits: Sequence[L
         *_COMMANDS,
         *audited,
         *_WORST,
-        *((name, unit, pa.float64()) for name, unit in TIMING),
+        *TIMING,
     ]
     return pa.schema([pa.field(name, kind, metadata={"unit": unit}) for name, unit, kind in columns])
 
 
-def flown_row(log: FlightLog, findings: Sequence[Finding], *, verdict: str, wall_s: float) -> Row:
+def flown_row(log: FlightLog, findings: Sequence[Finding], *, verdict: str, wall_s: float, machine: str) -> Row:
     """What a campaign keeps of a flight.
 
     Args:
@@ -105,6 +110,7 @@ def flown_row(log: FlightLog, findings: Sequence[Finding], *, verdict: str, wall
         findings: its audit.
         verdict: `satisfied`, `violated` or `lost`.
         wall_s: how long it took to fly [s].
+        machine: the processor that flew it.
     """
     row: Row = {
         "status": log.status,
@@ -114,6 +120,7 @@ def flown_row(log: FlightLog, findings: Sequence[Finding], *, verdict: str, wall
         "crashed": str(Phase.CRASHED) in log.control.phase,
         "duration": round(float(log.plant.t[-1]), 9),
         "wall_s": wall_s,
+        "machine": machine,
     }
     for finding in findings:
         name = finding.limit.name
@@ -155,7 +162,7 @@ def make_table(rows: Iterable[Row], schema: pa.Schema) -> pa.Table:
 
 def split_times(table: pa.Table) -> tuple[pa.Table, pa.Table]:
     """What a seed determines, and what a clock measured, by flight."""
-    times = [name for name, _ in TIMING]
+    times = [name for name, *_ in TIMING]
     return table.drop_columns(times), table.select(["flight", *times])
 
 

@@ -77,8 +77,7 @@ def go_on(plan: Plan, directory: Path, *, flying: bool) -> dict[str, Any]:
     """
     manifest = read_manifest(directory)
     if flying:
-        found = _flown_by(plan)
-        differing = [name for name in ("code", "controller", "versions") if manifest.get(name) != found[name]]
+        differing = [name for name in other_than_flew(manifest, plan) if name != "machine"]
         if differing:
             raise InputError(
                 f"{directory}: --resume goes on with the same code alone, and this one differs from what flew the "
@@ -125,6 +124,11 @@ def require_same(plan: Plan, directory: Path) -> None:
             f"{directory}: --resume goes on with the same campaign alone, and its {', '.join(differing)} differs from "
             f"the one there{rule}; choose another --out"
         )
+
+
+def other_than_flew(manifest: Mapping[str, Any], plan: Plan) -> list[str]:
+    """Of `code`, `controller`, `versions` and `machine`, those that are not as when a campaign was begun."""
+    return [name for name, value in _flown_by(plan).items() if manifest.get(name) != value]
 
 
 def _flown_by(plan: Plan) -> dict[str, Any]:

@@ -8,7 +8,7 @@ from quadsim.campaign.table import Row, failed_row, flown_row
 from quadsim.errors import QuadsimError
 from scenarios.campaign.engine import said
 from scenarios.campaign.plan import Plan
-from scenarios.runner import Flight, fly_scenario
+from scenarios.runner import Flight, fly_scenario, processor_name
 
 
 class CampaignPilot:
@@ -30,7 +30,11 @@ class CampaignPilot:
             return self._row(flight, failed_row(str(error)))
         except Exception as error:  # of a controller that is not ours, say: the campaign goes on without it
             return self._row(flight, failed_row(said(error)))
-        return self._row(flight, row_of(flown, clock.perf_counter() - started))
+        return self._row(flight, _kept(flown, clock.perf_counter() - started))
+
+    def row_of(self, flight: int, flown: Flight) -> Row:
+        """The row of a flight that was flown elsewhere; it has no clock times of its own."""
+        return self._row(flight, _kept(flown, 0.0))
 
     def lost(self, flight: int, reason: str) -> Row:
         """The row of a flight that no process came back from."""
@@ -41,6 +45,6 @@ class CampaignPilot:
         return row | {"failed": any(event.holds(row) for event in self._plan.failure)}
 
 
-def row_of(flight: Flight, wall_s: float) -> Row:
+def _kept(flight: Flight, wall_s: float) -> Row:
     """What a campaign keeps of a flight."""
-    return flown_row(flight.log, flight.findings, verdict=flight.outcome, wall_s=wall_s)
+    return flown_row(flight.log, flight.findings, verdict=flight.outcome, wall_s=wall_s, machine=processor_name())

@@ -56,7 +56,7 @@ class Plan:
     @property
     def columns(self) -> dict[str, pa.DataType]:
         """The columns that events may be about, with their types: all but clock times and what only counts flights."""
-        others = {*(name for name, _ in TIMING), "flight", "seed", "failed"}
+        others = {*(name for name, *_ in TIMING), "flight", "seed", "failed"}
         return {field.name: field.type for field in self.schema if field.name not in others}
 
     @cached_property

@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from quadsim.campaign.estimates import worst_flight
 from quadsim.campaign.store import FLIGHTS_FILE
-from quadsim.campaign.table import TIMING, read_table
+from quadsim.campaign.table import make_table, read_table
 from quadsim.errors import ParameterError
-from scenarios.campaign.manifest import stored_plan
-from scenarios.campaign.pilot import row_of
+from scenarios.campaign.manifest import other_than_flew, read_manifest, stored_plan
+from scenarios.campaign.pilot import CampaignPilot
+from scenarios.campaign.plan import Plan
 from scenarios.runner import Flight, Outputs, Progress, run, silent
 from scenarios.spec import Scenario
 
@@ -24,12 +25,17 @@ class Recorded:
     Attributes:
         number: which.
         row: its row of `flights.parquet`.
+        plan: the campaign.
         scenario: what was flown.
+        otherwise: of `code`, `controller`, `versions` and `machine`, those that are not as when it was flown, so that
+            numbers may differ.
     """
 
     number: int
     row: Mapping[str, Any]
+    plan: Plan
     scenario: Scenario
+    otherwise: Sequence[str]
 
 
 def recorded_flight(directory: Path, number: int | None) -> Recorded:
@@ -46,7 +52,8 @@ def recorded_flight(directory: Path, number: int | None) -> Recorded:
     if number not in flights:
         raise ParameterError("", "--flight", number, f"one of the flights 0 to {flights[-1]} of {directory}")
     row = table.slice(flights.index(number), 1).to_pylist()[0]
-    return Recorded(number=number, row=row, scenario=plan.of(number))
+    otherwise = other_than_flew(read_manifest(directory), plan)
+    return Recorded(number=number, row=row, plan=plan, scenario=plan.of(number), otherwise=otherwise)
 
 
 def replay(recorded: Recorded, target: Path, outputs: Outputs, progress: Progress = silent) -> tuple[Flight, list[str]]:
@@ -63,6 +70,6 @@ def replay(recorded: Recorded, target: Path, outputs: Outputs, progress: Progres
         machine with the same code.
     """
     flight = run(recorded.scenario, target, outputs, progress)
-    again = {**recorded.row, **row_of(flight, 0.0)}
-    clocks = {name for name, _ in TIMING}
-    return flight, [name for name, value in recorded.row.items() if name not in clocks and again[name] != value]
+    row = CampaignPilot(recorded.plan).row_of(recorded.number, flight)
+    (again,) = make_table([row], recorded.plan.schema).to_pylist()
+    return flight, [name for name, value in recorded.row.items() if name not in again or again[name] != value]

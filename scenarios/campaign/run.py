@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import time as clock
+from collections import Counter
 from collections.abc import Callable
 from contextlib import closing
 from dataclasses import dataclass
@@ -17,8 +18,8 @@ import pyarrow.compute as pc
 from quadsim.campaign.estimates import estimate
 from quadsim.campaign.report import write_report
 from quadsim.campaign.statistics import proportion
-from quadsim.campaign.store import Store, locked
-from quadsim.campaign.table import Row
+from quadsim.campaign.store import TIMES_FILE, Store, locked
+from quadsim.campaign.table import Row, read_table
 from quadsim.errors import InputError, OutputError, ParameterError
 from quadsim.rundir import file_hashes, write_json
 from scenarios.campaign import manifest as records
@@ -249,7 +250,14 @@ def _conclude(plan: Plan, directory: Path, progress: _Progress, manifest: dict[s
             failure=plan.spec.failure,
         )
     ours = {name: digest for name, digest in file_hashes(directory).items() if not name.startswith(".")}
+    manifest["machines"] = _machines(directory)
     manifest["files"] = {name: digest for name, digest in ours.items() if name != records.MANIFEST_FILE}
     manifest["status"] = "complete" if progress.wanted == plan.spec.flights else "stopped"
     records.write(manifest, directory)
     return Result(directory=directory, manifest=manifest, table=table, summary=summary)
+
+
+def _machines(directory: Path) -> dict[str, int]:
+    """Flights by the processor that flew them; those that raised, or that no process came back from, have none."""
+    machines = read_table(directory / TIMES_FILE)["machine"].drop_null().to_pylist()
+    return dict(sorted(Counter(machines).items()))

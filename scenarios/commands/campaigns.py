@@ -9,12 +9,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from quadsim import rundir
-from quadsim.errors import InputError, OutputError, ParameterError
+from quadsim.errors import InputError, ParameterError
 from scenarios import console
 from scenarios.campaign.manifest import read_manifest, stored_plan
 from scenarios.cli import EXIT_DONE, EXIT_FAILED
 from scenarios.commands.common import print_summary
-from scenarios.junit import write_cases
+from scenarios.junit import require_place, write_cases
 from scenarios.runner import Outputs
 
 if TYPE_CHECKING:
@@ -32,8 +32,8 @@ def campaign(options: Namespace) -> int:
     requirements = [parse_requirement(text) for text in options.requirements]
     if options.junit and not requirements:
         raise ParameterError("", "--junit", options.junit, "given with --require, whose verdicts it is to hold")
-    if options.junit and not Path(options.junit).parent.is_dir():
-        raise OutputError(options.junit, "there is no such folder")
+    if options.junit:
+        require_place(Path(options.junit))
     plan = load_plan(options.file, options.settings, flights=options.flights, seed=options.seed)
     for requirement in requirements:
         parse_event(requirement.event.text, plan.columns)
@@ -88,6 +88,10 @@ def replay(options: Namespace) -> int:
     flight = recorded_flight(directory, options.flight)
     target = Path(options.out) if options.out else Path("runs") / flight.scenario.name
     outputs = Outputs(video=options.video, recording=options.recording, figures=options.figures)
+    if flight.otherwise:
+        print(
+            f"quadsim: other {', '.join(flight.otherwise)} flew that campaign, so numbers may differ", file=sys.stderr
+        )
     with console.progress_bars(enabled=not options.json) as progress:
         _, differing = fly_again(flight, target, outputs, progress)
     print_summary(rundir.read_summary(target), options, where=str(target))

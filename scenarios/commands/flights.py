@@ -15,7 +15,7 @@ from scenarios.cli import EXIT_DONE, EXIT_FAILED
 from scenarios.commands.campaigns import compare_campaigns
 from scenarios.commands.common import load, print_summary
 from scenarios.courses import report
-from scenarios.junit import write_junit
+from scenarios.junit import require_place, write_junit
 from scenarios.loading import load_scenario
 from scenarios.runner import Outputs
 from scenarios.spec import Scenario
@@ -35,6 +35,8 @@ def run(options: Namespace) -> int:
 
 def check(options: Namespace) -> int:
     """`quadsim check`."""
+    if options.junit:
+        require_place(Path(options.junit))
     if Path(options.target).is_dir():
         if options.settings or options.seed is not None:
             option, value = ("--set", options.settings) if options.settings else ("--seed", options.seed)

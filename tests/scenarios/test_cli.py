@@ -354,6 +354,7 @@ WRONG: dict[str, tuple[list[str], str]] = {
     "check of no run": (["check", "folder"], "folder: is not a run directory"),
     "check of a run with settings": (["check", "folder", "--seed", "1"], "absent when a finished run is checked"),
     "junit below a file": (["check", "hover", *SHORT, "--junit", "file/v.xml"], "cannot write file/v.xml: "),
+    "junit is a folder": (["check", "hover", *SHORT, "--junit", "folder"], "cannot write folder: is a folder"),
     "compare of nothing": (["compare", "gone", "--out", "page"], "no scenario named 'gone'"),
     "compare of no run": (["compare", "folder", "--out", "page"], "folder: is not a run directory"),
     "video of nothing": (["video", "gone"], "gone: is not a run directory"),

@@ -33,7 +33,9 @@ def finding(limit: Limit, margin: float, sampled: float | None = None) -> Findin
 
 def test_a_row_has_what_the_schema_says(short_run: Run) -> None:
     schema = make_schema({"mass": (pa.float64(), "kg"), "kind": (pa.string(), "-")}, short_run.limits)
-    row = flown_row(short_run.log, audit(short_run.log, short_run.limits), verdict="violated", wall_s=1.5)
+    row = flown_row(
+        short_run.log, audit(short_run.log, short_run.limits), verdict="violated", wall_s=1.5, machine="x86"
+    )
     known = {"flight", "seed", "draw.mass", "draw.kind", "failed"}
     assert {*row} | known == {*schema.names}
     table = make_table([{**row, "flight": 2, "seed": 1, "failed": True}], schema)
@@ -45,7 +47,9 @@ def test_a_row_has_what_the_schema_says(short_run: Run) -> None:
 
 
 def test_a_row_tells_what_the_summary_tells(short_run: Run) -> None:
-    row = flown_row(short_run.log, audit(short_run.log, short_run.limits), verdict="satisfied", wall_s=0.0)
+    row = flown_row(
+        short_run.log, audit(short_run.log, short_run.limits), verdict="satisfied", wall_s=0.0, machine="x86"
+    )
     summary = short_run.summary
     assert row["rmse.z"] == summary["tracking"]["rmse"]["z"]
     assert row["slew_max"] == summary["control"]["slew_max"]
@@ -69,8 +73,8 @@ def test_rows_are_sorted_and_clock_times_stand_apart(short_run: Run) -> None:
     rows = [{"flight": k, "seed": k, "failed": False, "wall_s": 1.0} | failed_row("x") for k in (2, 0, 1)]
     flights, times = split_times(make_table(rows, schema))
     assert flights["flight"].to_pylist() == [0, 1, 2]
-    assert times.column_names == ["flight", "wall_s", "step_p50_ms", "step_p99_ms"]
-    assert not {"wall_s", "step_p50_ms"} & {*flights.column_names}
+    assert times.column_names == ["flight", "machine", "wall_s", "step_p50_ms", "step_p99_ms"]
+    assert not {"machine", "wall_s", "step_p50_ms"} & {*flights.column_names}
 
 
 @pytest.mark.parametrize(

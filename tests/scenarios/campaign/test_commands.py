@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import signal
 import subprocess
 import sys
@@ -94,6 +95,18 @@ def test_a_replay_gives_the_same_numbers(
     assert json.loads((tmp_path / "runs" / "first-2" / "summary.json").read_text())["scenario"] == "first-2"
 
 
+def test_a_replay_by_other_code_says_so_first(
+    flown: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    other = shutil.copytree(flown / "first", tmp_path / "other")
+    manifest = json.loads((other / "manifest.json").read_text())
+    (other / "manifest.json").write_text(json.dumps({**manifest, "code": "sha256:0"}))
+    assert main(["replay", str(other), "--flight", "2", *BARE]) == EXIT_DONE
+    said = "quadsim: other code flew that campaign, so numbers may differ"
+    assert capsys.readouterr().err.splitlines()[0] == said
+
+
 def test_two_campaigns_are_compared_flight_by_flight(
     flown: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -115,6 +128,11 @@ def test_two_campaigns_are_compared_flight_by_flight(
         (["campaign", "little.toml", "--require", "P(lost) < 2 @ 95%"], "requirement 'P(lost) < 2 @ 95%'"),
         (["campaign", "little.toml", "--require", "P(rmse.q > 1) < 0.1 @ 95%"], "no column named 'rmse.q'"),
         (["campaign", "little.toml", "--require", "lost < 1%"], "must read P(EVENT) OP SHARE @ CONFIDENCE%"),
+        (["campaign", "little.toml", "--require", "P(lost) < 1% @ 95%", "--junit", "."], "cannot write .: is a folder"),
+        (
+            ["campaign", "little.toml", "--require", "P(lost) < 1% @ 95%", "--junit", "gone/v.xml"],
+            "gone/v.xml: No such",
+        ),
         (["campaign", "little.toml", "--set", "duratoin=1"], "duratoin is not a field of the scenario file"),
         (["campaign", "little.toml", "--cluster", "gone.toml"], "gone.toml"),
         (["replay", "little.toml"], "is not a campaign"),

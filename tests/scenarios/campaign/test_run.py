@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import json
 from collections.abc import Generator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +22,7 @@ from scenarios.campaign.manifest import read_manifest
 from scenarios.campaign.plan import Plan, load_plan
 from scenarios.campaign.replay import recorded_flight, replay
 from scenarios.campaign.run import SUMMARY_FILE, Result, Standing
-from scenarios.runner import Outputs
+from scenarios.runner import Outputs, processor_name
 
 CAMPAIGN: dict[str, Any] = {
     "name": "little",
@@ -322,9 +322,22 @@ def test_a_replayed_flight_gives_the_campaigns_numbers(plan: Plan, tmp_path: Pat
 def test_a_replay_tells_when_numbers_differ(plan: Plan, tmp_path: Path) -> None:
     fly_campaign(plan, tmp_path / "c", Alone())
     recorded = recorded_flight(tmp_path / "c", 3)
-    other = recorded.__class__(number=3, row={**recorded.row, "rmse.z": 0.0}, scenario=recorded.scenario)
+    other = replace(recorded, row={**recorded.row, "rmse.z": 0.0, "draw.mass": 0.0, "gone": 1.0})
     _, differing = replay(other, tmp_path / "run", Outputs(video=False, recording=False, figures=False))
-    assert differing == ["rmse.z"]
+    assert sorted(differing) == ["draw.mass", "gone", "rmse.z"]
+
+
+def test_a_replay_knows_that_other_code_flew_the_campaign(plan: Plan, tmp_path: Path) -> None:
+    fly_campaign(plan, tmp_path / "c", Alone())
+    assert recorded_flight(tmp_path / "c", 3).otherwise == []
+    manifest = read_manifest(tmp_path / "c")
+    records.write({**manifest, "code": "sha256:0", "machine": {"processor": "another"}}, tmp_path / "c")
+    assert recorded_flight(tmp_path / "c", 3).otherwise == ["code", "machine"]
+
+
+def test_the_manifest_knows_what_flew(plan: Plan, tmp_path: Path) -> None:
+    result = fly_campaign(plan, tmp_path / "c", LocalEngine(2))
+    assert result.manifest["machines"] == {processor_name(): 12}
 
 
 def test_a_flight_that_there_is_not_is_named(plan: Plan, tmp_path: Path) -> None:
