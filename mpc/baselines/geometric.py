@@ -11,18 +11,11 @@ import numpy as np
 from mpc.actuators import ActuatorBounds
 from mpc.baselines.allocation import allocate, make_allocation
 from mpc.baselines.bandwidths import SEPARATION, YAW_SHARE, lag_to_allow_for
-from mpc.baselines.limits import (
-    held_for_a_period,
-    require_finite,
-    require_positive,
-    require_within,
-    stop,
-)
-from mpc.baselines.preview import differentiator, target_of
+from mpc.baselines.law import FeedbackLaw
+from mpc.baselines.limits import require_positive, require_within
+from mpc.baselines.preview import target_of
 from mpc.baselines.tracking import Gains, Integrals, geometric_wrench, integrate, motion_of
-from mpc.heading import predict_in_heading_frame
-from mpc.model import hover_model
-from quadsim.controller import GROUNDED, Command, Moment, Phase
+from quadsim.controller import Command, Moment, Phase
 from quadsim.errors import ParameterError
 from quadsim.state import Array
 from quadsim.vehicle import Vehicle
@@ -112,7 +105,7 @@ def geometric_settings(
     return GeometricSettings(period=period, **values)  # type: ignore[arg-type]
 
 
-class GeometricController:
+class GeometricController(FeedbackLaw):
     """Thrust along the body axis and a moment from errors on SE(3); see `mpc.baselines.tracking`.
 
     Args:
@@ -121,13 +114,11 @@ class GeometricController:
     """
 
     name: Final = "geometric"
-    solver: Final = ""
 
     def __init__(self, vehicle: Vehicle, settings: GeometricSettings) -> None:
+        super().__init__(vehicle, settings)
         self.settings = settings
-        self.bounds = ActuatorBounds.of_vehicle(vehicle) if settings.bounds is None else settings.bounds
         self.vehicle = vehicle
-        self.model = hover_model(vehicle, settings.period)
         self.gains = Gains(
             k_x=settings.k_x,
             k_v=settings.k_v,
@@ -142,33 +133,14 @@ class GeometricController:
             tilt_max=math.radians(settings.tilt_max),
         )
         self._allocation = make_allocation(vehicle)
-        self._operator = differentiator(settings.horizon, settings.period)
-        self.reset(self.model.u_bar)
-
-    @property
-    def horizon(self) -> int:
-        """N, samples of preview."""
-        return self.settings.horizon
 
     def reset(self, speeds: Array) -> None:
         """Start anew after the command u(-1) (4,) [rad/s]."""
-        self._before = np.array(speeds, float)
+        super().reset(speeds)
         self._integrals = Integrals(translation=np.zeros(3), rotation=np.zeros(3))
 
-    def step(self, now: Moment, state: Array, reference: Array) -> Command:
-        """The law's wrench as rotor speeds; see `quadsim.controller.Controller.step`.
-
-        The integrals rest on the ground, and while bounds keep the wrench from being given.
-
-        Raises:
-            CommandError: the state or the reference is not finite.
-        """
-        before = self._before if now.acting is None else now.acting
-        if now.phase in GROUNDED:
-            command = stop(now, self.bounds, before, self.horizon)
-            self.reset(command.speeds)
-            return command
-        require_finite(now, state, reference)
+    def _command(self, now: Moment, state: Array, reference: Array, before: Array) -> Command:
+        """The law's wrench as rotor speeds; the integrals rest while bounds keep it from being given."""
         motion, target = motion_of(state), target_of(reference, self._operator)
         wrench, wanted = geometric_wrench(self.gains, self.vehicle, motion, target, self._integrals)
         lower, upper = self.bounds.reach(before)
@@ -176,9 +148,4 @@ class GeometricController:
         given = np.allclose(self._allocation.M @ speeds**2, wrench, rtol=0.0, atol=1e-6 * self._allocation.scale.max())
         if given and now.phase is Phase.FLYING:
             self._integrals = integrate(self.gains, self._integrals, motion, target, wanted, self.settings.period)
-        self._before = speeds
-        return Command(speeds=speeds.copy(), plan=held_for_a_period(speeds, self.model, self.horizon))
-
-    def predict(self, states: Array, plans: Array) -> Array:
-        """See `quadsim.controller.Controller.predict`."""
-        return predict_in_heading_frame(self.model, states, plans)
+        return self._held_for_a_period(speeds)

@@ -11,16 +11,13 @@ import scipy.linalg
 
 from mpc.actuators import ActuatorBounds
 from mpc.baselines.allocation import allocate, make_allocation
-from mpc.baselines.limits import (
-    require_finite,
-    require_within,
-    stop,
-)
-from mpc.baselines.preview import differentiator, wrapped
-from mpc.heading import predict_in_heading_frame, turn_horizontally
-from mpc.model import LinearModel, hover_model
+from mpc.baselines.law import FeedbackLaw
+from mpc.baselines.limits import require_within
+from mpc.baselines.preview import wrapped
+from mpc.heading import turn_horizontally
+from mpc.model import LinearModel
 from mpc.problem import Objective
-from quadsim.controller import GROUNDED, Command, Moment
+from quadsim.controller import Command, Moment
 from quadsim.errors import ParameterError
 from quadsim.state import INDEX, N_STATES, REFERENCE_STATES, STATE_NAMES, VELOCITY, Array, read_only
 from quadsim.vehicle import N_ROTORS, Vehicle
@@ -94,7 +91,7 @@ def lqr_gain(model: LinearModel, objective: Objective) -> Array:
     return read_only(np.asarray(K))
 
 
-class LQR:
+class LQR(FeedbackLaw):
     """u = u_bar - K (xi - xi_r), the reference's state xi_r being its pose and velocity, upright.
 
     Heading errors count the short way round.  Speeds that leave the bounds are held to them as `allocate` says; thrust,
@@ -106,46 +103,18 @@ class LQR:
     """
 
     name: Final = "lqr"
-    solver: Final = ""
 
     def __init__(self, vehicle: Vehicle, settings: LQRSettings) -> None:
+        super().__init__(vehicle, settings)
         self.settings = settings
-        self.bounds = ActuatorBounds.of_vehicle(vehicle) if settings.bounds is None else settings.bounds
-        self.model = hover_model(vehicle, settings.period)
         self.gain = lqr_gain(self.model, settings.objective)
-        self._operator = differentiator(settings.horizon, settings.period)
         self._allocation = make_allocation(vehicle)
         self._tilt_asked = np.linalg.pinv(self.gain[:, TILT]) @ self.gain[:, HORIZONTAL]
-        self._before = self.model.u_bar
 
-    @property
-    def horizon(self) -> int:
-        """N, samples of preview."""
-        return self.settings.horizon
-
-    def reset(self, speeds: Array) -> None:
-        """Start anew after the command u(-1) (4,) [rad/s]."""
-        self._before = np.array(speeds, float)
-
-    def step(self, now: Moment, state: Array, reference: Array) -> Command:
-        """The law's command and the model's forecast of the next; see `quadsim.controller.Controller.step`.
-
-        Raises:
-            CommandError: the state or the reference is not finite.
-        """
-        before = self._before if now.acting is None else now.acting
-        if now.phase in GROUNDED:
-            command = stop(now, self.bounds, before, self.horizon)
-        else:
-            require_finite(now, state, reference)
-            plan = self._plan(state, reference, before)
-            command = Command(speeds=plan[0].copy(), plan=plan)
-        self._before = command.speeds
-        return command
-
-    def predict(self, states: Array, plans: Array) -> Array:
-        """See `quadsim.controller.Controller.predict`."""
-        return predict_in_heading_frame(self.model, states, plans)
+    def _command(self, now: Moment, state: Array, reference: Array, before: Array) -> Command:
+        """The law's command and the model's forecast of the next."""
+        plan = self._plan(state, reference, before)
+        return Command(speeds=plan[0].copy(), plan=plan)
 
     def _plan(self, state: Array, reference: Array, before: Array) -> Array:
         """(N, 4) commands: the law's now, held to the bounds, then those of the closed loop of the model."""

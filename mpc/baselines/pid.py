@@ -12,17 +12,10 @@ from mpc.actuators import ActuatorBounds
 from mpc.baselines.allocation import make_allocation
 from mpc.baselines.bandwidths import Bandwidths, bandwidths, lag_to_allow_for
 from mpc.baselines.cascade import Gains, fly_cascade, fresh_memory, make_body
-from mpc.baselines.limits import (
-    held_for_a_period,
-    require_finite,
-    require_positive,
-    require_within,
-    stop,
-)
-from mpc.baselines.preview import differentiator, target_of
-from mpc.heading import predict_in_heading_frame
-from mpc.model import hover_model
-from quadsim.controller import GROUNDED, Command, Moment, Phase
+from mpc.baselines.law import FeedbackLaw
+from mpc.baselines.limits import require_positive, require_within
+from mpc.baselines.preview import target_of
+from quadsim.controller import Command, Moment, Phase
 from quadsim.state import Array
 from quadsim.vehicle import Vehicle
 
@@ -91,7 +84,7 @@ def pid_settings(vehicle: Vehicle, *, period: float, lag: float | None = None, *
     return PIDSettings(period=period, bandwidths=speeds, **values)  # type: ignore[arg-type]
 
 
-class CascadedPID:
+class CascadedPID(FeedbackLaw):
     """Position P, velocity PID, attitude P by quaternions, rate PID, mixer; see `mpc.baselines.cascade`.
 
     Args:
@@ -100,12 +93,10 @@ class CascadedPID:
     """
 
     name: Final = "pid"
-    solver: Final = ""
 
     def __init__(self, vehicle: Vehicle, settings: PIDSettings) -> None:
+        super().__init__(vehicle, settings)
         self.settings = settings
-        self.bounds = ActuatorBounds.of_vehicle(vehicle) if settings.bounds is None else settings.bounds
-        self.model = hover_model(vehicle, settings.period)
         self.gains = Gains(
             bandwidths=settings.bandwidths,
             velocity_integral=settings.velocity_integral,
@@ -118,33 +109,16 @@ class CascadedPID:
             rate_max=tuple(np.radians(settings.rate_max).tolist()),
         )
         self.body = make_body(vehicle, make_allocation(vehicle), float(self.bounds.u_max.min()))
-        self._operator = differentiator(settings.horizon, settings.period)
-        self.reset(self.model.u_bar)
-
-    @property
-    def horizon(self) -> int:
-        """N, samples of preview."""
-        return self.settings.horizon
 
     def reset(self, speeds: Array) -> None:
         """Start anew after the command u(-1) (4,) [rad/s]."""
-        self._before = np.array(speeds, float)
+        super().reset(speeds)
         self._memory = fresh_memory()
 
-    def step(self, now: Moment, state: Array, reference: Array) -> Command:
-        """One period of all loops, integrals at rest while on the ground; see `quadsim.controller.Controller.step`.
-
-        Raises:
-            CommandError: the state or the reference is not finite.
-        """
-        before = self._before if now.acting is None else now.acting
-        if now.phase in GROUNDED:
-            command = stop(now, self.bounds, before, self.horizon)
-            self.reset(command.speeds)
-            return command
-        require_finite(now, state, reference)
+    def _command(self, now: Moment, state: Array, reference: Array, before: Array) -> Command:
+        """One period of all loops, integrals at rest until the vehicle flies."""
         lower, upper = self.bounds.reach(before)
-        self._before, self._memory = fly_cascade(
+        speeds, self._memory = fly_cascade(
             self.gains,
             self.body,
             self._memory,
@@ -155,8 +129,4 @@ class CascadedPID:
             period=self.settings.period,
             integrate=now.phase is Phase.FLYING,
         )
-        return Command(speeds=self._before.copy(), plan=held_for_a_period(self._before, self.model, self.horizon))
-
-    def predict(self, states: Array, plans: Array) -> Array:
-        """See `quadsim.controller.Controller.predict`."""
-        return predict_in_heading_frame(self.model, states, plans)
+        return self._held_for_a_period(speeds)

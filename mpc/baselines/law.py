@@ -1,0 +1,107 @@
+"""What the feedback laws share: a period's course from measurement to command, and the model that forecasts it."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from typing import Final, Protocol
+
+import numpy as np
+
+from mpc.actuators import ActuatorBounds
+from mpc.baselines.preview import differentiator
+from mpc.heading import predict_in_heading_frame
+from mpc.model import hover_model
+from quadsim.controller import GROUNDED, Command, Moment, stopped
+from quadsim.errors import CommandError
+from quadsim.state import STATE_NAMES, Array
+from quadsim.vehicle import Vehicle
+
+
+class LawSettings(Protocol):
+    """What the settings of every law say.
+
+    Attributes:
+        period: tau_s [s].
+        horizon: N, samples of preview; they tell the reference's velocity and acceleration.
+        bounds: what commands are held to; None for the speeds that the rotors hold.
+    """
+
+    @property
+    def period(self) -> float:
+        """See the class."""
+        ...
+
+    @property
+    def horizon(self) -> int:
+        """See the class."""
+        ...
+
+    @property
+    def bounds(self) -> ActuatorBounds | None:
+        """See the class."""
+        ...
+
+
+class FeedbackLaw(ABC):
+    """A controller that solves nothing: a subclass says what it commands in the air, `_command`.
+
+    Args:
+        vehicle: what is believed to fly.
+        settings: see there.
+    """
+
+    solver: Final = ""
+
+    def __init__(self, vehicle: Vehicle, settings: LawSettings) -> None:
+        self.bounds = ActuatorBounds.of_vehicle(vehicle) if settings.bounds is None else settings.bounds
+        self.model = hover_model(vehicle, settings.period)
+        self.horizon = settings.horizon
+        self._operator = differentiator(settings.horizon, settings.period)
+        self.reset(self.model.u_bar)
+
+    def reset(self, speeds: Array) -> None:
+        """Start anew after the command u(-1) (4,) [rad/s]."""
+        self._before = np.array(speeds, float)
+
+    def step(self, now: Moment, state: Array, reference: Array) -> Command:
+        """The law's command; on the ground the lowest speed, as fast as bounds allow; see `quadsim.controller`.
+
+        Raises:
+            CommandError: the state or the reference is not finite.
+        """
+        before = self._before if now.acting is None else now.acting
+        if now.phase in GROUNDED:
+            command = stopped(self.bounds.reach(before)[0], self.horizon, now.phase)
+            self.reset(command.speeds)
+            return command
+        require_finite(now, state, reference)
+        command = self._command(now, state, reference, before)
+        self._before = command.speeds.copy()
+        return command
+
+    def predict(self, states: Array, plans: Array) -> Array:
+        """See `quadsim.controller.Controller.predict`."""
+        return predict_in_heading_frame(self.model, states, plans)
+
+    @abstractmethod
+    def _command(self, now: Moment, state: Array, reference: Array, before: Array) -> Command:
+        """The command in the air after `before` (4,) [rad/s], from finite numbers; see `Controller.step`."""
+
+    def _held_for_a_period(self, speeds: Array) -> Command:
+        """`speeds` (4,) with the plan of a law that plans one period ahead: these, then hover [rad/s]."""
+        plan = np.tile(self.model.u_bar, (self.horizon, 1))
+        plan[0] = speeds
+        return Command(speeds=speeds.copy(), plan=plan)
+
+
+def require_finite(now: Moment, state: Array, reference: Array) -> None:
+    """A measurement and a preview that a command can be made from.
+
+    Raises:
+        CommandError: a number is not finite; nothing was commanded, and the controller's memory is as it was.
+    """
+    if not np.isfinite(state).all():
+        names = ", ".join(STATE_NAMES[i] for i in np.flatnonzero(~np.isfinite(state)))
+        raise CommandError(f"no command from a measured state whose {names} is not finite", time=now.time)
+    if not np.isfinite(reference).all():
+        raise CommandError("no command from a reference that is not finite", time=now.time)
