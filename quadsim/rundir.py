@@ -110,6 +110,29 @@ def write_json(path: Path, data: Mapping[str, Any]) -> None:
     write_atomically(path, json.dumps(data, indent=2, allow_nan=False) + "\n")
 
 
+def read_json(path: Path, kinds: Mapping[str, Any], what: str) -> dict[str, Any]:
+    """A JSON object from a file of ours.
+
+    Args:
+        path: of the file.
+        kinds: types of the entries that it has to have.
+        what: it is, for messages.
+
+    Raises:
+        FileError: it cannot be read, or an entry is missing or of another type.
+    """
+    try:
+        found = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
+        raise FileError(path, f"is not {what} ({error})") from error
+    if not isinstance(found, dict):
+        raise FileError(path, f"is not {what}: it is no table")
+    wrong = [name for name, kind in kinds.items() if not isinstance(found.get(name, ...), kind)]
+    if wrong:
+        raise FileError(path, f"is not {what}: it lacks or misstates {', '.join(wrong)}")
+    return found
+
+
 def write_atomically(path: Path, text: str) -> None:
     """Write or replace a text file in one step.
 
@@ -154,16 +177,7 @@ def read_summary(directory: Path) -> dict[str, Any]:
     path = directory / SUMMARY_FILE
     if not path.is_file():
         raise FileError(directory, f"is not a run directory: it has no {SUMMARY_FILE}")
-    try:
-        summary = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
-        raise FileError(path, f"is not a run's summary ({error})") from error
-    if not isinstance(summary, dict):
-        raise FileError(path, "is not a run's summary: it is no table")
-    wrong = [name for name, kind in _SUMMARY_TYPES.items() if not isinstance(summary.get(name, ...), kind)]
-    if wrong:
-        raise FileError(path, f"is not a run's summary: it lacks or misstates {', '.join(wrong)}")
-    return summary
+    return read_json(path, _SUMMARY_TYPES, "a run's summary")
 
 
 def load_run(directory: Path) -> Run:

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import hashlib
-import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final
 
 from quadsim.errors import FileError, InputError, OutputError
-from quadsim.rundir import write_atomically, write_json
+from quadsim.rundir import read_json, write_atomically, write_json
 from scenarios.campaign.code import code_digest, controller_digest
 from scenarios.campaign.plan import Plan, load_plan
 from scenarios.campaign.spec import CampaignSpec
@@ -150,18 +149,10 @@ def read_manifest(directory: Path) -> dict[str, Any]:
     path = directory / MANIFEST_FILE
     if not path.is_file():
         raise FileError(directory, f"is not a campaign: it has no {MANIFEST_FILE}")
-    try:
-        manifest = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
-        raise FileError(path, f"is not a campaign's manifest ({error})") from error
-    wrong = [
-        name
-        for name, kind in _KEYS.items()
-        if not isinstance(manifest, dict) or not isinstance(manifest.get(name), kind)
-    ]
-    if wrong or manifest["format"] != FORMAT:
-        raise FileError(path, f"is not a campaign's manifest: it lacks or misstates {', '.join(wrong or ['format'])}")
-    return dict(manifest)
+    manifest = read_json(path, _KEYS, "a campaign's manifest")
+    if manifest["format"] != FORMAT:
+        raise FileError(path, "is not a campaign's manifest: it lacks or misstates format")
+    return manifest
 
 
 def is_campaign(directory: Path) -> bool:
