@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import cached_property
 from types import TracebackType
 from typing import Final, Protocol
 
@@ -100,8 +101,6 @@ class Plant:
         self._yaw = 0.0
         self._wind = wind
         self._by_step = effects.follows_state or wind is not None
-        shape = outline(vehicle)
-        self._forces = StepForces(vehicle, effects, floor=shape.floor, disc=shape.disc)
         changes = sorted(effects.changes, key=lambda change: change.time)
         self._changes = [(math.ceil(change.time / timestep - 1e-6), change) for change in changes]
         self._rng = rng if rng is not None else np.random.default_rng(0)
@@ -171,6 +170,12 @@ class Plant:
         self._rng.bit_generator.state = self._rng_start
         if self._wind is not None:
             self._wind.reset()
+
+    @cached_property
+    def _forces(self) -> StepForces:
+        """What acts in each step; made where steps are taken one by one."""
+        shape = outline(self.vehicle)
+        return StepForces(self.vehicle, self.effects, floor=shape.floor, disc=shape.disc)
 
     def state(self) -> Array:
         """(12,) the true state now, yaw unwrapped since the last reset."""

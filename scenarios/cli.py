@@ -173,7 +173,7 @@ def _add_bench(bench: argparse.ArgumentParser) -> None:
     ladder.add_argument("--quick", action="store_true", help="three controllers, three conditions, 12 s each")
 
     campaign = kinds.add_parser("campaign", help="what many flights cost, by one worker and by two")
-    campaign.add_argument("--flights", type=int, metavar="N", default=30, help="per worker and round (default: 30)")
+    campaign.add_argument("--flights", type=int, metavar="N", default=40, help="per worker and round (default: 40)")
     campaign.add_argument("--rounds", type=int, metavar="N", default=3, help="of one worker and two (default: 3)")
     campaign.add_argument(
         "--sizes",

@@ -32,7 +32,7 @@ _LOOK_EVERY: Final = 1.0
 def bench_campaign(
     scenario: Scenario,
     *,
-    flights: int = 30,
+    flights: int = 40,
     rounds: int = 3,
     sizes: Sequence[int] = (10, 100, 1000, 10000),
     progress: Progress = silent,

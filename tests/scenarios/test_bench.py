@@ -370,7 +370,9 @@ def test_what_a_campaign_costs_is_measured_and_told() -> None:
     rounds, growth, targets = campaign_tables(profile)
     assert (len(rounds.lines), len(growth.lines), len(targets.lines)) == (2, 2, 4)
     assert len(campaign_tables(replace(profile, growing=()))) == 2
-    assert profile.to_json()["per_core_hour"] == pytest.approx(3600.0 * one.rate)
+    slower = replace(one, wall_s=2.0 * one.wall_s)
+    assert replace(profile, rounds=((slower, two), *profile.rounds)).per_core_hour == pytest.approx(3600.0 * one.rate)
+    assert one.flight_s == pytest.approx(one.busy_s / 6)
 
 
 @pytest.mark.parametrize("options", [{"flights": 0}, {"rounds": 0}, {"sizes": (0, 3)}])
