@@ -128,7 +128,7 @@ def campaign_tables(profile: CampaignProfile) -> list[Grid]:
             for run in pair
         ),
         note=f"{profile.rounds[0][0].flights} flights by one worker, {profile.rounds[0][1].flights} by two, in turns; "
-        "every flight's set-up and audit included. Where a flight takes longer beside another one, the cores share what "
+        "every flight's set-up and audit included. Where a flight takes longer beside another one, cores share what "
         "both need. Not flying: share of the workers' time, their start included.",
     )
     targets = targets_table("Asked of campaigns, and measured", campaign_targets(profile))
