@@ -139,7 +139,7 @@ def main() -> int:
     parser.add_argument("--kills", type=int, default=100)
     parser.add_argument("--flights", type=int, default=200)
     parser.add_argument("--duration", type=float, default=60.0, help="of a flight [s]")
-    parser.add_argument("--pause", type=float, default=1.0, help="mean time between kills [s]")
+    parser.add_argument("--pause", type=float, default=0.7, help="mean time between kills [s]")
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as directory:
