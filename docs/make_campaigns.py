@@ -17,6 +17,7 @@ from quadsim.campaign.comparison import compare
 from quadsim.campaign.comparison_tables import comparison_tables, pairing
 from quadsim.campaign.sentences import campaign_sentences, verdict_sentence
 from quadsim.campaign.tables import constraint_table, driver_table, event_table, worst_table
+from quadsim.campaign.wording import interval, percent
 from quadsim.table import Cell, Grid, grid_to_markdown
 from scenarios.bench.solvers import section
 from scenarios.campaign.console import progress
@@ -49,9 +50,9 @@ def violations(results: list[Result]) -> Grid:
             str(found["flights"]),
             str(lost["count"]),
             str(found["count"]),
-            f"{100 * found['share']:.1f} %",
-            f"{100 * found['lower']:.1f} to {100 * found['upper']:.1f} %",
-            f"{100 * found['upper_one_sided']:.1f} %",
+            percent(found["share"]),
+            interval(found["lower"], found["upper"]),
+            percent(found["upper_one_sided"]),
         )
         lines.append(tuple(Cell(text=text) for text in texts))
     return Grid(
@@ -110,7 +111,7 @@ def main() -> None:
     for name, result in zip(NAMES, results, strict=True):
         figure = Image.open(result.directory / "campaign.png").convert("RGB")
         target = ROOT / "docs" / f"campaign-{name}.png"
-        figure.quantize(32, dither=Image.Dither.NONE).save(target, optimize=True)
+        figure.quantize(128, dither=Image.Dither.NONE).save(target, optimize=True)
     (ROOT / "docs" / f"{PAGE}.md").write_text(page(results), encoding="utf-8")
     replace_in_readme("campaigns", grid_to_markdown(violations(results)), command="make campaigns")
 

@@ -29,6 +29,8 @@ if TYPE_CHECKING:
 
 _MARKERS: Final = {"satisfied": "o", "violated": "D", "lost": "x", "error": "s"}
 _MOST_DRIVERS: Final = 10
+_FEW: Final = 50
+"""Flights of a verdict that are drawn larger, so as to be seen among the others."""
 
 
 def write_campaign_figure(name: str, table: pa.Table, summary: Summary, directory: Path) -> list[Path]:
@@ -97,6 +99,7 @@ def _draw_margins(axes: Axes, table: pa.Table) -> None:
         below += counts
     if drawn.edges[0] <= 0.0 <= drawn.edges[-1]:
         axes.axvline(0.0, color=BOUND, linestyle="--", linewidth=1.1)
+    axes.set_ylim(0.0, 1.08 * below.max())
     axes.yaxis.set_major_locator(MaxNLocator(integer=True))
     axes.set_xlabel(drawn.label.replace("worst_margin", "worst margin"))
     axes.set_ylabel("flights")
@@ -148,7 +151,7 @@ def _draw_strongest(axes: Axes, table: pa.Table, summary: Summary) -> None:
             drawn.y[rows],
             _MARKERS[verdict],
             color=VERDICTS[verdict],
-            markersize=2.6,
+            markersize=2.6 if len(rows) > _FEW else 4.5,
             alpha=0.65,
             markeredgewidth=0.9 if verdict == "lost" else 0.0,
             rasterized=True,
