@@ -111,7 +111,7 @@ def main() -> None:
     for name, result in zip(NAMES, results, strict=True):
         figure = Image.open(result.directory / "campaign.png").convert("RGB")
         target = ROOT / "docs" / f"campaign-{name}.png"
-        figure.quantize(128, dither=Image.Dither.NONE).save(target, optimize=True)
+        figure.quantize(256, dither=Image.Dither.NONE).save(target, optimize=True)
     (ROOT / "docs" / f"{PAGE}.md").write_text(page(results), encoding="utf-8")
     replace_in_readme("campaigns", grid_to_markdown(violations(results)), command="make campaigns")
 
