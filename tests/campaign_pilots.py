@@ -67,7 +67,7 @@ def known(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
     return sorted(bare, key=lambda row: row["flight"])
 
 
-def until(holds: Callable[[], bool], seconds: float = 8.0) -> bool:
+def until(holds: Callable[[], bool], seconds: float = 30.0) -> bool:
     """Whether something becomes true before long."""
     end = clock.monotonic() + seconds
     while not holds():
