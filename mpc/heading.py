@@ -7,6 +7,7 @@ It is anchored where the vehicle rests, (x_s, u_s) of `mpc.equilibrium`: in axes
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from typing import Final
 
@@ -75,3 +76,19 @@ def predict_in_heading_frame(model: LinearModel, states: Array, plans: Array, tr
 def advance(model: LinearModel, state: Array, speeds: Array, trim: Trim) -> Array:
     """The state (12,) a period later under speeds (4,) [rad/s], by the anchored model in the heading frame."""
     return predict_in_heading_frame(anchored(model, trim), state[None], speeds[None, None], trim)[0, 0]
+
+
+def with_nearest_yaw(reference: Array, yaw: float, largest: float) -> Array:
+    """The reference (N, 4) with a yaw that starts from the present one and has no larger jumps [rad]."""
+    turned = reference.copy()
+    turned[:, 3] = yaw + np.cumsum(np.clip(np.diff(reference[:, 3], prepend=yaw), -largest, largest))
+    return turned
+
+
+def seen_from(reference: Array, yaw: float) -> Array:
+    """The reference (N, 4) in axes turned by a yaw [rad]."""
+    cosine, sine = math.cos(yaw), math.sin(yaw)
+    seen = reference.copy()
+    seen[:, :2] = reference[:, :2] @ np.array([[cosine, -sine], [sine, cosine]])
+    seen[:, 3] -= yaw
+    return seen

@@ -218,3 +218,10 @@ def accelerations(model: NonlinearModel, euler: Array, euler_rate: Array, drive:
     out[1] += d_y
     out[2] += d_z - model.gravity
     return out
+
+
+def spun(model: NonlinearModel, rotors: Array, command: Array, time: float) -> Array:
+    """Rotor speeds (4,) some time [s] after speeds (4,) under a command (4,) [rad/s]."""
+    if model.rotor_lag is None:
+        return command
+    return command + math.exp(-time / model.rotor_lag) * (rotors - command)

@@ -20,10 +20,17 @@ import numpy as np
 
 from mpc.actuators import BOUND_TOLERANCE, ActuatorBounds
 from mpc.equilibrium import Trim, equilibrium, twisted
-from mpc.heading import anchored, predict_in_heading_frame, slope, turn_horizontally
+from mpc.heading import (
+    anchored,
+    predict_in_heading_frame,
+    seen_from,
+    slope,
+    turn_horizontally,
+    with_nearest_yaw,
+)
 from mpc.linearise import linearise
 from mpc.model import continuous_model, discretise, hover_model
-from mpc.nonlinear import NonlinearModel, advance, nonlinear_model
+from mpc.nonlinear import NonlinearModel, advance, nonlinear_model, spun
 from mpc.observer import DisturbanceObserver, thrust_axis
 from mpc.observer import ObserverSettings as ObserverSettings
 from mpc.problem import Bounds, Objective
@@ -131,8 +138,8 @@ class RobustMPC:
             self._acting = np.array(now.acting, float)
         rest = self._period - self.settings.delay
         ahead, before, asked = self._ahead, self._rotors, self._asked
-        rotors = _spun(self._model, before, self._acting, rest)
-        self._rotors = _spun(self._model, rotors, self._acting, self.settings.delay)
+        rotors = spun(self._model, before, self._acting, rest)
+        self._rotors = spun(self._model, rotors, self._acting, self.settings.delay)
         self._ahead, self._asked = None, now.time
         if now.phase in GROUNDED:
             return self._stop(now.phase)
@@ -250,12 +257,12 @@ class RobustMPC:
     def _solve(self, x0: Array, reference: Array) -> StagewiseAnswer:
         yaw = float(x0[_YAW])
         if self.settings.linearisation is not Linearisation.HOVER:
-            desired = self._objective.desired(_turning(reference, yaw, self.settings.largest_turn))
+            desired = self._objective.desired(with_nearest_yaw(reference, yaw, self.settings.largest_turn))
             return self._qp.solve(*self._relinearised(x0), x0, desired, self._acting, self.trim.speeds)
         if not self.settings.heading:
             yaw = 0.0
         else:
-            reference = _turning(reference, yaw, self.settings.largest_turn)
+            reference = with_nearest_yaw(reference, yaw, self.settings.largest_turn)
             x0 = turn_horizontally(x0, np.array(-yaw))
             x0[_YAW] = 0.0
         u_s = self._balanced()
@@ -263,7 +270,7 @@ class RobustMPC:
         x_s[N_STATES:] = u_s[: self._model.n - N_STATES]
         held, N = self._hover, self.horizon
         c = np.broadcast_to(x_s - held.A[0] @ x_s - held.B[0] @ u_s, (N, x_s.size))
-        desired = self._objective.desired(_seen_from(reference, yaw))
+        desired = self._objective.desired(seen_from(reference, yaw))
         return self._qp.solve_prepared(held, c, x0, desired, self._acting, u_s)
 
     def _balanced(self) -> Array:
@@ -304,29 +311,6 @@ def _command(plan: Array, status: str, solution: Solution, slack: float = 0.0) -
 def _hover_matrices(vehicle: Vehicle, model: NonlinearModel) -> tuple[Array, Array]:
     """A (n, n), B (n, 4) at hover with zero yaw: Eq. (1), or with d(w)/dt = (u - w) / tau_r between."""
     return discretise(*continuous_model(vehicle, model.rotor_lag or 0.0), model.period)
-
-
-def _spun(model: NonlinearModel, rotors: Array, command: Array, time: float) -> Array:
-    """Rotor speeds (4,) some time [s] after speeds (4,) under a command (4,) [rad/s]."""
-    if model.rotor_lag is None:
-        return command
-    return command + math.exp(-time / model.rotor_lag) * (rotors - command)
-
-
-def _turning(reference: Array, yaw: float, largest: float) -> Array:
-    """The reference (N, 4) with a yaw that starts from the present one and has no larger jumps [rad]."""
-    turned = reference.copy()
-    turned[:, 3] = yaw + np.cumsum(np.clip(np.diff(reference[:, 3], prepend=yaw), -largest, largest))
-    return turned
-
-
-def _seen_from(reference: Array, yaw: float) -> Array:
-    """The reference (N, 4) in axes turned by a yaw [rad]."""
-    cosine, sine = math.cos(yaw), math.sin(yaw)
-    seen = reference.copy()
-    seen[:, :2] = reference[:, :2] @ np.array([[cosine, -sine], [sine, cosine]])
-    seen[:, 3] -= yaw
-    return seen
 
 
 def _widened(matrix: Array, n: int) -> Array:

@@ -37,8 +37,6 @@ STEPS_PER_STAGE: Final = 4
 """M, the fastest of 1 to 7 for 16 states, though 2 to 5 hardly differ."""
 SCALINGS: Final = 3
 """Passes of PIQP's scaling, which new matrices need anew: its usual ten take 0.2 ms longer and save no iteration."""
-
-
 LARGEST: Final = 1e6
 """Magnitude of a number in the data beyond which it is no vehicle's: four steps of such numbers multiply to 1e30, where
 PIQP takes bounds for infinite."""
