@@ -76,8 +76,8 @@ class CampaignProfile:
 
     @property
     def per_core_hour(self) -> float:
-        """Flights per hour of one core, in the best round: what disturbs a machine only ever takes time."""
-        return max(3600.0 * one.rate for one, _ in self.rounds)
+        """Flights per hour of one core, the median over the rounds."""
+        return float(np.median([3600.0 * one.rate for one, _ in self.rounds]))
 
     @property
     def scaling(self) -> float:
@@ -163,7 +163,7 @@ def campaign_targets(profile: CampaignProfile) -> list[Target]:
     memory = math.nan if profile.memory_mb is None else profile.memory_mb
     return [
         Target(
-            what=f"60 s flights of {profile.scenario} per core-hour, the best round",
+            what=f"60 s flights of {profile.scenario} per core-hour, the median round",
             asked=">= 3000",
             measured=f"{hour:.0f}",
             met=hour >= 3000.0,

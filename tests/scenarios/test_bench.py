@@ -371,7 +371,7 @@ def test_what_a_campaign_costs_is_measured_and_told() -> None:
     assert (len(rounds.lines), len(growth.lines), len(targets.lines)) == (2, 2, 4)
     assert len(campaign_tables(replace(profile, growing=()))) == 2
     slower = replace(one, wall_s=2.0 * one.wall_s)
-    assert replace(profile, rounds=((slower, two), *profile.rounds)).per_core_hour == pytest.approx(3600.0 * one.rate)
+    assert replace(profile, rounds=((slower, two), *profile.rounds)).per_core_hour == pytest.approx(2700.0 * one.rate)
     assert one.flight_s == pytest.approx(one.busy_s / 6)
 
 
