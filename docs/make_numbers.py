@@ -81,7 +81,7 @@ def results(flights: dict[str, Flight]) -> Table:
 
 
 def count_optimal(flight: Flight) -> int:
-    """Periods whose command is their optimum: found by the QP, or by the unconstrained optimum that is feasible."""
+    """Periods whose command is their optimum: found by QPs, or by the unconstrained optimum that is feasible."""
     return sum(status in ACCEPTED for status in flight.log.control.status)
 
 

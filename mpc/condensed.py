@@ -18,6 +18,8 @@ from quadsim.state import Array
 class Condensed:
     """min 1/2 u' H u + F(k)' u over u = [u(k); ...; u(k+N-1)], with the paper's row pairs as two-sided rows.
 
+    Rows of steps that have no bound are left out.
+
     Attributes:
         qp: H, the upper halves of A_ineq, and the box; vectors for xi(k), y_d and u(k-1) all zero.
         nu: number of inputs.
@@ -52,7 +54,9 @@ def condensed(problem: Problem) -> Condensed:
     maps = prediction(model, problem.horizon)
     terms = cost(maps, problem.objective)
     rows = inequalities(maps, bounds)
-    upper, lower = rows.upper_rows, rows.lower_rows
+    slews = np.arange(problem.horizon)[:, None] * model.nu + bounds.slewing
+    kept = np.concatenate([np.arange(rows.n_outputs), rows.n_outputs + slews.ravel()])
+    upper, lower = rows.upper_rows[kept], rows.lower_rows[kept]
     constant = rows.G3 + rows.G4 @ model.u_bar
     size = terms.H.shape[0]
     return Condensed(

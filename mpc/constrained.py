@@ -1,8 +1,7 @@
-"""The constrained MPC: at most one QP per period.  Eqs. (27)-(29)."""
+"""The constrained MPC: the optimum of Eq. (27) in every period.  Eqs. (27)-(29)."""
 
 from __future__ import annotations
 
-import time as clock
 from typing import Final
 
 import numpy as np
@@ -11,9 +10,9 @@ from mpc.condensed import require_bounds
 from mpc.prediction import rollout
 from mpc.problem import Problem
 from mpc.qp import Solution
-from mpc.shortcut import make_shortcut
-from mpc.solvers import QPSolver
-from quadsim.controller import GROUNDED, SOLVED, UNCONSTRAINED, Command, Moment, Phase, stopped
+from mpc.shortcut import with_shortcut
+from mpc.solvers import Answer, Solver
+from quadsim.controller import ACCEPTED, GROUNDED, Command, Moment, Phase, stopped
 from quadsim.errors import PlanExhaustedError
 from quadsim.state import Array
 
@@ -25,22 +24,21 @@ class ConstrainedMPC:
     """Finds the optimum of Eq. (27) each period and sends the first action of the optimal plan.
 
     Where the unconstrained optimum satisfies every constraint it is the solution, and no QP is solved: the status is
-    then `unconstrained`.  Only a QP's answer that is solved, finite, and whose first action is within the hard input
+    then `unconstrained`.  Only an answer that is the optimum, finite, and whose first action is within the hard input
     bounds is used.  Otherwise the previous plan, shifted by one step, is held (fallback level 1) for as long as it
     lasts, and then the flight is given up.
 
     Args:
         problem: with bounds.
         solver: set up for the same problem.
-        shortcut: whether to try the unconstrained optimum first; the commands are the same, found later.
+        shortcut: whether to try less than the whole QP first, see `mpc.shortcut`; the commands are the same.
     """
 
     name: Final = "constrained"
 
-    def __init__(self, problem: Problem, solver: QPSolver, *, shortcut: bool = True) -> None:
+    def __init__(self, problem: Problem, solver: Solver, *, shortcut: bool = True) -> None:
         self.problem = problem
-        self._solver = solver
-        self._shortcut = make_shortcut(problem) if shortcut else None
+        self._solver = with_shortcut(problem, solver) if shortcut else solver
         self._bounds = require_bounds(problem)
         self._before = problem.model.u_bar
         self._plan: Array | None = None
@@ -63,7 +61,7 @@ class ConstrainedMPC:
         self._held = 0
 
     def step(self, now: Moment, state: Array, reference: Array) -> Command:
-        """One QP at most; see `quadsim.controller.Controller.step`.
+        """See `quadsim.controller.Controller.step`.
 
         While landed the rotors are taken to their lowest speed as fast as their bounds allow.
 
@@ -75,7 +73,7 @@ class ConstrainedMPC:
         if now.phase in GROUNDED:
             return self._stop(now.phase)
         desired = self.problem.objective.desired(reference)
-        return self._without_qp(state, desired) or self._with_qp(now.time, state, desired)
+        return self._follow(now.time, self._solver.solve(state, desired, self._before))
 
     def predict(self, states: Array, plans: Array) -> Array:
         """See `quadsim.controller.Controller.predict`."""
@@ -86,19 +84,7 @@ class ConstrainedMPC:
         self._before, self._plan, self._held = lower, None, 0
         return stopped(lower.copy(), self.horizon, phase)
 
-    def _without_qp(self, state: Array, desired: Array) -> Command | None:
-        if self._shortcut is None:
-            return None
-        started = clock.perf_counter()
-        plan = self._shortcut.plan(state, desired, self._before)
-        if plan is None:
-            return None
-        self._plan, self._held, self._before = plan, 0, plan[0].copy()
-        solve_s = clock.perf_counter() - started
-        return Command(speeds=plan[0].copy(), plan=plan, status=UNCONSTRAINED, solve_s=solve_s)
-
-    def _with_qp(self, time: float, state: Array, desired: Array) -> Command:
-        answer = self._solver.solve(state, desired, self._before)
+    def _follow(self, time: float, answer: Answer) -> Command:
         lower, upper = self._reach()
         problem = _rejection(answer.solution, answer.plan, lower, upper)
         if problem is None:
@@ -114,7 +100,7 @@ class ConstrainedMPC:
         return Command(
             speeds=speeds.copy(),
             plan=self._plan if problem is None else _shifted(self._plan, self._held),
-            status=problem or SOLVED,
+            status=problem or solution.status,
             iterations=solution.iterations,
             active=solution.active if problem is None else 0,
             fallback=int(problem is not None),
@@ -138,7 +124,7 @@ def _shifted(plan: Array, steps: int) -> Array:
 
 def _rejection(solution: Solution, plan: Array, lower: Array, upper: Array) -> str | None:
     """Why an answer must not reach the plant, or None."""
-    if solution.status != SOLVED:
+    if solution.status not in ACCEPTED:
         return solution.status
     if not np.isfinite(plan).all():
         return "not_finite"

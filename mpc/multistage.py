@@ -26,8 +26,9 @@ from mpc.problem import Bounds, Objective, Problem
 from mpc.qp import QP, Vectors
 from quadsim.state import Array
 
-STEPS_PER_STAGE: Final = 5
-"""M, the fastest of 1 to 25 for the paper's case; see docs/performance.md."""
+INPUTS_PER_STAGE: Final = 20
+"""M times the number of inputs.  Of stages of 1 to 25 steps, five of four rotors are the fastest for the paper's case,
+twenty of one axis by itself about the fastest; see docs/performance.md."""
 SLEWS_BOUND_AT_ONCE: Final = 32
 """Steps from the start of the plan whose slews may well bind.  Later ones never did in the paper's flight, whatever its
 tilt bound and its horizon up to 200, and with 50 steps a QP without them is solved an eighth sooner."""
@@ -46,7 +47,8 @@ class Multistage:
         c_state, c_desired: gradient's slopes in xi(k) and y_d.
         b_state: equality right side's slope in xi(k).
         h_state: output rows' shift by the free response of the first stage, for xi(k).
-        first_slew: rows of G that hold u(k) - u(k-1).
+        slewing: (n_s,) the inputs whose steps are bounded.
+        first_slews: rows of G that hold their u(k) - u(k-1).
     """
 
     qp: QP
@@ -56,7 +58,8 @@ class Multistage:
     c_desired: csc_matrix
     b_state: Array
     h_state: Array
-    first_slew: slice
+    slewing: np.ndarray[tuple[int], np.dtype[np.int64]]
+    first_slews: slice
 
     def vectors(self, state: Array, desired: Array, u_before: Array) -> Vectors:
         """See `mpc.qp.Formulation.vectors`."""
@@ -69,8 +72,9 @@ class Multistage:
         free = self.h_state @ state
         h_l[:rows] -= free
         h_u[:rows] -= free
-        h_l[self.first_slew] += u_before - self.u_bar
-        h_u[self.first_slew] += u_before - self.u_bar
+        before = (u_before - self.u_bar)[self.slewing]
+        h_l[self.first_slews] += before
+        h_u[self.first_slews] += before
         return Vectors(c=c, b=b, h_l=h_l, h_u=h_u)
 
     def inputs(self, x: Array) -> Array:
@@ -88,13 +92,14 @@ class _Stage:
     outputs: Array
 
 
-def multistage(problem: Problem, *, steps_per_stage: int = STEPS_PER_STAGE) -> Multistage:
+def multistage(problem: Problem, *, steps_per_stage: int | None = None) -> Multistage:
     """Build the structured QP of a constrained problem.
 
     Args:
         problem: a problem with bounds.
-        steps_per_stage: M.  The first stage has no state among its variables and, where M > 1, takes as many more steps
-            as there is room for in blocks of the others' size; the last stage takes what is left.
+        steps_per_stage: M; None for as many as make `INPUTS_PER_STAGE`.  The first stage has no state among its
+            variables and, where M > 1, takes as many more steps as there is room for in blocks of the others' size; the
+            last stage takes what is left.
 
     Raises:
         ValueError: the problem has no bounds.
@@ -102,7 +107,8 @@ def multistage(problem: Problem, *, steps_per_stage: int = STEPS_PER_STAGE) -> M
     bounds = require_bounds(problem)
     model, N = problem.model, problem.horizon
     n, nu = model.n, model.nu
-    lengths = _stage_lengths(N, steps_per_stage, more_at_first=n // nu)
+    steps = max(INPUTS_PER_STAGE // nu, 1) if steps_per_stage is None else steps_per_stage
+    lengths = _stage_lengths(N, steps, more_at_first=n // nu)
     built = {length: _stage(prediction(model, length), problem.objective, bounds, length) for length in set(lengths)}
     stages = [built[length] for length in lengths]
 
@@ -112,7 +118,8 @@ def multistage(problem: Problem, *, steps_per_stage: int = STEPS_PER_STAGE) -> M
     outputs = [first.outputs[:, n:], *(stage.outputs for stage in stages[1:])]
     variables = _variable_index(lengths, n, nu)
     input_index = np.concatenate(variables.inputs)
-    slews = csc_matrix(slew_matrix(N, nu))
+    slewing = bounds.slewing
+    slews = csc_matrix(slew_matrix(N, nu))[(np.arange(N)[:, None] * nu + slewing).ravel()]
     size = variables.size
     output_rows = sparse.block_diag(outputs, format="csc")
     slew_rows = slews @ _selection(input_index, size)
@@ -123,11 +130,11 @@ def multistage(problem: Problem, *, steps_per_stage: int = STEPS_PER_STAGE) -> M
             A=_without_rounding(_dynamics(stages, variables, n)),
             b=np.zeros(n * (len(stages) - 1)),
             G=_without_rounding(csc_matrix(sparse.vstack([output_rows, slew_rows]))),
-            h_l=np.concatenate([np.tile(bounds.y_min, N), np.tile(bounds.delta_min, N)]),
-            h_u=np.concatenate([np.tile(bounds.y_max, N), np.tile(bounds.delta_max, N)]),
+            h_l=np.concatenate([np.tile(bounds.y_min, N), np.tile(bounds.delta_min[slewing], N)]),
+            h_u=np.concatenate([np.tile(bounds.y_max, N), np.tile(bounds.delta_max[slewing], N)]),
             x_l=_box(bounds.u_min - model.u_bar, input_index, N, size, -np.inf),
             x_u=_box(bounds.u_max - model.u_bar, input_index, N, size, np.inf),
-            seldom=nu * max(N - SLEWS_BOUND_AT_ONCE, 0),
+            seldom=slewing.size * max(N - SLEWS_BOUND_AT_ONCE, 0),
         ),
         u_bar=model.u_bar,
         input_index=input_index,
@@ -135,7 +142,8 @@ def multistage(problem: Problem, *, steps_per_stage: int = STEPS_PER_STAGE) -> M
         c_desired=csc_matrix(sparse.block_diag(gradients)),
         b_state=first.end[:, :n] if len(stages) > 1 else np.zeros((0, n)),
         h_state=first.outputs[:, :n],
-        first_slew=slice(output_rows.shape[0], output_rows.shape[0] + nu),
+        slewing=slewing,
+        first_slews=slice(output_rows.shape[0], output_rows.shape[0] + slewing.size),
     )
 
 

@@ -63,6 +63,11 @@ class Bounds:
             if np.any(lower >= upper):
                 raise ParameterError("controller", low, lower, f"below {high} = {upper}")
 
+    @property
+    def slewing(self) -> np.ndarray[tuple[int], np.dtype[np.int64]]:
+        """The inputs whose steps have a bound."""
+        return np.flatnonzero(np.isfinite(self.delta_min) | np.isfinite(self.delta_max))
+
 
 @dataclass(frozen=True, kw_only=True)
 class Problem:

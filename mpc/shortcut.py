@@ -1,15 +1,21 @@
-"""The unconstrained optimum where it is the constrained one: an exact way around the QP."""
+"""Exact ways around the whole QP: an optimum of fewer constraints that satisfies all of them is the optimum."""
 
 from __future__ import annotations
 
+import time as clock
+from dataclasses import replace
 from typing import Final
 
 import numpy as np
 
+from mpc.axes import Axis, bounded_axes
 from mpc.condensed import require_bounds
 from mpc.prediction import prediction
 from mpc.problem import Problem
+from mpc.qp import Solution
+from mpc.solvers import Answer, QPSolver, Solver, Way
 from mpc.unconstrained import sequence_gains
+from quadsim.controller import SOLVED, UNCONSTRAINED
 from quadsim.state import Array
 
 LARGEST_MAP: Final = 2**20
@@ -21,14 +27,112 @@ K_N xi(k), on deviations and not on the whole speed, is a hundredth of it."""
 
 
 class Shortcut:
-    """Evaluates Eq. (22), the optimal sequence without constraints, and keeps it when it satisfies all of them.
+    """Solves no more of the QP than it has to.
 
-    The cost is strictly convex, so its minimiser, if feasible, is the one and only solution of Eq. (27).  Sequence
-    and predicted outputs are affine in xi(k) and y_d,
+    The cost is strictly convex: the minimiser over fewer constraints, if it satisfies the others too, is the one and
+    only solution of Eq. (27).  In turn,
+
+    1. no constraint at all: Eq. (22), a product; the status is then `unconstrained`;
+    2. output bounds alone: a small QP for each axis whose outputs leave theirs; see `mpc.axes`;
+    3. the whole QP.
+
+    Args:
+        problem: with bounds.
+        whole: solves the whole QP; those of the axes are solved by a solver of the same name.
+
+    Raises:
+        numpy.linalg.LinAlgError: the Hessian is so ill-conditioned that the gains of Eq. (22) are not exact.
+    """
+
+    def __init__(self, problem: Problem, whole: Solver) -> None:
+        bounds, N = require_bounds(problem), problem.horizon
+        self._free = _FreeOptimum(problem)
+        self._axes = [_AxisSolver(axis, whole.name) for axis in bounded_axes(problem)]
+        self._whole = whole
+        self._bounds, self._u_bar = bounds, problem.model.u_bar
+        self._slews = np.empty((N, problem.model.nu))
+        self._unbound = Solution(
+            x=np.zeros(N * problem.model.nu),
+            y=np.zeros(0),
+            z=np.zeros(N * (bounds.y_min.size + bounds.slewing.size)),
+            z_box=np.zeros(N * problem.model.nu),
+            status=UNCONSTRAINED,
+            iterations=0,
+            active=0,
+            primal_residual=0.0,
+            dual_residual=0.0,
+            solve_s=0.0,
+        )
+
+    @property
+    def name(self) -> str:
+        """Name of the QP solver."""
+        return self._whole.name
+
+    def solve(self, state: Array, desired: Array, u_before: Array) -> Answer:
+        """See `mpc.solvers.Solver.solve`."""
+        started = clock.perf_counter()
+        answer = self._by_output_bounds(state, desired)
+        if answer is not None and self._inputs_within_bounds(answer.plan, u_before):
+            solution = replace(answer.solution, x=answer.plan.ravel(), solve_s=clock.perf_counter() - started)
+            return replace(answer, solution=solution)
+        tried_s = clock.perf_counter() - started
+        tried = 0 if answer is None else answer.solution.iterations
+        answer = self._whole.solve(state, desired, u_before)
+        solution = answer.solution
+        return replace(
+            answer,
+            solution=replace(solution, iterations=solution.iterations + tried, solve_s=solution.solve_s + tried_s),
+        )
+
+    def _by_output_bounds(self, state: Array, desired: Array) -> Answer | None:
+        """The optimum without bounds on inputs, as a solution of the condensed QP; None where none was found."""
+        plan, outputs = self._free.at(state, desired)
+        bounds = self._bounds
+        staying = np.all((bounds.y_min <= outputs) & (outputs <= bounds.y_max), axis=0)
+        if staying.all():
+            return Answer(plan=plan, solution=self._unbound, way=Way.FREE)
+        if not self._axes:
+            return None
+        z = np.zeros_like(self._unbound.z)
+        N = len(outputs)
+        multipliers = z[: outputs.size].reshape(outputs.shape)
+        parts = []
+        for solver in self._axes:
+            axis = solver.axis
+            if not staying[axis.outputs].all():
+                answer = solver.solve(state, desired)
+                if answer.solution.status != SOLVED:
+                    return None
+                plan = plan + (answer.plan - (plan - self._u_bar) @ axis.S.T) @ axis.T.T
+                multipliers[:, axis.outputs] = answer.solution.z[: N * axis.outputs.size].reshape(N, -1)
+                parts.append(answer.solution)
+        solution = replace(
+            self._unbound,
+            z=z,
+            status=SOLVED,
+            iterations=sum(part.iterations for part in parts),
+            active=sum(part.active for part in parts),
+            primal_residual=max(part.primal_residual for part in parts),
+            dual_residual=max(part.dual_residual for part in parts),
+        )
+        return Answer(plan=plan, solution=solution, way=Way.AXES)
+
+    def _inputs_within_bounds(self, plan: Array, u_before: Array) -> bool:
+        bounds = self._bounds
+        np.subtract(plan[0], u_before, out=self._slews[0])
+        np.subtract(plan[1:], plan[:-1], out=self._slews[1:])
+        return _within(bounds.u_min, plan, bounds.u_max) and _within(bounds.delta_min, self._slews, bounds.delta_max)
+
+
+class _FreeOptimum:
+    """Eq. (22), the optimal sequence without constraints, and the outputs that it leads to.
+
+    Both are affine in xi(k) and y_d,
 
         [u_opt; y_c] = W [xi(k); y_d] + [u_bar; 0],
 
-    so that matrix-vector products and a few comparisons decide.  All that is computed is written into buffers.
+    so that one product gives them.
     """
 
     def __init__(self, problem: Problem) -> None:
@@ -39,73 +143,50 @@ class Shortcut:
             raise np.linalg.LinAlgError("the Hessian is too ill-conditioned")
 
         def outputs(states: Array) -> Array:
-            """C_c applied to every predicted state in the columns of (N n, m)."""
             return (bounds.C_c @ states.reshape(N, model.n, -1)).reshape(N * bounds.y_min.size, states.shape[1])
 
-        self._inputs = _Affine(np.hstack([K, G]), hover, np.tile(bounds.u_min, N), np.tile(bounds.u_max, N))
-        self._outputs = _Affine(
-            np.hstack([outputs(maps.Phi + maps.Psi @ K), outputs(maps.Psi @ G)]),
-            np.zeros(N * bounds.y_min.size),
-            np.tile(bounds.y_min, N),
-            np.tile(bounds.y_max, N),
-        )
-        self._bounds = bounds
-        self._query = np.empty(K.shape[1] + G.shape[1])
-        self._slews = np.empty((N, model.nu))
+        self._map = np.block([[K, G], [outputs(maps.Phi + maps.Psi @ K), outputs(maps.Psi @ G)]])
+        self._u_bar, self._shape = model.u_bar, (N, model.nu)
+        self._query = np.empty(self._map.shape[1])
 
-    def plan(self, state: Array, desired: Array, u_before: Array) -> Array | None:
-        """The optimal inputs (N, nu) [rad/s] where no constraint stands in their way, else None.
-
-        Args:
-            state: xi(k) (n,).
-            desired: y_d (N, n_r).
-            u_before: u(k-1) (nu,).
-        """
+    def at(self, state: Array, desired: Array) -> tuple[Array, Array]:
+        """Inputs (N, nu) [rad/s] and outputs (N, n_c) for xi(k) (n,) and y_d (N, n_r)."""
         self._query[: state.size] = state
         self._query[state.size :] = desired.ravel()
-        if self._outputs.within_bounds(self._query) is None:  # first, as they bar the way most often
-            return None
-        sequence = self._inputs.within_bounds(self._query)
-        if sequence is None:
-            return None
-        plan = sequence.reshape(self._slews.shape)
-        np.subtract(plan[0], u_before, out=self._slews[0])
-        np.subtract(plan[1:], plan[:-1], out=self._slews[1:])
-        if not _within(self._bounds.delta_min, self._slews, self._bounds.delta_max):
-            return None
-        return plan.copy()
+        values = self._map @ self._query
+        N, nu = self._shape
+        return values[: N * nu].reshape(N, nu) + self._u_bar, values[N * nu :].reshape(N, -1)
 
 
-class _Affine:
-    """Values M q + m of a query q, between bounds."""
+class _AxisSolver:
+    """The QP of one axis, set up once."""
 
-    def __init__(self, matrix: Array, offset: Array, lower: Array, upper: Array) -> None:
-        self._matrix, self._offset, self._lower, self._upper = matrix, offset, lower, upper
-        self._values = np.empty(offset.size)
+    def __init__(self, axis: Axis, solver: str) -> None:
+        self.axis, self._solver = axis, QPSolver(solver, axis.problem)
+        self._before = axis.problem.model.u_bar
 
-    def within_bounds(self, query: Array) -> Array | None:
-        """The values, in a buffer that the next call overwrites, or None where one is out of its bounds."""
-        np.dot(self._matrix, query, out=self._values)
-        self._values += self._offset
-        return self._values if _within(self._lower, self._values, self._upper) else None
+    def solve(self, state: Array, desired: Array) -> Answer:
+        """The optimal w (N, m) for the whole's xi(k) (n,) and y_d (N, n_r)."""
+        axis = self.axis
+        return self._solver.solve(state[axis.states], desired[:, axis.regulated], self._before)
 
 
-def make_shortcut(problem: Problem) -> Shortcut | None:
-    """The problem's shortcut, or None where there is no good one.
+def with_shortcut(problem: Problem, whole: Solver) -> Solver:
+    """A solver that tries less than the whole QP first; the solver itself where that is no good.
 
-    The map grows with the square of the horizon, the QP in proportion to it: beyond `LARGEST_MAP` entries there is
-    none.  Nor is there where the Hessian is so ill-conditioned, by a long horizon or weights far apart, that the gains
-    are not exact.
+    The map to the free optimum grows with the square of the horizon, the QP in proportion to it: beyond `LARGEST_MAP`
+    entries nothing is tried.  Nor is it where the Hessian is so ill-conditioned, by a long horizon or weights far
+    apart, that the gains are not exact.
     """
     bounds, nu = require_bounds(problem), problem.model.nu
     rows = problem.horizon * (nu + bounds.y_min.size)
     columns = problem.model.n + problem.horizon * problem.objective.Q_y.shape[0]
     if rows * columns > LARGEST_MAP:
-        return None
+        return whole
     try:
-        return Shortcut(problem)
+        return Shortcut(problem, whole)
     except np.linalg.LinAlgError:
-        return None
+        return whole
 
 
 def _within(lower: Array, values: Array, upper: Array) -> bool:

@@ -171,7 +171,7 @@ def constraint_rows(at: Layout, bounds: Bounds, *, soft: bool, margins: Array | 
         kept = np.flatnonzero(below | above)
         slack = np.zeros((kept.size, 0))
         y_min, y_max = bounds.y_min[kept], bounds.y_max[kept]
-    limited = np.flatnonzero(np.isfinite(bounds.delta_min) | np.isfinite(bounds.delta_max))
+    limited = bounds.slewing
     outputs = np.arange(at.N * kept.size).reshape(at.N, kept.size)
     return Rows(
         C=bounds.C_c[kept],

@@ -7,6 +7,7 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from mpc.model import LinearModel
 from mpc.problem import Bounds, Objective, Problem
@@ -44,6 +45,46 @@ def random_problem(rng: np.random.Generator, *, horizon: int, n: int = 3, nu: in
         u_max=model.u_bar + rng.uniform(0.1, 3.0, nu),
     )
     return Problem(model=model, horizon=horizon, objective=objective, bounds=bounds)
+
+
+def random_axes(rng: np.random.Generator, *, horizon: int, room: float) -> Problem:
+    """Two random systems with bounded outputs and one without, in a random order of states and mixed by their inputs.
+
+    Args:
+        rng: random numbers.
+        horizon: N.
+        room: by how much bounds on inputs and their steps are wider than those of `random_problem`.
+    """
+    parts = [random_problem(rng, horizon=horizon, n=n, nu=nu) for n, nu in ((3, 1), (2, 2), (2, 1))]
+    order, mixing = rng.permutation(7), np.linalg.qr(rng.normal(size=(4, 4)))[0]
+    u_bar = rng.normal(size=4)
+    Q_u = mixing @ block_diag(*(part.objective.Q_u for part in parts)) @ mixing.T
+    limits = [part.bounds for part in parts if part.bounds is not None]
+    C_c = block_diag(*(bounds.C_c for bounds in limits[:2]), np.zeros((0, 2)))
+    step, span = room * rng.uniform(0.1, 2.0, 4), room * rng.uniform(0.1, 3.0, 4)
+    return Problem(
+        model=LinearModel(
+            A=block_diag(*(part.model.A for part in parts))[np.ix_(order, order)],
+            B=(block_diag(*(part.model.B for part in parts)) @ mixing.T)[order],
+            u_bar=u_bar,
+            period=0.1,
+        ),
+        horizon=horizon,
+        objective=Objective(
+            C_r=np.eye(7),
+            Q_y=block_diag(*(part.objective.Q_y for part in parts))[np.ix_(order, order)],
+            Q_u=0.5 * (Q_u + Q_u.T),
+        ),
+        bounds=Bounds(
+            C_c=C_c[:, order],
+            y_min=np.concatenate([bounds.y_min for bounds in limits[:2]]),
+            y_max=np.concatenate([bounds.y_max for bounds in limits[:2]]),
+            delta_min=-step,
+            delta_max=step,
+            u_min=u_bar - span,
+            u_max=u_bar + span,
+        ),
+    )
 
 
 def _random_definite(rng: np.random.Generator, size: int) -> Array:

@@ -7,8 +7,9 @@ import importlib.metadata
 import importlib.util
 import math
 from dataclasses import dataclass
+from enum import StrEnum
 from functools import partial
-from typing import Final
+from typing import Final, Protocol
 
 import numpy as np
 
@@ -151,17 +152,40 @@ def make_backend(name: str) -> Backend:
     return backend
 
 
+class Way(StrEnum):
+    """How an optimum was found: see `mpc.shortcut`."""
+
+    FREE = "the unconstrained optimum"
+    AXES = "one QP per axis"
+    WHOLE = "the whole QP"
+
+
 @dataclass(frozen=True, kw_only=True)
 class Answer:
-    """A QP's answer as a plan.
+    """An optimum as a plan.
 
     Attributes:
-        plan: (N, nu) inputs [rad/s]; to be used only when the solution's status is `solved`.
-        solution: the back end's answer.
+        plan: (N, nu) inputs [rad/s]; to be used only when the solution's status is accepted.
+        solution: the back end's answer, to the QP of the solver's own formulation; a shortcut's, to the condensed one.
+        way: how it was found.
     """
 
     plan: Array
     solution: Solution
+    way: Way = Way.WHOLE
+
+
+class Solver(Protocol):
+    """Finds a problem's optimum each period."""
+
+    @property
+    def name(self) -> str:
+        """Name of the QP solver, in `SOLVERS`."""
+        ...
+
+    def solve(self, state: Array, desired: Array, u_before: Array) -> Answer:
+        """The optimum for xi(k) (n,), y_d (N, n_r) and u(k-1) (nu,); whatever happens is in its status."""
+        ...
 
 
 class QPSolver:

@@ -41,11 +41,12 @@ class Contender:
         name: what it is called.
         solver: its name in `mpc.solvers.SOLVERS`.
         package: the solver's distribution and its version.
-        shortcut: whether it tries the unconstrained optimum first.
+        shortcut: whether it tries less than the whole QP first; see `mpc.shortcut`.
         repeats: how often each period was timed.
         step_ms: (K,) whole controller step per period, the best of the repeats [ms].
         raw_max_ms: the longest of all steps of all repeats, the machine's stalls included [ms].
         statuses: periods by what they were answered.
+        ways: periods by how their optimum was found.
         failures: periods without an optimum.
         input_error: largest error of the first input over the periods answered [rad/s]; None without any.
         kkt: worst KKT residual of what it answered; None without any.
@@ -59,6 +60,7 @@ class Contender:
     step_ms: Array
     raw_max_ms: float
     statuses: Mapping[str, int]
+    ways: Mapping[str, int]
     failures: int
     input_error: float | None
     kkt: float | None
@@ -75,7 +77,8 @@ class Growth:
 
     Attributes:
         name: the contender.
-        kind: which of its steps: those by the `QP`, those by the `shortcut`; empty for all of them.
+        kind: which of its steps, by how their optimum was found; empty for all of them.
+        whole: whether these are steps that solve the whole QP.
         horizons: N, as far as it went.
         p50, p99: whole step at each N [ms].
         failures: periods that the contender left without their optimum, by the N at which it did.
@@ -87,13 +90,14 @@ class Growth:
     p50: tuple[float, ...]
     p99: tuple[float, ...]
     kind: str = ""
+    whole: bool = True
     failures: Mapping[int, int] = field(default_factory=dict)
     dropped: str = ""
 
     @property
     def label(self) -> str:
         """The contender, and which of its steps."""
-        return f"{self.name}, by the {self.kind}" if self.kind else self.name
+        return f"{self.name}, by {self.kind}" if self.kind else self.name
 
     def exponent(self, quantile: str) -> float | None:
         """A in time ~ N^a, by least squares over the logarithms for N >= `FITTED_FROM`; None below three horizons."""
@@ -111,12 +115,14 @@ class StageLength:
         steps: M, steps per stage; None for the condensed form.
         variables: of the QP.
         p50, p99: time to update and solve it [ms].
+        default: whether it is the form that is flown.
     """
 
     steps: int | None
     variables: int
     p50: float
     p99: float
+    default: bool
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -133,8 +139,7 @@ class SolverBench:
         left_out: solvers that did not take part, and why.
         growth: of each contender; empty where that was not measured.
         growth_asked: periods asked at each horizon.
-        stages: the QP in its forms; empty where that was not measured.
-        default_steps: M of the default.
+        stages: by what they are forms of, the whole QP or that of one axis.
         reference_kkt: worst KKT residual of the optimum that first inputs are compared with.
         versions: of what the numbers depend on.
         machine: what the times were measured on.
@@ -149,8 +154,7 @@ class SolverBench:
     left_out: Mapping[str, str]
     growth: tuple[Growth, ...]
     growth_asked: int
-    stages: tuple[StageLength, ...]
-    default_steps: int
+    stages: Mapping[str, tuple[StageLength, ...]]
     reference_kkt: float
     versions: Mapping[str, str]
     machine: Mapping[str, Any]
@@ -178,7 +182,7 @@ class SolverBench:
                 {**asdict(growth), "exponents": {name: growth.exponent(name) for name in ("p50", "p99")}}
                 for growth in self.growth
             ],
-            "stages": [asdict(stage) for stage in self.stages],
+            "stages": {what: [asdict(stage) for stage in stages] for what, stages in self.stages.items()},
         }
 
 

@@ -11,6 +11,7 @@ from quadsim.bench.results import (
     Growth,
     RenderProfile,
     SolverBench,
+    StageLength,
     Target,
 )
 from quadsim.bench.targets import flight_targets, render_targets, solver_targets
@@ -22,7 +23,7 @@ def solver_tables(bench: SolverBench) -> list[Grid]:
     return [
         _contenders(bench),
         *([_growth(bench)] if bench.growth else []),
-        *([_stages(bench)] if bench.stages else []),
+        *(_stages(what, stages) for what, stages in bench.stages.items()),
         targets_table("Asked of the solvers, and measured", solver_targets(bench)),
     ]
 
@@ -117,11 +118,18 @@ def _how(bench: SolverBench) -> str:
         "repeats; raw max is the longest of all steps, the machine's stalls included. One process, one thread; "
         "contenders take their turns in random order. Failures are periods without an optimum. Over the others, u0 "
         "error [rad/s] is the largest of the first input, from an optimum in closed form whose own KKT residual is at "
-        f"most {bench.reference_kkt:.0e}, and KKT the worst residual of the contender's answer to its own QP. PIQP "
+        f"most {bench.reference_kkt:.0e}, and KKT the worst residual of the contender's answer to its own QP. "
+        f"{_shares(bench.default)}PIQP "
         "multistage is first given the QP without slews late in the plan, which hardly ever bind; where one does it "
         "solves twice, which no period here asks for."
     )
     return " ".join([said, *(f"Left out: {name}, {why}." for name, why in bench.left_out.items())])
+
+
+def _shares(contender: Contender) -> str:
+    """Which of its periods a contender with shortcuts answered how."""
+    told = ", ".join(f"by {way} {count}" for way, count in sorted(contender.ways.items(), key=lambda pair: -pair[1]))
+    return f"Periods that the default answered {told}. " if contender.shortcut else ""
 
 
 def _growth(bench: SolverBench) -> Grid:
@@ -159,18 +167,18 @@ def _growth_line(growth: Growth, horizons: Sequence[int]) -> tuple[Cell, ...]:
     return line(growth.label, *pairs, " / ".join(fitted) or ABSENT)
 
 
-def _stages(bench: SolverBench) -> Grid:
-    default = next(stage for stage in bench.stages if stage.steps == bench.default_steps)
+def _stages(what: str, stages: Sequence[StageLength]) -> Grid:
+    default = next(stage for stage in stages if stage.default)
     lines = []
-    for stage in bench.stages:
+    for stage in stages:
         name = "condensed, dense" if stage.steps is None else str(stage.steps)
         mark = Mark.BEST if stage is default else Mark.NONE
         label = f"{name} (default)" if stage is default else name
-        cells = line(str(stage.variables), f"{stage.p50:.2f}", f"{stage.p99:.2f}", f"{stage.p50 / default.p50:.2f}")
+        cells = line(str(stage.variables), f"{stage.p50:.3g}", f"{stage.p99:.3g}", f"{stage.p50 / default.p50:.2f}")
         lines.append((Cell(text=label, mark=mark), *cells))
     return Grid(
         key="stages",
-        title="How many steps make a stage",
+        title=f"How many steps make a stage: the {what}",
         head=("steps per stage", "variables", "p50 [ms]", "p99 [ms]", "p50, as a ratio to the default"),
         lines=tuple(lines),
         note="PIQP alone, on the periods whose QP has active constraints. Its multistage factorisation costs less the "

@@ -42,7 +42,7 @@ def solver_targets(bench: SolverBench) -> list[Target]:
         for quantile in ("p50", "p99") if growth.name == default.name else ():
             exponent = growth.exponent(quantile)
             if exponent is not None:
-                what = f"default, steps by the {growth.kind}: growth of {quantile} with N up to {growth.horizons[-1]}"
+                what = f"default, steps by {growth.kind}: growth of {quantile} with N up to {growth.horizons[-1]}"
                 targets.append(
                     Target(
                         what=what,

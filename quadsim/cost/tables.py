@@ -61,7 +61,7 @@ def _computation(study: CostStudy) -> Grid:
     lines = []
     for contender in study.contenders:
         lines.append(_times(study, contender.name, contender.step_ms, contender))
-        parts = {"by the unconstrained optimum": contender.shortcut, "by the QP": ~contender.shortcut}
+        parts = {"by the unconstrained optimum": contender.shortcut, "by QPs": ~contender.shortcut}
         if 0 < contender.shortcut.sum() < contender.shortcut.size:
             for how, periods in parts.items():
                 label = f"... its {periods.sum()} periods answered {how}"
@@ -161,7 +161,7 @@ def _sweep(sweep: Sweep, key: str, title: str) -> Grid:
         head=head,
         lines=tuple(_point(sweep, point, free=free) for point in sweep.points),
         note=(
-            "solved, unconstrained, held: periods answered by the QP, by an unconstrained optimum within every bound, "
+            "solved, unconstrained, held: periods answered by QPs, by an unconstrained optimum within every bound, "
             "and by an earlier plan where the QP has no solution. active: share of periods with an active constraint. "
             "settling: of the slowest step in x, y or z, judged until the controller sees the next one coming, which a "
             "longer horizon does sooner. step: timed on the flight's own queries. Bold: the flight that is studied."

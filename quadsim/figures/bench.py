@@ -80,7 +80,7 @@ def _draw_times(axes: Axes, bench: SolverBench) -> None:
 
 def _draw_growth(axes: Axes, bench: SolverBench) -> None:
     for growth in bench.growth:
-        if growth.kind == "shortcut":  # far below all others, and growing no faster than they do
+        if not growth.whole:  # far below all others, and growing no faster than they do
             continue
         colour, dashes = _look(bench, growth.name)
         own = growth.name == bench.default.name

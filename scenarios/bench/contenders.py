@@ -13,22 +13,23 @@ from mpc.condensed import condensed
 from mpc.constrained import ConstrainedMPC
 from mpc.polish import polish
 from mpc.problem import Problem
-from mpc.qp import QP, Solution, kkt_residuals
-from mpc.solvers import SOLVERS, Answer, QPSolver, make_backend
-from quadsim.controller import ACCEPTED, SOLVED, UNCONSTRAINED, Command, Moment
+from mpc.qp import Formulation, kkt_residuals
+from mpc.shortcut import with_shortcut
+from mpc.solvers import SOLVERS, Answer, QPSolver, Solver, Way, make_backend
+from quadsim.controller import ACCEPTED, Command, Moment
 from quadsim.errors import FlightError
 from quadsim.state import Array
 from scenarios.queries import Queries
 
 WITH_SHORTCUT: Final = ("daqp",)
-"""Solvers that are shown both with and without the shortcut, besides the default."""
+"""Solvers that are shown both with and without shortcuts, besides the default."""
 REFERENCE_SOLVER: Final = "piqp-dense"
 """Where the search for the optimum in closed form starts."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Entry:
-    """One contender: a solver, with or without the unconstrained optimum tried first."""
+    """One contender: a solver, with or without the shortcuts of `mpc.shortcut`."""
 
     solver: str
     shortcut: bool
@@ -40,21 +41,28 @@ class Entry:
 
 
 def entries(default: Entry, solvers: Sequence[str]) -> list[Entry]:
-    """The default first, then each installed solver alone, then those that are shown with the shortcut as well."""
+    """The default first, then each installed solver alone, then those that are shown with shortcuts as well."""
     installed = [name for name in solvers if SOLVERS[name].installed]
     alone = [Entry(solver=name, shortcut=False) for name in installed]
     both = [Entry(solver=name, shortcut=True) for name in installed if name in WITH_SHORTCUT]
     return [default, *(entry for entry in (*alone, *both) if entry != default)]
 
 
-class _Witnessed(QPSolver):
-    """The solver, whose last answer can be looked at."""
+class _Witnessed:
+    """A solver whose last answer can be looked at."""
 
-    last: Answer | None = None
+    def __init__(self, solver: Solver) -> None:
+        self._solver = solver
+        self.last: Answer | None = None
+
+    @property
+    def name(self) -> str:
+        """See `mpc.solvers.Solver.name`."""
+        return self._solver.name
 
     def solve(self, state: Array, desired: Array, u_before: Array) -> Answer:
-        """See `mpc.solvers.QPSolver.solve`."""
-        self.last = super().solve(state, desired, u_before)
+        """See `mpc.solvers.Solver.solve`."""
+        self.last = self._solver.solve(state, desired, u_before)
         return self.last
 
 
@@ -63,10 +71,12 @@ class StepEntrant:
 
     def __init__(self, entry: Entry, problem: Problem, queries: Queries) -> None:
         self.entry, self.problem, self._queries = entry, problem, queries
-        self.solver = _Witnessed(entry.solver, problem)
-        self._controller = ConstrainedMPC(problem, self.solver, shortcut=entry.shortcut)
-        self.answers: dict[int, tuple[Command | None, Answer | None]] = {}
-        """What was answered in the first pass, by period: the command, if any, and the solver's answer, if asked."""
+        whole = QPSolver(entry.solver, problem)
+        self.formulation = whole.formulation
+        self._solver = _Witnessed(with_shortcut(problem, whole) if entry.shortcut else whole)
+        self._controller = ConstrainedMPC(problem, self._solver, shortcut=False)
+        self.answers: dict[int, tuple[Command | None, Answer]] = {}
+        """What was answered in the first pass, by period: the command, if any, and the solver's answer."""
         self._command: Command | None = None
         self._period: int | None = None
 
@@ -78,7 +88,7 @@ class StepEntrant:
         self._controller.reset(queries.speeds_before[period])
         reference = queries.reference[period + 1 : period + 1 + self.problem.horizon]
         self._query = (Moment(time=float(queries.t[period])), queries.state[period], reference)
-        self._command, self.solver.last = None, None
+        self._command, self._solver.last = None, None
 
     def answer(self) -> None:
         """See `scenarios.bench.race.Entrant.answer`."""
@@ -89,14 +99,13 @@ class StepEntrant:
 
     def keep(self) -> None:
         """Keep the last answer, if it is the first to its question."""
-        if self._period is not None:
-            self.answers.setdefault(self._period, (self._command, self.solver.last))
+        if self._period is not None and self._solver.last is not None:
+            self.answers.setdefault(self._period, (self._command, self._solver.last))
 
-    def shortcuts(self, periods: Sequence[int]) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
-        """Which periods were answered by the shortcut."""
+    def ways(self, periods: Sequence[int]) -> np.ndarray[tuple[int], np.dtype[np.object_]]:
+        """The `mpc.solvers.Way` in which each period was answered."""
         self.keep()
-        commands = [self.answers[period][0] for period in periods]
-        return np.array([command is not None and command.status == UNCONSTRAINED for command in commands])
+        return np.array([self.answers[period][1].way for period in periods], dtype=object)
 
     def failures(self, periods: Sequence[int]) -> int:
         """How many periods were left without their optimum."""
@@ -137,6 +146,7 @@ class Verdict:
     """What an entrant's answers were worth; see `quadsim.bench.Contender`."""
 
     statuses: dict[str, int]
+    ways: dict[str, int]
     failures: int
     input_error: float | None
     kkt: float | None
@@ -145,7 +155,7 @@ class Verdict:
 def judge(entrant: StepEntrant, queries: Queries, periods: Sequence[int], reference: Reference) -> Verdict:
     """Hold the answers of an entrant's first pass against the optimum, and against the KKT conditions of its own QP."""
     entrant.keep()
-    problem, formulation, plain = entrant.problem, entrant.solver.formulation, condensed(entrant.problem)
+    problem, whole, plain = entrant.problem, entrant.formulation, condensed(entrant.problem)
     statuses: Counter[str] = Counter()
     errors, residuals = [], []
     for period in periods:
@@ -155,15 +165,12 @@ def judge(entrant: StepEntrant, queries: Queries, periods: Sequence[int], refere
             continue
         statuses[command.status] += 1
         errors.append(np.abs(command.speeds - reference.inputs[period]).max())
-        if command.status == UNCONSTRAINED:
-            qp = plain.qp.with_vectors(plain.vectors(*_query(problem, queries, period)))
-            residuals.append(kkt_residuals(qp, _without_multipliers(qp, command.plan)).worst)
-        else:
-            assert answer is not None  # or there would be no command
-            qp = formulation.qp.with_vectors(formulation.vectors(*_query(problem, queries, period)))
-            residuals.append(kkt_residuals(qp, answer.solution).worst)
+        form: Formulation = whole if answer.way is Way.WHOLE else plain
+        qp = form.qp.with_vectors(form.vectors(*_query(problem, queries, period)))
+        residuals.append(kkt_residuals(qp, answer.solution).worst)
     return Verdict(
         statuses=dict(sorted(statuses.items())),
+        ways=dict(Counter(map(str, entrant.ways(periods)))),
         failures=len(periods) - len(errors),
         input_error=float(np.max(errors)) if errors else None,
         kkt=float(np.max(residuals)) if residuals else None,
@@ -176,23 +183,6 @@ def _query(problem: Problem, queries: Queries, period: int) -> tuple[Array, Arra
     return queries.state[period], problem.objective.desired(reference), queries.speeds_before[period]
 
 
-def _without_multipliers(qp: QP, plan: Array) -> Solution:
-    """An unconstrained optimum as a solution of the condensed QP."""
-    return Solution(
-        x=plan.ravel(),
-        y=np.zeros_like(qp.b),
-        z=np.zeros_like(qp.h_l),
-        z_box=np.zeros_like(qp.c),
-        status=UNCONSTRAINED,
-        iterations=0,
-        active=0,
-        primal_residual=0.0,
-        dual_residual=0.0,
-        solve_s=0.0,
-    )
-
-
-def _failure(answer: Answer | None) -> str:
+def _failure(answer: Answer) -> str:
     """Why there was no command; a point that is called solved is rejected where it breaks the hard input bounds."""
-    assert answer is not None  # the solver was asked, or there would be a command
-    return "rejected" if answer.solution.status == SOLVED else answer.solution.status
+    return "rejected" if answer.solution.status in ACCEPTED else answer.solution.status

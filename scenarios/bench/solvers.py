@@ -9,21 +9,17 @@ from typing import Final
 
 import numpy as np
 
-from mpc.condensed import condensed
-from mpc.multistage import STEPS_PER_STAGE, multistage
 from mpc.problem import Problem
-from mpc.qp import Backend, Formulation, Vectors
-from mpc.solvers import SOLVERS
-from mpc.solvers.piqp_dense import PiqpDense
-from mpc.solvers.piqp_sparse import PiqpMultistage
+from mpc.solvers import SOLVERS, Way
 from quadsim import rundir
-from quadsim.bench import Contender, Growth, SolverBench, StageLength, solver_tables
+from quadsim.bench import Contender, Growth, SolverBench, solver_tables
 from quadsim.errors import InputError, ParameterError, UnknownNameError
 from quadsim.table import Grid, grid_to_markdown
 from scenarios.bench.contenders import Entry, StepEntrant, entries, judge, reference_optima
 from scenarios.bench.race import race, stretches
+from scenarios.bench.stages import time_stages
 from scenarios.build import build_problem
-from scenarios.queries import Queries, recorded
+from scenarios.queries import recorded
 from scenarios.runner import Flight, Progress, fly_scenario, machine, silent, versions
 from scenarios.spec import LARGEST_HORIZON, ConstrainedSpec, Scenario
 
@@ -36,7 +32,6 @@ REPEATS: Final = 3
 HORIZONS: Final = (10, 20, 50, 100, 200)
 GROWTH_STRIDE: Final = 6
 """One stretch of so many is asked at each horizon and of each form of the QP."""
-STEPS_TRIED: Final = (1, 2, 3, 4, 5, 6, 8, 10, 13, 17, 25)
 LONGEST_PASS: Final = 20.0
 """A contender whose first pass takes longer [s] is timed once."""
 PATIENCE: Final = 60.0
@@ -52,7 +47,7 @@ def bench_solvers(
     stride: int = 1,
     progress: Progress = silent,
 ) -> SolverBench:
-    """Fly a scenario, and put its queries to the controller as it is flown and to every solver without the shortcut.
+    """Fly a scenario, and put its queries to the controller as it is flown and to every solver without shortcuts.
 
     Args:
         scenario: by a constrained controller.
@@ -89,8 +84,14 @@ def bench_solvers(
         left_out={name: SOLVERS[name].line for name in solvers if not SOLVERS[name].installed},
         growth=growth,
         growth_asked=sum(map(len, few)),
-        stages=_stages(flight, problem, few, repeats=repeats, rng=rng, progress=progress),
-        default_steps=STEPS_PER_STAGE,
+        stages=time_stages(
+            problem,
+            recorded(scenario, flight.log.control, problem.horizon),
+            few,
+            repeats=repeats,
+            rng=rng,
+            progress=progress,
+        ),
         reference_kkt=reference_kkt,
         versions=versions(),
         machine=machine(),
@@ -204,9 +205,9 @@ def _growth(
 ) -> tuple[Growth, ...]:
     """Every contender at each N, until one would hardly keep up with the flight at the next.
 
-    Steps by the QP and steps by the shortcut are told apart: their shares change with N.
+    Steps by the whole QP and by either shortcut are told apart: their shares change with N.
     """
-    grown: dict[tuple[str, str], list[tuple[int, float, float]]] = {}
+    grown: dict[tuple[Entry, Way], list[tuple[int, float, float]]] = {}
     failures: dict[str, dict[int, int]] = {}
     dropped: dict[str, str] = {}
     periods = [period for stretch in asked for period in stretch]
@@ -232,73 +233,23 @@ def _growth(
             best = laps[entry.name].best
             if failed := entrants[entry.name].failures(periods):
                 failures.setdefault(entry.name, {})[N] = failed
-            short = entrants[entry.name].shortcuts(periods)
-            for kind, chosen in (("QP", ~short), ("shortcut", short)) if entry.shortcut else (("", ~short),):
-                if chosen.any():
-                    p50, p99 = np.percentile(best[chosen], [50, 99])
-                    grown.setdefault((entry.name, kind), []).append((N, float(p50), float(p99)))
+            ways = entrants[entry.name].ways(periods)
+            for way in Way:
+                if (ways == way).any():
+                    p50, p99 = np.percentile(best[ways == way], [50, 99])
+                    grown.setdefault((entry, way), []).append((N, float(p50), float(p99)))
             if (p95 := np.percentile(best, 95)) > 0.5 * deadline_ms:
                 dropped[entry.name] = f"p95 of {p95:.0f} ms at N = {N}, beyond half the control period"
     return tuple(
         Growth(
-            name=name,
-            kind=kind,
+            name=entry.name,
+            kind=str(way) if entry.shortcut else "",
+            whole=way is Way.WHOLE,
             horizons=tuple(N for N, _, _ in times),
             p50=tuple(p50 for _, p50, _ in times),
             p99=tuple(p99 for _, _, p99 in times),
-            failures=failures.get(name, {}),
-            dropped=dropped.get(name, "") if times[-1][0] < max(horizons) else "",
+            failures=failures.get(entry.name, {}),
+            dropped=dropped.get(entry.name, "") if times[-1][0] < max(horizons) else "",
         )
-        for (name, kind), times in grown.items()
+        for (entry, way), times in grown.items()
     )
-
-
-class _QPEntrant:
-    """A form of the QP with its back end, without a controller around it."""
-
-    def __init__(self, formulation: Formulation, backend: Backend, problem: Problem, queries: Queries) -> None:
-        self.formulation, self._backend, self._problem, self._queries = formulation, backend, problem, queries
-        backend.setup(formulation.qp)
-
-    def prepare(self, period: int) -> None:
-        """See `scenarios.bench.race.Entrant.prepare`."""
-        queries, problem = self._queries, self._problem
-        desired = problem.objective.desired(queries.reference[period + 1 : period + 1 + problem.horizon])
-        self._vectors: Vectors = self.formulation.vectors(queries.state[period], desired, queries.speeds_before[period])
-
-    def answer(self) -> None:
-        """See `scenarios.bench.race.Entrant.answer`."""
-        self._backend.solve(self._vectors)
-
-
-def _stages(
-    flight: Flight,
-    problem: Problem,
-    asked: Sequence[range],
-    *,
-    repeats: int,
-    rng: np.random.Generator,
-    progress: Progress,
-) -> tuple[StageLength, ...]:
-    """The QP alone, condensed and cut into stages of M steps, on the periods whose QP has active constraints."""
-    log = flight.log.control
-    queries = recorded(flight.scenario, log, problem.horizon)
-    entrants: dict[int | None, _QPEntrant] = {None: _QPEntrant(condensed(problem), PiqpDense(), problem, queries)}
-    for length in sorted({*STEPS_TRIED, STEPS_PER_STAGE}):
-        form = multistage(problem, steps_per_stage=length)
-        entrants[length] = _QPEntrant(form, PiqpMultistage(), problem, queries)
-    laps = race(
-        {str(steps): entrant for steps, entrant in entrants.items()},
-        asked,
-        repeats=repeats,
-        rng=rng,
-        progress=lambda done, total: progress("stages", done, total),
-    )
-    active = np.array([log.active[period] > 0 for stretch in asked for period in stretch])
-    counted = active if active.any() else np.ones_like(active)
-    found = []
-    for steps, entrant in entrants.items():
-        p50, p99 = np.percentile(laps[str(steps)].best[counted], [50, 99])
-        size = entrant.formulation.qp.c.size
-        found.append(StageLength(steps=steps, variables=size, p50=float(p50), p99=float(p99)))
-    return tuple(found)

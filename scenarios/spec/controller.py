@@ -24,7 +24,7 @@ class UnconstrainedSpec(WeightedSpec):
 
 
 class ConstrainedSpec(BoundedSpec):
-    """The paper's constrained MPC, at most one QP per period (Sec. 5)."""
+    """The paper's constrained MPC, the optimum of a QP in every period (Sec. 5)."""
 
     type: Literal["constrained"] = Field(description="the control law, by its name in `quadsim list`")
     solver: str = Field(
@@ -33,7 +33,7 @@ class ConstrainedSpec(BoundedSpec):
         json_schema_extra={"enum": [*SOLVERS]},
     )
     shortcut: bool = Field(
-        default=True, description="take the unconstrained optimum where no constraint bars it; exact"
+        default=True, description="solve less than the whole QP where that yields its optimum; exact"
     )
     fallback: FallbackSpec | None = Field(
         default=None, description="absent: the last plan is held, shifted, and then the flight is given up"

@@ -1,4 +1,4 @@
-"""The shortcut around the QP: it answers exactly where no constraint bars the way, and with the QP's own solution."""
+"""The ways around the whole QP: they answer exactly where no other constraint bars the way, and with its solution."""
 
 from __future__ import annotations
 
@@ -7,21 +7,40 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
-from support import paper_problem, paper_reference, random_problem
+from support import paper_problem, paper_reference, random_axes, random_problem
 
 from mpc import shortcut as module
+from mpc.condensed import condensed
 from mpc.constrained import ConstrainedMPC
 from mpc.constraints import inequalities
 from mpc.prediction import prediction
 from mpc.problem import Problem
-from mpc.shortcut import Shortcut, make_shortcut
-from mpc.solvers import QPSolver
+from mpc.qp import kkt_residuals
+from mpc.shortcut import Shortcut, with_shortcut
+from mpc.solvers import Answer, QPSolver, Way
 from mpc.unconstrained import sequence_gains
 from quadsim.controller import SOLVED, UNCONSTRAINED, Moment
 from quadsim.state import Array
 from scenarios.runner import Flight
+
+
+def shortcut(problem: Problem, solver: str = "piqp-multistage") -> Shortcut:
+    return Shortcut(problem, QPSolver(solver, problem))
+
+
+def free_plan(problem: Problem, state: Array, desired: Array, u_before: Array) -> Array | None:
+    """The plan, where no QP was needed."""
+    answer = shortcut(problem).solve(state, desired, u_before)
+    assert (answer.way is Way.FREE) == (answer.solution.status == UNCONSTRAINED)
+    return answer.plan if answer.way is Way.FREE else None
+
+
+def largest_residual(problem: Problem, answer: Answer, *query: Array) -> float:
+    """Of a shortcut's answer, as a solution of the paper's condensed QP."""
+    form = condensed(problem)
+    return kkt_residuals(form.qp.with_vectors(form.vectors(*query)), answer.solution).worst
 
 
 def unconstrained_optimum(problem: Problem, state: Array, desired: Array) -> Array:
@@ -41,17 +60,59 @@ def largest_violation(problem: Problem, plan: Array, state: Array, u_before: Arr
 
 
 @given(seed=st.integers(0, 10_000), horizon=st.integers(1, 8), size=st.sampled_from([0.01, 0.1, 0.5, 2.0]))
-def test_it_answers_where_and_only_where_every_constraint_holds(seed: int, horizon: int, size: float) -> None:
+def test_no_qp_is_solved_where_and_only_where_every_constraint_holds(seed: int, horizon: int, size: float) -> None:
     rng = np.random.default_rng(seed)
     problem = random_problem(rng, horizon=horizon, n_c=2)
     state, desired = size * rng.normal(size=3), size * rng.normal(size=(horizon, 3))
     u_before = problem.model.u_bar + 0.1 * size * rng.normal(size=2)
     optimum = unconstrained_optimum(problem, state, desired)
     violation = largest_violation(problem, optimum, state, u_before)
-    plan = Shortcut(problem).plan(state, desired, u_before)
+    plan = free_plan(problem, state, desired, u_before)
     assert (plan is not None) == (violation <= 0.0) or abs(violation) < 1e-9
     if plan is not None:
         np.testing.assert_allclose(plan, optimum, atol=1e-9)
+
+
+@given(
+    seed=st.integers(0, 10_000),
+    horizon=st.integers(2, 8),
+    size=st.sampled_from([0.5, 2.0, 5.0]),
+    room=st.sampled_from([1.0, 10.0, 1000.0]),
+)
+@settings(max_examples=60)
+def test_axis_by_axis_is_the_whole_where_and_only_where_inputs_stay_in_bounds(
+    seed: int, horizon: int, size: float, room: float
+) -> None:
+    rng = np.random.default_rng(seed)
+    problem = random_axes(rng, horizon=horizon, room=room)
+    n, nu = problem.model.n, problem.model.nu
+    query = (size * rng.normal(size=n), size * rng.normal(size=(horizon, n)), problem.model.u_bar)
+    found, whole = shortcut(problem).solve(*query), QPSolver("piqp-dense", problem).solve(*query)
+    if found.way is Way.WHOLE:
+        bounds = problem.bounds
+        assert bounds is not None
+        far = np.full(nu, 1e9)
+        wide = replace(bounds, u_min=bounds.u_min - far, u_max=bounds.u_max + far, delta_min=-far, delta_max=far)
+        without = shortcut(replace(problem, bounds=wide)).solve(*query)
+        if without.solution.status == SOLVED and without.way is not Way.WHOLE:
+            steps = np.diff(without.plan, axis=0, prepend=query[2][None])
+            inside = (bounds.u_min <= without.plan) & (without.plan <= bounds.u_max)
+            assert not (inside & (bounds.delta_min <= steps) & (steps <= bounds.delta_max)).all()
+    else:
+        assert whole.solution.status == SOLVED
+        np.testing.assert_allclose(found.plan, whole.plan, atol=1e-3 * max(1.0, np.abs(whole.plan).max()))
+        assert largest_residual(problem, found, *query) < 1e-5 * max(1.0, np.abs(whole.plan).max())
+
+
+def test_every_way_is_taken_by_random_problems() -> None:
+    """What the test above rests on."""
+    ways = []
+    for seed in range(60):
+        rng = np.random.default_rng(seed)
+        problem = random_axes(rng, horizon=6, room=float(rng.choice([1.0, 1000.0])))
+        size, n = rng.choice([0.1, 2.0]), problem.model.n
+        ways.append(shortcut(problem).solve(size * rng.normal(size=n), np.zeros((6, n)), problem.model.u_bar).way)
+    assert min(ways.count(way) for way in Way) >= 5
 
 
 @pytest.mark.parametrize("part", ["u_min", "u_max", "delta_min", "delta_max", "y_min", "y_max"])
@@ -61,7 +122,7 @@ def test_each_kind_of_constraint_is_seen(part: str) -> None:
     assert problem.bounds is not None
     state, desired = np.zeros(12), np.zeros((50, 4))
     state[[0, 2, 4, 6, 8]] = [0.02, -0.03, -0.05, 0.002, -0.003]
-    plan = Shortcut(problem).plan(state, desired, problem.model.u_bar)
+    plan = free_plan(problem, state, desired, problem.model.u_bar)
     assert plan is not None
     maps = prediction(problem.model, 50)
     outputs = (maps.Phi @ state + maps.Psi @ (plan - problem.model.u_bar).ravel()).reshape(
@@ -76,28 +137,32 @@ def test_each_kind_of_constraint_is_seen(part: str) -> None:
     extreme = values.min(axis=0) if part.endswith("min") else values.max(axis=0)
     for distance, free in ((-1e-6, True), (1e-6, False)):
         bounds = replace(problem.bounds, **{part: extreme + inwards * distance})
-        found = Shortcut(replace(problem, bounds=bounds)).plan(state, desired, problem.model.u_bar)
+        found = free_plan(replace(problem, bounds=bounds), state, desired, problem.model.u_bar)
         assert (found is not None) == free
 
 
-def test_its_answer_is_the_solution_of_the_qp(constrained_flight: Flight) -> None:
-    """Over the paper's flight: where the shortcut answers, the QP's solution is the same plan, with nothing active."""
+@pytest.mark.parametrize("solver", ["piqp-multistage", "daqp"])
+def test_its_answer_is_the_solution_of_the_whole_qp(constrained_flight: Flight, solver: str) -> None:
+    """Over the paper's flight: the same plan, whichever way it is found."""
     problem, log = paper_problem(), constrained_flight.log.control
-    shortcut, solver = Shortcut(problem), QPSolver("piqp-multistage", problem)
+    quick, whole = shortcut(problem, solver), QPSolver("daqp", problem)
     reference = paper_reference(log.t.size + 50)
     before = np.vstack([log.speeds_before, log.speeds[:-1]])
-    answered = 0
-    for k in range(0, log.t.size, 10):
+    ways = []
+    for k in range(0, log.t.size, 8):
         query = log.state[k], problem.objective.desired(reference[k + 1 : k + 51]), before[k]
-        plan = shortcut.plan(*query)
-        answer = solver.solve(*query)
-        assert answer.solution.status == SOLVED
-        if plan is not None:
-            answered += 1
-            np.testing.assert_allclose(plan, answer.plan, atol=1e-3)
-            np.testing.assert_allclose(plan[0], answer.plan[0], atol=1e-4)
-    assert answered == sum(status == UNCONSTRAINED for status in log.status[::10])
-    assert 40 < answered < 80  # of 120
+        answer, expected = quick.solve(*query), whole.solve(*query)
+        assert expected.solution.status == SOLVED
+        np.testing.assert_allclose(answer.plan, expected.plan, atol=5e-3)
+        np.testing.assert_allclose(answer.plan[0], expected.plan[0], atol=1e-3)
+        if answer.way is not Way.WHOLE:
+            assert largest_residual(problem, answer, *query) < 1e-4
+        if answer.way is Way.AXES:
+            assert answer.solution.status == SOLVED
+            assert min(answer.solution.active, answer.solution.iterations) > 0
+        ways.append(answer.way)
+    assert ways.count(Way.FREE) == sum(status == UNCONSTRAINED for status in log.status[::8])
+    assert {way: ways.count(way) for way in Way} == {Way.FREE: 74, Way.AXES: 70, Way.WHOLE: 6}
 
 
 def test_commands_with_and_without_it_are_the_same(constrained_flight: Flight) -> None:
@@ -119,33 +184,68 @@ def test_commands_with_and_without_it_are_the_same(constrained_flight: Flight) -
 
 def test_a_measured_nan_is_never_feasible() -> None:
     problem = paper_problem()
-    shortcut, hover = Shortcut(problem), problem.model.u_bar
+    quick, hover = shortcut(problem), problem.model.u_bar
     desired = np.zeros((50, 4))
-    assert shortcut.plan(np.zeros(12), desired, hover) is not None
-    assert shortcut.plan(np.full(12, np.nan), desired, hover) is None
-    assert shortcut.plan(np.zeros(12), desired * np.nan, hover) is None
-    assert shortcut.plan(np.zeros(12), desired, hover * np.nan) is None
+    assert quick.solve(np.zeros(12), desired, hover).way is Way.FREE
+    for query in (
+        (np.full(12, np.nan), desired, hover),
+        (np.zeros(12), desired * np.nan, hover),
+        (np.zeros(12), desired, hover * np.nan),
+    ):
+        answer = quick.solve(*query)
+        assert answer.way is Way.WHOLE
+        assert answer.solution.status == "invalid_data"
+
+
+def test_what_no_axis_can_hold_is_told_by_the_whole_qp() -> None:
+    """A roll that no torque could bring back within its bounds before the first predicted state."""
+    problem = paper_problem()
+    tilted = np.zeros(12)
+    tilted[6] = 0.5
+    answer = shortcut(problem).solve(tilted, np.zeros((50, 4)), problem.model.u_bar)
+    assert answer.way is Way.WHOLE
+    assert answer.solution.status == "primal_infeasible"
+
+
+def test_what_was_tried_in_vain_counts() -> None:
+    """Ten metres to the side at once: the pitch that takes stays within 5 deg, the rotors' steps do not."""
+    problem = paper_problem()
+    desired = np.zeros((50, 4))
+    desired[:, 0] = 10.0
+    query = np.zeros(12), desired, problem.model.u_bar
+    answer, whole = shortcut(problem).solve(*query), QPSolver("piqp-multistage", problem).solve(*query)
+    assert answer.way is Way.WHOLE
+    np.testing.assert_array_equal(answer.plan, whole.plan)
+    assert answer.solution.iterations > whole.solution.iterations + 5
 
 
 def test_there_is_none_where_its_map_is_too_large(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert make_shortcut(replace(paper_problem(), horizon=200)) is not None
-    assert make_shortcut(replace(paper_problem(), horizon=250)) is None
-    problem = paper_problem()
+    def tried(horizon: int) -> bool:
+        problem = replace(paper_problem(), horizon=horizon)
+        solver = QPSolver("piqp-multistage", problem)
+        return with_shortcut(problem, solver) is not solver
+
+    assert tried(200)
+    assert not tried(250)
 
     def unfactorable(_: Problem) -> None:
         raise np.linalg.LinAlgError
 
     monkeypatch.setattr(module, "sequence_gains", unfactorable)
-    assert make_shortcut(problem) is None
+    assert not tried(50)
 
 
-@pytest.mark.parametrize("height", [0.0, 8.0])
-def test_steps_leave_no_memory_behind_and_allocate_nothing_large(height: float) -> None:
-    """Both ways through a step: by the shortcut (at the reference) and by the QP (8 m below it)."""
+@pytest.mark.parametrize(
+    ("aside", "height", "way"), [(0.0, 0.0, Way.FREE), (3.0, 0.0, Way.AXES), (0.0, 8.0, Way.WHOLE)]
+)
+def test_steps_leave_no_memory_behind_and_allocate_nothing_large(aside: float, height: float, way: Way) -> None:
+    """All ways through a step: at the reference, before it moves away, 8 m below it."""
     problem = paper_problem()
     controller = ConstrainedMPC(problem, QPSolver("piqp-multistage", problem))
     controller.reset(problem.model.u_bar)
     reference = np.tile([0.0, 0.0, height, 0.0], (50, 1))
+    reference[:, 0] = aside * np.linspace(0.0, 1.0, 50) ** 4
+    assert shortcut(problem).solve(np.zeros(12), reference, problem.model.u_bar).way is way
     state = np.zeros(12)
     for _ in range(5):
         controller.step(Moment(), state, reference)
@@ -162,30 +262,30 @@ def test_steps_leave_no_memory_behind_and_allocate_nothing_large(height: float) 
         after, peak = tracemalloc.get_traced_memory()
     finally:
         tracemalloc.stop()
-    assert status == (SOLVED if height else UNCONSTRAINED)
+    assert status == (UNCONSTRAINED if way is Way.FREE else SOLVED)
     assert after - before < 2_000  # flat: less than 40 bytes a step
     assert peak - before < 64_000  # the condensed H alone has 320 kB
 
 
 def test_without_output_bounds_the_inputs_decide() -> None:
     problem = paper_problem("paper-constrained", "controller.output_bounds={}")
-    shortcut, far = Shortcut(problem), np.zeros(12)
-    assert shortcut.plan(far, np.zeros((50, 4)), problem.model.u_bar) is not None
+    quick, far = shortcut(problem), np.zeros(12)
+    assert quick.solve(far, np.zeros((50, 4)), problem.model.u_bar).way is Way.FREE
     far[4] = -100.0
-    assert shortcut.plan(far, np.zeros((50, 4)), problem.model.u_bar) is None
+    assert quick.solve(far, np.zeros((50, 4)), problem.model.u_bar).way is Way.WHOLE
 
 
 @pytest.mark.parametrize("horizon", [50, 100, 200])
 def test_it_is_exact_over_long_horizons(horizon: int) -> None:
     """Hover on the reference is u_bar throughout; a little beside it, the plan is the QP's."""
     problem = replace(paper_problem(), horizon=horizon)
-    shortcut, desired = Shortcut(problem), np.zeros((horizon, 4))
-    hover = shortcut.plan(np.zeros(12), desired, problem.model.u_bar)
+    desired = np.zeros((horizon, 4))
+    hover = free_plan(problem, np.zeros(12), desired, problem.model.u_bar)
     assert hover is not None
     np.testing.assert_allclose(hover, np.tile(problem.model.u_bar, (horizon, 1)), atol=1e-9)
     state = np.zeros(12)
     state[[0, 2, 4, 6, 8]] = [0.02, -0.03, -0.05, 0.002, -0.003]
-    plan = shortcut.plan(state, desired, problem.model.u_bar)
+    plan = free_plan(problem, state, desired, problem.model.u_bar)
     answer = QPSolver("piqp-multistage", problem).solve(state, desired, problem.model.u_bar)
     assert plan is not None
     np.testing.assert_allclose(plan[0], answer.plan[0], atol=1e-4)
@@ -193,8 +293,9 @@ def test_it_is_exact_over_long_horizons(horizon: int) -> None:
 
 def test_there_is_none_where_rounding_has_spoilt_the_gains() -> None:
     """A long horizon and inputs that cost next to nothing: cond(H) nears what double precision holds."""
-    settings = ("controller.horizon=200", "controller.input_weights.speed=1e-5")
-    problem = paper_problem("paper-constrained", *settings)
-    assert make_shortcut(problem) is None
+    options = ("controller.horizon=200", "controller.input_weights.speed=1e-5")
+    problem = paper_problem("paper-constrained", *options)
+    solver = QPSolver("piqp-multistage", problem)
+    assert with_shortcut(problem, solver) is solver
     with pytest.raises(np.linalg.LinAlgError):
-        Shortcut(problem)
+        Shortcut(problem, solver)

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from mpc.solvers import SOLVERS
+from mpc.solvers import SOLVERS, Way
 from quadsim.bench import (
     Growth,
     RenderProfile,
@@ -162,7 +162,7 @@ def test_growth_covers_all_contenders_and_horizons(bench: SolverBench) -> None:
     assert {growth.name for growth in bench.growth} == {contender.name for contender in bench.contenders}
     for contender in bench.contenders:
         kinds = {growth.kind for growth in bench.growth if growth.name == contender.name}
-        assert kinds <= ({"QP", "shortcut"} if contender.shortcut else {""})
+        assert kinds <= (set(Way) if contender.shortcut else {""})
     for growth in bench.growth:
         assert growth.horizons == (5, 20, 24, 30)
         assert all(0.0 < p50 <= p99 for p50, p99 in zip(growth.p50, growth.p99, strict=True))
@@ -170,12 +170,13 @@ def test_growth_covers_all_contenders_and_horizons(bench: SolverBench) -> None:
 
 
 def test_tables_are_complete(bench: SolverBench) -> None:
-    contenders, growth, stages, targets = solver_tables(bench)
+    contenders, growth, stages, axis_stages, targets = solver_tables(bench)
     assert [line[0].text.removesuffix(" (default)") for line in contenders.lines] == [c.name for c in bench.contenders]
-    for grid in (contenders, growth, stages, targets):
+    for grid in (contenders, growth, stages, axis_stages, targets):
         assert {len(line) for line in grid.lines} == {len(grid.head)}
         assert all(cell.text for line in grid.lines for cell in line)
     assert {line[0].text for line in stages.lines} >= {"condensed, dense", "1", "5 (default)", "25"}
+    assert {line[0].text for line in axis_stages.lines} >= {"condensed, dense", "1", "20 (default)", "25"}
     assert contenders.lines[0][6].text == "1"  # p99, as a ratio to itself
 
 

@@ -1,0 +1,132 @@
+"""The axes of a problem: parts that meet only in what the inputs can do.
+
+A hovering quadrotor is four systems: x with pitch, y with roll, z, and yaw.  Four rotors drive them all, so that bounds
+on rotors tie them together; but no prediction, no weight and no output bound does.  In an input u with the cost
+(u - u_bar)' Q_u (u - u_bar), two states are moved apart from each other where their rows of B Q_u^-1 B' do not meet.
+Take as axes the connected components of
+
+    A,  C_r' Q_y C_r,  C_c' C_c,  B Q_u^-1 B',
+
+and for each axis g inputs w_g with T_g spanning Q_u^-1 B_g'.  Then u = u_bar + sum T_g w_g, each w_g moves its own
+axis alone since B_h T_g = 0, and the cost falls apart since T_g' Q_u T_h = 0: without bounds on inputs the problem is
+one small problem per axis.  What of u lies in none of the T_g moves nothing, and is zero at the optimum.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+from scipy.sparse import csr_matrix
+from scipy.sparse.csgraph import connected_components
+
+from mpc.condensed import require_bounds
+from mpc.model import LinearModel
+from mpc.problem import Bounds, Objective, Problem
+from quadsim.state import Array
+
+Indices = np.ndarray[Any, np.dtype[np.int64]]
+
+ROUNDING: Final = 1e-12
+"""Relative size below which what ties two states is taken for a product of rounding."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Axis:
+    """One axis whose outputs have bounds, as a problem of its own.
+
+    Attributes:
+        problem: in w (N, m), with the axis's output bounds and no others; its u_bar is zero.
+        states: (n_g,) its states among those of the whole.
+        regulated: its rows of C_r.
+        outputs: its rows of C_c.
+        T: (nu, m) the axis's part of u - u_bar is T w; orthonormal columns.
+        S: (m, nu) w = S (u - u_bar), of all axes together.
+    """
+
+    problem: Problem
+    states: Indices
+    regulated: Indices
+    outputs: Indices
+    T: Array
+    S: Array
+
+
+def bounded_axes(problem: Problem) -> list[Axis]:
+    """The axes whose outputs have bounds.
+
+    None where the problem is all of one piece, or where nothing moves such an axis or asks anything of it.
+
+    Raises:
+        ValueError: the problem has no bounds.
+    """
+    bounds, model, objective = require_bounds(problem), problem.model, problem.objective
+    reach = np.linalg.solve(objective.Q_u, model.B.T)
+    weight = objective.C_r.T @ objective.Q_y @ objective.C_r
+    tied = _apart_from_rounding(model.A)
+    for gram in (weight, bounds.C_c.T @ bounds.C_c, model.B @ reach):
+        tied |= _tied(gram)
+    count, label = connected_components(csr_matrix(tied), directed=False)
+    if count == 1:
+        return []
+    bounded = np.isfinite(bounds.y_min) | np.isfinite(bounds.y_max)
+    axes = []
+    for g in range(count):
+        states = np.flatnonzero(label == g)
+        outputs = np.flatnonzero(bounded & bounds.C_c[:, states].any(axis=1))
+        if not outputs.size:
+            continue
+        directions, sizes, _ = np.linalg.svd(reach[:, states], full_matrices=False)
+        T = directions[:, sizes > ROUNDING * sizes[0]]
+        regulated = np.flatnonzero(objective.C_r[:, states].any(axis=1))
+        if not T.size or not regulated.size:
+            return []
+        axes.append(_axis(problem, bounds, T, states=states, regulated=regulated, outputs=outputs))
+    return axes
+
+
+def _axis(problem: Problem, bounds: Bounds, T: Array, *, states: Indices, regulated: Indices, outputs: Indices) -> Axis:
+    model, objective = problem.model, problem.objective
+    weight: Array = T.T @ objective.Q_u @ T
+    free = np.full(T.shape[1], np.inf)
+    return Axis(
+        problem=Problem(
+            model=LinearModel(
+                A=model.A[np.ix_(states, states)],
+                B=model.B[states] @ T,
+                u_bar=np.zeros(T.shape[1]),
+                period=model.period,
+            ),
+            horizon=problem.horizon,
+            objective=Objective(
+                C_r=objective.C_r[np.ix_(regulated, states)],
+                Q_y=objective.Q_y[np.ix_(regulated, regulated)],
+                Q_u=0.5 * (weight + weight.T),
+            ),
+            bounds=Bounds(
+                C_c=bounds.C_c[np.ix_(outputs, states)],
+                y_min=bounds.y_min[outputs],
+                y_max=bounds.y_max[outputs],
+                delta_min=-free,
+                delta_max=free,
+                u_min=-free,
+                u_max=free,
+            ),
+        ),
+        states=states,
+        regulated=regulated,
+        outputs=outputs,
+        T=T,
+        S=np.asarray(np.linalg.solve(weight, T.T @ objective.Q_u), dtype=np.float64),
+    )
+
+
+def _tied(gram: Array) -> np.ndarray[Any, np.dtype[np.bool_]]:
+    """Which pairs a positive semidefinite matrix ties, by its entries against their largest possible size."""
+    size = np.sqrt(np.diag(gram))
+    return np.abs(gram) > ROUNDING * np.outer(size, size)
+
+
+def _apart_from_rounding(A: Array) -> np.ndarray[Any, np.dtype[np.bool_]]:
+    return np.abs(A) > ROUNDING * np.abs(A).max()

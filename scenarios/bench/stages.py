@@ -1,0 +1,103 @@
+"""How many steps make a stage: the QP in its forms, by PIQP alone."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Final
+
+import numpy as np
+
+from mpc.axes import Axis, bounded_axes
+from mpc.condensed import condensed
+from mpc.multistage import INPUTS_PER_STAGE, multistage
+from mpc.problem import Problem
+from mpc.qp import Backend, Formulation, Vectors
+from mpc.solvers.piqp_dense import PiqpDense
+from mpc.solvers.piqp_sparse import PiqpMultistage
+from quadsim.bench import StageLength
+from quadsim.state import Array
+from scenarios.bench.race import race
+from scenarios.queries import Queries
+from scenarios.runner import Progress
+
+STEPS_TRIED: Final = (1, 2, 3, 4, 5, 6, 8, 10, 13, 17, 20, 25)
+
+Query = tuple[Array, Array, Array]
+"""xi(k), y_d and u(k-1)."""
+
+
+def time_stages(
+    problem: Problem,
+    queries: Queries,
+    asked: Sequence[range],
+    *,
+    repeats: int,
+    rng: np.random.Generator,
+    progress: Progress,
+) -> Mapping[str, tuple[StageLength, ...]]:
+    """The whole QP, and that of the first axis whose outputs have bounds, where there is one."""
+
+    def whole(period: int) -> Query:
+        reference = queries.reference[period + 1 : period + 1 + problem.horizon]
+        return queries.state[period], problem.objective.desired(reference), queries.speeds_before[period]
+
+    times = {"whole QP": _time(problem, whole, asked, repeats=repeats, rng=rng, progress=progress)}
+    for axis in bounded_axes(problem)[:1]:
+
+        def part(period: int, axis: Axis = axis) -> Query:
+            state, desired, before = whole(period)
+            return state[axis.states], desired[:, axis.regulated], axis.S @ (before - problem.model.u_bar)
+
+        times["QP of one axis"] = _time(axis.problem, part, asked, repeats=repeats, rng=rng, progress=progress)
+    return times
+
+
+class _QPEntrant:
+    """A form of the QP with its back end, without a controller around it."""
+
+    def __init__(self, formulation: Formulation, backend: Backend, query: Callable[[int], Query]) -> None:
+        self.formulation, self._backend, self._query = formulation, backend, query
+        self.active: dict[int, int] = {}
+        """Constraints active in the answer, by period."""
+        backend.setup(formulation.qp)
+
+    def prepare(self, period: int) -> None:
+        """See `scenarios.bench.race.Entrant.prepare`."""
+        self._period = period
+        self._vectors: Vectors = self.formulation.vectors(*self._query(period))
+
+    def answer(self) -> None:
+        """See `scenarios.bench.race.Entrant.answer`."""
+        self.active[self._period] = self._backend.solve(self._vectors).active
+
+
+def _time(
+    problem: Problem,
+    query: Callable[[int], Query],
+    asked: Sequence[range],
+    *,
+    repeats: int,
+    rng: np.random.Generator,
+    progress: Progress,
+) -> tuple[StageLength, ...]:
+    """The QP condensed and cut into stages of M steps, on the periods whose QP has active constraints."""
+    default = max(INPUTS_PER_STAGE // problem.model.nu, 1)
+    entrants: dict[int | None, _QPEntrant] = {None: _QPEntrant(condensed(problem), PiqpDense(), query)}
+    for length in sorted({*STEPS_TRIED, default}):
+        entrants[length] = _QPEntrant(multistage(problem, steps_per_stage=length), PiqpMultistage(), query)
+    laps = race(
+        {str(steps): entrant for steps, entrant in entrants.items()},
+        asked,
+        repeats=repeats,
+        rng=rng,
+        progress=lambda done, total: progress("stages", done, total),
+    )
+    found_active = entrants[default].active
+    active = np.array([found_active[period] > 0 for stretch in asked for period in stretch])
+    counted = active if active.any() else np.ones_like(active)
+    found = []
+    for steps, entrant in entrants.items():
+        p50, p99 = np.percentile(laps[str(steps)].best[counted], [50, 99])
+        size = entrant.formulation.qp.c.size
+        found.append(StageLength(steps=steps, variables=size, p50=float(p50), p99=float(p99), default=steps == default))
+    return tuple(found)

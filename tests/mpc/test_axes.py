@@ -1,0 +1,106 @@
+"""Which axes a problem falls into, and that they are worth as much together as it is."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from support import paper_problem, random_axes, random_problem
+
+from mpc.axes import bounded_axes
+from mpc.problem import Problem
+from quadsim.state import STATE_NAMES, Array
+
+QUADROTOR = {("x", "vx", "pitch", "pitch_rate"), ("y", "vy", "roll", "roll_rate")}
+
+
+def names(problem: Problem) -> set[tuple[str, ...]]:
+    return {tuple(STATE_NAMES[i] for i in axis.states) for axis in bounded_axes(problem)}
+
+
+@pytest.mark.parametrize("vehicle", ["lopes2011", "crazyflie2", "hummingbird"])
+def test_a_hovering_quadrotor_tilts_in_two_axes(vehicle: str) -> None:
+    """Whether its arms point along its axes or between them."""
+    problem = paper_problem("paper-constrained", f"vehicle.file={vehicle}")
+    assert names(problem) == QUADROTOR
+    for axis in bounded_axes(problem):
+        assert axis.T.shape == (4, 1)
+        np.testing.assert_allclose(axis.S @ axis.T, np.eye(1), atol=1e-12)
+
+
+def test_every_axis_with_a_bound_counts() -> None:
+    problem = paper_problem("paper-constrained", "controller.output_bounds={roll=[-5.0, 5.0], vz=[-1.0, 1.0]}")
+    assert names(problem) == {("y", "vy", "roll", "roll_rate"), ("z", "vz")}
+    unbounded = paper_problem("paper-constrained", "controller.output_bounds={}")
+    assert names(unbounded) == set()
+
+
+def test_rotors_of_different_weight_tie_the_axes() -> None:
+    """The fourth rotor leaves pitch alone, and trades roll for climb and yaw."""
+    problem = paper_problem("paper-constrained", "controller.input_weights.speed=[0.01, 0.01, 0.01, 0.02]")
+    rest = tuple(name for name in STATE_NAMES if name not in ("x", "vx", "pitch", "pitch_rate"))
+    assert names(problem) == {("x", "vx", "pitch", "pitch_rate"), rest}
+    whole = paper_problem("paper-constrained", "controller.input_weights.speed=[0.01, 0.01, 0.015, 0.02]")
+    assert names(whole) == set()
+
+
+@pytest.mark.parametrize("tie", ["A", "Q_y", "C_c"])
+def test_whatever_ties_two_states_ties_their_axes(tie: str) -> None:
+    problem = paper_problem()
+    assert problem.bounds is not None
+    x, y, pitch, roll = (STATE_NAMES.index(name) for name in ("x", "y", "pitch", "roll"))
+    if tie == "A":
+        A = problem.model.A.copy()
+        A[x, y] = 1e-3
+        problem = replace(problem, model=replace(problem.model, A=A))
+    elif tie == "Q_y":
+        Q_y = problem.objective.Q_y.copy()
+        Q_y[0, 1] = Q_y[1, 0] = 1e-3
+        problem = replace(problem, objective=replace(problem.objective, Q_y=Q_y))
+    else:
+        C_c = problem.bounds.C_c.copy()
+        C_c[0, [roll, pitch]] = 1.0
+        problem = replace(problem, bounds=replace(problem.bounds, C_c=C_c))
+    together = tuple(name for name in STATE_NAMES if name not in ("z", "vz", "yaw", "yaw_rate"))
+    assert names(problem) == {together}
+
+
+def test_one_piece_has_none() -> None:
+    assert bounded_axes(random_problem(np.random.default_rng(0), horizon=4)) == []
+
+
+def test_an_axis_that_nothing_moves_or_that_nothing_is_asked_of_gives_none() -> None:
+    problem = paper_problem()
+    B = problem.model.B.copy()
+    B[[STATE_NAMES.index(name) for name in ("y", "vy", "roll", "roll_rate")]] = 0.0
+    assert bounded_axes(replace(problem, model=replace(problem.model, B=B))) == []
+    indifferent = paper_problem("paper-constrained", "controller.output_weights={x=1.0, z=1.0, yaw=1.0}")
+    assert bounded_axes(indifferent) == []
+
+
+def cost(problem: Problem, state: Array, desired: Array, moves: Array) -> float:
+    """Eq. (5), by recursion, of moves u - u_bar (N, nu)."""
+    model, objective, total = problem.model, problem.objective, 0.0
+    for move, wanted in zip(moves, desired, strict=True):
+        state = model.A @ state + model.B @ move
+        error = objective.C_r @ state - wanted
+        total += error @ objective.Q_y @ error + move @ objective.Q_u @ move
+    return float(total)
+
+
+def test_costs_and_outputs_fall_apart() -> None:
+    """Whatever the inputs of an axis, they change its own cost and outputs, and nobody else's."""
+    rng = np.random.default_rng(3)
+    problem = random_axes(rng, horizon=5, room=1.0)
+    assert problem.bounds is not None
+    axes = bounded_axes(problem)
+    assert [axis.states.size for axis in axes] in ([3, 2], [2, 3])
+    state, desired, moves = rng.normal(size=7), rng.normal(size=(5, 7)), rng.normal(size=(5, 4))
+    for axis in axes:
+        own = (axis.problem, state[axis.states], desired[:, axis.regulated])
+        w, change = moves @ axis.S.T, rng.normal(size=(5, axis.T.shape[1]))
+        whole = cost(problem, state, desired, moves + change @ axis.T.T) - cost(problem, state, desired, moves)
+        assert cost(*own, w + change) - cost(*own, w) == pytest.approx(whole, rel=1e-9)
+        for i, move in enumerate(moves):
+            assert problem.model.B[axis.states] @ move == pytest.approx(axis.problem.model.B @ w[i], abs=1e-9)
