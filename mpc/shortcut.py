@@ -15,7 +15,7 @@ from mpc.problem import Problem
 from mpc.qp import Solution
 from mpc.solvers import Answer, QPSolver, Solver, Way
 from mpc.unconstrained import sequence_gains
-from quadsim.controller import SOLVED, UNCONSTRAINED
+from quadsim.controller import ACCEPTED, SOLVED, UNCONSTRAINED
 from quadsim.state import Array
 
 LARGEST_MAP: Final = 2**20
@@ -24,6 +24,8 @@ have 64 k entries, 200 steps 970 k."""
 ROUNDING: Final = 1e-2
 """Error of L_N u_bar [rad/s], whose value is known, beyond which rounding is taken to have spoilt the gains.  That of
 K_N xi(k), on deviations and not on the whole speed, is a hundredth of it."""
+NOT_TRIED: Final = "not_tried"
+"""Status of an attempt that was none."""
 
 
 class Shortcut:
@@ -72,49 +74,41 @@ class Shortcut:
     def solve(self, state: Array, desired: Array, u_before: Array) -> Answer:
         """See `mpc.solvers.Solver.solve`."""
         started = clock.perf_counter()
-        answer = self._by_output_bounds(state, desired)
-        if answer is not None and self._inputs_within_bounds(answer.plan, u_before):
-            solution = replace(answer.solution, x=answer.plan.ravel(), solve_s=clock.perf_counter() - started)
-            return replace(answer, solution=solution)
+        tried = self._by_output_bounds(state, desired)
+        found = tried.solution.status in ACCEPTED and self._inputs_within_bounds(tried.plan, u_before)
         tried_s = clock.perf_counter() - started
-        tried = 0 if answer is None else answer.solution.iterations
+        if found:
+            return replace(tried, solution=replace(tried.solution, x=tried.plan.ravel(), solve_s=tried_s))
         answer = self._whole.solve(state, desired, u_before)
-        solution = answer.solution
-        return replace(
-            answer,
-            solution=replace(solution, iterations=solution.iterations + tried, solve_s=solution.solve_s + tried_s),
-        )
+        iterations = tried.solution.iterations + answer.solution.iterations
+        solve_s = tried_s + answer.solution.solve_s
+        return replace(answer, solution=replace(answer.solution, iterations=iterations, solve_s=solve_s))
 
-    def _by_output_bounds(self, state: Array, desired: Array) -> Answer | None:
-        """The optimum without bounds on inputs, as a solution of the condensed QP; None where none was found."""
+    def _by_output_bounds(self, state: Array, desired: Array) -> Answer:
+        """The optimum without bounds on inputs, as a solution of the condensed QP."""
         plan, outputs = self._free.at(state, desired)
-        bounds = self._bounds
+        bounds, N = self._bounds, len(outputs)
         staying = np.all((bounds.y_min <= outputs) & (outputs <= bounds.y_max), axis=0)
         if staying.all():
             return Answer(plan=plan, solution=self._unbound, way=Way.FREE)
-        if not self._axes:
-            return None
-        z = np.zeros_like(self._unbound.z)
-        N = len(outputs)
+        leaving = [solver for solver in self._axes if not staying[solver.axis.outputs].all()]
+        if not leaving:  # all of one piece
+            return Answer(plan=plan, solution=replace(self._unbound, status=NOT_TRIED))
+        z, parts = np.zeros_like(self._unbound.z), []
         multipliers = z[: outputs.size].reshape(outputs.shape)
-        parts = []
-        for solver in self._axes:
-            axis = solver.axis
-            if not staying[axis.outputs].all():
-                answer = solver.solve(state, desired)
-                if answer.solution.status != SOLVED:
-                    return None
-                plan = plan + (answer.plan - (plan - self._u_bar) @ axis.S.T) @ axis.T.T
-                multipliers[:, axis.outputs] = answer.solution.z[: N * axis.outputs.size].reshape(N, -1)
-                parts.append(answer.solution)
+        for solver in leaving:
+            axis, answer = solver.axis, solver.solve(state, desired)
+            plan = plan + (answer.plan - (plan - self._u_bar) @ axis.S.T) @ axis.T.T
+            multipliers[:, axis.outputs] = answer.solution.z[: N * axis.outputs.size].reshape(N, -1)
+            parts.append(answer.solution)
         solution = replace(
             self._unbound,
             z=z,
-            status=SOLVED,
+            status=next((part.status for part in parts if part.status != SOLVED), SOLVED),
             iterations=sum(part.iterations for part in parts),
             active=sum(part.active for part in parts),
-            primal_residual=max(part.primal_residual for part in parts),
-            dual_residual=max(part.dual_residual for part in parts),
+            primal_residual=float(np.max([part.primal_residual for part in parts])),  # NaN stays NaN
+            dual_residual=float(np.max([part.dual_residual for part in parts])),
         )
         return Answer(plan=plan, solution=solution, way=Way.AXES)
 
