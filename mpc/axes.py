@@ -1,15 +1,15 @@
 """The axes of a problem: parts that meet only in what the inputs can do.
 
 A hovering quadrotor is four systems: x with pitch, y with roll, z, and yaw.  Four rotors drive them all, so that bounds
-on rotors tie them together; but no prediction, no weight and no output bound does.  In an input u with the cost
-(u - u_bar)' Q_u (u - u_bar), two states are moved apart from each other where their rows of B Q_u^-1 B' do not meet.
-Take as axes the connected components of
+on rotors tie them together; but no prediction, no weight and no output bound does.  Take as axes the connected
+components of the states under
 
-    A,  C_r' Q_y C_r,  C_c' C_c,  B Q_u^-1 B',
+    A,  |C_r|' |Q_y| |C_r|,  |C_c|' |C_c|,  B Q_u^-1 B',
 
-and for each axis g inputs w_g with T_g spanning Q_u^-1 B_g'.  Then u = u_bar + sum T_g w_g, each w_g moves its own
-axis alone since B_h T_g = 0, and the cost falls apart since T_g' Q_u T_h = 0: without bounds on inputs the problem is
-one small problem per axis.  What of u lies in none of the T_g moves nothing, and is zero at the optimum.
+the last for what it costs to move two states at once, and for each axis g inputs w_g with T_g spanning Q_u^-1 B_g'.
+Then u = u_bar + sum T_g w_g, each w_g moves its own axis alone since B_h T_g = 0, and the cost falls apart since
+T_g' Q_u T_h = 0: without bounds on inputs the problem is one small problem per axis.  What of u lies in none of the T_g
+moves nothing, and is zero at the optimum.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ class Axis:
         states: (n_g,) its states among those of the whole.
         regulated: its rows of C_r.
         outputs: its rows of C_c.
-        T: (nu, m) the axis's part of u - u_bar is T w; orthonormal columns.
+        T: (nu, m) the axis's part of u - u_bar is T w; columns of unit length.
         S: (m, nu) w = S (u - u_bar), of all axes together.
     """
 
@@ -56,21 +56,23 @@ class Axis:
 def bounded_axes(problem: Problem) -> list[Axis]:
     """The axes whose outputs have bounds.
 
-    None where the problem is all of one piece, or where nothing moves such an axis or asks anything of it.
+    None where the problem is all of one piece, or where nothing moves such an axis or asks anything of it, or where a
+    bound is on nothing.
 
     Raises:
         ValueError: the problem has no bounds.
     """
     bounds, model, objective = require_bounds(problem), problem.model, problem.objective
-    reach = np.linalg.solve(objective.Q_u, model.B.T)
-    weight = objective.C_r.T @ objective.Q_y @ objective.C_r
-    tied = _apart_from_rounding(model.A)
-    for gram in (weight, bounds.C_c.T @ bounds.C_c, model.B @ reach):
-        tied |= _tied(gram)
+    C_r, C_c = np.abs(objective.C_r), np.abs(bounds.C_c)
+    root = np.linalg.cholesky(objective.Q_u)
+    reach = _normalised(np.linalg.solve(root, model.B.T))
+    tied = (C_r.T @ np.abs(objective.Q_y) @ C_r + C_c.T @ C_c) > 0.0
+    tied |= np.abs(model.A) > ROUNDING * np.abs(model.A).max()
+    tied |= np.abs(reach.T @ reach) > ROUNDING
     count, label = connected_components(csr_matrix(tied), directed=False)
-    if count == 1:
-        return []
     bounded = np.isfinite(bounds.y_min) | np.isfinite(bounds.y_max)
+    if count == 1 or not C_c[bounded].any(axis=1).all():
+        return []
     axes = []
     for g in range(count):
         states = np.flatnonzero(label == g)
@@ -78,7 +80,7 @@ def bounded_axes(problem: Problem) -> list[Axis]:
         if not outputs.size:
             continue
         directions, sizes, _ = np.linalg.svd(reach[:, states], full_matrices=False)
-        T = directions[:, sizes > ROUNDING * sizes[0]]
+        T = _normalised(np.linalg.solve(root.T, directions[:, sizes > ROUNDING]))
         regulated = np.flatnonzero(objective.C_r[:, states].any(axis=1))
         if not T.size or not regulated.size:
             return []
@@ -122,11 +124,7 @@ def _axis(problem: Problem, bounds: Bounds, T: Array, *, states: Indices, regula
     )
 
 
-def _tied(gram: Array) -> np.ndarray[Any, np.dtype[np.bool_]]:
-    """Which pairs a positive semidefinite matrix ties, by its entries against their largest possible size."""
-    size = np.sqrt(np.diag(gram))
-    return np.abs(gram) > ROUNDING * np.outer(size, size)
-
-
-def _apart_from_rounding(A: Array) -> np.ndarray[Any, np.dtype[np.bool_]]:
-    return np.abs(A) > ROUNDING * np.abs(A).max()
+def _normalised(matrix: Array) -> Array:
+    """The matrix with columns of unit length; those of zeros stay."""
+    size = np.linalg.norm(matrix, axis=0)
+    return np.asarray(matrix / np.where(size > 0.0, size, 1.0), dtype=np.float64)

@@ -92,12 +92,17 @@ class _Stage:
     outputs: Array
 
 
+def usual_steps(inputs: int) -> int:
+    """M for a problem of so many inputs."""
+    return max(INPUTS_PER_STAGE // inputs, 1)
+
+
 def multistage(problem: Problem, *, steps_per_stage: int | None = None) -> Multistage:
     """Build the structured QP of a constrained problem.
 
     Args:
         problem: a problem with bounds.
-        steps_per_stage: M; None for as many as make `INPUTS_PER_STAGE`.  The first stage has no state among its
+        steps_per_stage: M; None for `usual_steps`.  The first stage has no state among its
             variables and, where M > 1, takes as many more steps as there is room for in blocks of the others' size; the
             last stage takes what is left.
 
@@ -107,7 +112,7 @@ def multistage(problem: Problem, *, steps_per_stage: int | None = None) -> Multi
     bounds = require_bounds(problem)
     model, N = problem.model, problem.horizon
     n, nu = model.n, model.nu
-    steps = max(INPUTS_PER_STAGE // nu, 1) if steps_per_stage is None else steps_per_stage
+    steps = usual_steps(nu) if steps_per_stage is None else steps_per_stage
     lengths = _stage_lengths(N, steps, more_at_first=n // nu)
     built = {length: _stage(prediction(model, length), problem.objective, bounds, length) for length in set(lengths)}
     stages = [built[length] for length in lengths]

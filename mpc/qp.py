@@ -53,19 +53,19 @@ class QP:
 
 @dataclass(frozen=True, kw_only=True)
 class Solution:
-    """What a back end answers; arrays are its own copies.
+    """What a back end answers, or a shortcut; arrays are no back end's own, and not to be written to.
 
     Attributes:
         x: primal point.
         y: multipliers of A x = b.
         z: multipliers of h_l <= G x <= h_u, positive at the upper side, negative at the lower.
         z_box: multipliers of x_l <= x <= x_u, signed likewise.
-        status: `solved`, or the back end's name for what went wrong.
+        status: `solved`, or the back end's name for what went wrong; of a shortcut, see `mpc.shortcut`.
         iterations: of the back end.
         active: inequality rows and box entries active at the point.
         primal_residual: as the back end reports it; NaN where it reports none.
         dual_residual: likewise.
-        solve_s: wall time inside the back end, updates included [s].
+        solve_s: wall time inside the back end, updates included, and what shortcuts took before it [s].
     """
 
     x: Array

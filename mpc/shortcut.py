@@ -16,7 +16,7 @@ from mpc.qp import Solution
 from mpc.solvers import Answer, QPSolver, Solver, Way
 from mpc.unconstrained import sequence_gains
 from quadsim.controller import ACCEPTED, SOLVED, UNCONSTRAINED
-from quadsim.state import Array
+from quadsim.state import Array, read_only
 
 LARGEST_MAP: Final = 2**20
 """Entries beyond which there is no shortcut: 8 MiB, as much as a core's caches hold.  50 steps of the paper's problem
@@ -54,10 +54,10 @@ class Shortcut:
         self._bounds, self._u_bar = bounds, problem.model.u_bar
         self._slews = np.empty((N, problem.model.nu))
         self._unbound = Solution(
-            x=np.zeros(N * problem.model.nu),
-            y=np.zeros(0),
-            z=np.zeros(N * (bounds.y_min.size + bounds.slewing.size)),
-            z_box=np.zeros(N * problem.model.nu),
+            x=read_only(np.zeros(N * problem.model.nu)),
+            y=read_only(np.zeros(0)),
+            z=read_only(np.zeros(N * (bounds.y_min.size + bounds.slewing.size))),
+            z_box=read_only(np.zeros(N * problem.model.nu)),
             status=UNCONSTRAINED,
             iterations=0,
             active=0,

@@ -46,7 +46,7 @@ class Contender:
         step_ms: (K,) whole controller step per period, the best of the repeats [ms].
         raw_max_ms: the longest of all steps of all repeats, the machine's stalls included [ms].
         statuses: periods by what they were answered.
-        ways: periods by how their optimum was found.
+        ways: periods by how their optimum was found, or last looked for.
         failures: periods without an optimum.
         input_error: largest error of the first input over the periods answered [rad/s]; None without any.
         kkt: worst KKT residual of what it answered; None without any.

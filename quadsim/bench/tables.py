@@ -177,7 +177,7 @@ def _stages(what: str, stages: Sequence[StageLength]) -> Grid:
         cells = line(str(stage.variables), f"{stage.p50:.3g}", f"{stage.p99:.3g}", f"{stage.p50 / default.p50:.2f}")
         lines.append((Cell(text=label, mark=mark), *cells))
     return Grid(
-        key="stages",
+        key=f"stages-{what.replace(' ', '-')}",
         title=f"How many steps make a stage: the {what}",
         head=("steps per stage", "variables", "p50 [ms]", "p99 [ms]", "p50, as a ratio to the default"),
         lines=tuple(lines),

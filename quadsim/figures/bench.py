@@ -80,7 +80,7 @@ def _draw_times(axes: Axes, bench: SolverBench) -> None:
 
 def _draw_growth(axes: Axes, bench: SolverBench) -> None:
     for growth in bench.growth:
-        if not growth.whole:  # far below all others, and growing no faster than they do
+        if not growth.whole:  # shorter at every horizon
             continue
         colour, dashes = _look(bench, growth.name)
         own = growth.name == bench.default.name
@@ -95,7 +95,7 @@ def _draw_growth(axes: Axes, bench: SolverBench) -> None:
             label=growth.name,
             zorder=3 if own else 2,
         )
-    horizons = bench.growth[0].horizons
+    horizons = sorted({N for growth in bench.growth for N in growth.horizons})
     axes.axhline(bench.deadline_ms, color=BOUND, linestyle="--", linewidth=1.1)
     axes.set_xscale("log")
     axes.set_yscale("log")

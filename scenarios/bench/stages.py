@@ -9,7 +9,7 @@ import numpy as np
 
 from mpc.axes import Axis, bounded_axes
 from mpc.condensed import condensed
-from mpc.multistage import INPUTS_PER_STAGE, multistage
+from mpc.multistage import multistage, usual_steps
 from mpc.problem import Problem
 from mpc.qp import Backend, Formulation, Vectors
 from mpc.solvers.piqp_dense import PiqpDense
@@ -81,7 +81,7 @@ def _time(
     progress: Progress,
 ) -> tuple[StageLength, ...]:
     """The QP condensed and cut into stages of M steps, on the periods whose QP has active constraints."""
-    default = max(INPUTS_PER_STAGE // problem.model.nu, 1)
+    default = usual_steps(problem.model.nu)
     entrants: dict[int | None, _QPEntrant] = {None: _QPEntrant(condensed(problem), PiqpDense(), query)}
     for length in sorted({*STEPS_TRIED, default}):
         entrants[length] = _QPEntrant(multistage(problem, steps_per_stage=length), PiqpMultistage(), query)

@@ -45,7 +45,7 @@ def test_rotors_of_different_weight_tie_the_axes() -> None:
     assert names(whole) == set()
 
 
-@pytest.mark.parametrize("tie", ["A", "Q_y", "C_c"])
+@pytest.mark.parametrize("tie", ["A", "Q_y", "C_r", "C_c", "two rows of C_c"])
 def test_whatever_ties_two_states_ties_their_axes(tie: str) -> None:
     problem = paper_problem()
     assert problem.bounds is not None
@@ -58,9 +58,16 @@ def test_whatever_ties_two_states_ties_their_axes(tie: str) -> None:
         Q_y = problem.objective.Q_y.copy()
         Q_y[0, 1] = Q_y[1, 0] = 1e-3
         problem = replace(problem, objective=replace(problem.objective, Q_y=Q_y))
+    elif tie == "C_r":  # rows whose product with the weights is the identity all the same
+        C_r, Q_y = problem.objective.C_r.copy(), problem.objective.Q_y.copy()
+        C_r[0, [x, y]] = 1.0
+        Q_y[:2, :2] = [[1.0, -1.0], [-1.0, 2.0]]
+        problem = replace(problem, objective=replace(problem.objective, C_r=C_r, Q_y=Q_y))
     else:
         C_c = problem.bounds.C_c.copy()
         C_c[0, [roll, pitch]] = 1.0
+        if tie != "C_c":  # roll + pitch and roll - pitch, whose product is diagonal all the same
+            C_c[1, [roll, pitch]] = [1.0, -1.0]
         problem = replace(problem, bounds=replace(problem.bounds, C_c=C_c))
     together = tuple(name for name in STATE_NAMES if name not in ("z", "vz", "yaw", "yaw_rate"))
     assert names(problem) == {together}
@@ -75,6 +82,9 @@ def test_an_axis_that_nothing_moves_or_that_nothing_is_asked_of_gives_none() -> 
     B = problem.model.B.copy()
     B[[STATE_NAMES.index(name) for name in ("y", "vy", "roll", "roll_rate")]] = 0.0
     assert bounded_axes(replace(problem, model=replace(problem.model, B=B))) == []
+    assert problem.bounds is not None
+    on_nothing = replace(problem.bounds, C_c=problem.bounds.C_c * [[0.0], [1.0]])
+    assert bounded_axes(replace(problem, bounds=on_nothing)) == []
     indifferent = paper_problem("paper-constrained", "controller.output_weights={x=1.0, z=1.0, yaw=1.0}")
     assert bounded_axes(indifferent) == []
 
@@ -90,7 +100,7 @@ def cost(problem: Problem, state: Array, desired: Array, moves: Array) -> float:
 
 
 def test_costs_and_outputs_fall_apart() -> None:
-    """Whatever the inputs of an axis, they change its own cost and outputs, and nobody else's."""
+    """Whatever the inputs of an axis, they change its own cost, states and outputs, and nobody else's."""
     rng = np.random.default_rng(3)
     problem = random_axes(rng, horizon=5, room=1.0)
     assert problem.bounds is not None
@@ -102,5 +112,7 @@ def test_costs_and_outputs_fall_apart() -> None:
         w, change = moves @ axis.S.T, rng.normal(size=(5, axis.T.shape[1]))
         whole = cost(problem, state, desired, moves + change @ axis.T.T) - cost(problem, state, desired, moves)
         assert cost(*own, w + change) - cost(*own, w) == pytest.approx(whole, rel=1e-9)
-        for i, move in enumerate(moves):
-            assert problem.model.B[axis.states] @ move == pytest.approx(axis.problem.model.B @ w[i], abs=1e-9)
+        others = np.setdiff1d(np.arange(7), axis.states)
+        np.testing.assert_allclose(problem.model.B[others] @ axis.T, 0.0, atol=1e-12)
+        np.testing.assert_allclose(problem.model.B[axis.states] @ moves.T, axis.problem.model.B @ w.T, atol=1e-9)
+        assert not problem.bounds.C_c[np.ix_(axis.outputs, others)].any()

