@@ -11,7 +11,7 @@ from mpc.prediction import rollout
 from mpc.problem import Problem
 from mpc.qp import Solution
 from mpc.shortcut import with_shortcut
-from mpc.solvers import Answer, Solver
+from mpc.solvers import Answer, Solver, Way
 from quadsim.controller import ACCEPTED, GROUNDED, Command, Moment, Phase, stopped
 from quadsim.errors import PlanExhaustedError
 from quadsim.state import Array
@@ -73,7 +73,8 @@ class ConstrainedMPC:
         if now.phase in GROUNDED:
             return self._stop(now.phase)
         desired = self.problem.objective.desired(reference)
-        return self._follow(now.time, self._solver.solve(state, desired, self._before))
+        answer = self._solver.solve(state, desired, self._before)
+        return self._take(answer) if answer.way is Way.FREE else self._follow(now.time, answer)
 
     def predict(self, states: Array, plans: Array) -> Array:
         """See `quadsim.controller.Controller.predict`."""
@@ -83,6 +84,12 @@ class ConstrainedMPC:
         lower, _ = self._reach()
         self._before, self._plan, self._held = lower, None, 0
         return stopped(lower.copy(), self.horizon, phase)
+
+    def _take(self, answer: Answer) -> Command:
+        """The first action of a free optimum, which is within every bound or it would not be one."""
+        self._plan, self._held, self._before = answer.plan, 0, answer.plan[0]
+        solution = answer.solution
+        return Command(speeds=answer.plan[0].copy(), plan=answer.plan, status=solution.status, solve_s=solution.solve_s)
 
     def _follow(self, time: float, answer: Answer) -> Command:
         lower, upper = self._reach()

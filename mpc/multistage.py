@@ -12,6 +12,7 @@ matrices are block banded, which a multistage factorisation exploits: its cost g
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Final
 
@@ -26,9 +27,9 @@ from mpc.problem import Bounds, Objective, Problem
 from mpc.qp import QP, Vectors
 from quadsim.state import Array
 
-INPUTS_PER_STAGE: Final = 20
-"""M times the number of inputs.  Of stages of 1 to 25 steps, five of four rotors are the fastest for the paper's case,
-twenty of one axis by itself about the fastest; see docs/performance.md."""
+STEPS_OF_ONE_INPUT: Final = 10
+"""M for one input; for more it falls with the root of their number.  Of stages of 1 to 25 steps, the resulting five of
+four rotors are the fastest for the paper's case, ten of one axis by itself nearly so; see docs/performance.md."""
 SLEWS_BOUND_AT_ONCE: Final = 32
 """Steps from the start of the plan whose slews may well bind.  Later ones never did in the paper's flight, whatever its
 tilt bound and its horizon up to 200, and with 50 steps a QP without them is solved an eighth sooner."""
@@ -94,7 +95,7 @@ class _Stage:
 
 def usual_steps(inputs: int) -> int:
     """M for a problem of so many inputs."""
-    return max(INPUTS_PER_STAGE // inputs, 1)
+    return max(round(STEPS_OF_ONE_INPUT / math.sqrt(inputs)), 1)
 
 
 def multistage(problem: Problem, *, steps_per_stage: int | None = None) -> Multistage:

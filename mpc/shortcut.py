@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time as clock
 from dataclasses import replace
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 
@@ -15,7 +15,7 @@ from mpc.problem import Problem
 from mpc.qp import Solution
 from mpc.solvers import Answer, QPSolver, Solver, Way
 from mpc.unconstrained import sequence_gains
-from quadsim.controller import ACCEPTED, SOLVED, UNCONSTRAINED
+from quadsim.controller import SOLVED, UNCONSTRAINED
 from quadsim.state import Array, read_only
 
 LARGEST_MAP: Final = 2**20
@@ -24,8 +24,6 @@ have 64 k entries, 200 steps 970 k."""
 ROUNDING: Final = 1e-2
 """Error of L_N u_bar [rad/s], whose value is known, beyond which rounding is taken to have spoilt the gains.  That of
 K_N xi(k), on deviations and not on the whole speed, is a hundredth of it."""
-NOT_TRIED: Final = "not_tried"
-"""Status of an attempt that was none."""
 
 
 class Shortcut:
@@ -47,24 +45,14 @@ class Shortcut:
     """
 
     def __init__(self, problem: Problem, whole: Solver) -> None:
-        bounds, N = require_bounds(problem), problem.horizon
+        bounds, N, nu = require_bounds(problem), problem.horizon, problem.model.nu
         self._free = _FreeOptimum(problem)
         self._axes = [_AxisSolver(axis, whole.name) for axis in bounded_axes(problem)]
         self._whole = whole
         self._bounds, self._u_bar = bounds, problem.model.u_bar
-        self._slews = np.empty((N, problem.model.nu))
-        self._unbound = Solution(
-            x=read_only(np.zeros(N * problem.model.nu)),
-            y=read_only(np.zeros(0)),
-            z=read_only(np.zeros(N * (bounds.y_min.size + bounds.slewing.size))),
-            z_box=read_only(np.zeros(N * problem.model.nu)),
-            status=UNCONSTRAINED,
-            iterations=0,
-            active=0,
-            primal_residual=0.0,
-            dual_residual=0.0,
-            solve_s=0.0,
-        )
+        self._slews = np.empty((N, nu))
+        self._y, self._z_box = read_only(np.zeros(0)), read_only(np.zeros(N * nu))
+        self._z = read_only(np.zeros(N * (bounds.y_min.size + bounds.slewing.size)))
 
     @property
     def name(self) -> str:
@@ -74,43 +62,48 @@ class Shortcut:
     def solve(self, state: Array, desired: Array, u_before: Array) -> Answer:
         """See `mpc.solvers.Solver.solve`."""
         started = clock.perf_counter()
-        tried = self._by_output_bounds(state, desired)
-        found = tried.solution.status in ACCEPTED and self._inputs_within_bounds(tried.plan, u_before)
-        tried_s = clock.perf_counter() - started
-        if found:
-            return replace(tried, solution=replace(tried.solution, x=tried.plan.ravel(), solve_s=tried_s))
+        plan, outputs = self._free.at(state, desired)
+        staying = (self._bounds.y_min <= outputs) & (outputs <= self._bounds.y_max)
+        way, found, z = Way.FREE, True, self._z
+        parts: list[Solution] = []
+        if not staying.all():
+            way = Way.AXES
+            plan, parts, z = self._by_axes(plan, np.all(staying, axis=0), state, desired)
+            found = bool(parts) and all(part.status == SOLVED for part in parts)
+        if found and self._inputs_within_bounds(plan, u_before):
+            return Answer(plan=plan, solution=self._joined(plan, parts, z, started), way=way)
+        tried_s, tried = clock.perf_counter() - started, sum(part.iterations for part in parts)
         answer = self._whole.solve(state, desired, u_before)
-        iterations = tried.solution.iterations + answer.solution.iterations
-        solve_s = tried_s + answer.solution.solve_s
+        iterations, solve_s = answer.solution.iterations + tried, answer.solution.solve_s + tried_s
         return replace(answer, solution=replace(answer.solution, iterations=iterations, solve_s=solve_s))
 
-    def _by_output_bounds(self, state: Array, desired: Array) -> Answer:
-        """The optimum without bounds on inputs, as a solution of the condensed QP."""
-        plan, outputs = self._free.at(state, desired)
-        bounds, N = self._bounds, len(outputs)
-        staying = np.all((bounds.y_min <= outputs) & (outputs <= bounds.y_max), axis=0)
-        if staying.all():
-            return Answer(plan=plan, solution=self._unbound, way=Way.FREE)
-        leaving = [solver for solver in self._axes if not staying[solver.axis.outputs].all()]
-        if not leaving:  # all of one piece
-            return Answer(plan=plan, solution=replace(self._unbound, status=NOT_TRIED))
-        z, parts = np.zeros_like(self._unbound.z), []
-        multipliers = z[: outputs.size].reshape(outputs.shape)
-        for solver in leaving:
-            axis, answer = solver.axis, solver.solve(state, desired)
-            plan = plan + (answer.plan - (plan - self._u_bar) @ axis.S.T) @ axis.T.T
-            multipliers[:, axis.outputs] = answer.solution.z[: N * axis.outputs.size].reshape(N, -1)
-            parts.append(answer.solution)
-        solution = replace(
-            self._unbound,
+    def _by_axes(self, free: Array, staying: Any, state: Array, desired: Array) -> tuple[Array, list[Solution], Array]:
+        """The free plan with the axes replaced whose outputs do not stay in bounds, their answers, the multipliers."""
+        plan, parts, z = free, [], np.zeros_like(self._z)
+        multipliers = z[: len(plan) * staying.size].reshape(-1, staying.size)
+        for solver in self._axes:
+            axis = solver.axis
+            if not staying[axis.outputs].all():
+                answer = solver.solve(state, desired)
+                plan = plan + (answer.plan - (plan - self._u_bar) @ axis.S.T) @ axis.T.T
+                multipliers[:, axis.outputs] = answer.solution.z[: len(plan) * axis.outputs.size].reshape(len(plan), -1)
+                parts.append(answer.solution)
+        return plan, parts, z
+
+    def _joined(self, plan: Array, parts: list[Solution], z: Array, started: float) -> Solution:
+        """The solution of the condensed QP whose axes' are these parts."""
+        return Solution(
+            x=plan.ravel(),
+            y=self._y,
             z=z,
-            status=next((part.status for part in parts if part.status != SOLVED), SOLVED),
+            z_box=self._z_box,
+            status=SOLVED if parts else UNCONSTRAINED,
             iterations=sum(part.iterations for part in parts),
             active=sum(part.active for part in parts),
-            primal_residual=float(np.max([part.primal_residual for part in parts])),  # NaN stays NaN
-            dual_residual=float(np.max([part.dual_residual for part in parts])),
+            primal_residual=max((part.primal_residual for part in parts), default=0.0),
+            dual_residual=max((part.dual_residual for part in parts), default=0.0),
+            solve_s=clock.perf_counter() - started,
         )
-        return Answer(plan=plan, solution=solution, way=Way.AXES)
 
     def _inputs_within_bounds(self, plan: Array, u_before: Array) -> bool:
         bounds = self._bounds

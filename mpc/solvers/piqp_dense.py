@@ -13,7 +13,7 @@ class PiqpDense:
 
     def __init__(self) -> None:
         self._solver = piqp.DenseSolver()
-        _piqp.configure(self._solver)
+        _piqp.configure(self._solver, gap=_piqp.GAP)
 
     def setup(self, qp: QP) -> None:
         """See `mpc.qp.Backend.setup`."""

@@ -46,6 +46,6 @@ class PiqpMultistage:
 def _multistage_solver(qp: QP) -> Any:
     solver = piqp.SparseSolver()
     solver.settings.kkt_solver = piqp.KKTSolver.sparse_multistage
-    _piqp.configure(solver)
+    _piqp.configure(solver, gap=_piqp.GAP)
     _piqp.setup(solver, qp)
     return solver
