@@ -7,6 +7,7 @@ import multiprocessing
 import os
 import pickle
 import signal
+import sys
 import time as clock
 from collections import Counter, deque
 from collections.abc import Generator, Iterator, Sequence
@@ -15,6 +16,7 @@ from multiprocessing import connection, resource_tracker
 from multiprocessing.connection import Connection
 from multiprocessing.context import ForkServerProcess
 from pathlib import Path
+from types import ModuleType
 from typing import Final
 
 from quadsim.campaign.table import Row
@@ -25,6 +27,8 @@ from scenarios.runner import usable_cores
 
 _AHEAD_S: Final = 1.0
 """Work [s] that a worker has in hand before it gets more: the parent may be writing files meanwhile."""
+_SETTLED: Final = "scenarios.campaign.preload"
+"""To be loaded by the server that forks the workers, and by no other process."""
 _MOST_STARTS: Final = 5
 _UNKNOWN: Final = 255
 """The exit code of a process whose server died, which would have told."""
@@ -98,7 +102,7 @@ class _Crew:
         self._failed_starts = 0
         self._pace = Pace()
         self._context = multiprocessing.get_context("forkserver")
-        self._context.set_forkserver_preload([__name__, type(pilot).__module__])
+        self._context.set_forkserver_preload([__name__, type(pilot).__module__, _SETTLED])
 
     def answers(self) -> Generator[Row]:
         self._employ()
@@ -205,14 +209,20 @@ class _Crew:
 
 @contextlib.contextmanager
 def _undisturbed() -> Iterator[None]:
-    """What is started here keeps linear algebra to one thread, and never sees Ctrl-C, which waits here meanwhile."""
+    """What is started here keeps linear algebra to one thread, and never sees Ctrl-C, which waits here meanwhile.
+
+    Nor does it run the parent's script again, as multiprocessing's children do, which takes longer than all the rest:
+    nothing that a worker is handed belongs to that.
+    """
     before = {name: os.environ.get(name) for name in _ONE_THREAD}
     resource_tracker.ensure_running()  # it lets signals through when it starts
     mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     os.environ.update(_ONE_THREAD)
+    script, sys.modules["__main__"] = sys.modules["__main__"], ModuleType("__main__")
     try:
         yield
     finally:
+        sys.modules["__main__"] = script
         for name, value in before.items():
             if value is None:
                 del os.environ[name]

@@ -150,6 +150,39 @@ def test_workers_seldom_look_for_cycles() -> None:
     assert gc.get_threshold() != (100_000, 50, 100)
 
 
+class _Settled(ToyPilot):
+    def fly(self, flight: int) -> Row:
+        return super().fly(flight) | {"settled": "scenarios.campaign.preload" in sys.modules}
+
+
+def test_the_server_of_workers_and_not_their_parent_has_settled() -> None:
+    assert all(row["settled"] for row in fly(_Settled()))
+    assert "scenarios.campaign.preload" not in sys.modules
+
+
+def test_a_script_is_not_run_again_by_its_workers(tmp_path: Path) -> None:
+    """So that it needs no guard against that."""
+    script = tmp_path / "script.py"
+    script.write_text(
+        "from campaign_pilots import ToyPilot\n"
+        "from scenarios.campaign.local import LocalEngine\n"
+        "print('run')\n"
+        "print(len(list(LocalEngine(2).answers(ToyPilot(), range(6)))))\n"
+        "import sys\n"
+        "print(sys.modules['__main__'].__file__)\n"
+    )
+    places = os.pathsep.join([str(ROOT), str(ROOT / "tests"), str(Path(__file__).parent)])
+    ran = subprocess.run(
+        [sys.executable, str(script)],
+        env={**os.environ, "PYTHONPATH": places},
+        capture_output=True,
+        text=True,
+        check=True,
+        timeout=60.0,
+    )
+    assert ran.stdout.split() == ["run", "6", str(script)]
+
+
 class _Unwelcome(ToyPilot):
     def __setstate__(self, state: object) -> None:
         raise RuntimeError("not here")
