@@ -28,6 +28,7 @@ ROOT = Path(__file__).resolve().parents[3]
 FLIGHTS = range(40)
 ALL = [value_of(flight) for flight in FLIGHTS]
 PARENT = """
+import signal
 import sys
 import time as clock
 from pathlib import Path
@@ -35,6 +36,7 @@ from campaign_pilots import ToyPilot
 from scenarios.campaign.local import LocalEngine
 
 if __name__ == "__main__":
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs inherit that it is ignored
     pilot = ToyPilot(seconds=float(sys.argv[2]), asleep=float(sys.argv[3]), diary=Path(sys.argv[1]))
     try:
         for _ in LocalEngine(2).answers(pilot, range(1000)):
