@@ -9,7 +9,7 @@ components of the states under
 the last for what it costs to move two states at once, and for each axis g inputs w_g with T_g spanning Q_u^-1 B_g'.
 Then u = u_bar + sum T_g w_g, each w_g moves its own axis alone since B_h T_g = 0, and the cost falls apart since
 T_g' Q_u T_h = 0: without bounds on inputs the problem is one small problem per axis.  What of u lies in none of the T_g
-moves nothing, and is zero at the optimum.
+moves nothing, and is u_bar's at the optimum.
 """
 
 from __future__ import annotations
@@ -34,15 +34,14 @@ ROUNDING: Final = 1e-12
 
 @dataclass(frozen=True, kw_only=True)
 class Axis:
-    """One axis whose outputs have bounds, as a problem of its own.
+    """One axis, as a problem of its own.
 
     Attributes:
-        problem: in w (N, m), with the axis's output bounds and no others; its u_bar is zero.
+        problem: in w (N, m), with the axis's output bounds, if any, and no others; its u_bar is zero.
         states: (n_g,) its states among those of the whole.
         regulated: its rows of C_r.
-        outputs: its rows of C_c.
+        outputs: its rows of C_c that have a bound.
         T: (nu, m) the axis's part of u - u_bar is T w; columns of unit length.
-        S: (m, nu) w = S (u - u_bar), of all axes together.
     """
 
     problem: Problem
@@ -50,14 +49,13 @@ class Axis:
     regulated: Indices
     outputs: Indices
     T: Array
-    S: Array
 
 
-def bounded_axes(problem: Problem) -> list[Axis]:
-    """The axes whose outputs have bounds.
+def axes(problem: Problem) -> list[Axis]:
+    """The axes of a problem, which together are all of it but its bounds on inputs.
 
-    None where the problem is all of one piece, or where nothing moves such an axis or asks anything of it, or where a
-    bound is on nothing.
+    Pieces that nothing moves or asks anything of are left out: they want u_bar.  Where such a piece has a bound, or a
+    bound or a row of C_r is on nothing, or the problem is all of one piece, the one axis is the whole problem.
 
     Raises:
         ValueError: the problem has no bounds.
@@ -71,25 +69,23 @@ def bounded_axes(problem: Problem) -> list[Axis]:
     tied |= np.abs(reach.T @ reach) > ROUNDING
     count, label = connected_components(csr_matrix(tied), directed=False)
     bounded = np.isfinite(bounds.y_min) | np.isfinite(bounds.y_max)
-    if count == 1 or not C_c[bounded].any(axis=1).all():
-        return []
-    axes = []
-    for g in range(count):
-        states = np.flatnonzero(label == g)
-        outputs = np.flatnonzero(bounded & bounds.C_c[:, states].any(axis=1))
-        if not outputs.size:
-            continue
-        directions, sizes, _ = np.linalg.svd(reach[:, states], full_matrices=False)
-        T = _normalised(np.linalg.solve(root.T, directions[:, sizes > ROUNDING]))
-        regulated = np.flatnonzero(objective.C_r[:, states].any(axis=1))
-        if not T.size or not regulated.size:
-            return []
-        axes.append(_axis(problem, bounds, T, states=states, regulated=regulated, outputs=outputs))
-    return axes
+    whole = _axis(problem, np.eye(model.nu), np.arange(model.n), np.arange(len(C_r)), np.flatnonzero(bounded))
+    if count == 1 or not (C_r.any(axis=1).all() and C_c[bounded].any(axis=1).all()):
+        return [whole]
+    found = []
+    for states in (np.flatnonzero(label == g) for g in range(count)):
+        regulated, outputs = C_r[:, states].any(axis=1), bounded & C_c[:, states].any(axis=1)
+        if reach[:, states].any() and regulated.any():
+            directions, sizes, _ = np.linalg.svd(reach[:, states], full_matrices=False)
+            T = _normalised(np.linalg.solve(root.T, directions[:, sizes > ROUNDING]))
+            found.append(_axis(problem, T, states, np.flatnonzero(regulated), np.flatnonzero(outputs)))
+        elif outputs.any():
+            return [whole]
+    return found
 
 
-def _axis(problem: Problem, bounds: Bounds, T: Array, *, states: Indices, regulated: Indices, outputs: Indices) -> Axis:
-    model, objective = problem.model, problem.objective
+def _axis(problem: Problem, T: Array, states: Indices, regulated: Indices, outputs: Indices) -> Axis:
+    model, objective, bounds = problem.model, problem.objective, require_bounds(problem)
     weight: Array = T.T @ objective.Q_u @ T
     free = np.full(T.shape[1], np.inf)
     return Axis(
@@ -120,7 +116,6 @@ def _axis(problem: Problem, bounds: Bounds, T: Array, *, states: Indices, regula
         regulated=regulated,
         outputs=outputs,
         T=T,
-        S=np.asarray(np.linalg.solve(weight, T.T @ objective.Q_u), dtype=np.float64),
     )
 
 

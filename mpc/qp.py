@@ -63,7 +63,7 @@ class Solution:
         status: `solved`, or the back end's name for what went wrong; of a shortcut, see `mpc.shortcut`.
         iterations: of the back end.
         active: inequality rows and box entries active at the point.
-        primal_residual: as the back end reports it; NaN where it reports none.
+        primal_residual: as the back end reports it, before any polish; NaN where it reports none.
         dual_residual: likewise.
         solve_s: wall time inside the back end, updates included, and what shortcuts took before it [s].
     """

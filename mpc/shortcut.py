@@ -3,27 +3,28 @@
 from __future__ import annotations
 
 import time as clock
+from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any, Final
+from typing import Final, NamedTuple
 
 import numpy as np
 
-from mpc.axes import Axis, bounded_axes
-from mpc.condensed import require_bounds
-from mpc.prediction import prediction
+from mpc.axes import Axis, Indices, axes
+from mpc.condensed import condensed, require_bounds
+from mpc.free import FreeOptimum
+from mpc.polish import RowPolish
 from mpc.problem import Problem
 from mpc.qp import Solution
 from mpc.solvers import Answer, QPSolver, Solver, Way
-from mpc.unconstrained import sequence_gains
 from quadsim.controller import SOLVED, UNCONSTRAINED
 from quadsim.state import Array, read_only
 
 LARGEST_MAP: Final = 2**20
 """Entries beyond which there is no shortcut: 8 MiB, as much as a core's caches hold.  50 steps of the paper's problem
-have 64 k entries, 200 steps 970 k."""
-ROUNDING: Final = 1e-2
-"""Error of L_N u_bar [rad/s], whose value is known, beyond which rounding is taken to have spoilt the gains.  That of
-K_N xi(k), on deviations and not on the whole speed, is a hundredth of it."""
+have 16 k entries, 400 steps 970 k."""
+NEAR: Final = 0.1
+"""How far outside its bounds an input may be [rad/s] before its axis's answer is polished: by far more than answers are
+off, since what is not worth polishing is left to the whole QP."""
 
 
 class Shortcut:
@@ -32,8 +33,9 @@ class Shortcut:
     The cost is strictly convex: the minimiser over fewer constraints, if it satisfies the others too, is the one and
     only solution of Eq. (27).  In turn,
 
-    1. no constraint at all: Eq. (22), a product; the status is then `unconstrained`;
-    2. output bounds alone: a small QP for each axis whose outputs leave theirs; see `mpc.axes`;
+    1. no constraint at all: Eq. (22), a product for each axis of `mpc.axes`; the status is then `unconstrained`;
+    2. output bounds alone: a small QP for each axis whose outputs leave theirs, its answer polished, so that it is
+       exact whatever the solver's tolerances; where there is one axis only, the whole, this is left out;
     3. the whole QP.
 
     Args:
@@ -46,11 +48,23 @@ class Shortcut:
 
     def __init__(self, problem: Problem, whole: Solver) -> None:
         bounds, N, nu = require_bounds(problem), problem.horizon, problem.model.nu
-        self._free = _FreeOptimum(problem)
-        self._axes = [_AxisSolver(axis, whole.name) for axis in bounded_axes(problem)]
+        parts = axes(problem)
+        self._free = FreeOptimum(problem, parts)
+        places = zip(parts, self._free.inputs, self._free.outputs, strict=True)
+        self._axes = [
+            _BoundedAxis(axis, whole.name, inputs=inputs, outputs=outputs)
+            for axis, inputs, outputs in places
+            if len(parts) > 1 and axis.outputs.size
+        ]
         self._whole = whole
-        self._bounds, self._u_bar = bounds, problem.model.u_bar
-        self._slews = np.empty((N, nu))
+        lower = np.stack([bounds.u_min, bounds.delta_min])[:, None]
+        upper = np.stack([bounds.u_max, bounds.delta_max])[:, None]
+        self._bounds, self._nearly = (lower, upper), (lower - NEAR, upper + NEAR)
+        self._inputs = np.empty((2, N, nu))
+        self._outputs = bounds.y_min.size
+        self._T, self._u_bar = np.ascontiguousarray(np.hstack([axis.T for axis in parts]).T), problem.model.u_bar
+        rows = np.concatenate([axis.outputs for axis in parts])
+        self._y_min, self._y_max = bounds.y_min[rows, None], bounds.y_max[rows, None]
         self._y, self._z_box = read_only(np.zeros(0)), read_only(np.zeros(N * nu))
         self._z = read_only(np.zeros(N * (bounds.y_min.size + bounds.slewing.size)))
 
@@ -62,100 +76,120 @@ class Shortcut:
     def solve(self, state: Array, desired: Array, u_before: Array) -> Answer:
         """See `mpc.solvers.Solver.solve`."""
         started = clock.perf_counter()
-        plan, outputs = self._free.at(state, desired)
-        staying = (self._bounds.y_min <= outputs) & (outputs <= self._bounds.y_max)
-        way, found, z = Way.FREE, True, self._z
-        parts: list[Solution] = []
-        if not staying.all():
-            way = Way.AXES
-            plan, parts, z = self._by_axes(plan, np.all(staying, axis=0), state, desired)
-            found = bool(parts) and all(part.status == SOLVED for part in parts)
-        if found and self._inputs_within_bounds(plan, u_before):
-            return Answer(plan=plan, solution=self._joined(plan, parts, z, started), way=way)
-        tried_s, tried = clock.perf_counter() - started, sum(part.iterations for part in parts)
+        w, y = self._free.at(state, desired)
+        staying = np.all((self._y_min <= y) & (y <= self._y_max), axis=1)
+        leaving = [axis for axis in self._axes if not staying[axis.outputs].all()]
+        parts = [axis.solve(state, desired) for axis in leaving]
+        if staying.all() or self._near(w, leaving, parts, u_before):
+            held = [axis.polished(part, w, y) for axis, part in zip(leaving, parts, strict=True)]
+            plan = self._plan(w, held)
+            if self._inputs_within(self._bounds, plan, u_before):
+                way = Way.AXES if parts else Way.FREE
+                return Answer(plan=plan, solution=self._joined(plan, held, parts, started), way=way)
+        tried_s, tried = clock.perf_counter() - started, sum(part.solution.iterations for part in parts)
         answer = self._whole.solve(state, desired, u_before)
         iterations, solve_s = answer.solution.iterations + tried, answer.solution.solve_s + tried_s
         return replace(answer, solution=replace(answer.solution, iterations=iterations, solve_s=solve_s))
 
-    def _by_axes(self, free: Array, staying: Any, state: Array, desired: Array) -> tuple[Array, list[Solution], Array]:
-        """The free plan with the axes replaced whose outputs do not stay in bounds, their answers, the multipliers."""
-        plan, parts, z = free, [], np.zeros_like(self._z)
-        multipliers = z[: len(plan) * staying.size].reshape(-1, staying.size)
-        for solver in self._axes:
-            axis = solver.axis
-            if not staying[axis.outputs].all():
-                answer = solver.solve(state, desired)
-                plan = plan + (answer.plan - (plan - self._u_bar) @ axis.S.T) @ axis.T.T
-                multipliers[:, axis.outputs] = answer.solution.z[: len(plan) * axis.outputs.size].reshape(len(plan), -1)
-                parts.append(answer.solution)
-        return plan, parts, z
+    def _near(self, w: Array, leaving: list[_BoundedAxis], parts: list[Answer], u_before: Array) -> bool:
+        """Whether the axes that leave their bounds have an answer, and together one that the inputs may well allow."""
+        if not parts or any(part.solution.status != SOLVED for part in parts):
+            return False
+        held = [axis.held(part) for axis, part in zip(leaving, parts, strict=True)]
+        return self._inputs_within(self._nearly, self._plan(w, held), u_before)
 
-    def _joined(self, plan: Array, parts: list[Solution], z: Array, started: float) -> Solution:
+    def _plan(self, w: Array, held: Sequence[_Held]) -> Array:
+        """(N, nu) of the inputs of all axes (m, N), of some as their outputs' bounds would have it."""
+        if held:
+            w = w.copy()
+            for axis in held:
+                w[axis.inputs] = axis.w
+        return np.asarray(w.T @ self._T + self._u_bar)
+
+    def _inputs_within(self, bounds: tuple[Array, Array], plan: Array, u_before: Array) -> bool:
+        """Whether all inputs and their steps are within bounds; NaN is not."""
+        lower, upper = bounds
+        inputs, steps = self._inputs
+        inputs[:] = plan
+        np.subtract(plan[0], u_before, out=steps[0])
+        np.subtract(plan[1:], plan[:-1], out=steps[1:])
+        return bool(((lower <= self._inputs) & (self._inputs <= upper)).all())
+
+    def _joined(self, plan: Array, held: list[_Held], parts: list[Answer], started: float) -> Solution:
         """The solution of the condensed QP whose axes' are these parts."""
+        z = self._z
+        if held:
+            z = np.zeros_like(z)
+            rows = z[: len(plan) * self._outputs].reshape(len(plan), -1)
+            for axis in held:
+                rows[:, axis.rows] = axis.z
         return Solution(
             x=plan.ravel(),
             y=self._y,
             z=z,
             z_box=self._z_box,
             status=SOLVED if parts else UNCONSTRAINED,
-            iterations=sum(part.iterations for part in parts),
-            active=sum(part.active for part in parts),
-            primal_residual=max((part.primal_residual for part in parts), default=0.0),
-            dual_residual=max((part.dual_residual for part in parts), default=0.0),
+            iterations=sum(part.solution.iterations for part in parts),
+            active=sum(axis.active for axis in held),
+            primal_residual=max((part.solution.primal_residual for part in parts), default=0.0),
+            dual_residual=max((part.solution.dual_residual for part in parts), default=0.0),
             solve_s=clock.perf_counter() - started,
         )
 
-    def _inputs_within_bounds(self, plan: Array, u_before: Array) -> bool:
-        bounds = self._bounds
-        np.subtract(plan[0], u_before, out=self._slews[0])
-        np.subtract(plan[1:], plan[:-1], out=self._slews[1:])
-        return _within(bounds.u_min, plan, bounds.u_max) and _within(bounds.delta_min, self._slews, bounds.delta_max)
 
+class _Held(NamedTuple):
+    """An axis held within its output bounds.
 
-class _FreeOptimum:
-    """Eq. (22), the optimal sequence without constraints, and the outputs that it leads to.
-
-    Both are affine in xi(k) and y_d,
-
-        [u_opt; y_c] = W [xi(k); y_d] + [u_bar; 0],
-
-    so that one product gives them.
+    Attributes:
+        inputs: its rows of w.
+        w: (m, N) its inputs.
+        rows: of C_c.
+        z: (N, n_c) their multipliers.
+        active: bounds active.
     """
 
-    def __init__(self, problem: Problem) -> None:
-        bounds, model, N = require_bounds(problem), problem.model, problem.horizon
-        gains, maps = sequence_gains(problem), prediction(model, N)
-        K, G, hover = gains.K, gains.G, np.tile(model.u_bar, N)
-        if not np.abs(gains.L @ model.u_bar - hover).max() < ROUNDING:
-            raise np.linalg.LinAlgError("the Hessian is too ill-conditioned")
-
-        def outputs(states: Array) -> Array:
-            return (bounds.C_c @ states.reshape(N, model.n, -1)).reshape(N * bounds.y_min.size, states.shape[1])
-
-        self._map = np.block([[K, G], [outputs(maps.Phi + maps.Psi @ K), outputs(maps.Psi @ G)]])
-        self._u_bar, self._shape = model.u_bar, (N, model.nu)
-        self._query = np.empty(self._map.shape[1])
-
-    def at(self, state: Array, desired: Array) -> tuple[Array, Array]:
-        """Inputs (N, nu) [rad/s] and outputs (N, n_c) for xi(k) (n,) and y_d (N, n_r)."""
-        self._query[: state.size] = state
-        self._query[state.size :] = desired.ravel()
-        values = self._map @ self._query
-        N, nu = self._shape
-        return values[: N * nu].reshape(N, nu) + self._u_bar, values[N * nu :].reshape(N, -1)
+    inputs: slice
+    w: Array
+    rows: Indices
+    z: Array
+    active: int
 
 
-class _AxisSolver:
-    """The QP of one axis, set up once."""
+class _BoundedAxis:
+    """The QP of one axis, set up once.
 
-    def __init__(self, axis: Axis, solver: str) -> None:
-        self.axis, self._solver = axis, QPSolver(solver, axis.problem)
+    Attributes:
+        rows: of C_c.
+        inputs, outputs: its places among those of all axes.
+    """
+
+    def __init__(self, axis: Axis, solver: str, *, inputs: slice, outputs: slice) -> None:
+        self._axis, self._solver = axis, QPSolver(solver, axis.problem)
         self._before = axis.problem.model.u_bar
+        self.rows, self.inputs, self.outputs = axis.outputs, inputs, outputs
+        qp = condensed(axis.problem).qp
+        self._polish = RowPolish(np.asarray(qp.P), np.asarray(qp.G), qp.h_l, qp.h_u)
 
     def solve(self, state: Array, desired: Array) -> Answer:
-        """The optimal w (N, m) for the whole's xi(k) (n,) and y_d (N, n_r)."""
-        axis = self.axis
+        """The optimal w (N, m) for the whole's xi(k) (n,) and y_d (N, n_r), as good as the solver's tolerances."""
+        axis = self._axis
         return self._solver.solve(state[axis.states], desired[:, axis.regulated], self._before)
+
+    def held(self, answer: Answer) -> _Held:
+        """What its solver answered."""
+        solution = answer.solution
+        z = solution.z[: len(answer.plan) * self.rows.size].reshape(len(answer.plan), -1)
+        return _Held(inputs=self.inputs, w=answer.plan.T, rows=self.rows, z=z, active=solution.active)
+
+    def polished(self, answer: Answer, w: Array, y: Array) -> _Held:
+        """The exact optimum, from an answer near it and the free optimum of all axes; where that fails, the answer."""
+        near = self.held(answer)
+        z = self._polish.multipliers(y[self.outputs].T.ravel(), near.z.ravel())
+        if z is None:
+            return near
+        plan = w[self.inputs].T - (self._polish.R @ z).reshape(answer.plan.shape)
+        active = int(np.count_nonzero(z))
+        return _Held(inputs=self.inputs, w=plan.T, rows=self.rows, z=z.reshape(near.z.shape), active=active)
 
 
 def with_shortcut(problem: Problem, whole: Solver) -> Solver:
@@ -165,17 +199,14 @@ def with_shortcut(problem: Problem, whole: Solver) -> Solver:
     entries nothing is tried.  Nor is it where the Hessian is so ill-conditioned, by a long horizon or weights far
     apart, that the gains are not exact.
     """
-    bounds, nu = require_bounds(problem), problem.model.nu
-    rows = problem.horizon * (nu + bounds.y_min.size)
-    columns = problem.model.n + problem.horizon * problem.objective.Q_y.shape[0]
-    if rows * columns > LARGEST_MAP:
+    N = problem.horizon
+    entries = sum(
+        N * (axis.T.shape[1] + axis.outputs.size) * (axis.states.size + N * axis.regulated.size)
+        for axis in axes(problem)
+    )
+    if entries > LARGEST_MAP:
         return whole
     try:
         return Shortcut(problem, whole)
     except np.linalg.LinAlgError:
         return whole
-
-
-def _within(lower: Array, values: Array, upper: Array) -> bool:
-    """Whether all values are within their bounds; NaN is not."""
-    return bool(((lower <= values) & (values <= upper)).all())

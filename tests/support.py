@@ -55,7 +55,7 @@ def random_axes(rng: np.random.Generator, *, horizon: int, room: float) -> Probl
         horizon: N.
         room: by how much bounds on inputs and their steps are wider than those of `random_problem`.
     """
-    parts = [random_problem(rng, horizon=horizon, n=n, nu=nu) for n, nu in ((3, 1), (2, 2), (2, 1))]
+    parts = [random_problem(rng, horizon=horizon, n=n, nu=nu, n_c=nu) for n, nu in ((3, 1), (2, 2), (2, 1))]
     order, mixing = rng.permutation(7), np.linalg.qr(rng.normal(size=(4, 4)))[0]
     u_bar = rng.normal(size=4)
     Q_u = mixing @ block_diag(*(part.objective.Q_u for part in parts)) @ mixing.T

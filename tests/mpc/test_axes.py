@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from support import paper_problem, random_axes, random_problem
 
-from mpc.axes import bounded_axes
+from mpc.axes import Axis, axes
 from mpc.problem import Problem
 from quadsim.state import STATE_NAMES, Array
 
@@ -16,17 +16,31 @@ QUADROTOR = {("x", "vx", "pitch", "pitch_rate"), ("y", "vy", "roll", "roll_rate"
 
 
 def names(problem: Problem) -> set[tuple[str, ...]]:
-    return {tuple(STATE_NAMES[i] for i in axis.states) for axis in bounded_axes(problem)}
+    """The states of the axes that have bounds; of none, where there is one axis only."""
+    found = axes(problem)
+    if len(found) == 1:
+        np.testing.assert_array_equal(found[0].T, np.eye(problem.model.nu))
+        np.testing.assert_array_equal(found[0].states, np.arange(problem.model.n))
+        return set()
+    return {tuple(STATE_NAMES[i] for i in axis.states) for axis in found if axis.outputs.size}
+
+
+def inverse(problem: Problem, axis: Axis) -> Array:
+    """S (m, nu) in w = S (u - u_bar), of all axes together."""
+    weighted = axis.T.T @ problem.objective.Q_u
+    return np.asarray(np.linalg.solve(weighted @ axis.T, weighted))
 
 
 @pytest.mark.parametrize("vehicle", ["lopes2011", "crazyflie2", "hummingbird"])
-def test_a_hovering_quadrotor_tilts_in_two_axes(vehicle: str) -> None:
+def test_a_hovering_quadrotor_falls_into_four_axes_and_tilts_in_two(vehicle: str) -> None:
     """Whether its arms point along its axes or between them."""
     problem = paper_problem("paper-constrained", f"vehicle.file={vehicle}")
     assert names(problem) == QUADROTOR
-    for axis in bounded_axes(problem):
-        assert axis.T.shape == (4, 1)
-        np.testing.assert_allclose(axis.S @ axis.T, np.eye(1), atol=1e-12)
+    found = axes(problem)
+    assert sorted(np.concatenate([axis.states for axis in found])) == list(range(12))
+    assert [axis.T.shape for axis in found] == [(4, 1)] * 4
+    every = np.hstack([axis.T for axis in found])
+    np.testing.assert_allclose(np.vstack([inverse(problem, axis) for axis in found]) @ every, np.eye(4), atol=1e-12)
 
 
 def test_every_axis_with_a_bound_counts() -> None:
@@ -73,20 +87,48 @@ def test_whatever_ties_two_states_ties_their_axes(tie: str) -> None:
     assert names(problem) == {together}
 
 
-def test_one_piece_has_none() -> None:
-    assert bounded_axes(random_problem(np.random.default_rng(0), horizon=4)) == []
+def test_one_piece_is_one_axis() -> None:
+    problem = random_problem(np.random.default_rng(0), horizon=4)
+    (whole,) = axes(problem)
+    assert problem.bounds is not None
+    assert whole.problem.bounds is not None
+    for ours, its in (
+        (problem.model.A, whole.problem.model.A),
+        (problem.model.B, whole.problem.model.B),
+        (problem.objective.Q_y, whole.problem.objective.Q_y),
+        (problem.objective.Q_u, whole.problem.objective.Q_u),
+        (problem.bounds.C_c, whole.problem.bounds.C_c),
+    ):
+        np.testing.assert_array_equal(ours, its)
 
 
-def test_an_axis_that_nothing_moves_or_that_nothing_is_asked_of_gives_none() -> None:
+def test_a_bounded_axis_that_nothing_moves_or_that_nothing_is_asked_of_leaves_one_piece() -> None:
     problem = paper_problem()
     B = problem.model.B.copy()
     B[[STATE_NAMES.index(name) for name in ("y", "vy", "roll", "roll_rate")]] = 0.0
-    assert bounded_axes(replace(problem, model=replace(problem.model, B=B))) == []
+    assert names(replace(problem, model=replace(problem.model, B=B))) == set()
     assert problem.bounds is not None
     on_nothing = replace(problem.bounds, C_c=problem.bounds.C_c * [[0.0], [1.0]])
-    assert bounded_axes(replace(problem, bounds=on_nothing)) == []
+    assert names(replace(problem, bounds=on_nothing)) == set()
     indifferent = paper_problem("paper-constrained", "controller.output_weights={x=1.0, z=1.0, yaw=1.0}")
-    assert bounded_axes(indifferent) == []
+    assert names(indifferent) == set()
+
+
+def test_an_unbounded_axis_that_nothing_is_asked_of_is_left_out() -> None:
+    problem = paper_problem(
+        "paper-constrained",
+        "controller.output_weights={x=1.0, y=1.0, z=1.0}",
+    )
+    assert names(problem) == QUADROTOR
+    assert len(axes(problem)) == 3
+
+
+def test_a_row_of_nothing_leaves_one_piece() -> None:
+    """By a weight on it with another row, what it is asked to be would count."""
+    problem = paper_problem()
+    C_r = problem.objective.C_r.copy()
+    C_r[0] = 0.0
+    assert names(replace(problem, objective=replace(problem.objective, C_r=C_r))) == set()
 
 
 def cost(problem: Problem, state: Array, desired: Array, moves: Array) -> float:
@@ -104,12 +146,12 @@ def test_costs_and_outputs_fall_apart() -> None:
     rng = np.random.default_rng(3)
     problem = random_axes(rng, horizon=5, room=1.0)
     assert problem.bounds is not None
-    axes = bounded_axes(problem)
-    assert [axis.states.size for axis in axes] in ([3, 2], [2, 3])
+    found = axes(problem)
+    assert sorted(axis.states.size for axis in found) == [2, 2, 3]
     state, desired, moves = rng.normal(size=7), rng.normal(size=(5, 7)), rng.normal(size=(5, 4))
-    for axis in axes:
+    for axis in found:
         own = (axis.problem, state[axis.states], desired[:, axis.regulated])
-        w, change = moves @ axis.S.T, rng.normal(size=(5, axis.T.shape[1]))
+        w, change = moves @ inverse(problem, axis).T, rng.normal(size=(5, axis.T.shape[1]))
         whole = cost(problem, state, desired, moves + change @ axis.T.T) - cost(problem, state, desired, moves)
         assert cost(*own, w + change) - cost(*own, w) == pytest.approx(whole, rel=1e-9)
         others = np.setdiff1d(np.arange(7), axis.states)

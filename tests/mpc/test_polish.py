@@ -6,13 +6,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from support import paper_problem, paper_reference
 
 from mpc.condensed import condensed
-from mpc.polish import polish
-from mpc.qp import kkt_residuals
+from mpc.polish import RowPolish, polish
+from mpc.qp import QP, Vectors, kkt_residuals
 from mpc.solvers import SOLVERS, make_backend
 from mpc.solvers.piqp_dense import PiqpDense
+from quadsim.state import Array
 
 
 @pytest.mark.parametrize("name", ["piqp-dense", "piqp-multistage"])
@@ -48,3 +51,48 @@ def test_polish_adds_and_drops_constraints() -> None:
             again = polish(qp, replace(optimum, z=z))
             np.testing.assert_allclose(again.x, optimum.x, atol=1e-6)
             assert kkt_residuals(qp, again).worst < 1e-6
+
+
+def row_problem(rng: np.random.Generator, *, n: int, rows: int) -> tuple[QP, Array]:
+    """A QP with bounds on rows alone, some of them infinite, and its minimiser without them."""
+    factor = rng.normal(size=(n, n))
+    P, c, infinite = factor @ factor.T + 0.1 * np.eye(n), 3.0 * rng.normal(size=n), np.full(n, np.inf)
+    lower, upper = -rng.uniform(0.1, 1.0, rows), rng.uniform(0.1, 1.0, rows)
+    lower[rng.random(rows) < 0.2] = -np.inf
+    qp = QP(
+        P=P,
+        c=c,
+        A=np.zeros((0, n)),
+        b=np.zeros(0),
+        G=rng.normal(size=(rows, n)),
+        h_l=lower,
+        h_u=upper,
+        x_l=-infinite,
+        x_u=infinite,
+    )
+    return qp, np.asarray(-np.linalg.solve(P, c))
+
+
+@given(seed=st.integers(0, 10_000), rows=st.integers(1, 8), off=st.sampled_from([0.0, 1e-3, 1.0]))
+def test_rows_are_polished_to_the_optimum(seed: int, rows: int, off: float) -> None:
+    """From multipliers that are a little or a lot off; the KKT conditions are the judge."""
+    rng = np.random.default_rng(seed)
+    qp, free = row_problem(rng, n=8, rows=rows)
+    polish = RowPolish(np.asarray(qp.P), np.asarray(qp.G), qp.h_l, qp.h_u)
+    backend = PiqpDense()
+    backend.setup(qp)
+    rough = backend.solve(Vectors(c=qp.c, b=qp.b, h_l=qp.h_l, h_u=qp.h_u))
+    z = polish.multipliers(qp.G @ free, rough.z + off * rng.normal(size=rows))
+    assert z is not None
+    exact = replace(rough, x=free - polish.R @ z, z=z, z_box=np.zeros(8))
+    assert kkt_residuals(qp, exact).worst < 1e-8 * max(1.0, np.abs(z).max())
+    np.testing.assert_allclose(exact.x, rough.x, atol=1e-3)
+
+
+def test_rows_that_depend_on_each_other_are_not_polished() -> None:
+    """The same row twice, both taken for active."""
+    G = np.array([[1.0, 0.0], [1.0, 0.0]])
+    polish = RowPolish(np.eye(2), G, np.full(2, -1.0), np.full(2, 1.0))
+    assert polish.multipliers(np.array([2.0, 2.0]), np.array([0.5, 0.5])) is None
+    z = polish.multipliers(np.array([2.0, 0.5]), np.array([1.0, 0.0]))
+    np.testing.assert_allclose(np.asarray(z), [1.0, 0.0])
