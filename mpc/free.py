@@ -47,7 +47,7 @@ class FreeOptimum:
         self._w, self._y = np.empty((self.inputs[-1].stop, N)), np.empty((self.outputs[-1].stop, N))
         columns = np.arange(n + N * n_r)
         wanted = columns[n:].reshape(N, n_r)
-        self._query, self._n = np.empty(columns.size), n
+        self._query = np.empty(columns.size)
         order = [np.concatenate([axis.states, wanted[:, axis.regulated].ravel()]) for axis in parts]
         self._order, self._given = np.concatenate(order), np.empty(sum(part.size for part in order))
         self._products: list[tuple[Array, Array, Array]] = []
@@ -61,9 +61,8 @@ class FreeOptimum:
 
     def at(self, state: Array, desired: Array) -> tuple[Array, Array]:
         """Inputs (m, N) and outputs (n_c, N) of all axes for xi(k) (n,) and y_d (N, n_r); the next call's too."""
-        self._query[: self._n] = state
-        self._query[self._n :] = desired.ravel()
-        np.take(self._query, self._order, out=self._given)
+        np.concatenate((state, desired), axis=None, out=self._query)
+        self._query.take(self._order, out=self._given, mode="clip")  # a mode that takes no copy
         for matrix, given, found in self._products:
             np.dot(matrix, given, out=found)
         return self._w, self._y

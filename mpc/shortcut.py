@@ -77,15 +77,20 @@ class Shortcut:
         """See `mpc.solvers.Solver.solve`."""
         started = clock.perf_counter()
         w, y = self._free.at(state, desired)
-        staying = np.all((self._y_min <= y) & (y <= self._y_max), axis=1)
-        leaving = [axis for axis in self._axes if not staying[axis.outputs].all()]
-        parts = [axis.solve(state, desired) for axis in leaving]
-        if staying.all() or self._near(w, leaving, parts, u_before):
-            held = [axis.polished(part, w, y) for axis, part in zip(leaving, parts, strict=True)]
-            plan = self._plan(w, held)
+        within = (self._y_min <= y) & (y <= self._y_max)
+        parts: list[Answer] = []
+        if within.all():
+            plan = self._plan(w)
             if self._inputs_within(self._bounds, plan, u_before):
-                way = Way.AXES if parts else Way.FREE
-                return Answer(plan=plan, solution=self._joined(plan, held, parts, started), way=way)
+                return Answer(plan=plan, solution=self._joined(plan, [], parts, started), way=Way.FREE)
+        else:
+            leaving = [axis for axis in self._axes if not within[axis.outputs].all()]
+            parts = [axis.solve(state, desired) for axis in leaving]
+            if self._near(w, leaving, parts, u_before):
+                held = [axis.polished(part, w, y) for axis, part in zip(leaving, parts, strict=True)]
+                plan = self._plan(w, held)
+                if self._inputs_within(self._bounds, plan, u_before):
+                    return Answer(plan=plan, solution=self._joined(plan, held, parts, started), way=Way.AXES)
         tried_s, tried = clock.perf_counter() - started, sum(part.solution.iterations for part in parts)
         answer = self._whole.solve(state, desired, u_before)
         iterations, solve_s = answer.solution.iterations + tried, answer.solution.solve_s + tried_s
@@ -98,7 +103,7 @@ class Shortcut:
         held = [axis.held(part) for axis, part in zip(leaving, parts, strict=True)]
         return self._inputs_within(self._nearly, self._plan(w, held), u_before)
 
-    def _plan(self, w: Array, held: Sequence[_Held]) -> Array:
+    def _plan(self, w: Array, held: Sequence[_Held] = ()) -> Array:
         """(N, nu) of the inputs of all axes (m, N), of some as their outputs' bounds would have it."""
         if held:
             w = w.copy()
@@ -117,22 +122,26 @@ class Shortcut:
 
     def _joined(self, plan: Array, held: list[_Held], parts: list[Answer], started: float) -> Solution:
         """The solution of the condensed QP whose axes' are these parts."""
-        z = self._z
+        z, iterations, active, primal, dual = self._z, 0, 0, 0.0, 0.0
         if held:
             z = np.zeros_like(z)
             rows = z[: len(plan) * self._outputs].reshape(len(plan), -1)
             for axis in held:
                 rows[:, axis.rows] = axis.z
+                active += axis.active
+            for part in parts:
+                iterations += part.solution.iterations
+                primal, dual = max(primal, part.solution.primal_residual), max(dual, part.solution.dual_residual)
         return Solution(
             x=plan.ravel(),
             y=self._y,
             z=z,
             z_box=self._z_box,
-            status=SOLVED if parts else UNCONSTRAINED,
-            iterations=sum(part.solution.iterations for part in parts),
-            active=sum(axis.active for axis in held),
-            primal_residual=max((part.solution.primal_residual for part in parts), default=0.0),
-            dual_residual=max((part.solution.dual_residual for part in parts), default=0.0),
+            status=SOLVED if held else UNCONSTRAINED,
+            iterations=iterations,
+            active=active,
+            primal_residual=primal,
+            dual_residual=dual,
             solve_s=clock.perf_counter() - started,
         )
 
