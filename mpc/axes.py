@@ -15,7 +15,7 @@ moves nothing, and is u_bar's at the optimum.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 from scipy.sparse import csr_matrix
@@ -24,9 +24,7 @@ from scipy.sparse.csgraph import connected_components
 from mpc.condensed import require_bounds
 from mpc.model import LinearModel
 from mpc.problem import Bounds, Objective, Problem
-from quadsim.state import Array
-
-Indices = np.ndarray[Any, np.dtype[np.int64]]
+from quadsim.state import Array, Indices
 
 ROUNDING: Final = 1e-12
 """Relative size below which what ties two states is taken for a product of rounding."""

@@ -22,9 +22,7 @@ from scipy import sparse
 from scipy.linalg import lapack
 
 from mpc.qp import QP, Matrix, Solution
-from quadsim.state import Array
-
-Indices = np.ndarray[Any, np.dtype[np.int64]]
+from quadsim.state import Array, Indices
 
 FEASIBLE: Final = 1e-9
 """Violation of a bound, and size of a multiplier of the wrong sign, that are taken for rounding."""

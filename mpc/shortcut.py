@@ -9,7 +9,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from mpc.axes import Axis, Indices, axes
+from mpc.axes import Axis, axes
 from mpc.condensed import condensed, require_bounds
 from mpc.free import FreeOptimum
 from mpc.polish import RowPolish
@@ -17,7 +17,7 @@ from mpc.problem import Problem
 from mpc.qp import Solution
 from mpc.solvers import Answer, QPSolver, Solver, Way
 from quadsim.controller import SOLVED, UNCONSTRAINED
-from quadsim.state import Array, read_only
+from quadsim.state import Array, Indices, read_only
 
 LARGEST_MAP: Final = 2**20
 """Entries beyond which there is no shortcut: 8 MiB, as much as a core's caches hold.  50 steps of the paper's problem

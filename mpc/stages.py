@@ -5,15 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from scipy.sparse import csc_matrix
 
 from mpc.problem import Bounds
-from quadsim.state import Array
-
-Indices = np.ndarray[Any, np.dtype[np.int64]]
+from quadsim.state import Array, Indices
 
 
 class Pattern:

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
 
 STATE_NAMES: Final = (
     "x", "vx", "y", "vy", "z", "vz",
