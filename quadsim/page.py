@@ -1,4 +1,4 @@
-"""Pages that open without a network: one template for their frame, and a mark by which they are known again."""
+"""Pages that open without a network: one template for their frame."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ def render_page(template: str, kind: str, **context: Any) -> str:
 
     Args:
         template: its file in `quadsim/templates`.
-        kind: what the page is, e.g. `comparison`; see `is_page`.
+        kind: what the page is, e.g. `comparison`.
         context: what the template is told.
     """
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
@@ -28,12 +28,3 @@ def render_page(template: str, kind: str, **context: Any) -> str:
         lstrip_blocks=True,
     )
     return environment.get_template(template).render(kind=kind, **context)
-
-
-def is_page(directory: Path, kind: str) -> bool:
-    """Whether a directory holds a page of that kind that we wrote."""
-    page = directory / PAGE_FILE
-    if not page.is_file():
-        return False
-    with page.open(encoding="utf-8", errors="replace") as file:
-        return f'<meta name="generator" content="quadsim {kind}">' in file.read(1024)

@@ -18,7 +18,8 @@ from quadsim.errors import OutputError, ParameterError
 from quadsim.figures import comparison_figure, write_cost_figures
 from quadsim.flightlog import FLIGHT_FILE, HORIZON_FILE, PLANT_FILE, TIMING_FILE
 from quadsim.narrative import comparison_sentences
-from quadsim.page import PAGE_FILE, is_page, render_page
+from quadsim.outputs import write_json, write_text, writing
+from quadsim.page import PAGE_FILE, render_page
 from quadsim.palette import line_colour
 from quadsim.plots import Plot, comparison_plots, cost_plots, plotly_script
 from quadsim.rundir import (
@@ -28,8 +29,6 @@ from quadsim.rundir import (
     SUMMARY_FILE,
     VIDEO_FILE,
     Run,
-    write_json,
-    writing,
 )
 from quadsim.table import Cell, Grid, to_markdown
 
@@ -37,7 +36,8 @@ TABLE_FILE: Final = "comparison.md"
 COST_FILE: Final = "cost.json"
 COST_TABLES_FILE: Final = "cost.md"
 
-_KIND: Final = "comparison"
+KIND: Final = "comparison"
+"""What `quadsim.outputs` calls such a directory."""
 _FILES: Final = {
     SUMMARY_FILE: "summary (JSON)",
     SCENARIO_FILE: "scenario (TOML)",
@@ -105,9 +105,9 @@ def write_comparison(runs: Sequence[Run], directory: Path, study: CostStudy | No
             raise OutputError(directory, f"it holds the run {run.directory}, which must stay; choose another --out")
     names = run_names(runs)
     rows = comparison_rows(runs)
-    with writing(directory, replaces=is_comparison) as partial:
+    with writing(directory, KIND) as partial:
         comparison_figure(runs, partial)
-        (partial / TABLE_FILE).write_text(to_markdown(rows, names), encoding="utf-8")
+        write_text(partial / TABLE_FILE, to_markdown(rows, names))
         views = [
             _place(run, name, folder, line_colour(i), partial)
             for i, (run, name, folder) in enumerate(zip(runs, names, _folder_names(names), strict=True))
@@ -115,7 +115,7 @@ def write_comparison(runs: Sequence[Run], directory: Path, study: CostStudy | No
         plots = comparison_plots(runs)
         page = render_page(
             "comparison.html.j2",
-            _KIND,
+            KIND,
             title=" and ".join(names) if len(names) < 3 else f"{len(names)} runs: {', '.join(names)}",
             runs=views,
             sentences=comparison_sentences(runs),
@@ -126,13 +126,8 @@ def write_comparison(runs: Sequence[Run], directory: Path, study: CostStudy | No
             figure="comparison.svg",
             table=TABLE_FILE,
         )
-        (partial / PAGE_FILE).write_text(page, encoding="utf-8")
+        write_text(partial / PAGE_FILE, page)
     return directory / PAGE_FILE
-
-
-def is_comparison(directory: Path) -> bool:
-    """Whether a directory holds a comparison that `write_comparison` wrote."""
-    return is_page(directory, _KIND)
 
 
 def _folder_names(names: Sequence[str]) -> list[str]:
@@ -182,7 +177,7 @@ def _place_study(study: CostStudy, page_directory: Path) -> _CostView:
     sentences = cost_sentences(study)
     write_json(page_directory / COST_FILE, study.to_json())
     text = f"# What do constraints cost?\n\n{cost_markdown(study, sentences)}"
-    (page_directory / COST_TABLES_FILE).write_text(text, encoding="utf-8")
+    write_text(page_directory / COST_TABLES_FILE, text)
     figures = [path for path in write_cost_figures(study, page_directory) if path.suffix == ".svg"]
     return _CostView(
         name=study.name,

@@ -3,20 +3,17 @@
 from __future__ import annotations
 
 import contextlib
-import hashlib
 import json
 import math
-import os
-import shutil
-import tempfile
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any, Final
 
 from quadsim.audit import Finding, Limit
-from quadsim.errors import FileError, OutputError
+from quadsim.errors import FileError
 from quadsim.flightlog import FlightLog, read_log
+from quadsim.outputs import LOCK_FILE, MANIFEST_FILE, digest, digest_of, growing, to_json
 from quadsim.vehicle import Vehicle
 
 SUMMARY_FILE: Final = "summary.json"
@@ -24,6 +21,8 @@ SCENARIO_FILE: Final = "scenario.toml"
 RECORDING_FILE: Final = "flight.rrd"
 VIDEO_FILE: Final = "flight.mp4"
 FIGURES_DIR: Final = "figures"
+KIND: Final = "run"
+"""What `quadsim.outputs` calls a run directory."""
 
 _SUMMARY_TYPES: Final = {
     "scenario": str,
@@ -38,7 +37,6 @@ _SUMMARY_TYPES: Final = {
     "vehicle": dict,
     "files": dict,
 }
-_FREE_BYTES_NEEDED: Final = 16 * 1024 * 1024
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -105,11 +103,6 @@ def limit_from_json(entry: Mapping[str, Any]) -> Limit:
     return Limit(**values | {name: bound for name, bound in absent.items() if values[name] is None})
 
 
-def write_json(path: Path, data: Mapping[str, Any]) -> None:
-    """Write strict JSON (no NaN), in one step; see `write_atomically`."""
-    write_atomically(path, json.dumps(data, indent=2, allow_nan=False) + "\n")
-
-
 def read_json(path: Path, kinds: Mapping[str, Any], what: str) -> dict[str, Any]:
     """A JSON object from a file of ours.
 
@@ -133,23 +126,6 @@ def read_json(path: Path, kinds: Mapping[str, Any], what: str) -> dict[str, Any]
     return found
 
 
-def write_atomically(path: Path, text: str) -> None:
-    """Write or replace a text file in one step.
-
-    Raises:
-        OutputError: it cannot be written; what was there is still there.
-    """
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.partial")
-    try:
-        temporary.write_text(text, encoding="utf-8")
-        temporary.replace(path)
-    except OSError as error:
-        raise OutputError(path, error.strerror or str(error)) from error
-    finally:
-        with contextlib.suppress(OSError):
-            temporary.unlink(missing_ok=True)
-
-
 def is_run(directory: Path) -> bool:
     """Whether a path is a run directory: one with a summary of ours, since others write a `summary.json` too."""
     try:
@@ -157,15 +133,6 @@ def is_run(directory: Path) -> bool:
     except FileError:
         return False
     return True
-
-
-def holds_run_alone(directory: Path) -> bool:
-    """Whether a directory is a run and holds no file but the run's own, so that it may be replaced."""
-    try:
-        own = {SUMMARY_FILE, *read_summary(directory)["files"]}
-    except FileError:
-        return False
-    return all(path.relative_to(directory).as_posix() in own for path in directory.rglob("*") if path.is_file())
 
 
 def read_summary(directory: Path) -> dict[str, Any]:
@@ -197,80 +164,40 @@ def load_run(directory: Path) -> Run:
 
 
 def file_hashes(directory: Path) -> dict[str, str]:
-    """SHA-256 of every file below a directory but the summary, by relative path, sorted."""
-    paths = sorted(path for path in directory.rglob("*") if path.is_file() and path.name != SUMMARY_FILE)
-    return {
-        path.relative_to(directory).as_posix(): "sha256:" + hashlib.sha256(path.read_bytes()).hexdigest()
-        for path in paths
-    }
+    """SHA-256 of every file below a directory but the summary and our own bookkeeping, by relative path, sorted."""
+    paths = sorted(path for path in directory.rglob("*") if path.is_file())
+    names = [path.relative_to(directory).as_posix() for path in paths]
+    return {name: digest_of(directory / name) for name in names if name not in (SUMMARY_FILE, MANIFEST_FILE, LOCK_FILE)}
 
 
-def refresh_hashes(directory: Path) -> None:
-    """Record the hashes of a run's files again, after a product such as the video was added."""
-    summary = read_summary(directory)
-    write_json(directory / SUMMARY_FILE, {**summary, "files": file_hashes(directory)})
+@contextlib.contextmanager
+def adding(directory: Path, name: str) -> Iterator[Callable[[bytes], None]]:
+    """Add a product such as the film to a run directory, or replace it, together with its hash in the summary.
+
+    Args:
+        directory: of the run.
+        name: of the file, relative to it.
+
+    Yields:
+        What takes the file's content and writes it.
+
+    Raises:
+        FileError: it is not a run directory.
+        OutputError: it cannot be written, or the file or the summary is not as we wrote it.
+    """
+    read_summary(directory)
+    with growing(directory, KIND) as files:
+        files.require([name, SUMMARY_FILE])
+
+        def write(content: bytes) -> None:
+            summary = read_summary(directory)
+            summary["files"] = dict(sorted({**summary["files"], name: digest(content)}.items()))
+            files.write({name: content, SUMMARY_FILE: to_json(summary).encode()})
+
+        yield write
 
 
 def damaged_files(directory: Path, summary: Mapping[str, Any]) -> list[str]:
     """Files named in the summary that are missing or whose SHA-256 is not the recorded one."""
     found = file_hashes(directory)
     return [name for name, digest in summary["files"].items() if found.get(name) != digest]
-
-
-@contextlib.contextmanager
-def writing(target: Path, replaces: Callable[[Path], bool] = holds_run_alone) -> Iterator[Path]:
-    """A directory to fill, which becomes `target` when the block ends well and vanishes when it does not.
-
-    Parents that are missing are made, and vanish with it.
-
-    Args:
-        target: the directory to make.
-        replaces: whether a directory that is already there, and not empty, may go: an earlier one of the same kind.
-
-    Raises:
-        OutputError: the place cannot be written, is nearly full, or holds something else.
-    """
-    target = Path(target)
-    missing: list[Path] = []
-    temporary: Path | None = None
-    try:
-        occupied = target.exists() and not (target.is_dir() and (replaces(target) or not any(target.iterdir())))
-        if occupied:
-            raise OutputError(target, "something else is already there; choose another --out")
-        files = [parent for parent in target.parents if parent.is_file()]
-        if files:
-            raise OutputError(target, f"{files[0]} is a file")
-        missing = [parent for parent in target.parents if not parent.exists()]
-        target.parent.mkdir(parents=True, exist_ok=True)
-        temporary = Path(tempfile.mkdtemp(prefix=f".{target.name}.", suffix=".partial", dir=target.parent))
-        if shutil.disk_usage(temporary).free < _FREE_BYTES_NEEDED:
-            raise OutputError(target, "the disk is full")
-        temporary.chmod(0o755)
-        yield temporary
-        _replace(temporary, target)
-    except OutputError as error:
-        if temporary is None or not error.path.is_relative_to(temporary):
-            raise
-        raise OutputError(target / error.path.relative_to(temporary), error.problem) from error
-    except OSError as error:
-        raise OutputError(target, error.strerror or str(error)) from error
-    finally:
-        if temporary is not None:
-            shutil.rmtree(temporary, ignore_errors=True)
-        for parent in missing:  # from the innermost outwards; one that is not empty stays
-            with contextlib.suppress(OSError):
-                parent.rmdir()
-
-
-def _replace(temporary: Path, target: Path) -> None:
-    if not target.exists():
-        temporary.rename(target)
-        return
-    old = temporary.with_suffix(".old")
-    target.rename(old)
-    try:
-        temporary.rename(target)
-    except OSError:
-        old.rename(target)
-        raise
-    shutil.rmtree(old, ignore_errors=True)

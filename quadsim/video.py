@@ -14,7 +14,6 @@ import selectors
 import shutil
 import subprocess
 import sys
-import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -22,6 +21,7 @@ from typing import IO, Final
 
 from quadsim.errors import OutputError, ParameterError, RenderingUnavailableError
 from quadsim.footage import Shot, film_span
+from quadsim.outputs import writing_file
 from quadsim.rundir import Run, load_run, vehicle_to_json
 from quadsim.vehicle import Vehicle
 
@@ -88,7 +88,7 @@ def render_video(
 
     Args:
         run_directory: a run with its summary and Parquet files.
-        path: the MP4 to write; one that is there is replaced.
+        path: the MP4 to write; an earlier one is replaced, if it is as we wrote it.
         workers: rendering processes, at most; the machine's cores when None.
         progress: called with frames done and frames in all, in the caller's thread.
         width: [pixels], even.
@@ -107,9 +107,8 @@ def render_video(
     shot = _plan(load_run(run_directory), start, stop, Shot(
         run=str(run_directory), width=width, height=height, fps=fps, speed=speed, count=1
     ))  # fmt: skip
-    with _staging(path) as folder:
-        _film(shot, folder / "film.mp4", workers, progress)
-        (folder / "film.mp4").replace(path)
+    with _making(path, ".mp4") as new:
+        _film(shot, new, workers, progress)
 
 
 def render_gif(
@@ -131,10 +130,10 @@ def render_gif(
         run=str(run_directory), width=2 * width, height=2 * round(width * 9 / 16), fps=fps, speed=speed, count=1,
         compact=True,
     ))  # fmt: skip
-    with _staging(path) as folder:
-        backend = _film(shot, folder / "film.mp4", workers, None)
-        _work([("gif", str(folder / "film.mp4"), str(folder / "film.gif"), str(width))], backend, folder)
-        (folder / "film.gif").replace(path)
+    with _making(path, ".gif") as new:
+        film = new.with_suffix(".mp4")
+        backend = _film(shot, film, workers, None)
+        _work([("gif", str(film), str(new), str(width))], backend, new.parent)
 
 
 def render_portrait(vehicle: Vehicle, path: Path, *, width: int = 1280, height: int = 720) -> None:
@@ -142,7 +141,7 @@ def render_portrait(vehicle: Vehicle, path: Path, *, width: int = 1280, height: 
 
     Args:
         vehicle: what is drawn.
-        path: the PNG to write; one that is there is replaced.
+        path: the PNG to write; an earlier one is replaced, if it is as we wrote it.
         width: [pixels].
         height: [pixels].
 
@@ -150,11 +149,10 @@ def render_portrait(vehicle: Vehicle, path: Path, *, width: int = 1280, height: 
         OutputError: the picture cannot be written, or the renderer failed; nothing is left behind.
         RenderingUnavailableError: this machine cannot render.
     """
-    with _staging(path) as folder:
+    with _making(path, ".png") as new:
         numbers = json.dumps(vehicle_to_json(vehicle))
-        task = ("portrait", numbers, str(folder / "portrait.png"), str(width), str(height))
-        _work([task], rendering_backend(), folder)
-        (folder / "portrait.png").replace(path)
+        task = ("portrait", numbers, str(new), str(width), str(height))
+        _work([task], rendering_backend(), new.parent)
 
 
 def _plan(run: Run, start: float, stop: float | None, shot: Shot) -> Shot:
@@ -187,15 +185,13 @@ class _WorkerFailure(Exception):
 
 
 @contextlib.contextmanager
-def _staging(path: Path) -> Iterator[Path]:
-    """A folder beside `path` that is gone when the block ends; what fails inside becomes an `OutputError`."""
+def _making(path: Path, form: str) -> Iterator[Path]:
+    """A file to be made in a folder of its own; see `writing_file`.  A worker's failure becomes an `OutputError`."""
     try:
-        with tempfile.TemporaryDirectory(prefix=f".{path.name}.", suffix=".partial", dir=path.parent) as folder:
-            yield Path(folder).resolve()
+        with writing_file(path, form) as new:
+            yield new.resolve()
     except _WorkerFailure as failure:
         raise OutputError(path, f"the renderer failed: {failure}") from failure
-    except OSError as error:
-        raise OutputError(path, error.strerror or str(error)) from error
 
 
 def _environment(backend: str) -> dict[str, str]:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import argparse
 import os
-import signal
 import sys
 from collections.abc import Sequence
 
@@ -223,8 +222,7 @@ def _add_settings(parser: argparse.ArgumentParser) -> None:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line; returns the exit status."""
     options = make_parser().parse_args(arguments)
-    if arguments is None:  # as a process of its own: being told to stop is Ctrl-C, and leaves nothing half written
-        signal.signal(signal.SIGTERM, signal.default_int_handler)
+    if arguments is None:  # as a process of its own
         collect_rarely()  # saves 5 % of a run
     try:
         from scenarios import commands
@@ -253,4 +251,6 @@ def _silence_stdout() -> None:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    from scenarios.entry import main as start
+
+    sys.exit(start())

@@ -2,29 +2,12 @@
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
 
-from quadsim.errors import OutputError
-from quadsim.rundir import write_atomically
-
-
-def require_place(path: Path) -> None:
-    """Refuse a place where no verdicts can be written, before anything flies for them.
-
-    Raises:
-        OutputError: it is a folder, or no file can be made beside it.
-    """
-    if path.is_dir():
-        raise OutputError(path, "is a folder")
-    try:
-        with tempfile.TemporaryFile(dir=path.parent):
-            pass
-    except OSError as error:
-        raise OutputError(path, error.strerror or str(error)) from error
+from quadsim.outputs import writing_file
 
 
 def write_junit(summary: Mapping[str, Any], path: Path) -> None:
@@ -57,7 +40,8 @@ def write_cases(suite: str, cases: Sequence[tuple[str, bool, str]], path: Path) 
             ElementTree.SubElement(case, "system-out").text = sentence
         else:
             ElementTree.SubElement(case, "failure", message=sentence)
-    write_atomically(path, ElementTree.tostring(root, encoding="utf-8", xml_declaration=True).decode())
+    with writing_file(path, ".xml") as file:
+        file.write_bytes(ElementTree.tostring(root, encoding="utf-8", xml_declaration=True))
 
 
 def _sentence(entry: Mapping[str, Any]) -> str:

@@ -22,6 +22,7 @@ from quadsim.controller import Phase
 from quadsim.estimation import Tally
 from quadsim.feasibility import to_json as feasibility_to_json
 from quadsim.flightlog import FlightLog, write_log
+from quadsim.outputs import write_json, write_text, writing
 from quadsim.sensing import SensorName
 from quadsim.vehicle import Vehicle
 from scenarios.build import (
@@ -144,24 +145,24 @@ def run(scenario: Scenario, target: Path, outputs: Outputs, progress: Progress =
         from quadsim.video import rendering_backend
 
         rendering_backend()
-    with rundir.writing(target) as directory:
+    with writing(target, rundir.KIND) as directory:
         flight = fly_scenario(scenario, progress)
         write_flight(flight, directory)
         _write_products(flight, directory, outputs, progress)
         summary = summarise(flight)
         summary["wall_s"]["total"] = clock.perf_counter() - started
         summary["files"] = rundir.file_hashes(directory)
-        rundir.write_json(directory / rundir.SUMMARY_FILE, summary)
+        write_json(directory / rundir.SUMMARY_FILE, summary)
     return flight
 
 
 def write_flight(flight: Flight, directory: Path) -> None:
     """Write the scenario, the Parquet tables and a summary, which is all that pictures are made from."""
     scenario = flight.scenario
-    (directory / rundir.SCENARIO_FILE).write_text(scenario.to_toml(), encoding="utf-8")
+    write_text(directory / rundir.SCENARIO_FILE, scenario.to_toml())
     metadata = {"scenario": scenario.name, "seed": str(scenario.seed)}
     write_log(directory, flight.log, plant_stride=scenario.plant_stride, metadata=metadata)
-    rundir.write_json(directory / rundir.SUMMARY_FILE, summarise(flight))
+    write_json(directory / rundir.SUMMARY_FILE, summarise(flight))
 
 
 def summarise(flight: Flight) -> dict[str, Any]:

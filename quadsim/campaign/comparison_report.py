@@ -7,15 +7,16 @@ from typing import Final
 
 from quadsim.campaign.comparison import Comparison
 from quadsim.campaign.comparison_tables import comparison_markdown, comparison_tables, pairing
-from quadsim.page import PAGE_FILE, is_page, render_page
+from quadsim.outputs import write_json, write_text, writing
+from quadsim.page import PAGE_FILE, render_page
 from quadsim.plots import plotly_script
 from quadsim.plots.campaign import comparison_margins_plot
-from quadsim.rundir import write_json, writing
 
 COMPARISON_FILE: Final = "comparison.json"
 TABLE_FILE: Final = "comparison.md"
 
-_KIND: Final = "campaign comparison"
+KIND: Final = "campaign comparison"
+"""What `quadsim.outputs` calls such a directory."""
 
 
 def write_comparison_report(comparison: Comparison, directory: Path) -> Path:
@@ -32,12 +33,12 @@ def write_comparison_report(comparison: Comparison, directory: Path) -> Path:
         OutputError: the directory cannot be written, or holds something else.
     """
     plot = comparison_margins_plot(comparison)
-    with writing(directory, replaces=is_comparison_report) as partial:
+    with writing(directory, KIND) as partial:
         write_json(partial / COMPARISON_FILE, comparison.to_json())
-        (partial / TABLE_FILE).write_text(comparison_markdown(comparison), encoding="utf-8")
+        write_text(partial / TABLE_FILE, comparison_markdown(comparison))
         page = render_page(
             "campaign_comparison.html.j2",
-            _KIND,
+            KIND,
             title=f"{comparison.names[1]} against {comparison.names[0]}",
             comparison=comparison,
             pairing=pairing(comparison),
@@ -46,10 +47,5 @@ def write_comparison_report(comparison: Comparison, directory: Path) -> Path:
             files=(COMPARISON_FILE, TABLE_FILE),
             plotly=plotly_script() if plot else "",
         )
-        (partial / PAGE_FILE).write_text(page, encoding="utf-8")
+        write_text(partial / PAGE_FILE, page)
     return directory / PAGE_FILE
-
-
-def is_comparison_report(directory: Path) -> bool:
-    """Whether a directory holds a comparison of campaigns that `write_comparison_report` wrote."""
-    return is_page(directory, _KIND)

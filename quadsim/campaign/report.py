@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
@@ -25,12 +24,11 @@ from quadsim.campaign.tables import (
     worst_table,
 )
 from quadsim.campaign.wording import count_of
-from quadsim.errors import OutputError
 from quadsim.figures.campaign import write_campaign_figure
+from quadsim.outputs import write_text
 from quadsim.page import PAGE_FILE, render_page
 from quadsim.plots import plotly_script
 from quadsim.plots.campaign import campaign_plots
-from quadsim.rundir import write_atomically
 from quadsim.table import Mark
 
 _FILES: Final = {
@@ -55,25 +53,28 @@ def write_report(
     name: str,
     description: str = "",
     failure: Sequence[str] = (),
+    campaign: Path | None = None,
 ) -> Path:
-    """Write `index.html`, `campaign.png` and `campaign.svg` into a campaign's directory, replacing earlier ones.
+    """Write `index.html`, `campaign.png` and `campaign.svg`.
 
     Args:
-        directory: of the campaign; it is there, and the page names it in its commands as it is given here.
+        directory: where to write them, one that is being made.
         table: `flights.parquet`.
         summary: `quadsim.campaign.estimates.estimate` of that table.
         manifest: how the campaign was made; nested tables are fine.
         name: the campaign's.
         description: what it is, in a line.
         failure: the events that count as failure.
+        campaign: the campaign's directory, where that is another, to which the page links and as its commands name it.
 
     Returns:
         The page.
 
     Raises:
-        OutputError: the directory cannot be written; earlier files are still there.
+        OutputError: the directory cannot be written.
     """
-    _write_figure(name, table, summary, directory)
+    campaign = directory if campaign is None else campaign
+    write_campaign_figure(name, table, summary, directory)
     plots = campaign_plots(table, summary)
     page = render_page(
         "campaign.html.j2",
@@ -90,16 +91,20 @@ def write_report(
         groups=group_table(summary),
         levels=level_tables(summary),
         lost=summary["verdicts"]["lost"],
-        worst=worst_table(summary, str(directory)),
+        worst=worst_table(summary, str(campaign)),
         worst_draws=worst_draws_table(summary),
         manifest=manifest_table(manifest),
         plots=plots,
         at_foot=_at_foot(table),
         thinning=thinning(table),
-        files=[(label, quote(file)) for file, label in _FILES.items() if (directory / file).is_file()],
+        files=[
+            (label, quote(file))
+            for file, label in _FILES.items()
+            if (directory / file).is_file() or (campaign / file).is_file()
+        ],
         plotly=plotly_script() if plots else "",
     )
-    write_atomically(directory / PAGE_FILE, page)
+    write_text(directory / PAGE_FILE, page)
     return directory / PAGE_FILE
 
 
@@ -115,15 +120,3 @@ def _at_foot(table: pa.Table) -> str:
     if drawn is None or not drawn.at_foot:
         return ""
     return f"At the foot: {count_of(drawn.at_foot, 'flight')} with a margin below {drawn.lowest:.3g}, or none."
-
-
-def _write_figure(name: str, table: pa.Table, summary: Summary, directory: Path) -> None:
-    """Draw beside the place, and put each file there in one step."""
-    try:
-        with tempfile.TemporaryDirectory(prefix=".figure.", dir=directory) as beside:
-            for path in write_campaign_figure(name, table, summary, Path(beside)):
-                path.replace(directory / path.name)
-    except OutputError as error:
-        raise OutputError(directory, error.problem) from error
-    except OSError as error:
-        raise OutputError(directory, error.strerror or str(error)) from error

@@ -1,18 +1,13 @@
 """A campaign's directory while it grows: nothing that was flown is lost, or there twice, whatever is killed.
 
-Rows are appended as files of their own below `parts/`, each written beside its place, forced to the disk and moved
-there in one step.  Only one process appends, and holds a lock while it does.  When all is flown the parts become
-`flights.parquet` and `timing.parquet`, and go.
+Rows are appended as files of their own below `parts/`.  When all is flown the parts become `flights.parquet` and
+`timing.parquet`, and go.
 """
 
 from __future__ import annotations
 
-import contextlib
-import fcntl
 import io
-import os
-import shutil
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
@@ -22,63 +17,35 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from quadsim.campaign.table import Row, make_table, read_table, split_times
-from quadsim.errors import FileError, OutputError
+from quadsim.errors import FileError
+from quadsim.outputs import Growing
 
 FLIGHTS_FILE: Final = "flights.parquet"
 TIMES_FILE: Final = "timing.parquet"
 PARTS_DIR: Final = "parts"
-_LOCK_FILE: Final = ".lock"
 _PART: Final = "part-*.parquet"
-
-
-@contextlib.contextmanager
-def locked(directory: Path) -> Iterator[None]:
-    """Hold a campaign's directory for oneself; whoever dies lets go of it.
-
-    Raises:
-        OutputError: another process holds it, or it cannot be written.
-    """
-    try:
-        handle = os.open(directory / _LOCK_FILE, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
-    except OSError as error:
-        raise OutputError(directory, error.strerror or str(error)) from error
-    try:
-        _hold(handle, directory)
-        yield
-    finally:
-        os.close(handle)
-
-
-def _hold(handle: int, directory: Path) -> None:
-    try:
-        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError as error:
-        raise OutputError(directory, "another campaign is being flown there") from error
-    except OSError as error:  # of a file system that knows no locks
-        raise OutputError(directory, f"cannot be held for one campaign alone ({error.strerror})") from error
 
 
 class Store:
     """The rows of a campaign on disk.
 
     Args:
-        directory: of the campaign; it is there already.
+        files: of the campaign's directory.
         schema: see `quadsim.campaign.table.make_schema`.
     """
 
-    def __init__(self, directory: Path, schema: pa.Schema) -> None:
-        self._directory, self._schema = directory, schema
-        self._parts = directory / PARTS_DIR
+    def __init__(self, files: Growing, schema: pa.Schema) -> None:
+        self._files, self._directory, self._schema = files, files.path, schema
 
     def table(self) -> pa.Table:
-        """All flights that are there, each once, sorted; what a killed process left half written is swept away.
+        """All flights that are there, each once, sorted.
 
         Raises:
             FileError: a file is damaged or of another campaign.
+            OutputError: a part is not as it was written.
         """
-        for leftover in self._parts.glob(".*.partial"):
-            leftover.unlink(missing_ok=True)
-        tables = [self._read(path) for path in sorted(self._parts.glob(_PART))]
+        self._files.require(self._parts())
+        tables = [self._read(self._directory / name) for name in self._parts()]
         if (self._directory / FLIGHTS_FILE).is_file():
             tables.insert(0, self._finished())
         if not tables:
@@ -101,12 +68,7 @@ class Store:
         if not rows:
             return
         first = min(row["flight"] for row in rows)
-        path = self._parts / f"part-{first:09d}.parquet"
-        try:
-            self._parts.mkdir(exist_ok=True)
-            _write_durably(make_table(rows, self._schema), path)
-        except OSError as error:
-            raise OutputError(path, error.strerror or str(error)) from error
+        self._files.write({f"{PARTS_DIR}/part-{first:09d}.parquet": _encoded(make_table(rows, self._schema))})
 
     def close(self, flights: int) -> pa.Table:
         """Put everything into its final two tables, and take the parts away.
@@ -122,13 +84,13 @@ class Store:
         """
         whole = self.table()
         table, times = split_times(whole.filter(pc.less(whole["flight"], flights)))
-        try:
-            _write_durably(times, self._directory / TIMES_FILE)
-            _write_durably(table, self._directory / FLIGHTS_FILE)
-        except OSError as error:
-            raise OutputError(self._directory, error.strerror or str(error)) from error
-        shutil.rmtree(self._parts, ignore_errors=True)
+        self._files.write({TIMES_FILE: _encoded(times), FLIGHTS_FILE: _encoded(table)})
+        self._files.remove(self._parts())
         return table
+
+    def _parts(self) -> list[str]:
+        """The parts that are there, by their names relative to the directory."""
+        return [f"{PARTS_DIR}/{path.name}" for path in sorted((self._directory / PARTS_DIR).glob(_PART))]
 
     def _read(self, path: Path) -> pa.Table:
         table = read_table(path)
@@ -156,22 +118,7 @@ class Store:
         return pa.Table.from_arrays(columns, schema=self._schema)
 
 
-def _write_durably(table: pa.Table, path: Path) -> None:
-    """A file that is there whole or not at all, even after a loss of power."""
-    partial = path.with_name(f".{path.name}.partial")
+def _encoded(table: pa.Table) -> bytes:
     buffer = io.BytesIO()
     pq.write_table(table, buffer, compression="zstd")
-    try:
-        with partial.open("wb") as file:
-            file.write(buffer.getbuffer())
-            file.flush()
-            os.fsync(file.fileno())
-        partial.replace(path)
-    except OSError:
-        partial.unlink(missing_ok=True)
-        raise
-    directory = os.open(path.parent, os.O_RDONLY)
-    try:
-        os.fsync(directory)
-    finally:
-        os.close(directory)
+    return buffer.getvalue()

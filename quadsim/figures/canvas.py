@@ -47,7 +47,7 @@ def write_drawings(drawings: Mapping[str, Callable[[], Figure]], directory: Path
 
     Args:
         drawings: what draws each figure, by the name of its files; called in the style of all figures.
-        directory: where the files go; made when it is not there.
+        directory: where the files go, one that is being made; a file of a figure's name must not be there.
 
     Returns:
         The files written, PNG and SVG of each figure.
@@ -66,8 +66,10 @@ def write_drawings(drawings: Mapping[str, Callable[[], Figure]], directory: Path
                 png, svg = directory / f"{name}.png", directory / f"{name}.svg"
                 figure.draw_without_rendering()  # finds the layout, once for both files
                 figure.set_layout_engine(None)
-                figure.savefig(png, dpi=DPI)
-                figure.savefig(svg, metadata={"Date": None})
+                with png.open("xb") as file:
+                    figure.savefig(file, format="png", dpi=DPI)
+                with svg.open("xb") as file:
+                    figure.savefig(file, format="svg", metadata={"Date": None})
                 paths += [png, svg]
     except OSError as error:
         raise OutputError(directory, error.strerror or str(error)) from error

@@ -16,14 +16,13 @@ Everything stands on one timeline, `sim_time`, the simulated time:
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
-import os
 from pathlib import Path
 
 import numpy as np
 
 from quadsim.errors import OutputError
+from quadsim.outputs import write_new
 from quadsim.palette import line_colour
 from quadsim.recording.aside import recording_aside
 from quadsim.recording.curves import send_effects, send_limit, send_signals, send_solver
@@ -42,22 +41,13 @@ def write_recording(run: Run, path: Path) -> None:
 
     Args:
         run: a run, completed or aborted, of any length.
-        path: the `.rrd` to write; an earlier one is replaced.
+        path: the `.rrd` to write; there must be none.
 
     Raises:
-        OutputError: the file cannot be written, or the environment switches rerun off.
+        OutputError: the file cannot be written or is there already, or the environment switches rerun off.
     """
     path = Path(path)
-    content = _encode(run, path)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.partial")
-    try:
-        temporary.write_bytes(content)
-        temporary.replace(path)
-    except OSError as error:
-        raise OutputError(path, error.strerror or str(error)) from error
-    finally:
-        with contextlib.suppress(OSError):  # there is none after success
-            temporary.unlink()
+    write_new(path, _encode(run, path))
 
 
 def _encode(run: Run, path: Path) -> bytes:

@@ -12,7 +12,7 @@ from typing import Final
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from quadsim import metrics, rundir
+from quadsim import metrics, outputs
 from quadsim.bench import Ladder, LadderFlight, ladder_legend, ladder_tables
 from quadsim.controller import Command, Controller, Moment
 from quadsim.errors import ParameterError
@@ -30,6 +30,8 @@ from scenarios.runner import Progress, machine, silent
 from scenarios.spec import Scenario
 
 FORMAT: Final = "quadsim bench ladder"
+KIND: Final = "bench ladder"
+"""What `quadsim.outputs` calls its directory."""
 RESULTS_FILE: Final = "ladder.json"
 TABLES_FILE: Final = "ladder.md"
 TIMED: Final = 3
@@ -192,8 +194,8 @@ def write_ladder(ladder: Ladder, directory: Path) -> None:
     """
     from quadsim.figures import write_ladder_figure
 
-    rundir.write_json(directory / RESULTS_FILE, {"format": FORMAT, **ladder.to_json()})
-    rundir.write_atomically(directory / TABLES_FILE, ladder_markdown(ladder))
+    outputs.write_json(directory / RESULTS_FILE, {"format": FORMAT, **ladder.to_json()})
+    outputs.write_text(directory / TABLES_FILE, ladder_markdown(ladder))
     write_ladder_figure(ladder, directory)
 
 
@@ -201,13 +203,3 @@ def ladder_markdown(ladder: Ladder) -> str:
     """All tables of a ladder, under what its controllers and conditions are."""
     sections = "\n".join(map(section, ladder_tables(ladder)))
     return f"# The ladder on {ladder.scenario}, {ladder.duration:g} s\n\n{ladder_legend(ladder)}\n{sections}"
-
-
-def is_ladder(directory: Path) -> bool:
-    """Whether a directory holds an earlier ladder and nothing else."""
-    own = {RESULTS_FILE, TABLES_FILE, "ladder.png", "ladder.svg"}
-    try:
-        said = (directory / RESULTS_FILE).read_text(encoding="utf-8")[:100]
-    except (OSError, UnicodeDecodeError):
-        return False
-    return f'"format": "{FORMAT}"' in said and {path.name for path in directory.iterdir()} <= own

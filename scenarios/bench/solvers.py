@@ -11,7 +11,7 @@ import numpy as np
 
 from mpc.problem import Problem
 from mpc.solvers import SOLVERS, Way
-from quadsim import rundir
+from quadsim import outputs
 from quadsim.bench import Contender, Growth, SolverBench, solver_tables
 from quadsim.errors import InputError, ParameterError, UnknownNameError
 from quadsim.table import Grid, grid_to_markdown
@@ -27,6 +27,8 @@ RESULTS_FILE: Final = "bench.json"
 TABLES_FILE: Final = "solvers.md"
 FORMAT: Final = "quadsim bench solvers"
 """What `bench.json` says it is."""
+KIND: Final = "bench of solvers"
+"""What `quadsim.outputs` calls its directory."""
 
 REPEATS: Final = 3
 HORIZONS: Final = (10, 20, 50, 100, 200)
@@ -106,8 +108,8 @@ def write_bench(bench: SolverBench, directory: Path) -> None:
     """
     from quadsim.figures import write_solver_figure
 
-    rundir.write_json(directory / RESULTS_FILE, {"format": FORMAT, **bench.to_json()})
-    (directory / TABLES_FILE).write_text(bench_markdown(bench), encoding="utf-8")
+    outputs.write_json(directory / RESULTS_FILE, {"format": FORMAT, **bench.to_json()})
+    outputs.write_text(directory / TABLES_FILE, bench_markdown(bench))
     write_solver_figure(bench, directory)
 
 
@@ -119,16 +121,6 @@ def bench_markdown(bench: SolverBench) -> str:
 def section(grid: Grid) -> str:
     """A table under its title, with its note, as Markdown."""
     return f"## {grid.title}\n\n{grid_to_markdown(grid)}\n{grid.note}".rstrip() + "\n"
-
-
-def is_bench(directory: Path) -> bool:
-    """Whether a directory holds an earlier bench and nothing else."""
-    own = {RESULTS_FILE, TABLES_FILE, "solvers.png", "solvers.svg"}
-    try:
-        said = (directory / RESULTS_FILE).read_text(encoding="utf-8")[:100]
-    except (OSError, UnicodeDecodeError):
-        return False
-    return f'"format": "{FORMAT}"' in said and {path.name for path in directory.iterdir()} <= own
 
 
 def _check(

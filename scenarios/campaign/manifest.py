@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final
 
-from quadsim.errors import FileError, InputError, OutputError
-from quadsim.rundir import read_json, write_atomically, write_json
+from quadsim.errors import FileError, InputError
+from quadsim.outputs import Growing, digest, digest_of, to_json
+from quadsim.rundir import read_json
 from scenarios.campaign.code import code_digest, controller_digest
 from scenarios.campaign.plan import Plan, load_plan
 from scenarios.campaign.spec import CampaignSpec
@@ -18,6 +18,8 @@ MANIFEST_FILE: Final = "manifest.json"
 CAMPAIGN_FILE: Final = "campaign.toml"
 SCENARIO_FILE: Final = "scenario.toml"
 FORMAT: Final = "quadsim campaign"
+KIND: Final = "campaign"
+"""What `quadsim.outputs` calls a campaign's directory."""
 _KEYS: Final = {
     "format": str,
     "name": str,
@@ -29,22 +31,17 @@ _KEYS: Final = {
 }
 
 
-def begin(plan: Plan, directory: Path) -> dict[str, Any]:
+def begin(plan: Plan, files: Growing) -> dict[str, Any]:
     """Write the files that define a campaign; its manifest comes last.
 
     Returns:
         The manifest.
 
     Raises:
-        OutputError: they cannot be written, or files of these names that say something else are there.
+        OutputError: they cannot be written, or files of these names that we did not write are there.
     """
     texts = _texts(plan)
-    for name, text in texts.items():
-        path = directory / name
-        if path.exists() and path.read_bytes() != text.encode():
-            raise OutputError(path, "is there already, and is no file of this campaign; choose another --out")
-    for name, text in texts.items():
-        write_atomically(directory / name, text)
+    files.write(texts)
     manifest: dict[str, Any] = {
         "format": FORMAT,
         "name": plan.spec.name,
@@ -53,20 +50,20 @@ def begin(plan: Plan, directory: Path) -> dict[str, Any]:
         "status": "running",
         "flights": plan.spec.flights,
         "flown": 0,
-        "files": {name: _digest(text.encode()) for name, text in texts.items()},
+        "files": {name: digest(text) for name, text in texts.items()},
         **_flown_by(plan),
         "sessions": [],
     }
-    write(manifest, directory)
+    write(manifest, files)
     return manifest
 
 
-def go_on(plan: Plan, directory: Path, *, flying: bool) -> dict[str, Any]:
+def go_on(plan: Plan, files: Growing, *, flying: bool) -> dict[str, Any]:
     """The manifest of a campaign that is gone on with, maybe by more flights; see `require_same`.
 
     Args:
         plan: the campaign.
-        directory: where it is.
+        files: of its directory.
         flying: whether anything is missing that has to be flown.
 
     Raises:
@@ -74,33 +71,32 @@ def go_on(plan: Plan, directory: Path, *, flying: bool) -> dict[str, Any]:
         InputError: other code would go on with it.
         OutputError: it cannot be written.
     """
-    manifest = read_manifest(directory)
+    manifest = read_manifest(files.path)
     if flying:
         differing = [name for name in other_than_flew(manifest, plan) if name != "machine"]
         if differing:
             raise InputError(
-                f"{directory}: --resume goes on with the same code alone, and this one differs from what flew the "
+                f"{files.path}: --resume goes on with the same code alone, and this one differs from what flew the "
                 f"first flights ({', '.join(differing)}): half of the numbers would be another program's; choose "
                 "another --out"
             )
     texts = _texts(plan)
-    files = {**manifest["files"], **{name: _digest(text.encode()) for name, text in texts.items()}}
-    manifest |= {"status": "running", "flights": plan.spec.flights, "files": files, "files_before": manifest["files"]}
-    write(manifest, directory)
-    for name, text in texts.items():
-        write_atomically(directory / name, text)
+    after = {**manifest["files"], **{name: digest(text) for name, text in texts.items()}}
+    manifest |= {"status": "running", "flights": plan.spec.flights, "files": after, "files_before": manifest["files"]}
+    write(manifest, files)
+    files.write(texts)
     del manifest["files_before"]
-    write(manifest, directory)
+    write(manifest, files)
     return manifest
 
 
-def write(manifest: Mapping[str, Any], directory: Path) -> None:
+def write(manifest: Mapping[str, Any], files: Growing) -> None:
     """Write or replace the manifest in one step.
 
     Raises:
-        OutputError: it cannot be written.
+        OutputError: it cannot be written, or is not as we wrote it.
     """
-    write_json(directory / MANIFEST_FILE, manifest)
+    files.write({MANIFEST_FILE: to_json(manifest).encode()})
 
 
 def require_same(plan: Plan, directory: Path) -> None:
@@ -175,20 +171,16 @@ def stored_plan(directory: Path) -> Plan:
     for name in (CAMPAIGN_FILE, SCENARIO_FILE):
         path = directory / name
         known = [files.get(name) for files in (manifest["files"], before) if isinstance(files, dict)]
-        if not path.is_file() or _digest(path.read_bytes()) not in known:
+        if not path.is_file() or digest_of(path) not in known:
             raise FileError(path, "is missing or not the file that was flown")
     return load_plan(str(directory / CAMPAIGN_FILE))
 
 
-def _texts(plan: Plan) -> Mapping[str, str]:
+def _texts(plan: Plan) -> Mapping[str, bytes]:
     """The campaign as files that need no others."""
-    return {CAMPAIGN_FILE: _own(plan).to_toml(), SCENARIO_FILE: plan.scenario.to_toml()}
+    return {CAMPAIGN_FILE: _own(plan).to_toml().encode(), SCENARIO_FILE: plan.scenario.to_toml().encode()}
 
 
 def _own(plan: Plan) -> CampaignSpec:
     """The campaign's file as its directory has it, with the scenario beside it."""
     return plan.spec.model_copy(update={"scenario": SCENARIO_FILE, "set": {}})
-
-
-def _digest(content: bytes) -> str:
-    return "sha256:" + hashlib.sha256(content).hexdigest()

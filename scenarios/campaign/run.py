@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import tempfile
 import time as clock
 from collections import Counter
 from collections.abc import Callable
@@ -18,10 +19,10 @@ import pyarrow.compute as pc
 from quadsim.campaign.estimates import estimate
 from quadsim.campaign.report import write_report
 from quadsim.campaign.statistics import proportion
-from quadsim.campaign.store import TIMES_FILE, Store, locked
+from quadsim.campaign.store import FLIGHTS_FILE, TIMES_FILE, Store
 from quadsim.campaign.table import Row, read_table
 from quadsim.errors import InputError, OutputError, ParameterError
-from quadsim.rundir import file_hashes, write_json
+from quadsim.outputs import Growing, digest_of, growing, to_json
 from scenarios.campaign import manifest as records
 from scenarios.campaign.engine import Engine
 from scenarios.campaign.pilot import CampaignPilot
@@ -29,6 +30,16 @@ from scenarios.campaign.plan import Plan
 
 SUMMARY_FILE: Final = "summary.json"
 REPORT_FILES: Final = ("index.html", "campaign.png", "campaign.svg")
+ALL_FILES: Final = (
+    records.CAMPAIGN_FILE,
+    records.SCENARIO_FILE,
+    records.MANIFEST_FILE,
+    SUMMARY_FILE,
+    FLIGHTS_FILE,
+    TIMES_FILE,
+    *REPORT_FILES,
+)
+"""What a campaign's directory holds in the end."""
 FLUSH_S: Final = 5.0
 """How long an answer may wait in memory before it is on the disk [s]."""
 CHECK_EVERY: Final = 10
@@ -104,17 +115,17 @@ def fly_campaign(
     if until_width is not None and not 0.0 < until_width < 1.0:
         raise ParameterError("", "--until-width", until_width, "between 0 and 1")
     session: dict[str, Any] = {"engine": engine.name, "workers": engine.workers, "flights": 0, "wall_s": None}
-    _require_place(directory, resume=resume)
-    with locked(directory):
+    if records.is_campaign(directory) and not resume:
+        raise OutputError(directory, "a campaign is already there; go on with it by --resume, or choose another --out")
+    with growing(directory, records.KIND) as files:
         going_on = records.is_campaign(directory)
         if going_on:
             records.require_same(plan, directory)
-        progress = _Progress(plan, directory, until_width=until_width, watch=watch)
-        manifest = (
-            records.go_on(plan, directory, flying=progress.missing) if going_on else records.begin(plan, directory)
-        )
+        files.require(ALL_FILES)
+        progress = _Progress(plan, files, until_width=until_width, watch=watch)
+        manifest = records.go_on(plan, files, flying=progress.missing) if going_on else records.begin(plan, files)
         manifest["sessions"].append(session)
-        records.write(manifest, directory)
+        records.write(manifest, files)
         try:
             progress.fly(engine)
         except BaseException:
@@ -123,15 +134,15 @@ def fly_campaign(
         finally:
             session |= {"flights": progress.flown, "wall_s": clock.perf_counter() - progress.started}
             manifest["flown"] = progress.done
-            records.write(manifest, directory)
-        return _conclude(plan, directory, progress, manifest, report=report)
+            records.write(manifest, files)
+        return _conclude(plan, files, progress, manifest, report=report)
 
 
 class _Progress:
     """A session: what is there, what is still to be flown, and what is waiting to be written."""
 
-    def __init__(self, plan: Plan, directory: Path, *, until_width: float | None, watch: Watch) -> None:
-        self.store = Store(directory, plan.schema)
+    def __init__(self, plan: Plan, files: Growing, *, until_width: float | None, watch: Watch) -> None:
+        self.store = Store(files, plan.schema)
         self.wanted = plan.spec.flights
         self.flown = 0
         self.started = clock.perf_counter()
@@ -217,43 +228,32 @@ class _Progress:
         return False
 
 
-def _require_place(directory: Path, *, resume: bool) -> None:
-    """A directory that this campaign may use."""
-    try:
-        directory.mkdir(parents=True, exist_ok=True)
-        entries = {path.name for path in directory.iterdir()}
-    except OSError as error:
-        raise OutputError(directory, error.strerror or str(error)) from error
-    if records.is_campaign(directory) and not resume:
-        raise OutputError(directory, "a campaign is already there; go on with it by --resume, or choose another --out")
-    begun = {records.CAMPAIGN_FILE, records.SCENARIO_FILE, ".lock"}  # by a process that died before its manifest
-    others = {name for name in entries - begun if not (name.startswith(".") and name.endswith(".partial"))}
-    if not records.is_campaign(directory) and others:
-        raise OutputError(directory, "something else is already there; choose another --out")
-
-
-def _conclude(plan: Plan, directory: Path, progress: _Progress, manifest: dict[str, Any], *, report: bool) -> Result:
+def _conclude(plan: Plan, files: Growing, progress: _Progress, manifest: dict[str, Any], *, report: bool) -> Result:
     """Final tables, estimates and report."""
+    directory = files.path
     table = progress.store.close(progress.wanted)
     summary = {"campaign": plan.spec.name, "scenario": plan.scenario.name, **estimate(table)}
-    write_json(directory / SUMMARY_FILE, summary)
-    for path in (*directory.glob(".*.partial"), *(directory / name for name in REPORT_FILES)):
-        path.unlink(missing_ok=True)  # what others left half written, and an earlier report
+    files.write({SUMMARY_FILE: to_json(summary).encode()})
     if report:
-        write_report(
-            directory,
-            table=table,
-            summary=summary,
-            manifest=manifest,
-            name=plan.spec.name,
-            description=plan.spec.description,
-            failure=plan.spec.failure,
-        )
-    ours = {name: digest for name, digest in file_hashes(directory).items() if not name.startswith(".")}
+        with tempfile.TemporaryDirectory() as scratch:
+            write_report(
+                Path(scratch),
+                campaign=directory,
+                table=table,
+                summary=summary,
+                manifest=manifest,
+                name=plan.spec.name,
+                description=plan.spec.description,
+                failure=plan.spec.failure,
+            )
+            files.write({name: (Path(scratch) / name).read_bytes() for name in REPORT_FILES})
+    else:
+        files.remove(REPORT_FILES)
+    ours = [name for name in ALL_FILES if name != records.MANIFEST_FILE and (directory / name).is_file()]
     manifest["machines"] = _machines(directory)
-    manifest["files"] = {name: digest for name, digest in ours.items() if name != records.MANIFEST_FILE}
+    manifest["files"] = {name: digest_of(directory / name) for name in ours}
     manifest["status"] = "complete" if progress.wanted == plan.spec.flights else "stopped"
-    records.write(manifest, directory)
+    records.write(manifest, files)
     return Result(directory=directory, manifest=manifest, table=table, summary=summary)
 
 

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import json
 from argparse import Namespace
-from pathlib import Path
 from typing import Any, Final
 
 from mpc.solvers import SOLVERS
-from quadsim import rundir
+from quadsim.outputs import real_path, writing
 from quadsim.table import Grid
 from scenarios import console, runner
 from scenarios.cli import EXIT_DONE
@@ -34,10 +33,10 @@ _Benched = tuple[dict[str, Any], list[Grid], str | None]
 
 def _bench_solvers(scenario: Scenario, options: Namespace, progress: runner.Progress) -> _Benched:
     from quadsim.bench import solver_tables
-    from scenarios.bench.solvers import bench_solvers, is_bench, write_bench
+    from scenarios.bench.solvers import KIND, bench_solvers, write_bench
 
-    target = Path(options.out)
-    with rundir.writing(target, replaces=is_bench) as directory:
+    target = real_path(options.out)
+    with writing(target, KIND) as directory:
         measured = bench_solvers(
             scenario,
             repeats=options.repeats,
@@ -68,10 +67,10 @@ def _bench_render(scenario: Scenario, options: Namespace, progress: runner.Progr
 
 def _bench_ladder(scenario: Scenario, options: Namespace, progress: runner.Progress) -> _Benched:
     from quadsim.bench import ladder_tables
-    from scenarios.bench.ladder import climb, is_ladder, write_ladder
+    from scenarios.bench.ladder import KIND, climb, write_ladder
 
-    target = Path(options.out)
-    with rundir.writing(target, replaces=is_ladder) as directory:
+    target = real_path(options.out)
+    with writing(target, KIND) as directory:
         ladder = climb(
             options.scenario,
             [*options.settings, f"seed={scenario.seed}"],

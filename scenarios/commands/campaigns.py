@@ -10,11 +10,12 @@ from typing import TYPE_CHECKING
 
 from quadsim import rundir
 from quadsim.errors import InputError, ParameterError
+from quadsim.outputs import real_path, require_directory, require_file
 from scenarios import console
 from scenarios.campaign.manifest import read_manifest, stored_plan
 from scenarios.cli import EXIT_DONE, EXIT_FAILED
 from scenarios.commands.common import print_summary
-from scenarios.junit import require_place, write_cases
+from scenarios.junit import write_cases
 from scenarios.runner import Outputs
 
 if TYPE_CHECKING:
@@ -30,14 +31,14 @@ def campaign(options: Namespace) -> int:
     from scenarios.campaign.run import fly_campaign
 
     requirements = [parse_requirement(text) for text in options.requirements]
-    if options.junit and not requirements:
+    if options.junit is not None and not requirements:
         raise ParameterError("", "--junit", options.junit, "given with --require, whose verdicts it is to hold")
-    if options.junit:
-        require_place(Path(options.junit))
+    if options.junit is not None:
+        require_file(options.junit)
     plan = load_plan(options.file, options.settings, flights=options.flights, seed=options.seed)
     for requirement in requirements:
         parse_event(requirement.event.text, plan.columns)
-    target = Path(options.out) if options.out else Path("runs") / "campaigns" / plan.spec.name
+    target = real_path(Path("runs") / "campaigns" / plan.spec.name if options.out is None else options.out)
     engine = _engine(options)
     try:
         with progress(enabled=not options.json) as watch:
@@ -54,7 +55,7 @@ def campaign(options: Namespace) -> int:
         print(f"quadsim: interrupted (Ctrl-C); {target} has what was flown, --resume goes on with it", file=sys.stderr)
         return EXIT_FAILED
     judgements = [judge(result.table, requirement) for requirement in requirements]
-    if options.junit:
+    if options.junit is not None:
         cases = [(judgement.requirement.text, judgement.holds, judgement.sentence) for judgement in judgements]
         write_cases(plan.spec.name, cases, Path(options.junit))
     if options.json:
@@ -86,7 +87,7 @@ def replay(options: Namespace) -> int:
 
     directory = Path(options.campaign)
     flight = recorded_flight(directory, options.flight)
-    target = Path(options.out) if options.out else Path("runs") / flight.scenario.name
+    target = real_path(Path("runs") / flight.scenario.name if options.out is None else options.out)
     outputs = Outputs(video=options.video, recording=options.recording, figures=options.figures)
     if flight.otherwise:
         print(
@@ -103,7 +104,7 @@ def replay(options: Namespace) -> int:
 def compare_campaigns(options: Namespace) -> int:
     """`quadsim compare` of two campaigns, flight by flight."""
     from quadsim.campaign.comparison import compare
-    from quadsim.campaign.comparison_report import write_comparison_report
+    from quadsim.campaign.comparison_report import KIND, write_comparison_report
     from quadsim.campaign.store import FLIGHTS_FILE
     from quadsim.campaign.table import read_table
     from scenarios.campaign.console import print_comparison
@@ -112,11 +113,13 @@ def compare_campaigns(options: Namespace) -> int:
         raise InputError(f"compare takes two campaigns, each by itself, not {len(options.targets)}")
     if options.cost:
         raise ParameterError("", "--cost", True, "absent when campaigns are compared")
+    target = real_path(options.out)
+    require_directory(target, KIND)
     first, second = (Path(name) for name in options.targets)
     names = (str(read_manifest(first)["name"]), str(read_manifest(second)["name"]))
     failures = (stored_plan(first).spec.failure, stored_plan(second).spec.failure)
     comparison = compare(read_table(first / FLIGHTS_FILE), read_table(second / FLIGHTS_FILE), names, failures)
-    page = write_comparison_report(comparison, Path(options.out))
+    page = write_comparison_report(comparison, target)
     if options.markdown:
         print(comparison.to_markdown())
     else:

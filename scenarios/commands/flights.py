@@ -8,6 +8,7 @@ from typing import Any
 
 from quadsim import rundir
 from quadsim.errors import FileError, ParameterError
+from quadsim.outputs import real_path, require_directory, require_file
 from scenarios import console, runner
 from scenarios.build import build_vehicle
 from scenarios.campaign.manifest import is_campaign
@@ -15,7 +16,7 @@ from scenarios.cli import EXIT_DONE, EXIT_FAILED
 from scenarios.commands.campaigns import compare_campaigns
 from scenarios.commands.common import load, print_summary
 from scenarios.courses import report
-from scenarios.junit import require_place, write_junit
+from scenarios.junit import write_junit
 from scenarios.loading import load_scenario
 from scenarios.runner import Outputs
 from scenarios.spec import Scenario
@@ -24,7 +25,7 @@ from scenarios.spec import Scenario
 def run(options: Namespace) -> int:
     """`quadsim run`."""
     scenario = load(options.scenario, options)
-    target = Path(options.out) if options.out else Path("runs") / scenario.name
+    target = real_path(Path("runs") / scenario.name if options.out is None else options.out)
     outputs = Outputs(video=options.video, recording=options.recording, figures=options.figures)
     _announce(scenario, options)
     with console.progress_bars(enabled=not options.json) as progress:
@@ -35,8 +36,8 @@ def run(options: Namespace) -> int:
 
 def check(options: Namespace) -> int:
     """`quadsim check`."""
-    if options.junit:
-        require_place(Path(options.junit))
+    if options.junit is not None:
+        require_file(options.junit)
     if Path(options.target).is_dir():
         if options.settings or options.seed is not None:
             option, value = ("--set", options.settings) if options.settings else ("--seed", options.seed)
@@ -47,7 +48,7 @@ def check(options: Namespace) -> int:
         _announce(scenario, options)
         with console.progress_bars(enabled=not options.json) as progress:
             summary = runner.summarise(runner.fly_scenario(scenario, progress))
-    if options.junit:
+    if options.junit is not None:
         write_junit(summary, Path(options.junit))
     print_summary(summary, options)
     return EXIT_DONE if summary["satisfied"] else EXIT_FAILED
@@ -56,13 +57,14 @@ def check(options: Namespace) -> int:
 def compare(options: Namespace) -> int:
     """`quadsim compare`."""
     from quadsim.comparison import comparison_rows, run_names
-    from quadsim.report import write_comparison
+    from quadsim.report import KIND, write_comparison
     from quadsim.table import to_markdown
     from scenarios.cost import find_study, study_cost
 
     if any(is_campaign(Path(name)) for name in options.targets):
         return compare_campaigns(options)
-    target = Path(options.out)
+    target = real_path(options.out)
+    require_directory(target, KIND)
     for name in options.targets:  # what is wrong with any of them is said before the first is flown
         if Path(name).is_dir():
             rundir.read_summary(Path(name))

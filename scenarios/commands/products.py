@@ -2,29 +2,43 @@
 
 from __future__ import annotations
 
+import tempfile
 from argparse import Namespace
 from pathlib import Path
 
 from quadsim import rundir
 from quadsim.errors import FileError, ParameterError
+from quadsim.outputs import real_path
 from scenarios import console
 from scenarios.cli import EXIT_DONE
 
 
 def video(options: Namespace) -> int:
     """`quadsim video`."""
-    from quadsim.video import render_gif, render_video
-
     directory = Path(options.run)
     rundir.read_summary(directory)
-    path = Path(options.out) if options.out else directory / rundir.VIDEO_FILE
+    path = real_path(directory / rundir.VIDEO_FILE if options.out is None else options.out)
     if options.workers is not None and options.workers < 1:
         raise ParameterError("", "--workers", options.workers, "at least 1")
     if path.suffix not in (".mp4", ".gif"):
         raise ParameterError("", "--out", options.out, "a file ending in .mp4 or .gif")
+    if path.resolve().parent == directory.resolve():
+        with rundir.adding(directory, path.name) as add, tempfile.TemporaryDirectory() as scratch:
+            film = Path(scratch) / path.name
+            _film(directory, film, options)
+            add(film.read_bytes())
+    else:
+        _film(directory, path, options)
+    print(f"written to {path}")
+    return EXIT_DONE
+
+
+def _film(directory: Path, path: Path, options: Namespace) -> None:
+    from quadsim.video import render_gif, render_video
+
     with console.progress_bars(enabled=True) as progress:
         if path.suffix == ".gif":
-            render_gif(directory, path)
+            render_gif(directory, path, workers=options.workers)
         else:
             render_video(
                 directory,
@@ -32,10 +46,6 @@ def video(options: Namespace) -> int:
                 workers=options.workers,
                 progress=lambda done, total: progress("video", done, total),
             )
-    if path.parent.resolve() == directory.resolve():
-        rundir.refresh_hashes(directory)
-    print(f"written to {path}")
-    return EXIT_DONE
 
 
 def view(options: Namespace) -> int:

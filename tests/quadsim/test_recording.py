@@ -430,9 +430,8 @@ def test_equal_flights_have_one_identity_and_others_another(path: Path, short_ru
     assert first != other
 
 
-def test_an_earlier_recording_is_replaced_and_nothing_else_is_left(short_run: Run, tmp_path: Path) -> None:
+def test_nothing_but_the_recording_is_left(short_run: Run, tmp_path: Path) -> None:
     target = tmp_path / "flight.rrd"
-    target.write_bytes(b"old")
     before = dict(os.environ)
     rr.set_strict_mode(False)
     write_recording(short_run, target)
@@ -443,11 +442,19 @@ def test_an_earlier_recording_is_replaced_and_nothing_else_is_left(short_run: Ru
     assert rr.get_global_data_recording() is None
 
 
-def test_a_full_disk_leaves_the_earlier_recording(short_run: Run, tmp_path: Path) -> None:
+def test_what_is_there_is_not_replaced(short_run: Run, tmp_path: Path) -> None:
+    target = tmp_path / "flight.rrd"
+    target.write_bytes(b"mine")
+    with pytest.raises(OutputError, match="something else is already there"):
+        write_recording(short_run, target)
+    assert target.read_bytes() == b"mine"
+    assert [entry.name for entry in tmp_path.iterdir()] == ["flight.rrd"]
+
+
+def test_a_full_disk_leaves_nothing(short_run: Run, tmp_path: Path) -> None:
     """No file may grow beyond 100 kB meanwhile."""
     resource = pytest.importorskip("resource")
     target = tmp_path / "flight.rrd"
-    target.write_bytes(b"old")
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, hard))
     try:
@@ -455,8 +462,7 @@ def test_a_full_disk_leaves_the_earlier_recording(short_run: Run, tmp_path: Path
             write_recording(short_run, target)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
-    assert [entry.name for entry in tmp_path.iterdir()] == ["flight.rrd"]
-    assert target.read_bytes() == b"old"
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_place_that_cannot_be_written_is_said(short_run: Run, tmp_path: Path) -> None:

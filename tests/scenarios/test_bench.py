@@ -30,7 +30,7 @@ from scenarios.bench.campaign import bench_campaign
 from scenarios.bench.contenders import Entry, StepEntrant, entries, judge, reference_optima
 from scenarios.bench.flight import bench_flight
 from scenarios.bench.race import race, stretches
-from scenarios.bench.solvers import bench_solvers, is_bench
+from scenarios.bench.solvers import bench_solvers
 from scenarios.build import build_problem, build_vehicle
 from scenarios.cli import EXIT_DONE, EXIT_WRONG_INPUT, main
 from scenarios.loading import load_scenario
@@ -204,8 +204,7 @@ def test_a_bench_is_written_whole_and_replaced_only_by_another(
     command = ["bench", "solvers", *ARGUMENTS, "--solver", "daqp", "--horizons", "5,10", "--out", str(target)]
     assert main(command) == EXIT_DONE
     assert "daqp + shortcut" in capsys.readouterr().out
-    assert {path.name for path in target.iterdir()} == FILES
-    assert is_bench(target)
+    assert {path.name for path in target.iterdir()} == {*FILES, ".quadsim.json"}
     kept = json.loads((target / "bench.json").read_text())
     assert kept["asked"] == len(kept["contenders"][0]["step_ms_by_period"]) == 60
     assert kept["machine"]["cores"] >= 1
@@ -217,8 +216,8 @@ def test_a_bench_is_written_whole_and_replaced_only_by_another(
 
     (target / "mine.txt").write_text("not to be lost")
     assert main(command) == EXIT_WRONG_INPUT
-    assert "something else is already there" in capsys.readouterr().err
-    assert {path.name for path in target.iterdir()} == {*FILES, "mine.txt"}
+    assert "it holds mine.txt, not as quadsim wrote it; choose another --out" in capsys.readouterr().err
+    assert {path.name for path in target.iterdir()} == {*FILES, ".quadsim.json", "mine.txt"}
 
 
 def test_a_solver_that_is_not_installed_is_named_and_left_out(monkeypatch: pytest.MonkeyPatch) -> None:

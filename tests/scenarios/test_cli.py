@@ -536,7 +536,7 @@ def test_a_long_flight_that_is_stopped_is_kept_up_to_there(tmp_path: Path, stop:
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),  # a shell's `&` has it ignored
     )
     deadline = clock.monotonic() + 30.0
-    while not list(tmp_path.glob(".run.*.partial")):
+    while not list(tmp_path.glob(".quadsim-*.partial")):
         assert clock.monotonic() < deadline, "the flight did not begin"
         clock.sleep(0.02)
     clock.sleep(3.0)

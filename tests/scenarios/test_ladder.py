@@ -19,7 +19,7 @@ from quadsim.bench import Ladder, LadderFlight, ladder_legend, ladder_tables
 from quadsim.errors import InputError, ParameterError
 from quadsim.table import Mark
 from scenarios.bench.climbers import CLIMBERS, FULL, equip, tilt_bound
-from scenarios.bench.ladder import Cell, climb, fly_cell, is_ladder, ladder_markdown, time_cell, write_ladder
+from scenarios.bench.ladder import Cell, climb, fly_cell, ladder_markdown, time_cell, write_ladder
 from scenarios.bench.processes import answer_all
 from scenarios.bench.rungs import CONDITIONS
 from scenarios.cli import EXIT_DONE, EXIT_WRONG_INPUT, main
@@ -200,10 +200,9 @@ def test_steps_are_timed_of_the_full_controller_and_in_the_first_condition(monke
         assert flight.step_p99 == (1.0 if controller == FULL or condition == "nominal" else None)
 
 
-def test_a_ladder_is_written_whole_and_replaces_its_own_kind(quick: Ladder, tmp_path: Path) -> None:
+def test_a_ladder_is_written_whole_and_the_same_each_time(quick: Ladder, tmp_path: Path) -> None:
     write_ladder(quick, tmp_path)
     assert {path.name for path in tmp_path.iterdir()} == FILES
-    assert is_ladder(tmp_path)
     data = json.loads((tmp_path / "ladder.json").read_text())
     assert data["format"] == "quadsim bench ladder"
     assert {entry["controller"] for entry in data["flights"]} == set(quick.controllers)
@@ -212,11 +211,9 @@ def test_a_ladder_is_written_whole_and_replaces_its_own_kind(quick: Ladder, tmp_
     assert ">lost<" in drawing
     assert (tmp_path / "ladder.md").read_text() == ladder_markdown(quick)
     first = drawing
-    write_ladder(quick, tmp_path)
-    assert (tmp_path / "ladder.svg").read_text() == first
-    (tmp_path / "notes.txt").write_text("mine")
-    assert not is_ladder(tmp_path)
-    assert not is_ladder(tmp_path / "nowhere")
+    (tmp_path / "again").mkdir()
+    write_ladder(quick, tmp_path / "again")
+    assert (tmp_path / "again" / "ladder.svg").read_text() == first
 
 
 def test_the_figure_of_a_made_up_ladder_tells_each_fate(tmp_path: Path) -> None:
@@ -270,7 +267,7 @@ def test_the_command_prints_json_alone(
     assert main(["bench", "ladder", "--quick", "--json", "--out", str(tmp_path / "ladder")]) == EXIT_DONE
     printed = json.loads(capsys.readouterr().out)
     assert len(printed["flights"]) == 9
-    assert {path.name for path in (tmp_path / "ladder").iterdir()} == FILES
+    assert {path.name for path in (tmp_path / "ladder").iterdir()} == {*FILES, ".quadsim.json"}
 
 
 def _slow_first(number: int) -> int:

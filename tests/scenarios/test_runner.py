@@ -324,6 +324,7 @@ def test_outputs_are_made_as_asked_for(tmp_path: Path, monkeypatch: pytest.Monke
     names = {path.name for path in (tmp_path / "run").iterdir()}
     assert names == {
         "summary.json", "scenario.toml", FLIGHT_FILE, TIMING_FILE, PLANT_FILE, HORIZON_FILE, "flight.rrd", "figures",
+        ".quadsim.json",
     }  # fmt: skip
     assert list((tmp_path / "run" / "figures").glob("*.png"))
     assert rundir.damaged_files(tmp_path / "run", rundir.read_summary(tmp_path / "run")) == []

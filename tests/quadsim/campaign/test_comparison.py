@@ -9,7 +9,7 @@ import pyarrow as pa
 import pytest
 
 from quadsim.campaign.comparison import compare
-from quadsim.campaign.comparison_report import is_comparison_report, write_comparison_report
+from quadsim.campaign.comparison_report import write_comparison_report
 from quadsim.errors import InputError, OutputError
 
 MakeCampaign = Callable[..., pa.Table]
@@ -126,11 +126,11 @@ def test_a_comparison_is_plain_data_and_a_table(thousand: pa.Table, better: pa.T
 def test_the_page_stands_with_its_files(thousand: pa.Table, better: pa.Table, tmp_path: Path) -> None:
     hostile = ("<b>paper</b>", "robust & more")
     page = write_comparison_report(compare(thousand, better, hostile), tmp_path / "out")
-    assert {path.name for path in page.parent.iterdir()} == {"index.html", "comparison.json", "comparison.md"}
+    names = {path.name for path in page.parent.iterdir()}
+    assert names == {"index.html", "comparison.json", "comparison.md", ".quadsim.json"}
     text = page.read_text()
     assert "<b>paper</b>" not in text
     assert "&lt;b&gt;paper&lt;/b&gt;" in text
-    assert is_comparison_report(page.parent)
     write_comparison_report(compare(thousand, thousand, NAMES), tmp_path / "out")
     assert "not distinguishable" in page.read_text()
     theirs = tmp_path / "theirs"

@@ -196,6 +196,7 @@ def test_a_browser_draws_the_page_and_has_no_complaint(make_campaign: MakeCampai
     assert "Chart Studio" not in report["buttons"]
 
 
-def test_a_place_that_is_not_there_is_told(thousand: pa.Table, tmp_path: Path) -> None:
-    with pytest.raises(OutputError, match="No such file"):
-        write_report(tmp_path / "gone", table=thousand, summary=estimate(thousand), manifest={}, name="a")
+def test_a_place_that_cannot_be_is_told(thousand: pa.Table, tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(OutputError, match="Not a directory"):
+        write_report(tmp_path / "file" / "gone", table=thousand, summary=estimate(thousand), manifest={}, name="a")
