@@ -524,7 +524,84 @@ def test_a_reader_that_goes_away_gets_no_traceback_and_no_status_0(options: list
     assert (process.wait(timeout=60), said) == (EXIT_FAILED, b"")
 
 
-@pytest.mark.parametrize("stop", [signal.SIGINT, signal.SIGTERM])
+ITSELF = """
+import os, signal, sys, threading
+from scenarios.entry import main
+after, stop = float(sys.argv[1]), int(sys.argv[2])
+timers = [threading.Timer(after, os.kill, (os.getpid(), stop))]
+listen = signal.signal
+def listening(which, handler):
+    before = listen(which, handler)
+    if which == signal.SIGHUP and timers:  # the last that is listened to
+        timers.pop().start()
+    return before
+signal.signal = listening
+if signal.getsignal(signal.SIGHUP) is signal.SIG_IGN:
+    timers.pop().start()
+sys.argv[:] = ["quadsim", *sys.argv[3:]]
+sys.exit(main())
+"""
+
+
+@pytest.mark.parametrize("stop", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+@pytest.mark.parametrize("delay", [0.0, 0.03, 0.1, 0.3])
+def test_who_is_told_to_stop_in_the_first_moments_ends_in_order(
+    tmp_path: Path, stop: signal.Signals, delay: float
+) -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", ITSELF, str(delay), str(int(stop)), "run", "hover", "--set", "duration=600"],
+        cwd=tmp_path,
+        env=environment(),
+        capture_output=True,
+        text=True,
+        timeout=60,
+        preexec_fn=listening,
+    )
+    assert done.returncode == EXIT_FAILED, done.stderr
+    assert "Traceback" not in done.stderr
+    assert "interrupted (Ctrl-C)" in done.stderr + done.stdout
+    assert {path.name for path in tmp_path.iterdir()} <= {"runs"}
+
+
+def listening() -> None:
+    """A shell's `&` has these signals ignored."""
+    for stop in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        signal.signal(stop, signal.SIG_DFL)
+
+
+def test_who_was_started_by_nohup_goes_on(tmp_path: Path) -> None:
+    command = [sys.executable, "-c", ITSELF, "0.5", str(int(signal.SIGHUP)), "run", "hover", *TABLES, *SHORT]
+    done = subprocess.run(
+        command,
+        cwd=tmp_path,
+        env=environment(),
+        capture_output=True,
+        timeout=60,
+        preexec_fn=lambda: signal.signal(signal.SIGHUP, signal.SIG_IGN),
+    )
+    assert (done.returncode, done.stderr) == (EXIT_DONE, b"")
+
+
+@pytest.mark.parametrize("closed", [(1,), (2,), (0, 1, 2), (0,)])
+def test_closed_streams_do_no_harm(tmp_path: Path, closed: tuple[int, ...]) -> None:
+    done = subprocess.run(
+        [sys.executable, "-m", "scenarios.cli", "run", "hover", *TABLES, *SHORT, "--out", "run"],
+        cwd=tmp_path,
+        env=environment(),
+        capture_output=True,
+        text=True,
+        timeout=60,
+        preexec_fn=lambda: [os.close(number) for number in closed],
+    )
+    if 1 in closed:
+        told = "" if 2 in closed else "quadsim: stdout is closed; to do without what is printed: >/dev/null\n"
+        assert (done.returncode, done.stderr, list(tmp_path.iterdir())) == (EXIT_WRONG_INPUT, told, [])
+    else:
+        assert (done.returncode, done.stderr) == (EXIT_DONE, "")
+        rundir.load_run(tmp_path / "run")
+
+
+@pytest.mark.parametrize("stop", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_a_long_flight_that_is_stopped_is_kept_up_to_there(tmp_path: Path, stop: signal.Signals) -> None:
     process = subprocess.Popen(
         [sys.executable, "-m", "scenarios.cli", "run", "hover", *TABLES, "--set", "duration=1800", "--out", "run"],
@@ -533,7 +610,7 @@ def test_a_long_flight_that_is_stopped_is_kept_up_to_there(tmp_path: Path, stop:
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),  # a shell's `&` has it ignored
+        preexec_fn=listening,
     )
     deadline = clock.monotonic() + 30.0
     while not list(tmp_path.glob(".quadsim-*.partial")):

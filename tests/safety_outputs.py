@@ -1,0 +1,349 @@
+"""Random trees, random places to write to, every command that writes: nothing that is not ours may change by one byte.
+
+As root it goes on as an ordinary user who may read everything and write nowhere but in a directory of its own:
+`python tests/safety_outputs.py --count 2000`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import hashlib
+import io
+import json
+import os
+import shutil
+import stat
+import subprocess
+import sys
+import tempfile
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Final
+from unittest import mock
+
+from hypothesis import HealthCheck, Phase, assume, given, seed, settings
+from hypothesis import strategies as st
+
+from quadsim.errors import OutputError
+from quadsim.outputs import real_path, require_directory, require_file, staging
+from scenarios.cli import main
+
+ROOT: Final = Path(__file__).resolve().parent.parent
+SHORT: Final = ("--set", "duration=0.1", "--no-video", "--no-recording", "--no-figures")
+CAMPAIGN: Final = """name = "small"
+scenario = "hover"
+flights = 2
+set = { duration = 0.1 }
+failure = ["lost"]
+[[vary]]
+name = "mass"
+fields = ["vehicle.mass"]
+distribution = "uniform"
+low = 4.3
+high = 4.5
+"""
+NAMES: Final = (
+    *("p", "P", "run", "Run", "a.", "a..", "...", "é", "e\u0301", " x", "x\n", "-o", "[red]", "*", "~", "\udcff"),
+    *("keep", "notes.md", "thesis.txt", ".draft.partial", ".quadsim-0.partial", ".lock", ".quadsim.json", "parts"),
+    *("index.html", "summary.json", "scenario.toml", "campaign.toml", "manifest.json", "flight.mp4", "figures"),
+)
+PLACES: Final = st.lists(
+    st.sampled_from(
+        [name for name in (*NAMES, "..", ".", "nope", "", "p", "p", "run", "run") if "partial" not in name]
+    ),
+    min_size=1,
+    max_size=4,
+).map("/".join)
+
+
+@dataclass(frozen=True)
+class Entry:
+    """Something in a tree: a path of names below it, and what is there."""
+
+    path: tuple[str, ...]
+    kind: str
+    content: str
+
+
+ENTRIES: Final = st.builds(
+    Entry,
+    st.lists(st.sampled_from(NAMES), min_size=1, max_size=3).map(tuple),
+    st.sampled_from(["file", "file", "folder", "link", "fifo", "run", "comparison", "campaign", "junit", "dead"]),
+    st.one_of(st.sampled_from(["", "mine", "<meta name='generator' content='quadsim comparison'>"]), PLACES),
+)
+SAVED: Final = st.builds(Entry, st.just(()), st.sampled_from(["file", "folder", "into"]), st.just("mine"))
+"""What somebody saves at the target while the command runs."""
+
+
+@dataclass(kw_only=True)
+class Inputs:
+    """What commands read: a run, a comparison, a campaign, and files of verdicts, all of ours and intact."""
+
+    folder: Path
+    counted: Counter[str] = field(default_factory=Counter)
+
+    def make(self) -> None:
+        """Have the commands make them."""
+        self.folder.mkdir()
+        (self.folder / "small.toml").write_text(CAMPAIGN)
+        for command in (
+            ["run", "hover", *SHORT, "--out", self["run"]],
+            ["check", self["run"], "--junit", self["junit"]],
+            ["compare", self["run"], "--out", self["comparison"]],
+            ["campaign", self["small.toml"], "--out", self["campaign"], "--workers", "1"],
+        ):
+            status, said = call(command)
+            assert status == 0, said
+
+    def __getitem__(self, name: str) -> str:
+        return str(self.folder / name)
+
+
+WRITERS: Final[dict[str, tuple[int, int]]] = {
+    "run": (12, 10**9),
+    "check": (6, 10**9),
+    "junit": (12, 10**9),
+    "replay": (8, 10**9),
+    "campaign": (6, 40),
+    "resume": (6, 60),
+    "compare": (8, 30),
+    "compare campaigns": (4, 30),
+    "vehicle": (6, 15),
+    "video": (6, 8),
+    "bench solvers": (3, 3),
+    "bench ladder": (3, 0),
+}
+"""How often each comes up, and how many may go all the way; the others only where they are refused at the door."""
+
+
+def command_of(writer: str, inputs: Inputs, out: str) -> tuple[list[str], str | None]:
+    """The command line that writes to a place, and whether it makes a directory of ours, of which kind."""
+    given = f"--out={out}"
+    match writer:
+        case "run":
+            return ["run", "hover", *SHORT, given], "run"
+        case "check":
+            return ["check", "hover", "--set", "duration=0.1", f"--junit={out}"], None
+        case "junit":
+            return ["check", inputs["run"], f"--junit={out}"], None
+        case "replay":
+            return ["replay", inputs["campaign"], "--no-video", "--no-recording", "--no-figures", given], "run"
+        case "campaign":
+            return ["campaign", inputs["small.toml"], "--workers", "1", given], "campaign"
+        case "resume":
+            return ["campaign", inputs["small.toml"], "--workers", "1", "--resume", given], "campaign"
+        case "compare":
+            return ["compare", inputs["run"], given], "comparison"
+        case "compare campaigns":
+            return ["compare", inputs["campaign"], inputs["campaign"], given], "campaign comparison"
+        case "vehicle":
+            return ["vehicle", "crazyflie2", f"{given}.png"], None
+        case "video":
+            return ["video", inputs["run"], f"{given}.gif"], None
+        case "bench solvers":
+            options = ("--repeats", "1", "--horizons", "none", "--solver", "piqp-multistage", "--stride", "2")
+            return ["bench", "solvers", "--set", "duration=2", *options, given], "bench of solvers"
+    return ["bench", "ladder", "--quick", given], "bench ladder"
+
+
+def build(tree: Sequence[Entry], base: Path, inputs: Inputs) -> set[Path]:
+    """Make a tree; the paths in it that are outputs of ours."""
+    ours: set[Path] = set()
+    for entry in tree:
+        path = base.joinpath(*entry.path)
+        with contextlib.suppress(OSError):  # a name that is taken, or below a file
+            path.parent.mkdir(parents=True, exist_ok=True)
+            if os.path.lexists(path) or any(parent in ours for parent in path.parents if entry.kind != "file"):
+                continue
+            match entry.kind:
+                case "file":
+                    path.write_bytes(os.fsencode(entry.content))
+                case "folder":
+                    path.mkdir()
+                case "link":
+                    path.symlink_to(entry.content or "..")
+                case "fifo":
+                    os.mkfifo(path)
+                case "junit":
+                    shutil.copyfile(inputs["junit"], path)
+                    ours.add(path)
+                case "dead":
+                    shutil.copytree(inputs["run"], path)  # as if of a process that died, with a file beside it
+                    (path / "owner.json").write_text('{"pid": 1, "inode": 0}')
+                case _:
+                    shutil.copytree(inputs[entry.kind], path)
+                    ours |= {path, *path.rglob("*")}
+    return ours
+
+
+def state(base: Path) -> dict[str, str]:
+    """Everything in a tree: its kind, and its content or where it leads."""
+    found = {}
+    for folder, folders, files in os.walk(base):
+        for name in (*folders, *files):
+            path = Path(folder, name)
+            mode = path.lstat().st_mode
+            what = stat.filemode(mode)
+            if stat.S_ISLNK(mode):
+                what += f" {path.readlink()}"
+            elif stat.S_ISREG(mode):
+                what += hashlib.sha256(path.read_bytes()).hexdigest()
+            found[str(path)] = what
+    return found
+
+
+def call(command: Sequence[str]) -> tuple[int, str]:
+    """Run a command line in this process: its exit status, and what it said on stderr."""
+    out = io.TextIOWrapper(io.BytesIO(), encoding="utf-8")
+    err = io.TextIOWrapper(io.BytesIO(), encoding="utf-8", errors="backslashreplace")
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+        try:
+            status = main(command)
+        except SystemExit as error:
+            status = int(error.code or 0)
+    err.flush()
+    return status, err.buffer.getvalue().decode()  # type: ignore[attr-defined]
+
+
+@contextlib.contextmanager
+def saved_meanwhile(entry: Entry | None, target: Path, note: Callable[[], None]) -> Iterator[None]:
+    """Somebody saves something at the target, or into it, right before it gets its name."""
+    put = staging.Staging.put
+    pending = [entry]
+
+    def late(self: staging.Staging, new: Path, place: Path, problem: Callable[[Path], str | None]) -> None:
+        saved = pending.pop() if pending and place == target else None
+        if saved is not None:
+            with contextlib.suppress(OSError):
+                if saved.kind == "file":
+                    target.write_bytes(b"mine") if not os.path.lexists(target) else None
+                else:
+                    target.mkdir(exist_ok=True)
+                if saved.kind == "into":
+                    (target / "thesis.txt").write_bytes(b"mine")
+            note()
+        put(self, new, place, problem)
+
+    with mock.patch.object(staging.Staging, "put", late):
+        yield
+
+
+def check_case(
+    base: Path, inputs: Inputs, tree: Sequence[Entry], writer: str, out: str, meanwhile: Entry | None
+) -> None:
+    """One case: build the tree, run the command in it, look at what became of it."""
+    shutil.rmtree(base, ignore_errors=True)
+    base.mkdir()
+    ours = build(tree, base, inputs)
+    os.chdir(base)
+    command, kind = command_of(writer, inputs, out)
+    place = next(part.partition("=")[2] for part in reversed(command) if part.startswith(("--out=", "--junit=")))
+    refused = True
+    try:
+        target = real_path(place)
+        require_directory(target, kind) if kind else require_file(target)
+        refused = False
+    except OutputError:
+        target = base / "nowhere"
+    assume(target.is_absolute() is False or target.is_relative_to(base) or refused)
+    target = Path(os.path.realpath(target))
+    if not refused:
+        assume(inputs.counted[f"{writer}: done"] < WRITERS[writer][1])
+    before = {path: what for path, what in state(base).items() if Path(path) not in ours}
+    whole = state(base)
+
+    def note() -> None:
+        nonlocal whole
+        late = {path: what for path, what in state(base).items() if ".quadsim-" not in path}
+        before.update({path: what for path, what in late.items() if path not in whole and Path(path) not in ours})
+        before.pop(str(target), None) if target.is_dir() and not any(target.iterdir()) else None
+        whole = late
+
+    with saved_meanwhile(meanwhile, target, note):
+        status, said = call(command)
+    after = state(base)
+    inputs.counted["cases"] += 1
+    inputs.counted[f"{writer}: {'done' if status != 2 else 'refused'}"] += 1
+    assert status in (0, 1, 2), said
+    assert "Traceback" not in said
+    changed = {path for path, what in before.items() if after.get(path) != what}
+    empty = {str(target)} if stat.S_ISDIR(target.lstat().st_mode if os.path.lexists(target) else 0) else set()
+    assert not changed - empty, f"{sorted(changed - empty)} changed; {said}"
+    if status == 2:
+        assert said.count("\n") == 1, said
+        assert said.startswith("quadsim: "), said
+        assert after == whole, f"left behind or lost: {sorted(after.items() ^ whole.items())}; {said}"
+    else:
+        assert not [path for path in after if ".quadsim-" in path and path not in before], "a staging directory stays"
+
+
+def attack(scratch: Path, count: int, number: int) -> dict[str, int]:
+    """Go through so many cases in a directory of one's own; how many of each command were refused and done."""
+    inputs = Inputs(folder=scratch / "inputs")
+    inputs.make()
+    before = state(inputs.folder)
+    writers = [name for name, (weight, _) in WRITERS.items() for _ in range(weight)]
+
+    @seed(number)
+    @settings(
+        max_examples=count,
+        deadline=None,
+        database=None,
+        phases=[Phase.generate, Phase.shrink],
+        suppress_health_check=list(HealthCheck),
+    )
+    @given(st.lists(ENTRIES, max_size=6), st.sampled_from(writers), PLACES, st.none() | SAVED, st.booleans())
+    def cases(tree: list[Entry], writer: str, place: str, meanwhile: Entry | None, absolute: bool) -> None:
+        out = f"{scratch / 'case'}/{place}" if absolute else place
+        check_case(scratch / "case", inputs, tree, writer, out, meanwhile)
+
+    cases()
+    os.chdir(scratch)
+    assert state(inputs.folder) == before, "what the commands read was changed"
+    return dict(sorted(inputs.counted.items()))
+
+
+def measure(count: int, number: int = 0) -> dict[str, int]:
+    """The same as an ordinary user, where this one is root.
+
+    Raises:
+        RuntimeError: a case failed; it is told.
+    """
+    with tempfile.TemporaryDirectory() as place:
+        scratch = Path(place).resolve() / "scratch"
+        scratch.mkdir()
+        user: list[str] = []
+        if os.geteuid() == 0:
+            nobody, capability = 65534, "dac_read_search"
+            os.chown(scratch, nobody, nobody)
+            Path(place).chmod(0o755)
+            user = ["setpriv", f"--reuid={nobody}", f"--regid={nobody}", "--clear-groups"]
+            user += [f"--{kind}=-all,+{capability}" for kind in ("inh-caps", "ambient-caps", "bounding-set")]
+        own = {"HOME": str(scratch), "TMPDIR": str(scratch), "MPLCONFIGDIR": str(scratch), "PYTHONPATH": str(ROOT)}
+        command = [*user, sys.executable, __file__, "--count", str(count), "--seed", str(number), "--in", str(scratch)]
+        done = subprocess.run(
+            command, env={**os.environ, **own}, cwd=scratch, capture_output=True, text=True, check=False
+        )
+    if done.returncode:
+        raise RuntimeError(done.stdout + done.stderr)
+    counted: dict[str, int] = json.loads(done.stdout.splitlines()[-1])
+    return counted
+
+
+def _main() -> None:
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--count", type=int, default=2000)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--in", dest="scratch", type=Path)
+    options: Any = parser.parse_args()
+    if options.scratch is None:
+        print(json.dumps(measure(options.count, options.seed), indent=2))
+    else:
+        print(json.dumps(attack(options.scratch, options.count, options.seed)))
+
+
+if __name__ == "__main__":
+    _main()
