@@ -112,6 +112,21 @@ class DivergenceError(FlightError):
     """The plant's state became non-finite, left every plausible range, or MuJoCo reported a numerical warning."""
 
 
+class LostError(FlightError):
+    """The vehicle is beyond one of the flight's loss criteria.
+
+    Attributes:
+        criterion: which, e.g. `tilt`; see `quadsim.lost.LossCriteria`.
+        value: what it was, in the criterion's unit.
+        limit: what it may be.
+    """
+
+    def __init__(self, criterion: str, said: str, unit: str, *, value: float, limit: float, time: float) -> None:
+        message = f"lost: {said} {value:.5g} {unit}, beyond lost.{criterion} = {limit:g} {unit}"
+        super().__init__(message, time=time)
+        self.criterion, self.value, self.limit = criterion, value, limit
+
+
 class CommandError(FlightError):
     """A command that must not reach the plant: wrong shape, non-finite, or beyond any rotor's speed."""
 
