@@ -14,6 +14,8 @@ from quadsim.lost import LossCriteria
 from quadsim.state import tilt
 from scenarios import cli
 from scenarios.build import build_loss
+from scenarios.campaign.pilot import CampaignPilot
+from scenarios.campaign.plan import load_plan
 from scenarios.loading import load_scenario
 from scenarios.problems import ScenarioError
 from scenarios.runner import fly_scenario, summarise
@@ -118,3 +120,16 @@ def test_a_descent_below_the_start_is_no_fall() -> None:
     flight = fly_scenario(load_scenario("hover", ["lost.depth=5", "duration=30", "constraints=[]", descent]))
     assert flight.log.plant.state[-1, 4] < -25.0
     assert flight.outcome == "satisfied"
+
+
+def test_a_campaign_draws_criteria_and_has_their_verdicts(unstable: str, tmp_path: Path) -> None:
+    file = tmp_path / "campaign.toml"
+    depths = 'name = "depth"\nfields = ["lost.depth"]\ndistribution = "uniform"\nlow = 5.0\nhigh = 40.0\n'
+    settings = "[set.lost]\ntilt = false\n"
+    file.write_text(f'name = "c"\nscenario = "{unstable}"\nflights = 3\n{settings}[[vary]]\n{depths}')
+    plan = load_plan(str(file))
+    rows = [CampaignPilot(plan).fly(flight) for flight in range(3)]
+    assert [row["verdict"] for row in rows] == ["lost"] * 3
+    assert all(f"beyond lost.depth = {row['draw.depth']:g} m" in str(row["reason"]) for row in rows)
+    order = np.argsort([float(str(row["draw.depth"])) for row in rows])
+    assert list(order) == list(np.argsort([float(str(row["duration"])) for row in rows]))
