@@ -18,6 +18,7 @@ from quadsim.metrics import peak_tilt, tracking
 from scenarios.loading import scenario_names
 from scenarios.runner import Flight
 from scenarios.spec import Group
+from scenarios.spec.lost import LostSpec
 
 PAGE = Path(__file__).resolve().parent / "scenarios.md"
 TITLES: dict[Group, str] = {
@@ -76,6 +77,12 @@ def _share(finding: Finding) -> float:
     return round(left / max(*bounds, limit.tolerance), 2)  # of equals the first: rounding decides nothing
 
 
+def _criteria() -> str:
+    """The loss criteria and their defaults, as the scenario file explains them."""
+    fields = LostSpec.model_fields.items()
+    return "".join(f"- `lost.{name} = {info.default:g}`: {info.description}\n" for name, info in fields)
+
+
 def page(flights: dict[str, Flight]) -> str:
     """The whole page."""
     count = len(flights)
@@ -85,8 +92,14 @@ def page(flights: dict[str, Flight]) -> str:
         "comments, to start your\nown from; the files, in [scenarios/library](../scenarios/library), say in a comment "
         "what each shows and with what numbers.\n",
         "The verdict is *satisfied* (flown to its end, every required constraint holds), *violated* (one does not) or "
-        "*lost* (the\nflight is given up). Each file states it, and a test flies them all; those that are not "
+        "*lost* (the\nflight ends early). Each file states it, and a test flies them all; those that are not "
         "satisfied are meant not to be.\n",
+        "A flight is lost when its controller gives up or answers with no command, when the simulation diverges, or "
+        "when the true\nstate is beyond a criterion of `[lost]` at a control sample: looked at once per period, until "
+        "the vehicle has crashed, which is\n*violated*. Every scenario has these criteria, and `false` switches one "
+        "off, as `--set lost.tilt=false` for loops and flips. The\nflight is recorded up to there; `summary.json` has "
+        "the criterion under `lost`, and its value, limit and time in `reason`.\n",
+        _criteria(),
         "`s`: seconds flown. `nearest to its bound`: the required constraint, but for those on speeds and steps, with "
         "the least left\nas a share of its range, and what is left at the physics rate; a little below 0 is within the "
         "constraint's tolerance where\nthe verdict is *satisfied*. `QPs`: periods in which the unconstrained optimum "

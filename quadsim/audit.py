@@ -121,6 +121,13 @@ class Limit:
         """Unit of the bounds, tolerances and margins."""
         return SIGNALS[self.signal].unit
 
+    @property
+    def half_band(self) -> float:
+        """Half of what lies between the bounds; of one bound alone its magnitude, or 1 where that is 0."""
+        if math.isfinite(self.lower) and math.isfinite(self.upper):
+            return 0.5 * (self.upper - self.lower)
+        return abs(self.lower if math.isfinite(self.lower) else self.upper) or 1.0
+
     def margin(self, values: Array) -> Array:
         """(K,) signed distance to the nearer bound, the smallest over rotors; negative = violated."""
         margin = np.minimum(values - self.lower, self.upper - values)

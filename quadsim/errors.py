@@ -7,7 +7,7 @@ that happened in flight: it ends the flight, is recorded with it as its reason, 
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 
@@ -43,12 +43,20 @@ class ParameterError(InputError):
 
 
 class UnknownNameError(InputError):
-    """A name that is not one of a known set; the message lists the set and the nearest member."""
+    """A name that is not one of a known set; the message lists the set and the nearest member, or those that are meant.
 
-    def __init__(self, kind: str, name: str, allowed: Iterable[str], hint: str = "") -> None:
+    Args:
+        kind: what it was to be a name of.
+        name: what was given.
+        allowed: the set.
+        hint: what to say besides.
+        meant: members of the set that mean the same, however they are spelt.
+    """
+
+    def __init__(self, kind: str, name: str, allowed: Iterable[str], hint: str = "", meant: Sequence[str] = ()) -> None:
         self.kind, self.name, self.allowed = kind, name, tuple(sorted(allowed))
-        near = difflib.get_close_matches(name, self.allowed, n=1)
-        guess = f"; did you mean {near[0]!r}?" if near else ""
+        near = meant or difflib.get_close_matches(name, self.allowed, n=1)
+        guess = f"; did you mean {' and '.join(map(repr, near))}?" if near else ""
         tail = f"; {hint}" if hint else ""
         super().__init__(f"no {kind} named {name!r}{guess} (there are: {', '.join(self.allowed)}){tail}")
 
@@ -110,6 +118,21 @@ class FlightError(QuadsimError):
 
 class DivergenceError(FlightError):
     """The plant's state became non-finite, left every plausible range, or MuJoCo reported a numerical warning."""
+
+
+class LostError(FlightError):
+    """The vehicle is beyond one of the flight's loss criteria.
+
+    Attributes:
+        criterion: which, e.g. `tilt`; see `quadsim.lost.LossCriteria`.
+        value: what it was, in the criterion's unit.
+        limit: what it may be.
+    """
+
+    def __init__(self, criterion: str, said: str, unit: str, *, value: float, limit: float, time: float) -> None:
+        message = f"lost: {said} {value:.5g} {unit}, beyond lost.{criterion} = {limit:g} {unit}"
+        super().__init__(message, time=time)
+        self.criterion, self.value, self.limit = criterion, value, limit
 
 
 class CommandError(FlightError):

@@ -133,6 +133,7 @@ class FlightLog:
         predicted: (K, N, 3) float32 positions [m] predicted at each period for t_{k+1} .. t_{k+N}, or None.
         reason: why the flight ended early; None when it was completed.
         interrupted: whether the person flying ended it.
+        lost: which of the loss criteria ended it, e.g. `tilt`; None where none did.
     """
 
     control: ControlLog
@@ -141,6 +142,7 @@ class FlightLog:
     predicted: np.ndarray[Any, np.dtype[np.float32]] | None = None
     reason: str | None = None
     interrupted: bool = False
+    lost: str | None = None
 
     @property
     def status(self) -> str:

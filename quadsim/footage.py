@@ -76,11 +76,20 @@ class MarginTrack:
         limit: the limit.
         now: (F,) signed margin; NaN outside the limit's time window.
         worst: (F,) smallest margin so far; NaN before the window.
+        share: the smallest of the whole flight, tolerance included, over half the limit's band: 1 in its middle,
+            negative where it is violated; infinite where the flight never reaches the window.
     """
 
     limit: Limit
     now: Array
     worst: Array
+    share: float
+
+    @property
+    def rank(self) -> tuple[bool, bool, float]:
+        """Sorts the limits of a flight: required ones that are violated, others that are, then the nearest first."""
+        broken = self.share < 0.0
+        return not broken, broken and not self.limit.required, self.share
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -184,8 +193,9 @@ def _track(run: Run, limit: Limit, times: Array) -> MarginTrack:
         t, values = run.log.plant.t, signal.plant(run.log.plant)
     inside = (t >= limit.start - 1e-9) & (t <= limit.stop + 1e-9)
     margin = np.where(inside, limit.margin(values), np.nan)
-    row = _row_before(t, times)
-    return MarginTrack(limit=limit, now=margin[row], worst=np.fmin.accumulate(margin)[row])
+    row, worst = _row_before(t, times), np.fmin.accumulate(margin)
+    share = (float(worst[-1]) + limit.tolerance) / limit.half_band
+    return MarginTrack(limit=limit, now=margin[row], worst=worst[row], share=np.inf if np.isnan(share) else share)
 
 
 def _smooth(t: Array, values: Array) -> Array:

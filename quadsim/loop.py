@@ -12,11 +12,12 @@ import numpy as np
 
 from quadsim.computation import Computation
 from quadsim.controller import MISSED, Command, Controller, Moment, Phase
-from quadsim.errors import FlightError, InterruptedFlightError
+from quadsim.errors import FlightError, InterruptedFlightError, LostError
 from quadsim.flightlog import ControlLog, FlightLog, PlantLog, TimingLog
+from quadsim.lost import LossCriteria, check_loss
 from quadsim.physics import Stretch, physics_to_state
 from quadsim.plant import Plant
-from quadsim.state import INDEX, N_STATES, Array
+from quadsim.state import INDEX, N_STATES, REFERENCE_NAMES, Array
 from quadsim.vehicle import N_ROTORS
 
 if TYPE_CHECKING:
@@ -37,6 +38,7 @@ def fly(
     computation: Computation | None = None,
     rng: np.random.Generator | None = None,
     ground: PhaseMonitor | None = None,
+    loss: LossCriteria | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> FlightLog:
     """Fly a number of control periods.
@@ -56,6 +58,7 @@ def fly(
         computation: how long commands take, in simulated time; none where absent.
         rng: what `computation` draws from.
         ground: what knows where the flight stands with the ground; it is flying throughout where absent.
+        loss: when the vehicle is lost, looked at once per control period until it has crashed; never where absent.
         progress: called with the number of periods flown, after each.
 
     Returns:
@@ -71,6 +74,8 @@ def fly(
     truth = np.empty((periods, N_STATES))
     states = np.empty((periods, N_STATES))
     start = plant.physics
+    heights = np.minimum(reference[:, REFERENCE_NAMES.index("z")], initial_state[INDEX["z"]])
+    lowest = np.minimum.accumulate(heights).tolist()
     samples: list[Sample] = []
     acting = np.array(initial_speeds, float)
     plan, age = acting[None], 0  # the last plan that came in time, and how many periods ago
@@ -83,6 +88,8 @@ def fly(
             states[k] = truth[k] if navigation is None else navigation.state()
             preview = reference[k + 1 : k + 1 + controller.horizon]
             phase = Phase.FLYING if ground is None else ground.advance(since, preview)
+            if loss is not None and phase is not Phase.CRASHED:
+                check_loss(loss, k * period, truth[k], reference[k], lowest[k])
             now = Moment(time=k * period, phase=phase, acting=acting)
             started = clock.perf_counter()
             command = controller.step(now, states[k], preview)
@@ -138,6 +145,7 @@ def fly(
         predicted=_predict(controller, control.state, commands),
         reason=None if ended is None else str(ended),
         interrupted=isinstance(ended, InterruptedFlightError),
+        lost=ended.criterion if isinstance(ended, LostError) else None,
     )
 
 

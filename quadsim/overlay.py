@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Final
 
 import numpy as np
@@ -11,7 +11,7 @@ from PIL import Image
 
 from quadsim.audit import Limit
 from quadsim.controller import ACCEPTED, Phase
-from quadsim.footage import Footage
+from quadsim.footage import Footage, MarginTrack
 from quadsim.pen import (
     AMBER,
     BLUE,
@@ -56,6 +56,7 @@ class Overlay:
         controller = run.summary.get("controller", {})
         self._subtitle = "  ·  ".join(filter(None, (controller.get("name"), controller.get("solver"))))
         self._grounded = any(phase != Phase.FLYING for phase in run.log.control.phase)
+        self._ranked = sorted(footage.margins, key=lambda track: track.rank)  # of the whole flight: rows stay in place
         self._top_view = TopView(run, footage, *(_COMPACT_MAP if compact else _MAP), acting=not compact)
 
     def draw(self, frame: Picture, i: int) -> Picture:
@@ -195,13 +196,26 @@ class Overlay:
     def _margins(self, pen: Pen, x: float, y: float, i: int) -> None:
         pen.text(x, y, "limit", size=13, colour=GREY)
         pen.text(x + 226, y, "worst margin so far", size=13, colour=GREY, anchor="ra")
-        begun = [track for track in self._footage.margins if not math.isnan(track.worst[i])]
-        for j, track in enumerate(begun[:_MOST_MARGINS]):
-            worst, row = track.worst[i], y + 22 + 18.5 * j
+        shown, rest = margin_rows(self._ranked, i)
+        pitch = 18.5 if len(self._ranked) <= _MOST_MARGINS else 16.0
+        for j, track in enumerate(shown):
+            worst, row = track.worst[i], y + 22 + pitch * j
             now_broken, once_broken = (margin < -track.limit.tolerance for margin in (track.now[i], worst))
             pen.text(x, row, track.limit.name, size=14, colour=RED if now_broken else GREY)
-            shown = f"{round(worst, 2) + 0.0:+.2f} {track.limit.unit}"
-            pen.text(x + 226, row, shown, size=14, colour=RED if once_broken else WHITE, anchor="ra")
+            told = f"{round(worst, 2) + 0.0:+.2f} {track.limit.unit}"
+            pen.text(x + 226, row, told, size=14, colour=RED if once_broken else WHITE, anchor="ra")
+        colour = RED if "violated" in rest else GREY
+        pen.text(x, y + 22 + pitch * len(shown), rest, size=14, colour=colour)
+
+
+def margin_rows(ranked: Sequence[MarginTrack], i: int) -> tuple[list[MarginTrack], str]:
+    """The limits that frame `i` shows, the first of those whose window has begun, and what is said of the others."""
+    begun = [track for track in ranked if not math.isnan(track.worst[i])]
+    hidden = begun[_MOST_MARGINS:]
+    broken = sum(track.worst[i] < -track.limit.tolerance for track in hidden)
+    told = {"more": len(hidden), "of them violated": broken, "not begun": len(ranked) - len(begun)}
+    parts = [f"{count} {what}" for what, count in told.items() if count]
+    return begun[:_MOST_MARGINS], f"and {', '.join(parts)}" if parts else ""
 
 
 def _bounds(limit: Limit | None) -> tuple[float, float]:

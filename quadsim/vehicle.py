@@ -185,7 +185,7 @@ def load_vehicle(path: Path, overrides: Mapping[str, Any] | None = None) -> Vehi
     values: dict[str, Any] = {**texts, **{key: entry["value"] for key, entry in entries.items()}}
     for key, value in (overrides or {}).items():
         if key not in VEHICLE_UNITS:
-            raise UnknownNameError("vehicle parameter", key, VEHICLE_UNITS)
+            raise UnknownNameError("vehicle parameter", key, VEHICLE_UNITS, meant=MEANT.get(key, ()))
         values[key] = value
     missing = [name for name in ("name", *VEHICLE_UNITS) if name not in values and name not in OPTIONAL_PARAMETERS]
     if missing:
@@ -209,7 +209,8 @@ def _read_entries(path: Path) -> tuple[dict[str, str], dict[str, dict[str, Any]]
             texts[key] = entry
             continue
         if key not in VEHICLE_UNITS:
-            raise UnknownNameError("vehicle parameter", key, VEHICLE_UNITS, hint=f"in {path}")
+            hint, meant = f"in {path}", MEANT.get(key, ())
+            raise UnknownNameError("vehicle parameter", key, VEHICLE_UNITS, hint=hint, meant=meant)
         if not isinstance(entry, dict) or set(entry) != {"value", "unit", "source"}:
             raise ParameterError("vehicle", key, entry, "a table with exactly value, unit and source")
         if entry["unit"] != VEHICLE_UNITS[key]:
@@ -238,6 +239,8 @@ VEHICLE_UNITS: Final[dict[str, str]] = {
     "rotor_drag": "N s^2/(m rad)",
     "body_drag": "m^2",
 }
+MEANT: Final[dict[str, tuple[str, ...]]] = {"rotor_lag": ("rotor_rise", "rotor_fall")}
+"""Parameters by what else they are called, where another one is spelt more alike."""
 OPTIONAL_PARAMETERS: Final = tuple(field.name for field in fields(Vehicle) if field.default is None)
 """Parameters that a vehicle file may leave out."""
 assert set(VEHICLE_UNITS) == {field.name for field in fields(Vehicle)} - {"name", "description"}

@@ -52,8 +52,7 @@ def read_scenario(
     name = data.pop("base")
     if not isinstance(name, str):
         raise ParameterError(path.name, "base", name, "a scenario's name or a path ending in .toml")
-    beside = path.parent / name
-    base = beside if name.endswith(".toml") and beside.is_file() else find(name)
+    base = _find_base(path, name, find)
     chain = (*above, path.resolve())
     if base.resolve() in chain:
         raise FileError(path, f"is its own base: {' -> '.join([*(file.name for file in chain), base.name])}")
@@ -61,6 +60,35 @@ def read_scenario(
     locate(inherited, base.parent)
     # The base's place in the library is its own.
     return merge({key: value for key, value in inherited.items() if key not in ("group", "expect")}, data)
+
+
+def _find_base(path: Path, name: str, find: Callable[[str], Path]) -> Path:
+    """A base beside the file that names it, or elsewhere."""
+    beside = path.parent / name
+    return beside if name.endswith(".toml") and beside.is_file() else find(name)
+
+
+def replaced_tables(path: Path, find: Callable[[str], Path]) -> dict[str, str]:
+    """Tables that stand instead of their base's, being of another `type`: what that was, and where, by their names.
+
+    Args:
+        path: a file that `read_scenario` can read.
+        find: as there.
+    """
+    data = _read(path)
+    if "base" not in data:
+        return {}
+    base = _find_base(path, data["base"], find)
+    return replaced_tables(base, find) | {
+        name: f"{before!r} in {base.name}" for name, before in retyped(read_scenario(base, find), data).items()
+    }
+
+
+def retyped(before: Mapping[str, Any], after: Mapping[str, Any]) -> dict[str, str]:
+    """The type that each table had which is of another one afterwards, by the table's name."""
+    kinds = {name: table["type"] for name, table in before.items() if isinstance(table, dict) and "type" in table}
+    now = {name: table.get("type", kinds.get(name)) for name, table in after.items() if isinstance(table, dict)}
+    return {name: kind for name, kind in kinds.items() if name in now and now[name] != kind}
 
 
 def merge(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:

@@ -14,6 +14,7 @@ from quadsim.assets import vehicle_path
 from quadsim.audit import Limit
 from quadsim.controller import Controller
 from quadsim.errors import InputError, ParameterError
+from quadsim.lost import LossCriteria
 from quadsim.phase import PhaseMonitor
 from quadsim.plant import Plant
 from quadsim.state import Array, make_state
@@ -85,6 +86,11 @@ def build_ground(scenario: Scenario, vehicle: Vehicle) -> PhaseMonitor | None:
     if ground is None or not ground.contact:
         return None
     return PhaseMonitor(outline(vehicle), period=scenario.control_period)
+
+
+def build_loss(scenario: Scenario) -> LossCriteria:
+    """When the flight is lost."""
+    return LossCriteria(**{name: limit for name, limit in scenario.lost if limit is not False})
 
 
 def build_initial_state(scenario: Scenario) -> Array:

@@ -11,7 +11,7 @@ from quadsim.navigation import Navigation
 from quadsim.plant import Plant
 from quadsim.state import Array
 from quadsim.vehicle import Vehicle
-from scenarios.build import build_ground, build_initial_speeds, build_initial_state
+from scenarios.build import build_ground, build_initial_speeds, build_initial_state, build_loss
 from scenarios.effects import build_computation
 from scenarios.randomness import generator
 from scenarios.spec import Scenario
@@ -50,5 +50,6 @@ def fly_once(
         computation=build_computation(scenario),
         rng=generator(scenario.seed, "computation"),
         ground=build_ground(scenario, vehicle),
+        loss=build_loss(scenario),
         progress=progress,
     )

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import copy
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
 from pydantic import ValidationError
 
 from quadsim.errors import FileError, UnknownNameError
-from scenarios.bases import read_scenario
+from scenarios.bases import read_scenario, replaced_tables, retyped
 from scenarios.checking import check_parts
 from scenarios.courses.build import located
 from scenarios.problems import ScenarioError, describe
@@ -54,13 +55,39 @@ def load_scenario(name: str, settings: Sequence[str] = ()) -> Scenario:
     try:
         path = scenario_path(name)
         data = read_scenario(path, scenario_path)
+        read = copy.deepcopy(data)
         for setting in settings:
             apply_setting(data, setting)
-        scenario = parse_scenario(data, source=path.name, directory=path.parent)
+        try:
+            scenario = parse_scenario(data, source=path.name, directory=path.parent)
+        except ScenarioError as error:
+            raise ScenarioError(path.name, [*error.problems, *_of_types(error.problems, path, read, data)]) from error
         check_parts(scenario)
     except OSError as error:  # of looking whether a file is there, e.g. under a name longer than the system takes
         raise FileError(str(error.filename)[:100], f"cannot be read ({error.strerror})") from error
     return scenario
+
+
+def _of_types(problems: Sequence[str], path: Path, read: Mapping[str, Any], data: Mapping[str, Any]) -> Iterator[str]:
+    """Why fields of a table are missing, or are too many: another type of it was asked for.
+
+    Args:
+        problems: what is wrong.
+        path: the file.
+        read: what was read from it.
+        data: the same with the settings.
+    """
+    unfit = (problem for problem in problems if problem.endswith(" is missing") or " is not a field of " in problem)
+    wrong = {problem.partition(".")[0] for problem in unfit}
+    given = retyped(read, data)
+    for name, before in given.items():
+        if name in wrong:
+            changed = f"--set changed its type from {before!r} to {data[name]['type']!r}, and all other fields stayed"
+            base = path.stem if path.parent == LIBRARY else path.name
+            yield f'{name}: {changed}; a file with base = "{base}" and a whole [{name}] replaces them'
+    for name, before in replaced_tables(path, scenario_path).items():
+        if name in wrong - {*given}:
+            yield f"{name}: of another type than that of its base ({before}), it replaces it whole and inherits nothing"
 
 
 def parse_scenario(data: Mapping[str, Any], *, source: str = "scenario", directory: Path | None = None) -> Scenario:

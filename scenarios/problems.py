@@ -12,6 +12,7 @@ from pydantic import BaseModel
 from pydantic_core import ErrorDetails
 
 from quadsim.errors import InputError
+from quadsim.vehicle import MEANT
 from scenarios.places import find
 from scenarios.spec import Scenario
 
@@ -122,5 +123,7 @@ def shown(value: object, depth: int = _DEEPEST_SHOWN) -> str:
 
 
 def _guess(given: object, allowed: Iterable[str]) -> str:
-    near = difflib.get_close_matches(str(given), allowed, n=1)
-    return f"; did you mean {near[0]!r}?" if near else ""
+    allowed = [*allowed]
+    meant = MEANT.get(str(given), ())
+    near = meant if meant and {*meant} <= {*allowed} else difflib.get_close_matches(str(given), allowed, n=1)
+    return f"; did you mean {' and '.join(map(repr, near))}?" if near else ""

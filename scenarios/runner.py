@@ -177,6 +177,7 @@ def summarise(flight: Flight) -> dict[str, Any]:
         "description": scenario.description,
         "status": log.status,
         "reason": log.reason,
+        "lost": log.lost,
         "satisfied": flight.satisfied,
         "group": scenario.group,
         "expected": scenario.expect,

@@ -213,14 +213,10 @@ def _times(timing: TimingLog) -> Row:
 
 def _share(finding: Finding) -> float:
     """A margin, tolerance included, as a share of half its band."""
-    lower, upper = finding.limit.lower, finding.limit.upper
-    if math.isfinite(lower) and math.isfinite(upper):
-        half = 0.5 * (upper - lower)
-    else:
-        half = abs(lower if math.isfinite(lower) else upper) or 1.0
     at_physics_rate = finding.worst_margin + finding.limit.tolerance
     at_samples = finding.worst_margin_sampled + finding.limit.tolerance_sampled
-    return float(np.fmin(at_physics_rate, at_samples) if math.isfinite(at_physics_rate) else at_physics_rate) / half
+    nearest = np.fmin(at_physics_rate, at_samples) if math.isfinite(at_physics_rate) else at_physics_rate
+    return float(nearest) / finding.limit.half_band
 
 
 def _storable(value: object) -> object:

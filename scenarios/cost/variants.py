@@ -8,7 +8,17 @@ from typing import Any, Final
 from scenarios.build import build_vehicle
 from scenarios.spec import ConstrainedSpec, Scenario, UnconstrainedSpec
 
-_NOT_THE_COURSE: Final = {"name", "description", "group", "expect", "log_rate", "vehicle", "controller", "constraints"}
+_NOT_THE_COURSE: Final = {
+    "name",
+    "description",
+    "group",
+    "expect",
+    "log_rate",
+    "vehicle",
+    "controller",
+    "lost",
+    "constraints",
+}
 """Fields in which flights that are compared by their controllers may differ; vehicles are compared by their numbers."""
 
 

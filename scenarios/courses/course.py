@@ -4,10 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 
 from quadsim.state import Array
+
+EXACT: Final = (0.0, 0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -18,11 +21,13 @@ class Path:
         pose: times (M,) within [0, duration] [s] -> (M, 4) x, y, z [m], yaw [rad], world.
         duration: [s].
         kinks: times [s] at which the velocity, or its derivative, may jump.
+        resolution: to how much x, y, z [m], yaw [rad] were rounded; 0 where they are exact.
     """
 
     pose: Callable[[Array], Array]
     duration: float
     kinks: tuple[float, ...] = ()
+    resolution: tuple[float, ...] = EXACT
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,12 +39,14 @@ class Course:
         initial: (4,) what it is before the flight, and where the filter starts.
         jumps: times [s] at which the pose itself jumps.
         kinks: times [s] at which the velocity, or its derivative, may jump.
+        resolution: to how much x, y, z [m], yaw [rad] were rounded; 0 where they are exact.
     """
 
     sample: Callable[[Array], Array]
     initial: Array
     jumps: tuple[float, ...] = ()
     kinks: tuple[float, ...] = ()
+    resolution: tuple[float, ...] = EXACT
 
 
 def begin(path: Path, *, start: float, initial: Array) -> Course:
@@ -61,4 +68,5 @@ def begin(path: Path, *, start: float, initial: Array) -> Course:
         initial=initial,
         jumps=(start,) if elsewhere else (),
         kinks=tuple(start + time for time in sorted(ends | set(path.kinks))),
+        resolution=path.resolution,
     )

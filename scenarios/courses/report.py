@@ -12,12 +12,16 @@ from quadsim.feasibility import STENCIL, Feasibility, Mask, assess, demand
 from quadsim.state import Array
 from quadsim.vehicle import Vehicle
 from scenarios.courses.build import build_course, filtered, initial_pose
+from scenarios.courses.smoothing import within_rounding
 from scenarios.spec import ANGLES, Scenario
 from scenarios.spec.optimisation import BoundedSpec
 
 
 def report(scenario: Scenario, vehicle: Vehicle) -> Feasibility:
     """What the filtered course asks for, against the vehicle's limits and the controller's bounds.
+
+    A table that was rounded is taken for the smoothest one within its last decimal: differences of the fourth order
+    would make of 0.1 mm steps of tens of rad/s, which no controller flies.
 
     Raises:
         InputError: the course cannot be built.
@@ -31,13 +35,10 @@ def report(scenario: Scenario, vehicle: Vehicle) -> Feasibility:
     changes = np.any(raw[1:] != raw[:-1], axis=1)
     away = () if np.allclose(initial_pose(scenario), course.initial, rtol=0.0, atol=1e-9) else (0.0,)
     jumps = sorted({time for time in (*course.jumps, *away) if time < scenario.duration})
-    needed = demand(
-        poses,
-        period,
-        vehicle,
-        jumps=_touched(t, course.jumps) & changes,
-        kinks=_touched(t, _isolated(course.kinks, period)),
-    )
+    jumped, kinked = _touched(t, course.jumps) & changes, _touched(t, _isolated(course.kinks, period))
+    channels = zip(poses.T, course.resolution, strict=True)
+    smooth = np.column_stack([within_rounding(values, unit, jumped | kinked) for values, unit in channels])
+    needed = demand(smooth, period, vehicle, jumps=jumped, kinks=kinked)
     return assess(needed, vehicle, bounds=_bounds(scenario), jumps=jumps)
 
 

@@ -1,12 +1,21 @@
-"""The filter between a course and the controller.  Eq. (31)."""
+"""The filter between a course and the controller, Eq. (31), and what a rounded table may have been before."""
 
 from __future__ import annotations
 
 import math
+from functools import lru_cache
+from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+from scipy.linalg import solveh_banded
 
-from quadsim.state import Array
+from quadsim.state import Array, read_only
+
+_ORDER: Final = 4
+"""Of the differences that are kept small: those that a torque, and so a rotor's speed, follows from."""
+_WEIGHTS: Final = tuple(10.0**exponent for exponent in range(6, -3, -1))
 
 
 def smooth(values: Array, *, initial: float, response_time: float, period: float) -> Array:
@@ -29,3 +38,42 @@ def smooth(values: Array, *, initial: float, response_time: float, period: float
         last = value + keep * (last - value)
         filtered[k] = last
     return filtered
+
+
+def within_rounding(values: Array, resolution: float, breaks: NDArray[np.bool_]) -> Array:
+    """The smoothest values that these may have been before they were rounded.
+
+    Whittaker-Henderson smoothing (Eilers 2003), min |z - y|^2 + w |D z|^2 with D the fourth differences, piece by
+    piece, with the largest weight w of `_WEIGHTS` that leaves every value within the resolution of what it was.
+
+    Args:
+        values: (M,) evenly spaced samples y.
+        resolution: one unit of the last decimal; 0 for exact values, which are returned as they are.
+        breaks: (M - 1,) whether the course has a corner or a jump between a sample and the next, which stays.
+    """
+    smoothed = values.copy()
+    for piece in np.split(np.arange(values.size), np.flatnonzero(breaks) + 1) if resolution > 0.0 else ():
+        if piece.size > 2 * _ORDER:
+            smoothed[piece] = _smoothest(values[piece], resolution)
+    return smoothed
+
+
+def _smoothest(values: Array, resolution: float) -> Array:
+    roughness = _roughness(values.size)
+    one = np.zeros_like(roughness)
+    one[-1] = 1.0
+    for weight in _WEIGHTS:
+        found: Array = solveh_banded(one + weight * roughness, values)
+        if np.abs(found - values).max() <= resolution:
+            return found
+    return values
+
+
+@lru_cache(maxsize=16)
+def _roughness(size: int) -> Array:
+    """(5, size) the upper bands of D'D, the diagonal last, as scipy's solver takes them."""
+    stencil = [(-1.0) ** k * math.comb(_ORDER, k) for k in range(_ORDER + 1)]
+    differences = sparse.diags_array(stencil, offsets=range(_ORDER + 1), shape=(size - _ORDER, size))
+    product = (differences.T @ differences).todia()
+    bands = [np.pad(product.diagonal(k), (k, 0)) for k in range(_ORDER, -1, -1)]
+    return read_only(np.stack(bands))

@@ -6,7 +6,8 @@ import csv
 import hashlib
 import io
 import math
-from dataclasses import dataclass
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path as FilePath
 from typing import Final
@@ -15,7 +16,7 @@ import numpy as np
 
 from quadsim.errors import FileError, InputError
 from quadsim.state import Array
-from scenarios.courses.course import Path
+from scenarios.courses.course import EXACT, Path
 from scenarios.courses.legs import polyline
 
 POSE_HEADER: Final = ("t", "x", "y", "z", "yaw")
@@ -24,6 +25,8 @@ LARGEST: Final = 1e6
 """Largest magnitude of a number in the table, as in the scenario file."""
 MOST_ROWS: Final = 200_000
 """Rows below the header: 200 s at 1 kHz.  Each is held in memory."""
+ROUNDED: Final = range(2, 8)
+"""Decimals of a rounded column: with fewer its numbers are meant as they stand, with more nobody can tell."""
 LARGEST_FILE: Final = 64_000_000
 """Size [bytes] of the largest file that is read."""
 
@@ -37,12 +40,14 @@ class Table:
         poses: (n, 4) x, y, z [m], yaw [rad], yaw unwrapped.
         velocities: (n, 3) [m/s]; None where the file has none.
         sha256: hash of the file.
+        resolution: one unit of the last decimal in each column of the poses [m, m, m, rad]; 0 where it is not rounded.
     """
 
     t: Array
     poses: Array
     velocities: Array | None
     sha256: str
+    resolution: tuple[float, ...] = EXACT
 
 
 def read_table(path: FilePath) -> Table:
@@ -87,7 +92,9 @@ def read_table(path: FilePath) -> Table:
     poses = numbers[:, 1:5].copy()
     poses[:, 3] = np.unwrap(poses[:, 3])
     velocities = numbers[:, 5:] if len(header) > len(POSE_HEADER) else None
-    return Table(t=t, poses=poses, velocities=velocities, sha256=hashlib.sha256(content).hexdigest())
+    resolution = tuple(_resolution(row[column] for row in rows[1:]) for column in range(1, 5))
+    digest = hashlib.sha256(content).hexdigest()
+    return Table(t=t, poses=poses, velocities=velocities, sha256=digest, resolution=resolution)
 
 
 def through_rows(table: Table) -> Path:
@@ -99,7 +106,7 @@ def through_rows(table: Table) -> Path:
     t = table.t - table.t[0]
     straight = polyline(t, table.poses)
     if table.velocities is None:
-        return straight
+        return replace(straight, resolution=table.resolution)
     velocities = table.velocities
 
     def pose(times: Array) -> Array:
@@ -115,7 +122,16 @@ def through_rows(table: Table) -> Path:
         )
         return poses
 
-    return Path(pose=pose, duration=straight.duration, kinks=straight.kinks)
+    return Path(pose=pose, duration=straight.duration, kinks=straight.kinks, resolution=table.resolution)
+
+
+def _resolution(cells: Iterable[str]) -> float:
+    """One unit of the last decimal that a column is written with, or 0 where that does not look like rounding."""
+    decimals = 0
+    for cell in cells:
+        digits, _, exponent = cell.strip().lower().partition("e")
+        decimals = max(decimals, len(digits.partition(".")[2]) - int(exponent or 0))
+    return 10.0**-decimals if decimals in ROUNDED else 0.0
 
 
 def _parse_row(path: FilePath, number: int, row: list[str], header: tuple[str, ...]) -> list[float]:

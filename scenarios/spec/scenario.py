@@ -16,6 +16,7 @@ from scenarios.spec.controller import ControllerSpec
 from scenarios.spec.course import ReferenceSpec
 from scenarios.spec.effects import EffectsSpec
 from scenarios.spec.events import Event, PayloadDropEvent, PayloadPickupEvent, SensorFaultEvent
+from scenarios.spec.lost import LostSpec
 from scenarios.spec.sensors import EstimatorSpec, SensorsSpec, check_sensing
 from scenarios.spec.start import InitialSpec, PlantSpec
 from scenarios.spec.vehicle import VehicleSpec
@@ -43,7 +44,8 @@ class Scenario(Spec):
     expect: Verdict = Field(
         default="satisfied",
         description="its verdict, if all is right: satisfied (flown to its end, every required constraint holds), "
-        "violated (one does not, or the vehicle crashes), lost (the flight is aborted)",
+        "violated (one does not, or the vehicle crashes), lost (the flight ends early, by a criterion of [lost] or "
+        "otherwise)",
     )
     duration: Annotated[float, Field(gt=0.0, le=LONGEST_FLIGHT)] = Field(
         description="[s] simulated time, a whole number of control periods"
@@ -69,6 +71,7 @@ class Scenario(Spec):
         default=None, description="absent: the controller is told what the sensors say, as it arrives"
     )
     events: Annotated[list[Event], MaxLen(MOST_ENTRIES)] = Field(default=[], description="what happens on the way")
+    lost: LostSpec = LostSpec()
     constraints: Annotated[list[ConstraintSpec], MaxLen(MOST_ENTRIES)] = Field(
         default=[], description="what the flight is audited against; signals and their units are those of the audit"
     )

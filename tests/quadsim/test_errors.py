@@ -16,6 +16,7 @@ from quadsim.errors import (
     FlightError,
     InputError,
     InterruptedFlightError,
+    LostError,
     MissingPackageError,
     OutputError,
     ParameterError,
@@ -27,7 +28,7 @@ from quadsim.errors import (
 )
 
 EVERY = [kind for _, kind in inspect.getmembers(errors, inspect.isclass) if kind.__module__ == errors.__name__]
-FLIGHT = {FlightError, DivergenceError, CommandError, PlanExhaustedError, InterruptedFlightError}
+FLIGHT = {FlightError, DivergenceError, LostError, CommandError, PlanExhaustedError, InterruptedFlightError}
 
 
 SAMPLES: list[QuadsimError] = [
@@ -42,6 +43,7 @@ SAMPLES: list[QuadsimError] = [
     ViewerUnavailableError("a"),
     FlightError("lost", time=1.0),
     DivergenceError("lost", time=1.0),
+    LostError("speed", "the speed is", "m/s", value=51.0, limit=50.0, time=1.0),
     CommandError("not finite", time=1.0),
     PlanExhaustedError("no plan", time=1.0),
     InterruptedFlightError(time=1.0),

@@ -10,10 +10,12 @@ from dataclasses import dataclass, field
 import numpy as np
 import pytest
 
-from quadsim.controller import Command, Controller, Moment
+from quadsim.controller import Command, Controller, Moment, Phase
 from quadsim.errors import PlanExhaustedError
 from quadsim.flightlog import FlightLog
 from quadsim.loop import fly
+from quadsim.lost import LossCriteria
+from quadsim.phase import PhaseMonitor
 from quadsim.plant import Plant
 from quadsim.state import Array, make_state
 from quadsim.vehicle import Vehicle
@@ -145,3 +147,56 @@ def test_a_flight_that_ended_early_is_let_go_at_once(vehicle: Vehicle, speeds: A
         assert states() is None
     finally:
         gc.enable()
+
+
+# --- flights that are lost -----------------------------------------------------------------------------------------
+
+
+def fall(
+    vehicle: Vehicle, loss: LossCriteria, *, descent: float = 0.0, ground: PhaseMonitor | None = None
+) -> FlightLog:
+    """Fly without thrust along a reference that goes down by `descent` [m] per period."""
+    reference = np.zeros((PERIODS + HORIZON, 4))
+    reference[:, 2] = -descent * np.arange(PERIODS + HORIZON)
+    with Plant(vehicle) as plant:
+        return fly(
+            plant,
+            Scripted(np.zeros((PERIODS, 4))),
+            reference,
+            initial_state=make_state(),
+            initial_speeds=plant.hover_speeds,
+            periods=PERIODS,
+            steps_per_period=STEPS,
+            ground=ground,
+            loss=loss,
+        )
+
+
+def test_a_flight_that_is_lost_is_kept_up_to_there(vehicle: Vehicle) -> None:
+    """A free fall is 0.5 m deep between the samples at 0.3 and 0.35 s."""
+    whole, cut = (fall(vehicle, LossCriteria(depth=depth)) for depth in (math.inf, 0.5))
+    assert (whole.reason, whole.lost, whole.control.t.size) == (None, None, PERIODS)
+    assert (cut.status, cut.lost, cut.interrupted) == ("aborted", "depth", False)
+    found = "the depth below the lowest of start and reference is 0.60086 m"
+    assert cut.reason == f"at t = 0.350 s: lost: {found}, beyond lost.depth = 0.5 m"
+    assert (cut.control.t.size, cut.plant.t[-1]) == (7, 0.35)
+    np.testing.assert_array_equal(cut.plant.state, whole.plant.state[: cut.plant.t.size])
+    np.testing.assert_array_equal(cut.control.speeds, whole.control.speeds[:7])
+
+
+def test_a_course_that_goes_down_is_no_fall(vehicle: Vehicle) -> None:
+    assert fall(vehicle, LossCriteria(depth=0.5), descent=0.1).reason is None
+
+
+def test_what_has_crashed_is_not_lost_as_well(vehicle: Vehicle) -> None:
+    class Crashed(PhaseMonitor):
+        def __init__(self) -> None:
+            """Know no ground."""
+
+        def reset(self) -> None:
+            """Nothing is remembered."""
+
+        def advance(self, states: Array, preview: Array) -> Phase:
+            return Phase.CRASHED
+
+    assert fall(vehicle, LossCriteria(depth=0.5), ground=Crashed()).reason is None

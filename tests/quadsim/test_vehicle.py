@@ -199,6 +199,11 @@ def edited(tmp_path: Path, old: str, new: str) -> Path:
     [
         ('name = "lopes2011"', "name = 3", r"^vehicle\.name must be a text; got 3$"),
         ('name = "lopes2011"', "", r"mine\.toml: lacks name$"),
+        (
+            "[arm_length]",
+            "[rotor_lag]",
+            r"no vehicle parameter named 'rotor_lag'; did you mean 'rotor_rise' and 'rotor_fall'\?.*mine",
+        ),
         ("[arm_length]", "[arm_lenght]", r"no vehicle parameter named 'arm_lenght'; did you mean 'arm_length'\?.*mine"),
         ('unit = "kg"\n', 'unit = "g"\n', r"^vehicle\.mass\.unit must be 'kg'; got 'g'$"),
         ('unit = "kg"\n', "", r"^vehicle\.mass must be a table with exactly value, unit and source; got "),

@@ -18,16 +18,16 @@ import numpy as np
 import pytest
 
 from quadsim import video
-from quadsim.audit import audit
+from quadsim.audit import Limit, audit
 from quadsim.controller import MISSED, SOLVED, UNCONSTRAINED
 from quadsim.errors import FileError, OutputError, ParameterError, RenderingUnavailableError
 from quadsim.flightlog import write_log
 from quadsim.footage import Shot, make_footage, thin
 from quadsim.outputs import write_json, writing_file
-from quadsim.overlay import Overlay
+from quadsim.overlay import Overlay, margin_rows
 from quadsim.pen import CYAN, GREEN, RED, VIOLET, Colour
 from quadsim.rundir import Run, load_run
-from quadsim.state import EULER, POSITION, body_to_world
+from quadsim.state import EULER, INDEX, POSITION, body_to_world
 from quadsim.video import render_gif, render_video, rendering_backend
 
 
@@ -304,9 +304,9 @@ def test_thinning_keeps_the_path_within_its_tolerance():
     assert thin(np.zeros((1, 3)), 0.01).tolist() == [0]
 
 
-def pixels(run: Run, colour: tuple[int, int, int]) -> int:
-    """How much of a frame at 1 s the captions fill with a colour."""
-    footage = make_footage(run, np.array([1.0]))
+def pixels(run: Run, colour: tuple[int, int, int], time: float = 1.0) -> int:
+    """How much of a frame the captions fill with a colour."""
+    footage = make_footage(run, np.array([time]))
     blank = np.full((720, 1280, 3), 128, np.uint8)
     picture = Overlay(run, footage, width=1280, height=720).draw(blank, 0)
     return int(np.count_nonzero((picture == colour).all(axis=-1)))
@@ -378,6 +378,57 @@ def test_captions_turn_red_when_a_limit_breaks(short_run: Run):
     )
     assert pixels(short_run, RED) == 0
     assert pixels(replace(short_run, limits=tight), RED) > 1000  # four bars, four numbers, one row of the table
+
+
+def bounded(run: Run, *limits: Limit) -> Run:
+    """The run as if it had been held to these limits, before which stand seven that are met with metres to spare."""
+    wide = [Limit(name=f"wide_{j}", signal="z", upper=1000.0 + j) for j in range(7)]
+    return replace(run, limits=(*wide, *limits))
+
+
+def rows(run: Run, *times: float) -> list[tuple[list[str], str]]:
+    """Names of the limits, and what is said of the others, in frames at these times."""
+    footage = make_footage(run, np.array(times))
+    ranked = sorted(footage.margins, key=lambda track: track.rank)
+    found = [margin_rows(ranked, i) for i in range(len(times))]
+    return [([track.limit.name for track in shown], rest) for shown, rest in found]
+
+
+def test_violated_limits_come_first_then_the_nearest_and_the_film_says_how_many_more(short_run: Run) -> None:
+    """In the order of the file the one that is violated by metres stands eighth, and was never seen."""
+    climb = short_run.log.plant.state[-1, INDEX["z"]]
+    assert climb > 2.0
+    low = Limit(name="low", signal="z", upper=0.5)
+    near = Limit(name="near", signal="z", upper=1.01 * climb)
+    reported = Limit(name="reported", signal="z", upper=0.01, required=False)
+    run = bounded(short_run, near, reported, low)
+    (shown, rest) = rows(run, 6.0)[0]
+    assert shown == ["low", "reported", "near", "wide_0", "wide_1", "wide_2"]
+    assert rest == "and 4 more"
+    assert pixels(bounded(short_run, near), RED, 6.0) == 0
+    assert pixels(run, RED, 6.0) > 0
+
+
+def test_rows_keep_their_place_over_the_film_and_over_its_pieces(short_run: Run) -> None:
+    """Violated at the end alone, and first from the start; processes that render pieces of a film share nothing."""
+    low = Limit(name="low", signal="z", upper=0.9 * short_run.log.plant.state[-1, INDEX["z"]])
+    run = bounded(short_run, low)
+    together = rows(run, 0.1, 6.0)
+    assert together[0] == together[1] == (["low", *(f"wide_{j}" for j in range(5))], "and 2 more")
+    assert rows(run, 0.1) == together[:1]
+    assert pixels(run, RED, 0.1) == 0 < pixels(run, RED, 6.0)
+
+
+def test_limits_that_have_not_begun_and_violated_ones_without_a_row_are_counted(short_run: Run) -> None:
+    later = Limit(name="later", signal="z", upper=0.01, start=5.0)
+    never = Limit(name="never", signal="z", upper=0.01, start=50.0)
+    early, end = rows(bounded(short_run, later, never), 1.0, 6.0)
+    assert early == ([f"wide_{j}" for j in range(6)], "and 1 more, 2 not begun")
+    assert end == (["later", *(f"wide_{j}" for j in range(5))], "and 2 more, 1 not begun")
+    low = [Limit(name=f"low_{j}", signal="z", upper=0.1 + 0.01 * j) for j in range(8)]
+    run = bounded(short_run, *low)
+    assert rows(run, 6.0) == [([f"low_{j}" for j in range(6)], "and 9 more, 2 of them violated")]
+    assert rows(replace(run, limits=run.limits[:4]), 6.0) == [([f"wide_{j}" for j in range(4)], "")]
 
 
 def test_captions_fit_pictures_of_other_sizes(short_run: Run):

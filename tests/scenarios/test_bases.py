@@ -10,6 +10,7 @@ from quadsim.assets import vehicle_path
 from quadsim.errors import FileError, ParameterError, UnknownNameError
 from scenarios.bases import merge
 from scenarios.loading import load_scenario
+from scenarios.problems import ScenarioError
 
 
 def write(directory: Path, name: str, text: str) -> str:
@@ -90,3 +91,38 @@ def test_a_circle_of_bases_is_told(tmp_path: Path) -> None:
 def test_a_wrong_base_is_told(tmp_path: Path, text: str, error: type[Exception], message: str) -> None:
     with pytest.raises(error, match=message):
         load_scenario(write(tmp_path, "x.toml", text))
+
+
+MISSING = [f"controller.{name} is missing" for name in ("horizon", "output_weights", "input_weights", "input_bounds")]
+WHOLE = (
+    "controller: of another type than that of its base ('constrained' in hover.toml), it replaces it whole and "
+    "inherits nothing"
+)
+
+
+@pytest.mark.parametrize("controller", ['controller = "robust"', '[controller]\ntype = "robust"'])
+def test_a_table_of_another_type_says_why_it_has_none_of_its_bases_fields(tmp_path: Path, controller: str) -> None:
+    (tmp_path / "mine.toml").write_text(f'base = "hover"\n{controller}\n')
+    (tmp_path / "above.toml").write_text('base = "mine.toml"\nduration = 3.0\n')
+    for name in ("mine.toml", "above.toml"):
+        with pytest.raises(ScenarioError) as caught:
+            load_scenario(str(tmp_path / name))
+        assert caught.value.problems == (*MISSING, WHOLE)
+
+
+def test_a_type_that_is_set_says_where_the_other_fields_are_from(tmp_path: Path) -> None:
+    (tmp_path / "mine.toml").write_text('base = "hover"\n')
+    changed = "controller: --set changed its type from 'constrained' to 'robust', and all other fields stayed"
+    for name, base in (("hover", "hover"), (str(tmp_path / "mine.toml"), "mine.toml")):
+        with pytest.raises(ScenarioError) as caught:
+            load_scenario(name, ["controller.type=robust"])
+        field, reason = caught.value.problems
+        assert field.startswith("controller.solver is not a field of the scenario file")
+        assert reason == f'{changed}; a file with base = "{base}" and a whole [controller] replaces them'
+
+
+def test_where_no_type_was_changed_or_another_value_is_wrong_nothing_is_said_of_types(tmp_path: Path) -> None:
+    for settings in (["controller.horizn=3"], ["reference.type=circle", "reference.radius=-1.0"]):
+        with pytest.raises(ScenarioError) as caught:
+            load_scenario("hover", settings)
+        assert len(caught.value.problems) == 1

@@ -21,6 +21,7 @@ from scenarios.courses.table import read_table
 from scenarios.loading import LIBRARY, load_scenario, parse_scenario, scenario_names
 from scenarios.runner import Flight
 from scenarios.spec import Group, Scenario
+from scenarios.spec.lost import LostSpec
 
 ALREADY_FLOWN = {"paper-constrained": "constrained_flight", "paper-unconstrained": "unconstrained_flight"}
 """Fixtures of the whole session."""
@@ -287,6 +288,12 @@ def test_the_page_has_every_scenario_once() -> None:
     named = [line.split("`")[1] for line in lines if line.startswith("| `")]
     assert sorted(named) == scenario_names()
     assert lines.count("| " + " | ".join(HEAD) + " |") == len(TITLES)
+
+
+def test_the_page_states_every_loss_criterion_and_its_default() -> None:
+    text = PAGE.read_text(encoding="utf-8")
+    for name, info in LostSpec.model_fields.items():
+        assert f"- `lost.{name} = {info.default:g}`: {info.description}\n" in text
 
 
 def test_nearest_is_the_constraint_with_the_least_left_of_its_range(

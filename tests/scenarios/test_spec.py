@@ -85,6 +85,9 @@ WRONG = {
     "duraton=3": "duraton is not a field of the scenario file; did you mean 'duration'? (there are: name, ...",
     "controller.horizn=3": "controller.horizn is not a field of the scenario file; did you mean 'horizon'? ...",
     "vehicle.weight=3": "vehicle.weight is not a field of the scenario file (there are: file, mass, gravity, ...",
+    "vehicle.rotor_lag=1": (
+        "vehicle.rotor_lag is not a field of the scenario file; did you mean 'rotor_rise' and 'rotor_fall'? ..."
+    ),
     "plant.step=1": "plant.step is not a field of the scenario file; did you mean 'timestep'? ...",
     "reference.x=[{start=0,stop=1,valu=2}]": "reference.x.0.value is missing\n  reference.x.0.valu is not a field ...",
     "constraints.roll.upr=3": "constraints.roll.upr is not a field of the scenario file; did you mean 'upper'? ...",

@@ -11,6 +11,7 @@ import pytest
 from support import scenario_table
 
 from quadsim.feasibility import Feasibility
+from quadsim.state import Array
 from quadsim.vehicle import Vehicle
 from scenarios.build import build_vehicle
 from scenarios.courses import build_course, build_reference, report
@@ -98,6 +99,40 @@ def test_a_dense_table_of_a_smooth_course_asks_for_what_the_course_does(tmp_path
     path.write_text("t,x,y,z,yaw\n" + "".join(",".join(map(repr, row.tolist())) + "\n" for row in rows[::4]))
     sparse = report(scenario(table), vehicle)
     assert sparse.tilt > 1.5 * smooth.tilt  # every row a corner
+
+
+def rounded(path: Path, poses: Array, decimals: int) -> dict[str, str]:
+    """The reference of a table with a row per control period."""
+    lines = (",".join(f"{value:.{decimals}f}" for value in (0.05 * k, *row)) for k, row in enumerate(poses))
+    path.write_text("t,x,y,z,yaw\n" + "\n".join(lines) + "\n")
+    return {"type": "csv", "file": str(path)}
+
+
+@pytest.mark.parametrize("decimals", [3, 4, 6])
+def test_a_rounded_table_of_a_smooth_course_asks_for_what_the_course_does(
+    tmp_path: Path, vehicle: Vehicle, decimals: int
+) -> None:
+    """Fourth differences of 0.1 mm of rounding are steps of tens of rad/s: no controller is asked for those."""
+    eight = scenario({"type": "figure_eight", "length": 6.0, "period": 12.0, "turns": 1.5, "ramp": 4.0})
+    smooth = report(eight, vehicle)
+    found = report(scenario(rounded(tmp_path / "eight.csv", poses_of(eight), decimals)), vehicle)
+    assert not any("change of rotor speed" in problem for problem in found.problems)
+    assert found.tilt == pytest.approx(smooth.tilt, abs=0.05)
+    assert (found.rotor_min, found.rotor_max) == pytest.approx((smooth.rotor_min, smooth.rotor_max), abs=0.2)
+
+
+def test_a_real_corner_in_a_rounded_table_is_still_seen(tmp_path: Path, vehicle: Vehicle) -> None:
+    """From rest to 1 m/s within a period, 20 m/s^2; the course is what it was to the last decimal."""
+    poses = np.zeros((420, 4))
+    poses[:, 0] = np.maximum(0.05 * (np.arange(420) - 200), 0.0)
+    found = report(scenario(rounded(tmp_path / "corner.csv", poses, 4)), vehicle)
+    assert found.acceleration == pytest.approx(20.0, rel=0.02)
+    assert any("change of rotor speed" in problem for problem in found.problems)
+
+
+def poses_of(made: Scenario) -> Array:
+    """(420, 4) samples of a course, one per control period."""
+    return build_course(made).sample(0.05 * np.arange(420))
 
 
 def test_bounds_are_those_of_the_controller(vehicle: Vehicle) -> None:

@@ -39,6 +39,15 @@ def test_what_spreadsheets_write_is_read_as_well(tmp_path: Path) -> None:
     np.testing.assert_array_equal(read_table(path).poses[0], [1.5, 2.0, 3.0, -1.0])
 
 
+def test_it_is_known_to_how_many_decimals_a_column_is_rounded(tmp_path: Path) -> None:
+    """Whole numbers are meant as they stand, and of doubles written out nobody can tell."""
+    table = read_table(write(tmp_path, "t,x,y,z,yaw\n0,0.1234,1.5,3, 1e-3\n1,0.2,-2,4,0.30000000000000004\n"))
+    assert table.resolution == (1e-4, 0.0, 0.0, 0.0)
+    table = read_table(write(tmp_path, "t,x,y,z,yaw\n0,12.5e-3,1.25,0.123456789,0\n1,0,-2,4,0\n"))
+    assert table.resolution == (1e-4, 1e-2, 0.0, 0.0)
+    assert through_rows(table).resolution == table.resolution
+
+
 def test_without_velocities_lines_are_straight(tmp_path: Path) -> None:
     path = through_rows(read_table(write(tmp_path, f"t,x,y,z,yaw\n{ROWS}")))
     poses = path.pose(np.array([0.0, 0.5, 1.0, 2.0, 3.0]))
