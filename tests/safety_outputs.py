@@ -12,11 +12,13 @@ import hashlib
 import io
 import json
 import os
+import random
 import shutil
 import stat
 import subprocess
 import sys
 import tempfile
+import time as clock
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
@@ -331,6 +333,55 @@ def measure(count: int, number: int = 0) -> dict[str, int]:
         raise RuntimeError(done.stdout + done.stderr)
     counted: dict[str, int] = json.loads(done.stdout.splitlines()[-1])
     return counted
+
+
+def measure_kills(count: int, number: int = 0) -> dict[str, int]:
+    """Kill processes at random moments while they write; the next one in the same place clears up after them.
+
+    Raises:
+        AssertionError: something of ours is left, or something else changed.
+    """
+    rng = random.Random(number)
+    counted = Counter(kills=0, leftovers=0)
+    with tempfile.TemporaryDirectory() as place:
+        base = Path(place)
+        build(
+            [Entry(("thesis.txt",), "file", "mine"), Entry((".draft.partial", "x"), "file", "mine")],
+            base,
+            Inputs(folder=base),
+        )
+        before = state(base)
+        (base / "small.toml").write_text(CAMPAIGN.replace("duration = 0.1", "duration = 5").replace("= 2", "= 20"))
+        for kill in range(count):
+            command = ["run", "hover", "--set", "duration=5", "--no-video", "--out", "run"]
+            if kill % 2:
+                command = ["campaign", "small.toml", "--workers", "1", "--out", "campaign", "--resume"]
+            process = subprocess.Popen(
+                [sys.executable, "-m", "scenarios.cli", *command],
+                cwd=base,
+                env={**os.environ, "PYTHONPATH": str(ROOT)},
+                stdout=subprocess.DEVNULL,
+                stderr=subprocess.DEVNULL,
+            )
+            while not list(base.rglob(".quadsim-*.partial")) and process.poll() is None:
+                clock.sleep(0.01)
+            clock.sleep(rng.uniform(0.0, 0.5))
+            process.kill()
+            process.wait()
+            counted["kills"] += 1
+            counted["leftovers"] += len(list(base.rglob(".quadsim-*.partial")))
+        os.chdir(base)
+        for command in (
+            ["run", "hover", *SHORT, "--out", "run"],
+            ["campaign", "small.toml", "--out", "campaign", "--resume"],
+        ):
+            status, said = call(command)
+            assert status == 0, said
+        os.chdir(ROOT)
+        after = state(base)
+        assert not [path for path in after if ".quadsim-" in path], "leftovers stay"
+        assert {path: after.get(path) for path in before} == before
+    return dict(counted)
 
 
 def _main() -> None:

@@ -1,0 +1,15 @@
+"""The attacks of docs/safety.md in a short form; `make safety` goes through all of them."""
+
+from __future__ import annotations
+
+import safety_outputs
+
+
+def test_nothing_that_is_not_ours_changes_wherever_a_command_is_told_to_write() -> None:
+    counted = safety_outputs.measure(60, number=1)
+    assert counted["cases"] >= 60
+    assert sum(number for name, number in counted.items() if name.endswith("done")) >= 10
+
+
+def test_processes_that_are_killed_leave_nothing_that_stays() -> None:
+    assert safety_outputs.measure_kills(4)["kills"] == 4
