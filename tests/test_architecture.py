@@ -171,3 +171,34 @@ def test_help_answers_at_once() -> None:
         times.append(clock.perf_counter() - started)
         assert b"usage: quadsim" in done.stdout
     assert min(times) < 0.5
+
+
+REMOVING = {"unlink", "rmdir", "rmtree", "rename", "renames", "remove", "removedirs", "move"}
+OUTPUTS = "quadsim.outputs"
+
+
+def removals(source: str) -> list[str]:
+    """Calls that remove or replace files, of `os`, `shutil` and `pathlib`; `text.replace` has two arguments."""
+    found = []
+    for node in ast.walk(ast.parse(source)):
+        if not isinstance(node, ast.Call) or not isinstance(node.func, ast.Attribute):
+            continue
+        name, owner = node.func.attr, ast.unparse(node.func.value)
+        of_list = name == "remove" and owner not in ("os", "files", "self._files")
+        replaces = name == "replace" and (len(node.args) == 1 or owner == "os") and owner != "dataclasses"
+        if replaces or (name in REMOVING and not of_list):
+            found.append(f"{owner}.{name}")
+    return found
+
+
+def test_one_package_alone_removes_and_replaces_files() -> None:
+    assert removals("import os; os.replace(a, b); p.unlink(); p.replace(q); 'a'.replace('b', 'c'); l.remove(1)") == [
+        "os.replace",
+        "p.unlink",
+        "p.replace",
+    ]
+    found = {name: removals(path.read_text()) for name, path in modules().items() if not name.startswith(OUTPUTS)}
+    asked_for = {"files.remove", "self._files.remove"}  # of `quadsim.outputs.Growing`
+    assert {name: calls for name, calls in found.items() if set(calls) - asked_for} == {}
+    trees = {name: removals(path.read_text()).count("shutil.rmtree") for name, path in modules().items()}
+    assert {name: count for name, count in trees.items() if count} == {f"{OUTPUTS}.staging": 1}

@@ -1,0 +1,53 @@
+"""Attack everything that writes or reads files, and remake the counts on docs/safety.md: `make safety`, some forty minutes."""
+
+from __future__ import annotations
+
+import argparse
+import time as clock
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+import safety_campaign
+import safety_mutations
+import safety_outputs
+
+from quadsim.table import Cell, Grid, grid_to_markdown
+
+PAGE = Path(__file__).resolve().parent / "safety.md"
+BEGIN, END = "<!-- counts: made by `make safety` -->", "<!-- counts end -->"
+
+ATTACKS: dict[str, tuple[Callable[[int], Mapping[str, int]], int]] = {
+    "Random trees and places, for every command that writes, as an ordinary user": (safety_outputs.measure, 2000),
+    "Processes killed (SIGKILL) while they write": (safety_outputs.measure_kills, 40),
+    "Changed `summary.json` of runs, read by every command": (safety_mutations.measure_summaries, 2000),
+    "Changed files of campaigns, read by every command": (safety_mutations.measure_campaigns, 2000),
+    "A campaign whose controllers hang, fork, eat memory or exit": (safety_campaign.measure, 60),
+}
+"""What was tried: by which function, and how often."""
+
+
+def counts(scale: float) -> str:
+    """Go through all attacks; what came of each, as Markdown."""
+    lines = []
+    for what, (attack, count) in ATTACKS.items():
+        started = clock.perf_counter()
+        found = attack(max(1, round(scale * count)))
+        told = "; ".join(f"{name.replace('_', ' ')} {number}" for name, number in found.items())
+        lines.append((Cell(text=what), Cell(text=told)))
+        print(f"{what}: {told} ({clock.perf_counter() - started:.0f} s)", flush=True)
+    return grid_to_markdown(Grid(key="counts", title="What was tried", head=("what", "what came of it"), lines=lines))
+
+
+def main() -> None:
+    """Remake the page's counts."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--scale", type=float, default=1.0, help="go through that share of the cases, and only tell")
+    options = parser.parse_args()
+    table = counts(options.scale)
+    if options.scale == 1.0:
+        head, _, rest = PAGE.read_text(encoding="utf-8").partition(BEGIN)
+        PAGE.write_text(f"{head}{BEGIN}\n\n{table}\n{END}{rest.partition(END)[2]}", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
