@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Final
 
 from quadsim.errors import LostError
-from quadsim.state import INDEX, POSITION, VELOCITY, Array
+from quadsim.state import Array
 
 CRITERIA: Final = {
     "tilt": ("the thrust axis is tilted by", "deg"),
@@ -41,22 +41,22 @@ def check_loss(criteria: LossCriteria, time: float, state: Array, reference: Arr
     Args:
         criteria: what counts as such.
         time: of the sample [s].
-        state: (12,) true state.
+        state: (12,) true state, as `quadsim.state` orders it.
         reference: (4,) x, y, z [m], yaw [rad] at the same time.
         lowest: height of the lowest of the start and the reference so far [m].
 
     Raises:
         LostError: a criterion is met.
     """
-    now, target = state.tolist(), reference.tolist()  # of so few numbers floats are quicker than arrays
-    up = math.cos(now[INDEX["roll"]]) * math.cos(now[INDEX["pitch"]])
-    values = (
-        math.degrees(math.acos(min(max(up, -1.0), 1.0))),
-        math.dist([now[i] for i in POSITION], target[:3]),
-        lowest - now[INDEX["z"]],
-        math.hypot(*(now[i] for i in VELOCITY)),
-    )
-    limits = (criteria.tilt, criteria.distance, criteria.depth, criteria.speed)
-    for (name, (said, unit)), value, limit in zip(CRITERIA.items(), values, limits, strict=True):
+    x, vx, y, vy, z, vz, roll, _, pitch, *_ = state.tolist()  # of so few numbers floats are quicker than arrays
+    tilt = math.degrees(math.acos(math.cos(roll) * math.cos(pitch)))
+    distance = math.dist((x, y, z), reference[:3].tolist())
+    depth = lowest - z
+    speed = math.hypot(vx, vy, vz)
+    within = tilt <= criteria.tilt and distance <= criteria.distance
+    if within and depth <= criteria.depth and speed <= criteria.speed:
+        return
+    for (name, (said, unit)), value in zip(CRITERIA.items(), (tilt, distance, depth, speed), strict=True):
+        limit = getattr(criteria, name)
         if value > limit:
             raise LostError(name, said, unit, value=value, limit=limit, time=time)
