@@ -15,7 +15,7 @@ from mpc.polish import polish
 from mpc.problem import Problem
 from mpc.qp import Formulation, kkt_residuals
 from mpc.shortcut import with_shortcut
-from mpc.solvers import SOLVERS, Answer, QPSolver, Solver, Way, make_backend
+from mpc.solvers import SOLVERS, Answer, QPSolver, Solver, make_backend
 from quadsim.controller import ACCEPTED, Command, Moment
 from quadsim.errors import FlightError
 from quadsim.state import Array
@@ -60,6 +60,11 @@ class _Witnessed:
         """See `mpc.solvers.Solver.name`."""
         return self._solver.name
 
+    @property
+    def formulation(self) -> Formulation:
+        """See `mpc.solvers.Solver.formulation`."""
+        return self._solver.formulation
+
     def solve(self, state: Array, desired: Array, u_before: Array) -> Answer:
         """See `mpc.solvers.Solver.solve`."""
         self.last = self._solver.solve(state, desired, u_before)
@@ -72,8 +77,8 @@ class StepEntrant:
     def __init__(self, entry: Entry, problem: Problem, queries: Queries) -> None:
         self.entry, self.problem, self._queries = entry, problem, queries
         whole = QPSolver(entry.solver, problem)
-        self.formulation = whole.formulation
         self._solver = _Witnessed(with_shortcut(problem, whole) if entry.shortcut else whole)
+        self.formulation = self._solver.formulation
         self._controller = ConstrainedMPC(problem, self._solver, shortcut=False)
         self.answers: dict[int, tuple[Command | None, Answer]] = {}
         """What was answered in the first pass, by period: the command, if any, and the solver's answer."""
@@ -155,7 +160,7 @@ class Verdict:
 def judge(entrant: StepEntrant, queries: Queries, periods: Sequence[int], reference: Reference) -> Verdict:
     """Hold the answers of an entrant's first pass against the optimum, and against the KKT conditions of its own QP."""
     entrant.keep()
-    problem, whole, plain = entrant.problem, entrant.formulation, condensed(entrant.problem)
+    problem, form = entrant.problem, entrant.formulation
     statuses: Counter[str] = Counter()
     errors, residuals = [], []
     for period in periods:
@@ -165,7 +170,6 @@ def judge(entrant: StepEntrant, queries: Queries, periods: Sequence[int], refere
             continue
         statuses[command.status] += 1
         errors.append(np.abs(command.speeds - reference.inputs[period]).max())
-        form: Formulation = whole if answer.way is Way.WHOLE else plain
         qp = form.qp.with_vectors(form.vectors(*_query(problem, queries, period)))
         residuals.append(kkt_residuals(qp, answer.solution).worst)
     return Verdict(
