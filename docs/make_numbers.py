@@ -1,13 +1,10 @@
-"""Remake every number that README.md, docs/numbers.md and docs/constraints-cost.md report: `make numbers`.
+"""Remake what README.md and docs/numbers.md report of the paper's flights and of the mathematics: `make numbers`.
 
-Flies the paper's scenarios, measures, and writes both pages whole, the figures of the second, and the tables between
-the markers of README.md.  Rows that no clock decides are also held by tests/test_documents.py.
+No clock decides any of it, and tests/test_documents.py holds most of it.  docs/make_performance.py makes the rest.
 """
 
 from __future__ import annotations
 
-import shutil
-import tempfile
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -21,15 +18,13 @@ from mpc.prediction import rollout
 from mpc.unconstrained import sequence_gains
 from quadsim.airframe import compile_model, rotor_thrusts
 from quadsim.controller import ACCEPTED
-from quadsim.cost import CostStudy, Variation, cost_markdown, cost_sentences
-from quadsim.figures import write_cost_figures
-from quadsim.metrics import percentiles
+from quadsim.cost import Variation
 from quadsim.plant import Plant
 from quadsim.state import REFERENCE_STATES, Array, make_state
 from quadsim.vehicle import Vehicle
 from scenarios import runner
 from scenarios.build import build_problem, build_vehicle
-from scenarios.cost import study_cost
+from scenarios.cost import fly_variations
 from scenarios.loading import load_scenario
 from scenarios.runner import Flight
 
@@ -182,57 +177,6 @@ def targets(constrained: Flight, variations: Sequence[Variation]) -> Table:
     ]
 
 
-def answer(study: CostStudy) -> Table:
-    """What constraints cost and what they buy, in a few lines."""
-
-    def pair(label: str, keys: Sequence[str], form: str = ".3g") -> tuple[str, ...]:
-        flights = (study.constrained, study.unconstrained)
-        return (label, *(", ".join(format(flight.numbers[key], form) for key in keys) for flight in flights))
-
-    gain, flown, *by_qp = study.contenders
-    times = {contender.name: percentiles(contender.step_ms) for contender in study.contenders}
-    told = {
-        name: ", ".join(f"{float(format(found[key], '.2g')):g}" for key in ("p50", "p99", "max"))
-        for name, found in times.items()
-    }
-    lost = [f"{point.value:g}" for point in study.horizons.points if not point.unconstrained.completed]
-    kept = [f"{point.value:g}" for point in study.horizons.points if not point.constrained.completed]
-    rows: Table = [
-        (f"{study.name}, same weights and horizon", "with its constraints", "without"),
-        pair("RMS error x, y, z [m]", ("rmse_x", "rmse_y", "rmse_z")),
-        pair("peak roll or pitch [deg]", ("tilt_plant",)),
-        pair("highest speed, largest step [rad/s]", ("speed_max", "step_max")),
-        pair("total variation of the commands [rad/s]", ("total_variation",), ".0f"),
-        ("periods without a QP", f"{flown.shortcut.sum()} of {flown.shortcut.size}", "all"),
-        ("horizons N at which the vehicle is lost", ", ".join(kept) or "none", ", ".join(lost) or "none"),
-        ("controller step: median, p99, max [ms]", told[flown.name], told[gain.name]),
-        ("largest loop rate [Hz]", *(f"{each.rate('max'):.0f}" for each in (flown, gain))),
-    ]
-    rows += [(f"{each.name} in every period: the same [ms]", told[each.name], "-") for each in by_qp]
-    return rows
-
-
-def write_cost(study: CostStudy) -> None:
-    """docs/constraints-cost.md with its figures, and the answer in README.md."""
-    docs, sentences = ROOT / "docs", cost_sentences(study)
-    with tempfile.TemporaryDirectory() as scratch:
-        drawn = [path for path in write_cost_figures(study, Path(scratch)) if path.suffix == ".svg"]
-        for path in drawn:
-            shutil.copyfile(path, docs / path.name)
-    page = [
-        "# What do constraints cost?\n\nMade by `make numbers` on one machine "
-        f"({study.machine['processor']}, {study.machine['cores']} cores); nothing here is typed by hand. The same "
-        "section, with plots\nto zoom into, is on the page of `quadsim compare paper-unconstrained paper-constrained "
-        "--out DIR`.\n",
-        "The paper leaves the question open. It compares two controllers that differ in weights and horizon as well "
-        "as in\nconstraints; here the constrained one is held against itself without them.\n",
-        cost_markdown(study, sentences),
-        *(f"![{path.stem}]({path.name})\n" for path in drawn),
-    ]
-    (docs / "constraints-cost.md").write_text("\n".join(page), encoding="utf-8")
-    replace_in_readme("cost", markdown(answer(study)))
-
-
 def markdown(rows: Table) -> str:
     """Rows as a Markdown table, the first as its head."""
     lines = ["| " + " | ".join(row) + " |" for row in rows]
@@ -260,7 +204,6 @@ def main() -> None:
     flights = {name: fly(name) for name in names}
     constrained = flights["paper-constrained"]
     table = markdown(results(flights))
-    study = study_cost(load_scenario("paper-constrained"), [load_scenario("paper-unconstrained")])
     page = [
         "# The numbers\n\nMade by `make numbers`; nothing here is typed by hand.\n",
         f"## The paper's flights\n\n{table}",
@@ -277,8 +220,7 @@ def main() -> None:
     ]
     (ROOT / "docs" / "numbers.md").write_text("\n".join(page), encoding="utf-8")
     replace_in_readme("results", table)
-    replace_in_readme("targets", markdown(targets(constrained, study.variations)))
-    write_cost(study)
+    replace_in_readme("targets", markdown(targets(constrained, fly_variations(load_scenario("paper-constrained")))))
 
 
 if __name__ == "__main__":

@@ -1,6 +1,7 @@
-"""Remake docs/performance.md and its figure on this machine: `make numbers`.
+"""Remake every time that README.md, docs/performance.md and docs/constraints-cost.md report: `make numbers`.
 
-Everything is measured by `quadsim bench`; here it becomes a page.
+Everything is measured by `quadsim bench`; here it becomes pages.  Steps of controllers are timed once, as a flight sees
+them (`scenarios.bench.race`), and all tables and figures take them from there.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ import tempfile
 import time as clock
 from pathlib import Path
 
+from make_cost import timed, write_cost
 from make_numbers import Table, markdown, replace_in_readme
 from PIL import Image
 
@@ -30,6 +32,7 @@ from scenarios.bench.flight import bench_flight
 from scenarios.bench.render import bench_render
 from scenarios.bench.solvers import bench_solvers, section, write_bench
 from scenarios.bench.together import bench_together, saving_rows
+from scenarios.cost import study_cost
 from scenarios.loading import load_scenario
 from scenarios.runner import fly_scenario
 
@@ -51,7 +54,6 @@ BEFORE: Table = [
     ("measurement", "0.05", "0.04", "0.04"),
     ("log and loop", "0.17", "0.04", "0.04"),
     ("the flight, with clocks in it", "1.80", "1.12", "0.77"),
-    ("step p50, p99 [ms]", "1.0, 1.5", "0.03, 1.25", "0.04, 1.20"),
 ]
 """Measured at these commits, on machines of the kind of the page's other numbers."""
 
@@ -171,7 +173,10 @@ def page(
         [
             "# Performance\n\nMade by `make numbers` on one machine "
             f"({machine['processor']}, {machine['cores']} cores, no GPU); each table in one run: read the ratios.\n"
-            f"`quadsim bench solvers`, `flight`, `render` and `campaign` measure the same on yours.\n",
+            f"`quadsim bench solvers`, `flight`, `render` and `campaign` measure the same on yours.\n\n"
+            "A controller's step is timed in one way, as a flight sees it: between two steps the plant flies a period, "
+            "each step is\ntaken three times in turns with all others', and the median counts. "
+            "[constraints-cost.md](constraints-cost.md) and the README tell\nthe same numbers.\n",
             section(contenders),
             "![Time of a whole controller step of every contender, and its growth with the horizon](solvers.png)\n",
             *(section(grid) for grid in others),
@@ -198,6 +203,7 @@ def main() -> None:
     (ROOT / "docs" / "performance.md").write_text(
         page(bench, flight, film, commands, effects, campaigns()), encoding="utf-8"
     )
+    write_cost(study_cost(scenario, [load_scenario("paper-unconstrained")], timed=timed(bench)))
     replace_in_readme("times", commands)
     replace_in_readme("solvers", grid_to_markdown(solver_tables(bench)[0]))
 

@@ -10,7 +10,7 @@ from mpc.constraints import inequalities
 from mpc.cost import cost
 from mpc.prediction import prediction
 from mpc.problem import Bounds, Problem
-from mpc.qp import QP, Vectors
+from mpc.qp import QP, Solution, Vectors
 from quadsim.state import Array
 
 
@@ -41,6 +41,10 @@ class Condensed:
     def inputs(self, x: Array) -> Array:
         """See `mpc.qp.Formulation.inputs`."""
         return x.reshape(-1, self.nu)
+
+    def condensed(self, solution: Solution) -> Solution:
+        """See `mpc.qp.Formulation.condensed`."""
+        return solution
 
 
 def condensed(problem: Problem) -> Condensed:

@@ -13,7 +13,7 @@ matrices are block banded, which a multistage factorisation exploits: its cost g
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -24,7 +24,7 @@ from mpc.condensed import require_bounds
 from mpc.constraints import slew_matrix
 from mpc.prediction import Prediction, prediction
 from mpc.problem import Bounds, Objective, Problem
-from mpc.qp import QP, Vectors
+from mpc.qp import QP, Solution, Vectors
 from quadsim.state import Array
 
 STEPS_OF_ONE_INPUT: Final = 10
@@ -81,6 +81,11 @@ class Multistage:
     def inputs(self, x: Array) -> Array:
         """See `mpc.qp.Formulation.inputs`."""
         return x[self.input_index].reshape(-1, self.u_bar.size) + self.u_bar
+
+    def condensed(self, solution: Solution) -> Solution:
+        """See `mpc.qp.Formulation.condensed`: the rows of G are the same, in the same order."""
+        x, z_box = self.inputs(solution.x).ravel(), solution.z_box[self.input_index]
+        return replace(solution, x=x, y=np.zeros(0), z_box=z_box)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 
 from mpc.model import LinearModel
 from quadsim.errors import ParameterError
-from quadsim.state import REFERENCE_STATES, Array
+from quadsim.state import N_STATES, REFERENCE_STATES, STATE_NAMES, STATE_UNITS, Array
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,6 +63,14 @@ class Bounds:
                 raise ParameterError("controller", low, lower, f"numbers of the same shape as {high} = {upper}")
             if np.any(lower >= upper):
                 raise ParameterError("controller", low, lower, f"below {high} = {upper}")
+
+    def output(self, i: int) -> tuple[str, float, str]:
+        """A constrained output as scenario files name it: its state, what one of its unit is there, and that unit."""
+        (states,) = np.nonzero(self.C_c[i])
+        if states.size != 1 or self.C_c[i, states[0]] != 1.0 or states[0] >= N_STATES:
+            return f"row {i} of C_c", 1.0, ""
+        name, unit = STATE_NAMES[states[0]], STATE_UNITS[states[0]]
+        return (name, math.degrees(1.0), unit.replace("rad", "deg")) if unit.startswith("rad") else (name, 1.0, unit)
 
     @property
     def slewing(self) -> np.ndarray[tuple[int], np.dtype[np.int64]]:

@@ -96,6 +96,10 @@ class Formulation(Protocol):
         """(N, nu) the planned inputs [rad/s] in a primal point."""
         ...
 
+    def condensed(self, solution: Solution) -> Solution:
+        """The same solution as one of the QP of `mpc.condensed`."""
+        ...
+
 
 class Backend(Protocol):
     """A QP solver set up once and called with new vectors each period."""

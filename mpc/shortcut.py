@@ -12,7 +12,7 @@ import numpy as np
 from mpc.axes import Axis, axes
 from mpc.condensed import condensed, require_bounds
 from mpc.free import FreeOptimum
-from mpc.polish import RowPolish
+from mpc.polish import DensePolish, RowPolish
 from mpc.problem import Problem
 from mpc.qp import Solution
 from mpc.solvers import Answer, QPSolver, Solver, Way
@@ -36,7 +36,7 @@ class Shortcut:
     1. no constraint at all: Eq. (22), a product for each axis of `mpc.axes`; the status is then `unconstrained`;
     2. output bounds alone: a small QP for each axis whose outputs leave theirs, its answer polished, so that it is
        exact whatever the solver's tolerances; where there is one axis only, the whole, this is left out;
-    3. the whole QP.
+    3. the whole QP, its answer polished as well where the matrices for that are no larger than `LARGEST_MAP`.
 
     Args:
         problem: with bounds.
@@ -44,6 +44,9 @@ class Shortcut:
 
     Raises:
         numpy.linalg.LinAlgError: the Hessian is so ill-conditioned that the gains of Eq. (22) are not exact.
+
+    Attributes:
+        formulation: the condensed QP.
     """
 
     def __init__(self, problem: Problem, whole: Solver) -> None:
@@ -56,7 +59,9 @@ class Shortcut:
             for axis, inputs, outputs in places
             if len(parts) > 1 and axis.outputs.size
         ]
-        self._whole = whole
+        self._whole, self.formulation = whole, condensed(problem)
+        qp = self.formulation.qp
+        self._polish = DensePolish(qp) if (qp.c.size + qp.h_l.size) ** 2 <= LARGEST_MAP else None
         lower = np.stack([bounds.u_min, bounds.delta_min])[:, None]
         upper = np.stack([bounds.u_max, bounds.delta_max])[:, None]
         self._bounds, self._nearly = (lower, upper), (lower - NEAR, upper + NEAR)
@@ -93,8 +98,14 @@ class Shortcut:
                     return Answer(plan=plan, solution=self._joined(plan, held, parts, started), way=Way.AXES)
         tried_s, tried = clock.perf_counter() - started, sum(part.solution.iterations for part in parts)
         answer = self._whole.solve(state, desired, u_before)
-        iterations, solve_s = answer.solution.iterations + tried, answer.solution.solve_s + tried_s
-        return replace(answer, solution=replace(answer.solution, iterations=iterations, solve_s=solve_s))
+        started = clock.perf_counter()
+        solution = self._whole.formulation.condensed(answer.solution)
+        if self._polish is not None and solution.status == SOLVED:
+            vectors = self.formulation.vectors(state, desired, u_before)
+            solution = self._polish.optimum(self.formulation.qp.with_vectors(vectors), solution)
+        solve_s = solution.solve_s + tried_s + clock.perf_counter() - started
+        solution = replace(solution, iterations=solution.iterations + tried, solve_s=solve_s)
+        return Answer(plan=self.formulation.inputs(solution.x), solution=solution)
 
     def _near(self, w: Array, leaving: list[_BoundedAxis], parts: list[Answer], u_before: Array) -> bool:
         """Whether the axes that leave their bounds have an answer, and together one that the inputs may well allow."""
@@ -177,7 +188,7 @@ class _BoundedAxis:
         self._before = axis.problem.model.u_bar
         self.rows, self.inputs, self.outputs = axis.outputs, inputs, outputs
         qp = condensed(axis.problem).qp
-        self._polish = RowPolish(np.asarray(qp.P), np.asarray(qp.G), qp.h_l, qp.h_u)
+        self._polish, self._bounds = RowPolish(np.asarray(qp.P), np.asarray(qp.G)), (qp.h_l, qp.h_u)
 
     def solve(self, state: Array, desired: Array) -> Answer:
         """The optimal w (N, m) for the whole's xi(k) (n,) and y_d (N, n_r), as good as the solver's tolerances."""
@@ -193,7 +204,7 @@ class _BoundedAxis:
     def polished(self, answer: Answer, w: Array, y: Array) -> _Held:
         """The exact optimum, from an answer near it and the free optimum of all axes; where that fails, the answer."""
         near = self.held(answer)
-        z = self._polish.multipliers(y[self.outputs].T.ravel(), near.z.ravel())
+        z = self._polish.multipliers(y[self.outputs].T.ravel(), near.z.ravel(), *self._bounds)
         if z is None:
             return near
         plan = w[self.inputs].T - (self._polish.R @ z).reshape(answer.plan.shape)

@@ -50,6 +50,8 @@ SHORTEST_LAG: Final = 1e-4
 
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(16)
 _ACCELERATED: Final = [INDEX[name] for name in ("vx", "vy", "vz", "roll_rate", "pitch_rate", "yaw_rate")]
+_TURNS: Final = np.array([0.0, 0.0, 0.0, 1.0, 1.0, 1.0])
+"""Which of them are angular."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -100,30 +102,43 @@ def margins(
         estimated: whether the prediction holds an estimate of the disturbance, which may be wrong by twice its bounds.
 
     Raises:
-        ParameterError: an output is bounded on one side only, or too narrowly for these disturbances; or the lag is too
-            short.
+        ParameterError: an output is bounded on one side only, or too narrowly for these disturbances, of which the one
+            that takes most is named; the lag is too short, or the delay longer than a period.
     """
     if 0.0 < rotor_lag < SHORTEST_LAG:
         raise ParameterError("controller", "rotor_lag", rotor_lag, f"0, or at least {SHORTEST_LAG:g} s")
     A, B, E = disturbed_model(vehicle, rotor_lag)
     C = np.hstack([bounds.C_c, np.zeros((len(bounds.C_c), len(A) - N_STATES))])
+    if delay > period:
+        raise ParameterError("controller", "delay", delay, f"at most the control period of {period} s")
     room = 0.5 * (bounds.y_max - bounds.y_min)
-    if not np.isfinite(room).all():
-        sides = np.stack([bounds.y_min, bounds.y_max]).tolist()
-        raise ParameterError("controller", "output_bounds", sides, "finite on both sides, to be drawn in")
+    for i in np.flatnonzero(~np.isfinite(room)):
+        name, scale, _ = bounds.output(int(i))
+        sides = [scale * float(bounds.y_min[i]), scale * float(bounds.y_max[i])]
+        raise ParameterError("controller.output_bounds", name, sides, "finite on both sides, to be drawn in")
     largest = (2.0 if estimated else 1.0) * np.repeat([settings.acceleration, settings.angular_acceleration], 3)
     basis = observed(A, C)
     A, B, C, E = basis.T @ A @ basis, basis.T @ B, C @ basis, basis.T @ E
     K = correction(*discretise(A, B, period), C / (ERROR_SHARE * room)[:, None], SPEED_SHARE * vehicle.hover_speed)
     drawn_in = growth(A, B, C, E * largest, K, period=period, horizon=horizon, delay=delay)
-    drawn_in += between_samples(settings.turning, period)
+    passed = between_samples(settings.turning, period)
+    drawn_in += passed
     worst = int(np.argmax(drawn_in[-1] / room))
     if drawn_in[-1, worst] > LARGEST_SHARE * room[worst]:
+        turned = growth(A, B, C, E * largest * _TURNS, K, period=period, horizon=horizon, delay=delay)[-1, worst]
+        shares = {
+            "acceleration": drawn_in[-1, worst] - turned - passed,
+            "angular_acceleration": turned,
+            "turning": passed,
+        }
+        most = max(shares, key=lambda name: float(shares[name]))
+        name, scale, unit = bounds.output(worst)
         rule = (
-            f"smaller: output {worst}, bounded to {room[worst]:.3g} on either side of its middle, would be drawn in by "
-            f"{drawn_in[-1, worst]:.3g}, and at most {LARGEST_SHARE:g} of that is allowed"
+            f"smaller, or the bounds on {name} wider: these leave {scale * room[worst]:.3g} {unit} on either side of "
+            f"their middle, of which {scale * drawn_in[-1, worst]:.3g} {unit} would be given up and at most "
+            f"{scale * LARGEST_SHARE * room[worst]:.3g} {unit} may be"
         )
-        raise ParameterError("controller", "tightening", settings, rule)
+        raise ParameterError("controller.tightening", most, getattr(settings, most), rule)
     return read_only(drawn_in)
 
 

@@ -21,6 +21,7 @@ from quadsim.conditions import (
     nested,
     verdict_cell,
 )
+from quadsim.controller import law_name
 from quadsim.rundir import Run
 from quadsim.table import ABSENT, Cell, Mark, Row, format_number
 
@@ -98,7 +99,7 @@ def _flight_rows(runs: Sequence[Run]) -> Iterator[Row]:
     yield row("verdict on the flight", lambda run: verdict_cell(run.summary))
     yield row("required constraints", lambda run: required(run.summary))
     yield row("time flown", lambda run: Cell(text=format_number(run.summary.get("duration"))), "s")
-    yield row("controller", text(lambda run: run.summary["controller"].get("name", ABSENT)))
+    yield row("controller", text(lambda run: law_name(run.summary["controller"].get("name", ABSENT))))
     yield row("solver", text(lambda run: run.summary["controller"].get("solver") or "closed form"))
     yield row("horizon", text(lambda run: run.summary["controller"].get("horizon", ABSENT)), "periods")
     yield row("vehicle", text(lambda run: run.vehicle.name))

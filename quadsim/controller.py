@@ -18,6 +18,15 @@ ACCEPTED: Final = frozenset({SOLVED, UNCONSTRAINED})
 """The statuses whose command is the period's optimum."""
 MISSED: Final = "missed"
 """Status of a period whose command came after the next period's begin: the one before it went on acting."""
+LAW_NAMES: Final = {
+    "unconstrained": "unconstrained MPC",
+    "constrained": "constrained MPC",
+    "robust": "robust MPC",
+    "lqr": "LQR",
+    "pid": "PID",
+    "geometric": "geometric control",
+}
+"""What controllers are called where people read, by the names that they record; others go by their own."""
 LARGEST_SPEED: Final = 1e5
 """Largest magnitude of a rotor speed command [rad/s] that is taken for a command rather than for a fault."""
 
@@ -141,3 +150,8 @@ def check_command(speeds: Array) -> str | None:
     if np.max(np.abs(speeds)) > LARGEST_SPEED:
         return f"the command is beyond any rotor's speed: {np.asarray(speeds).tolist()}"
     return None
+
+
+def law_name(recorded: str) -> str:
+    """What a controller is called where people read, by the name in a run's summary."""
+    return LAW_NAMES.get(recorded, recorded)

@@ -10,7 +10,7 @@ import numpy as np
 from PIL import Image
 
 from quadsim.audit import Limit
-from quadsim.controller import ACCEPTED, Phase
+from quadsim.controller import ACCEPTED, Phase, law_name
 from quadsim.footage import Footage, MarginTrack
 from quadsim.pen import (
     AMBER,
@@ -54,7 +54,7 @@ class Overlay:
         self._scale = min(width / 1280.0, height / 720.0) * (_COMPACT_SCALE if compact else 1.0)
         self._width, self._height = width / self._scale, height / self._scale
         controller = run.summary.get("controller", {})
-        self._subtitle = "  ·  ".join(filter(None, (controller.get("name"), controller.get("solver"))))
+        self._subtitle = "  ·  ".join(filter(None, (law_name(controller.get("name", "")), controller.get("solver"))))
         self._grounded = any(phase != Phase.FLYING for phase in run.log.control.phase)
         self._ranked = sorted(footage.margins, key=lambda track: track.rank)  # of the whole flight: rows stay in place
         self._top_view = TopView(run, footage, *(_COMPACT_MAP if compact else _MAP), acting=not compact)

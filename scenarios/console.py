@@ -13,6 +13,7 @@ from rich.markup import escape
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
+from quadsim.controller import law_name
 from quadsim.table import Cell, Grid, Mark, Row
 from scenarios import runner
 
@@ -116,7 +117,7 @@ def _controller_line(summary: Mapping[str, Any]) -> str:
     control, controller = summary["control"], summary["controller"]
     statuses = ", ".join(f"{count} {status}" for status, count in controller["statuses"].items())
     times = controller["step_ms"]
-    how = f"{controller['name']} MPC" + (f" by {controller['solver']}" if controller["solver"] else "")
+    how = law_name(controller["name"]) + (f" by {controller['solver']}" if controller["solver"] else "")
     return (
         f"{how}: {statuses}; step p50 {times['p50']:.3f}, p99 {times['p99']:.3f}, max {times['max']:.3f} ms "
         f"of {controller['deadline_ms']:g} ms\n"

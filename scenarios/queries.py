@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 import contextlib
-import time as clock
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
 
-from quadsim.controller import Controller, Moment
+from quadsim.controller import Command, Controller, Moment
 from quadsim.errors import FlightError
 from quadsim.flightlog import ControlLog
-from quadsim.state import Array
-from scenarios.build import build_reference
+from quadsim.state import Array, make_state
+from quadsim.vehicle import Vehicle
+from scenarios.build import build_plant, build_reference
 from scenarios.spec import Scenario
-from scenarios.timing import undisturbed
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,33 +44,45 @@ def recorded(scenario: Scenario, log: ControlLog, horizon: int) -> Queries:
     )
 
 
-def time_steps(
-    controller: Controller, queries: Queries, *, stride: int = 1, progress: Callable[[], None] = lambda: None
-) -> tuple[Array, tuple[str, ...]]:
-    """Answer queries once each, on one thread, with the garbage collector at rest.
+class Asked:
+    """A controller that is asked a flight's queries, each after the command that was given before it in that flight.
 
-    The controller is reset to u(k-1) before each step, so that each is asked exactly what was asked in flight.
-
-    Args:
-        controller: what is timed.
-        queries: what it is asked.
-        stride: one query of so many is asked.
-        progress: called after each step, outside its time.
-
-    Returns:
-        (ceil(K / stride),) time of each whole step [ms], and what each answered: its status, or `failed` where it gave
-        no command.
+    Attributes:
+        command: its last answer; None where there was none.
+        statuses: what it answered first, by period: its status, or `failed` where it gave no command.
     """
-    step_ms, statuses = [], []
-    with undisturbed():
-        for k in range(0, queries.t.size, stride):
-            controller.reset(queries.speeds_before[k])
-            reference = queries.reference[k + 1 : k + 1 + controller.horizon]
-            now, state, status = Moment(time=float(queries.t[k])), queries.state[k], "failed"
-            started = clock.perf_counter()
-            with contextlib.suppress(FlightError):
-                status = controller.step(now, state, reference).status
-            step_ms.append(1e3 * (clock.perf_counter() - started))
-            statuses.append(status)
-            progress()
-    return np.array(step_ms), tuple(statuses)
+
+    def __init__(self, controller: Controller, queries: Queries) -> None:
+        self._controller, self._queries = controller, queries
+        self.command: Command | None = None
+        self.statuses: dict[int, str] = {}
+
+    def prepare(self, period: int) -> None:
+        """See `scenarios.bench.race.Entrant.prepare`."""
+        queries = self._queries
+        self._controller.reset(queries.speeds_before[period])
+        reference = queries.reference[period + 1 : period + 1 + self._controller.horizon]
+        self._query = (Moment(time=float(queries.t[period])), queries.state[period], reference)
+        self._period, self.command = period, None
+
+    def answer(self) -> None:
+        """See `scenarios.bench.race.Entrant.answer`."""
+        try:
+            self.command = self._controller.step(*self._query)
+        except FlightError:  # there is no earlier plan to hold: the solver failed
+            self.command = None
+        self.statuses.setdefault(self._period, "failed" if self.command is None else self.command.status)
+
+
+@contextlib.contextmanager
+def flight_between(scenario: Scenario, vehicle: Vehicle) -> Iterator[Callable[[], None]]:
+    """What a flight does between two control steps: it flies a period and measures, which empties caches."""
+    with build_plant(scenario, vehicle) as plant:
+        hover = make_state(position=(0.0, 0.0, 10.0))
+
+        def fly() -> None:
+            plant.reset(hover)
+            plant.advance(plant.hover_speeds, scenario.steps_per_period)
+            plant.state()
+
+        yield fly

@@ -87,7 +87,8 @@ def lqr_gain(model: LinearModel, objective: Objective) -> Array:
         stable = False
     if not stable:
         rule = "such that every state it leaves free comes to rest: weigh x, y, z and yaw"
-        raise ParameterError("controller", "objective", np.diag(Q).tolist(), rule)
+        weights = {name: float(weight) for name, weight in zip(STATE_NAMES, Q.diagonal(), strict=True) if weight}
+        raise ParameterError("controller", "output_weights", weights, rule)
     return read_only(np.asarray(K))
 
 

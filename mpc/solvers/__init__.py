@@ -166,7 +166,7 @@ class Answer:
 
     Attributes:
         plan: (N, nu) inputs [rad/s]; to be used only when the solution's status is accepted.
-        solution: the back end's answer, to the QP of the solver's own formulation; a shortcut's, to the condensed one.
+        solution: to the QP of the solver's formulation.
         way: how it was found.
     """
 
@@ -181,6 +181,11 @@ class Solver(Protocol):
     @property
     def name(self) -> str:
         """Name of the QP solver, in `SOLVERS`."""
+        ...
+
+    @property
+    def formulation(self) -> Formulation:
+        """The QP that its solutions are of."""
         ...
 
     def solve(self, state: Array, desired: Array, u_before: Array) -> Answer:

@@ -43,7 +43,8 @@ class Contender:
         package: the solver's distribution and its version.
         shortcut: whether it tries less than the whole QP first; see `mpc.shortcut`.
         repeats: how often each period was timed.
-        step_ms: (K,) whole controller step per period, the best of the repeats [ms].
+        step_ms: (K,) whole controller step per period, the median of the repeats [ms].
+        answered: (K,) statuses.
         raw_max_ms: the longest of all steps of all repeats, the machine's stalls included [ms].
         statuses: periods by what they were answered.
         ways: periods by how their optimum was found, or last looked for.
@@ -58,6 +59,7 @@ class Contender:
     shortcut: bool
     repeats: int
     step_ms: Array
+    answered: tuple[str, ...]
     raw_max_ms: float
     statuses: Mapping[str, int]
     ways: Mapping[str, int]
@@ -136,6 +138,8 @@ class SolverBench:
         asked: periods asked, K.
         flown: periods of the flight.
         contenders: the default controller first.
+        gain_ms: (K,) whole step of the gain that the controller would be without its constraints [ms]; None where there
+            is none.
         left_out: solvers that did not take part, and why.
         growth: of each contender; empty where that was not measured.
         growth_asked: periods asked at each horizon.
@@ -151,6 +155,7 @@ class SolverBench:
     asked: int
     flown: int
     contenders: tuple[Contender, ...]
+    gain_ms: Array | None
     left_out: Mapping[str, str]
     growth: tuple[Growth, ...]
     growth_asked: int
@@ -166,12 +171,13 @@ class SolverBench:
 
     def to_json(self) -> dict[str, Any]:
         """Everything, as plain values; a number that is none is null."""
-        values = {name: value for name, value in vars(self).items() if name not in ("contenders", "growth", "stages")}
+        apart = ("contenders", "gain_ms", "growth", "stages")
         return {
-            **values,
+            **{name: value for name, value in vars(self).items() if name not in apart},
+            "gain_ms": None if self.gain_ms is None else metrics.percentiles(self.gain_ms),
             "contenders": [
                 {
-                    **asdict(contender),
+                    **{name: value for name, value in asdict(contender).items() if name != "answered"},
                     "step_ms": contender.quantiles,
                     "step_ms_by_period": np.round(contender.step_ms, 5).tolist(),
                     "p99_to_default": contender.quantiles["p99"] / self.default.quantiles["p99"],

@@ -114,8 +114,9 @@ def _contender(contender: Contender, bench: SolverBench, fastest: dict[str, floa
 def _how(bench: SolverBench) -> str:
     which = "All" if bench.asked == bench.flown else f"{bench.asked} of the"
     said = (
-        f"{which} {bench.flown} control periods of `{bench.scenario}`, N = {bench.horizon}, each the best of its "
-        "repeats; raw max is the longest of all steps, the machine's stalls included. One process, one thread; "
+        f"{which} {bench.flown} control periods of `{bench.scenario}`, N = {bench.horizon}, timed as a flight "
+        "sees them: between two steps the plant flies a period, and each is the median of its repeats; raw max is the "
+        "longest of all steps, the machine's stalls included. One process, one thread; "
         "contenders take their turns in random order. Failures are periods without an optimum. Over the others, u0 "
         "error [rad/s] is the largest of the first input, from an optimum in closed form whose own KKT residual is at "
         f"most {bench.reference_kkt:.0e}, and KKT the worst residual of the contender's answer to its own QP. "
@@ -142,8 +143,9 @@ def _growth(bench: SolverBench) -> Grid:
         if growth.failures
     )
     note = (
-        f"{bench.growth_asked} control periods at each N, the problem and its reference made anew; growth: the "
-        f"exponents of N that fit p50 and p99 from N = {FITTED_FROM} on."
+        f"{bench.growth_asked} control periods at each N, the problem and its reference made anew; at N = "
+        f"{bench.horizon} those of the contenders' table; growth: the exponents of N that fit p50 and p99 from N = "
+        f"{FITTED_FROM} on."
     )
     return Grid(
         key="growth",
@@ -181,8 +183,9 @@ def _stages(what: str, stages: Sequence[StageLength]) -> Grid:
         title=f"How many steps make a stage: the {what}",
         head=("steps per stage", "variables", "p50 [ms]", "p99 [ms]", "p50, as a ratio to the default"),
         lines=tuple(lines),
-        note="PIQP alone, on the periods whose QP has active constraints. Its multistage factorisation costs less the "
-        "fewer stages there are, and more the larger each is; the paper's own form is the condensed one.",
+        note="PIQP alone, timed in the same way, on the periods whose QP has active constraints. Its multistage "
+        "factorisation costs less the fewer stages there are, and more the larger each is; the paper's own form is the "
+        "condensed one.",
     )
 
 

@@ -79,7 +79,7 @@ class Contender:
 
     Attributes:
         name: what it is called.
-        step_ms: (K,) time of the whole controller step in each period, the best of all repeats [ms].
+        step_ms: (K,) time of the whole controller step in each period, the median of all repeats [ms].
         statuses: K texts, what each step answered.
         repeats: how often each period was timed.
     """

@@ -69,8 +69,9 @@ def _computation(study: CostStudy) -> Grid:
     repeats = sorted({contender.repeats for contender in study.contenders})
     note = (
         f"Whole controller step, Python included, on the same {study.contenders[0].step_ms.size} queries, recorded in "
-        f"the constrained flight; each period is the best of {' or '.join(map(str, repeats))} repeats. The rates are "
-        "those at which 99 % of the steps, or all, would end within one period."
+        f"the constrained flight, timed as a flight sees them: between two steps the plant flies a period, and each is "
+        f"the median of {' or '.join(map(str, repeats))} repeats. The rates are those at which 99 % of the steps, or "
+        "all, would end within one period."
     )
     left_out = "".join(f" Left out: {name}, {why}." for name, why in study.left_out.items())
     return Grid(
@@ -164,7 +165,8 @@ def _sweep(sweep: Sweep, key: str, title: str) -> Grid:
             "solved, unconstrained, held: periods answered by QPs, by an unconstrained optimum within every bound, "
             "and by an earlier plan where the QP has no solution. active: share of periods with an active constraint. "
             "settling: of the slowest step in x, y or z, judged until the controller sees the next one coming, which a "
-            "longer horizon does sooner. step: timed on the flight's own queries. Bold: the flight that is studied."
+            "longer horizon does sooner. step: timed in the same way, on the flight's own queries. Bold: the flight "
+            "that is studied."
         ),
     )
 

@@ -15,11 +15,10 @@ from mpc.polish import polish
 from mpc.problem import Problem
 from mpc.qp import Formulation, kkt_residuals
 from mpc.shortcut import with_shortcut
-from mpc.solvers import SOLVERS, Answer, QPSolver, Solver, Way, make_backend
-from quadsim.controller import ACCEPTED, Command, Moment
-from quadsim.errors import FlightError
+from mpc.solvers import SOLVERS, Answer, QPSolver, Solver, make_backend
+from quadsim.controller import ACCEPTED, Command
 from quadsim.state import Array
-from scenarios.queries import Queries
+from scenarios.queries import Asked, Queries
 
 WITH_SHORTCUT: Final = ("daqp",)
 """Solvers that are shown both with and without shortcuts, besides the default."""
@@ -60,6 +59,11 @@ class _Witnessed:
         """See `mpc.solvers.Solver.name`."""
         return self._solver.name
 
+    @property
+    def formulation(self) -> Formulation:
+        """See `mpc.solvers.Solver.formulation`."""
+        return self._solver.formulation
+
     def solve(self, state: Array, desired: Array, u_before: Array) -> Answer:
         """See `mpc.solvers.Solver.solve`."""
         self.last = self._solver.solve(state, desired, u_before)
@@ -67,45 +71,42 @@ class _Witnessed:
 
 
 class StepEntrant:
-    """A controller that is asked a flight's queries, each after the command that was given before it in that flight."""
+    """A constrained controller that is asked a flight's queries, and whose solver's answers are kept."""
 
     def __init__(self, entry: Entry, problem: Problem, queries: Queries) -> None:
-        self.entry, self.problem, self._queries = entry, problem, queries
+        self.entry, self.problem = entry, problem
         whole = QPSolver(entry.solver, problem)
-        self.formulation = whole.formulation
         self._solver = _Witnessed(with_shortcut(problem, whole) if entry.shortcut else whole)
-        self._controller = ConstrainedMPC(problem, self._solver, shortcut=False)
+        self.formulation = self._solver.formulation
+        self._asked = Asked(ConstrainedMPC(problem, self._solver, shortcut=False), queries)
         self.answers: dict[int, tuple[Command | None, Answer]] = {}
         """What was answered in the first pass, by period: the command, if any, and the solver's answer."""
-        self._command: Command | None = None
         self._period: int | None = None
 
     def prepare(self, period: int) -> None:
         """See `scenarios.bench.race.Entrant.prepare`; keeps what was answered last."""
         self.keep()
-        self._period = period
-        queries = self._queries
-        self._controller.reset(queries.speeds_before[period])
-        reference = queries.reference[period + 1 : period + 1 + self.problem.horizon]
-        self._query = (Moment(time=float(queries.t[period])), queries.state[period], reference)
-        self._command, self._solver.last = None, None
+        self._period, self._solver.last = period, None
+        self._asked.prepare(period)
 
     def answer(self) -> None:
         """See `scenarios.bench.race.Entrant.answer`."""
-        try:
-            self._command = self._controller.step(*self._query)
-        except FlightError:  # there is no earlier plan to hold: the solver failed
-            self._command = None
+        self._asked.answer()
 
     def keep(self) -> None:
         """Keep the last answer, if it is the first to its question."""
         if self._period is not None and self._solver.last is not None:
-            self.answers.setdefault(self._period, (self._command, self._solver.last))
+            self.answers.setdefault(self._period, (self._asked.command, self._solver.last))
 
     def ways(self, periods: Sequence[int]) -> np.ndarray[tuple[int], np.dtype[np.object_]]:
         """The `mpc.solvers.Way` in which each period was answered."""
         self.keep()
         return np.array([self.answers[period][1].way for period in periods], dtype=object)
+
+    def statuses(self, periods: Sequence[int]) -> tuple[str, ...]:
+        """What each period was answered."""
+        self.keep()
+        return tuple(self._asked.statuses[period] for period in periods)
 
     def failures(self, periods: Sequence[int]) -> int:
         """How many periods were left without their optimum."""
@@ -155,7 +156,7 @@ class Verdict:
 def judge(entrant: StepEntrant, queries: Queries, periods: Sequence[int], reference: Reference) -> Verdict:
     """Hold the answers of an entrant's first pass against the optimum, and against the KKT conditions of its own QP."""
     entrant.keep()
-    problem, whole, plain = entrant.problem, entrant.formulation, condensed(entrant.problem)
+    problem, form = entrant.problem, entrant.formulation
     statuses: Counter[str] = Counter()
     errors, residuals = [], []
     for period in periods:
@@ -165,7 +166,6 @@ def judge(entrant: StepEntrant, queries: Queries, periods: Sequence[int], refere
             continue
         statuses[command.status] += 1
         errors.append(np.abs(command.speeds - reference.inputs[period]).max())
-        form: Formulation = whole if answer.way is Way.WHOLE else plain
         qp = form.qp.with_vectors(form.vectors(*_query(problem, queries, period)))
         residuals.append(kkt_residuals(qp, answer.solution).worst)
     return Verdict(

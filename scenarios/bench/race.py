@@ -1,8 +1,12 @@
 """Contenders timed against each other in one process, so that what the machine does meanwhile meets them all.
 
+Every step that is timed is timed here, in one way, as a flight sees it: between two questions the plant flies a period,
+which leaves in the caches what it leaves there in a flight.  A question is put a few times, and its time is the median:
+what a flight sees but for the machine's stalls.
+
 The questions are put in stretches of consecutive periods.  Within a stretch a contender answers all of them, as in a
-flight: from its last answer, and with its data in the caches.  In each stretch the contenders take their turns in
-random order.  A stretch begins with the period before it, which is not timed.
+flight from its last answer.  In each stretch the contenders take their turns in random order.  A stretch begins with
+the period before it, which is not timed.
 """
 
 from __future__ import annotations
@@ -46,9 +50,9 @@ class Laps:
     ms: Array
 
     @property
-    def best(self) -> Array:
-        """(questions,) the shortest over the repeats [ms]."""
-        return self.ms.min(axis=0)
+    def median(self) -> Array:
+        """(questions,) over the repeats [ms]."""
+        return np.asarray(np.median(self.ms, axis=0))
 
 
 def stretches(periods: int, stride: int) -> list[range]:
@@ -60,6 +64,7 @@ def race(
     entrants: Mapping[str, Entrant],
     asked: Sequence[range],
     *,
+    between: Callable[[], None],
     repeats: int,
     rng: np.random.Generator,
     longest_pass: float = math.inf,
@@ -71,6 +76,7 @@ def race(
     Args:
         entrants: by name.
         asked: stretches of periods.
+        between: what a flight does between two questions; not timed.
         repeats: passes over all questions.
         rng: decides the order within each stretch.
         longest_pass: entrants whose first pass takes longer than this [s] make no other.
@@ -91,7 +97,7 @@ def race(
                 gc.collect()
                 for name in rng.permutation([name for name in racing if name in passes]).tolist():
                     left_ms = 1e3 * patience - sum(passes[name][-1])
-                    passes[name][-1] += _turn(entrants[name], stretch, left_ms)
+                    passes[name][-1] += _turn(entrants[name], stretch, between, left_ms)
                     if sum(passes[name][-1]) > 1e3 * patience:
                         del passes[name]
                     done += 1
@@ -100,7 +106,7 @@ def race(
     return {name: Laps(ms=np.array(laps)) for name, laps in passes.items()}
 
 
-def _turn(entrant: Entrant, stretch: range, left_ms: float) -> list[float]:
+def _turn(entrant: Entrant, stretch: range, between: Callable[[], None], left_ms: float) -> list[float]:
     """The times of one stretch [ms], or of as much of it as goes a little beyond the time left."""
     entrant.prepare(max(stretch.start - 1, 0))
     entrant.answer()
@@ -109,6 +115,7 @@ def _turn(entrant: Entrant, stretch: range, left_ms: float) -> list[float]:
         if sum(laps) > left_ms:
             break
         entrant.prepare(period)
+        between()
         started = clock.perf_counter()
         entrant.answer()
         laps.append(1e3 * (clock.perf_counter() - started))

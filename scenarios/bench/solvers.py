@@ -2,24 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Final
+from typing import Final, TypedDict
 
 import numpy as np
 
 from mpc.problem import Problem
 from mpc.solvers import SOLVERS, Way
+from mpc.unconstrained import UnconstrainedMPC
 from quadsim import outputs
 from quadsim.bench import Contender, Growth, SolverBench, solver_tables
 from quadsim.errors import InputError, ParameterError, UnknownNameError
+from quadsim.state import Array
 from quadsim.table import Grid, grid_to_markdown
 from scenarios.bench.contenders import Entry, StepEntrant, entries, judge, reference_optima
-from scenarios.bench.race import race, stretches
+from scenarios.bench.race import Laps, race, stretches
 from scenarios.bench.stages import time_stages
 from scenarios.build import build_problem
-from scenarios.queries import recorded
+from scenarios.queries import Asked, Queries, flight_between, recorded
 from scenarios.runner import Flight, Progress, fly_scenario, machine, silent, versions
 from scenarios.spec import LARGEST_HORIZON, ConstrainedSpec, Scenario
 
@@ -36,8 +38,31 @@ GROWTH_STRIDE: Final = 6
 """One stretch of so many is asked at each horizon and of each form of the QP."""
 LONGEST_PASS: Final = 20.0
 """A contender whose first pass takes longer [s] is timed once."""
+GAIN: Final = "unconstrained gain"
+"""What the controller would be without its constraints."""
 PATIENCE: Final = 60.0
 """A contender that takes longer for the questions at one horizon [s] is dropped."""
+
+
+class _Racing(TypedDict):
+    """What every race of a bench has in common; see `scenarios.bench.race.race`."""
+
+    between: Callable[[], None]
+    repeats: int
+    rng: np.random.Generator
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Timed:
+    """A contender's steps (K,) [ms], the ways (K,) they were answered in, and the periods without their optimum."""
+
+    step_ms: Array
+    ways: np.ndarray[tuple[int], np.dtype[np.object_]]
+    failures: int
+
+    @classmethod
+    def of(cls, entrant: StepEntrant, periods: Sequence[int], laps: Laps) -> _Timed:
+        return cls(step_ms=laps.median, ways=entrant.ways(periods), failures=entrant.failures(periods))
 
 
 def bench_solvers(
@@ -71,11 +96,15 @@ def bench_solvers(
     problem = build_problem(scenario, flight.vehicle)
     rng = np.random.default_rng(scenario.seed)
     taking_part = entries(Entry(solver=spec.solver, shortcut=spec.shortcut), solvers)
-    contenders, asked, reference_kkt = _time_contenders(
-        flight, problem, taking_part, repeats=repeats, stride=stride, rng=rng, progress=progress
-    )
     few = stretches(flight.log.control.t.size, stride * GROWTH_STRIDE)
-    growth = _growth(flight, problem, taking_part, horizons, few, repeats=repeats, rng=rng, progress=progress)
+    with flight_between(scenario, flight.vehicle) as between:
+        racing: _Racing = {"between": between, "repeats": repeats, "rng": rng}
+        contenders, own, gain, asked, reference_kkt = _time_contenders(
+            flight, problem, taking_part, stride=stride, progress=progress, **racing
+        )
+        growth = _growth(flight, problem, taking_part, horizons, few, own, progress=progress, **racing)
+        queries = recorded(scenario, flight.log.control, problem.horizon)
+        stages = time_stages(problem, queries, few, progress=progress, **racing)
     return SolverBench(
         scenario=scenario.name,
         horizon=problem.horizon,
@@ -83,17 +112,11 @@ def bench_solvers(
         asked=asked,
         flown=flight.log.control.t.size,
         contenders=contenders,
+        gain_ms=gain,
         left_out={name: SOLVERS[name].line for name in solvers if not SOLVERS[name].installed},
         growth=growth,
         growth_asked=sum(map(len, few)),
-        stages=time_stages(
-            problem,
-            recorded(scenario, flight.log.control, problem.horizon),
-            few,
-            repeats=repeats,
-            rng=rng,
-            progress=progress,
-        ),
+        stages=stages,
         reference_kkt=reference_kkt,
         versions=versions(),
         machine=machine(),
@@ -147,17 +170,19 @@ def _time_contenders(
     repeats: int,
     stride: int,
     rng: np.random.Generator,
+    between: Callable[[], None],
     progress: Progress,
-) -> tuple[tuple[Contender, ...], int, float]:
-    """Every contender, the number of periods asked, and the worst KKT residual of the reference."""
+) -> tuple[tuple[Contender, ...], dict[str, _Timed], Array | None, int, float]:
+    """Contenders, their steps, the gain's, the number of periods asked, and the reference's worst KKT residual."""
     queries = recorded(flight.scenario, flight.log.control, problem.horizon)
     asked = stretches(queries.t.size, stride)
     periods = [period for stretch in asked for period in stretch]
     reference = reference_optima(problem, queries, periods)
     entrants = {entry.name: StepEntrant(entry, problem, queries) for entry in taking_part}
     laps = race(
-        entrants,
+        {**_gain(problem, queries), **entrants},
         asked,
+        between=between,
         repeats=repeats,
         rng=rng,
         longest_pass=LONGEST_PASS,
@@ -170,13 +195,24 @@ def _time_contenders(
             package=_package(entrant.entry.solver),
             shortcut=entrant.entry.shortcut,
             repeats=laps[name].ms.shape[0],
-            step_ms=laps[name].best,
+            step_ms=laps[name].median,
+            answered=entrant.statuses(periods),
             raw_max_ms=float(laps[name].ms.max()),
             **vars(judge(entrant, queries, periods, reference)),
         )
         for name, entrant in entrants.items()
     )
-    return contenders, len(periods), reference.kkt
+    gain = laps[GAIN].median if GAIN in laps else None
+    own = {name: _Timed.of(entrant, periods, laps[name]) for name, entrant in entrants.items()}
+    return contenders, own, gain, len(periods), reference.kkt
+
+
+def _gain(problem: Problem, queries: Queries) -> dict[str, Asked]:
+    """The gain, where weights are not so far apart that it cannot be computed."""
+    try:
+        return {GAIN: Asked(UnconstrainedMPC(problem), queries)}
+    except np.linalg.LinAlgError:
+        return {}
 
 
 def _package(solver: str) -> str:
@@ -190,14 +226,17 @@ def _growth(
     taking_part: Sequence[Entry],
     horizons: Sequence[int],
     asked: Sequence[range],
+    own: Mapping[str, _Timed],
     *,
+    between: Callable[[], None],
     repeats: int,
     rng: np.random.Generator,
     progress: Progress,
 ) -> tuple[Growth, ...]:
     """Every contender at each N, until one would hardly keep up with the flight at the next.
 
-    Steps by the whole QP and by either shortcut are told apart: their shares change with N.
+    Steps by the whole QP and by either shortcut are told apart: their shares change with N.  At the flight's own N they
+    are those of the contenders, `own`, which are not timed again.
     """
     grown: dict[tuple[Entry, Way], list[tuple[int, float, float]]] = {}
     failures: dict[str, dict[int, int]] = {}
@@ -205,32 +244,35 @@ def _growth(
     periods = [period for stretch in asked for period in stretch]
     deadline_ms = 1e3 * flight.scenario.control_period
     for N in sorted(set(horizons)):
-        queries = recorded(flight.scenario, flight.log.control, N)
-        longer = replace(problem, horizon=N)
         racing = [entry for entry in taking_part if entry.name not in dropped]
-        entrants = {entry.name: StepEntrant(entry, longer, queries) for entry in racing}
-        laps = race(
-            entrants,
-            asked,
-            repeats=repeats,
-            rng=rng,
-            longest_pass=LONGEST_PASS,
-            patience=PATIENCE,
-            progress=lambda done, total, N=N: progress(f"N = {N}", done, total),  # type: ignore[misc]
-        )
+        if problem.horizon == N:
+            timed = dict(own)
+        else:
+            queries, longer = recorded(flight.scenario, flight.log.control, N), replace(problem, horizon=N)
+            entrants = {entry.name: StepEntrant(entry, longer, queries) for entry in racing}
+            laps = race(
+                entrants,
+                asked,
+                between=between,
+                repeats=repeats,
+                rng=rng,
+                longest_pass=LONGEST_PASS,
+                patience=PATIENCE,
+                progress=lambda done, total, N=N: progress(f"N = {N}", done, total),  # type: ignore[misc]
+            )
+            timed = {name: _Timed.of(entrants[name], periods, lap) for name, lap in laps.items()}
         for entry in racing:
-            if entry.name not in laps:
+            if entry.name not in timed:
                 dropped[entry.name] = f"more than {PATIENCE:g} s for them at N = {N}"
                 continue
-            best = laps[entry.name].best
-            if failed := entrants[entry.name].failures(periods):
-                failures.setdefault(entry.name, {})[N] = failed
-            ways = entrants[entry.name].ways(periods)
+            found = timed[entry.name]
+            if found.failures:
+                failures.setdefault(entry.name, {})[N] = found.failures
             for way in Way:
-                if (ways == way).any():
-                    p50, p99 = np.percentile(best[ways == way], [50, 99])
+                if (found.ways == way).any():
+                    p50, p99 = np.percentile(found.step_ms[found.ways == way], [50, 99])
                     grown.setdefault((entry, way), []).append((N, float(p50), float(p99)))
-            if (p95 := np.percentile(best, 95)) > 0.5 * deadline_ms:
+            if (p95 := np.percentile(found.step_ms, 95)) > 0.5 * deadline_ms:
                 dropped[entry.name] = f"p95 of {p95:.0f} ms at N = {N}, beyond half the control period"
     return tuple(
         Growth(

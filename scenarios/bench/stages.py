@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import Final
 
 import numpy as np
@@ -31,6 +32,7 @@ def time_stages(
     queries: Queries,
     asked: Sequence[range],
     *,
+    between: Callable[[], None],
     repeats: int,
     rng: np.random.Generator,
     progress: Progress,
@@ -41,7 +43,8 @@ def time_stages(
         reference = queries.reference[period + 1 : period + 1 + problem.horizon]
         return queries.state[period], problem.objective.desired(reference), queries.speeds_before[period]
 
-    times = {"whole QP": _time(problem, whole, asked, repeats=repeats, rng=rng, progress=progress)}
+    time = partial(_time, asked=asked, between=between, repeats=repeats, rng=rng, progress=progress)
+    times = {"whole QP": time(problem, whole)}
     bounded = [axis for axis in axes(problem) if axis.outputs.size]
     for axis in bounded[:1]:
 
@@ -49,7 +52,9 @@ def time_stages(
             state, desired, _ = whole(period)
             return state[axis.states], desired[:, axis.regulated], axis.problem.model.u_bar
 
-        times["QP of one axis"] = _time(axis.problem, part, asked, repeats=repeats, rng=rng, progress=progress)
+        times["QP of one axis"] = _time(
+            axis.problem, part, asked, between=between, repeats=repeats, rng=rng, progress=progress
+        )
     return times
 
 
@@ -77,6 +82,7 @@ def _time(
     query: Callable[[int], Query],
     asked: Sequence[range],
     *,
+    between: Callable[[], None],
     repeats: int,
     rng: np.random.Generator,
     progress: Progress,
@@ -89,6 +95,7 @@ def _time(
     laps = race(
         {str(steps): entrant for steps, entrant in entrants.items()},
         asked,
+        between=between,
         repeats=repeats,
         rng=rng,
         progress=lambda done, total: progress("stages", done, total),
@@ -98,7 +105,7 @@ def _time(
     counted = active if active.any() else np.ones_like(active)
     found = []
     for steps, entrant in entrants.items():
-        p50, p99 = np.percentile(laps[str(steps)].best[counted], [50, 99])
+        p50, p99 = np.percentile(laps[str(steps)].median[counted], [50, 99])
         size = entrant.formulation.qp.c.size
         found.append(StageLength(steps=steps, variables=size, p50=float(p50), p99=float(p99), default=steps == default))
     return tuple(found)

@@ -19,16 +19,16 @@ from quadsim.controller import Controller
 from quadsim.cost import Contender, Outcome
 from quadsim.errors import MissingPackageError
 from quadsim.flightlog import ControlLog, FlightLog
-from quadsim.state import REFERENCE_STATES, Array
+from quadsim.state import REFERENCE_STATES
+from scenarios.bench.race import race, stretches
 from scenarios.build import build_controller, build_course_steps, build_problem, build_vehicle
-from scenarios.queries import recorded, time_steps
+from scenarios.queries import Asked, flight_between, recorded
 from scenarios.runner import Progress, fly_scenario, usable_cores
 from scenarios.spec import Scenario
 
 REPEATS: Final = 3
-SWEEP_REPEATS: Final = 2
 SWEEP_STRIDE: Final = 3
-"""Of a flight in a sweep, each period of so many is timed."""
+"""Of a flight in a sweep, one stretch of so many is timed."""
 LONGEST_PASS: Final = 20.0
 """A contender that takes longer than this for all periods of a flight [s] is timed once."""
 
@@ -108,7 +108,10 @@ def _leave_interrupts_to_parent() -> None:
 def time_contenders(
     scenario: Scenario, log: ControlLog, solvers: Sequence[str], progress: Progress
 ) -> tuple[tuple[Contender, ...], dict[str, str]]:
-    """Everything that can compute a command, timed on the queries of a flight; and what could not take part."""
+    """Everything that can compute a command, timed on the queries of a flight; and what could not take part.
+
+    See `scenarios.bench.race` for how.
+    """
     if not log.t.size:
         return (), {}
     vehicle = build_vehicle(scenario)
@@ -123,30 +126,25 @@ def time_contenders(
             controllers[f"QP by {solver}"] = ConstrainedMPC(problem, QPSolver(solver, problem), shortcut=False)
         except MissingPackageError as error:
             left_out[solver] = str(error)
-    queries = recorded(scenario, log, problem.horizon)
-    total, done = REPEATS * len(controllers) * log.t.size, 0
-    passes: dict[str, list[tuple[Array, tuple[str, ...]]]] = {name: [] for name in controllers}
-
-    def report() -> None:
-        nonlocal done
-        done += 1
-        progress("steps", done, total)
-
-    for _ in range(REPEATS):
-        for name, controller in controllers.items():
-            if any(step_ms.sum() > 1e3 * LONGEST_PASS for step_ms, _ in passes[name]):
-                done += log.t.size
-            else:
-                passes[name].append(time_steps(controller, queries, progress=report))
-    progress("steps", total, total)
+    asked = {name: Asked(each, recorded(scenario, log, problem.horizon)) for name, each in controllers.items()}
+    with flight_between(scenario, vehicle) as between:
+        laps = race(
+            asked,
+            stretches(log.t.size, 1),
+            between=between,
+            repeats=REPEATS,
+            rng=np.random.default_rng(scenario.seed),
+            longest_pass=LONGEST_PASS,
+            progress=lambda done, total: progress("steps", done, total),
+        )
     contenders = (
         Contender(
             name=name,
-            step_ms=np.min([step_ms for step_ms, _ in timed], axis=0),
-            statuses=timed[0][1],
-            repeats=len(timed),
+            step_ms=laps[name].median,
+            statuses=tuple(each.statuses[period] for period in range(log.t.size)),
+            repeats=len(laps[name].ms),
         )
-        for name, timed in passes.items()
+        for name, each in asked.items()
     )
     return tuple(contenders), left_out
 
@@ -163,9 +161,17 @@ def time_flights(
     for done, (name, scenario) in enumerate(wanted.items()):
         log = flown[name].control
         if log.t.size:
-            controller = build_controller(scenario, build_vehicle(scenario))
-            queries = recorded(scenario, log, controller.horizon)
-            passes = [time_steps(controller, queries, stride=SWEEP_STRIDE)[0] for _ in range(SWEEP_REPEATS)]
-            timed[name] = metrics.percentiles(np.min(passes, axis=0))
+            vehicle = build_vehicle(scenario)
+            controller = build_controller(scenario, vehicle)
+            entrant = Asked(controller, recorded(scenario, log, controller.horizon))
+            with flight_between(scenario, vehicle) as between:
+                laps = race(
+                    {controller.name: entrant},
+                    stretches(log.t.size, SWEEP_STRIDE),
+                    between=between,
+                    repeats=REPEATS,
+                    rng=np.random.default_rng(scenario.seed),
+                )
+            timed[name] = metrics.percentiles(laps[controller.name].median)
         progress("sweeps", done + 1, len(wanted))
     return timed

@@ -10,7 +10,7 @@ import numpy as np
 
 from mpc.solvers import SOLVERS, make_backend
 from quadsim import metrics
-from quadsim.cost import CostStudy, Outcome, Sweep, SweepPoint, Variation
+from quadsim.cost import Contender, CostStudy, Outcome, Sweep, SweepPoint, Variation
 from quadsim.errors import InputError
 from quadsim.rundir import SCENARIO_FILE
 from scenarios.build import build_course_steps, build_reference
@@ -93,6 +93,7 @@ def study_cost(
     arm_lengths: Sequence[float] = ARM_LENGTHS,
     drags: Sequence[float] = DRAGS,
     solvers: Sequence[str] = SOLVERS_TIMED,
+    timed: Sequence[Contender] | None = None,
     workers: int | None = None,
     progress: Progress = silent,
 ) -> CostStudy:
@@ -109,6 +110,7 @@ def study_cost(
         arm_lengths: L to try [m].
         drags: d/b to try [m].
         solvers: what is to solve the QP in every period, for comparison; one that is not installed is left out.
+        timed: the gain without constraints, the controller as flown, and solvers, where they have been timed already.
         workers: processes that fly; one per usable core by default.
         progress: told how far it is.
 
@@ -118,7 +120,10 @@ def study_cost(
     spec = constrained.controller
     assert isinstance(spec, ConstrainedSpec)
     base = fly(constrained)
-    contenders, left_out = time_contenders(constrained, base.control, solvers, progress)
+    if timed is None:
+        contenders, left_out = time_contenders(constrained, base.control, solvers, progress)
+    else:
+        contenders, left_out = tuple(timed), {}
 
     own = own_tilt(spec)
     tilted = {tilt: with_tilt(constrained, tilt) for tilt in sorted({*tilts} | ({own} if own else set()))}
@@ -133,13 +138,18 @@ def study_cost(
     def outcome(scenario: Scenario) -> Outcome:
         return flown[key(scenario)].outcome
 
-    timed = time_flights([*tilted.values(), *shortened.values()], flown, progress)
+    swept = [
+        each for each in (*tilted.values(), *shortened.values()) if not contenders or key(each) != key(constrained)
+    ]
+    steps = time_flights(swept, flown, progress)
+    if contenders:
+        steps[key(constrained)] = metrics.percentiles(contenders[1].step_ms)
 
     def point(value: float, scenario: Scenario, *, free: bool) -> SweepPoint:
         return SweepPoint(
             value=value,
             constrained=outcome(scenario),
-            step_ms=timed.get(key(scenario), {}),
+            step_ms=steps.get(key(scenario), {}),
             unconstrained=outcome(without_constraints(scenario)) if free else None,
         )
 

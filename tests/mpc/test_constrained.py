@@ -41,7 +41,7 @@ class FaultySolver(QPSolver):
 
 def fly(faults: dict[int, str], periods: int, horizon: int = 50) -> list[Command]:
     solver = FaultySolver(faults, horizon)
-    controller = ConstrainedMPC(solver.problem, solver)
+    controller = ConstrainedMPC(solver.problem, solver, shortcut=not faults)  # which might mend a spoilt plan
     controller.reset(solver.problem.model.u_bar)
     reference = paper_reference(periods + horizon + 1)
     return [controller.step(Moment(time=0.05 * k), STATE, reference[k + 1 : k + 1 + horizon]) for k in range(periods)]

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from support import paper_problem, paper_reference, random_axes, random_problem
 
 from mpc import free as module
+from mpc import shortcut as shortcut_module
 from mpc.condensed import condensed
 from mpc.constrained import ConstrainedMPC
 from mpc.constraints import inequalities
@@ -154,11 +155,8 @@ def test_its_answer_is_the_solution_of_the_whole_qp(constrained_flight: Flight, 
         query = log.state[k], problem.objective.desired(reference[k + 1 : k + 51]), before[k]
         answer, expected = quick.solve(*query), whole.solve(*query)
         assert expected.solution.status == SOLVED
-        np.testing.assert_allclose(answer.plan, expected.plan, atol=5e-3)
-        np.testing.assert_allclose(answer.plan[0], expected.plan[0], atol=1e-3)
-        if answer.way is not Way.WHOLE:
-            assert largest_residual(problem, answer, *query) < 1e-7
-            np.testing.assert_allclose(answer.plan, expected.plan, atol=1e-6)
+        assert largest_residual(problem, answer, *query) < 1e-7
+        np.testing.assert_allclose(answer.plan, expected.plan, atol=1e-6)
         if answer.way is Way.AXES:
             assert answer.solution.status == SOLVED
             assert min(answer.solution.active, answer.solution.iterations) > 0
@@ -251,8 +249,23 @@ def test_what_was_tried_in_vain_counts() -> None:
     query = np.zeros(12), desired, problem.model.u_bar
     answer, whole = shortcut(problem).solve(*query), QPSolver("piqp-multistage", problem).solve(*query)
     assert answer.way is Way.WHOLE
-    np.testing.assert_array_equal(answer.plan, whole.plan)
+    np.testing.assert_allclose(answer.plan, whole.plan, atol=1e-3)
     assert answer.solution.iterations > whole.solution.iterations + 5
+
+
+def test_answers_to_a_whole_qp_too_large_to_polish_stand(monkeypatch: pytest.MonkeyPatch) -> None:
+    """500 rows and entries of the box, or 500^2 entries of the matrix that tells their multipliers."""
+    problem = paper_problem()
+    desired = np.zeros((50, 4))
+    desired[:, 0] = 10.0
+    query = np.zeros(12), desired, problem.model.u_bar
+    whole = QPSolver("piqp-multistage", problem).solve(*query).plan
+    for largest, polished in ((500**2, True), (500**2 - 1, False)):
+        monkeypatch.setattr(shortcut_module, "LARGEST_MAP", largest)
+        answer = shortcut(problem).solve(*query)
+        assert answer.way is Way.WHOLE
+        assert (largest_residual(problem, answer, *query) < 1e-9) is polished
+        assert np.array_equal(answer.plan, whole) is not polished
 
 
 def test_there_is_none_where_its_map_is_too_large(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -302,7 +315,8 @@ def test_steps_leave_no_memory_behind_and_allocate_nothing_large(aside: float, h
         tracemalloc.stop()
     assert status == (UNCONSTRAINED if way is Way.FREE else SOLVED)
     assert after - before < 2_000  # flat: less than 40 bytes a step
-    assert peak - before < 64_000  # the condensed H alone has 320 kB
+    # The condensed H alone has 320 kB; the whole QP's polish needs that for its active rows, twice.
+    assert peak - before < (800_000 if way is Way.WHOLE else 64_000)
 
 
 def test_without_output_bounds_the_inputs_decide() -> None:

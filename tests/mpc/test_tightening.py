@@ -21,7 +21,6 @@ from mpc.robust import RobustMPC, RobustSettings
 from mpc.stagewise import Penalty
 from mpc.tightening import (
     ERROR_SHARE,
-    LARGEST_SHARE,
     SHORTEST_LAG,
     SPEED_SHARE,
     TighteningSettings,
@@ -275,10 +274,37 @@ def test_settings_name_the_number_that_is_impossible(name: str, value: float) ->
         TighteningSettings(**{name: value})
 
 
-def test_disturbances_too_large_for_the_bounds_are_refused(vehicle: Vehicle) -> None:
-    rule = rf"tightening must be smaller: output \d, bounded to 0\.0873 .* at most {LARGEST_SHARE:g} of that is allowed"
+@pytest.mark.parametrize(("name", "given"), [("angular_acceleration", 20.0), ("turning", 200.0)])
+def test_disturbances_too_large_for_the_bounds_are_refused(vehicle: Vehicle, name: str, given: float) -> None:
+    """In the file's words and units: the disturbance that takes most, the output, and how much there is."""
+    rule = (
+        rf"^controller\.tightening\.{name} must be smaller, or the bounds on roll wider: these leave 5 deg on either "
+        rf"side of their middle, of which [\d.]+ deg would be given up and at most 2\.5 deg may be; got {given}$"
+    )
     with pytest.raises(ParameterError, match=rule):
-        tilt_margins(vehicle, TighteningSettings(angular_acceleration=20.0))
+        tilt_margins(vehicle, TighteningSettings(**{name: given}))
+
+
+def test_an_output_without_a_name_is_told_by_its_row(vehicle: Vehicle) -> None:
+    """As only Python code can make one: a sum of two states."""
+    bounds = tilt_bounds()
+    C_c = bounds.C_c.copy()
+    C_c[1, 0] = 1.0
+    with pytest.raises(
+        ParameterError, match=r"^controller\.tightening\.acceleration must .* bounds on row 1 of C_c wide"
+    ):
+        margins(
+            vehicle,
+            period=PERIOD,
+            horizon=HORIZON,
+            bounds=replace(bounds, C_c=C_c),
+            settings=TighteningSettings(acceleration=50.0),
+        )
+
+
+def test_a_delay_beyond_a_period_is_told_as_such(vehicle: Vehicle) -> None:
+    with pytest.raises(ParameterError, match=r"^controller\.delay must be at most the control period of .*; got 1\.0$"):
+        tilt_margins(vehicle, delay=1.0)
 
 
 def test_rotors_too_quick_to_compute_with_are_refused(vehicle: Vehicle) -> None:
@@ -291,7 +317,9 @@ def test_rotors_too_quick_to_compute_with_are_refused(vehicle: Vehicle) -> None:
 
 def test_bound_on_one_side_only_is_refused(vehicle: Vehicle) -> None:
     bounds = replace(tilt_bounds(), y_max=np.array([LIMIT, np.inf]))
-    with pytest.raises(ParameterError, match="output_bounds must be finite on both sides"):
+    with pytest.raises(
+        ParameterError, match=r"output_bounds\.pitch must be finite on both sides, to be drawn in; got \[-5\.0+, inf\]$"
+    ):
         margins(vehicle, period=PERIOD, horizon=HORIZON, bounds=bounds, settings=TighteningSettings())
 
 

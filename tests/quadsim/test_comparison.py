@@ -52,6 +52,13 @@ def test_values_are_the_summarys_with_angles_in_degrees(short_run: Run) -> None:
     assert row(rows, "bounds", "Constraint arrival_x").cells[0].text == "-0.01 .. 0.01, from 59 s"
 
 
+def test_a_law_goes_by_its_name_and_ones_own_by_what_it_says(short_run: Run) -> None:
+    for recorded, shown in (("geometric", "geometric control"), ("constrained", "constrained MPC"), ("mine", "mine")):
+        summary = {**short_run.summary, "controller": {**short_run.summary["controller"], "name": recorded}}
+        rows = comparison_rows([dataclasses.replace(short_run, summary=summary)])
+        assert row(rows, "controller").cells[0].text == shown
+
+
 def test_settling_has_a_row_for_each_step_of_the_courses(short_run: Run) -> None:
     def entry(channel: str, time: float, settled: float | None) -> dict[str, Any]:
         return {"channel": channel, "time": time, "before": 0.0, "after": 1.0, "settled": settled}

@@ -42,7 +42,7 @@ def test_times_become_shares_of_the_period_and_rates(cost_study: CostStudy) -> N
     late = line(grid, "QP by slow")
     assert (late[5].text, late[5].mark) == ("160 %", Mark.BAD)
     assert line(grid, "gain")[5].mark is Mark.NONE
-    assert "the best of 1 or 3 repeats" in grid.note
+    assert "the median of 1 or 3 repeats" in grid.note
     assert "Left out: absent, pip install it." in grid.note
 
 

@@ -304,6 +304,12 @@ def test_thinning_keeps_the_path_within_its_tolerance():
     assert thin(np.zeros((1, 3)), 0.01).tolist() == [0]
 
 
+def test_captions_name_the_law(short_run: Run) -> None:
+    summary = {**short_run.summary, "controller": {**short_run.summary["controller"], "name": "pid", "solver": ""}}
+    run = replace(short_run, summary=summary)
+    assert Overlay(run, make_footage(run, np.array([1.0])), width=1280, height=720)._subtitle == "PID"
+
+
 def pixels(run: Run, colour: tuple[int, int, int], time: float = 1.0) -> int:
     """How much of a frame the captions fill with a colour."""
     footage = make_footage(run, np.array([time]))

@@ -10,6 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import make_cost
 import numpy as np
 import pytest
 
@@ -34,7 +35,7 @@ from scenarios.bench.solvers import bench_solvers
 from scenarios.build import build_problem, build_vehicle
 from scenarios.cli import EXIT_DONE, EXIT_WRONG_INPUT, main
 from scenarios.loading import load_scenario
-from scenarios.queries import recorded
+from scenarios.queries import flight_between, recorded
 from scenarios.runner import Flight
 
 SHORT = ("duration=3.0", "controller.horizon=10")
@@ -71,6 +72,7 @@ def test_turns_are_random_and_every_question_is_put_to_all() -> None:
     laps = race(
         {name: Answering(name, diary) for name in "abc"},
         stretches(100, 1),
+        between=lambda: None,
         repeats=3,
         rng=np.random.default_rng(1),
     )
@@ -93,13 +95,60 @@ def test_slow_entrants_race_once_and_hopeless_ones_leave() -> None:
     diary: list[tuple[str, int]] = []
     entrants = {"quick": Answering("quick", diary), "slow": Answering("slow", diary, 0.002)}
     rng = np.random.default_rng(0)
-    once = race(entrants, [range(10)], repeats=3, rng=rng, longest_pass=0.01)
+    once = race(entrants, [range(10)], between=lambda: None, repeats=3, rng=rng, longest_pass=0.01)
     assert (once["quick"].ms.shape[0], once["slow"].ms.shape[0]) == (3, 1)
     assert once["slow"].ms.min() >= 2.0
-    assert list(race(entrants, [range(10)], repeats=2, rng=rng, patience=0.01)) == ["quick"]
+    assert list(race(entrants, [range(10)], between=lambda: None, repeats=2, rng=rng, patience=0.01)) == ["quick"]
 
 
-def test_the_best_of_the_repeats_and_the_longest_of_all(bench: SolverBench) -> None:
+def test_a_flight_goes_on_between_questions_and_is_not_timed() -> None:
+    """Each question is answered after the plant has flown a period, as in flight, and told by its median."""
+    diary: list[tuple[str, int]] = []
+
+    class Noted(Answering):
+        def answer(self) -> None:
+            self.diary.append(("answer", -1))
+            clock.sleep(0.001)
+
+    def between() -> None:
+        diary.append(("between", -1))
+        clock.sleep(0.02)
+
+    laps = race({"a": Noted("a", diary)}, [range(3)], between=between, repeats=3, rng=np.random.default_rng(0))["a"]
+    assert [name for name, _ in diary[2:]][:6] == ["a", "between", "answer"] * 2
+    assert [name for name, _ in diary].count("between") == 9
+    assert 1.0 <= laps.ms.min() < 20.0
+    np.testing.assert_array_equal(laps.median, np.sort(laps.ms, axis=0)[1])
+
+
+def test_between_steps_the_plant_flies_a_period() -> None:
+    scenario = load_scenario("paper-constrained", SHORT)
+    with flight_between(scenario, build_vehicle(scenario)) as between:
+        started = clock.perf_counter()
+        between()
+        between()
+        assert clock.perf_counter() - started > 2 * 50 * 1e-6  # a Runge-Kutta step of MuJoCo's takes some microseconds
+
+
+def test_a_time_stands_in_all_tables_once(bench: SolverBench) -> None:
+    """Growth at the flight's own horizon is not measured again, nor are the steps that the study of cost tells of."""
+    flown = bench_solvers(
+        load_scenario("paper-constrained", SHORT), repeats=1, horizons=(10,), solvers=("piqp-multistage",)
+    )
+    alone, growth = flown.contenders[1], {each.name: each for each in flown.growth if not each.kind}
+    assert growth[alone.name].p50 == (alone.quantiles["p50"],)
+    assert growth[alone.name].p99 == (alone.quantiles["p99"],)
+    gain, shown, qp = make_cost.timed(bench)
+    assert (gain.name, shown.name, qp.name) == ("unconstrained gain", "constrained, as flown", "QP by piqp-multistage")
+    assert bench.gain_ms is not None
+    assert gain.step_ms.size == shown.step_ms.size == 60
+    np.testing.assert_array_equal(shown.step_ms, bench.default.step_ms)
+    np.testing.assert_array_equal(qp.step_ms, bench.contenders[1].step_ms)
+    assert np.count_nonzero(shown.shortcut) == bench.default.statuses["unconstrained"]
+    assert np.median(gain.step_ms) < np.median(qp.step_ms)
+
+
+def test_the_median_of_the_repeats_and_the_longest_of_all(bench: SolverBench) -> None:
     for contender in bench.contenders:
         assert contender.step_ms.shape == (60,)
         assert contender.raw_max_ms >= contender.quantiles["max"] >= contender.quantiles["p50"] > 0.0

@@ -151,6 +151,17 @@ def test_run_prints_tables_and_where_the_files_are(here: Path, capsys: pytest.Ca
     assert rundir.is_run(here / "runs" / "hover")
 
 
+@pytest.mark.parametrize(
+    ("law", "line"), [("pid", "PID: "), ("geometric", "geometric control: "), ("lqr", "LQR: ")], ids=str
+)
+def test_only_an_mpc_is_called_one(here: Path, capsys: pytest.CaptureFixture[str], law: str, line: str) -> None:
+    few = ["--no-video", "--no-figures", "--no-recording"]
+    main(["run", "hover", "--set", f"controller={law}", "--set", "duration=0.5", *few])
+    printed = capsys.readouterr().out
+    assert any(each.startswith(line) for each in printed.splitlines())
+    assert "MPC" not in printed
+
+
 def test_run_prints_nothing_but_the_summary_as_json(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["run", "hover", *SHORT, *TABLES, "--out", "x", "--json"]) == EXIT_DONE
     printed = capsys.readouterr()

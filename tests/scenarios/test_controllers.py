@@ -25,7 +25,7 @@ from mpc.robust import Linearisation, RobustMPC, RobustSettings
 from mpc.solvers import QPSolver
 from mpc.tightening import TighteningSettings, margins
 from mpc.unconstrained import UnconstrainedMPC
-from quadsim.controller import SOLVED, Controller, Moment
+from quadsim.controller import LAW_NAMES, SOLVED, Controller, Moment
 from quadsim.errors import ParameterError
 from scenarios.build import (
     CONTROLLERS,
@@ -407,6 +407,18 @@ def test_every_law_is_listed_and_told_apart_by_its_name() -> None:
     tags = {note.tag for kind in get_args(get_args(_Table)[0]) for note in get_args(kind) if isinstance(note, Tag)}
     assert tags == {*LAWS, FORM}
     assert list(CONTROLLERS) == list(LAWS)
+    assert {*LAW_NAMES} == tags - {FORM}  # and has a name to be shown by
+
+
+def test_a_law_that_the_bounds_leave_too_little_for_is_told_in_the_files_words() -> None:
+    one = load_scenario("robust", ["controller.tightening={}", "controller.output_bounds.vx=[-0.2, 0.2]"])
+    message = (
+        "controller.tightening.acceleration must be smaller, or the bounds on vx wider: these leave 0.2 m/s on either "
+        "side of their middle, of which 0.327 m/s would be given up and at most 0.1 m/s may be; got 0.5"
+    )
+    with pytest.raises(ParameterError) as caught:
+        build_controller(one, build_vehicle(one))
+    assert str(caught.value) == message
 
 
 EVERYTHING = {

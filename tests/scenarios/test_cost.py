@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,13 +14,14 @@ from quadsim import rundir
 from quadsim.controller import Moment
 from quadsim.cost import CostStudy
 from quadsim.errors import InputError, MissingPackageError
+from quadsim.metrics import percentiles
 from scenarios import runner
 from scenarios.build import build_controller, build_vehicle
 from scenarios.cli import EXIT_DONE, EXIT_WRONG_INPUT, main
 from scenarios.cost import find_study, fly_variations, study_cost
 from scenarios.cost.variants import without_constraints
 from scenarios.loading import load_scenario
-from scenarios.queries import recorded, time_steps
+from scenarios.queries import Asked, recorded
 from scenarios.spec import Scenario
 
 SETTINGS = ["duration=4.0", "controller.horizon=10"]
@@ -146,9 +148,22 @@ def test_a_replay_gives_the_commands_of_the_flight() -> None:
         controller.reset(queries.speeds_before[k])
         command = controller.step(Moment(time=queries.t[k]), queries.state[k], queries.reference[k + 1 : k + 11])
         np.testing.assert_allclose(command.speeds, flight.log.control.speeds[k], atol=1e-6)
-    times, statuses = time_steps(controller, queries, stride=3)
-    assert times.shape == (27,)
-    assert statuses == flight.log.control.status[::3]
+    asked = Asked(controller, queries)
+    for k in range(80):
+        asked.prepare(k)
+        asked.answer()
+    assert tuple(asked.statuses.values()) == flight.log.control.status
+
+
+def test_a_time_stands_in_a_study_once(study: CostStudy) -> None:
+    """The flight that is studied has one line of times, wherever it appears; another study may be given its own."""
+    flown = percentiles(study.contenders[1].step_ms)
+    assert study.tilt.points[1].step_ms == study.horizons.points[1].step_ms == flown
+    few = {**SMALL, "tilts": (), "horizons": (), "arm_lengths": ()}
+    given = [replace(contender, step_ms=2.0 * contender.step_ms) for contender in study.contenders]
+    again = study_cost(scenario(), workers=1, timed=given, **few)
+    np.testing.assert_array_equal(again.contenders[2].step_ms, 2.0 * study.contenders[2].step_ms)
+    assert again.tilt.points[0].step_ms == percentiles(given[1].step_ms)
 
 
 def test_a_solver_that_is_not_installed_is_named_and_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -173,7 +188,7 @@ def test_flights_that_are_lost_stay_in_the_study() -> None:
 
 def test_progress_is_told_to_its_end() -> None:
     seen: dict[str, tuple[int, int]] = {}
-    few = {**SMALL, "tilts": (), "horizons": (), "arm_lengths": ()}
+    few = {**SMALL, "horizons": (), "arm_lengths": ()}
     study_cost(scenario(), workers=1, progress=lambda stage, done, total: seen.update({stage: (done, total)}), **few)
     assert list(seen) == ["steps", "flights", "sweeps"]
     assert all(done == total > 0 for done, total in seen.values())

@@ -1,0 +1,83 @@
+"""docs/constraints-cost.md, its figures, and the answer in README.md; `docs/make_performance.py` times and calls it."""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+
+from make_numbers import ROOT, Table, markdown, replace_in_readme
+
+from quadsim.bench import SolverBench
+from quadsim.cost import Contender, CostStudy, cost_markdown, cost_sentences
+from quadsim.figures import write_cost_figures
+from quadsim.metrics import percentiles
+from scenarios.cost.study import SOLVERS_TIMED
+
+
+def timed(bench: SolverBench) -> list[Contender]:
+    """The steps that the study tells of, as the bench has timed them: a time stands in all documents once."""
+    assert bench.gain_ms is not None
+    repeats = bench.default.repeats
+    gain = Contender(
+        name="unconstrained gain", step_ms=bench.gain_ms, statuses=("solved",) * bench.gain_ms.size, repeats=repeats
+    )
+    alone = {each.solver: each for each in bench.contenders if not each.shortcut}
+    named = {"constrained, as flown": bench.default}
+    named |= {f"QP by {solver}": alone[solver] for solver in SOLVERS_TIMED if solver in alone}
+    return [
+        gain,
+        *(
+            Contender(name=name, step_ms=each.step_ms, statuses=each.answered, repeats=each.repeats)
+            for name, each in named.items()
+        ),
+    ]
+
+
+def answer(study: CostStudy) -> Table:
+    """What constraints cost and what they buy, in a few lines."""
+
+    def pair(label: str, keys: Sequence[str], form: str = ".3g") -> tuple[str, ...]:
+        flights = (study.constrained, study.unconstrained)
+        return (label, *(", ".join(format(flight.numbers[key], form) for key in keys) for flight in flights))
+
+    gain, flown, *by_qp = study.contenders
+    times = {contender.name: percentiles(contender.step_ms) for contender in study.contenders}
+    told = {name: ", ".join(f"{found[key]:.3g}" for key in ("p50", "p99", "max")) for name, found in times.items()}
+    lost = [f"{point.value:g}" for point in study.horizons.points if not point.unconstrained.completed]
+    kept = [f"{point.value:g}" for point in study.horizons.points if not point.constrained.completed]
+    rows: Table = [
+        (f"{study.name}, same weights and horizon", "with its constraints", "without"),
+        pair("RMS error x, y, z [m]", ("rmse_x", "rmse_y", "rmse_z")),
+        pair("peak roll or pitch [deg]", ("tilt_plant",)),
+        pair("highest speed, largest step [rad/s]", ("speed_max", "step_max")),
+        pair("total variation of the commands [rad/s]", ("total_variation",), ".0f"),
+        ("periods without a QP", f"{flown.shortcut.sum()} of {flown.shortcut.size}", "all"),
+        ("horizons N at which the vehicle is lost", ", ".join(kept) or "none", ", ".join(lost) or "none"),
+        ("controller step: median, p99, max [ms]", told[flown.name], told[gain.name]),
+        ("largest loop rate [Hz]", *(f"{each.rate('max'):.0f}" for each in (flown, gain))),
+    ]
+    rows += [(f"{each.name} in every period: the same [ms]", told[each.name], "-") for each in by_qp]
+    return rows
+
+
+def write_cost(study: CostStudy) -> None:
+    """docs/constraints-cost.md with its figures, and the answer in README.md."""
+    docs, sentences = ROOT / "docs", cost_sentences(study)
+    with tempfile.TemporaryDirectory() as scratch:
+        drawn = [path for path in write_cost_figures(study, Path(scratch)) if path.suffix == ".svg"]
+        for path in drawn:
+            shutil.copyfile(path, docs / path.name)
+    page = [
+        "# What do constraints cost?\n\nMade by `make numbers` on one machine "
+        f"({study.machine['processor']}, {study.machine['cores']} cores); nothing here is typed by hand. The same "
+        "section, with plots\nto zoom into, is on the page of `quadsim compare paper-unconstrained paper-constrained "
+        "--out DIR`.\n",
+        "The paper leaves the question open. It compares two controllers that differ in weights and horizon as well "
+        "as in\nconstraints; here the constrained one is held against itself without them.\n",
+        cost_markdown(study, sentences),
+        *(f"![{path.stem}]({path.name})\n" for path in drawn),
+    ]
+    (docs / "constraints-cost.md").write_text("\n".join(page), encoding="utf-8")
+    replace_in_readme("cost", markdown(answer(study)))
