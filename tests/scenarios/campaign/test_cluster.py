@@ -28,6 +28,7 @@ from scenarios.campaign.jobs import Jobs, job_script, read_jobs, submit
 from scenarios.campaign.local import LocalEngine
 from scenarios.campaign.plan import load_plan
 from scenarios.campaign.run import SUMMARY_FILE, Standing, fly_campaign
+from scenarios.runner import Progress, silent
 
 ROOT = Path(__file__).resolve().parents[3]
 FLIGHTS = range(40)
@@ -147,7 +148,7 @@ def test_closing_the_iterator_ends_the_work_after_the_flights_in_the_air(two_wor
 
 
 class _Thrifty(ToyPilot):
-    def fly(self, flight: int) -> Row:
+    def fly(self, flight: int, progress: Progress = silent) -> Row:
         return super().fly(flight) | {"threshold": gc.get_threshold()}
 
 
