@@ -13,7 +13,7 @@ import signal
 import time as clock
 from collections import deque
 from mmap import mmap
-from multiprocessing import connection
+from multiprocessing import connection, forkserver
 from multiprocessing.connection import Connection
 from typing import Final, NamedTuple
 
@@ -66,6 +66,8 @@ def serve(pipe: Connection, folder: str) -> None:
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches every process of a terminal; the parent sees to it
     os.setsid()  # so that its parent can end whom it left, if somebody kills it
+    with contextlib.suppress(AttributeError, TypeError, OSError):
+        os.close(forkserver._forkserver._forkserver_alive_fd)  # type: ignore[attr-defined]  # what is written there kills the server
     collect_rarely()
     adopt_orphans()
     with contextlib.suppress(OSError):

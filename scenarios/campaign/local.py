@@ -25,9 +25,9 @@ from typing import Final
 
 from quadsim.campaign.table import Row
 from quadsim.errors import ParameterError
-from scenarios.campaign.engine import MOST_DEATHS, Answer, EngineError, Pace, Pilot, fair_share
+from scenarios.campaign.engine import MOST_DEATHS, ONE_THREAD, Answer, EngineError, Pace, Pilot, fair_share
 from scenarios.campaign.keeper import Fell, Ready, Unfit, serve
-from scenarios.campaign.processes import end_session
+from scenarios.campaign.processes import end_session, is_stopped
 from scenarios.runner import usable_cores
 
 _AHEAD_S: Final = 1.0
@@ -35,11 +35,12 @@ _AHEAD_S: Final = 1.0
 _SETTLED: Final = "scenarios.campaign.preload"
 """To be loaded by the server that forks the workers, and by no other process."""
 _MOST_STARTS: Final = 5
+_SILENCE_S: Final = 1.0
+"""After which keepers are looked at: one that was stopped would keep silent for ever [s]."""
 _LEAVING_S: Final = 8.0
 """For a keeper to end everybody whom it keeps [s]."""
 _UNKNOWN: Final = 255
 """The exit code of a process whose server died, which would have told."""
-_ONE_THREAD: Final = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
 
 
 class LocalEngine:
@@ -174,8 +175,11 @@ class _Crew:
         """Wait until somebody says something or dies; everything that is said then."""
         pipes = [keeper.pipe for keeper in self._keepers]
         sentinels = [keeper.process.sentinel for keeper in self._keepers if not keeper.orphaned]
-        heard = connection.wait([*pipes, *sentinels])
+        heard = connection.wait([*pipes, *sentinels], timeout=_SILENCE_S)
         rows: list[Row] = []
+        if not heard:
+            for keeper in [each for each in self._keepers if is_stopped(each.pid)]:
+                rows += self._bury(keeper)
         for keeper in list(self._keepers):
             keeper.orphaned |= keeper.process.sentinel in heard
             if keeper.pipe in heard:
@@ -217,7 +221,7 @@ class _Crew:
     def _bury(self, keeper: _Keeper) -> list[Row]:
         """Take a dead keeper's flights back; it may be the first of them that it died of."""
         self._keepers.remove(keeper)
-        keeper.dismiss()
+        keeper.process.kill()
         ending = keeper.ending()
         end_session(keeper.pid)  # it had no time for that
         rows: list[Row] = []
@@ -246,12 +250,12 @@ def _undisturbed() -> Iterator[None]:
     Nor does it run the parent's script again, as multiprocessing's children do, which takes longer than all the rest:
     nothing that a worker is handed belongs to that.
     """
-    before = {name: os.environ.get(name) for name in _ONE_THREAD}
+    before = {name: os.environ.get(name) for name in ONE_THREAD}
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of one that was killed; it has nothing of ours
         resource_tracker.ensure_running()  # it lets signals through when it starts
     mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    os.environ.update(_ONE_THREAD)
+    os.environ.update(ONE_THREAD)
     script, sys.modules["__main__"] = sys.modules["__main__"], ModuleType("__main__")
     try:
         yield

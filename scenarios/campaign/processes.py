@@ -89,13 +89,25 @@ def end_children(group: int | None = None) -> None:
         clock.sleep(0.001)
 
 
+def is_stopped(pid: int) -> bool:
+    """Whether somebody has stopped a process, as SIGSTOP does."""
+    return _state(Path(f"/proc/{pid}"))[:1] == ["T"]
+
+
 def end_session(session: int) -> None:
     """Kill whoever belongs to a session, whose leader is dead and is not to be survived."""
     for folder in Path("/proc").glob("[0-9]*"):
         with contextlib.suppress(OSError, LookupError):
-            state = (folder / "stat").read_text(encoding="ascii", errors="replace").rpartition(")")[2].split()
-            if int(state[3]) == session:
+            if int(_state(folder)[3]) == session:
                 os.kill(int(folder.name), signal.SIGKILL)
+
+
+def _state(process: Path) -> list[str]:
+    """What /proc/PID/stat says after the name: state, parent, group, session; nothing of a process that is gone."""
+    try:
+        return (process / "stat").read_text(encoding="ascii", errors="replace").rpartition(")")[2].split()
+    except OSError:
+        return []
 
 
 def _below(pid: int) -> Iterable[int]:
