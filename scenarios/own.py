@@ -128,6 +128,16 @@ def _numbers(given: Any) -> Array | None:
         return None
 
 
+def import_own(spec: OwnSpec) -> None:
+    """Import the module that a controller is in; see `build_own`.
+
+    Raises:
+        InputError: there is none, or it cannot be imported.
+    """
+    with _searched([] if spec.folder is None else [spec.folder], Path.cwd()) as folders:
+        _import(spec.type, _place(spec.type)[0], folders)
+
+
 def build_own(spec: OwnSpec, vehicle: Vehicle, period: float) -> Controller:
     """Import a controller and call it.
 

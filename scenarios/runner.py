@@ -109,6 +109,7 @@ def fly_scenario(scenario: Scenario, progress: Progress = silent) -> Flight:
             navigation = build_navigation(scenario, vehicle)
             started = clock.perf_counter()
             reference = build_reference(scenario, scenario.periods + controller.horizon)
+            progress("flight", 0, scenario.periods)
             log = fly_once(
                 scenario,
                 vehicle,

@@ -11,7 +11,9 @@ from typing import Any
 
 import psutil
 
-from quadsim.campaign.table import Row
+from quadsim.campaign.table import ERROR, Row
+from scenarios.campaign.spec import LimitsSpec
+from scenarios.runner import Progress, silent
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -25,6 +27,7 @@ class ToyPilot:
         kills_once: files by flight; if one is not there, it is made, and the process killed by SIGKILL.
         raises: exceptions by flight.
         diary: takes a line with flight and process as each flight begins.
+        limits: of each flight.
     """
 
     seconds: float = 0.0
@@ -33,8 +36,12 @@ class ToyPilot:
     kills_once: Mapping[int, Path] = field(default_factory=dict)
     raises: Mapping[int, BaseException] = field(default_factory=dict)
     diary: Path | None = None
+    limits: LimitsSpec = field(default_factory=LimitsSpec)
 
-    def fly(self, flight: int) -> Row:
+    def prepare(self) -> None:
+        pass
+
+    def fly(self, flight: int, progress: Progress = silent) -> Row:
         if self.diary is not None:
             with self.diary.open("a") as diary:
                 diary.write(f"{flight} {os.getpid()}\n")
@@ -52,7 +59,7 @@ class ToyPilot:
             raise self.raises[flight]
         return value_of(flight) | {"process": os.getpid()}
 
-    def lost(self, flight: int, reason: str) -> Row:
+    def lost(self, flight: int, reason: str, verdict: str = ERROR) -> Row:
         return {"flight": flight, "value": None, "reason": reason}
 
 

@@ -9,9 +9,10 @@ from typing import Any, Final
 import numpy as np
 import pyarrow as pa
 
-from quadsim.campaign.columns import VERDICTS, draw_names, is_number, numbers, texts, verdicts
+from quadsim.campaign.columns import draw_names, is_number, numbers, texts, verdicts
 from quadsim.campaign.estimates import Summary
 from quadsim.campaign.table import DRAW, unit_of
+from quadsim.campaign.verdicts import VERDICTS
 from quadsim.campaign.wording import count_of
 from quadsim.state import Array
 

@@ -31,13 +31,13 @@ from quadsim.campaign.statistics import (
     upper_bounds,
 )
 from quadsim.campaign.table import DRAW, MARGIN, SATISFIED, unit_of
+from quadsim.campaign.verdicts import VERDICTS
 from quadsim.errors import ParameterError
 from quadsim.state import Array
 
 Summary = Mapping[str, Any]
 
 WORST_FLIGHTS: Final = 10
-_WORSE: Final = {"lost": 0, "error": 1, "violated": 2, "satisfied": 3}
 _CURVE_POINTS: Final = 80
 _GROUPS: Final = ((50, 5), (12, 3))
 """Flights from which a drawn number's values are looked at in so many groups of about equal size."""
@@ -83,11 +83,12 @@ def worst_flight(table: pa.Table) -> int:
 def ranking(table: pa.Table) -> np.ndarray[Any, np.dtype[np.intp]]:
     """(K,) rows of the table, from the worst flight on.
 
-    Lost flights come before those that raised, these before violated and satisfied ones; among these, failed ones come
+    Lost flights come before those that raised, these before those that met a limit of time or memory, and these before
+    violated and satisfied ones; among these, failed ones come
     first, then the smaller worst margin.  Flights without a margin come after those with one, by their RMS error in
     position, the largest first.  What is still equal is in the order of the flights' numbers.
     """
-    ranks = np.array([_WORSE.get(verdict, 0) for verdict in texts(table, "verdict")], int)
+    ranks = np.array([VERDICTS[verdict].rank if verdict in VERDICTS else 0 for verdict in texts(table, "verdict")], int)
     margin = numbers(table, "worst_margin")
     errors = np.stack([np.nan_to_num(numbers(table, f"rmse.{axis}")) for axis in "xyz"])
     distance = np.where(np.isnan(margin), np.linalg.norm(errors, axis=0), 0.0)

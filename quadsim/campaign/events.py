@@ -27,6 +27,8 @@ _NAMED: Final[dict[str, tuple[str, bool | str]]] = {
     "lost": ("verdict", "lost"),
     "crash": ("crashed", True),
     "error": ("verdict", "error"),
+    "timeout": ("verdict", "timeout"),
+    "memory": ("verdict", "memory"),
 }
 """Column of each event that has a name, and its value there where the event holds."""
 _SPELLINGS: Final = {"failed": "failure", "violated": "violation", "crashed": "crash"}
@@ -99,8 +101,8 @@ def parse_event(text: str, columns: Mapping[str, pa.DataType] | pa.Schema | None
     """An event from its text.
 
     Args:
-        text: `failure`, `violation`, `lost`, `crash` or `error`, where `failed`, `violated` and `crashed` mean the same
-            as their nouns; or `COLUMN OP NUMBER` with one of `< <= > >=`, e.g. `rmse.z > 0.5`.
+        text: `failure`, `violation`, `lost`, `crash`, `error`, `timeout` or `memory`, where `failed`, `violated` and
+            `crashed` mean the same as their nouns; or `COLUMN OP NUMBER` with one of `< <= > >=`, e.g. `rmse.z > 0.5`.
         columns: those that a comparison may name, with their types, or the schema of a table; None for any.
 
     Raises:

@@ -7,16 +7,11 @@ from typing import Any, Final
 
 from quadsim.campaign.curves import ALPHA
 from quadsim.campaign.estimates import Summary
+from quadsim.campaign.verdicts import VERDICTS
 from quadsim.campaign.wording import count_of, listing, p_value, percent, share_with_interval
 from quadsim.table import format_number
 
 _OUTCOMES = {"worst_margin": "The worst margin", "failed": "Failure"}
-_VERDICTS = {
-    "satisfied": "held every required constraint",
-    "violated": "violated a required constraint",
-    "lost": "were lost",
-    "error": "raised an error",
-}
 _MOST_NAMED: Final = 4
 
 
@@ -35,8 +30,7 @@ def campaign_sentences(summary: Summary) -> list[str]:
 def _outcomes(summary: Summary) -> Iterator[str]:
     told = {verdict: count for verdict, count in summary["verdicts"].items() if count}
     parts = [
-        f"{count} {_VERDICTS[verdict].replace('were', 'was') if count == 1 else _VERDICTS[verdict]}"
-        for verdict, count in told.items()
+        f"{count} {VERDICTS[verdict].one if count == 1 else VERDICTS[verdict].many}" for verdict, count in told.items()
     ]
     if len(parts) == 1 and summary["flights"] > 1:
         yield f"All {parts[0].replace(' ', ' flights ', 1)}."

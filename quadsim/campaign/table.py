@@ -31,6 +31,10 @@ MARGIN, TIME_VIOLATED, SATISFIED = "margin.", "time_violated.", "satisfied."
 """How the columns of a constraint begin, before its name."""
 ERROR: Final = "error"
 """Status and verdict of a flight that raised, or whose process died."""
+TIMEOUT: Final = "timeout"
+"""Those of a flight that was ended since it, or a step of its controller, took too long."""
+MEMORY: Final = "memory"
+"""Those of a flight that asked for too much memory."""
 _MEASURES: Final = ("rmse", "max_error", "final_error", "overshoot")
 _HEAD: Final = (
     ("status", "-", pa.string()),
@@ -131,9 +135,14 @@ def flown_row(log: FlightLog, findings: Sequence[Finding], *, verdict: str, wall
     return row | (_numbers(log) if log.control.t.size else {})
 
 
-def failed_row(reason: str) -> Row:
-    """What is kept of a flight that raised, or whose process died."""
-    return {"status": ERROR, "verdict": ERROR, "reason": reason, "violated": True, "crashed": False}
+def failed_row(reason: str, verdict: str = ERROR) -> Row:
+    """What is kept of a flight that raised, whose process died, or that met a limit.
+
+    Args:
+        reason: in words.
+        verdict: `ERROR`, `TIMEOUT` or `MEMORY`.
+    """
+    return {"status": verdict, "verdict": verdict, "reason": reason, "violated": True, "crashed": False}
 
 
 def worst_margin(findings: Iterable[Finding]) -> tuple[float | None, str | None]:

@@ -8,10 +8,10 @@ from typing import Any
 
 from quadsim.campaign.curves import ALPHA, drivers, label
 from quadsim.campaign.estimates import Summary
+from quadsim.campaign.verdicts import GOOD
 from quadsim.campaign.wording import interval, p_value, percent
 from quadsim.table import ABSENT, Cell, Grid, Mark, format_number
 
-_BAD = ("lost", "error", "violated")
 _GROUPS = {
     3: ("lowest third", "middle", "highest third"),
     5: ("lowest fifth", "second", "third", "fourth", "highest fifth"),
@@ -36,7 +36,8 @@ def event_table(summary: Summary, failure: Sequence[str] = ()) -> Grid:
         lines=lines,
         note=(
             f"Failure: what the campaign counts as such{counted}. Violation: a required constraint did not hold or was "
-            "not reached, or the flight was lost or raised an error. Intervals are Clopper-Pearson's: two-sided, and "
+            "not reached, or the flight was lost, raised an error or met a limit of time or memory. Intervals are "
+            "Clopper-Pearson's: two-sided, and "
             "one-sided in the last two columns. They take flights as independent draws; draws spread evenly (Latin "
             "hypercube, Sobol', Halton) make the estimates more precise than that, and a grid gives the share over its "
             "own points."
@@ -169,7 +170,7 @@ def worst_table(summary: Summary, directory: str) -> Grid:
     lines = tuple(
         (
             Cell(text=str(flight["flight"])),
-            Cell(text=flight["verdict"], mark=Mark.BAD if flight["verdict"] in _BAD else Mark.NONE),
+            Cell(text=flight["verdict"], mark=Mark.NONE if flight["verdict"] == GOOD else Mark.BAD),
             *_line(format_number(flight["worst_margin"]), flight["worst_constraint"] or ABSENT),
             *_line(format_number(flight["duration"])),
             Cell(text=flight["reason"] or ABSENT, mark=Mark.TEXT),
@@ -182,7 +183,8 @@ def worst_table(summary: Summary, directory: str) -> Grid:
         title="Worst flights",
         head=("flight", "verdict", "worst margin", "constraint", "flown [s]", "reason"),
         lines=lines,
-        note="Lost flights first, then those that raised an error, violated a constraint, and held all; among these, "
+        note="Lost flights first, then those that raised an error, took too long or too much memory, violated a "
+        "constraint, and held all; among these, "
         "failed ones first, then the smaller worst margin. Margins of a lost flight end where it was aborted." + again,
     )
 

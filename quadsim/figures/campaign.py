@@ -19,15 +19,15 @@ from quadsim.campaign.curves import (
 )
 from quadsim.campaign.estimates import Summary
 from quadsim.campaign.sentences import verdict_sentence
+from quadsim.campaign.verdicts import VERDICTS
 from quadsim.figures.canvas import new_figure, write_drawings
-from quadsim.palette import BOUND, LINES, VERDICTS
+from quadsim.palette import BOUND, LINES
 
 if TYPE_CHECKING:
     from matplotlib.artist import Artist
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-_MARKERS: Final = {"satisfied": "o", "violated": "D", "lost": "x", "error": "s"}
 _MOST_DRIVERS: Final = 10
 _FEW: Final = 50
 """Flights of a verdict that are drawn larger, so as to be seen among the others."""
@@ -94,7 +94,13 @@ def _draw_margins(axes: Axes, table: pa.Table) -> None:
     for verdict in present(table):
         counts = drawn.counts[verdict]
         axes.bar(
-            drawn.edges[:-1], counts, np.diff(drawn.edges), below, align="edge", color=VERDICTS[verdict], label=verdict
+            drawn.edges[:-1],
+            counts,
+            np.diff(drawn.edges),
+            below,
+            align="edge",
+            color=VERDICTS[verdict].colour,
+            label=verdict,
         )
         below += counts
     if drawn.edges[0] <= 0.0 <= drawn.edges[-1]:
@@ -149,8 +155,8 @@ def _draw_strongest(axes: Axes, table: pa.Table, summary: Summary) -> None:
         axes.plot(
             cloud.x[rows],
             drawn.y[rows],
-            _MARKERS[verdict],
-            color=VERDICTS[verdict],
+            VERDICTS[verdict].marker,
+            color=VERDICTS[verdict].colour,
             markersize=2.6 if len(rows) > _FEW else 4.5,
             alpha=0.65,
             markeredgewidth=0.9 if verdict == "lost" else 0.0,

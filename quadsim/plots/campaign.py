@@ -26,13 +26,13 @@ from quadsim.campaign.curves import (
     shown_flights,
 )
 from quadsim.campaign.estimates import Summary
-from quadsim.palette import BOUND, LINES, REFERENCE, VERDICTS
+from quadsim.campaign.verdicts import VERDICTS
+from quadsim.palette import BOUND, LINES, REFERENCE
 from quadsim.plots.panels import BOTTOM, TOP, Plot, finished, panels, place
 
 if TYPE_CHECKING:
     from plotly.graph_objects import Figure
 
-SYMBOLS: Final = {"satisfied": "circle", "violated": "diamond", "lost": "x", "error": "square"}
 OUTCOMES: Final = {"with the worst margin": LINES[0], "with failure": LINES[1]}
 _LOG_TICKS: Final = [float(digit * 10**power) for power in range(7) for digit in (1, 2, 5)]
 _HEIGHT: Final = 230
@@ -153,7 +153,7 @@ def _histograms(drawn: list[Histogram], keys: tuple[tuple[str, str], ...]) -> Pl
                     y=histogram.counts[verdict].astype(np.float32),
                     width=float(edges[1] - edges[0]),
                     name=verdict,
-                    marker={"color": VERDICTS[verdict], "line": {"width": 0}},
+                    marker={"color": VERDICTS[verdict].colour, "line": {"width": 0}},
                     hovertemplate="%{x:.4g}: %{y} %{fullData.name}<extra></extra>",
                 ),
                 **place(panel),
@@ -213,7 +213,7 @@ def _scatter(table: pa.Table, parameters: list[Cloud], drawn: Margins) -> Plot:
                     customdata=numbered[rows],
                     mode="markers",
                     name=verdict,
-                    marker={"color": colour, "size": 4.5, "opacity": 0.7, "symbol": SYMBOLS[verdict]},
+                    marker={"color": colour, "size": 4.5, "opacity": 0.7, "symbol": VERDICTS[verdict].symbol},
                     hovertemplate="flight %{customdata}: %{fullData.name}<br>"
                     + (
                         "margin %{y:.3g}"
@@ -236,7 +236,7 @@ def _scatter(table: pa.Table, parameters: list[Cloud], drawn: Margins) -> Plot:
 
 
 def _verdict_keys(table: pa.Table) -> tuple[tuple[str, str], ...]:
-    return tuple((verdict, VERDICTS[verdict]) for verdict in present(table))
+    return tuple((verdict, VERDICTS[verdict].colour) for verdict in present(table))
 
 
 def _paneled(figure: Figure, key: str, title: str, count: int) -> Plot:

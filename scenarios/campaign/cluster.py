@@ -11,19 +11,17 @@ import re
 import time as clock
 from collections import Counter, deque
 from collections.abc import Generator, Iterator, Mapping, Sequence
-from functools import cache, cached_property, lru_cache
+from functools import cache, cached_property
 from pathlib import Path
 from typing import Any, Final
-
-from threadpoolctl import threadpool_limits
 
 from quadsim import __version__
 from quadsim.campaign.table import Row
 from quadsim.errors import MissingPackageError, ParameterError
+from scenarios.campaign.aside import Aside
 from scenarios.campaign.code import code_digest
-from scenarios.campaign.engine import MOST_DEATHS, Answer, EngineError, Pace, Pilot, fly_one, said
+from scenarios.campaign.engine import MOST_DEATHS, Answer, EngineError, Pace, Pilot, said
 from scenarios.campaign.jobs import Jobs, read_jobs, submit
-from scenarios.garbage import collect_rarely, settle
 
 PATIENCE_S: Final = 60.0
 PATIENCE_WITH_JOBS_S: Final = 86400.0
@@ -104,7 +102,7 @@ class DaskEngine:
 
 
 def fly_chunk(pickled: bytes, chunk: Sequence[int], expected: Mapping[str, str]) -> list[Answer]:
-    """Fly flights one after the other, on a worker; those after a cancellation are left out.
+    """Have flights flown one after the other, beside a worker; those after a cancellation are left out.
 
     Args:
         pickled: the pilot, small against seconds of work; each worker makes it once.
@@ -112,30 +110,35 @@ def fly_chunk(pickled: bytes, chunk: Sequence[int], expected: Mapping[str, str])
         expected: versions that the worker has to have.
 
     Raises:
-        EngineError: it has others.
+        EngineError: it has others, or nobody can fly there.
     """
     worker = _distributed().get_worker()
     other = [f"{name} {found}, not {expected[name]}" for name, found in versions().items() if found != expected[name]]
     if other:
         raise EngineError(f"the worker at {worker.address} has {', '.join(other)} as here: install the same there")
-    pilot = _unpickled(pickled)
+    aside = _aside(pickled)
     key, answers = worker.get_current_task(), []
-    with threadpool_limits(limits=1):
-        for flight in chunk:
-            task = worker.state.tasks.get(key)
-            if task is None or task.state == "cancelled":
-                break
-            answers.append(fly_one(pilot, flight))
+    for flight in chunk:
+        task = worker.state.tasks.get(key)
+        if task is None or task.state == "cancelled":
+            break
+        answers.append(aside.fly(flight))
     return answers
 
 
-@lru_cache(maxsize=1)
-def _unpickled(pickled: bytes) -> Pilot:
-    """What a worker does once."""
-    pilot: Pilot = pickle.loads(pickled)
-    collect_rarely()
-    settle()
-    return pilot
+_asides: dict[bytes, Aside] = {}
+"""Of this worker: one at most, of the campaign that it flies."""
+
+
+def _aside(pickled: bytes) -> Aside:
+    """What a worker starts once for a campaign; an earlier one's is ended."""
+    if pickled not in _asides:
+        pilot: Pilot = pickle.loads(pickled)
+        for other in _asides.values():
+            other.stop()
+        _asides.clear()
+        _asides[pickled] = Aside(pilot, pickled)
+    return _asides[pickled]
 
 
 @cache

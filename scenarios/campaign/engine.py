@@ -8,11 +8,15 @@ import time as clock
 from collections.abc import Generator, Sequence
 from typing import Final, NamedTuple, Protocol
 
-from quadsim.campaign.table import Row
+from quadsim.campaign.table import ERROR, MEMORY, Row
 from quadsim.errors import QuadsimError
+from scenarios.campaign.spec import LimitsSpec
+from scenarios.runner import Progress, silent
 
 MOST_DEATHS: Final = 10
 """Processes that may die while they fly a flight before it is given up: more than die by chance in one flight."""
+ONE_THREAD: Final = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
+"""Environment of a process that flies: results do not depend on the core count."""
 CHUNK_S: Final = 10.0
 """Work handed out at once [s]: long against what handing it out costs, short against a campaign."""
 
@@ -22,14 +26,32 @@ class EngineError(QuadsimError):
 
 
 class Pilot(Protocol):
-    """Flies flights, known by their numbers; pickled, and sent to each process once."""
+    """Flies flights, known by their numbers; pickled, and sent to each process once.
 
-    def fly(self, flight: int) -> Row:
-        """The row of a flight; plain values."""
+    Attributes:
+        limits: of each flight.
+    """
+
+    @property
+    def limits(self) -> LimitsSpec:
+        """See the class."""
         ...
 
-    def lost(self, flight: int, reason: str) -> Row:
-        """The row of a flight that nobody came back from: its process died, or `fly` raised."""
+    def prepare(self) -> None:
+        """Load what flights need, once in each process that flies; what fails here is told by the flights."""
+        ...
+
+    def fly(self, flight: int, progress: Progress = silent) -> Row:
+        """The row of a flight; plain values.
+
+        Args:
+            flight: which.
+            progress: told of the control periods that are flown, after each.
+        """
+        ...
+
+    def lost(self, flight: int, reason: str, verdict: str = ERROR) -> Row:
+        """The row of a flight that nobody came back from: its process died or met a limit, or `fly` raised."""
         ...
 
 
@@ -68,13 +90,15 @@ class Answer(NamedTuple):
     seconds: float
 
 
-def fly_one(pilot: Pilot, flight: int) -> Answer:
+def fly_one(pilot: Pilot, flight: int, progress: Progress = silent) -> Answer:
     """Fly a flight; an exception makes it lost, and is the reason."""
     started = clock.perf_counter()
     try:
-        row = pilot.fly(flight)
+        row = pilot.fly(flight, progress)
         pickle.dumps(row)  # it has to get home
-    except (Exception, SystemExit) as error:  # SystemExit: a controller that is not ours may ask to leave
+    except MemoryError as error:
+        row = pilot.lost(flight, said(error), MEMORY)
+    except BaseException as error:  # a controller that is not ours may ask to leave, or raise what ends loops
         row = pilot.lost(flight, said(error))
     gc.collect()  # what a flight leaves in cycles, a dozen megabytes sometimes, is not to wait for the next ones
     return Answer(row, clock.perf_counter() - started)

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import contextlib
 import time as clock
 
-from quadsim.campaign.table import Row, failed_row, flown_row
+from quadsim.campaign.table import ERROR, MEMORY, Row, failed_row, flown_row
 from quadsim.errors import QuadsimError
 from scenarios.campaign.engine import said
 from scenarios.campaign.plan import Plan
-from scenarios.runner import Flight, fly_scenario, processor_name
+from scenarios.campaign.spec import LimitsSpec
+from scenarios.own import import_own
+from scenarios.runner import Flight, Progress, fly_scenario, processor_name, silent
+from scenarios.spec.own import OwnSpec
 
 
 class CampaignPilot:
@@ -21,13 +25,28 @@ class CampaignPilot:
     def __init__(self, plan: Plan) -> None:
         self._plan = plan
 
-    def fly(self, flight: int) -> Row:
+    @property
+    def limits(self) -> LimitsSpec:
+        """See `Pilot`."""
+        return self._plan.spec.limits
+
+    def prepare(self) -> None:
+        """Import a controller that is not ours."""
+        controller = self._plan.scenario.controller
+        if isinstance(controller, OwnSpec):
+            with contextlib.suppress(Exception):
+                import_own(controller)
+
+    def fly(self, flight: int, progress: Progress = silent) -> Row:
         """The row of a flight; one that raises is a result too, with its reason."""
         started = clock.perf_counter()
         try:
-            flown = fly_scenario(self._plan.of(flight))
+            flown = fly_scenario(self._plan.of(flight), progress)
         except QuadsimError as error:
             return self._row(flight, failed_row(str(error)))
+        except MemoryError as error:
+            most = f"limits.memory is {self.limits.memory:g} MB"
+            return self._row(flight, failed_row(f"{said(error)} ({most})", MEMORY))
         except Exception as error:  # of a controller that is not ours, say: the campaign goes on without it
             return self._row(flight, failed_row(said(error)))
         return self._row(flight, _kept(flown, clock.perf_counter() - started))
@@ -36,9 +55,9 @@ class CampaignPilot:
         """The row of a flight that was flown elsewhere; it has no clock times of its own."""
         return self._row(flight, _kept(flown, 0.0))
 
-    def lost(self, flight: int, reason: str) -> Row:
+    def lost(self, flight: int, reason: str, verdict: str = ERROR) -> Row:
         """The row of a flight that no process came back from."""
-        return self._row(flight, failed_row(reason))
+        return self._row(flight, failed_row(reason, verdict))
 
     def _row(self, flight: int, came_of_it: Row) -> Row:
         row = dict.fromkeys(self._plan.schema.names) | self._plan.identity(flight) | came_of_it

@@ -5,7 +5,7 @@ So no worker has to look through it, nor copies the pages that hold it.
 
 from __future__ import annotations
 
-import scenarios.campaign.worker  # noqa: F401
+import scenarios.campaign.keeper  # noqa: F401
 from scenarios.garbage import settle
 
 settle()

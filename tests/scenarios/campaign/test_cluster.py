@@ -23,11 +23,13 @@ from quadsim.campaign.table import Row
 from quadsim.errors import FileError, InputError, MissingPackageError, ParameterError, UnknownNameError
 from scenarios.campaign import cluster as module
 from scenarios.campaign.cluster import DaskEngine, versions
-from scenarios.campaign.engine import EngineError
+from scenarios.campaign.engine import MOST_DEATHS, EngineError
 from scenarios.campaign.jobs import Jobs, job_script, read_jobs, submit
 from scenarios.campaign.local import LocalEngine
 from scenarios.campaign.plan import load_plan
 from scenarios.campaign.run import SUMMARY_FILE, Standing, fly_campaign
+from scenarios.campaign.spec import LimitsSpec
+from scenarios.runner import Progress, silent
 
 ROOT = Path(__file__).resolve().parents[3]
 FLIGHTS = range(40)
@@ -124,13 +126,40 @@ def test_a_campaign_whose_worker_is_killed_ends_in_the_same_bytes(two_workers: s
         assert (disturbed.directory / name).read_bytes() == (calm.directory / name).read_bytes()
 
 
+def test_a_flight_that_always_kills_its_process_is_lost_in_the_end(two_workers: str) -> None:
+    pilot = ToyPilot(asleep=0.02, kills={20: signal.SIGSEGV})
+    rows = known(fly(DaskEngine(two_workers), pilot))
+    assert rows[20]["reason"] == f"its process died {MOST_DEATHS} times, last by signal 11"
+    assert [row for row in rows if row["flight"] != 20] == [row for row in ALL if row["flight"] != 20]
+
+
+class _Patient(ToyPilot):
+    def fly(self, flight: int, progress: Progress = silent) -> Row:
+        if flight == 7:
+            clock.sleep(100.0)
+        return super().fly(flight)
+
+
+def test_limits_hold_beside_a_worker_too(two_workers: str) -> None:
+    rows = known(fly(DaskEngine(two_workers), _Patient(limits=LimitsSpec(flight=0.5))))
+    assert "limits.flight is 0.5 s" in rows[7]["reason"]
+    assert [row for row in rows if row["flight"] != 7] == [row for row in ALL if row["flight"] != 7]
+
+
+class _Assassin(ToyPilot):
+    def fly(self, flight: int, progress: Progress = silent) -> Row:
+        if flight == 20:
+            psutil.Process().parents()[1].kill()  # above its keeper
+            clock.sleep(100.0)
+        return super().fly(flight)
+
+
 def test_a_flight_that_always_kills_its_worker_is_lost_in_the_end(monkeypatch: pytest.MonkeyPatch) -> None:
     """The scheduler gives a chunk up at the first death; then each of its flights is tried alone; one is lost."""
     monkeypatch.setattr(module, "MOST_DEATHS", 2)
     with dask.config.set({"distributed.scheduler.allowed-failures": 0}), start_cluster() as cluster:
         # The worker has to be known to whoever restarts it before it dies.
-        pilot = ToyPilot(asleep=0.02, kills={20: signal.SIGSEGV})
-        rows = known(fly(DaskEngine(cluster.scheduler_address), pilot))
+        rows = known(fly(DaskEngine(cluster.scheduler_address), _Assassin(asleep=0.02)))
     assert rows[20] == {"flight": 20, "value": None, "reason": "its process died 2 times"}
     assert [row for row in rows if row["flight"] != 20] == [row for row in ALL if row["flight"] != 20]
 
@@ -147,7 +176,7 @@ def test_closing_the_iterator_ends_the_work_after_the_flights_in_the_air(two_wor
 
 
 class _Thrifty(ToyPilot):
-    def fly(self, flight: int) -> Row:
+    def fly(self, flight: int, progress: Progress = silent) -> Row:
         return super().fly(flight) | {"threshold": gc.get_threshold()}
 
 

@@ -22,7 +22,7 @@ from quadsim.campaign.table import Row
 from quadsim.errors import ParameterError, QuadsimError
 from scenarios.campaign.engine import CHUNK_S, MOST_DEATHS, Answer, EngineError, Pace, fair_share
 from scenarios.campaign.local import LocalEngine
-from scenarios.runner import usable_cores
+from scenarios.runner import Progress, silent, usable_cores
 
 ROOT = Path(__file__).resolve().parents[3]
 FLIGHTS = range(40)
@@ -80,7 +80,7 @@ def test_what_fly_raises_is_the_reason_of_its_rows_alone() -> None:
 
 
 class _Unspeakable(ToyPilot):
-    def fly(self, flight: int) -> Row:
+    def fly(self, flight: int, progress: Progress = silent) -> Row:
         return super().fly(flight) | ({"value": lambda: None} if flight == 1 else {})
 
 
@@ -143,7 +143,7 @@ def test_closing_the_iterator_stops_everybody() -> None:
 
 
 class _Thrifty(ToyPilot):
-    def fly(self, flight: int) -> Row:
+    def fly(self, flight: int, progress: Progress = silent) -> Row:
         return super().fly(flight) | {"threshold": gc.get_threshold()}
 
 
@@ -153,7 +153,7 @@ def test_workers_seldom_look_for_cycles() -> None:
 
 
 class _Settled(ToyPilot):
-    def fly(self, flight: int) -> Row:
+    def fly(self, flight: int, progress: Progress = silent) -> Row:
         return super().fly(flight) | {"settled": "scenarios.campaign.preload" in sys.modules}
 
 
