@@ -172,9 +172,11 @@ def read_table(path: Path) -> pa.Table:
     Raises:
         FileError: the file is missing, damaged, or none of ours.
     """
+    if not path.is_file():  # a folder would be read as many tables, and a pipe for ever
+        raise FileError(path, "is not a readable Parquet file (it is missing or no file)")
     try:
         table = pq.read_table(path, memory_map=False)
-    except (OSError, pa.ArrowException) as error:
+    except (OSError, ValueError, pa.ArrowException) as error:
         raise FileError(path, f"is not a readable Parquet file ({error})") from error
     if "flight" not in table.column_names:
         raise FileError(path, "is not a campaign's table: it has no column 'flight'")

@@ -8,11 +8,14 @@ from pathlib import Path
 from typing import Any, Final
 
 from quadsim.errors import FileError, InputError, OutputError
-from quadsim.rundir import read_json, write_atomically, write_json
+from quadsim.form import read_json
+from quadsim.rundir import write_atomically, write_json
 from scenarios.campaign.code import code_digest, controller_digest
 from scenarios.campaign.plan import Plan, load_plan
 from scenarios.campaign.spec import CampaignSpec
+from scenarios.foreign_code import announce_recorded, find_code
 from scenarios.runner import machine, versions
+from scenarios.spec.own import OwnSpec
 
 MANIFEST_FILE: Final = "manifest.json"
 CAMPAIGN_FILE: Final = "campaign.toml"
@@ -55,6 +58,7 @@ def begin(plan: Plan, directory: Path) -> dict[str, Any]:
         "flown": 0,
         "files": {name: _digest(text.encode()) for name, text in texts.items()},
         **_flown_by(plan),
+        **({"controller_code": find_code(own).digest} if isinstance(own := plan.scenario.controller, OwnSpec) else {}),
         "sessions": [],
     }
     write(manifest, directory)
@@ -126,7 +130,13 @@ def require_same(plan: Plan, directory: Path) -> None:
 
 
 def other_than_flew(manifest: Mapping[str, Any], plan: Plan) -> list[str]:
-    """Of `code`, `controller`, `versions` and `machine`, those that are not as when a campaign was begun."""
+    """Of `code`, `controller`, `versions` and `machine`, those that are not as when a campaign was begun.
+
+    Imports a controller that is not ours; what is to run, and what ran then, is told to
+    `scenarios.foreign_code.LOGGER` before.
+    """
+    if isinstance(plan.scenario.controller, OwnSpec):
+        announce_recorded(plan.scenario.controller, manifest.get("controller_code", manifest.get("controller")))
     return [name for name, value in _flown_by(plan).items() if manifest.get(name) != value]
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import sys
 from argparse import Namespace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -51,7 +50,7 @@ def campaign(options: Namespace) -> int:
                 watch=watch,
             )
     except KeyboardInterrupt:
-        print(f"quadsim: interrupted (Ctrl-C); {target} has what was flown, --resume goes on with it", file=sys.stderr)
+        console.say(f"interrupted (Ctrl-C); {target} has what was flown, --resume goes on with it")
         return EXIT_FAILED
     judgements = [judge(result.table, requirement) for requirement in requirements]
     if options.junit:
@@ -89,9 +88,7 @@ def replay(options: Namespace) -> int:
     target = Path(options.out) if options.out else Path("runs") / flight.scenario.name
     outputs = Outputs(video=options.video, recording=options.recording, figures=options.figures)
     if flight.otherwise:
-        print(
-            f"quadsim: other {', '.join(flight.otherwise)} flew that campaign, so numbers may differ", file=sys.stderr
-        )
+        console.say(f"other {', '.join(flight.otherwise)} flew that campaign, so numbers may differ")
     with console.progress_bars(enabled=not options.json) as progress:
         _, differing = fly_again(flight, target, outputs, progress)
     print_summary(rundir.read_summary(target), options, where=str(target))

@@ -7,8 +7,11 @@ from pathlib import Path
 
 from quadsim import rundir
 from quadsim.errors import FileError, ParameterError
+from quadsim.inside import require_inside
+from quadsim.printable import printable
 from scenarios import console
 from scenarios.cli import EXIT_DONE
+from scenarios.reaudit import reaudit
 
 
 def video(options: Namespace) -> int:
@@ -16,7 +19,7 @@ def video(options: Namespace) -> int:
     from quadsim.video import render_gif, render_video
 
     directory = Path(options.run)
-    rundir.read_summary(directory)
+    reaudit(directory, products=False)
     path = Path(options.out) if options.out else directory / rundir.VIDEO_FILE
     if options.workers is not None and options.workers < 1:
         raise ParameterError("", "--workers", options.workers, "at least 1")
@@ -33,8 +36,8 @@ def video(options: Namespace) -> int:
                 progress=lambda done, total: progress("video", done, total),
             )
     if path.parent.resolve() == directory.resolve():
-        rundir.refresh_hashes(directory)
-    print(f"written to {path}")
+        rundir.refresh_hash(directory, path.name)
+    print(f"written to {printable(str(path))}")
     return EXIT_DONE
 
 
@@ -46,6 +49,8 @@ def view(options: Namespace) -> int:
     recording = path / rundir.RECORDING_FILE if path.is_dir() else path
     if not path.exists():
         raise FileError(path, "no such run or recording")
+    if path.is_dir():
+        require_inside(path)
     if not recording.is_file():
         raise FileError(path, f"has no {rundir.RECORDING_FILE}; run the scenario again without --no-recording")
     if recording.suffix != ".rrd":

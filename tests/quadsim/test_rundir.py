@@ -207,14 +207,17 @@ def test_damaged_and_missing_files_are_found(copied: Path) -> None:
     assert sorted(rundir.damaged_files(copied, rundir.read_summary(copied))) == ["scenario.toml", "timing.parquet"]
 
 
-def test_hashes_are_taken_again_when_a_product_is_added(copied: Path) -> None:
+def test_the_hash_of_a_product_that_is_added_is_taken_and_no_other(copied: Path) -> None:
     (copied / "figures").mkdir()
     (copied / "figures" / "a.png").write_bytes(b"png")
+    (copied / "plant.parquet").write_bytes(b"another")
     before = rundir.read_summary(copied)
-    rundir.refresh_hashes(copied)
+    rundir.refresh_hash(copied, "figures/a.png")
     after = rundir.read_summary(copied)
     assert set(after["files"]) - set(before["files"]) == {"figures/a.png"}
     assert {**after, "files": 0} == {**before, "files": 0}
+    assert rundir.damaged_files(copied, after) == ["plant.parquet"]  # not hidden by the new product
+    assert rundir.is_sealed(copied, after)
 
 
 @pytest.mark.parametrize("content", [b"", b"{", b"[1]", b'"text"', b"\xff", b"{}"])
@@ -237,10 +240,12 @@ def test_a_directory_without_a_summary_is_no_run(tmp_path: Path) -> None:
     [
         ({"constraints": 3}, "it lacks or misstates constraints"),
         ({"satisfied": "yes", "files": None}, "it lacks or misstates satisfied, files"),
-        ({"constraints": [{"name": "roll"}]}, "is damaged"),
-        ({"constraints": [3]}, "is damaged"),
-        ({"vehicle": {"mass": 3.0}}, "is damaged"),
-        ({"vehicle": {"name": "x", "wings": 2}}, "is damaged"),
+        ({"constraints": [{"name": "roll"}]}, r"it lacks or misstates constraints\.0\.signal, constraints\.0\.unit"),
+        ({"constraints": [3]}, r"it lacks or misstates constraints\.0$"),
+        ({"vehicle": {"mass": 3.0}}, r"it lacks or misstates vehicle\.name"),
+        ({"duration": True, "seed": 1.5}, "it lacks or misstates duration, seed$"),
+        ({"tracking": {"unit": 3}}, r"it lacks or misstates tracking\.unit, tracking\.rmse"),
+        ({"reason": "at once"}, "contradicts itself: status is 'completed', and reason is 'at once'"),
     ],
 )
 def test_a_damaged_summary_is_refused(copied: Path, change: dict[str, Any], message: str) -> None:
