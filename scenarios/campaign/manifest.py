@@ -7,8 +7,10 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final
 
+from quadsim.campaign.store import FLIGHTS_FILE, TIMES_FILE
 from quadsim.errors import FileError, InputError, OutputError
-from quadsim.form import read_json
+from quadsim.form import MAYBE_TEXT, Each, Optional, read_json
+from quadsim.inside import require_inside
 from quadsim.rundir import write_atomically, write_json
 from scenarios.campaign.code import code_digest, controller_digest
 from scenarios.campaign.plan import Plan, load_plan
@@ -21,15 +23,16 @@ MANIFEST_FILE: Final = "manifest.json"
 CAMPAIGN_FILE: Final = "campaign.toml"
 SCENARIO_FILE: Final = "scenario.toml"
 FORMAT: Final = "quadsim campaign"
-_KEYS: Final = {
-    "format": str,
-    "name": str,
-    "status": str,
-    "flights": int,
-    "flown": int,
-    "files": dict,
-    "sessions": list,
+_FORM: Final = {
+    **dict.fromkeys(("format", "name", "status"), str),
+    **dict.fromkeys(("flights", "flown"), int),
+    "files": Each(str),
+    "files_before": Optional(Each(str)),
+    "sessions": [dict],
+    **dict.fromkeys(("controller", "controller_code"), Optional(MAYBE_TEXT)),
 }
+_FINISHED: Final = ("complete", "stopped")
+"""Status of a campaign that nothing has written to since its manifest has the hashes of its tables."""
 
 
 def begin(plan: Plan, directory: Path) -> dict[str, Any]:
@@ -156,10 +159,11 @@ def read_manifest(directory: Path) -> dict[str, Any]:
     Raises:
         FileError: there is none, or it is not one of ours.
     """
+    require_inside(directory)
     path = directory / MANIFEST_FILE
     if not path.is_file():
         raise FileError(directory, f"is not a campaign: it has no {MANIFEST_FILE}")
-    manifest = read_json(path, _KEYS, "a campaign's manifest")
+    manifest = read_json(path, _FORM, "a campaign's manifest")
     if manifest["format"] != FORMAT:
         raise FileError(path, "is not a campaign's manifest: it lacks or misstates format")
     return manifest
@@ -182,11 +186,13 @@ def stored_plan(directory: Path) -> Plan:
     """
     manifest = read_manifest(directory)
     before = manifest.get("files_before", {})  # where a process died while it made a campaign grow
-    for name in (CAMPAIGN_FILE, SCENARIO_FILE):
+    tables = [name for name in (FLIGHTS_FILE, TIMES_FILE) if manifest["status"] in _FINISHED]
+    for name in (CAMPAIGN_FILE, SCENARIO_FILE, *tables):
         path = directory / name
-        known = [files.get(name) for files in (manifest["files"], before) if isinstance(files, dict)]
+        known = [files[name] for files in (manifest["files"], before) if name in files]
         if not path.is_file() or _digest(path.read_bytes()) not in known:
-            raise FileError(path, "is missing or not the file that was flown")
+            what = "flown" if name not in tables else "written"
+            raise FileError(path, f"is missing or not the file that was {what}")
     return load_plan(str(directory / CAMPAIGN_FILE))
 
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from quadsim import rundir
 from quadsim.errors import InputError, ParameterError
 from scenarios import console
-from scenarios.campaign.manifest import read_manifest, stored_plan
+from scenarios.campaign.manifest import stored_plan
 from scenarios.cli import EXIT_DONE, EXIT_FAILED
 from scenarios.commands.common import print_summary
 from scenarios.junit import require_place, write_cases
@@ -102,7 +102,7 @@ def compare_campaigns(options: Namespace) -> int:
     from quadsim.campaign.comparison import compare
     from quadsim.campaign.comparison_report import write_comparison_report
     from quadsim.campaign.store import FLIGHTS_FILE
-    from quadsim.campaign.table import read_table
+    from quadsim.campaign.stored import read_flights
     from scenarios.campaign.console import print_comparison
 
     if len(options.targets) != 2:
@@ -110,9 +110,11 @@ def compare_campaigns(options: Namespace) -> int:
     if options.cost:
         raise ParameterError("", "--cost", True, "absent when campaigns are compared")
     first, second = (Path(name) for name in options.targets)
-    names = (str(read_manifest(first)["name"]), str(read_manifest(second)["name"]))
-    failures = (stored_plan(first).spec.failure, stored_plan(second).spec.failure)
-    comparison = compare(read_table(first / FLIGHTS_FILE), read_table(second / FLIGHTS_FILE), names, failures)
+    plans = (stored_plan(first), stored_plan(second))
+    names = (plans[0].spec.name, plans[1].spec.name)
+    failures = (plans[0].spec.failure, plans[1].spec.failure)
+    a, b = (read_flights(path / FLIGHTS_FILE, plan.schema) for path, plan in zip((first, second), plans, strict=True))
+    comparison = compare(a, b, names, failures)
     page = write_comparison_report(comparison, Path(options.out))
     if options.markdown:
         print(comparison.to_markdown())
