@@ -22,7 +22,7 @@ from quadsim.controller import Phase
 from quadsim.errors import FileError, InputError
 from quadsim.flightlog import FLIGHT_FILE, HORIZON_FILE, PLANT_FILE, TIMING_FILE, FlightLog
 from quadsim.printable import printable
-from scenarios.bases import read_scenario
+from scenarios.bases import read_whole
 from scenarios.build import build_limits
 from scenarios.loading import parse_scenario
 from scenarios.spec import Scenario
@@ -109,11 +109,7 @@ def stored_scenario(directory: Path) -> Scenario:
     path = directory / rundir.SCENARIO_FILE
     if not path.is_file():
         raise FileError(path, "is missing or no file")
-
-    def refuse(name: str) -> Path:
-        raise FileError(path, f"has a base, {name!r:.100}, and a run's scenario is whole")
-
-    return parse_scenario(read_scenario(path, refuse), source=str(path))
+    return parse_scenario(read_whole(path), source=str(path))
 
 
 def _changed(directory: Path, summary: Mapping[str, Any], *, products: bool) -> Iterator[str]:

@@ -187,6 +187,16 @@ def test_a_margin_between_the_rows_is_believed(flown: Path, tmp_path: Path) -> N
     assert reaudit(run).satisfied
 
 
+def test_a_run_whose_scenario_names_another_file_reads_none(flown: Path, tmp_path: Path) -> None:
+    run = shutil.copytree(flown / "good", tmp_path / "run")
+    unseal(run)
+    path = run / rundir.SCENARIO_FILE
+    path.write_text('base = "../other.toml"\n' + path.read_text())
+    rehash(run, rundir.SCENARIO_FILE)
+    with pytest.raises(FileError, match=r"scenario\.toml: has a base, and a run's scenario is whole"):
+        reaudit(run)
+
+
 def test_an_older_run_is_audited_and_that_it_has_no_digest_is_said(
     flown: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
