@@ -7,10 +7,10 @@ Three tables, as in the file contract: what happened once per control period (`f
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, BinaryIO, Final
 
 import numpy as np
 import pyarrow as pa
@@ -226,7 +226,7 @@ def write_log(directory: Path, log: FlightLog, *, plant_stride: int, metadata: M
     if log.predicted is not None:
         tables[HORIZON_FILE] = _horizon_table(log.control.t, log.predicted, metadata)
     for name, table in tables.items():
-        pq.write_table(table, directory / name, compression="zstd")
+        _write(table, directory / name)
 
 
 def add_metadata(path: Path, texts: Mapping[str, str]) -> None:
@@ -237,7 +237,7 @@ def add_metadata(path: Path, texts: Mapping[str, str]) -> None:
     """
     table = _read(path)
     named = {**(table.schema.metadata or {}), **{key.encode(): text.encode() for key, text in texts.items()}}
-    pq.write_table(table.replace_schema_metadata(named), path, compression="zstd")
+    _write(table.replace_schema_metadata(named), path)
 
 
 def read_metadata(path: Path) -> dict[str, str]:
@@ -246,15 +246,21 @@ def read_metadata(path: Path) -> dict[str, str]:
     Raises:
         FileError: it cannot be read.
     """
-    metadata = _read(path).schema.metadata or {}
+    metadata = _read(path, pq.read_schema).metadata or {}
     return {key.decode(errors="replace"): text.decode(errors="replace") for key, text in metadata.items()}
 
 
-def _read(path: Path) -> pa.Table:
-    if not path.is_file():  # a folder would be read as many tables, and a pipe for ever
+def _write(table: pa.Table, path: Path) -> None:
+    with path.open("wb") as file:  # Arrow by itself takes no path that is no Unicode
+        pq.write_table(table, file, compression="zstd")
+
+
+def _read(path: Path, read: Callable[[BinaryIO], Any] = pq.read_table) -> Any:
+    if not path.is_file():  # a pipe would be read for ever
         raise FileError(path, "is not a readable Parquet file (it is missing or no file)")
     try:
-        return pq.read_table(path, memory_map=False)
+        with path.open("rb") as file:
+            return read(file)
     except (OSError, ValueError, pa.ArrowException) as error:
         raise FileError(path, f"is not a readable Parquet file ({error})") from error
 

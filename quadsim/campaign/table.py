@@ -172,10 +172,11 @@ def read_table(path: Path) -> pa.Table:
     Raises:
         FileError: the file is missing, damaged, or none of ours.
     """
-    if not path.is_file():  # a folder would be read as many tables, and a pipe for ever
+    if not path.is_file():  # a pipe would be read for ever
         raise FileError(path, "is not a readable Parquet file (it is missing or no file)")
     try:
-        table = pq.read_table(path, memory_map=False)
+        with path.open("rb") as file:  # Arrow by itself takes no path that is no Unicode
+            table = pq.read_table(file)
     except (OSError, ValueError, pa.ArrowException) as error:
         raise FileError(path, f"is not a readable Parquet file ({error})") from error
     if "flight" not in table.column_names:
