@@ -177,7 +177,7 @@ def _constraint_differences(
     rounding = ROUNDING_TILT if finding.limit.signal == "tilt" else ROUNDING
     alike = ["peak_sampled", "worst_margin_sampled"]
     if SIGNALS[finding.limit.signal].plant is None or scenario.plant_stride == 1 or not log.control.t.size:
-        alike += ["peak_plant", "worst_margin", "worst_time", "time_violated"]
+        alike += ["peak_plant", "worst_margin", "worst_time"]
     for key in alike:
         if not _is_close(entry[key], again[key], rounding):
             yield f"{key} is recorded as {entry[key]}, and the tables give {again[key]}"
@@ -188,19 +188,24 @@ def _constraint_differences(
     if recorded is not None and not _is_close(_margin(finding, entry["peak_plant"]), recorded, rounding):
         yield f"worst_margin is recorded as {recorded}, and peak_plant as {entry['peak_plant']}"
     beyond = recorded is not None and recorded < -entry["tolerance"]
-    if (entry["time_violated"] > 0.0 and not beyond) or entry["time_violated"] < _time_seen(finding, scenario, log):
+    least, most = _time_beyond(finding, scenario, log)
+    if (entry["time_violated"] > 0.0 and not beyond) or not least <= entry["time_violated"] <= most:
         yield f"time_violated is recorded as {entry['time_violated']}, and the tables give {again['time_violated']:.6g}"
 
 
-def _time_seen(finding: Finding, scenario: Scenario, log: FlightLog) -> float:
-    """The least time beyond a bound and its tolerance that rows at the log rate leave possible [s]: a step each."""
-    signal, limit = SIGNALS[finding.limit.signal], finding.limit
-    if signal.plant is None or not log.control.t.size:
-        return 0.0
+def _time_beyond(finding: Finding, scenario: Scenario, log: FlightLog) -> tuple[float, float]:
+    """The least and the most time beyond a bound and its tolerance that the tables leave possible [s].
+
+    Rows at the log rate stand for one physics step each at least, and the last of them may come before the end.
+    """
+    signal, limit, seen = SIGNALS[finding.limit.signal], finding.limit, finding.time_violated
+    row = 1.0 / scenario.log_rate if scenario.plant_stride > 1 else 0.0
+    if signal.plant is None or not log.control.t.size or scenario.plant_stride == 1:
+        return seen - ROUNDING, seen + row + ROUNDING
     t = log.plant.t[:-1]  # the last row ends the flight, and lasts no time
     inside = (t >= limit.start) & (t <= limit.stop)
     beyond = limit.margin(signal.plant(log.plant))[:-1] < -limit.tolerance - ROUNDING_TILT
-    return max(0.0, (np.count_nonzero(inside & beyond) - 1) * scenario.plant.timestep)
+    return max(0.0, (np.count_nonzero(inside & beyond) - 1) * scenario.plant.timestep), math.inf
 
 
 def _margin(finding: Finding, peak: float | None) -> float | None:

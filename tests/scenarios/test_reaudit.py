@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -247,3 +248,21 @@ def test_the_tables_that_a_seed_determines_hold_no_digest(flown: Path) -> None:
     for name, sealed in ((FLIGHT_FILE, False), (PLANT_FILE, False), (TIMING_FILE, True)):
         metadata = pq.read_schema(flown / "good" / name).metadata
         assert (rundir.SEAL.encode() in metadata) is sealed
+
+
+@pytest.mark.parametrize("rate", [1000.0, 200.0, 50.0, 1.0])
+@pytest.mark.parametrize("name", ["nan-position", "hard-landing", "lost-rotor", "crazyflie-real-rotors", "gps-outage"])
+def test_what_a_run_records_is_what_its_tables_give(name: str, rate: float, tmp_path: Path) -> None:
+    """Flights that break off, crash, are told no number: at any log rate the tables never contradict the record."""
+    settings = ("--set", "duration=6.0", "--set", f"log_rate={rate}")
+    if name in ("gps-outage", "nan-position", "lost-rotor", "hard-landing"):
+        settings = settings[2:]  # whose events come later
+    out = str(tmp_path / "run")
+    status = main(["run", name, *settings, *TABLES, "--json", "--out", out])
+    assert main(["check", out]) == status
+    again = reaudit(Path(out))
+    for finding, entry in zip(again.findings, again.summary["constraints"], strict=True):
+        recorded = entry["worst_margin"]
+        assert recorded is None or math.isnan(finding.worst_margin) or recorded <= finding.worst_margin + 1e-6
+        if rate == 1000.0 and recorded is not None:
+            assert recorded == finding.worst_margin
