@@ -162,12 +162,22 @@ def load_run(directory: Path) -> Run:
 
 
 def file_hashes(directory: Path) -> dict[str, str]:
-    """SHA-256 of every file below a directory but the summary, by relative path, sorted."""
+    """SHA-256 of every file below a directory but the summary, by relative path, sorted.
+
+    Raises:
+        FileError: one cannot be read.
+    """
     paths = sorted(path for path in directory.rglob("*") if path.is_file() and path.name != SUMMARY_FILE)
     return {
-        path.relative_to(directory).as_posix(): "sha256:" + hashlib.sha256(path.read_bytes()).hexdigest()
-        for path in paths
+        path.relative_to(directory).as_posix(): "sha256:" + hashlib.sha256(_content(path)).hexdigest() for path in paths
     }
+
+
+def _content(path: Path) -> bytes:
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise FileError(path, f"cannot be read ({error.strerror})") from error
 
 
 def seal(directory: Path, summary: Mapping[str, Any]) -> None:
