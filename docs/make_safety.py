@@ -1,4 +1,4 @@
-"""Attack everything that writes or reads files, and remake the counts on docs/safety.md: `make safety`, some forty minutes."""
+"""Attack all that writes or reads files, and remake the counts on docs/safety.md: `make safety`, forty minutes."""
 
 from __future__ import annotations
 

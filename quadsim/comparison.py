@@ -22,6 +22,7 @@ from quadsim.conditions import (
     verdict_cell,
 )
 from quadsim.controller import law_name
+from quadsim.printable import printable
 from quadsim.rundir import Run
 from quadsim.table import ABSENT, Cell, Mark, Row, format_number
 
@@ -37,7 +38,7 @@ TIME_MEASURES: Final = {"p50": "median", "p95": "95th percentile", "p99": "99th 
 def run_names(runs: Sequence[Run]) -> tuple[str, ...]:
     """A distinct name for each run: its scenario's, with its directory's where two share a scenario."""
     scenarios = Counter(run.name for run in runs)
-    names = [run.name if scenarios[run.name] == 1 else f"{run.name} ({run.directory.name})" for run in runs]
+    names = [run.name if scenarios[run.name] == 1 else f"{run.name} ({printable(run.directory.name)})" for run in runs]
     seen = Counter(names)
     return tuple(name if seen[name] == 1 else f"{name}, {names[: i + 1].count(name)}" for i, name in enumerate(names))
 

@@ -10,6 +10,8 @@ import difflib
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
+from quadsim.printable import printable
+
 
 class QuadsimError(Exception):
     """Root of all errors raised on purpose; `exit_status` is what the command line returns for it.
@@ -65,7 +67,7 @@ class FileError(InputError):
     """A file that is missing, unreadable or malformed."""
 
     def __init__(self, path: Path | str, problem: str) -> None:
-        super().__init__(f"{path}: {problem}")
+        super().__init__(f"{printable(str(path))}: {problem}")
         self.path, self.problem = Path(path), problem
 
 
@@ -81,7 +83,7 @@ class OutputError(QuadsimError, OSError):
     """Results cannot be written: directory not writable, disk full; nothing is left behind."""
 
     def __init__(self, path: Path | str, problem: str) -> None:
-        super().__init__(f"cannot write {path}: {problem}")
+        super().__init__(f"cannot write {printable(str(path))}: {problem}")
         self.path, self.problem = Path(path), problem
 
 
@@ -112,7 +114,7 @@ class FlightError(QuadsimError):
     exit_status = 1
 
     def __init__(self, message: str, *, time: float) -> None:
-        super().__init__(f"at t = {time:.3f} s: {message}")
+        super().__init__(f"at t = {time:.3f} s: {printable(message)}")
         self.time = time
 
 

@@ -7,10 +7,10 @@ Three tables, as in the file contract: what happened once per control period (`f
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, BinaryIO, Final
 
 import numpy as np
 import pyarrow as pa
@@ -228,13 +228,42 @@ def write_log(directory: Path, log: FlightLog, *, plant_stride: int, metadata: M
     if log.predicted is not None:
         tables[HORIZON_FILE] = _horizon_table(log.control.t, log.predicted, metadata)
     for name, table in tables.items():
-        pq.write_table(table, directory / name, compression="zstd")
+        _write(table, directory / name)
 
 
-def _read(path: Path) -> pa.Table:
+def add_metadata(path: Path, texts: Mapping[str, str]) -> None:
+    """Add texts to those that a table of ours keeps in its schema.
+
+    Raises:
+        FileError: it cannot be read.
+    """
+    table = _read(path)
+    named = {**(table.schema.metadata or {}), **{key.encode(): text.encode() for key, text in texts.items()}}
+    _write(table.replace_schema_metadata(named), path)
+
+
+def read_metadata(path: Path) -> dict[str, str]:
+    """The texts that a table of ours keeps in its schema.
+
+    Raises:
+        FileError: it cannot be read.
+    """
+    metadata = _read(path, pq.read_schema).metadata or {}
+    return {key.decode(errors="replace"): text.decode(errors="replace") for key, text in metadata.items()}
+
+
+def _write(table: pa.Table, path: Path) -> None:
+    with path.open("wb") as file:  # Arrow by itself takes no path that is no Unicode
+        pq.write_table(table, file, compression="zstd")
+
+
+def _read(path: Path, read: Callable[[BinaryIO], Any] = pq.read_table) -> Any:
+    if not path.is_file():  # a pipe would be read for ever
+        raise FileError(path, "is not a readable Parquet file (it is missing or no file)")
     try:
-        return pq.read_table(path, memory_map=False)
-    except (OSError, pa.ArrowException) as error:
+        with path.open("rb") as file:
+            return read(file)
+    except (OSError, ValueError, pa.ArrowException) as error:
         raise FileError(path, f"is not a readable Parquet file ({error})") from error
 
 
@@ -247,7 +276,17 @@ def _stack_if_there(table: pa.Table, names: Sequence[str]) -> Array | None:
 
 
 def _numbers(table: pa.Table, name: str, kind: type = np.float64) -> np.ndarray[Any, Any]:
-    return np.asarray(table.column(name).to_numpy(), dtype=kind)
+    column = table.column(name)
+    if column.null_count:
+        raise ValueError(f"{name} has gaps")
+    return np.asarray(column.to_numpy(), dtype=kind)
+
+
+def _texts(table: pa.Table, name: str) -> tuple[str, ...]:
+    texts = tuple(table.column(name).to_pylist())
+    if not all(isinstance(text, str) for text in texts):
+        raise ValueError(f"{name} is not text throughout")
+    return texts
 
 
 def read_log(directory: Path, *, reason: str | None = None) -> FlightLog:
@@ -276,8 +315,8 @@ def read_log(directory: Path, *, reason: str | None = None) -> FlightLog:
             reference=_stack(flight, [f"ref_{name}" for name in REFERENCE_NAMES]),
             speeds=_stack(flight, [f"u{i}" for i in ROTORS]),
             speeds_before=before,
-            status=tuple(flight.column("status").to_pylist()),
-            phase=tuple(flight.column("phase").to_pylist()),
+            status=_texts(flight, "status"),
+            phase=_texts(flight, "phase"),
             **scalars,
         )
         plant_log = PlantLog(
@@ -289,11 +328,24 @@ def read_log(directory: Path, *, reason: str | None = None) -> FlightLog:
         )
         timing_log = TimingLog(**{name: _numbers(timing, name) for name in ("t", "solve_ms", "step_ms")})
         predicted = _read_predicted(directory)
+        _require_whole(control, timing_log, plant_log, predicted)
     except FileError:
         raise
-    except (AttributeError, KeyError, TypeError, ValueError) as error:
+    except (AttributeError, ArithmeticError, KeyError, TypeError, ValueError, pa.ArrowException) as error:
         raise FileError(directory, f"lacks or misstates a column of the flight log ({error})") from error
     return FlightLog(control=control, timing=timing_log, plant=plant_log, predicted=predicted, reason=reason)
+
+
+def _require_whole(
+    control: ControlLog, timing: TimingLog, plant: PlantLog, predicted: np.ndarray[Any, np.dtype[np.float32]] | None
+) -> None:
+    """Refuse tables that are not of one flight."""
+    rows = {control.t.size, timing.t.size, *(() if predicted is None else (len(predicted),))}
+    if len(rows) > 1 or not plant.t.size:
+        raise ValueError("its tables have not as many rows as one another, or none")
+    for t in (control.t, plant.t):
+        if not np.isfinite(t).all() or (np.diff(t) <= 0.0).any():
+            raise ValueError("t does not increase")
 
 
 def _read_predicted(directory: Path) -> np.ndarray[Any, np.dtype[np.float32]] | None:

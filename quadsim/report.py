@@ -17,6 +17,7 @@ from quadsim.cost import CostStudy, cost_markdown, cost_sentences, cost_tables
 from quadsim.errors import OutputError, ParameterError
 from quadsim.figures import comparison_figure, write_cost_figures
 from quadsim.flightlog import FLIGHT_FILE, HORIZON_FILE, PLANT_FILE, TIMING_FILE
+from quadsim.inside import require_inside
 from quadsim.narrative import comparison_sentences
 from quadsim.outputs import write_json, write_text, writing
 from quadsim.page import PAGE_FILE, render_page
@@ -96,11 +97,13 @@ def write_comparison(runs: Sequence[Run], directory: Path, study: CostStudy | No
     Raises:
         ParameterError: no run is given.
         OutputError: the directory cannot be written, holds something else, or holds one of the runs.
+        FileError: a link leads out of one of the runs.
     """
     if not runs:
         raise ParameterError("comparison", "runs", 0, "one or more")
     target = directory.resolve()
     for run in runs:
+        require_inside(run.directory)  # copying follows links
         if run.directory.resolve().is_relative_to(target):
             raise OutputError(directory, f"it holds the run {run.directory}, which must stay; choose another --out")
     names = run_names(runs)

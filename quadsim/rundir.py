@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import json
 import math
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, dataclass, fields
@@ -12,31 +11,30 @@ from typing import Any, Final
 
 from quadsim.audit import Finding, Limit
 from quadsim.errors import FileError
-from quadsim.flightlog import FlightLog, read_log
-from quadsim.outputs import LOCK_FILE, MANIFEST_FILE, digest, digest_of, growing, to_json
+from quadsim.flightlog import (
+    FLIGHT_FILE,
+    HORIZON_FILE,
+    PLANT_FILE,
+    TIMING_FILE,
+    FlightLog,
+    add_metadata,
+    read_log,
+    read_metadata,
+)
+from quadsim.outputs import LOCK_FILE, MANIFEST_FILE, digest, digest_of, growing, to_json, write_json
+from quadsim.summary import SUMMARY_FILE as SUMMARY_FILE
+from quadsim.summary import read_summary as read_summary
+from quadsim.summary import summary_digest
 from quadsim.vehicle import Vehicle
 
-SUMMARY_FILE: Final = "summary.json"
 SCENARIO_FILE: Final = "scenario.toml"
 RECORDING_FILE: Final = "flight.rrd"
 VIDEO_FILE: Final = "flight.mp4"
 FIGURES_DIR: Final = "figures"
 KIND: Final = "run"
 """What `quadsim.outputs` calls a run directory."""
-
-_SUMMARY_TYPES: Final = {
-    "scenario": str,
-    "status": str,
-    "reason": str | None,
-    "satisfied": bool,
-    "duration": float,
-    "tracking": dict,
-    "constraints": list,
-    "control": dict,
-    "controller": dict,
-    "vehicle": dict,
-    "files": dict,
-}
+SEAL: Final = "summary"
+"""Under which `timing.parquet` keeps the summary's digest."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -103,29 +101,6 @@ def limit_from_json(entry: Mapping[str, Any]) -> Limit:
     return Limit(**values | {name: bound for name, bound in absent.items() if values[name] is None})
 
 
-def read_json(path: Path, kinds: Mapping[str, Any], what: str) -> dict[str, Any]:
-    """A JSON object from a file of ours.
-
-    Args:
-        path: of the file.
-        kinds: types of the entries that it has to have.
-        what: it is, for messages.
-
-    Raises:
-        FileError: it cannot be read, or an entry is missing or of another type.
-    """
-    try:
-        found = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
-        raise FileError(path, f"is not {what} ({error})") from error
-    if not isinstance(found, dict):
-        raise FileError(path, f"is not {what}: it is no table")
-    wrong = [name for name, kind in kinds.items() if not isinstance(found.get(name, ...), kind)]
-    if wrong:
-        raise FileError(path, f"is not {what}: it lacks or misstates {', '.join(wrong)}")
-    return found
-
-
 def is_run(directory: Path) -> bool:
     """Whether a path is a run directory: one with a summary of ours, since others write a `summary.json` too."""
     try:
@@ -133,18 +108,6 @@ def is_run(directory: Path) -> bool:
     except FileError:
         return False
     return True
-
-
-def read_summary(directory: Path) -> dict[str, Any]:
-    """`summary.json` of a run directory.
-
-    Raises:
-        FileError: there is none, or it is not one of ours.
-    """
-    path = directory / SUMMARY_FILE
-    if not path.is_file():
-        raise FileError(directory, f"is not a run directory: it has no {SUMMARY_FILE}")
-    return read_json(path, _SUMMARY_TYPES, "a run's summary")
 
 
 def load_run(directory: Path) -> Run:
@@ -157,17 +120,28 @@ def load_run(directory: Path) -> Run:
     try:
         vehicle = Vehicle(**summary["vehicle"])
         limits = tuple(limit_from_json(entry) for entry in summary["constraints"])
-    except (KeyError, TypeError, ValueError) as error:
+    except (ArithmeticError, TypeError, ValueError) as error:
         raise FileError(directory / SUMMARY_FILE, f"is damaged ({error})") from error
     log = read_log(directory, reason=summary["reason"])
     return Run(directory=directory, summary=summary, log=log, vehicle=vehicle, limits=limits)
 
 
 def file_hashes(directory: Path) -> dict[str, str]:
-    """SHA-256 of every file below a directory but the summary and our own bookkeeping, by relative path, sorted."""
+    """SHA-256 of every file below a directory but the summary and our own bookkeeping, by relative path, sorted.
+
+    Raises:
+        FileError: one cannot be read.
+    """
     paths = sorted(path for path in directory.rglob("*") if path.is_file())
     names = [path.relative_to(directory).as_posix() for path in paths]
-    return {name: digest_of(directory / name) for name in names if name not in (SUMMARY_FILE, MANIFEST_FILE, LOCK_FILE)}
+    return {name: _hash(directory / name) for name in names if name not in (SUMMARY_FILE, MANIFEST_FILE, LOCK_FILE)}
+
+
+def _hash(path: Path) -> str:
+    try:
+        return digest_of(path)
+    except OSError as error:
+        raise FileError(path, f"cannot be read ({error.strerror})") from error
 
 
 @contextlib.contextmanager
@@ -197,7 +171,35 @@ def adding(directory: Path, name: str) -> Iterator[Callable[[bytes], None]]:
         yield write
 
 
+def seal(directory: Path, summary: Mapping[str, Any]) -> None:
+    """Write the summary of a run whose files are all there, with their hashes, and its digest into `timing.parquet`.
+
+    So the summary says when another file is changed, and `timing.parquet` when the summary is.
+
+    Raises:
+        OutputError: they cannot be written.
+    """
+    hashes = file_hashes(directory)
+    add_metadata(directory / TIMING_FILE, {SEAL: summary_digest(summary, _fixed(hashes))})
+    write_json(directory / SUMMARY_FILE, {**summary, "files": file_hashes(directory)})
+
+
 def damaged_files(directory: Path, summary: Mapping[str, Any]) -> list[str]:
     """Files named in the summary that are missing or whose SHA-256 is not the recorded one."""
     found = file_hashes(directory)
     return [name for name, digest in summary["files"].items() if found.get(name) != digest]
+
+
+def is_sealed(directory: Path, summary: Mapping[str, Any]) -> bool | None:
+    """Whether a run's summary is the one that was written with it; None for a run that does not say.
+
+    Raises:
+        FileError: `timing.parquet` cannot be read.
+    """
+    recorded = read_metadata(directory / TIMING_FILE).get(SEAL)
+    return None if recorded is None else recorded == summary_digest(summary, _fixed(summary["files"]))
+
+
+def _fixed(hashes: Mapping[str, str]) -> dict[str, str]:
+    """Hashes of what is made once, and holds no clock reading."""
+    return {name: hashes[name] for name in (SCENARIO_FILE, FLIGHT_FILE, PLANT_FILE, HORIZON_FILE) if name in hashes}

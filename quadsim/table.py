@@ -7,6 +7,8 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Final
 
+from quadsim.printable import printable
+
 ABSENT: Final = "-"
 
 
@@ -88,7 +90,7 @@ def grid_to_markdown(grid: Grid) -> str:
 
 
 def _markdown_line(*texts: str) -> str:
-    return "| " + " | ".join(text.replace("|", r"\|") for text in texts) + " |"
+    return "| " + " | ".join(printable(text).replace("|", r"\|") for text in texts) + " |"
 
 
 def format_number(value: float | None) -> str:

@@ -91,6 +91,18 @@ def retyped(before: Mapping[str, Any], after: Mapping[str, Any]) -> dict[str, st
     return {name: kind for name, kind in kinds.items() if name in now and now[name] != kind}
 
 
+def read_whole(path: Path) -> dict[str, Any]:
+    """The tables of a scenario file that has no base, as the one in a run's directory: no other file is read for it.
+
+    Raises:
+        FileError: it cannot be read, or has a base.
+    """
+    data = _read(path)
+    if "base" in data:
+        raise FileError(path, "has a base, and a run's scenario is whole")
+    return data
+
+
 def merge(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
     """One table over another, field by field.
 

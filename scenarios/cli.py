@@ -7,20 +7,34 @@ wrong.  Nothing heavy is imported before a command runs, so that `quadsim --help
 from __future__ import annotations
 
 import argparse
+import contextlib
+import logging
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from typing import NoReturn
 
 from quadsim import __version__
 from quadsim.errors import QuadsimError
+from quadsim.printable import printable
 from scenarios.garbage import collect_rarely
 
 EXIT_DONE, EXIT_FAILED, EXIT_WRONG_INPUT = 0, 1, 2
+_LINES = "\n"
+"""What a message of ours may be made of besides text: one with many problems has a line for each."""
+
+
+class _Parser(argparse.ArgumentParser):
+    """Shows what it was given as text, whatever stands in it."""
+
+    def error(self, message: str) -> NoReturn:
+        """See `argparse.ArgumentParser.error`."""
+        super().error(printable(message))
 
 
 def make_parser() -> argparse.ArgumentParser:
     """The command line's grammar."""
-    parser = argparse.ArgumentParser(
+    parser = _Parser(
         prog="quadsim",
         description="Fly model predictive controllers of quadrotors in MuJoCo; record, film and audit every flight.",
         epilog="exit status: 0 done; 1 a required constraint does not hold, or the flight was aborted or interrupted; "
@@ -225,13 +239,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if arguments is None:  # as a process of its own
         collect_rarely()  # saves 5 % of a run
     try:
-        from scenarios import commands
+        with _told():
+            from scenarios import commands
 
-        status = commands.COMMANDS[options.command](options)
+            status = commands.COMMANDS[options.command](options)
         sys.stdout.flush()
         return status
     except QuadsimError as error:
-        print(f"quadsim: {error}", file=sys.stderr)
+        print(f"quadsim: {printable(str(error), keep=_LINES)}", file=sys.stderr)
         return error.exit_status
     except KeyboardInterrupt:
         print("quadsim: interrupted (Ctrl-C); nothing half written was left behind", file=sys.stderr)
@@ -243,6 +258,35 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"quadsim: cannot write the output: {error.strerror or error}", file=sys.stderr)
         _silence_stdout()
         return EXIT_WRONG_INPUT
+
+
+@contextlib.contextmanager
+def _told() -> Iterator[None]:
+    """Show on stderr what the program tells of itself meanwhile: what code that is not its own it runs."""
+    logger, teller = logging.getLogger("quadsim"), _Teller()
+    before = logger.level
+    logger.addHandler(teller)
+    logger.setLevel(logging.INFO)
+    try:
+        yield
+    finally:
+        logger.removeHandler(teller)
+        logger.setLevel(before)
+
+
+class _Teller(logging.Handler):
+    """Shows on stderr what the program tells of itself, each thing once."""
+
+    def __init__(self) -> None:
+        super().__init__(logging.INFO)
+        self._told: set[str] = set()
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """See `logging.Handler.emit`."""
+        text = record.getMessage()
+        if text not in self._told:
+            self._told.add(text)
+            print(f"quadsim: {printable(text)}", file=sys.stderr, flush=True)
 
 
 def _silence_stdout() -> None:

@@ -8,19 +8,19 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from typing import Any, Final
 
 from rich.box import SIMPLE_HEAD
-from rich.console import Console
-from rich.markup import escape
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
+from rich.text import Text
 
 from quadsim.controller import law_name
 from quadsim.table import Cell, Grid, Mark, Row
 from scenarios import runner
+from scenarios.terminal import stderr, stdout, styled
 
 
 def print_listing(sections: Mapping[str, Mapping[str, str]]) -> None:
     """Names with one line each, by section."""
-    console = _console()
+    console = stdout()
     for title, entries in sections.items():
         table = Table(
             title=title, title_justify="left", title_style="bold", box=None, show_header=False, padding=(0, 2)
@@ -28,37 +28,53 @@ def print_listing(sections: Mapping[str, Mapping[str, str]]) -> None:
         table.add_column(no_wrap=True, style="cyan")
         table.add_column()
         for name, line in entries.items():
-            table.add_row(name, escape(line))
+            table.add_row(name, line)
         console.print(table)
         console.print()
 
 
 def print_summary(summary: Mapping[str, Any], where: str | None) -> None:
     """A flight's outcome, tracking, audit and solver, from its summary."""
-    console = _console()
-    console.print(f"[bold]{summary['scenario']}[/bold]  {outcome(summary)}  {summary['duration']:.2f} s flown")
+    console = stdout()
+    flown = styled(f"  {summary['duration']:.2f} s flown")
+    console.print(styled((summary["scenario"], "bold"), "  ") + outcome(summary) + flown)
     if "course" in summary:
-        console.print(escape(summary["course"]["sentence"]), soft_wrap=True)
+        console.print(summary["course"]["sentence"], soft_wrap=True)
     if summary["tracking"]:
         console.print(_tracking_table(summary["tracking"]))
     if summary["constraints"]:
         console.print(audit_table(summary["constraints"]))
     if summary["tracking"]:
-        console.print(_controller_line(summary))
+        for line in _controller_lines(summary):
+            console.print(line)
     for line in _effect_lines(summary):
         console.print(line)
+    if "reaudit" in summary:
+        again = summary["reaudit"]
+        told = "as recorded" if again["satisfied"] == summary["satisfied"] else "its verdict is recorded alone"
+        console.print(f"audited again from the tables, {again['rate']:g} rows per second: {told}")
     if where is not None:
-        console.print(f"written to [bold]{where}[/bold]", soft_wrap=True)
+        print_place(where)
+
+
+def print_place(where: str) -> None:
+    """Where something was written."""
+    stdout().print(styled("written to ", (where, "bold")), soft_wrap=True)
+
+
+def say(text: str) -> None:
+    """Tell a person, or a log, something that is no result."""
+    stderr().print(f"quadsim: {text}", soft_wrap=True)
 
 
 def print_notice(text: str) -> None:
     """Tell a person at a terminal something that work begins with."""
-    console = Console(stderr=True, highlight=False)
+    console = stderr()
     if console.is_terminal:
-        console.print(escape(text), soft_wrap=True)
+        console.print(text, soft_wrap=True)
 
 
-def outcome(summary: Mapping[str, Any]) -> str:
+def outcome(summary: Mapping[str, Any]) -> Text:
     """Completed or aborted with its reason, the verdict on the required constraints, and whether that was expected."""
     expected, as_expected = summary.get("expected", "satisfied"), summary.get("as_expected", True)
     remark = ""
@@ -66,9 +82,9 @@ def outcome(summary: Mapping[str, Any]) -> str:
         remark = ", as the scenario expects" if as_expected else f", where the scenario expects it {expected}"
     colour = "green" if as_expected and (remark or summary["satisfied"]) else "red"
     if summary["status"] != "completed":
-        return f"[{colour}]aborted{remark}[/{colour}]: {summary['reason']}"
+        return styled((f"aborted{remark}", colour), f": {summary['reason']}")
     verdict = "every required constraint holds" if summary["satisfied"] else "a required constraint does not hold"
-    return f"[{colour}]completed, {verdict}{remark}[/{colour}]"
+    return styled((f"completed, {verdict}{remark}", colour))
 
 
 def audit_table(constraints: Sequence[Mapping[str, Any]]) -> Table:
@@ -83,7 +99,7 @@ def audit_table(constraints: Sequence[Mapping[str, Any]]) -> Table:
     table.add_column("verdict", no_wrap=True)
     for entry in constraints:
         table.add_row(
-            escape(f"{entry['name']} [{entry['unit']}]"),
+            f"{entry['name']} [{entry['unit']}]",
             _range(entry["lower"], entry["upper"]),
             _number(entry["peak_sampled"]),
             _number(entry["peak_plant"]),
@@ -95,32 +111,34 @@ def audit_table(constraints: Sequence[Mapping[str, Any]]) -> Table:
     return table
 
 
-def _verdict(entry: Mapping[str, Any]) -> str:
+def _verdict(entry: Mapping[str, Any]) -> Text:
     if entry["satisfied"]:
-        return "[green]holds[/green]"
+        return styled(("holds", "green"))
     if entry["worst_margin"] is None:
-        return "[red]not reached[/red]"  # the flight ended before its time window
-    return "[red]VIOLATED[/red]" if entry["required"] else "[yellow]exceeded*[/yellow]"
+        return styled(("not reached", "red"))  # the flight ended before its time window
+    return styled(("VIOLATED", "red") if entry["required"] else ("exceeded*", "yellow"))
 
 
 def _tracking_table(tracking: Mapping[str, Any]) -> Table:
     table = _table("tracking, real minus filtered reference")
     table.add_column("")
     for channel, unit in tracking["unit"].items():
-        table.add_column(escape(f"{channel} [{unit}]"), justify="right")
+        table.add_column(f"{channel} [{unit}]", justify="right")
     for name in ("rmse", "max_error", "final_error", "overshoot"):
         table.add_row(name.replace("_", " "), *(f"{tracking[name][channel]:.4g}" for channel in tracking["unit"]))
     return table
 
 
-def _controller_line(summary: Mapping[str, Any]) -> str:
+def _controller_lines(summary: Mapping[str, Any]) -> Iterator[str]:
     control, controller = summary["control"], summary["controller"]
     statuses = ", ".join(f"{count} {status}" for status, count in controller["statuses"].items())
     times = controller["step_ms"]
     how = law_name(controller["name"]) + (f" by {controller['solver']}" if controller["solver"] else "")
-    return (
+    yield (
         f"{how}: {statuses}; step p50 {times['p50']:.3f}, p99 {times['p99']:.3f}, max {times['max']:.3f} ms "
-        f"of {controller['deadline_ms']:g} ms\n"
+        f"of {controller['deadline_ms']:g} ms"
+    )
+    yield (
         f"commanded speeds {control['speed_min']:.2f} .. {control['speed_max']:.2f} rad/s, "
         f"steps {control['slew_min']:.2f} .. {control['slew_max']:.2f} rad/s per period; "
         f"simulated in {summary['wall_s']['simulate']:.2f} s"
@@ -161,7 +179,7 @@ _BRIEF: Final = ("outcome", "required constraints", "RMS error", "verdict", "sta
 
 def print_comparison(rows: Sequence[Row], names: Sequence[str], where: str) -> None:
     """The comparison's answers side by side: outcomes, tracking, verdicts, times."""
-    console = _console()
+    console = stdout()
     table = _table("comparison")
     table.add_column("", no_wrap=True)
     for name in names:
@@ -170,32 +188,31 @@ def print_comparison(rows: Sequence[Row], names: Sequence[str], where: str) -> N
         if row.label.startswith(_BRIEF):
             label = row.group if row.headline else row.label
             unit = f" [{row.unit}]" if row.unit else ""
-            table.add_row(escape(label + unit), *(_cell(cell) for cell in row.cells))
+            table.add_row(label + unit, *(_cell(cell) for cell in row.cells))
     console.print(table)
-    console.print(f"every number, plots and films: [bold]{where}[/bold]", soft_wrap=True)
+    console.print(styled("every number, plots and films: ", (where, "bold")), soft_wrap=True)
 
 
 def print_grids(grids: Sequence[Grid], where: str | None, *, prose: Collection[str] = ()) -> None:
     """Tables of cases, one below the other, with what a reader has to know of each; `prose` names columns of words."""
-    console = _console()
+    console = stdout()
     for grid in grids:
-        table = _table(grid.title, caption=escape(grid.note.replace("`", "")) or None)
+        table = _table(grid.title, caption=grid.note.replace("`", "") or None)
         for i, name in enumerate(grid.head):
-            table.add_column(escape(name), justify="right" if i and name not in prose else "left", no_wrap=not i)
+            table.add_column(name, justify="right" if i and name not in prose else "left", no_wrap=not i)
         for line in grid.lines:
             table.add_row(*(_cell(cell) for cell in line))
         console.print(table)
         console.print()
     if where is not None:
-        console.print(f"written to [bold]{where}[/bold]", soft_wrap=True)
+        print_place(where)
 
 
 _STYLES: Final = {Mark.BEST: "bold", Mark.GOOD: "green", Mark.WARN: "yellow", Mark.BAD: "red"}
 
 
-def _cell(cell: Cell) -> str:
-    style = _STYLES.get(cell.mark)
-    return f"[{style}]{escape(cell.text)}[/{style}]" if style else escape(cell.text)
+def _cell(cell: Cell) -> Text:
+    return styled((cell.text, _STYLES.get(cell.mark, "")))
 
 
 def _number(value: float | None) -> str:
@@ -223,16 +240,10 @@ def _table(title: str, caption: str | None = None) -> Table:
     )
 
 
-def _console() -> Console:
-    """Stdout; wide enough for the tables where it is a file or a pipe."""
-    console = Console(highlight=False)
-    return console if console.is_terminal else Console(highlight=False, width=120)
-
-
 @contextlib.contextmanager
 def progress_bars(*, enabled: bool) -> Iterator[runner.Progress]:
     """Progress bars on stderr, one per stage; nothing when not enabled or not on a terminal."""
-    console = Console(stderr=True)
+    console = stderr()
     if not enabled or not console.is_terminal:
         yield runner.silent
         return

@@ -8,6 +8,7 @@ from typing import Any
 from xml.etree import ElementTree
 
 from quadsim.outputs import writing_file
+from quadsim.printable import printable
 
 
 def write_junit(summary: Mapping[str, Any], path: Path) -> None:
@@ -29,17 +30,19 @@ def write_junit(summary: Mapping[str, Any], path: Path) -> None:
 def write_cases(suite: str, cases: Sequence[tuple[str, bool, str]], path: Path) -> None:
     """Write test cases of a suite: the name of each, whether it passes, and what is said of it.
 
+    Characters that XML forbids, and others that steer a terminal, become escapes.
+
     Raises:
         OutputError: the file cannot be written.
     """
-    name, failures = f"quadsim.{suite}", sum(not passed for _, passed, _ in cases)
+    name, failures = printable(f"quadsim.{suite}"), sum(not passed for _, passed, _ in cases)
     root = ElementTree.Element("testsuite", name=name, tests=str(len(cases)), failures=str(failures))
     for case_name, passed, sentence in cases:
-        case = ElementTree.SubElement(root, "testcase", classname=name, name=case_name)
+        case = ElementTree.SubElement(root, "testcase", classname=name, name=printable(case_name))
         if passed:
-            ElementTree.SubElement(case, "system-out").text = sentence
+            ElementTree.SubElement(case, "system-out").text = printable(sentence)
         else:
-            ElementTree.SubElement(case, "failure", message=sentence)
+            ElementTree.SubElement(case, "failure", message=printable(sentence))
     with writing_file(path, ".xml") as file:
         file.write_bytes(ElementTree.tostring(root, encoding="utf-8", xml_declaration=True))
 

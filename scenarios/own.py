@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import contextlib
 import difflib
 import importlib
 import inspect
-import sys
 import traceback
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
-from importlib import metadata
 from pathlib import Path
 from typing import Any
 
@@ -18,12 +15,16 @@ import numpy as np
 
 from quadsim.controller import Command, Controller, Moment
 from quadsim.errors import CommandError, InputError, ParameterError
+from quadsim.printable import printable
 from quadsim.state import Array
 from quadsim.vehicle import N_ROTORS, Vehicle
-from scenarios.spec.own import ENTRY_POINTS, GIVEN, OwnSpec
+from scenarios.foreign_code import announce, folders_of, searched
+from scenarios.spec.own import GIVEN, OwnSpec
 
 _WHOLE, _REAL = ("iterations", "active", "fallback"), ("slack", "primal_residual", "dual_residual", "solve_s")
 """What else a command has: whole numbers, and numbers."""
+_LONGEST = 200
+"""Characters of a name or status."""
 
 
 class OwnController:
@@ -48,7 +49,7 @@ class OwnController:
     @property
     def name(self) -> str:
         """What it calls itself, or what its class is called."""
-        return str(getattr(self._law, "name", type(self._law).__name__))
+        return _line(getattr(self._law, "name", type(self._law).__name__))
 
     @property
     def module(self) -> str:
@@ -58,7 +59,7 @@ class OwnController:
     @property
     def solver(self) -> str:
         """Its QP solver; empty where it names none."""
-        return str(getattr(self._law, "solver", ""))
+        return _line(getattr(self._law, "solver", ""))
 
     def reset(self, speeds: Array) -> None:
         """See `quadsim.controller.Controller.reset`."""
@@ -117,7 +118,12 @@ class OwnController:
         for name in _REAL:
             if not isinstance(getattr(answer, name), int | float | np.integer | np.floating):
                 raise refuse(name, "a number")
-        return replace(answer, speeds=speeds, plan=plan)
+        return replace(answer, speeds=speeds, plan=plan, status=_line(answer.status))
+
+
+def _line(text: object) -> str:
+    """A name or a status as files and terminals can hold it."""
+    return printable(str(text))[:_LONGEST]
 
 
 def _numbers(given: Any) -> Array | None:
@@ -134,15 +140,18 @@ def import_own(spec: OwnSpec) -> None:
     Raises:
         InputError: there is none, or it cannot be imported.
     """
-    with _searched([] if spec.folder is None else [spec.folder], Path.cwd()) as folders:
-        _import(spec.type, _place(spec.type)[0], folders)
+    code = announce(spec)
+    folders = folders_of(spec)
+    with searched(folders):
+        _import(spec.type, code.module, folders)
 
 
 def build_own(spec: OwnSpec, vehicle: Vehicle, period: float) -> Controller:
     """Import a controller and call it.
 
-    Its module is looked for in the spec's folder, the working directory, then among what is installed; these two stand
-    first on the path while it is imported and called, and no longer.
+    What is to run is told to `scenarios.foreign_code.LOGGER` first.  Its module is looked for in the spec's folder, the
+    working directory, then among what is installed; these two stand first on the path while it is imported and called,
+    and no longer.
 
     Args:
         spec: names it.
@@ -153,9 +162,10 @@ def build_own(spec: OwnSpec, vehicle: Vehicle, period: float) -> Controller:
         InputError: there is no such module or class, it cannot be imported, it does not take the settings, refuses
             them by a ValueError, or has no `step`.  Any other exception of its own code passes, traceback and all.
     """
-    module_name, attribute = _place(spec.type)
-    with _searched([] if spec.folder is None else [spec.folder], Path.cwd()) as folders:
-        module = _import(spec.type, module_name, folders)
+    code = announce(spec)
+    folders, attribute = folders_of(spec), code.attribute
+    with searched(folders):
+        module = _import(spec.type, code.module, folders)
         factory = _find(spec.type, module, attribute)
         given = dict(zip(GIVEN, (vehicle, period, spec.horizon), strict=True)) | spec.settings
         _check_call(attribute, factory, given)
@@ -169,28 +179,6 @@ def build_own(spec: OwnSpec, vehicle: Vehicle, period: float) -> Controller:
         rule = f"something with a method step(now, state, reference); {attribute}(...) gave {type(law).__name__}"
         raise ParameterError("controller", "type", spec.type, rule)
     return OwnController(law, spec.horizon)
-
-
-def _place(name: str) -> tuple[str, str]:
-    """Module and attribute of a text, or of the entry point with that name."""
-    if ":" not in name:
-        entry = metadata.entry_points(group=ENTRY_POINTS)[name]
-        return entry.module, entry.attr
-    module, _, attribute = name.partition(":")
-    return module, attribute
-
-
-@contextlib.contextmanager
-def _searched(named: list[str], working: Path) -> Iterator[list[str]]:
-    """Folders that stand first on the import path for a while."""
-    before = list(sys.path)
-    folders = list(dict.fromkeys([*named, str(working)]))
-    sys.path[:0] = folders
-    importlib.invalidate_caches()  # a file may be newer than the last look into its folder
-    try:
-        yield folders
-    finally:
-        sys.path[:] = before
 
 
 def _import(name: str, module: str, folders: list[str]) -> Any:

@@ -152,8 +152,7 @@ def run(scenario: Scenario, target: Path, outputs: Outputs, progress: Progress =
         _write_products(flight, directory, outputs, progress)
         summary = summarise(flight)
         summary["wall_s"]["total"] = clock.perf_counter() - started
-        summary["files"] = rundir.file_hashes(directory)
-        write_json(directory / rundir.SUMMARY_FILE, summary)
+        rundir.seal(directory, summary)
     return flight
 
 

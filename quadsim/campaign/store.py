@@ -16,6 +16,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
+from quadsim.campaign.stored import read_flights, require_columns
 from quadsim.campaign.table import Row, make_table, read_table, split_times
 from quadsim.errors import FileError
 from quadsim.outputs import Growing
@@ -96,14 +97,16 @@ class Store:
         table = read_table(path)
         if table.schema != self._schema:
             raise FileError(path, "has other columns than this campaign")
+        require_columns(table, self._schema, path)
         return table
 
     def _finished(self) -> pa.Table:
         """The final table with its clock times, where they are there."""
-        table = read_table(self._directory / FLIGHTS_FILE)
+        table = read_flights(self._directory / FLIGHTS_FILE, self._schema)
         path = self._directory / TIMES_FILE
-        times = read_table(path) if path.is_file() else None
-        if times is None or not times["flight"].equals(table["flight"]):
+        times = read_table(path) if path.is_file() else table.select(["flight"])
+        require_columns(times, self._schema, path)
+        if not times["flight"].equals(table["flight"]):
             times = table.select(["flight"])  # the process died between the two files
         columns = [
             table[name]
@@ -113,8 +116,6 @@ class Store:
             else pa.nulls(table.num_rows, kind)
             for name, kind in zip(self._schema.names, self._schema.types, strict=True)
         ]
-        if not set(table.column_names) <= set(self._schema.names):
-            raise FileError(self._directory / FLIGHTS_FILE, "has other columns than this campaign")
         return pa.Table.from_arrays(columns, schema=self._schema)
 
 

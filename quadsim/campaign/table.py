@@ -181,9 +181,12 @@ def read_table(path: Path) -> pa.Table:
     Raises:
         FileError: the file is missing, damaged, or none of ours.
     """
+    if not path.is_file():  # a pipe would be read for ever
+        raise FileError(path, "is not a readable Parquet file (it is missing or no file)")
     try:
-        table = pq.read_table(path, memory_map=False)
-    except (OSError, pa.ArrowException) as error:
+        with path.open("rb") as file:  # Arrow by itself takes no path that is no Unicode
+            table = pq.read_table(file)
+    except (OSError, ValueError, pa.ArrowException) as error:
         raise FileError(path, f"is not a readable Parquet file ({error})") from error
     if "flight" not in table.column_names:
         raise FileError(path, "is not a campaign's table: it has no column 'flight'")

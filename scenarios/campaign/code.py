@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import functools
-import hashlib
 import sys
-from collections.abc import Iterable
 from pathlib import Path
 from typing import Final
 
 from quadsim.assets import models_dir
 from scenarios.build import build_controller, build_vehicle
+from scenarios.foreign_code import digest
 from scenarios.own import OwnController
 from scenarios.spec import Scenario
 
@@ -21,7 +20,7 @@ _PACKAGES: Final = ("quadsim", "mpc", "scenarios")
 @functools.cache
 def code_digest() -> str:
     """SHA-256 of everything of ours that numbers come from: code, models, scenarios."""
-    return _digest([*(_ROOT / package for package in _PACKAGES), models_dir()])
+    return digest([*(_ROOT / package for package in _PACKAGES), models_dir()])
 
 
 def controller_digest(scenario: Scenario) -> str | None:
@@ -37,15 +36,4 @@ def controller_digest(scenario: Scenario) -> str | None:
     file = getattr(sys.modules[package], "__file__", None)
     if file is None:
         return None
-    return _digest([Path(file).parent if Path(file).name == "__init__.py" else Path(file)])
-
-
-def _digest(places: Iterable[Path]) -> str:
-    digest = hashlib.sha256()
-    for place in places:
-        files = [place] if place.is_file() else sorted(place.rglob("*"))
-        for path in files:
-            if path.suffix in (".py", ".toml", ".xml") and path.is_file():
-                digest.update(f"{place.name}/{path.relative_to(place).as_posix()}\0".encode())
-                digest.update(path.read_bytes())
-    return f"sha256:{digest.hexdigest()}"
+    return digest([Path(file).parent if Path(file).name == "__init__.py" else Path(file)])

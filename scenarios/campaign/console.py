@@ -10,8 +10,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, Final
 
-from rich.console import Console
-from rich.markup import escape
 from rich.progress import BarColumn, Progress, TextColumn
 
 from quadsim.campaign.comparison import Comparison
@@ -24,6 +22,7 @@ from quadsim.campaign.wording import interval
 from quadsim.table import Grid
 from scenarios import console
 from scenarios.campaign.run import Standing, Watch
+from scenarios.terminal import stderr, stdout, styled
 
 MOST_LINES: Final = 8
 """Of a table on the terminal; the report has them all."""
@@ -37,12 +36,12 @@ LINE_EVERY: Final = 30.0
 @contextlib.contextmanager
 def progress(*, enabled: bool) -> Iterator[Watch]:
     """A bar on stderr, or a line now and then where that is no terminal, as in the log of a batch job."""
-    stderr = Console(stderr=True, highlight=False)
+    screen = stderr()
     if not enabled:
         yield lambda standing: None
-    elif stderr.is_terminal:
+    elif screen.is_terminal:
         columns = (TextColumn("flights"), BarColumn(), TextColumn("{task.description}"))
-        with Progress(*columns, console=stderr, transient=True) as bars:
+        with Progress(*columns, console=screen, transient=True) as bars:
             bar = bars.add_task("starting")
             yield lambda standing: bars.update(
                 bar, completed=standing.flown, total=standing.flights, description=describe(standing)
@@ -54,7 +53,7 @@ def progress(*, enabled: bool) -> Iterator[Watch]:
             nonlocal told
             if clock.perf_counter() - told > LINE_EVERY or standing.flown == standing.flights:
                 told = clock.perf_counter()
-                stderr.print(describe(standing), soft_wrap=True)
+                screen.print(describe(standing), soft_wrap=True)
 
         yield tell
 
@@ -74,21 +73,20 @@ def print_campaign(
     summary: Mapping[str, Any], failure: Sequence[str], judgements: Sequence[Judgement], where: str
 ) -> None:
     """What came of a campaign."""
-    stdout = Console(highlight=False)
-    stdout.print(f"[bold]{escape(summary['campaign'])}[/bold]: {escape(verdict_sentence(summary))}", soft_wrap=True)
+    out = stdout()
+    out.print(styled((summary["campaign"], "bold"), f": {verdict_sentence(summary)}"), soft_wrap=True)
     for sentence in campaign_sentences(summary):
-        stdout.print(escape(sentence), soft_wrap=True)
+        out.print(sentence, soft_wrap=True)
     tables = [event_table(summary, failure), constraint_table(summary), worst_table(summary, where)]
     brief = [replace(grid, note="", lines=grid.lines[:MOST_LINES]) for grid in tables if grid.lines]
-    shown = [_with_short_ends(grid, stdout.width) if grid.key == "worst" else grid for grid in brief]
+    shown = [_with_short_ends(grid, out.width) if grid.key == "worst" else grid for grid in brief]
     console.print_grids(shown, None, prose=("constraint", "reason"))
     if summary["worst"]:
         command = replay_command(where, summary["worst"][0]["flight"])
-        stdout.print(f"to fly one of them again: [bold]{escape(command)}[/bold]", soft_wrap=True)
+        out.print(styled("to fly one of them again: ", (command, "bold")), soft_wrap=True)
     for judgement in judgements:
-        colour = "green" if judgement.holds else "red"
-        stdout.print(f"[{colour}]{escape(judgement.sentence)}[/{colour}]", soft_wrap=True)
-    stdout.print(f"written to [bold]{escape(where)}[/bold]", soft_wrap=True)
+        out.print(styled((judgement.sentence, "green" if judgement.holds else "red")), soft_wrap=True)
+    console.print_place(where)
 
 
 def _with_short_ends(grid: Grid, width: int) -> Grid:
@@ -108,15 +106,13 @@ def _shortened(text: str, room: int) -> str:
 
 def print_replay(number: int, row: Mapping[str, Any], differing: Sequence[str]) -> None:
     """Whether a replayed flight gave the campaign's numbers."""
-    stdout = Console(highlight=False)
     if differing:
-        stdout.print(f"[red]flight {number} differs from the campaign's in {escape(', '.join(differing))}[/red]")
+        stdout().print(styled((f"flight {number} differs from the campaign's in {', '.join(differing)}", "red")))
     else:
-        stdout.print(f"flight {number}: {len(row)} columns, each the same as in the campaign")
+        stdout().print(f"flight {number}: {len(row)} columns, each the same as in the campaign")
 
 
 def print_comparison(comparison: Comparison, where: str) -> None:
     """Whether one campaign is better than another."""
-    stdout = Console(highlight=False)
-    stdout.print(escape(f"{comparison.sentence} {pairing(comparison)}"), soft_wrap=True)
+    stdout().print(f"{comparison.sentence} {pairing(comparison)}", soft_wrap=True)
     console.print_grids(comparison_tables(comparison), where)

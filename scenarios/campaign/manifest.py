@@ -6,13 +6,17 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final
 
+from quadsim.campaign.store import FLIGHTS_FILE, TIMES_FILE
 from quadsim.errors import FileError, InputError
+from quadsim.form import MAYBE_TEXT, Each, Optional, read_json
+from quadsim.inside import require_inside
 from quadsim.outputs import Growing, digest, digest_of, to_json
-from quadsim.rundir import read_json
 from scenarios.campaign.code import code_digest, controller_digest
 from scenarios.campaign.plan import Plan, load_plan
 from scenarios.campaign.spec import CampaignSpec
+from scenarios.foreign_code import announce_recorded, find_code
 from scenarios.runner import machine, versions
+from scenarios.spec.own import OwnSpec
 
 MANIFEST_FILE: Final = "manifest.json"
 CAMPAIGN_FILE: Final = "campaign.toml"
@@ -20,15 +24,16 @@ SCENARIO_FILE: Final = "scenario.toml"
 FORMAT: Final = "quadsim campaign"
 KIND: Final = "campaign"
 """What `quadsim.outputs` calls a campaign's directory."""
-_KEYS: Final = {
-    "format": str,
-    "name": str,
-    "status": str,
-    "flights": int,
-    "flown": int,
-    "files": dict,
-    "sessions": list,
+_FORM: Final = {
+    **dict.fromkeys(("format", "name", "status"), str),
+    **dict.fromkeys(("flights", "flown"), int),
+    "files": Each(str),
+    "files_before": Optional(Each(str)),
+    "sessions": [dict],
+    **dict.fromkeys(("controller", "controller_code"), Optional(MAYBE_TEXT)),
 }
+_FINISHED: Final = ("complete", "stopped")
+"""Status of a campaign that nothing has written to since its manifest has the hashes of its tables."""
 
 
 def begin(plan: Plan, files: Growing) -> dict[str, Any]:
@@ -52,6 +57,7 @@ def begin(plan: Plan, files: Growing) -> dict[str, Any]:
         "flown": 0,
         "files": {name: digest(text) for name, text in texts.items()},
         **_flown_by(plan),
+        **({"controller_code": find_code(own).digest} if isinstance(own := plan.scenario.controller, OwnSpec) else {}),
         "sessions": [],
     }
     write(manifest, files)
@@ -122,7 +128,13 @@ def require_same(plan: Plan, directory: Path) -> None:
 
 
 def other_than_flew(manifest: Mapping[str, Any], plan: Plan) -> list[str]:
-    """Of `code`, `controller`, `versions` and `machine`, those that are not as when a campaign was begun."""
+    """Of `code`, `controller`, `versions` and `machine`, those that are not as when a campaign was begun.
+
+    Imports a controller that is not ours; what is to run, and what ran then, is told to
+    `scenarios.foreign_code.LOGGER` before.
+    """
+    if isinstance(plan.scenario.controller, OwnSpec):
+        announce_recorded(plan.scenario.controller, manifest.get("controller_code", manifest.get("controller")))
     return [name for name, value in _flown_by(plan).items() if manifest.get(name) != value]
 
 
@@ -142,10 +154,11 @@ def read_manifest(directory: Path) -> dict[str, Any]:
     Raises:
         FileError: there is none, or it is not one of ours.
     """
+    require_inside(directory)
     path = directory / MANIFEST_FILE
     if not path.is_file():
         raise FileError(directory, f"is not a campaign: it has no {MANIFEST_FILE}")
-    manifest = read_json(path, _KEYS, "a campaign's manifest")
+    manifest = read_json(path, _FORM, "a campaign's manifest")
     if manifest["format"] != FORMAT:
         raise FileError(path, "is not a campaign's manifest: it lacks or misstates format")
     return manifest
@@ -168,11 +181,13 @@ def stored_plan(directory: Path) -> Plan:
     """
     manifest = read_manifest(directory)
     before = manifest.get("files_before", {})  # where a process died while it made a campaign grow
-    for name in (CAMPAIGN_FILE, SCENARIO_FILE):
+    tables = [name for name in (FLIGHTS_FILE, TIMES_FILE) if manifest["status"] in _FINISHED]
+    for name in (CAMPAIGN_FILE, SCENARIO_FILE, *tables):
         path = directory / name
-        known = [files.get(name) for files in (manifest["files"], before) if isinstance(files, dict)]
+        known = [files[name] for files in (manifest["files"], before) if name in files]
         if not path.is_file() or digest_of(path) not in known:
-            raise FileError(path, "is missing or not the file that was flown")
+            what = "flown" if name not in tables else "written"
+            raise FileError(path, f"is missing or not the file that was {what}")
     return load_plan(str(directory / CAMPAIGN_FILE))
 
 

@@ -9,7 +9,8 @@ from typing import Any
 
 from quadsim.campaign.estimates import worst_flight
 from quadsim.campaign.store import FLIGHTS_FILE
-from quadsim.campaign.table import make_table, read_table
+from quadsim.campaign.stored import read_flights
+from quadsim.campaign.table import make_table
 from quadsim.errors import ParameterError
 from scenarios.campaign.manifest import other_than_flew, read_manifest, stored_plan
 from scenarios.campaign.pilot import CampaignPilot
@@ -46,7 +47,7 @@ def recorded_flight(directory: Path, number: int | None) -> Recorded:
         FileError: the directory is no campaign, or not a finished one.
     """
     plan = stored_plan(directory)
-    table = read_table(directory / FLIGHTS_FILE)
+    table = read_flights(directory / FLIGHTS_FILE, plan.schema)
     number = worst_flight(table) if number is None else number
     flights = table["flight"].to_pylist()
     if number not in flights:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import sys
 from argparse import Namespace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -12,7 +11,7 @@ from quadsim import rundir
 from quadsim.errors import InputError, ParameterError
 from quadsim.outputs import real_path, require_directory, require_file
 from scenarios import console
-from scenarios.campaign.manifest import read_manifest, stored_plan
+from scenarios.campaign.manifest import stored_plan
 from scenarios.cli import EXIT_DONE, EXIT_FAILED
 from scenarios.commands.common import print_summary
 from scenarios.junit import write_cases
@@ -52,7 +51,7 @@ def campaign(options: Namespace) -> int:
                 watch=watch,
             )
     except KeyboardInterrupt:
-        print(f"quadsim: interrupted (Ctrl-C); {target} has what was flown, --resume goes on with it", file=sys.stderr)
+        console.say(f"interrupted (Ctrl-C); {target} has what was flown, --resume goes on with it")
         return EXIT_FAILED
     judgements = [judge(result.table, requirement) for requirement in requirements]
     if options.junit is not None:
@@ -90,9 +89,7 @@ def replay(options: Namespace) -> int:
     target = real_path(Path("runs") / flight.scenario.name if options.out is None else options.out)
     outputs = Outputs(video=options.video, recording=options.recording, figures=options.figures)
     if flight.otherwise:
-        print(
-            f"quadsim: other {', '.join(flight.otherwise)} flew that campaign, so numbers may differ", file=sys.stderr
-        )
+        console.say(f"other {', '.join(flight.otherwise)} flew that campaign, so numbers may differ")
     with console.progress_bars(enabled=not options.json) as progress:
         _, differing = fly_again(flight, target, outputs, progress)
     print_summary(rundir.read_summary(target), options, where=str(target))
@@ -106,7 +103,7 @@ def compare_campaigns(options: Namespace) -> int:
     from quadsim.campaign.comparison import compare
     from quadsim.campaign.comparison_report import KIND, write_comparison_report
     from quadsim.campaign.store import FLIGHTS_FILE
-    from quadsim.campaign.table import read_table
+    from quadsim.campaign.stored import read_flights
     from scenarios.campaign.console import print_comparison
 
     if len(options.targets) != 2:
@@ -116,9 +113,11 @@ def compare_campaigns(options: Namespace) -> int:
     target = real_path(options.out)
     require_directory(target, KIND)
     first, second = (Path(name) for name in options.targets)
-    names = (str(read_manifest(first)["name"]), str(read_manifest(second)["name"]))
-    failures = (stored_plan(first).spec.failure, stored_plan(second).spec.failure)
-    comparison = compare(read_table(first / FLIGHTS_FILE), read_table(second / FLIGHTS_FILE), names, failures)
+    plans = (stored_plan(first), stored_plan(second))
+    names = (plans[0].spec.name, plans[1].spec.name)
+    failures = (plans[0].spec.failure, plans[1].spec.failure)
+    a, b = (read_flights(path / FLIGHTS_FILE, plan.schema) for path, plan in zip((first, second), plans, strict=True))
+    comparison = compare(a, b, names, failures)
     page = write_comparison_report(comparison, target)
     if options.markdown:
         print(comparison.to_markdown())

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from argparse import Namespace
 from pathlib import Path
-from typing import Any
 
 from quadsim import rundir
-from quadsim.errors import FileError, ParameterError
+from quadsim.errors import ParameterError
 from quadsim.outputs import real_path, require_directory, require_file
 from scenarios import console, runner
 from scenarios.build import build_vehicle
@@ -18,6 +17,7 @@ from scenarios.commands.common import load, print_summary
 from scenarios.courses import report
 from scenarios.junit import write_junit
 from scenarios.loading import load_scenario
+from scenarios.reaudit import reaudit
 from scenarios.runner import Outputs
 from scenarios.spec import Scenario
 
@@ -38,11 +38,15 @@ def check(options: Namespace) -> int:
     """`quadsim check`."""
     if options.junit is not None:
         require_file(options.junit)
+    again = None
     if Path(options.target).is_dir():
         if options.settings or options.seed is not None:
             option, value = ("--set", options.settings) if options.settings else ("--seed", options.seed)
             raise ParameterError("", option, value, "absent when a finished run is checked")
-        summary = _read_intact_summary(Path(options.target))
+        again = reaudit(Path(options.target))
+        summary = {**again.summary, "reaudit": again.to_json()}
+        for note in again.notes:
+            console.say(f"{options.target}: {note}")
     else:
         scenario = load(options.target, options)
         _announce(scenario, options)
@@ -51,7 +55,7 @@ def check(options: Namespace) -> int:
     if options.junit is not None:
         write_junit(summary, Path(options.junit))
     print_summary(summary, options)
-    return EXIT_DONE if summary["satisfied"] else EXIT_FAILED
+    return EXIT_DONE if summary["satisfied"] and (again is None or again.satisfied) else EXIT_FAILED
 
 
 def compare(options: Namespace) -> int:
@@ -67,7 +71,8 @@ def compare(options: Namespace) -> int:
     require_directory(target, KIND)
     for name in options.targets:  # what is wrong with any of them is said before the first is flown
         if Path(name).is_dir():
-            rundir.read_summary(Path(name))
+            for note in reaudit(Path(name), products=False).notes:
+                console.say(f"{name}: {note}")
         else:
             load_scenario(name)
     studied = find_study(options.targets, asked=options.cost)
@@ -91,14 +96,6 @@ def _announce(scenario: Scenario, options: Namespace) -> None:
     """Say what the course asks for, before it is flown; the summary says it again."""
     if not options.json:
         console.print_notice(report(scenario, build_vehicle(scenario)).sentence)
-
-
-def _read_intact_summary(directory: Path) -> dict[str, Any]:
-    summary = rundir.read_summary(directory)
-    damaged = rundir.damaged_files(directory, summary)
-    if damaged:
-        raise FileError(directory, f"{', '.join(damaged)} missing or not the files that the summary was made from")
-    return rundir.load_run(directory).summary
 
 
 def _fly_for_comparison(name: str, target: Path) -> Path:

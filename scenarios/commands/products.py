@@ -8,15 +8,18 @@ from pathlib import Path
 
 from quadsim import rundir
 from quadsim.errors import FileError, ParameterError
+from quadsim.inside import require_inside
 from quadsim.outputs import real_path
+from quadsim.printable import printable
 from scenarios import console
 from scenarios.cli import EXIT_DONE
+from scenarios.reaudit import reaudit
 
 
 def video(options: Namespace) -> int:
     """`quadsim video`."""
     directory = Path(options.run)
-    rundir.read_summary(directory)
+    reaudit(directory, products=False)
     path = real_path(directory / rundir.VIDEO_FILE if options.out is None else options.out)
     if options.workers is not None and options.workers < 1:
         raise ParameterError("", "--workers", options.workers, "at least 1")
@@ -29,7 +32,7 @@ def video(options: Namespace) -> int:
             add(film.read_bytes())
     else:
         _film(directory, path, options)
-    print(f"written to {path}")
+    print(f"written to {printable(str(path))}")
     return EXIT_DONE
 
 
@@ -56,6 +59,8 @@ def view(options: Namespace) -> int:
     recording = path / rundir.RECORDING_FILE if path.is_dir() else path
     if not path.exists():
         raise FileError(path, "no such run or recording")
+    if path.is_dir():
+        require_inside(path)
     if not recording.is_file():
         raise FileError(path, f"has no {rundir.RECORDING_FILE}; run the scenario again without --no-recording")
     if recording.suffix != ".rrd":

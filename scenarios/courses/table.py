@@ -75,7 +75,7 @@ def read_table(path: FilePath) -> Table:
     header = tuple(rows[0]) if rows else ()
     if header not in (POSE_HEADER, POSE_HEADER + VELOCITY_HEADER):
         wanted = f"{','.join(POSE_HEADER)} or {','.join(POSE_HEADER + VELOCITY_HEADER)}"
-        raise FileError(path, f"row 1: the header must be {wanted}; got {_short(','.join(header))}")
+        raise FileError(path, f"row 1: the header must be {wanted}; got {_told(header)}")
     if len(rows) < 3:
         raise FileError(path, f"must have 2 or more rows below its header; got {len(rows) - 1}")
     if len(rows) > MOST_ROWS + 1:
@@ -152,6 +152,12 @@ def _parse_row(path: FilePath, number: int, row: list[str], header: tuple[str, .
             raise FileError(path, f"{place}: must be a finite number within +-{LARGEST:g}; got {_short(cell)}")
         values.append(value)
     return values
+
+
+def _told(header: tuple[str, ...]) -> str:
+    """What a header is, without its words: who names a file in a scenario may not be the one whose file it is."""
+    known = [name for name in header if name in POSE_HEADER + VELOCITY_HEADER]
+    return f"{len(header)} columns, {','.join(known) if known else 'none'} of them" if header else "none"
 
 
 def _short(text: str) -> str:

@@ -399,9 +399,9 @@ def test_wrong_input_has_exit_status_two_and_no_traceback(
 ) -> None:
     out = tmp_path / "out"
     assert main(["run", written("class Hover\n"), "--no-video", "--out", str(out)]) == 2
-    printed = capsys.readouterr().err
-    assert printed.startswith("quadsim: controller.type: module 'own_")
-    assert printed.count("\n") == 1
+    told, said = capsys.readouterr().err.splitlines()
+    assert told.startswith("quadsim: runs code that is not quadsim's: controller own_")
+    assert said.startswith("quadsim: controller.type: module 'own_")
     assert not out.exists()
 
 

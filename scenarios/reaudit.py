@@ -1,0 +1,233 @@
+"""A finished run held against itself: its files as they were written, its verdict as its tables give it again.
+
+Nothing that `summary.json` says of the verdict is believed.  The limits come from the run's `scenario.toml`, the values
+from `flight.parquet` and `plant.parquet`.  The recorded audit saw every physics step, the tables have the plant at the
+log rate, so at the physics rate the recorded margin may be the smaller one, and never the larger.  At the control
+samples both saw the same numbers.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from quadsim import rundir
+from quadsim.audit import SIGNALS, Finding, audit
+from quadsim.controller import Phase
+from quadsim.errors import FileError, InputError
+from quadsim.flightlog import FLIGHT_FILE, HORIZON_FILE, PLANT_FILE, TIMING_FILE, FlightLog
+from quadsim.printable import printable
+from scenarios.bases import read_whole
+from scenarios.build import build_limits
+from scenarios.loading import parse_scenario
+from scenarios.spec import Scenario
+
+TABLES: Final = (FLIGHT_FILE, PLANT_FILE, TIMING_FILE)
+OURS: Final = {*TABLES, HORIZON_FILE, rundir.SCENARIO_FILE, rundir.RECORDING_FILE, rundir.VIDEO_FILE}
+"""Files that nobody but a run writes under these names."""
+ROUNDING: Final = 1e-9
+"""By how much numbers may differ that another machine's arithmetic made, of 1 or of the larger number."""
+ROUNDING_TILT: Final = 1e-6
+"""The same for the tilt: near level an arc cosine has half of a number's digits."""
+MOST_SAID: Final = 6
+"""Differences that one message names."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Reaudit:
+    """What a run's tables say of it.
+
+    Attributes:
+        summary: `summary.json`.
+        findings: the audit made again, at the control samples and at the log rate.
+        satisfied: the verdict on the flight that follows from the tables.
+        rate: rows per second of `plant.parquet` [Hz].
+        notes: what a person should know, and what is no error.
+    """
+
+    summary: dict[str, Any]
+    findings: tuple[Finding, ...]
+    satisfied: bool
+    rate: float
+    notes: tuple[str, ...]
+
+    def to_json(self) -> dict[str, Any]:
+        """The audit made again, for `quadsim check --json`."""
+        entries = [rundir.limit_to_json(finding) for finding in self.findings]
+        return {"rate": self.rate, "satisfied": self.satisfied, "constraints": entries, "notes": list(self.notes)}
+
+
+def reaudit(directory: Path, *, products: bool = True) -> Reaudit:
+    """Audit a finished run again from its tables, and hold its summary against that.
+
+    Args:
+        directory: of the run.
+        products: whether film, recording and figures have to be there too; they can be made again.
+
+    Raises:
+        FileError: a file is missing, changed or damaged, or the summary is not what the tables say; the message names
+            what differs.
+    """
+    summary = rundir.read_summary(directory)
+    differing = list(_changed(directory, summary, products=products))
+    try:
+        sealed = rundir.is_sealed(directory, summary)
+        if sealed is False:
+            differing.append(f"{rundir.SUMMARY_FILE} is not the one that was written, by its digest in {TIMING_FILE}")
+        scenario = stored_scenario(directory)
+        log = rundir.load_run(directory).log
+        findings = audit(log, build_limits(scenario))
+    except InputError as error:
+        raise _said(directory, differing or [f"it cannot be audited again: {error}"]) from error
+    differing += _differences(summary, scenario, log, findings)
+    if differing:
+        raise _said(directory, differing)
+    notes = [] if sealed else ["its summary has no digest, as those of older versions: changes of it may not show"]
+    if others := _unlisted(directory, summary):
+        shown = ", ".join(others[:MOST_SAID]) + (" ..." if len(others) > MOST_SAID else "")
+        notes.append(f"not of this run: {printable(shown)}")
+    return Reaudit(
+        summary=summary,
+        findings=findings,
+        satisfied=_is_satisfied(summary["reason"], scenario, log, findings),
+        rate=scenario.log_rate,
+        notes=tuple(notes),
+    )
+
+
+def stored_scenario(directory: Path) -> Scenario:
+    """The scenario of a run, as its directory has it; no other file is read for it.
+
+    Raises:
+        InputError: it is missing or malformed.
+    """
+    path = directory / rundir.SCENARIO_FILE
+    if not path.is_file():
+        raise FileError(path, "is missing or no file")
+    return parse_scenario(read_whole(path), source=str(path))
+
+
+def _changed(directory: Path, summary: Mapping[str, Any], *, products: bool) -> Iterator[str]:
+    """Files that are not as they were written."""
+    for name in rundir.damaged_files(directory, summary):
+        if (directory / name).is_file():
+            yield f"{name} is not the file that was written"
+        elif products or name in (*TABLES, HORIZON_FILE, rundir.SCENARIO_FILE):
+            yield f"{name} is missing"
+    for name in (*TABLES, rundir.SCENARIO_FILE):
+        if name not in summary["files"]:
+            yield f"{rundir.SUMMARY_FILE} has no hash of {name}"
+    for name in _unlisted(directory, summary):
+        if name in OURS and name not in (*TABLES, rundir.SCENARIO_FILE):
+            yield f"{name} is there, and {rundir.SUMMARY_FILE} does not list it"
+
+
+def _unlisted(directory: Path, summary: Mapping[str, Any]) -> list[str]:
+    """Files in a run's directory that its summary does not list, sorted."""
+    listed = {rundir.SUMMARY_FILE, *summary["files"]}
+    found = (path.relative_to(directory).as_posix() for path in directory.rglob("*") if not path.is_dir())
+    return sorted(name for name in found if name not in listed)
+
+
+def _differences(
+    summary: Mapping[str, Any], scenario: Scenario, log: FlightLog, findings: Sequence[Finding]
+) -> Iterator[str]:
+    """What a summary says otherwise than the run's scenario and tables do."""
+    whole = log.control.t.size == scenario.periods
+    stated = {
+        "scenario": scenario.name,
+        "seed": scenario.seed,
+        "expected": scenario.expect,
+        "duration": round(log.control.t.size * scenario.control_period, 9),
+    }
+    for key, value in stated.items():
+        if key in summary and summary[key] != value:
+            yield f"{key} is recorded as {summary[key]!r:.80}, and the run's files say {value!r:.80}"
+    if summary["status"] == "completed" and not whole:
+        yield f"status is recorded as 'completed', and {log.control.t.size} of {scenario.periods} periods were flown"
+    entries = summary["constraints"]
+    names, wanted = [entry["name"] for entry in entries], [finding.limit.name for finding in findings]
+    if names != wanted:
+        yield f"the constraints recorded are {', '.join(names) or 'none'}, and the scenario's {', '.join(wanted)}"
+        return
+    for entry, finding in zip(entries, findings, strict=True):
+        yield from (f"{finding.limit.name}: {what}" for what in _constraint_differences(entry, finding, scenario, log))
+    required = all(entry["satisfied"] for entry in entries if entry["required"])
+    satisfied = summary["reason"] is None and not _is_crashed(log) and required
+    if summary["satisfied"] != satisfied:
+        yield f"satisfied is recorded as {summary['satisfied']}, and its audit and outcome make it {satisfied}"
+    outcome = "lost" if summary["reason"] is not None else "satisfied" if satisfied else "violated"
+    if summary.get("as_expected") and outcome != scenario.expect:
+        yield f"as_expected is recorded as True, and the flight is {outcome} where {scenario.expect} is expected"
+
+
+def _constraint_differences(
+    entry: Mapping[str, Any], finding: Finding, scenario: Scenario, log: FlightLog
+) -> Iterator[str]:
+    """What a summary says of one constraint otherwise than the tables do."""
+    again = rundir.limit_to_json(finding)
+    for key in ("signal", "unit", "lower", "upper", "tolerance", "tolerance_sampled", "required", "start", "stop"):
+        if entry[key] != again[key]:
+            yield f"{key} is recorded as {entry[key]!r:.80}, and is {again[key]!r:.80} in the scenario"
+    rounding = ROUNDING_TILT if finding.limit.signal == "tilt" else ROUNDING
+    alike = ["peak_sampled", "worst_margin_sampled"]
+    if SIGNALS[finding.limit.signal].plant is None or scenario.plant_stride == 1 or not log.control.t.size:
+        alike += ["peak_plant", "worst_margin", "worst_time"]
+    for key in alike:
+        if not _is_close(entry[key], again[key], rounding):
+            yield f"{key} is recorded as {entry[key]}, and the tables give {again[key]}"
+    recorded, there = entry["worst_margin"], again["worst_margin"]
+    milder = there is not None and (recorded is None or recorded > there + rounding * max(1.0, abs(there)))
+    if "worst_margin" not in alike and milder:
+        yield f"worst_margin is recorded as {recorded}, and the tables go down to {there:.6g}"
+    if recorded is not None and not _is_close(_margin(finding, entry["peak_plant"]), recorded, rounding):
+        yield f"worst_margin is recorded as {recorded}, and peak_plant as {entry['peak_plant']}"
+    beyond = recorded is not None and recorded < -entry["tolerance"]
+    least, most = _time_beyond(finding, scenario, log)
+    if (entry["time_violated"] > 0.0 and not beyond) or not least <= entry["time_violated"] <= most:
+        yield f"time_violated is recorded as {entry['time_violated']}, and the tables give {again['time_violated']:.6g}"
+
+
+def _time_beyond(finding: Finding, scenario: Scenario, log: FlightLog) -> tuple[float, float]:
+    """The least and the most time beyond a bound and its tolerance that the tables leave possible [s].
+
+    Rows at the log rate stand for one physics step each at least, and the last of them may come before the end.
+    """
+    signal, limit, seen = SIGNALS[finding.limit.signal], finding.limit, finding.time_violated
+    row = 1.0 / scenario.log_rate if scenario.plant_stride > 1 else 0.0
+    if signal.plant is None or not log.control.t.size or scenario.plant_stride == 1:
+        return seen - ROUNDING, seen + row + ROUNDING
+    t = log.plant.t[:-1]  # the last row ends the flight, and lasts no time
+    inside = (t >= limit.start) & (t <= limit.stop)
+    beyond = limit.margin(signal.plant(log.plant))[:-1] < -limit.tolerance - ROUNDING_TILT
+    return max(0.0, (np.count_nonzero(inside & beyond) - 1) * scenario.plant.timestep), math.inf
+
+
+def _margin(finding: Finding, peak: float | None) -> float | None:
+    return None if peak is None else float(finding.limit.margin(np.array([peak]))[0])
+
+
+def _is_satisfied(reason: str | None, scenario: Scenario, log: FlightLog, findings: Sequence[Finding]) -> bool:
+    whole = reason is None and log.control.t.size == scenario.periods and not _is_crashed(log)
+    return whole and all(finding.satisfied for finding in findings if finding.limit.required)
+
+
+def _is_crashed(log: FlightLog) -> bool:
+    return str(Phase.CRASHED) in log.control.phase
+
+
+def _is_close(recorded: float | None, again: float | None, rounding: float) -> bool:
+    if recorded is None or again is None:
+        return recorded is again
+    return math.isclose(recorded, again, rel_tol=rounding, abs_tol=rounding)
+
+
+def _said(directory: Path, differing: Sequence[str]) -> FileError:
+    shown = "; ".join(differing[:MOST_SAID])
+    more = f"; and {len(differing) - MOST_SAID} more" if len(differing) > MOST_SAID else ""
+    return FileError(directory, f"is not as it was written: {printable(shown)}{more}")

@@ -1,0 +1,268 @@
+"""`quadsim check RUN`: audited again from the tables, and every lie about them is said."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+from quadsim import rundir
+from quadsim.errors import FileError
+from quadsim.flightlog import FLIGHT_FILE, PLANT_FILE, TIMING_FILE
+from scenarios.cli import EXIT_DONE, EXIT_FAILED, EXIT_WRONG_INPUT, main
+from scenarios.reaudit import reaudit
+from tests.safety_mutations import unseal
+
+TABLES = ("--no-video", "--no-recording", "--no-figures")
+SHORT = ("--set", "duration=0.5")
+Change = Callable[[dict[str, Any]], None]
+
+
+@pytest.fixture(scope="module")
+def flown(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A directory with a run that holds its constraints and one that does not."""
+    here = tmp_path_factory.mktemp("runs")
+    assert main(["run", "hover", *SHORT, *TABLES, "--json", "--out", str(here / "good")]) == EXIT_DONE
+    broken = ("--set", "constraints.speed.upper=150.0")
+    assert main(["run", "hover", *SHORT, *TABLES, *broken, "--json", "--out", str(here / "bad")]) == EXIT_FAILED
+    return here
+
+
+@pytest.fixture(params=["sealed", "older"])
+def runs(flown: Path, tmp_path: Path, request: pytest.FixtureRequest) -> Path:
+    """Copies of the two, to tamper with: as they are, and as an older version left them, without a digest."""
+    shutil.copytree(flown, tmp_path / "runs")
+    if request.param == "older":
+        unseal(tmp_path / "runs" / "good")
+        unseal(tmp_path / "runs" / "bad")
+    return tmp_path / "runs"
+
+
+def rewrite(run: Path, change: Change) -> None:
+    """Change a run's summary as an editor would."""
+    path = run / rundir.SUMMARY_FILE
+    summary = json.loads(path.read_text())
+    change(summary)
+    path.write_text(json.dumps(summary, indent=2))
+
+
+def rehash(run: Path, name: str) -> None:
+    """Put the hash of a changed file into the summary, as one who tampers with two files would."""
+    digest = "sha256:" + hashlib.sha256((run / name).read_bytes()).hexdigest()
+    rewrite(run, lambda summary: summary["files"].update({name: digest}))
+
+
+def test_a_run_as_it_was_written_is_checked_and_its_verdict_made_again(
+    flown: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for name, status in (("good", EXIT_DONE), ("bad", EXIT_FAILED)):
+        assert main(["check", str(flown / name)]) == status
+        said = capsys.readouterr()
+        assert "audited again from the tables, 200 rows per second: as recorded" in said.out
+        assert said.err == ""
+        assert main(["check", str(flown / name), "--json"]) == status
+        again = json.loads(capsys.readouterr().out)["reaudit"]
+        assert again["satisfied"] is (status == EXIT_DONE)
+
+
+def test_one_sed_does_not_make_a_violated_run_hold(runs: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = runs / "bad" / rundir.SUMMARY_FILE
+    path.write_text(path.read_text().replace('"satisfied": false', '"satisfied": true'))
+    assert main(["check", str(runs / "bad")]) == EXIT_WRONG_INPUT
+    said = capsys.readouterr()
+    assert said.out == ""
+    assert "summary.json: contradicts itself: speed: satisfied is true, and its worst margins say otherwise" in said.err
+
+
+def all_well(summary: dict[str, Any]) -> None:
+    """What a careful liar writes."""
+    summary["satisfied"] = summary["as_expected"] = True
+    for entry in summary["constraints"]:
+        if not entry["satisfied"]:
+            entry |= {"satisfied": True, "time_violated": 0.0, "worst_margin": 5.0, "worst_margin_sampled": 5.0}
+            entry["peak_plant"] = entry["peak_sampled"] = entry["upper"] - 5.0
+
+
+def loosened(summary: dict[str, Any]) -> None:
+    all_well(summary)
+    for entry in summary["constraints"]:
+        entry["required"] = False
+
+
+def none(summary: dict[str, Any]) -> None:
+    summary |= {"constraints": [], "satisfied": True, "as_expected": True}
+
+
+LIES: dict[str, tuple[Change, str]] = {
+    "all well": (all_well, "speed: worst_margin_sampled is recorded as 5.0, and the tables give -42.8"),
+    "not required": (loosened, "required is recorded as False, and is True in the scenario"),
+    "no constraints": (none, "the constraints recorded are none, and the scenario's roll, pitch"),
+    "satisfied alone": (lambda summary: summary.update(satisfied=True), "satisfied is recorded as True"),
+    "longer": (lambda summary: summary.update(duration=60.0), "duration is recorded as 60.0, and the run's files say"),
+    "another": (lambda summary: summary.update(scenario="paper"), "scenario is recorded as 'paper'"),
+    "expected": (lambda summary: summary.update(expected="violated"), "expected is recorded as 'violated'"),
+}
+
+
+@pytest.mark.parametrize(("change", "message"), LIES.values(), ids=LIES)
+def test_a_verdict_that_the_tables_do_not_give_is_said(
+    runs: Path, change: Change, message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    rewrite(runs / "bad", change)
+    for command in (["check"], ["compare", "--out", str(runs / "page")], ["video"]):
+        assert main([*command[:1], str(runs / "bad"), *command[1:]]) == EXIT_WRONG_INPUT
+        said = capsys.readouterr()
+        assert message in said.err
+        assert said.err.count("\n") == 1
+    assert not (runs / "page").exists()
+
+
+def test_every_number_of_the_summary_is_sealed(flown: Path, tmp_path: Path) -> None:
+    """Also those that no table has: clock times, versions, what the course asks for."""
+    run = shutil.copytree(flown / "good", tmp_path / "run")
+    summary = json.loads((run / rundir.SUMMARY_FILE).read_text())
+    for path in (("wall_s", "total"), ("versions", "numpy"), ("course", "sentence"), ("tracking", "rmse", "x")):
+        changed = json.loads(json.dumps(summary))
+        inside = changed
+        for key in path[:-1]:
+            inside = inside[key]
+        inside[path[-1]] = "other" if isinstance(inside[path[-1]], str) else inside[path[-1]] + 1.0
+        (run / rundir.SUMMARY_FILE).write_text(json.dumps(changed))
+        with pytest.raises(FileError, match=r"summary\.json is not the one that was written, by its digest in timing"):
+            reaudit(run)
+
+
+@pytest.mark.parametrize("name", [FLIGHT_FILE, PLANT_FILE, TIMING_FILE, rundir.SCENARIO_FILE, "horizon.parquet"])
+def test_a_file_changed_with_its_hash_shows_in_another(
+    flown: Path, tmp_path: Path, name: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Two files tampered with: the third has the digest of both."""
+    run = shutil.copytree(flown / "good", tmp_path / "run")
+    path = run / name
+    if name == rundir.SCENARIO_FILE:
+        path.write_text(path.read_text() + "# changed\n")
+    elif name == TIMING_FILE:
+        table = pq.read_table(path)
+        pq.write_table(table.set_column(1, "solve_ms", pa.array([0.0] * table.num_rows)), path)
+    else:
+        pq.write_table(pq.read_table(path), path, compression="none")
+    assert main(["check", str(run)]) == EXIT_WRONG_INPUT
+    assert f"{name} is not the file that was written" in capsys.readouterr().err
+    if name != TIMING_FILE:  # which has the digest itself
+        rehash(run, name)
+        assert main(["check", str(run)]) == EXIT_WRONG_INPUT
+        assert "summary.json is not the one that was written" in capsys.readouterr().err
+
+
+def test_a_plant_that_goes_further_than_the_recorded_margin_shows(runs: Path) -> None:
+    """The tables are at 200 Hz and the audit at 1 kHz: the recorded margin may be the smaller one, never the larger."""
+    run = runs / "good"
+    path = run / PLANT_FILE
+    table = pq.read_table(path)
+    i, roll = table.column_names.index("roll"), table["roll"].to_numpy().copy()
+    roll[50] = 0.05  # 2.9 deg, within the bounds
+    pq.write_table(table.set_column(i, table.schema.field("roll"), pa.array(roll)), path)
+    rehash(run, PLANT_FILE)
+    with pytest.raises(FileError, match=r"roll: worst_margin is recorded as 5\.0, and the tables go down to 2\.13"):
+        reaudit(run)
+
+
+def test_a_margin_between_the_rows_is_believed(flown: Path, tmp_path: Path) -> None:
+    """A worse one than the tables show is no lie: there are four physics steps between two rows."""
+    run = shutil.copytree(flown / "good", tmp_path / "run")
+    unseal(run)
+
+    def worse(summary: dict[str, Any]) -> None:
+        entry = next(entry for entry in summary["constraints"] if entry["name"] == "roll")
+        entry |= {"worst_margin": 4.0, "peak_plant": 1.0}
+
+    rewrite(run, worse)
+    assert reaudit(run).satisfied
+
+
+def test_a_run_whose_scenario_names_another_file_reads_none(flown: Path, tmp_path: Path) -> None:
+    run = shutil.copytree(flown / "good", tmp_path / "run")
+    unseal(run)
+    path = run / rundir.SCENARIO_FILE
+    path.write_text('base = "../other.toml"\n' + path.read_text())
+    rehash(run, rundir.SCENARIO_FILE)
+    with pytest.raises(FileError, match=r"scenario\.toml: has a base, and a run's scenario is whole"):
+        reaudit(run)
+
+
+def test_an_older_run_is_audited_and_that_it_has_no_digest_is_said(
+    flown: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = shutil.copytree(flown / "good", tmp_path / "run")
+    unseal(run)
+    assert main(["check", str(run)]) == EXIT_DONE
+    said = capsys.readouterr().err
+    assert (
+        said == f"quadsim: {run}: its summary has no digest, as those of older versions: changes of it may not show\n"
+    )
+
+
+def test_files_of_others_are_said_and_files_of_ours_that_are_not_listed_are_an_error(
+    flown: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = shutil.copytree(flown / "good", tmp_path / "run")
+    (run / "notes.txt").write_text("mine")
+    assert main(["check", str(run)]) == EXIT_DONE
+    assert capsys.readouterr().err == f"quadsim: {run}: not of this run: notes.txt\n"
+    (run / "flight.mp4").write_bytes(b"another film")
+    assert main(["check", str(run)]) == EXIT_WRONG_INPUT
+    assert "flight.mp4 is there, and summary.json does not list it" in capsys.readouterr().err
+
+
+def test_a_film_does_not_hide_what_was_tampered_with(
+    flown: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = shutil.copytree(flown / "good", tmp_path / "run")
+    monkeypatch.setattr("quadsim.video.render_video", lambda _, path, **__: path.write_bytes(b"film"))
+    assert main(["video", str(run)]) == EXIT_DONE
+    assert main(["check", str(run)]) == EXIT_DONE  # the new film is listed, the digest still stands
+    (run / "horizon.parquet").write_bytes(b"another")
+    assert main(["video", str(run)]) == EXIT_WRONG_INPUT
+    assert main(["check", str(run)]) == EXIT_WRONG_INPUT
+    assert capsys.readouterr().err.count("horizon.parquet is not the file that was written") == 2
+
+
+def test_a_run_without_its_film_is_compared_and_not_checked(flown: Path, tmp_path: Path) -> None:
+    run = shutil.copytree(flown / "good", tmp_path / "run")
+    rewrite(run, lambda summary: summary["files"].update({"flight.mp4": "sha256:0"}))
+    assert reaudit(run, products=False).satisfied
+    with pytest.raises(FileError, match=r"flight\.mp4 is missing"):
+        reaudit(run)
+
+
+def test_the_tables_that_a_seed_determines_hold_no_digest(flown: Path) -> None:
+    """Their bytes are the same for every flight of a scenario; clock times, which are not, are in `timing.parquet`."""
+    for name, sealed in ((FLIGHT_FILE, False), (PLANT_FILE, False), (TIMING_FILE, True)):
+        metadata = pq.read_schema(flown / "good" / name).metadata
+        assert (rundir.SEAL.encode() in metadata) is sealed
+
+
+@pytest.mark.parametrize("rate", [1000.0, 200.0, 50.0, 1.0])
+@pytest.mark.parametrize("name", ["nan-position", "hard-landing", "lost-rotor", "crazyflie-real-rotors", "gps-outage"])
+def test_what_a_run_records_is_what_its_tables_give(name: str, rate: float, tmp_path: Path) -> None:
+    """Flights that break off, crash, are told no number: at any log rate the tables never contradict the record."""
+    settings = ("--set", "duration=6.0", "--set", f"log_rate={rate}")
+    if name in ("gps-outage", "nan-position", "lost-rotor", "hard-landing"):
+        settings = settings[2:]  # whose events come later
+    out = str(tmp_path / "run")
+    status = main(["run", name, *settings, *TABLES, "--json", "--out", out])
+    assert main(["check", out]) == status
+    again = reaudit(Path(out))
+    for finding, entry in zip(again.findings, again.summary["constraints"], strict=True):
+        recorded = entry["worst_margin"]
+        assert recorded is None or math.isnan(finding.worst_margin) or recorded <= finding.worst_margin + 1e-6
+        if rate == 1000.0 and recorded is not None:
+            assert recorded == finding.worst_margin
