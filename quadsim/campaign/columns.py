@@ -8,13 +8,12 @@ import numpy as np
 import pyarrow as pa
 
 from quadsim.campaign.events import Flags
-from quadsim.campaign.table import DRAW, ERROR, MARGIN, SATISFIED, TIME_VIOLATED
+from quadsim.campaign.table import DRAW, MARGIN, SATISFIED, TIME_VIOLATED
+from quadsim.campaign.verdicts import VERDICTS
 from quadsim.state import Array
 
 Texts = np.ndarray[Any, np.dtype[np.object_]]
 
-VERDICTS: Final = ("satisfied", "violated", "lost", ERROR)
-"""What a flight's verdict may be, from the best on."""
 _NO_METRIC: Final = ("flight", "seed", DRAW, MARGIN, TIME_VIOLATED, SATISFIED)
 
 

@@ -9,7 +9,7 @@ from quadsim.campaign.comparison import Comparison
 from quadsim.campaign.comparison_tables import comparison_markdown, comparison_tables, pairing
 from quadsim.page import PAGE_FILE, is_page, render_page
 from quadsim.plots import plotly_script
-from quadsim.plots.campaign import comparison_margins_plot
+from quadsim.plots.margins import comparison_margins_plot
 from quadsim.rundir import write_json, writing
 
 COMPARISON_FILE: Final = "comparison.json"
