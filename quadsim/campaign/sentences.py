@@ -35,8 +35,8 @@ def campaign_sentences(summary: Summary) -> list[str]:
         *_outcomes(summary),
         *_bounds(summary),
         *_constraints(summary),
-        *_drivers(summary),
-        *_splits(summary),
+        *driver_sentences(summary),
+        *split_sentences(summary),
         *_worst(summary),
     ]
 
@@ -94,7 +94,7 @@ def _constraints(summary: Summary) -> Iterator[str]:
     yield f"What most often does not hold is {names[0]}, in {share} of all flights{margin}."
 
 
-def _drivers(summary: Summary) -> Iterator[str]:
+def driver_sentences(summary: Summary) -> Iterator[str]:
     """What goes with the outcome in one direction, and what in another way."""
     for outcome, noun in _OUTCOMES.items():
         told = {name: found.get(outcome) for name, found in summary["parameters"].items()}
@@ -128,7 +128,7 @@ def _turn(summary: Summary, name: str, outcome: str) -> str:
     return "" if turn is None else f", {turn['kind']} near {turn['at']:.3g}"
 
 
-def _splits(summary: Summary) -> Iterator[str]:
+def split_sentences(summary: Summary) -> Iterator[str]:
     """Where the flights with an event are, by the surest threshold."""
     told: set[str] = set()
     for event, name, unit, split in sure_splits(summary):
