@@ -115,7 +115,8 @@ def driver_sentences(summary: Summary) -> Iterator[str]:
                 f"{noun} {'also ' if strongest else ''}depends on {listed}, without rising or falling throughout: "
                 "Chatterjee's xi, p-value after Holm's correction."
             )
-        if tested and not strongest and not surest:
+        told_by_threshold = outcome == "failed" and any(event == "failure" for event, *_ in sure_splits(summary))
+        if tested and not (strongest or surest or told_by_threshold):
             yield (
                 f"{noun} goes with no drawn number beyond chance (rank correlation, and Chatterjee's xi for any "
                 "dependence; 5 % after Holm's correction for all tests)."

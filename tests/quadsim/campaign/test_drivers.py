@@ -120,6 +120,18 @@ def test_failures_below_a_threshold_are_said_so() -> None:
     assert f"and 0 of {300 - failed} above it (0 %;" in said
 
 
+def test_a_threshold_alone_is_no_nothing() -> None:
+    """Failures crowd at the end of a range, where neither measure sees them: not a find and none in one list."""
+    x = np.arange(300.0)
+    failed = np.isin(x, [*range(0, 140, 14), *range(280, 300, 2)])
+    summary = estimate(flown({"mass": x}, np.where(failed, -0.1, 1.0)))
+    found = summary["parameters"]["mass"]["failed"]
+    assert min(found["p_holm"], found["p_xi_holm"]) > 0.05
+    said = campaign_sentences(summary)
+    assert sum(one.startswith("Failures cluster above mass = 279") for one in said) == 1
+    assert not any(one.startswith("Failure goes with no drawn number") for one in said)
+
+
 def test_nothing_is_said_of_nothing(make_campaign: MakeCampaign) -> None:
     said = campaign_sentences(estimate(make_campaign(40, severity=0.0)))
     told = "The worst margin goes with no drawn number beyond chance (rank correlation, and Chatterjee's xi"
