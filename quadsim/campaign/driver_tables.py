@@ -52,7 +52,7 @@ def split_table(summary: Summary) -> Grid:
     lines = tuple(
         _line(
             event,
-            f"{name} > {format_number(split['threshold'])}{'' if unit == '-' else f' {unit}'}",
+            f"{name} > {split['threshold']:.15g}{'' if unit == '-' else f' {unit}'}",
             *_side(split["low"]),
             *_side(split["high"]),
             f"{format_number(split['below'])} and {format_number(split['above'])}",

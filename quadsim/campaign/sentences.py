@@ -14,9 +14,9 @@ from quadsim.table import format_number
 
 _OUTCOMES = {"worst_margin": "The worst margin", "failed": "Failure"}
 _HAPPENED: Final = {
-    "failure": ("failures", "failed"),
-    "violation": ("violations", "violated a required constraint"),
-    "lost": ("losses", "were lost"),
+    "failure": ("failures", "failed", "failed"),
+    "violation": ("violations", "violated a required constraint", "violated one"),
+    "lost": ("losses", "were lost", "was lost"),
 }
 _MOST_NAMED: Final = 4
 _MOST_DRIVERS: Final = 3
@@ -139,9 +139,11 @@ def split_sentences(summary: Summary) -> Iterator[str]:
         worse, better, side = split["high"], split["low"], "above"
         if worse["share"] < better["share"]:
             worse, better, side = better, worse, "up to"
-        at = f"{name} = {format_number(split['threshold'])}{'' if unit == '-' else f' {unit}'}"
-        noun, verb = _HAPPENED[event]
-        head = f"All {worse['count']} {noun} are" if not better["count"] else f"{noun.capitalize()} cluster"
+        at = f"{name} = {split['threshold']:.15g}{'' if unit == '-' else f' {unit}'}"
+        noun, verb, one = _HAPPENED[event]
+        head = f"{noun.capitalize()} cluster"
+        if not better["count"]:
+            head = f"All {worse['count']} {noun} are" if worse["count"] > 1 else f"The one flight that {one} is"
         yield (
             f"{head} {side} {at}: {_part(worse)} flights {verb} there ({_ends(worse, summary)}), and {_part(better)} "
             f"{'up to it' if side == 'above' else 'above it'} ({_ends(better, summary)}); {p_value(split['p_holm'])}, "

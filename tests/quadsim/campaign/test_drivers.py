@@ -120,6 +120,15 @@ def test_failures_below_a_threshold_are_said_so() -> None:
     assert f"and 0 of {300 - failed} above it (0 %;" in said
 
 
+def test_one_flight_is_told_as_one() -> None:
+    x = np.arange(9000.0)
+    summary = estimate(flown({"mass": x}, np.ones(9000), lost=x == 8999))
+    assert any(
+        one.startswith("The one flight that failed is above mass = 8998: 1 of 1 flights failed there")
+        for one in campaign_sentences(summary)
+    )
+
+
 def test_a_threshold_alone_is_no_nothing() -> None:
     """Failures crowd at the end of a range, where neither measure sees them: not a find and none in one list."""
     x = np.arange(300.0)
