@@ -99,12 +99,20 @@ def part(result: Result) -> str:
 def first_to_break(result: Result) -> str:
     """What the paper's controller bears least, from a campaign of small errors."""
     summary = result.summary
-    names = dict.fromkeys(name for _, name, *_ in sure_splits(summary))
-    told = f"{next(iter(names))}. " if names else "nothing that is drawn, beyond chance. "
+    told = [(name, unit, event, split["threshold"]) for event, name, unit, split in sure_splits(summary)]
+    found = "It is nothing that is drawn, beyond chance"
+    if told:
+        first, unit = told[0][:2]
+        steps = sorted((threshold, event) for name, _, event, threshold in told if name == first)
+        listed = ", ".join(
+            f"{event} at {threshold:.15g}{'' if unit == '-' else f' {unit}'}" for threshold, event in steps
+        )
+        found = f"It is {first}. Thresholds along it: {listed}"
     said = [*driver_sentences(summary), *split_sentences(summary)]
     return (
-        f"## What breaks the paper's controller first\n\nWith small errors alone ({NOMINAL}), it is {told}"
-        f"{verdict_sentence(summary)}. {' '.join(said)}\n"
+        "## What breaks the paper's controller first\n\n"
+        f"With small errors alone ({NOMINAL}), {verdict_sentence(summary)}. {found}.\n\n"
+        + "".join(f"- {sentence}\n" for sentence in said)
     )
 
 
