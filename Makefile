@@ -83,7 +83,7 @@ robustness: setup  ## remake docs/robustness.md: the ladder of mismatches and 50
 soak: setup  ## one simulated hour on end: memory and step time have to stay as they were
 	@$(PY) tests/soak.py --minutes 60
 
-campaigns: setup  ## fly the campaigns that ship and remake docs/paper-robustness.md, some fifty minutes; goes on with what is there
+campaigns: setup  ## fly the campaigns that ship and remake docs/paper-robustness.md, an hour and a quarter; goes on with what is there
 	@$(PY) docs/make_campaigns.py
 
 kills: setup  ## kill a campaign's processes a hundred times: nothing may be lost, or there twice

@@ -14,21 +14,19 @@ import numpy as np
 import pyarrow as pa
 
 from quadsim.campaign.columns import constraint_names, draw_names, numbers, texts
-from quadsim.campaign.curves import ALPHA
+from quadsim.campaign.event_comparison import EventComparison, compare_events, events_of, other_differences
 from quadsim.campaign.events import Flags, parse_event
 from quadsim.campaign.paired_margins import ShownMargins, paired_margins
 from quadsim.campaign.statistics import (
+    ALPHA,
     CONFIDENCE,
     PairedDifference,
-    mcnemar,
     paired_difference,
-    paired_shares,
 )
 from quadsim.campaign.table import DRAW, unit_of
 from quadsim.campaign.wording import p_value, signed_interval, signed_points
 from quadsim.errors import InputError
 
-EVENTS: Final = ("failure", "violation")
 COMPARED: Final = (
     *(f"rmse.{name}" for name in ("x", "y", "z", "yaw")),
     *(f"max_error.{name}" for name in ("x", "y", "z")),
@@ -38,43 +36,6 @@ COMPARED: Final = (
     "fallback_periods",
 )
 """Metrics that are compared, where both campaigns have them."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class EventComparison:
-    """How often an event happened to one, to the other, and to both.
-
-    Attributes:
-        event: its name.
-        both: pairs in which it happened to both flights.
-        only_a: to the first campaign's alone.
-        only_b: to the second campaign's alone.
-        neither: to none of them.
-        p: two-sided p-value of McNemar's exact test.
-        difference: share of b - share of a.
-        lower: lower end of Tango's interval of that.
-        upper: its upper end.
-    """
-
-    event: str
-    both: int
-    only_a: int
-    only_b: int
-    neither: int
-    p: float
-    difference: float
-    lower: float
-    upper: float
-
-    @property
-    def counts(self) -> tuple[int, int]:
-        """Flights of the first and of the second campaign in which it happened."""
-        return self.both + self.only_a, self.both + self.only_b
-
-    @property
-    def pairs(self) -> int:
-        """All pairs."""
-        return self.both + self.only_a + self.only_b + self.neither
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -107,7 +68,7 @@ class Comparison:
         completed: pairs in which both flights were completed.
         shared_draws: parameters that both drew, alike in every pair.
         own_draws: parameters that only one of them drew.
-        events: failure and violation.
+        events: failure, then every other event that has a name, then for each constraint that it was not held.
         metrics: the main metrics.
         shown_margins: what is drawn of them; None where fewer than two pairs have margins.
     """
@@ -145,8 +106,9 @@ class Comparison:
             f"{told}: of {self.flights} paired flights, {count_b} failed with {b} and {count_a} with {a} "
             f"({failure.only_b} with {b} alone, {failure.only_a} with {a} alone; McNemar's exact test, "
             f"{p_value(failure.p)}). The difference is {signed_points(failure.difference)} percentage points "
-            f"({100.0 * CONFIDENCE:g} %: {signed_interval(failure.lower, failure.upper)})."
-        )
+            f"({100.0 * CONFIDENCE:g} %: {signed_interval(failure.lower, failure.upper)}). "
+            f"{other_differences(self.events, self.names)}"
+        ).rstrip()
 
     def to_json(self) -> dict[str, Any]:
         """Plain data for a file; differences are of the second campaign less the first."""
@@ -202,7 +164,7 @@ def compare(
     for column in ("seed", *(DRAW + name for name in shared_draws)):
         _require_alike(a, b, column, names)
     completed = (texts(a, "status") == "completed") & (texts(b, "status") == "completed")
-    events = {event: tuple(parse_event(event).column(table) for table in (a, b)) for event in EVENTS}
+    events = events_of(a, b)
     return Comparison(
         names=names,
         flights=shared.size,
@@ -210,7 +172,7 @@ def compare(
         completed=int(completed.sum()),
         shared_draws=shared_draws,
         own_draws=tuple(sorted(set(draws_a) ^ set(draws_b))),
-        events=tuple(_compare_event(event, *happened) for event, happened in events.items()),
+        events=compare_events(events),
         metrics=tuple(
             _compare_metric(a, b, name, completed)
             for name in COMPARED
@@ -249,22 +211,6 @@ def _require_alike(a: pa.Table, b: pa.Table, column: str, names: Sequence[str]) 
                 "campaigns of one seed and the same draws can be compared in pairs; fly one of them again with the "
                 "other's seed, sampling and [[vary]]"
             )
-
-
-def _compare_event(event: str, a: Flags, b: Flags) -> EventComparison:
-    both, only_a, only_b = int((a & b).sum()), int((a & ~b).sum()), int((b & ~a).sum())
-    lower, upper = paired_shares(only_a, only_b, a.size)
-    return EventComparison(
-        event=event,
-        both=both,
-        only_a=only_a,
-        only_b=only_b,
-        neither=a.size - both - only_a - only_b,
-        p=mcnemar(only_a, only_b),
-        difference=(only_b - only_a) / a.size,
-        lower=lower,
-        upper=upper,
-    )
 
 
 def _compare_metric(a: pa.Table, b: pa.Table, name: str, completed: Flags) -> MetricComparison:

@@ -10,7 +10,7 @@ from quadsim.campaign.comparison_tables import comparison_markdown, comparison_t
 from quadsim.outputs import write_json, write_text, writing
 from quadsim.page import PAGE_FILE, render_page
 from quadsim.plots import plotly_script
-from quadsim.plots.campaign import comparison_margins_plot
+from quadsim.plots.margins import comparison_margins_plot
 
 COMPARISON_FILE: Final = "comparison.json"
 TABLE_FILE: Final = "comparison.md"

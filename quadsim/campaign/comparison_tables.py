@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from quadsim.campaign.comparison import Comparison, EventComparison, MetricComparison
-from quadsim.campaign.curves import label
-from quadsim.campaign.statistics import CONFIDENCE
-from quadsim.campaign.wording import p_value, percent, signed_interval, signed_points
+from quadsim.campaign.comparison import Comparison, MetricComparison
+from quadsim.campaign.event_comparison import EventComparison
+from quadsim.campaign.statistics import ALPHA, CONFIDENCE
+from quadsim.campaign.wording import label, p_value, percent, signed_interval, signed_points
 from quadsim.table import ABSENT, Cell, Grid, Mark, format_number, grid_to_markdown
 
 _SURE = f"{100.0 * CONFIDENCE:g} %"
@@ -41,26 +41,40 @@ def _events(comparison: Comparison) -> Grid:
     a, b = comparison.names
     return Grid(
         key="events",
-        title="Failure and violation",
-        head=("event", a, b, f"{a} alone", f"{b} alone", "both", "p", "difference [points]", f"{_SURE} interval"),
+        title="Events",
+        head=(
+            "event",
+            a,
+            b,
+            f"{a} alone",
+            f"{b} alone",
+            "both",
+            "p",
+            "after Holm",
+            "difference [points]",
+            f"{_SURE} interval",
+        ),
         lines=tuple(_event(event) for event in comparison.events),
-        note="p: McNemar's exact test, two-sided, on the pairs in which one alone had the event. Difference: share of "
+        note="p: McNemar's exact test, two-sided, on the pairs in which one alone had the event, each event by itself; "
+        "the verdict is by that of failure. After Holm: corrected for all events of this table that one flight of a "
+        f"pair alone had; bold: beyond chance at {100.0 * ALPHA:g} %. Difference: share of "
         f"{b} less that of {a}, in percentage points, with Tango's score interval (1998) for pairs.",
     )
 
 
 def _event(event: EventComparison) -> tuple[Cell, ...]:
     counts = [f"{count} ({percent(count / event.pairs)})" for count in event.counts]
-    return _line(
+    counted = _line(
         event.event,
         *counts,
         str(event.only_a),
         str(event.only_b),
         str(event.both),
         p_value(event.p),
-        signed_points(event.difference),
-        signed_interval(event.lower, event.upper),
     )
+    mark = Mark.BEST if event.p_holm < ALPHA else Mark.NONE
+    corrected = Cell(text=p_value(event.p_holm), mark=mark)
+    return (*counted, corrected, *_line(signed_points(event.difference), signed_interval(event.lower, event.upper)))
 
 
 def _metrics(comparison: Comparison) -> Grid:

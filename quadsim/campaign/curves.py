@@ -2,21 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
 import pyarrow as pa
 
-from quadsim.campaign.columns import draw_names, is_number, numbers, texts, verdicts
+from quadsim.campaign.columns import numbers, verdicts
 from quadsim.campaign.estimates import Summary
-from quadsim.campaign.table import DRAW, unit_of
+from quadsim.campaign.scatters import lowest_shown, robust_ends
+from quadsim.campaign.statistics import ALPHA
+from quadsim.campaign.table import unit_of
 from quadsim.campaign.verdicts import VERDICTS
-from quadsim.campaign.wording import count_of
+from quadsim.campaign.wording import label
 from quadsim.state import Array
-
-Rows = np.ndarray[Any, np.dtype[np.intp]]
 
 MAIN_METRICS: Final = (
     "worst_margin",
@@ -26,51 +26,7 @@ MAIN_METRICS: Final = (
     "fallback_periods",
 )
 """What a reader of a campaign asks for first."""
-LOWEST_MARGIN: Final = -2.0
-"""Margins below this are drawn at it, so that a lost flight does not flatten all others."""
-ALPHA: Final = 0.05
-"""Level of the tests."""
-_MOST_POINTS: Final = 18_000
-"""Points that all scatters of a page may have together: a page of 10 000 flights stays near 6 MB and quick to draw."""
 _BINS: Final = 40
-_FENCE: Final = 5.0
-"""Quartile ranges beyond the quartiles up to which a histogram shows values where they are."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Margins:
-    """The worst margins as they are drawn.
-
-    Attributes:
-        y: (K,) heights; `foot` where a flight has no margin, or one below `lowest`.
-        true: (K,) the margins, NaN where there is none.
-        lowest: margins below this are drawn at the foot.
-        foot: height of what is too low, or is not there.
-        at_foot: how many flights are drawn there.
-    """
-
-    y: Array
-    true: Array
-    lowest: float
-    foot: float
-    at_foot: int
-
-
-@dataclass(frozen=True, kw_only=True)
-class Cloud:
-    """A drawn parameter of every flight, as horizontal positions.
-
-    Attributes:
-        name: the parameter.
-        label: its name, with its unit where it has one.
-        x: (K,) its values; whole numbers, spread a little, where it is drawn from names.
-        names: what stands at 0, 1, ...; empty where it is a number.
-    """
-
-    name: str
-    label: str
-    x: Array
-    names: tuple[str, ...]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -91,82 +47,38 @@ class Histogram:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Association:
+    """How a drawn number goes with an outcome.
+
+    Attributes:
+        rho: Spearman's rank correlation.
+        rho_is_sure: whether it is beyond chance, with all tests of the campaign taken together.
+        xi: Chatterjee's xi, of any dependence.
+        xi_is_sure: whether that is beyond chance.
+        p: the smaller of the two p-values, corrected.
+    """
+
+    rho: float
+    rho_is_sure: bool
+    xi: float
+    xi_is_sure: bool
+    p: float
+
+
+@dataclass(frozen=True, kw_only=True)
 class Driver:
-    """How a drawn number goes with an outcome: rank correlations, None where there is none to tell."""
+    """How a drawn number goes with the outcomes, None where there is none to tell."""
 
     name: str
     label: str
-    with_margin: float | None
-    with_failure: float | None
-    margin_is_sure: bool
-    failure_is_sure: bool
+    margin: Association | None
+    failure: Association | None
 
     @property
-    def strength(self) -> float:
-        """What drivers are ordered by: the correlation with the margin, or else with failure."""
-        return abs(self.with_failure or 0.0) if self.with_margin is None else abs(self.with_margin)
-
-
-def margins(table: pa.Table) -> Margins | None:
-    """The worst margins as they are drawn; None where no flight has any, as without a required constraint."""
-    true = numbers(table, "worst_margin")
-    true = np.where(np.isfinite(true), true, np.nan)
-    if np.isnan(true).all():
-        return None
-    least = lowest_shown(true)
-    low = np.isnan(true) | (true < least)
-    lowest = min(0.0, float(np.min(true[~low]))) if not low.all() else 0.0
-    foot = lowest - 0.15 if low.any() else lowest
-    return Margins(y=np.where(low, foot, true), true=true, lowest=least, foot=foot, at_foot=int(low.sum()))
-
-
-def lowest_shown(values: Array) -> float:
-    """The lowest of such margins that is shown where it is: `LOWEST_MARGIN`, but where most are lower still.
-
-    Args:
-        values: some of them finite.
-    """
-    finite = values[np.isfinite(values)]
-    return LOWEST_MARGIN if np.median(finite) > LOWEST_MARGIN else float(np.percentile(finite, 5))
-
-
-def clouds(table: pa.Table) -> list[Cloud]:
-    """Every drawn parameter, in order."""
-    found = []
-    for name in draw_names(table):
-        column = DRAW + name
-        told = label(name, unit_of(table, column))
-        if is_number(table, column):
-            found.append(Cloud(name=name, label=told, x=numbers(table, column), names=()))
-            continue
-        values = texts(table, column)
-        names = tuple(sorted(set(values)))
-        spread = np.random.default_rng(0).uniform(-0.3, 0.3, values.size)  # as every time
-        x = np.array([names.index(value) for value in values], float) + spread
-        found.append(Cloud(name=name, label=told, x=x, names=names))
-    return found
-
-
-def shown_flights(table: pa.Table) -> dict[str, Rows]:
-    """Rows of the flights that scatters show, by verdict: all, or at most a quarter of what a page bears of each."""
-    limit = min(max(_MOST_POINTS // max(len(draw_names(table)), 1), 400), 2000)
-    rows = {verdict: np.flatnonzero(found) for verdict, found in verdicts(table).items()}
-    if table.num_rows <= limit:
-        return rows
-    return {verdict: _evenly(found, limit // 4) for verdict, found in rows.items()}
-
-
-def thinning(table: pa.Table) -> str:
-    """What the scatters leave out, as a sentence; empty where they show all."""
-    shown = shown_flights(table)
-    parts = [
-        f"{shown[verdict].size} of {count_of(int(found.sum()), f'{verdict} flight')}"
-        for verdict, found in verdicts(table).items()
-        if shown[verdict].size < found.sum()
-    ]
-    if not parts:
-        return ""
-    return f"Drawn are {', '.join(parts)}, evenly spread by number; all others are drawn in full."
+    def weakness(self) -> tuple[float, float]:
+        """What drivers are ordered by, the strongest first: by the margin, or else by failure."""
+        found = self.margin or self.failure
+        return (found.p, -max(abs(found.rho), found.xi)) if found else (2.0, 0.0)
 
 
 def histograms(table: pa.Table) -> list[Histogram]:
@@ -191,23 +103,43 @@ def histograms(table: pa.Table) -> list[Histogram]:
 
 
 def drivers(summary: Summary) -> list[Driver]:
-    """The drawn numbers that go with an outcome at all, the strongest first."""
-    found = []
-    for name, parameter in summary["parameters"].items():
-        margin, failed = parameter.get("worst_margin"), parameter.get("failed")
-        if margin is None and failed is None:
-            continue
-        found.append(
-            Driver(
-                name=name,
-                label=label(name, parameter["unit"]),
-                with_margin=None if margin is None else margin["rho"],
-                with_failure=None if failed is None else failed["rho"],
-                margin_is_sure=margin is not None and margin["p_holm"] < ALPHA,
-                failure_is_sure=failed is not None and failed["p_holm"] < ALPHA,
-            )
+    """The drawn numbers that may go with an outcome at all, the strongest first."""
+    found = [
+        Driver(
+            name=name,
+            label=label(name, parameter["unit"]),
+            margin=_association(parameter.get("worst_margin")),
+            failure=_association(parameter.get("failed")),
         )
-    return sorted(found, key=lambda driver: -driver.strength)
+        for name, parameter in summary["parameters"].items()
+    ]
+    return sorted((one for one in found if one.margin or one.failure), key=lambda driver: driver.weakness)
+
+
+def _association(found: Mapping[str, Any] | None) -> Association | None:
+    if found is None:
+        return None
+    return Association(
+        rho=found["rho"],
+        rho_is_sure=found["p_holm"] < ALPHA,
+        xi=found["xi"],
+        xi_is_sure=found["p_xi_holm"] < ALPHA,
+        p=min(found["p_holm"], found["p_xi_holm"]),
+    )
+
+
+def sure_splits(summary: Summary) -> Iterator[tuple[str, str, str, Mapping[str, Any]]]:
+    """Event, drawn number, its unit and its threshold, of those beyond chance: by event, the surest first."""
+    found = summary["parameters"]
+    events = dict.fromkeys(event for parameter in found.values() for event in parameter.get("splits", {}))
+    for event in events:
+        told = [
+            (parameter["splits"][event]["p_there"], name)
+            for name, parameter in found.items()
+            if parameter.get("splits", {}).get(event, {"p_holm": 1.0})["p_holm"] < ALPHA
+        ]
+        for _, name in sorted(told):
+            yield event, name, found[name]["unit"], found[name]["splits"][event]
 
 
 def converging(summary: Summary) -> dict[str, str]:
@@ -229,29 +161,16 @@ def convergence_range(summary: Summary, events: Sequence[str]) -> tuple[float, f
     return 100.0 * max(lowest - room, -0.02 * (highest - lowest)), 100.0 * min(highest + room, 1.0 + 0.25 * room)
 
 
-def label(name: str, unit: str) -> str:
-    """A name with its unit, where it has one."""
-    return name if unit == "-" else f"{name} [{unit}]"
-
-
 def present(table: pa.Table) -> list[str]:
     """The verdicts that occur."""
     found = verdicts(table)
     return [verdict for verdict in VERDICTS if found[verdict].any()]
 
 
-def _evenly(rows: Rows, most: int) -> Rows:
-    if rows.size <= most:
-        return rows
-    places = np.round(np.linspace(0.0, rows.size - 1.0, most)).astype(int)
-    return np.asarray(rows[places])
-
-
 def _edges(values: Array, least: float, *, whole: bool) -> Array:
     """Bins of one width over the values, without the few that are far out; 0 is an edge where it is among them."""
-    q1, q3 = np.percentile(values, [25, 75])
-    reach = _FENCE * (q3 - q1) or np.inf
-    low, high = max(values.min(), q1 - reach, least), min(values.max(), q3 + reach)
+    low, high = robust_ends(values)
+    low = max(low, least)
     bins = min(_BINS, max(8, int(2.0 * np.sqrt(values.size))))
     if whole:
         width = max(1.0, np.ceil((high - low + 1.0) / bins))

@@ -14,33 +14,27 @@ from quadsim.campaign.columns import (
     constraint_names,
     draw_names,
     flags,
-    is_number,
     metric_names,
     numbers,
     texts,
     verdicts,
 )
+from quadsim.campaign.drivers import parameters
 from quadsim.campaign.events import EVENT_NAMES, Flags, parse_event
 from quadsim.campaign.statistics import (
     CONFIDENCE,
-    Correlation,
-    holm,
     lower_bounds,
     proportion,
-    rank_correlation,
     upper_bounds,
 )
 from quadsim.campaign.table import DRAW, MARGIN, SATISFIED, unit_of
 from quadsim.campaign.verdicts import VERDICTS
 from quadsim.errors import ParameterError
-from quadsim.state import Array
 
 Summary = Mapping[str, Any]
 
 WORST_FLIGHTS: Final = 10
 _CURVE_POINTS: Final = 80
-_GROUPS: Final = ((50, 5), (12, 3))
-"""Flights from which a drawn number's values are looked at in so many groups of about equal size."""
 
 
 def estimate(table: pa.Table) -> dict[str, Any]:
@@ -48,9 +42,8 @@ def estimate(table: pa.Table) -> dict[str, Any]:
 
     Keys: `flights`; `confidence` of every interval; `verdicts`, flights of each; `events` and `constraints`, by name,
     as proportions (`quadsim.campaign.statistics.Proportion`), a constraint's being that it did not hold or was not
-    reached; `metrics`, over the flights that have each; `parameters`, of each drawn number the rank correlation with
-    the worst margin and with failure, and the failures by `groups` of its values from the lowest on, or the failures
-    by level of what is drawn from names; `worst`, the ten worst flights; `convergence` of the shares of failure and
+    reached; `metrics`, over the flights that have each; `parameters`, how the outcome goes with each drawn parameter
+    (`quadsim.campaign.drivers.parameters`); `worst`, the ten worst flights; `convergence` of the shares of failure and
     violation over the first n flights.
 
     Args:
@@ -63,7 +56,7 @@ def estimate(table: pa.Table) -> dict[str, Any]:
         "events": {name: _share(parse_event(name).column(table)) for name in EVENT_NAMES},
         "metrics": {name: _metric(table, name) for name in metric_names(table)},
         "constraints": {name: _constraint(table, name) for name in constraint_names(table)},
-        "parameters": _parameters(table),
+        "parameters": parameters(table),
         "worst": [_flight(table, int(i)) for i in ranking(table)[:WORST_FLIGHTS]],
         "convergence": _convergence(table),
     }
@@ -88,7 +81,8 @@ def ranking(table: pa.Table) -> np.ndarray[Any, np.dtype[np.intp]]:
     first, then the smaller worst margin.  Flights without a margin come after those with one, by their RMS error in
     position, the largest first.  What is still equal is in the order of the flights' numbers.
     """
-    ranks = np.array([VERDICTS[verdict].rank if verdict in VERDICTS else 0 for verdict in texts(table, "verdict")], int)
+    known = {name: verdict.badness for name, verdict in VERDICTS.items()}
+    badness = np.array([known.get(name, max(known.values())) for name in texts(table, "verdict")], int)
     margin = numbers(table, "worst_margin")
     errors = np.stack([np.nan_to_num(numbers(table, f"rmse.{axis}")) for axis in "xyz"])
     distance = np.where(np.isnan(margin), np.linalg.norm(errors, axis=0), 0.0)
@@ -97,20 +91,9 @@ def ranking(table: pa.Table) -> np.ndarray[Any, np.dtype[np.intp]]:
         -distance,
         np.where(np.isnan(margin), np.inf, margin),
         ~flags(table, "failed", absent=True),
-        ranks,
+        -badness,
     )
     return np.lexsort(keys)
-
-
-def ranked_margins(table: pa.Table) -> Array:
-    """(K,) the worst margin of each flight for ranks: -inf of one that was lost before it had any, NaN of one without.
-
-    Where no flight has a margin, all are NaN.
-    """
-    margin = numbers(table, "worst_margin")
-    if np.isnan(margin).all():
-        return margin
-    return np.where(np.isnan(margin) & verdicts(table)["lost"], -np.inf, margin)
 
 
 def _share(happened: Flags) -> dict[str, Any]:
@@ -148,52 +131,6 @@ def _constraint(table: pa.Table, name: str) -> dict[str, Any]:
         row = int(np.nanargmin(margin))
         found |= {"worst_margin": float(margin[row]), "worst_flight": table["flight"][row].as_py()}
     return found
-
-
-def _parameters(table: pa.Table) -> dict[str, Any]:
-    failed = flags(table, "failed", absent=True)
-    outcomes = {"worst_margin": ranked_margins(table), "failed": failed.astype(float)}
-    names = draw_names(table)
-    drawn = [name for name in names if is_number(table, DRAW + name)]
-    found: dict[str, Any] = {name: _levels(table, name, failed) for name in names if name not in drawn}
-    for name in drawn:
-        values = numbers(table, DRAW + name)
-        found[name] = {"kind": "number", "unit": unit_of(table, DRAW + name), "groups": _groups(values, failed)}
-    for outcome, values in outcomes.items():
-        correlations = {name: rank_correlation(numbers(table, DRAW + name), values) for name in drawn}
-        for name, correlation in _corrected(correlations).items():
-            found[name][outcome] = correlation
-    return {name: found[name] for name in names}
-
-
-def _corrected(correlations: Mapping[str, Correlation | None]) -> dict[str, dict[str, Any] | None]:
-    """Correlations with their p-values corrected for how many there are."""
-    present = {name: correlation for name, correlation in correlations.items() if correlation is not None}
-    corrected = dict(zip(present, holm([correlation.p for correlation in present.values()]), strict=True))
-    told = {name: asdict(correlation) | {"p_holm": corrected[name]} for name, correlation in present.items()}
-    return {name: told.get(name) for name in correlations}
-
-
-def _levels(table: pa.Table, name: str, failed: Flags) -> dict[str, Any]:
-    levels = texts(table, DRAW + name)
-    shares = {level: _share(failed[levels == level]) for level in sorted(set(levels))}
-    return {"kind": "name", "unit": unit_of(table, DRAW + name), "levels": shares}
-
-
-def _groups(values: Array, failed: Flags) -> list[dict[str, Any]]:
-    """Failures by thirds or fifths of a drawn number, or by its values where these are no more; none of few flights."""
-    there = np.isfinite(values)
-    values, failed = values[there], failed[there]
-    size = next((groups for flights, groups in _GROUPS if values.size >= flights), 0)
-    if not size:
-        return []
-    distinct = np.unique(values)
-    cuts = distinct[1:] if distinct.size <= size else np.quantile(values, np.arange(1, size) / size)
-    group = np.searchsorted(cuts, values, side="right")
-    return [
-        {"low": float(values[of].min()), "high": float(values[of].max()), **_share(failed[of])}
-        for of in (group == k for k in np.unique(group))
-    ]
 
 
 def _flight(table: pa.Table, row: int) -> dict[str, Any]:

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
+from quadsim.campaign.verdicts import OWN_EVENTS
 from quadsim.errors import InputError, ParameterError, UnknownNameError
 
 if TYPE_CHECKING:
@@ -26,9 +27,7 @@ _NAMED: Final[dict[str, tuple[str, bool | str]]] = {
     "violation": ("violated", True),
     "lost": ("verdict", "lost"),
     "crash": ("crashed", True),
-    "error": ("verdict", "error"),
-    "timeout": ("verdict", "timeout"),
-    "memory": ("verdict", "memory"),
+    **{verdict: ("verdict", verdict) for verdict in OWN_EVENTS},
 }
 """Column of each event that has a name, and its value there where the event holds."""
 _SPELLINGS: Final = {"failed": "failure", "violated": "violation", "crashed": "crash"}
@@ -101,8 +100,8 @@ def parse_event(text: str, columns: Mapping[str, pa.DataType] | pa.Schema | None
     """An event from its text.
 
     Args:
-        text: `failure`, `violation`, `lost`, `crash`, `error`, `timeout` or `memory`, where `failed`, `violated` and
-            `crashed` mean the same as their nouns; or `COLUMN OP NUMBER` with one of `< <= > >=`, e.g. `rmse.z > 0.5`.
+        text: a name of `EVENT_NAMES`, e.g. `failure` or `lost`, where `failed`, `violated` and `crashed` mean the same
+            as their nouns; or `COLUMN OP NUMBER` with one of `< <= > >=`, e.g. `rmse.z > 0.5`.
         columns: those that a comparison may name, with their types, or the schema of a table; None for any.
 
     Raises:

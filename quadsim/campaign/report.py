@@ -9,21 +9,18 @@ from urllib.parse import quote
 
 import pyarrow as pa
 
-from quadsim.campaign.curves import margins, thinning
+from quadsim.campaign.driver_tables import driver_table, group_table, level_tables, split_table
 from quadsim.campaign.estimates import Summary
+from quadsim.campaign.scatters import clipping, clouds, margins, thinning
 from quadsim.campaign.sentences import campaign_sentences, verdict_sentence
 from quadsim.campaign.tables import (
     constraint_table,
-    driver_table,
     event_table,
-    group_table,
-    level_tables,
     manifest_table,
     metric_table,
     worst_draws_table,
     worst_table,
 )
-from quadsim.campaign.wording import count_of
 from quadsim.figures.campaign import write_campaign_figure
 from quadsim.outputs import write_text
 from quadsim.page import PAGE_FILE, render_page
@@ -88,6 +85,7 @@ def write_report(
         constraints=constraint_table(summary),
         metrics=metric_table(summary),
         drivers=driver_table(summary),
+        splits=split_table(summary),
         groups=group_table(summary),
         levels=level_tables(summary),
         lost=summary["verdicts"]["lost"],
@@ -95,7 +93,7 @@ def write_report(
         worst_draws=worst_draws_table(summary),
         manifest=manifest_table(manifest),
         plots=plots,
-        at_foot=_at_foot(table),
+        clipping=_clipping(table),
         thinning=thinning(table),
         files=[
             (label, quote(file))
@@ -114,9 +112,7 @@ def _mark(summary: Summary) -> Mark:
     return Mark.BAD if summary["events"]["failure"]["count"] else Mark.GOOD
 
 
-def _at_foot(table: pa.Table) -> str:
-    """Which flights scatters draw at their foot, as a sentence; empty where there are none."""
+def _clipping(table: pa.Table) -> str:
+    """Which flights scatters draw at their edges, as a sentence; empty where there are none."""
     drawn = margins(table)
-    if drawn is None or not drawn.at_foot:
-        return ""
-    return f"At the foot: {count_of(drawn.at_foot, 'flight')} with a margin below {drawn.lowest:.3g}, or none."
+    return "" if drawn is None else clipping(drawn, clouds(table, drawn))

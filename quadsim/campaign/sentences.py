@@ -5,14 +5,21 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from typing import Any, Final
 
-from quadsim.campaign.curves import ALPHA
+from quadsim.campaign.curves import sure_splits
 from quadsim.campaign.estimates import Summary
+from quadsim.campaign.statistics import ALPHA
 from quadsim.campaign.verdicts import VERDICTS
 from quadsim.campaign.wording import count_of, listing, p_value, percent, share_with_interval
 from quadsim.table import format_number
 
 _OUTCOMES = {"worst_margin": "The worst margin", "failed": "Failure"}
+_HAPPENED: Final = {
+    "failure": ("failures", "failed", "failed"),
+    "violation": ("violations", "violated a required constraint", "violated one"),
+    "lost": ("losses", "were lost", "was lost"),
+}
 _MOST_NAMED: Final = 4
+_MOST_DRIVERS: Final = 3
 
 
 def verdict_sentence(summary: Summary) -> str:
@@ -24,13 +31,21 @@ def verdict_sentence(summary: Summary) -> str:
 
 def campaign_sentences(summary: Summary) -> list[str]:
     """What the flights show, one fact each."""
-    return [*_outcomes(summary), *_bounds(summary), *_constraints(summary), *_drivers(summary), *_worst(summary)]
+    return [
+        *_outcomes(summary),
+        *_bounds(summary),
+        *_constraints(summary),
+        *driver_sentences(summary),
+        *split_sentences(summary),
+        *_worst(summary),
+    ]
 
 
 def _outcomes(summary: Summary) -> Iterator[str]:
     told = {verdict: count for verdict, count in summary["verdicts"].items() if count}
     parts = [
-        f"{count} {VERDICTS[verdict].one if count == 1 else VERDICTS[verdict].many}" for verdict, count in told.items()
+        f"{count} {VERDICTS[verdict].told_of_one if count == 1 else VERDICTS[verdict].told}"
+        for verdict, count in told.items()
     ]
     if len(parts) == 1 and summary["flights"] > 1:
         yield f"All {parts[0].replace(' ', ' flights ', 1)}."
@@ -79,19 +94,69 @@ def _constraints(summary: Summary) -> Iterator[str]:
     yield f"What most often does not hold is {names[0]}, in {share} of all flights{margin}."
 
 
-def _drivers(summary: Summary) -> Iterator[str]:
-    if not any(found["kind"] == "number" for found in summary["parameters"].values()):
-        return
+def driver_sentences(summary: Summary) -> Iterator[str]:
+    """What goes with the outcome in one direction, and what in another way."""
     for outcome, noun in _OUTCOMES.items():
         told = {name: found.get(outcome) for name, found in summary["parameters"].items()}
         tested = {name: found for name, found in told.items() if found}
-        sure = {name: found for name, found in tested.items() if found["p_holm"] < ALPHA}
-        strongest = sorted(sure.items(), key=lambda item: -abs(item[1]["rho"]))[:3]
+        rising = {name: found for name, found in tested.items() if found["p_holm"] < ALPHA}
+        strongest = sorted(rising.items(), key=lambda item: -abs(item[1]["rho"]))[:_MOST_DRIVERS]
         if strongest:
             listed = ", ".join(f"{name} ({found['rho']:+.2f}, {p_value(found['p_holm'])})" for name, found in strongest)
             yield f"{noun} goes most with {listed}: rank correlation, p-value after Holm's correction."
-        elif tested:
-            yield f"{noun} goes with no drawn number beyond chance (rank correlation, 5 % after Holm's correction)."
+        others = {name: found for name, found in tested.items() if found["p_xi_holm"] < ALPHA and name not in rising}
+        surest = sorted(others.items(), key=lambda item: -item[1]["xi"])[:_MOST_DRIVERS]
+        if surest:
+            listed = ", ".join(
+                f"{name} (xi {found['xi']:.2f}, {p_value(found['p_xi_holm'])}{_turn(summary, name, outcome)})"
+                for name, found in surest
+            )
+            yield (
+                f"{noun} {'also ' if strongest else ''}depends on {listed}, without rising or falling throughout: "
+                "Chatterjee's xi, p-value after Holm's correction."
+            )
+        told_by_threshold = outcome == "failed" and any(event == "failure" for event, *_ in sure_splits(summary))
+        if tested and not (strongest or surest or told_by_threshold):
+            yield (
+                f"{noun} goes with no drawn number beyond chance (rank correlation, and Chatterjee's xi for any "
+                "dependence; 5 % after Holm's correction for all tests)."
+            )
+
+
+def _turn(summary: Summary, name: str, outcome: str) -> str:
+    """Where the worst margin turns over a drawn number."""
+    turn = summary["parameters"][name]["turn"] if outcome == "worst_margin" else None
+    return "" if turn is None else f", {turn['kind']} near {turn['at']:.3g}"
+
+
+def split_sentences(summary: Summary) -> Iterator[str]:
+    """Where the flights with an event are, by the surest threshold."""
+    told: set[str] = set()
+    for event, name, unit, split in sure_splits(summary):
+        if event in told:
+            continue
+        told.add(event)
+        worse, better, side = split["high"], split["low"], "above"
+        if worse["share"] < better["share"]:
+            worse, better, side = better, worse, "up to"
+        at = f"{name} = {split['threshold']:.15g}{'' if unit == '-' else f' {unit}'}"
+        noun, verb, one = _HAPPENED[event]
+        head = f"{noun.capitalize()} cluster"
+        if not better["count"]:
+            head = f"All {worse['count']} {noun} are" if worse["count"] > 1 else f"The one flight that {one} is"
+        yield (
+            f"{head} {side} {at}: {_part(worse)} flights {verb} there ({_ends(worse, summary)}), and {_part(better)} "
+            f"{'up to it' if side == 'above' else 'above it'} ({_ends(better, summary)}); {p_value(split['p_holm'])}, "
+            "corrected for the choice of the threshold and for all tests."
+        )
+
+
+def _part(share: Mapping[str, Any]) -> str:
+    return f"{share['count']} of {share['flights']}"
+
+
+def _ends(share: Mapping[str, Any], summary: Summary) -> str:
+    return share_with_interval(share, summary["confidence"]).replace(" (", "; ").removesuffix(")")
 
 
 def _worst(summary: Summary) -> Iterator[str]:

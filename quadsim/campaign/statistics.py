@@ -1,4 +1,4 @@
-"""How sure an answer from many flights is: intervals, rank correlations, and paired comparisons.
+"""How sure an answer from many flights is: intervals, corrections for many tests, and paired comparisons.
 
 Flights are taken as independent draws.  Draws spread evenly (Latin hypercube, Sobol', Halton) make estimates vary less
 than that, so that the intervals are then wider than they need be.
@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 from scipy import optimize, stats
@@ -17,8 +17,8 @@ from scipy import optimize, stats
 from quadsim.state import Array
 
 CONFIDENCE: Final = 0.95
-_EXACT_UP_TO: Final = 8
-"""Pairs up to which all permutations are counted for a rank correlation's p-value; 8! = 40 320."""
+ALPHA: Final = 0.05
+"""Level of the tests."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,21 +42,6 @@ class Proportion:
     upper: float
     lower_one_sided: float
     upper_one_sided: float
-
-
-@dataclass(frozen=True, kw_only=True)
-class Correlation:
-    """Spearman's rank correlation.
-
-    Attributes:
-        rho: from -1 to 1.
-        p: two-sided p-value of no association.
-        flights: pairs it was taken over.
-    """
-
-    rho: float
-    p: float
-    flights: int
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -121,35 +106,6 @@ def proportion(count: int, flights: int, confidence: float = CONFIDENCE) -> Prop
         lower_one_sided=lower_bound(count, flights, confidence),
         upper_one_sided=upper_bound(count, flights, confidence),
     )
-
-
-def rank_correlation(x: Array, y: Array) -> Correlation | None:
-    """Spearman's rank correlation of pairs, ties at their mean rank.
-
-    The p-value counts all permutations of up to 8 pairs, and is from Student's t beyond.
-
-    Args:
-        x: (K,); pairs with a NaN do not count, infinities have their rank.
-        y: (K,).
-
-    Returns:
-        None of fewer than three pairs, or where one side is always the same.
-    """
-    kept = ~(np.isnan(x) | np.isnan(y))
-    x, y = stats.rankdata(x[kept]), stats.rankdata(y[kept])
-    if x.size < 3 or np.ptp(x) == 0.0 or np.ptp(y) == 0.0:
-        return None
-    if x.size > _EXACT_UP_TO:
-        found = stats.spearmanr(x, y)
-        return Correlation(rho=float(found.statistic), p=float(found.pvalue), flights=x.size)
-    centred = y - y.mean()
-    scale = float(np.linalg.norm(x - x.mean()) * np.linalg.norm(centred))
-
-    def statistic(ranks: Array, axis: int = -1) -> Any:
-        return np.sum(ranks * centred, axis=axis) / scale
-
-    test = stats.permutation_test((x,), statistic, permutation_type="pairings", vectorized=True, n_resamples=np.inf)
-    return Correlation(rho=float(test.statistic), p=float(test.pvalue), flights=x.size)
 
 
 def holm(p_values: Sequence[float]) -> list[float]:

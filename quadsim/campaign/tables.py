@@ -6,16 +6,10 @@ import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
-from quadsim.campaign.curves import ALPHA, drivers, label
 from quadsim.campaign.estimates import Summary
-from quadsim.campaign.verdicts import GOOD
-from quadsim.campaign.wording import interval, p_value, percent
+from quadsim.campaign.verdicts import HARMLESS
+from quadsim.campaign.wording import interval, label, percent
 from quadsim.table import ABSENT, Cell, Grid, Mark, format_number
-
-_GROUPS = {
-    3: ("lowest third", "middle", "highest third"),
-    5: ("lowest fifth", "second", "third", "fourth", "highest fifth"),
-}
 
 
 def event_table(summary: Summary, failure: Sequence[str] = ()) -> Grid:
@@ -91,86 +85,13 @@ def metric_table(summary: Summary) -> Grid:
     )
 
 
-def driver_table(summary: Summary) -> Grid:
-    """How each drawn number goes with the worst margin and with failure."""
-    lines = []
-    for driver in drivers(summary):
-        found = summary["parameters"][driver.name]
-        cells = [Cell(text=driver.label)]
-        for outcome in ("worst_margin", "failed"):
-            correlation = found.get(outcome)
-            if correlation is None:
-                cells += _line(ABSENT, ABSENT)
-                continue
-            mark = Mark.BEST if correlation["p_holm"] < ALPHA else Mark.NONE
-            cells += [
-                Cell(text=f"{correlation['rho']:+.2f}", mark=mark),
-                Cell(text=p_value(correlation["p_holm"])),
-            ]
-        lines.append(tuple(cells))
-    return Grid(
-        key="drivers-table",
-        title="Rank correlations",
-        head=("drawn number", "with the worst margin", "after Holm", "with failure", "after Holm"),
-        lines=tuple(lines),
-        note=(
-            f"Spearman's; bold: beyond chance at {100.0 * ALPHA:g} % over all parameters (Holm). A flight that was "
-            "lost before it had a margin ranks below all others. A parameter that does harm at both of its ends has a "
-            "small rank correlation: look at its scatter."
-        ),
-    )
-
-
-def group_table(summary: Summary) -> Grid:
-    """How often flights failed over each drawn number, from its lowest values on; of none or all failed, no lines."""
-    failure = summary["events"]["failure"]
-    told = {
-        name: found
-        for name, found in summary["parameters"].items()
-        if found.get("groups") and 0 < failure["count"] < failure["flights"]
-    }
-    size = max((len(found["groups"]) for found in told.values()), default=0)
-    lines = tuple(
-        _line(
-            label(name, found["unit"]),
-            *(_group(group) for group in found["groups"]),
-            *[ABSENT] * (size - len(found["groups"])),
-        )
-        for name, found in told.items()
-    )
-    return Grid(
-        key="groups",
-        title="Failures over each drawn number",
-        head=("drawn number", *_GROUPS.get(size, [f"{k + 1}." for k in range(size)])),
-        lines=lines,
-        note="Share of failed flights among those with such a value; flights are in groups of about equal size, or by "
-        f"value where there are few values. Over all flights it is {percent(failure['share'])}.",
-    )
-
-
-def level_tables(summary: Summary) -> list[Grid]:
-    """How often flights failed with each name or truth value that was drawn."""
-    grids: list[Grid] = []
-    for parameter, found in summary["parameters"].items():
-        name = label(parameter, found["unit"])
-        if found["kind"] == "number" or not found["levels"]:
-            continue
-        lines = tuple(
-            _line(level, f"{share['count']} of {share['flights']}", *_shares(share))
-            for level, share in found["levels"].items()
-        )
-        head = (name, "failed", "share", f"{100.0 * summary['confidence']:g} % interval")
-        grids.append(Grid(key=f"levels-{len(grids)}", title=f"Failures by {name}", head=head, lines=lines))
-    return grids
-
-
 def worst_table(summary: Summary, directory: str) -> Grid:
     """The worst flights, and how to fly one again."""
     worst = summary["worst"]
     lines = tuple(
         (
             Cell(text=str(flight["flight"])),
-            Cell(text=flight["verdict"], mark=Mark.NONE if flight["verdict"] == GOOD else Mark.BAD),
+            Cell(text=flight["verdict"], mark=Mark.NONE if flight["verdict"] == HARMLESS else Mark.BAD),
             *_line(format_number(flight["worst_margin"]), flight["worst_constraint"] or ABSENT),
             *_line(format_number(flight["duration"])),
             Cell(text=flight["reason"] or ABSENT, mark=Mark.TEXT),
@@ -232,11 +153,6 @@ def _value(value: Any) -> str:
     if isinstance(value, bool):
         return "true" if value else "false"
     return format_number(value) if isinstance(value, float) else str(value)
-
-
-def _group(group: Mapping[str, Any]) -> str:
-    low, high = format_number(group["low"]), format_number(group["high"])
-    return f"{low if low == high else f'{low} to {high}'}: {percent(group['share'])}"
 
 
 def _shares(found: Mapping[str, Any]) -> tuple[str, str]:

@@ -1,4 +1,4 @@
-"""What a flight's verdict may be: how it ended, what is said of it, how bad it is, and how it is drawn."""
+"""The verdicts on a flight of a campaign: how each is ranked, told and drawn.  A new one is a line here."""
 
 from __future__ import annotations
 
@@ -11,75 +11,64 @@ from quadsim.palette import BOUND, LINES, REFERENCE
 
 @dataclass(frozen=True, kw_only=True)
 class Verdict:
-    """One of them.
+    """What is to be known of a verdict.
 
     Attributes:
-        name: as tables have it.
-        one: said of one flight.
-        many: said of several.
-        rank: the worst one has the smallest.
-        colour: in which it is drawn.
-        symbol: plotly's.
-        marker: matplotlib's.
+        badness: its place among the worst flights: the larger, the worse.
+        told: what such flights did, after their number.
+        told_of_one: what one such flight did.
+        colour: of its flights.
+        marker: of its flights, in matplotlib's letters.
+        symbol: of its flights, in plotly's words.
     """
 
-    name: str
-    one: str
-    many: str
-    rank: int
+    badness: int
+    told: str
+    told_of_one: str
     colour: str
-    symbol: str
     marker: str
+    symbol: str
 
 
-_ALL: Final = (
-    Verdict(
-        name="satisfied",
-        one="held every required constraint",
-        many="held every required constraint",
-        rank=5,
+VERDICTS: Final = {
+    "satisfied": Verdict(
+        badness=0,
+        told="held every required constraint",
+        told_of_one="held every required constraint",
         colour=LINES[0],
-        symbol="circle",
         marker="o",
+        symbol="circle",
     ),
-    Verdict(
-        name="violated",
-        one="violated a required constraint",
-        many="violated a required constraint",
-        rank=4,
+    "violated": Verdict(
+        badness=1,
+        told="violated a required constraint",
+        told_of_one="violated a required constraint",
         colour=LINES[1],
-        symbol="diamond",
         marker="D",
+        symbol="diamond",
     ),
-    Verdict(name="lost", one="was lost", many="were lost", rank=0, colour=BOUND, symbol="x", marker="x"),
-    Verdict(
-        name=ERROR,
-        one="raised an error",
-        many="raised an error",
-        rank=1,
-        colour=REFERENCE,
-        symbol="square",
-        marker="s",
+    "lost": Verdict(badness=5, told="were lost", told_of_one="was lost", colour=BOUND, marker="x", symbol="x"),
+    ERROR: Verdict(
+        badness=4, told="raised an error", told_of_one="raised an error", colour=REFERENCE, marker="s", symbol="square"
     ),
-    Verdict(
-        name=TIMEOUT,
-        one="was ended since it took too long",
-        many="were ended since they took too long",
-        rank=2,
-        colour=LINES[3],
-        symbol="triangle-up",
+    TIMEOUT: Verdict(
+        badness=3,
+        told="were ended since they took too long",
+        told_of_one="was ended since it took too long",
+        colour=LINES[4],
         marker="^",
+        symbol="triangle-up",
     ),
-    Verdict(
-        name=MEMORY,
-        one="was ended since it took too much memory",
-        many="were ended since they took too much memory",
-        rank=3,
+    MEMORY: Verdict(
+        badness=2,
+        told="were ended since they took too much memory",
+        told_of_one="was ended since it took too much memory",
         colour=LINES[5],
-        symbol="triangle-down",
         marker="v",
+        symbol="triangle-down",
     ),
-)
-VERDICTS: Final = {verdict.name: verdict for verdict in _ALL}
-"""By their names, in the order of tables and legends."""
-GOOD: Final = "satisfied"
+}
+"""In the order in which they are drawn and counted."""
+HARMLESS: Final = "satisfied"
+OWN_EVENTS: Final = tuple(name for name in VERDICTS if name not in (HARMLESS, "violated"))
+"""Verdicts that are events of their own name; `violation` is every verdict but `satisfied`."""

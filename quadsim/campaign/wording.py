@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import math
+import textwrap
 from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
 from quadsim.table import ABSENT
 
 _MOST_DECIMALS: Final = 8
+_SHORTEST: Final = 5
+"""Characters that a line of every name may have."""
 
 
 def percent(share: float | None, digits: int = 2) -> str:
@@ -32,6 +35,11 @@ def signed_interval(lower: float, upper: float) -> str:
     return f"{signed_points(lower)} to {signed_points(upper)}"
 
 
+def label(name: str, unit: str) -> str:
+    """A name with its unit, where it has one."""
+    return name if unit == "-" else f"{name} [{unit}]"
+
+
 def count_of(count: int, thing: str) -> str:
     """So many things: `1 flight`, `12 flights`."""
     return f"{count} {thing}{'' if count == 1 else 's'}"
@@ -41,6 +49,17 @@ def listing(names: Sequence[str], most: int) -> str:
     """Names in a sentence, `a, b and c`, the last of too many as a count: `a, b and 7 others`."""
     shown = list(names) if len(names) <= most else [*names[: most - 1], f"{len(names) - most + 1} others"]
     return " and ".join(filter(None, [", ".join(shown[:-1]), shown[-1]]))
+
+
+def side_by_side(names: Sequence[str], room: int) -> list[str]:
+    """Names for ticks of an axis with room for so many characters, in two lines each; what is too long ends in `…`."""
+    each = max(_SHORTEST, room // max(len(names), 1) - 1)
+    found = []
+    for name in names:
+        told = name if len(name) <= 2 * each else f"{name[: 2 * each - 1]}…"
+        lines = textwrap.wrap(told, each)
+        found.append("\n".join(lines if len(lines) < 3 else (told[:each], told[each:])))
+    return found
 
 
 def share_with_interval(found: Mapping[str, Any], confidence: float) -> str:

@@ -2,39 +2,41 @@
 
 from __future__ import annotations
 
+import textwrap
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
 import pyarrow as pa
 
-from quadsim.campaign.curves import (
-    clouds,
-    convergence_range,
-    drivers,
-    histograms,
-    margins,
-    present,
-    shown_flights,
-)
+from quadsim.campaign.curves import Association, convergence_range, drivers, histograms, present
 from quadsim.campaign.estimates import Summary
+from quadsim.campaign.scatters import COURSE, Cloud, Margins, clipping, clouds, edges, margins, shown_flights
 from quadsim.campaign.sentences import verdict_sentence
 from quadsim.campaign.verdicts import VERDICTS
+from quadsim.campaign.wording import side_by_side
 from quadsim.figures.canvas import new_figure, write_drawings
-from quadsim.palette import BOUND, LINES
+from quadsim.palette import BOUND, COURSE_COLOUR, LINES
 
 if TYPE_CHECKING:
     from matplotlib.artist import Artist
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+_TRIANGLES: Final = {"down": "v", "up": "^", "left": "<", "right": ">"}
 _MOST_DRIVERS: Final = 10
+_MOST_SCATTERS: Final = 3
+_LINE: Final = 150
+"""Characters of a line below all panels."""
+_TICK_ROOM: Final = 60
+"""Characters that have room below a panel."""
+_TICKS: Final = 6
 _FEW: Final = 50
 """Flights of a verdict that are drawn larger, so as to be seen among the others."""
 
 
 def write_campaign_figure(name: str, table: pa.Table, summary: Summary, directory: Path) -> list[Path]:
-    """Draw how the estimate settles, the worst margins, what goes with them, and the strongest of that.
+    """Draw how the estimate settles, the worst margins, what goes with them, and the strongest three of that.
 
     Args:
         name: the campaign's.
@@ -52,13 +54,31 @@ def write_campaign_figure(name: str, table: pa.Table, summary: Summary, director
 
 
 def _draw(name: str, table: pa.Table, summary: Summary) -> Figure:
-    figure = new_figure(f"{name}: {verdict_sentence(summary)}", 9.6, 6.6)
-    ((settling, distribution), (ranks, strongest)) = figure.subplots(2, 2)
-    _draw_convergence(settling, summary)
-    _draw_margins(distribution, table)
-    _draw_drivers(ranks, summary)
-    _draw_strongest(strongest, table, summary)
+    drawn = margins(table)
+    parameters = _strongest(clouds(table, drawn), summary) if drawn is not None else []
+    rows = 3 if len(parameters) > 1 else 2
+    figure = new_figure(f"{name}: {verdict_sentence(summary)}", 9.6, 3.4 * rows)
+    panels = figure.subplots(rows, 2).ravel()
+    _draw_convergence(panels[0], summary)
+    _draw_margins(panels[1], table)
+    _draw_drivers(panels[2], summary)
+    if drawn is None or not parameters:
+        _say(panels[3], "no margins, or nothing drawn")
+    for axes in panels[3 + max(len(parameters), 1) :]:
+        axes.set_axis_off()
+    if drawn is not None and parameters:
+        for axes, cloud in zip(panels[3:], parameters, strict=False):
+            _draw_scatter(axes, table, cloud, drawn)
+        curve = f"Curve: {COURSE}. " if any(cloud.course is not None for cloud in parameters) else ""
+        note = textwrap.fill(curve + clipping(drawn, parameters), _LINE)
+        figure.supxlabel(note, x=0.01, ha="left", fontsize=8.0, color="#5b6067")
     return figure
+
+
+def _strongest(found: list[Cloud], summary: Summary) -> list[Cloud]:
+    """The parameters that go most with the outcome, or the first ones where none of them can."""
+    told = {driver.name: i for i, driver in enumerate(drivers(summary))}
+    return sorted(found, key=lambda cloud: told.get(cloud.name, len(told)))[:_MOST_SCATTERS]
 
 
 def _draw_convergence(axes: Axes, summary: Summary) -> None:
@@ -106,6 +126,7 @@ def _draw_margins(axes: Axes, table: pa.Table) -> None:
     if drawn.edges[0] <= 0.0 <= drawn.edges[-1]:
         axes.axvline(0.0, color=BOUND, linestyle="--", linewidth=1.1)
     axes.set_ylim(0.0, 1.08 * below.max())
+    axes.xaxis.set_major_locator(MaxNLocator(_TICKS, steps=(1, 2, 2.5, 5, 10)))
     axes.yaxis.set_major_locator(MaxNLocator(integer=True))
     axes.set_xlabel(drawn.label.replace("worst_margin", "worst margin"))
     axes.set_ylabel("flights")
@@ -113,60 +134,74 @@ def _draw_margins(axes: Axes, table: pa.Table) -> None:
 
 
 def _draw_drivers(axes: Axes, summary: Summary) -> None:
+    """Rank correlations as bars, and the measure of any dependence as diamonds over them."""
+    from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
-    axes.set_title("rank correlation with the drawn numbers", loc="left", fontsize=9.5)
-    told = drivers(summary)[:_MOST_DRIVERS][::-1]
+    axes.set_title("what goes with the outcome", loc="left", fontsize=9.5)
+    told = drivers(summary)[:_MOST_DRIVERS]
     if not told:
         _say(axes, "nothing to correlate")
         return
-    rows = np.arange(len(told))
     outcomes = (
-        ("worst margin", LINES[0], 0.2, [(driver.with_margin, driver.margin_is_sure) for driver in told]),
-        ("failure", LINES[1], -0.2, [(driver.with_failure, driver.failure_is_sure) for driver in told]),
+        ("worst margin", LINES[0], -0.2, [driver.margin for driver in told]),
+        ("failure", LINES[1], 0.2, [driver.failure for driver in told]),
     )
     keys: list[Artist] = []
-    for outcome, colour, offset, values in outcomes:
-        if all(value is None for value, _ in values):
-            continue
-        keys.append(Patch(color=colour, label=outcome))
-        bars = axes.barh(rows + offset, [value or 0.0 for value, _ in values], 0.38, color=colour)
-        for bar, (_, sure) in zip(bars, values, strict=True):
-            bar.set_alpha(1.0 if sure else 0.35)
+    for outcome, colour, offset, found in outcomes:
+        if any(found):
+            keys.append(Patch(color=colour, label=outcome))
+        for row, one in enumerate(found):
+            if one is not None:
+                _draw_association(axes, row + offset, one, colour)
+    diamond = Line2D([], [], marker="D", color="#1c1e21", linestyle="none", markersize=4.0, label="xi: any dependence")
+    keys += [Patch(color="#c9ccd1", label="rank correlation"), diamond]
     axes.axvline(0.0, color="#5b6067", linewidth=0.8)
-    axes.set_xlim(-1.0, 1.0)
-    axes.set_yticks(rows, [driver.label for driver in told])
+    axes.set_xlim(-1.04, 1.04)
+    axes.set_ylim(len(told) - 0.4, -0.6)
+    axes.set_yticks(range(len(told)), [driver.label for driver in told])
     axes.grid(axis="y", visible=False)
-    axes.set_xlabel("pale: not beyond chance (5 %, Holm)")
+    axes.set_xlabel("pale, hollow: not beyond chance (5 %, Holm over all tests)")
     axes.legend(handles=keys, fontsize=8.0)
 
 
-def _draw_strongest(axes: Axes, table: pa.Table, summary: Summary) -> None:
-    drawn, told = margins(table), drivers(summary)
-    parameters = {cloud.name: cloud for cloud in clouds(table)}
-    if drawn is None or not parameters:
-        _say(axes, "no margins, or nothing drawn")
-        return
-    cloud = parameters[told[0].name] if told else next(iter(parameters.values()))
+def _draw_association(axes: Axes, row: float, found: Association, colour: str) -> None:
+    axes.barh(row, found.rho, 0.38, color=colour, alpha=1.0 if found.rho_is_sure else 0.35)
+    inside = colour if found.xi_is_sure else "white"
+    axes.plot(
+        *(found.xi, row, "D"), color=inside, markeredgecolor="#1c1e21", markersize=4.0, markeredgewidth=0.7, zorder=3
+    )
+
+
+def _draw_scatter(axes: Axes, table: pa.Table, cloud: Cloud, drawn: Margins) -> None:
+    from matplotlib.ticker import MaxNLocator
+
     axes.set_title(f"worst margin over {cloud.name}", loc="left", fontsize=9.5)
-    shown = shown_flights(table)
+    shown, beyond = shown_flights(table), edges(cloud, drawn)
     for verdict in present(table):
-        rows = shown[verdict]
-        axes.plot(
-            cloud.x[rows],
-            drawn.y[rows],
-            VERDICTS[verdict].marker,
-            color=VERDICTS[verdict].colour,
-            markersize=2.6 if len(rows) > _FEW else 4.5,
-            alpha=0.65,
-            markeredgewidth=0.9 if verdict == "lost" else 0.0,
-            rasterized=True,
-        )
+        looks, rows = VERDICTS[verdict], shown[verdict]
+        size = 2.6 if len(rows) > _FEW else 4.5
+        for edge, marker in {"": looks.marker, **_TRIANGLES}.items():
+            of = rows[beyond[rows] == edge]
+            axes.plot(
+                cloud.x[of],
+                drawn.y[of],
+                marker,
+                color=looks.colour,
+                markersize=size + 2.0 if edge else size,
+                alpha=0.65,
+                markeredgewidth=0.9 if marker == "x" else 0.0,
+                rasterized=True,
+            )
     axes.axhline(0.0, color=BOUND, linestyle="--", linewidth=1.1)
+    if cloud.course is not None:
+        axes.plot(cloud.course.x, cloud.course.y, color=COURSE_COLOUR, linewidth=2.0)
+    axes.xaxis.set_major_locator(MaxNLocator(_TICKS, steps=(1, 2, 2.5, 5, 10)))
     if cloud.names:
-        axes.set_xticks(range(len(cloud.names)), cloud.names)
-    axes.set_xlabel(cloud.label)
+        axes.set_xticks(range(len(cloud.names)), side_by_side(cloud.names, _TICK_ROOM))
+    axes.set_ylim(*drawn.ends)
     axes.set_ylabel("worst margin")
+    axes.set_xlabel(cloud.label)
 
 
 def _say(axes: Axes, what: str) -> None:

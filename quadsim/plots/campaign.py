@@ -3,40 +3,34 @@
 from __future__ import annotations
 
 import html
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
 import pyarrow as pa
 
-from quadsim.campaign.columns import numbers
-from quadsim.campaign.comparison import Comparison
 from quadsim.campaign.curves import (
-    Cloud,
+    Association,
     Driver,
     Histogram,
-    Margins,
-    clouds,
     convergence_range,
     converging,
     drivers,
     histograms,
-    margins,
-    present,
-    shown_flights,
 )
 from quadsim.campaign.estimates import Summary
+from quadsim.campaign.scatters import clouds, margins
 from quadsim.campaign.verdicts import VERDICTS
-from quadsim.palette import BOUND, LINES, REFERENCE
-from quadsim.plots.panels import BOTTOM, TOP, Plot, finished, panels, place
+from quadsim.palette import BOUND, LINES
+from quadsim.plots.margins import scatter_plot, verdict_keys
+from quadsim.plots.panels import BOTTOM, TOP, Plot, finished, finished_panels, panels, place
 
 if TYPE_CHECKING:
-    from plotly.graph_objects import Figure
+    from plotly.graph_objects import Bar, Scatter
 
 OUTCOMES: Final = {"with the worst margin": LINES[0], "with failure": LINES[1]}
 _LOG_TICKS: Final = [float(digit * 10**power) for power in range(7) for digit in (1, 2, 5)]
-_HEIGHT: Final = 230
-"""Of a row of panels whose horizontal axes have each a scale of its own [pixels]."""
 
 
 def campaign_plots(table: pa.Table, summary: Summary) -> dict[str, Plot]:
@@ -53,47 +47,13 @@ def campaign_plots(table: pa.Table, summary: Summary) -> dict[str, Plot]:
     if table.num_rows:
         found["convergence"] = _convergence(summary)
     if drawn := histograms(table):
-        found["metrics"] = _histograms(drawn, _verdict_keys(table))
+        found["metrics"] = _histograms(drawn, verdict_keys(table))
     if told := drivers(summary):
         found["drivers"] = _drivers(told)
-    drawn_margins, parameters = margins(table), clouds(table)
-    if drawn_margins is not None and parameters:
-        found["scatter"] = _scatter(table, parameters, drawn_margins)
+    drawn_margins = margins(table)
+    if drawn_margins is not None and (parameters := clouds(table, drawn_margins)):
+        found["scatter"] = scatter_plot(table, parameters, drawn_margins)
     return found
-
-
-def comparison_margins_plot(comparison: Comparison) -> Plot | None:
-    """The worst margins of all pairs, one campaign against the other; None where too few pairs have both."""
-    from plotly.graph_objects import Figure, Scatter
-
-    shown = comparison.shown_margins
-    if shown is None:
-        return None
-    figure = Figure()
-    a, b = (html.escape(name) for name in comparison.names)
-    ends = [shown.lowest, shown.highest]
-    line = {"color": REFERENCE, "width": 1.2, "dash": "dash"}
-    figure.add_trace(Scatter(x=ends, y=ends, mode="lines", line=line, hoverinfo="skip"))
-    for kind, colour in shown.colours.items():
-        of = shown.kind == kind
-        figure.add_trace(
-            Scatter(
-                x=shown.margins[of, 0].astype(np.float32),
-                y=shown.margins[of, 1].astype(np.float32),
-                customdata=shown.flights[of],
-                mode="markers",
-                name=html.escape(kind),
-                marker={"color": colour, "size": 5.5, "opacity": 0.75},
-                hovertemplate=f"flight %{{customdata}}<br>{a}: %{{x:.3g}}<br>{b}: %{{y:.3g}}"
-                "<extra>%{fullData.name}</extra>",
-            )
-        )
-    figure.update_xaxes(title={"text": f"worst margin, {a}", "standoff": 6}, range=ends)
-    figure.update_yaxes(title={"text": f"worst margin, {b}"}, range=ends)
-    figure.update_layout(margin={"l": 60, "r": 12, "t": 12, "b": BOTTOM}, hovermode="closest")
-    plot = finished(figure, "margins", "Worst margin, flight by flight", height=480, timed=False)
-    keys = tuple((kind, colour) for kind, colour in shown.colours.items() if (shown.kind == kind).any())
-    return replace(plot, key_colours=keys)
 
 
 def _convergence(summary: Summary) -> Plot:
@@ -164,85 +124,61 @@ def _histograms(drawn: list[Histogram], keys: tuple[tuple[str, str], ...]) -> Pl
         if histogram.name == "worst_margin" and edges[0] <= 0.0 <= edges[-1]:
             figure.add_vline(0.0, line={"color": BOUND, "width": 1.4, "dash": "dash"}, **place(panel))
     figure.update_layout(barmode="stack", bargap=0)
-    plot = _paneled(figure, "metrics", "How flights are distributed", len(drawn))
+    plot = finished_panels(figure, "metrics", "How flights are distributed", len(drawn))
     return replace(plot, key_colours=keys)
 
 
 def _drivers(told: list[Driver]) -> Plot:
-    from plotly.graph_objects import Bar, Figure
+    """Rank correlations as bars, and the measure of any dependence as diamonds over them."""
+    from plotly.graph_objects import Figure
 
     names = [html.escape(driver.label) for driver in told]
     figure = Figure()
-    for outcome, colour in OUTCOMES.items():
-        of_margin = outcome == "with the worst margin"
-        values = [driver.with_margin if of_margin else driver.with_failure for driver in told]
-        sure = [driver.margin_is_sure if of_margin else driver.failure_is_sure for driver in told]
-        if all(value is None for value in values):
-            continue
-        figure.add_trace(
-            Bar(
-                x=values,
-                y=names,
-                orientation="h",
-                name=outcome,
-                marker={"color": colour, "opacity": [1.0 if one else 0.35 for one in sure]},
-                hovertemplate="%{y}, %{fullData.name}: %{x:.3f}<extra></extra>",
-            )
-        )
-    figure.update_xaxes(range=[-1.0, 1.0], title={"text": "rank correlation", "standoff": 6}, zeroline=True)
-    figure.update_yaxes(automargin=True, autorange="reversed")
-    figure.update_layout(margin={"l": 12, "r": 12, "t": 6, "b": BOTTOM}, bargap=0.35, barmode="group")
+    keys = []
+    for (outcome, colour), offset in zip(OUTCOMES.items(), (-0.19, 0.19), strict=True):
+        found = [driver.margin if outcome == "with the worst margin" else driver.failure for driver in told]
+        if any(found):
+            keys.append((outcome, colour))
+            figure.add_traces([*_measures(names, found, outcome, colour, offset)])
+    figure.update_xaxes(
+        range=[-1.04, 1.04],
+        title={"text": "bars: rank correlation; diamonds: xi, of any dependence", "standoff": 6},
+        zeroline=True,
+    )
+    ticks = {"tickmode": "array", "tickvals": list(range(len(names))), "ticktext": names}
+    figure.update_yaxes(automargin=True, range=[len(names) - 0.4, -0.6], **ticks)
+    figure.update_layout(margin={"l": 12, "r": 12, "t": 6, "b": BOTTOM}, barmode="overlay", hovermode="closest")
     plot = finished(figure, "drivers", "What goes with it", height=70 + 36 * len(told), timed=False)
-    return replace(plot, key_colours=tuple((trace.name, OUTCOMES[trace.name]) for trace in figure.data))
+    return replace(plot, key_colours=tuple(keys))
 
 
-def _scatter(table: pa.Table, parameters: list[Cloud], drawn: Margins) -> Plot:
-    from plotly.graph_objects import Scatter
+def _measures(
+    names: list[str], found: Sequence[Association | None], outcome: str, colour: str, offset: float
+) -> Iterator[Bar | Scatter]:
+    """Both measures of each drawn number with one outcome, its bars so far beside the middle of its line."""
+    from plotly.graph_objects import Bar, Scatter
 
-    keys = _verdict_keys(table)
-    figure = panels([html.escape(cloud.label) for cloud in parameters], shared=False)
-    shown = shown_flights(table)
-    numbered = numbers(table, "flight").astype(np.int32)
-    for panel, cloud in enumerate(parameters):
-        for verdict, colour in keys:
-            rows = shown[verdict]
-            figure.add_trace(
-                Scatter(
-                    x=cloud.x[rows].astype(np.float32),
-                    y=drawn.y[rows].astype(np.float32),
-                    customdata=numbered[rows],
-                    mode="markers",
-                    name=verdict,
-                    marker={"color": colour, "size": 4.5, "opacity": 0.7, "symbol": VERDICTS[verdict].symbol},
-                    hovertemplate="flight %{customdata}: %{fullData.name}<br>"
-                    + (
-                        "margin %{y:.3g}"
-                        if cloud.names
-                        else f"{html.escape(cloud.label)} %{{x:.4g}}, margin %{{y:.3g}}"
-                    )
-                    + "<extra></extra>",
-                ),
-                **place(panel),
-            )
-        if cloud.names:
-            ticks = {"tickvals": list(range(len(cloud.names))), "ticktext": [html.escape(name) for name in cloud.names]}
-            figure.update_xaxes(**ticks, **place(panel))
-        figure.add_hline(0.0, line={"color": BOUND, "width": 1.2, "dash": "dash"}, **place(panel))
-    high = max(1.0, float(np.nanmax(drawn.y)))
-    figure.update_yaxes(range=[drawn.foot - 0.05 * (high - drawn.foot), high + 0.04 * (high - drawn.foot)])
-    figure.update_layout(hovermode="closest")
-    plot = _paneled(figure, "scatter", "Worst margin over each drawn parameter", len(parameters))
-    return replace(plot, key_colours=keys)
-
-
-def _verdict_keys(table: pa.Table) -> tuple[tuple[str, str], ...]:
-    return tuple((verdict, VERDICTS[verdict].colour) for verdict in present(table))
-
-
-def _paneled(figure: Figure, key: str, title: str, count: int) -> Plot:
-    figure.update_annotations(font={"size": 13})
-    figure.update_layout(margin={"l": 52, "r": 12, "t": TOP, "b": 30})
-    return finished(figure, key, title, height=-(-count // 2) * _HEIGHT + TOP + 30, timed=False)
+    rows = [i for i, one in enumerate(found) if one]
+    there = [one for one in found if one]
+    told = {"customdata": [names[i] for i in rows], "name": outcome, "y": [i + offset for i in rows]}
+    yield Bar(
+        x=[one.rho for one in there],
+        orientation="h",
+        width=0.36,
+        marker={"color": colour, "opacity": [1.0 if one.rho_is_sure else 0.35 for one in there]},
+        hovertemplate="%{customdata}, %{fullData.name}: rank correlation %{x:.3f}<extra></extra>",
+        **told,
+    )
+    yield Scatter(
+        x=[one.xi for one in there],
+        mode="markers",
+        marker={
+            **{"color": colour, "size": 10, "line": {"color": "white", "width": 1}},
+            "symbol": ["diamond" if one.xi_is_sure else "diamond-open" for one in there],
+        },
+        hovertemplate="%{customdata}, %{fullData.name}: xi %{x:.3f}<extra></extra>",
+        **told,
+    )
 
 
 def _faded(colour: str, opacity: float) -> str:

@@ -16,6 +16,9 @@ if TYPE_CHECKING:
 
 PANEL_HEIGHT: Final = 210
 TOP, BOTTOM = 34, 46
+_OWN_HEIGHT: Final = 230
+"""Of a row of panels whose horizontal axes have each a scale of its own [pixels]."""
+_OWN_TICKS: Final = 5
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,12 +52,13 @@ def plotly_script() -> str:
 def panels(labels: Sequence[str], *, shared: bool = True) -> Figure:
     """An empty figure of two columns, its panels named row by row; they share their horizontal axes, or have own ones.
 
-    The last place stays empty where the labels are odd in number.
+    The last place stays empty where the labels are odd in number.  No tick label is turned: it would run into the next
+    row.
     """
     from plotly.subplots import make_subplots
 
     rows = -(-len(labels) // 2)
-    return make_subplots(
+    figure = make_subplots(
         rows=rows,
         cols=2,
         subplot_titles=list(labels),
@@ -63,6 +67,8 @@ def panels(labels: Sequence[str], *, shared: bool = True) -> Figure:
         vertical_spacing=0.14 / max(rows - 1, 1) if shared else 0.22 / rows,
         specs=[[{}, {} if 2 * row + 1 < len(labels) else None] for row in range(rows)],
     )
+    figure.update_xaxes(tickangle=0)
+    return figure
 
 
 def place(panel: int) -> dict[str, int]:
@@ -91,3 +97,11 @@ def finished(figure: Figure, key: str, title: str, *, height: int, timed: bool) 
     figure.update_layout(template="none", showlegend=False, height=height)
     text = str(figure.to_json()).replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
     return Plot(key=key, title=title, height=height, timed=timed, json=text)
+
+
+def finished_panels(figure: Figure, key: str, title: str, count: int) -> Plot:
+    """So many panels of `panels(..., shared=False)`."""
+    figure.update_annotations(font={"size": 13})
+    figure.update_xaxes(nticks=_OWN_TICKS)
+    figure.update_layout(margin={"l": 52, "r": 12, "t": TOP, "b": BOTTOM})
+    return finished(figure, key, title, height=-(-count // 2) * _OWN_HEIGHT + TOP + BOTTOM, timed=False)

@@ -10,6 +10,8 @@ import pytest
 
 from quadsim.campaign.comparison import compare
 from quadsim.campaign.comparison_report import write_comparison_report
+from quadsim.campaign.events import EVENT_NAMES
+from quadsim.campaign.statistics import holm
 from quadsim.errors import InputError, OutputError
 
 MakeCampaign = Callable[..., pa.Table]
@@ -38,6 +40,32 @@ def test_a_better_controller_is_found_to_be(thousand: pa.Table, better: pa.Table
     assert failure.lower < failure.difference < failure.upper < 0.0
     assert found.sentence.startswith("robust is better than paper: of 1000 paired flights, ")
     assert compare(better, thousand, NAMES).verdict == "worse"
+
+
+def test_losses_are_compared_beside_failures(make_campaign: MakeCampaign) -> None:
+    """Four of forty lost against none read as not distinguishable, without a word of it."""
+    one, other = make_campaign(40, seed=1, severity=100.0), make_campaign(40, seed=1, severity=100.0)
+    verdicts = ["lost"] * 4 + ["violated"] * 36
+    found = compare(changed(one, "verdict", verdicts), changed(other, "verdict", ["violated"] * 40), NAMES)
+    assert found.verdict == "not distinguishable"
+    lost = next(event for event in found.events if event.event == "lost")
+    assert (lost.counts, lost.p, lost.p_holm) == ((4, 0), 0.125, 0.125)
+    told = "Flights with robust and with paper differ in count, but not beyond chance, in lost (0 and 4, p = 0.12) ("
+    assert told in found.sentence
+    many = ["lost"] * 12 + ["violated"] * 28
+    found = compare(changed(one, "verdict", many), changed(other, "verdict", ["violated"] * 40), NAMES)
+    assert "not distinguishable by their failures" in found.sentence
+    assert "differ beyond chance in lost (0 and 12, p < 0.001) (McNemar's exact test of each event" in found.sentence
+    assert "| lost | 12 (30.0 %) | 0 (0 %) | 12 | 0 | 0 | p < 0.001 | **p < 0.001** |" in found.to_markdown()
+
+
+def test_every_event_and_constraint_is_compared_and_corrected(thousand: pa.Table, better: pa.Table) -> None:
+    found = compare(thousand, better, NAMES)
+    assert [event.event for event in found.events] == [*EVENT_NAMES, "roll not held", "slew not held"]
+    tested = [event for event in found.events if event.only_a + event.only_b]
+    assert [event.p_holm for event in tested] == holm([event.p for event in tested])
+    assert all(event.p_holm == 1.0 for event in found.events if event not in tested)
+    assert found.to_json()["events"]["lost"]["p_holm"] == next(e for e in found.events if e.event == "lost").p_holm
 
 
 def test_metrics_are_compared_where_both_were_completed(thousand: pa.Table, better: pa.Table) -> None:

@@ -10,10 +10,11 @@ import pyarrow as pa
 import pytest
 from browser import open_page
 
-from quadsim.campaign.curves import clouds, histograms, margins, shown_flights, thinning
+from quadsim.campaign.curves import histograms
 from quadsim.campaign.estimates import estimate
 from quadsim.campaign.report import write_report
-from quadsim.campaign.wording import interval, percent, signed_points
+from quadsim.campaign.scatters import clipping, clouds, margins, shown_flights, thinning
+from quadsim.campaign.wording import interval, percent, side_by_side, signed_points
 from quadsim.errors import OutputError
 from quadsim.plots.campaign import campaign_plots
 
@@ -151,16 +152,67 @@ def test_a_lost_flight_does_not_flatten_the_others(thousand: pa.Table) -> None:
     table = thousand.set_column(i, thousand.schema.field(i), pa.array(values))
     drawn = margins(table)
     assert drawn is not None
-    assert drawn.foot > -2.5
-    assert drawn.y[0] == drawn.y[1] == drawn.foot
-    assert drawn.at_foot == 1 + sum(value is None for value in values)
+    assert drawn.ends[0] > -0.6
+    assert drawn.y[0] == drawn.y[1] == np.min(drawn.y)
+    none = sum(value is None for value in values)
+    assert np.count_nonzero(drawn.edge == "down") == 1 + none
+    told = f"{drawn.shown[0]:.3g}, down to -1e+06; {none} flights without a margin, at the foot."
+    assert clipping(drawn, []).endswith(f"1 flight with a margin below {told}")
+    y = drawn.y[drawn.edge == ""]
+    assert np.ptp(y) > 0.8 * (drawn.ends[1] - drawn.ends[0]), "the others fill the axis"
     assert next(one for one in histograms(table) if one.name == "worst_margin").label.endswith(
         "1 beyond, in the end bars"
     )
 
 
+def test_outliers_are_drawn_at_the_edge_and_told(thousand: pa.Table, tmp_path: Path) -> None:
+    table = thousand.slice(0, 200)
+    for name, far in (("draw.wind", {3: 400.0, 5: -90.0}), ("worst_margin", {7: 55.0})):
+        values = [far.get(i, value) for i, value in enumerate(table[name].to_pylist())]
+        i = table.column_names.index(name)
+        table = table.set_column(i, table.schema.field(i), pa.array(values))
+    drawn = margins(table)
+    assert drawn is not None
+    assert drawn.y[7] == drawn.y.max() < 1.3
+    wind = next(cloud for cloud in clouds(table, drawn) if cloud.name == "wind")
+    assert wind.x.max() < 7.0
+    assert (wind.edge[3], wind.edge[5], drawn.edge[7]) == ("right", "left", "up")
+    assert np.count_nonzero(wind.edge != "") == 2
+    text = " ".join(without_scripts(write(tmp_path / "out", table)).split())
+    assert re.search(r"1 flight with a margin above 0\.\d+, up to 55;", text)
+    assert re.search(r"1 flight with wind below \S+, down to -90; 1 flight with wind above 5\.\d+, up to 400\.", text)
+    assert "to 400" in (tmp_path / "out" / "campaign.svg").read_text()
+    figure = json.loads(campaign_plots(table, estimate(table))["scatter"].json)
+    symbols = [trace["marker"]["symbol"] for trace in figure["data"] if trace["mode"] == "markers"]
+    edges = [symbol for one in symbols if isinstance(one, list) for symbol in one]
+    assert edges.count("triangle-right") == edges.count("triangle-left") == 1
+    assert edges.count("triangle-up") == 9, "in every panel"
+
+
+def test_a_curve_is_drawn_over_every_number(thousand: pa.Table) -> None:
+    drawn = margins(thousand)
+    assert drawn is not None
+    for cloud in clouds(thousand, drawn):
+        assert (cloud.course is None) is bool(cloud.names), cloud.name
+    figure = json.loads(campaign_plots(thousand, estimate(thousand))["scatter"].json)
+    assert sum(trace["mode"] == "lines" for trace in figure["data"]) == 7
+
+
+def test_no_tick_label_is_turned(thousand: pa.Table) -> None:
+    """Turned ones run into the next row of panels."""
+    for plot in campaign_plots(thousand, estimate(thousand)).values():
+        axes = [axis for key, axis in json.loads(plot.json)["layout"].items() if key.startswith("xaxis")]
+        assert axes
+        assert plot.key == "drivers" or all(axis["tickangle"] == 0 for axis in axes), plot.key
+    assert side_by_side(["piqp-multistage-condensed", "daqp", "x" * 30, "of two words"], 40) == [
+        *("piqp-mult\nistage-c…", "daqp", "x" * 9 + "\n" + "x" * 8 + "…", "of two\nwords"),
+    ]
+
+
 def test_names_have_places(thousand: pa.Table) -> None:
-    cloud = next(cloud for cloud in clouds(thousand) if cloud.name == "solver")
+    drawn = margins(thousand)
+    assert drawn is not None
+    cloud = next(cloud for cloud in clouds(thousand, drawn) if cloud.name == "solver")
     assert cloud.names == ("daqp", "gain", "piqp")
     assert [cloud.names[round(x)] for x in cloud.x] == thousand["draw.solver"].to_pylist()
 

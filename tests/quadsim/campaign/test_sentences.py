@@ -8,9 +8,10 @@ import pyarrow as pa
 import pytest
 from scipy import stats
 
+from quadsim.campaign.driver_tables import driver_table, group_table, level_tables
 from quadsim.campaign.estimates import estimate
 from quadsim.campaign.sentences import campaign_sentences
-from quadsim.campaign.tables import driver_table, group_table, level_tables, worst_draws_table, worst_table
+from quadsim.campaign.tables import worst_draws_table, worst_table
 from quadsim.campaign.wording import listing
 
 MakeCampaign = Callable[..., pa.Table]

@@ -15,7 +15,6 @@ from quadsim.campaign.statistics import (
     paired_difference,
     paired_shares,
     proportion,
-    rank_correlation,
     upper_bound,
     upper_bounds,
 )
@@ -58,42 +57,6 @@ def test_intervals_cover_simulated_campaigns() -> None:
     found = [proportion(int(count), 300) for count in rng.binomial(300, 0.04, 2000)]
     covered = np.mean([one.lower <= 0.04 <= one.upper for one in found])
     assert 0.95 <= covered < 0.985
-
-
-def test_rank_correlation_is_scipys() -> None:
-    rng = np.random.default_rng(2)
-    x, y = rng.normal(size=200), np.round(rng.normal(size=200), 1)  # with ties
-    y += 0.2 * x
-    found = rank_correlation(x, y)
-    expected = stats.spearmanr(x, y)
-    assert found is not None
-    assert (found.rho, found.p, found.flights) == pytest.approx((expected.statistic, expected.pvalue, 200), rel=1e-9)
-
-
-def test_rank_correlation_of_few_counts_all_permutations() -> None:
-    x, y = np.array([3.0, 1.0, 4.0, 1.5, 5.0]), np.array([0.0, 0.0, 1.0, 0.0, 1.0])
-    found = rank_correlation(x, y)
-    assert found is not None
-    rho = [stats.spearmanr(x, np.array(order)).statistic for order in itertools.permutations(y)]
-    beyond = np.mean(np.array(rho) >= found.rho - 1e-12)
-    assert found.rho == pytest.approx(stats.spearmanr(x, y).statistic)
-    assert found.p == pytest.approx(2.0 * beyond)
-    perfect = rank_correlation(np.arange(5.0), np.arange(5.0))
-    assert perfect is not None
-    assert (perfect.rho, perfect.p) == pytest.approx((1.0, 2.0 / 120.0))
-
-
-def test_rank_correlation_of_what_is_not_there() -> None:
-    x = np.arange(20.0)
-    assert rank_correlation(x, np.zeros(20)) is None
-    assert rank_correlation(x[:2], x[:2]) is None
-    assert rank_correlation(x, np.full(20, np.nan)) is None
-    gaps = rank_correlation(np.append(x, np.nan), np.append(-x, 3.0))
-    assert gaps is not None
-    assert (gaps.rho, gaps.flights) == (pytest.approx(-1.0), 20)
-    with_loss = rank_correlation(x, np.where(x > 17.0, -np.inf, -x))
-    assert with_loss is not None
-    assert with_loss.rho < -0.99
 
 
 def test_holm_is_holms() -> None:

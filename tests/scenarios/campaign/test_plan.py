@@ -10,6 +10,7 @@ import tomlkit
 
 from quadsim.errors import FileError, InputError, UnknownNameError
 from scenarios.campaign.plan import Plan, campaign_names, campaign_path, load_plan
+from scenarios.loading import load_scenario
 
 MASS = {
     "name": "mass",
@@ -121,6 +122,18 @@ def test_campaigns_on_the_same_draws_differ_in_their_controller_alone() -> None:
     assert [paper.identity(k) for k in range(20)] == [robust.identity(k) for k in range(20)]
     same = robust.of(3).model_copy(update={"controller": paper.of(3).controller, "name": paper.of(3).name})
     assert same == paper.of(3)
+
+
+def test_the_nominal_campaign_is_of_small_errors_at_the_papers_own_tolerance() -> None:
+    """Its controller, its bounds and its tolerance at them; lag to 8 ms, mass within 5 %, perfect sensors."""
+    nominal, paper = load_plan("paper-nominal"), load_scenario("paper-constrained")
+    assert nominal.scenario.controller == paper.controller
+    assert nominal.scenario.sensors == paper.sensors
+    tilts = {limit.name: limit for limit in paper.constraints if limit.name in ("roll", "pitch", "speed", "slew")}
+    assert {limit.name: limit for limit in nominal.scenario.constraints if limit.name in tilts} == tilts
+    drawn = [nominal.draws.values(flight) for flight in range(50)]
+    assert all(0.0 < values["lag"] <= 0.008 and abs(values["mass"] - 1.0) <= 0.05 for values in drawn)
+    assert nominal.spec.flights == 1000
 
 
 # --- what is refused -----------------------------------------------------------------------------------------------
