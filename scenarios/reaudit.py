@@ -26,6 +26,7 @@ from scenarios.bases import read_whole
 from scenarios.build import build_limits
 from scenarios.loading import parse_scenario
 from scenarios.spec import Scenario
+from scenarios.spec.own import LAWS, is_own
 
 TABLES: Final = (FLIGHT_FILE, PLANT_FILE, TIMING_FILE)
 OURS: Final = {*TABLES, HORIZON_FILE, rundir.SCENARIO_FILE, rundir.RECORDING_FILE, rundir.VIDEO_FILE}
@@ -103,13 +104,21 @@ def reaudit(directory: Path, *, products: bool = True) -> Reaudit:
 def stored_scenario(directory: Path) -> Scenario:
     """The scenario of a run, as its directory has it; no other file is read for it.
 
+    Its controller is not needed: another one stands for one of an installed package that is not installed here.
+
     Raises:
         InputError: it is missing or malformed.
     """
     path = directory / rundir.SCENARIO_FILE
     if not path.is_file():
         raise FileError(path, "is missing or no file")
-    return parse_scenario(read_whole(path), source=str(path))
+    data = read_whole(path)
+    controller = data.get("controller")
+    controller = controller if isinstance(controller, dict) else {}
+    name = controller.get("type")
+    if isinstance(name, str) and name not in LAWS and not is_own(name):
+        data["controller"] = {**controller, "type": "elsewhere:Controller"}
+    return parse_scenario(data, source=str(path))
 
 
 def _changed(directory: Path, summary: Mapping[str, Any], *, products: bool) -> Iterator[str]:

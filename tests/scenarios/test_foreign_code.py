@@ -160,3 +160,15 @@ def test_an_entry_point_is_found(here: Path, monkeypatch: pytest.MonkeyPatch) ->
     monkeypatch.setattr(metadata, "entry_points", lambda group: metadata.EntryPoints([entry]))
     code = find_code(OwnSpec(type="theirs"))
     assert (code.module, code.attribute, code.file) == ("theirs_7", "Hover", here / "theirs_7.py")
+
+
+def test_a_run_of_a_package_that_is_not_installed_here_is_checked(
+    here: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    entry = metadata.EntryPoint(name="theirs", value="theirs_7:Hover", group="quadsim.controllers")
+    with monkeypatch.context() as installed:
+        installed.setattr(metadata, "entry_points", lambda group: metadata.EntryPoints([entry]))
+        assert main(["run", "theirs.toml", "--set", 'controller.type="theirs"', *BARE, "--out", "run"]) == EXIT_DONE
+    capsys.readouterr()
+    assert main(["check", "run"]) == EXIT_DONE
+    assert capsys.readouterr().err == ""
