@@ -33,6 +33,8 @@ VIDEO_FILE: Final = "flight.mp4"
 FIGURES_DIR: Final = "figures"
 KIND: Final = "run"
 """What `quadsim.outputs` calls a run directory."""
+UNLISTED: Final = (SUMMARY_FILE, MANIFEST_FILE, LOCK_FILE)
+"""Files of ours whose hashes the summary does not have."""
 SEAL: Final = "summary"
 """Under which `timing.parquet` keeps the summary's digest."""
 
@@ -134,7 +136,7 @@ def file_hashes(directory: Path) -> dict[str, str]:
     """
     paths = sorted(path for path in directory.rglob("*") if path.is_file())
     names = [path.relative_to(directory).as_posix() for path in paths]
-    return {name: _hash(directory / name) for name in names if name not in (SUMMARY_FILE, MANIFEST_FILE, LOCK_FILE)}
+    return {name: _hash(directory / name) for name in names if name not in UNLISTED}
 
 
 def _hash(path: Path) -> str:

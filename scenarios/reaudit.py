@@ -137,8 +137,8 @@ def _changed(directory: Path, summary: Mapping[str, Any], *, products: bool) -> 
 
 
 def _unlisted(directory: Path, summary: Mapping[str, Any]) -> list[str]:
-    """Files in a run's directory that its summary does not list, sorted."""
-    listed = {rundir.SUMMARY_FILE, *summary["files"]}
+    """Files in a run's directory that its summary does not list, but for our own bookkeeping, sorted."""
+    listed = {*rundir.UNLISTED, *summary["files"]}
     found = (path.relative_to(directory).as_posix() for path in directory.rglob("*") if not path.is_dir())
     return sorted(name for name in found if name not in listed)
 
