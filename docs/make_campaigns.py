@@ -127,8 +127,8 @@ def page(results: list[Result]) -> str:
             f"({machine['processor']}, {machine['cores']} cores), from the campaigns that ship. What is drawn, from "
             "where, stands in\n[paper-robustness](../scenarios/campaigns/paper-robustness.toml);\n"
             "[paper-robustness-robust](../scenarios/campaigns/paper-robustness-robust.toml) has the same draws for the "
-            "robust controller, and\n[paper-nominal](../scenarios/campaigns/paper-nominal.toml) draws small errors alone "
-            "for the paper's controller. How campaigns work: [campaigns.md](campaigns.md).\n",
+            "robust controller, and\n[paper-nominal](../scenarios/campaigns/paper-nominal.toml) draws small errors "
+            "alone for the paper's controller. How campaigns work: [campaigns.md](campaigns.md).\n",
             section(violations(results)),
             first_to_break(nominal),
             f"## The one against the other\n\n{comparison.sentence} {pairing(comparison)}\n",
