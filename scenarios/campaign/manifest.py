@@ -47,7 +47,7 @@ def begin(plan: Plan, directory: Path) -> dict[str, Any]:
     texts = _texts(plan)
     for name, text in texts.items():
         path = directory / name
-        if path.exists() and path.read_bytes() != text.encode():
+        if path.exists() and (not path.is_file() or path.read_bytes() != text.encode()):  # a pipe is read for ever
             raise OutputError(path, "is there already, and is no file of this campaign; choose another --out")
     for name, text in texts.items():
         write_atomically(directory / name, text)
