@@ -29,7 +29,7 @@ TABLES = ("--no-video", "--no-recording", "--no-figures")
 NASTY = (
     "[/bold]",
     "[red]x",
-    "[link=file:///etc/passwd]x[/link]",
+    "[link=file:///decoy]x[/link]",
     "[@click=app.bell]x",
     ":smile:",
     "\x1b[2J\x1b]0;title\x07",
