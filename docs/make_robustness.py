@@ -61,7 +61,7 @@ def asked(ladder: Ladder) -> Grid:
         note="Disturbances beyond the size that the tightening states for those about each axis, "
         f"{STATED.angular_acceleration:g} rad/s^2, may tilt it further: a rotor that loses {100 * WORN:g} % makes "
         f"{worn_rotor():.0f} rad/s^2 at hover, and half of that in all by half. Measurement noise is not counted. "
-        "Steps are timed in further flights, one process at a time, each step the best of three.",
+        "Steps are timed in further flights, one process at a time, each step the median of three.",
     )
 
 

@@ -55,7 +55,7 @@ def ladder_tables(ladder: Ladder) -> list[Grid]:
             "step",
             "99th percentile of the controller's step, ms",
             lambda flight: Cell(text=ABSENT if flight.step_p99 is None else f"{flight.step_p99:.2f}"),
-            "Processor time, in flights flown for it one process at a time, each step the best of three; "
+            "Processor time, in flights flown for it one process at a time, each step the median of three; "
             f"{ABSENT} where none was.",
         ),
     ]

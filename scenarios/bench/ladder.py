@@ -61,7 +61,7 @@ def climb(
     """Fly every controller in every condition.
 
     Flights are spread over processes; results are the same however many there are.  Steps are timed in further flights,
-    one process at a time, each step the best of `TIMED` equal ones: those of `FULL` in every condition, and of every
+    one process at a time, each step the median of `TIMED` equal ones: those of `FULL` in every condition, and of every
     controller in the first one.
 
     Args:
@@ -116,9 +116,9 @@ def fly_cell(cell: Cell) -> LadderFlight:
 
 
 def time_cell(cell: Cell) -> float | None:
-    """The 99th percentile of the step's processor time [ms], each step the best of `TIMED` equal flights."""
+    """The 99th percentile of the step's processor time [ms], each step the median of `TIMED` equal flights."""
     times = [_fly(cell)[1] for _ in range(TIMED)]
-    return metrics.percentiles(np.min(times, axis=0))["p99"] if times[0].size else None
+    return metrics.percentiles(np.median(times, axis=0))["p99"] if times[0].size else None
 
 
 def _fly(cell: Cell) -> tuple[FlightLog, Array, Scenario]:
