@@ -80,6 +80,7 @@ def _engine(options: Namespace) -> Engine:
 
 def replay(options: Namespace) -> int:
     """`quadsim replay`."""
+    from quadsim.campaign.table import MEMORY, TIMEOUT
     from scenarios.campaign.console import print_replay
     from scenarios.campaign.replay import recorded_flight
     from scenarios.campaign.replay import replay as fly_again
@@ -92,6 +93,9 @@ def replay(options: Namespace) -> int:
         print(
             f"quadsim: other {', '.join(flight.otherwise)} flew that campaign, so numbers may differ", file=sys.stderr
         )
+    if flight.row["verdict"] in (TIMEOUT, MEMORY):
+        ended = f"quadsim: flight {flight.number} was ended in the campaign ({flight.row['reason']})"
+        print(f"{ended}; here nothing ends it but Ctrl-C", file=sys.stderr)
     with console.progress_bars(enabled=not options.json) as progress:
         _, differing = fly_again(flight, target, outputs, progress)
     print_summary(rundir.read_summary(target), options, where=str(target))

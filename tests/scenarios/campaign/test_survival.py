@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import gc
+import json
 import math
 import mmap
 import multiprocessing.forkserver
@@ -22,16 +23,20 @@ from pathlib import Path
 import numpy as np
 import psutil
 import pytest
+import tomlkit
 from campaign_pilots import ToyPilot, known, living, until, value_of
 from hostile_controller import KINDS
-from safety_campaign import measure, planned
+from safety_campaign import measure, planned, write
 
 from quadsim.campaign.table import ERROR, Row
 from quadsim.plant import Plant
 from scenarios.campaign.engine import MOST_DEATHS
 from scenarios.campaign.local import LocalEngine
+from scenarios.campaign.plan import load_plan
 from scenarios.campaign.spec import LimitsSpec
 from scenarios.campaign.traces import Traces
+from scenarios.cli import EXIT_DONE, EXIT_FAILED, main
+from scenarios.problems import ScenarioError
 from scenarios.runner import Progress, silent
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -47,6 +52,55 @@ def test_hostile_flights_change_no_other_flight_and_leave_nobody() -> None:
     assert counts["rows differ"] == counts["unexpected verdicts"] == counts["leftover processes"] == 0
     assert counts["hostile: timeout"] >= 5
     assert counts["hostile: memory"] == 4
+
+
+def test_flights_that_met_a_limit_stand_in_every_page_and_gate(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    file = write(tmp_path, ["hangs_in_python", "takes_memory_at_once", "calm"], armed=True)
+    gate = ["--require", "P(timeout) < 0.01 @ 95%"]
+    assert main(["campaign", str(file), "--out", "c", *gate]) == EXIT_FAILED
+    said = " ".join(capsys.readouterr().out.split())
+    assert "2 of 3 flights failed" in said  # violated is what counts where the file does not say
+    assert "1 was ended since it took too long, 1 was ended since it took too much memory" in said
+    summary = json.loads((tmp_path / "c" / "summary.json").read_text())
+    assert [summary["verdicts"][name] for name in ("satisfied", "timeout", "memory")] == [1, 1, 1]
+    assert [summary["events"][name]["count"] for name in ("failure", "timeout", "memory", "lost")] == [2, 1, 1, 0]
+    assert [flight["verdict"] for flight in summary["worst"]] == ["timeout", "memory", "satisfied"]
+    page = (tmp_path / "c" / "index.html").read_text(encoding="utf-8")
+    assert "limits.step is 1 s" in page
+    assert "limits.memory is 300 MB" in page
+    assert main(["compare", "c", "c", "--out", "pairs"]) == EXIT_DONE
+
+
+@pytest.mark.parametrize(
+    ("limits", "message"),
+    [
+        ({"step": 0.0}, "limits.step must be > 0.0; got 0.0"),
+        ({"memory": 10.0}, "limits.memory must be >= 100.0; got 10.0"),
+        ({"flight": "long"}, "limits.flight must be a number; got 'long'"),
+        ({"steps": 1.0}, "limits.steps is not a field"),
+    ],
+)
+def test_limits_that_are_none_are_refused(limits: dict[str, object], message: str, tmp_path: Path) -> None:
+    file = write(tmp_path, ["calm"], armed=False)
+    data = tomlkit.parse(file.read_text())
+    data["limits"] = limits
+    file.write_text(tomlkit.dumps(data))
+    with pytest.raises(ScenarioError) as refused:
+        load_plan(str(file))
+    assert message in str(refused.value)
+
+
+def test_limits_have_defaults_that_are_written_out(tmp_path: Path) -> None:
+    file = write(tmp_path, ["calm"], armed=False)
+    data = tomlkit.parse(file.read_text())
+    del data["limits"]
+    file.write_text(tomlkit.dumps(data))
+    plan = load_plan(str(file))
+    assert plan.spec.limits == LimitsSpec(flight=600.0, step=60.0, memory=2000.0)
+    assert "[limits]" in plan.spec.to_toml()
 
 
 def test_calm_flights_stand_between_hostile_ones() -> None:
