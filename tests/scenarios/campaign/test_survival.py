@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import gc
 import json
@@ -135,11 +136,11 @@ class Hostile(ToyPilot):
         return {**super().lost(flight, reason), "verdict": verdict}
 
 
-def fly(harm: Callable[[], object], **limits: float) -> tuple[Row, list[Row], float]:
-    """Row 5, all others, and the seconds that all took."""
-    began = clock.perf_counter()
-    rows = known(list(LocalEngine(2).answers(Hostile(harm=harm, limits=LimitsSpec(**limits)), FLIGHTS)))
-    return rows[5], [row for row in rows if row["flight"] != 5], clock.perf_counter() - began
+def fly(harm: Callable[[], object], diary: Path | None = None, **limits: float) -> tuple[Row, list[Row]]:
+    """Row 5, and all others."""
+    pilot = Hostile(harm=harm, diary=diary, limits=LimitsSpec(**limits))
+    rows = known(list(LocalEngine(2).answers(pilot, FLIGHTS)))
+    return rows[5], [row for row in rows if row["flight"] != 5]
 
 
 OTHERS = [row for row in ALL if row["flight"] != 5]
@@ -150,13 +151,14 @@ def hang() -> None:
         pass
 
 
-def test_a_step_that_takes_too_long_is_ended_and_not_tried_again() -> None:
-    row, others, seconds = fly(hang, step=0.5)
+def test_a_step_that_takes_too_long_is_ended_and_not_tried_again(tmp_path: Path) -> None:
+    row, others = fly(hang, tmp_path / "diary", step=0.5)
     assert row["verdict"] == "timeout"
-    assert row["reason"].startswith("a control period took 0.")
-    assert row["reason"].endswith("s, and limits.step is 0.5 s")
+    assert row["reason"].startswith("a control period took ")
+    assert row["reason"].endswith(" s, and limits.step is 0.5 s")
     assert others == OTHERS
-    assert seconds < 4.0  # ten times would be five
+    begun = [int(line.split()[0]) for line in (tmp_path / "diary").read_text().splitlines()]
+    assert begun.count(5) == 1
 
 
 class _Slow(Hostile):
@@ -203,7 +205,7 @@ def share_memory() -> None:
     ids=["its own", "shared"],
 )
 def test_too_much_memory_is_a_verdict(harm: Callable[[], object], said: str) -> None:
-    row, others, _ = fly(harm, memory=200.0)
+    row, others = fly(harm, memory=200.0)
     assert row["verdict"] == "memory"
     assert said in row["reason"]
     assert others == OTHERS
@@ -263,17 +265,18 @@ def test_children_of_a_controller_answer_nothing_and_end_with_its_flight(harm: C
     assert known(rows) == ALL
 
 
-def test_the_server_may_be_killed_by_every_flight() -> None:
-    """Whoever flies goes on; no flight is blamed."""
-    assert known(list(LocalEngine(2).answers(_Regicide(asleep=0.01), FLIGHTS))) == ALL
-
-
 class _Regicide(ToyPilot):
     def fly(self, flight: int, progress: Progress = silent) -> Row:
-        above = psutil.Process().parents()
-        if above[1].pid > 1 and "forkserver" in " ".join(above[1].cmdline()):
-            above[1].kill()
+        with contextlib.suppress(psutil.Error):
+            server = psutil.Process().parents()[1]
+            if "forkserver" in " ".join(server.cmdline()):
+                server.kill()
         return super().fly(flight)
+
+
+def test_the_server_may_be_killed_by_every_flight() -> None:
+    """Whoever flies goes on; no flight is blamed."""
+    assert known(list(LocalEngine(2).answers(_Regicide(asleep=0.01), FLIGHTS[:5]))) == ALL[:5]
 
 
 def test_the_resource_tracker_may_be_killed_without_a_word() -> None:
@@ -307,8 +310,9 @@ class _Talker(ToyPilot):
 
     def fly(self, flight: int, progress: Progress = silent) -> Row:
         if flight == 5:
-            outbox = max(number for number in range(3, 40) if _is_pipe(number))
-            os.write(outbox, bytes([3]) + bytes(40))
+            for number in range(3, 64):
+                if _is_pipe(number) and number != resource_tracker._resource_tracker._fd:
+                    os.write(number, bytes([3]) + bytes(40))
         return super().fly(flight)
 
 
