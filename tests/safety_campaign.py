@@ -69,6 +69,18 @@ class Flown:
     said: str
 
 
+def write(directory: Path, kinds: Sequence[str], *, armed: bool) -> Path:
+    """The file of a campaign whose flights do harm, or would if they were armed; see `fly`."""
+    names = [f"{i} {kind}" for i, kind in enumerate(kinds)]  # a grid's values are distinct
+    kind, *others = CAMPAIGN["vary"]
+    controller = {**CAMPAIGN["set"]["controller"], "settings": {"kind": "calm", "armed": armed}}
+    changes = {"flights": len(kinds), "vary": [{**kind, "values": names}, *others]}
+    changes["set"] = {**CAMPAIGN["set"], "controller": controller}
+    file = directory / "hostile.toml"
+    file.write_text(tomlkit.dumps({**CAMPAIGN, **changes}), encoding="utf-8")
+    return file
+
+
 def fly(directory: Path, kinds: Sequence[str], *, armed: bool, workers: int = 2) -> Flown:
     """Fly a campaign whose flights do harm, or would if they were armed, one after the other.
 
@@ -78,13 +90,7 @@ def fly(directory: Path, kinds: Sequence[str], *, armed: bool, workers: int = 2)
         armed: whether they do.
         workers: how many.
     """
-    names = [f"{i} {kind}" for i, kind in enumerate(kinds)]  # a grid's values are distinct
-    kind, *others = CAMPAIGN["vary"]
-    controller = {**CAMPAIGN["set"]["controller"], "settings": {"kind": "calm", "armed": armed}}
-    changes = {"flights": len(kinds), "vary": [{**kind, "values": names}, *others]}
-    changes["set"] = {**CAMPAIGN["set"], "controller": controller}
-    file = directory / "hostile.toml"
-    file.write_text(tomlkit.dumps({**CAMPAIGN, **changes}), encoding="utf-8")
+    file = write(directory, kinds, armed=armed)
     command = [sys.executable, "-m", "scenarios.cli", "campaign", str(file), "--out", str(directory / "out")]
     mark = f"QUADSIM_MARK={uuid.uuid4()}"
     started = clock.perf_counter()

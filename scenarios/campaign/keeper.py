@@ -25,7 +25,7 @@ from scenarios.campaign.processes import adopt_orphans, end_children, has_strays
 from scenarios.campaign.worker import FLIGHT, PULSE_BYTES, SIZE, Told, fly_for
 from scenarios.garbage import collect_rarely, settle
 
-LOOK_S: Final = 0.1
+LOOK_S: Final = 0.2
 """Between two looks at a worker that flies [s]."""
 _TURN_S: Final = 1.0
 """Most that one look counts of the time since the last one [s]."""

@@ -80,6 +80,7 @@ def _engine(options: Namespace) -> Engine:
 
 def replay(options: Namespace) -> int:
     """`quadsim replay`."""
+    from quadsim.campaign.table import MEMORY, TIMEOUT
     from scenarios.campaign.console import print_replay
     from scenarios.campaign.replay import recorded_flight
     from scenarios.campaign.replay import replay as fly_again
@@ -90,6 +91,9 @@ def replay(options: Namespace) -> int:
     outputs = Outputs(video=options.video, recording=options.recording, figures=options.figures)
     if flight.otherwise:
         console.say(f"other {', '.join(flight.otherwise)} flew that campaign, so numbers may differ")
+    if flight.row["verdict"] in (TIMEOUT, MEMORY):
+        ended = f"flight {flight.number} was ended in the campaign ({flight.row['reason']})"
+        console.say(f"{ended}; here nothing ends it but Ctrl-C")
     with console.progress_bars(enabled=not options.json) as progress:
         _, differing = fly_again(flight, target, outputs, progress)
     print_summary(rundir.read_summary(target), options, where=str(target))

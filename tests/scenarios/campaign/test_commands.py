@@ -11,6 +11,8 @@ import time as clock
 from pathlib import Path
 from xml.etree import ElementTree
 
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 import tomlkit
 
@@ -104,6 +106,19 @@ def test_a_replay_by_other_code_says_so_first(
     (other / "manifest.json").write_text(json.dumps({**manifest, "code": "sha256:0"}))
     assert main(["replay", str(other), "--flight", "2", *BARE]) == EXIT_DONE
     said = "quadsim: other code flew that campaign, so numbers may differ"
+    assert capsys.readouterr().err.splitlines()[0] == said
+
+
+def test_a_replay_of_a_flight_that_met_a_limit_says_so_first(
+    flown: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    other = shutil.copytree(flown / "first", tmp_path / "other")
+    rows = pq.read_table(other / "flights.parquet")
+    ended = [row | {"verdict": "timeout", "reason": "for ever"} for row in rows.to_pylist()]
+    pq.write_table(pa.Table.from_pylist(ended, schema=rows.schema), other / "flights.parquet")
+    assert main(["replay", str(other), "--flight", "2", *BARE]) == EXIT_FAILED
+    said = "quadsim: flight 2 was ended in the campaign (for ever); here nothing ends it but Ctrl-C"
     assert capsys.readouterr().err.splitlines()[0] == said
 
 
