@@ -8,12 +8,15 @@ from typing import Final
 import numpy as np
 import pyarrow as pa
 
+from quadsim.campaign.columns import numbers
 from quadsim.campaign.table import DRAW, TIMING, read_table
 from quadsim.errors import FileError
 
 _NEEDED: Final = ("flight", "seed", "status", "verdict", "failed", "violated", "crashed", "worst_margin")
 """Columns that no version left out; `flight` to `violated` have a value in every row."""
 _FILLED: Final = _NEEDED[:6]
+LARGEST: Final = 1e100
+"""Magnitude of the largest number that a flight has; sums of squares of larger ones are infinite."""
 
 
 def read_flights(path: Path, schema: pa.Schema) -> pa.Table:
@@ -24,8 +27,8 @@ def read_flights(path: Path, schema: pa.Schema) -> pa.Table:
         schema: of the campaign, `quadsim.campaign.table.make_schema`; a table of an older version may have fewer.
 
     Raises:
-        FileError: it cannot be read, a column is missing, not of the campaign or of another type, or flights are there
-            twice, or in no order.
+        FileError: it cannot be read, a column is missing, not of the campaign or of another type, a number is too
+            large, or flights are there twice, or in no order.
     """
     table = read_table(path)
     clock = {name for name, *_ in TIMING}
@@ -57,6 +60,9 @@ def require_columns(table: pa.Table, schema: pa.Schema, path: Path, *, without: 
         table.validate(full=True)
     except pa.ArrowException as error:
         raise FileError(path, f"is damaged ({error})") from error
+    for field in table.schema:
+        if pa.types.is_floating(field.type) and (np.abs(numbers(table, field.name)) > LARGEST).any():
+            raise FileError(path, f"has a number beyond +-{LARGEST:g} in its column {field.name}")
     flights = table["flight"].to_numpy()
     if flights.size and (flights[0] < 0 or (np.diff(flights) <= 0).any()):
         raise FileError(path, "has flights that are not numbered upwards from 0")
