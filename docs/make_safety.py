@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import time as clock
 from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 
 import safety_campaign
@@ -16,11 +17,18 @@ from quadsim.table import Cell, Grid, grid_to_markdown
 PAGE = Path(__file__).resolve().parent / "safety.md"
 BEGIN, END = "<!-- counts: made by `make safety` -->", "<!-- counts end -->"
 
+SUMMARIES, CAMPAIGNS = (partial(safety_mutations.as_ordinary_user, kind) for kind in ("summaries", "campaigns"))
 ATTACKS: dict[str, tuple[Callable[[int], Mapping[str, int]], int]] = {
     "Random trees and places, for every command that writes, as an ordinary user": (safety_outputs.measure, 2000),
     "Processes killed (SIGKILL) while they write": (safety_outputs.measure_kills, 40),
-    "Changed `summary.json` of runs, read by every command": (safety_mutations.measure_summaries, 2000),
-    "Changed files of campaigns, read by every command": (safety_mutations.measure_campaigns, 2000),
+    "Changed `summary.json` of runs, read by every command": (
+        partial(safety_mutations.as_ordinary_user, "summaries"),
+        2000,
+    ),
+    "Changed files of campaigns, read by every command": (
+        partial(safety_mutations.as_ordinary_user, "campaigns"),
+        2000,
+    ),
     "A campaign whose controllers hang, fork, eat memory or exit": (safety_campaign.measure, 60),
 }
 """What was tried: by which function, and how often."""
@@ -35,7 +43,9 @@ def counts(scale: float) -> str:
         told = "; ".join(f"{name.replace('_', ' ')} {number}" for name, number in found.items())
         lines.append((Cell(text=what), Cell(text=told)))
         print(f"{what}: {told} ({clock.perf_counter() - started:.0f} s)", flush=True)
-    return grid_to_markdown(Grid(key="counts", title="What was tried", head=("what", "what came of it"), lines=lines))
+    return grid_to_markdown(
+        Grid(key="counts", title="What was tried", head=("what", "what came of it"), lines=tuple(lines))
+    )
 
 
 def main() -> None:

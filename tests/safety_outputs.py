@@ -1,12 +1,7 @@
-"""Random trees, random places to write to, every command that writes: nothing that is not ours may change by one byte.
-
-As root it goes on as an ordinary user who may read everything and write nowhere but in a directory of its own:
-`python tests/safety_outputs.py --count 2000`.
-"""
+"""Random trees, random places, every command that writes: nothing that is not ours may change by one byte."""
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import hashlib
 import io
@@ -23,11 +18,12 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 from unittest import mock
 
 from hypothesis import HealthCheck, Phase, assume, given, seed, settings
 from hypothesis import strategies as st
+from ordinary_user import counts_of
 
 from quadsim.errors import OutputError
 from quadsim.outputs import real_path, require_directory, require_file, staging
@@ -309,30 +305,12 @@ def attack(scratch: Path, count: int, number: int) -> dict[str, int]:
 
 
 def measure(count: int, number: int = 0) -> dict[str, int]:
-    """The same as an ordinary user, where this one is root.
+    """Go through so many cases as an ordinary user, where this one is root; how many were refused and done.
 
     Raises:
         RuntimeError: a case failed; it is told.
     """
-    with tempfile.TemporaryDirectory() as place:
-        scratch = Path(place).resolve() / "scratch"
-        scratch.mkdir()
-        user: list[str] = []
-        if os.geteuid() == 0:
-            nobody, capability = 65534, "dac_read_search"
-            os.chown(scratch, nobody, nobody)
-            Path(place).chmod(0o755)
-            user = ["setpriv", f"--reuid={nobody}", f"--regid={nobody}", "--clear-groups"]
-            user += [f"--{kind}=-all,+{capability}" for kind in ("inh-caps", "ambient-caps", "bounding-set")]
-        own = {"HOME": str(scratch), "TMPDIR": str(scratch), "MPLCONFIGDIR": str(scratch), "PYTHONPATH": str(ROOT)}
-        command = [*user, sys.executable, __file__, "--count", str(count), "--seed", str(number), "--in", str(scratch)]
-        done = subprocess.run(
-            command, env={**os.environ, **own}, cwd=scratch, capture_output=True, text=True, check=False
-        )
-    if done.returncode:
-        raise RuntimeError(done.stdout + done.stderr)
-    counted: dict[str, int] = json.loads(done.stdout.splitlines()[-1])
-    return counted
+    return counts_of(Path(__file__).name, str(count), str(number))
 
 
 def measure_kills(count: int, number: int = 0) -> dict[str, int]:
@@ -384,17 +362,5 @@ def measure_kills(count: int, number: int = 0) -> dict[str, int]:
     return dict(counted)
 
 
-def _main() -> None:
-    parser = argparse.ArgumentParser()
-    parser.add_argument("--count", type=int, default=2000)
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--in", dest="scratch", type=Path)
-    options: Any = parser.parse_args()
-    if options.scratch is None:
-        print(json.dumps(measure(options.count, options.seed), indent=2))
-    else:
-        print(json.dumps(attack(options.scratch, options.count, options.seed)))
-
-
 if __name__ == "__main__":
-    _main()
+    print(json.dumps(attack(Path.cwd(), int(sys.argv[1]), int(sys.argv[2]))))

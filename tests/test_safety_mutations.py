@@ -7,8 +7,7 @@ import shutil
 from pathlib import Path
 
 import pytest
-
-from tests.safety_mutations import FILES, mutate_campaign, put
+from safety_mutations import FILES, mutate_campaign, put
 
 
 def test_a_file_is_put_in_place_of_a_link_and_never_through_it(tmp_path: Path) -> None:
