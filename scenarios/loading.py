@@ -85,8 +85,9 @@ def _of_types(problems: Sequence[str], path: Path, read: Mapping[str, Any], data
             changed = f"--set changed its type from {before!r} to {data[name]['type']!r}, and all other fields stayed"
             base = path.stem if path.parent == LIBRARY else path.name
             yield f'{name}: {changed}; a file with base = "{base}" and a whole [{name}] replaces them'
+    missing = {problem.partition(".")[0] for problem in problems if problem.endswith(" is missing")}
     for name, before in replaced_tables(path, scenario_path).items():
-        if name in wrong - {*given}:
+        if name in missing - {*given}:
             yield f"{name}: of another type than that of its base ({before}), it replaces it whole and inherits nothing"
 
 

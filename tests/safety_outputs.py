@@ -248,8 +248,8 @@ def check_case(
         target = base / "nowhere"
     assume(target.is_absolute() is False or target.is_relative_to(base) or refused)
     target = Path(os.path.realpath(target))
-    if not refused:
-        assume(inputs.counted[f"{writer}: done"] < WRITERS[writer][1])
+    if not refused and inputs.counted[f"{writer}: done"] >= WRITERS[writer][1]:
+        return
     before = {path: what for path, what in state(base).items() if Path(path) not in ours}
     whole = state(base)
 
@@ -296,7 +296,11 @@ def attack(scratch: Path, count: int, number: int) -> dict[str, int]:
     @given(st.lists(ENTRIES, max_size=6), st.sampled_from(writers), PLACES, st.none() | SAVED, st.booleans())
     def cases(tree: list[Entry], writer: str, place: str, meanwhile: Entry | None, absolute: bool) -> None:
         out = f"{scratch / 'case'}/{place}" if absolute else place
-        check_case(scratch / "case", inputs, tree, writer, out, meanwhile)
+        try:
+            check_case(scratch / "case", inputs, tree, writer, out, meanwhile)
+        except AssertionError as error:
+            error.add_note(f"{tree}\n{writer} to {out!r}, {meanwhile} saved meanwhile")
+            raise
 
     cases()
     os.chdir(scratch)

@@ -8,7 +8,7 @@ from collections import Counter
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 import pyarrow.parquet as pq
@@ -265,10 +265,10 @@ def test_a_disk_that_fills_up_while_a_table_is_written_leaves_nothing(
 ) -> None:
     write_table = pq.write_table
 
-    def full(data: Any, path: Path, **options: Any) -> None:
-        write_table(data, path, **options)
-        if path.name == table:
-            path.write_bytes(path.read_bytes()[:100])
+    def full(data: Any, file: BinaryIO, **options: Any) -> None:
+        write_table(data, file, **options)
+        if Path(file.name).name == table:
+            file.truncate(100)
             raise OSError(errno.ENOSPC, "No space left on device")
 
     monkeypatch.setattr(pq, "write_table", full)

@@ -16,6 +16,7 @@ import pyarrow.parquet as pq
 import pytest
 import tomlkit
 
+from quadsim.outputs import digest_of
 from scenarios.cli import EXIT_DONE, EXIT_FAILED, EXIT_WRONG_INPUT, main
 
 MASS = {
@@ -117,6 +118,9 @@ def test_a_replay_of_a_flight_that_met_a_limit_says_so_first(
     rows = pq.read_table(other / "flights.parquet")
     ended = [row | {"verdict": "timeout", "reason": "for ever"} for row in rows.to_pylist()]
     pq.write_table(pa.Table.from_pylist(ended, schema=rows.schema), other / "flights.parquet")
+    manifest = json.loads((other / "manifest.json").read_text())
+    manifest["files"]["flights.parquet"] = digest_of(other / "flights.parquet")
+    (other / "manifest.json").write_text(json.dumps(manifest))
     assert main(["replay", str(other), "--flight", "2", *BARE]) == EXIT_FAILED
     said = "quadsim: flight 2 was ended in the campaign (for ever); here nothing ends it but Ctrl-C"
     assert capsys.readouterr().err.splitlines()[0] == said
