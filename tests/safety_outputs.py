@@ -275,7 +275,7 @@ def check_case(
         assert said.startswith("quadsim: "), said
         assert after == whole, f"left behind or lost: {sorted(after.items() ^ whole.items())}; {said}"
     else:
-        assert not [path for path in after if ".quadsim-" in path and path not in before], "a staging directory stays"
+        assert not [path for path in after if ".quadsim-" in path and path not in whole], "a staging directory stays"
 
 
 def attack(scratch: Path, count: int, number: int) -> dict[str, int]:
