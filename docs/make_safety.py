@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import time as clock
 from collections.abc import Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
 
@@ -19,33 +20,34 @@ BEGIN, END = "<!-- counts: made by `make safety` -->", "<!-- counts end -->"
 
 SUMMARIES, CAMPAIGNS = (partial(safety_mutations.as_ordinary_user, kind) for kind in ("summaries", "campaigns"))
 ATTACKS: dict[str, tuple[Callable[[int], Mapping[str, int]], int]] = {
-    "Random trees and places, for every command that writes, as an ordinary user": (safety_outputs.measure, 2000),
+    "Random trees and places, for every command that writes": (safety_outputs.measure, 2000),
+    "Changed `summary.json` and tables of runs, read by every command": (SUMMARIES, 2000),
+    "Changed files of campaigns, read by every command": (CAMPAIGNS, 2000),
     "Processes killed (SIGKILL) while they write": (safety_outputs.measure_kills, 40),
-    "Changed `summary.json` of runs, read by every command": (
-        partial(safety_mutations.as_ordinary_user, "summaries"),
-        2000,
-    ),
-    "Changed files of campaigns, read by every command": (
-        partial(safety_mutations.as_ordinary_user, "campaigns"),
-        2000,
-    ),
-    "A campaign whose controllers hang, fork, eat memory or exit": (safety_campaign.measure, 60),
+    "One campaign with controllers that hang, fork, eat memory, exit": (safety_campaign.measure, 60),
 }
 """What was tried: by which function, and how often."""
+ASIDE = 3
+"""So many of them go on in processes of their own, as an ordinary user, and side by side."""
 
 
 def counts(scale: float) -> str:
     """Go through all attacks; what came of each, as Markdown."""
-    lines = []
-    for what, (attack, count) in ATTACKS.items():
+
+    def go(what: str) -> str:
         started = clock.perf_counter()
+        attack, count = ATTACKS[what]
         found = attack(max(1, round(scale * count)))
         told = "; ".join(f"{name.replace('_', ' ')} {number}" for name, number in found.items())
-        lines.append((Cell(text=what), Cell(text=told)))
         print(f"{what}: {told} ({clock.perf_counter() - started:.0f} s)", flush=True)
-    return grid_to_markdown(
-        Grid(key="counts", title="What was tried", head=("what", "what came of it"), lines=tuple(lines))
-    )
+        return told
+
+    names = list(ATTACKS)
+    with ThreadPoolExecutor() as beside:
+        told = list(beside.map(go, names[:ASIDE]))
+    told += [go(name) for name in names[ASIDE:]]
+    lines = tuple((Cell(text=name), Cell(text=text)) for name, text in zip(names, told, strict=True))
+    return grid_to_markdown(Grid(key="counts", title="What was tried", head=("what", "what came of it"), lines=lines))
 
 
 def main() -> None:
