@@ -255,7 +255,7 @@ def check_case(
 
     def note() -> None:
         nonlocal whole
-        late = {path: what for path, what in state(base).items() if ".quadsim-" not in path}
+        late = {path: what for path, what in state(base).items() if path in whole or ".quadsim-" not in path}
         before.update({path: what for path, what in late.items() if path not in whole and Path(path) not in ours})
         before.pop(str(target), None) if target.is_dir() and not any(target.iterdir()) else None
         whole = late
