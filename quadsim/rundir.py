@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any, Final
@@ -147,7 +147,7 @@ def _hash(path: Path) -> str:
 
 
 @contextlib.contextmanager
-def adding(directory: Path, name: str) -> Iterator[Callable[[bytes], None]]:
+def adding(directory: Path, name: str) -> Iterator[Path]:
     """Add a product such as the film to a run directory, or replace it, together with its hash in the summary.
 
     Args:
@@ -155,7 +155,7 @@ def adding(directory: Path, name: str) -> Iterator[Callable[[bytes], None]]:
         name: of the file, relative to it.
 
     Yields:
-        What takes the file's content and writes it.
+        The file to make, which gets its name when the block ends well.
 
     Raises:
         FileError: it is not a run directory.
@@ -164,13 +164,11 @@ def adding(directory: Path, name: str) -> Iterator[Callable[[bytes], None]]:
     read_summary(directory)
     with growing(directory, KIND) as files:
         files.require([name, SUMMARY_FILE])
-
-        def write(content: bytes) -> None:
-            summary = read_summary(directory)
-            summary["files"] = dict(sorted({**summary["files"], name: digest(content)}.items()))
-            files.write({name: content, SUMMARY_FILE: to_json(summary).encode()})
-
-        yield write
+        new = files.scratch / name
+        yield new
+        content, summary = new.read_bytes(), read_summary(directory)
+        summary["files"] = dict(sorted({**summary["files"], name: digest(content)}.items()))
+        files.write({name: content, SUMMARY_FILE: to_json(summary).encode()})
 
 
 def seal(directory: Path, summary: Mapping[str, Any]) -> None:

@@ -189,7 +189,7 @@ def _making(path: Path, form: str) -> Iterator[Path]:
     """A file to be made in a folder of its own; see `writing_file`.  A worker's failure becomes an `OutputError`."""
     try:
         with writing_file(path, form) as new:
-            yield new.resolve()
+            yield new
     except _WorkerFailure as failure:
         raise OutputError(path, f"the renderer failed: {failure}") from failure
 

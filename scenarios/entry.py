@@ -6,20 +6,38 @@ Ctrl-C, SIGTERM and SIGHUP all are `KeyboardInterrupt`, unless the process was s
 from __future__ import annotations
 
 import contextlib
+import math
 import os
 import signal
 import sys
+import time as clock
 from typing import Final
 
 _STOPS: Final = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+_PATIENCE_S: Final = 1.0
+"""Within which another signal is the same one: what is cleared up meanwhile is not to be interrupted."""
+
+
+class _Stop:
+    """Makes Ctrl-C of a signal; who goes away, or is impatient, sends several."""
+
+    def __init__(self) -> None:
+        self._last = -math.inf
+
+    def __call__(self, number: int, frame: object) -> None:
+        """See `signal.signal`."""
+        before, self._last = self._last, clock.monotonic()
+        if self._last - before > _PATIENCE_S:
+            raise KeyboardInterrupt
 
 
 def main() -> int:
     """Run the command line of this process; returns the exit status."""
     heard = [stop for stop in _STOPS if signal.getsignal(stop) is not signal.SIG_IGN]
+    handler = _Stop()
     try:
         for stop in heard:
-            signal.signal(stop, signal.default_int_handler)
+            signal.signal(stop, handler)
         _open_what_is_closed()
         if sys.stdout is None:
             print("quadsim: stdout is closed; to do without what is printed: >/dev/null", file=sys.stderr)

@@ -21,7 +21,17 @@ from typing import Any, Final
 
 from quadsim.errors import OutputError
 from quadsim.outputs.growing import Growing, growing
-from quadsim.outputs.manifest import LOCK_FILE, MANIFEST_FILE, digest, digest_of, seal, take_stock, to_json
+from quadsim.outputs.manifest import (
+    LOCK_FILE,
+    MANIFEST_FILE,
+    digest,
+    digest_of,
+    is_folder,
+    read_manifest,
+    seal,
+    take_stock,
+    to_json,
+)
 from quadsim.outputs.places import (
     as_output_error,
     occupied,
@@ -30,7 +40,7 @@ from quadsim.outputs.places import (
     problem_with_file,
     real_path,
 )
-from quadsim.outputs.staging import staging_beside
+from quadsim.outputs.staging import clear_leftovers, staging_beside
 
 __all__ = [
     "LOCK_FILE",
@@ -65,6 +75,8 @@ def require_directory(target: Path | str, kind: str) -> None:
             if os.path.lexists(parent) and not parent.is_dir():
                 raise OutputError(target, f"{parent} is a file")
         if os.path.lexists(target):
+            if is_folder(target) and read_manifest(target) is not None:
+                clear_leftovers(target)  # of a process that was killed while it added to it
             problem = problem_with_directory(target, kind)
             if problem is not None:
                 raise OutputError(target, problem)
@@ -97,7 +109,8 @@ def writing(target: Path | str, kind: str) -> Iterator[Path]:
     with parents_of(target), staging_beside(target) as staging:
         if shutil.disk_usage(staging.path).free < _FREE_BYTES_NEEDED:
             raise OutputError(target, "the disk is full")
-        staging.work.chmod(stat.S_IMODE(target.stat().st_mode) if target.exists() else 0o755)
+        if target.exists():
+            staging.work.chmod(stat.S_IMODE(target.stat().st_mode))
         yield staging.work
         manifest = take_stock(staging.work, kind)
         (staging.work / MANIFEST_FILE).write_bytes(manifest.encode())
@@ -133,17 +146,17 @@ def write_new(path: Path, content: bytes) -> None:
         staging.put(new, path, lambda _: occupied(()))
 
 
-def require_file(path: Path | str) -> None:
+def require_file(path: Path | str, form: str) -> None:
     """Refuse a place where `writing_file` would refuse, before any work is done for it.
 
     Raises:
         OutputError: see `writing_file`.
     """
     path = real_path(path)
-    problem = problem_with_file(path) if os.path.lexists(path) else None
-    if problem is not None:
-        raise OutputError(path, problem)
     try:
+        problem = problem_with_file(path, form) if os.path.lexists(path) else None
+        if problem is not None:
+            raise OutputError(path, problem)
         with tempfile.TemporaryFile(dir=path.parent):
             pass
     except OSError as error:
@@ -166,9 +179,9 @@ def writing_file(path: Path | str, form: str) -> Iterator[Path]:
             is still there.
     """
     path = real_path(path)
-    require_file(path)
+    require_file(path, form)
     with staging_beside(path) as staging:
         new = staging.work / f"new{form}"
         yield new
         seal(new, form)
-        staging.put(new, path, problem_with_file)
+        staging.put(new, path, lambda old: problem_with_file(old, form))

@@ -39,7 +39,13 @@ class Growing:
         self.path = path
         self._staging, self._kind = staging, kind
         self._manifest = read_manifest(path)
+        self._known = () if self._manifest is None else (digest(self._manifest.encode()),)
         self._numbers = itertools.count()
+
+    @property
+    def scratch(self) -> Path:
+        """Where files may be made that are to be added; what stays there vanishes."""
+        return self._staging.work
 
     @property
     def _files(self) -> Mapping[str, Sequence[str]]:
@@ -52,11 +58,15 @@ class Growing:
             OutputError: naming the first of them.
         """
         for name in names:
+            path = self.path / name
             for folder in PurePosixPath(name).parents[:-1]:
                 if os.path.lexists(self.path / folder) and not is_folder(self.path / folder):
                     raise OutputError(self.path / folder, "it is not a folder of quadsim's; move it away first")
-            if os.path.lexists(self.path / name) and not is_known(self.path / name, self._files.get(name, ())):
-                raise OutputError(self.path / name, _CHANGED)
+            try:
+                if os.path.lexists(path) and not is_known(path, self._files.get(name, ())):
+                    raise OutputError(path, _CHANGED)
+            except OSError as error:
+                raise as_output_error(path, error) from error
 
     def write(self, files: Mapping[str, bytes]) -> None:
         """Write or replace files, by their relative paths; each is on the disk, whole, when this returns.
@@ -64,9 +74,9 @@ class Growing:
         Raises:
             OutputError: one cannot be written, or one that is there is not as we wrote it, and still there.
         """
-        self.require(files)
         after = {name: (digest(content),) for name, content in files.items()}
         try:
+            self.require(files)
             self._list({**self._files, **{name: (*self._files.get(name, ()), *new) for name, new in after.items()}})
             for name, content in files.items():
                 (self.path / name).parent.mkdir(exist_ok=True)
@@ -82,9 +92,9 @@ class Growing:
             OutputError: one is not as we wrote it; it is still there.
         """
         there = [name for name in names if os.path.lexists(self.path / name)]
-        self.require(there)
         try:
             for name in there:
+                self.require([name])
                 (self.path / name).unlink()
             self._list({name: known for name, known in self._files.items() if name not in there})
         except OSError as error:
@@ -94,10 +104,11 @@ class Growing:
 
     def _list(self, files: Mapping[str, Sequence[str]]) -> None:
         """Replace the manifest."""
-        known = () if self._manifest is None else (digest(self._manifest.encode()),)
+        before = self._known
         manifest = Manifest(kind=self._kind, files=files)
-        self._put(MANIFEST_FILE, manifest.encode(), known)
-        self._manifest = manifest
+        self._known = (*before, digest(manifest.encode()))  # whichever of them is there if this is interrupted
+        self._put(MANIFEST_FILE, manifest.encode(), before)
+        self._manifest, self._known = manifest, self._known[-1:]
 
     def _put(self, name: str, content: bytes, known: Sequence[str]) -> None:
         new, target = self._staging.work / f"{next(self._numbers)}.new", self.path / name
@@ -138,24 +149,26 @@ def growing(directory: Path | str, kind: str) -> Iterator[Growing]:
             with _held(directory), staging_beside(directory / MANIFEST_FILE) as staging:
                 yield Growing(directory, kind, staging)
         finally:
-            if read_manifest(directory) is None:  # nothing was written
-                remove_lock(directory)
-                if is_new:
-                    remove_empty(directory)
+            if is_new and read_manifest(directory) is None:  # nothing was written
+                remove_empty(directory)
 
 
 @contextlib.contextmanager
 def _held(directory: Path) -> Iterator[None]:
-    """Hold a directory for oneself."""
-    flags = os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK
+    """Hold a directory for oneself; where nothing was written to it, the lock goes again."""
+    flags = os.O_RDWR | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK
+    path = directory / LOCK_FILE
+    is_new = not os.path.lexists(path)
     try:
-        handle = os.open(directory / LOCK_FILE, flags, 0o644)
+        handle = os.open(path, flags | (os.O_CREAT | os.O_EXCL if is_new else 0), 0o644)
     except OSError as error:
-        raise as_output_error(directory / LOCK_FILE, error) from error
+        raise as_output_error(path, error) from error
     try:
         _lock(handle, directory)
         yield
     finally:
+        if is_new and read_manifest(directory) is None:
+            remove_lock(directory)
         os.close(handle)
 
 

@@ -70,18 +70,19 @@ def digest_of(path: Path) -> str:
 
 def is_file(path: Path) -> bool:
     """Whether there is a plain file: no link, FIFO, device or folder."""
-    try:
-        return stat.S_ISREG(path.lstat().st_mode)
-    except OSError:
-        return False
+    return stat.S_ISREG(_mode(path))
 
 
 def is_folder(path: Path) -> bool:
     """Whether there is a folder itself, not a link to one."""
+    return stat.S_ISDIR(_mode(path))
+
+
+def _mode(path: Path) -> int:
     try:
-        return stat.S_ISDIR(path.lstat().st_mode)
-    except OSError:
-        return False
+        return path.lstat().st_mode
+    except (OSError, ValueError):  # there is nothing, or a name that nothing can have
+        return 0
 
 
 def is_known(path: Path, known: Sequence[str]) -> bool:
@@ -91,11 +92,13 @@ def is_known(path: Path, known: Sequence[str]) -> bool:
 
 def below(directory: Path) -> Iterator[Path]:
     """Everything below a directory, each folder before what is in it; links are not followed."""
-    with os.scandir(directory) as entries:
-        for entry in entries:
-            yield Path(entry.path)
-            if entry.is_dir(follow_symlinks=False):
-                yield from below(Path(entry.path))
+    folders = [directory]
+    while folders:
+        with os.scandir(folders.pop()) as entries:
+            for entry in entries:
+                yield Path(entry.path)
+                if entry.is_dir(follow_symlinks=False):
+                    folders.append(Path(entry.path))
 
 
 def take_stock(directory: Path, kind: str) -> Manifest:
@@ -114,9 +117,15 @@ def read_manifest(directory: Path) -> Manifest | None:
         data = json.loads(content)
         files = {str(name): tuple(map(str, known)) for name, known in data["files"].items()}
         manifest = Manifest(kind=str(data["kind"]), files=files)
-        return manifest if manifest.encode() == content else None
+        return manifest if manifest.encode() == content and all(map(_is_inside, files)) else None
     except (ValueError, TypeError, LookupError, AttributeError, RecursionError):
         return None
+
+
+def _is_inside(name: str) -> bool:
+    """Whether a name can be one of a file in a directory."""
+    path = PurePosixPath(name)
+    return bool(os.fsencode(name)) and "\0" not in name and not path.is_absolute() and ".." not in path.parts
 
 
 def is_manifest(path: Path) -> bool:
@@ -147,8 +156,7 @@ def remove_listed(directory: Path) -> None:
     if manifest is not None:
         linked = {name for name in manifest.folders if not is_folder(directory / name)}
         for name, known in manifest.files.items():
-            inside = ".." not in PurePosixPath(name).parts and not PurePosixPath(name).is_absolute()
-            if inside and not linked & {*map(str, PurePosixPath(name).parents)} and is_known(directory / name, known):
+            if not linked & {*map(str, PurePosixPath(name).parents)} and is_known(directory / name, known):
                 (directory / name).unlink()
         for folder in manifest.folders:
             remove_empty(directory / folder)
@@ -183,15 +191,15 @@ def seal(path: Path, form: str) -> None:
         file.write(before + mark + after)
 
 
-def is_sealed(path: Path) -> bool:
-    """Whether this is a file that was sealed, and that nobody changed since."""
+def is_sealed(path: Path, form: str | None = None) -> bool:
+    """Whether this is a file that was sealed, in that form or any, and that nobody changed since."""
     if not is_file(path):
         return False
     size = path.stat().st_size
     with path.open("rb") as file:
         file.seek(max(0, size - _LONGEST_SEAL))
         end = file.read()
-        for before, after in _SEALS.values():
+        for before, after in [_SEALS[form]] if form else _SEALS.values():
             mark = re.search(re.escape(before) + rb"quadsim sha256:([0-9a-f]{64})" + re.escape(after) + rb"\Z", end)
             if mark:
                 return _digest_of_start(path, size - len(end) + mark.start()) == mark[1].decode()

@@ -47,6 +47,8 @@ def problem_with_directory(path: Path, kind: str) -> str | None:
     """Why a directory must not be replaced; None if it is empty, or of that kind with nothing but ours in it."""
     if not is_folder(path):
         return occupied(())
+    if path.resolve().is_mount():
+        return "it is a mount point; name a directory in it"
     manifest = read_manifest(path)
     if manifest is None:
         there = sorted(entry.name for entry in path.iterdir())
@@ -57,11 +59,11 @@ def problem_with_directory(path: Path, kind: str) -> str | None:
     return f"it holds {few(others)}, not as quadsim wrote it; choose another --out" if others else None
 
 
-def problem_with_file(path: Path) -> str | None:
-    """Why something must not be replaced by a file; None if it is one that we wrote."""
+def problem_with_file(path: Path, form: str) -> str | None:
+    """Why something must not be replaced by a file of that form; None if it is one that we wrote."""
     if is_folder(path):
         return "is a folder"
-    return None if is_sealed(path) else "something else is already there; choose another file"
+    return None if is_sealed(path, form) else "something else is already there; choose another file"
 
 
 def occupied(names: Sequence[str]) -> str:

@@ -22,6 +22,7 @@ from quadsim.errors import OutputError
 from quadsim.outputs.manifest import (
     MANIFEST_FILE,
     below,
+    foreign,
     is_file,
     is_folder,
     is_known,
@@ -38,9 +39,11 @@ STAGING: Final = re.compile(r"\.quadsim-\w+\.partial")
 _HALF_MADE: Final = (
     "*.parquet", "*.rrd", "*.mp4", "*.gif", "*.png", "*.svg", "*.html", "*.log", "*.new", "new.*", "pieces.txt",
     "summary.json", "scenario.toml", "bench.json", "ladder.json", "comparison.json", "cost.json", "owner.json",
-    "solvers.md", "ladder.md", "comparison.md", "cost.md", "swapping", MANIFEST_FILE,
+    "solvers.md", "ladder.md", "comparison.md", "cost.md", MANIFEST_FILE,
 )  # fmt: skip
 """Names of the files that we make; anything else in the staging directory of a process that was killed stays."""
+_SLOT, _ASIDE, _NAME = "swap-", "aside", "name"
+"""In a staging directory: what is replaced, each in a slot; where it takes two steps, with the name that it had."""
 _NO_REPLACE, _EXCHANGE = 1, 2
 _CURRENT_DIRECTORY: Final = -100
 _UNSUPPORTED: Final = (errno.ENOSYS, errno.EINVAL, errno.ENOTSUP)
@@ -49,7 +52,7 @@ _log: Final = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Staging:
-    """A directory beside the outputs that are made in it.
+    """A directory beside the outputs that are made in it; what they replace never enters the one where they are made.
 
     Attributes:
         path: its own.
@@ -67,20 +70,10 @@ class Staging:
         """Says whose it is; locked as long as that process lives."""
         return self.path / "owner.json"
 
-    @property
-    def aside(self) -> Path:
-        """Where a target stands while it is replaced, on file systems that cannot swap two names in one step."""
-        return self.path / "aside"
-
-    @property
-    def swapping(self) -> Path:
-        """There from before a swap until what was replaced is removed: what is in `work` meanwhile may not be ours."""
-        return self.path / "swapping"
-
     def put(self, new: Path, target: Path, problem: Callable[[Path], str | None]) -> None:
         """Give what was made its name.
 
-        What had the name is moved to where the new was made, in the same step, and looked at there once more.
+        What had the name is moved to a slot of its own, in the same step, and looked at there once more.
 
         Args:
             new: what was made.
@@ -90,65 +83,62 @@ class Staging:
         Raises:
             OutputError: what had the name is not ours; it has it again.
         """
-        self.swapping.touch()
         try:
             _rename(new, target)
         except FileExistsError:
-            self._exchange(new, target)
-            reason = problem(new)
-            if reason is not None:
-                self._exchange(new, target)
-                self.swapping.unlink()
-                raise OutputError(target, reason) from None
-            new.unlink() if is_file(new) else remove_listed(new)
-        if not os.path.lexists(new):
-            self.swapping.unlink()
+            _refuse(target, problem(target))  # nearly always seen here, where nothing has been moved
+            slot = Path(tempfile.mkdtemp(prefix=_SLOT, dir=self.path)) / new.name
+            new.rename(slot)
+            self._swap(slot, target, problem)
 
-    def _exchange(self, new: Path, target: Path) -> None:
-        """Swap two names; in one step where the system can."""
-        if _renameat2(new, target, _EXCHANGE):
-            return
-        target.rename(self.aside)
+    def _swap(self, slot: Path, target: Path, problem: Callable[[Path], str | None]) -> None:
+        self._exchange(slot, target)
         try:
-            _rename(new, target)
+            _refuse(target, problem(slot))
+        except BaseException:  # also where it cannot be read, or by Ctrl-C
+            self._exchange(slot, target)
+            raise  # somebody may have saved something in the new one meanwhile: `dissolve` takes what is ours alone
+        with contextlib.suppress(OSError):  # the new one stands; what cannot be removed `dissolve` tells
+            slot.unlink() if is_file(slot) else remove_listed(slot)
+
+    def _exchange(self, slot: Path, target: Path) -> None:
+        """Swap two names; in one step where the system can."""
+        if _renameat2(slot, target, _EXCHANGE):
+            return
+        aside = slot.with_name(_ASIDE)
+        slot.with_name(_NAME).write_bytes(os.fsencode(os.path.relpath(target, self.path.parent)))
+        target.rename(aside)
+        try:
+            _rename(slot, target)
         except OSError:
-            self.aside.rename(target)
+            _rename(aside, target)  # or it stays where it is, where somebody has its name by now
             raise
-        self.aside.rename(new)
+        aside.rename(slot)
+        slot.with_name(_NAME).unlink()
 
     def close(self) -> None:
-        """Remove it all; but during a swap only what says itself that it is ours."""
+        """Remove what this process made; of what had a target's name, only what says itself that it is ours."""
         with contextlib.suppress(OSError):
-            if not self.swapping.exists():
-                shutil.rmtree(self.work, ignore_errors=True)  # made by this process
+            shutil.rmtree(self.work, ignore_errors=True)  # nothing else is ever moved there
             self.dissolve()
 
     def dissolve(self) -> None:
         """Remove what is known as ours, then the directory itself; it stays if there is anything else."""
-        if os.path.lexists(self.aside):
-            self._restore()
         if is_folder(self.work):
-            if self.swapping.exists():
-                _remove_own(self.work, beside=self.path.parent)
-            else:
-                _remove_half_made(self.work)
-        gone = [remove_empty(folder) for folder in (self.work, self.aside)]
+            _remove_half_made(self.work)
+        gone = [remove_empty(self.work)]
+        for slot in [path for path in self.path.iterdir() if path.name.startswith(_SLOT) and is_folder(path)]:
+            with contextlib.suppress(OSError, ValueError):
+                _restore(slot, self.path.parent)
+            for path in list(slot.iterdir()):
+                with contextlib.suppress(OSError):
+                    _remove_own(path, beside=self.path.parent)
+            gone.append(remove_empty(slot))
         if not all(gone):
-            _log.warning("%s holds something that quadsim did not write; it was left as it is", self.path)
+            _log.warning("%s holds files that are not quadsim's; move them out, then delete it", self.path)
             return
-        self.swapping.unlink(missing_ok=True)
         self.owner.unlink(missing_ok=True)
         self.path.rmdir()
-
-    def _restore(self) -> None:
-        """Give what was moved aside its name again, unless something has it by now."""
-        target = self.path.parent / Path(str(json.loads(self.owner.read_bytes())["target"])).name
-        if not os.path.lexists(target):
-            self.aside.rename(target)
-        elif is_sealed(self.aside):
-            self.aside.unlink()
-        elif is_folder(self.aside):
-            remove_listed(self.aside)
 
 
 @contextlib.contextmanager
@@ -164,9 +154,9 @@ def staging_beside(target: Path) -> Iterator[Staging]:
     handle = -1
     staging: Staging | None = None
     try:
-        _clear_leftovers(target.parent)
+        clear_leftovers(target.parent)
         staging = Staging(Path(tempfile.mkdtemp(prefix=".quadsim-", suffix=".partial", dir=target.parent)))
-        handle = _sign(staging, target)
+        handle = _sign(staging)
         staging.work.mkdir()
         yield staging
     except OutputError as error:
@@ -182,10 +172,10 @@ def staging_beside(target: Path) -> Iterator[Staging]:
             os.close(handle)
 
 
-def _sign(staging: Staging, target: Path) -> int:
+def _sign(staging: Staging) -> int:
     """Write down whose a staging directory is; the open file is locked as long as the process lives."""
     inode = staging.path.stat().st_ino  # a copy of it has another
-    owner = {"target": target.name, "inode": inode, **_identity(os.getpid())}
+    owner = {"inode": inode, **_identity(os.getpid())}
     handle = os.open(staging.owner, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
     with contextlib.suppress(OSError):  # of a file system that knows no locks
         fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -203,12 +193,12 @@ def _identity(pid: int) -> dict[str, Any]:
     return {"pid": pid, "started": started, "boot": boot, "host": platform.node()}
 
 
-def _clear_leftovers(folder: Path) -> None:
+def clear_leftovers(folder: Path) -> None:
     """Remove the staging directories in a folder whose processes were killed."""
     with os.scandir(folder) as entries:
         found = [Staging(Path(entry.path)) for entry in entries if STAGING.fullmatch(entry.name)]
     for staging in found:
-        with contextlib.suppress(OSError):
+        with contextlib.suppress(OSError, ValueError):
             if _is_abandoned(staging):
                 staging.dissolve()
 
@@ -219,8 +209,9 @@ def _is_abandoned(staging: Staging) -> bool:
         return False
     try:
         owner = json.loads(staging.owner.read_bytes())
-        now = _identity(int(owner["pid"]))
-        ours = owner["inode"] == staging.path.stat().st_ino and owner["host"] == now["host"]
+        now, state = _identity(int(owner["pid"])), staging.path.lstat()
+        safe = state.st_uid == os.geteuid() and not state.st_mode & 0o022  # nobody else moves things in it
+        ours = safe and owner["inode"] == state.st_ino and owner["host"] == now["host"]
         alive = owner["boot"] == now["boot"] and owner["started"] == now["started"]
     except (ValueError, TypeError, LookupError, OverflowError, RecursionError):
         return False
@@ -243,18 +234,33 @@ def _remove_half_made(work: Path) -> None:
             path.unlink()
 
 
-def _remove_own(work: Path, *, beside: Path) -> None:
+def _remove_own(path: Path, *, beside: Path) -> None:
     """Unlink what says itself that it is ours, or what the manifest of the directory around it lists."""
-    if read_manifest(work) is not None:
-        remove_listed(work)
+    if is_folder(path):
+        manifest = read_manifest(path)
+        if manifest is None or not foreign(path, manifest):
+            remove_listed(path)
         return
     around = read_manifest(beside)
     known = [] if around is None else [digest for digests in around.files.values() for digest in digests]
-    for path in list(work.iterdir()):
-        if is_folder(path):
-            remove_empty(path)
-        elif is_file(path) and (is_sealed(path) or is_known(path, known) or is_manifest(path)):
-            path.unlink()
+    if is_file(path) and (is_sealed(path) or is_known(path, known) or is_manifest(path)):
+        path.unlink()
+
+
+def _restore(slot: Path, folder: Path) -> None:
+    """Give what was moved aside its name again, where a process died in the midst of two steps."""
+    name = slot / _NAME
+    if not is_file(name):
+        return
+    target = Path(os.fsdecode(name.read_bytes()))
+    if os.path.lexists(slot / _ASIDE) and not target.is_absolute() and ".." not in target.parts:
+        _rename(slot / _ASIDE, folder / target)  # refused where something has it by now
+    name.unlink()
+
+
+def _refuse(target: Path, reason: str | None) -> None:
+    if reason is not None:
+        raise OutputError(target, reason)
 
 
 def _renameat2(source: Path, target: Path, flags: int) -> bool:

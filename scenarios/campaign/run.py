@@ -200,9 +200,9 @@ class _Progress:
         self._watch(Standing(flown=there, flights=self.wanted, failed=failed, rate=self.flown / elapsed))
 
     def _flush(self) -> None:
-        waiting, self._waiting = self._waiting, []
         self._flushed = clock.perf_counter()
-        self.store.append(waiting)
+        self.store.append(self._waiting)
+        self._waiting = []  # not before: by Ctrl-C it is appended once more, to the same file
 
     def _note(self, flights: Any, failed: Any) -> None:
         self._outcomes[np.asarray(flights, int)] = np.asarray(failed, np.int8)

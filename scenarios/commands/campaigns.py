@@ -33,7 +33,7 @@ def campaign(options: Namespace) -> int:
     if options.junit is not None and not requirements:
         raise ParameterError("", "--junit", options.junit, "given with --require, whose verdicts it is to hold")
     if options.junit is not None:
-        require_file(options.junit)
+        require_file(options.junit, ".xml")
     plan = load_plan(options.file, options.settings, flights=options.flights, seed=options.seed)
     for requirement in requirements:
         parse_event(requirement.event.text, plan.columns)

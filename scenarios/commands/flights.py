@@ -37,7 +37,7 @@ def run(options: Namespace) -> int:
 def check(options: Namespace) -> int:
     """`quadsim check`."""
     if options.junit is not None:
-        require_file(options.junit)
+        require_file(options.junit, ".xml")
     again = None
     if Path(options.target).is_dir():
         if options.settings or options.seed is not None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tempfile
 from argparse import Namespace
 from pathlib import Path
 
@@ -26,10 +25,8 @@ def video(options: Namespace) -> int:
     if path.suffix not in (".mp4", ".gif"):
         raise ParameterError("", "--out", options.out, "a file ending in .mp4 or .gif")
     if path.resolve().parent == directory.resolve():
-        with rundir.adding(directory, path.name) as add, tempfile.TemporaryDirectory() as scratch:
-            film = Path(scratch) / path.name
+        with rundir.adding(directory, path.name) as film:
             _film(directory, film, options)
-            add(film.read_bytes())
     else:
         _film(directory, path, options)
     print(f"written to {printable(str(path))}")

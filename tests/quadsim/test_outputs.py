@@ -26,6 +26,7 @@ from quadsim.errors import OutputError
 from quadsim.outputs import (
     growing,
     manifest,
+    places,
     real_path,
     require_directory,
     require_file,
@@ -253,6 +254,9 @@ def test_a_hostile_manifest_reaches_nothing_outside(ours: Path) -> None:
     (ours / "way").symlink_to(ours.parent / "way")
     files = {"../secret.txt": (digest,), str(secret): (digest,), "way/secret.txt": (digest,)}
     (ours / ".quadsim.json").write_bytes(manifest.Manifest(kind=KIND, files=files).encode())
+    manifest.remove_listed(ours)  # has no manifest of ours
+    files = {"way/secret.txt": (digest,)}
+    (ours / ".quadsim.json").write_bytes(manifest.Manifest(kind=KIND, files=files).encode())
     manifest.remove_listed(ours)
     assert secret.read_text() == (ours.parent / "way" / "secret.txt").read_text() == "mine"
 
@@ -290,7 +294,7 @@ def test_a_path_without_links_and_dots_stays_as_it_is(
 def test_a_path_that_leads_nowhere_is_refused(tmp_path: Path, name: str, message: str) -> None:
     (tmp_path / "loop").symlink_to("pool")
     (tmp_path / "pool").symlink_to("loop")
-    for refuse in (lambda path: require_directory(path, KIND), require_file):
+    for refuse in (lambda path: require_directory(path, KIND), lambda path: require_file(path, ".xml")):
         with pytest.raises(OutputError, match=message):
             refuse(tmp_path / name)
 
@@ -524,7 +528,7 @@ def test_a_leftover_with_something_of_a_persons_in_it_stays(tmp_path: Path, capl
         (left / "work" / "thesis.txt").write_text("years")
         make(tmp_path / "other")
         assert listing(left) == ["owner.json", "work", "work/thesis.txt"]
-        assert f"{left} holds something that quadsim did not write" in caplog.text
+        assert f"{left} holds files that are not quadsim's" in caplog.text
 
 
 @pytest.mark.parametrize("change", ["another inode", "another host", "alive", "no owner", "nonsense", "locked"])
@@ -573,7 +577,8 @@ def test_a_process_that_dies_while_it_swaps_costs_nothing(
         if moment == "after the swap":
             exchange(self, new, target)
         elif moment == "between two steps":
-            target.rename(self.aside)
+            new.with_name(staging._NAME).write_bytes(b"run")
+            target.rename(new.with_name(staging._ASIDE))
         raise SystemExit
 
     with monkeypatch.context() as patch:
@@ -593,9 +598,117 @@ def test_a_process_that_dies_while_it_swaps_costs_nothing(
         assert contents(ours) == before
 
 
+def test_the_lock_of_another_user_s_leftover_is_no_licence(tmp_path: Path) -> None:
+    with killed("writing", tmp_path / "run") as left:
+        left.chmod(0o777)  # anybody may have put links into it
+        before = contents(left)
+        make(tmp_path / "other")
+        assert contents(left) == before
+
+
+def test_a_leftover_in_a_directory_of_ours_does_not_bar_it(tmp_path: Path) -> None:
+    with killed("growing", tmp_path / "c"):
+        pass
+    with writing(tmp_path / "c", "campaign") as partial:
+        (partial / "new.txt").write_text("new")
+    assert listing(tmp_path / "c") == ["new.txt"]
+
+
+# --- moments -------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("how", ["directory", "file"])
+def test_what_is_saved_into_the_new_one_before_it_goes_back_stays(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, how: str
+) -> None:
+    """Somebody else's things come to light in the swap; in that moment more is saved where they were."""
+    target = tmp_path / "target"
+    exchange, times = staging.Staging._exchange, iter(range(9))
+
+    def late(self: staging.Staging, slot: Path, place: Path) -> None:
+        if next(times) == 0:  # after the first look
+            (place / "first.txt").write_text("mine") if how == "directory" else place.write_text("mine")
+            exchange(self, slot, place)
+            if how == "directory":
+                (place / "second.txt").write_text("mine")
+            else:
+                with place.open("a") as file:
+                    file.write("mine")
+        else:
+            exchange(self, slot, place)
+
+    make(target) if how == "directory" else write_one(target, ".xml", b"<a/>")
+    monkeypatch.setattr(staging.Staging, "_exchange", late)
+    with pytest.raises(OutputError):
+        make(target) if how == "directory" else write_one(target, ".xml", b"<a/>")
+    texts = [path.read_text() for path in tmp_path.rglob("*") if path.is_file()]
+    assert sum(text.endswith("mine") for text in texts) == 2
+    assert (target / "first.txt" if how == "directory" else target).read_text() == "mine"
+
+
+@pytest.mark.parametrize("error", [PermissionError("no"), KeyboardInterrupt()])
+def test_what_cannot_be_looked_at_again_goes_back(
+    ours: Path, monkeypatch: pytest.MonkeyPatch, error: BaseException
+) -> None:
+    look, before = places.problem_with_directory, contents(ours)
+
+    def fails(path: Path, kind: str) -> str | None:
+        if path.name == "work":  # in its slot
+            raise error
+        return look(path, kind)
+
+    monkeypatch.setattr("quadsim.outputs.problem_with_directory", fails)
+    with pytest.raises((OutputError, KeyboardInterrupt)):
+        make(ours, more="more")
+    monkeypatch.undo()
+    assert contents(ours) == before
+    assert [path.name for path in ours.parent.iterdir()] == ["run"]
+
+
+@pytest.mark.parametrize("name", ["a\0b", "\ud800", "../x", "/etc/passwd", ""])
+def test_a_manifest_with_names_that_cannot_be_is_none_of_ours(ours: Path, name: str) -> None:
+    hostile = manifest.Manifest(kind=KIND, files={name: ("sha256:0",)})
+    (ours / ".quadsim.json").write_bytes(hostile.encode())
+    with pytest.raises(OutputError, match="something else is already there"):
+        make(ours)
+    make(ours.parent / "other")
+
+
+def test_ctrl_c_in_a_step_of_a_directory_that_grows_is_no_change_by_others(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    put = staging.Staging.put
+
+    def interrupted(self: staging.Staging, new: Path, target: Path, problem: Callable[[Path], str | None]) -> None:
+        put(self, new, target, problem)
+        raise KeyboardInterrupt
+
+    with growing(tmp_path, "campaign") as files:
+        files.write({"a.txt": b"one"})
+        with monkeypatch.context() as patch:
+            patch.setattr(staging.Staging, "put", interrupted)
+            with pytest.raises(KeyboardInterrupt):
+                files.write({"a.txt": b"two"})
+        files.write({"a.txt": b"three"})
+    assert (tmp_path / "a.txt").read_bytes() == b"three"
+
+
+def test_a_persons_own_lock_file_stays(tmp_path: Path) -> None:
+    (tmp_path / ".lock").touch()
+    with pytest.raises(ValueError, match="halfway"), growing(tmp_path, "campaign"):
+        raise ValueError("halfway")
+    assert (tmp_path / ".lock").exists()
+
+
+def test_a_film_is_not_replaced_by_verdicts(tmp_path: Path) -> None:
+    write_one(tmp_path / "file", ".png", b"png")
+    with pytest.raises(OutputError, match="something else is already there"):
+        write_one(tmp_path / "file", ".xml", b"<a/>")
+
+
 def test_looking_for_leftovers_takes_no_time_where_there_are_many_files(tmp_path: Path) -> None:
     for i in range(2000):
         (tmp_path / f"{i}.txt").touch()
     started = clock.perf_counter()
-    staging._clear_leftovers(tmp_path)
+    staging.clear_leftovers(tmp_path)
     assert clock.perf_counter() - started < 0.1

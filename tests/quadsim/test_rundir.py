@@ -62,8 +62,8 @@ def test_damaged_and_missing_files_are_found(copied: Path) -> None:
 def test_a_product_is_added_with_its_hash(copied: Path) -> None:
     before = rundir.read_summary(copied)
     for content in (b"film", b"another film"):
-        with rundir.adding(copied, "flight.mp4") as add:
-            add(content)
+        with rundir.adding(copied, "flight.mp4") as new:
+            new.write_bytes(content)
         after = rundir.read_summary(copied)
         assert set(after["files"]) - set(before["files"]) == {"flight.mp4"}
         assert {**after, "files": 0} == {**before, "files": 0}
@@ -88,8 +88,8 @@ def test_a_product_never_replaces_what_is_not_ours(copied: Path, name: str) -> N
 def test_what_was_changed_by_hand_is_not_listed_by_adding_to_it(copied: Path) -> None:
     with (copied / "scenario.toml").open("a") as file:
         file.write("#")
-    with rundir.adding(copied, "flight.mp4") as add:
-        add(b"film")
+    with rundir.adding(copied, "flight.mp4") as new:
+        new.write_bytes(b"film")
     assert rundir.damaged_files(copied, rundir.read_summary(copied)) == ["scenario.toml"]
 
 
