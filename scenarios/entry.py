@@ -19,10 +19,23 @@ _PATIENCE_S: Final = 1.0
 
 
 class _Stop:
-    """Makes Ctrl-C of a signal; who goes away, or is impatient, sends several."""
+    """Makes Ctrl-C of a signal; who goes away, or is impatient, sends several.
+
+    Python ignores an exception that comes up in a destructor or a callback, of which imports have many; such a
+    Ctrl-C is raised once more.
+    """
 
     def __init__(self) -> None:
         self._last = -math.inf
+
+    def raise_again(self, ignored: sys.UnraisableHookArgs) -> None:
+        """See `sys.unraisablehook`."""
+        if issubclass(ignored.exc_type, KeyboardInterrupt):
+            self._last = -math.inf
+            signal.signal(signal.SIGALRM, self)
+            signal.setitimer(signal.ITIMER_REAL, 0.01)  # by then Python is out of there
+        else:
+            sys.__unraisablehook__(ignored)
 
     def __call__(self, number: int, frame: object) -> None:
         """See `signal.signal`."""
@@ -38,6 +51,7 @@ def main() -> int:
     try:
         for stop in heard:
             signal.signal(stop, handler)
+        sys.unraisablehook = handler.raise_again
         _open_what_is_closed()
         if sys.stdout is None:
             print("quadsim: stdout is closed; to do without what is printed: >/dev/null", file=sys.stderr)

@@ -117,6 +117,10 @@ WRITERS: Final[dict[str, tuple[int, int]]] = {
 """How often each comes up, and how many may go all the way; the others only where they are refused at the door."""
 
 
+FORMS: Final = {"check": ".xml", "junit": ".xml", "vehicle": ".png", "video": ".gif"}
+"""Of those that write a file by itself."""
+
+
 def command_of(writer: str, inputs: Inputs, out: str) -> tuple[list[str], str | None]:
     """The command line that writes to a place, and whether it makes a directory of ours, of which kind."""
     given = f"--out={out}"
@@ -242,7 +246,7 @@ def check_case(
     refused = True
     try:
         target = real_path(place)
-        require_directory(target, kind) if kind else require_file(target)
+        require_directory(target, kind) if kind else require_file(target, FORMS[writer])
         refused = False
     except OutputError:
         target = base / "nowhere"

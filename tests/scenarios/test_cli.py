@@ -579,6 +579,36 @@ def test_who_is_told_to_stop_in_the_first_moments_ends_in_order(
     assert {path.name for path in tmp_path.iterdir()} <= {"runs"}
 
 
+SWALLOWED = """
+import os, signal, sys, time
+from scenarios import cli, entry
+class Dying:
+    def __del__(self):
+        os.kill(os.getpid(), signal.SIGINT)
+        time.sleep(0.1)
+def run():
+    Dying()
+    time.sleep(5)
+    return 0
+cli.main = run
+sys.exit(entry.main())
+"""
+
+
+def test_a_stop_that_python_ignores_is_heard(tmp_path: Path) -> None:
+    """It does so in destructors and callbacks, of which imports have many."""
+    done = subprocess.run(
+        [sys.executable, "-c", SWALLOWED],
+        cwd=tmp_path,
+        env=environment(),
+        capture_output=True,
+        timeout=60,
+        preexec_fn=listening,
+    )
+    assert done.returncode == EXIT_FAILED
+    assert done.stderr.startswith(b"quadsim: interrupted (Ctrl-C)")
+
+
 def listening() -> None:
     """A shell's `&` has these signals ignored."""
     for stop in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
