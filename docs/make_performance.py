@@ -6,6 +6,7 @@ them (`scenarios.bench.race`), and all tables and figures take them from there.
 
 from __future__ import annotations
 
+import argparse
 import math
 import subprocess
 import sys
@@ -38,6 +39,8 @@ from scenarios.runner import fly_scenario
 
 ROOT = Path(__file__).resolve().parent.parent
 SCENARIO = "paper-constrained"
+REST = "## Where the time of a flight goes"
+"""What begins with it stays as it is where steps alone are measured."""
 
 REPEATS = 5
 
@@ -163,10 +166,8 @@ def campaigns() -> str:
     )
 
 
-def page(
-    bench: SolverBench, flight: FlightProfile, film: RenderProfile, commands: str, effects: str, campaigns: str
-) -> str:
-    """The whole page."""
+def steps(bench: SolverBench) -> str:
+    """The page's beginning: all that is told of a controller's steps."""
     contenders, *others = solver_tables(bench)
     machine = bench.machine
     return "\n".join(
@@ -180,6 +181,14 @@ def page(
             section(contenders),
             "![Time of a whole controller step of every contender, and its growth with the horizon](solvers.png)\n",
             *(section(grid) for grid in others),
+        ]
+    )
+
+
+def rest(flight: FlightProfile, film: RenderProfile, commands: str, effects: str, campaigns: str) -> str:
+    """What else takes time."""
+    return "\n".join(
+        [
             *(section(grid) for grid in flight_tables(flight)),
             f"Before, by commit; measured then, on machines of the same kind, not in this run:\n\n{markdown(BEFORE)}",
             f"## What effects cost\n\n{EFFECTS_NOTE}\n\n{effects}",
@@ -191,21 +200,26 @@ def page(
 
 
 def main() -> None:
-    """Measure everything and write it."""
-    scenario = load_scenario(SCENARIO)
-    flight, film = bench_flight(scenario), bench_render(scenario)
-    commands, effects = markdown(whole_commands(flight, film)), markdown(effect_costs())
+    """Measure everything and write it; with --steps a controller's steps alone, and the rest stays as it is."""
+    parser = argparse.ArgumentParser(description=main.__doc__)
+    parser.add_argument("--steps", action="store_true")
+    options = parser.parse_args()
+    scenario, path = load_scenario(SCENARIO), ROOT / "docs" / "performance.md"
+    if options.steps:
+        end = "".join(path.read_text(encoding="utf-8").partition(REST)[1:])
+    else:
+        flight, film = bench_flight(scenario), bench_render(scenario)
+        commands, effects = markdown(whole_commands(flight, film)), markdown(effect_costs())
+        end = rest(flight, film, commands, effects, campaigns())
+        replace_in_readme("times", commands)
     bench = bench_solvers(scenario)
     with tempfile.TemporaryDirectory() as scratch:
         write_bench(bench, Path(scratch))
         figure = Image.open(Path(scratch) / "solvers.png").convert("RGB")
         figure.quantize(64, dither=Image.Dither.NONE).save(ROOT / "docs" / "solvers.png", optimize=True)
-    (ROOT / "docs" / "performance.md").write_text(
-        page(bench, flight, film, commands, effects, campaigns()), encoding="utf-8"
-    )
-    write_cost(study_cost(scenario, [load_scenario("paper-unconstrained")], timed=timed(bench)))
-    replace_in_readme("times", commands)
+    path.write_text(f"{steps(bench)}\n{end}", encoding="utf-8")
     replace_in_readme("solvers", grid_to_markdown(solver_tables(bench)[0]))
+    write_cost(study_cost(scenario, [load_scenario("paper-unconstrained")], timed=timed(bench)))
 
 
 if __name__ == "__main__":
