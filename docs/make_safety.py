@@ -21,13 +21,14 @@ BEGIN, END = "<!-- counts: made by `make safety` -->", "<!-- counts end -->"
 SUMMARIES, CAMPAIGNS = (partial(safety_mutations.as_ordinary_user, kind) for kind in ("summaries", "campaigns"))
 ATTACKS: dict[str, tuple[Callable[[int], Mapping[str, int]], int]] = {
     "Random trees and places, for every command that writes": (safety_outputs.measure, 2000),
+    "The same, drawn anew": (partial(safety_outputs.measure, number=1), 700),
     "Changed `summary.json` and tables of runs, read by every command": (SUMMARIES, 2000),
     "Changed files of campaigns, read by every command": (CAMPAIGNS, 2000),
     "Processes killed (SIGKILL) while they write": (safety_outputs.measure_kills, 40),
     "One campaign with controllers that hang, fork, eat memory, exit": (safety_campaign.measure, 60),
 }
 """What was tried: by which function, and how often."""
-ASIDE = 3
+ASIDE = 4
 """So many of them go on in processes of their own, as an ordinary user, and side by side."""
 
 
