@@ -14,7 +14,7 @@ import numpy as np
 import scipy.linalg
 
 from mpc.model import hover_model
-from mpc.prediction import rollout
+from mpc.paper.prediction import rollout
 from mpc.unconstrained import sequence_gains
 from quadsim.airframe import compile_model, rotor_thrusts
 from quadsim.controller import ACCEPTED

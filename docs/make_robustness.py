@@ -13,7 +13,7 @@ import numpy as np
 from fault_injection import CONTROLLERS, NEAR, SOON, Consequence, draw, inject_all
 from PIL import Image
 
-from mpc.tightening import TighteningSettings
+from mpc.robust.tightening import TighteningSettings
 from quadsim.bench import Ladder, LadderFlight, ladder_legend, ladder_tables
 from quadsim.bench.ladder_tables import ARRIVED
 from quadsim.table import Cell, Grid

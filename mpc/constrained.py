@@ -6,18 +6,14 @@ from typing import Final
 
 import numpy as np
 
-from mpc.condensed import require_bounds
-from mpc.prediction import rollout
-from mpc.problem import Problem
-from mpc.qp import Solution
-from mpc.shortcut import with_shortcut
+from mpc.answer import ActuatorBounds, rejection, shifted
+from mpc.exact.shortcut import with_shortcut
+from mpc.ocp import Problem
+from mpc.paper.prediction import rollout
 from mpc.solvers import Answer, Solver, Way
-from quadsim.controller import ACCEPTED, GROUNDED, Command, Moment, Phase, stopped
+from quadsim.controller import GROUNDED, Command, Moment, Phase, stopped
 from quadsim.errors import PlanExhaustedError
 from quadsim.state import Array
-
-BOUND_TOLERANCE: Final = 1e-6
-"""How far outside its hard bounds [rad/s] an answer may be and still count as in bounds; it is then moved onto them."""
 
 
 class ConstrainedMPC:
@@ -31,7 +27,7 @@ class ConstrainedMPC:
     Args:
         problem: with bounds.
         solver: set up for the same problem.
-        shortcut: whether to try less than the whole QP first, see `mpc.shortcut`; the commands are the same.
+        shortcut: whether to try less than the whole QP first, see `mpc.exact.shortcut`; the commands are the same.
     """
 
     name: Final = "constrained"
@@ -39,7 +35,7 @@ class ConstrainedMPC:
     def __init__(self, problem: Problem, solver: Solver, *, shortcut: bool = True) -> None:
         self.problem = problem
         self._solver = with_shortcut(problem, solver) if shortcut else solver
-        self._bounds = require_bounds(problem)
+        self._bounds = ActuatorBounds.of_problem(problem)
         self._before = problem.model.u_bar
         self._plan: Array | None = None
         self._held = 0
@@ -59,6 +55,7 @@ class ConstrainedMPC:
         self._before = np.array(speeds, float)
         self._plan = None
         self._held = 0
+        self._solver.reset()
 
     def step(self, now: Moment, state: Array, reference: Array) -> Command:
         """See `quadsim.controller.Controller.step`.
@@ -81,7 +78,7 @@ class ConstrainedMPC:
         return rollout(self.problem.model, states, plans)
 
     def _stop(self, phase: Phase) -> Command:
-        lower, _ = self._reach()
+        lower, _ = self._bounds.reach(self._before)
         self._before, self._plan, self._held = lower, None, 0
         return stopped(lower.copy(), self.horizon, phase)
 
@@ -92,8 +89,7 @@ class ConstrainedMPC:
         return Command(speeds=answer.plan[0].copy(), plan=answer.plan, status=solution.status, solve_s=solution.solve_s)
 
     def _follow(self, time: float, answer: Answer) -> Command:
-        lower, upper = self._reach()
-        problem = _rejection(answer.solution, answer.plan, lower, upper)
+        problem = rejection(answer.solution.status, answer.plan, self._bounds, self._before)
         if problem is None:
             self._plan, self._held = answer.plan, 0
         elif self._plan is None or self._held + 1 >= self.horizon:
@@ -101,40 +97,18 @@ class ConstrainedMPC:
             raise PlanExhaustedError(f"the solver answered {problem!r} {held}", time=time)
         else:
             self._held += 1
-        speeds = np.minimum(np.maximum(self._plan[self._held], lower), upper)
+        speeds = self._bounds.clip(self._plan[self._held], self._before)
         self._before = speeds
         solution = answer.solution
         return Command(
             speeds=speeds.copy(),
-            plan=self._plan if problem is None else _shifted(self._plan, self._held),
+            plan=self._plan if problem is None else shifted(self._plan, self._held),
             status=problem or solution.status,
             iterations=solution.iterations,
             active=solution.active if problem is None else 0,
+            slack=float(np.max(answer.slacks, initial=0.0)) if problem is None else 0.0,
             fallback=int(problem is not None),
             primal_residual=solution.primal_residual,
             dual_residual=solution.dual_residual,
             solve_s=solution.solve_s,
         )
-
-    def _reach(self) -> tuple[Array, Array]:
-        """The speeds (4,) that the hard input bounds leave for this period, Eqs. (15) and (20)."""
-        bounds = self._bounds
-        lower = np.maximum(bounds.u_min, self._before + bounds.delta_min)
-        upper = np.minimum(bounds.u_max, self._before + bounds.delta_max)
-        return lower, upper
-
-
-def _shifted(plan: Array, steps: int) -> Array:
-    """What is left of a plan (N, nu) after some steps, its last input held."""
-    return np.concatenate([plan[steps:], np.repeat(plan[-1:], steps, axis=0)])
-
-
-def _rejection(solution: Solution, plan: Array, lower: Array, upper: Array) -> str | None:
-    """Why an answer must not reach the plant, or None."""
-    if solution.status not in ACCEPTED:
-        return solution.status
-    if not np.isfinite(plan).all():
-        return "not_finite"
-    if np.maximum(lower - plan[0], plan[0] - upper).max() > BOUND_TOLERANCE:
-        return "out_of_bounds"
-    return None

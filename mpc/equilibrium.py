@@ -14,7 +14,7 @@ from typing import Final
 
 import numpy as np
 
-from mpc.nonlinear import NonlinearModel
+from mpc.nonlinear.model import NonlinearModel
 from quadsim.errors import ParameterError
 from quadsim.state import INDEX, N_STATES, Array
 from quadsim.vehicle import N_ROTORS

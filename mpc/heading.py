@@ -15,7 +15,7 @@ import numpy as np
 
 from mpc.equilibrium import Trim
 from mpc.model import LinearModel
-from mpc.prediction import rollout
+from mpc.paper.prediction import rollout
 from quadsim.state import INDEX, N_STATES, Array
 
 _YAW: Final = INDEX["yaw"]

@@ -8,8 +8,8 @@ from typing import Protocol, TypeAlias
 import numpy as np
 from scipy.sparse import csc_matrix
 
-from mpc.problem import Problem
-from quadsim.state import Array
+from mpc.ocp import Problem, Rest, Rows
+from quadsim.state import Array, Indices
 
 Matrix: TypeAlias = Array | csc_matrix
 
@@ -29,10 +29,6 @@ class QP:
     """min 1/2 x' P x + c' x  subject to  A x = b,  h_l <= G x <= h_u,  x_l <= x <= x_u.
 
     Matrices are dense or sparse (csc); bounds may be infinite.  Eq. (27), with rows bounded from both sides.
-
-    Attributes:
-        seldom: how many rows, the last of G, hardly ever bind.  A hint: a back end may leave them out at first, since
-            an optimum that satisfies them all the same is the optimum.
     """
 
     P: Matrix
@@ -44,11 +40,107 @@ class QP:
     h_u: Array
     x_l: Array
     x_u: Array
-    seldom: int = 0
 
     def with_vectors(self, vectors: Vectors) -> QP:
         """The same matrices and box with other vectors."""
         return replace(self, c=vectors.c, b=vectors.b, h_l=vectors.h_l, h_u=vectors.h_u)
+
+
+@dataclass(frozen=True, kw_only=True)
+class QPRows:
+    """A problem's rows as a QP has them: bounds of single inputs in the box, a soft row as two with the same slack.
+
+    Attributes:
+        C: (K, n).
+        D: (K, nu).
+        E: (K, nu).
+        slack: (K, m_s) how slacks enter.
+        lower, upper: (N, K).
+        of_states: (K,) see `mpc.ocp.Rows`.
+        u_min, u_max: (N, nu) the box.
+        origin: (K,) which of the problem's rows each is.
+        boxed: the problem's rows in the box.
+        whole: the problem's rows.
+    """
+
+    C: Array
+    D: Array
+    E: Array
+    slack: Array
+    lower: Array
+    upper: Array
+    of_states: np.ndarray[tuple[int], np.dtype[np.bool_]]
+    u_min: Array
+    u_max: Array
+    origin: Indices
+    boxed: Indices
+    whole: Rows
+
+    def multipliers(self, z: Array, z_inputs: Array) -> Array:
+        """(N, m) multipliers of the problem's rows, from those of the QP's rows (N K,) and of inputs (N nu,)."""
+        N = len(self.lower)
+        found = np.zeros((N, len(self.whole.C)))
+        for column, row in zip(z.reshape(N, -1).T, self.origin, strict=True):
+            found[:, row] += column
+        z_inputs = z_inputs.reshape(N, -1)[:, self.whole.input[self.boxed]]
+        held = np.where(z_inputs > 0.0, self._binding(self.u_max, "upper"), self._binding(self.u_min, "lower"))
+        found[:, self.boxed] = np.where(held, z_inputs, 0.0)
+        return found
+
+    def split(self, multipliers: Array) -> tuple[Array, Array]:
+        """The inverse: multipliers of the QP's rows (N K,) and of inputs (N nu,)."""
+        z = multipliers[:, self.origin]
+        upward = np.where(np.isneginf(self.lower) & np.isfinite(self.upper), np.maximum(z, 0.0), z)
+        z = np.where(np.isposinf(self.upper), np.minimum(z, 0.0), upward)
+        z_inputs = np.zeros(self.u_min.shape)
+        for row in self.boxed:
+            z_inputs[:, self.whole.input[row]] += multipliers[:, row]
+        return z.ravel(), z_inputs.ravel()
+
+    def _binding(self, box: Array, side: str) -> Array:
+        """(N, boxed) which of the rows in the box is its bound."""
+        return np.asarray(getattr(self.whole, side)[:, self.boxed] == box[:, self.whole.input[self.boxed]])
+
+
+def qp_rows(problem: Problem) -> QPRows:
+    """A problem's rows as a QP has them.
+
+    Raises:
+        ValueError: the problem has none.
+    """
+    rows, nu = problem.rows, problem.model.nu
+    soft = rows.soft
+    number = np.zeros(len(rows.C), np.int64)
+    number[soft] = np.arange(soft.size)
+    boxed = np.flatnonzero(rows.input >= 0)
+    hard = np.flatnonzero((rows.input < 0) & np.isinf(rows.l1))
+    above = soft[np.isfinite(rows.upper[:, soft]).any(axis=0)]
+    below = soft[np.isfinite(rows.lower[:, soft]).any(axis=0)]
+    origin = np.concatenate([hard, above, below])
+    slack = np.zeros((origin.size, soft.size))
+    slack[hard.size + np.arange(above.size), number[above]] = -1.0
+    slack[hard.size + above.size + np.arange(below.size), number[below]] = 1.0
+    lower, upper = rows.lower[:, origin].copy(), rows.upper[:, origin].copy()
+    lower[:, hard.size : hard.size + above.size] = -np.inf
+    upper[:, hard.size + above.size :] = np.inf
+    u_min, u_max = np.full((len(lower), nu), -np.inf), np.full((len(lower), nu), np.inf)
+    for row in boxed:
+        u_min[:, rows.input[row]] = np.maximum(u_min[:, rows.input[row]], rows.lower[:, row])
+        u_max[:, rows.input[row]] = np.minimum(u_max[:, rows.input[row]], rows.upper[:, row])
+    return QPRows(
+        C=rows.C[origin],
+        D=rows.D[origin],
+        E=rows.E[origin],
+        slack=slack,
+        lower=lower,
+        upper=upper,
+        of_states=rows.of_states[origin],
+        u_min=u_min,
+        u_max=u_max,
+        origin=origin,
+        boxed=boxed,
+        whole=rows,
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,7 +152,7 @@ class Solution:
         y: multipliers of A x = b.
         z: multipliers of h_l <= G x <= h_u, positive at the upper side, negative at the lower.
         z_box: multipliers of x_l <= x <= x_u, signed likewise.
-        status: `solved`, or the back end's name for what went wrong; of a shortcut, see `mpc.shortcut`.
+        status: `solved`, or the back end's name for what went wrong; of a shortcut, see `mpc.exact.shortcut`.
         iterations: of the back end.
         active: inequality rows and box entries active at the point.
         primal_residual: as the back end reports it, before any polish; NaN where it reports none.
@@ -88,16 +180,20 @@ class Formulation(Protocol):
         """The matrices, with vectors for a zero state."""
         ...
 
-    def vectors(self, state: Array, desired: Array, u_before: Array) -> Vectors:
-        """The QP's vectors for xi(k) (n,), y_d (N, n_r) and u(k-1) (nu,)."""
+    def vectors(self, state: Array, desired: Array, u_before: Array, rest: Rest | None = None) -> Vectors:
+        """The QP's vectors for xi(k) (n,), y_d (N, n_r) and u(k-1) (nu,), at the problem's rest state or another."""
         ...
 
     def inputs(self, x: Array) -> Array:
         """(N, nu) the planned inputs [rad/s] in a primal point."""
         ...
 
-    def condensed(self, solution: Solution) -> Solution:
-        """The same solution as one of the QP of `mpc.condensed`."""
+    def slacks(self, x: Array) -> Array:
+        """(N, m_s) the slacks of soft rows in a primal point."""
+        ...
+
+    def multipliers(self, solution: Solution) -> Array:
+        """(N, m) the multipliers of the problem's rows (`mpc.ocp.Rows`), signed as in `Solution`."""
         ...
 
 

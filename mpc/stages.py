@@ -1,15 +1,14 @@
-"""The parts of a QP cut into stages: where its variables are, its constraint rows, matrices of a fixed pattern."""
+"""The parts of a QP cut into stages: where its variables are, and matrices of a fixed pattern."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.sparse import csc_matrix
 
-from mpc.problem import Bounds
 from quadsim.state import Array, Indices
 
 
@@ -20,14 +19,22 @@ class Pattern:
         shape: of the matrix.
         places: rows (..., rows) and columns (..., columns) of each block.
         blocks: an example; what is zero in it is left out for good.
+        rounding: share of the largest of its block's row and of its block's column below which an entry is zero.
     """
 
-    def __init__(self, shape: tuple[int, int], places: Sequence[tuple[Indices, Indices]], blocks: list[Array]) -> None:
+    def __init__(
+        self,
+        shape: tuple[int, int],
+        places: Sequence[tuple[Indices, Indices]],
+        blocks: list[Array],
+        *,
+        rounding: float = 0.0,
+    ) -> None:
         pairs = list(zip(places, blocks, strict=True))
         rows = np.concatenate([np.broadcast_to(at[0][..., :, None], block.shape).ravel() for at, block in pairs])
         columns = np.concatenate([np.broadcast_to(at[1][..., None, :], block.shape).ravel() for at, block in pairs])
         order = np.lexsort((rows, columns))
-        self._order = order[np.concatenate([block.ravel() for block in blocks])[order] != 0.0]
+        self._order = order[np.concatenate([_present(block, rounding).ravel() for block in blocks])[order]]
         self._rows = rows[self._order].astype(np.int32)
         counts = np.bincount(columns[self._order], minlength=shape[1])
         self._starts = np.concatenate([[0], np.cumsum(counts)]).astype(np.int32)
@@ -37,6 +44,15 @@ class Pattern:
         """The matrix with these blocks, its zeros stored."""
         data = np.concatenate([block.ravel() for block in blocks])[self._order]
         return csc_matrix((data, self._rows, self._starts), shape=self._shape)
+
+
+def _present(block: Array, rounding: float) -> NDArray[np.bool_]:
+    """Which entries (..., rows, columns) of a block are not zero."""
+    size = np.abs(block)
+    if not rounding or not size.size:
+        return size > 0.0
+    largest = np.minimum(size.max(axis=-1, keepdims=True), size.max(axis=-2, keepdims=True))
+    return np.asarray(size > rounding * largest)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -121,62 +137,3 @@ def condense_stages(start: Array, A: Array, B: Array, c: Array) -> Array:
         states[:, t + 1, :, at : at + nu] = B[:, t]
         states[:, t + 1, :, -1] += c[:, t]
     return states
-
-
-@dataclass(frozen=True, kw_only=True)
-class Rows:
-    """The rows of G.
-
-    Attributes:
-        C: (n_rows, n) per predicted state.
-        slack: (n_rows, n_s) its slacks' signs.
-        outputs: (N, n_rows) where these rows are.
-        limited: which inputs have bounds on their slews.
-        slews: where the rows u(i) - u(i-1) are.
-        slewing: which variables are the u(i) in them.
-        h_l, h_u: bounds, for variables and known states at zero.
-    """
-
-    C: Array
-    slack: Array
-    outputs: Indices
-    limited: Indices
-    slews: Indices
-    slewing: Indices
-    h_l: Array
-    h_u: Array
-
-
-def constraint_rows(at: Layout, bounds: Bounds, *, soft: bool, margins: Array | None = None) -> Rows:
-    """Rows that bound nothing are left out; soft bounds take a row for each side, with the same slack.
-
-    Args:
-        at: the variables.
-        bounds: of outputs, inputs and slews.
-        soft: whether output bounds are.
-        margins: (N, n_c) by which they are drawn in; None for none.
-    """
-    drawn_in = np.zeros((at.N, bounds.y_min.size)) if margins is None else margins
-    below, above = np.isfinite(bounds.y_min), np.isfinite(bounds.y_max)
-    if soft:
-        upper, lower = np.flatnonzero(above), np.flatnonzero(below)
-        kept = np.concatenate([upper, lower])
-        slack = np.concatenate([-np.eye(len(below))[upper], np.eye(len(below))[lower]])
-        y_min = np.concatenate([np.full(upper.size, -math.inf), bounds.y_min[lower]])
-        y_max = np.concatenate([bounds.y_max[upper], np.full(lower.size, math.inf)])
-    else:
-        kept = np.flatnonzero(below | above)
-        slack = np.zeros((kept.size, 0))
-        y_min, y_max = bounds.y_min[kept], bounds.y_max[kept]
-    limited = bounds.slewing
-    outputs = np.arange(at.N * kept.size).reshape(at.N, kept.size)
-    return Rows(
-        C=bounds.C_c[kept],
-        slack=slack,
-        outputs=outputs,
-        limited=limited,
-        slews=outputs.size + np.arange(at.N * limited.size),
-        slewing=at.inputs[:, limited].ravel(),
-        h_l=np.concatenate([(y_min + drawn_in[:, kept]).ravel(), np.tile(bounds.delta_min[limited], at.N)]),
-        h_u=np.concatenate([(y_max - drawn_in[:, kept]).ravel(), np.tile(bounds.delta_max[limited], at.N)]),
-    )

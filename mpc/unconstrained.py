@@ -9,9 +9,9 @@ from typing import Final
 import numpy as np
 import scipy.linalg
 
-from mpc.cost import cost
-from mpc.prediction import prediction, rollout
-from mpc.problem import Problem
+from mpc.ocp import Problem
+from mpc.paper.cost import cost
+from mpc.paper.prediction import prediction, rollout
 from quadsim.controller import GROUNDED, Command, Moment, stopped
 from quadsim.state import Array
 

@@ -8,7 +8,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from mpc.problem import Problem
+from mpc.ocp import Problem
 from quadsim.airframe import outline
 from quadsim.assets import vehicle_path
 from quadsim.audit import Limit

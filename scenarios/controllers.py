@@ -8,16 +8,15 @@ from typing import Any, Final
 
 import numpy as np
 
-from mpc.actuators import ActuatorBounds
+from mpc.answer import ActuatorBounds
 from mpc.constrained import ConstrainedMPC
-from mpc.fallback import FallbackSettings, Guarded
+from mpc.fallback.contract import FallbackSettings, Guarded
 from mpc.model import hover_model
-from mpc.observer import ObserverSettings
-from mpc.problem import Bounds, Objective, Problem
-from mpc.robust import Linearisation, RobustMPC, RobustSettings
+from mpc.ocp import Bounds, Objective, Penalty, Problem
+from mpc.robust.controller import Linearisation, RobustMPC, RobustSettings
+from mpc.robust.observer import ObserverSettings
+from mpc.robust.tightening import SHORTEST_LAG, TighteningSettings, margins
 from mpc.solvers import QPSolver
-from mpc.stagewise import Penalty
-from mpc.tightening import SHORTEST_LAG, TighteningSettings, margins
 from mpc.unconstrained import UnconstrainedMPC
 from quadsim.controller import Controller
 from quadsim.errors import InputError, ParameterError

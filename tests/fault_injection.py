@@ -13,7 +13,7 @@ from unittest import mock
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from mpc.fallback import Guarded
+from mpc.fallback.contract import Guarded
 from mpc.solvers import _piqp
 from quadsim.controller import SOLVED, Command, Controller, Moment
 from quadsim.flightlog import FlightLog

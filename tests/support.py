@@ -10,7 +10,7 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from mpc.model import LinearModel
-from mpc.problem import Bounds, Objective, Problem
+from mpc.ocp import Bounds, Objective, Problem
 from quadsim.flightlog import ControlLog, FlightLog, PlantLog, TimingLog
 from quadsim.state import INDEX, N_STATES, Array
 from quadsim.vehicle import N_ROTORS

@@ -8,7 +8,7 @@ from typing import Final
 
 import numpy as np
 
-from mpc.actuators import ActuatorBounds
+from mpc.answer import ActuatorBounds
 from mpc.baselines.allocation import allocate, make_allocation
 from mpc.baselines.bandwidths import SEPARATION, YAW_SHARE, lag_to_allow_for
 from mpc.baselines.law import FeedbackLaw

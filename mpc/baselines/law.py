@@ -7,7 +7,7 @@ from typing import Final, Protocol
 
 import numpy as np
 
-from mpc.actuators import ActuatorBounds
+from mpc.answer import ActuatorBounds
 from mpc.baselines.preview import differentiator
 from mpc.heading import predict_in_heading_frame
 from mpc.model import hover_model

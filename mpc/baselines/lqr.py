@@ -9,14 +9,14 @@ from typing import Final
 import numpy as np
 import scipy.linalg
 
-from mpc.actuators import ActuatorBounds
+from mpc.answer import ActuatorBounds
 from mpc.baselines.allocation import allocate, make_allocation
 from mpc.baselines.law import FeedbackLaw
 from mpc.baselines.limits import require_within
 from mpc.baselines.preview import wrapped
 from mpc.heading import turn_horizontally
 from mpc.model import LinearModel
-from mpc.problem import Objective
+from mpc.ocp import Objective
 from quadsim.controller import Command, Moment
 from quadsim.errors import ParameterError
 from quadsim.state import INDEX, N_STATES, REFERENCE_STATES, STATE_NAMES, VELOCITY, Array, read_only

@@ -8,7 +8,7 @@ from typing import Final
 
 import numpy as np
 
-from mpc.actuators import ActuatorBounds
+from mpc.answer import ActuatorBounds
 from mpc.baselines.allocation import make_allocation
 from mpc.baselines.bandwidths import Bandwidths, bandwidths, lag_to_allow_for
 from mpc.baselines.cascade import Gains, fly_cascade, fresh_memory, make_body

@@ -13,10 +13,10 @@ from typing import Final, Protocol
 
 import numpy as np
 
-from mpc.condensed import condensed
-from mpc.multistage import multistage
-from mpc.problem import Problem
+from mpc.ocp import Problem, Rest
+from mpc.paper.condensed import Condensed
 from mpc.qp import QP, Backend, Formulation, FormulationBuilder, Solution
+from mpc.staged import Staged
 from quadsim.errors import MissingPackageError, UnknownNameError
 from quadsim.state import Array
 
@@ -59,7 +59,7 @@ class SolverEntry:
 
 SOLVERS: Final[dict[str, SolverEntry]] = {
     "piqp-multistage": SolverEntry(
-        formulate=multistage,
+        formulate=Staged,
         backend="mpc.solvers.piqp_sparse:PiqpMultistage",
         package="piqp",
         module="piqp",
@@ -67,7 +67,7 @@ SOLVERS: Final[dict[str, SolverEntry]] = {
         extra="",
     ),
     "piqp-multistage-1": SolverEntry(
-        formulate=partial(multistage, steps_per_stage=1),
+        formulate=partial(Staged, steps_per_stage=1),
         backend="mpc.solvers.piqp_sparse:PiqpMultistage",
         package="piqp",
         module="piqp",
@@ -75,7 +75,7 @@ SOLVERS: Final[dict[str, SolverEntry]] = {
         extra="",
     ),
     "piqp-dense": SolverEntry(
-        formulate=condensed,
+        formulate=Condensed,
         backend="mpc.solvers.piqp_dense:PiqpDense",
         package="piqp",
         module="piqp",
@@ -83,7 +83,7 @@ SOLVERS: Final[dict[str, SolverEntry]] = {
         extra="",
     ),
     "daqp": SolverEntry(
-        formulate=condensed,
+        formulate=Condensed,
         backend="mpc.solvers.daqp_dense:DaqpDense",
         package="daqp",
         module="daqp",
@@ -91,42 +91,42 @@ SOLVERS: Final[dict[str, SolverEntry]] = {
         extra="daqp",
     ),
     "osqp": SolverEntry(
-        formulate=condensed,
+        formulate=Condensed,
         backend="mpc.solvers.osqp_sparse:OsqpSparse",
         package="osqp",
         module="osqp",
         description="OSQP, operator splitting, condensed, warm-started",
     ),
     "clarabel": SolverEntry(
-        formulate=multistage,
+        formulate=Staged,
         backend="mpc.solvers.clarabel_sparse:ClarabelSparse",
         package="clarabel",
         module="clarabel",
         description="Clarabel, interior point, partially condensed",
     ),
     "proxqp": SolverEntry(
-        formulate=condensed,
+        formulate=Condensed,
         backend="mpc.solvers.proxqp_dense:ProxqpDense",
         package="proxsuite",
         module="proxsuite",
         description="ProxQP, proximal augmented Lagrangian, dense, condensed",
     ),
     "quadprog": SolverEntry(
-        formulate=condensed,
+        formulate=Condensed,
         backend="mpc.solvers.quadprog_dense:QuadprogDense",
         package="quadprog",
         module="quadprog",
         description="quadprog, Goldfarb and Idnani's dual active set, condensed",
     ),
     "highs": SolverEntry(
-        formulate=condensed,
+        formulate=Condensed,
         backend="mpc.solvers.highs_sparse:HighsSparse",
         package="highspy",
         module="highspy",
         description="HiGHS, active set, condensed; fails on most of the paper's QPs",
     ),
     "qpoases": SolverEntry(
-        formulate=condensed,
+        formulate=Condensed,
         backend="mpc.solvers.qpoases_dense:QpoasesDense",
         package="casadi",
         module="casadi",
@@ -153,10 +153,10 @@ def make_backend(name: str) -> Backend:
 
 
 class Way(StrEnum):
-    """How an optimum was found: see `mpc.shortcut`."""
+    """How an optimum was found: see `mpc.exact.shortcut`."""
 
     FREE = "the unconstrained optimum"
-    AXES = "one QP per axis"
+    AXES = "active rows of states alone"
     WHOLE = "the whole QP"
 
 
@@ -166,11 +166,13 @@ class Answer:
 
     Attributes:
         plan: (N, nu) inputs [rad/s]; to be used only when the solution's status is accepted.
+        slacks: (N, m_s) by how much soft rows are violated.
         solution: to the QP of the solver's formulation.
         way: how it was found.
     """
 
     plan: Array
+    slacks: Array
     solution: Solution
     way: Way = Way.WHOLE
 
@@ -188,8 +190,19 @@ class Solver(Protocol):
         """The QP that its solutions are of."""
         ...
 
-    def solve(self, state: Array, desired: Array, u_before: Array) -> Answer:
-        """The optimum for xi(k) (n,), y_d (N, n_r) and u(k-1) (nu,); whatever happens is in its status."""
+    def reset(self) -> None:
+        """Forget the last period's answer, where it is where the next one starts."""
+        ...
+
+    def solve(self, state: Array, desired: Array, u_before: Array, rest: Rest | None = None) -> Answer:
+        """The optimum for xi(k) (n,), y_d (N, n_r) and u(k-1) (nu,); whatever happens is in its status.
+
+        Args:
+            state: xi(k).
+            desired: y_d.
+            u_before: u(k-1) [rad/s].
+            rest: where the model rests; None for the problem's.
+        """
         ...
 
 
@@ -202,18 +215,26 @@ class QPSolver:
         self.formulation: Formulation = SOLVERS[name].formulate(problem)
         self._backend.setup(self.formulation.qp)
 
-    def solve(self, state: Array, desired: Array, u_before: Array) -> Answer:
-        """Solve for xi(k) (n,), y_d (N, n_r) and u(k-1) (nu,).
+    def reset(self) -> None:
+        """See `Solver.reset`: back ends that start from their last answer, start from scratch anew."""
+        self._backend = make_backend(self.name)
+        self._backend.setup(self.formulation.qp)
+
+    def solve(self, state: Array, desired: Array, u_before: Array, rest: Rest | None = None) -> Answer:
+        """See `Solver.solve`.
 
         Data that is not finite is answered with the status `invalid_data`: no back end can be trusted to notice.
         """
-        vectors = self.formulation.vectors(state, desired, u_before)
         valid = math.isfinite(state.sum() + desired.sum() + u_before.sum())
-        solution = self._backend.solve(vectors) if valid else _refusal(self.formulation.qp)
-        return Answer(plan=self.formulation.inputs(solution.x), solution=solution)
+        if valid:
+            solution = self._backend.solve(self.formulation.vectors(state, desired, u_before, rest))
+        else:
+            solution = refusal(self.formulation.qp)
+        x = solution.x
+        return Answer(plan=self.formulation.inputs(x), slacks=self.formulation.slacks(x), solution=solution)
 
 
-def _refusal(qp: QP) -> Solution:
+def refusal(qp: QP) -> Solution:
     """What is answered without asking a back end."""
     return Solution(
         x=np.full_like(qp.c, math.nan),

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import time as clock
+from collections.abc import Mapping
 from typing import Any, Final
 
 import numpy as np
 import piqp
 
-from mpc.qp import QP, Solution, Vectors
+from mpc.qp import QP, Matrix, Solution, Vectors
 from quadsim.controller import SOLVED
 
 MAX_ITERATIONS: Final = 100
@@ -52,15 +53,15 @@ def setup(solver: Any, qp: QP) -> None:
     solver.setup(qp.P, qp.c, qp.A, qp.b, qp.G, qp.h_l, qp.h_u, qp.x_l, qp.x_u)
 
 
-def solve(solver: Any, vectors: Vectors, *, rows: int) -> Solution:
-    """Update the vectors, solve, copy everything out.
+def solve(solver: Any, vectors: Vectors, *, matrices: Mapping[str, Matrix] | None = None) -> Solution:
+    """Update the vectors, and matrices where there are others, solve, copy everything out.
 
     PIQP's result arrays are views that the next solve overwrites, and a failed solve leaves a finite x: the
     status is the only thing to go by.  Sizes are ours to get right, since a wrong one keeps the old data silently.
-    Multipliers are filled up to `rows` with zeros: those of rows that the solver was not given.
+    One update for all: two would scale the data twice.
     """
     started = clock.perf_counter()
-    solver.update(c=vectors.c, b=vectors.b, h_l=vectors.h_l, h_u=vectors.h_u)
+    solver.update(**(matrices or {}), c=vectors.c, b=vectors.b, h_l=vectors.h_l, h_u=vectors.h_u)
     status = solver.solve()
     elapsed = clock.perf_counter() - started
     result = solver.result
@@ -74,12 +75,10 @@ def solve(solver: Any, vectors: Vectors, *, rows: int) -> Solution:
             (result.z_bu, result.s_bu),
         )
     )
-    z = np.zeros(rows)
-    np.subtract(result.z_u, result.z_l, out=z[: vectors.h_l.size])
     return Solution(
         x=result.x.copy(),
         y=result.y.copy(),
-        z=z,
+        z=result.z_u - result.z_l,
         z_box=result.z_bu - result.z_bl,
         status=STATUS[status],
         iterations=int(result.info.iter),

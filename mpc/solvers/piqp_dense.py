@@ -21,4 +21,4 @@ class PiqpDense:
 
     def solve(self, vectors: Vectors) -> Solution:
         """See `mpc.qp.Backend.solve`."""
-        return _piqp.solve(self._solver, vectors, rows=vectors.h_l.size)
+        return _piqp.solve(self._solver, vectors)

@@ -41,7 +41,7 @@ class Contender:
         name: what it is called.
         solver: its name in `mpc.solvers.SOLVERS`.
         package: the solver's distribution and its version.
-        shortcut: whether it tries less than the whole QP first; see `mpc.shortcut`.
+        shortcut: whether it tries less than the whole QP first; see `mpc.exact.shortcut`.
         repeats: how often each period was timed.
         step_ms: (K,) whole controller step per period, the median of the repeats [ms].
         answered: (K,) statuses.

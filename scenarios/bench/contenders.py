@@ -9,12 +9,12 @@ from typing import Final
 
 import numpy as np
 
-from mpc.condensed import condensed
 from mpc.constrained import ConstrainedMPC
-from mpc.polish import polish
-from mpc.problem import Problem
+from mpc.exact.polish import polish
+from mpc.exact.shortcut import with_shortcut
+from mpc.ocp import Problem, Rest
+from mpc.paper.condensed import condensed
 from mpc.qp import Formulation, kkt_residuals
-from mpc.shortcut import with_shortcut
 from mpc.solvers import SOLVERS, Answer, QPSolver, Solver, make_backend
 from quadsim.controller import ACCEPTED, Command
 from quadsim.state import Array
@@ -28,7 +28,7 @@ REFERENCE_SOLVER: Final = "piqp-dense"
 
 @dataclass(frozen=True, kw_only=True)
 class Entry:
-    """One contender: a solver, with or without the shortcuts of `mpc.shortcut`."""
+    """One contender: a solver, with or without the shortcuts of `mpc.exact.shortcut`."""
 
     solver: str
     shortcut: bool
@@ -64,9 +64,13 @@ class _Witnessed:
         """See `mpc.solvers.Solver.formulation`."""
         return self._solver.formulation
 
-    def solve(self, state: Array, desired: Array, u_before: Array) -> Answer:
+    def reset(self) -> None:
+        """See `mpc.solvers.Solver.reset`."""
+        self._solver.reset()
+
+    def solve(self, state: Array, desired: Array, u_before: Array, rest: Rest | None = None) -> Answer:
         """See `mpc.solvers.Solver.solve`."""
-        self.last = self._solver.solve(state, desired, u_before)
+        self.last = self._solver.solve(state, desired, u_before, rest)
         return self.last
 
 
@@ -129,7 +133,7 @@ class Reference:
 
 
 def reference_optima(problem: Problem, queries: Queries, periods: Sequence[int]) -> Reference:
-    """Solve the periods' QPs in closed form; see `mpc.polish`."""
+    """Solve the periods' QPs in closed form; see `mpc.exact.polish`."""
     formulation, backend = condensed(problem), make_backend(REFERENCE_SOLVER)
     backend.setup(formulation.qp)
     inputs, worst = {}, 0.0

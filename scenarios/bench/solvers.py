@@ -9,7 +9,7 @@ from typing import Final, TypedDict
 
 import numpy as np
 
-from mpc.problem import Problem
+from mpc.ocp import Problem
 from mpc.solvers import SOLVERS, Way
 from mpc.unconstrained import UnconstrainedMPC
 from quadsim import outputs

@@ -8,13 +8,13 @@ from typing import Final
 
 import numpy as np
 
-from mpc.axes import Axis, axes
-from mpc.condensed import condensed
-from mpc.multistage import multistage, usual_steps
-from mpc.problem import Problem
+from mpc.exact.axes import Axis, axes
+from mpc.ocp import Problem
+from mpc.paper.condensed import condensed
 from mpc.qp import Backend, Formulation, Vectors
 from mpc.solvers.piqp_dense import PiqpDense
 from mpc.solvers.piqp_sparse import PiqpMultistage
+from mpc.staged import Staged, usual_steps
 from quadsim.bench import StageLength
 from quadsim.state import Array
 from scenarios.bench.race import race
@@ -91,7 +91,7 @@ def _time(
     default = usual_steps(problem.model.nu)
     entrants: dict[int | None, _QPEntrant] = {None: _QPEntrant(condensed(problem), PiqpDense(), query)}
     for length in sorted({*STEPS_TRIED, default}):
-        entrants[length] = _QPEntrant(multistage(problem, steps_per_stage=length), PiqpMultistage(), query)
+        entrants[length] = _QPEntrant(Staged(problem, steps_per_stage=length), PiqpMultistage(), query)
     laps = race(
         {str(steps): entrant for steps, entrant in entrants.items()},
         asked,

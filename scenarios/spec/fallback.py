@@ -6,7 +6,7 @@ from typing import Annotated, Final
 
 from pydantic import Field
 
-from mpc.fallback import FallbackSettings
+from mpc.fallback.contract import FallbackSettings
 from scenarios.spec.base import Positive, Spec
 
 _USUAL: Final = FallbackSettings()

@@ -6,8 +6,8 @@ from typing import Annotated, Final, Literal
 
 from pydantic import Discriminator, Field, Tag, model_validator
 
-from mpc.observer import ObserverSettings
-from mpc.tightening import SHORTEST_LAG, TighteningSettings
+from mpc.robust.observer import ObserverSettings
+from mpc.robust.tightening import SHORTEST_LAG, TighteningSettings
 from scenarios.spec.base import NonNegative, Positive, Spec
 from scenarios.spec.fallback import FallbackSpec
 from scenarios.spec.optimisation import BoundedSpec, Weight

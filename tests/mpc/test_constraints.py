@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from support import paper_problem, random_problem
 
-from mpc.constraints import inequalities
-from mpc.prediction import prediction, rollout
-from mpc.problem import Bounds
+from mpc.ocp import Bounds
+from mpc.paper.constraints import inequalities
+from mpc.paper.prediction import prediction, rollout
 from quadsim.errors import ParameterError
 
 

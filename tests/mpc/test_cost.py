@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from support import paper_problem, random_problem
 
-from mpc.cost import cost
-from mpc.prediction import prediction, rollout
-from mpc.problem import Problem
+from mpc.ocp import Problem
+from mpc.paper.cost import cost
+from mpc.paper.prediction import prediction, rollout
 from quadsim.state import Array, make_state
 
 

@@ -10,7 +10,7 @@ import pytest
 
 from mpc.equilibrium import LEAST_LIFT, Trim, equilibrium, twisted
 from mpc.heading import turn_horizontally
-from mpc.nonlinear import derivative, nonlinear_model
+from mpc.nonlinear.model import derivative, nonlinear_model
 from quadsim.errors import ParameterError
 from quadsim.state import INDEX, Array
 from quadsim.vehicle import Vehicle

@@ -16,13 +16,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from support import paper_problem, paper_reference
 
-from mpc.actuators import ActuatorBounds
+from mpc.answer import ActuatorBounds
 from mpc.constrained import ConstrainedMPC
 from mpc.equilibrium import Trim
-from mpc.fallback import FAILURES, FallbackSettings, Guarded
-from mpc.heading import advance as advance_from
-from mpc.heading import predict_in_heading_frame, turn
-from mpc.hover import (
+from mpc.fallback.completion import PLAUSIBLE, DeadReckoning, Reckoned
+from mpc.fallback.contract import FAILURES, FallbackSettings, Guarded
+from mpc.fallback.hover import (
     ACCEPTABLE_ACCELERATION,
     ACCEPTABLE_POSITION,
     ACCEPTABLE_RATE,
@@ -31,9 +30,10 @@ from mpc.hover import (
     LARGEST_CLIMB,
     HoverLaw,
 )
+from mpc.heading import advance as advance_from
+from mpc.heading import predict_in_heading_frame, turn
 from mpc.model import LinearModel, hover_model
-from mpc.problem import Problem
-from mpc.reckoning import PLAUSIBLE, DeadReckoning, Reckoned
+from mpc.ocp import Problem
 from mpc.solvers import Answer, QPSolver
 from mpc.solvers._piqp import STATUS
 from quadsim.airframe import outline

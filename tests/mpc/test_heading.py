@@ -10,10 +10,10 @@ import pytest
 
 from mpc.equilibrium import equilibrium, twisted
 from mpc.heading import advance, anchored, predict_in_heading_frame, turn, turn_horizontally
-from mpc.linearise import linearise
 from mpc.model import hover_model
-from mpc.nonlinear import nonlinear_model
-from mpc.prediction import rollout
+from mpc.nonlinear.linearise import linearise
+from mpc.nonlinear.model import nonlinear_model
+from mpc.paper.prediction import rollout
 from quadsim.state import INDEX
 from quadsim.vehicle import Vehicle
 

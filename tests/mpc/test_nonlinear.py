@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from mpc.linearise import linearise
 from mpc.model import hover_model
-from mpc.nonlinear import NonlinearModel, advance, derivative, nonlinear_model
+from mpc.nonlinear.linearise import linearise
+from mpc.nonlinear.model import NonlinearModel, advance, derivative, nonlinear_model
 from quadsim.effects import Disturbance, Effects, RotorDynamics
 from quadsim.errors import ParameterError
 from quadsim.plant import Plant

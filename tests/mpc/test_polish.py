@@ -12,11 +12,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from support import paper_problem, paper_reference, random_axes
 
-from mpc.condensed import condensed
-from mpc.polish import DensePolish, RowPolish, polish
-from mpc.problem import Problem
+from mpc.exact.polish import DensePolish, RowPolish, polish
+from mpc.exact.shortcut import Shortcut
+from mpc.ocp import Problem
+from mpc.paper.condensed import condensed
 from mpc.qp import QP, Solution, Vectors, kkt_residuals
-from mpc.shortcut import Shortcut
 from mpc.solvers import SOLVERS, QPSolver, Way, make_backend
 from mpc.solvers.piqp_dense import PiqpDense
 from quadsim.controller import ACCEPTED, SOLVED

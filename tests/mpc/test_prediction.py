@@ -7,7 +7,7 @@ import pytest
 from make_numbers import prediction_error
 from support import paper_problem, random_problem
 
-from mpc.prediction import prediction, rollout
+from mpc.paper.prediction import prediction, rollout
 from quadsim.vehicle import Vehicle
 
 

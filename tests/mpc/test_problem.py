@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from support import paper_problem
 
-from mpc.problem import Objective
+from mpc.ocp import Objective
 from quadsim.errors import ParameterError
 
 

@@ -10,13 +10,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from support import paper_problem, paper_reference, random_problem
 
-from mpc.condensed import condensed
-from mpc.multistage import multistage
-from mpc.problem import Problem
+from mpc.ocp import Problem
+from mpc.paper.condensed import condensed
 from mpc.qp import QP, Backend, Formulation, Solution, Vectors, kkt_residuals
 from mpc.solvers import SOLVERS, QPSolver, make_backend
 from mpc.solvers.piqp_dense import PiqpDense
 from mpc.solvers.piqp_sparse import PiqpMultistage
+from mpc.staged import Staged
 from quadsim.controller import SOLVED
 from quadsim.state import Array
 from scenarios.runner import Flight
@@ -78,7 +78,7 @@ def test_every_stage_length_gives_the_condensed_optimum(steps: int) -> None:
     plans = []
     for formulation, backend in (
         (condensed(problem), PiqpDense()),
-        (multistage(problem, steps_per_stage=steps), PiqpMultistage()),
+        (Staged(problem, steps_per_stage=steps), PiqpMultistage()),
     ):
         backend.setup(formulation.qp)
         vectors = formulation.vectors(STATE, problem.objective.desired(reference), problem.model.u_bar)
@@ -103,7 +103,7 @@ def test_random_systems_give_one_optimum_in_both_forms(seed: int, horizon: int, 
     assert problem.bounds is not None
     before = rng.uniform(problem.bounds.u_min, problem.bounds.u_max)
     query = (rng.normal(size=n) * 0.3, rng.normal(size=(horizon, n)), before)
-    dense, structured = condensed(problem), multistage(problem, steps_per_stage=steps)
+    dense, structured = condensed(problem), Staged(problem, steps_per_stage=steps)
     qp, one = solved(dense, PiqpDense(), query)
     other_qp, two = solved(structured, PiqpMultistage(), query)
     assert (one.status == SOLVED) == (two.status == SOLVED)  # feasibility is no matter of form
@@ -140,7 +140,7 @@ def test_answers_are_copies_that_the_next_solve_leaves_alone() -> None:
         np.testing.assert_array_equal(now, then)
 
 
-@pytest.mark.parametrize("build", [condensed, multistage])
+@pytest.mark.parametrize("build", [condensed, Staged])
 def test_a_problem_without_bounds_needs_no_qp(build: object) -> None:
     with pytest.raises(ValueError, match="needs a problem with bounds"):
         build(paper_problem("paper-unconstrained"))  # type: ignore[operator]
@@ -157,7 +157,7 @@ def test_rows_left_out_at_first_are_found_where_they_bind() -> None:
     """Slews late in the plan seldom bind; where they do, the answer is that of the whole QP, and tells its cost."""
     problem = tight_slews()
     query = np.zeros(12), problem.objective.desired(paper_reference(51)[1:]), problem.model.u_bar
-    formulation, backend = multistage(problem), PiqpMultistage()
+    formulation, backend = Staged(problem), PiqpMultistage()
     backend.setup(formulation.qp)
     vectors = formulation.vectors(*query)
     solution = backend.solve(vectors)
@@ -174,7 +174,7 @@ def test_rows_left_out_at_first_are_found_where_they_bind() -> None:
 def test_rows_left_out_at_first_do_not_bind_over_the_flight(constrained_flight: Flight) -> None:
     """And then one smaller QP gives the whole one's solution."""
     problem = paper_problem()
-    formulation = multistage(problem)
+    formulation = Staged(problem)
     assert formulation.qp.seldom == 4 * (50 - 32)
     once, whole = PiqpMultistage(), PiqpMultistage()
     once.setup(formulation.qp)
@@ -203,7 +203,7 @@ def test_stages_cover_the_horizon(steps: int) -> None:
     problem = paper_problem()
     query = np.zeros(12), problem.objective.desired(paper_reference(51)[1:]), problem.model.u_bar
     expected = QPSolver("piqp-dense", problem).solve(*query).plan
-    formulation, backend = multistage(problem, steps_per_stage=steps), PiqpMultistage()
+    formulation, backend = Staged(problem, steps_per_stage=steps), PiqpMultistage()
     backend.setup(formulation.qp)
     solution = backend.solve(formulation.vectors(*query))
     np.testing.assert_allclose(formulation.inputs(solution.x)[0], expected[0], atol=1e-3)
@@ -212,7 +212,7 @@ def test_stages_cover_the_horizon(steps: int) -> None:
 
 def test_products_of_rounding_are_left_out() -> None:
     """Rotors on body x do not roll the vehicle, though cos(90 deg) is not zero in binary."""
-    qp = multistage(paper_problem()).qp
+    qp = Staged(paper_problem()).qp
     outputs = abs(qp.G[:100]).tocsr()
     for row in (outputs[i].data for i in range(outputs.shape[0]) if outputs[i].nnz):
         assert row.min() > 1e-12 * row.max()

@@ -13,13 +13,13 @@ from support import paper_problem, paper_reference, random_axes, random_problem
 
 from mpc import free as module
 from mpc import shortcut as shortcut_module
-from mpc.condensed import condensed
 from mpc.constrained import ConstrainedMPC
-from mpc.constraints import inequalities
-from mpc.prediction import prediction
-from mpc.problem import Problem
+from mpc.exact.shortcut import Shortcut, with_shortcut
+from mpc.ocp import Problem
+from mpc.paper.condensed import condensed
+from mpc.paper.constraints import inequalities
+from mpc.paper.prediction import prediction
 from mpc.qp import kkt_residuals
-from mpc.shortcut import Shortcut, with_shortcut
 from mpc.solvers import Answer, QPSolver, Way
 from mpc.unconstrained import sequence_gains
 from quadsim.controller import SOLVED, UNCONSTRAINED, Moment

@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 from support import paper_problem, paper_reference, random_problem
 
-from mpc.condensed import condensed
 from mpc.constrained import ConstrainedMPC
-from mpc.multistage import multistage
+from mpc.paper.condensed import condensed
 from mpc.qp import Solution, kkt_residuals
 from mpc.solvers import SOLVERS, QPSolver, make_backend
 from mpc.solvers.daqp_dense import DaqpDense
 from mpc.solvers.osqp_sparse import OsqpSparse
 from mpc.solvers.piqp_dense import PiqpDense
+from mpc.staged import Staged
 from quadsim.controller import SOLVED, Moment
 from quadsim.errors import MissingPackageError, PlanExhaustedError, UnknownNameError
 from scenarios import runner
@@ -76,7 +76,7 @@ def test_equality_rows_and_multipliers(kind: type[DaqpDense | OsqpSparse]) -> No
         problem = random_problem(rng, horizon=6, n=3, nu=2, n_c=1)
         query = (0.1 * rng.normal(size=3), rng.normal(size=(6, 3)), problem.model.u_bar)
         plans = []
-        for formulation in (multistage(problem, steps_per_stage=2), condensed(problem)):
+        for formulation in (Staged(problem, steps_per_stage=2), condensed(problem)):
             backend, peer = kind(), PiqpDense()
             vectors = formulation.vectors(*query)
             backend.setup(formulation.qp)

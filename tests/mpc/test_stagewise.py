@@ -13,14 +13,13 @@ import scipy.linalg
 import scipy.optimize
 from support import paper_problem, paper_reference, random_problem
 
-from mpc.linearise import linearise
-from mpc.multistage import multistage
-from mpc.nonlinear import nonlinear_model
-from mpc.penalty import Penalty
-from mpc.problem import Bounds, Objective, Problem
+from mpc.nonlinear.linearise import linearise
+from mpc.nonlinear.model import nonlinear_model
+from mpc.ocp import Bounds, Objective, Penalty, Problem
 from mpc.qp import QP, kkt_residuals
 from mpc.solvers._common import start
 from mpc.solvers.daqp_dense import DaqpDense
+from mpc.staged import Staged
 from mpc.stagewise import LARGEST, StagewiseAnswer, StagewiseQP, _WithMore
 from quadsim.controller import SOLVED
 from quadsim.errors import ParameterError
@@ -143,7 +142,7 @@ def test_constant_matrices_make_the_papers_plan(constrained_flight: Flight, step
     problem = paper_problem()
     bounds = in_deviations(problem)
     solver = StagewiseQP(50, 12, 4, problem.objective, bounds, steps_per_stage=steps)
-    formulation, backend = multistage(problem), DaqpDense()
+    formulation, backend = Staged(problem), DaqpDense()
     backend.setup(formulation.qp)
     pressing = 0
     for query in flight_queries(constrained_flight, problem, stride=100):

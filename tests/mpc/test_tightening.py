@@ -14,12 +14,11 @@ import scipy.linalg
 from support import paper_problem, paper_reference
 
 from mpc.model import discretise
-from mpc.nonlinear import advance, derivative, nonlinear_model
-from mpc.observer import ObserverSettings
-from mpc.problem import Bounds
-from mpc.robust import RobustMPC, RobustSettings
-from mpc.stagewise import Penalty
-from mpc.tightening import (
+from mpc.nonlinear.model import advance, derivative, nonlinear_model
+from mpc.ocp import Bounds
+from mpc.robust.controller import RobustMPC, RobustSettings
+from mpc.robust.observer import ObserverSettings
+from mpc.robust.tightening import (
     ERROR_SHARE,
     SHORTEST_LAG,
     SPEED_SHARE,
@@ -31,6 +30,7 @@ from mpc.tightening import (
     margins,
     observed,
 )
+from mpc.stagewise import Penalty
 from quadsim.controller import SOLVED, Moment
 from quadsim.errors import ParameterError
 from quadsim.state import INDEX, Array

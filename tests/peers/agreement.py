@@ -10,7 +10,7 @@ import numpy as np
 from peers.checks import Check, versioned
 from peers.recorded import Query
 
-from mpc.problem import Problem
+from mpc.ocp import Problem
 from mpc.qp import KKTResiduals, kkt_residuals
 from mpc.solvers import SOLVERS, QPSolver
 from quadsim.controller import SOLVED

@@ -13,7 +13,7 @@ from peers.constrained_qp import ConstrainedQP
 from peers.recorded import Query
 from threadpoolctl import threadpool_limits
 
-from mpc.problem import Problem
+from mpc.ocp import Problem
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "verification.md"
 

@@ -25,8 +25,8 @@ from peers.checks import Check
 from peers.recorded import Query
 from qpmpc import MPCProblem, Plan, solve_mpc
 
-from mpc.condensed import require_bounds
-from mpc.problem import Problem
+from mpc.ocp import Problem
+from mpc.paper.condensed import require_bounds
 from mpc.solvers import QPSolver
 from quadsim.errors import ParameterError
 from quadsim.state import Array

@@ -16,9 +16,9 @@ import numpy as np
 import scipy.linalg
 from peers.checks import Check
 
-from mpc.cost import cost
-from mpc.prediction import prediction
-from mpc.problem import Problem
+from mpc.ocp import Problem
+from mpc.paper.cost import cost
+from mpc.paper.prediction import prediction
 from mpc.unconstrained import sequence_gains
 from quadsim.state import Array
 

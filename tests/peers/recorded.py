@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Final
 
-from mpc.problem import Problem
+from mpc.ocp import Problem
 from quadsim.state import Array
 from scenarios.build import build_problem
 from scenarios.loading import load_scenario

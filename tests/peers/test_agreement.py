@@ -11,7 +11,7 @@ from peers.checks import Check, versioned
 from peers.constrained_qp import ConstrainedQP
 from peers.recorded import Query
 
-from mpc.problem import Problem
+from mpc.ocp import Problem
 from mpc.solvers import SOLVERS
 
 

@@ -12,7 +12,7 @@ from peers.constrained_qp import OURS, ConstrainedQP, QpmpcController
 from peers.recorded import Query
 from support import paper_problem
 
-from mpc.problem import Problem
+from mpc.ocp import Problem
 from mpc.solvers import QPSolver
 from quadsim.controller import UNCONSTRAINED
 from quadsim.errors import ParameterError

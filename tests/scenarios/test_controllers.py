@@ -13,17 +13,17 @@ import pytest
 from jsonschema import Draft202012Validator
 from pydantic import Tag
 
-from mpc.actuators import ActuatorBounds
+from mpc.answer import ActuatorBounds
 from mpc.baselines.geometric import GeometricController
 from mpc.baselines.lqr import LQR, bryson_objective
 from mpc.baselines.pid import CascadedPID
 from mpc.constrained import ConstrainedMPC
-from mpc.fallback import FallbackSettings, Guarded
-from mpc.observer import ObserverSettings
-from mpc.problem import Bounds, Objective
-from mpc.robust import Linearisation, RobustMPC, RobustSettings
+from mpc.fallback.contract import FallbackSettings, Guarded
+from mpc.ocp import Bounds, Objective
+from mpc.robust.controller import Linearisation, RobustMPC, RobustSettings
+from mpc.robust.observer import ObserverSettings
+from mpc.robust.tightening import TighteningSettings, margins
 from mpc.solvers import QPSolver
-from mpc.tightening import TighteningSettings, margins
 from mpc.unconstrained import UnconstrainedMPC
 from quadsim.controller import LAW_NAMES, SOLVED, Controller, Moment
 from quadsim.errors import ParameterError

@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from support import scenario_table
 
-from mpc.problem import Objective
+from mpc.ocp import Objective
 from mpc.solvers import SOLVERS
 from quadsim.assets import vehicle_path
 from quadsim.audit import SIGNALS

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from mpc.actuators import ActuatorBounds
+from mpc.answer import ActuatorBounds
 from mpc.baselines.geometric import geometric_settings
 from mpc.baselines.pid import pid_settings
 from quadsim.controller import Moment, Phase

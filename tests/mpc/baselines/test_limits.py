@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mpc.actuators import ActuatorBounds
+from mpc.answer import ActuatorBounds
 from mpc.baselines.limits import require_positive, require_within
 from quadsim.errors import ParameterError
 from quadsim.vehicle import Vehicle

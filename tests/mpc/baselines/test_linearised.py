@@ -17,7 +17,7 @@ from mpc.baselines.pid import CascadedPID
 from mpc.baselines.preview import Target
 from mpc.baselines.tracking import Integrals, geometric_wrench, integrate, motion_of
 from mpc.model import LinearModel, continuous_model, discretise, hover_model
-from mpc.problem import Objective
+from mpc.ocp import Objective
 from quadsim.errors import ParameterError
 from quadsim.state import Array
 from quadsim.vehicle import Vehicle

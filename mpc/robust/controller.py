@@ -18,8 +18,10 @@ from typing import Final
 
 import numpy as np
 
-from mpc.actuators import BOUND_TOLERANCE, ActuatorBounds
+from mpc.answer import ActuatorBounds, rejection, shifted
 from mpc.equilibrium import Trim, equilibrium, twisted
+from mpc.exact.shortcut import with_shortcut
+from mpc.fallback.completion import PLAUSIBLE, Reckoned
 from mpc.heading import (
     anchored,
     predict_in_heading_frame,
@@ -28,25 +30,30 @@ from mpc.heading import (
     turn_horizontally,
     with_nearest_yaw,
 )
-from mpc.linearise import linearise
-from mpc.model import continuous_model, discretise, hover_model
-from mpc.nonlinear import NonlinearModel, advance, nonlinear_model, spun
-from mpc.observer import DisturbanceObserver, thrust_axis
-from mpc.observer import ObserverSettings as ObserverSettings
-from mpc.problem import Bounds, Objective
+from mpc.model import LinearModel, continuous_model, discretise, hover_model
+from mpc.nonlinear.linearise import linearise
+from mpc.nonlinear.model import NonlinearModel, advance, nonlinear_model, spun
+from mpc.ocp import Bounds, Constraint, Objective, Problem, Rest, lqr_terminal_weight
 from mpc.qp import Solution
-from mpc.reckoning import PLAUSIBLE, Reckoned
-from mpc.robust_settings import Linearisation as Linearisation
-from mpc.robust_settings import RobustSettings as RobustSettings
-from mpc.stagewise import StagewiseAnswer, StagewiseQP
-from quadsim.controller import GROUNDED, SOLVED, Command, Moment, Phase, stopped
+from mpc.robust.observer import DisturbanceObserver, thrust_axis
+from mpc.robust.observer import ObserverSettings as ObserverSettings
+from mpc.robust.settings import Linearisation as Linearisation
+from mpc.robust.settings import RobustSettings as RobustSettings
+from mpc.solvers import Answer, QPSolver, refusal
+from mpc.solvers.piqp_sparse import PiqpChanging
+from mpc.staged import Staged
+from quadsim.controller import ACCEPTED, GROUNDED, SOLVED, Command, Moment, Phase, stopped
 from quadsim.errors import ParameterError
 from quadsim.state import EULER, EULER_RATE, INDEX, N_STATES, REFERENCE_STATES, VELOCITY, Array
 from quadsim.vehicle import N_ROTORS, Vehicle
 
-TOLERANCE: Final = 1e-8
-"""PIQP's own.  A tenth of it, as for the paper's QP, takes three of twenty iterations more where tilt is at its bound,
-and on the paper's course changes no command by more than 1e-4 rad/s."""
+SOLVER: Final = "piqp-multistage"
+"""Solves what the shortcuts leave."""
+STEPS_PER_STAGE: Final = 4
+"""M where the model changes, the fastest of 1 to 7 for 16 states, though 2 to 5 hardly differ."""
+LARGEST: Final = 1e6
+"""Magnitude of a number in the data beyond which it is no vehicle's: four steps of such numbers multiply to 1e30, where
+PIQP takes bounds for infinite."""
 LONGEST_SPAN: Final = 0.25
 """Longest time between two measured states [s] for their difference to tell of a disturbance; a sensor of 4 Hz."""
 _SAME_TIME: Final = 1e-6
@@ -57,10 +64,10 @@ _REFERENCE: Final = list(REFERENCE_STATES)
 
 
 class RobustMPC:
-    """One stagewise QP per period; see the module.
+    """One optimum per period; see the module.
 
     It keeps no plan for bad times: what is not solved is said so by the status, with the command in force, for
-    `mpc.fallback.Guarded` to act on.
+    `mpc.fallback.contract.Guarded` to act on.
 
     Attributes:
         trim: what holds the vehicle at rest against the disturbance that is estimated.
@@ -72,13 +79,14 @@ class RobustMPC:
         objective: for the paper's 12 states.
         bounds: likewise.
         settings: the parts.
+        constraints: others, likewise.
 
     Raises:
         ParameterError: a number or a shape is not possible.
     """
 
     name: Final = "robust"
-    solver: Final = "piqp-stagewise"
+    solver: Final = SOLVER
 
     def __init__(
         self,
@@ -89,31 +97,39 @@ class RobustMPC:
         objective: Objective,
         bounds: Bounds,
         settings: RobustSettings,
+        constraints: tuple[Constraint, ...] = (),
     ) -> None:
         if settings.delay > period:
             raise ParameterError("controller", "delay", settings.delay, f"at most the control period of {period} s")
-        self.settings, self.horizon, self._period = settings, horizon, period
+        self._vehicle, self.settings, self.horizon, self._period = vehicle, settings, horizon, period
         self._nominal = hover_model(vehicle, period)
         self._model = nonlinear_model(vehicle, period, rotor_lag=settings.rotor_lag or None)
         self._inverse = np.linalg.inv(slope(self._nominal))
         self._objective = objective
-        self._actuators = ActuatorBounds.of(bounds)
-        n = self._model.n
-        self._qp = StagewiseQP(
-            horizon,
-            n,
-            N_ROTORS,
-            replace(objective, C_r=_widened(objective.C_r, n)),
-            replace(bounds, C_c=_widened(bounds.C_c, n)),
-            settings.penalty,
-            move_weight=settings.move_weight,
-            margins=settings.margins,
-            tolerance=TOLERANCE,
-        )
-        A, B = _hover_matrices(vehicle, self._model)
-        self._hover = self._qp.prepare(np.tile(A, (horizon, 1, 1)), np.tile(B, (horizon, 1, 1)))
+        problem = self._problem(objective, bounds, constraints)
+        self._actuators = ActuatorBounds.of_problem(problem)
+        if settings.linearisation is Linearisation.HOVER:
+            self._solver = with_shortcut(problem, QPSolver(SOLVER, problem))
+        else:
+            self._relinearised = Relinearised(problem)
         self._observer = None if settings.observer is None else DisturbanceObserver(settings.observer, period)
         self.reset(np.full(N_ROTORS, vehicle.hover_speed))
+
+    def _problem(self, objective: Objective, bounds: Bounds, constraints: tuple[Constraint, ...]) -> Problem:
+        """The optimisation of the hover model, its states perhaps with the rotor speeds."""
+        settings, n = self.settings, self._model.n
+        A, B = discretise(*continuous_model(self._vehicle, settings.rotor_lag), self._period)
+        model = LinearModel(A=A, B=B, u_bar=self._nominal.u_bar, period=self._period)
+        objective = replace(objective, C_r=_widened(objective.C_r, n), Q_d=settings.move_weight)
+        if settings.terminal:
+            objective = replace(objective, P=lqr_terminal_weight(model, objective))
+        return Problem(
+            model=model,
+            horizon=self.horizon,
+            objective=objective,
+            bounds=replace(bounds, C_c=_widened(bounds.C_c, n), penalty=settings.penalty, margins=settings.margins),
+            constraints=tuple(part if part.C is None else replace(part, C=_widened(part.C, n)) for part in constraints),
+        )
 
     def reset(self, speeds: Array) -> None:
         """Start anew after the command u(-1) (4,) [rad/s], with rotors at that speed."""
@@ -122,17 +138,20 @@ class RobustMPC:
         self._rotors = self._acting.copy()
         self._ahead: Array | None = None
         self._asked = self._measured = -math.inf
-        self._plan: tuple[Array, Array] | None = None
+        if self.settings.linearisation is Linearisation.HOVER:
+            self._solver.reset()
+        else:
+            self._relinearised.last = None
         self._forget()
 
     @np.errstate(over="ignore", invalid="ignore", divide="ignore")  # numbers out of hand are refused, not warned of
     def step(self, now: Moment, state: Array, reference: Array) -> Command:
         """See `quadsim.controller.Controller.step`.
 
-        Numbers that are not finite, not `mpc.reckoning.PLAUSIBLE`, or lead to such are answered with the status
-        `invalid_data`, and nothing is learned from them.  Nor is anything from a state that is in part predicted
-        (`mpc.reckoning.Reckoned`), nor from the first measured one after more than `LONGEST_SPAN` of such, or after a
-        pause: `now.time` has to be a period later than last time.
+        Numbers that are not finite, not `mpc.fallback.completion.PLAUSIBLE`, or lead to such are answered with the
+        status `invalid_data`, and nothing is learned from them.  Nor is anything from a state that is in part predicted
+        (`mpc.fallback.completion.Reckoned`), nor from the first measured one after more than `LONGEST_SPAN` of such, or
+        after a pause: `now.time` has to be a period later than last time.
         """
         if now.acting is not None:
             self._acting = np.array(now.acting, float)
@@ -159,13 +178,13 @@ class RobustMPC:
         if now.phase is Phase.FLYING:  # before, the ground holds the vehicle, which is nothing to learn from
             self._ahead = x0
         answer = self._solve(np.concatenate([x0, self._rotors])[: self._model.n], self._later(reference))
-        status = self._verdict(answer)
-        if status != SOLVED:
-            return self._refuse(status, answer.solution)
-        self._plan = answer.states, answer.plan
+        solution = answer.solution
+        problem = rejection(solution.status, answer.plan, self._actuators, self._acting)
+        if problem is not None:
+            return self._refuse(problem, solution)
         plan = answer.plan.copy()
         self._acting = plan[0] = self._actuators.clip(plan[0], self._acting)
-        return _command(plan, SOLVED, answer.solution, float(np.max(answer.slack, initial=0.0)))
+        return _command(plan, solution.status, solution, float(np.max(answer.slacks, initial=0.0)))
 
     def predict(self, states: Array, plans: Array) -> Array:
         """See `quadsim.controller.Controller.predict`.
@@ -219,27 +238,15 @@ class RobustMPC:
 
     def _stop(self, phase: Phase) -> Command:
         self._acting, _ = self._actuators.reach(self._acting)
-        self._plan = None
         self._forget()
         return stopped(self._acting.copy(), self.horizon, phase)
 
     def _refuse(self, status: str, solution: Solution | None = None) -> Command:
         """The command in force, with what speaks against another."""
-        self._plan = None
         plan = np.tile(self._acting, (self.horizon, 1))
         if solution is None:
             return Command(speeds=plan[0].copy(), plan=plan, status=status)
         return _command(plan, status, solution)
-
-    def _verdict(self, answer: StagewiseAnswer) -> str:
-        """`solved`, or why the answer must not be used."""
-        if answer.solution.status != SOLVED:
-            return answer.solution.status
-        if not np.isfinite(answer.plan).all():
-            return "not_finite"
-        lower, upper = self._actuators.reach(self._acting)
-        first = answer.plan[0]
-        return SOLVED if np.maximum(lower - first, first - upper).max() <= BOUND_TOLERANCE else "out_of_bounds"
 
     def _after(self, time: float, state: Array, rotors: Array) -> Array:
         """State (12,) some time [s] after a state (12,) with such rotor speeds (4,), under the command in force."""
@@ -254,11 +261,11 @@ class RobustMPC:
         later = np.concatenate([reference[1:], reference[-1:]])
         return reference + self.settings.delay / self._period * (later - reference)
 
-    def _solve(self, x0: Array, reference: Array) -> StagewiseAnswer:
+    def _solve(self, x0: Array, reference: Array) -> Answer:
         yaw = float(x0[_YAW])
         if self.settings.linearisation is not Linearisation.HOVER:
             desired = self._objective.desired(with_nearest_yaw(reference, yaw, self.settings.largest_turn))
-            return self._qp.solve(*self._relinearised(x0), x0, desired, self._acting, self.trim.speeds)
+            return self._relinearised.solve(*self._along_plan(x0), x0, desired, self._acting, self.trim.speeds)
         if not self.settings.heading:
             yaw = 0.0
         else:
@@ -268,10 +275,8 @@ class RobustMPC:
         u_s = self._balanced()
         x_s = self.trim.state(yaw, self._model.n)
         x_s[N_STATES:] = u_s[: self._model.n - N_STATES]
-        held, N = self._hover, self.horizon
-        c = np.broadcast_to(x_s - held.A[0] @ x_s - held.B[0] @ u_s, (N, x_s.size))
         desired = self._objective.desired(seen_from(reference, yaw))
-        return self._qp.solve_prepared(held, c, x0, desired, self._acting, u_s)
+        return self._solver.solve(x0, desired, self._acting, Rest(x_s, u_s))
 
     def _balanced(self) -> Array:
         """(4,) speeds at rest [rad/s] that also balance what thrust twists now, which the hover matrices leave out."""
@@ -280,18 +285,61 @@ class RobustMPC:
         balanced: Array = self.trim.speeds - self._inverse[:, 1:] @ (excess * self.trim.twist)
         return balanced
 
-    def _relinearised(self, x0: Array) -> tuple[Array, Array, Array]:
+    def _along_plan(self, x0: Array) -> tuple[Array, Array, Array]:
         """A (N, n, n), B (N, n, 4), c (N, n) of the predicted steps."""
         model = self._disturbed(thrust_axis(x0), self._period)
-        if self.settings.linearisation is Linearisation.STATE or self._plan is None:
+        last = self._relinearised.last
+        if self.settings.linearisation is Linearisation.STATE or last is None:
             A, B, c = linearise(model, x0[None], self._acting[None])
             return np.repeat(A, self.horizon, 0), np.repeat(B, self.horizon, 0), np.repeat(c, self.horizon, 0)
-        states, plan = self._plan
+        states, plan = last
         # A period later, what was predicted for the end of the first step is now; the last input is held for one more.
-        along, inputs = states.copy(), np.concatenate([plan[1:], plan[-1:]])
+        along = states.copy()
         along[:, _YAW] += math.tau * round((x0[_YAW] - along[0, _YAW]) / math.tau)
         along[0] = x0
-        return linearise(model, along, inputs)
+        return linearise(model, along, shifted(plan, 1))
+
+
+class Relinearised:
+    """A problem whose model changes from period to period, solved whole by PIQP.
+
+    Attributes:
+        last: predicted states (N, n) and plan (N, nu) of the last period, if that was solved.
+    """
+
+    def __init__(self, problem: Problem) -> None:
+        self._form = Staged(problem, steps_per_stage=STEPS_PER_STAGE, changing=True)
+        self._backend = PiqpChanging()
+        self._backend.setup(self._form.qp)
+        self.last: tuple[Array, Array] | None = None
+
+    def solve(self, A: Array, B: Array, c: Array, x0: Array, desired: Array, u_before: Array, u_rest: Array) -> Answer:
+        """Solve one period's QP.
+
+        Data that is not finite, or beyond `LARGEST`, is answered with the status `invalid_data`: PIQP cannot be trusted
+        to notice.
+
+        Args:
+            A: (N, n, n), A_i.
+            B: (N, n, nu), B_i.
+            c: (N, n), c_i.
+            x0: (n,) x(k).
+            desired: (N, n_r) y_d for x(k+1) .. x(k+N).
+            u_before: (nu,) u(k-1) [rad/s].
+            u_rest: (nu,) u_s [rad/s].
+        """
+        form = self._form
+        self.last = None
+        if all(np.abs(part).max() <= LARGEST for part in (A, B, c, x0, desired, u_before, u_rest)):
+            matrices = form.prepare(A, B)
+            qp = form.changed(matrices, form.changed_vectors(matrices, c, x0, desired, u_before, u_rest))
+            solution = self._backend.solve_changed(qp)
+        else:
+            solution = refusal(form.qp)
+        plan = form.inputs(solution.x)
+        if solution.status == SOLVED and np.isfinite(plan).all():
+            self.last = form.states(matrices, c, x0, solution.x), plan
+        return Answer(plan=plan, slacks=form.slacks(solution.x), solution=solution)
 
 
 def _command(plan: Array, status: str, solution: Solution, slack: float = 0.0) -> Command:
@@ -300,17 +348,12 @@ def _command(plan: Array, status: str, solution: Solution, slack: float = 0.0) -
         plan=plan,
         status=status,
         iterations=solution.iterations,
-        active=solution.active if status == SOLVED else 0,
+        active=solution.active if status in ACCEPTED else 0,
         slack=slack,
         primal_residual=solution.primal_residual,
         dual_residual=solution.dual_residual,
         solve_s=solution.solve_s,
     )
-
-
-def _hover_matrices(vehicle: Vehicle, model: NonlinearModel) -> tuple[Array, Array]:
-    """A (n, n), B (n, 4) at hover with zero yaw: Eq. (1), or with d(w)/dt = (u - w) / tau_r between."""
-    return discretise(*continuous_model(vehicle, model.rotor_lag or 0.0), model.period)
 
 
 def _widened(matrix: Array, n: int) -> Array:

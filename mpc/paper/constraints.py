@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mpc.prediction import Prediction
-from mpc.problem import Bounds
+from mpc.ocp import Bounds
+from mpc.paper.prediction import Prediction
 from quadsim.state import Array
 
 

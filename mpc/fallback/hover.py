@@ -21,7 +21,7 @@ from typing import Final
 import numpy as np
 import scipy.linalg
 
-from mpc.actuators import ActuatorBounds
+from mpc.answer import ActuatorBounds
 from mpc.equilibrium import Trim
 from mpc.heading import anchored, slope, turn_horizontally
 from mpc.model import LinearModel

@@ -11,7 +11,7 @@ from typing import Final
 
 import numpy as np
 
-from mpc.nonlinear import NonlinearModel, Passage, integrate
+from mpc.nonlinear.model import NonlinearModel, Passage, integrate
 from quadsim.state import EULER, EULER_RATE, N_STATES, POSITION, VELOCITY, Array
 from quadsim.vehicle import N_ROTORS
 
@@ -24,8 +24,8 @@ def linearise(model: NonlinearModel, x: Array, u: Array) -> tuple[Array, Array, 
     """A, B, c of x(k+1) ~ A x(k) + B u(k) + c about points x (M, n), u (M, 4).
 
     Returns:
-        (M, n, n), (M, n, 4) and (M, n): the derivatives of `mpc.nonlinear.advance` at each point, and what makes the
-        approximation exact there.
+        (M, n, n), (M, n, 4) and (M, n): the derivatives of `mpc.nonlinear.model.advance` at each point, and what makes
+        the approximation exact there.
     """
     passage = integrate(model, x, u)
     by_attitude, by_speeds = _jacobians(model, passage)

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mpc.prediction import Prediction
-from mpc.problem import Objective
+from mpc.ocp import Objective
+from mpc.paper.prediction import Prediction
 from quadsim.state import Array
 
 

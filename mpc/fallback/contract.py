@@ -10,7 +10,7 @@ Each period, the first of these that can be had:
 
 The inner controller is asked again in every period in which the state is known, so that recovery is automatic.  It is
 told the command in force each time, so that its own bounds on steps refer to what acts, whoever commanded it, and which
-channels of the state are predicted rather than measured (`mpc.reckoning.Reckoned`).
+channels of the state are predicted rather than measured (`mpc.fallback.completion.Reckoned`).
 
 One that estimates what disturbs the vehicle says what holds it at rest by an attribute `trim` (`mpc.equilibrium.Trim`).
 Levels 1 to 3, and predictions of what is not measured, start from it; it stays as it was while nothing is measured.
@@ -25,12 +25,12 @@ from typing import Final
 
 import numpy as np
 
-from mpc.actuators import BOUND_TOLERANCE, ActuatorBounds
+from mpc.answer import BOUND_TOLERANCE, ActuatorBounds
 from mpc.equilibrium import Trim
+from mpc.fallback.completion import PLAUSIBLE, DeadReckoning, Reckoned
+from mpc.fallback.hover import HoverLaw
 from mpc.heading import anchored, predict_in_heading_frame
-from mpc.hover import HoverLaw
 from mpc.model import LinearModel
-from mpc.reckoning import PLAUSIBLE, DeadReckoning, Reckoned
 from quadsim.controller import ACCEPTED, GROUNDED, Command, Controller, Moment, Phase, check_command, stopped
 from quadsim.errors import FlightError, ParameterError
 from quadsim.state import EULER, EULER_RATE, INDEX, N_STATES, POSITION, REFERENCE_STATES, VELOCITY, Array

@@ -1,4 +1,4 @@
-"""What actuators can take: rotor speeds and their steps, as the one place where a command is put within bounds."""
+"""The one contract for answers: solved, finite and within what actuators can take; else why not."""
 
 from __future__ import annotations
 
@@ -8,7 +8,8 @@ from typing import Final
 
 import numpy as np
 
-from mpc.problem import Bounds
+from mpc.ocp import Bounds, Problem
+from quadsim.controller import ACCEPTED
 from quadsim.errors import ParameterError
 from quadsim.state import Array
 from quadsim.vehicle import N_ROTORS, Vehicle
@@ -60,6 +61,21 @@ class ActuatorBounds:
         return cls(u_min=bounds.u_min, u_max=bounds.u_max, delta_min=bounds.delta_min, delta_max=bounds.delta_max)
 
     @classmethod
+    def of_problem(cls, problem: Problem) -> ActuatorBounds:
+        """What an optimisation's hard rows on single inputs, or on single steps, leave in every period."""
+        rows, nu = problem.rows, problem.model.nu
+        hard = np.isinf(rows.l1) & ~rows.C.any(axis=1)
+        found = []
+        for rate, other in ((rows.D, rows.E), (rows.E, rows.D)):
+            alone = hard & (np.count_nonzero(rate, axis=1) == 1) & ~other.any(axis=1)
+            lower, upper = np.full(nu, -math.inf), np.full(nu, math.inf)
+            for i in np.flatnonzero(alone & (rate.max(axis=1, initial=0.0) == 1.0)):
+                j = int(np.argmax(rate[i]))
+                lower[j], upper[j] = max(lower[j], rows.lower[0, i]), min(upper[j], rows.upper[0, i])
+            found += [lower, upper]
+        return cls(u_min=found[0], u_max=found[1], delta_min=found[2], delta_max=found[3])
+
+    @classmethod
     def of_vehicle(cls, vehicle: Vehicle) -> ActuatorBounds:
         """The speeds that its rotors hold, and no bounds on steps."""
         return cls.alike((vehicle.speed_min, vehicle.speed_max))
@@ -91,3 +107,25 @@ class ActuatorBounds:
         for i, speeds in enumerate(plan):
             clipped[i] = before = self.clip(speeds, before)
         return clipped
+
+
+def rejection(status: str, plan: Array, bounds: ActuatorBounds, before: Array) -> str | None:
+    """Why an answer must not reach the plant, or None.
+
+    Args:
+        status: what its solver says.
+        plan: (N, 4) [rad/s].
+        bounds: hard bounds.
+        before: (4,) the command in force [rad/s].
+    """
+    if status not in ACCEPTED:
+        return status
+    if not np.isfinite(plan).all():
+        return "not_finite"
+    lower, upper = bounds.reach(before)
+    return "out_of_bounds" if np.maximum(lower - plan[0], plan[0] - upper).max() > BOUND_TOLERANCE else None
+
+
+def shifted(plan: Array, steps: int) -> Array:
+    """What is left of a plan (N, nu) after some steps, its last input held."""
+    return np.concatenate([plan[steps:], np.repeat(plan[-1:], steps, axis=0)])

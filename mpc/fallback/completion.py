@@ -21,8 +21,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mpc.equilibrium import Trim
+from mpc.fallback.hover import require_quadrotor
 from mpc.heading import advance, turn
-from mpc.hover import require_quadrotor
 from mpc.model import LinearModel
 from quadsim.controller import Moment
 from quadsim.state import (

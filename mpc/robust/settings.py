@@ -6,8 +6,8 @@ import math
 from dataclasses import dataclass
 from enum import StrEnum
 
-from mpc.observer import ObserverSettings
-from mpc.penalty import Penalty
+from mpc.ocp import Penalty
+from mpc.robust.observer import ObserverSettings
 from quadsim.errors import ParameterError
 from quadsim.state import Array
 
@@ -38,7 +38,9 @@ class RobustSettings:
             the next; it goes on from there.  Of no effect on the hover model without `heading`.
         move_weight: Q_d (4, 4), of a command's change from one period to the next; None for none.
         linearisation: where the prediction is linearised.
-        margins: (N, n_c) by which the output bounds are drawn in; None for none.
+        margins: (N, n_c) by which the output bounds are tightened; None for none.
+        terminal: whether the last state has the weight of the hover model's LQR (`mpc.ocp.lqr_terminal_weight`); with
+            the hover model only.
     """
 
     penalty: Penalty | None = None
@@ -50,6 +52,7 @@ class RobustSettings:
     move_weight: Array | None = None
     linearisation: Linearisation = Linearisation.HOVER
     margins: Array | None = None
+    terminal: bool = False
 
     def __post_init__(self) -> None:
         for name in ("rotor_lag", "delay"):
@@ -57,3 +60,6 @@ class RobustSettings:
                 raise ParameterError("controller", name, getattr(self, name), "at least 0 s and finite")
         if not 0.0 < self.largest_turn < math.inf:
             raise ParameterError("controller", "largest_turn", self.largest_turn, "positive and finite")
+        if self.terminal and self.linearisation is not Linearisation.HOVER:
+            rule = 'left out, or linearisation = "hover": its Riccati equation is of that model'
+            raise ParameterError("controller", "terminal", "lqr", rule)

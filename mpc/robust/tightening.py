@@ -34,7 +34,7 @@ import numpy as np
 import scipy.linalg
 
 from mpc.model import continuous_model, discretise
-from mpc.problem import Bounds
+from mpc.ocp import Bounds
 from quadsim.errors import ParameterError
 from quadsim.state import INDEX, N_STATES, Array, read_only
 from quadsim.vehicle import Vehicle

@@ -1,0 +1,144 @@
+"""The axes of a problem: parts that meet only in what the inputs can do.
+
+A hovering quadrotor is four systems: x with pitch, y with roll, z, and yaw.  Four rotors drive them all, so that bounds
+on rotors tie them together; but no prediction, no weight and no output bound does.  Take as axes the connected
+components of the states under
+
+    A,  |C_r|' |Q_y| |C_r|,  P,  |C|' |C|,  B Q_u^-1 B',
+
+C of all rows, the last for what it costs to move two states at once, and for each axis g inputs w_g with T_g spanning
+Q_u^-1 B_g'.  Then u = u_s + sum T_g w_g, each w_g moves its own axis alone since B_h T_g = 0, and the cost falls apart
+since T_g' Q_u T_h = 0: without rows of inputs the problem is one small problem per axis.  What of u lies in none of the
+T_g moves nothing, and is u_s's at the optimum.  Where changes of inputs cost something, the axes are only used if they
+are all of u and Q_d falls apart alike.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csr_matrix
+from scipy.sparse.csgraph import connected_components
+
+from mpc.model import LinearModel
+from mpc.ocp import Objective, Problem
+from quadsim.state import Array, Indices
+
+ROUNDING: Final = 1e-12
+"""Relative size below which what ties two states is taken for a product of rounding."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Axis:
+    """One axis, as a problem of its own.
+
+    Attributes:
+        problem: in w (N, m), without constraints; its u_bar is zero.
+        states: (n_g,) its states among those of the whole.
+        regulated: its rows of C_r.
+        outputs: the problem's rows (`mpc.ocp.Rows`) on its states.
+        T: (nu, m) the axis's part of u - u_s is T w; columns of unit length.
+        T_inverse: (m, nu) w of u - u_s, where the axes are all of u.
+    """
+
+    problem: Problem
+    states: Indices
+    regulated: Indices
+    outputs: Indices
+    T: Array
+    T_inverse: Array
+
+
+def axes(problem: Problem) -> list[Axis]:
+    """The axes of a problem, which together are all of it but its rows of inputs.
+
+    Pieces that nothing moves or regulates are left out: they want u_s.  Where such a piece has a row, or a row of
+    constraints or of C_r is on nothing, or the problem is all of one piece, the one axis is the whole problem.
+
+    Raises:
+        ValueError: the problem has no constraints.
+    """
+    rows, model, objective = problem.rows, problem.model, problem.objective
+    bounded: NDArray[np.bool_] = np.asarray(rows.C.any(axis=1))
+    C_r, C = np.abs(objective.C_r), np.abs(rows.C)
+    root = np.linalg.cholesky(objective.Q_u)
+    reach = _normalised(np.linalg.solve(root, model.B.T))
+    tied = (C_r.T @ np.abs(objective.Q_y) @ C_r + C.T @ C) > 0.0
+    tied |= np.abs(model.A) > ROUNDING * np.abs(model.A).max()
+    tied |= np.abs(reach.T @ reach) > ROUNDING
+    if objective.P is not None:
+        tied |= objective.P != 0.0
+    count, label = connected_components(csr_matrix(tied), directed=False)
+    whole = _axis(problem, np.eye(model.nu), np.arange(model.n), np.arange(len(C_r)), np.flatnonzero(bounded))
+    on_nothing = not (C_r.any(axis=1).all() and bounded[rows.of_states].all())
+    if count == 1 or on_nothing:
+        return [whole]
+    found = []
+    for states in (np.flatnonzero(label == g) for g in range(count)):
+        regulated, outputs = C_r[:, states].any(axis=1), bounded & C[:, states].any(axis=1)
+        if reach[:, states].any() and regulated.any():
+            directions, sizes, _ = np.linalg.svd(reach[:, states], full_matrices=False)
+            T = _normalised(np.linalg.solve(root.T, directions[:, sizes > ROUNDING]))
+            found.append(_axis(problem, T, states, np.flatnonzero(regulated), np.flatnonzero(outputs)))
+        elif outputs.any():
+            return [whole]
+    if objective.Q_d is None:
+        return found
+    T = np.hstack([axis.T for axis in found])
+    if T.shape[0] != T.shape[1]:
+        return [whole]
+    across, start = T.T @ objective.Q_d @ T, 0
+    inverse, parted = np.linalg.inv(T), []
+    for axis in found:
+        own = slice(start, start + axis.T.shape[1])
+        others = np.delete(across[own], np.arange(own.start, own.stop), axis=1)
+        if np.abs(others).max(initial=0.0) > ROUNDING * np.abs(across).max():
+            return [whole]
+        parted.append(replace(axis, T_inverse=np.asarray(inverse[own], np.float64)))
+        start = own.stop
+    return parted
+
+
+def _axis(problem: Problem, T: Array, states: Indices, regulated: Indices, outputs: Indices) -> Axis:
+    model, objective = problem.model, problem.objective
+
+    def of_inputs(weight: Array | None) -> Array | None:
+        if weight is None:
+            return None
+        own = T.T @ weight @ T
+        return np.asarray(0.5 * (own + own.T))
+
+    Q_u = of_inputs(objective.Q_u)
+    assert Q_u is not None
+    return Axis(
+        problem=Problem(
+            model=LinearModel(
+                A=model.A[np.ix_(states, states)],
+                B=model.B[states] @ T,
+                u_bar=np.zeros(T.shape[1]),
+                period=model.period,
+            ),
+            horizon=problem.horizon,
+            objective=Objective(
+                C_r=objective.C_r[np.ix_(regulated, states)],
+                Q_y=objective.Q_y[np.ix_(regulated, regulated)],
+                Q_u=Q_u,
+                Q_d=of_inputs(objective.Q_d),
+                P=None if objective.P is None else objective.P[np.ix_(states, states)],
+            ),
+        ),
+        states=states,
+        regulated=regulated,
+        outputs=outputs,
+        T=T,
+        T_inverse=np.eye(T.shape[1], T.shape[0]),
+    )
+
+
+def _normalised(matrix: Array) -> Array:
+    """The matrix with columns of unit length; those of zeros stay."""
+    size = np.linalg.norm(matrix, axis=0)
+    return np.asarray(matrix / np.where(size > 0.0, size, 1.0), dtype=np.float64)

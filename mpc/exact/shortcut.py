@@ -1,0 +1,293 @@
+"""Exact ways around the whole QP: an optimum of fewer constraints that satisfies all of them is the optimum."""
+
+from __future__ import annotations
+
+import time as clock
+from dataclasses import replace
+from typing import Final, NamedTuple
+
+import numpy as np
+import scipy.linalg
+from numpy.typing import NDArray
+
+from mpc.exact.activeset import FEASIBLE, Active, ActiveSet, Side
+from mpc.exact.axes import axes
+from mpc.exact.free import FreeOptimum
+from mpc.ocp import Problem, Rest, Rows
+from mpc.paper.condensed import Condensed, condensed_cost, row_maps
+from mpc.paper.prediction import prediction
+from mpc.qp import Solution
+from mpc.solvers import Answer, Solver, Way
+from quadsim.controller import SOLVED, UNCONSTRAINED
+from quadsim.state import Array, Indices, read_only
+
+Flags = NDArray[np.bool_]
+
+LARGEST_MAP: Final = 2**20
+"""Entries beyond which there is no shortcut: 8 MiB, as much as a core's caches hold.  50 steps of the paper's problem
+have 16 k entries, 400 steps 970 k."""
+MOST_STEPS: Final = {"axes": 50, "all": 15}
+"""Steps of the active set method after which the whole QP's solver takes over: it is as fast."""
+
+
+class Shortcut:
+    """Solves no more of the QP than it has to.
+
+    The cost is strictly convex: the minimiser over fewer constraints, if it satisfies the others too, is the one and
+    only solution of Eq. (27).  In turn,
+
+    1. no constraint at all: Eq. (22), a product for each axis of `mpc.exact.axes`; the status is then `unconstrained`;
+    2. rows of states alone, axis by axis, by their multipliers (`mpc.exact.activeset`), from the last period's;
+    3. all rows, likewise;
+    4. the whole QP by its solver, whose active set then leads to the exact optimum.
+
+    Along the plan active rows alternate, so that the last period's set, moved one step earlier, is nearly this one's;
+    where margins grow along the horizon, it is nearly so unmoved.  Both are tried as a start.
+
+    Args:
+        problem: with constraints.
+        whole: solves the whole QP.
+
+    Raises:
+        numpy.linalg.LinAlgError: the Hessian is so ill-conditioned that the gains of Eq. (22) are not exact.
+
+    Attributes:
+        formulation: the condensed QP.
+    """
+
+    def __init__(self, problem: Problem, whole: Solver) -> None:
+        rows, N, nu = problem.rows, problem.horizon, problem.model.nu
+        parts = axes(problem)
+        self._rows, self._whole, self._rest = rows, whole, problem.rest
+        self._free, self.formulation = FreeOptimum(problem, parts), Condensed(problem)
+        self._T = np.ascontiguousarray(np.hstack([axis.T for axis in parts]).T)
+        self._C_r, self._C = problem.objective.C_r, rows.C
+        self._D, self._E = np.ascontiguousarray(rows.D.T), np.ascontiguousarray(rows.E.T)
+        channels = np.concatenate([axis.outputs for axis in parts])
+        of_states = rows.of_states[channels]
+        self._later = channels[of_states], np.flatnonzero(of_states)
+        self._now = channels[~of_states], np.flatnonzero(~of_states)
+        self._lower, self._upper = rows.lower.ravel(), rows.upper.ravel()
+        self._steps, self._values = np.empty((N, nu)), np.empty(rows.lower.shape)
+        self._side: Side = np.zeros(rows.lower.size, np.int8)
+        self._no_slacks = read_only(np.zeros((N, rows.soft.size)))
+        qp = self.formulation.qp
+        self._no_equalities, self._no_rows = read_only(np.zeros(0)), read_only(np.zeros(qp.h_l.size))
+        self._no_box = read_only(np.concatenate([np.zeros(N * nu), -np.tile(rows.l1[rows.soft], N)]))
+        self._nothing = Active(z=self._no_rows, values=self._no_rows, side=np.zeros(0, np.int8), steps=0)
+        grid = np.arange(rows.lower.size).reshape(rows.lower.shape)
+        self._of_inputs_alone = ~np.broadcast_to(rows.C.any(axis=1), grid.shape)
+        self._groups = []
+        if rows.of_states[rows.C.any(axis=1)].all():
+            groups = ((axis, axis.outputs) for axis in parts if axis.outputs.size)
+            self._groups = [
+                _Group(axis.problem, rows.part(own, axis.states, axis.T.shape[1]), grid[:, own].ravel(), axis.T)
+                for axis, own in groups
+                if (N * max(own.size, axis.T.shape[1])) ** 2 <= LARGEST_MAP
+            ]
+        self._all = _Group(problem, rows, grid.ravel(), np.eye(nu)) if grid.size**2 <= LARGEST_MAP else None
+
+    @property
+    def name(self) -> str:
+        """Name of the QP solver."""
+        return self._whole.name
+
+    def reset(self) -> None:
+        """See `mpc.solvers.Solver.reset`."""
+        self._side = np.zeros_like(self._side)
+        self._whole.reset()
+
+    def solve(self, state: Array, desired: Array, u_before: Array, rest: Rest | None = None) -> Answer:
+        """See `mpc.solvers.Solver.solve`."""
+        started = clock.perf_counter()
+        x_s, u_s = self._rest if rest is None else rest
+        dx, dy = (state, desired) if rest is None else (state - x_s, desired - self._C_r @ x_s)
+        w, y = self._free.at(dx, dy, u_before - u_s)
+        plan = np.dot(w.T, self._T)
+        plan += u_s
+        values = self._values_of_inputs(plan, u_before)
+        rows, channels = self._later
+        values[:, rows] += y[channels].T
+        rows, channels = self._now
+        if rows.size:
+            values[0, rows] += self._C[rows] @ dx
+            values[1:, rows] += y[channels, :-1].T
+        if rest is not None:
+            values += self._C @ x_s
+        free = values.ravel()
+        within = (self._lower <= free) & (free <= self._upper)
+        if within.all():
+            self._side = np.zeros_like(self._side)
+            nothing = self._nothing
+            solution = self._solution(plan, nothing, started, UNCONSTRAINED)
+            return Answer(plan=plan, slacks=self._no_slacks, solution=solution, way=Way.FREE)
+        free = free.copy()  # the values' room is used again
+        if np.isfinite(free).all():
+            starts = self._starts()
+            found, settled = self._by_axes(plan, free, within, u_before, starts)
+            way = Way.WHOLE if found is None else Way.AXES
+            if found is None and settled and self._all is not None:
+                found = self._all.solve(plan, free, self._lower, self._upper, starts, most=MOST_STEPS["all"])
+            if found is not None:
+                self._side = found.active.side
+                return self._answer(found, way, started)
+        return self._by_solver(plan, free, (state, desired, u_before, rest), started)
+
+    def _values_of_inputs(self, plan: Array, u_before: Array) -> Array:
+        """(N, m) D u + E (u - u_before) of the rows; the next call's too."""
+        steps, values = self._steps, self._values
+        np.subtract(plan[0], u_before, out=steps[0])
+        np.subtract(plan[1:], plan[:-1], out=steps[1:])
+        np.dot(plan, self._D, out=values)
+        values += np.dot(steps, self._E)
+        return values
+
+    def _starts(self) -> list[Side]:
+        """The last active set moved one step earlier, and as it was."""
+        moved, m = np.zeros_like(self._side), self._rows.l1.size
+        moved[:-m] = self._side[m:]
+        return [moved, self._side]
+
+    def _by_axes(
+        self, plan: Array, free: Array, within: Flags, u_before: Array, starts: list[Side]
+    ) -> tuple[_Found | None, bool]:
+        """The optimum with active rows of states alone, if it satisfies all others; and whether it was found at all."""
+        z, side, values, steps = np.zeros_like(free), np.zeros_like(self._side), free.copy(), 0
+        for group in self._groups:
+            own = group.rows
+            if within[own].all():
+                continue
+            found = group.solve(plan, values, self._lower, self._upper, starts, most=MOST_STEPS["axes"])
+            if found is None:
+                return None, False
+            plan, steps = found.plan, steps + found.active.steps
+            z[own], side[own], values[own] = found.active.z, found.active.side, found.active.values
+        inputs = self._values_of_inputs(plan, u_before)
+        values = np.where(self._of_inputs_alone, inputs, values.reshape(inputs.shape)).ravel()
+        beyond = np.maximum(values - self._upper, self._lower - values)
+        if not ((beyond <= FEASIBLE) | (np.abs(side) == 2)).all():
+            return None, True
+        return _Found(plan, Active(z=z, values=values, side=side, steps=steps)), True
+
+    def _answer(self, found: _Found, way: Way, started: float) -> Answer:
+        slacks, soft = self._no_slacks, self._rows.soft
+        if (np.abs(found.active.side) == 2).any():
+            values, shape = found.active.values, self._rows.lower.shape
+            beyond = np.maximum(np.maximum(values - self._upper, self._lower - values), 0.0)
+            slacks = np.where(np.abs(found.active.side) == 2, beyond, 0.0).reshape(shape)[:, soft]
+        solution = self._solution(found.plan, found.active, started, SOLVED, slacks)
+        return Answer(plan=found.plan, slacks=slacks, solution=solution, way=way)
+
+    def _solution(
+        self, plan: Array, active: Active, started: float, status: str, slacks: Array | None = None
+    ) -> Solution:
+        blank = Solution(
+            x=np.append(plan, self._no_slacks) if self._no_slacks.size else plan.ravel(),
+            y=self._no_equalities,
+            z=self._no_rows,
+            z_box=self._no_box,
+            status=status,
+            iterations=active.steps,
+            active=int(np.count_nonzero(active.side)),
+            primal_residual=0.0,
+            dual_residual=0.0,
+            solve_s=clock.perf_counter() - started,
+        )
+        if slacks is None:
+            return blank
+        return self.formulation.solution(blank, plan, slacks, active.z.reshape(self._rows.lower.shape))
+
+    def _by_solver(
+        self, plan: Array, free: Array, query: tuple[Array, Array, Array, Rest | None], started: float
+    ) -> Answer:
+        """The solver's answer to the whole QP, made exact where its active set leads to the optimum."""
+        tried_s = clock.perf_counter() - started
+        answer = self._whole.solve(*query)
+        started = clock.perf_counter()
+        given = answer.solution
+        self._side = np.zeros_like(self._side)
+        if given.status != SOLVED:
+            solution = replace(given, solve_s=given.solve_s + tried_s)
+            return replace(answer, solution=solution)
+        multipliers = self._whole.formulation.multipliers(given)
+        if self._all is not None:
+            near = self._all.near(multipliers.ravel(), free, self._lower, self._upper)
+            self._side = near
+            found = self._all.solve(plan, free, self._lower, self._upper, [near], most=MOST_STEPS["all"])
+            if found is not None:
+                self._side = found.active.side
+                answer = self._answer(found, Way.WHOLE, started)
+        if answer.solution is given:
+            answer = replace(answer, solution=self.formulation.solution(given, answer.plan, answer.slacks, multipliers))
+        solution = replace(
+            answer.solution,
+            iterations=given.iterations,
+            primal_residual=given.primal_residual,
+            dual_residual=given.dual_residual,
+            solve_s=given.solve_s + tried_s + clock.perf_counter() - started,
+        )
+        return replace(answer, solution=solution)
+
+
+class _Found(NamedTuple):
+    """A plan (N, nu) and the multipliers that lead to it."""
+
+    plan: Array
+    active: Active
+
+
+class _Group:
+    """Rows whose multipliers are found together.
+
+    Args:
+        problem: the part of the whole that they are on.
+        part: these rows of the part.
+        rows: where they are among all (N m,).
+        T: (nu, m) what the part's inputs are among all.
+    """
+
+    def __init__(self, problem: Problem, part: Rows, rows: Indices, T: Array) -> None:
+        maps = prediction(problem.model, problem.horizon)
+        G = row_maps(part, maps).of_inputs
+        factor = np.linalg.cholesky(condensed_cost(problem, maps).H)
+        half = scipy.linalg.solve_triangular(factor, G.reshape(rows.size, -1).T, lower=True)
+        self.rows, self._T = rows, T.T
+        self._R = np.ascontiguousarray(scipy.linalg.solve_triangular(factor, half, lower=True, trans="T").T)
+        l1, l2 = (np.tile(penalty, problem.horizon) for penalty in (part.l1, part.l2))
+        self._set = ActiveSet(half.T @ half, l1, l2)
+
+    def solve(
+        self, plan: Array, free: Array, lower: Array, upper: Array, starts: list[Side], *, most: int
+    ) -> _Found | None:
+        """The optimum over these rows alone, from one without them; of vectors and sides of all rows."""
+        own = self.rows
+        found = self._set.solve(free[own], lower[own], upper[own], [side[own] for side in starts], most=most)
+        if found is None:
+            return None
+        active = found.z.nonzero()[0]
+        change = (found.z[active] @ self._R[active]).reshape(len(plan), -1)
+        return _Found(plan - change @ self._T, found)
+
+    def near(self, z: Array, free: Array, lower: Array, upper: Array) -> Side:
+        """The active set that approximate multipliers tell of; see `ActiveSet.near`."""
+        return self._set.near(z, free, lower, upper)
+
+
+def with_shortcut(problem: Problem, whole: Solver) -> Solver:
+    """A solver that tries less than the whole QP first; the solver itself where that is no good.
+
+    The map to the free optimum grows with the square of the horizon, the QP in proportion to it: beyond `LARGEST_MAP`
+    entries nothing is tried.  Nor is it where the Hessian is so ill-conditioned, by a long horizon or weights far
+    apart, that the gains are not exact.
+    """
+    N = problem.horizon
+    entries = sum(
+        N * (axis.T.shape[1] + axis.outputs.size) * (axis.states.size + N * axis.regulated.size)
+        for axis in axes(problem)
+    )
+    if entries > LARGEST_MAP:
+        return whole
+    try:
+        return Shortcut(problem, whole)
+    except np.linalg.LinAlgError:
+        return whole

@@ -1,0 +1,1 @@
+"""What is flown when a controller has no good answer."""

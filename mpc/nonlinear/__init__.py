@@ -1,0 +1,1 @@
+"""The rigid body at any attitude, and its exact derivatives."""

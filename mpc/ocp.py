@@ -1,0 +1,389 @@
+"""The optimal control problem of an MPC, as a value: nothing else defines what is solved.
+
+Over N steps of a linear model, from x(k) and after the input u(k-1), minimised is
+
+    sum_i |C_r x(k+i) - y_d(i)|^2_Qy + |u(k+i-1) - u_s|^2_Qu + |u(k+i-1) - u(k+i-2)|^2_Qd,    i = 1 .. N,
+
+where the last state may have a weight P of its own, about the rest state x_s (`Rest`), subject to a tuple of
+constraints, each a value.  What is built from a problem walks the rows of all its constraints and knows no kind.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+import scipy.linalg
+
+from mpc.model import LinearModel
+from quadsim.errors import ParameterError
+from quadsim.state import N_STATES, REFERENCE_STATES, STATE_NAMES, STATE_UNITS, Array, Indices
+
+
+class Rest(NamedTuple):
+    """Where the model rests, x_s = A x_s + B (u_s - u_bar), and what the cost pulls inputs to.
+
+    Attributes:
+        x: (n,) x_s.
+        u: (nu,) u_s [rad/s].
+    """
+
+    x: Array
+    u: Array
+
+
+@dataclass(frozen=True, kw_only=True)
+class Objective:
+    """The cost of Eq. (5), with two terms that the paper does not have.
+
+    Attributes:
+        C_r: (n_r, n) regulated outputs y_r = C_r xi.  Eq. (4), where the paper prints n_r x n_r.
+        Q_y: (n_r, n_r) weight of the output error, symmetric positive definite.
+        Q_u: (nu, nu) weight of u - u_bar, symmetric positive definite.
+        Q_d: (nu, nu) weight of an input's change from one step to the next, symmetric positive semidefinite; None for
+            none.
+        P: (n, n) weight of the last state's distance from C_r^+ y_d, in place of Q_y's, symmetric positive
+            semidefinite; None for none.
+    """
+
+    C_r: Array
+    Q_y: Array
+    Q_u: Array
+    Q_d: Array | None = None
+    P: Array | None = None
+
+    def __post_init__(self) -> None:
+        for name in ("Q_y", "Q_u"):
+            _check_definite(name, getattr(self, name), least=0.0)
+        for name in ("Q_d", "P"):
+            if getattr(self, name) is not None:
+                _check_definite(name, getattr(self, name), least=-1e-12)
+        if self.C_r.ndim != 2 or self.Q_y.shape[0] != self.C_r.shape[0]:
+            raise ParameterError("controller", "C_r", self.C_r.shape, f"of shape ({self.Q_y.shape[0]}, n)")
+
+    def desired(self, reference: Array) -> Array:
+        """Desired outputs y_r^d (..., n_r) of a reference (..., 4) for x, y, z, yaw; other states are wanted at 0."""
+        return reference @ self.C_r[:, REFERENCE_STATES].T
+
+    @cached_property
+    def weights(self) -> tuple[Array, Array]:
+        """Q (n, n) and W (n, n_r): a state costs x' Q x - 2 x' W y_d, and what does not depend on it."""
+        W = self.C_r.T @ self.Q_y
+        return W @ self.C_r, W
+
+    @cached_property
+    def terminal_weights(self) -> tuple[Array, Array]:
+        """The same for the last state."""
+        return self.weights if self.P is None else (self.P, self.P @ np.linalg.pinv(self.C_r))
+
+    @property
+    def move_weight(self) -> Array:
+        """Q_d (nu, nu), zeros where there is none."""
+        return np.zeros_like(self.Q_u) if self.Q_d is None else self.Q_d
+
+
+def lqr_terminal_weight(model: LinearModel, objective: Objective) -> Array:
+    """P (n, n) of the DARE: what it costs to come to rest from a state in any time, without constraints.
+
+    With it the unconstrained optimum over N steps is that over infinitely many, but for the weight of changes of
+    inputs, which the DARE leaves out.
+
+    Raises:
+        ParameterError: it has no solution, as where some state costs nothing and does not come to rest by itself.
+    """
+    try:
+        P = scipy.linalg.solve_discrete_are(model.A, model.B, objective.weights[0], objective.Q_u)
+    except (np.linalg.LinAlgError, ValueError) as error:
+        rule = "left out, or weights on all of x, y, z and yaw: the Riccati equation has no solution with these"
+        raise ParameterError("controller", "terminal", "lqr", rule) from error
+    return np.asarray(0.5 * (P + P.T))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Penalty:
+    """What violating a row of a soft constraint by e costs: l1 e + l2 e^2.
+
+    While l1 exceeds the multiplier that the hard row would have, the penalty is exact: e is zero wherever the hard
+    problem is feasible (Kerrigan and Maciejowski, 2000, "Soft constraints and exact penalty functions in model
+    predictive control").
+
+    Attributes:
+        l1: (m,) at least 0.
+        l2: (m,) at least 0.
+    """
+
+    l1: Array
+    l2: Array
+
+    def __post_init__(self) -> None:
+        for name in ("l1", "l2"):
+            value = getattr(self, name)
+            if value.shape != self.l1.shape or value.ndim != 1 or not (np.isfinite(value) & (value >= 0.0)).all():
+                raise ParameterError("controller", name, value, "one finite number >= 0 per constrained output")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Constraint:
+    """lower <= C x(k+i) + D u(k+i) + E (u(k+i) - u(k+i-1)) <= upper.
+
+    Rows of states alone hold at x(k+1) .. x(k+N), all others at i = 0 .. N-1.
+
+    Attributes:
+        name: as messages and audits name it.
+        lower, upper: (m,), or (N, m) where the steps' bounds differ; infinite where there is no bound.
+        C: (m, n); None for zeros.
+        D: (m, nu); likewise.
+        E: (m, nu); likewise.
+        penalty: what violating it costs; None for a hard constraint.
+    """
+
+    name: str
+    lower: Array
+    upper: Array
+    C: Array | None = None
+    D: Array | None = None
+    E: Array | None = None
+    penalty: Penalty | None = None
+
+    def __post_init__(self) -> None:
+        lower, upper = self.lower, self.upper
+        if lower.shape != upper.shape or np.any(np.isnan(lower)) or np.any(np.isnan(upper)):
+            raise ParameterError(
+                "controller", f"{self.name}.lower", lower, f"numbers of the same shape as upper = {upper}"
+            )
+        if np.any(lower >= upper):
+            raise ParameterError("controller", f"{self.name}.lower", lower, f"below upper = {upper}")
+        given = [matrix for matrix in (self.C, self.D, self.E) if matrix is not None]
+        if not given or any(len(matrix) != lower.shape[-1] for matrix in given):
+            raise ParameterError("controller", self.name, [len(matrix) for matrix in given], f"{lower.shape[-1]} rows")
+        if not all(np.isfinite(matrix).all() for matrix in given):
+            raise ParameterError("controller", self.name, given, "finite numbers")
+        if self.penalty is not None and self.penalty.l1.size != lower.shape[-1]:
+            raise ParameterError("controller", "l1", self.penalty.l1.shape, f"of shape ({lower.shape[-1]},)")
+
+
+def tightened(constraint: Constraint, margins: Array) -> Constraint:
+    """The constraint with both bounds moved inwards by margins (N, m).
+
+    Raises:
+        ParameterError: a margin is negative or not finite, of another shape, or nothing is left between the bounds.
+    """
+    m = constraint.lower.shape[-1]
+    if np.ndim(margins) != 2 or margins.shape[1] != m or not (np.isfinite(margins) & (margins >= 0.0)).all():
+        raise ParameterError("controller", "margins", margins, f"finite numbers >= 0 of shape (N, {m})")
+    lower, upper = constraint.lower + margins, constraint.upper - margins
+    if not np.all(lower < upper):
+        raise ParameterError("controller", "margins", margins.max(0), "less than half of what is between the bounds")
+    return replace(constraint, lower=lower, upper=upper)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Bounds:
+    """The constraints of Eqs. (12)-(20); an infinite entry is no bound.
+
+    Attributes:
+        C_c: (n_c, n) constrained outputs y_c = C_c xi.  Eq. (12).
+        y_min, y_max: (n_c,) output bounds.  Eq. (13).
+        delta_min, delta_max: (nu,) bounds on u(k) - u(k-1) [rad/s].  Eq. (15).
+        u_min, u_max: (nu,) input bounds [rad/s].  Eq. (20).
+        penalty: what violating an output bound costs; None for hard ones.
+        margins: (N, n_c) by which output bounds are tightened at each predicted state; None for none.
+    """
+
+    C_c: Array
+    y_min: Array
+    y_max: Array
+    delta_min: Array
+    delta_max: Array
+    u_min: Array
+    u_max: Array
+    penalty: Penalty | None = None
+    margins: Array | None = None
+
+    def __post_init__(self) -> None:
+        for low, high in (("y_min", "y_max"), ("delta_min", "delta_max"), ("u_min", "u_max")):
+            lower, upper = getattr(self, low), getattr(self, high)
+            if lower.shape != upper.shape or np.any(np.isnan(lower)) or np.any(np.isnan(upper)):
+                raise ParameterError("controller", low, lower, f"numbers of the same shape as {high} = {upper}")
+            if np.any(lower >= upper):
+                raise ParameterError("controller", low, lower, f"below {high} = {upper}")
+
+    def output(self, i: int) -> tuple[str, float, str]:
+        """A constrained output as scenario files name it: its state, what one of its unit is there, and that unit."""
+        (states,) = np.nonzero(self.C_c[i])
+        if states.size != 1 or self.C_c[i, states[0]] != 1.0 or states[0] >= N_STATES:
+            return f"row {i} of C_c", 1.0, ""
+        name, unit = STATE_NAMES[states[0]], STATE_UNITS[states[0]]
+        return (name, math.degrees(1.0), unit.replace("rad", "deg")) if unit.startswith("rad") else (name, 1.0, unit)
+
+    @property
+    def constraints(self) -> tuple[Constraint, ...]:
+        """The same as values: outputs, slews, inputs."""
+        nu = self.u_min.size
+        outputs = Constraint(name="outputs", lower=self.y_min, upper=self.y_max, C=self.C_c, penalty=self.penalty)
+        return (
+            outputs if self.margins is None else tightened(outputs, self.margins),
+            Constraint(name="slews", lower=self.delta_min, upper=self.delta_max, E=np.eye(nu)),
+            Constraint(name="inputs", lower=self.u_min, upper=self.u_max, D=np.eye(nu)),
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Rows:
+    """The rows of all constraints that bound anything, m of them, in the constraints' order.
+
+    Attributes:
+        C: (m, n).
+        D: (m, nu).
+        E: (m, nu).
+        lower, upper: (N, m).
+        l1, l2: (m,) what violating a row costs; l1 is infinite of hard ones.
+        of_states: (m,) whether a row is of the state alone: entry i is then for x(k+i+1), otherwise for x(k+i), u(k+i).
+        input: (m,) the input that a hard row bounds by itself; -1 where it is no such row.
+        names: (m,) of their constraints.
+    """
+
+    C: Array
+    D: Array
+    E: Array
+    lower: Array
+    upper: Array
+    l1: Array
+    l2: Array
+    of_states: np.ndarray[tuple[int], np.dtype[np.bool_]]
+    input: Indices
+    names: tuple[str, ...]
+
+    @property
+    def soft(self) -> Indices:
+        """(m_s,) which rows are soft."""
+        return np.flatnonzero(np.isfinite(self.l1))
+
+    def part(self, rows: Indices, states: Indices, inputs: int) -> Rows:
+        """Some rows of states alone, on some states, of a problem with so many inputs."""
+        nothing = np.zeros((rows.size, inputs))
+        return replace(
+            self,
+            C=self.C[np.ix_(rows, states)],
+            D=nothing,
+            E=nothing,
+            lower=self.lower[:, rows],
+            upper=self.upper[:, rows],
+            l1=self.l1[rows],
+            l2=self.l2[rows],
+            of_states=self.of_states[rows],
+            input=self.input[rows],
+            names=tuple(self.names[row] for row in rows),
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Problem:
+    """Everything that defines a controller but the way its optimum is found.
+
+    Attributes:
+        model: the prediction model.
+        horizon: N, steps.
+        objective: what is minimised.
+        bounds: the paper's constraints; None for none.
+        constraints: others.
+    """
+
+    model: LinearModel
+    horizon: int
+    objective: Objective
+    bounds: Bounds | None = None
+    constraints: tuple[Constraint, ...] = ()
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.horizon, int) or self.horizon < 1:
+            raise ParameterError("controller", "horizon", self.horizon, "a whole number >= 1")
+        n, nu = self.model.n, self.model.nu
+        _check_shape("C_r", self.objective.C_r, (self.objective.C_r.shape[0], n))
+        _check_shape("Q_u", self.objective.Q_u, (nu, nu))
+        for name, matrix, shape in (("Q_d", self.objective.Q_d, (nu, nu)), ("P", self.objective.P, (n, n))):
+            if matrix is not None:
+                _check_shape(name, matrix, shape)
+        if self.bounds is not None:
+            _check_shape("C_c", self.bounds.C_c, (self.bounds.y_min.size, n))
+            _check_shape("delta_min", self.bounds.delta_min, (nu,))
+            _check_shape("u_min", self.bounds.u_min, (nu,))
+        for constraint in (*(self.bounds.constraints if self.bounds else ()), *self.constraints):
+            m = constraint.lower.shape[-1]
+            for name, matrix, columns in (("C", constraint.C, n), ("D", constraint.D, nu), ("E", constraint.E, nu)):
+                if matrix is not None:
+                    _check_shape(f"{constraint.name}.{name}", matrix, (m, columns))
+            if constraint.lower.ndim == 2:
+                _check_shape(f"{constraint.name}.lower", constraint.lower, (self.horizon, m))
+
+    @property
+    def rest(self) -> Rest:
+        """The equilibrium that the model is linearised at, the origin."""
+        return Rest(np.zeros(self.model.n), self.model.u_bar)
+
+    @cached_property
+    def rows(self) -> Rows:
+        """The rows of all constraints.
+
+        Raises:
+            ValueError: there are none.
+        """
+        constraints = (*(self.bounds.constraints if self.bounds else ()), *self.constraints)
+        if not constraints:
+            raise ValueError("a constrained MPC needs a problem with bounds")
+        N, n, nu = self.horizon, self.model.n, self.model.nu
+        sizes = [constraint.lower.shape[-1] for constraint in constraints]
+        C, D, E = (
+            np.concatenate(
+                [
+                    np.zeros((size, columns)) if matrix is None else matrix
+                    for size, matrix in zip(sizes, (getattr(part, name) for part in constraints), strict=True)
+                ]
+            )
+            for name, columns in (("C", n), ("D", nu), ("E", nu))
+        )
+        lower, upper = (
+            np.concatenate(
+                [np.broadcast_to(getattr(part, side), (N, m)) for part, m in zip(constraints, sizes, strict=True)], 1
+            )
+            for side in ("lower", "upper")
+        )
+        penalties = [
+            part.penalty or Penalty(l1=np.zeros(m), l2=np.zeros(m)) for part, m in zip(constraints, sizes, strict=True)
+        ]
+        hard = np.repeat([part.penalty is None for part in constraints], sizes)
+        single = hard & ~C.any(1) & ~E.any(1) & (np.count_nonzero(D, axis=1) == 1) & (D.max(axis=1, initial=0.0) == 1.0)
+        bounded = np.flatnonzero((np.isfinite(lower) | np.isfinite(upper)).any(axis=0))
+        names = np.repeat([part.name for part in constraints], sizes)
+        return Rows(
+            C=C[bounded],
+            D=D[bounded],
+            E=E[bounded],
+            lower=lower[:, bounded],
+            upper=upper[:, bounded],
+            l1=np.where(hard, math.inf, np.concatenate([part.l1 for part in penalties]))[bounded],
+            l2=np.concatenate([part.l2 for part in penalties])[bounded],
+            of_states=np.asarray(~D[bounded].any(axis=1) & ~E[bounded].any(axis=1)).reshape(bounded.size),
+            input=np.where(single, np.argmax(D, axis=1), -1)[bounded],
+            names=tuple(names[bounded].tolist()),
+        )
+
+
+def _check_shape(name: str, value: Array, shape: tuple[int, ...]) -> None:
+    if value.shape != shape:
+        raise ParameterError("controller", name, value.shape, f"of shape {shape}")
+
+
+def _check_definite(name: str, matrix: Array, *, least: float) -> None:
+    """Refuse a matrix that is not symmetric, or has an eigenvalue of `least` (of the largest entry) or less."""
+    symmetric = matrix.ndim == 2 and matrix.shape[0] == matrix.shape[1] and np.array_equal(matrix, matrix.T)
+    strict = least == 0.0
+    if symmetric and np.all(np.isfinite(matrix)):
+        smallest, limit = np.linalg.eigvalsh(matrix)[0], least * np.abs(matrix).max(initial=0.0)
+        if smallest > limit or (not strict and smallest >= limit):
+            return
+    kind = "definite" if strict else "semidefinite"
+    raise ParameterError("controller", name, matrix.tolist(), f"symmetric and positive {kind}")

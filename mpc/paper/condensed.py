@@ -1,0 +1,175 @@
+"""The paper's condensed QP in the inputs alone, for any optimal control problem.  Eqs. (27)-(29).
+
+Of the paper's problem the matrices are those of Eqs. (7)-(20) as printed, with row pairs as two-sided rows; other terms
+of the cost add to them, other constraints add rows, and soft rows add slacks after the inputs.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import scipy.linalg
+
+from mpc.ocp import Problem, Rest, Rows
+from mpc.paper.cost import cost
+from mpc.paper.prediction import Prediction, prediction
+from mpc.qp import QP, QPRows, Solution, Vectors, qp_rows
+from quadsim.state import Array
+
+
+@dataclass(frozen=True, kw_only=True)
+class CondensedCost:
+    """J = 1/2 v' H v + [F_x dx + F_y dy + F_d du]' v + const, for deviations from a rest state (x_s, u_s).
+
+    With v = u - u_s the sequence of inputs, dx = x(k) - x_s, dy = y_d - C_r x_s and du = u(k-1) - u_s.
+
+    Attributes:
+        H: (N nu, N nu) symmetric positive definite.  Eq. (7).
+        F_x: (N nu, n).  Eq. (8).
+        F_y: (N nu, N n_r).  Eq. (9).
+        F_d: (N nu, nu), zero without a weight of changes.
+    """
+
+    H: Array
+    F_x: Array
+    F_y: Array
+    F_d: Array
+
+
+def condensed_cost(problem: Problem, maps: Prediction) -> CondensedCost:
+    """The cost of a problem, from its prediction map."""
+    objective, N, n, nu = problem.objective, problem.horizon, problem.model.n, problem.model.nu
+    terms = cost(maps, objective)
+    H, F_x, F_y, F_d = terms.H, terms.F1, terms.F2, np.zeros((N * nu, nu))
+    if objective.Q_d is not None:
+        steps = np.kron(np.eye(N) - np.eye(N, k=-1), np.eye(nu))
+        H = H + 2.0 * steps.T @ np.kron(np.eye(N), objective.Q_d) @ steps
+        F_d[:nu] = -2.0 * objective.Q_d
+    if objective.P is not None:
+        (Q, W), (Q_end, W_end) = objective.weights, objective.terminal_weights
+        last, free = maps.Psi[-n:], maps.Phi[-n:]
+        H, F_x, F_y = H + 2.0 * last.T @ (Q_end - Q) @ last, F_x + 2.0 * last.T @ (Q_end - Q) @ free, F_y.copy()
+        F_y[:, -W.shape[1] :] -= 2.0 * last.T @ (W_end - W)
+    return CondensedCost(H=0.5 * (H + H.T), F_x=F_x, F_y=F_y, F_d=F_d)
+
+
+@dataclass(frozen=True, kw_only=True)
+class RowMaps:
+    """Values (N, m) of rows: of_inputs v + of_state dx + of_rest, the first of them less E du.
+
+    Attributes:
+        of_inputs: (N, m, N nu) slopes in v = u - u_s.
+        of_state: (N, m, n) in dx = x(k) - x_s.
+    """
+
+    of_inputs: Array
+    of_state: Array
+
+
+def row_maps(rows: Rows | QPRows, maps: Prediction) -> RowMaps:
+    """The rows' values as functions of inputs and state."""
+    n = maps.Phi.shape[1]
+    Psi, Phi = maps.Psi.reshape(-1, n, maps.Psi.shape[1]), maps.Phi.reshape(-1, n, n)
+    N, nu = len(Psi), Psi.shape[2] // len(Psi)
+    # Rows of states alone are for x(k+1) .. x(k+N), the others for x(k) .. x(k+N-1).
+    later, now = (rows.C * chosen[:, None] for chosen in (rows.of_states, ~rows.of_states))
+    of_inputs, of_state = later @ Psi, later @ Phi
+    of_inputs[1:] += now @ Psi[:-1]
+    of_state[0] += now
+    of_state[1:] += now @ Phi[:-1]
+    by_step = of_inputs.reshape(N, len(rows.C), N, nu)
+    by_step[range(N), :, range(N)] += rows.D + rows.E
+    by_step[range(1, N), :, range(N - 1)] -= rows.E
+    return RowMaps(of_inputs=of_inputs, of_state=of_state)
+
+
+class Condensed:
+    """min 1/2 x' P x + c' x over x = [u(k); ...; u(k+N-1); e], e (N, m_s) the slacks of soft rows.
+
+    Args:
+        problem: with constraints.
+
+    Attributes:
+        qp: H, the rows time by time, and the box; vectors for xi(k) and y_d zero and u(k-1) = u_bar.
+
+    Raises:
+        ValueError: the problem has no constraints; it needs no QP.
+    """
+
+    def __init__(self, problem: Problem) -> None:
+        self._problem, self._rows = problem, qp_rows(problem)
+        model, N, nu = problem.model, problem.horizon, problem.model.nu
+        self._maps = prediction(model, N)
+        self._cost, self._values = condensed_cost(problem, self._maps), row_maps(self._rows, self._maps)
+        rows = self._rows
+        self._inputs, m_s = N * nu, rows.slack.shape[1]
+        soft = problem.rows.soft
+        l1, l2 = np.tile(problem.rows.l1[soft], N), np.tile(problem.rows.l2[soft], N)
+        self._linear = np.concatenate([np.zeros(self._inputs), l1])
+        G = np.zeros((N, len(rows.C), self._inputs + N * m_s))
+        G[:, :, : self._inputs] = self._values.of_inputs
+        for i in range(N if m_s else 0):
+            G[i, :, self._inputs + i * m_s : self._inputs + (i + 1) * m_s] = rows.slack
+        self._of_rest = self._values.of_inputs.reshape(N, len(rows.C), N, nu).sum(axis=2)  # of u_s throughout
+        self._pull = self._cost.H.reshape(N * nu, N, nu).sum(axis=1)  # by u_s throughout
+        size = self._inputs + N * m_s
+        self._blank = QP(
+            P=np.asfortranarray(scipy.linalg.block_diag(self._cost.H, 2.0 * np.diag(l2)) if m_s else self._cost.H),
+            c=np.zeros(size),
+            A=np.zeros((0, size)),
+            b=np.zeros(0),
+            G=np.asfortranarray(G.reshape(-1, size)),
+            h_l=np.zeros(rows.lower.size),
+            h_u=np.zeros(rows.lower.size),
+            x_l=np.concatenate([rows.u_min.ravel(), np.zeros(N * m_s)]),
+            x_u=np.concatenate([rows.u_max.ravel(), np.full(N * m_s, np.inf)]),
+        )
+        nothing = np.zeros((N, problem.objective.C_r.shape[0]))
+        self.qp = self._blank.with_vectors(self.vectors(np.zeros(model.n), nothing, model.u_bar))
+
+    def vectors(self, state: Array, desired: Array, u_before: Array, rest: Rest | None = None) -> Vectors:
+        """See `mpc.qp.Formulation.vectors`."""
+        terms, values, rows = self._cost, self._values, self._rows
+        x_s, u_s = self._problem.rest if rest is None else rest
+        dx, dy, du = state - x_s, desired - self._problem.objective.C_r @ x_s, u_before - u_s
+        c = self._linear.copy()
+        c[: self._inputs] += terms.F_x @ dx + terms.F_y @ dy.ravel() + terms.F_d @ du - self._pull @ u_s
+        # Rows are of absolute inputs u = u_s + v and states x_s + dx(v).
+        shift = rows.C @ x_s + rows.D @ u_s + values.of_state @ dx - self._of_rest @ u_s
+        shift[0] += rows.E @ (u_s - u_before)
+        return Vectors(c=c, b=self._blank.b, h_l=(rows.lower - shift).ravel(), h_u=(rows.upper - shift).ravel())
+
+    def inputs(self, x: Array) -> Array:
+        """See `mpc.qp.Formulation.inputs`."""
+        return x[: self._inputs].reshape(self._problem.horizon, -1)
+
+    def slacks(self, x: Array) -> Array:
+        """See `mpc.qp.Formulation.slacks`."""
+        return x[self._inputs :].reshape(self._problem.horizon, -1)
+
+    def multipliers(self, solution: Solution) -> Array:
+        """See `mpc.qp.Formulation.multipliers`."""
+        return self._rows.multipliers(solution.z, solution.z_box[: self._inputs])
+
+    def solution(self, like: Solution, plan: Array, slacks: Array, multipliers: Array) -> Solution:
+        """A solution of this QP, of which the primal point and the rows' multipliers (N, m) are known.
+
+        Args:
+            like: what else it says.
+            plan: (N, nu).
+            slacks: (N, m_s).
+            multipliers: (N, m), positive at upper bounds and negative at lower ones.
+        """
+        z, z_inputs = self._rows.split(multipliers)
+        soft = self._problem.rows.soft
+        l1, l2 = self._problem.rows.l1[soft], self._problem.rows.l2[soft]
+        # Stationarity of a slack: l1 + 2 l2 e - |z| + z_box = 0.
+        z_slacks = np.minimum(np.abs(multipliers[:, soft]) - l1 - 2.0 * l2 * slacks, 0.0)
+        x = np.concatenate([plan.ravel(), slacks.ravel()])
+        return replace(like, x=x, y=self._blank.b, z=z, z_box=np.concatenate([z_inputs, z_slacks.ravel()]))
+
+
+def condensed(problem: Problem) -> Condensed:
+    """Condense a constrained problem."""
+    return Condensed(problem)
