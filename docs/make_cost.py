@@ -9,11 +9,13 @@ from pathlib import Path
 
 from make_numbers import ROOT, Table, markdown, replace_in_readme
 
-from quadsim.bench import SolverBench
-from quadsim.cost import Contender, CostStudy, cost_markdown, cost_sentences
-from quadsim.figures import write_cost_figures
-from quadsim.metrics import percentiles
-from scenarios.cost.study import SOLVERS_TIMED
+from quadsim.flight.metrics import percentiles
+from scenarios.bench.bench_results import SolverBench
+from scenarios.cost.cost_figures import write_cost_figures
+from scenarios.cost.cost_tables import cost_markdown
+from scenarios.cost.cost_text import cost_sentences
+from scenarios.cost.measure import SOLVERS_TIMED
+from scenarios.cost.study import Contender, CostStudy
 
 
 def timed(bench: SolverBench) -> list[Contender]:

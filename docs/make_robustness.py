@@ -14,12 +14,11 @@ from fault_injection import CONTROLLERS, NEAR, SOON, Consequence, draw, inject_a
 from PIL import Image
 
 from mpc.tightening import TighteningSettings
-from quadsim.bench import Ladder, LadderFlight, ladder_legend, ladder_tables
-from quadsim.bench.ladder_tables import ARRIVED
-from quadsim.table import Cell, Grid
-from scenarios.bench.climbers import FULL
-from scenarios.bench.ladder import climb, write_ladder
-from scenarios.bench.rungs import WORN
+from quadsim.report.table import Cell, Grid
+from scenarios.bench.mismatch.benchmark import climb, write_ladder
+from scenarios.bench.mismatch.conditions import WORN
+from scenarios.bench.mismatch.controllers import FULL
+from scenarios.bench.mismatch.survival import ARRIVED, Ladder, LadderFlight, ladder_legend, ladder_tables
 from scenarios.bench.solvers import section
 from scenarios.build import build_vehicle
 from scenarios.loading import load_scenario

@@ -67,10 +67,10 @@ def closed_loop_section(measured: ClosedLoop) -> str:
     return f"""\
 ## The whole constrained flight on RotorPy's plant
 
-`{scenario.name}`, {scenario.periods} periods, flown by the same loop (`quadsim.loop.fly`), controller and reference,
-once on MuJoCo and once on RotorPy's plant. The conversion from position, quaternion and body rates to the paper's state
-is ours in both. Whatever differs between the plants, and any command that jumps at a tiny change of the state, would
-add up over {scenario.periods * scenario.control_period:g} s:
+`{scenario.name}`, {scenario.periods} periods, flown by the same loop (`quadsim.sim.loop.fly`), controller and
+reference, once on MuJoCo and once on RotorPy's plant. The conversion from position, quaternion and body rates to the
+paper's state is ours in both. Whatever differs between the plants, and any command that jumps at a tiny change of the
+state, would add up over {scenario.periods * scenario.control_period:g} s:
 
 {markdown([closed_loop.HEAD, *measured.rows])}"""
 

@@ -16,17 +16,18 @@ from typing import Any, Final
 
 import numpy as np
 
-from quadsim import rundir
-from quadsim.audit import SIGNALS, Finding, audit
 from quadsim.controller import Phase
 from quadsim.errors import FileError, InputError
-from quadsim.flightlog import FLIGHT_FILE, HORIZON_FILE, PLANT_FILE, TIMING_FILE, FlightLog
+from quadsim.flight import rundir
+from quadsim.flight.audit import SIGNALS, Finding, audit
+from quadsim.flight.log import FlightLog
+from quadsim.flight.parquet import FLIGHT_FILE, HORIZON_FILE, PLANT_FILE, TIMING_FILE
 from quadsim.printable import printable
-from scenarios.bases import read_whole
 from scenarios.build import build_limits
 from scenarios.loading import parse_scenario
-from scenarios.spec import Scenario
-from scenarios.spec.own import LAWS, is_own
+from scenarios.schema.bases import read_whole
+from scenarios.schema.plugin import LAWS, is_own
+from scenarios.schema.scenario import Scenario
 
 TABLES: Final = (FLIGHT_FILE, PLANT_FILE, TIMING_FILE)
 OURS: Final = {*TABLES, HORIZON_FILE, rundir.SCENARIO_FILE, rundir.RECORDING_FILE, rundir.VIDEO_FILE}

@@ -8,13 +8,12 @@ from pathlib import Path
 import pytest
 from hypothesis import settings
 
-from quadsim import rundir
-from quadsim.rundir import Run
+from quadsim.flight import rundir
+from quadsim.flight.rundir import Run
 from quadsim.vehicle import Vehicle
-from scenarios import runner
 from scenarios.build import build_vehicle
 from scenarios.loading import load_scenario
-from scenarios.runner import Flight, Outputs
+from scenarios.run import Flight, Outputs, fly_scenario, run_scenario
 
 # Examples are not timed: a busy machine is no failure.  On CI they are the same ones each time.
 settings.register_profile("quadsim", deadline=None, derandomize="CI" in os.environ)
@@ -32,7 +31,7 @@ def vehicle() -> Vehicle:
 def short_run(tmp_path_factory: pytest.TempPathFactory) -> Run:
     """Six seconds of the constrained flight in a run directory with its summary, scenario and Parquet files."""
     directory = tmp_path_factory.mktemp("short") / "paper-constrained"
-    runner.run(load_scenario("paper-constrained", ["duration=6.0"]), directory, NO_PRODUCTS)
+    run_scenario(load_scenario("paper-constrained", ["duration=6.0"]), directory, NO_PRODUCTS)
     return rundir.load_run(directory)
 
 
@@ -44,10 +43,10 @@ def short_run_directory(short_run: Run) -> Path:
 @pytest.fixture(scope="session")
 def constrained_flight() -> Flight:
     """The paper's whole constrained flight, in memory, plant at the physics rate."""
-    return runner.fly_scenario(load_scenario("paper-constrained"))
+    return fly_scenario(load_scenario("paper-constrained"))
 
 
 @pytest.fixture(scope="session")
 def unconstrained_flight() -> Flight:
     """The paper's whole unconstrained flight, in memory."""
-    return runner.fly_scenario(load_scenario("paper-unconstrained"))
+    return fly_scenario(load_scenario("paper-unconstrained"))

@@ -21,10 +21,10 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from quadsim.controller import ACCEPTED, Controller, Moment
-from quadsim.plant import Plant
+from quadsim.sim.plant import Plant
 from quadsim.state import POSITION, Array
-from scenarios.bench.climbers import FULL, equip
-from scenarios.bench.rungs import CONDITIONS
+from scenarios.bench.mismatch.conditions import CONDITIONS
+from scenarios.bench.mismatch.controllers import FULL, equip
 from scenarios.build import (
     build_controller,
     build_initial_speeds,

@@ -11,7 +11,7 @@ from scipy.linalg import block_diag
 
 from mpc.model import LinearModel
 from mpc.problem import Bounds, Objective, Problem
-from quadsim.flightlog import ControlLog, FlightLog, PlantLog, TimingLog
+from quadsim.flight.log import ControlLog, FlightLog, PlantLog, TimingLog
 from quadsim.state import INDEX, N_STATES, Array
 from quadsim.vehicle import N_ROTORS
 from scenarios.build import build_problem, build_reference, build_vehicle

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from quadsim.errors import RenderingUnavailableError
-from quadsim.video import rendering_backend
+from quadsim.report.film.video import rendering_backend
 from scenarios.cli import EXIT_DONE, main, make_parser
 from scenarios.commands import COMMANDS
 from scenarios.loading import load_scenario

@@ -13,17 +13,22 @@ from mpc.problem import Problem
 from mpc.solvers import SOLVERS, Way
 from mpc.unconstrained import UnconstrainedMPC
 from quadsim import outputs
-from quadsim.bench import Contender, Growth, SolverBench, solver_tables
 from quadsim.errors import InputError, ParameterError, UnknownNameError
+from quadsim.report.table import Grid, grid_to_markdown
 from quadsim.state import Array
-from quadsim.table import Grid, grid_to_markdown
-from scenarios.bench.contenders import Entry, StepEntrant, entries, judge, reference_optima
-from scenarios.bench.race import Laps, race, stretches
+from scenarios.bench.bench_results import Contender, Growth, SolverBench
+from scenarios.bench.bench_tables import solver_tables
+from scenarios.bench.candidates import Entry, StepEntrant, entries, judge, reference_optima
+from scenarios.bench.queries import Asked, Queries, flight_between, recorded
 from scenarios.bench.stages import time_stages
+from scenarios.bench.timing import Laps, race, stretches
 from scenarios.build import build_problem
-from scenarios.queries import Asked, Queries, flight_between, recorded
-from scenarios.runner import Flight, Progress, fly_scenario, machine, silent, versions
-from scenarios.spec import LARGEST_HORIZON, ConstrainedSpec, Scenario
+from scenarios.machine import machine, versions
+from scenarios.progress import Progress, silent
+from scenarios.run import Flight, fly_scenario
+from scenarios.schema.controller import ConstrainedSpec
+from scenarios.schema.optimisation import LARGEST_HORIZON
+from scenarios.schema.scenario import Scenario
 
 RESULTS_FILE: Final = "bench.json"
 TABLES_FILE: Final = "solvers.md"
@@ -45,7 +50,7 @@ PATIENCE: Final = 60.0
 
 
 class _Racing(TypedDict):
-    """What every race of a bench has in common; see `scenarios.bench.race.race`."""
+    """What every race of a bench has in common; see `scenarios.bench.timing.race`."""
 
     between: Callable[[], None]
     repeats: int
@@ -129,7 +134,7 @@ def write_bench(bench: SolverBench, directory: Path) -> None:
     Raises:
         OutputError: it cannot be written.
     """
-    from quadsim.figures import write_solver_figure
+    from scenarios.bench.solver_figure import write_solver_figure
 
     outputs.write_json(directory / RESULTS_FILE, {"format": FORMAT, **bench.to_json()})
     outputs.write_text(directory / TABLES_FILE, bench_markdown(bench))

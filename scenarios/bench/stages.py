@@ -15,11 +15,11 @@ from mpc.problem import Problem
 from mpc.qp import Backend, Formulation, Vectors
 from mpc.solvers.piqp_dense import PiqpDense
 from mpc.solvers.piqp_sparse import PiqpMultistage
-from quadsim.bench import StageLength
 from quadsim.state import Array
-from scenarios.bench.race import race
-from scenarios.queries import Queries
-from scenarios.runner import Progress
+from scenarios.bench.bench_results import StageLength
+from scenarios.bench.queries import Queries
+from scenarios.bench.timing import race
+from scenarios.progress import Progress
 
 STEPS_TRIED: Final = (1, 2, 3, 4, 5, 6, 8, 10, 13, 17, 20, 25)
 
@@ -68,12 +68,12 @@ class _QPEntrant:
         backend.setup(formulation.qp)
 
     def prepare(self, period: int) -> None:
-        """See `scenarios.bench.race.Entrant.prepare`."""
+        """See `scenarios.bench.timing.Entrant.prepare`."""
         self._period = period
         self._vectors: Vectors = self.formulation.vectors(*self._query(period))
 
     def answer(self) -> None:
-        """See `scenarios.bench.race.Entrant.answer`."""
+        """See `scenarios.bench.timing.Entrant.answer`."""
         self.active[self._period] = self._backend.solve(self._vectors).active
 
 

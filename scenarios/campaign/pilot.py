@@ -5,14 +5,16 @@ from __future__ import annotations
 import contextlib
 import time as clock
 
-from quadsim.campaign.table import ERROR, MEMORY, Row, failed_row, flown_row
 from quadsim.errors import QuadsimError
-from scenarios.campaign.engine import said
+from scenarios.build.plugin import import_own
+from scenarios.campaign.engine.protocol import said
 from scenarios.campaign.plan import Plan
+from scenarios.campaign.results.table import ERROR, MEMORY, Row, failed_row, flown_row
 from scenarios.campaign.spec import LimitsSpec
-from scenarios.own import import_own
-from scenarios.runner import Flight, Progress, fly_scenario, processor_name, silent
-from scenarios.spec.own import OwnSpec
+from scenarios.machine import processor_name
+from scenarios.progress import Progress, silent
+from scenarios.run import Flight, fly_scenario
+from scenarios.schema.plugin import OwnSpec
 
 
 class CampaignPilot:

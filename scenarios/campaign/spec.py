@@ -9,11 +9,11 @@ from typing import Annotated, Any, Final, Literal
 from annotated_types import MaxLen, MinLen
 from pydantic import Field, model_validator
 
-from quadsim.campaign.events import parse_event
 from quadsim.errors import InputError
-from scenarios.spec.base import MOST_ENTRIES, Number, Positive, Spec
-from scenarios.spec.scenario import LARGEST_SEED
-from scenarios.writing import to_toml
+from scenarios.campaign.results.events import parse_event
+from scenarios.schema.base import MOST_ENTRIES, Number, Positive, Spec
+from scenarios.schema.scenario import LARGEST_SEED
+from scenarios.schema.writing import to_toml
 
 MOST_FLIGHTS: Final = 1_000_000
 

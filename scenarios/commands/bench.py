@@ -8,11 +8,12 @@ from typing import Any, Final
 
 from mpc.solvers import SOLVERS
 from quadsim.outputs import real_path, writing
-from quadsim.table import Grid
-from scenarios import console, runner
+from quadsim.report.table import Grid
 from scenarios.cli import EXIT_DONE
+from scenarios.commands import console
 from scenarios.commands.common import load
-from scenarios.spec import Scenario
+from scenarios.progress import Progress
+from scenarios.schema.scenario import Scenario
 
 
 def bench(options: Namespace) -> int:
@@ -31,8 +32,8 @@ _Benched = tuple[dict[str, Any], list[Grid], str | None]
 """What was measured, as plain values and as tables, and where it was written."""
 
 
-def _bench_solvers(scenario: Scenario, options: Namespace, progress: runner.Progress) -> _Benched:
-    from quadsim.bench import solver_tables
+def _bench_solvers(scenario: Scenario, options: Namespace, progress: Progress) -> _Benched:
+    from scenarios.bench.bench_tables import solver_tables
     from scenarios.bench.solvers import KIND, bench_solvers, write_bench
 
     target = real_path(options.out)
@@ -49,25 +50,25 @@ def _bench_solvers(scenario: Scenario, options: Namespace, progress: runner.Prog
     return measured.to_json(), solver_tables(measured), str(target)
 
 
-def _bench_flight(scenario: Scenario, options: Namespace, progress: runner.Progress) -> _Benched:
-    from quadsim.bench import flight_tables
+def _bench_flight(scenario: Scenario, options: Namespace, progress: Progress) -> _Benched:
+    from scenarios.bench.bench_tables import flight_tables
     from scenarios.bench.flight import bench_flight
 
     profile = bench_flight(scenario, repeats=options.repeats, progress=progress)
     return profile.to_json(), flight_tables(profile), None
 
 
-def _bench_render(scenario: Scenario, options: Namespace, progress: runner.Progress) -> _Benched:
-    from quadsim.bench import render_tables
-    from scenarios.bench.render import bench_render
+def _bench_render(scenario: Scenario, options: Namespace, progress: Progress) -> _Benched:
+    from scenarios.bench.bench_tables import render_tables
+    from scenarios.bench.film import bench_render
 
     profile = bench_render(scenario, seconds=options.seconds, workers=options.workers, progress=progress)
     return profile.to_json(), render_tables(profile), None
 
 
-def _bench_ladder(scenario: Scenario, options: Namespace, progress: runner.Progress) -> _Benched:
-    from quadsim.bench import ladder_tables
-    from scenarios.bench.ladder import KIND, climb, write_ladder
+def _bench_ladder(scenario: Scenario, options: Namespace, progress: Progress) -> _Benched:
+    from scenarios.bench.mismatch.benchmark import KIND, climb, write_ladder
+    from scenarios.bench.mismatch.survival import ladder_tables
 
     target = real_path(options.out)
     with writing(target, KIND) as directory:
@@ -82,9 +83,8 @@ def _bench_ladder(scenario: Scenario, options: Namespace, progress: runner.Progr
     return ladder.to_json(), ladder_tables(ladder), str(target)
 
 
-def _bench_campaign(scenario: Scenario, options: Namespace, progress: runner.Progress) -> _Benched:
-    from quadsim.bench import campaign_tables
-    from scenarios.bench.campaign import bench_campaign
+def _bench_campaign(scenario: Scenario, options: Namespace, progress: Progress) -> _Benched:
+    from scenarios.bench.campaigns import bench_campaign, campaign_tables
 
     profile = bench_campaign(
         scenario, flights=options.flights, rounds=options.rounds, sizes=options.sizes, progress=progress

@@ -5,21 +5,21 @@ from __future__ import annotations
 from argparse import Namespace
 from pathlib import Path
 
-from quadsim import rundir
 from quadsim.errors import ParameterError
+from quadsim.flight import rundir
 from quadsim.outputs import real_path, require_directory, require_file
-from scenarios import console, runner
 from scenarios.build import build_vehicle
 from scenarios.campaign.manifest import is_campaign
 from scenarios.cli import EXIT_DONE, EXIT_FAILED
+from scenarios.commands import console
 from scenarios.commands.campaigns import compare_campaigns
 from scenarios.commands.common import load, print_summary
-from scenarios.courses import report
-from scenarios.junit import write_junit
+from scenarios.commands.junit import write_junit
+from scenarios.courses.feasibility_check import report
 from scenarios.loading import load_scenario
 from scenarios.reaudit import reaudit
-from scenarios.runner import Outputs
-from scenarios.spec import Scenario
+from scenarios.run import Outputs, fly_scenario, run_scenario, summarise
+from scenarios.schema.scenario import Scenario
 
 
 def run(options: Namespace) -> int:
@@ -29,7 +29,7 @@ def run(options: Namespace) -> int:
     outputs = Outputs(video=options.video, recording=options.recording, figures=options.figures)
     _announce(scenario, options)
     with console.progress_bars(enabled=not options.json) as progress:
-        flight = runner.run(scenario, target, outputs, progress)
+        flight = run_scenario(scenario, target, outputs, progress)
     print_summary(rundir.read_summary(target), options, where=str(target))
     return EXIT_DONE if flight.satisfied else EXIT_FAILED
 
@@ -51,7 +51,7 @@ def check(options: Namespace) -> int:
         scenario = load(options.target, options)
         _announce(scenario, options)
         with console.progress_bars(enabled=not options.json) as progress:
-            summary = runner.summarise(runner.fly_scenario(scenario, progress))
+            summary = summarise(fly_scenario(scenario, progress))
     if options.junit is not None:
         write_junit(summary, Path(options.junit))
     print_summary(summary, options)
@@ -60,10 +60,11 @@ def check(options: Namespace) -> int:
 
 def compare(options: Namespace) -> int:
     """`quadsim compare`."""
-    from quadsim.comparison import comparison_rows, run_names
-    from quadsim.report import KIND, write_comparison
-    from quadsim.table import to_markdown
-    from scenarios.cost import find_study, study_cost
+    from quadsim.report.comparison import comparison_rows, run_names
+    from quadsim.report.pages.comparison_page import KIND, write_comparison
+    from quadsim.report.table import to_markdown
+    from scenarios.cost.measure import find_study, study_cost
+    from scenarios.cost.section import cost_section
 
     if any(is_campaign(Path(name)) for name in options.targets):
         return compare_campaigns(options)
@@ -83,7 +84,7 @@ def compare(options: Namespace) -> int:
         constrained, *others = studied
         with console.progress_bars(enabled=True) as progress:
             study = study_cost(constrained, others, progress=progress)
-    page = write_comparison(runs, target, study)
+    page = write_comparison(runs, target, None if study is None else cost_section(study))
     rows, names = comparison_rows(runs), run_names(runs)
     if options.markdown:
         print(to_markdown(rows, names))
@@ -102,5 +103,5 @@ def _fly_for_comparison(name: str, target: Path) -> Path:
     scenario = load_scenario(name)
     directory = target.parent / f"{target.name}-runs" / scenario.name
     with console.progress_bars(enabled=True) as progress:
-        runner.run(scenario, directory, Outputs(), progress)
+        run_scenario(scenario, directory, Outputs(), progress)
     return directory

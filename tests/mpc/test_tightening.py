@@ -36,8 +36,8 @@ from quadsim.errors import ParameterError
 from quadsim.state import INDEX, Array
 from quadsim.vehicle import Vehicle
 from scenarios.build import build_plant, build_reference
-from scenarios.flying import fly_once
 from scenarios.loading import load_scenario
+from scenarios.run import fly_once
 
 ROOT = Path(__file__).resolve().parents[2]
 TILTS = [INDEX["roll"], INDEX["pitch"]]

@@ -5,9 +5,9 @@ import dataclasses
 import numpy as np
 import pytest
 
-from quadsim.cost import MEASURES, Contender, CostStudy, Outcome, Sweep, SweepPoint, Variation
-from quadsim.flightlog import ControlLog, TimingLog
-from quadsim.rundir import Run
+from quadsim.flight.log import ControlLog, TimingLog
+from quadsim.flight.rundir import Run
+from scenarios.cost.study import MEASURES, Contender, CostStudy, Outcome, Sweep, SweepPoint, Variation
 
 
 @pytest.fixture(scope="session")
