@@ -21,10 +21,11 @@ from quadsim.sim.airframe import compile_model, rotor_thrusts
 from quadsim.sim.plant import Plant
 from quadsim.state import REFERENCE_STATES, Array, make_state
 from quadsim.vehicle import Vehicle
-from scenarios.build import build_problem, build_vehicle
+from scenarios.build import build_problem
 from scenarios.cost.measure import fly_variations
 from scenarios.cost.study import Variation
 from scenarios.loading import load_scenario
+from scenarios.parts.vehicle import build_vehicle
 from scenarios.run import Flight, fly_scenario, summarise
 
 ROOT = Path(__file__).resolve().parent.parent

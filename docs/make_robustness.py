@@ -20,8 +20,8 @@ from scenarios.bench.mismatch.conditions import WORN
 from scenarios.bench.mismatch.controllers import FULL
 from scenarios.bench.mismatch.survival import ARRIVED, Ladder, LadderFlight, ladder_legend, ladder_tables
 from scenarios.bench.solvers import section
-from scenarios.build import build_vehicle
 from scenarios.loading import load_scenario
+from scenarios.parts.vehicle import build_vehicle
 
 ROOT = Path(__file__).resolve().parent.parent
 FAULTS = 50

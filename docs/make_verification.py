@@ -23,8 +23,8 @@ from support import paper_problem
 from threadpoolctl import threadpool_limits
 
 from mpc.solvers import SOLVERS
-from scenarios.build import build_vehicle
 from scenarios.loading import load_scenario
+from scenarios.parts.vehicle import build_vehicle
 
 ROOT = Path(__file__).resolve().parent.parent
 INTRODUCTION = """\

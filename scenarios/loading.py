@@ -14,9 +14,9 @@ from quadsim.flight.ground import AIRBORNE, TOUCH, clearance
 from quadsim.sim.airframe import outline
 from quadsim.sim.effects.load import mass_properties
 from quadsim.vehicle import Vehicle
-from scenarios.build import build_initial_state, build_vehicle
-from scenarios.build.effects import build_effects, moving_air
 from scenarios.courses.make import build_course, located
+from scenarios.parts.effects import build_effects, moving_air
+from scenarios.parts.vehicle import build_initial_state, build_vehicle
 from scenarios.schema.bases import read_scenario, replaced_tables, retyped
 from scenarios.schema.course import CsvSpec
 from scenarios.schema.plugin import located as located_controller
@@ -147,7 +147,7 @@ def parse_scenario(data: Mapping[str, Any], *, source: str = "scenario", directo
     try:
         scenario = Scenario.model_validate(dict(data))
     except ValidationError as error:
-        problems = [describe(details, data) for details in error.errors(include_url=False)]
+        problems = [describe(details, data, Scenario) for details in error.errors(include_url=False)]
         raise ScenarioError(source, problems) from error
     file = scenario.vehicle.file
     if directory is not None and file.endswith(".toml") and (directory / file).is_file():

@@ -17,14 +17,13 @@ from typing import Any, Final
 import numpy as np
 
 from quadsim.controller import Phase
-from quadsim.errors import FileError, InputError
+from quadsim.errors import FileError, InputError, printable
 from quadsim.flight import rundir
 from quadsim.flight.audit import SIGNALS, Finding, audit
 from quadsim.flight.log import FlightLog
 from quadsim.flight.parquet import FLIGHT_FILE, HORIZON_FILE, PLANT_FILE, TIMING_FILE
-from quadsim.printable import printable
-from scenarios.build import build_limits
 from scenarios.loading import parse_scenario
+from scenarios.parts.limits import build_limits
 from scenarios.schema.bases import read_whole
 from scenarios.schema.plugin import LAWS, is_own
 from scenarios.schema.scenario import Scenario

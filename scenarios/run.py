@@ -26,24 +26,15 @@ from quadsim.sim.plant import Plant
 from quadsim.sim.sensing.sensor import SensorName
 from quadsim.state import Array
 from quadsim.vehicle import Vehicle
-from scenarios.build import (
-    build_controller,
-    build_course_steps,
-    build_ground,
-    build_initial_speeds,
-    build_initial_state,
-    build_limits,
-    build_loss,
-    build_plant,
-    build_reference,
-    build_vehicle,
-    resolve,
-)
-from scenarios.build.effects import build_computation
-from scenarios.build.navigation import build_navigation
-from scenarios.build.randomness import generator
+from scenarios.build import build_controller, build_ground, build_plant, resolve
 from scenarios.courses.feasibility_check import report
+from scenarios.courses.make import build_course_steps, build_reference
 from scenarios.machine import machine, usable_cores, versions
+from scenarios.parts.effects import build_computation
+from scenarios.parts.limits import build_limits, build_loss
+from scenarios.parts.navigation import build_navigation
+from scenarios.parts.randomness import generator
+from scenarios.parts.vehicle import build_initial_speeds, build_initial_state, build_vehicle
 from scenarios.progress import Progress, silent
 from scenarios.schema.scenario import Scenario, Verdict
 
@@ -66,7 +57,7 @@ def fly_once(
         plant: see `scenarios.build.build_plant`.
         controller: see `scenarios.build.build_controller`.
         reference: (K + N, 4); see `scenarios.courses.make.build_reference`.
-        navigation: see `scenarios.build.navigation.build_navigation`.
+        navigation: see `scenarios.parts.navigation.build_navigation`.
         progress: called with the number of periods flown, after each.
     """
     return fly(

@@ -11,7 +11,8 @@ from typing import Any
 
 import psutil
 
-from scenarios.campaign.results.table import ERROR, Row
+from scenarios.campaign.results.table import Row
+from scenarios.campaign.results.verdicts import ERROR
 from scenarios.campaign.spec import LimitsSpec
 from scenarios.progress import Progress, silent
 

@@ -25,9 +25,11 @@ from quadsim.vehicle import N_ROTORS, Vehicle
 from scenarios.bench.mismatch.benchmark import answer_all
 from scenarios.bench.mismatch.conditions import CONDITIONS
 from scenarios.bench.mismatch.controllers import FULL, equip
-from scenarios.build import build_controller, build_plant, build_problem, build_reference, build_vehicle
-from scenarios.build.navigation import build_navigation
+from scenarios.build import build_controller, build_plant, build_problem
+from scenarios.courses.make import build_reference
 from scenarios.loading import load_scenario
+from scenarios.parts.navigation import build_navigation
+from scenarios.parts.vehicle import build_vehicle
 from scenarios.run import fly_once
 from scenarios.schema.scenario import Scenario
 

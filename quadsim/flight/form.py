@@ -13,8 +13,7 @@ from pathlib import Path
 from types import NoneType
 from typing import Any, Final
 
-from quadsim.errors import FileError
-from quadsim.printable import printable
+from quadsim.errors import FileError, printable
 
 NUMBER: Final = float
 """Whole numbers too."""

@@ -8,11 +8,10 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, Final
 
-from quadsim.errors import FileError
+from quadsim.errors import FileError, printable
 from quadsim.flight.audit import SIGNALS
 from quadsim.flight.form import MAYBE_NUMBER, MAYBE_TEXT, NUMBER, Each, Optional, misfits, read_json
 from quadsim.outputs.paths import require_inside
-from quadsim.printable import printable
 from quadsim.state import REFERENCE_NAMES, STATE_NAMES
 
 SUMMARY_FILE: Final = "summary.json"

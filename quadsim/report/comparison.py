@@ -13,8 +13,8 @@ from typing import Any, Final
 import numpy as np
 
 from quadsim.controller import law_name
+from quadsim.errors import printable
 from quadsim.flight.rundir import Run
-from quadsim.printable import printable
 from quadsim.report.flight_conditions import (
     Summary,
     computation_rows,

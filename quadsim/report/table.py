@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Final
 
-from quadsim.printable import printable
+from quadsim.errors import printable
 
 ABSENT: Final = "-"
 

@@ -18,7 +18,6 @@ from quadsim.errors import ParameterError
 from quadsim.report.table import ABSENT, Grid
 from scenarios.bench.bench_results import Target
 from scenarios.bench.bench_tables import line, targets_table
-from scenarios.build import build_vehicle, resolve_vehicle
 from scenarios.campaign.engine.local import LocalEngine
 from scenarios.campaign.plan import Plan
 from scenarios.campaign.results.store import FLIGHTS_FILE, TIMES_FILE
@@ -27,6 +26,7 @@ from scenarios.campaign.run import Standing, fly_campaign
 from scenarios.campaign.spec import CampaignSpec
 from scenarios.loading import load_scenario
 from scenarios.machine import machine
+from scenarios.parts.vehicle import build_vehicle, resolve_vehicle
 from scenarios.progress import Progress, silent
 from scenarios.schema.scenario import Scenario
 

@@ -20,15 +20,12 @@ from quadsim.sim.plant import Plant
 from quadsim.state import Array
 from quadsim.vehicle import Vehicle
 from scenarios.bench.bench_results import FlightProfile
-from scenarios.build import (
-    build_controller,
-    build_limits,
-    build_plant,
-    build_reference,
-    build_vehicle,
-)
-from scenarios.build.navigation import build_navigation
+from scenarios.build import build_controller, build_plant
+from scenarios.courses.make import build_reference
 from scenarios.machine import machine
+from scenarios.parts.limits import build_limits
+from scenarios.parts.navigation import build_navigation
+from scenarios.parts.vehicle import build_vehicle
 from scenarios.progress import Progress, silent
 from scenarios.run import fly_once
 from scenarios.schema.scenario import Scenario

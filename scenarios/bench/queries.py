@@ -13,7 +13,8 @@ from quadsim.errors import FlightError
 from quadsim.flight.log import ControlLog
 from quadsim.state import Array, make_state
 from quadsim.vehicle import Vehicle
-from scenarios.build import build_plant, build_reference
+from scenarios.build import build_plant
+from scenarios.courses.make import build_reference
 from scenarios.schema.scenario import Scenario
 
 

@@ -8,9 +8,10 @@ from pathlib import Path
 from typing import Final
 
 from quadsim.assets import models_dir
-from scenarios.build import build_controller, build_vehicle
-from scenarios.build.foreign_code import digest
-from scenarios.build.plugin import OwnController
+from scenarios.parts.controllers import make_controller
+from scenarios.parts.foreign_code import digest
+from scenarios.parts.plugin import OwnController
+from scenarios.parts.vehicle import build_vehicle
 from scenarios.schema.scenario import Scenario
 
 _ROOT: Final = Path(__file__).resolve().parents[2]
@@ -29,7 +30,7 @@ def controller_digest(scenario: Scenario) -> str | None:
     Raises:
         InputError: the controller cannot be made.
     """
-    controller = build_controller(scenario, build_vehicle(scenario))
+    controller = make_controller(scenario.controller, build_vehicle(scenario), scenario.control_period)
     if not isinstance(controller, OwnController):
         return None
     package = controller.module.partition(".")[0]

@@ -10,12 +10,12 @@ from quadsim.errors import FileError, InputError
 from quadsim.flight.form import MAYBE_TEXT, Each, Optional, read_json
 from quadsim.outputs import Growing, digest, digest_of, to_json
 from quadsim.outputs.paths import require_inside
-from scenarios.build.foreign_code import announce_recorded, find_code
 from scenarios.campaign.digests import code_digest, controller_digest
 from scenarios.campaign.plan import Plan, load_plan
 from scenarios.campaign.results.store import FLIGHTS_FILE, TIMES_FILE
 from scenarios.campaign.spec import CampaignSpec
 from scenarios.machine import machine, versions
+from scenarios.parts.foreign_code import announce_recorded, find_code
 from scenarios.schema.plugin import OwnSpec
 
 MANIFEST_FILE: Final = "manifest.json"
@@ -131,7 +131,7 @@ def other_than_flew(manifest: Mapping[str, Any], plan: Plan) -> list[str]:
     """Of `code`, `controller`, `versions` and `machine`, those that are not as when a campaign was begun.
 
     Imports a controller that is not ours; what is to run, and what ran then, is told to
-    `scenarios.build.foreign_code.LOGGER` before.
+    `scenarios.parts.foreign_code.LOGGER` before.
     """
     if isinstance(plan.scenario.controller, OwnSpec):
         announce_recorded(plan.scenario.controller, manifest.get("controller_code", manifest.get("controller")))

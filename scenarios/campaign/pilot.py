@@ -6,12 +6,13 @@ import contextlib
 import time as clock
 
 from quadsim.errors import QuadsimError
-from scenarios.build.plugin import import_own
 from scenarios.campaign.engine.protocol import said
 from scenarios.campaign.plan import Plan
-from scenarios.campaign.results.table import ERROR, MEMORY, Row, failed_row, flown_row
+from scenarios.campaign.results.table import Row, failed_row, flown_row
+from scenarios.campaign.results.verdicts import ERROR, MEMORY
 from scenarios.campaign.spec import LimitsSpec
 from scenarios.machine import processor_name
+from scenarios.parts.plugin import import_own
 from scenarios.progress import Progress, silent
 from scenarios.run import Flight, fly_scenario
 from scenarios.schema.plugin import OwnSpec

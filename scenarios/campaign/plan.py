@@ -13,12 +13,14 @@ import pyarrow as pa
 from pydantic import ValidationError
 
 from quadsim.errors import FileError, InputError, ParameterError, UnknownNameError
-from scenarios.build import build_limits, build_vehicle, resolve_vehicle
+from scenarios.campaign.distributions import Value, VarySpec
 from scenarios.campaign.draws import Draws, extremes
 from scenarios.campaign.results.events import Event, parse_event
 from scenarios.campaign.results.table import DRAW, TIMING, Row, make_schema
-from scenarios.campaign.spec import CampaignSpec, Value, VarySpec
+from scenarios.campaign.spec import CampaignSpec
 from scenarios.loading import check_parts, parse_scenario, scenario_path
+from scenarios.parts.limits import build_limits
+from scenarios.parts.vehicle import build_vehicle, resolve_vehicle
 from scenarios.schema.bases import locate_files, merge, read_scenario
 from scenarios.schema.problems import ScenarioError, describe
 from scenarios.schema.scenario import Scenario

@@ -9,8 +9,7 @@ from typing import Any, Final
 from mpc.solvers import SOLVERS
 from quadsim.outputs import real_path, writing
 from quadsim.report.table import Grid
-from scenarios.cli import EXIT_DONE
-from scenarios.commands import console
+from scenarios.commands import EXIT_DONE, console
 from scenarios.commands.common import load
 from scenarios.progress import Progress
 from scenarios.schema.scenario import Scenario

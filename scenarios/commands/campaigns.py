@@ -1,4 +1,4 @@
-"""`quadsim campaign` and `replay`, and `compare` of two campaigns."""
+"""`quadsim campaign` and `replay`."""
 
 from __future__ import annotations
 
@@ -7,12 +7,10 @@ from argparse import Namespace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from quadsim.errors import InputError, ParameterError
+from quadsim.errors import ParameterError
 from quadsim.flight import rundir
-from quadsim.outputs import real_path, require_directory, require_file
-from scenarios.campaign.manifest import stored_plan
-from scenarios.cli import EXIT_DONE, EXIT_FAILED
-from scenarios.commands import console
+from quadsim.outputs import real_path, require_file
+from scenarios.commands import EXIT_DONE, EXIT_FAILED, console
 from scenarios.commands.common import print_summary
 from scenarios.commands.junit import write_cases
 from scenarios.run import Outputs
@@ -82,7 +80,7 @@ def replay(options: Namespace) -> int:
     """`quadsim replay`."""
     from scenarios.campaign.replay import recorded_flight
     from scenarios.campaign.replay import replay as fly_again
-    from scenarios.campaign.results.table import MEMORY, TIMEOUT
+    from scenarios.campaign.results.verdicts import MEMORY, TIMEOUT
     from scenarios.commands.campaign_console import print_replay
 
     directory = Path(options.campaign)
@@ -100,30 +98,3 @@ def replay(options: Namespace) -> int:
     if not options.json:
         print_replay(flight.number, flight.row, differing)
     return EXIT_FAILED if differing else EXIT_DONE
-
-
-def compare_campaigns(options: Namespace) -> int:
-    """`quadsim compare` of two campaigns, flight by flight."""
-    from scenarios.campaign.report.campaign_page import KIND, write_comparison_report
-    from scenarios.campaign.results.store import FLIGHTS_FILE, read_flights
-    from scenarios.campaign.statistics.comparison import compare
-    from scenarios.commands.campaign_console import print_comparison
-
-    if len(options.targets) != 2:
-        raise InputError(f"compare takes two campaigns, each by itself, not {len(options.targets)}")
-    if options.cost:
-        raise ParameterError("", "--cost", True, "absent when campaigns are compared")
-    target = real_path(options.out)
-    require_directory(target, KIND)
-    first, second = (Path(name) for name in options.targets)
-    plans = (stored_plan(first), stored_plan(second))
-    names = (plans[0].spec.name, plans[1].spec.name)
-    failures = (plans[0].spec.failure, plans[1].spec.failure)
-    a, b = (read_flights(path / FLIGHTS_FILE, plan.schema) for path, plan in zip((first, second), plans, strict=True))
-    comparison = compare(a, b, names, failures)
-    page = write_comparison_report(comparison, target)
-    if options.markdown:
-        print(comparison.to_markdown())
-    else:
-        print_comparison(comparison, str(page))
-    return EXIT_DONE

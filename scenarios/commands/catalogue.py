@@ -12,12 +12,12 @@ from mpc.solvers import SOLVERS
 from quadsim.assets import vehicle_names, vehicle_path
 from quadsim.errors import InputError, ParameterError
 from quadsim.vehicle import load_vehicle, vehicle_sources
-from scenarios.build import CONTROLLERS, build_vehicle, resolve
+from scenarios.build import CONTROLLERS, resolve
 from scenarios.campaign.plan import campaign_names, read_campaign
-from scenarios.cli import EXIT_DONE
-from scenarios.commands import console
+from scenarios.commands import EXIT_DONE, console
 from scenarios.commands.common import load
 from scenarios.loading import load_scenario, scenario_names
+from scenarios.parts.vehicle import build_vehicle
 from scenarios.schema.course import CsvSpec
 from scenarios.schema.scenario import Group, Scenario
 

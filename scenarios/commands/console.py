@@ -15,7 +15,7 @@ from rich.table import Table
 from rich.text import Text
 
 from quadsim.controller import law_name
-from quadsim.printable import printable
+from quadsim.errors import printable
 from quadsim.report.table import Cell, Grid, Mark, Row
 from scenarios.progress import Progress, silent
 

@@ -14,9 +14,11 @@ from quadsim.errors import QuadsimError
 from quadsim.report.film.video import rendering_backend
 from quadsim.report.recording import viewer_problem
 from quadsim.vehicle import N_ROTORS
-from scenarios.build import build_controller, build_initial_state, build_reference, build_vehicle
+from scenarios.build import build_controller
+from scenarios.courses.make import build_reference
 from scenarios.loading import load_scenario
 from scenarios.machine import machine, versions
+from scenarios.parts.vehicle import build_initial_state, build_vehicle
 
 
 def examine() -> dict[str, dict[str, str]]:

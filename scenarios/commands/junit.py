@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
 
+from quadsim.errors import printable
 from quadsim.outputs import writing_file
-from quadsim.printable import printable
 
 
 def write_junit(summary: Mapping[str, Any], path: Path) -> None:

@@ -5,13 +5,11 @@ from __future__ import annotations
 from argparse import Namespace
 from pathlib import Path
 
-from quadsim.errors import FileError, ParameterError
+from quadsim.errors import FileError, ParameterError, printable
 from quadsim.flight import rundir
 from quadsim.outputs import real_path
 from quadsim.outputs.paths import require_inside
-from quadsim.printable import printable
-from scenarios.cli import EXIT_DONE
-from scenarios.commands import console
+from scenarios.commands import EXIT_DONE, console
 from scenarios.reaudit import reaudit
 
 

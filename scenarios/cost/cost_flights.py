@@ -21,9 +21,11 @@ from quadsim.flight.log import ControlLog, FlightLog
 from quadsim.state import REFERENCE_STATES
 from scenarios.bench.queries import Asked, flight_between, recorded
 from scenarios.bench.timing import race, stretches
-from scenarios.build import build_controller, build_course_steps, build_problem, build_vehicle
+from scenarios.build import build_controller, build_problem
 from scenarios.cost.study import Contender, Outcome
+from scenarios.courses.make import build_course_steps
 from scenarios.machine import usable_cores
+from scenarios.parts.vehicle import build_vehicle
 from scenarios.progress import Progress
 from scenarios.run import fly_scenario
 from scenarios.schema.scenario import Scenario

@@ -12,7 +12,6 @@ from mpc.solvers import SOLVERS, make_backend
 from quadsim.errors import InputError
 from quadsim.flight import metrics
 from quadsim.flight.rundir import SCENARIO_FILE
-from scenarios.build import build_course_steps, build_reference
 from scenarios.cost.cost_flights import Flown, fly, fly_all, key, time_contenders, time_flights
 from scenarios.cost.study import Contender, CostStudy, Outcome, Sweep, SweepPoint, Variation
 from scenarios.cost.variants import (
@@ -24,6 +23,7 @@ from scenarios.cost.variants import (
     with_vehicles,
     without_constraints,
 )
+from scenarios.courses.make import build_course_steps, build_reference
 from scenarios.loading import load_scenario
 from scenarios.machine import machine
 from scenarios.progress import Progress, silent

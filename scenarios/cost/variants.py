@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any, Final
 
-from scenarios.build import build_vehicle
+from scenarios.parts.vehicle import build_vehicle
 from scenarios.schema.controller import ConstrainedSpec, UnconstrainedSpec
 from scenarios.schema.scenario import Scenario
 

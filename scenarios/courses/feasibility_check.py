@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -14,7 +15,9 @@ from quadsim.vehicle import Vehicle
 from scenarios.courses.make import build_course, filtered, initial_pose
 from scenarios.courses.smoothing import within_rounding
 from scenarios.schema.optimisation import ANGLES, BoundedSpec
-from scenarios.schema.scenario import Scenario
+
+if TYPE_CHECKING:
+    from scenarios.schema.scenario import Scenario
 
 
 def report(scenario: Scenario, vehicle: Vehicle) -> Feasibility:

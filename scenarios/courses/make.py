@@ -6,6 +6,7 @@ import math
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path as FilePath
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -33,7 +34,9 @@ from scenarios.schema.course import (
     WindowSpec,
     YawTurnsSpec,
 )
-from scenarios.schema.scenario import Scenario
+
+if TYPE_CHECKING:
+    from scenarios.schema.scenario import Scenario
 
 
 def build_course(scenario: Scenario) -> Course:

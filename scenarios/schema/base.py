@@ -10,7 +10,6 @@ from pydantic import BaseModel, ConfigDict, Field
 
 MOST_ENTRIES: Final = 1000
 """Of a list of tables."""
-
 Number = Annotated[float, Field(ge=-1e6, le=1e6)]
 NonNegative = Annotated[float, Field(ge=0.0, le=1e6)]
 Positive = Annotated[float, Field(gt=0.0, le=1e6)]
@@ -18,6 +17,8 @@ Fraction = Annotated[float, Field(ge=0.0, le=1.0)]
 Triple = Annotated[list[Number], Len(3, 3)]
 Quadruple = Annotated[list[Number], Len(4, 4)]
 Pair = Annotated[list[Number], Len(2, 2)]
+LARGEST_SEED: Final = 2**63 - 1
+"""The largest whole number that every reader of TOML takes."""
 
 
 class Spec(BaseModel):

@@ -11,7 +11,8 @@ from pydantic_core import PydanticCustomError
 from mpc.solvers import SOLVERS
 from quadsim.errors import UnknownNameError
 from scenarios.schema.baselines import GeometricSpec, LQRSpec, PIDSpec
-from scenarios.schema.optimisation import BoundedSpec, FallbackSpec, WeightedSpec
+from scenarios.schema.fallback import FallbackSpec
+from scenarios.schema.optimisation import BoundedSpec, WeightedSpec
 from scenarios.schema.plugin import FORM, LAWS, OwnSpec, is_own
 from scenarios.schema.robust import RobustSpec
 

@@ -16,7 +16,6 @@ from pydantic_core import ErrorDetails
 
 from quadsim.errors import InputError
 from quadsim.vehicle import MEANT
-from scenarios.schema.scenario import Scenario
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -167,9 +166,7 @@ class ScenarioError(InputError):
         self.source, self.problems = source, tuple(problems)
 
 
-def describe(
-    details: ErrorDetails, data: Mapping[str, Any], root: type[BaseModel] = Scenario, *, file: str = "scenario"
-) -> str:
+def describe(details: ErrorDetails, data: Mapping[str, Any], root: type[BaseModel], *, file: str = "scenario") -> str:
     """One line about one field: its name, what is allowed, what was given.
 
     Args:

@@ -9,7 +9,8 @@ from pydantic import Discriminator, Field, Tag, model_validator
 from mpc.observer import ObserverSettings
 from mpc.tightening import SHORTEST_LAG, TighteningSettings
 from scenarios.schema.base import NonNegative, Positive, Spec
-from scenarios.schema.optimisation import BoundedSpec, FallbackSpec, Weight
+from scenarios.schema.fallback import FallbackSpec
+from scenarios.schema.optimisation import BoundedSpec, Weight
 
 _OBSERVER: Final = ObserverSettings()
 _TIGHTENING: Final = TighteningSettings()

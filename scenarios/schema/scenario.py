@@ -11,7 +11,7 @@ from pydantic_core import PydanticCustomError
 from quadsim.errors import ParameterError, UnknownNameError
 from quadsim.flight.audit import SIGNALS
 from quadsim.sim.physics import steps_per_period
-from scenarios.schema.base import MOST_ENTRIES, NonNegative, Number, Positive, Quadruple, Spec, Triple
+from scenarios.schema.base import LARGEST_SEED, MOST_ENTRIES, NonNegative, Number, Positive, Quadruple, Spec, Triple
 from scenarios.schema.controller import ControllerSpec
 from scenarios.schema.course import ReferenceSpec
 from scenarios.schema.effects import ComputationSpec, EffectsSpec
@@ -143,8 +143,6 @@ class ConstraintSpec(Spec):
 
 
 LONGEST_FLIGHT: Final = 86_400.0
-LARGEST_SEED: Final = 2**63 - 1
-"""The largest whole number that every reader of TOML takes."""
 MOST_STEPS: Final = 10_000_000
 """Physics steps, and planned steps (periods times horizon), that one flight may take: each is held in memory."""
 

@@ -27,8 +27,10 @@ from quadsim.errors import ParameterError
 from quadsim.sim.effects.rotors import RotorDynamics
 from quadsim.state import INDEX, POSITION, Array, make_state
 from quadsim.vehicle import Vehicle
-from scenarios.build import build_plant, build_problem, build_reference, build_vehicle
+from scenarios.build import build_plant, build_problem
+from scenarios.courses.make import build_reference
 from scenarios.loading import load_scenario
+from scenarios.parts.vehicle import build_vehicle
 from scenarios.run import Flight, fly_once
 
 PERIOD = 0.05

@@ -35,7 +35,8 @@ from quadsim.controller import SOLVED, Moment
 from quadsim.errors import ParameterError
 from quadsim.state import INDEX, Array
 from quadsim.vehicle import Vehicle
-from scenarios.build import build_plant, build_reference
+from scenarios.build import build_plant
+from scenarios.courses.make import build_reference
 from scenarios.loading import load_scenario
 from scenarios.run import fly_once
 

@@ -14,15 +14,11 @@ from quadsim.flight.log import FlightLog
 from quadsim.flight.metrics import tracking
 from quadsim.sim.loop import fly
 from quadsim.sim.plant import Plant
-from scenarios.build import (
-    build_controller,
-    build_initial_state,
-    build_limits,
-    build_plant,
-    build_reference,
-    build_vehicle,
-)
+from scenarios.build import build_controller, build_plant
+from scenarios.courses.make import build_reference
 from scenarios.loading import load_scenario
+from scenarios.parts.limits import build_limits
+from scenarios.parts.vehicle import build_initial_state, build_vehicle
 from scenarios.schema.scenario import Scenario
 
 SCENARIO: Final = "paper-constrained"

@@ -19,8 +19,9 @@ from hypothesis import strategies as st
 from quadsim.errors import InputError
 from quadsim.flight.log import FlightLog
 from quadsim.flight.parquet import write_log
-from scenarios.build import build_vehicle, resolve
+from scenarios.build import resolve
 from scenarios.loading import check_parts, parse_scenario
+from scenarios.parts.vehicle import build_vehicle
 from scenarios.run import fly_scenario, summarise
 from scenarios.schema.scenario import Scenario
 

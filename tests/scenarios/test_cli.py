@@ -24,7 +24,8 @@ from quadsim.assets import vehicle_names
 from quadsim.errors import QuadsimError, RenderingUnavailableError
 from quadsim.flight import rundir
 from scenarios.campaign.plan import campaign_names
-from scenarios.cli import EXIT_DONE, EXIT_FAILED, EXIT_WRONG_INPUT, main
+from scenarios.cli import main
+from scenarios.commands import EXIT_DONE, EXIT_FAILED, EXIT_WRONG_INPUT
 from scenarios.loading import LIBRARY, load_scenario, scenario_names
 
 ROOT = Path(__file__).resolve().parents[2]

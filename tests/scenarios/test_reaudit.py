@@ -17,7 +17,8 @@ import pytest
 from quadsim.errors import FileError
 from quadsim.flight import rundir
 from quadsim.flight.parquet import FLIGHT_FILE, PLANT_FILE, TIMING_FILE
-from scenarios.cli import EXIT_DONE, EXIT_FAILED, EXIT_WRONG_INPUT, main
+from scenarios.cli import main
+from scenarios.commands import EXIT_DONE, EXIT_FAILED, EXIT_WRONG_INPUT
 from scenarios.reaudit import reaudit
 from tests.safety_mutations import unseal
 

@@ -21,9 +21,10 @@ from quadsim.flight import rundir
 from quadsim.flight.parquet import FLIGHT_FILE, HORIZON_FILE, PLANT_FILE, TIMING_FILE
 from quadsim.flight.rundir import Run
 from quadsim.sim import loop
-from scenarios.build import build_controller, build_vehicle
+from scenarios.build import build_controller
 from scenarios.loading import load_scenario, parse_scenario
 from scenarios.machine import PACKAGES
+from scenarios.parts.vehicle import build_vehicle
 from scenarios.run import Outputs, fly_scenario, run_scenario
 
 TABLES = Outputs(video=False, recording=False, figures=False)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any, Final
 
-from quadsim.printable import printable
+from quadsim.errors import printable
 
 PAGE_FILE: Final = "index.html"
 

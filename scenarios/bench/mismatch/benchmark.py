@@ -25,10 +25,12 @@ from scenarios.bench.mismatch.conditions import CONDITIONS, QUICK_CONDITIONS
 from scenarios.bench.mismatch.controllers import CLIMBERS, FULL, QUICK_CLIMBERS, equip, tilt_bound
 from scenarios.bench.mismatch.survival import Ladder, LadderFlight, ladder_legend, ladder_tables
 from scenarios.bench.solvers import section
-from scenarios.build import build_controller, build_plant, build_reference, build_vehicle
-from scenarios.build.navigation import build_navigation
+from scenarios.build import build_controller, build_plant
+from scenarios.courses.make import build_reference
 from scenarios.loading import load_scenario
 from scenarios.machine import machine, usable_cores
+from scenarios.parts.navigation import build_navigation
+from scenarios.parts.vehicle import build_vehicle
 from scenarios.progress import Progress, silent
 from scenarios.run import fly_once
 from scenarios.schema.scenario import Scenario

@@ -6,12 +6,15 @@ import gc
 import pickle
 import time as clock
 from collections.abc import Generator, Sequence
-from typing import Final, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Final, NamedTuple, Protocol
 
 from quadsim.errors import QuadsimError
-from scenarios.campaign.results.table import ERROR, MEMORY, Row
-from scenarios.campaign.spec import LimitsSpec
+from scenarios.campaign.results.table import Row
+from scenarios.campaign.results.verdicts import ERROR, MEMORY
 from scenarios.progress import Progress, silent
+
+if TYPE_CHECKING:
+    from scenarios.campaign.spec import LimitsSpec
 
 MOST_DEATHS: Final = 10
 """Processes that may die while they fly a flight before it is given up: more than die by chance in one flight."""

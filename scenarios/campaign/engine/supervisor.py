@@ -22,7 +22,7 @@ from threadpoolctl import threadpool_limits
 from scenarios.campaign.engine.processes import adopt_orphans, end_children, has_strays, memory_above
 from scenarios.campaign.engine.protocol import Answer, Pilot, said
 from scenarios.campaign.engine.worker import FLIGHT, PULSE_BYTES, SIZE, Told, fly_for
-from scenarios.campaign.results.table import MEMORY, TIMEOUT
+from scenarios.campaign.results.verdicts import MEMORY, TIMEOUT
 from scenarios.gc_settings import collect_rarely, settle
 
 LOOK_S: Final = 0.2

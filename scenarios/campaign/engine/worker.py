@@ -21,7 +21,7 @@ import numpy as np
 
 from scenarios.campaign.engine.processes import die_with, limit_memory
 from scenarios.campaign.engine.protocol import Answer, Pilot, fly_one
-from scenarios.campaign.results.table import MEMORY
+from scenarios.campaign.results.verdicts import MEMORY
 
 _PACKAGES: Final = ("quadsim", "mpc", "scenarios")
 _MODULES: Final = (

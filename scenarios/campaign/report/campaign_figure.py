@@ -13,8 +13,8 @@ from quadsim.report.figures.canvas import new_figure, write_drawings
 from quadsim.report.palette import BOUND, COURSE_COLOUR, LINES
 from scenarios.campaign.report.campaign_curves import Association, convergence_range, drivers, histograms, present
 from scenarios.campaign.report.campaign_text import verdict_sentence
+from scenarios.campaign.results.table import Summary
 from scenarios.campaign.results.verdicts import VERDICTS
-from scenarios.campaign.statistics.estimates import Summary
 from scenarios.campaign.statistics.scatters import (
     COURSE,
     Cloud,

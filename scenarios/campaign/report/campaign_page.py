@@ -30,8 +30,8 @@ from scenarios.campaign.report.campaign_tables import (
 from scenarios.campaign.report.campaign_text import campaign_sentences, verdict_sentence
 from scenarios.campaign.report.comparison_tables import comparison_markdown, comparison_tables, pairing
 from scenarios.campaign.report.margin_plots import comparison_margins_plot
+from scenarios.campaign.results.table import Summary
 from scenarios.campaign.statistics.comparison import Comparison
-from scenarios.campaign.statistics.estimates import Summary
 from scenarios.campaign.statistics.scatters import clipping, clouds, margins, thinning
 
 _FILES: Final = {

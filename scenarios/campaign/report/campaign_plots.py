@@ -22,8 +22,8 @@ from scenarios.campaign.report.campaign_curves import (
     histograms,
 )
 from scenarios.campaign.report.margin_plots import scatter_plot, verdict_keys
+from scenarios.campaign.results.table import Summary
 from scenarios.campaign.results.verdicts import VERDICTS
-from scenarios.campaign.statistics.estimates import Summary
 from scenarios.campaign.statistics.scatters import clouds, margins
 
 if TYPE_CHECKING:

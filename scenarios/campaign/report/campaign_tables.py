@@ -8,10 +8,15 @@ from typing import Any, Final
 
 from quadsim.report.table import ABSENT, Cell, Grid, Mark, format_number
 from scenarios.campaign.report.campaign_curves import Association, drivers, sure_splits
+from scenarios.campaign.results.table import Summary
 from scenarios.campaign.results.verdicts import HARMLESS
-from scenarios.campaign.statistics.estimates import Summary
 from scenarios.campaign.statistics.inference import ALPHA
 from scenarios.campaign.statistics.wording import interval, label, p_value, percent
+
+_GROUPS: Final = {
+    3: ("lowest third", "middle", "highest third"),
+    5: ("lowest fifth", "second", "third", "fourth", "highest fifth"),
+}
 
 
 def event_table(summary: Summary, failure: Sequence[str] = ()) -> Grid:
@@ -163,12 +168,6 @@ def _shares(found: Mapping[str, Any]) -> tuple[str, str]:
 
 def _line(*texts: str) -> tuple[Cell, ...]:
     return tuple(Cell(text=text) for text in texts)
-
-
-_GROUPS: Final = {
-    3: ("lowest third", "middle", "highest third"),
-    5: ("lowest fifth", "second", "third", "fourth", "highest fifth"),
-}
 
 
 def driver_table(summary: Summary) -> Grid:

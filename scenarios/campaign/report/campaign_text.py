@@ -7,8 +7,8 @@ from typing import Any, Final
 
 from quadsim.report.table import format_number
 from scenarios.campaign.report.campaign_curves import sure_splits
+from scenarios.campaign.results.table import Summary
 from scenarios.campaign.results.verdicts import VERDICTS
-from scenarios.campaign.statistics.estimates import Summary
 from scenarios.campaign.statistics.inference import ALPHA
 from scenarios.campaign.statistics.wording import count_of, listing, p_value, percent, share_with_interval
 

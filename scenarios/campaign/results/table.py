@@ -21,20 +21,14 @@ from quadsim.flight import metrics
 from quadsim.flight.audit import SIGNALS, Finding, Limit
 from quadsim.flight.log import FlightLog, TimingLog
 from quadsim.state import REFERENCE_NAMES, REFERENCE_UNITS
+from scenarios.campaign.results.verdicts import ERROR
 
 Row = dict[str, Any]
 """One flight's values by column: numbers, texts, or None."""
-
 DRAW: Final = "draw."
 """How the columns of drawn values begin."""
 MARGIN, TIME_VIOLATED, SATISFIED = "margin.", "time_violated.", "satisfied."
 """How the columns of a constraint begin, before its name."""
-ERROR: Final = "error"
-"""Status and verdict of a flight that raised, or whose process died."""
-TIMEOUT: Final = "timeout"
-"""Those of a flight that was ended since it, or a step of its controller, took too long."""
-MEMORY: Final = "memory"
-"""Those of a flight that asked for too much memory."""
 _MEASURES: Final = ("rmse", "max_error", "final_error", "overshoot")
 _HEAD: Final = (
     ("status", "-", pa.string()),
@@ -69,6 +63,7 @@ TIMING: Final = (
     ("step_p99_ms", "ms", pa.float64()),
 )
 """What a clock measured of a flight, and where; it stands in a table of its own."""
+Summary = Mapping[str, Any]
 
 
 def make_schema(draws: Mapping[str, tuple[pa.DataType, str]], limits: Sequence[Limit]) -> pa.Schema:

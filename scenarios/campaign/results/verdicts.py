@@ -6,7 +6,14 @@ from dataclasses import dataclass
 from typing import Final
 
 from quadsim.report.palette import BOUND, LINES, REFERENCE
-from scenarios.campaign.results.table import ERROR, MEMORY, TIMEOUT
+
+ERROR: Final = "error"
+"""Status and verdict of a flight that raised, or whose process died."""
+TIMEOUT: Final = "timeout"
+"""Those of a flight that was ended since it, or a step of its controller, took too long."""
+MEMORY: Final = "memory"
+"""Those of a flight that asked for too much memory."""
+HARMLESS: Final = "satisfied"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -69,6 +76,7 @@ VERDICTS: Final = {
     ),
 }
 """In the order in which they are drawn and counted."""
-HARMLESS: Final = "satisfied"
+
+
 OWN_EVENTS: Final = tuple(name for name in VERDICTS if name not in (HARMLESS, "violated"))
 """Verdicts that are events of their own name; `violation` is every verdict but `satisfied`."""

@@ -121,12 +121,6 @@ class Comparison:
             "metrics": {metric.name: asdict(metric) for metric in self.metrics},
         }
 
-    def to_markdown(self) -> str:
-        """The verdict and its tables."""
-        from scenarios.campaign.report.comparison_tables import comparison_markdown
-
-        return comparison_markdown(self)
-
 
 def compare(
     table_a: pa.Table,

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import asdict
 from typing import Any, Final
 
@@ -25,8 +24,6 @@ from scenarios.campaign.results.table import DRAW, MARGIN, SATISFIED, unit_of
 from scenarios.campaign.results.verdicts import VERDICTS
 from scenarios.campaign.statistics.drivers import parameters
 from scenarios.campaign.statistics.inference import CONFIDENCE, lower_bounds, proportion, upper_bounds
-
-Summary = Mapping[str, Any]
 
 WORST_FLIGHTS: Final = 10
 _CURVE_POINTS: Final = 80

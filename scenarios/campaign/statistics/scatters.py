@@ -18,6 +18,7 @@ from scenarios.campaign.results.columns import draw_names, is_number, numbers, t
 from scenarios.campaign.results.events import Flags
 from scenarios.campaign.results.table import DRAW, unit_of
 from scenarios.campaign.statistics.dependence import Trend, trend
+from scenarios.campaign.statistics.outliers import margin_ends, robust_ends
 from scenarios.campaign.statistics.wording import count_of, label
 
 Rows = np.ndarray[Any, np.dtype[np.intp]]
@@ -25,14 +26,8 @@ Edges = np.ndarray[Any, np.dtype[np.str_]]
 
 COURSE: Final = "half of the flights are above"
 """What a curve through the flights of a scatter tells."""
-LOWEST_MARGIN: Final = -2.0
-"""Margins below this are drawn at the foot, so that a lost flight does not flatten all others."""
-_LEAST_DEPTH: Final = 0.25
-"""Share of the height above 0 that is shown below it, however far from it the margins are."""
 _GAP: Final = 0.06
 """From the axis' end to what is drawn at the edge, as a share of the axis."""
-_FENCE: Final = 5.0
-"""Quartile ranges beyond the quartiles up to which values are drawn where they are."""
 _MOST_POINTS: Final = 18_000
 """Points that all scatters of a page may have together: a page of 10 000 flights stays near 6 MB and quick to draw."""
 
@@ -77,48 +72,6 @@ class Cloud:
     true: Array
     names: tuple[str, ...]
     course: Trend | None
-
-
-def robust_ends(values: Array) -> tuple[float, float]:
-    """The smallest and the largest of some values, without those far out.
-
-    Args:
-        values: some of them finite.
-    """
-    finite = values[np.isfinite(values)]
-    low, high = _fences(finite)
-    inside = finite[(finite >= low) & (finite <= high)]
-    return float(inside.min()), float(inside.max())
-
-
-def lowest_shown(values: Array) -> float:
-    """The lowest of such margins that may be shown where it is: `LOWEST_MARGIN`, but where most are lower still.
-
-    Args:
-        values: some of them finite.
-    """
-    finite = values[np.isfinite(values)]
-    return LOWEST_MARGIN if np.median(finite) > LOWEST_MARGIN else float(np.percentile(finite, 5))
-
-
-def margin_ends(values: Array) -> tuple[float, float]:
-    """The ends between which worst margins are drawn where they are; 0, the end of what is allowed, is among them.
-
-    Args:
-        values: some of them finite.
-    """
-    finite = values[np.isfinite(values)]
-    fence, above = _fences(finite)
-    high = max(0.0, float(finite[finite <= above].max()))
-    below = max(min(fence, -_LEAST_DEPTH * high), lowest_shown(finite))
-    return min(0.0, float(finite[finite >= below].min())), high
-
-
-def _fences(finite: Array) -> tuple[float, float]:
-    """Five quartile ranges beyond the quartiles."""
-    p5, q1, q3, p95 = np.percentile(finite, [5, 25, 75, 95])
-    reach = _FENCE * ((q3 - q1) or (p95 - p5)) or np.inf
-    return q1 - reach, q3 + reach
 
 
 def margins(table: pa.Table) -> Margins | None:

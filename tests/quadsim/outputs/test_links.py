@@ -11,7 +11,8 @@ from quadsim.errors import FileError
 from quadsim.flight import rundir
 from quadsim.outputs.paths import require_inside
 from quadsim.report.pages.comparison_page import write_comparison
-from scenarios.cli import EXIT_WRONG_INPUT, main
+from scenarios.cli import main
+from scenarios.commands import EXIT_WRONG_INPUT
 
 SECRET = "the user's own"
 

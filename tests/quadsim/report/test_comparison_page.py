@@ -14,6 +14,7 @@ from quadsim.errors import OutputError, ParameterError
 from quadsim.flight.rundir import Run
 from quadsim.report.pages.comparison_page import write_comparison
 from quadsim.report.plots.flight_plots import comparison_plots, thin
+from scenarios.cost.section import cost_section
 from scenarios.cost.study import CostStudy
 
 HOSTILE = "<script>alert(1)</script> & \"more\" 'quoted'"
@@ -84,7 +85,7 @@ def test_the_text_gives_outcomes_reasons_and_numbers(filmed_run: Run, aborted_ru
 
 def test_a_study_of_costs_has_a_section_and_files(short_run: Run, cost_study: CostStudy, tmp_path: Path) -> None:
     hostile = dataclasses.replace(cost_study, name=HOSTILE)
-    page = write_comparison([short_run], tmp_path / "out", hostile)
+    page = write_comparison([short_run], tmp_path / "out", cost_section(hostile))
     text = without_scripts(page.read_text())
     assert "What do constraints cost?" in text
     assert "&lt;script&gt;alert(1)" in text
@@ -220,7 +221,7 @@ def test_many_runs_keep_the_page_small(short_run: Run) -> None:
 def test_a_browser_draws_the_page_and_has_no_complaint(
     short_run: Run, aborted_run: Run, cost_study: CostStudy, tmp_path: Path
 ) -> None:
-    page = write_comparison([renamed(short_run, HOSTILE), aborted_run], tmp_path / "out", cost_study)
+    page = write_comparison([renamed(short_run, HOSTILE), aborted_run], tmp_path / "out", cost_section(cost_study))
     page.write_text(page.read_text().replace("</body>", f"{PROBE}</body>"))
     dom, console = open_page(page, tmp_path / "profile")
     assert console == []

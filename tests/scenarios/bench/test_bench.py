@@ -26,9 +26,11 @@ from scenarios.bench.queries import flight_between, recorded
 from scenarios.bench.solvers import bench_solvers
 from scenarios.bench.targets import solver_targets
 from scenarios.bench.timing import race, stretches
-from scenarios.build import build_problem, build_vehicle
-from scenarios.cli import EXIT_DONE, EXIT_WRONG_INPUT, main
+from scenarios.build import build_problem
+from scenarios.cli import main
+from scenarios.commands import EXIT_DONE, EXIT_WRONG_INPUT
 from scenarios.loading import load_scenario
+from scenarios.parts.vehicle import build_vehicle
 from scenarios.run import Flight
 
 SHORT = ("duration=3.0", "controller.horizon=10")

@@ -29,7 +29,8 @@ from scenarios.bench.mismatch.benchmark import (
 from scenarios.bench.mismatch.conditions import CONDITIONS
 from scenarios.bench.mismatch.controllers import CLIMBERS, FULL, equip, tilt_bound
 from scenarios.bench.mismatch.survival import Ladder, LadderFlight, ladder_legend, ladder_tables
-from scenarios.cli import EXIT_DONE, EXIT_WRONG_INPUT, main
+from scenarios.cli import main
+from scenarios.commands import EXIT_DONE, EXIT_WRONG_INPUT
 from scenarios.loading import load_scenario
 from scenarios.run import fly_scenario
 from scenarios.schema.robust import RobustSpec

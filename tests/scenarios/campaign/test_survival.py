@@ -34,9 +34,11 @@ from scenarios.campaign.engine.local import LocalEngine
 from scenarios.campaign.engine.protocol import MOST_DEATHS
 from scenarios.campaign.engine.worker import Traces
 from scenarios.campaign.plan import load_plan
-from scenarios.campaign.results.table import ERROR, Row
+from scenarios.campaign.results.table import Row
+from scenarios.campaign.results.verdicts import ERROR
 from scenarios.campaign.spec import LimitsSpec
-from scenarios.cli import EXIT_DONE, EXIT_FAILED, main
+from scenarios.cli import main
+from scenarios.commands import EXIT_DONE, EXIT_FAILED
 from scenarios.progress import Progress, silent
 from scenarios.schema.problems import ScenarioError
 

@@ -13,15 +13,14 @@ import pytest
 from rich.table import Table
 
 from quadsim.controller import Command, Moment
-from quadsim.errors import FileError, FlightError, OutputError
-from quadsim.printable import printable
+from quadsim.errors import FileError, FlightError, OutputError, printable
 from quadsim.report.table import Cell, Grid, Mark, Row, to_markdown
 from quadsim.state import Array
-from scenarios.build.plugin import OwnController
-from scenarios.cli import EXIT_DONE, EXIT_WRONG_INPUT, main
-from scenarios.commands import campaign_console, console
+from scenarios.cli import main
+from scenarios.commands import EXIT_DONE, EXIT_WRONG_INPUT, campaign_console, console
 from scenarios.commands.console import stdout, styled
 from scenarios.commands.junit import write_cases
+from scenarios.parts.plugin import OwnController
 from tests.safety_mutations import unseal
 
 TABLES = ("--no-video", "--no-recording", "--no-figures")

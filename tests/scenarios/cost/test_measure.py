@@ -15,12 +15,14 @@ from quadsim.errors import InputError, MissingPackageError
 from quadsim.flight import rundir
 from quadsim.flight.metrics import percentiles
 from scenarios.bench.queries import Asked, recorded
-from scenarios.build import build_controller, build_vehicle
-from scenarios.cli import EXIT_DONE, EXIT_WRONG_INPUT, main
+from scenarios.build import build_controller
+from scenarios.cli import main
+from scenarios.commands import EXIT_DONE, EXIT_WRONG_INPUT
 from scenarios.cost.measure import find_study, fly_variations, study_cost
 from scenarios.cost.study import CostStudy
 from scenarios.cost.variants import without_constraints
 from scenarios.loading import load_scenario
+from scenarios.parts.vehicle import build_vehicle
 from scenarios.run import Outputs, fly_scenario, run_scenario, summarise
 from scenarios.schema.scenario import Scenario
 

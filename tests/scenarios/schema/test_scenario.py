@@ -20,8 +20,10 @@ from quadsim.errors import FileError, InputError, ParameterError, UnknownNameErr
 from quadsim.flight.audit import SIGNALS
 from quadsim.state import STATE_NAMES
 from quadsim.vehicle import OPTIONAL_PARAMETERS, VEHICLE_UNITS
-from scenarios.build import build_limits, build_vehicle, resolve
+from scenarios.build import resolve
 from scenarios.loading import LIBRARY, load_scenario, parse_scenario, scenario_names, scenario_path
+from scenarios.parts.limits import build_limits
+from scenarios.parts.vehicle import build_vehicle
 from scenarios.schema.problems import ScenarioError
 from scenarios.schema.scenario import MOST_STEPS, Scenario
 from scenarios.schema.settings import apply_setting

@@ -9,8 +9,9 @@ import pytest
 from pydantic import BaseModel, Field
 from support import scenario_table
 
-from scenarios.build import build_vehicle, resolve
+from scenarios.build import resolve
 from scenarios.loading import load_scenario, parse_scenario, scenario_names
+from scenarios.parts.vehicle import build_vehicle
 from scenarios.schema.scenario import Scenario
 from scenarios.schema.writing import WIDTH, headline, tables_in, to_toml
 

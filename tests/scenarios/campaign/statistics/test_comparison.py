@@ -10,6 +10,7 @@ import pytest
 
 from quadsim.errors import InputError, OutputError
 from scenarios.campaign.report.campaign_page import write_comparison_report
+from scenarios.campaign.report.comparison_tables import comparison_markdown
 from scenarios.campaign.results.events import EVENT_NAMES
 from scenarios.campaign.statistics.comparison import compare
 from scenarios.campaign.statistics.inference import holm
@@ -56,7 +57,7 @@ def test_losses_are_compared_beside_failures(make_campaign: MakeCampaign) -> Non
     found = compare(changed(one, "verdict", many), changed(other, "verdict", ["violated"] * 40), NAMES)
     assert "not distinguishable by their failures" in found.sentence
     assert "differ beyond chance in lost (0 and 12, p < 0.001) (McNemar's exact test of each event" in found.sentence
-    assert "| lost | 12 (30.0 %) | 0 (0 %) | 12 | 0 | 0 | p < 0.001 | **p < 0.001** |" in found.to_markdown()
+    assert "| lost | 12 (30.0 %) | 0 (0 %) | 12 | 0 | 0 | p < 0.001 | **p < 0.001** |" in comparison_markdown(found)
 
 
 def test_every_event_and_constraint_is_compared_and_corrected(thousand: pa.Table, better: pa.Table) -> None:
@@ -95,7 +96,7 @@ def test_flights_of_one_campaign_alone_are_left_out(thousand: pa.Table, better: 
     found = compare(thousand, better.take(order), NAMES)
     assert (found.flights, found.left_out) == (600, 400)
     assert found.events == compare(thousand.slice(0, 600), better.slice(0, 600), NAMES).events
-    assert "400 flights that only one of them has are left out" in found.to_markdown()
+    assert "400 flights that only one of them has are left out" in comparison_markdown(found)
 
 
 def test_campaigns_of_one_name_are_told_apart(thousand: pa.Table, better: pa.Table) -> None:
@@ -137,7 +138,7 @@ def test_what_one_campaign_alone_draws_is_told(thousand: pa.Table, better: pa.Ta
     found = compare(thousand.drop_columns(["draw.lag"]), better, NAMES)
     assert found.own_draws == ("lag",)
     assert "lag" not in found.shared_draws
-    assert "one campaign alone draws lag" in found.to_markdown()
+    assert "one campaign alone draws lag" in comparison_markdown(found)
 
 
 def test_a_comparison_is_plain_data_and_a_table(thousand: pa.Table, better: pa.Table) -> None:
@@ -145,7 +146,7 @@ def test_a_comparison_is_plain_data_and_a_table(thousand: pa.Table, better: pa.T
     plain = found.to_json()
     assert json.loads(json.dumps(plain, allow_nan=False)) == plain
     assert plain["verdict"] == "better"
-    text = found.to_markdown()
+    text = comparison_markdown(found)
     assert text.startswith("# robust against paper\n\nrobust is better than paper")
     assert "| failure | 30 (3.0 %) |" in text
     assert "| worst_margin |" in text

@@ -1,4 +1,7 @@
-"""From `[controller]` to a law that flies: the MPCs and their fallback, the baselines, one's own."""
+"""From `[controller]` to a law that flies: the MPCs and their fallback, the baselines, one's own.
+
+Each law is imported where it is made, so that no command loads those it does not fly.
+"""
 
 from __future__ import annotations
 
@@ -9,24 +12,18 @@ from typing import Any, Final
 import numpy as np
 
 from mpc.actuators import ActuatorBounds
-from mpc.constrained import ConstrainedMPC
-from mpc.fallback import FallbackSettings, Guarded
+from mpc.fallback import FallbackSettings
 from mpc.model import hover_model
-from mpc.observer import ObserverSettings
 from mpc.problem import Bounds, Objective, Problem
-from mpc.robust import Linearisation, RobustMPC, RobustSettings
-from mpc.solvers import QPSolver
-from mpc.stagewise import Penalty
-from mpc.tightening import SHORTEST_LAG, TighteningSettings, margins
-from mpc.unconstrained import UnconstrainedMPC
+from mpc.tightening import SHORTEST_LAG
 from quadsim.controller import Controller
 from quadsim.errors import InputError, ParameterError
 from quadsim.state import INDEX, N_STATES, STATE_NAMES, Array
 from quadsim.vehicle import N_ROTORS, Vehicle
-from scenarios.build.plugin import build_own
+from scenarios.parts.plugin import build_own
 from scenarios.schema.baselines import GeometricSpec, LQRSpec, PIDSpec
 from scenarios.schema.controller import ConstrainedSpec, ControllerSpec, UnconstrainedSpec
-from scenarios.schema.optimisation import FallbackSpec
+from scenarios.schema.fallback import FallbackSpec
 from scenarios.schema.optimisation import ANGLES, BoundedSpec, InputWeightsSpec, WeightedSpec
 from scenarios.schema.plugin import OwnSpec
 from scenarios.schema.robust import RobustSpec
@@ -87,8 +84,7 @@ def make_controller(spec: ControllerSpec, vehicle: Vehicle, period: float) -> Co
         case UnconstrainedSpec():
             return _unconstrained(make_problem(spec, vehicle, period))
         case ConstrainedSpec():
-            problem = make_problem(spec, vehicle, period)
-            law = ConstrainedMPC(problem, QPSolver(spec.solver, problem), shortcut=spec.shortcut)
+            law = _constrained(spec, make_problem(spec, vehicle, period))
             return law if spec.fallback is None else guarded(law, spec, spec.fallback, vehicle, period)
         case RobustSpec():
             return guarded(_robust(spec, vehicle, period), spec, spec.fallback, vehicle, period)
@@ -100,6 +96,8 @@ def make_controller(spec: ControllerSpec, vehicle: Vehicle, period: float) -> Co
 
 def guarded(law: Controller, spec: BoundedSpec, fallback: FallbackSpec, vehicle: Vehicle, period: float) -> Controller:
     """The law within the fallback contract; the law itself where that is switched off."""
+    from mpc.fallback import Guarded
+
     if not fallback.enabled:
         return law
     return Guarded(
@@ -121,7 +119,16 @@ def guarded(law: Controller, spec: BoundedSpec, fallback: FallbackSpec, vehicle:
     )
 
 
-def _unconstrained(problem: Problem) -> UnconstrainedMPC:
+def _constrained(spec: ConstrainedSpec, problem: Problem) -> Controller:
+    from mpc.constrained import ConstrainedMPC
+    from mpc.solvers import QPSolver
+
+    return ConstrainedMPC(problem, QPSolver(spec.solver, problem), shortcut=spec.shortcut)
+
+
+def _unconstrained(problem: Problem) -> Controller:
+    from mpc.unconstrained import UnconstrainedMPC
+
     try:
         return UnconstrainedMPC(problem)
     except np.linalg.LinAlgError as error:
@@ -131,7 +138,12 @@ def _unconstrained(problem: Problem) -> UnconstrainedMPC:
         ) from error
 
 
-def _robust(spec: RobustSpec, vehicle: Vehicle, period: float) -> RobustMPC:
+def _robust(spec: RobustSpec, vehicle: Vehicle, period: float) -> Controller:
+    from mpc.observer import ObserverSettings
+    from mpc.robust import Linearisation, RobustMPC, RobustSettings
+    from mpc.stagewise import Penalty
+    from mpc.tightening import TighteningSettings, margins
+
     bounds, rotor_lag = make_bounds(spec), _rotor_lag(spec, vehicle)
     soft, offset_free, tightening = spec.soft, spec.offset_free, spec.tightening
     settings = RobustSettings(
@@ -171,7 +183,6 @@ def _robust(spec: RobustSpec, vehicle: Vehicle, period: float) -> RobustMPC:
 
 
 def _baseline(spec: LQRSpec | PIDSpec | GeometricSpec, vehicle: Vehicle, period: float) -> Controller:
-    # Late: these alone need scipy.optimize, which would delay the start of every command.
     from mpc.baselines.geometric import GeometricController, geometric_settings
     from mpc.baselines.lqr import LQR, LQRSettings, bryson_objective
     from mpc.baselines.pid import CascadedPID, pid_settings

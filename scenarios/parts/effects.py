@@ -4,24 +4,41 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
+from quadsim.errors import ParameterError
 from quadsim.sim.computation import Computation, Stall
 from quadsim.sim.effects import Disturbance, Effects, PayloadChange, RotorChange
+from quadsim.sim.effects.gust import Gust, Velocity
 from quadsim.sim.effects.load import Load, Payload
 from quadsim.sim.effects.rotors import RotorDynamics
-from quadsim.sim.effects.gust import Gust, Velocity
 from quadsim.sim.effects.turbulence import Dryden
 from quadsim.sim.effects.wind import WindChange, WindField
-from quadsim.errors import ParameterError
 from quadsim.vehicle import N_ROTORS, Vehicle
-from scenarios.build.randomness import generator
-from scenarios.schema.scenario import Scenario
+from scenarios.parts.randomness import generator
 from scenarios.schema.base import Spec
-from scenarios.schema.effects import ComputationSpec
-from scenarios.schema.effects import AirSpec, EffectsSpec, GroundSpec, LoadSpec, PayloadSpec, RotorsSpec
-from scenarios.schema.events import GustEvent, PayloadDropEvent, PayloadPickupEvent, RotorLossEvent, StallEvent, WindEvent
-from scenarios.schema.optimisation import FallbackSpec
+from scenarios.schema.effects import (
+    AirSpec,
+    ComputationSpec,
+    EffectsSpec,
+    GroundSpec,
+    LoadSpec,
+    PayloadSpec,
+    RotorsSpec,
+)
+from scenarios.schema.events import (
+    GustEvent,
+    PayloadDropEvent,
+    PayloadPickupEvent,
+    RotorLossEvent,
+    StallEvent,
+    WindEvent,
+)
+from scenarios.schema.fallback import FallbackSpec
+
+if TYPE_CHECKING:
+    from scenarios.schema.scenario import Scenario
+
 
 Table = TypeVar("Table", bound=Spec)
 

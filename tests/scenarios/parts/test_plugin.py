@@ -17,10 +17,11 @@ import pytest
 from quadsim.controller import Command, Moment
 from quadsim.errors import CommandError, InputError
 from quadsim.state import Array
-from scenarios.build import build_controller, build_vehicle
+from scenarios.build import build_controller
 from scenarios.cli import main
 from scenarios.loading import load_scenario
-from scenarios.build.plugin import OwnController
+from scenarios.parts.plugin import OwnController
+from scenarios.parts.vehicle import build_vehicle
 from scenarios.run import Outputs, fly_scenario, run_scenario
 
 HOVER = """

@@ -7,18 +7,20 @@ from typing import Any
 import numpy as np
 import pytest
 
-from quadsim.sim.computation import Computation, Stall
 from quadsim.controller import MISSED, Command, Controller, Moment
+from quadsim.errors import ParameterError
+from quadsim.sim.computation import Computation, Stall
 from quadsim.sim.effects import Disturbance, Effects, PayloadChange, RotorChange
 from quadsim.sim.effects.load import Load, Payload
 from quadsim.sim.effects.rotors import RotorDynamics
-from quadsim.errors import ParameterError
 from quadsim.state import Array
 from quadsim.vehicle import Vehicle
-from scenarios.build import build_controller, build_plant, build_reference, build_vehicle
-from scenarios.build.effects import build_computation, build_effects, build_wind, resolve_effects
-from scenarios.run import fly_once
+from scenarios.build import build_controller, build_plant
+from scenarios.courses.make import build_reference
 from scenarios.loading import load_scenario
+from scenarios.parts.effects import build_computation, build_effects, build_wind, resolve_effects
+from scenarios.parts.vehicle import build_vehicle
+from scenarios.run import fly_once
 from scenarios.schema.scenario import Scenario
 
 

@@ -14,11 +14,10 @@ from typing import Any
 import numpy as np
 
 from quadsim.controller import Command, Controller, Moment
-from quadsim.errors import CommandError, InputError, ParameterError
-from quadsim.printable import printable
+from quadsim.errors import CommandError, InputError, ParameterError, printable
 from quadsim.state import Array
 from quadsim.vehicle import N_ROTORS, Vehicle
-from scenarios.build.foreign_code import announce, folders_of, searched
+from scenarios.parts.foreign_code import announce, folders_of, searched
 from scenarios.schema.plugin import GIVEN, OwnSpec
 
 _WHOLE, _REAL = ("iterations", "active", "fallback"), ("slack", "primal_residual", "dual_residual", "solve_s")
@@ -149,7 +148,7 @@ def import_own(spec: OwnSpec) -> None:
 def build_own(spec: OwnSpec, vehicle: Vehicle, period: float) -> Controller:
     """Import a controller and call it.
 
-    What is to run is told to `scenarios.build.foreign_code.LOGGER` first.  Its module is looked for in the spec's folder, the
+    What is to run is told to `foreign_code.LOGGER` first.  Its module is looked for in the spec's folder, the
     working directory, then among what is installed; these two stand first on the path while it is imported and called,
     and no longer.
 

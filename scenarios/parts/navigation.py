@@ -4,16 +4,19 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 from quadsim.sim.estimation.settings import EstimatorSettings
 from quadsim.sim.navigation import Navigation
 from quadsim.sim.sensing.sensor import AXES, FaultKind, Outliers, Sensor, SensorFault, SensorName
 from quadsim.vehicle import Vehicle
-from scenarios.build.randomness import generator
+from scenarios.parts.randomness import generator
 from scenarios.schema.events import SensorFaultEvent
-from scenarios.schema.scenario import Scenario
 from scenarios.schema.sensors import AnySensorSpec, EstimatorSpec
+
+if TYPE_CHECKING:
+    from scenarios.schema.scenario import Scenario
+
 
 _UNITS: Final = {
     SensorName.POSITION: 1.0,

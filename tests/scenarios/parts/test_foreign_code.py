@@ -12,8 +12,9 @@ from pathlib import Path
 import pytest
 import tomlkit
 
-from scenarios.cli import EXIT_DONE, EXIT_WRONG_INPUT, main
-from scenarios.build.foreign_code import find_code
+from scenarios.cli import main
+from scenarios.commands import EXIT_DONE, EXIT_WRONG_INPUT
+from scenarios.parts.foreign_code import find_code
 from scenarios.schema.plugin import OwnSpec
 
 LAW = """

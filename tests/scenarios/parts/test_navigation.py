@@ -13,9 +13,9 @@ from support import scenario_table
 from quadsim.sim.sensing.sensor import FaultKind, SensorFault, SensorName
 from quadsim.vehicle import Vehicle
 from scenarios.loading import parse_scenario
-from scenarios.build.navigation import build_estimator, build_fault, build_navigation, build_sensors
-from scenarios.schema.problems import ScenarioError
+from scenarios.parts.navigation import build_estimator, build_fault, build_navigation, build_sensors
 from scenarios.run import fly_scenario
+from scenarios.schema.problems import ScenarioError
 from scenarios.schema.scenario import Scenario
 
 SENSORS: dict[str, Any] = {

@@ -27,25 +27,18 @@ from mpc.tightening import TighteningSettings, margins
 from mpc.unconstrained import UnconstrainedMPC
 from quadsim.controller import LAW_NAMES, SOLVED, Controller, Moment
 from quadsim.errors import ParameterError
-from scenarios.build import (
-    CONTROLLERS,
-    build_controller,
-    build_plant,
-    build_problem,
-    build_reference,
-    build_vehicle,
-    resolve,
-)
+from scenarios.build import CONTROLLERS, build_controller, build_plant, build_problem, resolve
 from scenarios.courses.feasibility_check import report
-from scenarios.run import fly_once
+from scenarios.courses.make import build_reference
 from scenarios.loading import load_scenario, parse_scenario
-from scenarios.schema.problems import ScenarioError
-from scenarios.run import fly_scenario
-from scenarios.schema.json_schema import scenario_schema
-from scenarios.schema.scenario import Scenario
+from scenarios.parts.vehicle import build_vehicle
+from scenarios.run import fly_once, fly_scenario
 from scenarios.schema.controller import _Table
-from scenarios.schema.optimisation import FallbackSpec
+from scenarios.schema.fallback import FallbackSpec
+from scenarios.schema.json_schema import scenario_schema
 from scenarios.schema.plugin import FORM, LAWS
+from scenarios.schema.problems import ScenarioError
+from scenarios.schema.scenario import Scenario
 
 ROBUST: dict[str, Any] = {
     "type": "robust",

@@ -1,0 +1,78 @@
+"""From a scenario file to the things that fly: vehicle, plant, reference, controller, limits."""
+
+from __future__ import annotations
+
+from typing import Final
+
+from mpc.problem import Problem
+from quadsim.controller import Controller
+from quadsim.errors import ParameterError
+from quadsim.sim.airframe import outline
+from quadsim.sim.phase import PhaseMonitor
+from quadsim.sim.plant import Plant
+from quadsim.vehicle import Vehicle
+from scenarios.parts.controllers import make_controller, make_problem
+from scenarios.parts.effects import build_effects, build_wind, resolve_effects
+from scenarios.parts.randomness import generator
+from scenarios.parts.vehicle import resolve_vehicle
+from scenarios.schema.optimisation import WeightedSpec
+from scenarios.schema.scenario import Scenario
+
+CONTROLLERS: Final = {
+    "unconstrained": "the paper's Sec. 4: a constant gain from the unconstrained optimum",
+    "constrained": "the paper's Sec. 5: a QP's optimum in every period, tilt, rotor speeds and their steps bounded",
+    "robust": "constrained, with soft bounds, rotor lag, delay, disturbances, heading and more, each switched on alone",
+    "lqr": "infinite-horizon LQR on the hover model, following the reference's velocity",
+    "pid": "cascaded PID, as autopilots fly it",
+    "geometric": "geometric tracking control on SE(3)",
+}
+
+
+def resolve(scenario: Scenario, vehicle: Vehicle) -> Scenario:
+    """The scenario with every number that it leaves to its vehicle written out: its file alone defines the flight."""
+    return resolve_vehicle(scenario, vehicle).model_copy(update={"effects": resolve_effects(scenario.effects, vehicle)})
+
+
+def build_plant(scenario: Scenario, vehicle: Vehicle, kind: type[Plant] = Plant) -> Plant:
+    """The simulated vehicle, and what acts on it.
+
+    Raises:
+        ParameterError: a combination of effects is not possible.
+    """
+    return kind(
+        vehicle,
+        timestep=scenario.plant.timestep,
+        limit_speeds=scenario.plant.limit_speeds,
+        effects=build_effects(scenario, vehicle),
+        wind=build_wind(scenario, vehicle),
+        rng=generator(scenario.seed, "disturbance"),
+    )
+
+
+def build_ground(scenario: Scenario, vehicle: Vehicle) -> PhaseMonitor | None:
+    """What knows where the flight stands with the ground; None where there is none."""
+    ground = scenario.effects.ground
+    if ground is None or not ground.contact:
+        return None
+    return PhaseMonitor(outline(vehicle), period=scenario.control_period)
+
+
+def build_problem(scenario: Scenario, vehicle: Vehicle) -> Problem:
+    """The controller's optimisation.
+
+    Raises:
+        InputError: the controller has none.
+    """
+    spec = scenario.controller
+    if not isinstance(spec, WeightedSpec):
+        raise ParameterError("controller", "type", spec.type, "one that minimises over a horizon")
+    return make_problem(spec, vehicle, scenario.control_period)
+
+
+def build_controller(scenario: Scenario, vehicle: Vehicle) -> Controller:
+    """The controller, set up and ready to be flown.
+
+    Raises:
+        InputError: it cannot be made from these numbers, or its code cannot be found or called.
+    """
+    return make_controller(scenario.controller, vehicle, scenario.control_period)
