@@ -25,7 +25,7 @@ from quadsim.flight.parquet import FLIGHT_FILE, HORIZON_FILE, PLANT_FILE, TIMING
 from scenarios.loading import parse_scenario
 from scenarios.parts.limits import build_limits
 from scenarios.schema.bases import read_whole
-from scenarios.schema.plugin import LAWS, is_own
+from scenarios.schema.plugin import LAWS, is_plugin
 from scenarios.schema.scenario import Scenario
 
 TABLES: Final = (FLIGHT_FILE, PLANT_FILE, TIMING_FILE)
@@ -116,7 +116,7 @@ def stored_scenario(directory: Path) -> Scenario:
     controller = data.get("controller")
     controller = controller if isinstance(controller, dict) else {}
     name = controller.get("type")
-    if isinstance(name, str) and name not in LAWS and not is_own(name):
+    if isinstance(name, str) and name not in LAWS and not is_plugin(name):
         data["controller"] = {**controller, "type": "elsewhere:Controller"}
     return parse_scenario(data, source=str(path))
 

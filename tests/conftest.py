@@ -12,7 +12,7 @@ from hypothesis import settings
 from quadsim.flight import rundir
 from quadsim.flight.rundir import Run
 from quadsim.vehicle import Vehicle
-from scenarios.cost.study import MEASURES, Contender, CostStudy, Outcome, Sweep, SweepPoint, Variation
+from scenarios.cost.study import MEASURES, CandidateTimes, CostStudy, Outcome, Sweep, SweepPoint, Variation
 from scenarios.loading import load_scenario
 from scenarios.parts.vehicle import build_vehicle
 from scenarios.run import Flight, Outputs, fly_scenario, run_scenario
@@ -87,9 +87,9 @@ def cost_study() -> CostStudy:
         others={"free": make_outcome(3.0)},
         reference=[{"settled": 5.0}, {"settled": None}],
         contenders=(
-            Contender(name="gain", step_ms=0.01 * step_ms, statuses=("solved",) * 10, repeats=3),
-            Contender(name="as flown", step_ms=step_ms, statuses=shortcut, repeats=3),
-            Contender(name="QP by slow", step_ms=8.0 * step_ms, statuses=("solved",) * 10, repeats=1),
+            CandidateTimes(name="gain", step_ms=0.01 * step_ms, statuses=("solved",) * 10, repeats=3),
+            CandidateTimes(name="as flown", step_ms=step_ms, statuses=shortcut, repeats=3),
+            CandidateTimes(name="QP by slow", step_ms=8.0 * step_ms, statuses=("solved",) * 10, repeats=1),
         ),
         left_out={"absent": "pip install it"},
         tilt=Sweep(

@@ -34,7 +34,7 @@ class Target:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Contender:
+class CandidateResult:
     """A controller that was asked what the flight's controller was asked.
 
     Attributes:
@@ -154,7 +154,7 @@ class SolverBench:
     deadline_ms: float
     asked: int
     flown: int
-    contenders: tuple[Contender, ...]
+    contenders: tuple[CandidateResult, ...]
     gain_ms: Array | None
     left_out: Mapping[str, str]
     growth: tuple[Growth, ...]
@@ -165,7 +165,7 @@ class SolverBench:
     machine: Mapping[str, Any]
 
     @property
-    def default(self) -> Contender:
+    def default(self) -> CandidateResult:
         """The controller as scenarios fly it."""
         return self.contenders[0]
 
@@ -177,12 +177,12 @@ class SolverBench:
             "gain_ms": None if self.gain_ms is None else metrics.percentiles(self.gain_ms),
             "contenders": [
                 {
-                    **{name: value for name, value in asdict(contender).items() if name != "answered"},
-                    "step_ms": contender.quantiles,
-                    "step_ms_by_period": np.round(contender.step_ms, 5).tolist(),
-                    "p99_to_default": contender.quantiles["p99"] / self.default.quantiles["p99"],
+                    **{name: value for name, value in asdict(candidate).items() if name != "answered"},
+                    "step_ms": candidate.quantiles,
+                    "step_ms_by_period": np.round(candidate.step_ms, 5).tolist(),
+                    "p99_to_default": candidate.quantiles["p99"] / self.default.quantiles["p99"],
                 }
-                for contender in self.contenders
+                for candidate in self.contenders
             ],
             "growth": [
                 {**asdict(growth), "exponents": {name: growth.exponent(name) for name in ("p50", "p99")}}

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Sequence
 from quadsim.report.table import ABSENT, Cell, Grid, Mark
 from scenarios.bench.bench_results import (
     FITTED_FROM,
-    Contender,
+    CandidateResult,
     FlightProfile,
     Growth,
     RenderProfile,
@@ -81,33 +81,33 @@ def _contenders(bench: SolverBench) -> Grid:
         "timed",
     )
     fastest = {
-        quantile: min(contender.quantiles[quantile] for contender in bench.contenders)
+        quantile: min(candidate.quantiles[quantile] for candidate in bench.contenders)
         for quantile in ("p50", "p95", "p99", "max")
     }
     return Grid(
         key="contenders",
         title="The contenders",
         head=head,
-        lines=tuple(_contender(contender, bench, fastest) for contender in bench.contenders),
+        lines=tuple(_contender(candidate, bench, fastest) for candidate in bench.contenders),
         note=_how(bench),
     )
 
 
-def _contender(contender: Contender, bench: SolverBench, fastest: dict[str, float]) -> tuple[Cell, ...]:
-    quantiles = contender.quantiles
-    label = f"{contender.name} (default)" if contender is bench.default else contender.name
+def _contender(candidate: CandidateResult, bench: SolverBench, fastest: dict[str, float]) -> tuple[Cell, ...]:
+    quantiles = candidate.quantiles
+    label = f"{candidate.name} (default)" if candidate is bench.default else candidate.name
     return (
         Cell(text=label),
         *(
             Cell(text=_milliseconds(value), mark=Mark.BEST if value == fastest[name] else Mark.NONE)
             for name, value in quantiles.items()
         ),
-        Cell(text=_milliseconds(contender.raw_max_ms)),
+        Cell(text=_milliseconds(candidate.raw_max_ms)),
         Cell(text=f"{quantiles['p99'] / bench.default.quantiles['p99']:.3g}"),
-        Cell(text=str(contender.failures), mark=Mark.BAD if contender.failures else Mark.NONE),
-        Cell(text=_residual(contender.input_error)),
-        Cell(text=_residual(contender.kkt)),
-        Cell(text=f"{contender.repeats}x"),
+        Cell(text=str(candidate.failures), mark=Mark.BAD if candidate.failures else Mark.NONE),
+        Cell(text=_residual(candidate.input_error)),
+        Cell(text=_residual(candidate.kkt)),
+        Cell(text=f"{candidate.repeats}x"),
     )
 
 
@@ -127,10 +127,10 @@ def _how(bench: SolverBench) -> str:
     return " ".join([said, *(f"Left out: {name}, {why}." for name, why in bench.left_out.items())])
 
 
-def _shares(contender: Contender) -> str:
+def _shares(candidate: CandidateResult) -> str:
     """Which of its periods a contender with shortcuts answered how."""
-    told = ", ".join(f"by {way} {count}" for way, count in sorted(contender.ways.items(), key=lambda pair: -pair[1]))
-    return f"Periods that the default answered {told}. " if contender.shortcut else ""
+    told = ", ".join(f"by {way} {count}" for way, count in sorted(candidate.ways.items(), key=lambda pair: -pair[1]))
+    return f"Periods that the default answered {told}. " if candidate.shortcut else ""
 
 
 def _growth(bench: SolverBench) -> Grid:

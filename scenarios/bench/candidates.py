@@ -18,7 +18,7 @@ from mpc.shortcut import with_shortcut
 from mpc.solvers import SOLVERS, Answer, QPSolver, Solver, make_backend
 from quadsim.controller import ACCEPTED, Command
 from quadsim.state import Array
-from scenarios.bench.queries import Asked, Queries
+from scenarios.bench.queries import QueriedController, Queries
 
 WITH_SHORTCUT: Final = ("daqp",)
 """Solvers that are shown both with and without shortcuts, besides the default."""
@@ -70,7 +70,7 @@ class _Witnessed:
         return self.last
 
 
-class StepEntrant:
+class StepCandidate:
     """A constrained controller that is asked a flight's queries, and whose solver's answers are kept."""
 
     def __init__(self, entry: Entry, problem: Problem, queries: Queries) -> None:
@@ -78,19 +78,19 @@ class StepEntrant:
         whole = QPSolver(entry.solver, problem)
         self._solver = _Witnessed(with_shortcut(problem, whole) if entry.shortcut else whole)
         self.formulation = self._solver.formulation
-        self._asked = Asked(ConstrainedMPC(problem, self._solver, shortcut=False), queries)
+        self._asked = QueriedController(ConstrainedMPC(problem, self._solver, shortcut=False), queries)
         self.answers: dict[int, tuple[Command | None, Answer]] = {}
         """What was answered in the first pass, by period: the command, if any, and the solver's answer."""
         self._period: int | None = None
 
     def prepare(self, period: int) -> None:
-        """See `scenarios.bench.timing.Entrant.prepare`; keeps what was answered last."""
+        """See `scenarios.bench.timing.Candidate.prepare`; keeps what was answered last."""
         self.keep()
         self._period, self._solver.last = period, None
         self._asked.prepare(period)
 
     def answer(self) -> None:
-        """See `scenarios.bench.timing.Entrant.answer`."""
+        """See `scenarios.bench.timing.Candidate.answer`."""
         self._asked.answer()
 
     def keep(self) -> None:
@@ -144,7 +144,7 @@ def reference_optima(problem: Problem, queries: Queries, periods: Sequence[int])
 
 @dataclass(frozen=True, kw_only=True)
 class Verdict:
-    """What an entrant's answers were worth; see `scenarios.bench.bench_results.Contender`."""
+    """What an entrant's answers were worth; see `scenarios.bench.bench_results.CandidateResult`."""
 
     statuses: dict[str, int]
     ways: dict[str, int]
@@ -153,14 +153,14 @@ class Verdict:
     kkt: float | None
 
 
-def judge(entrant: StepEntrant, queries: Queries, periods: Sequence[int], reference: Reference) -> Verdict:
+def judge(candidate: StepCandidate, queries: Queries, periods: Sequence[int], reference: Reference) -> Verdict:
     """Hold the answers of an entrant's first pass against the optimum, and against the KKT conditions of its own QP."""
-    entrant.keep()
-    problem, form = entrant.problem, entrant.formulation
+    candidate.keep()
+    problem, form = candidate.problem, candidate.formulation
     statuses: Counter[str] = Counter()
     errors, residuals = [], []
     for period in periods:
-        command, answer = entrant.answers[period]
+        command, answer = candidate.answers[period]
         if command is None or command.status not in ACCEPTED:
             statuses[_failure(answer)] += 1
             continue
@@ -170,7 +170,7 @@ def judge(entrant: StepEntrant, queries: Queries, periods: Sequence[int], refere
         residuals.append(kkt_residuals(qp, answer.solution).worst)
     return Verdict(
         statuses=dict(sorted(statuses.items())),
-        ways=dict(Counter(map(str, entrant.ways(periods)))),
+        ways=dict(Counter(map(str, candidate.ways(periods)))),
         failures=len(periods) - len(errors),
         input_error=float(np.max(errors)) if errors else None,
         kkt=float(np.max(residuals)) if residuals else None,

@@ -45,7 +45,7 @@ def recorded(scenario: Scenario, log: ControlLog, horizon: int) -> Queries:
     )
 
 
-class Asked:
+class QueriedController:
     """A controller that is asked a flight's queries, each after the command that was given before it in that flight.
 
     Attributes:
@@ -59,7 +59,7 @@ class Asked:
         self.statuses: dict[int, str] = {}
 
     def prepare(self, period: int) -> None:
-        """See `scenarios.bench.timing.Entrant.prepare`."""
+        """See `scenarios.bench.timing.Candidate.prepare`."""
         queries = self._queries
         self._controller.reset(queries.speeds_before[period])
         reference = queries.reference[period + 1 : period + 1 + self._controller.horizon]
@@ -67,7 +67,7 @@ class Asked:
         self._period, self.command = period, None
 
     def answer(self) -> None:
-        """See `scenarios.bench.timing.Entrant.answer`."""
+        """See `scenarios.bench.timing.Candidate.answer`."""
         try:
             self.command = self._controller.step(*self._query)
         except FlightError:  # there is no earlier plan to hold: the solver failed

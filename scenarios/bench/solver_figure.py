@@ -9,7 +9,7 @@ import numpy as np
 
 from quadsim.report.figures.canvas import new_figure, write_drawings
 from quadsim.report.palette import BOUND, LINES
-from scenarios.bench.bench_results import Contender, SolverBench
+from scenarios.bench.bench_results import CandidateResult, SolverBench
 from scenarios.bench.targets import PAPER_SOLVER
 
 if TYPE_CHECKING:
@@ -49,14 +49,14 @@ def _draw(bench: SolverBench) -> Figure:
 
 def _draw_times(axes: Axes, bench: SolverBench) -> None:
     """A row per contender, the quickest at the top: all its steps, with p50, p99 and the longest marked."""
-    ranked = sorted(bench.contenders, key=lambda contender: contender.quantiles["p99"], reverse=True)
+    ranked = sorted(bench.contenders, key=lambda candidate: candidate.quantiles["p99"], reverse=True)
     rng = np.random.default_rng(0)  # spreads the dots of a row, as every time
-    for row, contender in enumerate(ranked):
-        colour = _look(bench, contender.name)[0]
-        times = np.maximum(contender.step_ms, 1e-4)  # a clock may read 0, which has no place on a logarithmic axis
+    for row, candidate in enumerate(ranked):
+        colour = _look(bench, candidate.name)[0]
+        times = np.maximum(candidate.step_ms, 1e-4)  # a clock may read 0, which has no place on a logarithmic axis
         spread = row + rng.uniform(-0.28, 0.28, times.size)
         axes.plot(times, spread, ".", color=colour, markersize=2.0, alpha=0.35, rasterized=True)
-        quantiles = contender.quantiles
+        quantiles = candidate.quantiles
         for name, marker in (("p50", "|"), ("p99", "D"), ("max", ">")):
             axes.plot(
                 quantiles[name],
@@ -71,7 +71,7 @@ def _draw_times(axes: Axes, bench: SolverBench) -> None:
     axes.axvline(bench.deadline_ms, color=BOUND, linestyle="--", linewidth=1.1)
     axes.set_xscale("log")
     axes.xaxis.set_major_formatter("{x:g}")
-    axes.set_yticks(range(len(ranked)), [_label(bench, contender) for contender in ranked])
+    axes.set_yticks(range(len(ranked)), [_label(bench, candidate) for candidate in ranked])
     axes.grid(axis="y", visible=False)
     axes.set_ylim(-0.6, len(ranked) - 0.4)
     axes.set_xlabel(f"time [ms], N = {bench.horizon}; dashed: the control period")
@@ -107,14 +107,14 @@ def _draw_growth(axes: Axes, bench: SolverBench) -> None:
     axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize=8.0)
 
 
-def _label(bench: SolverBench, contender: Contender) -> str:
-    if contender is bench.default:
-        return f"{contender.name}\n(default)"
-    return f"{contender.name}\n(the paper's)" if contender.solver == PAPER_SOLVER else contender.name
+def _label(bench: SolverBench, candidate: CandidateResult) -> str:
+    if candidate is bench.default:
+        return f"{candidate.name}\n(default)"
+    return f"{candidate.name}\n(the paper's)" if candidate.solver == PAPER_SOLVER else candidate.name
 
 
 def _look(bench: SolverBench, name: str) -> tuple[str, str]:
     """Colour and line of a contender."""
-    names = [contender.name for contender in bench.contenders]
+    names = [candidate.name for candidate in bench.contenders]
     i = names.index(name)
     return LINES[i % len(LINES)], _DASHES[i // len(LINES) % len(_DASHES)]

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Final
 
-from scenarios.bench.bench_results import Contender, FlightProfile, RenderProfile, SolverBench, Target
+from scenarios.bench.bench_results import CandidateResult, FlightProfile, RenderProfile, SolverBench, Target
 
 PAPER_SOLVER: Final = "qpoases"
 """The solver of the paper."""
@@ -15,7 +15,7 @@ def solver_targets(bench: SolverBench) -> list[Target]:
     """Speed and exactness of the default controller, against the other solvers and the horizon."""
     default = bench.default
     own = default.quantiles
-    others = [contender for contender in bench.contenders if contender.solver != default.solver]
+    others = [candidate for candidate in bench.contenders if candidate.solver != default.solver]
     targets = [
         Target(what="default, p50", asked="<= 0.05 ms", measured=f"{own['p50']:.3f} ms", met=own["p50"] <= 0.05),
         Target(what="default, p99", asked="<= 1.6 ms", measured=f"{own['p99']:.2f} ms", met=own["p99"] <= 1.6),
@@ -32,13 +32,13 @@ def solver_targets(bench: SolverBench) -> list[Target]:
             met=default.failures == 0,
         ),
     ]
-    alone = [contender for contender in others if not contender.shortcut]
-    quick = [contender for contender in others if contender.shortcut]
+    alone = [candidate for candidate in others if not candidate.shortcut]
+    quick = [candidate for candidate in others if candidate.shortcut]
     for whose, rivals in (("every other solver's", alone), ("every other's with the same shortcuts", quick)):
         targets += [_below_others(default, rivals, quantile, whose) for quantile in ("p99", "max") if rivals]
-    for contender in others:
-        if contender.solver == PAPER_SOLVER:
-            ratio = contender.quantiles["p99"] / own["p99"]
+    for candidate in others:
+        if candidate.solver == PAPER_SOLVER:
+            ratio = candidate.quantiles["p99"] / own["p99"]
             what = "p99 of qpOASES, the paper's solver, to the default's"
             targets.append(Target(what=what, asked=">= 15", measured=f"{ratio:.0f}", met=ratio >= 15.0))
     for growth in bench.growth:
@@ -83,8 +83,8 @@ def render_targets(profile: RenderProfile) -> list[Target]:
     ]
 
 
-def _below_others(default: Contender, others: Sequence[Contender], quantile: str, whose: str) -> Target:
-    nearest = min(others, key=lambda contender: contender.quantiles[quantile])
+def _below_others(default: CandidateResult, others: Sequence[CandidateResult], quantile: str, whose: str) -> Target:
+    nearest = min(others, key=lambda candidate: candidate.quantiles[quantile])
     own, other = default.quantiles[quantile], nearest.quantiles[quantile]
     return Target(
         what=f"default, {quantile} below {whose}",

@@ -10,7 +10,7 @@ from typing import Final
 from quadsim.assets import models_dir
 from scenarios.parts.controllers import make_controller
 from scenarios.parts.foreign_code import digest
-from scenarios.parts.plugin import OwnController
+from scenarios.parts.plugin import PluginController
 from scenarios.parts.vehicle import build_vehicle
 from scenarios.schema.scenario import Scenario
 
@@ -31,7 +31,7 @@ def controller_digest(scenario: Scenario) -> str | None:
         InputError: the controller cannot be made.
     """
     controller = make_controller(scenario.controller, build_vehicle(scenario), scenario.control_period)
-    if not isinstance(controller, OwnController):
+    if not isinstance(controller, PluginController):
         return None
     package = controller.module.partition(".")[0]
     file = getattr(sys.modules[package], "__file__", None)

@@ -16,7 +16,7 @@ from scenarios.campaign.results.store import FLIGHTS_FILE, TIMES_FILE
 from scenarios.campaign.spec import CampaignSpec
 from scenarios.machine import machine, versions
 from scenarios.parts.foreign_code import announce_recorded, find_code
-from scenarios.schema.plugin import OwnSpec
+from scenarios.schema.plugin import PluginSpec
 
 MANIFEST_FILE: Final = "manifest.json"
 CAMPAIGN_FILE: Final = "campaign.toml"
@@ -57,7 +57,11 @@ def begin(plan: Plan, files: Growing) -> dict[str, Any]:
         "flown": 0,
         "files": {name: digest(text) for name, text in texts.items()},
         **_flown_by(plan),
-        **({"controller_code": find_code(own).digest} if isinstance(own := plan.scenario.controller, OwnSpec) else {}),
+        **(
+            {"controller_code": find_code(own).digest}
+            if isinstance(own := plan.scenario.controller, PluginSpec)
+            else {}
+        ),
         "sessions": [],
     }
     write(manifest, files)
@@ -133,7 +137,7 @@ def other_than_flew(manifest: Mapping[str, Any], plan: Plan) -> list[str]:
     Imports a controller that is not ours; what is to run, and what ran then, is told to
     `scenarios.parts.foreign_code.LOGGER` before.
     """
-    if isinstance(plan.scenario.controller, OwnSpec):
+    if isinstance(plan.scenario.controller, PluginSpec):
         announce_recorded(plan.scenario.controller, manifest.get("controller_code", manifest.get("controller")))
     return [name for name, value in _flown_by(plan).items() if manifest.get(name) != value]
 

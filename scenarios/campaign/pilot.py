@@ -12,10 +12,10 @@ from scenarios.campaign.results.table import Row, failed_row, flown_row
 from scenarios.campaign.results.verdicts import ERROR, MEMORY
 from scenarios.campaign.spec import LimitsSpec
 from scenarios.machine import processor_name
-from scenarios.parts.plugin import import_own
+from scenarios.parts.plugin import import_plugin
 from scenarios.progress import Progress, silent
 from scenarios.run import Flight, fly_scenario
-from scenarios.schema.plugin import OwnSpec
+from scenarios.schema.plugin import PluginSpec
 
 
 class CampaignPilot:
@@ -36,9 +36,9 @@ class CampaignPilot:
     def prepare(self) -> None:
         """Import a controller that is not ours."""
         controller = self._plan.scenario.controller
-        if isinstance(controller, OwnSpec):
+        if isinstance(controller, PluginSpec):
             with contextlib.suppress(Exception):
-                import_own(controller)
+                import_plugin(controller)
 
     def fly(self, flight: int, progress: Progress = silent) -> Row:
         """The row of a flight; one that raises is a result too, with its reason."""

@@ -65,21 +65,21 @@ def _bench_render(scenario: Scenario, options: Namespace, progress: Progress) ->
     return profile.to_json(), render_tables(profile), None
 
 
-def _bench_ladder(scenario: Scenario, options: Namespace, progress: Progress) -> _Benched:
-    from scenarios.bench.mismatch.benchmark import KIND, climb, write_ladder
-    from scenarios.bench.mismatch.survival import ladder_tables
+def _bench_mismatch(scenario: Scenario, options: Namespace, progress: Progress) -> _Benched:
+    from scenarios.bench.mismatch.benchmark import KIND, run_mismatch, write_mismatch
+    from scenarios.bench.mismatch.survival import mismatch_tables
 
     target = real_path(options.out)
     with writing(target, KIND) as directory:
-        ladder = climb(
+        measured = run_mismatch(
             options.scenario,
             [*options.settings, f"seed={scenario.seed}"],
             quick=options.quick,
             workers=options.workers,
             progress=progress,
         )
-        write_ladder(ladder, directory)
-    return ladder.to_json(), ladder_tables(ladder), str(target)
+        write_mismatch(measured, directory)
+    return measured.to_json(), mismatch_tables(measured), str(target)
 
 
 def _bench_campaign(scenario: Scenario, options: Namespace, progress: Progress) -> _Benched:
@@ -95,6 +95,6 @@ _BENCHES: Final = {
     "solvers": _bench_solvers,
     "flight": _bench_flight,
     "render": _bench_render,
-    "ladder": _bench_ladder,
+    "ladder": _bench_mismatch,
     "campaign": _bench_campaign,
 }

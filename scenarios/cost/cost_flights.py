@@ -19,10 +19,10 @@ from quadsim.errors import MissingPackageError
 from quadsim.flight import metrics
 from quadsim.flight.log import ControlLog, FlightLog
 from quadsim.state import REFERENCE_STATES
-from scenarios.bench.queries import Asked, flight_between, recorded
-from scenarios.bench.timing import race, stretches
+from scenarios.bench.queries import QueriedController, flight_between, recorded
+from scenarios.bench.timing import stretches, time_in_turns
 from scenarios.build import build_controller, build_problem
-from scenarios.cost.study import Contender, Outcome
+from scenarios.cost.study import CandidateTimes, Outcome
 from scenarios.courses.make import build_course_steps
 from scenarios.machine import usable_cores
 from scenarios.parts.vehicle import build_vehicle
@@ -109,9 +109,9 @@ def _leave_interrupts_to_parent() -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
-def time_contenders(
+def time_candidates(
     scenario: Scenario, log: ControlLog, solvers: Sequence[str], progress: Progress
-) -> tuple[tuple[Contender, ...], dict[str, str]]:
+) -> tuple[tuple[CandidateTimes, ...], dict[str, str]]:
     """Everything that can compute a command, timed on the queries of a flight; and what could not take part.
 
     See `scenarios.bench.timing` for how.
@@ -130,9 +130,11 @@ def time_contenders(
             controllers[f"QP by {solver}"] = ConstrainedMPC(problem, QPSolver(solver, problem), shortcut=False)
         except MissingPackageError as error:
             left_out[solver] = str(error)
-    asked = {name: Asked(each, recorded(scenario, log, problem.horizon)) for name, each in controllers.items()}
+    asked = {
+        name: QueriedController(each, recorded(scenario, log, problem.horizon)) for name, each in controllers.items()
+    }
     with flight_between(scenario, vehicle) as between:
-        laps = race(
+        laps = time_in_turns(
             asked,
             stretches(log.t.size, 1),
             between=between,
@@ -142,7 +144,7 @@ def time_contenders(
             progress=lambda done, total: progress("steps", done, total),
         )
     contenders = (
-        Contender(
+        CandidateTimes(
             name=name,
             step_ms=laps[name].median,
             statuses=tuple(each.statuses[period] for period in range(log.t.size)),
@@ -167,10 +169,10 @@ def time_flights(
         if log.t.size:
             vehicle = build_vehicle(scenario)
             controller = build_controller(scenario, vehicle)
-            entrant = Asked(controller, recorded(scenario, log, controller.horizon))
+            candidate = QueriedController(controller, recorded(scenario, log, controller.horizon))
             with flight_between(scenario, vehicle) as between:
-                laps = race(
-                    {controller.name: entrant},
+                laps = time_in_turns(
+                    {controller.name: candidate},
                     stretches(log.t.size, SWEEP_STRIDE),
                     between=between,
                     repeats=REPEATS,

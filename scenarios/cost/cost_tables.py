@@ -9,7 +9,7 @@ from quadsim.controller import SOLVED, UNCONSTRAINED
 from quadsim.flight.metrics import SETTLING_BAND, percentiles
 from quadsim.report.table import ABSENT, Cell, Grid, Mark, format_number, grid_to_markdown
 from quadsim.state import Array
-from scenarios.cost.study import MEASURES, Contender, CostStudy, Outcome, Sweep, SweepPoint
+from scenarios.cost.study import MEASURES, CandidateTimes, CostStudy, Outcome, Sweep, SweepPoint
 
 
 def cost_tables(study: CostStudy) -> list[Grid]:
@@ -59,14 +59,14 @@ def format_slowest(outcome: Outcome) -> str:
 
 def _computation(study: CostStudy) -> Grid:
     lines = []
-    for contender in study.contenders:
-        lines.append(_times(study, contender.name, contender.step_ms, contender))
-        parts = {"by the unconstrained optimum": contender.shortcut, "by QPs": ~contender.shortcut}
-        if 0 < contender.shortcut.sum() < contender.shortcut.size:
+    for candidate in study.contenders:
+        lines.append(_times(study, candidate.name, candidate.step_ms, candidate))
+        parts = {"by the unconstrained optimum": candidate.shortcut, "by QPs": ~candidate.shortcut}
+        if 0 < candidate.shortcut.sum() < candidate.shortcut.size:
             for how, periods in parts.items():
                 label = f"... its {periods.sum()} periods answered {how}"
-                lines.append(_times(study, label, contender.step_ms[periods]))
-    repeats = sorted({contender.repeats for contender in study.contenders})
+                lines.append(_times(study, label, candidate.step_ms[periods]))
+    repeats = sorted({candidate.repeats for candidate in study.contenders})
     note = (
         f"Whole controller step, Python included, on the same {study.contenders[0].step_ms.size} queries, recorded in "
         f"the constrained flight, timed as a flight sees them: between two steps the plant flies a period, and each is "
@@ -86,14 +86,14 @@ def _computation(study: CostStudy) -> Grid:
     )
 
 
-def _times(study: CostStudy, name: str, step_ms: Array, contender: Contender | None = None) -> tuple[Cell, ...]:
+def _times(study: CostStudy, name: str, step_ms: Array, candidate: CandidateTimes | None = None) -> tuple[Cell, ...]:
     """A line of the table of computation; rates and failures are those of a whole contender."""
     found = percentiles(step_ms)
     late = Mark.BAD if found["max"] > study.deadline_ms else Mark.NONE
     whole = [ABSENT] * 3
-    if contender is not None:
-        rates = (format_number(float(f"{contender.rate(measure):.3g}")) for measure in ("p99", "max"))
-        whole = [*rates, str(contender.failures)]
+    if candidate is not None:
+        rates = (format_number(float(f"{candidate.rate(measure):.3g}")) for measure in ("p99", "max"))
+        whole = [*rates, str(candidate.failures)]
     return (
         Cell(text=name),
         *(Cell(text=f"{found[measure]:.3g}") for measure in ("p50", "p95", "p99", "max")),

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator, Sequence
 from quadsim.flight.metrics import percentiles
 from quadsim.report.table import format_number
 from scenarios.cost.cost_tables import format_outcome, format_slowest
-from scenarios.cost.study import MEASURES, Contender, CostStudy, Outcome, Sweep, SweepPoint
+from scenarios.cost.study import MEASURES, CandidateTimes, CostStudy, Outcome, Sweep, SweepPoint
 
 
 def cost_sentences(study: CostStudy) -> list[str]:
@@ -43,20 +43,20 @@ def _computation(study: CostStudy) -> Iterator[str]:
             f"and is the answer after {_two(quick)} ms in the median; the others need QPs and {_two(slow)} ms."
         )
     if others:
-        told = "; ".join(_qp(study, contender) for contender in others)
+        told = "; ".join(_qp(study, candidate) for candidate in others)
         yield f"With the QP solved in every period: {told}."
 
 
-def _qp(study: CostStudy, contender: Contender) -> str:
-    found = percentiles(contender.step_ms)
-    late = int((contender.step_ms > study.deadline_ms).sum())
+def _qp(study: CostStudy, candidate: CandidateTimes) -> str:
+    found = percentiles(candidate.step_ms)
+    late = int((candidate.step_ms > study.deadline_ms).sum())
     times = f"{_two(found['p50'])} ms in the median and {_two(found['max'])} ms at most"
-    told = f"{contender.name} {times}, {_rate(contender)}"
+    told = f"{candidate.name} {times}, {_rate(candidate)}"
     return f"{told}, {late} of its steps too late" if late else told
 
 
-def _rate(contender: Contender) -> str:
-    return f"{_short(contender.rate('max'))} Hz"
+def _rate(candidate: CandidateTimes) -> str:
+    return f"{_short(candidate.rate('max'))} Hz"
 
 
 def _times(value: float, other: float) -> str:

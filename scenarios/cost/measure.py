@@ -12,8 +12,8 @@ from mpc.solvers import SOLVERS, make_backend
 from quadsim.errors import InputError
 from quadsim.flight import metrics
 from quadsim.flight.rundir import SCENARIO_FILE
-from scenarios.cost.cost_flights import Flown, fly, fly_all, key, time_contenders, time_flights
-from scenarios.cost.study import Contender, CostStudy, Outcome, Sweep, SweepPoint, Variation
+from scenarios.cost.cost_flights import Flown, fly, fly_all, key, time_candidates, time_flights
+from scenarios.cost.study import CandidateTimes, CostStudy, Outcome, Sweep, SweepPoint, Variation
 from scenarios.cost.variants import (
     course,
     is_counterpart,
@@ -27,7 +27,7 @@ from scenarios.courses.make import build_course_steps, build_reference
 from scenarios.loading import load_scenario
 from scenarios.machine import machine
 from scenarios.progress import Progress, silent
-from scenarios.schema.controller import ConstrainedSpec, UnconstrainedSpec, own_tilt
+from scenarios.schema.controller import ConstrainedSpec, UnconstrainedSpec, shared_tilt_bound
 from scenarios.schema.scenario import Scenario
 
 TILTS: Final = (2.0, 3.0, 4.0, 5.0, 7.0, 10.0, 15.0, 20.0)
@@ -94,7 +94,7 @@ def study_cost(
     arm_lengths: Sequence[float] = ARM_LENGTHS,
     drags: Sequence[float] = DRAGS,
     solvers: Sequence[str] = SOLVERS_TIMED,
-    timed: Sequence[Contender] | None = None,
+    timed: Sequence[CandidateTimes] | None = None,
     workers: int | None = None,
     progress: Progress = silent,
 ) -> CostStudy:
@@ -122,11 +122,11 @@ def study_cost(
     assert isinstance(spec, ConstrainedSpec)
     base = fly(constrained)
     if timed is None:
-        contenders, left_out = time_contenders(constrained, base.control, solvers, progress)
+        contenders, left_out = time_candidates(constrained, base.control, solvers, progress)
     else:
         contenders, left_out = tuple(timed), {}
 
-    own = own_tilt(spec)
+    own = shared_tilt_bound(spec)
     tilted = {tilt: with_tilt(constrained, tilt) for tilt in sorted({*tilts} | ({own} if own else set()))}
     shortened = {n: with_controller(constrained, horizon=n) for n in sorted({*horizons, spec.horizon})}
     varied = with_vehicles(constrained, arm_lengths, drags)

@@ -74,7 +74,7 @@ class Outcome:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Contender:
+class CandidateTimes:
     """A way to compute the commands, timed on the queries of one flight.
 
     Attributes:
@@ -183,7 +183,7 @@ class CostStudy:
     unconstrained: Outcome
     others: Mapping[str, Outcome]
     reference: Sequence[Mapping[str, Any]]
-    contenders: tuple[Contender, ...]
+    contenders: tuple[CandidateTimes, ...]
     left_out: Mapping[str, str]
     tilt: Sweep
     horizons: Sweep
@@ -194,13 +194,13 @@ class CostStudy:
         """Everything, as plain values; what a clock measured stands under `contenders` and `step_ms` alone."""
         timed = [
             {
-                "name": contender.name,
-                "repeats": contender.repeats,
-                "failures": contender.failures,
-                "shortcuts": int(contender.shortcut.sum()),
-                **metrics.percentiles(contender.step_ms),
-                "step_ms": [float(f"{value:.4g}") for value in contender.step_ms],
+                "name": candidate.name,
+                "repeats": candidate.repeats,
+                "failures": candidate.failures,
+                "shortcuts": int(candidate.shortcut.sum()),
+                **metrics.percentiles(candidate.step_ms),
+                "step_ms": [float(f"{value:.4g}") for value in candidate.step_ms],
             }
-            for contender in self.contenders
+            for candidate in self.contenders
         ]
         return {**asdict(self), "contenders": timed}

@@ -20,12 +20,12 @@ from quadsim.controller import Controller
 from quadsim.errors import InputError, ParameterError
 from quadsim.state import INDEX, N_STATES, STATE_NAMES, Array
 from quadsim.vehicle import N_ROTORS, Vehicle
-from scenarios.parts.plugin import build_own
+from scenarios.parts.plugin import build_plugin
 from scenarios.schema.baselines import GeometricSpec, LQRSpec, PIDSpec
 from scenarios.schema.controller import ConstrainedSpec, ControllerSpec, UnconstrainedSpec
 from scenarios.schema.fallback import FallbackSpec
 from scenarios.schema.optimisation import ANGLES, BoundedSpec, InputWeightsSpec, WeightedSpec
-from scenarios.schema.plugin import OwnSpec
+from scenarios.schema.plugin import PluginSpec
 from scenarios.schema.robust import RobustSpec
 
 FALLBACK_SHARE: Final = 0.8
@@ -90,8 +90,8 @@ def make_controller(spec: ControllerSpec, vehicle: Vehicle, period: float) -> Co
             return guarded(_robust(spec, vehicle, period), spec, spec.fallback, vehicle, period)
         case LQRSpec() | PIDSpec() | GeometricSpec():
             return _baseline(spec, vehicle, period)
-        case OwnSpec():
-            return build_own(spec, vehicle, period)
+        case PluginSpec():
+            return build_plugin(spec, vehicle, period)
 
 
 def guarded(law: Controller, spec: BoundedSpec, fallback: FallbackSpec, vehicle: Vehicle, period: float) -> Controller:

@@ -14,7 +14,7 @@ from importlib.machinery import ModuleSpec
 from pathlib import Path
 from typing import Final
 
-from scenarios.schema.plugin import ENTRY_POINTS, OwnSpec
+from scenarios.schema.plugin import ENTRY_POINTS, PluginSpec
 
 LOGGER: Final = logging.getLogger("quadsim.code")
 """Told, before the code of a controller that is not ours is imported, what is to run; the command line shows it."""
@@ -51,7 +51,7 @@ class Code:
         return f"runs code that is not quadsim's: controller {self.type} from {where}"
 
 
-def find_code(spec: OwnSpec) -> Code:
+def find_code(spec: PluginSpec) -> Code:
     """Where a controller's code is, found as it will be for its import, and nothing of it imported."""
     module, attribute = place(spec.type)
     with searched(folders_of(spec)):
@@ -61,14 +61,14 @@ def find_code(spec: OwnSpec) -> Code:
     return Code(type=spec.type, module=module, attribute=attribute, file=file, root=root)
 
 
-def announce(spec: OwnSpec) -> Code:
+def announce(spec: PluginSpec) -> Code:
     """Tell what is to run, before it does."""
     code = find_code(spec)
     LOGGER.info("%s", code)
     return code
 
 
-def announce_recorded(spec: OwnSpec, recorded: object) -> None:
+def announce_recorded(spec: PluginSpec, recorded: object) -> None:
     """The same, and whether it is the code that flew a campaign, by its digest."""
     code = announce(spec)
     if recorded is not None and recorded == code.digest:
@@ -86,7 +86,7 @@ def place(name: str) -> tuple[str, str]:
     return module, attribute
 
 
-def folders_of(spec: OwnSpec) -> list[str]:
+def folders_of(spec: PluginSpec) -> list[str]:
     """Where a controller's module is looked for before the installed ones."""
     return list(dict.fromkeys([*([] if spec.folder is None else [spec.folder]), str(Path.cwd())]))
 

@@ -18,7 +18,7 @@ from quadsim.errors import CommandError, InputError, ParameterError, printable
 from quadsim.state import Array
 from quadsim.vehicle import N_ROTORS, Vehicle
 from scenarios.parts.foreign_code import announce, folders_of, searched
-from scenarios.schema.plugin import GIVEN, OwnSpec
+from scenarios.schema.plugin import GIVEN, PluginSpec
 
 _WHOLE, _REAL = ("iterations", "active", "fallback"), ("slack", "primal_residual", "dual_residual", "solve_s")
 """What else a command has: whole numbers, and numbers."""
@@ -26,7 +26,7 @@ _LONGEST = 200
 """Characters of a name or status."""
 
 
-class OwnController:
+class PluginController:
     """A controller with a `step` alone, or more, as the testbed wants it.
 
     What it lacks is filled in: `name` by its class's, `solver` by none, `reset` by nothing.  A step may answer with
@@ -133,8 +133,8 @@ def _numbers(given: Any) -> Array | None:
         return None
 
 
-def import_own(spec: OwnSpec) -> None:
-    """Import the module that a controller is in; see `build_own`.
+def import_plugin(spec: PluginSpec) -> None:
+    """Import the module that a controller is in; see `build_plugin`.
 
     Raises:
         InputError: there is none, or it cannot be imported.
@@ -145,7 +145,7 @@ def import_own(spec: OwnSpec) -> None:
         _import(spec.type, code.module, folders)
 
 
-def build_own(spec: OwnSpec, vehicle: Vehicle, period: float) -> Controller:
+def build_plugin(spec: PluginSpec, vehicle: Vehicle, period: float) -> Controller:
     """Import a controller and call it.
 
     What is to run is told to `foreign_code.LOGGER` first.  Its module is looked for in the spec's folder, the
@@ -177,7 +177,7 @@ def build_own(spec: OwnSpec, vehicle: Vehicle, period: float) -> Controller:
     if not callable(getattr(law, "step", None)):
         rule = f"something with a method step(now, state, reference); {attribute}(...) gave {type(law).__name__}"
         raise ParameterError("controller", "type", spec.type, rule)
-    return OwnController(law, spec.horizon)
+    return PluginController(law, spec.horizon)
 
 
 def _import(name: str, module: str, folders: list[str]) -> Any:

@@ -13,7 +13,7 @@ from quadsim.errors import UnknownNameError
 from scenarios.schema.baselines import GeometricSpec, LQRSpec, PIDSpec
 from scenarios.schema.fallback import FallbackSpec
 from scenarios.schema.optimisation import BoundedSpec, WeightedSpec
-from scenarios.schema.plugin import FORM, LAWS, OwnSpec, is_own
+from scenarios.schema.plugin import FORM, LAWS, PluginSpec, is_plugin
 from scenarios.schema.robust import RobustSpec
 
 
@@ -46,7 +46,7 @@ class ConstrainedSpec(BoundedSpec):
         return self
 
 
-def own_tilt(spec: ConstrainedSpec) -> float | None:
+def shared_tilt_bound(spec: ConstrainedSpec) -> float | None:
     """The one number that bounds roll and pitch alike [deg], or None."""
     bounds = {abs(bound) for name in ("roll", "pitch") for bound in spec.output_bounds.get(name, [])}
     both = {"roll", "pitch"} <= spec.output_bounds.keys()
@@ -58,14 +58,14 @@ def _law(controller: object) -> str | None:
     given = controller.get("type") if isinstance(controller, Mapping) else getattr(controller, "type", None)
     if not isinstance(given, str):
         return None
-    return given if given in LAWS or not is_own(given) else FORM
+    return given if given in LAWS or not is_plugin(given) else FORM
 
 
 def _spelt_out(controller: Any) -> Any:
     """A law's name alone as the table that it stands for."""
     if isinstance(controller, str):
         return {"type": controller}
-    if not isinstance(controller, Mapping | WeightedSpec | LQRSpec | PIDSpec | GeometricSpec | OwnSpec):
+    if not isinstance(controller, Mapping | WeightedSpec | LQRSpec | PIDSpec | GeometricSpec | PluginSpec):
         raise PydanticCustomError("controller", "a table or a controller's name")
     return controller
 
@@ -77,7 +77,7 @@ _Table = Annotated[
     | Annotated[LQRSpec, Tag("lqr")]
     | Annotated[PIDSpec, Tag("pid")]
     | Annotated[GeometricSpec, Tag("geometric")]
-    | Annotated[OwnSpec, Tag(FORM)],
+    | Annotated[PluginSpec, Tag(FORM)],
     Discriminator(_law),
 ]
 ControllerSpec = Annotated[_Table, BeforeValidator(_spelt_out, json_schema_input_type=_Table | str)]

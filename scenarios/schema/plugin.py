@@ -25,7 +25,7 @@ LAWS: Final = ("unconstrained", "constrained", "robust", "lqr", "pid", "geometri
 _NAME: Final = r"[^\W\d]\w*(?:\.[^\W\d]\w*)*"
 
 
-class OwnSpec(Spec):
+class PluginSpec(Spec):
     """A controller of one's own, called as MyController(vehicle, period=..., horizon=..., **settings)."""
 
     type: str = Field(
@@ -40,7 +40,7 @@ class OwnSpec(Spec):
     settings: dict[str, Any] = Field(default={}, description="what else it is called with, by the arguments' names")
 
     @model_validator(mode="after")
-    def _check(self) -> OwnSpec:
+    def _check(self) -> PluginSpec:
         if ":" in self.type and not re.fullmatch(f"{_NAME}:{_NAME}", self.type):
             raise ValueError(f"type must be of the form {FORM}; got {self.type!r}")
         for name, value in self.settings.items():
@@ -52,7 +52,7 @@ class OwnSpec(Spec):
         return self
 
 
-def is_own(name: str) -> bool:
+def is_plugin(name: str) -> bool:
     """Whether a text names code, or an entry point that there is."""
     return ":" in name or name in metadata.entry_points(group=ENTRY_POINTS).names
 

@@ -12,7 +12,8 @@ from PIL import Image
 from quadsim.controller import ACCEPTED, Phase, law_name
 from quadsim.flight.audit import Limit
 from quadsim.flight.rundir import Run
-from quadsim.report.film.drawing import (
+from quadsim.report.film.frames import Footage, MarginTrack
+from quadsim.report.film.painter import (
     AMBER,
     BLUE,
     CYAN,
@@ -23,16 +24,15 @@ from quadsim.report.film.drawing import (
     VIOLET,
     WHITE,
     Colour,
-    Pen,
+    Painter,
     Picture,
     shade,
     text_width,
 )
-from quadsim.report.film.frames import Footage, MarginTrack
 from quadsim.report.film.topview import TopView
 from quadsim.state import INDEX, REFERENCE_NAMES, REFERENCE_STATES, Array
 
-_Panel = Callable[[Pen, float, float, int], None]
+_Panel = Callable[[Painter, float, float, int], None]
 
 _STRIP: Final = 150
 """Height of the bottom strip, in design pixels of a 1280 x 720 frame."""
@@ -80,12 +80,12 @@ class Overlay:
             shade(frame, 0, strip, self._width, _STRIP, scale=self._scale)
 
         image = Image.fromarray(frame)
-        pen = Pen(image, self._scale)
+        painter = Painter(image, self._scale)
         for j, (text, size, colour) in enumerate(lines):
-            pen.text(28, 38 + 27 * j, text, size=size, colour=colour, anchor="lm")
-        self._top_view.draw(pen, map_left, 16, i)
+            painter.text(28, 38 + 27 * j, text, size=size, colour=colour, anchor="lm")
+        self._top_view.draw(painter, map_left, 16, i)
         for left, (_, panel) in zip(lefts, columns, strict=True):
-            panel(pen, left, strip + (-8.0 if self._compact else 10.0), i)
+            panel(painter, left, strip + (-8.0 if self._compact else 10.0), i)
         return np.asarray(image)
 
     def _limit(self, signal: str, i: int) -> Limit | None:
@@ -123,65 +123,72 @@ class Overlay:
         good = fallback == 0 and status in ACCEPTED | {Phase.LANDED}
         return "  ·  ".join(told), 14, GREEN if good else RED
 
-    def _position(self, pen: Pen, x: float, y: float, i: int) -> None:
-        pen.text(x + 118, y, "now", size=13, colour=GREY, anchor="ra")
-        pen.text(x + 192, y, "reference", size=13, colour=AMBER, anchor="ra")
-        pen.text(x + 262, y, "error", size=13, colour=GREY, anchor="ra")
+    def _position(self, painter: Painter, x: float, y: float, i: int) -> None:
+        painter.text(x + 118, y, "now", size=13, colour=GREY, anchor="ra")
+        painter.text(x + 192, y, "reference", size=13, colour=AMBER, anchor="ra")
+        painter.text(x + 262, y, "error", size=13, colour=GREY, anchor="ra")
         reference = self._run.log.control.reference[self._footage.period[i]]
         values = (*self._footage.position[i], self._footage.euler[i, 2])
         for j, (name, state) in enumerate(zip(REFERENCE_NAMES, REFERENCE_STATES, strict=True)):
             angle = state == INDEX["yaw"]
             factor, digits = (math.degrees(1.0), 1) if angle else (1.0, 2)
             now, wanted, row = factor * values[j], factor * reference[j], y + 24 + 27 * j
-            pen.text(x, row, f"{name} [{'deg' if angle else 'm'}]", colour=GREY)
+            painter.text(x, row, f"{name} [{'deg' if angle else 'm'}]", colour=GREY)
             for right, value, colour in ((118, now, WHITE), (192, wanted, AMBER), (262, now - wanted, GREY)):
                 shown = round(value, digits) + 0.0  # no "-0.00"
-                pen.text(x + right, row, f"{shown:+.{digits}f}", colour=colour, anchor="ra")
+                painter.text(x + right, row, f"{shown:+.{digits}f}", colour=colour, anchor="ra")
 
-    def _attitude(self, pen: Pen, x: float, y: float, i: int) -> None:
-        pen.text(x, y, "attitude [deg]", size=13, colour=GREY)
+    def _attitude(self, painter: Painter, x: float, y: float, i: int) -> None:
+        painter.text(x, y, "attitude [deg]", size=13, colour=GREY)
         for j, name in enumerate(("roll", "pitch")):
             value, limit, row = math.degrees(self._footage.euler[i, j]), self._limit(name, i), y + 32 + 50 * j
             finite = [abs(b) for b in _bounds(limit) if math.isfinite(b)]
             span = 2.0 * max(finite) if finite else 30.0
             broken = _breaks(limit, value)
-            pen.text(x, row, name, size=17)
-            pen.text(
+            painter.text(x, row, name, size=17)
+            painter.text(
                 x + 262, row, f"{round(value, 2) + 0.0:+.2f}", size=17, colour=RED if broken else WHITE, anchor="ra"
             )
-            pen.box(x, row + 25, 262, 9, FAINT)
+            painter.box(x, row + 25, 262, 9, FAINT)
             centre, unit = x + 131, 131 / span
-            pen.box(centre, row + 25, unit * float(np.clip(value, -span, span)), 9, RED if broken else BLUE)
-            pen.box(centre - 0.5, row + 23, 1, 13, GREY)
+            painter.box(centre, row + 25, unit * float(np.clip(value, -span, span)), 9, RED if broken else BLUE)
+            painter.box(centre - 0.5, row + 23, 1, 13, GREY)
             for bound in _bounds(limit):
                 if math.isfinite(bound):
-                    pen.box(centre + unit * bound - 1, row + 21, 2.5, 17, RED if broken else AMBER)
+                    painter.box(centre + unit * bound - 1, row + 21, 2.5, 17, RED if broken else AMBER)
 
-    def _speeds(self, pen: Pen, x: float, y: float, i: int) -> None:
+    def _speeds(self, painter: Painter, x: float, y: float, i: int) -> None:
         limit = self._limit("speed", i)
         upper = _bounds(limit)[1]
         top = 1.25 * (upper if math.isfinite(upper) else self._run.vehicle.speed_max)
-        pen.text(x, y, "rotor speed [rad/s]", size=13, colour=GREY)
-        self._bars(pen, x, y, self._footage.speeds[i], limit, (0.0, top), "{:.0f}")
+        painter.text(x, y, "rotor speed [rad/s]", size=13, colour=GREY)
+        self._bars(painter, x, y, self._footage.speeds[i], limit, (0.0, top), "{:.0f}")
 
-    def _slews(self, pen: Pen, x: float, y: float, i: int) -> None:
+    def _slews(self, painter: Painter, x: float, y: float, i: int) -> None:
         limit = self._limit("slew", i)
         finite = [abs(bound) for bound in _bounds(limit) if math.isfinite(bound)]
         span = 1.6 * max(finite) if finite else 20.0
-        pen.text(x, y, "step per period [rad/s]", size=13, colour=GREY)
-        self._bars(pen, x, y, self._run.log.control.slews[self._footage.period[i]], limit, (-span, span), "{:+.1f}")
+        painter.text(x, y, "step per period [rad/s]", size=13, colour=GREY)
+        self._bars(painter, x, y, self._run.log.control.slews[self._footage.period[i]], limit, (-span, span), "{:+.1f}")
 
     def _bars(
-        self, pen: Pen, x: float, y: float, values: Array, limit: Limit | None, span: tuple[float, float], form: str
+        self,
+        painter: Painter,
+        x: float,
+        y: float,
+        values: Array,
+        limit: Limit | None,
+        span: tuple[float, float],
+        form: str,
     ) -> None:
         top, height, low, high = y + 22, 88.0, *span
         unit = height / (high - low)
         zero = top + height + unit * min(low, 0.0)
         for j, value in enumerate(values):
             left, broken = x + 50 * j, _breaks(limit, value)
-            pen.box(left, top, 34, height, FAINT)
-            pen.box(left, zero, 34, -unit * float(np.clip(value, low, high)), RED if broken else BLUE)
-            pen.text(
+            painter.box(left, top, 34, height, FAINT)
+            painter.box(left, zero, 34, -unit * float(np.clip(value, low, high)), RED if broken else BLUE)
+            painter.text(
                 left + 17,
                 top + height + 5,
                 form.format(round(value, 1) + 0.0),
@@ -191,21 +198,21 @@ class Overlay:
             )
         for bound in _bounds(limit):
             if math.isfinite(bound) and bound != 0.0:
-                pen.box(x - 4, zero - unit * bound - 1, 192, 2, AMBER)
+                painter.box(x - 4, zero - unit * bound - 1, 192, 2, AMBER)
 
-    def _margins(self, pen: Pen, x: float, y: float, i: int) -> None:
-        pen.text(x, y, "limit", size=13, colour=GREY)
-        pen.text(x + 226, y, "worst margin so far", size=13, colour=GREY, anchor="ra")
+    def _margins(self, painter: Painter, x: float, y: float, i: int) -> None:
+        painter.text(x, y, "limit", size=13, colour=GREY)
+        painter.text(x + 226, y, "worst margin so far", size=13, colour=GREY, anchor="ra")
         shown, rest = margin_rows(self._ranked, i)
         pitch = 18.5 if len(self._ranked) <= _MOST_MARGINS else 16.0
         for j, track in enumerate(shown):
             worst, row = track.worst[i], y + 22 + pitch * j
             now_broken, once_broken = (margin < -track.limit.tolerance for margin in (track.now[i], worst))
-            pen.text(x, row, track.limit.name, size=14, colour=RED if now_broken else GREY)
+            painter.text(x, row, track.limit.name, size=14, colour=RED if now_broken else GREY)
             told = f"{round(worst, 2) + 0.0:+.2f} {track.limit.unit}"
-            pen.text(x + 226, row, told, size=14, colour=RED if once_broken else WHITE, anchor="ra")
+            painter.text(x + 226, row, told, size=14, colour=RED if once_broken else WHITE, anchor="ra")
         colour = RED if "violated" in rest else GREY
-        pen.text(x, y + 22 + pitch * len(shown), rest, size=14, colour=colour)
+        painter.text(x, y + 22 + pitch * len(shown), rest, size=14, colour=colour)
 
 
 def margin_rows(ranked: Sequence[MarginTrack], i: int) -> tuple[list[MarginTrack], str]:

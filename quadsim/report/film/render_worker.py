@@ -22,8 +22,8 @@ import numpy as np
 from quadsim.controller import Phase
 from quadsim.flight.rundir import Run, load_run
 from quadsim.report.film.captions import Overlay
-from quadsim.report.film.drawing import Picture
 from quadsim.report.film.frames import Footage, Shot, make_footage, thin
+from quadsim.report.film.painter import Picture
 from quadsim.sim.airframe import FLOOR, PROPELLER_NAMES, compile_model
 from quadsim.state import Array
 from quadsim.vehicle import Vehicle

@@ -8,8 +8,8 @@ from typing import Final
 import numpy as np
 
 from quadsim.flight.rundir import Run
-from quadsim.report.film.drawing import AMBER, BLUE, CYAN, FAINT, GREEN, GREY, VIOLET, WHITE, Pen
 from quadsim.report.film.frames import Footage
+from quadsim.report.film.painter import AMBER, BLUE, CYAN, FAINT, GREEN, GREY, VIOLET, WHITE, Painter
 from quadsim.state import Array
 
 _LONGEST_ARROW: Final = 34.0
@@ -39,7 +39,7 @@ class TopView:
         self._low, self._high = np.minimum(low, path.min(axis=0)), np.maximum(high, path.max(axis=0))
         self._middle = 0.5 * (self._low + self._high)
 
-    def draw(self, pen: Pen, x: float, y: float, i: int) -> None:
+    def draw(self, painter: Painter, x: float, y: float, i: int) -> None:
         """Draw the map and the height scale into a box with its corner at (x, y)."""
         width, height = self.width, self.height
         room = np.array([width - 64.0, height - 66.0])
@@ -54,19 +54,19 @@ class TopView:
 
         footage = self._footage
         flown = footage.path[: np.searchsorted(footage.path_times, footage.times[i], side="right")]
-        pen.text(x + 10, y + 6, "from above", size=13, colour=GREY)
-        pen.line(place(footage.course), AMBER, width=1.2)
-        pen.line(place(np.concatenate([flown, footage.position[i : i + 1]])), BLUE, width=2.2)
+        painter.text(x + 10, y + 6, "from above", size=13, colour=GREY)
+        painter.line(place(footage.course), AMBER, width=1.2)
+        painter.line(place(np.concatenate([flown, footage.position[i : i + 1]])), BLUE, width=2.2)
         spot = place(footage.position[i])
         yaw = footage.euler[i, 2]
-        pen.line(np.stack([spot, spot + 11.0 * np.array([math.cos(yaw), -math.sin(yaw)])]), WHITE, width=2.5)
-        pen.dot(spot, 4.0, WHITE)
+        painter.line(np.stack([spot, spot + 11.0 * np.array([math.cos(yaw), -math.sin(yaw)])]), WHITE, width=2.5)
+        painter.dot(spot, 4.0, WHITE)
         if self._acting:
-            pen.arrow(spot - 1.25 * self._wind[i], self._wind[i], CYAN)
-            pen.arrow(spot, self._force[i], VIOLET)
+            painter.arrow(spot - 1.25 * self._wind[i], self._wind[i], CYAN)
+            painter.arrow(spot, self._force[i], VIOLET)
         metres = _round_length(0.22 * width / unit)
-        pen.box(x + width - 60 - unit * metres, y + 18, unit * metres, 2, GREY)
-        pen.text(x + width - 60, y + 4, f"{metres:g} m", size=12, colour=GREY, anchor="ra")
+        painter.box(x + width - 60 - unit * metres, y + 18, unit * metres, 2, GREY)
+        painter.text(x + width - 60, y + 4, f"{metres:g} m", size=12, colour=GREY, anchor="ra")
 
         rise = room[1] / extent[2]
         bar, bottom = x + width - 26, y + 32 + room[1]
@@ -74,11 +74,11 @@ class TopView:
         def level(z: float) -> float:
             return float(bottom - rise * (np.clip(z, self._low[2], self._high[2]) - self._low[2]))
 
-        pen.text(bar + 4, y + 6, "z", size=13, colour=GREY, anchor="ma")
-        pen.box(bar, bottom, 8, -room[1], FAINT)
-        pen.box(bar, bottom, 8, level(footage.position[i, 2]) - bottom, BLUE)
+        painter.text(bar + 4, y + 6, "z", size=13, colour=GREY, anchor="ma")
+        painter.box(bar, bottom, 8, -room[1], FAINT)
+        painter.box(bar, bottom, 8, level(footage.position[i, 2]) - bottom, BLUE)
         for right, label, colour in ((0.05, "reference", AMBER), (0.40, "flown", BLUE), (0.64, "predicted", GREEN)):
-            pen.text(x + right * width, y + height - 20, label, size=0.056 * width, colour=colour)
+            painter.text(x + right * width, y + height - 20, label, size=0.056 * width, colour=colour)
 
 
 def _arrows(vectors: Array, of_flight: Array) -> Array:

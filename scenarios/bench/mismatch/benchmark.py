@@ -22,8 +22,8 @@ from quadsim.flight import metrics
 from quadsim.flight.log import FlightLog
 from quadsim.state import INDEX, POSITION, Array
 from scenarios.bench.mismatch.conditions import CONDITIONS, QUICK_CONDITIONS
-from scenarios.bench.mismatch.controllers import CLIMBERS, FULL, QUICK_CLIMBERS, equip, tilt_bound
-from scenarios.bench.mismatch.survival import Ladder, LadderFlight, ladder_legend, ladder_tables
+from scenarios.bench.mismatch.controllers import FULL, QUICK_VARIANTS, VARIANTS, equip, tilt_bound
+from scenarios.bench.mismatch.survival import MismatchBench, MismatchFlight, mismatch_legend, mismatch_tables
 from scenarios.bench.solvers import section
 from scenarios.build import build_controller, build_plant
 from scenarios.courses.make import build_reference
@@ -94,14 +94,14 @@ class Cell:
     condition: str
 
 
-def climb(
+def run_mismatch(
     scenario: str = "paper-constrained",
     settings: Sequence[str] = (),
     *,
     quick: bool = False,
     workers: int | None = None,
     progress: Progress = silent,
-) -> Ladder:
+) -> MismatchBench:
     """Fly every controller in every condition.
 
     Flights are spread over processes; results are the same however many there are.  Steps are timed in further flights,
@@ -122,7 +122,7 @@ def climb(
         raise ParameterError("", "--workers", workers, "at least 1")
     if quick:
         settings = [*settings, f"duration={QUICK_DURATION}"]
-    controllers = QUICK_CLIMBERS if quick else tuple(CLIMBERS)
+    controllers = QUICK_VARIANTS if quick else tuple(VARIANTS)
     conditions = QUICK_CONDITIONS if quick else tuple(CONDITIONS)
     flown = load_scenario(scenario, settings)
     bound = tilt_bound(flown)
@@ -139,11 +139,11 @@ def climb(
 
     flights = dict(zip(cells, answer_all(fly_cell, cells, workers=workers, progress=told("flights")), strict=True))
     alone = dict(zip(timed, answer_all(time_cell, timed, workers=1, progress=told("step times")), strict=True))
-    return Ladder(
+    return MismatchBench(
         scenario=flown.name,
         duration=flown.duration,
         tilt_bound=bound,
-        controllers={name: CLIMBERS[name].about for name in controllers},
+        controllers={name: VARIANTS[name].about for name in controllers},
         conditions={name: CONDITIONS[name].about for name in conditions},
         flights={
             (cell.controller, cell.condition): replace(flight, step_p99=alone.get(cell))
@@ -153,7 +153,7 @@ def climb(
     )
 
 
-def fly_cell(cell: Cell) -> LadderFlight:
+def fly_cell(cell: Cell) -> MismatchFlight:
     """Fly one controller in one condition, here."""
     log, step_ms, scenario = _fly(cell)
     return _judge(log, step_ms, tilt_bound(_varied(cell)), scenario)
@@ -211,14 +211,14 @@ def _varied(cell: Cell) -> Scenario:
     return load_scenario(cell.scenario, [*cell.settings, *CONDITIONS[cell.condition].settings])
 
 
-def _judge(log: FlightLog, step_ms: Array, bound: float, scenario: Scenario) -> LadderFlight:
+def _judge(log: FlightLog, step_ms: Array, bound: float, scenario: Scenario) -> MismatchFlight:
     control = log.control
     flown = bool(control.t.size)
     end = control.truth[-1, list(POSITION)] - control.reference[-1, :3] if flown else None
     # A row of the plant stands for the step that follows it; the last has none.
     tilts = np.degrees(np.abs(log.plant.state[:-1, [INDEX["roll"], INDEX["pitch"]]]).max(axis=1))
     violated = np.count_nonzero(tilts > bound) * scenario.plant.timestep
-    return LadderFlight(
+    return MismatchFlight(
         reason=log.reason,
         flown=round(control.t.size * scenario.control_period, 9),
         rmse={axis: metrics.tracking(control)["rmse"][axis] for axis in "xyz"} if flown else None,
@@ -230,20 +230,20 @@ def _judge(log: FlightLog, step_ms: Array, bound: float, scenario: Scenario) -> 
     )
 
 
-def write_ladder(ladder: Ladder, directory: Path) -> None:
+def write_mismatch(measured: MismatchBench, directory: Path) -> None:
     """Write `ladder.json`, `ladder.md`, `ladder.png` and `ladder.svg` into a directory.
 
     Raises:
         OutputError: it cannot be written.
     """
-    from scenarios.bench.mismatch.survival_figure import write_ladder_figure
+    from scenarios.bench.mismatch.survival_figure import write_mismatch_figure
 
-    outputs.write_json(directory / RESULTS_FILE, {"format": FORMAT, **ladder.to_json()})
-    outputs.write_text(directory / TABLES_FILE, ladder_markdown(ladder))
-    write_ladder_figure(ladder, directory)
+    outputs.write_json(directory / RESULTS_FILE, {"format": FORMAT, **measured.to_json()})
+    outputs.write_text(directory / TABLES_FILE, mismatch_markdown(measured))
+    write_mismatch_figure(measured, directory)
 
 
-def ladder_markdown(ladder: Ladder) -> str:
+def mismatch_markdown(measured: MismatchBench) -> str:
     """All tables of a ladder, under what its controllers and conditions are."""
-    sections = "\n".join(map(section, ladder_tables(ladder)))
-    return f"# The ladder on {ladder.scenario}, {ladder.duration:g} s\n\n{ladder_legend(ladder)}\n{sections}"
+    sections = "\n".join(map(section, mismatch_tables(measured)))
+    return f"# The ladder on {measured.scenario}, {measured.duration:g} s\n\n{mismatch_legend(measured)}\n{sections}"

@@ -9,7 +9,7 @@ from typing import Any, Final
 from quadsim.errors import InputError
 from scenarios.bench.mismatch.conditions import Condition
 from scenarios.schema.baselines import GeometricSpec, LQRSpec, PIDSpec
-from scenarios.schema.controller import ConstrainedSpec, ControllerSpec, own_tilt
+from scenarios.schema.controller import ConstrainedSpec, ControllerSpec, shared_tilt_bound
 from scenarios.schema.optimisation import InputBoundsSpec, InputWeightsSpec
 from scenarios.schema.robust import OffsetFreeSpec, RobustSpec, SoftSpec, TighteningSpec
 from scenarios.schema.scenario import Scenario
@@ -26,7 +26,7 @@ _NO_STEPS: Final = 1e6
 
 
 @dataclass(frozen=True, kw_only=True)
-class Climber:
+class ControllerVariant:
     """A controller of the ladder.
 
     Attributes:
@@ -39,14 +39,14 @@ class Climber:
 
 
 def equip(scenario: Scenario, controller: str, condition: Condition) -> Scenario:
-    """The scenario flown by another controller of `CLIMBERS`, told what the condition tells.
+    """The scenario flown by another controller of `VARIANTS`, told what the condition tells.
 
     Raises:
         InputError: the scenario's own controller is no constrained one with the same bounds on roll and pitch.
     """
     tilt_bound(scenario)
     assert isinstance(scenario.controller, ConstrainedSpec)
-    spec = CLIMBERS[controller].spec(scenario.controller, condition, scenario.control_period)
+    spec = VARIANTS[controller].spec(scenario.controller, condition, scenario.control_period)
     return scenario.model_copy(update={"controller": spec})
 
 
@@ -57,7 +57,7 @@ def tilt_bound(scenario: Scenario) -> float:
         InputError: the scenario's controller has none.
     """
     spec = scenario.controller
-    bound = own_tilt(spec) if isinstance(spec, ConstrainedSpec) else None
+    bound = shared_tilt_bound(spec) if isinstance(spec, ConstrainedSpec) else None
     if bound is None:
         raise InputError(
             f"{scenario.name}: the ladder needs a constrained controller whose output_bounds of roll and pitch are the "
@@ -123,34 +123,34 @@ def _speeds_alone(spec: ConstrainedSpec) -> InputBoundsSpec:
     return InputBoundsSpec(speed=spec.input_bounds.speed, slew=[-_NO_STEPS, _NO_STEPS])
 
 
-CLIMBERS: Final = {
-    "paper": Climber(about="the paper's constrained MPC, hard bounds, no fallback", spec=_paper),
-    "soft": Climber(
+VARIANTS: Final = {
+    "paper": ControllerVariant(about="the paper's constrained MPC, hard bounds, no fallback", spec=_paper),
+    "soft": ControllerVariant(
         about=f"soft bounds on tilt, input weight {INPUT_WEIGHT:g}, move weight {MOVE_WEIGHT:g}; guarded, as are those "
         "that build on it",
         spec=_robust(modelled=False),
     ),
-    "+ model": Climber(about="and a prediction that knows rotor lag, delay and heading", spec=_robust()),
-    "+ offset-free": Climber(about="and disturbances estimated", spec=_robust(offset_free=OBSERVER)),
-    "+ tightening": Climber(
+    "+ model": ControllerVariant(about="and a prediction that knows rotor lag, delay and heading", spec=_robust()),
+    "+ offset-free": ControllerVariant(about="and disturbances estimated", spec=_robust(offset_free=OBSERVER)),
+    "+ tightening": ControllerVariant(
         about="and bounds drawn in for what may disturb it, and for what happens between samples",
         spec=_robust(offset_free=OBSERVER, tightening=TighteningSpec()),
     ),
-    "+ LTV": Climber(
+    "+ LTV": ControllerVariant(
         about="as + offset-free, linearised at the present state in each period",
         spec=_robust(offset_free=OBSERVER, linearisation="state"),
     ),
-    "+ iteration": Climber(
+    "+ iteration": ControllerVariant(
         about="as + offset-free, linearised along its last plan: the real-time iteration",
         spec=_robust(offset_free=OBSERVER, linearisation="trajectory"),
     ),
-    "LQR": Climber(
+    "LQR": ControllerVariant(
         about="infinite horizon, weights by Bryson's rule, in the heading frame; as the next two, it knows no bounds "
         f"but those on speeds, and asks for no more than {BASELINE_TILT:g} deg of tilt",
         spec=_lqr,
     ),
-    "PID": Climber(about="cascaded, as autopilots fly it; gains from the lag it is told", spec=_pid),
-    "geometric": Climber(
+    "PID": ControllerVariant(about="cascaded, as autopilots fly it; gains from the lag it is told", spec=_pid),
+    "geometric": ControllerVariant(
         about="on SE(3) with integrals (Goodarzi, Lee, Lee, 2013); gains from the lag it is told", spec=_geometric
     ),
 }
@@ -158,4 +158,4 @@ CLIMBERS: Final = {
 bounds on steps, which it knows nothing of, the LQR falls over on the nominal course."""
 FULL: Final = "+ tightening"
 """The one with every part that tells it apart from the paper's."""
-QUICK_CLIMBERS: Final = ("paper", "+ offset-free", "PID")
+QUICK_VARIANTS: Final = ("paper", "+ offset-free", "PID")

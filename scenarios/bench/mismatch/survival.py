@@ -15,7 +15,7 @@ OVERTURNED: Final = 90.0
 
 
 @dataclass(frozen=True, kw_only=True)
-class LadderFlight:
+class MismatchFlight:
     """What became of one flight; numbers are over what was flown, None where that is not one period.
 
     Attributes:
@@ -56,7 +56,7 @@ class LadderFlight:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Ladder:
+class MismatchBench:
     """Controllers by conditions on one course.
 
     Attributes:
@@ -74,7 +74,7 @@ class Ladder:
     tilt_bound: float
     controllers: Mapping[str, str]
     conditions: Mapping[str, str]
-    flights: Mapping[tuple[str, str], LadderFlight]
+    flights: Mapping[tuple[str, str], MismatchFlight]
     machine: Mapping[str, Any]
 
     def to_json(self) -> dict[str, Any]:
@@ -94,12 +94,12 @@ TILT_TOLERANCE: Final = 0.05
 """How far beyond its bound tilt may be before a reader should notice [deg]; the paper scenarios' own tolerance."""
 
 
-def ladder_tables(ladder: Ladder) -> list[Grid]:
+def mismatch_tables(measured: MismatchBench) -> list[Grid]:
     """The tables of a ladder."""
-    bound = ladder.tilt_bound
+    bound = measured.tilt_bound
     return [
         _grid(
-            ladder,
+            measured,
             "end",
             "Distance from the reference at the end, m",
             _end,
@@ -107,29 +107,29 @@ def ladder_tables(ladder: Ladder) -> list[Grid]:
             f"{ASTRAY:g} m at the end. Bold: at most {ARRIVED:g} m.",
         ),
         _grid(
-            ladder,
+            measured,
             "tilt",
             f"Peak tilt at the physics rate, deg; the bound is {bound:g}",
             lambda flight: _tilt(flight, bound),
             "The larger of |roll| and |pitch|. Bold: within the bound, tolerance 0.",
         ),
         _grid(
-            ladder,
+            measured,
             "violated",
             f"Time with roll or pitch beyond {bound:g} deg, s",
             lambda flight: Cell(text=format_number(flight.violated)),
             "At the physics rate, tolerance 0.",
         ),
-        _grid(ladder, "rmse", "RMS tracking errors x, y, z, m", _rmse, "Against the filtered reference."),
+        _grid(measured, "rmse", "RMS tracking errors x, y, z, m", _rmse, "Against the filtered reference."),
         _grid(
-            ladder,
+            measured,
             "fallbacks",
             "Periods not flown by the controller's own optimum",
             lambda flight: Cell(text=str(flight.fallbacks), mark=Mark.WARN if flight.fallbacks else Mark.NONE),
             "By an earlier plan or, deeper, by level hover.",
         ),
         _grid(
-            ladder,
+            measured,
             "step",
             "99th percentile of the controller's step, ms",
             lambda flight: Cell(text=ABSENT if flight.step_p99 is None else f"{flight.step_p99:.2f}"),
@@ -139,42 +139,42 @@ def ladder_tables(ladder: Ladder) -> list[Grid]:
     ]
 
 
-def ladder_legend(ladder: Ladder) -> str:
+def mismatch_legend(measured: MismatchBench) -> str:
     """What controllers and conditions are, as Markdown lists."""
     lines = ["Controllers:", ""]
-    lines += [f"- **{name}**: {about}" for name, about in ladder.controllers.items()]
+    lines += [f"- **{name}**: {about}" for name, about in measured.controllers.items()]
     lines += ["", "Conditions:", ""]
-    lines += [f"- **{name}**: {about}" for name, about in ladder.conditions.items()]
+    lines += [f"- **{name}**: {about}" for name, about in measured.conditions.items()]
     return "\n".join(lines) + "\n"
 
 
-def _grid(ladder: Ladder, key: str, title: str, cell: Callable[[LadderFlight], Cell], note: str) -> Grid:
-    def shown(flight: LadderFlight) -> Cell:
+def _grid(measured: MismatchBench, key: str, title: str, cell: Callable[[MismatchFlight], Cell], note: str) -> Grid:
+    def shown(flight: MismatchFlight) -> Cell:
         return cell(flight) if flight.survived else Cell(text=flight.fate, mark=Mark.BAD)
 
     lines = tuple(
         (
             Cell(text=condition),
-            *(shown(ladder.flights[controller, condition]) for controller in ladder.controllers),
+            *(shown(measured.flights[controller, condition]) for controller in measured.controllers),
         )
-        for condition in ladder.conditions
+        for condition in measured.conditions
     )
-    return Grid(key=key, title=title, head=("", *ladder.controllers), lines=lines, note=note)
+    return Grid(key=key, title=title, head=("", *measured.controllers), lines=lines, note=note)
 
 
-def _end(flight: LadderFlight) -> Cell:
+def _end(flight: MismatchFlight) -> Cell:
     assert flight.end_error is not None
     mark = Mark.BEST if flight.end_error <= ARRIVED else Mark.WARN if flight.end_error > FAR else Mark.NONE
     return Cell(text=f"{flight.end_error:.3f}", mark=mark)
 
 
-def _tilt(flight: LadderFlight, bound: float) -> Cell:
+def _tilt(flight: MismatchFlight, bound: float) -> Cell:
     assert flight.peak_tilt is not None
     tilt = flight.peak_tilt
     mark = Mark.BEST if tilt <= bound else Mark.WARN if tilt > bound + TILT_TOLERANCE else Mark.NONE
     return Cell(text=f"{tilt:.3f}" if abs(tilt - bound) < 1.0 else f"{tilt:.1f}", mark=mark)
 
 
-def _rmse(flight: LadderFlight) -> Cell:
+def _rmse(flight: MismatchFlight) -> Cell:
     assert flight.rmse is not None
     return Cell(text=", ".join(f"{flight.rmse[axis]:.2f}" for axis in "xyz"))

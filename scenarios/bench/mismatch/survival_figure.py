@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Final
 
 from quadsim.report.figures.canvas import new_figure, write_drawings
 from quadsim.report.palette import BOUND
-from scenarios.bench.mismatch.survival import ARRIVED, FAR, Ladder, LadderFlight
+from scenarios.bench.mismatch.survival import ARRIVED, FAR, MismatchBench, MismatchFlight
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -26,18 +26,18 @@ class _Panel:
     """A number of each flight, and up to where it is good, and fair."""
 
     title: str
-    value: Callable[[LadderFlight], float | None]
+    value: Callable[[MismatchFlight], float | None]
     good: float
     fair: float
     digits: int
     unit: str
 
 
-def write_ladder_figure(ladder: Ladder, directory: Path) -> list[Path]:
+def write_mismatch_figure(measured: MismatchBench, directory: Path) -> list[Path]:
     """Draw what became of every controller in every condition.
 
     Args:
-        ladder: what was flown.
+        measured: what was flown.
         directory: where `ladder.png` and `ladder.svg` go; made when it is not there.
 
     Returns:
@@ -46,11 +46,11 @@ def write_ladder_figure(ladder: Ladder, directory: Path) -> list[Path]:
     Raises:
         OutputError: the directory cannot be written.
     """
-    return write_drawings({"ladder": lambda: _draw(ladder)}, directory)
+    return write_drawings({"ladder": lambda: _draw(measured)}, directory)
 
 
-def _draw(ladder: Ladder) -> Figure:
-    bound = ladder.tilt_bound
+def _draw(measured: MismatchBench) -> Figure:
+    bound = measured.tilt_bound
     panels = (
         _Panel(
             title="distance from the reference at the end [m]",
@@ -69,20 +69,20 @@ def _draw(ladder: Ladder) -> Figure:
             unit="deg",
         ),
     )
-    width = 2.6 + 0.62 * len(ladder.conditions)
-    height = 1.9 + 2 * 0.27 * len(ladder.controllers)
-    figure = new_figure(f"{ladder.scenario}: what each controller survives", max(width, 9.0), max(height, 3.4))
+    width = 2.6 + 0.62 * len(measured.conditions)
+    height = 1.9 + 2 * 0.27 * len(measured.controllers)
+    figure = new_figure(f"{measured.scenario}: what each controller survives", max(width, 9.0), max(height, 3.4))
     for axes, panel in zip(figure.subplots(len(panels), 1, sharex=True), panels, strict=True):
-        _draw_panel(axes, ladder, panel)
+        _draw_panel(axes, measured, panel)
     return figure
 
 
-def _draw_panel(axes: Axes, ladder: Ladder, panel: _Panel) -> None:
+def _draw_panel(axes: Axes, measured: MismatchBench, panel: _Panel) -> None:
     from matplotlib.patches import Rectangle
 
-    for row, controller in enumerate(ladder.controllers):
-        for column, condition in enumerate(ladder.conditions):
-            flight = ladder.flights[controller, condition]
+    for row, controller in enumerate(measured.controllers):
+        for column, condition in enumerate(measured.conditions):
+            flight = measured.flights[controller, condition]
             colour, text = _look(flight, panel)
             axes.add_patch(Rectangle((column, row), 1.0, 1.0, facecolor=colour, edgecolor="white", linewidth=1.2))
             axes.text(
@@ -94,11 +94,11 @@ def _draw_panel(axes: Axes, ladder: Ladder, panel: _Panel) -> None:
                 fontsize=7.5,
                 color="#1c1e21" if flight.survived else "white",
             )
-    axes.set_xlim(0.0, len(ladder.conditions))
-    axes.set_ylim(len(ladder.controllers), 0.0)
-    places = [column + 0.5 for column in range(len(ladder.conditions))]
-    axes.set_xticks(places, [_broken(name) for name in ladder.conditions], fontsize=7.5)
-    axes.set_yticks([row + 0.5 for row in range(len(ladder.controllers))], [*ladder.controllers], fontsize=8.5)
+    axes.set_xlim(0.0, len(measured.conditions))
+    axes.set_ylim(len(measured.controllers), 0.0)
+    places = [column + 0.5 for column in range(len(measured.conditions))]
+    axes.set_xticks(places, [_broken(name) for name in measured.conditions], fontsize=7.5)
+    axes.set_yticks([row + 0.5 for row in range(len(measured.controllers))], [*measured.controllers], fontsize=8.5)
     axes.tick_params(length=0.0)
     axes.grid(visible=False)
     axes.spines[:].set_visible(False)
@@ -113,7 +113,7 @@ def _draw_panel(axes: Axes, ladder: Ladder, panel: _Panel) -> None:
     axes.legend(keys, labels, loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=4, fontsize=8.0, handlelength=1.0)
 
 
-def _look(flight: LadderFlight, panel: _Panel) -> tuple[str, str]:
+def _look(flight: MismatchFlight, panel: _Panel) -> tuple[str, str]:
     """A cell's colour, and what stands in it."""
     value = panel.value(flight)
     if not flight.survived or value is None:

@@ -20,7 +20,7 @@ from quadsim.errors import MissingPackageError, ParameterError
 from scenarios.campaign.digests import code_digest
 from scenarios.campaign.engine.jobs import Jobs, read_jobs, submit
 from scenarios.campaign.engine.protocol import MOST_DEATHS, Answer, EngineError, Pace, Pilot, said
-from scenarios.campaign.engine.supervisor_process import Aside
+from scenarios.campaign.engine.supervisor_process import SupervisorProcess
 from scenarios.campaign.results.table import Row
 
 PATIENCE_S: Final = 60.0
@@ -126,18 +126,18 @@ def fly_chunk(pickled: bytes, chunk: Sequence[int], expected: Mapping[str, str])
     return answers
 
 
-_asides: dict[bytes, Aside] = {}
+_asides: dict[bytes, SupervisorProcess] = {}
 """Of this worker: one at most, of the campaign that it flies."""
 
 
-def _aside(pickled: bytes) -> Aside:
+def _aside(pickled: bytes) -> SupervisorProcess:
     """What a worker starts once for a campaign; an earlier one's is ended."""
     if pickled not in _asides:
         pilot: Pilot = pickle.loads(pickled)
         for other in _asides.values():
             other.stop()
         _asides.clear()
-        _asides[pickled] = Aside(pilot, pickled)
+        _asides[pickled] = SupervisorProcess(pilot, pickled)
     return _asides[pickled]
 
 

@@ -37,9 +37,9 @@ _SETTLED: Final = "scenarios.campaign.engine.preload"
 """To be loaded by the server that forks the workers, and by no other process."""
 _MOST_STARTS: Final = 5
 _SILENCE_S: Final = 1.0
-"""After which keepers are looked at: one that was stopped would keep silent for ever [s]."""
+"""After which supervisors are looked at: one that was stopped would keep silent for ever [s]."""
 _LEAVING_S: Final = 8.0
-"""For a keeper to end everybody whom it keeps [s]."""
+"""For a supervisor to end everybody whom it keeps [s]."""
 _UNKNOWN: Final = 255
 """The exit code of a process whose server died, which would have told."""
 
@@ -76,7 +76,7 @@ class LocalEngine:
 
 
 @dataclass(eq=False)
-class _Keeper:
+class _Supervisor:
     """A process, and what it has been handed and not answered; the first of it is being flown.
 
     One whose server died is orphaned: it flies what it has, and is replaced.
@@ -118,7 +118,7 @@ class _Crew:
         self._pilot, self._size = pilot, size
         self._pickled = pickle.dumps(pilot)
         self._waiting, self._unanswered = deque(flights), len(flights)
-        self._keepers: list[_Keeper] = []
+        self._keepers: list[_Supervisor] = []
         self._deaths: Counter[int] = Counter()
         self._failed_starts = 0
         self._pace = Pace()
@@ -135,22 +135,22 @@ class _Crew:
 
     def dismiss(self) -> None:
         """Stop everybody at once."""
-        for keeper in self._keepers:
-            keeper.dismiss()
-        for keeper in self._keepers:
-            keeper.ending()
+        for supervisor in self._keepers:
+            supervisor.dismiss()
+        for supervisor in self._keepers:
+            supervisor.ending()
         self._keepers.clear()
 
     def _employ(self) -> None:
         """See that there are as many workers as can be used, and that all have work."""
-        for keeper in [each for each in self._keepers if each.orphaned and not each.flights]:
-            self._keepers.remove(keeper)
-            keeper.dismiss()
-            keeper.ending()
+        for supervisor in [each for each in self._keepers if each.orphaned and not each.flights]:
+            self._keepers.remove(supervisor)
+            supervisor.dismiss()
+            supervisor.ending()
         while len(self._keepers) < min(self._size, self._unanswered):
             self._hire()
-        for keeper in self._keepers:
-            self._feed(keeper)
+        for supervisor in self._keepers:
+            self._feed(supervisor)
 
     def _hire(self) -> None:
         for start in range(_MOST_STARTS):
@@ -159,7 +159,7 @@ class _Crew:
             try:
                 with _undisturbed():
                     process.start()
-                    self._keepers.append(_Keeper(process, ours, process.pid or 0))
+                    self._keepers.append(_Supervisor(process, ours, process.pid or 0))
             except (OSError, EOFError) as error:  # the server was killed just now; the next start makes a new one
                 ours.close()
                 problem = error
@@ -170,69 +170,69 @@ class _Crew:
             with contextlib.suppress(OSError):  # it is dead already, which its pipe will tell
                 ours.send_bytes(self._pickled)
             return
-        raise EngineError(f"no keeper process can be started here ({type(problem).__name__}: {problem})")
+        raise EngineError(f"no supervisor process can be started here ({type(problem).__name__}: {problem})")
 
     def _hear(self) -> list[Row]:
         """Wait until somebody says something or dies; everything that is said then."""
-        pipes = [keeper.pipe for keeper in self._keepers]
-        sentinels = [keeper.process.sentinel for keeper in self._keepers if not keeper.orphaned]
+        pipes = [supervisor.pipe for supervisor in self._keepers]
+        sentinels = [supervisor.process.sentinel for supervisor in self._keepers if not supervisor.orphaned]
         heard = connection.wait([*pipes, *sentinels], timeout=_SILENCE_S)
         rows: list[Row] = []
         if not heard:
-            for keeper in [each for each in self._keepers if is_stopped(each.pid)]:
-                rows += self._bury(keeper)
-        for keeper in list(self._keepers):
-            keeper.orphaned |= keeper.process.sentinel in heard
-            if keeper.pipe in heard:
-                rows += self._listen(keeper)
+            for supervisor in [each for each in self._keepers if is_stopped(each.pid)]:
+                rows += self._bury(supervisor)
+        for supervisor in list(self._keepers):
+            supervisor.orphaned |= supervisor.process.sentinel in heard
+            if supervisor.pipe in heard:
+                rows += self._listen(supervisor)
         return rows
 
-    def _listen(self, keeper: _Keeper) -> list[Row]:
+    def _listen(self, supervisor: _Supervisor) -> list[Row]:
         rows: list[Row] = []
         try:
-            while keeper.pipe.poll():
-                match keeper.pipe.recv():
-                    case Answer() as answer if keeper.flights and answer.row["flight"] == keeper.flights[0]:
-                        keeper.flights.popleft()
+            while supervisor.pipe.poll():
+                match supervisor.pipe.recv():
+                    case Answer() as answer if supervisor.flights and answer.row["flight"] == supervisor.flights[0]:
+                        supervisor.flights.popleft()
                         self._pace.note(answer)
                         rows.append(answer.row)
-                    case Fell(ending) if keeper.flights:
-                        rows += self._again_or_lost(keeper.flights.popleft(), ending)
+                    case Fell(ending) if supervisor.flights:
+                        rows += self._again_or_lost(supervisor.flights.popleft(), ending)
                     case Unfit(reason):
                         raise EngineError(f"a worker process cannot fly here: {reason}")
                     case Ready():
-                        keeper.ready, self._failed_starts = True, 0
+                        supervisor.ready, self._failed_starts = True, 0
                     case _:  # what nobody asked for
-                        return rows + self._bury(keeper)
+                        return rows + self._bury(supervisor)
         except (EOFError, OSError):
-            return rows + self._bury(keeper)
+            return rows + self._bury(supervisor)
         return rows
 
-    def _feed(self, keeper: _Keeper) -> None:
-        """Hand out more, unless the keeper has enough or there is nothing left."""
+    def _feed(self, supervisor: _Supervisor) -> None:
+        """Hand out more, unless the supervisor has enough or there is nothing left."""
         waiting = len(self._waiting)
         enough = min(self._pace.flights_in(_AHEAD_S), fair_share(waiting, self._size))
-        if keeper.orphaned or not keeper.ready or not waiting or len(keeper.flights) > enough:
+        if supervisor.orphaned or not supervisor.ready or not waiting or len(supervisor.flights) > enough:
             return
         chunk = [self._waiting.popleft() for _ in range(min(waiting, self._pace.chunk(waiting, self._size)))]
-        keeper.flights.extend(chunk)
+        supervisor.flights.extend(chunk)
         with contextlib.suppress(OSError):  # as in `_hire`
-            keeper.pipe.send(chunk)
+            supervisor.pipe.send(chunk)
 
-    def _bury(self, keeper: _Keeper) -> list[Row]:
-        """Take a dead keeper's flights back; it may be the first of them that it died of."""
-        self._keepers.remove(keeper)
-        keeper.process.kill()
-        ending = keeper.ending()
-        end_session(keeper.pid)  # it had no time for that
+    def _bury(self, supervisor: _Supervisor) -> list[Row]:
+        """Take a dead supervisor's flights back; it may be the first of them that it died of."""
+        self._keepers.remove(supervisor)
+        supervisor.process.kill()
+        ending = supervisor.ending()
+        end_session(supervisor.pid)  # it had no time for that
         rows: list[Row] = []
-        if keeper.flights:
-            rows += self._again_or_lost(keeper.flights.popleft(), ending)
-        elif not keeper.ready:
+        if supervisor.flights:
+            rows += self._again_or_lost(supervisor.flights.popleft(), ending)
+        elif not supervisor.ready:
             self._failed_starts += 1
             if self._failed_starts == _MOST_STARTS:
                 raise EngineError(f"{_MOST_STARTS} worker processes died while they started, the last {ending}")
-        self._waiting.extendleft(reversed(keeper.flights))
+        self._waiting.extendleft(reversed(supervisor.flights))
         return rows
 
     def _again_or_lost(self, flight: int, ending: str) -> list[Row]:

@@ -1,7 +1,7 @@
 """A process that starts a worker, hands it flights, watches it from outside and ends it with all that it started.
 
 No controller ever runs in it: whatever one does, hang with the interpreter held, fork, take all memory, block signals,
-it does to the worker, which the keeper replaces.  It leaves when its parent does, and nobody stays behind.
+it does to the worker, which the supervisor replaces.  It leaves when its parent does, and nobody stays behind.
 """
 
 from __future__ import annotations
@@ -46,13 +46,13 @@ class Unfit(NamedTuple):
 
 
 class Fell(NamedTuple):
-    """The worker died while it flew the first of the flights that the keeper had, which it does not try again."""
+    """The worker died while it flew the first of the flights that the supervisor had, which it does not try again."""
 
     ending: str
 
 
 Said = Ready | Unfit | Fell | Answer
-"""What a keeper tells its parent."""
+"""What a supervisor tells its parent."""
 
 
 def serve(pipe: Connection, folder: str) -> None:
@@ -80,7 +80,7 @@ def serve(pipe: Connection, folder: str) -> None:
         except Exception as error:
             return pipe.send(Unfit(said(error)))
         settle()
-        _Keeper(pilot, pipe).keep()
+        _Supervisor(pilot, pipe).keep()
     return None
 
 
@@ -88,7 +88,7 @@ class _Worker:
     """A process that flies, and the ends of the pipes to it."""
 
     def __init__(self, pilot: Pilot, pulse: mmap, parents: Connection) -> None:
-        keeper = os.getpid()
+        supervisor = os.getpid()
         inbox, self._inbox = os.pipe()
         self.outbox, outbox = os.pipe()
         self.pid = os.fork()
@@ -97,7 +97,7 @@ class _Worker:
                 parents.close()
                 os.close(self._inbox)
                 os.close(self.outbox)
-                fly_for(keeper, pilot, inbox, outbox, pulse)
+                fly_for(supervisor, pilot, inbox, outbox, pulse)
             finally:
                 os._exit(1)
         os.close(inbox)
@@ -105,7 +105,7 @@ class _Worker:
         self._heard = b""
 
     def hand(self, flight: int) -> None:
-        with contextlib.suppress(BrokenPipeError):  # it is dead already, which its keeper will see
+        with contextlib.suppress(BrokenPipeError):  # it is dead already, which its supervisor will see
             os.write(self._inbox, FLIGHT.pack(flight))
 
     def hear(self) -> Told | None:
@@ -155,7 +155,7 @@ class _Worker:
         end_children(self.pid)
 
 
-class _Keeper:
+class _Supervisor:
     def __init__(self, pilot: Pilot, pipe: Connection) -> None:
         self._pilot, self._pipe, self._limits = pilot, pipe, pilot.limits
         self._pulse = mmap(-1, PULSE_BYTES)

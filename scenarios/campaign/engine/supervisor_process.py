@@ -1,4 +1,4 @@
-"""A keeper as a process of its own, for a Dask worker, which has threads and so may not fork."""
+"""A supervisor as a process of its own, for a Dask worker, which has threads and so may not fork."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _MAIN: Final = (
 )
 
 
-class Aside:
+class SupervisorProcess:
     """Flies one flight at a time beside this process; whoever dies of it is replaced.
 
     Args:
@@ -59,7 +59,7 @@ class Aside:
         return Answer(self._pilot.lost(flight, reason), 0.0)
 
     def stop(self) -> None:
-        """End the keeper, which ends everybody whom it keeps."""
+        """End the supervisor, which ends everybody whom it keeps."""
         if self._pipe is not None and self._process is not None:
             self._pipe.close()
             self._process.wait()

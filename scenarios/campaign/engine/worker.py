@@ -1,4 +1,4 @@
-"""A process that flies what its keeper hands it, and says what came of each flight."""
+"""A process that flies what its supervisor hands it, and says what came of each flight."""
 
 from __future__ import annotations
 
@@ -109,7 +109,7 @@ def _rounding() -> tuple[float, ...]:
 
 
 FLIGHT: Final = struct.Struct("=q")
-"""A flight's number, as a keeper hands it out."""
+"""A flight's number, as a supervisor hands it out."""
 SIZE: Final = struct.Struct("=Q")
 """Of what follows, a pickled `Told` [bytes]."""
 PULSE_BYTES: Final = 8
@@ -127,18 +127,18 @@ class Told(NamedTuple):
     spent: bool
 
 
-def fly_for(keeper: int, pilot: Pilot, inbox: int, outbox: int, pulse: mmap) -> NoReturn:
+def fly_for(supervisor: int, pilot: Pilot, inbox: int, outbox: int, pulse: mmap) -> NoReturn:
     """Fly until somebody ends this process.
 
     Args:
-        keeper: the process that this one was forked from, and is not to outlive.
+        supervisor: the process that this one was forked from, and is not to outlive.
         pilot: flies.
         inbox: file descriptor that flights are read from.
         outbox: file descriptor that takes what is said.
-        pulse: shared with the keeper: 0 outside of control periods, else a number that changes with each.
+        pulse: shared with the supervisor: 0 outside of control periods, else a number that changes with each.
     """
     os.setpgid(0, 0)  # so that all that a controller starts can be ended in one stroke
-    die_with(keeper)
+    die_with(supervisor)
     os.dup2(2, 1)  # what controllers print is no part of a campaign's answer
     limit_memory(pilot.limits.memory)
     pilot.prepare()

@@ -20,12 +20,12 @@ from quadsim.report.film.video import rendering_backend, worker_count
 from scenarios.bench.bench_results import Growth, RenderProfile, SolverBench
 from scenarios.bench.bench_tables import flight_tables, render_tables, solver_tables
 from scenarios.bench.campaigns import bench_campaign, campaign_tables
-from scenarios.bench.candidates import Entry, StepEntrant, entries, judge, reference_optima
+from scenarios.bench.candidates import Entry, StepCandidate, entries, judge, reference_optima
 from scenarios.bench.flight import bench_flight
 from scenarios.bench.queries import flight_between, recorded
 from scenarios.bench.solvers import bench_solvers
 from scenarios.bench.targets import solver_targets
-from scenarios.bench.timing import race, stretches
+from scenarios.bench.timing import stretches, time_in_turns
 from scenarios.build import build_problem
 from scenarios.cli import main
 from scenarios.commands import EXIT_DONE, EXIT_WRONG_INPUT
@@ -64,7 +64,7 @@ def bench() -> SolverBench:
 
 def test_turns_are_random_and_every_question_is_put_to_all() -> None:
     diary: list[tuple[str, int]] = []
-    laps = race(
+    laps = time_in_turns(
         {name: Answering(name, diary) for name in "abc"},
         stretches(100, 1),
         between=lambda: None,
@@ -88,12 +88,14 @@ def test_stretches_cover_a_flight_or_an_even_part_of_it() -> None:
 
 def test_slow_entrants_race_once_and_hopeless_ones_leave() -> None:
     diary: list[tuple[str, int]] = []
-    entrants = {"quick": Answering("quick", diary), "slow": Answering("slow", diary, 0.002)}
+    candidates = {"quick": Answering("quick", diary), "slow": Answering("slow", diary, 0.002)}
     rng = np.random.default_rng(0)
-    once = race(entrants, [range(10)], between=lambda: None, repeats=3, rng=rng, longest_pass=0.01)
+    once = time_in_turns(candidates, [range(10)], between=lambda: None, repeats=3, rng=rng, longest_pass=0.01)
     assert (once["quick"].ms.shape[0], once["slow"].ms.shape[0]) == (3, 1)
     assert once["slow"].ms.min() >= 2.0
-    assert list(race(entrants, [range(10)], between=lambda: None, repeats=2, rng=rng, patience=0.01)) == ["quick"]
+    assert list(time_in_turns(candidates, [range(10)], between=lambda: None, repeats=2, rng=rng, patience=0.01)) == [
+        "quick"
+    ]
 
 
 def test_a_flight_goes_on_between_questions_and_is_not_timed() -> None:
@@ -109,7 +111,9 @@ def test_a_flight_goes_on_between_questions_and_is_not_timed() -> None:
         diary.append(("between", -1))
         clock.sleep(0.02)
 
-    laps = race({"a": Noted("a", diary)}, [range(3)], between=between, repeats=3, rng=np.random.default_rng(0))["a"]
+    laps = time_in_turns(
+        {"a": Noted("a", diary)}, [range(3)], between=between, repeats=3, rng=np.random.default_rng(0)
+    )["a"]
     assert [name for name, _ in diary[2:]][:6] == ["a", "between", "answer"] * 2
     assert [name for name, _ in diary].count("between") == 9
     assert 1.0 <= laps.ms.min() < 20.0
@@ -144,28 +148,28 @@ def test_a_time_stands_in_all_tables_once(bench: SolverBench) -> None:
 
 
 def test_the_median_of_the_repeats_and_the_longest_of_all(bench: SolverBench) -> None:
-    for contender in bench.contenders:
-        assert contender.step_ms.shape == (60,)
-        assert contender.raw_max_ms >= contender.quantiles["max"] >= contender.quantiles["p50"] > 0.0
-        assert contender.repeats == 2
+    for candidate in bench.contenders:
+        assert candidate.step_ms.shape == (60,)
+        assert candidate.raw_max_ms >= candidate.quantiles["max"] >= candidate.quantiles["p50"] > 0.0
+        assert candidate.repeats == 2
 
 
 def test_contenders_are_the_default_each_solver_alone_and_daqp_both_ways(bench: SolverBench) -> None:
-    names = [contender.name for contender in bench.contenders]
+    names = [candidate.name for candidate in bench.contenders]
     assert names == ["piqp-multistage + shortcut", "piqp-multistage", "daqp", "daqp + shortcut"]
-    assert [sum(contender.statuses.values()) for contender in bench.contenders] == [60] * 4
+    assert [sum(candidate.statuses.values()) for candidate in bench.contenders] == [60] * 4
     assert bench.contenders[1].statuses == {"solved": 60}
     assert bench.default.statuses.keys() <= {"solved", "unconstrained"}
 
 
 def test_answers_are_judged_by_an_optimum_in_closed_form(bench: SolverBench) -> None:
     assert bench.reference_kkt < 1e-6
-    for contender in bench.contenders:
-        assert contender.failures == 0
-        assert contender.input_error is not None
-        assert contender.input_error < (1e-6 if contender.solver == "daqp" else 5e-3)
-        assert contender.kkt is not None
-        assert contender.kkt < 1e-3
+    for candidate in bench.contenders:
+        assert candidate.failures == 0
+        assert candidate.input_error is not None
+        assert candidate.input_error < (1e-6 if candidate.solver == "daqp" else 5e-3)
+        assert candidate.kkt is not None
+        assert candidate.kkt < 1e-3
 
 
 def test_wrong_answers_and_failures_are_seen(constrained_flight: Flight) -> None:
@@ -174,20 +178,20 @@ def test_wrong_answers_and_failures_are_seen(constrained_flight: Flight) -> None
     queries = recorded(scenario, constrained_flight.log.control, problem.horizon)
     periods = range(4)
     reference = reference_optima(problem, queries, periods)
-    entrant = StepEntrant(entries("piqp-multistage", ["daqp"])[1], problem, queries)
+    candidate = StepCandidate(entries("piqp-multistage", ["daqp"])[1], problem, queries)
     for period in periods:
-        entrant.prepare(period)
-        entrant.answer()
-    assert judge(entrant, queries, periods, reference).failures == 0
+        candidate.prepare(period)
+        candidate.answer()
+    assert judge(candidate, queries, periods, reference).failures == 0
 
-    command, answer = entrant.answers[1]
+    command, answer = candidate.answers[1]
     assert command is not None
     assert answer is not None
-    entrant.answers[1] = (replace(command, speeds=command.speeds + 1.0), answer)
+    candidate.answers[1] = (replace(command, speeds=command.speeds + 1.0), answer)
     off = replace(answer, solution=replace(answer.solution, x=answer.solution.x + 1.0))
-    entrant.answers[2] = (entrant.answers[2][0], off)
-    entrant.answers[3] = (None, replace(answer, solution=replace(answer.solution, status="numerics")))
-    verdict = judge(entrant, queries, periods, reference)
+    candidate.answers[2] = (candidate.answers[2][0], off)
+    candidate.answers[3] = (None, replace(answer, solution=replace(answer.solution, status="numerics")))
+    verdict = judge(candidate, queries, periods, reference)
     assert verdict.input_error == pytest.approx(1.0, abs=1e-3)
     assert verdict.kkt is not None
     assert verdict.kkt > 0.5
@@ -203,10 +207,10 @@ def test_growth_is_fitted_over_the_long_horizons() -> None:
 
 
 def test_growth_covers_all_contenders_and_horizons(bench: SolverBench) -> None:
-    assert {growth.name for growth in bench.growth} == {contender.name for contender in bench.contenders}
-    for contender in bench.contenders:
-        kinds = {growth.kind for growth in bench.growth if growth.name == contender.name}
-        assert kinds <= (set(Way) if contender.shortcut else {""})
+    assert {growth.name for growth in bench.growth} == {candidate.name for candidate in bench.contenders}
+    for candidate in bench.contenders:
+        kinds = {growth.kind for growth in bench.growth if growth.name == candidate.name}
+        assert kinds <= (set(Way) if candidate.shortcut else {""})
     for growth in bench.growth:
         assert growth.horizons == (5, 20, 24, 30)
         assert all(0.0 < p50 <= p99 for p50, p99 in zip(growth.p50, growth.p99, strict=True))
@@ -270,7 +274,7 @@ def test_a_solver_that_is_not_installed_is_named_and_left_out(monkeypatch: pytes
     scenario = load_scenario("paper-constrained", ["duration=1.0", "controller.horizon=5"])
     found = bench_solvers(scenario, repeats=1, horizons=(), solvers=("piqp-dense", "qpoases"))
     assert found.left_out == {"qpoases": "not installed: pip install 'quadsim[solvers]'"}
-    assert {contender.solver for contender in found.contenders} == {"piqp-multistage", "piqp-dense"}
+    assert {candidate.solver for candidate in found.contenders} == {"piqp-multistage", "piqp-dense"}
     assert "Left out: qpoases, not installed" in solver_tables(found)[0].note
     assert found.growth == ()
 

@@ -20,15 +20,15 @@ from quadsim.report.table import Mark
 from scenarios.bench.mismatch.benchmark import (
     Cell,
     answer_all,
-    climb,
     fly_cell,
-    ladder_markdown,
+    mismatch_markdown,
+    run_mismatch,
     time_cell,
-    write_ladder,
+    write_mismatch,
 )
 from scenarios.bench.mismatch.conditions import CONDITIONS
-from scenarios.bench.mismatch.controllers import CLIMBERS, FULL, equip, tilt_bound
-from scenarios.bench.mismatch.survival import Ladder, LadderFlight, ladder_legend, ladder_tables
+from scenarios.bench.mismatch.controllers import FULL, VARIANTS, equip, tilt_bound
+from scenarios.bench.mismatch.survival import MismatchBench, MismatchFlight, mismatch_legend, mismatch_tables
 from scenarios.cli import main
 from scenarios.commands import EXIT_DONE, EXIT_WRONG_INPUT
 from scenarios.loading import load_scenario
@@ -37,7 +37,7 @@ from scenarios.schema.robust import RobustSpec
 
 SHORT = ("duration=1.0", "controller.horizon=10")
 FILES = {"ladder.json", "ladder.md", "ladder.png", "ladder.svg"}
-WELL = LadderFlight(
+WELL = MismatchFlight(
     reason=None,
     flown=60.0,
     rmse={"x": 0.5, "y": 0.25, "z": 1.0},
@@ -53,14 +53,14 @@ def cell(controller: str, condition: str, *settings: str) -> Cell:
     return Cell(scenario="paper-constrained", settings=settings, controller=controller, condition=condition)
 
 
-def made_up() -> Ladder:
+def made_up() -> MismatchBench:
     flights = {
         ("a", "calm"): WELL,
         ("a", "storm"): replace(WELL, reason="diverged", flown=12.6, end_error=None, peak_tilt=None, rmse=None),
         ("b", "calm"): replace(WELL, end_error=0.8, peak_tilt=5.3, violated=0.25, fallbacks=3),
         ("b", "storm"): replace(WELL, end_error=300.0),
     }
-    return Ladder(
+    return MismatchBench(
         scenario="paper-constrained",
         duration=60.0,
         tilt_bound=5.0,
@@ -87,7 +87,7 @@ def test_survival_is_judged_as_told(changes: dict[str, object], survived: bool, 
 
 
 def test_tables_show_each_flight_where_it_belongs() -> None:
-    tables = {grid.key: grid for grid in ladder_tables(made_up())}
+    tables = {grid.key: grid for grid in mismatch_tables(made_up())}
     assert tables["end"].head == ("", "a", "b")
     texts = {key: [[each.text for each in line] for line in grid.lines] for key, grid in tables.items()}
     assert texts["end"] == [["calm", "0.010", "0.800"], ["storm", "lost, 13 s", "astray"]]
@@ -98,7 +98,7 @@ def test_tables_show_each_flight_where_it_belongs() -> None:
     marks = [each.mark for line in tables["end"].lines for each in line[1:]]
     assert marks == [Mark.BEST, Mark.WARN, Mark.BAD, Mark.BAD]
     assert [each.mark for each in tables["tilt"].lines[0][1:]] == [Mark.BEST, Mark.WARN]
-    assert "- **b**: another" in ladder_legend(made_up())
+    assert "- **b**: another" in mismatch_legend(made_up())
 
 
 @pytest.mark.parametrize("condition", CONDITIONS)
@@ -111,7 +111,7 @@ def test_every_condition_flies_with_the_whole_controller(condition: str) -> None
     assert found.flown == duration
 
 
-@pytest.mark.parametrize("controller", CLIMBERS)
+@pytest.mark.parametrize("controller", VARIANTS)
 def test_every_controller_flies(controller: str) -> None:
     found = fly_cell(cell(controller, "delay 20 ms", *SHORT))
     assert found.survived
@@ -181,11 +181,11 @@ def test_a_lost_first_period_has_no_numbers() -> None:
 
 
 @pytest.fixture(scope="module")
-def quick() -> Ladder:
-    return climb(settings=["controller.horizon=10"], quick=True, workers=2)
+def quick() -> MismatchBench:
+    return run_mismatch(settings=["controller.horizon=10"], quick=True, workers=2)
 
 
-def test_results_do_not_depend_on_processes(quick: Ladder) -> None:
+def test_results_do_not_depend_on_processes(quick: MismatchBench) -> None:
     name = ("PID", "mass +30 %")
     alone = fly_cell(cell(*name, "controller.horizon=10", "duration=12.0"))
     assert replace(quick.flights[name], step_p99=None) == replace(alone, step_p99=None)
@@ -202,14 +202,14 @@ def test_steps_are_timed_of_the_full_controller_and_in_the_first_condition(monke
         return [float(workers or 0) for _ in cells] if ask is time_cell else [WELL for _ in cells]
 
     monkeypatch.setattr("scenarios.bench.mismatch.benchmark.answer_all", answer)
-    ladder = climb(workers=2)
-    assert asked == [(2, len(CLIMBERS) * len(CONDITIONS)), (1, len(CLIMBERS) + len(CONDITIONS) - 1)]
-    for (controller, condition), flight in ladder.flights.items():
+    measured = run_mismatch(workers=2)
+    assert asked == [(2, len(VARIANTS) * len(CONDITIONS)), (1, len(VARIANTS) + len(CONDITIONS) - 1)]
+    for (controller, condition), flight in measured.flights.items():
         assert flight.step_p99 == (1.0 if controller == FULL or condition == "nominal" else None)
 
 
-def test_a_ladder_is_written_whole_and_the_same_each_time(quick: Ladder, tmp_path: Path) -> None:
-    write_ladder(quick, tmp_path)
+def test_a_ladder_is_written_whole_and_the_same_each_time(quick: MismatchBench, tmp_path: Path) -> None:
+    write_mismatch(quick, tmp_path)
     assert {path.name for path in tmp_path.iterdir()} == FILES
     data = json.loads((tmp_path / "ladder.json").read_text())
     assert data["format"] == "quadsim bench ladder"
@@ -217,25 +217,25 @@ def test_a_ladder_is_written_whole_and_the_same_each_time(quick: Ladder, tmp_pat
     drawing = (tmp_path / "ladder.svg").read_text()
     assert ">+ offset-free<" in drawing
     assert ">lost<" in drawing
-    assert (tmp_path / "ladder.md").read_text() == ladder_markdown(quick)
+    assert (tmp_path / "ladder.md").read_text() == mismatch_markdown(quick)
     first = drawing
     (tmp_path / "again").mkdir()
-    write_ladder(quick, tmp_path / "again")
+    write_mismatch(quick, tmp_path / "again")
     assert (tmp_path / "again" / "ladder.svg").read_text() == first
 
 
 def test_the_figure_of_a_made_up_ladder_tells_each_fate(tmp_path: Path) -> None:
-    write_ladder(made_up(), tmp_path)
+    write_mismatch(made_up(), tmp_path)
     drawing = (tmp_path / "ladder.svg").read_text()
     for text in ("0.01", "0.80", "13 s", "astray", "4.90", "5.30"):
         assert f">{text}<" in drawing
 
 
 def test_the_page_says_what_is_met_and_what_is_not() -> None:
-    ladder = replace(made_up(), controllers={FULL: "full"}, conditions={"nominal": "", "wind 3 m/s": ""})
+    measured = replace(made_up(), controllers={FULL: "full"}, conditions={"nominal": "", "wind 3 m/s": ""})
     tilted = replace(WELL, peak_tilt=5.2, violated=0.1, end_error=0.4, step_p99=7.0)
-    ladder = replace(ladder, flights={(FULL, "nominal"): WELL, (FULL, "wind 3 m/s"): tilted})
-    told = [line[1].text for line in make_robustness.asked(ladder).lines]
+    measured = replace(measured, flights={(FULL, "nominal"): WELL, (FULL, "wind 3 m/s"): tilted})
+    told = [line[1].text for line in make_robustness.asked(measured).lines]
     assert told == ["in all 2", "in all 1", "not in: wind 3 m/s", "not in: wind 3 m/s"]
     fault = fault_injection.faults()[0]
     injection = fault_injection.Injection(controller="paper", fault=fault, start=3.0)
@@ -243,14 +243,14 @@ def test_the_page_says_what_is_met_and_what_is_not() -> None:
         injection=injection, reason=None, finite=True, within=True, fallback=1, furthest=0.2, back=10.5
     )
     windy = replace(injection, start=4.5, condition="wind 3 m/s")
-    page = make_robustness.page(ladder, [found, replace(found, injection=windy, back=4.0)])
+    page = make_robustness.page(measured, [found, replace(found, injection=windy, back=4.0)])
     assert "1 of 2 are harmless" in page
     assert f"| {fault.name} | 3.00 (nominal), 4.50 (wind 3 m/s) | 1 of 2 | 1 | 0.2000 | 10.50 |" in page
 
 
 def test_a_scenario_without_such_bounds_is_refused() -> None:
     with pytest.raises(InputError, match=r"paper-unconstrained: the ladder needs a constrained controller whose"):
-        climb("paper-unconstrained", quick=True)
+        run_mismatch("paper-unconstrained", quick=True)
     with pytest.raises(InputError, match="are the same, as paper-constrained has"):
         tilt_bound(load_scenario("paper-constrained", ["controller.output_bounds.roll=[-4.0, 5.0]"]))
     assert tilt_bound(load_scenario("paper-constrained")) == 5.0
@@ -258,7 +258,7 @@ def test_a_scenario_without_such_bounds_is_refused() -> None:
 
 def test_a_number_of_processes_that_is_none_is_refused() -> None:
     with pytest.raises(ParameterError, match=r"--workers must be at least 1; got 0"):
-        climb(workers=0)
+        run_mismatch(workers=0)
 
 
 def test_the_command_refuses_and_leaves_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -269,9 +269,9 @@ def test_the_command_refuses_and_leaves_nothing(tmp_path: Path, capsys: pytest.C
 
 
 def test_the_command_prints_json_alone(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, quick: Ladder
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, quick: MismatchBench
 ) -> None:
-    monkeypatch.setattr("scenarios.bench.mismatch.benchmark.climb", lambda *arguments, **options: quick)
+    monkeypatch.setattr("scenarios.bench.mismatch.benchmark.run_mismatch", lambda *arguments, **options: quick)
     assert main(["bench", "ladder", "--quick", "--json", "--out", str(tmp_path / "ladder")]) == EXIT_DONE
     printed = json.loads(capsys.readouterr().out)
     assert len(printed["flights"]) == 9

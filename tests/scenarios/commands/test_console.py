@@ -20,7 +20,7 @@ from scenarios.cli import main
 from scenarios.commands import EXIT_DONE, EXIT_WRONG_INPUT, campaign_console, console
 from scenarios.commands.console import stdout, styled
 from scenarios.commands.junit import write_cases
-from scenarios.parts.plugin import OwnController
+from scenarios.parts.plugin import PluginController
 from tests.safety_mutations import unseal
 
 TABLES = ("--no-video", "--no-recording", "--no-figures")
@@ -153,7 +153,7 @@ def test_a_controller_of_ones_own_names_itself_as_text(nasty: str) -> None:
         def step(self, now: Moment, state: Array, reference: Array) -> Command:
             return Command(speeds=state[:4], plan=reference[:1], status=nasty)
 
-    law = OwnController(Law(), horizon=1)
+    law = PluginController(Law(), horizon=1)
     assert law.name == law.solver == printable(nasty)
 
 

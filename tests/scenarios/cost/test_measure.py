@@ -14,7 +14,7 @@ from quadsim.controller import Moment
 from quadsim.errors import InputError, MissingPackageError
 from quadsim.flight import rundir
 from quadsim.flight.metrics import percentiles
-from scenarios.bench.queries import Asked, recorded
+from scenarios.bench.queries import QueriedController, recorded
 from scenarios.build import build_controller
 from scenarios.cli import main
 from scenarios.commands import EXIT_DONE, EXIT_WRONG_INPUT
@@ -129,10 +129,10 @@ def test_variations_change_the_vehicle(study: CostStudy) -> None:
 
 def test_contenders_answer_what_was_asked_in_flight(study: CostStudy) -> None:
     gain, flown, dense = study.contenders
-    assert [contender.name for contender in study.contenders] == [
+    assert [candidate.name for candidate in study.contenders] == [
         *("unconstrained gain", "constrained, as flown", "QP by piqp-dense"),
     ]
-    assert {contender.step_ms.size for contender in study.contenders} == {80}
+    assert {candidate.step_ms.size for candidate in study.contenders} == {80}
     assert 0 < flown.shortcut.sum() < 80
     assert int(flown.shortcut.sum()) == study.constrained.statuses["unconstrained"]
     assert not gain.shortcut.any()
@@ -150,7 +150,7 @@ def test_a_replay_gives_the_commands_of_the_flight() -> None:
         controller.reset(queries.speeds_before[k])
         command = controller.step(Moment(time=queries.t[k]), queries.state[k], queries.reference[k + 1 : k + 11])
         np.testing.assert_allclose(command.speeds, flight.log.control.speeds[k], atol=1e-6)
-    asked = Asked(controller, queries)
+    asked = QueriedController(controller, queries)
     for k in range(80):
         asked.prepare(k)
         asked.answer()
@@ -162,7 +162,7 @@ def test_a_time_stands_in_a_study_once(study: CostStudy) -> None:
     flown = percentiles(study.contenders[1].step_ms)
     assert study.tilt.points[1].step_ms == study.horizons.points[1].step_ms == flown
     few = {**SMALL, "tilts": (), "horizons": (), "arm_lengths": ()}
-    given = [replace(contender, step_ms=2.0 * contender.step_ms) for contender in study.contenders]
+    given = [replace(candidate, step_ms=2.0 * candidate.step_ms) for candidate in study.contenders]
     again = study_cost(scenario(), workers=1, timed=given, **few)
     np.testing.assert_array_equal(again.contenders[2].step_ms, 2.0 * study.contenders[2].step_ms)
     assert again.tilt.points[0].step_ms == percentiles(given[1].step_ms)
@@ -172,7 +172,7 @@ def test_a_solver_that_is_not_installed_is_named_and_left_out(monkeypatch: pytes
     monkeypatch.setattr(type(SOLVERS["qpoases"]), "installed", property(lambda entry: entry.package == "piqp"))
     few = {**SMALL, "tilts": (), "horizons": (), "arm_lengths": (), "solvers": ("piqp-dense", "qpoases")}
     found = study_cost(scenario(), workers=1, **few)
-    assert [contender.name for contender in found.contenders][2:] == ["QP by piqp-dense"]
+    assert [candidate.name for candidate in found.contenders][2:] == ["QP by piqp-dense"]
     assert "pip install 'quadsim[solvers]'" in found.left_out["qpoases"]
 
 

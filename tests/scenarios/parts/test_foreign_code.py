@@ -15,7 +15,7 @@ import tomlkit
 from scenarios.cli import main
 from scenarios.commands import EXIT_DONE, EXIT_WRONG_INPUT
 from scenarios.parts.foreign_code import find_code
-from scenarios.schema.plugin import OwnSpec
+from scenarios.schema.plugin import PluginSpec
 
 LAW = """
 import sys
@@ -142,7 +142,7 @@ def test_a_module_in_packages_is_found_and_none_of_them_imported(here: Path) -> 
     for init in (here / "pack_7" / "__init__.py", folder / "__init__.py"):
         init.write_text("raise SystemExit('it ran')\n")
     (folder / "law.py").write_text(LAW)
-    code = find_code(OwnSpec(type="pack_7.inner.law:Hover"))
+    code = find_code(PluginSpec(type="pack_7.inner.law:Hover"))
     assert (code.file, code.root) == (folder / "law.py", here / "pack_7")
     before = code.digest
     (folder / "__init__.py").write_text("")
@@ -151,15 +151,15 @@ def test_a_module_in_packages_is_found_and_none_of_them_imported(here: Path) -> 
 
 
 def test_a_module_that_is_loaded_is_the_one_that_runs(here: Path) -> None:
-    assert find_code(OwnSpec(type="tomlkit.api:Hover")).root == Path(str(tomlkit.__file__)).parent
-    assert find_code(OwnSpec(type="sys:Hover")).file is None
-    assert find_code(OwnSpec(type="nowhere_7.at.all:Hover")).file is None
+    assert find_code(PluginSpec(type="tomlkit.api:Hover")).root == Path(str(tomlkit.__file__)).parent
+    assert find_code(PluginSpec(type="sys:Hover")).file is None
+    assert find_code(PluginSpec(type="nowhere_7.at.all:Hover")).file is None
 
 
 def test_an_entry_point_is_found(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     entry = metadata.EntryPoint(name="theirs", value="theirs_7:Hover", group="quadsim.controllers")
     monkeypatch.setattr(metadata, "entry_points", lambda group: metadata.EntryPoints([entry]))
-    code = find_code(OwnSpec(type="theirs"))
+    code = find_code(PluginSpec(type="theirs"))
     assert (code.module, code.attribute, code.file) == ("theirs_7", "Hover", here / "theirs_7.py")
 
 

@@ -20,7 +20,7 @@ from quadsim.state import Array
 from scenarios.build import build_controller
 from scenarios.cli import main
 from scenarios.loading import load_scenario
-from scenarios.parts.plugin import OwnController
+from scenarios.parts.plugin import PluginController
 from scenarios.parts.vehicle import build_vehicle
 from scenarios.run import Outputs, fly_scenario, run_scenario
 
@@ -56,10 +56,10 @@ def written(tmp_path: Path) -> Iterator[Write]:
         del sys.modules[name]
 
 
-def build(path: str, *settings: str) -> OwnController:
+def build(path: str, *settings: str) -> PluginController:
     scenario = load_scenario(path, settings)
     controller = build_controller(scenario, build_vehicle(scenario))
-    assert isinstance(controller, OwnController)
+    assert isinstance(controller, PluginController)
     return controller
 
 
@@ -230,7 +230,7 @@ class Answers:
 
 
 def test_what_it_writes_over_is_its_own() -> None:
-    law, acting, state, reference = OwnController(Answers(), 3), np.ones(4), np.ones(12), np.ones((3, 4))
+    law, acting, state, reference = PluginController(Answers(), 3), np.ones(4), np.ones(12), np.ones((3, 4))
     first, second = (law.step(Moment(acting=acting), state, reference) for _ in range(2))
     assert {*acting, *state, *reference.ravel()} == {1.0}
     assert (first.speeds[0], second.speeds[0]) == (191.0, 192.0)
@@ -253,14 +253,14 @@ def test_what_it_writes_over_is_its_own() -> None:
     ],
 )
 def test_a_command_with_a_wrong_part_is_refused_by_its_name(part: str, given: Any, rule: str) -> None:
-    law = OwnController(Answers(**{part: given}), 3)
+    law = PluginController(Answers(**{part: given}), 3)
     with pytest.raises(CommandError, match=rf"Answers answered a Command whose {part} must be {rule}; got "):
         law.step(Moment(acting=np.ones(4)), np.zeros(12), np.zeros((3, 4)))
 
 
 @pytest.mark.parametrize("given", [None, np.zeros((1, 3, 12)), np.zeros((2, 12))])
 def test_a_prediction_of_another_shape_is_refused(given: Any) -> None:
-    law = OwnController(Answers(predicted=given), 3)
+    law = PluginController(Answers(predicted=given), 3)
     with pytest.raises(InputError, match=r"predict of Answers must give numbers of shape \(2, 3, 12\); got "):
         law.predict(np.zeros((2, 12)), np.zeros((2, 3, 4)))
 
@@ -271,7 +271,7 @@ def test_its_own_flight_errors_end_the_flight() -> None:
             raise CommandError("I will not", time=now.time)
 
     with pytest.raises(CommandError, match=r"^at t = 2\.000 s: I will not$"):
-        OwnController(Refuses(), 3).step(Moment(time=2.0), np.zeros(12), np.zeros((3, 4)))
+        PluginController(Refuses(), 3).step(Moment(time=2.0), np.zeros(12), np.zeros((3, 4)))
 
 
 # --- what is wrong -------------------------------------------------------------------------------------------------

@@ -25,8 +25,8 @@ from quadsim.flight.rundir import Run, load_run
 from quadsim.outputs import write_json, writing_file
 from quadsim.report.film import video
 from quadsim.report.film.captions import Overlay, margin_rows
-from quadsim.report.film.drawing import CYAN, GREEN, RED, VIOLET, Colour
 from quadsim.report.film.frames import Shot, make_footage, thin
+from quadsim.report.film.painter import CYAN, GREEN, RED, VIOLET, Colour
 from quadsim.report.film.video import render_gif, render_video, rendering_backend
 from quadsim.state import EULER, INDEX, POSITION, body_to_world
 
@@ -402,10 +402,10 @@ def rows(run: Run, *times: float) -> list[tuple[list[str], str]]:
 
 def test_violated_limits_come_first_then_the_nearest_and_the_film_says_how_many_more(short_run: Run) -> None:
     """In the order of the file the one that is violated by metres stands eighth, and was never seen."""
-    climb = short_run.log.plant.state[-1, INDEX["z"]]
-    assert climb > 2.0
+    run_mismatch = short_run.log.plant.state[-1, INDEX["z"]]
+    assert run_mismatch > 2.0
     low = Limit(name="low", signal="z", upper=0.5)
-    near = Limit(name="near", signal="z", upper=1.01 * climb)
+    near = Limit(name="near", signal="z", upper=1.01 * run_mismatch)
     reported = Limit(name="reported", signal="z", upper=0.01, required=False)
     run = bounded(short_run, near, reported, low)
     (shown, rest) = rows(run, 6.0)[0]

@@ -27,7 +27,7 @@ VIOLET: Final = (225, 120, 205)
 _SHADE: Final = (np.arange(256) * 0.24 + 12.0).astype(np.uint8)
 
 
-class Pen:
+class Painter:
     """Draws on one picture; lengths are design pixels, scaled to the picture's real size.
 
     Args:
