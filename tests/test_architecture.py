@@ -11,6 +11,7 @@ import time as clock
 import tomllib
 from collections.abc import Iterator
 from dataclasses import dataclass
+from graphlib import TopologicalSorter
 from pathlib import Path
 
 import pytest
@@ -159,6 +160,38 @@ def test_a_library_to_draw_with_is_imported_by_figures_or_plots_alone_and_late(
 def test_the_render_worker_is_imported_by_nobody(imports: list[Import]) -> None:
     assert RENDER_WORKER in modules()
     assert RENDER_WORKER not in {item.imported for item in imports}
+
+
+LONGEST_CHAIN = 18
+"""Modules that a reader follows at most from an import to what it stands on."""
+
+
+def test_no_module_and_no_folder_imports_what_imports_it(imports: list[Import]) -> None:
+    ours = modules()
+    packages = {"", *(name.rpartition(".")[0] for name in ours if "." in name)}
+    for package in packages:
+        within = f"{package}." if package else ""
+        graph: dict[str, set[str]] = {}
+        for item in imports:
+            if item.at_start and item.imported in ours and item.importer.startswith(within):
+                importer, imported = (
+                    name.removeprefix(within).partition(".")[0] for name in (item.importer, item.imported)
+                )
+                if item.imported.startswith(within) and imported != importer:
+                    graph.setdefault(importer, set()).add(imported)
+        tuple(TopologicalSorter(graph).static_order())  # raises where there is a cycle
+
+
+def test_no_chain_of_imports_is_long(imports: list[Import]) -> None:
+    ours = modules()
+    graph: dict[str, set[str]] = {name: set() for name in ours}
+    for item in imports:
+        if item.at_start and item.imported in ours and item.imported != item.importer:
+            graph[item.importer].add(item.imported)
+    depth: dict[str, int] = {}
+    for name in TopologicalSorter(graph).static_order():
+        depth[name] = 1 + max((depth[imported] for imported in graph[name]), default=0)
+    assert max(depth.values()) <= LONGEST_CHAIN
 
 
 def test_what_is_imported_is_what_is_declared(imports: list[Import]) -> None:

@@ -33,7 +33,7 @@ from scenarios.machine import usable_cores
 
 _AHEAD_S: Final = 1.0
 """Work [s] that a worker has in hand before it gets more: the parent may be writing files meanwhile."""
-_SETTLED: Final = "scenarios.campaign.engine.preload"
+_SETTLED: Final = "scenarios.campaign.preload"
 """To be loaded by the server that forks the workers, and by no other process."""
 _MOST_STARTS: Final = 5
 _SILENCE_S: Final = 1.0

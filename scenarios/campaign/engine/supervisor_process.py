@@ -16,7 +16,7 @@ from scenarios.campaign.engine.protocol import MOST_DEATHS, ONE_THREAD, Answer, 
 from scenarios.campaign.engine.supervisor import Fell, Ready, Unfit, serve
 
 _MAIN: Final = (
-    "import json, sys; sys.path[:] = json.loads(sys.argv[2]); import scenarios.campaign.engine.preload; "
+    "import json, sys; sys.path[:] = json.loads(sys.argv[2]); import scenarios.campaign.preload; "
     "from scenarios.campaign.engine.supervisor_process import main; main(int(sys.argv[1]))"
 )
 

@@ -155,12 +155,12 @@ def test_workers_seldom_look_for_cycles() -> None:
 
 class _Settled(ToyPilot):
     def fly(self, flight: int, progress: Progress = silent) -> Row:
-        return super().fly(flight) | {"settled": "scenarios.campaign.engine.preload" in sys.modules}
+        return super().fly(flight) | {"settled": "scenarios.campaign.preload" in sys.modules}
 
 
 def test_the_server_of_workers_and_not_their_parent_has_settled() -> None:
     assert all(row["settled"] for row in fly(_Settled()))
-    assert "scenarios.campaign.engine.preload" not in sys.modules
+    assert "scenarios.campaign.preload" not in sys.modules
 
 
 def test_a_script_is_not_run_again_by_its_workers(tmp_path: Path) -> None:

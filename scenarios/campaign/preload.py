@@ -5,6 +5,9 @@ So no worker loads it again, has to look through it for cycles, nor copies the p
 
 from __future__ import annotations
 
+import mpc.constrained
+import mpc.robust
+import mpc.unconstrained  # noqa: F401
 import scenarios.campaign.engine.supervisor
 import scenarios.campaign.pilot  # noqa: F401
 from scenarios.gc_settings import settle
