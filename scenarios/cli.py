@@ -16,8 +16,8 @@ from typing import NoReturn
 
 from quadsim import __version__
 from quadsim.errors import QuadsimError, printable
-from scenarios.commands import EXIT_FAILED, EXIT_WRONG_INPUT, carry_out
-from scenarios.gc_settings import collect_rarely
+from scenarios.commands import EXIT_FAILED, EXIT_WRONG_INPUT, find_command
+from scenarios.gc_tuning import collect_rarely
 
 _LINES = "\n"
 """What a message of ours may be made of besides text: one with many problems has a line for each."""
@@ -239,7 +239,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         collect_rarely()  # saves 5 % of a run
     try:
         with _told():
-            status = carry_out(options)
+            status = find_command(options.command)(options)
         sys.stdout.flush()
         return status
     except QuadsimError as error:

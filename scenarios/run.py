@@ -243,11 +243,11 @@ def _write_products(flight: Flight, directory: Path, outputs: Outputs, progress:
     flown = bool(run.log.control.t.size)
     with contextlib.ExitStack() as beside:
         if outputs.recording:
-            from quadsim.report.recording import recording_aside, write_recording
+            from quadsim.report.recording import recording_in_background, write_recording
 
             progress("recording", 0, 1)
             if outputs.figures and flown and usable_cores() > 1:  # while the figures are drawn: a tenth of a short run
-                beside.enter_context(recording_aside(directory))
+                beside.enter_context(recording_in_background(directory))
             else:
                 write_recording(run, directory / rundir.RECORDING_FILE)
         if outputs.figures and flown:

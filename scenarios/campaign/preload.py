@@ -10,6 +10,6 @@ import mpc.robust
 import mpc.unconstrained  # noqa: F401
 import scenarios.campaign.engine.supervisor
 import scenarios.campaign.pilot  # noqa: F401
-from scenarios.gc_settings import settle
+from scenarios.gc_tuning import settle
 
 settle()

@@ -16,24 +16,38 @@ Everything stands on one timeline, `sim_time`, the simulated time:
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
+import os
+import pickle
+import subprocess
+import sys
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Final
 
 import numpy as np
 
-from quadsim.errors import OutputError
-from quadsim.flight.rundir import Run
+from quadsim.errors import FileError, OutputError, ViewerUnavailableError
+from quadsim.flight.rundir import RECORDING_FILE, Run
 from quadsim.outputs import write_new
 from quadsim.report.palette import line_colour
-from quadsim.report.recording.child import recording_aside
 from quadsim.report.recording.layout import blueprint
 from quadsim.report.recording.signals import send_effects, send_limit, send_signals, send_solver
 from quadsim.report.recording.style import on_screen
 from quadsim.report.recording.texts import send_texts
-from quadsim.report.recording.viewer import open_viewer, viewer_problem
 from quadsim.report.recording.world import send_airframe, send_scene
 
-__all__ = ["open_viewer", "recording_aside", "viewer_problem", "write_recording"]
+_VIEWER: Final = (
+    sys.executable,
+    "-c",
+    "import sys; from rerun_cli.__main__ import main; sys.exit(main())",
+    "--bind=127.0.0.1",
+    "--port=auto",
+)
+"""Starts a viewer of its own, which only this machine can reach."""
+_INTERRUPTED: Final = 130
+"""The viewer's exit status after Ctrl-C."""
 
 
 def write_recording(run: Run, path: Path) -> None:
@@ -84,3 +98,66 @@ def _identity(run: Run) -> str:
     for array in (run.log.control.state, run.log.control.reference, run.log.control.speeds, run.log.plant.state):
         digest.update(np.ascontiguousarray(array).tobytes())
     return f"{run.name}-{digest.hexdigest()[:16]}"
+
+
+@contextlib.contextmanager
+def recording_in_background(directory: Path) -> Iterator[None]:
+    """Write a run directory's recording while the block runs; it is complete once the block is left.
+
+    A Ctrl-C does not reach the process, which has no terminal of its own: whatever ends the block early ends it too,
+    and what it wrote until then is not under the recording's name.
+
+    Raises:
+        OutputError: the file cannot be written, as from `write_recording`.
+    """
+    packages = os.pathsep.join(filter(None, (str(Path(__file__).resolve().parents[3]), os.environ.get("PYTHONPATH"))))
+    with subprocess.Popen(
+        [sys.executable, "-m", "quadsim.report.recording", str(directory)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        env={**os.environ, "PYTHONPATH": packages},
+        process_group=0,
+    ) as process:
+        try:
+            yield
+            raised, said = process.communicate()
+        finally:
+            process.kill()  # of no consequence to one that is done
+    if raised:
+        raise pickle.loads(raised)
+    if process.returncode:
+        last = said.decode(errors="replace").strip().rpartition("\n")[2]
+        raise OutputError(directory / RECORDING_FILE, last or f"its process ended with status {process.returncode}")
+
+
+def viewer_problem() -> str | None:
+    """Why rerun's own window cannot be opened on this machine, or None."""
+    if sys.platform.startswith("linux") and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+        return "there is no display (neither DISPLAY nor WAYLAND_DISPLAY is set)"
+    return None
+
+
+def open_viewer(path: Path, *, web: bool = False) -> None:
+    """Show a recording; returns when the viewer is closed or Ctrl-C is pressed.
+
+    Args:
+        path: an `.rrd` file.
+        web: whether to serve it, to this machine alone, for a browser; else rerun's own window shows it.
+
+    Raises:
+        FileError: there is no such file.
+        ViewerUnavailableError: there is no display, or the viewer failed.
+    """
+    if not path.is_file():
+        raise FileError(path, "there is no such recording")
+    problem = None if web else viewer_problem()
+    if problem:
+        raise ViewerUnavailableError(f"{problem}: show it in a browser with --web, or open {path} on another machine")
+    browser = ("--web-viewer", "--web-viewer-port=0") if web else ()
+    try:
+        status = subprocess.run([*_VIEWER, *browser, str(path)], check=False).returncode
+    except KeyboardInterrupt:
+        return
+    if status not in (0, _INTERRUPTED):
+        advice = "see its message above" if web else "see its message above, or show it in a browser with --web"
+        raise ViewerUnavailableError(f"the rerun viewer ended with status {status}; {advice}")

@@ -1,4 +1,4 @@
-"""`python -m quadsim.report.recording RUN`: what `child` starts.  An error goes to stdout, pickled."""
+"""`python -m quadsim.report.recording RUN`: what `recording_in_background` starts; an error goes to stdout, pickled."""
 
 from __future__ import annotations
 

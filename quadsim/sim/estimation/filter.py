@@ -18,9 +18,8 @@ from scipy.special import chdtri
 
 from quadsim.errors import ParameterError
 from quadsim.sim.estimation.estimate import N_ERRORS, Estimate, retract
-from quadsim.sim.estimation.prediction import Drive, drive, motion_model, predict
+from quadsim.sim.estimation.prediction import Drive, drive, lifts, motion_model, predict, stand
 from quadsim.sim.estimation.settings import EstimatorSettings
-from quadsim.sim.estimation.standing import lifts, stand
 from quadsim.sim.estimation.update import doubt, update
 from quadsim.sim.sensing.sampler import Sample
 from quadsim.sim.sensing.sensor import AXES, Sensor, SensorName

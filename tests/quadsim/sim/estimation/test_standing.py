@@ -11,9 +11,17 @@ import numpy as np
 import pytest
 
 from quadsim.sim.estimation.estimate import Estimate
-from quadsim.sim.estimation.prediction import MotionModel, drive, motion_model
+from quadsim.sim.estimation.prediction import (
+    STILL_RATE,
+    STILL_TIME,
+    STILL_VELOCITY,
+    MotionModel,
+    drive,
+    lifts,
+    motion_model,
+    stand,
+)
 from quadsim.sim.estimation.settings import EstimatorSettings
-from quadsim.sim.estimation.standing import STILL_RATE, STILL_TIME, STILL_VELOCITY, lifts, stand
 from quadsim.sim.sensing.sensor import Sensor, SensorName
 from quadsim.state import Array
 from quadsim.vehicle import Vehicle

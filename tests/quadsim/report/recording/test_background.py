@@ -13,7 +13,7 @@ import pytest
 from quadsim.errors import FileError, OutputError
 from quadsim.flight.parquet import PLANT_FILE
 from quadsim.flight.rundir import RECORDING_FILE, load_run
-from quadsim.report.recording import recording_aside, write_recording
+from quadsim.report.recording import recording_in_background, write_recording
 
 
 @pytest.fixture
@@ -31,7 +31,7 @@ def started(monkeypatch: pytest.MonkeyPatch) -> list[subprocess.Popen[bytes]]:
             super().__init__(*arguments, **options)  # type: ignore[call-overload]
             found.append(self)
 
-    monkeypatch.setattr("quadsim.report.recording.child.subprocess.Popen", Watched)
+    monkeypatch.setattr("quadsim.report.recording.subprocess.Popen", Watched)
     return found
 
 
@@ -42,7 +42,7 @@ def entities(path: Path) -> set[str]:
 
 
 def test_it_is_the_recording_that_would_have_been_written_here(run_directory: Path, tmp_path: Path) -> None:
-    with recording_aside(run_directory):
+    with recording_in_background(run_directory):
         pass
     write_recording(load_run(run_directory), tmp_path / "here.rrd")
     assert entities(run_directory / RECORDING_FILE) == entities(tmp_path / "here.rrd")
@@ -52,7 +52,7 @@ def test_it_is_the_recording_that_would_have_been_written_here(run_directory: Pa
 def test_an_error_is_the_callers_with_its_type_and_values(run_directory: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("RERUN", "off")
     off = "rerun is switched off by the environment variable RERUN"
-    with pytest.raises(OutputError, match=off) as caught, recording_aside(run_directory):
+    with pytest.raises(OutputError, match=off) as caught, recording_in_background(run_directory):
         pass
     assert caught.value.path == run_directory / RECORDING_FILE
     assert not (run_directory / RECORDING_FILE).exists()
@@ -60,19 +60,19 @@ def test_an_error_is_the_callers_with_its_type_and_values(run_directory: Path, m
 
 def test_a_run_that_cannot_be_read_is_named(run_directory: Path) -> None:
     (run_directory / PLANT_FILE).unlink()
-    with pytest.raises(FileError, match=PLANT_FILE), recording_aside(run_directory):
+    with pytest.raises(FileError, match=PLANT_FILE), recording_in_background(run_directory):
         pass
 
 
 def test_a_process_that_dies_is_no_recording(run_directory: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys, "executable", "/bin/false")
     died = r"flight\.rrd: its process ended with status 1$"
-    with pytest.raises(OutputError, match=died), recording_aside(run_directory):
+    with pytest.raises(OutputError, match=died), recording_in_background(run_directory):
         pass
 
 
 def test_what_ends_the_block_ends_the_process(run_directory: Path, started: list[subprocess.Popen[bytes]]) -> None:
-    with pytest.raises(KeyboardInterrupt), recording_aside(run_directory):
+    with pytest.raises(KeyboardInterrupt), recording_in_background(run_directory):
         raise KeyboardInterrupt
     (process,) = started
     assert process.returncode is not None
@@ -82,5 +82,5 @@ def test_what_ends_the_block_ends_the_process(run_directory: Path, started: list
 
 def test_a_ctrl_c_does_not_reach_the_process(run_directory: Path, started: list[subprocess.Popen[bytes]]) -> None:
     """A terminal interrupts the group of processes in its foreground."""
-    with recording_aside(run_directory):
+    with recording_in_background(run_directory):
         assert os.getpgid(started[0].pid) == started[0].pid != os.getpgid(0)
