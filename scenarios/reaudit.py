@@ -16,17 +16,17 @@ from typing import Any, Final
 
 import numpy as np
 
-from quadsim import rundir
-from quadsim.audit import SIGNALS, Finding, audit
 from quadsim.controller import Phase
-from quadsim.errors import FileError, InputError
-from quadsim.flightlog import FLIGHT_FILE, HORIZON_FILE, PLANT_FILE, TIMING_FILE, FlightLog
-from quadsim.printable import printable
-from scenarios.bases import read_whole
-from scenarios.build import build_limits
+from quadsim.errors import FileError, InputError, printable
+from quadsim.flight import rundir
+from quadsim.flight.audit import SIGNALS, Finding, audit
+from quadsim.flight.log import FlightLog
+from quadsim.flight.parquet import FLIGHT_FILE, HORIZON_FILE, PLANT_FILE, TIMING_FILE
 from scenarios.loading import parse_scenario
-from scenarios.spec import Scenario
-from scenarios.spec.own import LAWS, is_own
+from scenarios.parts.limits import build_limits
+from scenarios.schema.bases import read_whole
+from scenarios.schema.plugin import LAWS, is_plugin
+from scenarios.schema.scenario import Scenario
 
 TABLES: Final = (FLIGHT_FILE, PLANT_FILE, TIMING_FILE)
 OURS: Final = {*TABLES, HORIZON_FILE, rundir.SCENARIO_FILE, rundir.RECORDING_FILE, rundir.VIDEO_FILE}
@@ -116,7 +116,7 @@ def stored_scenario(directory: Path) -> Scenario:
     controller = data.get("controller")
     controller = controller if isinstance(controller, dict) else {}
     name = controller.get("type")
-    if isinstance(name, str) and name not in LAWS and not is_own(name):
+    if isinstance(name, str) and name not in LAWS and not is_plugin(name):
         data["controller"] = {**controller, "type": "elsewhere:Controller"}
     return parse_scenario(data, source=str(path))
 

@@ -11,11 +11,13 @@ from scipy.linalg import block_diag
 
 from mpc.model import LinearModel
 from mpc.ocp import Bounds, Objective, Problem
-from quadsim.flightlog import ControlLog, FlightLog, PlantLog, TimingLog
+from quadsim.flight.log import ControlLog, FlightLog, PlantLog, TimingLog
 from quadsim.state import INDEX, N_STATES, Array
 from quadsim.vehicle import N_ROTORS
-from scenarios.build import build_problem, build_reference, build_vehicle
+from scenarios.build import build_problem
+from scenarios.courses.make import build_reference
 from scenarios.loading import load_scenario
+from scenarios.parts.vehicle import build_vehicle
 
 
 def paper_problem(name: str = "paper-constrained", *settings: str) -> Problem:

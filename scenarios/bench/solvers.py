@@ -13,17 +13,22 @@ from mpc.ocp import Problem
 from mpc.solvers import SOLVERS, Way
 from mpc.unconstrained import UnconstrainedMPC
 from quadsim import outputs
-from quadsim.bench import Contender, Growth, SolverBench, solver_tables
 from quadsim.errors import InputError, ParameterError, UnknownNameError
+from quadsim.report.table import Grid, grid_to_markdown
 from quadsim.state import Array
-from quadsim.table import Grid, grid_to_markdown
-from scenarios.bench.contenders import Entry, StepEntrant, entries, judge, reference_optima
-from scenarios.bench.race import Laps, race, stretches
+from scenarios.bench.bench_results import CandidateResult, Growth, SolverBench
+from scenarios.bench.bench_tables import solver_tables
+from scenarios.bench.candidates import Entry, StepCandidate, entries, judge, reference_optima
+from scenarios.bench.queries import QueriedController, Queries, flight_between, recorded
 from scenarios.bench.stages import time_stages
+from scenarios.bench.timing import StepTimes, stretches, time_in_turns
 from scenarios.build import build_problem
-from scenarios.queries import Asked, Queries, flight_between, recorded
-from scenarios.runner import Flight, Progress, fly_scenario, machine, silent, versions
-from scenarios.spec import LARGEST_HORIZON, ConstrainedSpec, Scenario
+from scenarios.machine import machine, versions
+from scenarios.progress import Progress, silent
+from scenarios.run import Flight, fly_scenario
+from scenarios.schema.controller import ConstrainedSpec
+from scenarios.schema.optimisation import LARGEST_HORIZON
+from scenarios.schema.scenario import Scenario
 
 RESULTS_FILE: Final = "bench.json"
 TABLES_FILE: Final = "solvers.md"
@@ -45,7 +50,7 @@ PATIENCE: Final = 60.0
 
 
 class _Racing(TypedDict):
-    """What every race of a bench has in common; see `scenarios.bench.race.race`."""
+    """What every race of a bench has in common; see `scenarios.bench.timing.time_in_turns`."""
 
     between: Callable[[], None]
     repeats: int
@@ -61,8 +66,8 @@ class _Timed:
     failures: int
 
     @classmethod
-    def of(cls, entrant: StepEntrant, periods: Sequence[int], laps: Laps) -> _Timed:
-        return cls(step_ms=laps.median, ways=entrant.ways(periods), failures=entrant.failures(periods))
+    def of(cls, candidate: StepCandidate, periods: Sequence[int], laps: StepTimes) -> _Timed:
+        return cls(step_ms=laps.median, ways=candidate.ways(periods), failures=candidate.failures(periods))
 
 
 def bench_solvers(
@@ -129,7 +134,7 @@ def write_bench(bench: SolverBench, directory: Path) -> None:
     Raises:
         OutputError: it cannot be written.
     """
-    from quadsim.figures import write_solver_figure
+    from scenarios.bench.solver_figure import write_solver_figure
 
     outputs.write_json(directory / RESULTS_FILE, {"format": FORMAT, **bench.to_json()})
     outputs.write_text(directory / TABLES_FILE, bench_markdown(bench))
@@ -172,15 +177,15 @@ def _time_contenders(
     rng: np.random.Generator,
     between: Callable[[], None],
     progress: Progress,
-) -> tuple[tuple[Contender, ...], dict[str, _Timed], Array | None, int, float]:
+) -> tuple[tuple[CandidateResult, ...], dict[str, _Timed], Array | None, int, float]:
     """Contenders, their steps, the gain's, the number of periods asked, and the reference's worst KKT residual."""
     queries = recorded(flight.scenario, flight.log.control, problem.horizon)
     asked = stretches(queries.t.size, stride)
     periods = [period for stretch in asked for period in stretch]
     reference = reference_optima(problem, queries, periods)
-    entrants = {entry.name: StepEntrant(entry, problem, queries) for entry in taking_part}
-    laps = race(
-        {**_gain(problem, queries), **entrants},
+    candidates = {entry.name: StepCandidate(entry, problem, queries) for entry in taking_part}
+    laps = time_in_turns(
+        {**_gain(problem, queries), **candidates},
         asked,
         between=between,
         repeats=repeats,
@@ -189,28 +194,28 @@ def _time_contenders(
         progress=lambda done, total: progress("contenders", done, total),
     )
     contenders = tuple(
-        Contender(
+        CandidateResult(
             name=name,
-            solver=entrant.entry.solver,
-            package=_package(entrant.entry.solver),
-            shortcut=entrant.entry.shortcut,
+            solver=candidate.entry.solver,
+            package=_package(candidate.entry.solver),
+            shortcut=candidate.entry.shortcut,
             repeats=laps[name].ms.shape[0],
             step_ms=laps[name].median,
-            answered=entrant.statuses(periods),
+            answered=candidate.statuses(periods),
             raw_max_ms=float(laps[name].ms.max()),
-            **vars(judge(entrant, queries, periods, reference)),
+            **vars(judge(candidate, queries, periods, reference)),
         )
-        for name, entrant in entrants.items()
+        for name, candidate in candidates.items()
     )
     gain = laps[GAIN].median if GAIN in laps else None
-    own = {name: _Timed.of(entrant, periods, laps[name]) for name, entrant in entrants.items()}
+    own = {name: _Timed.of(candidate, periods, laps[name]) for name, candidate in candidates.items()}
     return contenders, own, gain, len(periods), reference.kkt
 
 
-def _gain(problem: Problem, queries: Queries) -> dict[str, Asked]:
+def _gain(problem: Problem, queries: Queries) -> dict[str, QueriedController]:
     """The gain, where weights are not so far apart that it cannot be computed."""
     try:
-        return {GAIN: Asked(UnconstrainedMPC(problem), queries)}
+        return {GAIN: QueriedController(UnconstrainedMPC(problem), queries)}
     except np.linalg.LinAlgError:
         return {}
 
@@ -249,9 +254,9 @@ def _growth(
             timed = dict(own)
         else:
             queries, longer = recorded(flight.scenario, flight.log.control, N), replace(problem, horizon=N)
-            entrants = {entry.name: StepEntrant(entry, longer, queries) for entry in racing}
-            laps = race(
-                entrants,
+            candidates = {entry.name: StepCandidate(entry, longer, queries) for entry in racing}
+            laps = time_in_turns(
+                candidates,
                 asked,
                 between=between,
                 repeats=repeats,
@@ -260,7 +265,7 @@ def _growth(
                 patience=PATIENCE,
                 progress=lambda done, total, N=N: progress(f"N = {N}", done, total),  # type: ignore[misc]
             )
-            timed = {name: _Timed.of(entrants[name], periods, lap) for name, lap in laps.items()}
+            timed = {name: _Timed.of(candidates[name], periods, lap) for name, lap in laps.items()}
         for entry in racing:
             if entry.name not in timed:
                 dropped[entry.name] = f"more than {PATIENCE:g} s for them at N = {N}"

@@ -23,14 +23,15 @@ from mpc.robust.controller import Linearisation, RobustMPC, RobustSettings, _hov
 from mpc.robust.observer import ObserverSettings
 from mpc.solvers import QPSolver
 from quadsim.controller import SOLVED, Moment, Phase
-from quadsim.effects.rotors import RotorDynamics
 from quadsim.errors import ParameterError
+from quadsim.sim.effects.rotors import RotorDynamics
 from quadsim.state import INDEX, POSITION, Array, make_state
 from quadsim.vehicle import Vehicle
-from scenarios.build import build_plant, build_problem, build_reference, build_vehicle
-from scenarios.flying import fly_once
+from scenarios.build import build_plant, build_problem
+from scenarios.courses.make import build_reference
 from scenarios.loading import load_scenario
-from scenarios.runner import Flight
+from scenarios.parts.vehicle import build_vehicle
+from scenarios.run import Flight, fly_once
 
 PERIOD = 0.05
 SOFT = Penalty(l1=np.full(2, 2e5), l2=np.full(2, 1e4))

@@ -15,7 +15,7 @@ from support import paper_problem, paper_reference
 
 from mpc.model import discretise
 from mpc.nonlinear.model import advance, derivative, nonlinear_model
-from mpc.ocp import Bounds
+from mpc.ocp import Bounds, Penalty
 from mpc.robust.controller import RobustMPC, RobustSettings
 from mpc.robust.observer import ObserverSettings
 from mpc.robust.tightening import (
@@ -30,14 +30,14 @@ from mpc.robust.tightening import (
     margins,
     observed,
 )
-from mpc.stagewise import Penalty
 from quadsim.controller import SOLVED, Moment
 from quadsim.errors import ParameterError
 from quadsim.state import INDEX, Array
 from quadsim.vehicle import Vehicle
-from scenarios.build import build_plant, build_reference
-from scenarios.flying import fly_once
+from scenarios.build import build_plant
+from scenarios.courses.make import build_reference
 from scenarios.loading import load_scenario
+from scenarios.run import fly_once
 
 ROOT = Path(__file__).resolve().parents[2]
 TILTS = [INDEX["roll"], INDEX["pitch"]]
