@@ -175,25 +175,30 @@ def _differences(
         yield f"as_expected is recorded as True, and the flight is {outcome} where {scenario.expect} is expected"
 
 
+_DEMANDS: Final = [
+    "signal",
+    "terms",
+    "unit",
+    "lower",
+    "upper",
+    "tolerance",
+    "tolerance_sampled",
+    "required",
+    "start",
+    "stop",
+]
+"""What the scenario says of a constraint."""
+
+
 def _constraint_differences(
     entry: Mapping[str, Any], finding: Finding, scenario: Scenario, log: FlightLog
 ) -> Iterator[str]:
     """What a summary says of one constraint otherwise than the tables do."""
     again = rundir.limit_to_json(finding)
-    for key in (
-        "signal",
-        "terms",
-        "unit",
-        "lower",
-        "upper",
-        "tolerance",
-        "tolerance_sampled",
-        "required",
-        "start",
-        "stop",
-    ):
-        if entry[key] != again[key]:
-            yield f"{key} is recorded as {entry[key]!r:.80}, and is {again[key]!r:.80} in the scenario"
+    recorded = {"terms": None, **entry}
+    for key in _DEMANDS:
+        if recorded[key] != again.get(key):
+            yield f"{key} is recorded as {recorded[key]!r:.80}, and is {again.get(key)!r:.80} in the scenario"
     rounding = ROUNDING_TILT if finding.limit.signal == "tilt" else ROUNDING
     alike = ["peak_sampled", "worst_margin_sampled"]
     if finding.limit.source.plant is None or scenario.plant_stride == 1 or not log.control.t.size:

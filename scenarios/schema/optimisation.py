@@ -80,9 +80,9 @@ class SoftSpec(Spec):
 
     linear: Annotated[float, Field(ge=0.0, le=1e12)] = Field(
         default=2e5,
-        description="[1/unit; rad for angles of output_bounds, the row's unit of a polytope] l1: exact where it is above "
-        "the multipliers that hard bounds would have, as 1e8 nearly always is; but what is nearly hard fights back as "
-        "hard where the model errs",
+        description="[1/unit; rad for angles of output_bounds, the row's unit of a polytope] l1: exact where it is "
+        "above the multipliers that hard bounds would have, as 1e8 nearly always is; but what is nearly hard fights "
+        "back as hard where the model errs",
     )
     quadratic: Annotated[float, Field(ge=0.0, le=1e12)] = Field(default=1e4, description="[1/unit^2] l2")
 
