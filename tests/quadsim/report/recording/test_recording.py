@@ -16,12 +16,12 @@ import pytest
 import rerun as rr
 from rerun.chunk import RrdReader
 
+import quadsim.report.recording as recording_module
 from quadsim.controller import SOLVED, UNCONSTRAINED
 from quadsim.errors import FileError, OutputError, ViewerUnavailableError
 from quadsim.flight.audit import SIGNALS, Limit, margins_sampled
 from quadsim.flight.rundir import Run
 from quadsim.report.recording import layout, open_viewer, texts, viewer_problem, world, write_recording
-from quadsim.report.recording import viewer as viewer_module
 from quadsim.report.recording.style import PANELS, TIMELINE, VERDICTS
 from quadsim.state import EULER, INDEX, POSITION, body_to_world
 
@@ -412,7 +412,7 @@ def test_the_layout_is_inside_and_shows_only_what_exists(content: Content, short
 
 def rerun(*arguments: str) -> subprocess.CompletedProcess[str]:
     """Runs rerun's command line."""
-    return subprocess.run([*viewer_module._VIEWER[:3], *arguments], capture_output=True, text=True, timeout=60)
+    return subprocess.run([*recording_module._VIEWER[:3], *arguments], capture_output=True, text=True, timeout=60)
 
 
 def test_rerun_finds_nothing_wrong_with_the_file_and_the_layout_is_in_force(path: Path) -> None:
@@ -494,7 +494,7 @@ def viewer(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Callable[[int], P
         program = (
             f"import sys, pathlib; pathlib.Path({str(notes)!r}).write_text(' '.join(sys.argv[1:])); sys.exit({status})"
         )
-        monkeypatch.setattr(viewer_module, "_VIEWER", (sys.executable, "-c", program, *viewer_module._VIEWER[3:]))
+        monkeypatch.setattr(recording_module, "_VIEWER", (sys.executable, "-c", program, *recording_module._VIEWER[3:]))
         return notes
 
     return replace
