@@ -88,16 +88,17 @@ class SoftSpec(Spec):
 
 
 class PolytopeSpec(Spec):
-    """Rows lower <= A v <= upper over states and rotor speeds: a geofence, a polytope of velocities, total thrust.
+    """Rows lower <= A v <= upper.
 
-    The flight is audited against the same rows, at the physics rate.
+    Over states and rotor speeds: a geofence, a polytope of velocities, total thrust.  The flight is audited against the
+    same rows, at the physics rate.
     """
 
     name: Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_-]*$")] = Field(
         description="what reports call it; of several rows name_1, name_2, ..."
     )
     of: Annotated[list[str], Len(1, len(TERMS))] = Field(
-        description="v: states [m, m/s, deg, deg/s] and rotor speeds [rad/s], of " + ", ".join(TERMS)
+        description="v: states [m, m/s, deg, deg/s], speed_1 to speed_4 [rad/s]"
     )
     rows: Annotated[list[list[Number]], Len(1, MOST_ENTRIES)] = Field(description="A: one list of numbers per row")
     lower: list[Number] | None = Field(default=None, description="[unit of the row] one per row; absent: no bound")

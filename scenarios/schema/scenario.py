@@ -223,7 +223,7 @@ class Scenario(Spec):
         names = [constraint.name for constraint in self.constraints]
         names += [name for polytope in polytopes for name in polytope.row_names]
         if len(set(names)) < len(names):
-            raise ValueError(f"constraints and polytopes must have distinct names; got {names}")
+            raise ValueError(f"constraints must have distinct names; got {names}")
         return self
 
     def _check_events(self) -> None:
