@@ -110,7 +110,9 @@ class ActiveSet:
                 active = side.nonzero()[0]
                 target = self._optimum(active, side[active], free, lower, upper)
             if target is None:
-                return None
+                if not self._release_dependent(z, active, side, free, lower, upper):
+                    return None
+                continue
             if step == 1:
                 z[active] = np.where(target * side[active] > 0.0, target, 0.0)
             if self._stop_at_kinks(z, target, active, side, at_once=step <= AT_ONCE):
@@ -169,6 +171,35 @@ class ActiveSet:
         if failed or (factor.diagonal() ** 2 < DEPENDENT * K.diagonal()).any():
             return None
         return np.asarray(target + lapack.dpotrs(factor, excess - K @ target)[0])
+
+    def _release_dependent(
+        self, z: Array, active: Indices, side: Side, free: Array, lower: Array, upper: Array
+    ) -> bool:
+        """Where active rows are dependent, move along what that leaves open until one stops; whether one did.
+
+        The dual function is linear along it.  If none stops, no point satisfies all rows.
+        """
+        K, excess = self._system(active, side[active], free, lower, upper)
+        factor, failed = lapack.dpotrf(K)
+        if not failed:
+            return False
+        k = failed - 1  # depends on those before it
+        direction = np.zeros(active.size)
+        direction[k] = 1.0
+        direction[:k] = -lapack.dpotrs(factor[:k, :k], K[:k, k])[0]
+        if direction @ excess < 0.0:
+            direction = -direction
+        sign, here = np.sign(side[active]), z[active]
+        inwards = sign * direction < -ROUNDING * np.abs(direction).max()
+        share = np.full(active.size, np.inf)
+        share[inwards] = (sign * here)[inwards] / -(sign * direction)[inwards]
+        first = int(share.argmin())
+        if not np.isfinite(share[first]):
+            return False
+        z[active] = here + share[first] * direction
+        z[active[first]] = 0.0
+        side[active[first]] = 0
+        return True
 
     def _stop_at_kinks(self, z: Array, target: Array, active: Indices, side: Side, *, at_once: bool) -> bool:
         """Move multipliers to the target, as far as all stay on their pieces; whether some did not."""
