@@ -26,7 +26,7 @@ Flags = NDArray[np.bool_]
 LARGEST_MAP: Final = 2**20
 """Entries beyond which there is no shortcut: 8 MiB, as much as a core's caches hold.  50 steps of the paper's problem
 have 16 k entries, 400 steps 970 k."""
-MOST_STEPS: Final = {"axes": 50, "all": 15}
+MOST_STEPS: Final = {"axes": 50, "all": 30}
 """Steps of the active set method after which the whole QP's solver takes over: it is as fast."""
 
 

@@ -26,6 +26,7 @@ from quadsim.state import (
     Array,
     tilt,
 )
+from quadsim.vehicle import N_ROTORS
 
 _DISPLAY: Final = {"rad": ("deg", math.degrees(1.0)), "rad/s": ("deg/s", math.degrees(1.0))}
 
@@ -79,13 +80,47 @@ SIGNALS: Final[dict[str, Signal]] = {
 }
 
 
+def _rotor_signal(i: int) -> Signal:
+    return Signal(unit="rad/s", sampled=lambda log: log.speeds[:, i], plant=lambda log: log.speeds[:, i])
+
+
+TERMS: Final[dict[str, Signal]] = {
+    **{name: SIGNALS[name] for name in STATE_NAMES},
+    **{f"speed_{i + 1}": _rotor_signal(i) for i in range(N_ROTORS)},
+}
+"""What a sum may have as its terms."""
+SUM: Final = "sum"
+"""The signal of a limit on a sum of terms."""
+
+
+def sum_signal(terms: tuple[tuple[str, float], ...]) -> Signal:
+    """A sum of terms, each a name in `TERMS` and its factor."""
+    signals = [(factor, TERMS[name]) for name, factor in terms]
+    units = {signal.unit for _, signal in signals}
+
+    def of_plant(log: PlantLog) -> Array:
+        return _total([factor * signal.plant(log) for factor, signal in signals if signal.plant is not None])
+
+    return Signal(
+        unit=units.pop() if len(units) == 1 else "-",
+        sampled=lambda log: _total([factor * signal.sampled(log) for factor, signal in signals]),
+        plant=of_plant,
+    )
+
+
+def _total(parts: list[Array]) -> Array:
+    return np.asarray(np.sum(parts, axis=0))
+
+
 @dataclass(frozen=True, kw_only=True)
 class Limit:
     """A bound on one signal, with the tolerances of its verdict.
 
     Attributes:
         name: the constraint's name in tables and files.
-        signal: a key of `SIGNALS`; `slew` is the command's step per period, `speed` and `slew` hold for every rotor.
+        signal: a key of `SIGNALS`, or `SUM`; `slew` is the command's step per period, `speed` and `slew` hold for every
+            rotor.
+        terms: of a sum, the names in `TERMS` and their factors.
         lower: smallest value allowed, in the signal's unit; -inf for none.
         upper: largest value allowed; inf for none.
         tolerance: how far beyond the bound the plant may go, at the physics rate.
@@ -104,10 +139,14 @@ class Limit:
     required: bool = True
     start: float = 0.0
     stop: float = math.inf
+    terms: tuple[tuple[str, float], ...] = ()
 
     def __post_init__(self) -> None:
-        if self.signal not in SIGNALS:
+        if self.signal not in SIGNALS and not (self.signal == SUM and self.terms):
             raise UnknownNameError("signal", self.signal, SIGNALS)
+        for name, _ in self.terms:
+            if name not in TERMS:
+                raise UnknownNameError("signal", name, TERMS)
         if not self.lower < self.upper:
             raise ParameterError(f"constraints.{self.name}", "lower", self.lower, f"below upper = {self.upper}")
         if not 0.0 <= self.tolerance_sampled <= self.tolerance < math.inf:
@@ -117,9 +156,14 @@ class Limit:
             raise ParameterError(f"constraints.{self.name}", "start", self.start, f"at most stop = {self.stop}")
 
     @property
+    def source(self) -> Signal:
+        """What is bounded."""
+        return sum_signal(self.terms) if self.signal == SUM else SIGNALS[self.signal]
+
+    @property
     def unit(self) -> str:
         """Unit of the bounds, tolerances and margins."""
-        return SIGNALS[self.signal].unit
+        return self.source.unit
 
     @property
     def half_band(self) -> float:
@@ -168,7 +212,7 @@ class Finding:
 
 def margins_sampled(limit: Limit, log: FlightLog) -> Array:
     """(K,) signed margins of a limit at the control samples, NaN outside its time window."""
-    margins = limit.margin(SIGNALS[limit.signal].sampled(log.control))
+    margins = limit.margin(limit.source.sampled(log.control))
     return np.where(_inside(limit, log.control.t), margins, np.nan)
 
 
@@ -190,7 +234,7 @@ def _inside(limit: Limit, t: Array) -> np.ndarray[Any, np.dtype[np.bool_]]:
 
 
 def _find(log: FlightLog, limit: Limit) -> Finding:
-    signal = SIGNALS[limit.signal]
+    signal = limit.source
     t, values = log.control.t, signal.sampled(log.control)
     sampled = peak, margin, time = _worst(limit, t, values)
     if signal.plant is not None and t.size:  # before the first period nothing was flown

@@ -78,6 +78,7 @@ def limit_to_json(finding: Finding) -> dict[str, Any]:
     return {
         "name": limit.name,
         "signal": limit.signal,
+        **({"terms": dict(limit.terms)} if limit.terms else {}),
         "unit": limit.unit,
         "lower": finite(limit.lower),
         "upper": finite(limit.upper),
@@ -99,7 +100,9 @@ def limit_to_json(finding: Finding) -> dict[str, Any]:
 def limit_from_json(entry: Mapping[str, Any]) -> Limit:
     """The limit that `limit_to_json` wrote."""
     absent = {"lower": -math.inf, "upper": math.inf, "stop": math.inf}
-    values: dict[str, Any] = {field.name: entry[field.name] for field in fields(Limit)}
+    terms = tuple((name, float(factor)) for name, factor in entry.get("terms", {}).items())
+    values: dict[str, Any] = {field.name: entry[field.name] for field in fields(Limit) if field.name != "terms"}
+    values["terms"] = terms
     return Limit(**values | {name: bound for name, bound in absent.items() if values[name] is None})
 
 

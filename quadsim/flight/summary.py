@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from quadsim.errors import FileError, printable
-from quadsim.flight.audit import SIGNALS
+from quadsim.flight.audit import SIGNALS, SUM, TERMS, sum_signal
 from quadsim.flight.form import MAYBE_NUMBER, MAYBE_TEXT, NUMBER, Each, Optional, misfits, read_json
 from quadsim.outputs.paths import require_inside
 from quadsim.state import REFERENCE_NAMES, STATE_NAMES
@@ -52,6 +52,7 @@ _CONSTRAINT: Final = {
     **dict.fromkeys(("name", "signal", "unit"), str),
     **dict.fromkeys(("tolerance", "tolerance_sampled", "start", "time_violated"), NUMBER),
     **dict.fromkeys(("required", "satisfied"), bool),
+    "terms": Optional(Each(NUMBER)),
     **dict.fromkeys(
         ("lower", "upper", "stop", "peak_sampled", "peak_plant", "worst_margin_sampled", "worst_margin", "worst_time"),
         MAYBE_NUMBER,
@@ -144,8 +145,7 @@ def contradictions(summary: Mapping[str, Any]) -> Iterator[str]:
         yield "two constraints have one name"
     for entry in summary["constraints"]:
         name = f"{entry['name']:.80}"
-        signal = SIGNALS.get(entry["signal"])
-        if signal is None or signal.unit != entry["unit"]:
+        if _unit(entry) != entry["unit"]:
             yield f"{name}: signal {entry['signal']!r:.40} in {entry['unit']!r:.40}"
         for key, others in (
             ("worst_margin", ("worst_time", "peak_plant")),
@@ -157,6 +157,15 @@ def contradictions(summary: Mapping[str, Any]) -> Iterator[str]:
             yield f"{name}: worst_margin_sampled is there without worst_margin"
         if entry["satisfied"] != is_satisfied(entry):
             yield f"{name}: satisfied is {str(entry['satisfied']).lower()}, and its worst margins say otherwise"
+
+
+def _unit(entry: Mapping[str, Any]) -> str | None:
+    """The unit of a constraint's signal; None where there is no such signal."""
+    if entry["signal"] in SIGNALS:
+        return SIGNALS[entry["signal"]].unit
+    terms = tuple(entry.get("terms", {}).items())
+    known = entry["signal"] == SUM and terms and all(name in TERMS for name, _ in terms)
+    return sum_signal(terms).unit if known else None
 
 
 def is_satisfied(entry: Mapping[str, Any]) -> bool:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any, Final
 
 import numpy as np
@@ -14,7 +15,7 @@ import numpy as np
 from mpc.answer import ActuatorBounds
 from mpc.fallback.contract import FallbackSettings
 from mpc.model import hover_model
-from mpc.ocp import Bounds, Objective, Problem
+from mpc.ocp import Bounds, Constraint, Objective, Penalty, Problem, lqr_terminal_weight
 from mpc.robust.tightening import SHORTEST_LAG
 from quadsim.controller import Controller
 from quadsim.errors import InputError, ParameterError
@@ -24,7 +25,7 @@ from scenarios.parts.plugin import build_plugin
 from scenarios.schema.baselines import GeometricSpec, LQRSpec, PIDSpec
 from scenarios.schema.controller import ConstrainedSpec, ControllerSpec, UnconstrainedSpec
 from scenarios.schema.fallback import FallbackSpec
-from scenarios.schema.optimisation import ANGLES, BoundedSpec, InputWeightsSpec, WeightedSpec
+from scenarios.schema.optimisation import ANGLES, BoundedSpec, InputWeightsSpec, SoftSpec, WeightedSpec
 from scenarios.schema.plugin import PluginSpec
 from scenarios.schema.robust import RobustSpec
 
@@ -38,11 +39,15 @@ SMALLEST_TILT: Final = 0.5
 
 def make_problem(spec: WeightedSpec, vehicle: Vehicle, period: float) -> Problem:
     """The optimisation of the paper's two controllers."""
+    model, objective = hover_model(vehicle, period), make_objective(spec.output_weights, spec.input_weights)
+    if spec.terminal == "lqr":
+        objective = replace(objective, P=lqr_terminal_weight(model, objective))
     return Problem(
-        model=hover_model(vehicle, period),
+        model=model,
         horizon=spec.horizon,
-        objective=make_objective(spec.output_weights, spec.input_weights),
+        objective=objective,
         bounds=make_bounds(spec) if isinstance(spec, BoundedSpec) else None,
+        constraints=make_polytopes(spec) if isinstance(spec, BoundedSpec) else (),
     )
 
 
@@ -72,6 +77,36 @@ def make_bounds(spec: BoundedSpec) -> Bounds:
         u_min=np.full(N_ROTORS, lower_speed),
         u_max=np.full(N_ROTORS, upper_speed),
     )
+
+
+def make_polytopes(spec: BoundedSpec) -> tuple[Constraint, ...]:
+    """`[[controller.polytopes]]` as rows over the 12 states and four rotor speeds, each in its own unit."""
+    found = []
+    for polytope in spec.polytopes:
+        rows, count = np.array(polytope.rows, float), len(polytope.rows)
+        C, D = np.zeros((count, N_STATES)), np.zeros((count, N_ROTORS))
+        for name, column in zip(polytope.of, rows.T, strict=True):
+            if name in INDEX:
+                C[:, INDEX[name]] = column * (math.degrees(1.0) if name in ANGLES else 1.0)
+            else:
+                D[:, int(name.removeprefix("speed_")) - 1] = column
+        soft = polytope.soft
+        found.append(
+            Constraint(
+                name=polytope.name,
+                lower=np.full(count, -math.inf) if polytope.lower is None else np.array(polytope.lower, float),
+                upper=np.full(count, math.inf) if polytope.upper is None else np.array(polytope.upper, float),
+                C=C,
+                D=D,
+                penalty=None if soft is None else make_penalty(soft, count),
+            )
+        )
+    return tuple(found)
+
+
+def make_penalty(soft: SoftSpec, rows: int) -> Penalty:
+    """The price of violating each of so many rows."""
+    return Penalty(l1=np.full(rows, float(soft.linear)), l2=np.full(rows, float(soft.quadratic)))
 
 
 def make_controller(spec: ControllerSpec, vehicle: Vehicle, period: float) -> Controller:
@@ -139,7 +174,6 @@ def _unconstrained(problem: Problem) -> Controller:
 
 
 def _robust(spec: RobustSpec, vehicle: Vehicle, period: float) -> Controller:
-    from mpc.ocp import Penalty
     from mpc.robust.controller import Linearisation, RobustMPC, RobustSettings
     from mpc.robust.observer import ObserverSettings
     from mpc.robust.tightening import TighteningSettings, margins
@@ -147,11 +181,7 @@ def _robust(spec: RobustSpec, vehicle: Vehicle, period: float) -> Controller:
     bounds, rotor_lag = make_bounds(spec), _rotor_lag(spec, vehicle)
     soft, offset_free, tightening = spec.soft, spec.offset_free, spec.tightening
     settings = RobustSettings(
-        penalty=None
-        if soft is None
-        else Penalty(
-            l1=np.full(bounds.y_min.size, float(soft.linear)), l2=np.full(bounds.y_min.size, float(soft.quadratic))
-        ),
+        penalty=None if soft is None else make_penalty(soft, bounds.y_min.size),
         rotor_lag=rotor_lag,
         delay=spec.delay,
         observer=None if offset_free is None else ObserverSettings(**offset_free.model_dump()),
@@ -159,6 +189,7 @@ def _robust(spec: RobustSpec, vehicle: Vehicle, period: float) -> Controller:
         largest_turn=math.radians(spec.largest_turn),
         move_weight=None if spec.move_weight is None else spec.move_weight * np.eye(N_ROTORS),
         linearisation=Linearisation(spec.linearisation),
+        terminal=spec.terminal == "lqr",
         margins=None
         if tightening is None
         else margins(
@@ -179,6 +210,7 @@ def _robust(spec: RobustSpec, vehicle: Vehicle, period: float) -> Controller:
         objective=make_objective(spec.output_weights, spec.input_weights),
         bounds=bounds,
         settings=settings,
+        constraints=make_polytopes(spec),
     )
 
 

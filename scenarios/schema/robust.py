@@ -10,7 +10,7 @@ from mpc.robust.observer import ObserverSettings
 from mpc.robust.tightening import SHORTEST_LAG, TighteningSettings
 from scenarios.schema.base import NonNegative, Positive, Spec
 from scenarios.schema.fallback import FallbackSpec
-from scenarios.schema.optimisation import BoundedSpec, Weight
+from scenarios.schema.optimisation import BoundedSpec, SoftSpec, Weight
 
 _OBSERVER: Final = ObserverSettings()
 _TIGHTENING: Final = TighteningSettings()
@@ -26,20 +26,6 @@ Lag = Annotated[
     Annotated[Seconds, Tag("number")] | Annotated[Literal["vehicle"], Tag("text")], Discriminator(_number_or_text)
 ]
 """A time constant, or that of the vehicle file."""
-
-
-class SoftSpec(Spec):
-    """Output bounds that may be left, at a price; inputs stay within theirs."""
-
-    linear: Annotated[float, Field(ge=0.0, le=1e12)] = Field(
-        default=2e5,
-        description="[1/unit of the state, rad for angles] l1, of leaving a bound at all: exact where it is above the "
-        "multipliers that hard bounds would have, as 1e8 nearly always is; but what is nearly hard fights back as hard "
-        "where the model errs",
-    )
-    quadratic: Annotated[float, Field(ge=0.0, le=1e12)] = Field(
-        default=1e4, description="[1/unit of the state^2, rad for angles] l2, of leaving it far"
-    )
 
 
 class OffsetFreeSpec(Spec):
@@ -114,5 +100,14 @@ class RobustSpec(BoundedSpec):
         if self.rotor_lag != "vehicle" and 0.0 < self.rotor_lag < SHORTEST_LAG:
             raise ValueError(f"rotor_lag must be 0, or at least {SHORTEST_LAG:g} s; got {self.rotor_lag:g}")
         if self.tightening is not None and not self.output_bounds:
-            raise ValueError("tightening must be absent where there are no output_bounds to draw in")
+            raise ValueError("tightening must be absent where there are no output_bounds to tighten")
+        if self.terminal is not None and self.linearisation != "hover":
+            raise ValueError(f'terminal must be absent where linearisation is not "hover"; got {self.terminal!r}')
+        for polytope in self.polytopes:
+            turned = [name for name in polytope.of if name in ("x", "vx", "y", "vy")]
+            if turned and self.heading and self.linearisation == "hover":
+                raise ValueError(
+                    f"polytopes: {polytope.name} must not be of {', '.join(turned)} where heading turns the hover "
+                    'model: heading = false, or linearisation = "trajectory"'
+                )
         return self

@@ -16,6 +16,7 @@ from scenarios.schema.controller import ControllerSpec
 from scenarios.schema.course import ReferenceSpec
 from scenarios.schema.effects import ComputationSpec, EffectsSpec
 from scenarios.schema.events import Event, PayloadDropEvent, PayloadPickupEvent, SensorFaultEvent
+from scenarios.schema.optimisation import BoundedSpec
 from scenarios.schema.sensors import EstimatorSpec, SensorsSpec, check_sensing
 from scenarios.schema.writing import to_toml
 
@@ -218,7 +219,9 @@ class Scenario(Spec):
         if self.initial.cold and not (self.effects.ground is not None and self.effects.ground.contact):
             raise ValueError("initial.cold must be false where effects.ground gives no floor to stand on; got true")
         check_sensing(self.sensors, self.estimator, timestep=self.plant.timestep)
+        polytopes = self.controller.polytopes if isinstance(self.controller, BoundedSpec) else []
         names = [constraint.name for constraint in self.constraints]
+        names += [name for polytope in polytopes for name in polytope.row_names]
         if len(set(names)) < len(names):
             raise ValueError(f"constraints must have distinct names; got {names}")
         return self

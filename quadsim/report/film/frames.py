@@ -8,7 +8,7 @@ from typing import Any, Final
 import numpy as np
 
 from quadsim.errors import FileError, ParameterError
-from quadsim.flight.audit import SIGNALS, Limit
+from quadsim.flight.audit import Limit
 from quadsim.flight.rundir import Run
 from quadsim.state import EULER, POSITION, Array, euler_to_quaternion
 
@@ -186,7 +186,7 @@ def _row_before(t: Array, times: Array) -> np.ndarray[Any, np.dtype[np.intp]]:
 
 
 def _track(run: Run, limit: Limit, times: Array) -> MarginTrack:
-    signal = SIGNALS[limit.signal]
+    signal = limit.source
     if signal.plant is None:
         t, values = run.log.control.t, signal.sampled(run.log.control)
     else:

@@ -10,8 +10,8 @@ from quadsim.errors import InputError
 from scenarios.bench.mismatch.conditions import Condition
 from scenarios.schema.baselines import GeometricSpec, LQRSpec, PIDSpec
 from scenarios.schema.controller import ConstrainedSpec, ControllerSpec, shared_tilt_bound
-from scenarios.schema.optimisation import InputBoundsSpec, InputWeightsSpec
-from scenarios.schema.robust import OffsetFreeSpec, RobustSpec, SoftSpec, TighteningSpec
+from scenarios.schema.optimisation import InputBoundsSpec, InputWeightsSpec, SoftSpec
+from scenarios.schema.robust import OffsetFreeSpec, RobustSpec, TighteningSpec
 from scenarios.schema.scenario import Scenario
 
 INPUT_WEIGHT: Final = 0.1

@@ -18,7 +18,7 @@ import pyarrow.parquet as pq
 from quadsim.controller import ACCEPTED, Phase
 from quadsim.errors import FileError
 from quadsim.flight import metrics
-from quadsim.flight.audit import SIGNALS, Finding, Limit
+from quadsim.flight.audit import Finding, Limit
 from quadsim.flight.log import FlightLog, TimingLog
 from quadsim.state import REFERENCE_NAMES, REFERENCE_UNITS
 from scenarios.campaign.results.verdicts import ERROR
@@ -82,7 +82,7 @@ def make_schema(draws: Mapping[str, tuple[pa.DataType, str]], limits: Sequence[L
         column
         for limit in limits
         for column in (
-            (MARGIN + limit.name, SIGNALS[limit.signal].unit, pa.float64()),
+            (MARGIN + limit.name, limit.unit, pa.float64()),
             (TIME_VIOLATED + limit.name, "s", pa.float64()),
             (SATISFIED + limit.name, "-", pa.bool_()),
         )
