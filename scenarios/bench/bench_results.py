@@ -75,15 +75,15 @@ class CandidateResult:
 
 @dataclass(frozen=True, kw_only=True)
 class Growth:
-    """How a contender's step grows with the horizon.
+    """How a candidate's step grows with the horizon.
 
     Attributes:
-        name: the contender.
+        name: the candidate.
         kind: which of its steps, by how their optimum was found; empty for all of them.
         whole: whether these are steps that solve the whole QP.
         horizons: N, as far as it went.
         p50, p99: whole step at each N [ms].
-        failures: periods that the contender left without their optimum, by the N at which it did.
+        failures: periods that the candidate left without their optimum, by the N at which it did.
         dropped: why it went no further; empty for one that went all the way.
     """
 
@@ -98,7 +98,7 @@ class Growth:
 
     @property
     def label(self) -> str:
-        """The contender, and which of its steps."""
+        """The candidate, and which of its steps."""
         return f"{self.name}, by {self.kind}" if self.kind else self.name
 
     def exponent(self, quantile: str) -> float | None:
@@ -129,7 +129,7 @@ class StageLength:
 
 @dataclass(frozen=True, kw_only=True)
 class SolverBench:
-    """All contenders on one flight's queries, in one run.
+    """All candidates on one flight's queries, in one run.
 
     Attributes:
         scenario: whose flight.
@@ -141,7 +141,7 @@ class SolverBench:
         gain_ms: (K,) whole step of the gain that the controller would be without its constraints [ms]; None where there
             is none.
         left_out: solvers that did not take part, and why.
-        growth: of each contender; empty where that was not measured.
+        growth: of each candidate; empty where that was not measured.
         growth_asked: periods asked at each horizon.
         stages: by what they are forms of, the whole QP or that of one axis.
         reference_kkt: worst KKT residual of the optimum that first inputs are compared with.

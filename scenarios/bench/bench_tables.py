@@ -19,9 +19,9 @@ from scenarios.bench.targets import flight_targets, render_targets, solver_targe
 
 
 def solver_tables(bench: SolverBench) -> list[Grid]:
-    """Contenders, the growth of their steps, the length of a stage, and what was asked."""
+    """Candidates, the growth of their steps, the length of a stage, and what was asked."""
     return [
-        _contenders(bench),
+        _candidates(bench),
         *([_growth(bench)] if bench.growth else []),
         *(_stages(what, stages) for what, stages in bench.stages.items()),
         targets_table("Asked of the solvers, and measured", solver_targets(bench)),
@@ -66,7 +66,7 @@ def render_tables(profile: RenderProfile) -> list[Grid]:
     return [grid, targets_table("Asked of a film, and measured", render_targets(profile))]
 
 
-def _contenders(bench: SolverBench) -> Grid:
+def _candidates(bench: SolverBench) -> Grid:
     head = (
         "whole step [ms]",
         "p50",
@@ -88,12 +88,12 @@ def _contenders(bench: SolverBench) -> Grid:
         key="contenders",
         title="The contenders",
         head=head,
-        lines=tuple(_contender(candidate, bench, fastest) for candidate in bench.contenders),
+        lines=tuple(_candidate(candidate, bench, fastest) for candidate in bench.contenders),
         note=_how(bench),
     )
 
 
-def _contender(candidate: CandidateResult, bench: SolverBench, fastest: dict[str, float]) -> tuple[Cell, ...]:
+def _candidate(candidate: CandidateResult, bench: SolverBench, fastest: dict[str, float]) -> tuple[Cell, ...]:
     quantiles = candidate.quantiles
     label = f"{candidate.name} (default)" if candidate is bench.default else candidate.name
     return (
@@ -128,7 +128,7 @@ def _how(bench: SolverBench) -> str:
 
 
 def _shares(candidate: CandidateResult) -> str:
-    """Which of its periods a contender with shortcuts answered how."""
+    """Which of its periods a candidate with shortcuts answered how."""
     told = ", ".join(f"by {way} {count}" for way, count in sorted(candidate.ways.items(), key=lambda pair: -pair[1]))
     return f"Periods that the default answered {told}. " if candidate.shortcut else ""
 

@@ -28,7 +28,7 @@ REFERENCE_SOLVER: Final = "piqp-dense"
 
 @dataclass(frozen=True, kw_only=True)
 class Entry:
-    """One contender: a solver, with or without the shortcuts of `mpc.exact.shortcut`."""
+    """One candidate: a solver, with or without the shortcuts of `mpc.exact.shortcut`."""
 
     solver: str
     shortcut: bool

@@ -17,11 +17,11 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _DASHES: Final = ("-", "--", ":")
-"""Contenders beyond the colours there are take them again, with another line."""
+"""Candidates beyond the colours there are take them again, with another line."""
 
 
 def write_solver_figure(bench: SolverBench, directory: Path) -> list[Path]:
-    """Draw the step times of all contenders, and their growth with the horizon.
+    """Draw the step times of all candidates, and their growth with the horizon.
 
     Args:
         bench: what was measured.
@@ -48,7 +48,7 @@ def _draw(bench: SolverBench) -> Figure:
 
 
 def _draw_times(axes: Axes, bench: SolverBench) -> None:
-    """A row per contender, the quickest at the top: all its steps, with p50, p99 and the longest marked."""
+    """A row per candidate, the quickest at the top: all its steps, with p50, p99 and the longest marked."""
     ranked = sorted(bench.contenders, key=lambda candidate: candidate.quantiles["p99"], reverse=True)
     rng = np.random.default_rng(0)  # spreads the dots of a row, as every time
     for row, candidate in enumerate(ranked):
@@ -114,7 +114,7 @@ def _label(bench: SolverBench, candidate: CandidateResult) -> str:
 
 
 def _look(bench: SolverBench, name: str) -> tuple[str, str]:
-    """Colour and line of a contender."""
+    """Colour and line of a candidate."""
     names = [candidate.name for candidate in bench.contenders]
     i = names.index(name)
     return LINES[i % len(LINES)], _DASHES[i // len(LINES) % len(_DASHES)]

@@ -42,11 +42,11 @@ HORIZONS: Final = (10, 20, 50, 100, 200)
 GROWTH_STRIDE: Final = 6
 """One stretch of so many is asked at each horizon and of each form of the QP."""
 LONGEST_PASS: Final = 20.0
-"""A contender whose first pass takes longer [s] is timed once."""
+"""A candidate whose first pass takes longer [s] is timed once."""
 GAIN: Final = "unconstrained gain"
 """What the controller would be without its constraints."""
 PATIENCE: Final = 60.0
-"""A contender that takes longer for the questions at one horizon [s] is dropped."""
+"""A candidate that takes longer for the questions at one horizon [s] is dropped."""
 
 
 class _Racing(TypedDict):
@@ -59,7 +59,7 @@ class _Racing(TypedDict):
 
 @dataclass(frozen=True, kw_only=True)
 class _Timed:
-    """A contender's steps (K,) [ms], the ways (K,) they were answered in, and the periods without their optimum."""
+    """A candidate's steps (K,) [ms], the ways (K,) they were answered in, and the periods without their optimum."""
 
     step_ms: Array
     ways: np.ndarray[tuple[int], np.dtype[np.object_]]
@@ -104,7 +104,7 @@ def bench_solvers(
     few = stretches(flight.log.control.t.size, stride * GROWTH_STRIDE)
     with flight_between(scenario, flight.vehicle) as between:
         racing: _Racing = {"between": between, "repeats": repeats, "rng": rng}
-        contenders, own, gain, asked, reference_kkt = _time_contenders(
+        contenders, own, gain, asked, reference_kkt = _time_candidates(
             flight, problem, taking_part, stride=stride, progress=progress, **racing
         )
         growth = _growth(flight, problem, taking_part, horizons, few, own, progress=progress, **racing)
@@ -167,7 +167,7 @@ def _check(
     return scenario.controller
 
 
-def _time_contenders(
+def _time_candidates(
     flight: Flight,
     problem: Problem,
     taking_part: Sequence[Entry],
@@ -178,7 +178,7 @@ def _time_contenders(
     between: Callable[[], None],
     progress: Progress,
 ) -> tuple[tuple[CandidateResult, ...], dict[str, _Timed], Array | None, int, float]:
-    """Contenders, their steps, the gain's, the number of periods asked, and the reference's worst KKT residual."""
+    """Candidates, their steps, the gain's, the number of periods asked, and the reference's worst KKT residual."""
     queries = recorded(flight.scenario, flight.log.control, problem.horizon)
     asked = stretches(queries.t.size, stride)
     periods = [period for stretch in asked for period in stretch]
@@ -238,10 +238,10 @@ def _growth(
     rng: np.random.Generator,
     progress: Progress,
 ) -> tuple[Growth, ...]:
-    """Every contender at each N, until one would hardly keep up with the flight at the next.
+    """Every candidate at each N, until one would hardly keep up with the flight at the next.
 
     Steps by the whole QP and by either shortcut are told apart: their shares change with N.  At the flight's own N they
-    are those of the contenders, `own`, which are not timed again.
+    are those of the candidates, `own`, which are not timed again.
     """
     grown: dict[tuple[Entry, Way], list[tuple[int, float, float]]] = {}
     failures: dict[str, dict[int, int]] = {}

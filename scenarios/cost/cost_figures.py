@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 def write_cost_figures(study: CostStudy, directory: Path) -> list[Path]:
-    """Draw the step times of all contenders, and both sweeps.
+    """Draw the step times of all candidates, and both sweeps.
 
     Args:
         study: what was measured.

@@ -34,7 +34,7 @@ REPEATS: Final = 3
 SWEEP_STRIDE: Final = 3
 """Of a flight in a sweep, one stretch of so many is timed."""
 LONGEST_PASS: Final = 20.0
-"""A contender that takes longer than this for all periods of a flight [s] is timed once."""
+"""A candidate that takes longer than this for all periods of a flight [s] is timed once."""
 
 
 @dataclass(frozen=True, kw_only=True)

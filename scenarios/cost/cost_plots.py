@@ -21,7 +21,7 @@ _LOG_TICKS: Final = [float(f"{digit}e{power}") for power in range(-4, 6) for dig
 
 
 def cost_plots(study: CostStudy) -> list[Plot]:
-    """Step times of all contenders, and both sweeps."""
+    """Step times of all candidates, and both sweeps."""
     sweeps = [
         _sweep(study, study.tilt, "cost-tilt", "Over the bound on roll and pitch"),
         _sweep(study, study.horizons, "cost-horizon", "Over the horizon"),

@@ -87,7 +87,7 @@ def _computation(study: CostStudy) -> Grid:
 
 
 def _times(study: CostStudy, name: str, step_ms: Array, candidate: CandidateTimes | None = None) -> tuple[Cell, ...]:
-    """A line of the table of computation; rates and failures are those of a whole contender."""
+    """A line of the table of computation; rates and failures are those of a whole candidate."""
     found = percentiles(step_ms)
     late = Mark.BAD if found["max"] > study.deadline_ms else Mark.NONE
     whole = [ABSENT] * 3

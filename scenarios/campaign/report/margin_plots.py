@@ -14,10 +14,10 @@ from quadsim.report.palette import BOUND, COURSE_COLOUR, REFERENCE
 from quadsim.report.plots.panels import BOTTOM, Plot, finished, finished_panels, panels, place
 from quadsim.state import Array
 from scenarios.campaign.report.campaign_curves import present
-from scenarios.campaign.results.columns import numbers
+from scenarios.campaign.results.columns import Rows, numbers
 from scenarios.campaign.results.verdicts import VERDICTS
 from scenarios.campaign.statistics.comparison import Comparison
-from scenarios.campaign.statistics.scatters import COURSE, Cloud, Margins, Rows, edges, shown_flights
+from scenarios.campaign.statistics.scatters import COURSE, Cloud, Margins, edges, shown_flights
 from scenarios.campaign.statistics.wording import side_by_side
 
 if TYPE_CHECKING:

@@ -13,8 +13,9 @@ from scenarios.campaign.results.table import DRAW, MARGIN, SATISFIED, TIME_VIOLA
 from scenarios.campaign.results.verdicts import VERDICTS
 
 Texts = np.ndarray[Any, np.dtype[np.object_]]
-
 _NO_METRIC: Final = ("flight", "seed", DRAW, MARGIN, TIME_VIOLATED, SATISFIED)
+Rows = np.ndarray[Any, np.dtype[np.intp]]
+Edges = np.ndarray[Any, np.dtype[np.str_]]
 
 
 def numbers(table: pa.Table, name: str) -> Array:

@@ -11,10 +11,9 @@ import pyarrow as pa
 
 from quadsim.report.palette import BOUND, LINES
 from quadsim.state import Array
-from scenarios.campaign.results.columns import numbers
+from scenarios.campaign.results.columns import Edges, Rows, numbers
 from scenarios.campaign.results.events import Flags
 from scenarios.campaign.statistics.outliers import margin_ends
-from scenarios.campaign.statistics.scatters import Edges, Rows
 from scenarios.campaign.statistics.wording import count_of
 
 _MOST_POINTS: Final = 4000

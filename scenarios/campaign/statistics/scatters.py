@@ -14,15 +14,12 @@ import numpy as np
 import pyarrow as pa
 
 from quadsim.state import Array
-from scenarios.campaign.results.columns import draw_names, is_number, numbers, texts, verdicts
+from scenarios.campaign.results.columns import Edges, Rows, draw_names, is_number, numbers, texts, verdicts
 from scenarios.campaign.results.events import Flags
 from scenarios.campaign.results.table import DRAW, unit_of
 from scenarios.campaign.statistics.dependence import Trend, trend
 from scenarios.campaign.statistics.outliers import margin_ends, robust_ends
 from scenarios.campaign.statistics.wording import count_of, label
-
-Rows = np.ndarray[Any, np.dtype[np.intp]]
-Edges = np.ndarray[Any, np.dtype[np.str_]]
 
 COURSE: Final = "half of the flights are above"
 """What a curve through the flights of a scatter tells."""
