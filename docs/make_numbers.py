@@ -42,14 +42,14 @@ def fly(name: str, *settings: str) -> Flight:
 
 
 def margin(flight: Flight, name: str) -> str:
-    """By how much a flight leaves a bound, in the bound's unit, and for how long at the physics rate."""
+    """By how much a flight violates a bound, in the bound's unit, and for how long at the physics rate."""
     finding = next(finding for finding in flight.findings if finding.limit.name == name)
     beyond = -min(finding.worst_margin, finding.worst_margin_sampled)
     if finding.satisfied:
         return f"held ({beyond:+.3f} {finding.limit.unit})" if beyond > 1e-6 else "held"
     if not finding.time_violated:
-        return f"commands leave by {beyond:.2f} {finding.limit.unit}, rotors held"
-    return f"left by {beyond:.2f} {finding.limit.unit}, {finding.time_violated:.2f} s"
+        return f"commands violate by {beyond:.2f} {finding.limit.unit}, rotors held"
+    return f"violated by {beyond:.2f} {finding.limit.unit}, {finding.time_violated:.2f} s"
 
 
 def results(flights: dict[str, Flight]) -> Table:
@@ -208,7 +208,7 @@ def main() -> None:
         "# The numbers\n\nMade by `make numbers`; nothing here is typed by hand.\n",
         f"## The paper's flights\n\n{table}",
         "A bound that is *held* may still be exceeded between the samples, by what stands in brackets; the audit's\n"
-        "tolerance for it is 0.05 deg. `left by` gives the worst excess and the seconds beyond bound and tolerance,\n"
+        "tolerance for it is 0.05 deg. `violated by` gives the worst excess and the seconds beyond bound and tolerance,\n"
         "at the physics rate; for steps, which exist once per period, at the samples.\n",
         "The same over the parameters that the paper leaves out, L and d/b, is in\n"
         "[constraints-cost.md](constraints-cost.md).\n",

@@ -1,6 +1,6 @@
 """Remake docs/robustness.md and its figure: `make robustness`.
 
-The ladder is `quadsim bench ladder`; the faults are those of tests/fault_injection.py, fifty for each controller.
+The mismatch benchmark is `quadsim bench ladder`; the faults are those of tests/fault_injection.py, fifty for each controller.
 """
 
 from __future__ import annotations
@@ -112,14 +112,14 @@ def page(measured: MismatchBench, found: Sequence[Consequence]) -> str:
     harmless = sum(each.harmless for each in found)
     return "\n".join(
         [
-            "# Robustness\n\nMade by `make robustness`; the ladder alone is `quadsim bench ladder`, on "
+            "# Robustness\n\nMade by `make robustness`; the mismatch benchmark alone is `quadsim bench ladder`, on "
             f"{measured.scenario}, {measured.duration:g} s.\n\n{mismatch_legend(measured)}",
             "![Each controller in each condition: distance at the end, and peak tilt](ladder.png)\n",
             section(asked(measured)),
             "LQR, PID and geometric control fly with up to 20 deg of tilt and no bound on steps of the rotor speeds, "
             "so their errors are not to be\ncompared with those at 5 deg. Their gains were tuned on the nominal course "
-            "and a few rungs; the robust controller's input and move\nweight and its observer on the rungs of this "
-            "ladder.\n",
+            "and in a few of these conditions; the robust\ncontroller's input and move weight and its observer in all of "
+            "them.\n",
             *(section(grid) for grid in mismatch_tables(measured)),
             f"## Faults\n\n{harmless} of {len(found)} are harmless: no exception; every command finite and within its "
             f"bounds on speeds and steps; the vehicle back within {NEAR:g} m of the same flight without the fault "

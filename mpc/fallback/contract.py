@@ -10,7 +10,7 @@ Each period, the first of these that can be had:
 
 The inner controller is asked again in every period in which the state is known, so that recovery is automatic.  It is
 told the command in force each time, so that its own bounds on steps refer to what acts, whoever commanded it, and which
-channels of the state are predicted rather than measured (`mpc.fallback.completion.Reckoned`).
+channels of the state are predicted rather than measured (`mpc.fallback.completion.CompletedMoment`).
 
 One that estimates what disturbs the vehicle says what holds it at rest by an attribute `trim` (`mpc.equilibrium.Trim`).
 Levels 1 to 3, and predictions of what is not measured, start from it; it stays as it was while nothing is measured.
@@ -27,7 +27,7 @@ import numpy as np
 
 from mpc.answer import BOUND_TOLERANCE, ActuatorBounds
 from mpc.equilibrium import Trim
-from mpc.fallback.completion import PLAUSIBLE, DeadReckoning, Reckoned
+from mpc.fallback.completion import PLAUSIBLE, StateCompletion, CompletedMoment
 from mpc.fallback.hover import HoverLaw
 from mpc.heading import anchored, predict_in_heading_frame
 from mpc.model import LinearModel
@@ -133,7 +133,7 @@ class Guarded:
         self.law = HoverLaw(model, tilt=settings.tilt)
         self._model, self._bounds, self._settings, self._failures = model, bounds, settings, failures
         self._distance = settings.distance
-        self._reckoning = DeadReckoning(model)
+        self._completion = StateCompletion(model)
         self._level = Trim(speeds=model.u_bar, lift=np.array([0.0, 0.0, 1.0]))
         self._good: _Good | None
         self._foreseen: Array | None
@@ -159,7 +159,7 @@ class Guarded:
         """Start anew after the command u(-1) (4,) [rad/s]."""
         usable = check_command(speeds) is None
         self._before = np.array(speeds, float) if usable else self._model.u_bar.copy()
-        self._reckoning.reset()
+        self._completion.reset()
         self._forget()
         self.inner.reset(self._before.copy())
 
@@ -170,8 +170,8 @@ class Guarded:
         to their lowest speed as fast as the bounds allow.
         """
         acting = self._before if now.acting is None or check_command(now.acting) is not None else now.acting
-        known = self._reckoning.complete(state, acting, self.trim, free=now.phase is Phase.FLYING)
-        told = Reckoned(**{**vars(now), "acting": acting.copy(), "unseen": self._reckoning.unseen.copy()})
+        known = self._completion.complete(state, acting, self.trim, free=now.phase is Phase.FLYING)
+        told = CompletedMoment(**{**vars(now), "acting": acting.copy(), "unseen": self._completion.unseen.copy()})
         status, answer = self._ask(told, known, reference)
         if now.phase in GROUNDED:
             self._forget()
@@ -211,10 +211,10 @@ class Guarded:
         self._good, self._foreseen, self._age = None, None, 0
         self._target, self._hovered = None, 0
 
-    def _ask(self, now: Reckoned, known: Array, reference: Array) -> tuple[str, Command | None]:
+    def _ask(self, now: CompletedMoment, known: Array, reference: Array) -> tuple[str, Command | None]:
         """The inner controller's answer where one was given, and its status: an accepted one is good to fly."""
         assert now.acting is not None
-        if self._model.period * float(self._reckoning.unseen.max()) > self._settings.unseen:
+        if self._model.period * float(self._completion.unseen.max()) > self._settings.unseen:
             return "state_unknown", None
         shape = (self.horizon, len(REFERENCE_STATES))
         if np.shape(reference) != shape or not (np.abs(reference) <= PLAUSIBLE[list(REFERENCE_STATES)]).all():

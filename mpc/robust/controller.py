@@ -21,7 +21,7 @@ import numpy as np
 from mpc.answer import ActuatorBounds, rejection, shifted
 from mpc.equilibrium import Trim, equilibrium, twisted
 from mpc.exact.shortcut import with_shortcut
-from mpc.fallback.completion import PLAUSIBLE, Reckoned
+from mpc.fallback.completion import PLAUSIBLE, CompletedMoment
 from mpc.heading import (
     anchored,
     predict_in_heading_frame,
@@ -150,7 +150,7 @@ class RobustMPC:
 
         Numbers that are not finite, not `mpc.fallback.completion.PLAUSIBLE`, or lead to such are answered with the
         status `invalid_data`, and nothing is learned from them.  Nor is anything from a state that is in part predicted
-        (`mpc.fallback.completion.Reckoned`), nor from the first measured one after more than `LONGEST_SPAN` of such, or
+        (`mpc.fallback.completion.CompletedMoment`), nor from the first measured one after more than `LONGEST_SPAN` of such, or
         after a pause: `now.time` has to be a period later than last time.
         """
         if now.acting is not None:
@@ -231,7 +231,7 @@ class RobustMPC:
 
     def _span(self, now: Moment) -> float:
         """Time since the last measured state [s]; infinite after a pause, or where the present one is not measured."""
-        if isinstance(now, Reckoned) and now.unseen[_MOVING].any():
+        if isinstance(now, CompletedMoment) and now.unseen[_MOVING].any():
             return math.inf
         span, self._measured = now.time - self._measured, now.time
         return span - _SAME_TIME

@@ -1,4 +1,4 @@
-"""Places where outputs go: what they are called, where a path leads, and what may stand in the way."""
+"""Paths of outputs: their names, where links lead, and what may already be there."""
 
 from __future__ import annotations
 

@@ -69,7 +69,7 @@ def begin(plan: Plan, files: Growing) -> dict[str, Any]:
 
 
 def go_on(plan: Plan, files: Growing, *, flying: bool) -> dict[str, Any]:
-    """The manifest of a campaign that is gone on with, maybe by more flights; see `require_same`.
+    """The manifest of a campaign that is resumed, perhaps with more flights; see `require_same`.
 
     Args:
         plan: the campaign.

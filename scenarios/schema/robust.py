@@ -29,7 +29,7 @@ Lag = Annotated[
 
 
 class OffsetFreeSpec(Spec):
-    """Force and torque that the model does not explain, estimated, predicted and aimed off for."""
+    """Unmodelled force and torque: estimated, predicted and compensated."""
 
     velocity_noise: Positive = Field(default=_OBSERVER.velocity_noise, description="[m/s] of a measured velocity")
     rate_noise: Positive = Field(default=_OBSERVER.rate_noise, description="[rad/s] of a measured body rate")
@@ -50,7 +50,7 @@ class OffsetFreeSpec(Spec):
 
 
 class TighteningSpec(Spec):
-    """Output bounds drawn in, so that they hold under disturbances within stated bounds, and between samples."""
+    """Output bounds tightened, so that they hold under disturbances within stated bounds, and between samples."""
 
     acceleration: NonNegative = Field(
         default=_TIGHTENING.acceleration,

@@ -13,7 +13,7 @@ from support import paper_problem, paper_reference
 
 from mpc.constrained import ConstrainedMPC
 from mpc.equilibrium import equilibrium
-from mpc.fallback.completion import Reckoned
+from mpc.fallback.completion import CompletedMoment
 from mpc.heading import turn_horizontally
 from mpc.model import hover_model
 from mpc.nonlinear.linearise import linearise
@@ -315,14 +315,14 @@ def test_predicted_states_teach_nothing_and_long_spans_of_them_neither(
     measured, guessed = np.zeros(12), np.zeros(12)
     guessed[INDEX["vx"]] = 1.0
     times = PERIOD * np.arange(predicted + 3)
-    controller.step(Reckoned(time=times[0], acting=acting, unseen=measured), np.zeros(12), HOLD)
+    controller.step(CompletedMoment(time=times[0], acting=acting, unseen=measured), np.zeros(12), HOLD)
     for time in times[1 : predicted + 1]:
-        controller.step(Reckoned(time=time, acting=acting, unseen=guessed), moving((0.3, 0.0, 0.0)), HOLD)
+        controller.step(CompletedMoment(time=time, acting=acting, unseen=guessed), moving((0.3, 0.0, 0.0)), HOLD)
         np.testing.assert_array_equal(controller.disturbance, 0.0)
-    controller.step(Reckoned(time=times[-2], acting=acting, unseen=measured), moving((0.1, 0.0, 0.0)), HOLD)
+    controller.step(CompletedMoment(time=times[-2], acting=acting, unseen=measured), moving((0.1, 0.0, 0.0)), HOLD)
     assert controller.disturbance.any() == learned
     before = controller.disturbance
-    controller.step(Reckoned(time=times[-1], acting=acting, unseen=measured), np.zeros(12), HOLD)
+    controller.step(CompletedMoment(time=times[-1], acting=acting, unseen=measured), np.zeros(12), HOLD)
     assert np.abs(controller.disturbance - before).max() > 0.0
 
 
@@ -331,7 +331,7 @@ def test_a_position_that_is_predicted_hides_no_disturbance(vehicle: Vehicle) -> 
     unseen = np.zeros(12)
     unseen[list(POSITION)] = 7.0
     for k, speed in enumerate((0.0, 0.2)):
-        controller.step(Reckoned(time=k * PERIOD, acting=acting, unseen=unseen), moving((0.0, 0.0, speed)), HOLD)
+        controller.step(CompletedMoment(time=k * PERIOD, acting=acting, unseen=unseen), moving((0.0, 0.0, speed)), HOLD)
     assert controller.disturbance[2] > 0.1
 
 

@@ -352,7 +352,7 @@ def test_impossible_penalties_are_refused(l1: list[float], l2: list[float]) -> N
 @pytest.mark.parametrize(("horizon", "steps"), [(1, 4), (3, 1), (7, 2), (10, 4)])
 @pytest.mark.parametrize("soft", [False, True])
 def test_weighted_moves_and_margins_agree_with_a_dense_solver(horizon: int, steps: int, soft: bool) -> None:
-    """The peer's cost with |u(i) - u(i-1)|^2_Qd added, and bounds drawn in, all written out once more."""
+    """The peer's cost with |u(i) - u(i-1)|^2_Qd added, and bounds tightened, all written out once more."""
     rng = np.random.default_rng(horizon + 10 * steps)
     solved = 0
     for _ in range(6):

@@ -98,7 +98,7 @@ def doubt(estimate: Estimate, name: SensorName, value: Array, refused: float) ->
     """The estimate with its variance widened by as much as a sample disagrees with it, so that the sample passes.
 
     For the way back after divergence: the innovation squared is added to the variance of all that the sensor sees, and
-    (innovation / time)^2 to that of the rates of change which may have led it astray in the meantime.
+    (innovation / time)^2 to that of the rates of change which may have caused its error in the meantime.
 
     Args:
         estimate: what is believed.

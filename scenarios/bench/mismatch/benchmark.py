@@ -81,12 +81,12 @@ TABLES_FILE: Final = "ladder.md"
 TIMED: Final = 3
 """Flights that steps are timed in: the machine's own slow spells are not the controller's."""
 QUICK_DURATION: Final = 12.0
-"""Of the flights of a quick ladder [s]."""
+"""Of the flights with `--quick` [s]."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Cell:
-    """One flight of the ladder, as a worker process is asked for it."""
+    """One flight of the benchmark, as it is sent to a worker process."""
 
     scenario: str
     settings: tuple[str, ...]
@@ -244,6 +244,8 @@ def write_mismatch(measured: MismatchBench, directory: Path) -> None:
 
 
 def mismatch_markdown(measured: MismatchBench) -> str:
-    """All tables of a ladder, under what its controllers and conditions are."""
+    """All tables, after the lists of controllers and conditions."""
     sections = "\n".join(map(section, mismatch_tables(measured)))
-    return f"# The ladder on {measured.scenario}, {measured.duration:g} s\n\n{mismatch_legend(measured)}\n{sections}"
+    return (
+        f"# Model mismatch on {measured.scenario}, {measured.duration:g} s\n\n{mismatch_legend(measured)}\n{sections}"
+    )

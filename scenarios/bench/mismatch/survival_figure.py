@@ -1,4 +1,4 @@
-"""The mismatch ladder -> its figure: a coloured cell per controller and condition, red where the vehicle is lost."""
+"""The mismatch benchmark -> its figure: a coloured cell per controller and condition, red where the vehicle is lost."""
 
 from __future__ import annotations
 

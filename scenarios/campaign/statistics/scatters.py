@@ -128,7 +128,7 @@ def thinning(table: pa.Table) -> str:
     ]
     if not parts:
         return ""
-    return f"Drawn are {', '.join(parts)}, evenly spread by number; all others are drawn in full."
+    return f"Drawn are {', '.join(parts)}, evenly spread by number; all others are shown in full."
 
 
 def clipping(drawn: Margins, parameters: list[Cloud]) -> str:

@@ -1,4 +1,4 @@
-"""`quadsim bench ladder`: conditions that can be flown, flights judged as told, whole results, refusals."""
+"""`quadsim bench ladder`: conditions that can be flown, flights judged by rule, whole results, refusals."""
 
 from __future__ import annotations
 
@@ -76,8 +76,8 @@ def made_up() -> MismatchBench:
     [
         ({}, True, ""),
         ({"reason": "diverged", "flown": 12.6}, False, "lost, 13 s"),
-        ({"end_error": 10.1}, False, "astray"),
-        ({"peak_tilt": 91.0, "end_error": 10.1}, False, "fell over"),
+        ({"end_error": 10.1}, False, "diverged"),
+        ({"peak_tilt": 91.0, "end_error": 10.1}, False, "overturned"),
         ({"reason": "no plan", "flown": 0.0, "end_error": None, "peak_tilt": None}, False, "lost, 0 s"),
     ],
 )
@@ -90,7 +90,7 @@ def test_tables_show_each_flight_where_it_belongs() -> None:
     tables = {grid.key: grid for grid in mismatch_tables(made_up())}
     assert tables["end"].head == ("", "a", "b")
     texts = {key: [[each.text for each in line] for line in grid.lines] for key, grid in tables.items()}
-    assert texts["end"] == [["calm", "0.010", "0.800"], ["storm", "lost, 13 s", "astray"]]
+    assert texts["end"] == [["calm", "0.010", "0.800"], ["storm", "lost, 13 s", "diverged"]]
     assert texts["tilt"][0] == ["calm", "4.900", "5.300"]
     assert texts["violated"][0] == ["calm", "0", "0.25"]
     assert texts["rmse"][0][1] == "0.50, 0.25, 1.00"
@@ -227,7 +227,7 @@ def test_a_ladder_is_written_whole_and_the_same_each_time(quick: MismatchBench, 
 def test_the_figure_of_a_made_up_ladder_tells_each_fate(tmp_path: Path) -> None:
     write_mismatch(made_up(), tmp_path)
     drawing = (tmp_path / "ladder.svg").read_text()
-    for text in ("0.01", "0.80", "13 s", "astray", "4.90", "5.30"):
+    for text in ("0.01", "0.80", "13 s", "diverged", "4.90", "5.30"):
         assert f">{text}<" in drawing
 
 
@@ -249,7 +249,9 @@ def test_the_page_says_what_is_met_and_what_is_not() -> None:
 
 
 def test_a_scenario_without_such_bounds_is_refused() -> None:
-    with pytest.raises(InputError, match=r"paper-unconstrained: the ladder needs a constrained controller whose"):
+    with pytest.raises(
+        InputError, match=r"paper-unconstrained: the mismatch benchmark needs a constrained controller whose"
+    ):
         run_mismatch("paper-unconstrained", quick=True)
     with pytest.raises(InputError, match="are the same, as paper-constrained has"):
         tilt_bound(load_scenario("paper-constrained", ["controller.output_bounds.roll=[-4.0, 5.0]"]))
