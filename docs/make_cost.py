@@ -25,7 +25,7 @@ def timed(bench: SolverBench) -> list[CandidateTimes]:
     gain = CandidateTimes(
         name="unconstrained gain", step_ms=bench.gain_ms, statuses=("solved",) * bench.gain_ms.size, repeats=repeats
     )
-    alone = {each.solver: each for each in bench.contenders if not each.shortcut}
+    alone = {each.solver: each for each in bench.candidates if not each.shortcut}
     named = {"constrained, as flown": bench.default}
     named |= {f"QP by {solver}": alone[solver] for solver in SOLVERS_TIMED if solver in alone}
     return [
@@ -44,9 +44,9 @@ def answer(study: CostStudy) -> Table:
         flights = (study.constrained, study.unconstrained)
         return (label, *(", ".join(format(flight.numbers[key], form) for key in keys) for flight in flights))
 
-    gain, flown, *by_qp = study.contenders
-    times = {candidate.name: percentiles(candidate.step_ms) for candidate in study.contenders}
-    told = {name: ", ".join(f"{found[key]:.3g}" for key in ("p50", "p99", "max")) for name, found in times.items()}
+    gain, flown, *by_qp = study.candidates
+    times = {candidate.name: percentiles(candidate.step_ms) for candidate in study.candidates}
+    text = {name: ", ".join(f"{found[key]:.3g}" for key in ("p50", "p99", "max")) for name, found in times.items()}
     lost = [f"{point.value:g}" for point in study.horizons.points if not point.unconstrained.completed]
     kept = [f"{point.value:g}" for point in study.horizons.points if not point.constrained.completed]
     rows: Table = [
@@ -57,10 +57,10 @@ def answer(study: CostStudy) -> Table:
         pair("total variation of the commands [rad/s]", ("total_variation",), ".0f"),
         ("periods without a QP", f"{flown.shortcut.sum()} of {flown.shortcut.size}", "all"),
         ("horizons N at which the vehicle is lost", ", ".join(kept) or "none", ", ".join(lost) or "none"),
-        ("controller step: median, p99, max [ms]", told[flown.name], told[gain.name]),
+        ("controller step: median, p99, max [ms]", text[flown.name], text[gain.name]),
         ("largest loop rate [Hz]", *(f"{each.rate('max'):.0f}" for each in (flown, gain))),
     ]
-    rows += [(f"{each.name} in every period: the same [ms]", told[each.name], "-") for each in by_qp]
+    rows += [(f"{each.name} in every period: the same [ms]", text[each.name], "-") for each in by_qp]
     return rows
 
 

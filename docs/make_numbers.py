@@ -148,7 +148,7 @@ def transition_difference(vehicle: Vehicle) -> float:
 
 
 def targets(constrained: Flight, variations: Sequence[Variation]) -> Table:
-    """What was asked of the flights and of the mathematics, and what is measured."""
+    """Targets for the flights and the mathematics, and what is measured."""
     found = {finding.limit.name: finding for finding in constrained.findings}
     tilt, inputs = [found["roll"], found["pitch"]], [found["speed"], found["slew"]]
     control = constrained.log.control
@@ -158,7 +158,7 @@ def targets(constrained: Flight, variations: Sequence[Variation]) -> Table:
     varied = max(variation.outcome.numbers["tilt_plant"] for variation in variations)
     beyond = max(0.0, *(-min(finding.worst_margin, finding.worst_margin_sampled) for finding in inputs))
     return [
-        ("paper-constrained, and the mathematics", "asked", "measured"),
+        ("paper-constrained, and the mathematics", "target", "measured"),
         ("roll, pitch beyond 5 deg at the samples", "<= 0.01 deg", f"{-min(f.worst_margin_sampled for f in tilt):.4f}"),
         ("roll, pitch beyond 5 deg at 1 kHz", "<= 0.05 deg", f"{-min(f.worst_margin for f in tilt):.3f}"),
         ("the same over L and d/b, worst of nine", "<= 0.1 deg", f"{varied - 5.0:.3f}"),
@@ -208,8 +208,8 @@ def main() -> None:
         "# The numbers\n\nMade by `make numbers`; nothing here is typed by hand.\n",
         f"## The paper's flights\n\n{table}",
         "A bound that is *held* may still be exceeded between the samples, by what stands in brackets; the audit's\n"
-        "tolerance for it is 0.05 deg. `violated by` gives the worst excess and the seconds beyond bound and tolerance,\n"
-        "at the physics rate; for steps, which exist once per period, at the samples.\n",
+        "tolerance for it is 0.05 deg. `violated by` gives the worst excess and the seconds beyond bound and\n"
+        "tolerance, at the physics rate; for steps, which exist once per period, at the samples.\n",
         "The same over the parameters that the paper leaves out, L and d/b, is in\n"
         "[constraints-cost.md](constraints-cost.md).\n",
         f"## K_N against the discrete LQR gain\n\n{markdown(lqr_convergence())}",

@@ -113,11 +113,11 @@ def effect_costs() -> Table:
 def whole_commands(flight: FlightProfile, film: RenderProfile) -> Table:
     """What a person waits for: the best of a few times, but for the film, whose time is long enough."""
     rows: Table = [
-        ("what a person waits for, at best", "asked", "measured [s]"),
+        ("what a person waits for, at best", "target", "measured [s]"),
         ("60 s of constrained flight simulated, one core", "<= 1.2 s", f"{flight.best:.2f}"),
     ]
     with tempfile.TemporaryDirectory() as scratch:
-        for label, asked, repeats, arguments in (
+        for label, target, repeats, arguments in (
             ("`quadsim --help`", "<= 0.3 s", REPEATS, ["--help"]),
             (
                 f"`quadsim run {SCENARIO} --no-video`",
@@ -132,7 +132,7 @@ def whole_commands(flight: FlightProfile, film: RenderProfile) -> Table:
                 ["video", f"{scratch}/run"],
             ),
         ):
-            rows.append((label, asked, f"{min(_wall_s(arguments) for _ in range(repeats)):.2f}"))
+            rows.append((label, target, f"{min(_wall_s(arguments) for _ in range(repeats)):.2f}"))
     return rows
 
 
@@ -158,8 +158,8 @@ def campaigns() -> str:
 
 
 def steps(bench: SolverBench) -> str:
-    """The page's beginning: all that is told of a controller's steps."""
-    contenders, *others = solver_tables(bench)
+    """The page's beginning: the tables of a controller's steps."""
+    candidates, *others = solver_tables(bench)
     machine = bench.machine
     return "\n".join(
         [
@@ -169,8 +169,8 @@ def steps(bench: SolverBench) -> str:
             "A controller's step is timed in one way, as a flight sees it: between two steps the plant flies a period, "
             "each step is\ntaken three times in turns with all others', and the median counts. "
             "[constraints-cost.md](constraints-cost.md) and the README tell\nthe same numbers.\n",
-            section(contenders),
-            "![Time of a whole controller step of every contender, and its growth with the horizon](solvers.png)\n",
+            section(candidates),
+            "![Time of a whole controller step of every candidate, and its growth with the horizon](solvers.png)\n",
             *(section(grid) for grid in others),
         ]
     )

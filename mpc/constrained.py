@@ -10,7 +10,7 @@ from mpc.answer import ActuatorBounds, rejection, shifted
 from mpc.exact.shortcut import with_shortcut
 from mpc.ocp import Problem
 from mpc.paper.prediction import rollout
-from mpc.solvers import Answer, Solver, Way
+from mpc.solvers import Answer, Route, Solver
 from quadsim.controller import GROUNDED, Command, Moment, Phase, stopped
 from quadsim.errors import PlanExhaustedError
 from quadsim.state import Array
@@ -71,7 +71,7 @@ class ConstrainedMPC:
             return self._stop(now.phase)
         desired = self.problem.objective.desired(reference)
         answer = self._solver.solve(state, desired, self._before)
-        return self._take(answer) if answer.way is Way.FREE else self._follow(now.time, answer)
+        return self._take(answer) if answer.route is Route.FREE else self._follow(now.time, answer)
 
     def predict(self, states: Array, plans: Array) -> Array:
         """See `quadsim.controller.Controller.predict`."""

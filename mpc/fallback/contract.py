@@ -8,12 +8,12 @@ Each period, the first of these that can be had:
 2. level hover by LQR: velocity to zero, then the place held; height and yaw held from the start;
 3. descent: the same, sinking at a steady speed, once level 2 has lasted too long.
 
-The inner controller is asked again in every period in which the state is known, so that recovery is automatic.  It is
-told the command in force each time, so that its own bounds on steps refer to what acts, whoever commanded it, and which
-channels of the state are predicted rather than measured (`mpc.fallback.completion.CompletedMoment`).
+The inner controller is called in every period in which the state is known, so that recovery is automatic.  It receives
+the command in force, so that its bounds on steps refer to what acts, whoever commanded it, and which channels of the
+state are predicted rather than measured (`mpc.fallback.completion.CompletedMoment`).
 
-One that estimates what disturbs the vehicle says what holds it at rest by an attribute `trim` (`mpc.equilibrium.Trim`).
-Levels 1 to 3, and predictions of what is not measured, start from it; it stays as it was while nothing is measured.
+One that estimates disturbances gives the equilibrium under them as an attribute `trim` (`mpc.equilibrium.Trim`).
+Levels 1 to 3, and predictions of channels that are not measured, start from it; it is held while nothing is measured.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ import numpy as np
 
 from mpc.answer import BOUND_TOLERANCE, ActuatorBounds
 from mpc.equilibrium import Trim
-from mpc.fallback.completion import PLAUSIBLE, StateCompletion, CompletedMoment
+from mpc.fallback.completion import PLAUSIBLE, CompletedMoment, StateCompletion
 from mpc.fallback.hover import HoverLaw
 from mpc.heading import anchored, predict_in_heading_frame
 from mpc.model import LinearModel
@@ -171,8 +171,8 @@ class Guarded:
         """
         acting = self._before if now.acting is None or check_command(now.acting) is not None else now.acting
         known = self._completion.complete(state, acting, self.trim, free=now.phase is Phase.FLYING)
-        told = CompletedMoment(**{**vars(now), "acting": acting.copy(), "unseen": self._completion.unseen.copy()})
-        status, answer = self._ask(told, known, reference)
+        completed = CompletedMoment(**{**vars(now), "acting": acting.copy(), "unseen": self._completion.unseen.copy()})
+        status, answer = self._ask(completed, known, reference)
         if now.phase in GROUNDED:
             self._forget()
             command = stopped(self._bounds.reach(acting)[0], self.horizon, now.phase)

@@ -149,9 +149,9 @@ class RobustMPC:
         """See `quadsim.controller.Controller.step`.
 
         Numbers that are not finite, not `mpc.fallback.completion.PLAUSIBLE`, or lead to such are answered with the
-        status `invalid_data`, and nothing is learned from them.  Nor is anything from a state that is in part predicted
-        (`mpc.fallback.completion.CompletedMoment`), nor from the first measured one after more than `LONGEST_SPAN` of such, or
-        after a pause: `now.time` has to be a period later than last time.
+        status `invalid_data`, and do not update the observer.  Neither does a state that is in part predicted
+        (`mpc.fallback.completion.CompletedMoment`), the first measured one after more than `LONGEST_SPAN` of such, or
+        one after a pause: `now.time` has to be a period later than last time.
         """
         if now.acting is not None:
             self._acting = np.array(now.acting, float)

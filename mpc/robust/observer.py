@@ -27,7 +27,7 @@ from quadsim.state import EULER, EULER_RATE, VELOCITY, Array, euler_to_body_rate
 _VELOCITY: Final = list(VELOCITY)
 _EULER: Final = list(EULER)
 _UPRIGHT: Final = 0.1
-"""Smallest vertical part of the thrust axis by which a change of vertical speed is told to be thrust's."""
+"""Smallest vertical part of the thrust axis from which on a change of vertical speed is attributed to thrust."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -10,8 +10,8 @@ i periods is bounded in each output by
 the support function of what w of any course can do, d the delay between measuring and acting.  With bounds tightened by
 r_i the plan of one period, moved on and corrected, keeps those of the next (Chisci, Rossiter and Zappa, 2001, "Systems
 with persistent disturbances: predictive control with restricted constraints"; Mayne, Seron and Rakovic, 2005, "Robust
-model predictive control of constrained linear systems with bounded disturbances").  Bounds on inputs are not tightened: near
-their bounds the correction may lack room.
+model predictive control of constrained linear systems with bounded disturbances").  Bounds on inputs are not tightened:
+near them the correction may lack authority.
 
 Between two samples an output y may pass both.  From the straight line through them it differs by at most
 

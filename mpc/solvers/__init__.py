@@ -152,7 +152,7 @@ def make_backend(name: str) -> Backend:
     return backend
 
 
-class Way(StrEnum):
+class Route(StrEnum):
     """How an optimum was found: see `mpc.exact.shortcut`."""
 
     FREE = "the unconstrained optimum"
@@ -168,13 +168,13 @@ class Answer:
         plan: (N, nu) inputs [rad/s]; to be used only when the solution's status is accepted.
         slacks: (N, m_s) by how much soft rows are violated.
         solution: to the QP of the solver's formulation.
-        way: how it was found.
+        route: how it was found.
     """
 
     plan: Array
     slacks: Array
     solution: Solution
-    way: Way = Way.WHOLE
+    route: Route = Route.WHOLE
 
 
 class Solver(Protocol):

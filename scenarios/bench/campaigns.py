@@ -65,7 +65,7 @@ class CampaignRun:
 
     @property
     def overhead(self) -> float:
-        """Share of the workers' time in which they did not fly: started, waited, told."""
+        """Share of the workers' time in which they did not fly: started, waited, reported."""
         return 1.0 - self.busy_s / (self.workers * self.wall_s)
 
 
@@ -222,7 +222,7 @@ def bench_campaign(
         flights: per worker and round.
         rounds: how many.
         sizes: flights of the larger ones, by two workers.
-        progress: told how far it is.
+        progress: called with how much is done, of how much.
 
     Raises:
         ParameterError: nothing is asked for.

@@ -81,4 +81,4 @@ _Table = Annotated[
     Discriminator(_law),
 ]
 ControllerSpec = Annotated[_Table, BeforeValidator(_spelt_out, json_schema_input_type=_Table | str)]
-"""Any of the laws, told apart by its type; one whose fields all have defaults may be given by its name alone."""
+"""Any of the laws, distinguished by its type; one whose fields all have defaults may be given by its name alone."""

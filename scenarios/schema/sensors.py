@@ -1,4 +1,4 @@
-"""`[sensors.position]` and so on, and `[estimator]`: what the controller is told, and how that is found.
+"""`[sensors.position]` and so on, and `[estimator]`: what is measured, and how the state is estimated.
 
 Numbers to start from:
 

@@ -19,7 +19,7 @@ from support import paper_problem, paper_reference
 from mpc.answer import ActuatorBounds
 from mpc.constrained import ConstrainedMPC
 from mpc.equilibrium import Trim
-from mpc.fallback.completion import PLAUSIBLE, StateCompletion, CompletedMoment
+from mpc.fallback.completion import PLAUSIBLE, CompletedMoment, StateCompletion
 from mpc.fallback.contract import FAILURES, FallbackSettings, Guarded
 from mpc.fallback.hover import (
     ACCEPTABLE_ACCELERATION,

@@ -17,7 +17,7 @@ from mpc.exact.shortcut import Shortcut
 from mpc.ocp import Problem
 from mpc.paper.condensed import condensed
 from mpc.qp import QP, Solution, Vectors, kkt_residuals
-from mpc.solvers import SOLVERS, QPSolver, Way, make_backend
+from mpc.solvers import SOLVERS, QPSolver, Route, make_backend
 from mpc.solvers.piqp_dense import PiqpDense
 from quadsim.controller import ACCEPTED, SOLVED
 from quadsim.state import Array
@@ -200,7 +200,7 @@ def test_whole_qps_are_polished_to_the_optimum(ratio: float, room: float, off: f
 @pytest.mark.parametrize(("ratio", "exact"), [(1.0, 1e-10), (1e9, 1e-5)])
 def test_every_way_ends_at_the_optimum(ratio: float, exact: float) -> None:
     """Without a QP, axis by axis and by the whole QP: docs/controllers.md tells these numbers."""
-    errors: dict[Way, list[float]] = {way: [] for way in Way}
+    errors: dict[Route, list[float]] = {way: [] for way in Route}
     asked = 0
     for seed in range(100):
         rng = np.random.default_rng(seed)
@@ -214,7 +214,7 @@ def test_every_way_ends_at_the_optimum(ratio: float, exact: float) -> None:
         x = certified(formulation.qp.with_vectors(formulation.vectors(*query)), answer.solution)
         asked += 1
         if x is not None:
-            errors[answer.way].append(np.abs(answer.plan.ravel() - x).max())
+            errors[answer.route].append(np.abs(answer.plan.ravel() - x).max())
     assert min(map(len, errors.values())) > 10
     assert sum(map(len, errors.values())) >= 0.95 * asked
     assert max(map(max, errors.values())) < exact

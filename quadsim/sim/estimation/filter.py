@@ -137,13 +137,13 @@ class ErrorStateFilter:
         return {name: replace(tally) for name, tally in self._track.tallies.items()}
 
     def advance(self, commands: Array, samples: Iterable[Sample], first: int, *, standing: bool = False) -> None:
-        """Take note of a stretch of flight and run the filter on to the fusion horizon.
+        """Take note of a segment of flight and run the filter on to the fusion horizon.
 
         Args:
             commands: (M, 4) rotor speeds in force during each physics step [rad/s].
             samples: what has arrived meanwhile, in any order.
             first: number of the first of these physics steps.
-            standing: whether a land detector has seen the vehicle on the ground when the stretch began; it has left
+            standing: whether a land detector has seen the vehicle on the ground when the segment began; it has left
                 the ground once the believed thrust exceeds its weight.
         """
         changed = np.any(commands != np.vstack([self._speeds, commands[:-1]]), axis=1)
@@ -168,7 +168,7 @@ class ErrorStateFilter:
         del self._starts[:kept], self._drives[:kept]
 
     def estimate(self, step: int) -> Estimate:
-        """What is believed at a physics step, no earlier than the last one told of."""
+        """The estimate at a physics step, no earlier than the last one that was given."""
         track = self._track.branch()
         self._run(track, self._waiting)
         self._predict(track, step)

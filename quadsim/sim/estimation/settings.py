@@ -1,4 +1,4 @@
-"""What an estimator is told: how the vehicle is disturbed, how well it is known at the start, what to believe."""
+"""Settings of the estimator: process noise, initial covariance, rejection of outliers."""
 
 from __future__ import annotations
 

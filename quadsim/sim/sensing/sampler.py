@@ -76,11 +76,11 @@ class Sampler:
         self._through: Array | None = None
 
     def sample(self, physics: Array, first: int) -> list[Sample]:
-        """The samples taken during a stretch of motion, those lost left out.
+        """The samples taken during a segment of motion, those lost left out.
 
         Args:
             physics: (M, 14) MuJoCo's states at successive physics steps.
-            first: number of the first of these steps; stretches follow one another from step 0.
+            first: number of the first of these steps; segments follow one another from step 0.
         """
         begin = -first % self._stride
         rows = physics[begin :: self._stride]

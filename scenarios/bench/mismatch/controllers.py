@@ -19,7 +19,7 @@ INPUT_WEIGHT: Final = 0.1
 MOVE_WEIGHT: Final = 20.0
 OBSERVER: Final = OffsetFreeSpec(torque_walk=0.2, force_walk=0.1)
 BASELINE_TILT: Final = 20.0
-"""Largest tilt that LQR, PID and geometric controller ask for [deg].  They have no bounds on states, so this limit does
+"""Largest tilt that LQR, PID and geometric controller command [deg].  They have no bounds on states, so this limit does
 for one; at the paper's 5 deg the geometric controller circles its goal, 8 m off after 60 s."""
 _NO_STEPS: Final = 1e6
 """A bound on steps [rad/s] that bounds nothing."""
@@ -113,7 +113,7 @@ def _geometric(spec: ConstrainedSpec, condition: Condition, period: float) -> Ge
 
 
 def _known_lag(condition: Condition, period: float) -> float | None:
-    """What gains have to allow for [s]: half a period at least, as by default; None where neither lag nor delay is known."""
+    """Lag that gains allow for [s], half a period at least; None where neither lag nor delay is known."""
     if not condition.rotor_lag and not condition.delay:
         return None
     return max(0.5 * period, condition.rotor_lag) + condition.delay
@@ -146,7 +146,7 @@ VARIANTS: Final = {
     ),
     "LQR": ControllerVariant(
         about="infinite horizon, weights by Bryson's rule, in the heading frame; as the next two, it knows no bounds "
-        f"but those on speeds, and asks for no more than {BASELINE_TILT:g} deg of tilt",
+        f"but those on speeds, and commands no more than {BASELINE_TILT:g} deg of tilt",
         spec=_lqr,
     ),
     "PID": ControllerVariant(about="cascaded, as autopilots fly it; gains from the lag it is given", spec=_pid),

@@ -41,7 +41,7 @@ class Pilot(Protocol):
         ...
 
     def prepare(self) -> None:
-        """Load what flights need, once in each process that flies; what fails here is told by the flights."""
+        """Load what flights need, once in each process that flies; what fails here is reported by the flights."""
         ...
 
     def fly(self, flight: int, progress: Progress = silent) -> Row:
@@ -49,7 +49,7 @@ class Pilot(Protocol):
 
         Args:
             flight: which.
-            progress: told of the control periods that are flown, after each.
+            progress: called after each control period that is flown.
         """
         ...
 

@@ -235,7 +235,7 @@ def test_the_page_says_what_is_met_and_what_is_not() -> None:
     measured = replace(made_up(), controllers={FULL: "full"}, conditions={"nominal": "", "wind 3 m/s": ""})
     tilted = replace(WELL, peak_tilt=5.2, violated=0.1, end_error=0.4, step_p99=7.0)
     measured = replace(measured, flights={(FULL, "nominal"): WELL, (FULL, "wind 3 m/s"): tilted})
-    told = [line[1].text for line in make_robustness.asked(measured).lines]
+    told = [line[1].text for line in make_robustness.targets(measured).lines]
     assert told == ["in all 2", "in all 1", "not in: wind 3 m/s", "not in: wind 3 m/s"]
     fault = fault_injection.faults()[0]
     injection = fault_injection.Injection(controller="paper", fault=fault, start=3.0)
