@@ -20,7 +20,7 @@ from mujoco.batch import Batch
 from threadpoolctl import threadpool_limits
 
 from quadsim.airframe import outline, rotor_thrusts
-from quadsim.effects.forces import StepForces, midway
+from quadsim.effects.forces import StepForces
 from quadsim.errors import ParameterError
 from quadsim.physics import Stretch
 from quadsim.plant import Plant
@@ -105,7 +105,9 @@ class Together:
         self._vehicle, self._rotors, self._timestep = vehicle, effects.rotors, scenario.plant.timestep
         self._winds = [build_wind(each, vehicle) for each in scenarios]
         shape = outline(vehicle)
-        self._forces = StepForces(vehicle, effects, floor=shape.floor, disc=shape.disc)
+        self._forces = StepForces(
+            vehicle, effects, timestep=scenario.plant.timestep, floor=shape.floor, disc=shape.disc
+        )
         self._by_step = effects.follows_state or self._winds[0] is not None
         self._batch = Batch(self._models[0], size, 1)
         self._batch.set_models(self._models)
@@ -147,16 +149,16 @@ class Together:
         return self._batch.rollout(steps, thrusts, record=(_STATE,))[_STATE]
 
     def _take_steps(self, thrusts: Array, of_rotors: Array, air: Array) -> Array:
-        batch, forces = self._batch, self._forces.wrench
+        batch, forces = self._batch, self._forces.midway
         qpos, qvel, applied, control = batch.qpos, batch.qvel, batch.qfrc_applied, batch.ctrl
         steps = thrusts.shape[1]
         trajectory = np.empty((self.size, steps, 14))
         wrench = np.empty((6, self.size))
         for i in range(steps):
             position, velocity = _entries(qpos), _entries(qvel)
-            motion = midway(position, velocity, self._before, self._timestep)
+            acting = forces(position, velocity, self._before, (), list(of_rotors[i]), list(air[i]))
             self._before = velocity
-            for row, entry in zip(wrench, forces(motion, (), list(of_rotors[i]), list(air[i])), strict=True):
+            for row, entry in zip(wrench, acting, strict=True):
                 row[:] = entry
             applied[:], control[:] = wrench.T, thrusts[:, i]
             batch.step()
