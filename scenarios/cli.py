@@ -17,7 +17,7 @@ from typing import NoReturn
 from quadsim import __version__
 from quadsim.errors import QuadsimError
 from quadsim.printable import printable
-from scenarios.garbage import collect_rarely
+from scenarios.gc_tuning import collect_rarely
 
 EXIT_DONE, EXIT_FAILED, EXIT_WRONG_INPUT = 0, 1, 2
 _LINES = "\n"

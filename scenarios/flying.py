@@ -13,6 +13,7 @@ from quadsim.state import Array
 from quadsim.vehicle import Vehicle
 from scenarios.build import build_ground, build_initial_speeds, build_initial_state, build_loss
 from scenarios.effects import build_computation
+from scenarios.gc_tuning import frozen
 from scenarios.randomness import generator
 from scenarios.spec import Scenario
 
@@ -27,7 +28,7 @@ def fly_once(
     navigation: Navigation | None,
     progress: Callable[[int], None] | None = None,
 ) -> FlightLog:
-    """Fly a scenario with a plant and a controller that were built for it.
+    """Fly a scenario with a plant and a controller that were built for it, undisturbed by Python's cycle collector.
 
     Args:
         scenario: what is flown.
@@ -38,18 +39,19 @@ def fly_once(
         navigation: see `scenarios.navigation.build_navigation`.
         progress: called with the number of periods flown, after each.
     """
-    return fly(
-        plant,
-        controller,
-        reference,
-        initial_state=build_initial_state(scenario),
-        initial_speeds=build_initial_speeds(scenario, vehicle),
-        periods=scenario.periods,
-        steps_per_period=scenario.steps_per_period,
-        navigation=navigation,
-        computation=build_computation(scenario),
-        rng=generator(scenario.seed, "computation"),
-        ground=build_ground(scenario, vehicle),
-        loss=build_loss(scenario),
-        progress=progress,
-    )
+    with frozen():
+        return fly(
+            plant,
+            controller,
+            reference,
+            initial_state=build_initial_state(scenario),
+            initial_speeds=build_initial_speeds(scenario, vehicle),
+            periods=scenario.periods,
+            steps_per_period=scenario.steps_per_period,
+            navigation=navigation,
+            computation=build_computation(scenario),
+            rng=generator(scenario.seed, "computation"),
+            ground=build_ground(scenario, vehicle),
+            loss=build_loss(scenario),
+            progress=progress,
+        )
