@@ -240,9 +240,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         collect_rarely()  # saves 5 % of a run
     try:
         with _told():
-            from scenarios import commands
+            from scenarios.commands import find_command
 
-            status = commands.COMMANDS[options.command](options)
+            status = find_command(options.command)(options)
         sys.stdout.flush()
         return status
     except QuadsimError as error:

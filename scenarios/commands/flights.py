@@ -10,9 +10,7 @@ from quadsim.errors import ParameterError
 from quadsim.outputs import real_path, require_directory, require_file
 from scenarios import console, runner
 from scenarios.build import build_vehicle
-from scenarios.campaign.manifest import is_campaign
 from scenarios.cli import EXIT_DONE, EXIT_FAILED
-from scenarios.commands.campaigns import compare_campaigns
 from scenarios.commands.common import load, print_summary
 from scenarios.courses import report
 from scenarios.junit import write_junit
@@ -63,6 +61,8 @@ def compare(options: Namespace) -> int:
     from quadsim.comparison import comparison_rows, run_names
     from quadsim.report import KIND, write_comparison
     from quadsim.table import to_markdown
+    from scenarios.campaign.manifest import is_campaign
+    from scenarios.commands.campaigns import compare_campaigns
     from scenarios.cost import find_study, study_cost
 
     if any(is_campaign(Path(name)) for name in options.targets):
