@@ -149,7 +149,7 @@ def main() -> None:
     from make_numbers import markdown
 
     before, after = options.before.resolve(), _commit(ROOT)
-    table = markdown(compare(before, options.runs))
+    table = markdown(compare(before, options.runs)).rstrip()
     text = TEXT.format(table=table, runs=options.runs, before=_commit(before), after=after)
     page = PAGE.read_text(encoding="utf-8")
     PAGE.write_text(f"{page.partition(TITLE)[0].rstrip()}\n\n{TITLE}\n\n{text}", encoding="utf-8")
