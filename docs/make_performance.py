@@ -16,6 +16,7 @@ from pathlib import Path
 
 from make_cost import timed, write_cost
 from make_numbers import Table, markdown, replace_in_readme
+from make_outside import outside
 from PIL import Image
 
 from quadsim.report.table import grid_to_markdown
@@ -201,7 +202,8 @@ def main() -> None:
     else:
         flight, film = bench_flight(scenario), bench_render(scenario)
         commands, effects = markdown(whole_commands(flight, film)), markdown(effect_costs())
-        end = rest(flight, film, commands, effects, campaigns())
+        kept = outside(path.read_text(encoding="utf-8"))  # which compares two checkouts: docs/make_outside.py
+        end = "\n".join([rest(flight, film, commands, effects, campaigns()), kept])
         replace_in_readme("times", commands)
     bench = bench_solvers(scenario)
     with tempfile.TemporaryDirectory() as scratch:

@@ -29,6 +29,7 @@ from quadsim.vehicle import Vehicle
 from scenarios.build import build_controller, build_ground, build_plant, resolve
 from scenarios.courses.feasibility_check import report
 from scenarios.courses.make import build_course_steps, build_reference
+from scenarios.gc_tuning import frozen
 from scenarios.machine import machine, usable_cores, versions
 from scenarios.parts.effects import build_computation
 from scenarios.parts.limits import build_limits, build_loss
@@ -49,7 +50,7 @@ def fly_once(
     navigation: Navigation | None,
     progress: Callable[[int], None] | None = None,
 ) -> FlightLog:
-    """Fly a scenario with a plant and a controller that were built for it.
+    """Fly a scenario with a plant and a controller that were built for it, undisturbed by Python's cycle collector.
 
     Args:
         scenario: what is flown.
@@ -60,21 +61,22 @@ def fly_once(
         navigation: see `scenarios.parts.navigation.build_navigation`.
         progress: called with the number of periods flown, after each.
     """
-    return fly(
-        plant,
-        controller,
-        reference,
-        initial_state=build_initial_state(scenario),
-        initial_speeds=build_initial_speeds(scenario, vehicle),
-        periods=scenario.periods,
-        steps_per_period=scenario.steps_per_period,
-        navigation=navigation,
-        computation=build_computation(scenario),
-        rng=generator(scenario.seed, "computation"),
-        ground=build_ground(scenario, vehicle),
-        loss=build_loss(scenario),
-        progress=progress,
-    )
+    with frozen():
+        return fly(
+            plant,
+            controller,
+            reference,
+            initial_state=build_initial_state(scenario),
+            initial_speeds=build_initial_speeds(scenario, vehicle),
+            periods=scenario.periods,
+            steps_per_period=scenario.steps_per_period,
+            navigation=navigation,
+            computation=build_computation(scenario),
+            rng=generator(scenario.seed, "computation"),
+            ground=build_ground(scenario, vehicle),
+            loss=build_loss(scenario),
+            progress=progress,
+        )
 
 
 @dataclass(frozen=True, kw_only=True)

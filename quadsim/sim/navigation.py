@@ -5,6 +5,8 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Sequence
+from operator import attrgetter
+from typing import Final
 
 import numpy as np
 
@@ -15,16 +17,18 @@ from quadsim.sim.estimation.settings import EstimatorSettings
 from quadsim.sim.sensing.sampler import Sample, Sampler, truth
 from quadsim.sim.sensing.sensor import Sensor, SensorFault, SensorName
 from quadsim.state import (
-    EULER,
-    EULER_RATE,
+    ANGLE_RATES,
+    ANGLES,
     N_STATES,
-    POSITION,
-    VELOCITY,
+    POSITIONS,
+    VELOCITIES,
     Array,
     body_to_euler_rates,
     quaternion_to_euler,
 )
 from quadsim.vehicle import Vehicle
+
+_TAKEN: Final = attrgetter("taken")
 
 
 class Navigation:
@@ -75,6 +79,8 @@ class Navigation:
             Sampler(sensor, timestep=timestep, faults=tuple(faults), rng=generators[sensor.name])
             for sensor in (*sensors, *perfect)
         )
+        sensed = {sampler.sensor.name for sampler in self._samplers}
+        self._perfect = tuple(name for name in SensorName if name not in sensed)
         self._filter = None if estimator is None else ErrorStateFilter(vehicle, sensors, estimator, timestep=timestep)
 
     def reset(self, physics: Array, speeds: Array, yaw: float = 0.0) -> None:
@@ -123,21 +129,18 @@ class Navigation:
                 SensorName.RATES: mean[MEAN_RATES],
             }
         else:
-            sensed = {sampler.sensor.name for sampler in self._samplers}
             for sample in self._arrived():
                 self._held[sample.sensor] = sample.value
-            received = {
-                name: self._held[name] if name in sensed else truth(name, self._physics[None])[0] for name in SensorName
-            }
+            received = self._held | {name: truth(name, self._physics[None])[0] for name in self._perfect}
         euler = received[SensorName.ATTITUDE].copy()
         state = np.empty(N_STATES)
-        state[list(POSITION)] = received[SensorName.POSITION]
-        state[list(VELOCITY)] = received[SensorName.VELOCITY]
-        state[list(EULER_RATE)] = body_to_euler_rates(euler, received[SensorName.RATES])
+        state[POSITIONS] = received[SensorName.POSITION]
+        state[VELOCITIES] = received[SensorName.VELOCITY]
+        state[ANGLE_RATES] = body_to_euler_rates(euler, received[SensorName.RATES])
         if math.isfinite(euler[2]):
             euler[2] += 2.0 * math.pi * round((self._yaw - float(euler[2])) / (2.0 * math.pi))
             self._yaw = float(euler[2])
-        state[list(EULER)] = euler
+        state[ANGLES] = euler
         return state
 
     @property
@@ -151,6 +154,10 @@ class Navigation:
 
     def _arrived(self) -> list[Sample]:
         """The samples that have arrived since last asked, the oldest first; the rest stay on their way."""
-        arrived = [sample for sample in self._in_flight if sample.arrival <= self._step]
-        self._in_flight = [sample for sample in self._in_flight if sample.arrival > self._step]
-        return sorted(arrived, key=lambda sample: sample.taken)
+        arrived: list[Sample] = []
+        in_flight: list[Sample] = []
+        for sample in self._in_flight:
+            (arrived if sample.arrival <= self._step else in_flight).append(sample)
+        self._in_flight = in_flight
+        arrived.sort(key=_TAKEN)
+        return arrived

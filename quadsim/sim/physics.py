@@ -10,11 +10,11 @@ import numpy as np
 
 from quadsim.errors import ParameterError
 from quadsim.state import (
-    EULER,
-    EULER_RATE,
+    ANGLE_RATES,
+    ANGLES,
     N_STATES,
-    POSITION,
-    VELOCITY,
+    POSITIONS,
+    VELOCITIES,
     Array,
     body_to_euler_rates,
     quaternion_to_euler,
@@ -47,14 +47,14 @@ def physics_to_state(physics: Array, yaw: float = 0.0) -> Array:
     """
     state = np.empty((physics.shape[0], N_STATES))
     euler = quaternion_to_euler(physics[:, 4:8])
-    state[:, POSITION] = physics[:, 1:4]
-    state[:, VELOCITY] = physics[:, 8:11]
-    state[:, EULER_RATE] = body_to_euler_rates(euler, physics[:, 11:14])
+    state[:, POSITIONS] = physics[:, 1:4]
+    state[:, VELOCITIES] = physics[:, 8:11]
+    state[:, ANGLE_RATES] = body_to_euler_rates(euler, physics[:, 11:14])
     if len(euler) > 1:
         euler[:, 2] = np.unwrap(euler[:, 2])
     turns = round((yaw - float(euler[0, 2])) / (2.0 * math.pi)) if len(euler) and math.isfinite(euler[0, 2]) else 0
     euler[:, 2] += 2.0 * math.pi * turns
-    state[:, EULER] = euler
+    state[:, ANGLES] = euler
     return state
 
 

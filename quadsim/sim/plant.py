@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from functools import cached_property
+from operator import add
+from struct import Struct
 from types import TracebackType
 from typing import Final, Protocol
 
@@ -15,7 +18,7 @@ from quadsim.controller import check_command
 from quadsim.errors import CommandError, DivergenceError, ParameterError
 from quadsim.sim.airframe import BODY, compile_model, outline
 from quadsim.sim.effects import Effects, RotorChange
-from quadsim.sim.effects.forces import StepForces, midway
+from quadsim.sim.effects.forces import StepForces
 from quadsim.sim.effects.load import Payload, apply_mass, mass_properties
 from quadsim.sim.physics import Segment, physics_to_state
 from quadsim.state import (
@@ -34,6 +37,7 @@ _FULL: Final = int(mujoco.mjtState.mjSTATE_FULLPHYSICS)
 _CONTROL: Final = int(mujoco.mjtState.mjSTATE_CTRL)
 _PLAUSIBLE: Final = 1e6
 """Largest magnitude of any time [s], position [m], speed [m/s] or rate [rad/s] taken for flight, not divergence."""
+_THREE, _FOUR, _SIX = Struct("3d"), Struct("4d"), Struct("6d")
 _NUMERICAL_WARNINGS: Final = (
     mujoco.mjtWarning.mjWARN_BADQPOS,
     mujoco.mjtWarning.mjWARN_BADQVEL,
@@ -175,7 +179,7 @@ class Plant:
     def _forces(self) -> StepForces:
         """What acts in each step; made where steps are taken one by one."""
         shape = outline(self.vehicle)
-        return StepForces(self.vehicle, self.effects, floor=shape.floor, disc=shape.disc)
+        return StepForces(self.vehicle, self.effects, timestep=self.timestep, floor=shape.floor, disc=shape.disc)
 
     def state(self) -> Array:
         """(12,) the true state now, yaw unwrapped since the last reset."""
@@ -267,37 +271,41 @@ class Plant:
 
     def _take_steps(self, thrusts: Array, speeds: Array, slopes: Array, wind: Array | None) -> tuple[Array, Array]:
         """One step after the other, each with the forces of its middle: states (M, 14) and wrenches (M, 6)."""
-        model, data, timestep = self.model, self._data, self.timestep
-        qpos, qvel, applied, control, fluid = data.qpos, data.qvel, data.qfrc_applied, data.ctrl, data.qfrc_fluid
+        model, data, steps = self.model, self._data, len(thrusts)
         mujoco.mj_setState(model, data, self._physics[0], _FULL)
-        steps = len(thrusts)
         trajectory, wrench = np.empty((steps, self._physics.shape[1])), np.empty((steps, 6))
-        positions, velocities = trajectory[:, 1:8], trajectory[:, 8:]
         noise = self._draw_disturbance(steps)
+        noises = None if noise is None else noise.tolist()
         air = np.zeros((steps, 3)) if wind is None else wind
         drags = self.effects.body_drag is not None
         moving_air = wind is not None and drags
-        velocity_before = self._velocity_before
         there = self._efficiency > 0.0  # a lost propeller neither drags nor carries momentum
         of_rotors = self._forces.of_rotors(speeds * there, slopes * there).tolist()
-        forces, step = self._forces.wrench, mujoco.mj_step
+        forces, step, velocity_before = self._forces.midway, mujoco.mj_step, self._velocity_before
+        # Through memory views, which take and give a few numbers in a third of an array's time.
+        qpos, qvel, fluid = data.qpos.data, data.qvel.data, data.qfrc_fluid
+        applied, control, air_of_model = (_bytes(array) for array in (data.qfrc_applied, data.ctrl, model.opt.wind))
+        states, wrenches = _bytes(trajectory).cast("d"), _bytes(wrench)
+        row = trajectory.shape[1]
         for i, (thrust, rotors, breeze) in enumerate(zip(thrusts.tolist(), of_rotors, air.tolist(), strict=True)):
             velocity = qvel.tolist()
-            motion = midway(qpos.tolist(), velocity, velocity_before, timestep)
+            acting: Sequence[float] = forces(qpos.tolist(), velocity, velocity_before, thrust, rotors, breeze)
             velocity_before = velocity
-            applied[:] = forces(motion, thrust, rotors, breeze)
-            if noise is not None:
-                applied += noise[i]
-            control[:] = thrust
+            if noises is not None:
+                acting = list(map(add, acting, noises[i]))
+            _SIX.pack_into(applied, 0, *acting)
+            _SIX.pack_into(wrenches, i * _SIX.size, *acting)
+            _FOUR.pack_into(control, 0, *thrust)
             if moving_air:
-                model.opt.wind[:] = breeze
+                _THREE.pack_into(air_of_model, 0, *breeze)
             step(model, data)
-            positions[i], velocities[i], wrench[i] = qpos, qvel, applied
+            first = row * i
+            states[first + 1 : first + 8], states[first + 8 : first + row] = qpos, qvel
             if drags:
                 wrench[i] += fluid
         self._velocity_before = velocity_before
         start = self._physics[0, :1]
-        trajectory[:, 0] = np.add.accumulate(np.concatenate([start, np.full(steps, timestep)]))[1:]
+        trajectory[:, 0] = np.add.accumulate(np.concatenate([start, np.full(steps, self.timestep)]))[1:]
         return trajectory, wrench
 
     def _draw_disturbance(self, steps: int) -> Array | None:
@@ -319,6 +327,11 @@ class Plant:
         counts = self._data.warning.number
         if counts.any() and (raised := [kind.name for kind in _NUMERICAL_WARNINGS if counts[int(kind)]]):
             raise DivergenceError(f"the plant diverged: MuJoCo reports {', '.join(raised)}", time=self.time)
+
+
+def _bytes(array: Array) -> memoryview:
+    """The memory of an array."""
+    return array.data.cast("B")
 
 
 def _discard(message: str) -> None:

@@ -10,6 +10,6 @@ import mpc.robust.controller
 import mpc.unconstrained  # noqa: F401
 import scenarios.campaign.engine.supervisor
 import scenarios.campaign.pilot  # noqa: F401
-from scenarios.gc_tuning import settle
+from scenarios.gc_tuning import freeze_for_good
 
-settle()
+freeze_for_good()

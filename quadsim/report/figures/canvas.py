@@ -64,7 +64,8 @@ def write_drawings(drawings: Mapping[str, Callable[[], Figure]], directory: Path
             for name, draw in drawings.items():
                 figure = draw()
                 png, svg = directory / f"{name}.png", directory / f"{name}.svg"
-                figure.draw_without_rendering()  # finds the layout, once for both files
+                if (layout := figure.get_layout_engine()) is not None:
+                    layout.execute(figure)  # once for both files, neither of which is then drawn for it
                 figure.set_layout_engine(None)
                 with png.open("xb") as file:
                     figure.savefig(file, format="png", dpi=DPI)

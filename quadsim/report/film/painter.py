@@ -24,6 +24,8 @@ GREEN: Final = (120, 222, 150)
 CYAN: Final = (126, 232, 232)
 VIOLET: Final = (225, 120, 205)
 
+_TEXTS: Final = 2048
+"""Texts that are kept as pictures, of each size of font: a film shows most of its words in every frame."""
 _SHADE: Final = (np.arange(256) * 0.24 + 12.0).astype(np.uint8)
 
 
@@ -80,9 +82,10 @@ def shade(frame: Picture, x: float, y: float, width: float, height: float, *, sc
     """Darken a rectangle of a frame, in place, so that text on it can be read."""
     rows = slice(round(y * scale), round((y + height) * scale))
     columns = slice(round(x * scale), round((x + width) * scale))
-    frame[rows, columns] = _SHADE[frame[rows, columns]]
+    frame[rows, columns] = _SHADE.take(frame[rows, columns])
 
 
+@functools.lru_cache(maxsize=_TEXTS)
 def text_width(text: str, size: float, *, scale: float) -> float:
     """How long a text is [design pixels]."""
     return _font(max(6, round(size * scale))).getlength(text) / scale
@@ -90,4 +93,7 @@ def text_width(text: str, size: float, *, scale: float) -> float:
 
 @functools.lru_cache(maxsize=32)
 def _font(size: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
-    return ImageFont.load_default(size)
+    font = ImageFont.load_default(size)
+    if isinstance(font, ImageFont.FreeTypeFont):  # else it is Pillow's own bitmap, which takes no time
+        font.getmask2 = functools.lru_cache(maxsize=_TEXTS)(font.getmask2)  # type: ignore[assignment,method-assign]
+    return font

@@ -103,7 +103,7 @@ class Stage:
         self._draw_horizon(i)
         self._draw_thrusts(i)
         self._draw_shadow(i)
-        return np.array(self._renderer.render())
+        return np.ascontiguousarray(self._renderer.render())
 
     def _connect(
         self, kind: mujoco.mjtGeom, width: float, start: Array, stop: Array, colour: tuple[float, float, float, float]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 
@@ -11,6 +12,9 @@ from quadsim.errors import ParameterError
 from quadsim.sim.effects.gust import Gust, Velocity, check_velocity, gust_velocity
 from quadsim.sim.effects.turbulence import Dryden, Turbulence
 from quadsim.state import Array
+
+_BLOCK: Final = 4096
+"""Physics steps whose wind is worked out at a time."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -72,22 +76,28 @@ class WindField:
         self._along = _direction(self._means[0])
         self._timestep = timestep
         self._turbulence = None if turbulence is None else Turbulence(turbulence, timestep=timestep, rng=rng)
-        self._step = 0
+        self.reset()
 
     def reset(self) -> None:
         """Rewind: the same wind again."""
-        self._step = 0
+        self._made, self._ahead = 0, np.empty((0, 3))  # steps whose wind is known, and that of the last of them
         if self._turbulence is not None:
             self._turbulence.reset()
 
     def advance(self, steps: int) -> Array:
         """(steps, 3) wind velocity at the middle of each of the next physics steps, world frame, z up [m/s]."""
-        middles = self._timestep * (np.arange(steps, dtype=np.float64) + (self._step + 0.5))
-        self._step += steps
+        while len(self._ahead) < steps:
+            self._ahead = np.concatenate([self._ahead, self._next_block()])
+        wind, self._ahead = self._ahead[:steps].copy(), self._ahead[steps:]
+        return wind
+
+    def _next_block(self) -> Array:
+        middles = self._timestep * (np.arange(_BLOCK, dtype=np.float64) + (self._made + 0.5))
+        self._made += _BLOCK
         wind: Array = self._means[np.searchsorted(self._change_times, middles, side="right")]
         wind += gust_velocity(self._gusts, middles)
         if self._turbulence is not None:
-            along, across, vertical = self._turbulence.advance(steps).T
+            along, across, vertical = self._turbulence.advance(_BLOCK).T
             x, y = self._along  # spelt out, as a matrix product may round by the number of rows
             wind += np.stack([x * along - y * across, y * along + x * across, vertical], axis=1)
         return wind

@@ -14,7 +14,6 @@ from dataclasses import dataclass, field, replace
 from typing import Final
 
 import numpy as np
-from scipy.special import chdtri
 
 from quadsim.errors import ParameterError
 from quadsim.sim.estimation.estimate import N_ERRORS, Estimate, retract
@@ -91,6 +90,8 @@ class ErrorStateFilter:
         Raises:
             ParameterError: a sensor is missing, or states a noise of zero.
         """
+        from scipy.special import chdtri  # whose package takes a while to load, and few flights have an estimator
+
         names = [sensor.name for sensor in sensors]
         for name in NEEDED:
             if name not in names:

@@ -23,7 +23,7 @@ from scenarios.campaign.engine.processes import adopt_orphans, end_children, has
 from scenarios.campaign.engine.protocol import Answer, Pilot, said
 from scenarios.campaign.engine.worker import FLIGHT, PULSE_BYTES, SIZE, Told, fly_for
 from scenarios.campaign.results.verdicts import MEMORY, TIMEOUT
-from scenarios.gc_tuning import collect_rarely, settle
+from scenarios.gc_tuning import collect_rarely, freeze_for_good
 
 LOOK_S: Final = 0.2
 """Between two looks at a worker that flies [s]."""
@@ -79,7 +79,7 @@ def serve(pipe: Connection, folder: str) -> None:
             raise
         except Exception as error:
             return pipe.send(Unfit(said(error)))
-        settle()
+        freeze_for_good()
         _Supervisor(pilot, pipe).keep()
     return None
 
