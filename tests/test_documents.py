@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
+from pkgutil import resolve_name
 
 import make_cost
 import make_numbers as numbers
+import pytest
 
 from quadsim.report.table import grid_to_markdown
 from scenarios.cost.cost_tables import cost_tables
@@ -15,6 +17,8 @@ from scenarios.loading import load_scenario
 from scenarios.run import Flight, fly_scenario
 
 ROOT = Path(__file__).resolve().parent.parent
+ENTRY_POINTS = {"quadsim.controllers"}
+"""Groups of entry points, which are written like modules."""
 
 
 def test_results_in_the_readme_are_what_the_flights_give(
@@ -80,3 +84,15 @@ def test_documents_link_to_files_that_exist() -> None:
         for target in re.findall(r"\]\(([^)#]+)\)", document.read_text(encoding="utf-8")):
             if "://" not in target:
                 assert (document.parent / target).exists(), f"{document.name} links to {target}"
+
+
+@pytest.mark.parametrize(
+    "document", ["CONTRIBUTING.md", "README.md", *sorted(p.name for p in (ROOT / "docs").glob("*.md"))]
+)
+def test_documents_name_what_exists(document: str) -> None:
+    """Every dotted name of a package in backticks is a module, or something in one."""
+    page = next(path for path in (ROOT / document, ROOT / "docs" / document) if path.exists())
+    named = set(re.findall(r"`((?:mpc|quadsim|scenarios)(?:\.[A-Za-z_]+)+)`", page.read_text(encoding="utf-8")))
+    assert document != "equations.md" or len(named) > 40
+    for name in sorted(named - ENTRY_POINTS):
+        resolve_name(name)

@@ -24,7 +24,7 @@ def solver_tables(bench: SolverBench) -> list[Grid]:
         _candidates(bench),
         *([_growth(bench)] if bench.growth else []),
         *(_stages(what, stages) for what, stages in bench.stages.items()),
-        targets_table("Asked of the solvers, and measured", solver_targets(bench)),
+        targets_table("Targets for the solvers", solver_targets(bench)),
     ]
 
 
@@ -46,7 +46,7 @@ def flight_tables(profile: FlightProfile) -> list[Grid]:
         lines=tuple(lines),
         note=f"Solver: {profile.solver or 'none, a gain'}; {place}; pieces are medians over {profile.repeats} flights.",
     )
-    return [grid, targets_table("Asked of a flight, and measured", flight_targets(profile))]
+    return [grid, targets_table("Targets for a flight", flight_targets(profile))]
 
 
 def render_tables(profile: RenderProfile) -> list[Grid]:
@@ -63,7 +63,7 @@ def render_tables(profile: RenderProfile) -> list[Grid]:
             line("60 s of film [s]", f"{profile.film_s(60.0):.1f}"),
         ),
     )
-    return [grid, targets_table("Asked of a film, and measured", render_targets(profile))]
+    return [grid, targets_table("Targets for a film", render_targets(profile))]
 
 
 def _candidates(bench: SolverBench) -> Grid:

@@ -148,7 +148,7 @@ def campaign_tables(profile: CampaignProfile) -> list[Grid]:
         "every flight's set-up and audit included. Where a flight takes longer beside another one, cores share what "
         "both need. Not flying: share of the workers' time, their start included.",
     )
-    targets = targets_table("Asked of campaigns, and measured", campaign_targets(profile))
+    targets = targets_table("Targets for campaigns", campaign_targets(profile))
     return [rounds, *([_growth(profile)] if profile.growing else []), targets]
 
 
