@@ -29,8 +29,8 @@ from quadsim.vehicle import Vehicle
 from scenarios.build import build_controller, build_ground, build_plant, resolve
 from scenarios.courses.feasibility_check import report
 from scenarios.courses.make import build_course_steps, build_reference
-from scenarios.machine import machine, usable_cores, versions
 from scenarios.gc_tuning import frozen
+from scenarios.machine import machine, usable_cores, versions
 from scenarios.parts.effects import build_computation
 from scenarios.parts.limits import build_limits, build_loss
 from scenarios.parts.navigation import build_navigation
