@@ -269,7 +269,7 @@ class _MatrixBuilder:
 
     def _stage_cost(self, slopes: Array, steps: int) -> Array:
         """Hessian (J, m, m) of stages' cost, the end state's left out."""
-        inner = slopes[:, :-1].reshape(len(slopes), -1, slopes.shape[3])
+        inner = slopes[:, :-1].reshape(len(slopes), (slopes.shape[1] - 1) * slopes.shape[2], slopes.shape[3])
         weighted = (2.0 * self._Q @ slopes[:, :-1]).reshape(inner.shape)
         hessian = inner.transpose(0, 2, 1) @ weighted
         hessian = 0.5 * (hessian + hessian.transpose(0, 2, 1))

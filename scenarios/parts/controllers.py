@@ -13,7 +13,7 @@ from typing import Any, Final
 import numpy as np
 
 from mpc.answer import ActuatorBounds
-from mpc.fallback.contract import FallbackSettings
+from mpc.fallback.settings import FallbackSettings
 from mpc.model import hover_model
 from mpc.ocp import Bounds, Constraint, Objective, Penalty, Problem, lqr_terminal_weight
 from mpc.robust.tightening import SHORTEST_LAG
