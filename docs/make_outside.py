@@ -7,6 +7,7 @@ its own.  Times are of processors, those of child processes included, so that wh
 from __future__ import annotations
 
 import argparse
+import importlib
 import json
 import os
 import resource
@@ -16,6 +17,7 @@ import sys
 import tempfile
 import time as clock
 from collections.abc import Callable, Iterator
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Final
 
@@ -52,10 +54,10 @@ turbulence and four sensors.
 
 def measure(name: str) -> dict[str, float]:
     """Processor seconds of one flight by the checkout that this process imports, by what they were spent on."""
-    from scenarios import runner
     from scenarios.campaign.plan import load_plan
     from scenarios.loading import load_scenario
 
+    runner = importlib.import_module("scenarios.run" if find_spec("scenarios.run") else "scenarios.runner")
     robust = load_plan("paper-robustness-robust").of(0)
     scenario = robust if name == "robust" else load_scenario(name)
     vehicle = runner.build_vehicle(robust)

@@ -8,7 +8,8 @@ from typing import Final
 
 import numpy as np
 
-from mpc.ocp import Bounds, Problem
+from mpc.constraints import Bounds
+from mpc.ocp import Problem
 from quadsim.controller import ACCEPTED
 from quadsim.errors import ParameterError
 from quadsim.state import Array

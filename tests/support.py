@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 from scipy.linalg import block_diag
 
+from mpc.constraints import Bounds
 from mpc.model import LinearModel
-from mpc.ocp import Bounds, Objective, Problem
+from mpc.ocp import Objective, Problem
 from quadsim.flight.log import ControlLog, FlightLog, PlantLog, TimingLog
 from quadsim.state import INDEX, N_STATES, Array
 from quadsim.vehicle import N_ROTORS

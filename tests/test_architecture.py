@@ -162,7 +162,7 @@ def test_the_render_worker_is_imported_by_nobody(imports: list[Import]) -> None:
     assert RENDER_WORKER not in {item.imported for item in imports}
 
 
-LONGEST_CHAIN = 18
+LONGEST_CHAIN = 15
 """Modules that a reader follows at most from an import to what it stands on."""
 
 

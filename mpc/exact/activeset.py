@@ -39,7 +39,7 @@ FEW: Final = 8
 """Wrong rows of a start with which no other one is looked at."""
 ROUNDED: Final = 1e-6
 """Share of l1 by which an approximate multiplier of a violated row may stay below it."""
-AT_ONCE: Final = 8
+AT_ONCE: Final = 2
 """Steps, the first ones, in which all rows that are wrong change, not the worst alone."""
 MOST_STEPS: Final = 60
 
@@ -74,7 +74,7 @@ class ActiveSet:
 
     def __init__(self, S: Array, l1: Array, l2: Array) -> None:
         self._S, self._l1 = np.ascontiguousarray(S), l1
-        self._soft = bool(np.isfinite(l1).any())
+        self._soft, self._least_l1 = bool(np.isfinite(l1).any()), float(l1.min(initial=np.inf))
         self._compliance = 0.5 / np.maximum(l2, LEAST_QUADRATIC * np.maximum(l1, 1.0))
 
     def solve(
@@ -203,12 +203,13 @@ class ActiveSet:
 
     def _stop_at_kinks(self, z: Array, target: Array, active: Indices, side: Side, *, at_once: bool) -> bool:
         """Move multipliers to the target, as far as all stay on their pieces; whether some did not."""
-        sign, here = np.sign(side[active]), z[active]
+        pieces = side[active]
+        sign, here = np.sign(pieces), z[active]
         size = sign * target
         stops = leaving = size < 0.0
         kink = np.zeros_like(target)
-        if self._soft:
-            l1, violated = self._l1[active], np.abs(side[active]) == 2
+        if self._soft and (size.max(initial=0.0) > self._least_l1 or (pieces != sign).any()):
+            l1, violated = self._l1[active], pieces != sign
             beyond = np.where(violated, l1 - size, size - l1) > ROUNDING * l1
             leaving = leaving & ~violated
             kink[beyond] = (sign * l1)[beyond]

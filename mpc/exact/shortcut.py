@@ -10,10 +10,11 @@ import numpy as np
 import scipy.linalg
 from numpy.typing import NDArray
 
+from mpc.constraints import Rows
 from mpc.exact.activeset import FEASIBLE, Active, ActiveSet, Side
 from mpc.exact.axes import axes
 from mpc.exact.free import FreeOptimum
-from mpc.ocp import Problem, Rest, Rows
+from mpc.ocp import Problem, Rest
 from mpc.paper.condensed import Condensed, condensed_cost, row_maps
 from mpc.paper.prediction import prediction
 from mpc.qp import Solution

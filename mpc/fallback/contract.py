@@ -20,7 +20,7 @@ from __future__ import annotations
 
 import math
 import re
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -29,62 +29,18 @@ from mpc.answer import BOUND_TOLERANCE, ActuatorBounds
 from mpc.equilibrium import Trim
 from mpc.fallback.completion import PLAUSIBLE, CompletedMoment, StateCompletion
 from mpc.fallback.hover import HoverLaw
+from mpc.fallback.settings import FallbackSettings as FallbackSettings
 from mpc.heading import anchored, predict_in_heading_frame
 from mpc.model import LinearModel
 from quadsim.controller import ACCEPTED, GROUNDED, Command, Controller, Moment, Phase, check_command, stopped
-from quadsim.errors import FlightError, ParameterError
-from quadsim.state import EULER, EULER_RATE, INDEX, N_STATES, POSITION, REFERENCE_STATES, VELOCITY, Array
+from quadsim.errors import FlightError
+from quadsim.state import INDEX, N_STATES, POSITION, REFERENCE_STATES, Array
 from quadsim.vehicle import N_ROTORS
 
 FAILURES: Final[tuple[type[Exception], ...]] = (FlightError, np.linalg.LinAlgError, ArithmeticError, RuntimeError)
 """What numerics and compiled back ends raise.  A programmer's mistakes (`TypeError`, `KeyError`, ...) end the run."""
 _MISTAKES: Final = (NotImplementedError, RecursionError)
 """Kinds of `RuntimeError` that are a programmer's, too."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class FallbackSettings:
-    """When the next level takes over; validated when made.
-
-    Attributes:
-        unseen: longest time that predictions stand in for a missing measurement before level 2 [s].
-        plan_age: longest time on one shifted plan [s]; its horizon, where that is shorter.
-        position, velocity, angle, rate: largest distance from that plan in any channel [m], [m/s], [rad], [rad/s].
-        hover: longest time on level 2 before the descent [s].
-        sink: speed of the descent [m/s].
-        tilt: largest tilt that levels 1 to 3 ask for [rad]; beside the plan's own on level 1.
-        settled: horizontal speed above which level 2 brakes without a place to go back to [m/s].
-    """
-
-    unseen: float = 1.5
-    plan_age: float = 1.0
-    position: float = 0.5
-    velocity: float = 1.0
-    angle: float = 0.2
-    rate: float = 1.0
-    hover: float = 5.0
-    sink: float = 0.5
-    tilt: float = math.radians(10.0)
-    settled: float = 0.3
-
-    def __post_init__(self) -> None:
-        for item in fields(self):
-            value = getattr(self, item.name)
-            if not 0.0 < value < math.inf:
-                raise ParameterError("controller", f"fallback.{item.name}", value, "positive and finite")
-
-    @property
-    def distance(self) -> Array:
-        """(12,) largest distance from a plan's states."""
-        distance = np.empty(N_STATES)
-        for rows, size in (
-            (POSITION, self.position),
-            (VELOCITY, self.velocity),
-            (EULER, self.angle),
-            (EULER_RATE, self.rate),
-        ):
-            distance[list(rows)] = size
-        return distance
 
 
 _USUAL: Final = FallbackSettings()

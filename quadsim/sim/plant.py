@@ -8,7 +8,7 @@ from functools import cached_property
 from operator import add
 from struct import Struct
 from types import TracebackType
-from typing import Final, Protocol
+from typing import Final
 
 import mujoco
 import numpy as np
@@ -17,7 +17,7 @@ from mujoco.rollout import Rollout
 from quadsim.controller import check_command
 from quadsim.errors import CommandError, DivergenceError, ParameterError
 from quadsim.sim.airframe import BODY, compile_model, outline
-from quadsim.sim.effects import Effects, RotorChange
+from quadsim.sim.effects import Effects, RotorChange, Wind
 from quadsim.sim.effects.forces import StepForces
 from quadsim.sim.effects.load import Payload, apply_mass, mass_properties
 from quadsim.sim.physics import Segment, physics_to_state
@@ -47,18 +47,6 @@ _NUMERICAL_WARNINGS: Final = (
 
 
 _CALM: Final = Effects()
-
-
-class Wind(Protocol):
-    """The air's motion along a flight; see `quadsim.sim.effects.wind.WindField`."""
-
-    def reset(self) -> None:
-        """Start again with the same wind."""
-        ...
-
-    def advance(self, steps: int) -> Array:
-        """(steps, 3) wind velocity at the middle of each of the next physics steps, world frame [m/s]."""
-        ...
 
 
 class Plant:
@@ -274,8 +262,8 @@ class Plant:
         model, data, steps = self.model, self._data, len(thrusts)
         mujoco.mj_setState(model, data, self._physics[0], _FULL)
         trajectory, wrench = np.empty((steps, self._physics.shape[1])), np.empty((steps, 6))
-        noise = self._draw_disturbance(steps)
-        noises = None if noise is None else noise.tolist()
+        disturbance = self.effects.disturbance
+        noises = None if disturbance is None else disturbance.draw(steps, self.timestep, self._rng).tolist()
         air = np.zeros((steps, 3)) if wind is None else wind
         drags = self.effects.body_drag is not None
         moving_air = wind is not None and drags
@@ -307,17 +295,6 @@ class Plant:
         start = self._physics[0, :1]
         trajectory[:, 0] = np.add.accumulate(np.concatenate([start, np.full(steps, self.timestep)]))[1:]
         return trajectory, wrench
-
-    def _draw_disturbance(self, steps: int) -> Array | None:
-        """(steps, 6) force, world [N], and torque, body [N m], of the disturbance over each step; None without one."""
-        disturbance = self.effects.disturbance
-        if disturbance is None:
-            return None
-        constant = np.array([*disturbance.force, *disturbance.torque])
-        density = np.repeat([disturbance.force_noise, disturbance.torque_noise], 3)
-        if not density.any():
-            return np.tile(constant, (steps, 1))
-        return constant + density / math.sqrt(self.timestep) * self._rng.standard_normal((steps, 6))
 
     def _check(self, trajectory: Array) -> None:
         if not np.abs(trajectory).max() < _PLAUSIBLE:  # as NaN is not

@@ -13,9 +13,10 @@ from typing import Any, Final
 import numpy as np
 
 from mpc.answer import ActuatorBounds
-from mpc.fallback.contract import FallbackSettings
+from mpc.constraints import Bounds, Constraint, Penalty
+from mpc.fallback.settings import FallbackSettings
 from mpc.model import hover_model
-from mpc.ocp import Bounds, Constraint, Objective, Penalty, Problem, lqr_terminal_weight
+from mpc.ocp import Objective, Problem, lqr_terminal_weight
 from mpc.robust.tightening import SHORTEST_LAG
 from quadsim.controller import Controller
 from quadsim.errors import InputError, ParameterError

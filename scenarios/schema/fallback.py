@@ -6,7 +6,7 @@ from typing import Annotated, Final
 
 from pydantic import Field
 
-from mpc.fallback.contract import FallbackSettings
+from mpc.fallback.settings import FallbackSettings
 from scenarios.schema.base import Positive, Spec
 
 _USUAL: Final = FallbackSettings()

@@ -12,13 +12,13 @@ import pytest
 from support import paper_problem, paper_reference
 
 from mpc.constrained import ConstrainedMPC
+from mpc.constraints import Penalty
 from mpc.equilibrium import equilibrium
 from mpc.fallback.completion import CompletedMoment
 from mpc.heading import turn_horizontally
 from mpc.model import hover_model
 from mpc.nonlinear.linearise import linearise
 from mpc.nonlinear.model import NonlinearModel, advance, derivative, nonlinear_model
-from mpc.ocp import Penalty
 from mpc.robust.controller import Linearisation, RobustMPC, RobustSettings, _hover_matrices
 from mpc.robust.observer import ObserverSettings
 from mpc.solvers import QPSolver

@@ -13,9 +13,10 @@ import scipy.linalg
 import scipy.optimize
 from support import paper_problem, paper_reference, random_problem
 
+from mpc.constraints import Bounds, Penalty
 from mpc.nonlinear.linearise import linearise
 from mpc.nonlinear.model import nonlinear_model
-from mpc.ocp import Bounds, Objective, Penalty, Problem
+from mpc.ocp import Objective, Problem
 from mpc.qp import QP, kkt_residuals
 from mpc.solvers._common import start
 from mpc.solvers.daqp_dense import DaqpDense

@@ -13,9 +13,9 @@ import pytest
 import scipy.linalg
 from support import paper_problem, paper_reference
 
+from mpc.constraints import Bounds, Penalty
 from mpc.model import discretise
 from mpc.nonlinear.model import advance, derivative, nonlinear_model
-from mpc.ocp import Bounds, Penalty
 from mpc.robust.controller import RobustMPC, RobustSettings
 from mpc.robust.observer import ObserverSettings
 from mpc.robust.tightening import (

@@ -13,10 +13,11 @@ import pytest
 
 from quadsim.controller import Command, Moment
 from quadsim.state import Array
-from scenarios import gc_tuning, runner
+from scenarios import gc_tuning
+from scenarios.build import build_controller
 from scenarios.gc_tuning import COLLECT_EVERY, frozen
 from scenarios.loading import load_scenario
-from scenarios.runner import fly_scenario
+from scenarios.run import fly_scenario
 
 HOARD = 300_000
 """Objects made before the flight; more than all that is loaded."""
@@ -72,16 +73,15 @@ class _Noting:
 def test_a_flight_sees_no_pass_over_what_was_there_before(passes: list[Pass], monkeypatch: pytest.MonkeyPatch) -> None:
     flown: list[_Noting] = []
     hoard: list[list[int]] = []
-    build = runner.build_controller
 
     def build_noting(*arguments: Any) -> _Noting:
-        flown.append(_Noting(build(*arguments), passes))
+        flown.append(_Noting(build_controller(*arguments), passes))
         gc.disable()  # until the flight begins, or they would be looked through before
         hoard.extend([number] for number in range(HOARD))
         passes.clear()
         return flown[-1]
 
-    monkeypatch.setattr(runner, "build_controller", build_noting)
+    monkeypatch.setattr("scenarios.run.build_controller", build_noting)
     fly_scenario(load_scenario("paper-unconstrained", ["duration=2.0"]))
     assert len(hoard) == HOARD
     in_flight = flown[0].in_flight
@@ -126,7 +126,7 @@ assert before and first >= before + 1000 and second <= first, (before, first, se
 
 
 def test_flights_are_counted_in_no_module() -> None:
-    """Where campaigns look for what a controller changed; see `scenarios.campaign.traces`."""
+    """Where campaigns look for what a controller changed; see `scenarios.campaign.engine.worker`."""
     before = dict(vars(gc_tuning))
     with frozen():
         pass

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, Protocol
+
+import numpy as np
 
 from quadsim.errors import ParameterError
 from quadsim.sim.effects.load import Load, Payload
 from quadsim.sim.effects.rotors import RotorDynamics
+from quadsim.state import Array
 from quadsim.vehicle import N_ROTORS
 
 __all__ = [
@@ -44,6 +47,15 @@ class Disturbance:
     torque: tuple[float, float, float] = (0.0, 0.0, 0.0)
     force_noise: float = 0.0
     torque_noise: float = 0.0
+
+    def draw(self, steps: int, timestep: float, rng: np.random.Generator) -> Array:
+        """(steps, 6) force, world [N], and torque, body [N m], over each step of `timestep` [s]."""
+        constant = np.array([*self.force, *self.torque])
+        density = np.repeat([self.force_noise, self.torque_noise], 3)
+        if not density.any():
+            return np.tile(constant, (steps, 1))
+        drawn: Array = constant + density / math.sqrt(timestep) * rng.standard_normal((steps, 6))
+        return drawn
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -121,3 +133,15 @@ class Effects:
         spinning = self.rotors is not None and self.rotors.inertia > 0.0
         aerodynamic = self.rotor_drag > 0.0 or self.body_drag is not None or self.rotor_radius is not None
         return spinning or aerodynamic or self.disturbance is not None
+
+
+class Wind(Protocol):
+    """The air's motion along a flight; see `quadsim.sim.effects.wind.WindField`."""
+
+    def reset(self) -> None:
+        """Start again with the same wind."""
+        ...
+
+    def advance(self, steps: int) -> Array:
+        """(steps, 3) wind velocity at the middle of each of the next physics steps, world frame [m/s]."""
+        ...

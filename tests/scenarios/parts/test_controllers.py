@@ -18,8 +18,9 @@ from mpc.baselines.geometric import GeometricController
 from mpc.baselines.lqr import LQR, bryson_objective
 from mpc.baselines.pid import CascadedPID
 from mpc.constrained import ConstrainedMPC
+from mpc.constraints import Bounds
 from mpc.fallback.contract import FallbackSettings, Guarded
-from mpc.ocp import Bounds, Objective
+from mpc.ocp import Objective
 from mpc.robust.controller import Linearisation, RobustMPC, RobustSettings
 from mpc.robust.observer import ObserverSettings
 from mpc.robust.tightening import TighteningSettings, margins
