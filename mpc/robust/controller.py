@@ -332,7 +332,8 @@ class Relinearised:
         self.last = None
         if all(np.abs(part).max() <= LARGEST for part in (A, B, c, x0, desired, u_before, u_rest)):
             matrices = form.prepare(A, B)
-            qp = form.changed(matrices, form.changed_vectors(matrices, c, x0, desired, u_before, u_rest))
+            rest = Rest(np.zeros_like(x0), u_rest)
+            qp = form.changed(matrices, form.changed_vectors(matrices, c, x0, desired, u_before, rest))
             solution = self._backend.solve_changed(qp)
         else:
             solution = refusal(form.qp)
