@@ -128,10 +128,11 @@ def dense_qp(problem: Problem, given: Period) -> QP:
     for part in constraints(problem):
         slopes, known = _probed(lambda plan, part=part: values(part, given, plan).ravel(), N, nu)  # type: ignore[misc]
         m = part.lower.shape[-1]
-        bounded = np.isfinite(part.lower.reshape(-1, m)).any(0) | np.isfinite(part.upper.reshape(-1, m)).any(0)
-        lower, upper = (np.broadcast_to(side, (N, m))[:, bounded] for side in (part.lower, part.upper))
+        lower, upper = (np.broadcast_to(side, (N, m)) for side in (part.lower, part.upper))
+        bounded = (np.isfinite(lower) | np.isfinite(upper)).any(axis=0)
+        lower, upper = lower[:, bounded], upper[:, bounded]
         known = known.reshape(N, m)[:, bounded]
-        rows = slopes.reshape(N, m, -1)[:, bounded], lower - known, upper - known
+        rows = slopes.reshape(N, m, N * nu)[:, bounded], lower - known, upper - known
         (hard if part.penalty is None else soft).append(rows)
         if part.penalty is not None:
             l1 = np.hstack([l1, np.tile(part.penalty.l1[bounded], (N, 1))])
