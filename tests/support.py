@@ -10,9 +10,8 @@ import numpy as np
 from ocp_peer import Period
 from scipy.linalg import block_diag
 
-from mpc.constraints import Bounds
+from mpc.constraints import Bounds, Constraint, Penalty
 from mpc.model import LinearModel
-from mpc.constraints import Constraint, Penalty
 from mpc.ocp import Objective, Problem, Rest
 from quadsim.flight.log import ControlLog, FlightLog, PlantLog, TimingLog
 from quadsim.state import INDEX, N_STATES, Array

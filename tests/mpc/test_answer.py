@@ -12,7 +12,8 @@ from hypothesis import strategies as st
 from support import paper_problem
 
 from mpc.answer import BOUND_TOLERANCE, ActuatorBounds, rejection, shifted
-from mpc.ocp import Constraint, Penalty, Problem
+from mpc.constraints import Constraint, Penalty
+from mpc.ocp import Problem
 from quadsim.controller import SOLVED, UNCONSTRAINED
 from quadsim.errors import ParameterError
 from quadsim.state import Array
