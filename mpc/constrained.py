@@ -10,7 +10,7 @@ from mpc.answer import ActuatorBounds, rejection, shifted
 from mpc.exact.shortcut import with_shortcut
 from mpc.ocp import Problem
 from mpc.paper.prediction import rollout
-from mpc.solvers import Answer, Route, Solver
+from mpc.solvers import Answer, Solver, Way
 from quadsim.controller import GROUNDED, Command, Moment, Phase, stopped
 from quadsim.errors import PlanExhaustedError
 from quadsim.state import Array
@@ -71,7 +71,7 @@ class ConstrainedMPC:
             return self._stop(now.phase)
         desired = self.problem.objective.desired(reference)
         answer = self._solver.solve(state, desired, self._before)
-        return self._take(answer) if answer.route is Route.FREE else self._follow(now.time, answer)
+        return self._take(answer) if answer.way is Way.FREE else self._follow(now.time, answer)
 
     def predict(self, states: Array, plans: Array) -> Array:
         """See `quadsim.controller.Controller.predict`."""
@@ -89,7 +89,7 @@ class ConstrainedMPC:
         return Command(speeds=answer.plan[0].copy(), plan=answer.plan, status=solution.status, solve_s=solution.solve_s)
 
     def _follow(self, time: float, answer: Answer) -> Command:
-        problem = rejection(answer.solution.status, answer.plan, self._bounds, self._before)
+        problem = rejection(answer.solution.status, answer.plan[0], answer.plan, self._bounds, self._before)
         if problem is None:
             self._plan, self._held = answer.plan, 0
         elif self._plan is None or self._held + 1 >= self.horizon:

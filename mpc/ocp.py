@@ -46,8 +46,8 @@ class Objective:
         Q_u: (nu, nu) weight of u - u_bar, symmetric positive definite.
         Q_d: (nu, nu) weight of an input's change from one step to the next, symmetric positive semidefinite; None for
             none.
-        P: (n, n) weight of the last state's distance from C_r^+ y_d, in place of Q_y's, symmetric positive
-            semidefinite; None for none.
+        P: (n, n) weight of the last state's distance from x_s + C_r^+ (y_d - C_r x_s), in place of Q_y's, symmetric
+            positive semidefinite; None for none.
     """
 
     C_r: Array
@@ -77,7 +77,7 @@ class Objective:
 
     @cached_property
     def terminal_weights(self) -> tuple[Array, Array]:
-        """The same for the last state."""
+        """The same for the last state, where x_s is the origin."""
         return self.weights if self.P is None else (self.P, self.P @ np.linalg.pinv(self.C_r))
 
     @property
@@ -134,6 +134,8 @@ class Problem:
             _check_shape("C_c", self.bounds.C_c, (self.bounds.y_min.size, n))
             _check_shape("delta_min", self.bounds.delta_min, (nu,))
             _check_shape("u_min", self.bounds.u_min, (nu,))
+            if self.bounds.margins is not None:
+                _check_shape("margins", self.bounds.margins, (self.horizon, self.bounds.y_min.size))
         for constraint in (*(self.bounds.constraints if self.bounds else ()), *self.constraints):
             m = constraint.lower.shape[-1]
             for name, matrix, columns in (("C", constraint.C, n), ("D", constraint.D, nu), ("E", constraint.E, nu)):

@@ -87,10 +87,11 @@ class Staged:
         """See `mpc.qp.Formulation.vectors`."""
         model, (x_s, u_s) = self._problem.model, self._problem.rest if rest is None else rest
         c = x_s - model.A @ x_s - model.B @ u_s
-        return self.changed_vectors(self.fixed, np.broadcast_to(c, (self._at.N, c.size)), state, desired, u_before, u_s)
+        every = np.broadcast_to(c, (self._at.N, c.size))
+        return self.changed_vectors(self.fixed, every, state, desired, u_before, Rest(x_s, u_s))
 
     def changed_vectors(
-        self, matrices: Matrices, c: Array, state: Array, desired: Array, u_before: Array, u_rest: Array
+        self, matrices: Matrices, c: Array, state: Array, desired: Array, u_before: Array, rest: Rest
     ) -> Vectors:
         """The QP's vectors for a model that changes.
 
@@ -100,11 +101,11 @@ class Staged:
             state: (n,) x(k).
             desired: (N, n_r) y_d for x(k+1) .. x(k+N).
             u_before: (nu,) u(k-1) [rad/s].
-            u_rest: (nu,) what the cost pulls inputs to [rad/s].
+            rest: what the cost pulls inputs to, and where the terminal weight is about.
         """
         at, rows, objective = self._at, self._rows, self._problem.objective
         head, tail = (part[..., 0] for part in self._offsets(matrices, c, state))
-        (Q, W), (_, W_end) = objective.weights, objective.terminal_weights
+        (Q, W), (Q_end, W_end) = objective.weights, objective.terminal_weights
         # Entry i is for x(k+i), i = 0 .. N-1; x(k) itself is past changing, and its slopes are zero.
         wanted = np.concatenate([np.zeros((1, at.n)), desired[:-1] @ W.T])
         known = np.concatenate([head[0, :-1], tail[:, :-1].reshape(-1, at.n)])
@@ -113,8 +114,9 @@ class Staged:
         gradient[at.head] = np.tensordot(matrices.head[0, :-1], pull[: at.L], ([0, 1], [0, 1]))
         later = pull[at.L :].reshape(len(at.tail), at.M, at.n)
         gradient[at.tail] = np.einsum("jtnm,jtn->jm", matrices.tail[:, :-1], later)
-        gradient[at.starts[-1]] = -2.0 * W_end @ desired[-1]
-        gradient[at.inputs] -= 2.0 * objective.Q_u @ u_rest
+        # The last state's target, C_r^+ (y_d - C_r x_s) from x_s; where Q_y weighs it, x_s has no part in it.
+        gradient[at.starts[-1]] = -2.0 * (W_end @ (desired[-1] - objective.C_r @ rest.x) + Q_end @ rest.x)
+        gradient[at.inputs] -= 2.0 * objective.Q_u @ rest.u
         gradient[at.inputs[0]] -= 2.0 * objective.move_weight @ u_before
         values = known @ rows.C.T * ~rows.of_states
         values[:-1] += known[1:] @ rows.C.T * rows.of_states

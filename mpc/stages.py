@@ -212,11 +212,11 @@ class MatrixBuilder:
             (rows.size, at.size),
             [
                 (rows[: at.L - 1, later], at.head),
-                (rows[at.L - 1 : -1, later].reshape(stages, at.M, -1), at.tail[:, None]),
+                (rows[at.L - 1 : -1, later].reshape(stages, at.M, later.size), at.tail[:, None]),
                 (rows[-1, later], at.starts[-1]),
                 (rows, at.slacks),
                 (rows[: at.L, now], at.head),
-                (rows[at.L :, now].reshape(stages, at.M, -1), at.tail[:, None]),
+                (rows[at.L :, now].reshape(stages, at.M, now.size), at.tail[:, None]),
                 (rows[cuts][:, now], at.lasts),
             ],
             self._inequalities(head, tail),
@@ -255,7 +255,7 @@ class MatrixBuilder:
 
     def _stage_cost(self, slopes: Array, steps: int) -> Array:
         """Hessian (J, m, m) of stages' cost, the end state's left out."""
-        inner = slopes[:, :-1].reshape(len(slopes), (slopes.shape[1] - 1) * slopes.shape[2], slopes.shape[3])
+        inner = slopes[:, :-1].reshape(len(slopes), steps * self._at.n, slopes.shape[3])
         weighted = (2.0 * self._Q @ slopes[:, :-1]).reshape(inner.shape)
         hessian = inner.transpose(0, 2, 1) @ weighted
         hessian = 0.5 * (hessian + hessian.transpose(0, 2, 1))

@@ -274,8 +274,8 @@ class _FailingSolver:
 
     status: str = SOLVED
 
-    def solve(self, real: Any, solver: Any, vectors: Any, *, rows: int) -> Any:
-        answer = real(solver, vectors, rows=rows)
+    def solve(self, real: Any, solver: Any, vectors: Any, **matrices: Any) -> Any:
+        answer = real(solver, vectors, **matrices)
         if self.status == SOLVED:
             return answer
         spoilt = {name: np.full_like(getattr(answer, name), np.nan) for name in ("x", "y", "z", "z_box")}

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from ocp_peer import Period
 from scipy.linalg import block_diag
 
-from mpc.constraints import Bounds
+from mpc.constraints import Bounds, Constraint, Penalty
 from mpc.model import LinearModel
-from mpc.ocp import Objective, Problem
+from mpc.ocp import Objective, Problem, Rest
 from quadsim.flight.log import ControlLog, FlightLog, PlantLog, TimingLog
 from quadsim.state import INDEX, N_STATES, Array
 from quadsim.vehicle import N_ROTORS
@@ -19,6 +20,7 @@ from scenarios.build import build_problem
 from scenarios.courses.make import build_reference
 from scenarios.loading import load_scenario
 from scenarios.parts.vehicle import build_vehicle
+from scenarios.run import Flight
 
 
 def paper_problem(name: str = "paper-constrained", *settings: str) -> Problem:
@@ -88,6 +90,81 @@ def random_axes(rng: np.random.Generator, *, horizon: int, room: float) -> Probl
             u_max=u_bar + span,
         ),
     )
+
+
+def with_terms(rng: np.random.Generator, problem: Problem, terms: Collection[str]) -> Problem:
+    """A random problem with some of what the paper's does not have.
+
+    Args:
+        rng: random numbers.
+        problem: with bounds on two outputs.
+        terms: of soft, margins, Q_d, P, constraints.
+    """
+    bounds, objective, N, n, nu = problem.bounds, problem.objective, problem.horizon, problem.model.n, problem.model.nu
+    assert bounds is not None
+    m = len(bounds.C_c)
+    if "soft" in terms:
+        penalty = Penalty(l1=rng.uniform(0.0, 30.0, m), l2=rng.uniform(0.1, 3.0, m))
+        bounds = replace(bounds, penalty=penalty)
+    if "margins" in terms:
+        bounds = replace(bounds, margins=0.3 * rng.uniform(size=(N, m)) * np.minimum(-bounds.y_min, bounds.y_max))
+    if "Q_d" in terms:
+        factor = rng.normal(size=(nu, rng.integers(1, nu + 1)))
+        objective = replace(objective, Q_d=_symmetric(3.0 * factor @ factor.T))
+    if "P" in terms:
+        factor = rng.normal(size=(n, rng.integers(1, n + 1)))
+        objective = replace(objective, P=_symmetric(factor @ factor.T))
+    added = tuple(random_rows(rng, problem, soft=soft) for soft in (False, True)) if "constraints" in terms else ()
+    return replace(problem, objective=objective, bounds=bounds, constraints=(*problem.constraints, *added))
+
+
+def random_rows(rng: np.random.Generator, problem: Problem, *, soft: bool, rows: int = 2) -> Constraint:
+    """C x + D u + E (u - u_before), one- and two-sided, with room around hover."""
+    n, nu = problem.model.n, problem.model.nu
+    D = rng.normal(size=(rows, nu))
+    lower, upper = (
+        D @ problem.model.u_bar - rng.uniform(0.5, 1.5, rows),
+        D @ problem.model.u_bar + rng.uniform(0.5, 1.5, rows),
+    )
+    lower[0] = -np.inf
+    return Constraint(
+        name="coupled",
+        C=rng.normal(size=(rows, n)),
+        D=D,
+        E=0.5 * rng.normal(size=(rows, nu)),
+        lower=lower,
+        upper=upper,
+        penalty=Penalty(l1=rng.uniform(0.0, 3.0, rows), l2=rng.uniform(0.1, 3.0, rows)) if soft else None,
+    )
+
+
+def changing_period(rng: np.random.Generator, problem: Problem) -> Period:
+    """Systems that differ from step to step, around the problem's own."""
+    model, N = problem.model, problem.horizon
+    return Period(
+        A=model.A + 0.1 * rng.normal(size=(N, model.n, model.n)),
+        B=model.B + 0.3 * rng.normal(size=(N, model.n, model.nu)),
+        c=0.2 * rng.normal(size=(N, model.n)),
+        state=0.2 * rng.normal(size=model.n),
+        desired=rng.normal(size=(N, len(problem.objective.C_r))),
+        u_before=model.u_bar,
+        rest=Rest(np.zeros(model.n), model.u_bar + 0.1 * rng.normal(size=model.nu)),
+    )
+
+
+def flight_queries(flight: Flight, problem: Problem, stride: int) -> list[tuple[Array, Array, Array]]:
+    """(xi(k), y_d, u(k-1)) of every `stride`-th period of a flight."""
+    log, N = flight.log.control, problem.horizon
+    reference = paper_reference(log.t.size + N)
+    before = np.vstack([log.speeds_before, log.speeds[:-1]])
+    return [
+        (log.state[k], problem.objective.desired(reference[k + 1 : k + 1 + N]), before[k])
+        for k in range(0, log.t.size, stride)
+    ]
+
+
+def _symmetric(matrix: Array) -> Array:
+    return np.asarray(0.5 * (matrix + matrix.T))
 
 
 def _random_definite(rng: np.random.Generator, size: int) -> Array:

@@ -70,7 +70,8 @@ def axes(problem: Problem) -> list[Axis]:
     tied |= np.abs(model.A) > ROUNDING * np.abs(model.A).max()
     tied |= np.abs(reach.T @ reach) > ROUNDING
     if objective.P is not None:
-        tied |= objective.P != 0.0
+        size = np.sqrt(np.abs(objective.P.diagonal()))
+        tied |= np.abs(objective.P) > ROUNDING * np.outer(size, size)
     count, label = connected_components(csr_matrix(tied), directed=False)
     whole = _axis(problem, np.eye(model.nu), np.arange(model.n), np.arange(len(C_r)), np.flatnonzero(bounded))
     on_nothing = not (C_r.any(axis=1).all() and bounded[rows.of_states].all())

@@ -18,7 +18,7 @@ from mpc.ocp import Problem, Rest
 from mpc.paper.condensed import Condensed, condensed_cost, row_maps
 from mpc.paper.prediction import prediction
 from mpc.qp import Solution
-from mpc.solvers import Answer, Route, Solver
+from mpc.solvers import Answer, Solver, Way
 from quadsim.controller import SOLVED, UNCONSTRAINED
 from quadsim.state import Array, Indices, read_only
 
@@ -121,17 +121,17 @@ class Shortcut:
             self._side = np.zeros_like(self._side)
             nothing = self._nothing
             solution = self._solution(plan, nothing, started, UNCONSTRAINED)
-            return Answer(plan=plan, slacks=self._no_slacks, solution=solution, route=Route.FREE)
+            return Answer(plan=plan, slacks=self._no_slacks, solution=solution, way=Way.FREE)
         free = free.copy()  # the values' room is used again
         if np.isfinite(free).all():
             starts = self._starts()
             found, settled = self._by_axes(plan, free, within, u_before, starts)
-            route = Route.WHOLE if found is None else Route.AXES
+            way = Way.WHOLE if found is None else Way.AXES
             if found is None and settled and self._all is not None:
                 found = self._all.solve(plan, free, self._lower, self._upper, starts, most=MOST_STEPS["all"])
             if found is not None:
                 self._side = found.active.side
-                return self._answer(found, route, started)
+                return self._answer(found, way, started)
         return self._by_solver(plan, free, (state, desired, u_before, rest), started)
 
     def _values_of_inputs(self, plan: Array, u_before: Array) -> Array:
@@ -170,14 +170,14 @@ class Shortcut:
             return None, True
         return _Found(plan, Active(z=z, values=values, side=side, steps=steps)), True
 
-    def _answer(self, found: _Found, route: Route, started: float) -> Answer:
+    def _answer(self, found: _Found, way: Way, started: float) -> Answer:
         slacks, soft = self._no_slacks, self._rows.soft
         if (np.abs(found.active.side) == 2).any():
             values, shape = found.active.values, self._rows.lower.shape
             beyond = np.maximum(np.maximum(values - self._upper, self._lower - values), 0.0)
             slacks = np.where(np.abs(found.active.side) == 2, beyond, 0.0).reshape(shape)[:, soft]
         solution = self._solution(found.plan, found.active, started, SOLVED, slacks)
-        return Answer(plan=found.plan, slacks=slacks, solution=solution, route=route)
+        return Answer(plan=found.plan, slacks=slacks, solution=solution, way=way)
 
     def _solution(
         self, plan: Array, active: Active, started: float, status: str, slacks: Array | None = None
@@ -217,7 +217,7 @@ class Shortcut:
             found = self._all.solve(plan, free, self._lower, self._upper, [near], most=MOST_STEPS["all"])
             if found is not None:
                 self._side = found.active.side
-                answer = self._answer(found, Route.WHOLE, started)
+                answer = self._answer(found, Way.WHOLE, started)
         if answer.solution is given:
             answer = replace(answer, solution=self.formulation.solution(given, answer.plan, answer.slacks, multipliers))
         solution = replace(

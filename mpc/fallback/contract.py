@@ -25,7 +25,7 @@ from typing import Final
 
 import numpy as np
 
-from mpc.answer import BOUND_TOLERANCE, ActuatorBounds
+from mpc.answer import ActuatorBounds, rejection, shifted
 from mpc.equilibrium import Trim
 from mpc.fallback.completion import PLAUSIBLE, CompletedMoment, StateCompletion
 from mpc.fallback.hover import HoverLaw
@@ -180,20 +180,11 @@ class Guarded:
         except self._failures as error:
             _raise_mistake(error)
             return _snake_case(type(error).__name__), None
-        if answer.status not in ACCEPTED:
-            return answer.status, answer
-        return self._rejection(answer, now.acting) or answer.status, answer
-
-    def _rejection(self, answer: Command, acting: Array) -> str | None:
-        """Why an answer that claims to be good is not, or None."""
-        if np.shape(answer.speeds) != (N_ROTORS,) or np.shape(answer.plan) != (self.horizon, N_ROTORS):
-            return "wrong_shape"
-        if not (np.isfinite(answer.speeds).all() and np.isfinite(answer.plan).all()):
-            return "not_finite"
-        lower, upper = self._bounds.reach(acting)
-        if np.maximum(lower - answer.speeds, answer.speeds - upper).max() > BOUND_TOLERANCE:
-            return "out_of_bounds"
-        return None
+        if answer.status in ACCEPTED and (
+            np.shape(answer.speeds) != (N_ROTORS,) or np.shape(answer.plan) != (self.horizon, N_ROTORS)
+        ):
+            return "wrong_shape", answer
+        return rejection(answer.status, answer.speeds, answer.plan, self._bounds, now.acting) or answer.status, answer
 
     def _accept(self, answer: Command, acting: Array) -> Command:
         """A good answer, moved onto its bounds; so is what it plans for later, which may act unasked."""
@@ -221,7 +212,7 @@ class Guarded:
         if lost or old or not (np.abs(deviation) <= self._distance).all():
             self._good = None
             return None
-        plan = np.concatenate([good.plan[age:], np.repeat(good.plan[-1:], age, axis=0)])
+        plan = shifted(good.plan, age)
         plan[0] += self.law.correction(deviation, float(known[INDEX["yaw"]]))
         return self._bounds.clip_plan(plan, acting)
 

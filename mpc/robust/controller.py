@@ -174,7 +174,7 @@ class RobustMPC:
             self._ahead = x0
         answer = self._solve(np.concatenate([x0, self._rotors])[: self._model.n], self._later(reference))
         solution = answer.solution
-        problem = rejection(solution.status, answer.plan, self._actuators, self._acting)
+        problem = rejection(solution.status, answer.plan[0], answer.plan, self._actuators, self._acting)
         if problem is not None:
             return self._refuse(problem, solution)
         plan = answer.plan.copy()

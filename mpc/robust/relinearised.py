@@ -6,7 +6,7 @@ from typing import Final
 
 import numpy as np
 
-from mpc.ocp import Problem
+from mpc.ocp import Problem, Rest
 from mpc.solvers import Answer, refusal
 from mpc.solvers.piqp_sparse import PiqpChanging
 from mpc.staged import Staged
@@ -52,7 +52,8 @@ class Relinearised:
         self.last = None
         if all(np.abs(part).max() <= LARGEST for part in (A, B, c, x0, desired, u_before, u_rest)):
             matrices = form.prepare(A, B)
-            qp = form.changed(matrices, form.changed_vectors(matrices, c, x0, desired, u_before, u_rest))
+            rest = Rest(np.zeros_like(x0), u_rest)
+            qp = form.changed(matrices, form.changed_vectors(matrices, c, x0, desired, u_before, rest))
             solution = self._backend.solve_changed(qp)
         else:
             solution = refusal(form.qp)

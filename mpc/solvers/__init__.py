@@ -152,7 +152,7 @@ def make_backend(name: str) -> Backend:
     return backend
 
 
-class Route(StrEnum):
+class Way(StrEnum):
     """How an optimum was found: see `mpc.exact.shortcut`."""
 
     FREE = "the unconstrained optimum"
@@ -168,13 +168,13 @@ class Answer:
         plan: (N, nu) inputs [rad/s]; to be used only when the solution's status is accepted.
         slacks: (N, m_s) by how much soft rows are violated.
         solution: to the QP of the solver's formulation.
-        route: how it was found.
+        way: how it was found.
     """
 
     plan: Array
     slacks: Array
     solution: Solution
-    route: Route = Route.WHOLE
+    way: Way = Way.WHOLE
 
 
 class Solver(Protocol):

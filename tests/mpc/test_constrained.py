@@ -9,6 +9,7 @@ import pytest
 from support import paper_problem, paper_reference
 
 from mpc.constrained import ConstrainedMPC
+from mpc.ocp import Rest
 from mpc.solvers import Answer, QPSolver
 from quadsim.controller import Command, Moment
 from quadsim.errors import PlanExhaustedError
@@ -26,8 +27,8 @@ class FaultySolver(QPSolver):
         super().__init__("piqp-multistage", self.problem)
         self.faults, self.calls = faults, 0
 
-    def solve(self, state: Array, desired: Array, u_before: Array) -> Answer:
-        answer = super().solve(state, desired, u_before)
+    def solve(self, state: Array, desired: Array, u_before: Array, rest: Rest | None = None) -> Answer:
+        answer = super().solve(state, desired, u_before, rest)
         fault = self.faults.get(self.calls)
         self.calls += 1
         if fault == "not_finite":

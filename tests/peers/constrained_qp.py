@@ -26,7 +26,6 @@ from peers.recorded import Query
 from qpmpc import MPCProblem, Plan, solve_mpc
 
 from mpc.ocp import Problem
-from mpc.paper.condensed import require_bounds
 from mpc.solvers import QPSolver
 from quadsim.errors import ParameterError
 from quadsim.state import Array
@@ -44,7 +43,9 @@ class QpmpcController:
     """A problem of ours in qpmpc, solved anew for every query."""
 
     def __init__(self, problem: Problem) -> None:
-        model, bounds, objective = problem.model, require_bounds(problem), problem.objective
+        model, bounds, objective = problem.model, problem.bounds, problem.objective
+        if bounds is None:
+            raise ParameterError("controller", "bounds", None, "given: without any, there is no QP")
         n, nu = model.n, model.nu
         weights = _diagonal("C_r' Q_y C_r", objective.C_r.T @ objective.Q_y @ objective.C_r)
         scales = np.where(weights > 0.0, np.sqrt(weights), UNWEIGHED)

@@ -33,7 +33,7 @@ from mpc.fallback.hover import (
 from mpc.heading import advance as advance_from
 from mpc.heading import predict_in_heading_frame, turn
 from mpc.model import LinearModel, hover_model
-from mpc.ocp import Problem
+from mpc.ocp import Problem, Rest
 from mpc.solvers import Answer, QPSolver
 from mpc.solvers._piqp import STATUS
 from quadsim.assets import vehicle_path
@@ -823,12 +823,12 @@ class FaultySolver(QPSolver):
         super().__init__("piqp-multistage", problem())
         self.faults, self.calls = faults, -1
 
-    def solve(self, state: Array, desired: Array, u_before: Array) -> Answer:
+    def solve(self, state: Array, desired: Array, u_before: Array, rest: Rest | None = None) -> Answer:
         self.calls += 1
         fault = self.faults.get(self.calls)
         if isinstance(fault, Exception):
             raise fault
-        answer = super().solve(state, desired, u_before)
+        answer = super().solve(state, desired, u_before, rest)
         if fault is None:
             return answer
         return replace(answer, solution=replace(answer.solution, status=fault), plan=answer.plan * np.nan)

@@ -1,0 +1,109 @@
+"""Where the search for active rows starts decides how long it takes, not what it finds."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from support import flight_queries, paper_problem
+
+from mpc.exact.shortcut import Shortcut
+from mpc.ocp import Problem, Rest
+from mpc.qp import Formulation
+from mpc.robust.controller import RobustMPC
+from mpc.solvers import Answer, QPSolver, Solver, Way
+from quadsim.controller import ACCEPTED
+from quadsim.state import Array
+from scenarios.build import build_controller, build_plant, build_reference, build_vehicle
+from scenarios.flying import fly_once
+from scenarios.loading import load_scenario
+from scenarios.navigation import build_navigation
+from scenarios.runner import Flight
+
+Query = tuple[Array, Array, Array, Rest]
+
+
+class Recording:
+    """A solver that keeps what it is asked."""
+
+    def __init__(self, solver: Solver) -> None:
+        self._solver = solver
+        self.queries: list[Query] = []
+
+    @property
+    def name(self) -> str:
+        return self._solver.name
+
+    @property
+    def formulation(self) -> Formulation:
+        return self._solver.formulation
+
+    def reset(self) -> None:
+        self._solver.reset()
+
+    def solve(self, state: Array, desired: Array, u_before: Array, rest: Rest | None = None) -> Answer:
+        assert rest is not None
+        self.queries.append((state.copy(), desired.copy(), u_before.copy(), Rest(rest.x.copy(), rest.u.copy())))
+        return self._solver.solve(state, desired, u_before, rest)
+
+
+@pytest.fixture(scope="module")
+def robust_queries() -> tuple[Problem, list[Query]]:
+    """Twelve seconds of the robust controller in the wind, its bounds soft and tightened; and its problem."""
+    scenario = load_scenario(
+        "robust", ["duration=12.0", "effects.air.rotor_drag=3e-4", "effects.air.wind=[2.0, 1.0, 0.0]"]
+    )
+    vehicle = build_vehicle(scenario)
+    with build_plant(scenario, vehicle) as plant:
+        controller = build_controller(scenario, vehicle)
+        inner = getattr(controller, "inner", controller)
+        assert isinstance(inner, RobustMPC)
+        assert isinstance(inner._solver, Shortcut)
+        problem = inner._solver.formulation._problem
+        inner._solver = recording = Recording(inner._solver)  # type: ignore[assignment]
+        reference = build_reference(scenario, scenario.periods + inner.horizon)
+        navigation = build_navigation(scenario, vehicle)
+        fly_once(scenario, vehicle, plant, controller, reference, navigation=navigation)
+    return problem, recording.queries
+
+
+def agreed(problem: Problem, queries: list[Query], stride: int) -> dict[Way, int]:
+    """How often each way was taken; each answer from a warm start is that from a cold one, by either meaning of it.
+
+    Rows count as held within 1e-9 of their bound, which late in the plan is worth 1e-6 rad/s: the whole plans agree
+    less well than the first inputs.
+    """
+    warm, reset, fresh = (Shortcut(problem, QPSolver("piqp-multistage", problem)) for _ in range(3))
+    empty = fresh._side.copy()
+    ways = dict.fromkeys(Way, 0)
+    for k, query in enumerate(queries):
+        answer = warm.solve(*query)
+        ways[answer.way] += 1
+        assert answer.solution.status in ACCEPTED
+        if k % stride:
+            continue
+        reset.reset()
+        fresh._side = empty.copy()
+        for cold in (reset, fresh):
+            other = cold.solve(*query)
+            assert (other.way is Way.FREE) == (answer.way is Way.FREE)
+            np.testing.assert_allclose(other.plan[0], answer.plan[0], rtol=1e-9, atol=0.0)
+            np.testing.assert_allclose(other.plan, answer.plan, rtol=1e-7, atol=0.0)
+            np.testing.assert_allclose(other.slacks, answer.slacks, rtol=0.0, atol=1e-9)
+    return ways
+
+
+def test_over_the_papers_flight(constrained_flight: Flight) -> None:
+    problem = paper_problem()
+    queries = [(*query, problem.rest) for query in flight_queries(constrained_flight, problem, stride=1)]
+    ways = agreed(problem, queries, stride=5)
+    assert min(ways.values()) > 10
+    assert ways[Way.AXES] > 300
+
+
+def test_over_a_robust_flight(robust_queries: tuple[Problem, list[Query]]) -> None:
+    problem, queries = robust_queries
+    assert problem.rows.soft.size == 2
+    assert len(queries) > 200
+    ways = agreed(problem, queries, stride=3)
+    assert ways[Way.FREE] > 20
+    assert ways[Way.AXES] + ways[Way.WHOLE] > 20

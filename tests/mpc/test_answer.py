@@ -1,0 +1,136 @@
+"""What may reach the plant: hard bounds of actuators, why an answer is rejected, and what is left of a plan."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from support import paper_problem
+
+from mpc.answer import BOUND_TOLERANCE, ActuatorBounds, rejection, shifted
+from mpc.constraints import Constraint, Penalty
+from mpc.ocp import Problem
+from quadsim.controller import SOLVED, UNCONSTRAINED
+from quadsim.errors import ParameterError
+from quadsim.state import Array
+
+HOVER = np.full(4, 190.0)
+
+
+def with_row(name: str, bound: float, *, soft: bool = False, **matrices: Array) -> Problem:
+    """The paper's problem with a further row that is at most a bound."""
+    penalty = Penalty(l1=np.ones(1), l2=np.ones(1)) if soft else None
+    row = Constraint(name=name, lower=np.full(1, -math.inf), upper=np.full(1, bound), penalty=penalty, **matrices)
+    return replace(paper_problem(), constraints=(row,))
+
+
+def test_bounds_of_the_papers_problem_are_its_own() -> None:
+    problem = paper_problem()
+    assert problem.bounds is not None
+    of_rows, of_bounds = ActuatorBounds.of_problem(problem), ActuatorBounds.of(problem.bounds)
+    for name in ("u_min", "u_max", "delta_min", "delta_max"):
+        np.testing.assert_array_equal(getattr(of_rows, name), getattr(problem.bounds, name))
+        np.testing.assert_array_equal(getattr(of_bounds, name), getattr(problem.bounds, name))
+
+
+def test_further_rows_on_single_inputs_and_steps_tighten_them() -> None:
+    second = np.eye(4)[1:2]
+    np.testing.assert_array_equal(
+        ActuatorBounds.of_problem(with_row("worn", 200.0, D=second)).u_max, [250.0, 200.0, 250.0, 250.0]
+    )
+    np.testing.assert_array_equal(
+        ActuatorBounds.of_problem(with_row("slow", 2.0, E=second)).delta_max, [5.0, 2.0, 5.0, 5.0]
+    )
+    wider = ActuatorBounds.of_problem(with_row("wide", 300.0, D=second))
+    np.testing.assert_array_equal(wider.u_max, np.full(4, 250.0))
+
+
+@pytest.mark.parametrize(
+    "row",
+    [
+        {"D": np.ones((1, 4))},
+        {"E": np.ones((1, 4))},
+        {"D": np.eye(4)[:1], "E": np.eye(4)[:1]},
+        {"D": np.eye(4)[:1], "C": np.ones((1, 12))},
+        {"D": -np.eye(4)[:1]},
+        {"D": np.eye(4)[:1], "soft": True},
+    ],
+)
+def test_rows_that_bound_no_single_input_in_every_period_are_none_of_them(row: dict[str, Array]) -> None:
+    bounds = ActuatorBounds.of_problem(with_row("other", 100.0, **row))  # type: ignore[arg-type]
+    np.testing.assert_array_equal(bounds.u_max, np.full(4, 250.0))
+    np.testing.assert_array_equal(bounds.u_min, np.zeros(4))
+    np.testing.assert_array_equal(bounds.delta_max, np.full(4, 5.0))
+
+
+def test_inputs_without_bounds_are_refused() -> None:
+    problem = paper_problem()
+    assert problem.bounds is not None
+    endless = replace(problem.bounds, u_max=np.full(4, math.inf))
+    with pytest.raises(ParameterError, match=r"controller\.u_min must be finite and below a finite u_max"):
+        ActuatorBounds.of_problem(replace(problem, bounds=endless))
+
+
+BOUNDS = ActuatorBounds.alike((0.0, 250.0), (-10.0, 5.0))
+PLAN = np.tile(HOVER, (5, 1))
+
+
+def off(first: float, row: int = 0) -> Array:
+    plan = PLAN.copy()
+    plan[row, 2] += first
+    return plan
+
+
+@pytest.mark.parametrize(
+    ("status", "plan", "reason"),
+    [
+        (SOLVED, PLAN, None),
+        (UNCONSTRAINED, PLAN, None),
+        ("max_iterations", PLAN, "max_iterations"),
+        ("primal_infeasible", PLAN * np.nan, "primal_infeasible"),  # what its solver says comes first
+        ("", PLAN, ""),
+        (SOLVED, off(math.nan), "not_finite"),
+        (SOLVED, off(math.inf, row=4), "not_finite"),
+        (SOLVED, off(5.0), None),
+        (SOLVED, off(5.0 + 0.5 * BOUND_TOLERANCE), None),
+        (SOLVED, off(5.0 + 2.0 * BOUND_TOLERANCE), "out_of_bounds"),
+        (SOLVED, off(-10.0), None),
+        (SOLVED, off(-10.0 - 2.0 * BOUND_TOLERANCE), "out_of_bounds"),
+        (SOLVED, off(40.0, row=1), None),  # only the first action reaches the plant
+    ],
+)
+def test_rejection_tells_why(status: str, plan: Array, reason: str | None) -> None:
+    assert rejection(status, plan, BOUNDS, HOVER) == reason
+
+
+def test_rejection_is_by_speed_where_steps_are_free() -> None:
+    free = ActuatorBounds.alike((0.0, 250.0))
+    assert rejection(SOLVED, off(60.0), free, HOVER) is None
+    assert rejection(SOLVED, off(60.1), free, HOVER) == "out_of_bounds"
+    assert rejection(SOLVED, off(-190.1), free, HOVER) == "out_of_bounds"
+
+
+@given(
+    st.integers(0, 2**32 - 1),
+    st.floats(0.0, 260.0, allow_nan=False),
+)
+def test_whatever_is_clipped_is_not_rejected(seed: int, level: float) -> None:
+    rng = np.random.default_rng(seed)
+    before = level + rng.normal(size=4)
+    plan = BOUNDS.clip_plan(level + 30.0 * rng.normal(size=(6, 4)), before)
+    assert rejection(SOLVED, plan, BOUNDS, before) is None
+
+
+@pytest.mark.parametrize("steps", [0, 1, 3, 4])
+def test_a_shifted_plan_goes_on_and_holds_its_last_input(steps: int) -> None:
+    plan = np.arange(20.0).reshape(5, 4)
+    left = shifted(plan, steps)
+    assert left.shape == plan.shape
+    for i in range(5):
+        np.testing.assert_array_equal(left[i], plan[min(i + steps, 4)])
+    left[:] = -1.0
+    assert plan.min() == 0.0  # a copy

@@ -1,0 +1,154 @@
+"""What a problem may be."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from support import paper_problem, random_problem
+
+from mpc.constraints import Constraint, Penalty, tightened
+from mpc.ocp import Objective, Problem
+from quadsim.errors import ParameterError
+from quadsim.state import Array
+
+
+@pytest.mark.parametrize(
+    "matrix",
+    [np.diag([1.0, 0.0]), np.diag([1.0, -1.0]), np.array([[1.0, 2.0], [2.0, 1.0]]), np.array([[1.0, 0.5], [0.0, 1.0]]),
+     np.diag([1.0, np.nan])],
+)  # fmt: skip
+@pytest.mark.parametrize("weight", ["Q_y", "Q_u"])
+def test_weights_must_be_positive_definite(matrix: np.ndarray, weight: str) -> None:
+    weights = {"Q_y": np.eye(2), "Q_u": np.eye(2), weight: matrix}
+    with pytest.raises(ParameterError, match=rf"controller\.{weight} must be symmetric and positive definite"):
+        Objective(C_r=np.eye(2), **weights)
+
+
+@pytest.mark.parametrize("horizon", [0, -3, 2.5])
+def test_horizon_must_be_a_whole_positive_number(horizon: float) -> None:
+    with pytest.raises(ParameterError, match=r"controller\.horizon must be a whole number >= 1"):
+        replace(paper_problem(), horizon=horizon)
+
+
+def test_regulated_outputs_are_n_r_by_n() -> None:
+    """Erratum after Eq. (4), which prints n_r by n_r."""
+    assert paper_problem().objective.C_r.shape == (4, 12)
+    with pytest.raises(ParameterError, match=r"controller\.C_r must be of shape"):
+        Objective(C_r=np.eye(3), Q_y=np.eye(4), Q_u=np.eye(4))
+    with pytest.raises(ParameterError, match=r"controller\.C_r must be of shape \(4, 12\)"):
+        replace(paper_problem(), objective=Objective(C_r=np.eye(4), Q_y=np.eye(4), Q_u=np.eye(4)))
+
+
+def test_desired_outputs_are_the_reference_and_zero_elsewhere() -> None:
+    reference = np.array([[1.0, 2.0, 3.0, 0.5]])
+    np.testing.assert_array_equal(paper_problem().objective.desired(reference), reference)
+    full = paper_problem("paper-unconstrained").objective.desired(reference)
+    np.testing.assert_array_equal(full, [[1, 0, 2, 0, 3, 0, 0, 0, 0, 0, 0.5, 0]])
+
+
+@pytest.mark.parametrize(
+    "matrix",
+    [-np.eye(4), np.diag([1.0, 1.0, 1.0, np.nan]), np.eye(4) + np.eye(4, k=1), np.ones((4, 3))],
+)
+@pytest.mark.parametrize("weight", ["Q_d", "P"])
+def test_weights_of_moves_and_of_the_last_state_must_be_semidefinite(matrix: Array, weight: str) -> None:
+    weights = {"Q_y": np.eye(4), "Q_u": np.eye(4)}
+    Objective(C_r=np.eye(4), **weights, **{weight: np.zeros((4, 4))})
+    with pytest.raises(ParameterError, match=rf"controller\.{weight} must be symmetric and positive semidefinite"):
+        Objective(C_r=np.eye(4), **weights, **{weight: matrix})
+
+
+def replaced(problem: Problem, **parts: object) -> Problem:
+    assert problem.bounds is not None
+    return replace(problem, bounds=replace(problem.bounds, **parts))
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda p: replace(p, objective=replace(p.objective, Q_u=np.eye(3))), r"Q_u must be of shape \(2, 2\)"),
+        (lambda p: replace(p, objective=replace(p.objective, Q_d=np.eye(3))), r"Q_d must be of shape \(2, 2\)"),
+        (lambda p: replace(p, objective=replace(p.objective, P=np.eye(2))), r"P must be of shape \(3, 3\)"),
+        (lambda p: replaced(p, C_c=np.ones((1, 4))), r"C_c must be of shape \(1, 3\)"),
+        (lambda p: replaced(p, delta_min=-np.ones(3), delta_max=np.ones(3)), r"delta_min must be of shape \(2,\)"),
+        (lambda p: replaced(p, u_min=-np.ones(3), u_max=np.ones(3)), r"u_min must be of shape \(2,\)"),
+        (lambda p: replaced(p, penalty=Penalty(l1=np.ones(2), l2=np.ones(2))), r"l1 must be of shape \(1,\)"),
+        (lambda p: replaced(p, margins=np.zeros((3, 1))), r"margins must be of shape \(4, 1\); got \(3, 1\)"),
+        (lambda p: replaced(p, margins=np.zeros((4, 2))), r"margins must be of shape \(4, 1\); got \(4, 2\)"),
+        (lambda p: replaced(p, margins=np.full((4, 1), -0.1)), r"margins must be finite numbers >= 0 of shape"),
+        (lambda p: replaced(p, margins=np.full((4, 1), np.nan)), r"margins must be finite numbers >= 0 of shape"),
+        (lambda p: replaced(p, margins=np.full((4, 1), 100.0)), r"margins must be less than half of what is between"),
+        (lambda p: with_row(p, C=np.ones((1, 2))), r"thrust\.C must be of shape \(1, 3\)"),
+        (lambda p: with_row(p, D=np.ones((1, 3))), r"thrust\.D must be of shape \(1, 2\)"),
+        (lambda p: with_row(p, E=np.ones((1, 3))), r"thrust\.E must be of shape \(1, 2\)"),
+        (
+            lambda p: with_row(p, D=np.ones((1, 2)), lower=np.zeros((3, 1)), upper=np.ones((3, 1))),
+            r"thrust\.lower must be of shape \(4, 1\); got \(3, 1\)",
+        ),
+        (lambda p: with_row(p), r"thrust must be 1 rows"),
+        (lambda p: with_row(p, D=np.ones((2, 2))), r"thrust must be 1 rows; got \[2\]"),
+        (lambda p: with_row(p, D=np.array([[np.nan, 0.0]])), r"thrust must be finite numbers"),
+        (lambda p: with_row(p, D=np.ones((1, 2)), lower=np.ones(1)), r"thrust\.lower must be below upper"),
+        (lambda p: with_row(p, D=np.ones((1, 2)), lower=np.full(1, np.nan)), r"thrust\.lower must be numbers of the"),
+        (
+            lambda p: with_row(p, D=np.ones((1, 2)), penalty=Penalty(l1=np.ones(2), l2=np.ones(2))),
+            r"l1 must be of shape \(1,\)",
+        ),
+    ],
+)
+def test_parts_that_do_not_fit_are_refused(make: Callable[[Problem], Problem], message: str) -> None:
+    with pytest.raises(ParameterError, match=rf"controller\.{message}"):
+        make(random_problem(np.random.default_rng(0), horizon=4))
+
+
+def with_row(problem: Problem, **parts: Any) -> Problem:
+    """A further row, between 0 and 1 unless another is given."""
+    given = {"lower": np.zeros(1), "upper": np.ones(1), **parts}
+    return replace(problem, constraints=(Constraint(name="thrust", **given),))
+
+
+@pytest.mark.parametrize(("l1", "l2"), [([-1.0], [0.0]), ([1.0], [math.nan]), ([1.0], [1.0, 2.0])])
+def test_impossible_penalties_are_refused(l1: list[float], l2: list[float]) -> None:
+    with pytest.raises(ParameterError, match=r"controller\.l[12] must be one finite number >= 0 per"):
+        Penalty(l1=np.array(l1), l2=np.array(l2))
+
+
+def test_rows_are_all_that_bound_anything_in_the_constraints_order() -> None:
+    """Rows without a bound are left out; others are told apart by what they are on, and by their price."""
+    problem = random_problem(np.random.default_rng(0), horizon=3, n_c=2)
+    assert problem.bounds is not None
+    endless = np.full(2, np.inf)
+    penalty = Penalty(l1=np.array([1.0, 2.0]), l2=np.array([3.0, 4.0]))
+    bounds = replace(problem.bounds, delta_max=endless, delta_min=np.array([-1.0, -np.inf]), penalty=penalty)
+    late = np.array([[np.inf], [np.inf], [2.0]])  # a bound at the last step alone
+    extra = Constraint(name="late", lower=-late, upper=late, C=np.ones((1, 3)), D=np.array([[2.0, 0.0]]))
+    rows = replace(problem, bounds=bounds, constraints=(extra,)).rows
+    assert rows.names == ("outputs", "outputs", "slews", "inputs", "inputs", "late")
+    np.testing.assert_array_equal(rows.of_states, [True, True, False, False, False, False])
+    np.testing.assert_array_equal(rows.input, [-1, -1, -1, 0, 1, -1])
+    np.testing.assert_array_equal(rows.l1, [1.0, 2.0, *[np.inf] * 4])
+    np.testing.assert_array_equal(rows.l2, [3.0, 4.0, *[0.0] * 4])
+    np.testing.assert_array_equal(rows.soft, [0, 1])
+    np.testing.assert_array_equal(rows.upper[:, -1:], late)
+    np.testing.assert_array_equal(rows.lower, np.broadcast_to(rows.lower, (3, 6)))
+    np.testing.assert_array_equal(rows.C[:2], bounds.C_c)
+    np.testing.assert_array_equal(rows.C[-1], np.ones(3))
+    np.testing.assert_array_equal(rows.D[3:], [[1.0, 0.0], [0.0, 1.0], [2.0, 0.0]])
+
+
+def test_margins_tighten_both_bounds_of_each_step() -> None:
+    problem = random_problem(np.random.default_rng(0), horizon=3, n_c=2)
+    assert problem.bounds is not None
+    margins = 0.1 * np.random.default_rng(1).uniform(size=(3, 2))
+    outputs, *others = replace(problem.bounds, margins=margins).constraints
+    np.testing.assert_array_equal(outputs.lower, problem.bounds.y_min + margins)
+    np.testing.assert_array_equal(outputs.upper, problem.bounds.y_max - margins)
+    assert [part.name for part in others] == ["slews", "inputs"]
+    unbounded = Constraint(name="above", lower=np.full(1, -np.inf), upper=np.ones(1), C=np.ones((1, 3)))
+    np.testing.assert_array_equal(tightened(unbounded, np.full((3, 1), 0.5)).upper, np.full((3, 1), 0.5))
+    assert np.isneginf(tightened(unbounded, np.full((3, 1), 0.5)).lower).all()

@@ -1,0 +1,343 @@
+"""A kind of constraint that only this test has, C x + D u + E (u - u_before), through every route to an optimum.
+
+That it holds is told by rolling the model out, and what the optimum is by a peer: see `ocp_peer`.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from functools import cache
+from typing import Any
+
+import numpy as np
+import ocp_peer
+import pytest
+from ocp_peer import Optimum, Period
+from support import changing_period, paper_problem, random_problem, random_rows
+
+from mpc.constrained import ConstrainedMPC
+from mpc.constraints import Constraint, Penalty, tightened
+from mpc.exact.shortcut import Shortcut
+from mpc.model import LinearModel, continuous_model, discretise
+from mpc.nonlinear.linearise import linearise
+from mpc.nonlinear.model import nonlinear_model
+from mpc.ocp import Objective, Problem, Rest, lqr_terminal_weight
+from mpc.robust.controller import Linearisation, RobustMPC, RobustSettings
+from mpc.robust.relinearised import Relinearised
+from mpc.solvers import SOLVERS, QPSolver, Way
+from quadsim.controller import ACCEPTED, SOLVED, UNCONSTRAINED, Moment
+from quadsim.state import Array, make_state
+from quadsim.vehicle import Vehicle
+
+INSTALLED = [name for name in SOLVERS if SOLVERS[name].installed]
+MAY_FAIL = {"osqp", "highs"}
+"""Which say so, see docs; all others have to solve."""
+N = 15
+PERIOD = 0.05
+
+
+def largest(constraint: Constraint, given: Period, plan: Array) -> float:
+    return float(ocp_peer.violation(constraint, given, plan).max())
+
+
+def coupled(problem: Problem, given: Period, *, soft: bool, share: float = 0.5, l1: float = 0.3) -> Constraint:
+    """Three rows over states, rotors and their steps, which the optimum without them violates; hover keeps them.
+
+    The first is bounded above, the second below, the third on both sides, each at a share of the way from hover to
+    the farthest that the optimum goes.
+    """
+    rng = np.random.default_rng(11)
+    m, n, nu = 3, 12, 4
+    C, D, E = rng.normal(size=(m, n)), 0.1 * rng.normal(size=(m, nu)), 0.1 * rng.normal(size=(m, nu))
+    if problem.model.n > n:
+        C = np.hstack([C, np.zeros((m, problem.model.n - n))])
+    endless = np.full(m, math.inf)
+    row = Constraint(name="coupled", C=C, D=D, E=E, lower=-endless, upper=endless)
+    goes = ocp_peer.values(row, given, ocp_peer.optimum(problem, given).plan) - D @ problem.model.u_bar
+    upwards = np.where(goes.max(axis=0) > -goes.min(axis=0), 1.0, -1.0) * [1.0, -1.0, 1.0]
+    C, D, E = (upwards[:, None] * part for part in (C, D, E))
+    level, room = D @ problem.model.u_bar, share * np.abs(goes).max(axis=0)
+    assert np.all(room > 1e-2)
+    lower, upper = level - room, level + room
+    lower[0], upper[1] = -math.inf, math.inf
+    penalty = Penalty(l1=np.full(m, l1), l2=np.full(m, 0.5)) if soft else None
+    return replace(row, C=C, D=D, E=E, lower=lower, upper=upper, penalty=penalty)
+
+
+@cache
+def paper(*, soft: bool) -> tuple[Problem, Period, Constraint, Optimum]:
+    """The paper's problem from hover, 3 m to go, with the coupled rows and their peer's optimum."""
+    problem = paper_problem("paper-constrained", f"controller.horizon={N}")
+    desired = problem.objective.desired(np.tile([3.0, -2.0, 2.0, 0.3], (N, 1)))
+    given = ocp_peer.period(problem, np.zeros(12), desired, problem.model.u_bar)
+    row = coupled(problem, given, soft=soft)
+    problem = replace(problem, constraints=(row,))
+    return problem, given, row, ocp_peer.optimum(problem, given)
+
+
+@cache
+def drawn(seed: int, *, soft: bool) -> tuple[Problem, Period, Constraint, Optimum]:
+    rng = np.random.default_rng(seed)
+    problem = random_problem(rng, horizon=6, n=3, nu=2, n_c=2)
+    row = random_rows(rng, problem, soft=soft)
+    problem = replace(problem, constraints=(row,))
+    given = ocp_peer.period(problem, 0.2 * rng.normal(size=3), rng.normal(size=(6, 3)), problem.model.u_bar)
+    return problem, given, row, ocp_peer.optimum(problem, given)
+
+
+CASES = ["paper", *range(8)]
+
+
+def case(which: str | int, *, soft: bool) -> tuple[Problem, Period, Constraint, Optimum]:
+    return paper(soft=soft) if isinstance(which, str) else drawn(which, soft=soft)
+
+
+@pytest.mark.parametrize("soft", [False, True])
+def test_the_peers_optimum_is_held_by_these_rows(soft: bool) -> None:
+    """What the tests below rest on: it is the optimum, it violates soft rows, and without them it is another."""
+    solved = violated = different = 0
+    for which in CASES:
+        problem, given, row, peer = case(which, soft=soft)
+        if peer.solution.status != SOLVED:
+            continue
+        solved += 1
+        assert peer.residual < 1e-6
+        beyond = largest(row, given, peer.plan)
+        violated += beyond > 1e-3
+        assert soft or beyond < 1e-8
+        if soft:
+            np.testing.assert_allclose(peer.slacks, ocp_peer.violation(row, given, peer.plan), atol=1e-8)
+        without = ocp_peer.optimum(replace(problem, constraints=()), given).plan
+        different += np.abs(without - peer.plan).max() > 1e-2
+    assert solved >= 6
+    assert different >= 4
+    assert (violated >= 2) == soft
+    assert case("paper", soft=soft)[3].solution.status == SOLVED
+
+
+@pytest.mark.parametrize("name", INSTALLED)
+@pytest.mark.parametrize("soft", [False, True])
+@pytest.mark.parametrize("which", CASES)
+def test_every_solver_holds_it(which: str | int, soft: bool, name: str) -> None:
+    problem, given, row, peer = case(which, soft=soft)
+    answer = QPSolver(name, problem).solve(given.state, given.desired, given.u_before)
+    if name in MAY_FAIL and answer.solution.status != SOLVED:
+        return
+    assert (answer.solution.status == SOLVED) == (peer.solution.status == SOLVED)
+    if peer.solution.status != SOLVED:
+        return
+    np.testing.assert_allclose(answer.plan[0], peer.plan[0], rtol=0.0, atol=2e-3)
+    np.testing.assert_allclose(answer.plan, peer.plan, rtol=0.0, atol=2e-2)
+    assert ocp_peer.cost(problem, given, answer.plan) < ocp_peer.cost(problem, given, peer.plan) * (1.0 + 1e-4) + 1e-4
+    beyond = ocp_peer.violation(row, given, answer.plan)
+    np.testing.assert_allclose(beyond, answer.slacks if soft else 0.0, atol=1e-5)
+
+
+@pytest.mark.parametrize("soft", [False, True])
+@pytest.mark.parametrize("which", CASES)
+def test_the_shortcut_holds_it(which: str | int, soft: bool) -> None:
+    """All rows together, from a cold start and from a warm one."""
+    problem, given, row, peer = case(which, soft=soft)
+    solver = Shortcut(problem, QPSolver("piqp-multistage", problem))
+    for _ in range(2):
+        answer = solver.solve(given.state, given.desired, given.u_before)
+        assert (answer.solution.status in ACCEPTED) == (peer.solution.status == SOLVED)
+        if peer.solution.status != SOLVED:
+            return
+        np.testing.assert_allclose(answer.plan, peer.plan, rtol=0.0, atol=1e-6)
+        beyond = ocp_peer.violation(row, given, answer.plan)
+        np.testing.assert_allclose(beyond, answer.slacks if soft else 0.0, atol=1e-7)
+
+
+@pytest.mark.parametrize("row", range(3))
+@pytest.mark.parametrize("side", ["lower", "upper"])
+@pytest.mark.parametrize("soft", [False, True])
+def test_the_free_optimum_is_taken_where_and_only_where_it_keeps_it(row: int, side: str, soft: bool) -> None:
+    """A bound just beyond the free optimum's extreme value stands in no way; just before it, it does."""
+    problem, given, wide, _ = paper(soft=soft)
+    query = 0.01 * given.state, 0.01 * given.desired, given.u_before
+    near = ocp_peer.period(problem, *query)
+    wide = replace(wide, lower=np.full(3, -1e6), upper=np.full(3, 1e6))
+
+    def answered(constraint: Constraint) -> Any:
+        one = replace(problem, constraints=(constraint,))
+        return Shortcut(one, QPSolver("piqp-multistage", one)).solve(*query)
+
+    free = answered(wide)
+    assert (free.way, free.solution.status) == (Way.FREE, UNCONSTRAINED)
+    reached = ocp_peer.values(wide, near, free.plan)[:, row]
+    extreme, outwards = (reached.min(), -1.0) if side == "lower" else (reached.max(), 1.0)
+    for distance, way in ((1e-7, Way.FREE), (-1e-4, Way.WHOLE)):
+        bound = getattr(wide, side).copy()
+        bound[row] = extreme + outwards * distance
+        answer = answered(replace(wide, **{side: bound}))
+        assert answer.way is way
+        if not soft:
+            assert largest(replace(wide, **{side: bound}), near, answer.plan) < 1e-8
+
+
+@pytest.mark.parametrize("soft", [False, True])
+def test_rows_of_states_alone_are_held_axis_by_axis(soft: bool) -> None:
+    """Of speed and tilt forwards, of climb, and of a yaw rate: each on its own axis, none of them the paper's kind.
+
+    Rotors that are quick enough for no step of theirs to be at a bound.
+    """
+    problem = paper_problem("paper-constrained", "controller.output_bounds={}")
+    assert problem.bounds is not None
+    quick = replace(problem.bounds, delta_min=np.full(4, -100.0), delta_max=np.full(4, 100.0))
+    problem = replace(problem, bounds=quick)
+    C = np.zeros((3, 12))
+    C[0, [1, 8]], C[1, [4, 5]], C[2, 11] = [1.0, 2.0], [0.2, 1.0], 1.0
+    penalty = Penalty(l1=np.full(3, 0.2), l2=np.full(3, 1.0)) if soft else None
+    row = Constraint(
+        name="speeds", C=C, lower=np.array([-0.2, -math.inf, -0.02]), upper=np.array([0.25, 0.1, 0.02]), penalty=penalty
+    )
+    problem = replace(problem, constraints=(row,))
+    desired = np.outer(np.linspace(0.0, 1.0, 50) ** 4, [3.0, 0.0, 1.0, 0.4])
+    given = ocp_peer.period(problem, np.zeros(12), desired, problem.model.u_bar)
+    peer = ocp_peer.optimum(problem, given)
+    without = ocp_peer.optimum(replace(problem, constraints=()), given)
+    assert (ocp_peer.violation(row, given, without.plan).max(axis=0) > 1e-2).all()
+    answer = Shortcut(problem, QPSolver("piqp-multistage", problem)).solve(np.zeros(12), desired, problem.model.u_bar)
+    assert answer.way is Way.AXES
+    np.testing.assert_allclose(answer.plan, peer.plan, rtol=0.0, atol=1e-5)
+    beyond = ocp_peer.violation(row, given, answer.plan)
+    assert (beyond.max() > 1e-3) == soft
+    np.testing.assert_allclose(beyond, answer.slacks if soft else 0.0, atol=1e-7)
+
+
+@pytest.mark.parametrize("soft", [False, True])
+def test_the_papers_controller_holds_it(soft: bool) -> None:
+    problem, given, _, peer = paper(soft=soft)
+    for shortcut in (False, True):
+        controller = ConstrainedMPC(problem, QPSolver("piqp-multistage", problem), shortcut=shortcut)
+        controller.reset(given.u_before)
+        command = controller.step(Moment(), given.state, given.desired)
+        assert command.status == SOLVED
+        np.testing.assert_allclose(command.speeds, peer.plan[0], atol=1e-3)
+        assert command.slack == pytest.approx(peer.slacks.max(initial=0.0), abs=1e-5)
+
+
+# The robust controller
+
+
+def margins(row: Constraint, level: Array) -> Array:
+    """Growing along the horizon to half of the room between hover and the nearer bound."""
+    room = np.minimum(level - row.lower, row.upper - level)
+    return np.asarray(np.linspace(0.0, 0.5, N)[:, None] * room)
+
+
+def modelled(vehicle: Vehicle, settings: RobustSettings, constraints: tuple[Constraint, ...]) -> Problem:
+    """What the controller is to solve at hover, built once more."""
+    problem = paper_problem("paper-constrained", f"controller.horizon={N}")
+    assert problem.bounds is not None
+    A, B = discretise(*continuous_model(vehicle, settings.rotor_lag), PERIOD)
+    more = ((0, 0), (0, len(A) - 12))
+    model = LinearModel(A=A, B=B, u_bar=problem.model.u_bar, period=PERIOD)
+    objective = Objective(
+        C_r=np.pad(problem.objective.C_r, more),
+        Q_y=problem.objective.Q_y,
+        Q_u=problem.objective.Q_u,
+        Q_d=settings.move_weight,
+    )
+    if settings.terminal:
+        objective = replace(objective, P=lqr_terminal_weight(model, objective))
+    bounds = replace(
+        problem.bounds, C_c=np.pad(problem.bounds.C_c, more), penalty=settings.penalty, margins=settings.margins
+    )
+    widened = tuple(
+        part if part.C is None else replace(part, C=np.pad(part.C, ((0, 0), (0, len(A) - part.C.shape[1]))))
+        for part in constraints
+    )
+    return Problem(model=model, horizon=N, objective=objective, bounds=bounds, constraints=widened)
+
+
+SETTINGS: dict[str, dict[str, Any]] = {
+    "plain": {},
+    "everything": {
+        "penalty": Penalty(l1=np.full(2, 2e5), l2=np.full(2, 1e4)),
+        "rotor_lag": 0.03,
+        "move_weight": 0.5 * np.eye(4),
+        "margins": np.linspace(0.0, 0.02, N)[:, None] * np.ones(2),
+    },
+    "terminal": {"terminal": True},
+    "state": {"linearisation": Linearisation.STATE},
+    "state with lag": {"linearisation": Linearisation.STATE, "rotor_lag": 0.03, "move_weight": 0.5 * np.eye(4)},
+}
+
+
+@pytest.mark.parametrize("parts", SETTINGS)
+@pytest.mark.parametrize("kind", ["hard", "soft", "tightened"])
+def test_the_robust_controller_holds_it(vehicle: Vehicle, parts: str, kind: str) -> None:
+    """From hover with a little tilt and speed; models of `state` are linearised there."""
+    settings = RobustSettings(**SETTINGS[parts])
+    base = modelled(vehicle, settings, ())
+    hover, reference = np.full(4, vehicle.hover_speed), np.tile([3.0, -2.0, 2.0, 0.3], (N, 1))
+    state = make_state(euler=(0.01, -0.02, 0.0))
+    state[1] = 0.05
+    x0 = np.concatenate([state, hover])[: base.model.n]
+    rest = Rest(np.zeros(base.model.n), hover)
+    rest.x[12:] = hover[: base.model.n - 12]
+    given = ocp_peer.period(base, x0, base.objective.desired(reference), hover, rest)
+    if settings.linearisation is Linearisation.STATE:
+        model = nonlinear_model(vehicle, PERIOD, rotor_lag=settings.rotor_lag or None)
+        A, B, c = (np.repeat(part, N, 0) for part in linearise(model, x0[None], hover[None]))
+        given = replace(given, A=A, B=B, c=c)
+    row = coupled(base, given, soft=kind == "soft", share=0.7)
+    row = replace(row, C=None if row.C is None else row.C[:, :12])
+    if kind == "tightened":
+        assert row.D is not None
+        row = tightened(row, margins(row, row.D @ hover))
+    problem = modelled(vehicle, settings, (row,))
+    peer = ocp_peer.optimum(problem, given)
+    assert peer.solution.status == SOLVED
+    bounds, small = paper_problem().bounds, paper_problem()
+    assert bounds is not None
+    controller = RobustMPC(
+        vehicle,
+        period=PERIOD,
+        horizon=N,
+        objective=small.objective,
+        bounds=bounds,
+        settings=settings,
+        constraints=(row,),
+    )
+    controller.reset(hover)
+    command = controller.step(Moment(acting=hover), state, reference)
+    assert command.status == SOLVED
+    exact = settings.linearisation is Linearisation.HOVER
+    np.testing.assert_allclose(command.plan[0], peer.plan[0], rtol=0.0, atol=1e-5 if exact else 1e-3)
+    np.testing.assert_allclose(command.plan, peer.plan, rtol=0.0, atol=1e-5 if exact else 2e-2)
+    held = problem.constraints[0]
+    beyond = ocp_peer.violation(held, given, command.plan)
+    assert command.slack == pytest.approx(peer.slacks.max(initial=0.0), abs=1e-6 if exact else 1e-4)
+    assert (beyond.max() > 1e-3) == (kind == "soft")
+    if kind != "soft":
+        assert beyond.max() < 1e-6
+        without = ocp_peer.optimum(replace(problem, constraints=()), given)
+        assert largest(held, given, without.plan) > 1e-2
+
+
+@pytest.mark.parametrize("soft", [False, True])
+def test_models_that_change_from_step_to_step_hold_it(soft: bool) -> None:
+    solved = 0
+    for seed in range(12):
+        rng = np.random.default_rng(seed)
+        problem = random_problem(rng, horizon=7, n=3, nu=2, n_c=2)
+        row = random_rows(rng, problem, soft=soft)
+        problem = replace(problem, constraints=(row,))
+        given = changing_period(rng, problem)
+        peer = ocp_peer.optimum(problem, given)
+        answer = Relinearised(problem).solve(
+            given.A, given.B, given.c, given.state, given.desired, given.u_before, given.rest.u
+        )
+        assert (answer.solution.status == SOLVED) == (peer.solution.status == SOLVED)
+        if peer.solution.status != SOLVED:
+            continue
+        solved += 1
+        np.testing.assert_allclose(answer.plan, peer.plan, atol=1e-3)
+        np.testing.assert_allclose(
+            ocp_peer.violation(row, given, answer.plan), answer.slacks if soft else 0.0, atol=1e-5
+        )
+    assert solved >= 4

@@ -1,0 +1,346 @@
+"""The staged QP: against the condensed one, against a peer's optimum for models that change, and its KKT conditions."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+import ocp_peer
+import pytest
+import scipy.optimize
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from ocp_peer import Period
+from support import changing_period, flight_queries, paper_problem, paper_reference, random_problem, with_terms
+
+from mpc.constraints import Penalty
+from mpc.exact.polish import polish
+from mpc.nonlinear.linearise import linearise
+from mpc.nonlinear.model import nonlinear_model
+from mpc.ocp import Problem, Rest
+from mpc.paper.condensed import Condensed, condensed
+from mpc.qp import QP, Formulation, Solution, kkt_residuals
+from mpc.solvers import QPSolver
+from mpc.solvers.daqp_dense import DaqpDense
+from mpc.solvers.piqp_dense import PiqpDense
+from mpc.solvers.piqp_sparse import PiqpChanging, PiqpMultistage
+from mpc.staged import Staged
+from quadsim.controller import SOLVED
+from quadsim.errors import ParameterError
+from quadsim.state import Array
+from quadsim.vehicle import Vehicle
+from scenarios.runner import Flight
+
+LAG = 0.05
+
+
+@dataclass(frozen=True)
+class Changing:
+    """A problem whose model changes, staged and solved anew each time, in any number of steps per stage."""
+
+    form: Staged
+    backend: PiqpChanging
+
+    def qp(self, now: Period) -> QP:
+        matrices = self.form.prepare(now.A, now.B)
+        vectors = self.form.changed_vectors(matrices, now.c, now.state, now.desired, now.u_before, now.rest)
+        return self.form.changed(matrices, vectors)
+
+    def solve(self, now: Period) -> Solution:
+        return self.backend.solve_changed(self.qp(now))
+
+    def plan(self, solution: Solution) -> Array:
+        return self.form.inputs(solution.x)
+
+    def slacks(self, solution: Solution) -> Array:
+        return self.form.slacks(solution.x)
+
+    def states(self, now: Period, solution: Solution) -> Array:
+        return self.form.states(self.form.prepare(now.A, now.B), now.c, now.state, solution.x)
+
+
+def changing(problem: Problem, steps: int) -> Changing:
+    form, backend = Staged(problem, steps_per_stage=steps, changing=True), PiqpChanging()
+    backend.setup(form.qp)
+    return Changing(form, backend)
+
+
+def softened(problem: Problem, l1: list[float], l2: list[float]) -> Problem:
+    assert problem.bounds is not None
+    penalty = Penalty(l1=np.array(l1), l2=np.array(l2))
+    return replace(problem, bounds=replace(problem.bounds, penalty=penalty))
+
+
+def exact(form: Formulation, query: tuple[Array, Array, Array, Rest]) -> tuple[Array, Array, float]:
+    """Plan and slacks at a form's optimum, with its KKT residual over the size of its multipliers."""
+    backend = PiqpMultistage() if isinstance(form, Staged) else PiqpDense()
+    backend.setup(form.qp)
+    vectors = form.vectors(*query)
+    qp, solution = form.qp.with_vectors(vectors), backend.solve(vectors)
+    assert solution.status == SOLVED
+    optimum = polish(qp, solution)
+    size = max(1.0, float(np.abs(np.concatenate([optimum.z, optimum.z_box])).max()))
+    return form.inputs(optimum.x), form.slacks(optimum.x), kkt_residuals(qp, optimum).worst / size
+
+
+@settings(max_examples=60)
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    horizon=st.integers(1, 12),
+    n=st.integers(1, 4),
+    nu=st.integers(1, 3),
+    steps=st.integers(1, 5),
+    terms=st.sets(st.sampled_from(["soft", "margins", "Q_d", "P", "constraints"])),
+    elsewhere=st.booleans(),
+)
+def test_it_has_the_condensed_optimum(
+    seed: int, horizon: int, n: int, nu: int, steps: int, terms: set[str], elsewhere: bool
+) -> None:
+    """Of random problems with every term that there is, at rest in the origin or elsewhere; feasible by their start."""
+    rng = np.random.default_rng(seed)
+    problem = with_terms(rng, random_problem(rng, horizon=horizon, n=n, nu=nu, n_c=2), terms)
+    model = problem.model
+    rest = Rest(0.1 * rng.normal(size=n), model.u_bar + 0.05 * rng.normal(size=nu)) if elsewhere else problem.rest
+    before = model.u_bar + 0.05 * rng.normal(size=nu)
+    query = 0.1 * rng.normal(size=n), rng.normal(size=(horizon, len(problem.objective.C_r))), before, rest
+    staged = Staged(problem, steps_per_stage=steps)
+    solver = PiqpMultistage()
+    solver.setup(staged.qp)
+    peer = ocp_peer.optimum(problem, ocp_peer.period(problem, *query))
+    if peer.solution.status != SOLVED:
+        assert solver.solve(staged.vectors(*query)).status != SOLVED
+        return
+    plan, slacks, residual = exact(staged, query)
+    other, others, residual_of_condensed = exact(Condensed(problem), query)
+    size = max(1.0, float(np.abs(other).max()))
+    assert max(residual, residual_of_condensed) < 1e-8
+    np.testing.assert_allclose(plan, other, rtol=0.0, atol=1e-8 * size)
+    np.testing.assert_allclose(slacks, others, rtol=0.0, atol=1e-8 * size)
+    np.testing.assert_allclose(plan, peer.plan, rtol=0.0, atol=1e-7 * size)
+
+
+@pytest.mark.parametrize("steps", [1, 4, 5, 50, 60])
+def test_stages_cover_the_horizon(steps: int) -> None:
+    """Whatever M, and whatever is left for the first stage and the last, the QP is the same."""
+    problem = paper_problem()
+    query = np.zeros(12), problem.objective.desired(paper_reference(51)[1:]), problem.model.u_bar
+    expected = QPSolver("piqp-dense", problem).solve(*query).plan
+    formulation, backend = Staged(problem, steps_per_stage=steps), PiqpMultistage()
+    backend.setup(formulation.qp)
+    solution = backend.solve(formulation.vectors(*query))
+    np.testing.assert_allclose(formulation.inputs(solution.x)[0], expected[0], atol=1e-3)
+    np.testing.assert_allclose(formulation.inputs(solution.x), expected, atol=0.05)
+
+
+@pytest.mark.parametrize("steps", [1, 3, 5, 7, 50, 80])
+def test_every_stage_length_gives_the_condensed_optimum(steps: int) -> None:
+    """Also where the horizon is no multiple of it, and where one stage holds it all."""
+    problem = paper_problem("paper-constrained", "controller.horizon=17")
+    state = np.zeros(12)
+    state[10] = np.pi / 6
+    query = state, problem.objective.desired(paper_reference(18)[1:]), problem.model.u_bar, problem.rest
+    plan, _, residual = exact(Staged(problem, steps_per_stage=steps), query)
+    other, _, _ = exact(condensed(problem), query)
+    assert residual < 1e-8
+    np.testing.assert_allclose(plan, other, atol=1e-6)
+
+
+def test_products_of_rounding_are_left_out() -> None:
+    """Rotors on body x do not roll the vehicle, though cos(90 deg) is not zero in binary."""
+    qp = Staged(paper_problem()).qp
+    outputs = abs(qp.G[:100]).tocsr()
+    for row in (outputs[i].data for i in range(outputs.shape[0]) if outputs[i].nnz):
+        assert row.min() > 1e-12 * row.max()
+
+
+@pytest.mark.parametrize("steps", [0, -1, 2.5])
+def test_impossible_stages_are_refused(steps: float) -> None:
+    problem = random_problem(np.random.default_rng(0), horizon=4)
+    with pytest.raises(ParameterError, match=r"controller\.steps_per_stage must be a whole number >= 1"):
+        Staged(problem, steps_per_stage=steps)  # type: ignore[arg-type]
+
+
+# Models that change from step to step
+
+
+@pytest.mark.parametrize("steps", [1, 2, 5])
+def test_constant_matrices_make_the_papers_plan(constrained_flight: Flight, steps: int) -> None:
+    problem = paper_problem()
+    solver = changing(problem, steps)
+    formulation, backend = Staged(problem), DaqpDense()
+    backend.setup(formulation.qp)
+    pressing = 0
+    for query in flight_queries(constrained_flight, problem, stride=100):
+        solution = solver.solve(ocp_peer.period(problem, *query))
+        optimum = backend.solve(formulation.vectors(*query))
+        assert solution.status == optimum.status == SOLVED
+        plan, expected = solver.plan(solution), formulation.inputs(optimum.x)
+        np.testing.assert_allclose(plan[:10], expected[:10], atol=1e-3)
+        np.testing.assert_allclose(plan, expected, atol=1e-2)
+        pressing += optimum.active
+    assert pressing > 100
+
+
+@pytest.mark.parametrize("steps", [1, 2, 4])
+@pytest.mark.parametrize("horizon", [1, 3, 7, 10])
+@pytest.mark.parametrize("soft", [False, True])
+@pytest.mark.parametrize("terms", [(), ("Q_d", "margins"), ("P", "constraints")])
+def test_systems_that_change_agree_with_a_peer(horizon: int, steps: int, soft: bool, terms: tuple[str, ...]) -> None:
+    """Moves weighed, bounds tightened, a terminal weight and further rows: the peer rolls all of them out by itself."""
+    rng = np.random.default_rng(100 * horizon + steps)
+    solved = 0
+    for _ in range(8):
+        problem = random_problem(rng, horizon=horizon, n=3, nu=2, n_c=2)
+        if soft:
+            problem = softened(problem, [30.0, 5.0], [2.0, 0.0])
+        problem = with_terms(rng, problem, terms)
+        now = changing_period(rng, problem)
+        peer = ocp_peer.optimum(problem, now)
+        solver = changing(problem, steps)
+        solution = solver.solve(now)
+        assert (solution.status == SOLVED) == (peer.solution.status == SOLVED)
+        if peer.solution.status != SOLVED:
+            continue
+        solved += 1
+        np.testing.assert_allclose(solver.plan(solution), peer.plan, atol=2e-4)
+        np.testing.assert_allclose(solver.slacks(solution), peer.slacks, atol=2e-4)
+        states = ocp_peer.trajectory(now, solver.plan(solution))[1:]
+        np.testing.assert_allclose(solver.states(now, solution), states, atol=1e-6)
+        assert kkt_residuals(solver.qp(now), solution).worst < 1e-5 * max(1.0, float(np.abs(solution.z).max()))
+    assert solved >= 2
+
+
+@pytest.mark.parametrize("soft", [False, True])
+def test_bounds_at_infinity_are_none(soft: bool) -> None:
+    rng = np.random.default_rng(8)
+    problem = random_problem(rng, horizon=6, n=3, nu=2, n_c=2)
+    assert problem.bounds is not None
+    endless = np.array([-math.inf, -math.inf])
+    above = np.array([1.0, math.inf])
+    below = np.array([-0.1, -math.inf])
+    bounds = replace(problem.bounds, y_min=below, y_max=-endless, delta_min=endless, delta_max=above)
+    problem = replace(problem, bounds=bounds)
+    if soft:
+        problem = softened(problem, [30.0, 30.0], [0.0, 0.0])
+    now, solver = changing_period(rng, problem), changing(problem, 2)
+    peer, solution = ocp_peer.optimum(problem, now), solver.solve(now)
+    assert peer.solution.status == solution.status == SOLVED
+    np.testing.assert_allclose(solver.plan(solution), peer.plan, atol=2e-4)
+
+
+def lagging(problem: Problem, vehicle: Vehicle) -> Problem:
+    """The paper's weights and bounds, for states that end with the rotor speeds."""
+    assert problem.bounds is not None
+    C_r, C_c = (np.pad(C, ((0, 0), (0, 4))) for C in (problem.objective.C_r, problem.bounds.C_c))
+    hover = np.full((1, 4), vehicle.hover_speed)
+    model = nonlinear_model(vehicle, 0.05, rotor_lag=LAG)
+    A, B, _ = linearise(model, np.hstack([np.zeros((1, 12)), hover]), hover)
+    return replace(
+        problem,
+        model=replace(problem.model, A=A[0], B=B[0]),
+        objective=replace(problem.objective, C_r=C_r),
+        bounds=replace(problem.bounds, C_c=C_c),
+    )
+
+
+def along_flight(flight: Flight, vehicle: Vehicle, problem: Problem, stride: int) -> Iterator[Period]:
+    """Periods of the nonlinear model with lag, each linearised at the state where it begins."""
+    model = nonlinear_model(vehicle, 0.05, rotor_lag=LAG)
+    hover = np.full(4, vehicle.hover_speed)
+    for state, desired, before in flight_queries(flight, problem, stride):
+        x0 = np.concatenate([state, before])
+        A, B, c = linearise(model, np.tile(x0, (50, 1)), np.tile(hover, (50, 1)))
+        rest = Rest(np.zeros(16), hover)
+        yield Period(A=A, B=B, c=c, state=x0, desired=desired, u_before=before, rest=rest)
+
+
+@pytest.mark.parametrize("steps", [1, 2, 5])
+def test_updated_values_solve_as_a_fresh_setup(constrained_flight: Flight, vehicle: Vehicle, steps: int) -> None:
+    """Soft bounds and lag, matrices of a tilting vehicle; hover, whose matrices have zeros elsewhere, comes last."""
+    problem = softened(lagging(paper_problem(), vehicle), [1e4, 1e4], [1e4, 1e4])
+    solver = changing(problem, steps)
+    periods = [*along_flight(constrained_flight, vehicle, problem, stride=240)]
+    nnz = set()
+    for now in [*periods[1:], periods[0]]:
+        updated, qp = solver.solve(now), solver.qp(now)
+        nnz.add((qp.P.nnz, qp.A.nnz, qp.G.nnz))  # type: ignore[union-attr]
+        fresh = changing(problem, steps).solve(now)
+        assert updated.status == SOLVED
+        np.testing.assert_allclose(solver.plan(updated), solver.plan(fresh), atol=1e-3)
+        residuals = kkt_residuals(qp, updated)
+        assert residuals.worst < 1e-4  # gradients and multipliers are of order 1e4
+        assert residuals.primal < 1e-6
+    assert len(nnz) == 1
+
+
+def test_matrices_made_once_serve_many_periods(constrained_flight: Flight, vehicle: Vehicle) -> None:
+    """Used again, and in turn with others, they make the same QP as matrices made anew."""
+    problem = softened(lagging(paper_problem(), vehicle), [2e5, 2e5], [1e4, 1e4])
+    problem = replace(problem, objective=replace(problem.objective, Q_d=5.0 * np.eye(4)))
+    form = Staged(problem, steps_per_stage=4, changing=True)
+    periods = [*along_flight(constrained_flight, vehicle, problem, stride=240)]
+    made = [form.prepare(now.A, now.B) for now in periods[:2]]
+    for which, now in [(0, periods[0]), (0, periods[1]), (1, periods[2]), (1, periods[3]), (0, periods[4])]:
+        given = now.c, now.state, now.desired, now.u_before, now.rest
+        again = form.prepare(periods[which].A, periods[which].B)
+        kept, fresh = (
+            form.changed(matrices, form.changed_vectors(matrices, *given)) for matrices in (made[which], again)
+        )
+        for name in ("P", "A", "G"):
+            assert (getattr(kept, name) != getattr(fresh, name)).nnz == 0
+        for name in ("c", "b", "h_l", "h_u"):
+            np.testing.assert_array_equal(getattr(kept, name), getattr(fresh, name))
+
+
+# Soft bounds
+
+
+def test_slack_is_zero_where_hard_bounds_cost_less_than_its_price(constrained_flight: Flight, vehicle: Vehicle) -> None:
+    problem = lagging(paper_problem(), vehicle)
+    price = 3e3
+    hard, soft = changing(problem, 4), changing(softened(problem, [price, price], [1e4, 1e4]), 4)
+    pressing = dear = 0
+    for now in along_flight(constrained_flight, vehicle, problem, stride=40):
+        strict, lenient = hard.solve(now), soft.solve(now)
+        assert lenient.status == SOLVED
+        multiplier = np.abs(hard.form.multipliers(strict)[:, :2]).max()  # of the output bounds
+        if strict.status == SOLVED and multiplier < price:
+            pressing += int(multiplier > 1.0)
+            assert soft.slacks(lenient).max() < 1e-7
+            np.testing.assert_allclose(soft.plan(lenient)[:10], hard.plan(strict)[:10], atol=1e-3)
+        else:
+            dear += int(soft.slacks(lenient).max() > 1e-4)
+    assert pressing > 2
+    assert dear > 0
+
+
+def test_slack_is_the_smallest_where_hard_bounds_are_infeasible() -> None:
+    """A price far above all else comes within a thousandth of the least total violation, a linear program's."""
+    problem = paper_problem()
+    bounds = problem.bounds
+    assert bounds is not None
+    tilted = np.zeros(12)
+    tilted[[6, 7, 9]] = np.radians([12.0, 20.0, 15.0])
+    desired, u_bar = problem.objective.desired(np.zeros((50, 4))), problem.model.u_bar
+    now = ocp_peer.period(problem, tilted, desired, u_bar)
+    assert changing(problem, 4).solve(now).status != SOLVED
+    lenient = softened(problem, [1e6, 1e6], [0.0, 0.0])
+    solver = changing(lenient, 4)
+    solution = solver.solve(now)
+    assert solution.status == SOLVED
+    plan, slacks = solver.plan(solution), solver.slacks(solution)
+    np.testing.assert_allclose(slacks, ocp_peer.violation(bounds.constraints[0], now, plan), atol=1e-7)
+    # The same rows, probed, with slacks to be minimised alone.
+    qp = ocp_peer.dense_qp(lenient, now)
+    above, below = np.isfinite(qp.h_u), np.isfinite(qp.h_l)
+    least = scipy.optimize.linprog(
+        np.concatenate([np.zeros(200), np.ones(100)]),
+        A_ub=np.vstack([qp.G[above], -qp.G[below]]),
+        b_ub=np.concatenate([qp.h_u[above], -qp.h_l[below]]),
+        bounds=[*[(None, None)] * 200, *[(0.0, None)] * 100],
+    )
+    assert least.status == 0
+    assert slacks.sum() == pytest.approx(least.fun, rel=1e-3)
+    assert least.fun > 0.01

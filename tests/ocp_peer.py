@@ -1,0 +1,210 @@
+"""The optimum of an optimal control problem from its definition alone: rolled out, probed, and solved as a dense QP.
+
+Nothing of `mpc.qp`, `mpc.staged` or `mpc.paper` that builds matrices is used: states by recursion, and every matrix by
+what unit inputs do.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.linalg
+
+from mpc.constraints import Constraint
+from mpc.exact.polish import polish
+from mpc.ocp import Problem, Rest
+from mpc.qp import QP, Solution, kkt_residuals
+from mpc.solvers._common import start
+from mpc.solvers.daqp_dense import DaqpDense
+from quadsim.state import Array
+
+
+@dataclass(frozen=True, kw_only=True)
+class Period:
+    """One period's data: x(k+i+1) = A_i x(k+i) + B_i u(k+i) + c_i from a state, after an input, towards outputs.
+
+    Attributes:
+        A: (N, n, n).
+        B: (N, n, nu).
+        c: (N, n).
+        state: (n,) x(k).
+        desired: (N, n_r) y_d.
+        u_before: (nu,) u(k-1).
+        rest: what the cost is about.
+    """
+
+    A: Array
+    B: Array
+    c: Array
+    state: Array
+    desired: Array
+    u_before: Array
+    rest: Rest
+
+
+def period(problem: Problem, state: Array, desired: Array, u_before: Array, rest: Rest | None = None) -> Period:
+    """Of the problem's own model, anchored at its rest state or another."""
+    model, N, (x_s, u_s) = problem.model, problem.horizon, problem.rest if rest is None else rest
+    c = x_s - model.A @ x_s - model.B @ u_s
+    return Period(
+        A=np.tile(model.A, (N, 1, 1)),
+        B=np.tile(model.B, (N, 1, 1)),
+        c=np.tile(c, (N, 1)),
+        state=state,
+        desired=desired,
+        u_before=u_before,
+        rest=Rest(x_s, u_s),
+    )
+
+
+def trajectory(given: Period, plan: Array) -> Array:
+    """(N + 1, n) x(k) .. x(k+N) under a plan (N, nu)."""
+    states = [given.state]
+    for A, B, c, u in zip(given.A, given.B, given.c, plan, strict=True):
+        states.append(A @ states[-1] + B @ u + c)
+    return np.array(states)
+
+
+def constraints(problem: Problem) -> tuple[Constraint, ...]:
+    """All of them, the paper's among them."""
+    return (*(problem.bounds.constraints if problem.bounds else ()), *problem.constraints)
+
+
+def values(constraint: Constraint, given: Period, plan: Array) -> Array:
+    """(N, m) the values of a constraint's rows along the rolled out plan."""
+    states, steps = trajectory(given, plan), np.diff(plan, axis=0, prepend=given.u_before[None])
+    found = np.zeros((len(plan), constraint.lower.shape[-1]))
+    for row in range(found.shape[1]):
+        of_inputs = [
+            matrix[row] @ part.T
+            for matrix, part in ((constraint.D, plan), (constraint.E, steps))
+            if matrix is not None and matrix[row].any()
+        ]
+        found[:, row] = sum(of_inputs, np.zeros(len(plan)))
+        if constraint.C is not None:
+            found[:, row] += (states[:-1] if of_inputs else states[1:]) @ constraint.C[row]
+    return found
+
+
+def violation(constraint: Constraint, given: Period, plan: Array) -> Array:
+    """(N, m) by how much a rolled out plan violates a constraint; 0 where it does not."""
+    found = values(constraint, given, plan)
+    return np.maximum(np.maximum(constraint.lower - found, found - constraint.upper), 0.0)
+
+
+def residuals(problem: Problem, given: Period, plan: Array) -> Array:
+    """What the cost is the sum of the squares of, but for slacks."""
+    objective, states = problem.objective, trajectory(given, plan)
+    errors = states[1:] @ objective.C_r.T - given.desired
+    parts = [(errors[: len(plan) - (objective.P is not None)], objective.Q_y), (plan - given.rest.u, objective.Q_u)]
+    if objective.Q_d is not None:
+        parts.append((np.diff(plan, axis=0, prepend=given.u_before[None]), objective.Q_d))
+    if objective.P is not None:
+        x_s, inverse = given.rest.x, np.linalg.pinv(objective.C_r)
+        wanted = x_s + inverse @ (given.desired[-1] - objective.C_r @ x_s)
+        parts.append((states[-1:] - wanted, objective.P))
+    return np.concatenate([(part @ _root(weight)).ravel() for part, weight in parts])
+
+
+def cost(problem: Problem, given: Period, plan: Array) -> float:
+    """What a plan costs, its violations of soft constraints included."""
+    total = float(np.square(residuals(problem, given, plan)).sum())
+    for constraint in constraints(problem):
+        if constraint.penalty is not None:
+            e = violation(constraint, given, plan)
+            total += float((e @ constraint.penalty.l1 + np.square(e) @ constraint.penalty.l2).sum())
+    return total
+
+
+def dense_qp(problem: Problem, given: Period) -> QP:
+    """In [u(k); ..; u(k+N-1); e], the slacks e of soft rows time by time."""
+    N, nu = given.B.shape[0], given.B.shape[2]
+    M, r0 = _probed(lambda plan: residuals(problem, given, plan), N, nu)
+    hard: list[tuple[Array, Array, Array]] = []
+    soft: list[tuple[Array, Array, Array]] = []
+    l1, l2 = np.zeros((N, 0)), np.zeros((N, 0))
+    for part in constraints(problem):
+        slopes, known = _probed(lambda plan, part=part: values(part, given, plan).ravel(), N, nu)  # type: ignore[misc]
+        m = part.lower.shape[-1]
+        lower, upper = (np.broadcast_to(side, (N, m)) for side in (part.lower, part.upper))
+        bounded = (np.isfinite(lower) | np.isfinite(upper)).any(axis=0)
+        lower, upper = lower[:, bounded], upper[:, bounded]
+        known = known.reshape(N, m)[:, bounded]
+        rows = slopes.reshape(N, m, N * nu)[:, bounded], lower - known, upper - known
+        (hard if part.penalty is None else soft).append(rows)
+        if part.penalty is not None:
+            l1 = np.hstack([l1, np.tile(part.penalty.l1[bounded], (N, 1))])
+            l2 = np.hstack([l2, np.tile(part.penalty.l2[bounded], (N, 1))])
+    n_s = l1.size
+    G, low, high = _stacked(hard, N * nu)
+    S, soft_low, soft_high = _stacked(soft, N * nu)
+    none = np.zeros((len(G), n_s))
+    return QP(
+        P=scipy.linalg.block_diag(2.0 * M.T @ M, np.diag(2.0 * l2.ravel())),
+        c=np.concatenate([2.0 * M.T @ r0, l1.ravel()]),
+        A=np.zeros((0, N * nu + n_s)),
+        b=np.zeros(0),
+        G=np.vstack([np.hstack([G, none]), np.hstack([S, np.eye(n_s)]), np.hstack([S, -np.eye(n_s)])]),
+        h_l=np.concatenate([low, soft_low, np.full(n_s, -math.inf)]),
+        h_u=np.concatenate([high, np.full(n_s, math.inf), soft_high]),
+        x_l=np.concatenate([np.full(N * nu, -math.inf), np.zeros(n_s)]),
+        x_u=np.full(N * nu + n_s, math.inf),
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Optimum:
+    """What the peer finds.
+
+    Attributes:
+        plan: (N, nu).
+        slacks: (N, m_s).
+        solution: of `dense_qp`.
+        residual: its largest KKT residual.
+    """
+
+    plan: Array
+    slacks: Array
+    solution: Solution
+    residual: float
+
+
+def optimum(problem: Problem, given: Period) -> Optimum:
+    """The exact optimum, by an active-set solver and dense matrices, or how they failed: see its solution's status."""
+    qp = dense_qp(problem, given)
+    backend = DaqpDense()
+    backend.setup(qp)
+    solution = backend.solve(start(qp))
+    exact = polish(qp, solution) if np.isfinite(solution.x).all() else solution
+    if kkt_residuals(qp, exact).worst < kkt_residuals(qp, solution).worst:
+        solution = exact
+    N, nu = given.B.shape[0], given.B.shape[2]
+    return Optimum(
+        plan=solution.x[: N * nu].reshape(N, nu),
+        slacks=solution.x[N * nu :].reshape(N, -1),
+        solution=solution,
+        residual=kkt_residuals(qp, solution).worst,
+    )
+
+
+def _probed(function: Callable[[Array], Array], N: int, nu: int) -> tuple[Array, Array]:
+    """Slopes and offset of a function that is affine in the plan."""
+    offset = function(np.zeros((N, nu)))
+    return np.array([function(unit.reshape(N, nu)) - offset for unit in np.eye(N * nu)]).T, offset
+
+
+def _stacked(parts: list[tuple[Array, Array, Array]], inputs: int) -> tuple[Array, Array, Array]:
+    """Rows and bounds of some constraints, time by time."""
+    if not parts:
+        return np.zeros((0, inputs)), np.zeros(0), np.zeros(0)
+    slopes, lower, upper = (np.concatenate(part, axis=1) for part in zip(*parts, strict=True))
+    return slopes.reshape(-1, inputs), lower.ravel(), upper.ravel()
+
+
+def _root(weight: Array) -> Array:
+    """R with R R' = weight."""
+    sizes, directions = np.linalg.eigh(weight)
+    return np.asarray(directions * np.sqrt(np.maximum(sizes, 0.0)))
