@@ -1,4 +1,4 @@
-"""docs/constraints-cost.md, its figures, and the answer in README.md; `docs/make_performance.py` times and calls it."""
+"""docs/constraints-cost.md and its figures; `docs/make_performance.py` times and calls it."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
-from make_numbers import ROOT, Table, markdown, replace_in_readme
+from make_numbers import ROOT, Table, markdown
 
 from quadsim.flight.metrics import percentiles
 from scenarios.bench.bench_results import SolverBench
@@ -65,7 +65,7 @@ def answer(study: CostStudy) -> Table:
 
 
 def write_cost(study: CostStudy) -> None:
-    """docs/constraints-cost.md with its figures, and the answer in README.md."""
+    """docs/constraints-cost.md with its figures."""
     docs, sentences = ROOT / "docs", cost_sentences(study)
     with tempfile.TemporaryDirectory() as scratch:
         drawn = [path for path in write_cost_figures(study, Path(scratch)) if path.suffix == ".svg"]
@@ -78,8 +78,9 @@ def write_cost(study: CostStudy) -> None:
         "--out DIR`.\n",
         "The paper leaves the question open. It compares two controllers that differ in weights and horizon as well "
         "as in\nconstraints; here the constrained one is held against itself without them.\n",
+        markdown(answer(study)),
+        "Where the unconstrained optimum satisfies every constraint it is the answer, without a QP.\n",
         cost_markdown(study, sentences),
         *(f"![{path.stem}]({path.name})\n" for path in drawn),
     ]
     (docs / "constraints-cost.md").write_text("\n".join(page), encoding="utf-8")
-    replace_in_readme("cost", markdown(answer(study)))

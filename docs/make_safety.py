@@ -39,15 +39,15 @@ def counts(scale: float) -> str:
         started = clock.perf_counter()
         attack, count = ATTACKS[what]
         found = attack(max(1, round(scale * count)))
-        found_text = "; ".join(f"{name.replace('_', ' ')} {number}" for name, number in found.items())
-        print(f"{what}: {found_text} ({clock.perf_counter() - started:.0f} s)", flush=True)
-        return found_text
+        outcomes = "; ".join(f"{name.replace('_', ' ')} {number}" for name, number in found.items())
+        print(f"{what}: {outcomes} ({clock.perf_counter() - started:.0f} s)", flush=True)
+        return outcomes
 
     names = list(ATTACKS)
     with ThreadPoolExecutor() as beside:
-        found_text = list(beside.map(go, names[:ASIDE]))
-    found_text += [go(name) for name in names[ASIDE:]]
-    lines = tuple((Cell(text=name), Cell(text=text)) for name, text in zip(names, found_text, strict=True))
+        outcomes = list(beside.map(go, names[:ASIDE]))
+    outcomes += [go(name) for name in names[ASIDE:]]
+    lines = tuple((Cell(text=name), Cell(text=text)) for name, text in zip(names, outcomes, strict=True))
     return grid_to_markdown(Grid(key="counts", title="What was tried", head=("what", "what came of it"), lines=lines))
 
 

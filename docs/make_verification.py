@@ -1,4 +1,4 @@
-"""Remake docs/verification.md and its table in README.md: `make verification`.
+"""Remake docs/verification.md: `make verification`.
 
 Measures what tests/peers holds, with the same functions, and writes the figures with the peers' versions.  tests/peers
 compares the page with today's figures.
@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from make_numbers import markdown, replace_in_readme
+from make_numbers import markdown
 from peers import agreement, closed_loop, constrained_qp, gain, open_loop, recorded
 from peers.agreement import Verdict
 from peers.checks import HEAD, Check
@@ -173,7 +173,6 @@ def main() -> None:
         agreement_section(verdicts),
     ]
     (ROOT / "docs" / "verification.md").write_text("\n".join(page), encoding="utf-8")
-    replace_in_readme("verification", table, command="make verification")
 
 
 if __name__ == "__main__":
