@@ -68,7 +68,7 @@ class RobustMPC:
         trim: what holds the vehicle at rest against the disturbance that is estimated.
 
     Args:
-        vehicle: what is believed to fly.
+        vehicle: the modelled vehicle.
         period: control period tau_s [s].
         horizon: N.
         objective: for the paper's 12 states.

@@ -92,7 +92,7 @@ def margins(
     """By how much the bounds of each output are tightened at each predicted state, (N, n_c) in its unit.
 
     Args:
-        vehicle: what is believed to fly.
+        vehicle: the modelled vehicle.
         period: control period tau [s].
         horizon: N.
         bounds: of outputs of the 12 states.

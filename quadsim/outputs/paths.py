@@ -44,7 +44,7 @@ def parents_of(target: Path) -> Iterator[None]:
 
 
 def problem_with_directory(path: Path, kind: str) -> str | None:
-    """Why a directory must not be replaced; None if it is empty, or of that kind with nothing but ours in it."""
+    """Why a directory must not be replaced; None if it is empty, or of that kind and all quadsim's."""
     if not is_folder(path):
         return occupied(())
     if path.resolve().is_mount():

@@ -11,7 +11,7 @@ from quadsim.report.table import ABSENT, Cell, Mark, Row, format_number
 Summary = Mapping[str, Any]
 
 _COURSE: Final = {
-    "tilt": ("largest tilt asked for", "deg"),
+    "tilt": ("largest tilt required", "deg"),
     "velocity": ("highest speed asked for", "m/s"),
     "rotor_min": ("lowest rotor speed asked for", "rad/s"),
     "rotor_max": ("highest rotor speed asked for", "rad/s"),

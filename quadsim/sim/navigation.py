@@ -54,7 +54,7 @@ class Navigation:
         """Set up, to be reset before use.
 
         Args:
-            vehicle: what is believed to fly.
+            vehicle: the modelled vehicle.
             timestep: physics step [s].
             sensors: at most one of each name; absent ones are perfect, or not there where there is an estimator.
             rng: where all randomness comes from.

@@ -18,11 +18,11 @@ FITTED_FROM: Final = 20
 
 @dataclass(frozen=True, kw_only=True)
 class Target:
-    """Something asked for, beside what was measured.
+    """A target, beside what was measured.
 
     Attributes:
         what: the quantity.
-        asked: the limit, in words.
+        asked: the target, in words.
         measured: the value, in words.
         met: whether it is within the limit.
     """
@@ -35,7 +35,7 @@ class Target:
 
 @dataclass(frozen=True, kw_only=True)
 class CandidateResult:
-    """A controller that was asked what the flight's controller was asked.
+    """A controller timed on the queries of the flight's controller.
 
     Attributes:
         name: what it is called.

@@ -134,7 +134,7 @@ def require_same(plan: Plan, directory: Path) -> None:
 def other_than_flew(manifest: Mapping[str, Any], plan: Plan) -> list[str]:
     """Of `code`, `controller`, `versions` and `machine`, those that are not as when a campaign was begun.
 
-    Imports a controller that is not ours; what is to run, and what ran then, is logged to
+    Imports a plug-in controller; what is to run, and what ran then, is logged to
     `scenarios.parts.foreign_code.LOGGER` before.
     """
     if isinstance(plan.scenario.controller, PluginSpec):

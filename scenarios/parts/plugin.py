@@ -1,4 +1,4 @@
-"""Controllers that are not ours: found by the place of their code, called, and fitted to the protocol."""
+"""Plug-in controllers: found by the location of their code, called, and fitted to the protocol."""
 
 from __future__ import annotations
 
@@ -154,7 +154,7 @@ def build_plugin(spec: PluginSpec, vehicle: Vehicle, period: float) -> Controlle
 
     Args:
         spec: names it.
-        vehicle: what is believed to fly.
+        vehicle: the modelled vehicle.
         period: tau_s [s].
 
     Raises:

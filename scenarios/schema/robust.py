@@ -43,9 +43,9 @@ class OffsetFreeSpec(Spec):
     torque_walk: Positive = Field(
         default=_OBSERVER.torque_walk, description="[rad/s^2] change of the torque's angular acceleration in a period"
     )
-    largest_force: Positive = Field(default=_OBSERVER.largest_force, description="[m/s^2] no larger one is believed")
+    largest_force: Positive = Field(default=_OBSERVER.largest_force, description="[m/s^2] larger estimates are clipped")
     largest_torque: Positive = Field(
-        default=_OBSERVER.largest_torque, description="[rad/s^2] no larger one is believed"
+        default=_OBSERVER.largest_torque, description="[rad/s^2] larger estimates are clipped"
     )
 
 

@@ -82,7 +82,7 @@ class ErrorStateFilter:
         """Set up, to be reset before use.
 
         Args:
-            vehicle: what is believed to fly.
+            vehicle: the modelled vehicle.
             sensors: what is believed of the sensors: their noise and the largest delay.
             settings: its tuning.
             timestep: physics step [s].

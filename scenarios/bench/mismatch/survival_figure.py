@@ -34,7 +34,7 @@ class _Panel:
 
 
 def write_mismatch_figure(measured: MismatchBench, directory: Path) -> list[Path]:
-    """Draw what became of every controller in every condition.
+    """Draw the outcome of every controller in every condition.
 
     Args:
         measured: what was flown.

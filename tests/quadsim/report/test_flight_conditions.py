@@ -55,7 +55,7 @@ def cells(rows: list[Row], group: str, label: str) -> list[str]:
 
 def test_rows_say_what_the_summary_says_and_a_dash_where_it_is_silent(bare_run: Run) -> None:
     rows = comparison_rows([having(bare_run, "full", **EVERYTHING), bare_run])
-    assert cells(rows, "Course", "largest tilt asked for") == ["5.61", "-"]
+    assert cells(rows, "Course", "largest tilt required") == ["5.61", "-"]
     assert cells(rows, "Course", "jumps") == ["at 1 s; at 7 s", "-"]
     assert cells(rows, "Course", "beyond the bounds") == ["pitch up to 5.61 deg (bound 5)", "-"]
     assert cells(rows, "Ground", "take-off at") == ["2.155", "-"]
