@@ -120,10 +120,8 @@ def _how(bench: SolverBench) -> str:
         "candidates take their turns in random order. Failures are periods without an optimum. Over the others, u0 "
         "error [rad/s] is the largest of the first input, from an optimum in closed form whose own KKT residual is at "
         f"most {bench.reference_kkt:.0e}, and KKT the worst residual of the candidate's answer to its own QP. "
-        f"{_shares(bench.default)}PIQP "
-        "multistage is first given the QP without slews late in the plan, which hardly ever bind; where one does it "
-        "solves twice, which no period here asks for."
-    )
+        f"{_shares(bench.default)}"
+    ).rstrip()
     return " ".join([said, *(f"Left out: {name}, {why}." for name, why in bench.left_out.items())])
 
 
