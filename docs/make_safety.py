@@ -48,7 +48,7 @@ def counts(scale: float) -> str:
         outcomes = list(beside.map(go, names[:ASIDE]))
     outcomes += [go(name) for name in names[ASIDE:]]
     lines = tuple((Cell(text=name), Cell(text=text)) for name, text in zip(names, outcomes, strict=True))
-    return grid_to_markdown(Grid(key="counts", title="What was tried", head=("what", "what came of it"), lines=lines))
+    return grid_to_markdown(Grid(key="counts", title="What was tried", head=("attack", "outcome"), lines=lines))
 
 
 def main() -> None:

@@ -143,7 +143,7 @@ class Guarded:
 
     @property
     def trim(self) -> Trim:
-        """What holds the vehicle at rest, as the inner controller believes; level hover where it does not say."""
+        """The equilibrium that the inner controller estimates; level hover where it has none."""
         try:
             trim = getattr(self.inner, "trim", None)
         except self._failures as error:

@@ -198,7 +198,7 @@ class RobustMPC:
         return np.concatenate([self._resting.acceleration, thrust * self.trim.twist])
 
     def _forget(self) -> None:
-        """Believe in no disturbance."""
+        """Assume no disturbance."""
         if self._observer is not None:
             self._observer.reset()
         self._believe()

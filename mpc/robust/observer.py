@@ -45,7 +45,7 @@ class ObserverSettings:
         rate_walk: the same of a body rate [rad/s].
         force_walk: change of the force's acceleration in a period [m/s^2].
         torque_walk: change of the torque's angular acceleration in a period [rad/s^2].
-        largest_force: no larger acceleration is ever believed [m/s^2].
+        largest_force: larger estimates are clipped [m/s^2].
         largest_torque: no larger angular acceleration [rad/s^2].
     """
 

@@ -83,7 +83,7 @@ class ErrorStateFilter:
 
         Args:
             vehicle: the modelled vehicle.
-            sensors: what is believed of the sensors: their noise and the largest delay.
+            sensors: the modelled sensors: their noise and the largest delay.
             settings: its tuning.
             timestep: physics step [s].
 
@@ -145,7 +145,7 @@ class ErrorStateFilter:
             samples: what has arrived meanwhile, in any order.
             first: number of the first of these physics steps.
             standing: whether a land detector has seen the vehicle on the ground when the segment began; it has left
-                the ground once the believed thrust exceeds its weight.
+                the ground once the modelled thrust exceeds its weight.
         """
         changed = np.any(commands != np.vstack([self._speeds, commands[:-1]]), axis=1)
         changed[:1] |= standing is not self._standing

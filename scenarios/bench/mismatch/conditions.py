@@ -55,8 +55,8 @@ CONDITIONS: Final = {
         )
         for lag in (0.01, 0.02, 0.05, 0.08)
     },
-    "mass +30 %": Condition(about="30 % heavier than believed", settings=("effects.load.mass_factor=1.3",)),
-    "mass -30 %": Condition(about="30 % lighter than believed", settings=("effects.load.mass_factor=0.7",)),
+    "mass +30 %": Condition(about="30 % heavier than modelled", settings=("effects.load.mass_factor=1.3",)),
+    "mass -30 %": Condition(about="30 % lighter than modelled", settings=("effects.load.mass_factor=0.7",)),
     "wind 3 m/s": Condition(
         about="3 m/s along x with Dryden turbulence, 7.7 m/s at 20 ft; rotor drag of 3e-4 kg/rad", settings=_wind(1.0)
     ),
