@@ -1,8 +1,11 @@
-"""Flights shared by the tests; each is flown once per session and worker."""
+"""Flights shared by the tests; each is flown once per session, whichever of its workers needs it first."""
 
 from __future__ import annotations
 
+import fcntl
 import os
+import pickle
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -13,6 +16,7 @@ from quadsim.rundir import Run
 from quadsim.vehicle import Vehicle
 from scenarios import runner
 from scenarios.build import build_vehicle
+from scenarios.cost.study import ARM_LENGTHS, DRAGS
 from scenarios.loading import load_scenario
 from scenarios.runner import Flight, Outputs
 
@@ -21,6 +25,34 @@ settings.register_profile("quadsim", deadline=None, derandomize="CI" in os.envir
 settings.load_profile("quadsim")
 
 NO_PRODUCTS = Outputs(video=False, recording=False, figures=False)
+
+Fly = Callable[..., Flight]
+
+
+@pytest.fixture(scope="session")
+def session_directory(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """One directory for all workers of this session."""
+    own = tmp_path_factory.getbasetemp()
+    return own.parent if "PYTEST_XDIST_WORKER" in os.environ else own
+
+
+@pytest.fixture(scope="session")
+def fly_once(session_directory: Path) -> Fly:
+    """Flies a scenario of the library with settings, in memory, plant at the physics rate; the same one only once."""
+    known: dict[str, Flight] = {}
+
+    def fly(name: str, *settings: str) -> Flight:
+        key = " ".join([name, *settings])
+        if key not in known:
+            path = session_directory / f"{key.replace('/', '_')}.flight"
+            with path.with_suffix(".lock").open("w") as lock:
+                fcntl.flock(lock, fcntl.LOCK_EX)
+                if not path.exists():
+                    path.write_bytes(pickle.dumps(runner.fly_scenario(load_scenario(name, settings)), protocol=-1))
+            known[key] = pickle.loads(path.read_bytes())
+        return known[key]
+
+    return fly
 
 
 @pytest.fixture(scope="session")
@@ -42,12 +74,22 @@ def short_run_directory(short_run: Run) -> Path:
 
 
 @pytest.fixture(scope="session")
-def constrained_flight() -> Flight:
-    """The paper's whole constrained flight, in memory, plant at the physics rate."""
-    return runner.fly_scenario(load_scenario("paper-constrained"))
+def constrained_flight(fly_once: Fly) -> Flight:
+    """The paper's whole constrained flight."""
+    return fly_once("paper-constrained")
 
 
 @pytest.fixture(scope="session")
-def unconstrained_flight() -> Flight:
-    """The paper's whole unconstrained flight, in memory."""
-    return runner.fly_scenario(load_scenario("paper-unconstrained"))
+def unconstrained_flight(fly_once: Fly) -> Flight:
+    """The paper's whole unconstrained flight."""
+    return fly_once("paper-unconstrained")
+
+
+@pytest.fixture(scope="session")
+def varied_flights(fly_once: Fly) -> dict[tuple[float, float], Flight]:
+    """The constrained flight over arm length [m] and drag to thrust [m], which the paper leaves out."""
+    return {
+        (arm, drag): fly_once("paper-constrained", f"vehicle.arm_length={arm}", f"vehicle.drag_to_thrust={drag}")
+        for arm in ARM_LENGTHS
+        for drag in DRAGS
+    }

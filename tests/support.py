@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future
 from dataclasses import replace
 from typing import Any
 
@@ -16,6 +17,21 @@ from quadsim.state import INDEX, N_STATES, Array
 from quadsim.vehicle import N_ROTORS
 from scenarios.build import build_problem, build_reference, build_vehicle
 from scenarios.loading import load_scenario
+
+
+class Here:
+    """Stands in for a pool of processes: does what it is given at once, in this one, which takes no time to start."""
+
+    def __init__(self, *_: object, **__: object) -> None:
+        pass
+
+    def submit(self, function: Callable[..., Any], *arguments: Any) -> Future[Any]:
+        future: Future[Any] = Future()
+        future.set_result(function(*arguments))
+        return future
+
+    def shutdown(self, **_: object) -> None:
+        pass
 
 
 def paper_problem(name: str = "paper-constrained", *settings: str) -> Problem:
