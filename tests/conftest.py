@@ -25,6 +25,35 @@ settings.register_profile("quadsim", deadline=None, derandomize="CI" in os.envir
 settings.load_profile("quadsim")
 
 NO_PRODUCTS = Outputs(video=False, recording=False, figures=False)
+LONG = (
+    *("scenarios/campaign/test_cluster.py", "scenarios/test_library.py", "scenarios/test_cli.py"),
+    *("scenarios/campaign/test_survival.py", "scenarios/test_faults.py", "scenarios/test_bench.py", "test_commands.py"),
+    *("test_safety.py", "scenarios/campaign/test_local.py", "scenarios/test_ladder.py", "test_documents.py"),
+    *("scenarios/test_soak.py", "quadsim/test_video.py", "scenarios/campaign/test_run.py", "scenarios/test_paper.py"),
+    *("scenarios/campaign/test_kills.py", "scenarios/test_mutations.py", "scenarios/test_any_scenario.py"),
+    *("quadsim/campaign/test_report.py", "quadsim/test_report.py", "scenarios/test_terminal.py"),
+    *("mpc/test_robust.py", "quadsim/test_figures.py", "scenarios/test_cost.py", "mpc/test_tightening.py"),
+)
+"""Modules that take longest; those not named take less than ten seconds each."""
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Give modules to the workers in the order of `pytest_collection_modifyitems`, not by their number of tests."""
+    if hasattr(config.option, "loadscopereorder"):
+        config.option.loadscopereorder = False
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Long modules first, so that no worker is left alone with one in the end."""
+    here = Path(__file__).parent
+    rank = {here / name: i for i, name in enumerate(LONG)}
+    items.sort(key=lambda item: rank.get(item.path, len(rank)))
+
+
+def pytest_sessionstart() -> None:
+    """Have no long module that is not there: a name that was changed is no longer first."""
+    assert all((Path(__file__).parent / name).is_file() for name in LONG)
+
 
 Fly = Callable[..., Flight]
 
