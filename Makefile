@@ -19,7 +19,7 @@ PYTHON ?= $(firstword $(foreach name,$(CANDIDATES),$(shell $(name) -c '$(SUPPORT
 
 PIP_INSTALL := $(PY) -m pip install --quiet --disable-pip-version-check
 NOT_INSTALLED := The packages could not be installed. With a network at hand: make setup
-RENDERS := $(PY) -c 'from quadsim.video import rendering_backend; rendering_backend()' 2>/dev/null
+RENDERS := $(PY) -c 'from quadsim.report.film.video import rendering_backend; rendering_backend()' 2>/dev/null
 HAS_BROWSER := { command -v chromium || command -v chromium-browser || command -v google-chrome; } >/dev/null
 
 # $(call quietly,COMMAND,ADVICE): runs a command silently; if it fails, shows its last errors, then the advice.

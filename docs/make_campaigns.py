@@ -14,20 +14,30 @@ from pathlib import Path
 from make_numbers import replace_in_readme
 from PIL import Image
 
-from quadsim.campaign.comparison import compare
-from quadsim.campaign.comparison_tables import comparison_tables, pairing
-from quadsim.campaign.curves import sure_splits
-from quadsim.campaign.driver_tables import driver_table, split_table
-from quadsim.campaign.sentences import campaign_sentences, driver_sentences, split_sentences, verdict_sentence
-from quadsim.campaign.tables import constraint_table, event_table, worst_table
-from quadsim.campaign.wording import interval, percent
-from quadsim.table import Cell, Grid, grid_to_markdown
+from quadsim.report.table import Cell, Grid, grid_to_markdown
 from scenarios.bench.solvers import section
-from scenarios.campaign.console import progress
-from scenarios.campaign.local import LocalEngine
+from scenarios.campaign.engine.local import LocalEngine
 from scenarios.campaign.manifest import stored_plan
 from scenarios.campaign.plan import load_plan
+from scenarios.campaign.report.campaign_curves import sure_splits
+from scenarios.campaign.report.campaign_tables import (
+    constraint_table,
+    driver_table,
+    event_table,
+    split_table,
+    worst_table,
+)
+from scenarios.campaign.report.campaign_text import (
+    campaign_sentences,
+    driver_sentences,
+    split_sentences,
+    verdict_sentence,
+)
+from scenarios.campaign.report.comparison_tables import comparison_tables, pairing
 from scenarios.campaign.run import Result, fly_campaign
+from scenarios.campaign.statistics.comparison import compare
+from scenarios.campaign.statistics.wording import interval, percent
+from scenarios.commands.campaign_console import progress
 
 ROOT = Path(__file__).resolve().parent.parent
 PAIR = ("paper-robustness", "paper-robustness-robust")

@@ -9,18 +9,20 @@ from pathlib import Path
 
 from make_numbers import ROOT, Table, markdown, replace_in_readme
 
-from quadsim.bench import SolverBench
-from quadsim.cost import Contender, CostStudy, cost_markdown, cost_sentences
-from quadsim.figures import write_cost_figures
-from quadsim.metrics import percentiles
-from scenarios.cost.study import SOLVERS_TIMED
+from quadsim.flight.metrics import percentiles
+from scenarios.bench.bench_results import SolverBench
+from scenarios.cost.cost_figures import write_cost_figures
+from scenarios.cost.cost_tables import cost_markdown
+from scenarios.cost.cost_text import cost_sentences
+from scenarios.cost.measure import SOLVERS_TIMED
+from scenarios.cost.study import CandidateTimes, CostStudy
 
 
-def timed(bench: SolverBench) -> list[Contender]:
+def timed(bench: SolverBench) -> list[CandidateTimes]:
     """The steps that the study tells of, as the bench has timed them: a time stands in all documents once."""
     assert bench.gain_ms is not None
     repeats = bench.default.repeats
-    gain = Contender(
+    gain = CandidateTimes(
         name="unconstrained gain", step_ms=bench.gain_ms, statuses=("solved",) * bench.gain_ms.size, repeats=repeats
     )
     alone = {each.solver: each for each in bench.contenders if not each.shortcut}
@@ -29,7 +31,7 @@ def timed(bench: SolverBench) -> list[Contender]:
     return [
         gain,
         *(
-            Contender(name=name, step_ms=each.step_ms, statuses=each.answered, repeats=each.repeats)
+            CandidateTimes(name=name, step_ms=each.step_ms, statuses=each.answered, repeats=each.repeats)
             for name, each in named.items()
         ),
     ]
@@ -43,7 +45,7 @@ def answer(study: CostStudy) -> Table:
         return (label, *(", ".join(format(flight.numbers[key], form) for key in keys) for flight in flights))
 
     gain, flown, *by_qp = study.contenders
-    times = {contender.name: percentiles(contender.step_ms) for contender in study.contenders}
+    times = {candidate.name: percentiles(candidate.step_ms) for candidate in study.contenders}
     told = {name: ", ".join(f"{found[key]:.3g}" for key in ("p50", "p99", "max")) for name, found in times.items()}
     lost = [f"{point.value:g}" for point in study.horizons.points if not point.unconstrained.completed]
     kept = [f"{point.value:g}" for point in study.horizons.points if not point.constrained.completed]

@@ -16,17 +16,17 @@ import scipy.linalg
 from mpc.model import hover_model
 from mpc.paper.prediction import rollout
 from mpc.unconstrained import sequence_gains
-from quadsim.airframe import compile_model, rotor_thrusts
 from quadsim.controller import ACCEPTED
-from quadsim.cost import Variation
-from quadsim.plant import Plant
+from quadsim.sim.airframe import compile_model, rotor_thrusts
+from quadsim.sim.plant import Plant
 from quadsim.state import REFERENCE_STATES, Array, make_state
 from quadsim.vehicle import Vehicle
-from scenarios import runner
-from scenarios.build import build_problem, build_vehicle
-from scenarios.cost import fly_variations
+from scenarios.build import build_problem
+from scenarios.cost.measure import fly_variations
+from scenarios.cost.study import Variation
 from scenarios.loading import load_scenario
-from scenarios.runner import Flight
+from scenarios.parts.vehicle import build_vehicle
+from scenarios.run import Flight, fly_scenario, summarise
 
 ROOT = Path(__file__).resolve().parent.parent
 PERIOD = 0.05
@@ -38,7 +38,7 @@ Table = list[tuple[str, ...]]
 
 def fly(name: str, *settings: str) -> Flight:
     """Fly a scenario of the library."""
-    return runner.fly_scenario(load_scenario(name, settings))
+    return fly_scenario(load_scenario(name, settings))
 
 
 def margin(flight: Flight, name: str) -> str:
@@ -56,7 +56,7 @@ def results(flights: dict[str, Flight]) -> Table:
     """The paper's flights side by side: tracking, bounds, extremes."""
     rows: Table = [("", *flights)]
     every = list(flights.values())
-    numbers = [runner.summarise(flight) for flight in every]
+    numbers = [summarise(flight) for flight in every]
     for channel, unit, scale in (("x", "m", 1.0), ("y", "m", 1.0), ("z", "m", 1.0), ("yaw", "deg", np.degrees(1.0))):
         values = (f"{scale * summary['tracking']['rmse'][channel]:.3f}" for summary in numbers)
         rows.append((f"RMS error {channel} [{unit}]", *values))

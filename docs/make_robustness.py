@@ -14,15 +14,14 @@ from fault_injection import CONTROLLERS, NEAR, SOON, Consequence, draw, inject_a
 from PIL import Image
 
 from mpc.robust.tightening import TighteningSettings
-from quadsim.bench import Ladder, LadderFlight, ladder_legend, ladder_tables
-from quadsim.bench.ladder_tables import ARRIVED
-from quadsim.table import Cell, Grid
-from scenarios.bench.climbers import FULL
-from scenarios.bench.ladder import climb, write_ladder
-from scenarios.bench.rungs import WORN
+from quadsim.report.table import Cell, Grid
+from scenarios.bench.mismatch.benchmark import run_mismatch, write_mismatch
+from scenarios.bench.mismatch.conditions import WORN
+from scenarios.bench.mismatch.controllers import FULL
+from scenarios.bench.mismatch.survival import ARRIVED, MismatchBench, MismatchFlight, mismatch_legend, mismatch_tables
 from scenarios.bench.solvers import section
-from scenarios.build import build_vehicle
 from scenarios.loading import load_scenario
+from scenarios.parts.vehicle import build_vehicle
 
 ROOT = Path(__file__).resolve().parent.parent
 FAULTS = 50
@@ -33,11 +32,11 @@ QUICK_ENOUGH = 6.0
 """What the step is to take at p99 [ms]."""
 
 
-def asked(ladder: Ladder) -> Grid:
+def asked(measured: MismatchBench) -> Grid:
     """What the full robust controller is to do, and does."""
-    flights = {condition: ladder.flights[FULL, condition] for condition in ladder.conditions}
+    flights = {condition: measured.flights[FULL, condition] for condition in measured.conditions}
     calm = {condition: flight for condition, flight in flights.items() if condition not in RESTLESS}
-    bound = ladder.tilt_bound
+    bound = measured.tilt_bound
     lines = (
         ("survives every condition", _failing(flights, lambda flight: flight.survived)),
         (
@@ -72,7 +71,7 @@ def worn_rotor() -> float:
     return float((torques / vehicle.inertia[:2]).max())
 
 
-def _failing(flights: dict[str, LadderFlight], holds: Callable[[LadderFlight], bool]) -> str:
+def _failing(flights: dict[str, MismatchFlight], holds: Callable[[MismatchFlight], bool]) -> str:
     failing = [condition for condition, flight in flights.items() if not holds(flight)]
     return f"not in: {', '.join(failing)}" if failing else f"in all {len(flights)}"
 
@@ -108,20 +107,20 @@ def fault_tables(found: Sequence[Consequence]) -> list[Grid]:
     return grids
 
 
-def page(ladder: Ladder, found: Sequence[Consequence]) -> str:
+def page(measured: MismatchBench, found: Sequence[Consequence]) -> str:
     """The whole page."""
     harmless = sum(each.harmless for each in found)
     return "\n".join(
         [
             "# Robustness\n\nMade by `make robustness`; the ladder alone is `quadsim bench ladder`, on "
-            f"{ladder.scenario}, {ladder.duration:g} s.\n\n{ladder_legend(ladder)}",
+            f"{measured.scenario}, {measured.duration:g} s.\n\n{mismatch_legend(measured)}",
             "![Each controller in each condition: distance at the end, and peak tilt](ladder.png)\n",
-            section(asked(ladder)),
+            section(asked(measured)),
             "LQR, PID and geometric control fly with up to 20 deg of tilt and no bound on steps of the rotor speeds, "
             "so their errors are not to be\ncompared with those at 5 deg. Their gains were tuned on the nominal course "
             "and a few rungs; the robust controller's input and move\nweight and its observer on the rungs of this "
             "ladder.\n",
-            *(section(grid) for grid in ladder_tables(ladder)),
+            *(section(grid) for grid in mismatch_tables(measured)),
             f"## Faults\n\n{harmless} of {len(found)} are harmless: no exception; every command finite and within its "
             f"bounds on speeds and steps; the vehicle back within {NEAR:g} m of the same flight without the fault "
             f"{SOON:g} s after its end. The reference is no measure: in the climb, at its bounds, the vehicle is "
@@ -137,13 +136,13 @@ def page(ladder: Ladder, found: Sequence[Consequence]) -> str:
 
 def main() -> None:
     """Fly everything and write it."""
-    ladder = climb()
+    measured = run_mismatch()
     found = inject_all(draw(FAULTS))
     with tempfile.TemporaryDirectory() as scratch:
-        write_ladder(ladder, Path(scratch))
+        write_mismatch(measured, Path(scratch))
         figure = Image.open(Path(scratch) / "ladder.png").convert("RGB")
         figure.quantize(32, dither=Image.Dither.NONE).save(ROOT / "docs" / "ladder.png", optimize=True)
-    (ROOT / "docs" / "robustness.md").write_text(page(ladder, found), encoding="utf-8")
+    (ROOT / "docs" / "robustness.md").write_text(page(measured, found), encoding="utf-8")
 
 
 if __name__ == "__main__":

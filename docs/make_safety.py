@@ -13,7 +13,7 @@ import safety_campaign
 import safety_mutations
 import safety_outputs
 
-from quadsim.table import Cell, Grid, grid_to_markdown
+from quadsim.report.table import Cell, Grid, grid_to_markdown
 
 PAGE = Path(__file__).resolve().parent / "safety.md"
 BEGIN, END = "<!-- counts: made by `make safety` -->", "<!-- counts end -->"

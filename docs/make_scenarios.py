@@ -12,13 +12,12 @@ from typing import get_args
 
 from make_numbers import fly, markdown
 
-from quadsim.audit import Finding
 from quadsim.controller import SOLVED
-from quadsim.metrics import peak_tilt, tracking
+from quadsim.flight.audit import Finding
+from quadsim.flight.metrics import peak_tilt, tracking
 from scenarios.loading import scenario_names
-from scenarios.runner import Flight
-from scenarios.spec import Group
-from scenarios.spec.lost import LostSpec
+from scenarios.run import Flight
+from scenarios.schema.scenario import Group, LostSpec
 
 PAGE = Path(__file__).resolve().parent / "scenarios.md"
 TITLES: dict[Group, str] = {

@@ -23,8 +23,8 @@ from support import paper_problem
 from threadpoolctl import threadpool_limits
 
 from mpc.solvers import SOLVERS
-from scenarios.build import build_vehicle
 from scenarios.loading import load_scenario
+from scenarios.parts.vehicle import build_vehicle
 
 ROOT = Path(__file__).resolve().parent.parent
 INTRODUCTION = """\
@@ -67,10 +67,10 @@ def closed_loop_section(measured: ClosedLoop) -> str:
     return f"""\
 ## The whole constrained flight on RotorPy's plant
 
-`{scenario.name}`, {scenario.periods} periods, flown by the same loop (`quadsim.loop.fly`), controller and reference,
-once on MuJoCo and once on RotorPy's plant. The conversion from position, quaternion and body rates to the paper's state
-is ours in both. Whatever differs between the plants, and any command that jumps at a tiny change of the state, would
-add up over {scenario.periods * scenario.control_period:g} s:
+`{scenario.name}`, {scenario.periods} periods, flown by the same loop (`quadsim.sim.loop.fly`), controller and
+reference, once on MuJoCo and once on RotorPy's plant. The conversion from position, quaternion and body rates to the
+paper's state is ours in both. Whatever differs between the plants, and any command that jumps at a tiny change of the
+state, would add up over {scenario.periods * scenario.control_period:g} s:
 
 {markdown([closed_loop.HEAD, *measured.rows])}"""
 

@@ -8,7 +8,8 @@ from typing import Final
 
 import numpy as np
 
-from mpc.ocp import Bounds, Problem
+from mpc.constraints import Bounds
+from mpc.ocp import Problem
 from quadsim.controller import ACCEPTED
 from quadsim.errors import ParameterError
 from quadsim.state import Array
@@ -109,21 +110,22 @@ class ActuatorBounds:
         return clipped
 
 
-def rejection(status: str, plan: Array, bounds: ActuatorBounds, before: Array) -> str | None:
+def rejection(status: str, speeds: Array, plan: Array, bounds: ActuatorBounds, before: Array) -> str | None:
     """Why an answer must not reach the plant, or None.
 
     Args:
-        status: what its solver says.
-        plan: (N, 4) [rad/s].
+        status: what is said of it.
+        speeds: (4,) the command [rad/s].
+        plan: (N, 4) the inputs planned [rad/s].
         bounds: hard bounds.
         before: (4,) the command in force [rad/s].
     """
     if status not in ACCEPTED:
         return status
-    if not np.isfinite(plan).all():
+    if not (np.isfinite(speeds).all() and np.isfinite(plan).all()):
         return "not_finite"
     lower, upper = bounds.reach(before)
-    return "out_of_bounds" if np.maximum(lower - plan[0], plan[0] - upper).max() > BOUND_TOLERANCE else None
+    return "out_of_bounds" if np.maximum(lower - speeds, speeds - upper).max() > BOUND_TOLERANCE else None
 
 
 def shifted(plan: Array, steps: int) -> Array:

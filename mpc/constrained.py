@@ -89,7 +89,7 @@ class ConstrainedMPC:
         return Command(speeds=answer.plan[0].copy(), plan=answer.plan, status=solution.status, solve_s=solution.solve_s)
 
     def _follow(self, time: float, answer: Answer) -> Command:
-        problem = rejection(answer.solution.status, answer.plan, self._bounds, self._before)
+        problem = rejection(answer.solution.status, answer.plan[0], answer.plan, self._bounds, self._before)
         if problem is None:
             self._plan, self._held = answer.plan, 0
         elif self._plan is None or self._held + 1 >= self.horizon:

@@ -8,7 +8,8 @@ from typing import Protocol, TypeAlias
 import numpy as np
 from scipy.sparse import csc_matrix
 
-from mpc.ocp import Problem, Rest, Rows
+from mpc.constraints import Rows
+from mpc.ocp import Problem, Rest
 from quadsim.state import Array, Indices
 
 Matrix: TypeAlias = Array | csc_matrix
@@ -56,7 +57,7 @@ class QPRows:
         E: (K, nu).
         slack: (K, m_s) how slacks enter.
         lower, upper: (N, K).
-        of_states: (K,) see `mpc.ocp.Rows`.
+        of_states: (K,) see `mpc.constraints.Rows`.
         u_min, u_max: (N, nu) the box.
         origin: (K,) which of the problem's rows each is.
         boxed: the problem's rows in the box.
@@ -193,7 +194,7 @@ class Formulation(Protocol):
         ...
 
     def multipliers(self, solution: Solution) -> Array:
-        """(N, m) the multipliers of the problem's rows (`mpc.ocp.Rows`), signed as in `Solution`."""
+        """(N, m) the multipliers of the problem's rows (`mpc.constraints.Rows`), signed as in `Solution`."""
         ...
 
 

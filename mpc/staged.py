@@ -18,46 +18,20 @@ The pattern of the matrices is fixed when a `Staged` is built; where they change
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Final
 
 import numpy as np
-from scipy.sparse import csc_matrix
 
 from mpc.ocp import Problem, Rest
 from mpc.qp import QP, Solution, Vectors, qp_rows
-from mpc.stages import Layout, Pattern, condense_stages, layout
+from mpc.stages import Matrices, MatrixBuilder, condense, layout
 from quadsim.errors import ParameterError
 from quadsim.state import Array
 
 STEPS_OF_ONE_INPUT: Final = 10
 """M for one input; for more it falls with the root of their number.  Of stages of 1 to 25 steps, the resulting five of
 four rotors are the fastest for the paper's case; see docs/performance.md."""
-ROUNDING: Final = 1e-14
-"""Entries below this fraction of the largest of their block are products of rounding: left out of fixed matrices."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Matrices:
-    """What the A_i and B_i of a horizon make of the QP; to be used for as many periods as these hold.
-
-    Attributes:
-        A: (N, n, n), A_i.
-        B: (N, n, nu), B_i.
-        head: (1, L + 1, n, L nu) slopes of the states of the first stage by v_0.
-        tail: (J - 1, M + 1, n, n + M nu) those of the others by [s_j, v_j].
-        P: cost.
-        dynamics: equality rows.
-        rows: inequality rows.
-    """
-
-    A: Array
-    B: Array
-    head: Array
-    tail: Array
-    P: csc_matrix
-    dynamics: csc_matrix
-    rows: csc_matrix
 
 
 def usual_steps(inputs: int) -> int:
@@ -91,7 +65,7 @@ class Staged:
             raise ParameterError("controller", "steps_per_stage", steps, "a whole number >= 1")
         self._problem, self._rows, soft = problem, qp_rows(problem), problem.rows.soft
         self._at = at = layout(N, model.n, model.nu, soft.size, steps)
-        self._builder = _MatrixBuilder(problem, at, changing=changing)
+        self._builder = MatrixBuilder(problem, at, changing=changing)
         self._linear = np.zeros(at.size)
         self._linear[at.slacks] = problem.rows.l1[soft]
         A, B = np.broadcast_to(model.A, (N, *model.A.shape)), np.broadcast_to(model.B, (N, *model.B.shape))
@@ -181,143 +155,4 @@ class Staged:
     def _offsets(self, matrices: Matrices, c: Array, state: Array) -> tuple[Array, Array]:
         """(1, L + 1, n, 1) and (J - 1, M + 1, n, 1): the states of all stages where v_j and s_1 .. s_J are zero."""
         zero = np.zeros((len(self._at.tail), self._at.n, 1))
-        return _condense(self._at, state[None, :, None], zero, matrices.A, matrices.B[:, :, :0], c)
-
-
-class _MatrixBuilder:
-    """Fixes the pattern of the matrices once, then fills in their values."""
-
-    def __init__(self, problem: Problem, at: Layout, *, changing: bool) -> None:
-        self._at, self._rows, objective = at, qp_rows(problem), problem.objective
-        self._Q, self._Q_end = objective.weights[0], objective.terminal_weights[0]
-        self._input_weight, self._move_weight = 2.0 * objective.Q_u, 2.0 * objective.move_weight
-        soft = problem.rows.soft
-        self._slack_weight = 2.0 * np.tile(problem.rows.l2[soft], at.N)[:, None, None]
-        self._input_costs = {steps: self._input_cost(steps) for steps in (at.L, at.M)}
-        if changing:  # of numbers in general position an entry is zero only where it always is
-            rng = np.random.default_rng(0)
-            A, B = (rng.normal(size=(at.N, at.n, width)) for width in (at.n, at.nu))
-        else:
-            A, B = (np.broadcast_to(part, (at.N, *part.shape)) for part in (problem.model.A, problem.model.B))
-        rounding = 0.0 if changing else ROUNDING
-        head, tail = self._slopes(A, B)
-        slack, ends, rows = at.slacks.reshape(-1, 1), at.ends, np.arange(self._rows.lower.size).reshape(at.N, -1)
-        self._P = Pattern(
-            (at.size, at.size),
-            [
-                (at.head, at.head),
-                (at.tail, at.tail),
-                (at.starts[-1], at.starts[-1]),
-                (slack, slack),
-                (at.lasts, at.firsts),
-                (at.firsts, at.lasts),
-            ],
-            self._costs(head, tail),
-            rounding=rounding,
-        )
-        self._A = Pattern(
-            (ends.size, at.size),
-            [(ends[:1], at.head), (ends[1:], at.tail), (ends, at.starts)],
-            self._dynamics(head, tail),
-            rounding=rounding,
-        )
-        later, now = np.flatnonzero(self._rows.of_states), np.flatnonzero(~self._rows.of_states)
-        self._later, self._now = later, now
-        stages, cuts = len(at.tail), at.L + at.M * np.arange(len(at.tail))
-        self._G = Pattern(
-            (rows.size, at.size),
-            [
-                (rows[: at.L - 1, later], at.head),
-                (rows[at.L - 1 : -1, later].reshape(stages, at.M, later.size), at.tail[:, None]),
-                (rows[-1, later], at.starts[-1]),
-                (rows, at.slacks),
-                (rows[: at.L, now], at.head),
-                (rows[at.L :, now].reshape(stages, at.M, now.size), at.tail[:, None]),
-                (rows[cuts][:, now], at.lasts),
-            ],
-            self._inequalities(head, tail),
-            rounding=rounding,
-        )
-
-    def build(self, A: Array, B: Array) -> Matrices:
-        """The matrices of A (N, n, n), B (N, n, nu)."""
-        head, tail = self._slopes(A, B)
-        return Matrices(
-            A=A,
-            B=B,
-            head=head,
-            tail=tail,
-            P=self._P.matrix(self._costs(head, tail)),
-            dynamics=self._A.matrix(self._dynamics(head, tail)),
-            rows=self._G.matrix(self._inequalities(head, tail)),
-        )
-
-    def _slopes(self, A: Array, B: Array) -> tuple[Array, Array]:
-        """`head` and `tail` of `Matrices`."""
-        at = self._at
-        start = np.zeros((1, at.n, at.head.size + 1))
-        free = np.zeros((len(at.tail), at.n, at.tail.shape[1] + 1))
-        free[:, :, : at.n] = np.eye(at.n)
-        head, tail = _condense(at, start, free, A, B, np.zeros((at.N, at.n)))
-        return head[..., :-1], tail[..., :-1]
-
-    def _costs(self, head: Array, tail: Array) -> list[Array]:
-        """P's blocks."""
-        at = self._at
-        blocks = [self._stage_cost(head, at.L), self._stage_cost(tail, at.M)]
-        (blocks[1] if len(tail) else blocks[0])[-1, -at.nu :, -at.nu :] -= self._move_weight  # none follows the last
-        across = np.broadcast_to(-self._move_weight, (len(at.lasts), at.nu, at.nu))
-        return [*blocks, 2.0 * self._Q_end, self._slack_weight, across, across.transpose(0, 2, 1)]
-
-    def _stage_cost(self, slopes: Array, steps: int) -> Array:
-        """Hessian (J, m, m) of stages' cost, the end state's left out."""
-        inner = slopes[:, :-1].reshape(len(slopes), steps * self._at.n, slopes.shape[3])
-        weighted = (2.0 * self._Q @ slopes[:, :-1]).reshape(inner.shape)
-        hessian = inner.transpose(0, 2, 1) @ weighted
-        hessian = 0.5 * (hessian + hessian.transpose(0, 2, 1))
-        weights = self._input_costs[steps]
-        hessian[:, -len(weights) :, -len(weights) :] += weights
-        return np.asarray(hessian)
-
-    def _input_cost(self, steps: int) -> Array:
-        """Hessian of the cost of a stage's inputs, of changes both from the stage before and to the one after."""
-        itself, beside = np.eye(steps), np.eye(steps, k=1) + np.eye(steps, k=-1)
-        cost: Array = np.kron(itself, self._input_weight + 2.0 * self._move_weight) - np.kron(beside, self._move_weight)
-        return cost
-
-    def _dynamics(self, head: Array, tail: Array) -> list[Array]:
-        """The equality rows' blocks: each stage's end is the next one's start."""
-        starts = np.broadcast_to(np.eye(self._at.n), (len(self._at.starts), self._at.n, self._at.n))
-        return [-head[:, -1], -tail[:, -1], starts]
-
-    def _inequalities(self, head: Array, tail: Array) -> list[Array]:
-        """G's blocks."""
-        at, rows, later, now = self._at, self._rows, self._later, self._now
-        slack = np.broadcast_to(rows.slack, (at.N, *rows.slack.shape))
-        before = np.broadcast_to(-rows.E[now], (len(at.lasts), now.size, at.nu))
-        return [
-            rows.C[later] @ head[0, 1:-1],
-            rows.C[later] @ tail[:, :-1],
-            rows.C[later],
-            slack,
-            self._inputs_too(rows.C[now] @ head[:, :-1], at.L)[0],
-            self._inputs_too(rows.C[now] @ tail[:, :-1], at.M),
-            before,
-        ]
-
-    def _inputs_too(self, of_states: Array, steps: int) -> Array:
-        """Rows (J, steps, k, m) of states with their own inputs and, but for the first, those before added."""
-        rows, now, nu = self._rows, self._now, self._at.nu
-        by_step = of_states[..., of_states.shape[-1] - steps * nu :].reshape(*of_states.shape[:3], steps, nu)
-        for t in range(steps):
-            by_step[:, t, :, t] += rows.D[now] + rows.E[now]
-            if t:
-                by_step[:, t, :, t - 1] -= rows.E[now]
-        of_states[..., of_states.shape[-1] - steps * nu :] = by_step.reshape(*of_states.shape[:3], steps * nu)
-        return of_states
-
-
-def _condense(at: Layout, start: Array, free: Array, *steps: Array) -> tuple[Array, Array]:
-    """The first stage from `start` and the others from `free` on; see `mpc.stages.condense_stages`."""
-    head = condense_stages(start, *(part[None, : at.L] for part in steps))
-    return head, condense_stages(free, *(part[at.L :].reshape(len(free), at.M, *part.shape[1:]) for part in steps))
+        return condense(self._at, state[None, :, None], zero, matrices.A, matrices.B[:, :, :0], c)

@@ -10,7 +10,7 @@ import numpy as np
 import scipy.linalg
 
 from mpc.ocp import Problem
-from mpc.paper.cost import cost
+from mpc.paper.condensed import condensed_cost
 from mpc.paper.prediction import prediction, rollout
 from quadsim.controller import GROUNDED, Command, Moment, stopped
 from quadsim.state import Array
@@ -53,12 +53,14 @@ class SequenceGains:
 
 def sequence_gains(problem: Problem) -> SequenceGains:
     """Solve Eq. (21) for the optimal sequence; bounds of the problem are left aside."""
-    terms = cost(prediction(problem.model, problem.horizon), problem.objective)
+    terms = condensed_cost(problem, prediction(problem.model, problem.horizon))
     factor = scipy.linalg.cho_factor(terms.H)
+    # Of the paper's problem -(F3 + F4): what an input held at u_bar throughout costs.
+    held = terms.H @ np.tile(np.eye(problem.model.nu), (problem.horizon, 1))
     return SequenceGains(
-        K=-scipy.linalg.cho_solve(factor, terms.F1),
-        G=-scipy.linalg.cho_solve(factor, terms.F2),
-        L=-scipy.linalg.cho_solve(factor, terms.F3 + terms.F4),
+        K=-scipy.linalg.cho_solve(factor, terms.F_x),
+        G=-scipy.linalg.cho_solve(factor, terms.F_y),
+        L=scipy.linalg.cho_solve(factor, held),
     )
 
 

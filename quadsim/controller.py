@@ -145,11 +145,11 @@ def check_command(speeds: Array) -> str | None:
     """What is wrong with rotor speeds that are about to reach the plant, or None."""
     if np.shape(speeds) != (4,):
         return f"the command has shape {np.shape(speeds)}, not (4,)"
+    if np.abs(speeds).max() <= LARGEST_SPEED:  # which no NaN is
+        return None
     if not np.all(np.isfinite(speeds)):
         return f"the command is not finite: {np.asarray(speeds).tolist()}"
-    if np.max(np.abs(speeds)) > LARGEST_SPEED:
-        return f"the command is beyond any rotor's speed: {np.asarray(speeds).tolist()}"
-    return None
+    return f"the command is beyond any rotor's speed: {np.asarray(speeds).tolist()}"
 
 
 def law_name(recorded: str) -> str:

@@ -7,10 +7,27 @@ that happened in flight: it ends the flight, is recorded with it as its reason, 
 from __future__ import annotations
 
 import difflib
+import unicodedata
 from collections.abc import Iterable, Sequence
 from pathlib import Path
+from typing import Final
 
-from quadsim.printable import printable
+_HIDDEN: Final = frozenset({"Cc", "Cf", "Cs", "Co", "Cn", "Zl", "Zp"})
+"""Unicode categories that steer what is shown, or show nothing: controls, formats such as direction, surrogates."""
+
+
+def printable(text: str, *, keep: str = "") -> str:
+    r"""A text with every character that steers a terminal written as an escape, e.g. `\x1b`.
+
+    Args:
+        text: any text, also one that no file can hold.
+        keep: such characters that stay.
+    """
+    if text.isprintable():
+        return text
+    return "".join(
+        each if each in keep or unicodedata.category(each) not in _HIDDEN else ascii(each)[1:-1] for each in text
+    )
 
 
 class QuadsimError(Exception):
@@ -126,7 +143,7 @@ class LostError(FlightError):
     """The vehicle is beyond one of the flight's loss criteria.
 
     Attributes:
-        criterion: which, e.g. `tilt`; see `quadsim.lost.LossCriteria`.
+        criterion: which, e.g. `tilt`; see `quadsim.flight.lost.LossCriteria`.
         value: what it was, in the criterion's unit.
         limit: what it may be.
     """

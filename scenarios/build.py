@@ -2,30 +2,21 @@
 
 from __future__ import annotations
 
-import math
-from pathlib import Path
-from typing import Any, Final
-
-import numpy as np
+from typing import Final
 
 from mpc.ocp import Problem
-from quadsim.airframe import outline
-from quadsim.assets import vehicle_path
-from quadsim.audit import Limit
 from quadsim.controller import Controller
-from quadsim.errors import InputError, ParameterError
-from quadsim.lost import LossCriteria
-from quadsim.phase import PhaseMonitor
-from quadsim.plant import Plant
-from quadsim.state import Array, make_state
-from quadsim.vehicle import N_ROTORS, OPTIONAL_PARAMETERS, VEHICLE_UNITS, Vehicle, load_vehicle
-from scenarios.controllers import make_controller, make_problem
-from scenarios.courses import build_course_steps as build_course_steps
-from scenarios.courses import build_reference as build_reference
-from scenarios.effects import build_effects, build_wind, resolve_effects
-from scenarios.randomness import generator
-from scenarios.spec import Scenario
-from scenarios.spec.optimisation import WeightedSpec
+from quadsim.errors import ParameterError
+from quadsim.sim.airframe import outline
+from quadsim.sim.phase import PhaseMonitor
+from quadsim.sim.plant import Plant
+from quadsim.vehicle import Vehicle
+from scenarios.parts.controllers import make_controller, make_problem
+from scenarios.parts.effects import build_effects, build_wind, resolve_effects
+from scenarios.parts.randomness import generator
+from scenarios.parts.vehicle import resolve_vehicle
+from scenarios.schema.optimisation import WeightedSpec
+from scenarios.schema.scenario import Scenario
 
 CONTROLLERS: Final = {
     "unconstrained": "the paper's Sec. 4: a constant gain from the unconstrained optimum",
@@ -37,31 +28,9 @@ CONTROLLERS: Final = {
 }
 
 
-def build_vehicle(scenario: Scenario) -> Vehicle:
-    """The vehicle file with the scenario's overrides; a resolved scenario has every number, and needs no file."""
-    file, overrides = scenario.vehicle.file, scenario.vehicle.overrides()
-    try:
-        path = vehicle_path(file)
-    except InputError:
-        if not overrides.keys() >= VEHICLE_UNITS.keys() - set(OPTIONAL_PARAMETERS):
-            raise
-        return Vehicle(name=Path(file).stem, **overrides)
-    return load_vehicle(path, overrides)
-
-
 def resolve(scenario: Scenario, vehicle: Vehicle) -> Scenario:
     """The scenario with every number that it leaves to its vehicle written out: its file alone defines the flight."""
     return resolve_vehicle(scenario, vehicle).model_copy(update={"effects": resolve_effects(scenario.effects, vehicle)})
-
-
-def resolve_vehicle(scenario: Scenario, vehicle: Vehicle) -> Scenario:
-    """The scenario with the numbers of its vehicle's file in it; effects go on taking theirs from the vehicle."""
-    numbers: dict[str, Any] = {
-        name: list(value) if isinstance(value, tuple) else value
-        for name in type(scenario.vehicle).model_fields
-        if name != "file" and (value := getattr(vehicle, name)) is not None
-    }
-    return scenario.model_copy(update={"vehicle": scenario.vehicle.model_copy(update=numbers)})
 
 
 def build_plant(scenario: Scenario, vehicle: Vehicle, kind: type[Plant] = Plant) -> Plant:
@@ -88,23 +57,6 @@ def build_ground(scenario: Scenario, vehicle: Vehicle) -> PhaseMonitor | None:
     return PhaseMonitor(outline(vehicle), period=scenario.control_period)
 
 
-def build_loss(scenario: Scenario) -> LossCriteria:
-    """When the flight is lost."""
-    return LossCriteria(**{name: limit for name, limit in scenario.lost if limit is not False})
-
-
-def build_initial_state(scenario: Scenario) -> Array:
-    """(12,) state at t = 0."""
-    x, y, z = scenario.initial.position
-    roll, pitch, yaw = np.radians(scenario.initial.euler)
-    return make_state(position=(x, y, z), euler=(roll, pitch, yaw))
-
-
-def build_initial_speeds(scenario: Scenario, vehicle: Vehicle) -> Array:
-    """(4,) u(-1), and the rotor speeds at t = 0 [rad/s]."""
-    return np.full(N_ROTORS, 0.0 if scenario.initial.cold else vehicle.hover_speed)
-
-
 def build_problem(scenario: Scenario, vehicle: Vehicle) -> Problem:
     """The controller's optimisation.
 
@@ -124,25 +76,3 @@ def build_controller(scenario: Scenario, vehicle: Vehicle) -> Controller:
         InputError: it cannot be made from these numbers, or its code cannot be found or called.
     """
     return make_controller(scenario.controller, vehicle, scenario.control_period)
-
-
-def build_limits(scenario: Scenario) -> tuple[Limit, ...]:
-    """What the flight is audited against."""
-
-    def or_infinite(value: float | None, sign: float) -> float:
-        return sign * math.inf if value is None else value
-
-    return tuple(
-        Limit(
-            name=spec.name,
-            signal=spec.signal,
-            lower=or_infinite(spec.lower, -1.0),
-            upper=or_infinite(spec.upper, 1.0),
-            tolerance=spec.tolerance,
-            tolerance_sampled=spec.tolerance_sampled,
-            required=spec.required,
-            start=spec.start,
-            stop=or_infinite(spec.stop, 1.0),
-        )
-        for spec in scenario.constraints
-    )

@@ -15,11 +15,10 @@ from collections.abc import Iterator, Sequence
 from typing import NoReturn
 
 from quadsim import __version__
-from quadsim.errors import QuadsimError
-from quadsim.printable import printable
-from scenarios.garbage import collect_rarely
+from quadsim.errors import QuadsimError, printable
+from scenarios.commands import EXIT_FAILED, EXIT_WRONG_INPUT, find_command
+from scenarios.gc_tuning import collect_rarely
 
-EXIT_DONE, EXIT_FAILED, EXIT_WRONG_INPUT = 0, 1, 2
 _LINES = "\n"
 """What a message of ours may be made of besides text: one with many problems has a line for each."""
 
@@ -240,9 +239,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         collect_rarely()  # saves 5 % of a run
     try:
         with _told():
-            from scenarios import commands
-
-            status = commands.COMMANDS[options.command](options)
+            status = find_command(options.command)(options)
         sys.stdout.flush()
         return status
     except QuadsimError as error:

@@ -9,15 +9,53 @@ from typing import Any, Final
 
 from pydantic import ValidationError
 
-from quadsim.errors import FileError, UnknownNameError
-from scenarios.bases import read_scenario, replaced_tables, retyped
-from scenarios.checking import check_parts
-from scenarios.courses.build import located
-from scenarios.problems import ScenarioError, describe
-from scenarios.settings import apply_setting
-from scenarios.spec import Scenario
-from scenarios.spec.course import CsvSpec
-from scenarios.spec.own import located as located_controller
+from quadsim.errors import FileError, ParameterError, UnknownNameError
+from quadsim.flight.ground import AIRBORNE, TOUCH, clearance
+from quadsim.sim.airframe import outline
+from quadsim.sim.effects.load import mass_properties
+from quadsim.vehicle import Vehicle
+from scenarios.courses.make import build_course, located
+from scenarios.parts.effects import build_effects, moving_air
+from scenarios.parts.vehicle import build_initial_state, build_vehicle
+from scenarios.schema.bases import read_scenario, replaced_tables, retyped
+from scenarios.schema.course import CsvSpec
+from scenarios.schema.plugin import located as located_controller
+from scenarios.schema.problems import ScenarioError, describe
+from scenarios.schema.scenario import Scenario
+from scenarios.schema.settings import apply_setting
+
+
+def check_parts(scenario: Scenario) -> None:
+    """Refuse, before anything is flown, parts that do not go together.
+
+    Raises:
+        InputError: there is no such vehicle, it cannot hover, an effect is not possible with it, the course cannot be
+            built, or the flight starts below the floor, or in the air with rotors at rest.
+    """
+    vehicle = build_vehicle(scenario)
+    load = build_effects(scenario, vehicle).load
+    mass_properties(vehicle, load, load.payloads)
+    moving_air(scenario, vehicle)
+    build_course(scenario)
+    ground = scenario.effects.ground
+    if ground is not None and (ground.contact or ground.effect):
+        _check_start(scenario, vehicle)
+
+
+def _check_start(scenario: Scenario, vehicle: Vehicle) -> None:
+    """Refuse a start below the floor, or one in the air with rotors at rest."""
+    shape, state, position = outline(vehicle), build_initial_state(scenario)[None, :], scenario.initial.position
+    feet = float(clearance(state, shape.feet, shape.foot_radius, shape.floor)[0])
+    hull = float(clearance(state, shape.hull, 0.0, shape.floor)[0])
+    lowest = min(feet, hull)
+    if lowest < -TOUCH:
+        roll, pitch, _ = scenario.initial.euler
+        rule = f"{-lowest:.3g} m higher, at roll {roll:g} and pitch {pitch:g} deg, for feet and hull to clear the floor"
+        raise ParameterError("initial", "position", position, rule)
+    if scenario.initial.cold and feet > AIRBORNE:
+        rule = f"on the floor where initial.cold is true, or it would fall: its feet are {feet:.3g} m above it"
+        raise ParameterError("initial", "position", position, rule)
+
 
 LIBRARY: Final = Path(__file__).resolve().parent / "library"
 
@@ -109,7 +147,7 @@ def parse_scenario(data: Mapping[str, Any], *, source: str = "scenario", directo
     try:
         scenario = Scenario.model_validate(dict(data))
     except ValidationError as error:
-        problems = [describe(details, data) for details in error.errors(include_url=False)]
+        problems = [describe(details, data, Scenario) for details in error.errors(include_url=False)]
         raise ScenarioError(source, problems) from error
     file = scenario.vehicle.file
     if directory is not None and file.endswith(".toml") and (directory / file).is_file():

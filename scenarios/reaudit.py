@@ -16,17 +16,17 @@ from typing import Any, Final
 
 import numpy as np
 
-from quadsim import rundir
-from quadsim.audit import SIGNALS, Finding, audit
 from quadsim.controller import Phase
-from quadsim.errors import FileError, InputError
-from quadsim.flightlog import FLIGHT_FILE, HORIZON_FILE, PLANT_FILE, TIMING_FILE, FlightLog
-from quadsim.printable import printable
-from scenarios.bases import read_whole
-from scenarios.build import build_limits
+from quadsim.errors import FileError, InputError, printable
+from quadsim.flight import rundir
+from quadsim.flight.audit import Finding, audit
+from quadsim.flight.log import FlightLog
+from quadsim.flight.parquet import FLIGHT_FILE, HORIZON_FILE, PLANT_FILE, TIMING_FILE
 from scenarios.loading import parse_scenario
-from scenarios.spec import Scenario
-from scenarios.spec.own import LAWS, is_own
+from scenarios.parts.limits import build_limits
+from scenarios.schema.bases import read_whole
+from scenarios.schema.plugin import LAWS, is_plugin
+from scenarios.schema.scenario import Scenario
 
 TABLES: Final = (FLIGHT_FILE, PLANT_FILE, TIMING_FILE)
 OURS: Final = {*TABLES, HORIZON_FILE, rundir.SCENARIO_FILE, rundir.RECORDING_FILE, rundir.VIDEO_FILE}
@@ -116,7 +116,7 @@ def stored_scenario(directory: Path) -> Scenario:
     controller = data.get("controller")
     controller = controller if isinstance(controller, dict) else {}
     name = controller.get("type")
-    if isinstance(name, str) and name not in LAWS and not is_own(name):
+    if isinstance(name, str) and name not in LAWS and not is_plugin(name):
         data["controller"] = {**controller, "type": "elsewhere:Controller"}
     return parse_scenario(data, source=str(path))
 
@@ -175,17 +175,33 @@ def _differences(
         yield f"as_expected is recorded as True, and the flight is {outcome} where {scenario.expect} is expected"
 
 
+_DEMANDS: Final = [
+    "signal",
+    "terms",
+    "unit",
+    "lower",
+    "upper",
+    "tolerance",
+    "tolerance_sampled",
+    "required",
+    "start",
+    "stop",
+]
+"""What the scenario says of a constraint."""
+
+
 def _constraint_differences(
     entry: Mapping[str, Any], finding: Finding, scenario: Scenario, log: FlightLog
 ) -> Iterator[str]:
     """What a summary says of one constraint otherwise than the tables do."""
     again = rundir.limit_to_json(finding)
-    for key in ("signal", "unit", "lower", "upper", "tolerance", "tolerance_sampled", "required", "start", "stop"):
-        if entry[key] != again[key]:
-            yield f"{key} is recorded as {entry[key]!r:.80}, and is {again[key]!r:.80} in the scenario"
+    recorded = {"terms": None, **entry}
+    for key in _DEMANDS:
+        if recorded[key] != again.get(key):
+            yield f"{key} is recorded as {recorded[key]!r:.80}, and is {again.get(key)!r:.80} in the scenario"
     rounding = ROUNDING_TILT if finding.limit.signal == "tilt" else ROUNDING
     alike = ["peak_sampled", "worst_margin_sampled"]
-    if SIGNALS[finding.limit.signal].plant is None or scenario.plant_stride == 1 or not log.control.t.size:
+    if finding.limit.source.plant is None or scenario.plant_stride == 1 or not log.control.t.size:
         alike += ["peak_plant", "worst_margin", "worst_time"]
     for key in alike:
         if not _is_close(entry[key], again[key], rounding):
@@ -207,7 +223,7 @@ def _time_beyond(finding: Finding, scenario: Scenario, log: FlightLog) -> tuple[
 
     Rows at the log rate stand for one physics step each at least, and the last of them may come before the end.
     """
-    signal, limit, seen = SIGNALS[finding.limit.signal], finding.limit, finding.time_violated
+    signal, limit, seen = finding.limit.source, finding.limit, finding.time_violated
     row = 1.0 / scenario.log_rate if scenario.plant_stride > 1 else 0.0
     if signal.plant is None or not log.control.t.size or scenario.plant_stride == 1:
         return seen - ROUNDING, seen + row + ROUNDING

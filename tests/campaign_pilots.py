@@ -11,9 +11,10 @@ from typing import Any
 
 import psutil
 
-from quadsim.campaign.table import ERROR, Row
+from scenarios.campaign.results.table import Row
+from scenarios.campaign.results.verdicts import ERROR
 from scenarios.campaign.spec import LimitsSpec
-from scenarios.runner import Progress, silent
+from scenarios.progress import Progress, silent
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -16,20 +16,22 @@ from threadpoolctl import threadpool_limits
 from mpc.fallback.contract import Guarded
 from mpc.solvers import _piqp
 from quadsim.controller import SOLVED, Command, Controller, Moment
-from quadsim.flightlog import FlightLog
-from quadsim.physics import Stretch
-from quadsim.plant import Plant
-from quadsim.sensing import SensorName
+from quadsim.flight.log import FlightLog
+from quadsim.sim.physics import Stretch
+from quadsim.sim.plant import Plant
+from quadsim.sim.sensing.sensor import SensorName
 from quadsim.state import POSITION, Array
 from quadsim.vehicle import N_ROTORS, Vehicle
-from scenarios.bench.climbers import FULL, equip
-from scenarios.bench.processes import answer_all
-from scenarios.bench.rungs import CONDITIONS
-from scenarios.build import build_controller, build_plant, build_problem, build_reference, build_vehicle
-from scenarios.flying import fly_once
+from scenarios.bench.mismatch.benchmark import answer_all
+from scenarios.bench.mismatch.conditions import CONDITIONS
+from scenarios.bench.mismatch.controllers import FULL, equip
+from scenarios.build import build_controller, build_plant, build_problem
+from scenarios.courses.make import build_reference
 from scenarios.loading import load_scenario
-from scenarios.navigation import build_navigation
-from scenarios.spec import Scenario
+from scenarios.parts.navigation import build_navigation
+from scenarios.parts.vehicle import build_vehicle
+from scenarios.run import fly_once
+from scenarios.schema.scenario import Scenario
 
 PERIOD: Final = 0.05
 """Of control [s]."""
@@ -94,7 +96,7 @@ def faults() -> tuple[Fault, ...]:
 
 @dataclass(frozen=True, kw_only=True)
 class Injection:
-    """A fault in a flight: of which controller, when [s], and under which of `scenarios.bench.rungs.CONDITIONS`."""
+    """A fault in a flight: of which controller, when [s], and under which of `mismatch.conditions.CONDITIONS`."""
 
     controller: str
     fault: Fault

@@ -329,7 +329,7 @@ def replaces_the_clock() -> None:
 
 @_kind()
 def replaces_methods_of_ours() -> None:
-    from quadsim.plant import Plant
+    from quadsim.sim.plant import Plant
 
     Plant.state = lambda self: np.full(12, 0.01)  # type: ignore[method-assign]
 

@@ -13,8 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.linalg
 
+from mpc.constraints import Constraint
 from mpc.exact.polish import polish
-from mpc.ocp import Constraint, Problem, Rest
+from mpc.ocp import Problem, Rest
 from mpc.qp import QP, Solution, kkt_residuals
 from mpc.solvers._common import start
 from mpc.solvers.daqp_dense import DaqpDense

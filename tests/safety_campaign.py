@@ -24,8 +24,8 @@ import pyarrow.parquet as pq
 import tomlkit
 from hostile_controller import ENDED, KINDS
 
-from quadsim.campaign.store import FLIGHTS_FILE
-from quadsim.campaign.table import Row
+from scenarios.campaign.results.store import FLIGHTS_FILE
+from scenarios.campaign.results.table import Row
 
 ROOT = Path(__file__).resolve().parents[1]
 LIMITS = {"flight": 20.0, "step": 1.0, "memory": 300.0}

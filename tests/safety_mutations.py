@@ -30,8 +30,8 @@ import pyarrow.parquet as pq
 import tomlkit
 from ordinary_user import counts_of
 
-from quadsim import rundir
-from quadsim.flightlog import FLIGHT_FILE, HORIZON_FILE, PLANT_FILE, TIMING_FILE
+from quadsim.flight import rundir
+from quadsim.flight.parquet import FLIGHT_FILE, HORIZON_FILE, PLANT_FILE, TIMING_FILE
 from scenarios.cli import main
 
 BARE: Final = ("--no-video", "--no-recording", "--no-figures")
@@ -542,7 +542,10 @@ def _no_films() -> Iterator[None]:
     def write(_: Path, path: Path, **__: object) -> None:
         put(path, b"film")
 
-    with mock.patch("quadsim.video.render_video", write), mock.patch("quadsim.recording.open_viewer"):
+    with (
+        mock.patch("quadsim.report.film.video.render_video", write),
+        mock.patch("quadsim.report.recording.open_viewer"),
+    ):
         yield
 
 

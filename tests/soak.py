@@ -21,19 +21,14 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from quadsim.controller import ACCEPTED, Controller, Moment
-from quadsim.plant import Plant
+from quadsim.sim.plant import Plant
 from quadsim.state import POSITION, Array
-from scenarios.bench.climbers import FULL, equip
-from scenarios.bench.rungs import CONDITIONS
-from scenarios.build import (
-    build_controller,
-    build_initial_speeds,
-    build_initial_state,
-    build_plant,
-    build_reference,
-    build_vehicle,
-)
+from scenarios.bench.mismatch.conditions import CONDITIONS
+from scenarios.bench.mismatch.controllers import FULL, equip
+from scenarios.build import build_controller, build_plant
+from scenarios.courses.make import build_reference
 from scenarios.loading import load_scenario
+from scenarios.parts.vehicle import build_initial_speeds, build_initial_state, build_vehicle
 
 CONDITION: Final = CONDITIONS["mass +30 %"]
 GROWTH: Final = 0.01

@@ -10,14 +10,17 @@ import numpy as np
 from ocp_peer import Period
 from scipy.linalg import block_diag
 
+from mpc.constraints import Bounds, Constraint, Penalty
 from mpc.model import LinearModel
-from mpc.ocp import Bounds, Constraint, Objective, Penalty, Problem, Rest
-from quadsim.flightlog import ControlLog, FlightLog, PlantLog, TimingLog
+from mpc.ocp import Objective, Problem, Rest
+from quadsim.flight.log import ControlLog, FlightLog, PlantLog, TimingLog
 from quadsim.state import INDEX, N_STATES, Array
 from quadsim.vehicle import N_ROTORS
-from scenarios.build import build_problem, build_reference, build_vehicle
+from scenarios.build import build_problem
+from scenarios.courses.make import build_reference
 from scenarios.loading import load_scenario
-from scenarios.runner import Flight
+from scenarios.parts.vehicle import build_vehicle
+from scenarios.run import Flight
 
 
 def paper_problem(name: str = "paper-constrained", *settings: str) -> Problem:

@@ -11,6 +11,7 @@ import time as clock
 import tomllib
 from collections.abc import Iterator
 from dataclasses import dataclass
+from graphlib import TopologicalSorter
 from pathlib import Path
 
 import pytest
@@ -20,14 +21,17 @@ from mpc.solvers import SOLVERS
 ROOT = Path(__file__).resolve().parent.parent
 PACKAGES = ("quadsim", "mpc", "scenarios")
 MPC_MAY_IMPORT = {"quadsim.vehicle", "quadsim.state", "quadsim.errors", "quadsim.controller"}
-RENDER_WORKER = "quadsim.render_worker"
+RENDER_WORKER = "quadsim.report.film.render_worker"
 """Only ever run as a child process, so it alone may import at its top what is heavy."""
+FOR_DRAWING = {
+    "matplotlib": r"quadsim\.report\.figures\..+|scenarios\..+_figures?",
+    "plotly": r"quadsim\.report\.plots\..+|scenarios\..+_plots",
+}
+"""Libraries to draw with, and the modules that may import them: those of flights, and each feature's own."""
 OF_ONE_ROOM = (
     "rerun",
     "imageio",
     "imageio_ffmpeg",
-    "matplotlib",
-    "plotly",
     "jinja2",
     "dask",
     "dask_jobqueue",
@@ -48,8 +52,8 @@ class Import:
 
     @property
     def room(self) -> str:
-        """The module of the first level that the importer is, or is part of, e.g. `quadsim.recording`."""
-        return ".".join(self.importer.split(".")[:2])
+        """The package that the importer is, or is part of, e.g. `quadsim.report.film`; in `scenarios` the feature."""
+        return ".".join(self.importer.split(".")[: 3 if self.importer.startswith("quadsim") else 2])
 
     @property
     def library(self) -> str:
@@ -135,7 +139,7 @@ def test_controllers_run_without_a_simulator() -> None:
     optional = {entry.backend.partition(":")[0]: entry.module for entry in SOLVERS.values() if entry.extra}
     loaded = loaded_by("import " + ", ".join(name for name in set(modules()) - set(optional) if name.startswith("mpc")))
     assert {"mpc", "quadsim", "piqp"} <= loaded
-    assert not loaded & {"mujoco", "scenarios", "pydantic", *OF_ONE_ROOM, *optional.values()}
+    assert not loaded & {"mujoco", "scenarios", "pydantic", *OF_ONE_ROOM, *FOR_DRAWING, *optional.values()}
 
 
 @pytest.mark.parametrize("library", OF_ONE_ROOM)
@@ -145,9 +149,49 @@ def test_a_library_for_outputs_is_imported_in_one_room_and_late(library: str, im
     assert not [item for item in uses if item.at_start and item.importer != RENDER_WORKER]
 
 
+@pytest.mark.parametrize("library", FOR_DRAWING)
+def test_a_library_to_draw_with_is_imported_by_figures_or_plots_alone_and_late(
+    library: str, imports: list[Import]
+) -> None:
+    uses = [item for item in imports if item.library == library]
+    assert not [item for item in uses if item.at_start or not re.fullmatch(FOR_DRAWING[library], item.importer)]
+
+
 def test_the_render_worker_is_imported_by_nobody(imports: list[Import]) -> None:
     assert RENDER_WORKER in modules()
     assert RENDER_WORKER not in {item.imported for item in imports}
+
+
+LONGEST_CHAIN = 15
+"""Modules that a reader follows at most from an import to what it stands on."""
+
+
+def test_no_module_and_no_folder_imports_what_imports_it(imports: list[Import]) -> None:
+    ours = modules()
+    packages = {"", *(name.rpartition(".")[0] for name in ours if "." in name)}
+    for package in packages:
+        within = f"{package}." if package else ""
+        graph: dict[str, set[str]] = {}
+        for item in imports:
+            if item.at_start and item.imported in ours and item.importer.startswith(within):
+                importer, imported = (
+                    name.removeprefix(within).partition(".")[0] for name in (item.importer, item.imported)
+                )
+                if item.imported.startswith(within) and imported != importer:
+                    graph.setdefault(importer, set()).add(imported)
+        tuple(TopologicalSorter(graph).static_order())  # raises where there is a cycle
+
+
+def test_no_chain_of_imports_is_long(imports: list[Import]) -> None:
+    ours = modules()
+    graph: dict[str, set[str]] = {name: set() for name in ours}
+    for item in imports:
+        if item.at_start and item.imported in ours and item.imported != item.importer:
+            graph[item.importer].add(item.imported)
+    depth: dict[str, int] = {}
+    for name in TopologicalSorter(graph).static_order():
+        depth[name] = 1 + max((depth[imported] for imported in graph[name]), default=0)
+    assert max(depth.values()) <= LONGEST_CHAIN
 
 
 def test_what_is_imported_is_what_is_declared(imports: list[Import]) -> None:

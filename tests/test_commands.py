@@ -13,9 +13,9 @@ from pathlib import Path
 import pytest
 
 from quadsim.errors import RenderingUnavailableError
-from quadsim.video import rendering_backend
-from scenarios.cli import EXIT_DONE, main, make_parser
-from scenarios.commands import COMMANDS
+from quadsim.report.film.video import rendering_backend
+from scenarios.cli import main, make_parser
+from scenarios.commands import COMMANDS, EXIT_DONE
 from scenarios.loading import load_scenario
 
 ROOT = Path(__file__).resolve().parent.parent

@@ -8,11 +8,11 @@ from pathlib import Path
 import make_cost
 import make_numbers as numbers
 
-from quadsim.cost import cost_tables
-from quadsim.table import grid_to_markdown
-from scenarios.cost import fly_variations, study_cost
+from quadsim.report.table import grid_to_markdown
+from scenarios.cost.cost_tables import cost_tables
+from scenarios.cost.measure import fly_variations, study_cost
 from scenarios.loading import load_scenario
-from scenarios.runner import Flight, fly_scenario
+from scenarios.run import Flight, fly_scenario
 
 ROOT = Path(__file__).resolve().parent.parent
 

@@ -14,7 +14,7 @@ import pytest
 
 from scenarios.cli import main
 from scenarios.loading import load_scenario
-from scenarios.runner import Flight, fly_scenario
+from scenarios.run import Flight, fly_scenario
 
 ROOT = Path(__file__).resolve().parent.parent
 EXAMPLES = ROOT / "examples"

@@ -76,7 +76,7 @@ def test_wheel_holds_every_file_of_the_packages(archives: Archives) -> None:
         held = {name for name in wheel.namelist() if ".dist-info/" not in name}
     assert held == expected
     assert {"quadsim/models/quadrotor.xml", "quadsim/py.typed", "scenarios/library/hover.toml"} <= held
-    assert any(name.startswith("quadsim/templates/") for name in held)
+    assert any(name.startswith("quadsim/report/templates/") for name in held)
 
 
 def test_source_archive_can_be_built_and_tested_from(archives: Archives) -> None:

@@ -35,11 +35,11 @@ LEAST_QUADRATIC: Final = 1e-9
 """Share of l1 that stands in for a quadratic penalty of zero."""
 ROUNDING: Final = 1e-12
 """Share of l1 by which a multiplier may pass it."""
-FEW: Final = 2
+FEW: Final = 8
 """Wrong rows of a start with which no other one is looked at."""
 ROUNDED: Final = 1e-6
 """Share of l1 by which an approximate multiplier of a violated row may stay below it."""
-AT_ONCE: Final = 3
+AT_ONCE: Final = 2
 """Steps, the first ones, in which all rows that are wrong change, not the worst alone."""
 MOST_STEPS: Final = 60
 
@@ -74,7 +74,7 @@ class ActiveSet:
 
     def __init__(self, S: Array, l1: Array, l2: Array) -> None:
         self._S, self._l1 = np.ascontiguousarray(S), l1
-        self._soft = bool(np.isfinite(l1).any())
+        self._soft, self._least_l1 = bool(np.isfinite(l1).any()), float(l1.min(initial=np.inf))
         self._compliance = 0.5 / np.maximum(l2, LEAST_QUADRATIC * np.maximum(l1, 1.0))
 
     def solve(
@@ -92,19 +92,27 @@ class ActiveSet:
         Returns:
             None where it was.
         """
-        side, fewest = starts[0], free.size + 1
-        for start in starts if len(starts) > 1 else ():
-            wrong = self._wrong(start, free, lower, upper)
-            if wrong < fewest:
-                side, fewest = start, wrong
-            if wrong <= FEW:
+        side, z = starts[0], np.zeros_like(free)
+        active = side.nonzero()[0]
+        target = self._optimum(active, side[active], free, lower, upper)
+        fewest = self._wrong(active, target, side, free, lower, upper)
+        for start in starts[1:]:
+            if fewest <= FEW:
                 break
-        side, z = side.copy(), np.zeros_like(free)
+            also = start.nonzero()[0]
+            found = self._optimum(also, start[also], free, lower, upper)
+            wrong = self._wrong(also, found, start, free, lower, upper)
+            if wrong < fewest:
+                side, active, target, fewest = start, also, found, wrong
+        side = side.copy()
         for step in range(1, most + 1):
-            active = side.nonzero()[0]
-            target = self._optimum(active, side[active], free, lower, upper)
+            if step > 1:
+                active = side.nonzero()[0]
+                target = self._optimum(active, side[active], free, lower, upper)
             if target is None:
-                return None
+                if not self._release_dependent(z, active, side, free, lower, upper):
+                    return None
+                continue
             if step == 1:
                 z[active] = np.where(target * side[active] > 0.0, target, 0.0)
             if self._stop_at_kinks(z, target, active, side, at_once=step <= AT_ONCE):
@@ -112,12 +120,22 @@ class ActiveSet:
             z[active] = target
             values = free - target @ self._S[active]
             if not self._join(values, lower, upper, side, at_once=step <= AT_ONCE):
-                bound = np.where(side[active] > 0, upper[active], lower[active])
-                apart = np.abs(values[active] - bound)[np.abs(side[active]) == 1]
-                if (apart > FEASIBLE).any():  # rows too nearly dependent for their multipliers
-                    return None
-                return Active(z=z, values=values, side=side, steps=step)
+                return self._accepted(active, side, free, lower, upper, step)
         return None
+
+    def _accepted(
+        self, active: Indices, side: Side, free: Array, lower: Array, upper: Array, steps: int
+    ) -> Active | None:
+        """The optimum of the right active set, as exact as can be; None where rows are too nearly dependent."""
+        target = self._refined(active, side[active], free, lower, upper)
+        if target is None:
+            return None
+        z = np.zeros_like(free)
+        z[active] = target
+        values = free - target @ self._S[active]
+        bound = np.where(side[active] > 0, upper[active], lower[active])
+        apart = np.abs(values[active] - bound)[np.abs(side[active]) == 1]
+        return None if (apart > FEASIBLE).any() else Active(z=z, values=values, side=side, steps=steps)
 
     def near(self, z: Array, free: Array, lower: Array, upper: Array) -> Side:
         """The active set that approximate multipliers (rows,) tell of: those that outweigh the distance to a bound."""
@@ -129,26 +147,70 @@ class ActiveSet:
         """The multipliers of active rows, on the pieces of psi that they are on; None where rows are dependent."""
         if not active.size:
             return np.zeros(0)
-        K = self._S[active[:, None], active]
+        K, excess = self._system(active, side, free, lower, upper)
+        _, target, failed = lapack.dposv(K, excess, lower=1)
+        return None if failed else np.asarray(target)
+
+    def _system(self, active: Indices, side: Side, free: Array, lower: Array, upper: Array) -> tuple[Array, Array]:
+        """K z = excess of active rows, on the pieces of psi that they are on."""
+        K = self._S.take(active, axis=0).take(active, axis=1)
         excess = free[active] - np.where(side > 0, upper[active], lower[active])
         if self._soft:
             (violated,) = (np.abs(side) == 2).nonzero()
             rows = active[violated]
             K[violated, violated] += self._compliance[rows]
             excess[violated] += np.sign(side[violated]) * self._l1[rows] * self._compliance[rows]
+        return K, excess
+
+    def _refined(self, active: Indices, side: Side, free: Array, lower: Array, upper: Array) -> Array | None:
+        """The optimum with a step of iterative refinement; None where rows are too nearly dependent."""
+        if not active.size:
+            return np.zeros(0)
+        K, excess = self._system(active, side, free, lower, upper)
         factor, target, failed = lapack.dposv(K, excess)
         if failed or (factor.diagonal() ** 2 < DEPENDENT * K.diagonal()).any():
             return None
         return np.asarray(target + lapack.dpotrs(factor, excess - K @ target)[0])
 
+    def _release_dependent(
+        self, z: Array, active: Indices, side: Side, free: Array, lower: Array, upper: Array
+    ) -> bool:
+        """Where active rows are dependent, move along what that leaves open until one stops; whether one did.
+
+        The dual function is linear along it.  If none stops, no point satisfies all rows.
+        """
+        K, excess = self._system(active, side[active], free, lower, upper)
+        factor, failed = lapack.dpotrf(K)
+        if not failed:
+            return False
+        k = failed - 1  # depends on those before it
+        direction = np.zeros(active.size)
+        direction[k] = 1.0
+        if k:  # before a row of nothing there may be none
+            direction[:k] = -lapack.dpotrs(factor[:k, :k], K[:k, k])[0]
+        if direction @ excess < 0.0:
+            direction = -direction
+        sign, here = np.sign(side[active]), z[active]
+        inwards = sign * direction < -ROUNDING * np.abs(direction).max()
+        share = np.full(active.size, np.inf)
+        share[inwards] = (sign * here)[inwards] / -(sign * direction)[inwards]
+        first = int(share.argmin())
+        if not np.isfinite(share[first]):
+            return False
+        z[active] = here + share[first] * direction
+        z[active[first]] = 0.0
+        side[active[first]] = 0
+        return True
+
     def _stop_at_kinks(self, z: Array, target: Array, active: Indices, side: Side, *, at_once: bool) -> bool:
         """Move multipliers to the target, as far as all stay on their pieces; whether some did not."""
-        sign, here = np.sign(side[active]), z[active]
+        pieces = side[active]
+        sign, here = np.sign(pieces), z[active]
         size = sign * target
         stops = leaving = size < 0.0
         kink = np.zeros_like(target)
-        if self._soft:
-            l1, violated = self._l1[active], np.abs(side[active]) == 2
+        if self._soft and (size.max(initial=0.0) > self._least_l1 or (pieces != sign).any()):
+            l1, violated = self._l1[active], pieces != sign
             beyond = np.where(violated, l1 - size, size - l1) > ROUNDING * l1
             leaving = leaving & ~violated
             kink[beyond] = (sign * l1)[beyond]
@@ -159,7 +221,8 @@ class ActiveSet:
             z[active] = np.where(stops, kink, target)
         else:
             share = np.ones_like(target)
-            share[stops] = (kink - here)[stops] / (target - here)[stops]
+            way = (target - here)[stops]
+            share[stops] = np.maximum((kink - here)[stops] / np.where(way == 0.0, np.inf, way), 0.0)
             least = share.min()
             stops = stops & (share <= least)
             z[active] = np.where(stops, kink, here + least * (target - here))
@@ -179,10 +242,8 @@ class ActiveSet:
         side[rows] = np.where(above[rows] > below[rows], 1, -1)
         return True
 
-    def _wrong(self, side: Side, free: Array, lower: Array, upper: Array) -> int:
-        """How many rows of an active set have a multiplier of the wrong sign, or would have to join."""
-        active = side.nonzero()[0]
-        target = self._optimum(active, side[active], free, lower, upper)
+    def _wrong(self, active: Indices, target: Array | None, side: Side, free: Array, lower: Array, upper: Array) -> int:
+        """How many rows have a multiplier of the wrong sign at the optimum of an active set, or would have to join."""
         if target is None:
             return free.size
         values = free - target @ self._S[active]

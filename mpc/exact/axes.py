@@ -39,7 +39,7 @@ class Axis:
         problem: in w (N, m), without constraints; its u_bar is zero.
         states: (n_g,) its states among those of the whole.
         regulated: its rows of C_r.
-        outputs: the problem's rows (`mpc.ocp.Rows`) on its states.
+        outputs: the problem's rows (`mpc.constraints.Rows`) on its states.
         T: (nu, m) the axis's part of u - u_s is T w; columns of unit length.
         T_inverse: (m, nu) w of u - u_s, where the axes are all of u.
     """

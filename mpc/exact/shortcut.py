@@ -10,10 +10,11 @@ import numpy as np
 import scipy.linalg
 from numpy.typing import NDArray
 
+from mpc.constraints import Rows
 from mpc.exact.activeset import FEASIBLE, Active, ActiveSet, Side
 from mpc.exact.axes import axes
 from mpc.exact.free import FreeOptimum
-from mpc.ocp import Problem, Rest, Rows
+from mpc.ocp import Problem, Rest
 from mpc.paper.condensed import Condensed, condensed_cost, row_maps
 from mpc.paper.prediction import prediction
 from mpc.qp import Solution
@@ -26,7 +27,7 @@ Flags = NDArray[np.bool_]
 LARGEST_MAP: Final = 2**20
 """Entries beyond which there is no shortcut: 8 MiB, as much as a core's caches hold.  50 steps of the paper's problem
 have 16 k entries, 400 steps 970 k."""
-MOST_STEPS: Final = {"axes": 50, "all": 15}
+MOST_STEPS: Final = {"axes": 50, "all": 30}
 """Steps of the active set method after which the whole QP's solver takes over: it is as fast."""
 
 

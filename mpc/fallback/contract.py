@@ -20,71 +20,27 @@ from __future__ import annotations
 
 import math
 import re
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
 
-from mpc.answer import BOUND_TOLERANCE, ActuatorBounds
+from mpc.answer import ActuatorBounds, rejection, shifted
 from mpc.equilibrium import Trim
 from mpc.fallback.completion import PLAUSIBLE, DeadReckoning, Reckoned
 from mpc.fallback.hover import HoverLaw
+from mpc.fallback.settings import FallbackSettings as FallbackSettings
 from mpc.heading import anchored, predict_in_heading_frame
 from mpc.model import LinearModel
 from quadsim.controller import ACCEPTED, GROUNDED, Command, Controller, Moment, Phase, check_command, stopped
-from quadsim.errors import FlightError, ParameterError
-from quadsim.state import EULER, EULER_RATE, INDEX, N_STATES, POSITION, REFERENCE_STATES, VELOCITY, Array
+from quadsim.errors import FlightError
+from quadsim.state import INDEX, N_STATES, POSITION, REFERENCE_STATES, Array
 from quadsim.vehicle import N_ROTORS
 
 FAILURES: Final[tuple[type[Exception], ...]] = (FlightError, np.linalg.LinAlgError, ArithmeticError, RuntimeError)
 """What numerics and compiled back ends raise.  A programmer's mistakes (`TypeError`, `KeyError`, ...) end the run."""
 _MISTAKES: Final = (NotImplementedError, RecursionError)
 """Kinds of `RuntimeError` that are a programmer's, too."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class FallbackSettings:
-    """When the next level takes over; validated when made.
-
-    Attributes:
-        unseen: longest time that predictions stand in for a missing measurement before level 2 [s].
-        plan_age: longest time on one shifted plan [s]; its horizon, where that is shorter.
-        position, velocity, angle, rate: largest distance from that plan in any channel [m], [m/s], [rad], [rad/s].
-        hover: longest time on level 2 before the descent [s].
-        sink: speed of the descent [m/s].
-        tilt: largest tilt that levels 1 to 3 ask for [rad]; beside the plan's own on level 1.
-        settled: horizontal speed above which level 2 brakes without a place to go back to [m/s].
-    """
-
-    unseen: float = 1.5
-    plan_age: float = 1.0
-    position: float = 0.5
-    velocity: float = 1.0
-    angle: float = 0.2
-    rate: float = 1.0
-    hover: float = 5.0
-    sink: float = 0.5
-    tilt: float = math.radians(10.0)
-    settled: float = 0.3
-
-    def __post_init__(self) -> None:
-        for item in fields(self):
-            value = getattr(self, item.name)
-            if not 0.0 < value < math.inf:
-                raise ParameterError("controller", f"fallback.{item.name}", value, "positive and finite")
-
-    @property
-    def distance(self) -> Array:
-        """(12,) largest distance from a plan's states."""
-        distance = np.empty(N_STATES)
-        for rows, size in (
-            (POSITION, self.position),
-            (VELOCITY, self.velocity),
-            (EULER, self.angle),
-            (EULER_RATE, self.rate),
-        ):
-            distance[list(rows)] = size
-        return distance
 
 
 _USUAL: Final = FallbackSettings()
@@ -224,20 +180,11 @@ class Guarded:
         except self._failures as error:
             _raise_mistake(error)
             return _snake_case(type(error).__name__), None
-        if answer.status not in ACCEPTED:
-            return answer.status, answer
-        return self._rejection(answer, now.acting) or answer.status, answer
-
-    def _rejection(self, answer: Command, acting: Array) -> str | None:
-        """Why an answer that claims to be good is not, or None."""
-        if np.shape(answer.speeds) != (N_ROTORS,) or np.shape(answer.plan) != (self.horizon, N_ROTORS):
-            return "wrong_shape"
-        if not (np.isfinite(answer.speeds).all() and np.isfinite(answer.plan).all()):
-            return "not_finite"
-        lower, upper = self._bounds.reach(acting)
-        if np.maximum(lower - answer.speeds, answer.speeds - upper).max() > BOUND_TOLERANCE:
-            return "out_of_bounds"
-        return None
+        if answer.status in ACCEPTED and (
+            np.shape(answer.speeds) != (N_ROTORS,) or np.shape(answer.plan) != (self.horizon, N_ROTORS)
+        ):
+            return "wrong_shape", answer
+        return rejection(answer.status, answer.speeds, answer.plan, self._bounds, now.acting) or answer.status, answer
 
     def _accept(self, answer: Command, acting: Array) -> Command:
         """A good answer, moved onto its bounds; so is what it plans for later, which may act unasked."""
@@ -265,7 +212,7 @@ class Guarded:
         if lost or old or not (np.abs(deviation) <= self._distance).all():
             self._good = None
             return None
-        plan = np.concatenate([good.plan[age:], np.repeat(good.plan[-1:], age, axis=0)])
+        plan = shifted(good.plan, age)
         plan[0] += self.law.correction(deviation, float(known[INDEX["yaw"]]))
         return self._bounds.clip_plan(plan, acting)
 

@@ -11,7 +11,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 import scipy.linalg
 
-from mpc.ocp import Problem, Rest, Rows
+from mpc.constraints import Rows
+from mpc.ocp import Problem, Rest
 from mpc.paper.cost import cost
 from mpc.paper.prediction import Prediction, prediction
 from mpc.qp import QP, QPRows, Solution, Vectors, qp_rows

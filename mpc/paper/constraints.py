@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mpc.ocp import Bounds
+from mpc.constraints import Bounds
 from mpc.paper.prediction import Prediction
 from quadsim.state import Array
 

@@ -19,6 +19,7 @@ from typing import Final
 import numpy as np
 
 from mpc.answer import ActuatorBounds, rejection, shifted
+from mpc.constraints import Bounds, Constraint
 from mpc.equilibrium import Trim, equilibrium, twisted
 from mpc.exact.shortcut import with_shortcut
 from mpc.fallback.completion import PLAUSIBLE, Reckoned
@@ -33,27 +34,21 @@ from mpc.heading import (
 from mpc.model import LinearModel, continuous_model, discretise, hover_model
 from mpc.nonlinear.linearise import linearise
 from mpc.nonlinear.model import NonlinearModel, advance, nonlinear_model, spun
-from mpc.ocp import Bounds, Constraint, Objective, Problem, Rest, lqr_terminal_weight
+from mpc.ocp import Objective, Problem, Rest, lqr_terminal_weight
 from mpc.qp import Solution
 from mpc.robust.observer import DisturbanceObserver, thrust_axis
 from mpc.robust.observer import ObserverSettings as ObserverSettings
+from mpc.robust.relinearised import Relinearised
 from mpc.robust.settings import Linearisation as Linearisation
 from mpc.robust.settings import RobustSettings as RobustSettings
-from mpc.solvers import Answer, QPSolver, refusal
-from mpc.solvers.piqp_sparse import PiqpChanging
-from mpc.staged import Staged
-from quadsim.controller import ACCEPTED, GROUNDED, SOLVED, Command, Moment, Phase, stopped
+from mpc.solvers import Answer, QPSolver
+from quadsim.controller import ACCEPTED, GROUNDED, Command, Moment, Phase, stopped
 from quadsim.errors import ParameterError
 from quadsim.state import EULER, EULER_RATE, INDEX, N_STATES, REFERENCE_STATES, VELOCITY, Array
 from quadsim.vehicle import N_ROTORS, Vehicle
 
 SOLVER: Final = "piqp-multistage"
 """Solves what the shortcuts leave."""
-STEPS_PER_STAGE: Final = 4
-"""M where the model changes, the fastest of 1 to 7 for 16 states, though 2 to 5 hardly differ."""
-LARGEST: Final = 1e6
-"""Magnitude of a number in the data beyond which it is no vehicle's: four steps of such numbers multiply to 1e30, where
-PIQP takes bounds for infinite."""
 LONGEST_SPAN: Final = 0.25
 """Longest time between two measured states [s] for their difference to tell of a disturbance; a sensor of 4 Hz."""
 _SAME_TIME: Final = 1e-6
@@ -179,7 +174,7 @@ class RobustMPC:
             self._ahead = x0
         answer = self._solve(np.concatenate([x0, self._rotors])[: self._model.n], self._later(reference))
         solution = answer.solution
-        problem = rejection(solution.status, answer.plan, self._actuators, self._acting)
+        problem = rejection(solution.status, answer.plan[0], answer.plan, self._actuators, self._acting)
         if problem is not None:
             return self._refuse(problem, solution)
         plan = answer.plan.copy()
@@ -298,49 +293,6 @@ class RobustMPC:
         along[:, _YAW] += math.tau * round((x0[_YAW] - along[0, _YAW]) / math.tau)
         along[0] = x0
         return linearise(model, along, shifted(plan, 1))
-
-
-class Relinearised:
-    """A problem whose model changes from period to period, solved whole by PIQP.
-
-    Attributes:
-        last: predicted states (N, n) and plan (N, nu) of the last period, if that was solved.
-    """
-
-    def __init__(self, problem: Problem) -> None:
-        self._form = Staged(problem, steps_per_stage=STEPS_PER_STAGE, changing=True)
-        self._backend = PiqpChanging()
-        self._backend.setup(self._form.qp)
-        self.last: tuple[Array, Array] | None = None
-
-    def solve(self, A: Array, B: Array, c: Array, x0: Array, desired: Array, u_before: Array, u_rest: Array) -> Answer:
-        """Solve one period's QP.
-
-        Data that is not finite, or beyond `LARGEST`, is answered with the status `invalid_data`: PIQP cannot be trusted
-        to notice.
-
-        Args:
-            A: (N, n, n), A_i.
-            B: (N, n, nu), B_i.
-            c: (N, n), c_i.
-            x0: (n,) x(k).
-            desired: (N, n_r) y_d for x(k+1) .. x(k+N).
-            u_before: (nu,) u(k-1) [rad/s].
-            u_rest: (nu,) u_s [rad/s].
-        """
-        form = self._form
-        self.last = None
-        if all(np.abs(part).max() <= LARGEST for part in (A, B, c, x0, desired, u_before, u_rest)):
-            matrices = form.prepare(A, B)
-            rest = Rest(np.zeros_like(x0), u_rest)
-            qp = form.changed(matrices, form.changed_vectors(matrices, c, x0, desired, u_before, rest))
-            solution = self._backend.solve_changed(qp)
-        else:
-            solution = refusal(form.qp)
-        plan = form.inputs(solution.x)
-        if solution.status == SOLVED and np.isfinite(plan).all():
-            self.last = form.states(matrices, c, x0, solution.x), plan
-        return Answer(plan=plan, slacks=form.slacks(solution.x), solution=solution)
 
 
 def _command(plan: Array, status: str, solution: Solution, slack: float = 0.0) -> Command:

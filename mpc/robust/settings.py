@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass
 from enum import StrEnum
 
-from mpc.ocp import Penalty
+from mpc.constraints import Penalty
 from mpc.robust.observer import ObserverSettings
 from quadsim.errors import ParameterError
 from quadsim.state import Array

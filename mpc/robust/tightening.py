@@ -33,8 +33,8 @@ from typing import Final
 import numpy as np
 import scipy.linalg
 
+from mpc.constraints import Bounds
 from mpc.model import continuous_model, discretise
-from mpc.ocp import Bounds
 from quadsim.errors import ParameterError
 from quadsim.state import INDEX, N_STATES, Array, read_only
 from quadsim.vehicle import Vehicle

@@ -32,7 +32,7 @@ from quadsim.outputs.manifest import (
     take_stock,
     to_json,
 )
-from quadsim.outputs.places import (
+from quadsim.outputs.paths import (
     as_output_error,
     occupied,
     parents_of,

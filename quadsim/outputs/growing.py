@@ -22,7 +22,7 @@ from quadsim.outputs.manifest import (
     remove_empty,
     remove_lock,
 )
-from quadsim.outputs.places import as_output_error, occupied, parents_of, real_path
+from quadsim.outputs.paths import as_output_error, occupied, parents_of, real_path
 from quadsim.outputs.staging import STAGING, Staging, staging_beside
 
 _CHANGED: Final = "it is not as quadsim wrote it; move it away first"

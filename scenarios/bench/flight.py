@@ -11,26 +11,24 @@ from typing import Final
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from quadsim.audit import audit
-from quadsim.bench import FlightProfile
 from quadsim.controller import Controller
 from quadsim.errors import InputError, ParameterError
-from quadsim.flightlog import FlightLog
-from quadsim.physics import Stretch
-from quadsim.plant import Plant
+from quadsim.flight.audit import audit
+from quadsim.flight.log import FlightLog
+from quadsim.sim.physics import Stretch
+from quadsim.sim.plant import Plant
 from quadsim.state import Array
 from quadsim.vehicle import Vehicle
-from scenarios.build import (
-    build_controller,
-    build_limits,
-    build_plant,
-    build_reference,
-    build_vehicle,
-)
-from scenarios.flying import fly_once
-from scenarios.navigation import build_navigation
-from scenarios.runner import Progress, machine, silent
-from scenarios.spec import Scenario
+from scenarios.bench.bench_results import FlightProfile
+from scenarios.build import build_controller, build_plant
+from scenarios.courses.make import build_reference
+from scenarios.machine import machine
+from scenarios.parts.limits import build_limits
+from scenarios.parts.navigation import build_navigation
+from scenarios.parts.vehicle import build_vehicle
+from scenarios.progress import Progress, silent
+from scenarios.run import fly_once
+from scenarios.schema.scenario import Scenario
 
 REPEATS: Final = 5
 
@@ -42,7 +40,7 @@ class _TimedPlant(Plant):
     measurement_s = 0.0
 
     def state(self) -> Array:
-        """See `quadsim.plant.Plant.state`."""
+        """See `quadsim.sim.plant.Plant.state`."""
         started = clock.perf_counter()
         try:
             return super().state()
@@ -50,7 +48,7 @@ class _TimedPlant(Plant):
             self.measurement_s += clock.perf_counter() - started
 
     def advance(self, speeds: Array, steps: int) -> Stretch:
-        """See `quadsim.plant.Plant.advance`."""
+        """See `quadsim.sim.plant.Plant.advance`."""
         started = clock.perf_counter()
         try:
             return super().advance(speeds, steps)

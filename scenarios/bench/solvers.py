@@ -13,17 +13,22 @@ from mpc.ocp import Problem
 from mpc.solvers import SOLVERS, Way
 from mpc.unconstrained import UnconstrainedMPC
 from quadsim import outputs
-from quadsim.bench import Contender, Growth, SolverBench, solver_tables
 from quadsim.errors import InputError, ParameterError, UnknownNameError
+from quadsim.report.table import Grid, grid_to_markdown
 from quadsim.state import Array
-from quadsim.table import Grid, grid_to_markdown
-from scenarios.bench.contenders import Entry, StepEntrant, entries, judge, reference_optima
-from scenarios.bench.race import Laps, race, stretches
+from scenarios.bench.bench_results import CandidateResult, Growth, SolverBench
+from scenarios.bench.bench_tables import solver_tables
+from scenarios.bench.candidates import Entry, StepCandidate, entries, judge, reference_optima
+from scenarios.bench.queries import QueriedController, Queries, flight_between, recorded
 from scenarios.bench.stages import time_stages
+from scenarios.bench.timing import StepTimes, stretches, time_in_turns
 from scenarios.build import build_problem
-from scenarios.queries import Asked, Queries, flight_between, recorded
-from scenarios.runner import Flight, Progress, fly_scenario, machine, silent, versions
-from scenarios.spec import LARGEST_HORIZON, ConstrainedSpec, Scenario
+from scenarios.machine import machine, versions
+from scenarios.progress import Progress, silent
+from scenarios.run import Flight, fly_scenario
+from scenarios.schema.controller import ConstrainedSpec
+from scenarios.schema.optimisation import LARGEST_HORIZON
+from scenarios.schema.scenario import Scenario
 
 RESULTS_FILE: Final = "bench.json"
 TABLES_FILE: Final = "solvers.md"
@@ -37,15 +42,15 @@ HORIZONS: Final = (10, 20, 50, 100, 200)
 GROWTH_STRIDE: Final = 6
 """One stretch of so many is asked at each horizon and of each form of the QP."""
 LONGEST_PASS: Final = 20.0
-"""A contender whose first pass takes longer [s] is timed once."""
+"""A candidate whose first pass takes longer [s] is timed once."""
 GAIN: Final = "unconstrained gain"
 """What the controller would be without its constraints."""
 PATIENCE: Final = 60.0
-"""A contender that takes longer for the questions at one horizon [s] is dropped."""
+"""A candidate that takes longer for the questions at one horizon [s] is dropped."""
 
 
 class _Racing(TypedDict):
-    """What every race of a bench has in common; see `scenarios.bench.race.race`."""
+    """What every race of a bench has in common; see `scenarios.bench.timing.time_in_turns`."""
 
     between: Callable[[], None]
     repeats: int
@@ -54,15 +59,15 @@ class _Racing(TypedDict):
 
 @dataclass(frozen=True, kw_only=True)
 class _Timed:
-    """A contender's steps (K,) [ms], the ways (K,) they were answered in, and the periods without their optimum."""
+    """A candidate's steps (K,) [ms], the ways (K,) they were answered in, and the periods without their optimum."""
 
     step_ms: Array
     ways: np.ndarray[tuple[int], np.dtype[np.object_]]
     failures: int
 
     @classmethod
-    def of(cls, entrant: StepEntrant, periods: Sequence[int], laps: Laps) -> _Timed:
-        return cls(step_ms=laps.median, ways=entrant.ways(periods), failures=entrant.failures(periods))
+    def of(cls, candidate: StepCandidate, periods: Sequence[int], laps: StepTimes) -> _Timed:
+        return cls(step_ms=laps.median, ways=candidate.ways(periods), failures=candidate.failures(periods))
 
 
 def bench_solvers(
@@ -99,7 +104,7 @@ def bench_solvers(
     few = stretches(flight.log.control.t.size, stride * GROWTH_STRIDE)
     with flight_between(scenario, flight.vehicle) as between:
         racing: _Racing = {"between": between, "repeats": repeats, "rng": rng}
-        contenders, own, gain, asked, reference_kkt = _time_contenders(
+        contenders, own, gain, asked, reference_kkt = _time_candidates(
             flight, problem, taking_part, stride=stride, progress=progress, **racing
         )
         growth = _growth(flight, problem, taking_part, horizons, few, own, progress=progress, **racing)
@@ -129,7 +134,7 @@ def write_bench(bench: SolverBench, directory: Path) -> None:
     Raises:
         OutputError: it cannot be written.
     """
-    from quadsim.figures import write_solver_figure
+    from scenarios.bench.solver_figure import write_solver_figure
 
     outputs.write_json(directory / RESULTS_FILE, {"format": FORMAT, **bench.to_json()})
     outputs.write_text(directory / TABLES_FILE, bench_markdown(bench))
@@ -162,7 +167,7 @@ def _check(
     return scenario.controller
 
 
-def _time_contenders(
+def _time_candidates(
     flight: Flight,
     problem: Problem,
     taking_part: Sequence[Entry],
@@ -172,15 +177,15 @@ def _time_contenders(
     rng: np.random.Generator,
     between: Callable[[], None],
     progress: Progress,
-) -> tuple[tuple[Contender, ...], dict[str, _Timed], Array | None, int, float]:
-    """Contenders, their steps, the gain's, the number of periods asked, and the reference's worst KKT residual."""
+) -> tuple[tuple[CandidateResult, ...], dict[str, _Timed], Array | None, int, float]:
+    """Candidates, their steps, the gain's, the number of periods asked, and the reference's worst KKT residual."""
     queries = recorded(flight.scenario, flight.log.control, problem.horizon)
     asked = stretches(queries.t.size, stride)
     periods = [period for stretch in asked for period in stretch]
     reference = reference_optima(problem, queries, periods)
-    entrants = {entry.name: StepEntrant(entry, problem, queries) for entry in taking_part}
-    laps = race(
-        {**_gain(problem, queries), **entrants},
+    candidates = {entry.name: StepCandidate(entry, problem, queries) for entry in taking_part}
+    laps = time_in_turns(
+        {**_gain(problem, queries), **candidates},
         asked,
         between=between,
         repeats=repeats,
@@ -189,28 +194,28 @@ def _time_contenders(
         progress=lambda done, total: progress("contenders", done, total),
     )
     contenders = tuple(
-        Contender(
+        CandidateResult(
             name=name,
-            solver=entrant.entry.solver,
-            package=_package(entrant.entry.solver),
-            shortcut=entrant.entry.shortcut,
+            solver=candidate.entry.solver,
+            package=_package(candidate.entry.solver),
+            shortcut=candidate.entry.shortcut,
             repeats=laps[name].ms.shape[0],
             step_ms=laps[name].median,
-            answered=entrant.statuses(periods),
+            answered=candidate.statuses(periods),
             raw_max_ms=float(laps[name].ms.max()),
-            **vars(judge(entrant, queries, periods, reference)),
+            **vars(judge(candidate, queries, periods, reference)),
         )
-        for name, entrant in entrants.items()
+        for name, candidate in candidates.items()
     )
     gain = laps[GAIN].median if GAIN in laps else None
-    own = {name: _Timed.of(entrant, periods, laps[name]) for name, entrant in entrants.items()}
+    own = {name: _Timed.of(candidate, periods, laps[name]) for name, candidate in candidates.items()}
     return contenders, own, gain, len(periods), reference.kkt
 
 
-def _gain(problem: Problem, queries: Queries) -> dict[str, Asked]:
+def _gain(problem: Problem, queries: Queries) -> dict[str, QueriedController]:
     """The gain, where weights are not so far apart that it cannot be computed."""
     try:
-        return {GAIN: Asked(UnconstrainedMPC(problem), queries)}
+        return {GAIN: QueriedController(UnconstrainedMPC(problem), queries)}
     except np.linalg.LinAlgError:
         return {}
 
@@ -233,10 +238,10 @@ def _growth(
     rng: np.random.Generator,
     progress: Progress,
 ) -> tuple[Growth, ...]:
-    """Every contender at each N, until one would hardly keep up with the flight at the next.
+    """Every candidate at each N, until one would hardly keep up with the flight at the next.
 
     Steps by the whole QP and by either shortcut are told apart: their shares change with N.  At the flight's own N they
-    are those of the contenders, `own`, which are not timed again.
+    are those of the candidates, `own`, which are not timed again.
     """
     grown: dict[tuple[Entry, Way], list[tuple[int, float, float]]] = {}
     failures: dict[str, dict[int, int]] = {}
@@ -249,9 +254,9 @@ def _growth(
             timed = dict(own)
         else:
             queries, longer = recorded(flight.scenario, flight.log.control, N), replace(problem, horizon=N)
-            entrants = {entry.name: StepEntrant(entry, longer, queries) for entry in racing}
-            laps = race(
-                entrants,
+            candidates = {entry.name: StepCandidate(entry, longer, queries) for entry in racing}
+            laps = time_in_turns(
+                candidates,
                 asked,
                 between=between,
                 repeats=repeats,
@@ -260,7 +265,7 @@ def _growth(
                 patience=PATIENCE,
                 progress=lambda done, total, N=N: progress(f"N = {N}", done, total),  # type: ignore[misc]
             )
-            timed = {name: _Timed.of(entrants[name], periods, lap) for name, lap in laps.items()}
+            timed = {name: _Timed.of(candidates[name], periods, lap) for name, lap in laps.items()}
         for entry in racing:
             if entry.name not in timed:
                 dropped[entry.name] = f"more than {PATIENCE:g} s for them at N = {N}"

@@ -15,11 +15,11 @@ from mpc.qp import Backend, Formulation, Vectors
 from mpc.solvers.piqp_dense import PiqpDense
 from mpc.solvers.piqp_sparse import PiqpMultistage
 from mpc.staged import Staged, usual_steps
-from quadsim.bench import StageLength
 from quadsim.state import Array
-from scenarios.bench.race import race
-from scenarios.queries import Queries
-from scenarios.runner import Progress
+from scenarios.bench.bench_results import StageLength
+from scenarios.bench.queries import Queries
+from scenarios.bench.timing import time_in_turns
+from scenarios.progress import Progress
 
 STEPS_TRIED: Final = (1, 2, 3, 4, 5, 6, 8, 10, 13, 17, 20, 25)
 
@@ -68,12 +68,12 @@ class _QPEntrant:
         backend.setup(formulation.qp)
 
     def prepare(self, period: int) -> None:
-        """See `scenarios.bench.race.Entrant.prepare`."""
+        """See `scenarios.bench.timing.Candidate.prepare`."""
         self._period = period
         self._vectors: Vectors = self.formulation.vectors(*self._query(period))
 
     def answer(self) -> None:
-        """See `scenarios.bench.race.Entrant.answer`."""
+        """See `scenarios.bench.timing.Candidate.answer`."""
         self.active[self._period] = self._backend.solve(self._vectors).active
 
 
@@ -89,23 +89,23 @@ def _time(
 ) -> tuple[StageLength, ...]:
     """The QP condensed and cut into stages of M steps, on the periods whose QP has active constraints."""
     default = usual_steps(problem.model.nu)
-    entrants: dict[int | None, _QPEntrant] = {None: _QPEntrant(condensed(problem), PiqpDense(), query)}
+    candidates: dict[int | None, _QPEntrant] = {None: _QPEntrant(condensed(problem), PiqpDense(), query)}
     for length in sorted({*STEPS_TRIED, default}):
-        entrants[length] = _QPEntrant(Staged(problem, steps_per_stage=length), PiqpMultistage(), query)
-    laps = race(
-        {str(steps): entrant for steps, entrant in entrants.items()},
+        candidates[length] = _QPEntrant(Staged(problem, steps_per_stage=length), PiqpMultistage(), query)
+    laps = time_in_turns(
+        {str(steps): candidate for steps, candidate in candidates.items()},
         asked,
         between=between,
         repeats=repeats,
         rng=rng,
         progress=lambda done, total: progress("stages", done, total),
     )
-    found_active = entrants[default].active
+    found_active = candidates[default].active
     active = np.array([found_active[period] > 0 for stretch in asked for period in stretch])
     counted = active if active.any() else np.ones_like(active)
     found = []
-    for steps, entrant in entrants.items():
+    for steps, candidate in candidates.items():
         p50, p99 = np.percentile(laps[str(steps)].median[counted], [50, 99])
-        size = entrant.formulation.qp.c.size
+        size = candidate.formulation.qp.c.size
         found.append(StageLength(steps=steps, variables=size, p50=float(p50), p99=float(p99), default=steps == default))
     return tuple(found)

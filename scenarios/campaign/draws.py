@@ -9,14 +9,13 @@ from __future__ import annotations
 
 import math
 import warnings
-from typing import Final, assert_never
+from typing import TYPE_CHECKING, Final, assert_never
 
 import numpy as np
 from scipy import stats
 
 from quadsim.state import Array
-from scenarios.campaign.spec import (
-    CampaignSpec,
+from scenarios.campaign.distributions import (
     ChoiceSpec,
     GridSpec,
     LogUniformSpec,
@@ -25,6 +24,9 @@ from scenarios.campaign.spec import (
     Value,
     VarySpec,
 )
+
+if TYPE_CHECKING:
+    from scenarios.campaign.spec import CampaignSpec
 
 _TAIL: Final = 1e-3
 """Share of a distribution beyond the values that stand for its ends."""

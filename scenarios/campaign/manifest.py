@@ -6,17 +6,17 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final
 
-from quadsim.campaign.store import FLIGHTS_FILE, TIMES_FILE
 from quadsim.errors import FileError, InputError
-from quadsim.form import MAYBE_TEXT, Each, Optional, read_json
-from quadsim.inside import require_inside
+from quadsim.flight.form import MAYBE_TEXT, Each, Optional, read_json
 from quadsim.outputs import Growing, digest, digest_of, to_json
-from scenarios.campaign.code import code_digest, controller_digest
+from quadsim.outputs.paths import require_inside
+from scenarios.campaign.digests import code_digest, controller_digest
 from scenarios.campaign.plan import Plan, load_plan
+from scenarios.campaign.results.store import FLIGHTS_FILE, TIMES_FILE
 from scenarios.campaign.spec import CampaignSpec
-from scenarios.foreign_code import announce_recorded, find_code
-from scenarios.runner import machine, versions
-from scenarios.spec.own import OwnSpec
+from scenarios.machine import machine, versions
+from scenarios.parts.foreign_code import announce_recorded, find_code
+from scenarios.schema.plugin import PluginSpec
 
 MANIFEST_FILE: Final = "manifest.json"
 CAMPAIGN_FILE: Final = "campaign.toml"
@@ -57,7 +57,11 @@ def begin(plan: Plan, files: Growing) -> dict[str, Any]:
         "flown": 0,
         "files": {name: digest(text) for name, text in texts.items()},
         **_flown_by(plan),
-        **({"controller_code": find_code(own).digest} if isinstance(own := plan.scenario.controller, OwnSpec) else {}),
+        **(
+            {"controller_code": find_code(own).digest}
+            if isinstance(own := plan.scenario.controller, PluginSpec)
+            else {}
+        ),
         "sessions": [],
     }
     write(manifest, files)
@@ -131,9 +135,9 @@ def other_than_flew(manifest: Mapping[str, Any], plan: Plan) -> list[str]:
     """Of `code`, `controller`, `versions` and `machine`, those that are not as when a campaign was begun.
 
     Imports a controller that is not ours; what is to run, and what ran then, is told to
-    `scenarios.foreign_code.LOGGER` before.
+    `scenarios.parts.foreign_code.LOGGER` before.
     """
-    if isinstance(plan.scenario.controller, OwnSpec):
+    if isinstance(plan.scenario.controller, PluginSpec):
         announce_recorded(plan.scenario.controller, manifest.get("controller_code", manifest.get("controller")))
     return [name for name, value in _flown_by(plan).items() if manifest.get(name) != value]
 

@@ -5,14 +5,17 @@ from __future__ import annotations
 import contextlib
 import time as clock
 
-from quadsim.campaign.table import ERROR, MEMORY, Row, failed_row, flown_row
 from quadsim.errors import QuadsimError
-from scenarios.campaign.engine import said
+from scenarios.campaign.engine.protocol import said
 from scenarios.campaign.plan import Plan
+from scenarios.campaign.results.table import Row, failed_row, flown_row
+from scenarios.campaign.results.verdicts import ERROR, MEMORY
 from scenarios.campaign.spec import LimitsSpec
-from scenarios.own import import_own
-from scenarios.runner import Flight, Progress, fly_scenario, processor_name, silent
-from scenarios.spec.own import OwnSpec
+from scenarios.machine import processor_name
+from scenarios.parts.plugin import import_plugin
+from scenarios.progress import Progress, silent
+from scenarios.run import Flight, fly_scenario
+from scenarios.schema.plugin import PluginSpec
 
 
 class CampaignPilot:
@@ -33,9 +36,9 @@ class CampaignPilot:
     def prepare(self) -> None:
         """Import a controller that is not ours."""
         controller = self._plan.scenario.controller
-        if isinstance(controller, OwnSpec):
+        if isinstance(controller, PluginSpec):
             with contextlib.suppress(Exception):
-                import_own(controller)
+                import_plugin(controller)
 
     def fly(self, flight: int, progress: Progress = silent) -> Row:
         """The row of a flight; one that raises is a result too, with its reason."""

@@ -12,18 +12,19 @@ from typing import Any, Final
 import pyarrow as pa
 from pydantic import ValidationError
 
-from quadsim.campaign.events import Event, parse_event
-from quadsim.campaign.table import DRAW, TIMING, Row, make_schema
 from quadsim.errors import FileError, InputError, ParameterError, UnknownNameError
-from scenarios.bases import locate_files, merge, read_scenario
-from scenarios.build import build_limits, build_vehicle, resolve_vehicle
+from scenarios.campaign.distributions import Value, VarySpec
 from scenarios.campaign.draws import Draws, extremes
-from scenarios.campaign.spec import CampaignSpec, Value, VarySpec
-from scenarios.checking import check_parts
-from scenarios.loading import parse_scenario, scenario_path
-from scenarios.problems import ScenarioError, describe
-from scenarios.settings import apply_setting, get_field, set_field
-from scenarios.spec import Scenario
+from scenarios.campaign.results.events import Event, parse_event
+from scenarios.campaign.results.table import DRAW, TIMING, Row, make_schema
+from scenarios.campaign.spec import CampaignSpec
+from scenarios.loading import check_parts, parse_scenario, scenario_path
+from scenarios.parts.limits import build_limits
+from scenarios.parts.vehicle import build_vehicle, resolve_vehicle
+from scenarios.schema.bases import locate_files, merge, read_scenario
+from scenarios.schema.problems import ScenarioError, describe
+from scenarios.schema.scenario import Scenario
+from scenarios.schema.settings import apply_setting, get_field, set_field
 
 FIRST: Final = 5
 """Flights of which one at least has to be possible."""

@@ -1,11 +1,15 @@
-"""Loaded last by the server that workers are forked from: what it has loaded is theirs as well, and no garbage.
+"""Loaded last by the server that workers are forked from: what it has loaded is theirs as well, and not looked through.
 
-So no worker has to look through it, nor copies the pages that hold it.
+So no worker loads it again, has to look through it for cycles, nor copies the pages that hold it.
 """
 
 from __future__ import annotations
 
-import scenarios.campaign.keeper  # noqa: F401
-from scenarios.garbage import settle
+import mpc.constrained
+import mpc.robust.controller
+import mpc.unconstrained  # noqa: F401
+import scenarios.campaign.engine.supervisor
+import scenarios.campaign.pilot  # noqa: F401
+from scenarios.gc_tuning import freeze_for_good
 
-settle()
+freeze_for_good()

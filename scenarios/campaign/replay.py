@@ -7,16 +7,16 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from quadsim.campaign.estimates import worst_flight
-from quadsim.campaign.store import FLIGHTS_FILE
-from quadsim.campaign.stored import read_flights
-from quadsim.campaign.table import make_table
 from quadsim.errors import ParameterError
 from scenarios.campaign.manifest import other_than_flew, read_manifest, stored_plan
 from scenarios.campaign.pilot import CampaignPilot
 from scenarios.campaign.plan import Plan
-from scenarios.runner import Flight, Outputs, Progress, run, silent
-from scenarios.spec import Scenario
+from scenarios.campaign.results.store import FLIGHTS_FILE, read_flights
+from scenarios.campaign.results.table import make_table
+from scenarios.campaign.statistics.estimates import worst_flight
+from scenarios.progress import Progress, silent
+from scenarios.run import Flight, Outputs, run_scenario
+from scenarios.schema.scenario import Scenario
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -63,14 +63,14 @@ def replay(recorded: Recorded, target: Path, outputs: Outputs, progress: Progres
     Args:
         recorded: the flight.
         target: the run directory.
-        outputs: see `scenarios.runner.run`.
-        progress: see `scenarios.runner.run`.
+        outputs: see `scenarios.run.run_scenario`.
+        progress: see `scenarios.run.run_scenario`.
 
     Returns:
         The flight, and the columns of the campaign's table that it does not agree with, bit for bit; none, on the same
         machine with the same code.
     """
-    flight = run(recorded.scenario, target, outputs, progress)
+    flight = run_scenario(recorded.scenario, target, outputs, progress)
     row = CampaignPilot(recorded.plan).row_of(recorded.number, flight)
     (again,) = make_table([row], recorded.plan.schema).to_pylist()
     return flight, [name for name, value in recorded.row.items() if name not in again or again[name] != value]

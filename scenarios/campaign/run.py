@@ -16,17 +16,17 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from quadsim.campaign.estimates import estimate
-from quadsim.campaign.report import write_report
-from quadsim.campaign.statistics import proportion
-from quadsim.campaign.store import FLIGHTS_FILE, TIMES_FILE, Store
-from quadsim.campaign.table import Row, read_table
 from quadsim.errors import InputError, OutputError, ParameterError
 from quadsim.outputs import Growing, digest_of, growing, to_json
 from scenarios.campaign import manifest as records
-from scenarios.campaign.engine import Engine
+from scenarios.campaign.engine.protocol import Engine
 from scenarios.campaign.pilot import CampaignPilot
 from scenarios.campaign.plan import Plan
+from scenarios.campaign.report.campaign_page import write_report
+from scenarios.campaign.results.store import FLIGHTS_FILE, TIMES_FILE, Store
+from scenarios.campaign.results.table import Row, read_table
+from scenarios.campaign.statistics.estimates import estimate
+from scenarios.campaign.statistics.inference import proportion
 
 SUMMARY_FILE: Final = "summary.json"
 REPORT_FILES: Final = ("index.html", "campaign.png", "campaign.svg")

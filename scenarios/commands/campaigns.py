@@ -1,4 +1,4 @@
-"""`quadsim campaign` and `replay`, and `compare` of two campaigns."""
+"""`quadsim campaign` and `replay`."""
 
 from __future__ import annotations
 
@@ -7,27 +7,25 @@ from argparse import Namespace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from quadsim import rundir
-from quadsim.errors import InputError, ParameterError
-from quadsim.outputs import real_path, require_directory, require_file
-from scenarios import console
-from scenarios.campaign.manifest import stored_plan
-from scenarios.cli import EXIT_DONE, EXIT_FAILED
+from quadsim.errors import ParameterError
+from quadsim.flight import rundir
+from quadsim.outputs import real_path, require_file
+from scenarios.commands import EXIT_DONE, EXIT_FAILED, console
 from scenarios.commands.common import print_summary
-from scenarios.junit import write_cases
-from scenarios.runner import Outputs
+from scenarios.commands.junit import write_cases
+from scenarios.run import Outputs
 
 if TYPE_CHECKING:
-    from scenarios.campaign.engine import Engine
+    from scenarios.campaign.engine.protocol import Engine
 
 
 def campaign(options: Namespace) -> int:
     """`quadsim campaign`."""
-    from quadsim.campaign.events import parse_event
-    from quadsim.campaign.gate import judge, parse_requirement
-    from scenarios.campaign.console import print_campaign, progress
     from scenarios.campaign.plan import load_plan
+    from scenarios.campaign.results.events import parse_event
     from scenarios.campaign.run import fly_campaign
+    from scenarios.campaign.statistics.requirement import judge, parse_requirement
+    from scenarios.commands.campaign_console import print_campaign, progress
 
     requirements = [parse_requirement(text) for text in options.requirements]
     if options.junit is not None and not requirements:
@@ -67,11 +65,11 @@ def campaign(options: Namespace) -> int:
 
 def _engine(options: Namespace) -> Engine:
     """Who flies the campaign."""
-    from scenarios.campaign.local import LocalEngine
+    from scenarios.campaign.engine.local import LocalEngine
 
     if options.cluster is None:
         return LocalEngine(options.workers)
-    from scenarios.campaign.cluster import DaskEngine
+    from scenarios.campaign.engine.cluster import DaskEngine
 
     if options.workers is not None:
         raise ParameterError("", "--workers", options.workers, "absent where --cluster says who flies")
@@ -80,10 +78,10 @@ def _engine(options: Namespace) -> Engine:
 
 def replay(options: Namespace) -> int:
     """`quadsim replay`."""
-    from quadsim.campaign.table import MEMORY, TIMEOUT
-    from scenarios.campaign.console import print_replay
     from scenarios.campaign.replay import recorded_flight
     from scenarios.campaign.replay import replay as fly_again
+    from scenarios.campaign.results.verdicts import MEMORY, TIMEOUT
+    from scenarios.commands.campaign_console import print_replay
 
     directory = Path(options.campaign)
     flight = recorded_flight(directory, options.flight)
@@ -100,31 +98,3 @@ def replay(options: Namespace) -> int:
     if not options.json:
         print_replay(flight.number, flight.row, differing)
     return EXIT_FAILED if differing else EXIT_DONE
-
-
-def compare_campaigns(options: Namespace) -> int:
-    """`quadsim compare` of two campaigns, flight by flight."""
-    from quadsim.campaign.comparison import compare
-    from quadsim.campaign.comparison_report import KIND, write_comparison_report
-    from quadsim.campaign.store import FLIGHTS_FILE
-    from quadsim.campaign.stored import read_flights
-    from scenarios.campaign.console import print_comparison
-
-    if len(options.targets) != 2:
-        raise InputError(f"compare takes two campaigns, each by itself, not {len(options.targets)}")
-    if options.cost:
-        raise ParameterError("", "--cost", True, "absent when campaigns are compared")
-    target = real_path(options.out)
-    require_directory(target, KIND)
-    first, second = (Path(name) for name in options.targets)
-    plans = (stored_plan(first), stored_plan(second))
-    names = (plans[0].spec.name, plans[1].spec.name)
-    failures = (plans[0].spec.failure, plans[1].spec.failure)
-    a, b = (read_flights(path / FLIGHTS_FILE, plan.schema) for path, plan in zip((first, second), plans, strict=True))
-    comparison = compare(a, b, names, failures)
-    page = write_comparison_report(comparison, target)
-    if options.markdown:
-        print(comparison.to_markdown())
-    else:
-        print_comparison(comparison, str(page))
-    return EXIT_DONE

@@ -12,14 +12,14 @@ from mpc.solvers import SOLVERS
 from quadsim.assets import vehicle_names, vehicle_path
 from quadsim.errors import InputError, ParameterError
 from quadsim.vehicle import load_vehicle, vehicle_sources
-from scenarios import console
-from scenarios.build import CONTROLLERS, build_vehicle, resolve
+from scenarios.build import CONTROLLERS, resolve
 from scenarios.campaign.plan import campaign_names, read_campaign
-from scenarios.cli import EXIT_DONE
+from scenarios.commands import EXIT_DONE, console
 from scenarios.commands.common import load
 from scenarios.loading import load_scenario, scenario_names
-from scenarios.spec import Group, Scenario
-from scenarios.spec.course import CsvSpec
+from scenarios.parts.vehicle import build_vehicle
+from scenarios.schema.course import CsvSpec
+from scenarios.schema.scenario import Group, Scenario
 
 _MEANT: Final = {"violated": "  (meant to violate a constraint)", "lost": "  (meant to be lost)"}
 """What `quadsim list` says of a scenario that is to defeat its controller."""
@@ -49,7 +49,7 @@ def list_everything(options: Namespace) -> int:
 def scenario(options: Namespace) -> int:
     """`quadsim scenario`."""
     if options.schema:
-        from scenarios.schema import scenario_schema
+        from scenarios.schema.json_schema import scenario_schema
 
         print(json.dumps(scenario_schema(), indent=2))
         return EXIT_DONE
@@ -67,12 +67,12 @@ def scenario(options: Namespace) -> int:
 
 def vehicle(options: Namespace) -> int:
     """`quadsim vehicle`."""
-    from scenarios.vehicle_sheet import make_sheet, sheet_tables, sheet_to_json
+    from scenarios.commands.vehicle_sheet import make_sheet, sheet_tables, sheet_to_json
 
     path = vehicle_path(options.vehicle)
     loaded, sources = load_vehicle(path), vehicle_sources(path)
     if options.out is not None:
-        from quadsim.video import render_portrait
+        from quadsim.report.film.video import render_portrait
 
         if Path(options.out).suffix != ".png":
             raise ParameterError("", "--out", options.out, "a file ending in .png")
@@ -87,7 +87,7 @@ def vehicle(options: Namespace) -> int:
 
 def doctor(options: Namespace) -> int:
     """`quadsim doctor`."""
-    from scenarios.doctor import examine
+    from scenarios.commands.doctor import examine
 
     findings = examine()
     if options.json:

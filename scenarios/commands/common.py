@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import Any
 
 from quadsim.errors import InputError
-from scenarios import console
+from scenarios.commands import console
 from scenarios.loading import load_scenario
-from scenarios.spec import Scenario
+from scenarios.schema.scenario import Scenario
 
 
 def load(name: str, options: Namespace) -> Scenario:

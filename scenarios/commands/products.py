@@ -5,13 +5,11 @@ from __future__ import annotations
 from argparse import Namespace
 from pathlib import Path
 
-from quadsim import rundir
-from quadsim.errors import FileError, ParameterError
-from quadsim.inside import require_inside
+from quadsim.errors import FileError, ParameterError, printable
+from quadsim.flight import rundir
 from quadsim.outputs import real_path
-from quadsim.printable import printable
-from scenarios import console
-from scenarios.cli import EXIT_DONE
+from quadsim.outputs.paths import require_inside
+from scenarios.commands import EXIT_DONE, console
 from scenarios.reaudit import reaudit
 
 
@@ -34,7 +32,7 @@ def video(options: Namespace) -> int:
 
 
 def _film(directory: Path, path: Path, options: Namespace) -> None:
-    from quadsim.video import render_gif, render_video
+    from quadsim.report.film.video import render_gif, render_video
 
     with console.progress_bars(enabled=True) as progress:
         if path.suffix == ".gif":
@@ -50,7 +48,7 @@ def _film(directory: Path, path: Path, options: Namespace) -> None:
 
 def view(options: Namespace) -> int:
     """`quadsim view`."""
-    from quadsim.recording import open_viewer
+    from quadsim.report.recording import open_viewer
 
     path = Path(options.run)
     recording = path / rundir.RECORDING_FILE if path.is_dir() else path

@@ -1,5 +1,1 @@
-"""What do constraints cost?  Flies and times all that a `quadsim.cost.CostStudy` tells of."""
-
-from scenarios.cost.study import find_study, fly_variations, study_cost
-
-__all__ = ["find_study", "fly_variations", "study_cost"]
+"""What do constraints cost?  Flights and times measured, and the page's section made from them."""

@@ -1,210 +1,206 @@
-"""The study of what constraints cost: which comparisons call for one, and what is flown and timed for it."""
+"""The numbers of a study of what constraints cost."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from pathlib import Path
+from dataclasses import asdict, dataclass
 from typing import Any, Final
 
 import numpy as np
 
-from mpc.solvers import SOLVERS, make_backend
-from quadsim import metrics
-from quadsim.cost import Contender, CostStudy, Outcome, Sweep, SweepPoint, Variation
-from quadsim.errors import InputError
-from quadsim.rundir import SCENARIO_FILE
-from scenarios.build import build_course_steps, build_reference
-from scenarios.cost.flights import Flown, fly, fly_all, key, time_contenders, time_flights
-from scenarios.cost.variants import (
-    course,
-    is_counterpart,
-    named,
-    own_tilt,
-    with_controller,
-    with_tilt,
-    with_vehicles,
-    without_constraints,
-)
-from scenarios.loading import load_scenario
-from scenarios.runner import Progress, machine, silent
-from scenarios.spec import ConstrainedSpec, Scenario, UnconstrainedSpec
-
-TILTS: Final = (2.0, 3.0, 4.0, 5.0, 7.0, 10.0, 15.0, 20.0)
-"""Bounds on roll and pitch that are tried [deg]."""
-HORIZONS: Final = (10, 15, 20, 30, 50, 75, 100)
-"""Horizons that are tried, N."""
-ARM_LENGTHS: Final = (0.2, 0.3, 0.5)
-"""L [m]; the paper gives none."""
-DRAGS: Final = (0.012, 0.024, 0.048)
-"""d/b [m]; the paper gives none."""
-SOLVERS_TIMED: Final = ("piqp-multistage", "piqp-dense", "qpoases")
-"""Both of this project, and the paper's own."""
-LONGEST_UNASKED: Final = 120.0
-"""A course that takes longer than this [s] is studied only when that is asked for: it is flown about thirty times."""
+from quadsim.controller import ACCEPTED, UNCONSTRAINED
+from quadsim.flight import metrics
+from quadsim.state import Array
 
 
-def find_study(targets: Sequence[str], *, asked: bool | None) -> list[Scenario]:
-    """The scenarios of what is compared that a study is made from: a constrained one, then unconstrained ones.
+@dataclass(frozen=True, kw_only=True)
+class Measure:
+    """A number that each flight of a study gives: what it is called, and its unit."""
 
-    Args:
-        targets: run directories, or scenarios.
-        asked: whether a study is wanted; None to find out: it is where a constrained and an unconstrained controller
-            fly the same course, which takes no longer than `LONGEST_UNASKED`.
+    label: str
+    unit: str
 
-    Returns:
-        The first constrained scenario and all unconstrained ones of its course, or nothing where none is to be made.
 
-    Raises:
-        InputError: a study is asked for, and nothing is flown by a constrained controller.
+MEASURES: Final[dict[str, Measure]] = {
+    "tilt_sampled": Measure(label="peak tilt at the samples", unit="deg"),
+    "tilt_plant": Measure(label="peak tilt at the physics rate", unit="deg"),
+    "rmse_x": Measure(label="RMS error x", unit="m"),
+    "rmse_y": Measure(label="RMS error y", unit="m"),
+    "rmse_z": Measure(label="RMS error z", unit="m"),
+    "rmse_yaw": Measure(label="RMS error yaw", unit="deg"),
+    "end_error": Measure(label="largest error at the end", unit="m, rad"),
+    "speed_max": Measure(label="highest rotor speed", unit="rad/s"),
+    "step_max": Measure(label="largest step of a command", unit="rad/s"),
+    "total_variation": Measure(label="total variation of the commands", unit="rad/s"),
+}
+"""The numbers of a flight, in order.  Tilt is the larger of |roll| and |pitch|, which are bounded one by one."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Outcome:
+    """What became of one flight.
+
+    Attributes:
+        reason: why it ended early; None when it was completed.
+        flown: time flown [s].
+        statuses: periods by the controller's status.
+        fallbacks: periods in which an earlier plan was held.
+        active: periods with a constraint active at their optimum.
+        numbers: a value for each of `MEASURES`, over what was flown; empty when not one period was.
+        settling: the entries of `quadsim.flight.metrics.settling`, one per step of the course.
     """
-    if asked is False:
-        return []
-    try:
-        scenarios = [load_scenario(_scenario_of(target)) for target in targets]
-    except InputError:
-        if asked:
-            raise
-        return []  # a run can be compared all the same, and what is no run is refused when it is read
-    constrained = next((each for each in scenarios if isinstance(each.controller, ConstrainedSpec)), None)
-    if constrained is None:
-        if asked:
-            raise InputError("--cost needs a flight by a constrained controller among those that are compared")
-        return []
-    assert isinstance(constrained.controller, ConstrainedSpec)
-    others = [
-        each
-        for each in scenarios
-        if isinstance(each.controller, UnconstrainedSpec) and course(each) == course(constrained)
-    ]
-    flyable = SOLVERS[constrained.controller.solver].installed
-    if asked is None and (not others or constrained.duration > LONGEST_UNASKED or not flyable):
-        return []
-    if not flyable:
-        make_backend(constrained.controller.solver)  # says what is missing, before anything is flown
-    return [constrained, *others]
+
+    reason: str | None
+    flown: float
+    statuses: Mapping[str, int]
+    fallbacks: int
+    active: int
+    numbers: Mapping[str, float]
+    settling: Sequence[Mapping[str, Any]]
+
+    @property
+    def completed(self) -> bool:
+        """Whether it was flown to its end."""
+        return self.reason is None
+
+    @property
+    def periods(self) -> int:
+        """Control periods flown."""
+        return sum(self.statuses.values())
+
+    def number(self, key: str) -> float | None:
+        """One of `MEASURES`; None for a flight that was lost, whose numbers are not like those of others."""
+        return self.numbers.get(key) if self.completed else None
 
 
-def study_cost(
-    constrained: Scenario,
-    others: Sequence[Scenario] = (),
-    *,
-    tilts: Sequence[float] = TILTS,
-    horizons: Sequence[int] = HORIZONS,
-    arm_lengths: Sequence[float] = ARM_LENGTHS,
-    drags: Sequence[float] = DRAGS,
-    solvers: Sequence[str] = SOLVERS_TIMED,
-    timed: Sequence[Contender] | None = None,
-    workers: int | None = None,
-    progress: Progress = silent,
-) -> CostStudy:
-    """Fly a constrained scenario, its counterpart without constraints, and everything they are compared with.
+@dataclass(frozen=True, kw_only=True)
+class CandidateTimes:
+    """A way to compute the commands, timed on the queries of one flight.
 
-    Steps are timed one after the other, while nothing else flies; flights are spread over processes.  What no clock
-    measured is the same however many there are.
-
-    Args:
-        constrained: by a constrained controller.
-        others: by unconstrained controllers, on the same course.
-        tilts: bounds on roll and pitch to try [deg], besides its own.
-        horizons: N to try, besides its own.
-        arm_lengths: L to try [m].
-        drags: d/b to try [m].
-        solvers: what is to solve the QP in every period, for comparison; one that is not installed is left out.
-        timed: the gain without constraints, the controller as flown, and solvers, where they have been timed already.
-        workers: processes that fly; one per usable core by default.
-        progress: told how far it is.
-
-    Returns:
-        The study.
+    Attributes:
+        name: what it is called.
+        step_ms: (K,) time of the whole controller step in each period, the median of all repeats [ms].
+        statuses: K texts, what each step answered.
+        repeats: how often each period was timed.
     """
-    spec = constrained.controller
-    assert isinstance(spec, ConstrainedSpec)
-    base = fly(constrained)
-    if timed is None:
-        contenders, left_out = time_contenders(constrained, base.control, solvers, progress)
-    else:
-        contenders, left_out = tuple(timed), {}
 
-    own = own_tilt(spec)
-    tilted = {tilt: with_tilt(constrained, tilt) for tilt in sorted({*tilts} | ({own} if own else set()))}
-    shortened = {n: with_controller(constrained, horizon=n) for n in sorted({*horizons, spec.horizon})}
-    varied = with_vehicles(constrained, arm_lengths, drags)
-    apart = named([each for each in others if not is_counterpart(each, constrained)])
+    name: str
+    step_ms: Array
+    statuses: tuple[str, ...]
+    repeats: int
 
-    wanted = [*shortened.values(), *tilted.values(), *varied.values()]
-    wanted += [without_constraints(each) for each in (constrained, *shortened.values())] + [*apart.values()]
-    flown = fly_all(wanted, {key(constrained): base}, workers, progress)
+    @property
+    def shortcut(self) -> np.ndarray[Any, np.dtype[np.bool_]]:
+        """(K,) the periods answered by an unconstrained optimum that satisfies every constraint."""
+        return np.array([status == UNCONSTRAINED for status in self.statuses])
 
-    def outcome(scenario: Scenario) -> Outcome:
-        return flown[key(scenario)].outcome
+    @property
+    def failures(self) -> int:
+        """Periods without an optimum."""
+        return sum(status not in ACCEPTED for status in self.statuses)
 
-    swept = [
-        each for each in (*tilted.values(), *shortened.values()) if not contenders or key(each) != key(constrained)
-    ]
-    steps = time_flights(swept, flown, progress)
-    if contenders:
-        steps[key(constrained)] = metrics.percentiles(contenders[1].step_ms)
-
-    def point(value: float, scenario: Scenario, *, free: bool) -> SweepPoint:
-        return SweepPoint(
-            value=value,
-            constrained=outcome(scenario),
-            step_ms=steps.get(key(scenario), {}),
-            unconstrained=outcome(without_constraints(scenario)) if free else None,
-        )
-
-    return CostStudy(
-        name=constrained.name,
-        horizon=spec.horizon,
-        deadline_ms=1e3 * constrained.control_period,
-        duration=constrained.duration,
-        constrained=base.outcome,
-        unconstrained=outcome(without_constraints(constrained)),
-        others={name: outcome(scenario) for name, scenario in apart.items()},
-        reference=_reference_settling(constrained),
-        contenders=contenders,
-        left_out=left_out,
-        tilt=Sweep(
-            name="tilt bound",
-            unit="deg",
-            base=own,
-            points=tuple(point(tilt, scenario, free=False) for tilt, scenario in tilted.items()),
-        ),
-        horizons=Sweep(
-            name="horizon",
-            unit="periods",
-            base=spec.horizon,
-            points=tuple(point(n, scenario, free=True) for n, scenario in shortened.items()),
-        ),
-        variations=_variations(varied, flown),
-        machine=machine(),
-    )
+    def rate(self, measure: str) -> float:
+        """The largest loop rate that a percentile of the step, such as `p99` or `max`, allows [Hz]."""
+        return 1e3 / metrics.percentiles(self.step_ms)[measure]
 
 
-def fly_variations(
-    constrained: Scenario,
-    *,
-    arm_lengths: Sequence[float] = ARM_LENGTHS,
-    drags: Sequence[float] = DRAGS,
-    workers: int | None = None,
-) -> tuple[Variation, ...]:
-    """The constrained flight over the parameters that the paper leaves out; see `study_cost`."""
-    varied = with_vehicles(constrained, arm_lengths, drags)
-    return _variations(varied, fly_all([*varied.values()], {}, workers, silent))
+@dataclass(frozen=True, kw_only=True)
+class SweepPoint:
+    """The flights at one value of what is swept.
+
+    Attributes:
+        value: that value.
+        constrained: the flight with constraints.
+        step_ms: median, percentiles and maximum of its controller's step [ms]; empty when not one period was flown.
+        unconstrained: the flight without them, where it depends on what is swept.
+    """
+
+    value: float
+    constrained: Outcome
+    step_ms: Mapping[str, float]
+    unconstrained: Outcome | None = None
 
 
-def _variations(varied: Mapping[tuple[float, float], Scenario], flown: Mapping[str, Flown]) -> tuple[Variation, ...]:
-    return tuple(
-        Variation(arm_length=arm, drag_to_thrust=drag, outcome=flown[key(scenario)].outcome)
-        for (arm, drag), scenario in varied.items()
-    )
+@dataclass(frozen=True, kw_only=True)
+class Sweep:
+    """Flights that differ in one number.
+
+    Attributes:
+        name: what is swept.
+        unit: its unit.
+        base: its value in the study's own flight; None where that has no one value.
+        points: in rising order of the value.
+    """
+
+    name: str
+    unit: str
+    base: float | None
+    points: tuple[SweepPoint, ...]
 
 
-def _scenario_of(target: str) -> str:
-    return str(Path(target) / SCENARIO_FILE) if Path(target).is_dir() else target
+@dataclass(frozen=True, kw_only=True)
+class Variation:
+    """The constrained flight with other values of the vehicle's parameters that the paper leaves out.
+
+    Attributes:
+        arm_length: L [m].
+        drag_to_thrust: d/b [m].
+        outcome: the flight.
+    """
+
+    arm_length: float
+    drag_to_thrust: float
+    outcome: Outcome
 
 
-def _reference_settling(scenario: Scenario) -> list[dict[str, Any]]:
-    """Settling of the filtered reference itself."""
-    t = np.arange(scenario.periods, dtype=np.float64) * scenario.control_period
-    return metrics.settling(t, build_reference(scenario, t.size), build_course_steps(scenario))
+@dataclass(frozen=True, kw_only=True)
+class CostStudy:
+    """What constraints cost, and what they buy, on one course.
+
+    Attributes:
+        name: of the constrained flight.
+        horizon: N, of both flights.
+        deadline_ms: the control period [ms].
+        duration: of the course [s].
+        constrained: the flight with constraints.
+        unconstrained: the same course, weights and horizon, without them.
+        others: compared flights of the course by unconstrained controllers with weights or a horizon of their own.
+        reference: settling of the filtered reference itself, had the vehicle followed it exactly.
+        contenders: timed on the queries of the constrained flight: the gain of the unconstrained optimum, the
+            constrained controller as it flew, and the QP in every period by one solver each.
+        left_out: solvers that could not take part, and what to do about it.
+        tilt: sweep of the bound on roll and pitch.
+        horizons: sweep of N.
+        variations: over the parameters that the paper leaves out.
+        machine: what the times were measured on.
+    """
+
+    name: str
+    horizon: int
+    deadline_ms: float
+    duration: float
+    constrained: Outcome
+    unconstrained: Outcome
+    others: Mapping[str, Outcome]
+    reference: Sequence[Mapping[str, Any]]
+    contenders: tuple[CandidateTimes, ...]
+    left_out: Mapping[str, str]
+    tilt: Sweep
+    horizons: Sweep
+    variations: tuple[Variation, ...]
+    machine: Mapping[str, Any]
+
+    def to_json(self) -> dict[str, Any]:
+        """Everything, as plain values; what a clock measured stands under `contenders` and `step_ms` alone."""
+        timed = [
+            {
+                "name": candidate.name,
+                "repeats": candidate.repeats,
+                "failures": candidate.failures,
+                "shortcuts": int(candidate.shortcut.sum()),
+                **metrics.percentiles(candidate.step_ms),
+                "step_ms": [float(f"{value:.4g}") for value in candidate.step_ms],
+            }
+            for candidate in self.contenders
+        ]
+        return {**asdict(self), "contenders": timed}

@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any, Final
 
-from scenarios.build import build_vehicle
-from scenarios.spec import ConstrainedSpec, Scenario, UnconstrainedSpec
+from scenarios.parts.vehicle import build_vehicle
+from scenarios.schema.controller import ConstrainedSpec, UnconstrainedSpec
+from scenarios.schema.scenario import Scenario
 
 _NOT_THE_COURSE: Final = {
     "name",
@@ -57,13 +58,6 @@ def without_constraints(scenario: Scenario) -> Scenario:
         input_weights=spec.input_weights,
     )
     return scenario.model_copy(update={"controller": free})
-
-
-def own_tilt(spec: ConstrainedSpec) -> float | None:
-    """The one number that bounds roll and pitch alike [deg], or None."""
-    bounds = {abs(bound) for name in ("roll", "pitch") for bound in spec.output_bounds.get(name, [])}
-    both = {"roll", "pitch"} <= spec.output_bounds.keys()
-    return bounds.pop() if both and len(bounds) == 1 else None
 
 
 def course(scenario: Scenario) -> tuple[Any, ...]:

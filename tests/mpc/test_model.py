@@ -8,7 +8,7 @@ from make_numbers import mujoco_transition, transition_difference
 
 from mpc.model import continuous_model, discretise, hover_model
 from quadsim.errors import ParameterError
-from quadsim.plant import Plant
+from quadsim.sim.plant import Plant
 from quadsim.state import Array, make_state
 from quadsim.vehicle import Vehicle
 

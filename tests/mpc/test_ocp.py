@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 from support import paper_problem, random_problem
 
-from mpc.ocp import Constraint, Objective, Penalty, Problem, tightened
+from mpc.constraints import Constraint, Penalty, tightened
+from mpc.ocp import Objective, Problem
 from quadsim.errors import ParameterError
 from quadsim.state import Array
 

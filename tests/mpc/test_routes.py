@@ -17,12 +17,14 @@ from ocp_peer import Optimum, Period
 from support import changing_period, paper_problem, random_problem, random_rows
 
 from mpc.constrained import ConstrainedMPC
+from mpc.constraints import Constraint, Penalty, tightened
 from mpc.exact.shortcut import Shortcut
 from mpc.model import LinearModel, continuous_model, discretise
 from mpc.nonlinear.linearise import linearise
 from mpc.nonlinear.model import nonlinear_model
-from mpc.ocp import Constraint, Objective, Penalty, Problem, Rest, lqr_terminal_weight, tightened
-from mpc.robust.controller import Linearisation, Relinearised, RobustMPC, RobustSettings
+from mpc.ocp import Objective, Problem, Rest, lqr_terminal_weight
+from mpc.robust.controller import Linearisation, RobustMPC, RobustSettings
+from mpc.robust.relinearised import Relinearised
 from mpc.solvers import SOLVERS, QPSolver, Way
 from quadsim.controller import ACCEPTED, SOLVED, UNCONSTRAINED, Moment
 from quadsim.state import Array, make_state

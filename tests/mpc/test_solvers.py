@@ -19,8 +19,8 @@ from mpc.solvers.piqp_dense import PiqpDense
 from mpc.staged import Staged
 from quadsim.controller import SOLVED, Moment
 from quadsim.errors import MissingPackageError, PlanExhaustedError, UnknownNameError
-from scenarios import runner
 from scenarios.loading import load_scenario
+from scenarios.run import fly_scenario
 
 ALWAYS = ("piqp-multistage", "piqp-multistage-1", "piqp-dense", "daqp", "osqp")
 """What `make setup` installs."""
@@ -95,7 +95,7 @@ def test_equality_rows_and_multipliers(kind: type[DaqpDense | OsqpSparse]) -> No
 
 def test_a_flight_by_daqp_holds_its_audit_and_is_the_same() -> None:
     flights = [
-        runner.fly_scenario(load_scenario("paper-constrained", [f"controller.solver={name}"]))
+        fly_scenario(load_scenario("paper-constrained", [f"controller.solver={name}"]))
         for name in ("daqp", "piqp-multistage")
     ]
     daqp, piqp = (flight.log.control for flight in flights)

@@ -15,10 +15,11 @@ from hypothesis import strategies as st
 from ocp_peer import Period
 from support import changing_period, flight_queries, paper_problem, paper_reference, random_problem, with_terms
 
+from mpc.constraints import Penalty
 from mpc.exact.polish import polish
 from mpc.nonlinear.linearise import linearise
 from mpc.nonlinear.model import nonlinear_model
-from mpc.ocp import Penalty, Problem, Rest
+from mpc.ocp import Problem, Rest
 from mpc.paper.condensed import Condensed, condensed
 from mpc.qp import QP, Formulation, Solution, kkt_residuals
 from mpc.solvers import QPSolver
@@ -30,7 +31,7 @@ from quadsim.controller import SOLVED
 from quadsim.errors import ParameterError
 from quadsim.state import Array
 from quadsim.vehicle import Vehicle
-from scenarios.runner import Flight
+from scenarios.run import Flight
 
 LAG = 0.05
 

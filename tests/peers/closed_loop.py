@@ -9,21 +9,17 @@ import numpy as np
 from peers.checks import Check
 from peers.rotorpy_plant import RotorPyPlant
 
-from quadsim.audit import audit
-from quadsim.flightlog import FlightLog
-from quadsim.loop import fly
-from quadsim.metrics import tracking
-from quadsim.plant import Plant
-from scenarios.build import (
-    build_controller,
-    build_initial_state,
-    build_limits,
-    build_plant,
-    build_reference,
-    build_vehicle,
-)
+from quadsim.flight.audit import audit
+from quadsim.flight.log import FlightLog
+from quadsim.flight.metrics import tracking
+from quadsim.sim.loop import fly
+from quadsim.sim.plant import Plant
+from scenarios.build import build_controller, build_plant
+from scenarios.courses.make import build_reference
 from scenarios.loading import load_scenario
-from scenarios.spec import Scenario
+from scenarios.parts.limits import build_limits
+from scenarios.parts.vehicle import build_initial_state, build_vehicle
+from scenarios.schema.scenario import Scenario
 
 SCENARIO: Final = "paper-constrained"
 HEAD: Final = ("", "on MuJoCo", "on RotorPy", "difference")

@@ -10,8 +10,8 @@ from peers.checks import Check
 from peers.rotorpy_plant import make_multirotor
 from scipy.spatial.transform import Rotation
 
-from quadsim.physics import steps_per_period
-from quadsim.plant import Plant
+from quadsim.sim.physics import steps_per_period
+from quadsim.sim.plant import Plant
 from quadsim.state import Array, make_state
 from quadsim.vehicle import N_ROTORS, Vehicle
 

@@ -7,10 +7,10 @@ from typing import Final
 
 from mpc.ocp import Problem
 from quadsim.state import Array
+from scenarios.bench.queries import recorded
 from scenarios.build import build_problem
 from scenarios.loading import load_scenario
-from scenarios.queries import recorded
-from scenarios.runner import fly_scenario
+from scenarios.run import fly_scenario
 
 SCENARIO: Final = "paper-constrained"
 

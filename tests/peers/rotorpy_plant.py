@@ -1,4 +1,4 @@
-"""RotorPy's multirotor with our vehicle's numbers, and behind the methods that `quadsim.loop.fly` calls.
+"""RotorPy's multirotor with our vehicle's numbers, and behind the methods that `quadsim.sim.loop.fly` calls.
 
 Both simulators take b w^2 [N] and d w^2 [N m] per rotor, arms from the centre of mass, +1 for a rotor that reacts with
 +z torque, and g = 9.81 m/s^2.  RotorPy keeps quaternions as (x, y, z, w), body rates in the body frame, and integrates
@@ -17,7 +17,7 @@ from rotorpy.vehicles.multirotor import Multirotor
 from scipy.integrate import solve_ivp
 
 from quadsim.errors import ParameterError
-from quadsim.physics import Stretch, physics_to_state
+from quadsim.sim.physics import Stretch, physics_to_state
 from quadsim.state import EULER, EULER_RATE, POSITION, VELOCITY, Array, euler_to_body_rates, euler_to_quaternion
 from quadsim.vehicle import N_ROTORS, Vehicle
 
@@ -53,7 +53,7 @@ def make_multirotor(vehicle: Vehicle) -> Any:
 
 
 class RotorPyPlant:
-    """RotorPy's multirotor in the place of `quadsim.plant.Plant`; the methods are explained there.
+    """RotorPy's multirotor in the place of `quadsim.sim.plant.Plant`; the methods are explained there.
 
     Attributes:
         vehicle: what flies.

@@ -11,7 +11,8 @@ from support import paper_problem, paper_reference
 from mpc.solvers import SOLVERS, QPSolver, make_backend
 from mpc.solvers.highs_sparse import hushed
 from quadsim.controller import SOLVED
-from scenarios.cli import EXIT_DONE, main
+from scenarios.cli import main
+from scenarios.commands import EXIT_DONE
 
 
 @pytest.mark.parametrize("name", SOLVERS)

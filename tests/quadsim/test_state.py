@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from quadsim.physics import physics_to_state
+from quadsim.sim.physics import physics_to_state
 from quadsim.state import (
     INDEX,
     N_STATES,

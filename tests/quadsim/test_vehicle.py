@@ -13,7 +13,7 @@ import pytest
 
 from quadsim.assets import models_dir, vehicle_names, vehicle_path
 from quadsim.errors import FileError, InputError, ParameterError, UnknownNameError
-from quadsim.rundir import vehicle_to_json
+from quadsim.flight.rundir import vehicle_to_json
 from quadsim.vehicle import OPTIONAL_PARAMETERS, VEHICLE_UNITS, Vehicle, load_vehicle, vehicle_sources
 
 FILE = vehicle_path("lopes2011")

@@ -17,12 +17,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from quadsim.errors import InputError
-from quadsim.flightlog import FlightLog, write_log
-from scenarios.build import build_vehicle, resolve
-from scenarios.checking import check_parts
-from scenarios.loading import parse_scenario
-from scenarios.runner import fly_scenario, summarise
-from scenarios.spec import Scenario
+from quadsim.flight.log import FlightLog
+from quadsim.flight.parquet import write_log
+from scenarios.build import resolve
+from scenarios.loading import check_parts, parse_scenario
+from scenarios.parts.vehicle import build_vehicle
+from scenarios.run import fly_scenario, summarise
+from scenarios.schema.scenario import Scenario
 
 
 def number(lower: float, upper: float) -> st.SearchStrategy[float]:

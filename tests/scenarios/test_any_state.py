@@ -10,11 +10,13 @@ from fault_injection import recorded
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from quadsim.loop import fly
-from quadsim.plant import Plant
+from quadsim.sim.loop import fly
+from quadsim.sim.plant import Plant
 from quadsim.state import EULER, EULER_RATE, N_STATES, POSITION, VELOCITY, tilt
-from scenarios.build import build_controller, build_reference, build_vehicle
+from scenarios.build import build_controller
+from scenarios.courses.make import build_reference
 from scenarios.loading import load_scenario
+from scenarios.parts.vehicle import build_vehicle
 
 PERIODS = 6
 SCENARIO = load_scenario("robust", [f"duration={0.05 * PERIODS}", "controller.rotor_lag=0.03", "constraints=[]"])

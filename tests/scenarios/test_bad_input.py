@@ -11,12 +11,12 @@ from support import scenario_table
 
 from quadsim.assets import vehicle_path
 from quadsim.errors import InputError
-from scenarios import bases
 from scenarios.cli import main
-from scenarios.courses import table
+from scenarios.courses import csv_course
 from scenarios.loading import load_scenario, parse_scenario
-from scenarios.problems import ScenarioError
-from scenarios.spec.base import MOST_ENTRIES
+from scenarios.schema import bases
+from scenarios.schema.base import MOST_ENTRIES
+from scenarios.schema.problems import ScenarioError
 
 MINE = 'base = "hover"\nname = "mine"\n'
 ESTIMATOR = ["estimator.type=error_state", "sensors.attitude={rate=100, noise=1}"]
@@ -409,7 +409,7 @@ def test_a_course_that_is_too_long_is_not_read(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, most: int, message: str
 ) -> None:
     (tmp_path / "course.csv").write_text(ROWS)
-    monkeypatch.setattr(table, name, most)
+    monkeypatch.setattr(csv_course, name, most)
     with pytest.raises(InputError, match=message):
         load_scenario("hover", [f"reference={{type='csv', file='{tmp_path / 'course.csv'}'}}"])
 

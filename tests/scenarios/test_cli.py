@@ -19,11 +19,13 @@ from xml.etree import ElementTree
 import pytest
 
 from mpc.solvers import SOLVERS
-from quadsim import __version__, rundir
+from quadsim import __version__
 from quadsim.assets import vehicle_names
 from quadsim.errors import QuadsimError, RenderingUnavailableError
+from quadsim.flight import rundir
 from scenarios.campaign.plan import campaign_names
-from scenarios.cli import EXIT_DONE, EXIT_FAILED, EXIT_WRONG_INPUT, main
+from scenarios.cli import main
+from scenarios.commands import EXIT_DONE, EXIT_FAILED, EXIT_WRONG_INPUT
 from scenarios.loading import LIBRARY, load_scenario, scenario_names
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -318,7 +320,7 @@ def test_a_film_beside_a_run_is_not_hashed_and_one_in_it_is(
     hover_directory: Path, here: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     shutil.copytree(hover_directory, "run")
-    monkeypatch.setattr("quadsim.video.render_video", lambda _, path, **__: path.write_bytes(b"film"))
+    monkeypatch.setattr("quadsim.report.film.video.render_video", lambda _, path, **__: path.write_bytes(b"film"))
     assert main(["video", "run", "--out", "beside.mp4"]) == EXIT_DONE
     assert "flight.mp4" not in rundir.read_summary(here / "run")["files"]
     assert main(["video", "run"]) == EXIT_DONE
@@ -473,9 +475,9 @@ def test_a_run_that_needs_a_film_is_refused_before_it_is_flown_where_nothing_ren
     def flown(*_: object) -> None:
         pytest.fail("it must not be flown")
 
-    monkeypatch.setattr("quadsim.video.rendering_backend", nothing_renders)
+    monkeypatch.setattr("quadsim.report.film.video.rendering_backend", nothing_renders)
     with monkeypatch.context() as grounded:
-        grounded.setattr("scenarios.runner.fly_scenario", flown)
+        grounded.setattr("scenarios.run.fly_scenario", flown)
         assert main(["run", "hover"]) == EXIT_WRONG_INPUT
     printed = capsys.readouterr()
     assert printed.err.startswith(
@@ -683,7 +685,7 @@ def test_ctrl_c_outside_a_flight_is_status_1_and_leaves_nothing(
     def interrupted(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("quadsim.figures.write_figures", interrupted)
+    monkeypatch.setattr("quadsim.report.figures.flight_figures.write_figures", interrupted)
     assert main(["run", "hover", *SHORT, "--no-video", "--no-recording"]) == EXIT_FAILED
     assert capsys.readouterr().err == "quadsim: interrupted (Ctrl-C); nothing half written was left behind\n"
     assert left_in(here) == []
@@ -694,7 +696,7 @@ def test_a_defect_of_our_own_shows_its_traceback(here: Path, monkeypatch: pytest
         raise ZeroDivisionError
 
     assert not issubclass(ZeroDivisionError, QuadsimError)
-    monkeypatch.setattr("scenarios.flying.fly", broken)
+    monkeypatch.setattr("scenarios.run.fly", broken)
     with pytest.raises(ZeroDivisionError):
         main(["check", "hover"])
 

@@ -32,8 +32,8 @@ from fault_injection import (
 
 from mpc.solvers._piqp import STATUS
 from quadsim.errors import CommandError
-from quadsim.plant import Plant
-from quadsim.sensing import SensorName
+from quadsim.sim.plant import Plant
+from quadsim.sim.sensing.sensor import SensorName
 from quadsim.vehicle import Vehicle
 
 FLIGHTS = (("robust", "mass +30 %"), ("robust", "worn rotor"), ("paper", "nominal"))

@@ -14,14 +14,13 @@ import pytest
 from make_scenarios import HEAD, PAGE, TITLES, nearest, row
 
 from quadsim.controller import ACCEPTED, MISSED
-from quadsim.flightlog import FLIGHT_FILE, PLANT_FILE, FlightLog, PlantLog, write_log
+from quadsim.flight.log import FlightLog, PlantLog
+from quadsim.flight.parquet import FLIGHT_FILE, PLANT_FILE, write_log
 from quadsim.state import INDEX
-from scenarios import runner
-from scenarios.courses.table import read_table
+from scenarios.courses.csv_course import read_table
 from scenarios.loading import LIBRARY, load_scenario, parse_scenario, scenario_names
-from scenarios.runner import Flight
-from scenarios.spec import Group, Scenario
-from scenarios.spec.lost import LostSpec
+from scenarios.run import Flight, fly_scenario, summarise
+from scenarios.schema.scenario import Group, LostSpec, Scenario
 
 ALREADY_FLOWN = {"paper-constrained": "constrained_flight", "paper-unconstrained": "unconstrained_flight"}
 """Fixtures of the whole session."""
@@ -36,7 +35,7 @@ def flight(request: pytest.FixtureRequest) -> Flight:
 
 
 def fly(scenario: Scenario, *, seed: int | None = None) -> Flight:
-    return runner.fly_scenario(scenario if seed is None else scenario.model_copy(update={"seed": seed}))
+    return fly_scenario(scenario if seed is None else scenario.model_copy(update={"seed": seed}))
 
 
 def written(flight: Flight, directory: Path) -> tuple[bytes, bytes]:
@@ -60,7 +59,7 @@ def draws(scenario: Scenario) -> bool:
 
 def error(flight: Flight, channel: str) -> float:
     """Real minus reference at the last sample."""
-    return float(runner.summarise(flight)["tracking"]["final_error"][channel])
+    return float(summarise(flight)["tracking"]["final_error"][channel])
 
 
 def estimation_rmse(log: FlightLog, columns: list[int]) -> float:
@@ -116,7 +115,7 @@ def jitter_misses_one_in_twenty(flight: Flight) -> None:
 
 
 def lands_gently(flight: Flight) -> None:
-    ground = runner.summarise(flight)["ground"]
+    ground = summarise(flight)["ground"]
     assert ground["phase"] == "landed"
     assert not ground["crashed"]
     assert 0.0 < ground["touchdown"]["speed"] < 0.5
@@ -127,16 +126,16 @@ def lands_gently(flight: Flight) -> None:
 
 
 def lands_by_estimate(flight: Flight) -> None:
-    ground, log = runner.summarise(flight)["ground"], flight.log.control
+    ground, log = summarise(flight)["ground"], flight.log.control
     assert ground["phase"] == "landed"
     assert 0.0 < ground["touchdown"]["speed"] < 0.5
     assert ground["touchdown"]["tilt"] < 2.0
     assert np.abs(log.state - log.truth)[log.t >= 1.0, INDEX["vz"]].max() < 0.3
-    assert runner.summarise(flight)["estimation"]["samples"]["position"]["rejected"] < 20
+    assert summarise(flight)["estimation"]["samples"]["position"]["rejected"] < 20
 
 
 def lands_hard(flight: Flight) -> None:
-    ground = runner.summarise(flight)["ground"]
+    ground = summarise(flight)["ground"]
     assert ground["touchdown"]["speed"] == pytest.approx(1.9, abs=0.05)
     assert ground["phase"] == "landed"
 

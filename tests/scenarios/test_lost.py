@@ -8,17 +8,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from quadsim import rundir
 from quadsim.controller import Phase
-from quadsim.lost import LossCriteria
+from quadsim.flight import rundir
+from quadsim.flight.lost import LossCriteria
 from quadsim.state import tilt
 from scenarios import cli
-from scenarios.build import build_loss
 from scenarios.campaign.pilot import CampaignPilot
 from scenarios.campaign.plan import load_plan
 from scenarios.loading import load_scenario
-from scenarios.problems import ScenarioError
-from scenarios.runner import fly_scenario, summarise
+from scenarios.parts.limits import build_loss
+from scenarios.run import fly_scenario, summarise
+from scenarios.schema.problems import ScenarioError
 
 UNSTABLE = '''
 import numpy as np

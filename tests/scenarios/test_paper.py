@@ -5,11 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from quadsim.audit import Finding
 from quadsim.controller import ACCEPTED, SOLVED, UNCONSTRAINED
-from scenarios import runner
+from quadsim.flight.audit import Finding
 from scenarios.loading import load_scenario
-from scenarios.runner import Flight
+from scenarios.run import Flight, fly_scenario, summarise
 
 SAMPLED, PLANT = 0.01, 0.05
 """How far beyond 5 deg roll and pitch may go [deg]: at the control samples, and at the physics rate."""
@@ -48,7 +47,7 @@ def test_constrained_flight_keeps_every_bound_and_arrives(constrained_flight: Fl
 @pytest.mark.parametrize("drag_to_thrust", [0.012, 0.024, 0.048])
 def test_it_holds_over_the_parameters_the_paper_leaves_out(arm_length: float, drag_to_thrust: float) -> None:
     settings = [f"vehicle.arm_length={arm_length}", f"vehicle.drag_to_thrust={drag_to_thrust}"]
-    flight = runner.fly_scenario(load_scenario("paper-constrained", settings))
+    flight = fly_scenario(load_scenario("paper-constrained", settings))
     assert_constrained_flight_holds(flight, plant_tolerance=0.1)
 
 
@@ -62,13 +61,13 @@ def test_unconstrained_flight_tracks_and_leaves_every_bound(unconstrained_flight
         assert not found[name].limit.required
         assert found[name].time_violated > 0.0
     assert unconstrained_flight.satisfied  # it promised none of them
-    entries = {entry["name"]: entry for entry in runner.summarise(unconstrained_flight)["constraints"]}
+    entries = {entry["name"]: entry for entry in summarise(unconstrained_flight)["constraints"]}
     assert entries["roll"]["worst_margin"] == pytest.approx(-4.48, abs=0.01)
     assert entries["speed"]["worst_margin"] == pytest.approx(-121.7, abs=0.1)
 
 
 def test_clipped_flight_shows_what_a_real_rotor_would_do() -> None:
-    flight = runner.fly_scenario(load_scenario("paper-unconstrained-clipped"))
+    flight = fly_scenario(load_scenario("paper-unconstrained-clipped"))
     assert flight.log.control.speeds.max() > 300.0
     assert flight.log.plant.speeds.max() == 250.0
     assert flight.satisfied
@@ -88,7 +87,7 @@ def test_constraints_make_the_profile_smoother(constrained_flight: Flight, uncon
 
 
 def test_both_solvers_fly_the_same_commands(constrained_flight: Flight) -> None:
-    dense = runner.fly_scenario(load_scenario("paper-constrained", ["controller.solver=piqp-dense"]))
+    dense = fly_scenario(load_scenario("paper-constrained", ["controller.solver=piqp-dense"]))
     difference = np.abs(dense.log.control.speeds - constrained_flight.log.control.speeds).max()
     assert difference < 1e-2
     assert dense.satisfied
@@ -128,7 +127,7 @@ def test_other_cases_fly_too() -> None:
         "constraints.arrival_z.required=false",
         "constraints.arrival_yaw.required=false",
     ]
-    flight = runner.fly_scenario(load_scenario("paper-constrained", settings))
+    flight = fly_scenario(load_scenario("paper-constrained", settings))
     assert len(flight.log.control.status) == 400
     assert set(flight.log.control.status) <= ACCEPTED
     assert flight.satisfied

@@ -14,10 +14,11 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from quadsim import rundir
 from quadsim.errors import FileError
-from quadsim.flightlog import FLIGHT_FILE, PLANT_FILE, TIMING_FILE
-from scenarios.cli import EXIT_DONE, EXIT_FAILED, EXIT_WRONG_INPUT, main
+from quadsim.flight import rundir
+from quadsim.flight.parquet import FLIGHT_FILE, PLANT_FILE, TIMING_FILE
+from scenarios.cli import main
+from scenarios.commands import EXIT_DONE, EXIT_FAILED, EXIT_WRONG_INPUT
 from scenarios.reaudit import reaudit
 from tests.safety_mutations import unseal
 
@@ -226,7 +227,7 @@ def test_a_film_does_not_hide_what_was_tampered_with(
     flown: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     run = shutil.copytree(flown / "good", tmp_path / "run")
-    monkeypatch.setattr("quadsim.video.render_video", lambda _, path, **__: path.write_bytes(b"film"))
+    monkeypatch.setattr("quadsim.report.film.video.render_video", lambda _, path, **__: path.write_bytes(b"film"))
     assert main(["video", str(run)]) == EXIT_DONE
     assert main(["check", str(run)]) == EXIT_DONE  # the new film is listed, the digest still stands
     (run / "horizon.parquet").write_bytes(b"another")

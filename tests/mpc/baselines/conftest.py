@@ -14,10 +14,10 @@ from mpc.baselines.lqr import LQR, LQRSettings, bryson_objective
 from mpc.baselines.pid import CascadedPID, pid_settings
 from quadsim.assets import vehicle_path
 from quadsim.controller import Controller
-from quadsim.effects import Effects
-from quadsim.flightlog import FlightLog
-from quadsim.loop import fly
-from quadsim.plant import Plant
+from quadsim.flight.log import FlightLog
+from quadsim.sim.effects import Effects
+from quadsim.sim.loop import fly
+from quadsim.sim.plant import Plant
 from quadsim.state import Array
 from quadsim.vehicle import Vehicle, load_vehicle
 

@@ -13,7 +13,7 @@ import pytest
 from mpc.baselines.cascade import Memory, fly_cascade, force_within, fresh_memory, velocity_wanted
 from mpc.baselines.preview import Target
 from quadsim.controller import Moment
-from quadsim.flightlog import FlightLog
+from quadsim.flight.log import FlightLog
 from quadsim.state import INDEX, Array, make_state
 from quadsim.vehicle import Vehicle
 

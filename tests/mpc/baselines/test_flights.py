@@ -9,8 +9,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from quadsim.effects import Effects, Load, RotorDynamics
-from quadsim.flightlog import FlightLog
+from quadsim.flight.log import FlightLog
+from quadsim.sim.effects import Effects
+from quadsim.sim.effects.load import Load
+from quadsim.sim.effects.rotors import RotorDynamics
 from quadsim.state import INDEX, make_state
 from quadsim.vehicle import Vehicle
 

@@ -15,7 +15,7 @@ from mpc.baselines.attitude import attitude_error_function, vee
 from mpc.baselines.preview import Target
 from mpc.baselines.tracking import Gains, Integrals, Motion, Wanted, geometric_wrench, integrate, motion_of
 from quadsim.controller import Moment
-from quadsim.flightlog import FlightLog
+from quadsim.flight.log import FlightLog
 from quadsim.state import make_state, tilt
 from quadsim.vehicle import Vehicle
 

@@ -36,18 +36,19 @@ from mpc.model import LinearModel, hover_model
 from mpc.ocp import Problem, Rest
 from mpc.solvers import Answer, QPSolver
 from mpc.solvers._piqp import STATUS
-from quadsim.airframe import outline
 from quadsim.assets import vehicle_path
-from quadsim.computation import Computation, Stall
 from quadsim.controller import ACCEPTED, Command, Moment, Phase
-from quadsim.effects import Effects
 from quadsim.errors import CommandError, ParameterError
-from quadsim.flightlog import FlightLog
-from quadsim.loop import fly
-from quadsim.navigation import Navigation
-from quadsim.phase import PhaseMonitor, clearance
-from quadsim.plant import Plant
-from quadsim.sensing import FaultKind, SensorFault, SensorName
+from quadsim.flight.ground import clearance
+from quadsim.flight.log import FlightLog
+from quadsim.sim.airframe import outline
+from quadsim.sim.computation import Computation, Stall
+from quadsim.sim.effects import Effects
+from quadsim.sim.loop import fly
+from quadsim.sim.navigation import Navigation
+from quadsim.sim.phase import PhaseMonitor
+from quadsim.sim.plant import Plant
+from quadsim.sim.sensing.sensor import FaultKind, SensorFault, SensorName
 from quadsim.state import EULER, EULER_RATE, INDEX, POSITION, VELOCITY, Array, make_state
 from quadsim.vehicle import Vehicle, load_vehicle
 

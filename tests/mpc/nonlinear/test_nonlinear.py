@@ -13,9 +13,10 @@ import pytest
 from mpc.model import hover_model
 from mpc.nonlinear.linearise import linearise
 from mpc.nonlinear.model import NonlinearModel, advance, derivative, nonlinear_model
-from quadsim.effects import Disturbance, Effects, RotorDynamics
 from quadsim.errors import ParameterError
-from quadsim.plant import Plant
+from quadsim.sim.effects import Disturbance, Effects
+from quadsim.sim.effects.rotors import RotorDynamics
+from quadsim.sim.plant import Plant
 from quadsim.state import (
     EULER,
     EULER_RATE,

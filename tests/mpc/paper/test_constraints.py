@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from support import paper_problem, random_problem
 
-from mpc.ocp import Bounds
+from mpc.constraints import Bounds
 from mpc.paper.constraints import inequalities
 from mpc.paper.prediction import prediction, rollout
 from quadsim.errors import ParameterError

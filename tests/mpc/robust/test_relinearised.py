@@ -11,8 +11,9 @@ import pytest
 from ocp_peer import Period
 from support import changing_period, paper_problem, random_problem
 
-from mpc.ocp import Penalty, Problem
-from mpc.robust.controller import LARGEST, Relinearised
+from mpc.constraints import Penalty
+from mpc.ocp import Problem
+from mpc.robust.relinearised import LARGEST, Relinearised
 from mpc.solvers import Answer
 from quadsim.controller import ACCEPTED, SOLVED
 

@@ -12,25 +12,26 @@ import pytest
 from support import paper_problem, paper_reference
 
 from mpc.constrained import ConstrainedMPC
+from mpc.constraints import Penalty
 from mpc.equilibrium import equilibrium
 from mpc.fallback.completion import Reckoned
 from mpc.heading import turn_horizontally
 from mpc.model import continuous_model, discretise, hover_model
 from mpc.nonlinear.linearise import linearise
 from mpc.nonlinear.model import NonlinearModel, advance, derivative, nonlinear_model
-from mpc.ocp import Penalty
 from mpc.robust.controller import Linearisation, RobustMPC, RobustSettings
 from mpc.robust.observer import ObserverSettings
 from mpc.solvers import QPSolver
 from quadsim.controller import ACCEPTED, SOLVED, UNCONSTRAINED, Moment, Phase
-from quadsim.effects.rotors import RotorDynamics
 from quadsim.errors import ParameterError
+from quadsim.sim.effects.rotors import RotorDynamics
 from quadsim.state import INDEX, POSITION, Array, make_state
 from quadsim.vehicle import Vehicle
-from scenarios.build import build_plant, build_problem, build_reference, build_vehicle
-from scenarios.flying import fly_once
+from scenarios.build import build_plant, build_problem
+from scenarios.courses.make import build_reference
 from scenarios.loading import load_scenario
-from scenarios.runner import Flight
+from scenarios.parts.vehicle import build_vehicle
+from scenarios.run import Flight, fly_once
 
 PERIOD = 0.05
 SOFT = Penalty(l1=np.full(2, 2e5), l2=np.full(2, 1e4))

@@ -13,9 +13,9 @@ import pytest
 import scipy.linalg
 from support import paper_problem, paper_reference
 
+from mpc.constraints import Bounds, Penalty
 from mpc.model import discretise
 from mpc.nonlinear.model import advance, derivative, nonlinear_model
-from mpc.ocp import Bounds, Penalty
 from mpc.robust.controller import RobustMPC, RobustSettings
 from mpc.robust.observer import ObserverSettings
 from mpc.robust.tightening import (
@@ -34,9 +34,10 @@ from quadsim.controller import ACCEPTED, Moment
 from quadsim.errors import ParameterError
 from quadsim.state import INDEX, Array
 from quadsim.vehicle import Vehicle
-from scenarios.build import build_plant, build_reference
-from scenarios.flying import fly_once
+from scenarios.build import build_plant
+from scenarios.courses.make import build_reference
 from scenarios.loading import load_scenario
+from scenarios.run import fly_once
 
 ROOT = Path(__file__).resolve().parents[3]
 TILTS = [INDEX["roll"], INDEX["pitch"]]

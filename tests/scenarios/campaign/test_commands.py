@@ -17,7 +17,8 @@ import pytest
 import tomlkit
 
 from quadsim.outputs import digest_of
-from scenarios.cli import EXIT_DONE, EXIT_FAILED, EXIT_WRONG_INPUT, main
+from scenarios.cli import main
+from scenarios.commands import EXIT_DONE, EXIT_FAILED, EXIT_WRONG_INPUT
 
 MASS = {
     "name": "mass",

@@ -12,18 +12,19 @@ from typing import Any
 import pytest
 import tomlkit
 
-from quadsim.campaign.table import Row, read_table
 from quadsim.errors import InputError, OutputError, ParameterError
 from quadsim.outputs import Growing, growing
 from scenarios.campaign import manifest as records
 from scenarios.campaign import run as module
-from scenarios.campaign.engine import Pilot
-from scenarios.campaign.local import LocalEngine
+from scenarios.campaign.engine.local import LocalEngine
+from scenarios.campaign.engine.protocol import Pilot
 from scenarios.campaign.manifest import read_manifest
 from scenarios.campaign.plan import Plan, load_plan
 from scenarios.campaign.replay import recorded_flight, replay
+from scenarios.campaign.results.table import Row, read_table
 from scenarios.campaign.run import SUMMARY_FILE, Result, Standing
-from scenarios.runner import Outputs, processor_name
+from scenarios.machine import processor_name
+from scenarios.run import Outputs
 
 CAMPAIGN: dict[str, Any] = {
     "name": "little",

@@ -29,16 +29,18 @@ from campaign_pilots import ToyPilot, known, living, until, value_of
 from hostile_controller import KINDS
 from safety_campaign import measure, planned, write
 
-from quadsim.campaign.table import ERROR, Row
-from quadsim.plant import Plant
-from scenarios.campaign.engine import MOST_DEATHS
-from scenarios.campaign.local import LocalEngine
+from quadsim.sim.plant import Plant
+from scenarios.campaign.engine.local import LocalEngine
+from scenarios.campaign.engine.protocol import MOST_DEATHS
+from scenarios.campaign.engine.worker import Traces
 from scenarios.campaign.plan import load_plan
+from scenarios.campaign.results.table import Row
+from scenarios.campaign.results.verdicts import ERROR
 from scenarios.campaign.spec import LimitsSpec
-from scenarios.campaign.traces import Traces
-from scenarios.cli import EXIT_DONE, EXIT_FAILED, main
-from scenarios.problems import ScenarioError
-from scenarios.runner import Progress, silent
+from scenarios.cli import main
+from scenarios.commands import EXIT_DONE, EXIT_FAILED
+from scenarios.progress import Progress, silent
+from scenarios.schema.problems import ScenarioError
 
 ROOT = Path(__file__).resolve().parents[3]
 FLIGHTS = range(12)
@@ -367,7 +369,7 @@ PARENT = """
 import sys
 from pathlib import Path
 from test_survival import Hostile, hold_the_interpreter
-from scenarios.campaign.local import LocalEngine
+from scenarios.campaign.engine.local import LocalEngine
 
 for _ in LocalEngine(2).answers(Hostile(harm=hold_the_interpreter, diary=Path(sys.argv[1])), [5]):
     pass

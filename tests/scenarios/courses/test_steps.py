@@ -7,8 +7,8 @@ import math
 import numpy as np
 import pytest
 
-from quadsim.metrics import CourseStep, settling
-from scenarios.courses import build_course_steps, build_reference
+from quadsim.flight.metrics import CourseStep, settling
+from scenarios.courses.make import build_course_steps, build_reference
 from scenarios.courses.smoothing import smooth
 from scenarios.courses.steps import Window, steps, switches
 from scenarios.loading import load_scenario

@@ -1,0 +1,161 @@
+"""Remake what docs/performance.md tells of a flight's time outside the QP: `python docs/make_outside.py BEFORE`.
+
+Two checkouts, the one in the directory BEFORE and this one, fly, run and film the same in turns, each in a process of
+its own.  Times are of processors, those of child processes included, so that what else the machine does counts little.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import json
+import os
+import resource
+import statistics
+import subprocess
+import sys
+import tempfile
+import time as clock
+from collections.abc import Callable, Iterator
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any, Final
+
+ROOT: Final = Path(__file__).resolve().parent.parent
+PAGE: Final = ROOT / "docs" / "performance.md"
+TITLE: Final = "## What a flight costs outside the QP"
+RUNS: Final = 5
+FLIGHTS: Final = {"a robust flight in wind": "robust", "`paper-constrained`": "paper-constrained"}
+COMMANDS: Final = (
+    ("`quadsim run paper-constrained --no-video`", "--no-video"),
+    ("6 s of it, and the film alone", "--set", "duration=6.0", "--no-recording", "--no-figures"),
+)
+TEXT: Final = """\
+The median of {runs} runs of each of two checkouts in turns, `{before}` and `{after}`, and of the ratios of neighbours;
+processor time. `python docs/make_outside.py BEFORE` remakes this section, with a checkout of the former in the
+directory BEFORE. The robust flight is the first of `paper-robustness-robust`: 60 s with rotor lag, rotor drag, wind,
+turbulence and four sensors.
+
+{table}
+
+- What can be worked out ahead of the flight is, many at a time: the wind of 4096 physics steps, and noise, bias,
+  dropouts and outliers of 256 samples of a sensor. What the rotors' speeds give to the forces is worked out for all
+  steps of a control period at once.
+- Forces that follow from the motion cannot be: each depends on the step before it. They are plain numbers in one
+  function, a microsecond a step, and reach MuJoCo through its memory. MuJoCo's own step takes more than half of the
+  plant's time.
+- A flight's numbers are the same to the bit in both, and so are the pixels of figures and films.
+- No pass of Python's cycle collector over what was there before a flight falls into one of its steps, whatever is
+  installed: it is frozen, and collected between flights; see `scenarios/gc_tuning.py`.
+- A command imports what it takes, not what all commands take; figures are laid out without being drawn for it; a film
+  keeps its words as pictures. What is left of a frame is the rasteriser's and the encoder's.
+"""
+
+
+def measure(name: str) -> dict[str, float]:
+    """Processor seconds of one flight by the checkout that this process imports, by what they were spent on."""
+    from scenarios.campaign.plan import load_plan
+    from scenarios.loading import load_scenario
+
+    runner = importlib.import_module("scenarios.run" if find_spec("scenarios.run") else "scenarios.runner")
+    robust = load_plan("paper-robustness-robust").of(0)
+    scenario = robust if name == "robust" else load_scenario(name)
+    vehicle = runner.build_vehicle(robust)
+    plant, navigation = (type(build(robust, vehicle)) for build in (runner.build_plant, runner.build_navigation))
+    spent: dict[str, float] = {}
+    for owner, method, piece in (
+        (plant, "advance", "plant and its effects"),
+        (plant, "state", "the true state"),
+        (navigation, "advance", "sensors"),
+        (navigation, "state", "sensors"),
+    ):
+        setattr(owner, method, _timed(getattr(owner, method), spent, piece))
+    runner.fly_scenario(scenario.model_copy(update={"duration": 1.0}))  # loads what is loaded late
+    spent.clear()
+    started = clock.thread_time()
+    runner.fly_scenario(scenario)
+    return {**spent, "the whole flight": clock.thread_time() - started}
+
+
+def _timed(function: Callable[..., Any], spent: dict[str, float], piece: str) -> Callable[..., Any]:
+    def call(*arguments: Any, **named: Any) -> Any:
+        started = clock.thread_time()
+        try:
+            return function(*arguments, **named)
+        finally:
+            spent[piece] = spent.get(piece, 0.0) + clock.thread_time() - started
+
+    return call
+
+
+def _command(tree: Path, *arguments: str) -> tuple[str, float]:
+    """Stdout of a Python command in a checkout, and its processor seconds."""
+    environment = {**os.environ, "PYTHONPATH": str(tree), "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+    done = subprocess.run([sys.executable, *arguments], cwd=tree, env=environment, capture_output=True, text=True)
+    if done.returncode not in (0, 1):  # a flight may violate its constraints
+        raise SystemExit(done.stderr)
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return done.stdout, sum(after[:2]) - sum(before[:2])
+
+
+def _once(tree: Path, run: Path) -> Iterator[tuple[str, float]]:
+    """All that is measured of a checkout, once; `run` is where its run goes."""
+    for label, name in FLIGHTS.items():
+        pieces = json.loads(_command(tree, str(Path(__file__)), "--measure", name)[0])
+        yield from ((f"{label}: {piece}", seconds) for piece, seconds in pieces.items())
+    for label, *arguments in COMMANDS:
+        command = ("-m", "scenarios.cli", "run", "paper-constrained", "--out", str(run), *arguments)
+        yield f"{label}, all processes", _command(tree, *command)[1]
+
+
+def compare(before: Path, runs: int) -> list[tuple[str, ...]]:
+    """A table with its head: what it was, what it is, and the median of the ratios of neighbours."""
+    times: dict[str, list[float]] = {}
+    with tempfile.TemporaryDirectory() as scratch:
+        for _ in range(runs):
+            for tree in (before, ROOT):
+                for name, value in _once(tree, Path(scratch) / "run"):
+                    times.setdefault(name, []).append(value)
+    rows: list[tuple[str, ...]] = [("processor time [s]", "before", "after", "ratio")]
+    for name, values in times.items():
+        pairs = list(zip(values[::2], values[1::2], strict=True))
+        old, new = (statistics.median(of_tree) for of_tree in zip(*pairs, strict=True))
+        ratio = statistics.median(after / then for then, after in pairs)
+        rows.append((name, f"{old:.2f}", f"{new:.2f}", f"{ratio:.2f}"))
+    return rows
+
+
+def outside(page: str) -> str:
+    """The section as a page has it; empty where it has none."""
+    return "".join(page.partition(TITLE)[1:])
+
+
+def _commit(tree: Path) -> str:
+    asked = ["git", "-C", str(tree), "rev-parse", "--short", "HEAD"]
+    return subprocess.run(asked, capture_output=True, text=True, check=True).stdout.strip()
+
+
+def main() -> None:
+    """Measure two checkouts in turns and write the section, the last of the page."""
+    parser = argparse.ArgumentParser(description=main.__doc__)
+    parser.add_argument("before", nargs="?", type=Path, help="directory of the checkout to compare with")
+    parser.add_argument("--runs", type=int, default=RUNS, help="of each checkout")
+    parser.add_argument("--measure", help=argparse.SUPPRESS)
+    options = parser.parse_args()
+    if options.measure is not None:
+        print(json.dumps(measure(options.measure)))
+        return
+    if options.before is None:
+        parser.error("BEFORE is missing")
+    from make_numbers import markdown
+
+    before, after = options.before.resolve(), _commit(ROOT)
+    table = markdown(compare(before, options.runs)).rstrip()
+    text = TEXT.format(table=table, runs=options.runs, before=_commit(before), after=after)
+    page = PAGE.read_text(encoding="utf-8")
+    PAGE.write_text(f"{page.partition(TITLE)[0].rstrip()}\n\n{TITLE}\n\n{text}", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,189 @@
+"""Constraints as values, and the rows of all of them: what is built from a problem walks these and knows no kind."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from quadsim.errors import ParameterError
+from quadsim.state import N_STATES, STATE_NAMES, STATE_UNITS, Array, Indices
+
+
+@dataclass(frozen=True, kw_only=True)
+class Penalty:
+    """What violating a row of a soft constraint by e costs: l1 e + l2 e^2.
+
+    While l1 exceeds the multiplier that the hard row would have, the penalty is exact: e is zero wherever the hard
+    problem is feasible (Kerrigan and Maciejowski, 2000, "Soft constraints and exact penalty functions in model
+    predictive control").
+
+    Attributes:
+        l1: (m,) at least 0.
+        l2: (m,) at least 0.
+    """
+
+    l1: Array
+    l2: Array
+
+    def __post_init__(self) -> None:
+        for name in ("l1", "l2"):
+            value = getattr(self, name)
+            if value.shape != self.l1.shape or value.ndim != 1 or not (np.isfinite(value) & (value >= 0.0)).all():
+                raise ParameterError("controller", name, value, "one finite number >= 0 per constrained output")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Constraint:
+    """lower <= C x(k+i) + D u(k+i) + E (u(k+i) - u(k+i-1)) <= upper.
+
+    Rows of states alone hold at x(k+1) .. x(k+N), all others at i = 0 .. N-1.
+
+    Attributes:
+        name: as messages and audits name it.
+        lower, upper: (m,), or (N, m) where the steps' bounds differ; infinite where there is no bound.
+        C: (m, n); None for zeros.
+        D: (m, nu); likewise.
+        E: (m, nu); likewise.
+        penalty: what violating it costs; None for a hard constraint.
+    """
+
+    name: str
+    lower: Array
+    upper: Array
+    C: Array | None = None
+    D: Array | None = None
+    E: Array | None = None
+    penalty: Penalty | None = None
+
+    def __post_init__(self) -> None:
+        lower, upper = self.lower, self.upper
+        if lower.shape != upper.shape or np.any(np.isnan(lower)) or np.any(np.isnan(upper)):
+            raise ParameterError(
+                "controller", f"{self.name}.lower", lower, f"numbers of the same shape as upper = {upper}"
+            )
+        if np.any(lower >= upper):
+            raise ParameterError("controller", f"{self.name}.lower", lower, f"below upper = {upper}")
+        given = [matrix for matrix in (self.C, self.D, self.E) if matrix is not None]
+        if not given or any(len(matrix) != lower.shape[-1] for matrix in given):
+            raise ParameterError("controller", self.name, [len(matrix) for matrix in given], f"{lower.shape[-1]} rows")
+        if not all(np.isfinite(matrix).all() for matrix in given):
+            raise ParameterError("controller", self.name, given, "finite numbers")
+        if self.penalty is not None and self.penalty.l1.size != lower.shape[-1]:
+            raise ParameterError("controller", "l1", self.penalty.l1.shape, f"of shape ({lower.shape[-1]},)")
+
+
+def tightened(constraint: Constraint, margins: Array) -> Constraint:
+    """The constraint with both bounds moved inwards by margins (N, m).
+
+    Raises:
+        ParameterError: a margin is negative or not finite, of another shape, or nothing is left between the bounds.
+    """
+    m = constraint.lower.shape[-1]
+    if np.ndim(margins) != 2 or margins.shape[1] != m or not (np.isfinite(margins) & (margins >= 0.0)).all():
+        raise ParameterError("controller", "margins", margins, f"finite numbers >= 0 of shape (N, {m})")
+    lower, upper = constraint.lower + margins, constraint.upper - margins
+    if not np.all(lower < upper):
+        raise ParameterError("controller", "margins", margins.max(0), "less than half of what is between the bounds")
+    return replace(constraint, lower=lower, upper=upper)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Bounds:
+    """The constraints of Eqs. (12)-(20); an infinite entry is no bound.
+
+    Attributes:
+        C_c: (n_c, n) constrained outputs y_c = C_c xi.  Eq. (12).
+        y_min, y_max: (n_c,) output bounds.  Eq. (13).
+        delta_min, delta_max: (nu,) bounds on u(k) - u(k-1) [rad/s].  Eq. (15).
+        u_min, u_max: (nu,) input bounds [rad/s].  Eq. (20).
+        penalty: what violating an output bound costs; None for hard ones.
+        margins: (N, n_c) by which output bounds are tightened at each predicted state; None for none.
+    """
+
+    C_c: Array
+    y_min: Array
+    y_max: Array
+    delta_min: Array
+    delta_max: Array
+    u_min: Array
+    u_max: Array
+    penalty: Penalty | None = None
+    margins: Array | None = None
+
+    def __post_init__(self) -> None:
+        for low, high in (("y_min", "y_max"), ("delta_min", "delta_max"), ("u_min", "u_max")):
+            lower, upper = getattr(self, low), getattr(self, high)
+            if lower.shape != upper.shape or np.any(np.isnan(lower)) or np.any(np.isnan(upper)):
+                raise ParameterError("controller", low, lower, f"numbers of the same shape as {high} = {upper}")
+            if np.any(lower >= upper):
+                raise ParameterError("controller", low, lower, f"below {high} = {upper}")
+
+    def output(self, i: int) -> tuple[str, float, str]:
+        """A constrained output as scenario files name it: its state, what one of its unit is there, and that unit."""
+        (states,) = np.nonzero(self.C_c[i])
+        if states.size != 1 or self.C_c[i, states[0]] != 1.0 or states[0] >= N_STATES:
+            return f"row {i} of C_c", 1.0, ""
+        name, unit = STATE_NAMES[states[0]], STATE_UNITS[states[0]]
+        return (name, math.degrees(1.0), unit.replace("rad", "deg")) if unit.startswith("rad") else (name, 1.0, unit)
+
+    @property
+    def constraints(self) -> tuple[Constraint, ...]:
+        """The same as values: outputs, slews, inputs."""
+        nu = self.u_min.size
+        outputs = Constraint(name="outputs", lower=self.y_min, upper=self.y_max, C=self.C_c, penalty=self.penalty)
+        return (
+            outputs if self.margins is None else tightened(outputs, self.margins),
+            Constraint(name="slews", lower=self.delta_min, upper=self.delta_max, E=np.eye(nu)),
+            Constraint(name="inputs", lower=self.u_min, upper=self.u_max, D=np.eye(nu)),
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Rows:
+    """The rows of all constraints that bound anything, m of them, in the constraints' order.
+
+    Attributes:
+        C: (m, n).
+        D: (m, nu).
+        E: (m, nu).
+        lower, upper: (N, m).
+        l1, l2: (m,) what violating a row costs; l1 is infinite of hard ones.
+        of_states: (m,) whether a row is of the state alone: entry i is then for x(k+i+1), otherwise for x(k+i), u(k+i).
+        input: (m,) the input that a hard row bounds by itself; -1 where it is no such row.
+        names: (m,) of their constraints.
+    """
+
+    C: Array
+    D: Array
+    E: Array
+    lower: Array
+    upper: Array
+    l1: Array
+    l2: Array
+    of_states: np.ndarray[tuple[int], np.dtype[np.bool_]]
+    input: Indices
+    names: tuple[str, ...]
+
+    @property
+    def soft(self) -> Indices:
+        """(m_s,) which rows are soft."""
+        return np.flatnonzero(np.isfinite(self.l1))
+
+    def part(self, rows: Indices, states: Indices, inputs: int) -> Rows:
+        """Some rows of states alone, on some states, of a problem with so many inputs."""
+        nothing = np.zeros((rows.size, inputs))
+        return replace(
+            self,
+            C=self.C[np.ix_(rows, states)],
+            D=nothing,
+            E=nothing,
+            lower=self.lower[:, rows],
+            upper=self.upper[:, rows],
+            l1=self.l1[rows],
+            l2=self.l2[rows],
+            of_states=self.of_states[rows],
+            input=self.input[rows],
+            names=tuple(self.names[row] for row in rows),
+        )

@@ -1,1 +1,0 @@
-"""Campaigns, many flights of one scenario: their tables, and what these say with which confidence."""

@@ -1,0 +1,264 @@
+"""Limits -> signed margins, at the control samples and at the physics rate, per constraint.
+
+A QP bounds the samples of a linear model; a vehicle has to hold its limits in between as well.  The audit therefore
+reads the plant at the physics rate, and states its tolerances: a verdict is `margin >= -tolerance`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+
+from quadsim.errors import ParameterError, UnknownNameError
+from quadsim.flight.log import ControlLog, FlightLog, PlantLog
+from quadsim.state import (
+    EULER,
+    INDEX,
+    POSITION,
+    REFERENCE_NAMES,
+    REFERENCE_STATES,
+    STATE_NAMES,
+    STATE_UNITS,
+    Array,
+    tilt,
+)
+from quadsim.vehicle import N_ROTORS
+
+_DISPLAY: Final = {"rad": ("deg", math.degrees(1.0)), "rad/s": ("deg/s", math.degrees(1.0))}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Signal:
+    """Something that can be limited: its unit in limits, and how to take it from a log.
+
+    Attributes:
+        unit: unit of the limit, e.g. `deg`.
+        sampled: log -> (K,) or (K, j) values at the control samples, in `unit`.
+        plant: log -> (M,) or (M, j) values at the physics rate, or None for what exists at samples only.
+    """
+
+    unit: str
+    sampled: Callable[[ControlLog], Array]
+    plant: Callable[[PlantLog], Array] | None
+
+
+def _state_signal(name: str, unit: str) -> Signal:
+    shown, scale = _DISPLAY.get(unit, (unit, 1.0))
+    i = INDEX[name]
+    return Signal(unit=shown, sampled=lambda log: scale * log.truth[:, i], plant=lambda log: scale * log.state[:, i])
+
+
+def _error_signal(j: int) -> Signal:
+    i = REFERENCE_STATES[j]
+    shown, scale = _DISPLAY.get(STATE_UNITS[i], (STATE_UNITS[i], 1.0))
+    return Signal(unit=shown, sampled=lambda log: scale * (log.truth[:, i] - log.reference[:, j]), plant=None)
+
+
+_ESTIMATED: Final = tuple(STATE_NAMES[i] for i in (*POSITION, *EULER))
+
+
+def _estimate_error_signal(name: str) -> Signal:
+    i = INDEX[name]
+    shown, scale = _DISPLAY.get(STATE_UNITS[i], (STATE_UNITS[i], 1.0))
+    return Signal(unit=shown, sampled=lambda log: scale * (log.state[:, i] - log.truth[:, i]), plant=None)
+
+
+SIGNALS: Final[dict[str, Signal]] = {
+    **{name: _state_signal(name, unit) for name, unit in zip(STATE_NAMES, STATE_UNITS, strict=True)},
+    **{f"{name}_error": _error_signal(j) for j, name in enumerate(REFERENCE_NAMES)},
+    **{f"{name}_estimate_error": _estimate_error_signal(name) for name in _ESTIMATED},
+    "tilt": Signal(
+        unit="deg", sampled=lambda log: np.degrees(tilt(log.truth)), plant=lambda log: np.degrees(tilt(log.state))
+    ),
+    # Commanded at the samples, acting in between: they differ where rotors saturate.
+    "speed": Signal(unit="rad/s", sampled=lambda log: log.speeds, plant=lambda log: log.speeds),
+    "slew": Signal(unit="rad/s", sampled=lambda log: log.slews, plant=None),
+}
+
+
+def _rotor_signal(i: int) -> Signal:
+    return Signal(unit="rad/s", sampled=lambda log: log.speeds[:, i], plant=lambda log: log.speeds[:, i])
+
+
+TERMS: Final[dict[str, Signal]] = {
+    **{name: SIGNALS[name] for name in STATE_NAMES},
+    **{f"speed_{i + 1}": _rotor_signal(i) for i in range(N_ROTORS)},
+}
+"""What a sum may have as its terms."""
+SUM: Final = "sum"
+"""The signal of a limit on a sum of terms."""
+
+
+def sum_signal(terms: tuple[tuple[str, float], ...]) -> Signal:
+    """A sum of terms, each a name in `TERMS` and its factor."""
+    signals = [(factor, TERMS[name]) for name, factor in terms]
+    units = {signal.unit for _, signal in signals}
+
+    def of_plant(log: PlantLog) -> Array:
+        return _total([factor * signal.plant(log) for factor, signal in signals if signal.plant is not None])
+
+    return Signal(
+        unit=units.pop() if len(units) == 1 else "-",
+        sampled=lambda log: _total([factor * signal.sampled(log) for factor, signal in signals]),
+        plant=of_plant,
+    )
+
+
+def _total(parts: list[Array]) -> Array:
+    return np.asarray(np.sum(parts, axis=0))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Limit:
+    """A bound on one signal, with the tolerances of its verdict.
+
+    Attributes:
+        name: the constraint's name in tables and files.
+        signal: a key of `SIGNALS`, or `SUM`; `slew` is the command's step per period, `speed` and `slew` hold for every
+            rotor.
+        terms: of a sum, the names in `TERMS` and their factors.
+        lower: smallest value allowed, in the signal's unit; -inf for none.
+        upper: largest value allowed; inf for none.
+        tolerance: how far beyond the bound the plant may go, at the physics rate.
+        tolerance_sampled: how far beyond the bound the control samples may go; at most `tolerance`.
+        required: whether the scenario demands it; a limit that is not required is measured and reported alone.
+        start: first time [s] at which it holds.
+        stop: last time [s] at which it holds.
+    """
+
+    name: str
+    signal: str
+    lower: float = -math.inf
+    upper: float = math.inf
+    tolerance: float = 0.0
+    tolerance_sampled: float = 0.0
+    required: bool = True
+    start: float = 0.0
+    stop: float = math.inf
+    terms: tuple[tuple[str, float], ...] = ()
+
+    def __post_init__(self) -> None:
+        if self.signal not in SIGNALS and not (self.signal == SUM and self.terms):
+            raise UnknownNameError("signal", self.signal, SIGNALS)
+        for name, _ in self.terms:
+            if name not in TERMS:
+                raise UnknownNameError("signal", name, TERMS)
+        if not self.lower < self.upper:
+            raise ParameterError(f"constraints.{self.name}", "lower", self.lower, f"below upper = {self.upper}")
+        if not 0.0 <= self.tolerance_sampled <= self.tolerance < math.inf:
+            rule = f"between 0 and tolerance = {self.tolerance}"
+            raise ParameterError(f"constraints.{self.name}", "tolerance_sampled", self.tolerance_sampled, rule)
+        if not self.start <= self.stop:
+            raise ParameterError(f"constraints.{self.name}", "start", self.start, f"at most stop = {self.stop}")
+
+    @property
+    def source(self) -> Signal:
+        """What is bounded."""
+        return sum_signal(self.terms) if self.signal == SUM else SIGNALS[self.signal]
+
+    @property
+    def unit(self) -> str:
+        """Unit of the bounds, tolerances and margins."""
+        return self.source.unit
+
+    @property
+    def half_band(self) -> float:
+        """Half of what lies between the bounds; of one bound alone its magnitude, or 1 where that is 0."""
+        if math.isfinite(self.lower) and math.isfinite(self.upper):
+            return 0.5 * (self.upper - self.lower)
+        return abs(self.lower if math.isfinite(self.lower) else self.upper) or 1.0
+
+    def margin(self, values: Array) -> Array:
+        """(K,) signed distance to the nearer bound, the smallest over rotors; negative = violated."""
+        margin = np.minimum(values - self.lower, self.upper - values)
+        return margin if margin.ndim == 1 else margin.min(axis=1)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Finding:
+    """What the audit found for one limit; margins and peaks in the limit's unit.
+
+    Attributes:
+        limit: the limit audited.
+        peak_sampled: the value nearest to (or furthest beyond) a bound at the control samples.
+        peak_plant: the same at the physics rate; equal to `peak_sampled` for signals that exist at samples only.
+        worst_margin_sampled: smallest signed margin at the control samples.
+        worst_margin: smallest signed margin at the physics rate.
+        worst_time: when that was [s].
+        time_violated: time spent beyond bound plus tolerance [s].
+    """
+
+    limit: Limit
+    peak_sampled: float
+    peak_plant: float
+    worst_margin_sampled: float
+    worst_margin: float
+    worst_time: float
+    time_violated: float
+
+    @property
+    def satisfied(self) -> bool:
+        """Whether the limit held, within its tolerances, at the samples and between them.
+
+        A window that the flight did not reach was not held; one that fell between two samples is judged by the plant.
+        """
+        broken_at_samples = self.worst_margin_sampled < -self.limit.tolerance_sampled
+        return self.worst_margin >= -self.limit.tolerance and not broken_at_samples
+
+
+def margins_sampled(limit: Limit, log: FlightLog) -> Array:
+    """(K,) signed margins of a limit at the control samples, NaN outside its time window."""
+    margins = limit.margin(limit.source.sampled(log.control))
+    return np.where(_inside(limit, log.control.t), margins, np.nan)
+
+
+def audit(log: FlightLog, limits: tuple[Limit, ...]) -> tuple[Finding, ...]:
+    """Hold a flight against its limits.
+
+    Args:
+        log: a flight whose plant rows are at the physics rate.
+        limits: what to hold it against.
+
+    Returns:
+        One finding per limit, in order.
+    """
+    return tuple(_find(log, limit) for limit in limits)
+
+
+def _inside(limit: Limit, t: Array) -> np.ndarray[Any, np.dtype[np.bool_]]:
+    return (t >= limit.start - 1e-9) & (t <= limit.stop + 1e-9)
+
+
+def _find(log: FlightLog, limit: Limit) -> Finding:
+    signal = limit.source
+    t, values = log.control.t, signal.sampled(log.control)
+    sampled = peak, margin, time = _worst(limit, t, values)
+    if signal.plant is not None and t.size:  # before the first period nothing was flown
+        t, values = log.plant.t, signal.plant(log.plant)
+        peak, margin, time = _worst(limit, t, values)
+    beyond = _inside(limit, t) & (limit.margin(values) < -limit.tolerance)
+    held = np.diff(t, append=log.plant.t[-1:])  # each value stands until the next, the last until the flight's end
+    return Finding(
+        limit=limit,
+        peak_sampled=sampled[0],
+        peak_plant=peak,
+        worst_margin_sampled=sampled[1],
+        worst_margin=margin,
+        worst_time=time,
+        time_violated=round(float(held[beyond].sum()), 9) + 0.0,
+    )
+
+
+def _worst(limit: Limit, t: Array, values: Array) -> tuple[float, float, float]:
+    """Value, margin and time where the margin is smallest; NaN when the window is empty."""
+    inside = _inside(limit, t)
+    if not inside.any():
+        return math.nan, math.nan, math.nan
+    t, columns = t[inside], values[inside].reshape(np.count_nonzero(inside), -1)
+    row = int(np.argmin(limit.margin(columns)))
+    column = int(np.argmin(np.minimum(columns[row] - limit.lower, limit.upper - columns[row])))
+    return float(columns[row, column]), float(limit.margin(columns)[row]), float(t[row])

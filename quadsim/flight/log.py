@@ -1,0 +1,135 @@
+"""One flight as stacked arrays with units: the control periods, what a clock measured, and the plant between commands.
+
+`quadsim.flight.parquet` writes and reads it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+
+from quadsim.state import Array
+from quadsim.vehicle import N_ROTORS
+
+WRENCH: Final = {**{f"force_{axis}": "N" for axis in "xyz"}, **{f"torque_{axis}": "N m" for axis in "xyz"}}
+"""Columns of the external force, world, and torque, body frame, with their units; only where there is any."""
+WIND: Final = {f"wind_{axis}": "m/s" for axis in "xyz"}
+"""Columns of the wind, world, with their units; only where there is any."""
+ROTORS: Final = range(1, N_ROTORS + 1)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ControlLog:
+    """One row per control period k, taken at t_k; K rows.
+
+    Attributes:
+        t: (K,) [s].
+        state: (K, 12) state as measured, which is what the controller was told; units of `STATE_UNITS`.
+        truth: (K, 12) state as it was; the same where measurement is perfect.
+        reference: (K, 4) filtered reference x, y, z [m], yaw [rad] at t_k.
+        speeds: (K, 4) commanded rotor speeds in force at the period's end [rad/s].
+        speeds_before: (4,) u(-1), the command before the first [rad/s].
+        status: K texts, one of `quadsim.controller.ACCEPTED` or what was instead; see `quadsim.controller.Command`.
+        phase: K texts, where the flight stood with the ground; see `quadsim.controller.Phase`.
+        iterations: (K,) solver iterations.
+        active: (K,) constraints active at the optimum.
+        fallback: (K,) 0 none, higher = deeper.
+        slack: (K,) largest softening of an output bound [rad].
+        primal_residual: (K,) as reported by the back end.
+        dual_residual: (K,) as reported by the back end.
+        delay: (K,) simulated time from the measurement to the command [s].
+    """
+
+    t: Array
+    state: Array
+    truth: Array
+    reference: Array
+    speeds: Array
+    speeds_before: Array
+    status: tuple[str, ...]
+    phase: tuple[str, ...]
+    iterations: np.ndarray[Any, np.dtype[np.int64]]
+    active: np.ndarray[Any, np.dtype[np.int64]]
+    fallback: np.ndarray[Any, np.dtype[np.int64]]
+    slack: Array
+    primal_residual: Array
+    dual_residual: Array
+    delay: Array
+
+    @property
+    def measured_perfectly(self) -> bool:
+        """Whether the controller was told the truth throughout."""
+        return self.state is self.truth or bool(np.array_equal(self.state, self.truth))
+
+    @property
+    def slews(self) -> Array:
+        """(K, 4) command steps u(k) - u(k-1) [rad/s per period], Eq. (15)."""
+        return np.diff(self.speeds, axis=0, prepend=self.speeds_before[None, :])
+
+
+@dataclass(frozen=True, kw_only=True)
+class TimingLog:
+    """What a clock measured, per control period."""
+
+    t: Array
+    solve_ms: Array
+    step_ms: Array
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlantLog:
+    """The plant between commands; M rows, the first at t = 0 before the first command.
+
+    Attributes:
+        t: (M,) [s].
+        state: (M, 12) true state, yaw unwrapped.
+        speeds: (M, 4) rotor speeds from t on [rad/s]; rotors that lag pass through them.
+        wrench: (M, 6) external force, world [N], and torque, body frame [N m], from t on; None where there is none.
+        wind: (M, 3) velocity of the air, world [m/s]; None without wind.
+    """
+
+    t: Array
+    state: Array
+    speeds: Array
+    wrench: Array | None = None
+    wind: Array | None = None
+
+    def every(self, stride: int) -> PlantLog:
+        """Each `stride`-th row, from the first on."""
+        return PlantLog(
+            t=self.t[::stride],
+            state=self.state[::stride],
+            speeds=self.speeds[::stride],
+            wrench=None if self.wrench is None else self.wrench[::stride],
+            wind=None if self.wind is None else self.wind[::stride],
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class FlightLog:
+    """A whole flight, or as much of one as was flown.
+
+    Attributes:
+        control: one row per control period.
+        timing: clock times, one row per control period.
+        plant: the plant, at the physics rate after a flight, at the log rate when read from a file.
+        predicted: (K, N, 3) float32 positions [m] predicted at each period for t_{k+1} .. t_{k+N}, or None.
+        reason: why the flight ended early; None when it was completed.
+        interrupted: whether the person flying ended it.
+        lost: which of the loss criteria ended it, e.g. `tilt`; None where none did.
+    """
+
+    control: ControlLog
+    timing: TimingLog
+    plant: PlantLog
+    predicted: np.ndarray[Any, np.dtype[np.float32]] | None = None
+    reason: str | None = None
+    interrupted: bool = False
+    lost: str | None = None
+
+    @property
+    def status(self) -> str:
+        """`completed` or `aborted`."""
+        return "completed" if self.reason is None else "aborted"

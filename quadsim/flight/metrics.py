@@ -1,0 +1,232 @@
+"""Pure functions from a flight to the numbers of its summary."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from quadsim.controller import ACCEPTED, MISSED, Phase
+from quadsim.flight.ground import AIRBORNE, clearance, takeoff_time, touchdown
+from quadsim.flight.log import ControlLog, FlightLog, TimingLog
+from quadsim.state import (
+    INDEX,
+    REFERENCE_NAMES,
+    REFERENCE_STATES,
+    REFERENCE_UNITS,
+    STATE_NAMES,
+    STATE_UNITS,
+    Array,
+)
+
+if TYPE_CHECKING:
+    from quadsim.flight.ground import Outline
+
+SETTLING_BAND: Final = 0.05
+"""Half width of the band an output has to stay in to be settled, as a share of the step."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class CourseStep:
+    """A step that the unfiltered course takes in one channel; angles in rad, lengths in m.
+
+    Attributes:
+        channel: `x`, `y`, `z` or `yaw`.
+        time: when the course steps [s].
+        before: the value before; at the start of a flight, where the vehicle is.
+        after: the value after.
+        until: when the controller first sees the channel's next step coming, or else the flight is planned to end [s].
+    """
+
+    channel: str
+    time: float
+    before: float
+    after: float
+    until: float
+
+
+def tracking(log: ControlLog) -> dict[str, Any]:
+    """Tracking errors, real minus reference, against the filtered reference at the control samples.
+
+    Returns:
+        `rmse`, `max_error` (largest magnitude), `final_error` (last sample, signed) and `overshoot` (how far the
+        channel leaves the range spanned by its reference and its start), each by channel x, y, z [m], yaw [rad].
+    """
+    state = log.truth[:, REFERENCE_STATES]
+    error = state - log.reference
+    lowest = np.minimum(log.reference.min(axis=0), state[0])
+    highest = np.maximum(log.reference.max(axis=0), state[0])
+    beyond = np.maximum((state - highest).max(axis=0), (lowest - state).max(axis=0))
+    return {
+        "unit": dict(zip(REFERENCE_NAMES, REFERENCE_UNITS, strict=True)),
+        "rmse": _by_channel(np.sqrt(np.mean(error**2, axis=0))),
+        "max_error": _by_channel(np.abs(error).max(axis=0)),
+        "final_error": _by_channel(error[-1]),
+        "overshoot": _by_channel(np.maximum(beyond, 0.0)),
+    }
+
+
+def settling(t: Array, outputs: Array, steps: Sequence[CourseStep]) -> list[dict[str, Any]]:
+    """How long each step of the course takes until the output has settled.
+
+    The settling time runs from the step of the unfiltered course to the first control sample from which on the output
+    stays within `SETTLING_BAND` of the step around its new value.  Samples are looked at up to `until`: a controller
+    with a preview moves before the next step, on purpose.  What steps of the other channels disturb does count.  None
+    where the output does not settle in that time, the flight ended before it was over, or there is no such time, the
+    next step coming into view at once.
+
+    Args:
+        t: (K,) control samples [s].
+        outputs: (K, 4) x, y, z [m], yaw [rad].
+        steps: of the course.
+
+    Returns:
+        One entry per step, in order: the step's own values, and `settled` [s].
+    """
+    period = t[1] - t[0] if t.size > 1 else 0.0
+    entries = []
+    for step in steps:
+        held = (t >= step.time - 1e-9) & (t <= step.until + 1e-9)
+        error = outputs[held, REFERENCE_NAMES.index(step.channel)] - step.after
+        outside = np.flatnonzero(np.abs(error) > SETTLING_BAND * abs(step.after - step.before))
+        first = outside[-1] + 1 if outside.size else 0
+        flown = t.size > 1 and t[-1] + period > step.until - 1e-9
+        settled = round(float(t[held][first] - step.time), 9) if flown and first < error.size else None
+        entries.append(
+            {
+                "channel": step.channel,
+                "time": step.time,
+                "before": step.before,
+                "after": step.after,
+                "settled": settled,
+            }
+        )
+    return entries
+
+
+def peak_tilt(state: Array) -> float:
+    """The largest magnitude that roll or pitch reaches in states (K, 12) [deg]; each is bounded by itself, Eq. (35)."""
+    return float(np.degrees(np.abs(state[:, [INDEX["roll"], INDEX["pitch"]]]).max()))
+
+
+def control(log: ControlLog) -> dict[str, float]:
+    """Extremes of the commanded speeds [rad/s] and of their steps per period [rad/s], over all rotors.
+
+    `total_variation` is the sum of the magnitudes of all steps of all rotors [rad/s].
+    """
+    return {
+        "speed_min": float(log.speeds.min()),
+        "speed_max": float(log.speeds.max()),
+        "slew_min": float(log.slews.min()),
+        "slew_max": float(log.slews.max()),
+        "total_variation": float(np.abs(log.slews).sum()),
+    }
+
+
+def percentiles(values: Array) -> dict[str, float]:
+    """Median, 95th and 99th percentile and maximum."""
+    p50, p95, p99 = np.percentile(values, [50, 95, 99])
+    return {"p50": float(p50), "p95": float(p95), "p99": float(p99), "max": float(values.max())}
+
+
+def controller(log: ControlLog, timing: TimingLog, deadline_ms: float) -> dict[str, Any]:
+    """Counts of solver statuses and fallbacks, iterations, residuals, and times against the deadline [ms].
+
+    Residuals are those of the periods whose optimum was found: a back end that gave up may report none, or infinite
+    ones.
+    """
+    found = np.array([status in ACCEPTED for status in log.status])
+    return {
+        "statuses": dict(sorted(Counter(log.status).items())),
+        "fallbacks": {str(level): count for level, count in sorted(Counter(log.fallback.tolist()).items())},
+        "iterations": {"mean": float(log.iterations.mean()), "max": int(log.iterations.max())},
+        "active_max": int(log.active.max()),
+        "active_periods": int(np.count_nonzero(log.active)),
+        "residual_max": {
+            "primal": _largest_reported(log.primal_residual[found]),
+            "dual": _largest_reported(log.dual_residual[found]),
+        },
+        "solve_ms": percentiles(timing.solve_ms),
+        "step_ms": percentiles(timing.step_ms),
+        "deadline_ms": deadline_ms,
+        "deadline_misses": int(np.count_nonzero(timing.step_ms > deadline_ms)),
+    }
+
+
+def computation(log: ControlLog) -> dict[str, Any]:
+    """Simulated times from measurement to command [ms], and how many commands came too late to be used."""
+    return {
+        "delay_ms": percentiles(1e3 * log.delay),
+        "missed": sum(status == MISSED for status in log.status),
+    }
+
+
+def estimation(log: ControlLog) -> dict[str, Any]:
+    """Errors of what the controller was told, told minus true, by state: RMS, and the largest magnitude.
+
+    Samples that are no numbers, as a failed sensor gives them, are counted and left out.
+    """
+    error = log.state - log.truth
+    finite = np.isfinite(error)
+    counted = np.maximum(finite.sum(axis=0), 1)
+    known = np.where(finite, error, 0.0)
+    return {
+        "unit": dict(zip(STATE_NAMES, STATE_UNITS, strict=True)),
+        "rmse": dict(zip(STATE_NAMES, np.sqrt((known**2).sum(axis=0) / counted).tolist(), strict=True)),
+        "max_error": dict(zip(STATE_NAMES, np.abs(known).max(axis=0).tolist(), strict=True)),
+        "not_finite": int(np.count_nonzero(~finite.all(axis=1))),
+    }
+
+
+def ground(log: FlightLog, outline: Outline) -> dict[str, Any]:
+    """How the flight left the ground and met it again, from plant rows at the physics rate.
+
+    Returns:
+        `started`, `landed` or `flying`; `takeoff_time` [s]; `touchdown`, of feet or hull (`time` [s], `speed` and
+        `horizontal_speed` [m/s], `tilt` [deg]), each None
+        where there was none; `phase`, the last one; `crashed`.
+    """
+    feet = clearance(log.plant.state, outline.feet, outline.foot_radius, outline.floor)
+    clearances = np.minimum(feet, clearance(log.plant.state, outline.hull, 0.0, outline.floor))
+    met = touchdown(log.plant.t, log.plant.state, clearances)
+    return {
+        "started": str(Phase.LANDED) if feet[0] <= AIRBORNE else str(Phase.FLYING),
+        "takeoff_time": takeoff_time(log.plant.t, feet),
+        "touchdown": None if met is None else asdict(met),
+        "phase": log.control.phase[-1] if log.control.phase else None,
+        "crashed": str(Phase.CRASHED) in log.control.phase,
+    }
+
+
+def _largest_reported(residuals: Array) -> float | None:
+    """The largest residual; None for a back end that reports none, 0 where there was nothing to report."""
+    largest = float(np.max(residuals, initial=0.0))
+    return None if math.isnan(largest) else largest
+
+
+def flight_numbers(log: FlightLog, deadline_ms: float, course: Sequence[CourseStep] = ()) -> dict[str, Any]:
+    """`tracking`, `control` and `controller` of a summary; each is empty when no period was flown.
+
+    Args:
+        log: the flight.
+        deadline_ms: the control period [ms].
+        course: the steps that `tracking.settling` tells of.
+    """
+    if not log.control.t.size:
+        return {"tracking": {}, "control": {}, "controller": {}}
+    return {
+        "tracking": {
+            **tracking(log.control),
+            "settling": settling(log.control.t, log.control.truth[:, REFERENCE_STATES], course),
+        },
+        "control": control(log.control),
+        "controller": controller(log.control, log.timing, deadline_ms),
+    }
+
+
+def _by_channel(values: Array) -> dict[str, float]:
+    return dict(zip(REFERENCE_NAMES, values.tolist(), strict=True))

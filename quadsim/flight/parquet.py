@@ -1,0 +1,236 @@
+"""A flight log's Parquet files.
+
+Three tables, as in the file contract: what happened once per control period (`flight.parquet`), what a clock measured
+(`timing.parquet`, the only one that differs between two equal flights), and the plant between commands
+(`plant.parquet`).  A fourth, `horizon.parquet`, keeps the predicted positions of every period for pictures.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import fields
+from pathlib import Path
+from typing import Any, BinaryIO, Final
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from quadsim.errors import FileError
+from quadsim.flight.log import ROTORS, WIND, WRENCH, ControlLog, FlightLog, PlantLog, TimingLog
+from quadsim.state import REFERENCE_NAMES, REFERENCE_UNITS, STATE_NAMES, STATE_UNITS, Array
+
+FLIGHT_FILE: Final = "flight.parquet"
+TIMING_FILE: Final = "timing.parquet"
+PLANT_FILE: Final = "plant.parquet"
+HORIZON_FILE: Final = "horizon.parquet"
+_TRUE: Final = "true_"
+"""How the columns of the true state begin, which are there where the measured one differs."""
+_COUNTS: Final = ("iterations", "active", "fallback")
+
+_Column = tuple[str, str, Any]
+
+
+def _state_columns(state: Array, prefix: str = "") -> list[_Column]:
+    named = zip(STATE_NAMES, STATE_UNITS, strict=True)
+    return [(prefix + name, unit, state[:, i]) for i, (name, unit) in enumerate(named)]
+
+
+def _table(columns: Sequence[_Column], metadata: Mapping[str, str]) -> pa.Table:
+    arrays, schema = [], []
+    for name, unit, values in columns:
+        array = values if isinstance(values, pa.Array) else pa.array(values)
+        arrays.append(array)
+        schema.append(pa.field(name, array.type, nullable=False, metadata={"unit": unit}))
+    return pa.Table.from_arrays(arrays, schema=pa.schema(schema, metadata=dict(metadata)))
+
+
+def _flight_table(log: ControlLog, metadata: Mapping[str, str]) -> pa.Table:
+    references = zip(REFERENCE_NAMES, REFERENCE_UNITS, strict=True)
+    columns: list[_Column] = [
+        ("t", "s", log.t),
+        *_state_columns(log.state),
+        *((f"ref_{name}", unit, log.reference[:, i]) for i, (name, unit) in enumerate(references)),
+        *((f"u{i}", "rad/s", log.speeds[:, i - 1]) for i in ROTORS),
+        ("status", "-", pa.array(log.status, pa.string())),
+        ("phase", "-", pa.array(log.phase, pa.string())),
+        ("iterations", "-", log.iterations),
+        ("active", "-", log.active),
+        ("fallback", "-", log.fallback),
+        ("slack", "rad", log.slack),
+        ("primal_residual", "-", log.primal_residual),
+        ("dual_residual", "-", log.dual_residual),
+        ("delay", "s", log.delay),
+        *([] if log.measured_perfectly else _state_columns(log.truth, _TRUE)),
+    ]
+    before = ",".join(repr(float(speed)) for speed in log.speeds_before)
+    return _table(columns, {**metadata, "speeds_before": before})
+
+
+def _plant_table(log: PlantLog, metadata: Mapping[str, str]) -> pa.Table:
+    speeds = [(f"w{i}", "rad/s", log.speeds[:, i - 1]) for i in ROTORS]
+    columns = [("t", "s", log.t), *_state_columns(log.state), *speeds]
+    if log.wrench is not None:
+        columns += [(name, unit, log.wrench[:, i]) for i, (name, unit) in enumerate(WRENCH.items())]
+    if log.wind is not None:
+        columns += [(name, unit, log.wind[:, i]) for i, (name, unit) in enumerate(WIND.items())]
+    return _table(columns, metadata)
+
+
+def _timing_table(log: TimingLog, metadata: Mapping[str, str]) -> pa.Table:
+    return _table([("t", "s", log.t), ("solve_ms", "ms", log.solve_ms), ("step_ms", "ms", log.step_ms)], metadata)
+
+
+def _horizon_table(t: Array, predicted: np.ndarray[Any, np.dtype[np.float32]], metadata: Mapping[str, str]) -> pa.Table:
+    horizon = predicted.shape[1]
+    lists = (pa.FixedSizeListArray.from_arrays(predicted[:, :, i].ravel(), horizon) for i in range(3))
+    return _table(
+        [("t", "s", t), *((f"predicted_{axis}", "m", a) for axis, a in zip("xyz", lists, strict=True))], metadata
+    )
+
+
+def write_log(directory: Path, log: FlightLog, *, plant_stride: int, metadata: Mapping[str, str]) -> None:
+    """Write a flight's Parquet files into an existing directory.
+
+    Args:
+        directory: where `flight.parquet`, `timing.parquet`, `plant.parquet` and `horizon.parquet` go.
+        log: the flight.
+        plant_stride: physics steps per row of `plant.parquet`.
+        metadata: texts kept in each file's schema; no clock reading belongs here.
+    """
+    tables = {
+        FLIGHT_FILE: _flight_table(log.control, metadata),
+        TIMING_FILE: _timing_table(log.timing, metadata),
+        PLANT_FILE: _plant_table(log.plant.every(plant_stride), metadata),
+    }
+    if log.predicted is not None:
+        tables[HORIZON_FILE] = _horizon_table(log.control.t, log.predicted, metadata)
+    for name, table in tables.items():
+        _write(table, directory / name)
+
+
+def add_metadata(path: Path, texts: Mapping[str, str]) -> None:
+    """Add texts to those that a table of ours keeps in its schema.
+
+    Raises:
+        FileError: it cannot be read.
+    """
+    table = _read(path)
+    named = {**(table.schema.metadata or {}), **{key.encode(): text.encode() for key, text in texts.items()}}
+    _write(table.replace_schema_metadata(named), path)
+
+
+def read_metadata(path: Path) -> dict[str, str]:
+    """The texts that a table of ours keeps in its schema.
+
+    Raises:
+        FileError: it cannot be read.
+    """
+    metadata = _read(path, pq.read_schema).metadata or {}
+    return {key.decode(errors="replace"): text.decode(errors="replace") for key, text in metadata.items()}
+
+
+def _write(table: pa.Table, path: Path) -> None:
+    with path.open("wb") as file:  # Arrow by itself takes no path that is no Unicode
+        pq.write_table(table, file, compression="zstd")
+
+
+def _read(path: Path, read: Callable[[BinaryIO], Any] = pq.read_table) -> Any:
+    if not path.is_file():  # a pipe would be read for ever
+        raise FileError(path, "is not a readable Parquet file (it is missing or no file)")
+    try:
+        with path.open("rb") as file:
+            return read(file)
+    except (OSError, ValueError, pa.ArrowException) as error:
+        raise FileError(path, f"is not a readable Parquet file ({error})") from error
+
+
+def _stack(table: pa.Table, names: Sequence[str]) -> Array:
+    return np.stack([_numbers(table, name) for name in names], axis=1)
+
+
+def _stack_if_there(table: pa.Table, names: Sequence[str]) -> Array | None:
+    return _stack(table, names) if set(names) <= set(table.column_names) else None
+
+
+def _numbers(table: pa.Table, name: str, kind: type = np.float64) -> np.ndarray[Any, Any]:
+    column = table.column(name)
+    if column.null_count:
+        raise ValueError(f"{name} has gaps")
+    return np.asarray(column.to_numpy(), dtype=kind)
+
+
+def _texts(table: pa.Table, name: str) -> tuple[str, ...]:
+    texts = tuple(table.column(name).to_pylist())
+    if not all(isinstance(text, str) for text in texts):
+        raise ValueError(f"{name} is not text throughout")
+    return texts
+
+
+def read_log(directory: Path, *, reason: str | None = None) -> FlightLog:
+    """Read a flight back; the plant's rows are at the log rate.
+
+    Args:
+        directory: a run directory.
+        reason: the flight's reason for ending early, which stands in its summary.
+
+    Raises:
+        FileError: a file is missing or damaged.
+    """
+    flight, timing, plant = (_read(directory / name) for name in (FLIGHT_FILE, TIMING_FILE, PLANT_FILE))
+    try:
+        before = np.array([float(text) for text in (flight.schema.metadata or {})[b"speeds_before"].split(b",")])
+        scalars = {
+            field.name: _numbers(flight, field.name, np.int64 if field.name in _COUNTS else np.float64)
+            for field in fields(ControlLog)
+            if field.name not in ("state", "truth", "reference", "speeds", "speeds_before", "status", "phase")
+        }
+        state = _stack(flight, STATE_NAMES)
+        truth = _stack_if_there(flight, [_TRUE + name for name in STATE_NAMES])
+        control = ControlLog(
+            state=state,
+            truth=state if truth is None else truth,
+            reference=_stack(flight, [f"ref_{name}" for name in REFERENCE_NAMES]),
+            speeds=_stack(flight, [f"u{i}" for i in ROTORS]),
+            speeds_before=before,
+            status=_texts(flight, "status"),
+            phase=_texts(flight, "phase"),
+            **scalars,
+        )
+        plant_log = PlantLog(
+            t=_numbers(plant, "t"),
+            state=_stack(plant, STATE_NAMES),
+            speeds=_stack(plant, [f"w{i}" for i in ROTORS]),
+            wrench=_stack_if_there(plant, list(WRENCH)),
+            wind=_stack_if_there(plant, list(WIND)),
+        )
+        timing_log = TimingLog(**{name: _numbers(timing, name) for name in ("t", "solve_ms", "step_ms")})
+        predicted = _read_predicted(directory)
+        _require_whole(control, timing_log, plant_log, predicted)
+    except FileError:
+        raise
+    except (AttributeError, ArithmeticError, KeyError, TypeError, ValueError, pa.ArrowException) as error:
+        raise FileError(directory, f"lacks or misstates a column of the flight log ({error})") from error
+    return FlightLog(control=control, timing=timing_log, plant=plant_log, predicted=predicted, reason=reason)
+
+
+def _require_whole(
+    control: ControlLog, timing: TimingLog, plant: PlantLog, predicted: np.ndarray[Any, np.dtype[np.float32]] | None
+) -> None:
+    """Refuse tables that are not of one flight."""
+    rows = {control.t.size, timing.t.size, *(() if predicted is None else (len(predicted),))}
+    if len(rows) > 1 or not plant.t.size:
+        raise ValueError("its tables have not as many rows as one another, or none")
+    for t in (control.t, plant.t):
+        if not np.isfinite(t).all() or (np.diff(t) <= 0.0).any():
+            raise ValueError("t does not increase")
+
+
+def _read_predicted(directory: Path) -> np.ndarray[Any, np.dtype[np.float32]] | None:
+    path = directory / HORIZON_FILE
+    if not path.exists():
+        return None
+    table = _read(path)
+    columns = [table.column(f"predicted_{axis}").combine_chunks() for axis in "xyz"]
+    shape = (table.num_rows, columns[0].type.list_size)  # also right for a flight of no period
+    return np.stack([column.flatten().to_numpy().reshape(shape) for column in columns], axis=-1)

@@ -1,0 +1,1 @@
+"""What a person looks at: figures, plots, films, recordings and pages made from flights."""

@@ -1,0 +1,95 @@
+"""How curves are drawn on paper, on a page and on a screen: the least span of an axis, and where an angle wraps."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from quadsim.flight.log import FlightLog
+from quadsim.state import Array
+
+LEAST_SPANS: Final = {"m": 0.01, "deg": 0.1, "m/s": 0.01, "deg/s": 0.1, "rad/s": 1.0}
+"""Span of an axis, by its unit, below which there is nothing to see but rounding."""
+_HALF_TURN: Final = 180.0
+
+
+def least_range(curves: Sequence[Array], unit: str) -> tuple[float, float] | None:
+    """Ends of an axis for curves that stand still; None where an axis may fit itself to them.
+
+    Args:
+        curves: all that the axis shows; numbers that are not finite do not count.
+        unit: of the axis; one that is not in `LEAST_SPANS` has no least span.
+    """
+    values = np.concatenate([np.ravel(curve) for curve in curves]) if curves else np.empty(0)
+    values = values[np.isfinite(values)]
+    span = LEAST_SPANS.get(unit, 0.0)
+    if not values.size or values.max() - values.min() >= span:
+        return None
+    middle = 0.5 * float(values.min() + values.max())
+    if abs(middle) < 1e-3 * span:
+        middle = 0.0  # an axis about zero has round ticks
+    return middle - 0.5 * span, middle + 0.5 * span
+
+
+def break_at_wraps(t: Array, values: Array, unit: str) -> tuple[Array, Array]:
+    """A curve with a gap wherever an angle in degrees jumps by more than half a turn, as roll does beyond 180 deg.
+
+    Args:
+        t: (K,) [s].
+        values: (K,).
+        unit: of the values; only those in `deg` wrap.
+
+    Returns:
+        Times and values, (K + wraps,) each, with a NaN in each gap.
+    """
+    after = np.flatnonzero(np.abs(np.diff(values)) > _HALF_TURN) + 1 if unit == "deg" else np.empty(0, int)
+    return np.insert(t, after, 0.5 * (t[after - 1] + t[after])), np.insert(values, after, np.nan)
+
+
+_VISIBLE_SPEED: Final = 1e-3
+"""Difference between commanded and acting rotor speeds from which on they are two curves [rad/s]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class EffectCurves:
+    """One quantity along x, y and z at the plant's instants.
+
+    Attributes:
+        key: short name, e.g. `wind`.
+        title: what it is.
+        unit: its unit.
+        values: (M, 3).
+    """
+
+    key: str
+    title: str
+    unit: str
+    values: Array
+
+
+def effect_curves(log: FlightLog) -> list[EffectCurves]:
+    """External force and torque, and the wind, each where it is not zero throughout."""
+    wrench = np.zeros((1, 6)) if log.plant.wrench is None else log.plant.wrench
+    wind = np.zeros((1, 3)) if log.plant.wind is None else log.plant.wind
+    curves = [
+        EffectCurves(key="force", title="external force, world", unit="N", values=wrench[:, :3]),
+        EffectCurves(key="torque", title="external torque, body", unit="N m", values=wrench[:, 3:]),
+        EffectCurves(key="wind", title="wind, world", unit="m/s", values=wind),
+    ]
+    return [entry for entry in curves if np.any(entry.values)]
+
+
+def commanded_speeds(log: FlightLog) -> Array | None:
+    """(M, 4) the commands in force at the plant's instants [rad/s]; None where the rotors turn just as commanded.
+
+    They differ where rotors lag or saturate, and where commands take time to compute.
+    """
+    plant, control = log.plant, log.control
+    if not control.t.size:
+        return None
+    period = np.searchsorted(control.t, plant.t, side="right") - 1
+    commanded: Array = control.speeds[period]
+    return commanded if np.abs(commanded - plant.speeds).max() > _VISIBLE_SPEED else None

@@ -1,0 +1,1 @@
+"""Films of flights: frames, captions and the processes that render them."""

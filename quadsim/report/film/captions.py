@@ -1,0 +1,235 @@
+"""The captions of a film: what the flight's numbers are at this frame, and which limits it breaks.  Pillow alone."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from typing import Final
+
+import numpy as np
+from PIL import Image
+
+from quadsim.controller import ACCEPTED, Phase, law_name
+from quadsim.flight.audit import Limit
+from quadsim.flight.rundir import Run
+from quadsim.report.film.frames import Footage, MarginTrack
+from quadsim.report.film.painter import (
+    AMBER,
+    BLUE,
+    CYAN,
+    FAINT,
+    GREEN,
+    GREY,
+    RED,
+    VIOLET,
+    WHITE,
+    Colour,
+    Painter,
+    Picture,
+    shade,
+    text_width,
+)
+from quadsim.report.film.topview import TopView
+from quadsim.state import INDEX, REFERENCE_NAMES, REFERENCE_STATES, Array
+
+_Panel = Callable[[Painter, float, float, int], None]
+
+_STRIP: Final = 150
+"""Height of the bottom strip, in design pixels of a 1280 x 720 frame."""
+_COMPACT_SCALE: Final = 1.6
+_MAP: Final = (236, 190)
+"""Width and height of the map, in design pixels."""
+_COMPACT_MAP: Final = (180, 150)
+_MOST_MARGINS: Final = 6
+
+
+class Overlay:
+    """Draws the captions of one film onto its frames.
+
+    Lengths below are design pixels of a 1280 x 720 frame, scaled to the frame's real size.
+    """
+
+    def __init__(self, run: Run, footage: Footage, *, width: int, height: int, compact: bool = False) -> None:
+        self._run, self._footage, self._compact = run, footage, compact
+        self._scale = min(width / 1280.0, height / 720.0) * (_COMPACT_SCALE if compact else 1.0)
+        self._width, self._height = width / self._scale, height / self._scale
+        controller = run.summary.get("controller", {})
+        self._subtitle = "  ·  ".join(filter(None, (law_name(controller.get("name", "")), controller.get("solver"))))
+        self._grounded = any(phase != Phase.FLYING for phase in run.log.control.phase)
+        self._ranked = sorted(footage.margins, key=lambda track: track.rank)  # of the whole flight: rows stay in place
+        self._top_view = TopView(run, footage, *(_COMPACT_MAP if compact else _MAP), acting=not compact)
+
+    def draw(self, frame: Picture, i: int) -> Picture:
+        """Frame `i` (height, width, 3) with its captions; `frame` itself is changed."""
+        lines = self._headlines(i)
+        columns: list[tuple[float, _Panel]] = [(262, self._attitude), (188, self._speeds)]
+        if not self._compact:
+            columns = [(262, self._position), *columns, (188, self._slews), (226, self._margins)]
+        gap = max(0.0, (self._width - 48.0 - sum(width for width, _ in columns)) / (len(columns) - 1))
+        lefts = [24.0 + gap * j + sum(width for width, _ in columns[:j]) for j in range(len(columns))]
+        strip = self._height - _STRIP
+
+        map_left, map_size = self._width - self._top_view.width - 16, (self._top_view.width, self._top_view.height)
+        longest = max(text_width(text, size, scale=self._scale) for text, size, _ in lines)
+        shade(frame, 16, 16, 24 + longest, 14 + 27 * len(lines), scale=self._scale)
+        shade(frame, map_left, 16, *map_size, scale=self._scale)
+        if self._compact:
+            for left, (width, _) in zip(lefts, columns, strict=True):
+                shade(frame, left - 8, strip - 16, width + 16, _STRIP, scale=self._scale)
+        else:
+            shade(frame, 0, strip, self._width, _STRIP, scale=self._scale)
+
+        image = Image.fromarray(frame)
+        painter = Painter(image, self._scale)
+        for j, (text, size, colour) in enumerate(lines):
+            painter.text(28, 38 + 27 * j, text, size=size, colour=colour, anchor="lm")
+        self._top_view.draw(painter, map_left, 16, i)
+        for left, (_, panel) in zip(lefts, columns, strict=True):
+            panel(painter, left, strip + (-8.0 if self._compact else 10.0), i)
+        return np.asarray(image)
+
+    def _limit(self, signal: str, i: int) -> Limit | None:
+        """The first limit on a signal that is in force at frame `i`."""
+        time = self._footage.times[i]
+        return next((x for x in self._run.limits if x.signal == signal and x.start <= time <= x.stop), None)
+
+    def _headlines(self, i: int) -> list[tuple[str, float, Colour]]:
+        """Text, size and colour of the lines in the corner."""
+        control, k = self._run.log.control, self._footage.period[i]
+        time = self._footage.times[i]
+        lines: list[tuple[str, float, Colour]] = [(self._run.name, 21, WHITE)]
+        if self._compact:
+            return [*lines, (f"t = {time:.1f} s", 17, GREY)]
+        lines += [(self._subtitle, 14, GREY), (f"t = {time:.2f} s", 20, WHITE), self._answer(k)]
+        for vectors, what, unit, colour in (
+            (self._footage.wind, "wind", "m/s", CYAN),
+            (self._footage.force, "external force", "N", VIOLET),
+        ):
+            if vectors is not None:
+                lines.append((f"{what} {np.linalg.norm(vectors[i]):.2g} {unit}", 14, colour))
+        reason = self._run.log.reason
+        if reason is not None and time >= control.t[-1]:
+            lines.append((f"aborted {reason}"[:130], 15, RED))
+        return lines
+
+    def _answer(self, k: int) -> tuple[str, float, Colour]:
+        """Phase, where the flight has a ground, and what the controller answered in period k; red for a failure."""
+        control = self._run.log.control
+        status, phase, fallback = control.status[k], control.phase[k], control.fallback[k]
+        told = [phase] if self._grounded and status != phase else []
+        told.append(status + (f" (fallback {fallback})" if fallback else ""))
+        if control.iterations[k]:
+            told += [f"{control.iterations[k]} iterations", f"{control.active[k]} active"]
+        good = fallback == 0 and status in ACCEPTED | {Phase.LANDED}
+        return "  ·  ".join(told), 14, GREEN if good else RED
+
+    def _position(self, painter: Painter, x: float, y: float, i: int) -> None:
+        painter.text(x + 118, y, "now", size=13, colour=GREY, anchor="ra")
+        painter.text(x + 192, y, "reference", size=13, colour=AMBER, anchor="ra")
+        painter.text(x + 262, y, "error", size=13, colour=GREY, anchor="ra")
+        reference = self._run.log.control.reference[self._footage.period[i]]
+        values = (*self._footage.position[i], self._footage.euler[i, 2])
+        for j, (name, state) in enumerate(zip(REFERENCE_NAMES, REFERENCE_STATES, strict=True)):
+            angle = state == INDEX["yaw"]
+            factor, digits = (math.degrees(1.0), 1) if angle else (1.0, 2)
+            now, wanted, row = factor * values[j], factor * reference[j], y + 24 + 27 * j
+            painter.text(x, row, f"{name} [{'deg' if angle else 'm'}]", colour=GREY)
+            for right, value, colour in ((118, now, WHITE), (192, wanted, AMBER), (262, now - wanted, GREY)):
+                shown = round(value, digits) + 0.0  # no "-0.00"
+                painter.text(x + right, row, f"{shown:+.{digits}f}", colour=colour, anchor="ra")
+
+    def _attitude(self, painter: Painter, x: float, y: float, i: int) -> None:
+        painter.text(x, y, "attitude [deg]", size=13, colour=GREY)
+        for j, name in enumerate(("roll", "pitch")):
+            value, limit, row = math.degrees(self._footage.euler[i, j]), self._limit(name, i), y + 32 + 50 * j
+            finite = [abs(b) for b in _bounds(limit) if math.isfinite(b)]
+            span = 2.0 * max(finite) if finite else 30.0
+            broken = _breaks(limit, value)
+            painter.text(x, row, name, size=17)
+            painter.text(
+                x + 262, row, f"{round(value, 2) + 0.0:+.2f}", size=17, colour=RED if broken else WHITE, anchor="ra"
+            )
+            painter.box(x, row + 25, 262, 9, FAINT)
+            centre, unit = x + 131, 131 / span
+            painter.box(centre, row + 25, unit * float(np.clip(value, -span, span)), 9, RED if broken else BLUE)
+            painter.box(centre - 0.5, row + 23, 1, 13, GREY)
+            for bound in _bounds(limit):
+                if math.isfinite(bound):
+                    painter.box(centre + unit * bound - 1, row + 21, 2.5, 17, RED if broken else AMBER)
+
+    def _speeds(self, painter: Painter, x: float, y: float, i: int) -> None:
+        limit = self._limit("speed", i)
+        upper = _bounds(limit)[1]
+        top = 1.25 * (upper if math.isfinite(upper) else self._run.vehicle.speed_max)
+        painter.text(x, y, "rotor speed [rad/s]", size=13, colour=GREY)
+        self._bars(painter, x, y, self._footage.speeds[i], limit, (0.0, top), "{:.0f}")
+
+    def _slews(self, painter: Painter, x: float, y: float, i: int) -> None:
+        limit = self._limit("slew", i)
+        finite = [abs(bound) for bound in _bounds(limit) if math.isfinite(bound)]
+        span = 1.6 * max(finite) if finite else 20.0
+        painter.text(x, y, "step per period [rad/s]", size=13, colour=GREY)
+        self._bars(painter, x, y, self._run.log.control.slews[self._footage.period[i]], limit, (-span, span), "{:+.1f}")
+
+    def _bars(
+        self,
+        painter: Painter,
+        x: float,
+        y: float,
+        values: Array,
+        limit: Limit | None,
+        span: tuple[float, float],
+        form: str,
+    ) -> None:
+        top, height, low, high = y + 22, 88.0, *span
+        unit = height / (high - low)
+        zero = top + height + unit * min(low, 0.0)
+        for j, value in enumerate(values):
+            left, broken = x + 50 * j, _breaks(limit, value)
+            painter.box(left, top, 34, height, FAINT)
+            painter.box(left, zero, 34, -unit * float(np.clip(value, low, high)), RED if broken else BLUE)
+            painter.text(
+                left + 17,
+                top + height + 5,
+                form.format(round(value, 1) + 0.0),
+                size=13,
+                colour=RED if broken else WHITE,
+                anchor="ma",
+            )
+        for bound in _bounds(limit):
+            if math.isfinite(bound) and bound != 0.0:
+                painter.box(x - 4, zero - unit * bound - 1, 192, 2, AMBER)
+
+    def _margins(self, painter: Painter, x: float, y: float, i: int) -> None:
+        painter.text(x, y, "limit", size=13, colour=GREY)
+        painter.text(x + 226, y, "worst margin so far", size=13, colour=GREY, anchor="ra")
+        shown, rest = margin_rows(self._ranked, i)
+        pitch = 18.5 if len(self._ranked) <= _MOST_MARGINS else 16.0
+        for j, track in enumerate(shown):
+            worst, row = track.worst[i], y + 22 + pitch * j
+            now_broken, once_broken = (margin < -track.limit.tolerance for margin in (track.now[i], worst))
+            painter.text(x, row, track.limit.name, size=14, colour=RED if now_broken else GREY)
+            told = f"{round(worst, 2) + 0.0:+.2f} {track.limit.unit}"
+            painter.text(x + 226, row, told, size=14, colour=RED if once_broken else WHITE, anchor="ra")
+        colour = RED if "violated" in rest else GREY
+        painter.text(x, y + 22 + pitch * len(shown), rest, size=14, colour=colour)
+
+
+def margin_rows(ranked: Sequence[MarginTrack], i: int) -> tuple[list[MarginTrack], str]:
+    """The limits that frame `i` shows, the first of those whose window has begun, and what is said of the others."""
+    begun = [track for track in ranked if not math.isnan(track.worst[i])]
+    hidden = begun[_MOST_MARGINS:]
+    broken = sum(track.worst[i] < -track.limit.tolerance for track in hidden)
+    told = {"more": len(hidden), "of them violated": broken, "not begun": len(ranked) - len(begun)}
+    parts = [f"{count} {what}" for what, count in told.items() if count]
+    return begun[:_MOST_MARGINS], f"and {', '.join(parts)}" if parts else ""
+
+
+def _bounds(limit: Limit | None) -> tuple[float, float]:
+    return (-math.inf, math.inf) if limit is None else (limit.lower, limit.upper)
+
+
+def _breaks(limit: Limit | None, value: float) -> bool:
+    lower, upper = _bounds(limit)
+    tolerance = 0.0 if limit is None else max(limit.tolerance, 1e-6)
+    return not lower - tolerance <= value <= upper + tolerance

@@ -1,0 +1,228 @@
+"""What the frames of a film show: a flight and its margins at frame times, and where the camera looks.  Plain numpy."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from typing import Any, Final
+
+import numpy as np
+
+from quadsim.errors import FileError, ParameterError
+from quadsim.flight.audit import Limit
+from quadsim.flight.rundir import Run
+from quadsim.state import EULER, POSITION, Array, euler_to_quaternion
+
+_CAMERA_MEMORY: Final = 0.7
+"""Time constant [s] of the camera's smoothing, forward and backward."""
+_LEASH: Final = 0.6
+"""How far the camera's aim may be from the vehicle, in arm lengths per axis."""
+
+_TOLERANCE: Final = 0.03
+"""How far a drawn path may be from the real one, in arm lengths."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Shot:
+    """Which frames to film, and in which size.
+
+    Attributes:
+        run: the run directory.
+        width: [pixels], even.
+        height: [pixels], even.
+        fps: frames per second of film.
+        start: simulated time of frame 0 [s].
+        speed: simulated seconds per second of film.
+        first: first frame to film.
+        count: how many.
+        compact: whether to leave out all but the largest captions, for small pictures.
+    """
+
+    run: str
+    width: int = 1280
+    height: int = 720
+    fps: int = 30
+    start: float = 0.0
+    speed: float = 1.0
+    first: int = 0
+    count: int
+    compact: bool = False
+
+    def __post_init__(self) -> None:
+        for name, smallest in (("width", 320), ("height", 180), ("fps", 1), ("count", 1)):
+            if getattr(self, name) < smallest:
+                raise ParameterError("film", name, getattr(self, name), f"at least {smallest}")
+        for name in ("width", "height"):
+            if getattr(self, name) % 2:
+                raise ParameterError("film", name, getattr(self, name), "even")
+        if not self.speed > 0.0:
+            raise ParameterError("film", "speed", self.speed, "positive")
+
+    @property
+    def times(self) -> Array:
+        """(count,) simulated times of the frames [s]."""
+        frames: Array = np.arange(self.first, self.first + self.count, dtype=float)
+        return self.start + self.speed / self.fps * frames
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain values, which make the same shot again."""
+        return asdict(self)
+
+
+@dataclass(frozen=True, kw_only=True)
+class MarginTrack:
+    """One limit's margins at frame times, in the limit's unit.
+
+    Attributes:
+        limit: the limit.
+        now: (F,) signed margin; NaN outside the limit's time window.
+        worst: (F,) smallest margin so far; NaN before the window.
+        share: the smallest of the whole flight, tolerance included, over half the limit's band: 1 in its middle,
+            negative where it is violated; infinite where the flight never reaches the window.
+    """
+
+    limit: Limit
+    now: Array
+    worst: Array
+    share: float
+
+    @property
+    def rank(self) -> tuple[bool, bool, float]:
+        """Sorts the limits of a flight: required ones that are violated, others that are, then the nearest first."""
+        broken = self.share < 0.0
+        return not broken, broken and not self.limit.required, self.share
+
+
+@dataclass(frozen=True, kw_only=True)
+class Footage:
+    """A flight at F frame times.
+
+    Attributes:
+        times: (F,) [s].
+        period: (F,) index of the control period each frame is in.
+        position: (F, 3) [m], world.
+        euler: (F, 3) roll, pitch, yaw [rad], of the plant row before the frame.
+        quaternion: (F, 4) attitude, scalar first.
+        speeds: (F, 4) rotor speeds [rad/s].
+        turned: (F, 4) angle each rotor has turned since the start [rad].
+        aim: (F, 3) what the camera looks at [m].
+        margins: one track per limit.
+        path_times: (P,) times of the flown path's points [s], at most a second apart.
+        path: (P, 3) flown path of the whole flight [m], thinned where it is straight.
+        course: (Q, 3) reference path of the whole flight [m], thinned.
+        wind: (F, 3) velocity of the air, world [m/s]; None without wind.
+        force: (F, 3) external force, world [N]; None where there is none.
+    """
+
+    times: Array
+    period: np.ndarray[Any, np.dtype[np.intp]]
+    position: Array
+    euler: Array
+    quaternion: Array
+    speeds: Array
+    turned: Array
+    aim: Array
+    margins: tuple[MarginTrack, ...]
+    path_times: Array
+    path: Array
+    course: Array
+    wind: Array | None
+    force: Array | None
+
+
+def film_span(run: Run) -> tuple[float, float]:
+    """First and last simulated time [s] there is something to film of.
+
+    Raises:
+        FileError: the flight ended before its first control period.
+    """
+    log = run.log
+    if log.control.t.size == 0 or log.plant.t.size == 0:
+        raise FileError(run.directory, "holds nothing to film: the flight ended before its first control period")
+    return float(log.plant.t[0]), float(log.plant.t[-1])
+
+
+def make_footage(run: Run, times: Array) -> Footage:
+    """Read a flight at frame times; times beyond the flight show its ends."""
+    plant, control = run.log.plant, run.log.control
+    times = np.clip(times, *film_span(run))
+    row = np.clip(np.searchsorted(plant.t, times + 1e-9, side="right") - 1, 0, max(plant.t.size - 2, 0))
+    after = np.minimum(row + 1, plant.t.size - 1)
+    share = ((times - plant.t[row]) / np.where(after > row, plant.t[after] - plant.t[row], 1.0))[:, None]
+    positions = plant.state[:, POSITION]
+    attitudes = euler_to_quaternion(plant.state[:, EULER])
+    here, there = attitudes[row], attitudes[after]
+    there = np.where((here * there).sum(axis=1, keepdims=True) < 0.0, -there, there)
+    quaternion = (1.0 - share) * here + share * there
+    position = (1.0 - share) * positions[row] + share * positions[after]
+    leash = _LEASH * run.vehicle.arm_length
+    aim = np.stack([np.interp(times, plant.t, _smooth(plant.t, axis)) for axis in positions.T], axis=1)
+    tolerance = _TOLERANCE * run.vehicle.arm_length
+    seconds = np.searchsorted(plant.t, np.arange(plant.t[0], plant.t[-1]))
+    path_rows = np.union1d(thin(positions, tolerance), seconds)
+    steps = np.diff(plant.t, prepend=plant.t[:1])[:, None]
+    turned = np.cumsum(steps * np.abs(plant.speeds), axis=0)
+    course = control.reference[:, :3]
+    force = None if plant.wrench is None else plant.wrench[:, :3]
+    return Footage(
+        times=times,
+        period=_row_before(control.t, times),
+        position=position,
+        euler=plant.state[row][:, EULER],
+        quaternion=quaternion / np.linalg.norm(quaternion, axis=1, keepdims=True),
+        speeds=plant.speeds[row],
+        turned=(1.0 - share) * turned[row] + share * turned[after],
+        aim=position + np.clip(aim - position, -leash, leash),
+        margins=tuple(_track(run, limit, times) for limit in run.limits),
+        path_times=plant.t[path_rows],
+        path=positions[path_rows],
+        course=course[thin(course, tolerance)],
+        wind=None if plant.wind is None else plant.wind[row],
+        force=None if force is None or not np.any(force) else force[row],
+    )
+
+
+def _row_before(t: Array, times: Array) -> np.ndarray[Any, np.dtype[np.intp]]:
+    return np.clip(np.searchsorted(t, times + 1e-9, side="right") - 1, 0, t.size - 1)
+
+
+def _track(run: Run, limit: Limit, times: Array) -> MarginTrack:
+    signal = limit.source
+    if signal.plant is None:
+        t, values = run.log.control.t, signal.sampled(run.log.control)
+    else:
+        t, values = run.log.plant.t, signal.plant(run.log.plant)
+    inside = (t >= limit.start - 1e-9) & (t <= limit.stop + 1e-9)
+    margin = np.where(inside, limit.margin(values), np.nan)
+    row, worst = _row_before(t, times), np.fmin.accumulate(margin)
+    share = (float(worst[-1]) + limit.tolerance) / limit.half_band
+    return MarginTrack(limit=limit, now=margin[row], worst=worst[row], share=np.inf if np.isnan(share) else share)
+
+
+def _smooth(t: Array, values: Array) -> Array:
+    """First-order low-pass, forward then backward, so that the picture neither lags nor leads."""
+    if t.size < 2:
+        return values
+    keep = float(np.exp(-(t[-1] - t[0]) / (t.size - 1) / _CAMERA_MEMORY))
+    for _ in range(2):
+        smooth = values.copy()
+        for i in range(1, smooth.size):
+            smooth[i] = keep * smooth[i - 1] + (1.0 - keep) * values[i]
+        values = smooth[::-1]
+    return values
+
+
+def thin(points: Array, tolerance: float) -> np.ndarray[Any, np.dtype[np.intp]]:
+    """Rows of a path (n, 3) that show it within `tolerance` [m], first and last included (Ramer-Douglas-Peucker)."""
+    kept, open_spans = {0, len(points) - 1}, [(0, len(points) - 1)]
+    while open_spans:
+        first, last = open_spans.pop()
+        inner, chord = points[first + 1 : last] - points[first], points[last] - points[first]
+        if not len(inner):
+            continue
+        along = np.clip(inner @ chord / max(float(chord @ chord), np.finfo(float).tiny), 0.0, 1.0)
+        apart = np.linalg.norm(inner - along[:, None] * chord, axis=1)
+        if apart.max() > tolerance:
+            middle = first + 1 + int(np.argmax(apart))
+            kept.add(middle)
+            open_spans += [(first, middle), (middle, last)]
+    return np.array(sorted(kept))

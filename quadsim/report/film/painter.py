@@ -1,0 +1,99 @@
+"""What the captions of films are drawn with, and in which colours.  Pillow alone."""
+
+from __future__ import annotations
+
+import functools
+import math
+from typing import Any, Final
+
+import numpy as np
+from PIL import Image, ImageDraw, ImageFont
+
+from quadsim.state import Array
+
+Picture = np.ndarray[Any, np.dtype[np.uint8]]
+Colour = tuple[int, int, int]
+
+WHITE: Final = (240, 243, 246)
+GREY: Final = (158, 168, 178)
+FAINT: Final = (74, 82, 92)
+RED: Final = (255, 84, 66)
+BLUE: Final = (72, 176, 255)
+AMBER: Final = (255, 184, 77)
+GREEN: Final = (120, 222, 150)
+CYAN: Final = (126, 232, 232)
+VIOLET: Final = (225, 120, 205)
+
+_TEXTS: Final = 2048
+"""Texts that are kept as pictures, of each size of font: a film shows most of its words in every frame."""
+_SHADE: Final = (np.arange(256) * 0.24 + 12.0).astype(np.uint8)
+
+
+class Painter:
+    """Draws on one picture; lengths are design pixels, scaled to the picture's real size.
+
+    Args:
+        image: what to draw on.
+        scale: real pixels per design pixel.
+    """
+
+    def __init__(self, image: Image.Image, scale: float) -> None:
+        self._pen, self._scale = ImageDraw.Draw(image), scale
+
+    def text(
+        self, x: float, y: float, text: str, *, size: float = 15, colour: Colour = WHITE, anchor: str = "la"
+    ) -> None:
+        """Write at a place; `anchor` is Pillow's, `ra` for right-aligned."""
+        font = _font(max(6, round(size * self._scale)))
+        self._pen.text((x * self._scale, y * self._scale), text, fill=colour, font=font, anchor=anchor)
+
+    def box(self, x: float, y: float, width: float, height: float, colour: Colour) -> None:
+        """Fill a rectangle; a negative width or height reaches to the left or up."""
+        left, right = sorted((x * self._scale, (x + width) * self._scale))
+        top, bottom = sorted((y * self._scale, (y + height) * self._scale))
+        self._pen.rectangle(
+            (round(left), round(top), max(round(right) - 1, round(left)), max(round(bottom) - 1, round(top))),
+            fill=colour,
+        )
+
+    def line(self, points: Array, colour: Colour, *, width: float = 1.5) -> None:
+        """Draw through points (n, 2)."""
+        if len(points) > 1:
+            self._pen.line(
+                (points * self._scale).ravel().tolist(), fill=colour, width=max(1, round(width * self._scale))
+            )
+
+    def dot(self, place: Array, radius: float, colour: Colour) -> None:
+        """Fill a circle."""
+        self._pen.circle((place * self._scale).tolist(), radius * self._scale, fill=colour)
+
+    def arrow(self, start: Array, reach: Array, colour: Colour) -> None:
+        """Draw from a place (2,) as far as `reach` (2,) says; nothing where that is shorter than its head."""
+        head, length = 6.0, math.hypot(*reach)
+        if length < head:
+            return
+        along = head / length * reach
+        across, tip = 0.6 * np.array([-along[1], along[0]]), start + reach
+        self.line(np.stack([start, tip]), colour, width=2.0)
+        self.line(np.stack([tip - along + across, tip, tip - along - across]), colour, width=2.0)
+
+
+def shade(frame: Picture, x: float, y: float, width: float, height: float, *, scale: float) -> None:
+    """Darken a rectangle of a frame, in place, so that text on it can be read."""
+    rows = slice(round(y * scale), round((y + height) * scale))
+    columns = slice(round(x * scale), round((x + width) * scale))
+    frame[rows, columns] = _SHADE.take(frame[rows, columns])
+
+
+@functools.lru_cache(maxsize=_TEXTS)
+def text_width(text: str, size: float, *, scale: float) -> float:
+    """How long a text is [design pixels]."""
+    return _font(max(6, round(size * scale))).getlength(text) / scale
+
+
+@functools.lru_cache(maxsize=32)
+def _font(size: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
+    font = ImageFont.load_default(size)
+    if isinstance(font, ImageFont.FreeTypeFont):  # else it is Pillow's own bitmap, which takes no time
+        font.getmask2 = functools.lru_cache(maxsize=_TEXTS)(font.getmask2)  # type: ignore[assignment,method-assign]
+    return font

@@ -1,0 +1,259 @@
+"""The child process that renders, `python -m quadsim.report.film.render_worker TASK [ARGUMENTS]`; see `video`.
+
+MuJoCo reads MUJOCO_GL when it is imported and dies where the library is missing, so nothing is rendered in the process
+that simulates.  Frames done are reported on stdout, one number per line.
+"""
+
+from __future__ import annotations
+
+import itertools
+import json
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, Final
+
+import imageio
+import imageio_ffmpeg
+import mujoco
+import numpy as np
+
+from quadsim.controller import Phase
+from quadsim.flight.rundir import Run, load_run
+from quadsim.report.film.captions import Overlay
+from quadsim.report.film.frames import Footage, Shot, make_footage, thin
+from quadsim.report.film.painter import Picture
+from quadsim.sim.airframe import FLOOR, PROPELLER_NAMES, compile_model
+from quadsim.state import Array
+from quadsim.vehicle import Vehicle
+
+TRAIL_SECONDS: Final = 12.0
+"""How long the path flown stays in sight [s]."""
+CAMERA_DISTANCE: Final = 6.8
+"""From camera to aim, in arm lengths; its azimuth and elevation below in degrees."""
+CAMERA_AZIMUTH: Final = 125.0
+CAMERA_ELEVATION: Final = -18.0
+BLADE_SLOWDOWN: Final = 20.0
+"""Blades are drawn turning this much slower than they do, so that an eye can follow."""
+PORTRAIT_DISTANCE: Final = 3.3
+"""From camera to vehicle in a portrait, in arm lengths; its azimuth and elevation below in degrees."""
+PORTRAIT_AZIMUTH: Final = -150.0
+PORTRAIT_ELEVATION: Final = -28.0
+PORTRAIT_SQUARE: Final = 0.1
+"""Side of a portrait's floor squares [m]."""
+_DEEPEST_FLOOR: Final = 30.0
+"""The floor lies below the whole flight, but no deeper than this [m]."""
+_LONGEST_ARROW: Final = 2.5
+"""Cap on a thrust arrow, in arrows at hover."""
+_MOST_GEOMS: Final = 2000
+_COURSE_COLOUR: Final = (1.0, 0.72, 0.25, 0.75)
+_TRAIL_COLOUR: Final = (0.12, 0.56, 1.0, 1.0)
+_HORIZON_COLOUR: Final = (0.35, 1.0, 0.55, 0.95)
+_THRUST_COLOUR: Final = (0.25, 0.70, 1.0, 0.85)
+_BROKEN_COLOUR: Final = (1.0, 0.2, 0.12, 0.95)
+_SHADOW_COLOUR: Final = (0.05, 0.07, 0.10, 0.45)
+
+
+class Stage:
+    """A vehicle in its scene, rendered off screen; use as a context manager, it owns an OpenGL context.
+
+    Besides the airframe, frames show the reference path, the path flown in the last seconds, the predicted horizon,
+    one thrust arrow per rotor (red beyond the speed limit) and a shadow with a plumb line to the floor.
+    """
+
+    def __init__(self, run: Run, footage: Footage, *, width: int, height: int) -> None:
+        self._run, self._footage = run, footage
+        self._arm = run.vehicle.arm_length
+        self._model = compile_model(run.vehicle, visuals=True)
+        self._model.vis.quality.offsamples = 0
+        self._model.vis.global_.offwidth, self._model.vis.global_.offheight = width, height
+        lowest = max(float(footage.path[:, 2].min()), -_DEEPEST_FLOOR)
+        self._floor = min(lowest, 0.0) + float(self._model.geom(FLOOR).pos[2])
+        self._model.geom(FLOOR).pos[2] = self._floor
+        self._data = mujoco.MjData(self._model)
+        self._camera = mujoco.MjvCamera()
+        self._camera.distance = CAMERA_DISTANCE * self._arm
+        self._camera.azimuth, self._camera.elevation = CAMERA_AZIMUTH, CAMERA_ELEVATION
+        self._speed_bound = min((limit.upper for limit in run.limits if limit.signal == "speed"), default=np.inf)
+        self._renderer = mujoco.Renderer(self._model, height, width, max_geom=_MOST_GEOMS)
+        for flag in (mujoco.mjtRndFlag.mjRND_SHADOW, mujoco.mjtRndFlag.mjRND_REFLECTION):
+            self._renderer.scene.flags[flag] = 0
+
+    def __enter__(self) -> Stage:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._renderer.close()
+
+    def render(self, i: int) -> Picture:
+        """Frame `i` of the footage, (height, width, 3), without captions."""
+        shown = self._footage
+        self._data.qpos[:3], self._data.qpos[3:7] = shown.position[i], shown.quaternion[i]
+        for name, turned, spin in zip(PROPELLER_NAMES, shown.turned[i], self._run.vehicle.rotor_spins, strict=True):
+            half = -0.5 * spin * turned / BLADE_SLOWDOWN  # a propeller turns against its reaction torque
+            self._model.body(name).quat[:] = np.cos(half), 0.0, 0.0, np.sin(half)
+        mujoco.mj_kinematics(self._model, self._data)
+        mujoco.mj_camlight(self._model, self._data)
+        # Aimed a little low, so that the vehicle stands above the captions.
+        self._camera.lookat = shown.aim[i] - (0.0, 0.0, 0.55 * self._arm)
+        self._renderer.update_scene(self._data, self._camera)
+        self._draw_course()
+        self._draw_trail(i)
+        self._draw_horizon(i)
+        self._draw_thrusts(i)
+        self._draw_shadow(i)
+        return np.ascontiguousarray(self._renderer.render())
+
+    def _connect(
+        self, kind: mujoco.mjtGeom, width: float, start: Array, stop: Array, colour: tuple[float, float, float, float]
+    ) -> None:
+        scene = self._renderer.scene
+        if scene.ngeom >= scene.maxgeom:
+            return
+        geom = scene.geoms[scene.ngeom]
+        mujoco.mjv_initGeom(geom, kind, np.zeros(3), np.zeros(3), np.zeros(9), np.array(colour, np.float32))
+        mujoco.mjv_connector(geom, kind, width, start, stop)
+        geom.category = mujoco.mjtCatBit.mjCAT_DECOR
+        geom.emission = 0.5
+        scene.ngeom += 1
+
+    def _draw_course(self) -> None:
+        course = self._footage.course
+        for start, stop in itertools.pairwise(course):
+            self._connect(mujoco.mjtGeom.mjGEOM_CAPSULE, 0.018 * self._arm, start, stop, _COURSE_COLOUR)
+
+    def _draw_trail(self, i: int) -> None:
+        now, times = self._footage.times[i], self._footage.path_times
+        first, last = np.searchsorted(times, (now - TRAIL_SECONDS, now), side="right")
+        points = np.concatenate([self._footage.path[first:last], self._footage.position[i : i + 1]])
+        for j, (start, stop) in enumerate(itertools.pairwise(points)):
+            age = (now - times[first + j]) / TRAIL_SECONDS
+            colour = (*_TRAIL_COLOUR[:3], float(np.clip(1.0 - age, 0.0, 1.0)))
+            self._connect(mujoco.mjtGeom.mjGEOM_CAPSULE, 0.030 * self._arm, start, stop, colour)
+
+    def _draw_horizon(self, i: int) -> None:
+        k = self._footage.period[i]
+        # A prediction knows no ground: from there it would fall through it.
+        if self._run.log.predicted is None or self._run.log.control.phase[k] != Phase.FLYING:
+            return
+        predicted = self._run.log.predicted[k].astype(float)
+        predicted = predicted[thin(predicted, 0.02 * self._arm)]
+        for start, stop in itertools.pairwise(predicted):
+            self._connect(mujoco.mjtGeom.mjGEOM_CAPSULE, 0.028 * self._arm, start, stop, _HORIZON_COLOUR)
+
+    def _draw_thrusts(self, i: int) -> None:
+        hover = self._run.vehicle.hover_speed
+        for name, speed in zip(PROPELLER_NAMES, self._footage.speeds[i], strict=True):
+            body = self._data.body(name)
+            length = 1.0 * self._arm * min(float(speed / hover) ** 2, _LONGEST_ARROW)
+            if length < 0.02 * self._arm:
+                continue
+            colour = _BROKEN_COLOUR if speed > self._speed_bound + 1e-6 else _THRUST_COLOUR
+            tip = body.xpos + length * body.xmat.reshape(3, 3)[:, 2]
+            self._connect(mujoco.mjtGeom.mjGEOM_ARROW, 0.04 * self._arm, body.xpos, tip, colour)
+
+    def _draw_shadow(self, i: int) -> None:
+        foot = np.array([*self._footage.position[i, :2], self._floor + 0.004 * self._arm])
+        thickness = np.array([0.0, 0.0, 0.004 * self._arm])
+        self._connect(mujoco.mjtGeom.mjGEOM_CYLINDER, 0.9 * self._arm, foot, foot + thickness, _SHADOW_COLOUR)
+        self._connect(mujoco.mjtGeom.mjGEOM_LINE, 1.0, self._footage.position[i], foot, _SHADOW_COLOUR)
+
+
+def frames(run: Run, shot: Shot) -> Iterator[Picture]:
+    """The frames of a shot, captions and all, each (height, width, 3)."""
+    footage = make_footage(run, shot.times)
+    overlay = Overlay(run, footage, width=shot.width, height=shot.height, compact=shot.compact)
+    with Stage(run, footage, width=shot.width, height=shot.height) as stage:
+        for i in range(shot.count):
+            yield overlay.draw(stage.render(i), i)
+
+
+def film(shot: Shot, path: Path) -> None:
+    """Render a shot and encode it as H.264, reporting frames done on stdout."""
+    options = ["-preset", "veryfast", "-crf", "23", "-threads", "1"]
+    writer: Any = imageio.get_writer(
+        path, format="FFMPEG", fps=shot.fps, codec="libx264", pixelformat="yuv420p", quality=None,
+        macro_block_size=1, ffmpeg_log_level="error", output_params=options,
+    )  # fmt: skip
+    with writer:
+        for i, picture in enumerate(frames(load_run(Path(shot.run)), shot), start=1):
+            writer.append_data(picture)
+            print(i, flush=True)
+
+
+def join(segments: Path, path: Path) -> None:
+    """Join the MP4 files that an ffmpeg concat list names, without encoding again."""
+    _ffmpeg("-f", "concat", "-safe", "0", "-i", str(segments), "-c", "copy", "-movflags", "+faststart", str(path))
+
+
+def make_gif(source: Path, path: Path, width: int) -> None:
+    """Turn an MP4 into a looping GIF of a given width [pixels], with few colours and little noise to keep it small."""
+    picture = f"scale={width}:-2:flags=area,hqdn3d=3:3:0:0,split[a][b];[a]palettegen=max_colors=96:stats_mode=diff[p]"
+    dither = "[b][p]paletteuse=dither=none:diff_mode=rectangle"
+    _ffmpeg("-i", str(source), "-filter_complex", f"{picture};{dither}", "-loop", "0", str(path))
+
+
+def draw_portrait(vehicle: Vehicle, path: Path, width: int, height: int) -> None:
+    """Draw a vehicle standing on a floor of 10 cm squares, seen from its front left."""
+    model = compile_model(vehicle, visuals=True)
+    model.vis.global_.offwidth, model.vis.global_.offheight = width, height
+    model.mat_texrepeat[model.material(FLOOR).id] = 0.5 / PORTRAIT_SQUARE  # the texture is two squares wide
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    camera = mujoco.MjvCamera()
+    camera.distance = PORTRAIT_DISTANCE * vehicle.arm_length
+    camera.azimuth, camera.elevation = PORTRAIT_AZIMUTH, PORTRAIT_ELEVATION
+    camera.lookat[2] = 0.5 * float(model.geom(FLOOR).pos[2])
+    with mujoco.Renderer(model, height, width) as renderer:
+        scene = renderer.scene
+        scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = 0  # too coarse for what is small: a disc on the floor instead
+        renderer.update_scene(data, camera)
+        size, place = np.array([0.9, 0.002, 0.0]) * vehicle.arm_length, np.array([0.0, 0.0, model.geom(FLOOR).pos[2]])
+        shadow = scene.geoms[scene.ngeom]
+        kind = mujoco.mjtGeom.mjGEOM_CYLINDER
+        mujoco.mjv_initGeom(shadow, kind, size, place, np.eye(3).ravel(), np.array(_SHADOW_COLOUR, np.float32))
+        scene.ngeom += 1
+        imageio.imwrite(path, renderer.render())
+
+
+def probe() -> None:
+    """Render one tiny picture, and fail unless there is something in it."""
+    model = mujoco.MjModel.from_xml_string(
+        "<mujoco><worldbody><light pos='0 0 3'/><geom size='1'/></worldbody></mujoco>"
+    )
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    renderer = mujoco.Renderer(model, 32, 32)
+    renderer.update_scene(data)
+    picture = renderer.render()
+    renderer.close()
+    if not picture.any():
+        raise RuntimeError("the picture is black")
+
+
+def _ffmpeg(*arguments: str) -> None:
+    command = [imageio_ffmpeg.get_ffmpeg_exe(), "-y", "-loglevel", "error", *arguments]
+    subprocess.run(command, check=True, stdin=subprocess.DEVNULL)
+
+
+def main(arguments: list[str]) -> None:
+    """Do one task: `probe`, `film SHOT MP4`, `join LIST MP4`, `gif MP4 GIF WIDTH` or `portrait VEHICLE PNG W H`."""
+    match arguments:
+        case ["probe"]:
+            probe()
+        case ["film", shot, path]:
+            fields: dict[str, Any] = json.loads(shot)
+            film(Shot(**fields), Path(path))
+        case ["join", segments, path]:
+            join(Path(segments), Path(path))
+        case ["gif", source, path, width]:
+            make_gif(Path(source), Path(path), int(width))
+        case ["portrait", vehicle, path, width, height]:
+            draw_portrait(Vehicle(**json.loads(vehicle)), Path(path), int(width), int(height))
+        case _:
+            raise SystemExit(main.__doc__)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

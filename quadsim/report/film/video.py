@@ -1,0 +1,251 @@
+"""A run directory -> a film of its flight, rendered after the flight in child processes.
+
+The caller never touches OpenGL: each child (`render_worker`) gets its own environment, renders and encodes a run of
+frames, and one more joins the pieces without encoding again.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import itertools
+import json
+import os
+import selectors
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import IO, Final
+
+from quadsim.errors import OutputError, ParameterError, RenderingUnavailableError
+from quadsim.flight.rundir import Run, load_run, vehicle_to_json
+from quadsim.outputs import writing_file
+from quadsim.report.film.frames import Shot, film_span
+from quadsim.vehicle import Vehicle
+
+BACKENDS: Final = ("egl", "osmesa")
+"""What can render without a screen, in the order tried."""
+_WORKER: Final = (sys.executable, "-m", "quadsim.report.film.render_worker")
+_PROBE_SECONDS: Final = 60.0
+_LEAST_FREE_BYTES: Final = 1024 * 1024
+_FEWEST_FRAMES: Final = 30
+"""A further worker is not worth its start for fewer frames than these."""
+
+Progress = Callable[[int, int], None]
+
+
+def rendering_backend() -> str:
+    """The OpenGL back end, `egl` or `osmesa`, that renders on this machine; MUJOCO_GL says which to try first.
+
+    Raises:
+        RenderingUnavailableError: none does; it tells what each one said.
+    """
+    preferred = os.environ.get("MUJOCO_GL", "").strip().lower()
+    tried: dict[str, str] = {}
+    for backend in sorted(BACKENDS, key=lambda name: name != preferred):
+        try:
+            subprocess.run(
+                [*_WORKER, "probe"], env=_environment(backend), check=True, capture_output=True, timeout=_PROBE_SECONDS
+            )
+        except subprocess.CalledProcessError as error:
+            tried[backend] = _last_line(error.stderr)
+        except subprocess.TimeoutExpired:
+            tried[backend] = f"gave no picture within {_PROBE_SECONDS:g} s"
+        else:
+            return backend
+    raise RenderingUnavailableError(tried)
+
+
+def worker_count(frames: int, most: int | None = None) -> int:
+    """How many processes render a film of so many frames: `most`, or the usable cores, as far as that pays.
+
+    Raises:
+        ParameterError: there is to be none.
+    """
+    if most is None:
+        most = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    if most < 1:
+        raise ParameterError("film", "workers", most, "at least 1")
+    return max(1, min(most, frames // _FEWEST_FRAMES))
+
+
+def render_video(
+    run_directory: Path,
+    path: Path,
+    *,
+    workers: int | None = None,
+    progress: Progress | None = None,
+    width: int = 1280,
+    height: int = 720,
+    fps: int = 30,
+    start: float = 0.0,
+    stop: float | None = None,
+    speed: float = 1.0,
+) -> None:
+    """Film a run as an MP4 (H.264, 4:2:0), which appears at `path` complete or not at all.
+
+    Args:
+        run_directory: a run with its summary and Parquet files.
+        path: the MP4 to write; an earlier one is replaced, if it is as we wrote it.
+        workers: rendering processes, at most; the machine's cores when None.
+        progress: called with frames done and frames in all, in the caller's thread.
+        width: [pixels], even.
+        height: [pixels], even.
+        fps: frames per second.
+        start: first simulated time shown [s].
+        stop: last simulated time shown [s]; the flight's end when None.
+        speed: simulated seconds per second of film.
+
+    Raises:
+        FileError: the run cannot be read, or holds nothing to film.
+        OutputError: the film cannot be written, or a renderer failed; nothing is left behind.
+        ParameterError: a size, rate or time that cannot be.
+        RenderingUnavailableError: this machine cannot render.
+    """
+    shot = _plan(load_run(run_directory), start, stop, Shot(
+        run=str(run_directory), width=width, height=height, fps=fps, speed=speed, count=1
+    ))  # fmt: skip
+    with _making(path, ".mp4") as new:
+        _film(shot, new, workers, progress)
+
+
+def render_gif(
+    run_directory: Path,
+    path: Path,
+    *,
+    width: int = 480,
+    fps: int = 8,
+    start: float = 0.0,
+    stop: float | None = None,
+    speed: float = 6.0,
+    workers: int | None = None,
+) -> None:
+    """Film a run as a small looping GIF in 16:9, a time-lapse by default; arguments and errors as `render_video`.
+
+    It is rendered at twice its size, with large captions, and scaled down, which smooths its edges.
+    """
+    shot = _plan(load_run(run_directory), start, stop, Shot(
+        run=str(run_directory), width=2 * width, height=2 * round(width * 9 / 16), fps=fps, speed=speed, count=1,
+        compact=True,
+    ))  # fmt: skip
+    with _making(path, ".gif") as new:
+        film = new.with_suffix(".mp4")
+        backend = _film(shot, film, workers, None)
+        _work([("gif", str(film), str(new), str(width))], backend, new.parent)
+
+
+def render_portrait(vehicle: Vehicle, path: Path, *, width: int = 1280, height: int = 720) -> None:
+    """Draw a vehicle standing on a floor of 10 cm squares, as a PNG that appears at `path` complete or not at all.
+
+    Args:
+        vehicle: what is drawn.
+        path: the PNG to write; an earlier one is replaced, if it is as we wrote it.
+        width: [pixels].
+        height: [pixels].
+
+    Raises:
+        OutputError: the picture cannot be written, or the renderer failed; nothing is left behind.
+        RenderingUnavailableError: this machine cannot render.
+    """
+    with _making(path, ".png") as new:
+        numbers = json.dumps(vehicle_to_json(vehicle))
+        task = ("portrait", numbers, str(new), str(width), str(height))
+        _work([task], rendering_backend(), new.parent)
+
+
+def _plan(run: Run, start: float, stop: float | None, shot: Shot) -> Shot:
+    first, last = film_span(run)
+    stop = last if stop is None else min(stop, last)
+    if not first <= start <= stop:
+        raise ParameterError("film", "start", start, f"between {first:g} s and its stop at {stop:g} s")
+    return replace(shot, start=start, count=max(1, round((stop - start) * shot.fps / shot.speed)))
+
+
+def _film(shot: Shot, path: Path, workers: int | None, progress: Progress | None) -> str:
+    """Film a shot in pieces and join them; the back end that did it."""
+    pieces = worker_count(shot.count, workers)
+    backend = rendering_backend()
+    edges = [shot.count * piece // pieces for piece in range(pieces + 1)]
+    shots = [replace(shot, first=a, count=b - a) for a, b in itertools.pairwise(edges)]
+    names = [f"piece{piece}.mp4" for piece in range(pieces)]
+    tasks = [
+        ("film", json.dumps(part.to_json()), str(path.parent / name)) for part, name in zip(shots, names, strict=True)
+    ]
+    _work(tasks, backend, path.parent, None if progress is None else lambda done: progress(done, shot.count))
+    listing = path.parent / "pieces.txt"
+    listing.write_text("".join(f"file '{name}'\n" for name in names), encoding="utf-8")
+    _work([("join", str(listing), str(path))], backend, path.parent)
+    return backend
+
+
+class _WorkerFailure(Exception):
+    """A worker ended badly; the text is its last line."""
+
+
+@contextlib.contextmanager
+def _making(path: Path, form: str) -> Iterator[Path]:
+    """A file to be made in a folder of its own; see `writing_file`.  A worker's failure becomes an `OutputError`."""
+    try:
+        with writing_file(path, form) as new:
+            yield new
+    except _WorkerFailure as failure:
+        raise OutputError(path, f"the renderer failed: {failure}") from failure
+
+
+def _environment(backend: str) -> dict[str, str]:
+    packages = os.pathsep.join(filter(None, (str(Path(__file__).resolve().parents[3]), os.environ.get("PYTHONPATH"))))
+    return {**os.environ, "MUJOCO_GL": backend, "PYOPENGL_PLATFORM": backend, "PYTHONPATH": packages}
+
+
+def _work(
+    tasks: Sequence[Sequence[str]], backend: str, folder: Path, report: Callable[[int], None] | None = None
+) -> None:
+    """Run worker tasks side by side; when one fails, or anything is raised here, the others are killed.
+
+    Args:
+        tasks: arguments of each worker.
+        backend: OpenGL back end.
+        folder: where the workers' stderr goes.
+        report: called with the sum of the last numbers that the workers printed.
+
+    Raises:
+        _WorkerFailure: a worker failed.
+    """
+    with contextlib.ExitStack() as stack:
+        watched = stack.enter_context(selectors.DefaultSelector())
+        logs: list[IO[bytes]] = []
+        done = [0] * len(tasks)
+        for i, task in enumerate(tasks):
+            logs.append(stack.enter_context((folder / f"worker{i}.log").open("w+b")))
+            process = stack.enter_context(
+                subprocess.Popen([*_WORKER, *task], env=_environment(backend), stdout=subprocess.PIPE, stderr=logs[i])
+            )
+            stack.callback(process.kill)  # runs before Popen's own exit, which waits; kills none that has ended
+            assert process.stdout is not None
+            watched.register(process.stdout, selectors.EVENT_READ, (i, process))
+        while watched.get_map():
+            for key, _ in watched.select():
+                i, process = key.data
+                line = process.stdout.readline()
+                if line:
+                    done[i] = int(line)
+                    if report is not None:
+                        report(sum(done))
+                    continue
+                watched.unregister(process.stdout)
+                if process.wait() != 0:
+                    logs[i].seek(0)
+                    raise _WorkerFailure(_why(logs[i].read(), folder))
+
+
+def _last_line(text: bytes) -> str:
+    lines = text.decode(errors="replace").strip().splitlines()
+    return lines[-1].strip() if lines else "it ended without a word"
+
+
+def _why(said: bytes, folder: Path) -> str:
+    """Why a worker failed; on a full disk it could not even write that down."""
+    full = shutil.disk_usage(folder).free < _LEAST_FREE_BYTES
+    return "the disk is full" if full else _last_line(said)

@@ -1,0 +1,133 @@
+"""Several runs -> the rows of what their flights met: course, ground, what was told, when commands came."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, Final
+
+from quadsim.report.table import ABSENT, Cell, Mark, Row, format_number
+
+Summary = Mapping[str, Any]
+
+_COURSE: Final = {
+    "tilt": ("largest tilt asked for", "deg"),
+    "velocity": ("highest speed asked for", "m/s"),
+    "rotor_min": ("lowest rotor speed asked for", "rad/s"),
+    "rotor_max": ("highest rotor speed asked for", "rad/s"),
+}
+_TOUCHDOWN: Final = {
+    "time": ("touchdown at", "s"),
+    "speed": ("touchdown, descending with", "m/s"),
+    "horizontal_speed": ("touchdown, along the ground with", "m/s"),
+    "tilt": ("touchdown, tilt", "deg"),
+}
+_ERRORS: Final = {"rmse": "RMS error as told", "max_error": "largest error as told"}
+_TOLD: Final = ("x", "y", "z", "roll", "pitch", "yaw")
+
+
+def nested(data: Any, *keys: str) -> Any:
+    """A nested value, or None where a key is missing: a run that ended at once has no numbers."""
+    for key in keys:
+        data = data.get(key) if isinstance(data, Mapping) else None
+    return data
+
+
+def verdict(summary: Summary) -> str:
+    """The verdict on a flight in one word: satisfied, violated, or lost."""
+    if summary["status"] != "completed":
+        return "lost"
+    demanded = (entry for entry in summary["constraints"] if entry["required"])
+    return "satisfied" if all(entry["satisfied"] for entry in demanded) else "violated"
+
+
+def verdict_cell(summary: Summary) -> Cell:
+    """The verdict, and whether it is the one that the scenario states; a run of an older version states none."""
+    found, expected = verdict(summary), summary.get("expected")
+    if expected is None:
+        return Cell(text=found)
+    if summary.get("as_expected"):
+        return Cell(text=f"{found}, as expected", mark=Mark.GOOD if found == "satisfied" else Mark.NONE)
+    if found == expected:
+        return Cell(text=f"{found}, but interrupted", mark=Mark.BAD)
+    return Cell(text=f"{found}, expected: {expected}", mark=Mark.BAD)
+
+
+def course_rows(summaries: Sequence[Summary]) -> Iterator[Row]:
+    """What each course asks for, by differential flatness, and what of it is beyond the vehicle or its bounds."""
+    if not _any(summaries, "course"):
+        return
+    for key, (label, unit) in _COURSE.items():
+        yield _numbers("Course", label, unit, [nested(summary, "course", key) for summary in summaries])
+    yield _row("Course", "jumps", [_listed(nested(summary, "course", "jumps"), "at {:g} s") for summary in summaries])
+    problems = [_listed(nested(summary, "course", "problems"), "{}", Mark.WARN) for summary in summaries]
+    yield _row("Course", "beyond the bounds", problems)
+
+
+def ground_rows(summaries: Sequence[Summary]) -> Iterator[Row]:
+    """Take-off and touchdown, of flights that have a ground."""
+    if not _any(summaries, "ground"):
+        return
+    yield _numbers("Ground", "take-off at", "s", [nested(summary, "ground", "takeoff_time") for summary in summaries])
+    for key, (label, unit) in _TOUCHDOWN.items():
+        yield _numbers("Ground", label, unit, [nested(summary, "ground", "touchdown", key) for summary in summaries])
+    yield _row("Ground", "at the end", [_phase(summary) for summary in summaries])
+
+
+def estimation_rows(summaries: Sequence[Summary]) -> Iterator[Row]:
+    """How wrong the controller was told its state, and which samples a filter refused."""
+    if not _any(summaries, "estimation"):
+        return
+    for measure, label in _ERRORS.items():
+        for name in _TOLD:
+            angle = name in ("roll", "pitch", "yaw")
+            values = [nested(summary, "estimation", measure, name) for summary in summaries]
+            shown = [math.degrees(value) if angle and value is not None else value for value in values]
+            yield _numbers("State as told", f"{label}, {name}", "deg" if angle else "m", shown)
+    gone = [nested(summary, "estimation", "not_finite") for summary in summaries]
+    yield _numbers("State as told", "periods told no number", "", gone)
+    yield _row("State as told", "samples refused by the filter", [_refused(summary) for summary in summaries])
+
+
+def computation_rows(summaries: Sequence[Summary]) -> Iterator[Row]:
+    """When commands came, in simulated time."""
+    if not _any(summaries, "computation"):
+        return
+    for measure, label in {"p50": "median", "max": "maximum"}.items():
+        values = [nested(summary, "computation", "delay_ms", measure) for summary in summaries]
+        yield _numbers("Simulated computation", f"command after its measurement, {label}", "ms", values)
+    missed = [nested(summary, "computation", "missed") for summary in summaries]
+    cells = [Cell(text=format_number(value), mark=Mark.WARN if value else Mark.NONE) for value in missed]
+    yield _row("Simulated computation", "commands too late to be used", cells)
+
+
+def _any(summaries: Sequence[Summary], key: str) -> bool:
+    return any(summary.get(key) for summary in summaries)
+
+
+def _row(group: str, label: str, cells: Sequence[Cell], unit: str = "") -> Row:
+    return Row(group=group, label=label, unit=unit, cells=tuple(cells))
+
+
+def _numbers(group: str, label: str, unit: str, values: Sequence[float | None]) -> Row:
+    return _row(group, label, [Cell(text=format_number(value)) for value in values], unit)
+
+
+def _listed(entries: Sequence[Any] | None, form: str, mark: Mark = Mark.NONE) -> Cell:
+    """Entries in one cell; `none` where there are none, `-` where a run does not say."""
+    if entries is None:
+        return Cell()
+    return Cell(text="; ".join(map(form.format, entries)), mark=mark) if entries else Cell(text="none")
+
+
+def _phase(summary: Summary) -> Cell:
+    if not summary.get("ground"):
+        return Cell()
+    crashed = nested(summary, "ground", "crashed")
+    return Cell(text=str(nested(summary, "ground", "phase")), mark=Mark.BAD if crashed else Mark.NONE)
+
+
+def _refused(summary: Summary) -> Cell:
+    samples = nested(summary, "estimation", "samples") or {}
+    told = [f"{name} {n['rejected']} of {n['accepted'] + n['rejected']}" for name, n in samples.items()]
+    return Cell(text=", ".join(told) or ABSENT)

@@ -1,0 +1,39 @@
+"""Pages that open without a network: one template for their frame."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, Final
+
+from quadsim.errors import printable
+
+PAGE_FILE: Final = "index.html"
+
+_TEMPLATES: Final = Path(__file__).resolve().parent.parent / "templates"
+
+
+def render_page(template: str, kind: str, **context: Any) -> str:
+    """A page from its template; whatever the context holds is printable text, unless the template says otherwise.
+
+    Args:
+        template: its file in `quadsim/report/templates`.
+        kind: what the page is, e.g. `comparison`.
+        context: what the template is told.
+    """
+    from jinja2 import Environment, FileSystemLoader, StrictUndefined
+
+    environment = Environment(
+        loader=FileSystemLoader(_TEMPLATES),
+        autoescape=True,
+        undefined=StrictUndefined,
+        finalize=_shown,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    return environment.get_template(template).render(kind=kind, **context)
+
+
+def _shown(value: Any) -> Any:
+    """Text and paths without what steers a reader's eye, or what no file can hold; markup of ours as it is."""
+    is_text = isinstance(value, str | Path) and not hasattr(value, "__html__")
+    return printable(str(value), keep="\n") if is_text else value

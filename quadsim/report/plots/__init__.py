@@ -1,0 +1,1 @@
+"""Zoomable plots for a page that works offline."""

@@ -1,0 +1,207 @@
+"""Runs -> plots of their flights: all runs overlaid, one colour each, linked time axes."""
+
+from __future__ import annotations
+
+import html
+from collections.abc import Iterator, Sequence
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from quadsim.flight.audit import SIGNALS
+from quadsim.flight.rundir import Run
+from quadsim.report.comparison import distinct_courses, run_names
+from quadsim.report.curves import break_at_wraps
+from quadsim.report.palette import REFERENCE, line_colour
+from quadsim.report.plots.panels import (
+    BOTTOM,
+    PANEL_HEIGHT,
+    TOP,
+    Plot,
+    draw_bound,
+    finished,
+    keep_least_span,
+    panels,
+    place,
+)
+from quadsim.state import POSITION, REFERENCE_NAMES, Array
+from quadsim.vehicle import N_ROTORS
+
+if TYPE_CHECKING:
+    from plotly.graph_objects import Figure
+
+_MOST_POINTS: Final = 3000
+_POINTS_OF_ALL_RUNS: Final = 12_000
+"""Points that one quantity may have over all runs: keeps a page of two runs near 6 MB, and of ten below 8 MB."""
+
+
+def comparison_plots(runs: Sequence[Run]) -> list[Plot]:
+    """All plots of the page, for the runs that flew at least one control period; none without such a run."""
+    flown = [(i, name, run) for i, (name, run) in enumerate(zip(run_names(runs), runs, strict=True))]
+    flown = [(i, name, run) for i, name, run in flown if run.log.control.t.size]
+    return list(_Plotter(flown).plots()) if flown else []
+
+
+def thin(values: Array, points: int) -> np.ndarray[Any, np.dtype[np.intp]]:
+    """Indices of at most about `points` values: the lowest and highest of each stretch, so that no peak is lost.
+
+    Args:
+        values: (K,); what is not finite is a gap.
+        points: how many to keep; all are kept where K is no larger.
+
+    Returns:
+        Rising indices, the first, the last, and all gaps included.
+    """
+    if values.size <= points:
+        return np.arange(values.size)
+    gaps = np.flatnonzero(~np.isfinite(values))
+    values = np.nan_to_num(values, posinf=0.0, neginf=0.0)
+    stride = -(-2 * values.size // points)
+    rows = -(-values.size // stride)
+    stretches = np.pad(values, (0, rows * stride - values.size), mode="edge").reshape(rows, stride)
+    starts = stride * np.arange(rows)
+    kept = np.concatenate([[0, values.size - 1], starts + stretches.argmin(axis=1), starts + stretches.argmax(axis=1)])
+    return np.unique(np.minimum(np.concatenate([kept, gaps]), values.size - 1))
+
+
+class _Plotter:
+    """Draws the plots of runs given as (number, name, run), which sets their colours and toggles."""
+
+    def __init__(self, runs: Sequence[tuple[int, str, Run]]) -> None:
+        self._runs = runs
+        self._courses = distinct_courses([run for _, _, run in runs])
+        self._end = max(float(run.log.plant.t[-1]) for _, _, run in runs)
+        self._points = min(_MOST_POINTS, max(200, _POINTS_OF_ALL_RUNS // len(runs)))
+
+    def plots(self) -> Iterator[Plot]:
+        rotors = range(1, N_ROTORS + 1)
+        yield self._states("course", "Course and heading", ("x", "y", "z", "yaw"))
+        yield self._states("attitude", "Roll and pitch", ("roll", "pitch"))
+        yield self._inputs("speeds", "Rotor speeds", "speed", [f"rotor {i} [rad/s]" for i in rotors])
+        yield self._inputs(
+            "slews", "Steps of the rotor speeds, per period", "slew", [f"rotor {i} [rad/s]" for i in rotors]
+        )
+        yield self._times()
+        yield self._path()
+
+    def _states(self, key: str, title: str, names: Sequence[str]) -> Plot:
+        figure = panels([f"{name} [{SIGNALS[name].unit}]" for name in names])
+        for panel, name in enumerate(names):
+            signal = SIGNALS[name].plant
+            assert signal is not None, name
+            self._references(figure, panel, name)
+            for i, label, run in self._runs:
+                drawn = break_at_wraps(run.log.plant.t, signal(run.log.plant), SIGNALS[name].unit)
+                self._line(figure, panel, i, label, *drawn)
+            self._bounds(figure, panel, name)
+            keep_least_span(figure, panel, SIGNALS[name].unit)
+        return self._timed(figure, key, title)
+
+    def _inputs(self, key: str, title: str, name: str, labels: Sequence[str]) -> Plot:
+        figure = panels(labels)
+        for panel in range(N_ROTORS):
+            for i, label, run in self._runs:
+                values = SIGNALS[name].sampled(run.log.control)[:, panel]
+                self._line(figure, panel, i, label, run.log.control.t, values, shape="hv")
+            self._bounds(figure, panel, name)
+            keep_least_span(figure, panel, SIGNALS[name].unit)
+        return self._timed(figure, key, title)
+
+    def _times(self) -> Plot:
+        labels = ("whole step [ms]", "solver alone [ms]", "solver iterations", "active constraints")
+        figure = panels(labels)
+        for i, label, run in self._runs:
+            timing, control = run.log.timing, run.log.control
+            for panel, values in enumerate((timing.step_ms, timing.solve_ms)):
+                read = np.where(values > 0.0, values, np.nan)  # a clock may read 0, which has no logarithm
+                self._line(figure, panel, i, label, timing.t, read, mode="markers")
+            for panel, counts in enumerate((control.iterations, control.active), start=2):
+                self._line(figure, panel, i, label, control.t, counts.astype(float), shape="hv")
+        for panel in (0, 1):
+            figure.update_yaxes(type="log", dtick=1, **place(panel))
+        for deadline in {float(run.summary["controller"]["deadline_ms"]) for _, _, run in self._runs}:
+            draw_bound(figure, 0, deadline, 0.0, self._end)
+        return self._timed(figure, "times", "Time to compute a command, against its deadline")
+
+    def _path(self) -> Plot:
+        from plotly.graph_objects import Figure, Scatter3d
+
+        def line(path: Array, style: dict[str, Any], identity: dict[str, Any]) -> Scatter3d:
+            x, y, z = path[:: max(1, len(path) // self._points)].T.astype(np.float32)
+            return Scatter3d(x=x, y=y, z=z, mode="lines", line=style, **identity)
+
+        figure = Figure()
+        for run in self._courses:
+            style = {"color": REFERENCE, "width": 3, "dash": "dash"}
+            figure.add_trace(line(run.log.control.reference[:, :3], style, {"name": "reference"}))
+        for i, label, run in self._runs:
+            style = {"color": line_colour(i), "width": 5}
+            figure.add_trace(line(run.log.plant.state[:, POSITION], style, _identity(i, label)))
+        axes = {f"{name}axis": {"title": {"text": f"{name} [m]"}} for name in "xyz"}
+        camera = {"eye": {"x": 1.2, "y": -1.7, "z": 0.8}, "center": {"x": 0.0, "y": 0.0, "z": -0.12}}
+        figure.update_layout(scene={"aspectmode": "data", "camera": camera, **axes}, margin=dict.fromkeys("lrtb", 0))
+        return finished(figure, "path", "Path in space", height=560, timed=False)
+
+    def _line(
+        self,
+        figure: Figure,
+        panel: int,
+        i: int,
+        label: str,
+        t: Array,
+        values: Array,
+        *,
+        shape: str = "linear",
+        mode: str = "lines",
+    ) -> None:
+        from plotly.graph_objects import Scatter
+
+        kept = thin(values, self._points)
+        figure.add_trace(
+            Scatter(
+                x=t[kept].astype(np.float32),
+                y=values[kept].astype(np.float32),
+                mode=mode,
+                line={"color": line_colour(i), "width": 1.6, "shape": shape},
+                marker={"color": line_colour(i), "size": 3.5},
+                **_identity(i, label),
+            ),
+            **place(panel),
+        )
+
+    def _references(self, figure: Figure, panel: int, name: str) -> None:
+        """Each distinct filtered reference of a quantity that has one."""
+        from plotly.graph_objects import Scatter
+
+        for run in self._courses if name in REFERENCE_NAMES else ():
+            values = run.log.control.reference[:, REFERENCE_NAMES.index(name)]
+            values = np.degrees(values) if SIGNALS[name].unit == "deg" else values
+            kept = thin(values, self._points)
+            x, y = run.log.control.t[kept].astype(np.float32), values[kept].astype(np.float32)
+            line = {"color": REFERENCE, "width": 1.6, "dash": "dash"}
+            figure.add_trace(Scatter(x=x, y=y, mode="lines", line=line, name="reference"), **place(panel))
+
+    def _bounds(self, figure: Figure, panel: int, signal: str) -> None:
+        """Each distinct bound on a signal, once, over the times it holds for."""
+        bounds = {
+            (bound, limit.start, min(limit.stop, self._end)): None
+            for _, _, run in self._runs
+            for limit in run.limits
+            for bound in (limit.lower, limit.upper)
+            if limit.signal == signal and limit.start < self._end and np.isfinite(bound)
+        }
+        for bound, start, stop in bounds:
+            draw_bound(figure, panel, bound, start, stop)
+
+    def _timed(self, figure: Figure, key: str, title: str) -> Plot:
+        rows = len(figure.layout.annotations) // 2
+        figure.update_xaxes(range=[-0.01 * self._end, self._end], showticklabels=True)
+        figure.update_xaxes(title={"text": "time [s]", "standoff": 6}, row=rows)
+        figure.update_layout(margin={"l": 52, "r": 12, "t": TOP, "b": BOTTOM}, hovermode="x unified", dragmode="zoom")
+        figure.update_annotations(font={"size": 13})
+        return finished(figure, key, title, height=rows * PANEL_HEIGHT + TOP + BOTTOM, timed=True)
+
+
+def _identity(i: int, label: str) -> dict[str, Any]:
+    """Name and toggle of a run's line; plotly reads names as HTML."""
+    return {"name": html.escape(label), "legendgroup": f"run{i}"}

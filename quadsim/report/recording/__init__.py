@@ -1,0 +1,163 @@
+"""A finished run -> a rerun recording that opens with its layout, and the viewer it opens in.
+
+Everything stands on one timeline, `sim_time`, the simulated time:
+
+    world/...           vehicle, thrusts, external force, wind, flown path, reference, and the horizon predicted at each
+                        control period of flight
+    signals/NAME        what can be limited, by the names and in the units of `quadsim.flight.audit.SIGNALS`
+    reference/NAME      what x, y, z and yaw should be
+    limits/NAME         the bounds, drawn with their signal
+    margins/NAME        signed distance to the nearer bound at the control samples; negative = violated
+    verdicts/NAME       what that says: holds, active, violated
+    solver/NAME         what each step of the controller took and answered
+    effects/NAME        external force and torque, wind, commands that rotors do not follow at once; where there are any
+    events, summary     texts
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import os
+import pickle
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from quadsim.errors import FileError, OutputError, ViewerUnavailableError
+from quadsim.flight.rundir import RECORDING_FILE, Run
+from quadsim.outputs import write_new
+from quadsim.report.palette import line_colour
+from quadsim.report.recording.layout import blueprint
+from quadsim.report.recording.signals import send_effects, send_limit, send_signals, send_solver
+from quadsim.report.recording.style import on_screen
+from quadsim.report.recording.texts import send_texts
+from quadsim.report.recording.world import send_airframe, send_scene
+
+_VIEWER: Final = (
+    sys.executable,
+    "-c",
+    "import sys; from rerun_cli.__main__ import main; sys.exit(main())",
+    "--bind=127.0.0.1",
+    "--port=auto",
+)
+"""Starts a viewer of its own, which only this machine can reach."""
+_INTERRUPTED: Final = 130
+"""The viewer's exit status after Ctrl-C."""
+
+
+def write_recording(run: Run, path: Path) -> None:
+    """Write a run as a rerun recording with its layout inside; the file appears complete or not at all.
+
+    Args:
+        run: a run, completed or aborted, of any length.
+        path: the `.rrd` to write; there must be none.
+
+    Raises:
+        OutputError: the file cannot be written or is there already, or the environment switches rerun off.
+    """
+    path = Path(path)
+    write_new(path, _encode(run, path))
+
+
+def _encode(run: Run, path: Path) -> bytes:
+    """The file's content, made in memory: rerun's own file writer hides from Python why it failed."""
+    import rerun as rr
+
+    recording = rr.RecordingStream(f"quadsim {run.name}", recording_id=_identity(run), send_properties=False)
+    if not rr.is_enabled(recording):
+        raise OutputError(path, "rerun is switched off by the environment variable RERUN")
+    memory = recording.memory_recording()
+    strict = rr.strict_mode()
+    rr.set_strict_mode(True)  # otherwise what cannot be recorded is left out with a warning
+    try:
+        recording.send_recording_name(run.name)
+        recording.send_blueprint(blueprint(run), make_active=True, make_default=True)
+        send_airframe(recording, run.vehicle)
+        send_scene(recording, run)
+        send_signals(recording, run.log)
+        for limit in run.limits:
+            peers = [peer.name for peer in run.limits if peer.unit == limit.unit]  # in one plot of margins
+            send_limit(recording, limit, run.log, on_screen(line_colour(peers.index(limit.name))))
+        send_solver(recording, run)
+        send_effects(recording, run.log)
+        send_texts(recording, run)
+        return bytes(memory.drain_as_bytes())
+    finally:
+        rr.set_strict_mode(strict)
+        recording.disconnect()
+
+
+def _identity(run: Run) -> str:
+    """The same for equal flights and different for others: the viewer merges recordings that share it."""
+    digest = hashlib.sha256(repr((run.vehicle, run.limits)).encode())
+    for array in (run.log.control.state, run.log.control.reference, run.log.control.speeds, run.log.plant.state):
+        digest.update(np.ascontiguousarray(array).tobytes())
+    return f"{run.name}-{digest.hexdigest()[:16]}"
+
+
+@contextlib.contextmanager
+def recording_in_background(directory: Path) -> Iterator[None]:
+    """Write a run directory's recording while the block runs; it is complete once the block is left.
+
+    A Ctrl-C does not reach the process, which has no terminal of its own: whatever ends the block early ends it too,
+    and what it wrote until then is not under the recording's name.
+
+    Raises:
+        OutputError: the file cannot be written, as from `write_recording`.
+    """
+    packages = os.pathsep.join(filter(None, (str(Path(__file__).resolve().parents[3]), os.environ.get("PYTHONPATH"))))
+    with subprocess.Popen(
+        [sys.executable, "-m", "quadsim.report.recording", str(directory)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        env={**os.environ, "PYTHONPATH": packages},
+        process_group=0,
+    ) as process:
+        try:
+            yield
+            raised, said = process.communicate()
+        finally:
+            process.kill()  # of no consequence to one that is done
+    if raised:
+        raise pickle.loads(raised)
+    if process.returncode:
+        last = said.decode(errors="replace").strip().rpartition("\n")[2]
+        raise OutputError(directory / RECORDING_FILE, last or f"its process ended with status {process.returncode}")
+
+
+def viewer_problem() -> str | None:
+    """Why rerun's own window cannot be opened on this machine, or None."""
+    if sys.platform.startswith("linux") and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+        return "there is no display (neither DISPLAY nor WAYLAND_DISPLAY is set)"
+    return None
+
+
+def open_viewer(path: Path, *, web: bool = False) -> None:
+    """Show a recording; returns when the viewer is closed or Ctrl-C is pressed.
+
+    Args:
+        path: an `.rrd` file.
+        web: whether to serve it, to this machine alone, for a browser; else rerun's own window shows it.
+
+    Raises:
+        FileError: there is no such file.
+        ViewerUnavailableError: there is no display, or the viewer failed.
+    """
+    if not path.is_file():
+        raise FileError(path, "there is no such recording")
+    problem = None if web else viewer_problem()
+    if problem:
+        raise ViewerUnavailableError(f"{problem}: show it in a browser with --web, or open {path} on another machine")
+    browser = ("--web-viewer", "--web-viewer-port=0") if web else ()
+    try:
+        status = subprocess.run([*_VIEWER, *browser, str(path)], check=False).returncode
+    except KeyboardInterrupt:
+        return
+    if status not in (0, _INTERRUPTED):
+        advice = "see its message above" if web else "see its message above, or show it in a browser with --web"
+        raise ViewerUnavailableError(f"the rerun viewer ended with status {status}; {advice}")

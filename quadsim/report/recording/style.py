@@ -1,0 +1,69 @@
+"""How a recording looks: the timeline, which signals share a plot, and the colours."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final
+
+from quadsim.flight.audit import SIGNALS
+from quadsim.report.palette import line_colour
+from quadsim.state import Array
+from quadsim.vehicle import N_ROTORS
+
+if TYPE_CHECKING:
+    import rerun as rr
+
+TIMELINE: Final = "sim_time"
+
+PANELS: Final[dict[str, tuple[str, ...]]] = {
+    "Position": ("x", "y", "z"),
+    "Roll and pitch": ("roll", "pitch"),
+    "Rotor speeds": ("speed",),
+    "Steps of the rotor speeds, per period": ("slew",),
+    "Velocity": ("vx", "vy", "vz"),
+    "Position errors": ("x_error", "y_error", "z_error"),
+    "Attitude rates": ("roll_rate", "pitch_rate", "yaw_rate"),
+    "Yaw and tilt": ("yaw", "tilt", "yaw_error"),
+    "Position as told, less the true one": ("x_estimate_error", "y_estimate_error", "z_estimate_error"),
+    "Attitude as told, less the true one": ("roll_estimate_error", "pitch_estimate_error", "yaw_estimate_error"),
+}
+"""Title of each plot, and its signals; every signal is in one, so that every limit is drawn."""
+assert sorted(name for names in PANELS.values() for name in names) == sorted(SIGNALS)
+FRONT_PANELS: Final = 4
+"""How many of the plots are seen first."""
+
+Colour = tuple[int, int, int, int]
+
+
+def on_screen(colour: str) -> Colour:
+    """A colour made for paper, lightened: the viewer's background may be black or white."""
+    red, green, blue = (round(0.7 * int(colour[i : i + 2], 16) + 0.3 * 255) for i in (1, 3, 5))
+    return red, green, blue, 255
+
+
+SERIES: Final = tuple(on_screen(line_colour(i)) for i in range(N_ROTORS))
+FLOWN: Final = (70, 160, 255, 255)
+WHOLE_PATH: Final = (70, 160, 255, 60)
+REFERENCE: Final = (165, 170, 178, 255)
+PREDICTED: Final = (255, 160, 40, 255)
+BOUND: Final = (255, 70, 70, 255)
+CARBON: Final = (75, 80, 90, 255)
+METAL: Final = (150, 155, 165, 255)
+SHELL: Final = (235, 238, 242, 255)
+FORWARD: Final = (245, 110, 30, 255)
+FORCE: Final = (225, 90, 200, 255)
+WIND: Final = (110, 220, 225, 255)
+AXES: Final = ((230, 90, 90, 255), (90, 200, 110, 255), (90, 140, 250, 255))
+
+VERDICTS: Final = {
+    "holds": (46, 125, 80, 255),
+    "active": (214, 150, 30, 255),
+    "violated": (220, 50, 50, 255),
+    "not in force": (0, 0, 0, 0),
+}
+
+
+def time_column(t: Array) -> rr.TimeColumn:
+    """Instants [s] on the recording's one timeline."""
+    import rerun as rr
+
+    return rr.TimeColumn(TIMELINE, duration=t)

@@ -1,0 +1,93 @@
+"""What is read: what happened when, and how the flight went."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from quadsim.controller import ACCEPTED, Phase
+from quadsim.flight.rundir import Run
+from quadsim.report.comparison import tracking_values
+from quadsim.report.narrative import condition_sentences
+from quadsim.report.recording.style import time_column
+
+if TYPE_CHECKING:
+    import rerun as rr
+
+
+def send_texts(recording: rr.RecordingStream, run: Run) -> None:
+    """The summary, and what happened when: changes of the solver's status, and the end."""
+    import rerun as rr
+
+    log, end = run.log.control, float(run.log.plant.t[-1])
+    answers = list(zip(log.status, log.fallback.tolist(), strict=True))
+    events = [
+        (
+            float(t),
+            f"{status}, fallback {fallback}",
+            "INFO" if status in ACCEPTED | {Phase.LANDED} and not fallback else "WARN",
+        )
+        for t, before, (status, fallback) in zip(log.t, [None, *answers], answers, strict=False)
+        if (status, fallback) != before
+    ]
+    events += _phase_changes(run)
+    events.append((end, _outcome(run), "INFO" if run.log.reason is None else "ERROR"))
+    times, texts, levels = zip(*sorted(events, key=lambda event: event[0]), strict=True)
+    recording.log("summary", rr.TextDocument(_summary(run), media_type=rr.MediaType.MARKDOWN), static=True)
+    recording.send_columns("events", [time_column(np.array(times))], rr.TextLog.columns(text=texts, level=levels))
+
+
+def _phase_changes(run: Run) -> list[tuple[float, str, str]]:
+    """Time, text and level of each change of the phase, in a flight that has a ground."""
+    control = run.log.control
+    if all(phase == Phase.FLYING for phase in control.phase):
+        return []
+    return [
+        (float(t), f"phase: {phase}", "WARN" if phase == Phase.CRASHED else "INFO")
+        for t, before, phase in zip(control.t, [None, *control.phase], control.phase, strict=False)
+        if phase != before
+    ]
+
+
+def _outcome(run: Run) -> str:
+    return "completed" if run.log.reason is None else f"aborted: {run.log.reason}"
+
+
+def _summary(run: Run) -> str:
+    """How the flight went, as Markdown."""
+    constraints, tracking, control = (run.summary[key] for key in ("constraints", "tracking", "controller"))
+    lines = [f"**{run.name}: {_outcome(run)}**", ""]
+    if constraints:
+        lines += ["| constraint | | worst margin | allowed |", "|---|---|---:|---|", *map(_verdict, constraints), ""]
+    if not all(entry["required"] for entry in constraints):
+        lines += ["In brackets: measured, not required.", ""]
+    if tracking:
+        measured = {name: tracking_values([run.summary], "rmse", name) for name in tracking["rmse"]}
+        errors = (f"{name} {_number(values[0])} {unit}" for name, (unit, values) in measured.items())
+        lines += [f"Tracking error, RMS: {', '.join(errors)}.", ""]
+    for sentence in condition_sentences([(run.name, run.summary)]):
+        lines += [sentence, ""]
+    if "step_ms" in control:
+        step = control["step_ms"]
+        lines += [
+            f"Controller step: median {step['p50']:.3g}, p99 {step['p99']:.3g}, longest {step['max']:.3g} ms; "
+            f"{control['deadline_misses']} beyond {control['deadline_ms']:g} ms."
+        ]
+    return "\n".join(lines)
+
+
+def _verdict(entry: Mapping[str, Any]) -> str:
+    """One constraint of the summary as a row of a Markdown table."""
+    lower, upper = _number(entry["lower"]), _number(entry["upper"])
+    margins = [entry[key] for key in ("worst_margin", "worst_margin_sampled") if entry[key] is not None]
+    worst = _number(min(margins, default=None))
+    bounds = f"≤ {upper}" if lower == "-" else f"≥ {lower}" if upper == "-" else f"{lower} to {upper}"
+    name = entry["name"] if entry["required"] else f"({entry['name']})"
+    verdict = "**holds**" if entry["satisfied"] else "**violated**"
+    return f"| {name} | {verdict} | {worst} | {bounds} ± {entry['tolerance']:g} {entry['unit']} |"
+
+
+def _number(value: float | None) -> str:
+    return "-" if value is None else f"{value:.3g}"

@@ -1,0 +1,107 @@
+"""A table as plain data: rows of marked cells, for the terminal, the page and Markdown alike."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Final
+
+from quadsim.errors import printable
+
+ABSENT: Final = "-"
+
+
+class Mark(StrEnum):
+    """What a reader should see in a cell at a glance; words and commands are set otherwise than numbers."""
+
+    NONE = ""
+    BEST = "best"
+    GOOD = "good"
+    WARN = "warn"
+    BAD = "bad"
+    TEXT = "text"
+    CODE = "code"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Cell:
+    """One run's value in a row, as text."""
+
+    text: str = ABSENT
+    mark: Mark = Mark.NONE
+
+
+@dataclass(frozen=True, kw_only=True)
+class Row:
+    """One quantity, across all runs.
+
+    Attributes:
+        group: the heading it stands under.
+        label: the quantity.
+        unit: its unit; empty when it has none.
+        cells: one per run, in order.
+        headline: whether it is its group's answer in one line: the verdict on a constraint.
+    """
+
+    group: str
+    label: str
+    unit: str = ""
+    cells: tuple[Cell, ...]
+    headline: bool = False
+
+
+@dataclass(frozen=True, kw_only=True)
+class Grid:
+    """A table of cases: a head, and a line of cells for each case, the first of which names it.
+
+    Attributes:
+        key: its identifier in a page.
+        title: its heading.
+        head: what stands above each column.
+        lines: cells of each case, as many as there are columns.
+        note: what a reader has to know of it.
+    """
+
+    key: str
+    title: str
+    head: tuple[str, ...]
+    lines: tuple[tuple[Cell, ...], ...]
+    note: str = ""
+
+
+def to_markdown(rows: Sequence[Row], names: Sequence[str]) -> str:
+    """A Markdown table of the rows: headlines and the best values in bold type."""
+    lines = [_markdown_line("", "", *names), _markdown_line("---", "---", *("---:" for _ in names))]
+    group = ""
+    for row in rows:
+        cells = [f"**{cell.text}**" if row.headline or cell.mark is Mark.BEST else cell.text for cell in row.cells]
+        lines.append(_markdown_line(f"**{row.group}**" if row.group != group else "", _with_unit(row), *cells))
+        group = row.group
+    return "\n".join(lines) + "\n"
+
+
+def grid_to_markdown(grid: Grid) -> str:
+    """A Markdown table of the grid: the best values in bold type."""
+    lines = [_markdown_line(*grid.head), _markdown_line("---", *("---:" for _ in grid.head[1:]))]
+    for cells in grid.lines:
+        lines.append(_markdown_line(*(f"**{cell.text}**" if cell.mark is Mark.BEST else cell.text for cell in cells)))
+    return "\n".join(lines) + "\n"
+
+
+def _markdown_line(*texts: str) -> str:
+    return "| " + " | ".join(printable(text).replace("|", r"\|") for text in texts) + " |"
+
+
+def format_number(value: float | None) -> str:
+    """Four significant digits, or two where it takes an exponent; `-` for None."""
+    if value is None:
+        return ABSENT
+    size = abs(value)
+    if 1e4 <= size < 1e7:
+        return f"{value:.0f}"
+    return f"{value:.4g}" if size == 0.0 or 1e-3 <= size < 1e7 else f"{value:.1e}"
+
+
+def _with_unit(row: Row) -> str:
+    return f"{row.label} [{row.unit}]" if row.unit else row.label

@@ -1,0 +1,1 @@
+"""What moves: the plant and its effects, sensors, state estimation, and the closed loop."""

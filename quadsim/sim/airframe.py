@@ -1,0 +1,226 @@
+"""From a vehicle to a compiled MuJoCo model: `models/quadrotor.xml` gives the shape, the vehicle gives the numbers."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Final
+
+import mujoco
+import numpy as np
+
+from quadsim.assets import models_dir
+from quadsim.flight.ground import Outline
+from quadsim.state import Array, euler_to_quaternion
+from quadsim.vehicle import N_ROTORS, Vehicle
+
+BODY: Final = "quadrotor"
+FLOOR: Final = "floor"
+IMU: Final = "imu"
+ROTOR_NAMES: Final = tuple(f"rotor{i}" for i in range(1, N_ROTORS + 1))
+ARM_NAMES: Final = tuple(f"arm{i}" for i in range(1, N_ROTORS + 1))
+FOOT_NAMES: Final = tuple(f"foot{i}" for i in range(1, N_ROTORS + 1))
+DISC_NAMES: Final = tuple(f"disc{i}" for i in range(1, N_ROTORS + 1))
+PROPELLER_NAMES: Final = tuple(f"propeller{i}" for i in range(1, N_ROTORS + 1))
+
+DRAWN_ARM: Final = 0.3
+"""Arm length [m] for which `quadrotor.xml` is drawn."""
+_WIDEST_DISC: Final = 0.48
+"""Largest radius of a rotor disc, in distances between neighbouring rotors: discs never meet."""
+_IDLE: Final = (mujoco.mjtDisableBit.mjDSBL_SPRING, mujoco.mjtDisableBit.mjDSBL_DAMPER)
+"""Stages of MuJoCo's step with nothing to do for a free body; with those of contact a sixth of its time."""
+_CONTACT: Final = (mujoco.mjtDisableBit.mjDSBL_CONSTRAINT, mujoco.mjtDisableBit.mjDSBL_CONTACT)
+"""Stages that only a body which may meet the ground needs."""
+_STIFFNESS: Final = (0.005, 1.0)
+"""Time constant [s] and damping ratio of a contact (MuJoCo's solref); five steps, where MuJoCo asks for two or more."""
+_FRICTION: Final = (0.8, 0.005, 0.0001)
+"""Sliding [-], torsional and rolling [m] friction between rubber feet and a hard floor; the first is a textbook value,
+the others MuJoCo's own."""
+_MEETS: Final = 1
+"""The bit of contype and conaffinity by which floor and airframe meet."""
+_RIM: Final = 32
+"""Points that stand for the rim of a rotor disc: its lowest point is missed by half a percent of its radius at most."""
+DRAG: Final = "drag"
+_BLUNT: Final = (0.5, 0.0, 0.0, 0.0, 0.0)
+"""Fluid coefficients that make MuJoCo's ellipsoid drag -rho C_blunt A |v| v into -rho A |v| v / 2, and nothing else."""
+
+
+def outline(vehicle: Vehicle) -> Outline:
+    """What of the airframe meets the ground first."""
+    model = compile_model(vehicle, visuals=True)
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    feet = np.array([data.geom(name).xpos for name in FOOT_NAMES])
+    around = np.linspace(0.0, 2.0 * np.pi, _RIM, endpoint=False)
+    rim = np.stack([np.cos(around), np.sin(around), np.zeros(_RIM)], axis=1)
+    discs = [data.geom(name).xpos + model.geom(name).size[0] * rim for name in DISC_NAMES]
+    battery = data.geom("battery").xpos - [0.0, 0.0, model.geom("battery").size[2]]
+    return Outline(
+        feet=feet,
+        foot_radius=float(model.geom(FOOT_NAMES[0]).size[0]),
+        hull=np.concatenate([*discs, battery[None, :]]),
+        floor=float(model.geom(FLOOR).pos[2]),
+        disc=float(data.geom(DISC_NAMES[0]).xpos[2]),
+    )
+
+
+def build_spec(
+    vehicle: Vehicle,
+    *,
+    visuals: bool = True,
+    contact: bool = False,
+    reweighed: bool = False,
+    body_drag: tuple[float, float, float] | None = None,
+    air_density: float = 0.0,
+) -> mujoco.MjSpec:
+    """The airframe's specification with every physical number taken from the vehicle.
+
+    Actuator i takes the thrust f_i = b w_i^2 [N] as its control and acts on site i along the site's z axis; the
+    sixth entry of its gear turns thrust into reaction torque, spin_i d / b [m].
+
+    Args:
+        vehicle: the numbers.
+        visuals: whether to keep what is there to be looked at and read (geoms, lights, cameras, sensors), fitted to the
+            vehicle's arms.  None of it moves the vehicle: without it every state is the same to the last bit, in half
+            the time.
+        contact: whether feet and hull meet the floor.
+        reweighed: whether the body's mass may be changed once compiled; see `quadsim.sim.effects.load.apply_mass`.
+        body_drag: drag areas C_d A along the body axes [m^2], or None.  The drag is MuJoCo's own, on the ellipsoid
+            whose projected areas they are: -rho A |v| v / 2 against the air that `option.wind` moves.  With it come
+            the ellipsoid's added-mass terms, a few grams of air.
+        air_density: rho [kg/m^3].
+    """
+    spec = mujoco.MjSpec.from_file(str(models_dir() / "quadrotor.xml"))
+    spec.option.gravity = [0.0, 0.0, -vehicle.gravity]
+    body = spec.body(BODY)
+    body.mass, body.inertia = vehicle.mass, list(vehicle.inertia)
+    if reweighed:
+        body.simple = 0
+    thrust_range = rotor_thrusts(vehicle, np.array([vehicle.speed_min, vehicle.speed_max]))
+    for name, position, spin in zip(ROTOR_NAMES, vehicle.rotor_positions, vehicle.rotor_spins, strict=True):
+        spec.site(name).pos = position
+        actuator = spec.actuator(name)
+        actuator.gear = [0.0, 0.0, 1.0, 0.0, 0.0, spin * vehicle.drag_to_thrust]
+        actuator.ctrlrange = thrust_range
+    _fit_drawing(spec, vehicle)
+    if contact:
+        _ground(spec)
+    if not visuals:
+        _strip(spec, contact=contact)
+    if body_drag is not None:
+        _add_drag(spec, body_drag, air_density)
+    return spec
+
+
+def compile_model(
+    vehicle: Vehicle,
+    *,
+    timestep: float = 1e-3,
+    limit_speeds: bool = False,
+    visuals: bool = False,
+    contact: bool = False,
+    reweighed: bool = False,
+    body_drag: tuple[float, float, float] | None = None,
+    air_density: float = 0.0,
+) -> mujoco.MjModel:
+    """Compile the airframe.
+
+    Args:
+        vehicle: the numbers.
+        timestep: physics step [s].
+        limit_speeds: whether thrusts saturate at the vehicle's rotor speed range; else any thrust >= 0 acts.
+        visuals: whether the model can be looked at; see `build_spec`.
+        contact: whether it can stand on the ground; see `build_spec`.
+        reweighed: see `build_spec`.
+        body_drag: see `build_spec`.
+        air_density: see `build_spec`.
+    """
+    spec = build_spec(
+        vehicle,
+        visuals=visuals,
+        contact=contact,
+        reweighed=reweighed,
+        body_drag=body_drag,
+        air_density=air_density,
+    )
+    spec.option.timestep = timestep
+    for name in ROTOR_NAMES:
+        spec.actuator(name).ctrllimited = int(limit_speeds)
+    return spec.compile()
+
+
+def rotor_thrusts(vehicle: Vehicle, speeds: Array) -> Array:
+    """Thrusts b w^2 [N] of rotor speeds [rad/s], any shape."""
+    return vehicle.thrust_coefficient * np.square(speeds)
+
+
+def _fit_drawing(spec: mujoco.MjSpec, vehicle: Vehicle) -> None:
+    """Scale the drawing to the arms, turn each to its rotor, size the discs as the rotors, colour what is in front."""
+    scale = vehicle.arm_length / DRAWN_ARM
+    _scale([*spec.geoms, *spec.cameras, *(spec.body(name) for name in PROPELLER_NAMES)], scale)
+    spec.geom(FLOOR).size = [0.0, 0.0, 1.0]  # endless whatever the scale
+    spec.stat.extent *= scale
+    positions = vehicle.rotor_positions
+    gaps = np.linalg.norm(positions[:, None] - positions[None], axis=2)[~np.eye(N_ROTORS, dtype=bool)]
+    radius = min(vehicle.rotor_radius or spec.geom("disc1").size[0], _WIDEST_DISC * float(gaps.min()))
+    for i, azimuth in enumerate(np.radians(vehicle.rotor_azimuths), start=1):
+        spec.body(f"arm{i}").quat = euler_to_quaternion(np.array([0.0, 0.0, azimuth]))
+        disc, blades = spec.geom(f"disc{i}"), spec.geom(f"blades{i}")
+        disc.size[0] = blades.size[0] = radius
+        if positions[i - 1, 0] > 0.1 * vehicle.arm_length:
+            spec.geom(f"arm{i}").material = "front"
+            disc.material = "disc_front"
+
+
+def _scale(elements: Sequence[mujoco.MjsGeom | mujoco.MjsCamera | mujoco.MjsBody], scale: float) -> None:
+    for element in elements:
+        element.pos *= scale
+        if isinstance(element, mujoco.MjsGeom):
+            element.size *= scale
+            element.fromto *= scale
+
+
+def _ground(spec: mujoco.MjSpec) -> None:
+    """Let feet, underside and rotor discs meet the floor."""
+    for flag in _CONTACT:
+        spec.option.disableflags &= ~int(flag)
+    for name in (FLOOR, "battery", *FOOT_NAMES, *DISC_NAMES):
+        geom = spec.geom(name)
+        geom.contype, geom.conaffinity = (_MEETS, 0) if name == FLOOR else (0, _MEETS)
+        geom.solref[: len(_STIFFNESS)] = _STIFFNESS
+        geom.friction = _FRICTION
+
+
+def _add_drag(spec: mujoco.MjSpec, areas: tuple[float, float, float], density: float) -> None:
+    """Hang an ellipsoid on the body that nothing but the air meets, with pi r_y r_z = A_x and so on."""
+    ax, ay, az = areas
+    spec.option.density = density
+    for flag in _IDLE:  # with both, MuJoCo leaves out all passive forces
+        spec.option.disableflags &= ~int(flag)
+    spec.body(BODY).add_geom(
+        name=DRAG,
+        type=mujoco.mjtGeom.mjGEOM_ELLIPSOID,
+        size=[float(np.sqrt(a)) for a in (ay * az / (np.pi * ax), ax * az / (np.pi * ay), ax * ay / (np.pi * az))],
+        mass=0.0,
+        contype=0,
+        conaffinity=0,
+        group=4,
+        fluid_ellipsoid=1,
+        fluid_coefs=list(_BLUNT),
+    )
+
+
+def _strip(spec: mujoco.MjSpec, *, contact: bool) -> None:
+    """Leave what moves: one free body, its rotors, what it stands on, and of each step only what acts on it."""
+    keep = {FLOOR, "battery", *FOOT_NAMES, *DISC_NAMES} if contact else set()
+    arms = [] if contact else [spec.body(name) for name in ARM_NAMES]  # with what hangs on them
+    for element in [*arms, *spec.cameras, *spec.lights, *spec.sensors, spec.site(IMU)]:
+        spec.delete(element)
+    for geom in list(spec.geoms):
+        if geom.name not in keep:
+            spec.delete(geom)
+        else:
+            geom.material = ""
+    for element in [*spec.materials, *spec.textures]:
+        spec.delete(element)
+    for idle in (*_IDLE, *(() if contact else _CONTACT)):
+        spec.option.disableflags |= int(idle)

@@ -1,0 +1,110 @@
+"""Wind as it passes the vehicle: a mean that may change, gusts, and turbulence."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from quadsim.errors import ParameterError
+from quadsim.sim.effects.gust import Gust, Velocity, check_velocity, gust_velocity
+from quadsim.sim.effects.turbulence import Dryden, Turbulence
+from quadsim.state import Array
+
+_BLOCK: Final = 4096
+"""Physics steps whose wind is worked out at a time."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class WindChange:
+    """A step of the mean wind.
+
+    Attributes:
+        time: from when on it blows [s].
+        velocity: the mean wind from then on, world frame [m/s].
+
+    Raises:
+        ParameterError: a value is not finite, or the time is negative.
+    """
+
+    time: float
+    velocity: Velocity
+
+    def __post_init__(self) -> None:
+        if not 0.0 <= self.time < math.inf:
+            raise ParameterError("wind_change", "time", self.time, "a finite time >= 0 s")
+        check_velocity("wind_change", "velocity", self.velocity)
+
+
+class WindField:
+    """The wind at the vehicle, an evolving state: the same everywhere, mean(t) + gusts(t) + turbulence(t).
+
+    The turbulence's longitudinal axis is the horizontal direction of the mean wind at time zero, or world x where
+    there is none, whatever the mean changes to later.
+
+    Args:
+        mean: (3,) mean wind from time zero on, world frame, z up [m/s]; where the air goes, not where it comes from.
+        gusts: discrete gusts, added up.
+        turbulence: strength and size of the turbulence; None for none.
+        timestep: physics step [s].
+        rng: randomness of the turbulence; a child of it is used, so that others may draw from it at any time.
+        changes: steps of the mean wind, in any order; of two at one time the later one counts.
+
+    Raises:
+        ParameterError: the mean is not three finite numbers, or the step is not positive.
+    """
+
+    def __init__(
+        self,
+        *,
+        mean: Velocity,
+        gusts: tuple[Gust, ...] = (),
+        turbulence: Dryden | None = None,
+        timestep: float,
+        rng: np.random.Generator,
+        changes: tuple[WindChange, ...] = (),
+    ) -> None:
+        check_velocity("wind", "mean", mean)
+        if not 0.0 < timestep < math.inf:
+            raise ParameterError("wind", "timestep", timestep, "a finite time > 0 s")
+        ordered = sorted(changes, key=lambda change: change.time)
+        self._means = np.array([mean, *(change.velocity for change in ordered)], float)
+        self._change_times = np.array([change.time for change in ordered])
+        self._gusts = gusts
+        self._along = _direction(self._means[0])
+        self._timestep = timestep
+        self._turbulence = None if turbulence is None else Turbulence(turbulence, timestep=timestep, rng=rng)
+        self.reset()
+
+    def reset(self) -> None:
+        """Rewind: the same wind again."""
+        self._made, self._ahead = 0, np.empty((0, 3))  # steps whose wind is known, and that of the last of them
+        if self._turbulence is not None:
+            self._turbulence.reset()
+
+    def advance(self, steps: int) -> Array:
+        """(steps, 3) wind velocity at the middle of each of the next physics steps, world frame, z up [m/s]."""
+        while len(self._ahead) < steps:
+            self._ahead = np.concatenate([self._ahead, self._next_block()])
+        wind, self._ahead = self._ahead[:steps].copy(), self._ahead[steps:]
+        return wind
+
+    def _next_block(self) -> Array:
+        middles = self._timestep * (np.arange(_BLOCK, dtype=np.float64) + (self._made + 0.5))
+        self._made += _BLOCK
+        wind: Array = self._means[np.searchsorted(self._change_times, middles, side="right")]
+        wind += gust_velocity(self._gusts, middles)
+        if self._turbulence is not None:
+            along, across, vertical = self._turbulence.advance(_BLOCK).T
+            x, y = self._along  # spelt out, as a matrix product may round by the number of rows
+            wind += np.stack([x * along - y * across, y * along + x * across, vertical], axis=1)
+        return wind
+
+
+def _direction(mean: Array) -> tuple[float, float]:
+    """Horizontal unit vector (x, y) along a mean wind (3,); x where there is none."""
+    x, y, _ = mean.tolist()
+    speed = math.hypot(x, y)
+    return (x / speed, y / speed) if speed > 0.0 else (1.0, 0.0)

@@ -1,0 +1,63 @@
+"""An estimate: a mean on the manifold of poses and rates, and the covariance of its small error.
+
+The error is e = [dp dv dtheta domega db], 15 numbers: position and velocity in the world frame, attitude as a rotation
+vector in the body frame (q_true = q * exp(dtheta)), body rates and gyro bias.  Solà 2017, Secs. 5.1.1 and 5.3.1;
+multiplicative in the sense of Markley, "Attitude error representations for Kalman filtering", JGCD 26 (2003).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from quadsim.sim.sensing.sphere import conjugate, exponential, logarithm, normalise, product
+from quadsim.state import Array
+
+POSITION: Final = slice(0, 3)
+VELOCITY: Final = slice(3, 6)
+ATTITUDE: Final = slice(6, 9)
+RATES: Final = slice(9, 12)
+GYRO_BIAS: Final = slice(12, 15)
+N_ERRORS: Final = 15
+
+MEAN_QUATERNION: Final = slice(6, 10)
+MEAN_RATES: Final = slice(10, 13)
+MEAN_GYRO_BIAS: Final = slice(13, 16)
+N_MEAN: Final = 16
+
+
+@dataclass(frozen=True, kw_only=True)
+class Estimate:
+    """What is believed of the vehicle.
+
+    Attributes:
+        mean: (16,) position [m], velocity [m/s] (world), quaternion wxyz, rates [rad/s] (body), gyro bias [rad/s].
+        covariance: (15, 15) of the error.
+    """
+
+    mean: Array
+    covariance: Array
+
+
+def retract(mean: Array, error: Array) -> Array:
+    """The mean (16,) moved by an error (15,); Solà 2017, Eq. (283)."""
+    moved = np.empty(N_MEAN)
+    moved[:6] = mean[:6] + error[:6]
+    w, x, y, z = mean[MEAN_QUATERNION].tolist()
+    a, b, c = error[ATTITUDE].tolist()
+    moved[MEAN_QUATERNION] = normalise(product((w, x, y, z), exponential((a, b, c))))
+    moved[10:] = mean[10:] + error[9:]
+    return moved
+
+
+def difference(mean: Array, other: Array) -> Array:
+    """The error (15,) of `other` against `mean`, such that moving `other` by it gives `mean`; inverts `retract`."""
+    error = np.empty(N_ERRORS)
+    error[:6] = mean[:6] - other[:6]
+    error[9:] = mean[10:] - other[10:]
+    w, x, y, z = mean[MEAN_QUATERNION].tolist()
+    a, b, c, d = other[MEAN_QUATERNION].tolist()
+    error[ATTITUDE] = logarithm(product(conjugate((a, b, c, d)), (w, x, y, z)))
+    return error

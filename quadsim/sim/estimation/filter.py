@@ -1,0 +1,218 @@
+"""The error-state extended Kalman filter over time: samples in the order they were taken, however late they arrive.
+
+The filter stands at the fusion horizon, now less the largest delay: every sample taken before has arrived and has been
+used, in the order of the time stamps.  What has arrived since is kept, and each time an estimate is asked for it is
+used on a copy that runs on to now; so a late sample corrects the past it belongs to.  Rotor speeds, and whether the
+vehicle stood, are kept likewise for each step since the horizon.
+"""
+
+from __future__ import annotations
+
+import bisect
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Final
+
+import numpy as np
+
+from quadsim.errors import ParameterError
+from quadsim.sim.estimation.estimate import N_ERRORS, Estimate, retract
+from quadsim.sim.estimation.prediction import Drive, drive, lifts, motion_model, predict, stand
+from quadsim.sim.estimation.settings import EstimatorSettings
+from quadsim.sim.estimation.update import doubt, update
+from quadsim.sim.sensing.sampler import Sample
+from quadsim.sim.sensing.sensor import AXES, Sensor, SensorName
+from quadsim.state import Array
+from quadsim.vehicle import Vehicle
+
+LONGEST_STEP: Final = 0.01
+"""Longest prediction at once [s]."""
+NEEDED: Final = (SensorName.POSITION, SensorName.ATTITUDE)
+"""Sensors without which position or heading would drift without bound."""
+_NAMES: Final = list(SensorName)
+_LARGEST: Final = 1e6
+"""A mean or a sample beyond this in magnitude [SI units], or not a number, tells nothing."""
+_LARGEST_VARIANCE: Final = 1e15
+"""The same for the trace of a covariance."""
+
+
+@dataclass(kw_only=True)
+class Tally:
+    """What became of one sensor's samples.
+
+    Attributes:
+        accepted: how many were used.
+        rejected: how many were refused: outside the gate, or not numbers.
+        nis: sum of the normalised innovations squared of those used; three each on average, where all is as stated.
+    """
+
+    accepted: int = 0
+    rejected: int = 0
+    nis: float = 0.0
+
+
+@dataclass(kw_only=True)
+class _Track:
+    """A filter at one instant; `refused` holds the step since which every sample of a sensor has been refused."""
+
+    step: int
+    estimate: Estimate
+    refused: dict[SensorName, int] = field(default_factory=dict)
+    tallies: dict[SensorName, Tally] = field(default_factory=dict)
+
+    def branch(self) -> _Track:
+        return _Track(
+            step=self.step,
+            estimate=self.estimate,
+            refused=dict(self.refused),
+            tallies={name: replace(tally) for name, tally in self.tallies.items()},
+        )
+
+
+class ErrorStateFilter:
+    """Turns samples and rotor speeds into an estimate.  Never raises in flight, and never answers with NaN.
+
+    Attributes:
+        settings: its tuning.
+    """
+
+    def __init__(
+        self, vehicle: Vehicle, sensors: Sequence[Sensor], settings: EstimatorSettings, *, timestep: float
+    ) -> None:
+        """Set up, to be reset before use.
+
+        Args:
+            vehicle: what is believed to fly.
+            sensors: what is believed of the sensors: their noise and the largest delay.
+            settings: its tuning.
+            timestep: physics step [s].
+
+        Raises:
+            ParameterError: a sensor is missing, or states a noise of zero.
+        """
+        from scipy.special import chdtri  # whose package takes a while to load, and few flights have an estimator
+
+        names = [sensor.name for sensor in sensors]
+        for name in NEEDED:
+            if name not in names:
+                raise ParameterError("estimator", "sensors", [str(n) for n in names], f"such that {name} is among them")
+        for sensor in sensors:
+            if min(sensor.noise) <= 0.0:
+                rule = "positive on every axis, for the estimator to weigh it"
+                raise ParameterError(f"sensors.{sensor.name}", "noise", sensor.noise, rule)
+        self.settings = settings
+        self._timestep = timestep
+        self._model = motion_model(vehicle, settings)
+        self._variances = {sensor.name: np.diag(np.square(sensor.noise)) for sensor in sensors}
+        self._horizon = max(sensor.latency(timestep) for sensor in sensors)
+        self._gate = float(chdtri(len(AXES), 1.0 - settings.gate))
+        self._patience = settings.patience / timestep
+        self._stride = max(1, int(LONGEST_STEP / timestep + 1e-9))
+
+    def reset(self, mean: Array, speeds: Array, rng: np.random.Generator) -> None:
+        """Start at step 0.
+
+        Args:
+            mean: (16,) the truth, gyro bias zero; the first estimate differs from it by a drawn error of the initial
+                covariance, the bias by what it is.
+            speeds: (4,) rotor speeds in force [rad/s].
+            rng: what the error is drawn from.
+        """
+        error = self._initial() * rng.standard_normal(N_ERRORS)
+        error[12:] = 0.0
+        estimate = Estimate(mean=retract(mean, error), covariance=np.diag(np.square(self._initial())))
+        tallies = {name: Tally() for name in self._variances}
+        self._track = _Track(step=0, estimate=estimate, tallies=tallies)
+        self._starts, self._speeds, self._standing = [0], speeds.copy(), False
+        self._drives: list[Drive | None] = [drive(self._model, speeds)]
+        self._waiting: list[Sample] = []
+
+    def _initial(self) -> Array:
+        s = self.settings
+        stds = (s.initial_position, s.initial_velocity, s.initial_attitude, s.initial_rates, s.initial_gyro_bias)
+        return np.repeat(stds, 3)
+
+    @property
+    def tallies(self) -> dict[SensorName, Tally]:
+        """What became of each sensor's samples, those after the fusion horizon not yet counted."""
+        return {name: replace(tally) for name, tally in self._track.tallies.items()}
+
+    def advance(self, commands: Array, samples: Iterable[Sample], first: int, *, standing: bool = False) -> None:
+        """Take note of a stretch of flight and run the filter on to the fusion horizon.
+
+        Args:
+            commands: (M, 4) rotor speeds in force during each physics step [rad/s].
+            samples: what has arrived meanwhile, in any order.
+            first: number of the first of these physics steps.
+            standing: whether a land detector has seen the vehicle on the ground when the stretch began; it has left
+                the ground once the believed thrust exceeds its weight.
+        """
+        changed = np.any(commands != np.vstack([self._speeds, commands[:-1]]), axis=1)
+        changed[:1] |= standing is not self._standing
+        for i in np.flatnonzero(changed).tolist():
+            driven = drive(self._model, commands[i])
+            self._starts.append(first + i)
+            self._drives.append(None if standing and not lifts(self._model, driven) else driven)
+        if len(commands):
+            self._speeds, self._standing = commands[-1].copy(), standing
+        horizon = first + len(commands) - self._horizon
+        for sample in samples:
+            if np.abs(sample.value).max() < _LARGEST:  # as NaN is not
+                self._waiting.append(sample)
+            else:
+                self._track.tallies[sample.sensor].rejected += 1
+        self._waiting.sort(key=_order)
+        ripe = bisect.bisect_right(self._waiting, horizon, key=lambda sample: sample.taken)
+        self._run(self._track, self._waiting[:ripe])
+        del self._waiting[:ripe]
+        kept = bisect.bisect_right(self._starts, self._track.step) - 1
+        del self._starts[:kept], self._drives[:kept]
+
+    def estimate(self, step: int) -> Estimate:
+        """What is believed at a physics step, no earlier than the last one told of."""
+        track = self._track.branch()
+        self._run(track, self._waiting)
+        self._predict(track, step)
+        return track.estimate
+
+    def _run(self, track: _Track, samples: list[Sample]) -> None:
+        for sample in samples:
+            self._predict(track, sample.taken)
+            self._use(track, sample)
+
+    def _predict(self, track: _Track, step: int) -> None:
+        while track.step < step:
+            i = bisect.bisect_right(self._starts, track.step) - 1
+            until = min(step, track.step + self._stride, *self._starts[i + 1 : i + 2])
+            driven, duration = self._drives[i], (until - track.step) * self._timestep
+            if driven is None:
+                after = stand(self._model, track.estimate, duration)
+            else:
+                after = predict(self._model, track.estimate, driven, duration)
+            if not _plausible(after):
+                # Nothing is known any more: stay where it was, as unsure as at the start, and let the sensors speak.
+                after = Estimate(mean=track.estimate.mean, covariance=np.diag(np.square(self._initial())))
+            track.estimate, track.step = after, until
+
+    def _use(self, track: _Track, sample: Sample) -> None:
+        name, tally = sample.sensor, track.tallies[sample.sensor]
+        refused = sample.taken - track.refused.get(name, sample.taken)
+        if refused >= self._patience > 0.0:
+            track.estimate = doubt(track.estimate, name, sample.value, refused * self._timestep)
+        after, distance = update(track.estimate, name, sample.value, self._variances[name], self._gate)
+        if after is track.estimate:
+            tally.rejected += 1
+            track.refused.setdefault(name, sample.taken)
+            return
+        track.estimate = after
+        track.refused.pop(name, None)
+        tally.accepted += 1
+        tally.nis += distance
+
+
+def _order(sample: Sample) -> tuple[int, int]:
+    return sample.taken, _NAMES.index(sample.sensor)
+
+
+def _plausible(estimate: Estimate) -> bool:
+    return bool(estimate.mean @ estimate.mean < _LARGEST**2 and estimate.covariance.trace() < _LARGEST_VARIANCE)

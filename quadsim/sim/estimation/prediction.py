@@ -1,0 +1,213 @@
+"""Prediction: the believed vehicle as a rigid body driven by its rotor speeds, and the growth of the error with time.
+
+    dp/dt = v            dv/dt = R(q) [0, 0, U/m] - [0, 0, g] + w_a      dq/dt = q * [0, omega] / 2
+    domega/dt = I^-1 (tau - omega x I omega) + w_alpha                   db/dt = w_b
+
+with white w_a, w_alpha, w_b, and to first order in the error, F(t) of de/dt = F e + w (Solà 2017, Eqs. (238)-(240), the
+vehicle's model in place of an accelerometer):
+
+    dv: -R [a]x dtheta      dtheta: -[omega]x dtheta + domega      domega: I^-1 ([I omega]x - [omega]x I) domega
+
+On the ground a vehicle whose feet stand would fall by its rotor speeds alone.  The ground carries what the rotors do
+not, so nothing moves: p, q and the gyro's bias stay, v = 0 and omega = 0, which is a zero-velocity update (Groves,
+"Principles of GNSS, Inertial, and Multisensor Integrated Navigation Systems", 2nd ed. 2013, Sec. 15.3) at every step.
+Legs that give and slide a little leave v and omega white: sigma at any instant, forgotten after tau, so that position
+and attitude walk randomly with densities sigma sqrt(tau).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from quadsim.sim.estimation.estimate import (
+    ATTITUDE,
+    GYRO_BIAS,
+    MEAN_RATES,
+    N_ERRORS,
+    POSITION,
+    RATES,
+    VELOCITY,
+    Estimate,
+)
+from quadsim.sim.estimation.settings import EstimatorSettings
+from quadsim.sim.sensing.sphere import exponential, normalise, product
+from quadsim.state import Array, read_only
+from quadsim.vehicle import Vehicle
+
+_EYE = read_only(np.eye(N_ERRORS))
+STILL_VELOCITY: Final = 0.1
+"""Standard deviation of the velocity of a vehicle that stands, per axis [m/s]; also of one that its ground cushion has
+lifted before the believed thrust could."""
+STILL_RATE: Final = math.radians(0.5)
+"""The same of its body rates [rad/s]: as much as a MEMS gyro's noise, so that standing is worth a sample of it."""
+STILL_TIME: Final = 0.01
+"""Time tau after which these velocities and rates are forgotten [s]."""
+
+
+def _chain() -> Array:
+    N = np.zeros((N_ERRORS, N_ERRORS))
+    N[POSITION, VELOCITY] = N[ATTITUDE, RATES] = np.eye(3)
+    return read_only(N)
+
+
+_CHAIN = _chain()
+"""The two double integrators, dp/dt = v and dtheta/dt = omega."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Drive:
+    """What the rotors do.
+
+    Attributes:
+        acceleration: U / m [m/s^2], along body z.
+        torque: (tau_x, tau_y, tau_z) [N m], body.
+    """
+
+    acceleration: float
+    torque: tuple[float, float, float]
+
+
+@dataclass(frozen=True, kw_only=True)
+class MotionModel:
+    """The believed vehicle.
+
+    Attributes:
+        mass: m [kg].
+        gravity: g [m/s^2].
+        inertia: (Ixx, Iyy, Izz) [kg m^2].
+        allocation: (4, 4) from squared rotor speeds to thrust and torque.
+        noise: three (15, 15) coefficients of h, h^2, h^3 in the noise that gathers in a time h; see `_gathered`.
+    """
+
+    mass: float
+    gravity: float
+    inertia: tuple[float, float, float]
+    allocation: Array
+    noise: tuple[Array, Array, Array]
+
+
+def motion_model(vehicle: Vehicle, settings: EstimatorSettings) -> MotionModel:
+    """The model of a vehicle disturbed as the settings say."""
+    density = np.zeros(N_ERRORS)
+    density[VELOCITY] = settings.acceleration_noise**2
+    density[RATES] = settings.angular_acceleration_noise**2
+    density[GYRO_BIAS] = settings.gyro_bias_walk**2
+    return MotionModel(
+        mass=vehicle.mass,
+        gravity=vehicle.gravity,
+        inertia=vehicle.inertia,
+        allocation=read_only(vehicle.allocation),
+        noise=_gathered(np.diag(density)),
+    )
+
+
+def drive(model: MotionModel, speeds: Array) -> Drive:
+    """What rotor speeds (4,) [rad/s] do; rotors do not turn backwards."""
+    thrust, x, y, z = (model.allocation @ np.square(np.maximum(speeds, 0.0))).tolist()
+    return Drive(acceleration=thrust / model.mass, torque=(x, y, z))
+
+
+def predict(model: MotionModel, estimate: Estimate, driven: Drive, duration: float) -> Estimate:
+    """The estimate some time later.
+
+    The mean by the midpoint rule, the attitude on the sphere; the covariance as F P F' + Q(h), F to third order in h.
+
+    Args:
+        model: the believed vehicle.
+        estimate: what is believed now.
+        driven: what the rotors do meanwhile.
+        duration: h [s]; short against the time in which the vehicle turns.
+    """
+    h, a = duration, driven.acceleration
+    px, py, pz, vx, vy, vz, qw, qx, qy, qz, p, q, r, *bias = estimate.mean.tolist()
+    attitude = (qw, qx, qy, qz)
+    ixx, iyy, izz = model.inertia
+    kx, ky, kz = (izz - iyy) / ixx, (ixx - izz) / iyy, (iyy - ixx) / izz
+    tx, ty, tz = driven.torque[0] / ixx, driven.torque[1] / iyy, driven.torque[2] / izz
+
+    half = 0.5 * h
+    p1, q1, r1 = p + half * (tx - kx * q * r), q + half * (ty - ky * p * r), r + half * (tz - kz * p * q)
+    quarter = 0.25 * h  # the mean rate of the first half, times its length
+    w, x, y, z = product(attitude, exponential((quarter * (p + p1), quarter * (q + q1), quarter * (r + r1))))
+    ax, ay, az = 2.0 * a * (x * z + w * y), 2.0 * a * (y * z - w * x), a * (1.0 - 2.0 * (x * x + y * y)) - model.gravity
+    mean = np.array(
+        [
+            px + h * (vx + half * ax),
+            py + h * (vy + half * ay),
+            pz + h * (vz + half * az),
+            vx + h * ax,
+            vy + h * ay,
+            vz + h * az,
+            *normalise(product(attitude, exponential((h * p1, h * q1, h * r1)))),
+            p + h * (tx - kx * q1 * r1),
+            q + h * (ty - ky * p1 * r1),
+            r + h * (tz - kz * p1 * q1),
+            *bias,
+        ]
+    )
+
+    # -R [a]x = a [-r2, r1, 0] with r1, r2 the columns of R, at the middle of the step as all else.
+    # Blocks are filled one above the other in the six columns of attitude and rates: one assignment costs as much as 9.
+    A = _CHAIN.copy()
+    A[VELOCITY.start : RATES.stop, ATTITUDE.start : RATES.stop] = [
+        [-2.0 * a * (x * y - w * z), a * (1.0 - 2.0 * (y * y + z * z)), 0.0, 0.0, 0.0, 0.0],
+        [-a * (1.0 - 2.0 * (x * x + z * z)), 2.0 * a * (x * y + w * z), 0.0, 0.0, 0.0, 0.0],
+        [-2.0 * a * (y * z + w * x), 2.0 * a * (x * z - w * y), 0.0, 0.0, 0.0, 0.0],
+        [0.0, r1, -q1, 1.0, 0.0, 0.0],
+        [-r1, 0.0, p1, 0.0, 1.0, 0.0],
+        [q1, -p1, 0.0, 0.0, 0.0, 1.0],
+        [0.0, 0.0, 0.0, 0.0, -kx * r1, -kx * q1],
+        [0.0, 0.0, 0.0, -ky * r1, 0.0, -ky * p1],
+        [0.0, 0.0, 0.0, -kz * q1, -kz * p1, 0.0],
+    ]
+    A *= h
+    F = _EYE + A @ (_EYE + 0.5 * A @ (_EYE + A / 3.0))
+    once, twice, thrice = model.noise
+    noise = h * (once + h * (twice + h * thrice))
+    return Estimate(mean=mean, covariance=F @ estimate.covariance @ F.T + noise)
+
+
+def _gathered(density: Array) -> tuple[Array, Array, Array]:
+    """Coefficients of the noise's covariance after a time h, int e^(N s) Q e^(N' s) ds = Q h + ... h^2 + ... h^3.
+
+    N holds the two double integrators, dp/dt = v and dtheta/dt = omega; N^2 = 0, so the series ends.  That the axes
+    turn meanwhile changes nothing, as the noise is alike on all of them.
+    """
+    N = _CHAIN
+    return read_only(density), read_only(0.5 * (N @ density + density @ N.T)), read_only(N @ density @ N.T / 3.0)
+
+
+def _blocks() -> tuple[Array, Array, Array]:
+    kept, variance, walk = np.ones(N_ERRORS), np.zeros(N_ERRORS), np.zeros(N_ERRORS)
+    kept[VELOCITY] = kept[RATES] = 0.0
+    variance[VELOCITY], variance[RATES] = STILL_VELOCITY**2, STILL_RATE**2
+    walk[POSITION], walk[ATTITUDE] = STILL_TIME * STILL_VELOCITY**2, STILL_TIME * STILL_RATE**2
+    return read_only(np.outer(kept, kept)), read_only(np.diag(variance)), read_only(np.diag(walk))
+
+
+_KEPT, _VARIANCE, _WALK = _blocks()
+"""(15, 15) each: 1 where neither velocity nor rates have a part and else 0; their variance; the growth of the rest."""
+
+
+def lifts(model: MotionModel, driven: Drive) -> bool:
+    """Whether rotors lift a vehicle off the ground: their thrust exceeds its weight, U > m g."""
+    return driven.acceleration > model.gravity
+
+
+def stand(model: MotionModel, estimate: Estimate, duration: float) -> Estimate:
+    """The estimate some time later of a vehicle that stands.
+
+    Args:
+        model: the believed vehicle.
+        estimate: what is believed now; of velocity and rates nothing is kept.
+        duration: h [s].
+    """
+    mean = estimate.mean.copy()
+    mean[VELOCITY] = mean[MEAN_RATES] = 0.0
+    covariance = _KEPT * estimate.covariance + _VARIANCE + duration * _WALK
+    covariance[GYRO_BIAS, GYRO_BIAS] += duration * model.noise[0][GYRO_BIAS, GYRO_BIAS]
+    return Estimate(mean=mean, covariance=covariance)

@@ -1,0 +1,239 @@
+"""The closed loop: plant -> controller -> command -> plant, once per control period."""
+
+from __future__ import annotations
+
+import math
+import time as clock
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from quadsim.controller import MISSED, Command, Controller, Moment, Phase
+from quadsim.errors import FlightError, InterruptedFlightError, LostError
+from quadsim.flight.log import ControlLog, FlightLog, PlantLog, TimingLog
+from quadsim.flight.lost import LossCriteria, check_loss
+from quadsim.sim.computation import Computation
+from quadsim.sim.physics import Stretch, physics_to_state
+from quadsim.sim.plant import Plant
+from quadsim.state import INDEX, N_STATES, REFERENCE_NAMES, Array
+from quadsim.vehicle import N_ROTORS
+
+if TYPE_CHECKING:
+    from quadsim.sim.navigation import Navigation
+    from quadsim.sim.phase import PhaseMonitor
+
+
+def fly(
+    plant: Plant,
+    controller: Controller,
+    reference: Array,
+    *,
+    initial_state: Array,
+    initial_speeds: Array,
+    periods: int,
+    steps_per_period: int,
+    navigation: Navigation | None = None,
+    computation: Computation | None = None,
+    rng: np.random.Generator | None = None,
+    ground: PhaseMonitor | None = None,
+    loss: LossCriteria | None = None,
+    progress: Callable[[int], None] | None = None,
+) -> FlightLog:
+    """Fly a number of control periods.
+
+    Whatever happens in flight ends up in the log: a typed flight error or Ctrl-C ends it early, with its reason and
+    everything up to it.
+
+    Args:
+        plant: what is flown; it is reset first.
+        controller: what flies it; it is reset first.
+        reference: (periods + N, 4) filtered x, y, z [m], yaw [rad], row k at t_k, N the controller's preview.
+        initial_state: (12,).
+        initial_speeds: (4,) u(-1), and the rotor speeds at the start [rad/s].
+        periods: K.
+        steps_per_period: physics steps per control period.
+        navigation: what the controller is told; the true state where absent.
+        computation: how long commands take, in simulated time; none where absent.
+        rng: what `computation` draws from.
+        ground: what knows where the flight stands with the ground; it is flying throughout where absent.
+        loss: when the vehicle is lost, looked at once per control period until it has crashed; never where absent.
+        progress: called with the number of periods flown, after each.
+
+    Returns:
+        The flight, with plant rows at the physics rate.
+    """
+    plant.reset(initial_state, initial_speeds)
+    controller.reset(initial_speeds)
+    period = steps_per_period * plant.timestep
+    if navigation is not None:
+        navigation.reset(plant.physics, initial_speeds, yaw=float(initial_state[INDEX["yaw"]]))
+    if ground is not None:
+        ground.reset()
+    truth = np.empty((periods, N_STATES))
+    states = np.empty((periods, N_STATES))
+    start = plant.physics
+    heights = np.minimum(reference[:, REFERENCE_NAMES.index("z")], initial_state[INDEX["z"]])
+    lowest = np.minimum.accumulate(heights).tolist()
+    samples: list[Sample] = []
+    acting = np.array(initial_speeds, float)
+    plan, age = acting[None], 0  # the last plan that came in time, and how many periods ago
+    draws = rng if rng is not None else np.random.default_rng(0)
+    ended: FlightError | None = None
+    try:
+        for k in range(periods):
+            truth[k] = plant.state()
+            since = physics_to_state(samples[-1].stretch.physics) if ground and samples else truth[k : k + 1]
+            states[k] = truth[k] if navigation is None else navigation.state()
+            preview = reference[k + 1 : k + 1 + controller.horizon]
+            phase = Phase.FLYING if ground is None else ground.advance(since, preview)
+            if loss is not None and phase is not Phase.CRASHED:
+                check_loss(loss, k * period, truth[k], reference[k], lowest[k])
+            now = Moment(time=k * period, phase=phase, acting=acting)
+            started = clock.perf_counter()
+            command = controller.step(now, states[k], preview)
+            step_s = clock.perf_counter() - started
+            delay = 0.0 if computation is None else computation.delay(now.time, command, draws)
+            wait = math.ceil(delay / plant.timestep - 1e-6)
+            missed = wait > steps_per_period  # one that comes just in time acts from the next period on
+            due = min(wait, steps_per_period)
+            if computation is not None and computation.plan:
+                due = min(due, math.ceil(computation.fixed / plant.timestep - 1e-6))
+            holds = [(acting, due), (_next_row(plan, age), min(wait, steps_per_period) - due)]
+            if missed:
+                age += 1
+                acting = holds[1][0] if holds[1][1] else acting
+            else:
+                acting, plan, age = command.speeds, command.plan, 0
+                holds.append((acting, steps_per_period - wait))
+            holds = [(speeds, steps) for speeds, steps in holds if steps > 0]
+            flown = [(plant.advance(speeds, steps), plant.applied(speeds)) for speeds, steps in holds]
+            if navigation is not None:
+                for stretch, speeds in flown:
+                    held = np.broadcast_to(speeds, (len(stretch.physics), N_ROTORS))
+                    navigation.advance(stretch.physics, held, standing=phase in (Phase.LANDED, Phase.ARMED))
+            samples.append(
+                Sample(
+                    command=command,
+                    speeds=acting,
+                    phase=phase,
+                    delay=delay,
+                    missed=missed,
+                    step_s=step_s,
+                    stretch=Stretch.join([stretch for stretch, _ in flown]),
+                    rotors=plant.speeds,
+                )
+            )
+            if progress is not None:
+                progress(k + 1)
+    except FlightError as error:
+        ended = error.with_traceback(None)  # which would hold this frame, and all that was flown, in a cycle
+    except KeyboardInterrupt:
+        ended = InterruptedFlightError(time=len(samples) * period)
+    count = len(samples)
+    control = _control_log(samples, states[:count], truth[:count], reference[:count], initial_speeds, period)
+    commands = [sample.command for sample in samples]
+    return FlightLog(
+        control=control,
+        timing=TimingLog(
+            t=control.t,
+            solve_ms=np.array([1e3 * command.solve_s for command in commands]),
+            step_ms=np.array([1e3 * sample.step_s for sample in samples]),
+        ),
+        plant=_plant_log(samples, start, initial_speeds, float(initial_state[INDEX["yaw"]]), plant.timestep),
+        predicted=_predict(controller, control.state, commands),
+        reason=None if ended is None else str(ended),
+        interrupted=isinstance(ended, InterruptedFlightError),
+        lost=ended.criterion if isinstance(ended, LostError) else None,
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sample:
+    """One control period as it was flown.
+
+    Attributes:
+        command: the controller's answer.
+        speeds: (4,) the command in force at the period's end: an earlier one, if this one missed its deadline [rad/s].
+        phase: where the flight stood with the ground.
+        delay: simulated time from the measurement to the command [s].
+        missed: whether that was too long.
+        step_s: wall time of the controller's step [s].
+        stretch: what the plant did.
+        rotors: (4,) rotor speeds at the period's end [rad/s].
+    """
+
+    command: Command
+    speeds: Array
+    phase: Phase
+    delay: float
+    missed: bool
+    step_s: float
+    stretch: Stretch
+    rotors: Array
+
+
+def _next_row(plan: Array, age: int) -> Array:
+    """What a plan (N, 4) has for the period after its first and `age` more; its last row beyond its end."""
+    row: Array = plan[min(age + 1, len(plan) - 1)]
+    return row
+
+
+def _control_log(
+    samples: list[Sample], states: Array, truth: Array, reference: Array, initial_speeds: Array, period: float
+) -> ControlLog:
+    def column(name: str, kind: type) -> np.ndarray[Any, np.dtype[Any]]:
+        return np.array([getattr(sample.command, name) for sample in samples], dtype=kind)
+
+    fallback = column("fallback", np.int64)
+    late = np.array([sample.missed for sample in samples], dtype=bool)
+    return ControlLog(
+        t=_times(len(samples), period),
+        state=states,
+        truth=truth,
+        reference=reference,
+        speeds=np.array([sample.speeds for sample in samples], float).reshape(-1, N_ROTORS),
+        speeds_before=np.array(initial_speeds, float),
+        status=tuple(MISSED if sample.missed else sample.command.status for sample in samples),
+        phase=tuple(str(sample.phase) for sample in samples),
+        iterations=column("iterations", np.int64),
+        active=column("active", np.int64),
+        fallback=np.where(late, np.maximum(fallback, 1), fallback),
+        slack=column("slack", float),
+        primal_residual=column("primal_residual", float),
+        dual_residual=column("dual_residual", float),
+        delay=np.array([sample.delay for sample in samples], float),
+    )
+
+
+def _plant_log(samples: list[Sample], start: Array, initial_speeds: Array, yaw: float, timestep: float) -> PlantLog:
+    stretches = [sample.stretch for sample in samples]
+    physics = np.concatenate([start[None], *(stretch.physics for stretch in stretches)])
+    last = samples[-1].rotors if samples else initial_speeds
+    flown = Stretch.join(stretches) if stretches else None
+    return PlantLog(
+        t=_times(physics.shape[0], timestep),
+        state=physics_to_state(physics, yaw),
+        speeds=np.concatenate([*(stretch.speeds for stretch in stretches), last[None]]),
+        wrench=None if flown is None else _held(flown.wrench),
+        wind=None if flown is None else _held(flown.wind),
+    )
+
+
+def _held(rows: Array | None) -> Array | None:
+    """What holds from each row on, with the last repeated for the flight's end."""
+    return None if rows is None else np.concatenate([rows, rows[-1:]])
+
+
+def _times(count: int, spacing: float) -> Array:
+    """Instants k * spacing without the rounding that adding up or a binary fraction leaves."""
+    return np.round(np.arange(count) * spacing, 9)
+
+
+def _predict(controller: Controller, states: Array, commands: list[Command]) -> np.ndarray | None:
+    predict = getattr(controller, "predict", None)  # a controller without a model has none
+    if not commands or predict is None:
+        return None
+    plans = np.stack([command.plan for command in commands])
+    return np.ascontiguousarray(predict(states, plans)[:, :, [0, 2, 4]], dtype=np.float32)

@@ -1,0 +1,163 @@
+"""Navigation: what a controller is told of the state, from what the sensors say of the true one."""
+
+from __future__ import annotations
+
+import copy
+import math
+from collections.abc import Sequence
+from operator import attrgetter
+from typing import Final
+
+import numpy as np
+
+from quadsim.errors import ParameterError
+from quadsim.sim.estimation.estimate import MEAN_QUATERNION, MEAN_RATES
+from quadsim.sim.estimation.filter import ErrorStateFilter, Tally
+from quadsim.sim.estimation.settings import EstimatorSettings
+from quadsim.sim.sensing.sampler import Sample, Sampler, truth
+from quadsim.sim.sensing.sensor import Sensor, SensorFault, SensorName
+from quadsim.state import (
+    ANGLE_RATES,
+    ANGLES,
+    N_STATES,
+    POSITIONS,
+    VELOCITIES,
+    Array,
+    body_to_euler_rates,
+    quaternion_to_euler,
+)
+from quadsim.vehicle import Vehicle
+
+_TAKEN: Final = attrgetter("taken")
+
+
+class Navigation:
+    """Sensors, and an estimator or none.
+
+    Without an estimator the controller is told the last sample of each sensor that has arrived, however old, and the
+    truth where there is no sensor; until the first sample arrives, the truth at t = 0.  With an estimator it is
+    told the estimate, from those sensors alone that there are.
+
+    Each sensor draws from a generator of its own, so that adding one, or its noise, leaves the others' draws alone.
+    """
+
+    def __init__(
+        self,
+        vehicle: Vehicle,
+        *,
+        timestep: float,
+        sensors: Sequence[Sensor],
+        rng: np.random.Generator,
+        faults: Sequence[SensorFault] = (),
+        estimator: EstimatorSettings | None = None,
+    ) -> None:
+        """Set up, to be reset before use.
+
+        Args:
+            vehicle: what is believed to fly.
+            timestep: physics step [s].
+            sensors: at most one of each name; absent ones are perfect, or not there where there is an estimator.
+            rng: where all randomness comes from.
+            faults: what befalls the sensors; a perfect one can be befallen too.
+            estimator: the error-state filter's tuning, or None.
+
+        Raises:
+            ParameterError: two sensors of one name, times that are no whole physics steps, a fault of a sensor that is
+                not there, or sensors that the estimator cannot work with.
+        """
+        names = [sensor.name for sensor in sensors]
+        if len(set(names)) < len(names):
+            raise ParameterError("navigation", "sensors", [str(name) for name in names], "at most one of each name")
+        befallen = {fault.sensor for fault in faults} - set(names)
+        if estimator is not None and befallen:
+            rule = f"on a sensor that the estimator has ({', '.join(names)})"
+            raise ParameterError("fault", "sensor", str(min(befallen)), rule)
+        perfect = [Sensor(name=name, rate=1.0 / timestep) for name in sorted(befallen)]
+        self._rng, *others = rng.spawn(1 + len(SensorName))
+        generators = dict(zip(SensorName, others, strict=True))
+        self._samplers = tuple(
+            Sampler(sensor, timestep=timestep, faults=tuple(faults), rng=generators[sensor.name])
+            for sensor in (*sensors, *perfect)
+        )
+        sensed = {sampler.sensor.name for sampler in self._samplers}
+        self._perfect = tuple(name for name in SensorName if name not in sensed)
+        self._filter = None if estimator is None else ErrorStateFilter(vehicle, sensors, estimator, timestep=timestep)
+
+    def reset(self, physics: Array, speeds: Array, yaw: float = 0.0) -> None:
+        """Start again, with the same draws.
+
+        Args:
+            physics: (14,) MuJoCo's state at t = 0; see `quadsim.sim.physics.physics_to_state`.
+            speeds: (4,) rotor speeds in force [rad/s].
+            yaw: near which turn the yaw is [rad].
+        """
+        self._step, self._yaw, self._physics = 0, yaw, physics.copy()
+        self._held = {name: truth(name, physics[None])[0] for name in SensorName}
+        self._in_flight: list[Sample] = []
+        for sampler in self._samplers:
+            sampler.reset()
+        if self._filter is not None:
+            mean = np.concatenate([physics[1:4], physics[8:11], physics[4:8], physics[11:14], np.zeros(3)])
+            self._filter.reset(mean, speeds, copy.deepcopy(self._rng))
+        self._receive(physics[None], first=0)
+        if self._filter is not None:
+            self._filter.advance(np.empty((0, len(speeds))), self._arrived(), first=0)
+
+    def advance(self, physics: Array, commands: Array, *, standing: bool = False) -> None:
+        """Take note of a stretch of flight.
+
+        Args:
+            physics: (M, 14) the true state after each physics step.
+            commands: (M, 4) rotor speeds in force during each of these steps [rad/s].
+            standing: whether the feet stood on the ground when the stretch began, as a land detector has it.
+        """
+        if not len(physics):
+            return
+        first, self._step, self._physics = self._step, self._step + len(physics), physics[-1].copy()
+        self._receive(physics, first + 1)
+        if self._filter is not None:
+            self._filter.advance(commands, self._arrived(), first, standing=standing)
+
+    def state(self) -> Array:
+        """(12,) what the controller is told now: paper's order, yaw unwrapped."""
+        if self._filter is not None:
+            mean = self._filter.estimate(self._step).mean
+            told = {
+                SensorName.POSITION: mean[0:3],
+                SensorName.VELOCITY: mean[3:6],
+                SensorName.ATTITUDE: quaternion_to_euler(mean[MEAN_QUATERNION]),
+                SensorName.RATES: mean[MEAN_RATES],
+            }
+        else:
+            for sample in self._arrived():
+                self._held[sample.sensor] = sample.value
+            told = self._held | {name: truth(name, self._physics[None])[0] for name in self._perfect}
+        euler = told[SensorName.ATTITUDE].copy()
+        state = np.empty(N_STATES)
+        state[POSITIONS] = told[SensorName.POSITION]
+        state[VELOCITIES] = told[SensorName.VELOCITY]
+        state[ANGLE_RATES] = body_to_euler_rates(euler, told[SensorName.RATES])
+        if math.isfinite(euler[2]):
+            euler[2] += 2.0 * math.pi * round((self._yaw - float(euler[2])) / (2.0 * math.pi))
+            self._yaw = float(euler[2])
+        state[ANGLES] = euler
+        return state
+
+    @property
+    def tallies(self) -> dict[SensorName, Tally]:
+        """What became of each sensor's samples in the estimator; empty without one."""
+        return {} if self._filter is None else self._filter.tallies
+
+    def _receive(self, physics: Array, first: int) -> None:
+        for sampler in self._samplers:
+            self._in_flight.extend(sampler.sample(physics, first))
+
+    def _arrived(self) -> list[Sample]:
+        """The samples that have arrived since last asked, the oldest first; the rest stay on their way."""
+        arrived: list[Sample] = []
+        in_flight: list[Sample] = []
+        for sample in self._in_flight:
+            (arrived if sample.arrival <= self._step else in_flight).append(sample)
+        self._in_flight = in_flight
+        arrived.sort(key=_TAKEN)
+        return arrived

@@ -1,0 +1,77 @@
+"""The phase of a flight, once per control period: on the ground, about to take off, flying or crashed."""
+
+from __future__ import annotations
+
+import math
+from typing import Final
+
+import numpy as np
+
+from quadsim.controller import Phase
+from quadsim.flight.ground import AIRBORNE, TOUCH, Outline, clearance
+from quadsim.state import INDEX, REFERENCE_NAMES, Array, tilt
+
+ASKED_RISE: Final = 0.05
+"""How far above the resting height a reference has to rise to ask for flight [m]."""
+REST: Final = 0.2
+"""How long the feet have to touch the ground without a break for the vehicle to have landed [s]."""
+CAPSIZED: Final = 60.0
+"""Tilt [deg] beyond which a vehicle that touches the ground has crashed."""
+
+
+class PhaseMonitor:
+    """Tells, once per control period, whether the vehicle stands, is about to take off, flies or has crashed.
+
+    - The first state decides: `landed` up to a clearance of `AIRBORNE`, else `flying`.
+    - On the ground it is `armed` while the previewed reference rises more than `ASKED_RISE` above the resting height,
+      else `landed`; from `armed` it is `flying` as soon as the clearance exceeds `AIRBORNE`.
+    - From `flying` it is `landed` once the feet have touched for `REST` and the whole preview stays on the ground.
+    - Whatever it was, it has `crashed` for good when anything but the feet touches the ground, or when the feet do with
+      the vehicle tilted beyond `CAPSIZED`.
+
+    Args:
+        outline: what may touch the ground, and where that is.
+        period: the control period [s].
+    """
+
+    def __init__(self, outline: Outline, *, period: float) -> None:
+        self._outline = outline
+        self._asking = outline.floor + outline.foot_radius - float(outline.feet[:, 2].min()) + ASKED_RISE
+        self._reach = float(np.linalg.norm(outline.hull, axis=1).max()) + TOUCH  # higher up nothing can touch
+        self._periods_of_rest = math.ceil(REST / period - 1e-9)
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the flight: the next state is the first."""
+        self._phase: Phase | None = None
+        self._touched = 0
+
+    def advance(self, states: Array, preview: Array) -> Phase:
+        """The phase of the control period that starts now.
+
+        Args:
+            states: (M, 12) true states since the last period began, the last of them now.
+            preview: (N, 4) reference x, y, z [m], yaw [rad] that the controller is about to see.
+        """
+        gap = float(clearance(states[-1:], self._outline.feet, self._outline.foot_radius, self._outline.floor)[0])
+        self._touched = self._touched + 1 if gap <= TOUCH else 0
+        asked = bool(preview[:, REFERENCE_NAMES.index("z")].max() > self._asking)
+        if self._phase is None:
+            self._phase = Phase.FLYING if gap > AIRBORNE else Phase.LANDED
+        if self._crashed(states):
+            self._phase = Phase.CRASHED
+        elif self._phase is Phase.FLYING:
+            if self._touched >= self._periods_of_rest and not asked:
+                self._phase = Phase.LANDED
+        elif self._phase is Phase.ARMED and gap > AIRBORNE:
+            self._phase = Phase.FLYING
+        elif self._phase is not Phase.CRASHED:
+            self._phase = Phase.ARMED if asked else Phase.LANDED
+        return self._phase
+
+    def _crashed(self, states: Array) -> bool:
+        if self._touched and np.degrees(tilt(states[-1:])[0]) > CAPSIZED:
+            return True
+        if states[:, INDEX["z"]].min() - self._outline.floor > self._reach:
+            return False
+        return float(clearance(states, self._outline.hull, 0.0, self._outline.floor).min()) <= TOUCH

@@ -1,0 +1,89 @@
+"""The simulator's own state over a number of steps, and how it becomes the paper's."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from quadsim.errors import ParameterError
+from quadsim.state import (
+    ANGLE_RATES,
+    ANGLES,
+    N_STATES,
+    POSITIONS,
+    VELOCITIES,
+    Array,
+    body_to_euler_rates,
+    quaternion_to_euler,
+)
+
+
+def steps_per_period(control_period: float, timestep: float) -> int:
+    """How many physics steps make one control period.
+
+    Raises:
+        ParameterError: the period is not a whole, positive number of steps.
+    """
+    steps = round(control_period / timestep)
+    if steps < 1 or not math.isclose(steps * timestep, control_period, rel_tol=1e-9):
+        rule = f"a whole multiple of the physics step of {timestep} s"
+        raise ParameterError("scenario", "control_period", control_period, rule)
+    return steps
+
+
+def physics_to_state(physics: Array, yaw: float = 0.0) -> Array:
+    """The paper's state from MuJoCo's.
+
+    Args:
+        physics: (M, 14) time, position (world), quaternion wxyz, velocity (world), angular rates (body).
+        yaw: near which turn the first row's yaw is [rad].
+
+    Returns:
+        (M, 12) states with Euler-angle rates (Sec. 2.2 takes body rates for them; see `quadsim.state`), yaw
+        unwrapped along the rows.
+    """
+    state = np.empty((physics.shape[0], N_STATES))
+    euler = quaternion_to_euler(physics[:, 4:8])
+    state[:, POSITIONS] = physics[:, 1:4]
+    state[:, VELOCITIES] = physics[:, 8:11]
+    state[:, ANGLE_RATES] = body_to_euler_rates(euler, physics[:, 11:14])
+    if len(euler) > 1:
+        euler[:, 2] = np.unwrap(euler[:, 2])
+    turns = round((yaw - float(euler[0, 2])) / (2.0 * math.pi)) if len(euler) and math.isfinite(euler[0, 2]) else 0
+    euler[:, 2] += 2.0 * math.pi * turns
+    state[:, ANGLES] = euler
+    return state
+
+
+@dataclass(frozen=True, kw_only=True)
+class Stretch:
+    """What happened over a number of physics steps; M rows, one per step.
+
+    Attributes:
+        physics: (M, 14) MuJoCo's state after each step; see `physics_to_state`.
+        speeds: (M, 4) rotor speeds at the start of each step [rad/s].
+        wrench: (M, 6) force, world [N], and torque, body frame about its origin [N m], of all effects but contact, over
+            each step; None where no effect makes any.
+        wind: (M, 3) velocity of the air in the middle of each step, world [m/s]; None without wind.
+    """
+
+    physics: Array
+    speeds: Array
+    wrench: Array | None
+    wind: Array | None
+
+    @staticmethod
+    def join(parts: Sequence[Stretch]) -> Stretch:
+        """Stretches one after the other as one."""
+        if len(parts) == 1:
+            return parts[0]
+
+        def stack(name: str) -> Array | None:
+            arrays = [getattr(part, name) for part in parts]
+            return None if arrays[0] is None else np.concatenate(arrays)
+
+        physics, speeds = (np.concatenate([getattr(part, name) for part in parts]) for name in ("physics", "speeds"))
+        return Stretch(physics=physics, speeds=speeds, wrench=stack("wrench"), wind=stack("wind"))

@@ -1,0 +1,315 @@
+"""The plant: the only owner of the MuJoCo model and its data."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from functools import cached_property
+from operator import add
+from struct import Struct
+from types import TracebackType
+from typing import Final
+
+import mujoco
+import numpy as np
+from mujoco.rollout import Rollout
+
+from quadsim.controller import check_command
+from quadsim.errors import CommandError, DivergenceError, ParameterError
+from quadsim.sim.airframe import BODY, compile_model, outline
+from quadsim.sim.effects import Effects, RotorChange, Wind
+from quadsim.sim.effects.forces import StepForces
+from quadsim.sim.effects.load import Payload, apply_mass, mass_properties
+from quadsim.sim.physics import Stretch, physics_to_state
+from quadsim.state import (
+    EULER,
+    EULER_RATE,
+    N_STATES,
+    POSITION,
+    VELOCITY,
+    Array,
+    euler_to_body_rates,
+    euler_to_quaternion,
+)
+from quadsim.vehicle import N_ROTORS, Vehicle
+
+_FULL: Final = int(mujoco.mjtState.mjSTATE_FULLPHYSICS)
+_CONTROL: Final = int(mujoco.mjtState.mjSTATE_CTRL)
+_PLAUSIBLE: Final = 1e6
+"""Largest magnitude of any time [s], position [m], speed [m/s] or rate [rad/s] taken for flight, not divergence."""
+_THREE, _FOUR, _SIX = Struct("3d"), Struct("4d"), Struct("6d")
+_NUMERICAL_WARNINGS: Final = (
+    mujoco.mjtWarning.mjWARN_BADQPOS,
+    mujoco.mjtWarning.mjWARN_BADQVEL,
+    mujoco.mjtWarning.mjWARN_BADQACC,
+    mujoco.mjtWarning.mjWARN_BADCTRL,
+)
+
+
+_CALM: Final = Effects()
+
+
+class Plant:
+    """A vehicle in MuJoCo: fourth-order Runge-Kutta at a fixed step, commands held in between.
+
+    Without effects rotors have their commanded speed at once, and a whole hold is one call of MuJoCo.  With effects
+    that depend on how the vehicle moves, each step is taken by itself, with forces evaluated in its middle (second
+    order).  Use as a context manager; it owns native memory.
+
+    Attributes:
+        vehicle: what flies, as its file says.
+        timestep: physics step [s].
+        effects: what acts on it.
+        model: the compiled model, not to be changed.
+    """
+
+    def __init__(
+        self,
+        vehicle: Vehicle,
+        *,
+        timestep: float = 1e-3,
+        limit_speeds: bool = False,
+        effects: Effects = _CALM,
+        wind: Wind | None = None,
+        rng: np.random.Generator | None = None,
+    ) -> None:
+        self.vehicle = vehicle
+        self.timestep = timestep
+        self.effects = effects
+        self.model = compile_model(
+            vehicle,
+            timestep=timestep,
+            limit_speeds=limit_speeds,
+            contact=effects.contact,
+            reweighed=effects.reweighs,
+            body_drag=effects.body_drag,
+            air_density=effects.air_density,
+        )
+        self._speed_range = (vehicle.speed_min, vehicle.speed_max) if limit_speeds else (0.0, math.inf)
+        self._data = mujoco.MjData(self.model)
+        mujoco.set_mju_user_warning(_discard)
+        self._rollout = Rollout(nthread=0)
+        self._physics = np.zeros((1, mujoco.mj_stateSize(self.model, _FULL)))
+        self._yaw = 0.0
+        self._wind = wind
+        self._by_step = effects.follows_state or wind is not None
+        changes = sorted(effects.changes, key=lambda change: change.time)
+        self._changes = [(math.ceil(change.time / timestep - 1e-6), change) for change in changes]
+        self._rng = rng if rng is not None else np.random.default_rng(0)
+        self._rng_start = self._rng.bit_generator.state
+        self.reset(np.zeros(N_STATES))
+
+    def __enter__(self) -> Plant:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._rollout.close()
+
+    @property
+    def time(self) -> float:
+        """Simulated time [s]."""
+        return float(self._physics[0, 0])
+
+    @property
+    def hover_speeds(self) -> Array:
+        """(4,) omega_bar on all rotors [rad/s], u(-1) of a flight that starts at rest in the air."""
+        return np.full(N_ROTORS, self.vehicle.hover_speed)
+
+    @property
+    def physics(self) -> Array:
+        """(14,) copy of MuJoCo's own state; see `physics_to_state`."""
+        return self._physics[0].copy()
+
+    @property
+    def speeds(self) -> Array:
+        """(4,) rotor speeds now [rad/s]."""
+        return self._speeds.copy()
+
+    def reset(self, state: Array, speeds: Array | None = None) -> None:
+        """Put the vehicle at a state at time zero, and everything that acts on it back to its start.
+
+        Args:
+            state: (12,).
+            speeds: (4,) rotor speeds [rad/s]; hover where absent.
+
+        Raises:
+            ParameterError: the state is not 12 finite numbers.
+        """
+        state = np.asarray(state, float)
+        if state.shape != (N_STATES,) or not np.all(np.isfinite(state)):
+            raise ParameterError("plant", "state", state.tolist(), f"{N_STATES} finite numbers")
+        mujoco.mj_resetData(self.model, self._data)
+        euler = state[list(EULER)]
+        self._physics[0] = np.concatenate(
+            [
+                [0.0],
+                state[list(POSITION)],
+                euler_to_quaternion(euler),
+                state[list(VELOCITY)],
+                euler_to_body_rates(euler, state[list(EULER_RATE)]),
+            ]
+        )
+        self._yaw = float(euler[2])
+        self._step = 0
+        self._pending = list(self._changes)
+        self._speeds = self.hover_speeds if speeds is None else np.array(speeds, float)
+        self._efficiency = np.array(self.effects.efficiency)
+        self._velocity_before = self._physics[0, 8:].tolist()
+        if self.effects.reweighs:
+            self._carry(list(self.effects.load.payloads))
+        self._rng.bit_generator.state = self._rng_start
+        if self._wind is not None:
+            self._wind.reset()
+
+    @cached_property
+    def _forces(self) -> StepForces:
+        """What acts in each step; made where steps are taken one by one."""
+        shape = outline(self.vehicle)
+        return StepForces(self.vehicle, self.effects, timestep=self.timestep, floor=shape.floor, disc=shape.disc)
+
+    def state(self) -> Array:
+        """(12,) the true state now, yaw unwrapped since the last reset."""
+        state = physics_to_state(self._physics, self._yaw)[0]
+        self._yaw = float(state[EULER[2]])
+        return state
+
+    def applied(self, speeds: Array) -> Array:
+        """The rotor speeds (4,) [rad/s] that a command asks for: it saturates at what rotors can do, and at zero."""
+        return np.clip(speeds, *self._speed_range)
+
+    def advance(self, speeds: Array, steps: int) -> Stretch:
+        """Hold a command for a number of physics steps.
+
+        Args:
+            speeds: (4,) commanded rotor speeds [rad/s].
+            steps: physics steps, at least 1.
+
+        Raises:
+            CommandError: the command is not four finite numbers; nothing moved.
+            DivergenceError: the state is no longer finite or plausible.
+        """
+        problem = check_command(speeds)
+        if problem is not None:
+            raise CommandError(problem, time=self.time)
+        target = self.applied(speeds)
+        parts, end = [], self._step + steps
+        while self._step < end:
+            self._change()
+            until = min(end, self._pending[0][0]) if self._pending else end
+            parts.append(self._hold(target, until - self._step))
+        return Stretch.join(parts)
+
+    def _change(self) -> None:
+        """Let happen what is due before the next step."""
+        while self._pending and self._pending[0][0] <= self._step:
+            _, change = self._pending.pop(0)
+            if isinstance(change, RotorChange):
+                self._efficiency[change.rotor - 1] = change.efficiency
+            else:
+                self._carry([] if change.payload is None else [*self._payloads, change.payload])
+
+    def _carry(self, payloads: list[Payload]) -> None:
+        self._payloads = payloads
+        apply_mass(self.model, BODY, mass_properties(self.vehicle, self.effects.load, payloads))
+
+    def _hold(self, target: Array, steps: int) -> Stretch:
+        """Advance while nothing but the vehicle and the air changes."""
+        rotors, timestep = self.effects.rotors, self.timestep
+        if rotors is None:
+            before = middle = np.broadcast_to(target, (steps, N_ROTORS))
+            slopes = np.zeros((steps, N_ROTORS))
+            self._speeds = target
+        else:
+            edges = timestep * np.arange(steps + 1, dtype=np.float64)
+            times = np.concatenate([edges, edges[:-1] + 0.5 * timestep])
+            speeds, slopes = rotors.respond(self._speeds, target, times)
+            before, self._speeds = speeds[:steps].copy(), speeds[steps].copy()
+            middle, slopes = speeds[steps + 1 :], slopes[steps + 1 :]
+        thrusts = self._efficiency * self.vehicle.thrust_coefficient * np.square(middle)
+        wrench = wind = None
+        if self._by_step:
+            wind = None if self._wind is None else self._wind.advance(steps)
+            trajectory, wrench = self._take_steps(thrusts, middle, slopes, wind)
+        else:
+            trajectory = self._run(thrusts)
+        self._check(trajectory)
+        self._physics[0] = trajectory[-1]
+        self._step += steps
+        return Stretch(physics=trajectory, speeds=before, wrench=wrench, wind=wind)
+
+    def _run(self, thrusts: Array) -> Array:
+        """All steps in one call: thrusts (M, 4) [N] -> states (M, 14)."""
+        steps = len(thrusts)
+        states = np.empty((1, steps, self._physics.shape[1]))
+        sensors = np.empty((1, steps, self.model.nsensordata))
+        self._rollout.rollout(
+            [self.model],
+            [self._data],
+            self._physics,
+            np.ascontiguousarray(thrusts[None]),
+            control_spec=_CONTROL,
+            skip_checks=True,
+            nstep=steps,
+            state=states,
+            sensordata=sensors,
+        )
+        return states[0]
+
+    def _take_steps(self, thrusts: Array, speeds: Array, slopes: Array, wind: Array | None) -> tuple[Array, Array]:
+        """One step after the other, each with the forces of its middle: states (M, 14) and wrenches (M, 6)."""
+        model, data, steps = self.model, self._data, len(thrusts)
+        mujoco.mj_setState(model, data, self._physics[0], _FULL)
+        trajectory, wrench = np.empty((steps, self._physics.shape[1])), np.empty((steps, 6))
+        disturbance = self.effects.disturbance
+        noises = None if disturbance is None else disturbance.draw(steps, self.timestep, self._rng).tolist()
+        air = np.zeros((steps, 3)) if wind is None else wind
+        drags = self.effects.body_drag is not None
+        moving_air = wind is not None and drags
+        there = self._efficiency > 0.0  # a lost propeller neither drags nor carries momentum
+        of_rotors = self._forces.of_rotors(speeds * there, slopes * there).tolist()
+        forces, step, velocity_before = self._forces.midway, mujoco.mj_step, self._velocity_before
+        # Through memory views, which take and give a few numbers in a third of an array's time.
+        qpos, qvel, fluid = data.qpos.data, data.qvel.data, data.qfrc_fluid
+        applied, control, air_of_model = (_bytes(array) for array in (data.qfrc_applied, data.ctrl, model.opt.wind))
+        states, wrenches = _bytes(trajectory).cast("d"), _bytes(wrench)
+        row = trajectory.shape[1]
+        for i, (thrust, rotors, breeze) in enumerate(zip(thrusts.tolist(), of_rotors, air.tolist(), strict=True)):
+            velocity = qvel.tolist()
+            acting: Sequence[float] = forces(qpos.tolist(), velocity, velocity_before, thrust, rotors, breeze)
+            velocity_before = velocity
+            if noises is not None:
+                acting = list(map(add, acting, noises[i]))
+            _SIX.pack_into(applied, 0, *acting)
+            _SIX.pack_into(wrenches, i * _SIX.size, *acting)
+            _FOUR.pack_into(control, 0, *thrust)
+            if moving_air:
+                _THREE.pack_into(air_of_model, 0, *breeze)
+            step(model, data)
+            first = row * i
+            states[first + 1 : first + 8], states[first + 8 : first + row] = qpos, qvel
+            if drags:
+                wrench[i] += fluid
+        self._velocity_before = velocity_before
+        start = self._physics[0, :1]
+        trajectory[:, 0] = np.add.accumulate(np.concatenate([start, np.full(steps, self.timestep)]))[1:]
+        return trajectory, wrench
+
+    def _check(self, trajectory: Array) -> None:
+        if not np.abs(trajectory).max() < _PLAUSIBLE:  # as NaN is not
+            plausible = (np.abs(trajectory) < _PLAUSIBLE).all(axis=1)
+            time = self.time + self.timestep * (1 + int(np.argmin(plausible)))
+            raise DivergenceError("the plant diverged: its state is not finite or beyond all plausibility", time=time)
+        counts = self._data.warning.number
+        if counts.any() and (raised := [kind.name for kind in _NUMERICAL_WARNINGS if counts[int(kind)]]):
+            raise DivergenceError(f"the plant diverged: MuJoCo reports {', '.join(raised)}", time=self.time)
+
+
+def _bytes(array: Array) -> memoryview:
+    """The memory of an array."""
+    return array.data.cast("B")
+
+
+def _discard(message: str) -> None:
+    """Receive MuJoCo's warnings, which `Plant._check` reads as counts; else they go to the terminal and a log file."""

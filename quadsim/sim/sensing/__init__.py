@@ -1,0 +1,1 @@
+"""What the vehicle's sensors say of its motion: noise, bias, delay, dropouts, outliers and faults."""

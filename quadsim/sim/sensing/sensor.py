@@ -1,0 +1,180 @@
+"""What a sensor is: what it measures, how often, how well; and what can befall it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Final
+
+from quadsim.errors import ParameterError
+from quadsim.sim.sensing.sphere import Vector
+
+AXES: Final = (0, 1, 2)
+
+
+class SensorName(StrEnum):
+    """What can be measured, three numbers each."""
+
+    POSITION = "position"
+    """x, y, z [m], world."""
+    VELOCITY = "velocity"
+    """vx, vy, vz [m/s], world."""
+    ATTITUDE = "attitude"
+    """Roll, pitch, yaw [rad]; errors are rotation vectors in the body frame, q_measured = q * exp(error)."""
+    RATES = "rates"
+    """p, q, r [rad/s], body: a rate gyro."""
+
+
+def _check(owner: str, name: str, value: float, lower: float, upper: float) -> None:
+    if not (math.isfinite(value) and lower <= value <= upper):
+        at_most = f" and at most {upper:g}" if math.isfinite(upper) else ""
+        rule = f"at least {lower:g}{at_most}, and finite" if math.isfinite(lower) else "a finite number"
+        raise ParameterError(owner, name, value, rule)
+
+
+def _check_vector(owner: str, name: str, vector: Sequence[float], lower: float) -> None:
+    if len(vector) != len(AXES):
+        raise ParameterError(owner, name, vector, "three numbers")
+    for value in vector:
+        _check(owner, name, value, lower, math.inf)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Outliers:
+    """Gross errors: now and then a sample's noise is drawn from a wider distribution instead.
+
+    The contaminated normal distribution (1 - probability) N(0, noise^2) + probability N(0, (size noise)^2).
+    Huber, "Robust estimation of a location parameter", Annals of Mathematical Statistics 35 (1964), Sec. 1.
+
+    Attributes:
+        probability: of a sample being one.
+        size: how many times its standard deviation is that of the others, all axes together.
+    """
+
+    probability: float = 0.0
+    size: float = 1.0
+
+    def __post_init__(self) -> None:
+        _check("outliers", "probability", self.probability, 0.0, 1.0)
+        _check("outliers", "size", self.size, 1.0, math.inf)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sensor:
+    """One sensor, in the unit of its name (see `SensorName`); validated when made.
+
+    A sample taken at t = j / rate is value + bias + walk(t) + noise.  It arrives `delay` later, or never.
+
+    Attributes:
+        name: what is measured.
+        rate: samples per second [Hz], the first at t = 0.
+        noise: standard deviation per axis, white from sample to sample.
+        bias: constant offset per axis.
+        bias_walk: the bias's random walk per axis [unit/sqrt(s)]: its variance grows by bias_walk^2 t.
+        delay: from taking a sample to its arrival [s].
+        dropout: probability of a sample being lost.
+        outliers: gross errors among the noise.
+
+    Raises:
+        ParameterError: a value is not finite or not possible.
+    """
+
+    name: SensorName
+    rate: float
+    noise: Vector = (0.0, 0.0, 0.0)
+    bias: Vector = (0.0, 0.0, 0.0)
+    bias_walk: Vector = (0.0, 0.0, 0.0)
+    delay: float = 0.0
+    dropout: float = 0.0
+    outliers: Outliers = Outliers()
+
+    def __post_init__(self) -> None:
+        owner = f"sensors.{self.name}"
+        _check(owner, "rate", self.rate, 0.0, math.inf)
+        if self.rate == 0.0:
+            raise ParameterError(owner, "rate", self.rate, "positive")
+        _check_vector(owner, "noise", self.noise, 0.0)
+        _check_vector(owner, "bias", self.bias, -math.inf)
+        _check_vector(owner, "bias_walk", self.bias_walk, 0.0)
+        _check(owner, "delay", self.delay, 0.0, math.inf)
+        _check(owner, "dropout", self.dropout, 0.0, 1.0)
+
+    def stride(self, timestep: float) -> int:
+        """Physics steps from one sample to the next.
+
+        Raises:
+            ParameterError: the rate does not divide the physics rate.
+        """
+        return _whole(f"sensors.{self.name}", "rate", self.rate, 1.0 / (self.rate * timestep), _divides(timestep))
+
+    def latency(self, timestep: float) -> int:
+        """Physics steps from taking a sample to its arrival.
+
+        Raises:
+            ParameterError: the delay is not a whole number of physics steps.
+        """
+        rule = f"a whole multiple of the physics step of {timestep} s"
+        return _whole(f"sensors.{self.name}", "delay", self.delay, self.delay / timestep, rule, smallest=0)
+
+
+class FaultKind(StrEnum):
+    """What can befall a sensor for a while."""
+
+    DROPOUT = "dropout"
+    """No samples."""
+    FREEZE = "freeze"
+    """Every sample repeats the last one that got through before."""
+    NAN = "nan"
+    """Samples are not numbers."""
+    BIAS = "bias"
+    """An offset is added."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SensorFault:
+    """A sensor's fault, for all samples taken at start <= t < stop; validated when made.
+
+    Attributes:
+        sensor: which one.
+        kind: what happens.
+        start: [s].
+        stop: [s]; infinite for good.
+        axes: which of the three numbers become NaN.
+        offset: what is added, in the sensor's unit; a rotation vector in the body frame for attitude.
+
+    Raises:
+        ParameterError: a value is not possible.
+    """
+
+    sensor: SensorName
+    kind: FaultKind
+    start: float
+    stop: float = math.inf
+    axes: tuple[int, ...] = AXES
+    offset: Vector = (0.0, 0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        _check("fault", "start", self.start, -math.inf, math.inf)
+        if not self.stop > self.start:
+            raise ParameterError("fault", "stop", self.stop, f"after start = {self.start} s")
+        if not self.axes or not set(self.axes) <= set(AXES):
+            raise ParameterError("fault", "axes", self.axes, "one or more of 0, 1, 2")
+        _check_vector("fault", "offset", self.offset, -math.inf)
+
+    def window(self, timestep: float) -> tuple[int, int | None]:
+        """First physics step that it holds at, and the first that it does not; None where it never ends."""
+        first = math.ceil(self.start / timestep - 1e-6)  # an instant meant to be a step is one, whatever the rounding
+        return first, math.ceil(self.stop / timestep - 1e-6) if math.isfinite(self.stop) else None
+
+
+def _divides(timestep: float) -> str:
+    return f"a divisor of the physics rate of {1.0 / timestep:g} Hz"
+
+
+def _whole(owner: str, name: str, value: float, count: float, rule: str, *, smallest: int = 1) -> int:
+    whole = round(count)
+    if whole < smallest or not math.isclose(whole, count, rel_tol=1e-9, abs_tol=1e-9):
+        raise ParameterError(owner, name, value, rule)
+    return whole

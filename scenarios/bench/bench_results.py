@@ -1,0 +1,277 @@
+"""The measurements of `quadsim bench` as plain values."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from typing import Any, Final
+
+import numpy as np
+
+from quadsim.flight import metrics
+from quadsim.state import Array
+
+FITTED_FROM: Final = 20
+"""N from which on the growth exponent is fitted: below, what every step costs hides what grows."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Target:
+    """Something asked for, beside what was measured.
+
+    Attributes:
+        what: the quantity.
+        asked: the limit, in words.
+        measured: the value, in words.
+        met: whether it is within the limit.
+    """
+
+    what: str
+    asked: str
+    measured: str
+    met: bool
+
+
+@dataclass(frozen=True, kw_only=True)
+class CandidateResult:
+    """A controller that was asked what the flight's controller was asked.
+
+    Attributes:
+        name: what it is called.
+        solver: its name in `mpc.solvers.SOLVERS`.
+        package: the solver's distribution and its version.
+        shortcut: whether it tries less than the whole QP first; see `mpc.exact.shortcut`.
+        repeats: how often each period was timed.
+        step_ms: (K,) whole controller step per period, the median of the repeats [ms].
+        answered: (K,) statuses.
+        raw_max_ms: the longest of all steps of all repeats, the machine's stalls included [ms].
+        statuses: periods by what they were answered.
+        ways: periods by how their optimum was found, or last looked for.
+        failures: periods without an optimum.
+        input_error: largest error of the first input over the periods answered [rad/s]; None without any.
+        kkt: worst KKT residual of what it answered; None without any.
+    """
+
+    name: str
+    solver: str
+    package: str
+    shortcut: bool
+    repeats: int
+    step_ms: Array
+    answered: tuple[str, ...]
+    raw_max_ms: float
+    statuses: Mapping[str, int]
+    ways: Mapping[str, int]
+    failures: int
+    input_error: float | None
+    kkt: float | None
+
+    @property
+    def quantiles(self) -> dict[str, float]:
+        """`p50`, `p95`, `p99`, `max` [ms] over the periods."""
+        return metrics.percentiles(self.step_ms)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Growth:
+    """How a candidate's step grows with the horizon.
+
+    Attributes:
+        name: the candidate.
+        kind: which of its steps, by how their optimum was found; empty for all of them.
+        whole: whether these are steps that solve the whole QP.
+        horizons: N, as far as it went.
+        p50, p99: whole step at each N [ms].
+        failures: periods that the candidate left without their optimum, by the N at which it did.
+        dropped: why it went no further; empty for one that went all the way.
+    """
+
+    name: str
+    horizons: tuple[int, ...]
+    p50: tuple[float, ...]
+    p99: tuple[float, ...]
+    kind: str = ""
+    whole: bool = True
+    failures: Mapping[int, int] = field(default_factory=dict)
+    dropped: str = ""
+
+    @property
+    def label(self) -> str:
+        """The candidate, and which of its steps."""
+        return f"{self.name}, by {self.kind}" if self.kind else self.name
+
+    def exponent(self, quantile: str) -> float | None:
+        """A in time ~ N^a, by least squares over the logarithms for N >= `FITTED_FROM`; None below three horizons."""
+        N = np.array(self.horizons)
+        times = np.array(self.p50 if quantile == "p50" else self.p99)[N >= FITTED_FROM]
+        N = N[N >= FITTED_FROM]
+        return float(np.polyfit(np.log(N), np.log(times), 1)[0]) if N.size >= 3 else None
+
+
+@dataclass(frozen=True, kw_only=True)
+class StageLength:
+    """The QP alone, in one of its forms.
+
+    Attributes:
+        steps: M, steps per stage; None for the condensed form.
+        variables: of the QP.
+        p50, p99: time to update and solve it [ms].
+        default: whether it is the form that is flown.
+    """
+
+    steps: int | None
+    variables: int
+    p50: float
+    p99: float
+    default: bool
+
+
+@dataclass(frozen=True, kw_only=True)
+class SolverBench:
+    """All candidates on one flight's queries, in one run.
+
+    Attributes:
+        scenario: whose flight.
+        horizon: N of that flight.
+        deadline_ms: its control period [ms].
+        asked: periods asked, K.
+        flown: periods of the flight.
+        contenders: the default controller first.
+        gain_ms: (K,) whole step of the gain that the controller would be without its constraints [ms]; None where there
+            is none.
+        left_out: solvers that did not take part, and why.
+        growth: of each candidate; empty where that was not measured.
+        growth_asked: periods asked at each horizon.
+        stages: by what they are forms of, the whole QP or that of one axis.
+        reference_kkt: worst KKT residual of the optimum that first inputs are compared with.
+        versions: of what the numbers depend on.
+        machine: what the times were measured on.
+    """
+
+    scenario: str
+    horizon: int
+    deadline_ms: float
+    asked: int
+    flown: int
+    contenders: tuple[CandidateResult, ...]
+    gain_ms: Array | None
+    left_out: Mapping[str, str]
+    growth: tuple[Growth, ...]
+    growth_asked: int
+    stages: Mapping[str, tuple[StageLength, ...]]
+    reference_kkt: float
+    versions: Mapping[str, str]
+    machine: Mapping[str, Any]
+
+    @property
+    def default(self) -> CandidateResult:
+        """The controller as scenarios fly it."""
+        return self.contenders[0]
+
+    def to_json(self) -> dict[str, Any]:
+        """Everything, as plain values; a number that is none is null."""
+        apart = ("contenders", "gain_ms", "growth", "stages")
+        return {
+            **{name: value for name, value in vars(self).items() if name not in apart},
+            "gain_ms": None if self.gain_ms is None else metrics.percentiles(self.gain_ms),
+            "contenders": [
+                {
+                    **{name: value for name, value in asdict(candidate).items() if name != "answered"},
+                    "step_ms": candidate.quantiles,
+                    "step_ms_by_period": np.round(candidate.step_ms, 5).tolist(),
+                    "p99_to_default": candidate.quantiles["p99"] / self.default.quantiles["p99"],
+                }
+                for candidate in self.contenders
+            ],
+            "growth": [
+                {**asdict(growth), "exponents": {name: growth.exponent(name) for name in ("p50", "p99")}}
+                for growth in self.growth
+            ],
+            "stages": {what: [asdict(stage) for stage in stages] for what, stages in self.stages.items()},
+        }
+
+
+@dataclass(frozen=True, kw_only=True)
+class FlightProfile:
+    """Where the time of a flight goes.
+
+    Attributes:
+        scenario: what was flown.
+        solver: by which solver; empty for a closed form.
+        duration: simulated time of one flight [s].
+        repeats: flights.
+        cores: cores that the process was held to; None where the system does not allow that.
+        wall_s: (repeats,) wall time of the closed loop of each flight, by an untouched plant and controller [s].
+        pieces: seconds of one flight by what they were spent on, the median over the repeats; they add up to the
+            median flight with clocks around its parts.
+        setup_s: building vehicle, plant, reference and controller [s].
+        audit_s: the audit after the flight [s].
+        machine: what the times were measured on.
+    """
+
+    scenario: str
+    solver: str
+    duration: float
+    repeats: int
+    cores: int | None
+    wall_s: tuple[float, ...]
+    pieces: Mapping[str, float]
+    setup_s: float
+    audit_s: float
+    machine: Mapping[str, Any]
+
+    @property
+    def best(self) -> float:
+        """The quickest flight [s]."""
+        return min(self.wall_s)
+
+    @property
+    def median(self) -> float:
+        """The median flight [s]."""
+        return float(np.median(self.wall_s))
+
+    def to_json(self) -> dict[str, Any]:
+        """Everything, as plain values."""
+        return {**asdict(self), "best_s": self.best, "median_s": self.median}
+
+
+@dataclass(frozen=True, kw_only=True)
+class RenderProfile:
+    """What a film costs.
+
+    Attributes:
+        scenario: what was filmed.
+        backend: how it was rendered, `egl` or `osmesa`.
+        width, height: of a frame.
+        fps: frames per second of film.
+        frames: filmed.
+        workers: rendering processes.
+        wall_s: from the run directory to the MP4 file, processes started and joined [s].
+        start_s: of which before the first frame: starting the processes and reading the run [s].
+        machine: what the times were measured on.
+    """
+
+    scenario: str
+    backend: str
+    width: int
+    height: int
+    fps: int
+    frames: int
+    workers: int
+    wall_s: float
+    start_s: float
+    machine: Mapping[str, Any]
+
+    @property
+    def frame_ms(self) -> float:
+        """Wall time per frame, all processes together, once they run [ms]."""
+        return 1e3 * (self.wall_s - self.start_s) / self.frames
+
+    def film_s(self, duration: float) -> float:
+        """Wall time of a film of so many seconds [s], from the two numbers above."""
+        return self.start_s + 1e-3 * self.frame_ms * math.ceil(duration * self.fps)
+
+    def to_json(self) -> dict[str, Any]:
+        """Everything, as plain values."""
+        return {**asdict(self), "frame_ms": self.frame_ms, "film_of_60_s": self.film_s(60.0)}

@@ -1,0 +1,217 @@
+"""The measurements of `quadsim bench` -> tables."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+
+from quadsim.report.table import ABSENT, Cell, Grid, Mark
+from scenarios.bench.bench_results import (
+    FITTED_FROM,
+    CandidateResult,
+    FlightProfile,
+    Growth,
+    RenderProfile,
+    SolverBench,
+    StageLength,
+    Target,
+)
+from scenarios.bench.targets import flight_targets, render_targets, solver_targets
+
+
+def solver_tables(bench: SolverBench) -> list[Grid]:
+    """Candidates, the growth of their steps, the length of a stage, and what was asked."""
+    return [
+        _candidates(bench),
+        *([_growth(bench)] if bench.growth else []),
+        *(_stages(what, stages) for what, stages in bench.stages.items()),
+        targets_table("Asked of the solvers, and measured", solver_targets(bench)),
+    ]
+
+
+def flight_tables(profile: FlightProfile) -> list[Grid]:
+    """Where the time of a flight goes, and what was asked."""
+    whole = sum(profile.pieces.values())
+    pieces = [(name, seconds) for name, seconds in profile.pieces.items()]
+    lines = [line(name, f"{seconds:.3f}", f"{100 * seconds / whole:.0f} %") for name, seconds in pieces]
+    lines.append(line("the flight, with clocks in it", f"{whole:.3f}", "100 %"))
+    lines.append(line(f"the flight, best of {profile.repeats}", f"{profile.best:.3f}", ABSENT))
+    lines.append(line("the flight, median", f"{profile.median:.3f}", ABSENT))
+    lines.append(line("set-up before it", f"{profile.setup_s:.3f}", ABSENT))
+    lines.append(line("audit after it", f"{profile.audit_s:.3f}", ABSENT))
+    place = "on one core" if profile.cores == 1 else "on whatever cores the system gives"
+    grid = Grid(
+        key="flight",
+        title="Where the time of a flight goes",
+        head=(f"{profile.duration:g} s of {profile.scenario}", "time [s]", "share"),
+        lines=tuple(lines),
+        note=f"Solver: {profile.solver or 'none, a gain'}; {place}; pieces are medians over {profile.repeats} flights.",
+    )
+    return [grid, targets_table("Asked of a flight, and measured", flight_targets(profile))]
+
+
+def render_tables(profile: RenderProfile) -> list[Grid]:
+    """What a film costs, and what was asked."""
+    grid = Grid(
+        key="render",
+        title="What a film costs",
+        head=(f"{profile.width}x{profile.height} at {profile.fps} fps, through {profile.backend.upper()}", ""),
+        lines=(
+            line("frames filmed", str(profile.frames)),
+            line("rendering processes", str(profile.workers)),
+            line("wall time per frame, all processes together [ms]", f"{profile.frame_ms:.1f}"),
+            line("wall time before the first frame [s]", f"{profile.start_s:.2f}"),
+            line("60 s of film [s]", f"{profile.film_s(60.0):.1f}"),
+        ),
+    )
+    return [grid, targets_table("Asked of a film, and measured", render_targets(profile))]
+
+
+def _candidates(bench: SolverBench) -> Grid:
+    head = (
+        "whole step [ms]",
+        "p50",
+        "p95",
+        "p99",
+        "max",
+        "raw max",
+        "p99 ratio",
+        "failures",
+        "u0 error",
+        "KKT",
+        "timed",
+    )
+    fastest = {
+        quantile: min(candidate.quantiles[quantile] for candidate in bench.contenders)
+        for quantile in ("p50", "p95", "p99", "max")
+    }
+    return Grid(
+        key="contenders",
+        title="The contenders",
+        head=head,
+        lines=tuple(_candidate(candidate, bench, fastest) for candidate in bench.contenders),
+        note=_how(bench),
+    )
+
+
+def _candidate(candidate: CandidateResult, bench: SolverBench, fastest: dict[str, float]) -> tuple[Cell, ...]:
+    quantiles = candidate.quantiles
+    label = f"{candidate.name} (default)" if candidate is bench.default else candidate.name
+    return (
+        Cell(text=label),
+        *(
+            Cell(text=_milliseconds(value), mark=Mark.BEST if value == fastest[name] else Mark.NONE)
+            for name, value in quantiles.items()
+        ),
+        Cell(text=_milliseconds(candidate.raw_max_ms)),
+        Cell(text=f"{quantiles['p99'] / bench.default.quantiles['p99']:.3g}"),
+        Cell(text=str(candidate.failures), mark=Mark.BAD if candidate.failures else Mark.NONE),
+        Cell(text=_residual(candidate.input_error)),
+        Cell(text=_residual(candidate.kkt)),
+        Cell(text=f"{candidate.repeats}x"),
+    )
+
+
+def _how(bench: SolverBench) -> str:
+    which = "All" if bench.asked == bench.flown else f"{bench.asked} of the"
+    said = (
+        f"{which} {bench.flown} control periods of `{bench.scenario}`, N = {bench.horizon}, timed as a flight "
+        "sees them: between two steps the plant flies a period, and each is the median of its repeats; raw max is the "
+        "longest of all steps, the machine's stalls included. One process, one thread; "
+        "contenders take their turns in random order. Failures are periods without an optimum. Over the others, u0 "
+        "error [rad/s] is the largest of the first input, from an optimum in closed form whose own KKT residual is at "
+        f"most {bench.reference_kkt:.0e}, and KKT the worst residual of the contender's answer to its own QP. "
+        f"{_shares(bench.default)}"
+    ).rstrip()
+    return " ".join([said, *(f"Left out: {name}, {why}." for name, why in bench.left_out.items())])
+
+
+def _shares(candidate: CandidateResult) -> str:
+    """Which of its periods a candidate with shortcuts answered how."""
+    told = ", ".join(f"by {way} {count}" for way, count in sorted(candidate.ways.items(), key=lambda pair: -pair[1]))
+    return f"Periods that the default answered {told}. " if candidate.shortcut else ""
+
+
+def _growth(bench: SolverBench) -> Grid:
+    horizons = sorted({N for growth in bench.growth for N in growth.horizons})
+    head = ("p50 / p99 of the whole step [ms]", *(f"N = {N}" for N in horizons), "growth")
+    dropped = dict.fromkeys(f"{growth.name}: {growth.dropped}" for growth in bench.growth if growth.dropped)
+    failed = dict.fromkeys(
+        f"{growth.name}: " + ", ".join(f"{count} at N = {N}" for N, count in growth.failures.items())
+        for growth in bench.growth
+        if growth.failures
+    )
+    note = (
+        f"{bench.growth_asked} control periods at each N, the problem and its reference made anew; at N = "
+        f"{bench.horizon} those of the contenders' table; growth: the exponents of N that fit p50 and p99 from N = "
+        f"{FITTED_FROM} on."
+    )
+    return Grid(
+        key="growth",
+        title="Growth with the horizon",
+        head=head,
+        lines=tuple(_growth_line(growth, horizons) for growth in bench.growth),
+        note=" ".join([note, *_listed("Periods without an optimum", failed), *_listed("Dropped", dropped)]),
+    )
+
+
+def _listed(what: str, entries: Iterable[str]) -> list[str]:
+    told = "; ".join(entries)
+    return [f"{what}: {told}."] if told else []
+
+
+def _growth_line(growth: Growth, horizons: Sequence[int]) -> tuple[Cell, ...]:
+    times = dict(zip(growth.horizons, zip(growth.p50, growth.p99, strict=True), strict=True))
+    pairs = [" / ".join(map(_milliseconds, times[N])) if N in times else ABSENT for N in horizons]
+    exponents = [growth.exponent(name) for name in ("p50", "p99")]
+    fitted = [f"{exponent:.2f}" for exponent in exponents if exponent is not None]
+    return line(growth.label, *pairs, " / ".join(fitted) or ABSENT)
+
+
+def _stages(what: str, stages: Sequence[StageLength]) -> Grid:
+    default = next(stage for stage in stages if stage.default)
+    lines = []
+    for stage in stages:
+        name = "condensed, dense" if stage.steps is None else str(stage.steps)
+        mark = Mark.BEST if stage is default else Mark.NONE
+        label = f"{name} (default)" if stage is default else name
+        cells = line(str(stage.variables), f"{stage.p50:.3g}", f"{stage.p99:.3g}", f"{stage.p50 / default.p50:.2f}")
+        lines.append((Cell(text=label, mark=mark), *cells))
+    return Grid(
+        key=f"stages-{what.replace(' ', '-')}",
+        title=f"How many steps make a stage: the {what}",
+        head=("steps per stage", "variables", "p50 [ms]", "p99 [ms]", "p50, as a ratio to the default"),
+        lines=tuple(lines),
+        note="PIQP alone, timed in the same way, on the periods whose QP has active constraints. Its multistage "
+        "factorisation costs less the fewer stages there are, and more the larger each is; the paper's own form is the "
+        "condensed one.",
+    )
+
+
+def targets_table(title: str, targets: Sequence[Target]) -> Grid:
+    """What was asked, what was measured, and whether it is met."""
+    return Grid(
+        key="targets",
+        title=title,
+        head=("quantity", "asked", "measured", "verdict"),
+        lines=tuple(
+            (
+                *line(target.what, target.asked, target.measured),
+                Cell(text="met" if target.met else "missed", mark=Mark.GOOD if target.met else Mark.BAD),
+            )
+            for target in targets
+        ),
+    )
+
+
+def line(*texts: str) -> tuple[Cell, ...]:
+    """Texts as the cells of a row."""
+    return tuple(Cell(text=text) for text in texts)
+
+
+def _milliseconds(value: float) -> str:
+    """Three digits: a step takes from 20 microseconds to a second."""
+    return f"{value:.3g}" if value < 100.0 else f"{value:.0f}"
+
+
+def _residual(value: float | None) -> str:
+    return ABSENT if value is None else f"{value:.0e}"

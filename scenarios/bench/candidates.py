@@ -1,0 +1,192 @@
+"""The controllers that take part in `quadsim bench solvers`, and what they answered."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from mpc.constrained import ConstrainedMPC
+from mpc.exact.polish import polish
+from mpc.exact.shortcut import with_shortcut
+from mpc.ocp import Problem, Rest
+from mpc.paper.condensed import condensed
+from mpc.qp import Formulation, kkt_residuals
+from mpc.solvers import SOLVERS, Answer, QPSolver, Solver, make_backend
+from quadsim.controller import ACCEPTED, Command
+from quadsim.state import Array
+from scenarios.bench.queries import QueriedController, Queries
+
+WITH_SHORTCUT: Final = ("daqp",)
+"""Solvers that are shown both with and without shortcuts, besides the default."""
+REFERENCE_SOLVER: Final = "piqp-dense"
+"""Where the search for the optimum in closed form starts."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Entry:
+    """One candidate: a solver, with or without the shortcuts of `mpc.exact.shortcut`."""
+
+    solver: str
+    shortcut: bool
+
+    @property
+    def name(self) -> str:
+        """What it is called."""
+        return f"{self.solver} + shortcut" if self.shortcut else self.solver
+
+
+def entries(default: Entry, solvers: Sequence[str]) -> list[Entry]:
+    """The default first, then each installed solver alone, then those that are shown with shortcuts as well."""
+    installed = [name for name in solvers if SOLVERS[name].installed]
+    alone = [Entry(solver=name, shortcut=False) for name in installed]
+    both = [Entry(solver=name, shortcut=True) for name in installed if name in WITH_SHORTCUT]
+    return [default, *(entry for entry in (*alone, *both) if entry != default)]
+
+
+class _Witnessed:
+    """A solver whose last answer can be looked at."""
+
+    def __init__(self, solver: Solver) -> None:
+        self._solver = solver
+        self.last: Answer | None = None
+
+    @property
+    def name(self) -> str:
+        """See `mpc.solvers.Solver.name`."""
+        return self._solver.name
+
+    @property
+    def formulation(self) -> Formulation:
+        """See `mpc.solvers.Solver.formulation`."""
+        return self._solver.formulation
+
+    def reset(self) -> None:
+        """See `mpc.solvers.Solver.reset`."""
+        self._solver.reset()
+
+    def solve(self, state: Array, desired: Array, u_before: Array, rest: Rest | None = None) -> Answer:
+        """See `mpc.solvers.Solver.solve`."""
+        self.last = self._solver.solve(state, desired, u_before, rest)
+        return self.last
+
+
+class StepCandidate:
+    """A constrained controller that is asked a flight's queries, and whose solver's answers are kept."""
+
+    def __init__(self, entry: Entry, problem: Problem, queries: Queries) -> None:
+        self.entry, self.problem = entry, problem
+        whole = QPSolver(entry.solver, problem)
+        self._solver = _Witnessed(with_shortcut(problem, whole) if entry.shortcut else whole)
+        self.formulation = self._solver.formulation
+        self._asked = QueriedController(ConstrainedMPC(problem, self._solver, shortcut=False), queries)
+        self.answers: dict[int, tuple[Command | None, Answer]] = {}
+        """What was answered in the first pass, by period: the command, if any, and the solver's answer."""
+        self._period: int | None = None
+
+    def prepare(self, period: int) -> None:
+        """See `scenarios.bench.timing.Candidate.prepare`; keeps what was answered last."""
+        self.keep()
+        self._period, self._solver.last = period, None
+        self._asked.prepare(period)
+
+    def answer(self) -> None:
+        """See `scenarios.bench.timing.Candidate.answer`."""
+        self._asked.answer()
+
+    def keep(self) -> None:
+        """Keep the last answer, if it is the first to its question."""
+        if self._period is not None and self._solver.last is not None:
+            self.answers.setdefault(self._period, (self._asked.command, self._solver.last))
+
+    def ways(self, periods: Sequence[int]) -> np.ndarray[tuple[int], np.dtype[np.object_]]:
+        """The `mpc.solvers.Way` in which each period was answered."""
+        self.keep()
+        return np.array([self.answers[period][1].way for period in periods], dtype=object)
+
+    def statuses(self, periods: Sequence[int]) -> tuple[str, ...]:
+        """What each period was answered."""
+        self.keep()
+        return tuple(self._asked.statuses[period] for period in periods)
+
+    def failures(self, periods: Sequence[int]) -> int:
+        """How many periods were left without their optimum."""
+        self.keep()
+        commands = [self.answers[period][0] for period in periods]
+        return sum(command is None or command.status not in ACCEPTED for command in commands)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Reference:
+    """The optimum of each period's QP, in closed form.
+
+    Attributes:
+        inputs: first input u(k) (4,) by period [rad/s].
+        kkt: worst KKT residual of them all.
+    """
+
+    inputs: Mapping[int, Array]
+    kkt: float
+
+
+def reference_optima(problem: Problem, queries: Queries, periods: Sequence[int]) -> Reference:
+    """Solve the periods' QPs in closed form; see `mpc.exact.polish`."""
+    formulation, backend = condensed(problem), make_backend(REFERENCE_SOLVER)
+    backend.setup(formulation.qp)
+    inputs, worst = {}, 0.0
+    for period in periods:
+        vectors = formulation.vectors(*_query(problem, queries, period))
+        qp = formulation.qp.with_vectors(vectors)
+        optimum = polish(qp, backend.solve(vectors))
+        worst = float(np.maximum(worst, kkt_residuals(qp, optimum).worst))  # NaN stays NaN
+        inputs[period] = formulation.inputs(optimum.x)[0]
+    return Reference(inputs=inputs, kkt=worst)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Verdict:
+    """What an entrant's answers were worth; see `scenarios.bench.bench_results.CandidateResult`."""
+
+    statuses: dict[str, int]
+    ways: dict[str, int]
+    failures: int
+    input_error: float | None
+    kkt: float | None
+
+
+def judge(candidate: StepCandidate, queries: Queries, periods: Sequence[int], reference: Reference) -> Verdict:
+    """Hold the answers of an entrant's first pass against the optimum, and against the KKT conditions of its own QP."""
+    candidate.keep()
+    problem, form = candidate.problem, candidate.formulation
+    statuses: Counter[str] = Counter()
+    errors, residuals = [], []
+    for period in periods:
+        command, answer = candidate.answers[period]
+        if command is None or command.status not in ACCEPTED:
+            statuses[_failure(answer)] += 1
+            continue
+        statuses[command.status] += 1
+        errors.append(np.abs(command.speeds - reference.inputs[period]).max())
+        qp = form.qp.with_vectors(form.vectors(*_query(problem, queries, period)))
+        residuals.append(kkt_residuals(qp, answer.solution).worst)
+    return Verdict(
+        statuses=dict(sorted(statuses.items())),
+        ways=dict(Counter(map(str, candidate.ways(periods)))),
+        failures=len(periods) - len(errors),
+        input_error=float(np.max(errors)) if errors else None,
+        kkt=float(np.max(residuals)) if residuals else None,
+    )
+
+
+def _query(problem: Problem, queries: Queries, period: int) -> tuple[Array, Array, Array]:
+    """xi(k), y_d and u(k-1)."""
+    reference = queries.reference[period + 1 : period + 1 + problem.horizon]
+    return queries.state[period], problem.objective.desired(reference), queries.speeds_before[period]
+
+
+def _failure(answer: Answer) -> str:
+    """Why there was no command; a point that is called solved is rejected where it breaks the hard input bounds."""
+    return "rejected" if answer.solution.status in ACCEPTED else answer.solution.status

@@ -1,0 +1,73 @@
+"""`quadsim bench render`: what a film costs."""
+
+from __future__ import annotations
+
+import math
+import tempfile
+import time as clock
+from pathlib import Path
+from typing import Final
+
+from quadsim.errors import ParameterError
+from quadsim.report.film.video import render_video, rendering_backend, worker_count
+from scenarios.bench.bench_results import RenderProfile
+from scenarios.machine import machine
+from scenarios.progress import Progress, silent
+from scenarios.run import Outputs, run_scenario
+from scenarios.schema.scenario import Scenario
+
+SECONDS: Final = 4.0
+"""Of film; the processes' start is told apart, so that a longer film follows from a short one."""
+WIDTH, HEIGHT, FPS = 1280, 720, 30
+
+
+def bench_render(
+    scenario: Scenario, *, seconds: float = SECONDS, workers: int | None = None, progress: Progress = silent
+) -> RenderProfile:
+    """Fly the first seconds of a scenario and film them.
+
+    Args:
+        scenario: what to film.
+        seconds: of flight and film, at most the scenario's own.
+        workers: rendering processes, at most; one per usable core by default.
+        progress: told how far it is.
+
+    Raises:
+        ParameterError: an argument is out of range.
+        RenderingUnavailableError: this machine cannot render.
+    """
+    if workers is not None and workers < 1:
+        raise ParameterError("", "--workers", workers, "at least 1")
+    period = scenario.control_period
+    if not period <= seconds < math.inf:
+        raise ParameterError("", "--seconds", seconds, f"finite, and at least one control period, {period} s")
+    backend = rendering_backend()
+    periods = min(scenario.periods, round(seconds / period))
+    short = scenario.model_copy(update={"duration": round(periods * period, 9)})
+    with tempfile.TemporaryDirectory() as scratch:
+        run = Path(scratch) / "run"
+        run_scenario(short, run, Outputs(video=False, recording=False, figures=False), progress)
+        first: list[float] = []
+        frames = 0
+
+        def report(done: int, total: int) -> None:
+            nonlocal frames
+            first.append(clock.perf_counter())
+            frames = total
+            progress("frames", done, total)
+
+        started = clock.perf_counter()
+        render_video(run, run / "film.mp4", workers=workers, width=WIDTH, height=HEIGHT, fps=FPS, progress=report)
+        wall_s = clock.perf_counter() - started
+    return RenderProfile(
+        scenario=scenario.name,
+        backend=backend,
+        width=WIDTH,
+        height=HEIGHT,
+        fps=FPS,
+        frames=frames,
+        workers=worker_count(frames, workers),
+        wall_s=wall_s,
+        start_s=first[0] - started,
+        machine=machine(),
+    )

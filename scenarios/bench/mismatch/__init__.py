@@ -1,0 +1,1 @@
+"""The model-mismatch benchmark, `quadsim bench ladder`: what each controller survives, condition by condition."""

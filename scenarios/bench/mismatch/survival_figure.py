@@ -1,0 +1,134 @@
+"""The mismatch ladder -> its figure: a coloured cell per controller and condition, red where the vehicle is lost."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+from quadsim.report.figures.canvas import new_figure, write_drawings
+from quadsim.report.palette import BOUND
+from scenarios.bench.mismatch.survival import ARRIVED, FAR, MismatchBench, MismatchFlight
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+_SHADES: Final = ("#bfe3d3", "#f6edb5", "#f0b968")
+"""Good, fair, poor; what is lost is drawn as bounds are."""
+_TILTED: Final = 0.5
+"""How far beyond its bound [deg] a tilt is still fair."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Panel:
+    """A number of each flight, and up to where it is good, and fair."""
+
+    title: str
+    value: Callable[[MismatchFlight], float | None]
+    good: float
+    fair: float
+    digits: int
+    unit: str
+
+
+def write_mismatch_figure(measured: MismatchBench, directory: Path) -> list[Path]:
+    """Draw what became of every controller in every condition.
+
+    Args:
+        measured: what was flown.
+        directory: where `ladder.png` and `ladder.svg` go; made when it is not there.
+
+    Returns:
+        The two files.
+
+    Raises:
+        OutputError: the directory cannot be written.
+    """
+    return write_drawings({"ladder": lambda: _draw(measured)}, directory)
+
+
+def _draw(measured: MismatchBench) -> Figure:
+    bound = measured.tilt_bound
+    panels = (
+        _Panel(
+            title="distance from the reference at the end [m]",
+            value=lambda flight: flight.end_error,
+            good=ARRIVED,
+            fair=FAR,
+            digits=2,
+            unit="m",
+        ),
+        _Panel(
+            title=f"peak tilt between samples too [deg]; the bound is {bound:g} deg",
+            value=lambda flight: flight.peak_tilt,
+            good=bound,
+            fair=bound + _TILTED,
+            digits=2,
+            unit="deg",
+        ),
+    )
+    width = 2.6 + 0.62 * len(measured.conditions)
+    height = 1.9 + 2 * 0.27 * len(measured.controllers)
+    figure = new_figure(f"{measured.scenario}: what each controller survives", max(width, 9.0), max(height, 3.4))
+    for axes, panel in zip(figure.subplots(len(panels), 1, sharex=True), panels, strict=True):
+        _draw_panel(axes, measured, panel)
+    return figure
+
+
+def _draw_panel(axes: Axes, measured: MismatchBench, panel: _Panel) -> None:
+    from matplotlib.patches import Rectangle
+
+    for row, controller in enumerate(measured.controllers):
+        for column, condition in enumerate(measured.conditions):
+            flight = measured.flights[controller, condition]
+            colour, text = _look(flight, panel)
+            axes.add_patch(Rectangle((column, row), 1.0, 1.0, facecolor=colour, edgecolor="white", linewidth=1.2))
+            axes.text(
+                column + 0.5,
+                row + 0.5,
+                text,
+                ha="center",
+                va="center",
+                fontsize=7.5,
+                color="#1c1e21" if flight.survived else "white",
+            )
+    axes.set_xlim(0.0, len(measured.conditions))
+    axes.set_ylim(len(measured.controllers), 0.0)
+    places = [column + 0.5 for column in range(len(measured.conditions))]
+    axes.set_xticks(places, [_broken(name) for name in measured.conditions], fontsize=7.5)
+    axes.set_yticks([row + 0.5 for row in range(len(measured.controllers))], [*measured.controllers], fontsize=8.5)
+    axes.tick_params(length=0.0)
+    axes.grid(visible=False)
+    axes.spines[:].set_visible(False)
+    axes.set_title(panel.title, loc="left", fontsize=9.5)
+    labels = (
+        f"up to {panel.good:g} {panel.unit}",
+        f"up to {panel.fair:g} {panel.unit}",
+        "more",
+        "lost",
+    )
+    keys = [Rectangle((0.0, 0.0), 1.0, 1.0, facecolor=colour) for colour in (*_SHADES, BOUND)]
+    axes.legend(keys, labels, loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=4, fontsize=8.0, handlelength=1.0)
+
+
+def _look(flight: MismatchFlight, panel: _Panel) -> tuple[str, str]:
+    """A cell's colour, and what stands in it."""
+    value = panel.value(flight)
+    if not flight.survived or value is None:
+        return BOUND, flight.fate.replace("lost, ", "")
+    shade = _SHADES[0] if value <= panel.good else _SHADES[1] if value <= panel.fair else _SHADES[2]
+    return shade, f"{value:.{panel.digits}f}"
+
+
+def _broken(name: str) -> str:
+    """A condition's name over as many lines as it has words, a number staying beside its unit."""
+    words = name.split(" ")
+    lines: list[str] = []
+    for word in words:
+        if lines and (lines[-1][-1].isdigit() or len(lines[-1]) + len(word) < 7):
+            lines[-1] += f" {word}"
+        else:
+            lines.append(word)
+    return "\n".join(lines)

@@ -1,0 +1,89 @@
+"""What a controller was asked in a flight, to ask another one the same and time it."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from quadsim.controller import Command, Controller, Moment
+from quadsim.errors import FlightError
+from quadsim.flight.log import ControlLog
+from quadsim.state import Array, make_state
+from quadsim.vehicle import Vehicle
+from scenarios.build import build_plant
+from scenarios.courses.make import build_reference
+from scenarios.schema.scenario import Scenario
+
+
+@dataclass(frozen=True, kw_only=True)
+class Queries:
+    """The queries of K control periods.
+
+    Attributes:
+        t: (K,) [s].
+        state: (K, 12) measured.
+        reference: (K + N, 4) filtered x, y, z [m], yaw [rad], row k at t_k.
+        speeds_before: (K, 4) u(k-1) [rad/s].
+    """
+
+    t: Array
+    state: Array
+    reference: Array
+    speeds_before: Array
+
+
+def recorded(scenario: Scenario, log: ControlLog, horizon: int) -> Queries:
+    """The queries of a flown scenario, with a reference for N = `horizon`."""
+    return Queries(
+        t=log.t,
+        state=log.state,
+        reference=build_reference(scenario, log.t.size + horizon),
+        speeds_before=np.vstack([log.speeds_before, log.speeds[:-1]]),
+    )
+
+
+class QueriedController:
+    """A controller that is asked a flight's queries, each after the command that was given before it in that flight.
+
+    Attributes:
+        command: its last answer; None where there was none.
+        statuses: what it answered first, by period: its status, or `failed` where it gave no command.
+    """
+
+    def __init__(self, controller: Controller, queries: Queries) -> None:
+        self._controller, self._queries = controller, queries
+        self.command: Command | None = None
+        self.statuses: dict[int, str] = {}
+
+    def prepare(self, period: int) -> None:
+        """See `scenarios.bench.timing.Candidate.prepare`."""
+        queries = self._queries
+        self._controller.reset(queries.speeds_before[period])
+        reference = queries.reference[period + 1 : period + 1 + self._controller.horizon]
+        self._query = (Moment(time=float(queries.t[period])), queries.state[period], reference)
+        self._period, self.command = period, None
+
+    def answer(self) -> None:
+        """See `scenarios.bench.timing.Candidate.answer`."""
+        try:
+            self.command = self._controller.step(*self._query)
+        except FlightError:  # there is no earlier plan to hold: the solver failed
+            self.command = None
+        self.statuses.setdefault(self._period, "failed" if self.command is None else self.command.status)
+
+
+@contextlib.contextmanager
+def flight_between(scenario: Scenario, vehicle: Vehicle) -> Iterator[Callable[[], None]]:
+    """What a flight does between two control steps: it flies a period and measures, which empties caches."""
+    with build_plant(scenario, vehicle) as plant:
+        hover = make_state(position=(0.0, 0.0, 10.0))
+
+        def fly() -> None:
+            plant.reset(hover)
+            plant.advance(plant.hover_speeds, scenario.steps_per_period)
+            plant.state()
+
+        yield fly

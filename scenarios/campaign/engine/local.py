@@ -1,0 +1,270 @@
+"""Processes on this machine, started in milliseconds by a server that has the libraries loaded; replaced if killed.
+
+Each is a supervisor with a worker of its own, see `scenarios.campaign.engine.supervisor`.  Once started it needs the
+server no more.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import multiprocessing
+import os
+import pickle
+import signal
+import sys
+import time as clock
+import warnings
+from collections import Counter, deque
+from collections.abc import Generator, Iterator, Sequence
+from dataclasses import dataclass, field
+from multiprocessing import connection, resource_tracker
+from multiprocessing.connection import Connection
+from multiprocessing.context import ForkServerProcess
+from pathlib import Path
+from types import ModuleType
+from typing import Final
+
+from quadsim.errors import ParameterError
+from scenarios.campaign.engine.processes import end_session, is_stopped
+from scenarios.campaign.engine.protocol import MOST_DEATHS, ONE_THREAD, Answer, EngineError, Pace, Pilot, fair_share
+from scenarios.campaign.engine.supervisor import Fell, Ready, Unfit, serve
+from scenarios.campaign.results.table import Row
+from scenarios.machine import usable_cores
+
+_AHEAD_S: Final = 1.0
+"""Work [s] that a worker has in hand before it gets more: the parent may be writing files meanwhile."""
+_SETTLED: Final = "scenarios.campaign.preload"
+"""To be loaded by the server that forks the workers, and by no other process."""
+_MOST_STARTS: Final = 5
+_SILENCE_S: Final = 1.0
+"""After which supervisors are looked at: one that was stopped would keep silent for ever [s]."""
+_LEAVING_S: Final = 8.0
+"""For a supervisor to end everybody whom it keeps [s]."""
+_UNKNOWN: Final = 255
+"""The exit code of a process whose server died, which would have told."""
+
+
+class LocalEngine:
+    """Processes on this machine.
+
+    Args:
+        workers: how many; one per usable core by default.
+
+    Raises:
+        ParameterError: fewer than one.
+    """
+
+    name = "local"
+
+    def __init__(self, workers: int | None = None) -> None:
+        if workers is not None and workers < 1:
+            raise ParameterError("", "workers", workers, "1 or more")
+        self._workers = workers or usable_cores()
+
+    @property
+    def workers(self) -> int:
+        """See `Engine`."""
+        return self._workers
+
+    def answers(self, pilot: Pilot, flights: Sequence[int]) -> Generator[Row]:
+        """See `Engine.answers`."""
+        crew = _Crew(pilot, flights, min(self._workers, len(flights)))
+        try:
+            yield from crew.answers()
+        finally:
+            crew.dismiss()
+
+
+@dataclass(eq=False)
+class _Supervisor:
+    """A process, and what it has been handed and not answered; the first of it is being flown.
+
+    One whose server died is orphaned: it flies what it has, and is replaced.
+    """
+
+    process: ForkServerProcess
+    pipe: Connection
+    pid: int
+    ready: bool = False
+    orphaned: bool = False
+    flights: deque[int] = field(default_factory=deque)
+
+    def dismiss(self) -> None:
+        """Ask it to leave with everybody whom it keeps."""
+        with contextlib.suppress(OSError):
+            self.pipe.send(None)
+
+    def ending(self) -> str:
+        """How it ended, after a while by force; frees what it held."""
+        until = clock.monotonic() + _LEAVING_S
+        with contextlib.suppress(EOFError, OSError):  # which says that it is gone, also after its server's death
+            while self.pipe.poll(max(until - clock.monotonic(), 0.0)):
+                self.pipe.recv_bytes()
+            self.process.kill()
+        self.pipe.close()
+        self.process.join(timeout=_LEAVING_S)
+        code = self.process.exitcode
+        if code is not None:
+            self.process.close()
+        if code is None or code == _UNKNOWN:
+            return "for an unknown reason"
+        return f"by signal {-code}" if code < 0 else f"with exit status {code}"
+
+
+class _Crew:
+    """The processes of one campaign, and the flights that are not answered yet."""
+
+    def __init__(self, pilot: Pilot, flights: Sequence[int], size: int) -> None:
+        self._pilot, self._size = pilot, size
+        self._pickled = pickle.dumps(pilot)
+        self._waiting, self._unanswered = deque(flights), len(flights)
+        self._keepers: list[_Supervisor] = []
+        self._deaths: Counter[int] = Counter()
+        self._failed_starts = 0
+        self._pace = Pace()
+        self._context = multiprocessing.get_context("forkserver")
+        self._context.set_forkserver_preload([__name__, type(pilot).__module__, _SETTLED])
+
+    def answers(self) -> Generator[Row]:
+        self._employ()
+        while self._unanswered:
+            rows = self._hear()
+            self._unanswered -= len(rows)
+            self._employ()  # before the caller gets to use what is answered, which may take a while
+            yield from rows
+
+    def dismiss(self) -> None:
+        """Stop everybody at once."""
+        for supervisor in self._keepers:
+            supervisor.dismiss()
+        for supervisor in self._keepers:
+            supervisor.ending()
+        self._keepers.clear()
+
+    def _employ(self) -> None:
+        """See that there are as many workers as can be used, and that all have work."""
+        for supervisor in [each for each in self._keepers if each.orphaned and not each.flights]:
+            self._keepers.remove(supervisor)
+            supervisor.dismiss()
+            supervisor.ending()
+        while len(self._keepers) < min(self._size, self._unanswered):
+            self._hire()
+        for supervisor in self._keepers:
+            self._feed(supervisor)
+
+    def _hire(self) -> None:
+        for start in range(_MOST_STARTS):
+            ours, theirs = self._context.Pipe()
+            process = self._context.Process(target=serve, args=(theirs, str(Path.cwd())), daemon=True)
+            try:
+                with _undisturbed():
+                    process.start()
+                    self._keepers.append(_Supervisor(process, ours, process.pid or 0))
+            except (OSError, EOFError) as error:  # the server was killed just now; the next start makes a new one
+                ours.close()
+                problem = error
+                clock.sleep(0.1 * start)
+                continue
+            finally:
+                theirs.close()
+            with contextlib.suppress(OSError):  # it is dead already, which its pipe will tell
+                ours.send_bytes(self._pickled)
+            return
+        raise EngineError(f"no supervisor process can be started here ({type(problem).__name__}: {problem})")
+
+    def _hear(self) -> list[Row]:
+        """Wait until somebody says something or dies; everything that is said then."""
+        pipes = [supervisor.pipe for supervisor in self._keepers]
+        sentinels = [supervisor.process.sentinel for supervisor in self._keepers if not supervisor.orphaned]
+        heard = connection.wait([*pipes, *sentinels], timeout=_SILENCE_S)
+        rows: list[Row] = []
+        if not heard:
+            for supervisor in [each for each in self._keepers if is_stopped(each.pid)]:
+                rows += self._bury(supervisor)
+        for supervisor in list(self._keepers):
+            supervisor.orphaned |= supervisor.process.sentinel in heard
+            if supervisor.pipe in heard:
+                rows += self._listen(supervisor)
+        return rows
+
+    def _listen(self, supervisor: _Supervisor) -> list[Row]:
+        rows: list[Row] = []
+        try:
+            while supervisor.pipe.poll():
+                match supervisor.pipe.recv():
+                    case Answer() as answer if supervisor.flights and answer.row["flight"] == supervisor.flights[0]:
+                        supervisor.flights.popleft()
+                        self._pace.note(answer)
+                        rows.append(answer.row)
+                    case Fell(ending) if supervisor.flights:
+                        rows += self._again_or_lost(supervisor.flights.popleft(), ending)
+                    case Unfit(reason):
+                        raise EngineError(f"a worker process cannot fly here: {reason}")
+                    case Ready():
+                        supervisor.ready, self._failed_starts = True, 0
+                    case _:  # what nobody asked for
+                        return rows + self._bury(supervisor)
+        except (EOFError, OSError):
+            return rows + self._bury(supervisor)
+        return rows
+
+    def _feed(self, supervisor: _Supervisor) -> None:
+        """Hand out more, unless the supervisor has enough or there is nothing left."""
+        waiting = len(self._waiting)
+        enough = min(self._pace.flights_in(_AHEAD_S), fair_share(waiting, self._size))
+        if supervisor.orphaned or not supervisor.ready or not waiting or len(supervisor.flights) > enough:
+            return
+        chunk = [self._waiting.popleft() for _ in range(min(waiting, self._pace.chunk(waiting, self._size)))]
+        supervisor.flights.extend(chunk)
+        with contextlib.suppress(OSError):  # as in `_hire`
+            supervisor.pipe.send(chunk)
+
+    def _bury(self, supervisor: _Supervisor) -> list[Row]:
+        """Take a dead supervisor's flights back; it may be the first of them that it died of."""
+        self._keepers.remove(supervisor)
+        supervisor.process.kill()
+        ending = supervisor.ending()
+        end_session(supervisor.pid)  # it had no time for that
+        rows: list[Row] = []
+        if supervisor.flights:
+            rows += self._again_or_lost(supervisor.flights.popleft(), ending)
+        elif not supervisor.ready:
+            self._failed_starts += 1
+            if self._failed_starts == _MOST_STARTS:
+                raise EngineError(f"{_MOST_STARTS} worker processes died while they started, the last {ending}")
+        self._waiting.extendleft(reversed(supervisor.flights))
+        return rows
+
+    def _again_or_lost(self, flight: int, ending: str) -> list[Row]:
+        """A flight whose process died flies again, unless too many have died of it."""
+        self._deaths[flight] += 1
+        if self._deaths[flight] < MOST_DEATHS:
+            self._waiting.appendleft(flight)
+            return []
+        return [self._pilot.lost(flight, f"its process died {MOST_DEATHS} times, last {ending}")]
+
+
+@contextlib.contextmanager
+def _undisturbed() -> Iterator[None]:
+    """What is started here keeps linear algebra to one thread, and never sees Ctrl-C, which waits here meanwhile.
+
+    Nor does it run the parent's script again, as multiprocessing's children do, which takes longer than all the rest:
+    nothing that a worker is handed belongs to that.
+    """
+    before = {name: os.environ.get(name) for name in ONE_THREAD}
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of one that was killed; it has nothing of ours
+        resource_tracker.ensure_running()  # it lets signals through when it starts
+    mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    os.environ.update(ONE_THREAD)
+    script, sys.modules["__main__"] = sys.modules["__main__"], ModuleType("__main__")
+    try:
+        yield
+    finally:
+        sys.modules["__main__"] = script
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value
+        signal.pthread_sigmask(signal.SIG_SETMASK, mask)

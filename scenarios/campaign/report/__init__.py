@@ -1,0 +1,1 @@
+"""A campaign as tables, text, figure, plots and pages."""

@@ -1,0 +1,163 @@
+"""A campaign -> a page that works offline, and its figure."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Final
+from urllib.parse import quote
+
+import pyarrow as pa
+
+from quadsim.outputs import write_json, write_text, writing
+from quadsim.report.pages.page import PAGE_FILE, render_page
+from quadsim.report.plots.panels import plotly_script
+from quadsim.report.table import Mark
+from scenarios.campaign.report.campaign_figure import write_campaign_figure
+from scenarios.campaign.report.campaign_plots import campaign_plots
+from scenarios.campaign.report.campaign_tables import (
+    constraint_table,
+    driver_table,
+    event_table,
+    group_table,
+    level_tables,
+    manifest_table,
+    metric_table,
+    split_table,
+    worst_draws_table,
+    worst_table,
+)
+from scenarios.campaign.report.campaign_text import campaign_sentences, verdict_sentence
+from scenarios.campaign.report.comparison_tables import comparison_markdown, comparison_tables, pairing
+from scenarios.campaign.report.margin_plots import comparison_margins_plot
+from scenarios.campaign.results.table import Summary
+from scenarios.campaign.statistics.comparison import Comparison
+from scenarios.campaign.statistics.scatters import clipping, clouds, margins, thinning
+
+_FILES: Final = {
+    "campaign.toml": "campaign (TOML)",
+    "scenario.toml": "scenario (TOML)",
+    "flights.parquet": "flights (Parquet)",
+    "timing.parquet": "clock times (Parquet)",
+    "summary.json": "summary (JSON)",
+    "manifest.json": "manifest (JSON)",
+    "campaign.png": "figure (PNG)",
+    "campaign.svg": "figure (SVG)",
+}
+"""What the page links to, where it is there, and under which name."""
+
+
+def write_report(
+    directory: Path,
+    *,
+    table: pa.Table,
+    summary: Summary,
+    manifest: Mapping[str, Any],
+    name: str,
+    description: str = "",
+    failure: Sequence[str] = (),
+    campaign: Path | None = None,
+) -> Path:
+    """Write `index.html`, `campaign.png` and `campaign.svg`.
+
+    Args:
+        directory: where to write them, one that is being made.
+        table: `flights.parquet`.
+        summary: `scenarios.campaign.statistics.estimates.estimate` of that table.
+        manifest: how the campaign was made; nested tables are fine.
+        name: the campaign's.
+        description: what it is, in a line.
+        failure: the events that count as failure.
+        campaign: the campaign's directory, where that is another, to which the page links and as its commands name it.
+
+    Returns:
+        The page.
+
+    Raises:
+        OutputError: the directory cannot be written.
+    """
+    campaign = directory if campaign is None else campaign
+    write_campaign_figure(name, table, summary, directory)
+    plots = campaign_plots(table, summary)
+    page = render_page(
+        "campaign.html.j2",
+        "campaign",
+        title=name,
+        description=description,
+        verdict=verdict_sentence(summary),
+        mark=_mark(summary),
+        sentences=campaign_sentences(summary),
+        events=event_table(summary, failure),
+        constraints=constraint_table(summary),
+        metrics=metric_table(summary),
+        drivers=driver_table(summary),
+        splits=split_table(summary),
+        groups=group_table(summary),
+        levels=level_tables(summary),
+        lost=summary["verdicts"]["lost"],
+        worst=worst_table(summary, str(campaign)),
+        worst_draws=worst_draws_table(summary),
+        manifest=manifest_table(manifest),
+        plots=plots,
+        clipping=_clipping(table),
+        thinning=thinning(table),
+        files=[
+            (label, quote(file))
+            for file, label in _FILES.items()
+            if (directory / file).is_file() or (campaign / file).is_file()
+        ],
+        plotly=plotly_script() if plots else "",
+    )
+    write_text(directory / PAGE_FILE, page)
+    return directory / PAGE_FILE
+
+
+def _mark(summary: Summary) -> Mark:
+    if not summary["flights"]:
+        return Mark.NONE
+    return Mark.BAD if summary["events"]["failure"]["count"] else Mark.GOOD
+
+
+def _clipping(table: pa.Table) -> str:
+    """Which flights scatters draw at their edges, as a sentence; empty where there are none."""
+    drawn = margins(table)
+    return "" if drawn is None else clipping(drawn, clouds(table, drawn))
+
+
+COMPARISON_FILE: Final = "comparison.json"
+TABLE_FILE: Final = "comparison.md"
+
+KIND: Final = "campaign comparison"
+"""What `quadsim.outputs` calls such a directory."""
+
+
+def write_comparison_report(comparison: Comparison, directory: Path) -> Path:
+    """Write `index.html`, `comparison.json` and `comparison.md`, which appear together or not at all.
+
+    Args:
+        comparison: what to tell.
+        directory: what to write; an earlier comparison of campaigns or an empty directory there is replaced.
+
+    Returns:
+        The page.
+
+    Raises:
+        OutputError: the directory cannot be written, or holds something else.
+    """
+    plot = comparison_margins_plot(comparison)
+    with writing(directory, KIND) as partial:
+        write_json(partial / COMPARISON_FILE, comparison.to_json())
+        write_text(partial / TABLE_FILE, comparison_markdown(comparison))
+        page = render_page(
+            "campaign_comparison.html.j2",
+            KIND,
+            title=f"{comparison.names[1]} against {comparison.names[0]}",
+            comparison=comparison,
+            pairing=pairing(comparison),
+            tables=comparison_tables(comparison),
+            plot=plot,
+            files=(COMPARISON_FILE, TABLE_FILE),
+            plotly=plotly_script() if plot else "",
+        )
+        write_text(partial / PAGE_FILE, page)
+    return directory / PAGE_FILE

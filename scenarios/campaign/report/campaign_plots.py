@@ -1,0 +1,187 @@
+"""A campaign -> the plots of its page."""
+
+from __future__ import annotations
+
+import html
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+import pyarrow as pa
+
+from quadsim.report.palette import BOUND, LINES
+from quadsim.report.plots.panels import BOTTOM, TOP, Plot, finished, finished_panels, panels, place
+from scenarios.campaign.report.campaign_curves import (
+    Association,
+    Driver,
+    Histogram,
+    convergence_range,
+    converging,
+    drivers,
+    histograms,
+)
+from scenarios.campaign.report.margin_plots import scatter_plot, verdict_keys
+from scenarios.campaign.results.table import Summary
+from scenarios.campaign.results.verdicts import VERDICTS
+from scenarios.campaign.statistics.scatters import clouds, margins
+
+if TYPE_CHECKING:
+    from plotly.graph_objects import Bar, Scatter
+
+OUTCOMES: Final = {"with the worst margin": LINES[0], "with failure": LINES[1]}
+_LOG_TICKS: Final = [float(digit * 10**power) for power in range(7) for digit in (1, 2, 5)]
+
+
+def campaign_plots(table: pa.Table, summary: Summary) -> dict[str, Plot]:
+    """The plots of a campaign that its flights have something for.
+
+    Args:
+        table: `flights.parquet`.
+        summary: its estimates.
+
+    Returns:
+        Any of `convergence`, `metrics`, `drivers` and `scatter`.
+    """
+    found = {}
+    if table.num_rows:
+        found["convergence"] = _convergence(summary)
+    if drawn := histograms(table):
+        found["metrics"] = _histograms(drawn, verdict_keys(table))
+    if told := drivers(summary):
+        found["drivers"] = _drivers(told)
+    drawn_margins = margins(table)
+    if drawn_margins is not None and (parameters := clouds(table, drawn_margins)):
+        found["scatter"] = scatter_plot(table, parameters, drawn_margins)
+    return found
+
+
+def _convergence(summary: Summary) -> Plot:
+    """The shares of failures and violations over the first n flights, in their intervals."""
+    from plotly.graph_objects import Scatter
+
+    events = converging(summary)
+    figure = panels(list(events.values()), shared=False)
+    curves = summary["convergence"]
+    n = np.asarray(curves["flights"], float)
+    around = np.concatenate([n, n[::-1]])
+    ends = convergence_range(summary, list(events))
+    for panel, event in enumerate(events):
+        share, lower, upper = (100.0 * np.asarray(curves[event][key]) for key in ("share", "lower", "upper"))
+        band = np.concatenate([upper, lower[::-1]])
+        filled = {"fill": "toself", "fillcolor": _faded(LINES[0], 0.22), "line": {"width": 0}}
+        figure.add_trace(Scatter(x=around, y=band, mode="lines", hoverinfo="skip", **filled), **place(panel))
+        figure.add_trace(
+            Scatter(
+                x=n,
+                y=share,
+                customdata=np.stack([lower, upper], axis=1),
+                mode="lines+markers" if n.size < 3 else "lines",
+                line={"color": LINES[0], "width": 2.0},
+                hovertemplate="%{x} flights: %{y:.3g} % (%{customdata[0]:.3g} to %{customdata[1]:.3g} %)"
+                "<extra></extra>",
+            ),
+            **place(panel),
+        )
+    if len(events) == 1:
+        figure.update_xaxes(domain=[0.0, 1.0])
+        figure.update_annotations(x=0.5)
+    figure.update_yaxes(range=list(ends))
+    last = float(np.log10(n[-1])) or 0.3
+    figure.update_xaxes(
+        type="log",
+        tickvals=_LOG_TICKS,
+        tickformat="~g",
+        range=[0.0, 1.02 * last],
+        title={"text": "flights", "standoff": 6},
+    )
+    figure.update_annotations(font={"size": 13})
+    figure.update_layout(margin={"l": 52, "r": 12, "t": TOP, "b": BOTTOM}, hovermode="closest")
+    return finished(figure, "convergence", "How the estimate settles", height=330, timed=False)
+
+
+def _histograms(drawn: list[Histogram], keys: tuple[tuple[str, str], ...]) -> Plot:
+    from plotly.graph_objects import Bar
+
+    figure = panels([html.escape(histogram.label) for histogram in drawn], shared=False)
+    for panel, histogram in enumerate(drawn):
+        edges = histogram.edges
+        for verdict, _ in keys:
+            figure.add_trace(
+                Bar(
+                    x=(0.5 * (edges[:-1] + edges[1:])).astype(np.float32),
+                    y=histogram.counts[verdict].astype(np.float32),
+                    width=float(edges[1] - edges[0]),
+                    name=verdict,
+                    marker={"color": VERDICTS[verdict].colour, "line": {"width": 0}},
+                    hovertemplate="%{x:.4g}: %{y} %{fullData.name}<extra></extra>",
+                ),
+                **place(panel),
+            )
+        highest = np.sum(list(histogram.counts.values()), axis=0).max()
+        if highest < 6:
+            figure.update_yaxes(dtick=1 if highest < 4 else 2, **place(panel))
+        if histogram.name == "worst_margin" and edges[0] <= 0.0 <= edges[-1]:
+            figure.add_vline(0.0, line={"color": BOUND, "width": 1.4, "dash": "dash"}, **place(panel))
+    figure.update_layout(barmode="stack", bargap=0)
+    plot = finished_panels(figure, "metrics", "How flights are distributed", len(drawn))
+    return replace(plot, key_colours=keys)
+
+
+def _drivers(told: list[Driver]) -> Plot:
+    """Rank correlations as bars, and the measure of any dependence as diamonds over them."""
+    from plotly.graph_objects import Figure
+
+    names = [html.escape(driver.label) for driver in told]
+    figure = Figure()
+    keys = []
+    for (outcome, colour), offset in zip(OUTCOMES.items(), (-0.19, 0.19), strict=True):
+        found = [driver.margin if outcome == "with the worst margin" else driver.failure for driver in told]
+        if any(found):
+            keys.append((outcome, colour))
+            figure.add_traces([*_measures(names, found, outcome, colour, offset)])
+    figure.update_xaxes(
+        range=[-1.04, 1.04],
+        title={"text": "bars: rank correlation; diamonds: xi, of any dependence", "standoff": 6},
+        zeroline=True,
+    )
+    ticks = {"tickmode": "array", "tickvals": list(range(len(names))), "ticktext": names}
+    figure.update_yaxes(automargin=True, range=[len(names) - 0.4, -0.6], **ticks)
+    figure.update_layout(margin={"l": 12, "r": 12, "t": 6, "b": BOTTOM}, barmode="overlay", hovermode="closest")
+    plot = finished(figure, "drivers", "What goes with it", height=70 + 36 * len(told), timed=False)
+    return replace(plot, key_colours=tuple(keys))
+
+
+def _measures(
+    names: list[str], found: Sequence[Association | None], outcome: str, colour: str, offset: float
+) -> Iterator[Bar | Scatter]:
+    """Both measures of each drawn number with one outcome, its bars so far beside the middle of its line."""
+    from plotly.graph_objects import Bar, Scatter
+
+    rows = [i for i, one in enumerate(found) if one]
+    there = [one for one in found if one]
+    told = {"customdata": [names[i] for i in rows], "name": outcome, "y": [i + offset for i in rows]}
+    yield Bar(
+        x=[one.rho for one in there],
+        orientation="h",
+        width=0.36,
+        marker={"color": colour, "opacity": [1.0 if one.rho_is_sure else 0.35 for one in there]},
+        hovertemplate="%{customdata}, %{fullData.name}: rank correlation %{x:.3f}<extra></extra>",
+        **told,
+    )
+    yield Scatter(
+        x=[one.xi for one in there],
+        mode="markers",
+        marker={
+            **{"color": colour, "size": 10, "line": {"color": "white", "width": 1}},
+            "symbol": ["diamond" if one.xi_is_sure else "diamond-open" for one in there],
+        },
+        hovertemplate="%{customdata}, %{fullData.name}: xi %{x:.3f}<extra></extra>",
+        **told,
+    )
+
+
+def _faded(colour: str, opacity: float) -> str:
+    """A colour of the palette as rgba, which plotly asks for to fill an area."""
+    red, green, blue = (int(colour[i : i + 2], 16) for i in (1, 3, 5))
+    return f"rgba({red},{green},{blue},{opacity})"

@@ -1,0 +1,117 @@
+"""Two campaigns compared -> tables, and all of it as Markdown."""
+
+from __future__ import annotations
+
+from quadsim.report.table import ABSENT, Cell, Grid, Mark, format_number, grid_to_markdown
+from scenarios.campaign.statistics.comparison import Comparison, MetricComparison
+from scenarios.campaign.statistics.event_comparison import EventComparison
+from scenarios.campaign.statistics.inference import ALPHA, CONFIDENCE
+from scenarios.campaign.statistics.wording import label, p_value, percent, signed_interval, signed_points
+
+_SURE = f"{100.0 * CONFIDENCE:g} %"
+
+
+def comparison_tables(comparison: Comparison) -> list[Grid]:
+    """Events, and metrics."""
+    return [_events(comparison), _metrics(comparison)]
+
+
+def comparison_markdown(comparison: Comparison) -> str:
+    """The verdict and its tables."""
+    parts = [f"# {comparison.names[1]} against {comparison.names[0]}\n", comparison.sentence + "\n"]
+    parts.append(pairing(comparison) + "\n")
+    for grid in comparison_tables(comparison):
+        parts += [f"## {grid.title}\n", grid_to_markdown(grid), grid.note + "\n"]
+    return "\n".join(parts)
+
+
+def pairing(comparison: Comparison) -> str:
+    """What the pairs have in common, and what they have not."""
+    told = f"Pairs have their seed in common, and all of {', '.join(comparison.shared_draws)}"
+    if not comparison.shared_draws:
+        told = "Pairs have their seed in common"
+    if comparison.own_draws:
+        told += f"; one campaign alone draws {', '.join(comparison.own_draws)}"
+    if comparison.left_out:
+        told += f"; {comparison.left_out} flights that only one of them has are left out"
+    return f"{told}."
+
+
+def _events(comparison: Comparison) -> Grid:
+    a, b = comparison.names
+    return Grid(
+        key="events",
+        title="Events",
+        head=(
+            "event",
+            a,
+            b,
+            f"{a} alone",
+            f"{b} alone",
+            "both",
+            "p",
+            "after Holm",
+            "difference [points]",
+            f"{_SURE} interval",
+        ),
+        lines=tuple(_event(event) for event in comparison.events),
+        note="p: McNemar's exact test, two-sided, on the pairs in which one alone had the event, each event by itself; "
+        "the verdict is by that of failure. After Holm: corrected for all events of this table that one flight of a "
+        f"pair alone had; bold: beyond chance at {100.0 * ALPHA:g} %. Difference: share of "
+        f"{b} less that of {a}, in percentage points, with Tango's score interval (1998) for pairs.",
+    )
+
+
+def _event(event: EventComparison) -> tuple[Cell, ...]:
+    counts = [f"{count} ({percent(count / event.pairs)})" for count in event.counts]
+    counted = _line(
+        event.event,
+        *counts,
+        str(event.only_a),
+        str(event.only_b),
+        str(event.both),
+        p_value(event.p),
+    )
+    mark = Mark.BEST if event.p_holm < ALPHA else Mark.NONE
+    corrected = Cell(text=p_value(event.p_holm), mark=mark)
+    return (*counted, corrected, *_line(signed_points(event.difference), signed_interval(event.lower, event.upper)))
+
+
+def _metrics(comparison: Comparison) -> Grid:
+    a, b = comparison.names
+    return Grid(
+        key="metrics",
+        title="Metrics",
+        head=(
+            *("metric", f"{a}, mean", f"{b}, mean", "mean difference", f"{_SURE} interval"),
+            *("median difference", f"{_SURE} interval", "pairs"),
+        ),
+        lines=tuple(_metric(metric) for metric in comparison.metrics),
+        note=(
+            f"Over the {comparison.completed} of {comparison.flights} pairs in which both flights were completed. "
+            f"Differences are {b} less {a}; bold where the interval does not hold 0. Intervals: Student's t of the "
+            "mean, order statistics of the median; each by itself, not corrected for how many there are. For "
+            "worst_margin more is better, for all others less."
+        ),
+    )
+
+
+def _metric(metric: MetricComparison) -> tuple[Cell, ...]:
+    found = metric.difference
+    return (
+        *_line(label(metric.name, metric.unit), format_number(metric.mean_a), format_number(metric.mean_b)),
+        *_difference(found.mean, found.lower, found.upper),
+        *_difference(found.median, found.median_lower, found.median_upper),
+        *_line(str(found.pairs)),
+    )
+
+
+def _difference(value: float | None, lower: float | None, upper: float | None) -> tuple[Cell, ...]:
+    if lower is None or upper is None:
+        return _line(format_number(value), ABSENT)
+    mark = Mark.BEST if lower > 0.0 or upper < 0.0 else Mark.NONE
+    return Cell(text=format_number(value), mark=mark), Cell(text=f"{format_number(lower)} to {format_number(upper)}")
+
+
+def _line(*texts: str) -> tuple[Cell, ...]:
+    return tuple(Cell(text=text) for text in texts)

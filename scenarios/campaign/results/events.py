@@ -1,0 +1,163 @@
+"""What may happen in a flight, as text: `lost`, `violation`, `rmse.z > 0.5`.
+
+One rule for what is not known: where a flight has no value, the event holds, since the flight did not show otherwise.
+"""
+
+from __future__ import annotations
+
+import math
+import operator
+import re
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from quadsim.errors import InputError, ParameterError, UnknownNameError
+from scenarios.campaign.results.verdicts import OWN_EVENTS
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+Flags = np.ndarray[Any, np.dtype[np.bool_]]
+
+_NAMED: Final[dict[str, tuple[str, bool | str]]] = {
+    "failure": ("failed", True),
+    "violation": ("violated", True),
+    "lost": ("verdict", "lost"),
+    "crash": ("crashed", True),
+    **{verdict: ("verdict", verdict) for verdict in OWN_EVENTS},
+}
+"""Column of each event that has a name, and its value there where the event holds."""
+_SPELLINGS: Final = {"failed": "failure", "violated": "violation", "crashed": "crash"}
+_OPERATIONS: Final[dict[str, Callable[[Any, Any], Any]]] = {
+    "<": operator.lt,
+    "<=": operator.le,
+    ">": operator.gt,
+    ">=": operator.ge,
+}
+_NEVER_COMPARED: Final = ("flight", "seed", "failed")
+"""Columns that tell flights apart, or what other events make of them."""
+_COMPARISON: Final = re.compile(r"(?P<column>[^<>=]*?)\s*(?P<operation><=|>=|<|>)\s*(?P<number>[^<>=]*)")
+
+EVENT_NAMES: Final = tuple(_NAMED)
+"""The events that have a name; every other one is `COLUMN OP NUMBER`."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Event:
+    """Something that a flight's row shows to have happened, or not.
+
+    Attributes:
+        text: the event as it is written in one way: a name of `EVENT_NAMES`, or `COLUMN OP NUMBER`.
+        column_name: the column that shows it.
+        operation: `==`, `<`, `<=`, `>` or `>=`.
+        value: what the column is compared with.
+    """
+
+    text: str
+    column_name: str
+    operation: str
+    value: bool | str | float
+
+    def holds(self, row: Mapping[str, Any]) -> bool:
+        """Whether it happened in one flight; so it did where the flight has no value.
+
+        Args:
+            row: a flight's values by column.
+
+        Raises:
+            UnknownNameError: there is no such column.
+            InputError: a number is asked for, and the column holds text.
+        """
+        if self.column_name not in row:
+            raise UnknownNameError("column", self.column_name, row)
+        value = row[self.column_name]
+        if value is None:
+            return True
+        if self.operation == "==":
+            return bool(value == self.value)
+        if isinstance(value, str):
+            raise _no_number(self.text, self.column_name)
+        return math.isnan(value) or bool(_OPERATIONS[self.operation](value, self.value))
+
+    def column(self, table: pa.Table) -> Flags:
+        """(K,) whether it happened, flight by flight; the same as `holds` of every row.
+
+        Raises:
+            UnknownNameError: there is no such column.
+            InputError: a number is asked for, and the column holds text.
+        """
+        if self.column_name not in table.column_names:
+            raise UnknownNameError("column", self.column_name, table.column_names)
+        if self.operation != "==" and not _is_number(table.schema.field(self.column_name).type):
+            raise _no_number(self.text, self.column_name)
+        return np.array([self.holds({self.column_name: value}) for value in table[self.column_name].to_pylist()], bool)
+
+
+def parse_event(text: str, columns: Mapping[str, pa.DataType] | pa.Schema | None = None) -> Event:
+    """An event from its text.
+
+    Args:
+        text: a name of `EVENT_NAMES`, e.g. `failure` or `lost`, where `failed`, `violated` and `crashed` mean the same
+            as their nouns; or `COLUMN OP NUMBER` with one of `< <= > >=`, e.g. `rmse.z > 0.5`.
+        columns: those that a comparison may name, with their types, or the schema of a table; None for any.
+
+    Raises:
+        UnknownNameError: no event has that name, or there is no such column.
+        InputError: a comparison is with a column that holds text, or with `flight`, `seed` or `failed`.
+        ParameterError: what is compared with is not a finite number.
+    """
+    text = " ".join(text.split())
+    name = _SPELLINGS.get(text, text)
+    if name in _NAMED:
+        column, value = _NAMED[name]
+        return Event(text=name, column_name=column, operation="==", value=value)
+    found = _COMPARISON.fullmatch(text)
+    if found is None:
+        hint = "or a comparison, COLUMN OP NUMBER with < <= > or >=, such as 'rmse.z > 0.5'"
+        raise UnknownNameError("event", text, {*_NAMED, *_SPELLINGS}, hint=hint)
+    column = found["column"]
+    if column in _NEVER_COMPARED:
+        raise InputError(
+            f"event {text!r} must compare a column that measures a flight, such as rmse.z; {column!r} does not"
+        )
+    if columns is not None:
+        _require_number(column, columns, text)
+    number = _number(found["number"], text)
+    return Event(
+        text=f"{column} {found['operation']} {number:.15g}",
+        column_name=column,
+        operation=found["operation"],
+        value=number,
+    )
+
+
+def _require_number(column: str, columns: Mapping[str, pa.DataType] | pa.Schema, event: str) -> None:
+    kinds = columns if isinstance(columns, Mapping) else dict(zip(columns.names, columns.types, strict=True))
+    if column not in kinds:
+        raise UnknownNameError("column", column, [name for name, kind in kinds.items() if _is_number(kind)])
+    if not _is_number(kinds[column]):
+        raise _no_number(event, column)
+
+
+def _is_number(kind: pa.DataType) -> bool:
+    """Whether a column's values, numbers or truth values, can be compared with a number."""
+    from pyarrow import types
+
+    return bool(types.is_boolean(kind) or types.is_integer(kind) or types.is_floating(kind))
+
+
+def _no_number(event: str, column: str) -> InputError:
+    return InputError(f"event {event!r} compares with a number; the column {column!r} holds text")
+
+
+def _number(given: str, event: str) -> float:
+    try:
+        number = float(given)
+    except ValueError:
+        number = math.nan
+    if not math.isfinite(number):
+        raise ParameterError(f"event {event!r}", "number", given, "a finite number")
+    return number

@@ -1,0 +1,235 @@
+"""The rows of a campaign, one per flight, and their Parquet table.
+
+A column's unit stands in its metadata.  A value that does not exist, such as the tracking error of a flight that raised
+before its first period, is null.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from quadsim.controller import ACCEPTED, Phase
+from quadsim.errors import FileError
+from quadsim.flight import metrics
+from quadsim.flight.audit import Finding, Limit
+from quadsim.flight.log import FlightLog, TimingLog
+from quadsim.state import REFERENCE_NAMES, REFERENCE_UNITS
+from scenarios.campaign.results.verdicts import ERROR
+
+Row = dict[str, Any]
+"""One flight's values by column: numbers, texts, or None."""
+DRAW: Final = "draw."
+"""How the columns of drawn values begin."""
+MARGIN, TIME_VIOLATED, SATISFIED = "margin.", "time_violated.", "satisfied."
+"""How the columns of a constraint begin, before its name."""
+_MEASURES: Final = ("rmse", "max_error", "final_error", "overshoot")
+_HEAD: Final = (
+    ("status", "-", pa.string()),
+    ("verdict", "-", pa.string()),
+    ("reason", "-", pa.string()),
+    ("failed", "-", pa.bool_()),
+    ("violated", "-", pa.bool_()),
+    ("crashed", "-", pa.bool_()),
+    ("duration", "s", pa.float64()),
+)
+_COMMANDS: Final = (
+    ("peak_tilt", "deg", pa.float64()),
+    ("speed_min", "rad/s", pa.float64()),
+    ("speed_max", "rad/s", pa.float64()),
+    ("slew_min", "rad/s", pa.float64()),
+    ("slew_max", "rad/s", pa.float64()),
+    ("total_variation", "rad/s", pa.float64()),
+    ("fallback_periods", "-", pa.int64()),
+    ("fallback_max", "-", pa.int64()),
+    ("unsolved_periods", "-", pa.int64()),
+    ("slack_max", "rad", pa.float64()),
+    ("iterations.mean", "-", pa.float64()),
+    ("iterations.max", "-", pa.int64()),
+)
+_WORST: Final = (("worst_margin", "-", pa.float64()), ("worst_constraint", "-", pa.string()))
+_COMMANDED: Final = ("speed", "slew")
+"""Signals that the controller sets itself."""
+TIMING: Final = (
+    ("machine", "-", pa.string()),
+    ("wall_s", "s", pa.float64()),
+    ("step_p50_ms", "ms", pa.float64()),
+    ("step_p99_ms", "ms", pa.float64()),
+)
+"""What a clock measured of a flight, and where; it stands in a table of its own."""
+Summary = Mapping[str, Any]
+
+
+def make_schema(draws: Mapping[str, tuple[pa.DataType, str]], limits: Sequence[Limit]) -> pa.Schema:
+    """The columns of a campaign, clock times last.
+
+    Args:
+        draws: type and unit, `-` for none, of each drawn parameter, by name.
+        limits: what its flights are audited against.
+    """
+    tracked = [
+        (f"{measure}.{channel}", unit, pa.float64())
+        for measure in _MEASURES
+        for channel, unit in zip(REFERENCE_NAMES, REFERENCE_UNITS, strict=True)
+    ]
+    audited = [
+        column
+        for limit in limits
+        for column in (
+            (MARGIN + limit.name, limit.unit, pa.float64()),
+            (TIME_VIOLATED + limit.name, "s", pa.float64()),
+            (SATISFIED + limit.name, "-", pa.bool_()),
+        )
+    ]
+    columns = [
+        ("flight", "-", pa.int64()),
+        ("seed", "-", pa.int64()),
+        *((DRAW + name, unit, kind) for name, (kind, unit) in draws.items()),
+        *_HEAD,
+        *tracked,
+        *_COMMANDS,
+        *audited,
+        *_WORST,
+        *TIMING,
+    ]
+    return pa.schema([pa.field(name, kind, metadata={"unit": unit}) for name, unit, kind in columns])
+
+
+def flown_row(log: FlightLog, findings: Sequence[Finding], *, verdict: str, wall_s: float, machine: str) -> Row:
+    """What a campaign keeps of a flight.
+
+    Args:
+        log: with plant rows at the physics rate.
+        findings: its audit.
+        verdict: `satisfied`, `violated` or `lost`.
+        wall_s: how long it took to fly [s].
+        machine: the processor that flew it.
+    """
+    row: Row = {
+        "status": log.status,
+        "verdict": verdict,
+        "reason": log.reason,
+        "violated": verdict != "satisfied",
+        "crashed": str(Phase.CRASHED) in log.control.phase,
+        "duration": round(float(log.plant.t[-1]), 9),
+        "wall_s": wall_s,
+        "machine": machine,
+    }
+    for finding in findings:
+        name = finding.limit.name
+        row[MARGIN + name] = _finite(finding.worst_margin)
+        row[TIME_VIOLATED + name] = finding.time_violated
+        row[SATISFIED + name] = finding.satisfied
+    row["worst_margin"], row["worst_constraint"] = worst_margin(findings)
+    return row | (_numbers(log) if log.control.t.size else {})
+
+
+def failed_row(reason: str, verdict: str = ERROR) -> Row:
+    """What is kept of a flight that raised, whose process died, or that met a limit.
+
+    Args:
+        reason: in words.
+        verdict: `ERROR`, `TIMEOUT` or `MEMORY`.
+    """
+    return {"status": verdict, "verdict": verdict, "reason": reason, "violated": True, "crashed": False}
+
+
+def worst_margin(findings: Iterable[Finding]) -> tuple[float | None, str | None]:
+    """The smallest margin of the required constraints, tolerance included, as a share of half its band, and whose.
+
+    At the physics rate or at the control samples, each with its own tolerance, whichever is smaller: it is negative
+    where a constraint that was reached did not hold.  1 is the middle of a band, 0 the end of what is allowed; of a
+    bound with one side alone, the share is of the bound's own magnitude.  A command at its own bound is no near miss:
+    constraints of `speed` and `slew` count once they are violated.  None where no such constraint was reached.
+    """
+    shares = [
+        (share, finding.limit.name)
+        for finding in findings
+        if finding.limit.required and math.isfinite(share := _share(finding))
+        if share < 0.0 or finding.limit.signal not in _COMMANDED
+    ]
+    return min(shares, default=(None, None))
+
+
+def make_table(rows: Iterable[Row], schema: pa.Schema) -> pa.Table:
+    """Rows as a table, sorted by flight; what a row lacks is null, and text that is no Unicode has backslashes."""
+    ordered = sorted(rows, key=lambda row: row["flight"])
+    columns = [pa.array([_storable(row.get(field.name)) for row in ordered], field.type) for field in schema]
+    return pa.Table.from_arrays(columns, schema=schema)
+
+
+def split_times(table: pa.Table) -> tuple[pa.Table, pa.Table]:
+    """What a seed determines, and what a clock measured, by flight."""
+    times = [name for name, *_ in TIMING]
+    return table.drop_columns(times), table.select(["flight", *times])
+
+
+def read_table(path: Path) -> pa.Table:
+    """A table of flights.
+
+    Raises:
+        FileError: the file is missing, damaged, or none of ours.
+    """
+    if not path.is_file():  # a pipe would be read for ever
+        raise FileError(path, "is not a readable Parquet file (it is missing or no file)")
+    try:
+        with path.open("rb") as file:  # Arrow by itself takes no path that is no Unicode
+            table = pq.read_table(file)
+    except (OSError, ValueError, pa.ArrowException) as error:
+        raise FileError(path, f"is not a readable Parquet file ({error})") from error
+    if "flight" not in table.column_names:
+        raise FileError(path, "is not a campaign's table: it has no column 'flight'")
+    return table
+
+
+def unit_of(table: pa.Table, column: str) -> str:
+    """The unit of a column; `-` for none."""
+    metadata = table.schema.field(column).metadata or {}
+    return str(metadata.get(b"unit", b"-").decode())
+
+
+def _numbers(log: FlightLog) -> Row:
+    control = log.control
+    tracked = metrics.tracking(control)
+    accepted = sum(status in ACCEPTED for status in control.status)
+    grounded = sum(status in (Phase.LANDED, Phase.CRASHED) for status in control.status)
+    return {
+        **{f"{measure}.{name}": tracked[measure][name] for measure in _MEASURES for name in REFERENCE_NAMES},
+        **metrics.control(control),
+        "peak_tilt": metrics.peak_tilt(log.plant.state),
+        "fallback_periods": int(np.count_nonzero(control.fallback)),
+        "fallback_max": int(control.fallback.max()),
+        "unsolved_periods": control.t.size - accepted - grounded,
+        "slack_max": float(control.slack.max()),
+        "iterations.mean": float(control.iterations.mean()),
+        "iterations.max": int(control.iterations.max()),
+        **_times(log.timing),
+    }
+
+
+def _times(timing: TimingLog) -> Row:
+    p50, p99 = np.percentile(timing.step_ms, [50, 99])
+    return {"step_p50_ms": float(p50), "step_p99_ms": float(p99)}
+
+
+def _share(finding: Finding) -> float:
+    """A margin, tolerance included, as a share of half its band."""
+    at_physics_rate = finding.worst_margin + finding.limit.tolerance
+    at_samples = finding.worst_margin_sampled + finding.limit.tolerance_sampled
+    nearest = np.fmin(at_physics_rate, at_samples) if math.isfinite(at_physics_rate) else at_physics_rate
+    return float(nearest) / finding.limit.half_band
+
+
+def _storable(value: object) -> object:
+    """A text without lone surrogates, which no file holds; all else as it is."""
+    return value.encode("utf-8", "backslashreplace").decode() if isinstance(value, str) else value
+
+
+def _finite(value: float) -> float | None:
+    return value if math.isfinite(value) else None

@@ -1,0 +1,1 @@
+"""What a campaign's flights say, and how sure that is."""

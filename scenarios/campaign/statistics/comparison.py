@@ -1,0 +1,215 @@
+"""Two campaigns flown on the same draws: is the second better, and how sure is that?
+
+Flights of one number meet the same drawn values and the same random numbers, so they are compared in pairs; that tells
+far smaller differences than two campaigns side by side would.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field
+from typing import Any, Final
+
+import numpy as np
+import pyarrow as pa
+
+from quadsim.errors import InputError
+from scenarios.campaign.results.columns import constraint_names, draw_names, numbers, texts
+from scenarios.campaign.results.events import Flags, parse_event
+from scenarios.campaign.results.table import DRAW, unit_of
+from scenarios.campaign.statistics.event_comparison import EventComparison, compare_events, events_of, other_differences
+from scenarios.campaign.statistics.inference import ALPHA, CONFIDENCE, PairedDifference, paired_difference
+from scenarios.campaign.statistics.paired_margins import ShownMargins, paired_margins
+from scenarios.campaign.statistics.wording import p_value, signed_interval, signed_points
+
+COMPARED: Final = (
+    *(f"rmse.{name}" for name in ("x", "y", "z", "yaw")),
+    *(f"max_error.{name}" for name in ("x", "y", "z")),
+    "peak_tilt",
+    "worst_margin",
+    "total_variation",
+    "fallback_periods",
+)
+"""Metrics that are compared, where both campaigns have them."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class MetricComparison:
+    """A metric over the pairs in which both flights were completed and have it.
+
+    Attributes:
+        name: its column.
+        unit: its unit, `-` for none.
+        mean_a: mean of the first campaign over these pairs; None of no pairs.
+        mean_b: mean of the second.
+        difference: of the second less the first.
+    """
+
+    name: str
+    unit: str
+    mean_a: float | None
+    mean_b: float | None
+    difference: PairedDifference
+
+
+@dataclass(frozen=True, kw_only=True)
+class Comparison:
+    """What two campaigns on the same draws show of each other.
+
+    Attributes:
+        names: of the first and the second campaign.
+        flights: pairs, flights that both campaigns have.
+        left_out: flights that only one of them has.
+        completed: pairs in which both flights were completed.
+        shared_draws: parameters that both drew, alike in every pair.
+        own_draws: parameters that only one of them drew.
+        events: failure, then every other event that has a name, then for each constraint that it was not held.
+        metrics: the main metrics.
+        shown_margins: what is drawn of them; None where fewer than two pairs have margins.
+    """
+
+    names: tuple[str, str]
+    flights: int
+    left_out: int
+    completed: int
+    shared_draws: tuple[str, ...]
+    own_draws: tuple[str, ...]
+    events: tuple[EventComparison, ...]
+    metrics: tuple[MetricComparison, ...]
+    shown_margins: ShownMargins | None = field(repr=False, compare=False)
+
+    @property
+    def verdict(self) -> str:
+        """`better`, `worse` or `not distinguishable`: of the second campaign, by its failures at a level of 5 %."""
+        failure = self.events[0]
+        if failure.p >= ALPHA:
+            return "not distinguishable"
+        return "better" if failure.only_b < failure.only_a else "worse"
+
+    @property
+    def sentence(self) -> str:
+        """The verdict with its numbers."""
+        a, b = self.names
+        failure = self.events[0]
+        count_a, count_b = failure.counts
+        told = (
+            f"{b} and {a} are not distinguishable by their failures"
+            if self.verdict == "not distinguishable"
+            else f"{b} is {self.verdict} than {a}"
+        )
+        return (
+            f"{told}: of {self.flights} paired flights, {count_b} failed with {b} and {count_a} with {a} "
+            f"({failure.only_b} with {b} alone, {failure.only_a} with {a} alone; McNemar's exact test, "
+            f"{p_value(failure.p)}). The difference is {signed_points(failure.difference)} percentage points "
+            f"({100.0 * CONFIDENCE:g} %: {signed_interval(failure.lower, failure.upper)}). "
+            f"{other_differences(self.events, self.names)}"
+        ).rstrip()
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain data for a file; differences are of the second campaign less the first."""
+        return {
+            "names": list(self.names),
+            "verdict": self.verdict,
+            "sentence": self.sentence,
+            "confidence": CONFIDENCE,
+            "flights": self.flights,
+            "left_out": self.left_out,
+            "completed": self.completed,
+            "shared_draws": list(self.shared_draws),
+            "own_draws": list(self.own_draws),
+            "events": {event.event: asdict(event) for event in self.events},
+            "metrics": {metric.name: asdict(metric) for metric in self.metrics},
+        }
+
+
+def compare(
+    table_a: pa.Table,
+    table_b: pa.Table,
+    names: tuple[str, str],
+    failures: tuple[Sequence[str], Sequence[str]] | None = None,
+) -> Comparison:
+    """Compare two campaigns, pairing their flights by number.
+
+    Args:
+        table_a: `flights.parquet` of the first.
+        table_b: of the second.
+        names: of the first and the second; where they are the same, the comparison tells them apart as such.
+        failures: the events that each counts as failure; None where they are known to be the same.
+
+    Raises:
+        InputError: they count other events as failure, or have other constraints; they have no flight in common; or a
+            pair differs in its seed or in a value that both drew.
+    """
+    if names[0] == names[1]:
+        names = (f"{names[0]} (first)", f"{names[1]} (second)")
+    _require_same_questions(table_a, table_b, names, failures)
+    shared = np.intersect1d(numbers(table_a, "flight"), numbers(table_b, "flight"))
+    if not shared.size:
+        raise InputError(f"campaigns {names[0]!r} and {names[1]!r} have no flight of one number: nothing can be paired")
+    a, b = (table.take(np.flatnonzero(np.isin(numbers(table, "flight"), shared))) for table in (table_a, table_b))
+    a, b = (table.sort_by("flight") for table in (a, b))
+    draws_a, draws_b = draw_names(a), draw_names(b)
+    shared_draws = tuple(name for name in draws_a if name in draws_b)
+    for column in ("seed", *(DRAW + name for name in shared_draws)):
+        _require_alike(a, b, column, names)
+    completed = (texts(a, "status") == "completed") & (texts(b, "status") == "completed")
+    events = events_of(a, b)
+    return Comparison(
+        names=names,
+        flights=shared.size,
+        left_out=table_a.num_rows + table_b.num_rows - 2 * shared.size,
+        completed=int(completed.sum()),
+        shared_draws=shared_draws,
+        own_draws=tuple(sorted(set(draws_a) ^ set(draws_b))),
+        events=compare_events(events),
+        metrics=tuple(
+            _compare_metric(a, b, name, completed)
+            for name in COMPARED
+            if name in a.column_names and name in b.column_names
+        ),
+        shown_margins=paired_margins(a, b, events["failure"], names),
+    )
+
+
+def _require_same_questions(
+    a: pa.Table, b: pa.Table, names: Sequence[str], failures: tuple[Sequence[str], Sequence[str]] | None
+) -> None:
+    if failures is not None:
+        first, second = (sorted({parse_event(text).text for text in events}) for events in failures)
+        if first != second:
+            raise InputError(
+                f"{names[0]!r} counts {', '.join(first)} as failure, and {names[1]!r} {', '.join(second)}: only "
+                "campaigns with the same failure events can be compared; fly one of them again with the other's"
+            )
+    only = [sorted(set(constraint_names(one)) - set(constraint_names(other))) for one, other in ((a, b), (b, a))]
+    for name, own in zip(names, only, strict=True):
+        if own:
+            raise InputError(
+                f"{name!r} alone has the constraints {', '.join(own)}: only campaigns that are audited against the "
+                "same constraints can be compared"
+            )
+
+
+def _require_alike(a: pa.Table, b: pa.Table, column: str, names: Sequence[str]) -> None:
+    for flight, first, second in zip(
+        a["flight"].to_pylist(), a[column].to_pylist(), b[column].to_pylist(), strict=True
+    ):
+        if first != second:
+            raise InputError(
+                f"flight {flight} of {names[0]!r} has {column} = {first!r}, and of {names[1]!r} {second!r}: only "
+                "campaigns of one seed and the same draws can be compared in pairs; fly one of them again with the "
+                "other's seed, sampling and [[vary]]"
+            )
+
+
+def _compare_metric(a: pa.Table, b: pa.Table, name: str, completed: Flags) -> MetricComparison:
+    first, second = numbers(a, name), numbers(b, name)
+    kept = completed & np.isfinite(first) & np.isfinite(second)
+    first, second = first[kept], second[kept]
+    return MetricComparison(
+        name=name,
+        unit=unit_of(a, name),
+        mean_a=float(first.mean()) if first.size else None,
+        mean_b=float(second.mean()) if second.size else None,
+        difference=paired_difference(first, second),
+    )

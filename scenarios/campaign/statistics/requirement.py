@@ -1,0 +1,195 @@
+"""A requirement on a probability, and whether a campaign's flights support it: the gate of a CI."""
+
+from __future__ import annotations
+
+import math
+import re
+from dataclasses import asdict, dataclass
+from decimal import Decimal
+from typing import Any, Final
+
+import pyarrow as pa
+
+from quadsim.errors import InputError, ParameterError
+from scenarios.campaign.results.events import Event, parse_event
+from scenarios.campaign.statistics.inference import lower_bound, upper_bound
+from scenarios.campaign.statistics.wording import count_of, percent
+
+EXAMPLE: Final = "P(violation) < 0.01 @ 95%"
+_SHARES: Final = (Decimal("1e-9"), 1 - Decimal("1e-9"))
+_CONFIDENCES: Final = (Decimal("0.5"), Decimal("0.999999"))
+_MOST_TOLD: Final = 10**9
+"""Flights beyond which it is only told that it takes more."""
+_FORM: Final = re.compile(
+    r"P\s*\((?P<event>[^()]*)\)\s*(?P<operation><=|>=|<|>)\s*(?P<share>[^<>=@]+?)\s*@\s*(?P<confidence>[^@%]+?)\s*%",
+    re.IGNORECASE,
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Requirement:
+    """What is asked: the probability of an event on one side of a share, with this confidence.
+
+    Attributes:
+        text: as it was given.
+        event: whose probability.
+        operation: `<`, `<=`, `>` or `>=`.
+        share: the limit on the probability, from 1e-9 to 1 - 1e-9.
+        confidence: of the one-sided bound, from 0.5 to 0.999999.
+    """
+
+    text: str
+    event: Event
+    operation: str
+    share: float
+    confidence: float
+
+    @property
+    def at_most(self) -> bool:
+        """Whether the probability is to be small, rather than large."""
+        return self.operation.startswith("<")
+
+    def supported_by(self, bound: float) -> bool:
+        """Whether a one-sided bound on the probability is on the side that is asked for."""
+        strict = len(self.operation) == 1
+        inside = bound < self.share if self.at_most else bound > self.share
+        return inside or (not strict and bound == self.share)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Judgement:
+    """Whether the flights support a requirement.
+
+    Attributes:
+        requirement: what was asked.
+        count: flights in which the event happened.
+        flights: of how many.
+        bound: the one-sided Clopper-Pearson bound at the requirement's confidence: upper where the probability is to
+            be small, lower where it is to be large.
+        holds: whether the bound supports the requirement.
+        least_flights: how many flights it takes at the very least, all of them without the event where it is to be
+            rare, and all with it where it is to be frequent.
+    """
+
+    requirement: Requirement
+    count: int
+    flights: int
+    bound: float
+    holds: bool
+    least_flights: int
+
+    @property
+    def sentence(self) -> str:
+        """The judgement with its numbers."""
+        asked = self.requirement
+        share = f" ({percent(self.count / self.flights)})" if self.flights else ""
+        told = (
+            f"{asked.text} {'holds' if self.holds else 'does not hold'}: {asked.event.text} in {self.count} of "
+            f"{count_of(self.flights, 'flight')}{share}, so with {100.0 * asked.confidence:g} % confidence at "
+            f"{'most' if asked.at_most else 'least'} {percent(self.bound, digits=3)}."
+        )
+        if self.flights >= self.least_flights:
+            return told
+        least = f"at least {count_of(self.least_flights, 'flight')}"
+        if self.least_flights > _MOST_TOLD:
+            least = f"more than {_MOST_TOLD:,} flights"
+        return f"{told} It takes {least}, {'none' if asked.at_most else 'all'} of them with that event."
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain data for `summary.json`."""
+        asked = asdict(self.requirement) | {"event": self.requirement.event.text}
+        return asdict(self) | {"requirement": asked, "sentence": self.sentence}
+
+
+def parse_requirement(text: str) -> Requirement:
+    """A requirement from its text.
+
+    Args:
+        text: `P(EVENT) OP SHARE @ CONFIDENCE%`: an event as `events.parse_event` takes it, one of
+            `< <= > >=`, a share from 1e-9 to 1 - 1e-9, as such or in percent, and the confidence, from 50 to
+            99.9999 percent.
+
+    Raises:
+        InputError: it is not of that form.
+        UnknownNameError: there is no such event.
+        ParameterError: a number is outside what is allowed.
+    """
+    text = " ".join(text.split())
+    found = _FORM.fullmatch(text)
+    if found is None:
+        raise InputError(
+            f"requirement {text!r} must read P(EVENT) OP SHARE @ CONFIDENCE%, with one of < <= > >=, such as "
+            f"{EXAMPLE!r}"
+        )
+    owner = f"requirement {text!r}"
+    share = _number(owner, "share", found["share"], *_SHARES)
+    confidence = _number(owner, "confidence", found["confidence"] + "%", *_CONFIDENCES)
+    return Requirement(
+        text=text,
+        event=parse_event(found["event"].strip()),
+        operation=found["operation"],
+        share=share,
+        confidence=confidence,
+    )
+
+
+def judge(table: pa.Table, requirement: Requirement) -> Judgement:
+    """Hold a campaign's flights against a requirement.
+
+    It holds when the one-sided Clopper-Pearson bound at its confidence is on the side that is asked for; so it takes
+    flights enough, and no flights support nothing.
+
+    Args:
+        table: `flights.parquet`.
+        requirement: what is asked.
+
+    Raises:
+        UnknownNameError: the table has no column that the event names.
+        InputError: the event compares text with a number.
+    """
+    happened = requirement.event.column(table)
+    count, flights = int(happened.sum()), happened.size
+    bound = (upper_bound if requirement.at_most else lower_bound)(count, flights, requirement.confidence)
+    return Judgement(
+        requirement=requirement,
+        count=count,
+        flights=flights,
+        bound=bound,
+        holds=flights > 0 and requirement.supported_by(bound),
+        least_flights=least_flights(requirement),
+    )
+
+
+def least_flights(requirement: Requirement) -> int:
+    """The smallest number of flights that can support a requirement, all of them as it wishes.
+
+    With n such flights the bound is (1 - confidence)^(1/n) from the far end, which asks for
+    n = ln(1 - confidence) / ln(1 - share); at a tie, the bound itself as it is computed decides.
+    """
+    kept = math.log1p(-requirement.share) if requirement.at_most else math.log(requirement.share)
+    n = max(1, math.ceil(math.log1p(-requirement.confidence) / kept))
+    near = range(max(1, n - 1), n + 2)
+    return next((k for k in near if requirement.supported_by(_best_bound(requirement, k))), n)
+
+
+def _best_bound(requirement: Requirement, n: int) -> float:
+    if requirement.at_most:
+        return upper_bound(0, n, requirement.confidence)
+    return lower_bound(n, n, requirement.confidence)
+
+
+def _number(owner: str, name: str, given: str, low: Decimal, high: Decimal) -> float:
+    """A share of one, given as such or in percent."""
+    in_percent = given.endswith("%")
+    if in_percent:
+        rule = f"from {(100 * low).normalize():f}% to {(100 * high).normalize():f}%"
+    else:
+        rule = f"a number from {low} to {high}".lower()
+    try:
+        value = Decimal(given.removesuffix("%").strip()) / (100 if in_percent else 1)
+        allowed = low <= value <= high
+    except ArithmeticError:
+        allowed = False
+    if not allowed:
+        raise ParameterError(owner, name, given, rule)
+    return float(value)

@@ -1,0 +1,118 @@
+"""What the command line prints of campaigns: progress on stderr, answers on stdout."""
+
+from __future__ import annotations
+
+import contextlib
+import datetime
+import re
+import time as clock
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from typing import Any, Final
+
+from rich.progress import BarColumn, Progress, TextColumn
+
+from quadsim.report.table import Grid
+from scenarios.campaign.report.campaign_tables import constraint_table, event_table, replay_command, worst_table
+from scenarios.campaign.report.campaign_text import campaign_sentences, verdict_sentence
+from scenarios.campaign.report.comparison_tables import comparison_tables, pairing
+from scenarios.campaign.run import Standing, Watch
+from scenarios.campaign.statistics.comparison import Comparison
+from scenarios.campaign.statistics.inference import proportion
+from scenarios.campaign.statistics.requirement import Judgement
+from scenarios.campaign.statistics.wording import interval
+from scenarios.commands import console
+from scenarios.commands.console import stderr, stdout, styled
+
+MOST_LINES: Final = 8
+"""Of a table on the terminal; the report has them all."""
+LEAST_WORDS, MOST_WORDS = 20, 60
+"""Characters of a reason on the terminal, as there is room."""
+_TIME: Final = re.compile(r"^at t = \S+ s: ")
+LINE_EVERY: Final = 30.0
+"""Between two lines of progress where stderr is no terminal [s]."""
+
+
+@contextlib.contextmanager
+def progress(*, enabled: bool) -> Iterator[Watch]:
+    """A bar on stderr, or a line now and then where that is no terminal, as in the log of a batch job."""
+    screen = stderr()
+    if not enabled:
+        yield lambda standing: None
+    elif screen.is_terminal:
+        columns = (TextColumn("flights"), BarColumn(), TextColumn("{task.description}"))
+        with Progress(*columns, console=screen, transient=True) as bars:
+            bar = bars.add_task("starting")
+            yield lambda standing: bars.update(
+                bar, completed=standing.flown, total=standing.flights, description=describe(standing)
+            )
+    else:
+        told = clock.perf_counter()
+
+        def tell(standing: Standing) -> None:
+            nonlocal told
+            if clock.perf_counter() - told > LINE_EVERY or standing.flown == standing.flights:
+                told = clock.perf_counter()
+                screen.print(describe(standing), soft_wrap=True)
+
+        yield tell
+
+
+def describe(standing: Standing) -> str:
+    """How far it is, how fast, until when, and how it looks."""
+    share = proportion(standing.failed, standing.flown)
+    left = (standing.flights - standing.flown) / standing.rate if standing.rate else 0.0
+    ends = interval(share.lower, share.upper)
+    return (
+        f"{standing.flown}/{standing.flights}, {standing.rate:.2f}/s, {datetime.timedelta(seconds=round(left))} left; "
+        f"{standing.failed} failed ({ends})"
+    )
+
+
+def print_campaign(
+    summary: Mapping[str, Any], failure: Sequence[str], judgements: Sequence[Judgement], where: str
+) -> None:
+    """What came of a campaign."""
+    out = stdout()
+    out.print(styled((summary["campaign"], "bold"), f": {verdict_sentence(summary)}"), soft_wrap=True)
+    for sentence in campaign_sentences(summary):
+        out.print(sentence, soft_wrap=True)
+    tables = [event_table(summary, failure), constraint_table(summary), worst_table(summary, where)]
+    brief = [replace(grid, note="", lines=grid.lines[:MOST_LINES]) for grid in tables if grid.lines]
+    shown = [_with_short_ends(grid, out.width) if grid.key == "worst" else grid for grid in brief]
+    console.print_grids(shown, None, prose=("constraint", "reason"))
+    if summary["worst"]:
+        command = replay_command(where, summary["worst"][0]["flight"])
+        out.print(styled("to fly one of them again: ", (command, "bold")), soft_wrap=True)
+    for judgement in judgements:
+        out.print(styled((judgement.sentence, "green" if judgement.holds else "red")), soft_wrap=True)
+    console.print_place(where)
+
+
+def _with_short_ends(grid: Grid, width: int) -> Grid:
+    """A table whose last column, of words, stays in a line each on a terminal so wide."""
+    others = zip(grid.head[:-1], *(line[:-1] for line in grid.lines), strict=True)
+    taken = sum(2 + max(len(head), *(len(cell.text) for cell in cells)) for head, *cells in others)
+    room = max(LEAST_WORDS, min(MOST_WORDS, width - taken))
+    lines = tuple((*line[:-1], replace(line[-1], text=_shortened(line[-1].text, room))) for line in grid.lines)
+    return replace(grid, lines=lines)
+
+
+def _shortened(text: str, room: int) -> str:
+    """A reason in one line, without its time, which stands beside it."""
+    line = _TIME.sub("", " ".join(text.split()))
+    return line if len(line) <= room else f"{line[: room - 3]}..."
+
+
+def print_replay(number: int, row: Mapping[str, Any], differing: Sequence[str]) -> None:
+    """Whether a replayed flight gave the campaign's numbers."""
+    if differing:
+        stdout().print(styled((f"flight {number} differs from the campaign's in {', '.join(differing)}", "red")))
+    else:
+        stdout().print(f"flight {number}: {len(row)} columns, each the same as in the campaign")
+
+
+def print_comparison(comparison: Comparison, where: str) -> None:
+    """Whether one campaign is better than another."""
+    stdout().print(f"{comparison.sentence} {pairing(comparison)}", soft_wrap=True)
+    console.print_grids(comparison_tables(comparison), where)

@@ -1,0 +1,293 @@
+"""What the command line prints: tables and progress bars.  Tables go to stdout, progress to stderr."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from typing import Any, Final
+
+from rich.box import SIMPLE_HEAD
+from rich.console import Console
+from rich.progress import BarColumn, TaskID, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import Progress as ProgressBars
+from rich.table import Table
+from rich.text import Text
+
+from quadsim.controller import law_name
+from quadsim.errors import printable
+from quadsim.report.table import Cell, Grid, Mark, Row
+from scenarios.progress import Progress, silent
+
+
+class PlainConsole(Console):
+    """Shows every string as it is, whoever wrote it: paths, names, reasons, summaries.
+
+    What is to have a style is a `rich.text.Text`, made by `styled`.
+    """
+
+    def __init__(self, *, stderr: bool = False, width: int | None = None) -> None:
+        super().__init__(stderr=stderr, width=width, highlight=False, markup=False, emoji=False)
+
+    def render_str(self, text: str, **options: Any) -> Text:
+        """See `rich.console.Console.render_str`; all strings come by here, those of tables too."""
+        return super().render_str(printable(text), **(options | {"markup": False, "emoji": False, "highlight": False}))
+
+
+def styled(*parts: str | tuple[str, str]) -> Text:
+    """Texts in a row, each by itself or with its style."""
+    return Text.assemble(
+        *(printable(part) if isinstance(part, str) else (printable(part[0]), part[1]) for part in parts)
+    )
+
+
+def stdout() -> PlainConsole:
+    """Stdout; wide enough for the tables where it is a file or a pipe."""
+    console = PlainConsole()
+    return console if console.is_terminal else PlainConsole(width=120)
+
+
+def stderr() -> PlainConsole:
+    """Stderr."""
+    return PlainConsole(stderr=True)
+
+
+def print_listing(sections: Mapping[str, Mapping[str, str]]) -> None:
+    """Names with one line each, by section."""
+    console = stdout()
+    for title, entries in sections.items():
+        table = Table(
+            title=title, title_justify="left", title_style="bold", box=None, show_header=False, padding=(0, 2)
+        )
+        table.add_column(no_wrap=True, style="cyan")
+        table.add_column()
+        for name, line in entries.items():
+            table.add_row(name, line)
+        console.print(table)
+        console.print()
+
+
+def print_summary(summary: Mapping[str, Any], where: str | None) -> None:
+    """A flight's outcome, tracking, audit and solver, from its summary."""
+    console = stdout()
+    flown = styled(f"  {summary['duration']:.2f} s flown")
+    console.print(styled((summary["scenario"], "bold"), "  ") + outcome(summary) + flown)
+    if "course" in summary:
+        console.print(summary["course"]["sentence"], soft_wrap=True)
+    if summary["tracking"]:
+        console.print(_tracking_table(summary["tracking"]))
+    if summary["constraints"]:
+        console.print(audit_table(summary["constraints"]))
+    if summary["tracking"]:
+        for line in _controller_lines(summary):
+            console.print(line)
+    for line in _effect_lines(summary):
+        console.print(line)
+    if "reaudit" in summary:
+        again = summary["reaudit"]
+        told = "as recorded" if again["satisfied"] == summary["satisfied"] else "its verdict is recorded alone"
+        console.print(f"audited again from the tables, {again['rate']:g} rows per second: {told}")
+    if where is not None:
+        print_place(where)
+
+
+def print_place(where: str) -> None:
+    """Where something was written."""
+    stdout().print(styled("written to ", (where, "bold")), soft_wrap=True)
+
+
+def say(text: str) -> None:
+    """Tell a person, or a log, something that is no result."""
+    stderr().print(f"quadsim: {text}", soft_wrap=True)
+
+
+def print_notice(text: str) -> None:
+    """Tell a person at a terminal something that work begins with."""
+    console = stderr()
+    if console.is_terminal:
+        console.print(text, soft_wrap=True)
+
+
+def outcome(summary: Mapping[str, Any]) -> Text:
+    """Completed or aborted with its reason, the verdict on the required constraints, and whether that was expected."""
+    expected, as_expected = summary.get("expected", "satisfied"), summary.get("as_expected", True)
+    remark = ""
+    if expected != "satisfied":
+        remark = ", as the scenario expects" if as_expected else f", where the scenario expects it {expected}"
+    colour = "green" if as_expected and (remark or summary["satisfied"]) else "red"
+    if summary["status"] != "completed":
+        return styled((f"aborted{remark}", colour), f": {summary['reason']}")
+    verdict = "every required constraint holds" if summary["satisfied"] else "a required constraint does not hold"
+    return styled((f"completed, {verdict}{remark}", colour))
+
+
+def audit_table(constraints: Sequence[Mapping[str, Any]]) -> Table:
+    """Every constraint with its bounds, peaks, margin, tolerances and verdict."""
+    caption = "beyond: seconds; tolerance: at the samples / at the physics rate"
+    if any(not entry["required"] for entry in constraints):
+        caption += ";  * reported, not required by the scenario"
+    table = _table("audit at the physics rate", caption=caption)
+    table.add_column("constraint", no_wrap=True)
+    for name in ("bounds", "sampled", "plant", "margin", "beyond", "tolerance"):
+        table.add_column(name, justify="right", no_wrap=True)
+    table.add_column("verdict", no_wrap=True)
+    for entry in constraints:
+        table.add_row(
+            f"{entry['name']} [{entry['unit']}]",
+            _range(entry["lower"], entry["upper"]),
+            _number(entry["peak_sampled"]),
+            _number(entry["peak_plant"]),
+            _number(entry["worst_margin"]),
+            _number(entry["time_violated"]),
+            f"{_number(entry['tolerance_sampled'])}/{_number(entry['tolerance'])}",
+            _verdict(entry),
+        )
+    return table
+
+
+def _verdict(entry: Mapping[str, Any]) -> Text:
+    if entry["satisfied"]:
+        return styled(("holds", "green"))
+    if entry["worst_margin"] is None:
+        return styled(("not reached", "red"))  # the flight ended before its time window
+    return styled(("VIOLATED", "red") if entry["required"] else ("exceeded*", "yellow"))
+
+
+def _tracking_table(tracking: Mapping[str, Any]) -> Table:
+    table = _table("tracking, real minus filtered reference")
+    table.add_column("")
+    for channel, unit in tracking["unit"].items():
+        table.add_column(f"{channel} [{unit}]", justify="right")
+    for name in ("rmse", "max_error", "final_error", "overshoot"):
+        table.add_row(name.replace("_", " "), *(f"{tracking[name][channel]:.4g}" for channel in tracking["unit"]))
+    return table
+
+
+def _controller_lines(summary: Mapping[str, Any]) -> Iterator[str]:
+    control, controller = summary["control"], summary["controller"]
+    statuses = ", ".join(f"{count} {status}" for status, count in controller["statuses"].items())
+    times = controller["step_ms"]
+    how = law_name(controller["name"]) + (f" by {controller['solver']}" if controller["solver"] else "")
+    yield (
+        f"{how}: {statuses}; step p50 {times['p50']:.3f}, p99 {times['p99']:.3f}, max {times['max']:.3f} ms "
+        f"of {controller['deadline_ms']:g} ms"
+    )
+    yield (
+        f"commanded speeds {control['speed_min']:.2f} .. {control['speed_max']:.2f} rad/s, "
+        f"steps {control['slew_min']:.2f} .. {control['slew_max']:.2f} rad/s per period; "
+        f"simulated in {summary['wall_s']['simulate']:.2f} s"
+    )
+
+
+def _effect_lines(summary: Mapping[str, Any]) -> Iterator[str]:
+    """What a flight's effects did, where it has them: ground, late commands, errors of the estimate."""
+    if "ground" in summary:
+        ground = summary["ground"]
+        left = "started in the air" if ground["started"] == "flying" else "never left it"
+        if ground["takeoff_time"] is not None:
+            left = f"left it at {ground['takeoff_time']:.2f} s"
+        touch = ground["touchdown"]
+        met = ""
+        if touch is not None:
+            met = (
+                f", met it at {touch['time']:.2f} s with {touch['speed']:.3g} m/s down, "
+                f"{touch['horizontal_speed']:.3g} m/s along and {touch['tilt']:.3g} deg of tilt"
+            )
+        yield f"ground: {left}{met}; {ground['phase']} at the end"
+    if "computation" in summary:
+        delay = summary["computation"]["delay_ms"]
+        yield (
+            f"simulated computation: p50 {delay['p50']:.3g}, p99 {delay['p99']:.3g}, max {delay['max']:.3g} ms; "
+            f"{summary['computation']['missed']} commands too late to be used"
+        )
+    if "estimation" in summary:
+        rmse = summary["estimation"]["rmse"]
+        lengths = ", ".join(f"{name} {rmse[name]:.3g}" for name in ("x", "y", "z"))
+        angles = ", ".join(f"{name} {math.degrees(rmse[name]):.3g}" for name in ("roll", "pitch", "yaw"))
+        yield f"RMS error of what the controller was told: {lengths} m; {angles} deg"
+
+
+_BRIEF: Final = ("outcome", "required constraints", "RMS error", "verdict", "statuses", "whole step, m")
+"""How the labels begin of the rows that a terminal shows; the page and its `comparison.md` have them all."""
+
+
+def print_comparison(rows: Sequence[Row], names: Sequence[str], where: str) -> None:
+    """The comparison's answers side by side: outcomes, tracking, verdicts, times."""
+    console = stdout()
+    table = _table("comparison")
+    table.add_column("", no_wrap=True)
+    for name in names:
+        table.add_column(name, justify="right")
+    for row in rows:
+        if row.label.startswith(_BRIEF):
+            label = row.group if row.headline else row.label
+            unit = f" [{row.unit}]" if row.unit else ""
+            table.add_row(label + unit, *(_cell(cell) for cell in row.cells))
+    console.print(table)
+    console.print(styled("every number, plots and films: ", (where, "bold")), soft_wrap=True)
+
+
+def print_grids(grids: Sequence[Grid], where: str | None, *, prose: Collection[str] = ()) -> None:
+    """Tables of cases, one below the other, with what a reader has to know of each; `prose` names columns of words."""
+    console = stdout()
+    for grid in grids:
+        table = _table(grid.title, caption=grid.note.replace("`", "") or None)
+        for i, name in enumerate(grid.head):
+            table.add_column(name, justify="right" if i and name not in prose else "left", no_wrap=not i)
+        for line in grid.lines:
+            table.add_row(*(_cell(cell) for cell in line))
+        console.print(table)
+        console.print()
+    if where is not None:
+        print_place(where)
+
+
+_STYLES: Final = {Mark.BEST: "bold", Mark.GOOD: "green", Mark.WARN: "yellow", Mark.BAD: "red"}
+
+
+def _cell(cell: Cell) -> Text:
+    return styled((cell.text, _STYLES.get(cell.mark, "")))
+
+
+def _number(value: float | None) -> str:
+    if value is None:
+        return "-"
+    return f"{value:.0f}" if 1e3 <= abs(value) < 1e5 else f"{value:.3g}".replace("e-0", "e-")
+
+
+def _range(lower: float | None, upper: float | None) -> str:
+    if lower is not None and upper is not None and lower == -upper:
+        return f"±{_number(upper)}"
+    return f"{_number(lower)}..{_number(upper)}"
+
+
+def _table(title: str, caption: str | None = None) -> Table:
+    return Table(
+        title=title,
+        title_justify="left",
+        title_style="bold",
+        caption=caption,
+        caption_justify="left",
+        box=SIMPLE_HEAD,
+        padding=0,
+        pad_edge=False,
+    )
+
+
+@contextlib.contextmanager
+def progress_bars(*, enabled: bool) -> Iterator[Progress]:
+    """Progress bars on stderr, one per stage; nothing when not enabled or not on a terminal."""
+    console = stderr()
+    if not enabled or not console.is_terminal:
+        yield silent
+        return
+    columns = (TextColumn("{task.description:<10}"), BarColumn(), TextColumn("{task.percentage:>3.0f} %"))
+    with ProgressBars(*columns, TimeElapsedColumn(), TimeRemainingColumn(), console=console, transient=True) as bars:
+        tasks: dict[str, TaskID] = {}
+
+        def report(stage: str, done: int, total: int) -> None:
+            if stage not in tasks:
+                tasks[stage] = bars.add_task(stage, total=total)
+            bars.update(tasks[stage], completed=done, total=total)
+
+        yield report

@@ -1,0 +1,267 @@
+"""What a vehicle's numbers amount to: hover, thrust and torque margins, and the poles of its linear model."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from typing import Any, Final
+
+import numpy as np
+from scipy.optimize import linprog
+
+from mpc.model import continuous_model, discretise
+from quadsim.report.table import Cell, Grid, format_number
+from quadsim.state import INDEX, Array
+from quadsim.vehicle import N_ROTORS, VEHICLE_UNITS, Vehicle
+
+AXES: Final = ("x", "y", "z")
+SHEET_PERIOD: Final = 0.05
+"""Control period of the discrete poles [s], the paper's."""
+_RPM: Final = 60.0 / (2.0 * math.pi)
+
+
+@dataclass(frozen=True, kw_only=True)
+class TorqueRange:
+    """The torques about one body axis that hover leaves room for.
+
+    Attributes:
+        axis: x, y or z.
+        lowest: torque [N m].
+        highest: torque [N m].
+        lowest_pure: the same with no torque about the other two axes [N m].
+        highest_pure: the same with no torque about the other two axes [N m].
+        lowest_acceleration: what `lowest` gives from rest [rad/s^2].
+        highest_acceleration: what `highest` gives from rest [rad/s^2].
+    """
+
+    axis: str
+    lowest: float
+    highest: float
+    lowest_pure: float
+    highest_pure: float
+    lowest_acceleration: float
+    highest_acceleration: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class VehicleSheet:
+    """Figures derived from a vehicle's numbers, all at hover.
+
+    Attributes:
+        weight: m g [N].
+        hover_speed: omega_bar [rad/s].
+        hover_speed_rpm: the same [rpm].
+        speed_range_used: where hover lies between the lowest speed, 0, and the highest, 1 [-].
+        thrust_to_weight: all rotors at their highest speed, over the weight [-].
+        climb_acceleration: largest upward acceleration from hover, level [m/s^2].
+        steady_tilt: largest tilt at which the rotors still carry the weight, cos(tilt) = 1 / thrust_to_weight [deg].
+        torques: about x, y and z.
+        thrust_slope: of one rotor, 2 b omega_bar [N s/rad].
+        input_slopes: largest entry of B_c in the rows of vz [m/s^2 per rad/s] and of the three rates [rad/s^2 per
+            rad/s]: what the controller believes one rotor does per rad/s.
+        integrator_chains: lengths of the chains of integrators that the linear model falls into, longest first.
+        continuous_poles: of A_c [1/s].
+        discrete_poles: of A at `period` [-].
+        period: tau_s [s].
+        lag_poles: of the rotors' speeds when they rise and fall, continuous [1/s], as far as the file gives them.
+        discrete_lag_poles: the same at `period` [-].
+    """
+
+    weight: float
+    hover_speed: float
+    hover_speed_rpm: float
+    speed_range_used: float
+    thrust_to_weight: float
+    climb_acceleration: float
+    steady_tilt: float
+    torques: tuple[TorqueRange, ...]
+    thrust_slope: float
+    input_slopes: dict[str, float]
+    integrator_chains: tuple[int, ...]
+    continuous_poles: tuple[float, ...]
+    discrete_poles: tuple[float, ...]
+    period: float
+    lag_poles: dict[str, float]
+    discrete_lag_poles: dict[str, float]
+
+
+def make_sheet(vehicle: Vehicle, *, period: float = SHEET_PERIOD) -> VehicleSheet:
+    """The figures of a vehicle.
+
+    Args:
+        vehicle: the numbers.
+        period: control period of the discrete poles [s].
+    """
+    A_c, B_c = continuous_model(vehicle)
+    A, _ = discretise(A_c, B_c, period)
+    chains = integrator_chains(A_c)
+    ratio = (vehicle.speed_max / vehicle.hover_speed) ** 2
+    lags = {name: value for name in ("rotor_rise", "rotor_fall") if (value := getattr(vehicle, name)) is not None}
+    return VehicleSheet(
+        weight=vehicle.mass * vehicle.gravity,
+        hover_speed=vehicle.hover_speed,
+        hover_speed_rpm=_RPM * vehicle.hover_speed,
+        speed_range_used=(vehicle.hover_speed - vehicle.speed_min) / (vehicle.speed_max - vehicle.speed_min),
+        thrust_to_weight=ratio,
+        climb_acceleration=(ratio - 1.0) * vehicle.gravity,
+        steady_tilt=math.degrees(math.acos(min(1.0, 1.0 / ratio))),
+        torques=torque_ranges(vehicle),
+        thrust_slope=2.0 * vehicle.thrust_coefficient * vehicle.hover_speed,
+        input_slopes={
+            name: float(np.abs(B_c[INDEX[name]]).max()) for name in ("vz", "roll_rate", "pitch_rate", "yaw_rate")
+        },
+        integrator_chains=chains,
+        # A_c permutes to a strictly upper triangular matrix: chains of integrators, whose poles are its diagonal.
+        continuous_poles=tuple(np.diag(A_c).tolist()),
+        discrete_poles=tuple(np.diag(A).tolist()),
+        period=period,
+        lag_poles={name: -1.0 / value for name, value in lags.items()},
+        discrete_lag_poles={name: math.exp(-period / value) for name, value in lags.items()},
+    )
+
+
+def torque_ranges(vehicle: Vehicle) -> tuple[TorqueRange, ...]:
+    """The largest torques of each sign about x, y, z with the thrust kept at the weight and every rotor in its range.
+
+    A linear programme in the squared speeds v_i = w_i^2: the torque about an axis is a row of the allocation matrix
+    times v, the thrust is its first row times v, and v_i lies between the squares of the speed limits.
+    """
+    ranges = []
+    for axis, name in enumerate(AXES):
+        (low, high), (low_pure, high_pure) = (_extremes(vehicle, 1 + axis, pure=pure) for pure in (False, True))
+        ranges.append(
+            TorqueRange(
+                axis=name,
+                lowest=low,
+                highest=high,
+                lowest_pure=low_pure,
+                highest_pure=high_pure,
+                lowest_acceleration=low / vehicle.inertia[axis],
+                highest_acceleration=high / vehicle.inertia[axis],
+            )
+        )
+    return tuple(ranges)
+
+
+def integrator_chains(A_c: Array) -> tuple[int, ...]:
+    """Sizes of the Jordan blocks of a nilpotent matrix (n, n), longest first: its chains of integrators.
+
+    rank A^(k-1) - rank A^k counts the blocks of size k or more.
+    """
+    ranks = [np.linalg.matrix_rank(np.linalg.matrix_power(A_c, k)) for k in range(A_c.shape[0] + 1)]
+    assert ranks[-1] == 0, "the hover model has poles away from zero"
+    at_least = [int(before - after) for before, after in itertools.pairwise(ranks)]
+    return tuple(sum(count > i for count in at_least) for i in range(at_least[0]))
+
+
+def sheet_to_json(vehicle: Vehicle, sheet: VehicleSheet, sources: Mapping[str, str]) -> dict[str, Any]:
+    """All of it as plain values: the vehicle, each parameter with unit and source, and what follows from them."""
+    return {
+        "name": vehicle.name,
+        "description": vehicle.description,
+        "parameters": {
+            name: {"value": value, "unit": unit, "source": sources[name]}
+            for name, unit in VEHICLE_UNITS.items()
+            if (value := getattr(vehicle, name)) is not None
+        },
+        "derived": asdict(sheet),
+    }
+
+
+def sheet_tables(vehicle: Vehicle, sheet: VehicleSheet, sources: Mapping[str, str]) -> list[Grid]:
+    """All of it as tables: figures, torques, linear model, parameters."""
+    return [
+        _grid(f"{vehicle.name} at hover", ("", "value", "unit"), _figures(vehicle, sheet), note=vehicle.description),
+        _grid(
+            "torque authority at hover",
+            ("axis", "torque [N m]", "acceleration [rad/s^2]", "pure torque [N m]"),
+            [
+                (
+                    torque.axis,
+                    _span(torque.lowest, torque.highest),
+                    _span(torque.lowest_acceleration, torque.highest_acceleration),
+                    _span(torque.lowest_pure, torque.highest_pure),
+                )
+                for torque in sheet.torques
+            ],
+            note="thrust kept at the weight, every rotor within its range; pure: no torque about the other axes",
+        ),
+        _grid("linear model at hover", ("", "continuous [1/s]", f"discrete, {1e3 * sheet.period:g} ms"), _poles(sheet)),
+        _grid(
+            "parameters",
+            ("parameter", "value", "unit", "source"),
+            [
+                (name, _value(value), unit, sources[name])
+                for name, unit in VEHICLE_UNITS.items()
+                if (value := getattr(vehicle, name)) is not None
+            ],
+            note="short names of sources are spelt out at the head of the vehicle's file",
+        ),
+    ]
+
+
+def _extremes(vehicle: Vehicle, row: int, *, pure: bool) -> tuple[float, float]:
+    """Smallest and largest torque [N m] of one row of the allocation matrix; `pure`: the other torques vanish."""
+    top = vehicle.speed_max**2
+    matrix = top * vehicle.allocation  # in v / speed_max^2, so that the programme is well scaled
+    units = np.abs(matrix).max(axis=1)
+    fixed = [0, *(other for other in (1, 2, 3) if pure and other != row)]
+    equal = np.zeros(len(fixed))
+    equal[0] = vehicle.mass * vehicle.gravity / units[0]
+    found = []
+    for sign in (1.0, -1.0):
+        solution = linprog(
+            sign * matrix[row] / units[row],
+            A_eq=matrix[fixed] / units[fixed, None],
+            b_eq=equal,
+            bounds=(vehicle.speed_min**2 / top, 1.0),
+            method="highs",
+        )
+        assert solution.success, "hover itself is feasible"
+        found.append(float(sign * solution.fun * units[row]))
+    return found[0], found[1]
+
+
+def _figures(vehicle: Vehicle, sheet: VehicleSheet) -> list[tuple[str, ...]]:
+    slopes = sheet.input_slopes
+    return [
+        ("mass", format_number(vehicle.mass), "kg"),
+        ("weight", format_number(sheet.weight), "N"),
+        ("hover speed", format_number(sheet.hover_speed), "rad/s"),
+        ("", format_number(sheet.hover_speed_rpm), "rpm"),
+        ("speed range used", f"{100.0 * sheet.speed_range_used:.1f}", "%"),
+        ("thrust to weight", format_number(sheet.thrust_to_weight), "-"),
+        ("largest climb acceleration", format_number(sheet.climb_acceleration), "m/s^2"),
+        ("largest steady tilt", format_number(sheet.steady_tilt), "deg"),
+        ("thrust of one rotor per rad/s", format_number(sheet.thrust_slope), "N s/rad"),
+        ("climb per rad/s of one rotor, as believed", format_number(slopes["vz"]), "m/s^2 per rad/s"),
+        *(
+            (f"{name} per rad/s of one rotor, as believed", format_number(slopes[f"{name}_rate"]), "rad/s^2 per rad/s")
+            for name in ("roll", "pitch", "yaw")
+        ),
+    ]
+
+
+def _poles(sheet: VehicleSheet) -> list[tuple[str, ...]]:
+    chains = ", ".join(str(length) for length in sheet.integrator_chains)
+    body = f"rigid body: {len(sheet.continuous_poles)} poles, chains of {chains} integrators"
+    lines: list[tuple[str, ...]] = [(body, "0", "1")]
+    for name, pole in sheet.lag_poles.items():
+        label = f"rotors that {'rise' if name == 'rotor_rise' else 'fall'}: {N_ROTORS} poles, unknown to the controller"
+        lines.append((label, format_number(pole), format_number(sheet.discrete_lag_poles[name])))
+    return lines
+
+
+def _grid(title: str, head: tuple[str, ...], lines: list[tuple[str, ...]], note: str = "") -> Grid:
+    cells = tuple(tuple(Cell(text=text) for text in line) for line in lines)
+    return Grid(key=head[0], title=title, head=head, lines=cells, note=note)
+
+
+def _span(low: float, high: float) -> str:
+    return f"{format_number(low)} .. {format_number(high)}"
+
+
+def _value(value: object) -> str:
+    return ", ".join(f"{item:g}" for item in value) if isinstance(value, tuple) else f"{value:g}"

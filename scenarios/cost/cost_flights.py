@@ -1,0 +1,183 @@
+"""Flights as a study holds them, flown over processes, and what their controllers' steps take."""
+
+from __future__ import annotations
+
+import multiprocessing
+import signal
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from mpc.constrained import ConstrainedMPC
+from mpc.solvers import QPSolver
+from mpc.unconstrained import UnconstrainedMPC
+from quadsim.controller import Controller
+from quadsim.errors import MissingPackageError
+from quadsim.flight import metrics
+from quadsim.flight.log import ControlLog, FlightLog
+from quadsim.state import REFERENCE_STATES
+from scenarios.bench.queries import QueriedController, flight_between, recorded
+from scenarios.bench.timing import stretches, time_in_turns
+from scenarios.build import build_controller, build_problem
+from scenarios.cost.study import CandidateTimes, Outcome
+from scenarios.courses.make import build_course_steps
+from scenarios.machine import usable_cores
+from scenarios.parts.vehicle import build_vehicle
+from scenarios.progress import Progress
+from scenarios.run import fly_scenario
+from scenarios.schema.scenario import Scenario
+
+REPEATS: Final = 3
+SWEEP_STRIDE: Final = 3
+"""Of a flight in a sweep, one stretch of so many is timed."""
+LONGEST_PASS: Final = 20.0
+"""A candidate that takes longer than this for all periods of a flight [s] is timed once."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Flown:
+    """A flight as a worker process hands it back."""
+
+    outcome: Outcome
+    control: ControlLog
+
+
+def key(scenario: Scenario) -> str:
+    """The same for equal scenarios, and different for others."""
+    return scenario.model_dump_json()
+
+
+def fly(scenario: Scenario) -> Flown:
+    """Fly a scenario, here."""
+    flight = fly_scenario(scenario)
+    return Flown(outcome=_outcome(scenario, flight.log), control=flight.log.control)
+
+
+def _outcome(scenario: Scenario, log: FlightLog) -> Outcome:
+    control = log.control
+    outputs = control.truth[:, REFERENCE_STATES]
+    return Outcome(
+        reason=log.reason,
+        flown=round(control.t.size * scenario.control_period, 9),
+        statuses={status: control.status.count(status) for status in sorted(set(control.status))},
+        fallbacks=int(np.count_nonzero(control.fallback)),
+        active=int(np.count_nonzero(control.active)),
+        numbers=_numbers(log) if control.t.size else {},
+        settling=metrics.settling(control.t, outputs, build_course_steps(scenario)),
+    )
+
+
+def _numbers(log: FlightLog) -> dict[str, float]:
+    """A value for each of `scenarios.cost.study.MEASURES`."""
+    tracking, control = metrics.tracking(log.control), metrics.control(log.control)
+    rmse = tracking["rmse"]
+    return {
+        "tilt_sampled": metrics.peak_tilt(log.control.truth),
+        "tilt_plant": metrics.peak_tilt(log.plant.state),
+        **{f"rmse_{axis}": rmse[axis] for axis in "xyz"},
+        "rmse_yaw": float(np.degrees(rmse["yaw"])),
+        "end_error": max(abs(error) for error in tracking["final_error"].values()),
+        "speed_max": control["speed_max"],
+        "step_max": max(-control["slew_min"], control["slew_max"]),
+        "total_variation": control["total_variation"],
+    }
+
+
+def fly_all(
+    scenarios: Sequence[Scenario], flown: Mapping[str, Flown], workers: int | None, progress: Progress
+) -> dict[str, Flown]:
+    """Fly what was not flown yet, over processes; results, with those given, by `key`."""
+    results = dict(flown)
+    wanted = {name: scenario for scenario in scenarios if (name := key(scenario)) not in results}
+    context = multiprocessing.get_context("spawn")  # a fork would take over whatever threads hold
+    pool = ProcessPoolExecutor(workers or usable_cores(), mp_context=context, initializer=_leave_interrupts_to_parent)
+    try:
+        futures = {pool.submit(fly, scenario): name for name, scenario in wanted.items()}
+        for done, future in enumerate(as_completed(futures), start=1):
+            results[futures[future]] = future.result()
+            progress("flights", done, len(futures))
+    finally:
+        pool.shutdown(cancel_futures=True)
+    return results
+
+
+def _leave_interrupts_to_parent() -> None:
+    """Ctrl-C reaches every process of a terminal; the parent alone is to say so."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
+def time_candidates(
+    scenario: Scenario, log: ControlLog, solvers: Sequence[str], progress: Progress
+) -> tuple[tuple[CandidateTimes, ...], dict[str, str]]:
+    """Everything that can compute a command, timed on the queries of a flight; and what could not take part.
+
+    See `scenarios.bench.timing` for how.
+    """
+    if not log.t.size:
+        return (), {}
+    vehicle = build_vehicle(scenario)
+    problem = build_problem(scenario, vehicle)
+    controllers: dict[str, Controller] = {
+        "unconstrained gain": UnconstrainedMPC(problem),
+        "constrained, as flown": build_controller(scenario, vehicle),
+    }
+    left_out = {}
+    for solver in solvers:
+        try:
+            controllers[f"QP by {solver}"] = ConstrainedMPC(problem, QPSolver(solver, problem), shortcut=False)
+        except MissingPackageError as error:
+            left_out[solver] = str(error)
+    asked = {
+        name: QueriedController(each, recorded(scenario, log, problem.horizon)) for name, each in controllers.items()
+    }
+    with flight_between(scenario, vehicle) as between:
+        laps = time_in_turns(
+            asked,
+            stretches(log.t.size, 1),
+            between=between,
+            repeats=REPEATS,
+            rng=np.random.default_rng(scenario.seed),
+            longest_pass=LONGEST_PASS,
+            progress=lambda done, total: progress("steps", done, total),
+        )
+    contenders = (
+        CandidateTimes(
+            name=name,
+            step_ms=laps[name].median,
+            statuses=tuple(each.statuses[period] for period in range(log.t.size)),
+            repeats=len(laps[name].ms),
+        )
+        for name, each in asked.items()
+    )
+    return tuple(contenders), left_out
+
+
+def time_flights(
+    scenarios: Sequence[Scenario], flown: Mapping[str, Flown], progress: Progress
+) -> dict[str, dict[str, float]]:
+    """Median, percentiles and maximum of each flight's controller step [ms], by `key`.
+
+    A flight of not one period has none.
+    """
+    wanted = {key(scenario): scenario for scenario in scenarios}
+    timed: dict[str, dict[str, float]] = {}
+    for done, (name, scenario) in enumerate(wanted.items()):
+        log = flown[name].control
+        if log.t.size:
+            vehicle = build_vehicle(scenario)
+            controller = build_controller(scenario, vehicle)
+            candidate = QueriedController(controller, recorded(scenario, log, controller.horizon))
+            with flight_between(scenario, vehicle) as between:
+                laps = time_in_turns(
+                    {controller.name: candidate},
+                    stretches(log.t.size, SWEEP_STRIDE),
+                    between=between,
+                    repeats=REPEATS,
+                    rng=np.random.default_rng(scenario.seed),
+                )
+            timed[name] = metrics.percentiles(laps[controller.name].median)
+        progress("sweeps", done + 1, len(wanted))
+    return timed

@@ -1,0 +1,280 @@
+"""From `[controller]` to a law that flies: the MPCs and their fallback, the baselines, one's own.
+
+Each law is imported where it is made, so that no command loads those it does not fly.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any, Final
+
+import numpy as np
+
+from mpc.answer import ActuatorBounds
+from mpc.constraints import Bounds, Constraint, Penalty
+from mpc.fallback.settings import FallbackSettings
+from mpc.model import hover_model
+from mpc.ocp import Objective, Problem, lqr_terminal_weight
+from mpc.robust.tightening import SHORTEST_LAG
+from quadsim.controller import Controller
+from quadsim.errors import InputError, ParameterError
+from quadsim.state import INDEX, N_STATES, STATE_NAMES, Array
+from quadsim.vehicle import N_ROTORS, Vehicle
+from scenarios.parts.plugin import build_plugin
+from scenarios.schema.baselines import GeometricSpec, LQRSpec, PIDSpec
+from scenarios.schema.controller import ConstrainedSpec, ControllerSpec, UnconstrainedSpec
+from scenarios.schema.fallback import FallbackSpec
+from scenarios.schema.optimisation import ANGLES, BoundedSpec, InputWeightsSpec, SoftSpec, WeightedSpec
+from scenarios.schema.plugin import PluginSpec
+from scenarios.schema.robust import RobustSpec
+
+FALLBACK_SHARE: Final = 0.8
+"""Tilt of the fallback over the tightest bound on it: the controller finds a vehicle that it can take over."""
+USUAL_TILT: Final = math.degrees(FallbackSettings().tilt)
+"""The fallback's tilt where nothing bounds it more tightly [deg]."""
+SMALLEST_TILT: Final = 0.5
+"""With less the fallback cannot hold against anything, whatever the bounds are [deg]."""
+
+
+def make_problem(spec: WeightedSpec, vehicle: Vehicle, period: float) -> Problem:
+    """The optimisation of the paper's two controllers."""
+    model, objective = hover_model(vehicle, period), make_objective(spec.output_weights, spec.input_weights)
+    if spec.terminal == "lqr":
+        objective = replace(objective, P=lqr_terminal_weight(model, objective))
+    return Problem(
+        model=model,
+        horizon=spec.horizon,
+        objective=objective,
+        bounds=make_bounds(spec) if isinstance(spec, BoundedSpec) else None,
+        constraints=make_polytopes(spec) if isinstance(spec, BoundedSpec) else (),
+    )
+
+
+def make_objective(output_weights: dict[str, float], input_weights: InputWeightsSpec) -> Objective:
+    """C_r, Q_y and Q_u of weights by the states' names."""
+    regulated = [name for name in STATE_NAMES if name in output_weights]
+    return Objective(
+        C_r=_selection(regulated),
+        Q_y=np.diag([output_weights[name] for name in regulated]),
+        Q_u=np.diag(np.broadcast_to(np.asarray(input_weights.speed, float), N_ROTORS)),
+    )
+
+
+def make_bounds(spec: BoundedSpec) -> Bounds:
+    """The bounds in SI units."""
+    constrained = [name for name in STATE_NAMES if name in spec.output_bounds]
+    scale = np.array([math.radians(1.0) if name in ANGLES else 1.0 for name in constrained])
+    pairs = np.array([spec.output_bounds[name] for name in constrained], float).reshape(-1, 2)
+    lower_speed, upper_speed = spec.input_bounds.speed
+    lower_slew, upper_slew = spec.input_bounds.slew
+    return Bounds(
+        C_c=_selection(constrained),
+        y_min=scale * pairs[:, 0],
+        y_max=scale * pairs[:, 1],
+        delta_min=np.full(N_ROTORS, lower_slew),
+        delta_max=np.full(N_ROTORS, upper_slew),
+        u_min=np.full(N_ROTORS, lower_speed),
+        u_max=np.full(N_ROTORS, upper_speed),
+    )
+
+
+def make_polytopes(spec: BoundedSpec) -> tuple[Constraint, ...]:
+    """`[[controller.polytopes]]` as rows over the 12 states and four rotor speeds, each in its own unit."""
+    found = []
+    for polytope in spec.polytopes:
+        rows, count = np.array(polytope.rows, float), len(polytope.rows)
+        C, D = np.zeros((count, N_STATES)), np.zeros((count, N_ROTORS))
+        for name, column in zip(polytope.of, rows.T, strict=True):
+            if name in INDEX:
+                C[:, INDEX[name]] = column * (math.degrees(1.0) if name in ANGLES else 1.0)
+            else:
+                D[:, int(name.removeprefix("speed_")) - 1] = column
+        soft = polytope.soft
+        found.append(
+            Constraint(
+                name=polytope.name,
+                lower=np.full(count, -math.inf) if polytope.lower is None else np.array(polytope.lower, float),
+                upper=np.full(count, math.inf) if polytope.upper is None else np.array(polytope.upper, float),
+                C=C,
+                D=D,
+                penalty=None if soft is None else make_penalty(soft, count),
+            )
+        )
+    return tuple(found)
+
+
+def make_penalty(soft: SoftSpec, rows: int) -> Penalty:
+    """The price of violating each of so many rows."""
+    return Penalty(l1=np.full(rows, float(soft.linear)), l2=np.full(rows, float(soft.quadratic)))
+
+
+def make_controller(spec: ControllerSpec, vehicle: Vehicle, period: float) -> Controller:
+    """The law, set up and ready to be flown.
+
+    Raises:
+        InputError: it cannot be made from these numbers, or its code cannot be found or called.
+    """
+    match spec:
+        case UnconstrainedSpec():
+            return _unconstrained(make_problem(spec, vehicle, period))
+        case ConstrainedSpec():
+            law = _constrained(spec, make_problem(spec, vehicle, period))
+            return law if spec.fallback is None else guarded(law, spec, spec.fallback, vehicle, period)
+        case RobustSpec():
+            return guarded(_robust(spec, vehicle, period), spec, spec.fallback, vehicle, period)
+        case LQRSpec() | PIDSpec() | GeometricSpec():
+            return _baseline(spec, vehicle, period)
+        case PluginSpec():
+            return build_plugin(spec, vehicle, period)
+
+
+def guarded(law: Controller, spec: BoundedSpec, fallback: FallbackSpec, vehicle: Vehicle, period: float) -> Controller:
+    """The law within the fallback contract; the law itself where that is switched off."""
+    from mpc.fallback.contract import Guarded
+
+    if not fallback.enabled:
+        return law
+    return Guarded(
+        law,
+        hover_model(vehicle, period),
+        bounds=ActuatorBounds.of(make_bounds(spec)),
+        settings=FallbackSettings(
+            unseen=fallback.unseen,
+            plan_age=fallback.plan_age,
+            position=fallback.position,
+            velocity=fallback.velocity,
+            angle=math.radians(fallback.angle),
+            rate=math.radians(fallback.rate),
+            hover=fallback.hover,
+            sink=fallback.sink,
+            tilt=math.radians(_fallback_tilt(spec, fallback)),
+            settled=fallback.settled,
+        ),
+    )
+
+
+def _constrained(spec: ConstrainedSpec, problem: Problem) -> Controller:
+    from mpc.constrained import ConstrainedMPC
+    from mpc.solvers import QPSolver
+
+    return ConstrainedMPC(problem, QPSolver(spec.solver, problem), shortcut=spec.shortcut)
+
+
+def _unconstrained(problem: Problem) -> Controller:
+    from mpc.unconstrained import UnconstrainedMPC
+
+    try:
+        return UnconstrainedMPC(problem)
+    except np.linalg.LinAlgError as error:
+        raise InputError(
+            "the controller's gain cannot be computed: its weights and the vehicle's numbers are too many orders of "
+            f"magnitude apart ({error})"
+        ) from error
+
+
+def _robust(spec: RobustSpec, vehicle: Vehicle, period: float) -> Controller:
+    from mpc.robust.controller import Linearisation, RobustMPC, RobustSettings
+    from mpc.robust.observer import ObserverSettings
+    from mpc.robust.tightening import TighteningSettings, margins
+
+    bounds, rotor_lag = make_bounds(spec), _rotor_lag(spec, vehicle)
+    soft, offset_free, tightening = spec.soft, spec.offset_free, spec.tightening
+    settings = RobustSettings(
+        penalty=None if soft is None else make_penalty(soft, bounds.y_min.size),
+        rotor_lag=rotor_lag,
+        delay=spec.delay,
+        observer=None if offset_free is None else ObserverSettings(**offset_free.model_dump()),
+        heading=spec.heading,
+        largest_turn=math.radians(spec.largest_turn),
+        move_weight=None if spec.move_weight is None else spec.move_weight * np.eye(N_ROTORS),
+        linearisation=Linearisation(spec.linearisation),
+        terminal=spec.terminal == "lqr",
+        margins=None
+        if tightening is None
+        else margins(
+            vehicle,
+            period=period,
+            horizon=spec.horizon,
+            bounds=bounds,
+            settings=TighteningSettings(**tightening.model_dump()),
+            rotor_lag=rotor_lag,
+            delay=spec.delay,
+            estimated=offset_free is not None,
+        ),
+    )
+    return RobustMPC(
+        vehicle,
+        period=period,
+        horizon=spec.horizon,
+        objective=make_objective(spec.output_weights, spec.input_weights),
+        bounds=bounds,
+        settings=settings,
+        constraints=make_polytopes(spec),
+    )
+
+
+def _baseline(spec: LQRSpec | PIDSpec | GeometricSpec, vehicle: Vehicle, period: float) -> Controller:
+    from mpc.baselines.geometric import GeometricController, geometric_settings
+    from mpc.baselines.lqr import LQR, LQRSettings, bryson_objective
+    from mpc.baselines.pid import CascadedPID, pid_settings
+
+    held = spec.input_bounds
+    bounds = None if held is None else ActuatorBounds.alike(_pair(held.speed), _pair(held.slew))
+    if isinstance(spec, LQRSpec):
+        objective = (
+            make_objective(spec.output_weights, spec.input_weights)
+            if spec.output_weights is not None and spec.input_weights is not None
+            else bryson_objective(vehicle)
+        )
+        lqr = LQRSettings(
+            period=period,
+            objective=objective,
+            horizon=spec.horizon,
+            heading_frame=spec.heading,
+            tilt_max=spec.tilt,
+            bounds=bounds,
+        )
+        return LQR(vehicle, lqr)
+    shared: dict[str, Any] = {
+        "period": period,
+        "lag": spec.lag,
+        "horizon": spec.horizon,
+        "tilt_max": spec.tilt,
+        "bounds": bounds,
+    }
+    if isinstance(spec, PIDSpec):
+        return CascadedPID(vehicle, pid_settings(vehicle, velocity_max=spec.velocity, **shared))
+    return GeometricController(vehicle, geometric_settings(vehicle, integral=spec.integral, **shared))
+
+
+def _rotor_lag(spec: RobustSpec, vehicle: Vehicle) -> float:
+    if spec.rotor_lag != "vehicle":
+        return spec.rotor_lag
+    if vehicle.rotor_rise is None:
+        rule = f"a number of seconds where the vehicle has no rotor_rise, and {vehicle.name} has none"
+        raise ParameterError("controller", "rotor_lag", spec.rotor_lag, rule)
+    if 0.0 < vehicle.rotor_rise < SHORTEST_LAG:
+        rule = f"a number of seconds where the vehicle's rotor_rise is below {SHORTEST_LAG:g} s, as {vehicle.name}'s is"
+        raise ParameterError("controller", "rotor_lag", spec.rotor_lag, rule)
+    return vehicle.rotor_rise
+
+
+def _fallback_tilt(spec: BoundedSpec, fallback: FallbackSpec) -> float:
+    """The fallback's largest tilt [deg]."""
+    if fallback.tilt is not None:
+        return fallback.tilt
+    pairs = (spec.output_bounds[name] for name in ("roll", "pitch") if name in spec.output_bounds)
+    tightest = min((FALLBACK_SHARE * min(-lower, upper) for lower, upper in pairs), default=USUAL_TILT)
+    return min(max(tightest, SMALLEST_TILT), USUAL_TILT)
+
+
+def _pair(bounds: Sequence[float]) -> tuple[float, float]:
+    lower, upper = bounds
+    return lower, upper
+
+
+def _selection(names: Sequence[str]) -> Array:
+    """Rows of the identity that pick states by name."""
+    return np.eye(N_STATES)[[INDEX[name] for name in names]]

@@ -1,0 +1,124 @@
+"""From `[sensors]`, `[estimator]` and the sensors' faults to what tells the controller the state."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Final
+
+from quadsim.sim.estimation.settings import EstimatorSettings
+from quadsim.sim.navigation import Navigation
+from quadsim.sim.sensing.sensor import AXES, FaultKind, Outliers, Sensor, SensorFault, SensorName
+from quadsim.vehicle import Vehicle
+from scenarios.parts.randomness import generator
+from scenarios.schema.events import SensorFaultEvent
+from scenarios.schema.sensors import AnySensorSpec, EstimatorSpec
+
+if TYPE_CHECKING:
+    from scenarios.schema.scenario import Scenario
+
+
+_UNITS: Final = {
+    SensorName.POSITION: 1.0,
+    SensorName.VELOCITY: 1.0,
+    SensorName.ATTITUDE: math.radians(1.0),
+    SensorName.RATES: math.radians(1.0),
+}
+"""The scenario file's unit of each sensor in the testbed's."""
+_IN_DEGREES: Final = frozenset({"gyro_bias_walk", "initial_attitude", "initial_rates", "initial_gyro_bias"})
+
+
+def build_navigation(scenario: Scenario, vehicle: Vehicle) -> Navigation | None:
+    """What tells the controller the state; None where that is the true one.
+
+    Args:
+        scenario: what is flown.
+        vehicle: the vehicle that the estimator believes in.
+
+    Raises:
+        ParameterError: a fault of a sensor that the estimator does not have.
+    """
+    sensors = () if scenario.sensors is None else build_sensors(scenario)
+    faults = tuple(
+        build_fault(
+            event.sensor,
+            event.fault,
+            start=event.at,
+            duration=event.duration,
+            axes=event.axes,
+            offset=event.offset,
+        )
+        for event in scenario.events
+        if isinstance(event, SensorFaultEvent)
+    )
+    if not sensors and not faults and scenario.estimator is None:
+        return None
+    return Navigation(
+        vehicle,
+        timestep=scenario.plant.timestep,
+        sensors=sensors,
+        rng=generator(scenario.seed, "sensors"),
+        faults=faults,
+        estimator=None if scenario.estimator is None else build_estimator(scenario.estimator),
+    )
+
+
+def build_sensors(scenario: Scenario) -> tuple[Sensor, ...]:
+    """The sensors that the scenario has, in SI units."""
+    present = {} if scenario.sensors is None else scenario.sensors.present()
+    return tuple(_sensor(name, spec) for name, spec in present.items())
+
+
+def build_estimator(spec: EstimatorSpec) -> EstimatorSettings:
+    """The filter's tuning, in SI units."""
+    values = spec.model_dump(exclude={"type"})
+    return EstimatorSettings(
+        **{name: math.radians(value) if name in _IN_DEGREES else value for name, value in values.items()}
+    )
+
+
+def build_fault(
+    sensor: str,
+    kind: str,
+    *,
+    start: float,
+    duration: float = math.inf,
+    axes: Sequence[str] | None = None,
+    offset: Sequence[float] | None = None,
+) -> SensorFault:
+    """A sensor's fault from its names in a scenario file.
+
+    Args:
+        sensor: `position`, `velocity`, `attitude` or `rates`.
+        kind: `dropout`, `freeze`, `nan` or `bias`.
+        start: [s].
+        duration: [s]; infinite for good.
+        axes: of nan, which of `x`, `y`, `z`; all where absent.
+        offset: of a bias, by axis: [m], [m/s], [deg] or [deg/s].
+    """
+    name = SensorName(sensor)
+    added = _three([0.0] * 3 if offset is None else list(offset), _UNITS[name])
+    affected = AXES if axes is None else tuple(sorted({"xyz".index(axis) for axis in axes}))
+    return SensorFault(
+        sensor=name, kind=FaultKind(kind), start=start, stop=start + duration, axes=affected, offset=added
+    )
+
+
+def _sensor(name: SensorName, spec: AnySensorSpec) -> Sensor:
+    unit = _UNITS[name]
+    outliers = Outliers() if spec.outliers is None else Outliers(**spec.outliers.model_dump())
+    return Sensor(
+        name=name,
+        rate=spec.rate,
+        noise=_three(spec.noise, unit),
+        bias=_three(spec.bias, unit),
+        bias_walk=_three(spec.bias_walk, unit),
+        delay=spec.delay,
+        dropout=spec.dropout,
+        outliers=outliers,
+    )
+
+
+def _three(value: float | list[float], unit: float) -> tuple[float, float, float]:
+    x, y, z = value if isinstance(value, list) else [value] * 3
+    return unit * x, unit * y, unit * z

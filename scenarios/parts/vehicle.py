@@ -1,0 +1,50 @@
+"""From `[vehicle]` and `[initial]` to the vehicle that is believed to fly, and how it starts."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from quadsim.assets import vehicle_path
+from quadsim.errors import InputError
+from quadsim.state import Array, make_state
+from quadsim.vehicle import N_ROTORS, OPTIONAL_PARAMETERS, VEHICLE_UNITS, Vehicle, load_vehicle
+
+if TYPE_CHECKING:
+    from scenarios.schema.scenario import Scenario
+
+
+def build_vehicle(scenario: Scenario) -> Vehicle:
+    """The vehicle file with the scenario's overrides; a resolved scenario has every number, and needs no file."""
+    file, overrides = scenario.vehicle.file, scenario.vehicle.overrides()
+    try:
+        path = vehicle_path(file)
+    except InputError:
+        if not overrides.keys() >= VEHICLE_UNITS.keys() - set(OPTIONAL_PARAMETERS):
+            raise
+        return Vehicle(name=Path(file).stem, **overrides)
+    return load_vehicle(path, overrides)
+
+
+def resolve_vehicle(scenario: Scenario, vehicle: Vehicle) -> Scenario:
+    """The scenario with the numbers of its vehicle's file in it; effects go on taking theirs from the vehicle."""
+    numbers: dict[str, Any] = {
+        name: list(value) if isinstance(value, tuple) else value
+        for name in type(scenario.vehicle).model_fields
+        if name != "file" and (value := getattr(vehicle, name)) is not None
+    }
+    return scenario.model_copy(update={"vehicle": scenario.vehicle.model_copy(update=numbers)})
+
+
+def build_initial_state(scenario: Scenario) -> Array:
+    """(12,) state at t = 0."""
+    x, y, z = scenario.initial.position
+    roll, pitch, yaw = np.radians(scenario.initial.euler)
+    return make_state(position=(x, y, z), euler=(roll, pitch, yaw))
+
+
+def build_initial_speeds(scenario: Scenario, vehicle: Vehicle) -> Array:
+    """(4,) u(-1), and the rotor speeds at t = 0 [rad/s]."""
+    return np.full(N_ROTORS, 0.0 if scenario.initial.cold else vehicle.hover_speed)

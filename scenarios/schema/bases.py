@@ -1,0 +1,166 @@
+"""`base = "paper-constrained"`: a scenario file that says only how it differs from another one."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, Final
+
+from quadsim.assets import read_toml
+from quadsim.errors import FileError, InputError, ParameterError
+from scenarios.schema.plugin import located
+
+LARGEST_FILE: Final = 4_000_000
+"""Size [bytes] of the largest file that is read; the longest scenario there can be is smaller."""
+DEEPEST: Final = 20
+"""Tables and lists within one another; a scenario has a third of them."""
+
+
+def locate_files(data: dict[str, Any], directory: Path) -> None:
+    """Make paths that are relative to a file's folder independent of it, in place."""
+    for table, field in (("vehicle", "file"), ("reference", "file")):
+        file = data.get(table, {}).get(field) if isinstance(data.get(table), dict) else None
+        if isinstance(file, str) and (directory / file).is_file():
+            data[table][field] = str((directory / file).resolve())
+    if "controller" in data:
+        data["controller"] = located(data["controller"], directory)
+
+
+def read_scenario(
+    path: Path,
+    find: Callable[[str], Path],
+    *,
+    locate: Callable[[dict[str, Any], Path], None] = locate_files,
+    above: tuple[Path, ...] = (),
+) -> dict[str, Any]:
+    """A scenario file's tables, merged over those of its base, and that one's base, and so on.
+
+    Args:
+        path: the file.
+        find: from a name to the file it means; see `scenarios.loading.scenario_path`.
+        locate: makes the paths in a base independent of its folder, in place.
+        above: the files that led here.
+
+    Raises:
+        FileError: a file is missing, too large, is not TOML, or is its own base in the end.
+        ParameterError: `base` is not a text.
+    """
+    data = _read(path)
+    if "base" not in data:
+        return data
+    name = data.pop("base")
+    if not isinstance(name, str):
+        raise ParameterError(path.name, "base", name, "a scenario's name or a path ending in .toml")
+    base = _find_base(path, name, find)
+    chain = (*above, path.resolve())
+    if base.resolve() in chain:
+        raise FileError(path, f"is its own base: {' -> '.join([*(file.name for file in chain), base.name])}")
+    inherited = read_scenario(base, find, locate=locate, above=chain)
+    locate(inherited, base.parent)
+    # The base's place in the library is its own.
+    return merge({key: value for key, value in inherited.items() if key not in ("group", "expect")}, data)
+
+
+def _find_base(path: Path, name: str, find: Callable[[str], Path]) -> Path:
+    """A base beside the file that names it, or elsewhere."""
+    beside = path.parent / name
+    return beside if name.endswith(".toml") and beside.is_file() else find(name)
+
+
+def replaced_tables(path: Path, find: Callable[[str], Path]) -> dict[str, str]:
+    """Tables that stand instead of their base's, being of another `type`: what that was, and where, by their names.
+
+    Args:
+        path: a file that `read_scenario` can read.
+        find: as there.
+    """
+    data = _read(path)
+    if "base" not in data:
+        return {}
+    base = _find_base(path, data["base"], find)
+    return replaced_tables(base, find) | {
+        name: f"{before!r} in {base.name}" for name, before in retyped(read_scenario(base, find), data).items()
+    }
+
+
+def retyped(before: Mapping[str, Any], after: Mapping[str, Any]) -> dict[str, str]:
+    """The type that each table had which is of another one afterwards, by the table's name."""
+    kinds = {name: table["type"] for name, table in before.items() if isinstance(table, dict) and "type" in table}
+    now = {name: table.get("type", kinds.get(name)) for name, table in after.items() if isinstance(table, dict)}
+    return {name: kind for name, kind in kinds.items() if name in now and now[name] != kind}
+
+
+def read_whole(path: Path) -> dict[str, Any]:
+    """The tables of a scenario file that has no base, as the one in a run's directory: no other file is read for it.
+
+    Raises:
+        FileError: it cannot be read, or has a base.
+    """
+    data = _read(path)
+    if "base" in data:
+        raise FileError(path, "has a base, and a run's scenario is whole")
+    return data
+
+
+def merge(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
+    """One table over another, field by field.
+
+    A table of another `type` replaces the base's; entries of a list that have names are merged by name, new ones come
+    after them; every other value replaces the base's.
+    """
+    merged = dict(copy.deepcopy(dict(base)))
+    for key, value in over.items():
+        before = merged.get(key)
+        if (
+            isinstance(before, dict)
+            and isinstance(value, dict)
+            and value.get("type", before.get("type")) == before.get("type")
+        ):
+            merged[key] = merge(before, value)
+        elif isinstance(before, list) and _named(before) and _named(value):
+            entries = {entry["name"]: entry for entry in before}
+            entries |= {entry["name"]: merge(entries.get(entry["name"], {}), entry) for entry in value}
+            merged[key] = list(entries.values())
+        else:
+            merged[key] = copy.deepcopy(value)
+    return merged
+
+
+def is_deeper(value: Any, levels: int) -> bool:
+    """Whether tables and lists stand within one another more than so many levels deep."""
+    layer = [value]
+    for _ in range(levels + 1):
+        layer = [
+            inner
+            for each in layer
+            if isinstance(each, dict | list)
+            for inner in (each.values() if isinstance(each, dict) else each)
+        ]
+    return bool(layer)
+
+
+def _read(path: Path) -> dict[str, Any]:
+    """A file's tables, if a person can have meant it as a scenario."""
+    try:
+        size = path.stat().st_size
+        if size > LARGEST_FILE:
+            raise FileError(path, f"must be of {LARGEST_FILE} or fewer bytes; got {size}")
+        data = read_toml(path)
+    except InputError:
+        raise
+    except (RecursionError, ValueError) as error:  # nested too deep, or a number of thousands of digits
+        raise FileError(path, f"is not valid TOML: {error}") from error
+    if is_deeper(data, DEEPEST):
+        raise FileError(path, f"must have at most {DEEPEST} tables and lists within one another")
+    if isinstance(data.get("controller"), str):  # its name alone, which a table over it, or a setting, adds to
+        data["controller"] = {"type": data["controller"]}
+    return data
+
+
+def _named(value: Any) -> bool:
+    """Whether a value is a list of tables that all have names, each its own."""
+    if not (isinstance(value, list) and value and all(isinstance(entry, dict) for entry in value)):
+        return False
+    names = [entry.get("name") for entry in value]
+    return all(isinstance(name, str) for name in names) and len(set(names)) == len(names)

@@ -1,0 +1,84 @@
+"""`[controller]`: the law, its weights and its bounds."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Annotated, Any, Literal
+
+from pydantic import BeforeValidator, Discriminator, Field, Tag, model_validator
+from pydantic_core import PydanticCustomError
+
+from mpc.solvers import SOLVERS
+from quadsim.errors import UnknownNameError
+from scenarios.schema.baselines import GeometricSpec, LQRSpec, PIDSpec
+from scenarios.schema.fallback import FallbackSpec
+from scenarios.schema.optimisation import BoundedSpec, WeightedSpec
+from scenarios.schema.plugin import FORM, LAWS, PluginSpec, is_plugin
+from scenarios.schema.robust import RobustSpec
+
+
+class UnconstrainedSpec(WeightedSpec):
+    """The paper's unconstrained MPC, a constant gain (Sec. 4)."""
+
+    type: Literal["unconstrained"] = Field(description="the control law, by its name in `quadsim list`")
+
+
+class ConstrainedSpec(BoundedSpec):
+    """The paper's constrained MPC, the optimum of a QP in every period (Sec. 5)."""
+
+    type: Literal["constrained"] = Field(description="the control law, by its name in `quadsim list`")
+    solver: str = Field(
+        default="piqp-multistage",
+        description="QP solver, by its name in `quadsim list`",
+        json_schema_extra={"enum": [*SOLVERS]},
+    )
+    shortcut: bool = Field(
+        default=True, description="solve less than the whole QP where that yields its optimum; exact"
+    )
+    fallback: FallbackSpec | None = Field(
+        default=None, description="absent: the last plan is held, shifted, and then the flight is given up"
+    )
+
+    @model_validator(mode="after")
+    def _check(self) -> ConstrainedSpec:
+        if self.solver not in SOLVERS:
+            raise ValueError(f"solver: {UnknownNameError('solver', self.solver, SOLVERS)}")
+        return self
+
+
+def shared_tilt_bound(spec: ConstrainedSpec) -> float | None:
+    """The one number that bounds roll and pitch alike [deg], or None."""
+    bounds = {abs(bound) for name in ("roll", "pitch") for bound in spec.output_bounds.get(name, [])}
+    both = {"roll", "pitch"} <= spec.output_bounds.keys()
+    return bounds.pop() if both and len(bounds) == 1 else None
+
+
+def _law(controller: object) -> str | None:
+    """Which of the laws below a table is of; what is neither ours nor code is left for the message."""
+    given = controller.get("type") if isinstance(controller, Mapping) else getattr(controller, "type", None)
+    if not isinstance(given, str):
+        return None
+    return given if given in LAWS or not is_plugin(given) else FORM
+
+
+def _spelt_out(controller: Any) -> Any:
+    """A law's name alone as the table that it stands for."""
+    if isinstance(controller, str):
+        return {"type": controller}
+    if not isinstance(controller, Mapping | WeightedSpec | LQRSpec | PIDSpec | GeometricSpec | PluginSpec):
+        raise PydanticCustomError("controller", "a table or a controller's name")
+    return controller
+
+
+_Table = Annotated[
+    Annotated[UnconstrainedSpec, Tag("unconstrained")]
+    | Annotated[ConstrainedSpec, Tag("constrained")]
+    | Annotated[RobustSpec, Tag("robust")]
+    | Annotated[LQRSpec, Tag("lqr")]
+    | Annotated[PIDSpec, Tag("pid")]
+    | Annotated[GeometricSpec, Tag("geometric")]
+    | Annotated[PluginSpec, Tag(FORM)],
+    Discriminator(_law),
+]
+ControllerSpec = Annotated[_Table, BeforeValidator(_spelt_out, json_schema_input_type=_Table | str)]
+"""Any of the laws, told apart by its type; one whose fields all have defaults may be given by its name alone."""

@@ -1,0 +1,74 @@
+"""The scenario file as JSON Schema (Draft 2020-12), for editors: fields, types, ranges, units and meanings.
+
+What no schema can say, such as a period that must be a whole multiple of another, is checked when the file is read.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Final
+
+from pydantic.json_schema import GenerateJsonSchema
+from pydantic_core import core_schema
+
+from scenarios.schema.scenario import Scenario
+
+DIALECT: Final = "https://json-schema.org/draft/2020-12/schema"
+BASE: Final = {
+    "type": "string",
+    "description": "a scenario's name, or a path ending in .toml, over which this file is merged field by field",
+}
+_TABLES: Final = "#/$defs/"
+_PARTIAL: Final = "Partial"
+"""How the names of tables begin of which a part may be given."""
+
+
+class _SchemaOfToml(GenerateJsonSchema):
+    """Fields under their own names alone, and none that is null: TOML leaves out what is absent."""
+
+    schema_dialect = DIALECT
+
+    def field_title_should_be_set(self, schema: Any) -> bool:
+        """Titles such as `Control Period` say no more than the name."""
+        return False
+
+    def nullable_schema(self, schema: core_schema.NullableSchema) -> dict[str, Any]:
+        """What a field may be where it is not absent."""
+        return self.generate_inner(schema["schema"])
+
+    def default_schema(self, schema: core_schema.WithDefaultSchema) -> dict[str, Any]:
+        """The same without a default where that is to be absent."""
+        if schema.get("default", ...) is None:
+            return self.generate_inner(schema["schema"])
+        return super().default_schema(schema)
+
+
+def scenario_schema() -> dict[str, Any]:
+    """The schema, as nested tables; without an identifier, so that it may lie anywhere.
+
+    A file with a `base` says only what differs: of it nothing is required.
+    """
+    whole = Scenario.model_json_schema(schema_generator=_SchemaOfToml)
+    tables = whole.pop("$defs")
+    difference = _loosened(whole)
+    difference["properties"] = {"base": BASE, **difference["properties"]}
+    return {
+        "$schema": DIALECT,
+        "title": "A quadsim scenario",
+        "type": "object",
+        "if": {"required": ["base"]},
+        "then": difference,
+        "else": whole,
+        "$defs": {**tables, **{_PARTIAL + name: _loosened(table) for name, table in tables.items()}},
+    }
+
+
+def _loosened(schema: Any) -> Any:
+    """A part of the schema with nothing required, and of several kinds any that fits."""
+    if isinstance(schema, list):
+        return [_loosened(entry) for entry in schema]
+    if isinstance(schema, str):
+        return schema.replace(_TABLES, _TABLES + _PARTIAL) if schema.startswith(_TABLES) else schema
+    if not isinstance(schema, dict):
+        return schema
+    kept = {key: value for key, value in schema.items() if key not in ("required", "discriminator")}
+    return {"anyOf" if key == "oneOf" else key: _loosened(value) for key, value in kept.items()}

@@ -1,0 +1,229 @@
+"""What is wrong with a scenario file, in lines a person can act on."""
+
+from __future__ import annotations
+
+import datetime
+import difflib
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import islice
+from types import NoneType, UnionType
+from typing import Annotated, Any, Final, Literal, Union, get_args, get_origin
+
+from annotated_types import Len, MaxLen, MinLen
+from pydantic import BaseModel, Tag
+from pydantic_core import ErrorDetails
+
+from quadsim.errors import InputError
+from quadsim.vehicle import MEANT
+
+
+@dataclass(frozen=True, kw_only=True)
+class Kind:
+    """One of the types that a value may have.
+
+    Attributes:
+        type: less its annotations.
+        metadata: these annotations.
+    """
+
+    type: Any
+    metadata: tuple[Any, ...] = ()
+
+    @property
+    def fields(self) -> tuple[str, ...]:
+        """Names of the fields, of a table."""
+        is_table = isinstance(self.type, type) and issubclass(self.type, BaseModel)
+        return tuple(self.type.model_fields) if is_table else ()
+
+    @property
+    def labels(self) -> set[str]:
+        """What pydantic calls this kind among several."""
+        tags = {note.tag for note in self.metadata if isinstance(note, Tag)}
+        if "type" in self.fields and get_origin(choice := self.type.model_fields["type"].annotation) is Literal:
+            tags |= {*get_args(choice)}
+        return tags or {getattr(self.type, "__name__", "")}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Place:
+    """A place in the file.
+
+    Attributes:
+        names: from the root; an entry of a list by its name, or else by its index.
+        kinds: what may stand there; none where nothing may.
+    """
+
+    names: tuple[str, ...]
+    kinds: tuple[Kind, ...]
+
+    @property
+    def fields(self) -> tuple[str, ...]:
+        """Names of all fields of the tables that may stand there."""
+        return tuple(dict.fromkeys(name for kind in self.kinds for name in kind.fields))
+
+    @property
+    def exact_length(self) -> int | None:
+        """How long a list has to be, where that is one number."""
+        for kind in self.kinds:
+            notes = kind.metadata if kind.type is list or get_origin(kind.type) is list else ()
+            shortest = {note.min_length for note in notes if isinstance(note, Len | MinLen)}
+            longest = {note.max_length for note in notes if isinstance(note, Len | MaxLen)}
+            if shortest and shortest == longest:
+                return int(shortest.pop())
+        return None
+
+    @property
+    def entries(self) -> str:
+        """What a list there holds."""
+        held = {entry.type for kind in self.kinds if get_origin(kind.type) is list for entry in _entries(kind)}
+        return "numbers" if held <= {float, int} else "texts" if held == {str} else "entries"
+
+
+def find(path: Sequence[int | str], data: Any, root: type[BaseModel]) -> Place:
+    """The place of a path of pydantic's in a file that is to be a `root`."""
+    names: list[str] = []
+    kinds: tuple[Kind, ...] = (Kind(type=root),)
+    for part in path:
+        named = tuple(kind for kind in kinds if part in kind.labels)
+        fields = [kind.type.model_fields[part] for kind in kinds if part in kind.fields]
+        if isinstance(part, int):
+            data = data[part]
+            name = data.get("name") if isinstance(data, Mapping) else None
+            names.append(name if isinstance(name, str) else str(part))
+            kinds = tuple(entry for kind in kinds for entry in _entries(kind))
+        elif len(kinds) > 1 and named:
+            kinds = named
+        elif fields or (isinstance(data, Mapping) and part in data):
+            names.append(part)
+            data = data.get(part) if isinstance(data, Mapping) else None
+            inner = [kinds_of(field.annotation, tuple(field.metadata)) for field in fields] or map(_entries, kinds)
+            kinds = tuple(kind for each in inner for kind in each)
+    return Place(names=tuple(names), kinds=kinds)
+
+
+def kinds_of(annotation: Any, metadata: tuple[Any, ...] = ()) -> tuple[Kind, ...]:
+    """All that a field's type allows, less None, which is a field that is absent."""
+    origin = get_origin(annotation)
+    if origin is Annotated:
+        inner, *notes = get_args(annotation)
+        return kinds_of(inner, (*metadata, *notes))
+    if origin in (Union, UnionType):
+        return tuple(kind for member in get_args(annotation) for kind in kinds_of(member, metadata))
+    return () if annotation is NoneType else (Kind(type=annotation, metadata=metadata),)
+
+
+def _entries(kind: Kind) -> tuple[Kind, ...]:
+    """What a list, or a table with names of the writer's choice, holds."""
+    return kinds_of(get_args(kind.type)[-1]) if get_origin(kind.type) in (list, dict) else ()
+
+
+_RULES: Final = {
+    "greater_than": "> {gt}",
+    "greater_than_equal": ">= {ge}",
+    "less_than": "< {lt}",
+    "less_than_equal": "<= {le}",
+    "multiple_of": "a multiple of {multiple_of}",
+    "finite_number": "a finite number",
+    "float_type": "a number",
+    "int_type": "a whole number",
+    "string_type": "a text",
+    "string_too_short": "a text of {min_length} or more characters",
+    "string_too_long": "a text of {max_length} or fewer characters",
+    "literal_error": "one of {expected}",
+    "bool_type": "true or false",
+    "list_type": "a list",
+    "tuple_type": "a list",
+    "dict_type": "a table",
+    "model_type": "a table",
+    "model_attributes_type": "a table",
+    "too_short": "of {min_length} or more entries",
+    "too_long": "of {max_length} or fewer entries",
+    "string_pattern_mismatch": "of the form {pattern}",
+    "union_tag_invalid": "one of {expected_tags} in its field {discriminator}",
+    "union_tag_not_found": "a table with a field {discriminator}",
+}
+"""How pydantic's kinds of error end the sentence "must be ..."."""
+_MOST_LINES: Final = 20
+"""Problems that one message names; it only counts the rest."""
+_MOST_ENTRIES: Final = 10
+_LONGEST: Final = 200
+"""Entries, and characters, that a message shows of what was given."""
+_DEEPEST_SHOWN: Final = 4
+
+
+class ScenarioError(InputError):
+    """A scenario file that cannot be flown.
+
+    Attributes:
+        problems: one line per field, each naming it, what was given and what is allowed.
+    """
+
+    def __init__(self, source: str, problems: Sequence[str]) -> None:
+        unsaid = len(problems) - _MOST_LINES
+        lines = [*problems[:_MOST_LINES], *([f"and {unsaid} more"] if unsaid > 0 else [])]
+        super().__init__(f"{source}: " + "\n  ".join(lines))
+        self.source, self.problems = source, tuple(problems)
+
+
+def describe(details: ErrorDetails, data: Mapping[str, Any], root: type[BaseModel], *, file: str = "scenario") -> str:
+    """One line about one field: its name, what is allowed, what was given.
+
+    Args:
+        details: what pydantic found.
+        data: the file.
+        root: what the file is to be.
+        file: what such a file is called.
+    """
+    place = find(details["loc"], data, root)
+    field, kind, given, context = ".".join(place.names), details["type"], details["input"], {**details.get("ctx", {})}
+    if kind == "missing":
+        return f"{field} is missing"
+    if kind == "extra_forbidden":
+        allowed = find(details["loc"][:-1], data, root).fields
+        if len(place.names) == 1 and field != "base":
+            allowed += ("base",)  # which is gone once a file has been merged over its base
+        guess = _guess(place.names[-1], allowed)
+        return f"{field} is not a field of the {file} file{guess} (there are: {', '.join(allowed)})"
+    if kind == "value_error":
+        return ".".join([*place.names, str(context["error"])])
+    if kind in ("too_short", "too_long") and place.exact_length is not None:
+        return f"{field} must be a list of {place.exact_length} {place.entries}; got {shown(given)}"
+    if kind == "too_long":
+        return f"{field} must be {_RULES[kind].format(**context)}; got {len(given)}"
+    guess = ""
+    if kind.startswith("union_tag"):
+        quoted = context["discriminator"]  # in quotes where it is a field's name, and else a function of the spec's
+        context["discriminator"] = name = quoted.strip("'") if quoted.startswith("'") else "type"
+        given = given.get(name) if isinstance(given, Mapping) else given
+        guess = _guess(given, context.get("expected_tags", "").strip("'").split("', '"))
+    rule = _RULES[kind].format(**context) if kind in _RULES else details["msg"]
+    return f"{field} must be {rule}; got {shown(given)}{guess}"
+
+
+def shown(value: object, depth: int = _DEEPEST_SHOWN) -> str:
+    """What was given, as it would be written in Python, cut to what a line can take."""
+    if isinstance(value, datetime.date | datetime.time):
+        text = value.isoformat()
+    elif isinstance(value, int) and value.bit_length() > 64:  # Python does not write out very long ones
+        text = f"a whole number of {value.bit_length()} bits"
+    elif isinstance(value, str):
+        text = repr(value[: _LONGEST + 1])
+    elif isinstance(value, Mapping | list) and depth == 0:
+        text = "..."
+    elif isinstance(value, Mapping):
+        entries = [f"{shown(key)}: {shown(each, depth - 1)}" for key, each in islice(value.items(), _MOST_ENTRIES)]
+        text = "{" + ", ".join([*entries, *(["..."] if len(value) > _MOST_ENTRIES else [])]) + "}"
+    elif isinstance(value, list):
+        entries = [shown(each, depth - 1) for each in value[:_MOST_ENTRIES]]
+        text = "[" + ", ".join([*entries, *(["..."] if len(value) > _MOST_ENTRIES else [])]) + "]"
+    else:
+        text = repr(value)
+    return text if len(text) <= _LONGEST else text[: _LONGEST - 3] + "..."
+
+
+def _guess(given: object, allowed: Iterable[str]) -> str:
+    allowed = [*allowed]
+    meant = MEANT.get(str(given), ())
+    near = meant if meant and {*meant} <= {*allowed} else difflib.get_close_matches(str(given), allowed, n=1)
+    return f"; did you mean {' and '.join(map(repr, near))}?" if near else ""

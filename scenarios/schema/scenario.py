@@ -1,0 +1,263 @@
+"""The whole scenario file."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Final, Literal, get_args
+
+from annotated_types import Len, MaxLen
+from pydantic import BeforeValidator, Field, model_validator
+from pydantic_core import PydanticCustomError
+
+from quadsim.errors import ParameterError, UnknownNameError
+from quadsim.flight.audit import SIGNALS
+from quadsim.sim.physics import steps_per_period
+from scenarios.schema.base import LARGEST_SEED, MOST_ENTRIES, NonNegative, Number, Positive, Quadruple, Spec, Triple
+from scenarios.schema.controller import ControllerSpec
+from scenarios.schema.course import ReferenceSpec
+from scenarios.schema.effects import ComputationSpec, EffectsSpec
+from scenarios.schema.events import Event, PayloadDropEvent, PayloadPickupEvent, SensorFaultEvent
+from scenarios.schema.optimisation import BoundedSpec
+from scenarios.schema.sensors import EstimatorSpec, SensorsSpec, check_sensing
+from scenarios.schema.writing import to_toml
+
+
+class VehicleSpec(Spec):
+    """Which vehicle file, and what in it to replace; units as in the file."""
+
+    file: str = Field(description="a shipped vehicle's name, or a path ending in .toml, relative to the scenario file")
+    mass: float | None = Field(default=None, description="[kg]")
+    gravity: float | None = Field(default=None, description="[m/s^2]")
+    inertia: Triple | None = Field(default=None, description="[kg m^2] Ixx, Iyy, Izz, body axes")
+    arm_length: float | None = Field(default=None, description="[m] L, centre of mass to rotor axis")
+    rotor_azimuths: Quadruple | None = Field(
+        default=None, description="[deg] direction of each arm from body +x, counter-clockwise seen from above"
+    )
+    rotor_spins: Annotated[list[int], Len(4, 4)] | None = Field(
+        default=None, description="[-] 1 or -1, sign of each rotor's reaction torque about body +z"
+    )
+    thrust_coefficient: float | None = Field(default=None, description="[N s^2/rad^2] b, thrust b w^2")
+    drag_to_thrust: float | None = Field(default=None, description="[m] d / b, reaction torque d w^2")
+    speed_min: float | None = Field(default=None, description="[rad/s] lowest speed that a rotor holds")
+    speed_max: float | None = Field(default=None, description="[rad/s] highest speed that a rotor holds")
+    rotor_rise: float | None = Field(default=None, description="[s] time constant of a rotor's speed when it rises")
+    rotor_fall: float | None = Field(default=None, description="[s] time constant of a rotor's speed when it falls")
+    rotor_inertia: float | None = Field(default=None, description="[kg m^2] of one rotor about its axis")
+    rotor_radius: float | None = Field(default=None, description="[m] R")
+    rotor_drag: float | None = Field(default=None, description="[N s^2/(m rad)] linear drag of one rotor")
+    body_drag: Triple | None = Field(default=None, description="[m^2] C_d A along body x, y, z")
+
+    def overrides(self) -> dict[str, Any]:
+        """The parameters that replace the file's."""
+        return self.model_dump(exclude={"file"}, exclude_none=True)
+
+
+class InitialSpec(Spec):
+    """Where the flight starts, at rest."""
+
+    position: Triple = Field(default=[0.0, 0.0, 0.0], description="[m] x, y, z in the world frame")
+    euler: Triple = Field(default=[0.0, 0.0, 0.0], description="[deg] roll, pitch, yaw")
+    cold: bool = Field(
+        default=False, description="whether it starts on the ground with rotors at rest, u(-1) = 0; else from hover"
+    )
+
+    @model_validator(mode="after")
+    def _check(self) -> InitialSpec:
+        if any(abs(angle) >= 90.0 for angle in self.euler[:2]):
+            raise ValueError(f"euler must have roll and pitch within +-90 deg; got {self.euler}")
+        return self
+
+
+class PlantSpec(Spec):
+    """The simulated vehicle."""
+
+    timestep: Annotated[float, Field(ge=1e-6, le=0.01)] = Field(default=1e-3, description="[s] physics step")
+    limit_speeds: bool = Field(
+        default=False, description="whether rotors saturate at the vehicle's speed_min and speed_max"
+    )
+
+
+_STEEPEST: Final = 180.0
+
+
+def _tilt_or_false(value: Any) -> Any:
+    return _number_or_false(value, _STEEPEST)
+
+
+def _number_or_false(value: Any, most: float = 1e6) -> Any:
+    """Refuse all but numbers in range and false, in one sentence; 0, which Python takes for false, is refused too."""
+    if value is False or (isinstance(value, int | float) and value is not True and 0.0 < value <= most):
+        return value
+    raise PydanticCustomError("number_or_false", "a number > 0 and <= {most}, or false", {"most": f"{most:g}"})
+
+
+Limit = Annotated[Positive | Literal[False], BeforeValidator(_number_or_false)]
+
+
+class LostSpec(Spec):
+    """When the flight is lost and ends, by the true state at each control sample; false switches a criterion off."""
+
+    tilt: Annotated[Annotated[float, Field(gt=0.0, le=_STEEPEST)] | Literal[False], BeforeValidator(_tilt_or_false)] = (
+        Field(
+            default=120.0,
+            description="[deg] between the thrust axis and the vertical; at 120, half the thrust pulls down; false for "
+            "loops and flips",
+        )
+    )
+    distance: Limit = Field(default=100.0, description="[m] from the reference at the same time")
+    depth: Limit = Field(default=50.0, description="[m] below the lowest of the start and the reference so far")
+    speed: Limit = Field(default=50.0, description="[m/s] in any direction")
+
+
+class ConstraintSpec(Spec):
+    """Bounds on a signal of the flight; see `quadsim.flight.audit.Limit`."""
+
+    name: Annotated[str, Field(pattern=r"^[A-Za-z0-9_.-]+$")] = Field(description="what reports call it")
+    signal: str = Field(
+        description="what is bounded: " + ", ".join(f"{name} [{signal.unit}]" for name, signal in SIGNALS.items()),
+        json_schema_extra={"enum": [*SIGNALS]},
+    )
+    lower: Number | None = Field(default=None, description="[unit of the signal] lower bound")
+    upper: Number | None = Field(default=None, description="[unit of the signal] upper bound")
+    tolerance: NonNegative = Field(default=0.0, description="[unit of the signal] allowed beyond, at the physics rate")
+    tolerance_sampled: NonNegative = Field(
+        default=0.0, description="[unit of the signal] allowed beyond, at the control samples"
+    )
+    required: bool = Field(default=True, description="false: measured and reported, never a failure")
+    start: Number = Field(default=0.0, description="[s] first time it holds")
+    stop: Number | None = Field(default=None, description="[s] last time it holds; absent: the flight's end")
+
+    @model_validator(mode="after")
+    def _check(self) -> ConstraintSpec:
+        if self.signal not in SIGNALS:
+            raise ValueError(f"signal: {UnknownNameError('signal', self.signal, SIGNALS)}")
+        if self.lower is None and self.upper is None:
+            raise ValueError("lower must be given, or upper, or both")
+        if self.lower is not None and self.upper is not None and self.lower >= self.upper:
+            raise ValueError(f"lower must be below upper = {self.upper}; got {self.lower}")
+        if self.tolerance_sampled > self.tolerance:
+            raise ValueError(
+                f"tolerance_sampled must be at most tolerance = {self.tolerance}; got {self.tolerance_sampled}"
+            )
+        if self.stop is not None and self.stop < self.start:
+            raise ValueError(f"stop must be at least start = {self.start}; got {self.stop}")
+        return self
+
+
+LONGEST_FLIGHT: Final = 86_400.0
+MOST_STEPS: Final = 10_000_000
+"""Physics steps, and planned steps (periods times horizon), that one flight may take: each is held in memory."""
+
+
+Group = Literal["paper", "courses", "air", "faults", "ground", "sensors", "other"]
+Verdict = Literal["satisfied", "violated", "lost"]
+
+
+class Scenario(Spec):
+    """A flight: what flies, where, by which controller, and what is required of it."""
+
+    name: Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9._-]*$", max_length=80)] = Field(
+        description="letters a-z, digits and . _ -; names the run's directory"
+    )
+    description: str = Field(description="one line for `quadsim list`")
+    group: Group = Field(default="other", description="where `quadsim list` shows it: " + ", ".join(get_args(Group)))
+    expect: Verdict = Field(
+        default="satisfied",
+        description="its verdict, if all is right: satisfied (flown to its end, every required constraint holds), "
+        "violated (one does not, or the vehicle crashes), lost (the flight ends early, by a criterion of [lost] or "
+        "otherwise)",
+    )
+    duration: Annotated[float, Field(gt=0.0, le=LONGEST_FLIGHT)] = Field(
+        description="[s] simulated time, a whole number of control periods"
+    )
+    control_period: Annotated[float, Field(gt=0.0, le=10.0)] = Field(
+        description="[s] tau_s, time for which a command is held, a whole number of physics steps"
+    )
+    seed: Annotated[int, Field(ge=0, le=LARGEST_SEED)] = Field(
+        default=0, description="of everything random; recorded with the flight"
+    )
+    log_rate: Annotated[float, Field(ge=0.01, le=1e6)] = Field(
+        default=200.0, description="[Hz] rows of plant.parquet; the audit sees every physics step"
+    )
+    vehicle: VehicleSpec
+    initial: InitialSpec = InitialSpec()
+    plant: PlantSpec = PlantSpec()
+    reference: ReferenceSpec
+    controller: ControllerSpec
+    effects: EffectsSpec = EffectsSpec()
+    computation: ComputationSpec | None = Field(default=None, description="absent: commands take no time")
+    sensors: SensorsSpec | None = Field(default=None, description="absent: the controller is told the true state")
+    estimator: EstimatorSpec | None = Field(
+        default=None, description="absent: the controller is told what the sensors say, as it arrives"
+    )
+    events: Annotated[list[Event], MaxLen(MOST_ENTRIES)] = Field(default=[], description="what happens on the way")
+    lost: LostSpec = LostSpec()
+    constraints: Annotated[list[ConstraintSpec], MaxLen(MOST_ENTRIES)] = Field(
+        default=[], description="what the flight is audited against; signals and their units are those of the audit"
+    )
+
+    @model_validator(mode="after")
+    def _check(self) -> Scenario:
+        for name, value, unit in (
+            ("control_period", self.control_period, self.plant.timestep),
+            ("duration", self.duration, self.control_period),
+            ("log_rate", 1.0 / self.log_rate, self.plant.timestep),
+        ):
+            try:
+                steps_per_period(value, unit)
+            except ParameterError as error:
+                what = "the control period" if name == "duration" else "the physics step plant.timestep"
+                given = self.log_rate if name == "log_rate" else value
+                period = "have a period that is" if name == "log_rate" else "be"
+                raise ValueError(f"{name} must {period} a whole multiple of {what} = {unit} s; got {given}") from error
+        for what, count in (
+            ("physics steps", self.periods * self.steps_per_period),
+            ("planned steps", self.periods * self.controller.horizon),
+        ):
+            if count > MOST_STEPS:
+                raise ValueError(f"duration must make at most {MOST_STEPS} {what}; got {count} of them")
+        self._check_events()
+        if self.initial.cold and not (self.effects.ground is not None and self.effects.ground.contact):
+            raise ValueError("initial.cold must be false where effects.ground gives no floor to stand on; got true")
+        check_sensing(self.sensors, self.estimator, timestep=self.plant.timestep)
+        polytopes = self.controller.polytopes if isinstance(self.controller, BoundedSpec) else []
+        names = [constraint.name for constraint in self.constraints]
+        names += [name for polytope in polytopes for name in polytope.row_names]
+        if len(set(names)) < len(names):
+            raise ValueError(f"constraints must have distinct names; got {names}")
+        return self
+
+    def _check_events(self) -> None:
+        carried = len(self.effects.load.payloads) if self.effects.load is not None else 0
+        for i, event in sorted(enumerate(self.events), key=lambda entry: entry[1].at):
+            if event.at >= self.duration:
+                raise ValueError(f"events.{i}.at must be before the flight's end, {self.duration} s; got {event.at}")
+            if isinstance(event, PayloadPickupEvent):
+                carried += 1
+            elif isinstance(event, PayloadDropEvent):
+                if not carried:
+                    raise ValueError(f"events.{i}.type must not be payload_drop at {event.at} s: nothing is carried")
+                carried = 0
+            elif isinstance(event, SensorFaultEvent) and self.estimator is not None:
+                present = [] if self.sensors is None else [str(name) for name in self.sensors.present()]
+                if event.sensor not in present:
+                    rule = f"one that the estimator has, of {', '.join(present)}"
+                    raise ValueError(f"events.{i}.sensor must be {rule}; got {event.sensor!r}")
+
+    @property
+    def periods(self) -> int:
+        """K, control periods in the flight."""
+        return steps_per_period(self.duration, self.control_period)
+
+    @property
+    def steps_per_period(self) -> int:
+        """Physics steps per control period."""
+        return steps_per_period(self.control_period, self.plant.timestep)
+
+    @property
+    def plant_stride(self) -> int:
+        """Physics steps per row of `plant.parquet`."""
+        return steps_per_period(1.0 / self.log_rate, self.plant.timestep)
+
+    def to_toml(self) -> str:
+        """The resolved file: every field, defaults included, with comments; parsing it gives this scenario again."""
+        return to_toml(self)

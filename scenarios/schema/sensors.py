@@ -1,0 +1,158 @@
+"""`[sensors.position]` and so on, and `[estimator]`: what the controller is told, and how that is found.
+
+Numbers to start from:
+
+- Satellite navigation, as PX4's EKF2 takes it (defaults of `EKF2_GPS_P_NOISE`, `EKF2_GPS_V_NOISE`, `EKF2_GPS_DELAY`):
+  position 0.5 m, velocity 0.3 m/s, both 0.11 s late.
+- Motion capture, as the Crazyflie's firmware takes it (`extPosStdDev`, `extQuatStdDev` of its localization
+  service): position 0.01 m, attitude 4.5e-3 rad = 0.26 deg.
+- A MEMS rate gyro, the ADIS16448 as RotorS has it (`gazebo_imu_plugin.h`; Furrer et al., "RotorS", 2016): white noise
+  of 2 x 35 / 3600 = 0.0194 deg/s/sqrt(Hz), so 0.0194 sqrt(rate) deg/s per sample, bias walk 2 x 4 / 3600 = 0.0022
+  deg/s/sqrt(s), bias when switched on 0.5 deg/s (one standard deviation).
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from annotated_types import Len
+from pydantic import Discriminator, Field, Tag
+
+from quadsim.errors import ParameterError
+from quadsim.sim.sensing.sensor import Sensor, SensorName
+from scenarios.schema.base import Fraction, NonNegative, Number, Spec
+
+
+def _number_or_list(value: object) -> str:
+    return "list" if isinstance(value, list) else "number"
+
+
+Deviations = Annotated[
+    Annotated[NonNegative, Tag("number")] | Annotated[list[NonNegative], Len(3, 3), Tag("list")],
+    Discriminator(_number_or_list),
+]
+"""One standard deviation for all three axes, or one each."""
+Offsets = Annotated[
+    Annotated[Number, Tag("number")] | Annotated[list[Number], Len(3, 3), Tag("list")], Discriminator(_number_or_list)
+]
+"""One offset for all three axes, or one each."""
+
+
+class OutliersSpec(Spec):
+    """Gross errors: samples whose noise is drawn from a wider distribution."""
+
+    probability: Fraction = Field(description="[-] of a sample being one")
+    size: Annotated[float, Field(ge=1.0, le=1e6)] = Field(description="[-] how many times the noise it has")
+
+
+class _SensorSpec(Spec):
+    rate: Annotated[float, Field(ge=0.01, le=1e4)] = Field(
+        description="[Hz] samples per second, the first at t = 0; a divisor of the physics rate"
+    )
+    delay: Annotated[float, Field(ge=0.0, le=10.0)] = Field(
+        default=0.0, description="[s] from taking a sample to its arrival, a whole number of physics steps"
+    )
+    dropout: Fraction = Field(default=0.0, description="[-] probability of a sample being lost")
+    outliers: OutliersSpec | None = Field(default=None, description="absent: none")
+
+
+class PositionSpec(_SensorSpec):
+    """Position, world frame: satellite navigation or motion capture."""
+
+    noise: Deviations = Field(default=0.0, description="[m] standard deviation, one for all axes or x, y, z")
+    bias: Offsets = Field(default=0.0, description="[m] constant offset, one for all axes or x, y, z")
+    bias_walk: Deviations = Field(default=0.0, description="[m/sqrt(s)] random walk of the offset")
+
+
+class VelocitySpec(_SensorSpec):
+    """Velocity, world frame."""
+
+    noise: Deviations = Field(default=0.0, description="[m/s] standard deviation, one for all axes or x, y, z")
+    bias: Offsets = Field(default=0.0, description="[m/s] constant offset, one for all axes or x, y, z")
+    bias_walk: Deviations = Field(default=0.0, description="[m/s/sqrt(s)] random walk of the offset")
+
+
+class AttitudeSpec(_SensorSpec):
+    """Roll, pitch and yaw, with errors that are small rotations about the body axes."""
+
+    noise: Deviations = Field(default=0.0, description="[deg] standard deviation, one for all body axes or x, y, z")
+    bias: Offsets = Field(default=0.0, description="[deg] constant rotation, one for all body axes or x, y, z")
+    bias_walk: Deviations = Field(default=0.0, description="[deg/sqrt(s)] random walk of that rotation")
+
+
+class RatesSpec(_SensorSpec):
+    """Body rates p, q, r: a rate gyro."""
+
+    noise: Deviations = Field(default=0.0, description="[deg/s] standard deviation, one for all body axes or x, y, z")
+    bias: Offsets = Field(default=0.0, description="[deg/s] constant offset, one for all body axes or x, y, z")
+    bias_walk: Deviations = Field(default=0.0, description="[deg/s/sqrt(s)] random walk of the offset")
+
+
+AnySensorSpec = PositionSpec | VelocitySpec | AttitudeSpec | RatesSpec
+
+
+class SensorsSpec(Spec):
+    """What measures the state; a sensor left out is perfect, or not there where there is an estimator."""
+
+    position: PositionSpec | None = Field(default=None, description="[m] in the world frame")
+    velocity: VelocitySpec | None = Field(default=None, description="[m/s] in the world frame")
+    attitude: AttitudeSpec | None = Field(default=None, description="[deg] roll, pitch, yaw")
+    rates: RatesSpec | None = Field(default=None, description="[deg/s] body rates")
+
+    def present(self) -> dict[SensorName, AnySensorSpec]:
+        """The sensors that there are."""
+        named = {name: getattr(self, name.value) for name in SensorName}
+        return {name: spec for name, spec in named.items() if spec is not None}
+
+
+class EstimatorSpec(Spec):
+    """An error-state Kalman filter from the sensors and the believed vehicle; see `quadsim.sim.estimation`."""
+
+    type: Literal["error_state"] = Field(description="kind of estimator")
+    acceleration_noise: NonNegative = Field(
+        default=0.3, description="[m/s^2/sqrt(Hz)] white acceleration that the believed vehicle does not explain"
+    )
+    angular_acceleration_noise: NonNegative = Field(
+        default=1.0, description="[rad/s^2/sqrt(Hz)] white angular acceleration that it does not explain"
+    )
+    gyro_bias_walk: NonNegative = Field(default=0.002, description="[deg/s/sqrt(s)] random walk of the gyro's bias")
+    initial_position: NonNegative = Field(
+        default=0.05, description="[m] standard deviation of the first estimate's error, per axis"
+    )
+    initial_velocity: NonNegative = Field(default=0.05, description="[m/s] the same")
+    initial_attitude: NonNegative = Field(default=1.0, description="[deg] the same, about each body axis")
+    initial_rates: NonNegative = Field(default=1.0, description="[deg/s] the same")
+    initial_gyro_bias: NonNegative = Field(default=0.5, description="[deg/s] the same, of a bias first taken as zero")
+    gate: Annotated[float, Field(gt=0.0, lt=1.0)] = Field(
+        default=0.9999, description="[-] probability with which a right sample passes the test of its innovation"
+    )
+    patience: NonNegative = Field(
+        default=1.0, description="[s] after which a sensor that was refused all along is believed again; 0 for never"
+    )
+
+
+def check_sensing(sensors: SensorsSpec | None, estimator: EstimatorSpec | None, *, timestep: float) -> None:
+    """Refuse sensors that do not fit the physics step, or that an estimator cannot work with.
+
+    Raises:
+        ValueError: beginning with the field's name.
+    """
+    present = {} if sensors is None else sensors.present()
+    for name, spec in present.items():
+        probe = Sensor(name=name, rate=spec.rate, delay=spec.delay)
+        try:
+            probe.stride(timestep)
+            probe.latency(timestep)
+        except ParameterError as error:
+            raise ValueError(str(error)) from error
+        if estimator is not None and not _all_positive(spec.noise):
+            raise ValueError(
+                f"sensors.{name}.noise must be positive, for the estimator to weigh its samples; got {spec.noise}"
+            )
+    missing = [name for name in (SensorName.POSITION, SensorName.ATTITUDE) if name not in present]
+    if estimator is not None and missing:
+        raise ValueError(f"estimator must have sensors.{missing[0]} to work with; got {[str(n) for n in present]}")
+
+
+def _all_positive(noise: float | list[float]) -> bool:
+    return min(noise) > 0.0 if isinstance(noise, list) else noise > 0.0

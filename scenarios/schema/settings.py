@@ -1,0 +1,105 @@
+"""Fields of a scenario's tables by dotted path: what `--set` replaces, and what a campaign draws."""
+
+from __future__ import annotations
+
+import contextlib
+import tomllib
+from typing import Any
+
+from quadsim.errors import ParameterError, UnknownNameError
+from scenarios.schema.bases import DEEPEST, is_deeper
+
+
+def apply_setting(data: dict[str, Any], setting: str) -> None:
+    """Apply one `dotted.path=value` to a scenario's tables; see `set_field`.
+
+    Raises:
+        ParameterError: the text is not of that form, or the path goes through something that is no table.
+    """
+    path, equals, text = setting.partition("=")
+    keys = path.strip().split(".")
+    if not equals or not all(keys):
+        raise ParameterError("", "--set", setting, "of the form dotted.path=value")
+    if keys == ["base"]:
+        raise ParameterError("", "--set", setting, "of a field other than base, which only a file can have")
+    value = _parse_value(text.strip())
+    if len(keys) > DEEPEST or is_deeper(value, DEEPEST):
+        raise ParameterError("", "--set", setting[:100], f"of at most {DEEPEST} tables and lists within one another")
+    set_field(data, path.strip(), value, asked="--set", given=setting)
+
+
+def set_field(data: dict[str, Any], path: str, value: Any, *, asked: str, given: str | None = None) -> None:
+    """Replace or add a field; tables on the way that are absent are made.
+
+    An entry of a list of tables is addressed by its name, as in `constraints.roll.upper`, or, where it has none, by its
+    index, as in `events.0.at`; a number of a list by its index, as in `initial.euler.2`.
+
+    Args:
+        data: the tables, changed in place.
+        path: dotted.
+        value: of TOML.
+        asked: who asks, for the message.
+        given: what was given, for the message; the path where absent.
+
+    Raises:
+        ParameterError: the path goes through something that is no table.
+        UnknownNameError: a list has no such entry.
+    """
+    *through, last = path.split(".")
+    holder = _holder(data, through, asked=asked, given=given or path)
+    if isinstance(holder, dict):
+        holder[last] = value
+    else:
+        _require_numbers(holder, path, asked=asked, given=given or path)
+        holder[_index(holder, ".".join(through), last)] = value
+
+
+def get_field(data: dict[str, Any], path: str) -> Any:
+    """The value of a field; None where it is absent.
+
+    Raises:
+        ParameterError, UnknownNameError: as `set_field`.
+    """
+    *through, last = path.split(".")
+    holder = _holder(data, through, asked="field", given=path)
+    if isinstance(holder, dict):
+        return holder.get(last)
+    _require_numbers(holder, path, asked="field", given=path)
+    return holder[_index(holder, ".".join(through), last)]
+
+
+def _holder(data: dict[str, Any], through: list[str], *, asked: str, given: str) -> dict[str, Any] | list[Any]:
+    """The table or list at the end of a path."""
+    held: Any = data
+    for depth, key in enumerate(through):
+        if isinstance(held, list):
+            held = held[_index(held, ".".join(through[:depth]), key)]
+        else:
+            held = held.setdefault(key, {})
+        if not isinstance(held, dict | list) or held == []:
+            raise ParameterError("", asked, given, f"a path to a field; {key} has none")
+    return held
+
+
+def _index(entries: list[Any], where: str, key: str) -> int:
+    """The place of a list's entry, by its name, or else its index."""
+    names = [str(entry.get("name", i)) if isinstance(entry, dict) else str(i) for i, entry in enumerate(entries)]
+    if key not in names:
+        raise UnknownNameError(f"entry of {where}", key, names)
+    return names.index(key)
+
+
+def _require_numbers(entries: list[Any], path: str, *, asked: str, given: str) -> None:
+    """Refuse a path that ends at an entry which is a table."""
+    if any(isinstance(entry, dict | list) for entry in entries):
+        raise ParameterError("", asked, given, f"a path to a field; {path} is an entry of a list")
+
+
+def _parse_value(text: str) -> Any:
+    """A value of TOML, or the text itself where it is none."""
+    # RecursionError: lists within lists without end; ValueError: not TOML, or a number of thousands of digits.
+    with contextlib.suppress(RecursionError, ValueError):
+        table = tomllib.loads(f"value = {text}")
+        if table.keys() == {"value"}:
+            return table["value"]
+    return text

@@ -1,0 +1,196 @@
+"""The audit: signed margins by hand, between samples too, with windows and tolerances."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from support import logged, small_log
+
+from quadsim.errors import ParameterError, UnknownNameError
+from quadsim.flight.audit import SIGNALS, Finding, Limit, audit, margins_sampled
+from quadsim.flight.log import FlightLog
+from quadsim.state import STATE_NAMES
+
+Z = Limit(name="height", signal="z", lower=-1.0, upper=2.0)
+SAMPLES = (0.0, 1.0, 1.9)
+PLANT = (0.0, 0.5, 1.0, 2.5, 1.9, -1.25, 0.0)
+"""Twice per 0.1 s period; beyond the upper bound at t = 0.15 s by 0.5, beyond the lower at t = 0.25 s by 0.25."""
+
+
+def find(log: FlightLog, limit: Limit) -> Finding:
+    (finding,) = audit(log, (limit,))
+    return finding
+
+
+def test_margins_are_signed_distances_to_the_nearer_bound() -> None:
+    np.testing.assert_array_equal(Z.margin(np.array([-2.0, -1.0, 0.0, 1.5, 2.0, 2.25])), [-1, 0, 1, 0.5, 0, -0.25])
+
+
+def test_a_peak_between_the_samples_is_found() -> None:
+    finding = find(logged("z", samples=SAMPLES, plant=PLANT), Z)
+    assert finding.peak_sampled == 1.9
+    assert finding.worst_margin_sampled == pytest.approx(0.1)
+    assert finding.peak_plant == 2.5
+    assert finding.worst_margin == -0.5
+    assert finding.worst_time == 0.15
+    assert finding.time_violated == pytest.approx(0.1)  # two rows of 0.05 s
+    assert not finding.satisfied
+
+
+@pytest.mark.parametrize(
+    ("tolerance", "sampled", "satisfied", "time_violated"),
+    [(0.0, 0.0, False, 0.1), (0.3, 0.0, False, 0.05), (0.499, 0.0, False, 0.05), (0.5, 0.0, True, 0.0)],
+)
+def test_the_verdict_allows_the_tolerance_and_no_more(
+    tolerance: float, sampled: float, satisfied: bool, time_violated: float
+) -> None:
+    limit = replace(Z, tolerance=tolerance, tolerance_sampled=sampled)
+    finding = find(logged("z", samples=SAMPLES, plant=PLANT), limit)
+    assert finding.satisfied == satisfied
+    assert finding.time_violated == pytest.approx(time_violated)
+    assert finding.worst_margin == -0.5  # a tolerance changes the verdict, never the margin
+
+
+@pytest.mark.parametrize(("sampled", "satisfied"), [(0.0, False), (0.099, False), (0.1001, True)])
+def test_samples_have_a_tolerance_of_their_own(sampled: float, satisfied: bool) -> None:
+    limit = replace(Z, upper=1.8, tolerance=10.0, tolerance_sampled=sampled)
+    finding = find(logged("z", samples=SAMPLES, plant=PLANT), limit)
+    assert finding.worst_margin_sampled == pytest.approx(-0.1)
+    assert finding.satisfied == satisfied
+
+
+@pytest.mark.parametrize(
+    ("start", "stop", "peak", "margin"),
+    [
+        (0.0, 0.1, 0.0, 1.0),  # 0 and 1 are equally near to a bound: the first is told
+        (0.0, 0.15, 2.5, -0.5),  # both ends belong to the window
+        (0.15, 0.15, 2.5, -0.5),
+        (0.16, 0.24, 1.9, 0.1),
+        (0.2, 0.25, -1.25, -0.25),
+        (0.26, math.inf, 0.0, 1.0),
+    ],
+)
+def test_a_window_counts_and_nothing_outside_it(start: float, stop: float, peak: float, margin: float) -> None:
+    finding = find(logged("z", samples=SAMPLES, plant=PLANT), replace(Z, start=start, stop=stop))
+    assert finding.worst_margin == pytest.approx(margin)
+    assert finding.peak_plant == peak
+
+
+def test_a_window_that_the_flight_never_reached_is_not_held() -> None:
+    finding = find(logged("z", samples=SAMPLES, plant=PLANT), replace(Z, start=9.0))
+    assert math.isnan(finding.worst_margin)
+    assert math.isnan(finding.peak_plant)
+    assert math.isnan(finding.worst_margin_sampled)
+    assert finding.time_violated == 0.0
+    assert not finding.satisfied
+
+
+def test_a_flight_of_no_period_holds_nothing() -> None:
+    for signal in SIGNALS:
+        assert not find(small_log(0), Limit(name="any", signal=signal, lower=-1e9, upper=1e9)).satisfied
+
+
+@pytest.mark.parametrize(("lower", "upper", "margin"), [(-math.inf, 2.0, -0.5), (-1.0, math.inf, -0.25)])
+def test_one_bound_alone_is_enough(lower: float, upper: float, margin: float) -> None:
+    assert find(logged("z", samples=SAMPLES, plant=PLANT), replace(Z, lower=lower, upper=upper)).worst_margin == margin
+
+
+def test_angles_are_limited_in_degrees() -> None:
+    log = logged("roll", samples=(0.0, np.radians(4.0)), plant=(0.0, np.radians(4.0), np.radians(5.5)))
+    finding = find(log, Limit(name="roll", signal="roll", lower=-5.0, upper=5.0))
+    assert finding.limit.unit == "deg"
+    assert finding.peak_plant == pytest.approx(5.5)
+    assert finding.worst_margin == pytest.approx(-0.5)
+    assert finding.worst_margin_sampled == pytest.approx(1.0)
+
+
+def test_units_of_signals() -> None:
+    units = {name: signal.unit for name, signal in SIGNALS.items()}
+    assert [units[name] for name in STATE_NAMES] == ["m", "m/s"] * 3 + ["deg", "deg/s"] * 3
+    assert [units[f"{name}_error"] for name in ("x", "y", "z", "yaw")] == ["m", "m", "m", "deg"]
+    assert (units["tilt"], units["speed"], units["slew"]) == ("deg", "rad/s", "rad/s")
+
+
+@given(roll=st.floats(-80.0, 80.0), pitch=st.floats(-80.0, 80.0))
+def test_tilt_is_the_angle_between_thrust_and_vertical(roll: float, pitch: float) -> None:
+    log = small_log(1)
+    log.control.truth[0, [6, 8]] = np.radians([roll, pitch])
+    expected = math.degrees(math.acos(math.cos(math.radians(roll)) * math.cos(math.radians(pitch))))
+    assert SIGNALS["tilt"].sampled(log.control)[0] == pytest.approx(expected)
+
+
+@pytest.mark.parametrize(("axis", "state", "scale"), [("x", 0, 1.0), ("yaw", 10, 180.0 / math.pi)])
+def test_errors_are_real_minus_reference_at_the_samples(axis: str, state: int, scale: float) -> None:
+    log = small_log(3)
+    errors = scale * (log.control.truth[:, state] - log.control.reference[:, {"x": 0, "yaw": 3}[axis]])
+    finding = find(log, Limit(name="error", signal=f"{axis}_error", upper=0.0))
+    assert finding.peak_sampled == finding.peak_plant == pytest.approx(errors.max())
+    assert finding.worst_time == log.control.t[np.argmax(errors)]
+
+
+def test_every_rotor_must_hold() -> None:
+    log = small_log(3)
+    log.control.speeds[1, 2] = 260.0
+    log.plant.speeds[7, 3] = 255.0
+    finding = find(log, Limit(name="speed", signal="speed", lower=0.0, upper=250.0))
+    assert finding.peak_sampled == 260.0  # commanded
+    assert finding.peak_plant == 255.0  # acting
+    np.testing.assert_array_equal(margins_sampled(finding.limit, log), (250.0 - log.control.speeds).min(axis=1))
+
+
+def test_steps_of_the_command_are_audited_from_the_first_on() -> None:
+    log = small_log(3)
+    log.control.speeds[:] = log.control.speeds_before + np.array([[6.0], [6.0], [-6.0]])
+    finding = find(log, Limit(name="slew", signal="slew", lower=-10.0, upper=5.0))
+    np.testing.assert_allclose(margins_sampled(finding.limit, log), [-1.0, 5.0, -2.0])
+    assert finding.worst_margin == pytest.approx(-2.0)
+    assert finding.worst_time == pytest.approx(0.2)
+    assert finding.peak_plant == finding.peak_sampled
+
+
+def test_margins_outside_the_window_are_nan() -> None:
+    log = logged("z", samples=SAMPLES, plant=PLANT)
+    np.testing.assert_allclose(margins_sampled(replace(Z, start=0.1, stop=0.1), log), [np.nan, 1.0, np.nan])
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"lower": 2.0}, r"^constraints\.height\.lower must be below upper = 2\.0; got 2\.0$"),
+        ({"lower": math.nan}, r"^constraints\.height\.lower must be below upper"),
+        ({"tolerance": -1.0}, r"^constraints\.height\.tolerance_sampled must be between 0 and tolerance = -1\.0; got"),
+        ({"tolerance_sampled": 0.1}, r"tolerance_sampled must be between 0 and tolerance = 0\.0; got 0\.1$"),
+        ({"tolerance": math.inf}, r"tolerance_sampled must be between 0 and tolerance = inf"),
+        ({"start": 3.0, "stop": 2.0}, r"^constraints\.height\.start must be at most stop = 2\.0; got 3\.0$"),
+    ],
+)
+def test_a_limit_that_cannot_be_is_refused(changes: dict[str, float], message: str) -> None:
+    with pytest.raises(ParameterError, match=message):
+        replace(Z, **changes)
+
+
+def test_an_unknown_signal_is_answered_with_those_there_are() -> None:
+    with pytest.raises(
+        UnknownNameError, match=r"^no signal named 'rol'; did you mean 'roll'\? \(there are: .*tilt.*\)$"
+    ):
+        Limit(name="roll", signal="rol", upper=1.0)
+
+
+def test_a_window_between_two_samples_is_judged_by_the_plant() -> None:
+    log = small_log(4)
+    limit = Limit(name="any", signal="x", lower=-1e9, upper=1e9, start=0.06, stop=0.09)
+    (finding,) = audit(log, (limit,))
+    assert np.isnan(finding.worst_margin_sampled)
+    assert finding.satisfied
+
+
+def test_a_limit_broken_all_the_time_is_broken_for_as_long_as_the_flight() -> None:
+    log = small_log(4)
+    limits = tuple(Limit(name=name, signal=name, lower=1e8) for name in ("x", "slew"))
+    for finding in audit(log, limits):
+        assert finding.time_violated == pytest.approx(log.plant.t[-1])

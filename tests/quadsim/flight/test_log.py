@@ -1,0 +1,175 @@
+"""The flight log and its Parquet files."""
+
+from __future__ import annotations
+
+import dataclasses
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from support import small_log
+
+from quadsim.errors import FileError
+from quadsim.flight.log import FlightLog
+from quadsim.flight.parquet import FLIGHT_FILE, HORIZON_FILE, PLANT_FILE, TIMING_FILE, read_log, write_log
+
+UNITS = {
+    FLIGHT_FILE: (
+        "t=s x=m vx=m/s y=m vy=m/s z=m vz=m/s roll=rad roll_rate=rad/s pitch=rad pitch_rate=rad/s yaw=rad "
+        "yaw_rate=rad/s ref_x=m ref_y=m ref_z=m ref_yaw=rad u1=rad/s u2=rad/s u3=rad/s u4=rad/s status=- phase=- "
+        "iterations=- active=- fallback=- slack=rad primal_residual=- dual_residual=- delay=s "
+        "true_x=m true_vx=m/s true_y=m true_vy=m/s true_z=m true_vz=m/s true_roll=rad true_roll_rate=rad/s "
+        "true_pitch=rad true_pitch_rate=rad/s true_yaw=rad true_yaw_rate=rad/s"
+    ),
+    TIMING_FILE: "t=s solve_ms=ms step_ms=ms",
+    PLANT_FILE: (
+        "t=s x=m vx=m/s y=m vy=m/s z=m vz=m/s roll=rad roll_rate=rad/s pitch=rad pitch_rate=rad/s yaw=rad "
+        "yaw_rate=rad/s w1=rad/s w2=rad/s w3=rad/s w4=rad/s force_x=N force_y=N force_z=N torque_x=N m torque_y=N m "
+        "torque_z=N m wind_x=m/s wind_y=m/s wind_z=m/s"
+    ),
+    HORIZON_FILE: "t=s predicted_x=m predicted_y=m predicted_z=m",
+}
+
+
+def write(directory: Path, log: FlightLog, stride: int = 1) -> None:
+    write_log(directory, log, plant_stride=stride, metadata={"scenario": "made-up", "seed": "3"})
+
+
+def assert_equal(one: object, other: object) -> None:
+    for field in dataclasses.fields(one):  # type: ignore[arg-type]
+        np.testing.assert_array_equal(getattr(one, field.name), getattr(other, field.name), err_msg=field.name)
+
+
+@pytest.mark.parametrize("periods", [0, 1, 2, 7])
+def test_a_flight_comes_back_bit_for_bit(tmp_path: Path, periods: int) -> None:
+    log = small_log(periods, reason="at t = 0.700 s: lost")
+    write(tmp_path, log)
+    back = read_log(tmp_path, reason=log.reason)
+    assert_equal(back.control, log.control)
+    assert_equal(back.timing, log.timing)
+    assert_equal(back.plant, log.plant)
+    if log.predicted is None:
+        assert back.predicted is None
+    else:
+        assert back.predicted is not None
+        assert back.predicted.dtype == np.float32
+        np.testing.assert_array_equal(back.predicted, log.predicted)
+    assert (back.status, back.reason) == ("aborted", "at t = 0.700 s: lost")
+
+
+def test_a_flight_without_a_reason_is_completed() -> None:
+    assert small_log().status == "completed"
+
+
+def test_the_plant_is_written_at_the_log_rate(tmp_path: Path) -> None:
+    log = small_log(4, steps=5)
+    write(tmp_path, log, stride=5)
+    back = read_log(tmp_path)
+    np.testing.assert_array_equal(back.plant.t, [0.0, 0.1, 0.2, 0.3, 0.4])
+    np.testing.assert_array_equal(back.plant.state, log.plant.state[::5])
+
+
+def test_slews_start_from_the_command_before_the_first() -> None:
+    log = small_log(3).control
+    expected = [log.speeds[0] - log.speeds_before, log.speeds[1] - log.speeds[0], log.speeds[2] - log.speeds[1]]
+    np.testing.assert_array_equal(log.slews, expected)
+
+
+@pytest.mark.parametrize("name", UNITS)
+def test_every_column_has_its_unit(tmp_path: Path, name: str) -> None:
+    write(tmp_path, small_log())
+    schema = pq.read_schema(tmp_path / name)
+    assert " ".join(f"{field.name}={field.metadata[b'unit'].decode()}" for field in schema) == UNITS[name]
+    assert schema.metadata[b"scenario"] == b"made-up"
+    assert schema.metadata[b"seed"] == b"3"
+
+
+def test_what_a_flight_does_not_have_takes_no_column(tmp_path: Path) -> None:
+    log = small_log()
+    control = dataclasses.replace(log.control, truth=log.control.state)
+    plain = dataclasses.replace(log, control=control, plant=dataclasses.replace(log.plant, wrench=None, wind=None))
+    write(tmp_path, plain)
+    assert not [name for name in pq.read_schema(tmp_path / FLIGHT_FILE).names if name.startswith("true_")]
+    assert pq.read_schema(tmp_path / PLANT_FILE).names[-1] == "w4"
+    back = read_log(tmp_path)
+    assert back.plant.wrench is None
+    assert back.plant.wind is None
+    np.testing.assert_array_equal(back.control.truth, log.control.state)
+    assert back.control.measured_perfectly
+
+
+def test_equal_flights_give_equal_bytes(tmp_path: Path) -> None:
+    for name in ("a", "b"):
+        (tmp_path / name).mkdir()
+        write(tmp_path / name, small_log())
+    for name in UNITS:
+        assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes()
+
+
+def test_a_real_flight_comes_back(short_run_directory: Path) -> None:
+    log = read_log(short_run_directory)
+    assert log.control.t.size == 120
+    assert log.plant.t.size == 6 * 200 + 1
+    assert log.plant.t[-1] == 6.0
+    np.testing.assert_allclose(np.diff(log.plant.t), 0.005, rtol=1e-9)
+    np.testing.assert_array_equal(log.plant.state[:-1:10], log.control.state)  # perfect measurement
+    np.testing.assert_array_equal(log.plant.speeds[:-1:10], log.control.speeds)
+
+
+@pytest.mark.parametrize("name", [FLIGHT_FILE, TIMING_FILE, PLANT_FILE])
+def test_a_missing_file_is_named(tmp_path: Path, name: str) -> None:
+    write(tmp_path, small_log())
+    (tmp_path / name).unlink()
+    with pytest.raises(FileError, match=rf"{name}: is not a readable Parquet file"):
+        read_log(tmp_path)
+
+
+def test_a_run_without_predictions_is_read(tmp_path: Path) -> None:
+    write(tmp_path, small_log())
+    (tmp_path / HORIZON_FILE).unlink()
+    assert read_log(tmp_path).predicted is None
+
+
+@pytest.mark.parametrize("name", UNITS)
+def test_a_damaged_file_is_named_wherever_it_is_damaged(short_run_directory: Path, tmp_path: Path, name: str) -> None:
+    """Cut off or overwritten anywhere: a typed error that names the file, or the reader noticed nothing; no crash."""
+    intact = (short_run_directory / name).read_bytes()
+    for other in UNITS:
+        shutil.copy(short_run_directory / other, tmp_path / other)
+    for size in (0, 3, 4, 100, len(intact) // 2, len(intact) - 1):
+        (tmp_path / name).write_bytes(intact[:size])
+        with pytest.raises(FileError, match=f"{name}: is not a readable Parquet file"):
+            read_log(tmp_path)
+    rng = np.random.default_rng(0)
+    noticed = 0
+    for _ in range(40):
+        damaged = bytearray(intact)
+        first = int(rng.integers(len(intact)))
+        damaged[first : first + 8] = rng.bytes(8)
+        (tmp_path / name).write_bytes(damaged[: len(intact)])
+        try:
+            read_log(tmp_path)
+        except FileError:
+            noticed += 1
+    assert noticed > 0
+
+
+@pytest.mark.parametrize("name", UNITS)
+def test_a_foreign_table_is_refused(tmp_path: Path, name: str) -> None:
+    write(tmp_path, small_log())
+    pq.write_table(pa.table({"t": [0.0, 1.0], "predicted_x": ["a", "b"]}), tmp_path / name)
+    with pytest.raises(FileError, match="lacks or misstates a column of the flight log"):
+        read_log(tmp_path)
+
+
+@pytest.mark.parametrize(("name", "column"), [(FLIGHT_FILE, "x"), (FLIGHT_FILE, "iterations"), (PLANT_FILE, "t")])
+def test_a_column_of_texts_is_refused(tmp_path: Path, name: str, column: str) -> None:
+    write(tmp_path, small_log())
+    table = pq.read_table(tmp_path / name)
+    texts = pa.array(["no number"] * table.num_rows)
+    pq.write_table(table.set_column(table.schema.get_field_index(column), column, texts), tmp_path / name)
+    with pytest.raises(FileError, match="lacks or misstates a column of the flight log"):
+        read_log(tmp_path)

@@ -1,0 +1,168 @@
+"""The numbers of a summary, by hand."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from support import small_log
+
+from quadsim.flight import metrics
+from quadsim.flight.log import ControlLog, TimingLog
+from quadsim.flight.metrics import CourseStep
+from quadsim.state import Array
+
+
+def control(z: list[float], reference: list[float]) -> ControlLog:
+    """A log where z [m] and its reference are as given and all else is zero."""
+    log = small_log(len(z)).control
+    state, wanted = np.zeros_like(log.state), np.zeros_like(log.reference)
+    state[:, 4], wanted[:, 2] = z, reference
+    return replace(log, truth=state, reference=wanted)
+
+
+def test_tracking_errors_are_real_minus_reference() -> None:
+    numbers = metrics.tracking(control([0.0, 1.0, 3.0, 1.5], [0.0, 2.0, 2.0, 2.0]))
+    assert numbers["rmse"]["z"] == pytest.approx(math.sqrt((0.0 + 1.0 + 1.0 + 0.25) / 4.0))
+    assert numbers["max_error"]["z"] == 1.0
+    assert numbers["final_error"]["z"] == -0.5
+    assert numbers["unit"] == {"x": "m", "y": "m", "z": "m", "yaw": "rad"}
+    for name in ("rmse", "max_error", "final_error", "overshoot"):
+        assert numbers[name]["x"] == numbers[name]["y"] == numbers[name]["yaw"] == 0.0
+
+
+@pytest.mark.parametrize(
+    ("z", "reference", "overshoot"),
+    [
+        ([0.0, 1.0, 3.0, 2.0], [0.0, 2.0, 2.0, 2.0], 1.0),  # above the highest reference
+        ([0.0, -0.5, 1.0, 2.0], [0.0, 2.0, 2.0, 2.0], 0.5),  # below where it started
+        ([5.0, 4.0, 2.0, 2.0], [2.0, 2.0, 2.0, 2.0], 0.0),  # coming from outside the reference is none
+        ([-1.0, 0.0, 2.0, 2.0], [2.0, 2.0, 2.0, 2.0], 0.0),
+        ([5.0, 4.0, 2.0, 1.75], [2.0, 2.0, 2.0, 2.0], 0.25),
+    ],
+)
+def test_overshoot_is_what_leaves_the_range_of_reference_and_start(
+    z: list[float], reference: list[float], overshoot: float
+) -> None:
+    assert metrics.tracking(control(z, reference))["overshoot"]["z"] == overshoot
+
+
+def test_extremes_of_speeds_and_steps() -> None:
+    log = small_log(3).control
+    log.speeds[:] = 200.0
+    log.speeds[1, 2] = 230.0
+    log.speeds_before[:] = 195.0
+    extremes = {"speed_min": 200.0, "speed_max": 230.0, "slew_min": -30.0, "slew_max": 30.0}
+    # Four rotors step from 195 to 200; then one goes to 230 and back.
+    assert metrics.control(log) == {**extremes, "total_variation": 4 * 5.0 + 30.0 + 30.0}
+
+
+def settled(t: Array, x: Array, *, before: float, after: float, start: float = 0.0, until: float) -> float | None:
+    """Settling time of x [m], all other channels at rest."""
+    outputs = np.zeros((t.size, 4))
+    outputs[:, 0] = x
+    step = CourseStep(channel="x", time=start, before=before, after=after, until=until)
+    (entry,) = metrics.settling(t, outputs, [step])
+    assert {name: entry[name] for name in ("channel", "time", "before", "after")} == {
+        "channel": "x", "time": start, "before": before, "after": after,
+    }  # fmt: skip
+    return entry["settled"]
+
+
+@pytest.mark.parametrize("tau", [0.1, 0.7, 2.0])
+@pytest.mark.parametrize(("before", "after"), [(0.0, 10.0), (3.0, -1.0)])
+def test_a_first_order_response_settles_after_tau_ln_20(tau: float, before: float, after: float) -> None:
+    """exp(-t / tau) = 0.05 at t = tau ln 20, whatever the step; the first sample from then on counts."""
+    period, start = 0.05, 2.0
+    t = np.arange(400) * period
+    x = np.where(t < start, before, after + (before - after) * np.exp(-(t - start) / tau))
+    expected = period * math.ceil(tau * math.log(20.0) / period)
+    found = settled(t, x, before=before, after=after, start=start, until=20.0)
+    assert found == pytest.approx(expected, abs=1e-9)
+
+
+def test_an_oscillation_settles_when_its_envelope_has() -> None:
+    """The extremes of 1 - exp(-t / 2) cos(pi t), near each whole second, are within 5 % from 2 ln 20 = 5.99 s on."""
+    t = np.arange(2000) * 0.01
+    x = 1.0 - np.exp(-0.5 * t) * np.cos(np.pi * t)
+    last = t[np.abs(x - 1.0) > 0.05][-1]
+    assert 5.0 < last < 2.0 * math.log(20.0)
+    assert settled(t, x, before=0.0, after=1.0, until=20.0) == pytest.approx(last + 0.01)
+
+
+def test_an_output_that_leaves_the_band_again_has_not_settled_before() -> None:
+    t = np.arange(10.0)
+    x = np.array([0.0, 1.0, 1.0, 1.0, 0.9, 1.0, 1.0, 1.0, 1.0, 1.0])
+    assert settled(t, x, before=0.0, after=1.0, until=10.0) == 5.0
+    assert settled(t, x, before=0.0, after=1.0, until=3.0) == 1.0  # what comes after is the next step's
+    assert settled(t, np.where(t < 9.0, x, 0.5), before=0.0, after=1.0, until=10.0) is None
+
+
+def test_the_band_is_a_share_of_the_step() -> None:
+    t = np.arange(4.0)
+    assert settled(t, np.array([0.0, 9.4, 9.6, 9.6]), before=0.0, after=10.0, until=4.0) == 2.0
+    assert settled(t, np.array([9.0, 9.4, 9.6, 9.6]), before=9.0, after=10.0, until=4.0) is None
+
+
+def test_one_sample_settles_nothing() -> None:
+    assert settled(np.zeros(1), np.zeros(1), before=1.0, after=0.0, until=40.0) is None
+
+
+def test_a_flight_that_ended_before_has_not_settled() -> None:
+    t, x = np.arange(5.0), np.array([0.0, 1.0, 1.0, 1.0, 1.0])
+    assert settled(t, x, before=0.0, after=1.0, until=5.0) == 1.0
+    assert settled(t, x, before=0.0, after=1.0, until=6.0) is None
+    assert settled(t, x, before=0.0, after=1.0, start=7.0, until=9.0) is None
+    assert settled(t[:0], x[:0], before=0.0, after=1.0, until=5.0) is None
+
+
+def test_peak_tilt_is_the_larger_of_roll_and_pitch() -> None:
+    state = np.zeros((3, 12))
+    state[1, 6], state[2, 8], state[2, 10] = math.radians(3.0), math.radians(-7.0), 2.0
+    assert metrics.peak_tilt(state) == pytest.approx(7.0)
+
+
+def test_percentiles() -> None:
+    values = np.arange(101.0)[::-1]
+    assert metrics.percentiles(values) == {"p50": 50.0, "p95": 95.0, "p99": 99.0, "max": 100.0}
+
+
+def test_the_controllers_counts_and_times() -> None:
+    log = replace(
+        small_log(4).control,
+        status=("solved", "max_iterations", "unconstrained", "solved"),
+        fallback=np.array([0, 1, 0, 0]),
+        iterations=np.array([3, 100, 4, 5]),
+        active=np.array([0, 0, 7, 2]),
+        primal_residual=np.array([1e-9, math.inf, 3e-9, 0.0]),
+        dual_residual=np.array([1e-8, math.nan, 0.0, 2e-8]),
+    )
+    timing = TimingLog(t=log.t, solve_ms=np.array([1.0, 2.0, 3.0, 4.0]), step_ms=np.array([50.0, 50.1, 3.0, 70.0]))
+    numbers = metrics.controller(log, timing, deadline_ms=50.0)
+    assert numbers["statuses"] == {"max_iterations": 1, "solved": 2, "unconstrained": 1}
+    assert numbers["fallbacks"] == {"0": 3, "1": 1}
+    assert numbers["iterations"] == {"mean": 28.0, "max": 100}
+    assert (numbers["active_max"], numbers["active_periods"]) == (7, 2)
+    assert numbers["solve_ms"]["p50"] == 2.5
+    assert numbers["step_ms"]["max"] == 70.0
+    assert (numbers["deadline_ms"], numbers["deadline_misses"]) == (50.0, 2)
+    assert numbers["residual_max"] == {"primal": 3e-9, "dual": 2e-8}  # of the periods with an optimum
+    json.dumps(numbers, allow_nan=False)
+
+
+def test_nothing_solved_has_no_residual() -> None:
+    log = replace(small_log(2).control, status=("numerics", "numerics"), primal_residual=np.full(2, math.nan))
+    assert metrics.controller(log, small_log(2).timing, 50.0)["residual_max"] == {"primal": 0.0, "dual": 0.0}
+
+
+def test_a_back_end_that_reports_no_residual_has_none() -> None:
+    log = replace(small_log(2).control, status=("solved", "solved"), primal_residual=np.array([math.nan, 0.0]))
+    assert metrics.controller(log, small_log(2).timing, 50.0)["residual_max"]["primal"] is None
+
+
+def test_a_flight_of_no_period_has_no_numbers() -> None:
+    assert metrics.flight_numbers(small_log(0), 50.0) == {"tracking": {}, "control": {}, "controller": {}}
+    assert all(metrics.flight_numbers(small_log(1), 50.0).values())

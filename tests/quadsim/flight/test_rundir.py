@@ -1,0 +1,136 @@
+"""A run directory is read back, and tells when it was tampered with."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import shutil
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from quadsim.errors import FileError, OutputError
+from quadsim.flight import rundir
+from quadsim.flight.audit import audit
+from quadsim.flight.rundir import Run
+from quadsim.outputs import write_json, writing
+
+
+@pytest.fixture
+def copied(short_run_directory: Path, tmp_path: Path) -> Path:
+    """A copy of the short run, to damage."""
+    return shutil.copytree(short_run_directory, tmp_path / "run")
+
+
+def test_a_run_is_read_back(short_run: Run) -> None:
+    assert rundir.is_run(short_run.directory)
+    assert short_run.name == "paper-constrained"
+    assert short_run.vehicle.hover_speed == pytest.approx(192.8, rel=1e-6)
+    assert short_run.log.status == "completed"
+    assert [limit.name for limit in short_run.limits][:4] == ["roll", "pitch", "speed", "slew"]
+    assert short_run.limits[0].stop == math.inf
+
+
+def test_limits_come_back_from_the_summary(short_run: Run) -> None:
+    for finding, entry in zip(audit(short_run.log, short_run.limits), short_run.summary["constraints"], strict=True):
+        assert rundir.limit_from_json(rundir.limit_to_json(finding)) == finding.limit
+        assert rundir.limit_from_json(json.loads(json.dumps(entry))) == finding.limit
+        if finding.limit.start > 6.0:  # a window not reached: null, not NaN
+            assert entry["worst_margin"] is entry["peak_plant"] is entry["worst_time"] is None
+            assert entry["satisfied"] is False
+
+
+def test_every_file_but_the_summary_has_its_hash(short_run_directory: Path) -> None:
+    summary = rundir.read_summary(short_run_directory)
+    assert set(summary["files"]) == {
+        "scenario.toml", "flight.parquet", "timing.parquet", "plant.parquet", "horizon.parquet",
+    }  # fmt: skip
+    for name, digest in summary["files"].items():
+        assert digest == "sha256:" + hashlib.sha256((short_run_directory / name).read_bytes()).hexdigest()
+    assert rundir.damaged_files(short_run_directory, summary) == []
+
+
+def test_damaged_and_missing_files_are_found(copied: Path) -> None:
+    (copied / "timing.parquet").unlink()
+    with (copied / "scenario.toml").open("a") as file:
+        file.write("#")
+    assert sorted(rundir.damaged_files(copied, rundir.read_summary(copied))) == ["scenario.toml", "timing.parquet"]
+
+
+def test_a_product_is_added_with_its_hash(copied: Path) -> None:
+    before = rundir.read_summary(copied)
+    for content in (b"film", b"another film"):
+        with rundir.adding(copied, "flight.mp4") as new:
+            new.write_bytes(content)
+        after = rundir.read_summary(copied)
+        assert set(after["files"]) - set(before["files"]) == {"flight.mp4"}
+        assert {**after, "files": 0} == {**before, "files": 0}
+        assert rundir.damaged_files(copied, after) == []
+    with writing(copied, rundir.KIND) as partial:  # it is all ours still
+        (partial / "new.txt").write_text("new")
+
+
+@pytest.mark.parametrize("name", ["flight.mp4", "summary.json"])
+def test_a_product_never_replaces_what_is_not_ours(copied: Path, name: str) -> None:
+    with (copied / name).open("a") as file:
+        file.write(" ")
+    content = (copied / name).read_bytes()
+    with (
+        pytest.raises(OutputError, match=f"{name}: it is not as quadsim wrote it"),
+        rundir.adding(copied, "flight.mp4"),
+    ):
+        pytest.fail("the block must not be entered")
+    assert (copied / name).read_bytes() == content
+
+
+def test_what_was_changed_by_hand_is_not_listed_by_adding_to_it(copied: Path) -> None:
+    with (copied / "scenario.toml").open("a") as file:
+        file.write("#")
+    with rundir.adding(copied, "flight.mp4") as new:
+        new.write_bytes(b"film")
+    assert rundir.damaged_files(copied, rundir.read_summary(copied)) == ["scenario.toml"]
+
+
+@pytest.mark.parametrize("content", [b"", b"{", b"[1]", b'"text"', b"\xff", b"{}"])
+def test_what_is_no_summary_is_refused(copied: Path, content: bytes) -> None:
+    (copied / "summary.json").write_bytes(content)
+    with pytest.raises(FileError, match=r"summary\.json: is not a run's summary"):
+        rundir.load_run(copied)
+    assert not rundir.is_run(copied)
+
+
+def test_a_directory_without_a_summary_is_no_run(tmp_path: Path) -> None:
+    with pytest.raises(FileError, match=r"is not a run directory: it has no summary\.json"):
+        rundir.read_summary(tmp_path)
+    assert not rundir.is_run(tmp_path)
+    assert not rundir.is_run(tmp_path / "nowhere")
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"constraints": 3}, "it lacks or misstates constraints"),
+        ({"satisfied": "yes", "files": None}, "it lacks or misstates satisfied, files"),
+        ({"constraints": [{"name": "roll"}]}, r"it lacks or misstates constraints\.0\.signal, constraints\.0\.unit"),
+        ({"constraints": [3]}, r"it lacks or misstates constraints\.0$"),
+        ({"vehicle": {"mass": 3.0}}, r"it lacks or misstates vehicle\.name"),
+        ({"duration": True, "seed": 1.5}, "it lacks or misstates duration, seed$"),
+        ({"tracking": {"unit": 3}}, r"it lacks or misstates tracking\.unit, tracking\.rmse"),
+        ({"reason": "at once"}, "contradicts itself: status is 'completed', and reason is 'at once'"),
+    ],
+)
+def test_a_damaged_summary_is_refused(copied: Path, change: dict[str, Any], message: str) -> None:
+    summary = rundir.read_summary(copied)
+    write_json(copied / "summary.json", summary | change)
+    with pytest.raises(FileError, match=rf"summary\.json: .*{message}"):
+        rundir.load_run(copied)
+
+
+def test_a_missing_entry_of_the_summary_is_named(copied: Path) -> None:
+    summary = rundir.read_summary(copied)
+    del summary["reason"], summary["vehicle"]
+    write_json(copied / "summary.json", summary)
+    with pytest.raises(FileError, match=r"it lacks or misstates reason, vehicle$"):
+        rundir.load_run(copied)

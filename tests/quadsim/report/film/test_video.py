@@ -1,0 +1,451 @@
+"""Films: the numbers behind the frames, the captions, and the MP4 and GIF that come out of the child processes."""
+
+from __future__ import annotations
+
+import gc
+import os
+import subprocess
+import sys
+import warnings
+from dataclasses import fields, replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import imageio.v3 as iio
+import imageio_ffmpeg
+import numpy as np
+import pytest
+
+from quadsim.controller import MISSED, SOLVED, UNCONSTRAINED
+from quadsim.errors import FileError, OutputError, ParameterError, RenderingUnavailableError
+from quadsim.flight.audit import Limit, audit
+from quadsim.flight.parquet import write_log
+from quadsim.flight.rundir import Run, load_run
+from quadsim.outputs import write_json, writing_file
+from quadsim.report.film import video
+from quadsim.report.film.captions import Overlay, margin_rows
+from quadsim.report.film.frames import Shot, make_footage, thin
+from quadsim.report.film.painter import CYAN, GREEN, RED, VIOLET, Colour
+from quadsim.report.film.video import render_gif, render_video, rendering_backend
+from quadsim.state import EULER, INDEX, POSITION, body_to_world
+
+
+@pytest.fixture(scope="module")
+def backend() -> str:
+    try:
+        return rendering_backend()
+    except RenderingUnavailableError as error:
+        pytest.skip(str(error))
+
+
+@pytest.fixture(scope="module")
+def film(backend: str, short_run: Run, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[tuple[int, int]]]:
+    """The first two seconds in two pieces, and the progress that was reported."""
+    path, reports = tmp_path_factory.mktemp("film") / "flight.mp4", []
+    render_video(
+        short_run.directory, path, workers=2, stop=2.0, progress=lambda done, total: reports.append((done, total))
+    )
+    return path, reports
+
+
+def decode(path: Path) -> np.ndarray:
+    """All frames of an MP4; imageio leaves ffmpeg's pipes to the garbage collector."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", ResourceWarning)
+        frames = iio.imread(path, plugin="FFMPEG")
+        gc.collect()
+    return frames
+
+
+def metadata(path: Path) -> dict[str, Any]:
+    """What ffmpeg says about an MP4."""
+    reader = imageio_ffmpeg.read_frames(path)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", ResourceWarning)
+        meta = next(reader)
+        reader.close()
+        del reader
+        gc.collect()
+    return meta
+
+
+def rewrite(run: Run, directory: Path, rows: int, *, states: float = 1.0) -> Path:
+    """A copy of a run, aborted after `rows` control periods, its plant states multiplied by `states`."""
+    directory.mkdir()
+    control, plant = run.log.control, run.log.plant
+    cut = {
+        field.name: getattr(control, field.name)[:rows] for field in fields(control) if field.name != "speeds_before"
+    }
+    last = np.searchsorted(plant.t, 0.05 * rows + 1e-9, side="right")
+    log = replace(
+        run.log,
+        control=replace(control, **cut),
+        timing=replace(run.log.timing, **{n: getattr(run.log.timing, n)[:rows] for n in ("t", "solve_ms", "step_ms")}),
+        plant=replace(plant, t=plant.t[:last], state=states * plant.state[:last], speeds=plant.speeds[:last]),
+        predicted=None if run.log.predicted is None else run.log.predicted[:rows],
+        reason="lost on purpose",
+    )
+    write_log(directory, log, plant_stride=1, metadata={})
+    write_json(directory / "summary.json", {**run.summary, "status": "aborted", "reason": log.reason})
+    return directory
+
+
+def test_the_film_has_the_frames_asked_for(film: tuple[Path, list[tuple[int, int]]]):
+    path, _ = film
+    frames, meta = decode(path), metadata(path)
+    assert frames.shape == (60, 720, 1280, 3)
+    assert meta["fps"] == 30.0
+    assert meta["codec"] == "h264"
+    assert meta["pix_fmt"].startswith("yuv420p")
+    sky, ground = frames[:, 60:100, 500:780].mean(axis=(1, 2)), frames[:, 500:540, 500:780].mean(axis=(1, 2))
+    assert (sky[:, 2] > sky[:, 0] + 15.0).all()  # a blue sky above a grey floor, in every frame of both pieces
+    assert (np.ptp(ground, axis=1) < 40.0).all()
+    assert ground.min() > 60.0
+    moved = np.abs(frames[30].astype(int) - frames[0]).mean()
+    assert moved > 2.0
+    assert path.stat().st_size < 2_000_000
+
+
+def test_the_index_stands_before_the_pictures(film: tuple[Path, list[tuple[int, int]]]):
+    data = film[0].read_bytes()
+    assert data.index(b"moov") < data.index(b"mdat")  # a browser can start before it has the whole file
+
+
+def test_progress_counts_up_to_all_frames_and_nothing_else_is_left(film: tuple[Path, list[tuple[int, int]]]):
+    path, reports = film
+    done = [count for count, _ in reports]
+    assert done == sorted(done)
+    assert reports[-1] == (60, 60)
+    assert [entry.name for entry in path.parent.iterdir()] == ["flight.mp4"]
+
+
+def test_the_callers_environment_is_untouched(backend: str, short_run: Run, tmp_path: Path):
+    before = dict(os.environ)
+    render_video(short_run.directory, tmp_path / "film.mp4", width=320, height=180, fps=5, stop=1.0)
+    assert dict(os.environ) == before
+    assert decode(tmp_path / "film.mp4").shape == (5, 180, 320, 3)
+
+
+def test_a_gif_is_small_and_moves(backend: str, short_run: Run, tmp_path: Path):
+    render_gif(short_run.directory, tmp_path / "film.gif", width=320, fps=4, stop=3.0, speed=3.0)
+    frames = iio.imread(tmp_path / "film.gif")
+    assert frames.shape[:3] == (4, 180, 320)
+    assert np.abs(frames[3].astype(int) - frames[0]).mean() > 2.0
+    assert (tmp_path / "film.gif").stat().st_size < 200_000
+
+
+@pytest.mark.parametrize(("rows", "states"), [(1, 1.0), (20, 1e5)], ids=["one-period", "lost-far-away"])
+def test_aborted_flights_can_be_filmed(backend: str, short_run: Run, tmp_path: Path, rows: int, states: float):
+    directory = rewrite(short_run, tmp_path / "aborted", rows, states=states)
+    render_video(directory, tmp_path / "film.mp4", width=320, height=180, fps=10, workers=1)
+    frames = decode(tmp_path / "film.mp4")
+    assert len(frames) == max(1, round(0.05 * rows * 10))
+    assert frames.mean() > 30.0
+
+
+def test_a_flight_without_a_single_period_is_refused(short_run: Run, tmp_path: Path):
+    directory = rewrite(short_run, tmp_path / "empty", 0)
+    with pytest.raises(FileError, match="nothing to film"):
+        render_video(directory, tmp_path / "film.mp4")
+    assert not (tmp_path / "film.mp4").exists()
+
+
+def test_without_a_backend_the_error_lists_what_was_tried(
+    short_run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(video, "BACKENDS", ("direct3d", "carrier-pigeon"))
+    with pytest.raises(RenderingUnavailableError, match=r"libegl1.*--no-video") as caught:
+        render_video(short_run.directory, tmp_path / "film.mp4", stop=0.5)
+    assert set(caught.value.tried) == {"direct3d", "carrier-pigeon"}
+    assert "direct3d" in caught.value.tried["direct3d"]  # MuJoCo's own complaint
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_users_backend_is_tried_first(monkeypatch: pytest.MonkeyPatch):
+    asked: list[str] = []
+
+    def run(_: object, *, env: dict[str, str], **__: object) -> None:
+        asked.append(env["MUJOCO_GL"])
+        assert env["PYOPENGL_PLATFORM"] == env["MUJOCO_GL"]
+        if env["MUJOCO_GL"] == "osmesa":
+            raise subprocess.CalledProcessError(1, "probe", stderr=b"Traceback\nImportError: no OSMesa here\n")
+
+    monkeypatch.setenv("MUJOCO_GL", "osmesa")
+    monkeypatch.setattr(subprocess, "run", run)
+    assert rendering_backend() == "egl"
+    assert asked == ["osmesa", "egl"]
+
+
+@pytest.fixture
+def fake_worker(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Workers that report one frame; the one that renders the first frames then waits, another fails."""
+    script = (
+        "import json, sys, time\n"
+        "if sys.argv[1] == 'probe': sys.exit()\n"
+        "print(1, flush=True)\n"
+        "open(sys.argv[3], 'w').write('half a film')\n"
+        "if json.loads(sys.argv[2])['first'] == 0: time.sleep(600)\n"
+        "sys.exit('Traceback ...\\nGLError: the picture is lost')\n"
+    )
+    monkeypatch.setattr(video, "_WORKER", (sys.executable, "-c", script))
+
+
+@pytest.mark.usefixtures("fake_worker")
+def test_a_worker_that_fails_on_a_full_disk_is_told_so(
+    short_run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(video.shutil, "disk_usage", lambda folder: SimpleNamespace(free=0))
+    with pytest.raises(OutputError, match="renderer failed: the disk is full"):
+        render_video(short_run.directory, tmp_path / "film.mp4", workers=2)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.usefixtures("fake_worker")
+def test_a_failing_worker_stops_the_others_and_leaves_nothing(short_run: Run, tmp_path: Path):
+    target = tmp_path / "film.mp4"
+    with writing_file(target, ".mp4") as older:
+        older.write_bytes(b"an older film")
+    with pytest.raises(OutputError, match="renderer failed: GLError: the picture is lost") as caught:
+        render_video(short_run.directory, target, workers=2)
+    assert caught.value.path == target
+    assert [entry.name for entry in tmp_path.iterdir()] == ["film.mp4"]
+    assert target.read_bytes().startswith(b"an older film")
+
+
+@pytest.mark.usefixtures("fake_worker")
+def test_ctrl_c_kills_the_workers(short_run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    started: list[subprocess.Popen[bytes]] = []
+    popen = subprocess.Popen
+
+    def spy(*arguments: object, **options: object) -> subprocess.Popen[bytes]:
+        started.append(popen(*arguments, **options))
+        return started[-1]
+
+    def interrupt(_: int, __: int) -> None:
+        raise KeyboardInterrupt
+
+    rendering_backend()  # the probe is not one of the workers to be watched
+    monkeypatch.setattr(video, "rendering_backend", lambda: "egl")
+    monkeypatch.setattr(subprocess, "Popen", spy)
+    with pytest.raises(KeyboardInterrupt):
+        render_video(short_run.directory, tmp_path / "film.mp4", workers=2, progress=interrupt)
+    assert len(started) == 2
+    assert all(process.returncode is not None for process in started)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_film_goes_nowhere_without_a_folder(short_run: Run, tmp_path: Path):
+    with pytest.raises(OutputError, match="No such file"):
+        render_video(short_run.directory, tmp_path / "missing" / "film.mp4", stop=0.1)
+
+
+@pytest.mark.parametrize(
+    ("options", "rule"),
+    [
+        ({"width": 641}, "even"),
+        ({"height": 90}, "at least 180"),
+        ({"fps": 0}, "at least 1"),
+        ({"workers": 0}, "at least 1"),
+        ({"speed": 0.0}, "positive"),
+        ({"start": 7.0}, "between 0 s"),
+    ],
+)
+def test_impossible_films_are_refused(short_run: Run, tmp_path: Path, options: dict[str, float], rule: str):
+    with pytest.raises(ParameterError, match=rule):
+        render_video(short_run.directory, tmp_path / "film.mp4", **options)
+
+
+def test_a_shot_tells_its_times():
+    shot = Shot(run="x", fps=10, start=2.0, speed=4.0, first=5, count=3)
+    assert shot.times == pytest.approx([4.0, 4.4, 4.8])
+    assert Shot(**shot.to_json()) == shot
+
+
+def test_footage_meets_the_plant_at_its_rows_and_halfway_between(short_run: Run):
+    plant = short_run.log.plant
+    rows = np.array([10, 200, 777])
+    at = make_footage(short_run, plant.t[rows])
+    assert at.position == pytest.approx(plant.state[rows][:, POSITION])
+    x, y, z, w = at.quaternion[:, 1], at.quaternion[:, 2], at.quaternion[:, 3], at.quaternion[:, 0]
+    up = np.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)], axis=1)
+    assert up == pytest.approx(body_to_world(plant.state[rows][:, EULER])[:, :, 2])
+    between = make_footage(short_run, 0.5 * (plant.t[rows] + plant.t[rows + 1]))
+    assert between.position == pytest.approx(0.5 * (plant.state[rows] + plant.state[rows + 1])[:, POSITION])
+    assert np.linalg.norm(between.quaternion, axis=1) == pytest.approx(np.ones(3))
+
+
+def test_footage_knows_its_period_and_the_worst_margin_so_far(short_run: Run):
+    footage = make_footage(short_run, np.array([0.0, 0.049, 0.05, 3.0, 6.0]))
+    assert footage.period.tolist() == [0, 0, 1, 60, len(short_run.log.control.t) - 1]
+    assert footage.turned[-1] == pytest.approx(np.sum(0.05 * short_run.log.control.speeds, axis=0), rel=1e-2)
+    findings = audit(short_run.log, short_run.limits)
+    for track, finding in zip(footage.margins, findings, strict=True):
+        assert track.worst[-1] == pytest.approx(finding.worst_margin, nan_ok=True)
+
+
+def test_the_camera_is_smooth_and_never_far(short_run: Run):
+    times = np.arange(0.0, 6.0, 1 / 30)
+    footage = make_footage(short_run, times)
+    reach = np.abs(footage.aim - footage.position).max()
+    assert 0.0 < reach <= 0.6 * short_run.vehicle.arm_length + 1e-12
+
+
+def test_thinning_keeps_the_path_within_its_tolerance():
+    angle = np.linspace(0.0, np.pi, 2000)
+    arc = np.stack([np.cos(angle), np.sin(angle), 0.0 * angle], axis=1)
+    kept = thin(arc, 0.01)
+    assert kept[0] == 0
+    assert kept[-1] == 1999
+    assert len(kept) < 30
+    sagitta = 1.0 - np.cos(0.5 * np.diff(angle[kept]))
+    assert sagitta.max() <= 0.01 + 1e-9
+    assert thin(np.zeros((5, 3)), 0.01).tolist() == [0, 4]
+    assert thin(np.zeros((1, 3)), 0.01).tolist() == [0]
+
+
+def test_captions_name_the_law(short_run: Run) -> None:
+    summary = {**short_run.summary, "controller": {**short_run.summary["controller"], "name": "pid", "solver": ""}}
+    run = replace(short_run, summary=summary)
+    assert Overlay(run, make_footage(run, np.array([1.0])), width=1280, height=720)._subtitle == "PID"
+
+
+def pixels(run: Run, colour: tuple[int, int, int], time: float = 1.0) -> int:
+    """How much of a frame the captions fill with a colour."""
+    footage = make_footage(run, np.array([time]))
+    blank = np.full((720, 1280, 3), 128, np.uint8)
+    picture = Overlay(run, footage, width=1280, height=720).draw(blank, 0)
+    return int(np.count_nonzero((picture == colour).all(axis=-1)))
+
+
+@pytest.mark.parametrize(
+    ("status", "good"),
+    [
+        (SOLVED, True),
+        (UNCONSTRAINED, True),
+        ("landed", True),
+        ("crashed", False),
+        (MISSED, False),
+        ("infeasible", False),
+    ],
+)
+def test_captions_tell_an_optimum_from_a_failure(short_run: Run, status: str, good: bool):
+    control = replace(short_run.log.control, status=(status,) * short_run.log.control.t.size)
+    run = replace(short_run, log=replace(short_run.log, control=control))
+    assert (pixels(run, GREEN) > pixels(run, RED)) == good
+    assert (pixels(run, RED) == 0) == good
+
+
+def test_captions_tell_the_phase_where_there_is_a_ground(short_run: Run):
+    def at_phase(*phases: str) -> Run:
+        control = short_run.log.control
+        phase = (*phases, *("flying",) * (control.t.size - len(phases)))
+        return replace(short_run, log=replace(short_run.log, control=replace(control, phase=phase)))
+
+    without = pixels(at_phase(), GREEN)
+    assert pixels(at_phase("landed"), GREEN) > without, "told throughout a flight with a ground"
+    assert pixels(at_phase("landed"), GREEN) != pixels(at_phase(*("armed",) * 40), GREEN)
+
+
+@pytest.mark.parametrize(("entry", "columns", "colour"), [("wind", 3, CYAN), ("wrench", 6, VIOLET)])
+def test_captions_tell_the_wind_and_the_external_force(short_run: Run, entry: str, columns: int, colour: Colour):
+    def acting(x: float) -> Run:
+        plant = short_run.log.plant
+        values = np.zeros((plant.t.size, columns))
+        values[:, 0] = x * (plant.t >= 0.5)
+        return replace(short_run, log=replace(short_run.log, plant=replace(plant, **{entry: values})))
+
+    assert pixels(short_run, colour) == 0
+    eastward, westward = pixels(acting(3.0), colour), pixels(acting(-3.0), colour)
+    assert eastward > 100
+    assert westward == pytest.approx(eastward, abs=15), "the arrow's edges are rounded otherwise"
+    calm = make_footage(acting(3.0), np.array([0.4, 0.6]))
+    shown = calm.wind if entry == "wind" else calm.force
+    assert shown is not None
+    np.testing.assert_array_equal(shown[:, 0], [0.0, 3.0])
+
+
+def test_arrows_on_the_map_point_where_the_wind_blows(short_run: Run):
+    plant = short_run.log.plant
+    wind = np.tile([0.0, 2.0, 0.0], (plant.t.size, 1))
+    run = replace(short_run, log=replace(short_run.log, plant=replace(plant, wind=wind)))
+    blank = np.full((720, 1280, 3), 128, np.uint8)
+    picture = Overlay(run, make_footage(run, np.array([0.0])), width=1280, height=720).draw(blank, 0)
+    rows, columns = np.nonzero((picture[:206, 1028:] == CYAN).all(axis=-1))
+    assert np.ptp(rows) > 25 > np.ptp(columns), "y is up on the map"
+    widest = [np.count_nonzero(rows == row) for row in (rows.min() + 3, rows.max() - 3)]
+    assert widest[0] > widest[1], "the head is above"
+
+
+def test_captions_turn_red_when_a_limit_breaks(short_run: Run):
+    tight = tuple(
+        replace(limit, upper=100.0, tolerance=0.0, tolerance_sampled=0.0) if limit.signal == "speed" else limit
+        for limit in short_run.limits
+    )
+    assert pixels(short_run, RED) == 0
+    assert pixels(replace(short_run, limits=tight), RED) > 1000  # four bars, four numbers, one row of the table
+
+
+def bounded(run: Run, *limits: Limit) -> Run:
+    """The run as if it had been held to these limits, before which stand seven that are met with metres to spare."""
+    wide = [Limit(name=f"wide_{j}", signal="z", upper=1000.0 + j) for j in range(7)]
+    return replace(run, limits=(*wide, *limits))
+
+
+def rows(run: Run, *times: float) -> list[tuple[list[str], str]]:
+    """Names of the limits, and what is said of the others, in frames at these times."""
+    footage = make_footage(run, np.array(times))
+    ranked = sorted(footage.margins, key=lambda track: track.rank)
+    found = [margin_rows(ranked, i) for i in range(len(times))]
+    return [([track.limit.name for track in shown], rest) for shown, rest in found]
+
+
+def test_violated_limits_come_first_then_the_nearest_and_the_film_says_how_many_more(short_run: Run) -> None:
+    """In the order of the file the one that is violated by metres stands eighth, and was never seen."""
+    run_mismatch = short_run.log.plant.state[-1, INDEX["z"]]
+    assert run_mismatch > 2.0
+    low = Limit(name="low", signal="z", upper=0.5)
+    near = Limit(name="near", signal="z", upper=1.01 * run_mismatch)
+    reported = Limit(name="reported", signal="z", upper=0.01, required=False)
+    run = bounded(short_run, near, reported, low)
+    (shown, rest) = rows(run, 6.0)[0]
+    assert shown == ["low", "reported", "near", "wide_0", "wide_1", "wide_2"]
+    assert rest == "and 4 more"
+    assert pixels(bounded(short_run, near), RED, 6.0) == 0
+    assert pixels(run, RED, 6.0) > 0
+
+
+def test_rows_keep_their_place_over_the_film_and_over_its_pieces(short_run: Run) -> None:
+    """Violated at the end alone, and first from the start; processes that render pieces of a film share nothing."""
+    low = Limit(name="low", signal="z", upper=0.9 * short_run.log.plant.state[-1, INDEX["z"]])
+    run = bounded(short_run, low)
+    together = rows(run, 0.1, 6.0)
+    assert together[0] == together[1] == (["low", *(f"wide_{j}" for j in range(5))], "and 2 more")
+    assert rows(run, 0.1) == together[:1]
+    assert pixels(run, RED, 0.1) == 0 < pixels(run, RED, 6.0)
+
+
+def test_limits_that_have_not_begun_and_violated_ones_without_a_row_are_counted(short_run: Run) -> None:
+    later = Limit(name="later", signal="z", upper=0.01, start=5.0)
+    never = Limit(name="never", signal="z", upper=0.01, start=50.0)
+    early, end = rows(bounded(short_run, later, never), 1.0, 6.0)
+    assert early == ([f"wide_{j}" for j in range(6)], "and 1 more, 2 not begun")
+    assert end == (["later", *(f"wide_{j}" for j in range(5))], "and 2 more, 1 not begun")
+    low = [Limit(name=f"low_{j}", signal="z", upper=0.1 + 0.01 * j) for j in range(8)]
+    run = bounded(short_run, *low)
+    assert rows(run, 6.0) == [([f"low_{j}" for j in range(6)], "and 9 more, 2 of them violated")]
+    assert rows(replace(run, limits=run.limits[:4]), 6.0) == [([f"wide_{j}" for j in range(4)], "")]
+
+
+def test_captions_fit_pictures_of_other_sizes(short_run: Run):
+    footage = make_footage(short_run, np.array([0.5]))
+    for width, height, compact in ((320, 180, False), (1920, 1080, False), (640, 480, False), (960, 540, True)):
+        blank = np.full((height, width, 3), 128, np.uint8)
+        picture = Overlay(short_run, footage, width=width, height=height, compact=compact).draw(blank, 0)
+        assert picture.shape == (height, width, 3)
+        assert 0.02 < np.mean(picture != 128) < 0.6
+
+
+def test_a_run_that_is_not_one_is_refused(tmp_path: Path):
+    with pytest.raises(FileError, match="is not a run directory"):
+        load_run(tmp_path)

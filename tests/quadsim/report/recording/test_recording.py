@@ -1,0 +1,546 @@
+"""The rerun recording, read back as the viewer would read it, and how the viewer is opened."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import math
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import rerun as rr
+from rerun.chunk import RrdReader
+
+import quadsim.report.recording as recording_module
+from quadsim.controller import SOLVED, UNCONSTRAINED
+from quadsim.errors import FileError, OutputError, ViewerUnavailableError
+from quadsim.flight.audit import SIGNALS, Limit, margins_sampled
+from quadsim.flight.rundir import Run
+from quadsim.report.recording import layout, open_viewer, texts, viewer_problem, world, write_recording
+from quadsim.report.recording.style import PANELS, TIMELINE, VERDICTS
+from quadsim.state import EULER, INDEX, POSITION, body_to_world
+
+
+class Content:
+    """What stands in a recording's file."""
+
+    def __init__(self, path: Path) -> None:
+        self.reader = RrdReader(path)
+        self.chunks = self.reader.stream().to_chunks()
+
+    @property
+    def entities(self) -> set[str]:
+        return {chunk.entity_path for chunk in self.chunks}
+
+    def times(self, entity: str) -> np.ndarray:
+        """Times of an entity's rows [s]."""
+        return self._column(entity, TIMELINE).to_numpy().astype("timedelta64[ns]").astype(float) * 1e-9
+
+    def rows(self, entity: str, component: str) -> list:
+        """The values of one component, one list per row."""
+        return self._column(entity, component).to_pylist()
+
+    def _column(self, entity: str, name: str):
+        (column,) = (
+            batch.column(field)
+            for chunk in self.chunks
+            if chunk.entity_path == entity
+            for batch in [chunk.to_record_batch()]
+            for field in batch.schema.names
+            if field == name or field.endswith(f":{name}")
+        )
+        return column
+
+
+@pytest.fixture(scope="module")
+def path(short_run: Run, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("recording") / "flight.rrd"
+    write_recording(short_run, path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def content(path: Path) -> Content:
+    return Content(path)
+
+
+@pytest.fixture
+def record(tmp_path: Path) -> Callable[[Run], Content]:
+    def write_and_read(run: Run) -> Content:
+        write_recording(run, tmp_path / "flight.rrd")
+        return Content(tmp_path / "flight.rrd")
+
+    return write_and_read
+
+
+def with_limits(run: Run, *limits: Limit) -> Run:
+    return dataclasses.replace(run, limits=limits)
+
+
+def test_the_vehicle_is_where_the_plant_was(content: Content, short_run: Run) -> None:
+    plant = short_run.log.plant
+    np.testing.assert_allclose(content.times("/world/vehicle"), plant.t, atol=1e-9)
+    moved = np.array(content.rows("/world/vehicle", "translation"))[:, 0]
+    np.testing.assert_allclose(moved, plant.state[:, POSITION], atol=1e-5)
+    x, y, z, w = np.array(content.rows("/world/vehicle/body", "quaternion"))[:, 0].T
+    forward = np.stack([1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)], axis=1)
+    np.testing.assert_allclose(forward, body_to_world(plant.state[:, EULER])[:, :, 0], atol=1e-5)
+
+
+def test_thrusts_stand_on_the_rotors_and_grow_with_squared_speeds(content: Content, short_run: Run) -> None:
+    vehicle = short_run.vehicle
+    origins = np.array(content.rows("/world/vehicle/body/thrust", "origins")[0])
+    np.testing.assert_allclose(origins[:, :2], vehicle.rotor_positions[:, :2], atol=1e-6)
+    arrows = np.array(content.rows("/world/vehicle/body/thrust", "vectors"))
+    expected = vehicle.arm_length * (short_run.log.plant.speeds / vehicle.hover_speed) ** 2
+    np.testing.assert_allclose(arrows[..., 2], expected, rtol=1e-5)
+    np.testing.assert_array_equal(arrows[..., :2], 0.0)
+
+
+def test_every_period_has_its_predicted_horizon(content: Content, short_run: Run) -> None:
+    control, predicted = short_run.log.control, short_run.log.predicted
+    assert predicted is not None
+    np.testing.assert_allclose(content.times("/world/horizon"), control.t, atol=1e-9)
+    strips = np.array(content.rows("/world/horizon", "strips"))[:, 0]
+    np.testing.assert_allclose(strips[:, 0], control.state[:, POSITION], atol=1e-5)
+    np.testing.assert_allclose(strips[:, 1:], predicted, atol=1e-5)
+
+
+def test_the_flown_path_grows_piece_by_piece_without_gaps(content: Content, short_run: Run) -> None:
+    pieces = [np.array(row[0]) for row in content.rows("/world/flown", "strips")]
+    position = short_run.log.plant.state[:, POSITION]
+    ends = [*short_run.log.control.t[1:], short_run.log.plant.t[-1]]
+    np.testing.assert_allclose(content.times("/world/flown"), ends, atol=1e-9)
+    assert len(pieces) == len(ends)
+    np.testing.assert_allclose(pieces[0][0], position[0], atol=1e-5)
+    for piece, following in itertools.pairwise(pieces):
+        np.testing.assert_array_equal(piece[-1], following[0])
+    np.testing.assert_allclose(pieces[-1][-1], position[-1], atol=1e-5)
+    (whole,) = content.rows("/world/path", "strips")[0]
+    np.testing.assert_allclose(whole, position, atol=1e-5)
+
+
+def test_dashes_lie_on_the_path_and_cover_half_of_it() -> None:
+    path = np.array([[0.0, 0.0, 0.0], [3.0, 0.0, 0.0], [3.0, 4.0, 0.0]])
+    dashes = world._dashes(path)
+    assert sum(float(np.linalg.norm(end - start)) for start, end in dashes) == pytest.approx(3.5, abs=0.25)
+    assert all(point[1] == 0.0 or point[0] == 3.0 for dash in dashes for point in dash)
+    assert len(world._dashes(1e4 * path)) <= 251
+    assert world._dashes(path[:1]) == world._dashes(path[:0]) == []
+
+
+@pytest.mark.parametrize("name", SIGNALS)
+def test_signals_are_the_audited_ones(name: str, content: Content, short_run: Run) -> None:
+    signal, log = SIGNALS[name], short_run.log
+    t, expected = (
+        (log.control.t, signal.sampled(log.control)) if signal.plant is None else (log.plant.t, signal.plant(log.plant))
+    )
+    np.testing.assert_allclose(content.times(f"/signals/{name}"), t, atol=1e-9)
+    np.testing.assert_array_equal(content.rows(f"/signals/{name}", "scalars"), expected.reshape(len(t), -1))
+    assert all(signal.unit in label for label in content.rows(f"/signals/{name}", "names")[0])
+    assert sum(name in names for names in PANELS.values()) == 1
+
+
+def test_curves_keep_their_peaks_when_the_viewer_is_zoomed_out(content: Content) -> None:
+    curves = {entity for entity in content.entities if entity.split("/")[1] in ("signals", "margins", "solver")}
+    assert len(curves) > len(SIGNALS)
+    for entity in curves:
+        assert content.rows(entity, "aggregation_policy") == [[rr.components.AggregationPolicy.MinMax.value]]
+
+
+def test_references_are_in_the_units_of_their_signals(record: Callable[[Run], Content], short_run: Run) -> None:
+    reference = short_run.log.control.reference + np.eye(4)[3]  # the paper's yaw reference is zero
+    control = dataclasses.replace(short_run.log.control, reference=reference)
+    content = record(dataclasses.replace(short_run, log=dataclasses.replace(short_run.log, control=control)))
+    np.testing.assert_array_equal(np.ravel(content.rows("/reference/z", "scalars")), reference[:, 2])
+    np.testing.assert_array_equal(np.ravel(content.rows("/reference/yaw", "scalars")), np.degrees(reference[:, 3]))
+
+
+def test_bounds_margins_and_verdicts_of_the_scenario(content: Content, short_run: Run) -> None:
+    reached = [limit for limit in short_run.limits if limit.start <= short_run.log.control.t[-1]]
+    assert {limit.name for limit in reached} >= {"roll", "pitch", "speed", "slew"}
+    assert {e.split("/")[2] for e in content.entities if e.startswith("/limits/")} == {limit.name for limit in reached}
+    for limit in reached:
+        assert content.rows(f"/limits/{limit.name}", "scalars") == [[limit.lower, limit.upper]] * 2
+        np.testing.assert_allclose(content.times(f"/limits/{limit.name}"), [0.0, short_run.log.plant.t[-1]])
+        margins = np.ravel(content.rows(f"/margins/{limit.name}", "scalars"))
+        np.testing.assert_array_equal(margins, margins_sampled(limit, short_run.log))
+    states = [state for row in content.rows("/verdicts/speed", "state") for state in row]
+    assert set(states) == {"holds", "active"}  # the paper's take-off is at full speed
+    assert all(before != after for before, after in itertools.pairwise(states))
+
+
+def test_a_limit_with_one_bound_and_a_window(record: Callable[[Run], Content], short_run: Run) -> None:
+    t, z = short_run.log.control.t, short_run.log.control.state[:, POSITION[2]]
+    below = float(np.interp(3.0, t, z))  # the vehicle climbs through it at 3 s
+    limit = Limit(name="ceiling", signal="z", upper=below, start=1.0, stop=4.0)
+    content = record(with_limits(short_run, limit))
+    assert content.rows("/limits/ceiling", "scalars") == [[below]] * 2
+    np.testing.assert_allclose(content.times("/limits/ceiling"), [1.0, 4.0])
+    np.testing.assert_allclose(content.times("/margins/ceiling"), t[(t > 0.99) & (t < 4.01)])
+    states = [row[0] for row in content.rows("/verdicts/ceiling", "state")]
+    assert states[0] == states[-1] == "not in force"
+    assert states[1] == "holds"
+    assert states[-2] == "violated"
+    assert content.times("/verdicts/ceiling")[states.index("violated")] == pytest.approx(3.0, abs=0.1)
+    assert set(states) <= set(VERDICTS)
+
+
+def test_a_run_without_limits(record: Callable[[Run], Content], short_run: Run) -> None:
+    run = dataclasses.replace(with_limits(short_run), summary={**short_run.summary, "constraints": []})
+    content = record(run)
+    assert not [entity for entity in content.entities if entity.startswith(("/limits", "/margins", "/verdicts"))]
+    assert "| constraint |" not in content.rows("/summary", "text")[0][0]
+
+
+def test_times_are_held_against_the_deadline(content: Content, short_run: Run) -> None:
+    timing = short_run.log.timing
+    np.testing.assert_array_equal(np.ravel(content.rows("/solver/step_ms", "scalars")), timing.step_ms)
+    np.testing.assert_array_equal(np.ravel(content.rows("/solver/solve_ms", "scalars")), timing.solve_ms)
+    np.testing.assert_array_equal(content.rows("/solver/deadline_ms", "scalars"), [[50.0], [50.0]])
+    np.testing.assert_array_equal(np.ravel(content.rows("/solver/active", "scalars")), short_run.log.control.active)
+
+
+def test_an_ideal_flight_has_no_effects(content: Content) -> None:
+    assert not [entity for entity in content.entities if "effects" in entity or "external_force" in entity]
+
+
+def test_forces_torques_wind_and_lagging_rotors_have_their_curves(
+    record: Callable[[Run], Content], short_run: Run
+) -> None:
+    plant, rng = short_run.log.plant, np.random.default_rng(0)
+    wrench, wind = rng.normal(size=(plant.t.size, 6)), rng.normal(size=(plant.t.size, 3))
+    plant = dataclasses.replace(plant, speeds=plant.speeds - 1.0, wrench=wrench, wind=wind)
+    run = dataclasses.replace(short_run, log=dataclasses.replace(short_run.log, plant=plant))
+    content = record(run)
+    for name, expected in {"force": wrench[:, :3], "torque": wrench[:, 3:], "wind": wind}.items():
+        np.testing.assert_array_equal(content.rows(f"/effects/{name}", "scalars"), expected)
+        np.testing.assert_allclose(content.times(f"/effects/{name}"), plant.t, atol=1e-9)
+    np.testing.assert_allclose(content.rows("/effects/commanded", "scalars"), plant.speeds + 1.0, atol=1e-9)
+    arrows = np.array(content.rows("/world/vehicle/external_force", "vectors"))[:, 0]
+    vehicle = run.vehicle
+    as_thrusts = vehicle.arm_length * 4.0 * wrench[:, :3] / (vehicle.mass * vehicle.gravity)
+    np.testing.assert_allclose(arrows, world._FORCE_SCALE * as_thrusts, rtol=1e-5, atol=1e-9)
+    assert layout._effects(run) == {
+        "Rotor speeds, commanded and acting": ["effects/commanded", "signals/speed"],
+        "External force, world": ["effects/force"],
+        "External torque, body": ["effects/torque"],
+        "Wind, world": ["effects/wind"],
+    }
+    assert "Effects" in "".join(
+        str(column)
+        for chunk in content.reader.stream(store=content.reader.blueprints()[0]).to_chunks()
+        for column in chunk.to_record_batch().columns
+    )
+
+
+def test_a_force_that_is_nowhere_is_not_drawn(record: Callable[[Run], Content], short_run: Run) -> None:
+    plant = dataclasses.replace(short_run.log.plant, wrench=np.zeros((short_run.log.plant.t.size, 6)))
+    content = record(dataclasses.replace(short_run, log=dataclasses.replace(short_run.log, plant=plant)))
+    assert not [entity for entity in content.entities if "effects" in entity or "external_force" in entity]
+
+
+def test_events_tell_each_change_of_the_solver_and_the_end(record: Callable[[Run], Content], short_run: Run) -> None:
+    control = short_run.log.control
+    status, fallback = [SOLVED] * control.t.size, control.fallback.copy()
+    status[20:30] = [UNCONSTRAINED] * 10
+    status[40:43], fallback[40:43] = ["infeasible"] * 3, [1, 1, 2]
+    changed = dataclasses.replace(control, status=tuple(status), fallback=fallback)
+    log = dataclasses.replace(short_run.log, control=changed, reason="the battery fell off")
+    content = record(dataclasses.replace(short_run, log=log))
+    texts = [row[0] for row in content.rows("/events", "text")]
+    levels = [row[0] for row in content.rows("/events", "level")]
+    assert texts == [
+        "solved, fallback 0",
+        "unconstrained, fallback 0",
+        "solved, fallback 0",
+        "infeasible, fallback 1",
+        "infeasible, fallback 2",
+        "solved, fallback 0",
+        "aborted: the battery fell off",
+    ]
+    assert levels == ["INFO", "INFO", "INFO", "WARN", "WARN", "INFO", "ERROR"]
+    times = [0.0, 1.0, 1.5, 2.0, 2.1, 2.15, log.plant.t[-1]]
+    np.testing.assert_allclose(content.times("/events"), times, atol=1e-9)
+
+
+def on_the_ground(run: Run, *phases: str) -> Run:
+    """The flight as if its first periods had been of other phases."""
+    control = run.log.control
+    phase = (*phases, *("flying",) * (control.t.size - len(phases)))
+    return dataclasses.replace(run, log=dataclasses.replace(run.log, control=dataclasses.replace(control, phase=phase)))
+
+
+def test_events_tell_the_phases_of_a_flight_with_a_ground(record: Callable[[Run], Content], short_run: Run) -> None:
+    content = record(on_the_ground(short_run, *["landed"] * 5, *["armed"] * 5))
+    times, rows = content.times("/events"), content.rows("/events", "text")
+    told = {round(float(time), 9): row[0] for time, row in zip(times, rows, strict=True) if "phase" in row[0]}
+    assert told == {0.0: "phase: landed", 0.25: "phase: armed", 0.5: "phase: flying"}
+    assert np.all(np.diff(times) >= 0.0)
+    assert [level for _, text, level in texts._phase_changes(on_the_ground(short_run, "crashed"))] == ["WARN", "INFO"]
+
+
+def test_no_horizon_is_drawn_on_the_ground(record: Callable[[Run], Content], short_run: Run) -> None:
+    content = record(on_the_ground(short_run, "landed", "armed"))
+    strips = content.rows("/world/horizon", "strips")
+    assert [len(row[0]) for row in strips[:2]] == [0, 0]
+    assert len(strips[2][0]) > 10
+
+
+def test_the_wind_is_an_arrow_that_meets_the_vehicle(record: Callable[[Run], Content], short_run: Run) -> None:
+    t = short_run.log.plant.t
+    wind = np.outer(1.0 + np.sin(t), [3.0, -4.0, 0.0])
+    plant = dataclasses.replace(short_run.log.plant, wind=wind)
+    content = record(dataclasses.replace(short_run, log=dataclasses.replace(short_run.log, plant=plant)))
+    vectors = np.array(content.rows("/world/vehicle/wind", "vectors"))[:, 0]
+    origins = np.array(content.rows("/world/vehicle/wind", "origins"))[:, 0]
+    longest = 1.5 * short_run.vehicle.arm_length
+    np.testing.assert_allclose(vectors, longest * wind / np.linalg.norm(wind, axis=1).max(), atol=1e-6)
+    tips = (origins + vectors)[:, :2]
+    np.testing.assert_allclose(tips, -0.3 * vectors[:, :2], atol=1e-6)
+
+
+def test_a_roll_that_wraps_has_gaps(record: Callable[[Run], Content], short_run: Run) -> None:
+    plant = short_run.log.plant
+    state = plant.state.copy()
+    state[:, INDEX["roll"]] = (4.0 * plant.t) % (2.0 * np.pi) - np.pi
+    turned = dataclasses.replace(short_run.log, plant=dataclasses.replace(plant, state=state))
+    drawn = np.ravel(record(dataclasses.replace(short_run, log=turned)).rows("/signals/roll", "scalars"))
+    assert np.nanmax(np.abs(np.diff(drawn))) < 10.0
+    assert np.count_nonzero(np.isnan(drawn)) == 3
+
+
+def test_a_lost_vehicle_leaves_the_picture(short_run: Run) -> None:
+    state = short_run.log.plant.state.copy()
+    state[-1, POSITION] += (0.0, 0.0, -1e4)
+    log = dataclasses.replace(short_run.log, plant=dataclasses.replace(short_run.log.plant, state=state))
+    eye, target = layout._overview(dataclasses.replace(short_run, log=log))
+    course = short_run.log.control.reference[:, :3]
+    assert np.linalg.norm(eye - target) < 5.0 * np.linalg.norm(np.ptp(course, axis=0)) + 20.0
+
+
+def test_the_axis_of_what_stands_still_has_the_least_span(short_run: Run) -> None:
+    assert layout._least_range(short_run, ("x", "y", "z")) is None
+    assert layout._least_range(short_run, ("roll", "pitch")) is None
+    assert layout._least_range(short_run, ("x_estimate_error",)) == (-0.005, 0.005)
+
+
+def test_the_summary_tells_what_the_flight_met(short_run: Run) -> None:
+    summary = {**short_run.summary, "expected": "lost", "as_expected": False}
+    summary["course"] = {"sentence": "The course asks for nothing."}
+    text = texts._summary(dataclasses.replace(short_run, summary=summary))
+    assert "its scenario states the verdict lost." in text
+    assert "paper-constrained: the course asks for nothing." in text
+    yaw = math.degrees(short_run.summary["tracking"]["rmse"]["yaw"])
+    assert f"yaw {yaw:.3g} deg" in text
+
+
+def test_the_summary_prints_each_verdict_with_its_tolerance(content: Content, short_run: Run) -> None:
+    (text,) = content.rows("/summary", "text")[0]
+    for entry in short_run.summary["constraints"]:
+        (row,) = (line for line in text.splitlines() if line.startswith(f"| {entry['name']} |"))
+        assert f"± {entry['tolerance']:g} {entry['unit']}" in row
+        assert ("**holds**" if entry["satisfied"] else "**violated**") in row
+    assert "RMS" in text
+    assert "beyond 50 ms" in text
+
+
+def test_the_summary_of_what_is_measured_alone_and_of_single_bounds(short_run: Run) -> None:
+    entry = {**short_run.summary["constraints"][0], "required": False, "satisfied": False, "lower": None}
+    summary = {**short_run.summary, "constraints": [{**entry, "worst_margin": 0.25, "worst_margin_sampled": -0.5}]}
+    text = texts._summary(dataclasses.replace(short_run, summary=summary))
+    assert "| (roll) | **violated** | -0.5 | ≤ 5 ± 0.05 deg |" in text
+    assert "In brackets" in text
+    assert texts._verdict({**entry, "lower": -1.0, "upper": None}).endswith("| ≥ -1 ± 0.05 deg |")
+
+
+def test_an_aborted_flight_is_recorded_with_its_reason(record: Callable[[Run], Content], aborted_run: Run) -> None:
+    content = record(aborted_run)
+    assert content.rows("/events", "level")[-1] == ["ERROR"]
+    assert aborted_run.log.reason is not None
+    assert aborted_run.log.reason in content.rows("/summary", "text")[0][0]
+
+
+def test_a_flight_that_never_began_is_recorded(record: Callable[[Run], Content], empty_run: Run) -> None:
+    content = record(empty_run)
+    assert len(content.rows("/world/vehicle", "translation")) == 1
+    assert not content.entities & {"/world/horizon", "/world/flown", "/solver/solve_ms", "/limits/roll"}
+    assert "command is not finite" in content.rows("/events", "text")[-1][0]
+
+
+def test_a_flight_without_predictions_or_finite_end_is_recorded(
+    record: Callable[[Run], Content], short_run: Run
+) -> None:
+    plant = short_run.log.plant
+    state = plant.state.copy()
+    state[-1] = math.nan
+    log = dataclasses.replace(short_run.log, predicted=None, plant=dataclasses.replace(plant, state=state))
+    content = record(dataclasses.replace(short_run, log=log))
+    assert "/world/horizon" not in content.entities
+    assert np.isfinite(layout._overview(dataclasses.replace(short_run, log=log))).all()
+
+
+def test_the_layout_is_inside_and_shows_only_what_exists(content: Content, short_run: Run) -> None:
+    (blueprint,) = content.reader.blueprints()
+    (store,) = content.reader.recordings()
+    assert blueprint.application_id == store.application_id == "quadsim paper-constrained"
+    chunks = content.reader.stream(store=blueprint).to_chunks()
+    batches = [chunk.to_record_batch() for chunk in chunks]
+    shown = {
+        query.lstrip("+ ")
+        for batch in batches
+        for name in batch.schema.names
+        if name == "ViewContents:query"
+        for row in batch.column(name).to_pylist()
+        for query in row
+    }
+    unreached = {limit.name for limit in short_run.limits if limit.start > short_run.log.control.t[-1]}
+    for query in shown:
+        prefix = "/" + query.strip("/").removesuffix("/**")
+        known = any(entity.startswith(prefix) for entity in content.entities)
+        assert known or query.startswith("$origin") or prefix.split("/")[-1] in unreached, query
+    assert {f"signals/{name}" for name in SIGNALS} <= {query.lstrip("/") for query in shown}
+    texts = "".join(str(column) for batch in batches for column in batch.columns)
+    assert TIMELINE in texts
+    assert all(title in texts for title in ("Course", "Vehicle", "Summary", *PANELS))
+
+
+def rerun(*arguments: str) -> subprocess.CompletedProcess[str]:
+    """Runs rerun's command line."""
+    return subprocess.run([*recording_module._VIEWER[:3], *arguments], capture_output=True, text=True, timeout=60)
+
+
+def test_rerun_finds_nothing_wrong_with_the_file_and_the_layout_is_in_force(path: Path) -> None:
+    verified = rerun("rrd", "verify", str(path))
+    assert verified.returncode == 0, verified.stderr
+    assert "make_active: true, make_default: true" in rerun("rrd", "print", str(path)).stdout
+    assert path.stat().st_size < 2_000_000
+
+
+def test_equal_flights_have_one_identity_and_others_another(path: Path, short_run: Run, tmp_path: Path) -> None:
+    write_recording(short_run, tmp_path / "again.rrd")
+    write_recording(with_limits(short_run), tmp_path / "other.rrd")
+    first, again, other = (RrdReader(p).recordings() for p in (path, tmp_path / "again.rrd", tmp_path / "other.rrd"))
+    assert first == again
+    assert first != other
+
+
+def test_nothing_but_the_recording_is_left(short_run: Run, tmp_path: Path) -> None:
+    target = tmp_path / "flight.rrd"
+    before = dict(os.environ)
+    rr.set_strict_mode(False)
+    write_recording(short_run, target)
+    assert [entry.name for entry in tmp_path.iterdir()] == ["flight.rrd"]
+    assert target.read_bytes()[:3] == b"RRF"
+    assert dict(os.environ) == before
+    assert not rr.strict_mode()
+    assert rr.get_global_data_recording() is None
+
+
+def test_what_is_there_is_not_replaced(short_run: Run, tmp_path: Path) -> None:
+    target = tmp_path / "flight.rrd"
+    target.write_bytes(b"mine")
+    with pytest.raises(OutputError, match="something else is already there"):
+        write_recording(short_run, target)
+    assert target.read_bytes() == b"mine"
+    assert [entry.name for entry in tmp_path.iterdir()] == ["flight.rrd"]
+
+
+def test_a_full_disk_leaves_nothing(short_run: Run, tmp_path: Path) -> None:
+    """No file may grow beyond 100 kB meanwhile."""
+    resource = pytest.importorskip("resource")
+    target = tmp_path / "flight.rrd"
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, hard))
+    try:
+        with pytest.raises(OutputError, match=r"flight\.rrd: File too large"):
+            write_recording(short_run, target)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_place_that_cannot_be_written_is_said(short_run: Run, tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(OutputError, match="Not a directory"):
+        write_recording(short_run, tmp_path / "file" / "flight.rrd")
+    with pytest.raises(OutputError, match="No such file or directory"):
+        write_recording(short_run, tmp_path / "missing" / "flight.rrd")
+
+
+def test_rerun_switched_off_is_said(short_run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("RERUN", "off")
+    with pytest.raises(OutputError, match="environment variable RERUN"):
+        write_recording(short_run, tmp_path / "flight.rrd")
+    assert not list(tmp_path.iterdir())
+
+
+def test_rerun_is_imported_when_a_recording_is_written_and_not_before() -> None:
+    program = "import sys, quadsim.report.recording; sys.exit('rerun' in sys.modules)"
+    subprocess.run([sys.executable, "-c", program], check=True, timeout=60)
+
+
+@pytest.fixture
+def viewer(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Callable[[int], Path]:
+    """Puts in the viewer's place a program that notes its arguments and ends with a status."""
+    notes = tmp_path / "arguments"
+
+    def replace(status: int) -> Path:
+        program = (
+            f"import sys, pathlib; pathlib.Path({str(notes)!r}).write_text(' '.join(sys.argv[1:])); sys.exit({status})"
+        )
+        monkeypatch.setattr(recording_module, "_VIEWER", (sys.executable, "-c", program, *recording_module._VIEWER[3:]))
+        return notes
+
+    return replace
+
+
+def test_the_viewer_is_given_the_file_and_listens_to_this_machine_alone(
+    viewer: Callable[[int], Path], path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("DISPLAY", ":0")
+    notes = viewer(0)
+    open_viewer(path)
+    assert notes.read_text() == f"--bind=127.0.0.1 --port=auto {path}"
+    open_viewer(path, web=True)
+    assert "--web-viewer" in notes.read_text().split()
+    viewer(130)  # closed by Ctrl-C
+    open_viewer(path, web=True)
+
+
+def test_a_viewer_that_fails_is_an_error(
+    viewer: Callable[[int], Path], path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("DISPLAY", ":0")
+    viewer(3)
+    with pytest.raises(ViewerUnavailableError, match=r"status 3.*--web"):
+        open_viewer(path)
+    with pytest.raises(ViewerUnavailableError, match=r"message above$"):
+        open_viewer(path, web=True)
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="displays are found through the environment on Linux")
+def test_without_a_display_the_browser_is_proposed(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    with pytest.raises(ViewerUnavailableError, match=r"no display.*--web"):
+        open_viewer(path)
+    assert "no display" in str(viewer_problem())
+    monkeypatch.setenv("WAYLAND_DISPLAY", "wayland-0")
+    assert viewer_problem() is None
+
+
+def test_a_recording_that_is_not_there_is_said(tmp_path: Path) -> None:
+    with pytest.raises(FileError, match="no such recording"):
+        open_viewer(tmp_path / "flight.rrd", web=True)
+
+
+def test_the_real_viewer_can_be_started() -> None:
+    done = rerun("--version")
+    assert done.returncode == 0
+    assert rr.__version__ in done.stdout

@@ -1,0 +1,245 @@
+"""The comparison page: complete or not there, escaped, offline, and without a complaint from a browser."""
+
+import dataclasses
+import json
+import re
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from browser import open_page
+
+from quadsim.errors import OutputError, ParameterError
+from quadsim.flight.rundir import Run
+from quadsim.report.pages.comparison_page import write_comparison
+from quadsim.report.plots.flight_plots import comparison_plots, thin
+from scenarios.cost.section import cost_section
+from scenarios.cost.study import CostStudy
+
+HOSTILE = "<script>alert(1)</script> & \"more\" 'quoted'"
+PROBE = """<script>
+(async () => {
+  while (!("drawn" in document.documentElement.dataset)) await new Promise((done) => setTimeout(done, 50));
+  await Plotly.relayout("course", { "xaxis.range": [1, 2] });
+  document.querySelector("[data-run=run0]").click();
+  await new Promise((done) => setTimeout(done, 500));
+  const panels = ["attitude", "speeds", "slews", "times"].map((id) => document.getElementById(id));
+  const seen = panels[0].data.filter((trace) => trace.legendgroup).map((trace) => String(trace.visible ?? true));
+  const costs = ["cost-steps", "cost-tilt", "cost-horizon"];
+  const report = document.createElement("output");
+  report.textContent = [
+    "ranges " + panels.map((panel) => panel.layout.xaxis.range.join("-")).join(" "),
+    "visible " + seen.join(" "),
+    "costs " + costs.map((id) => document.querySelectorAll(`#${id} .trace`).length).join(" "),
+    "svgs " + document.querySelectorAll(".main-svg .trace").length,
+    "buttons " + [...document.querySelectorAll(".modebar-btn")].map((button) => button.dataset.title).join(","),
+  ].join("; ");
+  document.body.append(report);
+})();
+</script>"""
+
+
+@pytest.fixture(scope="module")
+def filmed_run(short_run: Run, tmp_path_factory: pytest.TempPathFactory) -> Run:
+    """The short flight with a video, a recording and a figure beside it; nothing reads them but a browser."""
+    directory = tmp_path_factory.mktemp("filmed") / "run"
+    shutil.copytree(short_run.directory, directory)
+    (directory / "flight.mp4").write_bytes(b"film")
+    (directory / "flight.rrd").write_bytes(b"recording")
+    (directory / "figures").mkdir()
+    (directory / "figures" / "figure4_states.svg").write_text("<svg/>")
+    return dataclasses.replace(short_run, directory=directory)
+
+
+def renamed(run: Run, scenario: str) -> Run:
+    return dataclasses.replace(run, summary={**run.summary, "scenario": scenario})
+
+
+def without_scripts(page: str) -> str:
+    return re.sub(r"<script.*?</script>", "", page, flags=re.DOTALL)
+
+
+def test_the_page_stands_beside_its_files(filmed_run: Run, aborted_run: Run, tmp_path: Path) -> None:
+    page = write_comparison([filmed_run, aborted_run], tmp_path / "out")
+    assert page == tmp_path / "out" / "index.html"
+    assert page.stat().st_size < 8e6
+    assert {path.name for path in page.parent.iterdir()} == {
+        *("index.html", "comparison.png", "comparison.svg", "comparison.md", ".quadsim.json"),
+        *("paper-constrained.mp4", "paper-constrained", "lost"),
+    }
+    assert (page.parent / "paper-constrained.mp4").read_bytes() == b"film"
+    for url in re.findall(r'(?:href|src)="([^"#]+)"', without_scripts(page.read_text())):
+        assert url == "data:," or (page.parent / url).is_file(), url
+
+
+def test_the_text_gives_outcomes_reasons_and_numbers(filmed_run: Run, aborted_run: Run, tmp_path: Path) -> None:
+    text = without_scripts(write_comparison([filmed_run, aborted_run], tmp_path / "out").read_text())
+    assert "aborted: at t = 6.000 s: the plant&#39;s state is &lt;not&gt; finite &amp; more" in text
+    assert "holds (tolerance 0.01 / 0.05 deg)" in text
+    assert text.count("<video") == 1
+    assert "This run has no video" in text
+    assert "paper-constrained/flight.rrd" in text
+    assert "lost/flight.rrd" not in text
+
+
+def test_a_study_of_costs_has_a_section_and_files(short_run: Run, cost_study: CostStudy, tmp_path: Path) -> None:
+    hostile = dataclasses.replace(cost_study, name=HOSTILE)
+    page = write_comparison([short_run], tmp_path / "out", cost_section(hostile))
+    text = without_scripts(page.read_text())
+    assert "What do constraints cost?" in text
+    assert "&lt;script&gt;alert(1)" in text
+    assert text.count('<table class="grid">') == 5
+    assert text.count('<details class="folded" open>') == 2
+    assert '<td class="bad">lost at 0.5 s</td>' in text
+    assert {path.name for path in page.parent.iterdir() if path.name.startswith("cost")} == {
+        *("cost.json", "cost.md"),
+        *(f"cost_{what}.{kind}" for what in ("steps", "tilt", "horizon") for kind in ("png", "svg")),
+    }
+    for url in re.findall(r'(?:href|src)="([^"#]+)"', text):
+        assert url == "data:," or (page.parent / url).is_file(), url
+    assert "What do constraints cost?" not in write_comparison([short_run], tmp_path / "without").read_text()
+
+
+def test_nothing_is_fetched(short_run: Run, tmp_path: Path) -> None:
+    page = write_comparison([short_run], tmp_path / "out").read_text()
+    assert not re.search(r"""(?:src|href)=["']?(?:https?:)?//""", without_scripts(page))
+    assert "default-src 'none'" in page
+
+
+def test_hostile_names_are_text(short_run: Run, tmp_path: Path) -> None:
+    page = write_comparison([renamed(short_run, HOSTILE), short_run], tmp_path / "out")
+    text = page.read_text()
+    assert "<script>alert" not in text
+    assert "&lt;script&gt;alert(1)&lt;/script&gt;" in text
+    assert (page.parent / "script-alert-1-script-more-quoted").is_dir()
+
+
+def test_runs_of_one_name_keep_their_files_apart(short_run: Run, tmp_path: Path) -> None:
+    page = write_comparison([short_run, short_run, renamed(short_run, "!"), renamed(short_run, "?")], tmp_path / "out")
+    folders = {path.name for path in page.parent.iterdir() if path.is_dir()}
+    assert len(folders) == 4
+    assert {"run", "run-2"} <= folders
+
+
+def test_runs_without_a_period_or_constraints_are_compared(short_run: Run, empty_run: Run, tmp_path: Path) -> None:
+    free = dataclasses.replace(short_run, limits=(), summary={**short_run.summary, "constraints": []})
+    assert write_comparison([empty_run, free], tmp_path / "two").is_file()
+    text = write_comparison([empty_run], tmp_path / "one").read_text()
+    assert 'class="plot"' not in text
+    assert "the command is not finite" in text
+
+
+def test_an_earlier_comparison_is_replaced_and_nothing_else(short_run: Run, tmp_path: Path) -> None:
+    target = tmp_path / "out"
+    write_comparison([renamed(short_run, "first")], target)
+    write_comparison([renamed(short_run, "second")], target)
+    assert not (target / "first").exists()
+    assert (target / "second").is_dir()
+    theirs = tmp_path / "theirs"
+    theirs.mkdir()
+    (theirs / "index.html").write_text("<html>mine</html>")
+    with pytest.raises(OutputError, match="something else is already there"):
+        write_comparison([short_run], theirs)
+    assert (theirs / "index.html").read_text() == "<html>mine</html>"
+
+
+def test_a_place_that_holds_a_run_is_refused(short_run: Run) -> None:
+    for place in (short_run.directory, short_run.directory.parent):
+        with pytest.raises(OutputError, match="holds the run"):
+            write_comparison([short_run], place)
+    assert (short_run.directory / "summary.json").is_file()
+
+
+def test_nothing_is_left_of_a_comparison_that_fails(
+    short_run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full_disk(*_arguments: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("quadsim.report.pages.comparison_page.shutil.copyfile", full_disk)
+    with pytest.raises(OutputError, match="No space left"):
+        write_comparison([short_run], tmp_path / "out")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_no_runs_are_an_error(tmp_path: Path) -> None:
+    with pytest.raises(ParameterError, match=r"comparison\.runs must be one or more"):
+        write_comparison([], tmp_path / "out")
+
+
+def test_thinning_keeps_ends_and_extremes() -> None:
+    values = np.random.default_rng(0).normal(size=10_007)
+    kept = thin(values, 500)
+    assert kept.size <= 502
+    assert np.all(np.diff(kept) > 0)
+    assert {0, values.size - 1, int(values.argmin()), int(values.argmax())} <= set(kept.tolist())
+    assert np.array_equal(thin(values[:300], 300), np.arange(300))
+
+
+def test_thinning_keeps_gaps() -> None:
+    values = np.sin(np.arange(10_000.0))
+    values[[10, 5000]] = np.nan
+    kept = thin(values, 500)
+    assert kept.size <= 504
+    assert {10, 5000} <= set(kept.tolist())
+    assert np.nanmax(values[kept]) == np.nanmax(values)
+
+
+def test_the_page_tells_the_verdict_against_the_one_expected(short_run: Run, tmp_path: Path) -> None:
+    summary = {**short_run.summary, "expected": "lost", "as_expected": False, "constraints": []}
+    page = write_comparison([dataclasses.replace(short_run, summary=summary)], tmp_path / "out").read_text()
+    assert 'verdict:\n      <span class="bad">satisfied, expected: lost</span>' in page
+
+
+def test_plots_of_what_stands_still_have_a_least_span(short_run: Run) -> None:
+    plant = short_run.log.plant
+    still = dataclasses.replace(plant, state=np.full_like(plant.state, 1e-9))
+    control = dataclasses.replace(short_run.log.control, reference=np.zeros_like(short_run.log.control.reference))
+    log = dataclasses.replace(short_run.log, plant=still, control=control)
+    course, *_ = comparison_plots([dataclasses.replace(short_run, limits=(), log=log)])
+    layout = json.loads(course.json)["layout"]
+    assert [layout[axis]["autorangeoptions"]["include"] for axis in ("yaxis", "yaxis4")] == [
+        [-0.005, 0.005],
+        [-0.05, 0.05],
+    ]
+    moving, *_ = comparison_plots([short_run])
+    axes = json.loads(moving.json)["layout"]
+    assert [axis for axis in ("yaxis3", "yaxis4") if "autorangeoptions" in axes[axis]] == [], "z and yaw move"
+
+
+def test_many_runs_keep_the_page_small(short_run: Run) -> None:
+    t = np.linspace(0.0, 3600.0, 720_001)
+    rows = np.arange(t.size) % short_run.log.plant.t.size
+    plant = dataclasses.replace(
+        short_run.log.plant, t=t, state=short_run.log.plant.state[rows], speeds=short_run.log.plant.speeds[rows]
+    )
+    long = dataclasses.replace(short_run, log=dataclasses.replace(short_run.log, plant=plant))
+    assert sum(len(plot.json) for plot in comparison_plots([long] * 10)) < 3e6
+
+
+def test_a_browser_draws_the_page_and_has_no_complaint(
+    short_run: Run, aborted_run: Run, cost_study: CostStudy, tmp_path: Path
+) -> None:
+    page = write_comparison([renamed(short_run, HOSTILE), aborted_run], tmp_path / "out", cost_section(cost_study))
+    page.write_text(page.read_text().replace("</body>", f"{PROBE}</body>"))
+    dom, console = open_page(page, tmp_path / "profile")
+    assert console == []
+    report = re.findall(r"<output>(.*?)</output>", dom)[-1]
+    assert "ranges 1-2 1-2 1-2 1-2" in report
+    assert "visible false true false true" in report
+    assert int(re.findall(r"svgs (\d+)", report)[0]) > 40
+    assert "costs 3 16 16" in report  # the contenders, and the curves of six panels
+    assert set(re.findall(r"buttons ([^;]*)", report)[0].split(",")) == {
+        *("Download plot as a PNG", "Zoom", "Pan", "Zoom in", "Zoom out", "Autoscale", "Reset axes"),
+        *("Orbital rotation", "Turntable rotation", "Reset camera to default", "Reset camera to last save"),
+    }, "no button may send data away"
+
+
+def test_the_browser_would_complain(short_run: Run, tmp_path: Path) -> None:
+    page = write_comparison([short_run], tmp_path / "out")
+    fetching = '<img src="https://example.org/picture.png"><script>console.error("seen")</script></body>'
+    page.write_text(page.read_text().replace("</body>", fetching))
+    _, console = open_page(page, tmp_path / "profile")
+    assert any("seen" in line for line in console)
+    assert any("Content Security Policy" in line for line in console)

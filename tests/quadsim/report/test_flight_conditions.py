@@ -1,0 +1,142 @@
+"""What a comparison and its sentences say of verdicts, courses, ground, told states and late commands."""
+
+import copy
+import dataclasses
+from typing import Any
+
+import pytest
+
+from quadsim.flight.rundir import Run
+from quadsim.report.comparison import comparison_rows
+from quadsim.report.flight_conditions import verdict, verdict_cell
+from quadsim.report.narrative import comparison_sentences
+from quadsim.report.table import Mark, Row
+
+COURSE = {
+    "tilt": 5.61,
+    "velocity": 0.5,
+    "rotor_min": 183.2,
+    "rotor_max": 201.9,
+    "jumps": [1.0, 7.0],
+    "problems": ["pitch up to 5.61 deg (bound 5)"],
+    "sentence": "The course asks for up to 5.61 deg of tilt.",
+}
+GROUND = {
+    "takeoff_time": 2.155,
+    "touchdown": {"time": 15.885, "speed": 0.052, "horizontal_speed": 0.001, "tilt": 1.25},
+    "phase": "landed",
+    "crashed": False,
+}
+ESTIMATION = {
+    "rmse": {"x": 0.003, "y": 0.004, "z": 0.012, "roll": 0.01, "pitch": 0.0, "yaw": 0.0},
+    "max_error": {"x": 0.03, "y": 0.04, "z": 0.12, "roll": 0.1, "pitch": 0.0, "yaw": 0.0},
+    "not_finite": 10,
+    "samples": {"position": {"accepted": 95, "rejected": 5, "nis": 1.0}},
+}
+COMPUTATION = {"delay_ms": {"p50": 12.0, "p95": 30.0, "p99": 45.0, "max": 60.0}, "missed": 3}
+EVERYTHING = {"course": COURSE, "ground": GROUND, "estimation": ESTIMATION, "computation": COMPUTATION}
+
+
+def having(run: Run, scenario: str, **entries: Any) -> Run:
+    return dataclasses.replace(run, summary={**copy.deepcopy(run.summary), "scenario": scenario, **entries})
+
+
+@pytest.fixture
+def bare_run(short_run: Run) -> Run:
+    """The short flight as an older version wrote it: nothing of what this module tests."""
+    told = {key: value for key, value in short_run.summary.items() if key not in {*EVERYTHING, "expected"}}
+    return having(dataclasses.replace(short_run, summary=told), "bare")
+
+
+def cells(rows: list[Row], group: str, label: str) -> list[str]:
+    (found,) = (row for row in rows if (row.group, row.label) == (group, label))
+    return [cell.text for cell in found.cells]
+
+
+def test_rows_say_what_the_summary_says_and_a_dash_where_it_is_silent(bare_run: Run) -> None:
+    rows = comparison_rows([having(bare_run, "full", **EVERYTHING), bare_run])
+    assert cells(rows, "Course", "largest tilt asked for") == ["5.61", "-"]
+    assert cells(rows, "Course", "jumps") == ["at 1 s; at 7 s", "-"]
+    assert cells(rows, "Course", "beyond the bounds") == ["pitch up to 5.61 deg (bound 5)", "-"]
+    assert cells(rows, "Ground", "take-off at") == ["2.155", "-"]
+    assert cells(rows, "Ground", "touchdown, descending with") == ["0.052", "-"]
+    assert cells(rows, "Ground", "at the end") == ["landed", "-"]
+    assert cells(rows, "State as told", "RMS error as told, z") == ["0.012", "-"]
+    assert cells(rows, "State as told", "largest error as told, roll") == ["5.73", "-"], "in degrees"
+    assert cells(rows, "State as told", "samples refused by the filter") == ["position 5 of 100", "-"]
+    assert cells(rows, "Simulated computation", "command after its measurement, maximum") == ["60", "-"]
+    assert cells(rows, "Simulated computation", "commands too late to be used") == ["3", "-"]
+
+
+def test_flights_that_met_nothing_have_no_rows_of_it(bare_run: Run) -> None:
+    groups = {row.group for row in comparison_rows([bare_run])}
+    assert not {"Course", "Ground", "State as told", "Simulated computation"} & groups
+
+
+def test_a_flight_that_never_touches_the_ground_or_crashes_on_it(bare_run: Run) -> None:
+    aloft = having(bare_run, "aloft", ground={**GROUND, "takeoff_time": None, "touchdown": None, "phase": "flying"})
+    crashed = having(bare_run, "crashed", ground={**GROUND, "phase": "crashed", "crashed": True})
+    rows = comparison_rows([aloft, crashed])
+    assert cells(rows, "Ground", "touchdown at") == ["-", "15.88"]
+    (end,) = (row for row in rows if row.label == "at the end")
+    assert [cell.mark for cell in end.cells] == [Mark.NONE, Mark.BAD]
+    told = comparison_sentences([aloft, crashed])
+    assert "aloft is flying at the end." in told
+    assert any(sentence.startswith("crashed takes off") and sentence.endswith("and crashes.") for sentence in told)
+
+
+@pytest.mark.parametrize(
+    ("status", "satisfied", "expected", "as_expected", "text", "mark", "sentence"),
+    [
+        ("completed", True, "satisfied", True, "satisfied, as expected", Mark.GOOD, None),
+        ("completed", False, "violated", True, "violated, as expected", Mark.NONE, ", as its scenario states."),
+        ("aborted", False, "lost", True, "lost, as expected", Mark.NONE, "flight is lost, as its scenario states."),
+        ("aborted", False, "lost", False, "lost, but interrupted", Mark.BAD, "; its scenario states the verdict lost."),
+        ("completed", True, "lost", False, "satisfied, expected: lost", Mark.BAD, "; its scenario states the verdict"),
+    ],
+)
+def test_a_verdict_is_held_against_the_one_the_scenario_states(
+    bare_run: Run, status: str, satisfied: bool, expected: str, as_expected: bool, text: str, mark: Mark, sentence: str
+) -> None:
+    constraints = [{**bare_run.summary["constraints"][0], "required": True, "satisfied": satisfied}]
+    run = having(bare_run, "flight", status=status, constraints=constraints, expected=expected, as_expected=as_expected)
+    found = verdict_cell(run.summary)
+    assert (found.text, found.mark) == (text, mark)
+    told = [each for each in comparison_sentences([run]) if "scenario states" in each]
+    assert (not told) if sentence is None else (sentence in told[0])
+
+
+def test_a_verdict_needs_no_expectation_and_minds_required_constraints_alone(bare_run: Run) -> None:
+    entry = bare_run.summary["constraints"][0]
+    summary = {**bare_run.summary, "constraints": [{**entry, "required": False, "satisfied": False}]}
+    assert verdict(summary) == "satisfied"
+    assert verdict_cell(summary).mark is Mark.NONE
+
+
+def test_sentences_tell_what_each_flight_met(bare_run: Run) -> None:
+    told = comparison_sentences([having(bare_run, "one", **EVERYTHING), having(bare_run, "two", course=COURSE)])
+    assert "one and two: the course asks for up to 5.61 deg of tilt." in told, "one course, told once"
+    assert (
+        "one takes off at 2.155 s, meets the ground at 15.88 s (0.05 m/s downwards, 1.2 deg of tilt) and is landed at "
+        "the end."
+    ) in told
+    assert (
+        "The controller of one was told the position with an RMS error of 0.013 m and the attitude with one of "
+        "0.573 deg, and no number in 10 periods."
+    ) in told
+    assert (
+        "Commands of one come 12 ms after their measurement in the median and 60 ms at most; 3 too late to be used."
+    ) in told
+
+
+def test_bounds_that_differ_are_told_with_each_run(bare_run: Run) -> None:
+    entry = {**bare_run.summary["constraints"][0], "name": "roll", "satisfied": False, "worst_margin": -1.0}
+    entry |= {"worst_margin_sampled": -1.0, "time_violated": 0.0, "required": True, "start": 0.0, "stop": None}
+    wide = {**entry, "lower": -20.0, "upper": None, "start": 8.0}
+    one, two = (having(bare_run, name, constraints=[each]) for name, each in (("one", entry), ("two", wide)))
+    told = comparison_sentences([one, two])
+    assert (
+        "roll, whose bounds differ: one (-5 .. 5 deg) violates it by 1 deg; two (at least -20 deg, from 8 s) violates "
+        "it by 1 deg."
+    ) in told
+    assert "roll, -5 .. 5 deg: one violates it by 1 deg." in comparison_sentences([one])

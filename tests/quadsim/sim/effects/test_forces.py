@@ -1,0 +1,207 @@
+"""Drag, disturbance and ground effect in flight against closed forms; their order; what they leave alone."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from quadsim.sim.effects import Disturbance, Effects
+from quadsim.sim.effects.gust import Gust
+from quadsim.sim.effects.rotors import RotorDynamics
+from quadsim.sim.effects.wind import WindField
+from quadsim.sim.plant import Plant
+from quadsim.state import Array, make_state
+from quadsim.vehicle import Vehicle
+
+HIGH = make_state(position=(0.0, 0.0, 500.0))
+
+
+def moving(**rates: float) -> Array:
+    state = HIGH.copy()
+    for name, value in rates.items():
+        state[{"vx": 1, "vy": 3, "vz": 5, "yaw_rate": 11}[name]] = value
+    return state
+
+
+def still_air(velocity: tuple[float, float, float], *gusts: Gust) -> WindField:
+    return WindField(mean=velocity, gusts=gusts, timestep=1e-3, rng=np.random.default_rng(0))
+
+
+def test_rotor_drag_slows_a_level_glide_exponentially(vehicle: Vehicle) -> None:
+    """Exponentially: m dv/dt = -k (sum w) v while level; along z no rotor is held back."""
+    drag, hover = 2e-3, vehicle.hover_speed
+    rate = 4.0 * drag * hover / vehicle.mass
+    with Plant(vehicle, effects=Effects(rotor_drag=drag)) as plant:
+        plant.reset(moving(vx=3.0, vy=-1.0))
+        plant.advance(plant.hover_speeds, 2000)
+        state = plant.state()
+    np.testing.assert_allclose(state[[1, 3]], np.array([3.0, -1.0]) * math.exp(-2.0 * rate), rtol=1e-6)
+    np.testing.assert_allclose(state[[4, 5]], [500.0, 0.0], atol=1e-9)
+
+
+def test_rotor_drag_slows_a_turn(vehicle: Vehicle) -> None:
+    """Each rotor moves at r L across its arm: tau_z = -k (sum w) L^2 r."""
+    drag = 2e-3
+    rate = 4.0 * drag * vehicle.hover_speed * vehicle.arm_length**2 / vehicle.inertia[2]
+    with Plant(vehicle, effects=Effects(rotor_drag=drag)) as plant:
+        plant.reset(moving(yaw_rate=2.0))
+        plant.advance(plant.hover_speeds, 500)
+        assert plant.state()[11] == pytest.approx(2.0 * math.exp(-0.5 * rate), rel=1e-6)
+
+
+def test_rotor_drag_carries_a_tilted_vehicle_to_its_terminal_speed(vehicle: Vehicle) -> None:
+    """With attitude held, along body x: m dv/dt = m g sin(tilt) - k (sum w) v."""
+    drag, tilt = 4e-3, 0.2
+    speed = vehicle.hover_speed / math.sqrt(math.cos(tilt))
+    state = make_state(position=(0.0, 0.0, 500.0), euler=(0.0, tilt, 0.0))
+    with Plant(vehicle, effects=Effects(rotor_drag=drag)) as plant:
+        plant.reset(state)
+        plant.advance(np.full(4, speed), 6000)
+        settled = plant.state()
+    hold = 4.0 * drag * speed
+    along = settled[1] * math.cos(tilt) - settled[5] * math.sin(tilt)
+    reached = 1.0 - math.exp(-hold / vehicle.mass * 6.0)
+    assert along == pytest.approx(reached * vehicle.mass * vehicle.gravity * math.sin(tilt) / hold, rel=1e-5)
+
+
+@pytest.mark.parametrize(("axis", "name"), [(0, "vx"), (1, "vy"), (2, "vz")])
+def test_body_drag_is_half_rho_area_speed_squared(vehicle: Vehicle, axis: int, name: str) -> None:
+    areas = (0.02, 0.03, 0.06)
+    with Plant(vehicle, effects=Effects(body_drag=areas, air_density=1.2)) as plant:
+        plant.reset(moving(**{name: 8.0}))
+        wrench = plant.advance(plant.hover_speeds, 2000).wrench
+        speed = plant.state()[[1, 3, 5]][axis]
+    assert wrench is not None
+    decay = 0.5 * 1.2 * areas[axis] / vehicle.mass  # dv/dt = -decay v^2
+    assert speed == pytest.approx(8.0 / (1.0 + 8.0 * decay * 2.0), rel=1e-9)
+    assert wrench[0, axis] == pytest.approx(-decay * vehicle.mass * 64.0, rel=1e-2)
+
+
+def test_a_falling_vehicle_reaches_its_terminal_speed(vehicle: Vehicle) -> None:
+    with Plant(vehicle, effects=Effects(body_drag=(0.1, 0.1, 0.4), air_density=1.2)) as plant:
+        plant.reset(HIGH)
+        plant.advance(np.zeros(4), 20_000)
+        terminal = math.sqrt(vehicle.mass * vehicle.gravity / (0.5 * 1.2 * 0.4))
+        assert plant.state()[5] == pytest.approx(-terminal * math.tanh(vehicle.gravity * 20.0 / terminal), rel=1e-6)
+
+
+@pytest.mark.parametrize("effects", [Effects(rotor_drag=2e-3), Effects(body_drag=(0.05, 0.05, 0.05))])
+def test_only_the_air_speed_counts(vehicle: Vehicle, effects: Effects) -> None:
+    """Moving with the wind is as standing in still air."""
+    with Plant(vehicle, effects=effects, wind=still_air((4.0, -2.0, 0.0))) as plant:
+        plant.reset(moving(vx=4.0, vy=-2.0))
+        stretch = plant.advance(plant.hover_speeds, 100)
+    assert stretch.wrench is not None
+    np.testing.assert_allclose(stretch.wrench, 0.0, atol=1e-12)
+    np.testing.assert_array_equal(stretch.wind, np.tile([4.0, -2.0, 0.0], (100, 1)))
+
+
+def test_a_gust_pushes_by_its_integral(vehicle: Vehicle) -> None:
+    """While the vehicle hardly moves, m v = k (sum w) v_peak T / 2."""
+    drag = 1e-6
+    gust = Gust(start=0.1, duration=1.0, velocity=(10.0, 0.0, 0.0))
+    with Plant(vehicle, effects=Effects(rotor_drag=drag), wind=still_air((0.0, 0.0, 0.0), gust)) as plant:
+        plant.reset(HIGH)
+        plant.advance(plant.hover_speeds, 1300)
+        push = 4.0 * drag * vehicle.hover_speed * 10.0 * 0.5
+        assert plant.state()[1] == pytest.approx(push / vehicle.mass, rel=1e-3)
+
+
+def test_constant_force_and_torque_accelerate(vehicle: Vehicle) -> None:
+    disturbance = Disturbance(force=(0.4, -0.2, 0.1), torque=(0.0, 0.0, 1e-3))
+    with Plant(vehicle, effects=Effects(disturbance=disturbance)) as plant:
+        plant.reset(HIGH)
+        plant.advance(plant.hover_speeds, 1000)
+        state = plant.state()
+    np.testing.assert_allclose(state[[1, 3, 5]], np.array([0.4, -0.2, 0.1]) / vehicle.mass, rtol=1e-9)
+    assert state[11] == pytest.approx(1e-3 / vehicle.inertia[2], rel=1e-9)
+
+
+def test_white_noise_walks_as_a_random_walk(vehicle: Vehicle) -> None:
+    """The variance of velocity grows as (density / m)^2 t on each axis; the same seed gives the same flight."""
+    density, ends = 0.05, []
+    for seed in [*range(60), 0]:
+        disturbance = Effects(disturbance=Disturbance(force_noise=density))
+        with Plant(vehicle, effects=disturbance, rng=np.random.default_rng(seed)) as plant:
+            plant.reset(HIGH)
+            plant.advance(plant.hover_speeds, 100)
+            ends.append(plant.state()[[1, 3, 5]])
+            plant.reset(HIGH)
+            plant.advance(plant.hover_speeds, 60)
+            plant.advance(plant.hover_speeds, 40)
+            np.testing.assert_array_equal(plant.state()[[1, 3, 5]], ends[-1])
+    np.testing.assert_array_equal(ends[-1], ends[0])
+    ratio = np.mean(np.square(ends[:-1])) / ((density / vehicle.mass) ** 2 * 0.1)
+    assert ratio == pytest.approx(1.0, abs=4.0 * math.sqrt(2.0 / 180.0))  # 180 draws, four standard deviations
+
+
+def test_ground_effect_lifts_by_cheeseman_and_bennett(vehicle: Vehicle) -> None:
+    """Each rotor by the height of its own disc; torques about z stay those of the rotors alone."""
+    radius, height, roll = 0.2, 0.15, 0.3
+    speeds = vehicle.hover_speed * np.array([1.05, 0.95, 1.05, 0.95])
+    with Plant(vehicle, effects=Effects(rotor_radius=radius, contact=True)) as plant:
+        plant.reset(make_state(position=(0.0, 0.0, height), euler=(roll, 0.0, 0.0)), speeds)
+        stretch = plant.advance(speeds, 1)
+    floor, disc = -0.132, 0.034  # where the drawing has them
+    above = height - floor + disc * math.cos(roll) + vehicle.rotor_positions[:, 1] * math.sin(roll)
+    gains = vehicle.thrust_coefficient * speeds**2 * (1.0 / (1.0 - (radius / (4.0 * above)) ** 2) - 1.0)
+    assert stretch.wrench is not None
+    up = np.array([0.0, -math.sin(roll), math.cos(roll)])
+    np.testing.assert_allclose(stretch.wrench[0, :3], gains.sum() * up, rtol=1e-9, atol=1e-12)
+    torque = [gains @ vehicle.rotor_positions[:, 1], -gains @ vehicle.rotor_positions[:, 0], 0.0]
+    np.testing.assert_allclose(stretch.wrench[0, 3:], torque, rtol=1e-9, atol=1e-12)
+    yaw_torque = vehicle.drag_coefficient * (np.array(vehicle.rotor_spins) @ speeds**2)
+    assert stretch.physics[0, 13] == pytest.approx(1e-3 * yaw_torque / vehicle.inertia[2], rel=1e-3)
+
+
+def test_a_lost_propeller_neither_drags_nor_carries_momentum(vehicle: Vehicle) -> None:
+    effects = Effects(rotor_drag=3e-4, efficiency=(0.0,) * 4, rotors=RotorDynamics(rise=0.05, fall=0.05, inertia=1e-3))
+    start = moving(vx=5.0, yaw_rate=1.0)
+    start[7] = 0.5
+    with Plant(vehicle, effects=effects) as plant:
+        plant.reset(start)
+        wrench = plant.advance(1.1 * plant.hover_speeds, 10).wrench
+    np.testing.assert_array_equal(wrench, np.zeros((10, 6)))
+
+
+def test_a_second_flight_meets_the_same_wind(vehicle: Vehicle) -> None:
+    gust = Gust(start=0.02, duration=0.1, velocity=(0.0, 5.0, 0.0))
+    with Plant(vehicle, effects=Effects(rotor_drag=1e-3), wind=still_air((1.0, 0.0, 0.0), gust)) as plant:
+        winds = []
+        for _ in range(2):
+            plant.reset(HIGH)
+            winds.append(plant.advance(plant.hover_speeds, 80).wind)
+    np.testing.assert_array_equal(winds[0], winds[1])
+    assert np.ptp(winds[0]) > 1.0
+
+
+def test_forces_are_of_second_order_in_the_step(vehicle: Vehicle) -> None:
+    effects = Effects(rotor_drag=6e-3, rotors=RotorDynamics(rise=0.05, fall=0.05, inertia=5e-4))
+    commands = vehicle.hover_speed + np.random.default_rng(1).uniform(-25.0, 25.0, (8, 4))
+    start = moving(vx=5.0, yaw_rate=1.0)
+
+    def after(timestep: float) -> Array:
+        with Plant(vehicle, timestep=timestep, effects=effects) as plant:
+            plant.reset(start)
+            for command in commands:
+                plant.advance(command, round(0.05 / timestep))
+            return plant.physics[1:]
+
+    finest = after(0.05 / 800)
+    errors = [np.abs(after(0.05 / steps) - finest).max() for steps in (12, 25, 50)]
+    orders = np.log2(np.array(errors[:-1]) / errors[1:])
+    assert np.all(orders > 1.7), (orders, errors)
+    assert errors[-1] < 3e-5
+
+
+def test_a_plant_taken_step_by_step_flies_as_in_one_call(vehicle: Vehicle) -> None:
+    """A drag of next to nothing switches the other way of stepping on: the states are those of the plain plant."""
+    commands = vehicle.hover_speed + np.random.default_rng(2).uniform(-8.0, 8.0, (10, 4))
+    ends = []
+    for effects in (Effects(), Effects(rotor_drag=1e-300)):
+        with Plant(vehicle, effects=effects) as plant:
+            plant.reset(make_state())
+            ends.append(np.concatenate([plant.advance(command, 50).physics for command in commands]))
+    np.testing.assert_allclose(ends[1], ends[0], rtol=0.0, atol=1e-13)

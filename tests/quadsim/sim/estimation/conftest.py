@@ -1,0 +1,134 @@
+"""A vehicle that is disturbed exactly as the filter believes: white force and torque on a rigid body."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from quadsim.sim.estimation.estimate import difference
+from quadsim.sim.estimation.filter import ErrorStateFilter
+from quadsim.sim.estimation.settings import EstimatorSettings
+from quadsim.sim.sensing.sampler import Sampler
+from quadsim.sim.sensing.sensor import Sensor, SensorName
+from quadsim.state import Array
+from quadsim.vehicle import Vehicle
+
+TIMESTEP = 1e-3
+
+
+@dataclass(frozen=True, kw_only=True)
+class Motion:
+    """Made-up flights of S vehicles over M physics steps.
+
+    Attributes:
+        physics: (S, M + 1, 14) as MuJoCo's state, the start first.
+        commands: (M, 4) rotor speeds during each step.
+    """
+
+    physics: Array
+    commands: Array
+
+    def bias_free_mean(self, seed: int, step: int) -> Array:
+        """(16,) the true mean, gyro bias zero."""
+        row = self.physics[seed, step]
+        return np.concatenate([row[1:4], row[8:11], row[4:8], row[11:14], np.zeros(3)])
+
+
+def simulate(
+    vehicle: Vehicle,
+    settings: EstimatorSettings,
+    commands: Array,
+    *,
+    seeds: int,
+    rng: np.random.Generator,
+    attitude: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    rates: tuple[float, float, float] = (0.0, 0.0, 0.0),
+) -> Motion:
+    """Rigid bodies under rotor speeds (M, 4) and white noise of the settings' densities, Euler-Maruyama at 1 ms.
+
+    Written with rotation matrices of SciPy's, and apart from the filter's prediction in all else.
+    """
+    inertia = np.array(vehicle.inertia)
+    turn = Rotation.from_euler("ZYX", np.tile(np.radians(attitude[::-1]), (seeds, 1)), degrees=False)
+    p, v = np.zeros((seeds, 3)), np.zeros((seeds, 3))
+    w = np.tile(np.array(rates, float), (seeds, 1))
+    physics = np.zeros((seeds, len(commands) + 1, 14))
+    down = np.array([0.0, 0.0, -vehicle.gravity])
+    for k in range(len(commands) + 1):
+        physics[:, k, 0], physics[:, k, 1:4], physics[:, k, 8:11], physics[:, k, 11:14] = k * TIMESTEP, p, v, w
+        physics[:, k, 4:8] = turn.as_quat(scalar_first=True)
+        if k == len(commands):
+            break
+        wrench = vehicle.allocation @ commands[k] ** 2
+        kicks = np.sqrt(TIMESTEP) * rng.standard_normal((2, seeds, 3))
+        before, spin = v, w
+        w = w + TIMESTEP * (wrench[1:] - np.cross(w, inertia * w)) / inertia
+        middle = turn * Rotation.from_rotvec(0.5 * TIMESTEP * spin)
+        v = v + TIMESTEP * (middle.apply([0.0, 0.0, wrench[0] / vehicle.mass]) + down)
+        turn = turn * Rotation.from_rotvec(0.5 * TIMESTEP * (spin + w))
+        p = p + 0.5 * TIMESTEP * (before + v)
+        v = v + settings.acceleration_noise * kicks[0]
+        w = w + settings.angular_acceleration_noise * kicks[1]
+    return Motion(physics=physics, commands=commands)
+
+
+def run(
+    vehicle: Vehicle,
+    motion: Motion,
+    sensors: tuple[Sensor, ...],
+    settings: EstimatorSettings,
+    *,
+    seed: int,
+    believed: tuple[Sensor, ...] | None = None,
+    chunk: int = 50,
+    standing: range = range(0),
+    **faults: Any,
+) -> tuple[ErrorStateFilter, Array, Array, list[float]]:
+    """One seed through sensors and filter, which is told that the vehicle stands in chunks that begin in `standing`.
+
+    Returns:
+        The filter, its errors (K, 15) against the truth after each `chunk` steps, gyro bias included, its standard
+        deviations (K, 15), and its NEES at each.
+    """
+    rng = np.random.default_rng([8, seed])
+    bias = settings.initial_gyro_bias * rng.standard_normal(3)
+    known = [replace(s, bias=tuple(bias)) if s.name is SensorName.RATES else s for s in sensors]
+    generators = rng.spawn(len(SensorName))
+    samplers = [
+        Sampler(s, timestep=TIMESTEP, faults=faults.get("faults", ()), rng=g)
+        for s, g in zip(known, generators, strict=False)
+    ]
+    filter_ = ErrorStateFilter(vehicle, believed or sensors, settings, timestep=TIMESTEP)
+    filter_.reset(motion.bias_free_mean(seed, 0), motion.commands[0], rng)
+    in_flight = [sample for sampler in samplers for sample in sampler.sample(motion.physics[seed, :1], 0)]
+    errors, deviations, nees = [], [], []
+    for first in range(0, len(motion.commands), chunk):
+        stop = first + chunk
+        rows = motion.physics[seed, first + 1 : stop + 1]
+        in_flight += [sample for sampler in samplers for sample in sampler.sample(rows, first + 1)]
+        arrived = [s for s in in_flight if s.arrival <= stop]
+        filter_.advance(motion.commands[first:stop], arrived, first, standing=first in standing)
+        in_flight = [s for s in in_flight if s.arrival > stop]
+        estimate = filter_.estimate(stop)
+        true = motion.bias_free_mean(seed, stop)
+        true[13:] = bias
+        error = difference(true, estimate.mean)
+        errors.append(error)
+        deviations.append(np.sqrt(np.diag(estimate.covariance)))
+        nees.append(float(error @ np.linalg.solve(estimate.covariance, error)))
+    return filter_, np.array(errors), np.array(deviations), nees
+
+
+@pytest.fixture(scope="session")
+def simulate_motion(vehicle: Vehicle) -> Callable[..., Motion]:
+    return lambda *args, **kwargs: simulate(vehicle, *args, **kwargs)
+
+
+@pytest.fixture(scope="session")
+def run_filter(vehicle: Vehicle) -> Callable[..., Any]:
+    return lambda *args, **kwargs: run(vehicle, *args, **kwargs)

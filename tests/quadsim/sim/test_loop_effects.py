@@ -1,0 +1,266 @@
+"""The closed loop with late commands, sensors and a ground: who is told what, and when."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import pytest
+
+from quadsim.controller import GROUNDED, MISSED, Command, Moment, Phase, stopped
+from quadsim.flight.log import FlightLog
+from quadsim.flight.metrics import computation, estimation, ground
+from quadsim.sim.airframe import outline
+from quadsim.sim.computation import Computation, Stall
+from quadsim.sim.effects import Effects
+from quadsim.sim.effects.rotors import RotorDynamics
+from quadsim.sim.loop import fly
+from quadsim.sim.navigation import Navigation
+from quadsim.sim.phase import PhaseMonitor
+from quadsim.sim.plant import Plant
+from quadsim.sim.sensing.sensor import FaultKind, Sensor, SensorFault, SensorName
+from quadsim.state import Array, make_state
+from quadsim.vehicle import Vehicle
+
+PERIOD, STEPS = 0.05, 50
+
+
+@dataclass
+class Scripted:
+    """Commands what it is told to, stops when grounded, and keeps what it was asked."""
+
+    speeds: Array
+    name: str = "scripted"
+    solver: str = ""
+    horizon: int = 2
+    moments: list[Moment] = field(default_factory=list)
+    states: list[Array] = field(default_factory=list)
+
+    def reset(self, speeds: Array) -> None:
+        self.moments, self.states = [], []
+
+    def step(self, now: Moment, state: Array, reference: Array) -> Command:
+        k = len(self.moments)
+        self.moments.append(now)
+        self.states.append(state.copy())
+        if now.phase in GROUNDED:
+            return stopped(np.zeros(4), self.horizon, now.phase)
+        return Command(speeds=self.speeds[k], plan=np.tile(self.speeds[k], (self.horizon, 1)), iterations=k)
+
+    def predict(self, states: Array, plans: Array) -> Array:
+        return np.repeat(states[:, None, :], plans.shape[1], axis=1)
+
+
+def fly_scripted(plant: Plant, controller: Scripted, **options: Any) -> FlightLog:
+    periods = len(controller.speeds)
+    values: dict[str, Any] = {
+        "reference": np.zeros((periods + controller.horizon, 4)),
+        "initial_state": make_state(position=(0.0, 0.0, 10.0)),
+        "initial_speeds": plant.hover_speeds,
+    }
+    return fly(plant, controller, periods=periods, steps_per_period=STEPS, **{**values, **options})
+
+
+@pytest.fixture
+def speeds(vehicle: Vehicle) -> Array:
+    return vehicle.hover_speed + np.random.default_rng(5).uniform(-3, 3, (8, 4))
+
+
+def test_a_late_command_acts_from_its_time_on(vehicle: Vehicle, speeds: Array) -> None:
+    controller = Scripted(speeds)
+    with Plant(vehicle) as plant:
+        log = fly_scripted(plant, controller, computation=Computation(fixed=0.0105))
+        hover = plant.hover_speeds
+    acting = log.plant.speeds[:-1].reshape(-1, STEPS, 4)
+    before = np.concatenate([hover[None], speeds[:-1]])
+    np.testing.assert_array_equal(acting[:, :11], np.repeat(before[:, None], 11, axis=1))  # the next whole step
+    np.testing.assert_array_equal(acting[:, 11:], np.repeat(speeds[:, None], 39, axis=1))
+    np.testing.assert_array_equal(log.control.speeds, speeds)
+    np.testing.assert_allclose(log.control.delay, 0.0105)
+    for k, moment in enumerate(controller.moments):
+        np.testing.assert_array_equal(moment.acting, before[k])
+    assert computation(log.control)["missed"] == 0
+
+
+def test_a_missed_deadline_leaves_the_last_command_acting(vehicle: Vehicle, speeds: Array) -> None:
+    controller = Scripted(speeds)
+    stall = Stall(start=0.1, duration=0.12)  # catches periods 2, 3 and 4; the last of them is 20 ms late
+    with Plant(vehicle) as plant:
+        log = fly_scripted(plant, controller, computation=Computation(stalls=(stall,)))
+    assert [status == MISSED for status in log.control.status] == [k in (2, 3) for k in range(8)]
+    np.testing.assert_array_equal(log.control.speeds[1:5], speeds[[1, 1, 1, 4]])
+    np.testing.assert_array_equal(log.control.fallback, [0, 0, 1, 1, 0, 0, 0, 0])
+    np.testing.assert_allclose(log.control.delay, [0, 0, 0.12, 0.07, 0.02, 0, 0, 0], atol=1e-12)
+    np.testing.assert_array_equal(controller.moments[4].acting, speeds[1])
+    np.testing.assert_array_equal(log.plant.speeds[STEPS * 4 + 19], speeds[1])
+    np.testing.assert_array_equal(log.plant.speeds[STEPS * 4 + 20], speeds[4])
+    numbers = computation(log.control)
+    assert numbers["missed"] == 2
+    assert numbers["delay_ms"]["max"] == pytest.approx(120.0)
+
+
+def test_a_late_command_leaves_the_plan_going_on(vehicle: Vehicle, speeds: Array) -> None:
+    """Due after 10 ms, stalled over periods 2 to 4: the plan of period 1 goes on from when each command was due."""
+
+    class Planner(Scripted):
+        def step(self, now: Moment, state: Array, reference: Array) -> Command:
+            command = super().step(now, state, reference)
+            plan = command.speeds + np.arange(4.0)[:, None]
+            return Command(speeds=command.speeds, plan=plan)
+
+    computation = Computation(fixed=0.01, stalls=(Stall(start=0.1, duration=0.125),), plan=True)
+    with Plant(vehicle) as plant:
+        log = fly_scripted(plant, Planner(speeds, horizon=4), computation=computation)
+    acting = log.plant.speeds[:-1].reshape(-1, STEPS, 4)
+    for k, before, late in ((2, 0.0, 1.0), (3, 1.0, 2.0)):
+        np.testing.assert_array_equal(acting[k, :10], np.tile(speeds[1] + before, (10, 1)))
+        np.testing.assert_array_equal(acting[k, 10:], np.tile(speeds[1] + late, (40, 1)))
+    np.testing.assert_array_equal(acting[4, :10], np.tile(speeds[1] + 2.0, (10, 1)))
+    np.testing.assert_array_equal(acting[4, 10:25], np.tile(speeds[1] + 3.0, (15, 1)))
+    np.testing.assert_array_equal(acting[4, 25:], np.tile(speeds[4], (25, 1)))
+    assert [status == MISSED for status in log.control.status[:6]] == [False, False, True, True, False, False]
+    np.testing.assert_array_equal(log.control.speeds[2:5], [speeds[1] + 1.0, speeds[1] + 2.0, speeds[4]])
+
+
+def test_a_command_just_in_time_acts_a_period_later(vehicle: Vehicle, speeds: Array) -> None:
+    controller = Scripted(speeds)
+    with Plant(vehicle) as plant:
+        log = fly_scripted(plant, controller, computation=Computation(fixed=PERIOD))
+        hover = plant.hover_speeds
+    assert MISSED not in log.control.status
+    acting = np.concatenate([hover[None], speeds[:-1]])
+    np.testing.assert_array_equal(log.plant.speeds[:-1], np.repeat(acting, STEPS, axis=0))
+    np.testing.assert_array_equal([moment.acting for moment in controller.moments], acting)
+    np.testing.assert_array_equal(log.control.speeds, speeds)
+
+
+def test_iterations_cost_simulated_time(vehicle: Vehicle, speeds: Array) -> None:
+    with Plant(vehicle) as plant:
+        log = fly_scripted(plant, Scripted(speeds), computation=Computation(per_iteration=0.004))
+    np.testing.assert_allclose(log.control.delay, 0.004 * np.arange(8))
+
+
+def test_drawn_delays_are_the_seed_s(vehicle: Vehicle, speeds: Array) -> None:
+    def delays(seed: int) -> Array:
+        with Plant(vehicle) as plant:
+            rng = np.random.default_rng(seed)
+            return fly_scripted(plant, Scripted(speeds), computation=Computation(jitter=0.02), rng=rng).control.delay
+
+    np.testing.assert_array_equal(delays(3), delays(3))
+    assert np.any(delays(3) != delays(4))
+
+
+def test_the_controller_is_told_what_the_sensors_say(vehicle: Vehicle, speeds: Array) -> None:
+    sensors = [Sensor(name=SensorName.POSITION, rate=20.0, noise=(0.1, 0.1, 0.1))]
+    navigation = Navigation(vehicle, timestep=1e-3, sensors=sensors, rng=np.random.default_rng(0))
+    controller = Scripted(speeds)
+    with Plant(vehicle) as plant:
+        log = fly_scripted(plant, controller, navigation=navigation)
+    np.testing.assert_array_equal(controller.states, log.control.state)
+    np.testing.assert_allclose(log.control.truth, log.plant.state[:-1:STEPS], atol=1e-12)
+    told = log.control.state - log.control.truth
+    assert 0.02 < np.abs(told[:, [0, 2, 4]]).max() < 0.5
+    np.testing.assert_allclose(np.delete(told, [0, 2, 4], axis=1), 0.0, atol=1e-12)
+    numbers = estimation(log.control)
+    assert numbers["rmse"]["x"] == pytest.approx(np.sqrt(np.mean(told[:, 0] ** 2)))
+    assert numbers["max_error"]["vx"] < 1e-12
+    assert numbers["not_finite"] == 0
+
+
+def test_the_estimator_is_told_what_rotors_can_do_of_the_command(vehicle: Vehicle) -> None:
+    told: list[Array] = []
+
+    class Witness(Navigation):
+        def advance(self, physics: Array, commands: Array, *, standing: bool = False) -> None:
+            told.append(commands[0].copy())
+            super().advance(physics, commands, standing=standing)
+
+    navigation = Witness(vehicle, timestep=1e-3, sensors=[], rng=np.random.default_rng(0))
+    with Plant(vehicle, limit_speeds=True) as plant:
+        fly_scripted(plant, Scripted(np.full((2, 4), 300.0)), navigation=navigation)
+    np.testing.assert_array_equal(told, np.full((2, 4), vehicle.speed_max))
+
+
+def test_a_sensor_that_says_no_number_is_counted(vehicle: Vehicle, speeds: Array) -> None:
+    fault = SensorFault(sensor=SensorName.RATES, kind=FaultKind.NAN, start=0.1, stop=0.2)
+    navigation = Navigation(vehicle, timestep=1e-3, sensors=[], rng=np.random.default_rng(0), faults=[fault])
+    with Plant(vehicle) as plant:
+        log = fly_scripted(plant, Scripted(speeds), navigation=navigation)
+    assert estimation(log.control)["not_finite"] == 2
+    assert estimation(log.control)["rmse"]["roll_rate"] == pytest.approx(0.0, abs=1e-12)
+
+
+def test_take_off_and_landing(vehicle: Vehicle) -> None:
+    """Rotors spin up on the ground, lift, and go down again by script; the phases follow, and the metrics."""
+    periods = 80
+    script = np.full((periods, 4), vehicle.hover_speed)
+    script[:12] *= np.linspace(0.3, 1.0, 12)[:, None]
+    script[12:16] *= 1.15
+    script[16:24] *= 0.93
+    script[24:28] *= 0.93
+    script[28:] *= 0.98
+    reference = np.zeros((periods + 2, 4))
+    reference[8:30, 2] = 1.0
+    reference[30:, 2] = -0.1
+    controller = Scripted(script)
+    shape = outline(vehicle)
+    with Plant(vehicle, effects=Effects(contact=True, rotors=RotorDynamics(rise=0.02, fall=0.02))) as plant:
+        log = fly_scripted(
+            plant,
+            controller,
+            reference=reference,
+            initial_state=make_state(),
+            initial_speeds=np.zeros(4),
+            ground=PhaseMonitor(shape, period=PERIOD),
+        )
+    phases = list(dict.fromkeys(log.control.phase))
+    assert phases == ["landed", "armed", "flying"]  # the last of them comes twice
+    assert log.control.phase[-1] == "landed"
+    assert [moment.phase for moment in controller.moments] == [Phase(phase) for phase in log.control.phase]
+    assert log.control.status[-1] == "landed"
+    assert np.abs(log.plant.state[:400, [1, 3, 5]]).max() < 1e-2  # it stood still while the rotors were too slow
+    numbers = ground(log, shape)
+    assert 0.6 < numbers["takeoff_time"] < 1.2
+    touch = numbers["touchdown"]
+    row = int(np.searchsorted(log.plant.t, touch["time"]))
+    assert touch["speed"] == pytest.approx(-log.plant.state[row, 5])
+    assert touch["speed"] > 0.05
+    assert log.plant.state[row, 4] == pytest.approx(0.0, abs=5e-3)  # the origin at rest is at z = 0
+    assert touch["tilt"] < 0.1
+    assert not numbers["crashed"]
+    assert np.abs(log.plant.state[-1, [1, 3, 5]]).max() < 1e-6
+    assert log.plant.state[-1, 4] == pytest.approx(0.0, abs=1e-4)
+    assert log.plant.speeds[-1].max() < 1.0
+
+
+def test_a_capsized_vehicle_lies_on_the_ground_and_has_crashed(vehicle: Vehicle) -> None:
+    controller = Scripted(np.zeros((40, 4)))
+    with Plant(vehicle, effects=Effects(contact=True)) as plant:
+        log = fly_scripted(
+            plant,
+            controller,
+            initial_state=make_state(position=(0.0, 0.0, 0.4), euler=(1.2, 0.0, 0.0)),
+            ground=PhaseMonitor(outline(vehicle), period=PERIOD),
+        )
+    assert log.control.phase[-1] == "crashed"
+    assert log.control.status[-1] == "crashed"
+    assert log.plant.state[-1, 4] > -0.14
+    numbers = ground(log, outline(vehicle))
+    assert numbers["crashed"]
+    assert numbers["started"] == "flying"
+    assert numbers["takeoff_time"] is None
+    assert numbers["touchdown"]["tilt"] > 60.0
+    assert numbers["touchdown"]["speed"] > 0.5
+
+
+def test_a_sliding_vehicle_is_stopped_by_friction(vehicle: Vehicle) -> None:
+    """v^2 = 2 mu g s: feet at rest, friction 0.8."""
+    start = make_state()
+    start[1] = 1.0
+    with Plant(vehicle, effects=Effects(contact=True)) as plant:
+        plant.reset(start, np.zeros(4))
+        plant.advance(np.zeros(4), 1000)
+        state = plant.state()
+    assert state[0] == pytest.approx(1.0 / (2.0 * 0.8 * vehicle.gravity), rel=0.1)
+    assert abs(state[1]) < 1e-3

@@ -1,0 +1,178 @@
+"""What a controller is told, with and without an estimator."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+
+from quadsim.errors import ParameterError
+from quadsim.sim.estimation.settings import EstimatorSettings
+from quadsim.sim.navigation import Navigation
+from quadsim.sim.physics import physics_to_state
+from quadsim.sim.plant import Plant
+from quadsim.sim.sensing.sensor import FaultKind, Sensor, SensorFault, SensorName
+from quadsim.state import INDEX, Array, make_state
+from quadsim.vehicle import Vehicle
+
+TIMESTEP = 1e-3
+STEPS = 600
+NOISE = (0.01, 0.01, 0.01)
+SENSORS = (
+    Sensor(name=SensorName.POSITION, rate=20.0, noise=NOISE, delay=0.05),
+    Sensor(name=SensorName.ATTITUDE, rate=100.0, noise=NOISE),
+    Sensor(name=SensorName.RATES, rate=200.0, noise=NOISE),
+)
+
+
+@pytest.fixture(scope="module")
+def speeds(vehicle: Vehicle) -> Array:
+    return vehicle.hover_speed * np.array([1.01, 0.97, 1.01, 1.02])
+
+
+@pytest.fixture(scope="module")
+def physics(vehicle: Vehicle, speeds: Array) -> Array:
+    """(STEPS + 1, 14) of a flight that yaws through half a turn."""
+    with Plant(vehicle) as plant:
+        plant.reset(make_state(euler=(0.1, -0.2, math.radians(179.0))), speeds)
+        return np.vstack([plant.physics, plant.advance(speeds, STEPS).physics])
+
+
+def told(navigation: Navigation, physics: Array, speeds: Array, *, chunk: int = 50, yaw: float = 0.0) -> Array:
+    """(K, 12) what the controller is told at the start and after each 50 steps, told of it in chunks."""
+    navigation.reset(physics[0], speeds, yaw)
+    states = [navigation.state()]
+    for step in range(0, STEPS, chunk):
+        navigation.advance(physics[step + 1 : step + chunk + 1], np.tile(speeds, (chunk, 1)))
+        if (step + chunk) % 50 == 0:
+            states.append(navigation.state())
+    return np.array(states)
+
+
+def build(vehicle: Vehicle, *sensors: Sensor, seed: int = 0, **more: Any) -> Navigation:
+    return Navigation(vehicle, timestep=TIMESTEP, sensors=sensors, rng=np.random.default_rng(seed), **more)
+
+
+def test_without_sensors_the_truth_is_told(vehicle: Vehicle, physics: Array, speeds: Array) -> None:
+    states = told(build(vehicle), physics, speeds, yaw=math.radians(179.0))
+    np.testing.assert_allclose(states, physics_to_state(physics, math.radians(179.0))[::50], atol=1e-12)
+    assert states[-1, INDEX["yaw"]] > math.pi
+    again = told(build(vehicle), physics, speeds, yaw=math.radians(179.0) - 4.0 * math.pi)
+    np.testing.assert_allclose(again[:, INDEX["yaw"]], states[:, INDEX["yaw"]] - 4.0 * math.pi, atol=1e-12)
+
+
+@pytest.mark.parametrize("estimator", [None, EstimatorSettings()], ids=["held", "estimated"])
+def test_yaw_is_counted_over_whole_turns(estimator: EstimatorSettings | None, vehicle: Vehicle) -> None:
+    hover, spin = np.full(4, vehicle.hover_speed), 6.0 * math.pi
+    with Plant(vehicle) as plant:
+        start = make_state()
+        start[INDEX["yaw_rate"]] = spin
+        plant.reset(start, hover)
+        physics = np.vstack([plant.physics, plant.advance(hover, STEPS).physics])
+    yaw = told(build(vehicle, *SENSORS, estimator=estimator), physics, hover)[:, INDEX["yaw"]]
+    np.testing.assert_allclose(yaw, spin * 0.05 * np.arange(13), atol=0.05)  # 1.8 turns
+
+
+def test_the_last_sample_to_arrive_is_held(vehicle: Vehicle, physics: Array, speeds: Array) -> None:
+    late = Sensor(name=SensorName.POSITION, rate=4.0, delay=0.12)  # taken at 0, 0.25, 0.5 s
+    states = told(build(vehicle, late), physics, speeds)
+    truth = physics_to_state(physics)
+    taken = [0, 0, 0, 0, 0, 0, 0, 0, 250, 250, 250, 250, 250]  # the last at 0.6 s, before 0.62
+    np.testing.assert_array_equal(states[:, [0, 2, 4]], truth[taken][:, [0, 2, 4]])
+    np.testing.assert_allclose(states[:, [1, 3, 5]], truth[::50, [1, 3, 5]], atol=1e-12)
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+@pytest.mark.parametrize(
+    ("name", "columns"),
+    [
+        (SensorName.POSITION, ["x", "y", "z"]),
+        (SensorName.VELOCITY, ["vx", "vy", "vz"]),
+        (SensorName.ATTITUDE, ["roll", "pitch", "yaw"]),
+        (SensorName.RATES, None),
+    ],
+)
+def test_nan_reaches_the_controller_where_nothing_stops_it(
+    name: SensorName, columns: list[str] | None, axis: int, vehicle: Vehicle, physics: Array, speeds: Array
+) -> None:
+    """The sensors are perfect otherwise; what is no rate makes no Euler rate either."""
+    fault = SensorFault(sensor=name, kind=FaultKind.NAN, start=0.2, stop=0.4, axes=(axis,))
+    states = told(build(vehicle, faults=(fault,)), physics, speeds)
+    assert np.isfinite(states[[0, 1, 2, 3, 8, 9, 10]]).all()
+    assert np.isnan(states[4:8]).any(axis=1).all()
+    if columns is not None:
+        expected = [INDEX[columns[axis]]]
+        others = [INDEX[name] for name in ("x", "y", "z", "vx", "vy", "vz", "roll", "pitch", "yaw")]
+        assert [i for i in others if np.isnan(states[4, i])] == expected
+    np.testing.assert_allclose(states[8:], told(build(vehicle), physics, speeds)[8:], atol=1e-12)
+
+
+@pytest.mark.parametrize("estimator", [None, EstimatorSettings()], ids=["held", "estimated"])
+def test_what_is_told_depends_on_the_seed_alone(
+    estimator: EstimatorSettings | None, vehicle: Vehicle, physics: Array, speeds: Array
+) -> None:
+    navigation = build(vehicle, *SENSORS, estimator=estimator)
+    once = told(navigation, physics, speeds)
+    assert np.array_equal(told(navigation, physics, speeds), once)  # reset: the same again
+    assert np.array_equal(told(build(vehicle, *SENSORS, estimator=estimator), physics, speeds, chunk=25), once)
+    assert not np.array_equal(told(build(vehicle, *SENSORS, seed=1, estimator=estimator), physics, speeds), once)
+
+
+def test_one_sensor_leaves_the_draws_of_the_others_alone(vehicle: Vehicle, physics: Array, speeds: Array) -> None:
+    more = (*SENSORS, Sensor(name=SensorName.VELOCITY, rate=20.0, noise=NOISE))
+    few, many = (told(build(vehicle, *sensors), physics, speeds) for sensors in (SENSORS, more))
+    same = [i for i in range(12) if i not in (INDEX["vx"], INDEX["vy"], INDEX["vz"])]
+    assert np.array_equal(few[:, same], many[:, same])
+    assert not np.array_equal(few, many)
+
+
+def test_the_estimate_is_near_the_truth_and_its_yaw_unwrapped(vehicle: Vehicle, physics: Array, speeds: Array) -> None:
+    navigation = build(vehicle, *SENSORS, estimator=EstimatorSettings())
+    states = told(navigation, physics, speeds, yaw=math.radians(179.0))
+    error = states - physics_to_state(physics, math.radians(179.0))[::50]
+    assert np.abs(error[-1, [0, 2, 4]]).max() < 0.05
+    assert np.abs(error[-1, [6, 8, 10]]).max() < 0.02
+    assert np.abs(np.diff(states[:, INDEX["yaw"]])).max() < 0.2
+    assert {str(name): tally.accepted for name, tally in navigation.tallies.items()} == {
+        "position": 12,  # up to the horizon, the largest delay before now
+        "attitude": 56,
+        "rates": 111,
+    }
+    assert build(vehicle).tallies == {}
+
+
+@pytest.mark.parametrize("standing", [True, False])
+def test_the_estimator_alone_minds_that_the_feet_stand(standing: bool, vehicle: Vehicle, physics: Array) -> None:
+    cold = np.zeros((200, 4))
+    ground = np.tile(physics[:1], (201, 1))
+    ground[:, 4:8], ground[:, 8:] = [1.0, 0.0, 0.0, 0.0], 0.0
+    for estimator in (None, EstimatorSettings()):
+        navigation = build(vehicle, *SENSORS, estimator=estimator)
+        navigation.reset(ground[0], cold[0])
+        navigation.advance(ground[1:], cold, standing=standing)
+        falls = navigation.state()[INDEX["vz"]] < -0.3
+        assert falls == (estimator is not None and not standing)
+
+
+@pytest.mark.parametrize(
+    ("sensors", "more", "message"),
+    [
+        ((SENSORS[0], SENSORS[0]), {}, "navigation.sensors must be at most one of each name; got"),
+        (
+            SENSORS,
+            {
+                "estimator": EstimatorSettings(),
+                "faults": (SensorFault(sensor=SensorName.VELOCITY, kind=FaultKind.NAN, start=0.0),),
+            },
+            r"fault.sensor must be on a sensor that the estimator has \(position, attitude, rates\); got 'velocity'",
+        ),
+        ((Sensor(name=SensorName.POSITION, rate=300.0),), {}, "sensors.position.rate must be a divisor of"),
+    ],
+)
+def test_what_cannot_work_is_refused(
+    sensors: tuple[Sensor, ...], more: dict[str, Any], message: str, vehicle: Vehicle
+) -> None:
+    with pytest.raises(ParameterError, match=f"^{message}"):
+        build(vehicle, *sensors, **more)

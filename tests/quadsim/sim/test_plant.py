@@ -1,0 +1,191 @@
+"""The plant, against an independent integration of the Newton-Euler equations, and its refusals."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+from scipy.spatial.transform import Rotation
+
+from quadsim.errors import CommandError, DivergenceError, ParameterError
+from quadsim.sim.physics import physics_to_state, steps_per_period
+from quadsim.sim.plant import Plant
+from quadsim.state import Array, make_state
+from quadsim.vehicle import Vehicle
+
+PERIOD, STEPS = 0.05, 50
+
+
+def newton_euler(vehicle: Vehicle, start: Array, holds: Array) -> Array:
+    """The state (position, quaternion wxyz, velocity, body rates) after each row was held for a period, by DOP853."""
+    inertia = np.array(vehicle.inertia)
+
+    def slope(_t: float, y: Array, thrust: float, torque: Array) -> Array:
+        _, quaternion, velocity, rates = np.split(y, [3, 7, 10])
+        w, x, yq, z = quaternion / np.linalg.norm(quaternion)
+        up = Rotation.from_quat([x, yq, z, w]).apply([0.0, 0.0, 1.0])
+        acceleration = thrust / vehicle.mass * up - [0.0, 0.0, vehicle.gravity]
+        p, q, r = rates
+        spin = 0.5 * np.array(
+            [-x * p - yq * q - z * r, w * p + yq * r - z * q, w * q - x * r + z * p, w * r + x * q - yq * p]
+        )
+        angular = (torque - np.cross(rates, inertia * rates)) / inertia
+        return np.concatenate([velocity, spin, acceleration, angular])
+
+    y = start
+    for speeds in holds:
+        wrench = vehicle.allocation @ speeds**2
+        y = solve_ivp(slope, (0, PERIOD), y, "DOP853", rtol=1e-12, atol=1e-12, args=(wrench[0], wrench[1:])).y[:, -1]
+    return y
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_four_seconds_of_random_commands_match_newton_euler(vehicle: Vehicle, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    holds = vehicle.hover_speed + rng.uniform(-8.0, 8.0, (80, 4))
+    with Plant(vehicle) as plant:
+        plant.reset(make_state(euler=(0.1, -0.2, 0.5)))
+        start = plant.physics
+        for speeds in holds:
+            plant.advance(speeds, STEPS)
+        end = plant.physics
+    expected = newton_euler(vehicle, start[1:], holds)
+    assert np.abs(end[1:4] - expected[:3]).max() < 1e-6
+    assert np.abs(end[4:8] - expected[3:7] / np.linalg.norm(expected[3:7])).max() < 1e-6
+    assert np.abs(end[11:14]).max() > 0.1  # it did tumble about
+
+
+def test_free_fall_is_a_parabola(vehicle: Vehicle) -> None:
+    with Plant(vehicle) as plant:
+        plant.reset(make_state(position=(0.0, 0.0, 100.0)))
+        plant.advance(np.zeros(4), 2000)
+        assert plant.state()[4] == pytest.approx(100.0 - 0.5 * vehicle.gravity * 4.0, abs=1e-9)
+        assert plant.time == pytest.approx(2.0)
+
+
+def test_energy_and_angular_momentum_are_conserved_without_rotors(vehicle: Vehicle) -> None:
+    inertia = np.array(vehicle.inertia)
+
+    def invariants(physics: Array) -> tuple[float, Array]:
+        position, quaternion, velocity, rates = np.split(physics[1:], [3, 7, 10])
+        energy = 0.5 * vehicle.mass * velocity @ velocity + vehicle.mass * vehicle.gravity * position[2]
+        momentum = Rotation.from_quat(np.roll(quaternion, -1)).apply(inertia * rates)
+        return float(energy + 0.5 * rates @ (inertia * rates)), momentum
+
+    spinning = make_state(position=(0.0, 0.0, 50.0))
+    spinning[[7, 9, 11]] = 1.0, -2.0, 3.0
+    with Plant(vehicle) as plant:
+        plant.reset(spinning)
+        energy, momentum = invariants(plant.physics)
+        plant.advance(np.zeros(4), 3000)
+        later_energy, later_momentum = invariants(plant.physics)
+    assert later_energy == pytest.approx(energy, rel=1e-9)
+    np.testing.assert_allclose(later_momentum, momentum, atol=1e-9)
+
+
+def test_physics_converges_with_fourth_order(vehicle: Vehicle) -> None:
+    rng = np.random.default_rng(3)
+    holds = vehicle.hover_speed + rng.uniform(-30.0, 30.0, (10, 4))
+
+    def after(timestep: float) -> Array:
+        with Plant(vehicle, timestep=timestep) as plant:
+            plant.reset(make_state())
+            for speeds in holds:
+                plant.advance(speeds, round(PERIOD / timestep))
+            return plant.physics[1:]
+
+    finest = after(0.05 / 400)
+    errors = [np.abs(after(PERIOD / steps) - finest).max() for steps in (5, 10, 20)]
+    orders = np.log2(np.array(errors[:-1]) / errors[1:])
+    assert np.all(orders > 3.5), orders
+
+
+def test_state_comes_out_with_euler_rates_and_unwrapped_yaw(vehicle: Vehicle) -> None:
+    turning = make_state()
+    turning[11] = 4.0
+    with Plant(vehicle) as plant:
+        plant.reset(turning)
+        hover = plant.hover_speeds
+        yaws = []
+        rows = []
+        for _ in range(80):
+            rows.append(plant.advance(hover, STEPS).physics)
+            yaws.append(plant.state()[10])
+    np.testing.assert_allclose(yaws, 4.0 * PERIOD * np.arange(1, 81), atol=1e-9)  # sixteen radians, no jump
+    np.testing.assert_allclose(physics_to_state(np.concatenate(rows))[-1, 10], 16.0, atol=1e-9)
+
+
+def test_start_is_the_state_asked_for(vehicle: Vehicle) -> None:
+    asked = np.random.default_rng(0).uniform(-1, 1, 12)
+    with Plant(vehicle) as plant:
+        plant.reset(asked)
+        np.testing.assert_allclose(plant.state(), asked, atol=1e-12)
+        plant.reset(make_state(euler=(0.0, 0.0, 7.0)))  # a yaw beyond pi stays what it was
+        np.testing.assert_allclose(plant.state()[10], 7.0, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("speeds", "message"),
+    [
+        ([np.nan, 190.0, 190.0, 190.0], "the command is not finite"),
+        ([190.0, np.inf, 190.0, 190.0], "the command is not finite"),
+        ([190.0, 190.0, 190.0], r"shape \(3,\), not \(4,\)"),
+        ([1e9, 190.0, 190.0, 190.0], "beyond any rotor's speed"),
+    ],
+)
+def test_bad_commands_are_refused_before_anything_moves(vehicle: Vehicle, speeds: list[float], message: str) -> None:
+    with Plant(vehicle) as plant:
+        plant.reset(make_state())
+        with pytest.raises(CommandError, match=message):
+            plant.advance(np.array(speeds), STEPS)
+        assert plant.time == 0.0
+
+
+def test_divergence_is_raised_and_not_reset_away(
+    vehicle: Vehicle, capfd: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    with Plant(vehicle) as plant:
+        plant.reset(make_state())
+        with pytest.raises(DivergenceError, match=r"at t = \d+\.\d{3} s: the plant diverged"):
+            plant.advance(np.array([9e4, 0.0, 0.0, 0.0]), 50_000)
+    assert capfd.readouterr() == ("", "")
+    assert list(tmp_path.iterdir()) == []  # no MUJOCO_LOG.TXT
+
+
+def test_rotors_saturate_only_where_the_scenario_says_so(vehicle: Vehicle) -> None:
+    fast = np.full(4, 300.0)
+    with Plant(vehicle) as free, Plant(vehicle, limit_speeds=True) as limited:
+        for plant, speed in ((free, 300.0), (limited, vehicle.speed_max)):
+            plant.reset(make_state())
+            np.testing.assert_array_equal(plant.applied(fast), np.full(4, speed))
+            plant.advance(fast, 100)
+            thrust = 4 * vehicle.thrust_coefficient * speed**2
+            climb = 0.5 * (thrust / vehicle.mass - vehicle.gravity) * 0.1**2
+            assert plant.state()[4] == pytest.approx(climb, rel=1e-9)
+        np.testing.assert_array_equal(free.applied(-fast), np.zeros(4))  # a rotor cannot push down
+
+
+@pytest.mark.parametrize("state", [np.zeros(11), np.full(12, np.nan)])
+def test_impossible_starts_are_refused(vehicle: Vehicle, state: Array) -> None:
+    with Plant(vehicle) as plant, pytest.raises(ParameterError, match=r"plant\.state must be 12 finite numbers"):
+        plant.reset(state)
+
+
+@pytest.mark.parametrize("period", [0.0505, 0.0001, 0.0])
+def test_control_period_must_be_whole_steps(period: float) -> None:
+    with pytest.raises(ParameterError, match=r"control_period must be a whole multiple of the physics step"):
+        steps_per_period(period, 1e-3)
+
+
+def test_equal_commands_give_equal_bits(vehicle: Vehicle) -> None:
+    holds = vehicle.hover_speed + np.random.default_rng(1).uniform(-8, 8, (20, 4))
+
+    def fly() -> Array:
+        with Plant(vehicle) as plant:
+            plant.reset(make_state())
+            return np.concatenate([plant.advance(speeds, STEPS).physics for speeds in holds])
+
+    np.testing.assert_array_equal(fly(), fly())

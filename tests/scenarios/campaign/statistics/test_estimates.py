@@ -1,0 +1,159 @@
+"""The summary against numbers worked out by hand or by another route."""
+
+import json
+from collections.abc import Callable
+
+import numpy as np
+import pyarrow as pa
+import pytest
+from scipy import stats
+
+from quadsim.errors import ParameterError
+from scenarios.campaign.statistics.estimates import estimate, ranking, worst_flight
+
+MakeCampaign = Callable[..., pa.Table]
+
+
+def with_column(table: pa.Table, name: str, values: list[object]) -> pa.Table:
+    i = table.column_names.index(name)
+    return table.set_column(i, table.schema.field(i), pa.array(values, table.schema.field(i).type))
+
+
+@pytest.fixture(scope="module")
+def small() -> pa.Table:
+    """Eight flights: satisfied but for 3 and 6 lost, 1 and 5 violated, 4 an error; flight 7 failed by a metric."""
+    return pa.table(
+        {
+            "flight": list(range(8)),
+            "verdict": ["satisfied", "violated", "satisfied", "lost", "error", "violated", "lost", "satisfied"],
+            "reason": [None, None, None, "gone", "raised", None, "gone", None],
+            "failed": [False, True, False, True, True, True, True, True],
+            "violated": [False, True, False, True, True, True, True, False],
+            "crashed": [False, False, False, True, False, False, False, False],
+            "duration": [9.0, 9.0, 9.0, 2.0, None, 9.0, 1.0, 9.0],
+            "rmse.x": [0.1, 0.2, 0.3, 5.0, None, 0.4, 6.0, 0.9],
+            "worst_margin": [0.5, -0.1, 0.2, -3.0, None, -0.4, None, 0.8],
+            "worst_constraint": ["roll", "roll", "roll", "roll", None, "roll", None, "roll"],
+            "margin.roll": [2.5, -0.5, 1.0, -15.0, None, -2.0, None, 4.0],
+            "satisfied.roll": [True, False, True, False, None, False, False, True],
+            "draw.mass": [1.0, 1.3, 1.1, 1.5, 1.2, 1.4, 1.6, 0.9],
+            "draw.kind": ["a", "b", "a", "b", "b", "a", "b", "a"],
+        }
+    )
+
+
+def test_events_and_verdicts_are_counted(small: pa.Table) -> None:
+    found = estimate(small)
+    assert found["flights"] == 8
+    assert found["verdicts"] == {"satisfied": 3, "violated": 2, "lost": 2, "error": 1, "timeout": 0, "memory": 0}
+    counts = {name: event["count"] for name, event in found["events"].items()}
+    expected = {"failure": 6, "violation": 5, "lost": 2, "crash": 1, "error": 1, "timeout": 0, "memory": 0}
+    assert counts == expected
+    failure = found["events"]["failure"]
+    exact = stats.binomtest(6, 8).proportion_ci(0.95)
+    assert (failure["share"], failure["lower"], failure["upper"]) == pytest.approx((0.75, exact.low, exact.high))
+
+
+def test_metrics_are_those_of_the_flights_that_have_them(small: pa.Table) -> None:
+    found = estimate(small)["metrics"]
+    assert list(found) == ["duration", "rmse.x", "worst_margin"]
+    values = np.array([0.1, 0.2, 0.3, 5.0, 0.4, 6.0, 0.9])
+    assert found["rmse.x"]["flights"] == 7
+    assert found["rmse.x"]["mean"] == pytest.approx(values.mean())
+    assert found["rmse.x"]["sd"] == pytest.approx(values.std(ddof=1))
+    assert found["rmse.x"]["p95"] == pytest.approx(np.percentile(values, 95))
+    assert (found["rmse.x"]["min"], found["rmse.x"]["max"]) == (0.1, 6.0)
+
+
+def test_a_constraint_that_was_not_reached_did_not_hold(small: pa.Table) -> None:
+    roll = estimate(small)["constraints"]["roll"]
+    assert roll["not_satisfied"]["count"] == 5
+    assert (roll["worst_margin"], roll["worst_flight"]) == (-15.0, 3)
+
+
+def test_the_worst_flights_come_first(small: pa.Table) -> None:
+    assert ranking(small).tolist() == [3, 6, 4, 5, 1, 7, 2, 0]
+    assert worst_flight(small) == 3
+    worst = estimate(small)["worst"]
+    assert [flight["flight"] for flight in worst] == [3, 6, 4, 5, 1, 7, 2, 0]
+    assert worst[0]["draws"] == {"mass": 1.5, "kind": "b"}
+    assert worst[1]["worst_margin"] is None
+
+
+def test_equal_flights_come_in_the_order_of_their_numbers(small: pa.Table) -> None:
+    same = pa.concat_tables([small.slice(0, 1)] * 3).set_column(0, "flight", pa.array([12, 5, 30]))
+    assert worst_flight(same) == 5
+
+
+def test_without_margins_the_largest_error_is_the_worst(small: pa.Table) -> None:
+    free = with_column(small, "worst_margin", [None] * 8).take([0, 2, 7])
+    free = with_column(free, "failed", [False] * 3)
+    assert worst_flight(free) == 7
+
+
+def test_no_flight_is_no_worst(small: pa.Table) -> None:
+    with pytest.raises(ParameterError, match=r"campaign\.flights must be at least one"):
+        worst_flight(small.slice(0, 0))
+
+
+def test_a_lost_flight_without_margin_ranks_below_all(small: pa.Table) -> None:
+    found = estimate(small)["parameters"]["mass"]["worst_margin"]
+    mass = [1.0, 1.3, 1.1, 1.5, 1.4, 1.6, 0.9]
+    expected = stats.spearmanr(mass, [0.5, -0.1, 0.2, -3.0, -0.4, -1e9, 0.8]).statistic
+    assert found["rho"] == pytest.approx(expected)
+    assert found["flights"] == 7
+
+
+def test_what_is_drawn_from_names_has_shares(small: pa.Table) -> None:
+    found = estimate(small)["parameters"]["kind"]
+    assert found["kind"] == "name"
+    assert {level: (share["count"], share["flights"]) for level, share in found["levels"].items()} == {
+        "a": (2, 4),
+        "b": (4, 4),
+    }
+
+
+def test_drivers_are_those_that_were_put_in(thousand: pa.Table) -> None:
+    found = estimate(thousand)["parameters"]
+    tested = {name: entry["worst_margin"] for name, entry in found.items() if entry["kind"] == "number"}
+    assert {name for name, one in tested.items() if one["p_holm"] < 0.05} == {"mass", "wind"}
+    assert tested["wind"]["rho"] < tested["mass"]["rho"] < -0.3
+    assert all(one["p"] <= one["p_holm"] for one in tested.values())
+    assert found["wind"]["failed"]["rho"] > 0.1
+    assert set(found["payload"]["levels"]) == {"false", "true"}
+
+
+def test_nothing_goes_with_what_never_happens(make_campaign: MakeCampaign) -> None:
+    found = estimate(make_campaign(40, severity=0.0))
+    assert found["events"]["failure"]["count"] == 0
+    assert all(entry["failed"] is None for entry in found["parameters"].values() if entry["kind"] == "number")
+
+
+def test_convergence_ends_at_the_estimate(thousand: pa.Table) -> None:
+    found = estimate(thousand)
+    curves, failure = found["convergence"], found["events"]["failure"]
+    assert (curves["flights"][0], curves["flights"][-1]) == (1, 1000)
+    assert np.all(np.diff(curves["flights"]) > 0)
+    for key in ("share", "lower", "upper"):
+        assert curves["failure"][key][-1] == pytest.approx(failure[key])
+    i = curves["flights"].index(next(n for n in curves["flights"] if n > 100))
+    n = curves["flights"][i]
+    exact = stats.binomtest(sum(thousand["failed"].to_pylist()[:n]), n).proportion_ci(0.95)
+    assert (curves["failure"]["lower"][i], curves["failure"]["upper"][i]) == pytest.approx((exact.low, exact.high))
+
+
+@pytest.mark.parametrize("flights", [0, 1, 2, 5])
+def test_campaigns_of_few_flights_are_strict_json(make_campaign: MakeCampaign, flights: int) -> None:
+    table = make_campaign(flights)
+    found = estimate(table)
+    assert json.loads(json.dumps(found, allow_nan=False)) == found
+    assert found["flights"] == flights
+    assert len(found["worst"]) == flights
+
+
+def test_the_summary_of_a_thousand_is_strict_json(thousand: pa.Table) -> None:
+    found = estimate(thousand)
+    assert json.loads(json.dumps(found, allow_nan=False)) == found
+    assert len(found["worst"]) == 10
+    assert found["metrics"]["rmse.x"]["unit"] == "m"
+    assert not [name for name in found["metrics"] if name.startswith(("draw.", "margin.", "time_violated.", "seed"))]

@@ -1,0 +1,160 @@
+"""Intervals and tests against closed forms, published numbers, other routes through scipy, and simulation."""
+
+import itertools
+import math
+
+import numpy as np
+import pytest
+from scipy import optimize, stats
+
+from scenarios.campaign.statistics.inference import (
+    holm,
+    lower_bound,
+    lower_bounds,
+    mcnemar,
+    paired_difference,
+    paired_shares,
+    proportion,
+    upper_bound,
+    upper_bounds,
+)
+
+
+@pytest.mark.parametrize(("count", "trials"), [(0, 1), (1, 1), (0, 20), (3, 20), (37, 1000), (999, 1000), (10, 10)])
+def test_the_interval_is_scipys(count: int, trials: int) -> None:
+    found = proportion(count, trials)
+    exact = stats.binomtest(count, trials).proportion_ci(0.95, method="exact")
+    assert (found.lower, found.upper) == pytest.approx((exact.low, exact.high), abs=1e-9)
+    one_sided = stats.binomtest(count, trials, alternative="less").proportion_ci(0.95, method="exact")
+    assert found.upper_one_sided == pytest.approx(one_sided.high, abs=1e-9)
+    other = stats.binomtest(count, trials, alternative="greater").proportion_ci(0.9, method="exact")
+    assert lower_bound(count, trials, 0.9) == pytest.approx(other.low, abs=1e-9)
+    assert found.share == count / trials
+
+
+def test_bounds_in_closed_form() -> None:
+    assert upper_bound(0, 299, 0.95) == pytest.approx(1.0 - 0.05 ** (1.0 / 299.0), rel=1e-12)
+    assert lower_bound(50, 50, 0.99) == pytest.approx(0.01 ** (1.0 / 50.0), rel=1e-12)
+    assert (upper_bound(50, 50), lower_bound(0, 50)) == (1.0, 0.0)
+    nothing = proportion(0, 0)
+    assert (nothing.share, nothing.lower, nothing.upper, nothing.upper_one_sided) == (None, 0.0, 1.0, 1.0)
+
+
+@pytest.mark.parametrize("p", [0.002, 0.03, 0.2, 0.5, 0.97])
+@pytest.mark.parametrize("n", [5, 40, 400])
+def test_bounds_cover_as_often_as_they_say(n: int, p: float) -> None:
+    """The coverage, summed over every possible count."""
+    counts = np.arange(n + 1.0)
+    chance = stats.binom.pmf(counts, n, p)
+    trials = np.full(n + 1, float(n))
+    for confidence in (0.9, 0.95, 0.99):
+        assert chance[upper_bounds(counts, trials, confidence) >= p].sum() >= confidence - 1e-12
+        assert chance[lower_bounds(counts, trials, confidence) <= p].sum() >= confidence - 1e-12
+
+
+def test_intervals_cover_simulated_campaigns() -> None:
+    rng = np.random.default_rng(1)
+    found = [proportion(int(count), 300) for count in rng.binomial(300, 0.04, 2000)]
+    covered = np.mean([one.lower <= 0.04 <= one.upper for one in found])
+    assert 0.95 <= covered < 0.985
+
+
+def test_holm_is_holms() -> None:
+    assert holm([0.01, 0.04, 0.03, 0.005]) == pytest.approx([0.03, 0.06, 0.06, 0.02])  # p.adjust of R
+    assert holm([0.5, 0.6]) == [1.0, 1.0]
+    assert holm([]) == []
+
+
+def test_holm_keeps_the_chance_of_a_false_find() -> None:
+    p = np.random.default_rng(3).uniform(size=(4000, 9))
+    assert np.mean([min(holm(list(row))) < 0.05 for row in p]) == pytest.approx(0.05, abs=0.012)
+
+
+def test_mcnemar_in_closed_form() -> None:
+    assert mcnemar(0, 0) == 1.0
+    assert mcnemar(0, 6) == pytest.approx(2.0 / 2**6)
+    assert mcnemar(5, 15) == pytest.approx(2.0 * sum(math.comb(20, k) for k in range(6)) / 2**20)
+    assert mcnemar(15, 5) == mcnemar(5, 15)
+
+
+def test_paired_shares_as_published() -> None:
+    """Airway hyper-responsiveness, Fagerland, Lydersen and Laake, BMC Medical Research Methodology 14:49 (2014)."""
+    assert paired_shares(7, 1, 21) == pytest.approx((-0.517, -0.026), abs=5e-4)
+
+
+@pytest.mark.parametrize(("only_a", "only_b", "pairs"), [(7, 1, 21), (1, 0, 44), (0, 0, 30), (40, 20, 160), (5, 0, 5)])
+def test_paired_shares_invert_a_score_test(only_a: int, only_b: int, pairs: int) -> None:
+    """The ends, from a likelihood that is maximised numerically rather than in closed form."""
+
+    def statistic(difference: float) -> float:
+        low, high = max(0.0, -difference) + 1e-12, (1.0 - difference) / 2.0 - 1e-12
+
+        def loss(share: float) -> float:
+            rest = 1.0 - 2.0 * share - difference
+            counts = ((only_a, share), (only_b, share + difference), (pairs - only_a - only_b, rest))
+            return -sum(count * math.log(p) for count, p in counts if count)
+
+        share = float(optimize.minimize_scalar(loss, bounds=(low, high), method="bounded", options={"xatol": 1e-13}).x)
+        variance = pairs * (2.0 * share + difference * (1.0 - difference))
+        return (only_b - only_a - pairs * difference) / math.sqrt(variance)
+
+    lower, upper = paired_shares(only_a, only_b, pairs)
+    assert -1.0 <= lower <= (only_b - only_a) / pairs <= upper <= 1.0
+    z = stats.norm.ppf(0.975)
+    if lower > -1.0 + 1e-9:
+        assert statistic(lower) == pytest.approx(z, abs=1e-3)
+    if upper < 1.0 - 1e-9:
+        assert statistic(upper) == pytest.approx(-z, abs=1e-3)
+    flipped = paired_shares(only_b, only_a, pairs)
+    assert flipped == pytest.approx((-upper, -lower), abs=1e-9)
+
+
+def test_paired_shares_of_no_discordant_pair_in_closed_form() -> None:
+    end = stats.norm.ppf(0.975) ** 2
+    assert paired_shares(0, 0, 30) == pytest.approx((-end / (30 + end), end / (30 + end)), abs=1e-9)
+
+
+def test_paired_shares_without_a_difference_is_mcnemars_test() -> None:
+    """Zero is in the interval where (b - c)^2 / (b + c) is below z^2, and only there."""
+    for only_a, only_b in itertools.product(range(0, 30, 3), range(1, 30, 4)):
+        lower, upper = paired_shares(only_a, only_b, 200)
+        inside = (only_a - only_b) ** 2 / (only_a + only_b) < stats.norm.ppf(0.975) ** 2
+        assert (lower <= 0.0 <= upper) is bool(inside), (only_a, only_b)
+
+
+def test_paired_shares_cover_simulated_campaigns() -> None:
+    rng = np.random.default_rng(4)
+    cells = rng.multinomial(200, (0.06, 0.02, 0.92), 1500)
+    found = [paired_shares(int(only_a), int(only_b), 200) for only_a, only_b, _ in cells]
+    assert np.mean([lower <= -0.04 <= upper for lower, upper in found]) == pytest.approx(0.95, abs=0.02)
+
+
+def test_paired_difference_is_scipys() -> None:
+    rng = np.random.default_rng(5)
+    a = rng.normal(size=60)
+    b = a + 0.3 + 0.5 * rng.normal(size=60)
+    found = paired_difference(a, b)
+    interval = stats.ttest_rel(b, a).confidence_interval(0.95)
+    assert (found.mean, found.lower, found.upper) == pytest.approx((np.mean(b - a), interval.low, interval.high))
+    assert found.median == np.median(b - a)
+    ordered = np.sort(b - a)
+    rank = int(stats.binom.ppf(0.025, 60, 0.5))  # the sign test, inverted
+    assert (found.median_lower, found.median_upper) == (ordered[rank - 1], ordered[-rank])
+
+
+def test_paired_difference_covers() -> None:
+    rng = np.random.default_rng(6)
+    found = [paired_difference(np.zeros(40), rng.exponential(size=40)) for _ in range(600)]
+    medians = [one.median_lower <= math.log(2.0) <= one.median_upper for one in found]
+    means = [one.lower <= 1.0 <= one.upper for one in found]
+    assert np.mean(medians) >= 0.94
+    assert 0.89 < np.mean(means) < 0.97  # of a skewed law, the t interval is a little short
+
+
+def test_paired_difference_of_few() -> None:
+    none = paired_difference(np.empty(0), np.empty(0))
+    assert (none.pairs, none.mean, none.lower, none.median) == (0, None, None, None)
+    one = paired_difference(np.array([1.0]), np.array([3.0]))
+    assert (one.mean, one.lower, one.median, one.median_lower) == (2.0, None, 2.0, None)
+    same = paired_difference(np.ones(30), np.ones(30))
+    assert (same.mean, same.lower, same.upper, same.median_lower) == (0.0, 0.0, 0.0, 0.0)

@@ -1,0 +1,190 @@
+"""What a vehicle's numbers amount to, against closed forms and brute force, and what `quadsim vehicle` prints."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import imageio.v3 as iio
+import numpy as np
+import pytest
+
+from mpc.model import continuous_model, hover_model
+from quadsim.assets import vehicle_names, vehicle_path
+from quadsim.errors import RenderingUnavailableError
+from quadsim.report.film.video import render_portrait, rendering_backend
+from quadsim.state import INDEX
+from quadsim.vehicle import N_ROTORS, VEHICLE_UNITS, Vehicle, load_vehicle
+from scenarios.cli import main
+from scenarios.commands import EXIT_DONE
+from scenarios.commands.vehicle_sheet import integrator_chains, make_sheet, torque_ranges
+from scenarios.loading import load_scenario
+from scenarios.run import fly_scenario
+
+VEHICLES = [load_vehicle(vehicle_path(name)) for name in vehicle_names()]
+CRAZYFLIE, HUMMINGBIRD, LOPES = VEHICLES
+SKEWED = replace(HUMMINGBIRD, rotor_azimuths=(10.0, 100.0, -170.0, -80.0), speed_min=250.0)
+EVERY = pytest.mark.parametrize("vehicle", VEHICLES, ids=lambda vehicle: vehicle.name)
+
+
+def brute_force(vehicle: Vehicle, row: int) -> tuple[float, float]:
+    """Extreme torques over the vertices of {thrust = weight} in the box of squared speeds: all but one at a bound."""
+    thrust = vehicle.allocation[0]
+    low, high = vehicle.speed_min**2, vehicle.speed_max**2
+    torques = []
+    for free in range(N_ROTORS):
+        others = [i for i in range(N_ROTORS) if i != free]
+        for corner in itertools.product((low, high), repeat=N_ROTORS - 1):
+            v = np.zeros(N_ROTORS)
+            v[others] = corner
+            v[free] = (vehicle.mass * vehicle.gravity - thrust[others] @ corner) / thrust[free]
+            if low - 1e-6 <= v[free] <= high + 1e-6:
+                torques.append(float(vehicle.allocation[row] @ v))
+    return min(torques), max(torques)
+
+
+@pytest.mark.parametrize("vehicle", [*VEHICLES, SKEWED], ids=[*vehicle_names(), "skewed"])
+def test_torque_authority_is_that_of_the_best_vertex(vehicle: Vehicle) -> None:
+    for row, torque in enumerate(torque_ranges(vehicle), start=1):
+        low, high = brute_force(vehicle, row)
+        assert (torque.lowest, torque.highest) == pytest.approx((low, high), rel=1e-9)
+        inertia = vehicle.inertia[row - 1]
+        assert (torque.lowest_acceleration, torque.highest_acceleration) == pytest.approx(
+            (low / inertia, high / inertia)
+        )
+        assert low - 1e-12 <= torque.lowest_pure < 0.0 < torque.highest_pure <= high + 1e-12
+
+
+@EVERY
+def test_pure_torques_have_their_closed_forms(vehicle: Vehicle) -> None:
+    """Without yaw torque each diagonal pair lifts half the weight; in yaw one pair lifts as much as it can."""
+    weight, top = vehicle.mass * vehicle.gravity, vehicle.thrust_coefficient * vehicle.speed_max**2
+    swing = min(0.5 * weight, 2.0 * top - 0.5 * weight)  # between the two rotors of a pair
+    pairs = 2.0 if abs(vehicle.rotor_azimuths[0]) == 45.0 else 1.0
+    lean = math.cos(math.radians(45.0)) if pairs == 2.0 else 1.0
+    x, y, z = torque_ranges(vehicle)
+    assert x.highest_pure == y.highest_pure == pytest.approx(pairs * lean * vehicle.arm_length * swing)
+    assert z.highest_pure == pytest.approx(vehicle.drag_to_thrust * min(weight, 4.0 * top - weight))
+    assert z.lowest_pure == pytest.approx(-z.highest_pure)
+
+
+@EVERY
+def test_hover_figures_have_their_closed_forms(vehicle: Vehicle) -> None:
+    sheet = make_sheet(vehicle)
+    b, weight = vehicle.thrust_coefficient, vehicle.mass * vehicle.gravity
+    lift = 4.0 * b * vehicle.speed_max**2
+    assert sheet.weight == weight
+    assert 4.0 * b * sheet.hover_speed**2 == pytest.approx(weight)
+    assert sheet.hover_speed_rpm == pytest.approx(sheet.hover_speed / (2.0 * math.pi) * 60.0)
+    assert sheet.thrust_to_weight == pytest.approx(lift / weight)
+    assert sheet.climb_acceleration == pytest.approx((lift - weight) / vehicle.mass)
+    assert lift * math.cos(math.radians(sheet.steady_tilt)) == pytest.approx(weight)
+    assert sheet.speed_range_used == pytest.approx(sheet.hover_speed / vehicle.speed_max)
+    step = 1e-4 * sheet.hover_speed
+    rise = b * ((sheet.hover_speed + step) ** 2 - (sheet.hover_speed - step) ** 2) / (2.0 * step)
+    assert sheet.thrust_slope == pytest.approx(rise)
+    assert sheet.input_slopes["vz"] == pytest.approx(rise / vehicle.mass)
+    assert sheet.input_slopes["yaw_rate"] == pytest.approx(rise * vehicle.drag_to_thrust / vehicle.inertia[2])
+
+
+def test_a_vehicle_that_just_hovers_can_neither_tilt_nor_climb() -> None:
+    sheet = make_sheet(replace(LOPES, speed_max=LOPES.hover_speed))
+    assert (sheet.steady_tilt, sheet.climb_acceleration) == (0.0, 0.0)
+    assert [torque.highest for torque in sheet.torques] == pytest.approx([0.0] * 3, abs=1e-9)
+
+
+@EVERY
+def test_the_linear_model_is_four_chains_of_integrators(vehicle: Vehicle) -> None:
+    sheet = make_sheet(vehicle)
+    assert sheet.integrator_chains == (4, 4, 2, 2)  # x over pitch, y over roll, z, yaw
+    assert sheet.continuous_poles == (0.0,) * 12
+    assert sheet.discrete_poles == (1.0,) * 12
+    A_c, _ = continuous_model(vehicle)
+    assert np.all(np.linalg.matrix_power(A_c, 4) == 0.0)
+    assert A_c[INDEX["vx"], INDEX["pitch"]] == vehicle.gravity
+    shifted = hover_model(vehicle, sheet.period).A - np.eye(12)  # nilpotent: every pole of A is 1
+    assert np.abs(np.linalg.matrix_power(shifted, 4)).max() < 1e-15
+
+
+def test_chains_are_told_apart_by_their_lengths() -> None:
+    chain = np.eye(6, k=1)
+    chain[2, 3] = 0.0
+    assert integrator_chains(chain) == (3, 3)
+    chain[1, 2] = 0.0
+    assert integrator_chains(chain) == (3, 2, 1)
+
+
+def test_rotors_that_lag_add_their_poles() -> None:
+    sheet = make_sheet(HUMMINGBIRD)
+    assert sheet.lag_poles == {"rotor_rise": pytest.approx(-80.0), "rotor_fall": pytest.approx(-40.0)}
+    discrete = {"rotor_rise": pytest.approx(math.exp(-4.0)), "rotor_fall": pytest.approx(math.exp(-2.0))}
+    assert sheet.discrete_lag_poles == discrete
+    assert make_sheet(LOPES).lag_poles == {}
+
+
+@pytest.mark.parametrize("name", vehicle_names())
+def test_the_command_prints_figures_and_sources(name: str, capsys: pytest.CaptureFixture[str]) -> None:
+    vehicle = load_vehicle(vehicle_path(name))
+    assert main(["vehicle", name, "--json"]) == EXIT_DONE
+    sheet = json.loads(capsys.readouterr().out)
+    assert (sheet["name"], sheet["description"]) == (vehicle.name, vehicle.description)
+    assert sheet["derived"]["hover_speed"] == vehicle.hover_speed
+    given = [key for key in VEHICLE_UNITS if getattr(vehicle, key) is not None]
+    assert list(sheet["parameters"]) == given
+    assert all(entry["unit"] == VEHICLE_UNITS[key] and entry["source"] for key, entry in sheet["parameters"].items())
+
+    assert main(["vehicle", str(vehicle_path(name))]) == EXIT_DONE
+    printed = " ".join(capsys.readouterr().out.split())
+    for text in (vehicle.description, f"{vehicle.hover_speed:.4g}", "thrust to weight", "chains of 4, 4, 2, 2", *given):
+        assert text in printed
+    assert ("rotors that rise" in printed) == (vehicle.rotor_rise is not None)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["lopez2011"], "no vehicle named 'lopez2011'; did you mean 'lopes2011'?"),
+        (["gone.toml"], "gone.toml: no such vehicle file"),
+        (["lopes2011", "--out", "drawing.jpg"], "--out must be a file ending in .png; got 'drawing.jpg'"),
+    ],
+)
+def test_wrong_input_is_named(arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["vehicle", *arguments]) == 2
+    said = capsys.readouterr()
+    assert said.err.startswith(f"quadsim: {message}")
+    assert said.out == ""
+
+
+def test_the_portrait_shows_the_vehicle(tmp_path: Path) -> None:
+    try:
+        rendering_backend()
+    except RenderingUnavailableError as error:
+        pytest.skip(str(error))
+    render_portrait(CRAZYFLIE, tmp_path / "cf.png", width=320, height=180)
+    picture = iio.imread(tmp_path / "cf.png").astype(int)
+    assert picture.shape[:2] == (180, 320)
+    orange = (picture[..., 0] - picture[..., 2] > 80).nonzero()  # what points forward; the rest is grey and blue
+    assert np.ptp(orange[1]) > 100  # both front arms, across a third of the picture
+    assert [path.name for path in tmp_path.iterdir()] == ["cf.png"]
+
+
+FLOWN = {
+    "lopes2011": [],
+    "hummingbird": ["input_weights.speed=9e-4", "input_bounds.speed=[0, 838]", "input_bounds.slew=[-80, 80]"],
+    "crazyflie2": ["input_weights.speed=1e-4", "input_bounds.speed=[0, 2500]", "input_bounds.slew=[-250, 250]"],
+}
+
+
+@pytest.mark.parametrize("name", vehicle_names())
+def test_a_shipped_vehicle_hovers(name: str) -> None:
+    """From a tilted, turned start back to level at the reference within two seconds."""
+    settings = [f"vehicle.file={name}", "duration=2.0", "initial.euler=[2.0, -2.0, 3.0]", "controller.horizon=25"]
+    flight = fly_scenario(load_scenario("hover", [*settings, *(f"controller.{line}" for line in FLOWN[name])]))
+    assert flight.log.status == "completed"
+    end = flight.log.plant.state[-1]
+    assert np.abs(end[[INDEX[axis] for axis in "xyz"]] - [0.0, 0.0, 1.0]).max() < 0.02
+    assert np.degrees(np.abs(end[[INDEX[angle] for angle in ("roll", "pitch", "yaw")]])).max() < 0.6
+    assert np.abs(flight.log.plant.speeds - flight.vehicle.hover_speed).max() < 0.2 * flight.vehicle.hover_speed

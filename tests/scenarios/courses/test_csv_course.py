@@ -1,0 +1,146 @@
+"""Courses from CSV files: what is read, and what is said of every file that is wrong."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from quadsim.errors import FileError
+from scenarios.courses.csv_course import Table, read_table, through_rows
+
+ROWS = "0,0,0,1,0\n1,2,0,1,0.5\n3,2,4,2,1\n"
+
+
+def write(tmp_path: Path, text: str) -> Path:
+    path = tmp_path / "course.csv"
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def test_a_table_is_read_with_its_hash(tmp_path: Path) -> None:
+    path = write(tmp_path, f"t,x,y,z,yaw\n{ROWS}\n\n")
+    table = read_table(path)
+    np.testing.assert_array_equal(table.t, [0.0, 1.0, 3.0])
+    np.testing.assert_array_equal(table.poses, [[0, 0, 1, 0], [2, 0, 1, 0.5], [2, 4, 2, 1]])
+    assert table.velocities is None
+    assert table.sha256 == hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+def test_what_spreadsheets_write_is_read_as_well(tmp_path: Path) -> None:
+    """A byte order mark, carriage returns, quotes and blanks around numbers."""
+    path = tmp_path / "course.csv"
+    path.write_bytes(b'\xef\xbb\xbft,x,y,z,yaw\r\n0,"1.5", 2 ,3e0,-1\r\n1,0,0,0,0\r\n')
+    np.testing.assert_array_equal(read_table(path).poses[0], [1.5, 2.0, 3.0, -1.0])
+
+
+def test_it_is_known_to_how_many_decimals_a_column_is_rounded(tmp_path: Path) -> None:
+    """Whole numbers are meant as they stand, and of doubles written out nobody can tell."""
+    table = read_table(write(tmp_path, "t,x,y,z,yaw\n0,0.1234,1.5,3, 1e-3\n1,0.2,-2,4,0.30000000000000004\n"))
+    assert table.resolution == (1e-4, 0.0, 0.0, 0.0)
+    table = read_table(write(tmp_path, "t,x,y,z,yaw\n0,12.5e-3,1.25,0.123456789,0\n1,0,-2,4,0\n"))
+    assert table.resolution == (1e-4, 1e-2, 0.0, 0.0)
+    assert through_rows(table).resolution == table.resolution
+
+
+def test_without_velocities_lines_are_straight(tmp_path: Path) -> None:
+    path = through_rows(read_table(write(tmp_path, f"t,x,y,z,yaw\n{ROWS}")))
+    poses = path.pose(np.array([0.0, 0.5, 1.0, 2.0, 3.0]))
+    expected = [[0, 0, 1, 0], [1, 0, 1, 0.25], [2, 0, 1, 0.5], [2, 2, 1.5, 0.75], [2, 4, 2, 1]]
+    np.testing.assert_allclose(poses, expected)
+    assert (path.duration, path.kinks) == (3.0, (0.0, 1.0, 3.0))
+
+
+def test_with_velocities_a_cubic_is_met_exactly() -> None:
+    t = np.array([2.0, 2.5, 4.0, 4.2])
+    cubic = np.array([[1.0, -2.0, 0.5], [0.3, 1.0, -1.0], [0.2, 0.0, 0.4], [-0.1, 0.05, 0.02]])
+
+    def at(times: np.ndarray, order: int = 0) -> np.ndarray:
+        return np.stack([np.polynomial.Polynomial(column).deriv(order)(times) for column in cubic.T], axis=1)
+
+    table = Table(t=t, poses=np.column_stack([at(t), t]), velocities=at(t, 1), sha256="")
+    path, since = through_rows(table), np.linspace(0.0, 2.2, 50)
+    np.testing.assert_allclose(path.pose(since)[:, :3], at(2.0 + since), atol=1e-12)
+    np.testing.assert_allclose(path.pose(since)[:, 3], 2.0 + since)
+
+
+def test_with_velocities_the_velocity_is_continuous_and_the_one_given() -> None:
+    rng, t, h = np.random.default_rng(3), np.array([0.0, 0.4, 1.0, 2.0]), 1e-6
+    table = Table(t=t, poses=rng.normal(size=(4, 4)), velocities=rng.normal(size=(4, 3)), sha256="")
+    path = through_rows(table)
+    before = (path.pose(t[1:])[:, :3] - path.pose(t[1:] - h)[:, :3]) / h
+    after = (path.pose(t[:-1] + h)[:, :3] - path.pose(t[:-1])[:, :3]) / h
+    assert table.velocities is not None
+    np.testing.assert_allclose(before, table.velocities[1:], atol=1e-4)
+    np.testing.assert_allclose(after, table.velocities[:-1], atol=1e-4)
+
+
+def test_yaw_that_wraps_is_unwrapped(tmp_path: Path) -> None:
+    path = write(tmp_path, "t,x,y,z,yaw\n0,0,0,0,3.1\n1,0,0,0,-3.1\n2,0,0,0,-2.9\n")
+    np.testing.assert_allclose(read_table(path).poses[:, 3], [3.1, math.tau - 3.1, math.tau - 2.9])
+
+
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(data=st.data())
+def test_any_table_comes_back_from_its_text(tmp_path: Path, data: st.DataObject) -> None:
+    t = sorted(data.draw(st.sets(st.floats(0.0, 1e6), min_size=2, max_size=6)))
+    number = st.floats(-1e6, 1e6)
+    rows = [[time, *data.draw(st.tuples(*[number] * 3)), 0.1, *data.draw(st.tuples(*[number] * 3))] for time in t]
+    text = "t,x,y,z,yaw,vx,vy,vz\n" + "".join(",".join(map(repr, row)) + "\n" for row in rows)
+    table = read_table(write(tmp_path, text))
+    assert table.velocities is not None
+    np.testing.assert_array_equal(np.column_stack([table.t, table.poses, table.velocities]), rows)
+
+
+HEADER_RULE = "row 1: the header must be t,x,y,z,yaw or t,x,y,z,yaw,vx,vy,vz"
+WRONG = {
+    "": f"{HEADER_RULE}; got none",
+    "t,x,y,z\n0,0,0,0\n1,0,0,0\n": f"{HEADER_RULE}; got 4 columns, t,x,y,z of them",
+    "0,0,0,0,0\n1,0,0,0,0\n": f"{HEADER_RULE}; got 5 columns, none of them",
+    "root:x:0:0:root\nsecret,of,an,other,one\n": f"{HEADER_RULE}; got 1 columns, none of them",
+    "t,x,y,z,yaw\n": "must have 2 or more rows below its header; got 0",
+    "t,x,y,z,yaw\n0,0,0,0,0\n": "must have 2 or more rows below its header; got 1",
+    "t,x,y,z,yaw\n0,0,0,0,0\n1,0,0,0\n": "row 3: must have 5 cells (t,x,y,z,yaw); got 4",
+    "t,x,y,z,yaw\n0,0,0,0,0\n\n1,0,0,0,0\n": "row 3: must have 5 cells (t,x,y,z,yaw); got 0",
+    "t,x,y,z,yaw\n0,0,0,0,0\n1,0,,0,0\n": "row 3, column y: is empty",
+    "t,x,y,z,yaw\n0,0,0, ,0\n1,0,0,0,0\n": "row 2, column z: is empty",
+    "t,x,y,z,yaw\n0,0,0,0,0\n1,high,0,0,0\n": "row 3, column x: must be a number; got 'high'",
+    "t,x,y,z,yaw\n0,0,0,0,nan\n1,0,0,0,0\n": "row 2, column yaw: must be a finite number within +-1e+06; got 'nan'",
+    "t,x,y,z,yaw\n0,0,0,0,0\ninf,0,0,0,0\n": "row 3, column t: must be a finite number within +-1e+06; got 'inf'",
+    "t,x,y,z,yaw\n0,0,2e6,0,0\n1,0,0,0,0\n": "row 2, column y: must be a finite number within +-1e+06; got '2e6'",
+    "t,x,y,z,yaw\n-1,0,0,0,0\n1,0,0,0,0\n": "row 2, column t: must be >= 0; got -1",
+    "t,x,y,z,yaw\n0,0,0,0,0\n2,0,0,0,0\n1,0,0,0,0\n": (
+        "row 4, column t: must be above that of the row before = 2; got 1"
+    ),
+    "t,x,y,z,yaw\n0,0,0,0,0\n1,0,0,0,0\n1,0,0,0,0\n": (
+        "row 4, column t: must be above that of the row before = 1; got 1"
+    ),
+    "t,x,y,z,yaw,vx,vy,vz\n0,0,0,0,0,0,0,0\n1,0,0,0,0,0,fast,0\n": "row 3, column vy: must be a number; got 'fast'",
+}
+
+
+@pytest.mark.parametrize(("text", "message"), WRONG.items())
+def test_a_wrong_file_is_named_with_its_row_and_column(tmp_path: Path, text: str, message: str) -> None:
+    path = write(tmp_path, text)
+    with pytest.raises(FileError) as caught:
+        read_table(path)
+    assert str(caught.value) == f"{path}: {message}"
+
+
+@pytest.mark.parametrize("content", [b"\xff\xfet,x", b't,x,y,z,yaw\n"0,0,0,0,0\n'])
+def test_a_file_that_is_no_text_table_is_refused(tmp_path: Path, content: bytes) -> None:
+    path = tmp_path / "course.csv"
+    path.write_bytes(content)
+    with pytest.raises(FileError, match=r"course\.csv: cannot be read \("):
+        read_table(path)
+
+
+def test_a_missing_file_and_a_directory_are_named(tmp_path: Path) -> None:
+    for path in (tmp_path / "gone.csv", tmp_path):
+        with pytest.raises(FileError, match=r"cannot be read \("):
+            read_table(path)

@@ -1,0 +1,149 @@
+"""A scenario's course against its vehicle and its controller, before it is flown."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from support import scenario_table
+
+from quadsim.flight.feasibility import Feasibility
+from quadsim.state import Array
+from quadsim.vehicle import Vehicle
+from scenarios.courses.feasibility_check import report
+from scenarios.courses.make import build_course, build_reference
+from scenarios.loading import load_scenario, parse_scenario
+from scenarios.parts.vehicle import build_vehicle
+from scenarios.schema.scenario import Scenario
+
+
+def scenario(reference: dict[str, Any], *, duration: float = 20.0, **fields: Any) -> Scenario:
+    return parse_scenario(scenario_table() | {"duration": duration, "reference": reference, "constraints": []} | fields)
+
+
+def found(reference: dict[str, Any], vehicle: Vehicle, **fields: Any) -> Feasibility:
+    return report(scenario(reference, **fields), vehicle)
+
+
+def test_the_papers_course_steps_and_what_its_filter_leaves_is_beyond_the_bound() -> None:
+    """After a step of d m the filter leaves d (3 / tau_r)^2 exp(-3 t / tau_r): 20 deg for 10 m in one axis."""
+    made = load_scenario("paper-constrained")
+    finding = report(made, build_vehicle(made))
+    assert finding.jumps == (0.0, 10.0, 20.0, 40.0)
+    assert finding.tilt == pytest.approx(20.0, abs=0.1)
+    assert [problem.split()[0] for problem in finding.problems] == ["roll", "roll", "pitch", "pitch"]
+    assert finding.sentence.startswith(
+        "The course steps (at t = 0, 10, 20, 40 s); what is left asks for up to 19.96 deg of tilt (bound 5 deg), "
+    )
+
+
+def test_hover_asks_for_nothing() -> None:
+    made = load_scenario("hover")
+    finding = report(made, build_vehicle(made))
+    assert (finding.tilt, finding.jumps, finding.problems) == (0.0, (), ())
+
+
+def test_a_circle_asks_for_the_tilt_of_the_closed_form(vehicle: Vehicle) -> None:
+    circle = {"type": "circle", "radius": 3.0, "speed": 1.0, "turns": 2.0, "ramp": 10.0}
+    finding = found(circle, vehicle)
+    assert finding.tilt == pytest.approx(math.degrees(math.atan(1.0 / (3.0 * vehicle.gravity))), rel=1e-3)
+    assert finding.velocity == pytest.approx(1.0, rel=1e-3)
+    assert finding.problems == ()
+    assert "roll up to" in found(circle | {"speed": 3.0, "turns": 9.0}, vehicle).problems[0]
+
+
+def test_a_filter_lowers_what_is_asked_for(vehicle: Vehicle) -> None:
+    legs = {"type": "waypoints", "speed": 0.5, "points": [{"position": [3.0, 0.0, 0.0]}]}
+    corners = found(legs, vehicle)
+    assert corners.tilt == pytest.approx(math.degrees(math.atan(0.5 / 0.05 / vehicle.gravity)), rel=1e-9)
+    assert corners.rotor_max < 250.0  # no torque is taken of a corner
+    smoothed = math.degrees(math.atan(0.5 * 3.0 / 3.0 / vehicle.gravity))  # v (3 / tau_r), just after the corner
+    assert found(legs | {"response_time": 3.0}, vehicle).tilt == pytest.approx(smoothed, rel=0.03)
+
+
+def test_where_it_begins_elsewhere_the_course_jumps(vehicle: Vehicle) -> None:
+    circle = {"type": "circle", "radius": 3.0, "speed": 1.0, "start": 2.0, "centre": [5.0, 5.0]}
+    finding = found(circle, vehicle)
+    assert finding.jumps == (2.0,)
+    assert finding.tilt < 5.0
+    assert found(circle, vehicle, duration=1.0).jumps == ()  # a start after the flight's end
+
+
+def test_a_vehicle_that_is_turned_away_from_steps_makes_a_jump_at_the_start(vehicle: Vehicle) -> None:
+    finding = found({}, vehicle, initial={"position": [0.0, 0.0, 1.0], "euler": [0.0, 0.0, 20.0]})
+    assert finding.jumps == (0.0,)
+    assert finding.tilt == 0.0
+
+
+def test_an_entry_at_full_speed_is_seen(vehicle: Vehicle) -> None:
+    """Before the flight the vehicle is at rest: without a ramp the first period has to gain the whole speed."""
+    circle = {"type": "circle", "radius": 3.0, "speed": 1.0}
+    assert found(circle | {"ramp": 0.0}, vehicle).tilt > 60.0 > 5.0 > found(circle, vehicle).tilt
+
+
+def test_a_dense_table_of_a_smooth_course_asks_for_what_the_course_does(tmp_path: Path, vehicle: Vehicle) -> None:
+    """Rows as close as the control period are samples, not corners: their torques count."""
+    eight = scenario({"type": "figure_eight", "length": 6.0, "period": 6.0, "turns": 2.0})
+    smooth = report(eight, vehicle)
+    t = 0.05 * np.arange(401)
+    rows = np.column_stack([t, build_course(eight).sample(t)])
+    path = tmp_path / "eight.csv"
+    path.write_text("t,x,y,z,yaw\n" + "".join(",".join(map(repr, row.tolist())) + "\n" for row in rows))
+    table = {"type": "csv", "file": str(path)}
+    np.testing.assert_allclose(build_reference(scenario(table), 401), build_reference(eight, 401), atol=1e-12)
+    dense = report(scenario(table), vehicle)
+    assert dense.tilt == pytest.approx(smooth.tilt, rel=1e-6)
+    assert dense.rotor_max == pytest.approx(smooth.rotor_max, rel=1e-6)
+    path.write_text("t,x,y,z,yaw\n" + "".join(",".join(map(repr, row.tolist())) + "\n" for row in rows[::4]))
+    sparse = report(scenario(table), vehicle)
+    assert sparse.tilt > 1.5 * smooth.tilt  # every row a corner
+
+
+def rounded(path: Path, poses: Array, decimals: int) -> dict[str, str]:
+    """The reference of a table with a row per control period."""
+    lines = (",".join(f"{value:.{decimals}f}" for value in (0.05 * k, *row)) for k, row in enumerate(poses))
+    path.write_text("t,x,y,z,yaw\n" + "\n".join(lines) + "\n")
+    return {"type": "csv", "file": str(path)}
+
+
+@pytest.mark.parametrize("decimals", [3, 4, 6])
+def test_a_rounded_table_of_a_smooth_course_asks_for_what_the_course_does(
+    tmp_path: Path, vehicle: Vehicle, decimals: int
+) -> None:
+    """Fourth differences of 0.1 mm of rounding are steps of tens of rad/s: no controller is asked for those."""
+    eight = scenario({"type": "figure_eight", "length": 6.0, "period": 12.0, "turns": 1.5, "ramp": 4.0})
+    smooth = report(eight, vehicle)
+    found = report(scenario(rounded(tmp_path / "eight.csv", poses_of(eight), decimals)), vehicle)
+    assert not any("change of rotor speed" in problem for problem in found.problems)
+    assert found.tilt == pytest.approx(smooth.tilt, abs=0.05)
+    assert (found.rotor_min, found.rotor_max) == pytest.approx((smooth.rotor_min, smooth.rotor_max), abs=0.2)
+
+
+def test_a_real_corner_in_a_rounded_table_is_still_seen(tmp_path: Path, vehicle: Vehicle) -> None:
+    """From rest to 1 m/s within a period, 20 m/s^2; the course is what it was to the last decimal."""
+    poses = np.zeros((420, 4))
+    poses[:, 0] = np.maximum(0.05 * (np.arange(420) - 200), 0.0)
+    found = report(scenario(rounded(tmp_path / "corner.csv", poses, 4)), vehicle)
+    assert found.acceleration == pytest.approx(20.0, rel=0.02)
+    assert any("change of rotor speed" in problem for problem in found.problems)
+
+
+def poses_of(made: Scenario) -> Array:
+    """(420, 4) samples of a course, one per control period."""
+    return build_course(made).sample(0.05 * np.arange(420))
+
+
+def test_bounds_are_those_of_the_controller(vehicle: Vehicle) -> None:
+    circle = {"type": "circle", "radius": 3.0, "speed": 1.0, "turns": 2.0}
+    table = scenario_table()["controller"]
+    narrow = table | {"output_bounds": {"vx": [-0.5, 2.0], "yaw_rate": [-1.0, 1.0], "pitch": [-1.5, 1.5]}}
+    problems = found(circle, vehicle, controller=narrow).problems
+    assert [problem.split()[0] for problem in problems] == ["vx", "pitch", "pitch"]
+    assert problems[0] == "vx down to -0.9999 m/s (bound -0.5)"
+    free = {"type": "unconstrained", **{k: table[k] for k in ("horizon", "output_weights", "input_weights")}}
+    assert found(circle | {"speed": 3.0, "turns": 9.0}, vehicle, controller=free).problems == ()
+    slow = table | {"input_bounds": {"speed": [0.0, 192.0], "slew": [-10.0, 5.0]}}
+    assert "rotor speed up to 192.9 rad/s (bound 192)" in found(circle, vehicle, controller=slow).problems

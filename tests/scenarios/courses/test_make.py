@@ -1,0 +1,280 @@
+"""`[reference]` of every type: what it becomes, and what is said of one that is wrong."""
+
+from __future__ import annotations
+
+import math
+import tomllib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from support import scenario_table
+
+from quadsim.errors import FileError, ParameterError
+from quadsim.state import Array
+from scenarios.courses.make import build_course, build_course_steps, build_reference
+from scenarios.courses.smoothing import smooth
+from scenarios.loading import load_scenario, parse_scenario
+from scenarios.schema.course import MOST_POINTS
+from scenarios.schema.problems import ScenarioError
+from scenarios.schema.scenario import Scenario
+
+INITIAL = (1.0, -2.0, 3.0)
+POINTS = [{"position": [4.0, 2.0, 3.0], "yaw": 90.0}, {"position": [4.0, 2.0, 5.0]}]
+TABLE = "t,x,y,z,yaw\n1,1,-2,3,0.5\n3,5,-2,3,0.5\n"
+
+REFERENCES: dict[str, dict[str, Any]] = {
+    "steps": {"x": [{"start": 1.0, "stop": 3.0, "value": 2.0}]},
+    "waypoints": {"points": POINTS, "speed": 2.0},
+    "minimum_snap": {"points": POINTS, "speed": 1.0},
+    "circle": {"radius": 2.0, "speed": 1.0},
+    "helix": {"radius": 2.0, "period": 8.0, "climb": 1.5, "turns": -2.0},
+    "figure_eight": {"length": 4.0, "period": 12.0, "yaw_along_path": True},
+    "yaw_turns": {"turns": [{"start": 1.0, "yaw": 180.0, "rate": 45.0}]},
+}
+
+
+def scenario(kind: str, euler: tuple[float, float, float] = (0.0, 0.0, 30.0), **fields: Any) -> Scenario:
+    """A short scenario with a course of one type, its fields those of `REFERENCES` but for what is given."""
+    reference = {"type": kind, **REFERENCES.get(kind, {}), **fields}
+    reference = {name: value for name, value in reference.items() if value is not None}
+    initial = {"position": list(INITIAL), "euler": list(euler)}
+    return parse_scenario(scenario_table() | {"initial": initial, "reference": reference})
+
+
+def sampled(kind: str, *times: float, **fields: Any) -> Array:
+    return build_course(scenario(kind, **fields)).sample(np.array(times))
+
+
+# --- what is right -------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", REFERENCES)
+def test_every_type_comes_back_from_its_text(kind: str) -> None:
+    made = scenario(kind)
+    again = parse_scenario(tomllib.loads(made.to_toml()))
+    assert again == made
+    assert again.reference.type == kind
+    np.testing.assert_array_equal(build_reference(again, 50), build_reference(made, 50))
+
+
+def test_a_table_without_a_type_is_one_of_steps() -> None:
+    assert load_scenario("paper-constrained").reference.type == "steps"
+    assert load_scenario("paper-constrained", ["reference.response_time=2.5"]).reference.response_time == 2.5
+
+
+@pytest.mark.parametrize("kind", [kind for kind in REFERENCES if kind != "steps"])
+def test_every_course_begins_at_the_initial_position_and_stays_at_its_end(kind: str) -> None:
+    course = build_course(scenario(kind))
+    np.testing.assert_allclose(course.sample(np.zeros(1))[0, :3], INITIAL, atol=1e-12)
+    np.testing.assert_allclose(course.initial, [*INITIAL, math.radians(30.0)])
+    last = course.kinks[-1]
+    ends = course.sample(np.array([last, last + 0.05, 1e5]))
+    np.testing.assert_allclose(ends, ends[[0, 0, 0]], rtol=0.0, atol=1e-12)
+
+
+@pytest.mark.parametrize("kind", ["waypoints", "minimum_snap", "circle", "helix", "figure_eight"])
+def test_every_course_waits_for_its_start(kind: str) -> None:
+    t = np.arange(0.0, 20.0, 0.05)
+    at_once, later = build_course(scenario(kind)), build_course(scenario(kind, start=2.5))
+    np.testing.assert_allclose(later.sample(t + 2.5), at_once.sample(t), atol=1e-12)
+    np.testing.assert_array_equal(later.sample(np.array([0.0, 1.0, 2.45])), np.tile(later.initial, (3, 1)))
+
+
+@pytest.mark.parametrize("kind", REFERENCES)
+def test_every_course_passes_through_the_filter_from_its_initial_pose(kind: str) -> None:
+    course, t = build_course(scenario(kind)), 0.05 * np.arange(100)
+    reference = build_reference(scenario(kind, response_time=2.0), 100)
+    for column in range(4):
+        expected = smooth(course.sample(t)[:, column], initial=course.initial[column], response_time=2.0, period=0.05)
+        np.testing.assert_array_equal(reference[:, column], expected)
+
+
+def test_waypoints_keep_a_yaw_that_is_not_given_and_take_their_own_speed() -> None:
+    points = [{"position": [1.0, -2.0, 7.0]}, {"position": [1.0, 0.0, 7.0], "yaw": -90.0, "speed": 0.5, "hold": 1.0}]
+    poses = sampled("waypoints", 2.0, 4.0, 6.0, 7.0, points=points)
+    np.testing.assert_allclose(poses[:, :3], [[1, -2, 7], [1, -1, 7], [1, 0, 7], [1, 0, 7]], atol=1e-12)
+    np.testing.assert_allclose(np.degrees(poses[:, 3]), [30.0, -30.0, -90.0, -90.0])
+
+
+def test_minimum_snap_passes_its_points_when_its_speed_or_its_times_say() -> None:
+    for fields in ({"speed": 0.5}, {"speed": None, "times": [10.0, 14.0]}):
+        poses = sampled("minimum_snap", 10.0, 14.0, **fields)
+        np.testing.assert_allclose(poses[:, :3], [[4, 2, 3], [4, 2, 5]], atol=1e-10)
+        np.testing.assert_allclose(np.degrees(poses[:, 3]), 90.0)
+
+
+def test_a_circle_is_about_its_centre_or_begins_where_the_vehicle_is() -> None:
+    t = np.linspace(0.0, 17.0, 60)
+    free = build_course(scenario("circle", angle=90.0)).sample(t)
+    np.testing.assert_allclose(np.linalg.norm(free[:, :2] - [1.0, -4.0], axis=1), 2.0)
+    course = build_course(scenario("circle", centre=[5.0, 5.0], height=1.0, angle=180.0, yaw=-45.0))
+    np.testing.assert_allclose(course.sample(np.zeros(1)), [[3.0, 5.0, 1.0, math.radians(-45.0)]], atol=1e-12)
+    assert course.jumps == (0.0,)
+    assert build_course(scenario("circle")).jumps == ()
+
+
+def test_speed_is_that_at_full_speed_for_every_loop() -> None:
+    for kind, fields in (
+        ("circle", {}),
+        ("helix", {"period": None, "speed": 1.0}),
+        ("figure_eight", {"period": None, "speed": 1.0, "turns": 3.0}),
+    ):
+        t = np.arange(5.5, 12.0, 1e-3)
+        poses = build_course(scenario(kind, **fields)).sample(t)
+        fastest = np.linalg.norm(np.diff(poses[:, :3], axis=0), axis=1).max() / 1e-3
+        assert fastest == pytest.approx(1.0, rel=1e-4), kind
+
+
+def test_a_helix_climbs_and_turns_the_way_its_sign_says() -> None:
+    end = sampled("helix", 1e3)[0]
+    np.testing.assert_allclose(end[:3], [1.0, -2.0, 6.0], atol=1e-9)
+    early = sampled("helix", 4.0)[0]
+    assert early[1] < -2.0  # clockwise from +x: towards -y
+
+
+def test_a_figure_eight_has_half_its_length_for_a_width() -> None:
+    poses = build_course(scenario("figure_eight", angle=90.0)).sample(np.arange(0.0, 17.0, 0.01))
+    assert np.ptp(poses[:, 1]) == pytest.approx(4.0, rel=1e-4)
+    assert np.ptp(poses[:, 0]) == pytest.approx(2.0, rel=1e-4)
+
+
+def test_yaw_turns_are_in_degrees_and_leave_the_position() -> None:
+    poses = sampled("yaw_turns", 0.5, 2.0, 10.0)
+    np.testing.assert_allclose(np.degrees(poses[:, 3]), [30.0, 75.0, 180.0])
+    np.testing.assert_array_equal(poses[:, :3], np.tile(INITIAL, (3, 1)))
+
+
+def test_only_steps_have_steps_to_settle() -> None:
+    assert build_course_steps(scenario("steps"))
+    assert not any(build_course_steps(scenario(kind)) for kind in REFERENCES if kind != "steps")
+
+
+# --- tables --------------------------------------------------------------------------------------------------------
+
+
+def beside(tmp_path: Path, table: str = TABLE, **fields: str) -> Path:
+    """A scenario file in a folder with its table."""
+    (tmp_path / "course.csv").write_text(table)
+    lines = [f'{name} = "{value}"' for name, value in ({"type": "csv", "file": "course.csv"} | fields).items()]
+    text = load_scenario("hover").to_toml()
+    begun = text.index("[reference]")
+    ended = text.index("[controller]")
+    path = tmp_path / "mine.toml"
+    path.write_text(text[:begun] + "\n".join(["[reference]", "start = 0.5", *lines, "", text[ended:]]))
+    return path
+
+
+def test_a_table_is_found_beside_its_scenario_and_kept_by_its_whole_path_and_hash(tmp_path: Path) -> None:
+    made = load_scenario(str(beside(tmp_path)))
+    assert made.reference.type == "csv"
+    assert made.reference.file == str(tmp_path / "course.csv")
+    again = parse_scenario(tomllib.loads(made.to_toml()))
+    assert again == made
+    poses = build_course(again).sample(np.array([0.0, 1.45, 1.5, 2.5, 3.5, 9.0]))
+    np.testing.assert_allclose(poses[:, 0], [0.0, 0.0, 1.0, 3.0, 5.0, 5.0])  # row 1 is at 1 s, and start at 0.5 s
+    np.testing.assert_allclose(poses[-1], [5.0, -2.0, 3.0, 0.5])  # yaw in radians
+
+
+def test_a_table_is_found_in_the_working_directory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = beside(tmp_path, file="tables/other.csv")
+    (tmp_path / "elsewhere" / "tables").mkdir(parents=True)
+    (tmp_path / "elsewhere" / "tables" / "other.csv").write_text(TABLE)
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    reference = load_scenario(str(path)).reference
+    assert reference.type == "csv"
+    assert reference.file == str(tmp_path / "elsewhere" / "tables" / "other.csv")
+
+
+def test_a_table_that_changed_after_the_scenario_was_resolved_is_refused(tmp_path: Path) -> None:
+    made = load_scenario(str(beside(tmp_path)))
+    (tmp_path / "course.csv").write_text(TABLE.replace("5,-2", "6,-2"))
+    with pytest.raises(
+        FileError, match=r"course\.csv: is not the file of the scenario: its SHA-256 is not [0-9a-f]{64}$"
+    ):
+        build_course(made)
+
+
+def test_a_wrong_table_and_a_missing_one_are_named(tmp_path: Path) -> None:
+    with pytest.raises(FileError, match=r"course\.csv: row 3, column z: is empty$"):
+        load_scenario(str(beside(tmp_path, TABLE.replace("5,-2,3", "5,-2,"))))
+    with pytest.raises(FileError, match=r"gone\.csv: cannot be read"):
+        build_course(load_scenario(str(beside(tmp_path, file="gone.csv"))))
+
+
+# --- what is wrong -------------------------------------------------------------------------------------------------
+
+WRONG: list[tuple[str, dict[str, Any], str]] = [
+    (
+        "spiral",
+        {},
+        "reference must be one of 'steps', 'waypoints', 'minimum_snap', 'circle', 'helix', 'figure_eight', ",
+    ),
+    ("circle", {"type": ["circle"]}, "reference must be one of 'steps', "),
+    ("circle", {"radios": 2.0}, "reference.radios is not a field of the scenario file; did you mean 'radius'? "),
+    ("circle", {"radius": None}, "reference.radius is missing"),
+    ("circle", {"radius": 0.0}, "reference.radius must be > 0.0; got 0.0"),
+    ("circle", {"speed": 0.0}, "reference.speed must be >= 0.001; got 0.0"),
+    ("circle", {"speed": -1.0}, "reference.speed must be >= 0.001; got -1.0"),
+    ("circle", {"period": 3.0}, "reference.period must be given, or speed, but not both; got period and speed"),
+    ("circle", {"speed": None}, "reference.period must be given, or speed, but not both; got neither"),
+    ("circle", {"turns": 0.0}, "reference.turns must not be 0"),
+    ("circle", {"ramp": 12.6}, "reference.ramp must be at most the time of all turns at full speed = 12.5664 s; got"),
+    ("circle", {"yaw": 0.0, "yaw_along_path": True}, "reference.yaw must be absent where yaw_along_path is true"),
+    ("circle", {"start": -1.0}, "reference.start must be >= 0.0; got -1.0"),
+    ("circle", {"centre": [1.0]}, "reference.centre must be a list of 2 numbers; got [1.0]"),
+    ("helix", {"climb": None}, "reference.climb is missing"),
+    ("helix", {"ramp": 17.0}, "reference.ramp must be at most the time of all turns at full speed = 16 s; got 17.0"),
+    ("figure_eight", {"width": 0.0}, "reference.width must be > 0.0; got 0.0"),
+    ("waypoints", {"points": []}, f"reference.points must have 1 to {MOST_POINTS} entries; got 0"),
+    ("waypoints", {"points": POINTS * 101}, f"reference.points must have 1 to {MOST_POINTS} entries; got 202"),
+    ("waypoints", {"points": [{"position": [1.0, 2.0]}]}, "reference.points.0.position must be a list of 3 numbers"),
+    ("waypoints", {"points": [*POINTS, {"positon": [1.0, 2.0, 3.0]}]}, "reference.points.2.position is missing"),
+    ("waypoints", {"speed": 0.0}, "reference.speed must be >= 0.001; got 0.0"),
+    (
+        "waypoints",
+        {"points": [POINTS[0], POINTS[0]]},
+        "reference.points.1.position must be 0.001 m or more from that before it (to stay at a point give it a hold); "
+        "got [4.0, 2.0, 3.0] after [4.0, 2.0, 3.0]",
+    ),
+    ("minimum_snap", {"points": []}, f"reference.points must have 1 to {MOST_POINTS} entries; got 0"),
+    ("minimum_snap", {"speed": None}, "reference.times must be given, or speed, but not both; got neither"),
+    ("minimum_snap", {"times": [1.0, 2.0]}, "reference.times must be given, or speed, but not both; got times and sp"),
+    ("minimum_snap", {"speed": None, "times": [1.0]}, "reference.times must have one time for each of the 2 points; "),
+    ("minimum_snap", {"speed": None, "times": [2.0, 1.0]}, "reference.times must increase, by 0.001 s or more; got ["),
+    ("minimum_snap", {"speed": None, "times": [2.0, 2.0]}, "reference.times must increase, by 0.001 s or more; got ["),
+    ("minimum_snap", {"speed": None, "times": [0.0, 2.0]}, "reference.times.0 must be >= 0.001; got 0.0"),
+    (
+        "minimum_snap",
+        {"points": [POINTS[0], POINTS[0]]},
+        "reference.points.1.position must be 0.001 m or more from that before it (or give times instead of speed); got",
+    ),
+    ("yaw_turns", {"turns": []}, f"reference.turns must have 1 to {MOST_POINTS} entries; got 0"),
+    ("yaw_turns", {"turns": [{"start": 1.0, "yaw": 9.0, "rate": 0.0}]}, "reference.turns.0.rate must be >= 0.001; got"),
+    (
+        "yaw_turns",
+        {"turns": [{"start": start, "yaw": 9.0, "rate": 1.0} for start in (2.0, 2.0)]},
+        "reference.turns.1.start must be above that before it = 2.0; got 2.0",
+    ),
+    ("csv", {}, "reference.file is missing"),
+    ("csv", {"file": "a.csv", "sha256": "12"}, "reference.sha256 must be of the form ^[0-9a-f]{64}$; got '12'"),
+]
+
+
+@pytest.mark.parametrize(("kind", "fields", "message"), WRONG)
+def test_a_wrong_field_is_named(kind: str, fields: dict[str, Any], message: str) -> None:
+    with pytest.raises(ScenarioError) as caught:
+        scenario(kind, **fields)
+    assert str(caught.value).startswith(f"scenario: {message}")
+
+
+def test_a_first_point_that_leaves_no_way_to_go_is_named() -> None:
+    with pytest.raises(ParameterError) as caught:
+        build_course(scenario("minimum_snap", points=[{"position": list(INITIAL)}, *POINTS]))
+    assert str(caught.value) == (
+        "reference.points.0.position must be 0.001 m or more from the initial position, where the course begins "
+        "(or give times instead of speed); got [1.0, -2.0, 3.0]"
+    )
+    stays = scenario("minimum_snap", points=[{"position": list(INITIAL)}], speed=None, times=[5.0])
+    np.testing.assert_allclose(build_course(stays).sample(np.linspace(0, 5, 9))[:, :3], np.tile(INITIAL, (9, 1)))

@@ -1,0 +1,451 @@
+"""From `[controller]` to a law: every field arrives, parts are absent unless given, the paper's two are as ever."""
+
+from __future__ import annotations
+
+import math
+import tomllib
+from dataclasses import fields, replace
+from pathlib import Path
+from typing import Any, get_args
+
+import numpy as np
+import pytest
+from jsonschema import Draft202012Validator
+from pydantic import Tag
+
+from mpc.answer import ActuatorBounds
+from mpc.baselines.geometric import GeometricController
+from mpc.baselines.lqr import LQR, bryson_objective
+from mpc.baselines.pid import CascadedPID
+from mpc.constrained import ConstrainedMPC
+from mpc.constraints import Bounds
+from mpc.fallback.contract import FallbackSettings, Guarded
+from mpc.ocp import Objective
+from mpc.robust.controller import Linearisation, RobustMPC, RobustSettings
+from mpc.robust.observer import ObserverSettings
+from mpc.robust.tightening import TighteningSettings, margins
+from mpc.solvers import QPSolver
+from mpc.unconstrained import UnconstrainedMPC
+from quadsim.controller import LAW_NAMES, SOLVED, Controller, Moment
+from quadsim.errors import ParameterError
+from scenarios.build import CONTROLLERS, build_controller, build_plant, build_problem, resolve
+from scenarios.courses.feasibility_check import report
+from scenarios.courses.make import build_reference
+from scenarios.loading import load_scenario, parse_scenario
+from scenarios.parts.vehicle import build_vehicle
+from scenarios.run import fly_once, fly_scenario
+from scenarios.schema.controller import _Table
+from scenarios.schema.fallback import FallbackSpec
+from scenarios.schema.json_schema import scenario_schema
+from scenarios.schema.plugin import FORM, LAWS
+from scenarios.schema.problems import ScenarioError
+from scenarios.schema.scenario import Scenario
+
+ROBUST: dict[str, Any] = {
+    "type": "robust",
+    "horizon": 20,
+    "output_weights": {"x": 10.0, "y": 10.0, "z": 100.0, "yaw": 100.0},
+    "input_weights": {"speed": 0.1},
+    "output_bounds": {"roll": [-5.0, 5.0], "pitch": [-6.0, 4.5]},
+    "input_bounds": {"speed": [0.0, 250.0], "slew": [-10.0, 5.0]},
+}
+
+
+def scenario(controller: Any, vehicle: str = "lopes2011") -> Scenario:
+    return parse_scenario(
+        {
+            "name": "one",
+            "description": "a step of 1 m",
+            "duration": 2.0,
+            "control_period": 0.05,
+            "vehicle": {"file": vehicle},
+            "initial": {"position": [0.0, 0.0, 1.0]},
+            "reference": {"response_time": 1.0, "x": [{"start": 0.5, "stop": 9.0, "value": 1.0}]},
+            "controller": controller,
+        }
+    )
+
+
+def built(controller: Any, vehicle: str = "lopes2011") -> Controller:
+    one = scenario(controller, vehicle)
+    return build_controller(one, build_vehicle(one))
+
+
+def robust(**parts: Any) -> RobustMPC:
+    law = built({**ROBUST, "fallback": {"enabled": False}, **parts})
+    assert isinstance(law, RobustMPC)
+    return law
+
+
+def same(left: object, right: object) -> bool:
+    """Equal, arrays element by element."""
+    if isinstance(left, np.ndarray) or isinstance(right, np.ndarray):
+        return np.array_equal(np.asarray(left, float), np.asarray(right, float))
+    if hasattr(left, "__dataclass_fields__") and type(left) is type(right):
+        return all(same(getattr(left, item.name), getattr(right, item.name)) for item in fields(left))  # type: ignore[arg-type]
+    return left == right
+
+
+# --- the paper's two -----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["paper-constrained", "paper-unconstrained"])
+def test_the_papers_controllers_are_themselves_to_the_last_bit(name: str) -> None:
+    one = load_scenario(name, ["duration=3"])
+    vehicle = build_vehicle(one)
+    problem = build_problem(one, vehicle)
+    constrained = name == "paper-constrained"
+    direct = ConstrainedMPC(problem, QPSolver("piqp-multistage", problem)) if constrained else UnconstrainedMPC(problem)
+    law = build_controller(one, vehicle)
+    assert type(law) is type(direct)
+    reference = build_reference(one, one.periods + law.horizon)
+    flown = []
+    for each in (law, direct):
+        with build_plant(one, vehicle) as plant:
+            flown.append(fly_once(one, vehicle, plant, each, reference, navigation=None).control.speeds)
+    assert flown[0].tobytes() == flown[1].tobytes()
+
+
+def test_a_fallback_brings_the_papers_controller_through_its_infeasible_qp() -> None:
+    """It still leaves its bounds: surviving is not flying well."""
+    settings = ["duration=14"]
+    alone = fly_scenario(load_scenario("paper-constrained-lag20", [*settings, *_arrivals(13.0)]))
+    assert alone.outcome == "lost"
+    fallen_back = load_scenario("paper-constrained-lag20", [*settings, *_arrivals(13.0), "controller.fallback={}"])
+    flight = fly_scenario(fallen_back)
+    assert flight.log.reason is None
+    assert flight.log.control.fallback.max() >= 1
+    first = alone.log.control.status.index("primal_infeasible")
+    assert flight.log.control.speeds[:first].tobytes() == alone.log.control.speeds[:first].tobytes()
+
+
+def _arrivals(start: float) -> list[str]:
+    return [f"constraints.arrival_{axis}.start={start}" for axis in ("x", "y", "z", "yaw")]
+
+
+# --- the robust one ------------------------------------------------------------------------------------------------
+
+
+def test_of_the_robust_controller_every_part_is_absent_unless_given() -> None:
+    usual = replace(RobustSettings(), largest_turn=math.radians(30.0))
+    assert same(robust().settings, usual)
+
+
+LEVEL = {"roll": [-5.0, 5.0], "pitch": [-5.0, 5.0]}
+HOVER = 192.8
+BOUNDS = Bounds(
+    C_c=np.eye(12)[[6, 8]],
+    y_min=np.radians([-5.0, -6.0]),
+    y_max=np.radians([5.0, 4.5]),
+    delta_min=np.full(4, -10.0),
+    delta_max=np.full(4, 5.0),
+    u_min=np.zeros(4),
+    u_max=np.full(4, 250.0),
+)
+PARTS: dict[str, tuple[Any, dict[str, Any]]] = {
+    "rotor_lag": (0.03, {"rotor_lag": 0.03}),
+    "delay": (0.02, {"delay": 0.02}),
+    "offset_free": ({"force_walk": 0.7}, {"observer": ObserverSettings(force_walk=0.7)}),
+    "heading": (True, {"heading": True}),
+    "largest_turn": (90.0, {"largest_turn": math.radians(90.0)}),
+    "move_weight": (2.0, {"move_weight": 2.0 * np.eye(4)}),
+    "linearisation": ("trajectory", {"linearisation": Linearisation.TRAJECTORY}),
+}
+
+
+@pytest.mark.parametrize("part", PARTS)
+def test_a_part_is_switched_on_alone(part: str) -> None:
+    given, expected = PARTS[part]
+    assert same(robust(**{part: given}).settings, replace(robust().settings, **expected))
+
+
+def test_soft_bounds_have_their_penalties() -> None:
+    penalty = robust(soft={"linear": 3.0}).settings.penalty
+    assert penalty is not None
+    np.testing.assert_array_equal([penalty.l1, penalty.l2], [[3.0, 3.0], [1e4, 1e4]])
+
+
+@pytest.mark.parametrize("parts", [{}, {"rotor_lag": 0.05}, {"rotor_lag": 0.05, "tightening": {}, "offset_free": {}}])
+def test_at_a_price_that_is_high_enough_soft_bounds_are_hard_ones_from_any_state_that_has_a_way_out(
+    parts: dict[str, Any],
+) -> None:
+    """At the default one they are nearly always, and left by half a degree at most."""
+    usual = {**ROBUST, "horizon": 50, "heading": True, "move_weight": 20.0, "output_bounds": LEVEL}
+    prices: tuple[dict[str, Any], ...] = ({}, {"soft": {"linear": 1e8}}, {"soft": {}})
+    hard, soft, default = (robust(**{**usual, **parts, **price}) for price in prices)
+    rng, reference, feasible, pressing, slacks = np.random.default_rng(0), np.zeros((50, 4)), 0, 0, []
+    scale = np.array([10.0, 2.0, 10.0, 2.0, 10.0, 2.0, math.radians(5.0), 0.4, math.radians(5.0), 0.4, 1.0, 0.0])
+    for _ in range(150):
+        state, speeds = scale * rng.uniform(-1.0, 1.0, 12), HOVER + rng.uniform(-8.0, 8.0, 4)
+        for law in (hard, soft, default):
+            law.reset(speeds)
+        strict, lenient, usually = (law.step(Moment(acting=speeds), state, reference) for law in (hard, soft, default))
+        assert {lenient.status, usually.status} == {SOLVED}
+        if strict.status != SOLVED:
+            continue
+        feasible += 1
+        pressing += strict.active > 20
+        assert lenient.slack < 1e-7
+        np.testing.assert_allclose(lenient.speeds, strict.speeds, atol=2e-3)
+        slacks.append(usually.slack)
+    assert feasible > 100
+    assert pressing > 50
+    assert np.mean(np.array(slacks) > 1e-7) < 0.12
+    assert max(slacks) < math.radians(0.5)
+
+
+def test_tightening_is_that_of_the_stated_bounds_lag_and_delay() -> None:
+    drawn_in = robust(tightening={"acceleration": 0.2, "turning": 1.0}, rotor_lag=0.02, delay=0.01).settings.margins
+    expected = margins(
+        build_vehicle(scenario(ROBUST)),
+        period=0.05,
+        horizon=20,
+        bounds=BOUNDS,
+        settings=TighteningSettings(acceleration=0.2, turning=1.0),
+        rotor_lag=0.02,
+        delay=0.01,
+    )
+    assert drawn_in is not None
+    np.testing.assert_array_equal(drawn_in, expected)
+    doubled = robust(tightening={"acceleration": 0.2, "angular_acceleration": 1.0}).settings.margins
+    learning = robust(tightening={"acceleration": 0.1}, offset_free={}).settings.margins
+    assert doubled is not None
+    assert learning is not None
+    np.testing.assert_allclose(learning, doubled, rtol=1e-12)
+
+
+def test_weights_and_bounds_arrive_in_si_units() -> None:
+    problem = build_problem(scenario(ROBUST), build_vehicle(scenario(ROBUST)))
+    assert problem.bounds is not None
+    assert same(problem.bounds, BOUNDS)
+    objective = Objective(C_r=np.eye(12)[[0, 2, 4, 10]], Q_y=np.diag([10.0, 10.0, 100.0, 100.0]), Q_u=0.1 * np.eye(4))
+    assert same(problem.objective, objective)
+
+
+def test_the_vehicles_lag_is_its_rotor_rise() -> None:
+    lag = {"rotor_lag": "vehicle", "fallback": {"enabled": False}}
+    law = built({**ROBUST, **lag, "input_bounds": {"speed": [0.0, 800.0], "slew": [-50.0, 50.0]}}, "hummingbird")
+    vehicle = build_vehicle(scenario(ROBUST, "hummingbird"))
+    assert isinstance(law, RobustMPC)
+    assert law.settings.rotor_lag == vehicle.rotor_rise
+    assert vehicle.rotor_rise
+
+
+def test_a_vehicle_whose_lag_is_too_short_is_refused() -> None:
+    one = scenario({**ROBUST, "rotor_lag": "vehicle"})
+    quick = replace(build_vehicle(one), rotor_rise=1e-9)
+    with pytest.raises(ParameterError, match=r"rotor_lag must be .* where the vehicle's rotor_rise is below 0\.0001 s"):
+        build_controller(one, quick)
+
+
+def test_a_vehicle_without_a_lag_has_none_to_give() -> None:
+    with pytest.raises(ParameterError) as caught:
+        built({**ROBUST, "rotor_lag": "vehicle"})
+    assert str(caught.value) == (
+        "controller.rotor_lag must be a number of seconds where the vehicle has no rotor_rise, and lopes2011 has none; "
+        "got 'vehicle'"
+    )
+
+
+def test_a_delay_of_more_than_a_period_is_refused() -> None:
+    with pytest.raises(ParameterError, match=r"^controller\.delay must be at most the control period of 0\.05 s; got"):
+        built({**ROBUST, "delay": 0.06})
+
+
+def test_the_feasibility_report_holds_the_course_against_its_bounds() -> None:
+    one = scenario({**ROBUST, "output_bounds": {"roll": [-0.1, 0.1], "pitch": [-0.1, 0.1]}})
+    wide = scenario({**ROBUST, "output_bounds": {}})
+    vehicle = build_vehicle(one)
+    assert report(one, vehicle) != report(wide, vehicle)
+
+
+# --- fallback ------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("bounds", "given", "tilt"),
+    [
+        ({"roll": [-5.0, 5.0], "pitch": [-6.0, 4.5]}, {}, 0.8 * 4.5),
+        ({"roll": [-5.0, 5.0]}, {"tilt": 7.0}, 7.0),
+        ({"roll": [-40.0, 40.0]}, {}, 10.0),
+        ({"roll": [1.0, 40.0]}, {}, 0.5),
+        ({}, {}, 10.0),
+    ],
+)
+def test_the_fallback_is_on_and_keeps_well_within_the_bounds_on_tilt(
+    bounds: dict[str, Any], given: dict[str, Any], tilt: float
+) -> None:
+    law = built({**ROBUST, "output_bounds": bounds, "fallback": given})
+    assert isinstance(law, Guarded)
+    assert isinstance(law.inner, RobustMPC)
+    assert law.law.tilt == pytest.approx(math.radians(tilt), rel=1e-12)
+    assert law.name == "robust"
+
+
+def test_the_fallback_of_the_constrained_one_is_off_unless_given() -> None:
+    table = {**ROBUST, "type": "constrained"}
+    assert isinstance(built(table), ConstrainedMPC)
+    assert isinstance(built({**table, "fallback": {"enabled": False}}), ConstrainedMPC)
+    assert isinstance(built({**table, "fallback": {}}), Guarded)
+
+
+def test_the_defaults_of_the_fallback_are_its_own() -> None:
+    spec, usual = FallbackSpec(), FallbackSettings()
+    for name in ("unseen", "plan_age", "position", "velocity", "hover", "sink", "settled"):
+        assert getattr(spec, name) == getattr(usual, name), name
+    assert math.radians(spec.angle) == pytest.approx(usual.angle, rel=0.01)
+    assert math.radians(spec.rate) == pytest.approx(usual.rate, rel=0.01)
+    assert set(type(spec).model_fields) - {"enabled"} == {item.name for item in fields(usual)}
+
+
+# --- baselines -----------------------------------------------------------------------------------------------------
+
+
+def test_the_baselines_need_no_more_than_their_names() -> None:
+    kinds = {"lqr": LQR, "pid": CascadedPID, "geometric": GeometricController}
+    for name, kind in kinds.items():
+        law = built(name)
+        assert type(law) is kind
+        assert (law.name, law.horizon) == (name, 10)
+
+
+@pytest.mark.parametrize("name", ["lqr", "pid", "geometric"])
+def test_a_baseline_follows_a_step(name: str) -> None:
+    flight = fly_scenario(scenario(name).model_copy(update={"duration": 8.0}))
+    error = flight.log.control.truth[-1, [0, 2, 4]] - flight.log.control.reference[-1, :3]
+    assert flight.log.reason is None
+    assert np.abs(error).max() < 0.02
+
+
+def test_fields_of_the_baselines_arrive() -> None:
+    bounds = {"speed": [1.0, 300.0], "slew": [-20.0, 30.0]}
+    lqr, pid, geometric = (
+        built({"type": name, "horizon": 7, "tilt": 12.0, "input_bounds": bounds, **more})
+        for name, more in {
+            "lqr": {"heading": False},
+            "pid": {"lag": 0.2, "velocity": 3.0},
+            "geometric": {"lag": 0.2, "integral": True},
+        }.items()
+    )
+    assert isinstance(lqr, LQR)
+    assert isinstance(pid, CascadedPID)
+    assert isinstance(geometric, GeometricController)
+    for law in (lqr, pid, geometric):
+        assert same(law.settings.bounds, ActuatorBounds.alike((1.0, 300.0), (-20.0, 30.0)))
+        assert (law.settings.tilt_max, law.horizon) == (12.0, 7)
+    vehicle = build_vehicle(scenario("lqr"))
+    assert same(lqr.settings.objective, bryson_objective(vehicle))
+    assert not lqr.settings.heading_frame
+    assert pid.settings.velocity_max == 3.0
+    assert pid.settings.bandwidths.rate == pytest.approx(1.0 / (2.0 * 0.225))
+    assert geometric.settings.k_i > 0.0
+    weighted = built({"type": "lqr", "output_weights": ROBUST["output_weights"], "input_weights": {"speed": 0.1}})
+    assert isinstance(weighted, LQR)
+    assert same(weighted.settings.objective.Q_u, 0.1 * np.eye(4))
+
+
+# --- the file ------------------------------------------------------------------------------------------------------
+
+
+WRONG = {
+    "controller.rotor_lag=-1": "controller.rotor_lag must be >= 0.0; got -1",
+    "controller.rotor_lag=1e-9": "controller.rotor_lag must be 0, or at least 0.0001 s; got 1e-09",
+    "controller.rotor_lag=rotor": "controller.rotor_lag must be one of 'vehicle'; got 'rotor'",
+    "controller.delay=-1": "controller.delay must be >= 0.0; got -1",
+    "controller.soft.linear=-1": "controller.soft.linear must be >= 0.0; got -1",
+    "controller.soft=true": "controller.soft must be a table; got True",
+    "controller.offset_free.force_wak=1": "controller.offset_free.force_wak is not a field of the scenario file; did "
+    "you mean 'force_walk'? (there are: velocity_noise, rate_noise, velocity_walk, rate_walk, force_walk, torque_walk, "
+    "largest_force, largest_torque)",
+    "controller.offset_free.force_walk=0": "controller.offset_free.force_walk must be > 0.0; got 0",
+    "controller.heading=1": "controller.heading must be true or false; got 1",
+    "controller.largest_turn=0": "controller.largest_turn must be > 0.0; got 0",
+    "controller.move_weight=0": "controller.move_weight must be > 0.0; got 0",
+    "controller.linearisation=none": "controller.linearisation must be one of 'hover', 'state' or 'trajectory'; "
+    "got 'none'",
+    "controller.tightening.turning=-1": "controller.tightening.turning must be >= 0.0; got -1",
+    "controller.output_bounds={}": "controller.tightening must be absent where there are no output_bounds to draw in",
+    "controller.fallback=false": "controller.fallback must be a table; got False",
+    "controller.fallback.enabled=0": "controller.fallback.enabled must be true or false; got 0",
+    "controller.fallback.tilt=90": "controller.fallback.tilt must be < 90.0; got 90",
+    "controller.output_bounds.rol=[0, 1]": "controller.output_bounds.rol is not a state; did you mean 'roll'? (there "
+    "are: x, vx, y, vy, z, vz, roll, roll_rate, pitch, pitch_rate, yaw, yaw_rate)",
+    "controller.solver=daqp": "controller.solver is not a field of the scenario file ...",
+    "controller=lqt": "controller must be one of 'unconstrained', 'constrained', 'robust', 'lqr', 'pid', 'geometric', "
+    "'package.module:Class' in its field type; got 'lqt'; did you mean 'lqr'?",
+    "controller={type='lqr', input_weights={speed=1}}": "controller.input_weights must be given where output_weights "
+    "are, and nowhere else",
+    "controller={type='lqr', output_weights={zz=1}, input_weights={speed=1}}": "controller.output_weights.zz is not a "
+    "state; did you mean 'z'? ...",
+    "controller={type='pid', horizon=2}": "controller.horizon must be >= 3; got 2",
+    "controller={type='pid', tilt=90}": "controller.tilt must be <= 80.0; got 90",
+    "controller={type='geometric', velocity=1}": "controller.velocity is not a field of the scenario file ...",
+}
+
+
+@pytest.mark.parametrize(("setting", "message"), WRONG.items(), ids=WRONG)
+def test_a_wrong_field_is_named(setting: str, message: str) -> None:
+    with pytest.raises(ScenarioError) as caught:
+        load_scenario("robust", [setting])
+    said, begins = str(caught.value).removeprefix("robust.toml: "), message.endswith("...")
+    assert said.startswith(message[:-3]) if begins else said == message
+
+
+@pytest.mark.parametrize("name", ["lqr", "pid", "geometric"])
+def test_a_baseline_has_no_optimisation(name: str) -> None:
+    with pytest.raises(ParameterError, match=rf"^controller\.type must be one that minimises .*; got '{name}'$"):
+        build_problem(scenario(name), build_vehicle(scenario(name)))
+
+
+def test_every_law_is_listed_and_told_apart_by_its_name() -> None:
+    tags = {note.tag for kind in get_args(get_args(_Table)[0]) for note in get_args(kind) if isinstance(note, Tag)}
+    assert tags == {*LAWS, FORM}
+    assert list(CONTROLLERS) == list(LAWS)
+    assert {*LAW_NAMES} == tags - {FORM}  # and has a name to be shown by
+
+
+def test_a_law_that_the_bounds_leave_too_little_for_is_told_in_the_files_words() -> None:
+    one = load_scenario("robust", ["controller.tightening={}", "controller.output_bounds.vx=[-0.2, 0.2]"])
+    message = (
+        "controller.tightening.acceleration must be smaller, or the bounds on vx wider: these leave 0.2 m/s on either "
+        "side of their middle, of which 0.327 m/s would be given up and at most 0.1 m/s may be; got 0.5"
+    )
+    with pytest.raises(ParameterError) as caught:
+        build_controller(one, build_vehicle(one))
+    assert str(caught.value) == message
+
+
+EVERYTHING = {
+    **ROBUST,
+    "soft": {},
+    "rotor_lag": "vehicle",
+    "delay": 0.01,
+    "offset_free": {},
+    "tightening": {},
+    "heading": True,
+    "move_weight": 5.0,
+    "linearisation": "state",
+    "fallback": {"tilt": 3.0},
+}
+TABLES = ["pid", EVERYTHING, {**ROBUST, "type": "constrained", "fallback": {}}, {"type": "lqr"}, "a.b:C"]
+TABLES += [{"type": "a:B", "settings": {"gain": 2.0, "names": ["a"], "more": {"deep": [1, {"x": True}]}}}]
+
+
+@pytest.mark.parametrize("controller", TABLES, ids=str)
+def test_it_comes_back_from_its_resolved_file_which_the_schema_allows(controller: Any) -> None:
+    one = scenario(controller, "hummingbird")
+    text = resolve(one, build_vehicle(one)).to_toml()
+    again = parse_scenario(tomllib.loads(text))
+    assert again.controller == one.controller
+    assert again.to_toml() == text
+    validator = Draft202012Validator(scenario_schema())
+    validator.validate(tomllib.loads(text))
+    validator.validate({"base": "hover", "controller": controller})
+    validator.validate(tomllib.loads(text) | {"controller": controller})
+
+
+def test_a_name_alone_takes_fields_from_settings_and_from_files_over_it(tmp_path: Path) -> None:
+    (tmp_path / "one.toml").write_text('base = "hover"\nname = "one"\ncontroller = "pid"\n')
+    (tmp_path / "two.toml").write_text('base = "one.toml"\nname = "two"\n[controller]\ntilt = 20.0\n')
+    found = load_scenario(str(tmp_path / "two.toml"), ["controller.horizon=4"]).controller
+    assert found.model_dump(include={"type", "tilt", "horizon"}) == {"type": "pid", "tilt": 20.0, "horizon": 4}

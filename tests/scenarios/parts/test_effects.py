@@ -1,0 +1,212 @@
+"""From the scenario file to what acts: every field arrives where it belongs, and events add up."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from quadsim.controller import MISSED, Command, Controller, Moment
+from quadsim.errors import ParameterError
+from quadsim.sim.computation import Computation, Stall
+from quadsim.sim.effects import Disturbance, Effects, PayloadChange, RotorChange
+from quadsim.sim.effects.load import Load, Payload
+from quadsim.sim.effects.rotors import RotorDynamics
+from quadsim.state import Array
+from quadsim.vehicle import Vehicle
+from scenarios.build import build_controller, build_plant
+from scenarios.courses.make import build_reference
+from scenarios.loading import load_scenario
+from scenarios.parts.effects import build_computation, build_effects, build_wind, resolve_effects
+from scenarios.parts.vehicle import build_vehicle
+from scenarios.run import fly_once
+from scenarios.schema.scenario import Scenario
+
+
+def scenario(*settings: str, vehicle: str = "lopes2011") -> tuple[Scenario, Vehicle]:
+    loaded = load_scenario("hover", [f"vehicle.file={vehicle}", *settings])
+    return loaded, build_vehicle(loaded)
+
+
+def effects(*settings: str, vehicle: str = "lopes2011") -> Effects:
+    return build_effects(*scenario(*settings, vehicle=vehicle))
+
+
+def event(**fields: Any) -> str:
+    return "{" + ", ".join(f"{name} = {value!r}" for name, value in fields.items()) + "}"
+
+
+def events(*entries: str) -> str:
+    return f"events=[{', '.join(entries)}]"
+
+
+def test_without_effects_nothing_acts() -> None:
+    loaded, vehicle = scenario()
+    assert build_effects(loaded, vehicle) == Effects()
+    assert build_wind(loaded, vehicle) is None
+    assert build_computation(loaded) is None
+
+
+def test_every_field_arrives() -> None:
+    found = effects(
+        "effects.rotors={rise=0.01, fall=0.02, acceleration=900.0, inertia=1e-4, efficiency=[1.0, 0.9, 0.8, 0.7]}",
+        "effects.air={density=1.1, rotor_drag=2e-4, body_drag=[0.01, 0.02, 0.03]}",
+        "effects.ground={effect=true, rotor_radius=0.1}",
+        "effects.load={mass_factor=1.1, inertia_factor=[1.2, 1.1, 1.05], centre_of_mass=[0.01, 0.02, 0.03], "
+        "payloads=[{mass=0.3, position=[0.0, 0.0, -0.1]}]}",
+        "effects.disturbance={force=[1.0, 2.0, 3.0], torque=[0.1, 0.2, 0.3], force_noise=0.4, torque_noise=0.5}",
+    )
+    assert found == Effects(
+        rotors=RotorDynamics(rise=0.01, fall=0.02, acceleration=900.0, inertia=1e-4),
+        efficiency=(1.0, 0.9, 0.8, 0.7),
+        rotor_drag=2e-4,
+        body_drag=(0.01, 0.02, 0.03),
+        air_density=1.1,
+        rotor_radius=0.1,
+        contact=True,
+        load=Load(
+            mass_factor=1.1,
+            inertia_factor=(1.2, 1.1, 1.05),
+            centre_of_mass=(0.01, 0.02, 0.03),
+            payloads=(Payload(mass=0.3, position=(0.0, 0.0, -0.1)),),
+        ),
+        disturbance=Disturbance(force=(1.0, 2.0, 3.0), torque=(0.1, 0.2, 0.3), force_noise=0.4, torque_noise=0.5),
+    )
+
+
+def test_sizes_left_out_are_the_vehicle_s() -> None:
+    loaded, vehicle = scenario("effects={rotors={}, air={}, ground={effect=true}}", vehicle="hummingbird")
+    found = build_effects(loaded, vehicle)
+    assert found.rotors is not None
+    assert (found.rotors.rise, found.rotors.fall) == (vehicle.rotor_rise, vehicle.rotor_fall)
+    assert found.rotors.inertia == vehicle.rotor_inertia
+    assert (found.rotor_drag, found.body_drag) == (vehicle.rotor_drag, vehicle.body_drag)
+    assert found.rotor_radius == vehicle.rotor_radius
+    assert (
+        build_effects(loaded.model_copy(update={"effects": resolve_effects(loaded.effects, vehicle)}), vehicle) == found
+    )
+
+
+LOSS = {"type": "rotor_loss", "rotor": 2}
+
+
+@pytest.mark.parametrize("order", [1, -1])
+def test_losses_of_a_rotor_multiply_while_they_last(order: int) -> None:
+    entries = [
+        event(**LOSS, at=1.0, loss=0.2),
+        event(**LOSS, at=2.0, loss=0.5, duration=2.0),
+        event(**LOSS, at=3.0, loss=0.1, duration=3.0),
+        event(**LOSS, at=3.0, loss=0.3),
+        event(type="rotor_loss", rotor=4, at=2.0, loss=1.0),
+    ][::order]
+    found = effects("effects.rotors.efficiency=[1.0, 0.9, 1.0, 1.0]", events(*entries)).changes
+    shares = {
+        change.time: change.efficiency for change in found if isinstance(change, RotorChange) and change.rotor == 2
+    }
+    expected = {1.0: 0.8, 2.0: 0.4, 3.0: 0.4 * 0.9 * 0.7, 4.0: 0.8 * 0.9 * 0.7, 6.0: 0.8 * 0.7}
+    assert shares == pytest.approx({time: 0.9 * share for time, share in expected.items()})
+    assert RotorChange(time=2.0, rotor=4, efficiency=0.0) in found
+    assert len(found) == 6
+
+
+def test_payloads_come_and_go() -> None:
+    found = effects(
+        events(
+            event(type="payload_pickup", at=1.0, mass=0.5, position=[0.1, 0.0, 0.0]), event(type="payload_drop", at=2.0)
+        )
+    ).changes
+    picked = Payload(mass=0.5, position=(0.1, 0.0, 0.0))
+    assert found == (PayloadChange(time=1.0, payload=picked), PayloadChange(time=2.0, payload=None))
+
+
+def test_wind_is_mean_gusts_and_changes() -> None:
+    loaded, vehicle = scenario(
+        "effects.air={rotor_drag=1e-4, wind=[1.0, 0.0, 0.0]}",
+        events(
+            event(type="gust", at=1.0, duration=2.0, velocity=[0.0, 3.0, 0.0]),
+            event(type="wind", at=4.0, velocity=[0.0, 0.0, -2.0]),
+        ),
+    )
+    field = build_wind(loaded, vehicle)
+    assert field is not None
+    wind = field.advance(6000)
+    np.testing.assert_allclose(wind[[500, 1999, 3999, 4000]], [[1, 0, 0], [1, 3, 0], [1, 0, 0], [0, 0, -2]], atol=1e-5)
+
+
+def test_turbulence_passes_at_the_mean_wind_s_speed_and_follows_the_seed() -> None:
+    air = "effects.air={rotor_drag=1e-4, wind=[3.0, 4.0, 0.0], turbulence={wind_speed_20ft=8.0}}"
+    loaded, vehicle = scenario(air)
+    resolved = resolve_effects(loaded.effects, vehicle)
+    assert resolved.air is not None
+    assert resolved.air.turbulence is not None
+    assert resolved.air.turbulence.airspeed == 5.0
+
+    def blown(seed: int) -> Any:
+        field = build_wind(loaded.model_copy(update={"seed": seed}), vehicle)
+        assert field is not None
+        return field.advance(50)
+
+    np.testing.assert_array_equal(blown(1), blown(1))
+    assert np.any(blown(1) != blown(2))
+
+
+def test_computation_takes_its_times_and_stalls() -> None:
+    stall = events(event(type="stall", at=1.0, duration=0.2))
+    assert build_computation(scenario(stall)[0]) == Computation(stalls=(Stall(start=1.0, duration=0.2),))
+    loaded, _ = scenario("computation={delay=0.01, per_iteration=1e-4, jitter=0.002}")
+    assert build_computation(loaded) == Computation(fixed=0.01, per_iteration=1e-4, jitter=0.002)
+
+
+@pytest.mark.parametrize(
+    ("name", "settings", "expected"),
+    [
+        ("robust", [], True),
+        ("robust", ["controller.fallback.enabled=false"], False),
+        ("robust", ["computation={plan=false}"], False),
+        ("paper-constrained", [], False),
+        ("paper-constrained", ["controller.fallback={}"], True),
+        ("paper-constrained", ["computation={plan=true}"], True),
+        ("paper-unconstrained", [], False),
+    ],
+)
+def test_within_the_fallback_contract_a_missed_deadline_applies_the_plan(
+    name: str, settings: list[str], expected: bool
+) -> None:
+    loaded = load_scenario(name, [events(event(type="stall", at=1.0, duration=0.2)), *settings])
+    computation = build_computation(loaded)
+    assert computation is not None
+    assert computation.plan is expected
+
+
+def test_a_stalled_robust_controller_is_flown_by_its_last_plan() -> None:
+    stalled = load_scenario("robust", ["duration=2.0", events(event(type="stall", at=1.0, duration=0.12))])
+    controller = Spy(build_controller(stalled, vehicle := build_vehicle(stalled)))
+    reference = build_reference(stalled, stalled.periods + controller.horizon)
+    with build_plant(stalled, vehicle) as plant:
+        log = fly_once(stalled, vehicle, plant, controller, reference, navigation=None)
+    missed = [k for k, status in enumerate(log.control.status) if status == MISSED]
+    assert missed == [20, 21]
+    for k in missed:
+        np.testing.assert_array_equal(log.control.speeds[k], controller.plans[19][k - 19])
+        assert np.abs(log.control.speeds[k] - log.control.speeds[19]).max() > 1e-3, "the last command, held"
+
+
+class Spy:
+    """A controller whose plans are kept."""
+
+    def __init__(self, law: Controller) -> None:
+        self._law, self.plans = law, list[Array]()
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._law, name)
+
+    def step(self, now: Moment, state: Array, reference: Array) -> Command:
+        command = self._law.step(now, state, reference)
+        self.plans.append(command.plan.copy())
+        return command
+
+
+def test_wind_that_nothing_meets_is_refused() -> None:
+    with pytest.raises(ParameterError, match=r"effects\.air\.rotor_drag must be positive, or body_drag given"):
+        build_wind(*scenario("effects.air.wind=[1.0, 0.0, 0.0]"))

@@ -1,0 +1,122 @@
+"""`[sensors]` and `[estimator]`: their units, and what is said of wrong ones."""
+
+from __future__ import annotations
+
+import math
+import tomllib
+from typing import Any
+
+import numpy as np
+import pytest
+from support import scenario_table
+
+from quadsim.sim.sensing.sensor import FaultKind, SensorFault, SensorName
+from quadsim.vehicle import Vehicle
+from scenarios.loading import parse_scenario
+from scenarios.parts.navigation import build_estimator, build_fault, build_navigation, build_sensors
+from scenarios.run import fly_scenario
+from scenarios.schema.problems import ScenarioError
+from scenarios.schema.scenario import Scenario
+
+SENSORS: dict[str, Any] = {
+    "position": {"rate": 20, "noise": [0.1, 0.1, 0.2], "delay": 0.11},
+    "attitude": {"rate": 100.0, "noise": 1.0, "outliers": {"probability": 0.01, "size": 10.0}},
+    "rates": {"rate": 200.0, "noise": 0.3, "bias": [0.5, -0.5, 0.0], "bias_walk": 0.002, "dropout": 0.1},
+}
+ESTIMATOR: dict[str, Any] = {"type": "error_state", "initial_attitude": 2.0}
+
+
+def scenario(**tables: Any) -> Scenario:
+    return parse_scenario(scenario_table() | tables)
+
+
+def test_sensors_are_in_si_units() -> None:
+    position, attitude, rates = build_sensors(scenario(sensors=SENSORS))
+    assert (position.name, position.rate, position.delay) == (SensorName.POSITION, 20.0, 0.11)
+    assert position.noise == (0.1, 0.1, 0.2)
+    assert attitude.noise == pytest.approx([math.radians(1.0)] * 3)
+    assert (attitude.outliers.probability, attitude.outliers.size) == (0.01, 10.0)
+    assert rates.noise == pytest.approx([math.radians(0.3)] * 3)
+    assert rates.bias == pytest.approx([math.radians(0.5), math.radians(-0.5), 0.0])
+    assert rates.bias_walk == pytest.approx([math.radians(0.002)] * 3)
+    assert rates.dropout == 0.1
+
+
+def test_the_estimator_is_in_si_units() -> None:
+    spec = scenario(sensors=SENSORS, estimator=ESTIMATOR).estimator
+    assert spec is not None
+    settings = build_estimator(spec)
+    assert settings.initial_attitude == pytest.approx(math.radians(2.0))
+    assert settings.initial_gyro_bias == pytest.approx(math.radians(0.5))
+    assert (settings.acceleration_noise, settings.initial_position, settings.gate) == (0.3, 0.05, 0.9999)
+
+
+def test_faults_are_in_si_units() -> None:
+    assert build_fault("rates", "bias", start=2.0, duration=1.5, offset=[180.0, 0.0, 0.0]) == SensorFault(
+        sensor=SensorName.RATES, kind=FaultKind.BIAS, start=2.0, stop=3.5, offset=(math.pi, 0.0, 0.0)
+    )
+    assert build_fault("position", "nan", start=0.0).stop == math.inf
+
+
+def test_perfect_state_stays_the_default(vehicle: Vehicle) -> None:
+    assert build_navigation(scenario(), vehicle) is None
+    assert build_navigation(scenario(sensors=SENSORS), vehicle) is not None
+
+
+def test_tables_come_back_from_the_resolved_file() -> None:
+    given = scenario(sensors=SENSORS, estimator=ESTIMATOR)
+    assert parse_scenario(tomllib.loads(given.to_toml())) == given
+
+
+def test_a_flight_by_estimate_is_the_same_each_time() -> None:
+    given = scenario(sensors=SENSORS, estimator=ESTIMATOR)
+    logs = [fly_scenario(given).log.control for _ in range(2)]
+    assert np.array_equal(logs[0].state, logs[1].state)
+    error = logs[0].state - logs[0].truth
+    assert 1e-6 < np.abs(error[:, [0, 2, 4]]).max() < 0.5
+
+
+@pytest.mark.parametrize(
+    ("tables", "message"),
+    [
+        (
+            {"sensors": {"position": {"rate": 30.0}}},
+            "sensors.position.rate must be a divisor of the physics rate of 1000 Hz; got 30.0",
+        ),
+        (
+            {"sensors": {"position": {"rate": 20.0, "delay": 0.0005}}},
+            "sensors.position.delay must be a whole multiple of the physics step of 0.001 s; got 0.0005",
+        ),
+        ({"sensors": {"rates": {}}}, "sensors.rates.rate is missing"),
+        ({"sensors": {"rates": {"rate": 0.0}}}, "sensors.rates.rate must be >= 0.01; got 0.0"),
+        ({"sensors": {"rates": {"rate": 10.0, "noise": -1.0}}}, "sensors.rates.noise must be >= 0.0; got -1.0"),
+        (
+            {"sensors": {"rates": {"rate": 10.0, "noise": [1.0, 2.0]}}},
+            "sensors.rates.noise must be a list of 3 numbers; got [1.0, 2.0]",
+        ),
+        ({"sensors": {"rates": {"rate": 10.0, "dropout": 2.0}}}, "sensors.rates.dropout must be <= 1.0; got 2.0"),
+        (
+            {"sensors": {"rates": {"rate": 10.0, "outliers": {"probability": 0.1, "size": 0.5}}}},
+            "sensors.rates.outliers.size must be >= 1.0; got 0.5",
+        ),
+        ({"sensors": {"gps": {"rate": 10.0}}}, "sensors.gps is not a field of the scenario file"),
+        (
+            {"estimator": ESTIMATOR},
+            "estimator must have sensors.position to work with; got []",
+        ),
+        (
+            {"estimator": ESTIMATOR, "sensors": {"position": SENSORS["position"]}},
+            "estimator must have sensors.attitude to work with; got ['position']",
+        ),
+        (
+            {"estimator": ESTIMATOR, "sensors": SENSORS | {"rates": {"rate": 10.0, "noise": [0.0, 1.0, 1.0]}}},
+            "sensors.rates.noise must be positive, for the estimator to weigh its samples; got [0.0, 1.0, 1.0]",
+        ),
+        ({"estimator": {"type": "magic"}, "sensors": SENSORS}, "estimator.type must be"),
+        ({"estimator": ESTIMATOR | {"gate": 1.0}, "sensors": SENSORS}, "estimator.gate must be "),
+    ],
+)
+def test_wrong_tables_are_refused_with_their_field(tables: dict[str, Any], message: str) -> None:
+    with pytest.raises(ScenarioError) as caught:
+        scenario(**tables)
+    assert caught.value.problems[0].startswith(message)

@@ -1,0 +1,424 @@
+"""Controllers that are not ours: where they are looked for, how they are called, and what is said where they fail."""
+
+from __future__ import annotations
+
+import itertools
+import re
+import sys
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from quadsim.controller import Command, Moment
+from quadsim.errors import CommandError, InputError
+from quadsim.state import Array
+from scenarios.build import build_controller
+from scenarios.cli import main
+from scenarios.loading import load_scenario
+from scenarios.parts.plugin import PluginController
+from scenarios.parts.vehicle import build_vehicle
+from scenarios.run import Outputs, fly_scenario, run_scenario
+
+HOVER = """
+import numpy as np
+
+class Hover:
+    def __init__(self, vehicle, *, period, horizon, offset=0.0):
+        self.speeds, self.told = np.full(4, vehicle.hover_speed + offset), (period, horizon)
+    def step(self, now, state, reference):
+        return self.speeds
+"""
+SCENARIO = 'base = "hover"\nname = "own"\nduration = 0.2\nconstraints = []\n'
+
+Write = Callable[..., str]
+
+
+@pytest.fixture
+def written(tmp_path: Path) -> Iterator[Write]:
+    """Writes a module under a name that nothing else has, and a scenario beside it; gives the scenario's path."""
+    before, count = set(sys.modules), itertools.count()
+
+    def write(code: str, controller: str = 'controller = "{module}:Hover"', *, module: str | None = None) -> str:
+        name = module or f"own_{abs(hash(str(tmp_path)))}_{next(count)}"
+        folder = tmp_path / "beside"
+        folder.mkdir(exist_ok=True)
+        (folder / f"{name}.py").write_text(code)
+        (folder / f"{name}.toml").write_text(SCENARIO + controller.replace("{module}", name))
+        return str(folder / f"{name}.toml")
+
+    yield write
+    for name in set(sys.modules) - before:
+        del sys.modules[name]
+
+
+def build(path: str, *settings: str) -> PluginController:
+    scenario = load_scenario(path, settings)
+    controller = build_controller(scenario, build_vehicle(scenario))
+    assert isinstance(controller, PluginController)
+    return controller
+
+
+def message(path: str) -> str:
+    """What is said of a controller that cannot be made; the module's name and folder left out."""
+    with pytest.raises(InputError) as caught:
+        build(path)
+    file = Path(path)
+    said = str(caught.value).replace(str(file.parent), "FOLDER").replace(str(Path.cwd()), "HERE")
+    return said.replace(file.stem, "mine")
+
+
+# --- found and called ----------------------------------------------------------------------------------------------
+
+
+def test_it_is_found_beside_the_scenario_and_called_with_what_is_documented(written: Write) -> None:
+    law = build(written(HOVER), "controller.horizon=7", "controller.settings.offset=2.0")
+    command = law.step(Moment(), np.zeros(12), np.zeros((7, 4)))
+    vehicle = build_vehicle(load_scenario("hover"))
+    np.testing.assert_array_equal(command.speeds, np.full(4, vehicle.hover_speed + 2.0))
+    np.testing.assert_array_equal(command.plan, np.tile(command.speeds, (7, 1)))
+    assert law._law.told == (0.05, 7)
+    assert (law.name, law.solver, law.horizon) == ("Hover", "", 7)
+
+
+def test_the_import_path_is_left_as_it_was(written: Write) -> None:
+    before = list(sys.path)
+    build(written(HOVER))
+    with pytest.raises(InputError):
+        build(written("1 / 0"))
+    assert sys.path == before
+
+
+def test_it_is_found_in_the_working_directory(written: Write, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = Path(written(HOVER))
+    (tmp_path / "elsewhere.toml").write_text(path.read_text())
+    assert "package.module:Class" not in message_of_missing(tmp_path / "elsewhere.toml")
+    monkeypatch.chdir(path.parent)
+    assert build(str(tmp_path / "elsewhere.toml")).name == "Hover"
+
+
+def message_of_missing(path: Path) -> str:
+    with pytest.raises(InputError, match="of a module that there is") as caught:
+        build(str(path))
+    return str(caught.value)
+
+
+def test_a_base_in_another_folder_brings_its_controller(written: Write, tmp_path: Path) -> None:
+    base = written(HOVER)
+    (tmp_path / "derived.toml").write_text(f'base = "{base}"\nname = "derived"\n')
+    assert build(str(tmp_path / "derived.toml")).name == "Hover"
+
+
+def test_another_folder_is_named_relative_to_the_scenario(written: Write, tmp_path: Path) -> None:
+    path = Path(written(HOVER))
+    table = f'[controller]\ntype = "{path.stem}:Hover"\nfolder = "beside"\n'
+    (tmp_path / "above.toml").write_text(SCENARIO + table)
+    scenario = load_scenario(str(tmp_path / "above.toml"))
+    assert scenario.controller.model_dump()["folder"] == str(path.parent.resolve())
+    assert build(str(tmp_path / "above.toml")).name == "Hover"
+
+
+def test_a_resolved_file_flies_the_same_from_anywhere(written: Write, tmp_path: Path) -> None:
+    first = fly_scenario(load_scenario(written(HOVER)))
+    (tmp_path / "resolved.toml").write_text(first.scenario.to_toml())
+    again = fly_scenario(load_scenario(str(tmp_path / "resolved.toml")))
+    np.testing.assert_array_equal(again.log.plant.state, first.log.plant.state)
+
+
+def test_it_is_found_in_a_package_and_below_a_class(written: Write) -> None:
+    path = written("")
+    package = Path(path).parent / "own_package"
+    package.mkdir()
+    (package / "__init__.py").write_text("")
+    (package / "laws.py").write_text(HOVER.replace("class Hover:", "class Laws:\n  class Hover:"))
+    Path(path).write_text(SCENARIO + 'controller = "own_package.laws:Laws.Hover"')
+    assert build(path).name == "Hover"
+
+
+def entry(monkeypatch: pytest.MonkeyPatch, name: str, value: str) -> None:
+    """Announce an entry point, as an installed package does."""
+    points = metadata.EntryPoints([metadata.EntryPoint(name, value, "quadsim.controllers")])
+    monkeypatch.setattr(metadata, "entry_points", lambda *, group: points.select(group=group))
+
+
+def test_it_is_found_by_an_entry_point(written: Write, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = Path(written(HOVER, 'controller = "hold"'))
+    entry(monkeypatch, "hold", f"{path.stem}:Hover")
+    monkeypatch.syspath_prepend(path.parent)
+    assert build(str(path)).name == "Hover"
+
+
+def test_a_name_of_ours_is_ours_whatever_is_announced(written: Write, monkeypatch: pytest.MonkeyPatch) -> None:
+    entry(monkeypatch, "pid", "nowhere:Nothing")
+    scenario = load_scenario(written(HOVER, 'controller = "pid"'))
+    assert build_controller(scenario, build_vehicle(scenario)).name == "pid"
+
+
+# --- fitted to the protocol ----------------------------------------------------------------------------------------
+
+
+def test_without_predict_a_run_has_no_horizon_and_with_it_has_one(written: Write, tmp_path: Path) -> None:
+    outputs = Outputs(video=False, recording=True, figures=False)
+    run_scenario(load_scenario(written(HOVER)), tmp_path / "without", outputs)
+    assert not (tmp_path / "without" / "horizon.parquet").exists()
+    assert (tmp_path / "without" / "flight.rrd").is_file()
+    predict = (
+        "    def predict(self, states, plans):\n        return np.repeat(states[:, None], plans.shape[1], axis=1)\n"
+    )
+    run_scenario(load_scenario(written(HOVER + predict)), tmp_path / "with", outputs)
+    assert (tmp_path / "with" / "horizon.parquet").is_file()
+
+
+FULL = """
+from quadsim.controller import Command
+import numpy as np
+
+class Hover:
+    name, solver = "mine", "by-hand"
+    def __init__(self, vehicle, period, horizon):
+        self.horizon = horizon
+    def reset(self, speeds):
+        self.speeds = speeds
+    def step(self, now, state, reference):
+        state[:], reference[:] = np.nan, np.nan
+        return Command(speeds=self.speeds, plan=np.tile(self.speeds, (self.horizon, 1)), iterations=3)
+"""
+
+
+def test_what_it_has_is_used_and_what_it_is_told_is_a_copy(written: Write) -> None:
+    flight = fly_scenario(load_scenario(written(FULL)))
+    assert (flight.controller, flight.solver) == ("mine", "by-hand")
+    assert set(flight.log.control.iterations.tolist()) == {3}
+    assert np.isfinite(flight.log.control.state).all()
+    assert flight.outcome == "satisfied"
+
+
+@pytest.mark.parametrize("answer", ["None", "[1.0, 2.0, 3.0]", "'fast'", "[[1.0] * 4]", "object()"])
+def test_an_answer_that_is_no_command_ends_the_flight_with_that_reason(written: Write, answer: str) -> None:
+    flight = fly_scenario(load_scenario(written(HOVER.replace("return self.speeds", f"return {answer}"))))
+    assert flight.outcome == "lost"
+    shown = answer.replace("[1.0] * 4", "[1.0, 1.0, 1.0, 1.0]").replace("object()", "<object object")
+    assert str(flight.log.reason).startswith(f"at t = 0.000 s: Hover answered {shown}")
+    assert str(flight.log.reason).endswith("which is neither a Command nor 4 rotor speeds")
+
+
+def test_speeds_that_are_no_numbers_never_reach_the_plant(written: Write) -> None:
+    flight = fly_scenario(load_scenario(written(HOVER.replace("self.speeds\n", "self.speeds * np.nan\n"))))
+    assert flight.log.reason == "at t = 0.000 s: the command is not finite: [nan, nan, nan, nan]"
+
+
+class Answers:
+    """A law that writes over what it is told and what it answered, and answers a command changed in one part."""
+
+    def __init__(self, **changes: Any) -> None:
+        self._speeds, self._plan, self._changes = np.full(4, 190.0), np.full((3, 4), 190.0), changes
+
+    def step(self, now: Moment, state: Array, reference: Array) -> Command:
+        assert now.acting is not None
+        for told in (now.acting, state, reference):
+            told[:] = 7.0
+        self._speeds += 1.0
+        self._plan += 1.0
+        return replace(Command(speeds=self._speeds, plan=self._plan), **self._changes)
+
+    def predict(self, states: Array, plans: Array) -> Any:
+        return self._changes.get("predicted", np.zeros((len(states), 3, 12)))
+
+
+def test_what_it_writes_over_is_its_own() -> None:
+    law, acting, state, reference = PluginController(Answers(), 3), np.ones(4), np.ones(12), np.ones((3, 4))
+    first, second = (law.step(Moment(acting=acting), state, reference) for _ in range(2))
+    assert {*acting, *state, *reference.ravel()} == {1.0}
+    assert (first.speeds[0], second.speeds[0]) == (191.0, 192.0)
+    assert (first.plan[0, 0], second.plan[0, 0]) == (191.0, 192.0)
+
+
+@pytest.mark.parametrize(
+    ("part", "given", "rule"),
+    [
+        ("speeds", np.zeros(3), "4 numbers"),
+        ("speeds", "fast", "4 numbers"),
+        ("speeds", None, "4 numbers"),
+        ("plan", np.zeros((0, 4)), r"numbers of shape \(3, 4\)"),
+        ("plan", None, r"numbers of shape \(3, 4\)"),
+        ("plan", np.zeros((2, 4)), r"numbers of shape \(3, 4\)"),
+        ("status", None, "a text"),
+        ("fallback", None, "a whole number"),
+        ("iterations", 2.5, "a whole number"),
+        ("slack", "none", "a number"),
+    ],
+)
+def test_a_command_with_a_wrong_part_is_refused_by_its_name(part: str, given: Any, rule: str) -> None:
+    law = PluginController(Answers(**{part: given}), 3)
+    with pytest.raises(CommandError, match=rf"Answers answered a Command whose {part} must be {rule}; got "):
+        law.step(Moment(acting=np.ones(4)), np.zeros(12), np.zeros((3, 4)))
+
+
+@pytest.mark.parametrize("given", [None, np.zeros((1, 3, 12)), np.zeros((2, 12))])
+def test_a_prediction_of_another_shape_is_refused(given: Any) -> None:
+    law = PluginController(Answers(predicted=given), 3)
+    with pytest.raises(InputError, match=r"predict of Answers must give numbers of shape \(2, 3, 12\); got "):
+        law.predict(np.zeros((2, 12)), np.zeros((2, 3, 4)))
+
+
+def test_its_own_flight_errors_end_the_flight() -> None:
+    class Refuses:
+        def step(self, now: Moment, state: object, reference: object) -> Command:
+            raise CommandError("I will not", time=now.time)
+
+    with pytest.raises(CommandError, match=r"^at t = 2\.000 s: I will not$"):
+        PluginController(Refuses(), 3).step(Moment(time=2.0), np.zeros(12), np.zeros((3, 4)))
+
+
+# --- what is wrong -------------------------------------------------------------------------------------------------
+
+TAKES = "(after the vehicle it takes: period, horizon, offset)"
+WITH = '[controller]\ntype = "{module}:Hover"\nsettings = '
+WRONG = {
+    # name: (code, [controller], message)
+    "syntax": (
+        "class Hover\n",
+        None,
+        "controller.type: module 'mine' cannot be imported: SyntaxError: expected ':' (mine.py, line 1)",
+    ),
+    "raises": (
+        "\n1 / 0\n",
+        None,
+        "controller.type: module 'mine' cannot be imported: ZeroDivisionError: division by zero "
+        "(FOLDER/mine.py, line 2)",
+    ),
+    "needs": (
+        "import gone_package\n",
+        None,
+        "controller.type: module 'mine' cannot be imported: ModuleNotFoundError: No module named "
+        "'gone_package' (FOLDER/mine.py, line 1)",
+    ),
+    "attribute": (
+        HOVER,
+        'controller = "{module}:Hovr"',
+        "controller.type: 'mine' has no 'Hovr'; did you mean 'Hover'? (there are: Hover)",
+    ),
+    "empty": ("x = 1\n", None, "controller.type: 'mine' has no 'Hover'"),
+    "inner": (
+        HOVER,
+        'controller = "{module}:Hover.Inner"',
+        "controller.type: 'Hover' has no 'Inner' (there are: step)",
+    ),
+    "module": (
+        HOVER,
+        'controller = "{module}_gone.law:Hover"',
+        "controller.type must be of a module that there is: 'mine_gone' is not where the scenario file is, not in the "
+        "working directory HERE, and not installed; got 'mine_gone.law:Hover'",
+    ),
+    "submodule": (
+        HOVER,
+        'controller = "{module}.law:Hover"',
+        "controller.type must be of a module that there is: 'mine.law' is not where ...",
+    ),
+    "number": ("Hover = 3\n", None, "controller.type must be a class or a function; Hover is 3; got 'mine:Hover'"),
+    "no step": (
+        "def Hover(vehicle, **others): return vehicle.mass\n",
+        None,
+        "controller.type must be something with a method step(now, state, reference); Hover(...) gave float; "
+        "got 'mine:Hover'",
+    ),
+    "no horizon": (
+        "def Hover(vehicle, period): pass\n",
+        None,
+        "controller.type: Hover takes no argument 'horizon' (after the vehicle it takes: period)",
+    ),
+    "unknown": (
+        HOVER,
+        WITH + "{ ofset = 1 }",
+        f"controller.settings: Hover takes no argument 'ofset'; did you mean 'offset'? {TAKES}",
+    ),
+    "missing": (
+        HOVER.replace("offset=0.0", "offset"),
+        None,
+        "controller.settings: Hover cannot be called with them: missing a required argument: 'offset'",
+    ),
+    "refused": (
+        HOVER.replace("        self", "        if offset > 1: raise ValueError('too far')\n        self", 1),
+        WITH + "{ offset = 2 }",
+        "controller.settings: Hover refuses them: ValueError: too far (FOLDER/mine.py, line 6)",
+    ),
+    "reserved": (
+        HOVER,
+        WITH + "{ period = 2 }",
+        "controller.settings.period must be named as an argument is, other than vehicle, ...",
+    ),
+    "not a name": (
+        HOVER,
+        WITH + '{ "a b" = 2 }',
+        "controller.settings.a b must be named as an argument is, other than vehicle, ...",
+    ),
+    "infinite": (
+        HOVER,
+        WITH + "{ offset = inf }",
+        "controller.settings.offset must be a finite number, a text, true or false, or a ...",
+    ),
+    "date": (
+        HOVER,
+        WITH + "{ offset = [2020-01-01] }",
+        "controller.settings.offset must be a finite number, a text, true or false, ...",
+    ),
+    "form": (
+        HOVER,
+        'controller = "my module:Hover"',
+        "controller.type must be of the form package.module:Class; got 'my module:Hover'",
+    ),
+    "two": (HOVER, 'controller = "a:b:c"', "controller.type must be of the form package.module:Class; got 'a:b:c'"),
+}
+
+
+@pytest.mark.parametrize(("code", "controller", "expected"), WRONG.values(), ids=WRONG)
+def test_one_message_names_field_module_attribute_and_line(
+    written: Write, code: str, controller: str | None, expected: str
+) -> None:
+    path = written(code) if controller is None else written(code, controller)
+    said = message(path).removeprefix("mine.toml: ")
+    begins = expected.endswith("...")
+    assert said.startswith(expected[:-3]) if begins else said == expected
+    assert "\n" not in said
+
+
+def test_a_module_of_the_same_name_from_elsewhere_is_not_taken_for_it(written: Write) -> None:
+    said = message(written(HOVER, module="tomllib"))
+    assert re.fullmatch(
+        r"controller\.type: FOLDER/mine\.py cannot be imported: a module 'mine' from .*__init__\.py is loaded already; "
+        r"rename one of them",
+        said.replace("tomllib", "mine"),
+    )
+
+
+def test_wrong_input_has_exit_status_two_and_no_traceback(
+    written: Write, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out"
+    assert main(["run", written("class Hover\n"), "--no-video", "--out", str(out)]) == 2
+    told, said = capsys.readouterr().err.splitlines()
+    assert told.startswith("quadsim: runs code that is not quadsim's: controller own_")
+    assert said.startswith("quadsim: controller.type: module 'own_")
+    assert not out.exists()
+
+
+BUGS = {
+    "in its constructor": HOVER.replace("        self.speeds,", "        None + 1\n        self.speeds,"),
+    "in its step": HOVER.replace("        return self.speeds", "        return None + 1"),
+    "in its reset": HOVER + "    def reset(self, speeds):\n        None + 1\n",
+}
+
+
+@pytest.mark.parametrize("code", BUGS.values(), ids=BUGS)
+def test_a_bug_of_its_own_shows_its_traceback_and_leaves_nothing_behind(
+    written: Write, code: str, tmp_path: Path
+) -> None:
+    path, out = written(code), tmp_path / "out"
+    with pytest.raises(TypeError, match="unsupported operand") as caught:
+        main(["run", path, "--no-video", "--out", str(out)])
+    assert str(caught.traceback[-1].path) == path.replace(".toml", ".py")
+    assert not out.exists()

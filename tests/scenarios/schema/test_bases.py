@@ -1,0 +1,128 @@
+"""Scenario files that say only how they differ from another."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from quadsim.assets import vehicle_path
+from quadsim.errors import FileError, ParameterError, UnknownNameError
+from scenarios.loading import load_scenario
+from scenarios.schema.bases import merge
+from scenarios.schema.problems import ScenarioError
+
+
+def write(directory: Path, name: str, text: str) -> str:
+    (directory / name).write_text(text, encoding="utf-8")
+    return str(directory / name)
+
+
+def test_a_file_says_only_what_differs(tmp_path: Path) -> None:
+    mine = write(
+        tmp_path,
+        "mine.toml",
+        """
+        base = "paper-constrained"
+        name = "mine"
+        [vehicle]
+        mass = 4.2
+        [controller]
+        horizon = 30
+        [[constraints]]
+        name = "roll"
+        tolerance = 0.5
+        [[constraints]]
+        name = "climb"
+        signal = "vz"
+        upper = 3.0
+        """,
+    )
+    found, base = load_scenario(mine), load_scenario("paper-constrained")
+    assert (found.name, found.group, found.vehicle.mass, found.controller.horizon) == ("mine", "other", 4.2, 30)
+    assert found.reference == base.reference
+    assert found.description == base.description
+    assert [entry.name for entry in found.constraints] == [*(entry.name for entry in base.constraints), "climb"]
+    assert found.constraints[0] == base.constraints[0].model_copy(update={"tolerance": 0.5})
+    assert found.constraints[1:-1] == base.constraints[1:]
+
+
+def test_bases_have_bases_and_paths_are_their_own(tmp_path: Path) -> None:
+    (tmp_path / "deep").mkdir()
+    write(tmp_path / "deep", "light.toml", vehicle_path("lopes2011").read_text(encoding="utf-8"))
+    write(tmp_path / "deep", "first.toml", 'base = "hover"\nname = "first"\nvehicle = { file = "light.toml" }\n')
+    top = write(tmp_path, "top.toml", 'base = "deep/first.toml"\nname = "top"\nduration = 2.0\n')
+    found = load_scenario(top, ["duration=3.0"])
+    assert (found.name, found.duration) == ("top", 3.0)
+    assert found.vehicle.file == str((tmp_path / "deep" / "light.toml").resolve())
+
+
+def test_another_type_replaces_a_table() -> None:
+    base = {"reference": {"x": [1], "response_time": 2.0}, "controller": {"type": "constrained", "horizon": 5}}
+    circle = {"type": "circle", "radius": 1.0}
+    assert merge(base, {"reference": circle})["reference"] == circle
+    assert merge(base, {"controller": {"type": "constrained", "solver": "daqp"}})["controller"] == {
+        "type": "constrained",
+        "horizon": 5,
+        "solver": "daqp",
+    }
+    assert base["reference"]["x"] == [1]  # what was given is left alone
+
+
+def test_lists_without_names_are_replaced() -> None:
+    assert merge({"events": [{"at": 1.0}, {"at": 2.0}]}, {"events": [{"at": 3.0}]}) == {"events": [{"at": 3.0}]}
+
+
+def test_a_circle_of_bases_is_told(tmp_path: Path) -> None:
+    write(tmp_path, "a.toml", 'base = "b.toml"\n')
+    write(tmp_path, "b.toml", 'base = "a.toml"\n')
+    with pytest.raises(FileError, match=r"is its own base: a\.toml -> b\.toml -> a\.toml"):
+        load_scenario(str(tmp_path / "a.toml"))
+
+
+@pytest.mark.parametrize(
+    ("text", "error", "message"),
+    [
+        ("base = 3", ParameterError, r"x\.toml\.base must be a scenario's name or a path ending in \.toml; got 3"),
+        ('base = "papr-constrained"', UnknownNameError, r"did you mean 'paper-constrained'\?"),
+        ('base = "gone.toml"', FileError, r"gone\.toml: no such scenario file"),
+    ],
+)
+def test_a_wrong_base_is_told(tmp_path: Path, text: str, error: type[Exception], message: str) -> None:
+    with pytest.raises(error, match=message):
+        load_scenario(write(tmp_path, "x.toml", text))
+
+
+MISSING = [f"controller.{name} is missing" for name in ("horizon", "output_weights", "input_weights", "input_bounds")]
+WHOLE = (
+    "controller: of another type than that of its base ('constrained' in hover.toml), it replaces it whole and "
+    "inherits nothing"
+)
+
+
+@pytest.mark.parametrize("controller", ['controller = "robust"', '[controller]\ntype = "robust"'])
+def test_a_table_of_another_type_says_why_it_has_none_of_its_bases_fields(tmp_path: Path, controller: str) -> None:
+    (tmp_path / "mine.toml").write_text(f'base = "hover"\n{controller}\n')
+    (tmp_path / "above.toml").write_text('base = "mine.toml"\nduration = 3.0\n')
+    for name in ("mine.toml", "above.toml"):
+        with pytest.raises(ScenarioError) as caught:
+            load_scenario(str(tmp_path / name))
+        assert caught.value.problems == (*MISSING, WHOLE)
+
+
+def test_a_type_that_is_set_says_where_the_other_fields_are_from(tmp_path: Path) -> None:
+    (tmp_path / "mine.toml").write_text('base = "hover"\n')
+    changed = "controller: --set changed its type from 'constrained' to 'robust', and all other fields stayed"
+    for name, base in (("hover", "hover"), (str(tmp_path / "mine.toml"), "mine.toml")):
+        with pytest.raises(ScenarioError) as caught:
+            load_scenario(name, ["controller.type=robust"])
+        field, reason = caught.value.problems
+        assert field.startswith("controller.solver is not a field of the scenario file")
+        assert reason == f'{changed}; a file with base = "{base}" and a whole [controller] replaces them'
+
+
+def test_where_no_type_was_changed_or_another_value_is_wrong_nothing_is_said_of_types(tmp_path: Path) -> None:
+    for settings in (["controller.horizn=3"], ["reference.type=circle", "reference.radius=-1.0"]):
+        with pytest.raises(ScenarioError) as caught:
+            load_scenario("hover", settings)
+        assert len(caught.value.problems) == 1

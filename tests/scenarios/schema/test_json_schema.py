@@ -1,0 +1,103 @@
+"""The JSON Schema of scenario files: it says what the models say, and what no TOML file can hold is not in it."""
+
+from __future__ import annotations
+
+import json
+import tomllib
+from collections.abc import Iterator
+from typing import Any, get_args
+
+import pytest
+from jsonschema import Draft202012Validator
+
+from quadsim.assets import read_toml
+from quadsim.flight.audit import SIGNALS
+from scenarios.loading import load_scenario, scenario_names, scenario_path
+from scenarios.schema.json_schema import scenario_schema
+from scenarios.schema.scenario import Group, Scenario
+
+SCHEMA = scenario_schema()
+WHOLE, DIFFERENCE = SCHEMA["else"], SCHEMA["then"]
+VALIDATOR = Draft202012Validator(SCHEMA)
+
+
+def nodes(value: Any, path: str = "$") -> Iterator[tuple[str, dict[str, Any]]]:
+    """All tables of the schema, by their path."""
+    if isinstance(value, dict):
+        yield path, value
+        for key, inner in value.items():
+            yield from nodes(inner, f"{path}.{key}")
+    elif isinstance(value, list):
+        for i, inner in enumerate(value):
+            yield from nodes(inner, f"{path}.{i}")
+
+
+def test_it_is_plain_json_of_draft_2020_12_with_a_title_and_no_identifier() -> None:
+    assert json.loads(json.dumps(SCHEMA, allow_nan=False)) == SCHEMA
+    assert SCHEMA["$schema"] == "https://json-schema.org/draft/2020-12/schema"
+    assert SCHEMA["title"] == "A quadsim scenario"
+    assert SCHEMA["type"] == "object"
+    assert "$id" not in SCHEMA
+
+
+def test_it_has_the_fields_of_a_scenario_and_no_others() -> None:
+    assert list(WHOLE["properties"]) == list(Scenario.model_fields)
+    assert list(DIFFERENCE["properties"]) == ["base", *Scenario.model_fields]
+    assert WHOLE["additionalProperties"] is DIFFERENCE["additionalProperties"] is False
+    assert set(WHOLE["required"]) == {name for name, info in Scenario.model_fields.items() if info.is_required()}
+
+
+@pytest.mark.parametrize("name", ["duration", "seed", "group", "expect", "log_rate"])
+def test_fields_are_described_as_in_the_models(name: str) -> None:
+    assert WHOLE["properties"][name]["description"] == Scenario.model_fields[name].description
+
+
+def test_ranges_and_choices_are_told() -> None:
+    properties, tables = WHOLE["properties"], SCHEMA["$defs"]
+    assert (properties["duration"]["exclusiveMinimum"], properties["duration"]["type"]) == (0.0, "number")
+    assert properties["group"]["enum"] == list(get_args(Group))
+    assert tables["ConstraintSpec"]["properties"]["signal"]["enum"] == list(SIGNALS)
+    horizon = tables["ConstrainedSpec"]["properties"]["horizon"]
+    assert (horizon["type"], horizon["minimum"], horizon["maximum"]) == ("integer", 1, 1000)
+    assert tables["InitialSpec"]["properties"]["position"]["maxItems"] == 3
+
+
+@pytest.mark.parametrize("name", scenario_names())
+def test_the_library_is_valid(name: str) -> None:
+    VALIDATOR.validate(read_toml(scenario_path(name)))
+    VALIDATOR.validate(tomllib.loads(load_scenario(name).to_toml()))
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"base": "hover", "duraton": 3.0},
+        {"base": "hover", "effects": {"rotors": {"rise": -1.0}}},
+        {"base": "hover", "events": [{"type": "explosion", "at": 1.0}]},
+        {"base": "hover", "reference": {"type": "circle", "radius": "large"}},
+        {"base": 3},
+        {"name": "alone"},
+    ],
+)
+def test_what_is_wrong_is_invalid(wrong: dict[str, Any]) -> None:
+    assert not VALIDATOR.is_valid(wrong)
+    assert VALIDATOR.is_valid({"base": "hover", "effects": {"rotors": {"rise": 0.1}}, "controller": {"horizon": 9}})
+
+
+def test_every_reference_is_to_a_table_that_is_there() -> None:
+    references = {node["$ref"] for _, node in nodes(SCHEMA) if "$ref" in node}
+    assert "#/$defs/ConstraintSpec" in references
+    assert {reference.removeprefix("#/$defs/") for reference in references} <= set(SCHEMA["$defs"])
+
+
+def test_every_table_is_closed_and_described() -> None:
+    for name, table in SCHEMA["$defs"].items():
+        assert table["additionalProperties"] is False, name
+        assert table["description"], name
+
+
+def test_nothing_is_null() -> None:
+    """TOML has no null: what is absent is left out."""
+    for path, node in nodes(SCHEMA):
+        assert node.get("type") != "null", path
+        assert node.get("default", ...) is not None, path

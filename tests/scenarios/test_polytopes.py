@@ -1,0 +1,135 @@
+"""`[[controller.polytopes]]` and `terminal`: what is refused, the rows in SI units, and the audit by the same rows."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+
+from mpc.ocp import Problem
+from quadsim.flight import rundir
+from quadsim.flight.audit import SUM, TERMS, audit
+from quadsim.state import INDEX
+from quadsim.vehicle import N_ROTORS
+from scenarios.build import build_controller, build_problem
+from scenarios.loading import load_scenario, parse_scenario
+from scenarios.parts.limits import build_limits
+from scenarios.parts.vehicle import build_vehicle
+from scenarios.schema.problems import ScenarioError
+from tests.support import scenario_table, small_log
+
+MIXED: dict[str, Any] = {
+    "name": "mixed",
+    "of": ["pitch", "x", "speed_2"],
+    "rows": [[1.0, 2.0, 0.0], [0.0, 0.0, 1.0]],
+    "lower": [-3.0, 10.0],
+    "upper": [4.0, 240.0],
+}
+
+
+def table(**changes: Any) -> dict[str, Any]:
+    small = scenario_table()
+    small["controller"]["polytopes"] = [{**MIXED, **changes}]
+    return small
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"of": ["pitch", "x", "height"]}, "no signal named 'height'"),
+        ({"of": ["x", "x", "y"]}, "of must have distinct names"),
+        ({"rows": [[1.0, 2.0], [0.0, 1.0]]}, "rows must be lists of 3 numbers, not all 0; got [1.0, 2.0]"),
+        ({"rows": [[0.0, 0.0, 0.0], [0.0, 0.0, 1.0]]}, "not all 0"),
+        ({"lower": None, "upper": None}, "lower must be given, or upper, or both"),
+        ({"upper": [4.0]}, "upper must have one number per row, 2; got [4.0]"),
+        ({"lower": [5.0, 10.0]}, "lower must be below upper = 4.0; got 5.0"),
+        ({"tolerance_sampled": 1.0}, "tolerance_sampled must be at most tolerance = 0.0; got 1.0"),
+    ],
+)
+def test_wrong_rows_are_refused_by_their_field(changes: dict[str, Any], message: str) -> None:
+    wrong = table(**changes)
+    wrong["controller"]["polytopes"][0] = {
+        key: value for key, value in wrong["controller"]["polytopes"][0].items() if value is not None
+    }
+    with pytest.raises(ScenarioError) as caught:
+        parse_scenario(wrong)
+    assert message in str(caught.value)
+    assert "controller.polytopes" in str(caught.value)
+
+
+def test_a_polytope_must_not_be_called_like_a_constraint() -> None:
+    small = table(name="roll", rows=[[1.0, 0.0, 0.0]], lower=[-1.0], upper=[1.0])
+    with pytest.raises(ScenarioError, match="constraints must have distinct names"):
+        parse_scenario(small)
+
+
+def problem_of(small: dict[str, Any]) -> Problem:
+    scenario = parse_scenario(small)
+    return build_problem(scenario, build_vehicle(scenario))
+
+
+def test_rows_are_in_the_units_of_the_file() -> None:
+    (constraint,) = problem_of(table()).constraints
+    assert constraint.C is not None
+    assert constraint.D is not None
+    state, speeds = np.zeros(12), np.array([1.0, 20.0, 3.0, 4.0])
+    state[INDEX["pitch"]], state[INDEX["x"]] = math.radians(0.5), 3.0
+    np.testing.assert_allclose(constraint.C @ state + constraint.D @ speeds, [0.5 + 6.0, 20.0])
+    np.testing.assert_array_equal(constraint.upper, [4.0, 240.0])
+    assert constraint.penalty is None
+
+
+def test_the_audit_sees_the_same_rows_at_the_physics_rate() -> None:
+    scenario, log = parse_scenario(table()), small_log()
+    limits = [limit for limit in build_limits(scenario) if limit.signal == SUM]
+    assert [limit.name for limit in limits] == ["mixed_1", "mixed_2"]
+    assert [limit.unit for limit in limits] == ["-", "rad/s"]
+    (constraint,) = problem_of(table()).constraints
+    assert constraint.C is not None
+    assert constraint.D is not None
+    values = log.plant.state @ constraint.C.T + log.plant.speeds @ constraint.D.T
+    for row, finding in enumerate(audit(log, tuple(limits))):
+        margin = np.minimum(values[:, row] - constraint.lower[row], constraint.upper[row] - values[:, row])
+        assert finding.worst_margin == pytest.approx(margin.min(), abs=1e-9)
+        assert finding.worst_time == log.plant.t[np.argmin(margin)]
+        assert rundir.limit_from_json(rundir.limit_to_json(finding)) == finding.limit
+
+
+def test_every_term_has_both_rates() -> None:
+    log = small_log()
+    assert len(TERMS) == 12 + N_ROTORS
+    for signal in TERMS.values():
+        assert signal.plant is not None
+        assert signal.sampled(log.control).shape == log.control.t.shape
+        assert signal.plant(log.plant).shape == log.plant.t.shape
+
+
+def test_a_turned_model_has_no_rows_of_world_axes() -> None:
+    """The model of `heading` moves in axes turned by the yaw, where a row of x would be another one each period."""
+    with pytest.raises(ScenarioError, match="fence must not be of x where heading turns the hover model"):
+        load_scenario("robust", ['controller.polytopes=[{name="fence", of=["x"], rows=[[1.0]], upper=[3.0]}]'])
+
+
+def test_the_robust_controller_takes_them_too() -> None:
+    settings = [
+        "controller.heading=false",
+        'controller.terminal="lqr"',
+        'controller.polytopes=[{name="fence", of=["x"], rows=[[1.0]], upper=[3.0], soft={}}]',
+    ]
+    scenario = load_scenario("robust", settings)
+    assert build_controller(scenario, build_vehicle(scenario)).name == "robust"
+    assert "fence" in [limit.name for limit in build_limits(scenario)]
+
+
+def test_a_terminal_weight_needs_a_riccati_equation_with_a_solution() -> None:
+    small = scenario_table()
+    small["controller"] |= {"terminal": "lqr", "output_weights": {"z": 1.0}}
+    with pytest.raises(Exception, match=r"terminal must be left out, or weights on all of x, y, z and yaw"):
+        problem_of(small)
+
+
+def test_a_terminal_weight_is_of_the_hover_model() -> None:
+    with pytest.raises(ScenarioError, match='terminal must be absent where linearisation is not "hover"'):
+        load_scenario("robust", ['controller.terminal="lqr"', 'controller.linearisation="trajectory"'])

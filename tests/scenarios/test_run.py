@@ -1,0 +1,343 @@
+"""Whole runs: equal bytes from equal scenarios, the summary of the contract, and flights that end early."""
+
+from __future__ import annotations
+
+import errno
+import tomllib
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+
+from quadsim.assets import vehicle_path
+from quadsim.controller import SOLVED, UNCONSTRAINED
+from quadsim.errors import InputError, OutputError
+from quadsim.flight import rundir
+from quadsim.flight.parquet import FLIGHT_FILE, HORIZON_FILE, PLANT_FILE, TIMING_FILE
+from quadsim.flight.rundir import Run
+from quadsim.sim import loop
+from scenarios.build import build_controller
+from scenarios.loading import load_scenario, parse_scenario
+from scenarios.machine import PACKAGES
+from scenarios.parts.vehicle import build_vehicle
+from scenarios.run import Outputs, fly_scenario, run_scenario
+
+TABLES = Outputs(video=False, recording=False, figures=False)
+SHORT = "duration=0.5"
+UPSIDE = "initial.euler=[60.0, 0.0, 0.0]"
+"""A start from which no plan brings roll within its bound: the first QP is infeasible."""
+
+TOO_WEAK = [
+    "duration=10",
+    "plant.limit_speeds=true",
+    "vehicle.speed_max=192.801",  # just enough to hover: height that is lost never comes back
+    "initial.euler=[4.9, 0.0, 30.0]",
+    "controller.horizon=10",
+    "controller.output_bounds.z=[-1.0, 20.0]",
+]
+
+CONTRACT = {
+    "scenario": str,
+    "status": str,
+    "duration": float,
+    "seed": int,
+    "tracking.rmse.x": float,
+    "tracking.rmse.yaw": float,
+    "tracking.max_error.z": float,
+    "tracking.final_error.y": float,
+    "tracking.overshoot.x": float,
+    "tracking.settling.0.channel": str,
+    "tracking.settling.0.time": float,
+    "tracking.settling.0.before": float,
+    "tracking.settling.0.after": float,
+    "constraints.0.name": str,
+    "constraints.0.unit": str,
+    "constraints.0.lower": float,
+    "constraints.0.upper": float,
+    "constraints.0.tolerance": float,
+    "constraints.0.peak_sampled": float,
+    "constraints.0.peak_plant": float,
+    "constraints.0.worst_margin": float,
+    "constraints.0.time_violated": float,
+    "constraints.0.satisfied": bool,
+    "control.speed_min": float,
+    "control.speed_max": float,
+    "control.slew_min": float,
+    "control.slew_max": float,
+    "control.total_variation": float,
+    "controller.name": str,
+    "controller.solver": str,
+    "controller.statuses.solved": int,
+    "controller.fallbacks.0": int,
+    "controller.iterations.mean": float,
+    "controller.iterations.max": int,
+    **{f"controller.{what}_ms.{value}": float for what in ("solve", "step") for value in ("p50", "p95", "p99", "max")},
+    "controller.deadline_ms": float,
+    "controller.deadline_misses": int,
+    "wall_s.simulate": float,
+    "wall_s.total": float,
+    "versions.mujoco": str,
+    "machine.cores": int,
+}
+
+
+def at(summary: dict[str, Any], path: str) -> Any:
+    value: Any = summary
+    for key in path.split("."):
+        value = value[int(key)] if isinstance(value, list) else value[key]
+    return value
+
+
+def run(target: Path, *settings: str, name: str = "paper-constrained") -> Run:
+    run_scenario(load_scenario(name, settings), target, TABLES)
+    return rundir.load_run(target)
+
+
+def interrupt_after(periods: int) -> Callable[[str, int, int], None]:
+    """A progress report that is Ctrl-C once so many periods are flown."""
+
+    def report(stage: str, done: int, total: int) -> None:
+        if stage == "flight" and done == periods:
+            raise KeyboardInterrupt
+
+    return report
+
+
+# --- what a run is -------------------------------------------------------------------------------------------------
+
+
+def test_equal_scenarios_give_equal_bytes(short_run_directory: Path, tmp_path: Path) -> None:
+    again = run(tmp_path / "again", "duration=6.0").directory
+    for name in (FLIGHT_FILE, PLANT_FILE, HORIZON_FILE, "scenario.toml"):
+        assert (again / name).read_bytes() == (short_run_directory / name).read_bytes(), name
+    assert (again / TIMING_FILE).read_bytes() != (short_run_directory / TIMING_FILE).read_bytes()  # a clock's
+
+
+def test_a_runs_own_scenario_file_flies_it_again(short_run_directory: Path, tmp_path: Path) -> None:
+    scenario = load_scenario(str(short_run_directory / "scenario.toml"))
+    run_scenario(scenario, tmp_path / "again", TABLES)
+    assert (tmp_path / "again" / PLANT_FILE).read_bytes() == (short_run_directory / PLANT_FILE).read_bytes()
+
+
+@pytest.mark.parametrize("path", CONTRACT)
+def test_the_summary_has_every_entry_of_the_contract(short_run: Run, path: str) -> None:
+    value = at(short_run.summary, path)
+    assert type(value) is CONTRACT[path] or (CONTRACT[path] is float and type(value) is int)
+
+
+def test_the_summary_is_that_of_the_flight(short_run: Run) -> None:
+    summary, log = short_run.summary, short_run.log
+    assert (summary["scenario"], summary["status"], summary["reason"]) == ("paper-constrained", "completed", None)
+    assert (summary["duration"], summary["seed"]) == (6.0, 0)
+    assert summary["controller"]["statuses"] == dict(sorted(Counter(log.control.status).items()))
+    assert summary["controller"]["statuses"].keys() == {SOLVED, UNCONSTRAINED}
+    assert summary["control"]["speed_max"] == log.control.speeds.max()
+    assert summary["tracking"]["final_error"]["z"] == log.control.state[-1, 4] - log.control.reference[-1, 2]
+    assert summary["wall_s"]["total"] >= summary["wall_s"]["simulate"] > 0.0
+    assert set(summary["versions"]) == {"quadsim", "python", *PACKAGES}
+    scenario = tomllib.loads((short_run.directory / "scenario.toml").read_text())
+    assert [entry["name"] for entry in summary["constraints"]] == [entry["name"] for entry in scenario["constraints"]]
+    assert parse_scenario(scenario).vehicle.mass == summary["vehicle"]["mass"] == 4.0
+
+
+def test_hashes_are_those_of_the_files(short_run: Run) -> None:
+    assert short_run.summary["files"] == rundir.file_hashes(short_run.directory)
+
+
+def test_the_audit_sees_the_physics_rate_whatever_the_log_rate(tmp_path: Path) -> None:
+    dense, sparse = (run(tmp_path / rate, "duration=2.0", f"log_rate={rate}") for rate in ("1000", "20"))
+    assert (dense.log.plant.t.size, sparse.log.plant.t.size) == (2001, 41)
+    assert dense.summary["constraints"] == sparse.summary["constraints"]
+    margin = min(5.0 - np.abs(np.degrees(dense.log.plant.state[:, 6])))
+    assert dense.summary["constraints"][0]["worst_margin"] == pytest.approx(margin)
+
+
+def test_the_seed_is_recorded(tmp_path: Path) -> None:
+    flown = run(tmp_path / "run", SHORT, "seed=7")
+    assert flown.summary["seed"] == 7
+    assert pq.read_schema(flown.directory / FLIGHT_FILE).metadata[b"seed"] == b"7"
+
+
+def test_durations_are_told_without_rounding_errors(tmp_path: Path) -> None:
+    settings = ("control_period=0.1", "duration=0.3", "controller.horizon=10")
+    assert run(tmp_path / "run", *settings).summary["duration"] == 0.3  # 3 * 0.1 is not
+
+
+@pytest.mark.parametrize("name", ["paper-constrained", "paper-unconstrained"])
+@pytest.mark.parametrize("horizon", [1, 2, 3, 7, 11])
+def test_any_horizon_flies(name: str, horizon: int) -> None:
+    """Also those that no block of a partially condensed QP divides."""
+    settings = [SHORT, f"controller.horizon={horizon}"]
+    by_qp = ["controller.shortcut=false"] if name == "paper-constrained" else []
+    flight = fly_scenario(load_scenario(name, settings + by_qp))
+    assert flight.log.control.status == (SOLVED,) * 10
+    assert flight.log.predicted is not None
+    assert flight.log.predicted.shape == (10, horizon, 3)
+
+
+def test_a_second_run_replaces_the_first(tmp_path: Path) -> None:
+    run(tmp_path / "run", SHORT)
+    assert run(tmp_path / "run", SHORT, "seed=1").summary["seed"] == 1
+    assert [path.name for path in tmp_path.iterdir()] == ["run"]
+
+
+# --- flights that end early ----------------------------------------------------------------------------------------
+
+
+def test_a_flight_that_cannot_begin_is_recorded_with_its_reason(tmp_path: Path) -> None:
+    flown = run(tmp_path / "run", UPSIDE)
+    reason = "at t = 0.000 s: the solver answered 'primal_infeasible' with no plan to hold"
+    assert (flown.summary["status"], flown.summary["reason"]) == ("aborted", reason)
+    assert (flown.log.status, flown.log.reason) == ("aborted", reason)
+    assert flown.summary["satisfied"] is False
+    assert flown.summary["duration"] == 0.0
+    assert flown.summary["tracking"] == flown.summary["control"] == {}
+    assert (flown.log.control.t.size, flown.log.plant.t.size) == (0, 1)
+    assert np.degrees(flown.log.plant.state[0, 6]) == pytest.approx(60.0)
+    assert {"scenario.toml", FLIGHT_FILE, TIMING_FILE, PLANT_FILE} == set(flown.summary["files"])
+
+
+def test_a_flight_lost_on_the_way_is_recorded_up_to_there(tmp_path: Path) -> None:
+    """Rotors too weak to climb, which the controller does not know: it falls below its bound, and gives up."""
+    flown = run(tmp_path / "run", *TOO_WEAK)
+    periods = flown.log.control.t.size
+    assert 0 < periods < 200
+    assert flown.summary["reason"].startswith(f"at t = {0.05 * periods:.3f} s: the solver answered 'primal_infeasible'")
+    assert flown.summary["reason"].endswith("after holding the last plan for 9 periods")
+    assert flown.summary["duration"] == flown.log.plant.t[-1] == pytest.approx(0.05 * periods)
+    assert flown.summary["controller"]["fallbacks"] == {"0": periods - 9, "1": 9}
+    assert flown.log.plant.state[-1, 4] < -1.0
+
+
+def test_a_flight_that_was_interrupted_is_not_what_any_scenario_expects(tmp_path: Path) -> None:
+    scenario = load_scenario("hover", [SHORT, "expect=lost"])
+    flight = run_scenario(scenario, tmp_path / "run", TABLES, interrupt_after(3))
+    assert flight.outcome == "lost"
+    assert rundir.read_summary(tmp_path / "run")["as_expected"] is False
+
+
+def test_ctrl_c_in_flight_keeps_what_was_flown(tmp_path: Path) -> None:
+    scenario = load_scenario("paper-constrained", ["duration=6.0"])
+    flight = run_scenario(scenario, tmp_path / "run", TABLES, interrupt_after(33))
+    flown = rundir.load_run(tmp_path / "run")
+    assert flight.log.interrupted
+    assert flown.summary["reason"] == "at t = 1.650 s: interrupted (Ctrl-C)"
+    assert flown.log.control.t.size == 33
+    assert flown.log.plant.t[-1] == 1.65
+    assert rundir.damaged_files(flown.directory, flown.summary) == []
+
+
+def test_what_was_flown_until_then_is_what_would_have_been(short_run: Run, tmp_path: Path) -> None:
+    scenario = load_scenario("paper-constrained", ["duration=6.0"])
+    flight = run_scenario(scenario, tmp_path / "run", TABLES, interrupt_after(33))
+    np.testing.assert_array_equal(flight.log.control.speeds, short_run.log.control.speeds[:33])
+
+
+# --- nothing is ever half written ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("settings", "problem"),
+    [
+        (["vehicle.mass=0.0"], "vehicle.mass must be positive; got 0.0"),
+        (["vehicle.speed_min=300.0"], "vehicle.speed_min must be below speed_max"),
+        (["vehicle.file=gone.toml"], "gone.toml: no such vehicle file"),
+    ],
+)
+def test_a_wrong_vehicle_leaves_no_directory(tmp_path: Path, settings: list[str], problem: str) -> None:
+    with pytest.raises(InputError, match=problem):
+        run_scenario(load_scenario("paper-constrained", settings), tmp_path / "new" / "run", TABLES)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_numbers_that_no_gain_can_be_computed_from_are_refused() -> None:
+    scenario = load_scenario("paper-unconstrained", ["vehicle.inertia=[1e-12, 1e-12, 1e-12]"])
+    with pytest.raises(InputError, match=r"the controller's gain cannot be computed: .* orders of magnitude apart"):
+        build_controller(scenario, build_vehicle(scenario))
+
+
+@pytest.mark.parametrize("table", [FLIGHT_FILE, TIMING_FILE, PLANT_FILE, HORIZON_FILE])
+def test_a_disk_that_fills_up_while_a_table_is_written_leaves_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, table: str
+) -> None:
+    write_table = pq.write_table
+
+    def full(data: Any, file: BinaryIO, **options: Any) -> None:
+        write_table(data, file, **options)
+        if Path(file.name).name == table:
+            file.truncate(100)
+            raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(pq, "write_table", full)
+    with pytest.raises(OutputError, match=r"run: No space left on device$"):
+        run(tmp_path / "new" / "run", SHORT)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("error", [OSError(errno.ENOSPC, "No space left on device"), KeyboardInterrupt()])
+def test_a_run_whose_products_cannot_be_finished_leaves_the_earlier_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: BaseException
+) -> None:
+    earlier = run(tmp_path / "run", SHORT)
+
+    def failing(*_: object) -> None:
+        raise error
+
+    monkeypatch.setattr("quadsim.report.figures.flight_figures.write_figures", failing)
+    with pytest.raises((OutputError, KeyboardInterrupt)):
+        run_scenario(load_scenario("hover", [SHORT]), tmp_path / "run", Outputs(video=False))
+    assert rundir.read_summary(tmp_path / "run") == earlier.summary
+    assert [path.name for path in tmp_path.iterdir()] == ["run"]
+
+
+def test_a_defect_of_our_own_is_not_taken_for_a_flight(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Only typed flight errors and Ctrl-C become a reason; a bug must be seen, and leave nothing behind."""
+
+    def broken(*_: object) -> None:
+        raise ZeroDivisionError
+
+    monkeypatch.setattr(loop.Plant, "advance", broken)
+    with pytest.raises(ZeroDivisionError):
+        run(tmp_path / "new" / "run", SHORT)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("cores", [1, 2])
+def test_a_recording_that_cannot_be_made_leaves_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, cores: int
+) -> None:
+    monkeypatch.setattr("scenarios.run.usable_cores", lambda: cores)
+    monkeypatch.setenv("RERUN", "off")
+    with pytest.raises(OutputError, match=r"run/flight\.rrd: rerun is switched off by the environment variable RERUN$"):
+        run_scenario(load_scenario("hover", [SHORT]), tmp_path / "new" / "run", Outputs(video=False))
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("cores", [1, 2])
+def test_outputs_are_made_as_asked_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, cores: int) -> None:
+    """Where there are cores for it, the recording by a process of its own."""
+    monkeypatch.setattr("scenarios.run.usable_cores", lambda: cores)
+    run_scenario(load_scenario("hover", [SHORT]), tmp_path / "run", Outputs(video=False))
+    names = {path.name for path in (tmp_path / "run").iterdir()}
+    assert names == {
+        "summary.json", "scenario.toml", FLIGHT_FILE, TIMING_FILE, PLANT_FILE, HORIZON_FILE, "flight.rrd", "figures",
+        ".quadsim.json",
+    }  # fmt: skip
+    assert list((tmp_path / "run" / "figures").glob("*.png"))
+    assert rundir.damaged_files(tmp_path / "run", rundir.read_summary(tmp_path / "run")) == []
+
+
+def test_a_resolved_scenario_flies_without_its_vehicle_file(tmp_path: Path) -> None:
+    file = tmp_path / "mine.toml"
+    file.write_text(vehicle_path("lopes2011").read_text().replace('name = "lopes2011"', 'name = "mine"'))
+    settings = [f"vehicle.file={file}", "vehicle.mass=4.2", "duration=0.5"]
+    first = fly_scenario(load_scenario("hover", settings))
+    file.unlink()
+    again = fly_scenario(parse_scenario(tomllib.loads(first.scenario.to_toml())))
+    assert again.vehicle == replace(first.vehicle, description="")
+    assert again.log.control.speeds.tolist() == first.log.control.speeds.tolist()
