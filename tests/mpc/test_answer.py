@@ -144,14 +144,22 @@ def off(first: float, row: int = 0) -> Array:
     ],
 )
 def test_rejection_tells_why(status: str, plan: Array, reason: str | None) -> None:
-    assert rejection(status, plan, BOUNDS, HOVER) == reason
+    assert rejection(status, plan[0], plan, BOUNDS, HOVER) == reason
 
 
 def test_rejection_is_by_speed_where_steps_are_free() -> None:
     free = ActuatorBounds.alike((0.0, 250.0))
-    assert rejection(SOLVED, off(60.0), free, HOVER) is None
-    assert rejection(SOLVED, off(60.1), free, HOVER) == "out_of_bounds"
-    assert rejection(SOLVED, off(-190.1), free, HOVER) == "out_of_bounds"
+    for change, reason in ((60.0, None), (60.1, "out_of_bounds"), (-190.1, "out_of_bounds")):
+        plan = off(change)
+        assert rejection(SOLVED, plan[0], plan, free, HOVER) == reason
+
+
+def test_a_command_need_not_be_the_plans_first_input() -> None:
+    """Both have to be finite, and the command is the one that has to be in reach."""
+    assert rejection(SOLVED, HOVER, off(40.0), BOUNDS, HOVER) is None
+    assert rejection(SOLVED, HOVER + 5.1, PLAN, BOUNDS, HOVER) == "out_of_bounds"
+    assert rejection(SOLVED, HOVER * np.nan, PLAN, BOUNDS, HOVER) == "not_finite"
+    assert rejection(SOLVED, HOVER, off(math.nan), BOUNDS, HOVER) == "not_finite"
 
 
 @given(
@@ -162,7 +170,7 @@ def test_whatever_is_clipped_is_not_rejected(seed: int, level: float) -> None:
     rng = np.random.default_rng(seed)
     before = level + rng.normal(size=4)
     plan = BOUNDS.clip_plan(level + 30.0 * rng.normal(size=(6, 4)), before)
-    assert rejection(SOLVED, plan, BOUNDS, before) is None
+    assert rejection(SOLVED, plan[0], plan, BOUNDS, before) is None
 
 
 @pytest.mark.parametrize("steps", [0, 1, 3, 4])
