@@ -256,6 +256,8 @@ def _fly(controller: str, condition: str, duration: float, injections: Sequence[
     faulty = load_scenario("paper-constrained", (settings[0], f"events=[{', '.join(events)}]"))
     if controller == "robust":
         scenario = equip(scenario, FULL, CONDITIONS[condition])
+        whole = scenario.controller.model_copy(update={"shortcut": False})
+        scenario = scenario.model_copy(update={"controller": whole})
     scenario = scenario.model_copy(update={"events": [*scenario.events, *faulty.events]})
     vehicle = build_vehicle(scenario)
     with threadpool_limits(limits=1), _failing_solver() as solver, build_plant(scenario, vehicle) as plant:

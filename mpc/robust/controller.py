@@ -75,6 +75,7 @@ class RobustMPC:
         bounds: likewise.
         settings: the parts.
         constraints: others, likewise.
+        shortcut: whether to try less than the whole QP first, see `mpc.exact.shortcut`, with the hover model.
 
     Raises:
         ParameterError: a number or a shape is not possible.
@@ -93,6 +94,7 @@ class RobustMPC:
         bounds: Bounds,
         settings: RobustSettings,
         constraints: tuple[Constraint, ...] = (),
+        shortcut: bool = True,
     ) -> None:
         if settings.delay > period:
             raise ParameterError("controller", "delay", settings.delay, f"at most the control period of {period} s")
@@ -104,7 +106,8 @@ class RobustMPC:
         problem = self._problem(objective, bounds, constraints)
         self._actuators = ActuatorBounds.of_problem(problem)
         if settings.linearisation is Linearisation.HOVER:
-            self._solver = with_shortcut(problem, QPSolver(SOLVER, problem))
+            whole = QPSolver(SOLVER, problem)
+            self._solver = with_shortcut(problem, whole) if shortcut else whole
         else:
             self._relinearised = Relinearised(problem)
         self._observer = None if settings.observer is None else DisturbanceObserver(settings.observer, period)

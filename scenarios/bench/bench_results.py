@@ -143,7 +143,7 @@ class SolverBench:
         left_out: solvers that did not take part, and why.
         growth: of each candidate; empty where that was not measured.
         growth_asked: periods asked at each horizon.
-        stages: by what they are forms of, the whole QP or that of one axis.
+        stages: of the whole QP.
         reference_kkt: worst KKT residual of the optimum that first inputs are compared with.
         versions: of what the numbers depend on.
         machine: what the times were measured on.
@@ -159,7 +159,7 @@ class SolverBench:
     left_out: Mapping[str, str]
     growth: tuple[Growth, ...]
     growth_asked: int
-    stages: Mapping[str, tuple[StageLength, ...]]
+    stages: tuple[StageLength, ...]
     reference_kkt: float
     versions: Mapping[str, str]
     machine: Mapping[str, Any]
@@ -188,7 +188,7 @@ class SolverBench:
                 {**asdict(growth), "exponents": {name: growth.exponent(name) for name in ("p50", "p99")}}
                 for growth in self.growth
             ],
-            "stages": {what: [asdict(stage) for stage in stages] for what, stages in self.stages.items()},
+            "stages": [asdict(stage) for stage in self.stages],
         }
 
 

@@ -23,7 +23,7 @@ def solver_tables(bench: SolverBench) -> list[Grid]:
     return [
         _candidates(bench),
         *([_growth(bench)] if bench.growth else []),
-        *(_stages(what, stages) for what, stages in bench.stages.items()),
+        _stages(bench.stages),
         targets_table("Targets for the solvers", solver_targets(bench)),
     ]
 
@@ -167,7 +167,7 @@ def _growth_line(growth: Growth, horizons: Sequence[int]) -> tuple[Cell, ...]:
     return line(growth.label, *pairs, " / ".join(fitted) or ABSENT)
 
 
-def _stages(what: str, stages: Sequence[StageLength]) -> Grid:
+def _stages(stages: Sequence[StageLength]) -> Grid:
     default = next(stage for stage in stages if stage.default)
     lines = []
     for stage in stages:
@@ -177,8 +177,8 @@ def _stages(what: str, stages: Sequence[StageLength]) -> Grid:
         cells = line(str(stage.variables), f"{stage.p50:.3g}", f"{stage.p99:.3g}", f"{stage.p50 / default.p50:.2f}")
         lines.append((Cell(text=label, mark=mark), *cells))
     return Grid(
-        key=f"stages-{what.replace(' ', '-')}",
-        title=f"How many steps make a stage: the {what}",
+        key="stages",
+        title="How many steps make a stage",
         head=("steps per stage", "variables", "p50 [ms]", "p99 [ms]", "p50, as a ratio to the default"),
         lines=tuple(lines),
         note="PIQP alone, timed in the same way, on the periods whose QP has active constraints. Its multistage "

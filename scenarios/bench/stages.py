@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from functools import partial
+from collections.abc import Callable, Sequence
 from typing import Final
 
 import numpy as np
 
-from mpc.exact.axes import Axis, axes
 from mpc.ocp import Problem
 from mpc.paper.condensed import condensed
 from mpc.qp import Backend, Formulation, Vectors
@@ -36,59 +34,14 @@ def time_stages(
     repeats: int,
     rng: np.random.Generator,
     progress: Progress,
-) -> Mapping[str, tuple[StageLength, ...]]:
-    """The whole QP, and that of the first axis whose outputs have bounds, where there is one."""
+) -> tuple[StageLength, ...]:
+    """The QP condensed and cut into stages of M steps, on the periods in which constraints are active."""
+    default = usual_steps(problem.model.nu)
 
-    def whole(period: int) -> Query:
+    def query(period: int) -> Query:
         reference = queries.reference[period + 1 : period + 1 + problem.horizon]
         return queries.state[period], problem.objective.desired(reference), queries.speeds_before[period]
 
-    time = partial(_time, asked=asked, between=between, repeats=repeats, rng=rng, progress=progress)
-    times = {"whole QP": time(problem, whole)}
-    bounded = [axis for axis in axes(problem) if axis.outputs.size]
-    for axis in bounded[:1]:
-
-        def part(period: int, axis: Axis = axis) -> Query:
-            state, desired, _ = whole(period)
-            return state[axis.states], desired[:, axis.regulated], axis.problem.model.u_bar
-
-        times["QP of one axis"] = _time(
-            axis.problem, part, asked, between=between, repeats=repeats, rng=rng, progress=progress
-        )
-    return times
-
-
-class _QPEntrant:
-    """A form of the QP with its back end, without a controller around it."""
-
-    def __init__(self, formulation: Formulation, backend: Backend, query: Callable[[int], Query]) -> None:
-        self.formulation, self._backend, self._query = formulation, backend, query
-        self.active: dict[int, int] = {}
-        """Constraints active in the answer, by period."""
-        backend.setup(formulation.qp)
-
-    def prepare(self, period: int) -> None:
-        """See `scenarios.bench.timing.Candidate.prepare`."""
-        self._period = period
-        self._vectors: Vectors = self.formulation.vectors(*self._query(period))
-
-    def answer(self) -> None:
-        """See `scenarios.bench.timing.Candidate.answer`."""
-        self.active[self._period] = self._backend.solve(self._vectors).active
-
-
-def _time(
-    problem: Problem,
-    query: Callable[[int], Query],
-    asked: Sequence[range],
-    *,
-    between: Callable[[], None],
-    repeats: int,
-    rng: np.random.Generator,
-    progress: Progress,
-) -> tuple[StageLength, ...]:
-    """The QP condensed and cut into stages of M steps, on the periods whose QP has active constraints."""
-    default = usual_steps(problem.model.nu)
     candidates: dict[int | None, _QPEntrant] = {None: _QPEntrant(condensed(problem), PiqpDense(), query)}
     for length in sorted({*STEPS_TRIED, default}):
         candidates[length] = _QPEntrant(Staged(problem, steps_per_stage=length), PiqpMultistage(), query)
@@ -109,3 +62,22 @@ def _time(
         size = candidate.formulation.qp.c.size
         found.append(StageLength(steps=steps, variables=size, p50=float(p50), p99=float(p99), default=steps == default))
     return tuple(found)
+
+
+class _QPEntrant:
+    """A form of the QP with its back end, without a controller around it."""
+
+    def __init__(self, formulation: Formulation, backend: Backend, query: Callable[[int], Query]) -> None:
+        self.formulation, self._backend, self._query = formulation, backend, query
+        self.active: dict[int, int] = {}
+        """Constraints active in the answer, by period."""
+        backend.setup(formulation.qp)
+
+    def prepare(self, period: int) -> None:
+        """See `scenarios.bench.timing.Candidate.prepare`."""
+        self._period = period
+        self._vectors: Vectors = self.formulation.vectors(*self._query(period))
+
+    def answer(self) -> None:
+        """See `scenarios.bench.timing.Candidate.answer`."""
+        self.active[self._period] = self._backend.solve(self._vectors).active

@@ -212,6 +212,7 @@ def _robust(spec: RobustSpec, vehicle: Vehicle, period: float) -> Controller:
         bounds=bounds,
         settings=settings,
         constraints=make_polytopes(spec),
+        shortcut=spec.shortcut,
     )
 
 

@@ -32,9 +32,6 @@ class ConstrainedSpec(BoundedSpec):
         description="QP solver, by its name in `quadsim list`",
         json_schema_extra={"enum": [*SOLVERS]},
     )
-    shortcut: bool = Field(
-        default=True, description="solve less than the whole QP where that yields its optimum; exact"
-    )
     fallback: FallbackSpec | None = Field(
         default=None, description="absent: the last plan is held, shifted, and then the flight is given up"
     )

@@ -150,6 +150,9 @@ class BoundedSpec(WeightedSpec):
     polytopes: Annotated[list[PolytopeSpec], MaxLen(MOST_ENTRIES)] = Field(
         default=[], description="further bounds on sums of states and rotor speeds; audited as well"
     )
+    shortcut: bool = Field(
+        default=True, description="solve less than the whole QP where that yields its optimum; exact"
+    )
 
     @model_validator(mode="after")
     def _check_bounds(self) -> BoundedSpec:

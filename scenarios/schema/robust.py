@@ -15,6 +15,9 @@ from scenarios.schema.optimisation import BoundedSpec, SoftSpec, Weight
 _OBSERVER: Final = ObserverSettings()
 _TIGHTENING: Final = TighteningSettings()
 
+TURNED: Final = frozenset({"x", "vx", "y", "vy", "yaw"})
+"""States that have other values in axes turned by the yaw."""
+
 Seconds = Annotated[float, Field(ge=0.0, le=10.0)]
 
 
@@ -103,11 +106,13 @@ class RobustSpec(BoundedSpec):
             raise ValueError("tightening must be absent where there are no output_bounds to tighten")
         if self.terminal is not None and self.linearisation != "hover":
             raise ValueError(f'terminal must be absent where linearisation is not "hover"; got {self.terminal!r}')
-        for polytope in self.polytopes:
-            turned = [name for name in polytope.of if name in ("x", "vx", "y", "vy")]
-            if turned and self.heading and self.linearisation == "hover":
-                raise ValueError(
-                    f"polytopes: {polytope.name} must not be of {', '.join(turned)} where heading turns the hover "
-                    'model: heading = false, or linearisation = "trajectory"'
-                )
+        if self.heading and self.linearisation == "hover":
+            bounded = {"output_bounds": [*self.output_bounds], **{each.name: each.of for each in self.polytopes}}
+            for name, states in bounded.items():
+                turned = [state for state in states if state in TURNED]
+                if turned:
+                    raise ValueError(
+                        f"{name} must not be of {', '.join(turned)} where heading turns the hover model: "
+                        'heading = false, or linearisation = "trajectory"'
+                    )
         return self

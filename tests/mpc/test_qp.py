@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from support import flight_queries, paper_problem, paper_reference
 
+from mpc.constraints import Constraint
 from mpc.exact.polish import polish
 from mpc.exact.shortcut import Shortcut
-from mpc.ocp import Constraint
 from mpc.paper.condensed import condensed
 from mpc.qp import QP, Backend, Formulation, Solution, Vectors, kkt_residuals
 from mpc.solvers import SOLVERS, QPSolver, make_backend
