@@ -127,13 +127,13 @@ class _Worker:
         if len(self._heard) < SIZE.size + size:
             return None
         try:
-            text = pickle.loads(self._heard[SIZE.size :])
+            report = pickle.loads(self._heard[SIZE.size :])
         except Exception as error:
             raise ValueError("no pickle") from error
-        if not isinstance(text, Told):
+        if not isinstance(report, Told):
             raise ValueError("something else")
         self._heard = b""
-        return text
+        return report
 
     def is_dead(self) -> bool:
         return os.waitid(os.P_PID, self.pid, os.WEXITED | os.WNOHANG | os.WNOWAIT) is not None
@@ -215,10 +215,10 @@ class _Supervisor:
 
     def _hear(self, worker: _Worker) -> None:
         try:
-            text = worker.hear()
-            if text is None:
+            report = worker.hear()
+            if report is None:
                 return
-            if not self._flying or text.answer.row["flight"] != self._flights[0]:
+            if not self._flying or report.answer.row["flight"] != self._flights[0]:
                 raise ValueError("nobody asked")
         except EOFError:
             self._lose(worker.ending())
@@ -227,8 +227,8 @@ class _Supervisor:
         else:
             self._flights.popleft()
             self._flying = False
-            self._tell(text.answer)
-            if text.spent or has_strays(worker.pid):
+            self._tell(report.answer)
+            if report.spent or has_strays(worker.pid):
                 self._dismiss()  # so that the next flight does not meet what this one left
 
     def _lose(self, ending: str) -> None:
