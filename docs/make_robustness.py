@@ -131,7 +131,7 @@ def page(measured: MismatchBench, found: Sequence[Consequence]) -> str:
             "period, the shortcut being off.\n",
             *(section(grid) for grid in fault_tables(found)),
             "## Soak\n\n`make soak` flies the full robust controller for a simulated hour on end, and requires memory "
-            "flat to 1 % and steps as quick as at the beginning, to 10 %; the tests do so for five minutes.\n",
+            "flat to 1 % and steps as quick as at the beginning, to 10 %; the tests do so for three minutes.\n",
         ]
     )
 

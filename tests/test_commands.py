@@ -11,17 +11,19 @@ from argparse import Namespace
 from pathlib import Path
 
 import pytest
+from support import Here
 
 from quadsim.errors import RenderingUnavailableError
 from quadsim.report.film.video import rendering_backend
 from scenarios.cli import main, make_parser
 from scenarios.commands import COMMANDS, EXIT_DONE
 from scenarios.loading import load_scenario
+from scenarios.run import Outputs, run_scenario
 
 ROOT = Path(__file__).resolve().parent.parent
 SHORT = ("--set", "duration=1.0", "--set", "controller.horizon=5")
 ADDED = {
-    "run": ("--no-video",),
+    "run": ("--no-video", "--set", "duration=2.0", "--set", "constraints=[]"),
     "bench solvers": (*SHORT, "--repeats", "1", "--horizons", "none"),
     "bench flight": (*SHORT, "--repeats", "1"),
     "bench render": (*SHORT, "--seconds", "0.2"),
@@ -65,12 +67,26 @@ def promised_file(options: Namespace) -> Path | None:
 
 
 @pytest.fixture
-def workplace(short_run_directory: Path, campaign: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The working directory after `make demo`, with a shorter flight in the place of both, and after a campaign."""
+def workplace(flown: Path, campaign: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The working directory after `make demo`, with a shorter flight in the place of both, and after a campaign.
+
+    The ladder's flights too are shorter, and flown in this process.
+    """
     shutil.copytree(campaign, tmp_path / "runs" / "campaigns" / campaign.name)
     for name in ("paper-unconstrained", "paper-constrained"):
-        shutil.copytree(short_run_directory, tmp_path / "runs" / name)
+        shutil.copytree(flown, tmp_path / "runs" / name)
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("scenarios.bench.mismatch.benchmark.QUICK_DURATION", 2.0)
+    monkeypatch.setattr("scenarios.bench.mismatch.benchmark.ProcessPoolExecutor", Here)
+
+
+@pytest.fixture(scope="session")
+def flown(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run of one second, which is 30 frames of film."""
+    directory = tmp_path_factory.mktemp("flown") / "paper-constrained"
+    tables = Outputs(video=False, recording=False, figures=False)
+    run_scenario(load_scenario("paper-constrained", ["duration=1.0"]), directory, tables)
+    return directory
 
 
 @pytest.fixture(scope="session")

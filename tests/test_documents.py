@@ -3,16 +3,22 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 from pathlib import Path
 from pkgutil import resolve_name
+from typing import Any
 
 import make_cost
 import make_numbers as numbers
+import numpy as np
 import pytest
+from support import Here
 
 from quadsim.report.table import grid_to_markdown
+from scenarios.cost import cost_flights
 from scenarios.cost.cost_tables import cost_tables
-from scenarios.cost.measure import fly_variations, study_cost
+from scenarios.cost.measure import study_cost
+from scenarios.cost.study import CandidateTimes, Variation
 from scenarios.loading import load_scenario
 from scenarios.run import Flight, fly_scenario
 
@@ -21,21 +27,25 @@ ENTRY_POINTS = {"quadsim.controllers"}
 """Groups of entry points, which are written like modules."""
 
 
-def test_results_in_the_readme_are_what_the_flights_give(
-    constrained_flight: Flight, unconstrained_flight: Flight
-) -> None:
-    flights = {
-        "paper-unconstrained": unconstrained_flight,
-        "paper-unconstrained-clipped": numbers.fly("paper-unconstrained-clipped"),
-        "paper-constrained": constrained_flight,
-    }
-    table = numbers.markdown(numbers.results(flights))
+def test_results_in_the_readme_are_what_the_flights_give(fly_once: Callable[..., Flight]) -> None:
+    names = ("paper-unconstrained", "paper-unconstrained-clipped", "paper-constrained")
+    table = numbers.markdown(numbers.results({name: fly_once(name) for name in names}))
     for document in ("README.md", "docs/numbers.md"):
         assert table in (ROOT / document).read_text(encoding="utf-8"), f"{document} is out of date: make numbers"
 
 
-def test_targets_in_the_documents_are_met_and_todays(constrained_flight: Flight) -> None:
-    variations = fly_variations(load_scenario("paper-constrained"))
+def test_targets_in_the_documents_are_met_and_todays(
+    constrained_flight: Flight,
+    varied_flights: dict[tuple[float, float], Flight],
+    fly_once: Callable[..., Flight],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The flights over L and d/b and by the other solver are those of tests/scenarios/test_paper.py."""
+    monkeypatch.setattr(numbers, "fly", fly_once)
+    variations = [
+        Variation(arm_length=arm, drag_to_thrust=drag, outcome=cost_flights._outcome(flight.scenario, flight.log))
+        for (arm, drag), flight in varied_flights.items()
+    ]
     table = numbers.markdown(numbers.targets(constrained_flight, variations))
     page = (ROOT / "docs/numbers.md").read_text(encoding="utf-8")
     # The last digits of residues near rounding are the processor's; everything else is to be found as it stands.
@@ -43,9 +53,15 @@ def test_targets_in_the_documents_are_met_and_todays(constrained_flight: Flight)
     assert [line for line in stable if line not in page] == []
 
 
-def test_what_constraints_cost_is_what_the_flights_give() -> None:
-    """All that no clock decides, of the flight and its counterpart; the sweeps are those of `make numbers`."""
-    few = {"tilts": (), "horizons": (), "arm_lengths": (), "drags": (), "solvers": ()}
+def test_what_constraints_cost_is_what_the_flights_give(monkeypatch: pytest.MonkeyPatch) -> None:
+    """All that no clock decides, of the flight and its counterpart; the sweeps are those of `make numbers`.
+
+    What the steps take is made up.
+    """
+    monkeypatch.setattr(cost_flights, "ProcessPoolExecutor", Here)
+    steps: dict[str, Any] = {"step_ms": np.ones(1200), "statuses": ("solved",) * 1200, "repeats": 1}
+    timed = [CandidateTimes(name=name, **steps) for name in ("gain", "as flown")]
+    few = {"tilts": (), "horizons": (), "arm_lengths": (), "drags": (), "timed": timed}
     study = study_cost(load_scenario("paper-constrained"), [load_scenario("paper-unconstrained")], **few)
     flights = {grid.key: grid for grid in cost_tables(study)}["bounds"]
     page = (ROOT / "docs/constraints-cost.md").read_text(encoding="utf-8")

@@ -79,6 +79,46 @@ BOUNDS = ActuatorBounds.alike((0.0, 250.0), (-10.0, 5.0))
 PLAN = np.tile(HOVER, (5, 1))
 
 
+def test_reach_keeps_speeds_and_steps() -> None:
+    lower, upper = BOUNDS.reach(np.array([0.0, 5.0, 192.8, 248.0]))
+    np.testing.assert_allclose(lower, [0.0, 0.0, 182.8, 238.0])
+    np.testing.assert_allclose(upper, [5.0, 10.0, 197.8, 250.0])
+
+
+@pytest.mark.parametrize(("before", "only"), [(-100.0, 0.0), (400.0, 250.0)])
+def test_speeds_come_before_steps(before: float, only: float) -> None:
+    for end in BOUNDS.reach(np.full(4, before)):
+        np.testing.assert_array_equal(end, np.full(4, only))
+
+
+def test_a_plan_in_reach_stays_and_any_other_is_brought_into_it() -> None:
+    before = HOVER
+    steady = before + np.linspace(0.0, 40.0, 9)[:, None]
+    np.testing.assert_array_equal(BOUNDS.clip_plan(steady, before), steady)
+    wild = np.random.default_rng(0).uniform(-500.0, 500.0, (30, 4))
+    clipped = BOUNDS.clip_plan(wild, before)
+    steps = np.diff(clipped, axis=0, prepend=before[None])
+    assert clipped.min() >= 0.0
+    assert clipped.max() <= 250.0
+    assert steps.min() >= -10.0 - 1e-12
+    assert steps.max() <= 5.0 + 1e-12
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"u_max": [1.0]}, r"controller\.u_max must be 4 numbers; got \[1\.0\]"),
+        ({"delta_min": [math.nan] * 4}, r"controller\.delta_min must be 4 numbers"),
+        ({"u_max": [math.inf] * 4}, r"controller\.u_min must be finite and below a finite u_max"),
+        ({"u_min": [250.0] * 4}, r"controller\.u_min must be finite and below"),
+        ({"delta_max": [-1.0] * 4}, r"controller\.delta_min must be <= 0 and delta_max = .* so that a speed can be"),
+    ],
+)
+def test_impossible_bounds_are_refused(change: dict[str, list[float]], message: str) -> None:
+    with pytest.raises(ParameterError, match=message):
+        replace(BOUNDS, **change)  # type: ignore[arg-type]
+
+
 def off(first: float, row: int = 0) -> Array:
     plan = PLAN.copy()
     plan[row, 2] += first
@@ -104,14 +144,22 @@ def off(first: float, row: int = 0) -> Array:
     ],
 )
 def test_rejection_tells_why(status: str, plan: Array, reason: str | None) -> None:
-    assert rejection(status, plan, BOUNDS, HOVER) == reason
+    assert rejection(status, plan[0], plan, BOUNDS, HOVER) == reason
 
 
 def test_rejection_is_by_speed_where_steps_are_free() -> None:
     free = ActuatorBounds.alike((0.0, 250.0))
-    assert rejection(SOLVED, off(60.0), free, HOVER) is None
-    assert rejection(SOLVED, off(60.1), free, HOVER) == "out_of_bounds"
-    assert rejection(SOLVED, off(-190.1), free, HOVER) == "out_of_bounds"
+    for change, reason in ((60.0, None), (60.1, "out_of_bounds"), (-190.1, "out_of_bounds")):
+        plan = off(change)
+        assert rejection(SOLVED, plan[0], plan, free, HOVER) == reason
+
+
+def test_a_command_need_not_be_the_plans_first_input() -> None:
+    """Both have to be finite, and the command is the one that has to be in reach."""
+    assert rejection(SOLVED, HOVER, off(40.0), BOUNDS, HOVER) is None
+    assert rejection(SOLVED, HOVER + 5.1, PLAN, BOUNDS, HOVER) == "out_of_bounds"
+    assert rejection(SOLVED, HOVER * np.nan, PLAN, BOUNDS, HOVER) == "not_finite"
+    assert rejection(SOLVED, HOVER, off(math.nan), BOUNDS, HOVER) == "not_finite"
 
 
 @given(
@@ -122,7 +170,7 @@ def test_whatever_is_clipped_is_not_rejected(seed: int, level: float) -> None:
     rng = np.random.default_rng(seed)
     before = level + rng.normal(size=4)
     plan = BOUNDS.clip_plan(level + 30.0 * rng.normal(size=(6, 4)), before)
-    assert rejection(SOLVED, plan, BOUNDS, before) is None
+    assert rejection(SOLVED, plan[0], plan, BOUNDS, before) is None
 
 
 @pytest.mark.parametrize("steps", [0, 1, 3, 4])

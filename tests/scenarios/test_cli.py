@@ -664,7 +664,7 @@ def test_a_long_flight_that_is_stopped_is_kept_up_to_there(tmp_path: Path, stop:
     while not list(tmp_path.glob(".quadsim-*.partial")):
         assert clock.monotonic() < deadline, "the flight did not begin"
         clock.sleep(0.02)
-    clock.sleep(3.0)
+    clock.sleep(1.0)
     process.send_signal(stop)
     out, err = process.communicate(timeout=30)
     assert (process.returncode, err) == (EXIT_FAILED, "")

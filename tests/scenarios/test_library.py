@@ -1,4 +1,4 @@
-"""Every scenario that ships: finite, reproducible to the byte, with the verdict that its file states."""
+"""Every scenario that ships: finite, reproducible to the bit, with the verdict that its file states."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import math
 import tomllib
 from collections.abc import Callable
 from dataclasses import fields
-from pathlib import Path
 from typing import get_args
 
 import numpy as np
@@ -14,35 +13,50 @@ import pytest
 from make_scenarios import HEAD, PAGE, TITLES, nearest, row
 
 from quadsim.controller import ACCEPTED, MISSED
-from quadsim.flight.log import FlightLog, PlantLog
-from quadsim.flight.parquet import FLIGHT_FILE, PLANT_FILE, write_log
+from quadsim.flight.log import ControlLog, FlightLog, PlantLog
 from quadsim.state import INDEX
 from scenarios.courses.csv_course import read_table
 from scenarios.loading import LIBRARY, load_scenario, parse_scenario, scenario_names
 from scenarios.run import Flight, fly_scenario, summarise
 from scenarios.schema.scenario import Group, LostSpec, Scenario
 
-ALREADY_FLOWN = {"paper-constrained": "constrained_flight", "paper-unconstrained": "unconstrained_flight"}
-"""Fixtures of the whole session."""
+SHARED = ("paper-constrained", "paper-unconstrained", "paper-unconstrained-clipped")
+"""With other modules."""
 LONGEST_DESCRIPTION = 100
+COMPARED = 8.0
+"""Of a flight and of the same one again, at least [s]."""
 
 
 @pytest.fixture(scope="module", params=scenario_names())
-def flight(request: pytest.FixtureRequest) -> Flight:
+def flight(request: pytest.FixtureRequest, fly_once: Callable[..., Flight]) -> Flight:
     """Each scenario, flown once for the tests that ask for it one after another."""
-    name = request.param
-    return request.getfixturevalue(ALREADY_FLOWN[name]) if name in ALREADY_FLOWN else fly(load_scenario(name))
+    return fly_once(request.param) if request.param in SHARED else fly_scenario(load_scenario(request.param))
 
 
-def fly(scenario: Scenario, *, seed: int | None = None) -> Flight:
-    return fly_scenario(scenario if seed is None else scenario.model_copy(update={"seed": seed}))
+def flown_again(scenario: Scenario, periods: int, *, seed: int) -> FlightLog:
+    """The flight once more with a seed, interrupted after so many periods."""
+
+    def interrupt(stage: str, done: int, total: int) -> None:
+        if done == periods < total:
+            raise KeyboardInterrupt
+
+    return fly_scenario(scenario.model_copy(update={"seed": seed}), interrupt).log
 
 
-def written(flight: Flight, directory: Path) -> tuple[bytes, bytes]:
-    """flight.parquet and plant.parquet as bytes, without the seed's name in them."""
-    directory.mkdir()
-    write_log(directory, flight.log, plant_stride=flight.scenario.plant_stride, metadata={})
-    return (directory / FLIGHT_FILE).read_bytes(), (directory / PLANT_FILE).read_bytes()
+def periods_compared(scenario: Scenario) -> int:
+    """Of the first seconds, or as long as it takes for every event to have come and gone."""
+    ends = [event.at + (getattr(event, "duration", None) or 0.0) for event in scenario.events]
+    return math.ceil(max([COMPARED, *(end + 1.0 for end in ends)]) / scenario.control_period)
+
+
+def numbers(log: FlightLog, periods: int, steps: int) -> tuple[list[bytes], list[bytes]]:
+    """The first periods of the control log and of the plant, each column as bytes."""
+
+    def columns(rows: ControlLog | PlantLog, count: int) -> list[bytes]:
+        values = [getattr(rows, field.name) for field in fields(rows)]
+        return [np.asarray(each[:count]).tobytes() for each in values if each is not None]
+
+    return columns(log.control, periods), columns(log.plant, periods * steps)
 
 
 def draws(scenario: Scenario) -> bool:
@@ -224,15 +238,17 @@ def test_every_number_in_its_log_is_finite(flight: Flight) -> None:
         assert values is None or np.isfinite(values).all(), field.name
 
 
-def test_it_is_reproducible_and_its_seed_counts_where_something_is_random(flight: Flight, tmp_path: Path) -> None:
-    """Where nothing is random, the second flight has another seed, and still the same bytes."""
-    first = written(flight, tmp_path / "first")
-    if draws(flight.scenario):
-        assert written(fly(flight.scenario), tmp_path / "again") == first
-        other = written(fly(flight.scenario, seed=flight.scenario.seed + 1), tmp_path / "other")
+def test_it_is_reproducible_and_its_seed_counts_where_something_is_random(flight: Flight) -> None:
+    """To the bit.  Where nothing is random, the second flight has another seed, and still the same numbers."""
+    scenario, steps = flight.scenario, flight.scenario.steps_per_period
+    periods = periods_compared(scenario)
+    first = numbers(flight.log, periods, steps)
+    other = numbers(flown_again(scenario, periods, seed=scenario.seed + 1), periods, steps)
+    if draws(scenario):
+        assert numbers(flown_again(scenario, periods, seed=scenario.seed), periods, steps) == first
         assert all(ours != theirs for ours, theirs in zip(first, other, strict=True))
     else:
-        assert written(fly(flight.scenario, seed=flight.scenario.seed + 1), tmp_path / "again") == first
+        assert other == first
 
 
 def test_it_shows_what_its_file_says(flight: Flight) -> None:

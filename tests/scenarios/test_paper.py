@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 
@@ -45,9 +47,11 @@ def test_constrained_flight_keeps_every_bound_and_arrives(constrained_flight: Fl
 
 @pytest.mark.parametrize("arm_length", [0.2, 0.3, 0.5])
 @pytest.mark.parametrize("drag_to_thrust", [0.012, 0.024, 0.048])
-def test_it_holds_over_the_parameters_the_paper_leaves_out(arm_length: float, drag_to_thrust: float) -> None:
-    settings = [f"vehicle.arm_length={arm_length}", f"vehicle.drag_to_thrust={drag_to_thrust}"]
-    flight = fly_scenario(load_scenario("paper-constrained", settings))
+def test_it_holds_over_the_parameters_the_paper_leaves_out(
+    varied_flights: dict[tuple[float, float], Flight], arm_length: float, drag_to_thrust: float
+) -> None:
+    flight = varied_flights[arm_length, drag_to_thrust]
+    assert (flight.vehicle.arm_length, flight.vehicle.drag_to_thrust) == (arm_length, drag_to_thrust)
     assert_constrained_flight_holds(flight, plant_tolerance=0.1)
 
 
@@ -66,8 +70,8 @@ def test_unconstrained_flight_tracks_and_leaves_every_bound(unconstrained_flight
     assert entries["speed"]["worst_margin"] == pytest.approx(-121.7, abs=0.1)
 
 
-def test_clipped_flight_shows_what_a_real_rotor_would_do() -> None:
-    flight = fly_scenario(load_scenario("paper-unconstrained-clipped"))
+def test_clipped_flight_shows_what_a_real_rotor_would_do(fly_once: Callable[..., Flight]) -> None:
+    flight = fly_once("paper-unconstrained-clipped")
     assert flight.log.control.speeds.max() > 300.0
     assert flight.log.plant.speeds.max() == 250.0
     assert flight.satisfied
@@ -86,8 +90,8 @@ def test_constraints_make_the_profile_smoother(constrained_flight: Flight, uncon
     assert total_variation(constrained_flight) < total_variation(unconstrained_flight)  # by 2 % only
 
 
-def test_both_solvers_fly_the_same_commands(constrained_flight: Flight) -> None:
-    dense = fly_scenario(load_scenario("paper-constrained", ["controller.solver=piqp-dense"]))
+def test_both_solvers_fly_the_same_commands(constrained_flight: Flight, fly_once: Callable[..., Flight]) -> None:
+    dense = fly_once("paper-constrained", "controller.solver=piqp-dense")
     difference = np.abs(dense.log.control.speeds - constrained_flight.log.control.speeds).max()
     assert difference < 1e-2
     assert dense.satisfied

@@ -13,11 +13,12 @@ from mpc.robust.controller import RobustMPC
 from mpc.solvers import Answer, QPSolver, Solver, Way
 from quadsim.controller import ACCEPTED
 from quadsim.state import Array
-from scenarios.build import build_controller, build_plant, build_reference, build_vehicle
-from scenarios.flying import fly_once
+from scenarios.build import build_controller, build_plant
+from scenarios.courses.make import build_reference
 from scenarios.loading import load_scenario
-from scenarios.navigation import build_navigation
-from scenarios.runner import Flight
+from scenarios.parts.navigation import build_navigation
+from scenarios.parts.vehicle import build_vehicle
+from scenarios.run import Flight, fly_once
 
 Query = tuple[Array, Array, Array, Rest]
 

@@ -22,7 +22,7 @@ from mpc.nonlinear.model import NonlinearModel, advance, derivative, nonlinear_m
 from mpc.robust.controller import Linearisation, RobustMPC, RobustSettings
 from mpc.robust.observer import ObserverSettings
 from mpc.solvers import QPSolver
-from quadsim.controller import ACCEPTED, SOLVED, Moment, Phase
+from quadsim.controller import ACCEPTED, SOLVED, UNCONSTRAINED, Moment, Phase
 from quadsim.errors import ParameterError
 from quadsim.sim.effects.rotors import RotorDynamics
 from quadsim.state import INDEX, POSITION, Array, make_state
@@ -123,6 +123,20 @@ def test_the_hover_matrices_are_the_papers_without_lag_and_the_nonlinear_models_
     hover = discretise(*continuous_model(vehicle, 0.03), PERIOD)
     for ours, exact in zip(hover, linearise(lagging, x[None], u[None])[:2], strict=True):
         np.testing.assert_allclose(ours, exact[0], atol=1e-7)
+
+
+@pytest.mark.parametrize("parts", [{}, {"penalty": SOFT}, EVERYTHING])
+def test_a_period_without_an_active_constraint_says_so(vehicle: Vehicle, parts: dict[str, Any]) -> None:
+    """And one with some is solved; models that change have no such shortcut."""
+    now, aside = Moment(acting=np.full(4, vehicle.hover_speed)), np.tile([5.0, 0.0, 0.0, 0.0], (50, 1))
+    controller = robust(vehicle, **parts)
+    for reference, status in ((HOLD, UNCONSTRAINED), (aside, SOLVED), (HOLD, UNCONSTRAINED)):
+        controller.reset(np.full(4, vehicle.hover_speed))
+        command = controller.step(now, np.zeros(12), reference)
+        assert command.status == status
+        assert (command.active > 0) == (status == SOLVED)
+    changing = robust(vehicle, **{**parts, "linearisation": Linearisation.STATE})
+    assert changing.step(now, np.zeros(12), HOLD).status == SOLVED
 
 
 # Soft bounds

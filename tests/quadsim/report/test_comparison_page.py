@@ -52,6 +52,12 @@ def filmed_run(short_run: Run, tmp_path_factory: pytest.TempPathFactory) -> Run:
     return dataclasses.replace(short_run, directory=directory)
 
 
+@pytest.fixture(scope="module")
+def page(short_run: Run, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Of the short flight alone."""
+    return write_comparison([short_run], tmp_path_factory.mktemp("page") / "out")
+
+
 def renamed(run: Run, scenario: str) -> Run:
     return dataclasses.replace(run, summary={**run.summary, "scenario": scenario})
 
@@ -83,28 +89,30 @@ def test_the_text_gives_outcomes_reasons_and_numbers(filmed_run: Run, aborted_ru
     assert "lost/flight.rrd" not in text
 
 
-def test_a_study_of_costs_has_a_section_and_files(short_run: Run, cost_study: CostStudy, tmp_path: Path) -> None:
+def test_a_study_of_costs_has_a_section_and_files(
+    short_run: Run, cost_study: CostStudy, page: Path, tmp_path: Path
+) -> None:
     hostile = dataclasses.replace(cost_study, name=HOSTILE)
-    page = write_comparison([short_run], tmp_path / "out", cost_section(hostile))
-    text = without_scripts(page.read_text())
+    studied = write_comparison([short_run], tmp_path / "out", cost_section(hostile))
+    text = without_scripts(studied.read_text())
     assert "What do constraints cost?" in text
     assert "&lt;script&gt;alert(1)" in text
     assert text.count('<table class="grid">') == 5
     assert text.count('<details class="folded" open>') == 2
     assert '<td class="bad">lost at 0.5 s</td>' in text
-    assert {path.name for path in page.parent.iterdir() if path.name.startswith("cost")} == {
+    assert {path.name for path in studied.parent.iterdir() if path.name.startswith("cost")} == {
         *("cost.json", "cost.md"),
         *(f"cost_{what}.{kind}" for what in ("steps", "tilt", "horizon") for kind in ("png", "svg")),
     }
     for url in re.findall(r'(?:href|src)="([^"#]+)"', text):
-        assert url == "data:," or (page.parent / url).is_file(), url
-    assert "What do constraints cost?" not in write_comparison([short_run], tmp_path / "without").read_text()
+        assert url == "data:," or (studied.parent / url).is_file(), url
+    assert "What do constraints cost?" not in page.read_text()
 
 
-def test_nothing_is_fetched(short_run: Run, tmp_path: Path) -> None:
-    page = write_comparison([short_run], tmp_path / "out").read_text()
-    assert not re.search(r"""(?:src|href)=["']?(?:https?:)?//""", without_scripts(page))
-    assert "default-src 'none'" in page
+def test_nothing_is_fetched(page: Path) -> None:
+    text = page.read_text()
+    assert not re.search(r"""(?:src|href)=["']?(?:https?:)?//""", without_scripts(text))
+    assert "default-src 'none'" in text
 
 
 def test_hostile_names_are_text(short_run: Run, tmp_path: Path) -> None:
@@ -236,10 +244,10 @@ def test_a_browser_draws_the_page_and_has_no_complaint(
     }, "no button may send data away"
 
 
-def test_the_browser_would_complain(short_run: Run, tmp_path: Path) -> None:
-    page = write_comparison([short_run], tmp_path / "out")
+def test_the_browser_would_complain(page: Path, tmp_path: Path) -> None:
     fetching = '<img src="https://example.org/picture.png"><script>console.error("seen")</script></body>'
-    page.write_text(page.read_text().replace("</body>", fetching))
-    _, console = open_page(page, tmp_path / "profile")
+    changed = tmp_path / "index.html"
+    changed.write_text(page.read_text().replace("</body>", fetching))
+    _, console = open_page(changed, tmp_path / "profile")
     assert any("seen" in line for line in console)
     assert any("Content Security Policy" in line for line in console)

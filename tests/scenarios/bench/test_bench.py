@@ -34,7 +34,6 @@ from scenarios.parts.vehicle import build_vehicle
 from scenarios.run import Flight
 
 SHORT = ("duration=3.0", "controller.horizon=10")
-ARGUMENTS = [*(word for setting in SHORT for word in ("--set", setting)), "--repeats", "2"]
 FILES = {"bench.json", "solvers.md", "solvers.png", "solvers.svg"}
 
 
@@ -249,18 +248,19 @@ def test_a_bench_is_written_whole_and_replaced_only_by_another(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     target = tmp_path / "bench"
-    command = ["bench", "solvers", *ARGUMENTS, "--solver", "daqp", "--horizons", "5,10", "--out", str(target)]
+    short = ["--set", "duration=2.0", "--set", "controller.horizon=10", "--repeats", "1"]
+    command = ["bench", "solvers", *short, "--solver", "daqp", "--horizons", "5", "--out", str(target)]
     assert main(command) == EXIT_DONE
     assert "daqp + shortcut" in capsys.readouterr().out
     assert {path.name for path in target.iterdir()} == {*FILES, ".quadsim.json"}
     kept = json.loads((target / "bench.json").read_text())
-    assert kept["asked"] == len(kept["contenders"][0]["step_ms_by_period"]) == 60
+    assert kept["asked"] == len(kept["contenders"][0]["step_ms_by_period"]) == 40
     assert kept["machine"]["cores"] >= 1
     assert "piqp" in kept["versions"]
     assert "| piqp-multistage + shortcut (default) |" in (target / "solvers.md").read_text()
     assert (target / "solvers.png").read_bytes().startswith(b"\x89PNG")
     assert main([*command, "--stride", "2", "--json"]) == EXIT_DONE
-    assert json.loads(capsys.readouterr().out)["asked"] == 40
+    assert json.loads(capsys.readouterr().out)["asked"] == 20
 
     (target / "mine.txt").write_text("not to be lost")
     assert main(command) == EXIT_WRONG_INPUT
@@ -401,10 +401,10 @@ def test_what_cannot_be_timed_is_refused(
 def test_what_a_campaign_costs_is_measured_and_told() -> None:
     told: list[tuple[int, int]] = []
     profile = bench_campaign(
-        load_scenario("hover", ["duration=2.0"]),
+        load_scenario("hover", ["duration=1.0", "controller.horizon=10"]),
         flights=6,
         rounds=1,
-        sizes=(3, 30),
+        sizes=(3, 12),
         progress=lambda stage, done, total: told.append((done, total)),
     )
     assert told == [(1, 4), (2, 4), (3, 4), (4, 4)]
@@ -414,7 +414,7 @@ def test_what_a_campaign_costs_is_measured_and_told() -> None:
         assert 0.0 < run.busy_s < run.workers * run.wall_s
         assert run.bytes > 1000
         assert 0.0 < run.overhead < 1.0
-    assert [run.flights for run in profile.growing] == [3, 30]
+    assert [run.flights for run in profile.growing] == [3, 12]
     rounds, growth, targets = campaign_tables(profile)
     assert (len(rounds.lines), len(growth.lines), len(targets.lines)) == (2, 2, 4)
     assert len(campaign_tables(replace(profile, growing=()))) == 2

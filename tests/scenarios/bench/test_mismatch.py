@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import json
 import math
-import time as clock
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import fault_injection
 import make_robustness
-import numpy as np
 import pytest
 
 from quadsim.errors import InputError, ParameterError
@@ -19,7 +17,6 @@ from quadsim.flight import metrics
 from quadsim.report.table import Mark
 from scenarios.bench.mismatch.benchmark import (
     Cell,
-    answer_all,
     fly_cell,
     mismatch_markdown,
     run_mismatch,
@@ -278,15 +275,3 @@ def test_the_command_prints_json_alone(
     printed = json.loads(capsys.readouterr().out)
     assert len(printed["flights"]) == 9
     assert {path.name for path in (tmp_path / "ladder").iterdir()} == {*FILES, ".quadsim.json"}
-
-
-def _slow_first(number: int) -> int:
-    clock.sleep(0.3 if number == 0 else 0.0)
-    return number * number
-
-
-def test_answers_come_in_the_order_of_their_questions() -> None:
-    told: list[tuple[int, int]] = []
-    found = answer_all(_slow_first, [0, 1, 2, 3], workers=2, progress=lambda done, total: told.append((done, total)))
-    np.testing.assert_array_equal(found, [0, 1, 4, 9])
-    assert told == [(1, 4), (2, 4), (3, 4), (4, 4)]

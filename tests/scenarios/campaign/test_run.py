@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import json
+import shutil
 from collections.abc import Generator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -32,7 +33,7 @@ CAMPAIGN: dict[str, Any] = {
     "flights": 12,
     "seed": 4,
     "failure": ["lost", "max_error.z > 0.2"],
-    "set": {"duration": 0.5, "constraints": []},
+    "set": {"duration": 0.5, "constraints": [], "controller": {"horizon": 10}},
     "vary": [
         {
             "name": "mass",
@@ -77,21 +78,42 @@ def plan(tmp_path: Path) -> Plan:
     return make_plan(tmp_path)
 
 
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Result:
+    """The campaign of `plan`, flown to its end without a report; nobody changes its directory."""
+    here = tmp_path_factory.mktemp("whole")
+    return fly_campaign(make_plan(here), here / "c", Alone())
+
+
+@pytest.fixture(scope="module")
+def by_two(tmp_path_factory: pytest.TempPathFactory) -> Result:
+    """The same, flown by two processes."""
+    here = tmp_path_factory.mktemp("two")
+    return fly_campaign(make_plan(here), here / "c", LocalEngine(2))
+
+
+@pytest.fixture
+def flown(whole: Result, tmp_path: Path) -> Path:
+    """A copy of its directory to go on with, or to tamper with."""
+    return Path(shutil.copytree(whole.directory, tmp_path / "c"))
+
+
 def content(result: Result) -> tuple[bytes, bytes]:
     return (result.directory / "flights.parquet").read_bytes(), (result.directory / SUMMARY_FILE).read_bytes()
 
 
-def test_results_are_the_same_bytes_whoever_flies(plan: Plan, tmp_path: Path) -> None:
-    engines = {"forwards": Alone(), "backwards": Alone(backwards=True), "two": LocalEngine(2), "one": LocalEngine(1)}
-    results = [fly_campaign(plan, tmp_path / name, engine) for name, engine in engines.items()]
+def test_results_are_the_same_bytes_whoever_flies(plan: Plan, whole: Result, by_two: Result, tmp_path: Path) -> None:
+    engines = {"backwards": Alone(backwards=True), "one": LocalEngine(1)}
+    results = [whole, by_two, *(fly_campaign(plan, tmp_path / name, engine) for name, engine in engines.items())]
     assert len({content(result) for result in results}) == 1
     assert results[0].table.num_rows == 12
     assert 0 < sum(results[0].table["failed"].to_pylist()) < 12
 
 
 @pytest.mark.parametrize("ended_by", [KeyboardInterrupt, RuntimeError])
-def test_what_was_flown_stays_and_the_rest_follows(plan: Plan, tmp_path: Path, ended_by: type[BaseException]) -> None:
-    whole = fly_campaign(plan, tmp_path / "whole", Alone())
+def test_what_was_flown_stays_and_the_rest_follows(
+    plan: Plan, whole: Result, tmp_path: Path, ended_by: type[BaseException]
+) -> None:
     with pytest.raises(ended_by):
         fly_campaign(plan, tmp_path / "again", Alone(backwards=True, stops_after=5, stopped_by=ended_by))
     manifest = read_manifest(tmp_path / "again")
@@ -103,16 +125,13 @@ def test_what_was_flown_stays_and_the_rest_follows(plan: Plan, tmp_path: Path, e
     assert [session["flights"] for session in resumed.manifest["sessions"]] == [5, 7]
 
 
-def test_resuming_a_finished_campaign_flies_nothing(plan: Plan, tmp_path: Path) -> None:
-    whole = fly_campaign(plan, tmp_path / "c", Alone())
-    before = content(whole)
-    assert content(fly_campaign(plan, tmp_path / "c", Alone(stops_after=0), resume=True)) == before
+def test_resuming_a_finished_campaign_flies_nothing(plan: Plan, whole: Result, flown: Path) -> None:
+    assert content(fly_campaign(plan, flown, Alone(stops_after=0), resume=True)) == content(whole)
 
 
-def test_more_flights_may_follow(plan: Plan, tmp_path: Path) -> None:
-    fly_campaign(plan, tmp_path / "c", Alone())
+def test_more_flights_may_follow(flown: Path, tmp_path: Path) -> None:
     more = make_plan(tmp_path, flights=15)
-    grown = fly_campaign(more, tmp_path / "c", Alone(), resume=True)
+    grown = fly_campaign(more, flown, Alone(), resume=True)
     assert content(grown) == content(fly_campaign(more, tmp_path / "d", Alone()))
     assert grown.manifest["flights"] == grown.manifest["flown"] == 15
 
@@ -132,7 +151,7 @@ def test_a_flight_that_raises_is_a_result(tmp_path: Path) -> None:
 
 
 def test_it_stops_when_the_interval_is_narrow_enough_at_the_same_flight(tmp_path: Path) -> None:
-    plan = make_plan(tmp_path, flights=60)
+    plan = make_plan(tmp_path, flights=40)
     results = [
         fly_campaign(plan, tmp_path / name, engine, until_width=0.5)
         for name, engine in {"one": Alone(), "two": LocalEngine(2)}.items()
@@ -144,7 +163,7 @@ def test_it_stops_when_the_interval_is_narrow_enough_at_the_same_flight(tmp_path
     share = results[0].summary["events"]["failure"]
     assert share["upper"] - share["lower"] <= 0.5
     resumed = fly_campaign(plan, tmp_path / "one", Alone(), resume=True)
-    assert (resumed.table.num_rows, resumed.manifest["status"]) == (60, "complete")
+    assert (resumed.table.num_rows, resumed.manifest["status"]) == (40, "complete")
 
 
 @pytest.mark.parametrize("width", [0.0, 1.0, -0.1])
@@ -168,10 +187,9 @@ def test_a_manifest_says_what_was_flown(plan: Plan, tmp_path: Path) -> None:
 # --- what is refused -----------------------------------------------------------------------------------------------
 
 
-def test_a_campaign_is_not_flown_over_without_asking(plan: Plan, tmp_path: Path) -> None:
-    fly_campaign(plan, tmp_path / "c", Alone())
+def test_a_campaign_is_not_flown_over_without_asking(plan: Plan, flown: Path) -> None:
     with pytest.raises(OutputError, match="a campaign is already there; go on with it by --resume"):
-        fly_campaign(plan, tmp_path / "c", Alone())
+        fly_campaign(plan, flown, Alone())
 
 
 def test_a_directory_of_something_else_is_left_alone(plan: Plan, tmp_path: Path) -> None:
@@ -194,11 +212,10 @@ def test_a_directory_of_something_else_is_left_alone(plan: Plan, tmp_path: Path)
     ],
 )
 def test_another_campaign_does_not_go_on_with_it(
-    plan: Plan, tmp_path: Path, changes: dict[str, Any], named: str
+    flown: Path, tmp_path: Path, changes: dict[str, Any], named: str
 ) -> None:
-    fly_campaign(plan, tmp_path / "c", Alone())
     with pytest.raises(InputError, match=rf"its {named} differs from the one there"):
-        fly_campaign(make_plan(tmp_path, **changes), tmp_path / "c", Alone(), resume=True)
+        fly_campaign(make_plan(tmp_path, **changes), flown, Alone(), resume=True)
 
 
 def test_a_latin_hypercube_does_not_grow(tmp_path: Path) -> None:
@@ -208,12 +225,13 @@ def test_a_latin_hypercube_does_not_grow(tmp_path: Path) -> None:
         fly_campaign(more, tmp_path / "c", Alone(), resume=True)
 
 
-def test_other_code_does_not_go_on_with_it(plan: Plan, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    fly_campaign(plan, tmp_path / "c", Alone())
+def test_other_code_does_not_go_on_with_it(
+    plan: Plan, flown: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(records, "code_digest", lambda: "sha256:other")
     with pytest.raises(InputError, match=r"this one differs from what flew the first flights \(code\)"):
-        fly_campaign(make_plan(tmp_path, flights=13), tmp_path / "c", Alone(), resume=True)
-    kept = fly_campaign(plan, tmp_path / "c", Alone(), resume=True)
+        fly_campaign(make_plan(tmp_path, flights=13), flown, Alone(), resume=True)
+    kept = fly_campaign(plan, flown, Alone(), resume=True)
     assert kept.manifest["code"] != "sha256:other", "nothing is missing: what flew it stays there"
 
 
@@ -228,11 +246,10 @@ def test_another_controller_of_ones_own_does_not_go_on_with_it(tmp_path: Path) -
         fly_campaign(make_plan(tmp_path, **{**changed, "flights": 3}), tmp_path / "c", Alone(), resume=True)
 
 
-def test_a_narrow_interval_does_not_take_flights_away(plan: Plan, tmp_path: Path) -> None:
-    fly_campaign(plan, tmp_path / "c", Alone())
+def test_a_narrow_interval_does_not_take_flights_away(plan: Plan, flown: Path) -> None:
     with pytest.raises(InputError, match=r"--until-width would leave out flights: .* after 10 of the 12 flights"):
-        fly_campaign(plan, tmp_path / "c", Alone(), resume=True, until_width=0.7)
-    assert read_table(tmp_path / "c" / "flights.parquet").num_rows == 12
+        fly_campaign(plan, flown, Alone(), resume=True, until_width=0.7)
+    assert read_table(flown / "flights.parquet").num_rows == 12
 
 
 def test_grids_are_gone_through_in_whole_turns(tmp_path: Path) -> None:
@@ -245,9 +262,8 @@ def test_grids_are_gone_through_in_whole_turns(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("dies_after", ["manifest.json", "campaign.toml"])
 def test_dying_while_it_grows_locks_nothing_out(
-    plan: Plan, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, dies_after: str
+    flown: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, dies_after: str
 ) -> None:
-    fly_campaign(plan, tmp_path / "c", Alone())
     more = make_plan(tmp_path, flights=15)
 
     write = Growing.write
@@ -260,8 +276,8 @@ def test_dying_while_it_grows_locks_nothing_out(
     with monkeypatch.context() as patch:
         patch.setattr(Growing, "write", then_dies)
         with pytest.raises(KeyboardInterrupt):
-            fly_campaign(more, tmp_path / "c", Alone(), resume=True)
-    assert fly_campaign(more, tmp_path / "c", Alone(), resume=True).table.num_rows == 15
+            fly_campaign(more, flown, Alone(), resume=True)
+    assert fly_campaign(more, flown, Alone(), resume=True).table.num_rows == 15
 
 
 def test_files_of_ones_own_are_not_written_over(tmp_path: Path) -> None:
@@ -282,10 +298,8 @@ def test_a_report_of_fewer_flights_goes(plan: Plan, tmp_path: Path) -> None:
 
 
 def test_a_full_disk_ends_it_with_a_message_and_resuming_completes_it(
-    plan: Plan, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    plan: Plan, whole: Result, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    whole = fly_campaign(plan, tmp_path / "whole", Alone())
-
     def full(self: Any, rows: Sequence[Row]) -> None:
         raise OutputError("part", "No space left on device")
 
@@ -299,12 +313,11 @@ def test_a_full_disk_ends_it_with_a_message_and_resuming_completes_it(
 # --- replay --------------------------------------------------------------------------------------------------------
 
 
-def test_a_replayed_flight_gives_the_campaigns_numbers(plan: Plan, tmp_path: Path) -> None:
-    result = fly_campaign(plan, tmp_path / "c", LocalEngine(2))
-    worst = recorded_flight(tmp_path / "c", None)
-    assert worst.number == result.summary["worst"][0]["flight"]
+def test_a_replayed_flight_gives_the_campaigns_numbers(by_two: Result, tmp_path: Path) -> None:
+    worst = recorded_flight(by_two.directory, None)
+    assert worst.number == by_two.summary["worst"][0]["flight"]
     for number in (None, 0, 7):
-        recorded = recorded_flight(tmp_path / "c", number)
+        recorded = recorded_flight(by_two.directory, number)
         outputs = Outputs(video=False, recording=False, figures=False)
         flight, differing = replay(recorded, tmp_path / "runs" / recorded.scenario.name, outputs)
         assert differing == []
@@ -312,42 +325,36 @@ def test_a_replayed_flight_gives_the_campaigns_numbers(plan: Plan, tmp_path: Pat
         assert (tmp_path / "runs" / recorded.scenario.name / "summary.json").is_file()
 
 
-def test_a_replay_tells_when_numbers_differ(plan: Plan, tmp_path: Path) -> None:
-    fly_campaign(plan, tmp_path / "c", Alone())
-    recorded = recorded_flight(tmp_path / "c", 3)
+def test_a_replay_tells_when_numbers_differ(whole: Result, tmp_path: Path) -> None:
+    recorded = recorded_flight(whole.directory, 3)
     other = replace(recorded, row={**recorded.row, "rmse.z": 0.0, "draw.mass": 0.0, "gone": 1.0})
     _, differing = replay(other, tmp_path / "run", Outputs(video=False, recording=False, figures=False))
     assert sorted(differing) == ["draw.mass", "gone", "rmse.z"]
 
 
-def test_a_replay_knows_that_other_code_flew_the_campaign(plan: Plan, tmp_path: Path) -> None:
-    fly_campaign(plan, tmp_path / "c", Alone())
-    assert recorded_flight(tmp_path / "c", 3).otherwise == []
-    manifest = read_manifest(tmp_path / "c")
-    with growing(tmp_path / "c", records.KIND) as files:
+def test_a_replay_knows_that_other_code_flew_the_campaign(flown: Path) -> None:
+    assert recorded_flight(flown, 3).otherwise == []
+    manifest = read_manifest(flown)
+    with growing(flown, records.KIND) as files:
         records.write({**manifest, "code": "sha256:0", "machine": {"processor": "another"}}, files)
-    assert recorded_flight(tmp_path / "c", 3).otherwise == ["code", "machine"]
+    assert recorded_flight(flown, 3).otherwise == ["code", "machine"]
 
 
-def test_the_manifest_knows_what_flew(plan: Plan, tmp_path: Path) -> None:
-    result = fly_campaign(plan, tmp_path / "c", LocalEngine(2))
-    assert result.manifest["machines"] == {processor_name(): 12}
+def test_the_manifest_knows_what_flew(by_two: Result) -> None:
+    assert by_two.manifest["machines"] == {processor_name(): 12}
 
 
-def test_a_flight_that_there_is_not_is_named(plan: Plan, tmp_path: Path) -> None:
-    fly_campaign(plan, tmp_path / "c", Alone())
+def test_a_flight_that_there_is_not_is_named(whole: Result) -> None:
     with pytest.raises(ParameterError, match=r"--flight must be one of the flights 0 to 11 of .*; got 12"):
-        recorded_flight(tmp_path / "c", 12)
+        recorded_flight(whole.directory, 12)
 
 
-def test_a_campaign_whose_files_were_changed_is_not_replayed(plan: Plan, tmp_path: Path) -> None:
-    fly_campaign(plan, tmp_path / "c", Alone())
-    path = tmp_path / "c" / "scenario.toml"
+def test_a_campaign_whose_files_were_changed_is_not_replayed(flown: Path) -> None:
+    path = flown / "scenario.toml"
     path.write_text(path.read_text().replace("duration = 0.5", "duration = 0.6"))
     with pytest.raises(InputError, match=r"scenario\.toml: is missing or not the file that was flown"):
-        recorded_flight(tmp_path / "c", 0)
+        recorded_flight(flown, 0)
 
 
-def test_the_table_reads_back(plan: Plan, tmp_path: Path) -> None:
-    result = fly_campaign(plan, tmp_path / "c", Alone())
-    assert read_table(tmp_path / "c" / "flights.parquet").equals(result.table)
+def test_the_table_reads_back(whole: Result) -> None:
+    assert read_table(whole.directory / "flights.parquet").equals(whole.table)

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from support import Here
 
 from mpc.solvers import SOLVERS
 from quadsim.controller import Moment
@@ -18,6 +21,7 @@ from scenarios.bench.queries import QueriedController, recorded
 from scenarios.build import build_controller
 from scenarios.cli import main
 from scenarios.commands import EXIT_DONE, EXIT_WRONG_INPUT
+from scenarios.cost import cost_flights
 from scenarios.cost.measure import find_study, fly_variations, study_cost
 from scenarios.cost.study import CostStudy
 from scenarios.cost.variants import without_constraints
@@ -35,9 +39,19 @@ SMALL: dict[str, Any] = {
     "solvers": ("piqp-dense",),
 }
 
+FLIGHTS_ALONE: dict[str, Any] = {**SMALL, "tilts": (), "horizons": (), "arm_lengths": (), "solvers": ()}
+
 
 def scenario(*settings: str, name: str = "paper-constrained") -> Scenario:
     return load_scenario(name, [*SETTINGS, *settings])
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _here() -> Iterator[None]:
+    """Flights are flown in this process; one test compares that with several."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(cost_flights, "ProcessPoolExecutor", Here)
+        yield
 
 
 @pytest.fixture(scope="module")
@@ -55,7 +69,8 @@ def untimed(study: CostStudy) -> dict[str, Any]:
     return data
 
 
-def test_the_study_is_the_same_however_many_processes_fly(study: CostStudy) -> None:
+def test_the_study_is_the_same_however_many_processes_fly(study: CostStudy, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(cost_flights, "ProcessPoolExecutor", ProcessPoolExecutor)
     again = study_cost(scenario(), [scenario(name="paper-unconstrained")], workers=2, **SMALL)
     assert untimed(again) == untimed(study)
 
@@ -71,7 +86,7 @@ def test_runs_can_be_compared_without_the_solver_that_flew_them(monkeypatch: pyt
 
 def test_flights_of_one_name_are_told_apart() -> None:
     slower = scenario("controller.horizon=12", name="paper-unconstrained")
-    study = study_cost(scenario(), [scenario(name="paper-unconstrained"), slower], workers=1, **SMALL)
+    study = study_cost(scenario(), [scenario(name="paper-unconstrained"), slower], workers=1, **FLIGHTS_ALONE)
     assert list(study.others) == ["paper-unconstrained", "paper-unconstrained (2)"]
 
 
@@ -102,8 +117,7 @@ def test_the_counterpart_has_the_same_weights_and_no_constraints(study: CostStud
 def test_a_compared_counterpart_is_not_told_twice() -> None:
     own = scenario()
     free = without_constraints(own).model_copy(update={"name": "counterpart"})
-    few = {**SMALL, "tilts": (), "horizons": (), "arm_lengths": (), "solvers": ()}
-    assert study_cost(own, [free], workers=1, **few).others == {}
+    assert study_cost(own, [free], workers=1, **FLIGHTS_ALONE).others == {}
 
 
 def test_sweeps_hold_their_own_value_and_their_own_settings(study: CostStudy) -> None:
@@ -170,7 +184,7 @@ def test_a_time_stands_in_a_study_once(study: CostStudy) -> None:
 
 def test_a_solver_that_is_not_installed_is_named_and_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(type(SOLVERS["qpoases"]), "installed", property(lambda entry: entry.package == "piqp"))
-    few = {**SMALL, "tilts": (), "horizons": (), "arm_lengths": (), "solvers": ("piqp-dense", "qpoases")}
+    few = {**FLIGHTS_ALONE, "solvers": ("piqp-dense", "qpoases")}
     found = study_cost(scenario(), workers=1, **few)
     assert [candidate.name for candidate in found.candidates][2:] == ["QP by piqp-dense"]
     assert "pip install 'quadsim[solvers]'" in found.left_out["qpoases"]
@@ -190,7 +204,7 @@ def test_flights_that_are_lost_stay_in_the_study() -> None:
 
 def test_progress_is_told_to_its_end() -> None:
     seen: dict[str, tuple[int, int]] = {}
-    few = {**SMALL, "horizons": (), "arm_lengths": ()}
+    few = {**FLIGHTS_ALONE, "tilts": (3.0,)}
     study_cost(scenario(), workers=1, progress=lambda stage, done, total: seen.update({stage: (done, total)}), **few)
     assert list(seen) == ["steps", "flights", "sweeps"]
     assert all(done == total > 0 for done, total in seen.values())
@@ -237,11 +251,18 @@ def test_a_run_without_a_readable_scenario_is_compared_all_the_same(runs: dict[s
 
 
 def test_compare_puts_the_study_on_the_page(
-    runs: dict[str, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    runs: dict[str, str],
+    study: CostStudy,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
-    monkeypatch.setattr(
-        "scenarios.cost.measure.study_cost", lambda *scenarios, **_: study_cost(*scenarios, workers=1, **SMALL)
-    )
+    def made(constrained: Scenario, others: Sequence[Scenario], **_: object) -> CostStudy:
+        assert constrained.name == study.name
+        assert [each.name for each in others] == list(study.others)
+        return study
+
+    monkeypatch.setattr("scenarios.cost.measure.study_cost", made)
     both = [runs["paper-unconstrained"], runs["paper-constrained"]]
     assert main(["compare", *both, "--out", str(tmp_path / "page")]) == EXIT_DONE
     written = {path.name for path in (tmp_path / "page").iterdir()}

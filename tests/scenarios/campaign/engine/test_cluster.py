@@ -13,7 +13,6 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-import dask
 import distributed
 import psutil
 import pytest
@@ -60,9 +59,14 @@ def start_cluster(workers: int = 2, threads: int = 1) -> distributed.LocalCluste
 
 
 @pytest.fixture(scope="module")
-def two_workers() -> Iterator[str]:
-    with start_cluster() as cluster:
-        yield cluster.scheduler_address
+def cluster() -> Iterator[distributed.LocalCluster]:
+    with start_cluster() as started:
+        yield started
+
+
+@pytest.fixture(scope="module")
+def two_workers(cluster: distributed.LocalCluster) -> str:
+    return str(cluster.scheduler_address)
 
 
 def fly(engine: DaskEngine, pilot: ToyPilot, flights: Sequence[int] = FLIGHTS) -> list[Row]:
@@ -156,12 +160,14 @@ class _Assassin(ToyPilot):
         return super().fly(flight)
 
 
-def test_a_flight_that_always_kills_its_worker_is_lost_in_the_end(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_flight_that_always_kills_its_worker_is_lost_in_the_end(
+    cluster: distributed.LocalCluster, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """The scheduler gives a chunk up at the first death; then each of its flights is tried alone; one is lost."""
     monkeypatch.setattr(module, "MOST_DEATHS", 2)
-    with dask.config.set({"distributed.scheduler.allowed-failures": 0}), start_cluster() as cluster:
-        # The worker has to be known to whoever restarts it before it dies.
-        rows = known(fly(DaskEngine(cluster.scheduler_address), _Assassin(asleep=0.02)))
+    monkeypatch.setattr(cluster.scheduler, "allowed_failures", 0)
+    cluster.wait_for_workers(2, timeout=30.0)  # who restarts a worker has to know it before it dies
+    rows = known(fly(DaskEngine(cluster.scheduler_address), _Assassin(asleep=0.02)))
     assert rows[20] == {"flight": 20, "value": None, "reason": "its process died 2 times"}
     assert [row for row in rows if row["flight"] != 20] == [row for row in ALL if row["flight"] != 20]
 

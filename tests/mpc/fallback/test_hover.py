@@ -1,0 +1,116 @@
+"""The law of hover: the infinite horizon's gain, the same closed loop for every vehicle, and tilt within its bound."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+import scipy.linalg
+from scripted_controller import (
+    PERIOD,
+    advance,
+    bounds,
+    level,
+    model,
+    random_state,
+)
+
+from mpc.fallback.completion import StateCompletion
+from mpc.fallback.hover import (
+    ACCEPTABLE_ACCELERATION,
+    ACCEPTABLE_POSITION,
+    ACCEPTABLE_RATE,
+    ACCEPTABLE_TILT,
+    ACCEPTABLE_VELOCITY,
+    HoverLaw,
+)
+from mpc.heading import predict_in_heading_frame, turn
+from mpc.model import LinearModel, hover_model
+from quadsim.assets import vehicle_path
+from quadsim.errors import ParameterError
+from quadsim.state import EULER, EULER_RATE, INDEX, POSITION, VELOCITY
+from quadsim.vehicle import Vehicle, load_vehicle
+
+VEHICLES = ("lopes2011", "hummingbird", "crazyflie2")
+
+
+@pytest.mark.parametrize("name", VEHICLES)
+def test_every_vehicle_has_the_same_closed_loop(name: str) -> None:
+    hover = hover_model(load_vehicle(vehicle_path(name)), PERIOD)
+    law = HoverLaw(hover, tilt=0.2)
+    closed = hover.A - hover.B @ np.linalg.solve(law.slope, law.gain)
+    decay = np.sort(-np.log(np.abs(np.linalg.eigvals(closed))) / PERIOD)
+    assert decay[0] > 1.5  # [1/s]
+    reference = HoverLaw(model(), tilt=0.2)
+    np.testing.assert_allclose(law.gain, reference.gain, rtol=1e-6, atol=1e-7)
+
+
+def test_the_gain_is_the_infinite_horizon_s() -> None:
+    law = HoverLaw(model(), tilt=0.2)
+    size = np.empty(12)
+    for group, value in (
+        (POSITION, ACCEPTABLE_POSITION),
+        (VELOCITY, ACCEPTABLE_VELOCITY),
+        (EULER, ACCEPTABLE_TILT),
+        (EULER_RATE, ACCEPTABLE_RATE),
+    ):
+        size[list(group)] = value
+    weight = law.slope.T @ np.diag(np.array(ACCEPTABLE_ACCELERATION) ** -2.0) @ law.slope
+    A, B = model().A, model().B
+    P = scipy.linalg.solve_discrete_are(A, B, np.diag(size**-2.0), weight)
+    expected = np.linalg.solve(weight + B.T @ P @ B, B.T @ P @ A)
+    error = random_state(1, 1e-3)
+    np.testing.assert_allclose(law.correction(error, 0.0), -expected @ error, rtol=1e-6)
+
+
+def test_rotor_speeds_accelerate_as_the_vehicle_says(vehicle: Vehicle) -> None:
+    allocation = 2.0 * vehicle.hover_speed * vehicle.allocation
+    resistance = np.array([vehicle.mass, *vehicle.inertia])
+    np.testing.assert_allclose(HoverLaw(model(), tilt=0.2).slope, allocation / resistance[:, None], atol=1e-12)
+
+
+@pytest.mark.parametrize("yaw", [0.5, math.pi / 2, math.pi, -2.0])
+def test_law_and_prediction_turn_with_the_heading(yaw: float) -> None:
+    law, T, error = HoverLaw(model(), tilt=0.2), turn(yaw), random_state(2)
+    np.testing.assert_allclose(law.correction(T @ error, yaw), law.correction(error, 0.0), atol=1e-12)
+    state, speeds = random_state(3), model().u_bar + np.array([3.0, -2.0, 1.0, 0.5])
+    state[INDEX["yaw"]] = 0.0
+    ahead = np.zeros(12)
+    ahead[INDEX["yaw"]] = yaw
+    np.testing.assert_allclose(advance(T @ state + ahead, speeds), T @ advance(state, speeds) + ahead, atol=1e-12)
+
+
+def test_far_away_the_law_asks_for_its_tilt_and_no_more() -> None:
+    law = HoverLaw(model(), tilt=0.15)
+    leaning = np.zeros(12)
+    leaning[INDEX["x"]] = -500.0
+    leaning[INDEX["pitch"]] = 0.15  # towards +x
+    np.testing.assert_allclose(law.correction(leaning, 0.0), 0.0, atol=1e-9)
+    leaning[INDEX["z"]] = -500.0
+    leaning[INDEX["yaw"]] = 50.0
+    np.testing.assert_allclose((law.slope @ law.correction(leaning, 0.0))[[0, 3]], [2.0, -2.0])
+
+
+def test_the_law_s_plan_is_its_closed_loop() -> None:
+    law, state, target = HoverLaw(model(), tilt=0.2), random_state(4, 0.05), np.zeros(12)
+    target[INDEX["vz"]] = -0.5
+    plan = law.plan(state, target, model().u_bar, bounds(), 200, level())
+    state = predict_in_heading_frame(model(), state[None], plan[None], level())[0, -1]
+    assert state[INDEX["vz"]] == pytest.approx(-0.5, abs=1e-3)
+    assert state[INDEX["z"]] == pytest.approx(-0.5 * 200 * PERIOD, abs=1e-2)
+    np.testing.assert_allclose(np.delete(state, [INDEX["z"], INDEX["vz"]]), 0.0, atol=1e-3)
+
+
+@pytest.mark.parametrize("tilt", [0.0, 2.0, math.nan])
+def test_an_impossible_tilt_is_refused(tilt: float) -> None:
+    with pytest.raises(ParameterError, match=r"controller\.tilt must be between 0 and pi/2 rad"):
+        HoverLaw(model(), tilt=tilt)
+
+
+@pytest.mark.parametrize("make", [StateCompletion, lambda other: HoverLaw(other, tilt=0.2)])
+def test_another_kind_of_model_is_refused(make: Callable[[LinearModel], object]) -> None:
+    other = LinearModel(A=np.eye(3), B=np.ones((3, 2)), u_bar=np.zeros(2), period=PERIOD)
+    with pytest.raises(ParameterError, match="must be one of 12 states and 4 inputs; got '3 states and 2 inputs'"):
+        make(other)

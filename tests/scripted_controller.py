@@ -1,0 +1,140 @@
+"""A controller that answers as it is told to, the guard around it, and the paper's model for both to fly by."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from functools import cache
+from typing import Any
+
+import numpy as np
+from support import paper_problem
+
+from mpc.answer import ActuatorBounds
+from mpc.equilibrium import Trim
+from mpc.fallback.contract import Guarded
+from mpc.heading import advance as advance_from
+from mpc.heading import turn
+from mpc.model import LinearModel
+from mpc.ocp import Problem
+from quadsim.controller import Command, Moment
+from quadsim.state import INDEX, Array
+
+PERIOD = 0.05
+
+
+@cache
+def problem() -> Problem:
+    return paper_problem()
+
+
+@cache
+def model() -> LinearModel:
+    return problem().model
+
+
+@cache
+def bounds() -> ActuatorBounds:
+    hard = problem().bounds
+    assert hard is not None
+    return ActuatorBounds(u_min=hard.u_min, u_max=hard.u_max, delta_min=hard.delta_min, delta_max=hard.delta_max)
+
+
+@cache
+def level() -> Trim:
+    """Of the undisturbed vehicle."""
+    return Trim(speeds=model().u_bar, lift=np.array([0.0, 0.0, 1.0]))
+
+
+@cache
+def pressed() -> Trim:
+    """Of a vehicle that is heavier than believed, blown along x and turned about its own."""
+    return Trim(speeds=model().u_bar + np.array([27.0, 31.0, 27.0, 23.0]), lift=np.array([-0.3, 0.0, 9.81]))
+
+
+def advance(state: Array, speeds: Array, trim: Trim | None = None) -> Array:
+    """The state (12,) a period later, undisturbed unless told otherwise."""
+    return advance_from(model(), state, speeds, trim or level())
+
+
+def random_state(seed: int, scale: float = 0.1) -> Array:
+    return scale * np.random.default_rng(seed).normal(size=12)
+
+
+@dataclass
+class Scripted:
+    """Plans hover with one rotor a little faster, does in each period what it is told to, and keeps what it was asked.
+
+    A script's entry changes fields of that answer, or is raised.
+    """
+
+    script: dict[int, dict[str, Any] | Exception] = field(default_factory=dict)
+    horizon: int = 30
+    name: str = "scripted"
+    solver: str = "none"
+    asked: list[tuple[Moment, Array]] = field(default_factory=list)
+    resets: list[Array] = field(default_factory=list)
+
+    def reset(self, speeds: Array) -> None:
+        self.resets.append(speeds)
+
+    def step(self, now: Moment, state: Array, reference: Array) -> Command:
+        entry = self.script.get(len(self.asked), {})
+        self.asked.append((now, state.copy()))
+        if isinstance(entry, Exception):
+            raise entry
+        plan = np.tile(model().u_bar, (self.horizon, 1))
+        plan[:, 0] += np.linspace(0.0, 0.5, self.horizon)
+        return replace(Command(speeds=plan[0].copy(), plan=plan, iterations=7), **entry)
+
+    def predict(self, states: Array, plans: Array) -> Array:
+        predicted = np.empty((*plans.shape[:2], 12))
+        for k, state in enumerate(states):
+            now = state
+            for i, speeds in enumerate(plans[k]):
+                now = predicted[k, i] = advance(now, speeds)
+        return predicted
+
+
+def guard(inner: Any, **options: Any) -> Guarded:
+    guarded = Guarded(inner, model(), **{"bounds": bounds(), **options})
+    guarded.reset(model().u_bar)
+    return guarded
+
+
+def ask(guarded: Guarded, state: Array | None = None, **now: Any) -> Command:
+    return guarded.step(Moment(**now), np.zeros(12) if state is None else state, np.zeros((guarded.horizon, 4)))
+
+
+def failing(periods: Sequence[int], **answer: Any) -> dict[int, dict[str, Any] | Exception]:
+    return dict.fromkeys(periods, answer or {"status": "numerics"})
+
+
+def following(guarded: Guarded, periods: int) -> list[Command]:
+    """Commands while the vehicle moves as the model says."""
+    state, commands = np.zeros(12), []
+    for _ in range(periods):
+        commands.append(ask(guarded, state))
+        state = advance(state, commands[-1].speeds)
+    return commands
+
+
+class Pressed(Scripted):
+    """Knows what presses the vehicle, and plans what holds it at rest."""
+
+    trim = pressed()
+
+    def step(self, now: Moment, state: Array, reference: Array) -> Command:
+        plan = np.tile(self.trim.speeds, (self.horizon, 1))
+        answer = super().step(now, state, reference)
+        return replace(answer, speeds=plan[0], plan=plan)
+
+    def predict(self, states: Array, plans: Array) -> Array:
+        raise ZeroDivisionError
+
+
+def at_rest(yaw: float) -> Array:
+    """Under `pressed`, at the origin, headed anywhere."""
+    rest = turn(yaw) @ pressed().state(yaw)
+    rest[INDEX["yaw"]] = yaw
+    return rest
