@@ -118,11 +118,11 @@ def first_to_break(result: Result) -> str:
             f"{event} at {threshold:.15g}{'' if unit == '-' else f' {unit}'}" for threshold, event in steps
         )
         found = f"It is {first}. Thresholds along it: {listed}"
-    said = [*driver_sentences(summary), *split_sentences(summary)]
+    sentences = [*driver_sentences(summary), *split_sentences(summary)]
     return (
         "## What breaks the paper's controller first\n\n"
         f"With small errors alone ({NOMINAL}), {verdict_sentence(summary)}. {found}.\n\n"
-        + "".join(f"- {sentence}\n" for sentence in said)
+        + "".join(f"- {sentence}\n" for sentence in sentences)
     )
 
 

@@ -19,7 +19,7 @@ from scenarios.cost.study import CandidateTimes, CostStudy
 
 
 def timed(bench: SolverBench) -> list[CandidateTimes]:
-    """The steps that the study tells of, as the bench has timed them: a time stands in all documents once."""
+    """The steps of the study, as the bench has timed them: each time is measured once for all documents."""
     assert bench.gain_ms is not None
     repeats = bench.default.repeats
     gain = CandidateTimes(

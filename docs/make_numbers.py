@@ -207,7 +207,7 @@ def main() -> None:
     page = [
         "# The numbers\n\nMade by `make numbers`; nothing here is typed by hand.\n",
         f"## The paper's flights\n\n{table}",
-        "A bound that is *held* may still be exceeded between the samples, by what stands in brackets; the audit's\n"
+        "A bound that is *held* may still be exceeded between the samples, by the amount in brackets; the audit's\n"
         "tolerance for it is 0.05 deg. `violated by` gives the worst excess and the seconds beyond bound and\n"
         "tolerance, at the physics rate; for steps, which exist once per period, at the samples.\n",
         "The same over the parameters that the paper leaves out, L and d/b, is in\n"

@@ -1,4 +1,4 @@
-"""Remake what docs/performance.md tells of a flight's time outside the QP: `python docs/make_outside.py BEFORE`.
+"""Remake the section of docs/performance.md on a flight's time outside the QP: `python docs/make_outside.py BEFORE`.
 
 Two checkouts, the one in the directory BEFORE and this one, fly, run and film the same in turns, each in a process of
 its own.  Times are of processors, those of child processes included, so that what else the machine does counts little.

@@ -54,7 +54,7 @@ def counts(scale: float) -> str:
 def main() -> None:
     """Remake the page's counts."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--scale", type=float, default=1.0, help="go through that share of the cases, and only tell")
+    parser.add_argument("--scale", type=float, default=1.0, help="go through that share of the cases, and only print")
     options = parser.parse_args()
     table = counts(options.scale)
     if options.scale == 1.0:

@@ -69,8 +69,8 @@ def closed_loop_section(measured: ClosedLoop) -> str:
 
 `{scenario.name}`, {scenario.periods} periods, flown by the same loop (`quadsim.sim.loop.fly`), controller and
 reference, once on MuJoCo and once on RotorPy's plant. The conversion from position, quaternion and body rates to the
-paper's state is ours in both. Whatever differs between the plants, and any command that jumps at a tiny change of the
-state, would add up over {scenario.periods * scenario.control_period:g} s:
+paper's state is quadsim's in both. Whatever differs between the plants, and any command that jumps at a tiny change of
+the state, would add up over {scenario.periods * scenario.control_period:g} s:
 
 {markdown([closed_loop.HEAD, *measured.rows])}"""
 
@@ -112,8 +112,8 @@ an active-set method, exact to rounding). For x_(j+1) = A x_j + B v_j qpmpc mini
     |x_N - goal|^2 + sum_(j=0..N-1) (|x_j - target_j|^2 + |v_j|^2)
     subject to   C x_j + D v_j <= e   for j = 0 .. N-1.
 
-- Its weights are scalars, so ours go into the coordinates: x holds S xi, and v = R (u - u_bar), with S and R the square
-  roots of the diagonal weights.
+- Its weights are scalars, so the paper's go into the coordinates: x holds S xi, and v = R (u - u_bar), with S and R the
+  square roots of the diagonal weights.
 - States without weight are scaled by 2^-30. A power of two rounds nothing, and the weight that it leaves, 1e-18, is
   below the rounding of the others.
 - The bounds on u(k+j) - u(k+j-1) need the input before: x holds it too, without weight, and starts with u(k-1).

@@ -114,7 +114,7 @@ def rejection(status: str, speeds: Array, plan: Array, bounds: ActuatorBounds, b
     """Why an answer must not reach the plant, or None.
 
     Args:
-        status: what is said of it.
+        status: the solver's.
         speeds: (4,) the command [rad/s].
         plan: (N, 4) the inputs planned [rad/s].
         bounds: hard bounds.

@@ -148,8 +148,8 @@ class LostError(FlightError):
         limit: what it may be.
     """
 
-    def __init__(self, criterion: str, said: str, unit: str, *, value: float, limit: float, time: float) -> None:
-        message = f"lost: {said} {value:.5g} {unit}, beyond lost.{criterion} = {limit:g} {unit}"
+    def __init__(self, criterion: str, quantity: str, unit: str, *, value: float, limit: float, time: float) -> None:
+        message = f"lost: {quantity} {value:.5g} {unit}, beyond lost.{criterion} = {limit:g} {unit}"
         super().__init__(message, time=time)
         self.criterion, self.value, self.limit = criterion, value, limit
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 Progress = Callable[[str, int, int], None]
-"""Told (what, done, total) as long work goes on."""
+"""Called with (what, done, total) during long work."""
 
 
 def silent(stage: str, done: int, total: int) -> None:

@@ -61,7 +61,7 @@ _REFERENCE: Final = list(REFERENCE_STATES)
 class RobustMPC:
     """One optimum per period; see the module.
 
-    It keeps no plan for bad times: what is not solved is said so by the status, with the command in force, for
+    It holds no earlier plan: where nothing is solved, the status says so, with the command in force, for
     `mpc.fallback.contract.Guarded` to act on.
 
     Attributes:

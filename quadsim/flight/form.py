@@ -90,8 +90,8 @@ def read_json(path: Path, form: Mapping[str, Any], what: str) -> dict[str, Any]:
     except (OSError, RecursionError, ValueError) as error:
         if isinstance(error, FileError):
             raise
-        said = "it is nested too deep" if isinstance(error, RecursionError) else printable(str(error))[:200]
-        raise FileError(path, f"is not {what} ({said})") from error
+        reason = "it is nested too deep" if isinstance(error, RecursionError) else printable(str(error))[:200]
+        raise FileError(path, f"is not {what} ({reason})") from error
     if not isinstance(found, dict):
         raise FileError(path, f"is not {what}: it is no table")
     wrong = [printable(name)[:100] for name in misfits(found, form)]

@@ -15,7 +15,7 @@ CRITERIA: Final = {
     "depth": ("the depth below the lowest of start and reference is", "m"),
     "speed": ("the speed is", "m/s"),
 }
-"""What is said of each criterion of `LossCriteria`, and its unit; the first that is met is the reason."""
+"""Name of each criterion of `LossCriteria`, and its unit; the first that is met is the reason."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,7 +56,7 @@ def check_loss(criteria: LossCriteria, time: float, state: Array, reference: Arr
     within = tilt <= criteria.tilt and distance <= criteria.distance
     if within and depth <= criteria.depth and speed <= criteria.speed:
         return
-    for (name, (said, unit)), value in zip(CRITERIA.items(), (tilt, distance, depth, speed), strict=True):
+    for (name, (quantity, unit)), value in zip(CRITERIA.items(), (tilt, distance, depth, speed), strict=True):
         limit = getattr(criteria, name)
         if value > limit:
-            raise LostError(name, said, unit, value=value, limit=limit, time=time)
+            raise LostError(name, quantity, unit, value=value, limit=limit, time=time)

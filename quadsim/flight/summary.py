@@ -131,8 +131,8 @@ def read_summary(directory: Path) -> dict[str, Any]:
     wrong = list(misfits(flown, _FLOWN)) if summary["tracking"] or summary["control"] else []
     if wrong:
         raise FileError(path, f"is not {_WHAT}: it lacks or misstates {', '.join(map(printable, wrong[:10]))}")
-    if said := next(contradictions(summary), None):
-        raise FileError(path, f"contradicts itself: {printable(said)}")
+    if problem := next(contradictions(summary), None):
+        raise FileError(path, f"contradicts itself: {printable(problem)}")
     return summary
 
 

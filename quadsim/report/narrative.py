@@ -128,9 +128,9 @@ def _limit_sentences(named: _Named) -> Iterator[str]:
 def _case(entry: _Summary) -> str:
     """What one run did to one bound, e.g. `exceeds it by 5.62 deg, for 3.24 s in all`."""
     if not entry["satisfied"]:
-        phrases = f"{'violates' if entry['required'] else 'exceeds'} it {format_excess(entry)}"
+        text = f"{'violates' if entry['required'] else 'exceeds'} it {format_excess(entry)}"
         seconds = entry["time_violated"]
-        return f"{phrases}, for {format_number(seconds)} s in all" if seconds else phrases
+        return f"{text}, for {format_number(seconds)} s in all" if seconds else text
     margin = min(entry["worst_margin_sampled"], entry["worst_margin"])
     if abs(margin) < 1e-6:
         return "reaches it and keeps it"
@@ -147,8 +147,8 @@ def _tracking_sentences(named: _Named, *, courses: int) -> Iterator[str]:
     for channel in present_keys(summaries, "tracking", "rmse"):
         unit, values = tracking_values(summaries, "rmse", channel)
         pairs = sorted((value, name) for value, (name, _) in zip(values, flown, strict=True) if value is not None)
-        phrases = " against ".join(f"{format_number(value)} {unit} ({name})" for value, name in pairs)
-        parts.append(f"{channel} {phrases}")
+        values_text = " against ".join(f"{format_number(value)} {unit} ({name})" for value, name in pairs)
+        parts.append(f"{channel} {values_text}")
     if parts:
         yield f"RMS error to the filtered reference: {'; '.join(parts)}."
 
@@ -156,12 +156,12 @@ def _tracking_sentences(named: _Named, *, courses: int) -> Iterator[str]:
 def _effort_sentences(named: _Named) -> Iterator[str]:
     control = [(name, summary["control"]) for name, summary in named if summary["control"]]
     if control:
-        phrases = "; ".join(
+        text = "; ".join(
             f"{name} {format_number(c['speed_min'])} to {format_number(c['speed_max'])} rad/s, steps "
             f"{format_number(c['slew_min'])} to {format_number(c['slew_max'])} rad/s per period"
             for name, c in control
         )
-        yield f"Rotor speeds commanded: {phrases}."
+        yield f"Rotor speeds commanded: {text}."
     timed = sorted((c["step_ms"]["p50"], name, c) for name, s in named if (c := s["controller"]).get("step_ms"))
     for median, name, c in timed:
         yield (

@@ -113,7 +113,7 @@ def _candidate(candidate: CandidateResult, bench: SolverBench, fastest: dict[str
 
 def _how(bench: SolverBench) -> str:
     which = "All" if bench.asked == bench.flown else f"{bench.asked} of the"
-    said = (
+    text = (
         f"{which} {bench.flown} control periods of `{bench.scenario}`, N = {bench.horizon}, timed as a flight "
         "sees them: between two steps the plant flies a period, and each is the median of its repeats; raw max is the "
         "longest of all steps, the machine's stalls included. One process, one thread; "
@@ -122,7 +122,7 @@ def _how(bench: SolverBench) -> str:
         f"most {bench.reference_kkt:.0e}, and KKT the worst residual of the candidate's answer to its own QP. "
         f"{_shares(bench.default)}"
     ).rstrip()
-    return " ".join([said, *(f"Left out: {name}, {why}." for name, why in bench.left_out.items())])
+    return " ".join([text, *(f"Left out: {name}, {why}." for name, why in bench.left_out.items())])
 
 
 def _shares(candidate: CandidateResult) -> str:

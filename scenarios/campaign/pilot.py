@@ -6,7 +6,7 @@ import contextlib
 import time as clock
 
 from quadsim.errors import QuadsimError
-from scenarios.campaign.engine.protocol import said
+from scenarios.campaign.engine.protocol import describe
 from scenarios.campaign.plan import Plan
 from scenarios.campaign.results.table import Row, failed_row, flown_row
 from scenarios.campaign.results.verdicts import ERROR, MEMORY
@@ -49,9 +49,9 @@ class CampaignPilot:
             return self._row(flight, failed_row(str(error)))
         except MemoryError as error:
             most = f"limits.memory is {self.limits.memory:g} MB"
-            return self._row(flight, failed_row(f"{said(error)} ({most})", MEMORY))
+            return self._row(flight, failed_row(f"{describe(error)} ({most})", MEMORY))
         except Exception as error:  # of a plug-in controller, say: the campaign goes on without it
-            return self._row(flight, failed_row(said(error)))
+            return self._row(flight, failed_row(describe(error)))
         return self._row(flight, _kept(flown, clock.perf_counter() - started))
 
     def row_of(self, flight: int, flown: Flight) -> Row:

@@ -103,9 +103,9 @@ class Plan:
                 except ScenarioError as error:
                     raise ScenarioError(f"vary.{entry.name} at {value!r}", error.problems) from error
                 except InputError as error:
-                    said = str(error)
-                    where = "" if said.startswith("vary.") else f"vary.{entry.name} at {value!r}: "
-                    raise InputError(where + said) from error
+                    message = str(error)
+                    where = "" if message.startswith("vary.") else f"vary.{entry.name} at {value!r}: "
+                    raise InputError(where + message) from error
         refusals = [self._refusal(flight) for flight in range(min(FIRST, self.spec.flights))]
         if all(refusals):
             raise InputError(f"none of the first {len(refusals)} flights can be flown, the first since {refusals[0]}")

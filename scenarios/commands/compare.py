@@ -27,7 +27,7 @@ def compare(options: Namespace) -> int:
         return compare_campaigns(options)
     target = real_path(options.out)
     require_directory(target, KIND)
-    for name in options.targets:  # what is wrong with any of them is said before the first is flown
+    for name in options.targets:  # what is wrong with any of them is reported before the first is flown
         if Path(name).is_dir():
             for note in reaudit(Path(name), products=False).notes:
                 console.say(f"{name}: {note}")

@@ -28,7 +28,7 @@ def write_junit(summary: Mapping[str, Any], path: Path) -> None:
 
 
 def write_cases(suite: str, cases: Sequence[tuple[str, bool, str]], path: Path) -> None:
-    """Write test cases of a suite: the name of each, whether it passes, and what is said of it.
+    """Write test cases of a suite: the name of each, whether it passes, and its message.
 
     Characters that XML forbids, and others that steer a terminal, become escapes.
 

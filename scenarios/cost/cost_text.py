@@ -43,16 +43,16 @@ def _computation(study: CostStudy) -> Iterator[str]:
             f"and is the answer after {_two(quick)} ms in the median; the others need QPs and {_two(slow)} ms."
         )
     if others:
-        phrases = "; ".join(_qp(study, candidate) for candidate in others)
-        yield f"With the QP solved in every period: {phrases}."
+        steps = "; ".join(_qp(study, candidate) for candidate in others)
+        yield f"With the QP solved in every period: {steps}."
 
 
 def _qp(study: CostStudy, candidate: CandidateTimes) -> str:
     found = percentiles(candidate.step_ms)
     late = int((candidate.step_ms > study.deadline_ms).sum())
     times = f"{_two(found['p50'])} ms in the median and {_two(found['max'])} ms at most"
-    phrases = f"{candidate.name} {times}, {_rate(candidate)}"
-    return f"{phrases}, {late} of its steps too late" if late else phrases
+    text = f"{candidate.name} {times}, {_rate(candidate)}"
+    return f"{text}, {late} of its steps too late" if late else text
 
 
 def _rate(candidate: CandidateTimes) -> str:
@@ -105,8 +105,8 @@ def _bought(study: CostStudy) -> Iterator[str]:
         first, second = study.constrained.number(key), study.unconstrained.number(key)
         if first is not None and second is not None:
             measure = MEASURES[key]
-            phrases = f"{measure.label} {_short(first)} instead of {_short(second)} {measure.unit}"
-            (bought if first < second else paid).append(phrases)
+            phrase = f"{measure.label} {_short(first)} instead of {_short(second)} {measure.unit}"
+            (bought if first < second else paid).append(phrase)
     for what, parts in (("What they buy", bought), ("What they do not make smaller", paid)):
         if parts:
             yield f"{what}: {', '.join(parts)}."

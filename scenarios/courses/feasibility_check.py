@@ -1,4 +1,4 @@
-"""Whether a scenario's course can be flown, said before it is."""
+"""Whether a scenario's course can be flown, reported before the flight."""
 
 from __future__ import annotations
 

@@ -17,7 +17,7 @@ from typing import Final
 from scenarios.schema.plugin import ENTRY_POINTS, PluginSpec
 
 LOGGER: Final = logging.getLogger("quadsim.code")
-"""Told, before the code of a plug-in controller is imported, what is to run; the command line shows it."""
+"""Logs, before the code of a plug-in controller is imported, what is to run; the command line shows it."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -49,8 +49,8 @@ class _Line:
         key: its name.
         text: what is written of it, less its comment.
         value: what it is; None for one that is absent.
-        comment: what is said of it, beside it where that fits.
-        above: what is said before it, line by line.
+        comment: its description, beside it where that fits.
+        above: comments before it, line by line.
     """
 
     key: str
@@ -145,7 +145,7 @@ def _absent(path: tuple[str, ...], kinds: Sequence[type[BaseModel]], comment: st
 
 
 def _about_entries(kinds: Sequence[type[BaseModel]]) -> tuple[str, ...]:
-    """What is said of the tables in a small list; of several kinds the fields' names alone."""
+    """The comments of the tables in a small list; of several kinds the fields' names alone."""
     lines = []
     for kind in kinds:
         if len(kinds) > 1:

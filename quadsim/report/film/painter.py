@@ -38,20 +38,20 @@ class Painter:
     """
 
     def __init__(self, image: Image.Image, scale: float) -> None:
-        self._pen, self._scale = ImageDraw.Draw(image), scale
+        self._canvas, self._scale = ImageDraw.Draw(image), scale
 
     def text(
         self, x: float, y: float, text: str, *, size: float = 15, colour: Colour = WHITE, anchor: str = "la"
     ) -> None:
         """Write at a place; `anchor` is Pillow's, `ra` for right-aligned."""
         font = _font(max(6, round(size * self._scale)))
-        self._pen.text((x * self._scale, y * self._scale), text, fill=colour, font=font, anchor=anchor)
+        self._canvas.text((x * self._scale, y * self._scale), text, fill=colour, font=font, anchor=anchor)
 
     def box(self, x: float, y: float, width: float, height: float, colour: Colour) -> None:
         """Fill a rectangle; a negative width or height reaches to the left or up."""
         left, right = sorted((x * self._scale, (x + width) * self._scale))
         top, bottom = sorted((y * self._scale, (y + height) * self._scale))
-        self._pen.rectangle(
+        self._canvas.rectangle(
             (round(left), round(top), max(round(right) - 1, round(left)), max(round(bottom) - 1, round(top))),
             fill=colour,
         )
@@ -59,13 +59,13 @@ class Painter:
     def line(self, points: Array, colour: Colour, *, width: float = 1.5) -> None:
         """Draw through points (n, 2)."""
         if len(points) > 1:
-            self._pen.line(
+            self._canvas.line(
                 (points * self._scale).ravel().tolist(), fill=colour, width=max(1, round(width * self._scale))
             )
 
     def dot(self, place: Array, radius: float, colour: Colour) -> None:
         """Fill a circle."""
-        self._pen.circle((place * self._scale).tolist(), radius * self._scale, fill=colour)
+        self._canvas.circle((place * self._scale).tolist(), radius * self._scale, fill=colour)
 
     def arrow(self, start: Array, reach: Array, colour: Colour) -> None:
         """Draw from a place (2,) as far as `reach` (2,) says; nothing where that is shorter than its head."""

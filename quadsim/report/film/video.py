@@ -40,7 +40,7 @@ def rendering_backend() -> str:
     """The OpenGL back end, `egl` or `osmesa`, that renders on this machine; MUJOCO_GL says which to try first.
 
     Raises:
-        RenderingUnavailableError: none does; it tells what each one said.
+        RenderingUnavailableError: none does; with the output of each.
     """
     preferred = os.environ.get("MUJOCO_GL", "").strip().lower()
     tried: dict[str, str] = {}
@@ -245,7 +245,7 @@ def _last_line(text: bytes) -> str:
     return lines[-1].strip() if lines else "it ended without a word"
 
 
-def _why(said: bytes, folder: Path) -> str:
+def _why(output: bytes, folder: Path) -> str:
     """Why a worker failed; on a full disk it could not even write that down."""
     full = shutil.disk_usage(folder).free < _LEAST_FREE_BYTES
-    return "the disk is full" if full else _last_line(said)
+    return "the disk is full" if full else _last_line(output)

@@ -120,13 +120,13 @@ def recording_in_background(directory: Path) -> Iterator[None]:
     ) as process:
         try:
             yield
-            raised, said = process.communicate()
+            raised, output = process.communicate()
         finally:
             process.kill()  # of no consequence to one that is done
     if raised:
         raise pickle.loads(raised)
     if process.returncode:
-        last = said.decode(errors="replace").strip().rpartition("\n")[2]
+        last = output.decode(errors="replace").strip().rpartition("\n")[2]
         raise OutputError(directory / RECORDING_FILE, last or f"its process ended with status {process.returncode}")
 
 

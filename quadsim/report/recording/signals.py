@@ -73,7 +73,7 @@ def send_limit(recording: rr.RecordingStream, limit: Limit, log: FlightLog, colo
 
 
 def send_solver(recording: rr.RecordingStream, run: Run) -> None:
-    """Clock times, and what the solver said of its answers."""
+    """Clock times, and what the solver reports of its answers."""
     control, timing = run.log.control, run.log.timing
     first, second = SERIES[:2]
     for name, values, label, colour in (

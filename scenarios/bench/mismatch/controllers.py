@@ -145,7 +145,7 @@ VARIANTS: Final = {
         spec=_robust(offset_free=OBSERVER, linearisation="trajectory"),
     ),
     "LQR": ControllerVariant(
-        about="infinite horizon, weights by Bryson's rule, in the heading frame; as the next two, it knows no bounds "
+        about="infinite horizon, weights by Bryson's rule, in the heading frame; as the next two, it has no bounds "
         f"but those on speeds, and commands no more than {BASELINE_TILT:g} deg of tilt",
         spec=_lqr,
     ),

@@ -19,7 +19,7 @@ from quadsim import __version__
 from quadsim.errors import MissingPackageError, ParameterError
 from scenarios.campaign.digests import code_digest
 from scenarios.campaign.engine.jobs import Jobs, read_jobs, submit
-from scenarios.campaign.engine.protocol import MOST_DEATHS, Answer, EngineError, Pace, Pilot, said
+from scenarios.campaign.engine.protocol import MOST_DEATHS, Answer, EngineError, Pace, Pilot, describe
 from scenarios.campaign.engine.supervisor_process import SupervisorProcess
 from scenarios.campaign.results.table import Row
 
@@ -96,7 +96,7 @@ class DaskEngine:
             try:
                 client = _distributed().Client(address, timeout=_CONNECT_S, set_as_default=False)
             except (OSError, ValueError, ImportError) as error:
-                raise EngineError(f"{self._where} does not answer ({said(error)})") from error
+                raise EngineError(f"{self._where} does not answer ({describe(error)})") from error
             stack.callback(client.close, timeout=2.0)
             yield client
 
@@ -252,7 +252,7 @@ class _Flights:
             raise error
         if not isinstance(error, _distributed().KilledWorker):
             raise EngineError(
-                f"{self._where}: a worker cannot fly ({said(error)}); every worker, and the scheduler, "
+                f"{self._where}: a worker cannot fly ({describe(error)}); every worker, and the scheduler, "
                 f"needs quadsim {__version__} and what it needs"
             ) from error
         if not self._deaths.keys() >= set(chunk):  # not alone yet

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from quadsim.errors import FileError, InputError, MissingPackageError, ParameterError, UnknownNameError
-from scenarios.campaign.engine.protocol import EngineError, said
+from scenarios.campaign.engine.protocol import EngineError, describe
 
 _OURS: Final = ("jobs", "cores")
 _CLUSTER_ALONE: Final = ("scheduler_options", "shared_temp_directory")
@@ -89,7 +89,7 @@ def job_script(jobs: Jobs) -> str:
         job = _clusters()[jobs.system].job_cls("SCHEDULER", "NAME", cores=jobs.cores, processes=jobs.cores, **options)
         return str(job.job_script())
     except (ValueError, TypeError, AttributeError, OSError) as error:
-        raise InputError(f"[{jobs.system}] is refused by dask-jobqueue: {said(error)}") from error
+        raise InputError(f"[{jobs.system}] is refused by dask-jobqueue: {describe(error)}") from error
 
 
 def submit(jobs: Jobs) -> Any:
@@ -114,7 +114,7 @@ def submit(jobs: Jobs) -> Any:
             cluster.scale(jobs=jobs.jobs)
             cluster.sync(_submitted, cluster)
         except (RuntimeError, ValueError, TypeError, OSError) as error:
-            raise EngineError(f"{jobs.system} did not take the jobs: {said(error)}") from error
+            raise EngineError(f"{jobs.system} did not take the jobs: {describe(error)}") from error
         undone.pop_all()
     return cluster
 

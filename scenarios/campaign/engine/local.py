@@ -27,7 +27,7 @@ from typing import Final
 from quadsim.errors import ParameterError
 from scenarios.campaign.engine.processes import end_session, is_stopped
 from scenarios.campaign.engine.protocol import MOST_DEATHS, ONE_THREAD, Answer, EngineError, Pace, Pilot, fair_share
-from scenarios.campaign.engine.supervisor import Fell, Ready, Unfit, serve
+from scenarios.campaign.engine.supervisor import Died, Ready, Unfit, serve
 from scenarios.campaign.results.table import Row
 from scenarios.machine import usable_cores
 
@@ -173,7 +173,7 @@ class _Crew:
         raise EngineError(f"no supervisor process can be started here ({type(problem).__name__}: {problem})")
 
     def _hear(self) -> list[Row]:
-        """Wait until somebody says something or dies; everything that is said then."""
+        """Wait until a message comes or a process dies; all messages there are then."""
         pipes = [supervisor.pipe for supervisor in self._keepers]
         sentinels = [supervisor.process.sentinel for supervisor in self._keepers if not supervisor.orphaned]
         heard = connection.wait([*pipes, *sentinels], timeout=_SILENCE_S)
@@ -196,7 +196,7 @@ class _Crew:
                         supervisor.flights.popleft()
                         self._pace.note(answer)
                         rows.append(answer.row)
-                    case Fell(ending) if supervisor.flights:
+                    case Died(ending) if supervisor.flights:
                         rows += self._again_or_lost(supervisor.flights.popleft(), ending)
                     case Unfit(reason):
                         raise EngineError(f"a worker process cannot fly here: {reason}")

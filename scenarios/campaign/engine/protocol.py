@@ -100,14 +100,14 @@ def fly_one(pilot: Pilot, flight: int, progress: Progress = silent) -> Answer:
         row = pilot.fly(flight, progress)
         pickle.dumps(row)  # it has to get home
     except MemoryError as error:
-        row = pilot.lost(flight, said(error), MEMORY)
+        row = pilot.lost(flight, describe(error), MEMORY)
     except BaseException as error:  # a plug-in controller may ask to leave, or raise what ends loops
-        row = pilot.lost(flight, said(error))
+        row = pilot.lost(flight, describe(error))
     gc.collect()  # what a flight leaves in cycles, a dozen megabytes sometimes, is not to wait for the next ones
     return Answer(row, clock.perf_counter() - started)
 
 
-def said(error: BaseException) -> str:
+def describe(error: BaseException) -> str:
     """An exception in one line of printable text."""
     text = " ".join(f"{type(error).__name__}: {error}".split())
     return "".join(sign if sign.isprintable() else ascii(sign)[1:-1] for sign in text)

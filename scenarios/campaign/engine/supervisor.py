@@ -20,8 +20,8 @@ from typing import Final, NamedTuple
 from threadpoolctl import threadpool_limits
 
 from scenarios.campaign.engine.processes import adopt_orphans, end_children, has_strays, memory_above
-from scenarios.campaign.engine.protocol import Answer, Pilot, said
-from scenarios.campaign.engine.worker import FLIGHT, PULSE_BYTES, SIZE, Told, fly_for
+from scenarios.campaign.engine.protocol import Answer, Pilot, describe
+from scenarios.campaign.engine.worker import FLIGHT, PULSE_BYTES, SIZE, FlightReport, fly_for
 from scenarios.campaign.results.verdicts import MEMORY, TIMEOUT
 from scenarios.gc_tuning import collect_rarely, freeze_for_good
 
@@ -45,13 +45,13 @@ class Unfit(NamedTuple):
     reason: str
 
 
-class Fell(NamedTuple):
+class Died(NamedTuple):
     """The worker died while it flew the first of the flights that the supervisor had, which it does not try again."""
 
     ending: str
 
 
-Said = Ready | Unfit | Fell | Answer
+Message = Ready | Unfit | Died | Answer
 """What a supervisor tells its parent."""
 
 
@@ -78,7 +78,7 @@ def serve(pipe: Connection, folder: str) -> None:
         except EOFError:
             raise
         except Exception as error:
-            return pipe.send(Unfit(said(error)))
+            return pipe.send(Unfit(describe(error)))
         freeze_for_good()
         _Supervisor(pilot, pipe).keep()
     return None
@@ -108,7 +108,7 @@ class _Worker:
         with contextlib.suppress(BrokenPipeError):  # it is dead already, which its supervisor will see
             os.write(self._inbox, FLIGHT.pack(flight))
 
-    def hear(self) -> Told | None:
+    def hear(self) -> FlightReport | None:
         """What it says, once it is there as a whole.
 
         Raises:
@@ -127,13 +127,13 @@ class _Worker:
         if len(self._heard) < SIZE.size + size:
             return None
         try:
-            text = pickle.loads(self._heard[SIZE.size :])
+            report = pickle.loads(self._heard[SIZE.size :])
         except Exception as error:
             raise ValueError("no pickle") from error
-        if not isinstance(text, Told):
+        if not isinstance(report, FlightReport):
             raise ValueError("something else")
         self._heard = b""
-        return text
+        return report
 
     def is_dead(self) -> bool:
         return os.waitid(os.P_PID, self.pid, os.WEXITED | os.WNOHANG | os.WNOWAIT) is not None
@@ -166,14 +166,14 @@ class _Supervisor:
 
     def keep(self) -> None:
         try:
-            self._tell(Ready())
+            self._send(Ready())
             while self._listen():
                 if self._flights and not self._flying:
                     self._start()
         finally:
             self._dismiss()
 
-    def _tell(self, what: Said) -> None:
+    def _send(self, what: Message) -> None:
         self._pipe.send(what)
 
     def _start(self) -> None:
@@ -182,7 +182,7 @@ class _Supervisor:
             try:
                 self._worker = _Worker(self._pilot, self._pulse, self._pipe)
             except OSError as error:
-                self._tell(Unfit(said(error)))
+                self._send(Unfit(describe(error)))
                 raise EOFError from error
         self._pulse[:] = self._beat = bytes(PULSE_BYTES)
         self._spent = self._quiet = 0.0
@@ -215,10 +215,10 @@ class _Supervisor:
 
     def _hear(self, worker: _Worker) -> None:
         try:
-            text = worker.hear()
-            if text is None:
+            report = worker.hear()
+            if report is None:
                 return
-            if not self._flying or text.answer.row["flight"] != self._flights[0]:
+            if not self._flying or report.answer.row["flight"] != self._flights[0]:
                 raise ValueError("nobody asked")
         except EOFError:
             self._lose(worker.ending())
@@ -227,8 +227,8 @@ class _Supervisor:
         else:
             self._flights.popleft()
             self._flying = False
-            self._tell(text.answer)
-            if text.spent or has_strays(worker.pid):
+            self._send(report.answer)
+            if report.spent or has_strays(worker.pid):
                 self._dismiss()  # so that the next flight does not meet what this one left
 
     def _lose(self, ending: str) -> None:
@@ -237,7 +237,7 @@ class _Supervisor:
         self._dismiss()
         if flying:
             self._flights.popleft()
-            self._tell(Fell(ending))
+            self._send(Died(ending))
 
     def _watch(self, worker: _Worker, waited: float) -> None:
         """See that a worker which flies is alive, and within its limits."""
@@ -260,4 +260,4 @@ class _Supervisor:
         """End a flight that met a limit; once is enough."""
         self._dismiss()
         flight = self._flights.popleft()
-        self._tell(Answer(self._pilot.lost(flight, reason, verdict), self._spent))
+        self._send(Answer(self._pilot.lost(flight, reason, verdict), self._spent))

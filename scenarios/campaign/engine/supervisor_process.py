@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Final
 
 from scenarios.campaign.engine.protocol import MOST_DEATHS, ONE_THREAD, Answer, EngineError, Pilot
-from scenarios.campaign.engine.supervisor import Fell, Ready, Unfit, serve
+from scenarios.campaign.engine.supervisor import Died, Ready, Unfit, serve
 
 _MAIN: Final = (
     "import json, sys; sys.path[:] = json.loads(sys.argv[2]); import scenarios.campaign.preload; "
@@ -50,7 +50,7 @@ class SupervisorProcess:
                         return answer
                     case Unfit(reason):
                         raise EngineError(f"a worker process cannot fly here: {reason}")
-                    case Fell(ending):
+                    case Died(ending):
                         pass
             except (EOFError, OSError):
                 ending = "for an unknown reason"

@@ -111,11 +111,11 @@ def _rounding() -> tuple[float, ...]:
 FLIGHT: Final = struct.Struct("=q")
 """A flight's number, as a supervisor hands it out."""
 SIZE: Final = struct.Struct("=Q")
-"""Of what follows, a pickled `Told` [bytes]."""
+"""Of what follows, a pickled `FlightReport` [bytes]."""
 PULSE_BYTES: Final = 8
 
 
-class Told(NamedTuple):
+class FlightReport(NamedTuple):
     """What a worker says of a flight.
 
     Attributes:
@@ -134,7 +134,7 @@ def fly_for(supervisor: int, pilot: Pilot, inbox: int, outbox: int, pulse: mmap)
         supervisor: the process that this one was forked from, and is not to outlive.
         pilot: flies.
         inbox: file descriptor that flights are read from.
-        outbox: file descriptor that takes what is said.
+        outbox: file descriptor that takes the messages.
         pulse: shared with the supervisor: 0 outside of control periods, else a number that changes with each.
     """
     os.setpgid(0, 0)  # so that all that a controller starts can be ended in one stroke
@@ -157,8 +157,8 @@ def fly_for(supervisor: int, pilot: Pilot, inbox: int, outbox: int, pulse: mmap)
         if os.getpid() != me or (_identity(inbox), _identity(outbox)) != pipes:
             os._exit(1)
         spent = answer.row.get("verdict") == MEMORY or traces.found()
-        said = pickle.dumps(Told(answer, spent))
-        _write(outbox, SIZE.pack(len(said)) + said)
+        message = pickle.dumps(FlightReport(answer, spent))
+        _write(outbox, SIZE.pack(len(message)) + message)
 
 
 def _identity(descriptor: int) -> tuple[int, int]:

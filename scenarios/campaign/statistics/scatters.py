@@ -1,7 +1,7 @@
 """The flights of a campaign as points: the worst margin over each drawn parameter.
 
 Few flights far out would squash all others into a line.  They are drawn at the edge, as triangles that point to where
-they are, and it is said how many they are and how far out.
+they are; a caption has how many they are and how far out.
 """
 
 from __future__ import annotations
