@@ -144,14 +144,20 @@ def off(first: float, row: int = 0) -> Array:
     ],
 )
 def test_rejection_tells_why(status: str, plan: Array, reason: str | None) -> None:
-    assert rejection(status, plan, BOUNDS, HOVER) == reason
+    assert rejection(status, plan[0], plan, BOUNDS, HOVER) == reason
 
 
 def test_rejection_is_by_speed_where_steps_are_free() -> None:
     free = ActuatorBounds.alike((0.0, 250.0))
-    assert rejection(SOLVED, off(60.0), free, HOVER) is None
-    assert rejection(SOLVED, off(60.1), free, HOVER) == "out_of_bounds"
-    assert rejection(SOLVED, off(-190.1), free, HOVER) == "out_of_bounds"
+    assert rejection(SOLVED, off(60.0)[0], PLAN, free, HOVER) is None
+    assert rejection(SOLVED, off(60.1)[0], PLAN, free, HOVER) == "out_of_bounds"
+    assert rejection(SOLVED, off(-190.1)[0], PLAN, free, HOVER) == "out_of_bounds"
+
+
+def test_rejection_is_by_the_command_not_by_what_was_planned_for_it() -> None:
+    assert rejection(SOLVED, PLAN[0], off(40.0), BOUNDS, HOVER) is None
+    assert rejection(SOLVED, off(40.0)[0], PLAN, BOUNDS, HOVER) == "out_of_bounds"
+    assert rejection(SOLVED, off(math.nan)[0], PLAN, BOUNDS, HOVER) == "not_finite"
 
 
 @given(
@@ -162,7 +168,7 @@ def test_whatever_is_clipped_is_not_rejected(seed: int, level: float) -> None:
     rng = np.random.default_rng(seed)
     before = level + rng.normal(size=4)
     plan = BOUNDS.clip_plan(level + 30.0 * rng.normal(size=(6, 4)), before)
-    assert rejection(SOLVED, plan, BOUNDS, before) is None
+    assert rejection(SOLVED, plan[0], plan, BOUNDS, before) is None
 
 
 @pytest.mark.parametrize("steps", [0, 1, 3, 4])
