@@ -74,10 +74,10 @@ numbers: setup $(VENV)/.peers  ## remake the numbers in README.md and docs/, but
 	@$(PY) docs/make_scenarios.py
 	@$(PY) docs/make_performance.py
 
-verification: setup $(VENV)/.peers  ## remake docs/verification.md and its table in README.md
+verification: setup $(VENV)/.peers  ## remake docs/verification.md
 	@PYTHONPATH=tests $(PY) docs/make_verification.py
 
-robustness: setup  ## remake docs/robustness.md: the ladder of mismatches and 50 faults, some ten minutes
+robustness: setup  ## remake docs/robustness.md: the mismatch benchmark and 50 faults, some ten minutes
 	@PYTHONPATH=tests $(PY) docs/make_robustness.py
 
 soak: setup  ## one simulated hour on end: memory and step time have to stay as they were

@@ -1,7 +1,7 @@
 """Fly the campaigns that ship, and remake docs/paper-robustness.md with its figures: `make campaigns`.
 
 The flights take an hour and a quarter on two quiet cores, most of it the robust controller's.  They are kept under
-runs/campaigns/, and gone on with where they were stopped; remove that folder to fly them all anew.  What is flown is
+runs/campaigns/, and resumed where they were stopped; remove that folder to fly them all anew.  What is flown is
 summed up again by the code as it is.  With --there nothing is flown, and the page is made of the campaigns as they are,
 which may have been flown with fewer --flights, or by an earlier version of their files.
 """
@@ -89,7 +89,7 @@ def violations(results: list[Result]) -> Grid:
 def part(result: Result) -> str:
     """One campaign's section."""
     name, summary = result.summary["campaign"], result.summary
-    told = " ".join([verdict_sentence(summary) + ".", *campaign_sentences(summary)])
+    parts = " ".join([verdict_sentence(summary) + ".", *campaign_sentences(summary)])
     tables = (
         event_table(summary),
         constraint_table(summary),
@@ -99,7 +99,7 @@ def part(result: Result) -> str:
     )
     return "\n".join(
         [
-            f"## {name}\n\n{told}\n",
+            f"## {name}\n\n{parts}\n",
             f"![{name}: convergence, margins, what drives them](campaign-{name}.png)\n",
             *(section(grid).replace("## ", "### ", 1) for grid in tables),
         ]
@@ -109,11 +109,11 @@ def part(result: Result) -> str:
 def first_to_break(result: Result) -> str:
     """What the paper's controller bears least, from a campaign of small errors."""
     summary = result.summary
-    told = [(name, unit, event, split["threshold"]) for event, name, unit, split in sure_splits(summary)]
+    parts = [(name, unit, event, split["threshold"]) for event, name, unit, split in sure_splits(summary)]
     found = "It is nothing that is drawn, beyond chance"
-    if told:
-        first, unit = told[0][:2]
-        steps = sorted((threshold, event) for name, _, event, threshold in told if name == first)
+    if parts:
+        first, unit = parts[0][:2]
+        steps = sorted((threshold, event) for name, _, event, threshold in parts if name == first)
         listed = ", ".join(
             f"{event} at {threshold:.15g}{'' if unit == '-' else f' {unit}'}" for threshold, event in steps
         )

@@ -1,4 +1,4 @@
-"""docs/constraints-cost.md, its figures, and the answer in README.md; `docs/make_performance.py` times and calls it."""
+"""docs/constraints-cost.md and its figures; `docs/make_performance.py` times and calls it."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
-from make_numbers import ROOT, Table, markdown, replace_in_readme
+from make_numbers import ROOT, Table, markdown
 
 from quadsim.flight.metrics import percentiles
 from scenarios.bench.bench_results import SolverBench
@@ -25,7 +25,7 @@ def timed(bench: SolverBench) -> list[CandidateTimes]:
     gain = CandidateTimes(
         name="unconstrained gain", step_ms=bench.gain_ms, statuses=("solved",) * bench.gain_ms.size, repeats=repeats
     )
-    alone = {each.solver: each for each in bench.contenders if not each.shortcut}
+    alone = {each.solver: each for each in bench.candidates if not each.shortcut}
     named = {"constrained, as flown": bench.default}
     named |= {f"QP by {solver}": alone[solver] for solver in SOLVERS_TIMED if solver in alone}
     return [
@@ -44,9 +44,9 @@ def answer(study: CostStudy) -> Table:
         flights = (study.constrained, study.unconstrained)
         return (label, *(", ".join(format(flight.numbers[key], form) for key in keys) for flight in flights))
 
-    gain, flown, *by_qp = study.contenders
-    times = {candidate.name: percentiles(candidate.step_ms) for candidate in study.contenders}
-    told = {name: ", ".join(f"{found[key]:.3g}" for key in ("p50", "p99", "max")) for name, found in times.items()}
+    gain, flown, *by_qp = study.candidates
+    times = {candidate.name: percentiles(candidate.step_ms) for candidate in study.candidates}
+    text = {name: ", ".join(f"{found[key]:.3g}" for key in ("p50", "p99", "max")) for name, found in times.items()}
     lost = [f"{point.value:g}" for point in study.horizons.points if not point.unconstrained.completed]
     kept = [f"{point.value:g}" for point in study.horizons.points if not point.constrained.completed]
     rows: Table = [
@@ -57,15 +57,15 @@ def answer(study: CostStudy) -> Table:
         pair("total variation of the commands [rad/s]", ("total_variation",), ".0f"),
         ("periods without a QP", f"{flown.shortcut.sum()} of {flown.shortcut.size}", "all"),
         ("horizons N at which the vehicle is lost", ", ".join(kept) or "none", ", ".join(lost) or "none"),
-        ("controller step: median, p99, max [ms]", told[flown.name], told[gain.name]),
+        ("controller step: median, p99, max [ms]", text[flown.name], text[gain.name]),
         ("largest loop rate [Hz]", *(f"{each.rate('max'):.0f}" for each in (flown, gain))),
     ]
-    rows += [(f"{each.name} in every period: the same [ms]", told[each.name], "-") for each in by_qp]
+    rows += [(f"{each.name} in every period: the same [ms]", text[each.name], "-") for each in by_qp]
     return rows
 
 
 def write_cost(study: CostStudy) -> None:
-    """docs/constraints-cost.md with its figures, and the answer in README.md."""
+    """docs/constraints-cost.md with its figures."""
     docs, sentences = ROOT / "docs", cost_sentences(study)
     with tempfile.TemporaryDirectory() as scratch:
         drawn = [path for path in write_cost_figures(study, Path(scratch)) if path.suffix == ".svg"]
@@ -78,8 +78,9 @@ def write_cost(study: CostStudy) -> None:
         "--out DIR`.\n",
         "The paper leaves the question open. It compares two controllers that differ in weights and horizon as well "
         "as in\nconstraints; here the constrained one is held against itself without them.\n",
+        markdown(answer(study)),
+        "Where the unconstrained optimum satisfies every constraint it is the answer, without a QP.\n",
         cost_markdown(study, sentences),
         *(f"![{path.stem}]({path.name})\n" for path in drawn),
     ]
     (docs / "constraints-cost.md").write_text("\n".join(page), encoding="utf-8")
-    replace_in_readme("cost", markdown(answer(study)))

@@ -1,4 +1,4 @@
-"""Remake every time that README.md, docs/performance.md and docs/constraints-cost.md report: `make numbers`.
+"""Remake every time that docs/performance.md and docs/constraints-cost.md report: `make numbers`.
 
 Everything is measured by `quadsim bench`; here it becomes pages.  Steps of controllers are timed once, as a flight sees
 them (`scenarios.bench.timing`), and all tables and figures take them from there.
@@ -15,11 +15,10 @@ import time as clock
 from pathlib import Path
 
 from make_cost import timed, write_cost
-from make_numbers import Table, markdown, replace_in_readme
+from make_numbers import Table, markdown
 from make_outside import outside
 from PIL import Image
 
-from quadsim.report.table import grid_to_markdown
 from scenarios.bench.bench_results import FlightProfile, RenderProfile, SolverBench
 from scenarios.bench.bench_tables import flight_tables, render_tables, solver_tables
 from scenarios.bench.campaigns import bench_campaign, campaign_tables
@@ -114,11 +113,11 @@ def effect_costs() -> Table:
 def whole_commands(flight: FlightProfile, film: RenderProfile) -> Table:
     """What a person waits for: the best of a few times, but for the film, whose time is long enough."""
     rows: Table = [
-        ("what a person waits for, at best", "asked", "measured [s]"),
+        ("what a person waits for, at best", "target", "measured [s]"),
         ("60 s of constrained flight simulated, one core", "<= 1.2 s", f"{flight.best:.2f}"),
     ]
     with tempfile.TemporaryDirectory() as scratch:
-        for label, asked, repeats, arguments in (
+        for label, target, repeats, arguments in (
             ("`quadsim --help`", "<= 0.3 s", REPEATS, ["--help"]),
             (
                 f"`quadsim run {SCENARIO} --no-video`",
@@ -133,7 +132,7 @@ def whole_commands(flight: FlightProfile, film: RenderProfile) -> Table:
                 ["video", f"{scratch}/run"],
             ),
         ):
-            rows.append((label, asked, f"{min(_wall_s(arguments) for _ in range(repeats)):.2f}"))
+            rows.append((label, target, f"{min(_wall_s(arguments) for _ in range(repeats)):.2f}"))
     return rows
 
 
@@ -159,8 +158,8 @@ def campaigns() -> str:
 
 
 def steps(bench: SolverBench) -> str:
-    """The page's beginning: all that is told of a controller's steps."""
-    contenders, *others = solver_tables(bench)
+    """The page's beginning: the tables of a controller's steps."""
+    candidates, *others = solver_tables(bench)
     machine = bench.machine
     return "\n".join(
         [
@@ -169,9 +168,9 @@ def steps(bench: SolverBench) -> str:
             f"`quadsim bench solvers`, `flight`, `render` and `campaign` measure the same on yours.\n\n"
             "A controller's step is timed in one way, as a flight sees it: between two steps the plant flies a period, "
             "each step is\ntaken three times in turns with all others', and the median counts. "
-            "[constraints-cost.md](constraints-cost.md) and the README tell\nthe same numbers.\n",
-            section(contenders),
-            "![Time of a whole controller step of every contender, and its growth with the horizon](solvers.png)\n",
+            "[constraints-cost.md](constraints-cost.md) has the\nsame numbers.\n",
+            section(candidates),
+            "![Time of a whole controller step of every candidate, and its growth with the horizon](solvers.png)\n",
             *(section(grid) for grid in others),
         ]
     )
@@ -204,14 +203,12 @@ def main() -> None:
         commands, effects = markdown(whole_commands(flight, film)), markdown(effect_costs())
         kept = outside(path.read_text(encoding="utf-8"))  # which compares two checkouts: docs/make_outside.py
         end = "\n".join([rest(flight, film, commands, effects, campaigns()), kept])
-        replace_in_readme("times", commands)
     bench = bench_solvers(scenario)
     with tempfile.TemporaryDirectory() as scratch:
         write_bench(bench, Path(scratch))
         figure = Image.open(Path(scratch) / "solvers.png").convert("RGB")
         figure.quantize(64, dither=Image.Dither.NONE).save(ROOT / "docs" / "solvers.png", optimize=True)
     path.write_text(f"{steps(bench)}\n{end}", encoding="utf-8")
-    replace_in_readme("solvers", grid_to_markdown(solver_tables(bench)[0]))
     write_cost(study_cost(scenario, [load_scenario("paper-unconstrained")], timed=timed(bench)))
 
 

@@ -1,6 +1,7 @@
 """Remake docs/robustness.md and its figure: `make robustness`.
 
-The ladder is `quadsim bench ladder`; the faults are those of tests/fault_injection.py, fifty for each controller.
+The mismatch benchmark is `quadsim bench ladder`; the faults are those of tests/fault_injection.py, fifty for each
+controller.
 """
 
 from __future__ import annotations
@@ -32,8 +33,8 @@ QUICK_ENOUGH = 6.0
 """What the step is to take at p99 [ms]."""
 
 
-def asked(measured: MismatchBench) -> Grid:
-    """What the full robust controller is to do, and does."""
+def targets(measured: MismatchBench) -> Grid:
+    """Requirements on the full robust controller, and whether they are met."""
     flights = {condition: measured.flights[FULL, condition] for condition in measured.conditions}
     calm = {condition: flight for condition, flight in flights.items() if condition not in RESTLESS}
     bound = measured.tilt_bound
@@ -54,8 +55,8 @@ def asked(measured: MismatchBench) -> Grid:
     )
     return Grid(
         key="asked",
-        title=f"What is asked of {FULL}",
-        head=("asked", "does so"),
+        title=f"Requirements on {FULL}",
+        head=("requirement", "met"),
         lines=tuple((Cell(text=what), Cell(text=found)) for what, found in lines),
         note="Disturbances beyond the size that the tightening states for those about each axis, "
         f"{STATED.angular_acceleration:g} rad/s^2, may tilt it further: a rotor that loses {100 * WORN:g} % makes "
@@ -112,14 +113,15 @@ def page(measured: MismatchBench, found: Sequence[Consequence]) -> str:
     harmless = sum(each.harmless for each in found)
     return "\n".join(
         [
-            "# Robustness\n\nMade by `make robustness`; the ladder alone is `quadsim bench ladder`, on "
+            "# Robustness\n\nMade by `make robustness`; the mismatch benchmark alone is `quadsim bench ladder`, on "
             f"{measured.scenario}, {measured.duration:g} s.\n\n{mismatch_legend(measured)}",
             "![Each controller in each condition: distance at the end, and peak tilt](ladder.png)\n",
-            section(asked(measured)),
+            section(targets(measured)),
             "LQR, PID and geometric control fly with up to 20 deg of tilt and no bound on steps of the rotor speeds, "
             "so their errors are not to be\ncompared with those at 5 deg. Their gains were tuned on the nominal course "
-            "and a few rungs; the robust controller's input and move\nweight and its observer on the rungs of this "
-            "ladder.\n",
+            "and in a few of these conditions; the "
+            "robust\ncontroller's input and move weight and its observer in all of "
+            "them.\n",
             *(section(grid) for grid in mismatch_tables(measured)),
             f"## Faults\n\n{harmless} of {len(found)} are harmless: no exception; every command finite and within its "
             f"bounds on speeds and steps; the vehicle back within {NEAR:g} m of the same flight without the fault "
@@ -128,7 +130,7 @@ def page(measured: MismatchBench, found: Sequence[Consequence]) -> str:
             "controller flies undisturbed. A failed solver's answer is NaN throughout; the QP is solved in every "
             "period, the shortcut being off.\n",
             *(section(grid) for grid in fault_tables(found)),
-            "## Soak\n\n`make soak` flies the full robust controller for a simulated hour on end, and asks for memory "
+            "## Soak\n\n`make soak` flies the full robust controller for a simulated hour on end, and requires memory "
             "flat to 1 % and steps as quick as at the beginning, to 10 %; the tests do so for three minutes.\n",
         ]
     )

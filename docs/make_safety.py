@@ -39,16 +39,16 @@ def counts(scale: float) -> str:
         started = clock.perf_counter()
         attack, count = ATTACKS[what]
         found = attack(max(1, round(scale * count)))
-        told = "; ".join(f"{name.replace('_', ' ')} {number}" for name, number in found.items())
-        print(f"{what}: {told} ({clock.perf_counter() - started:.0f} s)", flush=True)
-        return told
+        outcomes = "; ".join(f"{name.replace('_', ' ')} {number}" for name, number in found.items())
+        print(f"{what}: {outcomes} ({clock.perf_counter() - started:.0f} s)", flush=True)
+        return outcomes
 
     names = list(ATTACKS)
     with ThreadPoolExecutor() as beside:
-        told = list(beside.map(go, names[:ASIDE]))
-    told += [go(name) for name in names[ASIDE:]]
-    lines = tuple((Cell(text=name), Cell(text=text)) for name, text in zip(names, told, strict=True))
-    return grid_to_markdown(Grid(key="counts", title="What was tried", head=("what", "what came of it"), lines=lines))
+        outcomes = list(beside.map(go, names[:ASIDE]))
+    outcomes += [go(name) for name in names[ASIDE:]]
+    lines = tuple((Cell(text=name), Cell(text=text)) for name, text in zip(names, outcomes, strict=True))
+    return grid_to_markdown(Grid(key="counts", title="What was tried", head=("attack", "outcome"), lines=lines))
 
 
 def main() -> None:

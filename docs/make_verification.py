@@ -1,4 +1,4 @@
-"""Remake docs/verification.md and its table in README.md: `make verification`.
+"""Remake docs/verification.md: `make verification`.
 
 Measures what tests/peers holds, with the same functions, and writes the figures with the peers' versions.  tests/peers
 compares the page with today's figures.
@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from make_numbers import markdown, replace_in_readme
+from make_numbers import markdown
 from peers import agreement, closed_loop, constrained_qp, gain, open_loop, recorded
 from peers.agreement import Verdict
 from peers.checks import HEAD, Check
@@ -120,7 +120,7 @@ an active-set method, exact to rounding). For x_(j+1) = A x_j + B v_j qpmpc mini
 - The paper weighs and bounds the outputs at k+1 .. k+N. So the output bounds are put on A x_j + B v_j, target_j is
   y_d(k+j) for j = 1 .. N-1, and goal is y_d(k+N); target_0 moves no input.
 
-Both are asked what the controller was asked in each period of `{recorded.SCENARIO}`: state, desired outputs, input
+Both get the queries of the controller in each period of `{recorded.SCENARIO}`: state, desired outputs, input
 before. In {measured.constrained.sum()} of the {measured.differences.size} periods a constraint is active;
 exactly in the others the controller took the unconstrained optimum, without a QP. `{constrained_qp.OURS}`, the default
 solver, differs by at most {measured.checks[0].row[2]}, where it stops iterating; how near the two problems
@@ -137,7 +137,7 @@ def agreement_section(measured: Sequence[Verdict]) -> str:
 Every solver of `mpc.solvers` on the same recorded QPs, through the back ends that `controller.solver` names. A solver's
 own word is not taken: of each solution that it calls solved, the residuals of the Karush-Kuhn-Tucker conditions are
 computed here, from the QP and the multipliers (`mpc.qp.kkt_residuals`), and the first input is compared with qpmpc's.
-What it does not call solved is a failure. {slow} take long and give up on some QPs; they are asked every
+What it does not call solved is a failure. {slow} take long and give up on some QPs; they get every
 {max(agreement.SLOW.values())}th period. The worst of all:
 
 {markdown([agreement.HEAD, *(verdict.row for verdict in measured)])}
@@ -173,7 +173,6 @@ def main() -> None:
         agreement_section(verdicts),
     ]
     (ROOT / "docs" / "verification.md").write_text("\n".join(page), encoding="utf-8")
-    replace_in_readme("verification", table, command="make verification")
 
 
 if __name__ == "__main__":

@@ -26,7 +26,7 @@ _ROLL, _PITCH = INDEX["roll"], INDEX["pitch"]
 
 @dataclass(frozen=True, kw_only=True)
 class Trim:
-    """What rest takes of a vehicle, for all that is known now.
+    """The estimated equilibrium of a vehicle.
 
     Attributes:
         speeds: (4,) of the rotors [rad/s].

@@ -83,9 +83,13 @@ class QPRows:
         found = np.zeros((N, len(self.whole.C)))
         for column, row in zip(z.reshape(N, -1).T, self.origin, strict=True):
             found[:, row] += column
-        z_inputs = z_inputs.reshape(N, -1)[:, self.whole.input[self.boxed]]
-        held = np.where(z_inputs > 0.0, self._binding(self.u_max, "upper"), self._binding(self.u_min, "lower"))
-        found[:, self.boxed] = np.where(held, z_inputs, 0.0)
+        left = z_inputs.reshape(N, -1).copy()
+        for row in self.boxed:  # of several at the same bound, the first has it all
+            j = self.whole.input[row]
+            upper, lower = self.whole.upper[:, row] == self.u_max[:, j], self.whole.lower[:, row] == self.u_min[:, j]
+            held = np.where(left[:, j] > 0.0, upper, lower)
+            found[held, row] = left[held, j]
+            left[held, j] = 0.0
         return found
 
     def split(self, multipliers: Array) -> tuple[Array, Array]:
@@ -97,10 +101,6 @@ class QPRows:
         for row in self.boxed:
             z_inputs[:, self.whole.input[row]] += multipliers[:, row]
         return z.ravel(), z_inputs.ravel()
-
-    def _binding(self, box: Array, side: str) -> Array:
-        """(N, boxed) which of the rows in the box is its bound."""
-        return np.asarray(getattr(self.whole, side)[:, self.boxed] == box[:, self.whole.input[self.boxed]])
 
 
 def qp_rows(problem: Problem) -> QPRows:

@@ -52,7 +52,7 @@ class SequenceGains:
 
 
 def sequence_gains(problem: Problem) -> SequenceGains:
-    """Solve Eq. (21) for the optimal sequence; bounds of the problem are left aside."""
+    """Solve Eq. (21) for the optimal sequence; bounds of the problem are ignored."""
     terms = condensed_cost(problem, prediction(problem.model, problem.horizon))
     factor = scipy.linalg.cho_factor(terms.H)
     # Of the paper's problem -(F3 + F4): what an input held at u_bar throughout costs.

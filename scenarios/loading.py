@@ -136,7 +136,7 @@ def parse_scenario(data: Mapping[str, Any], *, source: str = "scenario", directo
         data: the parsed TOML.
         source: what to call it in messages.
         directory: where relative paths of vehicles and courses are looked up, besides the working directory, and the
-            module of a controller that is not ours.
+            module of a plug-in controller.
 
     Raises:
         ScenarioError: naming every field that is wrong.

@@ -1,6 +1,6 @@
 """A finished run held against itself: its files as they were written, its verdict as its tables give it again.
 
-Nothing that `summary.json` says of the verdict is believed.  The limits come from the run's `scenario.toml`, the values
+Nothing in `summary.json` about the verdict is relied on.  The limits come from the run's `scenario.toml`, the values
 from `flight.parquet` and `plant.parquet`.  The recorded audit saw every physics step, the tables have the plant at the
 log rate, so at the physics rate the recorded margin may be the smaller one, and never the larger.  At the control
 samples both saw the same numbers.

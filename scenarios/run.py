@@ -54,7 +54,7 @@ def fly_once(
 
     Args:
         scenario: what is flown.
-        vehicle: what is believed to fly.
+        vehicle: the modelled vehicle.
         plant: see `scenarios.build.build_plant`.
         controller: see `scenarios.build.build_controller`.
         reference: (K + N, 4); see `scenarios.courses.make.build_reference`.

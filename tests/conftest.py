@@ -159,7 +159,7 @@ def cost_study() -> CostStudy:
         unconstrained=make_outcome(4.0, settled=8.0),
         others={"free": make_outcome(3.0)},
         reference=[{"settled": 5.0}, {"settled": None}],
-        contenders=(
+        candidates=(
             CandidateTimes(name="gain", step_ms=0.01 * step_ms, statuses=("solved",) * 10, repeats=3),
             CandidateTimes(name="as flown", step_ms=step_ms, statuses=shortcut, repeats=3),
             CandidateTimes(name="QP by slow", step_ms=8.0 * step_ms, statuses=("solved",) * 10, repeats=1),

@@ -17,7 +17,7 @@ from mpc.fallback.contract import Guarded
 from mpc.solvers import _piqp
 from quadsim.controller import SOLVED, Command, Controller, Moment
 from quadsim.flight.log import FlightLog
-from quadsim.sim.physics import Stretch
+from quadsim.sim.physics import Segment
 from quadsim.sim.plant import Plant
 from quadsim.sim.sensing.sensor import SensorName
 from quadsim.state import POSITION, Array
@@ -229,7 +229,7 @@ def recorded(plant: Plant) -> Iterator[list[Array]]:
     given: list[Array] = []
     real = plant.advance
 
-    def advance(speeds: Array, steps: int) -> Stretch:
+    def advance(speeds: Array, steps: int) -> Segment:
         given.append(np.array(speeds, float))
         return real(speeds, steps)
 

@@ -1,4 +1,4 @@
-"""Attitudes as rotation matrices: what a thrust direction and a heading ask for, and how far away they are."""
+"""Attitudes as rotation matrices: what a thrust direction and a heading require, and how far away they are."""
 
 from __future__ import annotations
 

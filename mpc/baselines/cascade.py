@@ -45,9 +45,9 @@ class Gains:
         velocity_derivative: share of the measured acceleration that the velocity loop takes back.
         rate_derivative: share of the measured angular acceleration that the rate loop takes back.
         yaw_weight: share of the heading error that a thrust direction to be reached leaves; see `prioritised_error`.
-        tilt_max: largest tilt asked for [rad].
-        velocity_max: largest velocity asked for, horizontal and vertical [m/s].
-        rate_max: largest body rates asked for, roll, pitch, yaw [rad/s].
+        tilt_max: largest tilt commanded [rad].
+        velocity_max: largest velocity commanded, horizontal and vertical [m/s].
+        rate_max: largest body rates commanded, roll, pitch, yaw [rad/s].
     """
 
     bandwidths: Bandwidths
@@ -98,7 +98,7 @@ def force_within(force: Array, *, weight: float, largest: float, tilt: float) ->
     Args:
         force: wanted.
         weight: m g [N].
-        largest: thrust to ask for [N].
+        largest: thrust to command [N].
         tilt: largest tilt [rad].
     """
     upright = limit_force(force, least=LEAST_LIFT * weight, tilt=tilt)
@@ -118,7 +118,7 @@ class Body:
         mass: [kg].
         gravity: [m/s^2].
         inertia: (3,) principal moments [kg m^2].
-        thrust_max: largest thrust to ask for [N].
+        thrust_max: largest thrust to command [N].
         allocation: see there.
     """
 
@@ -194,7 +194,7 @@ def fly_cascade(
 def _velocity_loop(
     gains: Gains, body: Body, memory: Memory, position: Array, velocity: Array, target: Target, period: float
 ) -> tuple[Array, Array]:
-    """The force (3,) to ask for [N], world, and the velocity integral (3,) [m/s^2] of the next period."""
+    """The force (3,) to command [N], world, and the velocity integral (3,) [m/s^2] of the next period."""
     proportional = gains.bandwidths.velocity
     error = velocity_wanted(gains, position, target) - velocity
     measured = np.zeros(3) if memory.velocity is None else (velocity - memory.velocity) / period

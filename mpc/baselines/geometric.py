@@ -37,8 +37,8 @@ class GeometricSettings:
         k_I: gain of the integral of e_Omega + c_2 e_R [1/s^2]; 0 for none.
         c_1: weight of the position error in the first integral [1/s].
         c_2: weight of the attitude error in the second [1/s].
-        sigma: largest acceleration that the first integral asks for, each axis [m/s^2].
-        sigma_R: largest angular acceleration that the second asks for, each axis [rad/s^2].
+        sigma: largest acceleration of the first integral, each axis [m/s^2].
+        sigma_R: largest angular acceleration of the second, each axis [rad/s^2].
         tilt_max: largest tilt of the wanted force [deg]; Lee et al. (2010) know none.
         horizon: N, samples of preview; they tell the reference's velocity and acceleration.
         bounds: what commands are held to; None for the speeds that the rotors hold.
@@ -81,7 +81,7 @@ def geometric_settings(
     the inner one (the cascade's separation of 2, twice), and both have the damping 1 / sqrt(2): k_R = k_Omega^2 / 2.
 
     Args:
-        vehicle: what is believed to fly.
+        vehicle: the modelled vehicle.
         period: tau_s [s].
         lag: of rotors and computation [s]; `lag_to_allow_for` where absent.
         integral: whether the integrals of Goodarzi et al. (2013) act, a quarter as fast as what they stand behind.
@@ -109,7 +109,7 @@ class GeometricController(FeedbackLaw):
     """Thrust along the body axis and a moment from errors on SE(3); see `mpc.baselines.tracking`.
 
     Args:
-        vehicle: what is believed to fly.
+        vehicle: the modelled vehicle.
         settings: see there.
     """
 

@@ -46,7 +46,7 @@ class FeedbackLaw(ABC):
     """A controller that solves nothing: a subclass says what it commands in the air, `_command`.
 
     Args:
-        vehicle: what is believed to fly.
+        vehicle: the modelled vehicle.
         settings: see there.
     """
 

@@ -99,7 +99,7 @@ class LQR(FeedbackLaw):
     roll and pitch torque go before yaw.
 
     Args:
-        vehicle: what is believed to fly.
+        vehicle: the modelled vehicle.
         settings: see there.
     """
 

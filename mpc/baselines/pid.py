@@ -32,9 +32,9 @@ class PIDSettings:
         velocity_derivative: share of the measured acceleration that is taken back.
         rate_derivative: share of the measured angular acceleration that is taken back; late by a period, less than 1.
         yaw_weight: share of the heading error asked for while turning the thrust; PX4's MC_YAW_WEIGHT.
-        tilt_max: largest tilt asked for [deg]; PX4's MPC_TILTMAX_AIR.
-        velocity_max: largest velocity asked for, horizontal and vertical [m/s]; PX4's MPC_XY_VEL_MAX.
-        rate_max: largest body rates asked for, roll, pitch, yaw [deg/s]; PX4's MC_ROLLRATE_MAX and so on.
+        tilt_max: largest tilt commanded [deg]; PX4's MPC_TILTMAX_AIR.
+        velocity_max: largest velocity commanded, horizontal and vertical [m/s]; PX4's MPC_XY_VEL_MAX.
+        rate_max: largest body rates commanded, roll, pitch, yaw [deg/s]; PX4's MC_ROLLRATE_MAX and so on.
         horizon: N, samples of preview; they tell the reference's velocity and acceleration.
         bounds: what commands are held to; None for the speeds that the rotors hold.
     """
@@ -69,7 +69,7 @@ def pid_settings(vehicle: Vehicle, *, period: float, lag: float | None = None, *
     """Settings whose gains follow from the period, and the lag [s] to allow for; see `bandwidths`.
 
     Args:
-        vehicle: what is believed to fly.
+        vehicle: the modelled vehicle.
         period: tau_s [s].
         lag: of rotors and computation; `lag_to_allow_for` where absent.
         others: fields of `PIDSettings`.
@@ -88,7 +88,7 @@ class CascadedPID(FeedbackLaw):
     """Position P, velocity PID, attitude P by quaternions, rate PID, mixer; see `mpc.baselines.cascade`.
 
     Args:
-        vehicle: what is believed to fly.
+        vehicle: the modelled vehicle.
         settings: see there.
     """
 

@@ -30,7 +30,7 @@ class Gains:
         k_I: of the integral of e_Omega + c_2 e_R [1/s^2]; 0 for none.
         c_1: [1/s].
         c_2: [1/s].
-        sigma: largest magnitude of the acceleration that the position integral asks for, each axis [m/s^2].
+        sigma: largest magnitude of the acceleration of the position integral, each axis [m/s^2].
         sigma_R: the same of the angular acceleration [rad/s^2].
         tilt_max: largest tilt of the wanted force [rad].
     """
@@ -69,7 +69,7 @@ class Motion:
 
 @dataclass(frozen=True, kw_only=True)
 class Integrals:
-    """What the integral terms ask for, within +-sigma: an acceleration, world, and an angular one, body; (3,) each."""
+    """The integral terms, within +-sigma: an acceleration, world, and an angular one, body; (3,) each."""
 
     translation: Array
     rotation: Array

@@ -186,7 +186,8 @@ class ActiveSet:
         k = failed - 1  # depends on those before it
         direction = np.zeros(active.size)
         direction[k] = 1.0
-        direction[:k] = -lapack.dpotrs(factor[:k, :k], K[:k, k])[0]
+        if k:  # before a row of nothing there may be none
+            direction[:k] = -lapack.dpotrs(factor[:k, :k], K[:k, k])[0]
         if direction @ excess < 0.0:
             direction = -direction
         sign, here = np.sign(side[active]), z[active]
@@ -220,7 +221,8 @@ class ActiveSet:
             z[active] = np.where(stops, kink, target)
         else:
             share = np.ones_like(target)
-            share[stops] = (kink - here)[stops] / (target - here)[stops]
+            way = (target - here)[stops]
+            share[stops] = np.maximum((kink - here)[stops] / np.where(way == 0.0, np.inf, way), 0.0)
             least = share.min()
             stops = stops & (share <= least)
             z[active] = np.where(stops, kink, here + least * (target - here))

@@ -31,7 +31,7 @@ MOST_ROUNDS: Final = 60
 
 
 def polish(qp: QP, solution: Solution) -> Solution:
-    """The exact optimum of a whole QP, by dense matrices: slow, and a reference that believes no solver.
+    """The exact optimum of a whole QP, by dense matrices: slow, and a reference independent of the solver.
 
     With the active constraints as equalities M x = d, what remains is one linear system,
 

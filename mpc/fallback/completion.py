@@ -1,15 +1,16 @@
-"""Dead reckoning: a whole state from one whose measured channels are partly missing.
+"""State completion: a whole state from one whose measured channels are partly missing.
 
-A channel that is not finite, beyond all plausibility, or frozen is missing.  Its place takes its conditional mean,
-given the channels that are there: the hover model, anchored where the vehicle rests for all that is known
-(`mpc.equilibrium`), predicts the state under the command in force, and a Kalman filter
-whose only measurements are the remaining channels corrects it (Simon, "Optimal State Estimation", 2006, Sec. 5.1; the
+A channel that is not finite, implausibly large, or frozen is missing.  It is replaced by its conditional mean given
+the available channels: the hover model, linearised about the estimated equilibrium (`mpc.equilibrium`), predicts the
+state under the command in force, and a Kalman filter whose only measurements are the available channels corrects it
+(Simon, "Optimal State Estimation", 2006, Sec. 5.1; the
 process noise is an acceleration, constant over a period and white from one to the next, Bar-Shalom, Li and Kirubarajan,
-"Estimation with Applications to Tracking and Navigation", 2001, Sec. 6.3.2).  Channels that are there are passed on as
-measured, so that nothing changes while all are.
+"Estimation with Applications to Tracking and Navigation", 2001, Sec. 6.3.2).  Available channels are passed on as
+measured, so that nothing changes while all are available.
 
-A group of three channels is frozen when it repeats the last period's numbers to the last bit, though the prediction has
-left them.  The numbers of a sensor slower than the controller are so between its samples, and predicted then.
+A group of three channels is frozen when it repeats the last period's numbers to the last bit although the prediction
+has moved away from them.  A sensor slower than the controller repeats its numbers between its samples; they are
+predicted then.
 """
 
 from __future__ import annotations
@@ -55,17 +56,17 @@ def _by_group(values: tuple[float, float, float, float]) -> Array:
 PLAUSIBLE: Final = _by_group((1e5, 1e3, 1e5, 1e3))
 """Largest magnitudes taken for a measurement [m, m/s, rad, rad/s]; a yaw counts its turns."""
 UNMOVED: Final = _by_group((1e-3, 5e-3, 1e-3, 2e-2))
-"""Distance of the prediction from numbers repeated to the last bit from which on they are frozen [same]."""
+"""Distance of the prediction from repeated numbers beyond which these count as frozen [same]."""
 NOISE: Final = _by_group((0.01, 0.02, 0.005, 0.02))
 """Standard deviations ascribed to measured channels [same]."""
 ACCELERATION: Final = (1.0, 2.0)
-"""Standard deviations of what the model leaves out [m/s^2, rad/s^2]."""
+"""Standard deviations of unmodelled accelerations [m/s^2, rad/s^2]."""
 UNKNOWN: Final = _by_group((100.0, 10.0, 1.0, 1.0))
 """Standard deviations before anything was measured [m, m/s, rad, rad/s]."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Reckoned(Moment):
+class CompletedMoment(Moment):
     """A moment whose state may in part be predicted rather than measured.
 
     Attributes:
@@ -75,7 +76,7 @@ class Reckoned(Moment):
     unseen: Array
 
 
-class DeadReckoning:
+class StateCompletion:
     """Completes one state after the other, one per control period.
 
     Attributes:
@@ -96,7 +97,7 @@ class DeadReckoning:
         self.reset()
 
     def reset(self) -> None:
-        """Nothing was measured yet: at rest and level at the origin, for all that is known."""
+        """Start anew: nothing measured yet; at rest, level and at the origin is assumed."""
         self._state = np.zeros(N_STATES)
         self._covariance: Array = np.diag(UNKNOWN**2)
         self._last = np.full(N_STATES, np.nan)
@@ -110,7 +111,7 @@ class DeadReckoning:
             measured: (12,) what was measured, in part perhaps not finite; of another shape, nothing was.
             acting: (4,) rotor speeds in force since the last state [rad/s].
             trim: what holds the vehicle at rest.
-            free: whether the vehicle flies, so that the model tells how it moves; nothing counts as frozen else.
+            free: whether the vehicle flies, so that the model predicts its motion; otherwise nothing counts as frozen.
         """
         if np.shape(measured) != (N_STATES,):
             measured = np.full(N_STATES, np.nan)

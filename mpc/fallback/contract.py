@@ -8,12 +8,12 @@ Each period, the first of these that can be had:
 2. level hover by LQR: velocity to zero, then the place held; height and yaw held from the start;
 3. descent: the same, sinking at a steady speed, once level 2 has lasted too long.
 
-The inner controller is asked again in every period in which the state is known, so that recovery is automatic.  It is
-told the command in force each time, so that its own bounds on steps refer to what acts, whoever commanded it, and which
-channels of the state are predicted rather than measured (`mpc.fallback.completion.Reckoned`).
+The inner controller is called in every period in which the state is known, so that recovery is automatic.  It receives
+the command in force, so that its bounds on steps refer to what acts, whoever commanded it, and which channels of the
+state are predicted rather than measured (`mpc.fallback.completion.CompletedMoment`).
 
-One that estimates what disturbs the vehicle says what holds it at rest by an attribute `trim` (`mpc.equilibrium.Trim`).
-Levels 1 to 3, and predictions of what is not measured, start from it; it stays as it was while nothing is measured.
+One that estimates disturbances gives the equilibrium under them as an attribute `trim` (`mpc.equilibrium.Trim`).
+Levels 1 to 3, and predictions of channels that are not measured, start from it; it is held while nothing is measured.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ import numpy as np
 
 from mpc.answer import ActuatorBounds, rejection, shifted
 from mpc.equilibrium import Trim
-from mpc.fallback.completion import PLAUSIBLE, DeadReckoning, Reckoned
+from mpc.fallback.completion import PLAUSIBLE, CompletedMoment, StateCompletion
 from mpc.fallback.hover import HoverLaw
 from mpc.fallback.settings import FallbackSettings as FallbackSettings
 from mpc.heading import anchored, predict_in_heading_frame
@@ -89,7 +89,7 @@ class Guarded:
         self.law = HoverLaw(model, tilt=settings.tilt)
         self._model, self._bounds, self._settings, self._failures = model, bounds, settings, failures
         self._distance = settings.distance
-        self._reckoning = DeadReckoning(model)
+        self._completion = StateCompletion(model)
         self._level = Trim(speeds=model.u_bar, lift=np.array([0.0, 0.0, 1.0]))
         self._good: _Good | None
         self._foreseen: Array | None
@@ -115,7 +115,7 @@ class Guarded:
         """Start anew after the command u(-1) (4,) [rad/s]."""
         usable = check_command(speeds) is None
         self._before = np.array(speeds, float) if usable else self._model.u_bar.copy()
-        self._reckoning.reset()
+        self._completion.reset()
         self._forget()
         self.inner.reset(self._before.copy())
 
@@ -126,9 +126,9 @@ class Guarded:
         to their lowest speed as fast as the bounds allow.
         """
         acting = self._before if now.acting is None or check_command(now.acting) is not None else now.acting
-        known = self._reckoning.complete(state, acting, self.trim, free=now.phase is Phase.FLYING)
-        told = Reckoned(**{**vars(now), "acting": acting.copy(), "unseen": self._reckoning.unseen.copy()})
-        status, answer = self._ask(told, known, reference)
+        known = self._completion.complete(state, acting, self.trim, free=now.phase is Phase.FLYING)
+        completed = CompletedMoment(**{**vars(now), "acting": acting.copy(), "unseen": self._completion.unseen.copy()})
+        status, answer = self._ask(completed, known, reference)
         if now.phase in GROUNDED:
             self._forget()
             command = stopped(self._bounds.reach(acting)[0], self.horizon, now.phase)
@@ -143,7 +143,7 @@ class Guarded:
 
     @property
     def trim(self) -> Trim:
-        """What holds the vehicle at rest, as the inner controller believes; level hover where it does not say."""
+        """The equilibrium that the inner controller estimates; level hover where it has none."""
         try:
             trim = getattr(self.inner, "trim", None)
         except self._failures as error:
@@ -167,10 +167,10 @@ class Guarded:
         self._good, self._foreseen, self._age = None, None, 0
         self._target, self._hovered = None, 0
 
-    def _ask(self, now: Reckoned, known: Array, reference: Array) -> tuple[str, Command | None]:
+    def _ask(self, now: CompletedMoment, known: Array, reference: Array) -> tuple[str, Command | None]:
         """The inner controller's answer where one was given, and its status: an accepted one is good to fly."""
         assert now.acting is not None
-        if self._model.period * float(self._reckoning.unseen.max()) > self._settings.unseen:
+        if self._model.period * float(self._completion.unseen.max()) > self._settings.unseen:
             return "state_unknown", None
         shape = (self.horizon, len(REFERENCE_STATES))
         if np.shape(reference) != shape or not (np.abs(reference) <= PLAUSIBLE[list(REFERENCE_STATES)]).all():

@@ -22,7 +22,7 @@ from mpc.answer import ActuatorBounds, rejection, shifted
 from mpc.constraints import Bounds, Constraint
 from mpc.equilibrium import Trim, equilibrium, twisted
 from mpc.exact.shortcut import with_shortcut
-from mpc.fallback.completion import PLAUSIBLE, Reckoned
+from mpc.fallback.completion import PLAUSIBLE, CompletedMoment
 from mpc.heading import (
     anchored,
     predict_in_heading_frame,
@@ -68,7 +68,7 @@ class RobustMPC:
         trim: what holds the vehicle at rest against the disturbance that is estimated.
 
     Args:
-        vehicle: what is believed to fly.
+        vehicle: the modelled vehicle.
         period: control period tau_s [s].
         horizon: N.
         objective: for the paper's 12 states.
@@ -144,9 +144,9 @@ class RobustMPC:
         """See `quadsim.controller.Controller.step`.
 
         Numbers that are not finite, not `mpc.fallback.completion.PLAUSIBLE`, or lead to such are answered with the
-        status `invalid_data`, and nothing is learned from them.  Nor is anything from a state that is in part predicted
-        (`mpc.fallback.completion.Reckoned`), nor from the first measured one after more than `LONGEST_SPAN` of such, or
-        after a pause: `now.time` has to be a period later than last time.
+        status `invalid_data`, and do not update the observer.  Neither does a state that is in part predicted
+        (`mpc.fallback.completion.CompletedMoment`), the first measured one after more than `LONGEST_SPAN` of such, or
+        one after a pause: `now.time` has to be a period later than last time.
         """
         if now.acting is not None:
             self._acting = np.array(now.acting, float)
@@ -198,7 +198,7 @@ class RobustMPC:
         return np.concatenate([self._resting.acceleration, thrust * self.trim.twist])
 
     def _forget(self) -> None:
-        """Believe in no disturbance."""
+        """Assume no disturbance."""
         if self._observer is not None:
             self._observer.reset()
         self._believe()
@@ -226,7 +226,7 @@ class RobustMPC:
 
     def _span(self, now: Moment) -> float:
         """Time since the last measured state [s]; infinite after a pause, or where the present one is not measured."""
-        if isinstance(now, Reckoned) and now.unseen[_MOVING].any():
+        if isinstance(now, CompletedMoment) and now.unseen[_MOVING].any():
             return math.inf
         span, self._measured = now.time - self._measured, now.time
         return span - _SAME_TIME

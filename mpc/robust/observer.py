@@ -27,7 +27,7 @@ from quadsim.state import EULER, EULER_RATE, VELOCITY, Array, euler_to_body_rate
 _VELOCITY: Final = list(VELOCITY)
 _EULER: Final = list(EULER)
 _UPRIGHT: Final = 0.1
-"""Smallest vertical part of the thrust axis by which a change of vertical speed is told to be thrust's."""
+"""Smallest vertical part of the thrust axis from which on a change of vertical speed is attributed to thrust."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,7 +45,7 @@ class ObserverSettings:
         rate_walk: the same of a body rate [rad/s].
         force_walk: change of the force's acceleration in a period [m/s^2].
         torque_walk: change of the torque's angular acceleration in a period [rad/s^2].
-        largest_force: no larger acceleration is ever believed [m/s^2].
+        largest_force: larger estimates are clipped [m/s^2].
         largest_torque: no larger angular acceleration [rad/s^2].
     """
 

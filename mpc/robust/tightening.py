@@ -1,4 +1,4 @@
-"""How far output bounds must be drawn in for a vehicle that is disturbed, and watched at every instant.
+"""Tightening of output bounds, so that they hold under bounded disturbances and between samples.
 
 Let the vehicle differ from its prediction by accelerations w of at most a stated size.  Where the prediction holds an
 estimate of the disturbance, itself within the stated bounds, a disturbance that changes sign is w = 2 times these away
@@ -7,11 +7,11 @@ i periods is bounded in each output by
 
     r_i = int_0^d |C e^(A_c s) E| w ds + sum_{j=0}^{i-1} int_0^tau |C (A - B K)^j e^(A_c (s + d)) E| w ds,
 
-the support function of what w of any course can do, d the delay between measuring and acting.  With bounds drawn in by
+the support function of what w of any course can do, d the delay between measuring and acting.  With bounds tightened by
 r_i the plan of one period, moved on and corrected, keeps those of the next (Chisci, Rossiter and Zappa, 2001, "Systems
 with persistent disturbances: predictive control with restricted constraints"; Mayne, Seron and Rakovic, 2005, "Robust
-model predictive control of constrained linear systems with bounded disturbances").  Inputs are not drawn in: near
-their bounds the correction may lack room.
+model predictive control of constrained linear systems with bounded disturbances").  Bounds on inputs are not tightened:
+near them the correction may lack authority.
 
 Between two samples an output y may pass both.  From the straight line through them it differs by at most
 
@@ -89,10 +89,10 @@ def margins(
     delay: float = 0.0,
     estimated: bool = False,
 ) -> Array:
-    """By how much the bounds of each output must be drawn in at each predicted state, (N, n_c) in its unit.
+    """By how much the bounds of each output are tightened at each predicted state, (N, n_c) in its unit.
 
     Args:
-        vehicle: what is believed to fly.
+        vehicle: the modelled vehicle.
         period: control period tau [s].
         horizon: N.
         bounds: of outputs of the 12 states.
@@ -115,7 +115,7 @@ def margins(
     for i in np.flatnonzero(~np.isfinite(room)):
         name, scale, _ = bounds.output(int(i))
         sides = [scale * float(bounds.y_min[i]), scale * float(bounds.y_max[i])]
-        raise ParameterError("controller.output_bounds", name, sides, "finite on both sides, to be drawn in")
+        raise ParameterError("controller.output_bounds", name, sides, "finite on both sides, to be tightened")
     largest = (2.0 if estimated else 1.0) * np.repeat([settings.acceleration, settings.angular_acceleration], 3)
     basis = observed(A, C)
     A, B, C, E = basis.T @ A @ basis, basis.T @ B, C @ basis, basis.T @ E

@@ -71,7 +71,7 @@ def _is(value: Any, kind: type) -> bool:
 
 
 def read_json(path: Path, form: Mapping[str, Any], what: str) -> dict[str, Any]:
-    """A JSON object from a file of ours.
+    """A JSON object from a file of quadsim's.
 
     Args:
         path: of the file.

@@ -26,7 +26,7 @@ class ControlLog:
 
     Attributes:
         t: (K,) [s].
-        state: (K, 12) state as measured, which is what the controller was told; units of `STATE_UNITS`.
+        state: (K, 12) state as measured, which the controller received; units of `STATE_UNITS`.
         truth: (K, 12) state as it was; the same where measurement is perfect.
         reference: (K, 4) filtered reference x, y, z [m], yaw [rad] at t_k.
         speeds: (K, 4) commanded rotor speeds in force at the period's end [rad/s].
@@ -60,7 +60,7 @@ class ControlLog:
 
     @property
     def measured_perfectly(self) -> bool:
-        """Whether the controller was told the truth throughout."""
+        """Whether the measured state was the true one throughout."""
         return self.state is self.truth or bool(np.array_equal(self.state, self.truth))
 
     @property

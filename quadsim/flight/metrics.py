@@ -166,7 +166,7 @@ def computation(log: ControlLog) -> dict[str, Any]:
 
 
 def estimation(log: ControlLog) -> dict[str, Any]:
-    """Errors of what the controller was told, told minus true, by state: RMS, and the largest magnitude.
+    """Errors of the measured state, measured minus true, by state: RMS, and the largest magnitude.
 
     Samples that are no numbers, as a failed sensor gives them, are counted and left out.
     """

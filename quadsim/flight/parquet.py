@@ -110,7 +110,7 @@ def write_log(directory: Path, log: FlightLog, *, plant_stride: int, metadata: M
 
 
 def add_metadata(path: Path, texts: Mapping[str, str]) -> None:
-    """Add texts to those that a table of ours keeps in its schema.
+    """Add texts to those that a table of quadsim's keeps in its schema.
 
     Raises:
         FileError: it cannot be read.
@@ -121,7 +121,7 @@ def add_metadata(path: Path, texts: Mapping[str, str]) -> None:
 
 
 def read_metadata(path: Path) -> dict[str, str]:
-    """The texts that a table of ours keeps in its schema.
+    """The texts that a table of quadsim's keeps in its schema.
 
     Raises:
         FileError: it cannot be read.

@@ -34,7 +34,7 @@ FIGURES_DIR: Final = "figures"
 KIND: Final = "run"
 """What `quadsim.outputs` calls a run directory."""
 UNLISTED: Final = (SUMMARY_FILE, MANIFEST_FILE, LOCK_FILE)
-"""Files of ours whose hashes the summary does not have."""
+"""Files of quadsim's whose hashes the summary does not have."""
 SEAL: Final = "summary"
 """Under which `timing.parquet` keeps the summary's digest."""
 
@@ -107,7 +107,7 @@ def limit_from_json(entry: Mapping[str, Any]) -> Limit:
 
 
 def is_run(directory: Path) -> bool:
-    """Whether a path is a run directory: one with a summary of ours, since others write a `summary.json` too."""
+    """Whether a path is a run directory: one with a summary of quadsim's, since others write a `summary.json` too."""
     try:
         read_summary(directory)
     except FileError:

@@ -183,6 +183,6 @@ def summary_digest(summary: Mapping[str, Any], fixed: Mapping[str, str]) -> str:
         summary: `summary.json`.
         fixed: hashes by file; a film, say, is made again, and is none of them.
     """
-    told = {key: value for key, value in summary.items() if key != "files"}
-    text = json.dumps([told, dict(fixed)], sort_keys=True, allow_nan=False)
+    hashed = {key: value for key, value in summary.items() if key != "files"}
+    text = json.dumps([hashed, dict(fixed)], sort_keys=True, allow_nan=False)
     return "sha256:" + hashlib.sha256(text.encode()).hexdigest()

@@ -1,7 +1,7 @@
-"""The one place that writes, replaces and removes files: complete or not at all, and never what is not ours.
+"""The one place that writes, replaces and removes files: complete or not at all, and never other people's.
 
 Whatever is made grows in a staging directory beside its target and gets its name in one step.  What may be replaced is
-known by its content: a directory of ours holds a manifest, `.quadsim.json`, of every file in it with its SHA-256, and a
+known by its content: a directory of quadsim's has a manifest, `.quadsim.json`, of every file with its SHA-256, and a
 file by itself ends in the SHA-256 of all that stands before.  That is looked at before work begins, and again when the
 earlier one has been moved out of the way, in the very step in which the new one takes its name: if there is anything
 else by then, it is moved back.  What is removed is unlinked file by file, each only if its content is the one listed.
@@ -101,7 +101,7 @@ def writing(target: Path | str, kind: str) -> Iterator[Path]:
         The directory to fill.
 
     Raises:
-        OutputError: the place cannot be written, is nearly full, or holds something that is not ours, now or when the
+        OutputError: the folder cannot be written, is nearly full, or holds what quadsim did not write, now or when the
             block ends; whatever was there is still there.
     """
     target = real_path(target)

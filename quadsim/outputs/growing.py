@@ -1,4 +1,4 @@
-"""Directories of ours that grow in place: a campaign's, or a run's that gets its film later."""
+"""Directories of quadsim's that grow in place: a campaign's, or a run's that gets its film later."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _CHANGED: Final = "it is not as quadsim wrote it; move it away first"
 
 
 class Growing:
-    """A directory of ours to which files are added in place; see `growing`.
+    """A directory of quadsim's to which files are added in place; see `growing`.
 
     The manifest is ahead of the files: it lists what a file was together with what it is about to be, so that nothing
     of ours is unknown to it whenever the process is killed.
@@ -126,10 +126,10 @@ class Growing:
 
 @contextlib.contextmanager
 def growing(directory: Path | str, kind: str) -> Iterator[Growing]:
-    """Add files to a directory of ours, or to a new or empty one; one process at a time, and whoever dies lets go.
+    """Add files to a directory of quadsim's, or to a new or empty one; one process at a time, and whoever dies lets go.
 
     Raises:
-        OutputError: it cannot be written, another process writes there, or it is of another kind, or not ours.
+        OutputError: it cannot be written, another process writes there, or it is of another kind, or not quadsim's.
     """
     directory = real_path(directory)
     with parents_of(directory):

@@ -1,4 +1,4 @@
-"""What is ours: files whose content is known, listed by a directory's manifest or sealed by a digest of their own."""
+"""What quadsim wrote: files whose content is known, listed by a manifest or sealed by a digest of their own."""
 
 from __future__ import annotations
 
@@ -102,13 +102,13 @@ def below(directory: Path) -> Iterator[Path]:
 
 
 def take_stock(directory: Path, kind: str) -> Manifest:
-    """The manifest of a directory that is all ours."""
+    """The manifest of a directory that is all quadsim's."""
     files = {path.relative_to(directory).as_posix(): path for path in below(directory) if not is_folder(path)}
     return Manifest(kind=kind, files={name: (digest_of(path),) for name, path in files.items()})
 
 
 def read_manifest(directory: Path) -> Manifest | None:
-    """The manifest of a directory of ours; None where there is none, or one that is not as we write it."""
+    """The manifest of a directory of quadsim's; None where there is none, or one that is not as we write it."""
     path = directory / MANIFEST_FILE
     if not is_file(path):
         return None

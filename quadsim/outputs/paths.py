@@ -1,4 +1,4 @@
-"""Places where outputs go: what they are called, where a path leads, and what may stand in the way."""
+"""Paths of outputs: their names, where links lead, and what may already be there."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def parents_of(target: Path) -> Iterator[None]:
 
 
 def problem_with_directory(path: Path, kind: str) -> str | None:
-    """Why a directory must not be replaced; None if it is empty, or of that kind with nothing but ours in it."""
+    """Why a directory must not be replaced; None if it is empty, or of that kind and all quadsim's."""
     if not is_folder(path):
         return occupied(())
     if path.resolve().is_mount():

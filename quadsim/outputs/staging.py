@@ -78,10 +78,10 @@ class Staging:
         Args:
             new: what was made.
             target: its name to be.
-            problem: why something must not be replaced; None if it is ours.
+            problem: why something must not be replaced; None if it is quadsim's.
 
         Raises:
-            OutputError: what had the name is not ours; it has it again.
+            OutputError: quadsim did not write what had the name; it has it again.
         """
         try:
             _rename(new, target)
@@ -97,7 +97,7 @@ class Staging:
             _refuse(target, problem(slot))
         except BaseException:  # also where it cannot be read, or by Ctrl-C
             self._exchange(slot, target)
-            raise  # somebody may have saved something in the new one meanwhile: `dissolve` takes what is ours alone
+            raise  # somebody may have saved something in the new one meanwhile: `dissolve` takes only what is quadsim's
         with contextlib.suppress(OSError):  # the new one stands; what cannot be removed `dissolve` tells
             slot.unlink() if is_file(slot) else remove_listed(slot)
 
@@ -117,13 +117,13 @@ class Staging:
         slot.with_name(_NAME).unlink()
 
     def close(self) -> None:
-        """Remove what this process made; of what had a target's name, only what says itself that it is ours."""
+        """Remove what this process made; of what had a target's name, only what its content shows to be quadsim's."""
         with contextlib.suppress(OSError):
             shutil.rmtree(self.work, ignore_errors=True)  # nothing else is ever moved there
             self.dissolve()
 
     def dissolve(self) -> None:
-        """Remove what is known as ours, then the directory itself; it stays if there is anything else."""
+        """Remove what is known as quadsim's, then the directory itself; it stays if there is anything else."""
         if is_folder(self.work):
             _remove_half_made(self.work)
         gone = [remove_empty(self.work)]
@@ -204,7 +204,7 @@ def clear_leftovers(folder: Path) -> None:
 
 
 def _is_abandoned(staging: Staging) -> bool:
-    """Whether a staging directory is one of ours, and its process dead."""
+    """Whether a staging directory is one of quadsim's, and its process dead."""
     if not is_folder(staging.path) or not is_file(staging.owner):
         return False
     try:
@@ -235,7 +235,7 @@ def _remove_half_made(work: Path) -> None:
 
 
 def _remove_own(path: Path, *, beside: Path) -> None:
-    """Unlink what says itself that it is ours, or what the manifest of the directory around it lists."""
+    """Unlink what its content shows to be quadsim's, or what the manifest of the directory around it lists."""
     if is_folder(path):
         manifest = read_manifest(path)
         if manifest is None or not foreign(path, manifest):

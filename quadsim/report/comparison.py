@@ -83,9 +83,9 @@ def required(summary: Mapping[str, Any]) -> Cell:
     failed = [entry for entry in demanded if not entry["satisfied"]]
     missed = [entry["name"] for entry in failed if entry["worst_margin"] is None]
     broken = [entry["name"] for entry in failed if entry["worst_margin"] is not None]
-    told = [f"{what}: {', '.join(names)}" for what, names in (("violated", broken), ("not reached", missed)) if names]
-    if told:
-        return Cell(text="; ".join(told), mark=Mark.BAD)
+    parts = [f"{what}: {', '.join(names)}" for what, names in (("violated", broken), ("not reached", missed)) if names]
+    if parts:
+        return Cell(text="; ".join(parts), mark=Mark.BAD)
     return Cell(text=f"all {len(demanded)} hold", mark=Mark.GOOD) if demanded else Cell(text="none")
 
 

@@ -1,4 +1,4 @@
-"""Several runs -> the rows of what their flights met: course, ground, what was told, when commands came."""
+"""Several runs -> the rows of what their flights met: course, ground, measurement errors, delays of commands."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from quadsim.report.table import ABSENT, Cell, Mark, Row, format_number
 Summary = Mapping[str, Any]
 
 _COURSE: Final = {
-    "tilt": ("largest tilt asked for", "deg"),
+    "tilt": ("largest tilt required", "deg"),
     "velocity": ("highest speed asked for", "m/s"),
     "rotor_min": ("lowest rotor speed asked for", "rad/s"),
     "rotor_max": ("highest rotor speed asked for", "rad/s"),
@@ -22,8 +22,8 @@ _TOUCHDOWN: Final = {
     "horizontal_speed": ("touchdown, along the ground with", "m/s"),
     "tilt": ("touchdown, tilt", "deg"),
 }
-_ERRORS: Final = {"rmse": "RMS error as told", "max_error": "largest error as told"}
-_TOLD: Final = ("x", "y", "z", "roll", "pitch", "yaw")
+_ERRORS: Final = {"rmse": "RMS error of the measured", "max_error": "largest error of the measured"}
+_MEASURED: Final = ("x", "y", "z", "roll", "pitch", "yaw")
 
 
 def nested(data: Any, *keys: str) -> Any:
@@ -75,18 +75,18 @@ def ground_rows(summaries: Sequence[Summary]) -> Iterator[Row]:
 
 
 def estimation_rows(summaries: Sequence[Summary]) -> Iterator[Row]:
-    """How wrong the controller was told its state, and which samples a filter refused."""
+    """Errors of the measured or estimated state, and the samples that a filter rejected."""
     if not _any(summaries, "estimation"):
         return
     for measure, label in _ERRORS.items():
-        for name in _TOLD:
+        for name in _MEASURED:
             angle = name in ("roll", "pitch", "yaw")
             values = [nested(summary, "estimation", measure, name) for summary in summaries]
             shown = [math.degrees(value) if angle and value is not None else value for value in values]
-            yield _numbers("State as told", f"{label}, {name}", "deg" if angle else "m", shown)
+            yield _numbers("Measured state", f"{label} {name}", "deg" if angle else "m", shown)
     gone = [nested(summary, "estimation", "not_finite") for summary in summaries]
-    yield _numbers("State as told", "periods told no number", "", gone)
-    yield _row("State as told", "samples refused by the filter", [_refused(summary) for summary in summaries])
+    yield _numbers("Measured state", "periods without a number", "", gone)
+    yield _row("Measured state", "samples rejected by the filter", [_refused(summary) for summary in summaries])
 
 
 def computation_rows(summaries: Sequence[Summary]) -> Iterator[Row]:
@@ -129,5 +129,5 @@ def _phase(summary: Summary) -> Cell:
 
 def _refused(summary: Summary) -> Cell:
     samples = nested(summary, "estimation", "samples") or {}
-    told = [f"{name} {n['rejected']} of {n['accepted'] + n['rejected']}" for name, n in samples.items()]
-    return Cell(text=", ".join(told) or ABSENT)
+    parts = [f"{name} {n['rejected']} of {n['accepted'] + n['rejected']}" for name, n in samples.items()]
+    return Cell(text=", ".join(parts) or ABSENT)

@@ -51,7 +51,7 @@ def _outcome_sentences(named: _Named) -> Iterator[str]:
 
 
 def condition_sentences(named: _Named) -> Iterator[str]:
-    """What was expected of each flight, and what it met: course, ground, what was told, when commands came."""
+    """What was expected of each flight, and what it met: course, ground, measurement errors, delays of commands."""
     for name, summary in named:
         found, expected = verdict(summary), summary.get("expected")
         if expected is not None and not summary.get("as_expected"):
@@ -66,7 +66,7 @@ def condition_sentences(named: _Named) -> Iterator[str]:
         yield f"{_list(names)}: {sentence[0].lower()}{sentence[1:]}"
     for name, summary in named:
         yield from _ground_sentences(name, summary)
-        yield from _told_sentences(name, summary)
+        yield from _estimation_sentences(name, summary)
         if delays := nested(summary, "computation", "delay_ms"):
             missed = summary["computation"]["missed"]
             yield (
@@ -79,22 +79,22 @@ def _ground_sentences(name: str, summary: _Summary) -> Iterator[str]:
     if not summary.get("ground"):
         return
     ground = summary["ground"]
-    told = [] if ground["takeoff_time"] is None else [f"takes off at {format_number(ground['takeoff_time'])} s"]
+    phrases = [] if ground["takeoff_time"] is None else [f"takes off at {format_number(ground['takeoff_time'])} s"]
     if met := ground["touchdown"]:
         impact = f"{met['speed']:.2f} m/s downwards, {met['tilt']:.1f} deg of tilt"
-        told.append(f"meets the ground at {format_number(met['time'])} s ({impact})")
-    told.append("crashes" if ground["crashed"] else f"is {ground['phase']} at the end")
-    yield f"{name} {_list(told)}."
+        phrases.append(f"meets the ground at {format_number(met['time'])} s ({impact})")
+    phrases.append("crashes" if ground["crashed"] else f"is {ground['phase']} at the end")
+    yield f"{name} {_list(phrases)}."
 
 
-def _told_sentences(name: str, summary: _Summary) -> Iterator[str]:
+def _estimation_sentences(name: str, summary: _Summary) -> Iterator[str]:
     if not summary.get("estimation"):
         return
     rmse, gone = summary["estimation"]["rmse"], summary["estimation"]["not_finite"]
     position = math.hypot(*(rmse[axis] for axis in ("x", "y", "z")))
     attitude = math.degrees(math.hypot(*(rmse[angle] for angle in ("roll", "pitch", "yaw"))))
     yield (
-        f"The controller of {name} was told the position with an RMS error of {format_number(position)} m and the "
+        f"The controller of {name} received the position with an RMS error of {format_number(position)} m and the "
         f"attitude with one of {format_number(attitude)} deg{f', and no number in {gone} periods' if gone else ''}."
     )
 
@@ -116,11 +116,11 @@ def _limit_sentences(named: _Named) -> Iterator[str]:
             continue
         bounds = {format_bounds(entry, entry["unit"]) for _, entry in reached}
         if len(bounds) == 1:
-            told = (f"{name} {_case(entry)}" for name, entry in reached)
-            yield f"{constraint}, {bounds.pop()}: {'; '.join(told)}."
+            phrases = (f"{name} {_case(entry)}" for name, entry in reached)
+            yield f"{constraint}, {bounds.pop()}: {'; '.join(phrases)}."
         else:
-            told = (f"{name} ({format_bounds(entry, entry['unit'])}) {_case(entry)}" for name, entry in reached)
-            yield f"{constraint}, whose bounds differ: {'; '.join(told)}."
+            phrases = (f"{name} ({format_bounds(entry, entry['unit'])}) {_case(entry)}" for name, entry in reached)
+            yield f"{constraint}, whose bounds differ: {'; '.join(phrases)}."
     for name, constraints in unreached.items():
         yield f"{name} ended before it was held to {_list(constraints)}."
 
@@ -128,9 +128,9 @@ def _limit_sentences(named: _Named) -> Iterator[str]:
 def _case(entry: _Summary) -> str:
     """What one run did to one bound, e.g. `exceeds it by 5.62 deg, for 3.24 s in all`."""
     if not entry["satisfied"]:
-        told = f"{'violates' if entry['required'] else 'exceeds'} it {format_excess(entry)}"
+        phrases = f"{'violates' if entry['required'] else 'exceeds'} it {format_excess(entry)}"
         seconds = entry["time_violated"]
-        return f"{told}, for {format_number(seconds)} s in all" if seconds else told
+        return f"{phrases}, for {format_number(seconds)} s in all" if seconds else phrases
     margin = min(entry["worst_margin_sampled"], entry["worst_margin"])
     if abs(margin) < 1e-6:
         return "reaches it and keeps it"
@@ -147,8 +147,8 @@ def _tracking_sentences(named: _Named, *, courses: int) -> Iterator[str]:
     for channel in present_keys(summaries, "tracking", "rmse"):
         unit, values = tracking_values(summaries, "rmse", channel)
         pairs = sorted((value, name) for value, (name, _) in zip(values, flown, strict=True) if value is not None)
-        told = " against ".join(f"{format_number(value)} {unit} ({name})" for value, name in pairs)
-        parts.append(f"{channel} {told}")
+        phrases = " against ".join(f"{format_number(value)} {unit} ({name})" for value, name in pairs)
+        parts.append(f"{channel} {phrases}")
     if parts:
         yield f"RMS error to the filtered reference: {'; '.join(parts)}."
 
@@ -156,12 +156,12 @@ def _tracking_sentences(named: _Named, *, courses: int) -> Iterator[str]:
 def _effort_sentences(named: _Named) -> Iterator[str]:
     control = [(name, summary["control"]) for name, summary in named if summary["control"]]
     if control:
-        told = "; ".join(
+        phrases = "; ".join(
             f"{name} {format_number(c['speed_min'])} to {format_number(c['speed_max'])} rad/s, steps "
             f"{format_number(c['slew_min'])} to {format_number(c['slew_max'])} rad/s per period"
             for name, c in control
         )
-        yield f"Rotor speeds commanded: {told}."
+        yield f"Rotor speeds commanded: {phrases}."
     timed = sorted((c["step_ms"]["p50"], name, c) for name, s in named if (c := s["controller"]).get("step_ms"))
     for median, name, c in timed:
         yield (

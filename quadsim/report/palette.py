@@ -1,7 +1,7 @@
-"""Colours of everything drawn from a flight on paper or on a page: told apart by colour-blind readers as well.
+"""Colours of everything drawn from a flight on paper or on a page: distinct for colour-blind readers as well.
 
 Runs and rotors take theirs in order from Okabe and Ito's palette (2008), its blue made lighter for dark pages, and
-less its vermilion, which is too near the red that bounds are drawn in.
+less its vermilion, which is too near the red of the bounds.
 """
 
 from __future__ import annotations

@@ -33,7 +33,7 @@ class Computation:
         per_iteration: [s] for each iteration that the solver reports.
         jitter: mean of the random part [s]; exponential, as the wait for a busy processor is.
         stalls: when the computer answers nothing.
-        plan: whether the last plan is gone on with while no command has come.
+        plan: whether the last plan is continued until a command arrives.
     """
 
     fixed: float = 0.0

@@ -15,7 +15,7 @@ from quadsim.errors import FlightError, InterruptedFlightError, LostError
 from quadsim.flight.log import ControlLog, FlightLog, PlantLog, TimingLog
 from quadsim.flight.lost import LossCriteria, check_loss
 from quadsim.sim.computation import Computation
-from quadsim.sim.physics import Stretch, physics_to_state
+from quadsim.sim.physics import Segment, physics_to_state
 from quadsim.sim.plant import Plant
 from quadsim.state import INDEX, N_STATES, REFERENCE_NAMES, Array
 from quadsim.vehicle import N_ROTORS
@@ -54,7 +54,7 @@ def fly(
         initial_speeds: (4,) u(-1), and the rotor speeds at the start [rad/s].
         periods: K.
         steps_per_period: physics steps per control period.
-        navigation: what the controller is told; the true state where absent.
+        navigation: measured or estimated state for the controller; the true state where absent.
         computation: how long commands take, in simulated time; none where absent.
         rng: what `computation` draws from.
         ground: what knows where the flight stands with the ground; it is flying throughout where absent.
@@ -84,7 +84,7 @@ def fly(
     try:
         for k in range(periods):
             truth[k] = plant.state()
-            since = physics_to_state(samples[-1].stretch.physics) if ground and samples else truth[k : k + 1]
+            since = physics_to_state(samples[-1].segment.physics) if ground and samples else truth[k : k + 1]
             states[k] = truth[k] if navigation is None else navigation.state()
             preview = reference[k + 1 : k + 1 + controller.horizon]
             phase = Phase.FLYING if ground is None else ground.advance(since, preview)
@@ -110,9 +110,9 @@ def fly(
             holds = [(speeds, steps) for speeds, steps in holds if steps > 0]
             flown = [(plant.advance(speeds, steps), plant.applied(speeds)) for speeds, steps in holds]
             if navigation is not None:
-                for stretch, speeds in flown:
-                    held = np.broadcast_to(speeds, (len(stretch.physics), N_ROTORS))
-                    navigation.advance(stretch.physics, held, standing=phase in (Phase.LANDED, Phase.ARMED))
+                for segment, speeds in flown:
+                    held = np.broadcast_to(speeds, (len(segment.physics), N_ROTORS))
+                    navigation.advance(segment.physics, held, standing=phase in (Phase.LANDED, Phase.ARMED))
             samples.append(
                 Sample(
                     command=command,
@@ -121,7 +121,7 @@ def fly(
                     delay=delay,
                     missed=missed,
                     step_s=step_s,
-                    stretch=Stretch.join([stretch for stretch, _ in flown]),
+                    segment=Segment.join([segment for segment, _ in flown]),
                     rotors=plant.speeds,
                 )
             )
@@ -160,7 +160,7 @@ class Sample:
         delay: simulated time from the measurement to the command [s].
         missed: whether that was too long.
         step_s: wall time of the controller's step [s].
-        stretch: what the plant did.
+        segment: what the plant did.
         rotors: (4,) rotor speeds at the period's end [rad/s].
     """
 
@@ -170,7 +170,7 @@ class Sample:
     delay: float
     missed: bool
     step_s: float
-    stretch: Stretch
+    segment: Segment
     rotors: Array
 
 
@@ -208,14 +208,14 @@ def _control_log(
 
 
 def _plant_log(samples: list[Sample], start: Array, initial_speeds: Array, yaw: float, timestep: float) -> PlantLog:
-    stretches = [sample.stretch for sample in samples]
-    physics = np.concatenate([start[None], *(stretch.physics for stretch in stretches)])
+    segments = [sample.segment for sample in samples]
+    physics = np.concatenate([start[None], *(segment.physics for segment in segments)])
     last = samples[-1].rotors if samples else initial_speeds
-    flown = Stretch.join(stretches) if stretches else None
+    flown = Segment.join(segments) if segments else None
     return PlantLog(
         t=_times(physics.shape[0], timestep),
         state=physics_to_state(physics, yaw),
-        speeds=np.concatenate([*(stretch.speeds for stretch in stretches), last[None]]),
+        speeds=np.concatenate([*(segment.speeds for segment in segments), last[None]]),
         wrench=None if flown is None else _held(flown.wrench),
         wind=None if flown is None else _held(flown.wind),
     )

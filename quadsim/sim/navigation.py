@@ -1,4 +1,4 @@
-"""Navigation: what a controller is told of the state, from what the sensors say of the true one."""
+"""Navigation: the state that a controller receives, from the sensors' measurements of the true one."""
 
 from __future__ import annotations
 
@@ -34,9 +34,9 @@ _TAKEN: Final = attrgetter("taken")
 class Navigation:
     """Sensors, and an estimator or none.
 
-    Without an estimator the controller is told the last sample of each sensor that has arrived, however old, and the
-    truth where there is no sensor; until the first sample arrives, the truth at t = 0.  With an estimator it is
-    told the estimate, from those sensors alone that there are.
+    Without an estimator the controller receives the last sample of each sensor that has arrived, however old, and the
+    truth where there is no sensor; until the first sample arrives, the truth at t = 0.  With an estimator it
+    receives the estimate, from the sensors that there are.
 
     Each sensor draws from a generator of its own, so that adding one, or its noise, leaves the others' draws alone.
     """
@@ -54,7 +54,7 @@ class Navigation:
         """Set up, to be reset before use.
 
         Args:
-            vehicle: what is believed to fly.
+            vehicle: the modelled vehicle.
             timestep: physics step [s].
             sensors: at most one of each name; absent ones are perfect, or not there where there is an estimator.
             rng: where all randomness comes from.
@@ -104,12 +104,12 @@ class Navigation:
             self._filter.advance(np.empty((0, len(speeds))), self._arrived(), first=0)
 
     def advance(self, physics: Array, commands: Array, *, standing: bool = False) -> None:
-        """Take note of a stretch of flight.
+        """Take note of a segment of flight.
 
         Args:
             physics: (M, 14) the true state after each physics step.
             commands: (M, 4) rotor speeds in force during each of these steps [rad/s].
-            standing: whether the feet stood on the ground when the stretch began, as a land detector has it.
+            standing: whether the feet stood on the ground when the segment began, as a land detector has it.
         """
         if not len(physics):
             return
@@ -119,10 +119,10 @@ class Navigation:
             self._filter.advance(commands, self._arrived(), first, standing=standing)
 
     def state(self) -> Array:
-        """(12,) what the controller is told now: paper's order, yaw unwrapped."""
+        """(12,) the state that the controller receives now: paper's order, yaw unwrapped."""
         if self._filter is not None:
             mean = self._filter.estimate(self._step).mean
-            told = {
+            received = {
                 SensorName.POSITION: mean[0:3],
                 SensorName.VELOCITY: mean[3:6],
                 SensorName.ATTITUDE: quaternion_to_euler(mean[MEAN_QUATERNION]),
@@ -131,12 +131,12 @@ class Navigation:
         else:
             for sample in self._arrived():
                 self._held[sample.sensor] = sample.value
-            told = self._held | {name: truth(name, self._physics[None])[0] for name in self._perfect}
-        euler = told[SensorName.ATTITUDE].copy()
+            received = self._held | {name: truth(name, self._physics[None])[0] for name in self._perfect}
+        euler = received[SensorName.ATTITUDE].copy()
         state = np.empty(N_STATES)
-        state[POSITIONS] = told[SensorName.POSITION]
-        state[VELOCITIES] = told[SensorName.VELOCITY]
-        state[ANGLE_RATES] = body_to_euler_rates(euler, told[SensorName.RATES])
+        state[POSITIONS] = received[SensorName.POSITION]
+        state[VELOCITIES] = received[SensorName.VELOCITY]
+        state[ANGLE_RATES] = body_to_euler_rates(euler, received[SensorName.RATES])
         if math.isfinite(euler[2]):
             euler[2] += 2.0 * math.pi * round((self._yaw - float(euler[2])) / (2.0 * math.pi))
             self._yaw = float(euler[2])

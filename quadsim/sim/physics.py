@@ -59,7 +59,7 @@ def physics_to_state(physics: Array, yaw: float = 0.0) -> Array:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Stretch:
+class Segment:
     """What happened over a number of physics steps; M rows, one per step.
 
     Attributes:
@@ -76,8 +76,8 @@ class Stretch:
     wind: Array | None
 
     @staticmethod
-    def join(parts: Sequence[Stretch]) -> Stretch:
-        """Stretches one after the other as one."""
+    def join(parts: Sequence[Segment]) -> Segment:
+        """Segments one after the other as one."""
         if len(parts) == 1:
             return parts[0]
 
@@ -86,4 +86,4 @@ class Stretch:
             return None if arrays[0] is None else np.concatenate(arrays)
 
         physics, speeds = (np.concatenate([getattr(part, name) for part in parts]) for name in ("physics", "speeds"))
-        return Stretch(physics=physics, speeds=speeds, wrench=stack("wrench"), wind=stack("wind"))
+        return Segment(physics=physics, speeds=speeds, wrench=stack("wrench"), wind=stack("wind"))

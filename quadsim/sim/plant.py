@@ -20,7 +20,7 @@ from quadsim.sim.airframe import BODY, compile_model, outline
 from quadsim.sim.effects import Effects, RotorChange, Wind
 from quadsim.sim.effects.forces import StepForces
 from quadsim.sim.effects.load import Payload, apply_mass, mass_properties
-from quadsim.sim.physics import Stretch, physics_to_state
+from quadsim.sim.physics import Segment, physics_to_state
 from quadsim.state import (
     EULER,
     EULER_RATE,
@@ -179,7 +179,7 @@ class Plant:
         """The rotor speeds (4,) [rad/s] that a command asks for: it saturates at what rotors can do, and at zero."""
         return np.clip(speeds, *self._speed_range)
 
-    def advance(self, speeds: Array, steps: int) -> Stretch:
+    def advance(self, speeds: Array, steps: int) -> Segment:
         """Hold a command for a number of physics steps.
 
         Args:
@@ -199,7 +199,7 @@ class Plant:
             self._change()
             until = min(end, self._pending[0][0]) if self._pending else end
             parts.append(self._hold(target, until - self._step))
-        return Stretch.join(parts)
+        return Segment.join(parts)
 
     def _change(self) -> None:
         """Let happen what is due before the next step."""
@@ -214,7 +214,7 @@ class Plant:
         self._payloads = payloads
         apply_mass(self.model, BODY, mass_properties(self.vehicle, self.effects.load, payloads))
 
-    def _hold(self, target: Array, steps: int) -> Stretch:
+    def _hold(self, target: Array, steps: int) -> Segment:
         """Advance while nothing but the vehicle and the air changes."""
         rotors, timestep = self.effects.rotors, self.timestep
         if rotors is None:
@@ -237,7 +237,7 @@ class Plant:
         self._check(trajectory)
         self._physics[0] = trajectory[-1]
         self._step += steps
-        return Stretch(physics=trajectory, speeds=before, wrench=wrench, wind=wind)
+        return Segment(physics=trajectory, speeds=before, wrench=wrench, wind=wind)
 
     def _run(self, thrusts: Array) -> Array:
         """All steps in one call: thrusts (M, 4) [N] -> states (M, 14)."""

@@ -18,11 +18,11 @@ FITTED_FROM: Final = 20
 
 @dataclass(frozen=True, kw_only=True)
 class Target:
-    """Something asked for, beside what was measured.
+    """A target, beside what was measured.
 
     Attributes:
         what: the quantity.
-        asked: the limit, in words.
+        asked: the target, in words.
         measured: the value, in words.
         met: whether it is within the limit.
     """
@@ -35,7 +35,7 @@ class Target:
 
 @dataclass(frozen=True, kw_only=True)
 class CandidateResult:
-    """A controller that was asked what the flight's controller was asked.
+    """A controller timed on the queries of the flight's controller.
 
     Attributes:
         name: what it is called.
@@ -137,7 +137,7 @@ class SolverBench:
         deadline_ms: its control period [ms].
         asked: periods asked, K.
         flown: periods of the flight.
-        contenders: the default controller first.
+        candidates: the default controller first.
         gain_ms: (K,) whole step of the gain that the controller would be without its constraints [ms]; None where there
             is none.
         left_out: solvers that did not take part, and why.
@@ -154,7 +154,7 @@ class SolverBench:
     deadline_ms: float
     asked: int
     flown: int
-    contenders: tuple[CandidateResult, ...]
+    candidates: tuple[CandidateResult, ...]
     gain_ms: Array | None
     left_out: Mapping[str, str]
     growth: tuple[Growth, ...]
@@ -167,11 +167,11 @@ class SolverBench:
     @property
     def default(self) -> CandidateResult:
         """The controller as scenarios fly it."""
-        return self.contenders[0]
+        return self.candidates[0]
 
     def to_json(self) -> dict[str, Any]:
         """Everything, as plain values; a number that is none is null."""
-        apart = ("contenders", "gain_ms", "growth", "stages")
+        apart = ("candidates", "gain_ms", "growth", "stages")
         return {
             **{name: value for name, value in vars(self).items() if name not in apart},
             "gain_ms": None if self.gain_ms is None else metrics.percentiles(self.gain_ms),
@@ -182,7 +182,7 @@ class SolverBench:
                     "step_ms_by_period": np.round(candidate.step_ms, 5).tolist(),
                     "p99_to_default": candidate.quantiles["p99"] / self.default.quantiles["p99"],
                 }
-                for candidate in self.contenders
+                for candidate in self.candidates
             ],
             "growth": [
                 {**asdict(growth), "exponents": {name: growth.exponent(name) for name in ("p50", "p99")}}

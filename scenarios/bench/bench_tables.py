@@ -19,17 +19,17 @@ from scenarios.bench.targets import flight_targets, render_targets, solver_targe
 
 
 def solver_tables(bench: SolverBench) -> list[Grid]:
-    """Candidates, the growth of their steps, the length of a stage, and what was asked."""
+    """Candidates, the growth of their steps, the length of a stage, and the targets."""
     return [
         _candidates(bench),
         *([_growth(bench)] if bench.growth else []),
         *(_stages(what, stages) for what, stages in bench.stages.items()),
-        targets_table("Asked of the solvers, and measured", solver_targets(bench)),
+        targets_table("Targets for the solvers", solver_targets(bench)),
     ]
 
 
 def flight_tables(profile: FlightProfile) -> list[Grid]:
-    """Where the time of a flight goes, and what was asked."""
+    """Where the time of a flight goes, and the targets."""
     whole = sum(profile.pieces.values())
     pieces = [(name, seconds) for name, seconds in profile.pieces.items()]
     lines = [line(name, f"{seconds:.3f}", f"{100 * seconds / whole:.0f} %") for name, seconds in pieces]
@@ -46,11 +46,11 @@ def flight_tables(profile: FlightProfile) -> list[Grid]:
         lines=tuple(lines),
         note=f"Solver: {profile.solver or 'none, a gain'}; {place}; pieces are medians over {profile.repeats} flights.",
     )
-    return [grid, targets_table("Asked of a flight, and measured", flight_targets(profile))]
+    return [grid, targets_table("Targets for a flight", flight_targets(profile))]
 
 
 def render_tables(profile: RenderProfile) -> list[Grid]:
-    """What a film costs, and what was asked."""
+    """What a film costs, and the targets."""
     grid = Grid(
         key="render",
         title="What a film costs",
@@ -63,7 +63,7 @@ def render_tables(profile: RenderProfile) -> list[Grid]:
             line("60 s of film [s]", f"{profile.film_s(60.0):.1f}"),
         ),
     )
-    return [grid, targets_table("Asked of a film, and measured", render_targets(profile))]
+    return [grid, targets_table("Targets for a film", render_targets(profile))]
 
 
 def _candidates(bench: SolverBench) -> Grid:
@@ -81,14 +81,14 @@ def _candidates(bench: SolverBench) -> Grid:
         "timed",
     )
     fastest = {
-        quantile: min(candidate.quantiles[quantile] for candidate in bench.contenders)
+        quantile: min(candidate.quantiles[quantile] for candidate in bench.candidates)
         for quantile in ("p50", "p95", "p99", "max")
     }
     return Grid(
-        key="contenders",
-        title="The contenders",
+        key="candidates",
+        title="The candidates",
         head=head,
-        lines=tuple(_candidate(candidate, bench, fastest) for candidate in bench.contenders),
+        lines=tuple(_candidate(candidate, bench, fastest) for candidate in bench.candidates),
         note=_how(bench),
     )
 
@@ -117,20 +117,18 @@ def _how(bench: SolverBench) -> str:
         f"{which} {bench.flown} control periods of `{bench.scenario}`, N = {bench.horizon}, timed as a flight "
         "sees them: between two steps the plant flies a period, and each is the median of its repeats; raw max is the "
         "longest of all steps, the machine's stalls included. One process, one thread; "
-        "contenders take their turns in random order. Failures are periods without an optimum. Over the others, u0 "
+        "candidates take their turns in random order. Failures are periods without an optimum. Over the others, u0 "
         "error [rad/s] is the largest of the first input, from an optimum in closed form whose own KKT residual is at "
-        f"most {bench.reference_kkt:.0e}, and KKT the worst residual of the contender's answer to its own QP. "
-        f"{_shares(bench.default)}PIQP "
-        "multistage is first given the QP without slews late in the plan, which hardly ever bind; where one does it "
-        "solves twice, which no period here asks for."
-    )
+        f"most {bench.reference_kkt:.0e}, and KKT the worst residual of the candidate's answer to its own QP. "
+        f"{_shares(bench.default)}"
+    ).rstrip()
     return " ".join([said, *(f"Left out: {name}, {why}." for name, why in bench.left_out.items())])
 
 
 def _shares(candidate: CandidateResult) -> str:
     """Which of its periods a candidate with shortcuts answered how."""
-    told = ", ".join(f"by {way} {count}" for way, count in sorted(candidate.ways.items(), key=lambda pair: -pair[1]))
-    return f"Periods that the default answered {told}. " if candidate.shortcut else ""
+    phrase = ", ".join(f"by {way} {count}" for way, count in sorted(candidate.ways.items(), key=lambda pair: -pair[1]))
+    return f"Periods that the default answered {phrase}. " if candidate.shortcut else ""
 
 
 def _growth(bench: SolverBench) -> Grid:
@@ -144,7 +142,7 @@ def _growth(bench: SolverBench) -> Grid:
     )
     note = (
         f"{bench.growth_asked} control periods at each N, the problem and its reference made anew; at N = "
-        f"{bench.horizon} those of the contenders' table; growth: the exponents of N that fit p50 and p99 from N = "
+        f"{bench.horizon} those of the candidates' table; growth: the exponents of N that fit p50 and p99 from N = "
         f"{FITTED_FROM} on."
     )
     return Grid(
@@ -157,8 +155,8 @@ def _growth(bench: SolverBench) -> Grid:
 
 
 def _listed(what: str, entries: Iterable[str]) -> list[str]:
-    told = "; ".join(entries)
-    return [f"{what}: {told}."] if told else []
+    phrase = "; ".join(entries)
+    return [f"{what}: {phrase}."] if phrase else []
 
 
 def _growth_line(growth: Growth, horizons: Sequence[int]) -> tuple[Cell, ...]:
@@ -190,11 +188,11 @@ def _stages(what: str, stages: Sequence[StageLength]) -> Grid:
 
 
 def targets_table(title: str, targets: Sequence[Target]) -> Grid:
-    """What was asked, what was measured, and whether it is met."""
+    """Targets, what was measured, and whether each is met."""
     return Grid(
         key="targets",
         title=title,
-        head=("quantity", "asked", "measured", "verdict"),
+        head=("quantity", "target", "measured", "verdict"),
         lines=tuple(
             (
                 *line(target.what, target.asked, target.measured),

@@ -65,7 +65,7 @@ class CampaignRun:
 
     @property
     def overhead(self) -> float:
-        """Share of the workers' time in which they did not fly: started, waited, told."""
+        """Share of the workers' time in which they did not fly: started, waited, reported."""
         return 1.0 - self.busy_s / (self.workers * self.wall_s)
 
 
@@ -148,7 +148,7 @@ def campaign_tables(profile: CampaignProfile) -> list[Grid]:
         "every flight's set-up and audit included. Where a flight takes longer beside another one, cores share what "
         "both need. Not flying: share of the workers' time, their start included.",
     )
-    targets = targets_table("Asked of campaigns, and measured", campaign_targets(profile))
+    targets = targets_table("Targets for campaigns", campaign_targets(profile))
     return [rounds, *([_growth(profile)] if profile.growing else []), targets]
 
 
@@ -222,7 +222,7 @@ def bench_campaign(
         flights: per worker and round.
         rounds: how many.
         sizes: flights of the larger ones, by two workers.
-        progress: told how far it is.
+        progress: called with how much is done, of how much.
 
     Raises:
         ParameterError: nothing is asked for.

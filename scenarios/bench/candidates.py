@@ -75,7 +75,7 @@ class _Witnessed:
 
 
 class StepCandidate:
-    """A constrained controller that is asked a flight's queries, and whose solver's answers are kept."""
+    """A constrained controller that is given a flight's queries, and whose solver's answers are kept."""
 
     def __init__(self, entry: Entry, problem: Problem, queries: Queries) -> None:
         self.entry, self.problem = entry, problem

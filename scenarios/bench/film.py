@@ -17,7 +17,7 @@ from scenarios.run import Outputs, run_scenario
 from scenarios.schema.scenario import Scenario
 
 SECONDS: Final = 4.0
-"""Of film; the processes' start is told apart, so that a longer film follows from a short one."""
+"""Of film; the processes' start is timed apart, so that a longer film follows from a short one."""
 WIDTH, HEIGHT, FPS = 1280, 720, 30
 
 
@@ -30,7 +30,7 @@ def bench_render(
         scenario: what to film.
         seconds: of flight and film, at most the scenario's own.
         workers: rendering processes, at most; one per usable core by default.
-        progress: told how far it is.
+        progress: called with how much is done, of how much.
 
     Raises:
         ParameterError: an argument is out of range.

@@ -15,7 +15,7 @@ from quadsim.controller import Controller
 from quadsim.errors import InputError, ParameterError
 from quadsim.flight.audit import audit
 from quadsim.flight.log import FlightLog
-from quadsim.sim.physics import Stretch
+from quadsim.sim.physics import Segment
 from quadsim.sim.plant import Plant
 from quadsim.state import Array
 from quadsim.vehicle import Vehicle
@@ -47,7 +47,7 @@ class _TimedPlant(Plant):
         finally:
             self.measurement_s += clock.perf_counter() - started
 
-    def advance(self, speeds: Array, steps: int) -> Stretch:
+    def advance(self, speeds: Array, steps: int) -> Segment:
         """See `quadsim.sim.plant.Plant.advance`."""
         started = clock.perf_counter()
         try:
@@ -62,7 +62,7 @@ def bench_flight(scenario: Scenario, *, repeats: int = REPEATS, progress: Progre
     Args:
         scenario: what to fly.
         repeats: flights of each kind.
-        progress: told how far it is.
+        progress: called with how much is done, of how much.
 
     Raises:
         ParameterError: no repeat is asked for.

@@ -1,4 +1,4 @@
-"""What a controller was asked in a flight, to ask another one the same and time it."""
+"""The queries of a controller in a flight, to time another one on the same."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def recorded(scenario: Scenario, log: ControlLog, horizon: int) -> Queries:
 
 
 class QueriedController:
-    """A controller that is asked a flight's queries, each after the command that was given before it in that flight.
+    """A controller that is given a flight's queries, each after the command that was given before it in that flight.
 
     Attributes:
         command: its last answer; None where there was none.

@@ -49,7 +49,7 @@ def _draw(bench: SolverBench) -> Figure:
 
 def _draw_times(axes: Axes, bench: SolverBench) -> None:
     """A row per candidate, the quickest at the top: all its steps, with p50, p99 and the longest marked."""
-    ranked = sorted(bench.contenders, key=lambda candidate: candidate.quantiles["p99"], reverse=True)
+    ranked = sorted(bench.candidates, key=lambda candidate: candidate.quantiles["p99"], reverse=True)
     rng = np.random.default_rng(0)  # spreads the dots of a row, as every time
     for row, candidate in enumerate(ranked):
         colour = _look(bench, candidate.name)[0]
@@ -115,6 +115,6 @@ def _label(bench: SolverBench, candidate: CandidateResult) -> str:
 
 def _look(bench: SolverBench, name: str) -> tuple[str, str]:
     """Colour and line of a candidate."""
-    names = [candidate.name for candidate in bench.contenders]
+    names = [candidate.name for candidate in bench.candidates]
     i = names.index(name)
     return LINES[i % len(LINES)], _DASHES[i // len(LINES) % len(_DASHES)]

@@ -21,7 +21,7 @@ from scenarios.bench.bench_tables import solver_tables
 from scenarios.bench.candidates import Entry, StepCandidate, entries, judge, reference_optima
 from scenarios.bench.queries import QueriedController, Queries, flight_between, recorded
 from scenarios.bench.stages import time_stages
-from scenarios.bench.timing import StepTimes, stretches, time_in_turns
+from scenarios.bench.timing import StepTimes, segments, time_in_turns
 from scenarios.build import build_problem
 from scenarios.machine import machine, versions
 from scenarios.progress import Progress, silent
@@ -40,7 +40,7 @@ KIND: Final = "bench of solvers"
 REPEATS: Final = 3
 HORIZONS: Final = (10, 20, 50, 100, 200)
 GROWTH_STRIDE: Final = 6
-"""One stretch of so many is asked at each horizon and of each form of the QP."""
+"""One segment of so many is asked at each horizon and of each form of the QP."""
 LONGEST_PASS: Final = 20.0
 """A candidate whose first pass takes longer [s] is timed once."""
 GAIN: Final = "unconstrained gain"
@@ -86,8 +86,8 @@ def bench_solvers(
         repeats: how often each question is put, at most.
         horizons: N for the growth; empty for none.
         solvers: names in `SOLVERS`; those that are not installed are left out.
-        stride: one stretch of 20 periods of so many is asked; of the growth and the forms, one of six of those.
-        progress: told how far it is.
+        stride: one segment of 20 periods of so many is asked; of the growth and the forms, one of six of those.
+        progress: called with how much is done, of how much.
 
     Raises:
         InputError: an argument is wrong, or the flight is not one by a constrained controller.
@@ -101,10 +101,10 @@ def bench_solvers(
     problem = build_problem(scenario, flight.vehicle)
     rng = np.random.default_rng(scenario.seed)
     taking_part = entries(Entry(solver=spec.solver, shortcut=spec.shortcut), solvers)
-    few = stretches(flight.log.control.t.size, stride * GROWTH_STRIDE)
+    few = segments(flight.log.control.t.size, stride * GROWTH_STRIDE)
     with flight_between(scenario, flight.vehicle) as between:
         racing: _Racing = {"between": between, "repeats": repeats, "rng": rng}
-        contenders, own, gain, asked, reference_kkt = _time_candidates(
+        candidates, own, gain, asked, reference_kkt = _time_candidates(
             flight, problem, taking_part, stride=stride, progress=progress, **racing
         )
         growth = _growth(flight, problem, taking_part, horizons, few, own, progress=progress, **racing)
@@ -116,7 +116,7 @@ def bench_solvers(
         deadline_ms=1e3 * scenario.control_period,
         asked=asked,
         flown=flight.log.control.t.size,
-        contenders=contenders,
+        candidates=candidates,
         gain_ms=gain,
         left_out={name: SOLVERS[name].line for name in solvers if not SOLVERS[name].installed},
         growth=growth,
@@ -180,8 +180,8 @@ def _time_candidates(
 ) -> tuple[tuple[CandidateResult, ...], dict[str, _Timed], Array | None, int, float]:
     """Candidates, their steps, the gain's, the number of periods asked, and the reference's worst KKT residual."""
     queries = recorded(flight.scenario, flight.log.control, problem.horizon)
-    asked = stretches(queries.t.size, stride)
-    periods = [period for stretch in asked for period in stretch]
+    asked = segments(queries.t.size, stride)
+    periods = [period for segment in asked for period in segment]
     reference = reference_optima(problem, queries, periods)
     candidates = {entry.name: StepCandidate(entry, problem, queries) for entry in taking_part}
     laps = time_in_turns(
@@ -191,9 +191,9 @@ def _time_candidates(
         repeats=repeats,
         rng=rng,
         longest_pass=LONGEST_PASS,
-        progress=lambda done, total: progress("contenders", done, total),
+        progress=lambda done, total: progress("candidates", done, total),
     )
-    contenders = tuple(
+    results = tuple(
         CandidateResult(
             name=name,
             solver=candidate.entry.solver,
@@ -209,7 +209,7 @@ def _time_candidates(
     )
     gain = laps[GAIN].median if GAIN in laps else None
     own = {name: _Timed.of(candidate, periods, laps[name]) for name, candidate in candidates.items()}
-    return contenders, own, gain, len(periods), reference.kkt
+    return results, own, gain, len(periods), reference.kkt
 
 
 def _gain(problem: Problem, queries: Queries) -> dict[str, QueriedController]:
@@ -240,13 +240,13 @@ def _growth(
 ) -> tuple[Growth, ...]:
     """Every candidate at each N, until one would hardly keep up with the flight at the next.
 
-    Steps by the whole QP and by either shortcut are told apart: their shares change with N.  At the flight's own N they
-    are those of the candidates, `own`, which are not timed again.
+    Steps by the whole QP and by either shortcut are counted apart: their shares change with N.  At the flight's own N
+    they are those of the candidates, `own`, which are not timed again.
     """
     grown: dict[tuple[Entry, Way], list[tuple[int, float, float]]] = {}
     failures: dict[str, dict[int, int]] = {}
     dropped: dict[str, str] = {}
-    periods = [period for stretch in asked for period in stretch]
+    periods = [period for segment in asked for period in segment]
     deadline_ms = 1e3 * flight.scenario.control_period
     for N in sorted(set(horizons)):
         racing = [entry for entry in taking_part if entry.name not in dropped]

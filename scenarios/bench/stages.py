@@ -101,7 +101,7 @@ def _time(
         progress=lambda done, total: progress("stages", done, total),
     )
     found_active = candidates[default].active
-    active = np.array([found_active[period] > 0 for stretch in asked for period in stretch])
+    active = np.array([found_active[period] > 0 for segment in asked for period in segment])
     counted = active if active.any() else np.ones_like(active)
     found = []
     for steps, candidate in candidates.items():

@@ -1,4 +1,4 @@
-"""What was asked of the project's speed, held against what a bench measured."""
+"""Targets for the project's speed, compared with what a benchmark measured."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ def solver_targets(bench: SolverBench) -> list[Target]:
     """Speed and exactness of the default controller, against the other solvers and the horizon."""
     default = bench.default
     own = default.quantiles
-    others = [candidate for candidate in bench.contenders if candidate.solver != default.solver]
+    others = [candidate for candidate in bench.candidates if candidate.solver != default.solver]
     targets = [
         Target(what="default, p50", asked="<= 0.05 ms", measured=f"{own['p50']:.3f} ms", met=own["p50"] <= 0.05),
         Target(what="default, p99", asked="<= 1.6 ms", measured=f"{own['p99']:.2f} ms", met=own["p99"] <= 1.6),

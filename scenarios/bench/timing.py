@@ -4,8 +4,8 @@ Every step that is timed is timed here, in one way, as a flight sees it: between
 which leaves in the caches what it leaves there in a flight.  A question is put a few times, and its time is the median:
 what a flight sees but for the machine's stalls.
 
-The questions are put in stretches of consecutive periods.  Within a stretch a candidate answers all of them, as in a
-flight from its last answer.  In each stretch the candidates take their turns in random order.  A stretch begins with
+The questions are put in segments of consecutive periods.  Within a segment a candidate answers all of them, as in a
+flight from its last answer.  In each segment the candidates take their turns in random order.  A segment begins with
 the period before it, which is not timed.
 """
 
@@ -41,7 +41,7 @@ def undisturbed() -> Iterator[None]:
             gc.enable()
 
 
-STRETCH: Final = 20
+SEGMENT: Final = 20
 """Consecutive periods that a candidate answers before it is the next one's turn."""
 
 
@@ -73,9 +73,9 @@ class StepTimes:
         return np.asarray(np.median(self.ms, axis=0))
 
 
-def stretches(periods: int, stride: int) -> list[range]:
-    """Every `stride`-th stretch of a flight."""
-    return [range(start, min(start + STRETCH, periods)) for start in range(0, periods, stride * STRETCH)]
+def segments(periods: int, stride: int) -> list[range]:
+    """Every `stride`-th segment of a flight."""
+    return [range(start, min(start + SEGMENT, periods)) for start in range(0, periods, stride * SEGMENT)]
 
 
 def time_in_turns(
@@ -93,13 +93,13 @@ def time_in_turns(
 
     Args:
         candidates: by name.
-        asked: stretches of periods.
+        asked: segments of periods.
         between: what a flight does between two questions; not timed.
         repeats: passes over all questions.
-        rng: decides the order within each stretch.
+        rng: decides the order within each segment.
         longest_pass: candidates whose first pass takes longer than this [s] make no other.
         patience: candidates that have not answered all in this time [s] are left out.
-        progress: told how many turns of how many are over.
+        progress: called with how many turns are done, of how many.
 
     Returns:
         Each candidate's times, in the order of the questions; none of those that left.
@@ -111,11 +111,11 @@ def time_in_turns(
             racing = [name for name, laps in passes.items() if sum(map(sum, laps[:1])) <= 1e3 * longest_pass]
             for name in racing:
                 passes[name].append([])
-            for stretch in asked:
+            for segment in asked:
                 gc.collect()
                 for name in rng.permutation([name for name in racing if name in passes]).tolist():
                     left_ms = 1e3 * patience - sum(passes[name][-1])
-                    passes[name][-1] += _turn(candidates[name], stretch, between, left_ms)
+                    passes[name][-1] += _turn(candidates[name], segment, between, left_ms)
                     if sum(passes[name][-1]) > 1e3 * patience:
                         del passes[name]
                     done += 1
@@ -124,12 +124,12 @@ def time_in_turns(
     return {name: StepTimes(ms=np.array(laps)) for name, laps in passes.items()}
 
 
-def _turn(candidate: Candidate, stretch: range, between: Callable[[], None], left_ms: float) -> list[float]:
-    """The times of one stretch [ms], or of as much of it as goes a little beyond the time left."""
-    candidate.prepare(max(stretch.start - 1, 0))
+def _turn(candidate: Candidate, segment: range, between: Callable[[], None], left_ms: float) -> list[float]:
+    """The times of one segment [ms], or of as much of it as goes a little beyond the time left."""
+    candidate.prepare(max(segment.start - 1, 0))
     candidate.answer()
     laps: list[float] = []
-    for period in stretch:
+    for period in segment:
         if sum(laps) > left_ms:
             break
         candidate.prepare(period)

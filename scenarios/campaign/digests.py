@@ -25,7 +25,7 @@ def code_digest() -> str:
 
 
 def controller_digest(scenario: Scenario) -> str | None:
-    """SHA-256 of the code of a controller that is not ours: its module, or the whole package that it is in.
+    """SHA-256 of the code of a plug-in controller: its module, or the whole package that it is in.
 
     Raises:
         InputError: the controller cannot be made.

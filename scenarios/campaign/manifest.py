@@ -69,7 +69,7 @@ def begin(plan: Plan, files: Growing) -> dict[str, Any]:
 
 
 def go_on(plan: Plan, files: Growing, *, flying: bool) -> dict[str, Any]:
-    """The manifest of a campaign that is gone on with, maybe by more flights; see `require_same`.
+    """The manifest of a campaign that is resumed, perhaps with more flights; see `require_same`.
 
     Args:
         plan: the campaign.
@@ -134,7 +134,7 @@ def require_same(plan: Plan, directory: Path) -> None:
 def other_than_flew(manifest: Mapping[str, Any], plan: Plan) -> list[str]:
     """Of `code`, `controller`, `versions` and `machine`, those that are not as when a campaign was begun.
 
-    Imports a controller that is not ours; what is to run, and what ran then, is told to
+    Imports a plug-in controller; what is to run, and what ran then, is logged to
     `scenarios.parts.foreign_code.LOGGER` before.
     """
     if isinstance(plan.scenario.controller, PluginSpec):

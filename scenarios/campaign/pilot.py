@@ -34,7 +34,7 @@ class CampaignPilot:
         return self._plan.spec.limits
 
     def prepare(self) -> None:
-        """Import a controller that is not ours."""
+        """Import a plug-in controller."""
         controller = self._plan.scenario.controller
         if isinstance(controller, PluginSpec):
             with contextlib.suppress(Exception):
@@ -50,7 +50,7 @@ class CampaignPilot:
         except MemoryError as error:
             most = f"limits.memory is {self.limits.memory:g} MB"
             return self._row(flight, failed_row(f"{said(error)} ({most})", MEMORY))
-        except Exception as error:  # of a controller that is not ours, say: the campaign goes on without it
+        except Exception as error:  # of a plug-in controller, say: the campaign goes on without it
             return self._row(flight, failed_row(said(error)))
         return self._row(flight, _kept(flown, clock.perf_counter() - started))
 

@@ -105,7 +105,7 @@ def fly_campaign(
         resume: whether to go on with what the directory holds; without it there must be nothing there.
         until_width: width of the 95 % interval of the failure probability, from 0 to 1, at which to stop.
         report: whether to write the page and its figure.
-        watch: told how far it is, as answers come.
+        watch: called with the progress, as answers come.
 
     Raises:
         InputError: another campaign is there, or `until_width` would leave out flights that are there.

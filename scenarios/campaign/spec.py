@@ -90,7 +90,7 @@ class CampaignSpec(Spec):
                 if field == "seed":
                     raise ValueError(f"vary.{entry.name}.fields must not have seed: every flight has one of its own")
                 if field.split(".")[-1] == "name":
-                    raise ValueError(f"vary.{entry.name}.fields must not have {field}: results are told by names")
+                    raise ValueError(f"vary.{entry.name}.fields must not have {field}: results are identified by names")
                 if field in owners:
                     raise ValueError(f"vary.{entry.name}.fields must not have {field}, which {owners[field]} draws")
                 owners[field] = entry.name

@@ -47,12 +47,12 @@ def progress(*, enabled: bool) -> Iterator[Watch]:
                 bar, completed=standing.flown, total=standing.flights, description=describe(standing)
             )
     else:
-        told = clock.perf_counter()
+        printed = clock.perf_counter()
 
         def tell(standing: Standing) -> None:
-            nonlocal told
-            if clock.perf_counter() - told > LINE_EVERY or standing.flown == standing.flights:
-                told = clock.perf_counter()
+            nonlocal printed
+            if clock.perf_counter() - printed > LINE_EVERY or standing.flown == standing.flights:
+                printed = clock.perf_counter()
                 screen.print(describe(standing), soft_wrap=True)
 
         yield tell

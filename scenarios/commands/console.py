@@ -85,8 +85,8 @@ def print_summary(summary: Mapping[str, Any], where: str | None) -> None:
         console.print(line)
     if "reaudit" in summary:
         again = summary["reaudit"]
-        told = "as recorded" if again["satisfied"] == summary["satisfied"] else "its verdict is recorded alone"
-        console.print(f"audited again from the tables, {again['rate']:g} rows per second: {told}")
+        phrase = "as recorded" if again["satisfied"] == summary["satisfied"] else "its verdict is recorded alone"
+        console.print(f"audited again from the tables, {again['rate']:g} rows per second: {phrase}")
     if where is not None:
         print_place(where)
 
@@ -204,7 +204,7 @@ def _effect_lines(summary: Mapping[str, Any]) -> Iterator[str]:
         rmse = summary["estimation"]["rmse"]
         lengths = ", ".join(f"{name} {rmse[name]:.3g}" for name in ("x", "y", "z"))
         angles = ", ".join(f"{name} {math.degrees(rmse[name]):.3g}" for name in ("roll", "pitch", "yaw"))
-        yield f"RMS error of what the controller was told: {lengths} m; {angles} deg"
+        yield f"RMS error of the measured state: {lengths} m; {angles} deg"
 
 
 _BRIEF: Final = ("outcome", "required constraints", "RMS error", "verdict", "statuses", "whole step, m")

@@ -60,7 +60,7 @@ class VehicleSheet:
         torques: about x, y and z.
         thrust_slope: of one rotor, 2 b omega_bar [N s/rad].
         input_slopes: largest entry of B_c in the rows of vz [m/s^2 per rad/s] and of the three rates [rad/s^2 per
-            rad/s]: what the controller believes one rotor does per rad/s.
+            rad/s]: the modelled effect of one rotor per rad/s.
         integrator_chains: lengths of the chains of integrators that the linear model falls into, longest first.
         continuous_poles: of A_c [1/s].
         discrete_poles: of A at `period` [-].
@@ -236,9 +236,9 @@ def _figures(vehicle: Vehicle, sheet: VehicleSheet) -> list[tuple[str, ...]]:
         ("largest climb acceleration", format_number(sheet.climb_acceleration), "m/s^2"),
         ("largest steady tilt", format_number(sheet.steady_tilt), "deg"),
         ("thrust of one rotor per rad/s", format_number(sheet.thrust_slope), "N s/rad"),
-        ("climb per rad/s of one rotor, as believed", format_number(slopes["vz"]), "m/s^2 per rad/s"),
+        ("climb per rad/s of one rotor, as modelled", format_number(slopes["vz"]), "m/s^2 per rad/s"),
         *(
-            (f"{name} per rad/s of one rotor, as believed", format_number(slopes[f"{name}_rate"]), "rad/s^2 per rad/s")
+            (f"{name} per rad/s of one rotor, as modelled", format_number(slopes[f"{name}_rate"]), "rad/s^2 per rad/s")
             for name in ("roll", "pitch", "yaw")
         ),
     ]

@@ -51,10 +51,10 @@ class Panel:
 
 def step_curves(study: CostStudy) -> list[Curve]:
     """Share of the periods [%] that each candidate answers within a time [ms]."""
-    share = 100.0 * np.arange(1, len(study.contenders[0].step_ms) + 1) / len(study.contenders[0].step_ms)
+    share = 100.0 * np.arange(1, len(study.candidates[0].step_ms) + 1) / len(study.candidates[0].step_ms)
     return [
         Curve(label=candidate.name, x=read_only(np.sort(candidate.step_ms)), y=share, colour=i)
-        for i, candidate in enumerate(study.contenders)
+        for i, candidate in enumerate(study.candidates)
     ]
 
 

@@ -29,7 +29,7 @@ def write_cost_figures(study: CostStudy, directory: Path) -> list[Path]:
     Raises:
         OutputError: the directory cannot be written.
     """
-    steps = {"cost_steps": lambda: _draw_steps(study)} if study.contenders else {}
+    steps = {"cost_steps": lambda: _draw_steps(study)} if study.candidates else {}
     sweeps = {
         "cost_tilt": lambda: _draw_sweep(study, study.tilt, "over the bound on roll and pitch"),
         "cost_horizon": lambda: _draw_sweep(study, study.horizons, "over the horizon"),
@@ -63,10 +63,10 @@ def _draw_sweep(study: CostStudy, sweep: Sweep, over: str) -> Figure:
         axes.set_xlabel(f"{sweep.name} [{sweep.unit}]")
     figure.align_ylabels()
     with_them, without = lost_at(sweep)
-    told = ["dashed: without constraints", "dotted: the flight that is studied"]
-    told += ["grey x: lost without constraints"] * bool(without) + ["red x: lost with constraints"] * bool(with_them)
-    told += ["red triangle: does not settle"] * any(panel.never for panel in sweep_panels(study, sweep))
-    figure.supxlabel(";  ".join(told), fontsize=8.5, color="#5b6067")
+    parts = ["dashed: without constraints", "dotted: the flight that is studied"]
+    parts += ["grey x: lost without constraints"] * bool(without) + ["red x: lost with constraints"] * bool(with_them)
+    parts += ["red triangle: does not settle"] * any(panel.never for panel in sweep_panels(study, sweep))
+    figure.supxlabel(";  ".join(parts), fontsize=8.5, color="#5b6067")
     return figure
 
 

@@ -20,7 +20,7 @@ from quadsim.flight import metrics
 from quadsim.flight.log import ControlLog, FlightLog
 from quadsim.state import REFERENCE_STATES
 from scenarios.bench.queries import QueriedController, flight_between, recorded
-from scenarios.bench.timing import stretches, time_in_turns
+from scenarios.bench.timing import segments, time_in_turns
 from scenarios.build import build_controller, build_problem
 from scenarios.cost.study import CandidateTimes, Outcome
 from scenarios.courses.make import build_course_steps
@@ -32,7 +32,7 @@ from scenarios.schema.scenario import Scenario
 
 REPEATS: Final = 3
 SWEEP_STRIDE: Final = 3
-"""Of a flight in a sweep, one stretch of so many is timed."""
+"""Of a flight in a sweep, one segment of so many is timed."""
 LONGEST_PASS: Final = 20.0
 """A candidate that takes longer than this for all periods of a flight [s] is timed once."""
 
@@ -136,14 +136,14 @@ def time_candidates(
     with flight_between(scenario, vehicle) as between:
         laps = time_in_turns(
             asked,
-            stretches(log.t.size, 1),
+            segments(log.t.size, 1),
             between=between,
             repeats=REPEATS,
             rng=np.random.default_rng(scenario.seed),
             longest_pass=LONGEST_PASS,
             progress=lambda done, total: progress("steps", done, total),
         )
-    contenders = (
+    candidates = (
         CandidateTimes(
             name=name,
             step_ms=laps[name].median,
@@ -152,7 +152,7 @@ def time_candidates(
         )
         for name, each in asked.items()
     )
-    return tuple(contenders), left_out
+    return tuple(candidates), left_out
 
 
 def time_flights(
@@ -173,7 +173,7 @@ def time_flights(
             with flight_between(scenario, vehicle) as between:
                 laps = time_in_turns(
                     {controller.name: candidate},
-                    stretches(log.t.size, SWEEP_STRIDE),
+                    segments(log.t.size, SWEEP_STRIDE),
                     between=between,
                     repeats=REPEATS,
                     rng=np.random.default_rng(scenario.seed),

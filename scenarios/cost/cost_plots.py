@@ -26,7 +26,7 @@ def cost_plots(study: CostStudy) -> list[Plot]:
         _sweep(study, study.tilt, "cost-tilt", "Over the bound on roll and pitch"),
         _sweep(study, study.horizons, "cost-horizon", "Over the horizon"),
     ]
-    return [_steps(study), *sweeps] if study.contenders else sweeps
+    return [_steps(study), *sweeps] if study.candidates else sweeps
 
 
 def _steps(study: CostStudy) -> Plot:

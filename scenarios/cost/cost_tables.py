@@ -16,7 +16,7 @@ def cost_tables(study: CostStudy) -> list[Grid]:
     """What the study measured: computation, the two flights, both sweeps, and the sensitivity."""
     return [
         _flights(study),
-        *([_computation(study)] if study.contenders else []),
+        *([_computation(study)] if study.candidates else []),
         _sweep(study.tilt, "tilt", "How it moves with the bound on roll and pitch"),
         _sweep(study.horizons, "horizon", "How it moves with the horizon"),
         _sensitivity(study),
@@ -59,16 +59,16 @@ def format_slowest(outcome: Outcome) -> str:
 
 def _computation(study: CostStudy) -> Grid:
     lines = []
-    for candidate in study.contenders:
+    for candidate in study.candidates:
         lines.append(_times(study, candidate.name, candidate.step_ms, candidate))
         parts = {"by the unconstrained optimum": candidate.shortcut, "by QPs": ~candidate.shortcut}
         if 0 < candidate.shortcut.sum() < candidate.shortcut.size:
             for how, periods in parts.items():
                 label = f"... its {periods.sum()} periods answered {how}"
                 lines.append(_times(study, label, candidate.step_ms[periods]))
-    repeats = sorted({candidate.repeats for candidate in study.contenders})
+    repeats = sorted({candidate.repeats for candidate in study.candidates})
     note = (
-        f"Whole controller step, Python included, on the same {study.contenders[0].step_ms.size} queries, recorded in "
+        f"Whole controller step, Python included, on the same {study.candidates[0].step_ms.size} queries, recorded in "
         f"the constrained flight, timed as a flight sees them: between two steps the plant flies a period, and each is "
         f"the median of {' or '.join(map(str, repeats))} repeats. The rates are those at which 99 % of the steps, or "
         "all, would end within one period."
@@ -114,8 +114,8 @@ def _flights(study: CostStudy) -> Grid:
     for i, step in enumerate(with_them.settling):
         values = [outcome.settling[i]["settled"] for outcome in (with_them, without, *others)]
         alone = study.reference[i]["settled"]
-        told = "" if alone is None else f" (filtered reference: {alone:g})"
-        lines.append(_compared(f"settling, {format_step(step)} [s]{told}", values))
+        phrase = "" if alone is None else f" (filtered reference: {alone:g})"
+        lines.append(_compared(f"settling, {format_step(step)} [s]{phrase}", values))
     return Grid(
         key="bounds",
         title="The same course with constraints and without",
@@ -142,7 +142,7 @@ def _compared(label: str, values: Sequence[float | None]) -> tuple[Cell, ...]:
 
 
 def _difference(first: float, second: float) -> str:
-    """How much `first` is more than `second`; 0 where both are told by the same digits."""
+    """How much `first` is more than `second`; 0 where both are shown with the same digits."""
     if format_number(first) == format_number(second):
         return "0"
     return f"{'+' if first > second else ''}{format_number(float(f'{first - second:.4g}'))}"
@@ -200,8 +200,8 @@ def _tracked(outcome: Outcome, key: str) -> Cell:
 
 
 def _settling_cell(outcome: Outcome) -> Cell:
-    told = format_slowest(outcome)
-    return Cell(text=told, mark=Mark.WARN if told.startswith("never") else Mark.NONE)
+    phrase = format_slowest(outcome)
+    return Cell(text=phrase, mark=Mark.WARN if phrase.startswith("never") else Mark.NONE)
 
 
 def _sensitivity(study: CostStudy) -> Grid:

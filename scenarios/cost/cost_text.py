@@ -24,9 +24,9 @@ def cost_sentences(study: CostStudy) -> list[str]:
 
 
 def _computation(study: CostStudy) -> Iterator[str]:
-    if not study.contenders:
+    if not study.candidates:
         return
-    gain, flown, *others = study.contenders
+    gain, flown, *others = study.candidates
     free, found = percentiles(gain.step_ms), percentiles(flown.step_ms)
     yield (
         f"Computation: with constraints a step takes {_two(found['p50'])} ms in the median, {_two(found['p99'])} ms at "
@@ -43,16 +43,16 @@ def _computation(study: CostStudy) -> Iterator[str]:
             f"and is the answer after {_two(quick)} ms in the median; the others need QPs and {_two(slow)} ms."
         )
     if others:
-        told = "; ".join(_qp(study, candidate) for candidate in others)
-        yield f"With the QP solved in every period: {told}."
+        phrases = "; ".join(_qp(study, candidate) for candidate in others)
+        yield f"With the QP solved in every period: {phrases}."
 
 
 def _qp(study: CostStudy, candidate: CandidateTimes) -> str:
     found = percentiles(candidate.step_ms)
     late = int((candidate.step_ms > study.deadline_ms).sum())
     times = f"{_two(found['p50'])} ms in the median and {_two(found['max'])} ms at most"
-    told = f"{candidate.name} {times}, {_rate(candidate)}"
-    return f"{told}, {late} of its steps too late" if late else told
+    phrases = f"{candidate.name} {times}, {_rate(candidate)}"
+    return f"{phrases}, {late} of its steps too late" if late else phrases
 
 
 def _rate(candidate: CandidateTimes) -> str:
@@ -105,8 +105,8 @@ def _bought(study: CostStudy) -> Iterator[str]:
         first, second = study.constrained.number(key), study.unconstrained.number(key)
         if first is not None and second is not None:
             measure = MEASURES[key]
-            told = f"{measure.label} {_short(first)} instead of {_short(second)} {measure.unit}"
-            (bought if first < second else paid).append(told)
+            phrases = f"{measure.label} {_short(first)} instead of {_short(second)} {measure.unit}"
+            (bought if first < second else paid).append(phrases)
     for what, parts in (("What they buy", bought), ("What they do not make smaller", paid)):
         if parts:
             yield f"{what}: {', '.join(parts)}."
@@ -153,8 +153,8 @@ def _sweep(sweep: Sweep, label: Callable[[SweepPoint], str]) -> Iterator[str]:
         yield f"Without constraints the vehicle is lost at {_list(without)}{nowhere}."
     held = [point for point in sweep.points if point.constrained.fallbacks]
     if held:
-        told = [f"{label(point)} ({point.constrained.fallbacks} periods)" for point in held]
-        yield f"The QP has no solution, and an earlier plan is held, at {_list(told)}."
+        phrases = [f"{label(point)} ({point.constrained.fallbacks} periods)" for point in held]
+        yield f"The QP has no solution, and an earlier plan is held, at {_list(phrases)}."
 
 
 def _is_lost(outcome: Outcome | None) -> bool:
@@ -164,8 +164,8 @@ def _is_lost(outcome: Outcome | None) -> bool:
 def _variations(study: CostStudy) -> Iterator[str]:
     lost = [v for v in study.variations if not v.outcome.completed]
     if lost:
-        told = [f"L = {v.arm_length:g} m, d/b = {v.drag_to_thrust:g} m" for v in lost]
-        yield f"The vehicle is lost at {'; '.join(told)}."
+        phrases = [f"L = {v.arm_length:g} m, d/b = {v.drag_to_thrust:g} m" for v in lost]
+        yield f"The vehicle is lost at {'; '.join(phrases)}."
     parts = []
     for key in ("tilt_plant", "rmse_x", "rmse_z", "total_variation"):
         values = [value for v in study.variations if (value := v.outcome.number(key)) is not None]

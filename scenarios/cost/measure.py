@@ -113,7 +113,7 @@ def study_cost(
         solvers: what is to solve the QP in every period, for comparison; one that is not installed is left out.
         timed: the gain without constraints, the controller as flown, and solvers, where they have been timed already.
         workers: processes that fly; one per usable core by default.
-        progress: told how far it is.
+        progress: called with how much is done, of how much.
 
     Returns:
         The study.
@@ -122,9 +122,9 @@ def study_cost(
     assert isinstance(spec, ConstrainedSpec)
     base = fly(constrained)
     if timed is None:
-        contenders, left_out = time_candidates(constrained, base.control, solvers, progress)
+        candidates, left_out = time_candidates(constrained, base.control, solvers, progress)
     else:
-        contenders, left_out = tuple(timed), {}
+        candidates, left_out = tuple(timed), {}
 
     own = shared_tilt_bound(spec)
     tilted = {tilt: with_tilt(constrained, tilt) for tilt in sorted({*tilts} | ({own} if own else set()))}
@@ -140,11 +140,11 @@ def study_cost(
         return flown[key(scenario)].outcome
 
     swept = [
-        each for each in (*tilted.values(), *shortened.values()) if not contenders or key(each) != key(constrained)
+        each for each in (*tilted.values(), *shortened.values()) if not candidates or key(each) != key(constrained)
     ]
     steps = time_flights(swept, flown, progress)
-    if contenders:
-        steps[key(constrained)] = metrics.percentiles(contenders[1].step_ms)
+    if candidates:
+        steps[key(constrained)] = metrics.percentiles(candidates[1].step_ms)
 
     def point(value: float, scenario: Scenario, *, free: bool) -> SweepPoint:
         return SweepPoint(
@@ -163,7 +163,7 @@ def study_cost(
         unconstrained=outcome(without_constraints(constrained)),
         others={name: outcome(scenario) for name, scenario in apart.items()},
         reference=_reference_settling(constrained),
-        contenders=contenders,
+        candidates=candidates,
         left_out=left_out,
         tilt=Sweep(
             name="tilt bound",

@@ -166,7 +166,7 @@ class CostStudy:
         unconstrained: the same course, weights and horizon, without them.
         others: compared flights of the course by unconstrained controllers with weights or a horizon of their own.
         reference: settling of the filtered reference itself, had the vehicle followed it exactly.
-        contenders: timed on the queries of the constrained flight: the gain of the unconstrained optimum, the
+        candidates: timed on the queries of the constrained flight: the gain of the unconstrained optimum, the
             constrained controller as it flew, and the QP in every period by one solver each.
         left_out: solvers that could not take part, and what to do about it.
         tilt: sweep of the bound on roll and pitch.
@@ -183,7 +183,7 @@ class CostStudy:
     unconstrained: Outcome
     others: Mapping[str, Outcome]
     reference: Sequence[Mapping[str, Any]]
-    contenders: tuple[CandidateTimes, ...]
+    candidates: tuple[CandidateTimes, ...]
     left_out: Mapping[str, str]
     tilt: Sweep
     horizons: Sweep
@@ -191,7 +191,7 @@ class CostStudy:
     machine: Mapping[str, Any]
 
     def to_json(self) -> dict[str, Any]:
-        """Everything, as plain values; what a clock measured stands under `contenders` and `step_ms` alone."""
+        """Everything, as plain values; what a clock measured is under `contenders` and `step_ms` alone."""
         timed = [
             {
                 "name": candidate.name,
@@ -201,6 +201,6 @@ class CostStudy:
                 **metrics.percentiles(candidate.step_ms),
                 "step_ms": [float(f"{value:.4g}") for value in candidate.step_ms],
             }
-            for candidate in self.contenders
+            for candidate in self.candidates
         ]
-        return {**asdict(self), "contenders": timed}
+        return {**{name: value for name, value in asdict(self).items() if name != "candidates"}, "contenders": timed}

@@ -1,1 +1,1 @@
-"""Courses: what the vehicle is asked to do, and whether it can."""
+"""Courses: desired positions and headings, and whether they can be flown."""

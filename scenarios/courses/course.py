@@ -32,7 +32,7 @@ class Path:
 
 @dataclass(frozen=True, kw_only=True)
 class Course:
-    """What is asked of the vehicle, before the filter of Eq. (31).
+    """The desired poses, before the filter of Eq. (31).
 
     Attributes:
         sample: times (M,) >= 0 [s] of the flight -> (M, 4) x, y, z [m], yaw [rad], world.

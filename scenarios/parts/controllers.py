@@ -1,4 +1,4 @@
-"""From `[controller]` to a law that flies: the MPCs and their fallback, the baselines, one's own.
+"""From `[controller]` to a law that flies: the MPCs and their fallback, the baselines, plug-ins.
 
 Each law is imported where it is made, so that no command loads those it does not fly.
 """

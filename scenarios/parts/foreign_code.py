@@ -1,4 +1,4 @@
-"""Code that is not ours: where it is found and what it is, known before any of it runs."""
+"""Foreign code: where it is found and what it is, known before any of it runs."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from typing import Final
 from scenarios.schema.plugin import ENTRY_POINTS, PluginSpec
 
 LOGGER: Final = logging.getLogger("quadsim.code")
-"""Told, before the code of a controller that is not ours is imported, what is to run; the command line shows it."""
+"""Told, before the code of a plug-in controller is imported, what is to run; the command line shows it."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -33,7 +33,7 @@ def build_navigation(scenario: Scenario, vehicle: Vehicle) -> Navigation | None:
 
     Args:
         scenario: what is flown.
-        vehicle: the vehicle that the estimator believes in.
+        vehicle: the vehicle of the estimator's model.
 
     Raises:
         ParameterError: a fault of a sensor that the estimator does not have.

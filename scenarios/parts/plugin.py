@@ -1,4 +1,4 @@
-"""Controllers that are not ours: found by the place of their code, called, and fitted to the protocol."""
+"""Plug-in controllers: found by the location of their code, called, and fitted to the protocol."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class PluginController:
     """A controller with a `step` alone, or more, as the testbed wants it.
 
     What it lacks is filled in: `name` by its class's, `solver` by none, `reset` by nothing.  A step may answer with
-    four speeds instead of a `Command`.  It gets copies of what it is told, and its answers are copied.  `predict` is
+    four speeds instead of a `Command`.  It gets copies of its inputs, and its answers are copied.  `predict` is
     there where it has one.
 
     Args:
@@ -148,13 +148,13 @@ def import_plugin(spec: PluginSpec) -> None:
 def build_plugin(spec: PluginSpec, vehicle: Vehicle, period: float) -> Controller:
     """Import a controller and call it.
 
-    What is to run is told to `foreign_code.LOGGER` first.  Its module is looked for in the spec's folder, the
+    What is to run is logged to `foreign_code.LOGGER` first.  Its module is looked for in the spec's folder, the
     working directory, then among what is installed; these two stand first on the path while it is imported and called,
     and no longer.
 
     Args:
         spec: names it.
-        vehicle: what is believed to fly.
+        vehicle: the modelled vehicle.
         period: tau_s [s].
 
     Raises:

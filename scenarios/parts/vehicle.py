@@ -1,4 +1,4 @@
-"""From `[vehicle]` and `[initial]` to the vehicle that is believed to fly, and how it starts."""
+"""From `[vehicle]` and `[initial]` to the modelled vehicle and its initial state."""
 
 from __future__ import annotations
 

@@ -52,14 +52,14 @@ class _TunedSpec(_BaselineSpec):
         default=None,
         description="[s] lag of rotors and computer that gains allow for; absent: the vehicle's, or half a period",
     )
-    tilt: Tilt = Field(default=45.0, description="[deg] largest tilt asked for")
+    tilt: Tilt = Field(default=45.0, description="[deg] largest tilt commanded")
 
 
 class PIDSpec(_TunedSpec):
     """Cascaded PID as autopilots fly it."""
 
     type: Literal["pid"] = Field(description="the control law, by its name in `quadsim list`")
-    velocity: Positive = Field(default=12.0, description="[m/s] largest velocity asked for")
+    velocity: Positive = Field(default=12.0, description="[m/s] largest velocity commanded")
 
 
 class GeometricSpec(_TunedSpec):

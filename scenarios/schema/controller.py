@@ -54,7 +54,7 @@ def shared_tilt_bound(spec: ConstrainedSpec) -> float | None:
 
 
 def _law(controller: object) -> str | None:
-    """Which of the laws below a table is of; what is neither ours nor code is left for the message."""
+    """Which of the laws below a table is of; anything else is left for the message."""
     given = controller.get("type") if isinstance(controller, Mapping) else getattr(controller, "type", None)
     if not isinstance(given, str):
         return None
@@ -81,4 +81,4 @@ _Table = Annotated[
     Discriminator(_law),
 ]
 ControllerSpec = Annotated[_Table, BeforeValidator(_spelt_out, json_schema_input_type=_Table | str)]
-"""Any of the laws, told apart by its type; one whose fields all have defaults may be given by its name alone."""
+"""Any of the laws, distinguished by its type; one whose fields all have defaults may be given by its name alone."""

@@ -1,4 +1,4 @@
-"""`[reference]`: what the vehicle is asked to do."""
+"""`[reference]`: the desired course."""
 
 from __future__ import annotations
 

@@ -112,7 +112,7 @@ class LoadSpec(Spec):
 
 
 class DisturbanceSpec(Spec):
-    """A force and a torque from nowhere, constant and random."""
+    """An unmodelled force and torque, constant and random."""
 
     force: Triple = Field(default=[0.0, 0.0, 0.0], description="[N] world frame")
     torque: Triple = Field(default=[0.0, 0.0, 0.0], description="[N m] body frame")
@@ -129,7 +129,7 @@ class EffectsSpec(Spec):
     air: AirSpec | None = Field(default=None, description="drag and wind")
     ground: GroundSpec | None = Field(default=None, description="a floor")
     load: LoadSpec | None = Field(default=None, description="errors of mass and inertia, payload")
-    disturbance: DisturbanceSpec | None = Field(default=None, description="force and torque from nowhere")
+    disturbance: DisturbanceSpec | None = Field(default=None, description="unmodelled force and torque")
 
 
 Seconds = Annotated[float, Field(ge=0.0, le=100.0)]
@@ -142,7 +142,7 @@ class ComputationSpec(Spec):
     per_iteration: Seconds = Field(default=0.0, description="[s] for each iteration of the solver")
     plan: bool | None = Field(
         default=None,
-        description="whether the last plan is gone on with while a command is late; else the last command is held; "
+        description="whether the last plan is continued while a command is late; else the last command is held; "
         "absent: true with a controller within the fallback contract",
     )
     jitter: Seconds = Field(default=0.0, description="[s] mean of an exponentially distributed part")

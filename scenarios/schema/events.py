@@ -94,4 +94,4 @@ Event = Annotated[
     RotorLossEvent | PayloadPickupEvent | PayloadDropEvent | GustEvent | WindEvent | SensorFaultEvent | StallEvent,
     Field(discriminator="type"),
 ]
-"""One entry of the list, told apart by its type."""
+"""One entry of the list, distinguished by its type."""

@@ -29,7 +29,7 @@ class FallbackSpec(Spec):
     sink: Positive = Field(default=_USUAL.sink, description="[m/s] speed of the descent")
     tilt: Tilt | None = Field(
         default=None,
-        description="[deg] largest tilt asked for; absent: 0.8 of the tightest bound on roll or pitch, so that the "
+        description="[deg] largest tilt commanded; absent: 0.8 of the tightest bound on roll or pitch, so that the "
         "controller takes over again within its bounds, or 10 where there is none",
     )
     settled: Positive = Field(

@@ -1,4 +1,4 @@
-"""`controller = "my_package.my_module:MyController"`: a controller that is not ours, by the place of its code."""
+"""`controller = "my_package.my_module:MyController"`: a plug-in controller, by the location of its code."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ ENTRY_POINTS: Final = "quadsim.controllers"
 GIVEN: Final = ("vehicle", "period", "horizon")
 """Arguments that every controller is called with."""
 LAWS: Final = ("unconstrained", "constrained", "robust", "lqr", "pid", "geometric")
-"""The names that are ours."""
+"""The names of built-in controllers."""
 _NAME: Final = r"[^\W\d]\w*(?:\.[^\W\d]\w*)*"
 
 

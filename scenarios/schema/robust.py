@@ -29,7 +29,7 @@ Lag = Annotated[
 
 
 class OffsetFreeSpec(Spec):
-    """Force and torque that the model does not explain, estimated, predicted and aimed off for."""
+    """Unmodelled force and torque: estimated, predicted and compensated."""
 
     velocity_noise: Positive = Field(default=_OBSERVER.velocity_noise, description="[m/s] of a measured velocity")
     rate_noise: Positive = Field(default=_OBSERVER.rate_noise, description="[rad/s] of a measured body rate")
@@ -43,14 +43,14 @@ class OffsetFreeSpec(Spec):
     torque_walk: Positive = Field(
         default=_OBSERVER.torque_walk, description="[rad/s^2] change of the torque's angular acceleration in a period"
     )
-    largest_force: Positive = Field(default=_OBSERVER.largest_force, description="[m/s^2] no larger one is believed")
+    largest_force: Positive = Field(default=_OBSERVER.largest_force, description="[m/s^2] larger estimates are clipped")
     largest_torque: Positive = Field(
-        default=_OBSERVER.largest_torque, description="[rad/s^2] no larger one is believed"
+        default=_OBSERVER.largest_torque, description="[rad/s^2] larger estimates are clipped"
     )
 
 
 class TighteningSpec(Spec):
-    """Output bounds drawn in, so that they hold under disturbances within stated bounds, and between samples."""
+    """Output bounds tightened, so that they hold under disturbances within stated bounds, and between samples."""
 
     acceleration: NonNegative = Field(
         default=_TIGHTENING.acceleration,

@@ -185,9 +185,9 @@ class Scenario(Spec):
     controller: ControllerSpec
     effects: EffectsSpec = EffectsSpec()
     computation: ComputationSpec | None = Field(default=None, description="absent: commands take no time")
-    sensors: SensorsSpec | None = Field(default=None, description="absent: the controller is told the true state")
+    sensors: SensorsSpec | None = Field(default=None, description="absent: the controller receives the true state")
     estimator: EstimatorSpec | None = Field(
-        default=None, description="absent: the controller is told what the sensors say, as it arrives"
+        default=None, description="absent: the controller receives the sensors' samples as they arrive"
     )
     events: Annotated[list[Event], MaxLen(MOST_ENTRIES)] = Field(default=[], description="what happens on the way")
     lost: LostSpec = LostSpec()

@@ -1,4 +1,4 @@
-"""`[sensors.position]` and so on, and `[estimator]`: what the controller is told, and how that is found.
+"""`[sensors.position]` and so on, and `[estimator]`: what is measured, and how the state is estimated.
 
 Numbers to start from:
 
@@ -106,12 +106,10 @@ class SensorsSpec(Spec):
 
 
 class EstimatorSpec(Spec):
-    """An error-state Kalman filter from the sensors and the believed vehicle; see `quadsim.sim.estimation`."""
+    """An error-state Kalman filter from the sensors and the modelled vehicle; see `quadsim.sim.estimation`."""
 
     type: Literal["error_state"] = Field(description="kind of estimator")
-    acceleration_noise: NonNegative = Field(
-        default=0.3, description="[m/s^2/sqrt(Hz)] white acceleration that the believed vehicle does not explain"
-    )
+    acceleration_noise: NonNegative = Field(default=0.3, description="[m/s^2/sqrt(Hz)] unmodelled white acceleration")
     angular_acceleration_noise: NonNegative = Field(
         default=1.0, description="[rad/s^2/sqrt(Hz)] white angular acceleration that it does not explain"
     )
@@ -127,7 +125,7 @@ class EstimatorSpec(Spec):
         default=0.9999, description="[-] probability with which a right sample passes the test of its innovation"
     )
     patience: NonNegative = Field(
-        default=1.0, description="[s] after which a sensor that was refused all along is believed again; 0 for never"
+        default=1.0, description="[s] after which a sensor that was rejected all along is accepted again; 0 for never"
     )
 
 

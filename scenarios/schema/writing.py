@@ -75,19 +75,19 @@ def _fill(container: Container | Table, model: BaseModel, path: tuple[str, ...],
     listed: set[tuple[type[BaseModel], ...]] = set()
     for name in sorted(fields, key=lambda name: name != "type"):
         value, kinds = getattr(model, name), tables_in(fields[name].annotation)
-        told = explained is not None and (type(model), name) in explained
+        explained_above = explained is not None and (type(model), name) in explained
         if explained is not None:
             explained.add((type(model), name))
-        comment = "" if told else _squeezed(fields[name].description or "")
+        comment = "" if explained_above else _squeezed(fields[name].description or "")
         if isinstance(value, BaseModel):
-            below.append((name, value, "" if told else comment or headline(type(value))))
+            below.append((name, value, "" if explained_above else comment or headline(type(value))))
         elif isinstance(value, Mapping) or (value and kinds and not path):
             below.append((name, value, comment))
         elif value is None:
-            if not told:
+            if not explained_above:
                 lines.append(_absent((*path, name), kinds, comment))
         else:
-            above = () if told or kinds in listed else _about_entries(kinds)
+            above = () if explained_above or kinds in listed else _about_entries(kinds)
             listed.add(kinds)
             lines.append(_present(name, value, comment, above))
     _write(container, lines)

@@ -149,15 +149,17 @@ def test_rejection_tells_why(status: str, plan: Array, reason: str | None) -> No
 
 def test_rejection_is_by_speed_where_steps_are_free() -> None:
     free = ActuatorBounds.alike((0.0, 250.0))
-    assert rejection(SOLVED, off(60.0)[0], PLAN, free, HOVER) is None
-    assert rejection(SOLVED, off(60.1)[0], PLAN, free, HOVER) == "out_of_bounds"
-    assert rejection(SOLVED, off(-190.1)[0], PLAN, free, HOVER) == "out_of_bounds"
+    for change, reason in ((60.0, None), (60.1, "out_of_bounds"), (-190.1, "out_of_bounds")):
+        plan = off(change)
+        assert rejection(SOLVED, plan[0], plan, free, HOVER) == reason
 
 
-def test_rejection_is_by_the_command_not_by_what_was_planned_for_it() -> None:
-    assert rejection(SOLVED, PLAN[0], off(40.0), BOUNDS, HOVER) is None
-    assert rejection(SOLVED, off(40.0)[0], PLAN, BOUNDS, HOVER) == "out_of_bounds"
-    assert rejection(SOLVED, off(math.nan)[0], PLAN, BOUNDS, HOVER) == "not_finite"
+def test_a_command_need_not_be_the_plans_first_input() -> None:
+    """Both have to be finite, and the command is the one that has to be in reach."""
+    assert rejection(SOLVED, HOVER, off(40.0), BOUNDS, HOVER) is None
+    assert rejection(SOLVED, HOVER + 5.1, PLAN, BOUNDS, HOVER) == "out_of_bounds"
+    assert rejection(SOLVED, HOVER * np.nan, PLAN, BOUNDS, HOVER) == "not_finite"
+    assert rejection(SOLVED, HOVER, off(math.nan), BOUNDS, HOVER) == "not_finite"
 
 
 @given(

@@ -8,6 +8,9 @@ import numpy as np
 import pytest
 from support import flight_queries, paper_problem, paper_reference
 
+from mpc.exact.polish import polish
+from mpc.exact.shortcut import Shortcut
+from mpc.ocp import Constraint
 from mpc.paper.condensed import condensed
 from mpc.qp import QP, Backend, Formulation, Solution, Vectors, kkt_residuals
 from mpc.solvers import SOLVERS, QPSolver, make_backend
@@ -100,3 +103,29 @@ def test_first_inputs_are_exact_over_the_flight(constrained_flight: Flight) -> N
     queries = flight_queries(constrained_flight, problem, stride=2)
     errors = [np.abs(ours.solve(*query).plan[0] - exact.solve(*query).plan[0]).max() for query in queries]
     assert max(errors) < 1e-3
+
+
+def test_multipliers_of_rows_are_those_of_the_qp_and_back() -> None:
+    """Rows of single inputs are in the box, several of them at one bound, others tighter at some steps alone."""
+    problem = paper_problem("paper-constrained", "controller.horizon=15")
+    late = np.full((15, 4), 250.0)
+    late[3:, 0] = 200.0
+    again = Constraint(name="again", D=np.eye(4), lower=np.zeros(4), upper=np.full(4, 250.0))
+    tighter = Constraint(name="late", D=np.eye(4), lower=np.full((15, 4), -1.0), upper=late)
+    problem = replace(problem, constraints=(again, tighter))
+    desired = problem.objective.desired(np.tile([0.0, 0.0, 30.0, 0.0], (15, 1)))
+    form, backend = condensed(problem), PiqpDense()
+    qp, solution = solved(form, backend, (np.zeros(12), desired, problem.model.u_bar))
+    optimum = polish(qp, solution)
+    assert kkt_residuals(qp, optimum).worst < 1e-5
+    rows = form.multipliers(optimum)
+    active = {name for name, column in zip(problem.rows.names, rows.T, strict=True) if column.any()}
+    assert {"slews", "inputs", "late"} <= active
+    assert "again" not in active
+    back = form.solution(optimum, form.inputs(optimum.x), form.slacks(optimum.x), rows)
+    np.testing.assert_array_equal(back.z, optimum.z)
+    np.testing.assert_array_equal(back.z_box, optimum.z_box)
+    answer = Shortcut(problem, QPSolver("piqp-multistage", problem)).solve(np.zeros(12), desired, problem.model.u_bar)
+    np.testing.assert_allclose(answer.plan, form.inputs(optimum.x), atol=1e-3)
+    largest = float(np.abs(answer.solution.z).max())
+    assert kkt_residuals(qp, answer.solution).worst < 1e-4 * largest

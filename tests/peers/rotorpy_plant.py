@@ -17,7 +17,7 @@ from rotorpy.vehicles.multirotor import Multirotor
 from scipy.integrate import solve_ivp
 
 from quadsim.errors import ParameterError
-from quadsim.sim.physics import Stretch, physics_to_state
+from quadsim.sim.physics import Segment, physics_to_state
 from quadsim.state import EULER, EULER_RATE, POSITION, VELOCITY, Array, euler_to_body_rates, euler_to_quaternion
 from quadsim.vehicle import N_ROTORS, Vehicle
 
@@ -104,7 +104,7 @@ class RotorPyPlant:
         """The rotor speeds (4,) [rad/s] that a command makes."""
         return np.maximum(speeds, 0.0)
 
-    def advance(self, speeds: Array, steps: int) -> Stretch:
+    def advance(self, speeds: Array, steps: int) -> Segment:
         """Hold rotor speeds (4,) [rad/s], and return the states in MuJoCo's order.
 
         RotorPy's `step` integrates the same function in the same way, but gives the end of the hold alone.
@@ -123,7 +123,7 @@ class RotorPyPlant:
         vectors[:, 6:10] /= np.linalg.norm(vectors[:, 6:10], axis=1, keepdims=True)
         physics = _to_physics(self._time + t, vectors)
         self._time, self._vector = float(physics[-1, 0]), vectors[-1].copy()
-        return Stretch(physics=physics, speeds=np.tile(held, (steps, 1)), wrench=None, wind=None)
+        return Segment(physics=physics, speeds=np.tile(held, (steps, 1)), wrench=None, wind=None)
 
 
 def _to_physics(t: Array, vectors: Array) -> Array:

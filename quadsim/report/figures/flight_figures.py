@@ -82,7 +82,7 @@ def _draw_states(run: Run) -> Figure:
     for column, names in enumerate((("x", "y", "z"), ("roll", "pitch", "yaw"))):
         for axes, name in zip(panels[:, column], names, strict=True):
             shown["flight"] = _draw_plant(axes, run, name, line_colour(0))
-            shown |= _draw_told(axes, run, name)
+            shown |= _draw_measured(axes, run, name)
             shown |= _draw_reference(axes, run, name)
             shown |= _draw_bounds(axes, run.limits, name, run_end(run))
             axes.set_ylabel(f"{name} [{SIGNALS[name].unit}]")
@@ -173,14 +173,14 @@ def _draw_plant(axes: Axes, run: Run, name: str, colour: str) -> Artist:
     return axes.plot(*drawn, color=colour)[0]
 
 
-def _draw_told(axes: Axes, run: Run, name: str) -> dict[str, Artist]:
-    """Draw a state as the controller was told it, beneath the true one; none where it was the true one."""
+def _draw_measured(axes: Axes, run: Run, name: str) -> dict[str, Artist]:
+    """Draw a state as measured, beneath the true one; none where they are the same."""
     control, signal = run.log.control, SIGNALS[name]
     if control.measured_perfectly:
         return {}
-    told = signal.sampled(dataclasses.replace(control, truth=control.state))
-    drawn = break_at_wraps(control.t, told, signal.unit)
-    return {"as told": axes.plot(*drawn, color=line_colour(1), linewidth=0.7, zorder=1.9)[0]}
+    measured = signal.sampled(dataclasses.replace(control, truth=control.state))
+    drawn = break_at_wraps(control.t, measured, signal.unit)
+    return {"measured": axes.plot(*drawn, color=line_colour(1), linewidth=0.7, zorder=1.9)[0]}
 
 
 def _draw_reference(axes: Axes, run: Run, name: str) -> dict[str, Artist]:
@@ -241,7 +241,7 @@ def draw_effects(run: Run) -> Figure:
         for what, names in _ERRORS.items():
             signals = [SIGNALS[f"{name}_estimate_error"] for name in names]
             values = np.stack([signal.sampled(log.control) for signal in signals], axis=1)
-            label = f"{what} as told,\nless the true one [{signals[0].unit}]"
+            label = f"{what} as measured,\nless the true one [{signals[0].unit}]"
             _draw_triple(panels[what], log.control.t, values, names, label, drawstyle="steps-post")
             keep_least_span(panels[what], signals[0].unit)
     bottom = [panels[name] for rows in (halves, wholes) if rows for name in dict.fromkeys(rows[-1])]

@@ -116,12 +116,12 @@ class Overlay:
         """Phase, where the flight has a ground, and what the controller answered in period k; red for a failure."""
         control = self._run.log.control
         status, phase, fallback = control.status[k], control.phase[k], control.fallback[k]
-        told = [phase] if self._grounded and status != phase else []
-        told.append(status + (f" (fallback {fallback})" if fallback else ""))
+        phrases = [phase] if self._grounded and status != phase else []
+        phrases.append(status + (f" (fallback {fallback})" if fallback else ""))
         if control.iterations[k]:
-            told += [f"{control.iterations[k]} iterations", f"{control.active[k]} active"]
+            phrases += [f"{control.iterations[k]} iterations", f"{control.active[k]} active"]
         good = fallback == 0 and status in ACCEPTED | {Phase.LANDED}
-        return "  ·  ".join(told), 14, GREEN if good else RED
+        return "  ·  ".join(phrases), 14, GREEN if good else RED
 
     def _position(self, painter: Painter, x: float, y: float, i: int) -> None:
         painter.text(x + 118, y, "now", size=13, colour=GREY, anchor="ra")
@@ -209,8 +209,8 @@ class Overlay:
             worst, row = track.worst[i], y + 22 + pitch * j
             now_broken, once_broken = (margin < -track.limit.tolerance for margin in (track.now[i], worst))
             painter.text(x, row, track.limit.name, size=14, colour=RED if now_broken else GREY)
-            told = f"{round(worst, 2) + 0.0:+.2f} {track.limit.unit}"
-            painter.text(x + 226, row, told, size=14, colour=RED if once_broken else WHITE, anchor="ra")
+            phrases = f"{round(worst, 2) + 0.0:+.2f} {track.limit.unit}"
+            painter.text(x + 226, row, phrases, size=14, colour=RED if once_broken else WHITE, anchor="ra")
         colour = RED if "violated" in rest else GREY
         painter.text(x, y + 22 + pitch * len(shown), rest, size=14, colour=colour)
 
@@ -220,8 +220,8 @@ def margin_rows(ranked: Sequence[MarginTrack], i: int) -> tuple[list[MarginTrack
     begun = [track for track in ranked if not math.isnan(track.worst[i])]
     hidden = begun[_MOST_MARGINS:]
     broken = sum(track.worst[i] < -track.limit.tolerance for track in hidden)
-    told = {"more": len(hidden), "of them violated": broken, "not begun": len(ranked) - len(begun)}
-    parts = [f"{count} {what}" for what, count in told.items() if count]
+    phrases = {"more": len(hidden), "of them violated": broken, "not begun": len(ranked) - len(begun)}
+    parts = [f"{count} {what}" for what, count in phrases.items() if count]
     return begun[:_MOST_MARGINS], f"and {', '.join(parts)}" if parts else ""
 
 

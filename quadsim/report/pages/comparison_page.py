@@ -44,7 +44,7 @@ _FILES: Final = {
 
 @dataclass(frozen=True, kw_only=True)
 class _RunView:
-    """What the page's template is told of one run; `video` and the targets of `files` are relative URLs."""
+    """The template's context of one run; `video` and the targets of `files` are relative URLs."""
 
     name: str
     colour: str

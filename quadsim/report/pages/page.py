@@ -18,7 +18,7 @@ def render_page(template: str, kind: str, **context: Any) -> str:
     Args:
         template: its file in `quadsim/report/templates`.
         kind: what the page is, e.g. `comparison`.
-        context: what the template is told.
+        context: the template's variables.
     """
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
 

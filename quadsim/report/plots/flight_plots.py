@@ -43,7 +43,7 @@ def comparison_plots(runs: Sequence[Run]) -> list[Plot]:
 
 
 def thin(values: Array, points: int) -> np.ndarray[Any, np.dtype[np.intp]]:
-    """Indices of at most about `points` values: the lowest and highest of each stretch, so that no peak is lost.
+    """Indices of at most about `points` values: the lowest and highest of each segment, so that no peak is lost.
 
     Args:
         values: (K,); what is not finite is a gap.
@@ -58,9 +58,9 @@ def thin(values: Array, points: int) -> np.ndarray[Any, np.dtype[np.intp]]:
     values = np.nan_to_num(values, posinf=0.0, neginf=0.0)
     stride = -(-2 * values.size // points)
     rows = -(-values.size // stride)
-    stretches = np.pad(values, (0, rows * stride - values.size), mode="edge").reshape(rows, stride)
+    segments = np.pad(values, (0, rows * stride - values.size), mode="edge").reshape(rows, stride)
     starts = stride * np.arange(rows)
-    kept = np.concatenate([[0, values.size - 1], starts + stretches.argmin(axis=1), starts + stretches.argmax(axis=1)])
+    kept = np.concatenate([[0, values.size - 1], starts + segments.argmin(axis=1), starts + segments.argmax(axis=1)])
     return np.unique(np.minimum(np.concatenate([kept, gaps]), values.size - 1))
 
 

@@ -78,7 +78,7 @@ def _overview(run: Run) -> tuple[Array, Array]:
 
 
 def _view(name: str, origin: str, eye: Array, target: Array) -> rrb.Spatial3DView:
-    """The scene as seen from a point that stands still in the frame of `origin`; the ground is drawn in the world's."""
+    """The scene seen from a point at rest in the frame of `origin`, and the ground, in the frame of the world."""
     import rerun.blueprint as rrb
 
     start, now = rrb.TimeRangeBoundary.infinite(), rrb.TimeRangeBoundary.cursor_relative()

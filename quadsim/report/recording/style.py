@@ -23,8 +23,8 @@ PANELS: Final[dict[str, tuple[str, ...]]] = {
     "Position errors": ("x_error", "y_error", "z_error"),
     "Attitude rates": ("roll_rate", "pitch_rate", "yaw_rate"),
     "Yaw and tilt": ("yaw", "tilt", "yaw_error"),
-    "Position as told, less the true one": ("x_estimate_error", "y_estimate_error", "z_estimate_error"),
-    "Attitude as told, less the true one": ("roll_estimate_error", "pitch_estimate_error", "yaw_estimate_error"),
+    "Position as measured, less the true one": ("x_estimate_error", "y_estimate_error", "z_estimate_error"),
+    "Attitude as measured, less the true one": ("roll_estimate_error", "pitch_estimate_error", "yaw_estimate_error"),
 }
 """Title of each plot, and its signals; every signal is in one, so that every limit is drawn."""
 assert sorted(name for names in PANELS.values() for name in names) == sorted(SIGNALS)

@@ -34,7 +34,7 @@ _AS_THE_FILE_SAYS: Final = Load()
 
 @dataclass(frozen=True, kw_only=True)
 class Disturbance:
-    """A force and a torque from nowhere: constant parts, and white noise.
+    """An unmodelled force and torque: constant parts, and white noise.
 
     Attributes:
         force: (x, y, z) in the world frame [N].
@@ -97,7 +97,7 @@ class Effects:
         rotor_radius: R [m] of the ground effect, or None for no ground effect.
         contact: whether there is a ground to stand on.
         load: what the vehicle really weighs.
-        disturbance: force and torque from nowhere, or None.
+        disturbance: unmodelled force and torque, or None.
         changes: what happens to rotors and payload on the way, in any order.
     """
 

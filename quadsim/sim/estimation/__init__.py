@@ -1,1 +1,1 @@
-"""From samples to the state a controller is told: an error-state Kalman filter, attitude on the sphere."""
+"""From samples to the state that a controller receives: an error-state Kalman filter, attitude on the sphere."""

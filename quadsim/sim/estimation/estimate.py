@@ -30,7 +30,7 @@ N_MEAN: Final = 16
 
 @dataclass(frozen=True, kw_only=True)
 class Estimate:
-    """What is believed of the vehicle.
+    """The estimated state of the vehicle.
 
     Attributes:
         mean: (16,) position [m], velocity [m/s] (world), quaternion wxyz, rates [rad/s] (body), gyro bias [rad/s].

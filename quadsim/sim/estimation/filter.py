@@ -82,8 +82,8 @@ class ErrorStateFilter:
         """Set up, to be reset before use.
 
         Args:
-            vehicle: what is believed to fly.
-            sensors: what is believed of the sensors: their noise and the largest delay.
+            vehicle: the modelled vehicle.
+            sensors: the modelled sensors: their noise and the largest delay.
             settings: its tuning.
             timestep: physics step [s].
 
@@ -138,14 +138,14 @@ class ErrorStateFilter:
         return {name: replace(tally) for name, tally in self._track.tallies.items()}
 
     def advance(self, commands: Array, samples: Iterable[Sample], first: int, *, standing: bool = False) -> None:
-        """Take note of a stretch of flight and run the filter on to the fusion horizon.
+        """Take note of a segment of flight and run the filter on to the fusion horizon.
 
         Args:
             commands: (M, 4) rotor speeds in force during each physics step [rad/s].
             samples: what has arrived meanwhile, in any order.
             first: number of the first of these physics steps.
-            standing: whether a land detector has seen the vehicle on the ground when the stretch began; it has left
-                the ground once the believed thrust exceeds its weight.
+            standing: whether a land detector has seen the vehicle on the ground when the segment began; it has left
+                the ground once the modelled thrust exceeds its weight.
         """
         changed = np.any(commands != np.vstack([self._speeds, commands[:-1]]), axis=1)
         changed[:1] |= standing is not self._standing
@@ -169,7 +169,7 @@ class ErrorStateFilter:
         del self._starts[:kept], self._drives[:kept]
 
     def estimate(self, step: int) -> Estimate:
-        """What is believed at a physics step, no earlier than the last one told of."""
+        """The estimate at a physics step, no earlier than the last one that was given."""
         track = self._track.branch()
         self._run(track, self._waiting)
         self._predict(track, step)

@@ -1,4 +1,4 @@
-"""Prediction: the believed vehicle as a rigid body driven by its rotor speeds, and the growth of the error with time.
+"""Prediction: the modelled vehicle as a rigid body driven by its rotor speeds, and the growth of the error with time.
 
     dp/dt = v            dv/dt = R(q) [0, 0, U/m] - [0, 0, g] + w_a      dq/dt = q * [0, omega] / 2
     domega/dt = I^-1 (tau - omega x I omega) + w_alpha                   db/dt = w_b
@@ -41,7 +41,7 @@ from quadsim.vehicle import Vehicle
 _EYE = read_only(np.eye(N_ERRORS))
 STILL_VELOCITY: Final = 0.1
 """Standard deviation of the velocity of a vehicle that stands, per axis [m/s]; also of one that its ground cushion has
-lifted before the believed thrust could."""
+lifted before the modelled thrust could."""
 STILL_RATE: Final = math.radians(0.5)
 """The same of its body rates [rad/s]: as much as a MEMS gyro's noise, so that standing is worth a sample of it."""
 STILL_TIME: Final = 0.01
@@ -73,7 +73,7 @@ class Drive:
 
 @dataclass(frozen=True, kw_only=True)
 class MotionModel:
-    """The believed vehicle.
+    """The modelled vehicle.
 
     Attributes:
         mass: m [kg].
@@ -117,8 +117,8 @@ def predict(model: MotionModel, estimate: Estimate, driven: Drive, duration: flo
     The mean by the midpoint rule, the attitude on the sphere; the covariance as F P F' + Q(h), F to third order in h.
 
     Args:
-        model: the believed vehicle.
-        estimate: what is believed now.
+        model: the modelled vehicle.
+        estimate: the estimate now.
         driven: what the rotors do meanwhile.
         duration: h [s]; short against the time in which the vehicle turns.
     """
@@ -202,8 +202,8 @@ def stand(model: MotionModel, estimate: Estimate, duration: float) -> Estimate:
     """The estimate some time later of a vehicle that stands.
 
     Args:
-        model: the believed vehicle.
-        estimate: what is believed now; of velocity and rates nothing is kept.
+        model: the modelled vehicle.
+        estimate: the estimate now; its velocity and rates are not used.
         duration: h [s].
     """
     mean = estimate.mean.copy()

@@ -1,4 +1,4 @@
-"""What an estimator is told: how the vehicle is disturbed, how well it is known at the start, what to believe."""
+"""Settings of the estimator: process noise, initial covariance, rejection of outliers."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ class EstimatorSettings:
     density sqrt(t).
 
     Attributes:
-        acceleration_noise: specific force the believed vehicle does not explain [m/s^2/sqrt(Hz)].
+        acceleration_noise: unmodelled specific force [m/s^2/sqrt(Hz)].
         angular_acceleration_noise: angular acceleration it does not explain [rad/s^2/sqrt(Hz)].
         gyro_bias_walk: random walk of the rate gyro's bias [rad/s/sqrt(s)].
         initial_position: standard deviation of the first estimate's error, per axis [m].
@@ -25,7 +25,7 @@ class EstimatorSettings:
         initial_rates: the same [rad/s].
         initial_gyro_bias: the same of the gyro's bias, first estimated as zero [rad/s].
         gate: probability with which a right sample passes the chi-square test of its innovation.
-        patience: a sensor whose every sample has been refused for this long is believed again [s]; 0 for never.
+        patience: a sensor whose every sample has been rejected for this long is accepted again [s]; 0 for never.
 
     Raises:
         ParameterError: a value is not finite or not possible.

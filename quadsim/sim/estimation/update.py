@@ -1,4 +1,4 @@
-"""Update: what a sample changes in an estimate, and whether it is to be believed.
+"""Update: what a sample changes in an estimate, and whether it is an outlier.
 
     r = z - h(x)    S = H P H' + R    K = P H' S^-1    e = K r    P <- P - K H P
 
@@ -76,7 +76,7 @@ def update(estimate: Estimate, name: SensorName, value: Array, variance: Array, 
     correction and is there neglected, too.
 
     Args:
-        estimate: what was believed before.
+        estimate: the estimate before.
         name: which sensor.
         value: (3,) the sample.
         variance: (3, 3) R, of the sensor's noise.
@@ -98,10 +98,10 @@ def doubt(estimate: Estimate, name: SensorName, value: Array, refused: float) ->
     """The estimate with its variance widened by as much as a sample disagrees with it, so that the sample passes.
 
     For the way back after divergence: the innovation squared is added to the variance of all that the sensor sees, and
-    (innovation / time)^2 to that of the rates of change which may have led it astray in the meantime.
+    (innovation / time)^2 to that of the rates of change which may have caused its error in the meantime.
 
     Args:
-        estimate: what is believed.
+        estimate: the estimate.
         name: which sensor.
         value: (3,) its sample.
         refused: for how long all its samples have been refused [s].

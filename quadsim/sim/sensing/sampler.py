@@ -80,11 +80,11 @@ class Sampler:
         self._errors, self._lost = np.empty((0, 3)), np.empty(0, dtype=bool)  # of the next samples, drawn ahead
 
     def sample(self, physics: Array, first: int) -> list[Sample]:
-        """The samples taken during a stretch of motion, those lost left out.
+        """The samples taken during a segment of motion, those lost left out.
 
         Args:
             physics: (M, 14) MuJoCo's states at successive physics steps.
-            first: number of the first of these steps; stretches follow one another from step 0.
+            first: number of the first of these steps; segments follow one another from step 0.
         """
         begin = -first % self._stride
         rows = physics[begin :: self._stride]

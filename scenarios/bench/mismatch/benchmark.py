@@ -52,7 +52,7 @@ def answer_all(
         ask: a module's function, which processes can find by its name.
         questions: what it is asked.
         workers: processes; one per usable core by default.
-        progress: told how many are done, of how many.
+        progress: called with how many are done, of how many.
     """
     context = multiprocessing.get_context("spawn")  # a fork would take over whatever threads hold
     count = min(workers or usable_cores(), len(questions) or 1)
@@ -81,12 +81,12 @@ TABLES_FILE: Final = "ladder.md"
 TIMED: Final = 3
 """Flights that steps are timed in: the machine's own slow spells are not the controller's."""
 QUICK_DURATION: Final = 12.0
-"""Of the flights of a quick ladder [s]."""
+"""Of the flights with `--quick` [s]."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Cell:
-    """One flight of the ladder, as a worker process is asked for it."""
+    """One flight of the benchmark, as it is sent to a worker process."""
 
     scenario: str
     settings: tuple[str, ...]
@@ -113,7 +113,7 @@ def run_mismatch(
         settings: of it, before those of the conditions.
         quick: three controllers, three conditions, short flights.
         workers: processes; one per usable core by default.
-        progress: told how far it is.
+        progress: called with how much is done, of how much.
 
     Raises:
         InputError: the scenario cannot be flown so, or the number of processes is none.
@@ -134,11 +134,13 @@ def run_mismatch(
         _varied(cell)  # one that cannot be flown is refused here, before anything is
     timed = [cell for cell in cells if cell.controller == FULL or cell.condition == conditions[0]]
 
-    def told(stage: str) -> Callable[[int, int], None]:
+    def report_stage(stage: str) -> Callable[[int, int], None]:
         return lambda done, total: progress(stage, done, total)
 
-    flights = dict(zip(cells, answer_all(fly_cell, cells, workers=workers, progress=told("flights")), strict=True))
-    alone = dict(zip(timed, answer_all(time_cell, timed, workers=1, progress=told("step times")), strict=True))
+    flights = dict(
+        zip(cells, answer_all(fly_cell, cells, workers=workers, progress=report_stage("flights")), strict=True)
+    )
+    alone = dict(zip(timed, answer_all(time_cell, timed, workers=1, progress=report_stage("step times")), strict=True))
     return MismatchBench(
         scenario=flown.name,
         duration=flown.duration,
@@ -244,6 +246,8 @@ def write_mismatch(measured: MismatchBench, directory: Path) -> None:
 
 
 def mismatch_markdown(measured: MismatchBench) -> str:
-    """All tables of a ladder, under what its controllers and conditions are."""
+    """All tables, after the lists of controllers and conditions."""
     sections = "\n".join(map(section, mismatch_tables(measured)))
-    return f"# The ladder on {measured.scenario}, {measured.duration:g} s\n\n{mismatch_legend(measured)}\n{sections}"
+    return (
+        f"# Model mismatch on {measured.scenario}, {measured.duration:g} s\n\n{mismatch_legend(measured)}\n{sections}"
+    )

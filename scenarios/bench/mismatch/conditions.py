@@ -1,4 +1,4 @@
-"""What `quadsim bench ladder` flies: conditions, as settings of a scenario, and what each tells its controllers."""
+"""The conditions of `quadsim bench ladder`, as settings of a scenario, and which parameters controllers know."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ WORN: Final = 0.2
 
 @dataclass(frozen=True, kw_only=True)
 class Condition:
-    """One way in which the plant is not what the controller believes.
+    """One mismatch between the plant and the controller's model.
 
     Attributes:
         about: in a line.
         settings: of the scenario file, by dotted paths.
-        rotor_lag: time constant that controllers with a model of it are told [s]; 0 for none.
-        delay: computation time that they are told [s].
+        rotor_lag: time constant that controllers with a model of it assume [s]; 0 for none.
+        delay: computation time that they assume [s].
     """
 
     about: str
@@ -49,14 +49,14 @@ CONDITIONS: Final = {
     "nominal": Condition(about="the paper's model, but for its linearisation"),
     **{
         f"lag {1e3 * lag:g} ms": Condition(
-            about=f"rotors with a time constant of {1e3 * lag:g} ms; models that know lag are told 50 ms",
+            about=f"rotors with a time constant of {1e3 * lag:g} ms; models of lag assume 50 ms",
             settings=_lag(lag),
             rotor_lag=0.05,
         )
         for lag in (0.01, 0.02, 0.05, 0.08)
     },
-    "mass +30 %": Condition(about="30 % heavier than believed", settings=("effects.load.mass_factor=1.3",)),
-    "mass -30 %": Condition(about="30 % lighter than believed", settings=("effects.load.mass_factor=0.7",)),
+    "mass +30 %": Condition(about="30 % heavier than modelled", settings=("effects.load.mass_factor=1.3",)),
+    "mass -30 %": Condition(about="30 % lighter than modelled", settings=("effects.load.mass_factor=0.7",)),
     "wind 3 m/s": Condition(
         about="3 m/s along x with Dryden turbulence, 7.7 m/s at 20 ft; rotor drag of 3e-4 kg/rad", settings=_wind(1.0)
     ),
@@ -74,15 +74,15 @@ CONDITIONS: Final = {
     ),
     **{
         f"delay {1e3 * delay:g} ms": Condition(
-            about=f"commands act {1e3 * delay:g} ms after the measurement; told to models that know delays",
+            about=f"commands act {1e3 * delay:g} ms after the measurement; known to models of delay",
             settings=(f"computation.delay={delay}",),
             delay=delay,
         )
         for delay in (0.02, 0.05)
     },
     "all by half": Condition(
-        about="lag 25 ms, told; mass +15 %; wind 1.5 m/s with turbulence; half the noise; rotor 2 loses 10 %; yaw 90 "
-        "deg; commands 10 ms late, told",
+        about="lag 25 ms, known; mass +15 %; wind 1.5 m/s with turbulence; half the noise; rotor 2 loses 10 %; yaw 90 "
+        "deg; commands 10 ms late, known",
         settings=(
             *_lag(0.025),
             "effects.load.mass_factor=1.15",

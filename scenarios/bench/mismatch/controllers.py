@@ -19,7 +19,7 @@ INPUT_WEIGHT: Final = 0.1
 MOVE_WEIGHT: Final = 20.0
 OBSERVER: Final = OffsetFreeSpec(torque_walk=0.2, force_walk=0.1)
 BASELINE_TILT: Final = 20.0
-"""Largest tilt that LQR, PID and geometric controller ask for [deg].  They have no bounds on states, so this limit does
+"""Largest tilt that LQR, PID and geometric controller command [deg].  They have no bounds on states, so this limit does
 for one; at the paper's 5 deg the geometric controller circles its goal, 8 m off after 60 s."""
 _NO_STEPS: Final = 1e6
 """A bound on steps [rad/s] that bounds nothing."""
@@ -27,11 +27,11 @@ _NO_STEPS: Final = 1e6
 
 @dataclass(frozen=True, kw_only=True)
 class ControllerVariant:
-    """A controller of the ladder.
+    """A controller of the benchmark.
 
     Attributes:
         about: what it is, in a line.
-        spec: its table, from a constrained one and what a condition tells.
+        spec: its table, from a constrained one and what a condition lets it know.
     """
 
     about: str
@@ -39,7 +39,7 @@ class ControllerVariant:
 
 
 def equip(scenario: Scenario, controller: str, condition: Condition) -> Scenario:
-    """The scenario flown by another controller of `VARIANTS`, told what the condition tells.
+    """The scenario flown by another controller of `VARIANTS`, with the parameters that the condition lets it know.
 
     Raises:
         InputError: the scenario's own controller is no constrained one with the same bounds on roll and pitch.
@@ -60,8 +60,8 @@ def tilt_bound(scenario: Scenario) -> float:
     bound = shared_tilt_bound(spec) if isinstance(spec, ConstrainedSpec) else None
     if bound is None:
         raise InputError(
-            f"{scenario.name}: the ladder needs a constrained controller whose output_bounds of roll and pitch are the "
-            "same, as paper-constrained has"
+            f"{scenario.name}: the mismatch benchmark needs a constrained controller whose output_bounds of roll and "
+            "pitch are the same, as paper-constrained has"
         )
     return bound
 
@@ -103,17 +103,17 @@ def _lqr(spec: ConstrainedSpec, condition: Condition, period: float) -> LQRSpec:
 
 
 def _pid(spec: ConstrainedSpec, condition: Condition, period: float) -> PIDSpec:
-    lag = _lag_told(condition, period)
+    lag = _known_lag(condition, period)
     return PIDSpec(type="pid", lag=lag, tilt=BASELINE_TILT, input_bounds=_speeds_alone(spec))
 
 
 def _geometric(spec: ConstrainedSpec, condition: Condition, period: float) -> GeometricSpec:
-    lag, bounds = _lag_told(condition, period), _speeds_alone(spec)
+    lag, bounds = _known_lag(condition, period), _speeds_alone(spec)
     return GeometricSpec(type="geometric", lag=lag, tilt=BASELINE_TILT, integral=True, input_bounds=bounds)
 
 
-def _lag_told(condition: Condition, period: float) -> float | None:
-    """What gains have to allow for [s]: half a period at least, as unasked; None where nothing is told."""
+def _known_lag(condition: Condition, period: float) -> float | None:
+    """Lag that gains allow for [s], half a period at least; None where neither lag nor delay is known."""
     if not condition.rotor_lag and not condition.delay:
         return None
     return max(0.5 * period, condition.rotor_lag) + condition.delay
@@ -133,7 +133,7 @@ VARIANTS: Final = {
     "+ model": ControllerVariant(about="and a prediction that knows rotor lag, delay and heading", spec=_robust()),
     "+ offset-free": ControllerVariant(about="and disturbances estimated", spec=_robust(offset_free=OBSERVER)),
     "+ tightening": ControllerVariant(
-        about="and bounds drawn in for what may disturb it, and for what happens between samples",
+        about="and output bounds tightened for disturbances and for the motion between samples",
         spec=_robust(offset_free=OBSERVER, tightening=TighteningSpec()),
     ),
     "+ LTV": ControllerVariant(
@@ -146,16 +146,16 @@ VARIANTS: Final = {
     ),
     "LQR": ControllerVariant(
         about="infinite horizon, weights by Bryson's rule, in the heading frame; as the next two, it knows no bounds "
-        f"but those on speeds, and asks for no more than {BASELINE_TILT:g} deg of tilt",
+        f"but those on speeds, and commands no more than {BASELINE_TILT:g} deg of tilt",
         spec=_lqr,
     ),
-    "PID": ControllerVariant(about="cascaded, as autopilots fly it; gains from the lag it is told", spec=_pid),
+    "PID": ControllerVariant(about="cascaded, as autopilots fly it; gains from the lag it is given", spec=_pid),
     "geometric": ControllerVariant(
-        about="on SE(3) with integrals (Goodarzi, Lee, Lee, 2013); gains from the lag it is told", spec=_geometric
+        about="on SE(3) with integrals (Goodarzi, Lee, Lee, 2013); gains from the lag it is given", spec=_geometric
     ),
 }
 """By their names in tables, in order.  The last three keep the bounds on speeds and no others: held to the paper's
-bounds on steps, which it knows nothing of, the LQR falls over on the nominal course."""
+bounds on steps, which it knows nothing of, the LQR overturns on the nominal course."""
 FULL: Final = "+ tightening"
 """The one with every part that tells it apart from the paper's."""
 QUICK_VARIANTS: Final = ("paper", "+ offset-free", "PID")

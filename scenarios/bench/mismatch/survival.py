@@ -1,4 +1,4 @@
-"""The mismatch ladder as plain values: what became of each controller in each condition."""
+"""The mismatch benchmark as plain values: the outcome of each controller in each condition."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any, Final
 
 from quadsim.report.table import ABSENT, Cell, Grid, Mark, format_number
 
-ASTRAY: Final = 10.0
+DIVERGED: Final = 10.0
 """Distance from the reference at the end [m] from which on a flight counts as lost, though nothing ended it."""
 OVERTURNED: Final = 90.0
 """Roll or pitch [deg] from which on a flight counts as lost, whatever came after."""
@@ -16,7 +16,7 @@ OVERTURNED: Final = 90.0
 
 @dataclass(frozen=True, kw_only=True)
 class MismatchFlight:
-    """What became of one flight; numbers are over what was flown, None where that is not one period.
+    """The outcome of one flight; numbers are over what was flown, None where that is not one period.
 
     Attributes:
         reason: why it ended early; None when it was completed.
@@ -40,10 +40,10 @@ class MismatchFlight:
 
     @property
     def survived(self) -> bool:
-        """Whether it was completed, never fell over, and ended near its reference."""
+        """Whether it was completed, never overturned, and ended near its reference."""
         if self.reason is not None or self.end_error is None or self.peak_tilt is None:
             return False
-        return self.end_error <= ASTRAY and self.peak_tilt <= OVERTURNED
+        return self.end_error <= DIVERGED and self.peak_tilt <= OVERTURNED
 
     @property
     def fate(self) -> str:
@@ -52,7 +52,7 @@ class MismatchFlight:
             return ""
         if self.reason is not None:
             return f"lost, {self.flown:.0f} s"
-        return "fell over" if (self.peak_tilt or 0.0) > OVERTURNED else "astray"
+        return "overturned" if (self.peak_tilt or 0.0) > OVERTURNED else "diverged"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -95,7 +95,7 @@ TILT_TOLERANCE: Final = 0.05
 
 
 def mismatch_tables(measured: MismatchBench) -> list[Grid]:
-    """The tables of a ladder."""
+    """The tables of the benchmark."""
     bound = measured.tilt_bound
     return [
         _grid(
@@ -103,8 +103,8 @@ def mismatch_tables(measured: MismatchBench) -> list[Grid]:
             "end",
             "Distance from the reference at the end, m",
             _end,
-            f"Lost: the flight was aborted at that time. Fell over: beyond {OVERTURNED:g} deg. Astray: beyond "
-            f"{ASTRAY:g} m at the end. Bold: at most {ARRIVED:g} m.",
+            f"Lost: the flight was aborted at that time. Overturned: beyond {OVERTURNED:g} deg. Diverged: beyond "
+            f"{DIVERGED:g} m at the end. Bold: at most {ARRIVED:g} m.",
         ),
         _grid(
             measured,

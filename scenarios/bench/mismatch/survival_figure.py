@@ -1,4 +1,4 @@
-"""The mismatch ladder -> its figure: a coloured cell per controller and condition, red where the vehicle is lost."""
+"""The mismatch benchmark -> its figure: a coloured cell per controller and condition, red where the vehicle is lost."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class _Panel:
 
 
 def write_mismatch_figure(measured: MismatchBench, directory: Path) -> list[Path]:
-    """Draw what became of every controller in every condition.
+    """Draw the outcome of every controller in every condition.
 
     Args:
         measured: what was flown.

@@ -17,7 +17,7 @@ from scenarios.campaign.engine.protocol import EngineError, said
 
 _OURS: Final = ("jobs", "cores")
 _CLUSTER_ALONE: Final = ("scheduler_options", "shared_temp_directory")
-"""What the scheduler is told and a job is not."""
+"""Options of the scheduler that a job does not get."""
 _NOT_TO_SET: Final = {
     *("self", "base_class_kwargs", "job_kwargs", "kwargs", "scheduler", "scheduler_cls", "job_cls", "name"),
     *("config_name", "loop", "asynchronous", "security", "silence_logs", "n_workers", "dashboard_address", "host"),
@@ -34,7 +34,7 @@ class Jobs:
         system: its name in dask-jobqueue, e.g. `slurm`.
         jobs: how many.
         cores: of each.
-        options: what dask-jobqueue is told besides, e.g. `memory`, `queue`, `walltime`.
+        options: further options of dask-jobqueue, e.g. `memory`, `queue`, `walltime`.
     """
 
     system: str

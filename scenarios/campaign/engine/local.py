@@ -41,7 +41,7 @@ _SILENCE_S: Final = 1.0
 _LEAVING_S: Final = 8.0
 """For a supervisor to end everybody whom it keeps [s]."""
 _UNKNOWN: Final = 255
-"""The exit code of a process whose server died, which would have told."""
+"""The exit code of a process whose server died without reporting it."""
 
 
 class LocalEngine:

@@ -41,7 +41,7 @@ class Pilot(Protocol):
         ...
 
     def prepare(self) -> None:
-        """Load what flights need, once in each process that flies; what fails here is told by the flights."""
+        """Load what flights need, once in each process that flies; what fails here is reported by the flights."""
         ...
 
     def fly(self, flight: int, progress: Progress = silent) -> Row:
@@ -49,7 +49,7 @@ class Pilot(Protocol):
 
         Args:
             flight: which.
-            progress: told of the control periods that are flown, after each.
+            progress: called after each control period that is flown.
         """
         ...
 
@@ -101,7 +101,7 @@ def fly_one(pilot: Pilot, flight: int, progress: Progress = silent) -> Answer:
         pickle.dumps(row)  # it has to get home
     except MemoryError as error:
         row = pilot.lost(flight, said(error), MEMORY)
-    except BaseException as error:  # a controller that is not ours may ask to leave, or raise what ends loops
+    except BaseException as error:  # a plug-in controller may ask to leave, or raise what ends loops
         row = pilot.lost(flight, said(error))
     gc.collect()  # what a flight leaves in cycles, a dozen megabytes sometimes, is not to wait for the next ones
     return Answer(row, clock.perf_counter() - started)

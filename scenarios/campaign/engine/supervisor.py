@@ -127,13 +127,13 @@ class _Worker:
         if len(self._heard) < SIZE.size + size:
             return None
         try:
-            told = pickle.loads(self._heard[SIZE.size :])
+            text = pickle.loads(self._heard[SIZE.size :])
         except Exception as error:
             raise ValueError("no pickle") from error
-        if not isinstance(told, Told):
+        if not isinstance(text, Told):
             raise ValueError("something else")
         self._heard = b""
-        return told
+        return text
 
     def is_dead(self) -> bool:
         return os.waitid(os.P_PID, self.pid, os.WEXITED | os.WNOHANG | os.WNOWAIT) is not None
@@ -215,10 +215,10 @@ class _Supervisor:
 
     def _hear(self, worker: _Worker) -> None:
         try:
-            told = worker.hear()
-            if told is None:
+            text = worker.hear()
+            if text is None:
                 return
-            if not self._flying or told.answer.row["flight"] != self._flights[0]:
+            if not self._flying or text.answer.row["flight"] != self._flights[0]:
                 raise ValueError("nobody asked")
         except EOFError:
             self._lose(worker.ending())
@@ -227,8 +227,8 @@ class _Supervisor:
         else:
             self._flights.popleft()
             self._flying = False
-            self._tell(told.answer)
-            if told.spent or has_strays(worker.pid):
+            self._tell(text.answer)
+            if text.spent or has_strays(worker.pid):
                 self._dismiss()  # so that the next flight does not meet what this one left
 
     def _lose(self, ending: str) -> None:

@@ -1,4 +1,4 @@
-"""A process that flies what its supervisor hands it, and says what came of each flight."""
+"""A process that flies what its supervisor hands it, and reports the outcome of each flight."""
 
 from __future__ import annotations
 
@@ -119,7 +119,7 @@ class Told(NamedTuple):
     """What a worker says of a flight.
 
     Attributes:
-        answer: what came of it.
+        answer: the outcome.
         spent: whether the flight left something in the process that the next one would meet.
     """
 

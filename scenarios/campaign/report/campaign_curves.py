@@ -96,8 +96,8 @@ def histograms(table: pa.Table) -> list[Histogram]:
             v: np.histogram(inside[of & np.isfinite(values)], edges)[0].astype(float) for v, of in by_verdict.items()
         }
         beyond = int(np.count_nonzero((finite < edges[0]) | (finite > edges[-1])))
-        told = f"; {beyond} beyond, in the end bars" if beyond else ""
-        found.append(Histogram(name=name, label=label(name, unit_of(table, name)) + told, edges=edges, counts=counts))
+        parts = f"; {beyond} beyond, in the end bars" if beyond else ""
+        found.append(Histogram(name=name, label=label(name, unit_of(table, name)) + parts, edges=edges, counts=counts))
     return found
 
 
@@ -132,12 +132,12 @@ def sure_splits(summary: Summary) -> Iterator[tuple[str, str, str, Mapping[str, 
     found = summary["parameters"]
     events = dict.fromkeys(event for parameter in found.values() for event in parameter.get("splits", {}))
     for event in events:
-        told = [
+        parts = [
             (parameter["splits"][event]["p_there"], name)
             for name, parameter in found.items()
             if parameter.get("splits", {}).get(event, {"p_holm": 1.0})["p_holm"] < ALPHA
         ]
-        for _, name in sorted(told):
+        for _, name in sorted(parts):
             yield event, name, found[name]["unit"], found[name]["splits"][event]
 
 

@@ -86,8 +86,8 @@ def _draw(name: str, table: pa.Table, summary: Summary) -> Figure:
 
 def _strongest(found: list[Cloud], summary: Summary) -> list[Cloud]:
     """The parameters that go most with the outcome, or the first ones where none of them can."""
-    told = {driver.name: i for i, driver in enumerate(drivers(summary))}
-    return sorted(found, key=lambda cloud: told.get(cloud.name, len(told)))[:_MOST_SCATTERS]
+    phrase = {driver.name: i for i, driver in enumerate(drivers(summary))}
+    return sorted(found, key=lambda cloud: phrase.get(cloud.name, len(phrase)))[:_MOST_SCATTERS]
 
 
 def _draw_convergence(axes: Axes, summary: Summary) -> None:
@@ -148,13 +148,13 @@ def _draw_drivers(axes: Axes, summary: Summary) -> None:
     from matplotlib.patches import Patch
 
     axes.set_title("what goes with the outcome", loc="left", fontsize=9.5)
-    told = drivers(summary)[:_MOST_DRIVERS]
-    if not told:
+    phrase = drivers(summary)[:_MOST_DRIVERS]
+    if not phrase:
         _say(axes, "nothing to correlate")
         return
     outcomes = (
-        ("worst margin", LINES[0], -0.2, [driver.margin for driver in told]),
-        ("failure", LINES[1], 0.2, [driver.failure for driver in told]),
+        ("worst margin", LINES[0], -0.2, [driver.margin for driver in phrase]),
+        ("failure", LINES[1], 0.2, [driver.failure for driver in phrase]),
     )
     keys: list[Artist] = []
     for outcome, colour, offset, found in outcomes:
@@ -167,8 +167,8 @@ def _draw_drivers(axes: Axes, summary: Summary) -> None:
     keys += [Patch(color="#c9ccd1", label="rank correlation"), diamond]
     axes.axvline(0.0, color="#5b6067", linewidth=0.8)
     axes.set_xlim(-1.04, 1.04)
-    axes.set_ylim(len(told) - 0.4, -0.6)
-    axes.set_yticks(range(len(told)), [driver.label for driver in told])
+    axes.set_ylim(len(phrase) - 0.4, -0.6)
+    axes.set_yticks(range(len(phrase)), [driver.label for driver in phrase])
     axes.grid(axis="y", visible=False)
     axes.set_xlabel("pale, hollow: not beyond chance (5 %, Holm over all tests)")
     axes.legend(handles=keys, fontsize=8.0)

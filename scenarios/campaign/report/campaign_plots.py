@@ -48,8 +48,8 @@ def campaign_plots(table: pa.Table, summary: Summary) -> dict[str, Plot]:
         found["convergence"] = _convergence(summary)
     if drawn := histograms(table):
         found["metrics"] = _histograms(drawn, verdict_keys(table))
-    if told := drivers(summary):
-        found["drivers"] = _drivers(told)
+    if text := drivers(summary):
+        found["drivers"] = _drivers(text)
     drawn_margins = margins(table)
     if drawn_margins is not None and (parameters := clouds(table, drawn_margins)):
         found["scatter"] = scatter_plot(table, parameters, drawn_margins)
@@ -128,15 +128,15 @@ def _histograms(drawn: list[Histogram], keys: tuple[tuple[str, str], ...]) -> Pl
     return replace(plot, key_colours=keys)
 
 
-def _drivers(told: list[Driver]) -> Plot:
+def _drivers(text: list[Driver]) -> Plot:
     """Rank correlations as bars, and the measure of any dependence as diamonds over them."""
     from plotly.graph_objects import Figure
 
-    names = [html.escape(driver.label) for driver in told]
+    names = [html.escape(driver.label) for driver in text]
     figure = Figure()
     keys = []
     for (outcome, colour), offset in zip(OUTCOMES.items(), (-0.19, 0.19), strict=True):
-        found = [driver.margin if outcome == "with the worst margin" else driver.failure for driver in told]
+        found = [driver.margin if outcome == "with the worst margin" else driver.failure for driver in text]
         if any(found):
             keys.append((outcome, colour))
             figure.add_traces([*_measures(names, found, outcome, colour, offset)])
@@ -148,7 +148,7 @@ def _drivers(told: list[Driver]) -> Plot:
     ticks = {"tickmode": "array", "tickvals": list(range(len(names))), "ticktext": names}
     figure.update_yaxes(automargin=True, range=[len(names) - 0.4, -0.6], **ticks)
     figure.update_layout(margin={"l": 12, "r": 12, "t": 6, "b": BOTTOM}, barmode="overlay", hovermode="closest")
-    plot = finished(figure, "drivers", "What goes with it", height=70 + 36 * len(told), timed=False)
+    plot = finished(figure, "drivers", "What goes with it", height=70 + 36 * len(text), timed=False)
     return replace(plot, key_colours=tuple(keys))
 
 
@@ -160,14 +160,14 @@ def _measures(
 
     rows = [i for i, one in enumerate(found) if one]
     there = [one for one in found if one]
-    told = {"customdata": [names[i] for i in rows], "name": outcome, "y": [i + offset for i in rows]}
+    text = {"customdata": [names[i] for i in rows], "name": outcome, "y": [i + offset for i in rows]}
     yield Bar(
         x=[one.rho for one in there],
         orientation="h",
         width=0.36,
         marker={"color": colour, "opacity": [1.0 if one.rho_is_sure else 0.35 for one in there]},
         hovertemplate="%{customdata}, %{fullData.name}: rank correlation %{x:.3f}<extra></extra>",
-        **told,
+        **text,
     )
     yield Scatter(
         x=[one.xi for one in there],
@@ -177,7 +177,7 @@ def _measures(
             "symbol": ["diamond" if one.xi_is_sure else "diamond-open" for one in there],
         },
         hovertemplate="%{customdata}, %{fullData.name}: xi %{x:.3f}<extra></extra>",
-        **told,
+        **text,
     )
 
 

@@ -172,9 +172,9 @@ def _line(*texts: str) -> tuple[Cell, ...]:
 
 def driver_table(summary: Summary) -> Grid:
     """How each drawn number goes with the worst margin and with failure."""
-    told = drivers(summary)
+    listed = drivers(summary)
     lines = []
-    for driver in told:
+    for driver in listed:
         cells = [Cell(text=driver.label)]
         for outcome, found in (("worst_margin", driver.margin), ("failed", driver.failure)):
             cells += _association(found, summary["parameters"][driver.name].get(outcome))
@@ -200,7 +200,7 @@ def driver_table(summary: Summary) -> Grid:
 
 def split_table(summary: Summary) -> Grid:
     """The thresholds on drawn numbers that tell flights with an event from those without, beyond chance."""
-    told = list(sure_splits(summary))
+    listed = list(sure_splits(summary))
     sure = f"{100.0 * summary['confidence']:g} % interval"
     lines = tuple(
         _line(
@@ -211,7 +211,7 @@ def split_table(summary: Summary) -> Grid:
             f"{format_number(split['below'])} and {format_number(split['above'])}",
             p_value(split["p_holm"]),
         )
-        for event, name, unit, split in told
+        for event, name, unit, split in listed
     )
     return Grid(
         key="splits",
@@ -231,19 +231,19 @@ def split_table(summary: Summary) -> Grid:
 def group_table(summary: Summary) -> Grid:
     """How often flights failed over each drawn number, from its lowest values on; of none or all failed, no lines."""
     failure = summary["events"]["failure"]
-    told = {
+    listed = {
         name: found
         for name, found in summary["parameters"].items()
         if found.get("groups") and 0 < failure["count"] < failure["flights"]
     }
-    size = max((len(found["groups"]) for found in told.values()), default=0)
+    size = max((len(found["groups"]) for found in listed.values()), default=0)
     lines = tuple(
         _line(
             label(name, found["unit"]),
             *(_group(group) for group in found["groups"]),
             *[ABSENT] * (size - len(found["groups"])),
         )
-        for name, found in told.items()
+        for name, found in listed.items()
     )
     return Grid(
         key="groups",
@@ -274,20 +274,20 @@ def level_tables(summary: Summary) -> list[Grid]:
     return grids
 
 
-def _association(found: Association | None, told: Mapping[str, Any] | None) -> tuple[Cell, ...]:
-    if found is None or told is None:
+def _association(found: Association | None, listed: Mapping[str, Any] | None) -> tuple[Cell, ...]:
+    if found is None or listed is None:
         return _line(*[ABSENT] * 4)
     return (
         Cell(text=f"{found.rho:+.2f}", mark=Mark.BEST if found.rho_is_sure else Mark.NONE),
-        Cell(text=p_value(told["p_holm"])),
+        Cell(text=p_value(listed["p_holm"])),
         Cell(text=f"{found.xi:.2f}", mark=Mark.BEST if found.xi_is_sure else Mark.NONE),
-        Cell(text=p_value(told["p_xi_holm"])),
+        Cell(text=p_value(listed["p_xi_holm"])),
     )
 
 
 def _side(share: Mapping[str, Any]) -> tuple[str, str]:
-    told = f"{share['count']} of {share['flights']} ({percent(share['share'])})"
-    return told, interval(share["lower"], share["upper"])
+    listed = f"{share['count']} of {share['flights']} ({percent(share['share'])})"
+    return listed, interval(share["lower"], share["upper"])
 
 
 def _group(group: Mapping[str, Any]) -> str:

@@ -25,8 +25,8 @@ _MOST_DRIVERS: Final = 3
 def verdict_sentence(summary: Summary) -> str:
     """How many flights failed, and how sure that is: `37 of 1000 flights failed: 3.7 % (95 %: 2.6 to 5.1 %)`."""
     failure = summary["events"]["failure"]
-    told = f"{failure['count']} of {count_of(failure['flights'], 'flight')} failed"
-    return f"{told}: {share_with_interval(failure, summary['confidence'])}" if failure["flights"] else told
+    phrases = f"{failure['count']} of {count_of(failure['flights'], 'flight')} failed"
+    return f"{phrases}: {share_with_interval(failure, summary['confidence'])}" if failure["flights"] else phrases
 
 
 def campaign_sentences(summary: Summary) -> list[str]:
@@ -42,10 +42,10 @@ def campaign_sentences(summary: Summary) -> list[str]:
 
 
 def _outcomes(summary: Summary) -> Iterator[str]:
-    told = {verdict: count for verdict, count in summary["verdicts"].items() if count}
+    phrases = {verdict: count for verdict, count in summary["verdicts"].items() if count}
     parts = [
-        f"{count} {VERDICTS[verdict].told_of_one if count == 1 else VERDICTS[verdict].told}"
-        for verdict, count in told.items()
+        f"{count} {VERDICTS[verdict].phrase_of_one if count == 1 else VERDICTS[verdict].phrase}"
+        for verdict, count in phrases.items()
     ]
     if len(parts) == 1 and summary["flights"] > 1:
         yield f"All {parts[0].replace(' ', ' flights ', 1)}."
@@ -97,8 +97,8 @@ def _constraints(summary: Summary) -> Iterator[str]:
 def driver_sentences(summary: Summary) -> Iterator[str]:
     """What goes with the outcome in one direction, and what in another way."""
     for outcome, noun in _OUTCOMES.items():
-        told = {name: found.get(outcome) for name, found in summary["parameters"].items()}
-        tested = {name: found for name, found in told.items() if found}
+        phrases = {name: found.get(outcome) for name, found in summary["parameters"].items()}
+        tested = {name: found for name, found in phrases.items() if found}
         rising = {name: found for name, found in tested.items() if found["p_holm"] < ALPHA}
         strongest = sorted(rising.items(), key=lambda item: -abs(item[1]["rho"]))[:_MOST_DRIVERS]
         if strongest:
@@ -131,11 +131,11 @@ def _turn(summary: Summary, name: str, outcome: str) -> str:
 
 def split_sentences(summary: Summary) -> Iterator[str]:
     """Where the flights with an event are, by the surest threshold."""
-    told: set[str] = set()
+    phrases: set[str] = set()
     for event, name, unit, split in sure_splits(summary):
-        if event in told:
+        if event in phrases:
             continue
-        told.add(event)
+        phrases.add(event)
         worse, better, side = split["high"], split["low"], "above"
         if worse["share"] < better["share"]:
             worse, better, side = better, worse, "up to"
@@ -165,9 +165,9 @@ def _worst(summary: Summary) -> Iterator[str]:
     worst = summary["worst"][0]
     margin = worst["worst_margin"]
     if margin is None:
-        told = ""
+        phrases = ""
     elif worst["verdict"] == "lost" and margin >= 0.0:
-        told = " before any required constraint was violated"
+        phrases = " before any required constraint was violated"
     else:
-        told = f", with a worst margin of {format_number(margin)} ({worst['worst_constraint']})"
-    yield f"The worst flight is number {worst['flight']}: {worst['verdict']}{told}."
+        phrases = f", with a worst margin of {format_number(margin)} ({worst['worst_constraint']})"
+    yield f"The worst flight is number {worst['flight']}: {worst['verdict']}{phrases}."

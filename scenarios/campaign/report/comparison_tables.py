@@ -27,14 +27,14 @@ def comparison_markdown(comparison: Comparison) -> str:
 
 def pairing(comparison: Comparison) -> str:
     """What the pairs have in common, and what they have not."""
-    told = f"Pairs have their seed in common, and all of {', '.join(comparison.shared_draws)}"
+    phrase = f"Pairs have their seed in common, and all of {', '.join(comparison.shared_draws)}"
     if not comparison.shared_draws:
-        told = "Pairs have their seed in common"
+        phrase = "Pairs have their seed in common"
     if comparison.own_draws:
-        told += f"; one campaign alone draws {', '.join(comparison.own_draws)}"
+        phrase += f"; one campaign alone draws {', '.join(comparison.own_draws)}"
     if comparison.left_out:
-        told += f"; {comparison.left_out} flights that only one of them has are left out"
-    return f"{told}."
+        phrase += f"; {comparison.left_out} flights that only one of them has are left out"
+    return f"{phrase}."
 
 
 def _events(comparison: Comparison) -> Grid:

@@ -47,8 +47,8 @@ def scatter_plot(table: pa.Table, parameters: list[Cloud], drawn: Margins) -> Pl
         if cloud.course is not None:
             figure.add_trace(_course(cloud.course.x, cloud.course.y), **place(panel))
         if cloud.names:
-            told = [html.escape(name).replace("\n", "<br>") for name in side_by_side(cloud.names, _TICK_ROOM)]
-            figure.update_xaxes(tickvals=list(range(len(told))), ticktext=told, **place(panel))
+            parts = [html.escape(name).replace("\n", "<br>") for name in side_by_side(cloud.names, _TICK_ROOM)]
+            figure.update_xaxes(tickvals=list(range(len(parts))), ticktext=parts, **place(panel))
     figure.update_yaxes(range=list(drawn.ends))
     figure.update_layout(hovermode="closest")
     plot = finished_panels(figure, "scatter", "Worst margin over each drawn parameter", len(parameters))

@@ -1,4 +1,4 @@
-"""The verdicts on a flight of a campaign: how each is ranked, told and drawn.  A new one is a line here."""
+"""The verdicts on a flight of a campaign: how each is ranked, worded and drawn.  A new one is a line here."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class Verdict:
 
     Attributes:
         badness: its place among the worst flights: the larger, the worse.
-        told: what such flights did, after their number.
+        phrase: what such flights did, after their number.
         told_of_one: what one such flight did.
         colour: of its flights.
         marker: of its flights, in matplotlib's letters.
@@ -30,8 +30,8 @@ class Verdict:
     """
 
     badness: int
-    told: str
-    told_of_one: str
+    phrase: str
+    phrase_of_one: str
     colour: str
     marker: str
     symbol: str
@@ -40,36 +40,41 @@ class Verdict:
 VERDICTS: Final = {
     "satisfied": Verdict(
         badness=0,
-        told="held every required constraint",
-        told_of_one="held every required constraint",
+        phrase="held every required constraint",
+        phrase_of_one="held every required constraint",
         colour=LINES[0],
         marker="o",
         symbol="circle",
     ),
     "violated": Verdict(
         badness=1,
-        told="violated a required constraint",
-        told_of_one="violated a required constraint",
+        phrase="violated a required constraint",
+        phrase_of_one="violated a required constraint",
         colour=LINES[1],
         marker="D",
         symbol="diamond",
     ),
-    "lost": Verdict(badness=5, told="were lost", told_of_one="was lost", colour=BOUND, marker="x", symbol="x"),
+    "lost": Verdict(badness=5, phrase="were lost", phrase_of_one="was lost", colour=BOUND, marker="x", symbol="x"),
     ERROR: Verdict(
-        badness=4, told="raised an error", told_of_one="raised an error", colour=REFERENCE, marker="s", symbol="square"
+        badness=4,
+        phrase="raised an error",
+        phrase_of_one="raised an error",
+        colour=REFERENCE,
+        marker="s",
+        symbol="square",
     ),
     TIMEOUT: Verdict(
         badness=3,
-        told="were ended since they took too long",
-        told_of_one="was ended since it took too long",
+        phrase="were ended since they took too long",
+        phrase_of_one="was ended since it took too long",
         colour=LINES[4],
         marker="^",
         symbol="triangle-up",
     ),
     MEMORY: Verdict(
         badness=2,
-        told="were ended since they took too much memory",
-        told_of_one="was ended since it took too much memory",
+        phrase="were ended since they took too much memory",
+        phrase_of_one="was ended since it took too much memory",
         colour=LINES[5],
         marker="v",
         symbol="triangle-down",

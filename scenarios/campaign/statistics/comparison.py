@@ -92,13 +92,13 @@ class Comparison:
         a, b = self.names
         failure = self.events[0]
         count_a, count_b = failure.counts
-        told = (
+        phrase = (
             f"{b} and {a} are not distinguishable by their failures"
             if self.verdict == "not distinguishable"
             else f"{b} is {self.verdict} than {a}"
         )
         return (
-            f"{told}: of {self.flights} paired flights, {count_b} failed with {b} and {count_a} with {a} "
+            f"{phrase}: of {self.flights} paired flights, {count_b} failed with {b} and {count_a} with {a} "
             f"({failure.only_b} with {b} alone, {failure.only_a} with {a} alone; McNemar's exact test, "
             f"{p_value(failure.p)}). The difference is {signed_points(failure.difference)} percentage points "
             f"({100.0 * CONFIDENCE:g} %: {signed_interval(failure.lower, failure.upper)}). "

@@ -195,12 +195,12 @@ def trend(x: Array, y: Array) -> Trend | None:
     order = np.argsort(x, kind="stable")
     parts = np.array_split(order, groups)
     centres = np.array([np.median(x[part]) for part in parts])
-    told, first = np.unique(centres, return_index=True)
-    if told.size < fewest:
+    distinct, first = np.unique(centres, return_index=True)
+    if distinct.size < fewest:
         return None
     medians = np.array([np.median(y[parts[i]]) for i in first])
-    span = float(told[-1] - told[0])
-    unit = (told - told[0]) / span
+    span = float(distinct[-1] - distinct[0])
+    unit = (distinct - distinct[0]) / span
     at = np.linspace(0.0, 1.0, _POINTS)
     smooth = np.clip(make_smoothing_spline(unit, medians)(at), medians.min(), medians.max())
-    return Trend(x=told[0] + span * at, y=np.asarray(smooth, float))
+    return Trend(x=distinct[0] + span * at, y=np.asarray(smooth, float))

@@ -69,11 +69,11 @@ def ranked_margins(table: pa.Table) -> Array:
 
 
 def _events(table: pa.Table) -> Iterator[tuple[str, Flags]]:
-    told: list[Flags] = []
+    distinct: list[Flags] = []
     for event in SPLIT_EVENTS:
         happened = parse_event(event).column(table)
-        if not any(np.array_equal(happened, earlier) for earlier in told):
-            told.append(happened)
+        if not any(np.array_equal(happened, earlier) for earlier in distinct):
+            distinct.append(happened)
             yield event, happened
 
 

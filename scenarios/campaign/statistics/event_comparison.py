@@ -106,7 +106,7 @@ def other_differences(events: Sequence[EventComparison], names: tuple[str, str])
 
     Returns:
         A sentence; empty where nothing else did.  A second event of the same numbers as the first, as violation is
-        where it alone counts as failure, is not told again.
+        where it alone counts as failure, is not reported again.
     """
     first, *others = events
     others = [event for event in others if event.only_a != event.only_b]

@@ -19,7 +19,7 @@ EXAMPLE: Final = "P(violation) < 0.01 @ 95%"
 _SHARES: Final = (Decimal("1e-9"), 1 - Decimal("1e-9"))
 _CONFIDENCES: Final = (Decimal("0.5"), Decimal("0.999999"))
 _MOST_TOLD: Final = 10**9
-"""Flights beyond which it is only told that it takes more."""
+"""Flights beyond which a message says only that it takes more."""
 _FORM: Final = re.compile(
     r"P\s*\((?P<event>[^()]*)\)\s*(?P<operation><=|>=|<|>)\s*(?P<share>[^<>=@]+?)\s*@\s*(?P<confidence>[^@%]+?)\s*%",
     re.IGNORECASE,
@@ -83,17 +83,17 @@ class Judgement:
         """The judgement with its numbers."""
         asked = self.requirement
         share = f" ({percent(self.count / self.flights)})" if self.flights else ""
-        told = (
+        phrase = (
             f"{asked.text} {'holds' if self.holds else 'does not hold'}: {asked.event.text} in {self.count} of "
             f"{count_of(self.flights, 'flight')}{share}, so with {100.0 * asked.confidence:g} % confidence at "
             f"{'most' if asked.at_most else 'least'} {percent(self.bound, digits=3)}."
         )
         if self.flights >= self.least_flights:
-            return told
+            return phrase
         least = f"at least {count_of(self.least_flights, 'flight')}"
         if self.least_flights > _MOST_TOLD:
             least = f"more than {_MOST_TOLD:,} flights"
-        return f"{told} It takes {least}, {'none' if asked.at_most else 'all'} of them with that event."
+        return f"{phrase} It takes {least}, {'none' if asked.at_most else 'all'} of them with that event."
 
     def to_json(self) -> dict[str, Any]:
         """Plain data for `summary.json`."""

@@ -90,9 +90,9 @@ def clouds(table: pa.Table, drawn: Margins) -> list[Cloud]:
     found = []
     for name in draw_names(table):
         column = DRAW + name
-        told = label(name, unit_of(table, column))
+        text = label(name, unit_of(table, column))
         if not is_number(table, column):
-            found.append(_levels(name, told, texts(table, column)))
+            found.append(_levels(name, text, texts(table, column)))
             continue
         true = numbers(table, column)
         low, high = robust_ends(true)
@@ -100,7 +100,7 @@ def clouds(table: pa.Table, drawn: Margins) -> list[Cloud]:
         edge = np.where(true < low, "left", np.where(true > high, "right", ""))
         x = np.select([edge == "left", edge == "right"], [low - gap, high + gap], true)
         course = trend(x, drawn.y) if np.isfinite(x).all() else None
-        found.append(Cloud(name=name, label=told, x=x, edge=edge, true=true, names=(), course=course))
+        found.append(Cloud(name=name, label=text, x=x, edge=edge, true=true, names=(), course=course))
     return found
 
 
@@ -128,7 +128,7 @@ def thinning(table: pa.Table) -> str:
     ]
     if not parts:
         return ""
-    return f"Drawn are {', '.join(parts)}, evenly spread by number; all others are drawn in full."
+    return f"Drawn are {', '.join(parts)}, evenly spread by number; all others are shown in full."
 
 
 def clipping(drawn: Margins, parameters: list[Cloud]) -> str:
@@ -164,11 +164,11 @@ def _told(beyond: Flags, how: str, limit: float, as_far: str, extreme: float) ->
     return f"{count_of(int(beyond.sum()), 'flight')} {how} {limit:.3g}, {as_far} {extreme:.3g}"
 
 
-def _levels(name: str, told: str, values: np.ndarray[Any, np.dtype[np.object_]]) -> Cloud:
+def _levels(name: str, text: str, values: np.ndarray[Any, np.dtype[np.object_]]) -> Cloud:
     names = tuple(sorted(set(values)))
     spread = np.random.default_rng(0).uniform(-0.3, 0.3, values.size)  # as every time
     x = np.array([names.index(value) for value in values], float) + spread
-    return Cloud(name=name, label=told, x=x, edge=np.full(x.size, ""), true=x, names=names, course=None)
+    return Cloud(name=name, label=text, x=x, edge=np.full(x.size, ""), true=x, names=names, course=None)
 
 
 def _evenly(rows: Rows, most: int) -> Rows:

@@ -61,14 +61,14 @@ def best_splits(columns: Mapping[str, Array], happened: Flags) -> dict[str, Spli
     """
     if happened.all() or not happened.any():
         return dict.fromkeys(columns)
-    told = {name: values for name, values in columns.items() if np.isfinite(values).all() and np.ptp(values) > 0.0}
-    if not told:
+    varying = {name: values for name, values in columns.items() if np.isfinite(values).all() and np.ptp(values) > 0.0}
+    if not varying:
         return dict.fromkeys(columns)
     flights = happened.size
     rare = happened if 2 * happened.sum() <= flights else ~happened  # the same test, and fewer counts to follow
     count = int(rare.sum())
-    orders = {name: np.argsort(values, kind="stable") for name, values in told.items()}
-    ranked = np.stack([told[name][order] for name, order in orders.items()])  # (D, K)
+    orders = {name: np.argsort(values, kind="stable") for name, values in varying.items()}
+    ranked = np.stack([varying[name][order] for name, order in orders.items()])  # (D, K)
     counts = np.stack([np.cumsum(rare[order], dtype=np.int_) for order in orders.values()])[:, :-1]  # (D, K - 1)
     allowed = np.diff(ranked) > 0.0
     chances = np.where(allowed, _fisher(counts, flights, count), np.inf)
@@ -76,7 +76,7 @@ def best_splits(columns: Mapping[str, Array], happened: Flags) -> dict[str, Spli
     best = chances[np.arange(cuts.size), cuts]
     p_values = _chances_of_as_good(best, allowed, flights, count)
     found: dict[str, Split | None] = dict.fromkeys(columns)
-    for i, name in enumerate(told):
+    for i, name in enumerate(varying):
         size = int(cuts[i]) + 1
         low = happened[orders[name]][:size]
         below, above = float(ranked[i, size - 1]), float(ranked[i, size])

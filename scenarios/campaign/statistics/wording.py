@@ -56,9 +56,9 @@ def side_by_side(names: Sequence[str], room: int) -> list[str]:
     each = max(_SHORTEST, room // max(len(names), 1) - 1)
     found = []
     for name in names:
-        told = name if len(name) <= 2 * each else f"{name[: 2 * each - 1]}…"
-        lines = textwrap.wrap(told, each)
-        found.append("\n".join(lines if len(lines) < 3 else (told[:each], told[each:])))
+        text = name if len(name) <= 2 * each else f"{name[: 2 * each - 1]}…"
+        lines = textwrap.wrap(text, each)
+        found.append("\n".join(lines if len(lines) < 3 else (text[:each], text[each:])))
     return found
 
 

@@ -119,7 +119,7 @@ def test_every_way_is_taken_by_random_problems() -> None:
 
 @pytest.mark.parametrize("part", ["u_min", "u_max", "delta_min", "delta_max", "y_min", "y_max"])
 def test_each_kind_of_constraint_is_seen(part: str) -> None:
-    """A bound drawn in until it is just beyond the optimum's extreme bars the way; just before, it does not."""
+    """A bound tightened until it is just beyond the optimum's extreme bars the way; just before, it does not."""
     problem = paper_problem()
     assert problem.bounds is not None
     state, desired = np.zeros(12), np.zeros((50, 4))

@@ -1,4 +1,4 @@
-"""Dead reckoning: what is measured passes, what is missing or frozen follows the model."""
+"""Dead completion: what is measured passes, what is missing or frozen follows the model."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from scripted_controller import (
     random_state,
 )
 
-from mpc.fallback.completion import PLAUSIBLE, DeadReckoning
+from mpc.fallback.completion import PLAUSIBLE, StateCompletion
 from quadsim.state import EULER, EULER_RATE, INDEX, POSITION, VELOCITY, Array
 
 
@@ -29,26 +29,26 @@ def moving(periods: int, *, acceleration: float = 0.0) -> tuple[Array, Array]:
     return np.array(states), speeds
 
 
-def reckon(states: Array, speeds: Array, missing: Sequence[int], *, value: float = math.nan) -> Array:
+def complete(states: Array, speeds: Array, missing: Sequence[int], *, value: float = math.nan) -> Array:
     """What is made of states whose channels go missing after the first."""
-    reckoning = DeadReckoning(model())
-    known = [reckoning.complete(states[0], model().u_bar, level())]
+    completion = StateCompletion(model())
+    known = [completion.complete(states[0], model().u_bar, level())]
     for state, command in zip(states[1:], speeds, strict=True):
         measured = state.copy()
         measured[list(missing)] = value
-        known.append(reckoning.complete(measured, command, level()))
+        known.append(completion.complete(measured, command, level()))
     return np.array(known)
 
 
 def test_what_is_measured_passes_unchanged() -> None:
     states, speeds = moving(20)
-    np.testing.assert_array_equal(reckon(states, speeds, []), states)
+    np.testing.assert_array_equal(complete(states, speeds, []), states)
 
 
 @pytest.mark.parametrize("missing", [*[(channel,) for channel in range(12)], POSITION, EULER + EULER_RATE, range(12)])
 def test_missing_channels_follow_the_model(missing: Sequence[int]) -> None:
     states, speeds = moving(20)
-    known = reckon(states, speeds, missing)
+    known = complete(states, speeds, missing)
     np.testing.assert_allclose(known, states, atol=1e-9)
     there = np.setdiff1d(np.arange(12), missing)
     np.testing.assert_array_equal(known[:, there], states[:, there])
@@ -57,14 +57,14 @@ def test_missing_channels_follow_the_model(missing: Sequence[int]) -> None:
 @pytest.mark.parametrize("value", [math.inf, -1e300, 2e5])
 def test_implausible_numbers_are_missing_ones(value: float) -> None:
     states, speeds = moving(10)
-    np.testing.assert_allclose(reckon(states, speeds, POSITION, value=value), states, atol=1e-9)
+    np.testing.assert_allclose(complete(states, speeds, POSITION, value=value), states, atol=1e-9)
 
 
 def test_the_channels_that_are_there_correct_what_is_missing() -> None:
     states, speeds = moving(20, acceleration=1.0)
     x, vx = INDEX["x"], INDEX["vx"]
-    blind = reckon(states, speeds, (x, vx))
-    corrected = reckon(states, speeds, (vx,))
+    blind = complete(states, speeds, (x, vx))
+    corrected = complete(states, speeds, (vx,))
     assert abs(blind[-1] - states[-1])[vx] == pytest.approx(1.0)  # 1 m/s^2 for 1 s
     assert abs(corrected[-1] - states[-1])[vx] < 0.3
 
@@ -72,46 +72,46 @@ def test_the_channels_that_are_there_correct_what_is_missing() -> None:
 @pytest.mark.parametrize("group", [POSITION, VELOCITY, EULER, EULER_RATE, tuple(range(12))])
 def test_frozen_numbers_are_missing_ones(group: Sequence[int]) -> None:
     states, speeds = moving(20)
-    reckoning = DeadReckoning(model())
-    reckoning.complete(states[0], model().u_bar, level())
+    completion = StateCompletion(model())
+    completion.complete(states[0], model().u_bar, level())
     for state, command in zip(states[1:], speeds, strict=True):
         measured = state.copy()
         measured[list(group)] = states[0][list(group)]
-        known = reckoning.complete(measured, command, level())
+        known = completion.complete(measured, command, level())
         np.testing.assert_allclose(known, state, atol=5e-2)  # until the prediction has left the numbers, they are taken
-    assert reckoning.unseen[list(group)].min() > 0
-    assert reckoning.complete(state + 1e-6, command, level()).tolist() == (state + 1e-6).tolist()
-    assert not reckoning.unseen.any()
+    assert completion.unseen[list(group)].min() > 0
+    assert completion.complete(state + 1e-6, command, level()).tolist() == (state + 1e-6).tolist()
+    assert not completion.unseen.any()
 
 
 def test_a_vehicle_at_rest_or_on_the_ground_is_not_frozen() -> None:
-    reckoning, rest = DeadReckoning(model()), np.zeros(12)
+    completion, rest = StateCompletion(model()), np.zeros(12)
     for _ in range(3):
-        reckoning.complete(rest, model().u_bar, level())
-    assert not reckoning.unseen.any()
+        completion.complete(rest, model().u_bar, level())
+    assert not completion.unseen.any()
     for _ in range(3):
-        reckoning.complete(rest, np.zeros(4), level(), free=False)
-    assert not reckoning.unseen.any()
-    reckoning.complete(rest, np.zeros(4), level())
-    assert reckoning.unseen.any()
+        completion.complete(rest, np.zeros(4), level(), free=False)
+    assert not completion.unseen.any()
+    completion.complete(rest, np.zeros(4), level())
+    assert completion.unseen.any()
 
 
 def test_what_was_missing_for_long_is_found_again_from_the_rest() -> None:
-    reckoning = DeadReckoning(model())
+    completion = StateCompletion(model())
     for _ in range(4000):
-        reckoning.complete(np.full(12, math.nan), model().u_bar, level())
+        completion.complete(np.full(12, math.nan), model().u_bar, level())
     states, speeds = moving(100)
     tilting = [INDEX[name] for name in ("roll", "roll_rate", "pitch", "pitch_rate")]  # seen in how it moves
     for state, command in zip(states, speeds, strict=False):
         measured = state.copy()
         measured[tilting] = math.nan
-        known = reckoning.complete(measured, command, level())
+        known = completion.complete(measured, command, level())
     np.testing.assert_allclose(known[tilting], state[tilting], atol=0.05)
 
 
 def test_nothing_measured_ever_stays_finite() -> None:
-    reckoning, rng = DeadReckoning(model()), np.random.default_rng(7)
+    completion, rng = StateCompletion(model()), np.random.default_rng(7)
     for k in range(3000):
         seen = rng.normal(size=12) if k % 500 == 0 else np.zeros(3)
-        known = reckoning.complete(seen, rng.uniform(-1e5, 1e5, 4), level())
+        known = completion.complete(seen, rng.uniform(-1e5, 1e5, 4), level())
         assert (np.abs(known) <= PLAUSIBLE).all()

@@ -19,7 +19,7 @@ from scripted_controller import (
     random_state,
 )
 
-from mpc.fallback.completion import Reckoned
+from mpc.fallback.completion import CompletedMoment
 from mpc.fallback.contract import FAILURES
 from mpc.fallback.settings import FallbackSettings
 from mpc.solvers._piqp import STATUS
@@ -267,9 +267,9 @@ def test_the_controller_is_told_what_is_predicted() -> None:
     for time, state in enumerate((np.zeros(12), partly, partly, np.zeros(12))):
         ask(guarded, state, time=float(time))
     told = [now for now, _ in inner.asked]
-    assert all(isinstance(now, Reckoned) for now in told)
+    assert all(isinstance(now, CompletedMoment) for now in told)
     assert [now.time for now in told] == [0.0, 1.0, 2.0, 3.0]
-    unseen = np.array([now.unseen for now in told if isinstance(now, Reckoned)])
+    unseen = np.array([now.unseen for now in told if isinstance(now, CompletedMoment)])
     assert unseen[:, INDEX["vz"]].tolist() == [0.0, 1.0, 2.0, 0.0]
     assert not np.delete(unseen, INDEX["vz"], axis=1).any()
 

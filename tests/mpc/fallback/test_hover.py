@@ -17,7 +17,7 @@ from scripted_controller import (
     random_state,
 )
 
-from mpc.fallback.completion import DeadReckoning
+from mpc.fallback.completion import StateCompletion
 from mpc.fallback.hover import (
     ACCEPTABLE_ACCELERATION,
     ACCEPTABLE_POSITION,
@@ -109,7 +109,7 @@ def test_an_impossible_tilt_is_refused(tilt: float) -> None:
         HoverLaw(model(), tilt=tilt)
 
 
-@pytest.mark.parametrize("make", [DeadReckoning, lambda other: HoverLaw(other, tilt=0.2)])
+@pytest.mark.parametrize("make", [StateCompletion, lambda other: HoverLaw(other, tilt=0.2)])
 def test_another_kind_of_model_is_refused(make: Callable[[LinearModel], object]) -> None:
     other = LinearModel(A=np.eye(3), B=np.ones((3, 2)), u_bar=np.zeros(2), period=PERIOD)
     with pytest.raises(ParameterError, match="must be one of 12 states and 4 inputs; got '3 states and 2 inputs'"):

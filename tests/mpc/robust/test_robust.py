@@ -14,7 +14,7 @@ from support import paper_problem, paper_reference
 from mpc.constrained import ConstrainedMPC
 from mpc.constraints import Penalty
 from mpc.equilibrium import equilibrium
-from mpc.fallback.completion import Reckoned
+from mpc.fallback.completion import CompletedMoment
 from mpc.heading import turn_horizontally
 from mpc.model import continuous_model, discretise, hover_model
 from mpc.nonlinear.linearise import linearise
@@ -22,7 +22,7 @@ from mpc.nonlinear.model import NonlinearModel, advance, derivative, nonlinear_m
 from mpc.robust.controller import Linearisation, RobustMPC, RobustSettings
 from mpc.robust.observer import ObserverSettings
 from mpc.solvers import QPSolver
-from quadsim.controller import ACCEPTED, SOLVED, Moment, Phase
+from quadsim.controller import ACCEPTED, SOLVED, UNCONSTRAINED, Moment, Phase
 from quadsim.errors import ParameterError
 from quadsim.sim.effects.rotors import RotorDynamics
 from quadsim.state import INDEX, POSITION, Array, make_state
@@ -123,6 +123,20 @@ def test_the_hover_matrices_are_the_papers_without_lag_and_the_nonlinear_models_
     hover = discretise(*continuous_model(vehicle, 0.03), PERIOD)
     for ours, exact in zip(hover, linearise(lagging, x[None], u[None])[:2], strict=True):
         np.testing.assert_allclose(ours, exact[0], atol=1e-7)
+
+
+@pytest.mark.parametrize("parts", [{}, {"penalty": SOFT}, EVERYTHING])
+def test_a_period_without_an_active_constraint_says_so(vehicle: Vehicle, parts: dict[str, Any]) -> None:
+    """And one with some is solved; models that change have no such shortcut."""
+    now, aside = Moment(acting=np.full(4, vehicle.hover_speed)), np.tile([5.0, 0.0, 0.0, 0.0], (50, 1))
+    controller = robust(vehicle, **parts)
+    for reference, status in ((HOLD, UNCONSTRAINED), (aside, SOLVED), (HOLD, UNCONSTRAINED)):
+        controller.reset(np.full(4, vehicle.hover_speed))
+        command = controller.step(now, np.zeros(12), reference)
+        assert command.status == status
+        assert (command.active > 0) == (status == SOLVED)
+    changing = robust(vehicle, **{**parts, "linearisation": Linearisation.STATE})
+    assert changing.step(now, np.zeros(12), HOLD).status == SOLVED
 
 
 # Soft bounds
@@ -318,14 +332,14 @@ def test_predicted_states_teach_nothing_and_long_spans_of_them_neither(
     measured, guessed = np.zeros(12), np.zeros(12)
     guessed[INDEX["vx"]] = 1.0
     times = PERIOD * np.arange(predicted + 3)
-    controller.step(Reckoned(time=times[0], acting=acting, unseen=measured), np.zeros(12), HOLD)
+    controller.step(CompletedMoment(time=times[0], acting=acting, unseen=measured), np.zeros(12), HOLD)
     for time in times[1 : predicted + 1]:
-        controller.step(Reckoned(time=time, acting=acting, unseen=guessed), moving((0.3, 0.0, 0.0)), HOLD)
+        controller.step(CompletedMoment(time=time, acting=acting, unseen=guessed), moving((0.3, 0.0, 0.0)), HOLD)
         np.testing.assert_array_equal(controller.disturbance, 0.0)
-    controller.step(Reckoned(time=times[-2], acting=acting, unseen=measured), moving((0.1, 0.0, 0.0)), HOLD)
+    controller.step(CompletedMoment(time=times[-2], acting=acting, unseen=measured), moving((0.1, 0.0, 0.0)), HOLD)
     assert controller.disturbance.any() == learned
     before = controller.disturbance
-    controller.step(Reckoned(time=times[-1], acting=acting, unseen=measured), np.zeros(12), HOLD)
+    controller.step(CompletedMoment(time=times[-1], acting=acting, unseen=measured), np.zeros(12), HOLD)
     assert np.abs(controller.disturbance - before).max() > 0.0
 
 
@@ -334,7 +348,7 @@ def test_a_position_that_is_predicted_hides_no_disturbance(vehicle: Vehicle) -> 
     unseen = np.zeros(12)
     unseen[list(POSITION)] = 7.0
     for k, speed in enumerate((0.0, 0.2)):
-        controller.step(Reckoned(time=k * PERIOD, acting=acting, unseen=unseen), moving((0.0, 0.0, speed)), HOLD)
+        controller.step(CompletedMoment(time=k * PERIOD, acting=acting, unseen=unseen), moving((0.0, 0.0, speed)), HOLD)
     assert controller.disturbance[2] > 0.1
 
 

@@ -318,7 +318,8 @@ def test_rotors_too_quick_to_compute_with_are_refused(vehicle: Vehicle) -> None:
 def test_bound_on_one_side_only_is_refused(vehicle: Vehicle) -> None:
     bounds = replace(tilt_bounds(), y_max=np.array([LIMIT, np.inf]))
     with pytest.raises(
-        ParameterError, match=r"output_bounds\.pitch must be finite on both sides, to be drawn in; got \[-5\.0+, inf\]$"
+        ParameterError,
+        match=r"output_bounds\.pitch must be finite on both sides, to be tightened; got \[-5\.0+, inf\]$",
     ):
         margins(vehicle, period=PERIOD, horizon=HORIZON, bounds=bounds, settings=TighteningSettings())
 

@@ -38,6 +38,6 @@ def test_an_angle_has_a_gap_at_each_wrap_and_nowhere_else() -> None:
 
 def test_what_is_no_angle_does_not_wrap() -> None:
     t, jump = np.arange(4.0), np.array([0.0, 0.0, 900.0, 900.0])
-    for drawn in break_at_wraps(t, jump, "rad/s"):
-        assert drawn.size == 4
+    for curve in break_at_wraps(t, jump, "rad/s"):
+        assert curve.size == 4
     assert break_at_wraps(t, jump, "deg")[1].size == 5

@@ -121,7 +121,7 @@ def with_effects(run: Run, *, wrench: bool = False, wind: bool = False, lag: boo
 SPEEDS = {"rotor 1 [rad/s]", "rotor 4 [rad/s]", "commanded", "acting"}
 FORCES = {"external force, world", "[N]", "external torque, body", "[N m]", "x", "y", "z"}
 AIR = {"wind, world", "[m/s]", "x", "y", "z"}
-TOLD = {"position as told,", "less the true one [m]", "less the true one [deg]", "x", "y", "z", "roll", "yaw"}
+TOLD = {"position as measured,", "less the true one [m]", "less the true one [deg]", "x", "y", "z", "roll", "yaw"}
 
 
 @pytest.mark.parametrize(("effect", "expected"), [("lag", SPEEDS), ("wrench", FORCES), ("wind", AIR), ("told", TOLD)])
@@ -195,9 +195,9 @@ def test_a_roll_that_wraps_is_no_line_across_the_panel(
 def test_states_are_drawn_as_told_beside_the_true_ones(
     short_run: Run, figures: dict[str, Path], tmp_path: Path
 ) -> None:
-    assert "as told" not in texts(figures["figure4_states.svg"])
+    assert "measured" not in texts(figures["figure4_states.svg"])
     write_figures(with_effects(short_run, told=True), tmp_path)
-    assert {"flight", "as told"} <= texts(tmp_path / "figure4_states.svg")
+    assert {"flight", "measured"} <= texts(tmp_path / "figure4_states.svg")
     told = lines_of_colour(tmp_path / "figure4_states.svg", line_colour(1))
     assert told - lines_of_colour(figures["figure4_states.svg"], line_colour(1)) == 6 + 1, "six panels and the legend"
 

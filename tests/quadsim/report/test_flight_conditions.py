@@ -55,22 +55,22 @@ def cells(rows: list[Row], group: str, label: str) -> list[str]:
 
 def test_rows_say_what_the_summary_says_and_a_dash_where_it_is_silent(bare_run: Run) -> None:
     rows = comparison_rows([having(bare_run, "full", **EVERYTHING), bare_run])
-    assert cells(rows, "Course", "largest tilt asked for") == ["5.61", "-"]
+    assert cells(rows, "Course", "largest tilt required") == ["5.61", "-"]
     assert cells(rows, "Course", "jumps") == ["at 1 s; at 7 s", "-"]
     assert cells(rows, "Course", "beyond the bounds") == ["pitch up to 5.61 deg (bound 5)", "-"]
     assert cells(rows, "Ground", "take-off at") == ["2.155", "-"]
     assert cells(rows, "Ground", "touchdown, descending with") == ["0.052", "-"]
     assert cells(rows, "Ground", "at the end") == ["landed", "-"]
-    assert cells(rows, "State as told", "RMS error as told, z") == ["0.012", "-"]
-    assert cells(rows, "State as told", "largest error as told, roll") == ["5.73", "-"], "in degrees"
-    assert cells(rows, "State as told", "samples refused by the filter") == ["position 5 of 100", "-"]
+    assert cells(rows, "Measured state", "RMS error of the measured z") == ["0.012", "-"]
+    assert cells(rows, "Measured state", "largest error of the measured roll") == ["5.73", "-"], "in degrees"
+    assert cells(rows, "Measured state", "samples rejected by the filter") == ["position 5 of 100", "-"]
     assert cells(rows, "Simulated computation", "command after its measurement, maximum") == ["60", "-"]
     assert cells(rows, "Simulated computation", "commands too late to be used") == ["3", "-"]
 
 
 def test_flights_that_met_nothing_have_no_rows_of_it(bare_run: Run) -> None:
     groups = {row.group for row in comparison_rows([bare_run])}
-    assert not {"Course", "Ground", "State as told", "Simulated computation"} & groups
+    assert not {"Course", "Ground", "Measured state", "Simulated computation"} & groups
 
 
 def test_a_flight_that_never_touches_the_ground_or_crashes_on_it(bare_run: Run) -> None:
@@ -121,7 +121,7 @@ def test_sentences_tell_what_each_flight_met(bare_run: Run) -> None:
         "the end."
     ) in told
     assert (
-        "The controller of one was told the position with an RMS error of 0.013 m and the attitude with one of "
+        "The controller of one received the position with an RMS error of 0.013 m and the attitude with one of "
         "0.573 deg, and no number in 10 periods."
     ) in told
     assert (

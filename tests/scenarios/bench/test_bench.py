@@ -25,7 +25,7 @@ from scenarios.bench.flight import bench_flight
 from scenarios.bench.queries import flight_between, recorded
 from scenarios.bench.solvers import bench_solvers
 from scenarios.bench.targets import solver_targets
-from scenarios.bench.timing import stretches, time_in_turns
+from scenarios.bench.timing import segments, time_in_turns
 from scenarios.build import build_problem
 from scenarios.cli import main
 from scenarios.commands import EXIT_DONE, EXIT_WRONG_INPUT
@@ -65,7 +65,7 @@ def test_turns_are_random_and_every_question_is_put_to_all() -> None:
     diary: list[tuple[str, int]] = []
     laps = time_in_turns(
         {name: Answering(name, diary) for name in "abc"},
-        stretches(100, 1),
+        segments(100, 1),
         between=lambda: None,
         repeats=3,
         rng=np.random.default_rng(1),
@@ -76,13 +76,13 @@ def test_turns_are_random_and_every_question_is_put_to_all() -> None:
     assert all(sorted(order) == ["a", "b", "c"] for order in rounds)
     assert len(rounds) > 3
     asked = [period for name, period in diary if name == "a"]
-    assert asked[:22] == [0, *range(20), 19]  # then the next stretch, from the period before it
+    assert asked[:22] == [0, *range(20), 19]  # then the next segment, from the period before it
     assert len(asked) == 3 * 5 * 21
 
 
 def test_stretches_cover_a_flight_or_an_even_part_of_it() -> None:
-    assert [period for stretch in stretches(50, 1) for period in stretch] == list(range(50))
-    assert stretches(130, 3) == [range(20), range(60, 80), range(120, 130)]
+    assert [period for segment in segments(50, 1) for period in segment] == list(range(50))
+    assert segments(130, 3) == [range(20), range(60, 80), range(120, 130)]
 
 
 def test_slow_entrants_race_once_and_hopeless_ones_leave() -> None:
@@ -133,7 +133,7 @@ def test_a_time_stands_in_all_tables_once(bench: SolverBench) -> None:
     flown = bench_solvers(
         load_scenario("paper-constrained", SHORT), repeats=1, horizons=(10,), solvers=("piqp-multistage",)
     )
-    alone, growth = flown.contenders[1], {each.name: each for each in flown.growth if not each.kind}
+    alone, growth = flown.candidates[1], {each.name: each for each in flown.growth if not each.kind}
     assert growth[alone.name].p50 == (alone.quantiles["p50"],)
     assert growth[alone.name].p99 == (alone.quantiles["p99"],)
     gain, shown, qp = make_cost.timed(bench)
@@ -141,29 +141,29 @@ def test_a_time_stands_in_all_tables_once(bench: SolverBench) -> None:
     assert bench.gain_ms is not None
     assert gain.step_ms.size == shown.step_ms.size == 60
     np.testing.assert_array_equal(shown.step_ms, bench.default.step_ms)
-    np.testing.assert_array_equal(qp.step_ms, bench.contenders[1].step_ms)
+    np.testing.assert_array_equal(qp.step_ms, bench.candidates[1].step_ms)
     assert np.count_nonzero(shown.shortcut) == bench.default.statuses["unconstrained"]
     assert np.median(gain.step_ms) < np.median(qp.step_ms)
 
 
 def test_the_median_of_the_repeats_and_the_longest_of_all(bench: SolverBench) -> None:
-    for candidate in bench.contenders:
+    for candidate in bench.candidates:
         assert candidate.step_ms.shape == (60,)
         assert candidate.raw_max_ms >= candidate.quantiles["max"] >= candidate.quantiles["p50"] > 0.0
         assert candidate.repeats == 2
 
 
 def test_contenders_are_the_default_each_solver_alone_and_daqp_both_ways(bench: SolverBench) -> None:
-    names = [candidate.name for candidate in bench.contenders]
+    names = [candidate.name for candidate in bench.candidates]
     assert names == ["piqp-multistage + shortcut", "piqp-multistage", "daqp", "daqp + shortcut"]
-    assert [sum(candidate.statuses.values()) for candidate in bench.contenders] == [60] * 4
-    assert bench.contenders[1].statuses == {"solved": 60}
+    assert [sum(candidate.statuses.values()) for candidate in bench.candidates] == [60] * 4
+    assert bench.candidates[1].statuses == {"solved": 60}
     assert bench.default.statuses.keys() <= {"solved", "unconstrained"}
 
 
 def test_answers_are_judged_by_an_optimum_in_closed_form(bench: SolverBench) -> None:
     assert bench.reference_kkt < 1e-6
-    for candidate in bench.contenders:
+    for candidate in bench.candidates:
         assert candidate.failures == 0
         assert candidate.input_error is not None
         assert candidate.input_error < (1e-6 if candidate.solver == "daqp" else 5e-3)
@@ -206,8 +206,8 @@ def test_growth_is_fitted_over_the_long_horizons() -> None:
 
 
 def test_growth_covers_all_contenders_and_horizons(bench: SolverBench) -> None:
-    assert {growth.name for growth in bench.growth} == {candidate.name for candidate in bench.contenders}
-    for candidate in bench.contenders:
+    assert {growth.name for growth in bench.growth} == {candidate.name for candidate in bench.candidates}
+    for candidate in bench.candidates:
         kinds = {growth.kind for growth in bench.growth if growth.name == candidate.name}
         assert kinds <= (set(Way) if candidate.shortcut else {""})
     for growth in bench.growth:
@@ -217,28 +217,28 @@ def test_growth_covers_all_contenders_and_horizons(bench: SolverBench) -> None:
 
 
 def test_tables_are_complete(bench: SolverBench) -> None:
-    contenders, growth, stages, axis_stages, targets = solver_tables(bench)
-    assert [line[0].text.removesuffix(" (default)") for line in contenders.lines] == [c.name for c in bench.contenders]
-    for grid in (contenders, growth, stages, axis_stages, targets):
+    candidates, growth, stages, axis_stages, targets = solver_tables(bench)
+    assert [line[0].text.removesuffix(" (default)") for line in candidates.lines] == [c.name for c in bench.candidates]
+    for grid in (candidates, growth, stages, axis_stages, targets):
         assert {len(line) for line in grid.lines} == {len(grid.head)}
         assert all(cell.text for line in grid.lines for cell in line)
     assert {line[0].text for line in stages.lines} >= {"condensed, dense", "1", "5 (default)", "25"}
     assert {line[0].text for line in axis_stages.lines} >= {"condensed, dense", "1", "10 (default)", "25"}
-    assert contenders.lines[0][6].text == "1"  # p99, as a ratio to itself
+    assert candidates.lines[0][6].text == "1"  # p99, as a ratio to itself
 
 
 def test_targets_compare_with_other_solvers_only(bench: SolverBench) -> None:
-    slow = replace(bench.contenders[2], step_ms=np.full(60, 1e3))
+    slow = replace(bench.candidates[2], step_ms=np.full(60, 1e3))
     default = replace(bench.default, step_ms=np.full(60, 0.01))
-    won = replace(bench, contenders=(default, bench.contenders[1], slow))
+    won = replace(bench, candidates=(default, bench.candidates[1], slow))
     verdicts = {target.what: target for target in solver_targets(won)}
     assert verdicts["default, p99 below every other solver's"].met
     assert "daqp" in verdicts["default, p99 below every other solver's"].asked
-    lost = replace(won, contenders=(replace(default, step_ms=np.full(60, 2e3), failures=1), *won.contenders[1:]))
+    lost = replace(won, candidates=(replace(default, step_ms=np.full(60, 2e3), failures=1), *won.candidates[1:]))
     missed = {target.what for target in solver_targets(lost) if not target.met}
     assert missed >= {"default, p50", "default, p99", "default, max below every other solver's"}
     assert "default, periods without an optimum" in missed
-    paper = replace(won, contenders=(default, replace(slow, solver="qpoases")))
+    paper = replace(won, candidates=(default, replace(slow, solver="qpoases")))
     ratio = next(target for target in solver_targets(paper) if "qpOASES" in target.what)
     assert ratio.met
     assert float(ratio.measured) == pytest.approx(1e5)
@@ -274,7 +274,7 @@ def test_a_solver_that_is_not_installed_is_named_and_left_out(monkeypatch: pytes
     scenario = load_scenario("paper-constrained", ["duration=1.0", "controller.horizon=5"])
     found = bench_solvers(scenario, repeats=1, horizons=(), solvers=("piqp-dense", "qpoases"))
     assert found.left_out == {"qpoases": "not installed: pip install 'quadsim[solvers]'"}
-    assert {candidate.solver for candidate in found.contenders} == {"piqp-multistage", "piqp-dense"}
+    assert {candidate.solver for candidate in found.candidates} == {"piqp-multistage", "piqp-dense"}
     assert "Left out: qpoases, not installed" in solver_tables(found)[0].note
     assert found.growth == ()
 

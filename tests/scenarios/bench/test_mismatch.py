@@ -1,4 +1,4 @@
-"""`quadsim bench ladder`: conditions that can be flown, flights judged as told, whole results, refusals."""
+"""`quadsim bench ladder`: conditions that can be flown, flights judged by rule, whole results, refusals."""
 
 from __future__ import annotations
 
@@ -73,8 +73,8 @@ def made_up() -> MismatchBench:
     [
         ({}, True, ""),
         ({"reason": "diverged", "flown": 12.6}, False, "lost, 13 s"),
-        ({"end_error": 10.1}, False, "astray"),
-        ({"peak_tilt": 91.0, "end_error": 10.1}, False, "fell over"),
+        ({"end_error": 10.1}, False, "diverged"),
+        ({"peak_tilt": 91.0, "end_error": 10.1}, False, "overturned"),
         ({"reason": "no plan", "flown": 0.0, "end_error": None, "peak_tilt": None}, False, "lost, 0 s"),
     ],
 )
@@ -87,7 +87,7 @@ def test_tables_show_each_flight_where_it_belongs() -> None:
     tables = {grid.key: grid for grid in mismatch_tables(made_up())}
     assert tables["end"].head == ("", "a", "b")
     texts = {key: [[each.text for each in line] for line in grid.lines] for key, grid in tables.items()}
-    assert texts["end"] == [["calm", "0.010", "0.800"], ["storm", "lost, 13 s", "astray"]]
+    assert texts["end"] == [["calm", "0.010", "0.800"], ["storm", "lost, 13 s", "diverged"]]
     assert texts["tilt"][0] == ["calm", "4.900", "5.300"]
     assert texts["violated"][0] == ["calm", "0", "0.25"]
     assert texts["rmse"][0][1] == "0.50, 0.25, 1.00"
@@ -224,7 +224,7 @@ def test_a_ladder_is_written_whole_and_the_same_each_time(quick: MismatchBench, 
 def test_the_figure_of_a_made_up_ladder_tells_each_fate(tmp_path: Path) -> None:
     write_mismatch(made_up(), tmp_path)
     drawing = (tmp_path / "ladder.svg").read_text()
-    for text in ("0.01", "0.80", "13 s", "astray", "4.90", "5.30"):
+    for text in ("0.01", "0.80", "13 s", "diverged", "4.90", "5.30"):
         assert f">{text}<" in drawing
 
 
@@ -232,7 +232,7 @@ def test_the_page_says_what_is_met_and_what_is_not() -> None:
     measured = replace(made_up(), controllers={FULL: "full"}, conditions={"nominal": "", "wind 3 m/s": ""})
     tilted = replace(WELL, peak_tilt=5.2, violated=0.1, end_error=0.4, step_p99=7.0)
     measured = replace(measured, flights={(FULL, "nominal"): WELL, (FULL, "wind 3 m/s"): tilted})
-    told = [line[1].text for line in make_robustness.asked(measured).lines]
+    told = [line[1].text for line in make_robustness.targets(measured).lines]
     assert told == ["in all 2", "in all 1", "not in: wind 3 m/s", "not in: wind 3 m/s"]
     fault = fault_injection.faults()[0]
     injection = fault_injection.Injection(controller="paper", fault=fault, start=3.0)
@@ -246,7 +246,9 @@ def test_the_page_says_what_is_met_and_what_is_not() -> None:
 
 
 def test_a_scenario_without_such_bounds_is_refused() -> None:
-    with pytest.raises(InputError, match=r"paper-unconstrained: the ladder needs a constrained controller whose"):
+    with pytest.raises(
+        InputError, match=r"paper-unconstrained: the mismatch benchmark needs a constrained controller whose"
+    ):
         run_mismatch("paper-unconstrained", quick=True)
     with pytest.raises(InputError, match="are the same, as paper-constrained has"):
         tilt_bound(load_scenario("paper-constrained", ["controller.output_bounds.roll=[-4.0, 5.0]"]))

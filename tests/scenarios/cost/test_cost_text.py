@@ -106,10 +106,10 @@ def test_what_constraints_make_larger_is_not_bought(cost_study: CostStudy) -> No
 
 def test_flights_that_were_lost_or_never_flown_are_told_too(cost_study: CostStudy) -> None:
     nothing = replace(cost_study.constrained, reason="no plan", flown=0.0, statuses={}, numbers={}, active=0)
-    told = "\n".join(cost_sentences(replace(cost_study, constrained=nothing, contenders=())))
+    told = "\n".join(cost_sentences(replace(cost_study, constrained=nothing, candidates=())))
     assert "bounded is lost at 0 s with its constraints: no plan." in told
     assert "Tracking" not in told
-    grids = cost_tables(replace(cost_study, constrained=nothing, contenders=()))
+    grids = cost_tables(replace(cost_study, constrained=nothing, candidates=()))
     assert "computation" not in {grid.key for grid in grids}
 
 
@@ -162,5 +162,5 @@ def test_plots_mark_what_is_lost(cost_study: CostStudy) -> None:
     assert marks.count("x") == 6  # in each panel
     assert marks.count("\u25b2") == 1
     assert {trace["name"] for trace in plots["cost-steps"]["data"]} == {"gain", "as flown", "QP by slow"}
-    without_times = cost_plots(replace(cost_study, contenders=()))
+    without_times = cost_plots(replace(cost_study, candidates=()))
     assert [plot.key for plot in without_times] == ["cost-tilt", "cost-horizon"]

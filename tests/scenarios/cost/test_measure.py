@@ -142,11 +142,11 @@ def test_variations_change_the_vehicle(study: CostStudy) -> None:
 
 
 def test_contenders_answer_what_was_asked_in_flight(study: CostStudy) -> None:
-    gain, flown, dense = study.contenders
-    assert [candidate.name for candidate in study.contenders] == [
+    gain, flown, dense = study.candidates
+    assert [candidate.name for candidate in study.candidates] == [
         *("unconstrained gain", "constrained, as flown", "QP by piqp-dense"),
     ]
-    assert {candidate.step_ms.size for candidate in study.contenders} == {80}
+    assert {candidate.step_ms.size for candidate in study.candidates} == {80}
     assert 0 < flown.shortcut.sum() < 80
     assert int(flown.shortcut.sum()) == study.constrained.statuses["unconstrained"]
     assert not gain.shortcut.any()
@@ -173,12 +173,12 @@ def test_a_replay_gives_the_commands_of_the_flight() -> None:
 
 def test_a_time_stands_in_a_study_once(study: CostStudy) -> None:
     """The flight that is studied has one line of times, wherever it appears; another study may be given its own."""
-    flown = percentiles(study.contenders[1].step_ms)
+    flown = percentiles(study.candidates[1].step_ms)
     assert study.tilt.points[1].step_ms == study.horizons.points[1].step_ms == flown
     few = {**SMALL, "tilts": (), "horizons": (), "arm_lengths": ()}
-    given = [replace(candidate, step_ms=2.0 * candidate.step_ms) for candidate in study.contenders]
+    given = [replace(candidate, step_ms=2.0 * candidate.step_ms) for candidate in study.candidates]
     again = study_cost(scenario(), workers=1, timed=given, **few)
-    np.testing.assert_array_equal(again.contenders[2].step_ms, 2.0 * study.contenders[2].step_ms)
+    np.testing.assert_array_equal(again.candidates[2].step_ms, 2.0 * study.candidates[2].step_ms)
     assert again.tilt.points[0].step_ms == percentiles(given[1].step_ms)
 
 
@@ -186,7 +186,7 @@ def test_a_solver_that_is_not_installed_is_named_and_left_out(monkeypatch: pytes
     monkeypatch.setattr(type(SOLVERS["qpoases"]), "installed", property(lambda entry: entry.package == "piqp"))
     few = {**FLIGHTS_ALONE, "solvers": ("piqp-dense", "qpoases")}
     found = study_cost(scenario(), workers=1, **few)
-    assert [candidate.name for candidate in found.contenders][2:] == ["QP by piqp-dense"]
+    assert [candidate.name for candidate in found.candidates][2:] == ["QP by piqp-dense"]
     assert "pip install 'quadsim[solvers]'" in found.left_out["qpoases"]
 
 
@@ -196,7 +196,7 @@ def test_flights_that_are_lost_stay_in_the_study() -> None:
     found = study_cost(upside, workers=1, **{**SMALL, "tilts": (70.0,), "arm_lengths": ()})
     assert not found.constrained.completed
     assert found.constrained.numbers == {}
-    assert found.contenders == ()
+    assert found.candidates == ()
     assert [point.constrained.completed for point in found.tilt.points] == [False, True]
     assert [bool(point.step_ms) for point in found.tilt.points] == [False, True]
     assert {entry["settled"] for entry in found.constrained.settling} == {None}

@@ -50,7 +50,7 @@ def film(backend: str, short_run: Run, tmp_path_factory: pytest.TempPathFactory)
 
 
 def decode(path: Path) -> np.ndarray:
-    """All frames of an MP4; imageio leaves ffmpeg's pipes to the garbage collector."""
+    """All frames of an MP4; imageio closes ffmpeg's pipes only when it is collected."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", ResourceWarning)
         frames = iio.imread(path, plugin="FFMPEG")

@@ -92,10 +92,10 @@ def test_only_the_air_speed_counts(vehicle: Vehicle, effects: Effects) -> None:
     """Moving with the wind is as standing in still air."""
     with Plant(vehicle, effects=effects, wind=still_air((4.0, -2.0, 0.0))) as plant:
         plant.reset(moving(vx=4.0, vy=-2.0))
-        stretch = plant.advance(plant.hover_speeds, 100)
-    assert stretch.wrench is not None
-    np.testing.assert_allclose(stretch.wrench, 0.0, atol=1e-12)
-    np.testing.assert_array_equal(stretch.wind, np.tile([4.0, -2.0, 0.0], (100, 1)))
+        segment = plant.advance(plant.hover_speeds, 100)
+    assert segment.wrench is not None
+    np.testing.assert_allclose(segment.wrench, 0.0, atol=1e-12)
+    np.testing.assert_array_equal(segment.wind, np.tile([4.0, -2.0, 0.0], (100, 1)))
 
 
 def test_a_gust_pushes_by_its_integral(vehicle: Vehicle) -> None:
@@ -143,17 +143,17 @@ def test_ground_effect_lifts_by_cheeseman_and_bennett(vehicle: Vehicle) -> None:
     speeds = vehicle.hover_speed * np.array([1.05, 0.95, 1.05, 0.95])
     with Plant(vehicle, effects=Effects(rotor_radius=radius, contact=True)) as plant:
         plant.reset(make_state(position=(0.0, 0.0, height), euler=(roll, 0.0, 0.0)), speeds)
-        stretch = plant.advance(speeds, 1)
+        segment = plant.advance(speeds, 1)
     floor, disc = -0.132, 0.034  # where the drawing has them
     above = height - floor + disc * math.cos(roll) + vehicle.rotor_positions[:, 1] * math.sin(roll)
     gains = vehicle.thrust_coefficient * speeds**2 * (1.0 / (1.0 - (radius / (4.0 * above)) ** 2) - 1.0)
-    assert stretch.wrench is not None
+    assert segment.wrench is not None
     up = np.array([0.0, -math.sin(roll), math.cos(roll)])
-    np.testing.assert_allclose(stretch.wrench[0, :3], gains.sum() * up, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(segment.wrench[0, :3], gains.sum() * up, rtol=1e-9, atol=1e-12)
     torque = [gains @ vehicle.rotor_positions[:, 1], -gains @ vehicle.rotor_positions[:, 0], 0.0]
-    np.testing.assert_allclose(stretch.wrench[0, 3:], torque, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(segment.wrench[0, 3:], torque, rtol=1e-9, atol=1e-12)
     yaw_torque = vehicle.drag_coefficient * (np.array(vehicle.rotor_spins) @ speeds**2)
-    assert stretch.physics[0, 13] == pytest.approx(1e-3 * yaw_torque / vehicle.inertia[2], rel=1e-3)
+    assert segment.physics[0, 13] == pytest.approx(1e-3 * yaw_torque / vehicle.inertia[2], rel=1e-3)
 
 
 def test_a_lost_propeller_neither_drags_nor_carries_momentum(vehicle: Vehicle) -> None:

@@ -82,13 +82,13 @@ def test_the_plant_climbs_as_its_lagging_rotors_do(vehicle: Vehicle) -> None:
     tau, start, command = 0.05, 180.0, 210.0
     with Plant(vehicle, effects=Effects(rotors=RotorDynamics(rise=tau, fall=tau))) as plant:
         plant.reset(make_state(), np.full(4, start))
-        stretch = plant.advance(np.full(4, command), 400)
+        segment = plant.advance(np.full(4, command), 400)
         t, gap, lift = 0.4, start - command, 4.0 * vehicle.thrust_coefficient / vehicle.mass
         decay = math.exp(-t / tau)
         impulse = command**2 * t + 2.0 * command * gap * tau * (1.0 - decay) + gap**2 * tau / 2.0 * (1.0 - decay**2)
         assert plant.state()[5] == pytest.approx(lift * impulse - vehicle.gravity * t, rel=1e-5)
         np.testing.assert_allclose(plant.speeds, command + gap * decay)
-    np.testing.assert_allclose(stretch.speeds[0], start)
+    np.testing.assert_allclose(segment.speeds[0], start)
 
 
 def test_holding_a_command_in_pieces_changes_nothing(vehicle: Vehicle) -> None:
