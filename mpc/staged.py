@@ -65,7 +65,7 @@ class Staged:
             raise ParameterError("controller", "steps_per_stage", steps, "a whole number >= 1")
         self._problem, self._rows, soft = problem, qp_rows(problem), problem.rows.soft
         self._at = at = layout(N, model.n, model.nu, soft.size, steps)
-        self._builder = MatrixBuilder(problem, at, changing=changing)
+        self._builder = MatrixBuilder(problem, self._rows, at, changing=changing)
         self._linear = np.zeros(at.size)
         self._linear[at.slacks] = problem.rows.l1[soft]
         A, B = np.broadcast_to(model.A, (N, *model.A.shape)), np.broadcast_to(model.B, (N, *model.B.shape))

@@ -4,15 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csc_matrix
 
-from mpc.ocp import Problem
-from mpc.qp import qp_rows
 from quadsim.state import Array, Indices
+
+if TYPE_CHECKING:
+    from mpc.ocp import Problem
+    from mpc.qp import QPRows
 
 ROUNDING: Final = 1e-14
 """Entries below this fraction of the largest of their block are products of rounding: left out of fixed matrices."""
@@ -171,8 +173,8 @@ class Matrices:
 class MatrixBuilder:
     """Fixes the pattern of the matrices once, then fills in their values."""
 
-    def __init__(self, problem: Problem, at: Layout, *, changing: bool) -> None:
-        self._at, self._rows, objective = at, qp_rows(problem), problem.objective
+    def __init__(self, problem: Problem, rows: QPRows, at: Layout, *, changing: bool) -> None:
+        self._at, self._rows, objective = at, rows, problem.objective
         self._Q, self._Q_end = objective.weights[0], objective.terminal_weights[0]
         self._input_weight, self._move_weight = 2.0 * objective.Q_u, 2.0 * objective.move_weight
         soft = problem.rows.soft
@@ -185,7 +187,7 @@ class MatrixBuilder:
             A, B = (np.broadcast_to(part, (at.N, *part.shape)) for part in (problem.model.A, problem.model.B))
         rounding = 0.0 if changing else ROUNDING
         head, tail = self._slopes(A, B)
-        slack, ends, rows = at.slacks.reshape(-1, 1), at.ends, np.arange(self._rows.lower.size).reshape(at.N, -1)
+        slack, ends, numbers = at.slacks.reshape(-1, 1), at.ends, np.arange(self._rows.lower.size).reshape(at.N, -1)
         self._P = Pattern(
             (at.size, at.size),
             [
@@ -209,15 +211,15 @@ class MatrixBuilder:
         self._later, self._now = later, now
         stages, cuts = len(at.tail), at.L + at.M * np.arange(len(at.tail))
         self._G = Pattern(
-            (rows.size, at.size),
+            (numbers.size, at.size),
             [
-                (rows[: at.L - 1, later], at.head),
-                (rows[at.L - 1 : -1, later].reshape(stages, at.M, later.size), at.tail[:, None]),
-                (rows[-1, later], at.starts[-1]),
-                (rows, at.slacks),
-                (rows[: at.L, now], at.head),
-                (rows[at.L :, now].reshape(stages, at.M, now.size), at.tail[:, None]),
-                (rows[cuts][:, now], at.lasts),
+                (numbers[: at.L - 1, later], at.head),
+                (numbers[at.L - 1 : -1, later].reshape(stages, at.M, later.size), at.tail[:, None]),
+                (numbers[-1, later], at.starts[-1]),
+                (numbers, at.slacks),
+                (numbers[: at.L, now], at.head),
+                (numbers[at.L :, now].reshape(stages, at.M, now.size), at.tail[:, None]),
+                (numbers[cuts][:, now], at.lasts),
             ],
             self._inequalities(head, tail),
             rounding=rounding,
