@@ -44,7 +44,8 @@ turbulence and four sensors.
 - Forces that follow from the motion cannot be: each depends on the step before it. They are plain numbers in one
   function, a microsecond a step, and reach MuJoCo through its memory. MuJoCo's own step takes more than half of the
   plant's time.
-- A flight's numbers are the same to the bit in both, and so are the pixels of figures and films.
+- None of this changes a bit of a flight's numbers, nor a pixel of figures and films. What the whole flight gains
+  besides is the controller's: exact optima from the last period's active set.
 - No pass of Python's cycle collector over what was there before a flight falls into one of its steps, whatever is
   installed: it is frozen, and collected between flights; see `scenarios/gc_tuning.py`.
 - A command imports what it takes, not what all commands take; figures are laid out without being drawn for it; a film
