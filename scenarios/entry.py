@@ -22,11 +22,18 @@ class _Stop:
     """Makes Ctrl-C of a signal; who goes away, or is impatient, sends several.
 
     Python ignores an exception that comes up in a destructor or a callback, of which imports have many; such a
-    Ctrl-C is raised once more.
+    Ctrl-C is raised once more.  A compiled module that is being imported makes an ImportError of it.
+
+    Attributes:
+        heard: whether there was one.
     """
 
     def __init__(self) -> None:
         self._last = -math.inf
+
+    @property
+    def heard(self) -> bool:
+        return math.isfinite(self._last)
 
     def raise_again(self, ignored: sys.UnraisableHookArgs) -> None:
         """See `sys.unraisablehook`."""
@@ -58,8 +65,12 @@ def main() -> int:
             return 2
         from scenarios.cli import main as run
 
+        if handler.heard:  # and swallowed by what was imported
+            raise KeyboardInterrupt
         return run()
-    except KeyboardInterrupt:
+    except (KeyboardInterrupt, ImportError, SystemError) as error:
+        if not (isinstance(error, KeyboardInterrupt) or handler.heard):
+            raise
         with contextlib.suppress(OSError):  # the terminal may be gone
             print("quadsim: interrupted (Ctrl-C); nothing half written was left behind", file=sys.stderr)
         return 1
