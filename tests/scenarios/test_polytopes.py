@@ -112,6 +112,12 @@ def test_a_turned_model_has_no_rows_of_world_axes() -> None:
         load_scenario("robust", ['controller.polytopes=[{name="fence", of=["x"], rows=[[1.0]], upper=[3.0]}]'])
 
 
+@pytest.mark.parametrize("state", ["x", "vy", "yaw"])
+def test_nor_has_it_output_bounds_of_them(state: str) -> None:
+    with pytest.raises(ScenarioError, match=f"output_bounds must not be of {state} where heading turns"):
+        load_scenario("robust", [f"controller.output_bounds.{state}=[-3.0, 3.0]"])
+
+
 def test_the_robust_controller_takes_them_too() -> None:
     settings = [
         "controller.heading=false",
