@@ -364,7 +364,7 @@ WRONG = {
     "controller.linearisation=none": "controller.linearisation must be one of 'hover', 'state' or 'trajectory'; "
     "got 'none'",
     "controller.tightening.turning=-1": "controller.tightening.turning must be >= 0.0; got -1",
-    "controller.output_bounds={}": "controller.tightening must be absent where there are no output_bounds to draw in",
+    "controller.output_bounds={}": "controller.tightening must be absent where there are no output_bounds to tighten",
     "controller.fallback=false": "controller.fallback must be a table; got False",
     "controller.fallback.enabled=0": "controller.fallback.enabled must be true or false; got 0",
     "controller.fallback.tilt=90": "controller.fallback.tilt must be < 90.0; got 90",
@@ -405,7 +405,7 @@ def test_every_law_is_listed_and_told_apart_by_its_name() -> None:
 
 
 def test_a_law_that_the_bounds_leave_too_little_for_is_told_in_the_files_words() -> None:
-    one = load_scenario("robust", ["controller.tightening={}", "controller.output_bounds.vx=[-0.2, 0.2]"])
+    one = load_scenario("robust", ["controller.heading=false", "controller.output_bounds.vx=[-0.2, 0.2]"])
     message = (
         "controller.tightening.acceleration must be smaller, or the bounds on vx wider: these leave 0.2 m/s on either "
         "side of their middle, of which 0.327 m/s would be given up and at most 0.1 m/s may be; got 0.5"
