@@ -56,14 +56,17 @@ class QueriedController:
     def __init__(self, controller: Controller, queries: Queries) -> None:
         self._controller, self._queries = controller, queries
         self.command: Command | None = None
+        self._period: int | None = None
         self.statuses: dict[int, str] = {}
 
     def prepare(self, period: int) -> None:
         """See `scenarios.bench.timing.Candidate.prepare`."""
-        queries = self._queries
-        self._controller.reset(queries.speeds_before[period])
+        queries, before = self._queries, self._queries.speeds_before[period]
+        if self._period is None or period != self._period + 1:
+            self._controller.reset(before)  # else what is warm stays so, as in a flight
         reference = queries.reference[period + 1 : period + 1 + self._controller.horizon]
-        self._query = (Moment(time=float(queries.t[period])), queries.state[period], reference)
+        moment = Moment(time=float(queries.t[period]), acting=before)
+        self._query = (moment, queries.state[period], reference)
         self._period, self.command = period, None
 
     def answer(self) -> None:
@@ -72,6 +75,7 @@ class QueriedController:
             self.command = self._controller.step(*self._query)
         except FlightError:  # there is no earlier plan to hold: the solver failed
             self.command = None
+        assert self._period is not None
         self.statuses.setdefault(self._period, "failed" if self.command is None else self.command.status)
 
 
