@@ -17,8 +17,9 @@ from quadsim.errors import RenderingUnavailableError
 from quadsim.report.film.video import rendering_backend
 from scenarios.cli import main, make_parser
 from scenarios.commands import COMMANDS, EXIT_DONE
+from scenarios.flight import Outputs
 from scenarios.loading import load_scenario
-from scenarios.run import Outputs, run_scenario
+from scenarios.run import run_scenario
 
 ROOT = Path(__file__).resolve().parent.parent
 SHORT = ("--set", "duration=1.0", "--set", "controller.horizon=5")

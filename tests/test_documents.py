@@ -19,8 +19,9 @@ from scenarios.cost import cost_flights
 from scenarios.cost.cost_tables import cost_tables
 from scenarios.cost.measure import study_cost
 from scenarios.cost.study import CandidateTimes, Variation
+from scenarios.flight import Flight
 from scenarios.loading import load_scenario
-from scenarios.run import Flight, fly_scenario
+from scenarios.run import fly_scenario
 
 ROOT = Path(__file__).resolve().parent.parent
 ENTRY_POINTS = {"quadsim.controllers"}

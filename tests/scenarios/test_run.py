@@ -22,10 +22,11 @@ from quadsim.flight.parquet import FLIGHT_FILE, HORIZON_FILE, PLANT_FILE, TIMING
 from quadsim.flight.rundir import Run
 from quadsim.sim import loop
 from scenarios.build import build_controller
+from scenarios.flight import Outputs
 from scenarios.loading import load_scenario, parse_scenario
 from scenarios.machine import PACKAGES
 from scenarios.parts.vehicle import build_vehicle
-from scenarios.run import Outputs, fly_scenario, run_scenario
+from scenarios.run import fly_scenario, run_scenario
 
 TABLES = Outputs(video=False, recording=False, figures=False)
 SHORT = "duration=0.5"

@@ -24,8 +24,8 @@ from scenarios.campaign.plan import Plan, load_plan
 from scenarios.campaign.replay import recorded_flight, replay
 from scenarios.campaign.results.table import Row, read_table
 from scenarios.campaign.run import SUMMARY_FILE, Result, Standing
+from scenarios.flight import Outputs
 from scenarios.machine import processor_name
-from scenarios.run import Outputs
 
 CAMPAIGN: dict[str, Any] = {
     "name": "little",
