@@ -87,7 +87,7 @@ def _draw_states(run: Run) -> Figure:
 
 
 def plot_signals(run: Run, names: Sequence[str]) -> list[Axes]:
-    """A figure of pyplot's with signals of the audit, so that notebooks and `pyplot.show` show it; see `draw_signals`."""
+    """The same in a figure of pyplot, which notebooks and `pyplot.show` show; see `draw_signals`."""
     from matplotlib import pyplot
 
     return draw_signals(pyplot.figure(figsize=(8.0, 0.9 + 1.4 * len(names)), layout="constrained"), run, names)
