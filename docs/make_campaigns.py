@@ -135,9 +135,9 @@ def page(results: list[Result]) -> str:
         [
             "# How often they fail: the paper's controller, and the robust one\n\nMade by `make campaigns` "
             f"({machine['processor']}, {machine['cores']} cores), from the campaigns that ship. What is drawn, from "
-            "where, stands in\n[paper-robustness](../scenarios/campaigns/paper-robustness.toml);\n"
-            "[paper-robustness-robust](../scenarios/campaigns/paper-robustness-robust.toml) has the same draws for the "
-            "robust controller, and\n[paper-nominal](../scenarios/campaigns/paper-nominal.toml) draws small errors "
+            "where, stands in\n`paper-robustness`;\n"
+            "`paper-robustness-robust` has the same draws for the "
+            "robust controller, and\n`paper-nominal` draws small errors "
             "alone for the paper's controller. How campaigns work: [campaigns.md](campaigns.md).\n",
             section(violations(results)),
             first_to_break(nominal),

@@ -18,11 +18,11 @@ if TYPE_CHECKING:
     from quadsim.controller import Moment as Moment
     from quadsim.errors import QuadsimError as QuadsimError
     from quadsim.vehicle import Vehicle as Vehicle
-    from quadsim.vehicle import load_vehicle as load_vehicle
     from scenarios.api import campaign as campaign
     from scenarios.api import compare as compare
     from scenarios.api import fly as fly
     from scenarios.api import load as load
+    from scenarios.api import load_vehicle as load_vehicle
     from scenarios.api import make_controller as make_controller
     from scenarios.api import read as read
     from scenarios.api import scenarios as scenarios
@@ -33,12 +33,12 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 
 _PLACES = {
-    "scenarios.api": ("campaign", "compare", "fly", "load", "make_controller", "read", "scenarios", "sweep"),
+    "scenarios.api": ("campaign", "compare", "fly", "load", "load_vehicle", "make_controller", "read", "scenarios", "sweep"),
     "scenarios.flight": ("Flight",),
     "scenarios.schema.scenario": ("Scenario",),
     "quadsim.controller": ("Command", "Moment"),
     "quadsim.errors": ("QuadsimError",),
-    "quadsim.vehicle": ("Vehicle", "load_vehicle"),
+    "quadsim.vehicle": ("Vehicle",),
 }
 _PUBLIC = {name: module for module, names in _PLACES.items() for name in names}
 __all__ = [*_PUBLIC]

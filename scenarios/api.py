@@ -11,10 +11,13 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
+from quadsim.assets import vehicle_path
 from quadsim.controller import Controller
 from quadsim.errors import InputError, ParameterError
 from quadsim.flight import rundir
 from quadsim.outputs import real_path
+from quadsim.vehicle import Vehicle
+from quadsim.vehicle import load_vehicle as read_vehicle
 from scenarios.build import build_controller
 from scenarios.flight import Flight, Outputs
 from scenarios.loading import check_parts, load_scenario, scenario_names
@@ -69,6 +72,24 @@ def load(name: str | Path, changes: Setting = ()) -> Scenario:
         return load_scenario(str(name), changes)
     scenario = load_scenario(str(name))
     return scenario.replace(changes) if changes else scenario
+
+
+def load_vehicle(name: str | Path) -> Vehicle:
+    """The numbers of a vehicle.
+
+    Args:
+        name: of one that ships, or a path ending in `.toml`.
+
+    Raises:
+        InputError: there is none, or it cannot fly.
+
+    Examples:
+        >>> import quadsim
+        >>> vehicle = quadsim.load_vehicle("hummingbird")
+        >>> vehicle.mass, round(vehicle.hover_speed)
+        (0.716, 458)
+    """
+    return read_vehicle(vehicle_path(str(name)))
 
 
 def fly(

@@ -300,7 +300,7 @@ def test_controllers_fly_without_a_simulator() -> None:
     vehicle = quadsim.make_controller("paper-constrained")
     assert vehicle.name == "constrained"
     problem = mpc.Problem(
-        model=mpc.hover_model(quadsim.load_vehicle(Path("models/hummingbird.toml").resolve()), 0.05),
+        model=mpc.hover_model(quadsim.load_vehicle("hummingbird"), 0.05),
         horizon=10,
         objective=mpc.Objective(C_r=np.eye(12)[:1], Q_y=np.eye(1), Q_u=np.eye(4)),
     )
