@@ -11,7 +11,6 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from make_numbers import replace_in_readme
 from PIL import Image
 
 from quadsim.report.table import Cell, Grid, grid_to_markdown
@@ -159,7 +158,6 @@ def main() -> None:
         target = ROOT / "docs" / f"campaign-{name}.png"
         figure.quantize(256, dither=Image.Dither.NONE).save(target, optimize=True)
     (ROOT / "docs" / f"{PAGE}.md").write_text(page(results), encoding="utf-8")
-    replace_in_readme("campaigns", grid_to_markdown(violations(results)), command="make campaigns")
 
 
 if __name__ == "__main__":
