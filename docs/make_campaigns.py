@@ -13,7 +13,7 @@ from pathlib import Path
 
 from PIL import Image
 
-from quadsim.report.table import Cell, Grid, grid_to_markdown
+from quadsim.report.table import Cell, Grid
 from scenarios.bench.solvers import section
 from scenarios.campaign.engine.local import LocalEngine
 from scenarios.campaign.manifest import stored_plan

@@ -19,12 +19,15 @@ if TYPE_CHECKING:
     from quadsim.errors import QuadsimError as QuadsimError
     from quadsim.vehicle import Vehicle as Vehicle
     from scenarios.api import campaign as campaign
+    from scenarios.api import check as check
     from scenarios.api import compare as compare
+    from scenarios.api import film as film
     from scenarios.api import fly as fly
     from scenarios.api import load as load
     from scenarios.api import load_vehicle as load_vehicle
     from scenarios.api import make_controller as make_controller
     from scenarios.api import read as read
+    from scenarios.api import replay as replay
     from scenarios.api import scenarios as scenarios
     from scenarios.api import sweep as sweep
     from scenarios.flight import Flight as Flight
@@ -33,7 +36,20 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 
 _PLACES = {
-    "scenarios.api": ("campaign", "compare", "fly", "load", "load_vehicle", "make_controller", "read", "scenarios", "sweep"),
+    "scenarios.api": (
+        "campaign",
+        "check",
+        "compare",
+        "film",
+        "fly",
+        "load",
+        "load_vehicle",
+        "make_controller",
+        "read",
+        "replay",
+        "scenarios",
+        "sweep",
+    ),
     "scenarios.flight": ("Flight",),
     "scenarios.schema.scenario": ("Scenario",),
     "quadsim.controller": ("Command", "Moment"),

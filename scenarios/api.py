@@ -24,12 +24,13 @@ from scenarios.loading import check_parts, load_scenario, scenario_names
 from scenarios.parts.own_code import refer_to, require_importable, set_up
 from scenarios.parts.vehicle import build_vehicle
 from scenarios.progress import Progress, silent
-from scenarios.reaudit import stored_scenario
+from scenarios.reaudit import Reaudit, reaudit, stored_scenario
 from scenarios.run import fly_scenario, run_scenario
 from scenarios.schema.scenario import Scenario
 
 if TYPE_CHECKING:
     from scenarios.campaign.engine.protocol import Engine
+    from scenarios.campaign.replay import Replay
     from scenarios.campaign.run import Result
     from scenarios.campaign.statistics.comparison import Comparison as CampaignComparison
     from scenarios.campaign.sweep import Sweep
@@ -87,7 +88,7 @@ def load_vehicle(name: str | Path) -> Vehicle:
         >>> import quadsim
         >>> vehicle = quadsim.load_vehicle("hummingbird")
         >>> vehicle.mass, round(vehicle.hover_speed)
-        (0.716, 458)
+        (0.716, 453)
     """
     return read_vehicle(vehicle_path(str(name)))
 
@@ -364,6 +365,104 @@ def compare(
         return compare_campaigns([Path(str(each)) for each in targets], target)
     with reporting(progress) as report:
         return compare_flights(targets, target, cost, report)
+
+
+def check(directory: str | Path) -> Reaudit:
+    """Audit a finished run again from its tables, and hold its summary and its files' hashes against that.
+
+    Raises:
+        FileError: a file is missing, changed or damaged, or the summary is not what the tables say.
+
+    Examples:
+        >>> import tempfile, quadsim
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     flown = quadsim.fly(quadsim.load("hover").replace({"duration": 1.0}))
+        ...     found = quadsim.check(flown.save(folder + "/run", video=False))
+        >>> found.satisfied, found.notes
+        (True, ())
+    """
+    return reaudit(Path(directory))
+
+
+def film(
+    directory: str | Path,
+    out: str | Path | None = None,
+    *,
+    workers: int | None = None,
+    progress: Progress | bool = True,
+) -> Path:
+    """Film a finished run.
+
+    Args:
+        directory: of the run.
+        out: an MP4 or GIF file; `flight.mp4` in the run's directory where absent, with its hash in the summary.
+        workers: rendering processes; one per usable core where absent.
+        progress: as of `fly`.
+
+    Returns:
+        The file.
+
+    Raises:
+        InputError: it is no run directory, or the file has another ending.
+        RenderingUnavailableError: nothing can render here.
+        OutputError: the file cannot be written.
+    """
+    from quadsim.report.film.video import render_gif, render_video
+
+    directory = Path(directory)
+    reaudit(directory, products=False)
+    path = real_path(directory / rundir.VIDEO_FILE if out is None else out)
+    if workers is not None and workers < 1:
+        raise ParameterError("", "--workers", workers, "at least 1")
+    if path.suffix not in (".mp4", ".gif"):
+        raise ParameterError("", "--out", out, "a file ending in .mp4 or .gif")
+    own = path.resolve().parent == directory.resolve()
+    with (
+        reporting(progress) as report,
+        rundir.adding(directory, path.name) if own else contextlib.nullcontext(path) as file,
+    ):
+        if path.suffix == ".gif":
+            render_gif(directory, file, workers=workers)
+        else:
+            render_video(directory, file, workers=workers, progress=lambda done, total: report("video", done, total))
+    return path
+
+
+def replay(
+    campaign: str | Path,
+    flight: int | None = None,
+    *,
+    out: str | Path | None = None,
+    video: bool = True,
+    recording: bool = True,
+    figures: bool = True,
+    progress: Progress | bool = True,
+) -> Replay:
+    """Fly one flight of a finished campaign again, with everything that a run directory has.
+
+    Args:
+        campaign: its directory.
+        flight: which; the worst where absent.
+        out: the run directory, `runs/CAMPAIGN-N` where absent.
+        video: whether to film it.
+        recording: whether to write `flight.rrd`.
+        figures: whether to draw it.
+        progress: as of `fly`.
+
+    Returns:
+        The flight, and the columns of the campaign's table that it does not agree with, bit for bit.
+
+    Raises:
+        InputError: there is no such campaign or flight.
+        OutputError: the directory cannot be written.
+    """
+    from scenarios.campaign.replay import recorded_flight, replay_flight
+
+    recorded = recorded_flight(Path(campaign), flight)
+    target = real_path(Path("runs") / recorded.scenario.name if out is None else out)
+    outputs = Outputs(video=video, recording=recording, figures=figures)
+    with reporting(progress) as report:
+        return replay_flight(recorded, target, outputs, report)
 
 
 @contextlib.contextmanager

@@ -58,23 +58,17 @@ def campaign(options: Namespace) -> int:
 
 def replay(options: Namespace) -> int:
     """`quadsim replay`."""
-    from scenarios.campaign.replay import recorded_flight
-    from scenarios.campaign.replay import replay as fly_again
-    from scenarios.campaign.results.verdicts import MEMORY, TIMEOUT
+    from scenarios.campaign.replay import recorded_flight, replay_flight
     from scenarios.commands.campaign_console import print_replay
 
-    directory = Path(options.campaign)
-    flight = recorded_flight(directory, options.flight)
-    target = real_path(Path("runs") / flight.scenario.name if options.out is None else options.out)
+    recorded = recorded_flight(Path(options.campaign), options.flight)
+    target = real_path(Path("runs") / recorded.scenario.name if options.out is None else options.out)
     outputs = Outputs(video=options.video, recording=options.recording, figures=options.figures)
-    if flight.otherwise:
-        console.say(f"other {', '.join(flight.otherwise)} flew that campaign, so numbers may differ")
-    if flight.row["verdict"] in (TIMEOUT, MEMORY):
-        ended = f"flight {flight.number} was ended in the campaign ({flight.row['reason']})"
-        console.say(f"{ended}; here nothing ends it but Ctrl-C")
+    for note in recorded.notes:
+        console.say(note)
     with console.progress_bars(enabled=not options.json) as progress:
-        _, differing = fly_again(flight, target, outputs, progress)
+        found = replay_flight(recorded, target, outputs, progress)
     print_summary(rundir.read_summary(target), options, where=str(target))
     if not options.json:
-        print_replay(flight.number, flight.row, differing)
-    return EXIT_FAILED if differing else EXIT_DONE
+        print_replay(recorded.number, recorded.row, found.differing)
+    return EXIT_FAILED if found.differing else EXIT_DONE
