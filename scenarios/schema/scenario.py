@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import json
+import math
+from collections.abc import Mapping
 from typing import Annotated, Any, Final, Literal, get_args
 
 from annotated_types import Len, MaxLen
@@ -10,11 +13,12 @@ from pydantic_core import PydanticCustomError
 
 from quadsim.errors import ParameterError, UnknownNameError
 from quadsim.flight.audit import SIGNALS
+from quadsim.sim.effects import Effects
 from quadsim.sim.physics import steps_per_period
 from scenarios.schema.base import LARGEST_SEED, MOST_ENTRIES, NonNegative, Number, Positive, Quadruple, Spec, Triple
 from scenarios.schema.controller import ControllerSpec
 from scenarios.schema.course import ReferenceSpec
-from scenarios.schema.effects import ComputationSpec, EffectsSpec
+from scenarios.schema.effects import ComputationSpec
 from scenarios.schema.events import Event, PayloadDropEvent, PayloadPickupEvent, SensorFaultEvent
 from scenarios.schema.optimisation import BoundedSpec
 from scenarios.schema.sensors import EstimatorSpec, SensorsSpec, check_sensing
@@ -183,7 +187,7 @@ class Scenario(Spec):
     plant: PlantSpec = PlantSpec()
     reference: ReferenceSpec
     controller: ControllerSpec
-    effects: EffectsSpec = EffectsSpec()
+    effects: Effects = Effects()
     computation: ComputationSpec | None = Field(default=None, description="absent: commands take no time")
     sensors: SensorsSpec | None = Field(default=None, description="absent: the controller receives the true state")
     estimator: EstimatorSpec | None = Field(
@@ -242,6 +246,15 @@ class Scenario(Spec):
                 if event.sensor not in present:
                     rule = f"one that the estimator has, of {', '.join(present)}"
                     raise ValueError(f"events.{i}.sensor must be {rule}; got {event.sensor!r}")
+
+    @classmethod
+    def read(cls, data: Mapping[str, Any]) -> Scenario:
+        """A scenario of a file's tables.
+
+        They are validated as JSON, where lists are tuples, texts are enumerations' values and tables are dataclasses,
+        and nothing else is converted.  What JSON cannot hold, as dates, is infinite there, which is allowed nowhere.
+        """
+        return cls.model_validate_json(json.dumps(data, default=lambda _: math.inf))
 
     @property
     def periods(self) -> int:

@@ -9,9 +9,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from quadsim.errors import ParameterError
+from quadsim.fields import Vector
 from quadsim.state import Array
 
-Velocity = tuple[float, float, float]
+Velocity = Vector
 """A velocity in the world frame, z up [m/s]."""
 
 

@@ -13,7 +13,7 @@ from quadsim.flight.log import FlightLog
 from quadsim.flight.metrics import computation, estimation, ground
 from quadsim.sim.airframe import outline
 from quadsim.sim.computation import Computation, Stall
-from quadsim.sim.effects import Effects
+from quadsim.sim.effects import Effects, Ground
 from quadsim.sim.effects.rotors import RotorDynamics
 from quadsim.sim.loop import fly
 from quadsim.sim.navigation import Navigation
@@ -205,7 +205,7 @@ def test_take_off_and_landing(vehicle: Vehicle) -> None:
     reference[30:, 2] = -0.1
     controller = Scripted(script)
     shape = outline(vehicle)
-    with Plant(vehicle, effects=Effects(contact=True, rotors=RotorDynamics(rise=0.02, fall=0.02))) as plant:
+    with Plant(vehicle, effects=Effects(ground=Ground(), rotors=RotorDynamics(rise=0.02, fall=0.02))) as plant:
         log = fly_scripted(
             plant,
             controller,
@@ -236,7 +236,7 @@ def test_take_off_and_landing(vehicle: Vehicle) -> None:
 
 def test_a_capsized_vehicle_lies_on_the_ground_and_has_crashed(vehicle: Vehicle) -> None:
     controller = Scripted(np.zeros((40, 4)))
-    with Plant(vehicle, effects=Effects(contact=True)) as plant:
+    with Plant(vehicle, effects=Effects(ground=Ground())) as plant:
         log = fly_scripted(
             plant,
             controller,
@@ -258,7 +258,7 @@ def test_a_sliding_vehicle_is_stopped_by_friction(vehicle: Vehicle) -> None:
     """v^2 = 2 mu g s: feet at rest, friction 0.8."""
     start = make_state()
     start[1] = 1.0
-    with Plant(vehicle, effects=Effects(contact=True)) as plant:
+    with Plant(vehicle, effects=Effects(ground=Ground())) as plant:
         plant.reset(start, np.zeros(4))
         plant.advance(np.zeros(4), 1000)
         state = plant.state()
