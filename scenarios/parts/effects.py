@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING
 
 from mpc.fallback.settings import FallbackSettings
 from quadsim.errors import ParameterError
-from quadsim.sim.computation import Computation, Stall
+from quadsim.fields import filled
+from quadsim.sim.computation import Computation, ComputationTime, Stall
 from quadsim.sim.effects import Air, Payload, PayloadChange, RotorChange, RotorDynamics
 from quadsim.sim.effects.gust import Gust
 from quadsim.sim.effects.wind import WindChange, WindField
 from quadsim.vehicle import Vehicle
 from scenarios.parts.randomness import generator
-from scenarios.schema.effects import ComputationSpec
 from scenarios.schema.events import (
     GustEvent,
     PayloadDropEvent,
@@ -81,14 +81,7 @@ def build_computation(scenario: Scenario) -> Computation | None:
     spec = scenario.computation
     if spec is None and not stalls:
         return None
-    spec = spec or ComputationSpec()
-    return Computation(
-        fixed=spec.delay,
-        per_iteration=spec.per_iteration,
-        jitter=spec.jitter,
-        stalls=stalls,
-        plan=_has_fallback(scenario) if spec.plan is None else spec.plan,
-    )
+    return Computation(**vars(filled(spec or ComputationTime(), plan=_has_fallback(scenario))), stalls=stalls)
 
 
 def _has_fallback(scenario: Scenario) -> bool:

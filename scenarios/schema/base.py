@@ -46,7 +46,7 @@ def fields_of(table: type[Any]) -> dict[str, FieldInfo]:
         return table.model_fields
     hints = get_type_hints(table, include_extras=True)
     found = {}
-    for field in dataclasses.fields(table):
+    for field in sorted(dataclasses.fields(table), key=lambda field: field.name != "type"):  # may be added to others
         found[field.name] = info = FieldInfo.from_annotated_attribute(hints[field.name], field)
         info.description = next((note.documentation for note in info.metadata if isinstance(note, DocInfo)), None)
     return found

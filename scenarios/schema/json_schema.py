@@ -12,7 +12,7 @@ from pydantic_core import core_schema
 
 from scenarios.schema.base import fields_of
 from scenarios.schema.scenario import Scenario
-from scenarios.schema.writing import headline
+from scenarios.schema.writing import headline, is_absent
 
 DIALECT: Final = "https://json-schema.org/draft/2020-12/schema"
 BASE: Final = {
@@ -48,7 +48,7 @@ class _SchemaOfToml(GenerateJsonSchema):
 
     def default_schema(self, schema: core_schema.WithDefaultSchema) -> dict[str, Any]:
         """The same without a default where that is to be absent."""
-        if schema.get("default", ...) is None:
+        if "default" in schema and is_absent(schema["default"]):
             return self.generate_inner(schema["schema"])
         return super().default_schema(schema)
 

@@ -14,7 +14,7 @@ from annotated_types import Len, MaxLen, MinLen
 from pydantic import BaseModel, Tag, ValidationError
 from pydantic_core import ErrorDetails
 
-from quadsim.errors import InputError, ParameterError
+from quadsim.errors import InputError, ParameterError, UnknownNameError
 from quadsim.vehicle import MEANT
 from scenarios.schema.base import fields_of, is_table
 
@@ -215,6 +215,8 @@ def describe(details: ErrorDetails, data: Mapping[str, Any], root: type[BaseMode
         error = context["error"]
         if isinstance(error, ParameterError):  # of a dataclass, which does not know where it stands
             return str(ParameterError(field, error.name, error.value, error.rule))
+        if isinstance(error, UnknownNameError):
+            return f"{field}.{error.kind}: {error}"
         return ".".join([*place.names, str(error)])
     if kind in ("too_short", "too_long") and place.exact_length is not None:
         return f"{field} must be a list of {place.exact_length} {place.entries}; got {shown(given)}"

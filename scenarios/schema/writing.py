@@ -6,6 +6,7 @@ stands there commented out.  In a list of tables each field is explained where i
 
 from __future__ import annotations
 
+import math
 import textwrap
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -29,6 +30,11 @@ def tables_in(annotation: Any) -> tuple[type[Any], ...]:
     if is_table(annotation):
         return (annotation,)
     return tuple(model for argument in get_args(annotation) for model in tables_in(argument))
+
+
+def is_absent(value: object) -> bool:
+    """Whether a field with this value is left out of a file: one without a value, or an infinite bound."""
+    return value is None or (isinstance(value, float) and math.isinf(value))
 
 
 WIDTH: Final = 120
@@ -84,7 +90,7 @@ def _fill(container: Container | Table, model: Any, path: tuple[str, ...], expla
             below.append((name, value, "" if explained_above else comment or headline(type(value))))
         elif isinstance(value, Mapping) or (value and kinds and not path):
             below.append((name, value, comment))
-        elif value is None:
+        elif is_absent(value):
             if not explained_above:
                 lines.append(_absent((*path, name), kinds, comment))
         else:
@@ -174,7 +180,7 @@ def _labelled(name: str, info: FieldInfo) -> str:
 def _item(value: Any) -> Item:
     """A number, a text, or a list or small table of them."""
     if is_table(type(value)):
-        value = {name: entry for name in fields_of(type(value)) if (entry := getattr(value, name)) is not None}
+        value = {name: entry for name in fields_of(type(value)) if not is_absent(entry := getattr(value, name))}
     if isinstance(value, Mapping):
         table = tomlkit.inline_table()
         for name, entry in value.items():

@@ -70,7 +70,7 @@ def speeds(vehicle: Vehicle) -> Array:
 def test_a_late_command_acts_from_its_time_on(vehicle: Vehicle, speeds: Array) -> None:
     controller = Scripted(speeds)
     with Plant(vehicle) as plant:
-        log = fly_scripted(plant, controller, computation=Computation(fixed=0.0105))
+        log = fly_scripted(plant, controller, computation=Computation(delay=0.0105))
         hover = plant.hover_speeds
     acting = log.plant.speeds[:-1].reshape(-1, STEPS, 4)
     before = np.concatenate([hover[None], speeds[:-1]])
@@ -109,7 +109,7 @@ def test_a_late_command_leaves_the_plan_going_on(vehicle: Vehicle, speeds: Array
             plan = command.speeds + np.arange(4.0)[:, None]
             return Command(speeds=command.speeds, plan=plan)
 
-    computation = Computation(fixed=0.01, stalls=(Stall(start=0.1, duration=0.125),), plan=True)
+    computation = Computation(delay=0.01, stalls=(Stall(start=0.1, duration=0.125),), plan=True)
     with Plant(vehicle) as plant:
         log = fly_scripted(plant, Planner(speeds, horizon=4), computation=computation)
     acting = log.plant.speeds[:-1].reshape(-1, STEPS, 4)
@@ -126,7 +126,7 @@ def test_a_late_command_leaves_the_plan_going_on(vehicle: Vehicle, speeds: Array
 def test_a_command_just_in_time_acts_a_period_later(vehicle: Vehicle, speeds: Array) -> None:
     controller = Scripted(speeds)
     with Plant(vehicle) as plant:
-        log = fly_scripted(plant, controller, computation=Computation(fixed=PERIOD))
+        log = fly_scripted(plant, controller, computation=Computation(delay=PERIOD))
         hover = plant.hover_speeds
     assert MISSED not in log.control.status
     acting = np.concatenate([hover[None], speeds[:-1]])

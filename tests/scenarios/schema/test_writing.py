@@ -14,7 +14,7 @@ from scenarios.loading import load_scenario, parse_scenario, scenario_names
 from scenarios.parts.vehicle import build_vehicle
 from scenarios.schema.base import fields_of
 from scenarios.schema.scenario import Scenario
-from scenarios.schema.writing import WIDTH, headline, tables_in, to_toml
+from scenarios.schema.writing import WIDTH, headline, is_absent, tables_in, to_toml
 
 EFFECTS = {
     "rotors": {"rise": 0.02, "efficiency": [1.0, 0.9, 1.0, 1.0]},
@@ -34,6 +34,13 @@ REFERENCES: list[dict[str, Any]] = [
     {"type": "waypoints", "points": [{"position": [1.0, 2.0, 3.0]}, {"position": [1.0, 2.0, 4.0], "hold": 2.0}]},
     {"type": "circle", "radius": 2.0, "period": 10.0},
 ]
+
+
+def present(value: Any) -> Any:
+    """What a file has of a table: what is not absent."""
+    if isinstance(value, dict):
+        return {key: present(each) for key, each in value.items() if not is_absent(each)}
+    return [present(each) for each in value] if isinstance(value, list) else value
 
 
 def everything(reference: dict[str, Any]) -> Scenario:
@@ -62,7 +69,7 @@ def test_what_is_written_is_read_again_and_written_the_same(scenario: Scenario) 
     again = parse_scenario(tomllib.loads(text))
     assert again == scenario
     assert again.to_toml() == text
-    assert tomllib.loads(text) == scenario.model_dump(mode="json", exclude_none=True)
+    assert tomllib.loads(text) == present(scenario.model_dump(mode="json"))
 
 
 @pytest.mark.parametrize("scenario", ALL, ids=lambda scenario: f"{scenario.name}-{scenario.reference.type}")
