@@ -11,7 +11,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Annotated, Any, TypeVar
 
-from annotated_types import Ge, Gt, Le, Len
+from annotated_types import Ge, Gt, Le, Len, doc
 
 Settings = TypeVar("Settings")
 
@@ -21,6 +21,8 @@ Positive = Annotated[float, Gt(0.0), Le(1e6)]
 Fraction = Annotated[float, Ge(0.0), Le(1.0)]
 Vector = Annotated[tuple[Number, ...], Len(3, 3)]
 """Of three numbers, x, y, z."""
+Instant = Annotated[float, Ge(0.0), Le(1e6), doc("[s] when it happens")]
+"""Of an event."""
 
 
 def filled(settings: Settings, **values: object) -> Settings:

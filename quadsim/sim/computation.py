@@ -11,14 +11,15 @@ from annotated_types import Ge, Le, doc
 
 from quadsim.controller import Command
 from quadsim.errors import ParameterError
+from quadsim.fields import Instant, Positive
 
 
 @dataclass(frozen=True, kw_only=True)
 class Stall:
-    """For `duration` [s] from `start` [s] on, no command is completed: one that is being computed waits for the end."""
+    """For a while no command is completed: one that is being computed waits for the end."""
 
-    start: float
-    duration: float
+    at: Instant
+    duration: Annotated[Positive, doc("[s] how long")]
 
 
 Seconds = Annotated[float, Ge(0.0), Le(100.0)]
@@ -66,7 +67,7 @@ class Computation(ComputationTime):
         taken = self.delay + self.per_iteration * command.iterations
         if self.jitter:
             taken += rng.exponential(self.jitter)
-        for stall in sorted(self.stalls, key=lambda stall: stall.start):
-            if time < stall.start + stall.duration and time + taken >= stall.start:
-                taken = max(taken, stall.start + stall.duration - time)
+        for stall in sorted(self.stalls, key=lambda stall: stall.at):
+            if time < stall.at + stall.duration and time + taken >= stall.at:
+                taken = max(taken, stall.at + stall.duration - time)
         return taken

@@ -10,18 +10,15 @@ from mpc.fallback.settings import FallbackSettings
 from quadsim.errors import ParameterError
 from quadsim.fields import filled
 from quadsim.sim.computation import Computation, ComputationTime, Stall
-from quadsim.sim.effects import Air, Payload, PayloadChange, RotorChange, RotorDynamics
+from quadsim.sim.effects import Air, PayloadChange, RotorChange, RotorDynamics
 from quadsim.sim.effects.gust import Gust
 from quadsim.sim.effects.wind import WindChange, WindField
 from quadsim.vehicle import Vehicle
 from scenarios.parts.randomness import generator
 from scenarios.schema.events import (
-    GustEvent,
     PayloadDropEvent,
     PayloadPickupEvent,
     RotorLossEvent,
-    StallEvent,
-    WindEvent,
 )
 
 if TYPE_CHECKING:
@@ -35,7 +32,7 @@ def moving_air(scenario: Scenario, vehicle: Vehicle) -> Air | None:
         ParameterError: there is wind, and nothing that it could push.
     """
     air = scenario.effects.resolved(vehicle).air or Air()
-    blown = any(isinstance(event, GustEvent | WindEvent) for event in scenario.events)
+    blown = any(isinstance(event, Gust | WindChange) for event in scenario.events)
     if not (any(air.wind) or air.turbulence is not None or blown):
         return None
     if not air.rotor_drag and air.body_drag is None:
@@ -53,20 +50,10 @@ def build_wind(scenario: Scenario, vehicle: Vehicle) -> WindField | None:
     air = moving_air(scenario, vehicle)
     if air is None:
         return None
-    gusts = tuple(
-        Gust(start=event.at, duration=event.duration, velocity=tuple(event.velocity))
-        for event in scenario.events
-        if isinstance(event, GustEvent)
-    )
-    changes = tuple(
-        WindChange(time=event.at, velocity=tuple(event.velocity))
-        for event in scenario.events
-        if isinstance(event, WindEvent)
-    )
     return WindField(
         mean=air.wind,
-        gusts=gusts,
-        changes=changes,
+        gusts=tuple(event for event in scenario.events if isinstance(event, Gust)),
+        changes=tuple(event for event in scenario.events if isinstance(event, WindChange)),
         turbulence=air.turbulence,
         timestep=scenario.plant.timestep,
         rng=generator(scenario.seed, "wind"),
@@ -75,9 +62,7 @@ def build_wind(scenario: Scenario, vehicle: Vehicle) -> WindField | None:
 
 def build_computation(scenario: Scenario) -> Computation | None:
     """How long commands take, or None where they take no time."""
-    stalls = tuple(
-        Stall(start=event.at, duration=event.duration) for event in scenario.events if isinstance(event, StallEvent)
-    )
+    stalls = tuple(event for event in scenario.events if isinstance(event, Stall))
     spec = scenario.computation
     if spec is None and not stalls:
         return None
@@ -95,8 +80,7 @@ def build_changes(scenario: Scenario) -> tuple[RotorChange | PayloadChange, ...]
     found: list[RotorChange | PayloadChange] = [*_losses(scenario)]
     for event in scenario.events:
         if isinstance(event, PayloadPickupEvent):
-            payload = Payload(mass=event.mass, position=tuple(event.position))
-            found.append(PayloadChange(time=event.at, payload=payload))
+            found.append(PayloadChange(time=event.at, payload=event))
         elif isinstance(event, PayloadDropEvent):
             found.append(PayloadChange(time=event.at, payload=None))
     return tuple(found)

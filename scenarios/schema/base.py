@@ -26,6 +26,10 @@ LARGEST_SEED: Final = 2**63 - 1
 """The largest whole number that every reader of TOML takes."""
 
 
+_FIRST: Final = {"at": 0, "type": 1}
+"""Fields that stand first in a table, which may have been added to those of a dataclass."""
+
+
 class Spec(BaseModel):
     """A table of the file.
 
@@ -46,7 +50,7 @@ def fields_of(table: type[Any]) -> dict[str, FieldInfo]:
         return table.model_fields
     hints = get_type_hints(table, include_extras=True)
     found = {}
-    for field in sorted(dataclasses.fields(table), key=lambda field: field.name != "type"):  # may be added to others
+    for field in sorted(dataclasses.fields(table), key=lambda field: _FIRST.get(field.name, len(_FIRST))):
         found[field.name] = info = FieldInfo.from_annotated_attribute(hints[field.name], field)
         info.description = next((note.documentation for note in info.metadata if isinstance(note, DocInfo)), None)
     return found

@@ -10,7 +10,7 @@ import numpy as np
 from annotated_types import Len, doc
 
 from quadsim.errors import InputError, ParameterError
-from quadsim.fields import NonNegative, Positive, Vector, filled
+from quadsim.fields import Instant, NonNegative, Positive, Vector, filled
 from quadsim.sim.effects.gust import Gust, Velocity, check_velocity, gust_velocity
 from quadsim.sim.effects.turbulence import FASTEST_AIRSPEED, SLOWEST_AIRSPEED, Dryden, Turbulence
 from quadsim.state import Array
@@ -64,20 +64,16 @@ class Air:
 class WindChange:
     """A step of the mean wind.
 
-    Attributes:
-        time: from when on it blows [s].
-        velocity: the mean wind from then on, world frame [m/s].
-
     Raises:
         ParameterError: a value is not finite, or the time is negative.
     """
 
-    time: float
-    velocity: Velocity
+    at: Instant
+    velocity: Annotated[Velocity, doc("[m/s] from then on, world frame")]
 
     def __post_init__(self) -> None:
-        if not 0.0 <= self.time < math.inf:
-            raise ParameterError("wind_change", "time", self.time, "a finite time >= 0 s")
+        if not 0.0 <= self.at < math.inf:
+            raise ParameterError("wind_change", "at", self.at, "a finite time >= 0 s")
         check_velocity("wind_change", "velocity", self.velocity)
 
 
@@ -112,9 +108,9 @@ class WindField:
         check_velocity("wind", "mean", mean)
         if not 0.0 < timestep < math.inf:
             raise ParameterError("wind", "timestep", timestep, "a finite time > 0 s")
-        ordered = sorted(changes, key=lambda change: change.time)
+        ordered = sorted(changes, key=lambda change: change.at)
         self._means = np.array([mean, *(change.velocity for change in ordered)], float)
-        self._change_times = np.array([change.time for change in ordered])
+        self._change_times = np.array([change.at for change in ordered])
         self._gusts = gusts
         self._along = _direction(self._means[0])
         self._timestep = timestep

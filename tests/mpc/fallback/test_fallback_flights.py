@@ -176,7 +176,7 @@ def test_missing_and_frozen_measurements_are_bridged(
 
 
 def test_a_stall_is_flown_through(vehicle: Vehicle, undisturbed: FlightLog) -> None:
-    log = fly_paper(vehicle, computation=Computation(stalls=(Stall(start=FAULT, duration=0.1),)))
+    log = fly_paper(vehicle, computation=Computation(stalls=(Stall(at=FAULT, duration=0.1),)))
     assert "missed" in log.control.status
     assert distance(log, undisturbed).max() < 0.1
 

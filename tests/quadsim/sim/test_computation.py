@@ -43,11 +43,11 @@ def test_jitter_is_exponential() -> None:
     ],
 )
 def test_a_stall_holds_back_what_it_meets(time: float, expected: float) -> None:
-    assert delay(Computation(delay=0.01, stalls=(Stall(start=1.0, duration=0.1),)), time) == pytest.approx(expected)
+    assert delay(Computation(delay=0.01, stalls=(Stall(at=1.0, duration=0.1),)), time) == pytest.approx(expected)
 
 
 def test_stalls_follow_one_another_whatever_their_order() -> None:
-    stalls = (Stall(start=0.02, duration=0.03), Stall(start=0.0, duration=0.02))
+    stalls = (Stall(at=0.02, duration=0.03), Stall(at=0.0, duration=0.02))
     assert delay(Computation(stalls=stalls)) == delay(Computation(stalls=stalls[::-1])) == pytest.approx(0.05)
 
 

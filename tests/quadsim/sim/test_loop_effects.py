@@ -85,7 +85,7 @@ def test_a_late_command_acts_from_its_time_on(vehicle: Vehicle, speeds: Array) -
 
 def test_a_missed_deadline_leaves_the_last_command_acting(vehicle: Vehicle, speeds: Array) -> None:
     controller = Scripted(speeds)
-    stall = Stall(start=0.1, duration=0.12)  # catches periods 2, 3 and 4; the last of them is 20 ms late
+    stall = Stall(at=0.1, duration=0.12)  # catches periods 2, 3 and 4; the last of them is 20 ms late
     with Plant(vehicle) as plant:
         log = fly_scripted(plant, controller, computation=Computation(stalls=(stall,)))
     assert [status == MISSED for status in log.control.status] == [k in (2, 3) for k in range(8)]
@@ -109,7 +109,7 @@ def test_a_late_command_leaves_the_plan_going_on(vehicle: Vehicle, speeds: Array
             plan = command.speeds + np.arange(4.0)[:, None]
             return Command(speeds=command.speeds, plan=plan)
 
-    computation = Computation(delay=0.01, stalls=(Stall(start=0.1, duration=0.125),), plan=True)
+    computation = Computation(delay=0.01, stalls=(Stall(at=0.1, duration=0.125),), plan=True)
     with Plant(vehicle) as plant:
         log = fly_scripted(plant, Planner(speeds, horizon=4), computation=computation)
     acting = log.plant.speeds[:-1].reshape(-1, STEPS, 4)

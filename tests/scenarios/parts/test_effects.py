@@ -159,7 +159,7 @@ def test_turbulence_passes_at_the_mean_wind_s_speed_and_follows_the_seed() -> No
 
 def test_computation_takes_its_times_and_stalls() -> None:
     stall = events(event(type="stall", at=1.0, duration=0.2))
-    assert build_computation(scenario(stall)[0]) == Computation(plan=False, stalls=(Stall(start=1.0, duration=0.2),))
+    assert build_computation(scenario(stall)[0]) == Computation(plan=False, stalls=(Stall(at=1.0, duration=0.2),))
     loaded, _ = scenario("computation={delay=0.01, per_iteration=1e-4, jitter=0.002}")
     assert build_computation(loaded) == Computation(delay=0.01, per_iteration=1e-4, plan=False, jitter=0.002)
 

@@ -101,7 +101,7 @@ def test_only_the_air_speed_counts(vehicle: Vehicle, effects: Effects) -> None:
 def test_a_gust_pushes_by_its_integral(vehicle: Vehicle) -> None:
     """While the vehicle hardly moves, m v = k (sum w) v_peak T / 2."""
     drag = 1e-6
-    gust = Gust(start=0.1, duration=1.0, velocity=(10.0, 0.0, 0.0))
+    gust = Gust(at=0.1, duration=1.0, velocity=(10.0, 0.0, 0.0))
     with Plant(vehicle, effects=Effects(air=Air(rotor_drag=drag)), wind=still_air((0.0, 0.0, 0.0), gust)) as plant:
         plant.reset(HIGH)
         plant.advance(plant.hover_speeds, 1300)
@@ -169,7 +169,7 @@ def test_a_lost_propeller_neither_drags_nor_carries_momentum(vehicle: Vehicle) -
 
 
 def test_a_second_flight_meets_the_same_wind(vehicle: Vehicle) -> None:
-    gust = Gust(start=0.02, duration=0.1, velocity=(0.0, 5.0, 0.0))
+    gust = Gust(at=0.02, duration=0.1, velocity=(0.0, 5.0, 0.0))
     with Plant(vehicle, effects=Effects(air=Air(rotor_drag=1e-3)), wind=still_air((1.0, 0.0, 0.0), gust)) as plant:
         winds = []
         for _ in range(2):
