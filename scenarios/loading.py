@@ -10,10 +10,10 @@ from typing import Any, Final
 from quadsim.errors import FileError, ParameterError, UnknownNameError
 from quadsim.flight.ground import AIRBORNE, TOUCH, clearance
 from quadsim.sim.airframe import outline
-from quadsim.sim.effects.load import mass_properties
+from quadsim.sim.effects.load import Load, mass_properties
 from quadsim.vehicle import Vehicle
 from scenarios.courses.make import build_course, located
-from scenarios.parts.effects import build_effects, moving_air
+from scenarios.parts.effects import moving_air
 from scenarios.parts.vehicle import build_initial_state, build_vehicle
 from scenarios.schema.bases import read_scenario, replaced_tables, retyped
 from scenarios.schema.course import CsvSpec
@@ -31,7 +31,7 @@ def check_parts(scenario: Scenario) -> None:
             built, or the flight starts below the floor, or in the air with rotors at rest.
     """
     vehicle = build_vehicle(scenario)
-    load = build_effects(scenario, vehicle).load
+    load = scenario.effects.resolved(vehicle).load or Load()
     mass_properties(vehicle, load, load.payloads)
     moving_air(scenario, vehicle)
     build_course(scenario)
