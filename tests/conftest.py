@@ -5,6 +5,7 @@ from __future__ import annotations
 import fcntl
 import os
 import pickle
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -20,6 +21,11 @@ from scenarios.cost.study import MEASURES, CandidateTimes, CostStudy, Outcome, S
 from scenarios.loading import load_scenario
 from scenarios.parts.vehicle import build_vehicle
 from scenarios.run import Flight, Outputs, fly_scenario, run_scenario
+
+# What is compiled is kept, also where the environment asks for the contrary: the workers, and all processes that tests
+# start, would compile the same modules again.  `make clean` removes it.
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+sys.dont_write_bytecode = False
 
 # Examples are not timed: a busy machine is no failure.  On CI they are the same ones each time.
 settings.register_profile("quadsim", deadline=None, derandomize="CI" in os.environ)
