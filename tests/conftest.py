@@ -8,6 +8,7 @@ import pickle
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -109,6 +110,21 @@ def short_run(tmp_path_factory: pytest.TempPathFactory) -> Run:
 @pytest.fixture(scope="session")
 def short_run_directory(short_run: Run) -> Path:
     return short_run.directory
+
+
+@pytest.fixture
+def sketched(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Figures are not laid out, and their PNG files are empty: for tests of the SVG's text, or of other files."""
+    from matplotlib.figure import Figure
+
+    save = Figure.savefig
+
+    def sketch(figure: Figure, file: Any, *, format: str, **options: Any) -> None:
+        if format != "png":
+            save(figure, file, format=format, **options)
+
+    monkeypatch.setattr(Figure, "savefig", sketch)
+    monkeypatch.setattr(Figure, "get_layout_engine", lambda _: None)
 
 
 @pytest.fixture(scope="session")
