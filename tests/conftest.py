@@ -34,17 +34,17 @@ settings.load_profile("quadsim")
 
 NO_PRODUCTS = Outputs(video=False, recording=False, figures=False)
 LONG = (
-    *("scenarios/campaign/engine/test_cluster.py", "scenarios/test_library.py", "scenarios/test_cli.py"),
-    *("scenarios/campaign/test_survival.py", "scenarios/test_faults.py", "scenarios/bench/test_bench.py"),
-    *("test_commands.py", "test_safety.py", "scenarios/campaign/engine/test_local.py"),
-    *("scenarios/bench/test_mismatch.py", "test_documents.py", "scenarios/test_soak.py"),
-    *("quadsim/report/film/test_video.py", "scenarios/campaign/test_run.py", "scenarios/test_paper.py"),
-    *("scenarios/campaign/test_kills.py", "scenarios/test_mutations.py", "scenarios/test_any_scenario.py"),
-    *("scenarios/campaign/report/test_campaign_page.py", "quadsim/report/test_comparison_page.py"),
-    *("scenarios/commands/test_console.py", "mpc/robust/test_robust.py", "quadsim/report/test_figures.py"),
-    *("scenarios/cost/test_measure.py", "mpc/robust/test_tightening.py"),
+    *("scenarios/campaign/engine/test_cluster.py", "scenarios/test_library.py", "test_safety.py"),
+    *("scenarios/campaign/test_survival.py", "scenarios/test_faults.py", "test_commands.py"),
+    *("quadsim/report/test_comparison_page.py", "scenarios/campaign/test_run.py", "scenarios/test_process.py"),
+    *("scenarios/bench/test_bench.py", "quadsim/report/test_figures.py", "scenarios/campaign/engine/test_local.py"),
+    *("scenarios/cost/test_measure.py", "test_documents.py", "scenarios/campaign/report/test_campaign_page.py"),
+    *("scenarios/campaign/test_kills.py", "quadsim/report/film/test_video.py", "scenarios/test_cli.py"),
+    *("scenarios/test_mutations.py", "scenarios/bench/test_mismatch.py", "scenarios/test_any_scenario.py"),
+    *("scenarios/parts/test_controllers.py", "mpc/robust/test_robust.py", "scenarios/commands/test_console.py"),
+    *("scenarios/campaign/test_commands.py", "test_packaging.py", "mpc/test_staged.py"),
 )
-"""Modules that take longest; those not named take less than ten seconds each."""
+"""Modules that take longest; those not named take less than six seconds each."""
 
 
 def pytest_configure(config: pytest.Config) -> None:
