@@ -245,18 +245,22 @@ def _built() -> tuple[Scenario, Vehicle]:
 
 @cache
 def _sound_flight(controller: str, condition: str, duration: float) -> tuple[FlightLog, Array]:
-    return _fly(controller, condition, duration, ())
+    """With the shortcut, whose answers are those of the whole QP within 1e-6 rad/s."""
+    return _fly(controller, condition, duration, (), shortcut=True)
 
 
-def _fly(controller: str, condition: str, duration: float, injections: Sequence[Injection]) -> tuple[FlightLog, Array]:
-    """A flight, and what the plant was given (M, 4); without the shortcut, so that there is a QP in every period."""
-    settings = (f"duration={round(duration, 9)}", "controller.shortcut=false", "controller.fallback.enabled=true")
+def _fly(
+    controller: str, condition: str, duration: float, injections: Sequence[Injection], *, shortcut: bool = False
+) -> tuple[FlightLog, Array]:
+    """A flight, and what the plant was given (M, 4); without the shortcut there is a QP in every period to fail."""
+    switch = f"controller.shortcut={str(shortcut).lower()}"
+    settings = (f"duration={round(duration, 9)}", switch, "controller.fallback.enabled=true")
     scenario = load_scenario("paper-constrained", (*settings, *CONDITIONS[condition].settings))
     events = [f"{{at={each.start}, {event}}}" for each in injections for event in each.fault.events]
     faulty = load_scenario("paper-constrained", (settings[0], f"events=[{', '.join(events)}]"))
     if controller == "robust":
         scenario = equip(scenario, FULL, CONDITIONS[condition])
-        whole = scenario.controller.model_copy(update={"shortcut": False})
+        whole = scenario.controller.model_copy(update={"shortcut": shortcut})
         scenario = scenario.model_copy(update={"controller": whole})
     scenario = scenario.model_copy(update={"events": [*scenario.events, *faulty.events]})
     vehicle = build_vehicle(scenario)

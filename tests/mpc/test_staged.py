@@ -85,7 +85,7 @@ def exact(form: Formulation, query: tuple[Array, Array, Array, Rest]) -> tuple[A
     return form.inputs(optimum.x), form.slacks(optimum.x), kkt_residuals(qp, optimum).worst / size
 
 
-@settings(max_examples=60)
+@settings(max_examples=40)
 @given(
     seed=st.integers(0, 2**32 - 1),
     horizon=st.integers(1, 12),

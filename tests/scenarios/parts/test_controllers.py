@@ -174,7 +174,7 @@ def test_at_a_price_that_is_high_enough_soft_bounds_are_hard_ones_from_any_state
     hard, soft, default = (robust(**{**usual, **parts, **price}) for price in prices)
     rng, reference, feasible, pressing, slacks = np.random.default_rng(0), np.zeros((50, 4)), 0, 0, []
     scale = np.array([10.0, 2.0, 10.0, 2.0, 10.0, 2.0, math.radians(5.0), 0.4, math.radians(5.0), 0.4, 1.0, 0.0])
-    for _ in range(150):
+    for _ in range(60):
         state, speeds = scale * rng.uniform(-1.0, 1.0, 12), HOVER + rng.uniform(-8.0, 8.0, 4)
         for law in (hard, soft, default):
             law.reset(speeds)
@@ -187,8 +187,8 @@ def test_at_a_price_that_is_high_enough_soft_bounds_are_hard_ones_from_any_state
         assert lenient.slack < 1e-7
         np.testing.assert_allclose(lenient.speeds, strict.speeds, atol=2e-3)
         slacks.append(usually.slack)
-    assert feasible > 100
-    assert pressing > 50
+    assert feasible > 40
+    assert pressing > 20
     assert np.mean(np.array(slacks) > 1e-7) < 0.12
     assert max(slacks) < math.radians(0.5)
 
