@@ -255,7 +255,7 @@ class _Group:
         self.rows, self._T = rows, T.T
         self._R = np.ascontiguousarray(scipy.linalg.solve_triangular(factor, half, lower=True, trans="T").T)
         l1, l2 = (np.tile(penalty, problem.horizon) for penalty in (part.l1, part.l2))
-        self._set = ActiveSet(half.T @ half, l1, l2)
+        self._set = ActiveSet(half.T @ half, l1, l2, part.l1.size)
 
     def solve(
         self, plan: Array, free: Array, lower: Array, upper: Array, starts: list[Side], *, most: int
