@@ -45,11 +45,8 @@ FEW: Final = 8
 """Wrong rows of a start with which no other one is looked at."""
 ROUNDED: Final = 1e-6
 """Share of l1 by which an approximate multiplier of a violated row may stay below it."""
-AT_ONCE: Final = 30
-"""Steps in which all rows that are wrong change."""
-PATIENCE: Final = 100
 MOST_STEPS: Final = 60
-"""Steps in which one does."""
+"""Steps of either method."""
 
 Side = NDArray[np.int8]
 """Of each row: 0 where it is inactive, 1 or -1 at its upper or lower bound, 2 or -2 where it is violated."""
@@ -79,7 +76,7 @@ class _Trial(NamedTuple):
     Attributes:
         side: (all rows,) the pieces.
         active: (k,) rows that have a multiplier.
-        rows: (k, all rows) of S.
+        rows: (k, all rows) of S; of the last trial alone.
         factor: (k, k) lower Cholesky factor of the system.
         excess: (k,) its right side.
         z: (k,) its solution.
@@ -121,7 +118,7 @@ class ActiveSet:
         self._least, self._most = l1 * (1.0 - ROUNDING), l1 * (1.0 + ROUNDING)
         self._offset = np.where(np.isfinite(l1), l1, 0.0) * self._compliance
         self._smallest = DEPENDENT * self._S.diagonal()
-        self._bounds = np.zeros((5, l1.size))  # what v_free exceeds, by piece
+        self._bounds, self._room = np.zeros((5, l1.size)), np.empty_like(self._S)
 
     def solve(
         self, free: Array, lower: Array, upper: Array, starts: Sequence[Side], *, most: int = MOST_STEPS
@@ -151,25 +148,24 @@ class ActiveSet:
             other = self._trial(start, bounds)
             if 2 * other.wrong < trial.wrong:
                 trial = other
-        best, seen, since = trial, set(), 0
+        best, fewest, seen = trial.side, trial.wrong, set()
         for step in range(1, most + 1):
             if not trial.wrong:
                 return self._accepted(trial, free, step)
-            since += 1
-            if trial.wrong < best.wrong:
-                best, since = trial, 0
+            if trial.wrong < fewest:
+                best, fewest = trial.side, trial.wrong
             side = self._all_changed(trial, bounds)
-            if (key := side.tobytes()) in seen or since > PATIENCE:
+            if (key := side.tobytes()) in seen:
                 break
             seen.add(key)
             trial = self._trial(side, bounds)
-        return self._one_by_one(best, free, bounds, step, most)
+        return self._one_by_one(best.copy(), free, bounds, step, most)
 
     def _trial(self, side: Side, bounds: Array) -> _Trial:
         """The maximum of the dual function on the pieces that a side says."""
         active = side.nonzero()[0]
         pieces = side[active]
-        rows = self._S.take(active, 0)
+        rows = self._S.take(active, 0, self._room[: active.size], "clip")  # a mode that takes no copy
         factor = rows.take(active, 1).T
         excess, z, failed, violated = bounds[pieces, active], pieces.astype(float), 0, False
         if active.size:
@@ -212,17 +208,18 @@ class ActiveSet:
         side[rows] = 2 * (bounds[1].take(rows) > trial.fall.take(rows)) - 1
         return side
 
-    def _one_by_one(self, trial: _Trial, free: Array, bounds: Array, before: int, most: int) -> Active | None:
-        """The multipliers by the dual method, from the rows of a trial; None where it is given up."""
-        side, z = trial.side.copy(), np.zeros_like(free)
-        if not trial.failed:
-            sign, violated = np.sign(side[trial.active]), np.abs(side[trial.active]) == 2
-            l1 = self._l1[trial.active]
-            size = np.clip(sign * trial.z, np.where(violated, l1, 0.0), np.where(violated, np.inf, l1))
-            z[trial.active], side[trial.active] = sign * size, trial.pieces
+    def _one_by_one(self, side: Side, free: Array, bounds: Array, before: int, most: int) -> Active | None:
+        """The multipliers by the dual method, from an active set, which is changed; None where it is given up."""
+        z = np.zeros_like(free)
         for step in range(before + 1, before + most + 1):
             trial = self._trial(side, bounds)
             active = trial.active
+            if step == before + 1 and not trial.failed:  # the first multipliers are those next to their pieces' maximum
+                sign, violated, l1 = np.sign(side[active]), np.abs(side[active]) == 2, self._l1[active]
+                size = np.clip(sign * trial.z, np.where(violated, l1, 0.0), np.where(violated, np.inf, l1))
+                z[active], side[active] = sign * size, trial.pieces
+                if (z[active] != trial.z).any():
+                    continue
             if trial.failed:
                 if not self._release_dependent(z, trial):
                     return None

@@ -162,13 +162,13 @@ class Condensed:
             slacks: (N, m_s).
             multipliers: (N, m), positive at upper bounds and negative at lower ones.
         """
-        z, z_inputs = self._rows.split(multipliers)
-        soft = self._problem.rows.soft
-        l1, l2 = self._problem.rows.l1[soft], self._problem.rows.l2[soft]
-        # Stationarity of a slack: l1 + 2 l2 e - |z| + z_box = 0.
-        z_slacks = np.minimum(np.abs(multipliers[:, soft]) - l1 - 2.0 * l2 * slacks, 0.0)
-        x = np.concatenate([plan.ravel(), slacks.ravel()])
-        return replace(like, x=x, y=self._blank.b, z=z, z_box=np.concatenate([z_inputs, z_slacks.ravel()]))
+        (z, z_box), x, soft = self._rows.split(multipliers), plan.ravel(), self._problem.rows.soft
+        if soft.size:
+            l1, l2 = self._problem.rows.l1[soft], self._problem.rows.l2[soft]
+            # Stationarity of a slack: l1 + 2 l2 e - |z| + z_box = 0.
+            z_slacks = np.minimum(np.abs(multipliers[:, soft]) - l1 - 2.0 * l2 * slacks, 0.0)
+            x, z_box = np.append(x, slacks), np.append(z_box, z_slacks)
+        return replace(like, x=x, y=self._blank.b, z=z, z_box=z_box)
 
 
 def condensed(problem: Problem) -> Condensed:

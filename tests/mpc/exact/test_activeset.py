@@ -34,7 +34,7 @@ class Rows:
         half = scipy.linalg.solve_triangular(root, G.T, lower=True)
         self.free = -scipy.linalg.cho_solve((root, True), c)
         self.R = scipy.linalg.solve_triangular(root, half, lower=True, trans="T")
-        self.set = ActiveSet(half.T @ half, l1, l2)
+        self.set = ActiveSet(half.T @ half, l1, l2, channels=1)
 
     def solve(self, *starts: Side, most: int = module.MOST_STEPS) -> Solution | None:
         """Of `whole`; None where the method gives up."""
