@@ -45,6 +45,8 @@ FEW: Final = 8
 """Wrong rows of a start with which no other one is looked at."""
 ROUNDED: Final = 1e-6
 """Share of l1 by which an approximate multiplier of a violated row may stay below it."""
+MOST_DEPENDENT: Final = 3
+"""Sets of dependent rows after which the search is given up: it leads from one to the next."""
 MOST_STEPS: Final = 60
 """Steps of either method."""
 
@@ -148,10 +150,13 @@ class ActiveSet:
             other = self._trial(start, bounds)
             if 2 * other.wrong < trial.wrong:
                 trial = other
-        best, fewest, seen = trial.side, trial.wrong, set()
+        best, fewest, seen, dependent = trial.side, trial.wrong, set(), 0
         for step in range(1, most + 1):
             if not trial.wrong:
                 return self._accepted(trial, free, step)
+            dependent += trial.failed > 0
+            if dependent > MOST_DEPENDENT:
+                return None
             if trial.wrong < fewest:
                 best, fewest = trial.side, trial.wrong
             side = self._all_changed(trial, bounds)
@@ -214,16 +219,14 @@ class ActiveSet:
         for step in range(before + 1, before + most + 1):
             trial = self._trial(side, bounds)
             active = trial.active
-            if step == before + 1 and not trial.failed:  # the first multipliers are those next to their pieces' maximum
+            if step == before + 1:  # the first multipliers are those next to their pieces' maximum
                 sign, violated, l1 = np.sign(side[active]), np.abs(side[active]) == 2, self._l1[active]
                 size = np.clip(sign * trial.z, np.where(violated, l1, 0.0), np.where(violated, np.inf, l1))
                 z[active], side[active] = sign * size, trial.pieces
                 if (z[active] != trial.z).any():
                     continue
             if trial.failed:
-                if not self._release_dependent(z, trial):
-                    return None
-                continue
+                return None
             stops = (trial.pieces != side[active]).nonzero()[0]
             if stops.size:  # as far as all stay on their pieces
                 rows = active[stops]
@@ -241,30 +244,6 @@ class ActiveSet:
             worst = int(trial.over.argmax())
             side[worst] = 1 if bounds[1, worst] > trial.fall[worst] else -1
         return None
-
-    def _release_dependent(self, z: Array, trial: _Trial) -> bool:
-        """Where active rows are dependent, move along what that leaves open until one stops; whether one did.
-
-        The dual function is linear along it.  If none stops, no point satisfies all rows.
-        """
-        active, k = trial.active, trial.failed - 1  # depends on those before it
-        direction = np.zeros(active.size)
-        direction[k] = 1.0
-        if k:  # before a row of nothing there may be none
-            direction[:k] = -lapack.dpotrs(trial.factor[:k, :k], trial.rows[:k, active[k]], lower=1)[0]
-        if direction @ trial.excess < 0.0:
-            direction = -direction
-        sign, here = np.sign(trial.side[active]), z[active]
-        inwards = sign * direction < -ROUNDING * np.abs(direction).max()
-        share = np.full(active.size, np.inf)
-        share[inwards] = (sign * here)[inwards] / -(sign * direction)[inwards]
-        first = int(share.argmin())
-        if not np.isfinite(share[first]):
-            return False
-        z[active] = here + share[first] * direction
-        z[active[first]] = 0.0
-        trial.side[active[first]] = 0
-        return True
 
     def _accepted(self, trial: _Trial, free: Array, steps: int) -> Active | None:
         """The optimum of the right active set, refined once; None where rows are too nearly dependent."""
