@@ -45,6 +45,10 @@ FEW: Final = 8
 """Wrong rows of a start with which no other one is looked at."""
 ROUNDED: Final = 1e-6
 """Share of l1 by which an approximate multiplier of a violated row may stay below it."""
+CAREFUL: Final = 4
+"""First steps in which of many rows that are to be inactive only the worst leaves."""
+FEW_LEAVING: Final = 3
+"""Rows that are not many."""
 MOST_DEPENDENT: Final = 3
 """Sets of dependent rows after which the search is given up: it leads from one to the next."""
 MOST_STEPS: Final = 60
@@ -159,7 +163,7 @@ class ActiveSet:
                 return None
             if trial.wrong < fewest:
                 best, fewest = trial.side, trial.wrong
-            side = self._all_changed(trial, bounds)
+            side = self._all_changed(trial, bounds, careful=step <= CAREFUL)
             if (key := side.tobytes()) in seen:
                 break
             seen.add(key)
@@ -198,13 +202,19 @@ class ActiveSet:
         beyond = size > np.where(outside, self._least[active], self._most[active])
         return sign * (outside | (size >= 0.0)) * (1 + beyond)
 
-    def _all_changed(self, trial: _Trial, bounds: Array) -> Side:
-        """The pieces with all that is wrong changed, but for violated rows next to one that is violated more."""
+    def _all_changed(self, trial: _Trial, bounds: Array, *, careful: bool) -> Side:
+        """The pieces with all that is wrong changed, but for violated rows next to one that is violated more.
+
+        One active row too many makes multipliers around it alternate in sign: to be careful is to release it alone.
+        """
         side = trial.side.copy()
         if trial.failed:
             side[trial.active[trial.failed - 1]] = 0
             return side
         side[trial.active] = trial.pieces
+        if careful and (leaving := (trial.pieces == 0).nonzero()[0]).size > FEW_LEAVING:
+            stay = np.delete(leaving, np.abs(trial.z[leaving]).argmax())
+            side[trial.active[stay]] = trial.side[trial.active[stay]]
         over, later = trial.over, self._channels
         joining = over > FEASIBLE
         joining[later:] &= over[later:] >= over[:-later]
