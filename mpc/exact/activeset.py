@@ -46,7 +46,7 @@ FEW: Final = 8
 ROUNDED: Final = 1e-6
 """Share of l1 by which an approximate multiplier of a violated row may stay below it."""
 CAREFUL: Final = 4
-"""First steps in which of many rows that are to be inactive only the worst leaves."""
+"""First steps in which, where most rows are active, only the worst of many with a wrong multiplier leaves."""
 FEW_LEAVING: Final = 3
 """Rows that are not many."""
 MOST_DEPENDENT: Final = 3
@@ -205,14 +205,15 @@ class ActiveSet:
     def _all_changed(self, trial: _Trial, bounds: Array, *, careful: bool) -> Side:
         """The pieces with all that is wrong changed, but for violated rows next to one that is violated more.
 
-        One active row too many makes multipliers around it alternate in sign: to be careful is to release it alone.
+        Between active rows one too many makes the others' multipliers alternate in sign: then it is released alone.
         """
         side = trial.side.copy()
         if trial.failed:
             side[trial.active[trial.failed - 1]] = 0
             return side
         side[trial.active] = trial.pieces
-        if careful and (leaving := (trial.pieces == 0).nonzero()[0]).size > FEW_LEAVING:
+        dense = 2 * trial.active.size > side.size
+        if careful and dense and (leaving := (trial.pieces == 0).nonzero()[0]).size > FEW_LEAVING:
             stay = np.delete(leaving, np.abs(trial.z[leaving]).argmax())
             side[trial.active[stay]] = trial.side[trial.active[stay]]
         over, later = trial.over, self._channels
