@@ -49,9 +49,9 @@ CAREFUL: Final = 4
 """First steps in which, where most rows are active, only the worst of many with a wrong multiplier leaves."""
 FEW_LEAVING: Final = 3
 """Rows that are not many."""
-MOST_DEPENDENT: Final = 3
+MOST_DEPENDENT: Final = 1
 """Sets of dependent rows after which the search is given up: it leads from one to the next."""
-MOST_STEPS: Final = 60
+MOST_STEPS: Final = 50
 """Steps of either method."""
 
 Side = NDArray[np.int8]

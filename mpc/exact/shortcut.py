@@ -27,8 +27,6 @@ Flags = NDArray[np.bool_]
 LARGEST_MAP: Final = 2**20
 """Entries beyond which there is no shortcut: 8 MiB, as much as a core's caches hold.  50 steps of the paper's problem
 have 16 k entries, 400 steps 970 k."""
-MOST_STEPS: Final = {"axes": 50, "all": 30}
-"""Steps of the active set method after which the whole QP's solver takes over: it is as fast."""
 
 
 class Shortcut:
@@ -128,7 +126,7 @@ class Shortcut:
             found, settled = self._by_axes(plan, free, within, u_before, starts)
             way = Way.WHOLE if found is None else Way.AXES
             if found is None and settled and self._all is not None:
-                found = self._all.solve(plan, free, starts, most=MOST_STEPS["all"])
+                found = self._all.solve(plan, free, starts)
             if found is not None:
                 self._side = found.active.side
                 return self._answer(found, way, started)
@@ -158,7 +156,7 @@ class Shortcut:
             own = group.rows
             if within[own].all():
                 continue
-            found = group.solve(plan, values, starts, most=MOST_STEPS["axes"])
+            found = group.solve(plan, values, starts)
             if found is None:
                 return None, False
             plan, steps = found.plan, steps + found.active.steps
@@ -216,7 +214,7 @@ class Shortcut:
         if self._all is not None:
             near = self._all.near(multipliers.ravel(), free)
             self._side = near
-            found = self._all.solve(plan, free, [near], most=MOST_STEPS["all"])
+            found = self._all.solve(plan, free, [near])
             if found is not None:
                 self._side = found.active.side
                 answer = self._answer(found, Way.WHOLE, started)
@@ -260,10 +258,10 @@ class _Group:
         self._lower, self._upper = part.lower.ravel(), part.upper.ravel()
         self._set = ActiveSet(half.T @ half, l1, l2, part.l1.size)
 
-    def solve(self, plan: Array, free: Array, starts: list[Side], *, most: int) -> _Found | None:
+    def solve(self, plan: Array, free: Array, starts: list[Side]) -> _Found | None:
         """The optimum over these rows alone, from one without them; of values and sides of all rows."""
         own = self.rows
-        found = self._set.solve(free[own], self._lower, self._upper, [side[own] for side in starts], most=most)
+        found = self._set.solve(free[own], self._lower, self._upper, [side[own] for side in starts])
         if found is None:
             return None
         active = found.z.nonzero()[0]
