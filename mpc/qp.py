@@ -31,6 +31,10 @@ class QP:
     """min 1/2 x' P x + c' x  subject to  A x = b,  h_l <= G x <= h_u,  x_l <= x <= x_u.
 
     Matrices are dense or sparse (csc); bounds may be infinite.  Eq. (27), with rows bounded from both sides.
+
+    Attributes:
+        later: which of the bounds of [x; G x] is the same one step later in the plan, its own at the last step; None
+            where that is not known.  What is active moves one step earlier from one period to the next.
     """
 
     P: Matrix
@@ -42,6 +46,7 @@ class QP:
     h_u: Array
     x_l: Array
     x_u: Array
+    later: Indices | None = None
 
     def with_vectors(self, vectors: Vectors) -> QP:
         """The same matrices and box with other vectors."""
