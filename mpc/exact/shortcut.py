@@ -67,6 +67,8 @@ class Shortcut:
         self._later = channels[of_states], np.flatnonzero(of_states)
         self._now = channels[~of_states], np.flatnonzero(~of_states)
         self._lower, self._upper = rows.lower.ravel(), rows.upper.ravel()
+        endless = np.isinf(rows.lower) + 2 * np.isinf(rows.upper)
+        self._uneven = bool((endless != endless[0]).any())  # some steps have bounds that others lack
         self._steps, self._values = np.empty((N, nu)), np.empty(rows.lower.shape)
         self._side: Side = np.zeros(rows.lower.size, np.int8)
         self._no_slacks = read_only(np.zeros((N, rows.soft.size)))
@@ -145,6 +147,8 @@ class Shortcut:
         """The last active set moved one step earlier, and as it was."""
         moved, m = np.zeros_like(self._side), self._rows.l1.size
         moved[:-m] = self._side[m:]
+        if self._uneven:
+            moved[np.isinf(np.where(moved > 0, self._upper, self._lower))] = 0
         return [moved, self._side]
 
     def _by_axes(
