@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -166,7 +167,7 @@ class Rows:
     input: Indices
     names: tuple[str, ...]
 
-    @property
+    @cached_property
     def soft(self) -> Indices:
         """(m_s,) which rows are soft."""
         return np.flatnonzero(np.isfinite(self.l1))

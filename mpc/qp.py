@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Protocol, TypeAlias
 
 import numpy as np
@@ -30,6 +31,10 @@ class QP:
     """min 1/2 x' P x + c' x  subject to  A x = b,  h_l <= G x <= h_u,  x_l <= x <= x_u.
 
     Matrices are dense or sparse (csc); bounds may be infinite.  Eq. (27), with rows bounded from both sides.
+
+    Attributes:
+        later: which of the bounds of [x; G x] is the same one step later in the plan, its own at the last step; None
+            where that is not known.  What is active moves one step earlier from one period to the next.
     """
 
     P: Matrix
@@ -41,6 +46,7 @@ class QP:
     h_u: Array
     x_l: Array
     x_u: Array
+    later: Indices | None = None
 
     def with_vectors(self, vectors: Vectors) -> QP:
         """The same matrices and box with other vectors."""
@@ -94,13 +100,16 @@ class QPRows:
 
     def split(self, multipliers: Array) -> tuple[Array, Array]:
         """The inverse: multipliers of the QP's rows (N K,) and of inputs (N nu,)."""
-        z = multipliers[:, self.origin]
-        upward = np.where(np.isneginf(self.lower) & np.isfinite(self.upper), np.maximum(z, 0.0), z)
-        z = np.where(np.isposinf(self.upper), np.minimum(z, 0.0), upward)
-        z_inputs = np.zeros(self.u_min.shape)
-        for row in self.boxed:
-            z_inputs[:, self.whole.input[row]] += multipliers[:, row]
-        return z.ravel(), z_inputs.ravel()
+        least, most, boxed = self._signs
+        z = np.minimum(np.maximum(multipliers[:, self.origin], least), most)
+        return z.ravel(), np.dot(multipliers, boxed).ravel()
+
+    @cached_property
+    def _signs(self) -> tuple[Array, Array, Array]:
+        """Bounds (N, K) that rows of one side set to their multipliers, and (m, nu) which input a row bounds."""
+        boxed = np.zeros((len(self.whole.C), self.u_min.shape[1]))
+        boxed[self.boxed, self.whole.input[self.boxed]] = 1.0
+        return np.where(np.isneginf(self.lower), 0.0, -np.inf), np.where(np.isposinf(self.upper), 0.0, np.inf), boxed
 
 
 def qp_rows(problem: Problem) -> QPRows:

@@ -14,12 +14,12 @@ import numpy as np
 import scipy.linalg
 
 from mpc.constraints import Constraint
-from mpc.exact.polish import polish
 from mpc.ocp import Problem, Rest
 from mpc.qp import QP, Solution, kkt_residuals
 from mpc.solvers._common import start
 from mpc.solvers.daqp_dense import DaqpDense
 from quadsim.state import Array
+from scenarios.bench.polish import polish
 
 
 @dataclass(frozen=True, kw_only=True)

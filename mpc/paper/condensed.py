@@ -16,7 +16,7 @@ from mpc.ocp import Problem, Rest
 from mpc.paper.cost import cost
 from mpc.paper.prediction import Prediction, prediction
 from mpc.qp import QP, QPRows, Solution, Vectors, qp_rows
-from quadsim.state import Array
+from quadsim.state import Array, Indices
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -125,6 +125,7 @@ class Condensed:
             h_u=np.zeros(rows.lower.size),
             x_l=np.concatenate([rows.u_min.ravel(), np.zeros(N * m_s)]),
             x_u=np.concatenate([rows.u_max.ravel(), np.full(N * m_s, np.inf)]),
+            later=_one_step_later([nu, m_s, len(rows.C)], N),
         )
         nothing = np.zeros((N, problem.objective.C_r.shape[0]))
         self.qp = self._blank.with_vectors(self.vectors(np.zeros(model.n), nothing, model.u_bar))
@@ -162,13 +163,23 @@ class Condensed:
             slacks: (N, m_s).
             multipliers: (N, m), positive at upper bounds and negative at lower ones.
         """
-        z, z_inputs = self._rows.split(multipliers)
-        soft = self._problem.rows.soft
-        l1, l2 = self._problem.rows.l1[soft], self._problem.rows.l2[soft]
-        # Stationarity of a slack: l1 + 2 l2 e - |z| + z_box = 0.
-        z_slacks = np.minimum(np.abs(multipliers[:, soft]) - l1 - 2.0 * l2 * slacks, 0.0)
-        x = np.concatenate([plan.ravel(), slacks.ravel()])
-        return replace(like, x=x, y=self._blank.b, z=z, z_box=np.concatenate([z_inputs, z_slacks.ravel()]))
+        (z, z_box), x, soft = self._rows.split(multipliers), plan.ravel(), self._problem.rows.soft
+        if soft.size:
+            l1, l2 = self._problem.rows.l1[soft], self._problem.rows.l2[soft]
+            # Stationarity of a slack: l1 + 2 l2 e - |z| + z_box = 0.
+            z_slacks = np.minimum(np.abs(multipliers[:, soft]) - l1 - 2.0 * l2 * slacks, 0.0)
+            x, z_box = np.append(x, slacks), np.append(z_box, z_slacks)
+        return replace(like, x=x, y=self._blank.b, z=z, z_box=z_box)
+
+
+def _one_step_later(sizes: list[int], N: int) -> Indices:
+    """See `mpc.qp.QP.later`, of blocks that have so many entries for each of N steps."""
+    found, start = [], 0
+    for size in sizes:
+        own = start + np.arange(N * size)
+        found.append(np.concatenate([own[size:], own[-size:] if size else own]))
+        start += own.size
+    return np.concatenate(found)
 
 
 def condensed(problem: Problem) -> Condensed:

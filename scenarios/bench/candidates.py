@@ -10,7 +10,6 @@ from typing import Final
 import numpy as np
 
 from mpc.constrained import ConstrainedMPC
-from mpc.exact.polish import polish
 from mpc.exact.shortcut import with_shortcut
 from mpc.ocp import Problem, Rest
 from mpc.paper.condensed import condensed
@@ -18,6 +17,7 @@ from mpc.qp import Formulation, kkt_residuals
 from mpc.solvers import SOLVERS, Answer, QPSolver, Solver, make_backend
 from quadsim.controller import ACCEPTED, Command
 from quadsim.state import Array
+from scenarios.bench.polish import polish
 from scenarios.bench.queries import QueriedController, Queries
 
 WITH_SHORTCUT: Final = ("daqp",)
@@ -133,7 +133,7 @@ class Reference:
 
 
 def reference_optima(problem: Problem, queries: Queries, periods: Sequence[int]) -> Reference:
-    """Solve the periods' QPs in closed form; see `mpc.exact.polish`."""
+    """Solve the periods' QPs in closed form; see `scenarios.bench.polish`."""
     formulation, backend = condensed(problem), make_backend(REFERENCE_SOLVER)
     backend.setup(formulation.qp)
     inputs, worst = {}, 0.0

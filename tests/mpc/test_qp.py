@@ -9,7 +9,6 @@ import pytest
 from support import flight_queries, paper_problem, paper_reference
 
 from mpc.constraints import Constraint
-from mpc.exact.polish import polish
 from mpc.exact.shortcut import Shortcut
 from mpc.paper.condensed import condensed
 from mpc.qp import QP, Backend, Formulation, Solution, Vectors, kkt_residuals
@@ -18,6 +17,7 @@ from mpc.solvers.piqp_dense import PiqpDense
 from mpc.staged import Staged
 from quadsim.controller import SOLVED
 from quadsim.state import Array
+from scenarios.bench.polish import polish
 from scenarios.flight import Flight
 
 STATE = np.zeros(12)

@@ -16,7 +16,6 @@ from ocp_peer import Period
 from support import changing_period, flight_queries, paper_problem, paper_reference, random_problem, with_terms
 
 from mpc.constraints import Penalty
-from mpc.exact.polish import polish
 from mpc.nonlinear.linearise import linearise
 from mpc.nonlinear.model import nonlinear_model
 from mpc.ocp import Problem, Rest
@@ -31,6 +30,7 @@ from quadsim.controller import SOLVED
 from quadsim.errors import ParameterError
 from quadsim.state import Array
 from quadsim.vehicle import Vehicle
+from scenarios.bench.polish import polish
 from scenarios.flight import Flight
 
 LAG = 0.05

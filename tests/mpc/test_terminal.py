@@ -10,7 +10,6 @@ import scipy.linalg
 from support import paper_problem, random_problem
 
 from mpc.exact.axes import axes
-from mpc.exact.polish import polish
 from mpc.exact.shortcut import Shortcut
 from mpc.ocp import Objective, Problem, Rest, lqr_terminal_weight
 from mpc.paper.condensed import Condensed
@@ -21,6 +20,7 @@ from mpc.solvers.piqp_sparse import PiqpMultistage
 from mpc.staged import Staged
 from quadsim.errors import ParameterError
 from quadsim.state import Array
+from scenarios.bench.polish import polish
 
 
 def terminated(problem: Problem) -> Problem:
