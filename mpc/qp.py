@@ -42,9 +42,14 @@ class QP:
     x_l: Array
     x_u: Array
 
+    @property
+    def vectors(self) -> Vectors:
+        """The vectors that it is written with."""
+        return Vectors(c=self.c, b=self.b, h_l=self.h_l, h_u=self.h_u)
+
     def with_vectors(self, vectors: Vectors) -> QP:
         """The same matrices and box with other vectors."""
-        return replace(self, c=vectors.c, b=vectors.b, h_l=vectors.h_l, h_u=vectors.h_u)
+        return replace(self, **vars(vectors))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -207,14 +212,6 @@ class Backend(Protocol):
 
     def solve(self, vectors: Vectors) -> Solution:
         """Solve with new vectors; whatever happens is in the solution's status."""
-        ...
-
-
-class FormulationBuilder(Protocol):
-    """Builds a formulation for a constrained problem."""
-
-    def __call__(self, problem: Problem) -> Formulation:
-        """Build it."""
         ...
 
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from mpc.ocp import Problem, Rest
 from mpc.solvers import Answer, refusal
-from mpc.solvers.piqp_sparse import PiqpChanging
+from mpc.solvers.piqp_backends import PiqpChanging
 from mpc.staged import Staged
 from quadsim.controller import SOLVED
 from quadsim.state import Array

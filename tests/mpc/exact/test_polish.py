@@ -12,7 +12,7 @@ from mpc.exact.polish import polish
 from mpc.paper.condensed import condensed
 from mpc.qp import kkt_residuals
 from mpc.solvers import SOLVERS, make_backend
-from mpc.solvers.piqp_dense import PiqpDense
+from mpc.solvers.piqp_backends import PiqpDense
 
 
 @pytest.mark.parametrize("name", ["piqp-dense", "piqp-multistage"])

@@ -22,7 +22,7 @@ from scripted_controller import (
 from mpc.fallback.completion import CompletedMoment
 from mpc.fallback.contract import FAILURES
 from mpc.fallback.settings import FallbackSettings
-from mpc.solvers._piqp import STATUS
+from mpc.solvers.piqp_backends import STATUS
 from quadsim.controller import ACCEPTED, Moment, Phase
 from quadsim.errors import CommandError, ParameterError
 from quadsim.state import INDEX, VELOCITY, Array
