@@ -15,9 +15,9 @@ from make_numbers import fly, markdown
 from quadsim.controller import SOLVED
 from quadsim.flight.audit import Finding
 from quadsim.flight.metrics import peak_tilt, tracking
-from scenarios.loading import scenario_names
 from scenarios.run import Flight
 from scenarios.schema.scenario import Group, LostSpec
+from scenarios.shipped import scenario_names
 
 PAGE = Path(__file__).resolve().parent / "scenarios.md"
 TITLES: dict[Group, str] = {

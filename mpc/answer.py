@@ -23,16 +23,14 @@ BOUND_TOLERANCE: Final = 1e-6
 class ActuatorBounds:
     """Hard bounds on rotor speeds, Eq. (20), and on their steps from one period to the next, Eq. (15).
 
-    Attributes:
-        u_min, u_max: (4,) speeds [rad/s], finite and not negative: rotors turn one way.
-        delta_min, delta_max: (4,) steps u(k) - u(k-1) [rad/s]; infinite where there is no bound.
-
     Raises:
         ParameterError: bounds that are not four numbers each, are not in order, or that forbid holding a speed.
     """
 
+    # (4,) speeds [rad/s], finite and not negative: rotors turn one way
     u_min: Array
     u_max: Array
+    # (4,) steps u(k) - u(k-1) [rad/s]; infinite where there is no bound
     delta_min: Array
     delta_max: Array
 

@@ -18,18 +18,12 @@ class LinearModel:
 
     Eq. (1) prints u(k) for the deviation; taken literally, hover would predict a climb.  A xi_bar = xi_bar at any
     hover position, so only the input needs the offset.
-
-    Attributes:
-        A: (n, n) state matrix.
-        B: (n, nu) input matrix.
-        u_bar: (nu,) input of the equilibrium, for a quadrotor omega_bar on all rotors [rad/s].
-        period: tau_s [s].
     """
 
-    A: Array
-    B: Array
-    u_bar: Array
-    period: float
+    A: Array  # (n, n) state matrix
+    B: Array  # (n, nu) input matrix
+    u_bar: Array  # (nu,) input of the equilibrium, for a quadrotor omega_bar on all rotors [rad/s]
+    period: float  # tau_s [s]
 
     @property
     def n(self) -> int:

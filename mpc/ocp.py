@@ -38,22 +38,15 @@ class Rest(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class Objective:
-    """The cost of Eq. (5), with two terms that the paper does not have.
+    """The cost of Eq. (5), with two terms that the paper does not have."""
 
-    Attributes:
-        C_r: (n_r, n) regulated outputs y_r = C_r xi.  Eq. (4), where the paper prints n_r x n_r.
-        Q_y: (n_r, n_r) weight of the output error, symmetric positive definite.
-        Q_u: (nu, nu) weight of u - u_bar, symmetric positive definite.
-        Q_d: (nu, nu) weight of an input's change from one step to the next, symmetric positive semidefinite; None for
-            none.
-        P: (n, n) weight of the last state's distance from x_s + C_r^+ (y_d - C_r x_s), in place of Q_y's, symmetric
-            positive semidefinite; None for none.
-    """
-
-    C_r: Array
-    Q_y: Array
-    Q_u: Array
+    C_r: Array  # (n_r, n) regulated outputs y_r = C_r xi. Eq. (4), where the paper prints n_r x n_r
+    Q_y: Array  # (n_r, n_r) weight of the output error, symmetric positive definite
+    Q_u: Array  # (nu, nu) weight of u - u_bar, symmetric positive definite
+    # (nu, nu) weight of an input's change from one step to the next, symmetric positive semidefinite; None for none
     Q_d: Array | None = None
+    # (n, n) weight of the last state's distance from x_s + C_r^+ (y_d - C_r x_s), in place of Q_y's, symmetric positive
+    # semidefinite; None for none
     P: Array | None = None
 
     def __post_init__(self) -> None:
@@ -105,21 +98,13 @@ def lqr_terminal_weight(model: LinearModel, objective: Objective) -> Array:
 
 @dataclass(frozen=True, kw_only=True)
 class Problem:
-    """Everything that defines a controller but the way its optimum is found.
+    """Everything that defines a controller but the way its optimum is found."""
 
-    Attributes:
-        model: the prediction model.
-        horizon: N, steps.
-        objective: what is minimised.
-        bounds: the paper's constraints; None for none.
-        constraints: others.
-    """
-
-    model: LinearModel
-    horizon: int
-    objective: Objective
-    bounds: Bounds | None = None
-    constraints: tuple[Constraint, ...] = ()
+    model: LinearModel  # the prediction model
+    horizon: int  # N, steps
+    objective: Objective  # what is minimised
+    bounds: Bounds | None = None  # the paper's constraints; None for none
+    constraints: tuple[Constraint, ...] = ()  # others
 
     def __post_init__(self) -> None:
         if not isinstance(self.horizon, int) or self.horizon < 1:

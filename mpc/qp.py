@@ -54,33 +54,22 @@ class QP:
 
 @dataclass(frozen=True, kw_only=True)
 class QPRows:
-    """A problem's rows as a QP has them: bounds of single inputs in the box, a soft row as two with the same slack.
+    """A problem's rows as a QP has them: bounds of single inputs in the box, a soft row as two with the same slack."""
 
-    Attributes:
-        C: (K, n).
-        D: (K, nu).
-        E: (K, nu).
-        slack: (K, m_s) how slacks enter.
-        lower, upper: (N, K).
-        of_states: (K,) see `mpc.constraints.Rows`.
-        u_min, u_max: (N, nu) the box.
-        origin: (K,) which of the problem's rows each is.
-        boxed: the problem's rows in the box.
-        whole: the problem's rows.
-    """
-
-    C: Array
-    D: Array
-    E: Array
-    slack: Array
+    C: Array  # (K, n)
+    D: Array  # (K, nu)
+    E: Array  # (K, nu)
+    slack: Array  # (K, m_s) how slacks enter
+    # (N, K)
     lower: Array
     upper: Array
-    of_states: np.ndarray[tuple[int], np.dtype[np.bool_]]
+    of_states: np.ndarray[tuple[int], np.dtype[np.bool_]]  # (K,) see `mpc.constraints.Rows`
+    # (N, nu) the box
     u_min: Array
     u_max: Array
-    origin: Indices
-    boxed: Indices
-    whole: Rows
+    origin: Indices  # (K,) which of the problem's rows each is
+    boxed: Indices  # the problem's rows in the box
+    whole: Rows  # the problem's rows
 
     def multipliers(self, z: Array, z_inputs: Array) -> Array:
         """(N, m) multipliers of the problem's rows, from those of the QP's rows (N K,) and of inputs (N nu,)."""
@@ -151,31 +140,18 @@ def qp_rows(problem: Problem) -> QPRows:
 
 @dataclass(frozen=True, kw_only=True)
 class Solution:
-    """What a back end answers, or a shortcut; arrays are no back end's own, and not to be written to.
+    """What a back end answers, or a shortcut; arrays are no back end's own, and not to be written to."""
 
-    Attributes:
-        x: primal point.
-        y: multipliers of A x = b.
-        z: multipliers of h_l <= G x <= h_u, positive at the upper side, negative at the lower.
-        z_box: multipliers of x_l <= x <= x_u, signed likewise.
-        status: `solved`, or the back end's name for what went wrong; of a shortcut, see `mpc.exact.shortcut`.
-        iterations: of the back end.
-        active: inequality rows and box entries active at the point.
-        primal_residual: as the back end reports it, before any polish; NaN where it reports none.
-        dual_residual: likewise.
-        solve_s: wall time inside the back end, updates included, and what shortcuts took before it [s].
-    """
-
-    x: Array
-    y: Array
-    z: Array
-    z_box: Array
-    status: str
-    iterations: int
-    active: int
-    primal_residual: float
-    dual_residual: float
-    solve_s: float
+    x: Array  # primal point
+    y: Array  # multipliers of A x = b
+    z: Array  # multipliers of h_l <= G x <= h_u, positive at the upper side, negative at the lower
+    z_box: Array  # multipliers of x_l <= x <= x_u, signed likewise
+    status: str  # `solved`, or the back end's name for what went wrong; of a shortcut, see `mpc.exact.shortcut`
+    iterations: int  # of the back end
+    active: int  # inequality rows and box entries active at the point
+    primal_residual: float  # as the back end reports it, before any polish; NaN where it reports none
+    dual_residual: float  # likewise
+    solve_s: float  # wall time inside the back end, updates included, and what shortcuts took before it [s]
 
 
 class Formulation(Protocol):
@@ -217,19 +193,12 @@ class Backend(Protocol):
 
 @dataclass(frozen=True, kw_only=True)
 class KKTResiduals:
-    """How far a point is from optimal, each as the largest absolute entry; all zero at the optimum.
+    """How far a point is from optimal, each as the largest absolute entry; all zero at the optimum."""
 
-    Attributes:
-        stationarity: P x + c + A' y + G' z + z_box.
-        primal: violation of A x = b, h_l <= G x <= h_u, x_l <= x <= x_u.
-        complementarity: multiplier times distance to the bound it belongs to.
-        dual: size of multipliers with no bound to belong to (an infinite one).
-    """
-
-    stationarity: float
-    primal: float
-    complementarity: float
-    dual: float
+    stationarity: float  # P x + c + A' y + G' z + z_box
+    primal: float  # violation of A x = b, h_l <= G x <= h_u, x_l <= x <= x_u
+    complementarity: float  # multiplier times distance to the bound it belongs to
+    dual: float  # size of multipliers with no bound to belong to (an infinite one)
 
     @property
     def worst(self) -> float:

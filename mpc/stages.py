@@ -65,34 +65,24 @@ def _present(block: Array, rounding: float) -> NDArray[np.bool_]:
 
 @dataclass(frozen=True, kw_only=True)
 class Layout:
-    """Where everything is among the variables.
+    """Where everything is among the variables."""
 
-    Attributes:
-        N, n, nu, L, M: horizon, states, inputs, steps in the first stage and in each other.
-        head: (L nu,) v_0.
-        tail: (J - 1, n + M nu) [s_j, v_j].
-        starts: (J, n) s_1 .. s_J.
-        inputs: (N, nu) in time order.
-        slacks: (N, n_s) in time order; n_s = 0 where bounds are hard.
-        ends: (J, n) equality rows.
-        lasts, firsts: (J - 1, nu) the last inputs of each stage but the last, and the first of the one after it.
-        size: of all.
-    """
-
+    # horizon, states, inputs, steps in the first stage and in each other
     N: int
     n: int
     nu: int
     L: int
     M: int
-    head: Indices
-    tail: Indices
-    starts: Indices
-    inputs: Indices
-    slacks: Indices
-    ends: Indices
+    head: Indices  # (L nu,) v_0
+    tail: Indices  # (J - 1, n + M nu) [s_j, v_j]
+    starts: Indices  # (J, n) s_1 .. s_J
+    inputs: Indices  # (N, nu) in time order
+    slacks: Indices  # (N, n_s) in time order; n_s = 0 where bounds are hard
+    ends: Indices  # (J, n) equality rows
+    # (J - 1, nu) the last inputs of each stage but the last, and the first of the one after it
     lasts: Indices
     firsts: Indices
-    size: int
+    size: int  # of all
 
 
 def layout(N: int, n: int, nu: int, n_s: int, M: int) -> Layout:
@@ -149,25 +139,15 @@ def condense_stages(start: Array, A: Array, B: Array, c: Array) -> Array:
 
 @dataclass(frozen=True, kw_only=True)
 class Matrices:
-    """What the A_i and B_i of a horizon make of the QP; to be used for as many periods as these hold.
+    """What the A_i and B_i of a horizon make of the QP; to be used for as many periods as these hold."""
 
-    Attributes:
-        A: (N, n, n), A_i.
-        B: (N, n, nu), B_i.
-        head: (1, L + 1, n, L nu) slopes of the states of the first stage by v_0.
-        tail: (J - 1, M + 1, n, n + M nu) those of the others by [s_j, v_j].
-        P: cost.
-        dynamics: equality rows.
-        rows: inequality rows.
-    """
-
-    A: Array
-    B: Array
-    head: Array
-    tail: Array
-    P: csc_matrix
-    dynamics: csc_matrix
-    rows: csc_matrix
+    A: Array  # (N, n, n), A_i
+    B: Array  # (N, n, nu), B_i
+    head: Array  # (1, L + 1, n, L nu) slopes of the states of the first stage by v_0
+    tail: Array  # (J - 1, M + 1, n, n + M nu) those of the others by [s_j, v_j]
+    P: csc_matrix  # cost
+    dynamics: csc_matrix  # equality rows
+    rows: csc_matrix  # inequality rows
 
 
 class MatrixBuilder:

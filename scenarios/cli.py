@@ -19,8 +19,7 @@ from quadsim.errors import QuadsimError, printable
 from scenarios.commands import EXIT_FAILED, EXIT_WRONG_INPUT, find_command
 from scenarios.gc_tuning import collect_rarely
 
-_LINES = "\n"
-"""What a message of ours may be made of besides text: one with many problems has a line for each."""
+_LINES = "\n"  # what a message of ours may be made of besides text: one with many problems has a line for each
 
 
 class _Parser(argparse.ArgumentParser):

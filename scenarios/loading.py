@@ -5,11 +5,11 @@ from __future__ import annotations
 import copy
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 from pydantic import ValidationError
 
-from quadsim.errors import FileError, ParameterError, UnknownNameError
+from quadsim.errors import FileError, ParameterError
 from quadsim.flight.ground import AIRBORNE, TOUCH, clearance
 from quadsim.sim.airframe import outline
 from quadsim.sim.effects.load import mass_properties
@@ -23,6 +23,7 @@ from scenarios.schema.plugin import located as located_controller
 from scenarios.schema.problems import ScenarioError, describe
 from scenarios.schema.scenario import Scenario
 from scenarios.schema.settings import apply_setting
+from scenarios.shipped import LIBRARY, scenario_path
 
 
 def check_parts(scenario: Scenario) -> None:
@@ -55,29 +56,6 @@ def _check_start(scenario: Scenario, vehicle: Vehicle) -> None:
     if scenario.initial.cold and feet > AIRBORNE:
         rule = f"on the floor where initial.cold is true, or it would fall: its feet are {feet:.3g} m above it"
         raise ParameterError("initial", "position", position, rule)
-
-
-LIBRARY: Final = Path(__file__).resolve().parent / "library"
-
-
-def scenario_names() -> list[str]:
-    """Names of the scenarios that ship, sorted."""
-    return sorted(path.stem for path in LIBRARY.glob("*.toml"))
-
-
-def scenario_path(name: str) -> Path:
-    """The file of a library name, or the path itself when it ends in `.toml`.
-
-    Raises:
-        FileError, UnknownNameError: there is none.
-    """
-    if name.endswith(".toml"):
-        if not Path(name).is_file():
-            raise FileError(name, "no such scenario file")
-        return Path(name)
-    if name not in scenario_names():
-        raise UnknownNameError("scenario", name, scenario_names(), hint="or give a path ending in .toml")
-    return LIBRARY / f"{name}.toml"
 
 
 def load_scenario(name: str, settings: Sequence[str] = ()) -> Scenario:

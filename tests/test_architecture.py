@@ -205,6 +205,11 @@ def test_help_loads_no_library() -> None:
     assert not loaded & declared()
 
 
+def test_the_list_loads_neither_the_simulator_nor_what_checks_scenarios() -> None:
+    loaded = loaded_by("import scenarios.cli\nscenarios.cli.main(['list'])")
+    assert not loaded & {"mujoco", "pydantic", "pyarrow", "pandas"}
+
+
 def test_help_answers_at_once() -> None:
     """The best of five starts: a busy machine is slow now and then, slow imports are so each time."""
     times = []

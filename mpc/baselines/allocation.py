@@ -24,23 +24,16 @@ from quadsim.vehicle import Vehicle
 
 WEIGHTS: Final = (30.0, 1000.0, 1000.0, 1.0)
 """Weights of thrust, roll, pitch and yaw in stage 2: squared, about a thousandfold from one to the next."""
-LARGEST_SPEED: Final = 1e4
-"""Stands for no upper bound [rad/s]; no rotor gets there."""
+LARGEST_SPEED: Final = 1e4  # stands for no upper bound [rad/s]; no rotor gets there
 
 
 @dataclass(frozen=True, kw_only=True)
 class Allocation:
-    """A vehicle's map between squared rotor speeds [rad^2/s^2] and the wrench [U, tau_x, tau_y, tau_z] [N, N m].
+    """A vehicle's map between squared rotor speeds [rad^2/s^2] and the wrench [U, tau_x, tau_y, tau_z] [N, N m]."""
 
-    Attributes:
-        M: (4, 4), wrench = M s.
-        inverse: (4, 4), s = inverse wrench.
-        scale: (4,) wrench that one rotor at hover speed gives, what is missed being counted in these units.
-    """
-
-    M: Array
-    inverse: Array
-    scale: Array
+    M: Array  # (4, 4), wrench = M s
+    inverse: Array  # (4, 4), s = inverse wrench
+    scale: Array  # (4,) wrench that one rotor at hover speed gives, what is missed being counted in these units
 
 
 def make_allocation(vehicle: Vehicle) -> Allocation:

@@ -10,10 +10,8 @@ from mpc.baselines.limits import require_positive, require_within
 from quadsim.errors import ParameterError
 from quadsim.vehicle import Vehicle
 
-SEPARATION: Final = 2.0
-"""Bandwidth of each loop over that of the loop around it."""
-YAW_SHARE: Final = 0.4
-"""Bandwidth of heading over that of roll and pitch: about PX4's MC_YAW_P / MC_ROLL_P = 2.8 / 6.5."""
+SEPARATION: Final = 2.0  # bandwidth of each loop over that of the loop around it
+YAW_SHARE: Final = 0.4  # bandwidth of heading over that of roll and pitch: about PX4's MC_YAW_P / MC_ROLL_P = 2.8 / 6.5
 
 
 @dataclass(frozen=True, kw_only=True)

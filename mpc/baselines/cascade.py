@@ -36,46 +36,28 @@ LEAST_LIFT: Final = 0.2
 
 @dataclass(frozen=True, kw_only=True)
 class Gains:
-    """Gains and limits of the loops; all loops are normalised by mass and inertia.
+    """Gains and limits of the loops; all loops are normalised by mass and inertia."""
 
-    Attributes:
-        bandwidths: proportional gains [1/s].
-        velocity_integral: integral gain of the velocity loop over its proportional gain [1/s].
-        rate_integral: the same of the rate loop [1/s].
-        velocity_derivative: share of the measured acceleration that the velocity loop takes back.
-        rate_derivative: share of the measured angular acceleration that the rate loop takes back.
-        yaw_weight: share of the heading error that a thrust direction to be reached leaves; see `prioritised_error`.
-        tilt_max: largest tilt commanded [rad].
-        velocity_max: largest velocity commanded, horizontal and vertical [m/s].
-        rate_max: largest body rates commanded, roll, pitch, yaw [rad/s].
-    """
-
-    bandwidths: Bandwidths
-    velocity_integral: float
-    rate_integral: float
-    velocity_derivative: float
-    rate_derivative: float
+    bandwidths: Bandwidths  # proportional gains [1/s]
+    velocity_integral: float  # integral gain of the velocity loop over its proportional gain [1/s]
+    rate_integral: float  # the same of the rate loop [1/s]
+    velocity_derivative: float  # share of the measured acceleration that the velocity loop takes back
+    rate_derivative: float  # share of the measured angular acceleration that the rate loop takes back
+    # share of the heading error that a thrust direction to be reached leaves; see `prioritised_error`
     yaw_weight: float
-    tilt_max: float
-    velocity_max: float
-    rate_max: tuple[float, float, float]
+    tilt_max: float  # largest tilt commanded [rad]
+    velocity_max: float  # largest velocity commanded, horizontal and vertical [m/s]
+    rate_max: tuple[float, float, float]  # largest body rates commanded, roll, pitch, yaw [rad/s]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Memory:
-    """What the loops remember from one period to the next.
+    """What the loops remember from one period to the next."""
 
-    Attributes:
-        velocity_integral: (3,) world [m/s^2].
-        rate_integral: (3,) body [rad/s^2].
-        velocity: (3,) measured before, world [m/s]; None in the first period.
-        rates: (3,) measured before, body [rad/s]; None in the first period.
-    """
-
-    velocity_integral: Array
-    rate_integral: Array
-    velocity: Array | None = None
-    rates: Array | None = None
+    velocity_integral: Array  # (3,) world [m/s^2]
+    rate_integral: Array  # (3,) body [rad/s^2]
+    velocity: Array | None = None  # (3,) measured before, world [m/s]; None in the first period
+    rates: Array | None = None  # (3,) measured before, body [rad/s]; None in the first period
 
 
 def fresh_memory() -> Memory:
@@ -112,21 +94,13 @@ def force_within(force: Array, *, weight: float, largest: float, tilt: float) ->
 
 @dataclass(frozen=True, kw_only=True)
 class Body:
-    """What the loops know of the vehicle.
+    """What the loops know of the vehicle."""
 
-    Attributes:
-        mass: [kg].
-        gravity: [m/s^2].
-        inertia: (3,) principal moments [kg m^2].
-        thrust_max: largest thrust to command [N].
-        allocation: see there.
-    """
-
-    mass: float
-    gravity: float
-    inertia: Array
-    thrust_max: float
-    allocation: Allocation
+    mass: float  # [kg]
+    gravity: float  # [m/s^2]
+    inertia: Array  # (3,) principal moments [kg m^2]
+    thrust_max: float  # largest thrust to command [N]
+    allocation: Allocation  # see there
 
 
 def make_body(vehicle: Vehicle, allocation: Allocation, speed_max: float) -> Body:

@@ -29,8 +29,7 @@ LARGEST_DEVIATIONS: Final = {
 """Deviations that weigh alike, each in its state's unit, and alike with `SPEED_SHARE`; see `bryson_objective`."""
 HORIZONTAL: Final = [INDEX[name] for name in ("x", "vx", "y", "vy")]
 TILT: Final = [INDEX[name] for name in ("roll", "pitch")]
-SPEED_SHARE: Final = 0.05
-"""Deviation of a rotor's speed from hover that weighs as much, as a share of the hover speed."""
+SPEED_SHARE: Final = 0.05  # deviation of a rotor's speed from hover that weighs as much, as a share of the hover speed
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -13,58 +13,35 @@ from mpc.baselines.preview import Target, wrapped
 from quadsim.state import EULER, EULER_RATE, INDEX, POSITION, VELOCITY, Array, body_to_world, euler_to_body_rates
 from quadsim.vehicle import Vehicle
 
-LEAST_LIFT: Final = 0.2
-"""Share of the weight below which the wanted force does not fall.  Ours."""
+LEAST_LIFT: Final = 0.2  # share of the weight below which the wanted force does not fall; ours
 
 
 @dataclass(frozen=True, kw_only=True)
 class Gains:
-    """Gains per unit of mass and inertia: the papers' k_x is m k_x here, and their k_R is J k_R.
+    """Gains per unit of mass and inertia: the papers' k_x is m k_x here, and their k_R is J k_R."""
 
-    Attributes:
-        k_x: of the position error [1/s^2].
-        k_v: of the velocity error [1/s].
-        k_R: (3,) of the attitude error, about body x, y, z [1/s^2].
-        k_Omega: (3,) of the rate error [1/s].
-        k_i: of the integral of e_v + c_1 e_x [1/s^2]; 0 for none.
-        k_I: of the integral of e_Omega + c_2 e_R [1/s^2]; 0 for none.
-        c_1: [1/s].
-        c_2: [1/s].
-        sigma: largest magnitude of the acceleration of the position integral, each axis [m/s^2].
-        sigma_R: the same of the angular acceleration [rad/s^2].
-        tilt_max: largest tilt of the wanted force [rad].
-    """
-
-    k_x: float
-    k_v: float
-    k_R: Array
-    k_Omega: Array
-    k_i: float
-    k_I: float
-    c_1: float
-    c_2: float
-    sigma: float
-    sigma_R: float
-    tilt_max: float
+    k_x: float  # of the position error [1/s^2]
+    k_v: float  # of the velocity error [1/s]
+    k_R: Array  # (3,) of the attitude error, about body x, y, z [1/s^2]
+    k_Omega: Array  # (3,) of the rate error [1/s]
+    k_i: float  # of the integral of e_v + c_1 e_x [1/s^2]; 0 for none
+    k_I: float  # of the integral of e_Omega + c_2 e_R [1/s^2]; 0 for none
+    c_1: float  # [1/s]
+    c_2: float  # [1/s]
+    sigma: float  # largest magnitude of the acceleration of the position integral, each axis [m/s^2]
+    sigma_R: float  # the same of the angular acceleration [rad/s^2]
+    tilt_max: float  # largest tilt of the wanted force [rad]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Motion:
-    """A measured state in the law's terms.
+    """A measured state in the law's terms."""
 
-    Attributes:
-        position: x (3,), world [m].
-        velocity: v (3,), world [m/s].
-        attitude: R (3, 3), body to world.
-        rates: Omega (3,), body [rad/s].
-        yaw: [rad].
-    """
-
-    position: Array
-    velocity: Array
-    attitude: Array
-    rates: Array
-    yaw: float
+    position: Array  # x (3,), world [m]
+    velocity: Array  # v (3,), world [m/s]
+    attitude: Array  # R (3, 3), body to world
+    rates: Array  # Omega (3,), body [rad/s]
+    yaw: float  # [rad]
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -39,8 +39,7 @@ from quadsim.vehicle import N_ROTORS
 
 FAILURES: Final[tuple[type[Exception], ...]] = (FlightError, np.linalg.LinAlgError, ArithmeticError, RuntimeError)
 """What numerics and compiled back ends raise.  A programmer's mistakes (`TypeError`, `KeyError`, ...) end the run."""
-_MISTAKES: Final = (NotImplementedError, RecursionError)
-"""Kinds of `RuntimeError` that are a programmer's, too."""
+_MISTAKES: Final = (NotImplementedError, RecursionError)  # kinds of `RuntimeError` that are a programmer's, too
 
 
 _USUAL: Final = FallbackSettings()

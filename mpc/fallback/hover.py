@@ -29,28 +29,21 @@ from quadsim.errors import ParameterError
 from quadsim.state import EULER, EULER_RATE, INDEX, N_STATES, POSITION, VELOCITY, Array, read_only
 from quadsim.vehicle import N_ROTORS
 
-ACCEPTABLE_POSITION: Final = 0.5
-"""[m]"""
-ACCEPTABLE_VELOCITY: Final = 1.0
-"""[m/s]"""
-ACCEPTABLE_TILT: Final = 0.2
-"""[rad], yaw as well."""
-ACCEPTABLE_RATE: Final = 1.0
-"""[rad/s]"""
-ACCEPTABLE_ACCELERATION: Final = (2.0, 8.0, 8.0, 2.0)
-"""Along z [m/s^2], about x, y and z [rad/s^2]."""
+ACCEPTABLE_POSITION: Final = 0.5  # [m]
+ACCEPTABLE_VELOCITY: Final = 1.0  # [m/s]
+ACCEPTABLE_TILT: Final = 0.2  # [rad], yaw as well
+ACCEPTABLE_RATE: Final = 1.0  # [rad/s]
+ACCEPTABLE_ACCELERATION: Final = (2.0, 8.0, 8.0, 2.0)  # along z [m/s^2], about x, y and z [rad/s^2]
 LARGEST_CLIMB: Final = 2.0
 """Acceleration along z [m/s^2], beside what rest takes, beyond which height does not pull: rotors keep the range that
 levels the vehicle."""
-LARGEST_TURN: Final = 2.0
-"""The same of yaw [rad/s^2]."""
+LARGEST_TURN: Final = 2.0  # the same of yaw [rad/s^2]
 
 _POSITION: Final = list(POSITION)
 _VELOCITY: Final = list(VELOCITY)
 _SIDEWAYS: Final = [INDEX[name] for name in ("x", "vx", "y", "vy")]
 _TILTS: Final = [INDEX["roll"], INDEX["pitch"]]
-_ROLL_PITCH: Final = [1, 2]
-"""Rows of an acceleration (4,)."""
+_ROLL_PITCH: Final = [1, 2]  # rows of an acceleration (4,)
 
 
 def require_quadrotor(model: LinearModel) -> None:

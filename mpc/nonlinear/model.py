@@ -36,27 +36,16 @@ def _nothing() -> Array:
 
 @dataclass(frozen=True, kw_only=True)
 class NonlinearModel:
-    """x(k+1) = f(x(k), u(k)); see the module.  Another disturbance is a matter of `dataclasses.replace`.
+    """x(k+1) = f(x(k), u(k)); see the module.  Another disturbance is a matter of `dataclasses.replace`."""
 
-    Attributes:
-        effectiveness: (4, 4) takes squared rotor speeds to U / m [m/s^2] and I^-1 tau [rad/s^2].
-        gyration: (3,) of (Iyy - Izz) / Ixx, (Izz - Ixx) / Iyy, (Ixx - Iyy) / Izz.
-        gravity: g [m/s^2].
-        period: tau_s [s].
-        substeps: Runge-Kutta steps per period.
-        rotor_lag: time constant tau_r of the rotor speeds [s]; None for speeds that are the inputs.
-        acceleration: (3,) a of the disturbance, world frame [m/s^2].
-        angular_acceleration: (3,) alpha of the disturbance, body frame [rad/s^2].
-    """
-
-    effectiveness: Array
-    gyration: Array
-    gravity: float
-    period: float
-    substeps: int = SUBSTEPS
-    rotor_lag: float | None = None
-    acceleration: Array = field(default_factory=_nothing)
-    angular_acceleration: Array = field(default_factory=_nothing)
+    effectiveness: Array  # (4, 4) takes squared rotor speeds to U / m [m/s^2] and I^-1 tau [rad/s^2]
+    gyration: Array  # (3,) of (Iyy - Izz) / Ixx, (Izz - Ixx) / Iyy, (Ixx - Iyy) / Izz
+    gravity: float  # g [m/s^2]
+    period: float  # tau_s [s]
+    substeps: int = SUBSTEPS  # Runge-Kutta steps per period
+    rotor_lag: float | None = None  # time constant tau_r of the rotor speeds [s]; None for speeds that are the inputs
+    acceleration: Array = field(default_factory=_nothing)  # (3,) a of the disturbance, world frame [m/s^2]
+    angular_acceleration: Array = field(default_factory=_nothing)  # (3,) alpha of the disturbance, body frame [rad/s^2]
 
     def __post_init__(self) -> None:
         if not 0.0 < self.period < math.inf:
@@ -126,23 +115,14 @@ def advance(model: NonlinearModel, x: Array, u: Array) -> Array:
 
 @dataclass(frozen=True, kw_only=True)
 class Passage:
-    """One period's integration, with the K = 4 `substeps` instants in it at which the model was evaluated.
+    """One period's integration, with the K = 4 `substeps` instants in it at which the model was evaluated."""
 
-    Attributes:
-        end: (..., n) states at the end.
-        euler: (K, 3, ...) Euler angles at those instants [rad].
-        euler_rate: (K, 3, ...) their rates [rad/s].
-        drive: (K, 4, ...) U / m [m/s^2] and I^-1 tau [rad/s^2].
-        speeds: (K, 4, ...) rotor speeds [rad/s].
-        decay: (K,) share of the first rotor speeds still in these, 0 without lag.
-    """
-
-    end: Array
-    euler: Array
-    euler_rate: Array
-    drive: Array
-    speeds: Array
-    decay: Array
+    end: Array  # (..., n) states at the end
+    euler: Array  # (K, 3, ...) Euler angles at those instants [rad]
+    euler_rate: Array  # (K, 3, ...) their rates [rad/s]
+    drive: Array  # (K, 4, ...) U / m [m/s^2] and I^-1 tau [rad/s^2]
+    speeds: Array  # (K, 4, ...) rotor speeds [rad/s]
+    decay: Array  # (K,) share of the first rotor speeds still in these, 0 without lag
 
 
 def integrate(model: NonlinearModel, x: Array, u: Array) -> Passage:

@@ -24,18 +24,12 @@ class CondensedCost:
     """J = 1/2 v' H v + [F_x dx + F_y dy + F_d du]' v + const, for deviations from a rest state (x_s, u_s).
 
     With v = u - u_s the sequence of inputs, dx = x(k) - x_s, dy = y_d - C_r x_s and du = u(k-1) - u_s.
-
-    Attributes:
-        H: (N nu, N nu) symmetric positive definite.  Eq. (7).
-        F_x: (N nu, n).  Eq. (8).
-        F_y: (N nu, N n_r).  Eq. (9).
-        F_d: (N nu, nu), zero without a weight of changes.
     """
 
-    H: Array
-    F_x: Array
-    F_y: Array
-    F_d: Array
+    H: Array  # (N nu, N nu) symmetric positive definite. Eq. (7)
+    F_x: Array  # (N nu, n). Eq. (8)
+    F_y: Array  # (N nu, N n_r). Eq. (9)
+    F_d: Array  # (N nu, nu), zero without a weight of changes
 
 
 def condensed_cost(problem: Problem, maps: Prediction) -> CondensedCost:
@@ -57,15 +51,10 @@ def condensed_cost(problem: Problem, maps: Prediction) -> CondensedCost:
 
 @dataclass(frozen=True, kw_only=True)
 class RowMaps:
-    """Values (N, m) of rows: of_inputs v + of_state dx + of_rest, the first of them less E du.
+    """Values (N, m) of rows: of_inputs v + of_state dx + of_rest, the first of them less E du."""
 
-    Attributes:
-        of_inputs: (N, m, N nu) slopes in v = u - u_s.
-        of_state: (N, m, n) in dx = x(k) - x_s.
-    """
-
-    of_inputs: Array
-    of_state: Array
+    of_inputs: Array  # (N, m, N nu) slopes in v = u - u_s
+    of_state: Array  # (N, m, n) in dx = x(k) - x_s
 
 
 def row_maps(rows: Rows | QPRows, maps: Prediction) -> RowMaps:

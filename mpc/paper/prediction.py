@@ -15,14 +15,10 @@ class Prediction:
     """Stacked future states [xi(k+1); ...; xi(k+N)] = Phi xi(k) + Psi (u - u_bar).
 
     The paper's Phi_i and Psi_i are the i-th block rows; its selections Pi_i are the block columns themselves.
-
-    Attributes:
-        Phi: (N n, n).
-        Psi: (N n, N nu), block lower triangular.
     """
 
-    Phi: Array
-    Psi: Array
+    Phi: Array  # (N n, n)
+    Psi: Array  # (N n, N nu), block lower triangular
 
 
 def prediction(model: LinearModel, horizon: int) -> Prediction:

@@ -47,12 +47,10 @@ from quadsim.errors import ParameterError
 from quadsim.state import EULER, EULER_RATE, INDEX, N_STATES, REFERENCE_STATES, VELOCITY, Array
 from quadsim.vehicle import N_ROTORS, Vehicle
 
-SOLVER: Final = "piqp-multistage"
-"""Solves what the shortcuts leave."""
+SOLVER: Final = "piqp-multistage"  # solves what the shortcuts leave
 LONGEST_SPAN: Final = 0.25
 """Longest time between two measured states [s] for their difference to tell of a disturbance; a sensor of 4 Hz."""
-_SAME_TIME: Final = 1e-6
-"""[s]"""
+_SAME_TIME: Final = 1e-6  # [s]
 _YAW: Final = INDEX["yaw"]
 _MOVING: Final = [*VELOCITY, *EULER, *EULER_RATE]
 _REFERENCE: Final = list(REFERENCE_STATES)

@@ -39,19 +39,15 @@ from quadsim.errors import ParameterError
 from quadsim.state import INDEX, N_STATES, Array, read_only
 from quadsim.vehicle import Vehicle
 
-LARGEST_SHARE: Final = 0.5
-"""Of the room on either side of the middle of an output's bounds, no more is given up."""
-ERROR_SHARE: Final = 0.1
-"""Output error, as a share of that room, to which the correction answers..."""
+LARGEST_SHARE: Final = 0.5  # of the room on either side of the middle of an output's bounds, no more is given up
+ERROR_SHARE: Final = 0.1  # output error, as a share of that room, to which the correction answers...
 SPEED_SHARE: Final = 0.025
 """...with about this share of the hover speed (Bryson's rule; Bryson and Ho, 1975, "Applied Optimal Control")."""
-SHORTEST_LAG: Final = 1e-4
-"""Time constant of rotors [s] below which gains cannot be computed; far below any period."""
+SHORTEST_LAG: Final = 1e-4  # time constant of rotors [s] below which gains cannot be computed; far below any period
 
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(16)
 _ACCELERATED: Final = [INDEX[name] for name in ("vx", "vy", "vz", "roll_rate", "pitch_rate", "yaw_rate")]
-_TURNS: Final = np.array([0.0, 0.0, 0.0, 1.0, 1.0, 1.0])
-"""Which of them are angular."""
+_TURNS: Final = np.array([0.0, 0.0, 0.0, 1.0, 1.0, 1.0])  # which of them are angular
 
 
 @dataclass(frozen=True, kw_only=True)

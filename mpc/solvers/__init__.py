@@ -24,21 +24,13 @@ from quadsim.state import Array
 
 @dataclass(frozen=True)
 class SolverEntry:
-    """How a named solver is made, and one line about it.
+    """How a named solver is made, and one line about it."""
 
-    Attributes:
-        formulate: builds the form of the problem that the back end takes.
-        backend: `module:class` of the back end in this folder, imported when it is first used.
-        package: distribution that it needs, and what it is imported as.
-        description: one line.
-        extra: the extra of this project that installs the package; empty for one that is always there.
-    """
-
-    formulate: Callable[[Problem], Formulation]
-    backend: str
-    package: str
-    description: str
-    extra: str = "solvers"
+    formulate: Callable[[Problem], Formulation]  # builds the form of the problem that the back end takes
+    backend: str  # `module:class` of the back end in this folder, imported when it is first used
+    package: str  # distribution that it needs, and what it is imported as
+    description: str  # one line
+    extra: str = "solvers"  # the extra of this project that installs the package; empty for one that is always there
 
     @property
     def installed(self) -> bool:
@@ -134,19 +126,12 @@ class Way(StrEnum):
 
 @dataclass(frozen=True, kw_only=True)
 class Answer:
-    """An optimum as a plan.
+    """An optimum as a plan."""
 
-    Attributes:
-        plan: (N, nu) inputs [rad/s]; to be used only when the solution's status is accepted.
-        slacks: (N, m_s) by how much soft rows are violated.
-        solution: to the QP of the solver's formulation.
-        way: how it was found.
-    """
-
-    plan: Array
-    slacks: Array
-    solution: Solution
-    way: Way = Way.WHOLE
+    plan: Array  # (N, nu) inputs [rad/s]; to be used only when the solution's status is accepted
+    slacks: Array  # (N, m_s) by how much soft rows are violated
+    solution: Solution  # to the QP of the solver's formulation
+    way: Way = Way.WHOLE  # how it was found
 
 
 class Solver(Protocol):

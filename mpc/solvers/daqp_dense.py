@@ -31,8 +31,7 @@ STATUS: Final = {
     -6: "overdetermined_start",
     -7: "max_time",
 }
-_EQUALITY: Final = 5
-"""How DAQP marks a row that is always active."""
+_EQUALITY: Final = 5  # how DAQP marks a row that is always active
 
 
 class DaqpDense:

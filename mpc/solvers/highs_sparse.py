@@ -28,8 +28,7 @@ SETTINGS: Final[dict[str, Any]] = {
     "qp_iteration_limit": 6000,  # where it finds the optimum it takes 2000 to 5000
 }
 
-LARGEST_VIOLATION: Final = 1e-5
-"""Of any row or box entry by a point that HiGHS calls optimal [rad or rad/s]."""
+LARGEST_VIOLATION: Final = 1e-5  # of any row or box entry by a point that HiGHS calls optimal [rad or rad/s]
 
 STATUS: Final = {
     highspy.HighsModelStatus.kOptimal: SOLVED,

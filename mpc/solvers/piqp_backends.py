@@ -11,11 +11,9 @@ import piqp
 from mpc.qp import QP, Matrix, Solution, Vectors
 from quadsim.controller import SOLVED
 
-MAX_ITERATIONS: Final = 100
-"""Cap for hopeless data (NaN runs PIQP to its limit); the paper's QPs take 8 to 23."""
+MAX_ITERATIONS: Final = 100  # cap for hopeless data (NaN runs PIQP to its limit); the paper's QPs take 8 to 23
 
-ACTIVE_SLACK: Final = 1e-6
-"""Distance to a bound (rad or rad/s) below which a constraint may count as active."""
+ACTIVE_SLACK: Final = 1e-6  # distance to a bound (rad or rad/s) below which a constraint may count as active
 
 STATUS: Final = {
     piqp.PIQP_SOLVED: SOLVED,

@@ -17,74 +17,48 @@ from quadsim.state import INDEX, Array
 from quadsim.vehicle import N_ROTORS, VEHICLE_UNITS, Vehicle
 
 AXES: Final = ("x", "y", "z")
-SHEET_PERIOD: Final = 0.05
-"""Control period of the discrete poles [s], the paper's."""
+SHEET_PERIOD: Final = 0.05  # control period of the discrete poles [s], the paper's
 _RPM: Final = 60.0 / (2.0 * math.pi)
 
 
 @dataclass(frozen=True, kw_only=True)
 class TorqueRange:
-    """The torques about one body axis that hover leaves room for.
+    """The torques about one body axis that hover leaves room for."""
 
-    Attributes:
-        axis: x, y or z.
-        lowest: torque [N m].
-        highest: torque [N m].
-        lowest_pure: the same with no torque about the other two axes [N m].
-        highest_pure: the same with no torque about the other two axes [N m].
-        lowest_acceleration: what `lowest` gives from rest [rad/s^2].
-        highest_acceleration: what `highest` gives from rest [rad/s^2].
-    """
-
-    axis: str
-    lowest: float
-    highest: float
-    lowest_pure: float
-    highest_pure: float
-    lowest_acceleration: float
-    highest_acceleration: float
+    axis: str  # x, y or z
+    lowest: float  # torque [N m]
+    highest: float  # torque [N m]
+    lowest_pure: float  # the same with no torque about the other two axes [N m]
+    highest_pure: float  # the same with no torque about the other two axes [N m]
+    lowest_acceleration: float  # what `lowest` gives from rest [rad/s^2]
+    highest_acceleration: float  # what `highest` gives from rest [rad/s^2]
 
 
 @dataclass(frozen=True, kw_only=True)
 class VehicleSheet:
-    """Figures derived from a vehicle's numbers, all at hover.
+    """Figures derived from a vehicle's numbers, all at hover."""
 
-    Attributes:
-        weight: m g [N].
-        hover_speed: omega_bar [rad/s].
-        hover_speed_rpm: the same [rpm].
-        speed_range_used: where hover lies between the lowest speed, 0, and the highest, 1 [-].
-        thrust_to_weight: all rotors at their highest speed, over the weight [-].
-        climb_acceleration: largest upward acceleration from hover, level [m/s^2].
-        steady_tilt: largest tilt at which the rotors still carry the weight, cos(tilt) = 1 / thrust_to_weight [deg].
-        torques: about x, y and z.
-        thrust_slope: of one rotor, 2 b omega_bar [N s/rad].
-        input_slopes: largest entry of B_c in the rows of vz [m/s^2 per rad/s] and of the three rates [rad/s^2 per
-            rad/s]: the modelled effect of one rotor per rad/s.
-        integrator_chains: lengths of the chains of integrators that the linear model falls into, longest first.
-        continuous_poles: of A_c [1/s].
-        discrete_poles: of A at `period` [-].
-        period: tau_s [s].
-        lag_poles: of the rotors' speeds when they rise and fall, continuous [1/s], as far as the file gives them.
-        discrete_lag_poles: the same at `period` [-].
-    """
-
-    weight: float
-    hover_speed: float
-    hover_speed_rpm: float
-    speed_range_used: float
-    thrust_to_weight: float
-    climb_acceleration: float
+    weight: float  # m g [N]
+    hover_speed: float  # omega_bar [rad/s]
+    hover_speed_rpm: float  # the same [rpm]
+    speed_range_used: float  # where hover lies between the lowest speed, 0, and the highest, 1 [-]
+    thrust_to_weight: float  # all rotors at their highest speed, over the weight [-]
+    climb_acceleration: float  # largest upward acceleration from hover, level [m/s^2]
+    # largest tilt at which the rotors still carry the weight, cos(tilt) = 1 / thrust_to_weight [deg]
     steady_tilt: float
-    torques: tuple[TorqueRange, ...]
-    thrust_slope: float
+    torques: tuple[TorqueRange, ...]  # about x, y and z
+    thrust_slope: float  # of one rotor, 2 b omega_bar [N s/rad]
+    # largest entry of B_c in the rows of vz [m/s^2 per rad/s] and of the three rates [rad/s^2 per rad/s]: the modelled
+    # effect of one rotor per rad/s
     input_slopes: dict[str, float]
+    # lengths of the chains of integrators that the linear model falls into, longest first
     integrator_chains: tuple[int, ...]
-    continuous_poles: tuple[float, ...]
-    discrete_poles: tuple[float, ...]
-    period: float
+    continuous_poles: tuple[float, ...]  # of A_c [1/s]
+    discrete_poles: tuple[float, ...]  # of A at `period` [-]
+    period: float  # tau_s [s]
+    # of the rotors' speeds when they rise and fall, continuous [1/s], as far as the file gives them
     lag_poles: dict[str, float]
-    discrete_lag_poles: dict[str, float]
+    discrete_lag_poles: dict[str, float]  # the same at `period` [-]
 
 
 def make_sheet(vehicle: Vehicle, *, period: float = SHEET_PERIOD) -> VehicleSheet:

@@ -14,15 +14,10 @@ from scenarios.courses.course import Path
 
 @dataclass(frozen=True, kw_only=True)
 class Loop:
-    """A closed curve, or one that is closed seen from above, by an angle theta that grows by 2 pi per turn.
+    """A closed curve, or one that is closed seen from above, by an angle theta that grows by 2 pi per turn."""
 
-    Attributes:
-        position: theta (M,) [rad] -> (M, 3) [m], world.
-        heading: theta (M,) [rad] -> (M,) direction of travel about z [rad], without jumps.
-    """
-
-    position: Callable[[Array], Array]
-    heading: Callable[[Array], Array]
+    position: Callable[[Array], Array]  # theta (M,) [rad] -> (M, 3) [m], world
+    heading: Callable[[Array], Array]  # theta (M,) [rad] -> (M,) direction of travel about z [rad], without jumps
 
 
 def circle(

@@ -18,15 +18,10 @@ ACCELERATION: Final = 2
 
 @dataclass(frozen=True, kw_only=True)
 class PiecewisePolynomial:
-    """Polynomials joined at knots.
+    """Polynomials joined at knots."""
 
-    Attributes:
-        knots: (n + 1,) increasing times [s].
-        coefficients: (n, p, c) of segment i in s = (t - knots[i]) / (knots[i + 1] - knots[i]), ascending powers.
-    """
-
-    knots: Array
-    coefficients: Array
+    knots: Array  # (n + 1,) increasing times [s]
+    coefficients: Array  # (n, p, c) of segment i in s = (t - knots[i]) / (knots[i + 1] - knots[i]), ascending powers
 
     def __call__(self, t: Array, order: int = 0) -> Array:
         """(M, c) values, or their derivatives of an order [1/s^order], at times t (M,)."""

@@ -13,8 +13,7 @@ from scipy.linalg import solveh_banded
 
 from quadsim.state import Array, read_only
 
-_ORDER: Final = 4
-"""Of the differences that are kept small: those that a torque, and so a rotor's speed, follows from."""
+_ORDER: Final = 4  # of the differences that are kept small: those that a torque, and so a rotor's speed, follows from
 _WEIGHTS: Final = tuple(10.0**exponent for exponent in range(6, -3, -1))
 
 

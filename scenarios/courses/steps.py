@@ -13,17 +13,11 @@ from quadsim.state import Array
 
 @dataclass(frozen=True, kw_only=True)
 class Window:
-    """A value held strictly between two instants, as in Eq. (30).
+    """A value held strictly between two instants, as in Eq. (30)."""
 
-    Attributes:
-        start: [s], excluded; at the instant itself the reference is elsewhere's value.
-        stop: [s], excluded.
-        value: [m], or [rad] for yaw.
-    """
-
-    start: float
-    stop: float
-    value: float
+    start: float  # [s], excluded; at the instant itself the reference is elsewhere's value
+    stop: float  # [s], excluded
+    value: float  # [m], or [rad] for yaw
 
 
 def steps(t: Array, windows: Sequence[Window], elsewhere: float) -> Array:

@@ -19,6 +19,7 @@ from scenarios.schema.events import Event, PayloadDropEvent, PayloadPickupEvent,
 from scenarios.schema.optimisation import BoundedSpec
 from scenarios.schema.sensors import EstimatorSpec, SensorsSpec, check_sensing
 from scenarios.schema.writing import to_toml
+from scenarios.shipped import Group
 
 
 class VehicleSpec(Spec):
@@ -148,7 +149,6 @@ MOST_STEPS: Final = 10_000_000
 """Physics steps, and planned steps (periods times horizon), that one flight may take: each is held in memory."""
 
 
-Group = Literal["paper", "courses", "air", "faults", "ground", "sensors", "other"]
 Verdict = Literal["satisfied", "violated", "lost"]
 
 
