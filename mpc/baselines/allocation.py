@@ -63,12 +63,6 @@ def allocate(allocation: Allocation, wrench: Array, lower: Array, upper: Array) 
     return speeds
 
 
-def wrench_of(allocation: Allocation, speeds: Array) -> Array:
-    """The wrench (4,) [N, N m] that rotor speeds (4,) [rad/s] give."""
-    wrench: Array = allocation.M @ np.square(speeds)
-    return wrench
-
-
 def _less_yaw(squares: Array, yaw: Array, low: Array, high: Array) -> Array | None:
     """The point nearest to `squares` of the line along `yaw`, (4,) squares per N m, within the bounds; None without."""
     room = 1e-9 * max(float(high.max()), 1.0)  # a corner of the bounds is a point of theirs, whatever the rounding

@@ -3,10 +3,38 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 
-from quadsim.state import Array
+from quadsim.state import EULER, EULER_RATE, POSITION, VELOCITY, Array, body_to_world, euler_to_body_rates
+
+LEAST_LIFT: Final = 0.2
+"""Share of the weight below which thrust is not asked to fall, so that torques keep their authority.  Ours."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Motion:
+    """A measured state with its attitude as a rotation matrix."""
+
+    position: Array  # x (3,), world [m]
+    velocity: Array  # v (3,), world [m/s]
+    attitude: Array  # R (3, 3), body to world
+    rates: Array  # Omega (3,), body [rad/s]
+    yaw: float  # [rad]
+
+
+def motion_of(state: Array) -> Motion:
+    """The motion that a state (12,) says."""
+    euler = state[list(EULER)]
+    return Motion(
+        position=state[list(POSITION)],
+        velocity=state[list(VELOCITY)],
+        attitude=body_to_world(euler),
+        rates=euler_to_body_rates(euler, state[list(EULER_RATE)]),
+        yaw=float(euler[2]),
+    )
 
 
 def hat(vector: Array) -> Array:
@@ -72,11 +100,6 @@ def prioritised_error(attitude: Array, wanted: Array, yaw_weight: float) -> Arra
     half = 0.5 * yaw_weight * turn
     c, s = math.cos(half), math.sin(half)
     return 2.0 * np.array([x * c + y * s, y * c - x * s, w * s / yaw_weight])
-
-
-def attitude_error_function(attitude: Array, wanted: Array) -> float:
-    """Psi(R, R_d) = tr(I - R_d' R) / 2, in [0, 2].  Lee, Leok, McClamroch (2010)."""
-    return 0.5 * (3.0 - float(np.trace(wanted.T @ attitude)))
 
 
 def attitude_error(attitude: Array, wanted: Array) -> Array:
