@@ -111,12 +111,7 @@ class ActuatorBounds:
 def rejection(status: str, speeds: Array, plan: Array, bounds: ActuatorBounds, before: Array) -> str | None:
     """Why an answer must not reach the plant, or None.
 
-    Args:
-        status: the solver's.
-        speeds: (4,) the command [rad/s].
-        plan: (N, 4) the inputs planned [rad/s].
-        bounds: hard bounds.
-        before: (4,) the command in force [rad/s].
+    `speeds` (4,) is the command, `plan` (N, 4) the inputs planned, `before` (4,) the command in force [rad/s].
     """
     if status not in ACCEPTED:
         return status

@@ -22,12 +22,8 @@ class ConstrainedMPC:
     Where the unconstrained optimum satisfies every constraint it is the solution, and no QP is solved: the status is
     then `unconstrained`.  Only an answer that is the optimum, finite, and whose first action is within the hard input
     bounds is used.  Otherwise the previous plan, shifted by one step, is held (fallback level 1) for as long as it
-    lasts, and then the flight is given up.
-
-    Args:
-        problem: with bounds.
-        solver: set up for the same problem.
-        shortcut: whether to try less than the whole QP first, see `mpc.exact.shortcut`; the commands are the same.
+    lasts, and then the flight is given up.  `shortcut`: whether to try less than the whole QP first
+    (`mpc.exact.shortcut`); the commands are the same.
     """
 
     name: Final = "constrained"

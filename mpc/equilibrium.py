@@ -67,12 +67,7 @@ def twisted(model: NonlinearModel, twist: Array) -> NonlinearModel:
 
 
 def equilibrium(model: NonlinearModel, twist: Array | None = None) -> Trim:
-    """What rest takes under the model's disturbance; a rotor that would have to pull stands still.
-
-    Args:
-        model: the model, `twisted` where it is.
-        twist: by what.
-    """
+    """What rest takes under a model's disturbance, `twisted` or not; a rotor that would have to pull stands still."""
     a_x, a_y, a_z = model.acceleration.tolist()
     up = max(model.gravity - a_z, LEAST_LIFT * model.gravity)
     thrust = math.hypot(a_x, a_y, up)

@@ -71,11 +71,7 @@ def discretise(A_c: Array, B_c: Array, period: float) -> tuple[Array, Array]:
 
 
 def hover_model(vehicle: Vehicle, period: float) -> LinearModel:
-    """The vehicle's discrete model at hover.
-
-    Args:
-        vehicle: the numbers.
-        period: control period tau_s [s].
+    """The vehicle's discrete model at hover, for a control period tau_s [s].
 
     Raises:
         ParameterError: the period is not positive.

@@ -8,9 +8,8 @@ from typing import Protocol, TypeAlias
 import numpy as np
 from scipy.sparse import csc_matrix
 
-from mpc.constraints import Rows
 from mpc.ocp import Problem, Rest
-from quadsim.state import Array, Indices
+from quadsim.state import Array
 
 Matrix: TypeAlias = Array | csc_matrix
 
@@ -52,35 +51,48 @@ class QP:
         return replace(self, **vars(vectors))
 
 
-@dataclass(frozen=True, kw_only=True)
 class QPRows:
-    """A problem's rows as a QP has them: bounds of single inputs in the box, a soft row as two with the same slack."""
+    """A problem's rows as a QP has them: bounds of single inputs in the box, a soft row as two with the same slack.
 
-    C: Array  # (K, n)
-    D: Array  # (K, nu)
-    E: Array  # (K, nu)
-    slack: Array  # (K, m_s) how slacks enter
-    # (N, K)
-    lower: Array
-    upper: Array
-    of_states: np.ndarray[tuple[int], np.dtype[np.bool_]]  # (K,) see `mpc.constraints.Rows`
-    # (N, nu) the box
-    u_min: Array
-    u_max: Array
-    origin: Indices  # (K,) which of the problem's rows each is
-    boxed: Indices  # the problem's rows in the box
-    whole: Rows  # the problem's rows
+    Attributes:
+        C, D, E: (K, n), (K, nu), (K, nu).
+        slack: (K, m_s) how slacks enter.
+        lower, upper: (N, K).
+        of_states: (K,) see `mpc.constraints.Rows`.
+        u_min, u_max: (N, nu) the box.
+
+    Raises:
+        ValueError: the problem has none.
+    """
+
+    def __init__(self, problem: Problem) -> None:
+        self._whole = rows = problem.rows
+        self._boxed = np.flatnonzero(rows.input >= 0)
+        hard = np.flatnonzero((rows.input < 0) & np.isinf(rows.l1))
+        above = rows.soft[np.isfinite(rows.upper[:, rows.soft]).any(axis=0)]
+        below = rows.soft[np.isfinite(rows.lower[:, rows.soft]).any(axis=0)]
+        self._origin = origin = np.concatenate([hard, above, below])
+        of_rows = np.eye(len(rows.C))[:, rows.soft]
+        self.slack = np.concatenate([np.zeros((hard.size, rows.soft.size)), 0.0 - of_rows[above], of_rows[below]])
+        self.C, self.D, self.E, self.of_states = rows.C[origin], rows.D[origin], rows.E[origin], rows.of_states[origin]
+        self.lower, self.upper = rows.lower[:, origin].copy(), rows.upper[:, origin].copy()
+        self.lower[:, hard.size : hard.size + above.size] = -np.inf
+        self.upper[:, hard.size + above.size :] = np.inf
+        self.u_min, self.u_max = (np.full((problem.horizon, problem.model.nu), side) for side in (-np.inf, np.inf))
+        for row, j in zip(self._boxed, rows.input[self._boxed], strict=True):
+            self.u_min[:, j] = np.maximum(self.u_min[:, j], rows.lower[:, row])
+            self.u_max[:, j] = np.minimum(self.u_max[:, j], rows.upper[:, row])
 
     def multipliers(self, z: Array, z_inputs: Array) -> Array:
         """(N, m) multipliers of the problem's rows, from those of the QP's rows (N K,) and of inputs (N nu,)."""
         N = len(self.lower)
-        found = np.zeros((N, len(self.whole.C)))
-        for column, row in zip(z.reshape(N, -1).T, self.origin, strict=True):
+        found = np.zeros((N, len(self._whole.C)))
+        for column, row in zip(z.reshape(N, -1).T, self._origin, strict=True):
             found[:, row] += column
         left = z_inputs.reshape(N, -1).copy()
-        for row in self.boxed:  # of several at the same bound, the first has it all
-            j = self.whole.input[row]
-            upper, lower = self.whole.upper[:, row] == self.u_max[:, j], self.whole.lower[:, row] == self.u_min[:, j]
+        for row in self._boxed:  # of several at the same bound, the first has it all
+            j = self._whole.input[row]
+            upper, lower = self._whole.upper[:, row] == self.u_max[:, j], self._whole.lower[:, row] == self.u_min[:, j]
             held = np.where(left[:, j] > 0.0, upper, lower)
             found[held, row] = left[held, j]
             left[held, j] = 0.0
@@ -88,54 +100,13 @@ class QPRows:
 
     def split(self, multipliers: Array) -> tuple[Array, Array]:
         """The inverse: multipliers of the QP's rows (N K,) and of inputs (N nu,)."""
-        z = multipliers[:, self.origin]
-        upward = np.where(np.isneginf(self.lower) & np.isfinite(self.upper), np.maximum(z, 0.0), z)
-        z = np.where(np.isposinf(self.upper), np.minimum(z, 0.0), upward)
+        z = multipliers[:, self._origin]
+        z = np.where(np.isneginf(self.lower) & np.isfinite(self.upper), np.maximum(z, 0.0), z)
+        z = np.where(np.isposinf(self.upper), np.minimum(z, 0.0), z)
         z_inputs = np.zeros(self.u_min.shape)
-        for row in self.boxed:
-            z_inputs[:, self.whole.input[row]] += multipliers[:, row]
+        for row in self._boxed:
+            z_inputs[:, self._whole.input[row]] += multipliers[:, row]
         return z.ravel(), z_inputs.ravel()
-
-
-def qp_rows(problem: Problem) -> QPRows:
-    """A problem's rows as a QP has them.
-
-    Raises:
-        ValueError: the problem has none.
-    """
-    rows, nu = problem.rows, problem.model.nu
-    soft = rows.soft
-    number = np.zeros(len(rows.C), np.int64)
-    number[soft] = np.arange(soft.size)
-    boxed = np.flatnonzero(rows.input >= 0)
-    hard = np.flatnonzero((rows.input < 0) & np.isinf(rows.l1))
-    above = soft[np.isfinite(rows.upper[:, soft]).any(axis=0)]
-    below = soft[np.isfinite(rows.lower[:, soft]).any(axis=0)]
-    origin = np.concatenate([hard, above, below])
-    slack = np.zeros((origin.size, soft.size))
-    slack[hard.size + np.arange(above.size), number[above]] = -1.0
-    slack[hard.size + above.size + np.arange(below.size), number[below]] = 1.0
-    lower, upper = rows.lower[:, origin].copy(), rows.upper[:, origin].copy()
-    lower[:, hard.size : hard.size + above.size] = -np.inf
-    upper[:, hard.size + above.size :] = np.inf
-    u_min, u_max = np.full((len(lower), nu), -np.inf), np.full((len(lower), nu), np.inf)
-    for row in boxed:
-        u_min[:, rows.input[row]] = np.maximum(u_min[:, rows.input[row]], rows.lower[:, row])
-        u_max[:, rows.input[row]] = np.minimum(u_max[:, rows.input[row]], rows.upper[:, row])
-    return QPRows(
-        C=rows.C[origin],
-        D=rows.D[origin],
-        E=rows.E[origin],
-        slack=slack,
-        lower=lower,
-        upper=upper,
-        of_states=rows.of_states[origin],
-        u_min=u_min,
-        u_max=u_max,
-        origin=origin,
-        boxed=boxed,
-        whole=rows,
-    )
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -63,68 +63,44 @@ def _present(block: Array, rounding: float) -> NDArray[np.bool_]:
     return np.asarray(size > rounding * largest)
 
 
-@dataclass(frozen=True, kw_only=True)
 class Layout:
-    """Where everything is among the variables."""
+    """Where everything is among the variables, for N steps of n states, nu inputs and n_s slacks, M in a stage.
 
-    # horizon, states, inputs, steps in the first stage and in each other
-    N: int
-    n: int
-    nu: int
-    L: int
-    M: int
-    head: Indices  # (L nu,) v_0
-    tail: Indices  # (J - 1, n + M nu) [s_j, v_j]
-    starts: Indices  # (J, n) s_1 .. s_J
-    inputs: Indices  # (N, nu) in time order
-    slacks: Indices  # (N, n_s) in time order; n_s = 0 where bounds are hard
-    ends: Indices  # (J, n) equality rows
-    # (J - 1, nu) the last inputs of each stage but the last, and the first of the one after it
-    lasts: Indices
-    firsts: Indices
-    size: int  # of all
+    Attributes:
+        N, n, nu, L, M: horizon, states, inputs, steps in the first stage and in each other.
+        head: (L nu,) v_0.
+        tail: (J - 1, n + M nu) [s_j, v_j].
+        starts: (J, n) s_1 .. s_J.
+        inputs: (N, nu) in time order.
+        slacks: (N, n_s) in time order; n_s = 0 where bounds are hard.
+        ends: (J, n) equality rows.
+        lasts, firsts: (J - 1, nu) the last inputs of each stage but the last, and the first of the one after it.
+        size: of all.
+    """
 
-
-def layout(N: int, n: int, nu: int, n_s: int, M: int) -> Layout:
-    """Variables for a horizon N of n states, nu inputs and n_s slacks in stages of M steps."""
-    room = M + (n // nu if M > 1 else 0)
-    L = N if room >= N else room - (room - N) % M
-    stages = (N - L) // M
-    first, width = L * nu + (L - 1) * n_s, n + M * (nu + n_s)
-    base = first + width * np.arange(stages + 1)[:, None]
-    size = first + stages * width + n + n_s
-    head, tail = np.arange(L * nu), base[:-1] + np.arange(n + M * nu)
-    starts = base + np.arange(n)
-    later = base[:-1] + n + M * nu + np.arange(M * n_s)
-    inputs = np.concatenate([head, tail[:, n:].ravel()]).reshape(N, nu)
-    cuts = L + M * np.arange(stages)
-    slacks = [np.arange(L * nu, first), later.ravel(), np.arange(size - n_s, size)]
-    return Layout(
-        N=N,
-        n=n,
-        nu=nu,
-        L=L,
-        M=M,
-        head=head,
-        tail=tail,
-        starts=starts,
-        inputs=inputs,
-        slacks=np.concatenate(slacks).reshape(N, n_s),
-        ends=np.arange(starts.size).reshape(starts.shape),
-        lasts=inputs[cuts - 1],
-        firsts=inputs[cuts],
-        size=size,
-    )
+    def __init__(self, N: int, n: int, nu: int, n_s: int, M: int) -> None:
+        room = M + (n // nu if M > 1 else 0)
+        L = N if room >= N else room - (room - N) % M
+        self.N, self.n, self.nu, self.L, self.M = N, n, nu, L, M
+        stages = (N - L) // M
+        first, width = L * nu + (L - 1) * n_s, n + M * (nu + n_s)
+        base = first + width * np.arange(stages + 1)[:, None]
+        self.size = first + stages * width + n + n_s
+        self.head, self.tail = np.arange(L * nu), base[:-1] + np.arange(n + M * nu)
+        self.starts = base + np.arange(n)
+        self.inputs = np.concatenate([self.head, self.tail[:, n:].ravel()]).reshape(N, nu)
+        later = base[:-1] + n + M * nu + np.arange(M * n_s)
+        slacks = [np.arange(L * nu, first), later.ravel(), np.arange(self.size - n_s, self.size)]
+        self.slacks = np.concatenate(slacks).reshape(N, n_s)
+        self.ends = np.arange(self.starts.size).reshape(self.starts.shape)
+        cuts = L + M * np.arange(stages)
+        self.lasts, self.firsts = self.inputs[cuts - 1], self.inputs[cuts]
 
 
 def condense_stages(start: Array, A: Array, B: Array, c: Array) -> Array:
     """(J, L + 1, n, m + 1) states of J stages of L steps, as functions of the variables, the inputs the last, and of 1.
 
-    Args:
-        start: (J, n, m + 1) the first of them.
-        A: (J, L, n, n).
-        B: (J, L, n, nu).
-        c: (J, L, n).
+    From the first of them (J, n, m + 1) by A (J, L, n, n), B (J, L, n, nu) and c (J, L, n).
     """
     (count, steps, n, nu), columns = B.shape, start.shape[2]
     states = np.empty((count, steps + 1, n, columns))

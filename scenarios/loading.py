@@ -85,14 +85,7 @@ def load_scenario(name: str, settings: Sequence[str] = ()) -> Scenario:
 
 
 def _of_types(problems: Sequence[str], path: Path, read: Mapping[str, Any], data: Mapping[str, Any]) -> Iterator[str]:
-    """Why fields of a table are missing, or are too many: another type of it was asked for.
-
-    Args:
-        problems: what is wrong.
-        path: the file.
-        read: what was read from it.
-        data: the same with the settings.
-    """
+    """Why fields of a table are missing, or are too many: another type was asked for than `read` from the file."""
     unfit = (problem for problem in problems if problem.endswith(" is missing") or " is not a field of " in problem)
     wrong = {problem.partition(".")[0] for problem in unfit}
     given = retyped(read, data)

@@ -46,13 +46,9 @@ def make_allocation(vehicle: Vehicle) -> Allocation:
 
 
 def allocate(allocation: Allocation, wrench: Array, lower: Array, upper: Array) -> Array:
-    """Rotor speeds (4,) [rad/s] within `lower` and `upper` (4,) that give a wrench, or what comes nearest to it.
+    """Rotor speeds (4,) within `lower` and `upper` (4,) [rad/s] that give a wrench, or what comes nearest to it.
 
-    Args:
-        allocation: of the vehicle.
-        wrench: (4,) thrust [N] along body z and torques [N m] about the body axes; finite.
-        lower: (4,) lowest speeds [rad/s], at least 0.
-        upper: (4,) highest speeds [rad/s], no lower than `lower`; may be infinite.
+    The wrench (4,) is thrust [N] along body z and torques [N m] about the body axes; upper speeds may be infinite.
     """
     low, high = lower**2, np.minimum(upper, LARGEST_SPEED) ** 2
     squares = allocation.inverse @ wrench

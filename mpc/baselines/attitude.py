@@ -73,17 +73,12 @@ def attitude_for(force: Array, yaw: float) -> Array:
 
 
 def prioritised_error(attitude: Array, wanted: Array, yaw_weight: float) -> Array:
-    """Attitude error (3,) about the body axes [rad for small errors], heading last.
+    """Attitude error (3,) about the body axes [rad for small errors], heading last; attitudes (3, 3) body to world.
 
     2 sgn(q_0) times the vector part of the error quaternion q = q_tilt q_yaw: the shortest rotation that brings body z
-    where it is wanted, then the rest, a turn about it of which only the share `yaw_weight` is asked for.  Brescianini,
-    Hehn, D'Andrea, "Nonlinear quadrocopter attitude control", ETH Zurich, 2013; PX4's AttitudeControl.  The yaw part
-    is divided by the weight, so that small errors of all three axes count alike.
-
-    Args:
-        attitude: (3, 3) R, body to world.
-        wanted: (3, 3) R_d, body to world.
-        yaw_weight: in (0, 1].
+    where it is wanted, then the rest, a turn about it of which only the share `yaw_weight`, in (0, 1], is asked for.
+    Brescianini, Hehn, D'Andrea, "Nonlinear quadrocopter attitude control", ETH Zurich, 2013; PX4's
+    AttitudeControl.  The yaw part is divided by the weight, so that small errors of all three axes count alike.
     """
     thrust = attitude.T @ wanted[:, 2]  # where body z is to go, seen from the body
     cosine = float(np.clip(thrust[2], -1.0, 1.0))

@@ -47,20 +47,15 @@ def lag_to_allow_for(vehicle: Vehicle, period: float) -> float:
 def bandwidths(
     *, period: float, lag: float, separation: float = SEPARATION, yaw_share: float = YAW_SHARE
 ) -> Bandwidths:
-    """Bandwidths of a cascade at a control period.
+    """Bandwidths of a cascade at a control period, with rotors and computation that lag [s].
 
-    A held command acts half a period late on average, and the rotors' lag adds to that: theta = period / 2 + lag.  The
+    A held command acts half a period late on average, and the lag adds to that: theta = period / 2 + lag.  The
     innermost loop, an integrator with that dead time, gets the gain 1 / (2 theta) (SIMC, Skogestad, "Simple analytic
     rules for model reduction and PID controller tuning", 2003: time constant and dead time equal).  Each loop outside
     is slower by `separation`, which is then every characteristic ratio a_i^2 / (a_{i-1} a_{i+1}) of the closed loop's
-    polynomial s^4 + k1 s^3 + k1 k2 s^2 + k1 k2 k3 s + k1 k2 k3 k4; 2 is the damping optimum (Naslin, 1960).  At 50 ms
-    and 25 ms of lag: 10, 5, 2.5 and 1.25 rad/s, where PX4 has 6.5, 1.8 and 0.95 from attitude to position.
-
-    Args:
-        period: [s].
-        lag: besides the sampling, of rotors and of computation [s].
-        separation: > 1.
-        yaw_share: bandwidths of the heading's loops over those of roll and pitch.
+    polynomial s^4 + k1 s^3 + k1 k2 s^2 + k1 k2 k3 s + k1 k2 k3 k4; 2 is the damping optimum (Naslin, 1960).  The
+    heading's loops have the share `yaw_share` of roll's and pitch's.  At 50 ms and 25 ms of lag: 10, 5, 2.5 and 1.25
+    rad/s, where PX4 has 6.5, 1.8 and 0.95 from attitude to position.
 
     Raises:
         ParameterError: a number is out of range.

@@ -82,19 +82,13 @@ class GeometricSettings:
 def geometric_settings(
     vehicle: Vehicle, *, period: float, lag: float | None = None, integral: bool = False, **others: object
 ) -> GeometricSettings:
-    """Settings whose gains follow from the period and the lag to allow for.
+    """Settings whose gains follow from the period and the lag to allow for [s]; `others` are fields of theirs.
 
     Since the law feeds forward how the wanted attitude turns, its linearisation has the polynomial
     (s^2 + k_Omega s + k_R)(s^2 + k_v s + k_x), and about k_Omega + k_v for the gain from a rate error to angular
     acceleration: that sum is 1 / (2 (period / 2 + lag)), as in `bandwidths`.  The outer pair is four times slower than
     the inner one (the cascade's separation of 2, twice), and both have the damping 1 / sqrt(2): k_R = k_Omega^2 / 2.
-
-    Args:
-        vehicle: the modelled vehicle.
-        period: tau_s [s].
-        lag: of rotors and computation [s]; `lag_to_allow_for` where absent.
-        integral: whether the integrals of Goodarzi et al. (2013) act, a quarter as fast as what they stand behind.
-        others: fields of `GeometricSettings`.
+    The integrals of Goodarzi et al. (2013) are, where they act, a quarter as fast as what they stand behind.
     """
     require_positive("period", period)
     allowed = lag_to_allow_for(vehicle, period) if lag is None else lag

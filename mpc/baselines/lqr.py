@@ -96,10 +96,6 @@ class LQR(FeedbackLaw):
 
     Heading errors count the short way round.  Speeds that leave the bounds are held to them as `allocate` says; thrust,
     roll and pitch torque go before yaw.
-
-    Args:
-        vehicle: the modelled vehicle.
-        settings: see there.
     """
 
     name: Final = "lqr"

@@ -73,14 +73,7 @@ class PIDSettings:
 
 
 def pid_settings(vehicle: Vehicle, *, period: float, lag: float | None = None, **others: object) -> PIDSettings:
-    """Settings whose gains follow from the period, and the lag [s] to allow for; see `bandwidths`.
-
-    Args:
-        vehicle: the modelled vehicle.
-        period: tau_s [s].
-        lag: of rotors and computation; `lag_to_allow_for` where absent.
-        others: fields of `PIDSettings`.
-    """
+    """Settings whose gains follow from the period and the lag to allow for [s]; `others` are fields of theirs."""
     allowed = lag_to_allow_for(vehicle, period) if lag is None else lag
     speeds = bandwidths(period=period, lag=allowed)
     values: dict[str, object] = {
@@ -129,14 +122,7 @@ class CascadedPID(FeedbackLaw):
         return self._held_for_a_period(speeds)
 
     def fly(self, memory: Memory, state: Array, target: Target, lower: Array, upper: Array) -> tuple[Array, Memory]:
-        """One period of all loops.
-
-        Args:
-            memory: of the period before.
-            state: (12,) measured.
-            target: what to follow now.
-            lower: (4,) lowest speeds within reach [rad/s].
-            upper: (4,) highest speeds within reach [rad/s].
+        """One period of all loops, from a state (12,) and speeds (4,) within reach [rad/s].
 
         Returns:
             (4,) rotor speeds [rad/s], and what to remember.
@@ -198,14 +184,7 @@ def velocity_wanted(settings: PIDSettings, position: Array, target: Target) -> A
 
 
 def force_within(force: Array, *, weight: float, largest: float, tilt: float) -> Array:
-    """A wanted force (3,) [N], world, as a vehicle can give it, height before horizontal motion.
-
-    Args:
-        force: wanted.
-        weight: m g [N].
-        largest: thrust to command [N].
-        tilt: largest tilt [rad].
-    """
+    """A wanted force (3,) [N], world, as a vehicle can give it within a tilt [rad]: height before horizontal motion."""
     upright = limit_force(force, least=LEAST_LIFT * weight, tilt=tilt)
     horizontal = math.hypot(upright[0], upright[1])
     spared = min(horizontal, HORIZONTAL_MARGIN * largest)

@@ -76,9 +76,6 @@ class StateCompletion:
     Attributes:
         unseen: (12,) periods since each channel was last measured; infinite before it ever was.
 
-    Args:
-        model: see `mpc.model.hover_model`.
-
     Raises:
         ParameterError: the model is not a quadrotor's.
     """

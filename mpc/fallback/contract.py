@@ -60,12 +60,11 @@ class Guarded:
     commands pass unchanged.
 
     Attributes:
-        inner: the controller asked first.
+        inner: the controller asked first, through the protocol alone.
         law: what levels 1 to 3 are made of.
 
     Args:
-        inner: reached through the protocol alone; one that falls back by itself does no harm, as only its accepted
-            answers are used.
+        inner: one that falls back by itself does no harm, as only its accepted answers are used.
         model: the hover model of the control period; see `mpc.model.hover_model`.
         bounds: hard bounds that every command keeps.
         settings: when the next level takes over.

@@ -66,10 +66,6 @@ class HoverLaw:
         slope: (4, 4) S; see `mpc.heading.slope`.
         tilt: largest roll and pitch asked for together [rad].
 
-    Args:
-        model: see `mpc.model.hover_model`.
-        tilt: [rad].
-
     Raises:
         ParameterError: the model is not a quadrotor's, or the tilt is not between 0 and 90 deg.
     """
@@ -99,9 +95,7 @@ class HoverLaw:
     def correction(self, error: Array, yaw: float) -> Array:
         """What to add to the rotor speeds (4,) [rad/s] to come closer to a state that the vehicle moves through.
 
-        Args:
-            error: (12,) measured minus wanted state.
-            yaw: measured [rad].
+        The error (12,) is the measured minus the wanted state, the yaw the measured one [rad].
         """
         return self._inverse @ self._acceleration(turn_horizontally(error, np.array(-yaw)), np.zeros(2))
 

@@ -73,13 +73,7 @@ class NonlinearModel:
 def nonlinear_model(
     vehicle: Vehicle, period: float, *, substeps: int = SUBSTEPS, rotor_lag: float | None = None
 ) -> NonlinearModel:
-    """The vehicle's model, undisturbed.
-
-    Args:
-        vehicle: the numbers.
-        period: control period tau_s [s].
-        substeps: Runge-Kutta steps per period.
-        rotor_lag: time constant of the rotor speeds [s]; None for none.
+    """The vehicle's model, undisturbed; see `NonlinearModel`.
 
     Raises:
         ParameterError: a number is not possible.
@@ -164,16 +158,10 @@ def integrate(model: NonlinearModel, x: Array, u: Array) -> Passage:
 
 
 def accelerations(model: NonlinearModel, euler: Array, euler_rate: Array, drive: Array) -> Array:
-    """(6, ...) d2(p)/dt2 [m/s^2] and d2(eta)/dt2 [rad/s^2].
+    """(6, ...) d2(p)/dt2 [m/s^2] and d2(eta)/dt2 [rad/s^2], of eta and its rate (3, ...) and of U/m, I^-1 tau (4, ...).
 
     With a, b, c the rates of roll, pitch and yaw, E^-1 dE/dt d(eta)/dt is (-b c cos - sin(pitch) l / cos, a c cos,
     -l / cos), where l = b (a + c sin(pitch)) and cos is that of pitch.
-
-    Args:
-        model: the model.
-        euler: (3, ...) eta [rad].
-        euler_rate: (3, ...) its rate [rad/s].
-        drive: (4, ...) U / m and I^-1 tau.
     """
     (sr, sp, sy), (cr, cp, cy) = np.sin(euler), np.cos(euler)
     a, b, c = euler_rate

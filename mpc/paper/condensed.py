@@ -15,7 +15,7 @@ from mpc.constraints import Rows
 from mpc.ocp import Problem, Rest
 from mpc.paper.cost import cost
 from mpc.paper.prediction import Prediction, prediction
-from mpc.qp import QP, QPRows, Solution, Vectors, qp_rows
+from mpc.qp import QP, QPRows, Solution, Vectors
 from quadsim.state import Array
 
 
@@ -77,9 +77,6 @@ def row_maps(rows: Rows | QPRows, maps: Prediction) -> RowMaps:
 class Condensed:
     """min 1/2 x' P x + c' x over x = [u(k); ...; u(k+N-1); e], e (N, m_s) the slacks of soft rows.
 
-    Args:
-        problem: with constraints.
-
     Attributes:
         qp: H, the rows time by time, and the box; vectors for xi(k) and y_d zero and u(k-1) = u_bar.
 
@@ -88,7 +85,7 @@ class Condensed:
     """
 
     def __init__(self, problem: Problem) -> None:
-        self._problem, self._rows = problem, qp_rows(problem)
+        self._problem, self._rows = problem, QPRows(problem)
         model, N, nu = problem.model, problem.horizon, problem.model.nu
         self._maps = prediction(model, N)
         self._cost, self._values = condensed_cost(problem, self._maps), row_maps(self._rows, self._maps)
@@ -143,13 +140,9 @@ class Condensed:
         return self._rows.multipliers(solution.z, solution.z_box[: self._inputs])
 
     def solution(self, like: Solution, plan: Array, slacks: Array, multipliers: Array) -> Solution:
-        """A solution of this QP, of which the primal point and the rows' multipliers (N, m) are known.
+        """This QP's solution of a plan (N, nu), slacks (N, m_s), rows' multipliers (N, m) and what else `like` says.
 
-        Args:
-            like: what else it says.
-            plan: (N, nu).
-            slacks: (N, m_s).
-            multipliers: (N, m), positive at upper bounds and negative at lower ones.
+        Multipliers are positive at upper bounds and negative at lower ones.
         """
         z, z_inputs = self._rows.split(multipliers)
         soft = self._problem.rows.soft

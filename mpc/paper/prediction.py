@@ -38,16 +38,7 @@ def prediction(model: LinearModel, horizon: int) -> Prediction:
 
 
 def rollout(model: LinearModel, states: Array, plans: Array) -> Array:
-    """Predicted states of many plans at once, by recursion rather than by Phi and Psi.
-
-    Args:
-        model: the linear model.
-        states: (K, n) states to start from.
-        plans: (K, N, nu) inputs.
-
-    Returns:
-        (K, N, n) states xi(k+1) .. xi(k+N).
-    """
+    """States (K, N, n) xi(k+1) .. xi(k+N) from states (K, n) under plans (K, N, nu), by recursion."""
     predicted = np.empty((*plans.shape[:2], model.n))
     state = states
     for i in range(plans.shape[1]):

@@ -60,20 +60,10 @@ class RobustMPC:
     """One optimum per period; see the module.
 
     It holds no earlier plan: where nothing is solved, the status says so, with the command in force, for
-    `mpc.fallback.contract.Guarded` to act on.
+    `mpc.fallback.contract.Guarded` to act on.  Objective, bounds and constraints are for the paper's 12 states.
 
     Attributes:
         trim: what holds the vehicle at rest against the disturbance that is estimated.
-
-    Args:
-        vehicle: the modelled vehicle.
-        period: control period tau_s [s].
-        horizon: N.
-        objective: for the paper's 12 states.
-        bounds: likewise.
-        settings: the parts.
-        constraints: others, likewise.
-        shortcut: whether to try less than the whole QP first, see `mpc.exact.shortcut`, with the hover model.
 
     Raises:
         ParameterError: a number or a shape is not possible.

@@ -146,17 +146,9 @@ def between_samples(acceleration: float, period: float) -> float:
 def growth(
     A: Array, B: Array, C: Array, E: Array, K: Array, *, period: float, horizon: int, delay: float = 0.0
 ) -> Array:
-    """r_1 .. r_N (N, n_c) of dx/dt = A x + B u + E w, |w| <= 1 in each component, u = -K x(k) held; see the module.
+    """r_1 .. r_N (N, n_c) of dx/dt = A x + B u + E w, |w| <= 1 in each component, u = -K x(k) held, outputs C x.
 
-    Args:
-        A: (n, n).
-        B: (n, nu).
-        C: (n_c, n).
-        E: (n, n_w).
-        K: (nu, n).
-        period: tau [s].
-        horizon: N.
-        delay: d [s].
+    Period tau and delay d [s]; see the module.
     """
     A_d, B_d = discretise(A, B, period)
     closed = A_d - B_d @ K

@@ -76,13 +76,7 @@ def smoothest(times: Array, values: Array, order: int) -> PiecewisePolynomial:
 
 
 def minimum_snap(start: Array, poses: Array, times: Sequence[float]) -> Path:
-    """Least snap of x, y, z and least angular acceleration of yaw through poses, at rest at both ends.
-
-    Args:
-        start: (4,) pose at time 0.
-        poses: (n, 4) x, y, z [m], yaw [rad].
-        times: (n,) when each is passed [s], increasing, the first above 0.
-    """
+    """Least snap of x, y, z and angular acceleration of yaw through poses (n, 4) at times (n,) [s], rest to rest."""
     knots, through = np.array([0.0, *times]), np.vstack([start, poses])
     position = smoothest(knots, through[:, :3], SNAP)
     yaw = smoothest(knots, through[:, 3:], ACCELERATION)

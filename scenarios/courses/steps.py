@@ -36,10 +36,7 @@ def steps(t: Array, windows: Sequence[Window], elsewhere: float) -> Array:
 def switches(windows: Sequence[Window], elsewhere: float, *, initial: float) -> list[tuple[float, float, float]]:
     """Where a piecewise constant reference steps: time [s], value before and value after, in order of time.
 
-    Args:
-        windows: as for `steps`; of windows that overlap, the last holds.
-        elsewhere: the value outside all windows.
-        initial: where the output is at time 0, from which the first step is counted.
+    Of windows that overlap, the last holds; the first step is counted from `initial`, where the output is at time 0.
     """
     instants = sorted({max(0.0, instant) for window in windows for instant in (window.start, window.stop)} | {0.0})
     held = [[window.value for window in windows if window.start <= t < window.stop] for t in instants]
