@@ -47,20 +47,23 @@ class Constraint:
     penalty: Penalty | None = None  # what violating it costs; None for a hard constraint
 
     def __post_init__(self) -> None:
-        lower, upper = self.lower, self.upper
-        if lower.shape != upper.shape or np.any(np.isnan(lower)) or np.any(np.isnan(upper)):
-            raise ParameterError(
-                "controller", f"{self.name}.lower", lower, f"numbers of the same shape as upper = {upper}"
-            )
-        if np.any(lower >= upper):
-            raise ParameterError("controller", f"{self.name}.lower", lower, f"below upper = {upper}")
+        _check_order(f"{self.name}.lower", self.lower, "upper", self.upper)
+        m = self.lower.shape[-1]
         given = [matrix for matrix in (self.C, self.D, self.E) if matrix is not None]
-        if not given or any(len(matrix) != lower.shape[-1] for matrix in given):
-            raise ParameterError("controller", self.name, [len(matrix) for matrix in given], f"{lower.shape[-1]} rows")
+        if not given or any(len(matrix) != m for matrix in given):
+            raise ParameterError("controller", self.name, [len(matrix) for matrix in given], f"{m} rows")
         if not all(np.isfinite(matrix).all() for matrix in given):
             raise ParameterError("controller", self.name, given, "finite numbers")
-        if self.penalty is not None and self.penalty.l1.size != lower.shape[-1]:
-            raise ParameterError("controller", "l1", self.penalty.l1.shape, f"of shape ({lower.shape[-1]},)")
+        if self.penalty is not None and self.penalty.l1.size != m:
+            raise ParameterError("controller", "l1", self.penalty.l1.shape, f"of shape ({m},)")
+
+
+def _check_order(low: str, lower: Array, high: str, upper: Array) -> None:
+    """Refuse bounds of different shapes, that are no numbers, or that leave nothing between them."""
+    if lower.shape != upper.shape or np.isnan(lower).any() or np.isnan(upper).any():
+        raise ParameterError("controller", low, lower, f"numbers of the same shape as {high} = {upper}")
+    if np.any(lower >= upper):
+        raise ParameterError("controller", low, lower, f"below {high} = {upper}")
 
 
 def tightened(constraint: Constraint, margins: Array) -> Constraint:
@@ -97,11 +100,7 @@ class Bounds:
 
     def __post_init__(self) -> None:
         for low, high in (("y_min", "y_max"), ("delta_min", "delta_max"), ("u_min", "u_max")):
-            lower, upper = getattr(self, low), getattr(self, high)
-            if lower.shape != upper.shape or np.any(np.isnan(lower)) or np.any(np.isnan(upper)):
-                raise ParameterError("controller", low, lower, f"numbers of the same shape as {high} = {upper}")
-            if np.any(lower >= upper):
-                raise ParameterError("controller", low, lower, f"below {high} = {upper}")
+            _check_order(low, getattr(self, low), high, getattr(self, high))
 
     def output(self, i: int) -> tuple[str, float, str]:
         """A constrained output as scenario files name it: its state, what one of its unit is there, and that unit."""

@@ -70,6 +70,16 @@ def discretise(A_c: Array, B_c: Array, period: float) -> tuple[Array, Array]:
     return exponential[:n, :n], exponential[:n, n:]
 
 
+def lqr(A: Array, B: Array, Q: Array, R: Array) -> Array:
+    """K (nu, n) of u = -K x, which minimises the sum of x' Q x + u' R u for ever, x(k+1) = A x(k) + B u(k).
+
+    Raises:
+        numpy.linalg.LinAlgError: there is no such gain.
+    """
+    P = scipy.linalg.solve_discrete_are(A, B, Q, R)
+    return np.asarray(np.linalg.solve(R + B.T @ P @ B, B.T @ P @ A))
+
+
 def hover_model(vehicle: Vehicle, period: float) -> LinearModel:
     """The vehicle's discrete model at hover, for a control period tau_s [s].
 

@@ -18,7 +18,7 @@ from typing import NamedTuple
 import numpy as np
 import scipy.linalg
 
-from mpc.constraints import Bounds, Constraint, Penalty, Rows
+from mpc.constraints import Bounds, Constraint, Rows
 from mpc.model import LinearModel
 from quadsim.errors import ParameterError
 from quadsim.state import REFERENCE_STATES, Array
@@ -121,7 +121,7 @@ class Problem:
             _check_shape("u_min", self.bounds.u_min, (nu,))
             if self.bounds.margins is not None:
                 _check_shape("margins", self.bounds.margins, (self.horizon, self.bounds.y_min.size))
-        for constraint in (*(self.bounds.constraints if self.bounds else ()), *self.constraints):
+        for constraint in self._all:
             m = constraint.lower.shape[-1]
             for name, matrix, columns in (("C", constraint.C, n), ("D", constraint.D, nu), ("E", constraint.E, nu)):
                 if matrix is not None:
@@ -134,6 +134,10 @@ class Problem:
         """The equilibrium that the model is linearised at, the origin."""
         return Rest(np.zeros(self.model.n), self.model.u_bar)
 
+    @property
+    def _all(self) -> tuple[Constraint, ...]:
+        return (*(self.bounds.constraints if self.bounds else ()), *self.constraints)
+
     @cached_property
     def rows(self) -> Rows:
         """The rows of all constraints.
@@ -141,44 +145,34 @@ class Problem:
         Raises:
             ValueError: there are none.
         """
-        constraints = (*(self.bounds.constraints if self.bounds else ()), *self.constraints)
-        if not constraints:
+        if not self._all:
             raise ValueError("a constrained MPC needs a problem with bounds")
         N, n, nu = self.horizon, self.model.n, self.model.nu
-        sizes = [constraint.lower.shape[-1] for constraint in constraints]
+        parts = [(part, part.lower.shape[-1]) for part in self._all]
         C, D, E = (
-            np.concatenate(
-                [
-                    np.zeros((size, columns)) if matrix is None else matrix
-                    for size, matrix in zip(sizes, (getattr(part, name) for part in constraints), strict=True)
-                ]
-            )
-            for name, columns in (("C", n), ("D", nu), ("E", nu))
+            np.concatenate([np.zeros((m, size)) if (M := getattr(part, name)) is None else M for part, m in parts])
+            for name, size in (("C", n), ("D", nu), ("E", nu))
         )
         lower, upper = (
-            np.concatenate(
-                [np.broadcast_to(getattr(part, side), (N, m)) for part, m in zip(constraints, sizes, strict=True)], 1
-            )
+            np.concatenate([np.broadcast_to(getattr(part, side), (N, m)) for part, m in parts], axis=1)
             for side in ("lower", "upper")
         )
-        penalties = [
-            part.penalty or Penalty(l1=np.zeros(m), l2=np.zeros(m)) for part, m in zip(constraints, sizes, strict=True)
-        ]
-        hard = np.repeat([part.penalty is None for part in constraints], sizes)
-        single = hard & ~C.any(1) & ~E.any(1) & (np.count_nonzero(D, axis=1) == 1) & (D.max(axis=1, initial=0.0) == 1.0)
+        l1 = np.concatenate([np.full(m, math.inf) if part.penalty is None else part.penalty.l1 for part, m in parts])
+        l2 = np.concatenate([np.zeros(m) if part.penalty is None else part.penalty.l2 for part, m in parts])
+        names = [part.name for part, m in parts for _ in range(m)]
+        of_input = ~C.any(1) & ~E.any(1) & (np.count_nonzero(D, axis=1) == 1) & (D.max(axis=1, initial=0.0) == 1.0)
         bounded = np.flatnonzero((np.isfinite(lower) | np.isfinite(upper)).any(axis=0))
-        names = np.repeat([part.name for part in constraints], sizes)
         return Rows(
             C=C[bounded],
             D=D[bounded],
             E=E[bounded],
             lower=lower[:, bounded],
             upper=upper[:, bounded],
-            l1=np.where(hard, math.inf, np.concatenate([part.l1 for part in penalties]))[bounded],
-            l2=np.concatenate([part.l2 for part in penalties])[bounded],
+            l1=l1[bounded],
+            l2=l2[bounded],
             of_states=np.asarray(~D[bounded].any(axis=1) & ~E[bounded].any(axis=1)).reshape(bounded.size),
-            input=np.where(single, np.argmax(D, axis=1), -1)[bounded],
-            names=tuple(names[bounded].tolist()),
+            input=np.where(np.isinf(l1) & of_input, np.argmax(D, axis=1), -1)[bounded],
+            names=tuple(names[i] for i in bounded),
         )
 
 

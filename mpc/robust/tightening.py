@@ -34,7 +34,7 @@ import numpy as np
 import scipy.linalg
 
 from mpc.constraints import Bounds
-from mpc.model import continuous_model, discretise
+from mpc.model import continuous_model, discretise, lqr
 from quadsim.errors import ParameterError
 from quadsim.state import INDEX, N_STATES, Array, read_only
 from quadsim.vehicle import Vehicle
@@ -187,9 +187,7 @@ def observed(A: Array, C: Array) -> Array:
 
 def correction(A: Array, B: Array, C: Array, size: float) -> Array:
     """K (nu, n) of the discrete LQR that weighs outputs C x against inputs over `size`."""
-    Q, R = C.T @ C, np.eye(B.shape[1]) / size**2
-    P = scipy.linalg.solve_discrete_are(A, B, Q, R)
-    return np.asarray(np.linalg.solve(R + B.T @ P @ B, B.T @ P @ A))
+    return lqr(A, B, C.T @ C, np.eye(B.shape[1]) / size**2)
 
 
 def _absolute_integral(A: Array, C: Array, E: Array, start: float, stop: float) -> Array:
