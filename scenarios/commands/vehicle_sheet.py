@@ -21,7 +21,7 @@ SHEET_PERIOD: Final = 0.05  # control period of the discrete poles [s], the pape
 _RPM: Final = 60.0 / (2.0 * math.pi)
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class TorqueRange:
     """The torques about one body axis that hover leaves room for."""
 
@@ -61,16 +61,10 @@ class VehicleSheet:
     discrete_lag_poles: dict[str, float]  # the same at `period` [-]
 
 
-def make_sheet(vehicle: Vehicle, *, period: float = SHEET_PERIOD) -> VehicleSheet:
-    """The figures of a vehicle.
-
-    Args:
-        vehicle: the numbers.
-        period: control period of the discrete poles [s].
-    """
+def make_sheet(vehicle: Vehicle) -> VehicleSheet:
+    """The figures of a vehicle."""
     A_c, B_c = continuous_model(vehicle)
-    A, _ = discretise(A_c, B_c, period)
-    chains = integrator_chains(A_c)
+    A, _ = discretise(A_c, B_c, SHEET_PERIOD)
     ratio = (vehicle.speed_max / vehicle.hover_speed) ** 2
     lags = {name: value for name in ("rotor_rise", "rotor_fall") if (value := getattr(vehicle, name)) is not None}
     return VehicleSheet(
@@ -86,13 +80,13 @@ def make_sheet(vehicle: Vehicle, *, period: float = SHEET_PERIOD) -> VehicleShee
         input_slopes={
             name: float(np.abs(B_c[INDEX[name]]).max()) for name in ("vz", "roll_rate", "pitch_rate", "yaw_rate")
         },
-        integrator_chains=chains,
+        integrator_chains=integrator_chains(A_c),
         # A_c permutes to a strictly upper triangular matrix: chains of integrators, whose poles are its diagonal.
         continuous_poles=tuple(np.diag(A_c).tolist()),
         discrete_poles=tuple(np.diag(A).tolist()),
-        period=period,
+        period=SHEET_PERIOD,
         lag_poles={name: -1.0 / value for name, value in lags.items()},
-        discrete_lag_poles={name: math.exp(-period / value) for name, value in lags.items()},
+        discrete_lag_poles={name: math.exp(-SHEET_PERIOD / value) for name, value in lags.items()},
     )
 
 
@@ -103,19 +97,9 @@ def torque_ranges(vehicle: Vehicle) -> tuple[TorqueRange, ...]:
     times v, the thrust is its first row times v, and v_i lies between the squares of the speed limits.
     """
     ranges = []
-    for axis, name in enumerate(AXES):
+    for axis, (name, inertia) in enumerate(zip(AXES, vehicle.inertia, strict=True)):
         (low, high), (low_pure, high_pure) = (_extremes(vehicle, 1 + axis, pure=pure) for pure in (False, True))
-        ranges.append(
-            TorqueRange(
-                axis=name,
-                lowest=low,
-                highest=high,
-                lowest_pure=low_pure,
-                highest_pure=high_pure,
-                lowest_acceleration=low / vehicle.inertia[axis],
-                highest_acceleration=high / vehicle.inertia[axis],
-            )
-        )
+        ranges.append(TorqueRange(name, low, high, low_pure, high_pure, low / inertia, high / inertia))
     return tuple(ranges)
 
 
@@ -132,16 +116,11 @@ def integrator_chains(A_c: Array) -> tuple[int, ...]:
 
 def sheet_to_json(vehicle: Vehicle, sheet: VehicleSheet, sources: Mapping[str, str]) -> dict[str, Any]:
     """All of it as plain values: the vehicle, each parameter with unit and source, and what follows from them."""
-    return {
-        "name": vehicle.name,
-        "description": vehicle.description,
-        "parameters": {
-            name: {"value": value, "unit": unit, "source": sources[name]}
-            for name, unit in VEHICLE_UNITS.items()
-            if (value := getattr(vehicle, name)) is not None
-        },
-        "derived": asdict(sheet),
+    parameters = {
+        name: {"value": value, "unit": unit, "source": sources[name]} for name, value, unit in _parameters(vehicle)
     }
+    about = {"name": vehicle.name, "description": vehicle.description}
+    return {**about, "parameters": parameters, "derived": asdict(sheet)}
 
 
 def sheet_tables(vehicle: Vehicle, sheet: VehicleSheet, sources: Mapping[str, str]) -> list[Grid]:
@@ -166,14 +145,16 @@ def sheet_tables(vehicle: Vehicle, sheet: VehicleSheet, sources: Mapping[str, st
         _grid(
             "parameters",
             ("parameter", "value", "unit", "source"),
-            [
-                (name, _value(value), unit, sources[name])
-                for name, unit in VEHICLE_UNITS.items()
-                if (value := getattr(vehicle, name)) is not None
-            ],
+            [(name, _value(value), unit, sources[name]) for name, value, unit in _parameters(vehicle)],
             note="short names of sources are spelt out at the head of the vehicle's file",
         ),
     ]
+
+
+def _parameters(vehicle: Vehicle) -> list[tuple[str, Any, str]]:
+    """Name, value and unit of those that the file gives."""
+    given = ((name, getattr(vehicle, name), unit) for name, unit in VEHICLE_UNITS.items())
+    return [(name, value, unit) for name, value, unit in given if value is not None]
 
 
 def _extremes(vehicle: Vehicle, row: int, *, pure: bool) -> tuple[float, float]:
@@ -182,8 +163,7 @@ def _extremes(vehicle: Vehicle, row: int, *, pure: bool) -> tuple[float, float]:
     matrix = top * vehicle.allocation  # in v / speed_max^2, so that the programme is well scaled
     units = np.abs(matrix).max(axis=1)
     fixed = [0, *(other for other in (1, 2, 3) if pure and other != row)]
-    equal = np.zeros(len(fixed))
-    equal[0] = vehicle.mass * vehicle.gravity / units[0]
+    equal = [vehicle.mass * vehicle.gravity / units[0], *np.zeros(len(fixed) - 1)]
     found = []
     for sign in (1.0, -1.0):
         solution = linprog(
