@@ -10,7 +10,8 @@ import numpy as np
 
 from mpc.constraints import Bounds
 from mpc.ocp import Problem
-from quadsim.controller import ACCEPTED
+from mpc.solvers import Answer
+from quadsim.controller import ACCEPTED, Command
 from quadsim.errors import ParameterError
 from quadsim.state import Array
 from quadsim.vehicle import N_ROTORS, Vehicle
@@ -119,6 +120,23 @@ def rejection(status: str, speeds: Array, plan: Array, bounds: ActuatorBounds, b
         return "not_finite"
     lower, upper = bounds.reach(before)
     return "out_of_bounds" if np.maximum(lower - speeds, speeds - upper).max() > BOUND_TOLERANCE else None
+
+
+def command_of(speeds: Array, plan: Array, status: str, answer: Answer, *, fallback: int = 0) -> Command:
+    """Speeds (4,) and a plan (N, 4) as a command under a status, with what the solver says of its answer."""
+    solution, accepted = answer.solution, status in ACCEPTED
+    return Command(
+        speeds=speeds.copy(),
+        plan=plan,
+        status=status,
+        iterations=solution.iterations,
+        active=solution.active if accepted else 0,
+        fallback=fallback,
+        slack=float(np.max(answer.slacks, initial=0.0)) if accepted else 0.0,
+        primal_residual=solution.primal_residual,
+        dual_residual=solution.dual_residual,
+        solve_s=solution.solve_s,
+    )
 
 
 def shifted(plan: Array, steps: int) -> Array:

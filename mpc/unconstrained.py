@@ -59,14 +59,9 @@ class UnconstrainedMPC:
     solver: Final = ""
 
     def __init__(self, problem: Problem) -> None:
-        self.problem = problem
+        self.problem, self.horizon = problem, problem.horizon
         self.gains = sequence_gains(problem)
         self._offset = self.gains.L @ problem.model.u_bar
-
-    @property
-    def horizon(self) -> int:
-        """N, samples of preview."""
-        return self.problem.horizon
 
     def reset(self, speeds: Array) -> None:
         """Nothing to forget: the law has no memory."""

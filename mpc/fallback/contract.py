@@ -20,7 +20,7 @@ from __future__ import annotations
 
 import math
 import re
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Final
 
 import numpy as np
@@ -43,14 +43,6 @@ _MISTAKES: Final = (NotImplementedError, RecursionError)  # kinds of `RuntimeErr
 
 
 _USUAL: Final = FallbackSettings()
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Good:
-    """The last accepted answer, and the state (12,) it was found for."""
-
-    state: Array
-    plan: Array
 
 
 class Guarded:
@@ -83,31 +75,16 @@ class Guarded:
         settings: FallbackSettings = _USUAL,
         failures: tuple[type[Exception], ...] = FAILURES,
     ) -> None:
-        self.inner = inner
+        self.inner, self.name, self.solver, self.horizon = inner, inner.name, inner.solver, inner.horizon
         self.law = HoverLaw(model, tilt=settings.tilt)
         self._model, self._bounds, self._settings, self._failures = model, bounds, settings, failures
         self._distance = settings.distance
         self._completion = StateCompletion(model)
         self._level = Trim(speeds=model.u_bar, lift=np.array([0.0, 0.0, 1.0]))
-        self._good: _Good | None
+        self._good: tuple[Array, Array] | None  # the state (12,) of the last accepted answer, and its plan (N, 4)
         self._foreseen: Array | None
         self._target: Array | None
         self.reset(model.u_bar)
-
-    @property
-    def name(self) -> str:
-        """Name of the law inside."""
-        return self.inner.name
-
-    @property
-    def solver(self) -> str:
-        """Name of the QP solver."""
-        return self.inner.solver
-
-    @property
-    def horizon(self) -> int:
-        """N, samples of preview."""
-        return self.inner.horizon
 
     def reset(self, speeds: Array) -> None:
         """Start anew after the command u(-1) (4,) [rad/s]."""
@@ -135,7 +112,7 @@ class Guarded:
         else:
             self._forget()
             command = self._accept(answer, acting)
-            self._good = _Good(state=known, plan=command.plan)
+            self._good = known, command.plan
         self._before = command.speeds.copy()
         return command
 
@@ -200,17 +177,17 @@ class Guarded:
 
     def _shifted(self, known: Array, acting: Array, *, lost: bool) -> Array | None:
         """What is left of the last good plan (N, 4), corrected now; None once it is of no use, and then for good."""
-        good, age = self._good, self._age
-        if good is None:
+        if self._good is None:
             return None
+        (state, plan), age = self._good, self._age
         if self._foreseen is None:
-            self._foreseen = self.predict(good.state[None], good.plan[None])[0]
+            self._foreseen = self.predict(state[None], plan[None])[0]
         deviation = known - self._foreseen[min(age, self.horizon) - 1]  # row i is of the state i + 1 periods later
         old = age >= self.horizon or age * self._model.period > self._settings.plan_age + 1e-9
         if lost or old or not (np.abs(deviation) <= self._distance).all():
             self._good = None
             return None
-        plan = shifted(good.plan, age)
+        plan = shifted(plan, age)
         plan[0] += self.law.correction(deviation, float(known[INDEX["yaw"]]))
         return self._bounds.clip_plan(plan, acting)
 
