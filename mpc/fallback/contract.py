@@ -60,7 +60,6 @@ class Guarded:
         model: the hover model of the control period; see `mpc.model.hover_model`.
         bounds: hard bounds that every command keeps.
         settings: when the next level takes over.
-        failures: exceptions of the inner controller that count as a failed period; their names become its status.
 
     Raises:
         ParameterError: the model is not a quadrotor's.
@@ -73,11 +72,10 @@ class Guarded:
         *,
         bounds: ActuatorBounds,
         settings: FallbackSettings = _USUAL,
-        failures: tuple[type[Exception], ...] = FAILURES,
     ) -> None:
         self.inner, self.name, self.solver, self.horizon = inner, inner.name, inner.solver, inner.horizon
         self.law = HoverLaw(model, tilt=settings.tilt)
-        self._model, self._bounds, self._settings, self._failures = model, bounds, settings, failures
+        self._model, self._bounds, self._settings = model, bounds, settings
         self._distance = settings.distance
         self._completion = StateCompletion(model)
         self._level = Trim(speeds=model.u_bar, lift=np.array([0.0, 0.0, 1.0]))
@@ -97,8 +95,8 @@ class Guarded:
     def step(self, now: Moment, state: Array, reference: Array) -> Command:
         """The first level's command that can be had; see `quadsim.controller.Controller.step`.
 
-        Whatever becomes of the inner controller, this raises none of its `failures`.  While grounded, rotors are taken
-        to their lowest speed as fast as the bounds allow.
+        Whatever becomes of the inner controller, this raises none of its `FAILURES`, whose names become the status.
+        While grounded, rotors are taken to their lowest speed as fast as the bounds allow.
         """
         acting = self._before if now.acting is None or check_command(now.acting) is not None else now.acting
         known = self._completion.complete(state, acting, self.trim, free=now.phase is Phase.FLYING)
@@ -121,8 +119,9 @@ class Guarded:
         """The equilibrium that the inner controller estimates; level hover where it has none."""
         try:
             trim = getattr(self.inner, "trim", None)
-        except self._failures as error:
-            _raise_mistake(error)
+        except _MISTAKES:
+            raise
+        except FAILURES:
             trim = None
         return trim if isinstance(trim, Trim) else self._level
 
@@ -130,11 +129,12 @@ class Guarded:
         """See `quadsim.controller.Controller.predict`; by the hover model where the inner controller cannot."""
         try:
             predicted = self.inner.predict(states, plans)
-        except self._failures as error:
-            _raise_mistake(error)
-        else:
-            if np.shape(predicted) == (*plans.shape[:2], N_STATES):
-                return predicted
+        except _MISTAKES:
+            raise
+        except FAILURES:
+            predicted = np.empty(0)
+        if np.shape(predicted) == (*plans.shape[:2], N_STATES):
+            return predicted
         return predict_in_heading_frame(anchored(self._model, self.trim), states, plans, self.trim)
 
     def _forget(self) -> None:
@@ -152,8 +152,9 @@ class Guarded:
             return "invalid_reference", None
         try:
             answer = self.inner.step(now, known.copy(), reference)
-        except self._failures as error:
-            _raise_mistake(error)
+        except _MISTAKES:
+            raise
+        except FAILURES as error:
             return _snake_case(type(error).__name__), None
         if answer.status in ACCEPTED and (
             np.shape(answer.speeds) != (N_ROTORS,) or np.shape(answer.plan) != (self.horizon, N_ROTORS)
@@ -208,12 +209,6 @@ class Guarded:
         self._hovered += 1
         plan = self.law.plan(known, self._target, acting, self._bounds, self.horizon, self.trim)
         return plan, 3 if sinking else 2
-
-
-def _raise_mistake(error: Exception) -> None:
-    """Let a programmer's mistake through."""
-    if isinstance(error, _MISTAKES):
-        raise error
 
 
 def _snake_case(name: str) -> str:
