@@ -40,8 +40,7 @@ def turn(yaw: float) -> Array:
 def slope(model: LinearModel) -> Array:
     """(4, 4) accelerations along z and about x, y, z per rotor speed [(m/s^2)/(rad/s)], [1/s]."""
     # Rates and vz integrate accelerations alone, so that their rows of B are the period times the slope.
-    accelerations: Array = model.B[_ACCELERATED] / model.period
-    return accelerations
+    return np.asarray(model.B[_ACCELERATED] / model.period)
 
 
 def anchored(model: LinearModel, trim: Trim) -> LinearModel:

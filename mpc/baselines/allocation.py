@@ -55,8 +55,7 @@ def allocate(allocation: Allocation, wrench: Array, lower: Array, upper: Array) 
     if not ((low <= squares) & (squares <= high)).all():
         given = _less_yaw(squares, allocation.inverse[:, 3], low, high)
         squares = _nearest(allocation, wrench, low, high) if given is None else given
-    speeds: Array = np.clip(np.sqrt(np.maximum(squares, 0.0)), lower, upper)
-    return speeds
+    return np.asarray(np.clip(np.sqrt(np.maximum(squares, 0.0)), lower, upper))
 
 
 def _less_yaw(squares: Array, yaw: Array, low: Array, high: Array) -> Array | None:
@@ -76,5 +75,4 @@ def _nearest(allocation: Allocation, wrench: Array, low: Array, high: Array) -> 
     found = lsq_linear(
         weights[:, None] * allocation.M * unit, weights * wrench, (low / unit, wide / unit), method="bvls", tol=1e-14
     )
-    nearest: Array = found.x * unit
-    return nearest
+    return np.asarray(found.x * unit)

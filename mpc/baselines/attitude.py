@@ -104,8 +104,7 @@ def attitude_error(attitude: Array, wanted: Array) -> Array:
 
 def rate_error(attitude: Array, rates: Array, wanted: Array, wanted_rates: Array) -> Array:
     """e_Omega = Omega - R' R_d Omega_d (3,) [rad/s].  Lee, Leok, McClamroch (2010)."""
-    error: Array = rates - attitude.T @ wanted @ wanted_rates
-    return error
+    return np.asarray(rates - attitude.T @ wanted @ wanted_rates)
 
 
 def unit_derivatives(v: Array, v1: Array, v2: Array) -> tuple[Array, Array, Array]:

@@ -266,8 +266,7 @@ class RobustMPC:
         """(4,) speeds at rest [rad/s] that also balance what thrust twists now, which the hover matrices leave out."""
         thrust = self._model.effectiveness[0]
         excess = thrust @ np.square(self._rotors) - thrust @ np.square(self.trim.speeds)
-        balanced: Array = self.trim.speeds - self._inverse[:, 1:] @ (excess * self.trim.twist)
-        return balanced
+        return np.asarray(self.trim.speeds - self._inverse[:, 1:] @ (excess * self.trim.twist))
 
     def _along_plan(self, x0: Array) -> tuple[Array, Array, Array]:
         """A (N, n, n), B (N, n, 4), c (N, n) of the predicted steps."""

@@ -1,16 +1,15 @@
-"""`quadsim list`, `scenario`, `vehicle` and `doctor`: what there is, and what it says."""
+"""`quadsim list` and `scenario`: what there is, and what it says."""
 
 from __future__ import annotations
 
 import json
 from argparse import Namespace
-from pathlib import Path
 from typing import Any, Final, get_args
 
 from mpc.solvers import SOLVERS
 from quadsim.assets import read_toml, vehicle_names, vehicle_path
-from quadsim.errors import InputError, ParameterError
-from quadsim.vehicle import load_vehicle, vehicle_sources
+from quadsim.errors import InputError
+from quadsim.vehicle import load_vehicle
 from scenarios.commands import EXIT_DONE, console
 from scenarios.shipped import CONTROLLERS, Group, campaign_names, campaign_path, scenario_names, scenario_path
 
@@ -67,36 +66,4 @@ def scenario(options: Namespace) -> int:
     if isinstance(resolved.reference, CsvSpec):  # a start for one's own may have a table of its own
         resolved = resolved.model_copy(update={"reference": resolved.reference.model_copy(update={"sha256": None})})
     print(resolved.to_toml(), end="")
-    return EXIT_DONE
-
-
-def vehicle(options: Namespace) -> int:
-    """`quadsim vehicle`."""
-    from scenarios.commands.vehicle_sheet import make_sheet, sheet_tables, sheet_to_json
-
-    path = vehicle_path(options.vehicle)
-    loaded, sources = load_vehicle(path), vehicle_sources(path)
-    if options.out is not None:
-        from quadsim.report.film.video import render_portrait
-
-        if Path(options.out).suffix != ".png":
-            raise ParameterError("", "--out", options.out, "a file ending in .png")
-        render_portrait(loaded, Path(options.out))
-    sheet = make_sheet(loaded)
-    if options.json:
-        print(json.dumps(sheet_to_json(loaded, sheet, sources), indent=2))
-    else:
-        console.print_grids(sheet_tables(loaded, sheet, sources), options.out, prose=("unit", "source"))
-    return EXIT_DONE
-
-
-def doctor(options: Namespace) -> int:
-    """`quadsim doctor`."""
-    from scenarios.commands.doctor import examine
-
-    findings = examine()
-    if options.json:
-        print(json.dumps(findings, indent=2))
-    else:
-        console.print_listing(findings)
     return EXIT_DONE

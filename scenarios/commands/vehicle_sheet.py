@@ -1,20 +1,26 @@
-"""What a vehicle's numbers amount to: hover, thrust and torque margins, and the poles of its linear model."""
+"""`quadsim vehicle`: what its numbers amount to, of hover, thrust and torque margins and of the linear model."""
 
 from __future__ import annotations
 
 import itertools
+import json
 import math
+from argparse import Namespace
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 from scipy.optimize import linprog
 
 from mpc.model import continuous_model, discretise
+from quadsim.assets import vehicle_path
+from quadsim.errors import ParameterError
 from quadsim.report.table import Cell, Grid, format_number
 from quadsim.state import INDEX, Array
-from quadsim.vehicle import N_ROTORS, VEHICLE_UNITS, Vehicle
+from quadsim.vehicle import N_ROTORS, VEHICLE_UNITS, Vehicle, load_vehicle, vehicle_sources
+from scenarios.commands import EXIT_DONE, console
 
 AXES: Final = ("x", "y", "z")
 SHEET_PERIOD: Final = 0.05  # control period of the discrete poles [s], the paper's
@@ -59,6 +65,24 @@ class VehicleSheet:
     # of the rotors' speeds when they rise and fall, continuous [1/s], as far as the file gives them
     lag_poles: dict[str, float]
     discrete_lag_poles: dict[str, float]  # the same at `period` [-]
+
+
+def vehicle(options: Namespace) -> int:
+    """`quadsim vehicle`."""
+    path = vehicle_path(options.vehicle)
+    loaded, sources = load_vehicle(path), vehicle_sources(path)
+    if options.out is not None:
+        from quadsim.report.film.video import render_portrait
+
+        if Path(options.out).suffix != ".png":
+            raise ParameterError("", "--out", options.out, "a file ending in .png")
+        render_portrait(loaded, Path(options.out))
+    sheet = make_sheet(loaded)
+    if options.json:
+        print(json.dumps(sheet_to_json(loaded, sheet, sources), indent=2))
+    else:
+        console.print_grids(sheet_tables(loaded, sheet, sources), options.out, prose=("unit", "source"))
+    return EXIT_DONE
 
 
 def make_sheet(vehicle: Vehicle) -> VehicleSheet:
