@@ -97,20 +97,12 @@ def through_rows(table: Table) -> Path:
     straight = polyline(t, table.poses)
     if table.velocities is None:
         return replace(straight, resolution=table.resolution)
-    velocities = table.velocities
+    from scipy.interpolate import CubicHermiteSpline
+
+    cubics = CubicHermiteSpline(t, table.poses[:, :3], table.velocities)
 
     def pose(times: Array) -> Array:
-        i = np.clip(np.searchsorted(t, times, side="right") - 1, 0, t.size - 2)
-        h = (t[i + 1] - t[i])[:, None]
-        s = (times - t[i])[:, None] / h
-        before, after = table.poses[i, :3], table.poses[i + 1, :3]
-        poses = straight.pose(times)
-        poses[:, :3] = (
-            (1.0 + 2.0 * s) * (1.0 - s) ** 2 * before
-            + s**2 * (3.0 - 2.0 * s) * after
-            + h * s * (1.0 - s) * ((1.0 - s) * velocities[i] - s * velocities[i + 1])
-        )
-        return poses
+        return np.hstack([cubics(times), straight.pose(times)[:, 3:]])
 
     return Path(pose=pose, duration=straight.duration, kinks=straight.kinks, resolution=table.resolution)
 
