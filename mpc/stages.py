@@ -23,20 +23,12 @@ ROUNDING: Final = 1e-14
 class Pattern:
     """A sparse matrix assembled from blocks (..., rows, columns) that keep their places.
 
-    Args:
-        shape: of the matrix.
-        places: rows (..., rows) and columns (..., columns) of each block.
-        blocks: an example; what is zero in it is left out for good.
-        rounding: share of the largest of its block's row and of its block's column below which an entry is zero.
+    Places are the rows (..., rows) and the columns (..., columns) of each block.  What is zero in the first blocks, or
+    below the share `rounding` of the largest of its block's row and of its block's column, is left out for good.
     """
 
     def __init__(
-        self,
-        shape: tuple[int, int],
-        places: Sequence[tuple[Indices, Indices]],
-        blocks: list[Array],
-        *,
-        rounding: float = 0.0,
+        self, shape: tuple[int, int], places: Sequence[tuple[Indices, Indices]], blocks: list[Array], rounding: float
     ) -> None:
         pairs = list(zip(places, blocks, strict=True))
         rows = np.concatenate([np.broadcast_to(at[0][..., :, None], block.shape).ravel() for at, block in pairs])
@@ -143,43 +135,24 @@ class MatrixBuilder:
             A, B = (np.broadcast_to(part, (at.N, *part.shape)) for part in (problem.model.A, problem.model.B))
         rounding = 0.0 if changing else ROUNDING
         head, tail = self._slopes(A, B)
-        slack, ends, numbers = at.slacks.reshape(-1, 1), at.ends, np.arange(self._rows.lower.size).reshape(at.N, -1)
-        self._P = Pattern(
-            (at.size, at.size),
-            [
-                (at.head, at.head),
-                (at.tail, at.tail),
-                (at.starts[-1], at.starts[-1]),
-                (slack, slack),
-                (at.lasts, at.firsts),
-                (at.firsts, at.lasts),
-            ],
-            self._costs(head, tail),
-            rounding=rounding,
-        )
-        self._A = Pattern(
-            (ends.size, at.size),
-            [(ends[:1], at.head), (ends[1:], at.tail), (ends, at.starts)],
-            self._dynamics(head, tail),
-            rounding=rounding,
-        )
-        later, now = np.flatnonzero(self._rows.of_states), np.flatnonzero(~self._rows.of_states)
-        self._later, self._now = later, now
+        slack, numbers = at.slacks.reshape(-1, 1), np.arange(rows.lower.size).reshape(at.N, -1)
+        costs = [(at.head, at.head), (at.tail, at.tail), (at.starts[-1], at.starts[-1]), (slack, slack)]
+        costs += [(at.lasts, at.firsts), (at.firsts, at.lasts)]
+        self._P = Pattern((at.size, at.size), costs, self._costs(head, tail), rounding)
+        dynamics = [(at.ends[:1], at.head), (at.ends[1:], at.tail), (at.ends, at.starts)]
+        self._A = Pattern((at.ends.size, at.size), dynamics, self._dynamics(head, tail), rounding)
+        self._later, self._now = later, now = np.flatnonzero(rows.of_states), np.flatnonzero(~rows.of_states)
         stages, cuts = len(at.tail), at.L + at.M * np.arange(len(at.tail))
-        self._G = Pattern(
-            (numbers.size, at.size),
-            [
-                (numbers[: at.L - 1, later], at.head),
-                (numbers[at.L - 1 : -1, later].reshape(stages, at.M, later.size), at.tail[:, None]),
-                (numbers[-1, later], at.starts[-1]),
-                (numbers, at.slacks),
-                (numbers[: at.L, now], at.head),
-                (numbers[at.L :, now].reshape(stages, at.M, now.size), at.tail[:, None]),
-                (numbers[cuts][:, now], at.lasts),
-            ],
-            self._inequalities(head, tail),
-            rounding=rounding,
-        )
+        inequalities = [
+            (numbers[: at.L - 1, later], at.head),
+            (numbers[at.L - 1 : -1, later].reshape(stages, at.M, later.size), at.tail[:, None]),
+            (numbers[-1, later], at.starts[-1]),
+            (numbers, at.slacks),
+            (numbers[: at.L, now], at.head),
+            (numbers[at.L :, now].reshape(stages, at.M, now.size), at.tail[:, None]),
+            (numbers[cuts][:, now], at.lasts),
+        ]
+        self._G = Pattern((numbers.size, at.size), inequalities, self._inequalities(head, tail), rounding)
 
     def build(self, A: Array, B: Array) -> Matrices:
         """The matrices of A (N, n, n), B (N, n, nu)."""
@@ -224,8 +197,8 @@ class MatrixBuilder:
     def _input_cost(self, steps: int) -> Array:
         """Hessian of the cost of a stage's inputs, of changes both from the stage before and to the one after."""
         itself, beside = np.eye(steps), np.eye(steps, k=1) + np.eye(steps, k=-1)
-        cost: Array = np.kron(itself, self._input_weight + 2.0 * self._move_weight) - np.kron(beside, self._move_weight)
-        return cost
+        own = np.kron(itself, self._input_weight + 2.0 * self._move_weight)
+        return np.asarray(own - np.kron(beside, self._move_weight))
 
     def _dynamics(self, head: Array, tail: Array) -> list[Array]:
         """The equality rows' blocks: each stage's end is the next one's start."""
