@@ -16,8 +16,8 @@ from quadsim.controller import SOLVED
 from quadsim.flight.audit import Finding
 from quadsim.flight.metrics import peak_tilt, tracking
 from scenarios.flight import Flight
-from scenarios.loading import scenario_names
 from scenarios.schema.scenario import Group, LostSpec
+from scenarios.shipped import scenario_names
 
 PAGE = Path(__file__).resolve().parent / "scenarios.md"
 TITLES: dict[Group, str] = {

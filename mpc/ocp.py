@@ -18,7 +18,7 @@ from typing import NamedTuple
 import numpy as np
 import scipy.linalg
 
-from mpc.constraints import Bounds, Constraint, Penalty, Rows
+from mpc.constraints import Bounds, Constraint, Rows
 from mpc.model import LinearModel
 from quadsim.errors import ParameterError
 from quadsim.state import REFERENCE_STATES, Array
@@ -38,22 +38,15 @@ class Rest(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class Objective:
-    """The cost of Eq. (5), with two terms that the paper does not have.
+    """The cost of Eq. (5), with two terms that the paper does not have."""
 
-    Attributes:
-        C_r: (n_r, n) regulated outputs y_r = C_r xi.  Eq. (4), where the paper prints n_r x n_r.
-        Q_y: (n_r, n_r) weight of the output error, symmetric positive definite.
-        Q_u: (nu, nu) weight of u - u_bar, symmetric positive definite.
-        Q_d: (nu, nu) weight of an input's change from one step to the next, symmetric positive semidefinite; None for
-            none.
-        P: (n, n) weight of the last state's distance from x_s + C_r^+ (y_d - C_r x_s), in place of Q_y's, symmetric
-            positive semidefinite; None for none.
-    """
-
-    C_r: Array
-    Q_y: Array
-    Q_u: Array
+    C_r: Array  # (n_r, n) regulated outputs y_r = C_r xi. Eq. (4), where the paper prints n_r x n_r
+    Q_y: Array  # (n_r, n_r) weight of the output error, symmetric positive definite
+    Q_u: Array  # (nu, nu) weight of u - u_bar, symmetric positive definite
+    # (nu, nu) weight of an input's change from one step to the next, symmetric positive semidefinite; None for none
     Q_d: Array | None = None
+    # (n, n) weight of the last state's distance from x_s + C_r^+ (y_d - C_r x_s), in place of Q_y's, symmetric positive
+    # semidefinite; None for none
     P: Array | None = None
 
     def __post_init__(self) -> None:
@@ -105,21 +98,13 @@ def lqr_terminal_weight(model: LinearModel, objective: Objective) -> Array:
 
 @dataclass(frozen=True, kw_only=True)
 class Problem:
-    """Everything that defines a controller but the way its optimum is found.
+    """Everything that defines a controller but the way its optimum is found."""
 
-    Attributes:
-        model: the prediction model.
-        horizon: N, steps.
-        objective: what is minimised.
-        bounds: the paper's constraints; None for none.
-        constraints: others.
-    """
-
-    model: LinearModel
-    horizon: int
-    objective: Objective
-    bounds: Bounds | None = None
-    constraints: tuple[Constraint, ...] = ()
+    model: LinearModel  # the prediction model
+    horizon: int  # N, steps
+    objective: Objective  # what is minimised
+    bounds: Bounds | None = None  # the paper's constraints; None for none
+    constraints: tuple[Constraint, ...] = ()  # others
 
     def __post_init__(self) -> None:
         if not isinstance(self.horizon, int) or self.horizon < 1:
@@ -136,7 +121,7 @@ class Problem:
             _check_shape("u_min", self.bounds.u_min, (nu,))
             if self.bounds.margins is not None:
                 _check_shape("margins", self.bounds.margins, (self.horizon, self.bounds.y_min.size))
-        for constraint in (*(self.bounds.constraints if self.bounds else ()), *self.constraints):
+        for constraint in self._all:
             m = constraint.lower.shape[-1]
             for name, matrix, columns in (("C", constraint.C, n), ("D", constraint.D, nu), ("E", constraint.E, nu)):
                 if matrix is not None:
@@ -149,6 +134,10 @@ class Problem:
         """The equilibrium that the model is linearised at, the origin."""
         return Rest(np.zeros(self.model.n), self.model.u_bar)
 
+    @property
+    def _all(self) -> tuple[Constraint, ...]:
+        return (*(self.bounds.constraints if self.bounds else ()), *self.constraints)
+
     @cached_property
     def rows(self) -> Rows:
         """The rows of all constraints.
@@ -156,44 +145,34 @@ class Problem:
         Raises:
             ValueError: there are none.
         """
-        constraints = (*(self.bounds.constraints if self.bounds else ()), *self.constraints)
-        if not constraints:
+        if not self._all:
             raise ValueError("a constrained MPC needs a problem with bounds")
         N, n, nu = self.horizon, self.model.n, self.model.nu
-        sizes = [constraint.lower.shape[-1] for constraint in constraints]
+        parts = [(part, part.lower.shape[-1]) for part in self._all]
         C, D, E = (
-            np.concatenate(
-                [
-                    np.zeros((size, columns)) if matrix is None else matrix
-                    for size, matrix in zip(sizes, (getattr(part, name) for part in constraints), strict=True)
-                ]
-            )
-            for name, columns in (("C", n), ("D", nu), ("E", nu))
+            np.concatenate([np.zeros((m, size)) if (M := getattr(part, name)) is None else M for part, m in parts])
+            for name, size in (("C", n), ("D", nu), ("E", nu))
         )
         lower, upper = (
-            np.concatenate(
-                [np.broadcast_to(getattr(part, side), (N, m)) for part, m in zip(constraints, sizes, strict=True)], 1
-            )
+            np.concatenate([np.broadcast_to(getattr(part, side), (N, m)) for part, m in parts], axis=1)
             for side in ("lower", "upper")
         )
-        penalties = [
-            part.penalty or Penalty(l1=np.zeros(m), l2=np.zeros(m)) for part, m in zip(constraints, sizes, strict=True)
-        ]
-        hard = np.repeat([part.penalty is None for part in constraints], sizes)
-        single = hard & ~C.any(1) & ~E.any(1) & (np.count_nonzero(D, axis=1) == 1) & (D.max(axis=1, initial=0.0) == 1.0)
+        l1 = np.concatenate([np.full(m, math.inf) if part.penalty is None else part.penalty.l1 for part, m in parts])
+        l2 = np.concatenate([np.zeros(m) if part.penalty is None else part.penalty.l2 for part, m in parts])
+        names = [part.name for part, m in parts for _ in range(m)]
+        of_input = ~C.any(1) & ~E.any(1) & (np.count_nonzero(D, axis=1) == 1) & (D.max(axis=1, initial=0.0) == 1.0)
         bounded = np.flatnonzero((np.isfinite(lower) | np.isfinite(upper)).any(axis=0))
-        names = np.repeat([part.name for part in constraints], sizes)
         return Rows(
             C=C[bounded],
             D=D[bounded],
             E=E[bounded],
             lower=lower[:, bounded],
             upper=upper[:, bounded],
-            l1=np.where(hard, math.inf, np.concatenate([part.l1 for part in penalties]))[bounded],
-            l2=np.concatenate([part.l2 for part in penalties])[bounded],
+            l1=l1[bounded],
+            l2=l2[bounded],
             of_states=np.asarray(~D[bounded].any(axis=1) & ~E[bounded].any(axis=1)).reshape(bounded.size),
-            input=np.where(single, np.argmax(D, axis=1), -1)[bounded],
-            names=tuple(names[bounded].tolist()),
+            input=np.where(np.isinf(l1) & of_input, np.argmax(D, axis=1), -1)[bounded],
+            names=tuple(names[i] for i in bounded),
         )
 
 

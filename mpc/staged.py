@@ -24,8 +24,8 @@ from typing import Final
 import numpy as np
 
 from mpc.ocp import Problem, Rest
-from mpc.qp import QP, Solution, Vectors, qp_rows
-from mpc.stages import Matrices, MatrixBuilder, condense, layout
+from mpc.qp import QP, QPRows, Solution, Vectors
+from mpc.stages import Layout, Matrices, MatrixBuilder, condense
 from quadsim.errors import ParameterError
 from quadsim.state import Array
 
@@ -63,8 +63,8 @@ class Staged:
         steps = usual_steps(model.nu) if steps_per_stage is None else steps_per_stage
         if not isinstance(steps, int) or steps < 1:
             raise ParameterError("controller", "steps_per_stage", steps, "a whole number >= 1")
-        self._problem, self._rows, soft = problem, qp_rows(problem), problem.rows.soft
-        self._at = at = layout(N, model.n, model.nu, soft.size, steps)
+        self._problem, self._rows, soft = problem, QPRows(problem), problem.rows.soft
+        self._at = at = Layout(N, model.n, model.nu, soft.size, steps)
         self._builder = MatrixBuilder(problem, self._rows, at, changing=changing)
         self._linear = np.zeros(at.size)
         self._linear[at.slacks] = problem.rows.l1[soft]
@@ -93,15 +93,9 @@ class Staged:
     def changed_vectors(
         self, matrices: Matrices, c: Array, state: Array, desired: Array, u_before: Array, rest: Rest
     ) -> Vectors:
-        """The QP's vectors for a model that changes.
+        """The QP's vectors for a model that changes, of c_i (N, n), x(k) (n,), y_d (N, n_r) and u(k-1) (nu,) [rad/s].
 
-        Args:
-            matrices: of `prepare`.
-            c: (N, n), c_i.
-            state: (n,) x(k).
-            desired: (N, n_r) y_d for x(k+1) .. x(k+N).
-            u_before: (nu,) u(k-1) [rad/s].
-            rest: what the cost pulls inputs to, and where the terminal weight is about.
+        At `rest` is what the cost pulls inputs to, and where the terminal weight is about.
         """
         at, rows, objective = self._at, self._rows, self._problem.objective
         head, tail = (part[..., 0] for part in self._offsets(matrices, c, state))

@@ -23,20 +23,12 @@ ROUNDING: Final = 1e-14
 class Pattern:
     """A sparse matrix assembled from blocks (..., rows, columns) that keep their places.
 
-    Args:
-        shape: of the matrix.
-        places: rows (..., rows) and columns (..., columns) of each block.
-        blocks: an example; what is zero in it is left out for good.
-        rounding: share of the largest of its block's row and of its block's column below which an entry is zero.
+    Places are the rows (..., rows) and the columns (..., columns) of each block.  What is zero in the first blocks, or
+    below the share `rounding` of the largest of its block's row and of its block's column, is left out for good.
     """
 
     def __init__(
-        self,
-        shape: tuple[int, int],
-        places: Sequence[tuple[Indices, Indices]],
-        blocks: list[Array],
-        *,
-        rounding: float = 0.0,
+        self, shape: tuple[int, int], places: Sequence[tuple[Indices, Indices]], blocks: list[Array], rounding: float
     ) -> None:
         pairs = list(zip(places, blocks, strict=True))
         rows = np.concatenate([np.broadcast_to(at[0][..., :, None], block.shape).ravel() for at, block in pairs])
@@ -63,9 +55,8 @@ def _present(block: Array, rounding: float) -> NDArray[np.bool_]:
     return np.asarray(size > rounding * largest)
 
 
-@dataclass(frozen=True, kw_only=True)
 class Layout:
-    """Where everything is among the variables.
+    """Where everything is among the variables, for N steps of n states, nu inputs and n_s slacks, M in a stage.
 
     Attributes:
         N, n, nu, L, M: horizon, states, inputs, steps in the first stage and in each other.
@@ -79,62 +70,29 @@ class Layout:
         size: of all.
     """
 
-    N: int
-    n: int
-    nu: int
-    L: int
-    M: int
-    head: Indices
-    tail: Indices
-    starts: Indices
-    inputs: Indices
-    slacks: Indices
-    ends: Indices
-    lasts: Indices
-    firsts: Indices
-    size: int
-
-
-def layout(N: int, n: int, nu: int, n_s: int, M: int) -> Layout:
-    """Variables for a horizon N of n states, nu inputs and n_s slacks in stages of M steps."""
-    room = M + (n // nu if M > 1 else 0)
-    L = N if room >= N else room - (room - N) % M
-    stages = (N - L) // M
-    first, width = L * nu + (L - 1) * n_s, n + M * (nu + n_s)
-    base = first + width * np.arange(stages + 1)[:, None]
-    size = first + stages * width + n + n_s
-    head, tail = np.arange(L * nu), base[:-1] + np.arange(n + M * nu)
-    starts = base + np.arange(n)
-    later = base[:-1] + n + M * nu + np.arange(M * n_s)
-    inputs = np.concatenate([head, tail[:, n:].ravel()]).reshape(N, nu)
-    cuts = L + M * np.arange(stages)
-    slacks = [np.arange(L * nu, first), later.ravel(), np.arange(size - n_s, size)]
-    return Layout(
-        N=N,
-        n=n,
-        nu=nu,
-        L=L,
-        M=M,
-        head=head,
-        tail=tail,
-        starts=starts,
-        inputs=inputs,
-        slacks=np.concatenate(slacks).reshape(N, n_s),
-        ends=np.arange(starts.size).reshape(starts.shape),
-        lasts=inputs[cuts - 1],
-        firsts=inputs[cuts],
-        size=size,
-    )
+    def __init__(self, N: int, n: int, nu: int, n_s: int, M: int) -> None:
+        room = M + (n // nu if M > 1 else 0)
+        L = N if room >= N else room - (room - N) % M
+        self.N, self.n, self.nu, self.L, self.M = N, n, nu, L, M
+        stages = (N - L) // M
+        first, width = L * nu + (L - 1) * n_s, n + M * (nu + n_s)
+        base = first + width * np.arange(stages + 1)[:, None]
+        self.size = first + stages * width + n + n_s
+        self.head, self.tail = np.arange(L * nu), base[:-1] + np.arange(n + M * nu)
+        self.starts = base + np.arange(n)
+        self.inputs = np.concatenate([self.head, self.tail[:, n:].ravel()]).reshape(N, nu)
+        later = base[:-1] + n + M * nu + np.arange(M * n_s)
+        slacks = [np.arange(L * nu, first), later.ravel(), np.arange(self.size - n_s, self.size)]
+        self.slacks = np.concatenate(slacks).reshape(N, n_s)
+        self.ends = np.arange(self.starts.size).reshape(self.starts.shape)
+        cuts = L + M * np.arange(stages)
+        self.lasts, self.firsts = self.inputs[cuts - 1], self.inputs[cuts]
 
 
 def condense_stages(start: Array, A: Array, B: Array, c: Array) -> Array:
     """(J, L + 1, n, m + 1) states of J stages of L steps, as functions of the variables, the inputs the last, and of 1.
 
-    Args:
-        start: (J, n, m + 1) the first of them.
-        A: (J, L, n, n).
-        B: (J, L, n, nu).
-        c: (J, L, n).
+    From the first of them (J, n, m + 1) by A (J, L, n, n), B (J, L, n, nu) and c (J, L, n).
     """
     (count, steps, n, nu), columns = B.shape, start.shape[2]
     states = np.empty((count, steps + 1, n, columns))
@@ -149,25 +107,15 @@ def condense_stages(start: Array, A: Array, B: Array, c: Array) -> Array:
 
 @dataclass(frozen=True, kw_only=True)
 class Matrices:
-    """What the A_i and B_i of a horizon make of the QP; to be used for as many periods as these hold.
+    """What the A_i and B_i of a horizon make of the QP; to be used for as many periods as these hold."""
 
-    Attributes:
-        A: (N, n, n), A_i.
-        B: (N, n, nu), B_i.
-        head: (1, L + 1, n, L nu) slopes of the states of the first stage by v_0.
-        tail: (J - 1, M + 1, n, n + M nu) those of the others by [s_j, v_j].
-        P: cost.
-        dynamics: equality rows.
-        rows: inequality rows.
-    """
-
-    A: Array
-    B: Array
-    head: Array
-    tail: Array
-    P: csc_matrix
-    dynamics: csc_matrix
-    rows: csc_matrix
+    A: Array  # (N, n, n), A_i
+    B: Array  # (N, n, nu), B_i
+    head: Array  # (1, L + 1, n, L nu) slopes of the states of the first stage by v_0
+    tail: Array  # (J - 1, M + 1, n, n + M nu) those of the others by [s_j, v_j]
+    P: csc_matrix  # cost
+    dynamics: csc_matrix  # equality rows
+    rows: csc_matrix  # inequality rows
 
 
 class MatrixBuilder:
@@ -187,43 +135,24 @@ class MatrixBuilder:
             A, B = (np.broadcast_to(part, (at.N, *part.shape)) for part in (problem.model.A, problem.model.B))
         rounding = 0.0 if changing else ROUNDING
         head, tail = self._slopes(A, B)
-        slack, ends, numbers = at.slacks.reshape(-1, 1), at.ends, np.arange(self._rows.lower.size).reshape(at.N, -1)
-        self._P = Pattern(
-            (at.size, at.size),
-            [
-                (at.head, at.head),
-                (at.tail, at.tail),
-                (at.starts[-1], at.starts[-1]),
-                (slack, slack),
-                (at.lasts, at.firsts),
-                (at.firsts, at.lasts),
-            ],
-            self._costs(head, tail),
-            rounding=rounding,
-        )
-        self._A = Pattern(
-            (ends.size, at.size),
-            [(ends[:1], at.head), (ends[1:], at.tail), (ends, at.starts)],
-            self._dynamics(head, tail),
-            rounding=rounding,
-        )
-        later, now = np.flatnonzero(self._rows.of_states), np.flatnonzero(~self._rows.of_states)
-        self._later, self._now = later, now
+        slack, numbers = at.slacks.reshape(-1, 1), np.arange(rows.lower.size).reshape(at.N, -1)
+        costs = [(at.head, at.head), (at.tail, at.tail), (at.starts[-1], at.starts[-1]), (slack, slack)]
+        costs += [(at.lasts, at.firsts), (at.firsts, at.lasts)]
+        self._P = Pattern((at.size, at.size), costs, self._costs(head, tail), rounding)
+        dynamics = [(at.ends[:1], at.head), (at.ends[1:], at.tail), (at.ends, at.starts)]
+        self._A = Pattern((at.ends.size, at.size), dynamics, self._dynamics(head, tail), rounding)
+        self._later, self._now = later, now = np.flatnonzero(rows.of_states), np.flatnonzero(~rows.of_states)
         stages, cuts = len(at.tail), at.L + at.M * np.arange(len(at.tail))
-        self._G = Pattern(
-            (numbers.size, at.size),
-            [
-                (numbers[: at.L - 1, later], at.head),
-                (numbers[at.L - 1 : -1, later].reshape(stages, at.M, later.size), at.tail[:, None]),
-                (numbers[-1, later], at.starts[-1]),
-                (numbers, at.slacks),
-                (numbers[: at.L, now], at.head),
-                (numbers[at.L :, now].reshape(stages, at.M, now.size), at.tail[:, None]),
-                (numbers[cuts][:, now], at.lasts),
-            ],
-            self._inequalities(head, tail),
-            rounding=rounding,
-        )
+        inequalities = [
+            (numbers[: at.L - 1, later], at.head),
+            (numbers[at.L - 1 : -1, later].reshape(stages, at.M, later.size), at.tail[:, None]),
+            (numbers[-1, later], at.starts[-1]),
+            (numbers, at.slacks),
+            (numbers[: at.L, now], at.head),
+            (numbers[at.L :, now].reshape(stages, at.M, now.size), at.tail[:, None]),
+            (numbers[cuts][:, now], at.lasts),
+        ]
+        self._G = Pattern((numbers.size, at.size), inequalities, self._inequalities(head, tail), rounding)
 
     def build(self, A: Array, B: Array) -> Matrices:
         """The matrices of A (N, n, n), B (N, n, nu)."""
@@ -268,8 +197,8 @@ class MatrixBuilder:
     def _input_cost(self, steps: int) -> Array:
         """Hessian of the cost of a stage's inputs, of changes both from the stage before and to the one after."""
         itself, beside = np.eye(steps), np.eye(steps, k=1) + np.eye(steps, k=-1)
-        cost: Array = np.kron(itself, self._input_weight + 2.0 * self._move_weight) - np.kron(beside, self._move_weight)
-        return cost
+        own = np.kron(itself, self._input_weight + 2.0 * self._move_weight)
+        return np.asarray(own - np.kron(beside, self._move_weight))
 
     def _dynamics(self, head: Array, tail: Array) -> list[Array]:
         """The equality rows' blocks: each stage's end is the next one's start."""

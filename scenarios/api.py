@@ -20,7 +20,7 @@ from quadsim.vehicle import Vehicle
 from quadsim.vehicle import load_vehicle as read_vehicle
 from scenarios.build import build_controller
 from scenarios.flight import Flight, Outputs
-from scenarios.loading import check_parts, load_scenario, scenario_names
+from scenarios.loading import check_parts, load_scenario
 from scenarios.parts.own_code import refer_to, refer_to_force, require_importable, set_up, set_up_force
 from scenarios.parts.plugin import build_force
 from scenarios.parts.randomness import generator
@@ -29,6 +29,7 @@ from scenarios.progress import Progress, silent
 from scenarios.reaudit import Reaudit, reaudit, stored_scenario
 from scenarios.run import fly_scenario, run_scenario
 from scenarios.schema.scenario import Scenario
+from scenarios.shipped import scenario_names
 
 if TYPE_CHECKING:
     from scenarios.campaign.engine.protocol import Engine

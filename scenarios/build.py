@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Final
 
 from mpc.ocp import Problem
 from quadsim.controller import Controller
@@ -20,15 +19,6 @@ from scenarios.parts.randomness import generator
 from scenarios.parts.vehicle import resolve_vehicle
 from scenarios.schema.optimisation import WeightedSpec
 from scenarios.schema.scenario import Scenario
-
-CONTROLLERS: Final = {
-    "unconstrained": "the paper's Sec. 4: a constant gain from the unconstrained optimum",
-    "constrained": "the paper's Sec. 5: a QP's optimum in every period, tilt, rotor speeds and their steps bounded",
-    "robust": "constrained, with soft bounds, rotor lag, delay, disturbances, heading and more, each switched on alone",
-    "lqr": "infinite-horizon LQR on the hover model, following the reference's velocity",
-    "pid": "cascaded PID, as autopilots fly it",
-    "geometric": "geometric tracking control on SE(3)",
-}
 
 
 def resolve(scenario: Scenario, vehicle: Vehicle) -> Scenario:

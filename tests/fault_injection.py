@@ -14,7 +14,7 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from mpc.fallback.contract import Guarded
-from mpc.solvers import _piqp
+from mpc.solvers import piqp_backends
 from quadsim.controller import SOLVED, Command, Controller, Moment
 from quadsim.flight.log import FlightLog
 from quadsim.sim.physics import Segment
@@ -50,7 +50,7 @@ AFTER: Final = 12.0
 """Time flown from the fault's end [s]."""
 LAST: Final = 60.0
 """Time at which the paper's course ends [s]."""
-STATUSES: Final = tuple(sorted({*_piqp.STATUS.values()} - {SOLVED}))
+STATUSES: Final = tuple(sorted({*piqp_backends.STATUS.values()} - {SOLVED}))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -291,7 +291,7 @@ class _FailingSolver:
 @contextlib.contextmanager
 def _failing_solver() -> Iterator[_FailingSolver]:
     failing = _FailingSolver()
-    with mock.patch.object(_piqp, "solve", partial(failing.solve, _piqp.solve)):
+    with mock.patch.object(piqp_backends, "solve", partial(failing.solve, piqp_backends.solve)):
         yield failing
 
 

@@ -16,7 +16,6 @@ import scipy.linalg
 from mpc.constraints import Constraint
 from mpc.ocp import Problem, Rest
 from mpc.qp import QP, Solution, kkt_residuals
-from mpc.solvers._common import start
 from mpc.solvers.daqp_dense import DaqpDense
 from quadsim.state import Array
 from scenarios.bench.polish import polish
@@ -177,7 +176,7 @@ def optimum(problem: Problem, given: Period) -> Optimum:
     qp = dense_qp(problem, given)
     backend = DaqpDense()
     backend.setup(qp)
-    solution = backend.solve(start(qp))
+    solution = backend.solve(qp.vectors)
     exact = polish(qp, solution) if np.isfinite(solution.x).all() else solution
     if kkt_residuals(qp, exact).worst < kkt_residuals(qp, solution).worst:
         solution = exact

@@ -15,7 +15,7 @@ from mpc.constraints import Rows
 from mpc.ocp import Problem, Rest
 from mpc.paper.cost import cost
 from mpc.paper.prediction import Prediction, prediction
-from mpc.qp import QP, QPRows, Solution, Vectors, qp_rows
+from mpc.qp import QP, QPRows, Solution, Vectors
 from quadsim.state import Array, Indices
 
 
@@ -24,18 +24,12 @@ class CondensedCost:
     """J = 1/2 v' H v + [F_x dx + F_y dy + F_d du]' v + const, for deviations from a rest state (x_s, u_s).
 
     With v = u - u_s the sequence of inputs, dx = x(k) - x_s, dy = y_d - C_r x_s and du = u(k-1) - u_s.
-
-    Attributes:
-        H: (N nu, N nu) symmetric positive definite.  Eq. (7).
-        F_x: (N nu, n).  Eq. (8).
-        F_y: (N nu, N n_r).  Eq. (9).
-        F_d: (N nu, nu), zero without a weight of changes.
     """
 
-    H: Array
-    F_x: Array
-    F_y: Array
-    F_d: Array
+    H: Array  # (N nu, N nu) symmetric positive definite. Eq. (7)
+    F_x: Array  # (N nu, n). Eq. (8)
+    F_y: Array  # (N nu, N n_r). Eq. (9)
+    F_d: Array  # (N nu, nu), zero without a weight of changes
 
 
 def condensed_cost(problem: Problem, maps: Prediction) -> CondensedCost:
@@ -57,15 +51,10 @@ def condensed_cost(problem: Problem, maps: Prediction) -> CondensedCost:
 
 @dataclass(frozen=True, kw_only=True)
 class RowMaps:
-    """Values (N, m) of rows: of_inputs v + of_state dx + of_rest, the first of them less E du.
+    """Values (N, m) of rows: of_inputs v + of_state dx + of_rest, the first of them less E du."""
 
-    Attributes:
-        of_inputs: (N, m, N nu) slopes in v = u - u_s.
-        of_state: (N, m, n) in dx = x(k) - x_s.
-    """
-
-    of_inputs: Array
-    of_state: Array
+    of_inputs: Array  # (N, m, N nu) slopes in v = u - u_s
+    of_state: Array  # (N, m, n) in dx = x(k) - x_s
 
 
 def row_maps(rows: Rows | QPRows, maps: Prediction) -> RowMaps:
@@ -88,9 +77,6 @@ def row_maps(rows: Rows | QPRows, maps: Prediction) -> RowMaps:
 class Condensed:
     """min 1/2 x' P x + c' x over x = [u(k); ...; u(k+N-1); e], e (N, m_s) the slacks of soft rows.
 
-    Args:
-        problem: with constraints.
-
     Attributes:
         qp: H, the rows time by time, and the box; vectors for xi(k) and y_d zero and u(k-1) = u_bar.
 
@@ -99,7 +85,7 @@ class Condensed:
     """
 
     def __init__(self, problem: Problem) -> None:
-        self._problem, self._rows = problem, qp_rows(problem)
+        self._problem, self._rows = problem, QPRows(problem)
         model, N, nu = problem.model, problem.horizon, problem.model.nu
         self._maps = prediction(model, N)
         self._cost, self._values = condensed_cost(problem, self._maps), row_maps(self._rows, self._maps)
@@ -155,13 +141,9 @@ class Condensed:
         return self._rows.multipliers(solution.z, solution.z_box[: self._inputs])
 
     def solution(self, like: Solution, plan: Array, slacks: Array, multipliers: Array) -> Solution:
-        """A solution of this QP, of which the primal point and the rows' multipliers (N, m) are known.
+        """This QP's solution of a plan (N, nu), slacks (N, m_s), rows' multipliers (N, m) and what else `like` says.
 
-        Args:
-            like: what else it says.
-            plan: (N, nu).
-            slacks: (N, m_s).
-            multipliers: (N, m), positive at upper bounds and negative at lower ones.
+        Multipliers are positive at upper bounds and negative at lower ones.
         """
         (z, z_box), x, soft = self._rows.split(multipliers), plan.ravel(), self._problem.rows.soft
         if soft.size:

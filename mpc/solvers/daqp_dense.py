@@ -54,13 +54,14 @@ class DaqpDense:
     def setup(self, qp: QP) -> None:
         """See `mpc.qp.Backend.setup`."""
         self._qp = qp
-        start = _common.start(qp)
         self._sense: Sense | None = None
         self._last: Sense | None = None
         sense = np.zeros(qp.c.size + qp.h_l.size + qp.b.size, dtype=np.intc)
         sense[qp.c.size + qp.h_l.size :] = _EQUALITY
         hessian, rows = _common.dense(qp.P), _common.dense(_common.rows(qp))
-        self._model.setup(hessian, qp.c.copy(), rows, _common.upper(qp, start), _common.lower(qp, start), sense)
+        self._model.setup(
+            hessian, qp.c.copy(), rows, _common.upper(qp, qp.vectors), _common.lower(qp, qp.vectors), sense
+        )
 
     def solve(self, vectors: Vectors) -> Solution:
         """See `mpc.qp.Backend.solve`."""
@@ -71,14 +72,8 @@ class DaqpDense:
         x, _, flag, info = self._model.solve()
         self._sense = self._moved(info["lam"]) if flag == 1 else None
         elapsed = clock.perf_counter() - started
-        return _common.solution(
-            qp,
-            x=x,
-            multipliers=info["lam"],
-            status=STATUS.get(flag, f"daqp_{flag}"),
-            iterations=info["iterations"],
-            solve_s=elapsed,
-        )
+        status = STATUS.get(flag, f"daqp_{flag}")
+        return _common.solution(qp, x, info["lam"], status=status, iterations=info["iterations"], solve_s=elapsed)
 
     def _moved(self, multipliers: Array) -> Sense | None:
         """The active set moved one step earlier; None where the one before would have been nearer unmoved.

@@ -10,8 +10,7 @@ import numpy as np
 from mpc.ocp import Problem
 from mpc.paper.condensed import condensed
 from mpc.qp import Backend, Formulation, Vectors
-from mpc.solvers.piqp_dense import PiqpDense
-from mpc.solvers.piqp_sparse import PiqpMultistage
+from mpc.solvers.piqp_backends import PiqpDense, PiqpMultistage
 from mpc.staged import Staged, usual_steps
 from quadsim.state import Array
 from scenarios.bench.bench_results import StageLength

@@ -28,6 +28,7 @@ from scenarios.schema.problems import ScenarioError, describe_all
 from scenarios.schema.sensors import EstimatorSpec, SensorsSpec, check_sensing
 from scenarios.schema.settings import set_field
 from scenarios.schema.writing import to_toml
+from scenarios.shipped import Group
 
 
 class VehicleSpec(Spec):
@@ -115,7 +116,6 @@ MOST_STEPS: Final = 10_000_000
 """Physics steps, and planned steps (periods times horizon), that one flight may take: each is held in memory."""
 
 
-Group = Literal["paper", "courses", "air", "faults", "ground", "sensors", "other"]
 Verdict = Literal["satisfied", "violated", "lost"]
 
 

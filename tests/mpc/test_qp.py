@@ -13,7 +13,7 @@ from mpc.exact.shortcut import Shortcut
 from mpc.paper.condensed import condensed
 from mpc.qp import QP, Backend, Formulation, Solution, Vectors, kkt_residuals
 from mpc.solvers import SOLVERS, QPSolver, make_backend
-from mpc.solvers.piqp_dense import PiqpDense
+from mpc.solvers.piqp_backends import PiqpDense
 from mpc.staged import Staged
 from quadsim.controller import SOLVED
 from quadsim.state import Array

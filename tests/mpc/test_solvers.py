@@ -15,12 +15,13 @@ from mpc.qp import Solution, kkt_residuals
 from mpc.solvers import SOLVERS, QPSolver, make_backend
 from mpc.solvers.daqp_dense import DaqpDense
 from mpc.solvers.osqp_sparse import OsqpSparse
-from mpc.solvers.piqp_dense import PiqpDense
+from mpc.solvers.piqp_backends import PiqpDense
 from mpc.staged import Staged
 from quadsim.controller import SOLVED, Moment
 from quadsim.errors import MissingPackageError, PlanExhaustedError, UnknownNameError
+from scenarios.flight import Flight
 from scenarios.loading import load_scenario
-from scenarios.run import Flight, fly_scenario
+from scenarios.run import fly_scenario
 
 ALWAYS = ("piqp-multistage", "piqp-multistage-1", "piqp-dense", "daqp", "osqp")
 """What `make setup` installs."""
@@ -155,5 +156,5 @@ def test_entries_tell_what_they_are() -> None:
         assert entry.installed
         assert entry.line == entry.description
         assert entry.version[0].isdigit()
-    absent = replace(SOLVERS["daqp"], module="a_package_that_nobody_has")
+    absent = replace(SOLVERS["daqp"], package="a_package_that_nobody_has")
     assert not absent.installed

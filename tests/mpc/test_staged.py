@@ -23,8 +23,7 @@ from mpc.paper.condensed import Condensed, condensed
 from mpc.qp import QP, Formulation, Solution, kkt_residuals
 from mpc.solvers import QPSolver
 from mpc.solvers.daqp_dense import DaqpDense
-from mpc.solvers.piqp_dense import PiqpDense
-from mpc.solvers.piqp_sparse import PiqpChanging, PiqpMultistage
+from mpc.solvers.piqp_backends import PiqpChanging, PiqpDense, PiqpMultistage
 from mpc.staged import Staged
 from quadsim.controller import SOLVED
 from quadsim.errors import ParameterError

@@ -18,10 +18,11 @@ from quadsim import __version__
 from quadsim.assets import vehicle_names
 from quadsim.errors import QuadsimError, RenderingUnavailableError
 from quadsim.flight import rundir
-from scenarios.campaign.plan import campaign_names
+from scenarios.campaign.plan import read_campaign
 from scenarios.cli import main
 from scenarios.commands import EXIT_DONE, EXIT_FAILED, EXIT_WRONG_INPUT
-from scenarios.loading import LIBRARY, load_scenario, scenario_names
+from scenarios.loading import load_scenario
+from scenarios.shipped import LIBRARY, campaign_names, scenario_names
 
 ROOT = Path(__file__).resolve().parents[2]
 TABLES = ("--no-video", "--no-recording", "--no-figures")
@@ -66,22 +67,21 @@ def test_list_as_json(capsys: pytest.CaptureFixture[str]) -> None:
     listed = json.loads(capsys.readouterr().out)
     assert list(listed) == ["scenarios", "groups", "expected", "campaigns", "vehicles", "controllers", "solvers"]
     assert list(listed["scenarios"]) == list(listed["groups"]) == list(listed["expected"]) == scenario_names()
-    assert listed["groups"]["paper-constrained"] == "paper"
-    assert listed["expected"]["paper-constrained"] == "satisfied"
+    checked = [load_scenario(name) for name in scenario_names()]
+    assert listed["scenarios"] == {scenario.name: scenario.description for scenario in checked}
+    assert listed["groups"] == {scenario.name: scenario.group for scenario in checked}
+    assert listed["expected"] == {scenario.name: scenario.expect for scenario in checked}
+    assert listed["campaigns"] == {name: read_campaign(name)["description"] for name in campaign_names()}
     assert list(listed["campaigns"]) == campaign_names()
     assert list(listed["solvers"]) == list(SOLVERS)
 
 
 def test_list_shows_scenarios_by_group_and_what_is_to_defeat_the_controller(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
-    meant = {"a": ("faults", "lost"), "b": ("air", "violated"), "c": ("air", "satisfied")}
-    made = {
-        name: load_scenario("hover", [f"name={name}", "description=d", f"group={group}", f"expect={expect}"])
-        for name, (group, expect) in meant.items()
-    }
-    monkeypatch.setattr("scenarios.commands.catalogue.scenario_names", lambda: list(made))
-    monkeypatch.setattr("scenarios.commands.catalogue.load_scenario", lambda name: made[name])
+    for name, group, expect in (("a", "faults", "lost"), ("b", "air", "violated"), ("c", "air", "satisfied")):
+        (tmp_path / f"{name}.toml").write_text(f'description = "d"\ngroup = "{group}"\nexpect = "{expect}"\n')
+    monkeypatch.setattr("scenarios.shipped.LIBRARY", tmp_path)
     assert main(["list"]) == EXIT_DONE
     lines = [" ".join(line.split()) for line in capsys.readouterr().out.splitlines()]
     assert lines[: lines.index("campaigns")] == [

@@ -17,9 +17,10 @@ from quadsim.flight.log import ControlLog, FlightLog, PlantLog
 from quadsim.state import INDEX
 from scenarios.courses.csv_course import read_table
 from scenarios.flight import Flight, summarise
-from scenarios.loading import LIBRARY, load_scenario, parse_scenario, scenario_names
+from scenarios.loading import load_scenario, parse_scenario
 from scenarios.run import fly_scenario
 from scenarios.schema.scenario import Group, LostSpec, Scenario
+from scenarios.shipped import LIBRARY, scenario_names
 
 SHARED = ("paper-constrained", "paper-unconstrained", "paper-unconstrained-clipped")
 """With other modules."""

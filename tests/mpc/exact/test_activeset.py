@@ -20,7 +20,7 @@ from mpc.ocp import Problem
 from mpc.paper.condensed import condensed
 from mpc.qp import QP, Solution, Vectors, kkt_residuals
 from mpc.solvers import QPSolver, Way
-from mpc.solvers.piqp_dense import PiqpDense
+from mpc.solvers.piqp_backends import PiqpDense
 from quadsim.controller import ACCEPTED, SOLVED
 from quadsim.state import Array
 

@@ -11,7 +11,7 @@ from support import paper_problem, paper_reference
 from mpc.paper.condensed import condensed
 from mpc.qp import kkt_residuals
 from mpc.solvers import SOLVERS, make_backend
-from mpc.solvers.piqp_dense import PiqpDense
+from mpc.solvers.piqp_backends import PiqpDense
 from scenarios.bench.polish import polish
 
 

@@ -9,8 +9,9 @@ import pytest
 import tomlkit
 
 from quadsim.errors import FileError, InputError, UnknownNameError
-from scenarios.campaign.plan import Plan, campaign_names, campaign_path, load_plan
+from scenarios.campaign.plan import Plan, load_plan
 from scenarios.loading import load_scenario
+from scenarios.shipped import campaign_names, campaign_path
 
 MASS = {
     "name": "mass",

@@ -28,7 +28,7 @@ from mpc.solvers import QPSolver
 from mpc.unconstrained import UnconstrainedMPC
 from quadsim.controller import LAW_NAMES, SOLVED, Controller, Moment
 from quadsim.errors import ParameterError
-from scenarios.build import CONTROLLERS, build_controller, build_plant, build_problem, resolve
+from scenarios.build import build_controller, build_plant, build_problem, resolve
 from scenarios.courses.feasibility_check import report
 from scenarios.courses.make import build_reference
 from scenarios.loading import load_scenario, parse_scenario
@@ -39,6 +39,7 @@ from scenarios.schema.json_schema import scenario_schema
 from scenarios.schema.plugin import FORM, LAWS
 from scenarios.schema.problems import ScenarioError
 from scenarios.schema.scenario import Scenario
+from scenarios.shipped import CONTROLLERS
 
 ROBUST: dict[str, Any] = {
     "type": "robust",
