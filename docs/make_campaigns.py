@@ -40,8 +40,7 @@ from scenarios.campaign.statistics.wording import interval, percent
 from scenarios.commands.campaign_console import progress
 
 ROOT = Path(__file__).resolve().parent.parent
-PAIR = ("paper-robustness", "paper-robustness-robust")
-"""Flown on the same draws, and compared flight by flight."""
+PAIR = ("paper-robustness", "paper-robustness-robust")  # flown on the same draws, and compared flight by flight
 NOMINAL = "paper-nominal"
 NAMES = (*PAIR, NOMINAL)
 PAGE = "paper-robustness"

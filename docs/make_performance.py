@@ -72,11 +72,7 @@ EFFECTS = {
         *(f"sensors.{name}={{rate=100, noise=0.01}}" for name in ("position", "velocity", "attitude", "rates"))
     ],
     "position and attitude sensor, estimator": [*GPS, "estimator={type='error_state'}"],
-    "the same with a gyro of 200 Hz": [
-        *GPS,
-        "sensors.rates={rate=200, noise=0.3}",
-        "estimator={type='error_state'}",
-    ],
+    "the same with a gyro of 200 Hz": [*GPS, "sensors.rates={rate=200, noise=0.3}", "estimator={type='error_state'}"],
 }
 """Effects whose cost is measured, as settings of the scenario; the first is what the others are compared with."""
 

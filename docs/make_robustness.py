@@ -26,11 +26,9 @@ from scenarios.parts.vehicle import build_vehicle
 
 ROOT = Path(__file__).resolve().parent.parent
 FAULTS = 50
-RESTLESS = ("wind 3 m/s", "sensor noise", "all by half")
-"""Conditions that never leave the vehicle at rest."""
+RESTLESS = ("wind 3 m/s", "sensor noise", "all by half")  # conditions that never leave the vehicle at rest
 STATED = TighteningSettings()
-QUICK_ENOUGH = 6.0
-"""What the step is to take at p99 [ms]."""
+QUICK_ENOUGH = 6.0  # what the step is to take at p99 [ms]
 
 
 def targets(measured: MismatchBench) -> Grid:

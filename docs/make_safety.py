@@ -28,8 +28,7 @@ ATTACKS: dict[str, tuple[Callable[[int], Mapping[str, int]], int]] = {
     "One campaign with controllers that hang, fork, eat memory, exit": (safety_campaign.measure, 60),
 }
 """What was tried: by which function, and how often."""
-ASIDE = 4
-"""So many of them go on in processes of their own, as an ordinary user, and side by side."""
+ASIDE = 4  # so many of them go on in processes of their own, as an ordinary user, and side by side
 
 
 def counts(scale: float) -> str:

@@ -33,25 +33,15 @@ from scenarios.schema.scenario import Scenario
 
 @dataclass(frozen=True, kw_only=True)
 class CampaignRun:
-    """One campaign, as it was timed.
+    """One campaign, as it was timed."""
 
-    Attributes:
-        flights: in it.
-        workers: processes.
-        wall_s: from the first process started to the last answer [s].
-        busy_s: what the flights took, summed [s].
-        concluding_s: final tables, estimates and report [s].
-        memory_mb: largest proportional set size of a worker [MB]; None where the system does not tell.
-        bytes: size of `flights.parquet`.
-    """
-
-    flights: int
-    workers: int
-    wall_s: float
-    busy_s: float
-    concluding_s: float
-    memory_mb: float | None
-    bytes: int
+    flights: int  # in it
+    workers: int  # processes
+    wall_s: float  # from the first process started to the last answer [s]
+    busy_s: float  # what the flights took, summed [s]
+    concluding_s: float  # final tables, estimates and report [s]
+    memory_mb: float | None  # largest proportional set size of a worker [MB]; None where the system does not tell
+    bytes: int  # size of `flights.parquet`
 
     @property
     def flight_s(self) -> float:
@@ -71,25 +61,15 @@ class CampaignRun:
 
 @dataclass(frozen=True, kw_only=True)
 class CampaignProfile:
-    """What campaigns cost.
+    """What campaigns cost."""
 
-    Attributes:
-        scenario: what was flown.
-        duration: of a flight [s].
-        rounds: campaigns by one worker and by two, flown in turns.
-        growing: campaigns of ever more flights.
-        growing_scenario: what these flew.
-        growing_duration: of a flight of these [s].
-        machine: what the times were measured on.
-    """
-
-    scenario: str
-    duration: float
-    rounds: tuple[tuple[CampaignRun, CampaignRun], ...]
-    growing: tuple[CampaignRun, ...]
-    growing_scenario: str
-    growing_duration: float
-    machine: Mapping[str, Any]
+    scenario: str  # what was flown
+    duration: float  # of a flight [s]
+    rounds: tuple[tuple[CampaignRun, CampaignRun], ...]  # campaigns by one worker and by two, flown in turns
+    growing: tuple[CampaignRun, ...]  # campaigns of ever more flights
+    growing_scenario: str  # what these flew
+    growing_duration: float  # of a flight of these [s]
+    machine: Mapping[str, Any]  # what the times were measured on
 
     @property
     def per_core_hour(self) -> float:
@@ -203,8 +183,7 @@ def campaign_targets(profile: CampaignProfile) -> list[Target]:
 
 GROWING: Final = ("hover", ("duration=0.5",))
 """What ever larger campaigns fly: so little that what a campaign adds shows."""
-_LOOK_EVERY: Final = 1.0
-"""Between two looks at the workers' memory [s]."""
+_LOOK_EVERY: Final = 1.0  # between two looks at the workers' memory [s]
 
 
 def bench_campaign(

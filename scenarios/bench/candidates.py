@@ -20,10 +20,8 @@ from quadsim.controller import ACCEPTED, Command
 from quadsim.state import Array
 from scenarios.bench.queries import QueriedController, Queries
 
-WITH_SHORTCUT: Final = ("daqp",)
-"""Solvers that are shown both with and without shortcuts, besides the default."""
-REFERENCE_SOLVER: Final = "piqp-dense"
-"""Where the search for the optimum in closed form starts."""
+WITH_SHORTCUT: Final = ("daqp",)  # solvers that are shown both with and without shortcuts, besides the default
+REFERENCE_SOLVER: Final = "piqp-dense"  # where the search for the optimum in closed form starts
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -121,15 +119,10 @@ class StepCandidate:
 
 @dataclass(frozen=True, kw_only=True)
 class Reference:
-    """The optimum of each period's QP, in closed form.
+    """The optimum of each period's QP, in closed form."""
 
-    Attributes:
-        inputs: first input u(k) (4,) by period [rad/s].
-        kkt: worst KKT residual of them all.
-    """
-
-    inputs: Mapping[int, Array]
-    kkt: float
+    inputs: Mapping[int, Array]  # first input u(k) (4,) by period [rad/s]
+    kkt: float  # worst KKT residual of them all
 
 
 def reference_optima(problem: Problem, queries: Queries, periods: Sequence[int]) -> Reference:

@@ -16,8 +16,7 @@ from scenarios.progress import Progress, silent
 from scenarios.run import Outputs, run_scenario
 from scenarios.schema.scenario import Scenario
 
-SECONDS: Final = 4.0
-"""Of film; the processes' start is timed apart, so that a longer film follows from a short one."""
+SECONDS: Final = 4.0  # of film; the processes' start is timed apart, so that a longer film follows from a short one
 WIDTH, HEIGHT, FPS = 1280, 720, 30
 
 

@@ -20,19 +20,12 @@ from scenarios.schema.scenario import Scenario
 
 @dataclass(frozen=True, kw_only=True)
 class Queries:
-    """The queries of K control periods.
+    """The queries of K control periods."""
 
-    Attributes:
-        t: (K,) [s].
-        state: (K, 12) measured.
-        reference: (K + N, 4) filtered x, y, z [m], yaw [rad], row k at t_k.
-        speeds_before: (K, 4) u(k-1) [rad/s].
-    """
-
-    t: Array
-    state: Array
-    reference: Array
-    speeds_before: Array
+    t: Array  # (K,) [s]
+    state: Array  # (K, 12) measured
+    reference: Array  # (K + N, 4) filtered x, y, z [m], yaw [rad], row k at t_k
+    speeds_before: Array  # (K, 4) u(k-1) [rad/s]
 
 
 def recorded(scenario: Scenario, log: ControlLog, horizon: int) -> Queries:

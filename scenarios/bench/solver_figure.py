@@ -16,8 +16,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-_DASHES: Final = ("-", "--", ":")
-"""Candidates beyond the colours there are take them again, with another line."""
+_DASHES: Final = ("-", "--", ":")  # candidates beyond the colours there are take them again, with another line
 
 
 def write_solver_figure(bench: SolverBench, directory: Path) -> list[Path]:

@@ -32,21 +32,15 @@ from scenarios.schema.scenario import Scenario
 
 RESULTS_FILE: Final = "bench.json"
 TABLES_FILE: Final = "solvers.md"
-FORMAT: Final = "quadsim bench solvers"
-"""What `bench.json` says it is."""
-KIND: Final = "bench of solvers"
-"""What `quadsim.outputs` calls its directory."""
+FORMAT: Final = "quadsim bench solvers"  # what `bench.json` says it is
+KIND: Final = "bench of solvers"  # what `quadsim.outputs` calls its directory
 
 REPEATS: Final = 3
 HORIZONS: Final = (10, 20, 50, 100, 200)
-GROWTH_STRIDE: Final = 6
-"""One segment of so many is asked at each horizon and of each form of the QP."""
-LONGEST_PASS: Final = 20.0
-"""A candidate whose first pass takes longer [s] is timed once."""
-GAIN: Final = "unconstrained gain"
-"""What the controller would be without its constraints."""
-PATIENCE: Final = 60.0
-"""A candidate that takes longer for the questions at one horizon [s] is dropped."""
+GROWTH_STRIDE: Final = 6  # one segment of so many is asked at each horizon and of each form of the QP
+LONGEST_PASS: Final = 20.0  # a candidate whose first pass takes longer [s] is timed once
+GAIN: Final = "unconstrained gain"  # what the controller would be without its constraints
+PATIENCE: Final = 60.0  # a candidate that takes longer for the questions at one horizon [s] is dropped
 
 
 class _Racing(TypedDict):

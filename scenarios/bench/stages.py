@@ -21,8 +21,7 @@ from scenarios.progress import Progress
 
 STEPS_TRIED: Final = (1, 2, 3, 4, 5, 6, 8, 10, 13, 17, 20, 25)
 
-Query = tuple[Array, Array, Array]
-"""xi(k), y_d and u(k-1)."""
+Query = tuple[Array, Array, Array]  # xi(k), y_d and u(k-1)
 
 
 def time_stages(
@@ -69,8 +68,7 @@ class _QPEntrant:
 
     def __init__(self, formulation: Formulation, backend: Backend, query: Callable[[int], Query]) -> None:
         self.formulation, self._backend, self._query = formulation, backend, query
-        self.active: dict[int, int] = {}
-        """Constraints active in the answer, by period."""
+        self.active: dict[int, int] = {}  # constraints active in the answer, by period
         backend.setup(formulation.qp)
 
     def prepare(self, period: int) -> None:

@@ -7,8 +7,7 @@ from typing import Final
 
 from scenarios.bench.bench_results import CandidateResult, FlightProfile, RenderProfile, SolverBench, Target
 
-PAPER_SOLVER: Final = "qpoases"
-"""The solver of the paper."""
+PAPER_SOLVER: Final = "qpoases"  # the solver of the paper
 
 
 def solver_targets(bench: SolverBench) -> list[Target]:

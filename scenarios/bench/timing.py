@@ -41,8 +41,7 @@ def undisturbed() -> Iterator[None]:
             gc.enable()
 
 
-SEGMENT: Final = 20
-"""Consecutive periods that a candidate answers before it is the next one's turn."""
+SEGMENT: Final = 20  # consecutive periods that a candidate answers before it is the next one's turn
 
 
 class Candidate(Protocol):
@@ -59,13 +58,9 @@ class Candidate(Protocol):
 
 @dataclass(frozen=True, kw_only=True)
 class StepTimes:
-    """What a candidate's answers took.
+    """What a candidate's answers took."""
 
-    Attributes:
-        ms: (repeats, questions) [ms].
-    """
-
-    ms: Array
+    ms: Array  # (repeats, questions) [ms]
 
     @property
     def median(self) -> Array:

@@ -28,8 +28,7 @@ from scenarios.campaign.distributions import (
 if TYPE_CHECKING:
     from scenarios.campaign.spec import CampaignSpec
 
-_TAIL: Final = 1e-3
-"""Share of a distribution beyond the values that stand for its ends."""
+_TAIL: Final = 1e-3  # share of a distribution beyond the values that stand for its ends
 
 
 class Draws:

@@ -22,8 +22,7 @@ MANIFEST_FILE: Final = "manifest.json"
 CAMPAIGN_FILE: Final = "campaign.toml"
 SCENARIO_FILE: Final = "scenario.toml"
 FORMAT: Final = "quadsim campaign"
-KIND: Final = "campaign"
-"""What `quadsim.outputs` calls a campaign's directory."""
+KIND: Final = "campaign"  # what `quadsim.outputs` calls a campaign's directory
 _FORM: Final = {
     **dict.fromkeys(("format", "name", "status"), str),
     **dict.fromkeys(("flights", "flown"), int),

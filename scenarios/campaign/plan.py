@@ -26,22 +26,16 @@ from scenarios.schema.problems import ScenarioError, describe
 from scenarios.schema.scenario import Scenario
 from scenarios.schema.settings import apply_setting, get_field, set_field
 
-FIRST: Final = 5
-"""Flights of which one at least has to be possible."""
+FIRST: Final = 5  # flights of which one at least has to be possible
 LIBRARY: Final = Path(__file__).resolve().parent.parent / "campaigns"
 
 
 @dataclass(frozen=True)
 class Plan:
-    """A campaign's file and the scenario that its flights differ from.
+    """A campaign's file and the scenario that its flights differ from."""
 
-    Attributes:
-        spec: the file.
-        scenario: with the file's changes, and every number of its vehicle, in it.
-    """
-
-    spec: CampaignSpec
-    scenario: Scenario
+    spec: CampaignSpec  # the file
+    scenario: Scenario  # with the file's changes, and every number of its vehicle, in it
 
     @cached_property
     def draws(self) -> Draws:

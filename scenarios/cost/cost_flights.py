@@ -31,10 +31,8 @@ from scenarios.run import fly_scenario
 from scenarios.schema.scenario import Scenario
 
 REPEATS: Final = 3
-SWEEP_STRIDE: Final = 3
-"""Of a flight in a sweep, one segment of so many is timed."""
-LONGEST_PASS: Final = 20.0
-"""A candidate that takes longer than this for all periods of a flight [s] is timed once."""
+SWEEP_STRIDE: Final = 3  # of a flight in a sweep, one segment of so many is timed
+LONGEST_PASS: Final = 20.0  # a candidate that takes longer than this for all periods of a flight [s] is timed once
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -105,9 +105,7 @@ def _times(study: CostStudy, name: str, step_ms: Array, candidate: CandidateTime
 def _flights(study: CostStudy) -> Grid:
     with_them, without = study.constrained, study.unconstrained
     others = list(study.others.values())
-    lines = [
-        _line("outcome", *map(format_outcome, (with_them, without)), ABSENT, ABSENT, *map(format_outcome, others)),
-    ]
+    lines = [_line("outcome", *map(format_outcome, (with_them, without)), ABSENT, ABSENT, *map(format_outcome, others))]
     for key, measure in MEASURES.items():
         values = [outcome.number(key) for outcome in (with_them, without, *others)]
         lines.append(_compared(f"{measure.label} [{measure.unit}]", values))

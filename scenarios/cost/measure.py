@@ -30,16 +30,11 @@ from scenarios.progress import Progress, silent
 from scenarios.schema.controller import ConstrainedSpec, UnconstrainedSpec, shared_tilt_bound
 from scenarios.schema.scenario import Scenario
 
-TILTS: Final = (2.0, 3.0, 4.0, 5.0, 7.0, 10.0, 15.0, 20.0)
-"""Bounds on roll and pitch that are tried [deg]."""
-HORIZONS: Final = (10, 15, 20, 30, 50, 75, 100)
-"""Horizons that are tried, N."""
-ARM_LENGTHS: Final = (0.2, 0.3, 0.5)
-"""L [m]; the paper gives none."""
-DRAGS: Final = (0.012, 0.024, 0.048)
-"""d/b [m]; the paper gives none."""
-SOLVERS_TIMED: Final = ("piqp-multistage", "piqp-dense", "qpoases")
-"""Both of this project, and the paper's own."""
+TILTS: Final = (2.0, 3.0, 4.0, 5.0, 7.0, 10.0, 15.0, 20.0)  # bounds on roll and pitch that are tried [deg]
+HORIZONS: Final = (10, 15, 20, 30, 50, 75, 100)  # horizons that are tried, N
+ARM_LENGTHS: Final = (0.2, 0.3, 0.5)  # L [m]; the paper gives none
+DRAGS: Final = (0.012, 0.024, 0.048)  # d/b [m]; the paper gives none
+SOLVERS_TIMED: Final = ("piqp-multistage", "piqp-dense", "qpoases")  # both of this project, and the paper's own
 LONGEST_UNASKED: Final = 120.0
 """A course that takes longer than this [s] is studied only when that is asked for: it is flown about thirty times."""
 

@@ -52,10 +52,7 @@ def without_constraints(scenario: Scenario) -> Scenario:
     spec = scenario.controller
     assert isinstance(spec, ConstrainedSpec)
     free = UnconstrainedSpec(
-        type="unconstrained",
-        horizon=spec.horizon,
-        output_weights=spec.output_weights,
-        input_weights=spec.input_weights,
+        type="unconstrained", horizon=spec.horizon, output_weights=spec.output_weights, input_weights=spec.input_weights
     )
     return scenario.model_copy(update={"controller": free})
 

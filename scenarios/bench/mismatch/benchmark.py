@@ -74,14 +74,11 @@ def _leave_interrupts_to_parent() -> None:
 
 
 FORMAT: Final = "quadsim bench ladder"
-KIND: Final = "bench ladder"
-"""What `quadsim.outputs` calls its directory."""
+KIND: Final = "bench ladder"  # what `quadsim.outputs` calls its directory
 RESULTS_FILE: Final = "ladder.json"
 TABLES_FILE: Final = "ladder.md"
-TIMED: Final = 3
-"""Flights that steps are timed in: the machine's own slow spells are not the controller's."""
-QUICK_DURATION: Final = 12.0
-"""Of the flights with `--quick` [s]."""
+TIMED: Final = 3  # flights that steps are timed in: the machine's own slow spells are not the controller's
+QUICK_DURATION: Final = 12.0  # of the flights with `--quick` [s]
 
 
 @dataclass(frozen=True, kw_only=True)

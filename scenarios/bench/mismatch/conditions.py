@@ -5,25 +5,17 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Final
 
-WORN: Final = 0.2
-"""Share of its thrust and torque that the worn rotor loses."""
+WORN: Final = 0.2  # share of its thrust and torque that the worn rotor loses
 
 
 @dataclass(frozen=True, kw_only=True)
 class Condition:
-    """One mismatch between the plant and the controller's model.
+    """One mismatch between the plant and the controller's model."""
 
-    Attributes:
-        about: in a line.
-        settings: of the scenario file, by dotted paths.
-        rotor_lag: time constant that controllers with a model of it assume [s]; 0 for none.
-        delay: computation time that they assume [s].
-    """
-
-    about: str
-    settings: tuple[str, ...] = ()
-    rotor_lag: float = 0.0
-    delay: float = 0.0
+    about: str  # in a line
+    settings: tuple[str, ...] = ()  # of the scenario file, by dotted paths
+    rotor_lag: float = 0.0  # time constant that controllers with a model of it assume [s]; 0 for none
+    delay: float = 0.0  # computation time that they assume [s]
 
 
 def _lag(seconds: float) -> tuple[str, ...]:

@@ -21,20 +21,15 @@ OBSERVER: Final = OffsetFreeSpec(torque_walk=0.2, force_walk=0.1)
 BASELINE_TILT: Final = 20.0
 """Largest tilt that LQR, PID and geometric controller command [deg].  They have no bounds on states, so this limit does
 for one; at the paper's 5 deg the geometric controller circles its goal, 8 m off after 60 s."""
-_NO_STEPS: Final = 1e6
-"""A bound on steps [rad/s] that bounds nothing."""
+_NO_STEPS: Final = 1e6  # a bound on steps [rad/s] that bounds nothing
 
 
 @dataclass(frozen=True, kw_only=True)
 class ControllerVariant:
-    """A controller of the benchmark.
+    """A controller of the benchmark."""
 
-    Attributes:
-        about: what it is, in a line.
-        spec: its table, from a constrained one and what a condition lets it know.
-    """
-
-    about: str
+    about: str  # what it is, in a line
+    # its table, from a constrained one and what a condition lets it know
     spec: Callable[[ConstrainedSpec, Condition, float], ControllerSpec]
 
 
@@ -156,6 +151,5 @@ VARIANTS: Final = {
 }
 """By their names in tables, in order.  The last three keep the bounds on speeds and no others: held to the paper's
 bounds on steps, which it knows nothing of, the LQR overturns on the nominal course."""
-FULL: Final = "+ tightening"
-"""The one with every part that tells it apart from the paper's."""
+FULL: Final = "+ tightening"  # the one with every part that tells it apart from the paper's
 QUICK_VARIANTS: Final = ("paper", "+ offset-free", "PID")

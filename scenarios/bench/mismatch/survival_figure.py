@@ -17,8 +17,7 @@ if TYPE_CHECKING:
 
 _SHADES: Final = ("#bfe3d3", "#f6edb5", "#f0b968")
 """Good, fair, poor; what is lost is drawn as bounds are."""
-_TILTED: Final = 0.5
-"""How far beyond its bound [deg] a tilt is still fair."""
+_TILTED: Final = 0.5  # how far beyond its bound [deg] a tilt is still fair
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -103,12 +102,7 @@ def _draw_panel(axes: Axes, measured: MismatchBench, panel: _Panel) -> None:
     axes.grid(visible=False)
     axes.spines[:].set_visible(False)
     axes.set_title(panel.title, loc="left", fontsize=9.5)
-    labels = (
-        f"up to {panel.good:g} {panel.unit}",
-        f"up to {panel.fair:g} {panel.unit}",
-        "more",
-        "lost",
-    )
+    labels = (f"up to {panel.good:g} {panel.unit}", f"up to {panel.fair:g} {panel.unit}", "more", "lost")
     keys = [Rectangle((0.0, 0.0), 1.0, 1.0, facecolor=colour) for colour in (*_SHADES, BOUND)]
     axes.legend(keys, labels, loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=4, fontsize=8.0, handlelength=1.0)
 

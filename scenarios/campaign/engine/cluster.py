@@ -24,8 +24,7 @@ from scenarios.campaign.engine.supervisor_process import SupervisorProcess
 from scenarios.campaign.results.table import Row
 
 PATIENCE_S: Final = 60.0
-PATIENCE_WITH_JOBS_S: Final = 86400.0
-"""Jobs may stand in a queue for hours before the first worker is there."""
+PATIENCE_WITH_JOBS_S: Final = 86400.0  # jobs may stand in a queue for hours before the first worker is there
 _DECIDE_NUMBERS: Final = ("mujoco", "numpy", "scipy", "piqp")
 """Packages that have to be the same everywhere for the same flight to give the same numbers."""
 _ADDRESS: Final = re.compile(r"(tcp|tls|ws|wss|ucx)://\S+:\d+")
@@ -126,8 +125,7 @@ def fly_chunk(pickled: bytes, chunk: Sequence[int], expected: Mapping[str, str])
     return answers
 
 
-_asides: dict[bytes, SupervisorProcess] = {}
-"""Of this worker: one at most, of the campaign that it flies."""
+_asides: dict[bytes, SupervisorProcess] = {}  # of this worker: one at most, of the campaign that it flies
 
 
 def _aside(pickled: bytes) -> SupervisorProcess:

@@ -20,8 +20,7 @@ MOST_DEATHS: Final = 10
 """Processes that may die while they fly a flight before it is given up: more than die by chance in one flight."""
 ONE_THREAD: Final = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
 """Environment of a process that flies: results do not depend on the core count."""
-CHUNK_S: Final = 10.0
-"""Work handed out at once [s]: long against what handing it out costs, short against a campaign."""
+CHUNK_S: Final = 10.0  # work handed out at once [s]: long against what handing it out costs, short against a campaign
 
 
 class EngineError(QuadsimError):

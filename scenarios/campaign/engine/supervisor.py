@@ -25,14 +25,10 @@ from scenarios.campaign.engine.worker import FLIGHT, PULSE_BYTES, SIZE, FlightRe
 from scenarios.campaign.results.verdicts import MEMORY, TIMEOUT
 from scenarios.gc_tuning import collect_rarely, freeze_for_good
 
-LOOK_S: Final = 0.2
-"""Between two looks at a worker that flies [s]."""
-_TURN_S: Final = 1.0
-"""Most that one look counts of the time since the last one [s]."""
-_LEAVING_S: Final = 1.0
-"""For a worker that says nothing more to be gone [s]."""
-_LARGEST: Final = 1 << 26
-"""No worker says more at once [bytes]."""
+LOOK_S: Final = 0.2  # between two looks at a worker that flies [s]
+_TURN_S: Final = 1.0  # most that one look counts of the time since the last one [s]
+_LEAVING_S: Final = 1.0  # for a worker that says nothing more to be gone [s]
+_LARGEST: Final = 1 << 26  # no worker says more at once [bytes]
 
 
 class Ready(NamedTuple):
@@ -51,8 +47,7 @@ class Died(NamedTuple):
     ending: str
 
 
-Message = Ready | Unfit | Died | Answer
-"""What a supervisor tells its parent."""
+Message = Ready | Unfit | Died | Answer  # what a supervisor tells its parent
 
 
 def serve(pipe: Connection, folder: str) -> None:

@@ -30,38 +30,23 @@ _BINS: Final = 40
 
 @dataclass(frozen=True, kw_only=True)
 class Histogram:
-    """How a metric is distributed, by verdict.
+    """How a metric is distributed, by verdict."""
 
-    Attributes:
-        name: the metric.
-        label: its name, with its unit and what is not shown in its place.
-        edges: (B + 1,) ends of the bins.
-        counts: flights in each bin, (B,), by verdict.
-    """
-
-    name: str
-    label: str
-    edges: Array
-    counts: dict[str, Array]
+    name: str  # the metric
+    label: str  # its name, with its unit and what is not shown in its place
+    edges: Array  # (B + 1,) ends of the bins
+    counts: dict[str, Array]  # flights in each bin, (B,), by verdict
 
 
 @dataclass(frozen=True, kw_only=True)
 class Association:
-    """How a drawn number goes with an outcome.
+    """How a drawn number goes with an outcome."""
 
-    Attributes:
-        rho: Spearman's rank correlation.
-        rho_is_sure: whether it is beyond chance, with all tests of the campaign taken together.
-        xi: Chatterjee's xi, of any dependence.
-        xi_is_sure: whether that is beyond chance.
-        p: the smaller of the two p-values, corrected.
-    """
-
-    rho: float
-    rho_is_sure: bool
-    xi: float
-    xi_is_sure: bool
-    p: float
+    rho: float  # Spearman's rank correlation
+    rho_is_sure: bool  # whether it is beyond chance, with all tests of the campaign taken together
+    xi: float  # Chatterjee's xi, of any dependence
+    xi_is_sure: bool  # whether that is beyond chance
+    p: float  # the smaller of the two p-values, corrected
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -35,13 +35,10 @@ if TYPE_CHECKING:
 _TRIANGLES: Final = {"down": "v", "up": "^", "left": "<", "right": ">"}
 _MOST_DRIVERS: Final = 10
 _MOST_SCATTERS: Final = 3
-_LINE: Final = 150
-"""Characters of a line below all panels."""
-_TICK_ROOM: Final = 60
-"""Characters that have room below a panel."""
+_LINE: Final = 150  # characters of a line below all panels
+_TICK_ROOM: Final = 60  # characters that have room below a panel
 _TICKS: Final = 6
-_FEW: Final = 50
-"""Flights of a verdict that are drawn larger, so as to be seen among the others."""
+_FEW: Final = 50  # flights of a verdict that are drawn larger, so as to be seen among the others
 
 
 def write_campaign_figure(name: str, table: pa.Table, summary: Summary, directory: Path) -> list[Path]:

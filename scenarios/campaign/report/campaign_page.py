@@ -127,8 +127,7 @@ def _clipping(table: pa.Table) -> str:
 COMPARISON_FILE: Final = "comparison.json"
 TABLE_FILE: Final = "comparison.md"
 
-KIND: Final = "campaign comparison"
-"""What `quadsim.outputs` calls such a directory."""
+KIND: Final = "campaign comparison"  # what `quadsim.outputs` calls such a directory
 
 
 def write_comparison_report(comparison: Comparison, directory: Path) -> Path:

@@ -75,9 +75,7 @@ def metric_table(summary: Summary) -> Grid:
     measures = ("mean", "sd", "min", "p5", "p50", "p95", "p99", "max")
     lines = tuple(
         _line(
-            label(name, found["unit"]),
-            *(format_number(found[measure]) for measure in measures),
-            str(found["flights"]),
+            label(name, found["unit"]), *(format_number(found[measure]) for measure in measures), str(found["flights"])
         )
         for name, found in summary["metrics"].items()
     )

@@ -64,14 +64,7 @@ def _events(comparison: Comparison) -> Grid:
 
 def _event(event: EventComparison) -> tuple[Cell, ...]:
     counts = [f"{count} ({percent(count / event.pairs)})" for count in event.counts]
-    counted = _line(
-        event.event,
-        *counts,
-        str(event.only_a),
-        str(event.only_b),
-        str(event.both),
-        p_value(event.p),
-    )
+    counted = _line(event.event, *counts, str(event.only_a), str(event.only_b), str(event.both), p_value(event.p))
     mark = Mark.BEST if event.p_holm < ALPHA else Mark.NONE
     corrected = Cell(text=p_value(event.p_holm), mark=mark)
     return (*counted, corrected, *_line(signed_points(event.difference), signed_interval(event.lower, event.upper)))

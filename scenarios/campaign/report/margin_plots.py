@@ -24,8 +24,7 @@ if TYPE_CHECKING:
     from plotly.graph_objects import Scatter
 
 _EDGE_SIZE: Final = 8
-_TICK_ROOM: Final = 46
-"""Characters that have room below a panel of a narrow page."""
+_TICK_ROOM: Final = 46  # characters that have room below a panel of a narrow page
 
 
 def verdict_keys(table: pa.Table) -> tuple[tuple[str, str], ...]:

@@ -41,25 +41,17 @@ _NEVER_COMPARED: Final = ("flight", "seed", "failed")
 """Columns that tell flights apart, or what other events make of them."""
 _COMPARISON: Final = re.compile(r"(?P<column>[^<>=]*?)\s*(?P<operation><=|>=|<|>)\s*(?P<number>[^<>=]*)")
 
-EVENT_NAMES: Final = tuple(_NAMED)
-"""The events that have a name; every other one is `COLUMN OP NUMBER`."""
+EVENT_NAMES: Final = tuple(_NAMED)  # the events that have a name; every other one is `COLUMN OP NUMBER`
 
 
 @dataclass(frozen=True, kw_only=True)
 class Event:
-    """Something that a flight's row shows to have happened, or not.
+    """Something that a flight's row shows to have happened, or not."""
 
-    Attributes:
-        text: the event as it is written in one way: a name of `EVENT_NAMES`, or `COLUMN OP NUMBER`.
-        column_name: the column that shows it.
-        operation: `==`, `<`, `<=`, `>` or `>=`.
-        value: what the column is compared with.
-    """
-
-    text: str
-    column_name: str
-    operation: str
-    value: bool | str | float
+    text: str  # the event as it is written in one way: a name of `EVENT_NAMES`, or `COLUMN OP NUMBER`
+    column_name: str  # the column that shows it
+    operation: str  # `==`, `<`, `<=`, `>` or `>=`
+    value: bool | str | float  # what the column is compared with
 
     def holds(self, row: Mapping[str, Any]) -> bool:
         """Whether it happened in one flight; so it did where the flight has no value.

@@ -24,8 +24,7 @@ from scenarios.campaign.results.table import DRAW, TIMING, Row, make_table, read
 _NEEDED: Final = ("flight", "seed", "status", "verdict", "failed", "violated", "crashed", "worst_margin")
 """Columns that no version left out; `flight` to `violated` have a value in every row."""
 _FILLED: Final = _NEEDED[:6]
-LARGEST: Final = 1e100
-"""Magnitude of the largest number that a flight has; sums of squares of larger ones are infinite."""
+LARGEST: Final = 1e100  # magnitude of the largest number that a flight has; sums of squares of larger ones are infinite
 
 
 def read_flights(path: Path, schema: pa.Schema) -> pa.Table:

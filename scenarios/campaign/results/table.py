@@ -23,10 +23,8 @@ from quadsim.flight.log import FlightLog, TimingLog
 from quadsim.state import REFERENCE_NAMES, REFERENCE_UNITS
 from scenarios.campaign.results.verdicts import ERROR
 
-Row = dict[str, Any]
-"""One flight's values by column: numbers, texts, or None."""
-DRAW: Final = "draw."
-"""How the columns of drawn values begin."""
+Row = dict[str, Any]  # one flight's values by column: numbers, texts, or None
+DRAW: Final = "draw."  # how the columns of drawn values begin
 MARGIN, TIME_VIOLATED, SATISFIED = "margin.", "time_violated.", "satisfied."
 """How the columns of a constraint begin, before its name."""
 _MEASURES: Final = ("rmse", "max_error", "final_error", "overshoot")
@@ -54,8 +52,7 @@ _COMMANDS: Final = (
     ("iterations.max", "-", pa.int64()),
 )
 _WORST: Final = (("worst_margin", "-", pa.float64()), ("worst_constraint", "-", pa.string()))
-_COMMANDED: Final = ("speed", "slew")
-"""Signals that the controller sets itself."""
+_COMMANDED: Final = ("speed", "slew")  # signals that the controller sets itself
 TIMING: Final = (
     ("machine", "-", pa.string()),
     ("wall_s", "s", pa.float64()),

@@ -7,12 +7,9 @@ from typing import Final
 
 from quadsim.report.palette import BOUND, LINES, REFERENCE
 
-ERROR: Final = "error"
-"""Status and verdict of a flight that raised, or whose process died."""
-TIMEOUT: Final = "timeout"
-"""Those of a flight that was ended since it, or a step of its controller, took too long."""
-MEMORY: Final = "memory"
-"""Those of a flight that asked for too much memory."""
+ERROR: Final = "error"  # status and verdict of a flight that raised, or whose process died
+TIMEOUT: Final = "timeout"  # those of a flight that was ended since it, or a step of its controller, took too long
+MEMORY: Final = "memory"  # those of a flight that asked for too much memory
 HARMLESS: Final = "satisfied"
 
 

@@ -35,21 +35,13 @@ COMPARED: Final = (
 
 @dataclass(frozen=True, kw_only=True)
 class MetricComparison:
-    """A metric over the pairs in which both flights were completed and have it.
+    """A metric over the pairs in which both flights were completed and have it."""
 
-    Attributes:
-        name: its column.
-        unit: its unit, `-` for none.
-        mean_a: mean of the first campaign over these pairs; None of no pairs.
-        mean_b: mean of the second.
-        difference: of the second less the first.
-    """
-
-    name: str
-    unit: str
-    mean_a: float | None
-    mean_b: float | None
-    difference: PairedDifference
+    name: str  # its column
+    unit: str  # its unit, `-` for none
+    mean_a: float | None  # mean of the first campaign over these pairs; None of no pairs
+    mean_b: float | None  # mean of the second
+    difference: PairedDifference  # of the second less the first
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -16,8 +16,7 @@ from quadsim.state import Array
 
 Counts = np.ndarray[Any, np.dtype[np.int_]]
 
-_EXACT_UP_TO: Final = 8
-"""Pairs up to which all permutations are counted for a rank correlation's p-value; 8! = 40 320."""
+_EXACT_UP_TO: Final = 8  # pairs up to which all permutations are counted for a rank correlation's p-value; 8! = 40 320
 _PERMUTED_UP_TO: Final = 40
 """Pairs up to which xi's p-value is from permutations; beyond, its asymptotic law is as good."""
 _PERMUTATIONS: Final = 9999
@@ -25,32 +24,20 @@ _PERMUTATIONS: Final = 9999
 
 @dataclass(frozen=True, kw_only=True)
 class Correlation:
-    """Spearman's rank correlation.
+    """Spearman's rank correlation."""
 
-    Attributes:
-        rho: from -1 to 1.
-        p: two-sided p-value of no association.
-        flights: pairs it was taken over.
-    """
-
-    rho: float
-    p: float
-    flights: int
+    rho: float  # from -1 to 1
+    p: float  # two-sided p-value of no association
+    flights: int  # pairs it was taken over
 
 
 @dataclass(frozen=True, kw_only=True)
 class Dependence:
-    """Chatterjee's xi.
+    """Chatterjee's xi."""
 
-    Attributes:
-        xi: about 0 where there is no dependence, 1 where the one number is a function of the other.
-        p: one-sided p-value of no dependence.
-        flights: pairs it was taken over.
-    """
-
-    xi: float
-    p: float
-    flights: int
+    xi: float  # about 0 where there is no dependence, 1 where the one number is a function of the other
+    p: float  # one-sided p-value of no dependence
+    flights: int  # pairs it was taken over
 
 
 def rank_correlation(x: Array, y: Array) -> Correlation | None:
@@ -138,10 +125,8 @@ def _log_binomial(n: int, k: Counts) -> Array:
     return np.asarray(special.gammaln(n + 1) - special.gammaln(k + 1) - special.gammaln(n - k + 1))
 
 
-_GROUPS: Final = (5, 25)
-"""The fewest and the most groups that a curve is drawn through."""
-_GROUPS_PER_ROOT: Final = 0.8
-"""Groups, as a share of the square root of the flights."""
+_GROUPS: Final = (5, 25)  # the fewest and the most groups that a curve is drawn through
+_GROUPS_PER_ROOT: Final = 0.8  # groups, as a share of the square root of the flights
 _POINTS: Final = 80
 _TURN: Final = 0.3
 """Share of a curve's height by which both of its ends have to lie on one side of what is between them."""
@@ -149,15 +134,10 @@ _TURN: Final = 0.3
 
 @dataclass(frozen=True, kw_only=True)
 class Trend:
-    """A smooth curve over a drawn number.
+    """A smooth curve over a drawn number."""
 
-    Attributes:
-        x: (G,) values of the drawn number, rising.
-        y: (G,) what half of the flights near there exceed.
-    """
-
-    x: Array
-    y: Array
+    x: Array  # (G,) values of the drawn number, rising
+    y: Array  # (G,) what half of the flights near there exceed
 
     @property
     def turn(self) -> tuple[str, float] | None:

@@ -131,9 +131,7 @@ def _flight(table: pa.Table, row: int) -> dict[str, Any]:
     margin = values["worst_margin"]
     if margin is not None and not math.isfinite(margin):
         values["worst_margin"] = None
-    return {name: values[name] for name in shown} | {
-        "draws": {name: values[DRAW + name] for name in draw_names(table)},
-    }
+    return {name: values[name] for name in shown} | {"draws": {name: values[DRAW + name] for name in draw_names(table)}}
 
 
 def _convergence(table: pa.Table) -> dict[str, Any]:

@@ -16,31 +16,19 @@ from scenarios.campaign.statistics.wording import p_value
 
 @dataclass(frozen=True, kw_only=True)
 class EventComparison:
-    """How often an event happened to one, to the other, and to both.
+    """How often an event happened to one, to the other, and to both."""
 
-    Attributes:
-        event: its name.
-        both: pairs in which it happened to both flights.
-        only_a: to the first campaign's alone.
-        only_b: to the second campaign's alone.
-        neither: to none of them.
-        p: two-sided p-value of McNemar's exact test.
-        p_holm: that, corrected by Holm's method for all compared events that happened to one flight of a pair alone.
-        difference: share of b - share of a.
-        lower: lower end of Tango's interval of that.
-        upper: its upper end.
-    """
-
-    event: str
-    both: int
-    only_a: int
-    only_b: int
-    neither: int
-    p: float
+    event: str  # its name
+    both: int  # pairs in which it happened to both flights
+    only_a: int  # to the first campaign's alone
+    only_b: int  # to the second campaign's alone
+    neither: int  # to none of them
+    p: float  # two-sided p-value of McNemar's exact test
+    # that, corrected by Holm's method for all compared events that happened to one flight of a pair alone
     p_holm: float
-    difference: float
-    lower: float
-    upper: float
+    difference: float  # share of b - share of a
+    lower: float  # lower end of Tango's interval of that
+    upper: float  # its upper end
 
     @property
     def counts(self) -> tuple[int, int]:

@@ -17,54 +17,34 @@ from scipy import optimize, stats
 from quadsim.state import Array
 
 CONFIDENCE: Final = 0.95
-ALPHA: Final = 0.05
-"""Level of the tests."""
+ALPHA: Final = 0.05  # level of the tests
 
 
 @dataclass(frozen=True, kw_only=True)
 class Proportion:
-    """A share of flights, with its Clopper-Pearson intervals.
+    """A share of flights, with its Clopper-Pearson intervals."""
 
-    Attributes:
-        count: flights in which it happened.
-        flights: of how many.
-        share: count / flights; None of no flights.
-        lower: lower end of the two-sided interval.
-        upper: upper end of the two-sided interval.
-        lower_one_sided: what the share is at least, with all the doubt on that side.
-        upper_one_sided: what the share is at most, with all the doubt on that side.
-    """
-
-    count: int
-    flights: int
-    share: float | None
-    lower: float
-    upper: float
-    lower_one_sided: float
-    upper_one_sided: float
+    count: int  # flights in which it happened
+    flights: int  # of how many
+    share: float | None  # count / flights; None of no flights
+    lower: float  # lower end of the two-sided interval
+    upper: float  # upper end of the two-sided interval
+    lower_one_sided: float  # what the share is at least, with all the doubt on that side
+    upper_one_sided: float  # what the share is at most, with all the doubt on that side
 
 
 @dataclass(frozen=True, kw_only=True)
 class PairedDifference:
-    """The differences b - a of pairs.
+    """The differences b - a of pairs."""
 
-    Attributes:
-        pairs: how many.
-        mean: their mean; None of no pairs.
-        lower: lower end of the mean's t interval; None of fewer than two pairs.
-        upper: its upper end.
-        median: their median.
-        median_lower: lower end of the median's distribution-free interval; None where too few pairs give none.
-        median_upper: its upper end.
-    """
-
-    pairs: int
-    mean: float | None
-    lower: float | None
-    upper: float | None
-    median: float | None
+    pairs: int  # how many
+    mean: float | None  # their mean; None of no pairs
+    lower: float | None  # lower end of the mean's t interval; None of fewer than two pairs
+    upper: float | None  # its upper end
+    median: float | None  # their median
+    # lower end of the median's distribution-free interval; None where too few pairs give none
     median_lower: float | None
-    median_upper: float | None
+    median_upper: float | None  # its upper end
 
 
 def upper_bounds(counts: Array, trials: Array, confidence: float = CONFIDENCE) -> Array:

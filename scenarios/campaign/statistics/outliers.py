@@ -10,10 +10,8 @@ from quadsim.state import Array
 
 LOWEST_MARGIN: Final = -2.0
 """Margins below this are drawn at the foot, so that a lost flight does not flatten all others."""
-_LEAST_DEPTH: Final = 0.25
-"""Share of the height above 0 that is shown below it, however far from it the margins are."""
-_FENCE: Final = 5.0
-"""Quartile ranges beyond the quartiles up to which values are drawn where they are."""
+_LEAST_DEPTH: Final = 0.25  # share of the height above 0 that is shown below it, however far from it the margins are
+_FENCE: Final = 5.0  # quartile ranges beyond the quartiles up to which values are drawn where they are
 
 
 def robust_ends(values: Array) -> tuple[float, float]:

@@ -21,31 +21,18 @@ _MOST_POINTS: Final = 4000
 
 @dataclass(frozen=True, kw_only=True)
 class ShownMargins:
-    """Worst margins of pairs as they are drawn.
+    """Worst margins of pairs as they are drawn."""
 
-    Attributes:
-        flights: (P,) their numbers.
-        margins: (P, 2) of the first and the second campaign; what is beyond the axes is at their edge.
-        true: (P, 2) the margins themselves.
-        edge: (P,) `down`, `up`, `left` or `right` where a pair is beyond the axes; else empty.
-        beyond: which pairs are drawn at the edges, and how far out they are, as a sentence; empty of none.
-        kind: (P,) which of the two failed, in words.
-        colours: colour of each kind.
-        lowest: low end of both axes.
-        highest: high end of both axes.
-        left_out: pairs that are not drawn, as there are too many.
-    """
-
-    flights: Rows
-    margins: Array
-    true: Array
-    edge: Edges
-    beyond: str
-    kind: np.ndarray[Any, np.dtype[np.object_]]
-    colours: dict[str, str]
-    lowest: float
-    highest: float
-    left_out: int
+    flights: Rows  # (P,) their numbers
+    margins: Array  # (P, 2) of the first and the second campaign; what is beyond the axes is at their edge
+    true: Array  # (P, 2) the margins themselves
+    edge: Edges  # (P,) `down`, `up`, `left` or `right` where a pair is beyond the axes; else empty
+    beyond: str  # which pairs are drawn at the edges, and how far out they are, as a sentence; empty of none
+    kind: np.ndarray[Any, np.dtype[np.object_]]  # (P,) which of the two failed, in words
+    colours: dict[str, str]  # colour of each kind
+    lowest: float  # low end of both axes
+    highest: float  # high end of both axes
+    left_out: int  # pairs that are not drawn, as there are too many
 
 
 def paired_margins(a: pa.Table, b: pa.Table, failed: tuple[Flags, ...], names: Sequence[str]) -> ShownMargins | None:

@@ -18,8 +18,7 @@ from scenarios.campaign.statistics.wording import count_of, percent
 EXAMPLE: Final = "P(violation) < 0.01 @ 95%"
 _SHARES: Final = (Decimal("1e-9"), 1 - Decimal("1e-9"))
 _CONFIDENCES: Final = (Decimal("0.5"), Decimal("0.999999"))
-_MOST_TOLD: Final = 10**9
-"""Flights beyond which a message says only that it takes more."""
+_MOST_TOLD: Final = 10**9  # flights beyond which a message says only that it takes more
 _FORM: Final = re.compile(
     r"P\s*\((?P<event>[^()]*)\)\s*(?P<operation><=|>=|<|>)\s*(?P<share>[^<>=@]+?)\s*@\s*(?P<confidence>[^@%]+?)\s*%",
     re.IGNORECASE,
@@ -28,21 +27,13 @@ _FORM: Final = re.compile(
 
 @dataclass(frozen=True, kw_only=True)
 class Requirement:
-    """What is asked: the probability of an event on one side of a share, with this confidence.
+    """What is asked: the probability of an event on one side of a share, with this confidence."""
 
-    Attributes:
-        text: as it was given.
-        event: whose probability.
-        operation: `<`, `<=`, `>` or `>=`.
-        share: the limit on the probability, from 1e-9 to 1 - 1e-9.
-        confidence: of the one-sided bound, from 0.5 to 0.999999.
-    """
-
-    text: str
-    event: Event
-    operation: str
-    share: float
-    confidence: float
+    text: str  # as it was given
+    event: Event  # whose probability
+    operation: str  # `<`, `<=`, `>` or `>=`
+    share: float  # the limit on the probability, from 1e-9 to 1 - 1e-9
+    confidence: float  # of the one-sided bound, from 0.5 to 0.999999
 
     @property
     def at_most(self) -> bool:
@@ -58,24 +49,17 @@ class Requirement:
 
 @dataclass(frozen=True, kw_only=True)
 class Judgement:
-    """Whether the flights support a requirement.
+    """Whether the flights support a requirement."""
 
-    Attributes:
-        requirement: what was asked.
-        count: flights in which the event happened.
-        flights: of how many.
-        bound: the one-sided Clopper-Pearson bound at the requirement's confidence: upper where the probability is to
-            be small, lower where it is to be large.
-        holds: whether the bound supports the requirement.
-        least_flights: how many flights it takes at the very least, all of them without the event where it is to be
-            rare, and all with it where it is to be frequent.
-    """
-
-    requirement: Requirement
-    count: int
-    flights: int
+    requirement: Requirement  # what was asked
+    count: int  # flights in which the event happened
+    flights: int  # of how many
+    # the one-sided Clopper-Pearson bound at the requirement's confidence: upper where the probability is to be small,
+    # lower where it is to be large
     bound: float
-    holds: bool
+    holds: bool  # whether the bound supports the requirement
+    # how many flights it takes at the very least, all of them without the event where it is to be rare, and all with it
+    # where it is to be frequent
     least_flights: int
 
     @property

@@ -21,54 +21,35 @@ from scenarios.campaign.statistics.dependence import Trend, trend
 from scenarios.campaign.statistics.outliers import margin_ends, robust_ends
 from scenarios.campaign.statistics.wording import count_of, label
 
-COURSE: Final = "half of the flights are above"
-"""What a curve through the flights of a scatter tells."""
-_GAP: Final = 0.06
-"""From the axis' end to what is drawn at the edge, as a share of the axis."""
+COURSE: Final = "half of the flights are above"  # what a curve through the flights of a scatter tells
+_GAP: Final = 0.06  # from the axis' end to what is drawn at the edge, as a share of the axis
 _MOST_POINTS: Final = 18_000
 """Points that all scatters of a page may have together: a page of 10 000 flights stays near 6 MB and quick to draw."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Margins:
-    """The worst margins as they are drawn.
+    """The worst margins as they are drawn."""
 
-    Attributes:
-        y: (K,) heights; at the foot where a flight has no margin, or one below the axis, at the top of one above it.
-        true: (K,) the margins, NaN where there is none.
-        edge: (K,) `down`, `up`, or empty where a flight is drawn where it is.
-        shown: the ends between which margins are drawn where they are.
-        ends: of the axis, with what is drawn at its edges.
-    """
-
+    # (K,) heights; at the foot where a flight has no margin, or one below the axis, at the top of one above it
     y: Array
-    true: Array
-    edge: Edges
-    shown: tuple[float, float]
-    ends: tuple[float, float]
+    true: Array  # (K,) the margins, NaN where there is none
+    edge: Edges  # (K,) `down`, `up`, or empty where a flight is drawn where it is
+    shown: tuple[float, float]  # the ends between which margins are drawn where they are
+    ends: tuple[float, float]  # of the axis, with what is drawn at its edges
 
 
 @dataclass(frozen=True, kw_only=True)
 class Cloud:
-    """A drawn parameter of every flight, as horizontal positions.
+    """A drawn parameter of every flight, as horizontal positions."""
 
-    Attributes:
-        name: the parameter.
-        label: its name, with its unit where it has one.
-        x: (K,) its values; whole numbers, spread a little, where it is drawn from names.
-        edge: (K,) `left`, `right`, or empty where a flight is drawn where it is.
-        true: (K,) its values; as `x` where it is drawn from names.
-        names: what stands at 0, 1, ...; empty where it is a number.
-        course: of the worst margin over it; None where there are too few flights, and of names.
-    """
-
-    name: str
-    label: str
-    x: Array
-    edge: Edges
-    true: Array
-    names: tuple[str, ...]
-    course: Trend | None
+    name: str  # the parameter
+    label: str  # its name, with its unit where it has one
+    x: Array  # (K,) its values; whole numbers, spread a little, where it is drawn from names
+    edge: Edges  # (K,) `left`, `right`, or empty where a flight is drawn where it is
+    true: Array  # (K,) its values; as `x` where it is drawn from names
+    names: tuple[str, ...]  # what stands at 0, 1, ...; empty where it is a number
+    course: Trend | None  # of the worst margin over it; None where there are too few flights, and of names
 
 
 def margins(table: pa.Table) -> Margins | None:

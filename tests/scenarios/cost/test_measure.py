@@ -144,7 +144,7 @@ def test_variations_change_the_vehicle(study: CostStudy) -> None:
 def test_contenders_answer_what_was_asked_in_flight(study: CostStudy) -> None:
     gain, flown, dense = study.candidates
     assert [candidate.name for candidate in study.candidates] == [
-        *("unconstrained gain", "constrained, as flown", "QP by piqp-dense"),
+        *("unconstrained gain", "constrained, as flown", "QP by piqp-dense")
     ]
     assert {candidate.step_ms.size for candidate in study.candidates} == {80}
     assert 0 < flown.shortcut.sum() < 80
