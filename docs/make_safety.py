@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import time as clock
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
@@ -14,6 +13,7 @@ import safety_mutations
 import safety_outputs
 
 from quadsim.report.table import Cell, Grid, grid_to_markdown
+from scenarios.bench.timing import Stopwatch
 
 PAGE = Path(__file__).resolve().parent / "safety.md"
 BEGIN, END = "<!-- counts: made by `make safety` -->", "<!-- counts end -->"
@@ -35,11 +35,11 @@ def counts(scale: float) -> str:
     """Go through all attacks; what came of each, as Markdown."""
 
     def go(what: str) -> str:
-        started = clock.perf_counter()
+        watch = Stopwatch()
         attack, count = ATTACKS[what]
         found = attack(max(1, round(scale * count)))
         outcomes = "; ".join(f"{name.replace('_', ' ')} {number}" for name, number in found.items())
-        print(f"{what}: {outcomes} ({clock.perf_counter() - started:.0f} s)", flush=True)
+        print(f"{what}: {outcomes} ({watch.elapsed:.0f} s)", flush=True)
         return outcomes
 
     names = list(ATTACKS)

@@ -6,7 +6,6 @@ import math
 import multiprocessing
 import re
 import tempfile
-import time as clock
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -18,6 +17,7 @@ from quadsim.errors import ParameterError
 from quadsim.report.table import ABSENT, Grid
 from scenarios.bench.bench_results import Target
 from scenarios.bench.bench_tables import line, targets_table
+from scenarios.bench.timing import Stopwatch
 from scenarios.campaign.engine.local import LocalEngine
 from scenarios.campaign.plan import Plan
 from scenarios.campaign.results.store import FLIGHTS_FILE, TIMES_FILE
@@ -239,9 +239,9 @@ def _timed(scenario: Scenario, flights: int, workers: int, *, report: bool) -> C
     memory = _Memory()
     with tempfile.TemporaryDirectory() as scratch:
         directory = Path(scratch) / "campaign"
-        started = clock.perf_counter()
+        stopwatch = Stopwatch()
         result = fly_campaign(plan, directory, LocalEngine(workers), report=report, watch=memory.look)
-        whole = clock.perf_counter() - started
+        whole = stopwatch.elapsed
         busy = sum(read_table(directory / TIMES_FILE)["wall_s"].to_pylist())
         wall = float(result.manifest["sessions"][-1]["wall_s"])
         return CampaignRun(
@@ -260,13 +260,13 @@ class _Memory:
 
     def __init__(self) -> None:
         self.largest: float | None = None
-        self._looked = clock.perf_counter()
+        self._since = Stopwatch()
 
     def look(self, standing: Standing) -> None:
         """Look, now and then."""
-        if clock.perf_counter() - self._looked < _LOOK_EVERY:
+        if self._since.elapsed < _LOOK_EVERY:
             return
-        self._looked = clock.perf_counter()
+        self._since = Stopwatch()
         sizes = [size for child in multiprocessing.active_children() if (size := _proportional(child.pid)) is not None]
         self.largest = max([*sizes, *([] if self.largest is None else [self.largest])], default=None)
 

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import math
 import tempfile
-import time as clock
 from pathlib import Path
 from typing import Final
 
 from quadsim.errors import ParameterError
 from quadsim.report.film.video import render_video, rendering_backend, worker_count
 from scenarios.bench.bench_results import RenderProfile
+from scenarios.bench.timing import Stopwatch
 from scenarios.machine import machine
 from scenarios.progress import Progress, silent
 from scenarios.run import Outputs, run_scenario
@@ -51,13 +51,13 @@ def bench_render(
 
         def report(done: int, total: int) -> None:
             nonlocal frames
-            first.append(clock.perf_counter())
+            first.append(watch.elapsed)
             frames = total
             progress("frames", done, total)
 
-        started = clock.perf_counter()
+        watch = Stopwatch()
         render_video(run, run / "film.mp4", workers=workers, width=WIDTH, height=HEIGHT, fps=FPS, progress=report)
-        wall_s = clock.perf_counter() - started
+        wall_s = watch.elapsed
     return RenderProfile(
         scenario=scenario.name,
         backend=backend,
@@ -67,6 +67,6 @@ def bench_render(
         frames=frames,
         workers=worker_count(frames, workers),
         wall_s=wall_s,
-        start_s=first[0] - started,
+        start_s=first[0],
         machine=machine(),
     )

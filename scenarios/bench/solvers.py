@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
-from typing import Final, TypedDict
+from typing import Final
 
 import numpy as np
 
@@ -43,12 +44,7 @@ GAIN: Final = "unconstrained gain"  # what the controller would be without its c
 PATIENCE: Final = 60.0  # a candidate that takes longer for the questions at one horizon [s] is dropped
 
 
-class _Racing(TypedDict):
-    """What every race of a bench has in common; see `scenarios.bench.timing.time_in_turns`."""
-
-    between: Callable[[], None]
-    repeats: int
-    rng: np.random.Generator
+Race = Callable[..., dict[str, StepTimes]]  # `time_in_turns` with what all races of a bench have in common
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -97,13 +93,13 @@ def bench_solvers(
     taking_part = entries(Entry(solver=spec.solver, shortcut=spec.shortcut), solvers)
     few = segments(flight.log.control.t.size, stride * GROWTH_STRIDE)
     with flight_between(scenario, flight.vehicle) as between:
-        racing: _Racing = {"between": between, "repeats": repeats, "rng": rng}
+        race = partial(time_in_turns, between=between, repeats=repeats, rng=rng)
         candidates, own, gain, asked, reference_kkt = _time_candidates(
-            flight, problem, taking_part, stride=stride, progress=progress, **racing
+            flight, problem, taking_part, race, stride=stride, progress=progress
         )
-        growth = _growth(flight, problem, taking_part, horizons, few, own, progress=progress, **racing)
+        growth = _growth(flight, problem, taking_part, race, horizons, few, own, progress)
         queries = recorded(scenario, flight.log.control, problem.horizon)
-        stages = time_stages(problem, queries, few, progress=progress, **racing)
+        stages = time_stages(problem, queries, few, race, progress)
     return SolverBench(
         scenario=scenario.name,
         horizon=problem.horizon,
@@ -165,11 +161,9 @@ def _time_candidates(
     flight: Flight,
     problem: Problem,
     taking_part: Sequence[Entry],
+    race: Race,
     *,
-    repeats: int,
     stride: int,
-    rng: np.random.Generator,
-    between: Callable[[], None],
     progress: Progress,
 ) -> tuple[tuple[CandidateResult, ...], dict[str, _Timed], Array | None, int, float]:
     """Candidates, their steps, the gain's, the number of periods asked, and the reference's worst KKT residual."""
@@ -178,14 +172,11 @@ def _time_candidates(
     periods = [period for segment in asked for period in segment]
     reference = reference_optima(problem, queries, periods)
     candidates = {entry.name: StepCandidate(entry, problem, queries) for entry in taking_part}
-    laps = time_in_turns(
+    laps = race(
         {**_gain(problem, queries), **candidates},
         asked,
-        between=between,
-        repeats=repeats,
-        rng=rng,
         longest_pass=LONGEST_PASS,
-        progress=lambda done, total: progress("candidates", done, total),
+        progress=partial(progress, "candidates"),
     )
     results = tuple(
         CandidateResult(
@@ -223,13 +214,10 @@ def _growth(
     flight: Flight,
     problem: Problem,
     taking_part: Sequence[Entry],
+    race: Race,
     horizons: Sequence[int],
     asked: Sequence[range],
     own: Mapping[str, _Timed],
-    *,
-    between: Callable[[], None],
-    repeats: int,
-    rng: np.random.Generator,
     progress: Progress,
 ) -> tuple[Growth, ...]:
     """Every candidate at each N, until one would hardly keep up with the flight at the next.
@@ -249,16 +237,8 @@ def _growth(
         else:
             queries, longer = recorded(flight.scenario, flight.log.control, N), replace(problem, horizon=N)
             candidates = {entry.name: StepCandidate(entry, longer, queries) for entry in racing}
-            laps = time_in_turns(
-                candidates,
-                asked,
-                between=between,
-                repeats=repeats,
-                rng=rng,
-                longest_pass=LONGEST_PASS,
-                patience=PATIENCE,
-                progress=lambda done, total, N=N: progress(f"N = {N}", done, total),  # type: ignore[misc]
-            )
+            report = partial(progress, f"N = {N}")
+            laps = race(candidates, asked, longest_pass=LONGEST_PASS, patience=PATIENCE, progress=report)
             timed = {name: _Timed.of(candidates[name], periods, lap) for name, lap in laps.items()}
         for entry in racing:
             if entry.name not in timed:

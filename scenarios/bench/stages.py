@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Final
 
 import numpy as np
@@ -16,7 +17,7 @@ from mpc.staged import Staged, usual_steps
 from quadsim.state import Array
 from scenarios.bench.bench_results import StageLength
 from scenarios.bench.queries import Queries
-from scenarios.bench.timing import time_in_turns
+from scenarios.bench.timing import StepTimes
 from scenarios.progress import Progress
 
 STEPS_TRIED: Final = (1, 2, 3, 4, 5, 6, 8, 10, 13, 17, 20, 25)
@@ -28,10 +29,7 @@ def time_stages(
     problem: Problem,
     queries: Queries,
     asked: Sequence[range],
-    *,
-    between: Callable[[], None],
-    repeats: int,
-    rng: np.random.Generator,
+    race: Callable[..., dict[str, StepTimes]],
     progress: Progress,
 ) -> tuple[StageLength, ...]:
     """The QP condensed and cut into stages of M steps, on the periods in which constraints are active."""
@@ -44,14 +42,8 @@ def time_stages(
     candidates: dict[int | None, _QPEntrant] = {None: _QPEntrant(condensed(problem), PiqpDense(), query)}
     for length in sorted({*STEPS_TRIED, default}):
         candidates[length] = _QPEntrant(Staged(problem, steps_per_stage=length), PiqpMultistage(), query)
-    laps = time_in_turns(
-        {str(steps): candidate for steps, candidate in candidates.items()},
-        asked,
-        between=between,
-        repeats=repeats,
-        rng=rng,
-        progress=lambda done, total: progress("stages", done, total),
-    )
+    named = {str(steps): candidate for steps, candidate in candidates.items()}
+    laps = race(named, asked, progress=partial(progress, "stages"))
     found_active = candidates[default].active
     active = np.array([found_active[period] > 0 for segment in asked for period in segment])
     counted = active if active.any() else np.ones_like(active)

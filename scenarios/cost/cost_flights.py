@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import multiprocessing
-import signal
+import functools
 from collections.abc import Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
 from typing import Final
 
@@ -21,10 +19,10 @@ from quadsim.flight.log import ControlLog, FlightLog
 from quadsim.state import REFERENCE_STATES
 from scenarios.bench.queries import QueriedController, flight_between, recorded
 from scenarios.bench.timing import segments, time_in_turns
+from scenarios.bench.worker_pool import answer_all
 from scenarios.build import build_controller, build_problem
 from scenarios.cost.study import CandidateTimes, Outcome
 from scenarios.courses.make import build_course_steps
-from scenarios.machine import usable_cores
 from scenarios.parts.vehicle import build_vehicle
 from scenarios.progress import Progress
 from scenarios.run import fly_scenario
@@ -90,21 +88,9 @@ def fly_all(
     """Fly what was not flown yet, over processes; results, with those given, by `key`."""
     results = dict(flown)
     wanted = {name: scenario for scenario in scenarios if (name := key(scenario)) not in results}
-    context = multiprocessing.get_context("spawn")  # a fork would take over whatever threads hold
-    pool = ProcessPoolExecutor(workers or usable_cores(), mp_context=context, initializer=_leave_interrupts_to_parent)
-    try:
-        futures = {pool.submit(fly, scenario): name for name, scenario in wanted.items()}
-        for done, future in enumerate(as_completed(futures), start=1):
-            results[futures[future]] = future.result()
-            progress("flights", done, len(futures))
-    finally:
-        pool.shutdown(cancel_futures=True)
+    done = answer_all(fly, [*wanted.values()], workers=workers, progress=functools.partial(progress, "flights"))
+    results |= zip(wanted, done, strict=True)
     return results
-
-
-def _leave_interrupts_to_parent() -> None:
-    """Ctrl-C reaches every process of a terminal; the parent alone is to say so."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 def time_candidates(

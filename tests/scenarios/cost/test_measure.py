@@ -17,11 +17,11 @@ from quadsim.controller import Moment
 from quadsim.errors import InputError, MissingPackageError
 from quadsim.flight import rundir
 from quadsim.flight.metrics import percentiles
+from scenarios.bench import worker_pool
 from scenarios.bench.queries import QueriedController, recorded
 from scenarios.build import build_controller
 from scenarios.cli import main
 from scenarios.commands import EXIT_DONE, EXIT_WRONG_INPUT
-from scenarios.cost import cost_flights
 from scenarios.cost.measure import find_study, fly_variations, study_cost
 from scenarios.cost.study import CostStudy
 from scenarios.cost.variants import without_constraints
@@ -50,7 +50,7 @@ def scenario(*settings: str, name: str = "paper-constrained") -> Scenario:
 def _here() -> Iterator[None]:
     """Flights are flown in this process; one test compares that with several."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(cost_flights, "ProcessPoolExecutor", Here)
+        patch.setattr(worker_pool, "ProcessPoolExecutor", Here)
         yield
 
 
@@ -70,7 +70,7 @@ def untimed(study: CostStudy) -> dict[str, Any]:
 
 
 def test_the_study_is_the_same_however_many_processes_fly(study: CostStudy, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(cost_flights, "ProcessPoolExecutor", ProcessPoolExecutor)
+    monkeypatch.setattr(worker_pool, "ProcessPoolExecutor", ProcessPoolExecutor)
     again = study_cost(scenario(), [scenario(name="paper-unconstrained")], workers=2, **SMALL)
     assert untimed(again) == untimed(study)
 
