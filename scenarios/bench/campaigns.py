@@ -194,14 +194,7 @@ def bench_campaign(
     sizes: Sequence[int] = (10, 100, 1000, 10000),
     progress: Progress = silent,
 ) -> CampaignProfile:
-    """Fly campaigns by one worker and by two, in turns, and then ever larger ones.
-
-    Args:
-        scenario: what the first ones fly, each time the same.
-        flights: per worker and round.
-        rounds: how many.
-        sizes: flights of the larger ones, by two workers.
-        progress: called with how much is done, of how much.
+    """Fly campaigns of so many flights per worker by one worker and by two, in turns, and then ever larger ones by two.
 
     Raises:
         ParameterError: nothing is asked for.

@@ -23,13 +23,7 @@ WIDTH, HEIGHT, FPS = 1280, 720, 30
 def bench_render(
     scenario: Scenario, *, seconds: float = SECONDS, workers: int | None = None, progress: Progress = silent
 ) -> RenderProfile:
-    """Fly the first seconds of a scenario and film them.
-
-    Args:
-        scenario: what to film.
-        seconds: of flight and film, at most the scenario's own.
-        workers: rendering processes, at most; one per usable core by default.
-        progress: called with how much is done, of how much.
+    """Fly the first seconds of a scenario and film them, by one process per usable core, or at most so many.
 
     Raises:
         ParameterError: an argument is out of range.

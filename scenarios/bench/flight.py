@@ -29,11 +29,6 @@ REPEATS: Final = 5
 def bench_flight(scenario: Scenario, *, repeats: int = REPEATS, progress: Progress = silent) -> FlightProfile:
     """Fly a scenario again and again on one core, in turns with and without clocks around its parts.
 
-    Args:
-        scenario: what to fly.
-        repeats: flights of each kind.
-        progress: called with how much is done, of how much.
-
     Raises:
         ParameterError: no repeat is asked for.
         InputError: the flight does not go to its end.

@@ -20,14 +20,7 @@ _DASHES: Final = ("-", "--", ":")  # candidates beyond the colours there are tak
 
 
 def write_solver_figure(bench: SolverBench, directory: Path) -> list[Path]:
-    """Draw the step times of all candidates, and their growth with the horizon.
-
-    Args:
-        bench: what was measured.
-        directory: where `solvers.png` and `solvers.svg` go; made when it is not there.
-
-    Returns:
-        The two files.
+    """Draw the step times of all candidates, and their growth, as `solvers.png` and `solvers.svg`; the two files.
 
     Raises:
         OutputError: the directory cannot be written.

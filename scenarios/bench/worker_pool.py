@@ -21,14 +21,7 @@ def answer_all(
     workers: int | None = None,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> list[Answer]:
-    """Ask each question in a process, and collect the answers in order.
-
-    Args:
-        ask: a module's function, which processes can find by its name.
-        questions: what it is asked.
-        workers: processes; one per usable core by default.
-        progress: called with how many are done, of how many.
-    """
+    """Ask a module's function each question in a process, one per usable core by default; the answers in order."""
     context = multiprocessing.get_context("spawn")  # a fork would take over whatever threads hold
     count = min(workers or usable_cores(), len(questions) or 1)
     pool = ProcessPoolExecutor(count, mp_context=context, initializer=_leave_interrupts_to_parent)

@@ -32,11 +32,7 @@ _TAIL: Final = 1e-3  # share of a distribution beyond the values that stand for 
 
 
 class Draws:
-    """What the flights of a campaign are drawn to be; the same for the same file, whoever asks, in whatever order.
-
-    Args:
-        spec: the campaign's file.
-    """
+    """What the flights of a campaign are drawn to be; the same for the same file, whoever asks, in whatever order."""
 
     def __init__(self, spec: CampaignSpec) -> None:
         self._spec = spec

@@ -51,13 +51,7 @@ def recorded_flight(directory: Path, number: int | None) -> Recorded:
 
 
 def replay(recorded: Recorded, target: Path, outputs: Outputs, progress: Progress = silent) -> tuple[Flight, list[str]]:
-    """Fly it again and write its run directory.
-
-    Args:
-        recorded: the flight.
-        target: the run directory.
-        outputs: see `scenarios.run.run_scenario`.
-        progress: see `scenarios.run.run_scenario`.
+    """Fly it again and write its run directory; see `scenarios.run.run_scenario`.
 
     Returns:
         The flight, and the columns of the campaign's table that it does not agree with, bit for bit; none, on the same

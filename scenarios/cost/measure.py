@@ -40,15 +40,10 @@ LONGEST_UNASKED: Final = 120.0
 
 
 def find_study(targets: Sequence[str], *, asked: bool | None) -> list[Scenario]:
-    """The scenarios of what is compared that a study is made from: a constrained one, then unconstrained ones.
+    """The first constrained scenario of runs or scenarios that are compared, and all unconstrained ones of its course.
 
-    Args:
-        targets: run directories, or scenarios.
-        asked: whether a study is wanted; None to find out: it is where a constrained and an unconstrained controller
-            fly the same course, which takes no longer than `LONGEST_UNASKED`.
-
-    Returns:
-        The first constrained scenario and all unconstrained ones of its course, or nothing where none is to be made.
+    Where `asked` is None a study is made where a constrained and an unconstrained controller fly the same course, which
+    takes no longer than `LONGEST_UNASKED`; nothing is returned where none is to be made.
 
     Raises:
         InputError: a study is asked for, and nothing is flown by a constrained controller.

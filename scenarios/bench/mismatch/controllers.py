@@ -66,12 +66,7 @@ def _paper(spec: ConstrainedSpec, condition: Condition, period: float) -> Constr
 
 
 def _robust(*, modelled: bool = True, **parts: Any) -> Callable[[ConstrainedSpec, Condition, float], RobustSpec]:
-    """The robust controller with soft bounds and some of its other parts.
-
-    Args:
-        modelled: whether the prediction knows rotor lag, delay and heading.
-        parts: other fields of `RobustSpec`.
-    """
+    """The robust controller with soft bounds, with or without a model of lag, delay and heading, and other parts."""
 
     def make(spec: ConstrainedSpec, condition: Condition, period: float) -> RobustSpec:
         known: dict[str, Any] = {}

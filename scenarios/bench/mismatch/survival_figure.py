@@ -33,14 +33,7 @@ class _Panel:
 
 
 def write_mismatch_figure(measured: MismatchBench, directory: Path) -> list[Path]:
-    """Draw the outcome of every controller in every condition.
-
-    Args:
-        measured: what was flown.
-        directory: where `ladder.png` and `ladder.svg` go; made when it is not there.
-
-    Returns:
-        The two files.
+    """Draw the outcome of every controller in every condition as `ladder.png` and `ladder.svg`; the two files.
 
     Raises:
         OutputError: the directory cannot be written.

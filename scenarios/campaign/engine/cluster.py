@@ -103,13 +103,10 @@ class DaskEngine:
 def fly_chunk(pickled: bytes, chunk: Sequence[int], expected: Mapping[str, str]) -> list[Answer]:
     """Have flights flown one after the other, beside a worker; those after a cancellation are left out.
 
-    Args:
-        pickled: the pilot, small against seconds of work; each worker makes it once.
-        chunk: the flights.
-        expected: versions that the worker has to have.
+    The pilot is small against seconds of work; each worker makes it once.
 
     Raises:
-        EngineError: it has others, or nobody can fly there.
+        EngineError: the worker has other versions than expected, or nobody can fly there.
     """
     worker = _distributed().get_worker()
     other = [f"{name} {found}, not {expected[name]}" for name, found in versions().items() if found != expected[name]]

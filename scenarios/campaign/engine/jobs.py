@@ -86,10 +86,7 @@ def job_script(jobs: Jobs) -> str:
 
 
 def submit(jobs: Jobs) -> Any:
-    """Start a scheduler in this process and submit the jobs.
-
-    Returns:
-        the dask-jobqueue cluster; closing it ends the jobs.
+    """Start them; closing the dask-jobqueue cluster that this returns ends them.
 
     Raises:
         EngineError: they cannot be submitted from this machine.

@@ -42,10 +42,7 @@ _UNKNOWN: Final = 255  # the exit code of a process whose server died without re
 
 
 class LocalEngine:
-    """Processes on this machine.
-
-    Args:
-        workers: how many; one per usable core by default.
+    """Processes on this machine, one per usable core by default.
 
     Raises:
         ParameterError: fewer than one.

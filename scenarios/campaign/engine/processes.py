@@ -69,8 +69,7 @@ def has_strays(worker: int) -> bool:
 def end_children(group: int | None = None) -> None:
     """Kill all below this process, which has adopted orphans, and see that they are gone.
 
-    Args:
-        group: of processes that are killed in one stroke, first; those that keep multiplying do not outrun that.
+    A group of processes is killed first, in one stroke, which those that keep multiplying do not outrun.
     """
     if group is not None:
         with contextlib.suppress(ProcessLookupError, PermissionError):

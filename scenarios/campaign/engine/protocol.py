@@ -44,12 +44,7 @@ class Pilot(Protocol):
         ...
 
     def fly(self, flight: int, progress: Progress = silent) -> Row:
-        """The row of a flight; plain values.
-
-        Args:
-            flight: which.
-            progress: called after each control period that is flown.
-        """
+        """The row of a flight, plain values; reports each control period that is flown."""
         ...
 
     def lost(self, flight: int, reason: str, verdict: str = ERROR) -> Row:
@@ -74,10 +69,6 @@ class Engine(Protocol):
 
     def answers(self, pilot: Pilot, flights: Sequence[int]) -> Generator[Row]:
         """The rows, each flight's exactly once, in whatever order they come; closing the iterator stops all work.
-
-        Args:
-            pilot: flies them.
-            flights: no two alike.
 
         Raises:
             EngineError: there is nobody left to fly.
@@ -128,12 +119,7 @@ class Pace:
         return int(seconds * self._flights / max(self._seconds, 1e-9))
 
     def chunk(self, waiting: int, workers: int) -> int:
-        """Flights to hand to one worker: fewer near the end, so that all finish together.
-
-        Args:
-            waiting: flights not handed out.
-            workers: those who share them.
-        """
+        """Flights to hand to one worker: fewer near the end, so that all finish together."""
         return max(1, min(self.flights_in(CHUNK_S), fair_share(waiting, workers)))
 
 

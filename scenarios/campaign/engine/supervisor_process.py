@@ -22,12 +22,7 @@ _MAIN: Final = (
 
 
 class SupervisorProcess:
-    """Flies one flight at a time beside this process; whoever dies of it is replaced.
-
-    Args:
-        pilot: flies.
-        pickled: the pilot.
-    """
+    """Flies one flight at a time beside this process; whoever dies of it is replaced."""
 
     def __init__(self, pilot: Pilot, pickled: bytes) -> None:
         self._pilot, self._pickled = pilot, pickled

@@ -42,16 +42,7 @@ _FEW: Final = 50  # flights of a verdict that are drawn larger, so as to be seen
 
 
 def write_campaign_figure(name: str, table: pa.Table, summary: Summary, directory: Path) -> list[Path]:
-    """Draw how the estimate settles, the worst margins, what goes with them, and the strongest three of that.
-
-    Args:
-        name: the campaign's.
-        table: `flights.parquet`.
-        summary: its estimates.
-        directory: where `campaign.png` and `campaign.svg` go; made when it is not there.
-
-    Returns:
-        The two files.
+    """Draw `campaign.png` and `.svg`: how the estimate settles, worst margins, and what goes with them.
 
     Raises:
         OutputError: the directory cannot be written.

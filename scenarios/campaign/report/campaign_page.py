@@ -131,14 +131,9 @@ KIND: Final = "campaign comparison"  # what `quadsim.outputs` calls such a direc
 
 
 def write_comparison_report(comparison: Comparison, directory: Path) -> Path:
-    """Write `index.html`, `comparison.json` and `comparison.md`, which appear together or not at all.
+    """Write `index.html`, `comparison.json` and `comparison.md`, which appear together or not at all; the page.
 
-    Args:
-        comparison: what to tell.
-        directory: what to write; an earlier comparison of campaigns or an empty directory there is replaced.
-
-    Returns:
-        The page.
+    An earlier comparison of campaigns or an empty directory there is replaced.
 
     Raises:
         OutputError: the directory cannot be written, or holds something else.

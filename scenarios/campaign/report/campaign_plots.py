@@ -34,15 +34,7 @@ _LOG_TICKS: Final = [float(digit * 10**power) for power in range(7) for digit in
 
 
 def campaign_plots(table: pa.Table, summary: Summary) -> dict[str, Plot]:
-    """The plots of a campaign that its flights have something for.
-
-    Args:
-        table: `flights.parquet`.
-        summary: its estimates.
-
-    Returns:
-        Any of `convergence`, `metrics`, `drivers` and `scatter`.
-    """
+    """The plots that its flights have something for: any of `convergence`, `metrics`, `drivers` and `scatter`."""
     found = {}
     if table.num_rows:
         found["convergence"] = _convergence(summary)

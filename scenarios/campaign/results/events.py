@@ -54,10 +54,7 @@ class Event:
     value: bool | str | float  # what the column is compared with
 
     def holds(self, row: Mapping[str, Any]) -> bool:
-        """Whether it happened in one flight; so it did where the flight has no value.
-
-        Args:
-            row: a flight's values by column.
+        """Whether it happened in one flight, given its values by column; so it did where the flight has no value.
 
         Raises:
             UnknownNameError: there is no such column.

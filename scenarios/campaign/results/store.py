@@ -28,11 +28,7 @@ LARGEST: Final = 1e100  # magnitude of the largest number that a flight has; sum
 
 
 def read_flights(path: Path, schema: pa.Schema) -> pa.Table:
-    """`flights.parquet` of a campaign.
-
-    Args:
-        path: of the table.
-        schema: of the campaign, `table.make_schema`; a table of an older version may have fewer.
+    """`flights.parquet` of a campaign, whose schema it has; a table of an older version may have fewer columns.
 
     Raises:
         FileError: it cannot be read, a column is missing, not of the campaign or of another type, a number is too
@@ -83,12 +79,7 @@ _PART: Final = "part-*.parquet"
 
 
 class Store:
-    """The rows of a campaign on disk.
-
-    Args:
-        files: of the campaign's directory.
-        schema: see `scenarios.campaign.results.table.make_schema`.
-    """
+    """The rows of a campaign on disk, in the columns of `scenarios.campaign.results.table.make_schema`."""
 
     def __init__(self, files: Growing, schema: pa.Schema) -> None:
         self._files, self._directory, self._schema = files, files.path, schema
@@ -127,13 +118,7 @@ class Store:
         self._files.write({f"{PARTS_DIR}/part-{first:09d}.parquet": _encoded(make_table(rows, self._schema))})
 
     def close(self, flights: int) -> pa.Table:
-        """Put everything into its final two tables, and take the parts away.
-
-        Args:
-            flights: how many count; those beyond are left out.
-
-        Returns:
-            `flights.parquet`.
+        """Put the first so many flights into their final two tables, take the parts away, and return `flights.parquet`.
 
         Raises:
             OutputError: they cannot be written; the parts are still there.

@@ -41,16 +41,10 @@ class Dependence:
 
 
 def rank_correlation(x: Array, y: Array) -> Correlation | None:
-    """Spearman's rank correlation of pairs, ties at their mean rank.
+    """Spearman's rank correlation of pairs x, y (K,), ties at their mean rank.
 
-    The p-value counts all permutations of up to 8 pairs, and is from Student's t beyond.
-
-    Args:
-        x: (K,); pairs with a NaN do not count, infinities have their rank.
-        y: (K,).
-
-    Returns:
-        None of fewer than three pairs, or where one side is always the same.
+    The p-value counts all permutations of up to 8 pairs, and is from Student's t beyond.  Pairs with a NaN do not
+    count, infinities have their rank.  None of fewer than three pairs, or where one side is always the same.
     """
     pairs = _ranked(x, y)
     if pairs is None:
@@ -70,20 +64,12 @@ def rank_correlation(x: Array, y: Array) -> Correlation | None:
 
 
 def any_dependence(x: Array, y: Array, rng: np.random.Generator) -> Dependence | None:
-    """Chatterjee's xi of y on x: how near y is to a function of x, of whatever shape.
+    """Chatterjee's xi of y on x, (K,) each: how near y is to a function of x, of whatever shape.
 
-    Equal values of x are put in an order at random, as its author advises.  The p-value of a y with two values, such as
-    an event, is exact: xi then counts how often the event begins or ends as x grows, as the runs test does.  Else it is
-    from 9999 permutations of up to 40 pairs, and from xi's asymptotic law beyond.
-    Source: Chatterjee, Journal of the American Statistical Association 116 (2021).
-
-    Args:
-        x: (K,); pairs with a NaN do not count, infinities have their rank.
-        y: (K,).
-        rng: of ties and permutations.
-
-    Returns:
-        None of fewer than three pairs, or where one side is always the same.
+    Pairs count as for `rank_correlation`.  Equal values of x are put in an order at random, as its author advises.  The
+    p-value of a y with two values, such as an event, is exact: xi then counts how often the event begins or ends as x
+    grows, as the runs test does.  Else it is from 9999 permutations of up to 40 pairs, and beyond from xi's asymptotic
+    law.  Source: Chatterjee, Journal of the American Statistical Association 116 (2021).
     """
     pairs = _ranked(x, y)
     if pairs is None:
@@ -154,17 +140,11 @@ class Trend:
 def trend(x: Array, y: Array) -> Trend | None:
     """A cubic smoothing spline through the medians of groups of flights that are next to one another.
 
-    Flights are sorted by x and parted into 5 to 25 groups of about equal size, 0.8 times as many as the square root of
-    the flights.  Medians are taken since no outlier moves them; generalised cross-validation chooses how smooth the
-    spline is, and it is cut off at the highest and the lowest median.
+    Flights, finite x and y (K,), are sorted by x and parted into 5 to 25 groups of about equal size, 0.8 times as many
+    as the square root of the flights.  Medians are taken since no outlier moves them; generalised cross-validation
+    chooses how smooth the spline is, and it is cut off at the highest and the lowest median.  None of fewer than 40
+    flights, or where x has too few values for five groups.
     Source: scipy.interpolate.make_smoothing_spline, after Woltring, Advances in Engineering Software 8 (1986).
-
-    Args:
-        x: (K,) values of the drawn number; finite.
-        y: (K,) the outcome; finite.
-
-    Returns:
-        None of fewer than 40 flights, or where x has too few values for five groups.
     """
     from scipy.interpolate import make_smoothing_spline
 

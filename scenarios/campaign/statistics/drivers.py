@@ -33,9 +33,6 @@ def parameters(table: pa.Table) -> dict[str, Any]:
     under `turn`, where the course of the worst margin turns, `highest` or `lowest` at a value, or None.  All p-values
     of all parameters, outcomes and measures together are corrected by Holm's method: `p_holm`, `p_xi_holm`.
     Of what is drawn from names or truth values: the failures by level.
-
-    Args:
-        table: `flights.parquet`; of no flights as well.
     """
     failed = flags(table, "failed", absent=True)
     names = draw_names(table)

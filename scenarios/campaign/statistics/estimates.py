@@ -37,9 +37,6 @@ def estimate(table: pa.Table) -> dict[str, Any]:
     reached; `metrics`, over the flights that have each; `parameters`, how the outcome goes with each drawn parameter
     (`drivers.parameters`); `worst`, the ten worst flights; `convergence` of the shares of failure and
     violation over the first n flights.
-
-    Args:
-        table: `flights.parquet`; of no flights as well.
     """
     return {
         "flights": table.num_rows,

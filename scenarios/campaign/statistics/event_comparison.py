@@ -59,10 +59,8 @@ def events_of(a: pa.Table, b: pa.Table) -> dict[str, tuple[Flags, Flags]]:
 def compare_events(events: Mapping[str, tuple[Flags, Flags]]) -> tuple[EventComparison, ...]:
     """Every event with its test, corrected for all of them but those that no flight of a pair had alone.
 
-    These have a p-value of 1 whatever the others are, so that there is nothing to correct for (Tarone, 1990).
-
-    Args:
-        events: (K,) whether it happened to each flight of the first and of the second campaign, by name.
+    These have a p-value of 1 whatever the others are, so that there is nothing to correct for (Tarone, 1990).  Events
+    are given by name, as (K,) whether each happened to the flights of the first and of the second campaign.
     """
     alone = {event: (int((a & ~b).sum()), int((b & ~a).sum())) for event, (a, b) in events.items()}
     tested = [event for event, counts in alone.items() if any(counts)]
@@ -90,11 +88,9 @@ def compare_events(events: Mapping[str, tuple[Flags, Flags]]) -> tuple[EventComp
 
 
 def other_differences(events: Sequence[EventComparison], names: tuple[str, str]) -> str:
-    """What else than the first event happened more often to one of two campaigns, beyond chance or not.
+    """What else than the first event happened more often to one of two campaigns, beyond chance or not, as a sentence.
 
-    Returns:
-        A sentence; empty where nothing else did.  A second event of the same numbers as the first, as violation is
-        where it alone counts as failure, is not reported again.
+    A second event of the same numbers as the first, as violation is where it alone counts as failure, is not reported.
     """
     first, *others = events
     others = [event for event in others if event.only_a != event.only_b]

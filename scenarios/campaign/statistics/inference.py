@@ -100,12 +100,7 @@ def holm(p_values: Sequence[float]) -> list[float]:
 
 
 def mcnemar(only_a: int, only_b: int) -> float:
-    """Two-sided p-value of McNemar's exact test: the discordant pairs are equally likely to be of either kind.
-
-    Args:
-        only_a: pairs in which it happened to the first alone.
-        only_b: pairs in which it happened to the second alone.
-    """
+    """Two-sided p-value of McNemar's exact test: a discordant pair is as likely to be of the first as of the second."""
     discordant = only_a + only_b
     return float(stats.binomtest(only_a, discordant).pvalue) if discordant else 1.0
 
@@ -113,14 +108,9 @@ def mcnemar(only_a: int, only_b: int) -> float:
 def paired_shares(only_a: int, only_b: int, pairs: int, confidence: float = CONFIDENCE) -> tuple[float, float]:
     """Interval of the difference of paired proportions, share of b - share of a: Tango's score interval.
 
-    It holds every difference that a score test does not reject; with no difference, that is McNemar's test.
+    It holds every difference that a score test does not reject; with no difference, that is McNemar's test.  Of all
+    `pairs`, at least one, it happened to the first alone in `only_a`, and to the second alone in `only_b`.
     Source: Tango, Statistics in Medicine 17 (1998).
-
-    Args:
-        only_a: pairs in which it happened to the first alone.
-        only_b: pairs in which it happened to the second alone.
-        pairs: all pairs, at least one.
-        confidence: of the interval.
     """
     z = float(stats.norm.ppf(0.5 * (1.0 + confidence)))
     estimate = (only_b - only_a) / pairs
@@ -150,15 +140,10 @@ def _score_variance(difference: float, only_a: int, only_b: int, pairs: int) -> 
 
 
 def paired_difference(a: Array, b: Array, confidence: float = CONFIDENCE) -> PairedDifference:
-    """Mean and median of b - a, each with its interval.
+    """Mean and median of b - a, (K,) finite each, with their intervals.
 
     The mean's is Student's t interval.  The median's has order statistics at its ends, by inverting the sign test, and
     asks nothing of the distribution (Conover, Practical Nonparametric Statistics, 1999, 3.2).
-
-    Args:
-        a: (K,) finite.
-        b: (K,) finite.
-        confidence: of each interval.
     """
     differences = np.asarray(b, float) - np.asarray(a, float)
     n = differences.size

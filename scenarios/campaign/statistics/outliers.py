@@ -15,11 +15,7 @@ _FENCE: Final = 5.0  # quartile ranges beyond the quartiles up to which values a
 
 
 def robust_ends(values: Array) -> tuple[float, float]:
-    """The smallest and the largest of some values, without those far out.
-
-    Args:
-        values: some of them finite.
-    """
+    """The smallest and the largest of some values, some of them finite, without those far out."""
     finite = values[np.isfinite(values)]
     low, high = _fences(finite)
     inside = finite[(finite >= low) & (finite <= high)]
@@ -27,11 +23,7 @@ def robust_ends(values: Array) -> tuple[float, float]:
 
 
 def lowest_shown(values: Array) -> float:
-    """The lowest of such margins that may be shown where it is: `LOWEST_MARGIN`, but where most are lower still.
-
-    Args:
-        values: some of them finite.
-    """
+    """The lowest of such margins that may be shown where it is: `LOWEST_MARGIN`, but where most are lower still."""
     finite = values[np.isfinite(values)]
     return LOWEST_MARGIN if np.median(finite) > LOWEST_MARGIN else float(np.percentile(finite, 5))
 
@@ -44,11 +36,7 @@ def _fences(finite: Array) -> tuple[float, float]:
 
 
 def margin_ends(values: Array) -> tuple[float, float]:
-    """The ends between which worst margins are drawn where they are; 0, the end of what is allowed, is among them.
-
-    Args:
-        values: some of them finite.
-    """
+    """The ends between which worst margins are drawn where they are; 0, the end of what is allowed, is among them."""
     finite = values[np.isfinite(values)]
     fence, above = _fences(finite)
     high = max(0.0, float(finite[finite <= above].max()))

@@ -36,14 +36,7 @@ class ShownMargins:
 
 
 def paired_margins(a: pa.Table, b: pa.Table, failed: tuple[Flags, ...], names: Sequence[str]) -> ShownMargins | None:
-    """The worst margins of all pairs as they are drawn; None where fewer than two pairs have margins.
-
-    Args:
-        a: flights of the first campaign, in pairs with those of the second.
-        b: of the second.
-        failed: (K,) which flights failed, of each.
-        names: of both.
-    """
+    """The worst margins of all pairs, and which of both (K,) failed, as drawn; None of fewer than two with margins."""
     pairs = np.stack([numbers(a, "worst_margin"), numbers(b, "worst_margin")], axis=1)
     there = np.flatnonzero(np.isfinite(pairs).all(axis=1))
     if there.size < 2:

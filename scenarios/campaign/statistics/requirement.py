@@ -118,14 +118,10 @@ def parse_requirement(text: str) -> Requirement:
 
 
 def judge(table: pa.Table, requirement: Requirement) -> Judgement:
-    """Hold a campaign's flights against a requirement.
+    """Hold a campaign's flights, `flights.parquet`, against a requirement.
 
     It holds when the one-sided Clopper-Pearson bound at its confidence is on the side that is asked for; so it takes
     flights enough, and no flights support nothing.
-
-    Args:
-        table: `flights.parquet`.
-        requirement: what is asked.
 
     Raises:
         UnknownNameError: the table has no column that the event names.

@@ -38,15 +38,9 @@ class Split:
 
 
 def best_splits(columns: Mapping[str, Array], happened: Flags) -> dict[str, Split | None]:
-    """The best threshold on each of several drawn numbers.
+    """The best threshold on each of several drawn numbers, (K,) by name, for an event that happened (K,) or not.
 
-    Args:
-        columns: (K,) values of each drawn number.
-        happened: (K,) whether the event happened.
-
-    Returns:
-        By name; None of a number that is always the same or not always there, and of an event that happened never or
-        always.
+    None of a number that is always the same or not always there, and of an event that happened never or always.
     """
     if happened.all() or not happened.any():
         return dict.fromkeys(columns)
