@@ -10,7 +10,7 @@ import numpy as np
 from quadsim.report.figures.canvas import new_figure, write_drawings
 from quadsim.report.palette import BOUND, LINES
 from scenarios.bench.bench_results import CandidateResult, SolverBench
-from scenarios.bench.targets import PAPER_SOLVER
+from scenarios.bench.bench_tables import PAPER_SOLVER
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -19,9 +19,8 @@ from quadsim.report.table import Grid, grid_to_markdown
 from quadsim.state import Array
 from scenarios.bench.bench_results import CandidateResult, Growth, SolverBench
 from scenarios.bench.bench_tables import solver_tables
-from scenarios.bench.candidates import Entry, StepCandidate, entries, judge, reference_optima
+from scenarios.bench.candidates import Entry, StepCandidate, entries, judge, reference_optima, time_stages
 from scenarios.bench.queries import QueriedController, Queries, flight_between, recorded
-from scenarios.bench.stages import time_stages
 from scenarios.bench.timing import StepTimes, segments, time_in_turns
 from scenarios.build import build_problem
 from scenarios.machine import machine, versions

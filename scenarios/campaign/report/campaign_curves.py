@@ -14,7 +14,7 @@ from scenarios.campaign.results.columns import numbers, verdicts
 from scenarios.campaign.results.table import Summary, unit_of
 from scenarios.campaign.results.verdicts import VERDICTS
 from scenarios.campaign.statistics.inference import ALPHA
-from scenarios.campaign.statistics.outliers import lowest_shown, robust_ends
+from scenarios.campaign.statistics.scatters import lowest_shown, robust_ends
 from scenarios.campaign.statistics.wording import label
 
 MAIN_METRICS: Final = (

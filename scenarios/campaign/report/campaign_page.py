@@ -14,7 +14,7 @@ from quadsim.report.pages.page import PAGE_FILE, render_page
 from quadsim.report.plots.panels import plotly_script
 from quadsim.report.table import Mark
 from scenarios.campaign.report.campaign_figure import write_campaign_figure
-from scenarios.campaign.report.campaign_plots import campaign_plots
+from scenarios.campaign.report.campaign_plots import campaign_plots, comparison_margins_plot
 from scenarios.campaign.report.campaign_tables import (
     constraint_table,
     driver_table,
@@ -29,7 +29,6 @@ from scenarios.campaign.report.campaign_tables import (
 )
 from scenarios.campaign.report.campaign_text import campaign_sentences, verdict_sentence
 from scenarios.campaign.report.comparison_tables import comparison_markdown, comparison_tables, pairing
-from scenarios.campaign.report.margin_plots import comparison_margins_plot
 from scenarios.campaign.results.table import Summary
 from scenarios.campaign.statistics.comparison import Comparison
 from scenarios.campaign.statistics.scatters import clipping, clouds, margins, thinning

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from quadsim.report.table import ABSENT, Cell, Grid, Mark, format_number, grid_to_markdown
-from scenarios.campaign.statistics.comparison import Comparison, MetricComparison
-from scenarios.campaign.statistics.event_comparison import EventComparison
+from scenarios.campaign.statistics.comparison import Comparison, EventComparison, MetricComparison
 from scenarios.campaign.statistics.inference import ALPHA, CONFIDENCE
 from scenarios.campaign.statistics.wording import label, p_value, percent, signed_interval, signed_points
 

@@ -15,7 +15,7 @@ from scenarios.campaign.results.events import Flags, parse_event
 from scenarios.campaign.results.table import DRAW, unit_of
 from scenarios.campaign.statistics.dependence import any_dependence, rank_correlation, trend
 from scenarios.campaign.statistics.inference import holm, proportion
-from scenarios.campaign.statistics.outliers import margin_ends
+from scenarios.campaign.statistics.scatters import margin_ends
 from scenarios.campaign.statistics.splits import best_splits
 
 SPLIT_EVENTS: Final = ("failure", "violation", "lost")
