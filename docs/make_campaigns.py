@@ -14,7 +14,7 @@ from pathlib import Path
 from make_numbers import replace_in_readme
 from PIL import Image
 
-from quadsim.report.table import Cell, Grid, grid_to_markdown
+from quadsim.report.table import Grid, grid_to_markdown, line
 from scenarios.bench.solvers import section
 from scenarios.campaign.engine.local import LocalEngine
 from scenarios.campaign.manifest import stored_plan
@@ -60,17 +60,14 @@ def violations(results: list[Result]) -> Grid:
     for result in results:
         events = result.summary["events"]
         found, lost = events["violation"], events["lost"]
-        texts = (
-            result.summary["campaign"],
-            str(found["flights"]),
-            str(events["failure"]["count"]),
-            str(lost["count"]),
-            str(found["count"]),
-            percent(found["share"]),
-            interval(found["lower"], found["upper"]),
-            percent(found["upper_one_sided"]),
+        lines.append(
+            line(
+                result.summary["campaign"],
+                *(str(found["flights"]), str(events["failure"]["count"]), str(lost["count"]), str(found["count"])),
+                *(percent(found["share"]), interval(found["lower"], found["upper"])),
+                percent(found["upper_one_sided"]),
+            )
         )
-        lines.append(tuple(Cell(text=text) for text in texts))
     return Grid(
         key="violations",
         title="How often a required constraint does not hold",

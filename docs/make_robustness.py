@@ -15,7 +15,7 @@ from fault_injection import CONTROLLERS, NEAR, SOON, Consequence, draw, inject_a
 from PIL import Image
 
 from mpc.robust.tightening import TighteningSettings
-from quadsim.report.table import Cell, Grid
+from quadsim.report.table import Grid, line
 from scenarios.bench.mismatch.benchmark import run_mismatch, write_mismatch
 from scenarios.bench.mismatch.conditions import WORN
 from scenarios.bench.mismatch.controllers import FULL
@@ -55,7 +55,7 @@ def targets(measured: MismatchBench) -> Grid:
         key="asked",
         title=f"Requirements on {FULL}",
         head=("requirement", "met"),
-        lines=tuple((Cell(text=what), Cell(text=found)) for what, found in lines),
+        lines=tuple(line(*texts) for texts in lines),
         note="Disturbances beyond the size that the tightening states for those about each axis, "
         f"{STATED.angular_acceleration:g} rad/s^2, may tilt it further: a rotor that loses {100 * WORN:g} % makes "
         f"{worn_rotor():.0f} rad/s^2 at hover, and half of that in all by half. Measurement noise is not counted. "
@@ -86,15 +86,13 @@ def fault_tables(found: Sequence[Consequence]) -> list[Grid]:
         lines = []
         for name, cases in sorted(kinds.items()):
             starts = ", ".join(f"{case.injection.start:.2f} ({case.injection.condition})" for case in cases)
-            texts = (
-                name,
-                starts,
-                f"{sum(case.harmless for case in cases)} of {len(cases)}",
-                str(max(case.fallback for case in cases)),
-                f"{max(case.furthest for case in cases):.4f}",
-                f"{max(case.back for case in cases):.2f}",
+            lines.append(
+                line(
+                    *(name, starts, f"{sum(case.harmless for case in cases)} of {len(cases)}"),
+                    str(max(case.fallback for case in cases)),
+                    *(f"{max(case.furthest for case in cases):.4f}", f"{max(case.back for case in cases):.2f}"),
+                )
             )
-            lines.append(tuple(Cell(text=text) for text in texts))
         grids.append(
             Grid(
                 key=f"faults-{controller}",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import itertools
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
@@ -12,7 +13,7 @@ import safety_campaign
 import safety_mutations
 import safety_outputs
 
-from quadsim.report.table import Cell, Grid, grid_to_markdown
+from quadsim.report.table import Grid, grid_to_markdown, line
 from scenarios.bench.timing import Stopwatch
 
 PAGE = Path(__file__).resolve().parent / "safety.md"
@@ -46,7 +47,7 @@ def counts(scale: float) -> str:
     with ThreadPoolExecutor() as beside:
         outcomes = list(beside.map(go, names[:ASIDE]))
     outcomes += [go(name) for name in names[ASIDE:]]
-    lines = tuple((Cell(text=name), Cell(text=text)) for name, text in zip(names, outcomes, strict=True))
+    lines = tuple(itertools.starmap(line, zip(names, outcomes, strict=True)))
     return grid_to_markdown(Grid(key="counts", title="What was tried", head=("attack", "outcome"), lines=lines))
 
 

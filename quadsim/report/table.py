@@ -70,6 +70,11 @@ class Grid:
     note: str = ""
 
 
+def line(*cells: Cell | str) -> tuple[Cell, ...]:
+    """A line of a grid; a text is a cell without a mark."""
+    return tuple(cell if isinstance(cell, Cell) else Cell(text=cell) for cell in cells)
+
+
 def to_markdown(rows: Sequence[Row], names: Sequence[str]) -> str:
     """A Markdown table of the rows: headlines and the best values in bold type."""
     lines = [_markdown_line("", "", *names), _markdown_line("---", "---", *("---:" for _ in names))]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 
@@ -15,8 +15,7 @@ from quadsim.state import Array
 FITTED_FROM: Final = 20  # N from which on the growth exponent is fitted: below, what every step costs hides what grows
 
 
-@dataclass(frozen=True, kw_only=True)
-class Target:
+class Target(NamedTuple):
     """A target, beside what was measured."""
 
     what: str  # the quantity

@@ -14,9 +14,9 @@ from typing import Any, Final
 import numpy as np
 
 from quadsim.errors import ParameterError
-from quadsim.report.table import ABSENT, Grid
+from quadsim.report.table import ABSENT, Grid, line
 from scenarios.bench.bench_results import Target
-from scenarios.bench.bench_tables import line, targets_table
+from scenarios.bench.bench_tables import targets_table
 from scenarios.bench.timing import Stopwatch
 from scenarios.campaign.engine.local import LocalEngine
 from scenarios.campaign.plan import Plan
@@ -158,26 +158,15 @@ def campaign_targets(profile: CampaignProfile) -> list[Target]:
     """What was asked of throughput, scaling, overhead and memory."""
     hour = profile.per_core_hour * profile.duration / 60.0
     memory = math.nan if profile.memory_mb is None else profile.memory_mb
+    throughput = f"60 s flights of {profile.scenario} per core-hour, the median round"
+    scaling, overhead = profile.scaling, profile.overhead
     return [
+        Target(throughput, ">= 3000", f"{hour:.0f}", hour >= 3000.0),
+        Target("two workers against one, the median round", ">= 1.9", f"{scaling:.2f}", scaling >= 1.9),
         Target(
-            what=f"60 s flights of {profile.scenario} per core-hour, the median round",
-            asked=">= 3000",
-            measured=f"{hour:.0f}",
-            met=hour >= 3000.0,
+            "two workers' time not spent flying, the median round", "< 2 %", f"{100 * overhead:.1f} %", overhead < 0.02
         ),
-        Target(
-            what="two workers against one, the median round",
-            asked=">= 1.9",
-            measured=f"{profile.scaling:.2f}",
-            met=profile.scaling >= 1.9,
-        ),
-        Target(
-            what="two workers' time not spent flying, the median round",
-            asked="< 2 %",
-            measured=f"{100 * profile.overhead:.1f} %",
-            met=profile.overhead < 0.02,
-        ),
-        Target(what="memory of a worker", asked="< 300 MB", measured=f"{memory:.0f} MB", met=memory < 300.0),
+        Target("memory of a worker", "< 300 MB", f"{memory:.0f} MB", memory < 300.0),
     ]
 
 

@@ -53,29 +53,16 @@ def entries(default: Entry, solvers: Sequence[str]) -> list[Entry]:
 
 
 class _Witnessed:
-    """A solver whose last answer can be looked at."""
+    """A solver, see `mpc.solvers.Solver`, whose last answer can be looked at."""
 
     def __init__(self, solver: Solver) -> None:
-        self._solver = solver
+        self.name, self.formulation, self.reset = solver.name, solver.formulation, solver.reset
+        self._solve = solver.solve
         self.last: Answer | None = None
-
-    @property
-    def name(self) -> str:
-        """See `mpc.solvers.Solver.name`."""
-        return self._solver.name
-
-    @property
-    def formulation(self) -> Formulation:
-        """See `mpc.solvers.Solver.formulation`."""
-        return self._solver.formulation
-
-    def reset(self) -> None:
-        """See `mpc.solvers.Solver.reset`."""
-        self._solver.reset()
 
     def solve(self, state: Array, desired: Array, u_before: Array, rest: Rest | None = None) -> Answer:
         """See `mpc.solvers.Solver.solve`."""
-        self.last = self._solver.solve(state, desired, u_before, rest)
+        self.last = self._solve(state, desired, u_before, rest)
         return self.last
 
 
@@ -117,12 +104,6 @@ class StepCandidate:
         self.keep()
         return tuple(self._asked.statuses[period] for period in periods)
 
-    def failures(self, periods: Sequence[int]) -> int:
-        """How many periods were left without their optimum."""
-        self.keep()
-        commands = [self.answers[period][0] for period in periods]
-        return sum(command is None or command.status not in ACCEPTED for command in commands)
-
 
 @dataclass(frozen=True, kw_only=True)
 class Reference:
@@ -138,7 +119,7 @@ def reference_optima(problem: Problem, queries: Queries, periods: Sequence[int])
     backend.setup(formulation.qp)
     inputs, worst = {}, 0.0
     for period in periods:
-        vectors = formulation.vectors(*_query(problem, queries, period))
+        vectors = formulation.vectors(*queries.of_qp(problem, period))
         qp = formulation.qp.with_vectors(vectors)
         optimum = polish(qp, backend.solve(vectors))
         worst = float(np.maximum(worst, kkt_residuals(qp, optimum).worst))  # NaN stays NaN
@@ -170,7 +151,7 @@ def judge(candidate: StepCandidate, queries: Queries, periods: Sequence[int], re
             continue
         statuses[command.status] += 1
         errors.append(np.abs(command.speeds - reference.inputs[period]).max())
-        qp = form.qp.with_vectors(form.vectors(*_query(problem, queries, period)))
+        qp = form.qp.with_vectors(form.vectors(*queries.of_qp(problem, period)))
         residuals.append(kkt_residuals(qp, answer.solution).worst)
     return Verdict(
         statuses=dict(sorted(statuses.items())),
@@ -181,20 +162,13 @@ def judge(candidate: StepCandidate, queries: Queries, periods: Sequence[int], re
     )
 
 
-def _query(problem: Problem, queries: Queries, period: int) -> tuple[Array, Array, Array]:
-    """xi(k), y_d and u(k-1)."""
-    reference = queries.reference[period + 1 : period + 1 + problem.horizon]
-    return queries.state[period], problem.objective.desired(reference), queries.speeds_before[period]
-
-
 def _failure(answer: Answer) -> str:
     """Why there was no command; a point that is called solved is rejected where it breaks the hard input bounds."""
     return "rejected" if answer.solution.status in ACCEPTED else answer.solution.status
 
 
+Query = Callable[[int], tuple[Array, Array, Array]]
 STEPS_TRIED: Final = (1, 2, 3, 4, 5, 6, 8, 10, 13, 17, 20, 25)
-
-Query = tuple[Array, Array, Array]  # xi(k), y_d and u(k-1)
 
 
 def time_stages(
@@ -205,11 +179,7 @@ def time_stages(
     progress: Progress,
 ) -> tuple[StageLength, ...]:
     """The QP condensed and cut into stages of M steps, on the periods in which constraints are active."""
-    default = usual_steps(problem.model.nu)
-
-    def query(period: int) -> Query:
-        reference = queries.reference[period + 1 : period + 1 + problem.horizon]
-        return queries.state[period], problem.objective.desired(reference), queries.speeds_before[period]
+    default, query = usual_steps(problem.model.nu), partial(queries.of_qp, problem)
 
     candidates: dict[int | None, _QPEntrant] = {None: _QPEntrant(condensed(problem), PiqpDense(), query)}
     for length in sorted({*STEPS_TRIED, default}):
@@ -230,7 +200,7 @@ def time_stages(
 class _QPEntrant:
     """A form of the QP with its back end, without a controller around it."""
 
-    def __init__(self, formulation: Formulation, backend: Backend, query: Callable[[int], Query]) -> None:
+    def __init__(self, formulation: Formulation, backend: Backend, query: Query) -> None:
         self.formulation, self._backend, self._query = formulation, backend, query
         self.active: dict[int, int] = {}  # constraints active in the answer, by period
         backend.setup(formulation.qp)

@@ -14,6 +14,7 @@ from mpc.ocp import Problem
 from mpc.solvers import SOLVERS, Way
 from mpc.unconstrained import UnconstrainedMPC
 from quadsim import outputs
+from quadsim.controller import ACCEPTED
 from quadsim.errors import InputError, ParameterError, UnknownNameError
 from quadsim.report.table import Grid, grid_to_markdown
 from quadsim.state import Array
@@ -56,7 +57,8 @@ class _Timed:
 
     @classmethod
     def of(cls, candidate: StepCandidate, periods: Sequence[int], laps: StepTimes) -> _Timed:
-        return cls(step_ms=laps.median, ways=candidate.ways(periods), failures=candidate.failures(periods))
+        failures = sum(status not in ACCEPTED for status in candidate.statuses(periods))
+        return cls(step_ms=laps.median, ways=candidate.ways(periods), failures=failures)
 
 
 def bench_solvers(
@@ -205,8 +207,7 @@ def _gain(problem: Problem, queries: Queries) -> dict[str, QueriedController]:
 
 
 def _package(solver: str) -> str:
-    entry = SOLVERS[solver]
-    return f"{entry.package} {entry.version}"
+    return f"{SOLVERS[solver].package} {SOLVERS[solver].version}"
 
 
 def _growth(

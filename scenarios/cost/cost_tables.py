@@ -7,7 +7,7 @@ from typing import Any
 
 from quadsim.controller import SOLVED, UNCONSTRAINED
 from quadsim.flight.metrics import SETTLING_BAND, percentiles
-from quadsim.report.table import ABSENT, Cell, Grid, Mark, format_number, grid_to_markdown
+from quadsim.report.table import ABSENT, Cell, Grid, Mark, format_number, grid_to_markdown, line
 from quadsim.state import Array
 from scenarios.cost.study import MEASURES, CandidateTimes, CostStudy, Outcome, Sweep, SweepPoint
 
@@ -105,7 +105,7 @@ def _times(study: CostStudy, name: str, step_ms: Array, candidate: CandidateTime
 def _flights(study: CostStudy) -> Grid:
     with_them, without = study.constrained, study.unconstrained
     others = list(study.others.values())
-    lines = [_line("outcome", *map(format_outcome, (with_them, without)), ABSENT, ABSENT, *map(format_outcome, others))]
+    lines = [line("outcome", *map(format_outcome, (with_them, without)), ABSENT, ABSENT, *map(format_outcome, others))]
     for key, measure in MEASURES.items():
         values = [outcome.number(key) for outcome in (with_them, without, *others)]
         lines.append(_compared(f"{measure.label} [{measure.unit}]", values))
@@ -136,7 +136,7 @@ def _compared(label: str, values: Sequence[float | None]) -> tuple[Cell, ...]:
     if first is not None and second is not None:
         difference = _difference(first, second)
         ratio = f"{first / second:.3g}" if second else ABSENT
-    return _line(label, *texts[:2], difference, ratio, *texts[2:])
+    return line(label, *texts[:2], difference, ratio, *texts[2:])
 
 
 def _difference(first: float, second: float) -> str:
@@ -204,7 +204,7 @@ def _settling_cell(outcome: Outcome) -> Cell:
 
 def _sensitivity(study: CostStudy) -> Grid:
     outcomes = [variation.outcome for variation in study.variations]
-    lines = [_line("outcome", *map(format_outcome, outcomes), "")]
+    lines = [line("outcome", *map(format_outcome, outcomes), "")]
     for status in (SOLVED, UNCONSTRAINED):
         counts = [float(outcome.statuses.get(status, 0)) for outcome in outcomes]
         lines.append(_spread(f"periods {status}", counts))
@@ -227,8 +227,4 @@ def _sensitivity(study: CostStudy) -> Grid:
 def _spread(label: str, values: Sequence[float | None]) -> tuple[Cell, ...]:
     found = [value for value in values if value is not None]
     spread = _difference(max(found), min(found)).removeprefix("+") if found else ABSENT
-    return _line(label, *map(format_number, values), spread)
-
-
-def _line(*texts: str) -> tuple[Cell, ...]:
-    return tuple(Cell(text=text) for text in texts)
+    return line(label, *map(format_number, values), spread)

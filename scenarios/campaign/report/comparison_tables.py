@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from quadsim.report.table import ABSENT, Cell, Grid, Mark, format_number, grid_to_markdown
+from quadsim.report.table import ABSENT, Cell, Grid, Mark, format_number, grid_to_markdown, line
 from scenarios.campaign.statistics.comparison import Comparison, EventComparison, MetricComparison
 from scenarios.campaign.statistics.inference import ALPHA, CONFIDENCE
 from scenarios.campaign.statistics.wording import label, p_value, percent, signed_interval, signed_points
@@ -63,10 +63,10 @@ def _events(comparison: Comparison) -> Grid:
 
 def _event(event: EventComparison) -> tuple[Cell, ...]:
     counts = [f"{count} ({percent(count / event.pairs)})" for count in event.counts]
-    counted = _line(event.event, *counts, str(event.only_a), str(event.only_b), str(event.both), p_value(event.p))
+    counted = line(event.event, *counts, str(event.only_a), str(event.only_b), str(event.both), p_value(event.p))
     mark = Mark.BEST if event.p_holm < ALPHA else Mark.NONE
     corrected = Cell(text=p_value(event.p_holm), mark=mark)
-    return (*counted, corrected, *_line(signed_points(event.difference), signed_interval(event.lower, event.upper)))
+    return (*counted, corrected, *line(signed_points(event.difference), signed_interval(event.lower, event.upper)))
 
 
 def _metrics(comparison: Comparison) -> Grid:
@@ -91,19 +91,15 @@ def _metrics(comparison: Comparison) -> Grid:
 def _metric(metric: MetricComparison) -> tuple[Cell, ...]:
     found = metric.difference
     return (
-        *_line(label(metric.name, metric.unit), format_number(metric.mean_a), format_number(metric.mean_b)),
+        *line(label(metric.name, metric.unit), format_number(metric.mean_a), format_number(metric.mean_b)),
         *_difference(found.mean, found.lower, found.upper),
         *_difference(found.median, found.median_lower, found.median_upper),
-        *_line(str(found.pairs)),
+        *line(str(found.pairs)),
     )
 
 
 def _difference(value: float | None, lower: float | None, upper: float | None) -> tuple[Cell, ...]:
     if lower is None or upper is None:
-        return _line(format_number(value), ABSENT)
+        return line(format_number(value), ABSENT)
     mark = Mark.BEST if lower > 0.0 or upper < 0.0 else Mark.NONE
     return Cell(text=format_number(value), mark=mark), Cell(text=f"{format_number(lower)} to {format_number(upper)}")
-
-
-def _line(*texts: str) -> tuple[Cell, ...]:
-    return tuple(Cell(text=text) for text in texts)
