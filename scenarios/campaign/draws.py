@@ -15,7 +15,7 @@ import numpy as np
 from scipy import stats
 
 from quadsim.state import Array
-from scenarios.campaign.distributions import (
+from scenarios.campaign.spec import (
     ChoiceSpec,
     GridSpec,
     LogUniformSpec,

@@ -13,11 +13,10 @@ import pyarrow as pa
 from pydantic import ValidationError
 
 from quadsim.errors import FileError, InputError, ParameterError, UnknownNameError
-from scenarios.campaign.distributions import Value, VarySpec
 from scenarios.campaign.draws import Draws, extremes
 from scenarios.campaign.results.events import Event, parse_event
 from scenarios.campaign.results.table import DRAW, TIMING, Row, make_schema
-from scenarios.campaign.spec import CampaignSpec
+from scenarios.campaign.spec import CampaignSpec, Value, VarySpec
 from scenarios.loading import check_parts, parse_scenario, scenario_path
 from scenarios.parts.limits import build_limits
 from scenarios.parts.vehicle import build_vehicle, resolve_vehicle

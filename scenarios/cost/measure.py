@@ -12,17 +12,22 @@ from mpc.solvers import SOLVERS, make_backend
 from quadsim.errors import InputError
 from quadsim.flight import metrics
 from quadsim.flight.rundir import SCENARIO_FILE
-from scenarios.cost.cost_flights import Flown, fly, fly_all, key, time_candidates, time_flights
-from scenarios.cost.study import CandidateTimes, CostStudy, Outcome, Sweep, SweepPoint, Variation
-from scenarios.cost.variants import (
+from scenarios.cost.cost_flights import (
+    Flown,
     course,
+    fly,
+    fly_all,
     is_counterpart,
+    key,
     named,
+    time_candidates,
+    time_flights,
     with_controller,
     with_tilt,
     with_vehicles,
     without_constraints,
 )
+from scenarios.cost.study import CandidateTimes, CostStudy, Outcome, Sweep, SweepPoint, Variation
 from scenarios.courses.make import build_course_steps, build_reference
 from scenarios.loading import load_scenario
 from scenarios.machine import machine

@@ -10,8 +10,7 @@ import numpy as np
 import pyarrow as pa
 
 from quadsim.state import Array
-from scenarios.campaign.results.columns import numbers, verdicts
-from scenarios.campaign.results.table import Summary, unit_of
+from scenarios.campaign.results.table import Summary, numbers, unit_of, verdicts
 from scenarios.campaign.results.verdicts import VERDICTS
 from scenarios.campaign.statistics.inference import ALPHA
 from scenarios.campaign.statistics.scatters import lowest_shown, robust_ends

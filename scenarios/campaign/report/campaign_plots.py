@@ -23,8 +23,7 @@ from scenarios.campaign.report.campaign_curves import (
     histograms,
     present,
 )
-from scenarios.campaign.results.columns import Rows, numbers
-from scenarios.campaign.results.table import Summary
+from scenarios.campaign.results.table import Rows, Summary, numbers
 from scenarios.campaign.results.verdicts import VERDICTS
 from scenarios.campaign.statistics.comparison import Comparison
 from scenarios.campaign.statistics.scatters import COURSE, Cloud, Margins, clouds, edges, margins, shown_flights

@@ -18,8 +18,7 @@ import pyarrow.parquet as pq
 
 from quadsim.errors import FileError
 from quadsim.outputs import Growing
-from scenarios.campaign.results.columns import numbers
-from scenarios.campaign.results.table import DRAW, TIMING, Row, make_table, read_table, split_times
+from scenarios.campaign.results.table import DRAW, TIMING, Row, make_table, numbers, read_table, split_times
 
 _NEEDED: Final = ("flight", "seed", "status", "verdict", "failed", "violated", "crashed", "worst_margin")
 """Columns that no version left out; `flight` to `violated` have a value in every row."""

@@ -14,9 +14,17 @@ import numpy as np
 import pyarrow as pa
 
 from quadsim.errors import InputError
-from scenarios.campaign.results.columns import constraint_names, draw_names, flags, numbers, texts
 from scenarios.campaign.results.events import EVENT_NAMES, Flags, parse_event
-from scenarios.campaign.results.table import DRAW, SATISFIED, unit_of
+from scenarios.campaign.results.table import (
+    DRAW,
+    SATISFIED,
+    constraint_names,
+    draw_names,
+    flags,
+    numbers,
+    texts,
+    unit_of,
+)
 from scenarios.campaign.statistics.inference import (
     ALPHA,
     CONFIDENCE,

@@ -10,9 +10,8 @@ import numpy as np
 import pyarrow as pa
 
 from quadsim.state import Array
-from scenarios.campaign.results.columns import draw_names, flags, is_number, numbers, texts, verdicts
 from scenarios.campaign.results.events import Flags, parse_event
-from scenarios.campaign.results.table import DRAW, unit_of
+from scenarios.campaign.results.table import DRAW, draw_names, flags, is_number, numbers, texts, unit_of, verdicts
 from scenarios.campaign.statistics.dependence import any_dependence, rank_correlation, trend
 from scenarios.campaign.statistics.inference import holm, proportion
 from scenarios.campaign.statistics.scatters import margin_ends

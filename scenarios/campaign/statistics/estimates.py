@@ -10,17 +10,20 @@ import numpy as np
 import pyarrow as pa
 
 from quadsim.errors import ParameterError
-from scenarios.campaign.results.columns import (
+from scenarios.campaign.results.events import EVENT_NAMES, Flags, parse_event
+from scenarios.campaign.results.table import (
+    DRAW,
+    MARGIN,
+    SATISFIED,
     constraint_names,
     draw_names,
     flags,
     metric_names,
     numbers,
     texts,
+    unit_of,
     verdicts,
 )
-from scenarios.campaign.results.events import EVENT_NAMES, Flags, parse_event
-from scenarios.campaign.results.table import DRAW, MARGIN, SATISFIED, unit_of
 from scenarios.campaign.results.verdicts import VERDICTS
 from scenarios.campaign.statistics.drivers import parameters
 from scenarios.campaign.statistics.inference import CONFIDENCE, lower_bounds, proportion, upper_bounds

@@ -15,9 +15,8 @@ import pyarrow as pa
 
 from quadsim.report.palette import BOUND, LINES
 from quadsim.state import Array
-from scenarios.campaign.results.columns import Edges, Rows, draw_names, is_number, numbers, texts, verdicts
 from scenarios.campaign.results.events import Flags
-from scenarios.campaign.results.table import DRAW, unit_of
+from scenarios.campaign.results.table import DRAW, Edges, Rows, draw_names, is_number, numbers, texts, unit_of, verdicts
 from scenarios.campaign.statistics.dependence import Trend, trend
 from scenarios.campaign.statistics.wording import count_of, label
 

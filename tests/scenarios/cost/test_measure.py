@@ -22,9 +22,9 @@ from scenarios.bench.queries import QueriedController, recorded
 from scenarios.build import build_controller
 from scenarios.cli import main
 from scenarios.commands import EXIT_DONE, EXIT_WRONG_INPUT
+from scenarios.cost.cost_flights import without_constraints
 from scenarios.cost.measure import find_study, fly_variations, study_cost
 from scenarios.cost.study import CostStudy
-from scenarios.cost.variants import without_constraints
 from scenarios.loading import load_scenario
 from scenarios.parts.vehicle import build_vehicle
 from scenarios.run import Outputs, fly_scenario, run_scenario, summarise
