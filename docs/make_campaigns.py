@@ -11,8 +11,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from make_numbers import replace_in_readme
-from PIL import Image
+from make_numbers import ROOT, copy_figure, replace_in, write_page
 
 from quadsim.report.table import Grid, grid_to_markdown, line
 from scenarios.bench.solvers import section
@@ -39,7 +38,6 @@ from scenarios.campaign.statistics.comparison import compare
 from scenarios.campaign.statistics.wording import interval, percent
 from scenarios.commands.campaign_console import progress
 
-ROOT = Path(__file__).resolve().parent.parent
 PAIR = ("paper-robustness", "paper-robustness-robust")  # flown on the same draws, and compared flight by flight
 NOMINAL = "paper-nominal"
 NAMES = (*PAIR, NOMINAL)
@@ -151,11 +149,9 @@ def main() -> None:
     options = parser.parse_args()
     results = [fly(name, there=options.there) for name in NAMES]
     for name, result in zip(NAMES, results, strict=True):
-        figure = Image.open(result.directory / "campaign.png").convert("RGB")
-        target = ROOT / "docs" / f"campaign-{name}.png"
-        figure.quantize(256, dither=Image.Dither.NONE).save(target, optimize=True)
-    (ROOT / "docs" / f"{PAGE}.md").write_text(page(results), encoding="utf-8")
-    replace_in_readme("campaigns", grid_to_markdown(violations(results)), command="make campaigns")
+        copy_figure(result.directory / "campaign.png", f"campaign-{name}.png", 256)
+    write_page(f"{PAGE}.md", page(results))
+    replace_in(ROOT / "README.md", "campaigns", grid_to_markdown(violations(results)), command="make campaigns")
 
 
 if __name__ == "__main__":

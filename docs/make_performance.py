@@ -11,9 +11,8 @@ import tempfile
 from pathlib import Path
 
 from make_cost import timed, write_cost
-from make_numbers import Table, markdown
+from make_numbers import ROOT, Table, copy_figure, markdown, write_page
 from make_outside import outside
-from PIL import Image
 
 from scenarios.bench.bench_results import FlightProfile, RenderProfile, SolverBench
 from scenarios.bench.bench_tables import flight_tables, render_tables, solver_tables
@@ -26,7 +25,6 @@ from scenarios.cost.measure import study_cost
 from scenarios.loading import load_scenario
 from scenarios.run import fly_scenario
 
-ROOT = Path(__file__).resolve().parent.parent
 SCENARIO = "paper-constrained"
 REST = "## Where the time of a flight goes"
 """What begins with it stays as it is where steps alone are measured."""
@@ -183,9 +181,8 @@ def main() -> None:
     bench = bench_solvers(scenario)
     with tempfile.TemporaryDirectory() as scratch:
         write_bench(bench, Path(scratch))
-        figure = Image.open(Path(scratch) / "solvers.png").convert("RGB")
-        figure.quantize(64, dither=Image.Dither.NONE).save(ROOT / "docs" / "solvers.png", optimize=True)
-    path.write_text(f"{steps(bench)}\n{end}", encoding="utf-8")
+        copy_figure(Path(scratch) / "solvers.png", "solvers.png", 64)
+    write_page(path.name, steps(bench), end)
     write_cost(study_cost(scenario, [load_scenario("paper-unconstrained")], timed=timed(bench)))
 
 

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 from fault_injection import CONTROLLERS, NEAR, SOON, Consequence, draw, inject_all
-from PIL import Image
+from make_numbers import copy_figure, write_page
 
 from mpc.robust.tightening import TighteningSettings
 from quadsim.report.table import Grid, line
@@ -24,7 +24,6 @@ from scenarios.bench.solvers import section
 from scenarios.loading import load_scenario
 from scenarios.parts.vehicle import build_vehicle
 
-ROOT = Path(__file__).resolve().parent.parent
 FAULTS = 50
 RESTLESS = ("wind 3 m/s", "sensor noise", "all by half")  # conditions that never leave the vehicle at rest
 STATED = TighteningSettings()
@@ -138,9 +137,8 @@ def main() -> None:
     found = inject_all(draw(FAULTS))
     with tempfile.TemporaryDirectory() as scratch:
         write_mismatch(measured, Path(scratch))
-        figure = Image.open(Path(scratch) / "ladder.png").convert("RGB")
-        figure.quantize(32, dither=Image.Dither.NONE).save(ROOT / "docs" / "ladder.png", optimize=True)
-    (ROOT / "docs" / "robustness.md").write_text(page(measured, found), encoding="utf-8")
+        copy_figure(Path(scratch) / "ladder.png", "ladder.png", 32)
+    write_page("robustness.md", page(measured, found))
 
 
 if __name__ == "__main__":

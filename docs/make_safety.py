@@ -7,17 +7,14 @@ import itertools
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
-from pathlib import Path
 
 import safety_campaign
 import safety_mutations
 import safety_outputs
+from make_numbers import ROOT, replace_in
 
 from quadsim.report.table import Grid, grid_to_markdown, line
 from scenarios.bench.timing import Stopwatch
-
-PAGE = Path(__file__).resolve().parent / "safety.md"
-BEGIN, END = "<!-- counts: made by `make safety` -->", "<!-- counts end -->"
 
 SUMMARIES, CAMPAIGNS = (partial(safety_mutations.as_ordinary_user, kind) for kind in ("summaries", "campaigns"))
 ATTACKS: dict[str, tuple[Callable[[int], Mapping[str, int]], int]] = {
@@ -58,8 +55,7 @@ def main() -> None:
     options = parser.parse_args()
     table = counts(options.scale)
     if options.scale == 1.0:
-        head, _, rest = PAGE.read_text(encoding="utf-8").partition(BEGIN)
-        PAGE.write_text(f"{head}{BEGIN}\n\n{table}\n{END}{rest.partition(END)[2]}", encoding="utf-8")
+        replace_in(ROOT / "docs" / "safety.md", "counts", table, command="make safety")
 
 
 if __name__ == "__main__":
