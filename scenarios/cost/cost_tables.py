@@ -94,12 +94,8 @@ def _times(study: CostStudy, name: str, step_ms: Array, candidate: CandidateTime
     if candidate is not None:
         rates = (format_number(float(f"{candidate.rate(measure):.3g}")) for measure in ("p99", "max"))
         whole = [*rates, str(candidate.failures)]
-    return (
-        Cell(text=name),
-        *(Cell(text=f"{found[measure]:.3g}") for measure in ("p50", "p95", "p99", "max")),
-        Cell(text=f"{100.0 * found['max'] / study.deadline_ms:.3g} %", mark=late),
-        *(Cell(text=text) for text in whole),
-    )
+    measures = (f"{found[measure]:.3g}" for measure in ("p50", "p95", "p99", "max"))
+    return line(name, *measures, Cell(text=f"{100.0 * found['max'] / study.deadline_ms:.3g} %", mark=late), *whole)
 
 
 def _flights(study: CostStudy) -> Grid:
@@ -170,36 +166,26 @@ def _sweep(sweep: Sweep, key: str, title: str) -> Grid:
 
 
 def _point(sweep: Sweep, point: SweepPoint, *, free: bool) -> tuple[Cell, ...]:
-    flown, without = point.constrained, point.unconstrained
-    mark = Mark.BEST if point.value == sweep.base else Mark.NONE
-    cells = [
-        Cell(text=f"{point.value:g}", mark=mark),
+    flown, without, settling = point.constrained, point.unconstrained, format_slowest(point.constrained)
+    cells: list[Cell | str] = [
+        Cell(text=f"{point.value:g}", mark=Mark.BEST if point.value == sweep.base else Mark.NONE),
         _outcome_cell(flown),
-        *(Cell(text=str(flown.statuses.get(status, 0))) for status in (SOLVED, UNCONSTRAINED)),
+        *(str(flown.statuses.get(status, 0)) for status in (SOLVED, UNCONSTRAINED)),
         Cell(text=str(flown.fallbacks), mark=Mark.BAD if flown.fallbacks else Mark.NONE),
-        Cell(text=f"{100.0 * flown.active / max(flown.periods, 1):.0f}"),
-        *(_tracked(flown, key) for key in ("rmse_x", "rmse_y", "rmse_z")),
-        _settling_cell(flown),
-        *(_tracked(flown, key) for key in ("tilt_sampled", "tilt_plant", "total_variation")),
-        *(Cell(text=f"{point.step_ms[key]:.3g}" if point.step_ms else ABSENT) for key in ("p50", "p99")),
+        f"{100.0 * flown.active / max(flown.periods, 1):.0f}",
+        *(format_number(flown.number(key)) for key in ("rmse_x", "rmse_y", "rmse_z")),
+        Cell(text=settling, mark=Mark.WARN if settling.startswith("never") else Mark.NONE),
+        *(format_number(flown.number(key)) for key in ("tilt_sampled", "tilt_plant", "total_variation")),
+        *(f"{point.step_ms[key]:.3g}" if point.step_ms else ABSENT for key in ("p50", "p99")),
     ]
     if free and without is not None:
-        tracked = (_tracked(without, key) for key in ("rmse_x", "tilt_plant", "total_variation"))
+        tracked = (format_number(without.number(key)) for key in ("rmse_x", "tilt_plant", "total_variation"))
         cells += [_outcome_cell(without), *tracked]
-    return tuple(cells)
+    return line(*cells)
 
 
 def _outcome_cell(outcome: Outcome) -> Cell:
     return Cell(text=format_outcome(outcome), mark=Mark.NONE if outcome.completed else Mark.BAD)
-
-
-def _tracked(outcome: Outcome, key: str) -> Cell:
-    return Cell(text=format_number(outcome.number(key)))
-
-
-def _settling_cell(outcome: Outcome) -> Cell:
-    phrase = format_slowest(outcome)
-    return Cell(text=phrase, mark=Mark.WARN if phrase.startswith("never") else Mark.NONE)
 
 
 def _sensitivity(study: CostStudy) -> Grid:

@@ -39,13 +39,22 @@ class Histogram:
 
 @dataclass(frozen=True, kw_only=True)
 class Association:
-    """How a drawn number goes with an outcome."""
+    """How a drawn number goes with an outcome; p-values are corrected for all tests of the campaign."""
 
     rho: float  # Spearman's rank correlation
-    rho_is_sure: bool  # whether it is beyond chance, with all tests of the campaign taken together
+    p_rho: float
     xi: float  # Chatterjee's xi, of any dependence
-    xi_is_sure: bool  # whether that is beyond chance
-    p: float  # the smaller of the two p-values, corrected
+    p_xi: float
+
+    @property
+    def rho_is_sure(self) -> bool:
+        """Whether the rank correlation is beyond chance."""
+        return self.p_rho < ALPHA
+
+    @property
+    def xi_is_sure(self) -> bool:
+        """Whether the dependence is beyond chance."""
+        return self.p_xi < ALPHA
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -61,7 +70,7 @@ class Driver:
     def weakness(self) -> tuple[float, float]:
         """What drivers are ordered by, the strongest first: by the margin, or else by failure."""
         found = self.margin or self.failure
-        return (found.p, -max(abs(found.rho), found.xi)) if found else (2.0, 0.0)
+        return (min(found.p_rho, found.p_xi), -max(abs(found.rho), found.xi)) if found else (2.0, 0.0)
 
 
 def histograms(table: pa.Table) -> list[Histogram]:
@@ -102,13 +111,7 @@ def drivers(summary: Summary) -> list[Driver]:
 def _association(found: Mapping[str, Any] | None) -> Association | None:
     if found is None:
         return None
-    return Association(
-        rho=found["rho"],
-        rho_is_sure=found["p_holm"] < ALPHA,
-        xi=found["xi"],
-        xi_is_sure=found["p_xi_holm"] < ALPHA,
-        p=min(found["p_holm"], found["p_xi_holm"]),
-    )
+    return Association(rho=found["rho"], p_rho=found["p_holm"], xi=found["xi"], p_xi=found["p_xi_holm"])
 
 
 def sure_splits(summary: Summary) -> Iterator[tuple[str, str, str, Mapping[str, Any]]]:

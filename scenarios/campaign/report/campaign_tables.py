@@ -55,7 +55,7 @@ def constraint_table(summary: Summary) -> Grid:
         margin = ABSENT if found["worst_margin"] is None else f"{format_number(found['worst_margin'])} {found['unit']}"
         flight = ABSENT if found["worst_flight"] is None else str(found["worst_flight"])
         count = Cell(text=str(failed["count"]), mark=mark)
-        lines.append((Cell(text=name), count, *line(*_shares(failed), margin, flight)))
+        lines.append(line(name, count, *_shares(failed), margin, flight))
     return Grid(
         key="constraints",
         title="Constraints",
@@ -94,11 +94,11 @@ def worst_table(summary: Summary, directory: str) -> Grid:
     """The worst flights, and how to fly one again."""
     worst = summary["worst"]
     lines = tuple(
-        (
-            Cell(text=str(flight["flight"])),
+        line(
+            str(flight["flight"]),
             Cell(text=flight["verdict"], mark=Mark.NONE if flight["verdict"] == HARMLESS else Mark.BAD),
-            *line(format_number(flight["worst_margin"]), flight["worst_constraint"] or ABSENT),
-            *line(format_number(flight["duration"])),
+            *(format_number(flight["worst_margin"]), flight["worst_constraint"] or ABSENT),
+            format_number(flight["duration"]),
             Cell(text=flight["reason"] or ABSENT, mark=Mark.TEXT),
         )
         for flight in worst
@@ -132,7 +132,7 @@ def worst_draws_table(summary: Summary) -> Grid:
 
 def manifest_table(manifest: Mapping[str, Any]) -> Grid:
     """How the campaign was made, a line for each entry."""
-    lines = tuple((Cell(text=key), Cell(text=value, mark=Mark.TEXT)) for key, value in _flat(manifest))
+    lines = tuple(line(key, Cell(text=value, mark=Mark.TEXT)) for key, value in _flat(manifest))
     return Grid(key="manifest", title="How it was made", head=("", ""), lines=lines)
 
 
@@ -166,13 +166,9 @@ def _shares(found: Mapping[str, Any]) -> tuple[str, str]:
 
 def driver_table(summary: Summary) -> Grid:
     """How each drawn number goes with the worst margin and with failure."""
-    listed = drivers(summary)
-    lines = []
-    for driver in listed:
-        cells = [Cell(text=driver.label)]
-        for outcome, found in (("worst_margin", driver.margin), ("failed", driver.failure)):
-            cells += _association(found, summary["parameters"][driver.name].get(outcome))
-        lines.append(tuple(cells))
+    lines = (
+        line(driver.label, *_association(driver.margin), *_association(driver.failure)) for driver in drivers(summary)
+    )
     return Grid(
         key="drivers-table",
         title="What goes with the outcome",
@@ -268,14 +264,14 @@ def level_tables(summary: Summary) -> list[Grid]:
     return grids
 
 
-def _association(found: Association | None, listed: Mapping[str, Any] | None) -> tuple[Cell, ...]:
-    if found is None or listed is None:
+def _association(found: Association | None) -> tuple[Cell, ...]:
+    if found is None:
         return line(*[ABSENT] * 4)
-    return (
+    return line(
         Cell(text=f"{found.rho:+.2f}", mark=Mark.BEST if found.rho_is_sure else Mark.NONE),
-        Cell(text=p_value(listed["p_holm"])),
+        p_value(found.p_rho),
         Cell(text=f"{found.xi:.2f}", mark=Mark.BEST if found.xi_is_sure else Mark.NONE),
-        Cell(text=p_value(listed["p_xi_holm"])),
+        p_value(found.p_xi),
     )
 
 

@@ -42,16 +42,8 @@ def _events(comparison: Comparison) -> Grid:
         key="events",
         title="Events",
         head=(
-            "event",
-            a,
-            b,
-            f"{a} alone",
-            f"{b} alone",
-            "both",
-            "p",
-            "after Holm",
-            "difference [points]",
-            f"{_SURE} interval",
+            *("event", a, b, f"{a} alone", f"{b} alone", "both"),
+            *("p", "after Holm", "difference [points]", f"{_SURE} interval"),
         ),
         lines=tuple(_event(event) for event in comparison.events),
         note="p: McNemar's exact test, two-sided, on the pairs in which one alone had the event, each event by itself; "
@@ -63,10 +55,10 @@ def _events(comparison: Comparison) -> Grid:
 
 def _event(event: EventComparison) -> tuple[Cell, ...]:
     counts = [f"{count} ({percent(count / event.pairs)})" for count in event.counts]
-    counted = line(event.event, *counts, str(event.only_a), str(event.only_b), str(event.both), p_value(event.p))
-    mark = Mark.BEST if event.p_holm < ALPHA else Mark.NONE
-    corrected = Cell(text=p_value(event.p_holm), mark=mark)
-    return (*counted, corrected, *line(signed_points(event.difference), signed_interval(event.lower, event.upper)))
+    pairs = map(str, (event.only_a, event.only_b, event.both))
+    corrected = Cell(text=p_value(event.p_holm), mark=Mark.BEST if event.p_holm < ALPHA else Mark.NONE)
+    difference = signed_points(event.difference), signed_interval(event.lower, event.upper)
+    return line(event.event, *counts, *pairs, p_value(event.p), corrected, *difference)
 
 
 def _metrics(comparison: Comparison) -> Grid:
@@ -90,11 +82,11 @@ def _metrics(comparison: Comparison) -> Grid:
 
 def _metric(metric: MetricComparison) -> tuple[Cell, ...]:
     found = metric.difference
-    return (
-        *line(label(metric.name, metric.unit), format_number(metric.mean_a), format_number(metric.mean_b)),
+    return line(
+        *(label(metric.name, metric.unit), format_number(metric.mean_a), format_number(metric.mean_b)),
         *_difference(found.mean, found.lower, found.upper),
         *_difference(found.median, found.median_lower, found.median_upper),
-        *line(str(found.pairs)),
+        str(found.pairs),
     )
 
 
@@ -102,4 +94,4 @@ def _difference(value: float | None, lower: float | None, upper: float | None) -
     if lower is None or upper is None:
         return line(format_number(value), ABSENT)
     mark = Mark.BEST if lower > 0.0 or upper < 0.0 else Mark.NONE
-    return Cell(text=format_number(value), mark=mark), Cell(text=f"{format_number(lower)} to {format_number(upper)}")
+    return line(Cell(text=format_number(value), mark=mark), f"{format_number(lower)} to {format_number(upper)}")

@@ -249,8 +249,7 @@ def flags(table: pa.Table, name: str, *, absent: bool) -> Flags:
 def texts(table: pa.Table, name: str) -> Texts:
     """(K,) a column as text, `-` where a flight has none; truth values as `true` and `false`."""
     words = {None: "-", True: "true", False: "false"} if pa.types.is_boolean(table[name].type) else {None: "-"}
-    values = table[name].to_pylist()
-    return np.array([str(words.get(value, value) if _hashable(value) else value) for value in values], object)
+    return np.array([str(words.get(value, value)) for value in table[name].to_pylist()], object)
 
 
 def verdicts(table: pa.Table) -> dict[str, Flags]:
@@ -283,7 +282,3 @@ def is_number(table: pa.Table, name: str) -> bool:
     """Whether a column holds numbers, rather than texts or truth values."""
     kind = table.schema.field(name).type
     return bool(pa.types.is_integer(kind) or pa.types.is_floating(kind))
-
-
-def _hashable(value: object) -> bool:
-    return not isinstance(value, list | dict)

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy import optimize, stats
 
 from quadsim.state import Array
@@ -38,17 +39,17 @@ class PairedDifference:
     """The differences b - a of pairs."""
 
     pairs: int  # how many
-    mean: float | None  # their mean; None of no pairs
-    lower: float | None  # lower end of the mean's t interval; None of fewer than two pairs
-    upper: float | None  # its upper end
-    median: float | None  # their median
+    mean: float | None = None  # their mean; None of no pairs
+    lower: float | None = None  # lower end of the mean's t interval; None of fewer than two pairs
+    upper: float | None = None  # its upper end
+    median: float | None = None  # their median
     # lower end of the median's distribution-free interval; None where too few pairs give none
-    median_lower: float | None
-    median_upper: float | None  # its upper end
+    median_lower: float | None = None
+    median_upper: float | None = None  # its upper end
 
 
-def upper_bounds(counts: Array, trials: Array, confidence: float = CONFIDENCE) -> Array:
-    """(K,) one-sided upper bounds on proportions: the largest p that gives so few with probability 1 - confidence.
+def upper_bounds(counts: ArrayLike, trials: ArrayLike, confidence: float = CONFIDENCE) -> Array:
+    """One-sided upper bounds on proportions, one or (K,): the largest p that gives so few with chance 1 - confidence.
 
     Source: Clopper and Pearson, Biometrika 26 (1934); 1 where all happened, and of no trials.
     """
@@ -58,20 +59,9 @@ def upper_bounds(counts: Array, trials: Array, confidence: float = CONFIDENCE) -
     return np.where(some, bounds, 1.0)
 
 
-def lower_bounds(counts: Array, trials: Array, confidence: float = CONFIDENCE) -> Array:
-    """(K,) one-sided lower bounds on proportions; 0 where none happened."""
-    counts, trials = np.asarray(counts, float), np.asarray(trials, float)
-    return 1.0 - upper_bounds(trials - counts, trials, confidence)
-
-
-def upper_bound(count: int, trials: int, confidence: float = CONFIDENCE) -> float:
-    """One proportion's one-sided upper bound; see `upper_bounds`."""
-    return float(upper_bounds(np.array([count]), np.array([trials]), confidence)[0])
-
-
-def lower_bound(count: int, trials: int, confidence: float = CONFIDENCE) -> float:
-    """One proportion's one-sided lower bound; see `lower_bounds`."""
-    return float(lower_bounds(np.array([count]), np.array([trials]), confidence)[0])
+def lower_bounds(counts: ArrayLike, trials: ArrayLike, confidence: float = CONFIDENCE) -> Array:
+    """One-sided lower bounds on proportions, one or (K,); 0 where none happened."""
+    return 1.0 - upper_bounds(np.asarray(trials, float) - np.asarray(counts, float), trials, confidence)
 
 
 def proportion(count: int, flights: int, confidence: float = CONFIDENCE) -> Proportion:
@@ -81,10 +71,10 @@ def proportion(count: int, flights: int, confidence: float = CONFIDENCE) -> Prop
         count=count,
         flights=flights,
         share=count / flights if flights else None,
-        lower=lower_bound(count, flights, either),
-        upper=upper_bound(count, flights, either),
-        lower_one_sided=lower_bound(count, flights, confidence),
-        upper_one_sided=upper_bound(count, flights, confidence),
+        lower=float(lower_bounds(count, flights, either)),
+        upper=float(upper_bounds(count, flights, either)),
+        lower_one_sided=float(lower_bounds(count, flights, confidence)),
+        upper_one_sided=float(upper_bounds(count, flights, confidence)),
     )
 
 
@@ -148,9 +138,7 @@ def paired_difference(a: Array, b: Array, confidence: float = CONFIDENCE) -> Pai
     differences = np.asarray(b, float) - np.asarray(a, float)
     n = differences.size
     if not n:
-        return PairedDifference(
-            pairs=0, mean=None, lower=None, upper=None, median=None, median_lower=None, median_upper=None
-        )
+        return PairedDifference(pairs=0)
     mean = float(differences.mean())
     half = None
     if n > 1:

@@ -12,7 +12,7 @@ import pyarrow as pa
 
 from quadsim.errors import InputError, ParameterError
 from scenarios.campaign.results.events import Event, parse_event
-from scenarios.campaign.statistics.inference import lower_bound, upper_bound
+from scenarios.campaign.statistics.inference import lower_bounds, upper_bounds
 from scenarios.campaign.statistics.wording import count_of, percent
 
 EXAMPLE: Final = "P(violation) < 0.01 @ 95%"
@@ -129,7 +129,7 @@ def judge(table: pa.Table, requirement: Requirement) -> Judgement:
     """
     happened = requirement.event.column(table)
     count, flights = int(happened.sum()), happened.size
-    bound = (upper_bound if requirement.at_most else lower_bound)(count, flights, requirement.confidence)
+    bound = _bound(requirement, count, flights)
     return Judgement(
         requirement=requirement,
         count=count,
@@ -149,13 +149,14 @@ def least_flights(requirement: Requirement) -> int:
     kept = math.log1p(-requirement.share) if requirement.at_most else math.log(requirement.share)
     n = max(1, math.ceil(math.log1p(-requirement.confidence) / kept))
     near = range(max(1, n - 1), n + 2)
-    return next((k for k in near if requirement.supported_by(_best_bound(requirement, k))), n)
+    best = ((k, _bound(requirement, 0 if requirement.at_most else k, k)) for k in near)
+    return next((k for k, bound in best if requirement.supported_by(bound)), n)
 
 
-def _best_bound(requirement: Requirement, n: int) -> float:
-    if requirement.at_most:
-        return upper_bound(0, n, requirement.confidence)
-    return lower_bound(n, n, requirement.confidence)
+def _bound(requirement: Requirement, count: int, flights: int) -> float:
+    """The one-sided bound on the probability that is to be on the side that is asked for."""
+    bounds = upper_bounds if requirement.at_most else lower_bounds
+    return float(bounds(count, flights, requirement.confidence))
 
 
 def _number(owner: str, name: str, given: str, low: Decimal, high: Decimal) -> float:
