@@ -66,7 +66,6 @@ def _share(finding: Finding) -> float:
 
 
 def _criteria() -> str:
-    """The loss criteria and their defaults, as the scenario file explains them."""
     fields = LostSpec.model_fields.items()
     return "".join(f"- `lost.{name} = {info.default:g}`: {info.description}\n" for name, info in fields)
 

@@ -105,21 +105,13 @@ def campaign_tables(profile: CampaignProfile) -> list[Grid]:
         key="campaign",
         title="What a campaign costs",
         head=(
-            f"{profile.duration:g} s of {profile.scenario}",
-            "workers",
-            "a flight [s]",
-            "flights/s",
-            "flights/core-h",
-            "not flying",
+            *(f"{profile.duration:g} s of {profile.scenario}", "workers", "a flight [s]", "flights/s"),
+            *("flights/core-h", "not flying"),
         ),
         lines=tuple(
             line(
-                f"round {i}",
-                str(run.workers),
-                f"{run.flight_s:.3f}",
-                f"{run.rate:.2f}",
-                f"{3600 * run.rate / run.workers:.0f}",
-                f"{100 * run.overhead:.1f} %",
+                *(f"round {i}", str(run.workers), f"{run.flight_s:.3f}", f"{run.rate:.2f}"),
+                *(f"{3600 * run.rate / run.workers:.0f}", f"{100 * run.overhead:.1f} %"),
             )
             for i, pair in enumerate(profile.rounds, start=1)
             for run in pair
@@ -139,11 +131,8 @@ def _growth(profile: CampaignProfile) -> Grid:
         head=("flights", "flying [s]", "per flight [ms]", "concluding [s]", "flights.parquet [MB]", "worker [MB]"),
         lines=tuple(
             line(
-                f"{run.flights}",
-                f"{run.wall_s:.1f}",
-                f"{1e3 * run.wall_s / run.flights:.1f}",
-                f"{run.concluding_s:.2f}",
-                f"{run.bytes / 1e6:.3f}",
+                *(f"{run.flights}", f"{run.wall_s:.1f}", f"{1e3 * run.wall_s / run.flights:.1f}"),
+                *(f"{run.concluding_s:.2f}", f"{run.bytes / 1e6:.3f}"),
                 ABSENT if run.memory_mb is None else f"{run.memory_mb:.0f}",
             )
             for run in profile.growing
@@ -245,7 +234,6 @@ class _Memory:
         self._since = Stopwatch()
 
     def look(self, standing: Standing) -> None:
-        """Look, now and then."""
         if self._since.elapsed < _LOOK_EVERY:
             return
         self._since = Stopwatch()

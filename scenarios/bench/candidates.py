@@ -61,7 +61,6 @@ class _Witnessed:
         self.last: Answer | None = None
 
     def solve(self, state: Array, desired: Array, u_before: Array, rest: Rest | None = None) -> Answer:
-        """See `mpc.solvers.Solver.solve`."""
         self.last = self._solve(state, desired, u_before, rest)
         return self.last
 
@@ -206,10 +205,8 @@ class _QPEntrant:
         backend.setup(formulation.qp)
 
     def prepare(self, period: int) -> None:
-        """See `scenarios.bench.timing.Candidate.prepare`."""
         self._period = period
         self._vectors: Vectors = self.formulation.vectors(*self._query(period))
 
     def answer(self) -> None:
-        """See `scenarios.bench.timing.Candidate.answer`."""
         self.active[self._period] = self._backend.solve(self._vectors).active

@@ -106,7 +106,6 @@ def _label(bench: SolverBench, candidate: CandidateResult) -> str:
 
 
 def _look(bench: SolverBench, name: str) -> tuple[str, str]:
-    """Colour and line of a candidate."""
     names = [candidate.name for candidate in bench.candidates]
     i = names.index(name)
     return LINES[i % len(LINES)], _DASHES[i // len(LINES) % len(_DASHES)]

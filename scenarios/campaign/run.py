@@ -150,12 +150,10 @@ class _Progress:
 
     @property
     def missing(self) -> bool:
-        """Whether there is anything to fly."""
         return bool((self._outcomes < 0).any()) and not self._is_sure()
 
     @property
     def done(self) -> int:
-        """Flights that are there and count."""
         return int(np.count_nonzero(self._outcomes[: self.wanted] >= 0))
 
     def fly(self, engine: Engine) -> None:

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 from quadsim.report.figures.canvas import new_figure, write_drawings
 from quadsim.report.palette import BOUND
@@ -20,15 +19,13 @@ _SHADES: Final = ("#bfe3d3", "#f6edb5", "#f0b968")
 _TILTED: Final = 0.5  # how far beyond its bound [deg] a tilt is still fair
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Panel:
+class _Panel(NamedTuple):
     """A number of each flight, and up to where it is good, and fair."""
 
     title: str
     value: Callable[[MismatchFlight], float | None]
     good: float
     fair: float
-    digits: int
     unit: str
 
 
@@ -43,23 +40,10 @@ def write_mismatch_figure(measured: MismatchBench, directory: Path) -> list[Path
 
 def _draw(measured: MismatchBench) -> Figure:
     bound = measured.tilt_bound
+    tilt = f"peak tilt between samples too [deg]; the bound is {bound:g} deg"
     panels = (
-        _Panel(
-            title="distance from the reference at the end [m]",
-            value=lambda flight: flight.end_error,
-            good=ARRIVED,
-            fair=FAR,
-            digits=2,
-            unit="m",
-        ),
-        _Panel(
-            title=f"peak tilt between samples too [deg]; the bound is {bound:g} deg",
-            value=lambda flight: flight.peak_tilt,
-            good=bound,
-            fair=bound + _TILTED,
-            digits=2,
-            unit="deg",
-        ),
+        _Panel("distance from the reference at the end [m]", lambda flight: flight.end_error, ARRIVED, FAR, "m"),
+        _Panel(tilt, lambda flight: flight.peak_tilt, bound, bound + _TILTED, "deg"),
     )
     width = 2.6 + 0.62 * len(measured.conditions)
     height = 1.9 + 2 * 0.27 * len(measured.controllers)
@@ -101,12 +85,11 @@ def _draw_panel(axes: Axes, measured: MismatchBench, panel: _Panel) -> None:
 
 
 def _look(flight: MismatchFlight, panel: _Panel) -> tuple[str, str]:
-    """A cell's colour, and what stands in it."""
     value = panel.value(flight)
     if not flight.survived or value is None:
         return BOUND, flight.fate.replace("lost, ", "")
     shade = _SHADES[0] if value <= panel.good else _SHADES[1] if value <= panel.fair else _SHADES[2]
-    return shade, f"{value:.{panel.digits}f}"
+    return shade, f"{value:.2f}"
 
 
 def _broken(name: str) -> str:

@@ -178,7 +178,6 @@ class _Flights:
                 self._client.cancel([future for future, _ in self._flying.values()], force=True)
 
     def _look(self) -> None:
-        """See, now and then, who is there."""
         now = clock.monotonic()
         if now - self._looked < _LOOK_S:
             return

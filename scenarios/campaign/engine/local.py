@@ -128,7 +128,6 @@ class _Crew:
             yield from rows
 
     def dismiss(self) -> None:
-        """Stop everybody at once."""
         for supervisor in self._keepers:
             supervisor.dismiss()
         for supervisor in self._keepers:

@@ -177,7 +177,6 @@ class _Supervisor:
         self._pipe.send(what)
 
     def _start(self) -> None:
-        """Have the next flight flown."""
         if self._worker is None:
             try:
                 self._worker = _Worker(self._pilot, self._pulse, self._pipe)
@@ -190,7 +189,6 @@ class _Supervisor:
         self._worker.hand(self._flights[0])
 
     def _dismiss(self) -> None:
-        """End the worker, and whatever a controller started."""
         self._flying = False
         if self._worker is not None:
             self._worker.end()
