@@ -57,27 +57,16 @@ def write_report(
     failure: Sequence[str] = (),
     campaign: Path | None = None,
 ) -> Path:
-    """Write `index.html`, `campaign.png` and `campaign.svg`.
+    """Write `index.html`, `campaign.png` and `campaign.svg` into a directory that is being made; the page.
 
-    Args:
-        directory: where to write them, one that is being made.
-        table: `flights.parquet`.
-        summary: `scenarios.campaign.statistics.estimates.estimate` of that table.
-        manifest: how the campaign was made; nested tables are fine.
-        name: the campaign's.
-        description: what it is, in a line.
-        failure: the events that count as failure.
-        campaign: the campaign's directory, where that is another, to which the page links and as its commands name it.
-
-    Returns:
-        The page.
+    The page links to the files of `campaign`, the campaign's own directory where that is another, as its commands do.
 
     Raises:
         OutputError: the directory cannot be written.
     """
     campaign = directory if campaign is None else campaign
     write_campaign_figure(name, table, summary, directory)
-    plots = campaign_plots(table, summary)
+    plots, drawn = campaign_plots(table, summary), margins(table)
     page = render_page(
         "campaign.html.j2",
         "campaign",
@@ -98,7 +87,7 @@ def write_report(
         worst_draws=worst_draws_table(summary),
         manifest=manifest_table(manifest),
         plots=plots,
-        clipping=_clipping(table),
+        clipping="" if drawn is None else clipping(drawn, clouds(table, drawn)),
         thinning=thinning(table),
         files=[
             (label, quote(file))
@@ -115,12 +104,6 @@ def _mark(summary: Summary) -> Mark:
     if not summary["flights"]:
         return Mark.NONE
     return Mark.BAD if summary["events"]["failure"]["count"] else Mark.GOOD
-
-
-def _clipping(table: pa.Table) -> str:
-    """Which flights scatters draw at their edges, as a sentence; empty where there are none."""
-    drawn = margins(table)
-    return "" if drawn is None else clipping(drawn, clouds(table, drawn))
 
 
 COMPARISON_FILE: Final = "comparison.json"

@@ -147,14 +147,9 @@ class Store:
         require_columns(times, self._schema, path)
         if not times["flight"].equals(table["flight"]):
             times = table.select(["flight"])  # the process died between the two files
-        columns = [
-            table[name]
-            if name in table.column_names
-            else times[name]
-            if name in times.column_names
-            else pa.nulls(table.num_rows, kind)
-            for name, kind in zip(self._schema.names, self._schema.types, strict=True)
-        ]
+        there = {name: of[name] for of in (times, table) for name in of.column_names}
+        fields = zip(self._schema.names, self._schema.types, strict=True)
+        columns = [there[name] if name in there else pa.nulls(table.num_rows, kind) for name, kind in fields]
         return pa.Table.from_arrays(columns, schema=self._schema)
 
 

@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Final
+from dataclasses import asdict, dataclass
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -76,6 +76,11 @@ def proportion(count: int, flights: int, confidence: float = CONFIDENCE) -> Prop
         lower_one_sided=float(lower_bounds(count, flights, confidence)),
         upper_one_sided=float(upper_bounds(count, flights, confidence)),
     )
+
+
+def share_of(happened: np.ndarray[Any, np.dtype[np.bool_]]) -> dict[str, Any]:
+    """The `Proportion` of the flights (K,) to which something happened, as plain data for JSON."""
+    return asdict(proportion(int(happened.sum()), happened.size))
 
 
 def holm(p_values: Sequence[float]) -> list[float]:
