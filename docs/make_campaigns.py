@@ -13,8 +13,7 @@ from pathlib import Path
 
 from make_numbers import ROOT, copy_figure, replace_in, write_page
 
-from quadsim.report.table import Grid, grid_to_markdown, line
-from scenarios.bench.solvers import section
+from quadsim.report.table import Grid, grid_to_markdown, line, section
 from scenarios.campaign.engine.local import LocalEngine
 from scenarios.campaign.manifest import stored_plan
 from scenarios.campaign.plan import load_plan
@@ -95,7 +94,7 @@ def part(result: Result) -> str:
         [
             f"## {name}\n\n{parts}\n",
             f"![{name}: convergence, margins, what drives them](campaign-{name}.png)\n",
-            *(section(grid).replace("## ", "### ", 1) for grid in tables),
+            *(section(grid, 3) for grid in tables),
         ]
     )
 
@@ -136,7 +135,7 @@ def page(results: list[Result]) -> str:
             section(violations(results)),
             first_to_break(nominal),
             f"## The one against the other\n\n{comparison.sentence} {pairing(comparison)}\n",
-            *(section(grid).replace("## ", "### ", 1) for grid in comparison_tables(comparison)),
+            *(section(grid, 3) for grid in comparison_tables(comparison)),
             *(part(result) for result in results),
         ]
     )

@@ -14,12 +14,13 @@ from make_cost import timed, write_cost
 from make_numbers import ROOT, Table, copy_figure, markdown, write_page
 from make_outside import outside
 
+from quadsim.report.table import section
 from scenarios.bench.bench_results import FlightProfile, RenderProfile, SolverBench
 from scenarios.bench.bench_tables import flight_tables, render_tables, solver_tables
 from scenarios.bench.campaigns import bench_campaign, campaign_tables
 from scenarios.bench.film import bench_render
 from scenarios.bench.flight import bench_flight
-from scenarios.bench.solvers import bench_solvers, section, write_bench
+from scenarios.bench.solvers import bench_solvers, write_bench
 from scenarios.bench.timing import in_turns, time_python
 from scenarios.cost.measure import study_cost
 from scenarios.loading import load_scenario

@@ -15,12 +15,11 @@ from fault_injection import CONTROLLERS, NEAR, SOON, Consequence, draw, inject_a
 from make_numbers import copy_figure, write_page
 
 from mpc.robust.tightening import TighteningSettings
-from quadsim.report.table import Grid, line
+from quadsim.report.table import Grid, line, section
 from scenarios.bench.mismatch.benchmark import run_mismatch, write_mismatch
 from scenarios.bench.mismatch.conditions import WORN
 from scenarios.bench.mismatch.controllers import FULL
 from scenarios.bench.mismatch.survival import ARRIVED, MismatchBench, MismatchFlight, mismatch_legend, mismatch_tables
-from scenarios.bench.solvers import section
 from scenarios.loading import load_scenario
 from scenarios.parts.vehicle import build_vehicle
 

@@ -94,6 +94,11 @@ def grid_to_markdown(grid: Grid) -> str:
     return "\n".join(lines) + "\n"
 
 
+def section(grid: Grid, level: int = 2) -> str:
+    """A grid under its title, with its note, as Markdown."""
+    return f"{level * '#'} {grid.title}\n\n{grid_to_markdown(grid)}\n{grid.note}".rstrip() + "\n"
+
+
 def _markdown_line(*texts: str) -> str:
     return "| " + " | ".join(printable(text).replace("|", r"\|") for text in texts) + " |"
 

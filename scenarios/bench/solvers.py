@@ -16,7 +16,7 @@ from mpc.unconstrained import UnconstrainedMPC
 from quadsim import outputs
 from quadsim.controller import ACCEPTED
 from quadsim.errors import InputError, ParameterError, UnknownNameError
-from quadsim.report.table import Grid, grid_to_markdown
+from quadsim.report.table import section
 from quadsim.state import Array
 from scenarios.bench.bench_results import CandidateResult, Growth, SolverBench
 from scenarios.bench.bench_tables import solver_tables
@@ -135,11 +135,6 @@ def write_bench(bench: SolverBench, directory: Path) -> None:
 def bench_markdown(bench: SolverBench) -> str:
     """All tables of a bench with their notes."""
     return f"# The solvers on {bench.scenario}\n\n" + "\n".join(map(section, solver_tables(bench)))
-
-
-def section(grid: Grid) -> str:
-    """A table under its title, with its note, as Markdown."""
-    return f"## {grid.title}\n\n{grid_to_markdown(grid)}\n{grid.note}".rstrip() + "\n"
 
 
 def _check(

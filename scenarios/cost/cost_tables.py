@@ -7,7 +7,7 @@ from typing import Any
 
 from quadsim.controller import SOLVED, UNCONSTRAINED
 from quadsim.flight.metrics import SETTLING_BAND, percentiles
-from quadsim.report.table import ABSENT, Cell, Grid, Mark, format_number, grid_to_markdown, line
+from quadsim.report.table import ABSENT, Cell, Grid, Mark, format_number, line, section
 from quadsim.state import Array
 from scenarios.cost.study import MEASURES, CandidateTimes, CostStudy, Outcome, Sweep, SweepPoint
 
@@ -25,10 +25,7 @@ def cost_tables(study: CostStudy) -> list[Grid]:
 
 def cost_markdown(study: CostStudy, sentences: Sequence[str]) -> str:
     """Sentences and tables as Markdown."""
-    parts = ["".join(f"- {sentence}\n" for sentence in sentences)]
-    for table in cost_tables(study):
-        parts.append(f"## {table.title}\n\n{grid_to_markdown(table)}\n{table.note}\n")
-    return "\n".join(parts)
+    return "\n".join(["".join(f"- {sentence}\n" for sentence in sentences), *map(section, cost_tables(study))])
 
 
 def format_outcome(outcome: Outcome) -> str:

@@ -16,11 +16,11 @@ from quadsim import outputs
 from quadsim.errors import ParameterError
 from quadsim.flight import metrics
 from quadsim.flight.log import FlightLog
+from quadsim.report.table import section
 from quadsim.state import INDEX, POSITION, Array
 from scenarios.bench.mismatch.conditions import CONDITIONS, QUICK_CONDITIONS
 from scenarios.bench.mismatch.controllers import FULL, QUICK_VARIANTS, VARIANTS, equip, tilt_bound
 from scenarios.bench.mismatch.survival import MismatchBench, MismatchFlight, mismatch_legend, mismatch_tables
-from scenarios.bench.solvers import section
 from scenarios.bench.timing import Stopwatch
 from scenarios.bench.worker_pool import answer_all
 from scenarios.build import build_controller, build_plant

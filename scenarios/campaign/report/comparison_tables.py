@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from quadsim.report.table import ABSENT, Cell, Grid, Mark, format_number, grid_to_markdown, line
+from quadsim.report.table import ABSENT, Cell, Grid, Mark, format_number, line, section
 from scenarios.campaign.statistics.comparison import Comparison, EventComparison, MetricComparison
 from scenarios.campaign.statistics.inference import ALPHA, CONFIDENCE
 from scenarios.campaign.statistics.wording import label, p_value, percent, signed_interval, signed_points
@@ -17,11 +17,9 @@ def comparison_tables(comparison: Comparison) -> list[Grid]:
 
 def comparison_markdown(comparison: Comparison) -> str:
     """The verdict and its tables."""
-    parts = [f"# {comparison.names[1]} against {comparison.names[0]}\n", comparison.sentence + "\n"]
-    parts.append(pairing(comparison) + "\n")
-    for grid in comparison_tables(comparison):
-        parts += [f"## {grid.title}\n", grid_to_markdown(grid), grid.note + "\n"]
-    return "\n".join(parts)
+    head = f"# {comparison.names[1]} against {comparison.names[0]}\n"
+    texts = (head, comparison.sentence + "\n", pairing(comparison) + "\n")
+    return "\n".join([*texts, *map(section, comparison_tables(comparison))])
 
 
 def pairing(comparison: Comparison) -> str:
