@@ -17,20 +17,8 @@ from quadsim.report.table import Grid, grid_to_markdown, line, section
 from scenarios.campaign.engine.local import LocalEngine
 from scenarios.campaign.manifest import stored_plan
 from scenarios.campaign.plan import load_plan
+from scenarios.campaign.report import campaign_tables, campaign_text
 from scenarios.campaign.report.campaign_curves import sure_splits
-from scenarios.campaign.report.campaign_tables import (
-    constraint_table,
-    driver_table,
-    event_table,
-    split_table,
-    worst_table,
-)
-from scenarios.campaign.report.campaign_text import (
-    campaign_sentences,
-    driver_sentences,
-    split_sentences,
-    verdict_sentence,
-)
 from scenarios.campaign.report.comparison_tables import comparison_tables, pairing
 from scenarios.campaign.run import Result, fly_campaign
 from scenarios.campaign.statistics.comparison import compare
@@ -82,13 +70,13 @@ def violations(results: list[Result]) -> Grid:
 def part(result: Result) -> str:
     """One campaign's section."""
     name, summary = result.summary["campaign"], result.summary
-    parts = " ".join([verdict_sentence(summary) + ".", *campaign_sentences(summary)])
+    parts = " ".join([campaign_text.verdict_sentence(summary) + ".", *campaign_text.campaign_sentences(summary)])
     tables = (
-        event_table(summary),
-        constraint_table(summary),
-        *([split_table(summary)] if split_table(summary).lines else []),
-        driver_table(summary),
-        worst_table(summary, f"runs/campaigns/{name}"),
+        campaign_tables.event_table(summary),
+        campaign_tables.constraint_table(summary),
+        *([campaign_tables.split_table(summary)] if campaign_tables.split_table(summary).lines else []),
+        campaign_tables.driver_table(summary),
+        campaign_tables.worst_table(summary, f"runs/campaigns/{name}"),
     )
     return "\n".join(
         [
@@ -111,10 +99,10 @@ def first_to_break(result: Result) -> str:
             f"{event} at {threshold:.15g}{'' if unit == '-' else f' {unit}'}" for threshold, event in steps
         )
         found = f"It is {first}. Thresholds along it: {listed}"
-    sentences = [*driver_sentences(summary), *split_sentences(summary)]
+    sentences = [*campaign_text.driver_sentences(summary), *campaign_text.split_sentences(summary)]
     return (
         "## What breaks the paper's controller first\n\n"
-        f"With small errors alone ({NOMINAL}), {verdict_sentence(summary)}. {found}.\n\n"
+        f"With small errors alone ({NOMINAL}), {campaign_text.verdict_sentence(summary)}. {found}.\n\n"
         + "".join(f"- {sentence}\n" for sentence in sentences)
     )
 

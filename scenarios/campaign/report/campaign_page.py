@@ -13,20 +13,9 @@ from quadsim.outputs import write_json, write_text, writing
 from quadsim.report.pages.page import PAGE_FILE, render_page
 from quadsim.report.plots.panels import plotly_script
 from quadsim.report.table import Mark
+from scenarios.campaign.report import campaign_tables
 from scenarios.campaign.report.campaign_figure import write_campaign_figure
 from scenarios.campaign.report.campaign_plots import campaign_plots, comparison_margins_plot
-from scenarios.campaign.report.campaign_tables import (
-    constraint_table,
-    driver_table,
-    event_table,
-    group_table,
-    level_tables,
-    manifest_table,
-    metric_table,
-    split_table,
-    worst_draws_table,
-    worst_table,
-)
 from scenarios.campaign.report.campaign_text import campaign_sentences, verdict_sentence
 from scenarios.campaign.report.comparison_tables import comparison_markdown, comparison_tables, pairing
 from scenarios.campaign.results.table import Summary
@@ -75,17 +64,17 @@ def write_report(
         verdict=verdict_sentence(summary),
         mark=_mark(summary),
         sentences=campaign_sentences(summary),
-        events=event_table(summary, failure),
-        constraints=constraint_table(summary),
-        metrics=metric_table(summary),
-        drivers=driver_table(summary),
-        splits=split_table(summary),
-        groups=group_table(summary),
-        levels=level_tables(summary),
+        events=campaign_tables.event_table(summary, failure),
+        constraints=campaign_tables.constraint_table(summary),
+        metrics=campaign_tables.metric_table(summary),
+        drivers=campaign_tables.driver_table(summary),
+        splits=campaign_tables.split_table(summary),
+        groups=campaign_tables.group_table(summary),
+        levels=campaign_tables.level_tables(summary),
         lost=summary["verdicts"]["lost"],
-        worst=worst_table(summary, str(campaign)),
-        worst_draws=worst_draws_table(summary),
-        manifest=manifest_table(manifest),
+        worst=campaign_tables.worst_table(summary, str(campaign)),
+        worst_draws=campaign_tables.worst_draws_table(summary),
+        manifest=campaign_tables.manifest_table(manifest),
         plots=plots,
         clipping="" if drawn is None else clipping(drawn, clouds(table, drawn)),
         thinning=thinning(table),

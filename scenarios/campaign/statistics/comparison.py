@@ -25,15 +25,7 @@ from scenarios.campaign.results.table import (
     texts,
     unit_of,
 )
-from scenarios.campaign.statistics.inference import (
-    ALPHA,
-    CONFIDENCE,
-    PairedDifference,
-    holm,
-    mcnemar,
-    paired_difference,
-    paired_shares,
-)
+from scenarios.campaign.statistics import inference
 from scenarios.campaign.statistics.scatters import ShownMargins, paired_margins
 from scenarios.campaign.statistics.wording import p_value, signed_interval, signed_points
 
@@ -88,12 +80,12 @@ def compare_events(events: Mapping[str, tuple[Flags, Flags]]) -> tuple[EventComp
     """
     alone = {event: (int((a & ~b).sum()), int((b & ~a).sum())) for event, (a, b) in events.items()}
     tested = [event for event, counts in alone.items() if any(counts)]
-    corrected = dict(zip(tested, holm([mcnemar(*alone[event]) for event in tested]), strict=True))
+    corrected = dict(zip(tested, inference.holm([inference.mcnemar(*alone[event]) for event in tested]), strict=True))
     found = []
     for event, (a, b) in events.items():
         only_a, only_b = alone[event]
         both = int((a & b).sum())
-        lower, upper = paired_shares(only_a, only_b, a.size)
+        lower, upper = inference.paired_shares(only_a, only_b, a.size)
         found.append(
             EventComparison(
                 event=event,
@@ -101,7 +93,7 @@ def compare_events(events: Mapping[str, tuple[Flags, Flags]]) -> tuple[EventComp
                 only_a=only_a,
                 only_b=only_b,
                 neither=a.size - both - only_a - only_b,
-                p=mcnemar(only_a, only_b),
+                p=inference.mcnemar(only_a, only_b),
                 p_holm=corrected.get(event, 1.0),
                 difference=(only_b - only_a) / a.size,
                 lower=lower,
@@ -119,8 +111,8 @@ def other_differences(events: Sequence[EventComparison], names: tuple[str, str])
     first, *others = events
     others = [event for event in others if event.only_a != event.only_b]
     others = [event for event in others if event.event != "violation" or event.cells != first.cells]
-    sure = [_told(event) for event in others if event.p_holm < ALPHA]
-    rest = [_told(event) for event in others if event.p_holm >= ALPHA]
+    sure = [_told(event) for event in others if event.p_holm < inference.ALPHA]
+    rest = [_told(event) for event in others if event.p_holm >= inference.ALPHA]
     parts = []
     if sure:
         parts.append(f"beyond chance in {', '.join(sure)}")
@@ -130,7 +122,7 @@ def other_differences(events: Sequence[EventComparison], names: tuple[str, str])
         return ""
     tests = sum(1 for event in events if event.only_a + event.only_b)
     return (
-        f"Flights with {names[1]} and with {names[0]} {'also ' if first.p < ALPHA else ''}differ "
+        f"Flights with {names[1]} and with {names[0]} {'also ' if first.p < inference.ALPHA else ''}differ "
         f"{'; and '.join(parts)} (McNemar's exact test of each event, after Holm's correction for {tests})."
     )
 
@@ -160,7 +152,7 @@ class MetricComparison:
     unit: str  # its unit, `-` for none
     mean_a: float | None  # mean of the first campaign over these pairs; None of no pairs
     mean_b: float | None  # mean of the second
-    difference: PairedDifference  # of the second less the first
+    difference: inference.PairedDifference  # of the second less the first
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -193,7 +185,7 @@ class Comparison:
     def verdict(self) -> str:
         """`better`, `worse` or `not distinguishable`: of the second campaign, by its failures at a level of 5 %."""
         failure = self.events[0]
-        if failure.p >= ALPHA:
+        if failure.p >= inference.ALPHA:
             return "not distinguishable"
         return "better" if failure.only_b < failure.only_a else "worse"
 
@@ -212,7 +204,7 @@ class Comparison:
             f"{phrase}: of {self.flights} paired flights, {count_b} failed with {b} and {count_a} with {a} "
             f"({failure.only_b} with {b} alone, {failure.only_a} with {a} alone; McNemar's exact test, "
             f"{p_value(failure.p)}). The difference is {signed_points(failure.difference)} percentage points "
-            f"({100.0 * CONFIDENCE:g} %: {signed_interval(failure.lower, failure.upper)}). "
+            f"({100.0 * inference.CONFIDENCE:g} %: {signed_interval(failure.lower, failure.upper)}). "
             f"{other_differences(self.events, self.names)}"
         ).rstrip()
 
@@ -222,7 +214,7 @@ class Comparison:
             "names": list(self.names),
             "verdict": self.verdict,
             "sentence": self.sentence,
-            "confidence": CONFIDENCE,
+            "confidence": inference.CONFIDENCE,
             "flights": self.flights,
             "left_out": self.left_out,
             "completed": self.completed,
@@ -322,5 +314,5 @@ def _compare_metric(a: pa.Table, b: pa.Table, name: str, completed: Flags) -> Me
         unit=unit_of(a, name),
         mean_a=float(first.mean()) if first.size else None,
         mean_b=float(second.mean()) if second.size else None,
-        difference=paired_difference(first, second),
+        difference=inference.paired_difference(first, second),
     )
