@@ -8,9 +8,8 @@ from __future__ import annotations
 import math
 import operator
 import re
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
 
@@ -31,12 +30,7 @@ _NAMED: Final[dict[str, tuple[str, bool | str]]] = {
 }
 """Column of each event that has a name, and its value there where the event holds."""
 _SPELLINGS: Final = {"failed": "failure", "violated": "violation", "crashed": "crash"}
-_OPERATIONS: Final[dict[str, Callable[[Any, Any], Any]]] = {
-    "<": operator.lt,
-    "<=": operator.le,
-    ">": operator.gt,
-    ">=": operator.ge,
-}
+_OPERATIONS: Final = {"<": operator.lt, "<=": operator.le, ">": operator.gt, ">=": operator.ge}
 _NEVER_COMPARED: Final = ("flight", "seed", "failed")
 """Columns that tell flights apart, or what other events make of them."""
 _COMPARISON: Final = re.compile(r"(?P<column>[^<>=]*?)\s*(?P<operation><=|>=|<|>)\s*(?P<number>[^<>=]*)")
@@ -44,8 +38,7 @@ _COMPARISON: Final = re.compile(r"(?P<column>[^<>=]*?)\s*(?P<operation><=|>=|<|>
 EVENT_NAMES: Final = tuple(_NAMED)  # the events that have a name; every other one is `COLUMN OP NUMBER`
 
 
-@dataclass(frozen=True, kw_only=True)
-class Event:
+class Event(NamedTuple):
     """Something that a flight's row shows to have happened, or not."""
 
     text: str  # the event as it is written in one way: a name of `EVENT_NAMES`, or `COLUMN OP NUMBER`
@@ -102,7 +95,7 @@ def parse_event(text: str, columns: Mapping[str, pa.DataType] | pa.Schema | None
     name = _SPELLINGS.get(text, text)
     if name in _NAMED:
         column, value = _NAMED[name]
-        return Event(text=name, column_name=column, operation="==", value=value)
+        return Event(name, column, "==", value)
     found = _COMPARISON.fullmatch(text)
     if found is None:
         hint = "or a comparison, COLUMN OP NUMBER with < <= > or >=, such as 'rmse.z > 0.5'"
@@ -115,12 +108,7 @@ def parse_event(text: str, columns: Mapping[str, pa.DataType] | pa.Schema | None
     if columns is not None:
         _require_number(column, columns, text)
     number = _number(found["number"], text)
-    return Event(
-        text=f"{column} {found['operation']} {number:.15g}",
-        column_name=column,
-        operation=found["operation"],
-        value=number,
-    )
+    return Event(f"{column} {found['operation']} {number:.15g}", column, found["operation"], number)
 
 
 def _require_number(column: str, columns: Mapping[str, pa.DataType] | pa.Schema, event: str) -> None:
