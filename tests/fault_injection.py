@@ -22,9 +22,9 @@ from quadsim.sim.plant import Plant
 from quadsim.sim.sensing.sensor import SensorName
 from quadsim.state import POSITION, Array
 from quadsim.vehicle import N_ROTORS, Vehicle
-from scenarios.bench.mismatch.benchmark import answer_all
 from scenarios.bench.mismatch.conditions import CONDITIONS
 from scenarios.bench.mismatch.controllers import FULL, equip
+from scenarios.bench.worker_pool import answer_all
 from scenarios.build import build_controller, build_plant, build_problem
 from scenarios.courses.make import build_reference
 from scenarios.loading import load_scenario

@@ -70,6 +70,11 @@ class Grid:
     note: str = ""
 
 
+def line(*cells: Cell | str) -> tuple[Cell, ...]:
+    """A line of a grid; a text is a cell without a mark."""
+    return tuple(cell if isinstance(cell, Cell) else Cell(text=cell) for cell in cells)
+
+
 def to_markdown(rows: Sequence[Row], names: Sequence[str]) -> str:
     """A Markdown table of the rows: headlines and the best values in bold type."""
     lines = [_markdown_line("", "", *names), _markdown_line("---", "---", *("---:" for _ in names))]
@@ -87,6 +92,11 @@ def grid_to_markdown(grid: Grid) -> str:
     for cells in grid.lines:
         lines.append(_markdown_line(*(f"**{cell.text}**" if cell.mark is Mark.BEST else cell.text for cell in cells)))
     return "\n".join(lines) + "\n"
+
+
+def section(grid: Grid, level: int = 2) -> str:
+    """A grid under its title, with its note, as Markdown."""
+    return f"{level * '#'} {grid.title}\n\n{grid_to_markdown(grid)}\n{grid.note}".rstrip() + "\n"
 
 
 def _markdown_line(*texts: str) -> str:

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from mpc.ocp import Problem
 from quadsim.controller import Command, Controller, Moment
 from quadsim.errors import FlightError
 from quadsim.flight.log import ControlLog
@@ -20,19 +21,17 @@ from scenarios.schema.scenario import Scenario
 
 @dataclass(frozen=True, kw_only=True)
 class Queries:
-    """The queries of K control periods.
+    """The queries of K control periods."""
 
-    Attributes:
-        t: (K,) [s].
-        state: (K, 12) measured.
-        reference: (K + N, 4) filtered x, y, z [m], yaw [rad], row k at t_k.
-        speeds_before: (K, 4) u(k-1) [rad/s].
-    """
+    t: Array  # (K,) [s]
+    state: Array  # (K, 12) measured
+    reference: Array  # (K + N, 4) filtered x, y, z [m], yaw [rad], row k at t_k
+    speeds_before: Array  # (K, 4) u(k-1) [rad/s]
 
-    t: Array
-    state: Array
-    reference: Array
-    speeds_before: Array
+    def of_qp(self, problem: Problem, period: int) -> tuple[Array, Array, Array]:
+        """xi(k), y_d and u(k-1)."""
+        reference = self.reference[period + 1 : period + 1 + problem.horizon]
+        return self.state[period], problem.objective.desired(reference), self.speeds_before[period]
 
 
 def recorded(scenario: Scenario, log: ControlLog, horizon: int) -> Queries:

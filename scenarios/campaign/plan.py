@@ -13,11 +13,10 @@ import pyarrow as pa
 from pydantic import ValidationError
 
 from quadsim.errors import FileError, InputError, ParameterError
-from scenarios.campaign.distributions import Value, VarySpec
 from scenarios.campaign.draws import Draws, extremes
 from scenarios.campaign.results.events import Event, parse_event
 from scenarios.campaign.results.table import DRAW, TIMING, Row, make_schema
-from scenarios.campaign.spec import CampaignSpec
+from scenarios.campaign.spec import CampaignSpec, Value, VarySpec
 from scenarios.loading import check_parts, parse_scenario
 from scenarios.parts.limits import build_limits
 from scenarios.parts.vehicle import build_vehicle, resolve_vehicle
@@ -27,21 +26,15 @@ from scenarios.schema.scenario import Scenario
 from scenarios.schema.settings import apply_setting, get_field, set_field
 from scenarios.shipped import campaign_path, scenario_path
 
-FIRST: Final = 5
-"""Flights of which one at least has to be possible."""
+FIRST: Final = 5  # flights of which one at least has to be possible
 
 
 @dataclass(frozen=True)
 class Plan:
-    """A campaign's file and the scenario that its flights differ from.
+    """A campaign's file and the scenario that its flights differ from."""
 
-    Attributes:
-        spec: the file.
-        scenario: with the file's changes, and every number of its vehicle, in it.
-    """
-
-    spec: CampaignSpec
-    scenario: Scenario
+    spec: CampaignSpec  # the file
+    scenario: Scenario  # with the file's changes, and every number of its vehicle, in it
 
     @cached_property
     def draws(self) -> Draws:

@@ -20,8 +20,7 @@ MOST_DEATHS: Final = 10
 """Processes that may die while they fly a flight before it is given up: more than die by chance in one flight."""
 ONE_THREAD: Final = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
 """Environment of a process that flies: results do not depend on the core count."""
-CHUNK_S: Final = 10.0
-"""Work handed out at once [s]: long against what handing it out costs, short against a campaign."""
+CHUNK_S: Final = 10.0  # work handed out at once [s]: long against what handing it out costs, short against a campaign
 
 
 class EngineError(QuadsimError):
@@ -45,12 +44,7 @@ class Pilot(Protocol):
         ...
 
     def fly(self, flight: int, progress: Progress = silent) -> Row:
-        """The row of a flight; plain values.
-
-        Args:
-            flight: which.
-            progress: called after each control period that is flown.
-        """
+        """The row of a flight, plain values; reports each control period that is flown."""
         ...
 
     def lost(self, flight: int, reason: str, verdict: str = ERROR) -> Row:
@@ -75,10 +69,6 @@ class Engine(Protocol):
 
     def answers(self, pilot: Pilot, flights: Sequence[int]) -> Generator[Row]:
         """The rows, each flight's exactly once, in whatever order they come; closing the iterator stops all work.
-
-        Args:
-            pilot: flies them.
-            flights: no two alike.
 
         Raises:
             EngineError: there is nobody left to fly.
@@ -129,12 +119,7 @@ class Pace:
         return int(seconds * self._flights / max(self._seconds, 1e-9))
 
     def chunk(self, waiting: int, workers: int) -> int:
-        """Flights to hand to one worker: fewer near the end, so that all finish together.
-
-        Args:
-            waiting: flights not handed out.
-            workers: those who share them.
-        """
+        """Flights to hand to one worker: fewer near the end, so that all finish together."""
         return max(1, min(self.flights_in(CHUNK_S), fair_share(waiting, workers)))
 
 

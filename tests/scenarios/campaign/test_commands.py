@@ -20,13 +20,7 @@ from quadsim.outputs import digest_of
 from scenarios.cli import main
 from scenarios.commands import EXIT_DONE, EXIT_FAILED, EXIT_WRONG_INPUT
 
-MASS = {
-    "name": "mass",
-    "fields": ["effects.load.mass_factor"],
-    "distribution": "uniform",
-    "low": 0.5,
-    "high": 1.5,
-}
+MASS = {"name": "mass", "fields": ["effects.load.mass_factor"], "distribution": "uniform", "low": 0.5, "high": 1.5}
 CAMPAIGN = {
     "name": "little",
     "scenario": "hover",

@@ -13,13 +13,7 @@ from scenarios.campaign.plan import Plan, load_plan
 from scenarios.loading import load_scenario
 from scenarios.shipped import campaign_names, campaign_path
 
-MASS = {
-    "name": "mass",
-    "fields": ["effects.load.mass_factor"],
-    "distribution": "uniform",
-    "low": 0.9,
-    "high": 1.1,
-}
+MASS = {"name": "mass", "fields": ["effects.load.mass_factor"], "distribution": "uniform", "low": 0.9, "high": 1.1}
 BASE: dict[str, Any] = {"name": "c", "scenario": "hover", "flights": 3, "vary": [MASS]}
 
 

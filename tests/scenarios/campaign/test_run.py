@@ -35,13 +35,7 @@ CAMPAIGN: dict[str, Any] = {
     "failure": ["lost", "max_error.z > 0.2"],
     "set": {"duration": 0.5, "constraints": [], "controller": {"horizon": 10}},
     "vary": [
-        {
-            "name": "mass",
-            "fields": ["effects.load.mass_factor"],
-            "distribution": "uniform",
-            "low": 0.5,
-            "high": 1.5,
-        },
+        {"name": "mass", "fields": ["effects.load.mass_factor"], "distribution": "uniform", "low": 0.5, "high": 1.5}
     ],
 }
 

@@ -17,14 +17,14 @@ from quadsim.controller import Moment
 from quadsim.errors import InputError, MissingPackageError
 from quadsim.flight import rundir
 from quadsim.flight.metrics import percentiles
+from scenarios.bench import worker_pool
 from scenarios.bench.queries import QueriedController, recorded
 from scenarios.build import build_controller
 from scenarios.cli import main
 from scenarios.commands import EXIT_DONE, EXIT_WRONG_INPUT
-from scenarios.cost import cost_flights
+from scenarios.cost.cost_flights import without_constraints
 from scenarios.cost.measure import find_study, fly_variations, study_cost
 from scenarios.cost.study import CostStudy
-from scenarios.cost.variants import without_constraints
 from scenarios.flight import Outputs, summarise
 from scenarios.loading import load_scenario
 from scenarios.parts.vehicle import build_vehicle
@@ -51,7 +51,7 @@ def scenario(*settings: str, name: str = "paper-constrained") -> Scenario:
 def _here() -> Iterator[None]:
     """Flights are flown in this process; one test compares that with several."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(cost_flights, "ProcessPoolExecutor", Here)
+        patch.setattr(worker_pool, "ProcessPoolExecutor", Here)
         yield
 
 
@@ -71,7 +71,7 @@ def untimed(study: CostStudy) -> dict[str, Any]:
 
 
 def test_the_study_is_the_same_however_many_processes_fly(study: CostStudy, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(cost_flights, "ProcessPoolExecutor", ProcessPoolExecutor)
+    monkeypatch.setattr(worker_pool, "ProcessPoolExecutor", ProcessPoolExecutor)
     again = study_cost(scenario(), [scenario(name="paper-unconstrained")], workers=2, **SMALL)
     assert untimed(again) == untimed(study)
 
@@ -145,7 +145,7 @@ def test_variations_change_the_vehicle(study: CostStudy) -> None:
 def test_contenders_answer_what_was_asked_in_flight(study: CostStudy) -> None:
     gain, flown, dense = study.candidates
     assert [candidate.name for candidate in study.candidates] == [
-        *("unconstrained gain", "constrained, as flown", "QP by piqp-dense"),
+        *("unconstrained gain", "constrained, as flown", "QP by piqp-dense")
     ]
     assert {candidate.step_ms.size for candidate in study.candidates} == {80}
     assert 0 < flown.shortcut.sum() < 80

@@ -81,7 +81,7 @@ def test_the_page_tells_what_the_flights_show(thousand: pa.Table, reported: Path
         assert f"<span>{table}</span>" in text
     assert "<dt>versions.numpy</dt><dd>2</dd>" in text
     assert {path.name for path in directory.iterdir()} == {
-        *("index.html", "campaign.png", "campaign.svg", "flights.parquet"),
+        *("index.html", "campaign.png", "campaign.svg", "flights.parquet")
     }
     for url in re.findall(r'(?:href|src)="([^"#]+)"', text):
         assert url == "data:," or (directory / url).is_file(), url
@@ -218,7 +218,7 @@ def test_no_tick_label_is_turned(thousand: pa.Table) -> None:
         assert axes
         assert plot.key == "drivers" or all(axis["tickangle"] == 0 for axis in axes), plot.key
     assert side_by_side(["piqp-multistage-condensed", "daqp", "x" * 30, "of two words"], 40) == [
-        *("piqp-mult\nistage-c…", "daqp", "x" * 9 + "\n" + "x" * 8 + "…", "of two\nwords"),
+        *("piqp-mult\nistage-c…", "daqp", "x" * 9 + "\n" + "x" * 8 + "…", "of two\nwords")
     ]
 
 
@@ -232,7 +232,7 @@ def test_names_have_places(thousand: pa.Table) -> None:
 
 def test_shares_are_told_with_the_digits_they_need() -> None:
     assert [percent(share) for share in (0.0, 0.037, 0.5, 0.00372, 0.99973, 1.0, None)] == [
-        *("0 %", "3.7 %", "50.0 %", "0.37 %", "99.973 %", "100 %", "-"),
+        *("0 %", "3.7 %", "50.0 %", "0.37 %", "99.973 %", "100 %", "-")
     ]
     assert interval(0.0262, 0.0506) == "2.6 to 5.1 %"
     assert interval(0.0, 0.00368) == "0 to 0.37 %"
