@@ -14,7 +14,6 @@ from threadpoolctl import threadpool_limits
 from quadsim.controller import Controller, Phase
 from quadsim.flight import metrics, rundir
 from quadsim.flight.audit import Finding, audit
-from quadsim.flight.feasibility import to_json as feasibility_to_json
 from quadsim.flight.log import FlightLog
 from quadsim.flight.parquet import write_log
 from quadsim.outputs import write_json, write_text, writing
@@ -213,7 +212,7 @@ def summarise(flight: Flight) -> dict[str, Any]:
         "as_expected": flight.outcome == scenario.expect and not log.interrupted,
         "duration": round(log.control.t.size * scenario.control_period, 9),
         "seed": scenario.seed,
-        "course": feasibility_to_json(report(scenario, flight.vehicle)),
+        "course": asdict(report(scenario, flight.vehicle)),
         "tracking": numbers["tracking"],
         "constraints": [rundir.limit_to_json(finding) for finding in flight.findings],
         "control": numbers["control"],
@@ -226,7 +225,7 @@ def summarise(flight: Flight) -> dict[str, Any]:
         **({"computation": metrics.computation(log.control)} if flown and build_computation(scenario) else {}),
         **({} if log.control.measured_perfectly else {"estimation": _estimation(flight)}),
         **({"ground": metrics.ground(log, outline(flight.vehicle))} if flown and ground and ground.contact else {}),
-        "vehicle": rundir.vehicle_to_json(flight.vehicle),
+        "vehicle": asdict(flight.vehicle),
         "wall_s": {"simulate": flight.simulate_s, "total": flight.simulate_s},
         "versions": versions(),
         "machine": machine(),

@@ -11,13 +11,11 @@ from typing import Any, Final
 import numpy as np
 
 from quadsim.state import Array
-from quadsim.vehicle import N_ROTORS
 
 WRENCH: Final = {**{f"force_{axis}": "N" for axis in "xyz"}, **{f"torque_{axis}": "N m" for axis in "xyz"}}
 """Columns of the external force, world, and torque, body frame, with their units; only where there is any."""
 WIND: Final = {f"wind_{axis}": "m/s" for axis in "xyz"}
 """Columns of the wind, world, with their units; only where there is any."""
-ROTORS: Final = range(1, N_ROTORS + 1)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -98,13 +96,8 @@ class PlantLog:
 
     def every(self, stride: int) -> PlantLog:
         """Each `stride`-th row, from the first on."""
-        return PlantLog(
-            t=self.t[::stride],
-            state=self.state[::stride],
-            speeds=self.speeds[::stride],
-            wrench=None if self.wrench is None else self.wrench[::stride],
-            wind=None if self.wind is None else self.wind[::stride],
-        )
+        kept: dict[str, Any] = {name: None if rows is None else rows[::stride] for name, rows in vars(self).items()}
+        return PlantLog(**kept)
 
 
 @dataclass(frozen=True, kw_only=True)

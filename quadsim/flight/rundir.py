@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import math
 from collections.abc import Iterator, Mapping
-from dataclasses import asdict, dataclass, fields
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, Final
 
@@ -63,36 +63,17 @@ class Run:
         return str(self.summary["scenario"])
 
 
-def vehicle_to_json(vehicle: Vehicle) -> dict[str, Any]:
-    """The vehicle's numbers for `summary.json`."""
-    return asdict(vehicle)
-
-
 def limit_to_json(finding: Finding) -> dict[str, Any]:
     """One entry of `constraints` in `summary.json`; an absent bound, or a window the flight never reached, is null."""
     limit = finding.limit
-
-    def finite(value: float) -> float | None:
-        return value if math.isfinite(value) else None
-
+    stated = {name: value for name, value in vars(limit).items() if name not in ("name", "signal", "terms")}
+    found = {name: value for name, value in vars(finding).items() if name != "limit"}
     return {
         "name": limit.name,
         "signal": limit.signal,
         **({"terms": dict(limit.terms)} if limit.terms else {}),
         "unit": limit.unit,
-        "lower": finite(limit.lower),
-        "upper": finite(limit.upper),
-        "tolerance": limit.tolerance,
-        "tolerance_sampled": limit.tolerance_sampled,
-        "required": limit.required,
-        "start": limit.start,
-        "stop": finite(limit.stop),
-        "peak_sampled": finite(finding.peak_sampled),
-        "peak_plant": finite(finding.peak_plant),
-        "worst_margin_sampled": finite(finding.worst_margin_sampled),
-        "worst_margin": finite(finding.worst_margin),
-        "worst_time": finite(finding.worst_time),
-        "time_violated": finding.time_violated,
+        **{name: value if math.isfinite(value) else None for name, value in (stated | found).items()},
         "satisfied": finding.satisfied,
     }
 
@@ -101,18 +82,9 @@ def limit_from_json(entry: Mapping[str, Any]) -> Limit:
     """The limit that `limit_to_json` wrote."""
     absent = {"lower": -math.inf, "upper": math.inf, "stop": math.inf}
     terms = tuple((name, float(factor)) for name, factor in entry.get("terms", {}).items())
-    values: dict[str, Any] = {field.name: entry[field.name] for field in fields(Limit) if field.name != "terms"}
-    values["terms"] = terms
-    return Limit(**values | {name: bound for name, bound in absent.items() if values[name] is None})
-
-
-def is_run(directory: Path) -> bool:
-    """Whether a path is a run directory: one with a summary of quadsim's, since others write a `summary.json` too."""
-    try:
-        read_summary(directory)
-    except FileError:
-        return False
-    return True
+    values = {field.name: entry[field.name] for field in fields(Limit) if field.name != "terms"}
+    values |= {name: bound for name, bound in absent.items() if values[name] is None}
+    return Limit(**values, terms=terms)
 
 
 def load_run(directory: Path) -> Run:
@@ -137,16 +109,15 @@ def file_hashes(directory: Path) -> dict[str, str]:
     Raises:
         FileError: one cannot be read.
     """
-    paths = sorted(path for path in directory.rglob("*") if path.is_file())
-    names = [path.relative_to(directory).as_posix() for path in paths]
-    return {name: _hash(directory / name) for name in names if name not in UNLISTED}
-
-
-def _hash(path: Path) -> str:
-    try:
-        return digest_of(path)
-    except OSError as error:
-        raise FileError(path, f"cannot be read ({error.strerror})") from error
+    hashes = {}
+    for path in sorted(path for path in directory.rglob("*") if path.is_file()):
+        name = path.relative_to(directory).as_posix()
+        if name not in UNLISTED:
+            try:
+                hashes[name] = digest_of(path)
+            except OSError as error:
+                raise FileError(path, f"cannot be read ({error.strerror})") from error
+    return hashes
 
 
 @contextlib.contextmanager

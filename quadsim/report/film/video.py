@@ -15,12 +15,12 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import IO, Final
 
 from quadsim.errors import OutputError, ParameterError, RenderingUnavailableError
-from quadsim.flight.rundir import Run, load_run, vehicle_to_json
+from quadsim.flight.rundir import Run, load_run
 from quadsim.outputs import writing_file
 from quadsim.report.film.frames import Shot, film_span
 from quadsim.vehicle import Vehicle
@@ -150,7 +150,7 @@ def render_portrait(vehicle: Vehicle, path: Path, *, width: int = 1280, height: 
         RenderingUnavailableError: this machine cannot render.
     """
     with _making(path, ".png") as new:
-        numbers = json.dumps(vehicle_to_json(vehicle))
+        numbers = json.dumps(asdict(vehicle))
         task = ("portrait", numbers, str(new), str(width), str(height))
         _work([task], rendering_backend(), new.parent)
 
