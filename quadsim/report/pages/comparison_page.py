@@ -16,9 +16,8 @@ from quadsim.flight.parquet import FLIGHT_FILE, HORIZON_FILE, PLANT_FILE, TIMING
 from quadsim.flight.rundir import FIGURES_DIR, RECORDING_FILE, SCENARIO_FILE, SUMMARY_FILE, VIDEO_FILE, Run
 from quadsim.outputs import write_text, writing
 from quadsim.outputs.paths import require_inside
-from quadsim.report.comparison import comparison_rows, outcome, required, run_names
+from quadsim.report.comparison import comparison_rows, outcome, required, run_names, verdict_cell
 from quadsim.report.figures.flight_figures import comparison_figure
-from quadsim.report.flight_conditions import verdict_cell
 from quadsim.report.narrative import comparison_sentences
 from quadsim.report.pages.page import PAGE_FILE, render_page
 from quadsim.report.palette import line_colour
