@@ -62,6 +62,11 @@ class Run:
         """The scenario's name."""
         return str(self.summary["scenario"])
 
+    @property
+    def end(self) -> float:
+        """Last time of the flight [s]."""
+        return float(self.log.plant.t[-1])
+
 
 def limit_to_json(finding: Finding) -> dict[str, Any]:
     """One entry of `constraints` in `summary.json`; an absent bound, or a window the flight never reached, is null."""

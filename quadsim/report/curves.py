@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 
-from quadsim.flight.log import FlightLog
-from quadsim.state import Array
+from quadsim.flight.audit import SIGNALS, Limit
+from quadsim.flight.log import ControlLog, FlightLog
+from quadsim.state import REFERENCE_NAMES, Array
 
 LEAST_SPANS: Final = {"m": 0.01, "deg": 0.1, "m/s": 0.01, "deg/s": 0.1, "rad/s": 1.0}
 """Span of an axis, by its unit, below which there is nothing to see but rounding."""
@@ -32,6 +33,23 @@ def least_range(curves: Sequence[Array], unit: str) -> tuple[float, float] | Non
     if abs(middle) < 1e-3 * span:
         middle = 0.0  # an axis about zero has round ticks
     return middle - 0.5 * span, middle + 0.5 * span
+
+
+def reference_curve(log: ControlLog, name: str) -> Array:
+    """(K,) filtered reference of x, y, z or yaw, in the unit of its signal."""
+    values = log.reference[:, REFERENCE_NAMES.index(name)]
+    return np.degrees(values) if SIGNALS[name].unit == "deg" else values
+
+
+def bounds_of(limits: Iterable[Limit], signal: str, end: float) -> list[tuple[float, float, float]]:
+    """Each distinct bound on a signal, once, and from when to when it holds in a flight that ends at `end` [s]."""
+    bounds = {
+        (bound, limit.start, min(limit.stop, end)): None
+        for limit in limits
+        for bound in (limit.lower, limit.upper)
+        if limit.signal == signal and limit.start < end and np.isfinite(bound)
+    }
+    return list(bounds)
 
 
 def break_at_wraps(t: Array, values: Array, unit: str) -> tuple[Array, Array]:

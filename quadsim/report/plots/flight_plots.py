@@ -11,7 +11,7 @@ import numpy as np
 from quadsim.flight.audit import SIGNALS
 from quadsim.flight.rundir import Run
 from quadsim.report.comparison import distinct_courses, run_names
-from quadsim.report.curves import break_at_wraps
+from quadsim.report.curves import bounds_of, break_at_wraps, reference_curve
 from quadsim.report.palette import REFERENCE, line_colour
 from quadsim.report.plots.panels import (
     BOTTOM,
@@ -37,8 +37,8 @@ _POINTS_OF_ALL_RUNS: Final = 12_000
 
 def comparison_plots(runs: Sequence[Run]) -> list[Plot]:
     """All plots of the page, for the runs that flew at least one control period; none without such a run."""
-    flown = [(i, name, run) for i, (name, run) in enumerate(zip(run_names(runs), runs, strict=True))]
-    flown = [(i, name, run) for i, name, run in flown if run.log.control.t.size]
+    named = enumerate(zip(run_names(runs), runs, strict=True))
+    flown = [(i, name, run) for i, (name, run) in named if run.log.control.t.size]
     return list(_Plotter(flown).plots()) if flown else []
 
 
@@ -70,17 +70,14 @@ class _Plotter:
     def __init__(self, runs: Sequence[tuple[int, str, Run]]) -> None:
         self._runs = runs
         self._courses = distinct_courses([run for _, _, run in runs])
-        self._end = max(float(run.log.plant.t[-1]) for _, _, run in runs)
+        self._end = max(run.end for _, _, run in runs)
         self._points = min(_MOST_POINTS, max(200, _POINTS_OF_ALL_RUNS // len(runs)))
 
     def plots(self) -> Iterator[Plot]:
-        rotors = range(1, N_ROTORS + 1)
         yield self._states("course", "Course and heading", ("x", "y", "z", "yaw"))
         yield self._states("attitude", "Roll and pitch", ("roll", "pitch"))
-        yield self._inputs("speeds", "Rotor speeds", "speed", [f"rotor {i} [rad/s]" for i in rotors])
-        yield self._inputs(
-            "slews", "Steps of the rotor speeds, per period", "slew", [f"rotor {i} [rad/s]" for i in rotors]
-        )
+        yield self._inputs("speeds", "Rotor speeds", "speed")
+        yield self._inputs("slews", "Steps of the rotor speeds, per period", "slew")
         yield self._times()
         yield self._path()
 
@@ -97,8 +94,8 @@ class _Plotter:
             keep_least_span(figure, panel, SIGNALS[name].unit)
         return self._timed(figure, key, title)
 
-    def _inputs(self, key: str, title: str, name: str, labels: Sequence[str]) -> Plot:
-        figure = panels(labels)
+    def _inputs(self, key: str, title: str, name: str) -> Plot:
+        figure = panels([f"rotor {i} [rad/s]" for i in range(1, N_ROTORS + 1)])
         for panel in range(N_ROTORS):
             for i, label, run in self._runs:
                 values = SIGNALS[name].sampled(run.log.control)[:, panel]
@@ -174,23 +171,15 @@ class _Plotter:
         from plotly.graph_objects import Scatter
 
         for run in self._courses if name in REFERENCE_NAMES else ():
-            values = run.log.control.reference[:, REFERENCE_NAMES.index(name)]
-            values = np.degrees(values) if SIGNALS[name].unit == "deg" else values
+            values = reference_curve(run.log.control, name)
             kept = thin(values, self._points)
             x, y = run.log.control.t[kept].astype(np.float32), values[kept].astype(np.float32)
             line = {"color": REFERENCE, "width": 1.6, "dash": "dash"}
             figure.add_trace(Scatter(x=x, y=y, mode="lines", line=line, name="reference"), **place(panel))
 
     def _bounds(self, figure: Figure, panel: int, signal: str) -> None:
-        """Each distinct bound on a signal, once, over the times it holds for."""
-        bounds = {
-            (bound, limit.start, min(limit.stop, self._end)): None
-            for _, _, run in self._runs
-            for limit in run.limits
-            for bound in (limit.lower, limit.upper)
-            if limit.signal == signal and limit.start < self._end and np.isfinite(bound)
-        }
-        for bound, start, stop in bounds:
+        limits = [limit for _, _, run in self._runs for limit in run.limits]
+        for bound, start, stop in bounds_of(limits, signal, self._end):
             draw_bound(figure, panel, bound, start, stop)
 
     def _timed(self, figure: Figure, key: str, title: str) -> Plot:
