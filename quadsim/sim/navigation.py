@@ -6,7 +6,6 @@ import copy
 import math
 from collections.abc import Sequence
 from operator import attrgetter
-from typing import Final
 
 import numpy as np
 
@@ -27,8 +26,6 @@ from quadsim.state import (
     quaternion_to_euler,
 )
 from quadsim.vehicle import Vehicle
-
-_TAKEN: Final = attrgetter("taken")
 
 
 class Navigation:
@@ -150,14 +147,10 @@ class Navigation:
 
     def _receive(self, physics: Array, first: int) -> None:
         for sampler in self._samplers:
-            self._in_flight.extend(sampler.sample(physics, first))
+            self._in_flight += sampler.sample(physics, first)
 
     def _arrived(self) -> list[Sample]:
         """The samples that have arrived since last asked, the oldest first; the rest stay on their way."""
-        arrived: list[Sample] = []
-        in_flight: list[Sample] = []
-        for sample in self._in_flight:
-            (arrived if sample.arrival <= self._step else in_flight).append(sample)
-        self._in_flight = in_flight
-        arrived.sort(key=_TAKEN)
-        return arrived
+        arrived = [sample for sample in self._in_flight if sample.arrival <= self._step]
+        self._in_flight = [sample for sample in self._in_flight if sample.arrival > self._step]
+        return sorted(arrived, key=attrgetter("taken"))

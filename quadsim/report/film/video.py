@@ -194,9 +194,11 @@ def _making(path: Path, form: str) -> Iterator[Path]:
         raise OutputError(path, f"the renderer failed: {failure}") from failure
 
 
-def _environment(backend: str) -> dict[str, str]:
+def _environment(backend: str, workers: int = 1) -> dict[str, str]:
+    # Side by side each worker keeps a core busy: threads of Mesa's software renderer would but take turns with them.
+    threads = {"LP_NUM_THREADS": "0"} if workers > 1 else {}
     packages = os.pathsep.join(filter(None, (str(Path(__file__).resolve().parents[3]), os.environ.get("PYTHONPATH"))))
-    return {**os.environ, "MUJOCO_GL": backend, "PYOPENGL_PLATFORM": backend, "PYTHONPATH": packages}
+    return {**threads, **os.environ, "MUJOCO_GL": backend, "PYOPENGL_PLATFORM": backend, "PYTHONPATH": packages}
 
 
 def _work(
@@ -217,10 +219,11 @@ def _work(
         watched = stack.enter_context(selectors.DefaultSelector())
         logs: list[IO[bytes]] = []
         done = [0] * len(tasks)
+        environment = _environment(backend, len(tasks))
         for i, task in enumerate(tasks):
             logs.append(stack.enter_context((folder / f"worker{i}.log").open("w+b")))
             process = stack.enter_context(
-                subprocess.Popen([*_WORKER, *task], env=_environment(backend), stdout=subprocess.PIPE, stderr=logs[i])
+                subprocess.Popen([*_WORKER, *task], env=environment, stdout=subprocess.PIPE, stderr=logs[i])
             )
             stack.callback(process.kill)  # runs before Popen's own exit, which waits; kills none that has ended
             assert process.stdout is not None

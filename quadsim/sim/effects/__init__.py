@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Final, Protocol
+from typing import Final
 
 import numpy as np
 
@@ -133,15 +133,3 @@ class Effects:
         spinning = self.rotors is not None and self.rotors.inertia > 0.0
         aerodynamic = self.rotor_drag > 0.0 or self.body_drag is not None or self.rotor_radius is not None
         return spinning or aerodynamic or self.disturbance is not None
-
-
-class Wind(Protocol):
-    """The air's motion along a flight; see `quadsim.sim.effects.wind.WindField`."""
-
-    def reset(self) -> None:
-        """Start again with the same wind."""
-        ...
-
-    def advance(self, steps: int) -> Array:
-        """(steps, 3) wind velocity at the middle of each of the next physics steps, world frame [m/s]."""
-        ...

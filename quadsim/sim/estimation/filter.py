@@ -61,12 +61,8 @@ class _Track:
     tallies: dict[SensorName, Tally] = field(default_factory=dict)
 
     def branch(self) -> _Track:
-        return _Track(
-            step=self.step,
-            estimate=self.estimate,
-            refused=dict(self.refused),
-            tallies={name: replace(tally) for name, tally in self.tallies.items()},
-        )
+        tallies = {name: replace(tally) for name, tally in self.tallies.items()}
+        return replace(self, refused=dict(self.refused), tallies=tallies)
 
 
 class ErrorStateFilter:
@@ -92,10 +88,10 @@ class ErrorStateFilter:
         """
         from scipy.special import chdtri  # whose package takes a while to load, and few flights have an estimator
 
-        names = [sensor.name for sensor in sensors]
+        names = [str(sensor.name) for sensor in sensors]
         for name in NEEDED:
             if name not in names:
-                raise ParameterError("estimator", "sensors", [str(n) for n in names], f"such that {name} is among them")
+                raise ParameterError("estimator", "sensors", names, f"such that {name} is among them")
         for sensor in sensors:
             if min(sensor.noise) <= 0.0:
                 rule = "positive on every axis, for the estimator to weigh it"
@@ -161,7 +157,7 @@ class ErrorStateFilter:
                 self._waiting.append(sample)
             else:
                 self._track.tallies[sample.sensor].rejected += 1
-        self._waiting.sort(key=_order)
+        self._waiting.sort(key=lambda sample: (sample.taken, _NAMES.index(sample.sensor)))
         ripe = bisect.bisect_right(self._waiting, horizon, key=lambda sample: sample.taken)
         self._run(self._track, self._waiting[:ripe])
         del self._waiting[:ripe]
@@ -208,10 +204,6 @@ class ErrorStateFilter:
         track.refused.pop(name, None)
         tally.accepted += 1
         tally.nis += distance
-
-
-def _order(sample: Sample) -> tuple[int, int]:
-    return sample.taken, _NAMES.index(sample.sensor)
 
 
 def _plausible(estimate: Estimate) -> bool:
