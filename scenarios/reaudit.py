@@ -175,18 +175,9 @@ def _differences(
         yield f"as_expected is recorded as True, and the flight is {outcome} where {scenario.expect} is expected"
 
 
-_DEMANDS: Final = [
-    "signal",
-    "terms",
-    "unit",
-    "lower",
-    "upper",
-    "tolerance",
-    "tolerance_sampled",
-    "required",
-    "start",
-    "stop",
-]
+_DEMANDS: Final = (
+    "signal", "terms", "unit", "lower", "upper", "tolerance", "tolerance_sampled", "required", "start", "stop",
+)  # fmt: skip
 """What the scenario says of a constraint."""
 
 
@@ -228,9 +219,8 @@ def _time_beyond(finding: Finding, scenario: Scenario, log: FlightLog) -> tuple[
     if signal.plant is None or not log.control.t.size or scenario.plant_stride == 1:
         return seen - ROUNDING, seen + row + ROUNDING
     t = log.plant.t[:-1]  # the last row ends the flight, and lasts no time
-    inside = (t >= limit.start) & (t <= limit.stop)
     beyond = limit.margin(signal.plant(log.plant))[:-1] < -limit.tolerance - ROUNDING_TILT
-    return max(0.0, (np.count_nonzero(inside & beyond) - 1) * scenario.plant.timestep), math.inf
+    return max(0.0, (np.count_nonzero(limit.holds_at(t) & beyond) - 1) * scenario.plant.timestep), math.inf
 
 
 def _margin(finding: Finding, peak: float | None) -> float | None:

@@ -7,7 +7,7 @@ import os
 import subprocess
 import sys
 import warnings
-from dataclasses import fields, replace
+from dataclasses import asdict, fields, replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -259,7 +259,7 @@ def test_impossible_films_are_refused(short_run: Run, tmp_path: Path, options: d
 def test_a_shot_tells_its_times():
     shot = Shot(run="x", fps=10, start=2.0, speed=4.0, first=5, count=3)
     assert shot.times == pytest.approx([4.0, 4.4, 4.8])
-    assert Shot(**shot.to_json()) == shot
+    assert Shot(**asdict(shot)) == shot
 
 
 def test_footage_meets_the_plant_at_its_rows_and_halfway_between(short_run: Run):
