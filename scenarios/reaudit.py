@@ -16,7 +16,6 @@ from typing import Any, Final
 
 import numpy as np
 
-from quadsim.controller import Phase
 from quadsim.errors import FileError, InputError, printable
 from quadsim.flight import rundir
 from quadsim.flight.audit import Finding, audit
@@ -92,10 +91,11 @@ def reaudit(directory: Path, *, products: bool = True) -> Reaudit:
     if others := _unlisted(directory, summary):
         shown = ", ".join(others[:MOST_SAID]) + (" ..." if len(others) > MOST_SAID else "")
         notes.append(f"not of this run: {printable(shown)}")
+    whole = summary["reason"] is None and log.control.t.size == scenario.periods and not log.control.crashed
     return Reaudit(
         summary=summary,
         findings=findings,
-        satisfied=_is_satisfied(summary["reason"], scenario, log, findings),
+        satisfied=whole and all(finding.satisfied for finding in findings if finding.limit.required),
         rate=scenario.log_rate,
         notes=tuple(notes),
     )
@@ -167,7 +167,7 @@ def _differences(
     for entry, finding in zip(entries, findings, strict=True):
         yield from (f"{finding.limit.name}: {what}" for what in _constraint_differences(entry, finding, scenario, log))
     required = all(entry["satisfied"] for entry in entries if entry["required"])
-    satisfied = summary["reason"] is None and not _is_crashed(log) and required
+    satisfied = summary["reason"] is None and not log.control.crashed and required
     if summary["satisfied"] != satisfied:
         yield f"satisfied is recorded as {summary['satisfied']}, and its audit and outcome make it {satisfied}"
     outcome = "lost" if summary["reason"] is not None else "satisfied" if satisfied else "violated"
@@ -225,15 +225,6 @@ def _time_beyond(finding: Finding, scenario: Scenario, log: FlightLog) -> tuple[
 
 def _margin(finding: Finding, peak: float | None) -> float | None:
     return None if peak is None else float(finding.limit.margin(np.array([peak]))[0])
-
-
-def _is_satisfied(reason: str | None, scenario: Scenario, log: FlightLog, findings: Sequence[Finding]) -> bool:
-    whole = reason is None and log.control.t.size == scenario.periods and not _is_crashed(log)
-    return whole and all(finding.satisfied for finding in findings if finding.limit.required)
-
-
-def _is_crashed(log: FlightLog) -> bool:
-    return str(Phase.CRASHED) in log.control.phase
 
 
 def _is_close(recorded: float | None, again: float | None, rounding: float) -> bool:

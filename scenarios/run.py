@@ -11,7 +11,7 @@ from typing import Any
 
 from threadpoolctl import threadpool_limits
 
-from quadsim.controller import Controller, Phase
+from quadsim.controller import Controller
 from quadsim.flight import metrics, rundir
 from quadsim.flight.audit import Finding, audit
 from quadsim.flight.log import FlightLog
@@ -114,7 +114,7 @@ class Flight:
     @property
     def satisfied(self) -> bool:
         """Whether the flight was completed without a crash, and every required constraint held."""
-        whole = self.log.reason is None and str(Phase.CRASHED) not in self.log.control.phase
+        whole = self.log.reason is None and not self.log.control.crashed
         return whole and all(finding.satisfied for finding in self.findings if finding.limit.required)
 
     @property

@@ -10,6 +10,7 @@ from typing import Any, Final
 
 import numpy as np
 
+from quadsim.controller import Phase
 from quadsim.state import Array
 
 WRENCH: Final = {**{f"force_{axis}": "N" for axis in "xyz"}, **{f"torque_{axis}": "N m" for axis in "xyz"}}
@@ -60,6 +61,11 @@ class ControlLog:
     def measured_perfectly(self) -> bool:
         """Whether the measured state was the true one throughout."""
         return self.state is self.truth or bool(np.array_equal(self.state, self.truth))
+
+    @property
+    def crashed(self) -> bool:
+        """Whether anything but the feet met the ground."""
+        return str(Phase.CRASHED) in self.phase
 
     @property
     def slews(self) -> Array:

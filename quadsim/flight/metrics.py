@@ -175,7 +175,7 @@ def ground(log: FlightLog, outline: Outline) -> dict[str, Any]:
         "takeoff_time": takeoff_time(log.plant.t, feet),
         "touchdown": touchdown(log.plant.t, log.plant.state, clearances),
         "phase": log.control.phase[-1] if log.control.phase else None,
-        "crashed": str(Phase.CRASHED) in log.control.phase,
+        "crashed": log.control.crashed,
     }
 
 

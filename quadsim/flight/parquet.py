@@ -89,11 +89,8 @@ def _horizon_table(t: Array, predicted: np.ndarray[Any, np.dtype[np.float32]], m
 def write_log(directory: Path, log: FlightLog, *, plant_stride: int, metadata: Mapping[str, str]) -> None:
     """Write a flight's Parquet files into an existing directory.
 
-    Args:
-        directory: where `flight.parquet`, `timing.parquet`, `plant.parquet` and `horizon.parquet` go.
-        log: the flight.
-        plant_stride: physics steps per row of `plant.parquet`.
-        metadata: texts kept in each file's schema; no clock reading belongs here.
+    Every `plant_stride`-th physics step is a row of `plant.parquet`; `metadata`, texts without a clock reading, is kept
+    in each file's schema.
     """
     tables = {
         FLIGHT_FILE: _flight_table(log.control, metadata),
@@ -165,11 +162,7 @@ def _texts(table: pa.Table, name: str) -> tuple[str, ...]:
 
 
 def read_log(directory: Path, *, reason: str | None = None) -> FlightLog:
-    """Read a flight back; the plant's rows are at the log rate.
-
-    Args:
-        directory: a run directory.
-        reason: the flight's reason for ending early, which stands in its summary.
+    """Read a flight back from its run directory, the plant's rows at the log rate; its summary has the `reason`.
 
     Raises:
         FileError: a file is missing or damaged.

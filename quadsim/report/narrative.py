@@ -116,12 +116,9 @@ def _limit_sentences(named: _Named) -> Iterator[str]:
         if constraint in held or not reached:
             continue
         bounds = {format_bounds(entry, entry["unit"]) for _, entry in reached}
-        if len(bounds) == 1:
-            phrases = (f"{name} {_case(entry)}" for name, entry in reached)
-            yield f"{constraint}, {bounds.pop()}: {'; '.join(phrases)}."
-        else:
-            phrases = (f"{name} ({format_bounds(entry, entry['unit'])}) {_case(entry)}" for name, entry in reached)
-            yield f"{constraint}, whose bounds differ: {'; '.join(phrases)}."
+        own = {name: f" ({format_bounds(entry, entry['unit'])})" if len(bounds) > 1 else "" for name, entry in reached}
+        phrases = "; ".join(f"{name}{own[name]} {_case(entry)}" for name, entry in reached)
+        yield f"{constraint}, {bounds.pop() if len(bounds) == 1 else 'whose bounds differ'}: {phrases}."
     for name, constraints in unreached.items():
         yield f"{name} ended before it was held to {_list(constraints)}."
 

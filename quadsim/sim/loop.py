@@ -154,15 +154,8 @@ def fly(
 class Sample:
     """One control period as it was flown.
 
-    Attributes:
-        command: the controller's answer.
-        speeds: (4,) the command in force at the period's end: an earlier one, if this one missed its deadline [rad/s].
-        phase: where the flight stood with the ground.
-        delay: simulated time from the measurement to the command [s].
-        missed: whether that was too long.
-        step_s: wall time of the controller's step [s].
-        segment: what the plant did.
-        rotors: (4,) rotor speeds at the period's end [rad/s].
+    `speeds` (4,) [rad/s] are the command in force at its end, an earlier one if `command` was missed, and `rotors` (4,)
+    how fast the rotors turned then; `delay` [s] is simulated, `step_s` [s] the wall time of the controller's step.
     """
 
     command: Command

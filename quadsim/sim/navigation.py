@@ -55,7 +55,7 @@ class Navigation:
             timestep: physics step [s].
             sensors: at most one of each name; absent ones are perfect, or not there where there is an estimator.
             rng: where all randomness comes from.
-            faults: what befalls the sensors; a perfect one can be befallen too.
+            faults: what befalls the sensors, perfect ones too.
             estimator: the error-state filter's tuning, or None.
 
         Raises:
@@ -101,12 +101,9 @@ class Navigation:
             self._filter.advance(np.empty((0, len(speeds))), self._arrived(), first=0)
 
     def advance(self, physics: Array, commands: Array, *, standing: bool = False) -> None:
-        """Take note of a segment of flight.
+        """Take note of a segment of flight: (M, 14) true states after each physics step, (M, 4) rotor speeds [rad/s].
 
-        Args:
-            physics: (M, 14) the true state after each physics step.
-            commands: (M, 4) rotor speeds in force during each of these steps [rad/s].
-            standing: whether the feet stood on the ground when the segment began, as a land detector has it.
+        `standing` is what a land detector says of the feet when the segment began.
         """
         if not len(physics):
             return

@@ -219,14 +219,10 @@ def _work(
                 watched.unregister(process.stdout)
                 if process.wait() != 0:
                     logs[i].seek(0)
-                    raise _WorkerFailure(_why(logs[i].read(), folder))
+                    full = shutil.disk_usage(folder).free < _LEAST_FREE_BYTES  # it could not even write that down
+                    raise _WorkerFailure("the disk is full" if full else _last_line(logs[i].read()))
 
 
 def _last_line(text: bytes) -> str:
     lines = text.decode(errors="replace").strip().splitlines()
     return lines[-1].strip() if lines else "it ended without a word"
-
-
-def _why(output: bytes, folder: Path) -> str:
-    """Why a worker failed; on a full disk it could not even write that down."""
-    return "the disk is full" if shutil.disk_usage(folder).free < _LEAST_FREE_BYTES else _last_line(output)

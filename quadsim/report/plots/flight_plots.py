@@ -43,14 +43,9 @@ def comparison_plots(runs: Sequence[Run]) -> list[Plot]:
 
 
 def thin(values: Array, points: int) -> np.ndarray[Any, np.dtype[np.intp]]:
-    """Indices of at most about `points` values: the lowest and highest of each segment, so that no peak is lost.
+    """Rising indices of about `points` of the values (K,): the lowest and highest of each segment, so no peak is lost.
 
-    Args:
-        values: (K,); what is not finite is a gap.
-        points: how many to keep; all are kept where K is no larger.
-
-    Returns:
-        Rising indices, the first, the last, and all gaps included.
+    The first, the last, and all gaps, where a value is not finite, are kept.
     """
     if values.size <= points:
         return np.arange(values.size)
@@ -147,35 +142,26 @@ class _Plotter:
         label: str,
         t: Array,
         values: Array,
-        *,
         shape: str = "linear",
-        mode: str = "lines",
+        **more: Any,
     ) -> None:
+        line = {"color": line_colour(i), "width": 1.6, "shape": shape}
+        marker = {"color": line_colour(i), "size": 3.5}
+        self._curve(figure, panel, t, values, line=line, **{"marker": marker, **_identity(i, label), **more})
+
+    def _curve(self, figure: Figure, panel: int, t: Array, values: Array, mode: str = "lines", **style: Any) -> None:
         from plotly.graph_objects import Scatter
 
         kept = thin(values, self._points)
-        figure.add_trace(
-            Scatter(
-                x=t[kept].astype(np.float32),
-                y=values[kept].astype(np.float32),
-                mode=mode,
-                line={"color": line_colour(i), "width": 1.6, "shape": shape},
-                marker={"color": line_colour(i), "size": 3.5},
-                **_identity(i, label),
-            ),
-            **place(panel),
-        )
+        x, y = t[kept].astype(np.float32), values[kept].astype(np.float32)
+        figure.add_trace(Scatter(x=x, y=y, mode=mode, **style), **place(panel))
 
     def _references(self, figure: Figure, panel: int, name: str) -> None:
         """Each distinct filtered reference of a quantity that has one."""
-        from plotly.graph_objects import Scatter
-
+        line = {"color": REFERENCE, "width": 1.6, "dash": "dash"}
         for run in self._courses if name in REFERENCE_NAMES else ():
             values = reference_curve(run.log.control, name)
-            kept = thin(values, self._points)
-            x, y = run.log.control.t[kept].astype(np.float32), values[kept].astype(np.float32)
-            line = {"color": REFERENCE, "width": 1.6, "dash": "dash"}
-            figure.add_trace(Scatter(x=x, y=y, mode="lines", line=line, name="reference"), **place(panel))
+            self._curve(figure, panel, run.log.control.t, values, line=line, name="reference")
 
     def _bounds(self, figure: Figure, panel: int, signal: str) -> None:
         limits = [limit for _, _, run in self._runs for limit in run.limits]

@@ -47,11 +47,7 @@ _INTERRUPTED: Final = 130
 
 
 def write_recording(run: Run, path: Path) -> None:
-    """Write a run as a rerun recording with its layout inside; the file appears complete or not at all.
-
-    Args:
-        run: a run, completed or aborted, of any length.
-        path: the `.rrd` to write; there must be none.
+    """Write a run, completed or not, as a new `.rrd` with its layout inside; it appears complete or not at all.
 
     Raises:
         OutputError: the file cannot be written or is there already, or the environment switches rerun off.
@@ -133,11 +129,9 @@ def viewer_problem() -> str | None:
 
 
 def open_viewer(path: Path, *, web: bool = False) -> None:
-    """Show a recording; returns when the viewer is closed or Ctrl-C is pressed.
+    """Show a recording in rerun's own window, or serve it, to this machine alone, for a browser.
 
-    Args:
-        path: an `.rrd` file.
-        web: whether to serve it, to this machine alone, for a browser; else rerun's own window shows it.
+    Returns when the viewer is closed or Ctrl-C is pressed.
 
     Raises:
         FileError: there is no such file.

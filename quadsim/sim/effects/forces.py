@@ -36,15 +36,7 @@ class StepForces:
     """
 
     def __init__(self, vehicle: Vehicle, effects: Effects, *, timestep: float, floor: float, disc: float) -> None:
-        """Set up.
-
-        Args:
-            vehicle: whose rotors they are.
-            effects: what acts on it.
-            timestep: physics step [s].
-            floor: height of the ground, world [m].
-            disc: height of the rotor discs, body frame [m].
-        """
+        """Set up, for a physics step [s] and heights of the ground, world [m], and of the discs, body frame [m]."""
         self._inertia = effects.rotors.inertia if effects.rotors is not None else 0.0
         self._drag = effects.rotor_drag
         self._radius = effects.rotor_radius

@@ -75,13 +75,7 @@ class ErrorStateFilter:
     def __init__(
         self, vehicle: Vehicle, sensors: Sequence[Sensor], settings: EstimatorSettings, *, timestep: float
     ) -> None:
-        """Set up, to be reset before use.
-
-        Args:
-            vehicle: the modelled vehicle.
-            sensors: the modelled sensors: their noise and the largest delay.
-            settings: its tuning.
-            timestep: physics step [s].
+        """Set up, to be reset before use, for the modelled vehicle and sensors and a physics step [s].
 
         Raises:
             ParameterError: a sensor is missing, or states a noise of zero.
@@ -185,7 +179,8 @@ class ErrorStateFilter:
                 after = stand(self._model, track.estimate, duration)
             else:
                 after = predict(self._model, track.estimate, driven, duration)
-            if not _plausible(after):
+            size, spread = after.mean @ after.mean, after.covariance.trace()
+            if not (size < _LARGEST**2 and spread < _LARGEST_VARIANCE):
                 # Nothing is known any more: stay where it was, as unsure as at the start, and let the sensors speak.
                 after = Estimate(mean=track.estimate.mean, covariance=np.diag(np.square(self._initial())))
             track.estimate, track.step = after, until
@@ -204,7 +199,3 @@ class ErrorStateFilter:
         track.refused.pop(name, None)
         tally.accepted += 1
         tally.nis += distance
-
-
-def _plausible(estimate: Estimate) -> bool:
-    return bool(estimate.mean @ estimate.mean < _LARGEST**2 and estimate.covariance.trace() < _LARGEST_VARIANCE)

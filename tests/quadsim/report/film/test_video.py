@@ -120,6 +120,14 @@ def test_progress_counts_up_to_all_frames_and_nothing_else_is_left(film: tuple[P
     assert [entry.name for entry in path.parent.iterdir()] == ["flight.mp4"]
 
 
+def test_only_workers_side_by_side_rasterise_in_one_thread(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("LP_NUM_THREADS", raising=False)
+    assert "LP_NUM_THREADS" not in video._environment("egl")
+    assert video._environment("egl", 2)["LP_NUM_THREADS"] == "0"
+    monkeypatch.setenv("LP_NUM_THREADS", "3")
+    assert video._environment("egl", 2)["LP_NUM_THREADS"] == "3"
+
+
 def test_the_callers_environment_is_untouched(backend: str, short_run: Run, tmp_path: Path):
     before = dict(os.environ)
     render_video(short_run.directory, tmp_path / "film.mp4", width=320, height=180, fps=5, stop=1.0)
