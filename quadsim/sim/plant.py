@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from functools import cached_property
 from operator import add
 from struct import Struct
-from types import TracebackType
 from typing import Final
 
 import mujoco
@@ -17,16 +16,18 @@ from mujoco.rollout import Rollout
 from quadsim.controller import check_command
 from quadsim.errors import CommandError, DivergenceError, ForceError, ParameterError
 from quadsim.sim.airframe import BODY, compile_model, outline
-from quadsim.sim.effects import Air, Effects, Force, Load, Payload, PayloadChange, RotorChange, RotorDynamics, Wind
+from quadsim.sim.effects import Effects, Force, Load, Payload, PayloadChange, RotorChange, RotorDynamics
 from quadsim.sim.effects.forces import StepForces
 from quadsim.sim.effects.load import apply_mass, mass_properties
+from quadsim.sim.effects.wind import Air, WindField
 from quadsim.sim.physics import Segment, physics_to_state
 from quadsim.state import (
+    ANGLE_RATES,
+    ANGLES,
     EULER,
-    EULER_RATE,
     N_STATES,
-    POSITION,
-    VELOCITY,
+    POSITIONS,
+    VELOCITIES,
     Array,
     euler_to_body_rates,
     euler_to_quaternion,
@@ -44,8 +45,6 @@ _NUMERICAL_WARNINGS: Final = (
     mujoco.mjtWarning.mjWARN_BADQACC,
     mujoco.mjtWarning.mjWARN_BADCTRL,
 )
-
-
 _CALM: Final = Effects()
 _AS_THE_FILE_SAYS: Final = Load()
 
@@ -72,7 +71,7 @@ class Plant:
         limit_speeds: bool = False,
         effects: Effects = _CALM,
         changes: Sequence[RotorChange | PayloadChange] = (),
-        wind: Wind | None = None,
+        wind: WindField | None = None,
         forces: Sequence[Force] = (),
         rng: np.random.Generator | None = None,
     ) -> None:
@@ -108,9 +107,7 @@ class Plant:
     def __enter__(self) -> Plant:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._rollout.close()
 
     @property
@@ -147,15 +144,10 @@ class Plant:
         if state.shape != (N_STATES,) or not np.all(np.isfinite(state)):
             raise ParameterError("plant", "state", state.tolist(), f"{N_STATES} finite numbers")
         mujoco.mj_resetData(self.model, self._data)
-        euler = state[list(EULER)]
+        euler = state[ANGLES]
+        rates = euler_to_body_rates(euler, state[ANGLE_RATES])
         self._physics[0] = np.concatenate(
-            [
-                [0.0],
-                state[list(POSITION)],
-                euler_to_quaternion(euler),
-                state[list(VELOCITY)],
-                euler_to_body_rates(euler, state[list(EULER_RATE)]),
-            ]
+            [[0.0], state[POSITIONS], euler_to_quaternion(euler), state[VELOCITIES], rates]
         )
         self._yaw = float(euler[2])
         self._step = 0
@@ -251,7 +243,6 @@ class Plant:
         """All steps in one call: thrusts (M, 4) [N] -> states (M, 14)."""
         steps = len(thrusts)
         states = np.empty((1, steps, self._physics.shape[1]))
-        sensors = np.empty((1, steps, self.model.nsensordata))
         self._rollout.rollout(
             [self.model],
             [self._data],
@@ -261,7 +252,7 @@ class Plant:
             skip_checks=True,
             nstep=steps,
             state=states,
-            sensordata=sensors,
+            sensordata=np.empty((1, steps, self.model.nsensordata)),
         )
         return states[0]
 

@@ -145,7 +145,7 @@ def test_run_prints_tables_and_where_the_files_are(here: Path, capsys: pytest.Ca
         assert part in printed.out
     assert "written to runs/hover" in printed.out
     assert printed.err == ""
-    assert rundir.is_run(here / "runs" / "hover")
+    assert rundir.read_summary(here / "runs" / "hover")
 
 
 @pytest.mark.parametrize(
@@ -190,7 +190,7 @@ def test_a_violated_constraint_is_status_1_and_the_run_is_kept(here: Path, capsy
     assert "completed, a required constraint does not hold" in printed.out
     assert printed.out.count("VIOLATED") == 1
     assert printed.err == ""
-    assert rundir.is_run(here / "runs" / "hover")
+    assert rundir.read_summary(here / "runs" / "hover")
 
 
 def test_a_violated_constraint_that_is_not_required_is_status_0(here: Path, capsys: pytest.CaptureFixture[str]) -> None:

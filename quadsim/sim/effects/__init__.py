@@ -110,18 +110,6 @@ class Effects:
         return spinning or dragged or lifted or self.disturbance is not None
 
 
-class Wind(Protocol):
-    """The air's motion along a flight; see `quadsim.sim.effects.wind.WindField`."""
-
-    def reset(self) -> None:
-        """Start again with the same wind."""
-        ...
-
-    def advance(self, steps: int) -> Array:
-        """(steps, 3) wind velocity at the middle of each of the next physics steps, world frame [m/s]."""
-        ...
-
-
 class Force(Protocol):
     """A force of one's own on the vehicle: called once per physics step, at its begin.
 

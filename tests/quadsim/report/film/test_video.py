@@ -7,7 +7,7 @@ import os
 import subprocess
 import sys
 import warnings
-from dataclasses import fields, replace
+from dataclasses import asdict, fields, replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -118,6 +118,14 @@ def test_progress_counts_up_to_all_frames_and_nothing_else_is_left(film: tuple[P
     assert done == sorted(done)
     assert reports[-1] == (30, 30)
     assert [entry.name for entry in path.parent.iterdir()] == ["flight.mp4"]
+
+
+def test_only_workers_side_by_side_rasterise_in_one_thread(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("LP_NUM_THREADS", raising=False)
+    assert "LP_NUM_THREADS" not in video._environment("egl")
+    assert video._environment("egl", 2)["LP_NUM_THREADS"] == "0"
+    monkeypatch.setenv("LP_NUM_THREADS", "3")
+    assert video._environment("egl", 2)["LP_NUM_THREADS"] == "3"
 
 
 def test_the_callers_environment_is_untouched(backend: str, short_run: Run, tmp_path: Path):
@@ -259,7 +267,7 @@ def test_impossible_films_are_refused(short_run: Run, tmp_path: Path, options: d
 def test_a_shot_tells_its_times():
     shot = Shot(run="x", fps=10, start=2.0, speed=4.0, first=5, count=3)
     assert shot.times == pytest.approx([4.0, 4.4, 4.8])
-    assert Shot(**shot.to_json()) == shot
+    assert Shot(**asdict(shot)) == shot
 
 
 def test_footage_meets_the_plant_at_its_rows_and_halfway_between(short_run: Run):
