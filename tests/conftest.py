@@ -19,9 +19,10 @@ from quadsim.flight.rundir import Run
 from quadsim.vehicle import Vehicle
 from scenarios.cost.measure import ARM_LENGTHS, DRAGS
 from scenarios.cost.study import MEASURES, CandidateTimes, CostStudy, Outcome, Sweep, SweepPoint, Variation
+from scenarios.flight import Flight, Outputs
 from scenarios.loading import load_scenario
 from scenarios.parts.vehicle import build_vehicle
-from scenarios.run import Flight, Outputs, fly_scenario, run_scenario
+from scenarios.run import fly_scenario, run_scenario
 
 # What is compiled is kept, also where the environment asks for the contrary: the workers, and all processes that tests
 # start, would compile the same modules again.  `make clean` removes it.

@@ -27,7 +27,7 @@ from quadsim.errors import ParameterError
 from quadsim.sim.effects.rotors import RotorDynamics
 from quadsim.state import INDEX, POSITION, Array, make_state
 from quadsim.vehicle import Vehicle
-from scenarios.run import Flight
+from scenarios.flight import Flight
 
 PERIOD = 0.05
 SOFT = Penalty(l1=np.full(2, 2e5), l2=np.full(2, 1e4))
