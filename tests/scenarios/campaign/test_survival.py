@@ -57,6 +57,7 @@ def test_hostile_flights_change_no_other_flight_and_leave_nobody() -> None:
     assert counts["hostile: memory"] == 4
 
 
+@pytest.mark.usefixtures("sketched")
 def test_flights_that_met_a_limit_stand_in_every_page_and_gate(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
