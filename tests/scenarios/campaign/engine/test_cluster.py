@@ -261,7 +261,7 @@ def test_a_killed_scheduler_ends_the_campaign_with_what_was_answered(
     processes: Callable[..., subprocess.Popen[bytes]], tmp_path: Path
 ) -> None:
     scheduler = processes("scheduler", "--host", "127.0.0.1", "--port", "0")
-    processes("worker", "--nthreads", "1", "--nworkers", "2", "--death-timeout", "5")
+    processes("worker", "--nthreads", "1", "--nworkers", "2", "--death-timeout", "60")
     file = tmp_path / "scheduler.json"
     assert until(lambda: file.exists() and bool(file.read_text()), seconds=30.0), (
         tmp_path / "scheduler.log"
