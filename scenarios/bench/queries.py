@@ -45,18 +45,13 @@ def recorded(scenario: Scenario, log: ControlLog, horizon: int) -> Queries:
 
 
 class QueriedController:
-    """A controller that is given a flight's queries, each after the command that was given before it in that flight.
-
-    Attributes:
-        command: its last answer; None where there was none.
-        statuses: what it answered first, by period: its status, or `failed` where it gave no command.
-    """
+    """A controller that is given a flight's queries, each after the command that was given before it in that flight."""
 
     def __init__(self, controller: Controller, queries: Queries) -> None:
         self._controller, self._queries = controller, queries
-        self.command: Command | None = None
+        self.command: Command | None = None  # its last answer; None where there was none
         self._period: int | None = None
-        self.statuses: dict[int, str] = {}
+        self.statuses: dict[int, str] = {}  # what it answered first, by period; `failed` where it gave no command
 
     def prepare(self, period: int) -> None:
         """See `scenarios.bench.timing.Candidate.prepare`."""

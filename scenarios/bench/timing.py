@@ -144,11 +144,9 @@ class Candidate(Protocol):
 
     def prepare(self, period: int) -> None:
         """Get ready; not timed."""
-        ...
 
     def answer(self) -> None:
         """Answer the question prepared for; timed."""
-        ...
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -28,44 +28,30 @@ class EngineError(QuadsimError):
 
 
 class Pilot(Protocol):
-    """Flies flights, known by their numbers; pickled, and sent to each process once.
-
-    Attributes:
-        limits: of each flight.
-    """
+    """Flies flights, known by their numbers; pickled, and sent to each process once."""
 
     @property
     def limits(self) -> LimitsSpec:
-        """See the class."""
-        ...
+        """Of each flight."""
 
     def prepare(self) -> None:
         """Load what flights need, once in each process that flies; what fails here is reported by the flights."""
-        ...
 
     def fly(self, flight: int, progress: Progress = silent) -> Row:
         """The row of a flight, plain values; reports each control period that is flown."""
-        ...
 
     def lost(self, flight: int, reason: str, verdict: str = ERROR) -> Row:
         """The row of a flight that nobody came back from: its process died or met a limit, or `fly` raised."""
-        ...
 
 
 class Engine(Protocol):
-    """Has flights flown.
+    """Has flights flown."""
 
-    Attributes:
-        name: for the manifest.
-        workers: processes that fly at the same time.
-    """
-
-    name: str
+    name: str  # for the manifest
 
     @property
     def workers(self) -> int:
-        """See the class."""
-        ...
+        """Processes that fly at the same time."""
 
     def answers(self, pilot: Pilot, flights: Sequence[int]) -> Generator[Row]:
         """The rows, each flight's exactly once, in whatever order they come; closing the iterator stops all work.
@@ -73,7 +59,6 @@ class Engine(Protocol):
         Raises:
             EngineError: there is nobody left to fly.
         """
-        ...
 
 
 class Answer(NamedTuple):

@@ -78,13 +78,13 @@ class Event(NamedTuple):
         return np.array([self.holds({self.column_name: value}) for value in table[self.column_name].to_pylist()], bool)
 
 
-def parse_event(text: str, columns: Mapping[str, pa.DataType] | pa.Schema | None = None) -> Event:
+def parse_event(text: str, columns: Mapping[str, pa.DataType] | None = None) -> Event:
     """An event from its text.
 
     Args:
         text: a name of `EVENT_NAMES`, e.g. `failure` or `lost`, where `failed`, `violated` and `crashed` mean the same
             as their nouns; or `COLUMN OP NUMBER` with one of `< <= > >=`, e.g. `rmse.z > 0.5`.
-        columns: those that a comparison may name, with their types, or the schema of a table; None for any.
+        columns: those that a comparison may name, with their types; None for any.
 
     Raises:
         UnknownNameError: no event has that name, or there is no such column.
@@ -106,17 +106,12 @@ def parse_event(text: str, columns: Mapping[str, pa.DataType] | pa.Schema | None
             f"event {text!r} must compare a column that measures a flight, such as rmse.z; {column!r} does not"
         )
     if columns is not None:
-        _require_number(column, columns, text)
+        if column not in columns:
+            raise UnknownNameError("column", column, [name for name, kind in columns.items() if _is_number(kind)])
+        if not _is_number(columns[column]):
+            raise _no_number(text, column)
     number = _number(found["number"], text)
     return Event(f"{column} {found['operation']} {number:.15g}", column, found["operation"], number)
-
-
-def _require_number(column: str, columns: Mapping[str, pa.DataType] | pa.Schema, event: str) -> None:
-    kinds = columns if isinstance(columns, Mapping) else dict(zip(columns.names, columns.types, strict=True))
-    if column not in kinds:
-        raise UnknownNameError("column", column, [name for name, kind in kinds.items() if _is_number(kind)])
-    if not _is_number(kinds[column]):
-        raise _no_number(event, column)
 
 
 def _is_number(kind: pa.DataType) -> bool:

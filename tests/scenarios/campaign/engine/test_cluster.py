@@ -265,7 +265,7 @@ def test_a_killed_scheduler_ends_the_campaign_with_what_was_answered(
 ) -> None:
     monkeypatch.setattr(module, "_CONNECT_S", 4.0)  # as long as it is called again
     scheduler = processes("scheduler", "--host", "127.0.0.1", "--port", "0")
-    processes("worker", "--nthreads", "1", "--nworkers", "2", "--death-timeout", "5")
+    processes("worker", "--nthreads", "1", "--nworkers", "2", "--death-timeout", "60")
     file = tmp_path / "scheduler.json"
     assert until(lambda: file.exists() and bool(file.read_text()), seconds=30.0), (
         tmp_path / "scheduler.log"
