@@ -28,12 +28,10 @@ class ActuatorBounds:
         ParameterError: bounds that are not four numbers each, are not in order, or that forbid holding a speed.
     """
 
-    # (4,) speeds [rad/s], finite and not negative: rotors turn one way
-    u_min: Array
-    u_max: Array
-    # (4,) steps u(k) - u(k-1) [rad/s]; infinite where there is no bound
-    delta_min: Array
-    delta_max: Array
+    u_min: Array  # (4,) speeds [rad/s], finite and not negative: rotors turn one way
+    u_max: Array  # likewise
+    delta_min: Array  # (4,) steps u(k) - u(k-1) [rad/s]; infinite where there is no bound
+    delta_max: Array  # likewise
 
     def __post_init__(self) -> None:
         for name in ("u_min", "u_max", "delta_min", "delta_max"):

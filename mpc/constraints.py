@@ -39,9 +39,8 @@ class Constraint:
     """
 
     name: str  # as messages and audits name it
-    # (m,), or (N, m) where the steps' bounds differ; infinite where there is no bound
-    lower: Array
-    upper: Array
+    lower: Array  # (m,), or (N, m) where the steps' bounds differ; infinite where there is no bound
+    upper: Array  # likewise
     C: Array | None = None  # (m, n); None for zeros
     D: Array | None = None  # (m, nu); likewise
     E: Array | None = None  # (m, nu); likewise
@@ -87,15 +86,12 @@ class Bounds:
     """The constraints of Eqs. (12)-(20); an infinite entry is no bound."""
 
     C_c: Array  # (n_c, n) constrained outputs y_c = C_c xi. Eq. (12)
-    # (n_c,) output bounds. Eq. (13)
-    y_min: Array
-    y_max: Array
-    # (nu,) bounds on u(k) - u(k-1) [rad/s]. Eq. (15)
-    delta_min: Array
-    delta_max: Array
-    # (nu,) input bounds [rad/s]. Eq. (20)
-    u_min: Array
-    u_max: Array
+    y_min: Array  # (n_c,) output bounds. Eq. (13)
+    y_max: Array  # likewise
+    delta_min: Array  # (nu,) bounds on u(k) - u(k-1) [rad/s]. Eq. (15)
+    delta_max: Array  # likewise
+    u_min: Array  # (nu,) input bounds [rad/s]. Eq. (20)
+    u_max: Array  # likewise
     penalty: Penalty | None = None  # what violating an output bound costs; None for hard ones
     margins: Array | None = None  # (N, n_c) by which output bounds are tightened at each predicted state; None for none
 
@@ -130,12 +126,10 @@ class Rows:
     C: Array  # (m, n)
     D: Array  # (m, nu)
     E: Array  # (m, nu)
-    # (N, m)
-    lower: Array
-    upper: Array
-    # (m,) what violating a row costs; l1 is infinite of hard ones
-    l1: Array
-    l2: Array
+    lower: Array  # (N, m)
+    upper: Array  # likewise
+    l1: Array  # (m,) what violating a row costs; l1 is infinite of hard ones
+    l2: Array  # likewise
     # (m,) whether a row is of the state alone: entry i is then for x(k+i+1), otherwise for x(k+i), u(k+i)
     of_states: np.ndarray[tuple[int], np.dtype[np.bool_]]
     input: Indices  # (m,) the input that a hard row bounds by itself; -1 where it is no such row

@@ -25,15 +25,10 @@ from quadsim.state import REFERENCE_STATES, Array
 
 
 class Rest(NamedTuple):
-    """Where the model rests, x_s = A x_s + B (u_s - u_bar), and what the cost pulls inputs to.
+    """Where the model rests, x_s = A x_s + B (u_s - u_bar), and what the cost pulls inputs to."""
 
-    Attributes:
-        x: (n,) x_s.
-        u: (nu,) u_s [rad/s].
-    """
-
-    x: Array
-    u: Array
+    x: Array  # (n,) x_s
+    u: Array  # (nu,) u_s [rad/s]
 
 
 @dataclass(frozen=True, kw_only=True)

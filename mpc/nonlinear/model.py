@@ -64,11 +64,6 @@ class NonlinearModel:
         """Number of states."""
         return N_STATES if self.rotor_lag is None else N_STATES + N_ROTORS
 
-    @property
-    def nu(self) -> int:
-        """Number of inputs."""
-        return N_ROTORS
-
 
 def nonlinear_model(
     vehicle: Vehicle, period: float, *, substeps: int = SUBSTEPS, rotor_lag: float | None = None

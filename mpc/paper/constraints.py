@@ -23,9 +23,8 @@ class Inequalities:
     G2: Array  # (rows, nu). Eqs. (16), (19)
     G3: Array  # (rows,). Eqs. (14), (16), (19)
     G4: Array  # (rows, nu), absent from the paper: +-C_c Psi_i applied to u = u_bar, the offset of the linearisation
-    # (N nu,) input bounds [rad/s]. Eq. (20)
-    u_min: Array
-    u_max: Array
+    u_min: Array  # (N nu,) input bounds [rad/s]. Eq. (20)
+    u_max: Array  # likewise
     n_outputs: int  # N n_c, the length of the first two groups of rows
 
     def right_side(self, state: Array, u_before: Array, u_bar: Array) -> Array:
