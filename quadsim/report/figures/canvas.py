@@ -51,12 +51,12 @@ def write_drawings(drawings: Mapping[str, Callable[[], Figure]], directory: Path
     import matplotlib
 
     paths = []
+    options: dict[str, dict[str, Any]] = {"png": {"dpi": DPI}, "svg": {"metadata": {"Date": None}}}
     try:
         directory.mkdir(parents=True, exist_ok=True)
         with matplotlib.rc_context(STYLE):
             for name, draw in drawings.items():
                 figure = draw()
-                options: dict[str, dict[str, Any]] = {"png": {"dpi": DPI}, "svg": {"metadata": {"Date": None}}}
                 if (layout := figure.get_layout_engine()) is not None:
                     layout.execute(figure)  # once for both files, neither of which is then drawn for it
                 figure.set_layout_engine(None)

@@ -30,6 +30,8 @@ from quadsim.vehicle import N_ROTORS
 if TYPE_CHECKING:
     from plotly.graph_objects import Figure
 
+_Named = tuple[int, str]
+"""Number and name of a run, which set its colour and toggle."""
 _MOST_POINTS: Final = 3000
 _POINTS_OF_ALL_RUNS: Final = 12_000
 """Points that one quantity may have over all runs: keeps a page of two runs near 6 MB, and of ten below 8 MB."""
@@ -84,7 +86,7 @@ class _Plotter:
             self._references(figure, panel, name)
             for i, label, run in self._runs:
                 drawn = break_at_wraps(run.log.plant.t, signal(run.log.plant), SIGNALS[name].unit)
-                self._line(figure, panel, i, label, *drawn)
+                self._line(figure, panel, (i, label), *drawn)
             self._bounds(figure, panel, name)
             keep_least_span(figure, panel, SIGNALS[name].unit)
         return self._timed(figure, key, title)
@@ -94,7 +96,7 @@ class _Plotter:
         for panel in range(N_ROTORS):
             for i, label, run in self._runs:
                 values = SIGNALS[name].sampled(run.log.control)[:, panel]
-                self._line(figure, panel, i, label, run.log.control.t, values, shape="hv")
+                self._line(figure, panel, (i, label), run.log.control.t, values, shape="hv")
             self._bounds(figure, panel, name)
             keep_least_span(figure, panel, SIGNALS[name].unit)
         return self._timed(figure, key, title)
@@ -106,9 +108,9 @@ class _Plotter:
             timing, control = run.log.timing, run.log.control
             for panel, values in enumerate((timing.step_ms, timing.solve_ms)):
                 read = np.where(values > 0.0, values, np.nan)  # a clock may read 0, which has no logarithm
-                self._line(figure, panel, i, label, timing.t, read, mode="markers")
+                self._line(figure, panel, (i, label), timing.t, read, mode="markers")
             for panel, counts in enumerate((control.iterations, control.active), start=2):
-                self._line(figure, panel, i, label, control.t, counts.astype(float), shape="hv")
+                self._line(figure, panel, (i, label), control.t, counts.astype(float), shape="hv")
         for panel in (0, 1):
             figure.update_yaxes(type="log", dtick=1, **place(panel))
         for deadline in {float(run.summary["controller"]["deadline_ms"]) for _, _, run in self._runs}:
@@ -135,19 +137,11 @@ class _Plotter:
         return finished(figure, "path", "Path in space", height=560, timed=False)
 
     def _line(
-        self,
-        figure: Figure,
-        panel: int,
-        i: int,
-        label: str,
-        t: Array,
-        values: Array,
-        shape: str = "linear",
-        **more: Any,
+        self, figure: Figure, panel: int, who: _Named, t: Array, values: Array, shape: str = "linear", **own: Any
     ) -> None:
-        line = {"color": line_colour(i), "width": 1.6, "shape": shape}
-        marker = {"color": line_colour(i), "size": 3.5}
-        self._curve(figure, panel, t, values, line=line, **{"marker": marker, **_identity(i, label), **more})
+        colour = line_colour(who[0])
+        line, marker = {"color": colour, "width": 1.6, "shape": shape}, {"color": colour, "size": 3.5}
+        self._curve(figure, panel, t, values, **{"line": line, "marker": marker, **_identity(*who), **own})
 
     def _curve(self, figure: Figure, panel: int, t: Array, values: Array, mode: str = "lines", **style: Any) -> None:
         from plotly.graph_objects import Scatter
