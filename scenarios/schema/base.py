@@ -6,6 +6,7 @@ A table is a `Spec`, or a settings dataclass of the core, which is then its only
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Sequence
 from typing import Annotated, Any, Final, TypeGuard, get_type_hints
 
@@ -46,8 +47,12 @@ def is_table(kind: object) -> TypeGuard[type[Any]]:
 
 def fields_of(table: type[Any]) -> dict[str, FieldInfo]:
     """The fields of a table by their names, with types, limits, defaults and descriptions."""
-    if issubclass(table, BaseModel):
-        return table.model_fields
+    return table.model_fields if issubclass(table, BaseModel) else _declared(table)  # type: ignore[arg-type]
+
+
+@functools.cache
+def _declared(table: Any) -> dict[str, FieldInfo]:
+    """The fields of a dataclass."""
     hints = get_type_hints(table, include_extras=True)
     found = {}
     for field in sorted(dataclasses.fields(table), key=lambda field: _FIRST.get(field.name, len(_FIRST))):
