@@ -9,7 +9,8 @@ from typing import Annotated, Literal
 from annotated_types import MaxLen, MinLen
 from pydantic import Field, model_validator
 
-from scenarios.schema.base import LARGEST_SEED, MOST_ENTRIES, Number, Positive, Spec
+from quadsim.fields import Number, Positive
+from scenarios.schema.base import LARGEST_SEED, MOST_ENTRIES, Spec
 
 Whole = Annotated[int, Field(ge=-LARGEST_SEED, le=LARGEST_SEED)]
 Value = bool | Whole | Number | str | list[Number]

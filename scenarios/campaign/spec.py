@@ -9,9 +9,10 @@ from annotated_types import MaxLen, MinLen
 from pydantic import Field, model_validator
 
 from quadsim.errors import InputError
+from quadsim.fields import Positive
 from scenarios.campaign.distributions import GridSpec, VarySpec
 from scenarios.campaign.results.events import parse_event
-from scenarios.schema.base import LARGEST_SEED, MOST_ENTRIES, Positive, Spec
+from scenarios.schema.base import LARGEST_SEED, MOST_ENTRIES, Spec
 from scenarios.schema.writing import to_toml
 
 MOST_FLIGHTS: Final = 1_000_000

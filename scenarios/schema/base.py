@@ -14,14 +14,11 @@ from annotated_types import DocInfo, Len
 from pydantic import BaseModel, ConfigDict
 from pydantic.fields import FieldInfo
 
-from quadsim.fields import Fraction, NonNegative, Number, Positive
-
-__all__ = ["Fraction", "NonNegative", "Number", "Positive"]  # and what stands here
+from quadsim.fields import Number
 
 MOST_ENTRIES: Final = 1000
 """Of a list of tables."""
 Triple = Annotated[list[Number], Len(3, 3)]
-Quadruple = Annotated[list[Number], Len(4, 4)]
 Pair = Annotated[list[Number], Len(2, 2)]
 LARGEST_SEED: Final = 2**63 - 1
 """The largest whole number that every reader of TOML takes."""

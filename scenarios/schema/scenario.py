@@ -12,12 +12,13 @@ from pydantic import BeforeValidator, Field, create_model, model_validator
 from pydantic_core import PydanticCustomError
 
 from quadsim.errors import InputError, ParameterError
+from quadsim.fields import Positive
 from quadsim.flight.audit import Limit
 from quadsim.sim.computation import ComputationTime
 from quadsim.sim.effects import Effects
 from quadsim.sim.physics import steps_per_period
 from quadsim.vehicle import VEHICLE_UNITS, Vehicle
-from scenarios.schema.base import LARGEST_SEED, MOST_ENTRIES, Positive, Spec, Triple, fields_of
+from scenarios.schema.base import LARGEST_SEED, MOST_ENTRIES, Spec, Triple, fields_of
 from scenarios.schema.controller import ControllerSpec
 from scenarios.schema.course import ReferenceSpec
 from scenarios.schema.events import Event, PayloadDropEvent, PayloadPickupEvent, SensorFaultEvent

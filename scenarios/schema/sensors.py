@@ -20,10 +20,10 @@ from annotated_types import Len, doc
 from pydantic import Discriminator, Field, Tag
 
 from quadsim.errors import ParameterError
-from quadsim.fields import Vector
+from quadsim.fields import NonNegative, Number, Vector
 from quadsim.sim.estimation.settings import EstimatorSettings
 from quadsim.sim.sensing.sensor import Sampling, Sensor, SensorName
-from scenarios.schema.base import NonNegative, Number, Spec
+from scenarios.schema.base import Spec
 
 
 def _number_or_list(value: object) -> str:
