@@ -153,7 +153,7 @@ class Vehicle:
 
     @property
     def allocation(self) -> Array:
-        """(4, 4) matrix taking squared rotor speeds to [U, tau_x, tau_y, tau_z] [N, N m] (Sec. 2.2)."""
+        """(4, 4) matrix taking squared rotor speeds to [U, tau_x, tau_y, tau_z], in N and N m (Sec. 2.2)."""
         b, d = self.thrust_coefficient, self.drag_coefficient
         x, y, _ = self.rotor_positions.T
         return np.stack([np.full(N_ROTORS, b), b * y, -b * x, d * np.array(self.rotor_spins, float)])

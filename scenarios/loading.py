@@ -7,8 +7,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
-from pydantic import ValidationError
-
 from quadsim.errors import FileError, ParameterError, UnknownNameError
 from quadsim.flight.ground import AIRBORNE, TOUCH, clearance
 from quadsim.sim.airframe import outline
@@ -20,7 +18,7 @@ from scenarios.parts.vehicle import build_initial_state, build_vehicle
 from scenarios.schema.bases import read_scenario, replaced_tables, retyped
 from scenarios.schema.course import CsvSpec
 from scenarios.schema.plugin import located as located_controller
-from scenarios.schema.problems import ScenarioError, describe_all
+from scenarios.schema.problems import ScenarioError
 from scenarios.schema.scenario import Scenario
 from scenarios.schema.settings import apply_setting
 
@@ -144,10 +142,7 @@ def parse_scenario(data: Mapping[str, Any], *, source: str = "scenario", directo
     """
     if directory is not None and "controller" in data:
         data = {**data, "controller": located_controller(data["controller"], directory)}
-    try:
-        scenario = Scenario.read(data)
-    except ValidationError as error:
-        raise ScenarioError(source, describe_all(error, data, Scenario)) from error
+    scenario = Scenario.parse(data, source=source)
     file = scenario.vehicle.file
     if directory is not None and file.endswith(".toml") and (directory / file).is_file():
         absolute = str((directory / file).resolve())

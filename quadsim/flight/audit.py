@@ -229,8 +229,12 @@ class Finding:
 
 def margins_sampled(limit: Limit, log: FlightLog) -> Array:
     """(K,) signed margins of a limit at the control samples, NaN outside its time window."""
-    margins = limit.margin(limit.source.sampled(log.control))
-    return np.where(_inside(limit, log.control.t), margins, np.nan)
+    return margins_at(limit, log.control.t, limit.source.sampled(log.control))
+
+
+def margins_at(limit: Limit, t: Array, values: Array) -> Array:
+    """(K,) signed margins of a limit on the values of its signal at times t (K,), NaN outside its time window."""
+    return np.where(_inside(limit, t), limit.margin(values), np.nan)
 
 
 def audit(log: FlightLog, limits: tuple[Limit, ...]) -> tuple[Finding, ...]:

@@ -107,6 +107,13 @@ def limit_from_json(entry: Mapping[str, Any]) -> Limit:
     return SumLimit(terms=tuple((name, float(factor)) for name, factor in entry["terms"].items()), **values)
 
 
+def finding_from_json(entry: Mapping[str, Any]) -> Finding:
+    """The finding that `limit_to_json` wrote."""
+    names = ("peak_sampled", "peak_plant", "worst_margin_sampled", "worst_margin", "worst_time", "time_violated")
+    values = {name: math.nan if entry[name] is None else float(entry[name]) for name in names}
+    return Finding(limit=limit_from_json(entry), **values)
+
+
 def is_run(directory: Path) -> bool:
     """Whether a path is a run directory: one with a summary of quadsim's, since others write a `summary.json` too."""
     try:

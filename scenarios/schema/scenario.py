@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import json
 import math
+import tomllib
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, get_args
 
 from annotated_types import MaxLen
-from pydantic import BeforeValidator, Field, create_model, model_validator
+from pydantic import BeforeValidator, Field, ValidationError, create_model, model_validator
 from pydantic_core import PydanticCustomError
 
 from quadsim.errors import InputError, ParameterError
@@ -23,7 +24,9 @@ from scenarios.schema.controller import ControllerSpec
 from scenarios.schema.course import ReferenceSpec
 from scenarios.schema.events import Event, PayloadDropEvent, PayloadPickupEvent, SensorFaultEvent
 from scenarios.schema.optimisation import BoundedSpec
+from scenarios.schema.problems import ScenarioError, describe_all
 from scenarios.schema.sensors import EstimatorSpec, SensorsSpec, check_sensing
+from scenarios.schema.settings import set_field
 from scenarios.schema.writing import to_toml
 
 
@@ -237,6 +240,40 @@ class Scenario(Spec):
     def plant_stride(self) -> int:
         """Physics steps per row of `plant.parquet`."""
         return steps_per_period(1.0 / self.log_rate, self.plant.timestep)
+
+    @classmethod
+    def parse(cls, data: Mapping[str, Any], *, source: str = "scenario") -> Scenario:
+        """Check a scenario given as nested tables.
+
+        Raises:
+            ScenarioError: naming every field that is wrong.
+        """
+        try:
+            return cls.read(data)
+        except ValidationError as error:
+            raise ScenarioError(source, describe_all(error, data, cls)) from error
+
+    def replace(self, changes: Mapping[str, Any]) -> Scenario:
+        """A scenario that differs in some fields; this one stays as it is.
+
+        Args:
+            changes: new values by dotted path, as for `--set`: an entry of a list of tables by its name, or else its
+                index.  Units as in the file.
+
+        Raises:
+            InputError: there is no such field, or a value is not allowed.
+
+        Examples:
+            >>> import quadsim
+            >>> scenario = quadsim.load("paper-constrained")
+            >>> longer = scenario.replace({"controller.horizon": 30, "vehicle.mass": 4.2})
+            >>> scenario.controller.horizon, longer.controller.horizon
+            (50, 30)
+        """
+        data = tomllib.loads(self.to_toml())
+        for path, value in changes.items():
+            set_field(data, path, value.tolist() if hasattr(value, "tolist") else value, asked="replace")
+        return Scenario.parse(data, source=self.name)
 
     def to_toml(self) -> str:
         """The resolved file: every field, defaults included, with comments; parsing it gives this scenario again."""
