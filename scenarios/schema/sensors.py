@@ -27,7 +27,7 @@ from scenarios.schema.base import Spec
 
 
 def _number_or_list(value: object) -> str:
-    return "list" if isinstance(value, list) else "number"
+    return "list" if isinstance(value, list | tuple) else "number"
 
 
 Deviations = Annotated[
