@@ -142,6 +142,11 @@ def parse_scenario(data: Mapping[str, Any], *, source: str = "scenario", directo
     """
     if directory is not None and "controller" in data:
         data = {**data, "controller": located_controller(data["controller"], directory)}
+    if directory is not None and isinstance(data.get("forces"), list):
+        forces = [
+            located_controller(force, directory) if isinstance(force, dict) else force for force in data["forces"]
+        ]
+        data = {**data, "forces": forces}
     scenario = Scenario.parse(data, source=source)
     file = scenario.vehicle.file
     if directory is not None and file.endswith(".toml") and (directory / file).is_file():

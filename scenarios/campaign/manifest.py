@@ -132,7 +132,7 @@ def require_same(plan: Plan, directory: Path) -> None:
 
 
 def other_than_flew(manifest: Mapping[str, Any], plan: Plan) -> list[str]:
-    """Of `code`, `controller`, `versions` and `machine`, those that are not as when a campaign was begun.
+    """Of `code`, `controller`, `forces`, `versions` and `machine`, those that are not as when a campaign was begun.
 
     Imports a plug-in controller; what is to run, and what ran then, is logged to
     `scenarios.parts.foreign_code.LOGGER` before.
@@ -147,6 +147,7 @@ def _flown_by(plan: Plan) -> dict[str, Any]:
     return {
         "code": code_digest(),
         "controller": controller_digest(plan.scenario),
+        "forces": [find_code(force).digest for force in plan.scenario.forces] or None,
         "versions": versions(),
         "machine": machine(),
     }

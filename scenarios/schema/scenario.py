@@ -24,6 +24,7 @@ from scenarios.schema.controller import ControllerSpec
 from scenarios.schema.course import ReferenceSpec
 from scenarios.schema.events import Event, PayloadDropEvent, PayloadPickupEvent, SensorFaultEvent
 from scenarios.schema.optimisation import BoundedSpec
+from scenarios.schema.plugin import ForceSpec
 from scenarios.schema.problems import ScenarioError, describe_all
 from scenarios.schema.sensors import EstimatorSpec, SensorsSpec, check_sensing
 from scenarios.schema.settings import set_field
@@ -151,6 +152,9 @@ class Scenario(Spec):
     reference: ReferenceSpec
     controller: ControllerSpec
     effects: Effects = Effects()
+    forces: Annotated[list[ForceSpec], MaxLen(MOST_ENTRIES)] = Field(
+        default=[], description="forces of one's own on the vehicle, each code that is called once per physics step"
+    )
     computation: ComputationTime | None = Field(default=None, description="absent: commands take no time")
     sensors: SensorsSpec | None = Field(default=None, description="absent: the controller receives the true state")
     estimator: EstimatorSpec | None = Field(
