@@ -10,8 +10,9 @@ from annotated_types import MaxLen, MinLen
 from pydantic import Field, model_validator
 
 from quadsim.errors import InputError
+from quadsim.fields import Number, Positive
 from scenarios.campaign.results.events import parse_event
-from scenarios.schema.base import LARGEST_SEED, MOST_ENTRIES, Number, Positive, Spec
+from scenarios.schema.base import LARGEST_SEED, MOST_ENTRIES, Spec
 from scenarios.schema.writing import to_toml
 
 Whole = Annotated[int, Field(ge=-LARGEST_SEED, le=LARGEST_SEED)]

@@ -12,13 +12,14 @@ from annotated_types import MaxLen
 from pydantic import BeforeValidator, Field, ValidationError, create_model, model_validator
 from pydantic_core import PydanticCustomError
 
-from quadsim.errors import ParameterError
+from quadsim.errors import InputError, ParameterError
+from quadsim.fields import Positive
 from quadsim.flight.audit import Limit
 from quadsim.sim.computation import ComputationTime
 from quadsim.sim.effects import Effects
 from quadsim.sim.physics import steps_per_period
 from quadsim.vehicle import VEHICLE_UNITS, Vehicle
-from scenarios.schema.base import LARGEST_SEED, MOST_ENTRIES, Positive, Spec, Triple, fields_of
+from scenarios.schema.base import LARGEST_SEED, MOST_ENTRIES, Spec, Triple, fields_of
 from scenarios.schema.controller import ControllerSpec
 from scenarios.schema.course import ReferenceSpec
 from scenarios.schema.events import Event, PayloadDropEvent, PayloadPickupEvent, SensorFaultEvent
@@ -219,8 +220,15 @@ class Scenario(Spec):
 
         They are validated as JSON, where lists are tuples, texts are enumerations' values and tables are dataclasses,
         and nothing else is converted.  What JSON cannot hold, as dates, is infinite there, which is allowed nowhere.
+
+        Raises:
+            InputError: a number has more digits than can be written.
         """
-        return cls.model_validate_json(json.dumps(data, default=lambda _: math.inf))
+        try:
+            text = json.dumps(data, default=lambda _: math.inf)
+        except ValueError as error:
+            raise InputError(f"a scenario must be one that can be written: {error}") from error
+        return cls.model_validate_json(text)
 
     @property
     def periods(self) -> int:
