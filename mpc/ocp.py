@@ -136,7 +136,7 @@ class Problem:
             _check_shape("u_min", self.bounds.u_min, (nu,))
             if self.bounds.margins is not None:
                 _check_shape("margins", self.bounds.margins, (self.horizon, self.bounds.y_min.size))
-        for constraint in (*(self.bounds.constraints if self.bounds else ()), *self.constraints):
+        for constraint in self.every_constraint:
             m = constraint.lower.shape[-1]
             for name, matrix, columns in (("C", constraint.C, n), ("D", constraint.D, nu), ("E", constraint.E, nu)):
                 if matrix is not None:
@@ -149,6 +149,11 @@ class Problem:
         """The equilibrium that the model is linearised at, the origin."""
         return Rest(np.zeros(self.model.n), self.model.u_bar)
 
+    @property
+    def every_constraint(self) -> tuple[Constraint, ...]:
+        """The paper's, in the order of `Bounds.constraints`, and then the others."""
+        return (*(self.bounds.constraints if self.bounds else ()), *self.constraints)
+
     @cached_property
     def rows(self) -> Rows:
         """The rows of all constraints.
@@ -156,7 +161,7 @@ class Problem:
         Raises:
             ValueError: there are none.
         """
-        constraints = (*(self.bounds.constraints if self.bounds else ()), *self.constraints)
+        constraints = self.every_constraint
         if not constraints:
             raise ValueError("a constrained MPC needs a problem with bounds")
         N, n, nu = self.horizon, self.model.n, self.model.nu
@@ -195,6 +200,47 @@ class Problem:
             input=np.where(single, np.argmax(D, axis=1), -1)[bounded],
             names=tuple(names[bounded].tolist()),
         )
+
+
+class Query(NamedTuple):
+    """What a problem is solved for in one period.
+
+    Attributes:
+        state: (n,) x(k).
+        desired: (N, n_r) y_d for x(k+1) .. x(k+N).
+        u_before: (nu,) u(k-1) [rad/s].
+        rest: where the model rests; None for the problem's.
+        steps: A_i (N, n, n), B_i (N, n, nu), c_i (N, n) of a model that changes; None for the problem's about `rest`.
+    """
+
+    state: Array
+    desired: Array
+    u_before: Array
+    rest: Rest | None = None
+    steps: tuple[Array, Array, Array] | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Unanswered:
+    """The first problem of a flight that had no answer; `mpc.diagnosis` says why.
+
+    Attributes:
+        problem: what was to be solved.
+        query: for what; its state and input are copied.
+        status: what spoke against the answer.
+        time: t_k, the period's begin [s].
+        delay: from there to the instant of x(k) [s].
+    """
+
+    problem: Problem
+    query: Query
+    status: str
+    time: float
+    delay: float = 0.0
+
+    def __post_init__(self) -> None:
+        query = self.query
+        object.__setattr__(self, "query", query._replace(state=query.state.copy(), u_before=query.u_before.copy()))
 
 
 def _check_shape(name: str, value: Array, shape: tuple[int, ...]) -> None:

@@ -18,7 +18,7 @@ import numpy as np
 
 from quadsim.controller import Phase
 from quadsim.errors import FileError, InputError, printable
-from quadsim.flight import rundir
+from quadsim.flight import metrics, rundir
 from quadsim.flight.audit import Finding, audit
 from quadsim.flight.log import FlightLog
 from quadsim.flight.parquet import FLIGHT_FILE, HORIZON_FILE, PLANT_FILE, TIMING_FILE
@@ -167,7 +167,11 @@ def _differences(
     for entry, finding in zip(entries, findings, strict=True):
         yield from (f"{finding.limit.name}: {what}" for what in _constraint_differences(entry, finding, scenario, log))
     required = all(entry["satisfied"] for entry in entries if entry["required"])
-    satisfied = summary["reason"] is None and not _is_crashed(log) and required
+    unrecovered = metrics.unrecovered(log.control)
+    if summary["tracking"] and summary["controller"].get("unrecovered", 0) != unrecovered:
+        recorded = summary["controller"].get("unrecovered", 0)
+        yield f"controller.unrecovered is recorded as {recorded}, and the tables give {unrecovered}"
+    satisfied = summary["reason"] is None and not _is_crashed(log) and not unrecovered and required
     if summary["satisfied"] != satisfied:
         yield f"satisfied is recorded as {summary['satisfied']}, and its audit and outcome make it {satisfied}"
     outcome = "lost" if summary["reason"] is not None else "satisfied" if satisfied else "violated"
@@ -239,7 +243,8 @@ def _margin(finding: Finding, peak: float | None) -> float | None:
 
 def _is_satisfied(reason: str | None, scenario: Scenario, log: FlightLog, findings: Sequence[Finding]) -> bool:
     whole = reason is None and log.control.t.size == scenario.periods and not _is_crashed(log)
-    return whole and all(finding.satisfied for finding in findings if finding.limit.required)
+    held = all(finding.satisfied for finding in findings if finding.limit.required)
+    return whole and held and not metrics.unrecovered(log.control)
 
 
 def _is_crashed(log: FlightLog) -> bool:

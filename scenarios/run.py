@@ -6,11 +6,13 @@ import contextlib
 import time as clock
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 from threadpoolctl import threadpool_limits
 
+from mpc.ocp import Unanswered
 from quadsim.controller import Controller, Phase
 from quadsim.flight import metrics, rundir
 from quadsim.flight.audit import Finding, audit
@@ -101,6 +103,7 @@ class Flight:
         solver: name of its QP solver; empty for a closed form.
         simulate_s: wall time of the closed loop alone [s].
         tallies: what became of each sensor's samples in the estimator; empty without one.
+        unanswered: the first period whose QP had no answer; None where all had, or there is none.
     """
 
     scenario: Scenario
@@ -111,12 +114,18 @@ class Flight:
     solver: str
     simulate_s: float
     tallies: Mapping[SensorName, Tally]
+    unanswered: Unanswered | None = None
 
     @property
     def satisfied(self) -> bool:
-        """Whether the flight was completed without a crash, and every required constraint held."""
-        whole = self.log.reason is None and str(Phase.CRASHED) not in self.log.control.phase
-        return whole and all(finding.satisfied for finding in self.findings if finding.limit.required)
+        """Whether the flight was completed, without a crash or fallback for good, and every required constraint held.
+
+        What fallback for good is: `quadsim.flight.metrics.unrecovered`.
+        """
+        control = self.log.control
+        whole = self.log.reason is None and str(Phase.CRASHED) not in control.phase
+        held = all(finding.satisfied for finding in self.findings if finding.limit.required)
+        return whole and held and not metrics.unrecovered(control)
 
     @property
     def outcome(self) -> Verdict:
@@ -124,6 +133,13 @@ class Flight:
         if self.log.reason is not None:
             return "lost"
         return "satisfied" if self.satisfied else "violated"
+
+    @cached_property
+    def diagnosis(self) -> dict[str, Any] | None:
+        """Why the first QP without an answer had none, see `scenarios.diagnosis`; made when it is first asked for."""
+        from scenarios.diagnosis import diagnose
+
+        return None if self.unanswered is None else diagnose(self.unanswered, self.scenario, self.vehicle)
 
 
 def fly_scenario(scenario: Scenario, progress: Progress = silent) -> Flight:
@@ -149,6 +165,7 @@ def fly_scenario(scenario: Scenario, progress: Progress = silent) -> Flight:
                 progress=lambda done: progress("flight", done, scenario.periods),
             )
             simulate_s = clock.perf_counter() - started
+        unanswered = getattr(controller, "unanswered", None)  # a controller of another kind has none
     return Flight(
         scenario=resolve(scenario, vehicle),
         vehicle=vehicle,
@@ -158,6 +175,7 @@ def fly_scenario(scenario: Scenario, progress: Progress = silent) -> Flight:
         solver=controller.solver,
         simulate_s=simulate_s,
         tallies={} if navigation is None else navigation.tallies,
+        unanswered=unanswered if isinstance(unanswered, Unanswered) else None,
     )
 
 
@@ -217,6 +235,7 @@ def summarise(flight: Flight) -> dict[str, Any]:
         "tracking": numbers["tracking"],
         "constraints": [rundir.limit_to_json(finding) for finding in flight.findings],
         "control": numbers["control"],
+        "diagnosis": flight.diagnosis,
         "controller": {
             "name": flight.controller,
             "solver": flight.solver,

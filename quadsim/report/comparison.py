@@ -171,6 +171,7 @@ def _solver_rows(summaries: Sequence[Summary]) -> Iterator[Row]:
 
     yield row("statuses", lambda controller: Cell(text=_counts(controller.get("statuses"))))
     yield row("periods by fallback level", lambda controller: Cell(text=_counts(controller.get("fallbacks"))))
+    yield row("in fallback for good", lambda controller: Cell(text=format_number(controller.get("unrecovered"))))
     yield row("iterations, mean", lambda controller: Cell(text=format_number(nested(controller, "iterations", "mean"))))
     yield row("iterations, most", lambda controller: Cell(text=format_number(nested(controller, "iterations", "max"))))
     yield row("active constraints, most", lambda controller: Cell(text=format_number(controller.get("active_max"))))

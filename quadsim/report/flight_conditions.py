@@ -23,6 +23,13 @@ _TOUCHDOWN: Final = {
     "tilt": ("touchdown, tilt", "deg"),
 }
 _ERRORS: Final = {"rmse": "RMS error of the measured", "max_error": "largest error of the measured"}
+_VERDICTS: Final = {
+    "satisfied": "holds every required constraint",
+    "violated": "does not hold every required constraint",
+    "lost": "is lost",
+}
+FOR_GOOD: Final = "ends in fallback for good"
+"""Of a flight whose verdict rests on that alone; see `quadsim.flight.metrics.unrecovered`."""
 _MEASURED: Final = ("x", "y", "z", "roll", "pitch", "yaw")
 
 
@@ -37,8 +44,22 @@ def verdict(summary: Summary) -> str:
     """The verdict on a flight in one word: satisfied, violated, or lost."""
     if summary["status"] != "completed":
         return "lost"
-    demanded = (entry for entry in summary["constraints"] if entry["required"])
-    return "satisfied" if all(entry["satisfied"] for entry in demanded) else "violated"
+    return "satisfied" if summary["satisfied"] else "violated"
+
+
+def verdict_sentence(summary: Summary) -> str:
+    """What the verdict rests on, after the name of the flight."""
+    found = verdict(summary)
+    if found == "violated" and all(entry["satisfied"] for entry in summary["constraints"] if entry["required"]):
+        return FOR_GOOD if summary["controller"].get("unrecovered") else "crashes"
+    return _VERDICTS[found]
+
+
+def failure_sentences(summary: Summary) -> list[str]:
+    """What kept the controller from its optimum: fallback for good, and why the first QP without an answer had none."""
+    periods, found = summary["controller"].get("unrecovered"), summary.get("diagnosis")
+    sentences = [f"{periods} periods in fallback, never recovered"] if periods else []
+    return sentences + ([] if found is None else [found["sentence"], *filter(None, [found["advice"]])])
 
 
 def verdict_cell(summary: Summary) -> Cell:

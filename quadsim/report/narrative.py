@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any, Final
+from typing import Any
 
 from quadsim.flight.rundir import Run
 from quadsim.report.comparison import (
@@ -16,17 +16,11 @@ from quadsim.report.comparison import (
     run_names,
     tracking_values,
 )
-from quadsim.report.flight_conditions import nested, verdict
+from quadsim.report.flight_conditions import failure_sentences, nested, verdict, verdict_sentence
 from quadsim.report.table import format_number
 
 _Summary = Mapping[str, Any]
 _Named = Sequence[tuple[str, _Summary]]
-
-_VERDICTS: Final = {
-    "satisfied": "holds every required constraint",
-    "violated": "does not hold every required constraint",
-    "lost": "is lost",
-}
 
 
 def comparison_sentences(runs: Sequence[Run]) -> list[str]:
@@ -51,13 +45,16 @@ def _outcome_sentences(named: _Named) -> Iterator[str]:
 
 
 def condition_sentences(named: _Named) -> Iterator[str]:
-    """What was expected of each flight, and what it met: course, ground, measurement errors, delays of commands."""
+    """What was expected of each flight, why a QP had no answer, and what it met: course, ground, errors, delays."""
     for name, summary in named:
         found, expected = verdict(summary), summary.get("expected")
         if expected is not None and not summary.get("as_expected"):
-            yield f"{name} {_VERDICTS[found]}; its scenario states the verdict {expected}."
+            yield f"{name} {verdict_sentence(summary)}; its scenario states the verdict {expected}."
         elif expected is not None and found != "satisfied":
-            yield f"{name} {_VERDICTS[found]}, as its scenario states."
+            yield f"{name} {verdict_sentence(summary)}, as its scenario states."
+    for name, summary in named:
+        if parts := failure_sentences(summary):
+            yield f"{name}: {'; '.join(parts)}."
     courses: dict[str, list[str]] = {}
     for name, summary in named:
         if sentence := nested(summary, "course", "sentence"):

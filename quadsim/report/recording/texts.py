@@ -10,6 +10,7 @@ import numpy as np
 from quadsim.controller import ACCEPTED, Phase
 from quadsim.flight.rundir import Run
 from quadsim.report.comparison import tracking_values
+from quadsim.report.flight_conditions import failure_sentences
 from quadsim.report.narrative import condition_sentences
 from quadsim.report.recording.style import time_column
 
@@ -33,6 +34,7 @@ def send_texts(recording: rr.RecordingStream, run: Run) -> None:
         if (status, fallback) != before
     ]
     events += _phase_changes(run)
+    events += _failures(run)
     events.append((end, _outcome(run), "INFO" if run.log.reason is None else "ERROR"))
     times, texts, levels = zip(*sorted(events, key=lambda event: event[0]), strict=True)
     recording.log("summary", rr.TextDocument(_summary(run), media_type=rr.MediaType.MARKDOWN), static=True)
@@ -49,6 +51,16 @@ def _phase_changes(run: Run) -> list[tuple[float, str, str]]:
         for t, before, phase in zip(control.t, [None, *control.phase], control.phase, strict=False)
         if phase != before
     ]
+
+
+def _failures(run: Run) -> list[tuple[float, str, str]]:
+    """Time, text and level of fallback for good, from its begin, and of why the first QP without an answer had none."""
+    sentences, times = failure_sentences(run.summary), []
+    if periods := run.summary["controller"].get("unrecovered"):
+        times.append(float(run.log.control.t[-periods]))
+    if found := run.summary.get("diagnosis"):
+        times += [found["time"]] * (len(sentences) - len(times))
+    return [(time, text, "ERROR") for time, text in zip(times, sentences, strict=True)]
 
 
 def _outcome(run: Run) -> str:
