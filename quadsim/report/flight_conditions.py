@@ -44,15 +44,20 @@ def verdict(summary: Summary) -> str:
     """The verdict on a flight in one word: satisfied, violated, or lost."""
     if summary["status"] != "completed":
         return "lost"
-    return "satisfied" if summary["satisfied"] else "violated"
+    whole = not (summary["controller"].get("unrecovered") or nested(summary, "ground", "crashed"))
+    return "satisfied" if whole and _all_held(summary) else "violated"
 
 
 def verdict_sentence(summary: Summary) -> str:
     """What the verdict rests on, after the name of the flight."""
     found = verdict(summary)
-    if found == "violated" and all(entry["satisfied"] for entry in summary["constraints"] if entry["required"]):
+    if found == "violated" and _all_held(summary):
         return FOR_GOOD if summary["controller"].get("unrecovered") else "crashes"
     return _VERDICTS[found]
+
+
+def _all_held(summary: Summary) -> bool:
+    return all(entry["satisfied"] for entry in summary["constraints"] if entry["required"])
 
 
 def failure_sentences(summary: Summary) -> list[str]:

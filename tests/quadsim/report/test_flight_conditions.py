@@ -99,15 +99,7 @@ def test_a_verdict_is_held_against_the_one_the_scenario_states(
     bare_run: Run, status: str, satisfied: bool, expected: str, as_expected: bool, text: str, mark: Mark, sentence: str
 ) -> None:
     constraints = [{**bare_run.summary["constraints"][0], "required": True, "satisfied": satisfied}]
-    run = having(
-        bare_run,
-        "flight",
-        status=status,
-        satisfied=satisfied,
-        constraints=constraints,
-        expected=expected,
-        as_expected=as_expected,
-    )
+    run = having(bare_run, "flight", status=status, constraints=constraints, expected=expected, as_expected=as_expected)
     found = verdict_cell(run.summary)
     assert (found.text, found.mark) == (text, mark)
     told = [each for each in comparison_sentences([run]) if "scenario states" in each]
