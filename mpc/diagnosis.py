@@ -265,7 +265,7 @@ def _relaxed(
         A_eq=qp.A @ basis,
         b_eq=qp.b,
         bounds=[(0.0, None) if price else (None, None) for price in cost],
-        method="highs",
+        method="highs-ds",
     )
     if found.status:
         return None

@@ -297,6 +297,7 @@ def _advice(found: Mapping[str, Any]) -> str:
         return ""
     tried = [
         ", ".join(f"{field} = {_toml(value)}" for field, value in each["settings"].items())
+        + (" (without the field solver)" if "controller.type" in each["settings"] else "")
         + (f" (level hover; an answer again after {each['after']:.2f} s, by the model)" if each["after"] else "")
         for each in found["suggestions"]
     ]
