@@ -115,7 +115,8 @@ def find_conflict(unanswered: Unanswered) -> Conflict | None:
                 last=int(steps[-1]) + later,
             )
             sides[side] = _moved(sides[side], share + FEASIBLE)  # for what comes next, as wide as it has to be
-        held |= _needed(problem, query, present, elastic, found.priced - giving.keys(), found.total)
+        priced = {side: one for side, one in present.items() if side in found.priced or side in giving}
+        held |= _needed(problem, query, priced, elastic, found.priced - giving.keys(), found.total)
     return Conflict(total=total, violated=violated, in_the_way=tuple(sorted(held - violated.keys())))
 
 
@@ -210,7 +211,7 @@ def _needed(
     total: float,
 ) -> set[Side]:
     """Of the bounds that are held, those without each of which there is less violation; no fewer would do."""
-    present = {side: one for side, one in sides.items() if side in elastic or side in held}
+    present = dict(sides)
     for side in sorted(held):
         fewer = {other: one for other, one in present.items() if other != side}
         found = _relaxed(problem, query, fewer, elastic)
@@ -248,15 +249,14 @@ def _relaxed(
         [side for side in sides if side in elastic],
         form.slacks(np.arange(qp.c.size, dtype=float)).astype(int),
     )
-    basis = sparse.identity(qp.c.size, format="csc")
-    cost = np.zeros(qp.c.size)
+    basis, cost, box = sparse.identity(qp.c.size, format="csc"), np.zeros(qp.c.size), np.stack([qp.x_l, qp.x_u], 1)
     cost[places] = 1.0
     if together is not None:
         weights = np.zeros(qp.c.size)
         weights[places] = [1.0 / together[side] for side in named]
         kept = np.setdiff1d(np.arange(qp.c.size), places)
         basis = sparse.hstack([basis[:, kept], sparse.csc_matrix(weights[:, None])], format="csc")
-        cost = np.append(np.zeros(kept.size), 1.0)
+        cost, box = np.append(np.zeros(kept.size), 1.0), np.vstack([box[kept], [0.0, math.inf]])
     above, below = np.isfinite(qp.h_u), np.isfinite(qp.h_l)
     found = linprog(
         cost,
@@ -264,18 +264,22 @@ def _relaxed(
         b_ub=np.concatenate([qp.h_u[above], -qp.h_l[below]]),
         A_eq=qp.A @ basis,
         b_eq=qp.b,
-        bounds=[(0.0, None) if price else (None, None) for price in cost],
+        bounds=box,
         method="highs-ds",
     )
     if found.status:
         return None
+    slacks = dict(zip(named, form.slacks(basis @ found.x).T, strict=True))
+    if together is not None:
+        return _Relaxed(total=float(found.fun), slacks=slacks, priced=set())
     z = np.zeros(qp.h_u.size)
     z[above] -= found.ineqlin.marginals[: np.count_nonzero(above)]
     z[below] += found.ineqlin.marginals[np.count_nonzero(above) :]
-    multipliers = form.multipliers(replace(refusal(qp), z=z, z_box=np.zeros(qp.c.size)))
+    z_box = -found.upper.marginals - found.lower.marginals
+    multipliers = form.multipliers(replace(refusal(qp), z=z, z_box=z_box))
     return _Relaxed(
         total=float(found.fun),
-        slacks=dict(zip(named, form.slacks(basis @ found.x).T, strict=True)),
+        slacks=slacks,
         priced={side for side, priced in zip(sides, multipliers.T, strict=True) if (np.abs(priced) > PRICED).any()},
     )
 
