@@ -60,10 +60,15 @@ def _all_held(summary: Summary) -> bool:
     return all(entry["satisfied"] for entry in summary["constraints"] if entry["required"])
 
 
+def fallback_sentence(periods: int) -> str:
+    """That a flight ended in fallback, after so many periods of it."""
+    return f"{periods} periods in fallback, never recovered"
+
+
 def failure_sentences(summary: Summary) -> list[str]:
     """What kept the controller from its optimum: fallback for good, and why the first QP without an answer had none."""
     periods, found = summary["controller"].get("unrecovered"), summary.get("diagnosis")
-    sentences = [f"{periods} periods in fallback, never recovered"] if periods else []
+    sentences = [fallback_sentence(periods)] if periods else []
     return sentences + ([] if found is None else [found["sentence"], *filter(None, [found["advice"]])])
 
 

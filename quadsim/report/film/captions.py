@@ -47,7 +47,7 @@ _MOST_MARGINS: Final = 6
 
 _LAST: Final = 1.0
 """Time at a film's end [s] in which it says why a QP had no answer, or that the flight stayed in fallback."""
-_WIDEST: Final = 110
+_WIDEST: Final = 140
 """Letters of a line of that, between the frame's edge and the map."""
 
 

@@ -8,9 +8,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from quadsim.controller import ACCEPTED, Phase
+from quadsim.flight.metrics import unrecovered
 from quadsim.flight.rundir import Run
 from quadsim.report.comparison import tracking_values
-from quadsim.report.flight_conditions import failure_sentences
+from quadsim.report.flight_conditions import fallback_sentence
 from quadsim.report.narrative import condition_sentences
 from quadsim.report.recording.style import time_column
 
@@ -54,13 +55,12 @@ def _phase_changes(run: Run) -> list[tuple[float, str, str]]:
 
 
 def _failures(run: Run) -> list[tuple[float, str, str]]:
-    """Time, text and level of fallback for good, from its begin, and of why the first QP without an answer had none."""
-    sentences, times = failure_sentences(run.summary), []
-    if periods := run.summary["controller"].get("unrecovered"):
-        times.append(float(run.log.control.t[-periods]))
-    if found := run.summary.get("diagnosis"):
-        times += [found["time"]] * (len(sentences) - len(times))
-    return [(time, text, "ERROR") for time, text in zip(times, sentences, strict=True)]
+    """Time, text and level of why the first QP without an answer had none, and of fallback for good, from its begin."""
+    found, periods = run.summary.get("diagnosis"), unrecovered(run.log.control)
+    events = [] if found is None else [(found["time"], text) for text in (found["sentence"], found["advice"]) if text]
+    if periods:
+        events.append((float(run.log.control.t[-periods]), fallback_sentence(periods)))
+    return [(time, text, "ERROR") for time, text in events]
 
 
 def _outcome(run: Run) -> str:
