@@ -25,7 +25,7 @@ from quadsim.state import INDEX, N_STATES, REFERENCE_NAMES, STATE_NAMES
 from quadsim.vehicle import N_ROTORS, Vehicle
 from scenarios.parts.controllers import make_bounds, make_controller, posed_problem
 from scenarios.schema.controller import ConstrainedSpec
-from scenarios.schema.optimisation import ANGLES, BoundedSpec
+from scenarios.schema.optimisation import ANGLES, BoundedSpec, PolytopeSpec
 from scenarios.schema.robust import RobustSpec
 from scenarios.schema.scenario import Scenario
 from scenarios.schema.settings import get_field, set_field
@@ -113,7 +113,10 @@ class _Case:
                 field=f"controller.output_bounds.{name}",
                 entry=int(side.upper),
             )
-        polytope = self._spec.polytopes[side.place - 1 - len(_ROTORS)]
+        polytope = self._polytope(side)
+        if polytope is None:  # of a kind that this module has no words for
+            name = f"{self._unanswered.problem.every_constraint[side.place].name}, row {side.row + 1},"
+            return _Bound(name=name, rotor=0, side=which, unit="-", factor=1.0, field="", entry=side.row)
         row = zip(polytope.of, polytope.rows[side.row], strict=True)
         return _Bound(
             name=polytope.row_names[side.row],
@@ -124,6 +127,10 @@ class _Case:
             field=f"controller.polytopes.{polytope.name}.{which}",
             entry=side.row,
         )
+
+    def _polytope(self, side: Side) -> PolytopeSpec | None:
+        name = self._unanswered.problem.every_constraint[side.place].name
+        return next((polytope for polytope in self._spec.polytopes if polytope.name == name), None)
 
     def entries(self, conflict: Conflict) -> Iterator[dict[str, Any]]:
         """What is violated, the largest share first, and what is in the way, each with its times and amount."""
@@ -141,7 +148,7 @@ class _Case:
         fields: dict[str, set[Side]] = {}
         for side in (*conflict.violated, *conflict.in_the_way):
             field = self.bound(side).field
-            if side in conflict.violated or field not in giving:
+            if field and (side in conflict.violated or field not in giving):
                 rotors = range(N_ROTORS) if side.place in _ROTORS else (side.row,)
                 fields.setdefault(field, set()).update(side._replace(row=row) for row in rotors)
         least = {field: smallest_widening(self._unanswered, sides) for field, sides in fields.items()}
@@ -152,7 +159,7 @@ class _Case:
             for side, found in conflict.violated.items():
                 field = self.bound(side).field
                 most[field] = max(found.amount, most.get(field, 0.0))
-            together = self._widened({field: (fields[field], amount) for field, amount in most.items()})
+            together = self._widened({field: (sides, most[field]) for field, sides in fields.items() if field in most})
             alone = [together] if together else []
         for settings in (*alone, *self._softened(conflict)):
             yield {"settings": settings, "after": None}
@@ -160,10 +167,9 @@ class _Case:
 
     def _softened(self, conflict: Conflict) -> list[Settings]:
         """Making soft what is violated, one constraint, or else all, at the largest price that is answered."""
-        tables = []
-        for place in sorted({side.place for side in conflict.violated} - _ROTORS.keys()):
-            polytope = f"polytopes.{self._spec.polytopes[place - 1 - len(_ROTORS)].name}." if place else ""
-            tables.append(f"controller.{polytope}soft")
+        polytopes = (self._polytope(side) for side in conflict.violated if side.place not in (0, *_ROTORS))
+        tables = ["controller.soft"] if any(side.place == 0 for side in conflict.violated) else []
+        tables += dict.fromkeys(f"controller.polytopes.{each.name}.soft" for each in polytopes if each is not None)
         found = [settings for table in tables if (settings := self._soft([table]))]
         if not found and len(tables) > 1 and (settings := self._soft(tables)):
             found = [settings]
