@@ -4,7 +4,7 @@
 
 .NOTPARALLEL:
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test peers check format types build numbers verification robustness soak campaigns kills safety pins clean
+.PHONY: help setup demo test peers check docs format types build numbers verification robustness soak campaigns kills safety pins clean
 
 VENV := .venv
 PY := $(VENV)/bin/python
@@ -69,6 +69,11 @@ build: setup  ## source archive and wheel in dist/; the wheel is installed alone
 	@$(PY) -m pytest -q tests/test_packaging.py
 	@ls dist
 
+docs: setup $(VENV)/.docs  ## build the documentation into site/, with a gallery of every scenario; a broken link fails
+	@PYTHONPATH=docs $(PY) docs/make_gallery.py
+	@$(VENV)/bin/zensical build --clean
+	@echo "Done. Open site/index.html in a browser."
+
 numbers: setup $(VENV)/.peers  ## remake the numbers in README.md and docs/, but for those of the peers
 	@$(PY) docs/make_numbers.py
 	@$(PY) docs/make_scenarios.py
@@ -96,8 +101,8 @@ pins: $(VENV)/.python  ## resolve every package anew, at its newest, into constr
 	@fresh=$$(mktemp -d) && trap 'rm -rf "$$fresh"' EXIT && fresh_python="$$fresh/bin/python" && \
 	$(PYTHON) -m venv "$$fresh" && \
 	$(call quietly,"$$fresh_python" -m pip install --quiet --upgrade pip \
-		&& "$$fresh_python" -m pip install --quiet '.[solvers]' --group dev --group peers,The packages could not be resolved.) && \
-	{ echo "# What setup and peers install, dependencies of dependencies included.  Made by 'make pins'; not edited by hand." && \
+		&& "$$fresh_python" -m pip install --quiet '.[solvers]' --group dev --group docs --group peers,The packages could not be resolved.) && \
+	{ echo "# What setup, docs and peers install, dependencies of dependencies included.  Made by 'make pins'; not edited by hand." && \
 	"$$fresh_python" -m pip freeze --all --exclude quadsim --exclude setuptools; } >"$$fresh/pins" && \
 	cp "$$fresh/pins" constraints.txt
 
@@ -126,6 +131,11 @@ $(VENV)/.peers: $(VENV)/.installed
 	@echo "Installing the peers and the other QP solvers into $(VENV)"
 	@$(call quietly,$(PIP_INSTALL) --constraint constraints.txt --group peers && \
 		$(PIP_INSTALL) --constraint constraints.txt --no-build-isolation --editable '.[solvers]',$(NOT_INSTALLED))
+	@touch $@
+
+$(VENV)/.docs: $(VENV)/.installed
+	@echo "Installing what builds the documentation into $(VENV)"
+	@$(call quietly,$(PIP_INSTALL) --constraint constraints.txt --group docs,$(NOT_INSTALLED))
 	@touch $@
 
 $(VENV)/.renders: $(VENV)/.installed

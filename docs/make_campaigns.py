@@ -11,10 +11,9 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from make_numbers import replace_in_readme
 from PIL import Image
 
-from quadsim.report.table import Cell, Grid, grid_to_markdown
+from quadsim.report.table import Cell, Grid
 from scenarios.bench.solvers import section
 from scenarios.campaign.engine.local import LocalEngine
 from scenarios.campaign.manifest import stored_plan
@@ -135,9 +134,9 @@ def page(results: list[Result]) -> str:
         [
             "# How often they fail: the paper's controller, and the robust one\n\nMade by `make campaigns` "
             f"({machine['processor']}, {machine['cores']} cores), from the campaigns that ship. What is drawn, from "
-            "where, stands in\n[paper-robustness](../scenarios/campaigns/paper-robustness.toml);\n"
-            "[paper-robustness-robust](../scenarios/campaigns/paper-robustness-robust.toml) has the same draws for the "
-            "robust controller, and\n[paper-nominal](../scenarios/campaigns/paper-nominal.toml) draws small errors "
+            "where, stands in\n`paper-robustness`;\n"
+            "`paper-robustness-robust` has the same draws for the "
+            "robust controller, and\n`paper-nominal` draws small errors "
             "alone for the paper's controller. How campaigns work: [campaigns.md](campaigns.md).\n",
             section(violations(results)),
             first_to_break(nominal),
@@ -159,7 +158,6 @@ def main() -> None:
         target = ROOT / "docs" / f"campaign-{name}.png"
         figure.quantize(256, dither=Image.Dither.NONE).save(target, optimize=True)
     (ROOT / "docs" / f"{PAGE}.md").write_text(page(results), encoding="utf-8")
-    replace_in_readme("campaigns", grid_to_markdown(violations(results)), command="make campaigns")
 
 
 if __name__ == "__main__":

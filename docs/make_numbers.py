@@ -24,9 +24,10 @@ from quadsim.vehicle import Vehicle
 from scenarios.build import build_problem
 from scenarios.cost.measure import fly_variations
 from scenarios.cost.study import Variation
+from scenarios.flight import Flight, summarise
 from scenarios.loading import load_scenario
 from scenarios.parts.vehicle import build_vehicle
-from scenarios.run import Flight, fly_scenario, summarise
+from scenarios.run import fly_scenario
 
 ROOT = Path(__file__).resolve().parent.parent
 PERIOD = 0.05

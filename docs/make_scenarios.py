@@ -15,8 +15,8 @@ from make_numbers import fly, markdown
 from quadsim.controller import SOLVED
 from quadsim.flight.audit import Finding
 from quadsim.flight.metrics import peak_tilt, tracking
+from scenarios.flight import Flight
 from scenarios.loading import scenario_names
-from scenarios.run import Flight
 from scenarios.schema.scenario import Group, LostSpec
 
 PAGE = Path(__file__).resolve().parent / "scenarios.md"
@@ -88,7 +88,7 @@ def page(flights: dict[str, Flight]) -> str:
     parts = [
         "# The scenarios\n\nMade by `make numbers`; nothing here is typed by hand.\n\n"
         f"{count} scenarios ship. `quadsim run NAME` flies one; `quadsim scenario NAME` prints its whole file with "
-        "comments, to start your\nown from; the files, in [scenarios/library](../scenarios/library), say in a comment "
+        "comments, to start your\nown from; the files, in `scenarios/library`, say in a comment "
         "what each shows and with what numbers.\n",
         "The verdict is *satisfied* (flown to its end, every required constraint holds), *violated* (one does not) or "
         "*lost* (the\nflight ends early). Each file states it, and a test flies them all; those that are not "

@@ -1,1 +1,57 @@
-"""The controllers: model predictive control in numpy, scipy and PIQP, usable without a simulator."""
+"""The controllers: model predictive control in numpy, scipy and PIQP, usable without a simulator.
+
+What a user of the controllers names is imported when it is first used: `mpc.ConstrainedMPC`, `mpc.paper`, ...
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from mpc.baselines.geometric import GeometricController as GeometricController
+    from mpc.baselines.lqr import LQR as LQR
+    from mpc.baselines.pid import CascadedPID as CascadedPID
+    from mpc.constrained import ConstrainedMPC as ConstrainedMPC
+    from mpc.constraints import Bounds as Bounds
+    from mpc.constraints import Constraint as Constraint
+    from mpc.constraints import Penalty as Penalty
+    from mpc.model import LinearModel as LinearModel
+    from mpc.model import hover_model as hover_model
+    from mpc.ocp import Objective as Objective
+    from mpc.ocp import Problem as Problem
+    from mpc.robust.controller import RobustMPC as RobustMPC
+    from mpc.robust.settings import RobustSettings as RobustSettings
+    from mpc.solvers import QPSolver as QPSolver
+    from mpc.unconstrained import UnconstrainedMPC as UnconstrainedMPC
+
+_PLACES = {
+    "mpc.baselines.geometric": ("GeometricController",),
+    "mpc.baselines.lqr": ("LQR",),
+    "mpc.baselines.pid": ("CascadedPID",),
+    "mpc.constrained": ("ConstrainedMPC",),
+    "mpc.constraints": ("Bounds", "Constraint", "Penalty"),
+    "mpc.model": ("LinearModel", "hover_model"),
+    "mpc.ocp": ("Objective", "Problem"),
+    "mpc.robust.controller": ("RobustMPC",),
+    "mpc.robust.settings": ("RobustSettings",),
+    "mpc.solvers": ("QPSolver",),
+    "mpc.unconstrained": ("UnconstrainedMPC",),
+}
+_PUBLIC = {name: module for module, names in _PLACES.items() for name in names}
+_ROOMS = ("baselines", "exact", "fallback", "nonlinear", "paper", "robust", "solvers")
+__all__ = [*_PUBLIC, *_ROOMS]
+
+
+def __getattr__(name: str) -> Any:
+    """Import a public name, or a subpackage, when it is first used."""
+    if name in _ROOMS:
+        return importlib.import_module(f"mpc.{name}")
+    if name not in _PUBLIC:
+        raise AttributeError(f"module 'mpc' has no attribute {name!r}")
+    return globals().setdefault(name, getattr(importlib.import_module(_PUBLIC[name]), name))
+
+
+def __dir__() -> list[str]:
+    """The public names, imported or not."""
+    return sorted({*globals(), *_PUBLIC, *_ROOMS})

@@ -6,15 +6,18 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any, Final
+from typing import Annotated, Any, Final, get_type_hints
 
 import numpy as np
+from annotated_types import DocInfo, Len, doc
 
 from quadsim.assets import read_toml
 from quadsim.errors import FileError, ParameterError, UnknownNameError
+from quadsim.fields import Number, Vector
 from quadsim.state import Array
 
 N_ROTORS: Final = 4
+OfRotors = Annotated[tuple[Number, ...], Len(N_ROTORS, N_ROTORS)]
 SMALLEST, LARGEST = 1e-12, 1e6
 """Magnitudes that a vehicle's numbers may have; MuJoCo refuses smaller inertias, and arithmetic larger ones."""
 
@@ -26,51 +29,38 @@ class Vehicle:
     Body frame: x forward, y left, z up, origin at the centre of mass.  Rotor i gives the thrust
     f_i = b w_i^2 [N] and the reaction torque spin_i d w_i^2 [N m] about body +z (Sec. 2.2).
 
-    Attributes:
-        name: short name.
-        description: one line for `quadsim list`.
-        mass: m [kg].
-        gravity: g [m/s^2].
-        inertia: (Ixx, Iyy, Izz) [kg m^2], principal and along the body axes.
-        arm_length: L [m], centre of mass to rotor axis.
-        rotor_azimuths: direction of each arm from body +x, counter-clockwise seen from above [deg].
-        rotor_spins: +1 or -1, sign of each reaction torque about body +z.
-        thrust_coefficient: b [N s^2/rad^2].
-        drag_to_thrust: d / b [m].
-        speed_min: lowest rotor speed the actuators can hold [rad/s].
-        speed_max: highest rotor speed the actuators can hold [rad/s].
-        rotor_rise: time constant of a rotor's speed when it rises, first order [s].
-        rotor_fall: the same when it falls [s].
-        rotor_inertia: of one rotor about its axis [kg m^2].
-        rotor_radius: R [m].
-        rotor_drag: linear drag of one rotor, force -rotor_drag w v_perp on it, v_perp its velocity through the air in
-            the rotor's plane [N s^2/(m rad)] (Martin and Salaun, 2010; Furrer et al., 2016).
-        body_drag: C_d A along body x, y and z [m^2].
-
-    What stands in `OPTIONAL_PARAMETERS` is None where its file does not give it.
+    Linear drag is a force -rotor_drag w v_perp on a rotor, v_perp its velocity through the air in the rotor's plane
+    (Martin and Salaun, 2010; Furrer et al., 2016).  What stands in `OPTIONAL_PARAMETERS` is None where its file does
+    not give it.
 
     Raises:
         ParameterError: a value is not finite or not possible, or the vehicle cannot hover within its rotors' range.
     """
 
-    name: str
-    description: str = ""
-    mass: float
-    gravity: float
-    inertia: tuple[float, float, float]
-    arm_length: float
-    rotor_azimuths: tuple[float, float, float, float]
-    rotor_spins: tuple[int, int, int, int]
-    thrust_coefficient: float
-    drag_to_thrust: float
-    speed_min: float
-    speed_max: float
-    rotor_rise: float | None = None
-    rotor_fall: float | None = None
-    rotor_inertia: float | None = None
-    rotor_radius: float | None = None
-    rotor_drag: float | None = None
-    body_drag: tuple[float, float, float] | None = None
+    name: Annotated[str, doc("short name")]
+    description: Annotated[str, doc("one line for `quadsim list`")] = ""
+    mass: Annotated[float, doc("[kg]")]
+    gravity: Annotated[float, doc("[m/s^2]")]
+    inertia: Annotated[Vector, doc("[kg m^2] Ixx, Iyy, Izz, body axes")]
+    arm_length: Annotated[float, doc("[m] L, centre of mass to rotor axis")]
+    rotor_azimuths: Annotated[
+        OfRotors, doc("[deg] direction of each arm from body +x, counter-clockwise seen from above")
+    ]
+    rotor_spins: Annotated[
+        tuple[int, ...],
+        Len(N_ROTORS, N_ROTORS),
+        doc("[-] 1 or -1, sign of each rotor's reaction torque about body +z"),
+    ]
+    thrust_coefficient: Annotated[float, doc("[N s^2/rad^2] b, thrust b w^2")]
+    drag_to_thrust: Annotated[float, doc("[m] d / b, reaction torque d w^2")]
+    speed_min: Annotated[float, doc("[rad/s] lowest speed that a rotor holds")]
+    speed_max: Annotated[float, doc("[rad/s] highest speed that a rotor holds")]
+    rotor_rise: Annotated[float | None, doc("[s] time constant of a rotor's speed when it rises")] = None
+    rotor_fall: Annotated[float | None, doc("[s] time constant of a rotor's speed when it falls")] = None
+    rotor_inertia: Annotated[float | None, doc("[kg m^2] of one rotor about its axis")] = None
+    rotor_radius: Annotated[float | None, doc("[m] R")] = None
+    rotor_drag: Annotated[float | None, doc("[N s^2/(m rad)] linear drag of one rotor")] = None
+    body_drag: Annotated[Vector | None, doc("[m^2] C_d A along body x, y, z")] = None
 
     def __post_init__(self) -> None:
         for name in ("mass", "gravity", "arm_length", "thrust_coefficient", "drag_to_thrust", "speed_max"):
@@ -163,7 +153,7 @@ class Vehicle:
 
     @property
     def allocation(self) -> Array:
-        """(4, 4) matrix taking squared rotor speeds to [U, tau_x, tau_y, tau_z] [N, N m] (Sec. 2.2)."""
+        """(4, 4) matrix taking squared rotor speeds to [U, tau_x, tau_y, tau_z], in N and N m (Sec. 2.2)."""
         b, d = self.thrust_coefficient, self.drag_coefficient
         x, y, _ = self.rotor_positions.T
         return np.stack([np.full(N_ROTORS, b), b * y, -b * x, d * np.array(self.rotor_spins, float)])
@@ -222,25 +212,13 @@ def _read_entries(path: Path) -> tuple[dict[str, str], dict[str, dict[str, Any]]
 
 
 VEHICLE_UNITS: Final[dict[str, str]] = {
-    "mass": "kg",
-    "gravity": "m/s^2",
-    "inertia": "kg m^2",
-    "arm_length": "m",
-    "rotor_azimuths": "deg",
-    "rotor_spins": "-",
-    "thrust_coefficient": "N s^2/rad^2",
-    "drag_to_thrust": "m",
-    "speed_min": "rad/s",
-    "speed_max": "rad/s",
-    "rotor_rise": "s",
-    "rotor_fall": "s",
-    "rotor_inertia": "kg m^2",
-    "rotor_radius": "m",
-    "rotor_drag": "N s^2/(m rad)",
-    "body_drag": "m^2",
+    name: note.documentation.partition("]")[0].removeprefix("[")
+    for name, hint in get_type_hints(Vehicle, include_extras=True).items()
+    for note in hint.__metadata__
+    if isinstance(note, DocInfo) and note.documentation.startswith("[")
 }
+"""The parameters of a vehicle file and their units."""
 MEANT: Final[dict[str, tuple[str, ...]]] = {"rotor_lag": ("rotor_rise", "rotor_fall")}
 """Parameters by what else they are called, where another one is spelt more alike."""
 OPTIONAL_PARAMETERS: Final = tuple(field.name for field in fields(Vehicle) if field.default is None)
 """Parameters that a vehicle file may leave out."""
-assert set(VEHICLE_UNITS) == {field.name for field in fields(Vehicle)} - {"name", "description"}

@@ -12,7 +12,7 @@ from quadsim.sim.phase import PhaseMonitor
 from quadsim.sim.plant import Plant
 from quadsim.vehicle import Vehicle
 from scenarios.parts.controllers import make_controller, make_problem
-from scenarios.parts.effects import build_effects, build_wind, resolve_effects
+from scenarios.parts.effects import build_changes, build_wind
 from scenarios.parts.randomness import generator
 from scenarios.parts.vehicle import resolve_vehicle
 from scenarios.schema.optimisation import WeightedSpec
@@ -30,7 +30,7 @@ CONTROLLERS: Final = {
 
 def resolve(scenario: Scenario, vehicle: Vehicle) -> Scenario:
     """The scenario with every number that it leaves to its vehicle written out: its file alone defines the flight."""
-    return resolve_vehicle(scenario, vehicle).model_copy(update={"effects": resolve_effects(scenario.effects, vehicle)})
+    return resolve_vehicle(scenario, vehicle).model_copy(update={"effects": scenario.effects.resolved(vehicle)})
 
 
 def build_plant(scenario: Scenario, vehicle: Vehicle, kind: type[Plant] = Plant) -> Plant:
@@ -43,7 +43,8 @@ def build_plant(scenario: Scenario, vehicle: Vehicle, kind: type[Plant] = Plant)
         vehicle,
         timestep=scenario.plant.timestep,
         limit_speeds=scenario.plant.limit_speeds,
-        effects=build_effects(scenario, vehicle),
+        effects=scenario.effects.resolved(vehicle),
+        changes=build_changes(scenario),
         wind=build_wind(scenario, vehicle),
         rng=generator(scenario.seed, "disturbance"),
     )

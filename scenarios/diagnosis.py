@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import math
+import tomllib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
@@ -21,7 +22,7 @@ from mpc.fallback.contract import Guarded
 from mpc.ocp import Unanswered
 from quadsim.errors import InputError
 from quadsim.flight.audit import TERMS, sum_signal
-from quadsim.state import INDEX, N_STATES, REFERENCE_NAMES, STATE_NAMES
+from quadsim.state import N_STATES, REFERENCE_STATES, STATE_NAMES
 from quadsim.vehicle import N_ROTORS, Vehicle
 from scenarios.parts.controllers import make_bounds, make_controller, posed_problem
 from scenarios.schema.controller import ConstrainedSpec
@@ -73,12 +74,12 @@ def diagnose(unanswered: Unanswered, scenario: Scenario, vehicle: Vehicle) -> di
     """
     if not isinstance(scenario.controller, BoundedSpec):
         return None
-    case = _Case(unanswered, scenario.controller, vehicle, scenario.control_period)
+    case = _Case(unanswered, scenario, scenario.controller, vehicle)
     conflict = find_conflict(unanswered)
     entries = [] if conflict is None else _merged([*case.entries(conflict)])
     suggestions = [] if conflict is None or conflict.feasible else [*case.suggestions(conflict)]
     found = {
-        "time": unanswered.time,
+        "time": round(unanswered.time, 9),
         "status": unanswered.status,
         "feasible": None if conflict is None else conflict.feasible,
         "conflict": entries,
@@ -90,8 +91,9 @@ def diagnose(unanswered: Unanswered, scenario: Scenario, vehicle: Vehicle) -> di
 class _Case:
     """One period's problem and the file that it is of."""
 
-    def __init__(self, unanswered: Unanswered, spec: BoundedSpec, vehicle: Vehicle, period: float) -> None:
-        self._unanswered, self._spec, self._vehicle, self._period = unanswered, spec, vehicle, period
+    def __init__(self, unanswered: Unanswered, scenario: Scenario, spec: BoundedSpec, vehicle: Vehicle) -> None:
+        self._unanswered, self._spec, self._vehicle = unanswered, spec, vehicle
+        self._period, self._file = scenario.control_period, scenario.to_toml()
         self._outputs = [name for name in STATE_NAMES if name in spec.output_bounds]
 
     def bound(self, side: Side) -> _Bound:
@@ -182,15 +184,14 @@ class _Case:
 
     def _widened(self, amounts: Mapping[str, tuple[set[Side], float]]) -> Settings | None:
         """Fields with bounds moved outwards by at least these amounts, if that helps."""
-        table = {"controller": self._spec.model_dump()}
+        table = tomllib.loads(self._file)
         for more in WIDER:
             settings: Settings = {}
             for field, (sides, amount) in amounts.items():
-                numbers = [*get_field(table, field)]
-                for bound in {self.bound(side) for side in sides}:
-                    numbers[bound.entry] = _outwards(
-                        get_field(table, field)[bound.entry], more * amount * bound.factor, upper=bound.side == "upper"
-                    )
+                numbers = [*(before := get_field(table, field))]
+                for bound in map(self.bound, sides):  # several rotors share an entry
+                    moved = more * amount * bound.factor
+                    numbers[bound.entry] = _outwards(before[bound.entry], moved, upper=bound.side == "upper")
                 settings[field] = numbers
             if self._helps(settings):
                 return settings
@@ -207,37 +208,36 @@ class _Case:
             return False
         return has_answer(problem, self._unanswered.query)
 
-    def _changed(self, settings: Settings) -> BoundedSpec | None:
+    def _changed(self, settings: Settings) -> ConstrainedSpec | RobustSpec | None:
         """The controller with other fields; None where the file would be refused."""
-        table = {"controller": self._spec.model_dump(exclude_none=True)}
+        table = tomllib.loads(self._file)
         for field, value in settings.items():
             set_field(table, field, value, asked="diagnosis")
-        changed = table["controller"]
-        robust = changed["type"] == "robust"
-        if robust and not isinstance(self._spec, RobustSpec):
-            changed = {name: value for name, value in changed.items() if name in RobustSpec.model_fields}
+        if "controller.type" in settings:
+            law = table["controller"]
+            table["controller"] = {name: value for name, value in law.items() if name in RobustSpec.model_fields}
         try:
-            return (RobustSpec if robust else ConstrainedSpec).model_validate(changed)
+            changed = Scenario.read(table).controller
         except ValidationError:
             return None
+        assert isinstance(changed, ConstrainedSpec | RobustSpec)
+        return changed
 
     def _fallback(self) -> Iterator[dict[str, Any]]:
         """The fallback, where there is none: after what time of its level hover the problem has an answer again."""
-        spec, unanswered = self._spec, self._unanswered
-        if not isinstance(spec, ConstrainedSpec) or (spec.fallback is not None and spec.fallback.enabled):
+        fallback = getattr(self._spec, "fallback", None)
+        if fallback is not None and fallback.enabled:
             return
         settings: Settings = {"controller.fallback": {}}
-        changed = self._changed(settings)
-        assert isinstance(changed, ConstrainedSpec)
+        changed, query = self._changed(settings), self._unanswered.query
+        assert changed is not None
         law = make_controller(changed, self._vehicle, self._period)
         assert isinstance(law, Guarded)
         target = np.zeros(N_STATES)
-        for name in REFERENCE_NAMES:
-            target[INDEX[name]] = unanswered.query.state[INDEX[name]]
-        query, bounds = unanswered.query, ActuatorBounds.of(make_bounds(spec))
-        periods = recovery(
-            unanswered, law.law.plan(query.state, target, query.u_before, bounds, spec.horizon, law.trim)
-        )
+        target[[*REFERENCE_STATES]] = query.state[[*REFERENCE_STATES]]
+        bounds = ActuatorBounds.of(make_bounds(changed))
+        plan = law.law.plan(query.state[:N_STATES], target, query.u_before, bounds, changed.horizon, law.trim)
+        periods = recovery(self._unanswered, plan)
         if periods is not None:
             yield {"settings": settings, "after": round(periods * self._period, 9)}
 

@@ -7,20 +7,18 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
-from pydantic import ValidationError
-
 from quadsim.errors import FileError, ParameterError, UnknownNameError
 from quadsim.flight.ground import AIRBORNE, TOUCH, clearance
 from quadsim.sim.airframe import outline
-from quadsim.sim.effects.load import mass_properties
+from quadsim.sim.effects.load import Load, mass_properties
 from quadsim.vehicle import Vehicle
 from scenarios.courses.make import build_course, located
-from scenarios.parts.effects import build_effects, moving_air
+from scenarios.parts.effects import moving_air
 from scenarios.parts.vehicle import build_initial_state, build_vehicle
 from scenarios.schema.bases import read_scenario, replaced_tables, retyped
 from scenarios.schema.course import CsvSpec
 from scenarios.schema.plugin import located as located_controller
-from scenarios.schema.problems import ScenarioError, describe
+from scenarios.schema.problems import ScenarioError
 from scenarios.schema.scenario import Scenario
 from scenarios.schema.settings import apply_setting
 
@@ -33,7 +31,7 @@ def check_parts(scenario: Scenario) -> None:
             built, or the flight starts below the floor, or in the air with rotors at rest.
     """
     vehicle = build_vehicle(scenario)
-    load = build_effects(scenario, vehicle).load
+    load = scenario.effects.resolved(vehicle).load or Load()
     mass_properties(vehicle, load, load.payloads)
     moving_air(scenario, vehicle)
     build_course(scenario)
@@ -144,11 +142,7 @@ def parse_scenario(data: Mapping[str, Any], *, source: str = "scenario", directo
     """
     if directory is not None and "controller" in data:
         data = {**data, "controller": located_controller(data["controller"], directory)}
-    try:
-        scenario = Scenario.model_validate(dict(data))
-    except ValidationError as error:
-        problems = [describe(details, data, Scenario) for details in error.errors(include_url=False)]
-        raise ScenarioError(source, problems) from error
+    scenario = Scenario.parse(data, source=source)
     file = scenario.vehicle.file
     if directory is not None and file.endswith(".toml") and (directory / file).is_file():
         absolute = str((directory / file).resolve())

@@ -17,9 +17,10 @@ from quadsim.flight.rundir import Run
 from quadsim.vehicle import Vehicle
 from scenarios.cost.measure import ARM_LENGTHS, DRAGS
 from scenarios.cost.study import MEASURES, CandidateTimes, CostStudy, Outcome, Sweep, SweepPoint, Variation
+from scenarios.flight import Flight, Outputs
 from scenarios.loading import load_scenario
 from scenarios.parts.vehicle import build_vehicle
-from scenarios.run import Flight, Outputs, fly_scenario, run_scenario
+from scenarios.run import fly_scenario, run_scenario
 
 # Examples are not timed: a busy machine is no failure.  On CI they are the same ones each time.
 settings.register_profile("quadsim", deadline=None, derandomize="CI" in os.environ)

@@ -19,9 +19,9 @@ from quadsim.state import INDEX, N_STATES, Array
 from quadsim.vehicle import N_ROTORS
 from scenarios.build import build_problem
 from scenarios.courses.make import build_reference
+from scenarios.flight import Flight
 from scenarios.loading import load_scenario
 from scenarios.parts.vehicle import build_vehicle
-from scenarios.run import Flight
 
 
 class Here:

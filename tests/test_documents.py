@@ -6,10 +6,12 @@ import re
 from collections.abc import Callable
 from pathlib import Path
 from pkgutil import resolve_name
+from types import ModuleType
 from typing import Any
 
 import make_cost
 import make_numbers as numbers
+import matplotlib as mpl
 import numpy as np
 import pytest
 from support import Here
@@ -19,10 +21,13 @@ from scenarios.cost import cost_flights
 from scenarios.cost.cost_tables import cost_tables
 from scenarios.cost.measure import study_cost
 from scenarios.cost.study import CandidateTimes, Variation
+from scenarios.flight import Flight
 from scenarios.loading import load_scenario
-from scenarios.run import Flight, fly_scenario
+from scenarios.run import fly_scenario
 
 ROOT = Path(__file__).resolve().parent.parent
+MADE = {"gallery.md"}
+"""Pages that `make docs` makes."""
 ENTRY_POINTS = {"quadsim.controllers"}
 """Groups of entry points, which are written like modules."""
 
@@ -90,8 +95,31 @@ def test_the_example_in_the_page_on_effects_is_a_scenario(tmp_path: Path) -> Non
 def test_documents_link_to_files_that_exist() -> None:
     for document in [*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md")]:
         for target in re.findall(r"\]\(([^)#]+)\)", document.read_text(encoding="utf-8")):
-            if "://" not in target:
+            if "://" not in target and target not in MADE:
                 assert (document.parent / target).exists(), f"{document.name} links to {target}"
+
+
+def test_pages_of_the_site_link_to_its_pages_alone() -> None:
+    """What is in the repository and not on the site is named, not linked."""
+    for document in (ROOT / "docs").glob("*.md"):
+        assert "](../" not in document.read_text(encoding="utf-8"), document.name
+
+
+def test_the_site_has_every_page() -> None:
+    site = (ROOT / "mkdocs.yml").read_text(encoding="utf-8")
+    pages = {path.name for path in (ROOT / "docs").glob("*.md")} | MADE
+    assert set(re.findall(r"[a-z-]+\.md", site)) == pages
+
+
+@pytest.mark.parametrize("document", ["../README.md", *sorted(path.name for path in (ROOT / "docs").glob("*.md"))])
+def test_python_on_the_pages_runs(document: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The blocks of a page in their order, as the notebook that it is too."""
+    mpl.use("Agg")
+    monkeypatch.chdir(tmp_path)
+    text = (ROOT / "docs" / document).read_text(encoding="utf-8")
+    module = ModuleType("page")
+    for block in re.findall(r"^```python\n(.*?)^```", text, re.DOTALL | re.MULTILINE):
+        exec(compile(block, document, "exec"), module.__dict__)
 
 
 @pytest.mark.parametrize(

@@ -13,8 +13,9 @@ import numpy as np
 import pytest
 
 from scenarios.cli import main
+from scenarios.flight import Flight
 from scenarios.loading import load_scenario
-from scenarios.run import Flight, fly_scenario
+from scenarios.run import fly_scenario
 
 ROOT = Path(__file__).resolve().parent.parent
 EXAMPLES = ROOT / "examples"

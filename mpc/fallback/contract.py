@@ -29,6 +29,7 @@ from mpc.answer import ActuatorBounds, rejection, shifted
 from mpc.equilibrium import Trim
 from mpc.fallback.completion import PLAUSIBLE, CompletedMoment, StateCompletion
 from mpc.fallback.hover import HoverLaw
+from mpc.fallback.settings import USUAL_TILT
 from mpc.fallback.settings import FallbackSettings as FallbackSettings
 from mpc.heading import anchored, predict_in_heading_frame
 from mpc.model import LinearModel
@@ -87,7 +88,7 @@ class Guarded:
         failures: tuple[type[Exception], ...] = FAILURES,
     ) -> None:
         self.inner = inner
-        self.law = HoverLaw(model, tilt=settings.tilt)
+        self.law = HoverLaw(model, tilt=math.radians(USUAL_TILT if settings.tilt is None else settings.tilt))
         self._model, self._bounds, self._settings, self._failures = model, bounds, settings, failures
         self._distance = settings.distance
         self._completion = StateCompletion(model)

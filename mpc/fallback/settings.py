@@ -4,53 +4,59 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, fields
+from typing import Annotated, Final
 
 import numpy as np
+from annotated_types import Gt, Lt, doc
 
 from quadsim.errors import ParameterError
+from quadsim.fields import Positive
 from quadsim.state import EULER, EULER_RATE, N_STATES, POSITION, VELOCITY, Array
+
+USUAL_TILT: Final = 10.0
+"""Largest tilt [deg] of the fallback where none is given."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class FallbackSettings:
-    """When the next level takes over; validated when made.
+    """The fallback contract: the shifted plan with an LQR correction, then level hover, then descent.
 
-    Attributes:
-        unseen: longest time that predictions stand in for a missing measurement before level 2 [s].
-        plan_age: longest time on one shifted plan [s]; its horizon, where that is shorter.
-        position, velocity, angle, rate: largest distance from that plan in any channel [m], [m/s], [rad], [rad/s].
-        hover: longest time on level 2 before the descent [s].
-        sink: speed of the descent [m/s].
-        tilt: largest tilt that levels 1 to 3 ask for [rad]; beside the plan's own on level 1.
-        settled: horizontal speed above which level 2 brakes without a place to go back to [m/s].
+    A plan is held no longer than its horizon; the tilt of the plan comes on top of `tilt`.
     """
 
-    unseen: float = 1.5
-    plan_age: float = 1.0
-    position: float = 0.5
-    velocity: float = 1.0
-    angle: float = 0.2
-    rate: float = 1.0
-    hover: float = 5.0
-    sink: float = 0.5
-    tilt: float = math.radians(10.0)
-    settled: float = 0.3
+    enabled: Annotated[bool, doc("false: what the controller does without an answer is its own")] = True
+    unseen: Annotated[Positive, doc("[s] longest time that predictions stand in for a missing measurement")] = 1.5
+    plan_age: Annotated[Positive, doc("[s] longest time on one shifted plan")] = 1.0
+    position: Annotated[Positive, doc("[m] largest distance from that plan")] = 0.5
+    velocity: Annotated[Positive, doc("[m/s] the same of a velocity")] = 1.0
+    angle: Annotated[Positive, doc("[deg] the same of roll, pitch and yaw")] = 11.5
+    rate: Annotated[Positive, doc("[deg/s] the same of their rates")] = 57.3
+    hover: Annotated[Positive, doc("[s] longest time in level hover, before the descent")] = 5.0
+    sink: Annotated[Positive, doc("[m/s] speed of the descent")] = 0.5
+    tilt: Annotated[
+        Annotated[float, Gt(0.0), Lt(90.0)] | None,
+        doc(
+            "[deg] largest tilt commanded; absent: 0.8 of the tightest bound on roll or pitch, so that the controller "
+            f"takes over again within its bounds, or {USUAL_TILT:g} where there is none"
+        ),
+    ] = None
+    settled: Annotated[Positive, doc("[m/s] above this horizontal speed it brakes without going back to a place")] = 0.3
 
     def __post_init__(self) -> None:
         for item in fields(self):
             value = getattr(self, item.name)
-            if not 0.0 < value < math.inf:
-                raise ParameterError("controller", f"fallback.{item.name}", value, "positive and finite")
+            if item.name != "enabled" and value is not None and not 0.0 < value < math.inf:
+                raise ParameterError("controller.fallback", item.name, value, "positive and finite")
 
     @property
     def distance(self) -> Array:
-        """(12,) largest distance from a plan's states."""
+        """(12,) largest distance from a plan's states [m], [m/s], [rad], [rad/s]."""
         distance = np.empty(N_STATES)
         for rows, size in (
             (POSITION, self.position),
             (VELOCITY, self.velocity),
-            (EULER, self.angle),
-            (EULER_RATE, self.rate),
+            (EULER, math.radians(self.angle)),
+            (EULER_RATE, math.radians(self.rate)),
         ):
             distance[list(rows)] = size
         return distance

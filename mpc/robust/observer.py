@@ -16,12 +16,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, fields
-from typing import Final
+from typing import Annotated, Final
 
 import numpy as np
 import scipy.linalg
+from annotated_types import doc
 
 from quadsim.errors import ParameterError
+from quadsim.fields import Positive
 from quadsim.state import EULER, EULER_RATE, VELOCITY, Array, euler_to_body_rates
 
 _VELOCITY: Final = list(VELOCITY)
@@ -32,31 +34,21 @@ _UPRIGHT: Final = 0.1
 
 @dataclass(frozen=True, kw_only=True)
 class ObserverSettings:
-    """Tuning of the disturbance observer: how much of a surprise is noise, and how fast disturbances change.
+    """Unmodelled force and torque: estimated, predicted and compensated.
 
-    Only ratios matter.  At a period of 50 ms the defaults have nine tenths of a step of the force within 2.4 s and of
-    the torque within 1.25 s: well below the bandwidth of the loop, so that rotors which lag otherwise than stated do
-    not make the two fight.
-
-    Attributes:
-        velocity_noise: of a measured velocity [m/s].
-        rate_noise: of a measured body rate [rad/s].
-        velocity_walk: unexplained change of a velocity in a period that is no lasting force [m/s].
-        rate_walk: the same of a body rate [rad/s].
-        force_walk: change of the force's acceleration in a period [m/s^2].
-        torque_walk: change of the torque's angular acceleration in a period [rad/s^2].
-        largest_force: larger estimates are clipped [m/s^2].
-        largest_torque: no larger angular acceleration [rad/s^2].
+    How much of a surprise is noise, and how fast disturbances change: only ratios matter.  At a period of 50 ms the
+    defaults have nine tenths of a step of the force within 2.4 s and of the torque within 1.25 s: well below the
+    bandwidth of the loop, so that rotors which lag otherwise than stated do not make the two fight.
     """
 
-    velocity_noise: float = 0.05
-    rate_noise: float = 0.05
-    velocity_walk: float = 0.05
-    rate_walk: float = 0.05
-    force_walk: float = 0.1
-    torque_walk: float = 0.2
-    largest_force: float = 5.0
-    largest_torque: float = 30.0
+    velocity_noise: Annotated[Positive, doc("[m/s] of a measured velocity")] = 0.05
+    rate_noise: Annotated[Positive, doc("[rad/s] of a measured body rate")] = 0.05
+    velocity_walk: Annotated[Positive, doc("[m/s] change of a velocity in a period that is no lasting force")] = 0.05
+    rate_walk: Annotated[Positive, doc("[rad/s] the same of a body rate")] = 0.05
+    force_walk: Annotated[Positive, doc("[m/s^2] change of the force's acceleration in a period")] = 0.1
+    torque_walk: Annotated[Positive, doc("[rad/s^2] change of the torque's angular acceleration in a period")] = 0.2
+    largest_force: Annotated[Positive, doc("[m/s^2] larger estimates are clipped")] = 5.0
+    largest_torque: Annotated[Positive, doc("[rad/s^2] larger estimates are clipped")] = 30.0
 
     def __post_init__(self) -> None:
         for item in fields(self):

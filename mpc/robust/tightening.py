@@ -28,14 +28,16 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, fields
-from typing import Final
+from typing import Annotated, Final
 
 import numpy as np
 import scipy.linalg
+from annotated_types import doc
 
 from mpc.constraints import Bounds
 from mpc.model import continuous_model, discretise
 from quadsim.errors import ParameterError
+from quadsim.fields import NonNegative
 from quadsim.state import INDEX, N_STATES, Array, read_only
 from quadsim.vehicle import Vehicle
 
@@ -56,20 +58,21 @@ _TURNS: Final = np.array([0.0, 0.0, 0.0, 1.0, 1.0, 1.0])
 
 @dataclass(frozen=True, kw_only=True)
 class TighteningSettings:
-    """Stated bounds, the same along and about each axis; what exceeds them is not answered for.
+    """Output bounds tightened, so that they hold under disturbances within stated bounds, and between samples.
 
-    What the prediction leaves out, as of tilted thrust or of rotors that lag otherwise, counts as a disturbance.
-
-    Attributes:
-        acceleration: of the disturbance, each component along the model's axes [m/s^2].
-        angular_acceleration: of the disturbance, each component about them [rad/s^2].
-        turning: the largest d2y/dt2 of an output at its bound, [rad/s^2] of an angle; inputs alone would allow far
-            more.
+    The stated bounds are the same along and about each axis; what exceeds them is not answered for.  What the
+    prediction leaves out, as of tilted thrust or of rotors that lag otherwise, counts as a disturbance.  Inputs alone
+    would allow far more than `turning`.
     """
 
-    acceleration: float = 0.5
-    angular_acceleration: float = 0.5
-    turning: float = 3.0
+    acceleration: Annotated[
+        NonNegative, doc("[m/s^2] bound on a disturbance's acceleration along each axis, world frame")
+    ] = 0.5
+    angular_acceleration: Annotated[NonNegative, doc("[rad/s^2] the same of angular ones, body frame")] = 0.5
+    turning: Annotated[
+        NonNegative,
+        doc("[unit of the state/s^2, rad for angles] largest second derivative of an output at its bound"),
+    ] = 3.0
 
     def __post_init__(self) -> None:
         for item in fields(self):

@@ -8,12 +8,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Any, Final
+from dataclasses import dataclass, field
+from typing import Annotated, Any, Final
 
 import numpy as np
+from annotated_types import doc
 
-from quadsim.errors import ParameterError, UnknownNameError
+from quadsim.errors import InputError, ParameterError, UnknownNameError
+from quadsim.fields import NonNegative, Number
 from quadsim.flight.log import ControlLog, FlightLog, PlantLog
 from quadsim.state import (
     EULER,
@@ -114,51 +116,44 @@ def _total(parts: list[Array]) -> Array:
 
 @dataclass(frozen=True, kw_only=True)
 class Limit:
-    """A bound on one signal, with the tolerances of its verdict.
+    """Bounds on a signal of the flight; see `quadsim.flight.audit.Limit`.
 
-    Attributes:
-        name: the constraint's name in tables and files.
-        signal: a key of `SIGNALS`, or `SUM`; `slew` is the command's step per period, `speed` and `slew` hold for every
-            rotor.
-        terms: of a sum, the names in `TERMS` and their factors.
-        lower: smallest value allowed, in the signal's unit; -inf for none.
-        upper: largest value allowed; inf for none.
-        tolerance: how far beyond the bound the plant may go, at the physics rate.
-        tolerance_sampled: how far beyond the bound the control samples may go; at most `tolerance`.
-        required: whether the scenario demands it; a limit that is not required is measured and reported alone.
-        start: first time [s] at which it holds.
-        stop: last time [s] at which it holds.
+    `slew` is the command's step per period, `speed` and `slew` hold for every rotor.  A bound that is infinite is none.
     """
 
-    name: str
-    signal: str
-    lower: float = -math.inf
-    upper: float = math.inf
-    tolerance: float = 0.0
-    tolerance_sampled: float = 0.0
-    required: bool = True
-    start: float = 0.0
-    stop: float = math.inf
-    terms: tuple[tuple[str, float], ...] = ()
+    name: Annotated[str, doc("what reports call it")] = field(metadata={"pattern": "^[A-Za-z0-9_.-]+$"})
+    signal: Annotated[
+        str, doc("what is bounded: " + ", ".join(f"{name} [{signal.unit}]" for name, signal in SIGNALS.items()))
+    ] = field(metadata={"json_schema_extra": {"enum": [*SIGNALS]}})
+    lower: Annotated[Number, doc("[unit of the signal] lower bound")] = -math.inf
+    upper: Annotated[Number, doc("[unit of the signal] upper bound")] = math.inf
+    tolerance: Annotated[NonNegative, doc("[unit of the signal] allowed beyond, at the physics rate")] = 0.0
+    tolerance_sampled: Annotated[NonNegative, doc("[unit of the signal] allowed beyond, at the control samples")] = 0.0
+    required: Annotated[bool, doc("false: measured and reported, never a failure")] = True
+    start: Annotated[Number, doc("[s] first time it holds")] = 0.0
+    stop: Annotated[Number, doc("[s] last time it holds; absent: the flight's end")] = math.inf
 
     def __post_init__(self) -> None:
-        if self.signal not in SIGNALS and not (self.signal == SUM and self.terms):
-            raise UnknownNameError("signal", self.signal, SIGNALS)
-        for name, _ in self.terms:
-            if name not in TERMS:
-                raise UnknownNameError("signal", name, TERMS)
+        self._check_signal()
+        owner = f"constraints.{self.name}"
+        if math.isinf(self.lower) and math.isinf(self.upper):
+            raise InputError("lower must be given, or upper, or both")
         if not self.lower < self.upper:
-            raise ParameterError(f"constraints.{self.name}", "lower", self.lower, f"below upper = {self.upper}")
+            raise ParameterError(owner, "lower", self.lower, f"below upper = {self.upper}")
         if not 0.0 <= self.tolerance_sampled <= self.tolerance < math.inf:
-            rule = f"between 0 and tolerance = {self.tolerance}"
-            raise ParameterError(f"constraints.{self.name}", "tolerance_sampled", self.tolerance_sampled, rule)
+            rule = f"at most tolerance = {self.tolerance}"
+            raise ParameterError(owner, "tolerance_sampled", self.tolerance_sampled, rule)
         if not self.start <= self.stop:
-            raise ParameterError(f"constraints.{self.name}", "start", self.start, f"at most stop = {self.stop}")
+            raise ParameterError(owner, "stop", self.stop, f"at least start = {self.start}")
+
+    def _check_signal(self) -> None:
+        if self.signal not in SIGNALS:
+            raise UnknownNameError("signal", self.signal, SIGNALS)
 
     @property
     def source(self) -> Signal:
         """What is bounded."""
-        return sum_signal(self.terms) if self.signal == SUM else SIGNALS[self.signal]
+        return SIGNALS[self.signal]
 
     @property
     def unit(self) -> str:
@@ -176,6 +171,28 @@ class Limit:
         """(K,) signed distance to the nearer bound, the smallest over rotors; negative = violated."""
         margin = np.minimum(values - self.lower, self.upper - values)
         return margin if margin.ndim == 1 else margin.min(axis=1)
+
+
+@dataclass(frozen=True, kw_only=True)
+class SumLimit(Limit):
+    """Bounds on a sum of signals.
+
+    Attributes:
+        terms: the names in `TERMS` and their factors.
+    """
+
+    signal: str = SUM
+    terms: tuple[tuple[str, float], ...]
+
+    def _check_signal(self) -> None:
+        for name, _ in self.terms:
+            if name not in TERMS:
+                raise UnknownNameError("signal", name, TERMS)
+
+    @property
+    def source(self) -> Signal:
+        """What is bounded."""
+        return sum_signal(self.terms)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -212,8 +229,12 @@ class Finding:
 
 def margins_sampled(limit: Limit, log: FlightLog) -> Array:
     """(K,) signed margins of a limit at the control samples, NaN outside its time window."""
-    margins = limit.margin(limit.source.sampled(log.control))
-    return np.where(_inside(limit, log.control.t), margins, np.nan)
+    return margins_at(limit, log.control.t, limit.source.sampled(log.control))
+
+
+def margins_at(limit: Limit, t: Array, values: Array) -> Array:
+    """(K,) signed margins of a limit on the values of its signal at times t (K,), NaN outside its time window."""
+    return np.where(_inside(limit, t), limit.margin(values), np.nan)
 
 
 def audit(log: FlightLog, limits: tuple[Limit, ...]) -> tuple[Finding, ...]:

@@ -89,6 +89,18 @@ def _horizon_table(t: Array, predicted: np.ndarray[Any, np.dtype[np.float32]], m
     )
 
 
+def log_tables(log: FlightLog, *, plant_stride: int = 1, metadata: Mapping[str, str]) -> dict[str, pa.Table]:
+    """A flight's tables `flight`, `timing`, `plant`, and `horizon` where positions were predicted; see `write_log`."""
+    tables = {
+        "flight": _flight_table(log.control, metadata),
+        "timing": _timing_table(log.timing, metadata),
+        "plant": _plant_table(log.plant.every(plant_stride), metadata),
+    }
+    if log.predicted is not None:
+        tables["horizon"] = _horizon_table(log.control.t, log.predicted, metadata)
+    return tables
+
+
 def write_log(directory: Path, log: FlightLog, *, plant_stride: int, metadata: Mapping[str, str]) -> None:
     """Write a flight's Parquet files into an existing directory.
 
@@ -98,15 +110,8 @@ def write_log(directory: Path, log: FlightLog, *, plant_stride: int, metadata: M
         plant_stride: physics steps per row of `plant.parquet`.
         metadata: texts kept in each file's schema; no clock reading belongs here.
     """
-    tables = {
-        FLIGHT_FILE: _flight_table(log.control, metadata),
-        TIMING_FILE: _timing_table(log.timing, metadata),
-        PLANT_FILE: _plant_table(log.plant.every(plant_stride), metadata),
-    }
-    if log.predicted is not None:
-        tables[HORIZON_FILE] = _horizon_table(log.control.t, log.predicted, metadata)
-    for name, table in tables.items():
-        _write(table, directory / name)
+    for name, table in log_tables(log, plant_stride=plant_stride, metadata=metadata).items():
+        _write(table, directory / f"{name}.parquet")
 
 
 def add_metadata(path: Path, texts: Mapping[str, str]) -> None:

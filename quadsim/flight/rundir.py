@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from quadsim.errors import FileError
-from quadsim.flight.audit import Finding, Limit
+from quadsim.flight.audit import Finding, Limit, SumLimit
 from quadsim.flight.log import FlightLog
 from quadsim.flight.parquet import (
     FLIGHT_FILE,
@@ -78,7 +78,7 @@ def limit_to_json(finding: Finding) -> dict[str, Any]:
     return {
         "name": limit.name,
         "signal": limit.signal,
-        **({"terms": dict(limit.terms)} if limit.terms else {}),
+        **({"terms": dict(limit.terms)} if isinstance(limit, SumLimit) else {}),
         "unit": limit.unit,
         "lower": finite(limit.lower),
         "upper": finite(limit.upper),
@@ -100,10 +100,18 @@ def limit_to_json(finding: Finding) -> dict[str, Any]:
 def limit_from_json(entry: Mapping[str, Any]) -> Limit:
     """The limit that `limit_to_json` wrote."""
     absent = {"lower": -math.inf, "upper": math.inf, "stop": math.inf}
-    terms = tuple((name, float(factor)) for name, factor in entry.get("terms", {}).items())
-    values: dict[str, Any] = {field.name: entry[field.name] for field in fields(Limit) if field.name != "terms"}
-    values["terms"] = terms
-    return Limit(**values | {name: bound for name, bound in absent.items() if values[name] is None})
+    values = {field.name: entry[field.name] for field in fields(Limit)}
+    values |= {name: bound for name, bound in absent.items() if values[name] is None}
+    if not entry.get("terms"):
+        return Limit(**values)
+    return SumLimit(terms=tuple((name, float(factor)) for name, factor in entry["terms"].items()), **values)
+
+
+def finding_from_json(entry: Mapping[str, Any]) -> Finding:
+    """The finding that `limit_to_json` wrote."""
+    names = ("peak_sampled", "peak_plant", "worst_margin_sampled", "worst_margin", "worst_time", "time_violated")
+    values = {name: math.nan if entry[name] is None else float(entry[name]) for name in names}
+    return Finding(limit=limit_from_json(entry), **values)
 
 
 def is_run(directory: Path) -> bool:

@@ -69,7 +69,7 @@ def build_spec(
     visuals: bool = True,
     contact: bool = False,
     reweighed: bool = False,
-    body_drag: tuple[float, float, float] | None = None,
+    body_drag: tuple[float, ...] | None = None,
     air_density: float = 0.0,
 ) -> mujoco.MjSpec:
     """The airframe's specification with every physical number taken from the vehicle.
@@ -119,7 +119,7 @@ def compile_model(
     visuals: bool = False,
     contact: bool = False,
     reweighed: bool = False,
-    body_drag: tuple[float, float, float] | None = None,
+    body_drag: tuple[float, ...] | None = None,
     air_density: float = 0.0,
 ) -> mujoco.MjModel:
     """Compile the airframe.
@@ -190,7 +190,7 @@ def _ground(spec: mujoco.MjSpec) -> None:
         geom.friction = _FRICTION
 
 
-def _add_drag(spec: mujoco.MjSpec, areas: tuple[float, float, float], density: float) -> None:
+def _add_drag(spec: mujoco.MjSpec, areas: tuple[float, ...], density: float) -> None:
     """Hang an ellipsoid on the body that nothing but the air meets, with pi r_y r_z = A_x and so on."""
     ax, ay, az = areas
     spec.option.density = density

@@ -94,12 +94,12 @@ def fly(
             started = clock.perf_counter()
             command = controller.step(now, states[k], preview)
             step_s = clock.perf_counter() - started
-            delay = 0.0 if computation is None else computation.delay(now.time, command, draws)
+            delay = 0.0 if computation is None else computation.taken(now.time, command, draws)
             wait = math.ceil(delay / plant.timestep - 1e-6)
             missed = wait > steps_per_period  # one that comes just in time acts from the next period on
             due = min(wait, steps_per_period)
             if computation is not None and computation.plan:
-                due = min(due, math.ceil(computation.fixed / plant.timestep - 1e-6))
+                due = min(due, math.ceil(computation.delay / plant.timestep - 1e-6))
             holds = [(acting, due), (_next_row(plan, age), min(wait, steps_per_period) - due)]
             if missed:
                 age += 1

@@ -17,9 +17,9 @@ from mujoco.rollout import Rollout
 from quadsim.controller import check_command
 from quadsim.errors import CommandError, DivergenceError, ParameterError
 from quadsim.sim.airframe import BODY, compile_model, outline
-from quadsim.sim.effects import Effects, RotorChange, Wind
+from quadsim.sim.effects import Air, Effects, Load, Payload, PayloadChange, RotorChange, RotorDynamics, Wind
 from quadsim.sim.effects.forces import StepForces
-from quadsim.sim.effects.load import Payload, apply_mass, mass_properties
+from quadsim.sim.effects.load import apply_mass, mass_properties
 from quadsim.sim.physics import Segment, physics_to_state
 from quadsim.state import (
     EULER,
@@ -47,6 +47,7 @@ _NUMERICAL_WARNINGS: Final = (
 
 
 _CALM: Final = Effects()
+_AS_THE_FILE_SAYS: Final = Load()
 
 
 class Plant:
@@ -59,7 +60,7 @@ class Plant:
     Attributes:
         vehicle: what flies, as its file says.
         timestep: physics step [s].
-        effects: what acts on it.
+        effects: what acts on it, resolved; see `quadsim.sim.effects.Effects.resolved`.
         model: the compiled model, not to be changed.
     """
 
@@ -70,20 +71,24 @@ class Plant:
         timestep: float = 1e-3,
         limit_speeds: bool = False,
         effects: Effects = _CALM,
+        changes: Sequence[RotorChange | PayloadChange] = (),
         wind: Wind | None = None,
         rng: np.random.Generator | None = None,
     ) -> None:
         self.vehicle = vehicle
         self.timestep = timestep
         self.effects = effects
+        self._rotors, air = effects.rotors or RotorDynamics(), effects.air or Air()
+        self._load = effects.load or _AS_THE_FILE_SAYS
+        self._reweighed = self._load != _AS_THE_FILE_SAYS or any(isinstance(each, PayloadChange) for each in changes)
         self.model = compile_model(
             vehicle,
             timestep=timestep,
             limit_speeds=limit_speeds,
-            contact=effects.contact,
-            reweighed=effects.reweighs,
-            body_drag=effects.body_drag,
-            air_density=effects.air_density,
+            contact=effects.ground is not None and effects.ground.contact,
+            reweighed=self._reweighed,
+            body_drag=air.body_drag,
+            air_density=air.density,
         )
         self._speed_range = (vehicle.speed_min, vehicle.speed_max) if limit_speeds else (0.0, math.inf)
         self._data = mujoco.MjData(self.model)
@@ -93,8 +98,8 @@ class Plant:
         self._yaw = 0.0
         self._wind = wind
         self._by_step = effects.follows_state or wind is not None
-        changes = sorted(effects.changes, key=lambda change: change.time)
-        self._changes = [(math.ceil(change.time / timestep - 1e-6), change) for change in changes]
+        ordered = sorted(changes, key=lambda change: change.time)
+        self._changes = [(math.ceil(change.time / timestep - 1e-6), change) for change in ordered]
         self._rng = rng if rng is not None else np.random.default_rng(0)
         self._rng_start = self._rng.bit_generator.state
         self.reset(np.zeros(N_STATES))
@@ -155,10 +160,10 @@ class Plant:
         self._step = 0
         self._pending = list(self._changes)
         self._speeds = self.hover_speeds if speeds is None else np.array(speeds, float)
-        self._efficiency = np.array(self.effects.efficiency)
+        self._efficiency = np.array(self._rotors.efficiency)
         self._velocity_before = self._physics[0, 8:].tolist()
-        if self.effects.reweighs:
-            self._carry(list(self.effects.load.payloads))
+        if self._reweighed:
+            self._carry(list(self._load.payloads))
         self._rng.bit_generator.state = self._rng_start
         if self._wind is not None:
             self._wind.reset()
@@ -212,12 +217,12 @@ class Plant:
 
     def _carry(self, payloads: list[Payload]) -> None:
         self._payloads = payloads
-        apply_mass(self.model, BODY, mass_properties(self.vehicle, self.effects.load, payloads))
+        apply_mass(self.model, BODY, mass_properties(self.vehicle, self._load, payloads))
 
     def _hold(self, target: Array, steps: int) -> Segment:
         """Advance while nothing but the vehicle and the air changes."""
-        rotors, timestep = self.effects.rotors, self.timestep
-        if rotors is None:
+        rotors, timestep = self._rotors, self.timestep
+        if rotors.at_once:
             before = middle = np.broadcast_to(target, (steps, N_ROTORS))
             slopes = np.zeros((steps, N_ROTORS))
             self._speeds = target
@@ -265,7 +270,7 @@ class Plant:
         disturbance = self.effects.disturbance
         noises = None if disturbance is None else disturbance.draw(steps, self.timestep, self._rng).tolist()
         air = np.zeros((steps, 3)) if wind is None else wind
-        drags = self.effects.body_drag is not None
+        drags = self.effects.air is not None and self.effects.air.body_drag is not None
         moving_air = wind is not None and drags
         there = self._efficiency > 0.0  # a lost propeller neither drags nor carries momentum
         of_rotors = self._forces.of_rotors(speeds * there, slopes * there).tolist()

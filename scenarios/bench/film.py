@@ -11,9 +11,10 @@ from typing import Final
 from quadsim.errors import ParameterError
 from quadsim.report.film.video import render_video, rendering_backend, worker_count
 from scenarios.bench.bench_results import RenderProfile
+from scenarios.flight import Outputs
 from scenarios.machine import machine
 from scenarios.progress import Progress, silent
-from scenarios.run import Outputs, run_scenario
+from scenarios.run import run_scenario
 from scenarios.schema.scenario import Scenario
 
 SECONDS: Final = 4.0

@@ -23,9 +23,10 @@ from scenarios.bench.queries import QueriedController, Queries, flight_between, 
 from scenarios.bench.stages import time_stages
 from scenarios.bench.timing import StepTimes, segments, time_in_turns
 from scenarios.build import build_problem
+from scenarios.flight import Flight
 from scenarios.machine import machine, versions
 from scenarios.progress import Progress, silent
-from scenarios.run import Flight, fly_scenario
+from scenarios.run import fly_scenario
 from scenarios.schema.controller import ConstrainedSpec
 from scenarios.schema.optimisation import LARGEST_HORIZON
 from scenarios.schema.scenario import Scenario

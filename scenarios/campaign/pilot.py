@@ -11,10 +11,11 @@ from scenarios.campaign.plan import Plan
 from scenarios.campaign.results.table import Row, failed_row, flown_row
 from scenarios.campaign.results.verdicts import ERROR, MEMORY
 from scenarios.campaign.spec import LimitsSpec
+from scenarios.flight import Flight
 from scenarios.machine import processor_name
 from scenarios.parts.plugin import import_plugin
 from scenarios.progress import Progress, silent
-from scenarios.run import Flight, fly_scenario
+from scenarios.run import fly_scenario
 from scenarios.schema.plugin import PluginSpec
 
 

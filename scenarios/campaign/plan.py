@@ -194,6 +194,18 @@ def load_plan(name: str, settings: Sequence[str] = (), *, flights: int | None = 
     return plan
 
 
+def make_plan(scenario: Scenario, data: Mapping[str, Any]) -> Plan:
+    """A campaign of a scenario that is there already, its other fields given as in a file.
+
+    Raises:
+        InputError: a field is not allowed, or what varies cannot be flown.
+    """
+    spec = parse_campaign({"name": scenario.name, **data, "scenario": scenario.name}, source="campaign")
+    plan = Plan(spec=spec, scenario=resolve_vehicle(scenario, build_vehicle(scenario)))
+    plan.check()
+    return plan
+
+
 def parse_campaign(data: Mapping[str, Any], *, source: str) -> CampaignSpec:
     """Check a campaign given as nested tables.
 

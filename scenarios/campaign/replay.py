@@ -13,9 +13,11 @@ from scenarios.campaign.pilot import CampaignPilot
 from scenarios.campaign.plan import Plan
 from scenarios.campaign.results.store import FLIGHTS_FILE, read_flights
 from scenarios.campaign.results.table import make_table
+from scenarios.campaign.results.verdicts import MEMORY, TIMEOUT
 from scenarios.campaign.statistics.estimates import worst_flight
+from scenarios.flight import Flight, Outputs
 from scenarios.progress import Progress, silent
-from scenarios.run import Flight, Outputs, run_scenario
+from scenarios.run import run_scenario
 from scenarios.schema.scenario import Scenario
 
 
@@ -38,6 +40,17 @@ class Recorded:
     scenario: Scenario
     otherwise: Sequence[str]
 
+    @property
+    def notes(self) -> list[str]:
+        """What a person should know before it is flown again."""
+        found = []
+        if self.otherwise:
+            found.append(f"other {', '.join(self.otherwise)} flew that campaign, so numbers may differ")
+        if self.row["verdict"] in (TIMEOUT, MEMORY):
+            ended = f"flight {self.number} was ended in the campaign ({self.row['reason']})"
+            found.append(f"{ended}; here nothing ends it but Ctrl-C")
+        return found
+
 
 def recorded_flight(directory: Path, number: int | None) -> Recorded:
     """A flight of a campaign's directory; the worst one where no number is given.
@@ -57,7 +70,25 @@ def recorded_flight(directory: Path, number: int | None) -> Recorded:
     return Recorded(number=number, row=row, plan=plan, scenario=plan.of(number), otherwise=otherwise)
 
 
-def replay(recorded: Recorded, target: Path, outputs: Outputs, progress: Progress = silent) -> tuple[Flight, list[str]]:
+@dataclass(frozen=True, kw_only=True)
+class Replay:
+    """A flight of a campaign, flown again.
+
+    Attributes:
+        recorded: as the campaign has it.
+        flight: as it was flown now.
+        directory: its run directory.
+        differing: the columns of the campaign's table that it does not agree with, bit for bit; none, on the same
+            machine with the same code.
+    """
+
+    recorded: Recorded
+    flight: Flight
+    directory: Path
+    differing: Sequence[str]
+
+
+def replay_flight(recorded: Recorded, target: Path, outputs: Outputs, progress: Progress = silent) -> Replay:
     """Fly it again and write its run directory.
 
     Args:
@@ -65,12 +96,9 @@ def replay(recorded: Recorded, target: Path, outputs: Outputs, progress: Progres
         target: the run directory.
         outputs: see `scenarios.run.run_scenario`.
         progress: see `scenarios.run.run_scenario`.
-
-    Returns:
-        The flight, and the columns of the campaign's table that it does not agree with, bit for bit; none, on the same
-        machine with the same code.
     """
     flight = run_scenario(recorded.scenario, target, outputs, progress)
     row = CampaignPilot(recorded.plan).row_of(recorded.number, flight)
     (again,) = make_table([row], recorded.plan.schema).to_pylist()
-    return flight, [name for name, value in recorded.row.items() if name not in again or again[name] != value]
+    differing = [name for name, value in recorded.row.items() if name not in again or again[name] != value]
+    return Replay(recorded=recorded, flight=flight, directory=target, differing=differing)

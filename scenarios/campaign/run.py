@@ -27,6 +27,8 @@ from scenarios.campaign.results.store import FLIGHTS_FILE, TIMES_FILE, Store
 from scenarios.campaign.results.table import Row, read_table
 from scenarios.campaign.statistics.estimates import estimate
 from scenarios.campaign.statistics.inference import proportion
+from scenarios.campaign.statistics.requirement import Judgement
+from scenarios.flight import to_pandas
 
 SUMMARY_FILE: Final = "summary.json"
 REPORT_FILES: Final = ("index.html", "campaign.png", "campaign.svg")
@@ -75,12 +77,24 @@ class Result:
         manifest: what was flown, with what.
         table: `flights.parquet`.
         summary: `summary.json`.
+        failure: the events of which any one makes a flight fail.
+        judgements: of the requirements that were stated.
     """
 
     directory: Path
     manifest: dict[str, Any]
     table: pa.Table
     summary: dict[str, Any]
+    failure: tuple[str, ...]
+    judgements: tuple[Judgement, ...] = ()
+
+    def to_pandas(self) -> Any:
+        """The table as a pandas DataFrame.
+
+        Raises:
+            MissingPackageError: pandas is not installed.
+        """
+        return to_pandas(self.table)
 
 
 def fly_campaign(
@@ -254,7 +268,9 @@ def _conclude(plan: Plan, files: Growing, progress: _Progress, manifest: dict[st
     manifest["files"] = {name: digest_of(directory / name) for name in ours}
     manifest["status"] = "complete" if progress.wanted == plan.spec.flights else "stopped"
     records.write(manifest, files)
-    return Result(directory=directory, manifest=manifest, table=table, summary=summary)
+    return Result(
+        directory=directory, manifest=manifest, table=table, summary=summary, failure=tuple(plan.spec.failure)
+    )
 
 
 def _machines(directory: Path) -> dict[str, int]:

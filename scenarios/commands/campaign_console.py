@@ -34,10 +34,10 @@ LINE_EVERY: Final = 30.0
 
 
 @contextlib.contextmanager
-def progress(*, enabled: bool) -> Iterator[Watch]:
-    """A bar on stderr, or a line now and then where that is no terminal, as in the log of a batch job."""
+def progress(*, enabled: bool, lines: bool = True) -> Iterator[Watch]:
+    """A bar on stderr; where that is no terminal, as in a batch job, a line now and then, or nothing."""
     screen = stderr()
-    if not enabled:
+    if not enabled or not (lines or screen.is_terminal):
         yield lambda standing: None
     elif screen.is_terminal:
         columns = (TextColumn("flights"), BarColumn(), TextColumn("{task.description}"))

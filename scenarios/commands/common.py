@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import json
 from argparse import Namespace
-from pathlib import Path
 from typing import Any
 
-from quadsim.errors import InputError
+from scenarios.api import load as load_scenario
 from scenarios.commands import console
-from scenarios.loading import load_scenario
 from scenarios.schema.scenario import Scenario
 
 
@@ -20,8 +18,6 @@ def load(name: str, options: Namespace) -> Scenario:
         InputError: it cannot be flown.
     """
     settings = [*options.settings] if options.seed is None else [*options.settings, f"seed={options.seed}"]
-    if Path(name).is_dir():
-        raise InputError(f"{name} is a directory; give a scenario's name or its TOML file")
     return load_scenario(name, settings)
 
 

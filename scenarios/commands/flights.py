@@ -8,13 +8,13 @@ from pathlib import Path
 from quadsim.errors import ParameterError
 from quadsim.flight import rundir
 from quadsim.outputs import real_path, require_file
+from scenarios.api import fly
 from scenarios.commands import EXIT_DONE, EXIT_FAILED, console
 from scenarios.commands.common import load, print_summary
 from scenarios.commands.junit import write_junit
 from scenarios.courses.feasibility_check import report
 from scenarios.parts.vehicle import build_vehicle
 from scenarios.reaudit import reaudit
-from scenarios.run import Outputs, fly_scenario, run_scenario, summarise
 from scenarios.schema.scenario import Scenario
 
 
@@ -22,10 +22,15 @@ def run(options: Namespace) -> int:
     """`quadsim run`."""
     scenario = load(options.scenario, options)
     target = real_path(Path("runs") / scenario.name if options.out is None else options.out)
-    outputs = Outputs(video=options.video, recording=options.recording, figures=options.figures)
     _announce(scenario, options)
-    with console.progress_bars(enabled=not options.json) as progress:
-        flight = run_scenario(scenario, target, outputs, progress)
+    flight = fly(
+        scenario,
+        out=target,
+        video=options.video,
+        recording=options.recording,
+        figures=options.figures,
+        progress=not options.json,
+    )
     print_summary(rundir.read_summary(target), options, where=str(target))
     return EXIT_DONE if flight.satisfied else EXIT_FAILED
 
@@ -46,8 +51,7 @@ def check(options: Namespace) -> int:
     else:
         scenario = load(options.target, options)
         _announce(scenario, options)
-        with console.progress_bars(enabled=not options.json) as progress:
-            summary = summarise(fly_scenario(scenario, progress))
+        summary = dict(fly(scenario, progress=not options.json).summary)
     if options.junit is not None:
         write_junit(summary, Path(options.junit))
     print_summary(summary, options)

@@ -14,7 +14,7 @@ import numpy as np
 
 from mpc.answer import ActuatorBounds
 from mpc.constraints import Bounds, Constraint, Penalty
-from mpc.fallback.settings import FallbackSettings
+from mpc.fallback.settings import USUAL_TILT, FallbackSettings
 from mpc.model import hover_model
 from mpc.ocp import Objective, Problem, lqr_terminal_weight
 from mpc.robust.tightening import SHORTEST_LAG
@@ -25,7 +25,6 @@ from quadsim.vehicle import N_ROTORS, Vehicle
 from scenarios.parts.plugin import build_plugin
 from scenarios.schema.baselines import GeometricSpec, LQRSpec, PIDSpec
 from scenarios.schema.controller import ConstrainedSpec, ControllerSpec, UnconstrainedSpec
-from scenarios.schema.fallback import FallbackSpec
 from scenarios.schema.optimisation import ANGLES, BoundedSpec, InputWeightsSpec, SoftSpec, WeightedSpec
 from scenarios.schema.plugin import PluginSpec
 from scenarios.schema.robust import RobustSpec
@@ -35,8 +34,6 @@ if TYPE_CHECKING:
 
 FALLBACK_SHARE: Final = 0.8
 """Tilt of the fallback over the tightest bound on it: the controller finds a vehicle that it can take over."""
-USUAL_TILT: Final = math.degrees(FallbackSettings().tilt)
-"""The fallback's tilt where nothing bounds it more tightly [deg]."""
 SMALLEST_TILT: Final = 0.5
 """With less the fallback cannot hold against anything, whatever the bounds are [deg]."""
 
@@ -144,29 +141,16 @@ def posed_problem(spec: BoundedSpec, vehicle: Vehicle, period: float) -> Problem
     return make_problem(spec, vehicle, period)
 
 
-def guarded(law: Controller, spec: BoundedSpec, fallback: FallbackSpec, vehicle: Vehicle, period: float) -> Controller:
+def guarded(
+    law: Controller, spec: BoundedSpec, fallback: FallbackSettings, vehicle: Vehicle, period: float
+) -> Controller:
     """The law within the fallback contract; the law itself where that is switched off."""
     from mpc.fallback.contract import Guarded
 
     if not fallback.enabled:
         return law
-    return Guarded(
-        law,
-        hover_model(vehicle, period),
-        bounds=ActuatorBounds.of(make_bounds(spec)),
-        settings=FallbackSettings(
-            unseen=fallback.unseen,
-            plan_age=fallback.plan_age,
-            position=fallback.position,
-            velocity=fallback.velocity,
-            angle=math.radians(fallback.angle),
-            rate=math.radians(fallback.rate),
-            hover=fallback.hover,
-            sink=fallback.sink,
-            tilt=math.radians(_fallback_tilt(spec, fallback)),
-            settled=fallback.settled,
-        ),
-    )
+    settings = replace(fallback, tilt=_fallback_tilt(spec, fallback))
+    return Guarded(law, hover_model(vehicle, period), bounds=ActuatorBounds.of(make_bounds(spec)), settings=settings)
 
 
 def _constrained(spec: ConstrainedSpec, problem: Problem) -> Controller:
@@ -190,16 +174,15 @@ def _unconstrained(problem: Problem) -> Controller:
 
 def _robust(spec: RobustSpec, vehicle: Vehicle, period: float) -> RobustMPC:
     from mpc.robust.controller import Linearisation, RobustMPC, RobustSettings
-    from mpc.robust.observer import ObserverSettings
-    from mpc.robust.tightening import TighteningSettings, margins
+    from mpc.robust.tightening import margins
 
     bounds, rotor_lag = make_bounds(spec), _rotor_lag(spec, vehicle)
-    soft, offset_free, tightening = spec.soft, spec.offset_free, spec.tightening
+    soft, tightening = spec.soft, spec.tightening
     settings = RobustSettings(
         penalty=None if soft is None else make_penalty(soft, bounds.y_min.size),
         rotor_lag=rotor_lag,
         delay=spec.delay,
-        observer=None if offset_free is None else ObserverSettings(**offset_free.model_dump()),
+        observer=spec.offset_free,
         heading=spec.heading,
         largest_turn=math.radians(spec.largest_turn),
         move_weight=None if spec.move_weight is None else spec.move_weight * np.eye(N_ROTORS),
@@ -212,10 +195,10 @@ def _robust(spec: RobustSpec, vehicle: Vehicle, period: float) -> RobustMPC:
             period=period,
             horizon=spec.horizon,
             bounds=bounds,
-            settings=TighteningSettings(**tightening.model_dump()),
+            settings=tightening,
             rotor_lag=rotor_lag,
             delay=spec.delay,
-            estimated=offset_free is not None,
+            estimated=spec.offset_free is not None,
         ),
     )
     return RobustMPC(
@@ -276,7 +259,7 @@ def _rotor_lag(spec: RobustSpec, vehicle: Vehicle) -> float:
     return vehicle.rotor_rise
 
 
-def _fallback_tilt(spec: BoundedSpec, fallback: FallbackSpec) -> float:
+def _fallback_tilt(spec: BoundedSpec, fallback: FallbackSettings) -> float:
     """The fallback's largest tilt [deg]."""
     if fallback.tilt is not None:
         return fallback.tilt

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING
 
-from quadsim.flight.audit import SUM, Limit
+from quadsim.flight.audit import Limit, SumLimit
 from quadsim.flight.lost import LossCriteria
 from scenarios.schema.optimisation import BoundedSpec, PolytopeSpec
 
@@ -20,30 +20,12 @@ def build_loss(scenario: Scenario) -> LossCriteria:
 
 def build_limits(scenario: Scenario) -> tuple[Limit, ...]:
     """What the flight is audited against: its constraints, and the controller's polytopes."""
-
-    def or_infinite(value: float | None, sign: float) -> float:
-        return sign * math.inf if value is None else value
-
-    return tuple(
-        Limit(
-            name=spec.name,
-            signal=spec.signal,
-            lower=or_infinite(spec.lower, -1.0),
-            upper=or_infinite(spec.upper, 1.0),
-            tolerance=spec.tolerance,
-            tolerance_sampled=spec.tolerance_sampled,
-            required=spec.required,
-            start=spec.start,
-            stop=or_infinite(spec.stop, 1.0),
-        )
-        for spec in scenario.constraints
-    ) + tuple(
-        Limit(
+    return tuple(scenario.constraints) + tuple(
+        SumLimit(
             name=name,
-            signal=SUM,
             terms=tuple((of, factor) for of, factor in zip(polytope.of, row, strict=True) if factor),
-            lower=or_infinite(None if polytope.lower is None else polytope.lower[i], -1.0),
-            upper=or_infinite(None if polytope.upper is None else polytope.upper[i], 1.0),
+            lower=-math.inf if polytope.lower is None else polytope.lower[i],
+            upper=math.inf if polytope.upper is None else polytope.upper[i],
             tolerance=polytope.tolerance,
             tolerance_sampled=polytope.tolerance_sampled,
             required=polytope.required,

@@ -6,13 +6,12 @@ import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Final
 
-from quadsim.sim.estimation.settings import EstimatorSettings
 from quadsim.sim.navigation import Navigation
-from quadsim.sim.sensing.sensor import AXES, FaultKind, Outliers, Sensor, SensorFault, SensorName
+from quadsim.sim.sensing.sensor import AXES, FaultKind, Sensor, SensorFault, SensorName
 from quadsim.vehicle import Vehicle
 from scenarios.parts.randomness import generator
 from scenarios.schema.events import SensorFaultEvent
-from scenarios.schema.sensors import AnySensorSpec, EstimatorSpec
+from scenarios.schema.sensors import AnySensorSpec
 
 if TYPE_CHECKING:
     from scenarios.schema.scenario import Scenario
@@ -25,7 +24,6 @@ _UNITS: Final = {
     SensorName.RATES: math.radians(1.0),
 }
 """The scenario file's unit of each sensor in the testbed's."""
-_IN_DEGREES: Final = frozenset({"gyro_bias_walk", "initial_attitude", "initial_rates", "initial_gyro_bias"})
 
 
 def build_navigation(scenario: Scenario, vehicle: Vehicle) -> Navigation | None:
@@ -59,7 +57,7 @@ def build_navigation(scenario: Scenario, vehicle: Vehicle) -> Navigation | None:
         sensors=sensors,
         rng=generator(scenario.seed, "sensors"),
         faults=faults,
-        estimator=None if scenario.estimator is None else build_estimator(scenario.estimator),
+        estimator=scenario.estimator,
     )
 
 
@@ -67,14 +65,6 @@ def build_sensors(scenario: Scenario) -> tuple[Sensor, ...]:
     """The sensors that the scenario has, in SI units."""
     present = {} if scenario.sensors is None else scenario.sensors.present()
     return tuple(_sensor(name, spec) for name, spec in present.items())
-
-
-def build_estimator(spec: EstimatorSpec) -> EstimatorSettings:
-    """The filter's tuning, in SI units."""
-    values = spec.model_dump(exclude={"type"})
-    return EstimatorSettings(
-        **{name: math.radians(value) if name in _IN_DEGREES else value for name, value in values.items()}
-    )
 
 
 def build_fault(
@@ -105,18 +95,8 @@ def build_fault(
 
 
 def _sensor(name: SensorName, spec: AnySensorSpec) -> Sensor:
-    unit = _UNITS[name]
-    outliers = Outliers() if spec.outliers is None else Outliers(**spec.outliers.model_dump())
-    return Sensor(
-        name=name,
-        rate=spec.rate,
-        noise=_three(spec.noise, unit),
-        bias=_three(spec.bias, unit),
-        bias_walk=_three(spec.bias_walk, unit),
-        delay=spec.delay,
-        dropout=spec.dropout,
-        outliers=outliers,
-    )
+    of_axes = {field: _three(getattr(spec, field), _UNITS[name]) for field in ("noise", "bias", "bias_walk")}
+    return Sensor(name=name, **{**dict(spec), **of_axes})
 
 
 def _three(value: float | list[float], unit: float) -> tuple[float, float, float]:

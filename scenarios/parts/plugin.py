@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import difflib
+import functools
 import importlib
 import inspect
 import traceback
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +23,8 @@ from scenarios.schema.plugin import GIVEN, PluginSpec
 
 _WHOLE, _REAL = ("iterations", "active", "fallback"), ("slack", "primal_residual", "dual_residual", "solve_s")
 """What else a command has: whole numbers, and numbers."""
+STEP = ("now", "state", "reference")
+"""What the arguments of a controller's step are called, and of a function that is one."""
 _LONGEST = 200
 """Characters of a name or status."""
 
@@ -53,7 +56,7 @@ class PluginController:
     @property
     def module(self) -> str:
         """The module that its code is in."""
-        return type(self._law).__module__
+        return self._law.module if isinstance(self._law, _Function) else type(self._law).__module__
 
     @property
     def solver(self) -> str:
@@ -133,6 +136,15 @@ def _numbers(given: Any) -> Array | None:
         return None
 
 
+@dataclass(frozen=True)
+class _Function:
+    """A function as a law without memory."""
+
+    step: Callable[..., Any]
+    name: str
+    module: str
+
+
 def import_plugin(spec: PluginSpec) -> None:
     """Import the module that a controller is in; see `build_plugin`.
 
@@ -162,18 +174,26 @@ def build_plugin(spec: PluginSpec, vehicle: Vehicle, period: float) -> Controlle
             them by a ValueError, or has no `step`.  Any other exception of its own code passes, traceback and all.
     """
     code = announce(spec)
-    folders, attribute = folders_of(spec), code.attribute
+    folders = folders_of(spec)
     with searched(folders):
         module = _import(spec.type, code.module, folders)
-        factory = _find(spec.type, module, attribute)
-        given = dict(zip(GIVEN, (vehicle, period, spec.horizon), strict=True)) | spec.settings
-        _check_call(attribute, factory, given)
-        try:
-            law = factory(given.pop("vehicle"), **given)
-        except InputError:
-            raise
-        except ValueError as error:
-            raise InputError(f"controller.settings: {attribute} refuses them: {_said(error)}") from error
+        return make_law(_find(spec.type, module, code.attribute), spec, vehicle, period)
+
+
+def make_law(code: Callable[..., Any], spec: PluginSpec, vehicle: Vehicle, period: float) -> PluginController:
+    """A controller of a function law(now, state, reference), or of a class, which is called; see `build_plugin`."""
+    attribute = getattr(code, "__qualname__", spec.type.partition(":")[2])
+    if inspect.isfunction(code) and tuple(inspect.signature(code).parameters)[:3] == STEP:
+        step = functools.partial(code, **spec.settings)
+        return PluginController(_Function(step, code.__name__, code.__module__), spec.horizon)
+    given = dict(zip(GIVEN, (vehicle, period, spec.horizon), strict=True)) | spec.settings
+    _check_call(attribute, code, given)
+    try:
+        law = code(given.pop("vehicle"), **given)
+    except InputError:
+        raise
+    except ValueError as error:
+        raise InputError(f"controller.settings: {attribute} refuses them: {_said(error)}") from error
     if not callable(getattr(law, "step", None)):
         rule = f"something with a method step(now, state, reference); {attribute}(...) gave {type(law).__name__}"
         raise ParameterError("controller", "type", spec.type, rule)

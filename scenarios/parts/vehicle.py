@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -30,11 +30,7 @@ def build_vehicle(scenario: Scenario) -> Vehicle:
 
 def resolve_vehicle(scenario: Scenario, vehicle: Vehicle) -> Scenario:
     """The scenario with the numbers of its vehicle's file in it; effects go on taking theirs from the vehicle."""
-    numbers: dict[str, Any] = {
-        name: list(value) if isinstance(value, tuple) else value
-        for name in type(scenario.vehicle).model_fields
-        if name != "file" and (value := getattr(vehicle, name)) is not None
-    }
+    numbers = {name: getattr(vehicle, name) for name in VEHICLE_UNITS}
     return scenario.model_copy(update={"vehicle": scenario.vehicle.model_copy(update=numbers)})
 
 

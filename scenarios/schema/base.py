@@ -1,24 +1,33 @@
-"""What all tables of the scenario file share: strictness, and the kinds of numbers."""
+"""What all tables of the scenario file share: strictness, kinds of numbers, and how their fields are declared.
+
+A table is a `Spec`, or a settings dataclass of the core, which is then its only declaration; see `quadsim.fields`.
+"""
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
-from typing import Annotated, Final
+from typing import Annotated, Any, Final, TypeGuard, get_type_hints
 
-from annotated_types import Len
-from pydantic import BaseModel, ConfigDict, Field
+from annotated_types import DocInfo, Len
+from pydantic import BaseModel, ConfigDict
+from pydantic.fields import FieldInfo
+
+from quadsim.fields import Fraction, NonNegative, Number, Positive
+
+__all__ = ["Fraction", "NonNegative", "Number", "Positive"]  # and what stands here
 
 MOST_ENTRIES: Final = 1000
 """Of a list of tables."""
-Number = Annotated[float, Field(ge=-1e6, le=1e6)]
-NonNegative = Annotated[float, Field(ge=0.0, le=1e6)]
-Positive = Annotated[float, Field(gt=0.0, le=1e6)]
-Fraction = Annotated[float, Field(ge=0.0, le=1.0)]
 Triple = Annotated[list[Number], Len(3, 3)]
 Quadruple = Annotated[list[Number], Len(4, 4)]
 Pair = Annotated[list[Number], Len(2, 2)]
 LARGEST_SEED: Final = 2**63 - 1
 """The largest whole number that every reader of TOML takes."""
+
+
+_FIRST: Final = {"at": 0, "type": 1}
+"""Fields that stand first in a table, which may have been added to those of a dataclass."""
 
 
 class Spec(BaseModel):
@@ -28,6 +37,23 @@ class Spec(BaseModel):
     """
 
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True, allow_inf_nan=False)
+
+
+def is_table(kind: object) -> TypeGuard[type[Any]]:
+    """Whether a type is one of tables."""
+    return isinstance(kind, type) and (issubclass(kind, BaseModel) or dataclasses.is_dataclass(kind))
+
+
+def fields_of(table: type[Any]) -> dict[str, FieldInfo]:
+    """The fields of a table by their names, with types, limits, defaults and descriptions."""
+    if issubclass(table, BaseModel):
+        return table.model_fields
+    hints = get_type_hints(table, include_extras=True)
+    found = {}
+    for field in sorted(dataclasses.fields(table), key=lambda field: _FIRST.get(field.name, len(_FIRST))):
+        found[field.name] = info = FieldInfo.from_annotated_attribute(hints[field.name], field)
+        info.description = next((note.documentation for note in info.metadata if isinstance(note, DocInfo)), None)
+    return found
 
 
 def require_ordered(name: str, pair: Sequence[float]) -> None:

@@ -8,10 +8,10 @@ from typing import Annotated, Any, Literal
 from pydantic import BeforeValidator, Discriminator, Field, Tag, model_validator
 from pydantic_core import PydanticCustomError
 
+from mpc.fallback.settings import FallbackSettings
 from mpc.solvers import SOLVERS
 from quadsim.errors import UnknownNameError
 from scenarios.schema.baselines import GeometricSpec, LQRSpec, PIDSpec
-from scenarios.schema.fallback import FallbackSpec
 from scenarios.schema.optimisation import BoundedSpec, WeightedSpec
 from scenarios.schema.plugin import FORM, LAWS, PluginSpec, is_plugin
 from scenarios.schema.robust import RobustSpec
@@ -32,7 +32,7 @@ class ConstrainedSpec(BoundedSpec):
         description="QP solver, by its name in `quadsim list`",
         json_schema_extra={"enum": [*SOLVERS]},
     )
-    fallback: FallbackSpec | None = Field(
+    fallback: FallbackSettings | None = Field(
         default=None, description="absent: the last plan is held, shifted, and then the flight is given up"
     )
 

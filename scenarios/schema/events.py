@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Annotated, Literal
 
-from annotated_types import Len
+from annotated_types import Len, doc
 from pydantic import Field, model_validator
 
+from quadsim.fields import Instant
+from quadsim.sim.computation import Stall
+from quadsim.sim.effects.gust import Gust
+from quadsim.sim.effects.load import Payload
+from quadsim.sim.effects.wind import WindChange
 from scenarios.schema.base import Fraction, Positive, Spec, Triple
-
-Instant = Annotated[float, Field(ge=0.0, le=1e6)]
 
 
 class _Event(Spec):
@@ -27,12 +31,12 @@ class RotorLossEvent(_Event):
     )
 
 
-class PayloadPickupEvent(_Event):
+@dataclass(frozen=True, kw_only=True)
+class PayloadPickupEvent(Payload):
     """The vehicle takes up a point mass, which moves with it from then on."""
 
-    type: Literal["payload_pickup"] = Field(description="kind of event: payload_pickup")
-    mass: Positive = Field(description="[kg]")
-    position: Triple = Field(default=[0.0, 0.0, 0.0], description="[m] in the body frame")
+    at: Instant
+    type: Annotated[Literal["payload_pickup"], doc("kind of event: payload_pickup")]
 
 
 class PayloadDropEvent(_Event):
@@ -41,19 +45,18 @@ class PayloadDropEvent(_Event):
     type: Literal["payload_drop"] = Field(description="kind of event: payload_drop")
 
 
-class GustEvent(_Event):
+@dataclass(frozen=True, kw_only=True)
+class GustEvent(Gust):
     """A gust of the 1-cosine shape."""
 
-    type: Literal["gust"] = Field(description="kind of event: gust")
-    duration: Positive = Field(description="[s] from calm to calm")
-    velocity: Triple = Field(description="[m/s] in its middle, world frame")
+    type: Annotated[Literal["gust"], doc("kind of event: gust")]
 
 
-class WindEvent(_Event):
+@dataclass(frozen=True, kw_only=True)
+class WindEvent(WindChange):
     """The mean wind changes."""
 
-    type: Literal["wind"] = Field(description="kind of event: wind")
-    velocity: Triple = Field(description="[m/s] from then on, world frame")
+    type: Annotated[Literal["wind"], doc("kind of event: wind")]
 
 
 class SensorFaultEvent(_Event):
@@ -83,11 +86,11 @@ class SensorFaultEvent(_Event):
         return self
 
 
-class StallEvent(_Event):
+@dataclass(frozen=True, kw_only=True)
+class StallEvent(Stall):
     """The computer answers nothing for a while; a command being computed waits for its end."""
 
-    type: Literal["stall"] = Field(description="kind of event: stall")
-    duration: Positive = Field(description="[s] how long")
+    type: Annotated[Literal["stall"], doc("kind of event: stall")]
 
 
 Event = Annotated[

@@ -10,7 +10,9 @@ from typing import Any, Final
 from pydantic.json_schema import GenerateJsonSchema
 from pydantic_core import core_schema
 
+from scenarios.schema.base import fields_of
 from scenarios.schema.scenario import Scenario
+from scenarios.schema.writing import headline, is_absent
 
 DIALECT: Final = "https://json-schema.org/draft/2020-12/schema"
 BASE: Final = {
@@ -35,9 +37,18 @@ class _SchemaOfToml(GenerateJsonSchema):
         """What a field may be where it is not absent."""
         return self.generate_inner(schema["schema"])
 
+    def dataclass_schema(self, schema: core_schema.DataclassSchema) -> dict[str, Any]:
+        """The same with what a settings dataclass says of its fields; see `quadsim.fields`."""
+        found, table = super().dataclass_schema(schema), schema["cls"]
+        found["description"] = f"{headline(table)}."
+        for name, field in fields_of(table).items():
+            if field.description:
+                found["properties"][name]["description"] = field.description
+        return found
+
     def default_schema(self, schema: core_schema.WithDefaultSchema) -> dict[str, Any]:
         """The same without a default where that is to be absent."""
-        if schema.get("default", ...) is None:
+        if "default" in schema and is_absent(schema["default"]):
             return self.generate_inner(schema["schema"])
         return super().default_schema(schema)
 

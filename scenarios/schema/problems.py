@@ -11,11 +11,12 @@ from types import NoneType, UnionType
 from typing import Annotated, Any, Final, Literal, Union, get_args, get_origin
 
 from annotated_types import Len, MaxLen, MinLen
-from pydantic import BaseModel, Tag
+from pydantic import BaseModel, Tag, ValidationError
 from pydantic_core import ErrorDetails
 
-from quadsim.errors import InputError
+from quadsim.errors import InputError, ParameterError, UnknownNameError
 from quadsim.vehicle import MEANT
+from scenarios.schema.base import fields_of, is_table
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,14 +34,18 @@ class Kind:
     @property
     def fields(self) -> tuple[str, ...]:
         """Names of the fields, of a table."""
-        is_table = isinstance(self.type, type) and issubclass(self.type, BaseModel)
-        return tuple(self.type.model_fields) if is_table else ()
+        return tuple(fields_of(self.type)) if is_table(self.type) else ()
+
+    @property
+    def is_list(self) -> bool:
+        """Whether it is a list in a file."""
+        return (get_origin(self.type) or self.type) in (list, tuple)
 
     @property
     def labels(self) -> set[str]:
         """What pydantic calls this kind among several."""
         tags = {note.tag for note in self.metadata if isinstance(note, Tag)}
-        if "type" in self.fields and get_origin(choice := self.type.model_fields["type"].annotation) is Literal:
+        if "type" in self.fields and get_origin(choice := fields_of(self.type)["type"].annotation) is Literal:
             tags |= {*get_args(choice)}
         return tags or {getattr(self.type, "__name__", "")}
 
@@ -52,10 +57,12 @@ class Place:
     Attributes:
         names: from the root; an entry of a list by its name, or else by its index.
         kinds: what may stand there; none where nothing may.
+        given: what stands there.
     """
 
     names: tuple[str, ...]
     kinds: tuple[Kind, ...]
+    given: Any
 
     @property
     def fields(self) -> tuple[str, ...]:
@@ -66,7 +73,7 @@ class Place:
     def exact_length(self) -> int | None:
         """How long a list has to be, where that is one number."""
         for kind in self.kinds:
-            notes = kind.metadata if kind.type is list or get_origin(kind.type) is list else ()
+            notes = kind.metadata if kind.is_list else ()
             shortest = {note.min_length for note in notes if isinstance(note, Len | MinLen)}
             longest = {note.max_length for note in notes if isinstance(note, Len | MaxLen)}
             if shortest and shortest == longest:
@@ -76,7 +83,7 @@ class Place:
     @property
     def entries(self) -> str:
         """What a list there holds."""
-        held = {entry.type for kind in self.kinds if get_origin(kind.type) is list for entry in _entries(kind)}
+        held = {entry.type for kind in self.kinds if kind.is_list for entry in _entries(kind)}
         return "numbers" if held <= {float, int} else "texts" if held == {str} else "entries"
 
 
@@ -86,7 +93,7 @@ def find(path: Sequence[int | str], data: Any, root: type[BaseModel]) -> Place:
     kinds: tuple[Kind, ...] = (Kind(type=root),)
     for part in path:
         named = tuple(kind for kind in kinds if part in kind.labels)
-        fields = [kind.type.model_fields[part] for kind in kinds if part in kind.fields]
+        fields = [fields_of(kind.type)[part] for kind in kinds if part in kind.fields]
         if isinstance(part, int):
             data = data[part]
             name = data.get("name") if isinstance(data, Mapping) else None
@@ -99,7 +106,7 @@ def find(path: Sequence[int | str], data: Any, root: type[BaseModel]) -> Place:
             data = data.get(part) if isinstance(data, Mapping) else None
             inner = [kinds_of(field.annotation, tuple(field.metadata)) for field in fields] or map(_entries, kinds)
             kinds = tuple(kind for each in inner for kind in each)
-    return Place(names=tuple(names), kinds=kinds)
+    return Place(names=tuple(names), kinds=kinds, given=data)
 
 
 def kinds_of(annotation: Any, metadata: tuple[Any, ...] = ()) -> tuple[Kind, ...]:
@@ -115,7 +122,8 @@ def kinds_of(annotation: Any, metadata: tuple[Any, ...] = ()) -> tuple[Kind, ...
 
 def _entries(kind: Kind) -> tuple[Kind, ...]:
     """What a list, or a table with names of the writer's choice, holds."""
-    return kinds_of(get_args(kind.type)[-1]) if get_origin(kind.type) in (list, dict) else ()
+    origin, arguments = get_origin(kind.type), get_args(kind.type)
+    return kinds_of(arguments[0] if origin is tuple else arguments[-1]) if origin in (list, dict, tuple) else ()
 
 
 _RULES: Final = {
@@ -131,12 +139,14 @@ _RULES: Final = {
     "string_too_short": "a text of {min_length} or more characters",
     "string_too_long": "a text of {max_length} or fewer characters",
     "literal_error": "one of {expected}",
+    "enum": "one of {expected}",
     "bool_type": "true or false",
     "list_type": "a list",
     "tuple_type": "a list",
     "dict_type": "a table",
     "model_type": "a table",
     "model_attributes_type": "a table",
+    "dataclass_type": "a table",
     "too_short": "of {min_length} or more entries",
     "too_long": "of {max_length} or fewer entries",
     "string_pattern_mismatch": "of the form {pattern}",
@@ -166,6 +176,19 @@ class ScenarioError(InputError):
         self.source, self.problems = source, tuple(problems)
 
 
+def describe_all(error: ValidationError, data: Mapping[str, Any], root: type[BaseModel]) -> list[str]:
+    """A line about each wrong field; of a list, that it is too long, or else which of its entries are wrong."""
+    found = error.errors(include_url=False)
+    unsaid: set[int] = set()
+    for each in found:
+        if each["type"] in ("too_short", "too_long"):
+            entries = [id(other) for other in found if other["loc"][:-1] == each["loc"]]
+            bounds = each["ctx"]
+            longer = len(each["input"]) > (bounds["max_length"] if "max_length" in bounds else bounds["min_length"])
+            unsaid.update(entries if longer else [id(each)] if entries else [])
+    return [describe(details, data, root) for details in found if id(details) not in unsaid]
+
+
 def describe(details: ErrorDetails, data: Mapping[str, Any], root: type[BaseModel], *, file: str = "scenario") -> str:
     """One line about one field: its name, what is allowed, what was given.
 
@@ -176,17 +199,25 @@ def describe(details: ErrorDetails, data: Mapping[str, Any], root: type[BaseMode
         file: what such a file is called.
     """
     place = find(details["loc"], data, root)
-    field, kind, given, context = ".".join(place.names), details["type"], details["input"], {**details.get("ctx", {})}
+    field, kind, context = ".".join(place.names), details["type"], {**details.get("ctx", {})}
+    given = details["input"] if details["loc"][-1:] == ("[key]",) else place.given
+    if kind == "finite_number" and not isinstance(given, float):  # see `scenarios.schema.scenario.Scenario.read`
+        kind = "float_type"
     if kind == "missing":
         return f"{field} is missing"
-    if kind == "extra_forbidden":
+    if kind in ("extra_forbidden", "unexpected_keyword_argument"):
         allowed = find(details["loc"][:-1], data, root).fields
         if len(place.names) == 1 and field != "base":
             allowed += ("base",)  # which is gone once a file has been merged over its base
         guess = _guess(place.names[-1], allowed)
         return f"{field} is not a field of the {file} file{guess} (there are: {', '.join(allowed)})"
     if kind == "value_error":
-        return ".".join([*place.names, str(context["error"])])
+        error = context["error"]
+        if isinstance(error, ParameterError):  # of a dataclass, which does not know where it stands
+            return str(ParameterError(field, error.name, error.value, error.rule))
+        if isinstance(error, UnknownNameError):
+            return f"{field}.{error.kind}: {error}"
+        return ".".join([*place.names, str(error)])
     if kind in ("too_short", "too_long") and place.exact_length is not None:
         return f"{field} must be a list of {place.exact_length} {place.entries}; got {shown(given)}"
     if kind == "too_long":

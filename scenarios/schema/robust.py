@@ -6,14 +6,10 @@ from typing import Annotated, Final, Literal
 
 from pydantic import Discriminator, Field, Tag, model_validator
 
+from mpc.fallback.settings import FallbackSettings
 from mpc.robust.observer import ObserverSettings
 from mpc.robust.tightening import SHORTEST_LAG, TighteningSettings
-from scenarios.schema.base import NonNegative, Positive, Spec
-from scenarios.schema.fallback import FallbackSpec
 from scenarios.schema.optimisation import BoundedSpec, SoftSpec, Weight
-
-_OBSERVER: Final = ObserverSettings()
-_TIGHTENING: Final = TighteningSettings()
 
 TURNED: Final = frozenset({"x", "vx", "y", "vy", "yaw"})
 """States that have other values in axes turned by the yaw."""
@@ -31,43 +27,6 @@ Lag = Annotated[
 """A time constant, or that of the vehicle file."""
 
 
-class OffsetFreeSpec(Spec):
-    """Unmodelled force and torque: estimated, predicted and compensated."""
-
-    velocity_noise: Positive = Field(default=_OBSERVER.velocity_noise, description="[m/s] of a measured velocity")
-    rate_noise: Positive = Field(default=_OBSERVER.rate_noise, description="[rad/s] of a measured body rate")
-    velocity_walk: Positive = Field(
-        default=_OBSERVER.velocity_walk, description="[m/s] change of a velocity in a period that is no lasting force"
-    )
-    rate_walk: Positive = Field(default=_OBSERVER.rate_walk, description="[rad/s] the same of a body rate")
-    force_walk: Positive = Field(
-        default=_OBSERVER.force_walk, description="[m/s^2] change of the force's acceleration in a period"
-    )
-    torque_walk: Positive = Field(
-        default=_OBSERVER.torque_walk, description="[rad/s^2] change of the torque's angular acceleration in a period"
-    )
-    largest_force: Positive = Field(default=_OBSERVER.largest_force, description="[m/s^2] larger estimates are clipped")
-    largest_torque: Positive = Field(
-        default=_OBSERVER.largest_torque, description="[rad/s^2] larger estimates are clipped"
-    )
-
-
-class TighteningSpec(Spec):
-    """Output bounds tightened, so that they hold under disturbances within stated bounds, and between samples."""
-
-    acceleration: NonNegative = Field(
-        default=_TIGHTENING.acceleration,
-        description="[m/s^2] bound on a disturbance's acceleration along each axis, world frame",
-    )
-    angular_acceleration: NonNegative = Field(
-        default=_TIGHTENING.angular_acceleration, description="[rad/s^2] the same of angular ones, body frame"
-    )
-    turning: NonNegative = Field(
-        default=_TIGHTENING.turning,
-        description="[unit of the state/s^2, rad for angles] largest second derivative of an output at its bound",
-    )
-
-
 class RobustSpec(BoundedSpec):
     """The robust MPC: `constrained`, and beside it whatever of the parts below is given."""
 
@@ -81,8 +40,8 @@ class RobustSpec(BoundedSpec):
     delay: Seconds = Field(
         default=0.0, description="[s] known time from measurement to command that is predicted through"
     )
-    offset_free: OffsetFreeSpec | None = None
-    tightening: TighteningSpec | None = None
+    offset_free: ObserverSettings | None = None
+    tightening: TighteningSettings | None = None
     heading: bool = Field(default=False, description="whether the hover model is turned by the present yaw")
     largest_turn: Annotated[float, Field(gt=0.0, le=180.0)] = Field(
         default=30.0,
@@ -96,7 +55,7 @@ class RobustSpec(BoundedSpec):
         description="where the model is linearised: at hover, once; at the present state; or along the last plan, one "
         "step of sequential quadratic programming each period",
     )
-    fallback: FallbackSpec = FallbackSpec()
+    fallback: FallbackSettings = FallbackSettings()
 
     @model_validator(mode="after")
     def _check(self) -> RobustSpec:

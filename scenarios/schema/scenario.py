@@ -2,22 +2,30 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Final, Literal, get_args
+import json
+import math
+import tomllib
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, get_args
 
-from annotated_types import Len, MaxLen
-from pydantic import BeforeValidator, Field, model_validator
+from annotated_types import MaxLen
+from pydantic import BeforeValidator, Field, ValidationError, create_model, model_validator
 from pydantic_core import PydanticCustomError
 
-from quadsim.errors import ParameterError, UnknownNameError
-from quadsim.flight.audit import SIGNALS
+from quadsim.errors import ParameterError
+from quadsim.flight.audit import Limit
+from quadsim.sim.computation import ComputationTime
+from quadsim.sim.effects import Effects
 from quadsim.sim.physics import steps_per_period
-from scenarios.schema.base import LARGEST_SEED, MOST_ENTRIES, NonNegative, Number, Positive, Quadruple, Spec, Triple
+from quadsim.vehicle import VEHICLE_UNITS, Vehicle
+from scenarios.schema.base import LARGEST_SEED, MOST_ENTRIES, Positive, Spec, Triple, fields_of
 from scenarios.schema.controller import ControllerSpec
 from scenarios.schema.course import ReferenceSpec
-from scenarios.schema.effects import ComputationSpec, EffectsSpec
 from scenarios.schema.events import Event, PayloadDropEvent, PayloadPickupEvent, SensorFaultEvent
 from scenarios.schema.optimisation import BoundedSpec
+from scenarios.schema.problems import ScenarioError, describe_all
 from scenarios.schema.sensors import EstimatorSpec, SensorsSpec, check_sensing
+from scenarios.schema.settings import set_field
 from scenarios.schema.writing import to_toml
 
 
@@ -25,30 +33,23 @@ class VehicleSpec(Spec):
     """Which vehicle file, and what in it to replace; units as in the file."""
 
     file: str = Field(description="a shipped vehicle's name, or a path ending in .toml, relative to the scenario file")
-    mass: float | None = Field(default=None, description="[kg]")
-    gravity: float | None = Field(default=None, description="[m/s^2]")
-    inertia: Triple | None = Field(default=None, description="[kg m^2] Ixx, Iyy, Izz, body axes")
-    arm_length: float | None = Field(default=None, description="[m] L, centre of mass to rotor axis")
-    rotor_azimuths: Quadruple | None = Field(
-        default=None, description="[deg] direction of each arm from body +x, counter-clockwise seen from above"
-    )
-    rotor_spins: Annotated[list[int], Len(4, 4)] | None = Field(
-        default=None, description="[-] 1 or -1, sign of each rotor's reaction torque about body +z"
-    )
-    thrust_coefficient: float | None = Field(default=None, description="[N s^2/rad^2] b, thrust b w^2")
-    drag_to_thrust: float | None = Field(default=None, description="[m] d / b, reaction torque d w^2")
-    speed_min: float | None = Field(default=None, description="[rad/s] lowest speed that a rotor holds")
-    speed_max: float | None = Field(default=None, description="[rad/s] highest speed that a rotor holds")
-    rotor_rise: float | None = Field(default=None, description="[s] time constant of a rotor's speed when it rises")
-    rotor_fall: float | None = Field(default=None, description="[s] time constant of a rotor's speed when it falls")
-    rotor_inertia: float | None = Field(default=None, description="[kg m^2] of one rotor about its axis")
-    rotor_radius: float | None = Field(default=None, description="[m] R")
-    rotor_drag: float | None = Field(default=None, description="[N s^2/(m rad)] linear drag of one rotor")
-    body_drag: Triple | None = Field(default=None, description="[m^2] C_d A along body x, y, z")
 
     def overrides(self) -> dict[str, Any]:
         """The parameters that replace the file's."""
         return self.model_dump(exclude={"file"}, exclude_none=True)
+
+
+if not TYPE_CHECKING:  # with every parameter of `quadsim.vehicle.Vehicle`, each of which may be absent
+    VehicleSpec = create_model(
+        VehicleSpec.__name__,
+        __base__=VehicleSpec,
+        __doc__=VehicleSpec.__doc__,
+        **{
+            name: (field.rebuild_annotation() | None, Field(default=None, description=field.description))
+            for name, field in fields_of(Vehicle).items()
+            if name in VEHICLE_UNITS
+        },
+    )
 
 
 class InitialSpec(Spec):
@@ -90,7 +91,7 @@ def _number_or_false(value: Any, most: float = 1e6) -> Any:
     raise PydanticCustomError("number_or_false", "a number > 0 and <= {most}, or false", {"most": f"{most:g}"})
 
 
-Limit = Annotated[Positive | Literal[False], BeforeValidator(_number_or_false)]
+LimitOrOff = Annotated[Positive | Literal[False], BeforeValidator(_number_or_false)]
 
 
 class LostSpec(Spec):
@@ -103,44 +104,9 @@ class LostSpec(Spec):
             "loops and flips",
         )
     )
-    distance: Limit = Field(default=100.0, description="[m] from the reference at the same time")
-    depth: Limit = Field(default=50.0, description="[m] below the lowest of the start and the reference so far")
-    speed: Limit = Field(default=50.0, description="[m/s] in any direction")
-
-
-class ConstraintSpec(Spec):
-    """Bounds on a signal of the flight; see `quadsim.flight.audit.Limit`."""
-
-    name: Annotated[str, Field(pattern=r"^[A-Za-z0-9_.-]+$")] = Field(description="what reports call it")
-    signal: str = Field(
-        description="what is bounded: " + ", ".join(f"{name} [{signal.unit}]" for name, signal in SIGNALS.items()),
-        json_schema_extra={"enum": [*SIGNALS]},
-    )
-    lower: Number | None = Field(default=None, description="[unit of the signal] lower bound")
-    upper: Number | None = Field(default=None, description="[unit of the signal] upper bound")
-    tolerance: NonNegative = Field(default=0.0, description="[unit of the signal] allowed beyond, at the physics rate")
-    tolerance_sampled: NonNegative = Field(
-        default=0.0, description="[unit of the signal] allowed beyond, at the control samples"
-    )
-    required: bool = Field(default=True, description="false: measured and reported, never a failure")
-    start: Number = Field(default=0.0, description="[s] first time it holds")
-    stop: Number | None = Field(default=None, description="[s] last time it holds; absent: the flight's end")
-
-    @model_validator(mode="after")
-    def _check(self) -> ConstraintSpec:
-        if self.signal not in SIGNALS:
-            raise ValueError(f"signal: {UnknownNameError('signal', self.signal, SIGNALS)}")
-        if self.lower is None and self.upper is None:
-            raise ValueError("lower must be given, or upper, or both")
-        if self.lower is not None and self.upper is not None and self.lower >= self.upper:
-            raise ValueError(f"lower must be below upper = {self.upper}; got {self.lower}")
-        if self.tolerance_sampled > self.tolerance:
-            raise ValueError(
-                f"tolerance_sampled must be at most tolerance = {self.tolerance}; got {self.tolerance_sampled}"
-            )
-        if self.stop is not None and self.stop < self.start:
-            raise ValueError(f"stop must be at least start = {self.start}; got {self.stop}")
-        return self
+    distance: LimitOrOff = Field(default=100.0, description="[m] from the reference at the same time")
+    depth: LimitOrOff = Field(default=50.0, description="[m] below the lowest of the start and the reference so far")
+    speed: LimitOrOff = Field(default=50.0, description="[m/s] in any direction")
 
 
 LONGEST_FLIGHT: Final = 86_400.0
@@ -183,15 +149,15 @@ class Scenario(Spec):
     plant: PlantSpec = PlantSpec()
     reference: ReferenceSpec
     controller: ControllerSpec
-    effects: EffectsSpec = EffectsSpec()
-    computation: ComputationSpec | None = Field(default=None, description="absent: commands take no time")
+    effects: Effects = Effects()
+    computation: ComputationTime | None = Field(default=None, description="absent: commands take no time")
     sensors: SensorsSpec | None = Field(default=None, description="absent: the controller receives the true state")
     estimator: EstimatorSpec | None = Field(
         default=None, description="absent: the controller receives the sensors' samples as they arrive"
     )
     events: Annotated[list[Event], MaxLen(MOST_ENTRIES)] = Field(default=[], description="what happens on the way")
     lost: LostSpec = LostSpec()
-    constraints: Annotated[list[ConstraintSpec], MaxLen(MOST_ENTRIES)] = Field(
+    constraints: Annotated[list[Limit], MaxLen(MOST_ENTRIES)] = Field(
         default=[], description="what the flight is audited against; signals and their units are those of the audit"
     )
 
@@ -243,6 +209,15 @@ class Scenario(Spec):
                     rule = f"one that the estimator has, of {', '.join(present)}"
                     raise ValueError(f"events.{i}.sensor must be {rule}; got {event.sensor!r}")
 
+    @classmethod
+    def read(cls, data: Mapping[str, Any]) -> Scenario:
+        """A scenario of a file's tables.
+
+        They are validated as JSON, where lists are tuples, texts are enumerations' values and tables are dataclasses,
+        and nothing else is converted.  What JSON cannot hold, as dates, is infinite there, which is allowed nowhere.
+        """
+        return cls.model_validate_json(json.dumps(data, default=lambda _: math.inf))
+
     @property
     def periods(self) -> int:
         """K, control periods in the flight."""
@@ -257,6 +232,40 @@ class Scenario(Spec):
     def plant_stride(self) -> int:
         """Physics steps per row of `plant.parquet`."""
         return steps_per_period(1.0 / self.log_rate, self.plant.timestep)
+
+    @classmethod
+    def parse(cls, data: Mapping[str, Any], *, source: str = "scenario") -> Scenario:
+        """Check a scenario given as nested tables.
+
+        Raises:
+            ScenarioError: naming every field that is wrong.
+        """
+        try:
+            return cls.read(data)
+        except ValidationError as error:
+            raise ScenarioError(source, describe_all(error, data, cls)) from error
+
+    def replace(self, changes: Mapping[str, Any]) -> Scenario:
+        """A scenario that differs in some fields; this one stays as it is.
+
+        Args:
+            changes: new values by dotted path, as for `--set`: an entry of a list of tables by its name, or else its
+                index.  Units as in the file.
+
+        Raises:
+            InputError: there is no such field, or a value is not allowed.
+
+        Examples:
+            >>> import quadsim
+            >>> scenario = quadsim.load("paper-constrained")
+            >>> longer = scenario.replace({"controller.horizon": 30, "vehicle.mass": 4.2})
+            >>> scenario.controller.horizon, longer.controller.horizon
+            (50, 30)
+        """
+        data = tomllib.loads(self.to_toml())
+        for path, value in changes.items():
+            set_field(data, path, value.tolist() if hasattr(value, "tolist") else value, asked="replace")
+        return Scenario.parse(data, source=self.name)
 
     def to_toml(self) -> str:
         """The resolved file: every field, defaults included, with comments; parsing it gives this scenario again."""

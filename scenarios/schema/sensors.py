@@ -13,13 +13,15 @@ Numbers to start from:
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Annotated, Literal
 
-from annotated_types import Len
+from annotated_types import Len, doc
 from pydantic import Discriminator, Field, Tag
 
 from quadsim.errors import ParameterError
-from quadsim.sim.sensing.sensor import Sensor, SensorName
+from quadsim.sim.estimation.settings import EstimatorSettings
+from quadsim.sim.sensing.sensor import Outliers, Sensor, SensorName
 from scenarios.schema.base import Fraction, NonNegative, Number, Spec
 
 
@@ -38,13 +40,6 @@ Offsets = Annotated[
 """One offset for all three axes, or one each."""
 
 
-class OutliersSpec(Spec):
-    """Gross errors: samples whose noise is drawn from a wider distribution."""
-
-    probability: Fraction = Field(description="[-] of a sample being one")
-    size: Annotated[float, Field(ge=1.0, le=1e6)] = Field(description="[-] how many times the noise it has")
-
-
 class _SensorSpec(Spec):
     rate: Annotated[float, Field(ge=0.01, le=1e4)] = Field(
         description="[Hz] samples per second, the first at t = 0; a divisor of the physics rate"
@@ -53,7 +48,7 @@ class _SensorSpec(Spec):
         default=0.0, description="[s] from taking a sample to its arrival, a whole number of physics steps"
     )
     dropout: Fraction = Field(default=0.0, description="[-] probability of a sample being lost")
-    outliers: OutliersSpec | None = Field(default=None, description="absent: none")
+    outliers: Outliers | None = Field(default=None, description="absent: none")
 
 
 class PositionSpec(_SensorSpec):
@@ -105,28 +100,11 @@ class SensorsSpec(Spec):
         return {name: spec for name, spec in named.items() if spec is not None}
 
 
-class EstimatorSpec(Spec):
+@dataclass(frozen=True, kw_only=True)
+class EstimatorSpec(EstimatorSettings):
     """An error-state Kalman filter from the sensors and the modelled vehicle; see `quadsim.sim.estimation`."""
 
-    type: Literal["error_state"] = Field(description="kind of estimator")
-    acceleration_noise: NonNegative = Field(default=0.3, description="[m/s^2/sqrt(Hz)] unmodelled white acceleration")
-    angular_acceleration_noise: NonNegative = Field(
-        default=1.0, description="[rad/s^2/sqrt(Hz)] white angular acceleration that it does not explain"
-    )
-    gyro_bias_walk: NonNegative = Field(default=0.002, description="[deg/s/sqrt(s)] random walk of the gyro's bias")
-    initial_position: NonNegative = Field(
-        default=0.05, description="[m] standard deviation of the first estimate's error, per axis"
-    )
-    initial_velocity: NonNegative = Field(default=0.05, description="[m/s] the same")
-    initial_attitude: NonNegative = Field(default=1.0, description="[deg] the same, about each body axis")
-    initial_rates: NonNegative = Field(default=1.0, description="[deg/s] the same")
-    initial_gyro_bias: NonNegative = Field(default=0.5, description="[deg/s] the same, of a bias first taken as zero")
-    gate: Annotated[float, Field(gt=0.0, lt=1.0)] = Field(
-        default=0.9999, description="[-] probability with which a right sample passes the test of its innovation"
-    )
-    patience: NonNegative = Field(
-        default=1.0, description="[s] after which a sensor that was rejected all along is accepted again; 0 for never"
-    )
+    type: Annotated[Literal["error_state"], doc("kind of estimator")]
 
 
 def check_sensing(sensors: SensorsSpec | None, estimator: EstimatorSpec | None, *, timestep: float) -> None:

@@ -6,28 +6,35 @@ stands there commented out.  In a list of tables each field is explained where i
 
 from __future__ import annotations
 
+import math
 import textwrap
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final, Literal, get_args, get_origin
 
 import tomlkit
-from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 from tomlkit.container import Container
 from tomlkit.items import Item, Table
 
+from scenarios.schema.base import fields_of, is_table
 
-def headline(model: type[BaseModel]) -> str:
+
+def headline(model: type[Any]) -> str:
     """What a table is, in one line: the first of its class's docstring, less its full stop."""
     return (model.__doc__ or "").strip().partition("\n")[0].removesuffix(".")
 
 
-def tables_in(annotation: Any) -> tuple[type[BaseModel], ...]:
+def tables_in(annotation: Any) -> tuple[type[Any], ...]:
     """The kinds of table that a field's type is or holds: several for a union of them, none for numbers and texts."""
-    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+    if is_table(annotation):
         return (annotation,)
     return tuple(model for argument in get_args(annotation) for model in tables_in(argument))
+
+
+def is_absent(value: object) -> bool:
+    """Whether a field with this value is left out of a file: one without a value, or an infinite bound."""
+    return value is None or (isinstance(value, float) and math.isinf(value))
 
 
 WIDTH: Final = 120
@@ -37,7 +44,7 @@ _NEAREST, _FARTHEST = 23, 44
 _LONG: Final = WIDTH - _FARTHEST
 """A list that is longer takes a line per entry."""
 
-_Explained = set[tuple[type[BaseModel], str]]
+_Explained = set[tuple[type[Any], str]]
 """Fields that an earlier entry of the same list explains."""
 
 
@@ -60,30 +67,30 @@ class _Line:
     above: tuple[str, ...] = ()
 
 
-def to_toml(model: BaseModel) -> str:
+def to_toml(model: Any) -> str:
     """A model as a TOML document."""
     document = tomlkit.document()
     _fill(document, model, (), None)
     return document.as_string()
 
 
-def _fill(container: Container | Table, model: BaseModel, path: tuple[str, ...], explained: _Explained | None) -> None:
+def _fill(container: Container | Table, model: Any, path: tuple[str, ...], explained: _Explained | None) -> None:
     """Write a model: first its numbers, texts and small lists, then the tables below it, each in the model's order."""
-    fields = type(model).model_fields
+    fields = fields_of(type(model))
     lines: list[_Line] = []
     below: list[tuple[str, Any, str]] = []
-    listed: set[tuple[type[BaseModel], ...]] = set()
+    listed: set[tuple[type[Any], ...]] = set()
     for name in sorted(fields, key=lambda name: name != "type"):
         value, kinds = getattr(model, name), tables_in(fields[name].annotation)
         explained_above = explained is not None and (type(model), name) in explained
         if explained is not None:
             explained.add((type(model), name))
         comment = "" if explained_above else _squeezed(fields[name].description or "")
-        if isinstance(value, BaseModel):
+        if is_table(type(value)):
             below.append((name, value, "" if explained_above else comment or headline(type(value))))
         elif isinstance(value, Mapping) or (value and kinds and not path):
             below.append((name, value, comment))
-        elif value is None:
+        elif is_absent(value):
             if not explained_above:
                 lines.append(_absent((*path, name), kinds, comment))
         else:
@@ -92,18 +99,18 @@ def _fill(container: Container | Table, model: BaseModel, path: tuple[str, ...],
             lines.append(_present(name, value, comment, above))
     _write(container, lines)
     for name, value, comment in below:
-        if isinstance(value, list):
+        if isinstance(value, list | tuple):
             _write_entries(container, name, value, comment)
             continue
         table = _table((*path, name), comment)
-        if isinstance(value, BaseModel):
+        if is_table(type(value)):
             _fill(table, value, (*path, name), explained)
         else:
             _write(table, [_present(key, entry, "") for key, entry in value.items()])
         container.append(name, table)
 
 
-def _write_entries(container: Container | Table, name: str, entries: Sequence[BaseModel], comment: str) -> None:
+def _write_entries(container: Container | Table, name: str, entries: Sequence[Any], comment: str) -> None:
     """A list of tables, each below a header of its own."""
     rows = tomlkit.aot()
     explained: _Explained = set()
@@ -139,24 +146,24 @@ def _present(name: str, value: Any, comment: str, above: tuple[str, ...] = ()) -
     return _Line(key=name, text=text, value=item, comment=comment, above=above)
 
 
-def _absent(path: tuple[str, ...], kinds: Sequence[type[BaseModel]], comment: str) -> _Line:
+def _absent(path: tuple[str, ...], kinds: Sequence[type[Any]], comment: str) -> _Line:
     text = f"# [{'.'.join(path)}]" if kinds else f"# {path[-1]} ="
     return _Line(key=path[-1], text=text, value=None, comment=comment or "; ".join(map(headline, kinds)))
 
 
-def _about_entries(kinds: Sequence[type[BaseModel]]) -> tuple[str, ...]:
+def _about_entries(kinds: Sequence[type[Any]]) -> tuple[str, ...]:
     """The comments of the tables in a small list; of several kinds the fields' names alone."""
     lines = []
     for kind in kinds:
         if len(kinds) > 1:
-            names = (_labelled(name, info) for name, info in sorted(kind.model_fields.items(), key=_type_first))
+            names = (_labelled(name, info) for name, info in sorted(fields_of(kind).items(), key=_type_first))
             lines += textwrap.wrap(
                 f"{{{', '.join(names)}}}: {headline(kind)}", WIDTH - 2, subsequent_indent="  ", break_on_hyphens=False
             )
             continue
-        width = max(map(len, kind.model_fields))
-        lines.append(f"each {{{', '.join(kind.model_fields)}}}: {headline(kind)}")
-        lines += [f"  {name:<{width}}  {info.description or ''}" for name, info in kind.model_fields.items()]
+        width = max(map(len, fields_of(kind)))
+        lines.append(f"each {{{', '.join(fields_of(kind))}}}: {headline(kind)}")
+        lines += [f"  {name:<{width}}  {info.description or ''}" for name, info in fields_of(kind).items()]
     return tuple(lines)
 
 
@@ -172,14 +179,14 @@ def _labelled(name: str, info: FieldInfo) -> str:
 
 def _item(value: Any) -> Item:
     """A number, a text, or a list or small table of them."""
-    if isinstance(value, BaseModel):
-        value = {name: entry for name in type(value).model_fields if (entry := getattr(value, name)) is not None}
+    if is_table(type(value)):
+        value = {name: entry for name in fields_of(type(value)) if not is_absent(entry := getattr(value, name))}
     if isinstance(value, Mapping):
         table = tomlkit.inline_table()
         for name, entry in value.items():
             table.append(name, _item(entry))
         return table
-    if isinstance(value, list):
+    if isinstance(value, list | tuple):
         array = tomlkit.array()
         for entry in value:
             array.append(_item(entry))

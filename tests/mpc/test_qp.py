@@ -18,7 +18,7 @@ from mpc.solvers.piqp_dense import PiqpDense
 from mpc.staged import Staged
 from quadsim.controller import SOLVED
 from quadsim.state import Array
-from scenarios.run import Flight
+from scenarios.flight import Flight
 
 STATE = np.zeros(12)
 STATE[10] = np.pi / 6

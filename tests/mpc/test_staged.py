@@ -31,7 +31,7 @@ from quadsim.controller import SOLVED
 from quadsim.errors import ParameterError
 from quadsim.state import Array
 from quadsim.vehicle import Vehicle
-from scenarios.run import Flight
+from scenarios.flight import Flight
 
 LAG = 0.05
 

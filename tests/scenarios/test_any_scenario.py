@@ -20,9 +20,10 @@ from quadsim.errors import InputError
 from quadsim.flight.log import FlightLog
 from quadsim.flight.parquet import write_log
 from scenarios.build import resolve
+from scenarios.flight import summarise
 from scenarios.loading import check_parts, parse_scenario
 from scenarios.parts.vehicle import build_vehicle
-from scenarios.run import fly_scenario, summarise
+from scenarios.run import fly_scenario
 from scenarios.schema.scenario import Scenario
 
 

@@ -6,6 +6,7 @@ import contextlib
 import json
 import math
 import re
+import tomllib
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -222,7 +223,7 @@ def test_a_little_less_than_the_smallest_bound_is_not_enough(name: str, file: st
         ((field, value), *others) = suggestion["settings"].items()
         if others or not isinstance(value, list):
             continue
-        before = get_field({"controller": asked.scenario.controller.model_dump()}, field)
+        before = get_field(tomllib.loads(asked.scenario.to_toml()), field)
         less = [old + 0.97 * (new - old) for old, new in zip(before, value, strict=True)]
         assert ask(file, case, setting(field, less)).status not in ACCEPTED
 

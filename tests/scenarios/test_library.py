@@ -16,8 +16,9 @@ from quadsim.controller import ACCEPTED, MISSED
 from quadsim.flight.log import ControlLog, FlightLog, PlantLog
 from quadsim.state import INDEX
 from scenarios.courses.csv_course import read_table
+from scenarios.flight import Flight, summarise
 from scenarios.loading import LIBRARY, load_scenario, parse_scenario, scenario_names
-from scenarios.run import Flight, fly_scenario, summarise
+from scenarios.run import fly_scenario
 from scenarios.schema.scenario import Group, LostSpec, Scenario
 
 SHARED = ("paper-constrained", "paper-unconstrained", "paper-unconstrained-clipped")

@@ -15,9 +15,10 @@ from quadsim.state import tilt
 from scenarios import cli
 from scenarios.campaign.pilot import CampaignPilot
 from scenarios.campaign.plan import load_plan
+from scenarios.flight import summarise
 from scenarios.loading import load_scenario
 from scenarios.parts.limits import build_loss
-from scenarios.run import fly_scenario, summarise
+from scenarios.run import fly_scenario
 from scenarios.schema.problems import ScenarioError
 
 UNSTABLE = '''

@@ -9,8 +9,9 @@ import pytest
 
 from quadsim.controller import ACCEPTED, SOLVED, UNCONSTRAINED
 from quadsim.flight.audit import Finding
+from scenarios.flight import Flight, summarise
 from scenarios.loading import load_scenario
-from scenarios.run import Flight, fly_scenario, summarise
+from scenarios.run import fly_scenario
 
 SAMPLED, PLANT = 0.01, 0.05
 """How far beyond 5 deg roll and pitch may go [deg]: at the control samples, and at the physics rate."""

@@ -21,9 +21,10 @@ from quadsim.flight import rundir
 from quadsim.flight.parquet import FLIGHT_FILE, PLANT_FILE, TIMING_FILE
 from scenarios.cli import main
 from scenarios.commands import EXIT_DONE, EXIT_FAILED, EXIT_WRONG_INPUT
+from scenarios.flight import Flight
 from scenarios.loading import load_scenario
 from scenarios.reaudit import reaudit
-from scenarios.run import Flight, fly_scenario
+from scenarios.run import fly_scenario
 from tests.safety_mutations import unseal
 
 TABLES = ("--no-video", "--no-recording", "--no-figures")

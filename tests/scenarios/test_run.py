@@ -22,10 +22,11 @@ from quadsim.flight.parquet import FLIGHT_FILE, HORIZON_FILE, PLANT_FILE, TIMING
 from quadsim.flight.rundir import Run
 from quadsim.sim import loop
 from scenarios.build import build_controller
+from scenarios.flight import Outputs
 from scenarios.loading import load_scenario, parse_scenario
 from scenarios.machine import PACKAGES
 from scenarios.parts.vehicle import build_vehicle
-from scenarios.run import Outputs, fly_scenario, run_scenario
+from scenarios.run import fly_scenario, run_scenario
 
 TABLES = Outputs(video=False, recording=False, figures=False)
 SHORT = "duration=0.5"
@@ -311,7 +312,7 @@ def test_a_defect_of_our_own_is_not_taken_for_a_flight(tmp_path: Path, monkeypat
 def test_a_recording_that_cannot_be_made_leaves_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, cores: int
 ) -> None:
-    monkeypatch.setattr("scenarios.run.usable_cores", lambda: cores)
+    monkeypatch.setattr("scenarios.flight.usable_cores", lambda: cores)
     monkeypatch.setenv("RERUN", "off")
     with pytest.raises(OutputError, match=r"run/flight\.rrd: rerun is switched off by the environment variable RERUN$"):
         run_scenario(load_scenario("hover", [SHORT]), tmp_path / "new" / "run", Outputs(video=False))
@@ -321,7 +322,7 @@ def test_a_recording_that_cannot_be_made_leaves_nothing(
 @pytest.mark.parametrize("cores", [1, 2])
 def test_outputs_are_made_as_asked_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, cores: int) -> None:
     """Where there are cores for it, the recording by a process of its own."""
-    monkeypatch.setattr("scenarios.run.usable_cores", lambda: cores)
+    monkeypatch.setattr("scenarios.flight.usable_cores", lambda: cores)
     run_scenario(load_scenario("hover", [SHORT]), tmp_path / "run", Outputs(video=False))
     names = {path.name for path in (tmp_path / "run").iterdir()}
     assert names == {

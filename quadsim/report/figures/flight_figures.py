@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import io
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -15,7 +16,7 @@ from quadsim.report.comparison import distinct_courses, run_names
 from quadsim.report.curves import break_at_wraps, commanded_speeds, effect_curves
 from quadsim.report.figures.canvas import finish_figure, keep_least_span, new_figure, run_end, run_title, write_drawings
 from quadsim.report.palette import BOUND, REFERENCE, line_colour
-from quadsim.state import REFERENCE_NAMES, Array
+from quadsim.state import REFERENCE_NAMES, STATE_NAMES, Array
 from quadsim.vehicle import N_ROTORS
 
 if TYPE_CHECKING:
@@ -79,16 +80,57 @@ def _draw_states(run: Run) -> Figure:
     figure = new_figure(run_title(run, "position and attitude"), 9.6, 6.4)
     panels = figure.subplots(3, 2, sharex=True)
     shown: dict[str, Artist] = {}
-    for column, names in enumerate((("x", "y", "z"), ("roll", "pitch", "yaw"))):
-        for axes, name in zip(panels[:, column], names, strict=True):
-            shown["flight"] = _draw_plant(axes, run, name, line_colour(0))
-            shown |= _draw_measured(axes, run, name)
-            shown |= _draw_reference(axes, run, name)
-            shown |= _draw_bounds(axes, run.limits, name, run_end(run))
-            axes.set_ylabel(f"{name} [{SIGNALS[name].unit}]")
-            keep_least_span(axes, SIGNALS[name].unit)
+    for axes, name in zip(panels.T.flat, ("x", "y", "z", "roll", "pitch", "yaw"), strict=True):
+        shown |= draw_signal(axes, run, name)
     finish_figure(figure, panels[-1], shown, run_end(run))
     return figure
+
+
+def plot_signals(run: Run, names: Sequence[str]) -> list[Axes]:
+    """The same in a figure of pyplot, which notebooks and `pyplot.show` show; see `draw_signals`."""
+    from matplotlib import pyplot
+
+    return draw_signals(pyplot.figure(figsize=(8.0, 0.9 + 1.4 * len(names)), layout="constrained"), run, names)
+
+
+def signals_png(run: Run, names: Sequence[str]) -> bytes:
+    """A small PNG of signals of the audit."""
+    from matplotlib.figure import Figure
+
+    figure, png = Figure(figsize=(6.0, 3.2), layout="constrained"), io.BytesIO()
+    draw_signals(figure, run, names)
+    figure.savefig(png, format="png", dpi=90)
+    return png.getvalue()
+
+
+def draw_signals(figure: Figure, run: Run, names: Sequence[str]) -> list[Axes]:
+    """Draw signals of the audit over time, a panel each, into an empty figure; returns the panels, top to bottom."""
+    panels = list(figure.subplots(len(names), 1, sharex=True, squeeze=False)[:, 0])
+    shown: dict[str, Artist] = {}
+    for axes, name in zip(panels, names, strict=True):
+        shown |= draw_signal(axes, run, name)
+        axes.grid(alpha=0.4)
+    finish_figure(figure, panels[-1:], shown, run_end(run))
+    return panels
+
+
+def draw_signal(axes: Axes, run: Run, name: str) -> dict[str, Artist]:
+    """Draw a signal of the audit with its reference and its bounds; returns the legend's entries."""
+    signal, control = SIGNALS[name], run.log.control
+    shown: dict[str, Artist] = {}
+    sampled = signal.sampled(control)
+    if sampled.ndim == 1 and signal.plant is not None:
+        shown["flight"] = _draw_plant(axes, run, name, line_colour(0))
+    else:
+        for i, values in enumerate(np.atleast_2d(sampled.T)):
+            label = "flight" if sampled.ndim == 1 else f"rotor {i + 1}"
+            shown[label] = axes.plot(control.t, values, color=line_colour(i), drawstyle="steps-post", linewidth=1.0)[0]
+    shown |= _draw_measured(axes, run, name) if name in STATE_NAMES else {}
+    shown |= _draw_reference(axes, run, name)
+    shown |= _draw_bounds(axes, run.limits, name, run_end(run))
+    axes.set_ylabel(f"{name} [{signal.unit}]")
+    keep_least_span(axes, signal.unit)
+    return shown
 
 
 def _draw_inputs(run: Run) -> Figure:

@@ -3,21 +3,26 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import Final, Protocol
+from dataclasses import dataclass, replace
+from typing import Annotated, Protocol
 
 import numpy as np
+from annotated_types import doc
 
 from quadsim.errors import ParameterError
+from quadsim.fields import NonNegative, Vector
+from quadsim.sim.effects.ground_effect import Ground
 from quadsim.sim.effects.load import Load, Payload
 from quadsim.sim.effects.rotors import RotorDynamics
+from quadsim.sim.effects.wind import Air
 from quadsim.state import Array
-from quadsim.vehicle import N_ROTORS
+from quadsim.vehicle import N_ROTORS, Vehicle
 
 __all__ = [
-    "SEA_LEVEL_DENSITY",
+    "Air",
     "Disturbance",
     "Effects",
+    "Ground",
     "Load",
     "Payload",
     "PayloadChange",
@@ -25,28 +30,17 @@ __all__ = [
     "RotorDynamics",
 ]
 
-SEA_LEVEL_DENSITY: Final = 1.225
-"""Density of air [kg/m^3] at sea level in the International Standard Atmosphere (ISO 2533)."""
-
-
-_AS_THE_FILE_SAYS: Final = Load()
-
 
 @dataclass(frozen=True, kw_only=True)
 class Disturbance:
-    """An unmodelled force and torque: constant parts, and white noise.
+    """An unmodelled force and torque, constant and random."""
 
-    Attributes:
-        force: (x, y, z) in the world frame [N].
-        torque: (x, y, z) in the body frame, about its origin [N m].
-        force_noise: square root of the two-sided spectral density of each axis [N s^0.5].
-        torque_noise: the same [N m s^0.5].
-    """
-
-    force: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    torque: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    force_noise: float = 0.0
-    torque_noise: float = 0.0
+    force: Annotated[Vector, doc("[N] world frame")] = (0.0, 0.0, 0.0)
+    torque: Annotated[Vector, doc("[N m] body frame")] = (0.0, 0.0, 0.0)
+    force_noise: Annotated[
+        NonNegative, doc("[N s^0.5] root of the two-sided spectral density of white noise, each axis")
+    ] = 0.0
+    torque_noise: Annotated[NonNegative, doc("[N m s^0.5] the same of the torque")] = 0.0
 
     def draw(self, steps: int, timestep: float, rng: np.random.Generator) -> Array:
         """(steps, 6) force, world [N], and torque, body [N m], over each step of `timestep` [s]."""
@@ -86,53 +80,34 @@ class PayloadChange:
 
 @dataclass(frozen=True, kw_only=True)
 class Effects:
-    """Every effect of one flight but the wind, which is a field of its own.
+    """What acts on the plant beyond the paper's model; a table that is absent is an effect that is off."""
 
-    Attributes:
-        rotors: how rotors follow their commands; None for at once.
-        efficiency: share of its thrust and torque that each rotor gives.
-        rotor_drag: k [kg/rad]: rotor i is held back by k w_i times its air speed across its axis [N].
-        body_drag: drag areas C_d A along the body axes [m^2], or None.
-        air_density: [kg/m^3].
-        rotor_radius: R [m] of the ground effect, or None for no ground effect.
-        contact: whether there is a ground to stand on.
-        load: what the vehicle really weighs.
-        disturbance: unmodelled force and torque, or None.
-        changes: what happens to rotors and payload on the way, in any order.
-    """
+    rotors: Annotated[RotorDynamics | None, doc("rotor lag, limits, inertia, wear")] = None
+    air: Annotated[Air | None, doc("drag and wind")] = None
+    ground: Annotated[Ground | None, doc("a floor")] = None
+    load: Annotated[Load | None, doc("errors of mass and inertia, payload")] = None
+    disturbance: Annotated[Disturbance | None, doc("unmodelled force and torque")] = None
 
-    rotors: RotorDynamics | None = None
-    efficiency: tuple[float, float, float, float] = (1.0, 1.0, 1.0, 1.0)
-    rotor_drag: float = 0.0
-    body_drag: tuple[float, float, float] | None = None
-    air_density: float = SEA_LEVEL_DENSITY
-    rotor_radius: float | None = None
-    contact: bool = False
-    load: Load = _AS_THE_FILE_SAYS
-    disturbance: Disturbance | None = None
-    changes: tuple[RotorChange | PayloadChange, ...] = ()
+    def resolved(self, vehicle: Vehicle) -> Effects:
+        """With every size that is left to the vehicle.
 
-    def __post_init__(self) -> None:
-        if len(self.efficiency) != N_ROTORS or not all(0.0 <= share <= 1.0 for share in self.efficiency):
-            raise ParameterError("effects.rotors", "efficiency", self.efficiency, "four numbers between 0 and 1")
-        if not 0.0 <= self.rotor_drag < math.inf:
-            raise ParameterError("effects.air", "rotor_drag", self.rotor_drag, "at least 0 and finite")
-        if self.body_drag is not None and not all(0.0 < area < math.inf for area in self.body_drag):
-            raise ParameterError("effects.air", "body_drag", self.body_drag, "three positive and finite numbers")
-        if not 0.0 < self.air_density < math.inf:
-            raise ParameterError("effects.air", "density", self.air_density, "positive and finite")
-
-    @property
-    def reweighs(self) -> bool:
-        """Whether the vehicle ever has another mass than its file says."""
-        return self.load != _AS_THE_FILE_SAYS or any(isinstance(change, PayloadChange) for change in self.changes)
+        Raises:
+            ParameterError: a size is needed that neither gives, or a combination is not possible.
+        """
+        return replace(
+            self,
+            rotors=self.rotors and self.rotors.resolved(vehicle),
+            air=self.air and self.air.resolved(vehicle),
+            ground=self.ground and self.ground.resolved(vehicle),
+        )
 
     @property
     def follows_state(self) -> bool:
         """Whether a force depends on how the vehicle moves, so that each physics step has to be taken by itself."""
-        spinning = self.rotors is not None and self.rotors.inertia > 0.0
-        aerodynamic = self.rotor_drag > 0.0 or self.body_drag is not None or self.rotor_radius is not None
-        return spinning or aerodynamic or self.disturbance is not None
+        spinning = self.rotors is not None and bool(self.rotors.inertia)
+        dragged = self.air is not None and (bool(self.air.rotor_drag) or self.air.body_drag is not None)
+        lifted = self.ground is not None and self.ground.effect
+        return spinning or dragged or lifted or self.disturbance is not None
 
 
 class Wind(Protocol):

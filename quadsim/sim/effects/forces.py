@@ -43,9 +43,10 @@ class StepForces:
             floor: height of the ground, world [m].
             disc: height of the rotor discs, body frame [m].
         """
-        self._inertia = effects.rotors.inertia if effects.rotors is not None else 0.0
-        self._drag = effects.rotor_drag
-        self._radius = effects.rotor_radius
+        rotors, air, ground = effects.rotors, effects.air, effects.ground
+        self._inertia = (rotors and rotors.inertia) or 0.0
+        self._drag = (air and air.rotor_drag) or 0.0
+        self._radius = ground.rotor_radius if ground is not None and ground.effect else None
         self._timestep, self._floor, self._disc = timestep, floor, disc
         self._places: list[tuple[float, float]] = [(x, y) for x, y, _ in vehicle.rotor_positions.tolist()]
         k, spins = self._drag, np.array(vehicle.rotor_spins, float)

@@ -5,13 +5,16 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
+from annotated_types import doc
 
 from quadsim.errors import ParameterError
+from quadsim.fields import Instant, Positive, Vector
 from quadsim.state import Array
 
-Velocity = tuple[float, float, float]
+Velocity = Vector
 """A velocity in the world frame, z up [m/s]."""
 
 
@@ -22,23 +25,19 @@ class Gust:
     The shape is that of 14 CFR 25.341(a)(2), v = v_peak / 2 (1 - cos(pi s / H)) over the way s = 0 .. 2 H; its rise
     to the peak is the discrete gust of MIL-F-8785C, Sec. 3.7.1.3.  Both measure the gust along the way of an aeroplane
     that flies into it at the airspeed V.  A hovering vehicle waits for the air instead: T = 2 H / V is given here.
-
-    Attributes:
-        start: t0, when it sets in [s].
-        duration: T, from calm to calm [s].
-        velocity: v_peak, at t0 + T/2, world frame [m/s].
+    t0 is `at`, T `duration` and v_peak `velocity`.
 
     Raises:
         ParameterError: a value is not finite, the start is negative or the duration is not positive.
     """
 
-    start: float
-    duration: float
-    velocity: Velocity
+    at: Instant
+    duration: Annotated[Positive, doc("[s] from calm to calm")]
+    velocity: Annotated[Velocity, doc("[m/s] in its middle, world frame")]
 
     def __post_init__(self) -> None:
-        if not 0.0 <= self.start < math.inf:
-            raise ParameterError("gust", "start", self.start, "a finite time >= 0 s")
+        if not 0.0 <= self.at < math.inf:
+            raise ParameterError("gust", "at", self.at, "a finite time >= 0 s")
         if not 0.0 < self.duration < math.inf:
             raise ParameterError("gust", "duration", self.duration, "a finite time > 0 s")
         check_velocity("gust", "velocity", self.velocity)
@@ -48,7 +47,7 @@ def gust_velocity(gusts: Sequence[Gust], t: Array) -> Array:
     """Sum of gusts (M, 3) at times `t` (M,) [s], world frame [m/s]."""
     velocity = np.zeros((t.size, 3))
     for gust in gusts:
-        share = (t - gust.start) / gust.duration
+        share = (t - gust.at) / gust.duration
         inside = (share > 0.0) & (share < 1.0)
         velocity[inside] += 0.5 * (1.0 - np.cos(2.0 * np.pi * share[inside, None])) * np.array(gust.velocity)
     return velocity

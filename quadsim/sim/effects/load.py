@@ -4,47 +4,43 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Annotated
 
 import mujoco
 import numpy as np
+from annotated_types import Ge, Le, Len, MaxLen, doc
 
 from quadsim.errors import ParameterError
+from quadsim.fields import Positive, Vector
 from quadsim.state import Array
 from quadsim.vehicle import Vehicle
 
 
 @dataclass(frozen=True, kw_only=True)
 class Payload:
-    """A point mass fixed to the vehicle.
+    """A point mass fixed to the vehicle."""
 
-    Attributes:
-        mass: [kg].
-        position: (x, y, z) in the body frame [m].
-    """
-
-    mass: float
-    position: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    mass: Annotated[Positive, doc("[kg]")]
+    position: Annotated[Vector, doc("[m] in the body frame")] = (0.0, 0.0, 0.0)
 
     def __post_init__(self) -> None:
         if not 0.0 < self.mass < np.inf:
             raise ParameterError("effects.load.payloads", "mass", self.mass, "positive and finite")
 
 
+Factor = Annotated[float, Ge(0.05), Le(20.0)]
+
+
 @dataclass(frozen=True, kw_only=True)
 class Load:
-    """How the vehicle that flies differs from its file, which the controller goes on believing.
+    """How the vehicle that flies differs from its file, which the controller goes on believing."""
 
-    Attributes:
-        mass_factor: real mass over the file's.
-        inertia_factor: real moments of inertia over the file's, about the body axes.
-        centre_of_mass: where it really is, in the body frame [m].
-        payloads: what it carries from the start.
-    """
-
-    mass_factor: float = 1.0
-    inertia_factor: tuple[float, float, float] = (1.0, 1.0, 1.0)
-    centre_of_mass: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    payloads: tuple[Payload, ...] = ()
+    mass_factor: Annotated[Factor, doc("[-] real mass over the file's")] = 1.0
+    inertia_factor: Annotated[
+        tuple[Factor, ...], Len(3, 3), doc("[-] real moments of inertia over the file's, about body x, y, z")
+    ] = (1.0, 1.0, 1.0)
+    centre_of_mass: Annotated[Vector, doc("[m] where it really is, body frame")] = (0.0, 0.0, 0.0)
+    payloads: Annotated[tuple[Payload, ...], MaxLen(1000), doc("what it carries from the start")] = ()
 
     def __post_init__(self) -> None:
         if not 0.0 < self.mass_factor < np.inf:

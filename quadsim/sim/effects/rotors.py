@@ -4,43 +4,73 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
+from annotated_types import Len, doc
 
 from quadsim.errors import ParameterError
+from quadsim.fields import Fraction, NonNegative, Positive, filled
 from quadsim.state import Array
+from quadsim.vehicle import N_ROTORS, Vehicle
 
 
 @dataclass(frozen=True, kw_only=True)
 class RotorDynamics:
-    """How rotor speeds follow their commands, and what their inertia does to the body.
+    """Rotors that take time and may be worn; see `quadsim.sim.effects.rotors`.
 
     Speeds follow as a first-order lag whose slope is limited, dw/dt = clip((w_cmd - w) / tau, -a, a): the model of
     RotorS (Furrer et al. 2016, "RotorS - A Modular Gazebo MAV Simulator Framework", Eq. (18)) with its separate time
-    constants for speeding up and slowing down.  A rotor pushes w_cmd from one side and never passes it, so that the
-    answer to a held command is a straight line followed by an exponential: no integration, no step size.
-
-    Attributes:
-        rise: tau while a rotor speeds up [s]; 0 for at once.
-        fall: tau while it slows down [s]; 0 for at once.
-        acceleration: a, largest change of a rotor's speed [rad/s^2]; inf for no limit.
-        inertia: J_r of each rotor about its axis [kg m^2]; 0 for massless rotors.
+    constants for speeding up and slowing down, tau = `rise` and `fall`, and a = `acceleration`.  A rotor pushes w_cmd
+    from one side and never passes it, so that the answer to a held command is a straight line followed by an
+    exponential: no integration, no step size.
     """
 
-    rise: float = 0.0
-    fall: float = 0.0
-    acceleration: float = math.inf
-    inertia: float = 0.0
+    rise: Annotated[
+        Positive | None,
+        doc("[s] time constant while speeding up; absent: the vehicle's, or at once where it states none"),
+    ] = None
+    fall: Annotated[
+        Positive | None,
+        doc("[s] time constant while slowing down; absent: the vehicle's, or at once where it states none"),
+    ] = None
+    acceleration: Annotated[Positive | None, doc("[rad/s^2] largest change of a rotor's speed; absent: no limit")] = (
+        None
+    )
+    inertia: Annotated[
+        NonNegative | None,
+        doc("[kg m^2] of one rotor: gyroscopic and spin-up torque; absent: the vehicle's, or 0 where it states none"),
+    ] = None
+    efficiency: Annotated[
+        tuple[Fraction, ...], Len(N_ROTORS, N_ROTORS), doc("[-] share of its thrust and torque that each rotor gives")
+    ] = (1.0, 1.0, 1.0, 1.0)
 
     def __post_init__(self) -> None:
         for name in ("rise", "fall", "inertia"):
-            if not 0.0 <= getattr(self, name) < math.inf:
+            if not 0.0 <= (getattr(self, name) or 0.0) < math.inf:
                 raise ParameterError("effects.rotors", name, getattr(self, name), "at least 0 and finite")
-        if not self.acceleration > 0.0:
+        if self.acceleration is not None and not self.acceleration > 0.0:
             raise ParameterError("effects.rotors", "acceleration", self.acceleration, "positive")
-        if self.inertia and math.isinf(self.acceleration) and not (self.rise and self.fall):
+        if len(self.efficiency) != N_ROTORS or not all(0.0 <= share <= 1.0 for share in self.efficiency):
+            raise ParameterError("effects.rotors", "efficiency", self.efficiency, "four numbers between 0 and 1")
+
+    @property
+    def at_once(self) -> bool:
+        """Whether rotors have the commanded speed at once, and no inertia."""
+        return not (self.rise or self.fall or self.acceleration or self.inertia)
+
+    def resolved(self, vehicle: Vehicle) -> RotorDynamics:
+        """With the sizes that are left to the vehicle.
+
+        Raises:
+            ParameterError: rotors with inertia change their speed at once.
+        """
+        inertia = vehicle.rotor_inertia or 0.0
+        found = filled(self, rise=vehicle.rotor_rise, fall=vehicle.rotor_fall, inertia=inertia)
+        if found.inertia and not found.acceleration and not (found.rise and found.fall):
             rule = "0 where rotors change their speed at once: that would take an infinite torque"
-            raise ParameterError("effects.rotors", "inertia", self.inertia, rule)
+            raise ParameterError("effects.rotors", "inertia", found.inertia, rule)
+        return found
 
     def respond(self, speeds: Array, target: Array, elapsed: Array) -> tuple[Array, Array]:
         """Speeds and accelerations some time after a command.
@@ -55,14 +85,14 @@ class RotorDynamics:
         """
         gap = target - speeds
         sign, distance = np.sign(gap), np.abs(gap)
-        lag = np.where(gap >= 0.0, self.rise, self.fall)
-        eased = distance if math.isinf(self.acceleration) else np.minimum(distance, self.acceleration * lag)
-        ramp_end = (distance - eased) / self.acceleration  # until then the slope is at its limit; 0 without one
+        lag, steepest = np.where(gap >= 0.0, self.rise or 0.0, self.fall or 0.0), self.acceleration or math.inf
+        eased = distance if math.isinf(steepest) else np.minimum(distance, steepest * lag)
+        ramp_end = (distance - eased) / steepest  # until then the slope is at its limit; 0 without one
         t = elapsed[:, None]
         ramping = t < ramp_end
         rate = np.divide(1.0, lag, out=np.zeros_like(lag), where=lag > 0.0)
         decay = np.where(lag > 0.0, np.exp(-rate * np.maximum(t - ramp_end, 0.0)), 0.0)
-        limit = self.acceleration if math.isfinite(self.acceleration) else 0.0
+        limit = steepest if math.isfinite(steepest) else 0.0
         after = np.where(ramping, speeds + sign * limit * t, target - sign * eased * decay)
         slope = np.where(ramping, sign * limit, sign * eased * rate * decay)
         return after, slope

@@ -23,15 +23,18 @@ from __future__ import annotations
 import copy
 import math
 from dataclasses import dataclass
-from typing import Final
+from typing import Annotated, Final
 
 import numpy as np
+from annotated_types import Ge, Le, doc
 
 from quadsim.errors import ParameterError
 from quadsim.state import Array
 
 LOWEST, HIGHEST = 3.048, 304.8
 """Heights [m] between which the low-altitude model holds: 10 and 1000 ft (Figs. 10 and 11)."""
+SLOWEST_AIRSPEED, FASTEST_AIRSPEED = 0.01, 200.0
+"""[m/s] at which turbulence may pass; at the slower one, it takes hours."""
 _METRES_PER_FOOT: Final = 0.3048
 _BLOCK: Final = 4096
 """Samples made at a time: their number is fixed, so that it makes no difference how many are asked for at once."""
@@ -41,23 +44,26 @@ _OUTPUT: Final = np.array([[1.0, *2 * [math.sqrt(1.5)]], [0.0, *2 * [(1.0 - math
 
 @dataclass(frozen=True, kw_only=True)
 class Dryden:
-    """Strength and size of the turbulence, MIL-F-8785C, Sec. 3.7.3.4; the order of axes is u, v, w.
+    """Dryden turbulence at low altitude; see `quadsim.sim.effects.turbulence`.
 
-    u is along the mean wind, v across it and horizontal, w vertical.
-
-    Attributes:
-        altitude: h, height above the ground [m].
-        wind_speed_20ft: W20, mean wind speed 20 ft (6.1 m) above the ground [m/s]; turbulence is light, moderate and
-            severe at 15, 30 and 45 knots (7.7, 15.4 and 23.2 m/s, Fig. 9).
-        airspeed: V, at which the field passes the vehicle [m/s]; in hover, the speed of the mean wind.
+    MIL-F-8785C, Sec. 3.7.3.4; the order of axes is u, v, w: along the mean wind, across it and horizontal, vertical.
+    Turbulence is light, moderate and severe at a mean wind of 15, 30 and 45 knots (7.7, 15.4 and 23.2 m/s, Fig. 9).
 
     Raises:
         ParameterError: the altitude is outside the model, the wind speed negative, or the airspeed not positive.
     """
 
-    altitude: float
-    wind_speed_20ft: float
-    airspeed: float
+    altitude: Annotated[float, Ge(LOWEST), Le(HIGHEST), doc("[m] above the ground, for the scale lengths")] = 10.0
+    wind_speed_20ft: Annotated[
+        float,
+        Ge(0.0),
+        Le(100.0),
+        doc("[m/s] mean wind 6.1 m above the ground, for the intensities; 7.7 is light, 15.4 moderate"),
+    ]
+    airspeed: Annotated[
+        Annotated[float, Ge(SLOWEST_AIRSPEED), Le(FASTEST_AIRSPEED)] | None,
+        doc("[m/s] at which the turbulence passes the vehicle; absent: the mean wind's speed"),
+    ] = None
 
     def __post_init__(self) -> None:
         if not LOWEST <= self.altitude <= HIGHEST:
@@ -67,7 +73,7 @@ class Dryden:
             raise ParameterError(
                 "effects.air.turbulence", "wind_speed_20ft", self.wind_speed_20ft, "a finite speed >= 0 m/s"
             )
-        if not 0.0 < self.airspeed < math.inf:
+        if self.airspeed is not None and not 0.0 < self.airspeed < math.inf:
             raise ParameterError("effects.air.turbulence", "airspeed", self.airspeed, "a finite speed > 0 m/s")
 
     @property
@@ -98,6 +104,7 @@ class Turbulence:
     """
 
     def __init__(self, dryden: Dryden, *, timestep: float, rng: np.random.Generator) -> None:
+        assert dryden.airspeed is not None, "resolved"
         self._intensities = dryden.intensities
         self._steps = [discretise(timestep * dryden.airspeed / length) for length in dryden.lengths]
         (self._source,) = rng.spawn(1)

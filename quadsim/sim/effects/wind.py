@@ -1,40 +1,79 @@
-"""Wind as it passes the vehicle: a mean that may change, gusts, and turbulence."""
+"""The air: its drag on the vehicle, and wind as it passes: a mean that may change, gusts, and turbulence."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import Final
+from dataclasses import dataclass, replace
+from typing import Annotated, Final
 
 import numpy as np
+from annotated_types import Len, doc
 
-from quadsim.errors import ParameterError
+from quadsim.errors import InputError, ParameterError
+from quadsim.fields import Instant, NonNegative, Positive, Vector, filled
 from quadsim.sim.effects.gust import Gust, Velocity, check_velocity, gust_velocity
-from quadsim.sim.effects.turbulence import Dryden, Turbulence
+from quadsim.sim.effects.turbulence import FASTEST_AIRSPEED, SLOWEST_AIRSPEED, Dryden, Turbulence
 from quadsim.state import Array
+from quadsim.vehicle import Vehicle
 
+SEA_LEVEL_DENSITY: Final = 1.225
+"""Density of air [kg/m^3] at sea level in the International Standard Atmosphere (ISO 2533)."""
 _BLOCK: Final = 4096
 """Physics steps whose wind is worked out at a time."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Air:
+    """Drag, and the wind; see `quadsim.sim.effects.forces` and `quadsim.sim.effects.wind`."""
+
+    density: Annotated[Positive, doc("[kg/m^3] of the air, for the drag of the body")] = SEA_LEVEL_DENSITY
+    rotor_drag: Annotated[
+        NonNegative | None,
+        doc("[kg/rad] drag of one rotor per speed and air speed in its plane; absent: the vehicle's, or 0"),
+    ] = None
+    body_drag: Annotated[
+        Annotated[tuple[Positive, ...], Len(3, 3)] | None,
+        doc("[m^2] drag areas C_d A along body x, y, z; absent: the vehicle's, or none"),
+    ] = None
+    wind: Annotated[Vector, doc("[m/s] mean velocity of the air, world frame")] = (0.0, 0.0, 0.0)
+    turbulence: Annotated[Dryden | None, doc("Dryden turbulence; absent: none")] = None
+
+    def __post_init__(self) -> None:
+        if self.rotor_drag is not None and not 0.0 <= self.rotor_drag < math.inf:
+            raise ParameterError("effects.air", "rotor_drag", self.rotor_drag, "at least 0 and finite")
+        if self.body_drag is not None and not all(0.0 < area < math.inf for area in self.body_drag):
+            raise ParameterError("effects.air", "body_drag", self.body_drag, "three positive and finite numbers")
+        if not 0.0 < self.density < math.inf:
+            raise ParameterError("effects.air", "density", self.density, "positive and finite")
+        carried = self.turbulence is None or self.turbulence.airspeed is not None
+        if not carried and not SLOWEST_AIRSPEED <= math.hypot(*self.wind) <= FASTEST_AIRSPEED:
+            raise InputError(
+                f"turbulence.airspeed must be given where no mean wind of {SLOWEST_AIRSPEED:g} to {FASTEST_AIRSPEED:g} "
+                f"m/s carries the turbulence past; got a wind of {[*self.wind]}"
+            )
+
+    def resolved(self, vehicle: Vehicle) -> Air:
+        """With the sizes that are left to the vehicle, and to the mean wind."""
+        found = filled(self, rotor_drag=vehicle.rotor_drag or 0.0, body_drag=vehicle.body_drag)
+        if found.turbulence is None:
+            return found
+        return replace(found, turbulence=filled(found.turbulence, airspeed=math.hypot(*found.wind)))
 
 
 @dataclass(frozen=True, kw_only=True)
 class WindChange:
     """A step of the mean wind.
 
-    Attributes:
-        time: from when on it blows [s].
-        velocity: the mean wind from then on, world frame [m/s].
-
     Raises:
         ParameterError: a value is not finite, or the time is negative.
     """
 
-    time: float
-    velocity: Velocity
+    at: Instant
+    velocity: Annotated[Velocity, doc("[m/s] from then on, world frame")]
 
     def __post_init__(self) -> None:
-        if not 0.0 <= self.time < math.inf:
-            raise ParameterError("wind_change", "time", self.time, "a finite time >= 0 s")
+        if not 0.0 <= self.at < math.inf:
+            raise ParameterError("wind_change", "at", self.at, "a finite time >= 0 s")
         check_velocity("wind_change", "velocity", self.velocity)
 
 
@@ -69,9 +108,9 @@ class WindField:
         check_velocity("wind", "mean", mean)
         if not 0.0 < timestep < math.inf:
             raise ParameterError("wind", "timestep", timestep, "a finite time > 0 s")
-        ordered = sorted(changes, key=lambda change: change.time)
+        ordered = sorted(changes, key=lambda change: change.at)
         self._means = np.array([mean, *(change.velocity for change in ordered)], float)
-        self._change_times = np.array([change.time for change in ordered])
+        self._change_times = np.array([change.at for change in ordered])
         self._gusts = gusts
         self._along = _direction(self._means[0])
         self._timestep = timestep

@@ -9,6 +9,7 @@ vehicle stood, are kept likewise for each step since the horizon.
 from __future__ import annotations
 
 import bisect
+import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Final
@@ -129,8 +130,8 @@ class ErrorStateFilter:
 
     def _initial(self) -> Array:
         s = self.settings
-        stds = (s.initial_position, s.initial_velocity, s.initial_attitude, s.initial_rates, s.initial_gyro_bias)
-        return np.repeat(stds, 3)
+        turned = map(math.radians, (s.initial_attitude, s.initial_rates, s.initial_gyro_bias))
+        return np.repeat([s.initial_position, s.initial_velocity, *turned], 3)
 
     @property
     def tallies(self) -> dict[SensorName, Tally]:

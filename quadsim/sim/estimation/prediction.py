@@ -23,6 +23,7 @@ from typing import Final
 
 import numpy as np
 
+from quadsim.fields import Vector
 from quadsim.sim.estimation.estimate import (
     ATTITUDE,
     GYRO_BIAS,
@@ -85,7 +86,7 @@ class MotionModel:
 
     mass: float
     gravity: float
-    inertia: tuple[float, float, float]
+    inertia: Vector
     allocation: Array
     noise: tuple[Array, Array, Array]
 
@@ -95,7 +96,7 @@ def motion_model(vehicle: Vehicle, settings: EstimatorSettings) -> MotionModel:
     density = np.zeros(N_ERRORS)
     density[VELOCITY] = settings.acceleration_noise**2
     density[RATES] = settings.angular_acceleration_noise**2
-    density[GYRO_BIAS] = settings.gyro_bias_walk**2
+    density[GYRO_BIAS] = math.radians(settings.gyro_bias_walk) ** 2
     return MotionModel(
         mass=vehicle.mass,
         gravity=vehicle.gravity,

@@ -135,8 +135,9 @@ class Sampler:
 
     def _draw_noise(self, count: int) -> Array:
         noise = self._noise * self._of_noise.standard_normal((count, 3))
-        outlying = self._of_outliers.random(count) < self.sensor.outliers.probability
-        noise[outlying] *= self.sensor.outliers.size
+        draws, outliers = self._of_outliers.random(count), self.sensor.outliers
+        if outliers is not None:
+            noise[draws < outliers.probability] *= outliers.size
         return noise
 
     def _measure(self, rows: Array, errors: Array) -> Array:

@@ -6,9 +6,12 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import Final
+from typing import Annotated, Final
+
+from annotated_types import Ge, Le, doc
 
 from quadsim.errors import ParameterError
+from quadsim.fields import Fraction
 from quadsim.sim.sensing.sphere import Vector
 
 AXES: Final = (0, 1, 2)
@@ -43,18 +46,14 @@ def _check_vector(owner: str, name: str, vector: Sequence[float], lower: float) 
 
 @dataclass(frozen=True, kw_only=True)
 class Outliers:
-    """Gross errors: now and then a sample's noise is drawn from a wider distribution instead.
+    """Gross errors: samples whose noise is drawn from a wider distribution.
 
-    The contaminated normal distribution (1 - probability) N(0, noise^2) + probability N(0, (size noise)^2).
-    Huber, "Robust estimation of a location parameter", Annals of Mathematical Statistics 35 (1964), Sec. 1.
-
-    Attributes:
-        probability: of a sample being one.
-        size: how many times its standard deviation is that of the others, all axes together.
+    The contaminated normal distribution (1 - probability) N(0, noise^2) + probability N(0, (size noise)^2), all axes
+    together.  Huber, "Robust estimation of a location parameter", Annals of Mathematical Statistics 35 (1964), Sec. 1.
     """
 
-    probability: float = 0.0
-    size: float = 1.0
+    probability: Annotated[Fraction, doc("[-] of a sample being one")]
+    size: Annotated[float, Ge(1.0), Le(1e6), doc("[-] how many times the noise it has")]
 
     def __post_init__(self) -> None:
         _check("outliers", "probability", self.probability, 0.0, 1.0)
@@ -75,7 +74,7 @@ class Sensor:
         bias_walk: the bias's random walk per axis [unit/sqrt(s)]: its variance grows by bias_walk^2 t.
         delay: from taking a sample to its arrival [s].
         dropout: probability of a sample being lost.
-        outliers: gross errors among the noise.
+        outliers: gross errors among the noise; None for none.
 
     Raises:
         ParameterError: a value is not finite or not possible.
@@ -88,7 +87,7 @@ class Sensor:
     bias_walk: Vector = (0.0, 0.0, 0.0)
     delay: float = 0.0
     dropout: float = 0.0
-    outliers: Outliers = Outliers()
+    outliers: Outliers | None = None
 
     def __post_init__(self) -> None:
         owner = f"sensors.{self.name}"

@@ -6,18 +6,20 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Final
 
+from mpc.robust.observer import ObserverSettings
+from mpc.robust.tightening import TighteningSettings
 from quadsim.errors import InputError
 from scenarios.bench.mismatch.conditions import Condition
 from scenarios.schema.baselines import GeometricSpec, LQRSpec, PIDSpec
 from scenarios.schema.controller import ConstrainedSpec, ControllerSpec, shared_tilt_bound
 from scenarios.schema.optimisation import InputBoundsSpec, InputWeightsSpec, SoftSpec
-from scenarios.schema.robust import OffsetFreeSpec, RobustSpec, TighteningSpec
+from scenarios.schema.robust import RobustSpec
 from scenarios.schema.scenario import Scenario
 
 INPUT_WEIGHT: Final = 0.1
 """Of the robust controllers, ten times the paper's: with its 0.01, rotor lag that the model misjudges is amplified."""
 MOVE_WEIGHT: Final = 20.0
-OBSERVER: Final = OffsetFreeSpec(torque_walk=0.2, force_walk=0.1)
+OBSERVER: Final = ObserverSettings(torque_walk=0.2, force_walk=0.1)
 BASELINE_TILT: Final = 20.0
 """Largest tilt that LQR, PID and geometric controller command [deg].  They have no bounds on states, so this limit does
 for one; at the paper's 5 deg the geometric controller circles its goal, 8 m off after 60 s."""
@@ -134,7 +136,7 @@ VARIANTS: Final = {
     "+ offset-free": ControllerVariant(about="and disturbances estimated", spec=_robust(offset_free=OBSERVER)),
     "+ tightening": ControllerVariant(
         about="and output bounds tightened for disturbances and for the motion between samples",
-        spec=_robust(offset_free=OBSERVER, tightening=TighteningSpec()),
+        spec=_robust(offset_free=OBSERVER, tightening=TighteningSettings()),
     ),
     "+ LTV": ControllerVariant(
         about="as + offset-free, linearised at the present state in each period",

@@ -24,7 +24,7 @@ from mpc.solvers import Answer, QPSolver, Way
 from mpc.unconstrained import sequence_gains
 from quadsim.controller import SOLVED, UNCONSTRAINED, Moment
 from quadsim.state import Array
-from scenarios.run import Flight
+from scenarios.flight import Flight
 
 
 def shortcut(problem: Problem, solver: str = "piqp-multistage") -> Shortcut:

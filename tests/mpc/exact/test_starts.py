@@ -15,10 +15,11 @@ from quadsim.controller import ACCEPTED
 from quadsim.state import Array
 from scenarios.build import build_controller, build_plant
 from scenarios.courses.make import build_reference
+from scenarios.flight import Flight
 from scenarios.loading import load_scenario
 from scenarios.parts.navigation import build_navigation
 from scenarios.parts.vehicle import build_vehicle
-from scenarios.run import Flight, fly_once
+from scenarios.run import fly_once
 
 Query = tuple[Array, Array, Array, Rest]
 

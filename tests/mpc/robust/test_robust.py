@@ -29,9 +29,10 @@ from quadsim.state import INDEX, POSITION, Array, make_state
 from quadsim.vehicle import Vehicle
 from scenarios.build import build_plant, build_problem
 from scenarios.courses.make import build_reference
+from scenarios.flight import Flight
 from scenarios.loading import load_scenario
 from scenarios.parts.vehicle import build_vehicle
-from scenarios.run import Flight, fly_once
+from scenarios.run import fly_once
 
 PERIOD = 0.05
 SOFT = Penalty(l1=np.full(2, 2e5), l2=np.full(2, 1e4))

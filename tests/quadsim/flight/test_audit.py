@@ -163,10 +163,10 @@ def test_margins_outside_the_window_are_nan() -> None:
     [
         ({"lower": 2.0}, r"^constraints\.height\.lower must be below upper = 2\.0; got 2\.0$"),
         ({"lower": math.nan}, r"^constraints\.height\.lower must be below upper"),
-        ({"tolerance": -1.0}, r"^constraints\.height\.tolerance_sampled must be between 0 and tolerance = -1\.0; got"),
-        ({"tolerance_sampled": 0.1}, r"tolerance_sampled must be between 0 and tolerance = 0\.0; got 0\.1$"),
-        ({"tolerance": math.inf}, r"tolerance_sampled must be between 0 and tolerance = inf"),
-        ({"start": 3.0, "stop": 2.0}, r"^constraints\.height\.start must be at most stop = 2\.0; got 3\.0$"),
+        ({"tolerance": -1.0}, r"^constraints\.height\.tolerance_sampled must be at most tolerance = -1\.0; got"),
+        ({"tolerance_sampled": 0.1}, r"tolerance_sampled must be at most tolerance = 0\.0; got 0\.1$"),
+        ({"tolerance": math.inf}, r"tolerance_sampled must be at most tolerance = inf"),
+        ({"start": 3.0, "stop": 2.0}, r"^constraints\.height\.stop must be at least start = 3\.0; got 2\.0$"),
     ],
 )
 def test_a_limit_that_cannot_be_is_refused(changes: dict[str, float], message: str) -> None:

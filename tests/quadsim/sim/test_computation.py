@@ -15,18 +15,18 @@ COMMAND = Command(speeds=np.zeros(4), plan=np.zeros((1, 4)), iterations=12)
 
 
 def delay(computation: Computation, time: float = 0.0) -> float:
-    return computation.delay(time, COMMAND, np.random.default_rng(0))
+    return computation.taken(time, COMMAND, np.random.default_rng(0))
 
 
 def test_fixed_part_and_iterations_add_up() -> None:
     assert delay(Computation()) == 0.0
-    assert delay(Computation(fixed=0.01, per_iteration=0.002)) == pytest.approx(0.034)
+    assert delay(Computation(delay=0.01, per_iteration=0.002)) == pytest.approx(0.034)
 
 
 def test_jitter_is_exponential() -> None:
     rng = np.random.default_rng(0)
-    computation = Computation(fixed=0.005, jitter=0.01)
-    waits = np.array([computation.delay(0.0, COMMAND, rng) for _ in range(20_000)]) - 0.005
+    computation = Computation(delay=0.005, jitter=0.01)
+    waits = np.array([computation.taken(0.0, COMMAND, rng) for _ in range(20_000)]) - 0.005
     assert waits.min() >= 0.0
     assert waits.mean() == pytest.approx(0.01, rel=0.03)
     assert np.mean(waits > 0.03) == pytest.approx(np.exp(-3.0), rel=0.1)
@@ -43,15 +43,15 @@ def test_jitter_is_exponential() -> None:
     ],
 )
 def test_a_stall_holds_back_what_it_meets(time: float, expected: float) -> None:
-    assert delay(Computation(fixed=0.01, stalls=(Stall(start=1.0, duration=0.1),)), time) == pytest.approx(expected)
+    assert delay(Computation(delay=0.01, stalls=(Stall(at=1.0, duration=0.1),)), time) == pytest.approx(expected)
 
 
 def test_stalls_follow_one_another_whatever_their_order() -> None:
-    stalls = (Stall(start=0.02, duration=0.03), Stall(start=0.0, duration=0.02))
+    stalls = (Stall(at=0.02, duration=0.03), Stall(at=0.0, duration=0.02))
     assert delay(Computation(stalls=stalls)) == delay(Computation(stalls=stalls[::-1])) == pytest.approx(0.05)
 
 
-@pytest.mark.parametrize("values", [{"fixed": -0.1}, {"per_iteration": float("nan")}, {"jitter": float("inf")}])
+@pytest.mark.parametrize("values", [{"delay": -0.1}, {"per_iteration": float("nan")}, {"jitter": float("inf")}])
 def test_impossible_times_are_refused(values: dict[str, Any]) -> None:
     (name,) = values
     with pytest.raises(ParameterError, match=rf"computation\.{name} must be at least 0 s and finite"):

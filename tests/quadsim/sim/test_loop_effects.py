@@ -13,7 +13,7 @@ from quadsim.flight.log import FlightLog
 from quadsim.flight.metrics import computation, estimation, ground
 from quadsim.sim.airframe import outline
 from quadsim.sim.computation import Computation, Stall
-from quadsim.sim.effects import Effects
+from quadsim.sim.effects import Effects, Ground
 from quadsim.sim.effects.rotors import RotorDynamics
 from quadsim.sim.loop import fly
 from quadsim.sim.navigation import Navigation
@@ -70,7 +70,7 @@ def speeds(vehicle: Vehicle) -> Array:
 def test_a_late_command_acts_from_its_time_on(vehicle: Vehicle, speeds: Array) -> None:
     controller = Scripted(speeds)
     with Plant(vehicle) as plant:
-        log = fly_scripted(plant, controller, computation=Computation(fixed=0.0105))
+        log = fly_scripted(plant, controller, computation=Computation(delay=0.0105))
         hover = plant.hover_speeds
     acting = log.plant.speeds[:-1].reshape(-1, STEPS, 4)
     before = np.concatenate([hover[None], speeds[:-1]])
@@ -85,7 +85,7 @@ def test_a_late_command_acts_from_its_time_on(vehicle: Vehicle, speeds: Array) -
 
 def test_a_missed_deadline_leaves_the_last_command_acting(vehicle: Vehicle, speeds: Array) -> None:
     controller = Scripted(speeds)
-    stall = Stall(start=0.1, duration=0.12)  # catches periods 2, 3 and 4; the last of them is 20 ms late
+    stall = Stall(at=0.1, duration=0.12)  # catches periods 2, 3 and 4; the last of them is 20 ms late
     with Plant(vehicle) as plant:
         log = fly_scripted(plant, controller, computation=Computation(stalls=(stall,)))
     assert [status == MISSED for status in log.control.status] == [k in (2, 3) for k in range(8)]
@@ -109,7 +109,7 @@ def test_a_late_command_leaves_the_plan_going_on(vehicle: Vehicle, speeds: Array
             plan = command.speeds + np.arange(4.0)[:, None]
             return Command(speeds=command.speeds, plan=plan)
 
-    computation = Computation(fixed=0.01, stalls=(Stall(start=0.1, duration=0.125),), plan=True)
+    computation = Computation(delay=0.01, stalls=(Stall(at=0.1, duration=0.125),), plan=True)
     with Plant(vehicle) as plant:
         log = fly_scripted(plant, Planner(speeds, horizon=4), computation=computation)
     acting = log.plant.speeds[:-1].reshape(-1, STEPS, 4)
@@ -126,7 +126,7 @@ def test_a_late_command_leaves_the_plan_going_on(vehicle: Vehicle, speeds: Array
 def test_a_command_just_in_time_acts_a_period_later(vehicle: Vehicle, speeds: Array) -> None:
     controller = Scripted(speeds)
     with Plant(vehicle) as plant:
-        log = fly_scripted(plant, controller, computation=Computation(fixed=PERIOD))
+        log = fly_scripted(plant, controller, computation=Computation(delay=PERIOD))
         hover = plant.hover_speeds
     assert MISSED not in log.control.status
     acting = np.concatenate([hover[None], speeds[:-1]])
@@ -205,7 +205,7 @@ def test_take_off_and_landing(vehicle: Vehicle) -> None:
     reference[30:, 2] = -0.1
     controller = Scripted(script)
     shape = outline(vehicle)
-    with Plant(vehicle, effects=Effects(contact=True, rotors=RotorDynamics(rise=0.02, fall=0.02))) as plant:
+    with Plant(vehicle, effects=Effects(ground=Ground(), rotors=RotorDynamics(rise=0.02, fall=0.02))) as plant:
         log = fly_scripted(
             plant,
             controller,
@@ -236,7 +236,7 @@ def test_take_off_and_landing(vehicle: Vehicle) -> None:
 
 def test_a_capsized_vehicle_lies_on_the_ground_and_has_crashed(vehicle: Vehicle) -> None:
     controller = Scripted(np.zeros((40, 4)))
-    with Plant(vehicle, effects=Effects(contact=True)) as plant:
+    with Plant(vehicle, effects=Effects(ground=Ground())) as plant:
         log = fly_scripted(
             plant,
             controller,
@@ -258,7 +258,7 @@ def test_a_sliding_vehicle_is_stopped_by_friction(vehicle: Vehicle) -> None:
     """v^2 = 2 mu g s: feet at rest, friction 0.8."""
     start = make_state()
     start[1] = 1.0
-    with Plant(vehicle, effects=Effects(contact=True)) as plant:
+    with Plant(vehicle, effects=Effects(ground=Ground())) as plant:
         plant.reset(start, np.zeros(4))
         plant.advance(np.zeros(4), 1000)
         state = plant.state()

@@ -29,9 +29,9 @@ from scenarios.bench.timing import segments, time_in_turns
 from scenarios.build import build_problem
 from scenarios.cli import main
 from scenarios.commands import EXIT_DONE, EXIT_WRONG_INPUT
+from scenarios.flight import Flight
 from scenarios.loading import load_scenario
 from scenarios.parts.vehicle import build_vehicle
-from scenarios.run import Flight
 
 SHORT = ("duration=3.0", "controller.horizon=10")
 FILES = {"bench.json", "solvers.md", "solvers.png", "solvers.svg"}

@@ -21,11 +21,11 @@ from scenarios.campaign.engine.local import LocalEngine
 from scenarios.campaign.engine.protocol import Pilot
 from scenarios.campaign.manifest import read_manifest
 from scenarios.campaign.plan import Plan, load_plan
-from scenarios.campaign.replay import recorded_flight, replay
+from scenarios.campaign.replay import recorded_flight, replay_flight
 from scenarios.campaign.results.table import Row, read_table
 from scenarios.campaign.run import SUMMARY_FILE, Result, Standing
+from scenarios.flight import Outputs
 from scenarios.machine import processor_name
-from scenarios.run import Outputs
 
 CAMPAIGN: dict[str, Any] = {
     "name": "little",
@@ -319,7 +319,8 @@ def test_a_replayed_flight_gives_the_campaigns_numbers(by_two: Result, tmp_path:
     for number in (None, 0, 7):
         recorded = recorded_flight(by_two.directory, number)
         outputs = Outputs(video=False, recording=False, figures=False)
-        flight, differing = replay(recorded, tmp_path / "runs" / recorded.scenario.name, outputs)
+        again = replay_flight(recorded, tmp_path / "runs" / recorded.scenario.name, outputs)
+        flight, differing = again.flight, again.differing
         assert differing == []
         assert flight.log.control.t.size == 10
         assert (tmp_path / "runs" / recorded.scenario.name / "summary.json").is_file()
@@ -328,7 +329,7 @@ def test_a_replayed_flight_gives_the_campaigns_numbers(by_two: Result, tmp_path:
 def test_a_replay_tells_when_numbers_differ(whole: Result, tmp_path: Path) -> None:
     recorded = recorded_flight(whole.directory, 3)
     other = replace(recorded, row={**recorded.row, "rmse.z": 0.0, "draw.mass": 0.0, "gone": 1.0})
-    _, differing = replay(other, tmp_path / "run", Outputs(video=False, recording=False, figures=False))
+    differing = replay_flight(other, tmp_path / "run", Outputs(video=False, recording=False, figures=False)).differing
     assert sorted(differing) == ["draw.mass", "gone", "rmse.z"]
 
 

@@ -25,9 +25,10 @@ from scenarios.cost import cost_flights
 from scenarios.cost.measure import find_study, fly_variations, study_cost
 from scenarios.cost.study import CostStudy
 from scenarios.cost.variants import without_constraints
+from scenarios.flight import Outputs, summarise
 from scenarios.loading import load_scenario
 from scenarios.parts.vehicle import build_vehicle
-from scenarios.run import Outputs, fly_scenario, run_scenario, summarise
+from scenarios.run import fly_scenario, run_scenario
 from scenarios.schema.scenario import Scenario
 
 SETTINGS = ["duration=4.0", "controller.horizon=10"]

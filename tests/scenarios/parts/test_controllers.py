@@ -19,7 +19,7 @@ from mpc.baselines.lqr import LQR, bryson_objective
 from mpc.baselines.pid import CascadedPID
 from mpc.constrained import ConstrainedMPC
 from mpc.constraints import Bounds
-from mpc.fallback.contract import FallbackSettings, Guarded
+from mpc.fallback.contract import Guarded
 from mpc.ocp import Objective
 from mpc.robust.controller import Linearisation, RobustMPC, RobustSettings
 from mpc.robust.observer import ObserverSettings
@@ -35,7 +35,6 @@ from scenarios.loading import load_scenario, parse_scenario
 from scenarios.parts.vehicle import build_vehicle
 from scenarios.run import fly_once, fly_scenario
 from scenarios.schema.controller import _Table
-from scenarios.schema.fallback import FallbackSpec
 from scenarios.schema.json_schema import scenario_schema
 from scenarios.schema.plugin import FORM, LAWS
 from scenarios.schema.problems import ScenarioError
@@ -287,15 +286,6 @@ def test_the_fallback_of_the_constrained_one_is_off_unless_given() -> None:
     assert isinstance(built(table), ConstrainedMPC)
     assert isinstance(built({**table, "fallback": {"enabled": False}}), ConstrainedMPC)
     assert isinstance(built({**table, "fallback": {}}), Guarded)
-
-
-def test_the_defaults_of_the_fallback_are_its_own() -> None:
-    spec, usual = FallbackSpec(), FallbackSettings()
-    for name in ("unseen", "plan_age", "position", "velocity", "hover", "sink", "settled"):
-        assert getattr(spec, name) == getattr(usual, name), name
-    assert math.radians(spec.angle) == pytest.approx(usual.angle, rel=0.01)
-    assert math.radians(spec.rate) == pytest.approx(usual.rate, rel=0.01)
-    assert set(type(spec).model_fields) - {"enabled"} == {item.name for item in fields(usual)}
 
 
 # --- baselines -----------------------------------------------------------------------------------------------------

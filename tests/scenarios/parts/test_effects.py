@@ -10,15 +10,23 @@ import pytest
 from quadsim.controller import MISSED, Command, Controller, Moment
 from quadsim.errors import ParameterError
 from quadsim.sim.computation import Computation, Stall
-from quadsim.sim.effects import Disturbance, Effects, PayloadChange, RotorChange
-from quadsim.sim.effects.load import Load, Payload
-from quadsim.sim.effects.rotors import RotorDynamics
+from quadsim.sim.effects import (
+    Air,
+    Disturbance,
+    Effects,
+    Ground,
+    Load,
+    Payload,
+    PayloadChange,
+    RotorChange,
+    RotorDynamics,
+)
 from quadsim.state import Array
 from quadsim.vehicle import Vehicle
 from scenarios.build import build_controller, build_plant
 from scenarios.courses.make import build_reference
 from scenarios.loading import load_scenario
-from scenarios.parts.effects import build_computation, build_effects, build_wind, resolve_effects
+from scenarios.parts.effects import build_changes, build_computation, build_wind
 from scenarios.parts.vehicle import build_vehicle
 from scenarios.run import fly_once
 from scenarios.schema.scenario import Scenario
@@ -30,7 +38,8 @@ def scenario(*settings: str, vehicle: str = "lopes2011") -> tuple[Scenario, Vehi
 
 
 def effects(*settings: str, vehicle: str = "lopes2011") -> Effects:
-    return build_effects(*scenario(*settings, vehicle=vehicle))
+    loaded, modelled = scenario(*settings, vehicle=vehicle)
+    return loaded.effects.resolved(modelled)
 
 
 def event(**fields: Any) -> str:
@@ -43,7 +52,8 @@ def events(*entries: str) -> str:
 
 def test_without_effects_nothing_acts() -> None:
     loaded, vehicle = scenario()
-    assert build_effects(loaded, vehicle) == Effects()
+    assert loaded.effects.resolved(vehicle) == Effects()
+    assert build_changes(loaded) == ()
     assert build_wind(loaded, vehicle) is None
     assert build_computation(loaded) is None
 
@@ -58,13 +68,9 @@ def test_every_field_arrives() -> None:
         "effects.disturbance={force=[1.0, 2.0, 3.0], torque=[0.1, 0.2, 0.3], force_noise=0.4, torque_noise=0.5}",
     )
     assert found == Effects(
-        rotors=RotorDynamics(rise=0.01, fall=0.02, acceleration=900.0, inertia=1e-4),
-        efficiency=(1.0, 0.9, 0.8, 0.7),
-        rotor_drag=2e-4,
-        body_drag=(0.01, 0.02, 0.03),
-        air_density=1.1,
-        rotor_radius=0.1,
-        contact=True,
+        rotors=RotorDynamics(rise=0.01, fall=0.02, acceleration=900.0, inertia=1e-4, efficiency=(1.0, 0.9, 0.8, 0.7)),
+        air=Air(density=1.1, rotor_drag=2e-4, body_drag=(0.01, 0.02, 0.03)),
+        ground=Ground(effect=True, rotor_radius=0.1),
         load=Load(
             mass_factor=1.1,
             inertia_factor=(1.2, 1.1, 1.05),
@@ -77,15 +83,15 @@ def test_every_field_arrives() -> None:
 
 def test_sizes_left_out_are_the_vehicle_s() -> None:
     loaded, vehicle = scenario("effects={rotors={}, air={}, ground={effect=true}}", vehicle="hummingbird")
-    found = build_effects(loaded, vehicle)
+    found = loaded.effects.resolved(vehicle)
     assert found.rotors is not None
+    assert found.air is not None
+    assert found.ground is not None
     assert (found.rotors.rise, found.rotors.fall) == (vehicle.rotor_rise, vehicle.rotor_fall)
     assert found.rotors.inertia == vehicle.rotor_inertia
-    assert (found.rotor_drag, found.body_drag) == (vehicle.rotor_drag, vehicle.body_drag)
-    assert found.rotor_radius == vehicle.rotor_radius
-    assert (
-        build_effects(loaded.model_copy(update={"effects": resolve_effects(loaded.effects, vehicle)}), vehicle) == found
-    )
+    assert (found.air.rotor_drag, found.air.body_drag) == (vehicle.rotor_drag, vehicle.body_drag)
+    assert found.ground.rotor_radius == vehicle.rotor_radius
+    assert found.resolved(vehicle) == found
 
 
 LOSS = {"type": "rotor_loss", "rotor": 2}
@@ -100,7 +106,7 @@ def test_losses_of_a_rotor_multiply_while_they_last(order: int) -> None:
         event(**LOSS, at=3.0, loss=0.3),
         event(type="rotor_loss", rotor=4, at=2.0, loss=1.0),
     ][::order]
-    found = effects("effects.rotors.efficiency=[1.0, 0.9, 1.0, 1.0]", events(*entries)).changes
+    found = build_changes(scenario("effects.rotors.efficiency=[1.0, 0.9, 1.0, 1.0]", events(*entries))[0])
     shares = {
         change.time: change.efficiency for change in found if isinstance(change, RotorChange) and change.rotor == 2
     }
@@ -111,11 +117,11 @@ def test_losses_of_a_rotor_multiply_while_they_last(order: int) -> None:
 
 
 def test_payloads_come_and_go() -> None:
-    found = effects(
-        events(
-            event(type="payload_pickup", at=1.0, mass=0.5, position=[0.1, 0.0, 0.0]), event(type="payload_drop", at=2.0)
-        )
-    ).changes
+    entries = (
+        event(type="payload_pickup", at=1.0, mass=0.5, position=[0.1, 0.0, 0.0]),
+        event(type="payload_drop", at=2.0),
+    )
+    found = build_changes(scenario(events(*entries))[0])
     picked = Payload(mass=0.5, position=(0.1, 0.0, 0.0))
     assert found == (PayloadChange(time=1.0, payload=picked), PayloadChange(time=2.0, payload=None))
 
@@ -137,7 +143,7 @@ def test_wind_is_mean_gusts_and_changes() -> None:
 def test_turbulence_passes_at_the_mean_wind_s_speed_and_follows_the_seed() -> None:
     air = "effects.air={rotor_drag=1e-4, wind=[3.0, 4.0, 0.0], turbulence={wind_speed_20ft=8.0}}"
     loaded, vehicle = scenario(air)
-    resolved = resolve_effects(loaded.effects, vehicle)
+    resolved = loaded.effects.resolved(vehicle)
     assert resolved.air is not None
     assert resolved.air.turbulence is not None
     assert resolved.air.turbulence.airspeed == 5.0
@@ -153,9 +159,9 @@ def test_turbulence_passes_at_the_mean_wind_s_speed_and_follows_the_seed() -> No
 
 def test_computation_takes_its_times_and_stalls() -> None:
     stall = events(event(type="stall", at=1.0, duration=0.2))
-    assert build_computation(scenario(stall)[0]) == Computation(stalls=(Stall(start=1.0, duration=0.2),))
+    assert build_computation(scenario(stall)[0]) == Computation(plan=False, stalls=(Stall(at=1.0, duration=0.2),))
     loaded, _ = scenario("computation={delay=0.01, per_iteration=1e-4, jitter=0.002}")
-    assert build_computation(loaded) == Computation(fixed=0.01, per_iteration=1e-4, jitter=0.002)
+    assert build_computation(loaded) == Computation(delay=0.01, per_iteration=1e-4, plan=False, jitter=0.002)
 
 
 @pytest.mark.parametrize(

@@ -13,7 +13,7 @@ from support import scenario_table
 from quadsim.sim.sensing.sensor import FaultKind, SensorFault, SensorName
 from quadsim.vehicle import Vehicle
 from scenarios.loading import parse_scenario
-from scenarios.parts.navigation import build_estimator, build_fault, build_navigation, build_sensors
+from scenarios.parts.navigation import build_fault, build_navigation, build_sensors
 from scenarios.run import fly_scenario
 from scenarios.schema.problems import ScenarioError
 from scenarios.schema.scenario import Scenario
@@ -42,13 +42,13 @@ def test_sensors_are_in_si_units() -> None:
     assert rates.dropout == 0.1
 
 
-def test_the_estimator_is_in_si_units() -> None:
+def test_the_estimator_flies_by_its_table(vehicle: Vehicle) -> None:
     spec = scenario(sensors=SENSORS, estimator=ESTIMATOR).estimator
     assert spec is not None
-    settings = build_estimator(spec)
-    assert settings.initial_attitude == pytest.approx(math.radians(2.0))
-    assert settings.initial_gyro_bias == pytest.approx(math.radians(0.5))
-    assert (settings.acceleration_noise, settings.initial_position, settings.gate) == (0.3, 0.05, 0.9999)
+    assert (spec.initial_attitude, spec.initial_gyro_bias) == (2.0, 0.5)
+    assert (spec.acceleration_noise, spec.initial_position, spec.gate) == (0.3, 0.05, 0.9999)
+    navigation = build_navigation(scenario(sensors=SENSORS, estimator=ESTIMATOR), vehicle)
+    assert navigation is not None
 
 
 def test_faults_are_in_si_units() -> None:

@@ -19,10 +19,11 @@ from quadsim.errors import CommandError, InputError
 from quadsim.state import Array
 from scenarios.build import build_controller
 from scenarios.cli import main
+from scenarios.flight import Outputs
 from scenarios.loading import load_scenario
 from scenarios.parts.plugin import PluginController
 from scenarios.parts.vehicle import build_vehicle
-from scenarios.run import Outputs, fly_scenario, run_scenario
+from scenarios.run import fly_scenario, run_scenario
 
 HOVER = """
 import numpy as np

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -43,7 +44,7 @@ def test_a_file_says_only_what_differs(tmp_path: Path) -> None:
     assert found.reference == base.reference
     assert found.description == base.description
     assert [entry.name for entry in found.constraints] == [*(entry.name for entry in base.constraints), "climb"]
-    assert found.constraints[0] == base.constraints[0].model_copy(update={"tolerance": 0.5})
+    assert found.constraints[0] == replace(base.constraints[0], tolerance=0.5)
     assert found.constraints[1:-1] == base.constraints[1:]
 
 

@@ -56,7 +56,7 @@ def test_ranges_and_choices_are_told() -> None:
     properties, tables = WHOLE["properties"], SCHEMA["$defs"]
     assert (properties["duration"]["exclusiveMinimum"], properties["duration"]["type"]) == (0.0, "number")
     assert properties["group"]["enum"] == list(get_args(Group))
-    assert tables["ConstraintSpec"]["properties"]["signal"]["enum"] == list(SIGNALS)
+    assert tables["Limit"]["properties"]["signal"]["enum"] == list(SIGNALS)
     horizon = tables["ConstrainedSpec"]["properties"]["horizon"]
     assert (horizon["type"], horizon["minimum"], horizon["maximum"]) == ("integer", 1, 1000)
     assert tables["InitialSpec"]["properties"]["position"]["maxItems"] == 3
@@ -86,7 +86,7 @@ def test_what_is_wrong_is_invalid(wrong: dict[str, Any]) -> None:
 
 def test_every_reference_is_to_a_table_that_is_there() -> None:
     references = {node["$ref"] for _, node in nodes(SCHEMA) if "$ref" in node}
-    assert "#/$defs/ConstraintSpec" in references
+    assert "#/$defs/Limit" in references
     assert {reference.removeprefix("#/$defs/") for reference in references} <= set(SCHEMA["$defs"])
 
 

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from quadsim.sim.effects import Disturbance, Effects
+from quadsim.sim.effects import Air, Disturbance, Effects, Ground
 from quadsim.sim.effects.gust import Gust
 from quadsim.sim.effects.rotors import RotorDynamics
 from quadsim.sim.effects.wind import WindField
@@ -33,7 +33,7 @@ def test_rotor_drag_slows_a_level_glide_exponentially(vehicle: Vehicle) -> None:
     """Exponentially: m dv/dt = -k (sum w) v while level; along z no rotor is held back."""
     drag, hover = 2e-3, vehicle.hover_speed
     rate = 4.0 * drag * hover / vehicle.mass
-    with Plant(vehicle, effects=Effects(rotor_drag=drag)) as plant:
+    with Plant(vehicle, effects=Effects(air=Air(rotor_drag=drag))) as plant:
         plant.reset(moving(vx=3.0, vy=-1.0))
         plant.advance(plant.hover_speeds, 2000)
         state = plant.state()
@@ -45,7 +45,7 @@ def test_rotor_drag_slows_a_turn(vehicle: Vehicle) -> None:
     """Each rotor moves at r L across its arm: tau_z = -k (sum w) L^2 r."""
     drag = 2e-3
     rate = 4.0 * drag * vehicle.hover_speed * vehicle.arm_length**2 / vehicle.inertia[2]
-    with Plant(vehicle, effects=Effects(rotor_drag=drag)) as plant:
+    with Plant(vehicle, effects=Effects(air=Air(rotor_drag=drag))) as plant:
         plant.reset(moving(yaw_rate=2.0))
         plant.advance(plant.hover_speeds, 500)
         assert plant.state()[11] == pytest.approx(2.0 * math.exp(-0.5 * rate), rel=1e-6)
@@ -56,7 +56,7 @@ def test_rotor_drag_carries_a_tilted_vehicle_to_its_terminal_speed(vehicle: Vehi
     drag, tilt = 4e-3, 0.2
     speed = vehicle.hover_speed / math.sqrt(math.cos(tilt))
     state = make_state(position=(0.0, 0.0, 500.0), euler=(0.0, tilt, 0.0))
-    with Plant(vehicle, effects=Effects(rotor_drag=drag)) as plant:
+    with Plant(vehicle, effects=Effects(air=Air(rotor_drag=drag))) as plant:
         plant.reset(state)
         plant.advance(np.full(4, speed), 6000)
         settled = plant.state()
@@ -69,7 +69,7 @@ def test_rotor_drag_carries_a_tilted_vehicle_to_its_terminal_speed(vehicle: Vehi
 @pytest.mark.parametrize(("axis", "name"), [(0, "vx"), (1, "vy"), (2, "vz")])
 def test_body_drag_is_half_rho_area_speed_squared(vehicle: Vehicle, axis: int, name: str) -> None:
     areas = (0.02, 0.03, 0.06)
-    with Plant(vehicle, effects=Effects(body_drag=areas, air_density=1.2)) as plant:
+    with Plant(vehicle, effects=Effects(air=Air(body_drag=areas, density=1.2))) as plant:
         plant.reset(moving(**{name: 8.0}))
         wrench = plant.advance(plant.hover_speeds, 2000).wrench
         speed = plant.state()[[1, 3, 5]][axis]
@@ -80,14 +80,14 @@ def test_body_drag_is_half_rho_area_speed_squared(vehicle: Vehicle, axis: int, n
 
 
 def test_a_falling_vehicle_reaches_its_terminal_speed(vehicle: Vehicle) -> None:
-    with Plant(vehicle, effects=Effects(body_drag=(0.1, 0.1, 0.4), air_density=1.2)) as plant:
+    with Plant(vehicle, effects=Effects(air=Air(body_drag=(0.1, 0.1, 0.4), density=1.2))) as plant:
         plant.reset(HIGH)
         plant.advance(np.zeros(4), 20_000)
         terminal = math.sqrt(vehicle.mass * vehicle.gravity / (0.5 * 1.2 * 0.4))
         assert plant.state()[5] == pytest.approx(-terminal * math.tanh(vehicle.gravity * 20.0 / terminal), rel=1e-6)
 
 
-@pytest.mark.parametrize("effects", [Effects(rotor_drag=2e-3), Effects(body_drag=(0.05, 0.05, 0.05))])
+@pytest.mark.parametrize("effects", [Effects(air=Air(rotor_drag=2e-3)), Effects(air=Air(body_drag=(0.05, 0.05, 0.05)))])
 def test_only_the_air_speed_counts(vehicle: Vehicle, effects: Effects) -> None:
     """Moving with the wind is as standing in still air."""
     with Plant(vehicle, effects=effects, wind=still_air((4.0, -2.0, 0.0))) as plant:
@@ -101,8 +101,8 @@ def test_only_the_air_speed_counts(vehicle: Vehicle, effects: Effects) -> None:
 def test_a_gust_pushes_by_its_integral(vehicle: Vehicle) -> None:
     """While the vehicle hardly moves, m v = k (sum w) v_peak T / 2."""
     drag = 1e-6
-    gust = Gust(start=0.1, duration=1.0, velocity=(10.0, 0.0, 0.0))
-    with Plant(vehicle, effects=Effects(rotor_drag=drag), wind=still_air((0.0, 0.0, 0.0), gust)) as plant:
+    gust = Gust(at=0.1, duration=1.0, velocity=(10.0, 0.0, 0.0))
+    with Plant(vehicle, effects=Effects(air=Air(rotor_drag=drag)), wind=still_air((0.0, 0.0, 0.0), gust)) as plant:
         plant.reset(HIGH)
         plant.advance(plant.hover_speeds, 1300)
         push = 4.0 * drag * vehicle.hover_speed * 10.0 * 0.5
@@ -141,7 +141,7 @@ def test_ground_effect_lifts_by_cheeseman_and_bennett(vehicle: Vehicle) -> None:
     """Each rotor by the height of its own disc; torques about z stay those of the rotors alone."""
     radius, height, roll = 0.2, 0.15, 0.3
     speeds = vehicle.hover_speed * np.array([1.05, 0.95, 1.05, 0.95])
-    with Plant(vehicle, effects=Effects(rotor_radius=radius, contact=True)) as plant:
+    with Plant(vehicle, effects=Effects(ground=Ground(effect=True, rotor_radius=radius))) as plant:
         plant.reset(make_state(position=(0.0, 0.0, height), euler=(roll, 0.0, 0.0)), speeds)
         segment = plant.advance(speeds, 1)
     floor, disc = -0.132, 0.034  # where the drawing has them
@@ -157,7 +157,9 @@ def test_ground_effect_lifts_by_cheeseman_and_bennett(vehicle: Vehicle) -> None:
 
 
 def test_a_lost_propeller_neither_drags_nor_carries_momentum(vehicle: Vehicle) -> None:
-    effects = Effects(rotor_drag=3e-4, efficiency=(0.0,) * 4, rotors=RotorDynamics(rise=0.05, fall=0.05, inertia=1e-3))
+    effects = Effects(
+        air=Air(rotor_drag=3e-4), rotors=RotorDynamics(rise=0.05, fall=0.05, inertia=1e-3, efficiency=(0.0,) * 4)
+    )
     start = moving(vx=5.0, yaw_rate=1.0)
     start[7] = 0.5
     with Plant(vehicle, effects=effects) as plant:
@@ -167,8 +169,8 @@ def test_a_lost_propeller_neither_drags_nor_carries_momentum(vehicle: Vehicle) -
 
 
 def test_a_second_flight_meets_the_same_wind(vehicle: Vehicle) -> None:
-    gust = Gust(start=0.02, duration=0.1, velocity=(0.0, 5.0, 0.0))
-    with Plant(vehicle, effects=Effects(rotor_drag=1e-3), wind=still_air((1.0, 0.0, 0.0), gust)) as plant:
+    gust = Gust(at=0.02, duration=0.1, velocity=(0.0, 5.0, 0.0))
+    with Plant(vehicle, effects=Effects(air=Air(rotor_drag=1e-3)), wind=still_air((1.0, 0.0, 0.0), gust)) as plant:
         winds = []
         for _ in range(2):
             plant.reset(HIGH)
@@ -178,7 +180,7 @@ def test_a_second_flight_meets_the_same_wind(vehicle: Vehicle) -> None:
 
 
 def test_forces_are_of_second_order_in_the_step(vehicle: Vehicle) -> None:
-    effects = Effects(rotor_drag=6e-3, rotors=RotorDynamics(rise=0.05, fall=0.05, inertia=5e-4))
+    effects = Effects(air=Air(rotor_drag=6e-3), rotors=RotorDynamics(rise=0.05, fall=0.05, inertia=5e-4))
     commands = vehicle.hover_speed + np.random.default_rng(1).uniform(-25.0, 25.0, (8, 4))
     start = moving(vx=5.0, yaw_rate=1.0)
 
@@ -200,7 +202,7 @@ def test_a_plant_taken_step_by_step_flies_as_in_one_call(vehicle: Vehicle) -> No
     """A drag of next to nothing switches the other way of stepping on: the states are those of the plain plant."""
     commands = vehicle.hover_speed + np.random.default_rng(2).uniform(-8.0, 8.0, (10, 4))
     ends = []
-    for effects in (Effects(), Effects(rotor_drag=1e-300)):
+    for effects in (Effects(), Effects(air=Air(rotor_drag=1e-300))):
         with Plant(vehicle, effects=effects) as plant:
             plant.reset(make_state())
             ends.append(np.concatenate([plant.advance(command, 50).physics for command in commands]))

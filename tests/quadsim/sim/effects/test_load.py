@@ -70,7 +70,7 @@ def test_payload_is_taken_up_and_let_go(vehicle: Vehicle) -> None:
         PayloadChange(time=0.2, payload=Payload(mass=1.0)),
         PayloadChange(time=1.0, payload=None),
     )
-    with Plant(vehicle, effects=Effects(changes=changes)) as plant:
+    with Plant(vehicle, changes=changes) as plant:
         for _ in range(2):  # the second flight begins as the first did
             plant.reset(make_state(position=(0.0, 0.0, 100.0)))
             slopes = np.diff(plant.advance(plant.hover_speeds, 1500).physics[:, 10]) / 1e-3

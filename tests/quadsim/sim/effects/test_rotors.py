@@ -69,12 +69,17 @@ def test_an_answer_in_two_parts_is_the_answer_in_one() -> None:
         ({"rise": -0.01}, r"effects\.rotors\.rise must be at least 0 and finite; got -0\.01"),
         ({"fall": math.nan}, r"effects\.rotors\.fall must be at least 0 and finite; got nan"),
         ({"acceleration": 0.0}, r"effects\.rotors\.acceleration must be positive; got 0\.0"),
-        ({"inertia": 1e-5}, r"effects\.rotors\.inertia must be 0 where rotors change their speed at once"),
+        ({"efficiency": (1.0, 1.0)}, r"effects\.rotors\.efficiency must be four numbers between 0 and 1"),
     ],
 )
 def test_impossible_rotors_are_refused(values: dict[str, Any], message: str) -> None:
     with pytest.raises(ParameterError, match=message):
         RotorDynamics(**values)
+
+
+def test_inertia_of_rotors_that_change_their_speed_at_once_is_refused(vehicle: Vehicle) -> None:
+    with pytest.raises(ParameterError, match=r"effects\.rotors\.inertia must be 0 where rotors change their speed at"):
+        RotorDynamics(inertia=1e-5).resolved(vehicle)
 
 
 def test_the_plant_climbs_as_its_lagging_rotors_do(vehicle: Vehicle) -> None:
@@ -153,9 +158,10 @@ def test_gyroscopic_and_spin_up_torque_are_those_of_real_rotors(vehicle: Vehicle
 
 
 def test_a_worn_rotor_gives_its_share(vehicle: Vehicle) -> None:
-    worn = Effects(efficiency=(1.0, 0.8, 1.0, 1.0), changes=(RotorChange(time=0.1, rotor=4, efficiency=0.0),))
+    worn = Effects(rotors=RotorDynamics(efficiency=(1.0, 0.8, 1.0, 1.0)))
+    lost = (RotorChange(time=0.1, rotor=4, efficiency=0.0),)
     speeds = np.full(4, vehicle.hover_speed)
-    with Plant(vehicle, effects=worn) as plant:
+    with Plant(vehicle, effects=worn, changes=lost) as plant:
         plant.reset(make_state(position=(0.0, 0.0, 100.0)))
         plant.advance(speeds, 1)
         share = vehicle.thrust_coefficient * vehicle.hover_speed**2 * 1e-3
@@ -167,8 +173,8 @@ def test_a_worn_rotor_gives_its_share(vehicle: Vehicle) -> None:
         plant.advance(speeds, 99)
         before = plant.physics
         plant.advance(speeds, 1)
-        lost = (plant.physics - before)[11] * ixx / 1e-3
-        assert lost == pytest.approx((0.2 - 1.0) * arm * share / 1e-3, rel=1e-2)
+        gone = (plant.physics - before)[11] * ixx / 1e-3
+        assert gone == pytest.approx((0.2 - 1.0) * arm * share / 1e-3, rel=1e-2)
 
 
 @pytest.mark.parametrize(

@@ -32,7 +32,7 @@ def middles(steps: int) -> Array:
 
 
 def test_a_gust_has_the_1_cosine_shape() -> None:
-    gust = Gust(start=0.2, duration=0.5, velocity=(4.0, -2.0, 1.0))
+    gust = Gust(at=0.2, duration=0.5, velocity=(4.0, -2.0, 1.0))
     t = middles(1000)
     expected = np.where((t > 0.2) & (t < 0.7), np.sin(np.pi * (t - 0.2) / 0.5) ** 2, 0.0)  # (1 - cos 2 a) / 2
     wind = field(gusts=(gust,)).advance(1000)
@@ -40,27 +40,27 @@ def test_a_gust_has_the_1_cosine_shape() -> None:
 
 
 def test_a_gust_peaks_halfway_and_is_calm_outside() -> None:
-    gust = Gust(start=1.0, duration=3.0, velocity=(0.0, 5.0, 0.0))
+    gust = Gust(at=1.0, duration=3.0, velocity=(0.0, 5.0, 0.0))
     velocity = gust_velocity([gust], np.array([0.0, 1.0, 1.75, 2.5, 3.25, 4.0, 9.0]))
     np.testing.assert_allclose(velocity[:, 1], [0.0, 0.0, 2.5, 5.0, 2.5, 0.0, 0.0], atol=1e-12)
 
 
 def test_a_gust_blows_half_its_peak_on_average() -> None:
     """Its integral is v T / 2; sums at the middles of equal steps are exact for a whole period of a cosine."""
-    gust = Gust(start=0.3, duration=0.4, velocity=(7.0, 0.0, -3.0))
+    gust = Gust(at=0.3, duration=0.4, velocity=(7.0, 0.0, -3.0))
     way = STEP * field(gusts=(gust,)).advance(1000).sum(axis=0)
     np.testing.assert_allclose(way, np.array([7.0, 0.0, -3.0]) * 0.4 / 2.0, atol=1e-12)
 
 
 def test_gusts_and_mean_add_up() -> None:
-    gusts = tuple(Gust(start=start, duration=0.5, velocity=(1.0, 2.0, 3.0)) for start in (0.1, 0.3))
+    gusts = tuple(Gust(at=start, duration=0.5, velocity=(1.0, 2.0, 3.0)) for start in (0.1, 0.3))
     apart = sum(field(gusts=(gust,)).advance(1000) for gust in gusts)
     together = field(mean=(-1.0, 0.5, 0.25), gusts=gusts).advance(1000)
     np.testing.assert_allclose(together, apart + np.array([-1.0, 0.5, 0.25]), atol=1e-12)
 
 
 def test_the_mean_steps_at_its_time_and_stays() -> None:
-    changes = (WindChange(time=0.75, velocity=(0.0, 0.0, 0.0)), WindChange(time=0.25, velocity=(0.0, 3.0, 1.0)))
+    changes = (WindChange(at=0.75, velocity=(0.0, 0.0, 0.0)), WindChange(at=0.25, velocity=(0.0, 3.0, 1.0)))
     wind = field(mean=(2.0, 0.0, 0.0), changes=changes).advance(1000)
     np.testing.assert_array_equal(wind[:250], np.tile([2.0, 0.0, 0.0], (250, 1)))
     np.testing.assert_array_equal(wind[250:750], np.tile([0.0, 3.0, 1.0], (500, 1)))
@@ -68,12 +68,12 @@ def test_the_mean_steps_at_its_time_and_stays() -> None:
 
 
 def test_a_change_counts_from_its_own_instant_on() -> None:
-    wind = field(changes=(WindChange(time=STEP * 100.5, velocity=(1.0, 0.0, 0.0)),)).advance(200)
+    wind = field(changes=(WindChange(at=STEP * 100.5, velocity=(1.0, 0.0, 0.0)),)).advance(200)
     np.testing.assert_array_equal(wind[:, 0], np.repeat([0.0, 1.0], 100))
 
 
 def test_of_two_changes_at_one_time_the_later_counts() -> None:
-    changes = tuple(WindChange(time=0.0, velocity=(speed, 0.0, 0.0)) for speed in (1.0, 2.0))
+    changes = tuple(WindChange(at=0.0, velocity=(speed, 0.0, 0.0)) for speed in (1.0, 2.0))
     np.testing.assert_array_equal(field(mean=(9.0, 0.0, 0.0), changes=changes).advance(3)[:, 0], 2.0)
 
 
@@ -82,8 +82,8 @@ def test_the_wind_does_not_depend_on_how_many_steps_are_asked_for_at_once(parts:
     """To the last bit, across the blocks that turbulence is made in."""
 
     def make() -> WindField:
-        gust = Gust(start=0.1, duration=5.0, velocity=(1.0, 2.0, 3.0))
-        change = WindChange(time=0.123, velocity=(0.0, 1.0, 0.0))
+        gust = Gust(at=0.1, duration=5.0, velocity=(1.0, 2.0, 3.0))
+        change = WindChange(at=0.123, velocity=(0.0, 1.0, 0.0))
         return field(mean=(3.0, 4.0, 0.5), gusts=(gust,), turbulence=DRYDEN, changes=(change,))
 
     pieces, source = [], make()
@@ -94,9 +94,7 @@ def test_the_wind_does_not_depend_on_how_many_steps_are_asked_for_at_once(parts:
 
 
 def test_reset_gives_the_same_wind_again() -> None:
-    wind = field(
-        mean=(1.0, 0.0, 0.0), gusts=(Gust(start=0.0, duration=1.0, velocity=(1.0, 1.0, 1.0)),), turbulence=DRYDEN
-    )
+    wind = field(mean=(1.0, 0.0, 0.0), gusts=(Gust(at=0.0, duration=1.0, velocity=(1.0, 1.0, 1.0)),), turbulence=DRYDEN)
     first = wind.advance(5000)
     assert not np.array_equal(wind.advance(5000), first)
     wind.reset()
@@ -131,12 +129,12 @@ NAN = float("nan")
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: Gust(start=-1.0, duration=1.0, velocity=(1.0, 0.0, 0.0)), "gust.start must be a finite time >= 0 s"),
-        (lambda: Gust(start=NAN, duration=1.0, velocity=(1.0, 0.0, 0.0)), "gust.start must be a finite time >= 0 s"),
-        (lambda: Gust(start=0.0, duration=0.0, velocity=(1.0, 0.0, 0.0)), "gust.duration must be a finite time > 0 s"),
-        (lambda: Gust(start=0.0, duration=1.0, velocity=(NAN, 0.0, 0.0)), "gust.velocity must be three finite numbers"),
-        (lambda: WindChange(time=-1.0, velocity=(1.0, 0.0, 0.0)), "wind_change.time must be a finite time >= 0 s"),
-        (lambda: WindChange(time=1.0, velocity=(1.0, 0.0)), "wind_change.velocity must be three finite numbers"),
+        (lambda: Gust(at=-1.0, duration=1.0, velocity=(1.0, 0.0, 0.0)), "gust.at must be a finite time >= 0 s"),
+        (lambda: Gust(at=NAN, duration=1.0, velocity=(1.0, 0.0, 0.0)), "gust.at must be a finite time >= 0 s"),
+        (lambda: Gust(at=0.0, duration=0.0, velocity=(1.0, 0.0, 0.0)), "gust.duration must be a finite time > 0 s"),
+        (lambda: Gust(at=0.0, duration=1.0, velocity=(NAN, 0.0, 0.0)), "gust.velocity must be three finite numbers"),
+        (lambda: WindChange(at=-1.0, velocity=(1.0, 0.0, 0.0)), "wind_change.at must be a finite time >= 0 s"),
+        (lambda: WindChange(at=1.0, velocity=(1.0, 0.0)), "wind_change.velocity must be three finite numbers"),
         (lambda: field(mean=(1.0, NAN, 0.0)), "wind.mean must be three finite numbers, x, y, z in m/s; got"),
         (
             lambda: WindField(mean=(0.0, 0.0, 0.0), timestep=0.0, rng=np.random.default_rng()),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
@@ -96,7 +97,7 @@ def run(
         deviations (K, 15), and its NEES at each.
     """
     rng = np.random.default_rng([8, seed])
-    bias = settings.initial_gyro_bias * rng.standard_normal(3)
+    bias = math.radians(settings.initial_gyro_bias) * rng.standard_normal(3)
     known = [replace(s, bias=tuple(bias)) if s.name is SensorName.RATES else s for s in sensors]
     generators = rng.spawn(len(SensorName))
     samplers = [

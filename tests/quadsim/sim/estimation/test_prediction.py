@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
 from scipy.linalg import expm
@@ -70,7 +72,9 @@ def test_the_covariance_moves_by_the_jacobian_of_the_mean(vehicle: Vehicle, mode
 
 
 def test_the_noise_that_gathers_is_van_loans(vehicle: Vehicle) -> None:
-    settings = EstimatorSettings(acceleration_noise=0.3, angular_acceleration_noise=2.0, gyro_bias_walk=0.1)
+    settings = EstimatorSettings(
+        acceleration_noise=0.3, angular_acceleration_noise=2.0, gyro_bias_walk=math.degrees(0.1)
+    )
     model = motion_model(vehicle, settings)
     rest = np.zeros(16)
     rest[6] = 1.0

@@ -26,7 +26,7 @@ from quadsim.sim.sensing.sensor import Sensor, SensorName
 from quadsim.state import Array
 from quadsim.vehicle import Vehicle
 
-SETTINGS = EstimatorSettings(acceleration_noise=0.1, angular_acceleration_noise=0.5, gyro_bias_walk=1e-3)
+SETTINGS = EstimatorSettings(acceleration_noise=0.1, angular_acceleration_noise=0.5, gyro_bias_walk=math.degrees(1e-3))
 SENSORS = (
     Sensor(name=SensorName.POSITION, rate=100.0, noise=(0.01, 0.01, 0.01)),
     Sensor(name=SensorName.ATTITUDE, rate=100.0, noise=(0.005, 0.005, 0.005)),
@@ -90,7 +90,7 @@ def test_rotors_lift_what_they_could_hold_in_hover(vehicle: Vehicle, model: Moti
 
 
 def test_it_is_believed_to_stand_and_the_gyros_bias_is_found(takeoff: Any, run_filter: Callable[..., Any]) -> None:
-    believed = replace(SETTINGS, initial_gyro_bias=math.radians(2.0))
+    believed = replace(SETTINGS, initial_gyro_bias=2.0)
     for seed in range(3):
         filter_, errors, deviations, _ = run_filter(takeoff, SENSORS, believed, seed=seed, standing=range(REST))
         ground = slice(1, REST // 50)

@@ -87,7 +87,7 @@ def test_outliers_widen_the_noise_of_their_share_of_samples(physics: Array) -> N
         name=SensorName.POSITION, rate=1000.0, noise=(0.1, 0.1, 0.1), outliers=Outliers(probability=0.1, size=20.0)
     )
     found = errors(sampler(sensor).sample(physics, 0), physics)
-    clean = errors(sampler(replace(sensor, outliers=Outliers())).sample(physics, 0), physics)
+    clean = errors(sampler(replace(sensor, outliers=None)).sample(physics, 0), physics)
     widened = np.isclose(found, 20.0 * clean, rtol=1e-6, atol=1e-9)
     assert np.all(widened | np.isclose(found, clean, rtol=1e-6, atol=1e-9))
     assert np.all(widened.all(axis=1) == widened.any(axis=1))  # all axes of a sample together

@@ -1,0 +1,95 @@
+"""Make docs/gallery.md and its figures, a picture and the numbers of every scenario that ships: `make docs`.
+
+Flies every scenario; neither the page nor the figures are kept in the repository.
+"""
+
+from __future__ import annotations
+
+from concurrent.futures import ProcessPoolExecutor
+from pathlib import Path
+from typing import get_args
+
+import matplotlib as mpl
+import numpy as np
+from make_scenarios import TITLES, nearest
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+import quadsim
+from quadsim.report.figures.flight_figures import draw_signal
+from quadsim.report.palette import REFERENCE, line_colour
+from scenarios.flight import Flight
+from scenarios.machine import usable_cores
+from scenarios.schema.scenario import Group
+
+DOCS = Path(__file__).resolve().parent
+PAGE, FIGURES = DOCS / "gallery.md", DOCS / "gallery"
+SIDES = np.array([-1.0, 1.0])
+HEAD = """# Gallery
+
+Every scenario that ships: its path (dashed: the reference), roll and pitch with their bounds, the verdict, and
+the constraint that came nearest to its bound, with its smallest margin at the physics rate.
+`quadsim run NAME` flies one, films it and writes its recording; `quadsim scenario NAME` prints its file.
+All numbers in tables: [scenarios](scenarios.md). Made by `make docs`.
+"""
+
+
+def draw(flight: Flight, file: Path) -> None:
+    """The path in space, roll and pitch."""
+    figure = Figure(figsize=(8.0, 2.9), layout="constrained")
+    left, right = figure.add_gridspec(1, 2, width_ratios=(1.0, 1.5))
+    space = figure.add_subplot(left, projection="3d")
+    reference, state = flight.reference, flight.plant
+    space.plot(reference["x"], reference["y"], reference["z"], color=REFERENCE, linestyle="--", linewidth=0.9)
+    space.plot(state["x"], state["y"], state["z"], color=line_colour(0), linewidth=1.1)
+    paths = np.stack([np.concatenate([reference[axis], state[axis]]) for axis in "xyz"])
+    middle, widest = 0.5 * (paths.min(axis=1) + paths.max(axis=1)), max(1.0, np.ptp(paths, axis=1).max())
+    half = 0.5 * np.maximum(np.ptp(paths, axis=1), 0.25 * widest)
+    space.set(xlim=middle[0] + SIDES * half[0], ylim=middle[1] + SIDES * half[1], zlim=middle[2] + SIDES * half[2])
+    space.set_box_aspect(half)
+    space.ticklabel_format(useOffset=False)
+    space.tick_params(labelsize=6, pad=-2)
+    space.locator_params(nbins=4)
+    axes: Axes = figure.add_subplot(right)
+    shown = draw_signal(axes, flight.run, "roll")
+    pitch = axes.plot(state["t"], np.degrees(state["pitch"]), color=line_colour(2), linewidth=1.0, zorder=1.9)
+    shown = {"roll": shown.pop("flight"), "pitch": pitch[0], **shown}
+    axes.legend(shown.values(), shown, ncols=len(shown), frameon=False, loc="lower left", bbox_to_anchor=(0.0, 1.0))
+    axes.set_ylabel("roll, pitch [deg]")
+    axes.set_xlabel("time [s]")
+    figure.savefig(file, format="svg", metadata={"Date": None})
+
+
+def entry(name: str) -> tuple[Group, str]:
+    """Fly and draw a scenario; its group, and its section of the page."""
+    flight = quadsim.fly(name, progress=False)
+    draw(flight, FIGURES / f"{name}.svg")
+    scenario, rmse = flight.scenario, ", ".join(f"{flight.metrics[f'rmse.{axis}']:.3f}" for axis in "xyz")
+    numbers = [
+        f"**{flight.outcome}**",
+        f"{flight.summary['duration']:g} s",
+        f"RMS error x, y, z {rmse} m",
+        nearest(flight),
+    ]
+    return scenario.group, (
+        f"### {name}\n\n{scenario.description}.\n\n![Path and attitude of {name}](gallery/{name}.svg)\n\n"
+        f"{' · '.join(numbers)}\n"
+    )
+
+
+def main() -> None:
+    """Fly everything and write the page."""
+    FIGURES.mkdir(exist_ok=True)
+    mpl.rcParams |= {"svg.hashsalt": "quadsim", "font.size": 8.0, "axes.spines.top": False, "axes.spines.right": False}
+    with ProcessPoolExecutor(usable_cores()) as pool:
+        entries = list(pool.map(entry, quadsim.scenarios()))
+    parts = [HEAD]
+    for group in get_args(Group):
+        members = [text for of, text in entries if of == group]
+        if members:
+            parts += [f"## {TITLES.get(group, group)}\n", *members]
+    PAGE.write_text("\n".join(parts), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()

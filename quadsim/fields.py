@@ -1,0 +1,31 @@
+"""What the fields of settings may hold, in Python and in files alike: kinds of numbers with their limits.
+
+A settings dataclass is the one declaration of its fields: type and limits by `annotated_types`, unit and meaning by
+`annotated_types.doc`, default.  `scenarios.schema` reads tables of scenario files straight into these dataclasses, and
+makes messages, the JSON Schema and commented files of them.  Numbers are therefore in the units of files: angles in
+degrees; what computes with them converts them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Annotated, Any, TypeVar
+
+from annotated_types import Ge, Gt, Le, Len, doc
+
+Settings = TypeVar("Settings")
+
+Number = Annotated[float, Ge(-1e6), Le(1e6)]
+NonNegative = Annotated[float, Ge(0.0), Le(1e6)]
+Positive = Annotated[float, Gt(0.0), Le(1e6)]
+Fraction = Annotated[float, Ge(0.0), Le(1.0)]
+Vector = Annotated[tuple[Number, ...], Len(3, 3)]
+"""Of three numbers, x, y, z."""
+Instant = Annotated[float, Ge(0.0), Le(1e6), doc("[s] when it happens")]
+"""Of an event."""
+
+
+def filled(settings: Settings, **values: object) -> Settings:
+    """A settings dataclass with the fields that are None taken from elsewhere."""
+    absent: dict[str, Any] = {name: value for name, value in values.items() if getattr(settings, name) is None}
+    return replace(settings, **absent)  # type: ignore[type-var]

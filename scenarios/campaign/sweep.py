@@ -1,0 +1,109 @@
+"""A scenario flown for every combination of some fields' values."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from contextlib import closing
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+
+from quadsim.errors import ParameterError, UnknownNameError
+from scenarios.campaign.engine.protocol import Engine
+from scenarios.campaign.pilot import CampaignPilot
+from scenarios.campaign.plan import Plan, parse_campaign
+from scenarios.campaign.results.table import DRAW, make_table
+from scenarios.flight import to_pandas
+from scenarios.parts.vehicle import build_vehicle, resolve_vehicle
+from scenarios.progress import Progress, silent
+from scenarios.schema.scenario import Scenario
+
+
+class SweepPlan(Plan):
+    """A plan whose flights differ in what is swept alone: each has the scenario's own seed."""
+
+    def of(self, flight: int) -> Scenario:
+        """The scenario of one flight; see `Plan.of`."""
+        values = self.draws.values(flight)
+        changes = [(entry, values[entry.name]) for entry in self.spec.vary]
+        return self._varied(changes, name=f"{self.scenario.name[:70]}-{flight}", seed=self.scenario.seed)
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """The flights of a sweep, a row each.
+
+    Attributes:
+        table: what was swept, by dotted path; verdict; tracking errors; commands; margins of each constraint; step
+            times.  Units are in the columns' metadata.
+    """
+
+    table: pa.Table
+
+    def __getitem__(self, column: str) -> np.ndarray[Any, Any]:
+        """(flights,) of a column by its name.
+
+        Raises:
+            UnknownNameError: there is none.
+        """
+        if column not in self.table.column_names:
+            raise UnknownNameError("column", column, self.table.column_names)
+        return np.asarray(self.table[column].to_numpy())
+
+    def __len__(self) -> int:
+        """Flights."""
+        return int(self.table.num_rows)
+
+    def to_arrow(self) -> pa.Table:
+        """The table."""
+        return self.table
+
+    def to_pandas(self) -> Any:
+        """The table as a pandas DataFrame.
+
+        Raises:
+            MissingPackageError: pandas is not installed.
+        """
+        return to_pandas(self.table)
+
+
+def fly_sweep(
+    scenario: Scenario, values: Mapping[str, Sequence[Any]], engine: Engine, progress: Progress = silent
+) -> Sweep:
+    """Fly every combination, the last field varying fastest.
+
+    Args:
+        scenario: what is flown.
+        values: what to try, by dotted path.
+        engine: who flies.
+        progress: called with (what, done, total).
+
+    Raises:
+        InputError: a field does not exist, or a value is not allowed.
+    """
+    for path, tried in values.items():
+        if isinstance(tried, str) or not len(tried):
+            raise ParameterError("sweep", path, tried, "a list of values to try")
+    lists = {path: getattr(tried, "tolist", lambda tried=tried: list(tried))() for path, tried in values.items()}
+    entries = [
+        {"name": f"field-{i}", "fields": [path], "distribution": "grid", "values": tried}
+        for i, (path, tried) in enumerate(lists.items())
+    ]
+    count = math.prod(len(tried) for tried in lists.values())
+    data = {"name": scenario.name, "scenario": scenario.name, "flights": count, "vary": entries}
+    spec = parse_campaign(data, source="sweep")
+    plan = SweepPlan(spec=spec, scenario=resolve_vehicle(scenario, build_vehicle(scenario)))
+    plan.check()
+    progress("sweep", 0, count)
+    rows = []
+    with closing(engine.answers(CampaignPilot(plan), range(count))) as answers:
+        for row in answers:
+            rows.append(row)
+            progress("sweep", len(rows), count)
+    table = make_table(rows, plan.schema).drop_columns(["flight", "seed", "failed"])
+    table = table.rename_columns({f"{DRAW}field-{i}": path for i, path in enumerate(lists)})
+    first = [*lists, *(name for name in table.column_names if name not in lists)]
+    return Sweep(table.select(first))

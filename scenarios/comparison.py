@@ -1,0 +1,148 @@
+"""Flights side by side: what is compared is found, flown where it has to be, and laid out on a page."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from quadsim.errors import InputError
+from quadsim.flight import rundir
+from quadsim.outputs import require_directory
+from quadsim.report.table import Row
+from scenarios.campaign.manifest import is_campaign as is_campaign
+from scenarios.campaign.manifest import stored_plan
+from scenarios.flight import Flight, Outputs
+from scenarios.loading import load_scenario
+from scenarios.progress import Progress, silent
+from scenarios.reaudit import reaudit
+from scenarios.run import run_scenario
+from scenarios.schema.scenario import Scenario
+
+if TYPE_CHECKING:
+    from scenarios.campaign.statistics.comparison import Comparison as CampaignComparison
+
+Target = Flight | Scenario | str | Path
+"""What can be compared: a flight, a run directory, or a scenario to fly, by itself or by its name."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Comparison:
+    """Flights side by side.
+
+    Attributes:
+        runs: the flights.
+        rows: the table, a row per quantity.
+        names: of its columns, one per flight.
+        page: `index.html`, where it was written.
+        notes: what a person should know of the runs that were read.
+    """
+
+    runs: tuple[rundir.Run, ...]
+    rows: list[Row]
+    names: tuple[str, ...]
+    page: Path | None
+    notes: tuple[str, ...] = ()
+
+    def to_markdown(self) -> str:
+        """The table as Markdown."""
+        from quadsim.report.table import to_markdown
+
+        return to_markdown(self.rows, self.names)
+
+    def _repr_markdown_(self) -> str:
+        """The table, for notebooks."""
+        return self.to_markdown()
+
+
+def compare_flights(
+    targets: Sequence[Target], out: Path | None = None, cost: bool | None = None, progress: Progress = silent
+) -> Comparison:
+    """Compare flights, and write the page where a directory is given.
+
+    Args:
+        targets: one or more.
+        out: the directory of the page; what has to be flown is kept beside it, in `OUT-runs`.
+        cost: whether to study what constraints cost; None: where a constrained and an unconstrained controller fly the
+            same course of at most 120 s.
+        progress: called with (what, done, total).
+
+    Raises:
+        InputError: something is no flight and no scenario; nothing was flown.
+        OutputError: the directory cannot be written.
+    """
+    from quadsim.report.comparison import comparison_rows, run_names
+    from quadsim.report.pages.comparison_page import KIND, write_comparison
+    from scenarios.cost.measure import find_study, study_cost
+    from scenarios.cost.section import cost_section
+
+    if out is not None:
+        require_directory(out, KIND)
+    notes = [note for target in targets for note in _checked(target)]
+    named = [_name_of(target) for target in targets]
+    studied = find_study(named, asked=cost) if out is not None else []
+    with tempfile.TemporaryDirectory() as scratch:
+        beside = Path(scratch) if out is None else out.parent / f"{out.name}-runs"
+        runs = tuple(_run_of(target, beside, progress, pictures=out is not None) for target in targets)
+        study = study_cost(studied[0], studied[1:], progress=progress) if studied else None
+        section = None if study is None else cost_section(study)
+        page = None if out is None else write_comparison(runs, out, section)
+    return Comparison(runs=runs, rows=comparison_rows(runs), names=run_names(runs), page=page, notes=tuple(notes))
+
+
+def _checked(target: Target) -> Sequence[str]:
+    """What a person should know of a target, before anything is flown."""
+    if isinstance(target, Flight | Scenario):
+        return ()
+    if Path(target).is_dir():
+        return [f"{target}: {note}" for note in reaudit(Path(target), products=False).notes]
+    load_scenario(str(target))
+    return ()
+
+
+def _name_of(target: Target) -> str:
+    if isinstance(target, Flight):
+        return target.scenario.name if target.directory is None else str(target.directory)
+    return target.name if isinstance(target, Scenario) else str(target)
+
+
+def _run_of(target: Target, beside: Path, progress: Progress, *, pictures: bool) -> rundir.Run:
+    """A target as a run, flown and written beside the page where it is none yet."""
+    if isinstance(target, Flight):
+        if target.directory is not None or not pictures:
+            return target.run
+        return rundir.load_run(target.save(beside / target.scenario.name, progress=progress))
+    if not isinstance(target, Scenario) and Path(target).is_dir():
+        return rundir.load_run(Path(target))
+    scenario = target if isinstance(target, Scenario) else load_scenario(str(target))
+    outputs = Outputs(video=pictures, recording=pictures, figures=pictures)
+    run_scenario(scenario, beside / scenario.name, outputs, progress)
+    return rundir.load_run(beside / scenario.name)
+
+
+def compare_campaigns(directories: Sequence[Path], out: Path | None = None) -> CampaignComparison:
+    """Compare two campaigns flight by flight, and write the report where a directory is given.
+
+    Raises:
+        InputError: they are not two finished campaigns.
+        OutputError: the directory cannot be written.
+    """
+    from scenarios.campaign.report.campaign_page import KIND, write_comparison_report
+    from scenarios.campaign.results.store import FLIGHTS_FILE, read_flights
+    from scenarios.campaign.statistics.comparison import compare
+
+    if len(directories) != 2:
+        raise InputError(f"compare takes two campaigns, each by itself, not {len(directories)}")
+    if out is not None:
+        require_directory(out, KIND)
+    first, second = directories
+    plans = (stored_plan(first), stored_plan(second))
+    names = (plans[0].spec.name, plans[1].spec.name)
+    failures = (plans[0].spec.failure, plans[1].spec.failure)
+    a, b = (read_flights(path / FLIGHTS_FILE, plan.schema) for path, plan in zip((first, second), plans, strict=True))
+    comparison = compare(a, b, names, failures)
+    if out is not None:
+        write_comparison_report(comparison, out)
+    return comparison

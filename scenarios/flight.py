@@ -1,0 +1,430 @@
+"""A flown scenario in memory: named arrays, numbers, pictures, and the run directory that it is saved to."""
+
+from __future__ import annotations
+
+import contextlib
+import time as clock
+from base64 import b64encode
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, dataclass, field
+from functools import cached_property
+from html import escape
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from quadsim.controller import Phase
+from quadsim.errors import MissingPackageError, OutputError, UnknownNameError
+from quadsim.flight import metrics, rundir
+from quadsim.flight.audit import SIGNALS, Finding, margins_at, margins_sampled
+from quadsim.flight.feasibility import to_json as feasibility_to_json
+from quadsim.flight.log import ROTORS, FlightLog
+from quadsim.flight.parquet import log_tables, write_log
+from quadsim.outputs import write_json, write_text, writing
+from quadsim.sim.airframe import outline
+from quadsim.sim.estimation.filter import Tally
+from quadsim.sim.sensing.sensor import SensorName
+from quadsim.state import REFERENCE_NAMES, STATE_NAMES, Array
+from quadsim.vehicle import Vehicle
+from scenarios.courses.feasibility_check import report
+from scenarios.courses.make import build_course_steps
+from scenarios.machine import machine, usable_cores, versions
+from scenarios.parts.effects import build_computation
+from scenarios.progress import Progress, silent
+from scenarios.schema.scenario import Scenario, Verdict
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+    from mpc.ocp import Unanswered
+
+
+@dataclass(frozen=True, kw_only=True)
+class Outputs:
+    """Which files a run makes besides its summary, scenario and Parquet tables."""
+
+    video: bool = True
+    recording: bool = True
+    figures: bool = True
+
+    def check(self) -> None:
+        """Refuse a video that cannot be made here, before anything is flown.
+
+        Raises:
+            RenderingUnavailableError: so it is.
+        """
+        if self.video:
+            from quadsim.report.film.video import rendering_backend
+
+            rendering_backend()
+
+
+@dataclass(frozen=True, kw_only=True)
+class Flight:
+    """A flown scenario.
+
+    Arrays with one row per control period k, taken at t_k, are `time`, `state`, `measured`, `reference`, `command` and
+    `margins`; `plant` has the vehicle between them, at the physics rate (from a directory: at the scenario's
+    `log_rate`).  Angles are in rad, world frame z up, Euler angles roll, pitch, yaw (Z-Y-X).
+
+    Attributes:
+        scenario: resolved, with every number of its vehicle in it.
+        vehicle: what was flown.
+        log: the flight as stacked arrays.
+        findings: the audit, one per constraint of the scenario.
+        controller: name of the control law.
+        solver: name of its QP solver; empty for a closed form.
+        simulate_s: wall time of the closed loop alone [s].
+        tallies: what became of each sensor's samples in the estimator; empty without one.
+        directory: where it was read from; None for one that was flown.
+        recorded: `summary.json` of one that was read; None for one that was flown.
+        unanswered: the first period whose QP had no answer; None where all had, there is no QP, or it was read.
+
+    Examples:
+        >>> import quadsim
+        >>> flight = quadsim.fly(quadsim.load("hover").replace({"duration": 1.0}))
+        >>> flight.outcome, flight.time.shape, flight.command.shape
+        ('satisfied', (20,), (20, 4))
+        >>> bool(flight.margins["roll"].min() > 0.0)
+        True
+    """
+
+    scenario: Scenario
+    vehicle: Vehicle
+    log: FlightLog = field(repr=False)
+    findings: tuple[Finding, ...] = field(repr=False)
+    controller: str
+    solver: str
+    simulate_s: float
+    tallies: Mapping[SensorName, Tally] = field(repr=False)
+    directory: Path | None = None
+    recorded: Mapping[str, Any] | None = field(default=None, repr=False)
+    unanswered: Unanswered | None = field(default=None, repr=False)
+
+    @property
+    def satisfied(self) -> bool:
+        """Whether the flight was completed, without a crash or fallback for good, and every required constraint held.
+
+        What fallback for good is: `quadsim.flight.metrics.unrecovered`.
+        """
+        control = self.log.control
+        whole = self.log.reason is None and str(Phase.CRASHED) not in control.phase
+        held = all(finding.satisfied for finding in self.findings if finding.limit.required)
+        return whole and held and not metrics.unrecovered(control)
+
+    @property
+    def outcome(self) -> Verdict:
+        """The verdict in one word; `lost` is a flight that was aborted, whoever ended it."""
+        if self.log.reason is not None:
+            return "lost"
+        return "satisfied" if self.satisfied else "violated"
+
+    @cached_property
+    def diagnosis(self) -> Mapping[str, Any] | None:
+        """Why the first QP without an answer had none, and what would help; None where all QPs had one.
+
+        `sentence` and `advice` are for people; the other entries are explained in `docs/controllers.md`.
+        """
+        if self.recorded is not None:
+            return self.recorded.get("diagnosis")
+        from scenarios.diagnosis import diagnose
+
+        return None if self.unanswered is None else diagnose(self.unanswered, self.scenario, self.vehicle)
+
+    @property
+    def audit(self) -> tuple[Finding, ...]:
+        """What the audit found at the physics rate, one entry per constraint of the scenario."""
+        return self.findings
+
+    @property
+    def time(self) -> Array:
+        """(K,) t_k of each control period [s]."""
+        return self.log.control.t
+
+    @cached_property
+    def state(self) -> dict[str, Array]:
+        """(K,) of each true state by its name [m, m/s, rad, rad/s]; names as in `quadsim.state.STATE_NAMES`."""
+        return dict(zip(STATE_NAMES, self.log.control.truth.T, strict=True))
+
+    @cached_property
+    def measured(self) -> dict[str, Array]:
+        """(K,) of each state as the controller received it; the same as `state` where measurement is perfect."""
+        return dict(zip(STATE_NAMES, self.log.control.state.T, strict=True))
+
+    @cached_property
+    def reference(self) -> dict[str, Array]:
+        """(K,) of the filtered reference x, y, z [m], yaw [rad]."""
+        return dict(zip(REFERENCE_NAMES, self.log.control.reference.T, strict=True))
+
+    @property
+    def command(self) -> Array:
+        """(K, 4) commanded rotor speeds [rad/s]."""
+        return self.log.control.speeds
+
+    @cached_property
+    def plant(self) -> dict[str, Array]:
+        """(M,) of the time `t` [s], each true state, and rotor speeds `w1` .. `w4` [rad/s], between commands."""
+        log = self.log.plant
+        speeds = {f"w{i}": log.speeds[:, i - 1] for i in ROTORS}
+        return {"t": log.t, **dict(zip(STATE_NAMES, log.state.T, strict=True)), **speeds}
+
+    @cached_property
+    def margins(self) -> dict[str, Array]:
+        """(K,) of each constraint by its name: its smallest signed margin within the period; negative = violated.
+
+        At the rate of `plant`, in the constraint's unit; NaN outside its time window.  The smallest of all is the
+        audit's `worst_margin`.
+        """
+        plant, t = self.log.plant, self.time
+        starts = np.minimum(np.searchsorted(plant.t, t - 1e-9), max(plant.t.size - 1, 0))
+        found: dict[str, Array] = {}
+        for finding in self.findings:
+            limit, signal = finding.limit, finding.limit.source
+            if signal.plant is None or not t.size:
+                found[limit.name] = margins_sampled(limit, self.log)
+            else:
+                between = margins_at(limit, plant.t, signal.plant(plant))
+                found[limit.name] = np.fmin.reduceat(between, starts)
+        return found
+
+    @cached_property
+    def summary(self) -> Mapping[str, Any]:
+        """Everything in numbers: the content of `summary.json`."""
+        return self.recorded if self.recorded is not None else summarise(self)
+
+    @cached_property
+    def metrics(self) -> dict[str, float]:
+        """The flight's numbers by name, e.g. `rmse.x`, `speed_max`, `step_ms.p99`; units as in `summary`."""
+        tables = (self.summary[name] for name in ("tracking", "control", "controller"))
+        return {name: value for table in tables for name, value in _numbers(table)}
+
+    @property
+    def run(self) -> rundir.Run:
+        """The flight as the figures and pages of reports take it."""
+        limits = tuple(finding.limit for finding in self.findings)
+        directory = self.directory or Path(self.scenario.name)
+        return rundir.Run(
+            directory=directory, summary=dict(self.summary), log=self.log, vehicle=self.vehicle, limits=limits
+        )
+
+    def to_arrow(self, table: str = "flight") -> pa.Table:
+        """A table of the flight, units in its columns' metadata.
+
+        Args:
+            table: `flight` (a row per control period), `plant` (between the commands), `timing` (what a clock
+                measured), or `horizon` (the positions that were predicted).
+
+        Raises:
+            UnknownNameError: the flight has no such table.
+        """
+        tables = log_tables(self.log, metadata=self.metadata)
+        if table not in tables:
+            raise UnknownNameError("table", table, tables)
+        return tables[table]
+
+    def to_pandas(self, table: str = "flight") -> Any:
+        """The same as a pandas DataFrame.
+
+        Raises:
+            MissingPackageError: pandas is not installed.
+        """
+        return to_pandas(self.to_arrow(table))
+
+    def plot(self, *signals: str) -> list[Any]:
+        """Draw signals over time with their references and bounds, one panel each.
+
+        Args:
+            signals: names that constraints can have, as `x`, `tilt`, `speed`; position and attitude where none is
+                given.
+
+        Returns:
+            The matplotlib axes, top to bottom; `axes[0].figure` is the figure, which is pyplot's.
+
+        Raises:
+            UnknownNameError: there is no such signal.
+        """
+        from quadsim.report.figures.flight_figures import plot_signals
+
+        for name in signals:
+            if name not in SIGNALS:
+                raise UnknownNameError("signal", name, SIGNALS)
+        return plot_signals(self.run, signals or ("x", "y", "z", "roll", "pitch", "yaw"))
+
+    def save(
+        self,
+        directory: str | Path,
+        *,
+        video: bool = True,
+        recording: bool = True,
+        figures: bool = True,
+        progress: Progress = silent,
+    ) -> Path:
+        """Write the run directory, as `quadsim run` does; it appears complete or not at all.
+
+        Args:
+            directory: where; an earlier run there is replaced.
+            video: whether to film it.
+            recording: whether to write `flight.rrd` for the rerun viewer.
+            figures: whether to draw it.
+            progress: called with (what, done, total).
+
+        Returns:
+            The directory.
+
+        Raises:
+            RenderingUnavailableError: a video is wanted and cannot be made.
+            OutputError: the directory cannot be written, or the flight was read from a directory.
+        """
+        if self.recorded is not None:
+            raise OutputError(directory, f"this flight is on disk already, in {self.directory}; copy that directory")
+        outputs = Outputs(video=video, recording=recording, figures=figures)
+        outputs.check()
+        with writing(Path(directory), rundir.KIND) as partial:
+            write_run(self, partial, outputs, progress)
+        return Path(directory)
+
+    def _repr_html_(self) -> str:
+        """Numbers and a small plot, for notebooks."""
+        rows = "".join(
+            f"<tr><td>{escape(entry.limit.name)}</td><td>{entry.worst_margin:.4g} {escape(entry.limit.unit)}</td>"
+            f"<td>{'holds' if entry.satisfied else 'violated'}</td></tr>"
+            for entry in self.findings
+        )
+        errors = ", ".join(f"{name} {self.metrics[f'rmse.{name}']:.3g}" for name in "xyz" if self.time.size)
+        plot = ""
+        if self.time.size:
+            from quadsim.report.figures.flight_figures import signals_png
+
+            plot = b64encode(signals_png(self.run, ("x", "y", "z"))).decode()
+            plot = f'<img alt="position over time" src="data:image/png;base64,{plot}">'
+        return (
+            f"<p><b>{escape(self.scenario.name)}</b>: {self.outcome}, {self.summary['duration']:g} s flown, "
+            f"RMS error [m]: {errors or 'none'}</p>"
+            f"<table><tr><th>constraint</th><th>worst margin</th><th>verdict</th></tr>{rows}</table>{plot}"
+        )
+
+    @property
+    def metadata(self) -> dict[str, str]:
+        """What each of its tables keeps in its schema."""
+        return {"scenario": self.scenario.name, "seed": str(self.scenario.seed)}
+
+
+def to_pandas(table: pa.Table) -> Any:
+    """An Arrow table as a DataFrame.
+
+    Raises:
+        MissingPackageError: pandas is not installed.
+    """
+    if find_spec("pandas") is None:
+        raise MissingPackageError("a DataFrame", "pandas", extra="pandas")
+    return table.to_pandas()
+
+
+def _numbers(table: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, float]]:
+    """The numbers of nested tables, by their paths."""
+    for name, value in table.items():
+        if isinstance(value, Mapping):
+            yield from _numbers(value, f"{prefix}{name}.")
+        elif isinstance(value, int | float) and not isinstance(value, bool):
+            yield prefix + name, value
+
+
+def write_run(
+    flight: Flight, directory: Path, outputs: Outputs, progress: Progress = silent, *, since: float | None = None
+) -> None:
+    """Write a run directory: scenario, Parquet tables, what pictures are wanted, and the summary that seals it.
+
+    Args:
+        flight: as it was flown.
+        directory: one that is being made.
+        outputs: which pictures.
+        progress: called with (what, done, total).
+        since: clock reading at which the flight's work began [s], for the summary's total.
+    """
+    started = clock.perf_counter() - flight.simulate_s if since is None else since
+    summary = flight.summary
+    write_text(directory / rundir.SCENARIO_FILE, flight.scenario.to_toml())
+    write_log(directory, flight.log, plant_stride=flight.scenario.plant_stride, metadata=flight.metadata)
+    write_json(directory / rundir.SUMMARY_FILE, summary)
+    _write_products(flight, directory, outputs, progress)
+    total = {**summary["wall_s"], "total": clock.perf_counter() - started}
+    rundir.seal(directory, {**summary, "wall_s": total})
+
+
+def summarise(flight: Flight) -> dict[str, Any]:
+    """`summary.json` of a flight, but for the hashes of its files and the total wall time."""
+    scenario, log = flight.scenario, flight.log
+    course = build_course_steps(scenario)
+    ground = scenario.effects.ground
+    flown = log.control.t.size > 0
+    numbers = metrics.flight_numbers(log, deadline_ms=1e3 * scenario.control_period, course=course)
+    return {
+        "scenario": scenario.name,
+        "description": scenario.description,
+        "status": log.status,
+        "reason": log.reason,
+        "lost": log.lost,
+        "satisfied": flight.satisfied,
+        "group": scenario.group,
+        "expected": scenario.expect,
+        "as_expected": flight.outcome == scenario.expect and not log.interrupted,
+        "duration": round(log.control.t.size * scenario.control_period, 9),
+        "seed": scenario.seed,
+        "course": feasibility_to_json(report(scenario, flight.vehicle)),
+        "tracking": numbers["tracking"],
+        "constraints": [rundir.limit_to_json(finding) for finding in flight.findings],
+        "control": numbers["control"],
+        "diagnosis": flight.diagnosis,
+        "controller": {
+            "name": flight.controller,
+            "solver": flight.solver,
+            "horizon": scenario.controller.horizon,
+            **numbers["controller"],
+        },
+        **({"computation": metrics.computation(log.control)} if flown and build_computation(scenario) else {}),
+        **({} if log.control.measured_perfectly else {"estimation": _estimation(flight)}),
+        **({"ground": metrics.ground(log, outline(flight.vehicle))} if flown and ground and ground.contact else {}),
+        "vehicle": rundir.vehicle_to_json(flight.vehicle),
+        "wall_s": {"simulate": flight.simulate_s, "total": flight.simulate_s},
+        "versions": versions(),
+        "machine": machine(),
+        "files": {},
+    }
+
+
+def _estimation(flight: Flight) -> dict[str, Any]:
+    samples = {str(name): asdict(tally) for name, tally in flight.tallies.items()}
+    return {**metrics.estimation(flight.log.control), "samples": samples}
+
+
+def _write_products(flight: Flight, directory: Path, outputs: Outputs, progress: Progress) -> None:
+    """Recording, figures and video, each made from the files that are already there."""
+    run = rundir.load_run(directory)
+    flown = bool(run.log.control.t.size)
+    with contextlib.ExitStack() as beside:
+        if outputs.recording:
+            from quadsim.report.recording import recording_in_background, write_recording
+
+            progress("recording", 0, 1)
+            if outputs.figures and flown and usable_cores() > 1:  # while the figures are drawn: a tenth of a short run
+                beside.enter_context(recording_in_background(directory))
+            else:
+                write_recording(run, directory / rundir.RECORDING_FILE)
+        if outputs.figures and flown:
+            from quadsim.report.figures.flight_figures import write_figures
+
+            progress("figures", 0, 1)
+            write_figures(run, directory / rundir.FIGURES_DIR)
+            progress("figures", 1, 1)
+    if outputs.recording:
+        progress("recording", 1, 1)
+    if outputs.video and flown and not flight.log.interrupted:
+        from quadsim.report.film.video import render_video
+
+        render_video(
+            directory,
+            directory / rundir.VIDEO_FILE,
+            progress=lambda done, total: progress("video", done, total),
+        )

@@ -1,0 +1,310 @@
+"""`import quadsim`: what users call from Python."""
+
+from __future__ import annotations
+
+import doctest
+import functools
+import importlib
+import inspect
+import os
+import signal
+import subprocess
+import sys
+import threading
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import mpc
+import quadsim
+import scenarios.api
+import scenarios.flight
+import scenarios.schema.scenario
+from quadsim.controller import Moment
+from quadsim.errors import InputError, OutputError, ParameterError, UnknownNameError
+from quadsim.flight import rundir
+from quadsim.state import Array
+from quadsim.vehicle import Vehicle
+from scenarios.flight import Flight
+from scenarios.schema.scenario import Scenario
+
+EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
+
+
+def hover_law(now: Moment, state: Array, reference: Array) -> Array:
+    """A law that other processes can import."""
+    return np.full(4, 180.0 if now.time < 0.2 else 210.0)
+
+
+class Gentle:
+    """A law with settings."""
+
+    def __init__(self, vehicle: Vehicle, period: float, horizon: int, share: float = 1.0) -> None:
+        self.speeds = np.full(4, share * vehicle.hover_speed)
+
+    def step(self, now: Moment, state: Array, reference: Array) -> Array:
+        return self.speeds
+
+
+@pytest.fixture(scope="module")
+def hover() -> Scenario:
+    return quadsim.load("hover").replace({"duration": 1.0})
+
+
+@pytest.fixture(scope="module")
+def flight() -> Flight:
+    return quadsim.fly(quadsim.load("paper-constrained").replace({"duration": 6.0}), progress=False)
+
+
+@pytest.mark.parametrize("module", [scenarios.api, scenarios.flight, scenarios.schema.scenario])
+def test_the_examples_of_docstrings_run(module: object) -> None:
+    found = doctest.testmod(module, raise_on_error=False)  # type: ignore[arg-type]
+    assert found.attempted > 0
+    assert found.failed == 0
+
+
+@pytest.mark.parametrize("package", [quadsim, mpc])
+def test_every_public_name_is_there_and_documented(package: object) -> None:
+    for name in package.__all__:  # type: ignore[attr-defined]
+        assert getattr(package, name).__doc__, name
+        assert name in dir(package)
+    with pytest.raises(AttributeError, match="no attribute 'nonsense'"):
+        package.nonsense  # type: ignore[attr-defined]  # noqa: B018
+
+
+def test_every_function_has_an_example() -> None:
+    functions = [each for each in map(quadsim.__getattr__, quadsim.__all__) if inspect.isfunction(each)]
+    assert len(functions) >= 8
+    without = [each.__name__ for each in functions if each.__module__ == "scenarios.api" and ">>>" not in each.__doc__]
+    assert without == ["film", "replay"]  # which take long
+
+
+def test_importing_it_imports_nothing_heavy() -> None:
+    code = "import quadsim, sys; print(*sorted({name.partition('.')[0] for name in sys.modules}))"
+    loaded = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.split()
+    assert not {"numpy", "mujoco", "scipy", "pydantic", "matplotlib", "scenarios", "mpc"} & set(loaded)
+
+
+def test_a_scenario_is_changed_field_by_field() -> None:
+    scenario = quadsim.load("paper-constrained", {"controller.horizon": 30})
+    changed = scenario.replace(
+        {"vehicle.mass": np.float64(4.2), "constraints.roll.upper": 4.0, "initial.euler.2": 10.0}
+    )
+    assert (changed.controller.horizon, changed.vehicle.mass, changed.initial.euler) == (30, 4.2, [0.0, 0.0, 10.0])
+    assert next(each.upper for each in changed.constraints if each.name == "roll") == 4.0
+    assert scenario.vehicle.mass is None
+    with pytest.raises(InputError, match=r"controller\.horizn is not a field"):
+        scenario.replace({"controller.horizn": 3})
+    with pytest.raises(InputError, match="horizon"):
+        scenario.replace({"controller.horizon": -1})
+    with pytest.raises(InputError, match="no scenario named"):
+        quadsim.load("nonsense")
+
+
+def test_arrays_have_names_and_agree_with_the_tables(flight: Flight) -> None:
+    table = flight.to_arrow()
+    assert np.array_equal(flight.time, table["t"].to_numpy())
+    assert np.array_equal(flight.state["x"], table["x"].to_numpy())
+    assert np.array_equal(flight.command[:, 2], table["u3"].to_numpy())
+    assert np.array_equal(flight.reference["yaw"], table["ref_yaw"].to_numpy())
+    assert flight.measured["roll"] is not flight.state["roll"]
+    assert len(flight.plant["w1"]) == len(flight.to_arrow("plant")) == 6001
+    assert flight.metrics["rmse.x"] == flight.summary["tracking"]["rmse"]["x"]
+    with pytest.raises(UnknownNameError, match="no table named 'wind'"):
+        flight.to_arrow("wind")
+
+
+def test_margins_are_those_of_the_audit(flight: Flight) -> None:
+    """Each period's worst at the physics rate; the worst of all is the audit's."""
+    assert [*flight.margins] == [finding.limit.name for finding in flight.audit]
+    for finding in flight.audit:
+        margins = flight.margins[finding.limit.name]
+        assert margins.shape == flight.time.shape
+        if np.isnan(finding.worst_margin):  # its window is later
+            assert np.isnan(margins).all()
+        else:
+            assert np.nanmin(margins) == pytest.approx(finding.worst_margin, abs=1e-12)
+            k = int(np.nanargmin(margins))
+            assert flight.time[k] - 1e-9 <= finding.worst_time <= flight.time[k] + 0.05 + 1e-9
+
+
+def test_it_is_drawn(flight: Flight) -> None:
+    import matplotlib as mpl
+
+    mpl.use("Agg")
+    axes = flight.plot("x", "roll", "speed")
+    assert [each.get_ylabel() for each in axes] == ["x [m]", "roll [deg]", "speed [rad/s]"]
+    assert len(axes[2].get_lines()) == 4
+    assert len(flight.plot()) == 6
+    with pytest.raises(UnknownNameError, match="no signal named 'rol'; did you mean 'roll'"):
+        flight.plot("rol")
+    page = flight._repr_html_()
+    assert "data:image/png;base64," in page
+    assert all(finding.limit.name in page for finding in flight.audit)
+
+
+def test_a_saved_flight_is_the_run_that_the_command_writes(flight: Flight, tmp_path: Path) -> None:
+    """The same bytes of Parquet; read again it says the same."""
+    flight.save(tmp_path / "saved", video=False, recording=False, figures=False)
+    quadsim.fly(flight.scenario, out=tmp_path / "run", video=False, recording=False, figures=False, progress=False)
+    for name in ("flight.parquet", "plant.parquet", "horizon.parquet", "scenario.toml"):
+        assert (tmp_path / "saved" / name).read_bytes() == (tmp_path / "run" / name).read_bytes()
+    read = quadsim.read(tmp_path / "saved")
+    assert read.audit == flight.audit or [str(each) for each in read.audit] == [str(each) for each in flight.audit]
+    assert (read.outcome, read.controller, read.solver) == (flight.outcome, flight.controller, flight.solver)
+    assert read.scenario == flight.scenario
+    assert np.array_equal(read.command, flight.command)
+    assert read.metrics["rmse.z"] == flight.metrics["rmse.z"]
+    assert not rundir.damaged_files(tmp_path / "saved", read.summary)
+    with pytest.raises(OutputError, match="on disk already"):
+        read.save(tmp_path / "again")
+
+
+def test_ones_own_law_flies(hover: Scenario) -> None:
+    by_function = quadsim.fly(hover, controller=hover_law, progress=False)
+    assert by_function.controller == "hover_law"
+    assert by_function.scenario.controller.type == f"{__name__}:hover_law"
+    assert set(by_function.command[:, 0]) == {180.0, 210.0}
+
+    by_class = quadsim.fly(hover, controller=functools.partial(Gentle, share=0.5), progress=False)
+    assert by_class.scenario.controller.settings == {"share": 0.5}
+    ready = Gentle(by_class.vehicle, 0.05, 50, share=0.5)
+    assert np.array_equal(by_class.command, quadsim.fly(hover, controller=ready, progress=False).command)
+
+    def local(now: Moment, state: Array, reference: Array) -> Array:
+        return ready.speeds
+
+    assert np.array_equal(by_class.command, quadsim.fly(hover, controller=local, progress=False).command)
+
+
+def test_a_law_from_a_file_flies_the_same(hover: Scenario, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(str(EXAMPLES))
+    law = importlib.import_module("my_controller").MyController
+    passed = quadsim.fly(hover, controller=law, progress=False)
+    named = quadsim.fly(passed.scenario, progress=False)  # its file alone says who flew
+    assert np.array_equal(passed.command, named.command)
+
+
+@pytest.mark.parametrize(
+    ("law", "message"),
+    [
+        (3.0, "a class, a function law"),
+        (functools.partial(Gentle, 0.5), "named arguments alone"),
+        (functools.partial(Gentle, shade=0.5), "takes no argument 'shade'; did you mean 'share'"),
+    ],
+)
+def test_what_is_no_law_is_refused(law: object, message: str, hover: Scenario) -> None:
+    with pytest.raises(InputError, match=message):
+        quadsim.fly(hover, controller=law, progress=False)
+
+
+def test_a_sweep_flies_every_combination(hover: Scenario) -> None:
+    found = quadsim.sweep(
+        hover,
+        {"controller.horizon": [20, 30], "vehicle.mass": np.array([4.0, 4.5, 5.0])},
+        workers=2,
+        progress=False,
+    )
+    assert len(found) == 6
+    assert found["controller.horizon"].tolist() == [20.0] * 3 + [30.0] * 3
+    assert found["vehicle.mass"].tolist() == [4.0, 4.5, 5.0] * 2
+    alone = quadsim.fly(hover.replace({"controller.horizon": 30, "vehicle.mass": 4.5}), progress=False)
+    assert found["rmse.z"][4] == alone.metrics["rmse.z"]
+    assert found.to_arrow().schema.field("rmse.z").metadata == {b"unit": b"m"}
+    with pytest.raises(UnknownNameError, match="no column named 'rmse'"):
+        found["rmse"]
+    with pytest.raises(ParameterError, match="a list of values to try"):
+        quadsim.sweep(hover, {"controller.horizon": []})
+    with pytest.raises(InputError, match="horizon"):
+        quadsim.sweep(hover, {"controller.horizon": [0]}, workers=1)
+
+
+def test_ones_own_law_is_sent_to_other_processes_by_its_place(
+    hover: Scenario, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    source = "import numpy as np\ndef steady(now, state, reference, speed=210.0):\n    return np.full(4, speed)\n"
+    (tmp_path / "my_laws.py").write_text(source)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    steady = importlib.import_module("my_laws").steady
+
+    def swept(law: object) -> list[float]:
+        found = quadsim.sweep(hover, {"vehicle.mass": [4.0, 5.0]}, controller=law, workers=1, progress=False)
+        assert found["reason"].tolist() == [None, None]
+        return found["speed_max"].tolist()
+
+    assert swept(steady) == [210.0, 210.0]
+    assert swept(functools.partial(steady, speed=190.0)) == [190.0, 190.0]
+
+    def local(now: Moment, state: Array, reference: Array) -> Array:
+        return np.zeros(4)
+
+    for law, message in ((local, "defined in a function"), (object(), "an object's state is not sent")):
+        with pytest.raises(ParameterError, match=message):
+            quadsim.sweep(hover, {"vehicle.mass": [4.0]}, controller=law, workers=1)
+
+
+def test_a_campaign_of_a_scenario_judges_requirements(hover: Scenario, tmp_path: Path) -> None:
+    mass = {"name": "mass", "fields": ["vehicle.mass"], "distribution": "uniform", "low": 4.0, "high": 4.4}
+    found = quadsim.campaign(
+        hover,
+        vary=[mass],
+        flights=4,
+        seed=7,
+        require=["P(lost) < 0.9 @ 50%"],
+        workers=1,
+        out=tmp_path / "c",
+        report=False,
+        progress=False,
+    )
+    assert found.table["draw.mass"].to_numpy().min() >= 4.0
+    assert [judgement.holds for judgement in found.judgements] == [True]
+    assert found.directory == tmp_path / "c"
+    with pytest.raises(InputError, match=r"vary\.mass"):
+        quadsim.campaign(hover, vary=[mass | {"low": -1.0}], flights=2, out=tmp_path / "d")
+    with pytest.raises(InputError, match="go with a scenario"):
+        quadsim.campaign("paper-nominal", vary=[mass])
+
+
+def test_flights_are_compared(hover: Scenario, flight: Flight, tmp_path: Path) -> None:
+    other = quadsim.fly(hover, progress=False)
+    found = quadsim.compare(flight, other, progress=False)
+    assert found.names == ("paper-constrained", "hover")
+    assert found.page is None
+    assert found.to_markdown().startswith("|")
+    saved = other.save(tmp_path / "hover", video=False, recording=False)
+    page = quadsim.compare(saved, out=tmp_path / "page", cost=False, progress=False).page
+    assert page == tmp_path / "page" / "index.html"
+    assert "hover" in page.read_text()
+
+
+def test_ctrl_c_ends_a_flight_in_order() -> None:
+    scenario = quadsim.load("hover").replace({"duration": 600.0})
+    timer = threading.Timer(0.5, os.kill, (os.getpid(), signal.SIGINT))
+    timer.start()
+    flown = quadsim.fly(scenario, progress=False)
+    timer.join()
+    assert flown.log.interrupted
+    assert 0.0 < flown.time[-1] < 599.0
+    assert flown.outcome == "lost"
+
+
+def test_a_script_without_a_terminal_sees_no_progress() -> None:
+    code = "import quadsim; quadsim.fly(quadsim.load('hover').replace({'duration': 1.0}))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert (done.stdout, done.stderr) == ("", "")
+
+
+def test_controllers_fly_without_a_simulator() -> None:
+    vehicle = quadsim.make_controller("paper-constrained")
+    assert vehicle.name == "constrained"
+    problem = mpc.Problem(
+        model=mpc.hover_model(quadsim.load_vehicle("hummingbird"), 0.05),
+        horizon=10,
+        objective=mpc.Objective(C_r=np.eye(12)[:1], Q_y=np.eye(1), Q_u=np.eye(4)),
+    )
+    law = mpc.UnconstrainedMPC(problem)
+    law.reset(np.zeros(4))
+    assert law.step(Moment(), np.zeros(12), np.zeros((10, 4))).speeds.shape == (4,)
+    assert mpc.paper.__name__ == "mpc.paper"
+    assert mpc.baselines.__name__ == "mpc.baselines"
