@@ -7,7 +7,9 @@ import json
 import math
 import re
 import tomllib
+from collections.abc import Callable
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,13 +18,16 @@ import pytest
 
 from mpc.diagnosis import find_conflict
 from mpc.fallback.contract import Guarded
+from mpc.fallback.settings import FallbackSettings
 from mpc.ocp import Unanswered
 from quadsim.controller import ACCEPTED, Controller, Moment
 from quadsim.errors import PlanExhaustedError
+from quadsim.flight import metrics
 from quadsim.state import INDEX, Array, make_state
 from quadsim.vehicle import Vehicle
 from scenarios.build import build_controller
 from scenarios.diagnosis import diagnose
+from scenarios.flight import Flight
 from scenarios.loading import load_scenario, scenario_path
 from scenarios.parts.vehicle import build_vehicle
 from scenarios.schema.scenario import Scenario
@@ -341,3 +346,16 @@ def test_the_words_of_the_file(file: str) -> None:
     assert "slew of rotors 2, 4 lower; slew of rotors 2, 4 upper" in found["sentence"]
     assert 'controller.type = "robust", controller.soft = {} (without the field solver)' in found["advice"]
     assert "controller.fallback = {} (level hover; an answer again after 0.20 s, by the model)" in found["advice"]
+
+
+def test_the_example_of_the_documentation_is_what_a_flight_says(fly_once: Callable[..., Flight]) -> None:
+    found = fly_once("paper-constrained-lag20").diagnosis
+    assert found is not None
+    text = (Path(__file__).resolve().parents[2] / "docs" / "controllers.md").read_text(encoding="utf-8")
+    said, advised = re.findall(r"```text\n(no answer .*)\n(to try: .*); \.\.\.\n```", text)[0]
+    assert found["sentence"] == said
+    assert found["advice"].startswith(advised)
+
+
+def test_fallback_counts_as_for_good_from_the_longest_time_on_one_shifted_plan() -> None:
+    assert FallbackSettings().plan_age == metrics.UNRECOVERED
