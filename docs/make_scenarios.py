@@ -92,8 +92,8 @@ def page(flights: dict[str, Flight]) -> str:
         "what each shows and with what numbers.\n",
         "The verdict is *satisfied* (flown to its end, every required constraint holds), *violated* (one does not, the "
         "vehicle\ncrashes, or the controller ends in [fallback for good](controllers.md#fallback)) or *lost* (the "
-        "flight ends early). Each file states\nit, and a test flies them all; those that are not satisfied are meant not "
-        "to be.\n",
+        "flight ends early). Each file states\nit, and a test flies them all; those that are not satisfied are meant "
+        "not to be.\n",
         "A flight is lost when its controller gives up or answers with no command, when the simulation diverges, or "
         "when the true\nstate is beyond a criterion of `[lost]` at a control sample: looked at once per period, until "
         "the vehicle has crashed, which is\n*violated*. Every scenario has these criteria, and `false` switches one "
