@@ -78,9 +78,10 @@ def page(flights: dict[str, Flight]) -> str:
         f"{count} scenarios ship. `quadsim run NAME` flies one; `quadsim scenario NAME` prints its whole file with "
         "comments, to start your\nown from; the files, in `scenarios/library`, say in a comment "
         "what each shows and with what numbers.\n",
-        "The verdict is *satisfied* (flown to its end, every required constraint holds), *violated* (one does not) or "
-        "*lost* (the\nflight ends early). Each file states it, and a test flies them all; those that are not "
-        "satisfied are meant not to be.\n",
+        "The verdict is *satisfied* (flown to its end, every required constraint holds), *violated* (one does not, the "
+        "vehicle\ncrashes, or the controller ends in [fallback for good](controllers.md#fallback)) or *lost* (the "
+        "flight ends early). Each file states\nit, and a test flies them all; those that are not satisfied are meant "
+        "not to be.\n",
         "A flight is lost when its controller gives up or answers with no command, when the simulation diverges, or "
         "when the true\nstate is beyond a criterion of `[lost]` at a control sample: looked at once per period, until "
         "the vehicle has crashed, which is\n*violated*. Every scenario has these criteria, and `false` switches one "

@@ -8,9 +8,9 @@ import numpy as np
 
 from mpc.answer import ActuatorBounds, command_of, rejection, shifted
 from mpc.exact.shortcut import with_shortcut
-from mpc.ocp import Problem
+from mpc.ocp import Problem, Query, Unanswered
 from mpc.paper.prediction import rollout
-from mpc.solvers import Answer, Solver, Way
+from mpc.solvers import INVALID_DATA, Answer, Solver, Way
 from quadsim.controller import GROUNDED, Command, Moment, Phase, stopped
 from quadsim.errors import PlanExhaustedError
 from quadsim.state import Array
@@ -24,6 +24,10 @@ class ConstrainedMPC:
     bounds is used.  Otherwise the previous plan, shifted by one step, is held (fallback level 1) for as long as it
     lasts, and then the flight is given up.  `shortcut`: whether to try less than the whole QP first
     (`mpc.exact.shortcut`); the commands are the same.
+
+    Attributes:
+        problem: as given.
+        unanswered: the first period since `reset` whose QP had no answer; None where all had.
     """
 
     name: Final = "constrained"
@@ -34,10 +38,12 @@ class ConstrainedMPC:
         self._solver = with_shortcut(problem, solver) if shortcut else solver
         self._bounds = ActuatorBounds.of_problem(problem)
         self._before, self._plan, self._held = problem.model.u_bar, None, 0
+        self.unanswered: Unanswered | None = None
 
     def reset(self, speeds: Array) -> None:
         """Start anew after the command u(-1) (4,) [rad/s]."""
         self._before, self._plan, self._held = np.array(speeds, float), None, 0
+        self.unanswered = None
         self._solver.reset()
 
     def step(self, now: Moment, state: Array, reference: Array) -> Command:
@@ -52,9 +58,9 @@ class ConstrainedMPC:
             self._before = now.acting
         if now.phase in GROUNDED:
             return self._stop(now.phase)
-        desired = self.problem.objective.desired(reference)
-        answer = self._solver.solve(state, desired, self._before)
-        return self._take(answer) if answer.way is Way.FREE else self._follow(now.time, answer)
+        query = Query(state, self.problem.objective.desired(reference), self._before)
+        answer = self._solver.solve(query.state, query.desired, query.u_before)
+        return self._take(answer) if answer.way is Way.FREE else self._follow(now.time, query, answer)
 
     def predict(self, states: Array, plans: Array) -> Array:
         """See `quadsim.controller.Controller.predict`."""
@@ -71,8 +77,10 @@ class ConstrainedMPC:
         solution = answer.solution
         return Command(speeds=answer.plan[0].copy(), plan=answer.plan, status=solution.status, solve_s=solution.solve_s)
 
-    def _follow(self, time: float, answer: Answer) -> Command:
+    def _follow(self, time: float, query: Query, answer: Answer) -> Command:
         problem = rejection(answer.solution.status, answer.plan[0], answer.plan, self._bounds, self._before)
+        if problem not in (None, INVALID_DATA) and self.unanswered is None:
+            self.unanswered = Unanswered(problem=self.problem, query=query, status=problem, time=time)
         if problem is None:
             self._plan, self._held = answer.plan, 0
         elif self._plan is None or self._held + 1 >= self.horizon:

@@ -116,7 +116,7 @@ class Problem:
             _check_shape("u_min", self.bounds.u_min, (nu,))
             if self.bounds.margins is not None:
                 _check_shape("margins", self.bounds.margins, (self.horizon, self.bounds.y_min.size))
-        for constraint in self._all:
+        for constraint in self.every_constraint:
             m = constraint.lower.shape[-1]
             for name, matrix, columns in (("C", constraint.C, n), ("D", constraint.D, nu), ("E", constraint.E, nu)):
                 if matrix is not None:
@@ -130,7 +130,8 @@ class Problem:
         return Rest(np.zeros(self.model.n), self.model.u_bar)
 
     @property
-    def _all(self) -> tuple[Constraint, ...]:
+    def every_constraint(self) -> tuple[Constraint, ...]:
+        """The paper's, in the order of `Bounds.constraints`, and then the others."""
         return (*(self.bounds.constraints if self.bounds else ()), *self.constraints)
 
     @cached_property
@@ -140,10 +141,11 @@ class Problem:
         Raises:
             ValueError: there are none.
         """
-        if not self._all:
+        constraints = self.every_constraint
+        if not constraints:
             raise ValueError("a constrained MPC needs a problem with bounds")
         N, n, nu = self.horizon, self.model.n, self.model.nu
-        parts = [(part, part.lower.shape[-1]) for part in self._all]
+        parts = [(part, part.lower.shape[-1]) for part in constraints]
         C, D, E = (
             np.concatenate([np.zeros((m, size)) if (M := getattr(part, name)) is None else M for part, m in parts])
             for name, size in (("C", n), ("D", nu), ("E", nu))
@@ -169,6 +171,47 @@ class Problem:
             input=np.where(np.isinf(l1) & of_input, np.argmax(D, axis=1), -1)[bounded],
             names=tuple(names[i] for i in bounded),
         )
+
+
+class Query(NamedTuple):
+    """What a problem is solved for in one period.
+
+    Attributes:
+        state: (n,) x(k).
+        desired: (N, n_r) y_d for x(k+1) .. x(k+N).
+        u_before: (nu,) u(k-1) [rad/s].
+        rest: where the model rests; None for the problem's.
+        steps: A_i (N, n, n), B_i (N, n, nu), c_i (N, n) of a model that changes; None for the problem's about `rest`.
+    """
+
+    state: Array
+    desired: Array
+    u_before: Array
+    rest: Rest | None = None
+    steps: tuple[Array, Array, Array] | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Unanswered:
+    """The first problem of a flight that had no answer; `mpc.diagnosis` says why.
+
+    Attributes:
+        problem: what was to be solved.
+        query: for what; its state and input are copied.
+        status: what spoke against the answer.
+        time: t_k, the period's begin [s].
+        delay: from there to the instant of x(k) [s].
+    """
+
+    problem: Problem
+    query: Query
+    status: str
+    time: float
+    delay: float = 0.0
+
+    def __post_init__(self) -> None:
+        query = self.query
+        object.__setattr__(self, "query", query._replace(state=query.state.copy(), u_before=query.u_before.copy()))
 
 
 def _check_shape(name: str, value: Array, shape: tuple[int, ...]) -> None:

@@ -36,6 +36,8 @@ from scenarios.schema.scenario import Scenario, Verdict
 if TYPE_CHECKING:
     import pyarrow as pa
 
+    from mpc.ocp import Unanswered
+
 
 @dataclass(frozen=True, kw_only=True)
 class Outputs:
@@ -76,6 +78,7 @@ class Flight:
         tallies: what became of each sensor's samples in the estimator; empty without one.
         directory: where it was read from; None for one that was flown.
         recorded: `summary.json` of one that was read; None for one that was flown.
+        unanswered: the first period whose QP had no answer; None where all had, there is no QP, or it was read.
 
     Examples:
         >>> import quadsim
@@ -96,12 +99,17 @@ class Flight:
     tallies: Mapping[SensorName, Tally] = field(repr=False)
     directory: Path | None = None
     recorded: Mapping[str, Any] | None = field(default=None, repr=False)
+    unanswered: Unanswered | None = field(default=None, repr=False)
 
     @property
     def satisfied(self) -> bool:
-        """Whether the flight was completed without a crash, and every required constraint held."""
+        """Whether the flight was completed, without a crash or fallback for good, and every required constraint held.
+
+        What fallback for good is: `quadsim.flight.metrics.unrecovered`.
+        """
         whole = self.log.reason is None and not self.log.control.crashed
-        return whole and all(finding.satisfied for finding in self.findings if finding.limit.required)
+        held = all(finding.satisfied for finding in self.findings if finding.limit.required)
+        return whole and held and not metrics.unrecovered(self.log.control)
 
     @property
     def outcome(self) -> Verdict:
@@ -109,6 +117,18 @@ class Flight:
         if self.log.reason is not None:
             return "lost"
         return "satisfied" if self.satisfied else "violated"
+
+    @cached_property
+    def diagnosis(self) -> Mapping[str, Any] | None:
+        """Why the first QP without an answer had none, and what would help; None where all QPs had one.
+
+        `sentence` and `advice` are for people; the other entries are explained in `docs/controllers.md`.
+        """
+        if self.recorded is not None:
+            return self.recorded.get("diagnosis")
+        from scenarios.diagnosis import diagnose
+
+        return None if self.unanswered is None else diagnose(self.unanswered, self.scenario, self.vehicle)
 
     @property
     def audit(self) -> tuple[Finding, ...]:
@@ -353,6 +373,7 @@ def summarise(flight: Flight) -> dict[str, Any]:
         "tracking": numbers["tracking"],
         "constraints": [rundir.limit_to_json(finding) for finding in flight.findings],
         "control": numbers["control"],
+        "diagnosis": flight.diagnosis,
         "controller": {
             "name": flight.controller,
             "solver": flight.solver,

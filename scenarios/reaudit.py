@@ -17,7 +17,7 @@ from typing import Any, Final
 import numpy as np
 
 from quadsim.errors import FileError, InputError, printable
-from quadsim.flight import rundir
+from quadsim.flight import metrics, rundir
 from quadsim.flight.audit import Finding, audit
 from quadsim.flight.log import FlightLog
 from quadsim.flight.parquet import FLIGHT_FILE, HORIZON_FILE, PLANT_FILE, TIMING_FILE
@@ -92,6 +92,7 @@ def reaudit(directory: Path, *, products: bool = True) -> Reaudit:
         shown = ", ".join(others[:MOST_SAID]) + (" ..." if len(others) > MOST_SAID else "")
         notes.append(f"not of this run: {printable(shown)}")
     whole = summary["reason"] is None and log.control.t.size == scenario.periods and not log.control.crashed
+    whole = whole and not metrics.unrecovered(log.control)
     return Reaudit(
         summary=summary,
         findings=findings,
@@ -167,7 +168,11 @@ def _differences(
     for entry, finding in zip(entries, findings, strict=True):
         yield from (f"{finding.limit.name}: {what}" for what in _constraint_differences(entry, finding, scenario, log))
     required = all(entry["satisfied"] for entry in entries if entry["required"])
-    satisfied = summary["reason"] is None and not log.control.crashed and required
+    unrecovered = metrics.unrecovered(log.control)
+    if summary["tracking"] and summary["controller"].get("unrecovered", 0) != unrecovered:
+        recorded = summary["controller"].get("unrecovered", 0)
+        yield f"controller.unrecovered is recorded as {recorded}, and the tables give {unrecovered}"
+    satisfied = summary["reason"] is None and not log.control.crashed and not unrecovered and required
     if summary["satisfied"] != satisfied:
         yield f"satisfied is recorded as {summary['satisfied']}, and its audit and outcome make it {satisfied}"
     outcome = "lost" if summary["reason"] is not None else "satisfied" if satisfied else "violated"

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from threadpoolctl import threadpool_limits
 
+from mpc.ocp import Unanswered
 from quadsim.controller import Controller
 from quadsim.flight import rundir
 from quadsim.flight.audit import audit
@@ -105,6 +106,7 @@ def fly_scenario(
                 progress=lambda done: progress("flight", done, scenario.periods),
             )
             simulate_s = clock.perf_counter() - started
+    unanswered = getattr(controller, "unanswered", None)  # a controller of another kind has none
     return Flight(
         scenario=resolve(scenario, vehicle),
         vehicle=vehicle,
@@ -114,6 +116,7 @@ def fly_scenario(
         solver=controller.solver,
         simulate_s=simulate_s,
         tallies={} if navigation is None else navigation.tallies,
+        unanswered=unanswered if isinstance(unanswered, Unanswered) else None,
     )
 
 

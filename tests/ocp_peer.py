@@ -7,11 +7,12 @@ what unit inputs do.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
 
 import numpy as np
 import scipy.linalg
+from scipy.optimize import linprog
 
 from mpc.constraints import Constraint
 from mpc.ocp import Problem, Rest
@@ -152,6 +153,44 @@ def dense_qp(problem: Problem, given: Period) -> QP:
         x_l=np.concatenate([np.full(N * nu, -math.inf), np.zeros(n_s)]),
         x_u=np.full(N * nu + n_s, math.inf),
     )
+
+
+def least_violation(
+    problem: Problem, given: Period, sides: Collection[tuple[int, int, bool]] | None = None
+) -> float | None:
+    """The smallest sum of violations of hard constraints on states, each over half of what lies between its bounds.
+
+    None where bounds on inputs cannot hold by themselves.  Of the bounds, by constraint, row and whether upper, those
+    given alone are there, or all.
+    """
+    N, nu = given.B.shape[0], given.B.shape[2]
+    rows: list[Array] = []
+    bounds: list[Array] = []
+    weights: list[Array] = []
+    for place, part in enumerate(constraints(problem)):
+        if part.penalty is not None:
+            continue
+        slopes, known = _probed(lambda plan, part=part: values(part, given, plan).ravel(), N, nu)  # type: ignore[misc]
+        m = part.lower.shape[-1]
+        lower, upper = (np.broadcast_to(side, (N, m)) for side in (part.lower, part.upper))
+        free = part.C is not None and bool(part.C.any())
+        for i, j in np.ndindex(N, m):
+            half = 0.5 * max(upper[:, j] - lower[:, j])
+            size = max((abs(b) for b in (lower[0, j], upper[0, j]) if math.isfinite(b)), default=1.0) or 1.0
+            for sign, bound in ((1.0, upper[i, j]), (-1.0, -lower[i, j])):
+                if math.isfinite(bound) and (sides is None or (place, j, sign > 0.0) in sides):
+                    rows.append(sign * slopes[i * m + j])
+                    bounds.append(bound - sign * known[i * m + j])
+                    weights.append((half if math.isfinite(half) else size) if free else 0.0)
+    slack = np.diag(weights)[:, np.flatnonzero(weights)]
+    found = linprog(
+        np.concatenate([np.zeros(N * nu), np.ones(slack.shape[1])]),
+        A_ub=np.hstack([rows, -slack]),
+        b_ub=bounds,
+        bounds=[(None, None)] * (N * nu) + [(0.0, None)] * slack.shape[1],
+        method="highs-ipm",
+    )
+    return None if found.status else float(found.fun)
 
 
 @dataclass(frozen=True, kw_only=True)

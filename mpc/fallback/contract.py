@@ -33,6 +33,7 @@ from mpc.fallback.settings import USUAL_TILT
 from mpc.fallback.settings import FallbackSettings as FallbackSettings
 from mpc.heading import anchored, predict_in_heading_frame
 from mpc.model import LinearModel
+from mpc.ocp import Unanswered
 from quadsim.controller import ACCEPTED, GROUNDED, Command, Controller, Moment, Phase, check_command, stopped
 from quadsim.errors import FlightError
 from quadsim.state import INDEX, N_STATES, POSITION, REFERENCE_STATES, Array
@@ -125,6 +126,12 @@ class Guarded:
         except FAILURES:
             trim = None
         return trim if isinstance(trim, Trim) else self._level
+
+    @property
+    def unanswered(self) -> Unanswered | None:
+        """The first period since `reset` whose QP had no answer; None where all had, or there is no QP."""
+        found = getattr(self.inner, "unanswered", None)
+        return found if isinstance(found, Unanswered) else None
 
     def predict(self, states: Array, plans: Array) -> Array:
         """See `quadsim.controller.Controller.predict`; by the hover model where the inner controller cannot."""

@@ -34,13 +34,13 @@ from mpc.heading import (
 from mpc.model import LinearModel, continuous_model, discretise, hover_model
 from mpc.nonlinear.linearise import linearise
 from mpc.nonlinear.model import NonlinearModel, advance, nonlinear_model, spun
-from mpc.ocp import Objective, Problem, Rest, lqr_terminal_weight
+from mpc.ocp import Objective, Problem, Query, Rest, Unanswered, lqr_terminal_weight
 from mpc.robust.observer import DisturbanceObserver, thrust_axis
 from mpc.robust.observer import ObserverSettings as ObserverSettings
 from mpc.robust.relinearised import Relinearised
 from mpc.robust.settings import Linearisation as Linearisation
 from mpc.robust.settings import RobustSettings as RobustSettings
-from mpc.solvers import Answer, QPSolver
+from mpc.solvers import INVALID_DATA, Answer, QPSolver
 from quadsim.controller import GROUNDED, Command, Moment, Phase, stopped
 from quadsim.errors import ParameterError
 from quadsim.state import EULER, EULER_RATE, INDEX, N_STATES, REFERENCE_STATES, VELOCITY, Array
@@ -62,7 +62,9 @@ class RobustMPC:
     `mpc.fallback.contract.Guarded` to act on.  Objective, bounds and constraints are for the paper's 12 states.
 
     Attributes:
+        problem: the optimisation, its states perhaps with the rotor speeds.
         trim: what holds the vehicle at rest against the disturbance that is estimated.
+        unanswered: the first period since `reset` whose QP had no answer; None where all had.
 
     Raises:
         ParameterError: a number or a shape is not possible.
@@ -90,7 +92,7 @@ class RobustMPC:
         self._model = nonlinear_model(vehicle, period, rotor_lag=settings.rotor_lag or None)
         self._inverse = np.linalg.inv(slope(self._nominal))
         self._objective = objective
-        problem = self._problem(objective, bounds, constraints)
+        self.problem = problem = self._problem(objective, bounds, constraints)
         self._actuators = ActuatorBounds.of_problem(problem)
         if settings.linearisation is Linearisation.HOVER:
             whole = QPSolver(SOLVER, problem)
@@ -123,6 +125,7 @@ class RobustMPC:
         self._rotors = self._acting.copy()
         self._ahead: Array | None = None
         self._asked = self._measured = -math.inf
+        self.unanswered: Unanswered | None = None
         if self.settings.linearisation is Linearisation.HOVER:
             self._solver.reset()
         else:
@@ -148,7 +151,7 @@ class RobustMPC:
         if now.phase in GROUNDED:
             return self._stop(now.phase)
         if not ((np.abs(state) <= PLAUSIBLE).all() and (np.abs(reference) <= PLAUSIBLE[_REFERENCE]).all()):
-            return self._refuse("invalid_data")
+            return self._refuse(INVALID_DATA)
         if ahead is None or abs(now.time - asked - self._period) > _SAME_TIME:
             self._measured = -math.inf
         span = self._span(now)
@@ -159,12 +162,17 @@ class RobustMPC:
                 self._believe()
         x0 = self._after(self.settings.delay, state, rotors)
         if not np.isfinite(x0).all():
-            return self._refuse("invalid_data")
+            return self._refuse(INVALID_DATA)
         if now.phase is Phase.FLYING:  # before, the ground holds the vehicle, which is nothing to learn from
             self._ahead = x0
-        answer = self._solve(np.concatenate([x0, self._rotors])[: self._model.n], self._later(reference))
+        query = self._query(np.concatenate([x0, self._rotors])[: self._model.n], self._later(reference))
+        answer = self._solve(query)
         problem = rejection(answer.solution.status, answer.plan[0], answer.plan, self._actuators, self._acting)
         if problem is not None:
+            if problem != INVALID_DATA and self.unanswered is None:
+                self.unanswered = Unanswered(
+                    problem=self.problem, query=query, status=problem, time=now.time, delay=self.settings.delay
+                )
             return self._refuse(problem, answer)
         plan = answer.plan.copy()
         self._acting = plan[0] = self._actuators.clip(plan[0], self._acting)
@@ -245,11 +253,18 @@ class RobustMPC:
         later = np.concatenate([reference[1:], reference[-1:]])
         return reference + self.settings.delay / self._period * (later - reference)
 
-    def _solve(self, x0: Array, reference: Array) -> Answer:
+    def _solve(self, query: Query) -> Answer:
+        if query.steps is None:
+            return self._solver.solve(query.state, query.desired, query.u_before, query.rest)
+        assert query.rest is not None
+        return self._relinearised.solve(*query.steps, query.state, query.desired, query.u_before, query.rest.u)
+
+    def _query(self, x0: Array, reference: Array) -> Query:
         yaw = float(x0[_YAW])
         if self.settings.linearisation is not Linearisation.HOVER:
             desired = self._objective.desired(with_nearest_yaw(reference, yaw, self.settings.largest_turn))
-            return self._relinearised.solve(*self._along_plan(x0), x0, desired, self._acting, self.trim.speeds)
+            rest = Rest(np.zeros_like(x0), self.trim.speeds)
+            return Query(x0, desired, self._acting, rest, self._along_plan(x0))
         if not self.settings.heading:
             yaw = 0.0
         else:
@@ -259,8 +274,7 @@ class RobustMPC:
         u_s = self._balanced()
         x_s = self.trim.state(yaw, self._model.n)
         x_s[N_STATES:] = u_s[: self._model.n - N_STATES]
-        desired = self._objective.desired(seen_from(reference, yaw))
-        return self._solver.solve(x0, desired, self._acting, Rest(x_s, u_s))
+        return Query(x0, self._objective.desired(seen_from(reference, yaw)), self._acting, Rest(x_s, u_s))
 
     def _balanced(self) -> Array:
         """(4,) speeds at rest [rad/s] that also balance what thrust twists now, which the hover matrices leave out."""

@@ -99,6 +99,10 @@ SOLVERS: Final = {
 }
 
 
+INVALID_DATA: Final = "invalid_data"
+"""Status of a query with numbers that no back end is asked about."""
+
+
 def make_backend(name: str) -> Backend:
     """A fresh back end of a named solver.
 
@@ -193,7 +197,7 @@ def refusal(qp: QP) -> Solution:
         y=np.full_like(qp.b, math.nan),
         z=np.full_like(qp.h_l, math.nan),
         z_box=np.full_like(qp.c, math.nan),
-        status="invalid_data",
+        status=INVALID_DATA,
         iterations=0,
         active=0,
         primal_residual=math.nan,

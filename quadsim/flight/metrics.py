@@ -18,6 +18,10 @@ from quadsim.state import INDEX, REFERENCE_NAMES, REFERENCE_STATES, REFERENCE_UN
 SETTLING_BAND: Final = 0.05
 """Half width of the band an output has to stay in to be settled, as a share of the step."""
 
+UNRECOVERED: Final = 1.0
+"""Time that a flight has to be in fallback at its end for that to count as for good [s]: the longest that one shifted
+plan is held, unless a scenario says otherwise."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class CourseStep:
@@ -116,7 +120,7 @@ def percentiles(values: Array) -> dict[str, float]:
 
 
 def controller(log: ControlLog, timing: TimingLog, deadline_ms: float) -> dict[str, Any]:
-    """Counts of solver statuses and fallbacks, iterations, residuals, and times against the deadline [ms].
+    """Counts of statuses and fallbacks, `unrecovered`, iterations, residuals, times against the deadline [ms].
 
     Residuals are those of the periods whose optimum was found: a back end that gave up may report none, or infinite
     ones.
@@ -125,6 +129,7 @@ def controller(log: ControlLog, timing: TimingLog, deadline_ms: float) -> dict[s
     return {
         "statuses": dict(sorted(Counter(log.status).items())),
         "fallbacks": {str(level): count for level, count in sorted(Counter(log.fallback.tolist()).items())},
+        "unrecovered": unrecovered(log),
         "iterations": {"mean": float(log.iterations.mean()), "max": int(log.iterations.max())},
         "active_max": int(log.active.max()),
         "active_periods": int(np.count_nonzero(log.active)),
@@ -137,6 +142,17 @@ def controller(log: ControlLog, timing: TimingLog, deadline_ms: float) -> dict[s
         "deadline_ms": deadline_ms,
         "deadline_misses": int(np.count_nonzero(timing.step_ms > deadline_ms)),
     }
+
+
+def unrecovered(log: ControlLog) -> int:
+    """Periods in fallback up to the flight's end, from which it never recovered; 0 where they last too short to tell.
+
+    They count from `UNRECOVERED` on, or where the whole flight was in fallback.
+    """
+    good = np.flatnonzero(log.fallback == 0)
+    periods = log.t.size - (int(good[-1]) + 1 if good.size else 0)
+    period = float(log.t[1] - log.t[0]) if log.t.size > 1 else math.inf
+    return periods if periods and (not good.size or periods * period >= UNRECOVERED - 1e-9) else 0
 
 
 def computation(log: ControlLog) -> dict[str, Any]:

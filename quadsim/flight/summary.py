@@ -39,7 +39,7 @@ _FLOWN: Final = {
         "statuses": Each(int),
         "fallbacks": Each(int),
         "iterations": {"mean": NUMBER, "max": int},
-        **dict.fromkeys(("active_max", "active_periods"), Optional(int)),
+        **dict.fromkeys(("active_max", "active_periods", "unrecovered"), Optional(int)),
         "residual_max": Optional({"primal": MAYBE_NUMBER, "dual": MAYBE_NUMBER}),
         "solve_ms": _SPREAD,
         "step_ms": _SPREAD,
@@ -72,6 +72,20 @@ _VEHICLE: Final = {
     ),
     "body_drag": Optional(([NUMBER], type(None))),
 }
+_DIAGNOSIS: Final = {
+    "time": NUMBER,
+    "feasible": (bool, type(None)),
+    **dict.fromkeys(("status", "sentence", "advice"), str),
+    "conflict": [
+        {
+            **dict.fromkeys(("name", "side", "unit", "field"), str),
+            "rotors": [int],
+            "by": NUMBER,
+            **dict.fromkeys(("start", "stop"), MAYBE_NUMBER),
+        }
+    ],
+    "suggestions": [{"settings": dict, "after": MAYBE_NUMBER}],
+}
 _TOUCHDOWN: Final = dict.fromkeys(("time", "speed", "horizontal_speed", "tilt"), NUMBER)
 FORM: Final = {
     **dict.fromkeys(("scenario", "status"), str),
@@ -86,6 +100,7 @@ FORM: Final = {
     "constraints": [_CONSTRAINT],
     "control": dict,
     "controller": _LAW,
+    "diagnosis": Optional((_DIAGNOSIS, type(None))),
     "computation": Optional({"delay_ms": _SPREAD, "missed": int}),
     "estimation": Optional(
         {

@@ -18,6 +18,13 @@ from quadsim.flight.rundir import Run
 from quadsim.report.table import ABSENT, Cell, Mark, Row, format_number
 
 Summary = Mapping[str, Any]
+_VERDICTS: Final = {
+    "satisfied": "holds every required constraint",
+    "violated": "does not hold every required constraint",
+    "lost": "is lost",
+}
+FOR_GOOD: Final = "ends in fallback for good"
+"""Of a flight whose verdict rests on that alone; see `quadsim.flight.metrics.unrecovered`."""
 _Line = tuple[str, str, Callable[[Summary], Cell]]
 """A row's label, its unit, and the cell of a summary."""
 
@@ -85,10 +92,34 @@ def outcome(summary: Summary) -> Cell:
 
 def verdict(summary: Summary) -> str:
     """The verdict on a flight in one word: satisfied, violated, or lost."""
-    if not is_completed(summary):
+    if summary["status"] != "completed":
         return "lost"
-    demanded = (entry for entry in summary["constraints"] if entry["required"])
-    return "satisfied" if all(entry["satisfied"] for entry in demanded) else "violated"
+    whole = not (summary["controller"].get("unrecovered") or nested(summary, "ground", "crashed"))
+    return "satisfied" if whole and _all_held(summary) else "violated"
+
+
+def verdict_sentence(summary: Summary) -> str:
+    """What the verdict rests on, after the name of the flight."""
+    found = verdict(summary)
+    if found == "violated" and _all_held(summary):
+        return FOR_GOOD if summary["controller"].get("unrecovered") else "crashes"
+    return _VERDICTS[found]
+
+
+def _all_held(summary: Summary) -> bool:
+    return all(entry["satisfied"] for entry in summary["constraints"] if entry["required"])
+
+
+def fallback_sentence(periods: int) -> str:
+    """That a flight ended in fallback, after so many periods of it."""
+    return f"{periods} periods in fallback, never recovered"
+
+
+def failure_sentences(summary: Summary) -> list[str]:
+    """What kept the controller from its optimum: fallback for good, and why the first QP without an answer had none."""
+    periods, found = summary["controller"].get("unrecovered"), summary.get("diagnosis")
+    sentences = [fallback_sentence(periods)] if periods else []
+    return sentences + ([] if found is None else [found["sentence"], *filter(None, [found["advice"]])])
 
 
 def verdict_cell(summary: Summary) -> Cell:
@@ -331,6 +362,7 @@ _COMMANDS: Final[tuple[_Line, ...]] = (
 _SOLVER: Final[tuple[_Line, ...]] = (
     ("statuses", "", _counts("statuses")),
     ("periods by fallback level", "", _counts("fallbacks")),
+    ("in fallback for good", "", _number("controller", "unrecovered")),
     ("iterations, mean", "", _number("controller", "iterations", "mean")),
     ("iterations, most", "", _number("controller", "iterations", "max")),
     ("active constraints, most", "", _number("controller", "active_max")),

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from typing import Final
 
 from quadsim.flight.rundir import Run
 from quadsim.report.comparison import (
     Summary,
     distinct_courses,
+    failure_sentences,
     format_bounds,
     format_excess,
     is_completed,
@@ -18,16 +18,11 @@ from quadsim.report.comparison import (
     run_names,
     tracking_values,
     verdict,
+    verdict_sentence,
 )
 from quadsim.report.table import format_number
 
 _Named = Sequence[tuple[str, Summary]]
-
-_VERDICTS: Final = {
-    "satisfied": "holds every required constraint",
-    "violated": "does not hold every required constraint",
-    "lost": "is lost",
-}
 
 
 def comparison_sentences(runs: Sequence[Run]) -> list[str]:
@@ -52,13 +47,16 @@ def _outcome_sentences(named: _Named) -> Iterator[str]:
 
 
 def condition_sentences(named: _Named) -> Iterator[str]:
-    """What was expected of each flight, and what it met: course, ground, measurement errors, delays of commands."""
+    """What was expected of each flight, why a QP had no answer, and what it met: course, ground, errors, delays."""
     for name, summary in named:
         found, expected = verdict(summary), summary.get("expected")
         if expected is not None and not summary.get("as_expected"):
-            yield f"{name} {_VERDICTS[found]}; its scenario states the verdict {expected}."
+            yield f"{name} {verdict_sentence(summary)}; its scenario states the verdict {expected}."
         elif expected is not None and found != "satisfied":
-            yield f"{name} {_VERDICTS[found]}, as its scenario states."
+            yield f"{name} {verdict_sentence(summary)}, as its scenario states."
+    for name, summary in named:
+        if parts := failure_sentences(summary):
+            yield f"{name}: {'; '.join(parts)}."
     courses: dict[str, list[str]] = {}
     for name, summary in named:
         if sentence := nested(summary, "course", "sentence"):

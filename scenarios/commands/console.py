@@ -16,6 +16,7 @@ from rich.text import Text
 
 from quadsim.controller import law_name
 from quadsim.errors import printable
+from quadsim.report.comparison import FOR_GOOD, failure_sentences, verdict_sentence
 from quadsim.report.table import Cell, Grid, Mark, Row
 from scenarios.progress import Progress, silent
 
@@ -77,8 +78,10 @@ def print_summary(summary: Mapping[str, Any], where: str | None) -> None:
         console.print(_tracking_table(summary["tracking"]))
     if summary["constraints"]:
         console.print(audit_table(summary["constraints"]))
-    for line in (*(_controller_lines(summary) if summary["tracking"] else ()), *_effect_lines(summary)):
+    for line in _controller_lines(summary) if summary["tracking"] else ():
         console.print(line)
+    for line in (*_effect_lines(summary), *failure_sentences(summary)):
+        console.print(line, soft_wrap=True)
     if "reaudit" in summary:
         again = summary["reaudit"]
         phrase = "as recorded" if again["satisfied"] == summary["satisfied"] else "its verdict is recorded alone"
@@ -114,6 +117,8 @@ def outcome(summary: Mapping[str, Any]) -> Text:
     if summary["status"] != "completed":
         return styled((f"aborted{remark}", colour), f": {summary['reason']}")
     verdict = "every required constraint holds" if summary["satisfied"] else "a required constraint does not hold"
+    if verdict_sentence(summary) == FOR_GOOD:
+        verdict = "but in fallback for good"
     return styled((f"completed, {verdict}{remark}", colour))
 
 

@@ -9,6 +9,7 @@ from xml.etree import ElementTree
 
 from quadsim.errors import printable
 from quadsim.outputs import writing_file
+from quadsim.report.comparison import failure_sentences
 
 
 def write_junit(summary: Mapping[str, Any], path: Path) -> None:
@@ -19,7 +20,9 @@ def write_junit(summary: Mapping[str, Any], path: Path) -> None:
     Raises:
         OutputError: the file cannot be written.
     """
-    cases = [("flight", summary["status"] == "completed", str(summary["reason"] or "completed"))]
+    said = "; ".join(filter(None, [summary["reason"] or "completed", *failure_sentences(summary)]))
+    whole = summary["status"] == "completed" and not summary["controller"].get("unrecovered")
+    cases = [("flight", whole, said)]
     cases += [
         (entry["name"], entry["satisfied"] or not entry["required"], _sentence(entry))
         for entry in summary["constraints"]

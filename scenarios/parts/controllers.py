@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
@@ -28,6 +28,9 @@ from scenarios.schema.controller import ConstrainedSpec, ControllerSpec, Unconst
 from scenarios.schema.optimisation import ANGLES, BoundedSpec, InputWeightsSpec, SoftSpec, WeightedSpec
 from scenarios.schema.plugin import PluginSpec
 from scenarios.schema.robust import RobustSpec
+
+if TYPE_CHECKING:
+    from mpc.robust.controller import RobustMPC
 
 FALLBACK_SHARE: Final = 0.8
 """Tilt of the fallback over the tightest bound on it: the controller finds a vehicle that it can take over."""
@@ -127,6 +130,17 @@ def make_controller(spec: ControllerSpec, vehicle: Vehicle, period: float) -> Co
             return build_plugin(spec, vehicle, period)
 
 
+def posed_problem(spec: BoundedSpec, vehicle: Vehicle, period: float) -> Problem:
+    """The optimisation that a law with bounds solves in each period.
+
+    Raises:
+        InputError: it cannot be made from these numbers.
+    """
+    if isinstance(spec, RobustSpec):
+        return _robust(spec.model_copy(update={"shortcut": False}), vehicle, period).problem
+    return make_problem(spec, vehicle, period)
+
+
 def guarded(
     law: Controller, spec: BoundedSpec, fallback: FallbackSettings, vehicle: Vehicle, period: float
 ) -> Controller:
@@ -158,7 +172,7 @@ def _unconstrained(problem: Problem) -> Controller:
         ) from error
 
 
-def _robust(spec: RobustSpec, vehicle: Vehicle, period: float) -> Controller:
+def _robust(spec: RobustSpec, vehicle: Vehicle, period: float) -> RobustMPC:
     from mpc.robust.controller import Linearisation, RobustMPC, RobustSettings
     from mpc.robust.tightening import margins
 

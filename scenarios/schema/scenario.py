@@ -131,8 +131,8 @@ class Scenario(Spec):
     expect: Verdict = Field(
         default="satisfied",
         description="its verdict, if all is right: satisfied (flown to its end, every required constraint holds), "
-        "violated (one does not, or the vehicle crashes), lost (the flight ends early, by a criterion of [lost] or "
-        "otherwise)",
+        "violated (one does not, the vehicle crashes, or the controller ends in fallback for good), lost (the flight "
+        "ends early, by a criterion of [lost] or otherwise)",
     )
     duration: Annotated[float, Field(gt=0.0, le=LONGEST_FLIGHT)] = Field(
         description="[s] simulated time, a whole number of control periods"

@@ -284,3 +284,61 @@ def test_what_a_run_records_is_what_its_tables_give(
         assert recorded is None or math.isnan(finding.worst_margin) or recorded <= finding.worst_margin + 1e-6
         if rate == 1000.0 and recorded is not None:
             assert recorded == finding.worst_margin
+
+
+STUCK = (
+    "controller.fallback={}",
+    'controller.polytopes=[{name = "left", of = ["x"], rows = [[1.0]], upper = [-0.5], required = false}]',
+    "controller.output_bounds.x=[-0.1, 0.1]",
+)
+
+
+@pytest.fixture(scope="module")
+def stuck(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A flight that holds every required constraint, and whose QP never has an answer."""
+    target = tmp_path_factory.mktemp("stuck") / "run"
+    options = [option for setting in STUCK for option in ("--set", setting)]
+    assert main(["run", "hover", *SHORT, *TABLES, *options, "--json", "--out", str(target)]) == EXIT_FAILED
+    return target
+
+
+def test_fallback_for_good_is_no_success_and_says_why(stuck: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    summary = rundir.read_summary(stuck)
+    assert all(entry["satisfied"] for entry in summary["constraints"] if entry["required"])
+    assert (summary["satisfied"], summary["as_expected"], summary["controller"]["unrecovered"]) == (False, False, 10)
+    assert main(["check", str(stuck), "--junit", str(stuck.parent / "verdicts.xml")]) == EXIT_FAILED
+    said = capsys.readouterr().out
+    assert "completed, but in fallback for good  0.50 s flown" in said
+    assert "10 periods in fallback, never recovered\n" in said
+    assert "cannot hold together: left upper at +0.05 s .. +2.50 s by " in said
+    assert "to try: controller." in said
+    assert 'message="completed; 10 periods in fallback, never recovered; no answer at t = 0.00 s' in (
+        stuck.parent / "verdicts.xml"
+    ).read_text(encoding="utf-8")
+    assert main(["check", str(stuck), "--json"]) == EXIT_FAILED
+    printed = json.loads(capsys.readouterr().out)
+    assert printed["diagnosis"] == summary["diagnosis"]
+    assert printed["diagnosis"]["conflict"][0]["name"] == "left"
+    assert printed["reaudit"]["satisfied"] is False
+
+
+def forgiven(summary: dict[str, Any]) -> None:
+    summary["satisfied"] = summary["as_expected"] = True
+    summary["controller"]["unrecovered"] = 0
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (forgiven, "controller.unrecovered is recorded as 0, and the tables give 10"),
+        (lambda summary: summary.update(satisfied=True), "satisfied is recorded as True"),
+    ],
+)
+def test_fallback_for_good_cannot_be_edited_away(
+    stuck: Path, tmp_path: Path, change: Change, message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = shutil.copytree(stuck, tmp_path / "run")
+    unseal(run)
+    rewrite(run, change)
+    assert main(["check", str(run)]) == EXIT_WRONG_INPUT
+    assert message in capsys.readouterr().err

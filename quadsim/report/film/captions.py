@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import textwrap
 from collections.abc import Callable, Sequence
 from typing import Final
 
@@ -12,6 +13,7 @@ from PIL import Image
 from quadsim.controller import ACCEPTED, Phase, law_name
 from quadsim.flight.audit import Limit
 from quadsim.flight.rundir import Run
+from quadsim.report.comparison import failure_sentences
 from quadsim.report.film.frames import Footage, MarginTrack
 from quadsim.report.film.painter import (
     AMBER,
@@ -41,6 +43,12 @@ _MAP: Final = (236, 190)
 """Width and height of the map, in design pixels."""
 _COMPACT_MAP: Final = (180, 150)
 _MOST_MARGINS: Final = 6
+
+
+_LAST: Final = 1.0
+"""Time at a film's end [s] in which it says why a QP had no answer, or that the flight stayed in fallback."""
+_WIDEST: Final = 140
+"""Letters of a line of that, between the frame's edge and the map."""
 
 
 class Overlay:
@@ -110,6 +118,9 @@ class Overlay:
         reason = self._run.log.reason
         if reason is not None and time >= control.t[-1]:
             lines.append((f"aborted {reason}"[:130], 15, RED))
+        if time >= self._footage.times[-1] - _LAST:
+            for sentence in failure_sentences(self._run.summary):
+                lines += [(part, 14, AMBER) for part in textwrap.wrap(sentence, _WIDEST)]
         return lines
 
     def _answer(self, k: int) -> tuple[str, float, Colour]:

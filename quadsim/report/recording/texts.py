@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from quadsim.controller import ACCEPTED, Phase
+from quadsim.flight.metrics import unrecovered
 from quadsim.flight.rundir import Run
-from quadsim.report.comparison import tracking_values
+from quadsim.report.comparison import fallback_sentence, tracking_values
 from quadsim.report.narrative import condition_sentences
 from quadsim.report.recording.style import time_column
 from quadsim.state import Array
@@ -29,6 +30,7 @@ def send_texts(recording: rr.RecordingStream, run: Run) -> None:
         for t, (status, fallback) in _changes(log.t, list(zip(log.status, log.fallback.tolist(), strict=True)))
     ]
     events += _phase_changes(run)
+    events += _failures(run)
     events.append((run.end, _outcome(run), "INFO" if run.log.reason is None else "ERROR"))
     times, texts, levels = zip(*sorted(events, key=lambda event: event[0]), strict=True)
     recording.log("summary", rr.TextDocument(_summary(run), media_type=rr.MediaType.MARKDOWN), static=True)
@@ -50,6 +52,15 @@ def _changes(t: Array, values: Sequence[Any]) -> list[tuple[float, Any]]:
     """The first value and those that differ from the one before, each with its time [s]."""
     pairs = zip(t.tolist(), [None, *values], values, strict=False)
     return [(time, value) for time, before, value in pairs if value != before]
+
+
+def _failures(run: Run) -> list[tuple[float, str, str]]:
+    """Time, text and level of why the first QP without an answer had none, and of fallback for good, from its begin."""
+    found, periods = run.summary.get("diagnosis"), unrecovered(run.log.control)
+    events = [] if found is None else [(found["time"], text) for text in (found["sentence"], found["advice"]) if text]
+    if periods:
+        events.append((float(run.log.control.t[-periods]), fallback_sentence(periods)))
+    return [(time, text, "ERROR") for time, text in events]
 
 
 def _outcome(run: Run) -> str:

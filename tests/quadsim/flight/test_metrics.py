@@ -153,6 +153,27 @@ def test_the_controllers_counts_and_times() -> None:
     json.dumps(numbers, allow_nan=False)
 
 
+@pytest.mark.parametrize(
+    ("levels", "expected"),
+    [
+        ([0] * 20, 0),
+        ([2, *[0] * 19], 0),  # it recovered
+        ([0] * 11 + [1] * 9, 0),  # 0.9 s, too short to tell
+        ([0] * 10 + [1] * 9 + [3], 10),
+        ([1] * 5 + [0] + [1] * 14, 14),
+        ([2, 2, 1], 3),  # the whole of a short flight
+        ([1], 1),
+        ([0], 0),
+        ([], 0),
+    ],
+)
+def test_fallback_for_good_is_the_last_second_at_least_or_the_whole_flight(levels: list[int], expected: int) -> None:
+    log = replace(small_log(len(levels)).control, fallback=np.array(levels, np.int64))
+    assert metrics.unrecovered(log) == expected
+    if levels:
+        assert metrics.controller(log, small_log(len(levels)).timing, 100.0)["unrecovered"] == expected
+
+
 def test_nothing_solved_has_no_residual() -> None:
     log = replace(small_log(2).control, status=("numerics", "numerics"), primal_residual=np.full(2, math.nan))
     assert metrics.controller(log, small_log(2).timing, 50.0)["residual_max"] == {"primal": 0.0, "dual": 0.0}

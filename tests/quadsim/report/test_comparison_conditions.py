@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from quadsim.flight.rundir import Run
-from quadsim.report.comparison import comparison_rows, verdict, verdict_cell
+from quadsim.report.comparison import comparison_rows, failure_sentences, verdict, verdict_cell, verdict_sentence
 from quadsim.report.narrative import comparison_sentences
 from quadsim.report.table import Mark, Row
 
@@ -43,7 +43,7 @@ def having(run: Run, scenario: str, **entries: Any) -> Run:
 @pytest.fixture
 def bare_run(short_run: Run) -> Run:
     """The short flight as an older version wrote it: nothing of what this module tests."""
-    told = {key: value for key, value in short_run.summary.items() if key not in {*EVERYTHING, "expected"}}
+    told = {key: value for key, value in short_run.summary.items() if key not in {*EVERYTHING, "expected", "diagnosis"}}
     return having(dataclasses.replace(short_run, summary=told), "bare")
 
 
@@ -139,3 +139,38 @@ def test_bounds_that_differ_are_told_with_each_run(bare_run: Run) -> None:
         "it by 1 deg."
     ) in told
     assert "roll, -5 .. 5 deg: one violates it by 1 deg." in comparison_sentences([one])
+
+
+DIAGNOSIS = {
+    "time": 1.0,
+    "status": "primal_infeasible",
+    "feasible": False,
+    "conflict": [],
+    "suggestions": [],
+    "sentence": "no answer at t = 1.00 s; cannot hold together: roll upper at +0.15 s .. +0.40 s by 0.8 deg",
+    "advice": "to try: controller.output_bounds.roll = [-5.0, 5.8]",
+}
+
+
+def test_fallback_for_good_is_no_success_and_is_said_with_its_reason(bare_run: Run) -> None:
+    held = [{**entry, "satisfied": True} for entry in bare_run.summary["constraints"]]
+    controller = {**bare_run.summary["controller"], "unrecovered": 318}
+    good = having(bare_run, "good", constraints=held)
+    stuck = having(
+        bare_run, "stuck", constraints=held, controller=controller, diagnosis=DIAGNOSIS, expected="satisfied"
+    )
+    crashed = having(bare_run, "crashed", constraints=held, ground={**GROUND, "crashed": True})
+    assert [verdict(run.summary) for run in (good, stuck, crashed)] == ["satisfied", "violated", "violated"]
+    assert verdict_sentence(stuck.summary) == "ends in fallback for good"
+    assert verdict_sentence(crashed.summary) == "crashes"
+    assert verdict_sentence(having(stuck, "both", constraints=bare_run.summary["constraints"]).summary).startswith(
+        "does"
+    )
+    told = comparison_sentences([good, stuck])
+    assert "stuck ends in fallback for good; its scenario states the verdict satisfied." in told
+    said = ["318 periods in fallback, never recovered", DIAGNOSIS["sentence"], DIAGNOSIS["advice"]]
+    assert failure_sentences(stuck.summary) == said
+    assert f"stuck: {'; '.join(map(str, said))}." in told
+    assert not [sentence for sentence in told if sentence.startswith("good:")]
+    assert cells(comparison_rows([good, stuck]), "Solver", "in fallback for good") == ["0", "318"]
+    assert failure_sentences(having(good, "solver", diagnosis={**DIAGNOSIS, "advice": ""}).summary) == [said[1]]

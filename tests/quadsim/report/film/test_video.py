@@ -344,6 +344,24 @@ def test_captions_tell_an_optimum_from_a_failure(short_run: Run, status: str, go
     assert (pixels(run, RED) == 0) == good
 
 
+def test_the_last_second_says_why_there_was_no_answer_and_that_the_fallback_went_on(short_run: Run) -> None:
+    long = "cannot hold together: " + "; ".join(["roll upper at +0.15 s .. +0.40 s by 0.8 deg"] * 6)
+    controller = {**short_run.summary["controller"], "unrecovered": 40}
+    found = {"sentence": long, "advice": "to try: more"}
+    run = replace(short_run, summary={**short_run.summary, "controller": controller, "diagnosis": found})
+    footage = make_footage(run, np.array([4.9, 5.0, 6.0]))
+    overlay = Overlay(run, footage, width=1280, height=720)
+    lines = [[text for text, _, _ in overlay._headlines(i)] for i in range(3)]
+    assert not [text for text in lines[0] if "recovered" in text]
+    said = lines[2][lines[2].index("40 periods in fallback, never recovered") :]
+    assert lines[1][-len(said) :] == said
+    assert " ".join(said[1:]) == f"{long} to try: more"
+    assert len(said) == 5
+    overlay.draw(np.full((720, 1280, 3), 128, np.uint8), 2)
+    small = Overlay(run, footage, width=480, height=270, compact=True)
+    assert len(small._headlines(2)) == 2
+
+
 def test_captions_tell_the_phase_where_there_is_a_ground(short_run: Run):
     def at_phase(*phases: str) -> Run:
         control = short_run.log.control

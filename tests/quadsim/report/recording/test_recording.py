@@ -269,6 +269,31 @@ def test_events_tell_each_change_of_the_solver_and_the_end(record: Callable[[Run
     np.testing.assert_allclose(content.times("/events"), times, atol=1e-9)
 
 
+def test_events_tell_why_there_was_no_answer_and_when_the_fallback_began_for_good(
+    record: Callable[[Run], Content], short_run: Run
+) -> None:
+    control = short_run.log.control
+    fallback = control.fallback.copy()
+    fallback[-40:] = 2
+    log = dataclasses.replace(short_run.log, control=dataclasses.replace(control, fallback=fallback))
+    found = {"time": 1.0, "sentence": "cannot hold together: roll upper by 1 deg", "advice": "to try: more"}
+    controller = {**short_run.summary["controller"], "unrecovered": 40}
+    summary = {**short_run.summary, "diagnosis": found, "controller": controller}
+    content = record(dataclasses.replace(short_run, log=log, summary=summary))
+    levels = content.rows("/events", "level")
+    told = {
+        row[0]: round(float(time), 9)
+        for time, row, level in zip(content.times("/events"), content.rows("/events", "text"), levels, strict=True)
+        if level == ["ERROR"]
+    }
+    assert told == {
+        "cannot hold together: roll upper by 1 deg": 1.0,
+        "to try: more": 1.0,
+        "40 periods in fallback, never recovered": 4.0,
+    }
+    assert "cannot hold together: roll upper" in content.rows("/summary", "text")[0][0]
+
+
 def on_the_ground(run: Run, *phases: str) -> Run:
     """The flight as if its first periods had been of other phases."""
     control = run.log.control

@@ -1,0 +1,293 @@
+"""Why a problem has no answer: which constraints cannot hold together, by how much, and what would help.
+
+An elastic problem has a slack e >= 0 for each bound at each step, and is a linear program:
+
+    minimise  sum e / s    subject to    the dynamics,  lower - e <= C x + D u + E du <= upper + e,
+
+s half of what lies between a row's bounds, so that rows of any unit count alike.  It always has an answer, and that is
+zero if, and only if, the QP has one.  Bounds on inputs alone come first: what they allow is what actuators can do, and
+bounds on states are to give way to it.  Of these, those with slack are *violated*.  Those that are *in the way* have
+none, and each is needed: without it less violation would do.  They are found by the multipliers, and then by leaving
+out one after the other (Chinneck and Dravnieks, 1991, "Locating minimal infeasible constraint sets in linear
+programs").
+
+It walks the constraints' rows and knows no kind.  Soft constraints never stand in the way of an answer.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, replace
+from typing import Final, NamedTuple
+
+import numpy as np
+from scipy import sparse
+
+from mpc.constraints import Constraint, Penalty
+from mpc.ocp import Problem, Query, Unanswered
+from mpc.robust.relinearised import Relinearised
+from mpc.solvers import QPSolver, refusal
+from mpc.staged import Staged
+from quadsim.controller import SOLVED
+from quadsim.state import Array
+
+SOLVER: Final = "piqp-multistage"
+"""Solves again what is suggested; the solver of the flight may be another."""
+FEASIBLE: Final = 1e-6
+"""Violation, as a share of half of what lies between a row's bounds, below which it is rounding."""
+PRICED: Final = 1e-7
+"""Multiplier of a bound, in shares per share, above which it may be in the way."""
+
+
+class Side(NamedTuple):
+    """One of the two bounds of a row.
+
+    Attributes:
+        place: of its constraint among the problem's (`mpc.ocp.Problem.every_constraint`).
+        row: of the constraint.
+        upper: whether it is the upper bound.
+    """
+
+    place: int
+    row: int
+    upper: bool
+
+
+@dataclass(frozen=True, kw_only=True)
+class Violation:
+    """A bound that has to give way.
+
+    Attributes:
+        amount: the most that it is violated by, in its row's own unit.
+        share: the same as a share of half of what lies between the row's bounds.
+        first, last: when that begins and ends, as whole periods after the instant of x(k).
+    """
+
+    amount: float
+    share: float
+    first: int
+    last: int
+
+
+@dataclass(frozen=True, kw_only=True)
+class Conflict:
+    """What cannot hold together; nothing where the problem has an answer, and its solver failed to find it.
+
+    Attributes:
+        total: the sum of all violations, as shares.
+        violated: the bounds that have to give way.
+        in_the_way: the bounds that hold, and without each of which less violation would do.
+    """
+
+    total: float
+    violated: Mapping[Side, Violation]
+    in_the_way: tuple[Side, ...]
+
+    @property
+    def feasible(self) -> bool:
+        """Whether all constraints can hold."""
+        return not self.violated
+
+
+def find_conflict(unanswered: Unanswered) -> Conflict | None:
+    """Which constraints cannot hold together; None where the elastic problem cannot be solved either."""
+    problem, query = unanswered.problem, unanswered.query
+    sides, scales = _sides(problem), _scales(problem)
+    of_inputs = {side for side in sides if not _of_states(problem.every_constraint[side.place])}
+    total, violated, held = 0.0, dict[Side, Violation](), set[Side]()
+    for elastic in filter(None, (of_inputs, sides.keys() - of_inputs)):
+        present = {side: one for side, one in sides.items() if side in of_inputs or side in elastic}
+        found = _relaxed(problem, query, present, elastic)
+        if found is None:
+            return None
+        total += found.total
+        if found.total <= FEASIBLE:
+            continue
+        giving = {side: slack for side, slack in found.slacks.items() if (slack > FEASIBLE).any()}
+        for side, slack in giving.items():
+            steps, share = np.flatnonzero(slack > FEASIBLE), float(slack.max())
+            later = int(_of_states_alone(problem.every_constraint[side.place], side.row))
+            violated[side] = Violation(
+                amount=share * float(scales[side.place][side.row]),
+                share=share,
+                first=int(steps[0]) + later,
+                last=int(steps[-1]) + later,
+            )
+            sides[side] = _moved(sides[side], share + FEASIBLE)  # for what comes next, as wide as it has to be
+        priced = {side: one for side, one in present.items() if side in found.priced or side in giving}
+        held |= _needed(problem, query, priced, elastic, found.priced - giving.keys(), found.total)
+    return Conflict(total=total, violated=violated, in_the_way=tuple(sorted(held - violated.keys())))
+
+
+def smallest_widening(unanswered: Unanswered, sides: Collection[Side]) -> float | None:
+    """By how much these bounds have to be moved outwards, all by the same amount at all steps, for an answer.
+
+    None where that does not help, however far they are moved.
+    """
+    problem, query = unanswered.problem, unanswered.query
+    scales = {side: _scales(problem)[side.place][side.row] for side in sides}
+    found = _relaxed(problem, query, _sides(problem), sides, together=scales)
+    return None if found is None else found.total
+
+
+def has_answer(problem: Problem, query: Query) -> bool:
+    """Whether the problem is solved, by PIQP as controllers have it solved."""
+    state, desired, u_before, rest, steps = query
+    if steps is None:
+        answer = QPSolver(SOLVER, problem).solve(state, desired, u_before, rest)
+    else:
+        answer = Relinearised(problem).solve(*steps, state, desired, u_before, (rest or problem.rest).u)
+    return answer.solution.status == SOLVED
+
+
+def recovery(unanswered: Unanswered, plan: Array) -> int | None:
+    """After how many periods of a plan (N, nu) the problem has an answer, by the model; None for not within it."""
+    problem, query = unanswered.problem, unanswered.query
+    state = query.state
+    for i, (u, A, B, c) in enumerate(zip(plan, *_steps(problem, query), strict=True)):
+        state = A @ state + B @ u + c
+        if has_answer(problem, query._replace(state=state, u_before=u)):
+            return i + 1
+    return None
+
+
+class _Relaxed(NamedTuple):
+    """An elastic problem's answer: its optimum, each elastic bound's slack (N,), and bounds with a multiplier."""
+
+    total: float
+    slacks: dict[Side, Array]
+    priced: set[Side]
+
+
+def _of_states(constraint: Constraint) -> bool:
+    return constraint.C is not None and bool(constraint.C.any())
+
+
+def _of_states_alone(constraint: Constraint, row: int) -> bool:
+    return not any(matrix is not None and matrix[row].any() for matrix in (constraint.D, constraint.E))
+
+
+def _scales(problem: Problem) -> list[Array]:
+    """Of each constraint's rows (m,): half of what lies between the bounds; of one bound alone its size, or 1."""
+    scales = []
+    for part in problem.every_constraint:
+        lower, upper = np.atleast_2d(part.lower), np.atleast_2d(part.upper)
+        half = 0.5 * (upper - lower).max(axis=0)
+        size = np.where(np.isfinite(lower), np.abs(lower), np.where(np.isfinite(upper), np.abs(upper), 0.0)).max(axis=0)
+        scales.append(np.where(np.isfinite(half), half, np.where(size > 0.0, size, 1.0)))
+    return scales
+
+
+def _sides(problem: Problem) -> dict[Side, Constraint]:
+    """Every finite bound of a hard constraint as a constraint of its own, over its row's scale."""
+    sides = {}
+    for place, (part, scales) in enumerate(zip(problem.every_constraint, _scales(problem), strict=True)):
+        for row in range(scales.size if part.penalty is None else 0):
+            matrices = {
+                name: None if matrix is None else matrix[[row]] / scales[row]
+                for name, matrix in (("C", part.C), ("D", part.D), ("E", part.E))
+            }
+            for upper in (False, True):
+                bound = (part.upper if upper else part.lower)[..., [row]] / scales[row]
+                if np.isfinite(bound).any():
+                    none = np.full_like(bound, -math.inf if upper else math.inf)
+                    lower, higher = (none, bound) if upper else (bound, none)
+                    sides[Side(place, row, upper)] = Constraint(name=part.name, lower=lower, upper=higher, **matrices)
+    return sides
+
+
+def _moved(side: Constraint, share: float) -> Constraint:
+    """A bound moved outwards."""
+    return replace(side, lower=side.lower - share, upper=side.upper + share)
+
+
+def _needed(
+    problem: Problem,
+    query: Query,
+    sides: Mapping[Side, Constraint],
+    elastic: Collection[Side],
+    held: set[Side],
+    total: float,
+) -> set[Side]:
+    """Of the bounds that are held, those without each of which there is less violation; no fewer would do."""
+    present = dict(sides)
+    for side in sorted(held):
+        fewer = {other: one for other, one in present.items() if other != side}
+        found = _relaxed(problem, query, fewer, elastic)
+        if found is not None and found.total >= total * (1.0 - 1e-6) - FEASIBLE:
+            present = fewer
+    return held & present.keys()
+
+
+def _relaxed(
+    problem: Problem,
+    query: Query,
+    sides: Mapping[Side, Constraint],
+    elastic: Collection[Side],
+    together: Mapping[Side, float] | None = None,
+) -> _Relaxed | None:
+    """Solve the elastic problem; None where that fails, or cannot be.
+
+    Args:
+        problem: whose model it is.
+        query: what it is solved for.
+        sides: the bounds, over their rows' scales.
+        elastic: those with slack.
+        together: their scales, where all have the same slack at all steps, in their own unit; it is what is minimised.
+    """
+    from scipy.optimize import linprog  # takes a tenth of a second, which flights without failures do not need
+
+    slack = Penalty(l1=np.ones(1), l2=np.zeros(1))
+    rows = tuple(replace(one, penalty=slack if side in elastic else None) for side, one in sides.items())
+    form = Staged(replace(problem, bounds=None, constraints=rows), changing=True)
+    A, B, c = _steps(problem, query)
+    matrices = form.prepare(A, B)
+    vectors = form.changed_vectors(matrices, c, *query[:3], query.rest or problem.rest)
+    qp = form.changed(matrices, vectors)
+    named, places = (
+        [side for side in sides if side in elastic],
+        form.slacks(np.arange(qp.c.size, dtype=float)).astype(int),
+    )
+    basis, cost, box = sparse.identity(qp.c.size, format="csc"), np.zeros(qp.c.size), np.stack([qp.x_l, qp.x_u], 1)
+    cost[places] = 1.0
+    if together is not None:
+        weights = np.zeros(qp.c.size)
+        weights[places] = [1.0 / together[side] for side in named]
+        kept = np.setdiff1d(np.arange(qp.c.size), places)
+        basis = sparse.hstack([basis[:, kept], sparse.csc_matrix(weights[:, None])], format="csc")
+        cost, box = np.append(np.zeros(kept.size), 1.0), np.vstack([box[kept], [0.0, math.inf]])
+    above, below = np.isfinite(qp.h_u), np.isfinite(qp.h_l)
+    found = linprog(
+        cost,
+        A_ub=sparse.vstack([qp.G[above], -qp.G[below]]) @ basis,
+        b_ub=np.concatenate([qp.h_u[above], -qp.h_l[below]]),
+        A_eq=qp.A @ basis,
+        b_eq=qp.b,
+        bounds=box,
+        method="highs-ds",
+    )
+    if found.status:
+        return None
+    slacks = dict(zip(named, form.slacks(basis @ found.x).T, strict=True))
+    if together is not None:
+        return _Relaxed(total=float(found.fun), slacks=slacks, priced=set())
+    z = np.zeros(qp.h_u.size)
+    z[above] -= found.ineqlin.marginals[: np.count_nonzero(above)]
+    z[below] += found.ineqlin.marginals[np.count_nonzero(above) :]
+    z_box = -found.upper.marginals - found.lower.marginals
+    multipliers = form.multipliers(replace(refusal(qp), z=z, z_box=z_box))
+    return _Relaxed(
+        total=float(found.fun),
+        slacks=slacks,
+        priced={side for side, priced in zip(sides, multipliers.T, strict=True) if (np.abs(priced) > PRICED).any()},
+    )
+
+
+def _steps(problem: Problem, query: Query) -> tuple[Array, Array, Array]:
+    """A (N, n, n), B (N, n, nu), c (N, n) of the predicted steps."""
+    if query.steps is not None:
+        return query.steps
+    model, N, (x_s, u_s) = problem.model, problem.horizon, query.rest or problem.rest
+    A, B, c = model.A, model.B, x_s - model.A @ x_s - model.B @ u_s
+    return np.tile(A, (N, 1, 1)), np.tile(B, (N, 1, 1)), np.tile(c, (N, 1))

@@ -1,0 +1,317 @@
+"""Why a flight's QP had no answer, in the words and units of the scenario file, and what to try.
+
+What is suggested is a change of the file, and each was tried: the problem is built anew from the changed file, and
+solved for the same period.  It says nothing about the flight that would follow.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import tomllib
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+from pydantic import ValidationError
+
+from mpc.answer import ActuatorBounds
+from mpc.diagnosis import Conflict, Side, find_conflict, has_answer, recovery, smallest_widening
+from mpc.fallback.contract import Guarded
+from mpc.ocp import Unanswered
+from quadsim.errors import InputError
+from quadsim.flight.audit import TERMS, sum_signal
+from quadsim.state import N_STATES, REFERENCE_STATES, STATE_NAMES
+from quadsim.vehicle import N_ROTORS, Vehicle
+from scenarios.parts.controllers import make_bounds, make_controller, posed_problem
+from scenarios.schema.controller import ConstrainedSpec
+from scenarios.schema.optimisation import ANGLES, BoundedSpec, PolytopeSpec
+from scenarios.schema.robust import RobustSpec
+from scenarios.schema.scenario import Scenario
+from scenarios.schema.settings import get_field, set_field
+
+Settings = dict[str, Any]
+WIDER: Final = (1.0, 1.02, 1.1, 1.5)
+"""The smallest widening, rounded outwards, and what is tried after it: next to infeasible, solvers give up, and a wider
+bound may be tightened by more."""
+SOFT: Final[tuple[dict[str, float], ...]] = ({}, {"linear": 1e4}, {"linear": 1e3}, {"linear": 1e2})
+"""Prices of softness, the usual one first; far from feasible, a solver gives up at high ones."""
+_ROTORS: Final = {1: "slew", 2: "speed"}
+"""Fields of `input_bounds` by their constraint's place, as `mpc.constraints.Bounds.constraints` has them."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Bound:
+    """A side of a row, as the file has it.
+
+    Attributes:
+        name: what reports call it, without its rotor.
+        rotor: 1 to 4, or 0.
+        side: `lower` or `upper`.
+        unit: of the bound in the file.
+        factor: from the row's unit to that.
+        field: of the file, a list of numbers.
+        entry: which of them.
+    """
+
+    name: str
+    rotor: int
+    side: str
+    unit: str
+    factor: float
+    field: str
+    entry: int
+
+
+def diagnose(unanswered: Unanswered, scenario: Scenario, vehicle: Vehicle) -> dict[str, Any] | None:
+    """`diagnosis` of a flight's summary; None where its controller's bounds are not a scenario file's.
+
+    Args:
+        unanswered: the first period without an answer.
+        scenario: what was flown, with a controller that has bounds.
+        vehicle: the modelled vehicle.
+    """
+    if not isinstance(scenario.controller, BoundedSpec):
+        return None
+    case = _Case(unanswered, scenario, scenario.controller, vehicle)
+    conflict = find_conflict(unanswered)
+    entries = [] if conflict is None else _merged([*case.entries(conflict)])
+    suggestions = [] if conflict is None or conflict.feasible else [*case.suggestions(conflict)]
+    found = {
+        "time": round(unanswered.time, 9),
+        "status": unanswered.status,
+        "feasible": None if conflict is None else conflict.feasible,
+        "conflict": entries,
+        "suggestions": suggestions,
+    }
+    return {**found, "sentence": _sentence(found), "advice": _advice(found)}
+
+
+class _Case:
+    """One period's problem and the file that it is of."""
+
+    def __init__(self, unanswered: Unanswered, scenario: Scenario, spec: BoundedSpec, vehicle: Vehicle) -> None:
+        self._unanswered, self._spec, self._vehicle = unanswered, spec, vehicle
+        self._period, self._file = scenario.control_period, scenario.to_toml()
+        self._outputs = [name for name in STATE_NAMES if name in spec.output_bounds]
+
+    def bound(self, side: Side) -> _Bound:
+        """A side in the words of the file."""
+        which, table = ("lower", "upper")[side.upper], "controller.input_bounds."
+        if side.place in _ROTORS:
+            name, rotor = _ROTORS[side.place], side.row + 1
+            return _Bound(
+                name=name, rotor=rotor, side=which, unit="rad/s", factor=1.0, field=table + name, entry=int(side.upper)
+            )
+        if side.place == 0:
+            name = self._outputs[side.row]
+            return _Bound(
+                name=name,
+                rotor=0,
+                side=which,
+                unit=TERMS[name].unit,
+                factor=math.degrees(1.0) if name in ANGLES else 1.0,
+                field=f"controller.output_bounds.{name}",
+                entry=int(side.upper),
+            )
+        polytope = self._polytope(side)
+        if polytope is None:  # of a kind that this module has no words for
+            name = f"{self._unanswered.problem.every_constraint[side.place].name}, row {side.row + 1},"
+            return _Bound(name=name, rotor=0, side=which, unit="-", factor=1.0, field="", entry=side.row)
+        row = zip(polytope.of, polytope.rows[side.row], strict=True)
+        return _Bound(
+            name=polytope.row_names[side.row],
+            rotor=0,
+            side=which,
+            unit=sum_signal(tuple((name, factor) for name, factor in row if factor)).unit,
+            factor=1.0,
+            field=f"controller.polytopes.{polytope.name}.{which}",
+            entry=side.row,
+        )
+
+    def _polytope(self, side: Side) -> PolytopeSpec | None:
+        name = self._unanswered.problem.every_constraint[side.place].name
+        return next((polytope for polytope in self._spec.polytopes if polytope.name == name), None)
+
+    def entries(self, conflict: Conflict) -> Iterator[dict[str, Any]]:
+        """What is violated, the largest share first, and what is in the way, each with its times and amount."""
+        delay, period = self._unanswered.delay, self._period
+        for side, found in sorted(conflict.violated.items(), key=lambda item: -item[1].share):
+            bound = self.bound(side)
+            first, last = (round(delay + steps * period, 9) for steps in (found.first, found.last))
+            yield {**_named(bound), "by": found.amount * bound.factor, "start": first, "stop": last}
+        for side in conflict.in_the_way:
+            yield {**_named(self.bound(side)), "by": 0.0, "start": None, "stop": None}
+
+    def suggestions(self, conflict: Conflict) -> Iterator[dict[str, Any]]:
+        """Changes of the file that give the period an answer: of one bound, the least first; softness; the fallback."""
+        giving = {self.bound(side).field for side in conflict.violated}
+        fields: dict[str, set[Side]] = {}
+        for side in (*conflict.violated, *conflict.in_the_way):
+            field = self.bound(side).field
+            if field and (side in conflict.violated or field not in giving):
+                rotors = range(N_ROTORS) if side.place in _ROTORS else (side.row,)
+                fields.setdefault(field, set()).update(side._replace(row=row) for row in rotors)
+        least = {field: smallest_widening(self._unanswered, sides) for field, sides in fields.items()}
+        changes = [{field: (fields[field], amount)} for field, amount in least.items() if amount is not None]
+        alone = [settings for change in changes if (settings := self._widened(change))]
+        if not alone:
+            most: dict[str, float] = {}
+            for side, found in conflict.violated.items():
+                field = self.bound(side).field
+                most[field] = max(found.amount, most.get(field, 0.0))
+            together = self._widened({field: (sides, most[field]) for field, sides in fields.items() if field in most})
+            alone = [together] if together else []
+        for settings in (*alone, *self._softened(conflict)):
+            yield {"settings": settings, "after": None}
+        yield from self._fallback()
+
+    def _softened(self, conflict: Conflict) -> list[Settings]:
+        """Making soft what is violated, one constraint, or else all, at the largest price that is answered."""
+        polytopes = (self._polytope(side) for side in conflict.violated if side.place not in (0, *_ROTORS))
+        tables = ["controller.soft"] if any(side.place == 0 for side in conflict.violated) else []
+        tables += dict.fromkeys(f"controller.polytopes.{each.name}.soft" for each in polytopes if each is not None)
+        found = [settings for table in tables if (settings := self._soft([table]))]
+        if not found and len(tables) > 1 and (settings := self._soft(tables)):
+            found = [settings]
+        return found
+
+    def _soft(self, tables: Sequence[str]) -> Settings | None:
+        other_law = "controller.soft" in tables and not isinstance(self._spec, RobustSpec)
+        law: Settings = {"controller.type": "robust"} if other_law else {}
+        return next(filter(self._helps, ({**law, **dict.fromkeys(tables, soft)} for soft in SOFT)), None)
+
+    def _widened(self, amounts: Mapping[str, tuple[set[Side], float]]) -> Settings | None:
+        """Fields with bounds moved outwards by at least these amounts, if that helps."""
+        table = tomllib.loads(self._file)
+        for more in WIDER:
+            settings: Settings = {}
+            for field, (sides, amount) in amounts.items():
+                numbers = [*(before := get_field(table, field))]
+                for bound in map(self.bound, sides):  # several rotors share an entry
+                    moved = more * amount * bound.factor
+                    numbers[bound.entry] = _outwards(before[bound.entry], moved, upper=bound.side == "upper")
+                settings[field] = numbers
+            if self._helps(settings):
+                return settings
+        return None
+
+    def _helps(self, settings: Settings) -> bool:
+        """Whether the period has an answer with these fields."""
+        spec = self._changed(settings)
+        if spec is None or spec.input_bounds.speed[1] > max(self._vehicle.speed_max, self._spec.input_bounds.speed[1]):
+            return False
+        try:
+            problem = posed_problem(spec, self._vehicle, self._period)
+        except InputError:
+            return False
+        return has_answer(problem, self._unanswered.query)
+
+    def _changed(self, settings: Settings) -> ConstrainedSpec | RobustSpec | None:
+        """The controller with other fields; None where the file would be refused."""
+        table = tomllib.loads(self._file)
+        for field, value in settings.items():
+            set_field(table, field, value, asked="diagnosis")
+        if "controller.type" in settings:
+            law = table["controller"]
+            table["controller"] = {name: value for name, value in law.items() if name in RobustSpec.model_fields}
+        try:
+            changed = Scenario.read(table).controller
+        except ValidationError:
+            return None
+        assert isinstance(changed, ConstrainedSpec | RobustSpec)
+        return changed
+
+    def _fallback(self) -> Iterator[dict[str, Any]]:
+        """The fallback, where there is none: after what time of its level hover the problem has an answer again."""
+        fallback = getattr(self._spec, "fallback", None)
+        if fallback is not None and fallback.enabled:
+            return
+        settings: Settings = {"controller.fallback": {}}
+        changed, query = self._changed(settings), self._unanswered.query
+        assert changed is not None
+        law = make_controller(changed, self._vehicle, self._period)
+        assert isinstance(law, Guarded)
+        target = np.zeros(N_STATES)
+        target[[*REFERENCE_STATES]] = query.state[[*REFERENCE_STATES]]
+        bounds = ActuatorBounds.of(make_bounds(changed))
+        plan = law.law.plan(query.state[:N_STATES], target, query.u_before, bounds, changed.horizon, law.trim)
+        periods = recovery(self._unanswered, plan)
+        if periods is not None:
+            yield {"settings": settings, "after": round(periods * self._period, 9)}
+
+
+def _named(bound: _Bound) -> dict[str, Any]:
+    return {
+        "name": bound.name,
+        "rotors": [bound.rotor] if bound.rotor else [],
+        "side": bound.side,
+        "unit": bound.unit,
+        "field": bound.field,
+    }
+
+
+def _merged(entries: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """The same side of several rotors as one entry, with the largest amount and from the first time to the last."""
+    merged: dict[tuple[Any, ...], dict[str, Any]] = {}
+    for entry in entries:
+        key = (entry["name"], entry["side"], entry["by"] > 0.0)
+        if key not in merged:
+            merged[key] = entry
+            continue
+        other = merged[key]
+        times = {"start": other["start"], "stop": other["stop"]}
+        if entry["by"]:
+            times = {"start": min(other["start"], entry["start"]), "stop": max(other["stop"], entry["stop"])}
+        rotors = sorted(other["rotors"] + entry["rotors"])
+        merged[key] = {**other, **times, "rotors": rotors, "by": max(other["by"], entry["by"])}
+    return list(merged.values())
+
+
+def _outwards(bound: float, amount: float, *, upper: bool) -> float:
+    """A bound moved outwards by an amount, which is rounded up to three digits."""
+    digits = 2 - math.floor(math.log10(amount)) if amount > 0.0 else 0
+    moved = math.ceil(round(amount * 10.0**digits, 6)) / 10.0**digits
+    return round(bound + moved if upper else bound - moved, max(digits, 0) + 3)
+
+
+def _sentence(found: Mapping[str, Any]) -> str:
+    """When, and what cannot hold together."""
+    begin = f"no answer at t = {found['time']:.2f} s ({found['status']})"
+    if found["feasible"] is None:
+        return f"{begin}, nor to its elastic problem: its numbers are beyond what can be solved"
+    if found["feasible"]:
+        return f"{begin}, though all constraints can hold together: it is the solver that failed"
+    return f"{begin}; cannot hold together: {'; '.join(map(_phrase, found['conflict']))}"
+
+
+def _phrase(entry: Mapping[str, Any]) -> str:
+    """One bound, e.g. `roll upper at +0.15 s .. +0.40 s by 0.8 deg`, or `slew of rotor 3 lower`."""
+    rotors = entry["rotors"]
+    which = f" of rotor{'s' if len(rotors) > 1 else ''} {', '.join(map(str, rotors))}" if rotors else ""
+    name = f"{entry['name']}{which} {entry['side']}"
+    if not entry["by"]:
+        return name
+    times = dict.fromkeys(f"+{entry[key]:.2f} s" for key in ("start", "stop"))
+    return f"{name} at {' .. '.join(times)} by {entry['by']:.3g} {entry['unit'].replace('-', '')}".rstrip()
+
+
+def _advice(found: Mapping[str, Any]) -> str:
+    """What to try."""
+    if found["feasible"] is not False:
+        return ""
+    tried = [
+        ", ".join(f"{field} = {_toml(value)}" for field, value in each["settings"].items())
+        + (" (without the field solver)" if "controller.type" in each["settings"] else "")
+        + (f" (level hover; an answer again after {each['after']:.2f} s, by the model)" if each["after"] else "")
+        for each in found["suggestions"]
+    ]
+    return f"to try: {'; '.join(tried)}" if tried else "no bound alone, nor all of them by as much, gives it an answer"
+
+
+def _toml(value: object) -> str:
+    """Text, a list of numbers, or a table of numbers, as a scenario file has it."""
+    if not isinstance(value, dict):
+        return json.dumps(value)
+    return f"{{ {', '.join(f'{name} = {number:g}' for name, number in value.items())} }}" if value else "{}"

@@ -1,0 +1,180 @@
+"""The elastic problem on random ones: zero where, and only where, there is an answer; and what it names is needed."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import ocp_peer
+import pytest
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+from support import changing_period, random_problem, with_terms
+
+from mpc.constraints import Constraint, Penalty
+from mpc.diagnosis import Conflict, Side, find_conflict, has_answer, recovery, smallest_widening
+from mpc.model import LinearModel
+from mpc.ocp import Objective, Problem, Query, Unanswered
+
+TERMS = ((), ("constraints",), ("margins", "constraints"), ("soft",), ("soft", "margins", "constraints", "P", "Q_d"))
+NEAR = 1e-4
+"""Violation, as a share, that is too little for an independent solver to be sure of."""
+
+
+def posed(seed: int, terms: tuple[str, ...], *, changing: bool, far: float) -> Unanswered:
+    """A random problem from a state that is so far from the origin."""
+    rng = np.random.default_rng(seed)
+    problem = with_terms(rng, random_problem(rng, horizon=6, n=4, nu=2, n_c=2), terms)
+    state, desired = far * rng.normal(size=4), rng.normal(size=(6, 4))
+    before = problem.model.u_bar + rng.uniform(-3.0, 3.0, 2)
+    now = changing_period(rng, problem)
+    query = Query(state, desired, before, now.rest, (now.A, now.B, now.c) if changing else None)
+    return Unanswered(problem=problem, query=query, status="unsolved", time=0.0)
+
+
+def period(unanswered: Unanswered) -> ocp_peer.Period:
+    problem, query = unanswered.problem, unanswered.query
+    now = ocp_peer.period(problem, query.state, query.desired, query.u_before, query.rest)
+    return now if query.steps is None else replace(now, **dict(zip("ABc", query.steps, strict=True)))
+
+
+def conflict_of(unanswered: Unanswered) -> Conflict:
+    conflict = find_conflict(unanswered)
+    assert conflict is not None
+    return conflict
+
+
+RANDOM = {
+    "seed": st.integers(0, 2**32 - 1),
+    "terms": st.sampled_from(TERMS),
+    "changing": st.booleans(),
+    "far": st.sampled_from([0.1, 1.0, 5.0]),
+}
+
+
+@given(**RANDOM)
+@settings(max_examples=150)
+def test_it_is_zero_where_and_only_where_there_is_an_answer(
+    seed: int, terms: tuple[str, ...], changing: bool, far: float
+) -> None:
+    unanswered = posed(seed, terms, changing=changing, far=far)
+    least = ocp_peer.least_violation(unanswered.problem, period(unanswered))
+    assume(least is None or least == pytest.approx(0.0, abs=1e-9) or least > NEAR)
+    conflict = conflict_of(unanswered)
+    feasible = least is not None and least < NEAR
+    assert conflict.feasible == feasible
+    assert (conflict.total == pytest.approx(0.0, abs=1e-6)) == feasible
+    if least is not None:
+        assert conflict.total == pytest.approx(least, rel=1e-5, abs=1e-6)
+        assert not {side for side in conflict.violated if side.place in (1, 2)}
+
+
+@given(**RANDOM)
+@settings(max_examples=40)
+def test_what_is_named_is_a_conflict_by_itself_and_each_part_of_it_is_needed(
+    seed: int, terms: tuple[str, ...], changing: bool, far: float
+) -> None:
+    """Of bounds on states: without all others they stay as large, and shrink without any one that is in the way."""
+    unanswered = posed(seed, terms, changing=changing, far=far)
+    problem, now = unanswered.problem, period(unanswered)
+    assume(ocp_peer.least_violation(problem, now) is not None)
+    conflict = conflict_of(unanswered)
+    assume(conflict.total > NEAR)
+    named = {*conflict.violated, *conflict.in_the_way}
+    assert ocp_peer.least_violation(problem, now, named) == pytest.approx(conflict.total, rel=1e-5)
+    for side in conflict.in_the_way:
+        less = ocp_peer.least_violation(problem, now, named - {side})
+        assert less is not None
+        assert less < conflict.total * (1.0 - 1e-7)
+    shares = [found.share for found in conflict.violated.values()]
+    assert max(shares) <= conflict.total * (1.0 + 1e-6)
+    assert all(found.first <= found.last <= problem.horizon for found in conflict.violated.values())
+
+
+@given(**RANDOM)
+@settings(max_examples=40)
+def test_the_smallest_widening_is_enough_and_no_less_is(
+    seed: int, terms: tuple[str, ...], changing: bool, far: float
+) -> None:
+    """Each bound that gives way by itself, and all of them together."""
+    unanswered = posed(seed, terms, changing=changing, far=far)
+    problem, query = unanswered.problem, unanswered.query
+    conflict = conflict_of(unanswered)
+    assume(conflict.total > NEAR)
+    for sides in ({side} for side in conflict.violated):
+        amount = smallest_widening(unanswered, sides)
+        if amount is None or amount < NEAR:
+            continue
+        assert has_answer(widened(problem, sides, 1.01 * amount + 1e-4), query)
+        assert not has_answer(widened(problem, sides, 0.99 * amount - 1e-4), query)
+
+
+def widened(problem: Problem, sides: set[Side], amount: float) -> Problem:
+    parts = []
+    for place, part in enumerate(problem.every_constraint):
+        lower, upper = part.lower.copy(), part.upper.copy()
+        for side in sides:
+            if side.place == place and side.upper:
+                upper[..., side.row] += amount
+            elif side.place == place:
+                lower[..., side.row] -= amount
+        parts.append(replace(part, lower=lower, upper=upper))
+    return replace(problem, bounds=None, constraints=tuple(parts))
+
+
+def integrator(*constraints: Constraint) -> Unanswered:
+    """x(k+1) = x(k) + u(k) over four steps from 3, with |u| <= 1."""
+    model = LinearModel(A=np.eye(1), B=np.eye(1), u_bar=np.zeros(1), period=1.0)
+    inputs = Constraint(name="inputs", lower=-np.ones(1), upper=np.ones(1), D=np.eye(1))
+    problem = Problem(
+        model=model,
+        horizon=4,
+        objective=Objective(C_r=np.eye(1), Q_y=np.eye(1), Q_u=np.eye(1)),
+        constraints=(inputs, *constraints),
+    )
+    query = Query(np.array([3.0]), np.zeros((4, 1)), np.zeros(1))
+    return Unanswered(problem=problem, query=query, status="unsolved", time=0.0)
+
+
+BAND = Constraint(name="band", lower=-np.ones(1), upper=np.ones(1), C=np.eye(1))
+
+
+def test_an_integrator_by_hand() -> None:
+    """By one a step, 2, 1, .. violates the bound of 1 once, by 1; the lower bound on inputs is in the way."""
+    unanswered = integrator(BAND)
+    conflict = conflict_of(unanswered)
+    assert conflict.in_the_way == (Side(0, 0, False),)
+    ((side, found),) = conflict.violated.items()
+    assert side == Side(1, 0, True)
+    assert (found.amount, found.share, found.first, found.last) == (pytest.approx(1.0), pytest.approx(1.0), 1, 1)
+    assert smallest_widening(unanswered, {side}) == pytest.approx(1.0)
+    assert smallest_widening(unanswered, {Side(0, 0, False)}) == pytest.approx(1.0)
+    assert smallest_widening(unanswered, {Side(0, 0, True)}) is None
+    assert recovery(unanswered, -np.ones((4, 1))) == 1
+    assert recovery(unanswered, np.ones((4, 1))) is None
+
+
+def test_bounds_on_inputs_come_first_and_states_give_way_to_what_is_left() -> None:
+    """Inputs >= 3 against <= 1: the one with the wider scale gives way; then states follow from inputs of 1 to 3."""
+    pushed = Constraint(name="pushed", lower=np.array([3.0]), upper=np.array([np.inf]), D=np.eye(1))
+    conflict = conflict_of(integrator(BAND, pushed))
+    assert conflict.violated[Side(2, 0, False)].amount == pytest.approx(2.0)
+    assert conflict.violated[Side(2, 0, False)].first == 0
+    assert conflict.violated[Side(2, 0, False)].last == 3
+    # Inputs of 1 at least, once 3 has given way to that: 4, 5, 6, 7 from 3.
+    assert conflict.violated[Side(1, 0, True)].amount == pytest.approx(6.0, abs=1e-4)
+
+
+def test_soft_constraints_are_never_in_conflict() -> None:
+    soft = replace(BAND, penalty=Penalty(l1=np.ones(1), l2=np.ones(1)))
+    conflict = conflict_of(integrator(soft))
+    assert conflict.feasible
+    assert (conflict.total, conflict.in_the_way) == (pytest.approx(0.0), ())
+
+
+def test_what_is_kept_of_a_period_is_no_view_of_what_goes_on() -> None:
+    state, before = np.zeros(1), np.zeros(1)
+    problem = integrator().problem
+    kept = Unanswered(problem=problem, query=Query(state, np.zeros((4, 1)), before), status="unsolved", time=0.0)
+    state[:], before[:] = 1.0, 1.0
+    assert (kept.query.state, kept.query.u_before) == (0.0, 0.0)

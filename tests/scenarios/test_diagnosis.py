@@ -1,0 +1,361 @@
+"""Ten known conflicts: each culprit is named, by the right amount, and what is suggested makes the QP feasible."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import math
+import re
+import tomllib
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import ocp_peer
+import pytest
+
+from mpc.diagnosis import find_conflict
+from mpc.fallback.contract import Guarded
+from mpc.fallback.settings import FallbackSettings
+from mpc.ocp import Unanswered
+from quadsim.controller import ACCEPTED, Controller, Moment
+from quadsim.errors import PlanExhaustedError
+from quadsim.flight import metrics
+from quadsim.state import INDEX, Array, make_state
+from quadsim.vehicle import Vehicle
+from scenarios.build import build_controller
+from scenarios.diagnosis import diagnose
+from scenarios.flight import Flight
+from scenarios.loading import load_scenario, scenario_path
+from scenarios.parts.vehicle import build_vehicle
+from scenarios.schema.scenario import Scenario
+from scenarios.schema.settings import get_field
+
+TILTED = make_state(euler=(math.radians(20.0), 0.0, 0.0))
+FENCE = '{ name = "fence", of = ["x", "y"], rows = [[1.0, 1.0]], upper = [6.8] }'
+CLIMB = '{ name = "climb", of = ["vz"], rows = [[1.0]], lower = [0.5] }'
+LEAST = '{ name = "least", of = ["speed_1", "speed_2", "speed_3", "speed_4"], rows = [[1, 1, 1, 1]], lower = [780] }'
+MOST = '{ name = "most", of = ["speed_1", "speed_2", "speed_3", "speed_4"], rows = [[1, 1, 1, 1]], upper = [760] }'
+
+
+def moving(name: str, value: float, **place: Any) -> Array:
+    state = make_state(**place)
+    state[INDEX[name]] = value
+    return state
+
+
+@dataclass(frozen=True, kw_only=True)
+class Case:
+    """A conflict: what is asked for, which bounds give way and which of the others must be named as in the way."""
+
+    settings: tuple[str, ...] = ()
+    state: Array = field(default_factory=lambda: make_state())
+    acting: float | None = None
+    violated: tuple[str, ...] = ()
+    in_the_way: tuple[str, ...] = ()
+    field: str = ""
+
+
+CASES = {
+    "start beyond the tilt bound": Case(
+        state=TILTED, violated=("roll upper",), in_the_way=("slew lower", "slew upper"), field="output_bounds.roll"
+    ),
+    "slew too small to come back": Case(
+        settings=("controller.input_bounds.slew=[-1.0, 0.5]",),
+        state=moving("roll_rate", math.radians(10.0), euler=(math.radians(4.9), 0.0, 0.0)),
+        violated=("roll upper",),
+        in_the_way=("slew lower", "slew upper"),
+        field="output_bounds.roll",
+    ),
+    "speeds too low to hover": Case(
+        settings=("controller.input_bounds.speed=[0.0, 190.0]", "controller.output_bounds.vz=[-0.1, 1.0]"),
+        acting=190.0,
+        violated=("vz lower",),
+        in_the_way=("speed upper",),
+        field="input_bounds.speed",
+    ),
+    "a polytope against a bound": Case(
+        settings=("controller.output_bounds.vz=[-0.2, 0.2]", f"controller.polytopes=[{CLIMB}]"),
+        state=moving("vz", 0.2),
+        violated=("climb lower",),
+        in_the_way=("vz upper",),
+        field="polytopes.climb.lower",
+    ),
+    "two polytopes": Case(
+        settings=(f"controller.polytopes=[{LEAST}, {MOST}]",),
+        violated=("least lower",),
+        in_the_way=("most upper",),
+        field="polytopes.least.lower",
+    ),
+    "falling too fast": Case(
+        settings=("controller.output_bounds.vz=[-0.5, 0.5]",),
+        state=moving("vz", -2.0),
+        violated=("vz lower",),
+        in_the_way=("slew upper",),
+        field="output_bounds.vz",
+    ),
+    "tightened bounds": Case(
+        settings=("controller.type=robust", "controller.tightening={}"),
+        state=moving("roll_rate", math.radians(9.0), euler=(math.radians(5.5), 0.0, 0.0)),
+        violated=("roll upper",),
+        in_the_way=("slew lower", "slew upper"),
+        field="output_bounds.roll",
+    ),
+    "outside the fence": Case(
+        settings=(f"controller.polytopes=[{FENCE}]",),
+        state=make_state(position=(5.0, 5.0, 0.0)),
+        violated=("fence upper",),
+        field="polytopes.fence.upper",
+    ),
+    "the last command outside the bounds": Case(
+        acting=290.0, violated=("speed upper",), in_the_way=("slew lower",), field="input_bounds.slew"
+    ),
+    "linearised along the trajectory": Case(
+        settings=("controller.type=robust", 'controller.linearisation="trajectory"'),
+        state=TILTED,
+        violated=("roll upper",),
+        in_the_way=("slew lower", "slew upper"),
+        field="output_bounds.roll",
+    ),
+    "rotors that lag, and a delay": Case(
+        settings=("controller.type=robust", "controller.rotor_lag=0.05", "controller.delay=0.02"),
+        state=TILTED,
+        violated=("roll upper",),
+        field="output_bounds.roll",
+    ),
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Asked:
+    """A controller that was asked once."""
+
+    scenario: Scenario
+    vehicle: Vehicle
+    controller: Controller
+    status: str
+    unanswered: Unanswered | None
+
+    @property
+    def found(self) -> dict[str, Any]:
+        assert self.unanswered is not None
+        found = diagnose(self.unanswered, self.scenario, self.vehicle)
+        assert found is not None
+        return found
+
+
+@pytest.fixture(scope="session")
+def file(tmp_path_factory: pytest.TempPathFactory) -> str:
+    """A hover whose file names no solver, so that its law may be another."""
+    text = scenario_path("hover").read_text(encoding="utf-8")
+    path = tmp_path_factory.mktemp("diagnosis") / "hover.toml"
+    path.write_text(text.replace('solver = "piqp-multistage"\n', ""), encoding="utf-8")
+    return str(path)
+
+
+def ask(file: str, case: Case, *more: str) -> Asked:
+    """Have the case's controller step once, without a simulator."""
+    scenario = load_scenario(file, [*case.settings, *more])
+    vehicle = build_vehicle(scenario)
+    controller = build_controller(scenario, vehicle)
+    acting = np.full(4, vehicle.hover_speed if case.acting is None else case.acting)
+    controller.reset(acting)
+    status = "plan_exhausted_error"
+    with contextlib.suppress(PlanExhaustedError):
+        status = controller.step(Moment(acting=acting), case.state, np.zeros((controller.horizon, 4))).status
+    return Asked(
+        scenario=scenario,
+        vehicle=vehicle,
+        controller=controller,
+        status=status,
+        unanswered=getattr(controller, "unanswered", None),
+    )
+
+
+def names(entries: list[dict[str, Any]]) -> set[str]:
+    return {f"{entry['name']} {entry['side']}" for entry in entries}
+
+
+def setting(field: str, value: object) -> str:
+    """As it is given to `--set`."""
+    if isinstance(value, dict):
+        return f"{field}={{{', '.join(f'{name} = {number}' for name, number in value.items())}}}"
+    return f"{field}={json.dumps(value)}"
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_each_culprit_is_named_and_each_suggestion_makes_it_feasible(name: str, file: str) -> None:
+    case = CASES[name]
+    asked = ask(file, case)
+    assert asked.status not in ACCEPTED
+    found = asked.found
+    assert found["feasible"] is False
+    assert names([entry for entry in found["conflict"] if entry["by"]]) == set(case.violated)
+    assert names([entry for entry in found["conflict"] if not entry["by"]]) >= set(case.in_the_way)
+    for part in (*case.violated, *case.in_the_way):
+        word, side = part.split()
+        assert re.search(rf"\b{word}\b[^;]*\b{side}\b", found["sentence"])
+    widened = [each["settings"] for each in found["suggestions"] if len(each["settings"]) == 1 and not each["after"]]
+    assert any(f"controller.{case.field}" in settings for settings in widened)
+    for suggestion in found["suggestions"]:
+        if suggestion["after"] is None:
+            changed = [setting(*item) for item in suggestion["settings"].items()]
+            assert ask(file, case, *changed).status in ACCEPTED, changed
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_the_least_violation_is_that_of_an_independent_program(name: str, file: str) -> None:
+    """Dense, of probed matrices, with bounds on inputs hard; where these cannot hold by themselves it has no answer."""
+    unanswered = ask(file, CASES[name]).unanswered
+    assert unanswered is not None
+    conflict = find_conflict(unanswered)
+    assert conflict is not None
+    least = ocp_peer.least_violation(unanswered.problem, given(unanswered))
+    inputs = {"two polytopes", "the last command outside the bounds"}
+    assert (least is None) == (name in inputs)
+    if least is not None:
+        assert conflict.total == pytest.approx(least, rel=1e-6)
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_a_little_less_than_the_smallest_bound_is_not_enough(name: str, file: str) -> None:
+    """The suggestion is rounded up by a hundredth of the change at most."""
+    case = CASES[name]
+    asked = ask(file, case)
+    for suggestion in asked.found["suggestions"]:
+        ((field, value), *others) = suggestion["settings"].items()
+        if others or not isinstance(value, list):
+            continue
+        before = get_field(tomllib.loads(asked.scenario.to_toml()), field)
+        less = [old + 0.97 * (new - old) for old, new in zip(before, value, strict=True)]
+        assert ask(file, case, setting(field, less)).status not in ACCEPTED
+
+
+def given(unanswered: Unanswered) -> ocp_peer.Period:
+    problem, query = unanswered.problem, unanswered.query
+    if query.steps is None:
+        return ocp_peer.period(problem, query.state, query.desired, query.u_before, query.rest)
+    A, B, c = query.steps
+    rest = query.rest or problem.rest
+    return ocp_peer.Period(A=A, B=B, c=c, state=query.state, desired=query.desired, u_before=query.u_before, rest=rest)
+
+
+def entry_of(asked: Asked, name: str) -> dict[str, Any]:
+    return next(entry for entry in asked.found["conflict"] if entry["name"] == name and entry["by"])
+
+
+def test_amounts_in_closed_form(file: str) -> None:
+    """By hand, from the model's matrices and the bounds on steps of -10 and 5 rad/s alone."""
+    tilted = ask(file, CASES["start beyond the tilt bound"])
+    assert tilted.unanswered is not None
+    model = tilted.unanswered.problem.model
+    row = model.B[INDEX["roll"]]
+    first = 20.0 + math.degrees(float(np.where(row > 0.0, -10.0, 5.0) @ row))
+    entry = entry_of(tilted, "roll")
+    assert entry["by"] == pytest.approx(first - 5.0, abs=1e-6)
+    assert (entry["start"], entry["unit"]) == (0.05, "deg")
+
+    lift = float(model.B[INDEX["vz"]].sum())  # of vz in a period, per rad/s of all rotors
+    falling = entry_of(ask(file, CASES["falling too fast"]), "vz")
+    after = -2.0 + lift * np.cumsum(5.0 * np.arange(1, 51))
+    assert falling["by"] == pytest.approx(-0.5 - after[0], abs=1e-6)
+    assert (falling["start"], falling["stop"]) == (0.05, pytest.approx(0.05 * np.count_nonzero(after < -0.5)))
+
+    hovering = ask(file, CASES["speeds too low to hover"])
+    entry, sinking = entry_of(hovering, "vz"), lift * (190.0 - float(model.u_bar[0])) * np.arange(1, 51)
+    assert entry["by"] == pytest.approx(-0.1 - sinking[-1], abs=1e-6)
+    assert (entry["start"], entry["stop"]) == (pytest.approx(0.05 * (1 + np.count_nonzero(sinking >= -0.1))), 2.5)
+
+    fenced = entry_of(ask(file, CASES["outside the fence"]), "fence")
+    assert fenced["by"] == pytest.approx(3.2, abs=1e-3)
+    assert (fenced["start"], fenced["unit"]) == (0.05, "m")
+    total = entry_of(ask(file, CASES["two polytopes"]), "least")
+    assert (total["by"], total["start"], total["stop"]) == (pytest.approx(20.0), 0.0, 2.45)
+    climbing = entry_of(ask(file, CASES["a polytope against a bound"]), "climb")
+    assert (climbing["by"], climbing["start"], climbing["stop"]) == (pytest.approx(0.3), 0.05, 2.5)
+
+    fast = entry_of(ask(file, CASES["the last command outside the bounds"]), "speed")
+    assert (fast["by"], fast["start"], fast["stop"]) == (pytest.approx(30.0), 0.0, 0.1)
+    assert fast["rotors"] == [1, 2, 3, 4]
+
+
+def test_a_tightened_bound_is_violated_by_what_is_beyond_it(file: str) -> None:
+    asked = ask(file, CASES["tightened bounds"])
+    assert asked.unanswered is not None
+    problem = asked.unanswered.problem
+    assert problem.bounds is not None
+    assert problem.bounds.margins is not None
+    row = problem.model.B[INDEX["roll"]]
+    unforced = float(problem.model.A[INDEX["roll"]] @ CASES["tightened bounds"].state)
+    rolls = unforced + float(np.where(row > 0.0, -10.0, 5.0) @ row)
+    assert rolls < math.radians(5.0)
+    beyond = rolls - (math.radians(5.0) - problem.bounds.margins[0, 0])
+    assert entry_of(asked, "roll")["by"] == pytest.approx(math.degrees(beyond), abs=1e-6)
+
+
+def test_times_are_those_of_the_prediction_behind_its_delay(file: str) -> None:
+    assert entry_of(ask(file, CASES["rotors that lag, and a delay"]), "roll")["start"] == 0.07
+
+
+def test_the_fallback_is_suggested_with_the_time_after_which_it_helps(file: str) -> None:
+    """The contract itself flies the model from there, and the optimum is accepted again in that period."""
+    case = CASES["start beyond the tilt bound"]
+    asked = ask(file, case)
+    after = next(each["after"] for each in asked.found["suggestions"] if "controller.fallback" in each["settings"])
+    guarded, model = ask(file, case, "controller.fallback={}").controller, asked.unanswered.problem.model  # type: ignore[union-attr]
+    assert isinstance(guarded, Guarded)
+    state, acting = case.state, np.full(4, asked.vehicle.hover_speed)
+    guarded.reset(acting)
+    for k in range(50):
+        command = guarded.step(Moment(time=0.05 * k, acting=acting), state, np.zeros((50, 4)))
+        if command.status in ACCEPTED:
+            break
+        state, acting = model.A @ state + model.B @ (command.speeds - model.u_bar), command.speeds
+    assert after == pytest.approx(0.05 * k)
+    assert k > 0
+
+
+def test_a_solver_that_fails_where_all_constraints_can_hold_is_told_apart(file: str) -> None:
+    asked = ask(file, CASES["start beyond the tilt bound"], "controller.output_bounds.roll=[-90.0, 90.0]")
+    assert asked.unanswered is None
+    controller = ask(file, CASES["start beyond the tilt bound"]).unanswered
+    assert controller is not None
+    level = controller.query._replace(state=make_state())
+    failed = Unanswered(problem=controller.problem, query=level, status="max_iterations", time=1.0)
+    found = diagnose(failed, asked.scenario, asked.vehicle)
+    assert found is not None
+    assert (found["feasible"], found["conflict"], found["suggestions"], found["advice"]) == (True, [], [], "")
+    assert found["sentence"].endswith("it is the solver that failed")
+
+
+def test_it_is_the_same_each_time_and_holds_copies(file: str) -> None:
+    asked = ask(file, CASES["outside the fence"])
+    assert json.dumps(asked.found) == json.dumps(ask(file, CASES["outside the fence"]).found)
+    assert asked.unanswered is not None
+    asked.controller.reset(np.full(4, asked.vehicle.hover_speed))
+    assert getattr(asked.controller, "unanswered", 1) is None
+
+
+def test_the_words_of_the_file(file: str) -> None:
+    found = ask(file, CASES["start beyond the tilt bound"]).found
+    assert found["sentence"].startswith(
+        "no answer at t = 0.00 s (primal_infeasible); cannot hold together: roll upper at +0.05 s .. +0.15 s by 14 deg;"
+    )
+    assert "slew of rotors 2, 4 lower; slew of rotors 2, 4 upper" in found["sentence"]
+    assert 'controller.type = "robust", controller.soft = {} (without the field solver)' in found["advice"]
+    assert "controller.fallback = {} (level hover; an answer again after 0.20 s, by the model)" in found["advice"]
+
+
+def test_the_example_of_the_documentation_is_what_a_flight_says(fly_once: Callable[..., Flight]) -> None:
+    found = fly_once("paper-constrained-lag20").diagnosis
+    assert found is not None
+    text = (Path(__file__).resolve().parents[2] / "docs" / "controllers.md").read_text(encoding="utf-8")
+    said, advised = re.findall(r"```text\n(no answer .*)\n(to try: .*); \.\.\.\n```", text)[0]
+    assert found["sentence"] == said
+    assert found["advice"].startswith(advised)
+
+
+def test_fallback_counts_as_for_good_from_the_longest_time_on_one_shifted_plan() -> None:
+    assert FallbackSettings().plan_age == metrics.UNRECOVERED
