@@ -8,14 +8,16 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
 from quadsim.controller import law_name
 from quadsim.errors import printable
-from quadsim.flight.rundir import Run
 from quadsim.report.table import ABSENT, Cell, Mark, Row, format_number
+
+if TYPE_CHECKING:
+    from quadsim.flight.rundir import Run
 
 Summary = Mapping[str, Any]
 _VERDICTS: Final = {
