@@ -262,7 +262,7 @@ class Scenario(Spec):
 
         Args:
             changes: new values by dotted path, as for `--set`: an entry of a list of tables by its name, or else its
-                index.  Units as in the file.
+                index.  Units as in the file; None for a field that is to be absent.
 
         Raises:
             InputError: there is no such field, or a value is not allowed.

@@ -37,7 +37,7 @@ def set_field(data: dict[str, Any], path: str, value: Any, *, asked: str, given:
     Args:
         data: the tables, changed in place.
         path: dotted.
-        value: of TOML.
+        value: of TOML; None for a field that is to be absent.
         asked: who asks, for the message.
         given: what was given, for the message; the path where absent.
 
@@ -47,7 +47,9 @@ def set_field(data: dict[str, Any], path: str, value: Any, *, asked: str, given:
     """
     *through, last = path.split(".")
     holder = _holder(data, through, asked=asked, given=given or path)
-    if isinstance(holder, dict):
+    if isinstance(holder, dict) and value is None:
+        holder.pop(last, None)
+    elif isinstance(holder, dict):
         holder[last] = value
     else:
         _require_numbers(holder, path, asked=asked, given=given or path)

@@ -6,6 +6,7 @@ import doctest
 import functools
 import importlib
 import inspect
+import math
 import os
 import signal
 import subprocess
@@ -94,6 +95,9 @@ def test_a_scenario_is_changed_field_by_field() -> None:
     assert (changed.controller.horizon, changed.vehicle.mass, changed.initial.euler) == (30, 4.2, [0.0, 0.0, 10.0])
     assert next(each.upper for each in changed.constraints if each.name == "roll") == 4.0
     assert scenario.vehicle.mass is None
+    assert changed.replace({"vehicle.mass": None}).vehicle.mass is None
+    one_sided = changed.replace({"constraints.roll.upper": None}).constraints
+    assert [each.upper for each in one_sided if each.name == "roll"] == [math.inf]
     with pytest.raises(InputError, match=r"controller\.horizn is not a field"):
         scenario.replace({"controller.horizn": 3})
     with pytest.raises(InputError, match="horizon"):
