@@ -72,6 +72,8 @@ build: setup  ## source archive and wheel in dist/; the wheel is installed alone
 docs: setup $(VENV)/.docs  ## build the documentation into site/, with a gallery of every scenario; a broken link fails
 	@PYTHONPATH=docs $(PY) docs/make_gallery.py
 	@$(VENV)/bin/zensical build --clean
+	@sed -i 's|https://unpkg.com/iframe-worker/shim|assets/iframe-worker.js|' site/*.html
+	@! grep -lE 'src="https?:|<link[^>]*href="https?:[^"]*\.(css|js)' site/*.html || { echo "These pages need a network." >&2; false; }
 	@echo "Done. Open site/index.html in a browser."
 
 numbers: setup $(VENV)/.peers  ## remake the numbers in README.md and docs/, but for those of the peers
