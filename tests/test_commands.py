@@ -82,7 +82,7 @@ def workplace(flown: Path, campaign: Path, tmp_path: Path, monkeypatch: pytest.M
         shutil.copytree(flown, tmp_path / "runs" / name)
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("scenarios.bench.mismatch.benchmark.QUICK_DURATION", 2.0)
-    monkeypatch.setattr("scenarios.bench.mismatch.benchmark.ProcessPoolExecutor", Here)
+    monkeypatch.setattr("scenarios.bench.worker_pool.ProcessPoolExecutor", Here)
 
 
 @pytest.fixture(scope="session")
