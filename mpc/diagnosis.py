@@ -17,7 +17,7 @@ It walks the constraints' rows and knows no kind.  Soft constraints never stand 
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, replace
 from typing import Final, NamedTuple
 
@@ -36,7 +36,7 @@ SOLVER: Final = "piqp-multistage"
 """Solves again what is suggested; the solver of the flight may be another."""
 FEASIBLE: Final = 1e-6
 """Violation, as a share of half of what lies between a row's bounds, below which it is rounding."""
-PRICED: Final = 1e-7
+PRICED: Final = 1e-9
 """Multiplier of a bound, in shares per share, above which it may be in the way."""
 
 
@@ -115,8 +115,7 @@ def find_conflict(unanswered: Unanswered) -> Conflict | None:
                 last=int(steps[-1]) + later,
             )
             sides[side] = _moved(sides[side], share + FEASIBLE)  # for what comes next, as wide as it has to be
-        priced = {side: one for side, one in present.items() if side in found.priced or side in giving}
-        held |= _needed(problem, query, priced, elastic, found.priced - giving.keys(), found.total)
+        held |= _needed(problem, query, present, elastic, found, giving)
     return Conflict(total=total, violated=violated, in_the_way=tuple(sorted(held - violated.keys())))
 
 
@@ -133,23 +132,34 @@ def smallest_widening(unanswered: Unanswered, sides: Collection[Side]) -> float 
 
 def has_answer(problem: Problem, query: Query) -> bool:
     """Whether the problem is solved, by PIQP as controllers have it solved."""
-    state, desired, u_before, rest, steps = query
-    if steps is None:
-        answer = QPSolver(SOLVER, problem).solve(state, desired, u_before, rest)
-    else:
-        answer = Relinearised(problem).solve(*steps, state, desired, u_before, (rest or problem.rest).u)
-    return answer.solution.status == SOLVED
+    return _set_up(problem, query)(query)
 
 
 def recovery(unanswered: Unanswered, plan: Array) -> int | None:
     """After how many periods of a plan (N, nu) the problem has an answer, by the model; None for not within it."""
     problem, query = unanswered.problem, unanswered.query
-    state = query.state
+    is_solved, state = _set_up(problem, query), query.state
     for i, (u, A, B, c) in enumerate(zip(plan, *_steps(problem, query), strict=True)):
         state = A @ state + B @ u + c
-        if has_answer(problem, query._replace(state=state, u_before=u)):
+        if is_solved(query._replace(state=state, u_before=u)):
             return i + 1
     return None
+
+
+def _set_up(problem: Problem, query: Query) -> Callable[[Query], bool]:
+    """Tells of queries of this one's kind whether they are solved."""
+    if query.steps is None:
+        fixed = QPSolver(SOLVER, problem)
+        return lambda query: fixed.solve(*query[:4]).solution.status == SOLVED
+    changing = Relinearised(problem)
+
+    def is_solved(query: Query) -> bool:
+        assert query.steps is not None
+        rest = query.rest or problem.rest
+        answer = changing.solve(*query.steps, query.state, query.desired, query.u_before, rest.u)
+        return answer.solution.status == SOLVED
+
+    return is_solved
 
 
 class _Relaxed(NamedTuple):
@@ -207,17 +217,23 @@ def _needed(
     query: Query,
     sides: Mapping[Side, Constraint],
     elastic: Collection[Side],
-    held: set[Side],
-    total: float,
+    found: _Relaxed,
+    giving: Collection[Side],
 ) -> set[Side]:
     """Of the bounds that are held, those without each of which there is less violation; no fewer would do."""
-    present = dict(sides)
-    for side in sorted(held):
+
+    def is_enough(kept: Mapping[Side, Constraint]) -> bool:
+        less = _relaxed(problem, query, kept, elastic)
+        return less is not None and less.total >= found.total * (1.0 - 1e-6) - FEASIBLE
+
+    # Multipliers may fall by powers of ten along a chain of bounds, each at the next step, to less than can be told.
+    priced = {side: one for side, one in sides.items() if side in found.priced or side in giving}
+    present = priced if is_enough(priced) else dict(sides)
+    for side in sorted(present.keys() - set(giving)):
         fewer = {other: one for other, one in present.items() if other != side}
-        found = _relaxed(problem, query, fewer, elastic)
-        if found is not None and found.total >= total * (1.0 - 1e-6) - FEASIBLE:
+        if is_enough(fewer):
             present = fewer
-    return held & present.keys()
+    return present.keys() - set(giving)
 
 
 def _relaxed(

@@ -47,6 +47,8 @@ _MOST_MARGINS: Final = 6
 
 _LAST: Final = 1.0
 """Time at a film's end [s] in which it says why a QP had no answer, or that the flight stayed in fallback."""
+_MOST_LINES: Final = 10
+"""Of that: more would reach the strip at the bottom."""
 _WIDEST: Final = 140
 """Letters of a line of that, between the frame's edge and the map."""
 
@@ -119,8 +121,11 @@ class Overlay:
         if reason is not None and time >= control.t[-1]:
             lines.append((f"aborted {reason}"[:130], 15, RED))
         if time >= self._footage.times[-1] - _LAST:
-            for sentence in failure_sentences(self._run.summary):
-                lines += [(part, 14, AMBER) for part in textwrap.wrap(sentence, _WIDEST)]
+            said = [textwrap.wrap(sentence, _WIDEST) for sentence in failure_sentences(self._run.summary)]
+            parts = [part for sentence in said for part in sentence]
+            lines += [(part, 14, AMBER) for part in parts[:_MOST_LINES]]
+            if len(parts) > _MOST_LINES:
+                lines.append(("... all of it is in summary.json", 14, AMBER))
         return lines
 
     def _answer(self, k: int) -> tuple[str, float, Colour]:

@@ -358,6 +358,11 @@ def test_the_last_second_says_why_there_was_no_answer_and_that_the_fallback_went
     assert " ".join(said[1:]) == f"{long} to try: more"
     assert len(said) == 5
     overlay.draw(np.full((720, 1280, 3), 128, np.uint8), 2)
+    endless = {"sentence": "; ".join([long] * 20), "advice": ""}
+    much = Overlay(replace(run, summary={**run.summary, "diagnosis": endless}), footage, width=1280, height=720)
+    shown = [text for text, _, _ in much._headlines(2)]
+    assert shown[-1] == "... all of it is in summary.json"
+    assert 38 + 27 * (len(shown) + 2) < 720 - 150
     small = Overlay(run, footage, width=480, height=270, compact=True)
     assert len(small._headlines(2)) == 2
 
