@@ -163,6 +163,7 @@ def assess(
     vehicle: Vehicle,
     *,
     bounds: Mapping[str, tuple[float, float]] | None = None,
+    tightened: Mapping[str, tuple[float, float]] | None = None,
     jumps: Sequence[float] = (),
 ) -> Feasibility:
     """Hold a demand against the vehicle's rotor speeds and a controller's bounds.
@@ -172,13 +173,15 @@ def assess(
         vehicle: its rotor limits.
         bounds: lower and upper bound by name, a state of `quadsim.state` in SI, `speed` [rad/s] of the rotors or `slew`
             [rad/s per period].
+        tightened: what tightening leaves of them at the end of the horizon, of states; looked at where the bounds
+            themselves are kept.
         jumps: times [s] at which the course jumps.
     """
     bounds = bounds or {}
     rotor = (float(needed.speeds.min()), float(needed.speeds.max()))
     tilt = math.degrees(float(needed.tilt.max()))
     yaw = math.degrees(float(np.abs(needed.state[:, INDEX["yaw"]]).max()))
-    problems = _problems(needed, vehicle, bounds)
+    problems = _problems(needed, vehicle, bounds, tightened or {})
     velocity = float(np.linalg.norm(needed.state[:, VELOCITY], axis=1).max())
     return Feasibility(
         tilt=tilt,
@@ -211,7 +214,12 @@ def _attitudes(pushed: Array, yaw: Array) -> Array:
     return np.stack([roll, pitch, yaw], axis=1)
 
 
-def _problems(needed: Demand, vehicle: Vehicle, bounds: Mapping[str, tuple[float, float]]) -> tuple[str, ...]:
+def _problems(
+    needed: Demand,
+    vehicle: Vehicle,
+    bounds: Mapping[str, tuple[float, float]],
+    tightened: Mapping[str, tuple[float, float]],
+) -> tuple[str, ...]:
     """A line for each side of a limit or bound that the demand leaves."""
     least, most = vehicle.speed_min, vehicle.speed_max
     found = _beyond("rotor speed", "rad/s", needed.speeds, (least, most), "limit")
@@ -225,7 +233,11 @@ def _problems(needed: Demand, vehicle: Vehicle, bounds: Mapping[str, tuple[float
         else:
             unit, scale = _DISPLAY.get(STATE_UNITS[INDEX[name]], (STATE_UNITS[INDEX[name]], 1.0))
             values = scale * needed.state[:, INDEX[name]]
-            found += _beyond(name, unit, values, (scale * lower, scale * upper), "bound")
+            beyond = _beyond(name, unit, values, (scale * lower, scale * upper), "bound")
+            if not beyond and name in tightened:
+                left = (scale * tightened[name][0], scale * tightened[name][1])
+                beyond = _beyond(name, unit, values, left, f"bound {scale * upper:.4g}, tightened to")
+            found += beyond
     return tuple(found)
 
 

@@ -53,6 +53,21 @@ def scenario(options: Namespace) -> int:
 
         print(json.dumps(scenario_schema(), indent=2))
         return EXIT_DONE
+    if options.vehicle is not None:
+        from scenarios.design.first_scenario import first_scenario
+
+        given = {"a scenario": options.scenario, "--set": options.settings, "--seed": options.seed}
+        for name, value in given.items():
+            if value:
+                raise ParameterError("", "--for", options.vehicle, f"given without {name}")
+        made = first_scenario(
+            load_vehicle(vehicle_path(options.vehicle)),
+            options.vehicle,
+            course=options.course,
+            law=options.controller,
+        )
+        print(made.to_toml(), end="")
+        return EXIT_DONE
     if options.scenario is None:
         raise InputError(
             f"scenario needs a name or a TOML file, or --schema (there are: {', '.join(scenario_names())})"
@@ -67,8 +82,18 @@ def scenario(options: Namespace) -> int:
 
 def vehicle(options: Namespace) -> int:
     """`quadsim vehicle`."""
-    from scenarios.commands.vehicle_sheet import make_sheet, sheet_tables, sheet_to_json
+    if options.template:
+        from scenarios.design.vehicle_template import vehicle_template
 
+        print(vehicle_template(), end="")
+        return EXIT_DONE
+    from scenarios.commands.vehicle_sheet import make_sheet, sheet_tables, sheet_to_json, shortfall_table
+    from scenarios.design.shortfalls import shortfalls
+
+    if options.vehicle is None:
+        raise InputError(
+            f"vehicle needs a name or a TOML file, or --template (there are: {', '.join(vehicle_names())})"
+        )
     path = vehicle_path(options.vehicle)
     loaded, sources = load_vehicle(path), vehicle_sources(path)
     if options.out is not None:
@@ -78,10 +103,14 @@ def vehicle(options: Namespace) -> int:
             raise ParameterError("", "--out", options.out, "a file ending in .png")
         render_portrait(loaded, Path(options.out))
     sheet = make_sheet(loaded)
+    missed = None if options.scenario is None else shortfalls(load_scenario(options.scenario), loaded)
     if options.json:
-        print(json.dumps(sheet_to_json(loaded, sheet, sources), indent=2))
+        about = {} if missed is None else {"scenario": options.scenario, "shortfalls": missed}
+        print(json.dumps(sheet_to_json(loaded, sheet, sources) | about, indent=2))
     else:
-        console.print_grids(sheet_tables(loaded, sheet, sources), options.out, prose=("unit", "source"))
+        tables = sheet_tables(loaded, sheet, sources)
+        tables += [] if missed is None else [shortfall_table(options.scenario, missed)]
+        console.print_grids(tables, options.out, prose=("unit", "source", "what and why"))
     return EXIT_DONE
 
 

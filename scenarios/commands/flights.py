@@ -11,7 +11,7 @@ from quadsim.outputs import real_path, require_file
 from scenarios.commands import EXIT_DONE, EXIT_FAILED, console
 from scenarios.commands.common import load, print_summary
 from scenarios.commands.junit import write_junit
-from scenarios.courses.feasibility_check import report
+from scenarios.courses.feasibility_check import fitting, report
 from scenarios.parts.vehicle import build_vehicle
 from scenarios.reaudit import reaudit
 from scenarios.run import Outputs, fly_scenario, run_scenario, summarise
@@ -57,4 +57,7 @@ def check(options: Namespace) -> int:
 def _announce(scenario: Scenario, options: Namespace) -> None:
     """Say what the course asks for, before it is flown; the summary says it again."""
     if not options.json:
-        console.print_notice(report(scenario, build_vehicle(scenario)).sentence)
+        vehicle = build_vehicle(scenario)
+        asked = report(scenario, vehicle)
+        fits = fitting(scenario, vehicle) if asked.problems and console.is_watched() else ""
+        console.print_notice(f"{asked.sentence} {fits}".rstrip())

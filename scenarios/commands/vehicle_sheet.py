@@ -4,45 +4,23 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, Final
 
 import numpy as np
-from scipy.optimize import linprog
 
 from mpc.model import continuous_model, discretise
 from quadsim.report.table import Cell, Grid, format_number
 from quadsim.state import INDEX, Array
 from quadsim.vehicle import N_ROTORS, VEHICLE_UNITS, Vehicle
+from scenarios.design.authority import TorqueRange, authority, torque_ranges
+from scenarios.design.loop import delay_margin
+from scenarios.design.tuning import tune
 
-AXES: Final = ("x", "y", "z")
 SHEET_PERIOD: Final = 0.05
 """Control period of the discrete poles [s], the paper's."""
 _RPM: Final = 60.0 / (2.0 * math.pi)
-
-
-@dataclass(frozen=True, kw_only=True)
-class TorqueRange:
-    """The torques about one body axis that hover leaves room for.
-
-    Attributes:
-        axis: x, y or z.
-        lowest: torque [N m].
-        highest: torque [N m].
-        lowest_pure: the same with no torque about the other two axes [N m].
-        highest_pure: the same with no torque about the other two axes [N m].
-        lowest_acceleration: what `lowest` gives from rest [rad/s^2].
-        highest_acceleration: what `highest` gives from rest [rad/s^2].
-    """
-
-    axis: str
-    lowest: float
-    highest: float
-    lowest_pure: float
-    highest_pure: float
-    lowest_acceleration: float
-    highest_acceleration: float
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -67,6 +45,13 @@ class VehicleSheet:
         period: tau_s [s].
         lag_poles: of the rotors' speeds when they rise and fall, continuous [1/s], as far as the file gives them.
         discrete_lag_poles: the same at `period` [-].
+        sink_acceleration: largest downward acceleration from hover, level [m/s^2].
+        time_constants: of a controller made for the vehicle (`scenarios.design.tuning`), one over each bandwidth, by
+            axis [s].
+        limited_by: what the bandwidth of x and y is the limit of: lag, torque or period.
+        tilt_bound: of that controller [deg].
+        control_period: of it [s].
+        delay_margin: delay beyond what the model knows of that its loop stands, without bounds [s].
     """
 
     weight: float
@@ -85,6 +70,12 @@ class VehicleSheet:
     period: float
     lag_poles: dict[str, float]
     discrete_lag_poles: dict[str, float]
+    sink_acceleration: float
+    time_constants: dict[str, float]
+    limited_by: str
+    tilt_bound: float
+    control_period: float
+    delay_margin: float
 
 
 def make_sheet(vehicle: Vehicle, *, period: float = SHEET_PERIOD) -> VehicleSheet:
@@ -97,16 +88,16 @@ def make_sheet(vehicle: Vehicle, *, period: float = SHEET_PERIOD) -> VehicleShee
     A_c, B_c = continuous_model(vehicle)
     A, _ = discretise(A_c, B_c, period)
     chains = integrator_chains(A_c)
-    ratio = (vehicle.speed_max / vehicle.hover_speed) ** 2
+    can, tuning = authority(vehicle), tune(vehicle)
     lags = {name: value for name in ("rotor_rise", "rotor_fall") if (value := getattr(vehicle, name)) is not None}
     return VehicleSheet(
         weight=vehicle.mass * vehicle.gravity,
         hover_speed=vehicle.hover_speed,
         hover_speed_rpm=_RPM * vehicle.hover_speed,
-        speed_range_used=(vehicle.hover_speed - vehicle.speed_min) / (vehicle.speed_max - vehicle.speed_min),
-        thrust_to_weight=ratio,
-        climb_acceleration=(ratio - 1.0) * vehicle.gravity,
-        steady_tilt=math.degrees(math.acos(min(1.0, 1.0 / ratio))),
+        speed_range_used=can.hover_share,
+        thrust_to_weight=can.thrust_to_weight,
+        climb_acceleration=can.climb,
+        steady_tilt=math.degrees(can.steady_tilt),
         torques=torque_ranges(vehicle),
         thrust_slope=2.0 * vehicle.thrust_coefficient * vehicle.hover_speed,
         input_slopes={
@@ -119,30 +110,17 @@ def make_sheet(vehicle: Vehicle, *, period: float = SHEET_PERIOD) -> VehicleShee
         period=period,
         lag_poles={name: -1.0 / value for name, value in lags.items()},
         discrete_lag_poles={name: math.exp(-period / value) for name, value in lags.items()},
+        sink_acceleration=can.sink,
+        time_constants={
+            "x, y": 1.0 / tuning.bandwidth,
+            "z": 1.0 / tuning.height,
+            "yaw": 1.0 / tuning.heading,
+        },
+        limited_by=tuning.limited_by,
+        tilt_bound=math.degrees(tuning.tilt),
+        control_period=tuning.period,
+        delay_margin=delay_margin(vehicle, tuning),
     )
-
-
-def torque_ranges(vehicle: Vehicle) -> tuple[TorqueRange, ...]:
-    """The largest torques of each sign about x, y, z with the thrust kept at the weight and every rotor in its range.
-
-    A linear programme in the squared speeds v_i = w_i^2: the torque about an axis is a row of the allocation matrix
-    times v, the thrust is its first row times v, and v_i lies between the squares of the speed limits.
-    """
-    ranges = []
-    for axis, name in enumerate(AXES):
-        (low, high), (low_pure, high_pure) = (_extremes(vehicle, 1 + axis, pure=pure) for pure in (False, True))
-        ranges.append(
-            TorqueRange(
-                axis=name,
-                lowest=low,
-                highest=high,
-                lowest_pure=low_pure,
-                highest_pure=high_pure,
-                lowest_acceleration=low / vehicle.inertia[axis],
-                highest_acceleration=high / vehicle.inertia[axis],
-            )
-        )
-    return tuple(ranges)
 
 
 def integrator_chains(A_c: Array) -> tuple[int, ...]:
@@ -188,6 +166,12 @@ def sheet_tables(vehicle: Vehicle, sheet: VehicleSheet, sources: Mapping[str, st
             ],
             note="thrust kept at the weight, every rotor within its range; pure: no torque about the other axes",
         ),
+        _grid(
+            "what a controller made for it can do",
+            ("", "value", "unit"),
+            _abilities(vehicle, sheet),
+            note="quadsim scenario --for VEHICLE makes it; the rules: scenarios/design/tuning.py",
+        ),
         _grid("linear model at hover", ("", "continuous [1/s]", f"discrete, {1e3 * sheet.period:g} ms"), _poles(sheet)),
         _grid(
             "parameters",
@@ -202,26 +186,10 @@ def sheet_tables(vehicle: Vehicle, sheet: VehicleSheet, sources: Mapping[str, st
     ]
 
 
-def _extremes(vehicle: Vehicle, row: int, *, pure: bool) -> tuple[float, float]:
-    """Smallest and largest torque [N m] of one row of the allocation matrix; `pure`: the other torques vanish."""
-    top = vehicle.speed_max**2
-    matrix = top * vehicle.allocation  # in v / speed_max^2, so that the programme is well scaled
-    units = np.abs(matrix).max(axis=1)
-    fixed = [0, *(other for other in (1, 2, 3) if pure and other != row)]
-    equal = np.zeros(len(fixed))
-    equal[0] = vehicle.mass * vehicle.gravity / units[0]
-    found = []
-    for sign in (1.0, -1.0):
-        solution = linprog(
-            sign * matrix[row] / units[row],
-            A_eq=matrix[fixed] / units[fixed, None],
-            b_eq=equal,
-            bounds=(vehicle.speed_min**2 / top, 1.0),
-            method="highs",
-        )
-        assert solution.success, "hover itself is feasible"
-        found.append(float(sign * solution.fun * units[row]))
-    return found[0], found[1]
+def shortfall_table(scenario: str, missed: Sequence[str]) -> Grid:
+    """Which bounds of a scenario a vehicle cannot meet; see `scenarios.design.shortfalls`."""
+    lines = [(str(i + 1), text) for i, text in enumerate(missed)] or [("-", "none: the vehicle meets all of them")]
+    return _grid(f"bounds of {scenario} that it cannot meet", ("", "what and why"), lines)
 
 
 def _figures(vehicle: Vehicle, sheet: VehicleSheet) -> list[tuple[str, ...]]:
@@ -244,6 +212,26 @@ def _figures(vehicle: Vehicle, sheet: VehicleSheet) -> list[tuple[str, ...]]:
     ]
 
 
+def _abilities(vehicle: Vehicle, sheet: VehicleSheet) -> list[tuple[str, ...]]:
+    why = {"lag": "the rotors' lag", "torque": "torque in reserve", "period": "the shortest control period"}
+    level = vehicle.gravity * math.tan(math.radians(sheet.tilt_bound))
+    return [
+        ("largest sink acceleration", format_number(sheet.sink_acceleration), "m/s^2"),
+        ("tilt bound", format_number(sheet.tilt_bound), "deg"),
+        ("largest level acceleration within it", format_number(level), "m/s^2"),
+        *(
+            (
+                f"time constant of {axis}" + (f", limited by {why[sheet.limited_by]}" if axis == "x, y" else ""),
+                format_number(time),
+                "s",
+            )
+            for axis, time in sheet.time_constants.items()
+        ),
+        ("delay that it stands beyond what it knows of", format_number(sheet.delay_margin), "s"),
+        ("control period", format_number(sheet.control_period), "s"),
+    ]
+
+
 def _poles(sheet: VehicleSheet) -> list[tuple[str, ...]]:
     chains = ", ".join(str(length) for length in sheet.integrator_chains)
     body = f"rigid body: {len(sheet.continuous_poles)} poles, chains of {chains} integrators"
@@ -254,7 +242,7 @@ def _poles(sheet: VehicleSheet) -> list[tuple[str, ...]]:
     return lines
 
 
-def _grid(title: str, head: tuple[str, ...], lines: list[tuple[str, ...]], note: str = "") -> Grid:
+def _grid(title: str, head: tuple[str, ...], lines: Sequence[tuple[str, ...]], note: str = "") -> Grid:
     cells = tuple(tuple(Cell(text=text) for text in line) for line in lines)
     return Grid(key=head[0], title=title, head=head, lines=cells, note=note)
 

@@ -49,9 +49,7 @@ BASELINE_SHARE: Final = 0.9
 they ask for."""
 GRID: Final = 0.2
 """Durations are multiples of it [s], and so of every control period."""
-_EIGHT_PEAK: Final = float(
-    np.hypot(np.sin(angle := np.linspace(0.0, math.pi, 721)), 2.0 * np.sin(2.0 * angle)).max()
-)
+_EIGHT_PEAK: Final = float(np.hypot(np.sin(angle := np.linspace(0.0, math.pi, 721)), 2.0 * np.sin(2.0 * angle)).max())
 """Largest |d2p/dt2| of the figure eight (a sin wt, a/2 sin 2wt), over a w^2."""
 
 
@@ -168,14 +166,15 @@ def _head(vehicle: Vehicle, tuning: Tuning, course: str, law: str) -> tuple[str,
     margin = delay_margin(vehicle, tuning)
     return (
         f"A first flight of {_description(course, vehicle)}.",
-        f"Made by: quadsim scenario --for VEHICLE --course {course}" + ("" if law == "robust" else f" --controller {law}"),
+        f"Made by: quadsim scenario --for VEHICLE --course {course}"
+        + ("" if law == "robust" else f" --controller {law}"),
         "",
-        f"Thrust to weight {can.thrust_to_weight:.3g}, so at most {math.degrees(can.steady_tilt):.3g} deg of steady tilt; "
-        f"angular acceleration in reserve at hover",
+        f"Thrust to weight {can.thrust_to_weight:.3g}: at most {math.degrees(can.steady_tilt):.3g} deg of steady tilt; "
+        "angular acceleration in reserve at hover",
         f"{can.turning[0]:.3g}, {can.turning[1]:.3g}, {can.turning[2]:.3g} rad/s^2 about x, y, z.",
-        f"The loop's bandwidth is w = {tuning.bandwidth:.3g} rad/s for x and y, limited by {limits[tuning.limited_by]};",
+        f"The loop's bandwidth for x and y is w = {tuning.bandwidth:.3g} rad/s, limited by {limits[tuning.limited_by]};",
         f"{tuning.height:.3g} rad/s for z, {tuning.heading:.3g} rad/s for yaw. "
-        f"Without bounds it stands {1e3 * margin:.3g} ms more delay than the model knows of.",
+        f"Without bounds it stands {1e3 * margin:.3g} ms more delay than it knows of.",
         "Weights by Bryson's rule, 1 / (largest accepted deviation)^2; all rules and sources: scenarios/design/tuning.py.",
     )
 
@@ -238,7 +237,9 @@ def _robust(vehicle: Vehicle, tuning: Tuning) -> Iterator[Entry]:
         return Entry(table=f"controller{table}", key=key, value=value, why=why)
 
     yield line("type", "robust", "")
-    yield line("horizon", tuning.horizon, f"N, periods: {HORIZON_TIMES:g} / w = {HORIZON_TIMES / tuning.bandwidth:.3g} s")
+    yield line(
+        "horizon", tuning.horizon, f"N, periods: {HORIZON_TIMES:g} / w = {HORIZON_TIMES / tuning.bandwidth:.3g} s"
+    )
     known = "the vehicle's rotor_rise is predicted" if lag else "the vehicle gives no lag"
     yield line("rotor_lag", "vehicle" if lag else 0.0, known)
     yield line("heading", True, "the hover model is turned by the present yaw")
@@ -333,5 +334,3 @@ def _text(value: Any) -> str:
     if isinstance(value, list):
         return "[" + ", ".join(map(_text, value)) + "]"
     return json.dumps(value, ensure_ascii=False) if isinstance(value, bool | str) else repr(value)
-
-

@@ -134,7 +134,7 @@ def tune(vehicle: Vehicle) -> Tuning:
 
 
 def _bandwidth(can: Authority, tilt: float) -> tuple[float, Literal["lag", "torque", "period"], float]:
-    """w [rad/s], what limits it, and the period [s]."""
+    """The bandwidth w [rad/s], what limits it, and the period [s]."""
     for period in PERIODS:
         limits: dict[Literal["lag", "torque", "period"], float] = {
             "lag": 1.0 / (LAG_RATIO * (can.lag + 0.5 * period)),
