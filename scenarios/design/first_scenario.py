@@ -172,10 +172,11 @@ def _head(vehicle: Vehicle, tuning: Tuning, course: str, law: str) -> tuple[str,
         f"Thrust to weight {can.thrust_to_weight:.3g}: at most {math.degrees(can.steady_tilt):.3g} deg of steady tilt; "
         "angular acceleration in reserve at hover",
         f"{can.turning[0]:.3g}, {can.turning[1]:.3g}, {can.turning[2]:.3g} rad/s^2 about x, y, z.",
-        f"The loop's bandwidth for x and y is w = {tuning.bandwidth:.3g} rad/s, limited by {limits[tuning.limited_by]};",
+        f"The loop's bandwidth for x and y is w = {tuning.bandwidth:.3g} rad/s,",
+        f"limited by {limits[tuning.limited_by]};",
         f"{tuning.height:.3g} rad/s for z, {tuning.heading:.3g} rad/s for yaw. "
         f"Without bounds it stands {1e3 * margin:.3g} ms more delay than it knows of.",
-        "Weights by Bryson's rule, 1 / (largest accepted deviation)^2; all rules and sources: scenarios/design/tuning.py.",
+        "Weights by Bryson's rule, 1 / (largest accepted deviation)^2; rules and sources: scenarios/design/tuning.py.",
     )
 
 
