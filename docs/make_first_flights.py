@@ -1,7 +1,7 @@
-"""Remake docs/first-flights.md: first scenarios of shipped and drawn vehicles, each flown once: `make first-flights`.
+"""Remake docs/first-flights.md, first scenarios of shipped and drawn vehicles, flown once: `make first-flights`.
 
-No clock decides anything here.  The vehicles are drawn by tests/plausible_vehicles.py; the flights are made and flown by
-tests/first_flights.py, as the tests do with some of them.
+No clock decides anything here.  The vehicles are drawn by tests/plausible_vehicles.py; the flights are made and flown
+by tests/first_flights.py, as the tests do with some of them.
 """
 
 from __future__ import annotations
@@ -14,40 +14,54 @@ from pathlib import Path
 
 from first_flights import DRAWN, LARGEST_RMS, SEED, FirstFlight, fly_first, vehicles
 from make_numbers import markdown
+from plausible_vehicles import HEAVIEST, LIGHTEST, QUICKEST, SLOWEST, STRONGEST, WEAKEST
 
 from quadsim.vehicle import Vehicle
 from scenarios.design.first_scenario import COURSES, LAWS, SHARE
-from scenarios.design.tuning import STEEPEST, tune
+from scenarios.design.tuning import STEEPEST, THRUST_SHARE, tune
 
 PAGE = Path(__file__).resolve().parent / "first-flights.md"
 Flights = dict[tuple[str, str, str], FirstFlight]
 """By vehicle, course and law."""
+STEEPER = math.radians(55.0)
+"""A tilt bound to try beside the rule's [rad]."""
 
 
-def page(flown: list[Vehicle], flights: Flights, causes: Flights) -> str:
+def page(flown: list[Vehicle], flights: Flights, causes: Flights, steeper: dict[str, FirstFlight]) -> str:
     """The whole page."""
     robust = [flight for (_, _, law), flight in flights.items() if law == LAWS[0]]
     met = sum(flight.meets_the_bar for flight in robust)
+    missed = [name for name, flight in steeper.items() if not flight.meets_the_bar]
     parts = [
         "# First flights\n\nMade by `make first-flights`; nothing here is typed by hand.\n\n"
-        "`quadsim scenario --for VEHICLE --course COURSE [--controller NAME]` makes a scenario from a vehicle's numbers "
-        "([own-vehicle.md](own-vehicle.md)). Here it\nis made and flown once, untouched, for the vehicles that ship and "
-        f"for {DRAWN} drawn at random (seed {SEED}): 30 g to 25 kg, thrust to weight\n1.6 to 6, rotor lag 10 to 120 ms, X "
-        "and plus, with lag, inertia and drag in the plant.\n",
-        f"The bar for `robust`: hover, 1 m steps and a figure eight at {100 * SHARE:g} % of the largest acceleration within "
-        f"the tilt bound, every\nconstraint held at every instant, RMS error below {100 * LARGEST_RMS:g} % of the course's "
-        f"size. It is met in **{met} of {len(robust)}** flights. The tilt bound is\n{math.degrees(STEEPEST):g} deg or what "
-        "85 % of the thrust holds: beyond, it is not the vehicle but the model linearised at hover that ends.\n",
-        "The baselines fly the same courses with their own defaults, which know neither lag nor bounds on tilt nor the "
-        "course ahead; no error\nis required of them, only the bounds.\n",
-        "Each cell: RMS error in percent of the course's size, then the room left to the tilt bound in percent of it; "
-        "**lost** or **violated**\nwhere it was.\n",
+        "`quadsim scenario --for VEHICLE --course COURSE [--controller NAME]` makes a scenario from a vehicle's\n"
+        "numbers ([own-vehicle.md](own-vehicle.md)). Here it is made and flown once, untouched, for the vehicles that\n"
+        f"ship and for {DRAWN} drawn at random (seed {SEED}): {1e3 * LIGHTEST:g} g to {HEAVIEST:g} kg, "
+        f"thrust to weight {WEAKEST:g} to {STRONGEST:g},\nrotor lag {1e3 * QUICKEST:g} to {1e3 * SLOWEST:g} ms, "
+        "X and plus, with lag, inertia and drag in the plant.\n",
+        f"The bar for `robust`: hover, 1 m steps and a figure eight at {100 * SHARE:g} % of the largest acceleration "
+        "within\nthe tilt bound, every constraint held at every instant, RMS error below "
+        f"{100 * LARGEST_RMS:g} % of the course's size.\nIt is met in **{met} of {len(robust)}** flights.\n",
+        f"The tilt bound is {math.degrees(STEEPEST):g} deg, or what {100 * THRUST_SHARE:g} % of the thrust holds where "
+        "that is less. Most of these vehicles could\nhold more; the model linearised at hover is what ends. With a "
+        f"bound of {math.degrees(STEEPER):g} deg the figure eight at {100 * SHARE:g} % of\nwhat that allows meets the "
+        f"bar with {sum(flight.meets_the_bar for flight in steeper.values())} of {len(steeper)} vehicles"
+        + (f", but not with {_listed(missed)}" if missed else "")
+        + ".\n",
+        "The baselines fly the same courses with their own defaults, which plan nothing ahead; no error is required "
+        "of\nthem, only the bounds.\n",
+        "Each cell: RMS error in percent of the course's size, then the room left to the tilt bound in percent of it;\n"
+        "**lost** or **violated** where it was. Lag is the longer of rise and fall, w the bandwidth of x and y.\n",
     ]
     for law in LAWS:
         rows = [_row(vehicle, flights, law) for vehicle in flown]
         parts.append(f"## {law}\n\n{_summary(flights, law)}\n\n{markdown([_head(), *rows])}")
     parts.append(_failures(flights, causes))
     return "\n".join(parts)
+
+
+def _listed(names: list[str]) -> str:
+    return ", ".join(names)
 
 
 def _head() -> tuple[str, ...]:
@@ -78,7 +92,9 @@ def _cell(flight: FirstFlight) -> str:
 
 def _summary(flights: Flights, law: str) -> str:
     held = [flight for (_, _, name), flight in flights.items() if name == law]
-    texts = [f"{sum(flight.outcome == 'satisfied' for flight in held)} of {len(held)} flights with every constraint held"]
+    texts = [
+        f"{sum(flight.outcome == 'satisfied' for flight in held)} of {len(held)} flights with every constraint held"
+    ]
     for course in COURSES:
         rms = [
             100.0 * flight.rms
@@ -104,9 +120,9 @@ def _failures(flights: Flights, causes: Flights) -> str:
     return (
         "## What was not flown\n\n"
         + "\n".join(lines)
-        + "\n\nThe drag of the body is MuJoCo's, on an ellipsoid, whose added mass turns a body that moves obliquely "
-        "further across its way (the Munk\nmoment). On a light body at several metres per second that is an instability "
-        "which rotors of 100 ms lag hardly outrun.\n"
+        + "\n\nThe drag of the body is MuJoCo's, on an ellipsoid, whose added mass turns a body that moves obliquely\n"
+        "further across its way (the Munk moment). On a light body at several metres per second that is an\n"
+        "instability which rotors of 100 ms lag hardly outrun.\n"
     )
 
 
@@ -122,8 +138,11 @@ def main() -> None:
     found = vehicles()
     flights = dict(_flown(found))
     bare = {vehicle.name: replace(vehicle, body_drag=None) for vehicle in found}
-    causes = {key: fly_first(bare[key[0]], *key[1:]) for key, flight in flights.items() if flight.outcome != "satisfied"}
-    PAGE.write_text(page(found, flights, causes), encoding="utf-8")
+    causes = {
+        key: fly_first(bare[key[0]], *key[1:]) for key, flight in flights.items() if flight.outcome != "satisfied"
+    }
+    steeper = {vehicle.name: fly_first(vehicle, "figure-eight", LAWS[0], steepest=STEEPER) for vehicle in found}
+    PAGE.write_text(page(found, flights, causes, steeper), encoding="utf-8")
 
 
 if __name__ == "__main__":

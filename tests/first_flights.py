@@ -12,6 +12,7 @@ from quadsim.assets import vehicle_names, vehicle_path
 from quadsim.flight.metrics import peak_tilt, tracking
 from quadsim.vehicle import VEHICLE_UNITS, Vehicle, load_vehicle
 from scenarios.design.first_scenario import first_scenario
+from scenarios.design.tuning import STEEPEST
 from scenarios.loading import parse_scenario
 from scenarios.run import fly_scenario
 
@@ -53,9 +54,9 @@ def vehicles() -> list[Vehicle]:
     return [*(load_vehicle(vehicle_path(name)) for name in vehicle_names()), *plausible_vehicles(DRAWN, SEED)]
 
 
-def fly_first(vehicle: Vehicle, course: str, law: str) -> FirstFlight:
-    """Make a first scenario and fly it once."""
-    made = first_scenario(vehicle, vehicle.name, course=course, law=law)
+def fly_first(vehicle: Vehicle, course: str, law: str, *, steepest: float = STEEPEST) -> FirstFlight:
+    """Make a first scenario, with a tilt bound of at most `steepest` [rad], and fly it once."""
+    made = first_scenario(vehicle, vehicle.name, course=course, law=law, steepest=steepest)
     numbers = {name: value for name in VEHICLE_UNITS if (value := getattr(vehicle, name)) is not None}
     given = {name: list(value) if isinstance(value, tuple) else value for name, value in numbers.items()}
     flight = fly_scenario(parse_scenario(made.to_data() | {"vehicle": {"file": vehicle.name, **given}}))

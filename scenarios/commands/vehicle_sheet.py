@@ -11,6 +11,7 @@ from typing import Any, Final
 import numpy as np
 
 from mpc.model import continuous_model, discretise
+from quadsim.errors import ParameterError
 from quadsim.report.table import Cell, Grid, format_number
 from quadsim.state import INDEX, Array
 from quadsim.vehicle import N_ROTORS, VEHICLE_UNITS, Vehicle
@@ -21,6 +22,27 @@ from scenarios.design.tuning import tune
 SHEET_PERIOD: Final = 0.05
 """Control period of the discrete poles [s], the paper's."""
 _RPM: Final = 60.0 / (2.0 * math.pi)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Designed:
+    """What a controller made for a vehicle can do; see `scenarios.design.tuning`.
+
+    Attributes:
+        time_constants: one over the bandwidth of each axis [s].
+        limited_by: what the bandwidth of x and y is the limit of: lag, torque or period.
+        tilt_bound: [deg].
+        level_acceleration: largest within it [m/s^2].
+        period: control period [s].
+        delay_margin: delay beyond what the model knows of that its loop stands, without bounds [s].
+    """
+
+    time_constants: dict[str, float]
+    limited_by: str
+    tilt_bound: float
+    level_acceleration: float
+    period: float
+    delay_margin: float
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,12 +68,7 @@ class VehicleSheet:
         lag_poles: of the rotors' speeds when they rise and fall, continuous [1/s], as far as the file gives them.
         discrete_lag_poles: the same at `period` [-].
         sink_acceleration: largest downward acceleration from hover, level [m/s^2].
-        time_constants: of a controller made for the vehicle (`scenarios.design.tuning`), one over each bandwidth, by
-            axis [s].
-        limited_by: what the bandwidth of x and y is the limit of: lag, torque or period.
-        tilt_bound: of that controller [deg].
-        control_period: of it [s].
-        delay_margin: delay beyond what the model knows of that its loop stands, without bounds [s].
+        designed: what a controller made for the vehicle can do; None where hover leaves nothing to control it with.
     """
 
     weight: float
@@ -71,11 +88,7 @@ class VehicleSheet:
     lag_poles: dict[str, float]
     discrete_lag_poles: dict[str, float]
     sink_acceleration: float
-    time_constants: dict[str, float]
-    limited_by: str
-    tilt_bound: float
-    control_period: float
-    delay_margin: float
+    designed: Designed | None
 
 
 def make_sheet(vehicle: Vehicle, *, period: float = SHEET_PERIOD) -> VehicleSheet:
@@ -88,7 +101,7 @@ def make_sheet(vehicle: Vehicle, *, period: float = SHEET_PERIOD) -> VehicleShee
     A_c, B_c = continuous_model(vehicle)
     A, _ = discretise(A_c, B_c, period)
     chains = integrator_chains(A_c)
-    can, tuning = authority(vehicle), tune(vehicle)
+    can = authority(vehicle)
     lags = {name: value for name in ("rotor_rise", "rotor_fall") if (value := getattr(vehicle, name)) is not None}
     return VehicleSheet(
         weight=vehicle.mass * vehicle.gravity,
@@ -111,14 +124,21 @@ def make_sheet(vehicle: Vehicle, *, period: float = SHEET_PERIOD) -> VehicleShee
         lag_poles={name: -1.0 / value for name, value in lags.items()},
         discrete_lag_poles={name: math.exp(-period / value) for name, value in lags.items()},
         sink_acceleration=can.sink,
-        time_constants={
-            "x, y": 1.0 / tuning.bandwidth,
-            "z": 1.0 / tuning.height,
-            "yaw": 1.0 / tuning.heading,
-        },
+        designed=_designed(vehicle),
+    )
+
+
+def _designed(vehicle: Vehicle) -> Designed | None:
+    try:
+        tuning = tune(vehicle)
+    except ParameterError:
+        return None
+    return Designed(
+        time_constants={"x, y": 1.0 / tuning.bandwidth, "z": 1.0 / tuning.height, "yaw": 1.0 / tuning.heading},
         limited_by=tuning.limited_by,
         tilt_bound=math.degrees(tuning.tilt),
-        control_period=tuning.period,
+        level_acceleration=vehicle.gravity * tuning.acceleration,
+        period=tuning.period,
         delay_margin=delay_margin(vehicle, tuning),
     )
 
@@ -169,7 +189,7 @@ def sheet_tables(vehicle: Vehicle, sheet: VehicleSheet, sources: Mapping[str, st
         _grid(
             "what a controller made for it can do",
             ("", "value", "unit"),
-            _abilities(vehicle, sheet),
+            _abilities(sheet),
             note="quadsim scenario --for VEHICLE makes it; the rules: scenarios/design/tuning.py",
         ),
         _grid("linear model at hover", ("", "continuous [1/s]", f"discrete, {1e3 * sheet.period:g} ms"), _poles(sheet)),
@@ -212,23 +232,23 @@ def _figures(vehicle: Vehicle, sheet: VehicleSheet) -> list[tuple[str, ...]]:
     ]
 
 
-def _abilities(vehicle: Vehicle, sheet: VehicleSheet) -> list[tuple[str, ...]]:
+def _abilities(sheet: VehicleSheet) -> list[tuple[str, ...]]:
+    sinks: tuple[str, ...] = ("largest sink acceleration", format_number(sheet.sink_acceleration), "m/s^2")
+    made = sheet.designed
+    if made is None:
+        return [sinks, ("none can be made: hover leaves nothing to control it with", "-", "")]
     why = {"lag": "the rotors' lag", "torque": "torque in reserve", "period": "the shortest control period"}
-    level = vehicle.gravity * math.tan(math.radians(sheet.tilt_bound))
+    labels = {"x, y": f"x, y, limited by {why[made.limited_by]}"}
     return [
-        ("largest sink acceleration", format_number(sheet.sink_acceleration), "m/s^2"),
-        ("tilt bound", format_number(sheet.tilt_bound), "deg"),
-        ("largest level acceleration within it", format_number(level), "m/s^2"),
+        sinks,
+        ("tilt bound", format_number(made.tilt_bound), "deg"),
+        ("largest level acceleration within it", format_number(made.level_acceleration), "m/s^2"),
         *(
-            (
-                f"time constant of {axis}" + (f", limited by {why[sheet.limited_by]}" if axis == "x, y" else ""),
-                format_number(time),
-                "s",
-            )
-            for axis, time in sheet.time_constants.items()
+            (f"time constant of {labels.get(axis, axis)}", format_number(time), "s")
+            for axis, time in made.time_constants.items()
         ),
-        ("delay that it stands beyond what it knows of", format_number(sheet.delay_margin), "s"),
-        ("control period", format_number(sheet.control_period), "s"),
+        ("delay that it stands beyond what it knows of", format_number(made.delay_margin), "s"),
+        ("control period", format_number(made.period), "s"),
     ]
 
 

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike
 
+from quadsim.errors import ParameterError
 from quadsim.flight.feasibility import STENCIL, Feasibility, Mask, assess, demand
 from quadsim.state import STATE_NAMES, Array
 from quadsim.vehicle import Vehicle
@@ -148,7 +149,11 @@ def _tightened(scenario: Scenario, vehicle: Vehicle) -> dict[str, tuple[float, f
     spec = scenario.controller
     if not isinstance(spec, RobustSpec):
         return {}
-    margins, bounds = tightening_margins(spec, vehicle, scenario.control_period), make_bounds(spec)
+    bounds = make_bounds(spec)
+    try:
+        margins = tightening_margins(spec, vehicle, scenario.control_period)
+    except ParameterError:  # which is said where the controller is made
+        return {}
     if margins is None:
         return {}
     ends = zip(bounds.y_min + margins[-1], bounds.y_max - margins[-1], strict=True)

@@ -24,6 +24,7 @@ from scenarios.design.tuning import (
     LAG_RATIO,
     MOVE_RATIO,
     PERIOD_SHARE,
+    STEEPEST,
     THRUST_SHARE,
     Tuning,
     tune,
@@ -116,7 +117,9 @@ class FirstScenario:
         return "\n".join(lines) + "\n"
 
 
-def first_scenario(vehicle: Vehicle, file: str, *, course: str = "hover", law: str = "robust") -> FirstScenario:
+def first_scenario(
+    vehicle: Vehicle, file: str, *, course: str = "hover", law: str = "robust", steepest: float = STEEPEST
+) -> FirstScenario:
     """A scenario that the vehicle flies well, with its controller's numbers made from the vehicle's.
 
     Args:
@@ -124,6 +127,7 @@ def first_scenario(vehicle: Vehicle, file: str, *, course: str = "hover", law: s
         file: where they are, as the scenario is to name it: a shipped vehicle or a path ending in `.toml`.
         course: one of `COURSES`.
         law: one of `LAWS`; all but `robust` with their own defaults.
+        steepest: largest tilt bound [rad].
 
     Raises:
         UnknownNameError: there is no such course or law.
@@ -131,7 +135,7 @@ def first_scenario(vehicle: Vehicle, file: str, *, course: str = "hover", law: s
     for kind, name, known in (("course", course, COURSES), ("controller", law, LAWS)):
         if name not in known:
             raise UnknownNameError(kind, name, known)
-    tuning = tune(vehicle)
+    tuning = tune(vehicle, steepest=steepest)
     flown, duration, size = _course(course, vehicle, tuning)
     name = re.sub(r"[^a-z0-9._-]+", "-", f"first-{vehicle.name}-{course}".lower())[:80]
     entries = (

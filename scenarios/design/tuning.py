@@ -27,6 +27,7 @@ from typing import Final, Literal
 import numpy as np
 
 from mpc.model import continuous_model
+from quadsim.errors import ParameterError
 from quadsim.state import INDEX
 from quadsim.vehicle import Vehicle
 from scenarios.design.authority import Authority, authority
@@ -53,6 +54,8 @@ HEADING_RATIO: Final = 0.7
 """Bandwidth of the heading over that of the place."""
 HEADING_STEP: Final = 0.5
 """Deviation of the heading that the whole torque in reserve answers [rad]."""
+LEAST_RESERVE: Final = 1e-6
+"""Acceleration [m/s^2] and angular acceleration [rad/s^2] in reserve below which there is nothing to design."""
 MOVE_RATIO: Final = 4.0
 """Frequency at which changes of rotor speeds cost as much as these, over w."""
 
@@ -97,10 +100,22 @@ class Tuning:
         return math.tan(self.tilt)
 
 
-def tune(vehicle: Vehicle) -> Tuning:
-    """The numbers for a vehicle; see the module."""
+def tune(vehicle: Vehicle, *, steepest: float = STEEPEST) -> Tuning:
+    """The numbers for a vehicle; see the module.
+
+    Args:
+        vehicle: the numbers.
+        steepest: largest tilt bound [rad].
+
+    Raises:
+        ParameterError: hover leaves no thrust or no torque in reserve.
+    """
     can = authority(vehicle)
-    tilt = min(STEEPEST, math.acos(min(1.0, 1.0 / (THRUST_SHARE * can.thrust_to_weight))))
+    if min(can.climb, can.sink, *can.turning) < LEAST_RESERVE:
+        rule = f"further from its hover speed, {vehicle.hover_speed:.4g} rad/s, or nothing is left to control it with"
+        side = "speed_max" if can.climb <= can.sink else "speed_min"
+        raise ParameterError("vehicle", side, getattr(vehicle, side), rule)
+    tilt = min(steepest, math.acos(min(1.0, 1.0 / (THRUST_SHARE * can.thrust_to_weight))))
     # A vehicle that barely hovers keeps at least a third of the tilt that it can hold.
     tilt = max(tilt, can.steady_tilt / 3.0)
     bandwidth, limited_by, period = _bandwidth(can, tilt)

@@ -68,7 +68,7 @@ def test_every_number_of_the_controller_says_where_it_comes_from() -> None:
     numbers = [
         entry
         for entry in made.entries
-        if entry.table.startswith("controller") and entry.key != "type" or entry.key == "control_period"
+        if (entry.table.startswith("controller") and entry.key != "type") or entry.key == "control_period"
     ]
     assert len(numbers) >= 14
     assert all(entry.why for entry in numbers)

@@ -11,6 +11,7 @@ from first_flights import vehicles
 from plausible_vehicles import HEAVIEST, LIGHTEST, QUICKEST, SLOWEST, STRONGEST, WEAKEST, plausible_vehicles
 
 from mpc.model import continuous_model, discretise
+from quadsim.errors import ParameterError
 from quadsim.state import INDEX
 from quadsim.vehicle import N_ROTORS, Vehicle
 from scenarios.design.authority import authority
@@ -53,7 +54,7 @@ def test_period_horizon_and_bandwidth_go_together(vehicle: Vehicle) -> None:
 
 
 def test_weights_make_a_butterworth_pattern_of_the_stated_bandwidth() -> None:
-    """Without lag and without the cost of moves, at a short period: four poles of x at radius w, two of z, two of yaw."""
+    """Without lag and the cost of moves, at a short period: four poles of x at radius w, two of z, two of yaw."""
     vehicle = next(each for each in ALL if each.name == "lopes2011")
     tuning = replace(tune(vehicle), period=0.001, move_weight=1e-12)
     K = gain(vehicle, tuning)[:, :12]
@@ -109,3 +110,12 @@ def test_drawn_vehicles_fill_the_range_and_are_the_same_each_time() -> None:
         assert least <= min(values) < least * (most / least) ** 0.1
         assert most >= max(values) > most / (most / least) ** 0.1
     assert len({vehicle.rotor_azimuths for vehicle in drawn}) == 2
+
+
+def test_a_vehicle_with_nothing_in_reserve_is_refused_and_one_with_little_is_not() -> None:
+    vehicle = next(each for each in ALL if each.name == "hummingbird")
+    with pytest.raises(ParameterError, match=r"vehicle.speed_max must be further from its hover speed, 453.2 rad/s"):
+        tune(replace(vehicle, speed_max=vehicle.hover_speed))
+    little = tune(replace(vehicle, speed_max=1.02 * vehicle.hover_speed))
+    assert little.tilt == pytest.approx(little.authority.steady_tilt / 3.0)
+    assert delay_margin(vehicle, little) > 0.0
