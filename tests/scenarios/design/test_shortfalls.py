@@ -11,7 +11,7 @@ import pytest
 from quadsim.assets import vehicle_path
 from quadsim.vehicle import OPTIONAL_PARAMETERS, VEHICLE_UNITS, load_vehicle
 from scenarios.cli import main
-from scenarios.commands import EXIT_DONE, EXIT_WRONG_INPUT
+from scenarios.commands import EXIT_DONE, EXIT_WRONG_INPUT, console
 from scenarios.design.first_scenario import COURSES, LAWS, first_scenario
 from scenarios.design.shortfalls import shortfalls
 from scenarios.design.vehicle_template import ADVICE, parameter_meanings, vehicle_template
@@ -107,3 +107,17 @@ def test_from_a_template_to_a_scenario_by_the_command_line(
 def test_wrong_requests_are_refused(arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(arguments) == EXIT_WRONG_INPUT
     assert message in capsys.readouterr().err
+
+
+def test_the_speed_at_which_a_course_fits_is_said_before_the_flight(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    said: list[str] = []
+    monkeypatch.setattr(console, "is_watched", lambda: True)
+    monkeypatch.setattr(console, "print_notice", said.append)
+    settings = ["reference.period=6.0", "reference.start=0.0", "duration=4.0"]
+    main(["check", "hummingbird-figure-eight", *(part for setting in settings for part in ("--set", setting))])
+    assert len(said) == 1
+    assert "It cannot be followed exactly: roll up to" in said[0]
+    assert said[0].endswith(" % of its size.")
+    assert " It would fit at " in said[0]
