@@ -83,10 +83,19 @@ def make_parser() -> argparse.ArgumentParser:
     scenario = command("scenario", help="print a scenario with all defaults and comments: a start for yours")
     scenario.add_argument("scenario", metavar="SCENARIO", nargs="?", help=_SCENARIO)
     _add_settings(scenario)
+    scenario.add_argument("--for", dest="vehicle", metavar="VEHICLE", help="print one made for this vehicle instead")
+    scenario.add_argument("--course", default="hover", metavar="NAME", help="of it: hover, step or figure-eight")
+    scenario.add_argument(
+        "--controller", default="robust", metavar="NAME", help="of it: robust, lqr, pid or geometric (default: robust)"
+    )
     scenario.add_argument("--schema", action="store_true", help="print the JSON Schema of scenario files instead")
 
     vehicle = command("vehicle", help="a vehicle's derived figures, its parameters' sources, its picture")
-    vehicle.add_argument("vehicle", metavar="VEHICLE", help="a shipped vehicle's name, or path to a TOML file")
+    vehicle.add_argument(
+        "vehicle", metavar="VEHICLE", nargs="?", help="a shipped vehicle's name, or path to a TOML file"
+    )
+    vehicle.add_argument("--template", action="store_true", help="print a commented vehicle file to fill in instead")
+    vehicle.add_argument("--scenario", metavar="SCENARIO", help="say which of its bounds the vehicle cannot meet")
     vehicle.add_argument("--out", metavar="FILE", help="PNG file to draw it to, on a floor of 10 cm squares")
     vehicle.add_argument("--json", action="store_true", help="as JSON on stdout")
 

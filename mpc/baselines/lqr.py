@@ -14,7 +14,7 @@ from mpc.baselines.law import FeedbackLaw
 from mpc.baselines.limits import require_within
 from mpc.baselines.preview import wrapped
 from mpc.heading import turn_horizontally
-from mpc.model import LinearModel, lqr
+from mpc.model import LinearModel, continuous_model, discretise, hover_model, lqr
 from mpc.ocp import Objective
 from quadsim.controller import Command, Moment
 from quadsim.errors import ParameterError
@@ -29,6 +29,9 @@ LARGEST_DEVIATIONS: Final = {
 HORIZONTAL: Final = [INDEX[name] for name in ("x", "vx", "y", "vy")]
 TILT: Final = [INDEX[name] for name in ("roll", "pitch")]
 SPEED_SHARE: Final = 0.05  # deviation of a rotor's speed from hover that weighs as much, as a share of the hover speed
+LAG_MARGIN: Final = 1.5  # times the lag of the vehicle's rotors that the default weights' loop stands
+_HALVINGS: Final = 12
+_SHORTEST_LAG: Final = 1e-4  # [s]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,11 +63,36 @@ class LQRSettings:
             require_within("tilt_max", self.tilt_max, 0.1, 80.0)
 
 
-def bryson_objective(vehicle: Vehicle) -> Objective:
-    """Weights 1 / (largest deviation)^2 of every state and input: Bryson's rule (Bryson and Ho, 1975)."""
+def bryson_objective(vehicle: Vehicle, period: float | None = None) -> Objective:
+    """Weights 1 / (largest deviation)^2 of every state and input: Bryson's rule (Bryson and Ho, 1975).
+
+    The model knows no lag.  Where the vehicle's rotors lag so much that the loop of these weights would not be stable
+    with `LAG_MARGIN` times their time constant, the deviation of the rotor speeds is halved until it is.
+
+    Args:
+        vehicle: the modelled vehicle.
+        period: tau_s [s]; None for no look at the lag.
+    """
     deviations = np.array([LARGEST_DEVIATIONS[name] for name in STATE_NAMES])
-    speed = SPEED_SHARE * vehicle.hover_speed
-    return Objective(C_r=np.eye(N_STATES), Q_y=np.diag(deviations**-2.0), Q_u=np.eye(N_ROTORS) / speed**2)
+    share = SPEED_SHARE
+    for _ in range(_HALVINGS):
+        speed = share * vehicle.hover_speed
+        objective = Objective(C_r=np.eye(N_STATES), Q_y=np.diag(deviations**-2.0), Q_u=np.eye(N_ROTORS) / speed**2)
+        if period is None or _stands_lag(vehicle, period, objective):
+            break
+        share *= 0.5
+    return objective
+
+
+def _stands_lag(vehicle: Vehicle, period: float, objective: Objective) -> bool:
+    """Whether an LQR's loop is stable with `LAG_MARGIN` times the lag of the vehicle's rotors."""
+    lag = LAG_MARGIN * max(vehicle.rotor_rise or 0.0, vehicle.rotor_fall or 0.0)
+    if lag < _SHORTEST_LAG:
+        return True
+    A, B = discretise(*continuous_model(vehicle, lag), period)
+    K = np.zeros((N_ROTORS, len(A)))
+    K[:, :N_STATES] = lqr_gain(hover_model(vehicle, period), objective)
+    return float(np.abs(np.linalg.eigvals(A - B @ K)).max()) < 1.0
 
 
 def lqr_gain(model: LinearModel, objective: Objective) -> Array:

@@ -156,6 +156,7 @@ def assess(
     vehicle: Vehicle,
     *,
     bounds: Mapping[str, tuple[float, float]] | None = None,
+    tightened: Mapping[str, tuple[float, float]] | None = None,
     jumps: Sequence[float] = (),
 ) -> Feasibility:
     """Hold a demand against the vehicle's rotor speeds and a controller's bounds.
@@ -165,6 +166,8 @@ def assess(
         vehicle: its rotor limits.
         bounds: lower and upper bound by name, a state of `quadsim.state` in SI, `speed` [rad/s] of the rotors or `slew`
             [rad/s per period].
+        tightened: what tightening leaves of them at the end of the horizon, of states; looked at where the bounds
+            themselves are kept.
         jumps: times [s] at which the course jumps.
     """
     bounds = bounds or {}
@@ -178,7 +181,7 @@ def assess(
         "rotor_max": float(needed.speeds.max()),
         "thrust_to_weight": float(needed.thrust.max()) / (vehicle.mass * vehicle.gravity),
     }
-    problems = _problems(needed, vehicle, bounds)
+    problems = _problems(needed, vehicle, bounds, tightened or {})
     sentence = _sentence(peaks, vehicle, bounds, jumps, problems)
     return Feasibility(**peaks, jumps=tuple(jumps), problems=problems, sentence=sentence)
 
@@ -193,7 +196,12 @@ def _attitudes(pushed: Array, yaw: Array) -> Array:
     return np.stack([roll, pitch, yaw], axis=1)
 
 
-def _problems(needed: Demand, vehicle: Vehicle, bounds: Mapping[str, tuple[float, float]]) -> tuple[str, ...]:
+def _problems(
+    needed: Demand,
+    vehicle: Vehicle,
+    bounds: Mapping[str, tuple[float, float]],
+    tightened: Mapping[str, tuple[float, float]],
+) -> tuple[str, ...]:
     """A line for each side of a limit or bound that the demand leaves."""
     least, most = vehicle.speed_min, vehicle.speed_max
     found = _beyond("rotor speed", "rad/s", needed.speeds, (least, most), "limit")
@@ -207,7 +215,11 @@ def _problems(needed: Demand, vehicle: Vehicle, bounds: Mapping[str, tuple[float
         else:
             unit, scale = shown_unit(STATE_UNITS[INDEX[name]])
             values = scale * needed.state[:, INDEX[name]]
-            found += _beyond(name, unit, values, (scale * lower, scale * upper), "bound")
+            beyond = _beyond(name, unit, values, (scale * lower, scale * upper), "bound")
+            if not beyond and name in tightened:
+                left = (scale * tightened[name][0], scale * tightened[name][1])
+                beyond = _beyond(name, unit, values, left, f"bound {scale * upper:.4g}, tightened to")
+            found += beyond
     return tuple(found)
 
 

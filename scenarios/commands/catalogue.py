@@ -8,7 +8,7 @@ from typing import Any, Final, get_args
 
 from mpc.solvers import SOLVERS
 from quadsim.assets import read_toml, vehicle_names, vehicle_path
-from quadsim.errors import InputError
+from quadsim.errors import InputError, ParameterError
 from quadsim.vehicle import load_vehicle
 from scenarios.commands import EXIT_DONE, console
 from scenarios.shipped import CONTROLLERS, Group, campaign_names, campaign_path, scenario_names, scenario_path
@@ -56,6 +56,21 @@ def scenario(options: Namespace) -> int:
         from scenarios.schema.json_schema import scenario_schema
 
         print(json.dumps(scenario_schema(), indent=2))
+        return EXIT_DONE
+    if options.vehicle is not None:
+        from scenarios.design.first_scenario import first_scenario
+
+        given = {"a scenario": options.scenario, "--set": options.settings, "--seed": options.seed}
+        for name, value in given.items():
+            if value:
+                raise ParameterError("", "--for", options.vehicle, f"given without {name}")
+        made = first_scenario(
+            load_vehicle(vehicle_path(options.vehicle)),
+            options.vehicle,
+            course=options.course,
+            law=options.controller,
+        )
+        print(made.to_toml(), end="")
         return EXIT_DONE
     if options.scenario is None:
         raise InputError(

@@ -100,6 +100,11 @@ def say(text: str) -> None:
     stderr().print(f"quadsim: {text}", soft_wrap=True)
 
 
+def is_watched() -> bool:
+    """Whether a person at a terminal sees notices."""
+    return stderr().is_terminal
+
+
 def print_notice(text: str) -> None:
     """Tell a person at a terminal something that work begins with."""
     console = stderr()

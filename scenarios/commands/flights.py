@@ -12,7 +12,7 @@ from scenarios.api import fly
 from scenarios.commands import EXIT_DONE, EXIT_FAILED, console
 from scenarios.commands.common import load, print_summary
 from scenarios.commands.junit import write_junit
-from scenarios.courses.feasibility_check import report
+from scenarios.courses.feasibility_check import fitting, report
 from scenarios.parts.vehicle import build_vehicle
 from scenarios.reaudit import reaudit
 from scenarios.schema.scenario import Scenario
@@ -61,4 +61,7 @@ def check(options: Namespace) -> int:
 def _announce(scenario: Scenario, options: Namespace) -> None:
     """Say what the course asks for, before it is flown; the summary says it again."""
     if not options.json:
-        console.print_notice(report(scenario, build_vehicle(scenario)).sentence)
+        vehicle = build_vehicle(scenario)
+        asked = report(scenario, vehicle)
+        fits = fitting(scenario, vehicle) if asked.problems and console.is_watched() else ""
+        console.print_notice(f"{asked.sentence} {fits}".rstrip())

@@ -6,38 +6,38 @@ import itertools
 import json
 import math
 from argparse import Namespace
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from scipy.optimize import linprog
 
 from mpc.model import continuous_model, discretise
-from quadsim.assets import vehicle_path
-from quadsim.errors import ParameterError
+from quadsim.assets import vehicle_names, vehicle_path
+from quadsim.errors import InputError, ParameterError
 from quadsim.report.table import Cell, Grid, format_number
 from quadsim.state import INDEX, Array
 from quadsim.vehicle import N_ROTORS, VEHICLE_UNITS, Vehicle, load_vehicle, vehicle_sources
 from scenarios.commands import EXIT_DONE, console
+from scenarios.design.authority import TorqueRange, authority, torque_ranges
+from scenarios.design.loop import delay_margin
+from scenarios.design.tuning import tune
 
-AXES: Final = ("x", "y", "z")
 SHEET_PERIOD: Final = 0.05  # control period of the discrete poles [s], the paper's
 _RPM: Final = 60.0 / (2.0 * math.pi)
 
 
-@dataclass(frozen=True)
-class TorqueRange:
-    """The torques about one body axis that hover leaves room for."""
+@dataclass(frozen=True, kw_only=True)
+class Designed:
+    """What a controller made for a vehicle can do; see `scenarios.design.tuning`."""
 
-    axis: str  # x, y or z
-    lowest: float  # torque [N m]
-    highest: float  # torque [N m]
-    lowest_pure: float  # the same with no torque about the other two axes [N m]
-    highest_pure: float  # the same with no torque about the other two axes [N m]
-    lowest_acceleration: float  # what `lowest` gives from rest [rad/s^2]
-    highest_acceleration: float  # what `highest` gives from rest [rad/s^2]
+    time_constants: dict[str, float]  # one over the bandwidth of each axis [s]
+    limited_by: str  # what the bandwidth of x and y is the limit of: lag, torque or period
+    tilt_bound: float  # [deg]
+    level_acceleration: float  # largest within it [m/s^2]
+    period: float  # control period [s]
+    delay_margin: float  # delay beyond what the model knows of that its loop stands, without bounds [s]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -65,10 +65,20 @@ class VehicleSheet:
     # of the rotors' speeds when they rise and fall, continuous [1/s], as far as the file gives them
     lag_poles: dict[str, float]
     discrete_lag_poles: dict[str, float]  # the same at `period` [-]
+    sink_acceleration: float  # largest downward acceleration from hover, level [m/s^2]
+    designed: Designed | None  # None where hover leaves nothing to control it with
 
 
 def vehicle(options: Namespace) -> int:
     """`quadsim vehicle`."""
+    if options.template:
+        from scenarios.design.vehicle_template import vehicle_template
+
+        print(vehicle_template(), end="")
+        return EXIT_DONE
+    if options.vehicle is None:
+        names = ", ".join(vehicle_names())
+        raise InputError(f"vehicle needs a name or a TOML file, or --template (there are: {names})")
     path = vehicle_path(options.vehicle)
     loaded, sources = load_vehicle(path), vehicle_sources(path)
     if options.out is not None:
@@ -78,10 +88,19 @@ def vehicle(options: Namespace) -> int:
             raise ParameterError("", "--out", options.out, "a file ending in .png")
         render_portrait(loaded, Path(options.out))
     sheet = make_sheet(loaded)
+    missed = None
+    if options.scenario is not None:
+        from scenarios.design.shortfalls import shortfalls
+        from scenarios.loading import load_scenario
+
+        missed = shortfalls(load_scenario(options.scenario), loaded)
     if options.json:
-        print(json.dumps(sheet_to_json(loaded, sheet, sources), indent=2))
+        about = {} if missed is None else {"scenario": options.scenario, "shortfalls": missed}
+        print(json.dumps(sheet_to_json(loaded, sheet, sources) | about, indent=2))
     else:
-        console.print_grids(sheet_tables(loaded, sheet, sources), options.out, prose=("unit", "source"))
+        tables = sheet_tables(loaded, sheet, sources)
+        tables += [] if missed is None else [shortfall_table(options.scenario, missed)]
+        console.print_grids(tables, options.out, prose=("unit", "source", "what and why"))
     return EXIT_DONE
 
 
@@ -89,16 +108,16 @@ def make_sheet(vehicle: Vehicle) -> VehicleSheet:
     """The figures of a vehicle."""
     A_c, B_c = continuous_model(vehicle)
     A, _ = discretise(A_c, B_c, SHEET_PERIOD)
-    ratio = (vehicle.speed_max / vehicle.hover_speed) ** 2
+    can = authority(vehicle)
     lags = {name: value for name in ("rotor_rise", "rotor_fall") if (value := getattr(vehicle, name)) is not None}
     return VehicleSheet(
         weight=vehicle.mass * vehicle.gravity,
         hover_speed=vehicle.hover_speed,
         hover_speed_rpm=_RPM * vehicle.hover_speed,
-        speed_range_used=(vehicle.hover_speed - vehicle.speed_min) / (vehicle.speed_max - vehicle.speed_min),
-        thrust_to_weight=ratio,
-        climb_acceleration=(ratio - 1.0) * vehicle.gravity,
-        steady_tilt=math.degrees(math.acos(min(1.0, 1.0 / ratio))),
+        speed_range_used=can.hover_share,
+        thrust_to_weight=can.thrust_to_weight,
+        climb_acceleration=can.climb,
+        steady_tilt=math.degrees(can.steady_tilt),
         torques=torque_ranges(vehicle),
         thrust_slope=2.0 * vehicle.thrust_coefficient * vehicle.hover_speed,
         input_slopes={
@@ -111,20 +130,24 @@ def make_sheet(vehicle: Vehicle) -> VehicleSheet:
         period=SHEET_PERIOD,
         lag_poles={name: -1.0 / value for name, value in lags.items()},
         discrete_lag_poles={name: math.exp(-SHEET_PERIOD / value) for name, value in lags.items()},
+        sink_acceleration=can.sink,
+        designed=_designed(vehicle),
     )
 
 
-def torque_ranges(vehicle: Vehicle) -> tuple[TorqueRange, ...]:
-    """The largest torques of each sign about x, y, z with the thrust kept at the weight and every rotor in its range.
-
-    A linear programme in the squared speeds v_i = w_i^2: the torque about an axis is a row of the allocation matrix
-    times v, the thrust is its first row times v, and v_i lies between the squares of the speed limits.
-    """
-    ranges = []
-    for axis, (name, inertia) in enumerate(zip(AXES, vehicle.inertia, strict=True)):
-        (low, high), (low_pure, high_pure) = (_extremes(vehicle, 1 + axis, pure=pure) for pure in (False, True))
-        ranges.append(TorqueRange(name, low, high, low_pure, high_pure, low / inertia, high / inertia))
-    return tuple(ranges)
+def _designed(vehicle: Vehicle) -> Designed | None:
+    try:
+        tuning = tune(vehicle)
+    except ParameterError:
+        return None
+    return Designed(
+        time_constants={"x, y": 1.0 / tuning.bandwidth, "z": 1.0 / tuning.height, "yaw": 1.0 / tuning.heading},
+        limited_by=tuning.limited_by,
+        tilt_bound=math.degrees(tuning.tilt),
+        level_acceleration=vehicle.gravity * tuning.acceleration,
+        period=tuning.period,
+        delay_margin=delay_margin(vehicle, tuning),
+    )
 
 
 def integrator_chains(A_c: Array) -> tuple[int, ...]:
@@ -165,6 +188,12 @@ def sheet_tables(vehicle: Vehicle, sheet: VehicleSheet, sources: Mapping[str, st
             ],
             note="thrust kept at the weight, every rotor within its range; pure: no torque about the other axes",
         ),
+        _grid(
+            "what a controller made for it can do",
+            ("", "value", "unit"),
+            _abilities(sheet),
+            note="quadsim scenario --for VEHICLE makes it; the rules: scenarios/design/tuning.py",
+        ),
         _grid("linear model at hover", ("", "continuous [1/s]", f"discrete, {1e3 * sheet.period:g} ms"), _poles(sheet)),
         _grid(
             "parameters",
@@ -181,25 +210,10 @@ def _parameters(vehicle: Vehicle) -> list[tuple[str, Any, str]]:
     return [(name, value, unit) for name, value, unit in given if value is not None]
 
 
-def _extremes(vehicle: Vehicle, row: int, *, pure: bool) -> tuple[float, float]:
-    """Smallest and largest torque [N m] of one row of the allocation matrix; `pure`: the other torques vanish."""
-    top = vehicle.speed_max**2
-    matrix = top * vehicle.allocation  # in v / speed_max^2, so that the programme is well scaled
-    units = np.abs(matrix).max(axis=1)
-    fixed = [0, *(other for other in (1, 2, 3) if pure and other != row)]
-    equal = [vehicle.mass * vehicle.gravity / units[0], *np.zeros(len(fixed) - 1)]
-    found = []
-    for sign in (1.0, -1.0):
-        solution = linprog(
-            sign * matrix[row] / units[row],
-            A_eq=matrix[fixed] / units[fixed, None],
-            b_eq=equal,
-            bounds=(vehicle.speed_min**2 / top, 1.0),
-            method="highs",
-        )
-        assert solution.success, "hover itself is feasible"
-        found.append(float(sign * solution.fun * units[row]))
-    return found[0], found[1]
+def shortfall_table(scenario: str, missed: Sequence[str]) -> Grid:
+    """Which bounds of a scenario a vehicle cannot meet; see `scenarios.design.shortfalls`."""
+    lines = [(str(i + 1), text) for i, text in enumerate(missed)] or [("-", "none: the vehicle meets all of them")]
+    return _grid(f"bounds of {scenario} that it cannot meet", ("", "what and why"), lines)
 
 
 def _figures(vehicle: Vehicle, sheet: VehicleSheet) -> list[tuple[str, ...]]:
@@ -222,6 +236,26 @@ def _figures(vehicle: Vehicle, sheet: VehicleSheet) -> list[tuple[str, ...]]:
     ]
 
 
+def _abilities(sheet: VehicleSheet) -> list[tuple[str, ...]]:
+    sinks: tuple[str, ...] = ("largest sink acceleration", format_number(sheet.sink_acceleration), "m/s^2")
+    made = sheet.designed
+    if made is None:
+        return [sinks, ("none can be made: hover leaves nothing to control it with", "-", "")]
+    why = {"lag": "the rotors' lag", "torque": "torque in reserve", "period": "the shortest control period"}
+    labels = {"x, y": f"x, y, limited by {why[made.limited_by]}"}
+    return [
+        sinks,
+        ("tilt bound", format_number(made.tilt_bound), "deg"),
+        ("largest level acceleration within it", format_number(made.level_acceleration), "m/s^2"),
+        *(
+            (f"time constant of {labels.get(axis, axis)}", format_number(time), "s")
+            for axis, time in made.time_constants.items()
+        ),
+        ("delay that it stands beyond what it knows of", format_number(made.delay_margin), "s"),
+        ("control period", format_number(made.period), "s"),
+    ]
+
+
 def _poles(sheet: VehicleSheet) -> list[tuple[str, ...]]:
     chains = ", ".join(str(length) for length in sheet.integrator_chains)
     body = f"rigid body: {len(sheet.continuous_poles)} poles, chains of {chains} integrators"
@@ -232,7 +266,7 @@ def _poles(sheet: VehicleSheet) -> list[tuple[str, ...]]:
     return lines
 
 
-def _grid(title: str, head: tuple[str, ...], lines: list[tuple[str, ...]], note: str = "") -> Grid:
+def _grid(title: str, head: tuple[str, ...], lines: Sequence[tuple[str, ...]], note: str = "") -> Grid:
     cells = tuple(tuple(Cell(text=text) for text in line) for line in lines)
     return Grid(key=head[0], title=title, head=head, lines=cells, note=note)
 

@@ -3,19 +3,24 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from quadsim.errors import ParameterError
 from quadsim.flight.audit import Mask
 from quadsim.flight.feasibility import STENCIL, Feasibility, assess, demand
-from quadsim.state import Array
+from quadsim.state import STATE_NAMES, Array
 from quadsim.vehicle import Vehicle
+from scenarios.courses.course import Course
 from scenarios.courses.make import build_course, filtered, initial_pose
 from scenarios.courses.smoothing import within_rounding
+from scenarios.parts.controllers import make_bounds, tightening_margins
 from scenarios.schema.optimisation import ANGLES, BoundedSpec
+from scenarios.schema.robust import RobustSpec
 
 if TYPE_CHECKING:
     from scenarios.schema.scenario import Scenario
@@ -30,20 +35,86 @@ def report(scenario: Scenario, vehicle: Vehicle) -> Feasibility:
     Raises:
         InputError: the course cannot be built.
     """
-    course, period = build_course(scenario), scenario.control_period
-    samples = scenario.periods + 1
+    return _asked(build_course(scenario), scenario, vehicle, duration=scenario.duration)
+
+
+def fitting(scenario: Scenario, vehicle: Vehicle) -> str:
+    """At which speed, size or response time a course that is beyond limits or bounds would be within them.
+
+    The course is flown more slowly, made smaller about its start, or filtered more, to the nearest percent; jumps count
+    as in `report`, which leaves them out.
+
+    Returns:
+        A sentence; empty where the course fits as it is, or at none of them down to a tenth.
+    """
+    course, duration, filtered_by = build_course(scenario), scenario.duration, scenario.reference.response_time
+
+    def slower(share: float) -> bool:
+        return not _asked(_scaled(course, pace=share), scenario, vehicle, duration=duration / share).problems
+
+    def smaller(share: float) -> bool:
+        return not _asked(_scaled(course, size=share), scenario, vehicle, duration=duration).problems
+
+    def smoother(share: float) -> bool:
+        changed = scenario.reference.model_copy(update={"response_time": filtered_by / share})
+        softened = scenario.model_copy(update={"reference": changed})
+        return not _asked(course, softened, vehicle, duration=duration).problems
+
+    if smaller(1.0):
+        return ""
+    ways = []
+    if (share := _largest(slower)) is not None:
+        ways.append(f"at {100.0 * share:.0f} % of its speed")
+    if (share := _largest(smaller)) is not None:
+        ways.append(f"at {100.0 * share:.0f} % of its size")
+    if filtered_by > 0.0 and (share := _largest(smoother)) is not None:
+        ways.append(f"with a response time of {filtered_by / share:.3g} s")
+    return f"It would fit {', or '.join(ways)}." if ways else ""
+
+
+def _largest(fits: Callable[[float], bool]) -> float | None:
+    """The largest whole percentage at which something fits, as a share, by halving; None where a tenth does not."""
+    low, high = 10, 100
+    if not fits(0.01 * low):
+        return None
+    while high - low > 1:
+        middle = (low + high) // 2
+        low, high = (middle, high) if fits(0.01 * middle) else (low, middle)
+    return 0.01 * low
+
+
+def _scaled(course: Course, *, pace: float = 1.0, size: float = 1.0) -> Course:
+    """A course flown at a share of its speed, or of a share of its size about its start."""
+    scale = np.array([size, size, size, 1.0])
+
+    def sample(t: Array) -> Array:
+        return np.asarray(course.initial + scale * (course.sample(pace * t) - course.initial))
+
+    return replace(
+        course,
+        sample=sample,
+        jumps=tuple(time / pace for time in course.jumps),
+        kinks=tuple(time / pace for time in course.kinks),
+        resolution=tuple((scale * course.resolution).tolist()),
+    )
+
+
+def _asked(course: Course, scenario: Scenario, vehicle: Vehicle, *, duration: float) -> Feasibility:
+    """What a course, in place of the scenario's and for so long [s], asks for."""
+    period = scenario.control_period
+    samples = round(duration / period) + 1
     flown = filtered(course, scenario, samples + STENCIL)
     poses = np.vstack([np.tile(course.initial, (STENCIL, 1)), flown])  # before the flight the vehicle is at rest
     t: Array = period * np.arange(-STENCIL, samples + STENCIL, dtype=np.float64)
     raw = np.vstack([np.tile(course.initial, (STENCIL, 1)), course.sample(t[STENCIL:])])
     changes = np.any(raw[1:] != raw[:-1], axis=1)
     away = () if np.allclose(initial_pose(scenario), course.initial, rtol=0.0, atol=1e-9) else (0.0,)
-    jumps = sorted({time for time in (*course.jumps, *away) if time < scenario.duration})
+    jumps = sorted({time for time in (*course.jumps, *away) if time < duration})
     jumped, kinked = _touched(t, course.jumps) & changes, _touched(t, _isolated(course.kinks, period))
     channels = zip(poses.T, course.resolution, strict=True)
     smooth = np.column_stack([within_rounding(values, unit, jumped | kinked) for values, unit in channels])
     needed = demand(smooth, period, vehicle, jumps=jumped, kinks=kinked)
-    return assess(needed, vehicle, bounds=_bounds(scenario), jumps=jumps)
+    return assess(needed, vehicle, bounds=_bounds(scenario), tightened=_tightened(scenario, vehicle), jumps=jumps)
 
 
 def _touched(t: Array, instants: ArrayLike) -> Mask:
@@ -72,3 +143,20 @@ def _bounds(scenario: Scenario) -> dict[str, tuple[float, float]]:
         "speed": (spec.input_bounds.speed[0], spec.input_bounds.speed[1]),
         "slew": (spec.input_bounds.slew[0], spec.input_bounds.slew[1]),
     }
+
+
+def _tightened(scenario: Scenario, vehicle: Vehicle) -> dict[str, tuple[float, float]]:
+    """What tightening leaves of the output bounds at the end of the horizon, SI; none without it."""
+    spec = scenario.controller
+    if not isinstance(spec, RobustSpec):
+        return {}
+    bounds = make_bounds(spec)
+    try:
+        margins = tightening_margins(spec, vehicle, scenario.control_period)
+    except ParameterError:  # which is said where the controller is made
+        return {}
+    if margins is None:
+        return {}
+    ends = zip(bounds.y_min + margins[-1], bounds.y_max - margins[-1], strict=True)
+    names = [name for name in STATE_NAMES if name in spec.output_bounds]
+    return {name: (float(lower), float(upper)) for name, (lower, upper) in zip(names, ends, strict=True)}

@@ -174,10 +174,9 @@ def _unconstrained(problem: Problem) -> Controller:
 
 def _robust(spec: RobustSpec, vehicle: Vehicle, period: float) -> RobustMPC:
     from mpc.robust.controller import Linearisation, RobustMPC, RobustSettings
-    from mpc.robust.tightening import margins
 
     bounds, rotor_lag = make_bounds(spec), _rotor_lag(spec, vehicle)
-    soft, tightening = spec.soft, spec.tightening
+    soft = spec.soft
     settings = RobustSettings(
         penalty=None if soft is None else make_penalty(soft, bounds.y_min.size),
         rotor_lag=rotor_lag,
@@ -188,18 +187,7 @@ def _robust(spec: RobustSpec, vehicle: Vehicle, period: float) -> RobustMPC:
         move_weight=None if spec.move_weight is None else spec.move_weight * np.eye(N_ROTORS),
         linearisation=Linearisation(spec.linearisation),
         terminal=spec.terminal == "lqr",
-        margins=None
-        if tightening is None
-        else margins(
-            vehicle,
-            period=period,
-            horizon=spec.horizon,
-            bounds=bounds,
-            settings=tightening,
-            rotor_lag=rotor_lag,
-            delay=spec.delay,
-            estimated=spec.offset_free is not None,
-        ),
+        margins=tightening_margins(spec, vehicle, period),
     )
     return RobustMPC(
         vehicle,
@@ -210,6 +198,28 @@ def _robust(spec: RobustSpec, vehicle: Vehicle, period: float) -> RobustMPC:
         settings=settings,
         constraints=make_polytopes(spec),
         shortcut=spec.shortcut,
+    )
+
+
+def tightening_margins(spec: RobustSpec, vehicle: Vehicle, period: float) -> Array | None:
+    """By how much the output bounds are tightened at each predicted state, (N, n_c); None where they are not.
+
+    Raises:
+        ParameterError: they cannot be.
+    """
+    if spec.tightening is None:
+        return None
+    from mpc.robust.tightening import margins
+
+    return margins(
+        vehicle,
+        period=period,
+        horizon=spec.horizon,
+        bounds=make_bounds(spec),
+        settings=spec.tightening,
+        rotor_lag=_rotor_lag(spec, vehicle),
+        delay=spec.delay,
+        estimated=spec.offset_free is not None,
     )
 
 
@@ -224,7 +234,7 @@ def _baseline(spec: LQRSpec | PIDSpec | GeometricSpec, vehicle: Vehicle, period:
         objective = (
             make_objective(spec.output_weights, spec.input_weights)
             if spec.output_weights is not None and spec.input_weights is not None
-            else bryson_objective(vehicle)
+            else bryson_objective(vehicle, period)
         )
         lqr = LQRSettings(
             period=period,

@@ -28,10 +28,11 @@ from quadsim.vehicle import Vehicle
 from scenarios.build import build_controller
 from scenarios.diagnosis import diagnose
 from scenarios.flight import Flight
-from scenarios.loading import load_scenario, scenario_path
+from scenarios.loading import load_scenario
 from scenarios.parts.vehicle import build_vehicle
 from scenarios.schema.scenario import Scenario
 from scenarios.schema.settings import get_field
+from scenarios.shipped import scenario_path
 
 TILTED = make_state(euler=(math.radians(20.0), 0.0, 0.0))
 FENCE = '{ name = "fence", of = ["x", "y"], rows = [[1.0, 1.0]], upper = [6.8] }'

@@ -13,7 +13,7 @@ from support import scenario_table
 from quadsim.flight.feasibility import Feasibility
 from quadsim.state import Array
 from quadsim.vehicle import Vehicle
-from scenarios.courses.feasibility_check import report
+from scenarios.courses.feasibility_check import fitting, report
 from scenarios.courses.make import build_course, build_reference
 from scenarios.loading import load_scenario, parse_scenario
 from scenarios.parts.vehicle import build_vehicle
@@ -61,7 +61,7 @@ def test_a_filter_lowers_what_is_asked_for(vehicle: Vehicle) -> None:
     assert corners.tilt == pytest.approx(math.degrees(math.atan(0.5 / 0.05 / vehicle.gravity)), rel=1e-9)
     assert corners.rotor_max < 250.0  # no torque is taken of a corner
     smoothed = math.degrees(math.atan(0.5 * 3.0 / 3.0 / vehicle.gravity))  # v (3 / tau_r), just after the corner
-    assert found(legs | {"response_time": 3.0}, vehicle).tilt == pytest.approx(smoothed, rel=0.03)
+    assert found(legs | {"response_time": 3.0}, vehicle).tilt == pytest.approx(smoothed, rel=0.06)
 
 
 def test_where_it_begins_elsewhere_the_course_jumps(vehicle: Vehicle) -> None:
@@ -147,3 +147,48 @@ def test_bounds_are_those_of_the_controller(vehicle: Vehicle) -> None:
     assert found(circle | {"speed": 3.0, "turns": 9.0}, vehicle, controller=free).problems == ()
     slow = table | {"input_bounds": {"speed": [0.0, 192.0], "slew": [-10.0, 5.0]}}
     assert "rotor speed up to 192.9 rad/s (bound 192)" in found(circle, vehicle, controller=slow).problems
+
+
+TIGHT = {
+    "type": "robust",
+    "horizon": 50,
+    "output_weights": {"x": 10.0, "y": 10.0, "z": 100.0, "yaw": 100.0},
+    "input_weights": {"speed": 0.1},
+    "output_bounds": {"roll": [-5.0, 5.0], "pitch": [-5.0, 5.0]},
+    "input_bounds": {"speed": [0.0, 250.0], "slew": [-10.0, 5.0]},
+    "tightening": {},
+}
+
+
+def test_a_course_within_the_bounds_but_not_within_the_tightened_ones_is_said(vehicle: Vehicle) -> None:
+    """A circle of 4.9 deg: within 5 deg, but tightening leaves 4.84 deg."""
+    speed = math.sqrt(3.0 * vehicle.gravity * math.tan(math.radians(4.9)))
+    circle = {"type": "circle", "radius": 3.0, "speed": speed, "turns": 3.0, "ramp": 10.0}
+    loose = found(circle, vehicle, controller={name: value for name, value in TIGHT.items() if name != "tightening"})
+    assert loose.problems == ()
+    problems = found(circle, vehicle, controller=TIGHT).problems
+    assert len(problems) == 4
+    assert problems[0].startswith("roll up to 4.9 deg (bound 5, tightened to 4.83")
+    asked = scenario(circle, controller=TIGHT)
+    assert fitting(asked, vehicle) == "It would fit at 99 % of its speed, or at 98 % of its size."
+
+
+def test_the_speed_at_which_a_course_fits_is_that_of_the_closed_form(vehicle: Vehicle) -> None:
+    """tan(tilt) goes with the speed squared, and with the size at the same time for a turn."""
+    circle = {"type": "circle", "radius": 3.0, "speed": 3.0, "turns": 9.0, "ramp": 10.0}
+    made = scenario(circle)
+    share = math.tan(math.radians(5.0)) * 3.0 * vehicle.gravity / 3.0**2
+    assert fitting(made, vehicle) == (
+        f"It would fit at {math.floor(100 * math.sqrt(share))} % of its speed, or at "
+        f"{math.floor(100 * share)} % of its size."
+    )
+    assert fitting(scenario(circle | {"speed": 1.0, "turns": 2.0}), vehicle) == ""
+
+
+def test_filtered_steps_would_fit_with_a_slower_filter_or_smaller(vehicle: Vehicle) -> None:
+    """What the filter leaves is d (3 / tau_r)^2: at 5 deg and with 2 m in one axis tau_r = 4.58 s."""
+    steps = {"response_time": 3.0, "y": [{"start": 1.0, "stop": 15.0, "value": 2.0}]}
+    said = fitting(scenario(steps), vehicle)
+    time = 3.0 * math.sqrt(2.0 / (vehicle.gravity * math.tan(math.radians(5.0))))
+    assert said.startswith("It would fit at ")
+    assert float(said.removesuffix(" s.").rpartition(" ")[2]) == pytest.approx(time, rel=0.06)

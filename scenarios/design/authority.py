@@ -1,0 +1,125 @@
+"""What a vehicle's rotors can do about it at hover: thrust and torques in reserve, and how long they take."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from scipy.optimize import linprog
+
+from quadsim.vehicle import Vehicle
+
+AXES: Final = ("x", "y", "z")
+
+
+@dataclass(frozen=True, kw_only=True)
+class TorqueRange:
+    """The torques about one body axis that hover leaves room for.
+
+    Attributes:
+        axis: x, y or z.
+        lowest: torque [N m].
+        highest: torque [N m].
+        lowest_pure: the same with no torque about the other two axes [N m].
+        highest_pure: the same with no torque about the other two axes [N m].
+        lowest_acceleration: what `lowest` gives from rest [rad/s^2].
+        highest_acceleration: what `highest` gives from rest [rad/s^2].
+    """
+
+    axis: str
+    lowest: float
+    highest: float
+    lowest_pure: float
+    highest_pure: float
+    lowest_acceleration: float
+    highest_acceleration: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class Authority:
+    """Figures at hover that a controller's design follows from.
+
+    Attributes:
+        thrust_to_weight: all rotors at their highest speed, over the weight [-].
+        hover_share: where hover lies between the lowest speed, 0, and the highest, 1 [-].
+        steady_tilt: largest tilt at which the rotors still carry the weight, cos(tilt) = 1 / thrust_to_weight [rad].
+        climb: largest upward acceleration from hover, level [m/s^2].
+        sink: largest downward acceleration from hover, level [m/s^2].
+        turning: (3,) angular acceleration about body x, y, z that is to be had both ways, without torque about the
+            other axes, while thrust carries the weight [rad/s^2].
+        lag: the longer time constant of a rotor's speed [s]; 0 where the vehicle gives none.
+    """
+
+    thrust_to_weight: float
+    hover_share: float
+    steady_tilt: float
+    climb: float
+    sink: float
+    turning: tuple[float, float, float]
+    lag: float
+
+
+def authority(vehicle: Vehicle) -> Authority:
+    """The figures of a vehicle."""
+    hover = vehicle.hover_speed
+    ratio = (vehicle.speed_max / hover) ** 2
+    x, y, z = (
+        min(-torque.lowest_pure, torque.highest_pure) / inertia
+        for torque, inertia in zip(torque_ranges(vehicle), vehicle.inertia, strict=True)
+    )
+    return Authority(
+        thrust_to_weight=ratio,
+        hover_share=(hover - vehicle.speed_min) / (vehicle.speed_max - vehicle.speed_min),
+        steady_tilt=math.acos(min(1.0, 1.0 / ratio)),
+        climb=(ratio - 1.0) * vehicle.gravity,
+        sink=(1.0 - (vehicle.speed_min / hover) ** 2) * vehicle.gravity,
+        turning=(x, y, z),
+        lag=max(vehicle.rotor_rise or 0.0, vehicle.rotor_fall or 0.0),
+    )
+
+
+def torque_ranges(vehicle: Vehicle) -> tuple[TorqueRange, ...]:
+    """The largest torques of each sign about x, y, z with the thrust kept at the weight and every rotor in its range.
+
+    A linear programme in the squared speeds v_i = w_i^2: the torque about an axis is a row of the allocation matrix
+    times v, the thrust is its first row times v, and v_i lies between the squares of the speed limits.
+    """
+    ranges = []
+    for axis, name in enumerate(AXES):
+        (low, high), (low_pure, high_pure) = (_extremes(vehicle, 1 + axis, pure=pure) for pure in (False, True))
+        ranges.append(
+            TorqueRange(
+                axis=name,
+                lowest=low,
+                highest=high,
+                lowest_pure=low_pure,
+                highest_pure=high_pure,
+                lowest_acceleration=low / vehicle.inertia[axis],
+                highest_acceleration=high / vehicle.inertia[axis],
+            )
+        )
+    return tuple(ranges)
+
+
+def _extremes(vehicle: Vehicle, row: int, *, pure: bool) -> tuple[float, float]:
+    """Smallest and largest torque [N m] of one row of the allocation matrix; `pure`: the other torques vanish."""
+    top = vehicle.speed_max**2
+    matrix = top * vehicle.allocation  # in v / speed_max^2, so that the programme is well scaled
+    units = np.abs(matrix).max(axis=1)
+    fixed = [0, *(other for other in (1, 2, 3) if pure and other != row)]
+    equal = np.zeros(len(fixed))
+    equal[0] = vehicle.mass * vehicle.gravity / units[0]
+    found = []
+    for sign in (1.0, -1.0):
+        solution = linprog(
+            sign * matrix[row] / units[row],
+            A_eq=matrix[fixed] / units[fixed, None],
+            b_eq=equal,
+            bounds=(vehicle.speed_min**2 / top, 1.0),
+            method="highs",
+        )
+        assert solution.success, "hover itself is feasible"
+        found.append(float(sign * solution.fun * units[row]))
+    return found[0], found[1]

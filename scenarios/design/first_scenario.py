@@ -1,0 +1,341 @@
+"""A scenario made for a vehicle: its controller, a course that it can fly, and where every number comes from."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+
+from mpc.robust.tightening import SHORTEST_LAG
+from quadsim.errors import UnknownNameError, printable
+from quadsim.vehicle import Vehicle
+from scenarios.design.loop import delay_margin
+from scenarios.design.tuning import (
+    HEADING_RATIO,
+    HEADING_STEP,
+    HEIGHT_RATIO,
+    HEIGHT_STEP,
+    HORIZON_TIMES,
+    LAG_RATIO,
+    MOVE_RATIO,
+    PERIOD_SHARE,
+    STEEPEST,
+    THRUST_SHARE,
+    Tuning,
+    tune,
+)
+
+COURSES: Final = ("hover", "step", "figure-eight")
+LAWS: Final = ("robust", "lqr", "pid", "geometric")
+SHARE: Final = 0.6
+"""Largest acceleration of a figure eight, over the largest within the tilt bound."""
+EIGHT_RATIO: Final = 0.3
+"""Turns of a figure eight per time [rad/s] over the loop's bandwidth: across it moves twice as fast."""
+STEP_RATIO: Final = 0.28
+"""Bandwidth of the filter of steps over the loop's."""
+STEP: Final = 1.0
+"""[m]"""
+ROOM: Final = 0.15
+"""Largest error that is allowed on the way, over the size of the course; the RMS error is a third of that or less."""
+SOFT: Final = (2e4, 1e3)
+"""l1 and l2 of the tilt bounds over the weight of x, as the defaults have them with the paper's weight of 10."""
+LQR_TILT: Final = 30.0
+BASELINE_SHARE: Final = 0.9
+"""Tilt [deg] that an LQR is limited to, and share of the tilt bound that the other baselines are: they only limit what
+they ask for."""
+GRID: Final = 0.2
+"""Durations are multiples of it [s], and so of every control period."""
+_EIGHT_PEAK: Final = float(np.hypot(np.sin(angle := np.linspace(0.0, math.pi, 721)), 2.0 * np.sin(2.0 * angle)).max())
+"""Largest |d2p/dt2| of the figure eight (a sin wt, a/2 sin 2wt), over a w^2."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Entry:
+    """A line of the file.
+
+    Attributes:
+        table: its header, without brackets; empty for the top.
+        key: of the field; empty for an empty table, which switches a part on.
+        value: of TOML.
+        why: what it is, in its unit, and where it comes from.
+    """
+
+    table: str
+    key: str
+    value: Any
+    why: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class FirstScenario:
+    """A scenario for a vehicle, line by line.
+
+    Attributes:
+        head: comments above it.
+        entries: its lines, those of a table together.
+        size: of the course [m]: the step, or the figure's length; for hover a step's.
+    """
+
+    head: tuple[str, ...]
+    entries: tuple[Entry, ...]
+    size: float
+
+    def to_data(self) -> dict[str, Any]:
+        """As nested tables, what parsing `to_toml` gives."""
+        data: dict[str, Any] = {}
+        for entry in self.entries:
+            holder = data
+            if entry.table == "[constraints]":
+                rows = data.setdefault("constraints", [])
+                if entry.key == "name":
+                    rows.append({})
+                holder = rows[-1]
+            else:
+                for name in entry.table.split("."):
+                    holder = holder.setdefault(name, {}) if name else holder
+            if entry.key:
+                holder[entry.key] = entry.value
+        return data
+
+    def to_toml(self) -> str:
+        """As a commented file."""
+        lines = [f"# {printable(text)}".rstrip() for text in self.head]
+        table = ""
+        for entry in self.entries:
+            if entry.table != table or (entry.table == "[constraints]" and entry.key == "name"):
+                table = entry.table
+                lines += ["", f"[{table}]" + (f"  # {entry.why}" if not entry.key else "")]
+            elif not lines[-1].strip() or lines[-1].startswith("#"):
+                lines.append("")
+            if entry.key:
+                lines.append(f"{entry.key} = {_text(entry.value)}" + (f"  # {entry.why}" if entry.why else ""))
+        return "\n".join(lines) + "\n"
+
+
+def first_scenario(
+    vehicle: Vehicle, file: str, *, course: str = "hover", law: str = "robust", steepest: float = STEEPEST
+) -> FirstScenario:
+    """A scenario that the vehicle flies well, with its controller's numbers made from the vehicle's.
+
+    Args:
+        vehicle: the numbers.
+        file: where they are, as the scenario is to name it: a shipped vehicle or a path ending in `.toml`.
+        course: one of `COURSES`.
+        law: one of `LAWS`; all but `robust` with their own defaults.
+        steepest: largest tilt bound [rad].
+
+    Raises:
+        UnknownNameError: there is no such course or law.
+    """
+    for kind, name, known in (("course", course, COURSES), ("controller", law, LAWS)):
+        if name not in known:
+            raise UnknownNameError(kind, name, known)
+    tuning = tune(vehicle, steepest=steepest)
+    flown, duration, size = _course(course, vehicle, tuning)
+    name = re.sub(r"[^a-z0-9._-]+", "-", f"first-{vehicle.name}-{course}".lower())[:80]
+    entries = (
+        Entry(table="", key="name", value=name, why=""),
+        Entry(table="", key="description", value=_description(course, vehicle), why=""),
+        Entry(table="", key="duration", value=duration, why="s"),
+        Entry(
+            table="",
+            key="control_period",
+            value=tuning.period,
+            why=f"s, tau: the longest of the usual ones with tau w <= {PERIOD_SHARE:g}",
+        ),
+        Entry(table="vehicle", key="file", value=file, why="made for its numbers: remake this file when they change"),
+        Entry(table="initial", key="position", value=[0.0, 0.0, 1.0], why="m, world; at rest"),
+        Entry(table="plant", key="limit_speeds", value=True, why="rotors saturate at their lowest and highest speed"),
+        *flown,
+        *(_robust(vehicle, tuning) if law == "robust" else _baseline(law, vehicle, tuning)),
+        Entry(table="effects.rotors", key="", value=None, why="lag and inertia of the vehicle file"),
+        Entry(table="effects.air", key="", value=None, why="drag of the vehicle file"),
+        *_constraints(vehicle, tuning, size if law == "robust" else None),
+    )
+    return FirstScenario(head=_head(vehicle, tuning, course, law), entries=entries, size=size)
+
+
+def _head(vehicle: Vehicle, tuning: Tuning, course: str, law: str) -> tuple[str, ...]:
+    can = tuning.authority
+    limits = {
+        "lag": f"the rotors' lag: 1 / ({LAG_RATIO:g} (T + tau / 2)), T = {1e3 * can.lag:.3g} ms",
+        "torque": "torque: 0.5 sqrt(alpha / tilt bound), alpha the smaller of roll's and pitch's",
+        "period": "what a period of 10 ms or more can serve",
+    }
+    margin = delay_margin(vehicle, tuning)
+    return (
+        f"A first flight of {_description(course, vehicle)}.",
+        f"Made by: quadsim scenario --for VEHICLE --course {course}"
+        + ("" if law == "robust" else f" --controller {law}"),
+        "",
+        f"Thrust to weight {can.thrust_to_weight:.3g}: at most {math.degrees(can.steady_tilt):.3g} deg of steady tilt; "
+        "angular acceleration in reserve at hover",
+        f"{can.turning[0]:.3g}, {can.turning[1]:.3g}, {can.turning[2]:.3g} rad/s^2 about x, y, z.",
+        f"The loop's bandwidth for x and y is w = {tuning.bandwidth:.3g} rad/s,",
+        f"limited by {limits[tuning.limited_by]};",
+        f"{tuning.height:.3g} rad/s for z, {tuning.heading:.3g} rad/s for yaw. "
+        f"Without bounds it stands {1e3 * margin:.3g} ms more delay than it knows of.",
+        "Weights by Bryson's rule, 1 / (largest accepted deviation)^2; rules and sources: scenarios/design/tuning.py.",
+    )
+
+
+def _description(course: str, vehicle: Vehicle) -> str:
+    what = {
+        "hover": "hover at 1 m",
+        "step": f"steps of {STEP:g} m in x, y and z",
+        "figure-eight": f"a figure eight at {100.0 * SHARE:g} % of the largest acceleration within the tilt bound",
+    }
+    return f"{vehicle.name}: {what[course]}"
+
+
+def _course(course: str, vehicle: Vehicle, tuning: Tuning) -> tuple[list[Entry], float, float]:
+    """The lines of `[reference]`, the flight's duration [s], and the course's size [m]."""
+    if course == "hover":
+        why = "no windows: every axis stays at its initial position, yaw at 0"
+        return [Entry(table="reference", key="", value=None, why=why)], 4.0, STEP
+    if course == "step":
+        slowest = min(tuning.bandwidth, tuning.height)
+        response = round(3.0 / (STEP_RATIO * slowest), 2)
+        start = _later(max(1.0, 3.0 / tuning.bandwidth))
+        hold = _later(max(1.5, 1.2 * response))
+        why = f"s, 95 % of a step: 3 / ({STEP_RATIO:g} times {slowest:.3g} rad/s, the slower of w and that of z)"
+        found = [Entry(table="reference", key="response_time", value=response, why=why)]
+        for axis, begin, until, value in (("x", 0, 2, STEP), ("y", 1, 3, STEP), ("z", 0, 2, 1.0 + STEP)):
+            window = {"start": round(start + begin * hold, 9), "stop": round(start + until * hold, 9), "value": value}
+            found.append(Entry(table="reference", key=axis, value=[window], why="s, s, m"))
+        return found, round(start + 4.0 * hold, 9), STEP
+    acceleration = SHARE * vehicle.gravity * tuning.acceleration
+    length = _rounded(2.0 * acceleration / (_EIGHT_PEAK * (EIGHT_RATIO * tuning.bandwidth) ** 2), 3)
+    turn = round(math.tau * math.sqrt(0.5 * length * _EIGHT_PEAK / acceleration), 3)
+    ramp = round(0.5 * turn, 3)
+    found = [
+        Entry(table="reference", key="type", value="figure_eight", why=""),
+        Entry(table="reference", key="start", value=1.0, why="s"),
+        Entry(
+            table="reference",
+            key="length",
+            value=length,
+            why=f"m, end to end: such that it turns with {EIGHT_RATIO:g} w; width half of it",
+        ),
+        Entry(
+            table="reference",
+            key="period",
+            value=turn,
+            why=f"s: at most {acceleration:.3g} m/s^2, {SHARE:g} of g tan(tilt bound)",
+        ),
+        Entry(table="reference", key="ramp", value=ramp, why="s, half a turn to gain its speed, and to lose it"),
+    ]
+    return found, _later(1.0 + turn + ramp + 1.0), length
+
+
+def _robust(vehicle: Vehicle, tuning: Tuning) -> Iterator[Entry]:
+    place, height, heading = (_rounded(weight) for weight in tuning.weights)
+    speed = _rounded(tuning.speed_weight)
+    lag = vehicle.rotor_rise is not None and vehicle.rotor_rise >= SHORTEST_LAG
+
+    def line(key: str, value: Any, why: str, table: str = "") -> Entry:
+        return Entry(table=f"controller{table}", key=key, value=value, why=why)
+
+    yield line("type", "robust", "")
+    yield line(
+        "horizon", tuning.horizon, f"N, periods: {HORIZON_TIMES:g} / w = {HORIZON_TIMES / tuning.bandwidth:.3g} s"
+    )
+    known = "the vehicle's rotor_rise is predicted" if lag else "the vehicle gives no lag"
+    yield line("rotor_lag", "vehicle" if lag else 0.0, known)
+    yield line("heading", True, "the hover model is turned by the present yaw")
+    why = f"of changes: as much as speed costs at {MOVE_RATIO:g} w, speed / ({MOVE_RATIO:g} w tau)^2"
+    yield line("move_weight", _rounded(tuning.move_weight), why)
+    yield line("", None, "force and torque that the model does not know are estimated and compensated", ".offset_free")
+    yield line("linear", _rounded(SOFT[0] * place), f"l1: {SOFT[0]:g} times the weight of x", ".soft")
+    yield line("quadratic", _rounded(SOFT[1] * place), f"l2: {SOFT[1]:g} times the weight of x", ".soft")
+    where = ".output_weights"
+    why = f"1 / (g tan(tilt bound) / w^2)^2: {tuning.deviation:.3g} m is what the tilt bound answers"
+    yield line("x", place, why, where)
+    yield line("y", place, "as x", where)
+    why = f"for {tuning.height:.3g} rad/s, at most {HEIGHT_RATIO:g} w; all thrust in reserve answers {HEIGHT_STEP:g} m"
+    yield line("z", height, f"{why} or more", where)
+    turned = math.degrees(HEADING_STEP)
+    why = f"for {tuning.heading:.3g} rad/s, at most {HEADING_RATIO:g} w; all torque in reserve answers {turned:.3g} deg"
+    yield line("yaw", heading, f"{why} or more", where)
+    why = f"1 / ({speed**-0.5:.3g} rad/s)^2: with it four integrators have the bandwidth w, (g beta)^2 x / w^8"
+    yield line("speed", speed, why, ".input_weights")
+    tilt = _tilt(tuning)
+    limit = math.degrees(math.acos(min(1.0, 1.0 / (THRUST_SHARE * tuning.authority.thrust_to_weight))))
+    why = f"deg: what the hover model stands, or {limit:.3g} deg, what {100 * THRUST_SHARE:g} % of the thrust holds"
+    yield line("roll", [-tilt, tilt], why, ".output_bounds")
+    yield line("pitch", [-tilt, tilt], "as roll", ".output_bounds")
+    yield from _inputs(vehicle, tuning)
+
+
+def _baseline(law: str, vehicle: Vehicle, tuning: Tuning) -> Iterator[Entry]:
+    tilt = min(LQR_TILT, BASELINE_SHARE * _tilt(tuning)) if law == "lqr" else BASELINE_SHARE * _tilt(tuning)
+    yield Entry(table="controller", key="type", value=law, why="its gains are its own defaults for the vehicle")
+    why = "deg, largest that it asks for; below the audit's, since it plans nothing"
+    yield Entry(table="controller", key="tilt", value=round(tilt, 3), why=why)
+    yield from _inputs(vehicle, tuning)
+
+
+def _inputs(vehicle: Vehicle, tuning: Tuning) -> Iterator[Entry]:
+    down, up = _slew(tuning)
+    table = "controller.input_bounds"
+    why = f"rad/s, what the rotors hold; hover is {vehicle.hover_speed:.4g}"
+    yield Entry(table=table, key="speed", value=[vehicle.speed_min, vehicle.speed_max], why=why)
+    why = "rad/s per period: what a rotor's own speed makes in one, from hover towards its limits"
+    yield Entry(table=table, key="slew", value=[down, up], why=why)
+
+
+def _constraints(vehicle: Vehicle, tuning: Tuning, size: float | None) -> Iterator[Entry]:
+    """What the flight is audited against; `size` of the course [m] where its errors are limited too."""
+    tilt, (down, up) = _tilt(tuning), _slew(tuning)
+    rounding = _rounded(1e-9 * vehicle.speed_max)
+
+    def entry(name: str, signal: str, bounds: tuple[float, float], tolerance: float, why: str) -> Iterator[Entry]:
+        pairs = {"name": name, "signal": signal, "lower": bounds[0], "upper": bounds[1]}
+        if tolerance:
+            pairs |= {"tolerance": tolerance, "tolerance_sampled": tolerance}
+        for key, value in pairs.items():
+            said = {"lower": why, "tolerance": "rounding"}.get(key, "")
+            yield Entry(table="[constraints]", key=key, value=value, why=said)
+
+    for name in ("roll", "pitch"):
+        yield from entry(name, name, (-tilt, tilt), 0.0, "deg, the tilt bound, at every instant")
+    yield from entry("speed", "speed", (vehicle.speed_min, vehicle.speed_max), rounding, "rad/s, what the rotors hold")
+    yield from entry("slew", "slew", (down, up), rounding, "rad/s per period, the controller's bound")
+    if size is not None:
+        off = _rounded(ROOM * size)
+        for axis in "xyz":
+            why = f"m, {100 * ROOM:g} % of the course's size, {size:g} m"
+            yield from entry(f"hold_{axis}", f"{axis}_error", (-off, off), 0.0, why)
+
+
+def _tilt(tuning: Tuning) -> float:
+    """The tilt bound [deg], a whole number where it is above 5."""
+    degrees = math.degrees(tuning.tilt) + 1e-9
+    return float(math.floor(degrees)) if degrees > 5.0 else _rounded(degrees)
+
+
+def _slew(tuning: Tuning) -> tuple[float, float]:
+    return _rounded(tuning.slew[0], 4), _rounded(tuning.slew[1], 4)
+
+
+def _later(time: float) -> float:
+    """The next multiple of `GRID`."""
+    return round(GRID * math.ceil(round(time / GRID, 6)), 9)
+
+
+def _rounded(number: float, digits: int = 3) -> float:
+    return float(f"{number:.{digits}g}")
+
+
+def _text(value: Any) -> str:
+    """A value as TOML."""
+    if isinstance(value, dict):
+        return "{ " + ", ".join(f"{key} = {_text(entry)}" for key, entry in value.items()) + " }"
+    if isinstance(value, list):
+        return "[" + ", ".join(map(_text, value)) + "]"
+    return json.dumps(value, ensure_ascii=False) if isinstance(value, bool | str) else repr(value)

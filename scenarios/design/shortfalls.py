@@ -1,0 +1,93 @@
+"""Which bounds of a scenario a vehicle cannot meet, and why."""
+
+from __future__ import annotations
+
+import math
+from typing import Final
+
+from quadsim.vehicle import Vehicle
+from scenarios.courses.feasibility_check import fitting, report
+from scenarios.design.authority import Authority, authority
+from scenarios.schema.baselines import GeometricSpec, LQRSpec, PIDSpec
+from scenarios.schema.optimisation import BoundedSpec, InputBoundsSpec
+from scenarios.schema.robust import RobustSpec
+from scenarios.schema.scenario import Scenario
+
+SLOWEST_ANSWER: Final = 1.0
+"""Time [s] within which steps of the command, as they are bounded, should come from hover to the highest speed."""
+
+
+def shortfalls(scenario: Scenario, vehicle: Vehicle) -> tuple[str, ...]:
+    """A line for each bound that the vehicle cannot meet; none for a scenario that suits it.
+
+    Args:
+        scenario: whatever vehicle it has itself.
+        vehicle: that it is to be flown with.
+    """
+    spec, can = scenario.controller, authority(vehicle)
+    found: list[str] = []
+    if isinstance(spec, BoundedSpec | LQRSpec | PIDSpec | GeometricSpec) and spec.input_bounds is not None:
+        found += _inputs(spec.input_bounds, vehicle, scenario.control_period)
+    if isinstance(spec, BoundedSpec):
+        for name in ("roll", "pitch"):
+            if name in spec.output_bounds:
+                found += _tilt(f"controller.output_bounds.{name}", max(map(abs, spec.output_bounds[name])), can)
+    elif isinstance(spec, LQRSpec | PIDSpec | GeometricSpec):
+        found += _tilt("controller.tilt", spec.tilt, can)
+    if isinstance(spec, RobustSpec) and spec.rotor_lag == "vehicle" and vehicle.rotor_rise is None:
+        found.append("controller.rotor_lag is the vehicle's, whose file gives no rotor_rise: give a number of seconds")
+    for limit in scenario.constraints:
+        if limit.signal == "speed" and not (
+            (-math.inf if limit.lower is None else limit.lower)
+            <= vehicle.hover_speed
+            <= (math.inf if limit.upper is None else limit.upper)
+        ):
+            sides = f"{'...' if limit.lower is None else f'{limit.lower:g}'} to {limit.upper if limit.upper else 0:g}"
+            found.append(f"constraint {limit.name}: hover is {vehicle.hover_speed:.4g} rad/s, the audit allows {sides}")
+    if any("hover is" in line for line in found):  # the course's rotor speeds would say it again
+        return tuple(found)
+    problems = report(scenario, vehicle).problems
+    found += [f"the course asks for {problem}" for problem in problems]
+    fits = fitting(scenario, vehicle) if problems else ""
+    return (*found, fits) if fits else tuple(found)
+
+
+def _inputs(bounds: InputBoundsSpec, vehicle: Vehicle, period: float) -> list[str]:
+    lower, upper = bounds.speed
+    hover, found = vehicle.hover_speed, []
+    if hover > upper:
+        found.append(f"controller.input_bounds.speed: hover is {hover:.4g} rad/s, the scenario allows {upper:g}")
+    elif hover < lower:
+        found.append(
+            f"controller.input_bounds.speed: hover is {hover:.4g} rad/s, the scenario asks for at least {lower:g}"
+        )
+    if upper > vehicle.speed_max:
+        found.append(
+            f"controller.input_bounds.speed: the scenario counts on {upper:g} rad/s, the rotors reach "
+            f"{vehicle.speed_max:g}"
+        )
+    if lower < vehicle.speed_min:
+        found.append(
+            f"controller.input_bounds.speed: the scenario counts on {lower:g} rad/s, the rotors hold at least "
+            f"{vehicle.speed_min:g}"
+        )
+    up = bounds.slew[1]
+    needed = vehicle.speed_max - hover
+    if up * SLOWEST_ANSWER < needed * period:
+        time = f"{needed * period / up:.3g} s" if up else "for ever"
+        found.append(
+            f"controller.input_bounds.slew: {up:g} rad/s per period take {time} from hover to the highest speed, "
+            f"{needed:.4g} rad/s more; tilt and height are answered too late"
+        )
+    return found
+
+
+def _tilt(name: str, bound: float, can: Authority) -> list[str]:
+    """A tilt [deg] at which the rotors do not carry the weight any more."""
+    steady = math.degrees(can.steady_tilt)
+    if bound <= steady:
+        return []
+    return [
+        f"{name}: {bound:g} deg, but from {steady:.3g} deg on the rotors do not carry the weight "
+        f"(thrust to weight {can.thrust_to_weight:.3g})"
+    ]

@@ -1,0 +1,167 @@
+"""A controller's numbers from a vehicle's: how fast loops may be, and the weights that make them so.
+
+1. *Bandwidth.*  From rotor speeds to a place there are four integrators.  The optimum of q x^2 + r u^2 on them is a
+   Butterworth pattern of radius w (Anderson and Moore, "Optimal Control", 1990, Sec. 5.4), with
+   w^8 = (g beta)^2 q / r and beta the angular acceleration per rotor speed; of two integrators, w^4 = beta^2 q / r.
+   w is the smallest of
+   - 1 / (`LAG_RATIO` (T + tau / 2)), T the rotors' time constant and tau the period: the loop then stands about
+     0.8 (T + tau / 2) more delay than it knows of (`scenarios.design.loop.delay_margin`; the tests measure it);
+   - 0.5 sqrt(alpha / tilt), alpha the angular acceleration in reserve: the largest tilt is reached and left within
+     2 sqrt(tilt / alpha) = 1 / w;
+   - `FASTEST`, so that a period of 10 ms or more is enough.
+2. *Period*: the longest with tau w <= `PERIOD_SHARE`, 40 samples in each period of the loop's own motion (Astroem and
+   Wittenmark, "Computer-Controlled Systems", 1997, ask for 15 to 60).
+3. *Horizon*: `HORIZON_TIMES` / w, in which the loop's own motion has died out.
+4. *Weights* by Bryson's rule, 1 / (largest accepted deviation)^2 (Bryson and Ho, "Applied Optimal Control", 1975): the
+   place deviates by what the tilt bound itself would answer, g tan(tilt) / w^2; the rotor speed's weight follows from
+   w by 1., those of height and heading likewise from theirs.  Changes of rotor speeds cost as much as the speeds
+   themselves at `MOVE_RATIO` w.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Final, Literal
+
+import numpy as np
+
+from mpc.model import continuous_model
+from quadsim.errors import ParameterError
+from quadsim.state import INDEX
+from quadsim.vehicle import Vehicle
+from scenarios.design.authority import Authority, authority
+
+PERIODS: Final = (0.05, 0.04, 0.025, 0.02, 0.01)
+"""Control periods to choose from [s], whole multiples of the physics step."""
+LAG_RATIO: Final = 2.5
+"""1 / w over the lag and half a period."""
+FASTEST: Final = 6.0
+"""Largest bandwidth [rad/s]."""
+STEEPEST: Final = math.radians(40.0)
+"""Largest tilt bound [rad]: at hover the model takes tan(tilt) for tilt, 20 % less at 40 deg."""
+THRUST_SHARE: Final = 0.85
+"""Share of the thrust that holds the vehicle at the tilt bound; the rest is for torques."""
+PERIOD_SHARE: Final = 0.16
+"""Largest w tau."""
+HORIZON_TIMES: Final = 5.0
+"""Horizon times w."""
+HEIGHT_RATIO: Final = 1.5
+"""Bandwidth of height over that of the place: two integrators less."""
+HEIGHT_STEP: Final = 0.25
+"""Deviation of the height that the whole reserve of thrust answers [m]."""
+HEADING_RATIO: Final = 0.7
+"""Bandwidth of the heading over that of the place."""
+HEADING_STEP: Final = 0.5
+"""Deviation of the heading that the whole torque in reserve answers [rad]."""
+LEAST_RESERVE: Final = 1e-6
+"""Acceleration [m/s^2] and angular acceleration [rad/s^2] in reserve below which there is nothing to design."""
+MOVE_RATIO: Final = 4.0
+"""Frequency at which changes of rotor speeds cost as much as these, over w."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Tuning:
+    """Numbers of `[controller] type = "robust"` for a vehicle.
+
+    Attributes:
+        authority: what they follow from.
+        period: tau [s].
+        horizon: N [periods].
+        tilt: bound on roll and on pitch [rad].
+        bandwidth: w of x and y [rad/s].
+        limited_by: what w is the limit of.
+        height: bandwidth of z [rad/s].
+        heading: bandwidth of yaw [rad/s].
+        deviation: accepted of x and y [m].
+        weights: of x and y [1/m^2], z [1/m^2] and yaw [1/rad^2].
+        speed_weight: of a rotor's speed [s^2/rad^2].
+        move_weight: of its change from period to period [s^2/rad^2].
+        slew: largest changes of a command from one period to the next, down and up [rad/s].
+    """
+
+    authority: Authority
+    period: float
+    horizon: int
+    tilt: float
+    bandwidth: float
+    limited_by: Literal["lag", "torque", "period"]
+    height: float
+    heading: float
+    deviation: float
+    weights: tuple[float, float, float]
+    speed_weight: float
+    move_weight: float
+    slew: tuple[float, float]
+
+    @property
+    def acceleration(self) -> float:
+        """Largest level acceleration within the tilt bound, over that of gravity [-]."""
+        return math.tan(self.tilt)
+
+
+def tune(vehicle: Vehicle, *, steepest: float = STEEPEST) -> Tuning:
+    """The numbers for a vehicle; see the module.
+
+    Args:
+        vehicle: the numbers.
+        steepest: largest tilt bound [rad].
+
+    Raises:
+        ParameterError: hover leaves no thrust or no torque in reserve.
+    """
+    can = authority(vehicle)
+    if min(can.climb, can.sink, *can.turning) < LEAST_RESERVE:
+        rule = f"further from its hover speed, {vehicle.hover_speed:.4g} rad/s, or nothing is left to control it with"
+        side = "speed_max" if can.climb <= can.sink else "speed_min"
+        raise ParameterError("vehicle", side, getattr(vehicle, side), rule)
+    tilt = min(steepest, math.acos(min(1.0, 1.0 / (THRUST_SHARE * can.thrust_to_weight))))
+    # A vehicle that barely hovers keeps at least a third of the tilt that it can hold.
+    tilt = max(tilt, can.steady_tilt / 3.0)
+    bandwidth, limited_by, period = _bandwidth(can, tilt)
+    height = min(HEIGHT_RATIO * bandwidth, math.sqrt(min(can.climb, can.sink) / HEIGHT_STEP))
+    heading = min(HEADING_RATIO * bandwidth, math.sqrt(can.turning[2] / HEADING_STEP))
+    _, B = continuous_model(vehicle)
+    lift, roll, pitch, yaw = (
+        float(np.linalg.norm(B[INDEX[name]])) for name in ("vz", "roll_rate", "pitch_rate", "yaw_rate")
+    )
+    deviation = vehicle.gravity * math.tan(tilt) / bandwidth**2
+    place = deviation**-2.0
+    speed = place * (vehicle.gravity * min(roll, pitch)) ** 2 / bandwidth**8
+    return Tuning(
+        authority=can,
+        period=period,
+        horizon=math.ceil(HORIZON_TIMES / (bandwidth * period)),
+        tilt=tilt,
+        bandwidth=bandwidth,
+        limited_by=limited_by,
+        height=height,
+        heading=heading,
+        deviation=deviation,
+        weights=(place, speed * height**4 / lift**2, speed * heading**4 / yaw**2),
+        speed_weight=speed,
+        move_weight=speed / (MOVE_RATIO * bandwidth * period) ** 2,
+        slew=(
+            -(vehicle.hover_speed - vehicle.speed_min) * _reached(period, vehicle.rotor_fall),
+            (vehicle.speed_max - vehicle.hover_speed) * _reached(period, vehicle.rotor_rise),
+        ),
+    )
+
+
+def _bandwidth(can: Authority, tilt: float) -> tuple[float, Literal["lag", "torque", "period"], float]:
+    """The bandwidth w [rad/s], what limits it, and the period [s]."""
+    for period in PERIODS:
+        limits: dict[Literal["lag", "torque", "period"], float] = {
+            "lag": 1.0 / (LAG_RATIO * (can.lag + 0.5 * period)),
+            "torque": 0.5 * math.sqrt(min(can.turning[:2]) / tilt),
+            "period": FASTEST,
+        }
+        limited_by = min(limits, key=lambda name: limits[name])
+        if limits[limited_by] * period <= PERIOD_SHARE:
+            break
+    return limits[limited_by], limited_by, period
+
+
+def _reached(period: float, lag: float | None) -> float:
+    """Share of a step that a rotor's speed makes in a period."""
+    return 1.0 if lag is None else 1.0 - math.exp(-period / lag)

@@ -1,0 +1,76 @@
+"""First flights, made and flown in memory: what the tests and docs/first-flights.md judge `scenarios.design` by."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Final
+
+from plausible_vehicles import plausible_vehicles
+
+from quadsim.assets import vehicle_names, vehicle_path
+from quadsim.flight.metrics import peak_tilt, tracking
+from quadsim.vehicle import VEHICLE_UNITS, Vehicle, load_vehicle
+from scenarios.design.first_scenario import first_scenario
+from scenarios.design.tuning import STEEPEST
+from scenarios.loading import parse_scenario
+from scenarios.run import fly_scenario
+
+LARGEST_RMS: Final = 0.05
+"""Of the robust controller's position error, over the course's size."""
+DRAWN: Final = 20
+SEED: Final = 2026
+"""How many vehicles are drawn, and from which seed."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class FirstFlight:
+    """How a first flight went.
+
+    Attributes:
+        outcome: the verdict in one word.
+        rms: of the distance from the reference, over the course's size; NaN where hardly anything was flown.
+        nearest: the bound on tilt that was come nearest to, what was left of it as a share; negative: violated.
+        violated: constraints that did not hold.
+        size: of the course [m].
+        tilt: largest roll or pitch [deg].
+    """
+
+    outcome: str
+    rms: float
+    nearest: float
+    violated: tuple[str, ...]
+    size: float
+    tilt: float
+
+    @property
+    def meets_the_bar(self) -> bool:
+        """Whether it was flown to its end, every constraint held, with an RMS error within the bar."""
+        return self.outcome == "satisfied" and self.rms < LARGEST_RMS
+
+
+def vehicles() -> list[Vehicle]:
+    """Those that ship, and the drawn ones."""
+    return [*(load_vehicle(vehicle_path(name)) for name in vehicle_names()), *plausible_vehicles(DRAWN, SEED)]
+
+
+def fly_first(vehicle: Vehicle, course: str, law: str, *, steepest: float = STEEPEST) -> FirstFlight:
+    """Make a first scenario, with a tilt bound of at most `steepest` [rad], and fly it once."""
+    made = first_scenario(vehicle, vehicle.name, course=course, law=law, steepest=steepest)
+    numbers = {name: value for name in VEHICLE_UNITS if (value := getattr(vehicle, name)) is not None}
+    given = {name: list(value) if isinstance(value, tuple) else value for name, value in numbers.items()}
+    flight = fly_scenario(parse_scenario(made.to_data() | {"vehicle": {"file": vehicle.name, **given}}))
+    if not flight.log.control.t.size:
+        return FirstFlight(
+            outcome=flight.outcome, rms=math.nan, nearest=math.nan, violated=(), size=made.size, tilt=math.nan
+        )
+    errors = tracking(flight.log.control)["rmse"]
+    tilts = [finding for finding in flight.findings if finding.limit.name in ("roll", "pitch")]
+    return FirstFlight(
+        outcome=flight.outcome,
+        rms=math.hypot(errors["x"], errors["y"], errors["z"]) / made.size,
+        nearest=min(finding.worst_margin / finding.limit.upper for finding in tilts),
+        violated=tuple(finding.limit.name for finding in flight.findings if not finding.satisfied),
+        size=made.size,
+        tilt=peak_tilt(flight.log.plant.state),
+    )

@@ -1,0 +1,104 @@
+"""First scenarios, made from a vehicle's numbers and flown once; all of them: docs/make_first_flights.py."""
+
+from __future__ import annotations
+
+import tomllib
+from pathlib import Path
+
+import numpy as np
+import pytest
+from first_flights import fly_first, vehicles
+
+from mpc.baselines.lqr import bryson_objective
+from quadsim.errors import UnknownNameError
+from quadsim.vehicle import Vehicle, load_vehicle
+from scenarios.design.first_scenario import BASELINE_SHARE, COURSES, LAWS, first_scenario
+from scenarios.design.vehicle_template import vehicle_template
+from scenarios.loading import load_scenario, parse_scenario
+from scenarios.schema.robust import RobustSpec
+
+ALL = {vehicle.name: vehicle for vehicle in vehicles()}
+SHIPPED = ("crazyflie2", "hummingbird", "lopes2011")
+HARDEST = ("random-08", "random-13", "random-16", "random-17")
+"""The slowest rotors, 10 and 20 kg, and the one that strays most."""
+
+
+@pytest.mark.parametrize("name", [*SHIPPED, *HARDEST])
+def test_the_robust_controller_flies_it_first_time(name: str) -> None:
+    for course in COURSES:
+        flight = fly_first(ALL[name], course, "robust")
+        assert flight.meets_the_bar, (course, flight)
+
+
+@pytest.mark.parametrize("law", LAWS[1:])
+@pytest.mark.parametrize("name", ["crazyflie2", "random-17"])
+def test_baselines_fly_it_within_the_bounds(name: str, law: str) -> None:
+    for course in COURSES[1:]:
+        flight = fly_first(ALL[name], course, law)
+        assert flight.outcome == "satisfied", (course, flight)
+
+
+def test_the_figure_eight_comes_near_to_what_it_is_made_for() -> None:
+    """60 % of g tan(40 deg) is a tilt of 26.7 deg: a course that asks for less would prove nothing."""
+    flight = fly_first(ALL["hummingbird"], "figure-eight", "robust")
+    assert 25.0 < flight.tilt < 32.0
+
+
+@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.parametrize("course", COURSES)
+def test_the_file_says_what_is_flown(course: str, law: str) -> None:
+    made = first_scenario(ALL["hummingbird"], "hummingbird", course=course, law=law)
+    text = made.to_toml()
+    assert tomllib.loads(text) == made.to_data()
+    assert max(map(len, text.splitlines())) <= 160
+    scenario = parse_scenario(made.to_data())
+    assert scenario.controller.type == law
+    bounds = {limit.signal: (limit.lower, limit.upper) for limit in scenario.constraints}
+    if isinstance(scenario.controller, RobustSpec):
+        assert bounds["roll"] == tuple(scenario.controller.output_bounds["roll"])
+        assert bounds["slew"] == tuple(scenario.controller.input_bounds.slew)
+        assert {"x_error", "y_error", "z_error"} <= bounds.keys()
+    else:
+        assert made.to_data()["controller"]["tilt"] <= BASELINE_SHARE * (bounds["roll"][1] or 0.0)
+        assert "x_error" not in bounds
+
+
+def test_every_number_of_the_controller_says_where_it_comes_from() -> None:
+    made = first_scenario(ALL["hummingbird"], "hummingbird", course="figure-eight")
+    numbers = [
+        entry
+        for entry in made.entries
+        if (entry.table.startswith("controller") and entry.key != "type") or entry.key == "control_period"
+    ]
+    assert len(numbers) >= 14
+    assert all(entry.why for entry in numbers)
+
+
+def test_a_scenario_of_no_such_course_or_law_is_refused() -> None:
+    with pytest.raises(UnknownNameError, match=r"course.*'loop'.*figure-eight, hover, step"):
+        first_scenario(ALL["hummingbird"], "hummingbird", course="loop")
+    with pytest.raises(UnknownNameError, match=r"controller.*'fast'.*geometric, lqr, pid, robust"):
+        first_scenario(ALL["hummingbird"], "hummingbird", law="fast")
+
+
+def test_the_template_is_a_vehicle_that_flies(tmp_path: Path) -> None:
+    file = tmp_path / "mine.toml"
+    file.write_text(vehicle_template(), encoding="utf-8")
+    vehicle = load_vehicle(file)
+    assert vehicle.mass == 1.5
+    flight = fly_first(vehicle, "figure-eight", "robust")
+    assert flight.meets_the_bar, flight
+    made = tmp_path / "first.toml"
+    made.write_text(first_scenario(vehicle, "mine.toml").to_toml(), encoding="utf-8")
+    assert load_scenario(str(made)).vehicle.file == str(file.resolve())
+
+
+def test_the_default_lqr_is_slower_where_rotors_are_slow_and_as_it_was_elsewhere() -> None:
+    def weight(vehicle: Vehicle, period: float | None) -> float:
+        return float(bryson_objective(vehicle, period).Q_u[0, 0])
+
+    for name in ("hummingbird", "lopes2011", "random-17"):
+        assert weight(ALL[name], 0.05) == weight(ALL[name], None)
+    slow = ALL["random-08"]
+    assert weight(slow, 0.05) >= 4.0 * weight(slow, None)
+    assert np.log2(weight(slow, 0.05) / weight(slow, None)) % 2.0 == pytest.approx(0.0, abs=1e-9)

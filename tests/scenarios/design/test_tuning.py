@@ -1,0 +1,121 @@
+"""The rules that a first scenario follows, against closed loops."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from first_flights import vehicles
+from plausible_vehicles import HEAVIEST, LIGHTEST, QUICKEST, SLOWEST, STRONGEST, WEAKEST, plausible_vehicles
+
+from mpc.model import continuous_model, discretise
+from quadsim.errors import ParameterError
+from quadsim.state import INDEX
+from quadsim.vehicle import N_ROTORS, Vehicle
+from scenarios.design.authority import authority
+from scenarios.design.loop import delay_margin, gain, is_stable
+from scenarios.design.tuning import FASTEST, PERIOD_SHARE, tune
+
+ALL = vehicles()
+EVERY = pytest.mark.parametrize("vehicle", ALL, ids=lambda vehicle: vehicle.name)
+
+
+def test_authority_is_that_of_closed_forms() -> None:
+    """A plus at thrust to weight r: two rotors up to r of their share and two down, so that the sum stays."""
+    vehicle = next(each for each in ALL if each.name == "lopes2011")
+    can = authority(vehicle)
+    ratio = (250.0 / vehicle.hover_speed) ** 2
+    assert can.thrust_to_weight == pytest.approx(ratio)
+    assert math.cos(can.steady_tilt) == pytest.approx(1.0 / ratio)
+    assert can.climb == pytest.approx((ratio - 1.0) * 9.81)
+    share = 4.0 * 9.81 / 4.0
+    assert can.turning[0] == pytest.approx((ratio - 1.0) * 2.0 * share * 0.3 / 0.033)
+    assert can.turning[2] == pytest.approx((ratio - 1.0) * 4.0 * share * 0.024 / 0.066)
+
+
+@EVERY
+def test_the_loop_stands_a_third_of_its_time_constant_of_more_delay(vehicle: Vehicle) -> None:
+    """The bound by lag then leaves 0.8 (T + tau / 2), whatever the vehicle."""
+    tuning = tune(vehicle)
+    margin = delay_margin(vehicle, tuning)
+    assert margin * tuning.bandwidth == pytest.approx(1.0 / 3.0, rel=0.05)
+    assert margin > 0.75 * (tuning.authority.lag + 0.5 * tuning.period)
+
+
+@EVERY
+def test_period_horizon_and_bandwidth_go_together(vehicle: Vehicle) -> None:
+    tuning = tune(vehicle)
+    assert tuning.bandwidth <= FASTEST
+    assert tuning.bandwidth * tuning.period <= PERIOD_SHARE
+    assert 30 <= tuning.horizon <= 60
+    assert 0.0 < tuning.tilt < tuning.authority.steady_tilt
+
+
+def test_weights_make_a_butterworth_pattern_of_the_stated_bandwidth() -> None:
+    """Without lag and the cost of moves, at a short period: four poles of x at radius w, two of z, two of yaw."""
+    vehicle = next(each for each in ALL if each.name == "lopes2011")
+    tuning = replace(tune(vehicle), period=0.001, move_weight=1e-12)
+    K = gain(vehicle, tuning)[:, :12]
+    A, B = discretise(*continuous_model(vehicle), tuning.period)
+    closed = A - B @ K
+    for names, radius in (
+        (("x", "vx", "pitch", "pitch_rate"), tuning.bandwidth),
+        (("z", "vz"), tuning.height),
+        (("yaw", "yaw_rate"), tuning.heading),
+    ):
+        chosen = [INDEX[name] for name in names]
+        poles = np.log(np.linalg.eigvals(closed[np.ix_(chosen, chosen)])) / tuning.period
+        np.testing.assert_allclose(np.abs(poles), radius, rtol=0.02)
+        n = len(chosen)
+        expected = np.sort([math.sin(math.pi * (2 * k + 1) / (2 * n)) for k in range(n)])
+        np.testing.assert_allclose(np.sort(-poles.real / radius), expected, rtol=0.03)
+
+
+def test_a_delay_margin_is_where_a_simulated_loop_begins_to_grow() -> None:
+    vehicle = next(each for each in ALL if each.name == "hummingbird")
+    tuning = tune(vehicle)
+    K, margin, step = gain(vehicle, tuning), delay_margin(vehicle, tuning), 1e-3
+    A, B = discretise(*continuous_model(vehicle, vehicle.rotor_rise or 0.0), step)
+
+    def grows(delay: float) -> bool:
+        x, acting, waiting = np.zeros(len(A)), np.zeros(N_ROTORS), []
+        x[INDEX["x"]] = 1.0
+        last, peaks = np.zeros(N_ROTORS), []
+        for i in range(8000):
+            if i % round(tuning.period / step) == 0:
+                last = -K @ np.concatenate([x, last])
+                waiting.append((i + round(delay / step), last))
+            while waiting and waiting[0][0] <= i:
+                acting = waiting.pop(0)[1]
+            x = A @ x + B @ acting
+            peaks.append(abs(x[INDEX["pitch"]]))
+        return max(peaks[6000:]) > max(peaks[2000:4000])
+
+    assert is_stable(vehicle, tuning, K, 0.0)
+    assert not grows(0.9 * margin)
+    assert grows(1.1 * margin)
+
+
+def test_drawn_vehicles_fill_the_range_and_are_the_same_each_time() -> None:
+    drawn = plausible_vehicles(20, 2026)
+    assert drawn == plausible_vehicles(20, 2026)
+    assert drawn != plausible_vehicles(20, 2027)
+    for values, least, most in (
+        ([vehicle.mass for vehicle in drawn], LIGHTEST, HEAVIEST),
+        ([authority(vehicle).thrust_to_weight for vehicle in drawn], WEAKEST, STRONGEST),
+        ([vehicle.rotor_rise or 0.0 for vehicle in drawn], QUICKEST, SLOWEST),
+    ):
+        assert least <= min(values) < least * (most / least) ** 0.1
+        assert most >= max(values) > most / (most / least) ** 0.1
+    assert len({vehicle.rotor_azimuths for vehicle in drawn}) == 2
+
+
+def test_a_vehicle_with_nothing_in_reserve_is_refused_and_one_with_little_is_not() -> None:
+    vehicle = next(each for each in ALL if each.name == "hummingbird")
+    with pytest.raises(ParameterError, match=r"vehicle.speed_max must be further from its hover speed, 453.2 rad/s"):
+        tune(replace(vehicle, speed_max=vehicle.hover_speed))
+    little = tune(replace(vehicle, speed_max=1.02 * vehicle.hover_speed))
+    assert little.tilt == pytest.approx(little.authority.steady_tilt / 3.0)
+    assert delay_margin(vehicle, little) > 0.0
