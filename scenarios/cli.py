@@ -84,10 +84,8 @@ def make_parser() -> argparse.ArgumentParser:
     scenario.add_argument("scenario", metavar="SCENARIO", nargs="?", help=_SCENARIO)
     _add_settings(scenario)
     scenario.add_argument("--for", dest="vehicle", metavar="VEHICLE", help="print one made for this vehicle instead")
-    scenario.add_argument("--course", default="hover", metavar="NAME", help="of it: hover, step or figure-eight")
-    scenario.add_argument(
-        "--controller", default="robust", metavar="NAME", help="of it: robust, lqr, pid or geometric (default: robust)"
-    )
+    scenario.add_argument("--course", metavar="NAME", help="of it: hover, step or figure-eight (default: hover)")
+    scenario.add_argument("--controller", metavar="NAME", help="of it: robust, lqr, pid or geometric (default: robust)")
     scenario.add_argument("--schema", action="store_true", help="print the JSON Schema of scenario files instead")
 
     vehicle = command("vehicle", help="a vehicle's derived figures, its parameters' sources, its picture")

@@ -58,7 +58,7 @@ def scenario(options: Namespace) -> int:
         print(json.dumps(scenario_schema(), indent=2))
         return EXIT_DONE
     if options.vehicle is not None:
-        from scenarios.design.first_scenario import first_scenario
+        from scenarios.design.first_scenario import COURSES, LAWS, first_scenario
 
         given = {"a scenario": options.scenario, "--set": options.settings, "--seed": options.seed}
         for name, value in given.items():
@@ -67,11 +67,14 @@ def scenario(options: Namespace) -> int:
         made = first_scenario(
             load_vehicle(vehicle_path(options.vehicle)),
             options.vehicle,
-            course=options.course,
-            law=options.controller,
+            course=options.course or COURSES[0],
+            law=options.controller or LAWS[0],
         )
         print(made.to_toml(), end="")
         return EXIT_DONE
+    for name, value in (("--course", options.course), ("--controller", options.controller)):
+        if value is not None:
+            raise ParameterError("", name, value, "given with --for alone")
     if options.scenario is None:
         raise InputError(
             f"scenario needs a name or a TOML file, or --schema (there are: {', '.join(scenario_names())})"

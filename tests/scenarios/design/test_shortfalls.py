@@ -101,6 +101,7 @@ def test_from_a_template_to_a_scenario_by_the_command_line(
             "no course named 'x' (there are: figure-eight, hover, step)",
         ),
         (["scenario", "hover", "--for", "hummingbird"], "--for must be given without a scenario; got 'hummingbird'"),
+        (["scenario", "hover", "--course", "step"], "--course must be given with --for alone; got 'step'"),
         (["scenario", "--for", "hummingbird", "--set", "duration=3.0"], "--for must be given without --set"),
     ],
 )
