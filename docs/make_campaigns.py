@@ -11,36 +11,21 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from PIL import Image
+from make_numbers import copy_figure, write_page
 
-from quadsim.report.table import Cell, Grid
-from scenarios.bench.solvers import section
+from quadsim.report.table import Grid, line, section
 from scenarios.campaign.engine.local import LocalEngine
 from scenarios.campaign.manifest import stored_plan
 from scenarios.campaign.plan import load_plan
+from scenarios.campaign.report import campaign_tables, campaign_text
 from scenarios.campaign.report.campaign_curves import sure_splits
-from scenarios.campaign.report.campaign_tables import (
-    constraint_table,
-    driver_table,
-    event_table,
-    split_table,
-    worst_table,
-)
-from scenarios.campaign.report.campaign_text import (
-    campaign_sentences,
-    driver_sentences,
-    split_sentences,
-    verdict_sentence,
-)
 from scenarios.campaign.report.comparison_tables import comparison_tables, pairing
 from scenarios.campaign.run import Result, fly_campaign
 from scenarios.campaign.statistics.comparison import compare
 from scenarios.campaign.statistics.wording import interval, percent
 from scenarios.commands.campaign_console import progress
 
-ROOT = Path(__file__).resolve().parent.parent
-PAIR = ("paper-robustness", "paper-robustness-robust")
-"""Flown on the same draws, and compared flight by flight."""
+PAIR = ("paper-robustness", "paper-robustness-robust")  # flown on the same draws, and compared flight by flight
 NOMINAL = "paper-nominal"
 NAMES = (*PAIR, NOMINAL)
 PAGE = "paper-robustness"
@@ -60,17 +45,14 @@ def violations(results: list[Result]) -> Grid:
     for result in results:
         events = result.summary["events"]
         found, lost = events["violation"], events["lost"]
-        texts = (
-            result.summary["campaign"],
-            str(found["flights"]),
-            str(events["failure"]["count"]),
-            str(lost["count"]),
-            str(found["count"]),
-            percent(found["share"]),
-            interval(found["lower"], found["upper"]),
-            percent(found["upper_one_sided"]),
+        lines.append(
+            line(
+                result.summary["campaign"],
+                *(str(found["flights"]), str(events["failure"]["count"]), str(lost["count"]), str(found["count"])),
+                *(percent(found["share"]), interval(found["lower"], found["upper"])),
+                percent(found["upper_one_sided"]),
+            )
         )
-        lines.append(tuple(Cell(text=text) for text in texts))
     return Grid(
         key="violations",
         title="How often a required constraint does not hold",
@@ -88,19 +70,19 @@ def violations(results: list[Result]) -> Grid:
 def part(result: Result) -> str:
     """One campaign's section."""
     name, summary = result.summary["campaign"], result.summary
-    parts = " ".join([verdict_sentence(summary) + ".", *campaign_sentences(summary)])
+    parts = " ".join([campaign_text.verdict_sentence(summary) + ".", *campaign_text.campaign_sentences(summary)])
     tables = (
-        event_table(summary),
-        constraint_table(summary),
-        *([split_table(summary)] if split_table(summary).lines else []),
-        driver_table(summary),
-        worst_table(summary, f"runs/campaigns/{name}"),
+        campaign_tables.event_table(summary),
+        campaign_tables.constraint_table(summary),
+        *([campaign_tables.split_table(summary)] if campaign_tables.split_table(summary).lines else []),
+        campaign_tables.driver_table(summary),
+        campaign_tables.worst_table(summary, f"runs/campaigns/{name}"),
     )
     return "\n".join(
         [
             f"## {name}\n\n{parts}\n",
             f"![{name}: convergence, margins, what drives them](campaign-{name}.png)\n",
-            *(section(grid).replace("## ", "### ", 1) for grid in tables),
+            *(section(grid, 3) for grid in tables),
         ]
     )
 
@@ -117,10 +99,10 @@ def first_to_break(result: Result) -> str:
             f"{event} at {threshold:.15g}{'' if unit == '-' else f' {unit}'}" for threshold, event in steps
         )
         found = f"It is {first}. Thresholds along it: {listed}"
-    sentences = [*driver_sentences(summary), *split_sentences(summary)]
+    sentences = [*campaign_text.driver_sentences(summary), *campaign_text.split_sentences(summary)]
     return (
         "## What breaks the paper's controller first\n\n"
-        f"With small errors alone ({NOMINAL}), {verdict_sentence(summary)}. {found}.\n\n"
+        f"With small errors alone ({NOMINAL}), {campaign_text.verdict_sentence(summary)}. {found}.\n\n"
         + "".join(f"- {sentence}\n" for sentence in sentences)
     )
 
@@ -141,7 +123,7 @@ def page(results: list[Result]) -> str:
             section(violations(results)),
             first_to_break(nominal),
             f"## The one against the other\n\n{comparison.sentence} {pairing(comparison)}\n",
-            *(section(grid).replace("## ", "### ", 1) for grid in comparison_tables(comparison)),
+            *(section(grid, 3) for grid in comparison_tables(comparison)),
             *(part(result) for result in results),
         ]
     )
@@ -154,10 +136,8 @@ def main() -> None:
     options = parser.parse_args()
     results = [fly(name, there=options.there) for name in NAMES]
     for name, result in zip(NAMES, results, strict=True):
-        figure = Image.open(result.directory / "campaign.png").convert("RGB")
-        target = ROOT / "docs" / f"campaign-{name}.png"
-        figure.quantize(256, dither=Image.Dither.NONE).save(target, optimize=True)
-    (ROOT / "docs" / f"{PAGE}.md").write_text(page(results), encoding="utf-8")
+        copy_figure(result.directory / "campaign.png", f"campaign-{name}.png", 256)
+    write_page(f"{PAGE}.md", page(results))
 
 
 if __name__ == "__main__":

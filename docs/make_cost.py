@@ -7,7 +7,7 @@ import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
-from make_numbers import ROOT, Table, markdown
+from make_numbers import ROOT, Table, markdown, write_page
 
 from quadsim.flight.metrics import percentiles
 from scenarios.bench.bench_results import SolverBench
@@ -66,12 +66,13 @@ def answer(study: CostStudy) -> Table:
 
 def write_cost(study: CostStudy) -> None:
     """docs/constraints-cost.md with its figures."""
-    docs, sentences = ROOT / "docs", cost_sentences(study)
+    sentences = cost_sentences(study)
     with tempfile.TemporaryDirectory() as scratch:
         drawn = [path for path in write_cost_figures(study, Path(scratch)) if path.suffix == ".svg"]
         for path in drawn:
-            shutil.copyfile(path, docs / path.name)
-    page = [
+            shutil.copyfile(path, ROOT / "docs" / path.name)
+    write_page(
+        "constraints-cost.md",
         "# What do constraints cost?\n\nMade by `make numbers` on one machine "
         f"({study.machine['processor']}, {study.machine['cores']} cores); nothing here is typed by hand. The same "
         "section, with plots\nto zoom into, is on the page of `quadsim compare paper-unconstrained paper-constrained "
@@ -82,5 +83,4 @@ def write_cost(study: CostStudy) -> None:
         "Where the unconstrained optimum satisfies every constraint it is the answer, without a QP.\n",
         cost_markdown(study, sentences),
         *(f"![{path.stem}]({path.name})\n" for path in drawn),
-    ]
-    (docs / "constraints-cost.md").write_text("\n".join(page), encoding="utf-8")
+    )

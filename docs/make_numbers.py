@@ -12,6 +12,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import scipy.linalg
+from PIL import Image
 
 from mpc.model import hover_model
 from mpc.paper.prediction import rollout
@@ -139,11 +140,8 @@ def mujoco_transition(vehicle: Vehicle, timestep: float) -> tuple[Array, Array]:
 
 def transition_difference(vehicle: Vehicle) -> float:
     """Largest difference of A and B from MuJoCo's, in the limit of a vanishing step (Richardson extrapolation)."""
-    exact, coarse, fine = (
-        hover_model(vehicle, PERIOD),
-        mujoco_transition(vehicle, 1e-3),
-        mujoco_transition(vehicle, 5e-4),
-    )
+    exact = hover_model(vehicle, PERIOD)
+    coarse, fine = mujoco_transition(vehicle, 1e-3), mujoco_transition(vehicle, 5e-4)
     limits = (2.0 * two - one for one, two in zip(coarse, fine, strict=True))
     return float(max(np.abs(limit - part).max() for limit, part in zip(limits, (exact.A, exact.B), strict=True)))
 
@@ -184,13 +182,22 @@ def markdown(rows: Table) -> str:
     return "\n".join([lines[0], "|" + " --- |" * len(rows[0]), *lines[1:]]) + "\n"
 
 
-def replace_in_readme(name: str, table: str, *, command: str = "make numbers") -> None:
-    """Put a table between the markers of that name in README.md, which also name the command that makes it."""
-    readme = ROOT / "README.md"
+def replace_in(page: Path, name: str, table: str, *, command: str = "make numbers") -> None:
+    """Put a table between the markers of that name in a page, which also name the command that makes it."""
     begin, end = f"<!-- {name}: made by `{command}` -->", f"<!-- {name} end -->"
-    head, _, rest = readme.read_text(encoding="utf-8").partition(begin)
-    _, _, tail = rest.partition(end)
-    readme.write_text(f"{head}{begin}\n\n{table}\n{end}{tail}", encoding="utf-8")
+    head, _, rest = page.read_text(encoding="utf-8").partition(begin)
+    page.write_text(f"{head}{begin}\n\n{table}\n{end}{rest.partition(end)[2]}", encoding="utf-8")
+
+
+def write_page(name: str, *parts: str) -> None:
+    """Write a page of docs/, its parts a line apart."""
+    (ROOT / "docs" / name).write_text("\n".join(parts), encoding="utf-8")
+
+
+def copy_figure(drawn: Path, name: str, colours: int) -> None:
+    """Put a figure into docs/ with so many colours, which makes it small."""
+    figure = Image.open(drawn).convert("RGB")
+    figure.quantize(colours, dither=Image.Dither.NONE).save(ROOT / "docs" / name, optimize=True)
 
 
 def solver_difference(flight: Flight) -> float:
@@ -205,7 +212,8 @@ def main() -> None:
     flights = {name: fly(name) for name in names}
     constrained = flights["paper-constrained"]
     table, variations = markdown(results(flights)), fly_variations(load_scenario("paper-constrained"))
-    page = [
+    write_page(
+        "numbers.md",
         "# The numbers\n\nMade by `make numbers`; nothing here is typed by hand.\n",
         f"## The paper's flights\n\n{table}",
         "A bound that is *held* may still be exceeded between the samples, by the amount in brackets; the audit's\n"
@@ -219,9 +227,8 @@ def main() -> None:
         "The error falls by four as the deviation halves: quadratically.\n",
         "## The two forms of the QP\n\nLargest difference between the commands of `piqp-dense` and `piqp-multistage`\n"
         f"over the whole constrained flight: {solver_difference(constrained):.1e} rad/s.\n",
-    ]
-    (ROOT / "docs" / "numbers.md").write_text("\n".join(page), encoding="utf-8")
-    replace_in_readme("results", table)
+    )
+    replace_in(ROOT / "README.md", "results", table)
 
 
 if __name__ == "__main__":

@@ -9,14 +9,12 @@ from __future__ import annotations
 import argparse
 import importlib
 import json
-import os
-import resource
+import runpy
 import statistics
 import subprocess
-import sys
 import tempfile
 import time as clock
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Final
@@ -63,64 +61,46 @@ def measure(name: str) -> dict[str, float]:
     scenario = robust if name == "robust" else load_scenario(name)
     vehicle = runner.build_vehicle(robust)
     plant, navigation = (type(build(robust, vehicle)) for build in (runner.build_plant, runner.build_navigation))
-    spent: dict[str, float] = {}
+    # the harness is this checkout's, whichever one is measured
+    stopwatch: Any = runpy.run_path(str(ROOT / "scenarios" / "bench" / "timing.py"))["Stopwatch"]
+    watch = stopwatch(clock.thread_time)
     for owner, method, piece in (
         (plant, "advance", "plant and its effects"),
         (plant, "state", "the true state"),
         (navigation, "advance", "sensors"),
         (navigation, "state", "sensors"),
     ):
-        setattr(owner, method, _timed(getattr(owner, method), spent, piece))
+        watch.watch(owner, method, piece)
     runner.fly_scenario(scenario.model_copy(update={"duration": 1.0}))  # loads what is loaded late
-    spent.clear()
-    started = clock.thread_time()
+    watch.clear()
+    watch.watch(runner, "fly_scenario", "the whole flight")
     runner.fly_scenario(scenario)
-    return {**spent, "the whole flight": clock.thread_time() - started}
-
-
-def _timed(function: Callable[..., Any], spent: dict[str, float], piece: str) -> Callable[..., Any]:
-    def call(*arguments: Any, **named: Any) -> Any:
-        started = clock.thread_time()
-        try:
-            return function(*arguments, **named)
-        finally:
-            spent[piece] = spent.get(piece, 0.0) + clock.thread_time() - started
-
-    return call
-
-
-def _command(tree: Path, *arguments: str) -> tuple[str, float]:
-    """Stdout of a Python command in a checkout, and its processor seconds."""
-    environment = {**os.environ, "PYTHONPATH": str(tree), "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
-    before = resource.getrusage(resource.RUSAGE_CHILDREN)
-    done = subprocess.run([sys.executable, *arguments], cwd=tree, env=environment, capture_output=True, text=True)
-    if done.returncode not in (0, 1):  # a flight may violate its constraints
-        raise SystemExit(done.stderr)
-    after = resource.getrusage(resource.RUSAGE_CHILDREN)
-    return done.stdout, sum(after[:2]) - sum(before[:2])
+    return dict(watch.totals())
 
 
 def _once(tree: Path, run: Path) -> Iterator[tuple[str, float]]:
     """All that is measured of a checkout, once; `run` is where its run goes."""
+    from scenarios.bench.timing import time_python
+
     for label, name in FLIGHTS.items():
-        pieces = json.loads(_command(tree, str(Path(__file__)), "--measure", name)[0])
+        pieces = json.loads(time_python(str(Path(__file__)), "--measure", name, tree=tree).output)
         yield from ((f"{label}: {piece}", seconds) for piece, seconds in pieces.items())
     for label, *arguments in COMMANDS:
         command = ("-m", "scenarios.cli", "run", "paper-constrained", "--out", str(run), *arguments)
-        yield f"{label}, all processes", _command(tree, *command)[1]
+        yield f"{label}, all processes", time_python(*command, tree=tree).processor_s
 
 
 def compare(before: Path, runs: int) -> list[tuple[str, ...]]:
     """A table with its head: what it was, what it is, and the median of the ratios of neighbours."""
-    times: dict[str, list[float]] = {}
+    from scenarios.bench.timing import in_turns
+
     with tempfile.TemporaryDirectory() as scratch:
-        for _ in range(runs):
-            for tree in (before, ROOT):
-                for name, value in _once(tree, Path(scratch) / "run"):
-                    times.setdefault(name, []).append(value)
+        run = Path(scratch) / "run"
+        once = {"before": lambda: dict(_once(before, run)), "after": lambda: dict(_once(ROOT, run))}
+        earlier, now = in_turns(once, runs).values()
     rows: list[tuple[str, ...]] = [("processor time [s]", "before", "after", "ratio")]
-    for name, values in times.items():
-        pairs = list(zip(values[::2], values[1::2], strict=True))
+    for name in earlier[0]:
+        pairs = [(then[name], after[name]) for then, after in zip(earlier, now, strict=True)]
         old, new = (statistics.median(of_tree) for of_tree in zip(*pairs, strict=True))
         ratio = statistics.median(after / then for then, after in pairs)
         rows.append((name, f"{old:.2f}", f"{new:.2f}", f"{ratio:.2f}"))

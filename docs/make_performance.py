@@ -7,29 +7,25 @@ them (`scenarios.bench.timing`), and all tables and figures take them from there
 from __future__ import annotations
 
 import argparse
-import math
-import subprocess
-import sys
 import tempfile
-import time as clock
 from pathlib import Path
 
 from make_cost import timed, write_cost
-from make_numbers import Table, markdown
+from make_numbers import ROOT, Table, copy_figure, markdown, write_page
 from make_outside import outside
-from PIL import Image
 
+from quadsim.report.table import section
 from scenarios.bench.bench_results import FlightProfile, RenderProfile, SolverBench
 from scenarios.bench.bench_tables import flight_tables, render_tables, solver_tables
 from scenarios.bench.campaigns import bench_campaign, campaign_tables
 from scenarios.bench.film import bench_render
 from scenarios.bench.flight import bench_flight
-from scenarios.bench.solvers import bench_solvers, section, write_bench
+from scenarios.bench.solvers import bench_solvers, write_bench
+from scenarios.bench.timing import in_turns, time_python
 from scenarios.cost.measure import study_cost
 from scenarios.loading import load_scenario
 from scenarios.run import fly_scenario
 
-ROOT = Path(__file__).resolve().parent.parent
 SCENARIO = "paper-constrained"
 REST = "## Where the time of a flight goes"
 """What begins with it stays as it is where steps alone are measured."""
@@ -72,11 +68,7 @@ EFFECTS = {
         *(f"sensors.{name}={{rate=100, noise=0.01}}" for name in ("position", "velocity", "attitude", "rates"))
     ],
     "position and attitude sensor, estimator": [*GPS, "estimator={type='error_state'}"],
-    "the same with a gyro of 200 Hz": [
-        *GPS,
-        "sensors.rates={rate=200, noise=0.3}",
-        "estimator={type='error_state'}",
-    ],
+    "the same with a gyro of 200 Hz": [*GPS, "sensors.rates={rate=200, noise=0.3}", "estimator={type='error_state'}"],
 }
 """Effects whose cost is measured, as settings of the scenario; the first is what the others are compared with."""
 
@@ -100,10 +92,8 @@ def effect_costs() -> Table:
     """What effects cost a flight of 20 s in hover; best of `REPEATS`, in turns."""
     hover = ["duration=20.0", "reference.x=[]", "reference.y=[]", "reference.z=[]", "initial.position=[0.0, 0.0, 2.0]"]
     scenarios = {name: load_scenario("paper-unconstrained", [*hover, *extra]) for name, extra in EFFECTS.items()}
-    best = dict.fromkeys(EFFECTS, math.inf)
-    for _ in range(REPEATS):
-        for name, scenario in scenarios.items():
-            best[name] = min(best[name], fly_scenario(scenario).simulate_s)
+    runs = {name: lambda flown=scenario: fly_scenario(flown).simulate_s for name, scenario in scenarios.items()}
+    best = {name: min(seconds) for name, seconds in in_turns(runs, REPEATS).items()}
     rows: Table = [("effects", "60 s of flight [s]", "ratio")]
     for name, seconds in best.items():
         rows.append((name, f"{3.0 * seconds:.2f}", f"{seconds / best['none']:.2f}"))
@@ -117,30 +107,16 @@ def whole_commands(flight: FlightProfile, film: RenderProfile) -> Table:
         ("60 s of constrained flight simulated, one core", "<= 1.2 s", f"{flight.best:.2f}"),
     ]
     with tempfile.TemporaryDirectory() as scratch:
-        for label, target, repeats, arguments in (
-            ("`quadsim --help`", "<= 0.3 s", REPEATS, ["--help"]),
-            (
-                f"`quadsim run {SCENARIO} --no-video`",
-                "<= 4 s",
-                REPEATS,
-                ["run", SCENARIO, "--no-video", "--out", f"{scratch}/run"],
-            ),
-            (
-                f"`quadsim video`: the same 60 s, 1280x720 at 30 fps, {film.workers} cores",
-                "<= 60 s",
-                1,
-                ["video", f"{scratch}/run"],
-            ),
+        run = f"{scratch}/run"
+        filmed = f"`quadsim video`: the same 60 s, 1280x720 at 30 fps, {film.workers} cores"
+        for label, target, repeats, *arguments in (
+            ("`quadsim --help`", "<= 0.3 s", REPEATS, "--help"),
+            (f"`quadsim run {SCENARIO} --no-video`", "<= 4 s", REPEATS, "run", SCENARIO, "--no-video", "--out", run),
+            (filmed, "<= 60 s", 1, "video", run),
         ):
-            rows.append((label, target, f"{min(_wall_s(arguments) for _ in range(repeats)):.2f}"))
+            times = [time_python("-m", "scenarios.cli", *arguments, tree=ROOT).wall_s for _ in range(repeats)]
+            rows.append((label, target, f"{min(times):.2f}"))
     return rows
-
-
-def _wall_s(arguments: list[str]) -> float:
-    """Wall time of one `quadsim` command [s]."""
-    started = clock.perf_counter()
-    subprocess.run([sys.executable, "-m", "scenarios.cli", *arguments], check=True, capture_output=True, cwd=ROOT)
-    return clock.perf_counter() - started
 
 
 def campaigns() -> str:
@@ -206,9 +182,8 @@ def main() -> None:
     bench = bench_solvers(scenario)
     with tempfile.TemporaryDirectory() as scratch:
         write_bench(bench, Path(scratch))
-        figure = Image.open(Path(scratch) / "solvers.png").convert("RGB")
-        figure.quantize(64, dither=Image.Dither.NONE).save(ROOT / "docs" / "solvers.png", optimize=True)
-    path.write_text(f"{steps(bench)}\n{end}", encoding="utf-8")
+        copy_figure(Path(scratch) / "solvers.png", "solvers.png", 64)
+    write_page(path.name, steps(bench), end)
     write_cost(study_cost(scenario, [load_scenario("paper-unconstrained")], timed=timed(bench)))
 
 

@@ -12,25 +12,21 @@ from pathlib import Path
 
 import numpy as np
 from fault_injection import CONTROLLERS, NEAR, SOON, Consequence, draw, inject_all
-from PIL import Image
+from make_numbers import copy_figure, write_page
 
 from mpc.robust.tightening import TighteningSettings
-from quadsim.report.table import Cell, Grid
+from quadsim.report.table import Grid, line, section
 from scenarios.bench.mismatch.benchmark import run_mismatch, write_mismatch
 from scenarios.bench.mismatch.conditions import WORN
 from scenarios.bench.mismatch.controllers import FULL
 from scenarios.bench.mismatch.survival import ARRIVED, MismatchBench, MismatchFlight, mismatch_legend, mismatch_tables
-from scenarios.bench.solvers import section
 from scenarios.loading import load_scenario
 from scenarios.parts.vehicle import build_vehicle
 
-ROOT = Path(__file__).resolve().parent.parent
 FAULTS = 50
-RESTLESS = ("wind 3 m/s", "sensor noise", "all by half")
-"""Conditions that never leave the vehicle at rest."""
+RESTLESS = ("wind 3 m/s", "sensor noise", "all by half")  # conditions that never leave the vehicle at rest
 STATED = TighteningSettings()
-QUICK_ENOUGH = 6.0
-"""What the step is to take at p99 [ms]."""
+QUICK_ENOUGH = 6.0  # what the step is to take at p99 [ms]
 
 
 def targets(measured: MismatchBench) -> Grid:
@@ -57,7 +53,7 @@ def targets(measured: MismatchBench) -> Grid:
         key="asked",
         title=f"Requirements on {FULL}",
         head=("requirement", "met"),
-        lines=tuple((Cell(text=what), Cell(text=found)) for what, found in lines),
+        lines=tuple(line(*texts) for texts in lines),
         note="Disturbances beyond the size that the tightening states for those about each axis, "
         f"{STATED.angular_acceleration:g} rad/s^2, may tilt it further: a rotor that loses {100 * WORN:g} % makes "
         f"{worn_rotor():.0f} rad/s^2 at hover, and half of that in all by half. Measurement noise is not counted. "
@@ -88,15 +84,13 @@ def fault_tables(found: Sequence[Consequence]) -> list[Grid]:
         lines = []
         for name, cases in sorted(kinds.items()):
             starts = ", ".join(f"{case.injection.start:.2f} ({case.injection.condition})" for case in cases)
-            texts = (
-                name,
-                starts,
-                f"{sum(case.harmless for case in cases)} of {len(cases)}",
-                str(max(case.fallback for case in cases)),
-                f"{max(case.furthest for case in cases):.4f}",
-                f"{max(case.back for case in cases):.2f}",
+            lines.append(
+                line(
+                    *(name, starts, f"{sum(case.harmless for case in cases)} of {len(cases)}"),
+                    str(max(case.fallback for case in cases)),
+                    *(f"{max(case.furthest for case in cases):.4f}", f"{max(case.back for case in cases):.2f}"),
+                )
             )
-            lines.append(tuple(Cell(text=text) for text in texts))
         grids.append(
             Grid(
                 key=f"faults-{controller}",
@@ -142,9 +136,8 @@ def main() -> None:
     found = inject_all(draw(FAULTS))
     with tempfile.TemporaryDirectory() as scratch:
         write_mismatch(measured, Path(scratch))
-        figure = Image.open(Path(scratch) / "ladder.png").convert("RGB")
-        figure.quantize(32, dither=Image.Dither.NONE).save(ROOT / "docs" / "ladder.png", optimize=True)
-    (ROOT / "docs" / "robustness.md").write_text(page(measured, found), encoding="utf-8")
+        copy_figure(Path(scratch) / "ladder.png", "ladder.png", 32)
+    write_page("robustness.md", page(measured, found))
 
 
 if __name__ == "__main__":

@@ -3,20 +3,18 @@
 from __future__ import annotations
 
 import argparse
-import time as clock
+import itertools
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
-from pathlib import Path
 
 import safety_campaign
 import safety_mutations
 import safety_outputs
+from make_numbers import ROOT, replace_in
 
-from quadsim.report.table import Cell, Grid, grid_to_markdown
-
-PAGE = Path(__file__).resolve().parent / "safety.md"
-BEGIN, END = "<!-- counts: made by `make safety` -->", "<!-- counts end -->"
+from quadsim.report.table import Grid, grid_to_markdown, line
+from scenarios.bench.timing import Stopwatch
 
 SUMMARIES, CAMPAIGNS = (partial(safety_mutations.as_ordinary_user, kind) for kind in ("summaries", "campaigns"))
 ATTACKS: dict[str, tuple[Callable[[int], Mapping[str, int]], int]] = {
@@ -28,26 +26,25 @@ ATTACKS: dict[str, tuple[Callable[[int], Mapping[str, int]], int]] = {
     "One campaign with controllers that hang, fork, eat memory, exit": (safety_campaign.measure, 60),
 }
 """What was tried: by which function, and how often."""
-ASIDE = 4
-"""So many of them go on in processes of their own, as an ordinary user, and side by side."""
+ASIDE = 4  # so many of them go on in processes of their own, as an ordinary user, and side by side
 
 
 def counts(scale: float) -> str:
     """Go through all attacks; what came of each, as Markdown."""
 
     def go(what: str) -> str:
-        started = clock.perf_counter()
+        watch = Stopwatch()
         attack, count = ATTACKS[what]
         found = attack(max(1, round(scale * count)))
         outcomes = "; ".join(f"{name.replace('_', ' ')} {number}" for name, number in found.items())
-        print(f"{what}: {outcomes} ({clock.perf_counter() - started:.0f} s)", flush=True)
+        print(f"{what}: {outcomes} ({watch.elapsed:.0f} s)", flush=True)
         return outcomes
 
     names = list(ATTACKS)
     with ThreadPoolExecutor() as beside:
         outcomes = list(beside.map(go, names[:ASIDE]))
     outcomes += [go(name) for name in names[ASIDE:]]
-    lines = tuple((Cell(text=name), Cell(text=text)) for name, text in zip(names, outcomes, strict=True))
+    lines = tuple(itertools.starmap(line, zip(names, outcomes, strict=True)))
     return grid_to_markdown(Grid(key="counts", title="What was tried", head=("attack", "outcome"), lines=lines))
 
 
@@ -58,8 +55,7 @@ def main() -> None:
     options = parser.parse_args()
     table = counts(options.scale)
     if options.scale == 1.0:
-        head, _, rest = PAGE.read_text(encoding="utf-8").partition(BEGIN)
-        PAGE.write_text(f"{head}{BEGIN}\n\n{table}\n{END}{rest.partition(END)[2]}", encoding="utf-8")
+        replace_in(ROOT / "docs" / "safety.md", "counts", table, command="make safety")
 
 
 if __name__ == "__main__":

@@ -16,8 +16,8 @@ from quadsim.controller import SOLVED
 from quadsim.flight.audit import Finding
 from quadsim.flight.metrics import peak_tilt, tracking
 from scenarios.flight import Flight
-from scenarios.loading import scenario_names
 from scenarios.schema.scenario import Group, LostSpec
+from scenarios.shipped import scenario_names
 
 PAGE = Path(__file__).resolve().parent / "scenarios.md"
 TITLES: dict[Group, str] = {
@@ -29,14 +29,8 @@ TITLES: dict[Group, str] = {
     "sensors": "Sensors and estimation",
 }
 HEAD = (
-    "scenario",
-    "shows",
-    "verdict",
-    "s",
-    "peak roll, pitch [deg]",
-    "RMS error x, y, z [m]",
-    "nearest to its bound",
-    "QPs [%]",
+    *("scenario", "shows", "verdict", "s", "peak roll, pitch [deg]", "RMS error x, y, z [m]"),
+    *("nearest to its bound", "QPs [%]"),
 )
 
 
@@ -49,13 +43,8 @@ def row(flight: Flight) -> tuple[str, ...]:
         return (*first, "-", "-", "-", "-")
     rmse = tracking(log.control)["rmse"]
     solved = f"{100.0 * log.control.status.count(SOLVED) / log.control.t.size:.0f}" if flight.solver else "-"
-    return (
-        *first,
-        f"{peak_tilt(log.plant.state):.1f}",
-        ", ".join(f"{rmse[axis]:.3f}" for axis in "xyz"),
-        nearest(flight),
-        solved,
-    )
+    errors = ", ".join(f"{rmse[axis]:.3f}" for axis in "xyz")
+    return (*first, f"{peak_tilt(log.plant.state):.1f}", errors, nearest(flight), solved)
 
 
 def nearest(flight: Flight) -> str:
@@ -77,7 +66,6 @@ def _share(finding: Finding) -> float:
 
 
 def _criteria() -> str:
-    """The loss criteria and their defaults, as the scenario file explains them."""
     fields = LostSpec.model_fields.items()
     return "".join(f"- `lost.{name} = {info.default:g}`: {info.description}\n" for name, info in fields)
 

@@ -7,10 +7,9 @@ compares the page with today's figures.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
 
 import numpy as np
-from make_numbers import markdown
+from make_numbers import markdown, write_page
 from peers import agreement, closed_loop, constrained_qp, gain, open_loop, recorded
 from peers.agreement import Verdict
 from peers.checks import HEAD, Check
@@ -26,7 +25,6 @@ from mpc.solvers import SOLVERS
 from scenarios.loading import load_scenario
 from scenarios.parts.vehicle import build_vehicle
 
-ROOT = Path(__file__).resolve().parent.parent
 INTRODUCTION = """\
 # Verification
 
@@ -163,7 +161,8 @@ def main() -> None:
         *qp.checks,
     ]
     table = markdown([HEAD, *(check.row for check in checks)])
-    page = [
+    write_page(
+        "verification.md",
         INTRODUCTION,
         table,
         open_loop_section(plant),
@@ -171,8 +170,7 @@ def main() -> None:
         gain_section(gains),
         constrained_section(qp),
         agreement_section(verdicts),
-    ]
-    (ROOT / "docs" / "verification.md").write_text("\n".join(page), encoding="utf-8")
+    )
 
 
 if __name__ == "__main__":

@@ -10,7 +10,8 @@ import numpy as np
 
 from mpc.constraints import Bounds
 from mpc.ocp import Problem
-from quadsim.controller import ACCEPTED
+from mpc.solvers import Answer
+from quadsim.controller import ACCEPTED, Command
 from quadsim.errors import ParameterError
 from quadsim.state import Array
 from quadsim.vehicle import N_ROTORS, Vehicle
@@ -23,18 +24,14 @@ BOUND_TOLERANCE: Final = 1e-6
 class ActuatorBounds:
     """Hard bounds on rotor speeds, Eq. (20), and on their steps from one period to the next, Eq. (15).
 
-    Attributes:
-        u_min, u_max: (4,) speeds [rad/s], finite and not negative: rotors turn one way.
-        delta_min, delta_max: (4,) steps u(k) - u(k-1) [rad/s]; infinite where there is no bound.
-
     Raises:
         ParameterError: bounds that are not four numbers each, are not in order, or that forbid holding a speed.
     """
 
-    u_min: Array
-    u_max: Array
-    delta_min: Array
-    delta_max: Array
+    u_min: Array  # (4,) speeds [rad/s], finite and not negative: rotors turn one way
+    u_max: Array  # likewise
+    delta_min: Array  # (4,) steps u(k) - u(k-1) [rad/s]; infinite where there is no bound
+    delta_max: Array  # likewise
 
     def __post_init__(self) -> None:
         for name in ("u_min", "u_max", "delta_min", "delta_max"):
@@ -113,12 +110,7 @@ class ActuatorBounds:
 def rejection(status: str, speeds: Array, plan: Array, bounds: ActuatorBounds, before: Array) -> str | None:
     """Why an answer must not reach the plant, or None.
 
-    Args:
-        status: the solver's.
-        speeds: (4,) the command [rad/s].
-        plan: (N, 4) the inputs planned [rad/s].
-        bounds: hard bounds.
-        before: (4,) the command in force [rad/s].
+    `speeds` (4,) is the command, `plan` (N, 4) the inputs planned, `before` (4,) the command in force [rad/s].
     """
     if status not in ACCEPTED:
         return status
@@ -126,6 +118,23 @@ def rejection(status: str, speeds: Array, plan: Array, bounds: ActuatorBounds, b
         return "not_finite"
     lower, upper = bounds.reach(before)
     return "out_of_bounds" if np.maximum(lower - speeds, speeds - upper).max() > BOUND_TOLERANCE else None
+
+
+def command_of(speeds: Array, plan: Array, status: str, answer: Answer, *, fallback: int = 0) -> Command:
+    """Speeds (4,) and a plan (N, 4) as a command under a status, with what the solver says of its answer."""
+    solution, accepted = answer.solution, status in ACCEPTED
+    return Command(
+        speeds=speeds.copy(),
+        plan=plan,
+        status=status,
+        iterations=solution.iterations,
+        active=solution.active if accepted else 0,
+        fallback=fallback,
+        slack=float(np.max(answer.slacks, initial=0.0)) if accepted else 0.0,
+        primal_residual=solution.primal_residual,
+        dual_residual=solution.dual_residual,
+        solve_s=solution.solve_s,
+    )
 
 
 def shifted(plan: Array, steps: int) -> Array:

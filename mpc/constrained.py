@@ -6,7 +6,7 @@ from typing import Final
 
 import numpy as np
 
-from mpc.answer import ActuatorBounds, rejection, shifted
+from mpc.answer import ActuatorBounds, command_of, rejection, shifted
 from mpc.exact.shortcut import with_shortcut
 from mpc.ocp import Problem, Query, Unanswered
 from mpc.paper.prediction import rollout
@@ -22,12 +22,8 @@ class ConstrainedMPC:
     Where the unconstrained optimum satisfies every constraint it is the solution, and no QP is solved: the status is
     then `unconstrained`.  Only an answer that is the optimum, finite, and whose first action is within the hard input
     bounds is used.  Otherwise the previous plan, shifted by one step, is held (fallback level 1) for as long as it
-    lasts, and then the flight is given up.
-
-    Args:
-        problem: with bounds.
-        solver: set up for the same problem.
-        shortcut: whether to try less than the whole QP first, see `mpc.exact.shortcut`; the commands are the same.
+    lasts, and then the flight is given up.  `shortcut`: whether to try less than the whole QP first
+    (`mpc.exact.shortcut`); the commands are the same.
 
     Attributes:
         problem: as given.
@@ -35,31 +31,18 @@ class ConstrainedMPC:
     """
 
     name: Final = "constrained"
+    _plan: Array | None
 
     def __init__(self, problem: Problem, solver: Solver, *, shortcut: bool = True) -> None:
-        self.problem = problem
+        self.problem, self.horizon, self.solver = problem, problem.horizon, solver.name
         self._solver = with_shortcut(problem, solver) if shortcut else solver
         self._bounds = ActuatorBounds.of_problem(problem)
-        self._before = problem.model.u_bar
-        self._plan: Array | None = None
-        self._held = 0
+        self._before, self._plan, self._held = problem.model.u_bar, None, 0
         self.unanswered: Unanswered | None = None
-
-    @property
-    def solver(self) -> str:
-        """Name of the QP solver."""
-        return self._solver.name
-
-    @property
-    def horizon(self) -> int:
-        """N, samples of preview."""
-        return self.problem.horizon
 
     def reset(self, speeds: Array) -> None:
         """Start anew after the command u(-1) (4,) [rad/s]."""
-        self._before = np.array(speeds, float)
-        self._plan = None
-        self._held = 0
+        self._before, self._plan, self._held = np.array(speeds, float), None, 0
         self.unanswered = None
         self._solver.reset()
 
@@ -105,18 +88,7 @@ class ConstrainedMPC:
             raise PlanExhaustedError(f"the solver answered {problem!r} {held}", time=time)
         else:
             self._held += 1
-        speeds = self._bounds.clip(self._plan[self._held], self._before)
-        self._before = speeds
-        solution = answer.solution
-        return Command(
-            speeds=speeds.copy(),
-            plan=self._plan if problem is None else shifted(self._plan, self._held),
-            status=problem or solution.status,
-            iterations=solution.iterations,
-            active=solution.active if problem is None else 0,
-            slack=float(np.max(answer.slacks, initial=0.0)) if problem is None else 0.0,
-            fallback=int(problem is not None),
-            primal_residual=solution.primal_residual,
-            dual_residual=solution.dual_residual,
-            solve_s=solution.solve_s,
-        )
+        self._before = self._bounds.clip(self._plan[self._held], self._before)
+        if problem is None:
+            return command_of(self._before, self._plan, answer.solution.status, answer)
+        return command_of(self._before, shifted(self._plan, self._held), problem, answer, fallback=1)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -18,14 +19,10 @@ class Penalty:
     While l1 exceeds the multiplier that the hard row would have, the penalty is exact: e is zero wherever the hard
     problem is feasible (Kerrigan and Maciejowski, 2000, "Soft constraints and exact penalty functions in model
     predictive control").
-
-    Attributes:
-        l1: (m,) at least 0.
-        l2: (m,) at least 0.
     """
 
-    l1: Array
-    l2: Array
+    l1: Array  # (m,) at least 0
+    l2: Array  # (m,) at least 0
 
     def __post_init__(self) -> None:
         for name in ("l1", "l2"):
@@ -39,39 +36,34 @@ class Constraint:
     """lower <= C x(k+i) + D u(k+i) + E (u(k+i) - u(k+i-1)) <= upper.
 
     Rows of states alone hold at x(k+1) .. x(k+N), all others at i = 0 .. N-1.
-
-    Attributes:
-        name: as messages and audits name it.
-        lower, upper: (m,), or (N, m) where the steps' bounds differ; infinite where there is no bound.
-        C: (m, n); None for zeros.
-        D: (m, nu); likewise.
-        E: (m, nu); likewise.
-        penalty: what violating it costs; None for a hard constraint.
     """
 
-    name: str
-    lower: Array
-    upper: Array
-    C: Array | None = None
-    D: Array | None = None
-    E: Array | None = None
-    penalty: Penalty | None = None
+    name: str  # as messages and audits name it
+    lower: Array  # (m,), or (N, m) where the steps' bounds differ; infinite where there is no bound
+    upper: Array  # likewise
+    C: Array | None = None  # (m, n); None for zeros
+    D: Array | None = None  # (m, nu); likewise
+    E: Array | None = None  # (m, nu); likewise
+    penalty: Penalty | None = None  # what violating it costs; None for a hard constraint
 
     def __post_init__(self) -> None:
-        lower, upper = self.lower, self.upper
-        if lower.shape != upper.shape or np.any(np.isnan(lower)) or np.any(np.isnan(upper)):
-            raise ParameterError(
-                "controller", f"{self.name}.lower", lower, f"numbers of the same shape as upper = {upper}"
-            )
-        if np.any(lower >= upper):
-            raise ParameterError("controller", f"{self.name}.lower", lower, f"below upper = {upper}")
+        _check_order(f"{self.name}.lower", self.lower, "upper", self.upper)
+        m = self.lower.shape[-1]
         given = [matrix for matrix in (self.C, self.D, self.E) if matrix is not None]
-        if not given or any(len(matrix) != lower.shape[-1] for matrix in given):
-            raise ParameterError("controller", self.name, [len(matrix) for matrix in given], f"{lower.shape[-1]} rows")
+        if not given or any(len(matrix) != m for matrix in given):
+            raise ParameterError("controller", self.name, [len(matrix) for matrix in given], f"{m} rows")
         if not all(np.isfinite(matrix).all() for matrix in given):
             raise ParameterError("controller", self.name, given, "finite numbers")
-        if self.penalty is not None and self.penalty.l1.size != lower.shape[-1]:
-            raise ParameterError("controller", "l1", self.penalty.l1.shape, f"of shape ({lower.shape[-1]},)")
+        if self.penalty is not None and self.penalty.l1.size != m:
+            raise ParameterError("controller", "l1", self.penalty.l1.shape, f"of shape ({m},)")
+
+
+def _check_order(low: str, lower: Array, high: str, upper: Array) -> None:
+    """Refuse bounds of different shapes, that are no numbers, or that leave nothing between them."""
+    if lower.shape != upper.shape or np.isnan(lower).any() or np.isnan(upper).any():
+        raise ParameterError("controller", low, lower, f"numbers of the same shape as {high} = {upper}")
+    if np.any(lower >= upper):
+        raise ParameterError("controller", low, lower, f"below {high} = {upper}")
 
 
 def tightened(constraint: Constraint, margins: Array) -> Constraint:
@@ -91,34 +83,21 @@ def tightened(constraint: Constraint, margins: Array) -> Constraint:
 
 @dataclass(frozen=True, kw_only=True)
 class Bounds:
-    """The constraints of Eqs. (12)-(20); an infinite entry is no bound.
+    """The constraints of Eqs. (12)-(20); an infinite entry is no bound."""
 
-    Attributes:
-        C_c: (n_c, n) constrained outputs y_c = C_c xi.  Eq. (12).
-        y_min, y_max: (n_c,) output bounds.  Eq. (13).
-        delta_min, delta_max: (nu,) bounds on u(k) - u(k-1) [rad/s].  Eq. (15).
-        u_min, u_max: (nu,) input bounds [rad/s].  Eq. (20).
-        penalty: what violating an output bound costs; None for hard ones.
-        margins: (N, n_c) by which output bounds are tightened at each predicted state; None for none.
-    """
-
-    C_c: Array
-    y_min: Array
-    y_max: Array
-    delta_min: Array
-    delta_max: Array
-    u_min: Array
-    u_max: Array
-    penalty: Penalty | None = None
-    margins: Array | None = None
+    C_c: Array  # (n_c, n) constrained outputs y_c = C_c xi. Eq. (12)
+    y_min: Array  # (n_c,) output bounds. Eq. (13)
+    y_max: Array  # likewise
+    delta_min: Array  # (nu,) bounds on u(k) - u(k-1) [rad/s]. Eq. (15)
+    delta_max: Array  # likewise
+    u_min: Array  # (nu,) input bounds [rad/s]. Eq. (20)
+    u_max: Array  # likewise
+    penalty: Penalty | None = None  # what violating an output bound costs; None for hard ones
+    margins: Array | None = None  # (N, n_c) by which output bounds are tightened at each predicted state; None for none
 
     def __post_init__(self) -> None:
         for low, high in (("y_min", "y_max"), ("delta_min", "delta_max"), ("u_min", "u_max")):
-            lower, upper = getattr(self, low), getattr(self, high)
-            if lower.shape != upper.shape or np.any(np.isnan(lower)) or np.any(np.isnan(upper)):
-                raise ParameterError("controller", low, lower, f"numbers of the same shape as {high} = {upper}")
-            if np.any(lower >= upper):
-                raise ParameterError("controller", low, lower, f"below {high} = {upper}")
+            _check_order(low, getattr(self, low), high, getattr(self, high))
 
     def output(self, i: int) -> tuple[str, float, str]:
         """A constrained output as scenario files name it: its state, what one of its unit is there, and that unit."""
@@ -142,31 +121,21 @@ class Bounds:
 
 @dataclass(frozen=True, kw_only=True)
 class Rows:
-    """The rows of all constraints that bound anything, m of them, in the constraints' order.
+    """The rows of all constraints that bound anything, m of them, in the constraints' order."""
 
-    Attributes:
-        C: (m, n).
-        D: (m, nu).
-        E: (m, nu).
-        lower, upper: (N, m).
-        l1, l2: (m,) what violating a row costs; l1 is infinite of hard ones.
-        of_states: (m,) whether a row is of the state alone: entry i is then for x(k+i+1), otherwise for x(k+i), u(k+i).
-        input: (m,) the input that a hard row bounds by itself; -1 where it is no such row.
-        names: (m,) of their constraints.
-    """
-
-    C: Array
-    D: Array
-    E: Array
-    lower: Array
-    upper: Array
-    l1: Array
-    l2: Array
+    C: Array  # (m, n)
+    D: Array  # (m, nu)
+    E: Array  # (m, nu)
+    lower: Array  # (N, m)
+    upper: Array  # likewise
+    l1: Array  # (m,) what violating a row costs; l1 is infinite of hard ones
+    l2: Array  # likewise
+    # (m,) whether a row is of the state alone: entry i is then for x(k+i+1), otherwise for x(k+i), u(k+i)
     of_states: np.ndarray[tuple[int], np.dtype[np.bool_]]
-    input: Indices
-    names: tuple[str, ...]
+    input: Indices  # (m,) the input that a hard row bounds by itself; -1 where it is no such row
+    names: tuple[str, ...]  # (m,) of their constraints
 
-    @property
+    @cached_property
     def soft(self) -> Indices:
         """(m_s,) which rows are soft."""
         return np.flatnonzero(np.isfinite(self.l1))

@@ -19,8 +19,7 @@ from quadsim.errors import ParameterError
 from quadsim.state import INDEX, N_STATES, Array
 from quadsim.vehicle import N_ROTORS
 
-LEAST_LIFT: Final = 0.1
-"""Share of the weight that thrust holds at least: no rest is upside down."""
+LEAST_LIFT: Final = 0.1  # share of the weight that thrust holds at least: no rest is upside down
 _ROLL, _PITCH = INDEX["roll"], INDEX["pitch"]
 
 
@@ -28,17 +27,13 @@ _ROLL, _PITCH = INDEX["roll"], INDEX["pitch"]
 class Trim:
     """The estimated equilibrium of a vehicle.
 
-    Attributes:
-        speeds: (4,) of the rotors [rad/s].
-        lift: (3,) along which thrust points, world frame, of any length; upwards.
-        twist: (3,) angular acceleration, body frame, over the acceleration by thrust that brings it about [1/m].
-
     Raises:
         ParameterError: they are not as many finite numbers, or lift does not point upwards.
     """
 
-    speeds: Array
-    lift: Array
+    speeds: Array  # (4,) of the rotors [rad/s]
+    lift: Array  # (3,) along which thrust points, world frame, of any length; upwards
+    # (3,) angular acceleration, body frame, over the acceleration by thrust that brings it about [1/m]
     twist: Array = field(default_factory=lambda: np.zeros(3))
 
     def __post_init__(self) -> None:
@@ -72,12 +67,7 @@ def twisted(model: NonlinearModel, twist: Array) -> NonlinearModel:
 
 
 def equilibrium(model: NonlinearModel, twist: Array | None = None) -> Trim:
-    """What rest takes under the model's disturbance; a rotor that would have to pull stands still.
-
-    Args:
-        model: the model, `twisted` where it is.
-        twist: by what.
-    """
+    """What rest takes under a model's disturbance, `twisted` or not; a rotor that would have to pull stands still."""
     a_x, a_y, a_z = model.acceleration.tolist()
     up = max(model.gravity - a_z, LEAST_LIFT * model.gravity)
     thrust = math.hypot(a_x, a_y, up)

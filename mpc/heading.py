@@ -40,8 +40,7 @@ def turn(yaw: float) -> Array:
 def slope(model: LinearModel) -> Array:
     """(4, 4) accelerations along z and about x, y, z per rotor speed [(m/s^2)/(rad/s)], [1/s]."""
     # Rates and vz integrate accelerations alone, so that their rows of B are the period times the slope.
-    accelerations: Array = model.B[_ACCELERATED] / model.period
-    return accelerations
+    return np.asarray(model.B[_ACCELERATED] / model.period)
 
 
 def anchored(model: LinearModel, trim: Trim) -> LinearModel:
@@ -55,13 +54,9 @@ def anchored(model: LinearModel, trim: Trim) -> LinearModel:
 
 
 def predict_in_heading_frame(model: LinearModel, states: Array, plans: Array, trim: Trim | None = None) -> Array:
-    """Predicted states (K, N, 12) of the linear model turned by each measured yaw.
+    """Predicted states (K, N, 12) of the linear model turned by each measured yaw, of states (K, 12), plans (K, N, 4).
 
-    Args:
-        model: at zero yaw; as at hover, or `anchored`.
-        states: (K, 12).
-        plans: (K, N, 4) [rad/s].
-        trim: where it is anchored; at level hover where absent.
+    With a trim the model is one that is `anchored` there; otherwise at level hover.
     """
     yaws = states[:, _YAW]
     seen = turn_horizontally(states, -yaws)

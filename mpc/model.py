@@ -18,18 +18,12 @@ class LinearModel:
 
     Eq. (1) prints u(k) for the deviation; taken literally, hover would predict a climb.  A xi_bar = xi_bar at any
     hover position, so only the input needs the offset.
-
-    Attributes:
-        A: (n, n) state matrix.
-        B: (n, nu) input matrix.
-        u_bar: (nu,) input of the equilibrium, for a quadrotor omega_bar on all rotors [rad/s].
-        period: tau_s [s].
     """
 
-    A: Array
-    B: Array
-    u_bar: Array
-    period: float
+    A: Array  # (n, n) state matrix
+    B: Array  # (n, nu) input matrix
+    u_bar: Array  # (nu,) input of the equilibrium, for a quadrotor omega_bar on all rotors [rad/s]
+    period: float  # tau_s [s]
 
     @property
     def n(self) -> int:
@@ -76,12 +70,18 @@ def discretise(A_c: Array, B_c: Array, period: float) -> tuple[Array, Array]:
     return exponential[:n, :n], exponential[:n, n:]
 
 
-def hover_model(vehicle: Vehicle, period: float) -> LinearModel:
-    """The vehicle's discrete model at hover.
+def lqr(A: Array, B: Array, Q: Array, R: Array) -> Array:
+    """K (nu, n) of u = -K x, which minimises the sum of x' Q x + u' R u for ever, x(k+1) = A x(k) + B u(k).
 
-    Args:
-        vehicle: the numbers.
-        period: control period tau_s [s].
+    Raises:
+        numpy.linalg.LinAlgError: there is no such gain.
+    """
+    P = scipy.linalg.solve_discrete_are(A, B, Q, R)
+    return np.asarray(np.linalg.solve(R + B.T @ P @ B, B.T @ P @ A))
+
+
+def hover_model(vehicle: Vehicle, period: float) -> LinearModel:
+    """The vehicle's discrete model at hover, for a control period tau_s [s].
 
     Raises:
         ParameterError: the period is not positive.

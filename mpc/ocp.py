@@ -18,42 +18,30 @@ from typing import NamedTuple
 import numpy as np
 import scipy.linalg
 
-from mpc.constraints import Bounds, Constraint, Penalty, Rows
+from mpc.constraints import Bounds, Constraint, Rows
 from mpc.model import LinearModel
 from quadsim.errors import ParameterError
 from quadsim.state import REFERENCE_STATES, Array
 
 
 class Rest(NamedTuple):
-    """Where the model rests, x_s = A x_s + B (u_s - u_bar), and what the cost pulls inputs to.
+    """Where the model rests, x_s = A x_s + B (u_s - u_bar), and what the cost pulls inputs to."""
 
-    Attributes:
-        x: (n,) x_s.
-        u: (nu,) u_s [rad/s].
-    """
-
-    x: Array
-    u: Array
+    x: Array  # (n,) x_s
+    u: Array  # (nu,) u_s [rad/s]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Objective:
-    """The cost of Eq. (5), with two terms that the paper does not have.
+    """The cost of Eq. (5), with two terms that the paper does not have."""
 
-    Attributes:
-        C_r: (n_r, n) regulated outputs y_r = C_r xi.  Eq. (4), where the paper prints n_r x n_r.
-        Q_y: (n_r, n_r) weight of the output error, symmetric positive definite.
-        Q_u: (nu, nu) weight of u - u_bar, symmetric positive definite.
-        Q_d: (nu, nu) weight of an input's change from one step to the next, symmetric positive semidefinite; None for
-            none.
-        P: (n, n) weight of the last state's distance from x_s + C_r^+ (y_d - C_r x_s), in place of Q_y's, symmetric
-            positive semidefinite; None for none.
-    """
-
-    C_r: Array
-    Q_y: Array
-    Q_u: Array
+    C_r: Array  # (n_r, n) regulated outputs y_r = C_r xi. Eq. (4), where the paper prints n_r x n_r
+    Q_y: Array  # (n_r, n_r) weight of the output error, symmetric positive definite
+    Q_u: Array  # (nu, nu) weight of u - u_bar, symmetric positive definite
+    # (nu, nu) weight of an input's change from one step to the next, symmetric positive semidefinite; None for none
     Q_d: Array | None = None
+    # (n, n) weight of the last state's distance from x_s + C_r^+ (y_d - C_r x_s), in place of Q_y's, symmetric positive
+    # semidefinite; None for none
     P: Array | None = None
 
     def __post_init__(self) -> None:
@@ -105,21 +93,13 @@ def lqr_terminal_weight(model: LinearModel, objective: Objective) -> Array:
 
 @dataclass(frozen=True, kw_only=True)
 class Problem:
-    """Everything that defines a controller but the way its optimum is found.
+    """Everything that defines a controller but the way its optimum is found."""
 
-    Attributes:
-        model: the prediction model.
-        horizon: N, steps.
-        objective: what is minimised.
-        bounds: the paper's constraints; None for none.
-        constraints: others.
-    """
-
-    model: LinearModel
-    horizon: int
-    objective: Objective
-    bounds: Bounds | None = None
-    constraints: tuple[Constraint, ...] = ()
+    model: LinearModel  # the prediction model
+    horizon: int  # N, steps
+    objective: Objective  # what is minimised
+    bounds: Bounds | None = None  # the paper's constraints; None for none
+    constraints: tuple[Constraint, ...] = ()  # others
 
     def __post_init__(self) -> None:
         if not isinstance(self.horizon, int) or self.horizon < 1:
@@ -165,40 +145,31 @@ class Problem:
         if not constraints:
             raise ValueError("a constrained MPC needs a problem with bounds")
         N, n, nu = self.horizon, self.model.n, self.model.nu
-        sizes = [constraint.lower.shape[-1] for constraint in constraints]
+        parts = [(part, part.lower.shape[-1]) for part in constraints]
         C, D, E = (
-            np.concatenate(
-                [
-                    np.zeros((size, columns)) if matrix is None else matrix
-                    for size, matrix in zip(sizes, (getattr(part, name) for part in constraints), strict=True)
-                ]
-            )
-            for name, columns in (("C", n), ("D", nu), ("E", nu))
+            np.concatenate([np.zeros((m, size)) if (M := getattr(part, name)) is None else M for part, m in parts])
+            for name, size in (("C", n), ("D", nu), ("E", nu))
         )
         lower, upper = (
-            np.concatenate(
-                [np.broadcast_to(getattr(part, side), (N, m)) for part, m in zip(constraints, sizes, strict=True)], 1
-            )
+            np.concatenate([np.broadcast_to(getattr(part, side), (N, m)) for part, m in parts], axis=1)
             for side in ("lower", "upper")
         )
-        penalties = [
-            part.penalty or Penalty(l1=np.zeros(m), l2=np.zeros(m)) for part, m in zip(constraints, sizes, strict=True)
-        ]
-        hard = np.repeat([part.penalty is None for part in constraints], sizes)
-        single = hard & ~C.any(1) & ~E.any(1) & (np.count_nonzero(D, axis=1) == 1) & (D.max(axis=1, initial=0.0) == 1.0)
+        l1 = np.concatenate([np.full(m, math.inf) if part.penalty is None else part.penalty.l1 for part, m in parts])
+        l2 = np.concatenate([np.zeros(m) if part.penalty is None else part.penalty.l2 for part, m in parts])
+        names = [part.name for part, m in parts for _ in range(m)]
+        of_input = ~C.any(1) & ~E.any(1) & (np.count_nonzero(D, axis=1) == 1) & (D.max(axis=1, initial=0.0) == 1.0)
         bounded = np.flatnonzero((np.isfinite(lower) | np.isfinite(upper)).any(axis=0))
-        names = np.repeat([part.name for part in constraints], sizes)
         return Rows(
             C=C[bounded],
             D=D[bounded],
             E=E[bounded],
             lower=lower[:, bounded],
             upper=upper[:, bounded],
-            l1=np.where(hard, math.inf, np.concatenate([part.l1 for part in penalties]))[bounded],
-            l2=np.concatenate([part.l2 for part in penalties])[bounded],
+            l1=l1[bounded],
+            l2=l2[bounded],
             of_states=np.asarray(~D[bounded].any(axis=1) & ~E[bounded].any(axis=1)).reshape(bounded.size),
-            input=np.where(single, np.argmax(D, axis=1), -1)[bounded],
-            names=tuple(names[bounded].tolist()),
+            input=np.where(np.isinf(l1) & of_input, np.argmax(D, axis=1), -1)[bounded],
+            names=tuple(names[i] for i in bounded),
         )
 
 

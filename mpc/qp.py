@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Protocol, TypeAlias
 
 import numpy as np
 from scipy.sparse import csc_matrix
 
-from mpc.constraints import Rows
 from mpc.ocp import Problem, Rest
 from quadsim.state import Array, Indices
 
@@ -30,6 +30,10 @@ class QP:
     """min 1/2 x' P x + c' x  subject to  A x = b,  h_l <= G x <= h_u,  x_l <= x <= x_u.
 
     Matrices are dense or sparse (csc); bounds may be infinite.  Eq. (27), with rows bounded from both sides.
+
+    Attributes:
+        later: which of the bounds of [x; G x] is the same one step later in the plan, its own at the last step; None
+            where that is not known.  What is active moves one step earlier from one period to the next.
     """
 
     P: Matrix
@@ -41,52 +45,60 @@ class QP:
     h_u: Array
     x_l: Array
     x_u: Array
+    later: Indices | None = None
+
+    @property
+    def vectors(self) -> Vectors:
+        """The vectors that it is written with."""
+        return Vectors(c=self.c, b=self.b, h_l=self.h_l, h_u=self.h_u)
 
     def with_vectors(self, vectors: Vectors) -> QP:
         """The same matrices and box with other vectors."""
-        return replace(self, c=vectors.c, b=vectors.b, h_l=vectors.h_l, h_u=vectors.h_u)
+        return replace(self, **vars(vectors))
 
 
-@dataclass(frozen=True, kw_only=True)
 class QPRows:
     """A problem's rows as a QP has them: bounds of single inputs in the box, a soft row as two with the same slack.
 
     Attributes:
-        C: (K, n).
-        D: (K, nu).
-        E: (K, nu).
+        C, D, E: (K, n), (K, nu), (K, nu).
         slack: (K, m_s) how slacks enter.
         lower, upper: (N, K).
         of_states: (K,) see `mpc.constraints.Rows`.
         u_min, u_max: (N, nu) the box.
-        origin: (K,) which of the problem's rows each is.
-        boxed: the problem's rows in the box.
-        whole: the problem's rows.
+
+    Raises:
+        ValueError: the problem has none.
     """
 
-    C: Array
-    D: Array
-    E: Array
-    slack: Array
-    lower: Array
-    upper: Array
-    of_states: np.ndarray[tuple[int], np.dtype[np.bool_]]
-    u_min: Array
-    u_max: Array
-    origin: Indices
-    boxed: Indices
-    whole: Rows
+    def __init__(self, problem: Problem) -> None:
+        self._whole = rows = problem.rows
+        self._boxed = np.flatnonzero(rows.input >= 0)
+        hard = np.flatnonzero((rows.input < 0) & np.isinf(rows.l1))
+        above = rows.soft[np.isfinite(rows.upper[:, rows.soft]).any(axis=0)]
+        below = rows.soft[np.isfinite(rows.lower[:, rows.soft]).any(axis=0)]
+        self._origin = origin = np.concatenate([hard, above, below])
+        of_rows = np.eye(len(rows.C))[:, rows.soft]
+        self.slack = np.concatenate([np.zeros((hard.size, rows.soft.size)), 0.0 - of_rows[above], of_rows[below]])
+        self.C, self.D, self.E, self.of_states = rows.C[origin], rows.D[origin], rows.E[origin], rows.of_states[origin]
+        self.lower, self.upper = rows.lower[:, origin].copy(), rows.upper[:, origin].copy()
+        self.lower[:, hard.size : hard.size + above.size] = -np.inf
+        self.upper[:, hard.size + above.size :] = np.inf
+        self.u_min, self.u_max = (np.full((problem.horizon, problem.model.nu), side) for side in (-np.inf, np.inf))
+        for row, j in zip(self._boxed, rows.input[self._boxed], strict=True):
+            self.u_min[:, j] = np.maximum(self.u_min[:, j], rows.lower[:, row])
+            self.u_max[:, j] = np.minimum(self.u_max[:, j], rows.upper[:, row])
 
     def multipliers(self, z: Array, z_inputs: Array) -> Array:
         """(N, m) multipliers of the problem's rows, from those of the QP's rows (N K,) and of inputs (N nu,)."""
         N = len(self.lower)
-        found = np.zeros((N, len(self.whole.C)))
-        for column, row in zip(z.reshape(N, -1).T, self.origin, strict=True):
+        found = np.zeros((N, len(self._whole.C)))
+        for column, row in zip(z.reshape(N, -1).T, self._origin, strict=True):
             found[:, row] += column
         left = z_inputs.reshape(N, -1).copy()
-        for row in self.boxed:  # of several at the same bound, the first has it all
-            j = self.whole.input[row]
-            upper, lower = self.whole.upper[:, row] == self.u_max[:, j], self.whole.lower[:, row] == self.u_min[:, j]
+        for row in self._boxed:  # of several at the same bound, the first has it all
+            j = self._whole.input[row]
+            upper, lower = self._whole.upper[:, row] == self.u_max[:, j], self._whole.lower[:, row] == self.u_min[:, j]
             held = np.where(left[:, j] > 0.0, upper, lower)
             found[held, row] = left[held, j]
             left[held, j] = 0.0
@@ -94,83 +106,32 @@ class QPRows:
 
     def split(self, multipliers: Array) -> tuple[Array, Array]:
         """The inverse: multipliers of the QP's rows (N K,) and of inputs (N nu,)."""
-        z = multipliers[:, self.origin]
-        upward = np.where(np.isneginf(self.lower) & np.isfinite(self.upper), np.maximum(z, 0.0), z)
-        z = np.where(np.isposinf(self.upper), np.minimum(z, 0.0), upward)
-        z_inputs = np.zeros(self.u_min.shape)
-        for row in self.boxed:
-            z_inputs[:, self.whole.input[row]] += multipliers[:, row]
-        return z.ravel(), z_inputs.ravel()
+        least, most, boxed = self._signs
+        z = np.minimum(np.maximum(multipliers[:, self._origin], least), most)
+        return z.ravel(), np.dot(multipliers, boxed).ravel()
 
-
-def qp_rows(problem: Problem) -> QPRows:
-    """A problem's rows as a QP has them.
-
-    Raises:
-        ValueError: the problem has none.
-    """
-    rows, nu = problem.rows, problem.model.nu
-    soft = rows.soft
-    number = np.zeros(len(rows.C), np.int64)
-    number[soft] = np.arange(soft.size)
-    boxed = np.flatnonzero(rows.input >= 0)
-    hard = np.flatnonzero((rows.input < 0) & np.isinf(rows.l1))
-    above = soft[np.isfinite(rows.upper[:, soft]).any(axis=0)]
-    below = soft[np.isfinite(rows.lower[:, soft]).any(axis=0)]
-    origin = np.concatenate([hard, above, below])
-    slack = np.zeros((origin.size, soft.size))
-    slack[hard.size + np.arange(above.size), number[above]] = -1.0
-    slack[hard.size + above.size + np.arange(below.size), number[below]] = 1.0
-    lower, upper = rows.lower[:, origin].copy(), rows.upper[:, origin].copy()
-    lower[:, hard.size : hard.size + above.size] = -np.inf
-    upper[:, hard.size + above.size :] = np.inf
-    u_min, u_max = np.full((len(lower), nu), -np.inf), np.full((len(lower), nu), np.inf)
-    for row in boxed:
-        u_min[:, rows.input[row]] = np.maximum(u_min[:, rows.input[row]], rows.lower[:, row])
-        u_max[:, rows.input[row]] = np.minimum(u_max[:, rows.input[row]], rows.upper[:, row])
-    return QPRows(
-        C=rows.C[origin],
-        D=rows.D[origin],
-        E=rows.E[origin],
-        slack=slack,
-        lower=lower,
-        upper=upper,
-        of_states=rows.of_states[origin],
-        u_min=u_min,
-        u_max=u_max,
-        origin=origin,
-        boxed=boxed,
-        whole=rows,
-    )
+    @cached_property
+    def _signs(self) -> tuple[Array, Array, Array]:
+        """Bounds (N, K) that rows of one side set to their multipliers, and (m, nu) which input a row bounds."""
+        boxed = np.zeros((len(self._whole.C), self.u_min.shape[1]))
+        boxed[self._boxed, self._whole.input[self._boxed]] = 1.0
+        return np.where(np.isneginf(self.lower), 0.0, -np.inf), np.where(np.isposinf(self.upper), 0.0, np.inf), boxed
 
 
 @dataclass(frozen=True, kw_only=True)
 class Solution:
-    """What a back end answers, or a shortcut; arrays are no back end's own, and not to be written to.
+    """What a back end answers, or a shortcut; arrays are no back end's own, and not to be written to."""
 
-    Attributes:
-        x: primal point.
-        y: multipliers of A x = b.
-        z: multipliers of h_l <= G x <= h_u, positive at the upper side, negative at the lower.
-        z_box: multipliers of x_l <= x <= x_u, signed likewise.
-        status: `solved`, or the back end's name for what went wrong; of a shortcut, see `mpc.exact.shortcut`.
-        iterations: of the back end.
-        active: inequality rows and box entries active at the point.
-        primal_residual: as the back end reports it, before any polish; NaN where it reports none.
-        dual_residual: likewise.
-        solve_s: wall time inside the back end, updates included, and what shortcuts took before it [s].
-    """
-
-    x: Array
-    y: Array
-    z: Array
-    z_box: Array
-    status: str
-    iterations: int
-    active: int
-    primal_residual: float
-    dual_residual: float
-    solve_s: float
+    x: Array  # primal point
+    y: Array  # multipliers of A x = b
+    z: Array  # multipliers of h_l <= G x <= h_u, positive at the upper side, negative at the lower
+    z_box: Array  # multipliers of x_l <= x <= x_u, signed likewise
+    status: str  # `solved`, or the back end's name for what went wrong; of a shortcut, see `mpc.exact.shortcut`
+    iterations: int  # of the back end
+    active: int  # inequality rows and box entries active at the point
+    primal_residual: float  # as the back end reports it, before any polish; NaN where it reports none
+    dual_residual: float  # likewise
+    solve_s: float  # wall time inside the back end, updates included, and what shortcuts took before it [s]
 
 
 class Formulation(Protocol):
@@ -210,29 +171,14 @@ class Backend(Protocol):
         ...
 
 
-class FormulationBuilder(Protocol):
-    """Builds a formulation for a constrained problem."""
-
-    def __call__(self, problem: Problem) -> Formulation:
-        """Build it."""
-        ...
-
-
 @dataclass(frozen=True, kw_only=True)
 class KKTResiduals:
-    """How far a point is from optimal, each as the largest absolute entry; all zero at the optimum.
+    """How far a point is from optimal, each as the largest absolute entry; all zero at the optimum."""
 
-    Attributes:
-        stationarity: P x + c + A' y + G' z + z_box.
-        primal: violation of A x = b, h_l <= G x <= h_u, x_l <= x <= x_u.
-        complementarity: multiplier times distance to the bound it belongs to.
-        dual: size of multipliers with no bound to belong to (an infinite one).
-    """
-
-    stationarity: float
-    primal: float
-    complementarity: float
-    dual: float
+    stationarity: float  # P x + c + A' y + G' z + z_box
+    primal: float  # violation of A x = b, h_l <= G x <= h_u, x_l <= x <= x_u
+    complementarity: float  # multiplier times distance to the bound it belongs to
+    dual: float  # size of multipliers with no bound to belong to (an infinite one)
 
     @property
     def worst(self) -> float:

@@ -18,17 +18,21 @@ The pattern of the matrices is fixed when a `Staged` is built; where they change
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csc_matrix
 
 from mpc.ocp import Problem, Rest
-from mpc.qp import QP, Solution, Vectors, qp_rows
-from mpc.stages import Matrices, MatrixBuilder, condense, layout
+from mpc.qp import QP, QPRows, Solution, Vectors
 from quadsim.errors import ParameterError
-from quadsim.state import Array
+from quadsim.state import Array, Indices
 
+ROUNDING: Final = 1e-14
+"""Entries below this fraction of the largest of their block are products of rounding: left out of fixed matrices."""
 STEPS_OF_ONE_INPUT: Final = 10
 """M for one input; for more it falls with the root of their number.  Of stages of 1 to 25 steps, the resulting five of
 four rotors are the fastest for the paper's case; see docs/performance.md."""
@@ -37,6 +41,224 @@ four rotors are the fastest for the paper's case; see docs/performance.md."""
 def usual_steps(inputs: int) -> int:
     """M for a problem of so many inputs."""
     return max(round(STEPS_OF_ONE_INPUT / math.sqrt(inputs)), 1)
+
+
+class Pattern:
+    """A sparse matrix assembled from blocks (..., rows, columns) that keep their places.
+
+    Places are the rows (..., rows) and the columns (..., columns) of each block.  What is zero in the first blocks, or
+    below the share `rounding` of the largest of its block's row and of its block's column, is left out for good.
+    """
+
+    def __init__(
+        self, shape: tuple[int, int], places: Sequence[tuple[Indices, Indices]], blocks: list[Array], rounding: float
+    ) -> None:
+        pairs = list(zip(places, blocks, strict=True))
+        rows = np.concatenate([np.broadcast_to(at[0][..., :, None], block.shape).ravel() for at, block in pairs])
+        columns = np.concatenate([np.broadcast_to(at[1][..., None, :], block.shape).ravel() for at, block in pairs])
+        order = np.lexsort((rows, columns))
+        self._order = order[np.concatenate([_present(block, rounding).ravel() for block in blocks])[order]]
+        self._rows = rows[self._order].astype(np.int32)
+        counts = np.bincount(columns[self._order], minlength=shape[1])
+        self._starts = np.concatenate([[0], np.cumsum(counts)]).astype(np.int32)
+        self._shape = shape
+
+    def matrix(self, blocks: list[Array]) -> csc_matrix:
+        """The matrix with these blocks, its zeros stored."""
+        data = np.concatenate([block.ravel() for block in blocks])[self._order]
+        return csc_matrix((data, self._rows, self._starts), shape=self._shape)
+
+
+def _present(block: Array, rounding: float) -> NDArray[np.bool_]:
+    """Which entries (..., rows, columns) of a block are not zero."""
+    size = np.abs(block)
+    if not rounding or not size.size:
+        return size > 0.0
+    largest = np.minimum(size.max(axis=-1, keepdims=True), size.max(axis=-2, keepdims=True))
+    return np.asarray(size > rounding * largest)
+
+
+class Layout:
+    """Where everything is among the variables, for N steps of n states, nu inputs and n_s slacks, M in a stage.
+
+    Attributes:
+        N, n, nu, L, M: horizon, states, inputs, steps in the first stage and in each other.
+        head: (L nu,) v_0.
+        tail: (J - 1, n + M nu) [s_j, v_j].
+        starts: (J, n) s_1 .. s_J.
+        inputs: (N, nu) in time order.
+        slacks: (N, n_s) in time order; n_s = 0 where bounds are hard.
+        ends: (J, n) equality rows.
+        lasts, firsts: (J - 1, nu) the last inputs of each stage but the last, and the first of the one after it.
+        size: of all.
+    """
+
+    def __init__(self, N: int, n: int, nu: int, n_s: int, M: int) -> None:
+        room = M + (n // nu if M > 1 else 0)
+        L = N if room >= N else room - (room - N) % M
+        self.N, self.n, self.nu, self.L, self.M = N, n, nu, L, M
+        stages = (N - L) // M
+        first, width = L * nu + (L - 1) * n_s, n + M * (nu + n_s)
+        base = first + width * np.arange(stages + 1)[:, None]
+        self.size = first + stages * width + n + n_s
+        self.head, self.tail = np.arange(L * nu), base[:-1] + np.arange(n + M * nu)
+        self.starts = base + np.arange(n)
+        self.inputs = np.concatenate([self.head, self.tail[:, n:].ravel()]).reshape(N, nu)
+        later = base[:-1] + n + M * nu + np.arange(M * n_s)
+        slacks = [np.arange(L * nu, first), later.ravel(), np.arange(self.size - n_s, self.size)]
+        self.slacks = np.concatenate(slacks).reshape(N, n_s)
+        self.ends = np.arange(self.starts.size).reshape(self.starts.shape)
+        cuts = L + M * np.arange(stages)
+        self.lasts, self.firsts = self.inputs[cuts - 1], self.inputs[cuts]
+
+
+def condense_stages(start: Array, A: Array, B: Array, c: Array) -> Array:
+    """(J, L + 1, n, m + 1) states of J stages of L steps, as functions of the variables, the inputs the last, and of 1.
+
+    From the first of them (J, n, m + 1) by A (J, L, n, n), B (J, L, n, nu) and c (J, L, n).
+    """
+    (count, steps, n, nu), columns = B.shape, start.shape[2]
+    states = np.empty((count, steps + 1, n, columns))
+    states[:, 0] = start
+    for t in range(steps):
+        np.matmul(A[:, t], states[:, t], out=states[:, t + 1])
+        at = columns - 1 - (steps - t) * nu
+        states[:, t + 1, :, at : at + nu] = B[:, t]
+        states[:, t + 1, :, -1] += c[:, t]
+    return states
+
+
+@dataclass(frozen=True, kw_only=True)
+class Matrices:
+    """What the A_i and B_i of a horizon make of the QP; to be used for as many periods as these hold."""
+
+    A: Array  # (N, n, n), A_i
+    B: Array  # (N, n, nu), B_i
+    head: Array  # (1, L + 1, n, L nu) slopes of the states of the first stage by v_0
+    tail: Array  # (J - 1, M + 1, n, n + M nu) those of the others by [s_j, v_j]
+    P: csc_matrix  # cost
+    dynamics: csc_matrix  # equality rows
+    rows: csc_matrix  # inequality rows
+
+
+class MatrixBuilder:
+    """Fixes the pattern of the matrices once, then fills in their values."""
+
+    def __init__(self, problem: Problem, rows: QPRows, at: Layout, *, changing: bool) -> None:
+        self._at, self._rows, objective = at, rows, problem.objective
+        self._Q, self._Q_end = objective.weights[0], objective.terminal_weights[0]
+        self._input_weight, self._move_weight = 2.0 * objective.Q_u, 2.0 * objective.move_weight
+        soft = problem.rows.soft
+        self._slack_weight = 2.0 * np.tile(problem.rows.l2[soft], at.N)[:, None, None]
+        self._input_costs = {steps: self._input_cost(steps) for steps in (at.L, at.M)}
+        if changing:  # of numbers in general position an entry is zero only where it always is
+            rng = np.random.default_rng(0)
+            A, B = (rng.normal(size=(at.N, at.n, width)) for width in (at.n, at.nu))
+        else:
+            A, B = (np.broadcast_to(part, (at.N, *part.shape)) for part in (problem.model.A, problem.model.B))
+        rounding = 0.0 if changing else ROUNDING
+        head, tail = self._slopes(A, B)
+        slack, numbers = at.slacks.reshape(-1, 1), np.arange(rows.lower.size).reshape(at.N, -1)
+        costs = [(at.head, at.head), (at.tail, at.tail), (at.starts[-1], at.starts[-1]), (slack, slack)]
+        costs += [(at.lasts, at.firsts), (at.firsts, at.lasts)]
+        self._P = Pattern((at.size, at.size), costs, self._costs(head, tail), rounding)
+        dynamics = [(at.ends[:1], at.head), (at.ends[1:], at.tail), (at.ends, at.starts)]
+        self._A = Pattern((at.ends.size, at.size), dynamics, self._dynamics(head, tail), rounding)
+        self._later, self._now = later, now = np.flatnonzero(rows.of_states), np.flatnonzero(~rows.of_states)
+        stages, cuts = len(at.tail), at.L + at.M * np.arange(len(at.tail))
+        inequalities = [
+            (numbers[: at.L - 1, later], at.head),
+            (numbers[at.L - 1 : -1, later].reshape(stages, at.M, later.size), at.tail[:, None]),
+            (numbers[-1, later], at.starts[-1]),
+            (numbers, at.slacks),
+            (numbers[: at.L, now], at.head),
+            (numbers[at.L :, now].reshape(stages, at.M, now.size), at.tail[:, None]),
+            (numbers[cuts][:, now], at.lasts),
+        ]
+        self._G = Pattern((numbers.size, at.size), inequalities, self._inequalities(head, tail), rounding)
+
+    def build(self, A: Array, B: Array) -> Matrices:
+        """The matrices of A (N, n, n), B (N, n, nu)."""
+        head, tail = self._slopes(A, B)
+        return Matrices(
+            A=A,
+            B=B,
+            head=head,
+            tail=tail,
+            P=self._P.matrix(self._costs(head, tail)),
+            dynamics=self._A.matrix(self._dynamics(head, tail)),
+            rows=self._G.matrix(self._inequalities(head, tail)),
+        )
+
+    def _slopes(self, A: Array, B: Array) -> tuple[Array, Array]:
+        """`head` and `tail` of `Matrices`."""
+        at = self._at
+        start = np.zeros((1, at.n, at.head.size + 1))
+        free = np.zeros((len(at.tail), at.n, at.tail.shape[1] + 1))
+        free[:, :, : at.n] = np.eye(at.n)
+        head, tail = condense(at, start, free, A, B, np.zeros((at.N, at.n)))
+        return head[..., :-1], tail[..., :-1]
+
+    def _costs(self, head: Array, tail: Array) -> list[Array]:
+        """P's blocks."""
+        at = self._at
+        blocks = [self._stage_cost(head, at.L), self._stage_cost(tail, at.M)]
+        (blocks[1] if len(tail) else blocks[0])[-1, -at.nu :, -at.nu :] -= self._move_weight  # none follows the last
+        across = np.broadcast_to(-self._move_weight, (len(at.lasts), at.nu, at.nu))
+        return [*blocks, 2.0 * self._Q_end, self._slack_weight, across, across.transpose(0, 2, 1)]
+
+    def _stage_cost(self, slopes: Array, steps: int) -> Array:
+        """Hessian (J, m, m) of stages' cost, the end state's left out."""
+        inner = slopes[:, :-1].reshape(len(slopes), steps * self._at.n, slopes.shape[3])
+        weighted = (2.0 * self._Q @ slopes[:, :-1]).reshape(inner.shape)
+        hessian = inner.transpose(0, 2, 1) @ weighted
+        hessian = 0.5 * (hessian + hessian.transpose(0, 2, 1))
+        weights = self._input_costs[steps]
+        hessian[:, -len(weights) :, -len(weights) :] += weights
+        return np.asarray(hessian)
+
+    def _input_cost(self, steps: int) -> Array:
+        """Hessian of the cost of a stage's inputs, of changes both from the stage before and to the one after."""
+        itself, beside = np.eye(steps), np.eye(steps, k=1) + np.eye(steps, k=-1)
+        own = np.kron(itself, self._input_weight + 2.0 * self._move_weight)
+        return np.asarray(own - np.kron(beside, self._move_weight))
+
+    def _dynamics(self, head: Array, tail: Array) -> list[Array]:
+        """The equality rows' blocks: each stage's end is the next one's start."""
+        starts = np.broadcast_to(np.eye(self._at.n), (len(self._at.starts), self._at.n, self._at.n))
+        return [-head[:, -1], -tail[:, -1], starts]
+
+    def _inequalities(self, head: Array, tail: Array) -> list[Array]:
+        """G's blocks."""
+        at, rows, later, now = self._at, self._rows, self._later, self._now
+        slack = np.broadcast_to(rows.slack, (at.N, *rows.slack.shape))
+        before = np.broadcast_to(-rows.E[now], (len(at.lasts), now.size, at.nu))
+        return [
+            rows.C[later] @ head[0, 1:-1],
+            rows.C[later] @ tail[:, :-1],
+            rows.C[later],
+            slack,
+            self._inputs_too(rows.C[now] @ head[:, :-1], at.L)[0],
+            self._inputs_too(rows.C[now] @ tail[:, :-1], at.M),
+            before,
+        ]
+
+    def _inputs_too(self, of_states: Array, steps: int) -> Array:
+        """Rows (J, steps, k, m) of states with their own inputs and, but for the first, those before added."""
+        rows, now, nu = self._rows, self._now, self._at.nu
+        by_step = of_states[..., of_states.shape[-1] - steps * nu :].reshape(*of_states.shape[:3], steps, nu)
+        for t in range(steps):
+            by_step[:, t, :, t] += rows.D[now] + rows.E[now]
+            if t:
+                by_step[:, t, :, t - 1] -= rows.E[now]
+        of_states[..., of_states.shape[-1] - steps * nu :] = by_step.reshape(*of_states.shape[:3], steps * nu)
+        return of_states
+
+
+def condense(at: Layout, start: Array, free: Array, *steps: Array) -> tuple[Array, Array]:
+    """The first stage from `start` and the others from `free` on; see `condense_stages`."""
+    head = condense_stages(start, *(part[None, : at.L] for part in steps))
+    return head, condense_stages(free, *(part[at.L :].reshape(len(free), at.M, *part.shape[1:]) for part in steps))
 
 
 class Staged:
@@ -63,8 +285,8 @@ class Staged:
         steps = usual_steps(model.nu) if steps_per_stage is None else steps_per_stage
         if not isinstance(steps, int) or steps < 1:
             raise ParameterError("controller", "steps_per_stage", steps, "a whole number >= 1")
-        self._problem, self._rows, soft = problem, qp_rows(problem), problem.rows.soft
-        self._at = at = layout(N, model.n, model.nu, soft.size, steps)
+        self._problem, self._rows, soft = problem, QPRows(problem), problem.rows.soft
+        self._at = at = Layout(N, model.n, model.nu, soft.size, steps)
         self._builder = MatrixBuilder(problem, self._rows, at, changing=changing)
         self._linear = np.zeros(at.size)
         self._linear[at.slacks] = problem.rows.l1[soft]
@@ -93,15 +315,9 @@ class Staged:
     def changed_vectors(
         self, matrices: Matrices, c: Array, state: Array, desired: Array, u_before: Array, rest: Rest
     ) -> Vectors:
-        """The QP's vectors for a model that changes.
+        """The QP's vectors for a model that changes, of c_i (N, n), x(k) (n,), y_d (N, n_r) and u(k-1) (nu,) [rad/s].
 
-        Args:
-            matrices: of `prepare`.
-            c: (N, n), c_i.
-            state: (n,) x(k).
-            desired: (N, n_r) y_d for x(k+1) .. x(k+N).
-            u_before: (nu,) u(k-1) [rad/s].
-            rest: what the cost pulls inputs to, and where the terminal weight is about.
+        At `rest` is what the cost pulls inputs to, and where the terminal weight is about.
         """
         at, rows, objective = self._at, self._rows, self._problem.objective
         head, tail = (part[..., 0] for part in self._offsets(matrices, c, state))

@@ -18,32 +18,20 @@ from quadsim.state import Array
 
 @dataclass(frozen=True, kw_only=True)
 class Gains:
-    """u_opt(k) = K_N xi(k) + G_N y_d + L_N u_bar.  Eq. (23).
+    """u_opt(k) = K_N xi(k) + G_N y_d + L_N u_bar.  Eq. (23)."""
 
-    Attributes:
-        K_N: (nu, n).  Eq. (24).
-        G_N: (nu, N n_r).  Eq. (25).
-        L_N: (nu, nu).  Eq. (26); the identity, once F3 has its sign and the linearisation its offset.
-    """
-
-    K_N: Array
-    G_N: Array
-    L_N: Array
+    K_N: Array  # (nu, n). Eq. (24)
+    G_N: Array  # (nu, N n_r). Eq. (25)
+    L_N: Array  # (nu, nu). Eq. (26); the identity, once F3 has its sign and the linearisation its offset
 
 
 @dataclass(frozen=True, kw_only=True)
 class SequenceGains:
-    """The whole optimal sequence u_opt = K xi(k) + G y_d + L u_bar of Eq. (22), all N steps.
+    """The whole optimal sequence u_opt = K xi(k) + G y_d + L u_bar of Eq. (22), all N steps."""
 
-    Attributes:
-        K: (N nu, n).
-        G: (N nu, N n_r).
-        L: (N nu, nu).
-    """
-
-    K: Array
-    G: Array
-    L: Array
+    K: Array  # (N nu, n)
+    G: Array  # (N nu, N n_r)
+    L: Array  # (N nu, nu)
 
     def first(self) -> Gains:
         """The gains of the first action, by Pi_1."""
@@ -71,14 +59,9 @@ class UnconstrainedMPC:
     solver: Final = ""
 
     def __init__(self, problem: Problem) -> None:
-        self.problem = problem
+        self.problem, self.horizon = problem, problem.horizon
         self.gains = sequence_gains(problem)
         self._offset = self.gains.L @ problem.model.u_bar
-
-    @property
-    def horizon(self) -> int:
-        """N, samples of preview."""
-        return self.problem.horizon
 
     def reset(self, speeds: Array) -> None:
         """Nothing to forget: the law has no memory."""

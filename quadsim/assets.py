@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import tomllib
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,12 @@ def models_dir() -> Path:
         if (candidate / "quadrotor.xml").is_file():
             return candidate
     raise FileError(package / "models", "quadrotor.xml is missing: the installation is incomplete, reinstall quadsim")
+
+
+def own_packages() -> dict[str, str]:
+    """The entry of its environment by which a child process finds quadsim where this one did."""
+    places = (str(Path(__file__).resolve().parents[1]), os.environ.get("PYTHONPATH"))
+    return {"PYTHONPATH": os.pathsep.join(filter(None, places))}
 
 
 def vehicle_names() -> list[str]:

@@ -158,6 +158,10 @@ class CommandError(FlightError):
     """A command that must not reach the plant: wrong shape, non-finite, or beyond any rotor's speed."""
 
 
+class ForceError(FlightError):
+    """A force of one's own that is not six finite numbers."""
+
+
 class PlanExhaustedError(FlightError):
     """The solver failed and no step of the last good plan is left to hold."""
 

@@ -7,6 +7,7 @@ and **Euler-angle rates**, not body rates. All functions take arrays with any le
 
 from __future__ import annotations
 
+import math
 from typing import Final
 
 import numpy as np
@@ -34,9 +35,16 @@ ANGLES: Final = slice(6, 12, 2)
 ANGLE_RATES: Final = slice(7, 12, 2)
 """The same entries as slices, by which NumPy finds them in a fifth of the time."""
 
+_SHOWN: Final = {"rad": ("deg", math.degrees(1.0)), "rad/s": ("deg/s", math.degrees(1.0))}
+
 REFERENCE_NAMES: Final = ("x", "y", "z", "yaw")
 REFERENCE_UNITS: Final = ("m", "m", "m", "rad")
 REFERENCE_STATES: Final = tuple(INDEX[name] for name in REFERENCE_NAMES)
+
+
+def shown_unit(unit: str) -> tuple[str, float]:
+    """The unit in which people read an SI quantity, and the factor to it: angles are shown in degrees."""
+    return _SHOWN.get(unit, (unit, 1.0))
 
 
 def quaternion_to_euler(quaternion: Array) -> Array:

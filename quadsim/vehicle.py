@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Annotated, Any, Final, get_type_hints
+from typing import Annotated, Any, Final, NoReturn, get_type_hints
 
 import numpy as np
 from annotated_types import DocInfo, Len, doc
@@ -67,9 +67,9 @@ class Vehicle:
             self._check_number(name, getattr(self, name), positive=True)
         self._check_number("speed_min", self.speed_min, positive=False)
         if self.speed_min < 0.0:
-            raise ParameterError("vehicle", "speed_min", self.speed_min, ">= 0 rad/s")
+            self._refuse("speed_min", ">= 0 rad/s")
         if self.speed_min >= self.speed_max:
-            raise ParameterError("vehicle", "speed_min", self.speed_min, f"below speed_max = {self.speed_max}")
+            self._refuse("speed_min", f"below speed_max = {self.speed_max}")
         self._check_vector("inertia", 3, positive=True)
         self._check_vector("rotor_azimuths", N_ROTORS, positive=False)
         self._check_vector("rotor_spins", N_ROTORS, positive=False)
@@ -79,23 +79,21 @@ class Vehicle:
             elif getattr(self, name) is not None:
                 self._check_number(name, getattr(self, name), positive=True)
         if any(abs(spin) != 1 for spin in self.rotor_spins):
-            raise ParameterError("vehicle", "rotor_spins", self.rotor_spins, "four values, each 1 or -1")
-        ixx, iyy, izz = self.inertia
-        if 2.0 * max(self.inertia) > (ixx + iyy + izz) * (1.0 + 1e-12):
-            raise ParameterError(
-                "vehicle", "inertia", self.inertia, "such that no moment exceeds the sum of the other two"
-            )
+            self._refuse("rotor_spins", "four values, each 1 or -1")
+        if 2.0 * max(self.inertia) > sum(self.inertia) * (1.0 + 1e-12):
+            self._refuse("inertia", "such that no moment exceeds the sum of the other two")
         self._check_layout()
         self._check_hover()
+
+    def _refuse(self, name: str, rule: str) -> NoReturn:
+        raise ParameterError("vehicle", name, getattr(self, name), rule)
 
     def _check_layout(self) -> None:
         b, d = self.thrust_coefficient, self.drag_coefficient
         scale = np.array([b, b * self.arm_length, b * self.arm_length, d])
         unit_allocation = self.allocation / scale[:, None]
         if abs(np.linalg.det(unit_allocation)) < 1e-9:
-            raise ParameterError(
-                "vehicle", "rotor_azimuths", self.rotor_azimuths, "a layout that controls roll, pitch, yaw and thrust"
-            )
+            self._refuse("rotor_azimuths", "a layout that controls roll, pitch, yaw and thrust")
         if np.abs(unit_allocation[1:].sum(axis=1)).max() > 1e-9:
             layout = {"rotor_azimuths": self.rotor_azimuths, "rotor_spins": self.rotor_spins}
             rule = "a layout whose torques cancel when all rotors turn alike, so that it can hover"
@@ -107,10 +105,8 @@ class Vehicle:
             speed = getattr(self, name)
             if sign * (hover - speed) > 0.0:
                 lift = N_ROTORS * self.thrust_coefficient * speed**2
-                raise ParameterError(
-                    "vehicle",
+                self._refuse(
                     name,
-                    speed,
                     f"{side} its hover speed, {hover:.6g} rad/s, or it cannot hover (rotors hold {self.speed_min:g} to "
                     f"{self.speed_max:g} rad/s; {self.mass:g} kg weigh {weight:.4g} N, the rotors lift {lift:.4g} N at "
                     f"{speed:g} rad/s)",

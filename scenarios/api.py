@@ -20,13 +20,16 @@ from quadsim.vehicle import Vehicle
 from quadsim.vehicle import load_vehicle as read_vehicle
 from scenarios.build import build_controller
 from scenarios.flight import Flight, Outputs
-from scenarios.loading import check_parts, load_scenario, scenario_names
-from scenarios.parts.own_code import refer_to, require_importable, set_up
+from scenarios.loading import check_parts, load_scenario
+from scenarios.parts.own_code import refer_to, refer_to_force, require_importable, set_up, set_up_force
+from scenarios.parts.plugin import build_force
+from scenarios.parts.randomness import generator
 from scenarios.parts.vehicle import build_vehicle
 from scenarios.progress import Progress, silent
 from scenarios.reaudit import Reaudit, reaudit, stored_scenario
 from scenarios.run import fly_scenario, run_scenario
 from scenarios.schema.scenario import Scenario
+from scenarios.shipped import scenario_names
 
 if TYPE_CHECKING:
     from scenarios.campaign.engine.protocol import Engine
@@ -97,6 +100,7 @@ def fly(
     scenario: Scenario | str | Path,
     *,
     controller: object = None,
+    forces: Sequence[object] = (),
     out: str | Path | None = None,
     video: bool = True,
     recording: bool = True,
@@ -113,6 +117,9 @@ def fly(
             and with a method `step(now, state, reference)`; a function `law(now, state, reference)` that gives four
             rotor speeds [rad/s]; an object with such a `step`; or a text `package.module:Class`.  Further arguments of
             a class through `functools.partial`.
+        forces: forces of one's own that act on the vehicle, besides the scenario's effects: functions
+            `force(time, state)`, called once per physics step, that give force x, y, z in the world frame [N] and
+            torque in the body frame [N m]; or classes called as MyForce(vehicle, rng=...) whose objects are called so.
         out: the run directory to write, complete or not at all; nothing is written where absent (`Flight.save` can).
         video: whether to film it, where it is written.
         recording: whether to write `flight.rrd`, where it is written.
@@ -134,22 +141,27 @@ def fly(
         ...     return np.full(4, 300.0)
         >>> bool(quadsim.fly(scenario, controller=full_throttle).state["vz"][-1] > 1.0)
         True
+        >>> def side_wind(time, state):
+        ...     return np.array([0.5, 0.0, 0.0, 0.0, 0.0, 0.0])
+        >>> bool(quadsim.fly(scenario, forces=[side_wind]).state["x"][-1] > 0.01)
+        True
     """
     if not isinstance(scenario, Scenario):
         scenario = load(scenario)
-    law: Controller | None = None
-    if isinstance(controller, str):
-        scenario = scenario.replace({"controller": {"type": controller, "horizon": scenario.controller.horizon}})
-    elif controller is not None:
+    referring, law, own = named_by(scenario, controller, forces), None, None
+    if controller is not None and not isinstance(controller, str):
         spec = refer_to(controller, scenario.controller.horizon)
-        scenario = scenario.replace({"controller": spec.model_dump(exclude_none=True)})
         law = set_up(controller, spec, build_vehicle(scenario), scenario.control_period)
-    check_parts(scenario)
+    if forces:
+        vehicle, rng = build_vehicle(scenario), generator(scenario.seed, "forces")
+        own = [build_force(spec, vehicle, rng) for spec in scenario.forces]
+        own += [set_up_force(force, vehicle, rng) for force in forces]
+    check_parts(referring)
     with reporting(progress) as report:
         if out is None:
-            return fly_scenario(scenario, report, law)
+            return fly_scenario(referring, report, law, own)
         outputs = Outputs(video=video, recording=recording, figures=figures)
-        return run_scenario(scenario, real_path(out), outputs, report, law)
+        return run_scenario(referring, real_path(out), outputs, report, law, own)
 
 
 def read(directory: str | Path) -> Flight:
@@ -211,6 +223,7 @@ def sweep(
     values: Mapping[str, Sequence[Any]],
     *,
     controller: object = None,
+    forces: Sequence[object] = (),
     workers: int | None = None,
     progress: bool = True,
 ) -> Sweep:
@@ -220,6 +233,7 @@ def sweep(
         scenario: what is flown, or its name or file.
         values: what to try, by dotted path.
         controller: who flies it, as of `fly`; a class or a function of a module that other processes can import.
+        forces: what acts on it, as of `fly`; the same.
         workers: processes that fly; one per usable core where absent.
         progress: whether to show a bar on a terminal.
 
@@ -241,7 +255,7 @@ def sweep(
     if not isinstance(scenario, Scenario):
         scenario = load(scenario)
     with reporting(progress) as report:
-        return fly_sweep(flown_by(scenario, controller), values, make_engine(workers, None), report)
+        return fly_sweep(flown_by(scenario, controller, forces), values, make_engine(workers, None), report)
 
 
 def campaign(
@@ -253,6 +267,7 @@ def campaign(
     seed: int | None = None,
     changes: Sequence[str] = (),
     controller: object = None,
+    forces: Sequence[object] = (),
     require: Sequence[str] = (),
     workers: int | None = None,
     cluster: str | None = None,
@@ -272,6 +287,7 @@ def campaign(
         seed: of all draws, instead of the file's.
         changes: of a file: texts `dotted.path=value` that change fields of its scenario.
         controller: of a scenario: who flies, as of `sweep`.
+        forces: of a scenario: what acts on it, as of `sweep`.
         require: requirements as texts, e.g. `P(failure) < 0.02`, that `judgements` judges.
         workers: processes that fly; one per usable core where absent.
         cluster: a dask cluster that flies instead, as of `--cluster`.
@@ -310,8 +326,8 @@ def campaign(
     if isinstance(campaign, Scenario):
         asked = {"vary": [dict(entry) for entry in vary], "flights": flights, "seed": seed, **fields}
         given = {name: value for name, value in asked.items() if value is not None}
-        plan = make_plan(flown_by(campaign, controller), given)
-    elif vary or fields or controller is not None:
+        plan = make_plan(flown_by(campaign, controller, forces), given)
+    elif vary or fields or controller is not None or forces:
         raise InputError("vary, controller and other fields go with a scenario; a campaign file has its own")
     else:
         plan = load_plan(str(campaign), changes, flights=flights, seed=seed)
@@ -479,19 +495,31 @@ def reporting(progress: Progress | bool) -> Iterator[Progress]:
             yield bars
 
 
-def flown_by(scenario: Scenario, controller: object) -> Scenario:
-    """A scenario with a controller that other processes import by its place.
+def named_by(scenario: Scenario, controller: object, forces: Sequence[object] = ()) -> Scenario:
+    """A scenario whose file names the controller and the forces that were passed in, by the place of their code."""
+    changes: dict[str, Any] = {}
+    horizon = scenario.controller.horizon
+    if isinstance(controller, str):
+        changes["controller"] = {"type": controller, "horizon": horizon}
+    elif controller is not None:
+        changes["controller"] = refer_to(controller, horizon).model_dump(exclude_none=True)
+    if forces:
+        specs = [*scenario.forces, *map(refer_to_force, forces)]
+        changes["forces"] = [spec.model_dump(exclude_none=True) for spec in specs]
+    return scenario.replace(changes) if changes else scenario
+
+
+def flown_by(scenario: Scenario, controller: object, forces: Sequence[object] = ()) -> Scenario:
+    """The same, of code that other processes import by its place.
 
     Raises:
         ParameterError: they cannot.
     """
-    if controller is None:
-        return scenario
-    horizon = scenario.controller.horizon
-    if isinstance(controller, str):
-        return scenario.replace({"controller": {"type": controller, "horizon": horizon}})
-    require_importable(controller)
-    return scenario.replace({"controller": refer_to(controller, horizon).model_dump(exclude_none=True)})
+    if controller is not None and not isinstance(controller, str):
+        require_importable(controller)
+    for force in forces:
+        require_importable(force, "forces")
+    return named_by(scenario, controller, forces)
 
 
 def make_engine(workers: int | None, cluster: str | None) -> Engine:

@@ -2,30 +2,23 @@
 
 from __future__ import annotations
 
-from typing import Final
+from collections.abc import Sequence
 
 from mpc.ocp import Problem
 from quadsim.controller import Controller
 from quadsim.errors import ParameterError
 from quadsim.sim.airframe import outline
+from quadsim.sim.effects import Force
 from quadsim.sim.phase import PhaseMonitor
 from quadsim.sim.plant import Plant
 from quadsim.vehicle import Vehicle
 from scenarios.parts.controllers import make_controller, make_problem
 from scenarios.parts.effects import build_changes, build_wind
+from scenarios.parts.plugin import build_force
 from scenarios.parts.randomness import generator
 from scenarios.parts.vehicle import resolve_vehicle
 from scenarios.schema.optimisation import WeightedSpec
 from scenarios.schema.scenario import Scenario
-
-CONTROLLERS: Final = {
-    "unconstrained": "the paper's Sec. 4: a constant gain from the unconstrained optimum",
-    "constrained": "the paper's Sec. 5: a QP's optimum in every period, tilt, rotor speeds and their steps bounded",
-    "robust": "constrained, with soft bounds, rotor lag, delay, disturbances, heading and more, each switched on alone",
-    "lqr": "infinite-horizon LQR on the hover model, following the reference's velocity",
-    "pid": "cascaded PID, as autopilots fly it",
-    "geometric": "geometric tracking control on SE(3)",
-}
 
 
 def resolve(scenario: Scenario, vehicle: Vehicle) -> Scenario:
@@ -33,12 +26,21 @@ def resolve(scenario: Scenario, vehicle: Vehicle) -> Scenario:
     return resolve_vehicle(scenario, vehicle).model_copy(update={"effects": scenario.effects.resolved(vehicle)})
 
 
-def build_plant(scenario: Scenario, vehicle: Vehicle, kind: type[Plant] = Plant) -> Plant:
+def build_plant(
+    scenario: Scenario, vehicle: Vehicle, kind: type[Plant] = Plant, forces: Sequence[Force] | None = None
+) -> Plant:
     """The simulated vehicle, and what acts on it.
 
+    Args:
+        scenario: what is flown.
+        vehicle: the modelled vehicle.
+        kind: the class of the plant.
+        forces: of one's own, instead of those that the scenario names.
+
     Raises:
-        ParameterError: a combination of effects is not possible.
+        InputError: a combination of effects is not possible, or a force cannot be imported.
     """
+    rng = generator(scenario.seed, "forces")
     return kind(
         vehicle,
         timestep=scenario.plant.timestep,
@@ -46,6 +48,7 @@ def build_plant(scenario: Scenario, vehicle: Vehicle, kind: type[Plant] = Plant)
         effects=scenario.effects.resolved(vehicle),
         changes=build_changes(scenario),
         wind=build_wind(scenario, vehicle),
+        forces=[build_force(spec, vehicle, rng) for spec in scenario.forces] if forces is None else forces,
         rng=generator(scenario.seed, "disturbance"),
     )
 

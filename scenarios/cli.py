@@ -12,15 +12,17 @@ import logging
 import os
 import sys
 from collections.abc import Iterator, Sequence
-from typing import NoReturn
+from typing import Any, Final, NoReturn
 
 from quadsim import __version__
 from quadsim.errors import QuadsimError, printable
 from scenarios.commands import EXIT_FAILED, EXIT_WRONG_INPUT, find_command
 from scenarios.gc_tuning import collect_rarely
 
-_LINES = "\n"
-"""What a message of ours may be made of besides text: one with many problems has a line for each."""
+_LINES = "\n"  # what a message of ours may be made of besides text: one with many problems has a line for each
+_SCENARIO: Final = "library name, or path to a TOML file"
+_NUMBER: Final[dict[str, Any]] = {"type": int, "metavar": "N"}
+_SUMMARY: Final[dict[str, Any]] = {"action": "store_true", "help": "print the summary alone, as JSON on stdout"}
 
 
 class _Parser(argparse.ArgumentParser):
@@ -40,165 +42,129 @@ def make_parser() -> argparse.ArgumentParser:
         "2 wrong input",
     )
     parser.add_argument("--version", action="version", version=f"quadsim {__version__}")
-    commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
+    command = parser.add_subparsers(dest="command", metavar="COMMAND", required=True).add_parser
 
-    listing = commands.add_parser("list", help="scenarios, vehicles, controllers and solvers, one line each")
+    listing = command("list", help="scenarios, vehicles, controllers and solvers, one line each")
     listing.add_argument("--json", action="store_true", help="as JSON on stdout")
 
-    run = commands.add_parser("run", help="fly one scenario and write its run directory")
-    _add_scenario(run)
+    run = command("run", help="fly one scenario and write its run directory")
+    run.add_argument("scenario", metavar="SCENARIO", help=_SCENARIO)
     run.add_argument("--out", metavar="DIR", help="run directory, replacing an earlier run (default: runs/SCENARIO)")
     _add_settings(run)
     _add_products(run)
-    run.add_argument("--json", action="store_true", help="print the summary alone, as JSON on stdout")
+    run.add_argument("--json", **_SUMMARY)
 
-    check = commands.add_parser("check", help="audit a scenario (flown first) or a finished run; exit 1 if it fails")
+    check = command("check", help="audit a scenario (flown first) or a finished run; exit 1 if it fails")
     check.add_argument("target", metavar="SCENARIO_OR_RUN", help="library name, TOML file, or run directory")
     _add_settings(check)
     check.add_argument("--junit", metavar="FILE", help="also write the verdicts as JUnit XML")
-    check.add_argument("--json", action="store_true", help="print the summary alone, as JSON on stdout")
+    check.add_argument("--json", **_SUMMARY)
 
-    compare = commands.add_parser("compare", help="flights, or two campaigns, side by side: table, figures, HTML page")
-    compare.add_argument(
-        "targets",
-        metavar="RUN_OR_SCENARIO",
-        nargs="+",
-        help="run directories, scenarios to fly, or the directories of two campaigns",
-    )
+    compare = command("compare", help="flights, or two campaigns, side by side: table, figures, HTML page")
+    targets = "run directories, scenarios to fly, or the directories of two campaigns"
+    compare.add_argument("targets", metavar="RUN_OR_SCENARIO", nargs="+", help=targets)
     compare.add_argument("--out", metavar="DIR", required=True, help="directory of the page")
-    compare.add_argument(
-        "--cost",
-        action=argparse.BooleanOptionalAction,
-        default=None,
-        help="study what constraints cost; takes a minute (default: where a constrained and an unconstrained "
-        "controller fly the same course of at most 120 s)",
+    cost = (
+        "study what constraints cost; takes a minute (default: where a constrained and an unconstrained controller fly "
+        "the same course of at most 120 s)"
     )
+    compare.add_argument("--cost", action=argparse.BooleanOptionalAction, default=None, help=cost)
     compare.add_argument("--markdown", action="store_true", help="print the table as Markdown")
 
-    video = commands.add_parser("video", help="film a finished run")
+    video = command("video", help="film a finished run")
     video.add_argument("run", metavar="RUN", help="run directory")
     video.add_argument("--out", metavar="FILE", help="MP4 or GIF file (default: RUN/flight.mp4)")
-    video.add_argument("--workers", type=int, metavar="N", help="rendering processes (default: one per core)")
+    video.add_argument("--workers", **_NUMBER, help="rendering processes (default: one per core)")
 
-    view = commands.add_parser("view", help="open a run's recording in the rerun viewer")
+    view = command("view", help="open a run's recording in the rerun viewer")
     view.add_argument("run", metavar="RUN", help="run directory or .rrd file")
     view.add_argument("--web", action="store_true", help="serve the viewer to a browser instead")
 
-    scenario = commands.add_parser(
-        "scenario", help="print a scenario with all defaults and comments: a start for yours"
-    )
-    scenario.add_argument("scenario", metavar="SCENARIO", nargs="?", help="library name, or path to a TOML file")
+    scenario = command("scenario", help="print a scenario with all defaults and comments: a start for yours")
+    scenario.add_argument("scenario", metavar="SCENARIO", nargs="?", help=_SCENARIO)
     _add_settings(scenario)
     scenario.add_argument("--schema", action="store_true", help="print the JSON Schema of scenario files instead")
 
-    vehicle = commands.add_parser("vehicle", help="a vehicle's derived figures, its parameters' sources, its picture")
+    vehicle = command("vehicle", help="a vehicle's derived figures, its parameters' sources, its picture")
     vehicle.add_argument("vehicle", metavar="VEHICLE", help="a shipped vehicle's name, or path to a TOML file")
     vehicle.add_argument("--out", metavar="FILE", help="PNG file to draw it to, on a floor of 10 cm squares")
     vehicle.add_argument("--json", action="store_true", help="as JSON on stdout")
 
-    _add_campaign(commands.add_parser("campaign", help="fly a scenario many times, what may vary drawn at random"))
+    _add_campaign(command("campaign", help="fly a scenario many times, what may vary drawn at random"))
 
-    replay = commands.add_parser("replay", help="fly one flight of a campaign again, with all outputs")
+    replay = command("replay", help="fly one flight of a campaign again, with all outputs")
     replay.add_argument("campaign", metavar="CAMPAIGN", help="a campaign's directory")
     which = replay.add_mutually_exclusive_group()
     which.add_argument("--worst", action="store_true", help="the worst flight (the default)")
-    which.add_argument("--flight", type=int, metavar="N", help="that flight")
+    which.add_argument("--flight", **_NUMBER, help="that flight")
     replay.add_argument("--out", metavar="DIR", help="run directory (default: runs/CAMPAIGN-N)")
     _add_products(replay)
-    replay.add_argument("--json", action="store_true", help="print the summary alone, as JSON on stdout")
+    replay.add_argument("--json", **_SUMMARY)
 
-    _add_bench(commands.add_parser("bench", help="measure QP solvers, a flight, a film, and what controllers survive"))
+    _add_bench(command("bench", help="measure QP solvers, a flight, a film, and what controllers survive"))
 
-    doctor = commands.add_parser("doctor", help="what this machine can do")
+    doctor = command("doctor", help="what this machine can do")
     doctor.add_argument("--json", action="store_true", help="as JSON on stdout")
     return parser
 
 
 def _add_campaign(campaign: argparse.ArgumentParser) -> None:
-    campaign.add_argument("file", metavar="FILE", help="library name, or path to a TOML file")
-    campaign.add_argument("--out", metavar="DIR", help="campaign's directory (default: runs/campaigns/NAME)")
-    campaign.add_argument("--workers", type=int, metavar="N", help="processes (default: one per core)")
-    campaign.add_argument(
-        "--cluster",
-        metavar="ADDRESS",
-        help="fly on a Dask cluster: a scheduler's address, tcp://HOST:PORT, or a TOML file that describes a batch "
-        "system's jobs",
-    )
-    campaign.add_argument("--resume", action="store_true", help="go on with what is there")
-    campaign.add_argument("--flights", type=int, metavar="N", help="so many instead of the file's")
-    campaign.add_argument(
-        "--until-width",
-        type=float,
-        metavar="W",
-        help="stop once the 95 %% interval of the failure probability is as narrow as this, e.g. 0.05",
-    )
-    campaign.add_argument(
-        "--require",
-        dest="requirements",
-        metavar="REQUIREMENT",
-        action="append",
-        default=[],
-        help='exit 1 unless the flights support it, e.g. "P(violation) < 0.01 @ 95%%"; may be repeated',
-    )
-    campaign.add_argument(
-        "--report", action=argparse.BooleanOptionalAction, default=True, help="write the report, an HTML page"
-    )
-    campaign.add_argument("--junit", metavar="FILE", help="also write the requirements' verdicts as JUnit XML")
+    add = campaign.add_argument
+    add("file", metavar="FILE", help=_SCENARIO)
+    add("--out", metavar="DIR", help="campaign's directory (default: runs/campaigns/NAME)")
+    add("--workers", **_NUMBER, help="processes (default: one per core)")
+    scheduler = "a scheduler's address, tcp://HOST:PORT, or a TOML file that describes a batch system's jobs"
+    add("--cluster", metavar="ADDRESS", help=f"fly on a Dask cluster: {scheduler}")
+    add("--resume", action="store_true", help="go on with what is there")
+    add("--flights", **_NUMBER, help="so many instead of the file's")
+    width = "stop once the 95 %% interval of the failure probability is as narrow as this, e.g. 0.05"
+    add("--until-width", type=float, metavar="W", help=width)
+    require = 'exit 1 unless the flights support it, e.g. "P(violation) < 0.01 @ 95%%"; may be repeated'
+    add("--require", dest="requirements", metavar="REQUIREMENT", action="append", default=[], help=require)
+    add("--report", action=argparse.BooleanOptionalAction, default=True, help="write the report, an HTML page")
+    add("--junit", metavar="FILE", help="also write the requirements' verdicts as JUnit XML")
     _add_settings(campaign)
-    campaign.add_argument("--json", action="store_true", help="print the summary alone, as JSON on stdout")
+    add("--json", **_SUMMARY)
 
 
 def _add_bench(bench: argparse.ArgumentParser) -> None:
-    kinds = bench.add_subparsers(dest="kind", metavar="WHAT", required=True)
+    kind = bench.add_subparsers(dest="kind", metavar="WHAT", required=True).add_parser
+    numbers: dict[str, Any] = {"type": _whole_numbers, "metavar": "N,N,..."}
 
-    solvers = kinds.add_parser("solvers", help="every installed QP solver on the queries of one flight, in one run")
-    solvers.add_argument("--out", metavar="DIR", default="runs/bench-solvers", help="directory (default: %(default)s)")
-    solvers.add_argument("--repeats", type=int, metavar="N", default=5, help="ask each question so often (default: 5)")
-    solvers.add_argument(
-        "--horizons",
-        type=_whole_numbers,
-        metavar="N,N,...",
-        default=[10, 20, 50, 100, 200],
-        help="horizons for the growth of the step, or none (default: 10,20,50,100,200)",
-    )
-    solvers.add_argument(
-        "--solver",
-        dest="solvers",
-        metavar="NAME",
-        action="append",
-        help="time this one; may be repeated (default: all)",
-    )
-    solvers.add_argument(
-        "--stride", type=int, metavar="N", default=1, help="ask 20 periods of each so many times 20 (default: 1, all)"
-    )
+    solvers = kind("solvers", help="every installed QP solver on the queries of one flight, in one run")
+    add = solvers.add_argument
+    add("--out", metavar="DIR", default="runs/bench-solvers", help="directory (default: %(default)s)")
+    add("--repeats", **_NUMBER, default=5, help="ask each question so often (default: 5)")
+    horizons = "horizons for the growth of the step, or none (default: 10,20,50,100,200)"
+    add("--horizons", **numbers, default=[10, 20, 50, 100, 200], help=horizons)
+    this = "time this one; may be repeated (default: all)"
+    add("--solver", dest="solvers", metavar="NAME", action="append", help=this)
+    add("--stride", **_NUMBER, default=1, help="ask 20 periods of each so many times 20 (default: 1, all)")
 
-    flight = kinds.add_parser("flight", help="where the time of a flight goes")
-    flight.add_argument("--repeats", type=int, metavar="N", default=5, help="flights (default: 5)")
+    flight = kind("flight", help="where the time of a flight goes")
+    flight.add_argument("--repeats", **_NUMBER, default=5, help="flights (default: 5)")
 
-    render = kinds.add_parser("render", help="what a film costs")
+    render = kind("render", help="what a film costs")
     render.add_argument("--seconds", type=float, metavar="S", default=4.0, help="of film (default: 4)")
-    render.add_argument("--workers", type=int, metavar="N", help="rendering processes (default: one per core)")
+    render.add_argument("--workers", **_NUMBER, help="rendering processes (default: one per core)")
 
-    ladder = kinds.add_parser("ladder", help="what each controller survives, from rotor lag to a worn rotor")
+    ladder = kind("ladder", help="what each controller survives, from rotor lag to a worn rotor")
     ladder.add_argument("--out", metavar="DIR", default="runs/bench-ladder", help="directory (default: %(default)s)")
-    ladder.add_argument("--workers", type=int, metavar="N", help="processes (default: one per core)")
+    ladder.add_argument("--workers", **_NUMBER, help="processes (default: one per core)")
     ladder.add_argument("--quick", action="store_true", help="three controllers, three conditions, 12 s each")
 
-    campaign = kinds.add_parser("campaign", help="what many flights cost, by one worker and by two")
-    campaign.add_argument("--flights", type=int, metavar="N", default=40, help="per worker and round (default: 40)")
-    campaign.add_argument("--rounds", type=int, metavar="N", default=3, help="of one worker and two (default: 3)")
-    campaign.add_argument(
-        "--sizes",
-        type=_whole_numbers,
-        metavar="N,N,...",
-        default=[10, 100, 1000, 10000],
-        help="flights of ever larger campaigns, or none (default: 10,100,1000,10000)",
-    )
+    campaign = kind("campaign", help="what many flights cost, by one worker and by two")
+    campaign.add_argument("--flights", **_NUMBER, default=40, help="per worker and round (default: 40)")
+    campaign.add_argument("--rounds", **_NUMBER, default=3, help="of one worker and two (default: 3)")
+    sizes = "flights of ever larger campaigns, or none (default: 10,100,1000,10000)"
+    campaign.add_argument("--sizes", **numbers, default=[10, 100, 1000, 10000], help=sizes)
 
-    for kind in (solvers, flight, render, ladder, campaign):
-        kind.add_argument("--scenario", metavar="SCENARIO", default="paper-constrained", help="(default: %(default)s)")
-        _add_settings(kind)
-        kind.add_argument("--json", action="store_true", help="print what was measured alone, as JSON on stdout")
+    for parser in (solvers, flight, render, ladder, campaign):
+        parser.add_argument(
+            "--scenario", metavar="SCENARIO", default="paper-constrained", help="(default: %(default)s)"
+        )
+        _add_settings(parser)
+        parser.add_argument("--json", action="store_true", help="print what was measured alone, as JSON on stdout")
 
 
 def _whole_numbers(text: str) -> list[int]:
@@ -209,27 +175,18 @@ def _whole_numbers(text: str) -> list[int]:
         raise argparse.ArgumentTypeError(f"must be whole numbers between commas, or none; got {text!r}") from None
 
 
-def _add_scenario(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("scenario", metavar="SCENARIO", help="library name, or path to a TOML file")
-
-
 def _add_products(parser: argparse.ArgumentParser) -> None:
-    for product in ("video", "recording", "figures"):
-        parser.add_argument(
-            f"--{product}", action=argparse.BooleanOptionalAction, default=True, help=f"make the {product}"
-        )
+    for name in ("video", "recording", "figures"):
+        parser.add_argument(f"--{name}", action=argparse.BooleanOptionalAction, default=True, help=f"make the {name}")
 
 
 def _add_settings(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "--set",
-        dest="settings",
-        metavar="KEY=VALUE",
-        action="append",
-        default=[],
-        help="replace a field of the scenario, e.g. --set controller.horizon=30; may be repeated",
+    add, replaced = (
+        parser.add_argument,
+        "replace a field of the scenario, e.g. --set controller.horizon=30; may be repeated",
     )
-    parser.add_argument("--seed", type=int, metavar="N", help="replace the seed, of everything random in it")
+    add("--set", dest="settings", metavar="KEY=VALUE", action="append", default=[], help=replaced)
+    parser.add_argument("--seed", **_NUMBER, help="replace the seed, of everything random in it")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -15,12 +15,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from quadsim.controller import Phase
 from quadsim.errors import MissingPackageError, OutputError, UnknownNameError
 from quadsim.flight import metrics, rundir
 from quadsim.flight.audit import SIGNALS, Finding, margins_at, margins_sampled
-from quadsim.flight.feasibility import to_json as feasibility_to_json
-from quadsim.flight.log import ROTORS, FlightLog
+from quadsim.flight.log import FlightLog
 from quadsim.flight.parquet import log_tables, write_log
 from quadsim.outputs import write_json, write_text, writing
 from quadsim.sim.airframe import outline
@@ -109,10 +107,9 @@ class Flight:
 
         What fallback for good is: `quadsim.flight.metrics.unrecovered`.
         """
-        control = self.log.control
-        whole = self.log.reason is None and str(Phase.CRASHED) not in control.phase
+        whole = self.log.reason is None and not self.log.control.crashed
         held = all(finding.satisfied for finding in self.findings if finding.limit.required)
-        return whole and held and not metrics.unrecovered(control)
+        return whole and held and not metrics.unrecovered(self.log.control)
 
     @property
     def outcome(self) -> Verdict:
@@ -167,7 +164,7 @@ class Flight:
     def plant(self) -> dict[str, Array]:
         """(M,) of the time `t` [s], each true state, and rotor speeds `w1` .. `w4` [rad/s], between commands."""
         log = self.log.plant
-        speeds = {f"w{i}": log.speeds[:, i - 1] for i in ROTORS}
+        speeds = {f"w{i}": column for i, column in enumerate(log.speeds.T, start=1)}
         return {"t": log.t, **dict(zip(STATE_NAMES, log.state.T, strict=True)), **speeds}
 
     @cached_property
@@ -372,7 +369,7 @@ def summarise(flight: Flight) -> dict[str, Any]:
         "as_expected": flight.outcome == scenario.expect and not log.interrupted,
         "duration": round(log.control.t.size * scenario.control_period, 9),
         "seed": scenario.seed,
-        "course": feasibility_to_json(report(scenario, flight.vehicle)),
+        "course": asdict(report(scenario, flight.vehicle)),
         "tracking": numbers["tracking"],
         "constraints": [rundir.limit_to_json(finding) for finding in flight.findings],
         "control": numbers["control"],
@@ -386,7 +383,7 @@ def summarise(flight: Flight) -> dict[str, Any]:
         **({"computation": metrics.computation(log.control)} if flown and build_computation(scenario) else {}),
         **({} if log.control.measured_perfectly else {"estimation": _estimation(flight)}),
         **({"ground": metrics.ground(log, outline(flight.vehicle))} if flown and ground and ground.contact else {}),
-        "vehicle": rundir.vehicle_to_json(flight.vehicle),
+        "vehicle": asdict(flight.vehicle),
         "wall_s": {"simulate": flight.simulate_s, "total": flight.simulate_s},
         "versions": versions(),
         "machine": machine(),

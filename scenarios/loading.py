@@ -5,9 +5,9 @@ from __future__ import annotations
 import copy
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
-from quadsim.errors import FileError, ParameterError, UnknownNameError
+from quadsim.errors import FileError, ParameterError
 from quadsim.flight.ground import AIRBORNE, TOUCH, clearance
 from quadsim.sim.airframe import outline
 from quadsim.sim.effects.load import Load, mass_properties
@@ -21,6 +21,7 @@ from scenarios.schema.plugin import located as located_controller
 from scenarios.schema.problems import ScenarioError
 from scenarios.schema.scenario import Scenario
 from scenarios.schema.settings import apply_setting
+from scenarios.shipped import LIBRARY, scenario_path
 
 
 def check_parts(scenario: Scenario) -> None:
@@ -55,29 +56,6 @@ def _check_start(scenario: Scenario, vehicle: Vehicle) -> None:
         raise ParameterError("initial", "position", position, rule)
 
 
-LIBRARY: Final = Path(__file__).resolve().parent / "library"
-
-
-def scenario_names() -> list[str]:
-    """Names of the scenarios that ship, sorted."""
-    return sorted(path.stem for path in LIBRARY.glob("*.toml"))
-
-
-def scenario_path(name: str) -> Path:
-    """The file of a library name, or the path itself when it ends in `.toml`.
-
-    Raises:
-        FileError, UnknownNameError: there is none.
-    """
-    if name.endswith(".toml"):
-        if not Path(name).is_file():
-            raise FileError(name, "no such scenario file")
-        return Path(name)
-    if name not in scenario_names():
-        raise UnknownNameError("scenario", name, scenario_names(), hint="or give a path ending in .toml")
-    return LIBRARY / f"{name}.toml"
-
-
 def load_scenario(name: str, settings: Sequence[str] = ()) -> Scenario:
     """Read and check a scenario, merged over its `base` where it has one, with the vehicle and the course it names.
 
@@ -105,14 +83,7 @@ def load_scenario(name: str, settings: Sequence[str] = ()) -> Scenario:
 
 
 def _of_types(problems: Sequence[str], path: Path, read: Mapping[str, Any], data: Mapping[str, Any]) -> Iterator[str]:
-    """Why fields of a table are missing, or are too many: another type of it was asked for.
-
-    Args:
-        problems: what is wrong.
-        path: the file.
-        read: what was read from it.
-        data: the same with the settings.
-    """
+    """Why fields of a table are missing, or are too many: another type was asked for than `read` from the file."""
     unfit = (problem for problem in problems if problem.endswith(" is missing") or " is not a field of " in problem)
     wrong = {problem.partition(".")[0] for problem in unfit}
     given = retyped(read, data)
@@ -142,6 +113,11 @@ def parse_scenario(data: Mapping[str, Any], *, source: str = "scenario", directo
     """
     if directory is not None and "controller" in data:
         data = {**data, "controller": located_controller(data["controller"], directory)}
+    if directory is not None and isinstance(data.get("forces"), list):
+        forces = [
+            located_controller(force, directory) if isinstance(force, dict) else force for force in data["forces"]
+        ]
+        data = {**data, "forces": forces}
     scenario = Scenario.parse(data, source=source)
     file = scenario.vehicle.file
     if directory is not None and file.endswith(".toml") and (directory / file).is_file():

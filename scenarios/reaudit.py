@@ -16,7 +16,6 @@ from typing import Any, Final
 
 import numpy as np
 
-from quadsim.controller import Phase
 from quadsim.errors import FileError, InputError, printable
 from quadsim.flight import metrics, rundir
 from quadsim.flight.audit import Finding, audit
@@ -92,10 +91,12 @@ def reaudit(directory: Path, *, products: bool = True) -> Reaudit:
     if others := _unlisted(directory, summary):
         shown = ", ".join(others[:MOST_SAID]) + (" ..." if len(others) > MOST_SAID else "")
         notes.append(f"not of this run: {printable(shown)}")
+    whole = summary["reason"] is None and log.control.t.size == scenario.periods and not log.control.crashed
+    whole = whole and not metrics.unrecovered(log.control)
     return Reaudit(
         summary=summary,
         findings=findings,
-        satisfied=_is_satisfied(summary["reason"], scenario, log, findings),
+        satisfied=whole and all(finding.satisfied for finding in findings if finding.limit.required),
         rate=scenario.log_rate,
         notes=tuple(notes),
     )
@@ -171,7 +172,7 @@ def _differences(
     if summary["tracking"] and summary["controller"].get("unrecovered", 0) != unrecovered:
         recorded = summary["controller"].get("unrecovered", 0)
         yield f"controller.unrecovered is recorded as {recorded}, and the tables give {unrecovered}"
-    satisfied = summary["reason"] is None and not _is_crashed(log) and not unrecovered and required
+    satisfied = summary["reason"] is None and not log.control.crashed and not unrecovered and required
     if summary["satisfied"] != satisfied:
         yield f"satisfied is recorded as {summary['satisfied']}, and its audit and outcome make it {satisfied}"
     outcome = "lost" if summary["reason"] is not None else "satisfied" if satisfied else "violated"
@@ -179,18 +180,9 @@ def _differences(
         yield f"as_expected is recorded as True, and the flight is {outcome} where {scenario.expect} is expected"
 
 
-_DEMANDS: Final = [
-    "signal",
-    "terms",
-    "unit",
-    "lower",
-    "upper",
-    "tolerance",
-    "tolerance_sampled",
-    "required",
-    "start",
-    "stop",
-]
+_DEMANDS: Final = (
+    "signal", "terms", "unit", "lower", "upper", "tolerance", "tolerance_sampled", "required", "start", "stop",
+)  # fmt: skip
 """What the scenario says of a constraint."""
 
 
@@ -232,23 +224,12 @@ def _time_beyond(finding: Finding, scenario: Scenario, log: FlightLog) -> tuple[
     if signal.plant is None or not log.control.t.size or scenario.plant_stride == 1:
         return seen - ROUNDING, seen + row + ROUNDING
     t = log.plant.t[:-1]  # the last row ends the flight, and lasts no time
-    inside = (t >= limit.start) & (t <= limit.stop)
     beyond = limit.margin(signal.plant(log.plant))[:-1] < -limit.tolerance - ROUNDING_TILT
-    return max(0.0, (np.count_nonzero(inside & beyond) - 1) * scenario.plant.timestep), math.inf
+    return max(0.0, (np.count_nonzero(limit.holds_at(t) & beyond) - 1) * scenario.plant.timestep), math.inf
 
 
 def _margin(finding: Finding, peak: float | None) -> float | None:
     return None if peak is None else float(finding.limit.margin(np.array([peak]))[0])
-
-
-def _is_satisfied(reason: str | None, scenario: Scenario, log: FlightLog, findings: Sequence[Finding]) -> bool:
-    whole = reason is None and log.control.t.size == scenario.periods and not _is_crashed(log)
-    held = all(finding.satisfied for finding in findings if finding.limit.required)
-    return whole and held and not metrics.unrecovered(log.control)
-
-
-def _is_crashed(log: FlightLog) -> bool:
-    return str(Phase.CRASHED) in log.control.phase
 
 
 def _is_close(recorded: float | None, again: float | None, rounding: float) -> bool:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time as clock
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from threadpoolctl import threadpool_limits
@@ -14,6 +14,7 @@ from quadsim.flight import rundir
 from quadsim.flight.audit import audit
 from quadsim.flight.log import FlightLog
 from quadsim.outputs import writing
+from quadsim.sim.effects import Force
 from quadsim.sim.loop import fly
 from quadsim.sim.navigation import Navigation
 from quadsim.sim.plant import Plant
@@ -71,7 +72,12 @@ def fly_once(
         )
 
 
-def fly_scenario(scenario: Scenario, progress: Progress = silent, law: Controller | None = None) -> Flight:
+def fly_scenario(
+    scenario: Scenario,
+    progress: Progress = silent,
+    law: Controller | None = None,
+    forces: Sequence[Force] | None = None,
+) -> Flight:
     """Fly a scenario and audit it, writing nothing.
 
     Linear algebra is held to one thread: the matrices are small, and results do not depend on the core count.
@@ -80,11 +86,12 @@ def fly_scenario(scenario: Scenario, progress: Progress = silent, law: Controlle
         scenario: what is flown.
         progress: called with (what, done, total).
         law: who flies it, instead of what is built from the scenario's `controller`.
+        forces: what acts on it, instead of what is built from the scenario's `forces`.
     """
     vehicle = build_vehicle(scenario)
     with threadpool_limits(limits=1):
         controller = build_controller(scenario, vehicle) if law is None else law
-        with build_plant(scenario, vehicle) as plant:
+        with build_plant(scenario, vehicle, forces=forces) as plant:
             navigation = build_navigation(scenario, vehicle)
             started = clock.perf_counter()
             reference = build_reference(scenario, scenario.periods + controller.horizon)
@@ -114,7 +121,12 @@ def fly_scenario(scenario: Scenario, progress: Progress = silent, law: Controlle
 
 
 def run_scenario(
-    scenario: Scenario, target: Path, outputs: Outputs, progress: Progress = silent, law: Controller | None = None
+    scenario: Scenario,
+    target: Path,
+    outputs: Outputs,
+    progress: Progress = silent,
+    law: Controller | None = None,
+    forces: Sequence[Force] | None = None,
 ) -> Flight:
     """Fly a scenario and write its run directory, which appears complete or not at all.
 
@@ -126,6 +138,7 @@ def run_scenario(
         outputs: which pictures.
         progress: called with (what, done, total).
         law: see `fly_scenario`.
+        forces: see `fly_scenario`.
 
     Raises:
         RenderingUnavailableError: a video is wanted and cannot be made; nothing was flown.
@@ -134,6 +147,6 @@ def run_scenario(
     started = clock.perf_counter()
     outputs.check()
     with writing(target, rundir.KIND) as directory:
-        flight = fly_scenario(scenario, progress, law)
+        flight = fly_scenario(scenario, progress, law, forces)
         write_run(flight, directory, outputs, progress, since=started)
     return flight

@@ -5,8 +5,10 @@ from __future__ import annotations
 import fcntl
 import os
 import pickle
+import sys
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -22,23 +24,28 @@ from scenarios.loading import load_scenario
 from scenarios.parts.vehicle import build_vehicle
 from scenarios.run import fly_scenario, run_scenario
 
+# What is compiled is kept, also where the environment asks for the contrary: the workers, and all processes that tests
+# start, would compile the same modules again.  `make clean` removes it.
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+sys.dont_write_bytecode = False
+
 # Examples are not timed: a busy machine is no failure.  On CI they are the same ones each time.
 settings.register_profile("quadsim", deadline=None, derandomize="CI" in os.environ)
 settings.load_profile("quadsim")
 
 NO_PRODUCTS = Outputs(video=False, recording=False, figures=False)
 LONG = (
-    *("scenarios/campaign/engine/test_cluster.py", "scenarios/test_library.py", "scenarios/test_cli.py"),
-    *("scenarios/campaign/test_survival.py", "scenarios/test_faults.py", "scenarios/bench/test_bench.py"),
-    *("test_commands.py", "test_safety.py", "scenarios/campaign/engine/test_local.py"),
-    *("scenarios/bench/test_mismatch.py", "test_documents.py", "scenarios/test_soak.py"),
-    *("quadsim/report/film/test_video.py", "scenarios/campaign/test_run.py", "scenarios/test_paper.py"),
-    *("scenarios/campaign/test_kills.py", "scenarios/test_mutations.py", "scenarios/test_any_scenario.py"),
-    *("scenarios/campaign/report/test_campaign_page.py", "quadsim/report/test_comparison_page.py"),
-    *("scenarios/commands/test_console.py", "mpc/robust/test_robust.py", "quadsim/report/test_figures.py"),
-    *("scenarios/cost/test_measure.py", "mpc/robust/test_tightening.py"),
+    *("scenarios/campaign/engine/test_cluster.py", "scenarios/test_library.py", "test_safety.py"),
+    *("scenarios/campaign/test_survival.py", "scenarios/test_faults.py", "test_commands.py"),
+    *("quadsim/report/test_comparison_page.py", "scenarios/campaign/test_run.py", "scenarios/test_process.py"),
+    *("scenarios/bench/test_bench.py", "quadsim/report/test_figures.py", "scenarios/campaign/engine/test_local.py"),
+    *("scenarios/cost/test_measure.py", "test_documents.py", "scenarios/campaign/report/test_campaign_page.py"),
+    *("scenarios/campaign/test_kills.py", "quadsim/report/film/test_video.py", "scenarios/test_cli.py"),
+    *("scenarios/test_mutations.py", "scenarios/bench/test_mismatch.py", "scenarios/test_any_scenario.py"),
+    *("scenarios/parts/test_controllers.py", "mpc/robust/test_robust.py", "scenarios/commands/test_console.py"),
+    *("scenarios/campaign/test_commands.py", "test_packaging.py", "mpc/test_staged.py"),
 )
-"""Modules that take longest; those not named take less than ten seconds each."""
+"""Modules that take longest; those not named take less than six seconds each."""
 
 
 def pytest_configure(config: pytest.Config) -> None:
@@ -104,6 +111,21 @@ def short_run(tmp_path_factory: pytest.TempPathFactory) -> Run:
 @pytest.fixture(scope="session")
 def short_run_directory(short_run: Run) -> Path:
     return short_run.directory
+
+
+@pytest.fixture
+def sketched(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Figures are not laid out, and their PNG files are empty: for tests of the SVG's text, or of other files."""
+    from matplotlib.figure import Figure
+
+    save = Figure.savefig
+
+    def sketch(figure: Figure, file: Any, *, format: str, **options: Any) -> None:
+        if format != "png":
+            save(figure, file, format=format, **options)
+
+    monkeypatch.setattr(Figure, "savefig", sketch)
+    monkeypatch.setattr(Figure, "get_layout_engine", lambda _: None)
 
 
 @pytest.fixture(scope="session")

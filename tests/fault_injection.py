@@ -14,7 +14,7 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from mpc.fallback.contract import Guarded
-from mpc.solvers import _piqp
+from mpc.solvers import piqp_backends
 from quadsim.controller import SOLVED, Command, Controller, Moment
 from quadsim.flight.log import FlightLog
 from quadsim.sim.physics import Segment
@@ -22,9 +22,9 @@ from quadsim.sim.plant import Plant
 from quadsim.sim.sensing.sensor import SensorName
 from quadsim.state import POSITION, Array
 from quadsim.vehicle import N_ROTORS, Vehicle
-from scenarios.bench.mismatch.benchmark import answer_all
 from scenarios.bench.mismatch.conditions import CONDITIONS
 from scenarios.bench.mismatch.controllers import FULL, equip
+from scenarios.bench.worker_pool import answer_all
 from scenarios.build import build_controller, build_plant, build_problem
 from scenarios.courses.make import build_reference
 from scenarios.loading import load_scenario
@@ -50,7 +50,7 @@ AFTER: Final = 12.0
 """Time flown from the fault's end [s]."""
 LAST: Final = 60.0
 """Time at which the paper's course ends [s]."""
-STATUSES: Final = tuple(sorted({*_piqp.STATUS.values()} - {SOLVED}))
+STATUSES: Final = tuple(sorted({*piqp_backends.STATUS.values()} - {SOLVED}))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -245,18 +245,22 @@ def _built() -> tuple[Scenario, Vehicle]:
 
 @cache
 def _sound_flight(controller: str, condition: str, duration: float) -> tuple[FlightLog, Array]:
-    return _fly(controller, condition, duration, ())
+    """With the shortcut, whose answers are those of the whole QP within 1e-6 rad/s."""
+    return _fly(controller, condition, duration, (), shortcut=True)
 
 
-def _fly(controller: str, condition: str, duration: float, injections: Sequence[Injection]) -> tuple[FlightLog, Array]:
-    """A flight, and what the plant was given (M, 4); without the shortcut, so that there is a QP in every period."""
-    settings = (f"duration={round(duration, 9)}", "controller.shortcut=false", "controller.fallback.enabled=true")
+def _fly(
+    controller: str, condition: str, duration: float, injections: Sequence[Injection], *, shortcut: bool = False
+) -> tuple[FlightLog, Array]:
+    """A flight, and what the plant was given (M, 4); without the shortcut there is a QP in every period to fail."""
+    switch = f"controller.shortcut={str(shortcut).lower()}"
+    settings = (f"duration={round(duration, 9)}", switch, "controller.fallback.enabled=true")
     scenario = load_scenario("paper-constrained", (*settings, *CONDITIONS[condition].settings))
     events = [f"{{at={each.start}, {event}}}" for each in injections for event in each.fault.events]
     faulty = load_scenario("paper-constrained", (settings[0], f"events=[{', '.join(events)}]"))
     if controller == "robust":
         scenario = equip(scenario, FULL, CONDITIONS[condition])
-        whole = scenario.controller.model_copy(update={"shortcut": False})
+        whole = scenario.controller.model_copy(update={"shortcut": shortcut})
         scenario = scenario.model_copy(update={"controller": whole})
     scenario = scenario.model_copy(update={"events": [*scenario.events, *faulty.events]})
     vehicle = build_vehicle(scenario)
@@ -287,7 +291,7 @@ class _FailingSolver:
 @contextlib.contextmanager
 def _failing_solver() -> Iterator[_FailingSolver]:
     failing = _FailingSolver()
-    with mock.patch.object(_piqp, "solve", partial(failing.solve, _piqp.solve)):
+    with mock.patch.object(piqp_backends, "solve", partial(failing.solve, piqp_backends.solve)):
         yield failing
 
 

@@ -15,12 +15,11 @@ import scipy.linalg
 from scipy.optimize import linprog
 
 from mpc.constraints import Constraint
-from mpc.exact.polish import polish
 from mpc.ocp import Problem, Rest
 from mpc.qp import QP, Solution, kkt_residuals
-from mpc.solvers._common import start
 from mpc.solvers.daqp_dense import DaqpDense
 from quadsim.state import Array
+from scenarios.bench.polish import polish
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -216,7 +215,7 @@ def optimum(problem: Problem, given: Period) -> Optimum:
     qp = dense_qp(problem, given)
     backend = DaqpDense()
     backend.setup(qp)
-    solution = backend.solve(start(qp))
+    solution = backend.solve(qp.vectors)
     exact = polish(qp, solution) if np.isfinite(solution.x).all() else solution
     if kkt_residuals(qp, exact).worst < kkt_residuals(qp, solution).worst:
         solution = exact

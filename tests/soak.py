@@ -25,10 +25,12 @@ from quadsim.sim.plant import Plant
 from quadsim.state import POSITION, Array
 from scenarios.bench.mismatch.conditions import CONDITIONS
 from scenarios.bench.mismatch.controllers import FULL, equip
+from scenarios.bench.timing import Stopwatch
 from scenarios.build import build_controller, build_plant
 from scenarios.courses.make import build_reference
 from scenarios.loading import load_scenario
 from scenarios.parts.vehicle import build_initial_speeds, build_initial_state, build_vehicle
+from scenarios.schema.scenario import Scenario
 
 CONDITION: Final = CONDITIONS["mass +30 %"]
 GROWTH: Final = 0.01
@@ -85,25 +87,23 @@ def soak(laps: int) -> Soak:
     controller = build_controller(scenario, vehicle)
     course = build_reference(scenario, scenario.periods)
     reference = np.concatenate([course, course[: controller.horizon + 1]])
-    memory, step_ms = np.zeros(laps), np.zeros(laps * scenario.periods)
+    memory, watch = np.zeros(laps), Stopwatch(clock.thread_time)
+    watch.watch(controller, "step", "step")
     failures, end_error = 0, 0.0
     with threadpool_limits(limits=1), build_plant(scenario, vehicle) as plant:
         acting = build_initial_speeds(scenario, vehicle)
         plant.reset(build_initial_state(scenario), acting)
         controller.reset(acting)
         for lap in range(laps):
-            times = step_ms[lap * scenario.periods : (lap + 1) * scenario.periods]
             start = lap * scenario.duration
-            acting, failed, off = _fly_lap(
-                plant, controller, reference, acting, times, start, scenario.steps_per_period
-            )
+            acting, failed, off = _fly_lap(plant, controller, reference, acting, start, scenario)
             failures, end_error = failures + failed, max(end_error, off)
             gc.collect()
             memory[lap] = resident()
     return Soak(
         minutes=laps * scenario.duration / 60.0,
         memory=memory,
-        step_ms=step_ms,
+        step_ms=1e3 * np.array(watch.laps["step"]),
         failures=failures,
         end_error=end_error,
         laps_compared=max(1, laps // 10),
@@ -111,19 +111,17 @@ def soak(laps: int) -> Soak:
 
 
 def _fly_lap(
-    plant: Plant, controller: Controller, reference: Array, acting: Array, times: Array, start: float, steps: int
+    plant: Plant, controller: Controller, reference: Array, acting: Array, start: float, scenario: Scenario
 ) -> tuple[Array, int, float]:
     """One lap from `start` [s]; the last command (4,), periods without an accepted answer, and the error at its end."""
-    failed, off = 0, np.inf
-    for k in range(times.size):
+    failed, off, steps = 0, np.inf, scenario.steps_per_period
+    for k in range(scenario.periods):
         now = Moment(time=start + k * steps * plant.timestep, acting=acting)
         preview = reference[k + 1 : k + 1 + controller.horizon]
         state = plant.state()
-        if k == times.size - controller.horizon - 1:
+        if k == scenario.periods - controller.horizon - 1:
             off = float(np.linalg.norm(state[list(POSITION)] - reference[k, :3]))
-        started = clock.thread_time()
         command = controller.step(now, state, preview)
-        times[k] = 1e3 * (clock.thread_time() - started)
         failed += command.status not in ACCEPTED
         acting = command.speeds
         plant.advance(acting, steps)

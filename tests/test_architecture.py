@@ -139,7 +139,8 @@ def test_controllers_know_vehicle_state_errors_and_protocol_alone(imports: list[
 
 
 def test_controllers_run_without_a_simulator() -> None:
-    optional = {entry.backend.partition(":")[0]: entry.module for entry in SOLVERS.values() if entry.extra}
+    backends = {f"mpc.solvers.{entry.backend.partition(':')[0]}": entry for entry in SOLVERS.values()}
+    optional = {module: entry.package for module, entry in backends.items() if entry.extra}
     loaded = loaded_by("import " + ", ".join(name for name in set(modules()) - set(optional) if name.startswith("mpc")))
     assert {"mpc", "quadsim", "piqp"} <= loaded
     assert not loaded & {"mujoco", "scenarios", "pydantic", *OF_ONE_ROOM, *FOR_DRAWING, *optional.values()}
@@ -207,6 +208,11 @@ def test_help_loads_no_library() -> None:
     loaded = loaded_by("import scenarios.cli\ntry: scenarios.cli.main(['--help'])\nexcept SystemExit: pass")
     assert "scenarios" in loaded
     assert not loaded & declared()
+
+
+def test_the_list_loads_neither_the_simulator_nor_what_checks_scenarios() -> None:
+    loaded = loaded_by("import scenarios.cli\nscenarios.cli.main(['list'])")
+    assert not loaded & {"mujoco", "pydantic", "pyarrow", "pandas"}
 
 
 def test_help_answers_at_once() -> None:

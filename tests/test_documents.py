@@ -17,6 +17,7 @@ import pytest
 from support import Here
 
 from quadsim.report.table import grid_to_markdown
+from scenarios.bench import worker_pool
 from scenarios.cost import cost_flights
 from scenarios.cost.cost_tables import cost_tables
 from scenarios.cost.measure import study_cost
@@ -63,7 +64,7 @@ def test_what_constraints_cost_is_what_the_flights_give(monkeypatch: pytest.Monk
 
     What the steps take is made up.
     """
-    monkeypatch.setattr(cost_flights, "ProcessPoolExecutor", Here)
+    monkeypatch.setattr(worker_pool, "ProcessPoolExecutor", Here)
     steps: dict[str, Any] = {"step_ms": np.ones(1200), "statuses": ("solved",) * 1200, "repeats": 1}
     timed = [CandidateTimes(name=name, **steps) for name in ("gain", "as flown")]
     few = {"tilts": (), "horizons": (), "arm_lengths": (), "drags": (), "timed": timed}

@@ -24,23 +24,16 @@ from quadsim.vehicle import Vehicle
 
 WEIGHTS: Final = (30.0, 1000.0, 1000.0, 1.0)
 """Weights of thrust, roll, pitch and yaw in stage 2: squared, about a thousandfold from one to the next."""
-LARGEST_SPEED: Final = 1e4
-"""Stands for no upper bound [rad/s]; no rotor gets there."""
+LARGEST_SPEED: Final = 1e4  # stands for no upper bound [rad/s]; no rotor gets there
 
 
 @dataclass(frozen=True, kw_only=True)
 class Allocation:
-    """A vehicle's map between squared rotor speeds [rad^2/s^2] and the wrench [U, tau_x, tau_y, tau_z] [N, N m].
+    """A vehicle's map between squared rotor speeds [rad^2/s^2] and the wrench [U, tau_x, tau_y, tau_z] [N, N m]."""
 
-    Attributes:
-        M: (4, 4), wrench = M s.
-        inverse: (4, 4), s = inverse wrench.
-        scale: (4,) wrench that one rotor at hover speed gives, what is missed being counted in these units.
-    """
-
-    M: Array
-    inverse: Array
-    scale: Array
+    M: Array  # (4, 4), wrench = M s
+    inverse: Array  # (4, 4), s = inverse wrench
+    scale: Array  # (4,) wrench that one rotor at hover speed gives, what is missed being counted in these units
 
 
 def make_allocation(vehicle: Vehicle) -> Allocation:
@@ -53,27 +46,16 @@ def make_allocation(vehicle: Vehicle) -> Allocation:
 
 
 def allocate(allocation: Allocation, wrench: Array, lower: Array, upper: Array) -> Array:
-    """Rotor speeds (4,) [rad/s] within `lower` and `upper` (4,) that give a wrench, or what comes nearest to it.
+    """Rotor speeds (4,) within `lower` and `upper` (4,) [rad/s] that give a wrench, or what comes nearest to it.
 
-    Args:
-        allocation: of the vehicle.
-        wrench: (4,) thrust [N] along body z and torques [N m] about the body axes; finite.
-        lower: (4,) lowest speeds [rad/s], at least 0.
-        upper: (4,) highest speeds [rad/s], no lower than `lower`; may be infinite.
+    The wrench (4,) is thrust [N] along body z and torques [N m] about the body axes; upper speeds may be infinite.
     """
     low, high = lower**2, np.minimum(upper, LARGEST_SPEED) ** 2
     squares = allocation.inverse @ wrench
     if not ((low <= squares) & (squares <= high)).all():
         given = _less_yaw(squares, allocation.inverse[:, 3], low, high)
         squares = _nearest(allocation, wrench, low, high) if given is None else given
-    speeds: Array = np.clip(np.sqrt(np.maximum(squares, 0.0)), lower, upper)
-    return speeds
-
-
-def wrench_of(allocation: Allocation, speeds: Array) -> Array:
-    """The wrench (4,) [N, N m] that rotor speeds (4,) [rad/s] give."""
-    wrench: Array = allocation.M @ np.square(speeds)
-    return wrench
+    return np.asarray(np.clip(np.sqrt(np.maximum(squares, 0.0)), lower, upper))
 
 
 def _less_yaw(squares: Array, yaw: Array, low: Array, high: Array) -> Array | None:
@@ -93,5 +75,4 @@ def _nearest(allocation: Allocation, wrench: Array, low: Array, high: Array) -> 
     found = lsq_linear(
         weights[:, None] * allocation.M * unit, weights * wrench, (low / unit, wide / unit), method="bvls", tol=1e-14
     )
-    nearest: Array = found.x * unit
-    return nearest
+    return np.asarray(found.x * unit)

@@ -3,10 +3,38 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 
-from quadsim.state import Array
+from quadsim.state import EULER, EULER_RATE, POSITION, VELOCITY, Array, body_to_world, euler_to_body_rates
+
+LEAST_LIFT: Final = 0.2
+"""Share of the weight below which thrust is not asked to fall, so that torques keep their authority.  Ours."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Motion:
+    """A measured state with its attitude as a rotation matrix."""
+
+    position: Array  # x (3,), world [m]
+    velocity: Array  # v (3,), world [m/s]
+    attitude: Array  # R (3, 3), body to world
+    rates: Array  # Omega (3,), body [rad/s]
+    yaw: float  # [rad]
+
+
+def motion_of(state: Array) -> Motion:
+    """The motion that a state (12,) says."""
+    euler = state[list(EULER)]
+    return Motion(
+        position=state[list(POSITION)],
+        velocity=state[list(VELOCITY)],
+        attitude=body_to_world(euler),
+        rates=euler_to_body_rates(euler, state[list(EULER_RATE)]),
+        yaw=float(euler[2]),
+    )
 
 
 def hat(vector: Array) -> Array:
@@ -45,17 +73,12 @@ def attitude_for(force: Array, yaw: float) -> Array:
 
 
 def prioritised_error(attitude: Array, wanted: Array, yaw_weight: float) -> Array:
-    """Attitude error (3,) about the body axes [rad for small errors], heading last.
+    """Attitude error (3,) about the body axes [rad for small errors], heading last; attitudes (3, 3) body to world.
 
     2 sgn(q_0) times the vector part of the error quaternion q = q_tilt q_yaw: the shortest rotation that brings body z
-    where it is wanted, then the rest, a turn about it of which only the share `yaw_weight` is asked for.  Brescianini,
-    Hehn, D'Andrea, "Nonlinear quadrocopter attitude control", ETH Zurich, 2013; PX4's AttitudeControl.  The yaw part
-    is divided by the weight, so that small errors of all three axes count alike.
-
-    Args:
-        attitude: (3, 3) R, body to world.
-        wanted: (3, 3) R_d, body to world.
-        yaw_weight: in (0, 1].
+    where it is wanted, then the rest, a turn about it of which only the share `yaw_weight`, in (0, 1], is asked for.
+    Brescianini, Hehn, D'Andrea, "Nonlinear quadrocopter attitude control", ETH Zurich, 2013; PX4's
+    AttitudeControl.  The yaw part is divided by the weight, so that small errors of all three axes count alike.
     """
     thrust = attitude.T @ wanted[:, 2]  # where body z is to go, seen from the body
     cosine = float(np.clip(thrust[2], -1.0, 1.0))
@@ -74,11 +97,6 @@ def prioritised_error(attitude: Array, wanted: Array, yaw_weight: float) -> Arra
     return 2.0 * np.array([x * c + y * s, y * c - x * s, w * s / yaw_weight])
 
 
-def attitude_error_function(attitude: Array, wanted: Array) -> float:
-    """Psi(R, R_d) = tr(I - R_d' R) / 2, in [0, 2].  Lee, Leok, McClamroch (2010)."""
-    return 0.5 * (3.0 - float(np.trace(wanted.T @ attitude)))
-
-
 def attitude_error(attitude: Array, wanted: Array) -> Array:
     """e_R = (R_d' R - R' R_d)^vee / 2 (3,).  Lee, Leok, McClamroch (2010)."""
     return vee(wanted.T @ attitude)
@@ -86,8 +104,7 @@ def attitude_error(attitude: Array, wanted: Array) -> Array:
 
 def rate_error(attitude: Array, rates: Array, wanted: Array, wanted_rates: Array) -> Array:
     """e_Omega = Omega - R' R_d Omega_d (3,) [rad/s].  Lee, Leok, McClamroch (2010)."""
-    error: Array = rates - attitude.T @ wanted @ wanted_rates
-    return error
+    return np.asarray(rates - attitude.T @ wanted @ wanted_rates)
 
 
 def unit_derivatives(v: Array, v1: Array, v2: Array) -> tuple[Array, Array, Array]:

@@ -6,14 +6,12 @@ import math
 from dataclasses import dataclass
 from typing import Final
 
-from mpc.baselines.limits import require_positive, require_within
+from mpc.baselines.limits import require_positive
 from quadsim.errors import ParameterError
 from quadsim.vehicle import Vehicle
 
-SEPARATION: Final = 2.0
-"""Bandwidth of each loop over that of the loop around it."""
-YAW_SHARE: Final = 0.4
-"""Bandwidth of heading over that of roll and pitch: about PX4's MC_YAW_P / MC_ROLL_P = 2.8 / 6.5."""
+SEPARATION: Final = 2.0  # bandwidth of each loop over that of the loop around it
+YAW_SHARE: Final = 0.4  # bandwidth of heading over that of roll and pitch: about PX4's MC_YAW_P / MC_ROLL_P = 2.8 / 6.5
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,23 +44,16 @@ def lag_to_allow_for(vehicle: Vehicle, period: float) -> float:
     return max(0.5 * period, vehicle.rotor_rise or 0.0, vehicle.rotor_fall or 0.0)
 
 
-def bandwidths(
-    *, period: float, lag: float, separation: float = SEPARATION, yaw_share: float = YAW_SHARE
-) -> Bandwidths:
-    """Bandwidths of a cascade at a control period.
+def bandwidths(*, period: float, lag: float) -> Bandwidths:
+    """Bandwidths of a cascade at a control period, with rotors and computation that lag [s].
 
-    A held command acts half a period late on average, and the rotors' lag adds to that: theta = period / 2 + lag.  The
+    A held command acts half a period late on average, and the lag adds to that: theta = period / 2 + lag.  The
     innermost loop, an integrator with that dead time, gets the gain 1 / (2 theta) (SIMC, Skogestad, "Simple analytic
     rules for model reduction and PID controller tuning", 2003: time constant and dead time equal).  Each loop outside
-    is slower by `separation`, which is then every characteristic ratio a_i^2 / (a_{i-1} a_{i+1}) of the closed loop's
-    polynomial s^4 + k1 s^3 + k1 k2 s^2 + k1 k2 k3 s + k1 k2 k3 k4; 2 is the damping optimum (Naslin, 1960).  At 50 ms
-    and 25 ms of lag: 10, 5, 2.5 and 1.25 rad/s, where PX4 has 6.5, 1.8 and 0.95 from attitude to position.
-
-    Args:
-        period: [s].
-        lag: besides the sampling, of rotors and of computation [s].
-        separation: > 1.
-        yaw_share: bandwidths of the heading's loops over those of roll and pitch.
+    is slower by `SEPARATION`, which is then every characteristic ratio a_i^2 / (a_{i-1} a_{i+1}) of the closed loop's
+    polynomial s^4 + k1 s^3 + k1 k2 s^2 + k1 k2 k3 s + k1 k2 k3 k4; 2 is the damping optimum (Naslin, 1960).  The
+    heading's loops have the share `YAW_SHARE` of roll's and pitch's.  At 50 ms and 25 ms of lag: 10, 5, 2.5 and 1.25
+    rad/s, where PX4 has 6.5, 1.8 and 0.95 from attitude to position.
 
     Raises:
         ParameterError: a number is out of range.
@@ -70,16 +61,14 @@ def bandwidths(
     require_positive("period", period)
     if not 0.0 <= lag < math.inf:
         raise ParameterError("controller", "lag", lag, "at least 0 and finite")
-    require_within("separation", separation, 1.5, 10.0)
-    require_within("yaw_share", yaw_share, 0.05, 1.0)
     rate = 1.0 / (2.0 * (0.5 * period + lag))
-    attitude = rate / separation
-    velocity = attitude / separation
+    attitude = rate / SEPARATION
+    velocity = attitude / SEPARATION
     return Bandwidths(
         rate=rate,
         attitude=attitude,
-        yaw_rate=yaw_share * rate,
-        yaw=yaw_share * attitude,
+        yaw_rate=YAW_SHARE * rate,
+        yaw=YAW_SHARE * attitude,
         velocity=velocity,
-        position=velocity / separation,
+        position=velocity / SEPARATION,
     )

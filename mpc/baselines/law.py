@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from typing import Final, Protocol
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
@@ -16,43 +16,18 @@ from quadsim.errors import CommandError
 from quadsim.state import STATE_NAMES, Array
 from quadsim.vehicle import Vehicle
 
-
-class LawSettings(Protocol):
-    """What the settings of every law say.
-
-    Attributes:
-        period: tau_s [s].
-        horizon: N, samples of preview; they tell the reference's velocity and acceleration.
-        bounds: what commands are held to; None for the speeds that the rotors hold.
-    """
-
-    @property
-    def period(self) -> float:
-        """See the class."""
-        ...
-
-    @property
-    def horizon(self) -> int:
-        """See the class."""
-        ...
-
-    @property
-    def bounds(self) -> ActuatorBounds | None:
-        """See the class."""
-        ...
+if TYPE_CHECKING:
+    from mpc.baselines.geometric import GeometricSettings
+    from mpc.baselines.lqr import LQRSettings
+    from mpc.baselines.pid import PIDSettings
 
 
 class FeedbackLaw(ABC):
-    """A controller that solves nothing: a subclass says what it commands in the air, `_command`.
-
-    Args:
-        vehicle: the modelled vehicle.
-        settings: see there.
-    """
+    """A controller that solves nothing: a subclass says what it commands in the air, `_command`."""
 
     solver: Final = ""
 
-    def __init__(self, vehicle: Vehicle, settings: LawSettings) -> None:
+    def __init__(self, vehicle: Vehicle, settings: LQRSettings | PIDSettings | GeometricSettings) -> None:
         self.bounds = ActuatorBounds.of_vehicle(vehicle) if settings.bounds is None else settings.bounds
         self.model = hover_model(vehicle, settings.period)
         self.horizon = settings.horizon
@@ -67,14 +42,18 @@ class FeedbackLaw(ABC):
         """The law's command; on the ground the lowest speed, as fast as bounds allow; see `quadsim.controller`.
 
         Raises:
-            CommandError: the state or the reference is not finite.
+            CommandError: the state or the reference is not finite; nothing was commanded, and nothing is remembered.
         """
         before = self._before if now.acting is None else now.acting
         if now.phase in GROUNDED:
             command = stopped(self.bounds.reach(before)[0], self.horizon, now.phase)
             self.reset(command.speeds)
             return command
-        require_finite(now, state, reference)
+        if not np.isfinite(state).all():
+            names = ", ".join(STATE_NAMES[i] for i in np.flatnonzero(~np.isfinite(state)))
+            raise CommandError(f"no command from a measured state whose {names} is not finite", time=now.time)
+        if not np.isfinite(reference).all():
+            raise CommandError("no command from a reference that is not finite", time=now.time)
         command = self._command(now, state, reference, before)
         self._before = command.speeds.copy()
         return command
@@ -92,16 +71,3 @@ class FeedbackLaw(ABC):
         plan = np.tile(self.model.u_bar, (self.horizon, 1))
         plan[0] = speeds
         return Command(speeds=speeds.copy(), plan=plan)
-
-
-def require_finite(now: Moment, state: Array, reference: Array) -> None:
-    """A measurement and a preview that a command can be made from.
-
-    Raises:
-        CommandError: a number is not finite; nothing was commanded, and the controller's memory is as it was.
-    """
-    if not np.isfinite(state).all():
-        names = ", ".join(STATE_NAMES[i] for i in np.flatnonzero(~np.isfinite(state)))
-        raise CommandError(f"no command from a measured state whose {names} is not finite", time=now.time)
-    if not np.isfinite(reference).all():
-        raise CommandError("no command from a reference that is not finite", time=now.time)

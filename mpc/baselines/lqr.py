@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-import scipy.linalg
 
 from mpc.answer import ActuatorBounds
 from mpc.baselines.allocation import allocate, make_allocation
@@ -15,7 +14,7 @@ from mpc.baselines.law import FeedbackLaw
 from mpc.baselines.limits import require_within
 from mpc.baselines.preview import wrapped
 from mpc.heading import turn_horizontally
-from mpc.model import LinearModel
+from mpc.model import LinearModel, lqr
 from mpc.ocp import Objective
 from quadsim.controller import Command, Moment
 from quadsim.errors import ParameterError
@@ -29,8 +28,7 @@ LARGEST_DEVIATIONS: Final = {
 """Deviations that weigh alike, each in its state's unit, and alike with `SPEED_SHARE`; see `bryson_objective`."""
 HORIZONTAL: Final = [INDEX[name] for name in ("x", "vx", "y", "vy")]
 TILT: Final = [INDEX[name] for name in ("roll", "pitch")]
-SPEED_SHARE: Final = 0.05
-"""Deviation of a rotor's speed from hover that weighs as much, as a share of the hover speed."""
+SPEED_SHARE: Final = 0.05  # deviation of a rotor's speed from hover that weighs as much, as a share of the hover speed
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -77,19 +75,17 @@ def lqr_gain(model: LinearModel, objective: Objective) -> Array:
     Raises:
         ParameterError: there is no such gain, as where an unstable state is not weighted.
     """
-    A, B, Q_u = model.A, model.B, objective.Q_u
     Q = objective.C_r.T @ objective.Q_y @ objective.C_r
     try:
-        P = scipy.linalg.solve_discrete_are(A, B, Q, Q_u)
-        K = scipy.linalg.solve(Q_u + B.T @ P @ B, B.T @ P @ A, assume_a="pos")
-        stable = float(np.abs(np.linalg.eigvals(A - B @ K)).max()) < 1.0
+        K = lqr(model.A, model.B, Q, objective.Q_u)
+        stable = float(np.abs(np.linalg.eigvals(model.A - model.B @ K)).max()) < 1.0
     except (np.linalg.LinAlgError, ValueError):
         stable = False
     if not stable:
         rule = "such that every state it leaves free comes to rest: weigh x, y, z and yaw"
         weights = {name: float(weight) for name, weight in zip(STATE_NAMES, Q.diagonal(), strict=True) if weight}
         raise ParameterError("controller", "output_weights", weights, rule)
-    return read_only(np.asarray(K))
+    return read_only(K)
 
 
 class LQR(FeedbackLaw):
@@ -97,10 +93,6 @@ class LQR(FeedbackLaw):
 
     Heading errors count the short way round.  Speeds that leave the bounds are held to them as `allocate` says; thrust,
     roll and pitch torque go before yaw.
-
-    Args:
-        vehicle: the modelled vehicle.
-        settings: see there.
     """
 
     name: Final = "lqr"

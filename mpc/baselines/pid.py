@@ -1,23 +1,30 @@
-"""Cascaded PID, as autopilots fly it."""
+"""Cascaded PID, as autopilots fly it: one loop in the other, position P, velocity PID, attitude P, rate PID, mixer.
+
+The structure is PX4's (PositionControl, AttitudeControl, RateControl); ArduPilot's differs in names.
+"""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
 
 from mpc.answer import ActuatorBounds
-from mpc.baselines.allocation import make_allocation
+from mpc.baselines.allocation import allocate, make_allocation
+from mpc.baselines.attitude import LEAST_LIFT, Motion, attitude_for, limit_force, motion_of, prioritised_error
 from mpc.baselines.bandwidths import Bandwidths, bandwidths, lag_to_allow_for
-from mpc.baselines.cascade import Gains, fly_cascade, fresh_memory, make_body
 from mpc.baselines.law import FeedbackLaw
 from mpc.baselines.limits import require_positive, require_within
-from mpc.baselines.preview import target_of
+from mpc.baselines.preview import Target, target_of
 from quadsim.controller import Command, Moment, Phase
 from quadsim.state import Array
 from quadsim.vehicle import Vehicle
+
+HORIZONTAL_MARGIN: Final = 0.3  # share of the largest thrust that climbing leaves to the sides: PX4's MPC_THR_XY_MARG
+LARGEST_THRUST: Final = 0.85
+"""Share of all rotors' highest thrust that is asked for: PX4's mixer takes back up to 15 % of it for yaw."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,14 +73,7 @@ class PIDSettings:
 
 
 def pid_settings(vehicle: Vehicle, *, period: float, lag: float | None = None, **others: object) -> PIDSettings:
-    """Settings whose gains follow from the period, and the lag [s] to allow for; see `bandwidths`.
-
-    Args:
-        vehicle: the modelled vehicle.
-        period: tau_s [s].
-        lag: of rotors and computation; `lag_to_allow_for` where absent.
-        others: fields of `PIDSettings`.
-    """
+    """Settings whose gains follow from the period and the lag to allow for [s]; `others` are fields of theirs."""
     allowed = lag_to_allow_for(vehicle, period) if lag is None else lag
     speeds = bandwidths(period=period, lag=allowed)
     values: dict[str, object] = {
@@ -84,49 +84,111 @@ def pid_settings(vehicle: Vehicle, *, period: float, lag: float | None = None, *
     return PIDSettings(period=period, bandwidths=speeds, **values)  # type: ignore[arg-type]
 
 
-class CascadedPID(FeedbackLaw):
-    """Position P, velocity PID, attitude P by quaternions, rate PID, mixer; see `mpc.baselines.cascade`.
+@dataclass(frozen=True, kw_only=True)
+class Memory:
+    """What the loops remember from one period to the next."""
 
-    Args:
-        vehicle: the modelled vehicle.
-        settings: see there.
-    """
+    velocity_integral: Array  # (3,) world [m/s^2]
+    rate_integral: Array  # (3,) body [rad/s^2]
+    velocity: Array | None = None  # (3,) measured before, world [m/s]; None in the first period
+    rates: Array | None = None  # (3,) measured before, body [rad/s]; None in the first period
+
+
+class CascadedPID(FeedbackLaw):
+    """Position P, velocity PID, attitude P by quaternions, rate PID, mixer, all normalised by mass and inertia."""
 
     name: Final = "pid"
 
     def __init__(self, vehicle: Vehicle, settings: PIDSettings) -> None:
+        self.settings, self._vehicle, self._inertia = settings, vehicle, np.array(vehicle.inertia)
         super().__init__(vehicle, settings)
-        self.settings = settings
-        self.gains = Gains(
-            bandwidths=settings.bandwidths,
-            velocity_integral=settings.velocity_integral,
-            rate_integral=settings.rate_integral,
-            velocity_derivative=settings.velocity_derivative,
-            rate_derivative=settings.rate_derivative,
-            yaw_weight=settings.yaw_weight,
-            tilt_max=math.radians(settings.tilt_max),
-            velocity_max=settings.velocity_max,
-            rate_max=tuple(np.radians(settings.rate_max).tolist()),
-        )
-        self.body = make_body(vehicle, make_allocation(vehicle), float(self.bounds.u_max.min()))
+        self.allocation = make_allocation(vehicle)
+        highest = float(self.bounds.u_max.min())
+        self._largest = LARGEST_THRUST * 4.0 * vehicle.thrust_coefficient * highest**2  # thrust to command [N]
 
     def reset(self, speeds: Array) -> None:
         """Start anew after the command u(-1) (4,) [rad/s]."""
         super().reset(speeds)
-        self._memory = fresh_memory()
+        self._memory = Memory(velocity_integral=np.zeros(3), rate_integral=np.zeros(3))
 
     def _command(self, now: Moment, state: Array, reference: Array, before: Array) -> Command:
         """One period of all loops, integrals at rest until the vehicle flies."""
-        lower, upper = self.bounds.reach(before)
-        speeds, self._memory = fly_cascade(
-            self.gains,
-            self.body,
-            self._memory,
-            state,
-            target_of(reference, self._operator),
-            lower=lower,
-            upper=upper,
-            period=self.settings.period,
-            integrate=now.phase is Phase.FLYING,
-        )
+        target, reach = target_of(reference, self._operator), self.bounds.reach(before)
+        speeds, after = self.fly(self._memory, state, target, *reach)
+        if now.phase is not Phase.FLYING:
+            held = self._memory
+            after = replace(after, velocity_integral=held.velocity_integral, rate_integral=held.rate_integral)
+        self._memory = after
         return self._held_for_a_period(speeds)
+
+    def fly(self, memory: Memory, state: Array, target: Target, lower: Array, upper: Array) -> tuple[Array, Memory]:
+        """One period of all loops, from a state (12,) and speeds (4,) within reach [rad/s].
+
+        Returns:
+            (4,) rotor speeds [rad/s], and what to remember.
+        """
+        motion, k, inertia, period = motion_of(state), self.settings.bandwidths, self._inertia, self.settings.period
+        force, velocity_integral = self._velocity_loop(memory, motion, target)
+        turning = np.zeros(3) if memory.rates is None else (motion.rates - memory.rates) / period
+        error = self._rates_wanted(motion, force, target) - motion.rates
+        proportional = np.array([k.rate, k.rate, k.yaw_rate])
+        acceleration = proportional * error + memory.rate_integral - self.settings.rate_derivative * turning
+        wrench = np.concatenate([[np.linalg.norm(force)], inertia * acceleration])
+        speeds = allocate(self.allocation, wrench, lower, upper)
+        # What the mixer could not give stops an integral from asking for more of it.
+        missed = acceleration - (self.allocation.M @ np.square(speeds))[1:] / inertia
+        windup = missed * error > 1e-9 * (1.0 + np.abs(acceleration)) * np.abs(error)
+        summed = np.where(windup, 0.0, error)
+        return speeds, Memory(
+            velocity_integral=velocity_integral,
+            rate_integral=memory.rate_integral + period * self.settings.rate_integral * proportional * summed,
+            velocity=motion.velocity,
+            rates=motion.rates,
+        )
+
+    def _velocity_loop(self, memory: Memory, motion: Motion, target: Target) -> tuple[Array, Array]:
+        """The force (3,) to command [N], world, and the velocity integral (3,) [m/s^2] of the next period."""
+        settings, mass, gravity = self.settings, self._vehicle.mass, self._vehicle.gravity
+        period, proportional = settings.period, settings.bandwidths.velocity
+        error = velocity_wanted(settings, motion.position, target) - motion.velocity
+        measured = np.zeros(3) if memory.velocity is None else (motion.velocity - memory.velocity) / period
+        wanted = (
+            target.acceleration
+            + proportional * error
+            + memory.velocity_integral
+            - settings.velocity_derivative * measured
+            + np.array([0.0, 0.0, gravity])
+        )
+        tilt = math.radians(settings.tilt_max)
+        force = force_within(mass * wanted, weight=mass * gravity, largest=self._largest, tilt=tilt)
+        # Tracking anti-windup: the integral is drawn to where it just saturates; PX4's gain, after Rundqwist (1990).
+        error = error - 2.0 / proportional * (wanted - force / mass)
+        integral = memory.velocity_integral + period * settings.velocity_integral * proportional * error
+        return force, np.clip(integral, -gravity, gravity)
+
+    def _rates_wanted(self, motion: Motion, force: Array, target: Target) -> Array:
+        """(3,) body rates to turn at [rad/s], by the attitude loop."""
+        k, limit = self.settings.bandwidths, np.radians(self.settings.rate_max)
+        error = prioritised_error(motion.attitude, attitude_for(force, target.yaw), self.settings.yaw_weight)
+        heading = motion.attitude[2] * target.yaw_rate  # a turn about world z, seen from the body
+        return np.clip(np.array([k.attitude, k.attitude, k.yaw]) * error + heading, -limit, limit)
+
+
+def velocity_wanted(settings: PIDSettings, position: Array, target: Target) -> Array:
+    """(3,) velocity to fly at [m/s]: the target's, and a share of the position error per second, within limits."""
+    wanted = target.velocity + settings.bandwidths.position * (target.position - position)
+    horizontal = math.hypot(wanted[0], wanted[1])
+    wanted[:2] *= min(1.0, settings.velocity_max / max(horizontal, 1e-9))
+    wanted[2] = np.clip(wanted[2], -settings.velocity_max, settings.velocity_max)
+    return wanted
+
+
+def force_within(force: Array, *, weight: float, largest: float, tilt: float) -> Array:
+    """A wanted force (3,) [N], world, as a vehicle can give it within a tilt [rad]: height before horizontal motion."""
+    upright = limit_force(force, least=LEAST_LIFT * weight, tilt=tilt)
+    horizontal = math.hypot(upright[0], upright[1])
+    spared = min(horizontal, HORIZONTAL_MARGIN * largest)
+    upward = min(upright[2], math.sqrt(largest**2 - spared**2))
+    allowed = min(math.sqrt(largest**2 - upward**2), upward * math.tan(tilt))
+    share = 1.0 if horizontal <= allowed else allowed / horizontal
+    return np.array([share * upright[0], share * upright[1], upward])

@@ -11,29 +11,19 @@ import numpy as np
 from quadsim.errors import ParameterError
 from quadsim.state import Array, read_only
 
-SMALLEST_PREVIEW: Final = 3
-"""Samples that a parabola needs."""
+SMALLEST_PREVIEW: Final = 3  # samples that a parabola needs
 
 
 @dataclass(frozen=True, kw_only=True)
 class Target:
-    """What a baseline is to follow at t_k, world frame.
+    """What a baseline is to follow at t_k, world frame."""
 
-    Attributes:
-        position: (3,) [m].
-        velocity: (3,) [m/s].
-        acceleration: (3,) [m/s^2].
-        yaw: [rad].
-        yaw_rate: [rad/s].
-        yaw_acceleration: [rad/s^2].
-    """
-
-    position: Array
-    velocity: Array
-    acceleration: Array
-    yaw: float
-    yaw_rate: float
-    yaw_acceleration: float
+    position: Array  # (3,) [m]
+    velocity: Array  # (3,) [m/s]
+    acceleration: Array  # (3,) [m/s^2]
+    yaw: float  # [rad]
+    yaw_rate: float  # [rad/s]
+    yaw_acceleration: float  # [rad/s^2]
 
 
 def differentiator(samples: int, period: float) -> Array:

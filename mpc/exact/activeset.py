@@ -9,11 +9,17 @@ The multipliers z, positive at upper bounds and negative at lower ones, maximise
     z' G v_free - 1/2 z' S z - sum_i psi_i(z_i),
 
 psi_i(z) = upper_i z for z > 0 and lower_i z for z < 0, to which a soft row of penalty l1 e + l2 e^2 adds
-(|z| - l1)^2 / (4 l2) beyond l1: concave, and quadratic between the kinks.  Maximised over the rows that are active with
-the pieces they are on, which is one linear system; a row whose multiplier would pass a kink stops there and changes its
-piece, a row that is violated joins, the worst first.  Each step raises the dual function, so that the method ends
-(Goldfarb and Idnani, Mathematical Programming 27, 1983, is the same for hard rows).  It starts where the last period's
-active set says, and ends at the optimum itself.
+(|z| - l1)^2 / (4 l2) beyond l1: concave, and quadratic between the kinks.  Where the active rows and the pieces they
+are on are known, its maximum is one linear system.  Two methods find them, one after the other:
+
+1. the primal-dual active set method (Hintermueller, Ito and Kunisch, SIAM J. Optim. 13(3), 2003), a Newton method for
+   the optimality conditions: all rows that break one change at once, a row that is violated more than the same row a
+   step earlier and later standing for its neighbours.  It takes a few steps and may go in circles; then
+2. the dual method of Goldfarb and Idnani (Mathematical Programming 27, 1983), from the set with the fewest wrong rows:
+   a row whose multiplier would pass a kink stops there and changes its piece, a row that is violated joins, the worst
+   first.  Each step raises the dual function, so that the method ends.
+
+Both end at the optimum itself.
 """
 
 from __future__ import annotations
@@ -39,12 +45,19 @@ FEW: Final = 8
 """Wrong rows of a start with which no other one is looked at."""
 ROUNDED: Final = 1e-6
 """Share of l1 by which an approximate multiplier of a violated row may stay below it."""
-AT_ONCE: Final = 2
-"""Steps, the first ones, in which all rows that are wrong change, not the worst alone."""
-MOST_STEPS: Final = 60
+CAREFUL: Final = 4
+"""First steps in which, where most rows are active, only the worst of many with a wrong multiplier leaves."""
+FEW_LEAVING: Final = 3
+"""Rows that are not many."""
+MOST_DEPENDENT: Final = 1
+"""Sets of dependent rows after which the search is given up: it leads from one to the next."""
+MOST_STEPS: Final = 50
+"""Steps of either method."""
 
 Side = NDArray[np.int8]
 """Of each row: 0 where it is inactive, 1 or -1 at its upper or lower bound, 2 or -2 where it is violated."""
+_SIGN: Final = np.array([0.0, 1.0, 1.0, -1.0, -1.0])
+"""Of a `Side`, by which it can be indexed."""
 
 
 class Active(NamedTuple):
@@ -63,6 +76,36 @@ class Active(NamedTuple):
     steps: int
 
 
+class _Trial(NamedTuple):
+    """The maximum of the dual function on given pieces, and what breaks the optimality conditions there.
+
+    Attributes:
+        side: (all rows,) the pieces.
+        active: (k,) rows that have a multiplier.
+        rows: (k, all rows) of S; of the last trial alone.
+        factor: (k, k) lower Cholesky factor of the system.
+        excess: (k,) its right side.
+        z: (k,) its solution.
+        fall: (all rows,) S z.
+        pieces: (k,) that the multipliers would be on.
+        over: (all rows,) violation of inactive rows.
+        wrong: how many rows break the conditions.
+        failed: the first active row that depends on those before it, counted from 1; 0 for none.
+    """
+
+    side: Side
+    active: Indices
+    rows: Array
+    factor: Array
+    excess: Array
+    z: Array
+    fall: Array
+    pieces: Side
+    over: Array
+    wrong: int
+    failed: int
+
+
 class ActiveSet:
     """Finds the multipliers of QPs that differ in their vectors alone.
 
@@ -70,12 +113,18 @@ class ActiveSet:
         S: (rows, rows) G P^-1 G'.
         l1: (rows,) linear penalty; infinite of hard rows.
         l2: (rows,) quadratic penalty of soft rows.
+        channels: rows of one step; the same rows of the next one follow.
     """
 
-    def __init__(self, S: Array, l1: Array, l2: Array) -> None:
-        self._S, self._l1 = np.ascontiguousarray(S), l1
+    def __init__(self, S: Array, l1: Array, l2: Array, channels: int) -> None:
+        self._S, self._l1, self._channels = np.ascontiguousarray(S), l1, channels
         self._soft, self._least_l1 = bool(np.isfinite(l1).any()), float(l1.min(initial=np.inf))
-        self._compliance = 0.5 / np.maximum(l2, LEAST_QUADRATIC * np.maximum(l1, 1.0))
+        compliance = 0.5 / np.maximum(l2, LEAST_QUADRATIC * np.maximum(l1, 1.0))
+        self._compliance = np.where(np.isfinite(l1), compliance, 0.0)
+        self._least, self._most = l1 * (1.0 - ROUNDING), l1 * (1.0 + ROUNDING)
+        self._offset = np.where(np.isfinite(l1), l1, 0.0) * self._compliance
+        self._smallest = DEPENDENT * self._S.diagonal()
+        self._bounds, self._room = np.zeros((5, l1.size)), np.empty_like(self._S)
 
     def solve(
         self, free: Array, lower: Array, upper: Array, starts: Sequence[Side], *, most: int = MOST_STEPS
@@ -86,167 +135,147 @@ class ActiveSet:
             free: (rows,) G v_free.
             lower: (rows,) bounds, below the upper ones; infinite where there is none.
             upper: (rows,) likewise.
-            starts: active sets; the one with the fewest wrong rows is the start.
-            most: steps after which the search is given up.
+            starts: active sets; the first, or one with less than half as many wrong rows, is the start.
+            most: steps of each method after which it is given up.
 
         Returns:
-            None where it was.
+            None where both were.
         """
-        side, z = starts[0], np.zeros_like(free)
-        active = side.nonzero()[0]
-        target = self._optimum(active, side[active], free, lower, upper)
-        fewest = self._wrong(active, target, side, free, lower, upper)
+        bounds = self._bounds
+        np.subtract(free, upper, out=bounds[1])
+        np.subtract(free, lower, out=bounds[-1])
+        if self._soft:
+            np.add(bounds[1], self._offset, out=bounds[2])
+            np.subtract(bounds[-1], self._offset, out=bounds[-2])
+        trial = self._trial(starts[0], bounds)
         for start in starts[1:]:
-            if fewest <= FEW:
+            if trial.wrong <= FEW:
                 break
-            also = start.nonzero()[0]
-            found = self._optimum(also, start[also], free, lower, upper)
-            wrong = self._wrong(also, found, start, free, lower, upper)
-            if wrong < fewest:
-                side, active, target, fewest = start, also, found, wrong
-        side = side.copy()
+            other = self._trial(start, bounds)
+            if 2 * other.wrong < trial.wrong:
+                trial = other
+        best, fewest, seen, dependent = trial.side, trial.wrong, set(), 0
         for step in range(1, most + 1):
-            if step > 1:
-                active = side.nonzero()[0]
-                target = self._optimum(active, side[active], free, lower, upper)
-            if target is None:
-                if not self._release_dependent(z, active, side, free, lower, upper):
-                    return None
+            if not trial.wrong:
+                return self._accepted(trial, free, step)
+            dependent += trial.failed > 0
+            if dependent > MOST_DEPENDENT:
+                return None
+            if trial.wrong < fewest:
+                best, fewest = trial.side, trial.wrong
+            side = self._all_changed(trial, bounds, careful=step <= CAREFUL)
+            if (key := side.tobytes()) in seen:
+                break
+            seen.add(key)
+            trial = self._trial(side, bounds)
+        return self._one_by_one(best.copy(), free, bounds, step, most)
+
+    def _trial(self, side: Side, bounds: Array) -> _Trial:
+        """The maximum of the dual function on the pieces that a side says."""
+        active = side.nonzero()[0]
+        pieces = side[active]
+        rows = self._S.take(active, 0, self._room[: active.size], "clip")  # a mode that takes no copy
+        factor = rows.take(active, 1).T
+        excess, z, failed, violated = bounds[pieces, active], pieces.astype(float), 0, False
+        if active.size:
+            if self._soft and (beyond := (np.abs(pieces) == 2).nonzero()[0]).size:
+                factor[beyond, beyond] += self._compliance[active[beyond]]
+                violated = True
+            factor, z, failed = lapack.dposv(factor, excess, lower=1, overwrite_a=1)
+        if failed:
+            nothing = np.zeros(0)
+            return _Trial(side, active, rows, factor, excess, z, nothing, pieces, nothing, side.size, failed)
+        fall = np.dot(z, rows)
+        over = np.maximum(bounds[1] - fall, fall - bounds[-1])
+        over[active] = 0.0
+        pieces = self._pieces(active, pieces, z, violated=violated)
+        wrong = int(np.count_nonzero(over > FEASIBLE)) + int(np.count_nonzero(pieces != side[active]))
+        return _Trial(side, active, rows, factor, excess, z, fall, pieces, over, wrong, 0)
+
+    def _pieces(self, active: Indices, pieces: Side, z: Array, *, violated: bool) -> Side:
+        """The pieces that multipliers (k,) of active rows would be on, next to those they were taken to be on."""
+        size = z * pieces
+        if not violated and size.max(initial=0.0) <= self._least_l1:
+            return pieces * (size >= 0.0)
+        sign = np.sign(pieces)
+        size, outside = z * sign, pieces != sign
+        beyond = size > np.where(outside, self._least[active], self._most[active])
+        return sign * (outside | (size >= 0.0)) * (1 + beyond)
+
+    def _all_changed(self, trial: _Trial, bounds: Array, *, careful: bool) -> Side:
+        """The pieces with all that is wrong changed, but for violated rows next to one that is violated more.
+
+        Between active rows one too many makes the others' multipliers alternate in sign: then it is released alone.
+        """
+        side = trial.side.copy()
+        if trial.failed:
+            side[trial.active[trial.failed - 1]] = 0
+            return side
+        side[trial.active] = trial.pieces
+        dense = 2 * trial.active.size > side.size
+        if careful and dense and (leaving := (trial.pieces == 0).nonzero()[0]).size > FEW_LEAVING:
+            stay = np.delete(leaving, np.abs(trial.z[leaving]).argmax())
+            side[trial.active[stay]] = trial.side[trial.active[stay]]
+        over, later = trial.over, self._channels
+        joining = over > FEASIBLE
+        joining[later:] &= over[later:] >= over[:-later]
+        joining[:-later] &= over[:-later] >= over[later:]
+        rows = joining.nonzero()[0]
+        side[rows] = 2 * (bounds[1].take(rows) > trial.fall.take(rows)) - 1
+        return side
+
+    def _one_by_one(self, side: Side, free: Array, bounds: Array, before: int, most: int) -> Active | None:
+        """The multipliers by the dual method, from an active set, which is changed; None where it is given up."""
+        z = np.zeros_like(free)
+        for step in range(before + 1, before + most + 1):
+            trial = self._trial(side, bounds)
+            active = trial.active
+            if step == before + 1:  # the first multipliers are those next to their pieces' maximum
+                sign, violated, l1 = np.sign(side[active]), np.abs(side[active]) == 2, self._l1[active]
+                size = np.clip(sign * trial.z, np.where(violated, l1, 0.0), np.where(violated, np.inf, l1))
+                z[active], side[active] = sign * size, trial.pieces
+                if (z[active] != trial.z).any():
+                    continue
+            if trial.failed:
+                return None
+            stops = (trial.pieces != side[active]).nonzero()[0]
+            if stops.size:  # as far as all stay on their pieces
+                rows = active[stops]
+                kink = np.where(trial.pieces[stops] == 0, 0.0, np.sign(side[rows]) * self._l1[rows])
+                way = (trial.z - z[active])[stops]
+                share = np.maximum((kink - z[rows]) / np.where(way == 0.0, np.inf, way), 0.0)
+                least = share.min()
+                z[active] += least * (trial.z - z[active])
+                first = share <= least
+                z[rows[first]], side[rows[first]] = kink[first], trial.pieces[stops[first]]
                 continue
-            if step == 1:
-                z[active] = np.where(target * side[active] > 0.0, target, 0.0)
-            if self._stop_at_kinks(z, target, active, side, at_once=step <= AT_ONCE):
-                continue
-            z[active] = target
-            values = free - target @ self._S[active]
-            if not self._join(values, lower, upper, side, at_once=step <= AT_ONCE):
-                return self._accepted(active, side, free, lower, upper, step)
+            if not trial.wrong:
+                return self._accepted(trial, free, step)
+            z[active] = trial.z
+            worst = int(trial.over.argmax())
+            side[worst] = 1 if bounds[1, worst] > trial.fall[worst] else -1
         return None
 
-    def _accepted(
-        self, active: Indices, side: Side, free: Array, lower: Array, upper: Array, steps: int
-    ) -> Active | None:
-        """The optimum of the right active set, as exact as can be; None where rows are too nearly dependent."""
-        target = self._refined(active, side[active], free, lower, upper)
-        if target is None:
-            return None
-        z = np.zeros_like(free)
-        z[active] = target
-        values = free - target @ self._S[active]
-        bound = np.where(side[active] > 0, upper[active], lower[active])
-        apart = np.abs(values[active] - bound)[np.abs(side[active]) == 1]
-        return None if (apart > FEASIBLE).any() else Active(z=z, values=values, side=side, steps=steps)
+    def _accepted(self, trial: _Trial, free: Array, steps: int) -> Active | None:
+        """The optimum of the right active set, refined once; None where rows are too nearly dependent."""
+        active, z, fall = trial.active, np.zeros(free.size), trial.fall
+        if active.size:
+            if (trial.factor.diagonal() ** 2 < self._smallest[active]).any():
+                return None
+            left = trial.excess - fall[active]
+            if self._soft:
+                violated = np.abs(trial.pieces) == 2
+                left -= violated * self._compliance[active] * trial.z
+            refined = trial.z + lapack.dpotrs(trial.factor, left, lower=1)[0]
+            fall = np.dot(refined, trial.rows)
+            apart = np.abs(trial.excess - fall[active])
+            if not (apart[~violated] if self._soft else apart).max(initial=0.0) <= FEASIBLE:
+                return None
+            z[active] = refined
+        return Active(z=z, values=free - fall, side=trial.side, steps=steps)
 
     def near(self, z: Array, free: Array, lower: Array, upper: Array) -> Side:
         """The active set that approximate multipliers (rows,) tell of: those that outweigh the distance to a bound."""
         values, reach = free - self._S @ z, z * self._S.diagonal()
         side = (reach > upper - values).astype(np.int8) - (-reach > values - lower)
         return np.where(np.abs(z) > (1.0 - ROUNDED) * self._l1, 2 * side, side).astype(np.int8) if self._soft else side
-
-    def _optimum(self, active: Indices, side: Side, free: Array, lower: Array, upper: Array) -> Array | None:
-        """The multipliers of active rows, on the pieces of psi that they are on; None where rows are dependent."""
-        if not active.size:
-            return np.zeros(0)
-        K, excess = self._system(active, side, free, lower, upper)
-        _, target, failed = lapack.dposv(K, excess, lower=1)
-        return None if failed else np.asarray(target)
-
-    def _system(self, active: Indices, side: Side, free: Array, lower: Array, upper: Array) -> tuple[Array, Array]:
-        """K z = excess of active rows, on the pieces of psi that they are on."""
-        K = self._S.take(active, axis=0).take(active, axis=1)
-        excess = free[active] - np.where(side > 0, upper[active], lower[active])
-        if self._soft:
-            (violated,) = (np.abs(side) == 2).nonzero()
-            rows = active[violated]
-            K[violated, violated] += self._compliance[rows]
-            excess[violated] += np.sign(side[violated]) * self._l1[rows] * self._compliance[rows]
-        return K, excess
-
-    def _refined(self, active: Indices, side: Side, free: Array, lower: Array, upper: Array) -> Array | None:
-        """The optimum with a step of iterative refinement; None where rows are too nearly dependent."""
-        if not active.size:
-            return np.zeros(0)
-        K, excess = self._system(active, side, free, lower, upper)
-        factor, target, failed = lapack.dposv(K, excess)
-        if failed or (factor.diagonal() ** 2 < DEPENDENT * K.diagonal()).any():
-            return None
-        return np.asarray(target + lapack.dpotrs(factor, excess - K @ target)[0])
-
-    def _release_dependent(
-        self, z: Array, active: Indices, side: Side, free: Array, lower: Array, upper: Array
-    ) -> bool:
-        """Where active rows are dependent, move along what that leaves open until one stops; whether one did.
-
-        The dual function is linear along it.  If none stops, no point satisfies all rows.
-        """
-        K, excess = self._system(active, side[active], free, lower, upper)
-        factor, failed = lapack.dpotrf(K)
-        if not failed:
-            return False
-        k = failed - 1  # depends on those before it
-        direction = np.zeros(active.size)
-        direction[k] = 1.0
-        if k:  # before a row of nothing there may be none
-            direction[:k] = -lapack.dpotrs(factor[:k, :k], K[:k, k])[0]
-        if direction @ excess < 0.0:
-            direction = -direction
-        sign, here = np.sign(side[active]), z[active]
-        inwards = sign * direction < -ROUNDING * np.abs(direction).max()
-        share = np.full(active.size, np.inf)
-        share[inwards] = (sign * here)[inwards] / -(sign * direction)[inwards]
-        first = int(share.argmin())
-        if not np.isfinite(share[first]):
-            return False
-        z[active] = here + share[first] * direction
-        z[active[first]] = 0.0
-        side[active[first]] = 0
-        return True
-
-    def _stop_at_kinks(self, z: Array, target: Array, active: Indices, side: Side, *, at_once: bool) -> bool:
-        """Move multipliers to the target, as far as all stay on their pieces; whether some did not."""
-        pieces = side[active]
-        sign, here = np.sign(pieces), z[active]
-        size = sign * target
-        stops = leaving = size < 0.0
-        kink = np.zeros_like(target)
-        if self._soft and (size.max(initial=0.0) > self._least_l1 or (pieces != sign).any()):
-            l1, violated = self._l1[active], pieces != sign
-            beyond = np.where(violated, l1 - size, size - l1) > ROUNDING * l1
-            leaving = leaving & ~violated
-            kink[beyond] = (sign * l1)[beyond]
-            stops = leaving | beyond
-        if not stops.any():
-            return False
-        if at_once:
-            z[active] = np.where(stops, kink, target)
-        else:
-            share = np.ones_like(target)
-            way = (target - here)[stops]
-            share[stops] = np.maximum((kink - here)[stops] / np.where(way == 0.0, np.inf, way), 0.0)
-            least = share.min()
-            stops = stops & (share <= least)
-            z[active] = np.where(stops, kink, here + least * (target - here))
-        left, changed = active[stops & leaving], active[stops & ~leaving]
-        side[left] = 0
-        side[changed] = np.where(np.abs(side[changed]) == 1, 2 * side[changed], side[changed] // 2)
-        return True
-
-    def _join(self, values: Array, lower: Array, upper: Array, side: Side, *, at_once: bool) -> bool:
-        """Make violated rows active; whether there were some."""
-        above, below = values - upper, lower - values
-        over = np.where(side == 0, np.maximum(above, below), 0.0)
-        worst = int(over.argmax())
-        if not over[worst] > FEASIBLE:
-            return False
-        rows = (over > FEASIBLE).nonzero()[0] if at_once else np.array([worst])
-        side[rows] = np.where(above[rows] > below[rows], 1, -1)
-        return True
-
-    def _wrong(self, active: Indices, target: Array | None, side: Side, free: Array, lower: Array, upper: Array) -> int:
-        """How many rows have a multiplier of the wrong sign at the optimum of an active set, or would have to join."""
-        if target is None:
-            return free.size
-        values = free - target @ self._S[active]
-        outside = (values - upper > FEASIBLE) | (lower - values > FEASIBLE)
-        outside[active] = target * side[active] < 0.0
-        return int(np.count_nonzero(outside))

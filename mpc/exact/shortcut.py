@@ -27,8 +27,6 @@ Flags = NDArray[np.bool_]
 LARGEST_MAP: Final = 2**20
 """Entries beyond which there is no shortcut: 8 MiB, as much as a core's caches hold.  50 steps of the paper's problem
 have 16 k entries, 400 steps 970 k."""
-MOST_STEPS: Final = {"axes": 50, "all": 30}
-"""Steps of the active set method after which the whole QP's solver takes over: it is as fast."""
 
 
 class Shortcut:
@@ -69,6 +67,8 @@ class Shortcut:
         self._later = channels[of_states], np.flatnonzero(of_states)
         self._now = channels[~of_states], np.flatnonzero(~of_states)
         self._lower, self._upper = rows.lower.ravel(), rows.upper.ravel()
+        endless = np.isinf(rows.lower) + 2 * np.isinf(rows.upper)
+        self._uneven = bool((endless != endless[0]).any())  # some steps have bounds that others lack
         self._steps, self._values = np.empty((N, nu)), np.empty(rows.lower.shape)
         self._side: Side = np.zeros(rows.lower.size, np.int8)
         self._no_slacks = read_only(np.zeros((N, rows.soft.size)))
@@ -128,7 +128,7 @@ class Shortcut:
             found, settled = self._by_axes(plan, free, within, u_before, starts)
             way = Way.WHOLE if found is None else Way.AXES
             if found is None and settled and self._all is not None:
-                found = self._all.solve(plan, free, self._lower, self._upper, starts, most=MOST_STEPS["all"])
+                found = self._all.solve(plan, free, starts)
             if found is not None:
                 self._side = found.active.side
                 return self._answer(found, way, started)
@@ -147,35 +147,39 @@ class Shortcut:
         """The last active set moved one step earlier, and as it was."""
         moved, m = np.zeros_like(self._side), self._rows.l1.size
         moved[:-m] = self._side[m:]
+        if self._uneven:
+            moved[np.isinf(np.where(moved > 0, self._upper, self._lower))] = 0
         return [moved, self._side]
 
     def _by_axes(
         self, plan: Array, free: Array, within: Flags, u_before: Array, starts: list[Side]
     ) -> tuple[_Found | None, bool]:
         """The optimum with active rows of states alone, if it satisfies all others; and whether it was found at all."""
-        z, side, values, steps = np.zeros_like(free), np.zeros_like(self._side), free.copy(), 0
+        z, side, values, steps = np.zeros(free.size), np.zeros_like(self._side), free.copy(), 0
         for group in self._groups:
             own = group.rows
             if within[own].all():
                 continue
-            found = group.solve(plan, values, self._lower, self._upper, starts, most=MOST_STEPS["axes"])
+            found = group.solve(plan, values, starts)
             if found is None:
                 return None, False
             plan, steps = found.plan, steps + found.active.steps
             z[own], side[own], values[own] = found.active.z, found.active.side, found.active.values
         inputs = self._values_of_inputs(plan, u_before)
-        values = np.where(self._of_inputs_alone, inputs, values.reshape(inputs.shape)).ravel()
+        np.copyto(values.reshape(inputs.shape), inputs, where=self._of_inputs_alone)
         beyond = np.maximum(values - self._upper, self._lower - values)
-        if not ((beyond <= FEASIBLE) | (np.abs(side) == 2)).all():
+        if self._no_slacks.size:
+            beyond[np.abs(side) == 2] = 0.0
+        if not beyond[beyond.argmax()] <= FEASIBLE:
             return None, True
         return _Found(plan, Active(z=z, values=values, side=side, steps=steps)), True
 
     def _answer(self, found: _Found, way: Way, started: float) -> Answer:
-        slacks, soft = self._no_slacks, self._rows.soft
-        if (np.abs(found.active.side) == 2).any():
+        slacks = self._no_slacks
+        if slacks.size and (violated := np.abs(found.active.side) == 2).any():
             values, shape = found.active.values, self._rows.lower.shape
             beyond = np.maximum(np.maximum(values - self._upper, self._lower - values), 0.0)
-            slacks = np.where(np.abs(found.active.side) == 2, beyond, 0.0).reshape(shape)[:, soft]
+            slacks = (violated * beyond).reshape(shape)[:, self._rows.soft]
         solution = self._solution(found.plan, found.active, started, SOLVED, slacks)
         return Answer(plan=found.plan, slacks=slacks, solution=solution, way=way)
 
@@ -183,7 +187,7 @@ class Shortcut:
         self, plan: Array, active: Active, started: float, status: str, slacks: Array | None = None
     ) -> Solution:
         blank = Solution(
-            x=np.append(plan, self._no_slacks) if self._no_slacks.size else plan.ravel(),
+            x=np.append(plan, self._no_slacks) if slacks is None and self._no_slacks.size else plan.ravel(),
             y=self._no_equalities,
             z=self._no_rows,
             z_box=self._no_box,
@@ -212,9 +216,9 @@ class Shortcut:
             return replace(answer, solution=solution)
         multipliers = self._whole.formulation.multipliers(given)
         if self._all is not None:
-            near = self._all.near(multipliers.ravel(), free, self._lower, self._upper)
+            near = self._all.near(multipliers.ravel(), free)
             self._side = near
-            found = self._all.solve(plan, free, self._lower, self._upper, [near], most=MOST_STEPS["all"])
+            found = self._all.solve(plan, free, [near])
             if found is not None:
                 self._side = found.active.side
                 answer = self._answer(found, Way.WHOLE, started)
@@ -255,23 +259,22 @@ class _Group:
         self.rows, self._T = rows, T.T
         self._R = np.ascontiguousarray(scipy.linalg.solve_triangular(factor, half, lower=True, trans="T").T)
         l1, l2 = (np.tile(penalty, problem.horizon) for penalty in (part.l1, part.l2))
-        self._set = ActiveSet(half.T @ half, l1, l2)
+        self._lower, self._upper = part.lower.ravel(), part.upper.ravel()
+        self._set = ActiveSet(half.T @ half, l1, l2, part.l1.size)
 
-    def solve(
-        self, plan: Array, free: Array, lower: Array, upper: Array, starts: list[Side], *, most: int
-    ) -> _Found | None:
-        """The optimum over these rows alone, from one without them; of vectors and sides of all rows."""
+    def solve(self, plan: Array, free: Array, starts: list[Side]) -> _Found | None:
+        """The optimum over these rows alone, from one without them; of values and sides of all rows."""
         own = self.rows
-        found = self._set.solve(free[own], lower[own], upper[own], [side[own] for side in starts], most=most)
+        found = self._set.solve(free[own], self._lower, self._upper, [side[own] for side in starts])
         if found is None:
             return None
         active = found.z.nonzero()[0]
-        change = (found.z[active] @ self._R[active]).reshape(len(plan), -1)
-        return _Found(plan - change @ self._T, found)
+        change = np.dot(found.z[active], self._R.take(active, 0)).reshape(len(plan), -1)
+        return _Found(plan - np.dot(change, self._T), found)
 
-    def near(self, z: Array, free: Array, lower: Array, upper: Array) -> Side:
-        """The active set that approximate multipliers tell of; see `ActiveSet.near`."""
-        return self._set.near(z, free, lower, upper)
+    def near(self, z: Array, free: Array) -> Side:
+        """The active set that approximate multipliers of all rows tell of; see `ActiveSet.near`."""
+        return self._set.near(z, free, self._lower, self._upper)
 
 
 def with_shortcut(problem: Problem, whole: Solver) -> Solver:

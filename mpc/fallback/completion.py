@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mpc.equilibrium import Trim
-from mpc.fallback.hover import require_quadrotor
+from mpc.fallback.hover import by_group, require_quadrotor
 from mpc.heading import advance, turn
 from mpc.model import LinearModel
 from quadsim.controller import Moment
@@ -45,35 +45,21 @@ _ANGLES, _RATES = _GROUPS[2:]
 _TURNING: Final = np.array(EULER + EULER_RATE)
 
 
-def _by_group(values: tuple[float, float, float, float]) -> Array:
-    """(12,) one value for position, velocity, angles and their rates each."""
-    channels = np.empty(N_STATES)
-    for group, value in zip(_GROUPS, values, strict=True):
-        channels[group] = value
-    return read_only(channels)
-
-
-PLAUSIBLE: Final = _by_group((1e5, 1e3, 1e5, 1e3))
+PLAUSIBLE: Final = by_group(1e5, 1e3, 1e5, 1e3)
 """Largest magnitudes taken for a measurement [m, m/s, rad, rad/s]; a yaw counts its turns."""
-UNMOVED: Final = _by_group((1e-3, 5e-3, 1e-3, 2e-2))
+UNMOVED: Final = by_group(1e-3, 5e-3, 1e-3, 2e-2)
 """Distance of the prediction from repeated numbers beyond which these count as frozen [same]."""
-NOISE: Final = _by_group((0.01, 0.02, 0.005, 0.02))
-"""Standard deviations ascribed to measured channels [same]."""
-ACCELERATION: Final = (1.0, 2.0)
-"""Standard deviations of unmodelled accelerations [m/s^2, rad/s^2]."""
-UNKNOWN: Final = _by_group((100.0, 10.0, 1.0, 1.0))
+NOISE: Final = by_group(0.01, 0.02, 0.005, 0.02)  # standard deviations ascribed to measured channels [same]
+ACCELERATION: Final = (1.0, 2.0)  # standard deviations of unmodelled accelerations [m/s^2, rad/s^2]
+UNKNOWN: Final = by_group(100.0, 10.0, 1.0, 1.0)
 """Standard deviations before anything was measured [m, m/s, rad, rad/s]."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class CompletedMoment(Moment):
-    """A moment whose state may in part be predicted rather than measured.
+    """A moment whose state may in part be predicted rather than measured."""
 
-    Attributes:
-        unseen: (12,) periods since each channel was measured; 0 for one that is.
-    """
-
-    unseen: Array
+    unseen: Array  # (12,) periods since each channel was measured; 0 for one that is
 
 
 class StateCompletion:
@@ -81,9 +67,6 @@ class StateCompletion:
 
     Attributes:
         unseen: (12,) periods since each channel was last measured; infinite before it ever was.
-
-    Args:
-        model: see `mpc.model.hover_model`.
 
     Raises:
         ParameterError: the model is not a quadrotor's.

@@ -20,7 +20,7 @@ from __future__ import annotations
 
 import math
 import re
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Final
 
 import numpy as np
@@ -41,19 +41,10 @@ from quadsim.vehicle import N_ROTORS
 
 FAILURES: Final[tuple[type[Exception], ...]] = (FlightError, np.linalg.LinAlgError, ArithmeticError, RuntimeError)
 """What numerics and compiled back ends raise.  A programmer's mistakes (`TypeError`, `KeyError`, ...) end the run."""
-_MISTAKES: Final = (NotImplementedError, RecursionError)
-"""Kinds of `RuntimeError` that are a programmer's, too."""
+_MISTAKES: Final = (NotImplementedError, RecursionError)  # kinds of `RuntimeError` that are a programmer's, too
 
 
 _USUAL: Final = FallbackSettings()
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Good:
-    """The last accepted answer, and the state (12,) it was found for."""
-
-    state: Array
-    plan: Array
 
 
 class Guarded:
@@ -63,16 +54,14 @@ class Guarded:
     commands pass unchanged.
 
     Attributes:
-        inner: the controller asked first.
+        inner: the controller asked first, through the protocol alone.
         law: what levels 1 to 3 are made of.
 
     Args:
-        inner: reached through the protocol alone; one that falls back by itself does no harm, as only its accepted
-            answers are used.
+        inner: one that falls back by itself does no harm, as only its accepted answers are used.
         model: the hover model of the control period; see `mpc.model.hover_model`.
         bounds: hard bounds that every command keeps.
         settings: when the next level takes over.
-        failures: exceptions of the inner controller that count as a failed period; their names become its status.
 
     Raises:
         ParameterError: the model is not a quadrotor's.
@@ -85,33 +74,17 @@ class Guarded:
         *,
         bounds: ActuatorBounds,
         settings: FallbackSettings = _USUAL,
-        failures: tuple[type[Exception], ...] = FAILURES,
     ) -> None:
-        self.inner = inner
+        self.inner, self.name, self.solver, self.horizon = inner, inner.name, inner.solver, inner.horizon
         self.law = HoverLaw(model, tilt=math.radians(USUAL_TILT if settings.tilt is None else settings.tilt))
-        self._model, self._bounds, self._settings, self._failures = model, bounds, settings, failures
+        self._model, self._bounds, self._settings = model, bounds, settings
         self._distance = settings.distance
         self._completion = StateCompletion(model)
         self._level = Trim(speeds=model.u_bar, lift=np.array([0.0, 0.0, 1.0]))
-        self._good: _Good | None
+        self._good: tuple[Array, Array] | None  # the state (12,) of the last accepted answer, and its plan (N, 4)
         self._foreseen: Array | None
         self._target: Array | None
         self.reset(model.u_bar)
-
-    @property
-    def name(self) -> str:
-        """Name of the law inside."""
-        return self.inner.name
-
-    @property
-    def solver(self) -> str:
-        """Name of the QP solver."""
-        return self.inner.solver
-
-    @property
-    def horizon(self) -> int:
-        """N, samples of preview."""
-        return self.inner.horizon
 
     def reset(self, speeds: Array) -> None:
         """Start anew after the command u(-1) (4,) [rad/s]."""
@@ -124,8 +97,8 @@ class Guarded:
     def step(self, now: Moment, state: Array, reference: Array) -> Command:
         """The first level's command that can be had; see `quadsim.controller.Controller.step`.
 
-        Whatever becomes of the inner controller, this raises none of its `failures`.  While grounded, rotors are taken
-        to their lowest speed as fast as the bounds allow.
+        Whatever becomes of the inner controller, this raises none of its `FAILURES`, whose names become the status.
+        While grounded, rotors are taken to their lowest speed as fast as the bounds allow.
         """
         acting = self._before if now.acting is None or check_command(now.acting) is not None else now.acting
         known = self._completion.complete(state, acting, self.trim, free=now.phase is Phase.FLYING)
@@ -139,7 +112,7 @@ class Guarded:
         else:
             self._forget()
             command = self._accept(answer, acting)
-            self._good = _Good(state=known, plan=command.plan)
+            self._good = known, command.plan
         self._before = command.speeds.copy()
         return command
 
@@ -148,8 +121,9 @@ class Guarded:
         """The equilibrium that the inner controller estimates; level hover where it has none."""
         try:
             trim = getattr(self.inner, "trim", None)
-        except self._failures as error:
-            _raise_mistake(error)
+        except _MISTAKES:
+            raise
+        except FAILURES:
             trim = None
         return trim if isinstance(trim, Trim) else self._level
 
@@ -163,11 +137,12 @@ class Guarded:
         """See `quadsim.controller.Controller.predict`; by the hover model where the inner controller cannot."""
         try:
             predicted = self.inner.predict(states, plans)
-        except self._failures as error:
-            _raise_mistake(error)
-        else:
-            if np.shape(predicted) == (*plans.shape[:2], N_STATES):
-                return predicted
+        except _MISTAKES:
+            raise
+        except FAILURES:
+            predicted = np.empty(0)
+        if np.shape(predicted) == (*plans.shape[:2], N_STATES):
+            return predicted
         return predict_in_heading_frame(anchored(self._model, self.trim), states, plans, self.trim)
 
     def _forget(self) -> None:
@@ -185,8 +160,9 @@ class Guarded:
             return "invalid_reference", None
         try:
             answer = self.inner.step(now, known.copy(), reference)
-        except self._failures as error:
-            _raise_mistake(error)
+        except _MISTAKES:
+            raise
+        except FAILURES as error:
             return _snake_case(type(error).__name__), None
         if answer.status in ACCEPTED and (
             np.shape(answer.speeds) != (N_ROTORS,) or np.shape(answer.plan) != (self.horizon, N_ROTORS)
@@ -210,17 +186,17 @@ class Guarded:
 
     def _shifted(self, known: Array, acting: Array, *, lost: bool) -> Array | None:
         """What is left of the last good plan (N, 4), corrected now; None once it is of no use, and then for good."""
-        good, age = self._good, self._age
-        if good is None:
+        if self._good is None:
             return None
+        (state, plan), age = self._good, self._age
         if self._foreseen is None:
-            self._foreseen = self.predict(good.state[None], good.plan[None])[0]
+            self._foreseen = self.predict(state[None], plan[None])[0]
         deviation = known - self._foreseen[min(age, self.horizon) - 1]  # row i is of the state i + 1 periods later
         old = age >= self.horizon or age * self._model.period > self._settings.plan_age + 1e-9
         if lost or old or not (np.abs(deviation) <= self._distance).all():
             self._good = None
             return None
-        plan = shifted(good.plan, age)
+        plan = shifted(plan, age)
         plan[0] += self.law.correction(deviation, float(known[INDEX["yaw"]]))
         return self._bounds.clip_plan(plan, acting)
 
@@ -241,12 +217,6 @@ class Guarded:
         self._hovered += 1
         plan = self.law.plan(known, self._target, acting, self._bounds, self.horizon, self.trim)
         return plan, 3 if sinking else 2
-
-
-def _raise_mistake(error: Exception) -> None:
-    """Let a programmer's mistake through."""
-    if isinstance(error, _MISTAKES):
-        raise error
 
 
 def _snake_case(name: str) -> str:

@@ -19,38 +19,37 @@ import math
 from typing import Final
 
 import numpy as np
-import scipy.linalg
 
 from mpc.answer import ActuatorBounds
 from mpc.equilibrium import Trim
 from mpc.heading import anchored, slope, turn_horizontally
-from mpc.model import LinearModel
+from mpc.model import LinearModel, lqr
 from quadsim.errors import ParameterError
 from quadsim.state import EULER, EULER_RATE, INDEX, N_STATES, POSITION, VELOCITY, Array, read_only
 from quadsim.vehicle import N_ROTORS
 
-ACCEPTABLE_POSITION: Final = 0.5
-"""[m]"""
-ACCEPTABLE_VELOCITY: Final = 1.0
-"""[m/s]"""
-ACCEPTABLE_TILT: Final = 0.2
-"""[rad], yaw as well."""
-ACCEPTABLE_RATE: Final = 1.0
-"""[rad/s]"""
-ACCEPTABLE_ACCELERATION: Final = (2.0, 8.0, 8.0, 2.0)
-"""Along z [m/s^2], about x, y and z [rad/s^2]."""
+ACCEPTABLE_ACCELERATION: Final = (2.0, 8.0, 8.0, 2.0)  # along z [m/s^2], about x, y and z [rad/s^2]
 LARGEST_CLIMB: Final = 2.0
 """Acceleration along z [m/s^2], beside what rest takes, beyond which height does not pull: rotors keep the range that
 levels the vehicle."""
-LARGEST_TURN: Final = 2.0
-"""The same of yaw [rad/s^2]."""
+LARGEST_TURN: Final = 2.0  # the same of yaw [rad/s^2]
 
 _POSITION: Final = list(POSITION)
 _VELOCITY: Final = list(VELOCITY)
 _SIDEWAYS: Final = [INDEX[name] for name in ("x", "vx", "y", "vy")]
 _TILTS: Final = [INDEX["roll"], INDEX["pitch"]]
-_ROLL_PITCH: Final = [1, 2]
-"""Rows of an acceleration (4,)."""
+_ROLL_PITCH: Final = [1, 2]  # rows of an acceleration (4,)
+
+
+def by_group(position: float, velocity: float, angle: float, rate: float) -> Array:
+    """(12,) one value for positions, velocities, Euler angles and their rates each."""
+    channels = np.empty(N_STATES)
+    for group, value in ((POSITION, position), (VELOCITY, velocity), (EULER, angle), (EULER_RATE, rate)):
+        channels[list(group)] = value
+    return read_only(channels)
+
+
+ACCEPTABLE: Final = by_group(0.5, 1.0, 0.2, 1.0)  # [m], [m/s], [rad], yaw as well, [rad/s]
 
 
 def require_quadrotor(model: LinearModel) -> None:
@@ -73,10 +72,6 @@ class HoverLaw:
         slope: (4, 4) S; see `mpc.heading.slope`.
         tilt: largest roll and pitch asked for together [rad].
 
-    Args:
-        model: see `mpc.model.hover_model`.
-        tilt: [rad].
-
     Raises:
         ParameterError: the model is not a quadrotor's, or the tilt is not between 0 and 90 deg.
     """
@@ -88,27 +83,16 @@ class HoverLaw:
         self.model, self.tilt = model, tilt
         self.slope = read_only(slope(model))
         self._inverse = np.linalg.inv(self.slope)
-        acceptable = np.empty(N_STATES)
-        for group, size in (
-            (POSITION, ACCEPTABLE_POSITION),
-            (VELOCITY, ACCEPTABLE_VELOCITY),
-            (EULER, ACCEPTABLE_TILT),
-            (EULER_RATE, ACCEPTABLE_RATE),
-        ):
-            acceptable[list(group)] = size
         pushed = model.B @ self._inverse  # xi(k+1) = A xi(k) + pushed acceleration
-        Q, R = np.diag(acceptable**-2.0), np.diag(np.array(ACCEPTABLE_ACCELERATION) ** -2.0)
-        P = scipy.linalg.solve_discrete_are(model.A, pushed, Q, R)
-        self.gain = read_only(np.linalg.solve(R + pushed.T @ P @ pushed, pushed.T @ P @ model.A))
+        Q, R = np.diag(ACCEPTABLE**-2.0), np.diag(np.array(ACCEPTABLE_ACCELERATION) ** -2.0)
+        self.gain = read_only(lqr(model.A, pushed, Q, R))
         rows = self.gain[_ROLL_PITCH]
         self._lean = np.linalg.solve(rows[:, _TILTS], rows[:, _SIDEWAYS])
 
     def correction(self, error: Array, yaw: float) -> Array:
         """What to add to the rotor speeds (4,) [rad/s] to come closer to a state that the vehicle moves through.
 
-        Args:
-            error: (12,) measured minus wanted state.
-            yaw: measured [rad].
+        The error (12,) is the measured minus the wanted state, the yaw the measured one [rad].
         """
         return self._inverse @ self._acceleration(turn_horizontally(error, np.array(-yaw)), np.zeros(2))
 

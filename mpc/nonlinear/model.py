@@ -36,27 +36,16 @@ def _nothing() -> Array:
 
 @dataclass(frozen=True, kw_only=True)
 class NonlinearModel:
-    """x(k+1) = f(x(k), u(k)); see the module.  Another disturbance is a matter of `dataclasses.replace`.
+    """x(k+1) = f(x(k), u(k)); see the module.  Another disturbance is a matter of `dataclasses.replace`."""
 
-    Attributes:
-        effectiveness: (4, 4) takes squared rotor speeds to U / m [m/s^2] and I^-1 tau [rad/s^2].
-        gyration: (3,) of (Iyy - Izz) / Ixx, (Izz - Ixx) / Iyy, (Ixx - Iyy) / Izz.
-        gravity: g [m/s^2].
-        period: tau_s [s].
-        substeps: Runge-Kutta steps per period.
-        rotor_lag: time constant tau_r of the rotor speeds [s]; None for speeds that are the inputs.
-        acceleration: (3,) a of the disturbance, world frame [m/s^2].
-        angular_acceleration: (3,) alpha of the disturbance, body frame [rad/s^2].
-    """
-
-    effectiveness: Array
-    gyration: Array
-    gravity: float
-    period: float
-    substeps: int = SUBSTEPS
-    rotor_lag: float | None = None
-    acceleration: Array = field(default_factory=_nothing)
-    angular_acceleration: Array = field(default_factory=_nothing)
+    effectiveness: Array  # (4, 4) takes squared rotor speeds to U / m [m/s^2] and I^-1 tau [rad/s^2]
+    gyration: Array  # (3,) of (Iyy - Izz) / Ixx, (Izz - Ixx) / Iyy, (Ixx - Iyy) / Izz
+    gravity: float  # g [m/s^2]
+    period: float  # tau_s [s]
+    substeps: int = SUBSTEPS  # Runge-Kutta steps per period
+    rotor_lag: float | None = None  # time constant tau_r of the rotor speeds [s]; None for speeds that are the inputs
+    acceleration: Array = field(default_factory=_nothing)  # (3,) a of the disturbance, world frame [m/s^2]
+    angular_acceleration: Array = field(default_factory=_nothing)  # (3,) alpha of the disturbance, body frame [rad/s^2]
 
     def __post_init__(self) -> None:
         if not 0.0 < self.period < math.inf:
@@ -75,22 +64,11 @@ class NonlinearModel:
         """Number of states."""
         return N_STATES if self.rotor_lag is None else N_STATES + N_ROTORS
 
-    @property
-    def nu(self) -> int:
-        """Number of inputs."""
-        return N_ROTORS
-
 
 def nonlinear_model(
     vehicle: Vehicle, period: float, *, substeps: int = SUBSTEPS, rotor_lag: float | None = None
 ) -> NonlinearModel:
-    """The vehicle's model, undisturbed.
-
-    Args:
-        vehicle: the numbers.
-        period: control period tau_s [s].
-        substeps: Runge-Kutta steps per period.
-        rotor_lag: time constant of the rotor speeds [s]; None for none.
+    """The vehicle's model, undisturbed; see `NonlinearModel`.
 
     Raises:
         ParameterError: a number is not possible.
@@ -126,23 +104,14 @@ def advance(model: NonlinearModel, x: Array, u: Array) -> Array:
 
 @dataclass(frozen=True, kw_only=True)
 class Passage:
-    """One period's integration, with the K = 4 `substeps` instants in it at which the model was evaluated.
+    """One period's integration, with the K = 4 `substeps` instants in it at which the model was evaluated."""
 
-    Attributes:
-        end: (..., n) states at the end.
-        euler: (K, 3, ...) Euler angles at those instants [rad].
-        euler_rate: (K, 3, ...) their rates [rad/s].
-        drive: (K, 4, ...) U / m [m/s^2] and I^-1 tau [rad/s^2].
-        speeds: (K, 4, ...) rotor speeds [rad/s].
-        decay: (K,) share of the first rotor speeds still in these, 0 without lag.
-    """
-
-    end: Array
-    euler: Array
-    euler_rate: Array
-    drive: Array
-    speeds: Array
-    decay: Array
+    end: Array  # (..., n) states at the end
+    euler: Array  # (K, 3, ...) Euler angles at those instants [rad]
+    euler_rate: Array  # (K, 3, ...) their rates [rad/s]
+    drive: Array  # (K, 4, ...) U / m [m/s^2] and I^-1 tau [rad/s^2]
+    speeds: Array  # (K, 4, ...) rotor speeds [rad/s]
+    decay: Array  # (K,) share of the first rotor speeds still in these, 0 without lag
 
 
 def integrate(model: NonlinearModel, x: Array, u: Array) -> Passage:
@@ -184,16 +153,10 @@ def integrate(model: NonlinearModel, x: Array, u: Array) -> Passage:
 
 
 def accelerations(model: NonlinearModel, euler: Array, euler_rate: Array, drive: Array) -> Array:
-    """(6, ...) d2(p)/dt2 [m/s^2] and d2(eta)/dt2 [rad/s^2].
+    """(6, ...) d2(p)/dt2 [m/s^2] and d2(eta)/dt2 [rad/s^2], of eta and its rate (3, ...) and of U/m, I^-1 tau (4, ...).
 
     With a, b, c the rates of roll, pitch and yaw, E^-1 dE/dt d(eta)/dt is (-b c cos - sin(pitch) l / cos, a c cos,
     -l / cos), where l = b (a + c sin(pitch)) and cos is that of pitch.
-
-    Args:
-        model: the model.
-        euler: (3, ...) eta [rad].
-        euler_rate: (3, ...) its rate [rad/s].
-        drive: (4, ...) U / m and I^-1 tau.
     """
     (sr, sp, sy), (cr, cp, cy) = np.sin(euler), np.cos(euler)
     a, b, c = euler_rate

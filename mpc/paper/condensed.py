@@ -15,8 +15,8 @@ from mpc.constraints import Rows
 from mpc.ocp import Problem, Rest
 from mpc.paper.cost import cost
 from mpc.paper.prediction import Prediction, prediction
-from mpc.qp import QP, QPRows, Solution, Vectors, qp_rows
-from quadsim.state import Array
+from mpc.qp import QP, QPRows, Solution, Vectors
+from quadsim.state import Array, Indices
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -24,18 +24,12 @@ class CondensedCost:
     """J = 1/2 v' H v + [F_x dx + F_y dy + F_d du]' v + const, for deviations from a rest state (x_s, u_s).
 
     With v = u - u_s the sequence of inputs, dx = x(k) - x_s, dy = y_d - C_r x_s and du = u(k-1) - u_s.
-
-    Attributes:
-        H: (N nu, N nu) symmetric positive definite.  Eq. (7).
-        F_x: (N nu, n).  Eq. (8).
-        F_y: (N nu, N n_r).  Eq. (9).
-        F_d: (N nu, nu), zero without a weight of changes.
     """
 
-    H: Array
-    F_x: Array
-    F_y: Array
-    F_d: Array
+    H: Array  # (N nu, N nu) symmetric positive definite. Eq. (7)
+    F_x: Array  # (N nu, n). Eq. (8)
+    F_y: Array  # (N nu, N n_r). Eq. (9)
+    F_d: Array  # (N nu, nu), zero without a weight of changes
 
 
 def condensed_cost(problem: Problem, maps: Prediction) -> CondensedCost:
@@ -57,15 +51,10 @@ def condensed_cost(problem: Problem, maps: Prediction) -> CondensedCost:
 
 @dataclass(frozen=True, kw_only=True)
 class RowMaps:
-    """Values (N, m) of rows: of_inputs v + of_state dx + of_rest, the first of them less E du.
+    """Values (N, m) of rows: of_inputs v + of_state dx + of_rest, the first of them less E du."""
 
-    Attributes:
-        of_inputs: (N, m, N nu) slopes in v = u - u_s.
-        of_state: (N, m, n) in dx = x(k) - x_s.
-    """
-
-    of_inputs: Array
-    of_state: Array
+    of_inputs: Array  # (N, m, N nu) slopes in v = u - u_s
+    of_state: Array  # (N, m, n) in dx = x(k) - x_s
 
 
 def row_maps(rows: Rows | QPRows, maps: Prediction) -> RowMaps:
@@ -88,9 +77,6 @@ def row_maps(rows: Rows | QPRows, maps: Prediction) -> RowMaps:
 class Condensed:
     """min 1/2 x' P x + c' x over x = [u(k); ...; u(k+N-1); e], e (N, m_s) the slacks of soft rows.
 
-    Args:
-        problem: with constraints.
-
     Attributes:
         qp: H, the rows time by time, and the box; vectors for xi(k) and y_d zero and u(k-1) = u_bar.
 
@@ -99,7 +85,7 @@ class Condensed:
     """
 
     def __init__(self, problem: Problem) -> None:
-        self._problem, self._rows = problem, qp_rows(problem)
+        self._problem, self._rows = problem, QPRows(problem)
         model, N, nu = problem.model, problem.horizon, problem.model.nu
         self._maps = prediction(model, N)
         self._cost, self._values = condensed_cost(problem, self._maps), row_maps(self._rows, self._maps)
@@ -125,6 +111,7 @@ class Condensed:
             h_u=np.zeros(rows.lower.size),
             x_l=np.concatenate([rows.u_min.ravel(), np.zeros(N * m_s)]),
             x_u=np.concatenate([rows.u_max.ravel(), np.full(N * m_s, np.inf)]),
+            later=_one_step_later([nu, m_s, len(rows.C)], N),
         )
         nothing = np.zeros((N, problem.objective.C_r.shape[0]))
         self.qp = self._blank.with_vectors(self.vectors(np.zeros(model.n), nothing, model.u_bar))
@@ -154,21 +141,27 @@ class Condensed:
         return self._rows.multipliers(solution.z, solution.z_box[: self._inputs])
 
     def solution(self, like: Solution, plan: Array, slacks: Array, multipliers: Array) -> Solution:
-        """A solution of this QP, of which the primal point and the rows' multipliers (N, m) are known.
+        """This QP's solution of a plan (N, nu), slacks (N, m_s), rows' multipliers (N, m) and what else `like` says.
 
-        Args:
-            like: what else it says.
-            plan: (N, nu).
-            slacks: (N, m_s).
-            multipliers: (N, m), positive at upper bounds and negative at lower ones.
+        Multipliers are positive at upper bounds and negative at lower ones.
         """
-        z, z_inputs = self._rows.split(multipliers)
-        soft = self._problem.rows.soft
-        l1, l2 = self._problem.rows.l1[soft], self._problem.rows.l2[soft]
-        # Stationarity of a slack: l1 + 2 l2 e - |z| + z_box = 0.
-        z_slacks = np.minimum(np.abs(multipliers[:, soft]) - l1 - 2.0 * l2 * slacks, 0.0)
-        x = np.concatenate([plan.ravel(), slacks.ravel()])
-        return replace(like, x=x, y=self._blank.b, z=z, z_box=np.concatenate([z_inputs, z_slacks.ravel()]))
+        (z, z_box), x, soft = self._rows.split(multipliers), plan.ravel(), self._problem.rows.soft
+        if soft.size:
+            l1, l2 = self._problem.rows.l1[soft], self._problem.rows.l2[soft]
+            # Stationarity of a slack: l1 + 2 l2 e - |z| + z_box = 0.
+            z_slacks = np.minimum(np.abs(multipliers[:, soft]) - l1 - 2.0 * l2 * slacks, 0.0)
+            x, z_box = np.append(x, slacks), np.append(z_box, z_slacks)
+        return replace(like, x=x, y=self._blank.b, z=z, z_box=z_box)
+
+
+def _one_step_later(sizes: list[int], N: int) -> Indices:
+    """See `mpc.qp.QP.later`, of blocks that have so many entries for each of N steps."""
+    found, start = [], 0
+    for size in sizes:
+        own = start + np.arange(N * size)
+        found.append(np.concatenate([own[size:], own[-size:] if size else own]))
+        start += own.size
+    return np.concatenate(found)
 
 
 def condensed(problem: Problem) -> Condensed:

@@ -16,25 +16,16 @@ class Inequalities:
     """A_ineq u <= G1 xi(k) + G2 u(k-1) + G3 + G4 u_bar, and u_min <= u <= u_max.
 
     Rows in the paper's order: output upper, output lower (N n_c each), slew upper, slew lower (N nu each).
-
-    Attributes:
-        A_ineq: (2 N n_c + 2 N nu, N nu).  Eqs. (14), (16), (18).
-        G1: (rows, n).  Eqs. (14), (18).
-        G2: (rows, nu).  Eqs. (16), (19).
-        G3: (rows,).  Eqs. (14), (16), (19).
-        G4: (rows, nu), absent from the paper: +-C_c Psi_i applied to u = u_bar, the offset of the linearisation.
-        u_min, u_max: (N nu,) input bounds [rad/s].  Eq. (20).
-        n_outputs: N n_c, the length of the first two groups of rows.
     """
 
-    A_ineq: Array
-    G1: Array
-    G2: Array
-    G3: Array
-    G4: Array
-    u_min: Array
-    u_max: Array
-    n_outputs: int
+    A_ineq: Array  # (2 N n_c + 2 N nu, N nu). Eqs. (14), (16), (18)
+    G1: Array  # (rows, n). Eqs. (14), (18)
+    G2: Array  # (rows, nu). Eqs. (16), (19)
+    G3: Array  # (rows,). Eqs. (14), (16), (19)
+    G4: Array  # (rows, nu), absent from the paper: +-C_c Psi_i applied to u = u_bar, the offset of the linearisation
+    u_min: Array  # (N nu,) input bounds [rad/s]. Eq. (20)
+    u_max: Array  # likewise
+    n_outputs: int  # N n_c, the length of the first two groups of rows
 
     def right_side(self, state: Array, u_before: Array, u_bar: Array) -> Array:
         """B_ineq(k) (rows,) of Eq. (29)."""

@@ -13,22 +13,14 @@ from quadsim.state import Array
 
 @dataclass(frozen=True, kw_only=True)
 class Cost:
-    """J(u) = 1/2 u' H u + [F1 xi(k) + F2 y_d + (F3 + F4) u_bar]' u + const, u = [u(k); ...; u(k+N-1)].
+    """J(u) = 1/2 u' H u + [F1 xi(k) + F2 y_d + (F3 + F4) u_bar]' u + const, u = [u(k); ...; u(k+N-1)]."""
 
-    Attributes:
-        H: (N nu, N nu) symmetric positive definite.  Eq. (7).
-        F1: (N nu, n).  Eq. (8).
-        F2: (N nu, N n_r), for the stacked desired outputs.  Eq. (9).
-        F3: (N nu, nu) = -2 sum Pi_i' Q_u.  Eq. (10) prints it with a plus, which would regulate u to -u_bar.
-        F4: (N nu, nu), absent from the paper: the offset of the linearisation, -2 sum Psi_i' C_r' Q_y C_r Psi_i
-            applied to u = u_bar throughout.  H [I; ...; I] = -(F3 + F4), so that at hover on the reference the
-            optimum is u_bar.
-    """
-
-    H: Array
-    F1: Array
-    F2: Array
-    F3: Array
+    H: Array  # (N nu, N nu) symmetric positive definite. Eq. (7)
+    F1: Array  # (N nu, n). Eq. (8)
+    F2: Array  # (N nu, N n_r), for the stacked desired outputs. Eq. (9)
+    F3: Array  # (N nu, nu) = -2 sum Pi_i' Q_u. Eq. (10) prints it with a plus, which would regulate u to -u_bar
+    # (N nu, nu), absent from the paper: the offset of the linearisation, -2 sum Psi_i' C_r' Q_y C_r Psi_i applied to u
+    # = u_bar throughout. H [I; ...; I] = -(F3 + F4), so that at hover on the reference the optimum is u_bar
     F4: Array
 
     def gradient(self, state: Array, desired: Array, u_bar: Array) -> Array:

@@ -15,14 +15,10 @@ class Prediction:
     """Stacked future states [xi(k+1); ...; xi(k+N)] = Phi xi(k) + Psi (u - u_bar).
 
     The paper's Phi_i and Psi_i are the i-th block rows; its selections Pi_i are the block columns themselves.
-
-    Attributes:
-        Phi: (N n, n).
-        Psi: (N n, N nu), block lower triangular.
     """
 
-    Phi: Array
-    Psi: Array
+    Phi: Array  # (N n, n)
+    Psi: Array  # (N n, N nu), block lower triangular
 
 
 def prediction(model: LinearModel, horizon: int) -> Prediction:
@@ -42,16 +38,7 @@ def prediction(model: LinearModel, horizon: int) -> Prediction:
 
 
 def rollout(model: LinearModel, states: Array, plans: Array) -> Array:
-    """Predicted states of many plans at once, by recursion rather than by Phi and Psi.
-
-    Args:
-        model: the linear model.
-        states: (K, n) states to start from.
-        plans: (K, N, nu) inputs.
-
-    Returns:
-        (K, N, n) states xi(k+1) .. xi(k+N).
-    """
+    """States (K, N, n) xi(k+1) .. xi(k+N) from states (K, n) under plans (K, N, nu), by recursion."""
     predicted = np.empty((*plans.shape[:2], model.n))
     state = states
     for i in range(plans.shape[1]):

@@ -18,7 +18,7 @@ from typing import Final
 
 import numpy as np
 
-from mpc.answer import ActuatorBounds, rejection, shifted
+from mpc.answer import ActuatorBounds, command_of, rejection, shifted
 from mpc.constraints import Bounds, Constraint
 from mpc.equilibrium import Trim, equilibrium, twisted
 from mpc.exact.shortcut import with_shortcut
@@ -35,24 +35,21 @@ from mpc.model import LinearModel, continuous_model, discretise, hover_model
 from mpc.nonlinear.linearise import linearise
 from mpc.nonlinear.model import NonlinearModel, advance, nonlinear_model, spun
 from mpc.ocp import Objective, Problem, Query, Rest, Unanswered, lqr_terminal_weight
-from mpc.qp import Solution
 from mpc.robust.observer import DisturbanceObserver, thrust_axis
 from mpc.robust.observer import ObserverSettings as ObserverSettings
 from mpc.robust.relinearised import Relinearised
 from mpc.robust.settings import Linearisation as Linearisation
 from mpc.robust.settings import RobustSettings as RobustSettings
 from mpc.solvers import INVALID_DATA, Answer, QPSolver
-from quadsim.controller import ACCEPTED, GROUNDED, Command, Moment, Phase, stopped
+from quadsim.controller import GROUNDED, Command, Moment, Phase, stopped
 from quadsim.errors import ParameterError
 from quadsim.state import EULER, EULER_RATE, INDEX, N_STATES, REFERENCE_STATES, VELOCITY, Array
 from quadsim.vehicle import N_ROTORS, Vehicle
 
-SOLVER: Final = "piqp-multistage"
-"""Solves what the shortcuts leave."""
+SOLVER: Final = "piqp-multistage"  # solves what the shortcuts leave
 LONGEST_SPAN: Final = 0.25
 """Longest time between two measured states [s] for their difference to tell of a disturbance; a sensor of 4 Hz."""
-_SAME_TIME: Final = 1e-6
-"""[s]"""
+_SAME_TIME: Final = 1e-6  # [s]
 _YAW: Final = INDEX["yaw"]
 _MOVING: Final = [*VELOCITY, *EULER, *EULER_RATE]
 _REFERENCE: Final = list(REFERENCE_STATES)
@@ -62,22 +59,12 @@ class RobustMPC:
     """One optimum per period; see the module.
 
     It holds no earlier plan: where nothing is solved, the status says so, with the command in force, for
-    `mpc.fallback.contract.Guarded` to act on.
+    `mpc.fallback.contract.Guarded` to act on.  Objective, bounds and constraints are for the paper's 12 states.
 
     Attributes:
         problem: the optimisation, its states perhaps with the rotor speeds.
         trim: what holds the vehicle at rest against the disturbance that is estimated.
         unanswered: the first period since `reset` whose QP had no answer; None where all had.
-
-    Args:
-        vehicle: the modelled vehicle.
-        period: control period tau_s [s].
-        horizon: N.
-        objective: for the paper's 12 states.
-        bounds: likewise.
-        settings: the parts.
-        constraints: others, likewise.
-        shortcut: whether to try less than the whole QP first, see `mpc.exact.shortcut`, with the hover model.
 
     Raises:
         ParameterError: a number or a shape is not possible.
@@ -180,17 +167,16 @@ class RobustMPC:
             self._ahead = x0
         query = self._query(np.concatenate([x0, self._rotors])[: self._model.n], self._later(reference))
         answer = self._solve(query)
-        solution = answer.solution
-        problem = rejection(solution.status, answer.plan[0], answer.plan, self._actuators, self._acting)
+        problem = rejection(answer.solution.status, answer.plan[0], answer.plan, self._actuators, self._acting)
         if problem is not None:
             if problem != INVALID_DATA and self.unanswered is None:
                 self.unanswered = Unanswered(
                     problem=self.problem, query=query, status=problem, time=now.time, delay=self.settings.delay
                 )
-            return self._refuse(problem, solution)
+            return self._refuse(problem, answer)
         plan = answer.plan.copy()
         self._acting = plan[0] = self._actuators.clip(plan[0], self._acting)
-        return _command(plan, solution.status, solution, float(np.max(answer.slacks, initial=0.0)))
+        return command_of(plan[0], plan, answer.solution.status, answer)
 
     def predict(self, states: Array, plans: Array) -> Array:
         """See `quadsim.controller.Controller.predict`.
@@ -247,12 +233,12 @@ class RobustMPC:
         self._forget()
         return stopped(self._acting.copy(), self.horizon, phase)
 
-    def _refuse(self, status: str, solution: Solution | None = None) -> Command:
+    def _refuse(self, status: str, answer: Answer | None = None) -> Command:
         """The command in force, with what speaks against another."""
         plan = np.tile(self._acting, (self.horizon, 1))
-        if solution is None:
+        if answer is None:
             return Command(speeds=plan[0].copy(), plan=plan, status=status)
-        return _command(plan, status, solution)
+        return command_of(plan[0], plan, status, answer)
 
     def _after(self, time: float, state: Array, rotors: Array) -> Array:
         """State (12,) some time [s] after a state (12,) with such rotor speeds (4,), under the command in force."""
@@ -294,8 +280,7 @@ class RobustMPC:
         """(4,) speeds at rest [rad/s] that also balance what thrust twists now, which the hover matrices leave out."""
         thrust = self._model.effectiveness[0]
         excess = thrust @ np.square(self._rotors) - thrust @ np.square(self.trim.speeds)
-        balanced: Array = self.trim.speeds - self._inverse[:, 1:] @ (excess * self.trim.twist)
-        return balanced
+        return np.asarray(self.trim.speeds - self._inverse[:, 1:] @ (excess * self.trim.twist))
 
     def _along_plan(self, x0: Array) -> tuple[Array, Array, Array]:
         """A (N, n, n), B (N, n, 4), c (N, n) of the predicted steps."""
@@ -310,20 +295,6 @@ class RobustMPC:
         along[:, _YAW] += math.tau * round((x0[_YAW] - along[0, _YAW]) / math.tau)
         along[0] = x0
         return linearise(model, along, shifted(plan, 1))
-
-
-def _command(plan: Array, status: str, solution: Solution, slack: float = 0.0) -> Command:
-    return Command(
-        speeds=plan[0].copy(),
-        plan=plan,
-        status=status,
-        iterations=solution.iterations,
-        active=solution.active if status in ACCEPTED else 0,
-        slack=slack,
-        primal_residual=solution.primal_residual,
-        dual_residual=solution.dual_residual,
-        solve_s=solution.solve_s,
-    )
 
 
 def _widened(matrix: Array, n: int) -> Array:

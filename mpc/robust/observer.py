@@ -60,11 +60,7 @@ class ObserverSettings:
 def observer_gain(period: float, *, noise: float, walk: float, change: float) -> tuple[float, float]:
     """Gains (of v, of d) of the steady-state Kalman filter of one pair, on the surprise in v.
 
-    Args:
-        period: tau_s [s].
-        noise: standard deviation of what is measured.
-        walk: of w_v.
-        change: of w_d.
+    Standard deviations are of what is measured (`noise`), of w_v (`walk`) and of w_d (`change`).
     """
     A, C = np.array([[1.0, period], [0.0, 1.0]]), np.array([[1.0, 0.0]])
     P = scipy.linalg.solve_discrete_are(A.T, C.T, np.diag([walk**2, change**2]), np.array([[noise**2]]))

@@ -8,7 +8,7 @@ import numpy as np
 
 from mpc.ocp import Problem, Rest
 from mpc.solvers import Answer, refusal
-from mpc.solvers.piqp_sparse import PiqpChanging
+from mpc.solvers.piqp_backends import PiqpChanging
 from mpc.staged import Staged
 from quadsim.controller import SOLVED
 from quadsim.state import Array
@@ -34,19 +34,10 @@ class Relinearised:
         self.last: tuple[Array, Array] | None = None
 
     def solve(self, A: Array, B: Array, c: Array, x0: Array, desired: Array, u_before: Array, u_rest: Array) -> Answer:
-        """Solve one period's QP.
+        """Solve one period's QP, of A_i (N, n, n), B_i (N, n, nu), c_i (N, n); x0 is x(k), u_rest u_s [rad/s].
 
         Data that is not finite, or beyond `LARGEST`, is answered with the status `invalid_data`: PIQP cannot be trusted
         to notice.
-
-        Args:
-            A: (N, n, n), A_i.
-            B: (N, n, nu), B_i.
-            c: (N, n), c_i.
-            x0: (n,) x(k).
-            desired: (N, n_r) y_d for x(k+1) .. x(k+N).
-            u_before: (nu,) u(k-1) [rad/s].
-            u_rest: (nu,) u_s [rad/s].
         """
         form = self._form
         self.last = None

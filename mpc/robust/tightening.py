@@ -35,25 +35,21 @@ import scipy.linalg
 from annotated_types import doc
 
 from mpc.constraints import Bounds
-from mpc.model import continuous_model, discretise
+from mpc.model import continuous_model, discretise, lqr
 from quadsim.errors import ParameterError
 from quadsim.fields import NonNegative
 from quadsim.state import INDEX, N_STATES, Array, read_only
 from quadsim.vehicle import Vehicle
 
-LARGEST_SHARE: Final = 0.5
-"""Of the room on either side of the middle of an output's bounds, no more is given up."""
-ERROR_SHARE: Final = 0.1
-"""Output error, as a share of that room, to which the correction answers..."""
+LARGEST_SHARE: Final = 0.5  # of the room on either side of the middle of an output's bounds, no more is given up
+ERROR_SHARE: Final = 0.1  # output error, as a share of that room, to which the correction answers...
 SPEED_SHARE: Final = 0.025
 """...with about this share of the hover speed (Bryson's rule; Bryson and Ho, 1975, "Applied Optimal Control")."""
-SHORTEST_LAG: Final = 1e-4
-"""Time constant of rotors [s] below which gains cannot be computed; far below any period."""
+SHORTEST_LAG: Final = 1e-4  # time constant of rotors [s] below which gains cannot be computed; far below any period
 
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(16)
 _ACCELERATED: Final = [INDEX[name] for name in ("vx", "vy", "vz", "roll_rate", "pitch_rate", "yaw_rate")]
-_TURNS: Final = np.array([0.0, 0.0, 0.0, 1.0, 1.0, 1.0])
-"""Which of them are angular."""
+_TURNS: Final = np.array([0.0, 0.0, 0.0, 1.0, 1.0, 1.0])  # which of them are angular
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -153,17 +149,9 @@ def between_samples(acceleration: float, period: float) -> float:
 def growth(
     A: Array, B: Array, C: Array, E: Array, K: Array, *, period: float, horizon: int, delay: float = 0.0
 ) -> Array:
-    """r_1 .. r_N (N, n_c) of dx/dt = A x + B u + E w, |w| <= 1 in each component, u = -K x(k) held; see the module.
+    """r_1 .. r_N (N, n_c) of dx/dt = A x + B u + E w, |w| <= 1 in each component, u = -K x(k) held, outputs C x.
 
-    Args:
-        A: (n, n).
-        B: (n, nu).
-        C: (n_c, n).
-        E: (n, n_w).
-        K: (nu, n).
-        period: tau [s].
-        horizon: N.
-        delay: d [s].
+    Period tau and delay d [s]; see the module.
     """
     A_d, B_d = discretise(A, B, period)
     closed = A_d - B_d @ K
@@ -202,9 +190,7 @@ def observed(A: Array, C: Array) -> Array:
 
 def correction(A: Array, B: Array, C: Array, size: float) -> Array:
     """K (nu, n) of the discrete LQR that weighs outputs C x against inputs over `size`."""
-    Q, R = C.T @ C, np.eye(B.shape[1]) / size**2
-    P = scipy.linalg.solve_discrete_are(A, B, Q, R)
-    return np.asarray(np.linalg.solve(R + B.T @ P @ B, B.T @ P @ A))
+    return lqr(A, B, C.T @ C, np.eye(B.shape[1]) / size**2)
 
 
 def _absolute_integral(A: Array, C: Array, E: Array, start: float, stop: float) -> Array:

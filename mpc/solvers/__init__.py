@@ -6,6 +6,7 @@ import importlib
 import importlib.metadata
 import importlib.util
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from enum import StrEnum
 from functools import partial
@@ -15,36 +16,26 @@ import numpy as np
 
 from mpc.ocp import Problem, Rest
 from mpc.paper.condensed import Condensed
-from mpc.qp import QP, Backend, Formulation, FormulationBuilder, Solution
+from mpc.qp import QP, Backend, Formulation, Solution
 from mpc.staged import Staged
 from quadsim.errors import MissingPackageError, UnknownNameError
 from quadsim.state import Array
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class SolverEntry:
-    """How a named solver is made, and one line about it.
+    """How a named solver is made, and one line about it."""
 
-    Attributes:
-        formulate: builds the form of the problem that the back end takes.
-        backend: `module:class` of the back end, imported when it is first used.
-        package: distribution that it needs, for its version.
-        module: what that distribution is imported as.
-        description: one line.
-        extra: the extra of this project that installs the package; empty for one that is always there.
-    """
-
-    formulate: FormulationBuilder
-    backend: str
-    package: str
-    module: str
-    description: str
-    extra: str = "solvers"
+    formulate: Callable[[Problem], Formulation]  # builds the form of the problem that the back end takes
+    backend: str  # `module:class` of the back end in this folder, imported when it is first used
+    package: str  # distribution that it needs, and what it is imported as
+    description: str  # one line
+    extra: str = "solvers"  # the extra of this project that installs the package; empty for one that is always there
 
     @property
     def installed(self) -> bool:
         """Whether the package is there; importing it is left for later."""
-        return importlib.util.find_spec(self.module) is not None
+        return importlib.util.find_spec(self.package) is not None
 
     @property
     def version(self) -> str:
@@ -57,80 +48,53 @@ class SolverEntry:
         return self.description if self.installed else f"not installed: pip install 'quadsim[{self.extra}]'"
 
 
-SOLVERS: Final[dict[str, SolverEntry]] = {
+SOLVERS: Final = {
     "piqp-multistage": SolverEntry(
-        formulate=Staged,
-        backend="mpc.solvers.piqp_sparse:PiqpMultistage",
-        package="piqp",
-        module="piqp",
-        description="PIQP, multistage, partially condensed (default)",
-        extra="",
+        Staged, "piqp_backends:PiqpMultistage", "piqp", "PIQP, multistage, partially condensed (default)", extra=""
     ),
     "piqp-multistage-1": SolverEntry(
-        formulate=partial(Staged, steps_per_stage=1),
-        backend="mpc.solvers.piqp_sparse:PiqpMultistage",
-        package="piqp",
-        module="piqp",
-        description="PIQP, multistage, one stage per step",
+        partial(Staged, steps_per_stage=1),
+        "piqp_backends:PiqpMultistage",
+        "piqp",
+        "PIQP, multistage, one stage per step",
         extra="",
     ),
     "piqp-dense": SolverEntry(
-        formulate=Condensed,
-        backend="mpc.solvers.piqp_dense:PiqpDense",
-        package="piqp",
-        module="piqp",
-        description="PIQP, dense Cholesky, on the paper's condensed matrices",
+        Condensed,
+        "piqp_backends:PiqpDense",
+        "piqp",
+        "PIQP, dense Cholesky, on the paper's condensed matrices",
         extra="",
     ),
     "daqp": SolverEntry(
-        formulate=Condensed,
-        backend="mpc.solvers.daqp_dense:DaqpDense",
-        package="daqp",
-        module="daqp",
-        description="DAQP, dual active set, condensed, warm-started",
-        extra="daqp",
+        Condensed, "daqp_dense:DaqpDense", "daqp", "DAQP, dual active set, condensed, warm-started", extra="daqp"
     ),
     "osqp": SolverEntry(
-        formulate=Condensed,
-        backend="mpc.solvers.osqp_sparse:OsqpSparse",
-        package="osqp",
-        module="osqp",
-        description="OSQP, operator splitting, condensed, warm-started",
+        Condensed, "osqp_sparse:OsqpSparse", "osqp", "OSQP, operator splitting, condensed, warm-started"
     ),
     "clarabel": SolverEntry(
-        formulate=Staged,
-        backend="mpc.solvers.clarabel_sparse:ClarabelSparse",
-        package="clarabel",
-        module="clarabel",
-        description="Clarabel, interior point, partially condensed",
+        Staged, "clarabel_sparse:ClarabelSparse", "clarabel", "Clarabel, interior point, partially condensed"
     ),
     "proxqp": SolverEntry(
-        formulate=Condensed,
-        backend="mpc.solvers.proxqp_dense:ProxqpDense",
-        package="proxsuite",
-        module="proxsuite",
-        description="ProxQP, proximal augmented Lagrangian, dense, condensed",
+        Condensed, "proxqp_dense:ProxqpDense", "proxsuite", "ProxQP, proximal augmented Lagrangian, dense, condensed"
     ),
     "quadprog": SolverEntry(
-        formulate=Condensed,
-        backend="mpc.solvers.quadprog_dense:QuadprogDense",
-        package="quadprog",
-        module="quadprog",
-        description="quadprog, Goldfarb and Idnani's dual active set, condensed",
+        Condensed,
+        "quadprog_dense:QuadprogDense",
+        "quadprog",
+        "quadprog, Goldfarb and Idnani's dual active set, condensed",
     ),
     "highs": SolverEntry(
-        formulate=Condensed,
-        backend="mpc.solvers.highs_sparse:HighsSparse",
-        package="highspy",
-        module="highspy",
-        description="HiGHS, active set, condensed; fails on most of the paper's QPs",
+        Condensed,
+        "highs_sparse:HighsSparse",
+        "highspy",
+        "HiGHS, active set, condensed; fails on most of the paper's QPs",
     ),
     "qpoases": SolverEntry(
-        formulate=Condensed,
-        backend="mpc.solvers.qpoases_dense:QpoasesDense",
-        package="casadi",
-        module="casadi",
-        description="qpOASES through CasADi, the paper's own solver, condensed, warm-started",
+        Condensed,
+        "qpoases_dense:QpoasesDense",
+        "casadi",
+        "qpOASES through CasADi, the paper's own solver, condensed, warm-started",
     ),
 }
 
@@ -152,7 +116,7 @@ def make_backend(name: str) -> Backend:
     if not entry.installed:
         raise MissingPackageError(f"the solver {name!r}", entry.package, extra=entry.extra)
     module, _, kind = entry.backend.partition(":")
-    backend: Backend = getattr(importlib.import_module(module), kind)()
+    backend: Backend = getattr(importlib.import_module(f"{__name__}.{module}"), kind)()
     return backend
 
 
@@ -166,19 +130,12 @@ class Way(StrEnum):
 
 @dataclass(frozen=True, kw_only=True)
 class Answer:
-    """An optimum as a plan.
+    """An optimum as a plan."""
 
-    Attributes:
-        plan: (N, nu) inputs [rad/s]; to be used only when the solution's status is accepted.
-        slacks: (N, m_s) by how much soft rows are violated.
-        solution: to the QP of the solver's formulation.
-        way: how it was found.
-    """
-
-    plan: Array
-    slacks: Array
-    solution: Solution
-    way: Way = Way.WHOLE
+    plan: Array  # (N, nu) inputs [rad/s]; to be used only when the solution's status is accepted
+    slacks: Array  # (N, m_s) by how much soft rows are violated
+    solution: Solution  # to the QP of the solver's formulation
+    way: Way = Way.WHOLE  # how it was found
 
 
 class Solver(Protocol):
@@ -199,13 +156,9 @@ class Solver(Protocol):
         ...
 
     def solve(self, state: Array, desired: Array, u_before: Array, rest: Rest | None = None) -> Answer:
-        """The optimum for xi(k) (n,), y_d (N, n_r) and u(k-1) (nu,); whatever happens is in its status.
+        """The optimum for xi(k) (n,), y_d (N, n_r) and u(k-1) (nu,) [rad/s], at the problem's rest state or another.
 
-        Args:
-            state: xi(k).
-            desired: y_d.
-            u_before: u(k-1) [rad/s].
-            rest: where the model rests; None for the problem's.
+        Whatever happens is in its status.
         """
         ...
 
@@ -229,8 +182,7 @@ class QPSolver:
 
         Data that is not finite is answered with the status `invalid_data`: no back end can be trusted to notice.
         """
-        valid = math.isfinite(state.sum() + desired.sum() + u_before.sum())
-        if valid:
+        if math.isfinite(state.sum() + desired.sum() + u_before.sum()):
             solution = self._backend.solve(self.formulation.vectors(state, desired, u_before, rest))
         else:
             solution = refusal(self.formulation.qp)

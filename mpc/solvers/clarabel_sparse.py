@@ -51,7 +51,7 @@ class ClarabelSparse:
     def setup(self, qp: QP) -> None:
         """See `mpc.qp.Backend.setup`."""
         self._qp = qp
-        self._sides = _common.one_sided(qp)
+        self._sides = _common.OneSided(qp)
         settings = clarabel.DefaultSettings()
         for name, value in SETTINGS.items():
             setattr(settings, name, value)
@@ -59,7 +59,7 @@ class ClarabelSparse:
             sparse.triu(qp.P, format="csc"),
             qp.c,
             self._sides.matrix,
-            self._sides.right_side(_common.start(qp)),
+            self._sides.right_side(qp.vectors),
             [clarabel.ZeroConeT(qp.b.size), clarabel.NonnegativeConeT(self._sides.matrix.shape[0] - qp.b.size)],
             settings,
         )
@@ -72,11 +72,10 @@ class ClarabelSparse:
         elapsed = clock.perf_counter() - started
         return _common.solution(
             self._qp,
-            x=np.array(answer.x),
-            multipliers=self._sides.two_sided(np.array(answer.z)),
+            np.array(answer.x),
+            self._sides.two_sided(np.array(answer.z)),
             status=STATUS[str(answer.status)],
             iterations=int(answer.iterations),
             solve_s=elapsed,
-            primal_residual=float(answer.r_prim),
-            dual_residual=float(answer.r_dual),
+            residuals=(float(answer.r_prim), float(answer.r_dual)),
         )

@@ -1,5 +1,8 @@
 """DAQP: a dual active-set method that factorises the Hessian once and starts from the last active set.
 
+Where the QP tells which bound is the same one step later in the plan, that set may be moved one step earlier: where
+active bounds alternate along the plan, it is wrong nearly everywhere as it was.
+
 Arnström, Bemporad and Axehill, A Dual Active-Set Solver for Embedded Quadratic Programming Using Recursive LDL'
 Updates, IEEE TAC 2022.
 """
@@ -11,10 +14,14 @@ from typing import Final
 
 import daqp
 import numpy as np
+from numpy.typing import NDArray
 
 from mpc.qp import QP, Solution, Vectors
 from mpc.solvers import _common
 from quadsim.controller import SOLVED
+from quadsim.state import Array
+
+Sense = NDArray[np.intc]
 
 SETTINGS: Final = {
     "primal_tol": 1e-8,  # rad or rad/s; its own 1e-6 is as fast
@@ -31,8 +38,10 @@ STATUS: Final = {
     -6: "overdetermined_start",
     -7: "max_time",
 }
+_ACTIVE: Final = 1
+_LOWER: Final = 2
 _EQUALITY: Final = 5
-"""How DAQP marks a row that is always active."""
+"""How DAQP marks bounds: active at first, at the lower side, always active."""
 
 
 class DaqpDense:
@@ -45,24 +54,39 @@ class DaqpDense:
     def setup(self, qp: QP) -> None:
         """See `mpc.qp.Backend.setup`."""
         self._qp = qp
-        start = _common.start(qp)
+        self._sense: Sense | None = None
+        self._last: Sense | None = None
         sense = np.zeros(qp.c.size + qp.h_l.size + qp.b.size, dtype=np.intc)
         sense[qp.c.size + qp.h_l.size :] = _EQUALITY
         hessian, rows = _common.dense(qp.P), _common.dense(_common.rows(qp))
-        self._model.setup(hessian, qp.c.copy(), rows, _common.upper(qp, start), _common.lower(qp, start), sense)
+        self._model.setup(
+            hessian, qp.c.copy(), rows, _common.upper(qp, qp.vectors), _common.lower(qp, qp.vectors), sense
+        )
 
     def solve(self, vectors: Vectors) -> Solution:
         """See `mpc.qp.Backend.solve`."""
         qp = self._qp
         started = clock.perf_counter()
-        self._model.update(f=vectors.c, bupper=_common.upper(qp, vectors), blower=_common.lower(qp, vectors))
+        upper, lower = _common.upper(qp, vectors), _common.lower(qp, vectors)
+        self._model.update(f=vectors.c, bupper=upper, blower=lower, sense=self._sense)
         x, _, flag, info = self._model.solve()
+        self._sense = self._moved(info["lam"]) if flag == 1 else None
         elapsed = clock.perf_counter() - started
-        return _common.solution(
-            qp,
-            x=x,
-            multipliers=info["lam"],
-            status=STATUS.get(flag, f"daqp_{flag}"),
-            iterations=info["iterations"],
-            solve_s=elapsed,
-        )
+        status = STATUS.get(flag, f"daqp_{flag}")
+        return _common.solution(qp, x, info["lam"], status=status, iterations=info["iterations"], solve_s=elapsed)
+
+    def _moved(self, multipliers: Array) -> Sense | None:
+        """The active set moved one step earlier; None where the one before would have been nearer unmoved.
+
+        DAQP then starts from the last one as it was, whose factors it has.
+        """
+        later, last = self._qp.later, self._last
+        if later is None:
+            return None
+        found = ((multipliers != 0.0) * (_ACTIVE + _LOWER * (multipliers < 0.0)))[: later.size]
+        self._last = found
+        if last is not None and np.count_nonzero(found != last[later]) > np.count_nonzero(found != last):
+            return None
+        sense = np.full(multipliers.size, _EQUALITY, dtype=np.intc)
+        sense[: later.size] = found[later]
+        return sense

@@ -22,15 +22,13 @@ from scipy import sparse
 from mpc.qp import QP, Solution, Vectors
 from mpc.solvers import _common
 from quadsim.controller import SOLVED
-from quadsim.state import Array
 
 SETTINGS: Final[dict[str, Any]] = {
     "threads": 1,
     "qp_iteration_limit": 6000,  # where it finds the optimum it takes 2000 to 5000
 }
 
-LARGEST_VIOLATION: Final = 1e-5
-"""Of any row or box entry by a point that HiGHS calls optimal [rad or rad/s]."""
+LARGEST_VIOLATION: Final = 1e-5  # of any row or box entry by a point that HiGHS calls optimal [rad or rad/s]
 
 STATUS: Final = {
     highspy.HighsModelStatus.kOptimal: SOLVED,
@@ -85,17 +83,18 @@ class HighsSparse:
         x = np.array(answer.col_value) if answer.value_valid else np.full(columns.size, np.nan)
         duals = (answer.col_dual, answer.row_dual) if answer.dual_valid else (x * np.nan, lower * np.nan)
         status = STATUS.get(solver.getModelStatus(), "unsolved")
-        if status == SOLVED and _violation(self._qp, vectors, x) > LARGEST_VIOLATION:
-            status = "violated"
+        if status == SOLVED:
+            qp, values = self._qp, np.concatenate([x, self._qp.G @ x, self._qp.A @ x])
+            violation = np.maximum(_common.lower(qp, vectors) - values, values - _common.upper(qp, vectors)).max()
+            status = "violated" if violation > LARGEST_VIOLATION else SOLVED
         return _common.solution(
             self._qp,
-            x=x,
-            multipliers=-np.concatenate(duals),  # HiGHS counts them positive at the lower side
+            x,
+            -np.concatenate(duals),  # HiGHS counts them positive at the lower side
             status=status,
             iterations=max(0, int(info.qp_iteration_count)),
             solve_s=elapsed,
-            primal_residual=float(info.max_primal_infeasibility),
-            dual_residual=float(info.max_dual_infeasibility),
+            residuals=(float(info.max_primal_infeasibility), float(info.max_dual_infeasibility)),
         )
 
 
@@ -113,8 +112,3 @@ def hushed() -> Iterator[None]:
         os.dup2(kept, 1)
         os.close(kept)
         os.close(nowhere)
-
-
-def _violation(qp: QP, vectors: Vectors, x: Array) -> float:
-    values = np.concatenate([x, qp.G @ x, qp.A @ x])
-    return float(np.maximum(_common.lower(qp, vectors) - values, values - _common.upper(qp, vectors)).max())

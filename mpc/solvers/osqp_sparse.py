@@ -48,9 +48,9 @@ class OsqpSparse:
     def setup(self, qp: QP) -> None:
         """See `mpc.qp.Backend.setup`."""
         self._qp = qp
-        start, P = _common.start(qp), sparse.triu(qp.P, format="csc")
-        lower, upper = _common.lower(qp, start), _common.upper(qp, start)
-        self._solver.setup(P, qp.c, _common.block(qp), lower, upper, **SETTINGS)
+        block = sparse.vstack([sparse.identity(qp.c.size), _common.rows(qp)], format="csc")
+        lower, upper = _common.lower(qp, qp.vectors), _common.upper(qp, qp.vectors)
+        self._solver.setup(sparse.triu(qp.P, format="csc"), qp.c, block, lower, upper, **SETTINGS)
 
     def solve(self, vectors: Vectors) -> Solution:
         """See `mpc.qp.Backend.solve`."""
@@ -62,11 +62,10 @@ class OsqpSparse:
         info = answer.info
         return _common.solution(
             qp,
-            x=np.array(answer.x),
-            multipliers=np.array(answer.y),
+            np.array(answer.x),
+            np.array(answer.y),
             status=STATUS[info.status_val],
             iterations=int(info.iter),
             solve_s=elapsed,
-            primal_residual=float(info.prim_res),
-            dual_residual=float(info.dual_res),
+            residuals=(float(info.prim_res), float(info.dual_res)),
         )

@@ -45,11 +45,7 @@ class ProxqpDense:
         for name, value in SETTINGS.items():
             setattr(self._solver.settings, name, value)
         defaults = self._solver.settings  # handed over with each QP, or an infeasible one leaves its penalties behind
-        self._penalties = {
-            "rho": defaults.default_rho,
-            "mu_eq": defaults.default_mu_eq,
-            "mu_in": defaults.default_mu_in,
-        }
+        self._penalties = {name: getattr(defaults, f"default_{name}") for name in ("rho", "mu_eq", "mu_in")}
         P, A, G = _common.dense(qp.P), _common.dense(qp.A), _common.dense(qp.G)
         self._solver.init(P, qp.c, A, qp.b, G, qp.h_l, qp.h_u, qp.x_l, qp.x_u)
 
@@ -66,11 +62,10 @@ class ProxqpDense:
         z, z_box = np.split(np.array(results.z), [qp.h_l.size])
         return _common.solution(
             qp,
-            x=np.array(results.x),
-            multipliers=np.concatenate([z_box, z, results.y]),
+            np.array(results.x),
+            np.concatenate([z_box, z, results.y]),
             status=STATUS[results.info.status],
             iterations=int(results.info.iter),
             solve_s=elapsed,
-            primal_residual=float(results.info.pri_res),
-            dual_residual=float(results.info.dua_res),
+            residuals=(float(results.info.pri_res), float(results.info.dua_res)),
         )

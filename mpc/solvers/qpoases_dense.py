@@ -59,15 +59,13 @@ class QpoasesDense:
         answer = self._solver(g=vectors.c, lba=lower, uba=upper, **self._constant)
         elapsed = clock.perf_counter() - started
         stats = self._solver.stats()
+        failure = next((name for part, name in FAILURES.items() if part in str(stats["return_status"])), "numerics")
+        status = SOLVED if stats["success"] else failure
         return _common.solution(
             self._qp,
-            x=answer["x"].full().ravel(),
-            multipliers=np.concatenate([answer["lam_x"].full().ravel(), answer["lam_a"].full().ravel()]),
-            status=SOLVED if stats["success"] else _failure(str(stats["return_status"])),
+            answer["x"].full().ravel(),
+            np.concatenate([answer["lam_x"].full().ravel(), answer["lam_a"].full().ravel()]),
+            status=status,
             iterations=int(stats["iter_count"]),
             solve_s=elapsed,
         )
-
-
-def _failure(sentence: str) -> str:
-    return next((name for part, name in FAILURES.items() if part in sentence), "numerics")

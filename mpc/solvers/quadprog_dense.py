@@ -28,7 +28,7 @@ class QuadprogDense:
             InputError: the Hessian is not positive definite to working precision.
         """
         self._qp = qp
-        self._sides = _common.one_sided(qp)
+        self._sides = _common.OneSided(qp)
         try:
             factor = scipy.linalg.cholesky(_common.dense(qp.P))
         except scipy.linalg.LinAlgError as error:
@@ -53,8 +53,8 @@ class QuadprogDense:
             iterations = 0
         return _common.solution(
             qp,
-            x=x,
-            multipliers=self._sides.two_sided(multipliers),
+            x,
+            self._sides.two_sided(multipliers),
             status=status,
             iterations=iterations,
             solve_s=clock.perf_counter() - started,

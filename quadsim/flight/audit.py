@@ -9,10 +9,11 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Annotated, Any, Final
+from typing import Annotated, Final
 
 import numpy as np
 from annotated_types import doc
+from numpy.typing import NDArray
 
 from quadsim.errors import InputError, ParameterError, UnknownNameError
 from quadsim.fields import NonNegative, Number
@@ -26,11 +27,12 @@ from quadsim.state import (
     STATE_NAMES,
     STATE_UNITS,
     Array,
+    shown_unit,
     tilt,
 )
 from quadsim.vehicle import N_ROTORS
 
-_DISPLAY: Final = {"rad": ("deg", math.degrees(1.0)), "rad/s": ("deg/s", math.degrees(1.0))}
+Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,32 +49,32 @@ class Signal:
     sampled: Callable[[ControlLog], Array]
     plant: Callable[[PlantLog], Array] | None
 
-
-def _state_signal(name: str, unit: str) -> Signal:
-    shown, scale = _DISPLAY.get(unit, (unit, 1.0))
-    i = INDEX[name]
-    return Signal(unit=shown, sampled=lambda log: scale * log.truth[:, i], plant=lambda log: scale * log.state[:, i])
-
-
-def _error_signal(j: int) -> Signal:
-    i = REFERENCE_STATES[j]
-    shown, scale = _DISPLAY.get(STATE_UNITS[i], (STATE_UNITS[i], 1.0))
-    return Signal(unit=shown, sampled=lambda log: scale * (log.truth[:, i] - log.reference[:, j]), plant=None)
+    def finest(self, log: FlightLog) -> tuple[Array, Array]:
+        """Times [s] and values: of the plant's rows where it exists there, else at the control samples."""
+        if self.plant is None:
+            return log.control.t, self.sampled(log.control)
+        return log.plant.t, self.plant(log.plant)
 
 
-_ESTIMATED: Final = tuple(STATE_NAMES[i] for i in (*POSITION, *EULER))
+def _state(i: int) -> Signal:
+    unit, scale = shown_unit(STATE_UNITS[i])
+    return Signal(unit=unit, sampled=lambda log: scale * log.truth[:, i], plant=lambda log: scale * log.state[:, i])
 
 
-def _estimate_error_signal(name: str) -> Signal:
-    i = INDEX[name]
-    shown, scale = _DISPLAY.get(STATE_UNITS[i], (STATE_UNITS[i], 1.0))
-    return Signal(unit=shown, sampled=lambda log: scale * (log.state[:, i] - log.truth[:, i]), plant=None)
+def _error(j: int) -> Signal:
+    unit, scale = shown_unit(STATE_UNITS[i := REFERENCE_STATES[j]])
+    return Signal(unit=unit, sampled=lambda log: scale * (log.truth[:, i] - log.reference[:, j]), plant=None)
+
+
+def _estimate_error(i: int) -> Signal:
+    unit, scale = shown_unit(STATE_UNITS[i])
+    return Signal(unit=unit, sampled=lambda log: scale * (log.state[:, i] - log.truth[:, i]), plant=None)
 
 
 SIGNALS: Final[dict[str, Signal]] = {
-    **{name: _state_signal(name, unit) for name, unit in zip(STATE_NAMES, STATE_UNITS, strict=True)},
-    **{f"{name}_error": _error_signal(j) for j, name in enumerate(REFERENCE_NAMES)},
-    **{f"{name}_estimate_error": _estimate_error_signal(name) for name in _ESTIMATED},
+    **{name: _state(i) for name, i in INDEX.items()},
+    **{f"{name}_error": _error(j) for j, name in enumerate(REFERENCE_NAMES)},
+    **{f"{STATE_NAMES[i]}_estimate_error": _estimate_error(i) for i in (*POSITION, *EULER)},
     "tilt": Signal(
         unit="deg", sampled=lambda log: np.degrees(tilt(log.truth)), plant=lambda log: np.degrees(tilt(log.state))
     ),
@@ -99,19 +101,11 @@ def sum_signal(terms: tuple[tuple[str, float], ...]) -> Signal:
     """A sum of terms, each a name in `TERMS` and its factor."""
     signals = [(factor, TERMS[name]) for name, factor in terms]
     units = {signal.unit for _, signal in signals}
-
-    def of_plant(log: PlantLog) -> Array:
-        return _total([factor * signal.plant(log) for factor, signal in signals if signal.plant is not None])
-
     return Signal(
         unit=units.pop() if len(units) == 1 else "-",
-        sampled=lambda log: _total([factor * signal.sampled(log) for factor, signal in signals]),
-        plant=of_plant,
+        sampled=lambda log: np.sum([factor * signal.sampled(log) for factor, signal in signals], axis=0),
+        plant=lambda log: np.sum([factor * signal.plant(log) for factor, signal in signals if signal.plant], axis=0),
     )
-
-
-def _total(parts: list[Array]) -> Array:
-    return np.asarray(np.sum(parts, axis=0))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -166,6 +160,10 @@ class Limit:
         if math.isfinite(self.lower) and math.isfinite(self.upper):
             return 0.5 * (self.upper - self.lower)
         return abs(self.lower if math.isfinite(self.lower) else self.upper) or 1.0
+
+    def holds_at(self, t: Array) -> Mask:
+        """(K,) whether it holds at times (K,) [s]."""
+        return (t >= self.start - 1e-9) & (t <= self.stop + 1e-9)
 
     def margin(self, values: Array) -> Array:
         """(K,) signed distance to the nearer bound, the smallest over rotors; negative = violated."""
@@ -234,34 +232,21 @@ def margins_sampled(limit: Limit, log: FlightLog) -> Array:
 
 def margins_at(limit: Limit, t: Array, values: Array) -> Array:
     """(K,) signed margins of a limit on the values of its signal at times t (K,), NaN outside its time window."""
-    return np.where(_inside(limit, t), limit.margin(values), np.nan)
+    return np.where(limit.holds_at(t), limit.margin(values), np.nan)
 
 
 def audit(log: FlightLog, limits: tuple[Limit, ...]) -> tuple[Finding, ...]:
-    """Hold a flight against its limits.
-
-    Args:
-        log: a flight whose plant rows are at the physics rate.
-        limits: what to hold it against.
-
-    Returns:
-        One finding per limit, in order.
-    """
+    """Hold a flight, its plant rows at the physics rate, against its limits: one finding for each, in order."""
     return tuple(_find(log, limit) for limit in limits)
 
 
-def _inside(limit: Limit, t: Array) -> np.ndarray[Any, np.dtype[np.bool_]]:
-    return (t >= limit.start - 1e-9) & (t <= limit.stop + 1e-9)
-
-
 def _find(log: FlightLog, limit: Limit) -> Finding:
-    signal = limit.source
-    t, values = log.control.t, signal.sampled(log.control)
+    t, values = log.control.t, limit.source.sampled(log.control)
     sampled = peak, margin, time = _worst(limit, t, values)
-    if signal.plant is not None and t.size:  # before the first period nothing was flown
-        t, values = log.plant.t, signal.plant(log.plant)
+    if t.size:  # before the first period nothing was flown
+        t, values = limit.source.finest(log)
         peak, margin, time = _worst(limit, t, values)
-    beyond = _inside(limit, t) & (limit.margin(values) < -limit.tolerance)
+    beyond = limit.holds_at(t) & (limit.margin(values) < -limit.tolerance)
     held = np.diff(t, append=log.plant.t[-1:])  # each value stands until the next, the last until the flight's end
     return Finding(
         limit=limit,
@@ -276,7 +261,7 @@ def _find(log: FlightLog, limit: Limit) -> Finding:
 
 def _worst(limit: Limit, t: Array, values: Array) -> tuple[float, float, float]:
     """Value, margin and time where the margin is smallest; NaN when the window is empty."""
-    inside = _inside(limit, t)
+    inside = limit.holds_at(t)
     if not inside.any():
         return math.nan, math.nan, math.nan
     t, columns = t[inside], values[inside].reshape(np.count_nonzero(inside), -1)

@@ -14,12 +14,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
-from typing import Any, Final
+from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from quadsim.flight.audit import Mask
 from quadsim.state import (
     EULER,
     EULER_RATE,
@@ -30,6 +30,8 @@ from quadsim.state import (
     VELOCITY,
     Array,
     euler_to_body_rates,
+    shown_unit,
+    tilt,
 )
 from quadsim.vehicle import Vehicle
 
@@ -37,9 +39,6 @@ STENCIL: Final = 2
 """Samples on either side that a torque depends on."""
 TOLERANCE: Final = 1e-6
 """How far beyond a bound a demand may go, relative to the bound and absolute: rounding in the differences."""
-_DISPLAY: Final = {"rad": ("deg", math.degrees(1.0)), "rad/s": ("deg/s", math.degrees(1.0))}
-
-Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -61,12 +60,6 @@ class Demand:
     torque: Array
     speeds: Array
     slews: Array
-
-    @property
-    def tilt(self) -> Array:
-        """(K,) angle between the thrust and the vertical [rad]."""
-        roll, pitch = self.state[:, INDEX["roll"]], self.state[:, INDEX["pitch"]]
-        return np.arccos(np.clip(np.cos(roll) * np.cos(pitch), -1.0, 1.0))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -175,30 +168,19 @@ def assess(
         jumps: times [s] at which the course jumps.
     """
     bounds = bounds or {}
-    rotor = (float(needed.speeds.min()), float(needed.speeds.max()))
-    tilt = math.degrees(float(needed.tilt.max()))
-    yaw = math.degrees(float(np.abs(needed.state[:, INDEX["yaw"]]).max()))
+    peaks = {
+        "tilt": math.degrees(float(tilt(needed.state).max())),
+        "velocity": float(np.linalg.norm(needed.state[:, VELOCITY], axis=1).max()),
+        "acceleration": float(np.linalg.norm(needed.acceleration, axis=1).max()),
+        "yaw": math.degrees(float(np.abs(needed.state[:, INDEX["yaw"]]).max())),
+        "yaw_rate": math.degrees(float(np.abs(needed.state[:, INDEX["yaw_rate"]]).max())),
+        "rotor_min": float(needed.speeds.min()),
+        "rotor_max": float(needed.speeds.max()),
+        "thrust_to_weight": float(needed.thrust.max()) / (vehicle.mass * vehicle.gravity),
+    }
     problems = _problems(needed, vehicle, bounds)
-    velocity = float(np.linalg.norm(needed.state[:, VELOCITY], axis=1).max())
-    return Feasibility(
-        tilt=tilt,
-        velocity=velocity,
-        acceleration=float(np.linalg.norm(needed.acceleration, axis=1).max()),
-        yaw=yaw,
-        yaw_rate=math.degrees(float(np.abs(needed.state[:, INDEX["yaw_rate"]]).max())),
-        rotor_min=rotor[0],
-        rotor_max=rotor[1],
-        thrust_to_weight=float(needed.thrust.max()) / (vehicle.mass * vehicle.gravity),
-        jumps=tuple(jumps),
-        problems=problems,
-        sentence=_sentence(tilt, velocity, yaw, rotor, vehicle, bounds, jumps, problems),
-    )
-
-
-def to_json(feasibility: Feasibility) -> dict[str, Any]:
-    """The finding for `summary.json`."""
-    found = asdict(feasibility)
-    return {**found, "jumps": list(feasibility.jumps), "problems": list(feasibility.problems)}
+    sentence = _sentence(peaks, vehicle, bounds, jumps, problems)
+    return Feasibility(**peaks, jumps=tuple(jumps), problems=problems, sentence=sentence)
 
 
 def _attitudes(pushed: Array, yaw: Array) -> Array:
@@ -223,7 +205,7 @@ def _problems(needed: Demand, vehicle: Vehicle, bounds: Mapping[str, tuple[float
             slews = needed.slews[np.isfinite(needed.slews)]
             found += _beyond("change of rotor speed", "rad/s per period", slews, (lower, upper), "bound")
         else:
-            unit, scale = _DISPLAY.get(STATE_UNITS[INDEX[name]], (STATE_UNITS[INDEX[name]], 1.0))
+            unit, scale = shown_unit(STATE_UNITS[INDEX[name]])
             values = scale * needed.state[:, INDEX[name]]
             found += _beyond(name, unit, values, (scale * lower, scale * upper), "bound")
     return tuple(found)
@@ -242,10 +224,7 @@ def _beyond(name: str, unit: str, values: Array, allowed: tuple[float, float], k
 
 
 def _sentence(
-    tilt: float,
-    velocity: float,
-    yaw: float,
-    rotor: tuple[float, float],
+    peaks: Mapping[str, float],
     vehicle: Vehicle,
     bounds: Mapping[str, tuple[float, float]],
     jumps: Sequence[float],
@@ -254,11 +233,12 @@ def _sentence(
     tilts = [math.degrees(abs(side)) for name in ("roll", "pitch") if name in bounds for side in bounds[name]]
     allowed = f" (bound {min(tilts):.4g} deg)" if tilts else ""
     times = ", ".join(f"{time:g}" for time in jumps[:4]) + (", ..." if len(jumps) > 4 else "")
-    turned = f", a yaw of {round(yaw, 1):g} deg" if yaw > 0.5 else ""
+    turned = f", a yaw of {round(peaks['yaw'], 1):g} deg" if peaks["yaw"] > 0.5 else ""
     subject = f"The course steps (at t = {times} s); what is left asks" if jumps else "The course asks"
     asked = (
-        f"{subject} for up to {round(tilt, 2):g} deg of tilt{allowed}, {round(velocity, 2):g} m/s{turned}, "
-        f"and rotor speeds of {rotor[0]:.4g} to {rotor[1]:.4g} rad/s "
+        f"{subject} for up to {round(peaks['tilt'], 2):g} deg of tilt{allowed}, "
+        f"{round(peaks['velocity'], 2):g} m/s{turned}, "
+        f"and rotor speeds of {peaks['rotor_min']:.4g} to {peaks['rotor_max']:.4g} rad/s "
         f"(limits {vehicle.speed_min:.4g} and {vehicle.speed_max:.4g} rad/s)."
     )
     return f"{asked} It cannot be followed exactly: {'; '.join(problems)}." if problems else asked

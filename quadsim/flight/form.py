@@ -71,12 +71,7 @@ def _is(value: Any, kind: type) -> bool:
 
 
 def read_json(path: Path, form: Mapping[str, Any], what: str) -> dict[str, Any]:
-    """A JSON object from a file of quadsim's.
-
-    Args:
-        path: of the file.
-        form: what it has to hold.
-        what: it is, for messages.
+    """A JSON object of a form from a file of quadsim's; messages call the file `what`.
 
     Raises:
         FileError: it cannot be read, is no strict JSON in Unicode, names an entry twice, or an entry is missing or of
@@ -94,8 +89,7 @@ def read_json(path: Path, form: Mapping[str, Any], what: str) -> dict[str, Any]:
         raise FileError(path, f"is not {what} ({reason})") from error
     if not isinstance(found, dict):
         raise FileError(path, f"is not {what}: it is no table")
-    wrong = [printable(name)[:100] for name in misfits(found, form)]
-    if wrong:
+    if wrong := [printable(name)[:100] for name in misfits(found, form)]:
         more = f" and {len(wrong) - MOST_NAMED} more" if len(wrong) > MOST_NAMED else ""
         raise FileError(path, f"is not {what}: it lacks or misstates {', '.join(wrong[:MOST_NAMED])}{more}")
     return found

@@ -52,30 +52,17 @@ def clearance(states: Array, points: Array, radius: float, floor: float) -> Arra
     return lowest
 
 
-@dataclass(frozen=True, kw_only=True)
-class Touchdown:
-    """How a vehicle met the ground, from its last state before.
-
-    Attributes:
-        time: of that state [s].
-        speed: downwards [m/s].
-        horizontal_speed: along the ground [m/s].
-        tilt: between the thrust axis and the vertical [deg].
-    """
-
-    time: float
-    speed: float
-    horizontal_speed: float
-    tilt: float
-
-
-def touchdown(t: Array, states: Array, clearances: Array) -> Touchdown | None:
+def touchdown(t: Array, states: Array, clearances: Array) -> dict[str, float] | None:
     """The first touch after the vehicle has flown; None where there is none.
 
     Args:
         t: (M,) [s].
         states: (M, 12), at the physics rate: at the log rate the speed is that of up to a log period before.
         clearances: (M,) of what may meet the ground first [m]; see `clearance`.
+
+    Returns:
+        Of the last state before: `time` [s], `speed` downwards and `horizontal_speed` [m/s], and `tilt` of the thrust
+        axis from the vertical [deg].
     """
     flown = np.flatnonzero(clearances > AIRBORNE)
     if not flown.size:
@@ -85,12 +72,8 @@ def touchdown(t: Array, states: Array, clearances: Array) -> Touchdown | None:
         return None
     last = flown[0] + met[0] - 1
     vx, vy, vz = (float(states[last, INDEX[name]]) for name in ("vx", "vy", "vz"))
-    return Touchdown(
-        time=float(t[last]),
-        speed=-vz,
-        horizontal_speed=math.hypot(vx, vy),
-        tilt=float(np.degrees(tilt(states[last : last + 1])[0])),
-    )
+    lean = float(np.degrees(tilt(states[last : last + 1])[0]))
+    return {"time": float(t[last]), "speed": -vz, "horizontal_speed": math.hypot(vx, vy), "tilt": lean}
 
 
 def takeoff_time(t: Array, clearances: Array) -> float | None:

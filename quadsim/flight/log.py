@@ -10,14 +10,13 @@ from typing import Any, Final
 
 import numpy as np
 
+from quadsim.controller import Phase
 from quadsim.state import Array
-from quadsim.vehicle import N_ROTORS
 
 WRENCH: Final = {**{f"force_{axis}": "N" for axis in "xyz"}, **{f"torque_{axis}": "N m" for axis in "xyz"}}
 """Columns of the external force, world, and torque, body frame, with their units; only where there is any."""
 WIND: Final = {f"wind_{axis}": "m/s" for axis in "xyz"}
 """Columns of the wind, world, with their units; only where there is any."""
-ROTORS: Final = range(1, N_ROTORS + 1)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -64,6 +63,11 @@ class ControlLog:
         return self.state is self.truth or bool(np.array_equal(self.state, self.truth))
 
     @property
+    def crashed(self) -> bool:
+        """Whether anything but the feet met the ground."""
+        return str(Phase.CRASHED) in self.phase
+
+    @property
     def slews(self) -> Array:
         """(K, 4) command steps u(k) - u(k-1) [rad/s per period], Eq. (15)."""
         return np.diff(self.speeds, axis=0, prepend=self.speeds_before[None, :])
@@ -98,13 +102,8 @@ class PlantLog:
 
     def every(self, stride: int) -> PlantLog:
         """Each `stride`-th row, from the first on."""
-        return PlantLog(
-            t=self.t[::stride],
-            state=self.state[::stride],
-            speeds=self.speeds[::stride],
-            wrench=None if self.wrench is None else self.wrench[::stride],
-            wind=None if self.wind is None else self.wind[::stride],
-        )
+        kept: dict[str, Any] = {name: None if rows is None else rows[::stride] for name, rows in vars(self).items()}
+        return PlantLog(**kept)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -5,26 +5,15 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING, Any, Final
+from dataclasses import dataclass
+from typing import Any, Final
 
 import numpy as np
 
 from quadsim.controller import ACCEPTED, MISSED, Phase
-from quadsim.flight.ground import AIRBORNE, clearance, takeoff_time, touchdown
+from quadsim.flight.ground import AIRBORNE, Outline, clearance, takeoff_time, touchdown
 from quadsim.flight.log import ControlLog, FlightLog, TimingLog
-from quadsim.state import (
-    INDEX,
-    REFERENCE_NAMES,
-    REFERENCE_STATES,
-    REFERENCE_UNITS,
-    STATE_NAMES,
-    STATE_UNITS,
-    Array,
-)
-
-if TYPE_CHECKING:
-    from quadsim.flight.ground import Outline
+from quadsim.state import INDEX, REFERENCE_NAMES, REFERENCE_STATES, REFERENCE_UNITS, STATE_NAMES, STATE_UNITS, Array
 
 SETTLING_BAND: Final = 0.05
 """Half width of the band an output has to stay in to be settled, as a share of the step."""
@@ -100,15 +89,8 @@ def settling(t: Array, outputs: Array, steps: Sequence[CourseStep]) -> list[dict
         first = outside[-1] + 1 if outside.size else 0
         flown = t.size > 1 and t[-1] + period > step.until - 1e-9
         settled = round(float(t[held][first] - step.time), 9) if flown and first < error.size else None
-        entries.append(
-            {
-                "channel": step.channel,
-                "time": step.time,
-                "before": step.before,
-                "after": step.after,
-                "settled": settled,
-            }
-        )
+        step_taken = {name: getattr(step, name) for name in ("channel", "time", "before", "after")}
+        entries.append({**step_taken, "settled": settled})
     return entries
 
 
@@ -152,8 +134,8 @@ def controller(log: ControlLog, timing: TimingLog, deadline_ms: float) -> dict[s
         "active_max": int(log.active.max()),
         "active_periods": int(np.count_nonzero(log.active)),
         "residual_max": {
-            "primal": _largest_reported(log.primal_residual[found]),
-            "dual": _largest_reported(log.dual_residual[found]),
+            "primal": _largest(log.primal_residual[found]),
+            "dual": _largest(log.dual_residual[found]),
         },
         "solve_ms": percentiles(timing.solve_ms),
         "step_ms": percentiles(timing.step_ms),
@@ -175,10 +157,7 @@ def unrecovered(log: ControlLog) -> int:
 
 def computation(log: ControlLog) -> dict[str, Any]:
     """Simulated times from measurement to command [ms], and how many commands came too late to be used."""
-    return {
-        "delay_ms": percentiles(1e3 * log.delay),
-        "missed": sum(status == MISSED for status in log.status),
-    }
+    return {"delay_ms": percentiles(1e3 * log.delay), "missed": log.status.count(MISSED)}
 
 
 def estimation(log: ControlLog) -> dict[str, Any]:
@@ -202,23 +181,21 @@ def ground(log: FlightLog, outline: Outline) -> dict[str, Any]:
     """How the flight left the ground and met it again, from plant rows at the physics rate.
 
     Returns:
-        `started`, `landed` or `flying`; `takeoff_time` [s]; `touchdown`, of feet or hull (`time` [s], `speed` and
-        `horizontal_speed` [m/s], `tilt` [deg]), each None
-        where there was none; `phase`, the last one; `crashed`.
+        `started`, `landed` or `flying`; `takeoff_time` [s] and `touchdown`, of feet or hull, each None where there was
+        none; `phase`, the last one; `crashed`.
     """
     feet = clearance(log.plant.state, outline.feet, outline.foot_radius, outline.floor)
     clearances = np.minimum(feet, clearance(log.plant.state, outline.hull, 0.0, outline.floor))
-    met = touchdown(log.plant.t, log.plant.state, clearances)
     return {
         "started": str(Phase.LANDED) if feet[0] <= AIRBORNE else str(Phase.FLYING),
         "takeoff_time": takeoff_time(log.plant.t, feet),
-        "touchdown": None if met is None else asdict(met),
+        "touchdown": touchdown(log.plant.t, log.plant.state, clearances),
         "phase": log.control.phase[-1] if log.control.phase else None,
-        "crashed": str(Phase.CRASHED) in log.control.phase,
+        "crashed": log.control.crashed,
     }
 
 
-def _largest_reported(residuals: Array) -> float | None:
+def _largest(residuals: Array) -> float | None:
     """The largest residual; None for a back end that reports none, 0 where there was nothing to report."""
     largest = float(np.max(residuals, initial=0.0))
     return None if math.isnan(largest) else largest
@@ -234,11 +211,9 @@ def flight_numbers(log: FlightLog, deadline_ms: float, course: Sequence[CourseSt
     """
     if not log.control.t.size:
         return {"tracking": {}, "control": {}, "controller": {}}
+    settled = settling(log.control.t, log.control.truth[:, REFERENCE_STATES], course)
     return {
-        "tracking": {
-            **tracking(log.control),
-            "settling": settling(log.control.t, log.control.truth[:, REFERENCE_STATES], course),
-        },
+        "tracking": {**tracking(log.control), "settling": settled},
         "control": control(log.control),
         "controller": controller(log.control, log.timing, deadline_ms),
     }

@@ -7,8 +7,7 @@ Three tables, as in the file contract: what happened once per control period (`f
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import fields
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, BinaryIO, Final
 
@@ -17,8 +16,9 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from quadsim.errors import FileError
-from quadsim.flight.log import ROTORS, WIND, WRENCH, ControlLog, FlightLog, PlantLog, TimingLog
+from quadsim.flight.log import WIND, WRENCH, ControlLog, FlightLog, PlantLog, TimingLog
 from quadsim.state import REFERENCE_NAMES, REFERENCE_UNITS, STATE_NAMES, STATE_UNITS, Array
+from quadsim.vehicle import N_ROTORS
 
 FLIGHT_FILE: Final = "flight.parquet"
 TIMING_FILE: Final = "timing.parquet"
@@ -26,14 +26,24 @@ PLANT_FILE: Final = "plant.parquet"
 HORIZON_FILE: Final = "horizon.parquet"
 _TRUE: Final = "true_"
 """How the columns of the true state begin, which are there where the measured one differs."""
+_REFERENCES: Final = tuple(f"ref_{name}" for name in REFERENCE_NAMES)
+_COMMANDED: Final = tuple(f"u{i}" for i in range(1, N_ROTORS + 1))
+_TURNING: Final = tuple(f"w{i}" for i in range(1, N_ROTORS + 1))
+_SPEED_UNITS: Final = ("rad/s",) * N_ROTORS
+_TIMES: Final = {"t": "s", "solve_ms": "ms", "step_ms": "ms"}
 _COUNTS: Final = ("iterations", "active", "fallback")
+_NUMBERS: Final = {"slack": "rad", "primal_residual": "-", "dual_residual": "-", "delay": "s"}
+"""Columns of one number in each period, with their units; those of counts have none."""
 
 _Column = tuple[str, str, Any]
 
 
-def _state_columns(state: Array, prefix: str = "") -> list[_Column]:
-    named = zip(STATE_NAMES, STATE_UNITS, strict=True)
-    return [(prefix + name, unit, state[:, i]) for i, (name, unit) in enumerate(named)]
+def _columns(rows: Array, names: Iterable[str], units: Iterable[str]) -> Iterator[_Column]:
+    return zip(names, units, rows.T, strict=True)
+
+
+def _state_columns(state: Array, prefix: str = "") -> Iterator[_Column]:
+    return _columns(state, (prefix + name for name in STATE_NAMES), STATE_UNITS)
 
 
 def _table(columns: Sequence[_Column], metadata: Mapping[str, str]) -> pa.Table:
@@ -46,21 +56,15 @@ def _table(columns: Sequence[_Column], metadata: Mapping[str, str]) -> pa.Table:
 
 
 def _flight_table(log: ControlLog, metadata: Mapping[str, str]) -> pa.Table:
-    references = zip(REFERENCE_NAMES, REFERENCE_UNITS, strict=True)
     columns: list[_Column] = [
         ("t", "s", log.t),
         *_state_columns(log.state),
-        *((f"ref_{name}", unit, log.reference[:, i]) for i, (name, unit) in enumerate(references)),
-        *((f"u{i}", "rad/s", log.speeds[:, i - 1]) for i in ROTORS),
+        *_columns(log.reference, _REFERENCES, REFERENCE_UNITS),
+        *_columns(log.speeds, _COMMANDED, _SPEED_UNITS),
         ("status", "-", pa.array(log.status, pa.string())),
         ("phase", "-", pa.array(log.phase, pa.string())),
-        ("iterations", "-", log.iterations),
-        ("active", "-", log.active),
-        ("fallback", "-", log.fallback),
-        ("slack", "rad", log.slack),
-        ("primal_residual", "-", log.primal_residual),
-        ("dual_residual", "-", log.dual_residual),
-        ("delay", "s", log.delay),
+        *((name, "-", getattr(log, name)) for name in _COUNTS),
+        *((name, unit, getattr(log, name)) for name, unit in _NUMBERS.items()),
         *([] if log.measured_perfectly else _state_columns(log.truth, _TRUE)),
     ]
     before = ",".join(repr(float(speed)) for speed in log.speeds_before)
@@ -68,17 +72,10 @@ def _flight_table(log: ControlLog, metadata: Mapping[str, str]) -> pa.Table:
 
 
 def _plant_table(log: PlantLog, metadata: Mapping[str, str]) -> pa.Table:
-    speeds = [(f"w{i}", "rad/s", log.speeds[:, i - 1]) for i in ROTORS]
-    columns = [("t", "s", log.t), *_state_columns(log.state), *speeds]
-    if log.wrench is not None:
-        columns += [(name, unit, log.wrench[:, i]) for i, (name, unit) in enumerate(WRENCH.items())]
-    if log.wind is not None:
-        columns += [(name, unit, log.wind[:, i]) for i, (name, unit) in enumerate(WIND.items())]
+    columns = [("t", "s", log.t), *_state_columns(log.state), *_columns(log.speeds, _TURNING, _SPEED_UNITS)]
+    for rows, units in ((log.wrench, WRENCH), (log.wind, WIND)):
+        columns += [] if rows is None else _columns(rows, units, units.values())
     return _table(columns, metadata)
-
-
-def _timing_table(log: TimingLog, metadata: Mapping[str, str]) -> pa.Table:
-    return _table([("t", "s", log.t), ("solve_ms", "ms", log.solve_ms), ("step_ms", "ms", log.step_ms)], metadata)
 
 
 def _horizon_table(t: Array, predicted: np.ndarray[Any, np.dtype[np.float32]], metadata: Mapping[str, str]) -> pa.Table:
@@ -93,7 +90,7 @@ def log_tables(log: FlightLog, *, plant_stride: int = 1, metadata: Mapping[str, 
     """A flight's tables `flight`, `timing`, `plant`, and `horizon` where positions were predicted; see `write_log`."""
     tables = {
         "flight": _flight_table(log.control, metadata),
-        "timing": _timing_table(log.timing, metadata),
+        "timing": _table([(name, unit, getattr(log.timing, name)) for name, unit in _TIMES.items()], metadata),
         "plant": _plant_table(log.plant.every(plant_stride), metadata),
     }
     if log.predicted is not None:
@@ -104,11 +101,8 @@ def log_tables(log: FlightLog, *, plant_stride: int = 1, metadata: Mapping[str, 
 def write_log(directory: Path, log: FlightLog, *, plant_stride: int, metadata: Mapping[str, str]) -> None:
     """Write a flight's Parquet files into an existing directory.
 
-    Args:
-        directory: where `flight.parquet`, `timing.parquet`, `plant.parquet` and `horizon.parquet` go.
-        log: the flight.
-        plant_stride: physics steps per row of `plant.parquet`.
-        metadata: texts kept in each file's schema; no clock reading belongs here.
+    Every `plant_stride`-th physics step is a row of `plant.parquet`; `metadata`, texts without a clock reading, is kept
+    in each file's schema.
     """
     for name, table in log_tables(log, plant_stride=plant_stride, metadata=metadata).items():
         _write(table, directory / f"{name}.parquet")
@@ -173,11 +167,7 @@ def _texts(table: pa.Table, name: str) -> tuple[str, ...]:
 
 
 def read_log(directory: Path, *, reason: str | None = None) -> FlightLog:
-    """Read a flight back; the plant's rows are at the log rate.
-
-    Args:
-        directory: a run directory.
-        reason: the flight's reason for ending early, which stands in its summary.
+    """Read a flight back from its run directory, the plant's rows at the log rate; its summary has the `reason`.
 
     Raises:
         FileError: a file is missing or damaged.
@@ -185,31 +175,28 @@ def read_log(directory: Path, *, reason: str | None = None) -> FlightLog:
     flight, timing, plant = (_read(directory / name) for name in (FLIGHT_FILE, TIMING_FILE, PLANT_FILE))
     try:
         before = np.array([float(text) for text in (flight.schema.metadata or {})[b"speeds_before"].split(b",")])
-        scalars = {
-            field.name: _numbers(flight, field.name, np.int64 if field.name in _COUNTS else np.float64)
-            for field in fields(ControlLog)
-            if field.name not in ("state", "truth", "reference", "speeds", "speeds_before", "status", "phase")
-        }
         state = _stack(flight, STATE_NAMES)
         truth = _stack_if_there(flight, [_TRUE + name for name in STATE_NAMES])
         control = ControlLog(
+            t=_numbers(flight, "t"),
             state=state,
             truth=state if truth is None else truth,
-            reference=_stack(flight, [f"ref_{name}" for name in REFERENCE_NAMES]),
-            speeds=_stack(flight, [f"u{i}" for i in ROTORS]),
+            reference=_stack(flight, _REFERENCES),
+            speeds=_stack(flight, _COMMANDED),
             speeds_before=before,
             status=_texts(flight, "status"),
             phase=_texts(flight, "phase"),
-            **scalars,
+            **{name: _numbers(flight, name, np.int64) for name in _COUNTS},
+            **{name: _numbers(flight, name) for name in _NUMBERS},
         )
         plant_log = PlantLog(
             t=_numbers(plant, "t"),
             state=_stack(plant, STATE_NAMES),
-            speeds=_stack(plant, [f"w{i}" for i in ROTORS]),
+            speeds=_stack(plant, _TURNING),
             wrench=_stack_if_there(plant, list(WRENCH)),
             wind=_stack_if_there(plant, list(WIND)),
         )
-        timing_log = TimingLog(**{name: _numbers(timing, name) for name in ("t", "solve_ms", "step_ms")})
+        timing_log = TimingLog(**{name: _numbers(timing, name) for name in _TIMES})
         predicted = _read_predicted(directory)
         _require_whole(control, timing_log, plant_log, predicted)
     except FileError:

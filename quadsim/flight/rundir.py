@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import math
 from collections.abc import Iterator, Mapping
-from dataclasses import asdict, dataclass, fields
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, Final
 
@@ -62,37 +62,23 @@ class Run:
         """The scenario's name."""
         return str(self.summary["scenario"])
 
-
-def vehicle_to_json(vehicle: Vehicle) -> dict[str, Any]:
-    """The vehicle's numbers for `summary.json`."""
-    return asdict(vehicle)
+    @property
+    def end(self) -> float:
+        """Last time of the flight [s]."""
+        return float(self.log.plant.t[-1])
 
 
 def limit_to_json(finding: Finding) -> dict[str, Any]:
     """One entry of `constraints` in `summary.json`; an absent bound, or a window the flight never reached, is null."""
     limit = finding.limit
-
-    def finite(value: float) -> float | None:
-        return value if math.isfinite(value) else None
-
+    stated = {name: value for name, value in vars(limit).items() if name not in ("name", "signal", "terms")}
+    found = {name: value for name, value in vars(finding).items() if name != "limit"}
     return {
         "name": limit.name,
         "signal": limit.signal,
         **({"terms": dict(limit.terms)} if isinstance(limit, SumLimit) else {}),
         "unit": limit.unit,
-        "lower": finite(limit.lower),
-        "upper": finite(limit.upper),
-        "tolerance": limit.tolerance,
-        "tolerance_sampled": limit.tolerance_sampled,
-        "required": limit.required,
-        "start": limit.start,
-        "stop": finite(limit.stop),
-        "peak_sampled": finite(finding.peak_sampled),
-        "peak_plant": finite(finding.peak_plant),
-        "worst_margin_sampled": finite(finding.worst_margin_sampled),
-        "worst_margin": finite(finding.worst_margin),
-        "worst_time": finite(finding.worst_time),
-        "time_violated": finding.time_violated,
+        **{name: value if math.isfinite(value) else None for name, value in (stated | found).items()},
         "satisfied": finding.satisfied,
     }
 
@@ -112,15 +98,6 @@ def finding_from_json(entry: Mapping[str, Any]) -> Finding:
     names = ("peak_sampled", "peak_plant", "worst_margin_sampled", "worst_margin", "worst_time", "time_violated")
     values = {name: math.nan if entry[name] is None else float(entry[name]) for name in names}
     return Finding(limit=limit_from_json(entry), **values)
-
-
-def is_run(directory: Path) -> bool:
-    """Whether a path is a run directory: one with a summary of quadsim's, since others write a `summary.json` too."""
-    try:
-        read_summary(directory)
-    except FileError:
-        return False
-    return True
 
 
 def load_run(directory: Path) -> Run:
@@ -145,16 +122,15 @@ def file_hashes(directory: Path) -> dict[str, str]:
     Raises:
         FileError: one cannot be read.
     """
-    paths = sorted(path for path in directory.rglob("*") if path.is_file())
-    names = [path.relative_to(directory).as_posix() for path in paths]
-    return {name: _hash(directory / name) for name in names if name not in UNLISTED}
-
-
-def _hash(path: Path) -> str:
-    try:
-        return digest_of(path)
-    except OSError as error:
-        raise FileError(path, f"cannot be read ({error.strerror})") from error
+    hashes = {}
+    for path in sorted(path for path in directory.rglob("*") if path.is_file()):
+        name = path.relative_to(directory).as_posix()
+        if name not in UNLISTED:
+            try:
+                hashes[name] = digest_of(path)
+            except OSError as error:
+                raise FileError(path, f"cannot be read ({error.strerror})") from error
+    return hashes
 
 
 @contextlib.contextmanager

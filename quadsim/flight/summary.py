@@ -125,8 +125,6 @@ FORM: Final = {
     "machine": Optional({"system": str, "processor": str, "cores": (int, type(None))}),
     "files": Each(str),
 }
-
-
 _TOGETHER: Final = {"worst_margin": ("worst_time", "peak_plant"), "worst_margin_sampled": ("peak_sampled",)}
 """Of a constraint: what is there wherever a margin is."""
 
@@ -162,10 +160,7 @@ def contradictions(summary: Mapping[str, Any]) -> Iterator[str]:
         name = f"{entry['name']:.80}"
         if _unit(entry) != entry["unit"]:
             yield f"{name}: signal {entry['signal']!r:.40} in {entry['unit']!r:.40}"
-        for key, others in (
-            ("worst_margin", ("worst_time", "peak_plant")),
-            ("worst_margin_sampled", ("peak_sampled",)),
-        ):
+        for key, others in _TOGETHER.items():
             if entry[key] is not None and any(entry[other] is None for other in others):
                 yield f"{name}: {key} is there without {' and '.join(others)}"
         if entry["worst_margin"] is None and entry["worst_margin_sampled"] is not None:

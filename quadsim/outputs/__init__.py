@@ -33,8 +33,8 @@ from quadsim.outputs.manifest import (
     to_json,
 )
 from quadsim.outputs.paths import (
-    as_output_error,
     occupied,
+    output_errors,
     parents_of,
     problem_with_directory,
     problem_with_file,
@@ -70,7 +70,7 @@ def require_directory(target: Path | str, kind: str) -> None:
         OutputError: see `writing`.
     """
     target = real_path(target)
-    try:
+    with output_errors(target):
         for parent in target.parents:
             if os.path.lexists(parent) and not parent.is_dir():
                 raise OutputError(target, f"{parent} is a file")
@@ -82,8 +82,6 @@ def require_directory(target: Path | str, kind: str) -> None:
                 raise OutputError(target, problem)
             if target.samefile(Path.cwd()):
                 raise OutputError(target, "it is the current directory; name one to be made")
-    except OSError as error:
-        raise as_output_error(target, error) from error
 
 
 @contextlib.contextmanager
@@ -123,10 +121,8 @@ def write_text(path: Path, text: str) -> None:
     Raises:
         OutputError: it cannot be written.
     """
-    try:
+    with output_errors(path):
         path.write_text(text, encoding="utf-8")
-    except OSError as error:
-        raise as_output_error(path, error) from error
 
 
 def write_json(path: Path, data: Mapping[str, Any]) -> None:
@@ -153,14 +149,12 @@ def require_file(path: Path | str, form: str) -> None:
         OutputError: see `writing_file`.
     """
     path = real_path(path)
-    try:
+    with output_errors(path):
         problem = problem_with_file(path, form) if os.path.lexists(path) else None
         if problem is not None:
             raise OutputError(path, problem)
         with tempfile.TemporaryFile(dir=path.parent):
             pass
-    except OSError as error:
-        raise as_output_error(path, error) from error
 
 
 @contextlib.contextmanager

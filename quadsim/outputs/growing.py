@@ -22,7 +22,7 @@ from quadsim.outputs.manifest import (
     remove_empty,
     remove_lock,
 )
-from quadsim.outputs.paths import as_output_error, occupied, parents_of, real_path
+from quadsim.outputs.paths import occupied, output_errors, parents_of, real_path
 from quadsim.outputs.staging import STAGING, Staging, staging_beside
 
 _CHANGED: Final = "it is not as quadsim wrote it; move it away first"
@@ -62,11 +62,9 @@ class Growing:
             for folder in PurePosixPath(name).parents[:-1]:
                 if os.path.lexists(self.path / folder) and not is_folder(self.path / folder):
                     raise OutputError(self.path / folder, "it is not a folder of quadsim's; move it away first")
-            try:
+            with output_errors(path):
                 if os.path.lexists(path) and not is_known(path, self._files.get(name, ())):
                     raise OutputError(path, _CHANGED)
-            except OSError as error:
-                raise as_output_error(path, error) from error
 
     def write(self, files: Mapping[str, bytes]) -> None:
         """Write or replace files, by their relative paths; each is on the disk, whole, when this returns.
@@ -75,15 +73,13 @@ class Growing:
             OutputError: one cannot be written, or one that is there is not as we wrote it, and still there.
         """
         after = {name: (digest(content),) for name, content in files.items()}
-        try:
+        with output_errors(self.path):
             self.require(files)
             self._list({**self._files, **{name: (*self._files.get(name, ()), *new) for name, new in after.items()}})
             for name, content in files.items():
                 (self.path / name).parent.mkdir(exist_ok=True)
                 self._put(name, content, self._files[name])
             self._list({**self._files, **after})
-        except OSError as error:
-            raise as_output_error(self.path, error) from error
 
     def remove(self, names: Iterable[str]) -> None:
         """Remove files that are as we wrote them, and folders that are empty then.
@@ -92,13 +88,11 @@ class Growing:
             OutputError: one is not as we wrote it; it is still there.
         """
         there = [name for name in names if os.path.lexists(self.path / name)]
-        try:
+        with output_errors(self.path):
             for name in there:
                 self.require([name])
                 (self.path / name).unlink()
             self._list({name: known for name, known in self._files.items() if name not in there})
-        except OSError as error:
-            raise as_output_error(self.path, error) from error
         for folder in {(self.path / name).parent for name in there} - {self.path}:
             remove_empty(folder)
 
@@ -133,13 +127,11 @@ def growing(directory: Path | str, kind: str) -> Iterator[Growing]:
     """
     directory = real_path(directory)
     with parents_of(directory):
-        try:
+        with output_errors(directory):
             is_new = not directory.exists()
             directory.mkdir(exist_ok=True)
             found = read_manifest(directory)
             names = {path.name for path in directory.iterdir()} - {LOCK_FILE}
-        except OSError as error:
-            raise as_output_error(directory, error) from error
         others = sorted(name for name in names if not STAGING.fullmatch(name))
         if found is None and others:
             raise OutputError(directory, occupied(others))
@@ -159,10 +151,8 @@ def _held(directory: Path) -> Iterator[None]:
     flags = os.O_RDWR | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK
     path = directory / LOCK_FILE
     is_new = not os.path.lexists(path)
-    try:
+    with output_errors(path):
         handle = os.open(path, flags | (os.O_CREAT | os.O_EXCL if is_new else 0), 0o644)
-    except OSError as error:
-        raise as_output_error(path, error) from error
     try:
         _lock(handle, directory)
         yield

@@ -77,6 +77,15 @@ def few(names: Sequence[str]) -> str:
     return ", ".join(shown) + (f" and {len(names) - 3} more" if len(names) > 3 else "")
 
 
+@contextlib.contextmanager
+def output_errors(path: Path) -> Iterator[None]:
+    """Raise the system's errors as those of an output."""
+    try:
+        yield
+    except OSError as error:
+        raise as_output_error(path, error) from error
+
+
 def as_output_error(path: Path, error: OSError) -> OutputError:
     """The system's error as one of ours, which it may be already."""
     return error if isinstance(error, OutputError) else OutputError(path, error.strerror or str(error))

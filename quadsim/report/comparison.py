@@ -7,32 +7,35 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import Any, Final
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
 from quadsim.controller import law_name
 from quadsim.errors import printable
-from quadsim.flight.rundir import Run
-from quadsim.report.flight_conditions import (
-    Summary,
-    computation_rows,
-    course_rows,
-    estimation_rows,
-    ground_rows,
-    nested,
-    verdict_cell,
-)
 from quadsim.report.table import ABSENT, Cell, Mark, Row, format_number
 
-TRACKING_MEASURES: Final = {
-    "rmse": "RMS error",
-    "max_error": "largest error",
-    "final_error": "final error",
-    "overshoot": "overshoot",
+if TYPE_CHECKING:
+    from quadsim.flight.rundir import Run
+
+Summary = Mapping[str, Any]
+_VERDICTS: Final = {
+    "satisfied": "holds every required constraint",
+    "violated": "does not hold every required constraint",
+    "lost": "is lost",
 }
-TIME_MEASURES: Final = {"p50": "median", "p95": "95th percentile", "p99": "99th percentile", "max": "maximum"}
+FOR_GOOD: Final = "ends in fallback for good"
+"""Of a flight whose verdict rests on that alone; see `quadsim.flight.metrics.unrecovered`."""
+_Line = tuple[str, str, Callable[[Summary], Cell]]
+"""A row's label, its unit, and the cell of a summary."""
+
+
+def nested(data: Any, *keys: str) -> Any:
+    """A nested value, or None where a key is missing: a run that ended at once has no numbers."""
+    for key in keys:
+        data = data.get(key) if isinstance(data, Mapping) else None
+    return data
 
 
 def run_names(runs: Sequence[Run]) -> tuple[str, ...]:
@@ -56,28 +59,84 @@ def distinct_courses(runs: Sequence[Run]) -> list[Run]:
 def comparison_rows(runs: Sequence[Run]) -> list[Row]:
     """Everything the summaries say, side by side; a value that a run lacks is shown as `-`."""
     summaries = [run.summary for run in runs]
+
+    def rows(group: str, lines: Iterable[_Line], only_with: str = "status") -> Iterator[Row]:
+        if any(summary.get(only_with) for summary in summaries):
+            for label, unit, cell in lines:
+                yield Row(group=group, label=label, unit=unit, cells=tuple(map(cell, summaries)))
+
     return [
-        *_flight_rows(runs),
-        *course_rows(summaries),
+        *rows("Flight", _FLIGHT),
+        *rows("Course", _COURSE, "course"),
         *_tracking_rows(summaries),
         *_constraint_rows(summaries),
-        *ground_rows(summaries),
-        *estimation_rows(summaries),
-        *_command_rows(summaries),
-        *_solver_rows(summaries),
-        *computation_rows(summaries),
-        *_time_rows(summaries),
+        *rows("Ground", _GROUND, "ground"),
+        *rows("Measured state", _ESTIMATION, "estimation"),
+        *rows("Commands", _COMMANDS),
+        *rows("Solver", _SOLVER),
+        *rows("Simulated computation", _COMPUTATION, "computation"),
+        *_step_time_rows(summaries),
+        *rows("Time", _TIMES),
     ]
 
 
-def outcome(summary: Mapping[str, Any]) -> Cell:
+def is_completed(summary: Summary) -> bool:
+    """Whether the flight was flown to its end."""
+    return bool(summary["status"] == "completed")
+
+
+def outcome(summary: Summary) -> Cell:
     """Completed, or aborted with its reason."""
     if is_completed(summary):
         return Cell(text="completed", mark=Mark.GOOD)
     return Cell(text=f"aborted: {summary.get('reason')}", mark=Mark.BAD)
 
 
-def required(summary: Mapping[str, Any]) -> Cell:
+def verdict(summary: Summary) -> str:
+    """The verdict on a flight in one word: satisfied, violated, or lost."""
+    if summary["status"] != "completed":
+        return "lost"
+    whole = not (summary["controller"].get("unrecovered") or nested(summary, "ground", "crashed"))
+    return "satisfied" if whole and _all_held(summary) else "violated"
+
+
+def verdict_sentence(summary: Summary) -> str:
+    """What the verdict rests on, after the name of the flight."""
+    found = verdict(summary)
+    if found == "violated" and _all_held(summary):
+        return FOR_GOOD if summary["controller"].get("unrecovered") else "crashes"
+    return _VERDICTS[found]
+
+
+def _all_held(summary: Summary) -> bool:
+    return all(entry["satisfied"] for entry in summary["constraints"] if entry["required"])
+
+
+def fallback_sentence(periods: int) -> str:
+    """That a flight ended in fallback, after so many periods of it."""
+    return f"{periods} periods in fallback, never recovered"
+
+
+def failure_sentences(summary: Summary) -> list[str]:
+    """What kept the controller from its optimum: fallback for good, and why the first QP without an answer had none."""
+    periods, found = summary["controller"].get("unrecovered"), summary.get("diagnosis")
+    sentences = [fallback_sentence(periods)] if periods else []
+    return sentences + ([] if found is None else [found["sentence"], *filter(None, [found["advice"]])])
+
+
+def verdict_cell(summary: Summary) -> Cell:
+    """The verdict, and whether it is the one that the scenario states; a run of an older version states none."""
+    found, expected = verdict(summary), summary.get("expected")
+    if expected is None:
+        return Cell(text=found)
+    if summary.get("as_expected"):
+        return Cell(text=f"{found}, as expected", mark=Mark.GOOD if found == "satisfied" else Mark.NONE)
+    if found == expected:
+        return Cell(text=f"{found}, but interrupted", mark=Mark.BAD)
+    return Cell(text=f"{found}, expected: {expected}", mark=Mark.BAD)
+
+
+def required(summary: Summary) -> Cell:
     """The verdict on the constraints that the scenario demands, naming those that do not hold."""
     demanded = [entry for entry in summary["constraints"] if entry["required"]]
     failed = [entry for entry in demanded if not entry["satisfied"]]
@@ -89,45 +148,6 @@ def required(summary: Mapping[str, Any]) -> Cell:
     return Cell(text=f"all {len(demanded)} hold", mark=Mark.GOOD) if demanded else Cell(text="none")
 
 
-def _flight_rows(runs: Sequence[Run]) -> Iterator[Row]:
-    def row(label: str, cell: Callable[[Run], Cell], unit: str = "") -> Row:
-        return Row(group="Flight", label=label, unit=unit, cells=tuple(cell(run) for run in runs))
-
-    def text(value: Callable[[Run], object]) -> Callable[[Run], Cell]:
-        return lambda run: Cell(text=str(value(run)))
-
-    yield row("outcome", lambda run: outcome(run.summary))
-    yield row("verdict on the flight", lambda run: verdict_cell(run.summary))
-    yield row("required constraints", lambda run: required(run.summary))
-    yield row("time flown", lambda run: Cell(text=format_number(run.summary.get("duration"))), "s")
-    yield row("controller", text(lambda run: law_name(run.summary["controller"].get("name", ABSENT))))
-    yield row("solver", text(lambda run: run.summary["controller"].get("solver") or "closed form"))
-    yield row("horizon", text(lambda run: run.summary["controller"].get("horizon", ABSENT)), "periods")
-    yield row("vehicle", text(lambda run: run.vehicle.name))
-    yield row("mass", text(lambda run: format_number(run.vehicle.mass)), "kg")
-    yield row("seed", text(lambda run: run.summary.get("seed", ABSENT)))
-
-
-def _tracking_rows(summaries: Sequence[Summary]) -> Iterator[Row]:
-    for measure, label in TRACKING_MEASURES.items():
-        for channel in present_keys(summaries, "tracking", measure):
-            unit, values = tracking_values(summaries, measure, channel)
-            cells = _best_smallest(summaries, values)
-            yield Row(group="Tracking", label=f"{label}, {channel}", unit=unit, cells=cells)
-    yield from _settling_rows(summaries)
-
-
-def _settling_rows(summaries: Sequence[Summary]) -> Iterator[Row]:
-    """One row per step of the courses; `-` where an output does not settle or a run has no such step."""
-    settled = [
-        {(entry["channel"], entry["time"]): entry["settled"] for entry in nested(summary, "tracking", "settling") or ()}
-        for summary in summaries
-    ]
-    for channel, time in dict.fromkeys(step for steps in settled for step in steps):
-        cells = _best_smallest(summaries, [steps.get((channel, time)) for steps in settled])
-        yield Row(group="Tracking", label=f"settling, {channel} at {time:g} s", unit="s", cells=cells)
-
-
 def tracking_values(summaries: Sequence[Summary], measure: str, channel: str) -> tuple[str, list[float | None]]:
     """Unit and values of one tracking measure; angles in degrees."""
     units = {nested(summary, "tracking", "unit", channel) for summary in summaries} - {None}
@@ -137,76 +157,9 @@ def tracking_values(summaries: Sequence[Summary], measure: str, channel: str) ->
     return "/".join(sorted(units)), values
 
 
-def _constraint_rows(summaries: Sequence[Summary]) -> Iterator[Row]:
-    audits = [{entry["name"]: entry for entry in summary["constraints"]} for summary in summaries]
-    for name in dict.fromkeys(name for audit in audits for name in audit):
-        entries = [audit.get(name) for audit in audits]
-        own_unit = next(entry["unit"] for entry in entries if entry is not None)
-        for label, unit, cell in _CONSTRAINT_ROWS:
-            yield Row(
-                group=f"Constraint {name}",
-                label=label,
-                unit=own_unit if unit is None else unit,
-                cells=tuple(Cell() if entry is None else cell(entry) for entry in entries),
-                headline=label == "verdict",
-            )
-
-
-def _command_rows(summaries: Sequence[Summary]) -> Iterator[Row]:
-    labels = {
-        "speed_min": "lowest rotor speed",
-        "speed_max": "highest rotor speed",
-        "slew_min": "largest step down, per period",
-        "slew_max": "largest step up, per period",
-        "total_variation": "total variation",
-    }
-    for key, label in labels.items():
-        cells = tuple(Cell(text=format_number(nested(summary, "control", key))) for summary in summaries)
-        yield Row(group="Commands", label=label, unit="rad/s", cells=cells)
-
-
-def _solver_rows(summaries: Sequence[Summary]) -> Iterator[Row]:
-    def row(label: str, cell: Callable[[Summary], Cell]) -> Row:
-        return Row(group="Solver", label=label, cells=tuple(cell(summary["controller"]) for summary in summaries))
-
-    yield row("statuses", lambda controller: Cell(text=_counts(controller.get("statuses"))))
-    yield row("periods by fallback level", lambda controller: Cell(text=_counts(controller.get("fallbacks"))))
-    yield row("in fallback for good", lambda controller: Cell(text=format_number(controller.get("unrecovered"))))
-    yield row("iterations, mean", lambda controller: Cell(text=format_number(nested(controller, "iterations", "mean"))))
-    yield row("iterations, most", lambda controller: Cell(text=format_number(nested(controller, "iterations", "max"))))
-    yield row("active constraints, most", lambda controller: Cell(text=format_number(controller.get("active_max"))))
-
-
-def _time_rows(summaries: Sequence[Summary]) -> Iterator[Row]:
-    for clock, what in {"step_ms": "whole step", "solve_ms": "solver alone"}.items():
-        for measure, label in TIME_MEASURES.items():
-            values = [nested(summary, "controller", clock, measure) for summary in summaries]
-            yield Row(group="Time", label=f"{what}, {label}", unit="ms", cells=_best_smallest(summaries, values))
-
-    def row(label: str, unit: str, keys: tuple[str, str]) -> Row:
-        cells = tuple(Cell(text=format_number(nested(summary, *keys))) for summary in summaries)
-        return Row(group="Time", label=label, unit=unit, cells=cells)
-
-    yield row("deadline", "ms", ("controller", "deadline_ms"))
-    misses = [nested(summary, "controller", "deadline_misses") for summary in summaries]
-    cells = tuple(Cell(text=format_number(value), mark=Mark.BAD if value else Mark.NONE) for value in misses)
-    yield Row(group="Time", label="deadline misses", cells=cells)
-    yield row("simulated in", "s", ("wall_s", "simulate"))
-    yield row("with all files", "s", ("wall_s", "total"))
-
-
 def present_keys(summaries: Sequence[Summary], *path: str) -> list[str]:
     """Keys that any summary has at a path, in order."""
     return list(dict.fromkeys(key for summary in summaries for key in nested(summary, *path) or {}))
-
-
-def _counts(counts: Mapping[str, int] | None) -> str:
-    return ", ".join(f"{name}: {count}" for name, count in counts.items()) if counts else ABSENT
-
-
-def is_completed(summary: Summary) -> bool:
-    """Whether the flight was flown to its end."""
-    return bool(summary["status"] == "completed")
 
 
 def format_bounds(entry: Summary, unit: str = "") -> str:
@@ -221,20 +174,6 @@ def format_bounds(entry: Summary, unit: str = "") -> str:
     return f"{bounds} {unit}".rstrip() + window
 
 
-def _verdict(entry: Summary) -> str:
-    """The verdict and the tolerances it stands on, e.g. `holds (tolerance 0.01 / 0.05 deg)`."""
-    tolerance = f"tolerance {entry['tolerance_sampled']:g} / {entry['tolerance']:g} {entry['unit']}"
-    return f"{_finding(entry)} ({tolerance})"
-
-
-def _finding(entry: Summary) -> str:
-    if entry["worst_margin"] is None:
-        return "not reached"
-    if entry["satisfied"]:
-        return "holds"
-    return f"violated {format_excess(entry)}" if entry["required"] else f"exceeded {format_excess(entry)}, not required"
-
-
 def format_excess(entry: Summary) -> str:
     """How far a constraint was exceeded; says so where that was at the samples alone, in what was commanded."""
     at_samples = entry["worst_margin"] >= -entry["tolerance"]
@@ -242,27 +181,34 @@ def format_excess(entry: Summary) -> str:
     return f"by {format_number(-margin)} {entry['unit']}{' at the samples' if at_samples else ''}"
 
 
-def _verdict_mark(entry: Summary) -> Mark:
-    if entry["satisfied"]:
-        return Mark.GOOD
-    return Mark.BAD if entry["required"] else Mark.WARN
+def _tracking_rows(summaries: Sequence[Summary]) -> Iterator[Row]:
+    measures = {"rmse": "RMS error", "max_error": "largest error", "final_error": "final error"}
+    for measure, label in {**measures, "overshoot": "overshoot"}.items():
+        for channel in present_keys(summaries, "tracking", measure):
+            unit, values = tracking_values(summaries, measure, channel)
+            yield _best_smallest("Tracking", f"{label}, {channel}", unit, summaries, values)
+    # One row per step of the courses; `-` where an output does not settle or a run has no such step.
+    settled = [
+        {(entry["channel"], entry["time"]): entry["settled"] for entry in nested(summary, "tracking", "settling") or ()}
+        for summary in summaries
+    ]
+    for channel, time in dict.fromkeys(step for steps in settled for step in steps):
+        times = [steps.get((channel, time)) for steps in settled]
+        yield _best_smallest("Tracking", f"settling, {channel} at {time:g} s", "s", summaries, times)
 
 
-def _margin_cell(key: str, tolerance: str) -> Callable[[Summary], Cell]:
-    def cell(entry: Summary) -> Cell:
-        beyond = entry[key] is not None and entry[key] < -entry[tolerance]
-        return Cell(text=format_number(entry[key]), mark=_verdict_mark(entry) if beyond else Mark.NONE)
-
-    return cell
-
-
-def _violation_cell(entry: Summary) -> Cell:
-    seconds = entry["time_violated"]
-    return Cell(text=format_number(seconds), mark=_verdict_mark(entry) if seconds > 0.0 else Mark.NONE)
+def _step_time_rows(summaries: Sequence[Summary]) -> Iterator[Row]:
+    measures = {"p50": "median", "p95": "95th percentile", "p99": "99th percentile", "max": "maximum"}
+    for clock, what in {"step_ms": "whole step", "solve_ms": "solver alone"}.items():
+        for measure, label in measures.items():
+            values = [nested(summary, "controller", clock, measure) for summary in summaries]
+            yield _best_smallest("Time", f"{what}, {label}", "ms", summaries, values)
 
 
-def _best_smallest(summaries: Sequence[Summary], values: Sequence[float | None]) -> tuple[Cell, ...]:
-    """Cells with the value nearest to zero marked, among the flights that were completed and when they differ."""
+def _best_smallest(
+    group: str, label: str, unit: str, summaries: Sequence[Summary], values: Sequence[float | None]
+) -> Row:
+    """A row with the value nearest to zero marked, among the flights that were completed and when they differ."""
     texts = [format_number(value) for value in values]
     eligible = {
         i: abs(value)
@@ -271,21 +217,178 @@ def _best_smallest(summaries: Sequence[Summary], values: Sequence[float | None])
     }
     differ = len({texts[i] for i in eligible}) > 1
     best = {i for i in eligible if differ and texts[i] == texts[min(eligible, key=eligible.__getitem__)]}
-    return tuple(Cell(text=text, mark=Mark.BEST if i in best else Mark.NONE) for i, text in enumerate(texts))
+    cells = tuple(Cell(text=text, mark=Mark.BEST if i in best else Mark.NONE) for i, text in enumerate(texts))
+    return Row(group=group, label=label, unit=unit, cells=cells)
 
 
-def _number_cell(key: str) -> Callable[[Summary], Cell]:
-    return lambda entry: Cell(text=format_number(entry[key]))
+def _constraint_rows(summaries: Sequence[Summary]) -> Iterator[Row]:
+    audits = [{entry["name"]: entry for entry in summary["constraints"]} for summary in summaries]
+    for name in dict.fromkeys(name for audit in audits for name in audit):
+        entries = [audit.get(name) for audit in audits]
+        own_unit = next(entry["unit"] for entry in entries if entry is not None)
+        for label, unit, cell in _CONSTRAINT:
+            yield Row(
+                group=f"Constraint {name}",
+                label=label,
+                unit=own_unit if unit == _OWN else unit,
+                cells=tuple(Cell() if entry is None else cell(entry) for entry in entries),
+                headline=label == "verdict",
+            )
 
 
-_CONSTRAINT_ROWS: Final[tuple[tuple[str, str | None, Callable[[Summary], Cell]], ...]] = (
-    ("verdict", "", lambda entry: Cell(text=_verdict(entry), mark=_verdict_mark(entry))),
-    ("bounds", None, lambda entry: Cell(text=format_bounds(entry))),
-    ("peak at the samples", None, _number_cell("peak_sampled")),
-    ("peak at the physics rate", None, _number_cell("peak_plant")),
-    ("worst margin at the samples", None, _margin_cell("worst_margin_sampled", "tolerance_sampled")),
-    ("worst margin at the physics rate", None, _margin_cell("worst_margin", "tolerance")),
-    ("when", "s", _number_cell("worst_time")),
-    ("time violated", "s", _violation_cell),
+def _verdict(entry: Summary) -> Cell:
+    """The verdict on a constraint and the tolerances it stands on, e.g. `holds (tolerance 0.01 / 0.05 deg)`."""
+    if entry["worst_margin"] is None:
+        finding = "not reached"
+    elif entry["satisfied"]:
+        finding = "holds"
+    else:
+        excess = format_excess(entry)
+        finding = f"violated {excess}" if entry["required"] else f"exceeded {excess}, not required"
+    tolerance = f"tolerance {entry['tolerance_sampled']:g} / {entry['tolerance']:g} {entry['unit']}"
+    return Cell(text=f"{finding} ({tolerance})", mark=_verdict_mark(entry))
+
+
+def _verdict_mark(entry: Summary) -> Mark:
+    if entry["satisfied"]:
+        return Mark.GOOD
+    return Mark.BAD if entry["required"] else Mark.WARN
+
+
+def _margin(key: str, tolerance: str) -> Callable[[Summary], Cell]:
+    def cell(entry: Summary) -> Cell:
+        beyond = entry[key] is not None and entry[key] < -entry[tolerance]
+        return Cell(text=format_number(entry[key]), mark=_verdict_mark(entry) if beyond else Mark.NONE)
+
+    return cell
+
+
+def _violation(entry: Summary) -> Cell:
+    seconds = entry["time_violated"]
+    return Cell(text=format_number(seconds), mark=_verdict_mark(entry) if seconds > 0.0 else Mark.NONE)
+
+
+def _text(value: Callable[[Summary], object]) -> Callable[[Summary], Cell]:
+    return lambda summary: Cell(text=str(value(summary)))
+
+
+def _number(*keys: str, unit: str = "", wrong: Mark = Mark.NONE) -> Callable[[Summary], Cell]:
+    """The number at a path, in degrees where that is its unit; marked as wrong where it is not zero."""
+
+    def cell(summary: Summary) -> Cell:
+        value = nested(summary, *keys)
+        shown = math.degrees(value) if unit == "deg" and value is not None else value
+        return Cell(text=format_number(shown), mark=wrong if value else Mark.NONE)
+
+    return cell
+
+
+def _counts(key: str) -> Callable[[Summary], Cell]:
+    def cell(summary: Summary) -> Cell:
+        counts = summary["controller"].get(key)
+        return Cell(text=", ".join(f"{name}: {count}" for name, count in counts.items())) if counts else Cell()
+
+    return cell
+
+
+def _listed(key: str, form: str, mark: Mark) -> Callable[[Summary], Cell]:
+    """Entries of the course in one cell; `none` where there are none, `-` where a run does not say."""
+
+    def cell(summary: Summary) -> Cell:
+        entries = nested(summary, "course", key)
+        if not entries:
+            return Cell() if entries is None else Cell(text="none")
+        return Cell(text="; ".join(map(form.format, entries)), mark=mark)
+
+    return cell
+
+
+def _phase(summary: Summary) -> Cell:
+    if not summary.get("ground"):
+        return Cell()
+    crashed = nested(summary, "ground", "crashed")
+    return Cell(text=str(nested(summary, "ground", "phase")), mark=Mark.BAD if crashed else Mark.NONE)
+
+
+def _refused(summary: Summary) -> Cell:
+    samples = nested(summary, "estimation", "samples") or {}
+    parts = [f"{name} {n['rejected']} of {n['accepted'] + n['rejected']}" for name, n in samples.items()]
+    return Cell(text=", ".join(parts) or ABSENT)
+
+
+_FLIGHT: Final[tuple[_Line, ...]] = (
+    ("outcome", "", outcome),
+    ("verdict on the flight", "", verdict_cell),
+    ("required constraints", "", required),
+    ("time flown", "s", _number("duration")),
+    ("controller", "", _text(lambda summary: law_name(summary["controller"].get("name", ABSENT)))),
+    ("solver", "", _text(lambda summary: summary["controller"].get("solver") or "closed form")),
+    ("horizon", "periods", _text(lambda summary: summary["controller"].get("horizon", ABSENT))),
+    ("vehicle", "", _text(lambda summary: summary["vehicle"]["name"])),
+    ("mass", "kg", _number("vehicle", "mass")),
+    ("seed", "", _text(lambda summary: summary.get("seed", ABSENT))),
 )
-"""Rows of a constraint: label, unit (None for the constraint's own), and the cell of an entry of the audit."""
+_COURSE: Final[tuple[_Line, ...]] = (
+    ("largest tilt required", "deg", _number("course", "tilt")),
+    ("highest speed asked for", "m/s", _number("course", "velocity")),
+    ("lowest rotor speed asked for", "rad/s", _number("course", "rotor_min")),
+    ("highest rotor speed asked for", "rad/s", _number("course", "rotor_max")),
+    ("jumps", "", _listed("jumps", "at {:g} s", Mark.NONE)),
+    ("beyond the bounds", "", _listed("problems", "{}", Mark.WARN)),
+)
+_GROUND: Final[tuple[_Line, ...]] = (
+    ("take-off at", "s", _number("ground", "takeoff_time")),
+    ("touchdown at", "s", _number("ground", "touchdown", "time")),
+    ("touchdown, descending with", "m/s", _number("ground", "touchdown", "speed")),
+    ("touchdown, along the ground with", "m/s", _number("ground", "touchdown", "horizontal_speed")),
+    ("touchdown, tilt", "deg", _number("ground", "touchdown", "tilt")),
+    ("at the end", "", _phase),
+)
+_MEASURED: Final = {"x": "m", "y": "m", "z": "m", "roll": "deg", "pitch": "deg", "yaw": "deg"}
+_ESTIMATION: Final[tuple[_Line, ...]] = (
+    *(
+        (f"{label} error of the measured {name}", unit, _number("estimation", measure, name, unit=unit))
+        for measure, label in (("rmse", "RMS"), ("max_error", "largest"))
+        for name, unit in _MEASURED.items()
+    ),
+    ("periods without a number", "", _number("estimation", "not_finite")),
+    ("samples rejected by the filter", "", _refused),
+)
+_COMMANDS: Final[tuple[_Line, ...]] = (
+    ("lowest rotor speed", "rad/s", _number("control", "speed_min")),
+    ("highest rotor speed", "rad/s", _number("control", "speed_max")),
+    ("largest step down, per period", "rad/s", _number("control", "slew_min")),
+    ("largest step up, per period", "rad/s", _number("control", "slew_max")),
+    ("total variation", "rad/s", _number("control", "total_variation")),
+)
+_SOLVER: Final[tuple[_Line, ...]] = (
+    ("statuses", "", _counts("statuses")),
+    ("periods by fallback level", "", _counts("fallbacks")),
+    ("in fallback for good", "", _number("controller", "unrecovered")),
+    ("iterations, mean", "", _number("controller", "iterations", "mean")),
+    ("iterations, most", "", _number("controller", "iterations", "max")),
+    ("active constraints, most", "", _number("controller", "active_max")),
+)
+_COMPUTATION: Final[tuple[_Line, ...]] = (
+    ("command after its measurement, median", "ms", _number("computation", "delay_ms", "p50")),
+    ("command after its measurement, maximum", "ms", _number("computation", "delay_ms", "max")),
+    ("commands too late to be used", "", _number("computation", "missed", wrong=Mark.WARN)),
+)
+_TIMES: Final[tuple[_Line, ...]] = (
+    ("deadline", "ms", _number("controller", "deadline_ms")),
+    ("deadline misses", "", _number("controller", "deadline_misses", wrong=Mark.BAD)),
+    ("simulated in", "s", _number("wall_s", "simulate")),
+    ("with all files", "s", _number("wall_s", "total")),
+)
+_OWN: Final = "own"
+"""In place of a row's unit: the constraint's own."""
+_CONSTRAINT: Final[tuple[_Line, ...]] = (
+    ("verdict", "", _verdict),
+    ("bounds", _OWN, lambda entry: Cell(text=format_bounds(entry))),
+    ("peak at the samples", _OWN, _number("peak_sampled")),
+    ("peak at the physics rate", _OWN, _number("peak_plant")),
+    ("worst margin at the samples", _OWN, _margin("worst_margin_sampled", "tolerance_sampled")),
+    ("worst margin at the physics rate", _OWN, _margin("worst_margin", "tolerance")),
+    ("when", "s", _number("worst_time")),
+    ("time violated", "s", _violation),
+)

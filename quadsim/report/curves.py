@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 
-from quadsim.flight.log import FlightLog
-from quadsim.state import Array
+from quadsim.flight.audit import SIGNALS, Limit
+from quadsim.flight.log import ControlLog, FlightLog
+from quadsim.state import REFERENCE_NAMES, Array
 
 LEAST_SPANS: Final = {"m": 0.01, "deg": 0.1, "m/s": 0.01, "deg/s": 0.1, "rad/s": 1.0}
 """Span of an axis, by its unit, below which there is nothing to see but rounding."""
@@ -17,11 +18,9 @@ _HALF_TURN: Final = 180.0
 
 
 def least_range(curves: Sequence[Array], unit: str) -> tuple[float, float] | None:
-    """Ends of an axis for curves that stand still; None where an axis may fit itself to them.
+    """Ends of an axis for curves that stand still; None where it may fit itself to them, or has no least span.
 
-    Args:
-        curves: all that the axis shows; numbers that are not finite do not count.
-        unit: of the axis; one that is not in `LEAST_SPANS` has no least span.
+    Numbers that are not finite do not count.
     """
     values = np.concatenate([np.ravel(curve) for curve in curves]) if curves else np.empty(0)
     values = values[np.isfinite(values)]
@@ -34,16 +33,27 @@ def least_range(curves: Sequence[Array], unit: str) -> tuple[float, float] | Non
     return middle - 0.5 * span, middle + 0.5 * span
 
 
+def reference_curve(log: ControlLog, name: str) -> Array:
+    """(K,) filtered reference of x, y, z or yaw, in the unit of its signal."""
+    values = log.reference[:, REFERENCE_NAMES.index(name)]
+    return np.degrees(values) if SIGNALS[name].unit == "deg" else values
+
+
+def bounds_of(limits: Iterable[Limit], signal: str, end: float) -> list[tuple[float, float, float]]:
+    """Each distinct bound on a signal, once, and from when to when it holds in a flight that ends at `end` [s]."""
+    bounds = {
+        (bound, limit.start, min(limit.stop, end)): None
+        for limit in limits
+        for bound in (limit.lower, limit.upper)
+        if limit.signal == signal and limit.start < end and np.isfinite(bound)
+    }
+    return list(bounds)
+
+
 def break_at_wraps(t: Array, values: Array, unit: str) -> tuple[Array, Array]:
     """A curve with a gap wherever an angle in degrees jumps by more than half a turn, as roll does beyond 180 deg.
 
-    Args:
-        t: (K,) [s].
-        values: (K,).
-        unit: of the values; only those in `deg` wrap.
-
-    Returns:
-        Times and values, (K + wraps,) each, with a NaN in each gap.
+    Times [s] and values (K,) become (K + wraps,), with a NaN in each gap; values of another unit than `deg` never wrap.
     """
     after = np.flatnonzero(np.abs(np.diff(values)) > _HALF_TURN) + 1 if unit == "deg" else np.empty(0, int)
     return np.insert(t, after, 0.5 * (t[after - 1] + t[after])), np.insert(values, after, np.nan)
@@ -55,14 +65,7 @@ _VISIBLE_SPEED: Final = 1e-3
 
 @dataclass(frozen=True, kw_only=True)
 class EffectCurves:
-    """One quantity along x, y and z at the plant's instants.
-
-    Attributes:
-        key: short name, e.g. `wind`.
-        title: what it is.
-        unit: its unit.
-        values: (M, 3).
-    """
+    """One quantity along x, y and z at the plant's instants, `values` (M, 3); `key` is a short name, e.g. `wind`."""
 
     key: str
     title: str
@@ -74,11 +77,11 @@ def effect_curves(log: FlightLog) -> list[EffectCurves]:
     """External force and torque, and the wind, each where it is not zero throughout."""
     wrench = np.zeros((1, 6)) if log.plant.wrench is None else log.plant.wrench
     wind = np.zeros((1, 3)) if log.plant.wind is None else log.plant.wind
-    curves = [
+    curves = (
         EffectCurves(key="force", title="external force, world", unit="N", values=wrench[:, :3]),
         EffectCurves(key="torque", title="external torque, body", unit="N m", values=wrench[:, 3:]),
         EffectCurves(key="wind", title="wind, world", unit="m/s", values=wind),
-    ]
+    )
     return [entry for entry in curves if np.any(entry.values)]
 
 

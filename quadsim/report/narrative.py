@@ -3,24 +3,26 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
-from typing import Any
+from collections.abc import Iterator, Sequence
 
 from quadsim.flight.rundir import Run
 from quadsim.report.comparison import (
+    Summary,
     distinct_courses,
+    failure_sentences,
     format_bounds,
     format_excess,
     is_completed,
+    nested,
     present_keys,
     run_names,
     tracking_values,
+    verdict,
+    verdict_sentence,
 )
-from quadsim.report.flight_conditions import failure_sentences, nested, verdict, verdict_sentence
 from quadsim.report.table import format_number
 
-_Summary = Mapping[str, Any]
-_Named = Sequence[tuple[str, _Summary]]
+_Named = Sequence[tuple[str, Summary]]
 
 
 def comparison_sentences(runs: Sequence[Run]) -> list[str]:
@@ -72,7 +74,7 @@ def condition_sentences(named: _Named) -> Iterator[str]:
             )
 
 
-def _ground_sentences(name: str, summary: _Summary) -> Iterator[str]:
+def _ground_sentences(name: str, summary: Summary) -> Iterator[str]:
     if not summary.get("ground"):
         return
     ground = summary["ground"]
@@ -84,7 +86,7 @@ def _ground_sentences(name: str, summary: _Summary) -> Iterator[str]:
     yield f"{name} {_list(phrases)}."
 
 
-def _estimation_sentences(name: str, summary: _Summary) -> Iterator[str]:
+def _estimation_sentences(name: str, summary: Summary) -> Iterator[str]:
     if not summary.get("estimation"):
         return
     rmse, gone = summary["estimation"]["rmse"], summary["estimation"]["not_finite"]
@@ -97,7 +99,7 @@ def _estimation_sentences(name: str, summary: _Summary) -> Iterator[str]:
 
 
 def _limit_sentences(named: _Named) -> Iterator[str]:
-    cases: dict[str, list[tuple[str, _Summary]]] = {}
+    cases: dict[str, list[tuple[str, Summary]]] = {}
     unreached: dict[str, list[str]] = {}
     for name, summary in named:
         for entry in summary["constraints"]:
@@ -112,17 +114,14 @@ def _limit_sentences(named: _Named) -> Iterator[str]:
         if constraint in held or not reached:
             continue
         bounds = {format_bounds(entry, entry["unit"]) for _, entry in reached}
-        if len(bounds) == 1:
-            phrases = (f"{name} {_case(entry)}" for name, entry in reached)
-            yield f"{constraint}, {bounds.pop()}: {'; '.join(phrases)}."
-        else:
-            phrases = (f"{name} ({format_bounds(entry, entry['unit'])}) {_case(entry)}" for name, entry in reached)
-            yield f"{constraint}, whose bounds differ: {'; '.join(phrases)}."
+        own = {name: f" ({format_bounds(entry, entry['unit'])})" if len(bounds) > 1 else "" for name, entry in reached}
+        phrases = "; ".join(f"{name}{own[name]} {_case(entry)}" for name, entry in reached)
+        yield f"{constraint}, {bounds.pop() if len(bounds) == 1 else 'whose bounds differ'}: {phrases}."
     for name, constraints in unreached.items():
         yield f"{name} ended before it was held to {_list(constraints)}."
 
 
-def _case(entry: _Summary) -> str:
+def _case(entry: Summary) -> str:
     """What one run did to one bound, e.g. `exceeds it by 5.62 deg, for 3.24 s in all`."""
     if not entry["satisfied"]:
         text = f"{'violates' if entry['required'] else 'exceeds'} it {format_excess(entry)}"

@@ -34,14 +34,9 @@ class Cell:
 
 @dataclass(frozen=True, kw_only=True)
 class Row:
-    """One quantity, across all runs.
+    """One quantity under the heading of its group: a cell for each run, in order.
 
-    Attributes:
-        group: the heading it stands under.
-        label: the quantity.
-        unit: its unit; empty when it has none.
-        cells: one per run, in order.
-        headline: whether it is its group's answer in one line: the verdict on a constraint.
+    A headline is its group's answer in one line, such as the verdict on a constraint.
     """
 
     group: str
@@ -55,12 +50,7 @@ class Row:
 class Grid:
     """A table of cases: a head, and a line of cells for each case, the first of which names it.
 
-    Attributes:
-        key: its identifier in a page.
-        title: its heading.
-        head: what stands above each column.
-        lines: cells of each case, as many as there are columns.
-        note: what a reader has to know of it.
+    `key` is its identifier in a page, `note` what a reader has to know of it.
     """
 
     key: str
@@ -70,13 +60,19 @@ class Grid:
     note: str = ""
 
 
+def line(*cells: Cell | str) -> tuple[Cell, ...]:
+    """A line of a grid; a text is a cell without a mark."""
+    return tuple(cell if isinstance(cell, Cell) else Cell(text=cell) for cell in cells)
+
+
 def to_markdown(rows: Sequence[Row], names: Sequence[str]) -> str:
     """A Markdown table of the rows: headlines and the best values in bold type."""
     lines = [_markdown_line("", "", *names), _markdown_line("---", "---", *("---:" for _ in names))]
     group = ""
     for row in rows:
         cells = [f"**{cell.text}**" if row.headline or cell.mark is Mark.BEST else cell.text for cell in row.cells]
-        lines.append(_markdown_line(f"**{row.group}**" if row.group != group else "", _with_unit(row), *cells))
+        label = f"{row.label} [{row.unit}]" if row.unit else row.label
+        lines.append(_markdown_line(f"**{row.group}**" if row.group != group else "", label, *cells))
         group = row.group
     return "\n".join(lines) + "\n"
 
@@ -87,6 +83,11 @@ def grid_to_markdown(grid: Grid) -> str:
     for cells in grid.lines:
         lines.append(_markdown_line(*(f"**{cell.text}**" if cell.mark is Mark.BEST else cell.text for cell in cells)))
     return "\n".join(lines) + "\n"
+
+
+def section(grid: Grid, level: int = 2) -> str:
+    """A grid under its title, with its note, as Markdown."""
+    return f"{level * '#'} {grid.title}\n\n{grid_to_markdown(grid)}\n{grid.note}".rstrip() + "\n"
 
 
 def _markdown_line(*texts: str) -> str:
@@ -101,7 +102,3 @@ def format_number(value: float | None) -> str:
     if 1e4 <= size < 1e7:
         return f"{value:.0f}"
     return f"{value:.4g}" if size == 0.0 or 1e-3 <= size < 1e7 else f"{value:.1e}"
-
-
-def _with_unit(row: Row) -> str:
-    return f"{row.label} [{row.unit}]" if row.unit else row.label

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Final
 
 import mujoco
@@ -16,11 +15,9 @@ from quadsim.vehicle import N_ROTORS, Vehicle
 BODY: Final = "quadrotor"
 FLOOR: Final = "floor"
 IMU: Final = "imu"
-ROTOR_NAMES: Final = tuple(f"rotor{i}" for i in range(1, N_ROTORS + 1))
-ARM_NAMES: Final = tuple(f"arm{i}" for i in range(1, N_ROTORS + 1))
-FOOT_NAMES: Final = tuple(f"foot{i}" for i in range(1, N_ROTORS + 1))
-DISC_NAMES: Final = tuple(f"disc{i}" for i in range(1, N_ROTORS + 1))
-PROPELLER_NAMES: Final = tuple(f"propeller{i}" for i in range(1, N_ROTORS + 1))
+ROTOR_NAMES, ARM_NAMES, FOOT_NAMES, DISC_NAMES, PROPELLER_NAMES = (
+    tuple(f"{part}{i}" for i in range(1, N_ROTORS + 1)) for part in ("rotor", "arm", "foot", "disc", "propeller")
+)
 
 DRAWN_ARM: Final = 0.3
 """Arm length [m] for which `quadrotor.xml` is drawn."""
@@ -63,54 +60,6 @@ def outline(vehicle: Vehicle) -> Outline:
     )
 
 
-def build_spec(
-    vehicle: Vehicle,
-    *,
-    visuals: bool = True,
-    contact: bool = False,
-    reweighed: bool = False,
-    body_drag: tuple[float, ...] | None = None,
-    air_density: float = 0.0,
-) -> mujoco.MjSpec:
-    """The airframe's specification with every physical number taken from the vehicle.
-
-    Actuator i takes the thrust f_i = b w_i^2 [N] as its control and acts on site i along the site's z axis; the
-    sixth entry of its gear turns thrust into reaction torque, spin_i d / b [m].
-
-    Args:
-        vehicle: the numbers.
-        visuals: whether to keep what is there to be looked at and read (geoms, lights, cameras, sensors), fitted to the
-            vehicle's arms.  None of it moves the vehicle: without it every state is the same to the last bit, in half
-            the time.
-        contact: whether feet and hull meet the floor.
-        reweighed: whether the body's mass may be changed once compiled; see `quadsim.sim.effects.load.apply_mass`.
-        body_drag: drag areas C_d A along the body axes [m^2], or None.  The drag is MuJoCo's own, on the ellipsoid
-            whose projected areas they are: -rho A |v| v / 2 against the air that `option.wind` moves.  With it come
-            the ellipsoid's added-mass terms, a few grams of air.
-        air_density: rho [kg/m^3].
-    """
-    spec = mujoco.MjSpec.from_file(str(models_dir() / "quadrotor.xml"))
-    spec.option.gravity = [0.0, 0.0, -vehicle.gravity]
-    body = spec.body(BODY)
-    body.mass, body.inertia = vehicle.mass, list(vehicle.inertia)
-    if reweighed:
-        body.simple = 0
-    thrust_range = rotor_thrusts(vehicle, np.array([vehicle.speed_min, vehicle.speed_max]))
-    for name, position, spin in zip(ROTOR_NAMES, vehicle.rotor_positions, vehicle.rotor_spins, strict=True):
-        spec.site(name).pos = position
-        actuator = spec.actuator(name)
-        actuator.gear = [0.0, 0.0, 1.0, 0.0, 0.0, spin * vehicle.drag_to_thrust]
-        actuator.ctrlrange = thrust_range
-    _fit_drawing(spec, vehicle)
-    if contact:
-        _ground(spec)
-    if not visuals:
-        _strip(spec, contact=contact)
-    if body_drag is not None:
-        _add_drag(spec, body_drag, air_density)
-    return spec
-
-
 def compile_model(
     vehicle: Vehicle,
     *,
@@ -122,29 +71,45 @@ def compile_model(
     body_drag: tuple[float, ...] | None = None,
     air_density: float = 0.0,
 ) -> mujoco.MjModel:
-    """Compile the airframe.
+    """Compile the airframe with every physical number taken from the vehicle.
+
+    Actuator i takes the thrust f_i = b w_i^2 [N] as its control and acts on site i along the site's z axis; the
+    sixth entry of its gear turns thrust into reaction torque, spin_i d / b [m].
 
     Args:
         vehicle: the numbers.
         timestep: physics step [s].
         limit_speeds: whether thrusts saturate at the vehicle's rotor speed range; else any thrust >= 0 acts.
-        visuals: whether the model can be looked at; see `build_spec`.
-        contact: whether it can stand on the ground; see `build_spec`.
-        reweighed: see `build_spec`.
-        body_drag: see `build_spec`.
-        air_density: see `build_spec`.
+        visuals: whether to keep what is there to be looked at and read (geoms, lights, cameras, sensors), fitted to the
+            vehicle's arms.  None of it moves the vehicle: without it every state is the same to the last bit, in half
+            the time.
+        contact: whether feet and hull meet the floor.
+        reweighed: whether the body's mass may be changed once compiled; see `quadsim.sim.effects.load.apply_mass`.
+        body_drag: drag areas C_d A along the body axes [m^2], or None.  The drag is MuJoCo's own, on the ellipsoid
+            whose projected areas they are: -rho A |v| v / 2 against the air that `option.wind` moves.  With it come
+            the ellipsoid's added-mass terms, a few grams of air.
+        air_density: rho [kg/m^3].
     """
-    spec = build_spec(
-        vehicle,
-        visuals=visuals,
-        contact=contact,
-        reweighed=reweighed,
-        body_drag=body_drag,
-        air_density=air_density,
-    )
+    spec = mujoco.MjSpec.from_file(str(models_dir() / "quadrotor.xml"))
     spec.option.timestep = timestep
-    for name in ROTOR_NAMES:
-        spec.actuator(name).ctrllimited = int(limit_speeds)
+    spec.option.gravity = [0.0, 0.0, -vehicle.gravity]
+    body = spec.body(BODY)
+    body.mass, body.inertia = vehicle.mass, list(vehicle.inertia)
+    if reweighed:
+        body.simple = 0
+    thrust_range = rotor_thrusts(vehicle, np.array([vehicle.speed_min, vehicle.speed_max]))
+    for name, position, spin in zip(ROTOR_NAMES, vehicle.rotor_positions, vehicle.rotor_spins, strict=True):
+        spec.site(name).pos = position
+        actuator = spec.actuator(name)
+        actuator.gear = [0.0, 0.0, 1.0, 0.0, 0.0, spin * vehicle.drag_to_thrust]
+        actuator.ctrlrange, actuator.ctrllimited = thrust_range, int(limit_speeds)
+    _fit_drawing(spec, vehicle)
+    if contact:
+        _ground(spec)
+    if not visuals:
+        _strip(spec, contact=contact)
+    if body_drag is not None:
+        _add_drag(spec, body_drag, air_density)
     return spec.compile()
 
 
@@ -156,7 +121,11 @@ def rotor_thrusts(vehicle: Vehicle, speeds: Array) -> Array:
 def _fit_drawing(spec: mujoco.MjSpec, vehicle: Vehicle) -> None:
     """Scale the drawing to the arms, turn each to its rotor, size the discs as the rotors, colour what is in front."""
     scale = vehicle.arm_length / DRAWN_ARM
-    _scale([*spec.geoms, *spec.cameras, *(spec.body(name) for name in PROPELLER_NAMES)], scale)
+    for element in (*spec.geoms, *spec.cameras, *(spec.body(name) for name in PROPELLER_NAMES)):
+        element.pos *= scale
+        if isinstance(element, mujoco.MjsGeom):
+            element.size *= scale
+            element.fromto *= scale
     spec.geom(FLOOR).size = [0.0, 0.0, 1.0]  # endless whatever the scale
     spec.stat.extent *= scale
     positions = vehicle.rotor_positions
@@ -169,14 +138,6 @@ def _fit_drawing(spec: mujoco.MjSpec, vehicle: Vehicle) -> None:
         if positions[i - 1, 0] > 0.1 * vehicle.arm_length:
             spec.geom(f"arm{i}").material = "front"
             disc.material = "disc_front"
-
-
-def _scale(elements: Sequence[mujoco.MjsGeom | mujoco.MjsCamera | mujoco.MjsBody], scale: float) -> None:
-    for element in elements:
-        element.pos *= scale
-        if isinstance(element, mujoco.MjsGeom):
-            element.size *= scale
-            element.fromto *= scale
 
 
 def _ground(spec: mujoco.MjSpec) -> None:

@@ -100,7 +100,8 @@ def fly(
             due = min(wait, steps_per_period)
             if computation is not None and computation.plan:
                 due = min(due, math.ceil(computation.delay / plant.timestep - 1e-6))
-            holds = [(acting, due), (_next_row(plan, age), min(wait, steps_per_period) - due)]
+            planned = plan[min(age + 1, len(plan) - 1)]  # its last row beyond its end
+            holds = [(acting, due), (planned, min(wait, steps_per_period) - due)]
             if missed:
                 age += 1
                 acting = holds[1][0] if holds[1][1] else acting
@@ -153,15 +154,8 @@ def fly(
 class Sample:
     """One control period as it was flown.
 
-    Attributes:
-        command: the controller's answer.
-        speeds: (4,) the command in force at the period's end: an earlier one, if this one missed its deadline [rad/s].
-        phase: where the flight stood with the ground.
-        delay: simulated time from the measurement to the command [s].
-        missed: whether that was too long.
-        step_s: wall time of the controller's step [s].
-        segment: what the plant did.
-        rotors: (4,) rotor speeds at the period's end [rad/s].
+    `speeds` (4,) [rad/s] are the command in force at its end, an earlier one if `command` was missed, and `rotors` (4,)
+    how fast the rotors turned then; `delay` [s] is simulated, `step_s` [s] the wall time of the controller's step.
     """
 
     command: Command
@@ -172,12 +166,6 @@ class Sample:
     step_s: float
     segment: Segment
     rotors: Array
-
-
-def _next_row(plan: Array, age: int) -> Array:
-    """What a plan (N, 4) has for the period after its first and `age` more; its last row beyond its end."""
-    row: Array = plan[min(age + 1, len(plan) - 1)]
-    return row
 
 
 def _control_log(
@@ -208,22 +196,17 @@ def _control_log(
 
 
 def _plant_log(samples: list[Sample], start: Array, initial_speeds: Array, yaw: float, timestep: float) -> PlantLog:
-    segments = [sample.segment for sample in samples]
-    physics = np.concatenate([start[None], *(segment.physics for segment in segments)])
-    last = samples[-1].rotors if samples else initial_speeds
-    flown = Segment.join(segments) if segments else None
+    if not samples:
+        return PlantLog(t=_times(1, timestep), state=physics_to_state(start[None], yaw), speeds=initial_speeds[None])
+    flown = Segment.join([sample.segment for sample in samples])
+    physics = np.concatenate([start[None], flown.physics])
     return PlantLog(
-        t=_times(physics.shape[0], timestep),
+        t=_times(len(physics), timestep),
         state=physics_to_state(physics, yaw),
-        speeds=np.concatenate([*(segment.speeds for segment in segments), last[None]]),
-        wrench=None if flown is None else _held(flown.wrench),
-        wind=None if flown is None else _held(flown.wind),
+        speeds=np.concatenate([flown.speeds, samples[-1].rotors[None]]),
+        wrench=None if flown.wrench is None else np.concatenate([flown.wrench, flown.wrench[-1:]]),
+        wind=None if flown.wind is None else np.concatenate([flown.wind, flown.wind[-1:]]),
     )
-
-
-def _held(rows: Array | None) -> Array | None:
-    """What holds from each row on, with the last repeated for the flight's end."""
-    return None if rows is None else np.concatenate([rows, rows[-1:]])
 
 
 def _times(count: int, spacing: float) -> Array:

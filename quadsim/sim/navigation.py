@@ -6,7 +6,6 @@ import copy
 import math
 from collections.abc import Sequence
 from operator import attrgetter
-from typing import Final
 
 import numpy as np
 
@@ -27,8 +26,6 @@ from quadsim.state import (
     quaternion_to_euler,
 )
 from quadsim.vehicle import Vehicle
-
-_TAKEN: Final = attrgetter("taken")
 
 
 class Navigation:
@@ -58,7 +55,7 @@ class Navigation:
             timestep: physics step [s].
             sensors: at most one of each name; absent ones are perfect, or not there where there is an estimator.
             rng: where all randomness comes from.
-            faults: what befalls the sensors; a perfect one can be befallen too.
+            faults: what befalls the sensors, perfect ones too.
             estimator: the error-state filter's tuning, or None.
 
         Raises:
@@ -104,12 +101,9 @@ class Navigation:
             self._filter.advance(np.empty((0, len(speeds))), self._arrived(), first=0)
 
     def advance(self, physics: Array, commands: Array, *, standing: bool = False) -> None:
-        """Take note of a segment of flight.
+        """Take note of a segment of flight: (M, 14) true states after each physics step, (M, 4) rotor speeds [rad/s].
 
-        Args:
-            physics: (M, 14) the true state after each physics step.
-            commands: (M, 4) rotor speeds in force during each of these steps [rad/s].
-            standing: whether the feet stood on the ground when the segment began, as a land detector has it.
+        `standing` is what a land detector says of the feet when the segment began.
         """
         if not len(physics):
             return
@@ -150,14 +144,10 @@ class Navigation:
 
     def _receive(self, physics: Array, first: int) -> None:
         for sampler in self._samplers:
-            self._in_flight.extend(sampler.sample(physics, first))
+            self._in_flight += sampler.sample(physics, first)
 
     def _arrived(self) -> list[Sample]:
         """The samples that have arrived since last asked, the oldest first; the rest stay on their way."""
-        arrived: list[Sample] = []
-        in_flight: list[Sample] = []
-        for sample in self._in_flight:
-            (arrived if sample.arrival <= self._step else in_flight).append(sample)
-        self._in_flight = in_flight
-        arrived.sort(key=_TAKEN)
-        return arrived
+        arrived = [sample for sample in self._in_flight if sample.arrival <= self._step]
+        self._in_flight = [sample for sample in self._in_flight if sample.arrival > self._step]
+        return sorted(arrived, key=attrgetter("taken"))

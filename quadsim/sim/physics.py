@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -81,9 +82,6 @@ class Segment:
         if len(parts) == 1:
             return parts[0]
 
-        def stack(name: str) -> Array | None:
-            arrays = [getattr(part, name) for part in parts]
-            return None if arrays[0] is None else np.concatenate(arrays)
-
-        physics, speeds = (np.concatenate([getattr(part, name) for part in parts]) for name in ("physics", "speeds"))
-        return Segment(physics=physics, speeds=speeds, wrench=stack("wrench"), wind=stack("wind"))
+        columns = {name: [getattr(part, name) for part in parts] for name in vars(parts[0])}
+        stacked: dict[str, Any] = {name: None if c[0] is None else np.concatenate(c) for name, c in columns.items()}
+        return Segment(**stacked)

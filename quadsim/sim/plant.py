@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from functools import cached_property
 from operator import add
 from struct import Struct
-from types import TracebackType
 from typing import Final
 
 import mujoco
@@ -15,18 +14,20 @@ import numpy as np
 from mujoco.rollout import Rollout
 
 from quadsim.controller import check_command
-from quadsim.errors import CommandError, DivergenceError, ParameterError
+from quadsim.errors import CommandError, DivergenceError, ForceError, ParameterError
 from quadsim.sim.airframe import BODY, compile_model, outline
-from quadsim.sim.effects import Air, Effects, Load, Payload, PayloadChange, RotorChange, RotorDynamics, Wind
+from quadsim.sim.effects import Effects, Force, Load, Payload, PayloadChange, RotorChange, RotorDynamics
 from quadsim.sim.effects.forces import StepForces
 from quadsim.sim.effects.load import apply_mass, mass_properties
+from quadsim.sim.effects.wind import Air, WindField
 from quadsim.sim.physics import Segment, physics_to_state
 from quadsim.state import (
+    ANGLE_RATES,
+    ANGLES,
     EULER,
-    EULER_RATE,
     N_STATES,
-    POSITION,
-    VELOCITY,
+    POSITIONS,
+    VELOCITIES,
     Array,
     euler_to_body_rates,
     euler_to_quaternion,
@@ -44,8 +45,6 @@ _NUMERICAL_WARNINGS: Final = (
     mujoco.mjtWarning.mjWARN_BADQACC,
     mujoco.mjtWarning.mjWARN_BADCTRL,
 )
-
-
 _CALM: Final = Effects()
 _AS_THE_FILE_SAYS: Final = Load()
 
@@ -72,7 +71,8 @@ class Plant:
         limit_speeds: bool = False,
         effects: Effects = _CALM,
         changes: Sequence[RotorChange | PayloadChange] = (),
-        wind: Wind | None = None,
+        wind: WindField | None = None,
+        forces: Sequence[Force] = (),
         rng: np.random.Generator | None = None,
     ) -> None:
         self.vehicle = vehicle
@@ -96,8 +96,8 @@ class Plant:
         self._rollout = Rollout(nthread=0)
         self._physics = np.zeros((1, mujoco.mj_stateSize(self.model, _FULL)))
         self._yaw = 0.0
-        self._wind = wind
-        self._by_step = effects.follows_state or wind is not None
+        self._wind, self._own = wind, tuple(forces)
+        self._by_step = effects.follows_state or wind is not None or bool(self._own)
         ordered = sorted(changes, key=lambda change: change.time)
         self._changes = [(math.ceil(change.time / timestep - 1e-6), change) for change in ordered]
         self._rng = rng if rng is not None else np.random.default_rng(0)
@@ -107,9 +107,7 @@ class Plant:
     def __enter__(self) -> Plant:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._rollout.close()
 
     @property
@@ -146,15 +144,10 @@ class Plant:
         if state.shape != (N_STATES,) or not np.all(np.isfinite(state)):
             raise ParameterError("plant", "state", state.tolist(), f"{N_STATES} finite numbers")
         mujoco.mj_resetData(self.model, self._data)
-        euler = state[list(EULER)]
+        euler = state[ANGLES]
+        rates = euler_to_body_rates(euler, state[ANGLE_RATES])
         self._physics[0] = np.concatenate(
-            [
-                [0.0],
-                state[list(POSITION)],
-                euler_to_quaternion(euler),
-                state[list(VELOCITY)],
-                euler_to_body_rates(euler, state[list(EULER_RATE)]),
-            ]
+            [[0.0], state[POSITIONS], euler_to_quaternion(euler), state[VELOCITIES], rates]
         )
         self._yaw = float(euler[2])
         self._step = 0
@@ -167,6 +160,8 @@ class Plant:
         self._rng.bit_generator.state = self._rng_start
         if self._wind is not None:
             self._wind.reset()
+        for force in self._own:
+            getattr(force, "reset", lambda: None)()
 
     @cached_property
     def _forces(self) -> StepForces:
@@ -248,7 +243,6 @@ class Plant:
         """All steps in one call: thrusts (M, 4) [N] -> states (M, 14)."""
         steps = len(thrusts)
         states = np.empty((1, steps, self._physics.shape[1]))
-        sensors = np.empty((1, steps, self.model.nsensordata))
         self._rollout.rollout(
             [self.model],
             [self._data],
@@ -258,7 +252,7 @@ class Plant:
             skip_checks=True,
             nstep=steps,
             state=states,
-            sensordata=sensors,
+            sensordata=np.empty((1, steps, self.model.nsensordata)),
         )
         return states[0]
 
@@ -286,6 +280,8 @@ class Plant:
             velocity_before = velocity
             if noises is not None:
                 acting = list(map(add, acting, noises[i]))
+            if self._own:
+                acting = list(map(add, acting, self._own_wrench(i * self.timestep)))
             _SIX.pack_into(applied, 0, *acting)
             _SIX.pack_into(wrenches, i * _SIX.size, *acting)
             _FOUR.pack_into(control, 0, *thrust)
@@ -300,6 +296,23 @@ class Plant:
         start = self._physics[0, :1]
         trajectory[:, 0] = np.add.accumulate(np.concatenate([start, np.full(steps, self.timestep)]))[1:]
         return trajectory, wrench
+
+    def _own_wrench(self, since: float) -> list[float]:
+        """The sum of the forces of one's own, world [N] and body frame [N m], so long [s] after the hold's begin.
+
+        Raises:
+            ForceError: one is not six finite numbers.
+        """
+        physics, time = np.concatenate([[0.0], self._data.qpos, self._data.qvel]), self.time + since
+        state, total = physics_to_state(physics[None])[0], np.zeros(6)
+        for force in self._own:
+            wrench = np.asarray(force(time, state.copy()), float)
+            if wrench.shape != (6,) or not np.all(np.isfinite(wrench)):
+                name = getattr(force, "__name__", type(force).__name__)
+                given = f"{wrench.tolist()!r:.80}"
+                raise ForceError(f"the force {name} must give six finite numbers [N, N m]; got {given}", time=time)
+            total += wrench
+        return total.tolist()
 
     def _check(self, trajectory: Array) -> None:
         if not np.abs(trajectory).max() < _PLAUSIBLE:  # as NaN is not

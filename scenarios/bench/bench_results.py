@@ -5,67 +5,42 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 
 from quadsim.flight import metrics
 from quadsim.state import Array
 
-FITTED_FROM: Final = 20
-"""N from which on the growth exponent is fitted: below, what every step costs hides what grows."""
+FITTED_FROM: Final = 20  # N from which on the growth exponent is fitted: below, what every step costs hides what grows
 
 
-@dataclass(frozen=True, kw_only=True)
-class Target:
-    """A target, beside what was measured.
+class Target(NamedTuple):
+    """A target, beside what was measured."""
 
-    Attributes:
-        what: the quantity.
-        asked: the target, in words.
-        measured: the value, in words.
-        met: whether it is within the limit.
-    """
-
-    what: str
-    asked: str
-    measured: str
-    met: bool
+    what: str  # the quantity
+    asked: str  # the target, in words
+    measured: str  # the value, in words
+    met: bool  # whether it is within the limit
 
 
 @dataclass(frozen=True, kw_only=True)
 class CandidateResult:
-    """A controller timed on the queries of the flight's controller.
+    """A controller timed on the queries of the flight's controller."""
 
-    Attributes:
-        name: what it is called.
-        solver: its name in `mpc.solvers.SOLVERS`.
-        package: the solver's distribution and its version.
-        shortcut: whether it tries less than the whole QP first; see `mpc.exact.shortcut`.
-        repeats: how often each period was timed.
-        step_ms: (K,) whole controller step per period, the median of the repeats [ms].
-        answered: (K,) statuses.
-        raw_max_ms: the longest of all steps of all repeats, the machine's stalls included [ms].
-        statuses: periods by what they were answered.
-        ways: periods by how their optimum was found, or last looked for.
-        failures: periods without an optimum.
-        input_error: largest error of the first input over the periods answered [rad/s]; None without any.
-        kkt: worst KKT residual of what it answered; None without any.
-    """
-
-    name: str
-    solver: str
-    package: str
-    shortcut: bool
-    repeats: int
-    step_ms: Array
-    answered: tuple[str, ...]
-    raw_max_ms: float
-    statuses: Mapping[str, int]
-    ways: Mapping[str, int]
-    failures: int
-    input_error: float | None
-    kkt: float | None
+    name: str  # what it is called
+    solver: str  # its name in `mpc.solvers.SOLVERS`
+    package: str  # the solver's distribution and its version
+    shortcut: bool  # whether it tries less than the whole QP first; see `mpc.exact.shortcut`
+    repeats: int  # how often each period was timed
+    step_ms: Array  # (K,) whole controller step per period, the median of the repeats [ms]
+    answered: tuple[str, ...]  # (K,) statuses
+    raw_max_ms: float  # the longest of all steps of all repeats, the machine's stalls included [ms]
+    statuses: Mapping[str, int]  # periods by what they were answered
+    ways: Mapping[str, int]  # periods by how their optimum was found, or last looked for
+    failures: int  # periods without an optimum
+    input_error: float | None  # largest error of the first input over the periods answered [rad/s]; None without any
+    kkt: float | None  # worst KKT residual of what it answered; None without any
 
     @property
     def quantiles(self) -> dict[str, float]:
@@ -75,26 +50,17 @@ class CandidateResult:
 
 @dataclass(frozen=True, kw_only=True)
 class Growth:
-    """How a candidate's step grows with the horizon.
+    """How a candidate's step grows with the horizon."""
 
-    Attributes:
-        name: the candidate.
-        kind: which of its steps, by how their optimum was found; empty for all of them.
-        whole: whether these are steps that solve the whole QP.
-        horizons: N, as far as it went.
-        p50, p99: whole step at each N [ms].
-        failures: periods that the candidate left without their optimum, by the N at which it did.
-        dropped: why it went no further; empty for one that went all the way.
-    """
-
-    name: str
-    horizons: tuple[int, ...]
-    p50: tuple[float, ...]
-    p99: tuple[float, ...]
-    kind: str = ""
-    whole: bool = True
+    name: str  # the candidate
+    horizons: tuple[int, ...]  # N, as far as it went
+    p50: tuple[float, ...]  # whole step at each N [ms]
+    p99: tuple[float, ...]  # whole step at each N [ms]
+    kind: str = ""  # which of its steps, by how their optimum was found; empty for all of them
+    whole: bool = True  # whether these are steps that solve the whole QP
+    # periods that the candidate left without their optimum, by the N at which it did
     failures: Mapping[int, int] = field(default_factory=dict)
-    dropped: str = ""
+    dropped: str = ""  # why it went no further; empty for one that went all the way
 
     @property
     def label(self) -> str:
@@ -111,58 +77,34 @@ class Growth:
 
 @dataclass(frozen=True, kw_only=True)
 class StageLength:
-    """The QP alone, in one of its forms.
+    """The QP alone, in one of its forms."""
 
-    Attributes:
-        steps: M, steps per stage; None for the condensed form.
-        variables: of the QP.
-        p50, p99: time to update and solve it [ms].
-        default: whether it is the form that is flown.
-    """
-
-    steps: int | None
-    variables: int
-    p50: float
-    p99: float
-    default: bool
+    steps: int | None  # M, steps per stage; None for the condensed form
+    variables: int  # of the QP
+    p50: float  # time to update and solve it [ms]
+    p99: float  # time to update and solve it [ms]
+    default: bool  # whether it is the form that is flown
 
 
 @dataclass(frozen=True, kw_only=True)
 class SolverBench:
-    """All candidates on one flight's queries, in one run.
+    """All candidates on one flight's queries, in one run."""
 
-    Attributes:
-        scenario: whose flight.
-        horizon: N of that flight.
-        deadline_ms: its control period [ms].
-        asked: periods asked, K.
-        flown: periods of the flight.
-        candidates: the default controller first.
-        gain_ms: (K,) whole step of the gain that the controller would be without its constraints [ms]; None where there
-            is none.
-        left_out: solvers that did not take part, and why.
-        growth: of each candidate; empty where that was not measured.
-        growth_asked: periods asked at each horizon.
-        stages: of the whole QP.
-        reference_kkt: worst KKT residual of the optimum that first inputs are compared with.
-        versions: of what the numbers depend on.
-        machine: what the times were measured on.
-    """
-
-    scenario: str
-    horizon: int
-    deadline_ms: float
-    asked: int
-    flown: int
-    candidates: tuple[CandidateResult, ...]
+    scenario: str  # whose flight
+    horizon: int  # N of that flight
+    deadline_ms: float  # its control period [ms]
+    asked: int  # periods asked, K
+    flown: int  # periods of the flight
+    candidates: tuple[CandidateResult, ...]  # the default controller first
+    # (K,) whole step of the gain that the controller would be without its constraints [ms]; None where there is none
     gain_ms: Array | None
-    left_out: Mapping[str, str]
-    growth: tuple[Growth, ...]
-    growth_asked: int
-    stages: tuple[StageLength, ...]
-    reference_kkt: float
-    versions: Mapping[str, str]
-    machine: Mapping[str, Any]
+    left_out: Mapping[str, str]  # solvers that did not take part, and why
+    growth: tuple[Growth, ...]  # of each candidate; empty where that was not measured
+    growth_asked: int  # periods asked at each horizon
+    stages: tuple[StageLength, ...]  # of the whole QP
+    reference_kkt: float  # worst KKT residual of the optimum that first inputs are compared with
+    versions: Mapping[str, str]  # of what the numbers depend on
+    machine: Mapping[str, Any]  # what the times were measured on
 
     @property
     def default(self) -> CandidateResult:
@@ -194,32 +136,21 @@ class SolverBench:
 
 @dataclass(frozen=True, kw_only=True)
 class FlightProfile:
-    """Where the time of a flight goes.
+    """Where the time of a flight goes."""
 
-    Attributes:
-        scenario: what was flown.
-        solver: by which solver; empty for a closed form.
-        duration: simulated time of one flight [s].
-        repeats: flights.
-        cores: cores that the process was held to; None where the system does not allow that.
-        wall_s: (repeats,) wall time of the closed loop of each flight, by an untouched plant and controller [s].
-        pieces: seconds of one flight by what they were spent on, the median over the repeats; they add up to the
-            median flight with clocks around its parts.
-        setup_s: building vehicle, plant, reference and controller [s].
-        audit_s: the audit after the flight [s].
-        machine: what the times were measured on.
-    """
-
-    scenario: str
-    solver: str
-    duration: float
-    repeats: int
-    cores: int | None
+    scenario: str  # what was flown
+    solver: str  # by which solver; empty for a closed form
+    duration: float  # simulated time of one flight [s]
+    repeats: int  # flights
+    cores: int | None  # cores that the process was held to; None where the system does not allow that
+    # (repeats,) wall time of the closed loop of each flight, by an untouched plant and controller [s]
     wall_s: tuple[float, ...]
+    # seconds of one flight by what they were spent on, the median over the repeats; they add up to the median flight
+    # with clocks around its parts
     pieces: Mapping[str, float]
-    setup_s: float
-    audit_s: float
-    machine: Mapping[str, Any]
+    setup_s: float  # building vehicle, plant, reference and controller [s]
+    audit_s: float  # the audit after the flight [s]
+    machine: Mapping[str, Any]  # what the times were measured on
 
     @property
     def best(self) -> float:
@@ -238,30 +169,18 @@ class FlightProfile:
 
 @dataclass(frozen=True, kw_only=True)
 class RenderProfile:
-    """What a film costs.
+    """What a film costs."""
 
-    Attributes:
-        scenario: what was filmed.
-        backend: how it was rendered, `egl` or `osmesa`.
-        width, height: of a frame.
-        fps: frames per second of film.
-        frames: filmed.
-        workers: rendering processes.
-        wall_s: from the run directory to the MP4 file, processes started and joined [s].
-        start_s: of which before the first frame: starting the processes and reading the run [s].
-        machine: what the times were measured on.
-    """
-
-    scenario: str
-    backend: str
-    width: int
-    height: int
-    fps: int
-    frames: int
-    workers: int
-    wall_s: float
-    start_s: float
-    machine: Mapping[str, Any]
+    scenario: str  # what was filmed
+    backend: str  # how it was rendered, `egl` or `osmesa`
+    width: int  # of a frame
+    height: int  # of a frame
+    fps: int  # frames per second of film
+    frames: int  # filmed
+    workers: int  # rendering processes
+    wall_s: float  # from the run directory to the MP4 file, processes started and joined [s]
+    start_s: float  # of which before the first frame: starting the processes and reading the run [s]
+    machine: Mapping[str, Any]  # what the times were measured on
 
     @property
     def frame_ms(self) -> float:

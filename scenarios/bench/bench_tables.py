@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from typing import Final
 
-from quadsim.report.table import ABSENT, Cell, Grid, Mark
+from quadsim.report.table import ABSENT, Cell, Grid, Mark, line
 from scenarios.bench.bench_results import (
     FITTED_FROM,
     CandidateResult,
@@ -15,7 +16,6 @@ from scenarios.bench.bench_results import (
     StageLength,
     Target,
 )
-from scenarios.bench.targets import flight_targets, render_targets, solver_targets
 
 
 def solver_tables(bench: SolverBench) -> list[Grid]:
@@ -31,19 +31,20 @@ def solver_tables(bench: SolverBench) -> list[Grid]:
 def flight_tables(profile: FlightProfile) -> list[Grid]:
     """Where the time of a flight goes, and the targets."""
     whole = sum(profile.pieces.values())
-    pieces = [(name, seconds) for name, seconds in profile.pieces.items()]
-    lines = [line(name, f"{seconds:.3f}", f"{100 * seconds / whole:.0f} %") for name, seconds in pieces]
-    lines.append(line("the flight, with clocks in it", f"{whole:.3f}", "100 %"))
-    lines.append(line(f"the flight, best of {profile.repeats}", f"{profile.best:.3f}", ABSENT))
-    lines.append(line("the flight, median", f"{profile.median:.3f}", ABSENT))
-    lines.append(line("set-up before it", f"{profile.setup_s:.3f}", ABSENT))
-    lines.append(line("audit after it", f"{profile.audit_s:.3f}", ABSENT))
     place = "on one core" if profile.cores == 1 else "on whatever cores the system gives"
+    pieces = [(name, seconds, f"{100 * seconds / whole:.0f} %") for name, seconds in profile.pieces.items()]
+    pieces += [
+        ("the flight, with clocks in it", whole, "100 %"),
+        (f"the flight, best of {profile.repeats}", profile.best, ABSENT),
+        ("the flight, median", profile.median, ABSENT),
+        ("set-up before it", profile.setup_s, ABSENT),
+        ("audit after it", profile.audit_s, ABSENT),
+    ]
     grid = Grid(
         key="flight",
         title="Where the time of a flight goes",
         head=(f"{profile.duration:g} s of {profile.scenario}", "time [s]", "share"),
-        lines=tuple(lines),
+        lines=tuple(line(name, f"{seconds:.3f}", share) for name, seconds, share in pieces),
         note=f"Solver: {profile.solver or 'none, a gain'}; {place}; pieces are medians over {profile.repeats} flights.",
     )
     return [grid, targets_table("Targets for a flight", flight_targets(profile))]
@@ -67,47 +68,28 @@ def render_tables(profile: RenderProfile) -> list[Grid]:
 
 
 def _candidates(bench: SolverBench) -> Grid:
-    head = (
-        "whole step [ms]",
-        "p50",
-        "p95",
-        "p99",
-        "max",
-        "raw max",
-        "p99 ratio",
-        "failures",
-        "u0 error",
-        "KKT",
-        "timed",
-    )
-    fastest = {
-        quantile: min(candidate.quantiles[quantile] for candidate in bench.candidates)
-        for quantile in ("p50", "p95", "p99", "max")
-    }
+    quantiles = ("p50", "p95", "p99", "max")
+    fastest = {name: min(candidate.quantiles[name] for candidate in bench.candidates) for name in quantiles}
     return Grid(
         key="candidates",
         title="The candidates",
-        head=head,
+        head=("whole step [ms]", *quantiles, *("raw max", "p99 ratio", "failures", "u0 error", "KKT", "timed")),
         lines=tuple(_candidate(candidate, bench, fastest) for candidate in bench.candidates),
         note=_how(bench),
     )
 
 
 def _candidate(candidate: CandidateResult, bench: SolverBench, fastest: dict[str, float]) -> tuple[Cell, ...]:
-    quantiles = candidate.quantiles
-    label = f"{candidate.name} (default)" if candidate is bench.default else candidate.name
-    return (
-        Cell(text=label),
-        *(
-            Cell(text=_milliseconds(value), mark=Mark.BEST if value == fastest[name] else Mark.NONE)
-            for name, value in quantiles.items()
-        ),
-        Cell(text=_milliseconds(candidate.raw_max_ms)),
-        Cell(text=f"{quantiles['p99'] / bench.default.quantiles['p99']:.3g}"),
-        Cell(text=str(candidate.failures), mark=Mark.BAD if candidate.failures else Mark.NONE),
-        Cell(text=_residual(candidate.input_error)),
-        Cell(text=_residual(candidate.kkt)),
-        Cell(text=f"{candidate.repeats}x"),
+    quantiles, failures = candidate.quantiles, candidate.failures
+    marks = {name: Mark.BEST if value == fastest[name] else Mark.NONE for name, value in quantiles.items()}
+    return line(
+        f"{candidate.name} (default)" if candidate is bench.default else candidate.name,
+        *(Cell(text=_milliseconds(value), mark=marks[name]) for name, value in quantiles.items()),
+        _milliseconds(candidate.raw_max_ms),
+        f"{quantiles['p99'] / bench.default.quantiles['p99']:.3g}",
+        Cell(text=str(failures), mark=Mark.BAD if failures else Mark.NONE),
+        *map(_residual, (candidate.input_error, candidate.kkt)),
+        f"{candidate.repeats}x",
     )
 
 
@@ -172,10 +154,9 @@ def _stages(stages: Sequence[StageLength]) -> Grid:
     lines = []
     for stage in stages:
         name = "condensed, dense" if stage.steps is None else str(stage.steps)
-        mark = Mark.BEST if stage is default else Mark.NONE
-        label = f"{name} (default)" if stage is default else name
-        cells = line(str(stage.variables), f"{stage.p50:.3g}", f"{stage.p99:.3g}", f"{stage.p50 / default.p50:.2f}")
-        lines.append((Cell(text=label, mark=mark), *cells))
+        label = Cell(text=f"{name} (default)", mark=Mark.BEST) if stage is default else name
+        ratio = f"{stage.p50 / default.p50:.2f}"
+        lines.append(line(label, str(stage.variables), f"{stage.p50:.3g}", f"{stage.p99:.3g}", ratio))
     return Grid(
         key="stages",
         title="How many steps make a stage",
@@ -189,23 +170,13 @@ def _stages(stages: Sequence[StageLength]) -> Grid:
 
 def targets_table(title: str, targets: Sequence[Target]) -> Grid:
     """Targets, what was measured, and whether each is met."""
+    met, missed = Cell(text="met", mark=Mark.GOOD), Cell(text="missed", mark=Mark.BAD)
     return Grid(
         key="targets",
         title=title,
         head=("quantity", "target", "measured", "verdict"),
-        lines=tuple(
-            (
-                *line(target.what, target.asked, target.measured),
-                Cell(text="met" if target.met else "missed", mark=Mark.GOOD if target.met else Mark.BAD),
-            )
-            for target in targets
-        ),
+        lines=tuple(line(*target[:3], met if target.met else missed) for target in targets),
     )
-
-
-def line(*texts: str) -> tuple[Cell, ...]:
-    """Texts as the cells of a row."""
-    return tuple(Cell(text=text) for text in texts)
 
 
 def _milliseconds(value: float) -> str:
@@ -215,3 +186,56 @@ def _milliseconds(value: float) -> str:
 
 def _residual(value: float | None) -> str:
     return ABSENT if value is None else f"{value:.0e}"
+
+
+PAPER_SOLVER: Final = "qpoases"  # the solver of the paper
+
+
+def solver_targets(bench: SolverBench) -> list[Target]:
+    """Speed and exactness of the default controller, against the other solvers and the horizon."""
+    default, own = bench.default, bench.default.quantiles
+    error, failures = default.input_error, default.failures
+    others = [candidate for candidate in bench.candidates if candidate.solver != default.solver]
+    targets = [
+        Target("default, p50", "<= 0.05 ms", f"{own['p50']:.3f} ms", own["p50"] <= 0.05),
+        Target("default, p99", "<= 1.6 ms", f"{own['p99']:.2f} ms", own["p99"] <= 1.6),
+        Target(
+            "default, worst first input",
+            "<= 1e-3 rad/s",
+            ABSENT if error is None else f"{error:.0e} rad/s",
+            error is not None and error <= 1e-3,
+        ),
+        Target("default, periods without an optimum", "0", str(failures), failures == 0),
+    ]
+    for whose, shortcut in (("every other solver's", False), ("every other's with the same shortcuts", True)):
+        rivals = [candidate for candidate in others if candidate.shortcut == shortcut]
+        for name in ("p99", "max") if rivals else ():
+            other, nearest = min((rival.quantiles[name], rival.name) for rival in rivals)
+            asked, measured = f"< {other:.2f} ms ({nearest})", f"{own[name]:.2f} ms"
+            targets.append(Target(f"default, {name} below {whose}", asked, measured, own[name] < other))
+    for candidate in others:
+        if candidate.solver == PAPER_SOLVER:
+            ratio = candidate.quantiles["p99"] / own["p99"]
+            what = "p99 of qpOASES, the paper's solver, to the default's"
+            targets.append(Target(what, ">= 15", f"{ratio:.0f}", ratio >= 15.0))
+    for growth in bench.growth:
+        for name in ("p50", "p99") if growth.name == default.name else ():
+            if (exponent := growth.exponent(name)) is not None:
+                what = f"default, steps by {growth.kind}: growth of {name} with N up to {growth.horizons[-1]}"
+                met = exponent <= 1.2 and not growth.failures
+                targets.append(Target(what, "<= N^1.2", f"N^{exponent:.2f}", met))
+    return targets
+
+
+def flight_targets(profile: FlightProfile) -> list[Target]:
+    """The wall time of a minute of flight."""
+    minute = profile.best * 60.0 / profile.duration
+    what = f"60 s of {profile.scenario} simulated, on one core, the best of {profile.repeats}"
+    return [Target(what, "<= 1.2 s", f"{minute:.2f} s", minute <= 1.2)]
+
+
+def render_targets(profile: RenderProfile) -> list[Target]:
+    """The wall time of a minute of film on two cores."""
+    minute = profile.film_s(60.0)
+    what = f"60 s of film, {profile.width}x{profile.height} at {profile.fps} fps, {profile.workers} processes"
+    return [Target(what, "<= 60 s on 2 cores", f"{minute:.0f} s", minute <= 60.0)]

@@ -6,7 +6,6 @@ import math
 import multiprocessing
 import re
 import tempfile
-import time as clock
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -15,9 +14,10 @@ from typing import Any, Final
 import numpy as np
 
 from quadsim.errors import ParameterError
-from quadsim.report.table import ABSENT, Grid
+from quadsim.report.table import ABSENT, Grid, line
 from scenarios.bench.bench_results import Target
-from scenarios.bench.bench_tables import line, targets_table
+from scenarios.bench.bench_tables import targets_table
+from scenarios.bench.timing import Stopwatch
 from scenarios.campaign.engine.local import LocalEngine
 from scenarios.campaign.plan import Plan
 from scenarios.campaign.results.store import FLIGHTS_FILE, TIMES_FILE
@@ -33,25 +33,15 @@ from scenarios.schema.scenario import Scenario
 
 @dataclass(frozen=True, kw_only=True)
 class CampaignRun:
-    """One campaign, as it was timed.
+    """One campaign, as it was timed."""
 
-    Attributes:
-        flights: in it.
-        workers: processes.
-        wall_s: from the first process started to the last answer [s].
-        busy_s: what the flights took, summed [s].
-        concluding_s: final tables, estimates and report [s].
-        memory_mb: largest proportional set size of a worker [MB]; None where the system does not tell.
-        bytes: size of `flights.parquet`.
-    """
-
-    flights: int
-    workers: int
-    wall_s: float
-    busy_s: float
-    concluding_s: float
-    memory_mb: float | None
-    bytes: int
+    flights: int  # in it
+    workers: int  # processes
+    wall_s: float  # from the first process started to the last answer [s]
+    busy_s: float  # what the flights took, summed [s]
+    concluding_s: float  # final tables, estimates and report [s]
+    memory_mb: float | None  # largest proportional set size of a worker [MB]; None where the system does not tell
+    bytes: int  # size of `flights.parquet`
 
     @property
     def flight_s(self) -> float:
@@ -71,25 +61,15 @@ class CampaignRun:
 
 @dataclass(frozen=True, kw_only=True)
 class CampaignProfile:
-    """What campaigns cost.
+    """What campaigns cost."""
 
-    Attributes:
-        scenario: what was flown.
-        duration: of a flight [s].
-        rounds: campaigns by one worker and by two, flown in turns.
-        growing: campaigns of ever more flights.
-        growing_scenario: what these flew.
-        growing_duration: of a flight of these [s].
-        machine: what the times were measured on.
-    """
-
-    scenario: str
-    duration: float
-    rounds: tuple[tuple[CampaignRun, CampaignRun], ...]
-    growing: tuple[CampaignRun, ...]
-    growing_scenario: str
-    growing_duration: float
-    machine: Mapping[str, Any]
+    scenario: str  # what was flown
+    duration: float  # of a flight [s]
+    rounds: tuple[tuple[CampaignRun, CampaignRun], ...]  # campaigns by one worker and by two, flown in turns
+    growing: tuple[CampaignRun, ...]  # campaigns of ever more flights
+    growing_scenario: str  # what these flew
+    growing_duration: float  # of a flight of these [s]
+    machine: Mapping[str, Any]  # what the times were measured on
 
     @property
     def per_core_hour(self) -> float:
@@ -125,21 +105,13 @@ def campaign_tables(profile: CampaignProfile) -> list[Grid]:
         key="campaign",
         title="What a campaign costs",
         head=(
-            f"{profile.duration:g} s of {profile.scenario}",
-            "workers",
-            "a flight [s]",
-            "flights/s",
-            "flights/core-h",
-            "not flying",
+            *(f"{profile.duration:g} s of {profile.scenario}", "workers", "a flight [s]", "flights/s"),
+            *("flights/core-h", "not flying"),
         ),
         lines=tuple(
             line(
-                f"round {i}",
-                str(run.workers),
-                f"{run.flight_s:.3f}",
-                f"{run.rate:.2f}",
-                f"{3600 * run.rate / run.workers:.0f}",
-                f"{100 * run.overhead:.1f} %",
+                *(f"round {i}", str(run.workers), f"{run.flight_s:.3f}", f"{run.rate:.2f}"),
+                *(f"{3600 * run.rate / run.workers:.0f}", f"{100 * run.overhead:.1f} %"),
             )
             for i, pair in enumerate(profile.rounds, start=1)
             for run in pair
@@ -159,11 +131,8 @@ def _growth(profile: CampaignProfile) -> Grid:
         head=("flights", "flying [s]", "per flight [ms]", "concluding [s]", "flights.parquet [MB]", "worker [MB]"),
         lines=tuple(
             line(
-                f"{run.flights}",
-                f"{run.wall_s:.1f}",
-                f"{1e3 * run.wall_s / run.flights:.1f}",
-                f"{run.concluding_s:.2f}",
-                f"{run.bytes / 1e6:.3f}",
+                *(f"{run.flights}", f"{run.wall_s:.1f}", f"{1e3 * run.wall_s / run.flights:.1f}"),
+                *(f"{run.concluding_s:.2f}", f"{run.bytes / 1e6:.3f}"),
                 ABSENT if run.memory_mb is None else f"{run.memory_mb:.0f}",
             )
             for run in profile.growing
@@ -178,33 +147,21 @@ def campaign_targets(profile: CampaignProfile) -> list[Target]:
     """What was asked of throughput, scaling, overhead and memory."""
     hour = profile.per_core_hour * profile.duration / 60.0
     memory = math.nan if profile.memory_mb is None else profile.memory_mb
+    throughput = f"60 s flights of {profile.scenario} per core-hour, the median round"
+    scaling, overhead = profile.scaling, profile.overhead
     return [
+        Target(throughput, ">= 3000", f"{hour:.0f}", hour >= 3000.0),
+        Target("two workers against one, the median round", ">= 1.9", f"{scaling:.2f}", scaling >= 1.9),
         Target(
-            what=f"60 s flights of {profile.scenario} per core-hour, the median round",
-            asked=">= 3000",
-            measured=f"{hour:.0f}",
-            met=hour >= 3000.0,
+            "two workers' time not spent flying, the median round", "< 2 %", f"{100 * overhead:.1f} %", overhead < 0.02
         ),
-        Target(
-            what="two workers against one, the median round",
-            asked=">= 1.9",
-            measured=f"{profile.scaling:.2f}",
-            met=profile.scaling >= 1.9,
-        ),
-        Target(
-            what="two workers' time not spent flying, the median round",
-            asked="< 2 %",
-            measured=f"{100 * profile.overhead:.1f} %",
-            met=profile.overhead < 0.02,
-        ),
-        Target(what="memory of a worker", asked="< 300 MB", measured=f"{memory:.0f} MB", met=memory < 300.0),
+        Target("memory of a worker", "< 300 MB", f"{memory:.0f} MB", memory < 300.0),
     ]
 
 
 GROWING: Final = ("hover", ("duration=0.5",))
 """What ever larger campaigns fly: so little that what a campaign adds shows."""
-_LOOK_EVERY: Final = 1.0
-"""Between two looks at the workers' memory [s]."""
+_LOOK_EVERY: Final = 1.0  # between two looks at the workers' memory [s]
 
 
 def bench_campaign(
@@ -215,14 +172,7 @@ def bench_campaign(
     sizes: Sequence[int] = (10, 100, 1000, 10000),
     progress: Progress = silent,
 ) -> CampaignProfile:
-    """Fly campaigns by one worker and by two, in turns, and then ever larger ones.
-
-    Args:
-        scenario: what the first ones fly, each time the same.
-        flights: per worker and round.
-        rounds: how many.
-        sizes: flights of the larger ones, by two workers.
-        progress: called with how much is done, of how much.
+    """Fly campaigns of so many flights per worker by one worker and by two, in turns, and then ever larger ones by two.
 
     Raises:
         ParameterError: nothing is asked for.
@@ -260,9 +210,9 @@ def _timed(scenario: Scenario, flights: int, workers: int, *, report: bool) -> C
     memory = _Memory()
     with tempfile.TemporaryDirectory() as scratch:
         directory = Path(scratch) / "campaign"
-        started = clock.perf_counter()
+        stopwatch = Stopwatch()
         result = fly_campaign(plan, directory, LocalEngine(workers), report=report, watch=memory.look)
-        whole = clock.perf_counter() - started
+        whole = stopwatch.elapsed
         busy = sum(read_table(directory / TIMES_FILE)["wall_s"].to_pylist())
         wall = float(result.manifest["sessions"][-1]["wall_s"])
         return CampaignRun(
@@ -281,13 +231,12 @@ class _Memory:
 
     def __init__(self) -> None:
         self.largest: float | None = None
-        self._looked = clock.perf_counter()
+        self._since = Stopwatch()
 
     def look(self, standing: Standing) -> None:
-        """Look, now and then."""
-        if clock.perf_counter() - self._looked < _LOOK_EVERY:
+        if self._since.elapsed < _LOOK_EVERY:
             return
-        self._looked = clock.perf_counter()
+        self._since = Stopwatch()
         sizes = [size for child in multiprocessing.active_children() if (size := _proportional(child.pid)) is not None]
         self.largest = max([*sizes, *([] if self.largest is None else [self.largest])], default=None)
 

@@ -3,27 +3,31 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Final
 
 import numpy as np
 
 from mpc.constrained import ConstrainedMPC
-from mpc.exact.polish import polish
 from mpc.exact.shortcut import with_shortcut
 from mpc.ocp import Problem, Rest
 from mpc.paper.condensed import condensed
-from mpc.qp import Formulation, kkt_residuals
+from mpc.qp import Backend, Formulation, Vectors, kkt_residuals
 from mpc.solvers import SOLVERS, Answer, QPSolver, Solver, make_backend
+from mpc.solvers.piqp_backends import PiqpDense, PiqpMultistage
+from mpc.staged import Staged, usual_steps
 from quadsim.controller import ACCEPTED, Command
 from quadsim.state import Array
+from scenarios.bench.bench_results import StageLength
+from scenarios.bench.polish import polish
 from scenarios.bench.queries import QueriedController, Queries
+from scenarios.bench.timing import StepTimes
+from scenarios.progress import Progress
 
-WITH_SHORTCUT: Final = ("daqp",)
-"""Solvers that are shown both with and without shortcuts, besides the default."""
-REFERENCE_SOLVER: Final = "piqp-dense"
-"""Where the search for the optimum in closed form starts."""
+WITH_SHORTCUT: Final = ("daqp",)  # solvers that are shown both with and without shortcuts, besides the default
+REFERENCE_SOLVER: Final = "piqp-dense"  # where the search for the optimum in closed form starts
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -48,29 +52,15 @@ def entries(default: Entry, solvers: Sequence[str]) -> list[Entry]:
 
 
 class _Witnessed:
-    """A solver whose last answer can be looked at."""
+    """A solver, see `mpc.solvers.Solver`, whose last answer can be looked at."""
 
     def __init__(self, solver: Solver) -> None:
-        self._solver = solver
+        self.name, self.formulation, self.reset = solver.name, solver.formulation, solver.reset
+        self._solve = solver.solve
         self.last: Answer | None = None
 
-    @property
-    def name(self) -> str:
-        """See `mpc.solvers.Solver.name`."""
-        return self._solver.name
-
-    @property
-    def formulation(self) -> Formulation:
-        """See `mpc.solvers.Solver.formulation`."""
-        return self._solver.formulation
-
-    def reset(self) -> None:
-        """See `mpc.solvers.Solver.reset`."""
-        self._solver.reset()
-
     def solve(self, state: Array, desired: Array, u_before: Array, rest: Rest | None = None) -> Answer:
-        """See `mpc.solvers.Solver.solve`."""
-        self.last = self._solver.solve(state, desired, u_before, rest)
+        self.last = self._solve(state, desired, u_before, rest)
         return self.last
 
 
@@ -112,33 +102,22 @@ class StepCandidate:
         self.keep()
         return tuple(self._asked.statuses[period] for period in periods)
 
-    def failures(self, periods: Sequence[int]) -> int:
-        """How many periods were left without their optimum."""
-        self.keep()
-        commands = [self.answers[period][0] for period in periods]
-        return sum(command is None or command.status not in ACCEPTED for command in commands)
-
 
 @dataclass(frozen=True, kw_only=True)
 class Reference:
-    """The optimum of each period's QP, in closed form.
+    """The optimum of each period's QP, in closed form."""
 
-    Attributes:
-        inputs: first input u(k) (4,) by period [rad/s].
-        kkt: worst KKT residual of them all.
-    """
-
-    inputs: Mapping[int, Array]
-    kkt: float
+    inputs: Mapping[int, Array]  # first input u(k) (4,) by period [rad/s]
+    kkt: float  # worst KKT residual of them all
 
 
 def reference_optima(problem: Problem, queries: Queries, periods: Sequence[int]) -> Reference:
-    """Solve the periods' QPs in closed form; see `mpc.exact.polish`."""
+    """Solve the periods' QPs in closed form; see `scenarios.bench.polish`."""
     formulation, backend = condensed(problem), make_backend(REFERENCE_SOLVER)
     backend.setup(formulation.qp)
     inputs, worst = {}, 0.0
     for period in periods:
-        vectors = formulation.vectors(*_query(problem, queries, period))
+        vectors = formulation.vectors(*queries.of_qp(problem, period))
         qp = formulation.qp.with_vectors(vectors)
         optimum = polish(qp, backend.solve(vectors))
         worst = float(np.maximum(worst, kkt_residuals(qp, optimum).worst))  # NaN stays NaN
@@ -170,7 +149,7 @@ def judge(candidate: StepCandidate, queries: Queries, periods: Sequence[int], re
             continue
         statuses[command.status] += 1
         errors.append(np.abs(command.speeds - reference.inputs[period]).max())
-        qp = form.qp.with_vectors(form.vectors(*_query(problem, queries, period)))
+        qp = form.qp.with_vectors(form.vectors(*queries.of_qp(problem, period)))
         residuals.append(kkt_residuals(qp, answer.solution).worst)
     return Verdict(
         statuses=dict(sorted(statuses.items())),
@@ -181,12 +160,52 @@ def judge(candidate: StepCandidate, queries: Queries, periods: Sequence[int], re
     )
 
 
-def _query(problem: Problem, queries: Queries, period: int) -> tuple[Array, Array, Array]:
-    """xi(k), y_d and u(k-1)."""
-    reference = queries.reference[period + 1 : period + 1 + problem.horizon]
-    return queries.state[period], problem.objective.desired(reference), queries.speeds_before[period]
-
-
 def _failure(answer: Answer) -> str:
     """Why there was no command; a point that is called solved is rejected where it breaks the hard input bounds."""
     return "rejected" if answer.solution.status in ACCEPTED else answer.solution.status
+
+
+Query = Callable[[int], tuple[Array, Array, Array]]
+STEPS_TRIED: Final = (1, 2, 3, 4, 5, 6, 8, 10, 13, 17, 20, 25)
+
+
+def time_stages(
+    problem: Problem,
+    queries: Queries,
+    asked: Sequence[range],
+    race: Callable[..., dict[str, StepTimes]],
+    progress: Progress,
+) -> tuple[StageLength, ...]:
+    """The QP condensed and cut into stages of M steps, on the periods in which constraints are active."""
+    default, query = usual_steps(problem.model.nu), partial(queries.of_qp, problem)
+
+    candidates: dict[int | None, _QPEntrant] = {None: _QPEntrant(condensed(problem), PiqpDense(), query)}
+    for length in sorted({*STEPS_TRIED, default}):
+        candidates[length] = _QPEntrant(Staged(problem, steps_per_stage=length), PiqpMultistage(), query)
+    named = {str(steps): candidate for steps, candidate in candidates.items()}
+    laps = race(named, asked, progress=partial(progress, "stages"))
+    found_active = candidates[default].active
+    active = np.array([found_active[period] > 0 for segment in asked for period in segment])
+    counted = active if active.any() else np.ones_like(active)
+    found = []
+    for steps, candidate in candidates.items():
+        p50, p99 = np.percentile(laps[str(steps)].median[counted], [50, 99])
+        size = candidate.formulation.qp.c.size
+        found.append(StageLength(steps=steps, variables=size, p50=float(p50), p99=float(p99), default=steps == default))
+    return tuple(found)
+
+
+class _QPEntrant:
+    """A form of the QP with its back end, without a controller around it."""
+
+    def __init__(self, formulation: Formulation, backend: Backend, query: Query) -> None:
+        self.formulation, self._backend, self._query = formulation, backend, query
+        self.active: dict[int, int] = {}  # constraints active in the answer, by period
+        backend.setup(formulation.qp)
+
+    def prepare(self, period: int) -> None:
+        self._period = period
+        self._vectors: Vectors = self.formulation.vectors(*self._query(period))
+
+    def answer(self) -> None:
+        self.active[self._period] = self._backend.solve(self._vectors).active

@@ -4,34 +4,27 @@ from __future__ import annotations
 
 import math
 import tempfile
-import time as clock
 from pathlib import Path
 from typing import Final
 
 from quadsim.errors import ParameterError
 from quadsim.report.film.video import render_video, rendering_backend, worker_count
 from scenarios.bench.bench_results import RenderProfile
+from scenarios.bench.timing import Stopwatch
 from scenarios.flight import Outputs
 from scenarios.machine import machine
 from scenarios.progress import Progress, silent
 from scenarios.run import run_scenario
 from scenarios.schema.scenario import Scenario
 
-SECONDS: Final = 4.0
-"""Of film; the processes' start is timed apart, so that a longer film follows from a short one."""
+SECONDS: Final = 4.0  # of film; the processes' start is timed apart, so that a longer film follows from a short one
 WIDTH, HEIGHT, FPS = 1280, 720, 30
 
 
 def bench_render(
     scenario: Scenario, *, seconds: float = SECONDS, workers: int | None = None, progress: Progress = silent
 ) -> RenderProfile:
-    """Fly the first seconds of a scenario and film them.
-
-    Args:
-        scenario: what to film.
-        seconds: of flight and film, at most the scenario's own.
-        workers: rendering processes, at most; one per usable core by default.
-        progress: called with how much is done, of how much.
+    """Fly the first seconds of a scenario and film them, by one process per usable core, or at most so many.
 
     Raises:
         ParameterError: an argument is out of range.
@@ -53,13 +46,13 @@ def bench_render(
 
         def report(done: int, total: int) -> None:
             nonlocal frames
-            first.append(clock.perf_counter())
+            first.append(watch.elapsed)
             frames = total
             progress("frames", done, total)
 
-        started = clock.perf_counter()
+        watch = Stopwatch()
         render_video(run, run / "film.mp4", workers=workers, width=WIDTH, height=HEIGHT, fps=FPS, progress=report)
-        wall_s = clock.perf_counter() - started
+        wall_s = watch.elapsed
     return RenderProfile(
         scenario=scenario.name,
         backend=backend,
@@ -69,6 +62,6 @@ def bench_render(
         frames=frames,
         workers=worker_count(frames, workers),
         wall_s=wall_s,
-        start_s=first[0] - started,
+        start_s=first[0],
         machine=machine(),
     )

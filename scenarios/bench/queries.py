@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from mpc.ocp import Problem
 from quadsim.controller import Command, Controller, Moment
 from quadsim.errors import FlightError
 from quadsim.flight.log import ControlLog
@@ -20,19 +21,17 @@ from scenarios.schema.scenario import Scenario
 
 @dataclass(frozen=True, kw_only=True)
 class Queries:
-    """The queries of K control periods.
+    """The queries of K control periods."""
 
-    Attributes:
-        t: (K,) [s].
-        state: (K, 12) measured.
-        reference: (K + N, 4) filtered x, y, z [m], yaw [rad], row k at t_k.
-        speeds_before: (K, 4) u(k-1) [rad/s].
-    """
+    t: Array  # (K,) [s]
+    state: Array  # (K, 12) measured
+    reference: Array  # (K + N, 4) filtered x, y, z [m], yaw [rad], row k at t_k
+    speeds_before: Array  # (K, 4) u(k-1) [rad/s]
 
-    t: Array
-    state: Array
-    reference: Array
-    speeds_before: Array
+    def of_qp(self, problem: Problem, period: int) -> tuple[Array, Array, Array]:
+        """xi(k), y_d and u(k-1)."""
+        reference = self.reference[period + 1 : period + 1 + problem.horizon]
+        return self.state[period], problem.objective.desired(reference), self.speeds_before[period]
 
 
 def recorded(scenario: Scenario, log: ControlLog, horizon: int) -> Queries:
@@ -46,18 +45,13 @@ def recorded(scenario: Scenario, log: ControlLog, horizon: int) -> Queries:
 
 
 class QueriedController:
-    """A controller that is given a flight's queries, each after the command that was given before it in that flight.
-
-    Attributes:
-        command: its last answer; None where there was none.
-        statuses: what it answered first, by period: its status, or `failed` where it gave no command.
-    """
+    """A controller that is given a flight's queries, each after the command that was given before it in that flight."""
 
     def __init__(self, controller: Controller, queries: Queries) -> None:
         self._controller, self._queries = controller, queries
-        self.command: Command | None = None
+        self.command: Command | None = None  # its last answer; None where there was none
         self._period: int | None = None
-        self.statuses: dict[int, str] = {}
+        self.statuses: dict[int, str] = {}  # what it answered first, by period; `failed` where it gave no command
 
     def prepare(self, period: int) -> None:
         """See `scenarios.bench.timing.Candidate.prepare`."""

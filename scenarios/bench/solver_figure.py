@@ -10,25 +10,17 @@ import numpy as np
 from quadsim.report.figures.canvas import new_figure, write_drawings
 from quadsim.report.palette import BOUND, LINES
 from scenarios.bench.bench_results import CandidateResult, SolverBench
-from scenarios.bench.targets import PAPER_SOLVER
+from scenarios.bench.bench_tables import PAPER_SOLVER
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-_DASHES: Final = ("-", "--", ":")
-"""Candidates beyond the colours there are take them again, with another line."""
+_DASHES: Final = ("-", "--", ":")  # candidates beyond the colours there are take them again, with another line
 
 
 def write_solver_figure(bench: SolverBench, directory: Path) -> list[Path]:
-    """Draw the step times of all candidates, and their growth with the horizon.
-
-    Args:
-        bench: what was measured.
-        directory: where `solvers.png` and `solvers.svg` go; made when it is not there.
-
-    Returns:
-        The two files.
+    """Draw the step times of all candidates, and their growth, as `solvers.png` and `solvers.svg`; the two files.
 
     Raises:
         OutputError: the directory cannot be written.
@@ -114,7 +106,6 @@ def _label(bench: SolverBench, candidate: CandidateResult) -> str:
 
 
 def _look(bench: SolverBench, name: str) -> tuple[str, str]:
-    """Colour and line of a candidate."""
     names = [candidate.name for candidate in bench.candidates]
     i = names.index(name)
     return LINES[i % len(LINES)], _DASHES[i // len(LINES) % len(_DASHES)]

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
-from typing import Final, TypedDict
+from typing import Final
 
 import numpy as np
 
@@ -13,14 +14,14 @@ from mpc.ocp import Problem
 from mpc.solvers import SOLVERS, Way
 from mpc.unconstrained import UnconstrainedMPC
 from quadsim import outputs
+from quadsim.controller import ACCEPTED
 from quadsim.errors import InputError, ParameterError, UnknownNameError
-from quadsim.report.table import Grid, grid_to_markdown
+from quadsim.report.table import section
 from quadsim.state import Array
 from scenarios.bench.bench_results import CandidateResult, Growth, SolverBench
 from scenarios.bench.bench_tables import solver_tables
-from scenarios.bench.candidates import Entry, StepCandidate, entries, judge, reference_optima
+from scenarios.bench.candidates import Entry, StepCandidate, entries, judge, reference_optima, time_stages
 from scenarios.bench.queries import QueriedController, Queries, flight_between, recorded
-from scenarios.bench.stages import time_stages
 from scenarios.bench.timing import StepTimes, segments, time_in_turns
 from scenarios.build import build_problem
 from scenarios.flight import Flight
@@ -33,29 +34,18 @@ from scenarios.schema.scenario import Scenario
 
 RESULTS_FILE: Final = "bench.json"
 TABLES_FILE: Final = "solvers.md"
-FORMAT: Final = "quadsim bench solvers"
-"""What `bench.json` says it is."""
-KIND: Final = "bench of solvers"
-"""What `quadsim.outputs` calls its directory."""
+FORMAT: Final = "quadsim bench solvers"  # what `bench.json` says it is
+KIND: Final = "bench of solvers"  # what `quadsim.outputs` calls its directory
 
 REPEATS: Final = 3
 HORIZONS: Final = (10, 20, 50, 100, 200)
-GROWTH_STRIDE: Final = 6
-"""One segment of so many is asked at each horizon and of each form of the QP."""
-LONGEST_PASS: Final = 20.0
-"""A candidate whose first pass takes longer [s] is timed once."""
-GAIN: Final = "unconstrained gain"
-"""What the controller would be without its constraints."""
-PATIENCE: Final = 60.0
-"""A candidate that takes longer for the questions at one horizon [s] is dropped."""
+GROWTH_STRIDE: Final = 6  # one segment of so many is asked at each horizon and of each form of the QP
+LONGEST_PASS: Final = 20.0  # a candidate whose first pass takes longer [s] is timed once
+GAIN: Final = "unconstrained gain"  # what the controller would be without its constraints
+PATIENCE: Final = 60.0  # a candidate that takes longer for the questions at one horizon [s] is dropped
 
 
-class _Racing(TypedDict):
-    """What every race of a bench has in common; see `scenarios.bench.timing.time_in_turns`."""
-
-    between: Callable[[], None]
-    repeats: int
-    rng: np.random.Generator
+Race = Callable[..., dict[str, StepTimes]]  # `time_in_turns` with what all races of a bench have in common
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -68,7 +58,8 @@ class _Timed:
 
     @classmethod
     def of(cls, candidate: StepCandidate, periods: Sequence[int], laps: StepTimes) -> _Timed:
-        return cls(step_ms=laps.median, ways=candidate.ways(periods), failures=candidate.failures(periods))
+        failures = sum(status not in ACCEPTED for status in candidate.statuses(periods))
+        return cls(step_ms=laps.median, ways=candidate.ways(periods), failures=failures)
 
 
 def bench_solvers(
@@ -104,13 +95,13 @@ def bench_solvers(
     taking_part = entries(Entry(solver=spec.solver, shortcut=spec.shortcut), solvers)
     few = segments(flight.log.control.t.size, stride * GROWTH_STRIDE)
     with flight_between(scenario, flight.vehicle) as between:
-        racing: _Racing = {"between": between, "repeats": repeats, "rng": rng}
+        race = partial(time_in_turns, between=between, repeats=repeats, rng=rng)
         candidates, own, gain, asked, reference_kkt = _time_candidates(
-            flight, problem, taking_part, stride=stride, progress=progress, **racing
+            flight, problem, taking_part, race, stride=stride, progress=progress
         )
-        growth = _growth(flight, problem, taking_part, horizons, few, own, progress=progress, **racing)
+        growth = _growth(flight, problem, taking_part, race, horizons, few, own, progress)
         queries = recorded(scenario, flight.log.control, problem.horizon)
-        stages = time_stages(problem, queries, few, progress=progress, **racing)
+        stages = time_stages(problem, queries, few, race, progress)
     return SolverBench(
         scenario=scenario.name,
         horizon=problem.horizon,
@@ -147,11 +138,6 @@ def bench_markdown(bench: SolverBench) -> str:
     return f"# The solvers on {bench.scenario}\n\n" + "\n".join(map(section, solver_tables(bench)))
 
 
-def section(grid: Grid) -> str:
-    """A table under its title, with its note, as Markdown."""
-    return f"## {grid.title}\n\n{grid_to_markdown(grid)}\n{grid.note}".rstrip() + "\n"
-
-
 def _check(
     scenario: Scenario, repeats: int, horizons: Sequence[int], solvers: Sequence[str], stride: int
 ) -> ConstrainedSpec:
@@ -172,11 +158,9 @@ def _time_candidates(
     flight: Flight,
     problem: Problem,
     taking_part: Sequence[Entry],
+    race: Race,
     *,
-    repeats: int,
     stride: int,
-    rng: np.random.Generator,
-    between: Callable[[], None],
     progress: Progress,
 ) -> tuple[tuple[CandidateResult, ...], dict[str, _Timed], Array | None, int, float]:
     """Candidates, their steps, the gain's, the number of periods asked, and the reference's worst KKT residual."""
@@ -185,14 +169,11 @@ def _time_candidates(
     periods = [period for segment in asked for period in segment]
     reference = reference_optima(problem, queries, periods)
     candidates = {entry.name: StepCandidate(entry, problem, queries) for entry in taking_part}
-    laps = time_in_turns(
+    laps = race(
         {**_gain(problem, queries), **candidates},
         asked,
-        between=between,
-        repeats=repeats,
-        rng=rng,
         longest_pass=LONGEST_PASS,
-        progress=lambda done, total: progress("candidates", done, total),
+        progress=partial(progress, "candidates"),
     )
     results = tuple(
         CandidateResult(
@@ -222,21 +203,17 @@ def _gain(problem: Problem, queries: Queries) -> dict[str, QueriedController]:
 
 
 def _package(solver: str) -> str:
-    entry = SOLVERS[solver]
-    return f"{entry.package} {entry.version}"
+    return f"{SOLVERS[solver].package} {SOLVERS[solver].version}"
 
 
 def _growth(
     flight: Flight,
     problem: Problem,
     taking_part: Sequence[Entry],
+    race: Race,
     horizons: Sequence[int],
     asked: Sequence[range],
     own: Mapping[str, _Timed],
-    *,
-    between: Callable[[], None],
-    repeats: int,
-    rng: np.random.Generator,
     progress: Progress,
 ) -> tuple[Growth, ...]:
     """Every candidate at each N, until one would hardly keep up with the flight at the next.
@@ -256,16 +233,8 @@ def _growth(
         else:
             queries, longer = recorded(flight.scenario, flight.log.control, N), replace(problem, horizon=N)
             candidates = {entry.name: StepCandidate(entry, longer, queries) for entry in racing}
-            laps = time_in_turns(
-                candidates,
-                asked,
-                between=between,
-                repeats=repeats,
-                rng=rng,
-                longest_pass=LONGEST_PASS,
-                patience=PATIENCE,
-                progress=lambda done, total, N=N: progress(f"N = {N}", done, total),  # type: ignore[misc]
-            )
+            report = partial(progress, f"N = {N}")
+            laps = race(candidates, asked, longest_pass=LONGEST_PASS, patience=PATIENCE, progress=report)
             timed = {name: _Timed.of(candidates[name], periods, lap) for name, lap in laps.items()}
         for entry in racing:
             if entry.name not in timed:

@@ -1,8 +1,8 @@
-"""Candidates timed against each other in one process, so that what the machine does meanwhile meets them all.
+"""The one place where times are taken: of calls and commands, of whole runs in turns, and of a controller's steps.
 
-Every step that is timed is timed here, in one way, as a flight sees it: between two questions the plant flies a period,
-which leaves in the caches what it leaves there in a flight.  A question is put a few times, and its time is the median:
-what a flight sees but for the machine's stalls.
+What is compared is timed in turns, so that what the machine does meanwhile meets all of it.  Steps are timed as a
+flight sees them: between two questions the plant flies a period, which leaves in the caches what it leaves there in a
+flight.  A question is put a few times, and its time is the median: what a flight sees but for the machine's stalls.
 
 The questions are put in segments of consecutive periods.  Within a segment a candidate answers all of them, as in a
 flight from its last answer.  In each segment the candidates take their turns in random order.  A segment begins with
@@ -12,17 +12,112 @@ the period before it, which is not timed.
 from __future__ import annotations
 
 import contextlib
+import functools
 import gc
 import math
+import os
+import subprocess
+import sys
 import time as clock
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Final, Protocol
+from pathlib import Path
+from typing import Any, Final, NamedTuple, Protocol, TypeVar
 
 import numpy as np
 from threadpoolctl import threadpool_limits
 
 from quadsim.state import Array
+
+Found = TypeVar("Found")
+
+
+class Stopwatch:
+    """Seconds since it was made, and those that calls took.
+
+    Args:
+        now: a clock [s]: `time.perf_counter`, or `time.thread_time`, which stands still while other processes run.
+    """
+
+    def __init__(self, now: Callable[[], float] = clock.perf_counter) -> None:
+        self._now, self._started = now, now()
+        self.laps: dict[str, list[float]] = {}  # seconds of each call that is watched, by what it is called
+
+    @property
+    def elapsed(self) -> float:
+        """Seconds since it was made."""
+        return self._now() - self._started
+
+    def watch(self, owner: object, method: str, name: str) -> None:
+        """Have each call of a method, of an object or of a class, leave its seconds in `laps[name]`."""
+        function, laps, now = getattr(owner, method), self.laps.setdefault(name, []), self._now
+
+        @functools.wraps(function)
+        def timed(*arguments: Any, **named: Any) -> Any:
+            started = now()
+            try:
+                return function(*arguments, **named)
+            finally:
+                laps.append(now() - started)
+
+        setattr(owner, method, timed)
+
+    def totals(self) -> dict[str, float]:
+        """Seconds of all calls that were watched, by name; of those that were not called, nothing."""
+        return {name: sum(laps) for name, laps in self.laps.items() if laps}
+
+    def clear(self) -> None:
+        """Forget all calls so far."""
+        for laps in self.laps.values():
+            laps.clear()
+
+
+def in_turns(runs: Mapping[str, Callable[[], Found]], repeats: int) -> dict[str, list[Found]]:
+    """What each of several runs returned, each so many times, in turns."""
+    found: dict[str, list[Found]] = {name: [] for name in runs}
+    for _ in range(repeats):
+        for name, run in runs.items():
+            found[name].append(run())
+    return found
+
+
+class CommandTime(NamedTuple):
+    """What a command printed, its wall time, and the processor time of all its processes [s]."""
+
+    output: str
+    wall_s: float
+    processor_s: float
+
+
+def time_python(*arguments: str, tree: Path) -> CommandTime:
+    """Run Python in a checkout, on one thread of linear algebra, and time it.
+
+    Raises:
+        SystemExit: with what it said, where its exit status is neither 0 nor 1: a flight may violate its constraints.
+    """
+    import resource  # no such thing on Windows
+
+    environment = {**os.environ, "PYTHONPATH": str(tree), "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
+    before, watch = resource.getrusage(resource.RUSAGE_CHILDREN), Stopwatch()
+    done = subprocess.run([sys.executable, *arguments], cwd=tree, env=environment, capture_output=True, text=True)
+    wall_s, after = watch.elapsed, resource.getrusage(resource.RUSAGE_CHILDREN)
+    if done.returncode not in (0, 1):
+        raise SystemExit(done.stderr)
+    return CommandTime(done.stdout, wall_s, sum(after[:2]) - sum(before[:2]))
+
+
+@contextlib.contextmanager
+def one_core() -> Iterator[int | None]:
+    """Hold the process to one of its cores; None where the system does not offer that."""
+    if not hasattr(os, "sched_setaffinity"):
+        yield None
+        return
+    allowed = os.sched_getaffinity(0)
+    os.sched_setaffinity(0, {max(allowed)})
+    try:
+        yield 1
+    finally:
+        os.sched_setaffinity(0, allowed)
 
 
 @contextlib.contextmanager
@@ -41,8 +136,7 @@ def undisturbed() -> Iterator[None]:
             gc.enable()
 
 
-SEGMENT: Final = 20
-"""Consecutive periods that a candidate answers before it is the next one's turn."""
+SEGMENT: Final = 20  # consecutive periods that a candidate answers before it is the next one's turn
 
 
 class Candidate(Protocol):
@@ -50,22 +144,16 @@ class Candidate(Protocol):
 
     def prepare(self, period: int) -> None:
         """Get ready; not timed."""
-        ...
 
     def answer(self) -> None:
         """Answer the question prepared for; timed."""
-        ...
 
 
 @dataclass(frozen=True, kw_only=True)
 class StepTimes:
-    """What a candidate's answers took.
+    """What a candidate's answers took."""
 
-    Attributes:
-        ms: (repeats, questions) [ms].
-    """
-
-    ms: Array
+    ms: Array  # (repeats, questions) [ms]
 
     @property
     def median(self) -> Array:

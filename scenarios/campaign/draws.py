@@ -15,7 +15,7 @@ import numpy as np
 from scipy import stats
 
 from quadsim.state import Array
-from scenarios.campaign.distributions import (
+from scenarios.campaign.spec import (
     ChoiceSpec,
     GridSpec,
     LogUniformSpec,
@@ -28,16 +28,11 @@ from scenarios.campaign.distributions import (
 if TYPE_CHECKING:
     from scenarios.campaign.spec import CampaignSpec
 
-_TAIL: Final = 1e-3
-"""Share of a distribution beyond the values that stand for its ends."""
+_TAIL: Final = 1e-3  # share of a distribution beyond the values that stand for its ends
 
 
 class Draws:
-    """What the flights of a campaign are drawn to be; the same for the same file, whoever asks, in whatever order.
-
-    Args:
-        spec: the campaign's file.
-    """
+    """What the flights of a campaign are drawn to be; the same for the same file, whoever asks, in whatever order."""
 
     def __init__(self, spec: CampaignSpec) -> None:
         self._spec = spec

@@ -22,8 +22,7 @@ MANIFEST_FILE: Final = "manifest.json"
 CAMPAIGN_FILE: Final = "campaign.toml"
 SCENARIO_FILE: Final = "scenario.toml"
 FORMAT: Final = "quadsim campaign"
-KIND: Final = "campaign"
-"""What `quadsim.outputs` calls a campaign's directory."""
+KIND: Final = "campaign"  # what `quadsim.outputs` calls a campaign's directory
 _FORM: Final = {
     **dict.fromkeys(("format", "name", "status"), str),
     **dict.fromkeys(("flights", "flown"), int),
@@ -37,10 +36,7 @@ _FINISHED: Final = ("complete", "stopped")
 
 
 def begin(plan: Plan, files: Growing) -> dict[str, Any]:
-    """Write the files that define a campaign; its manifest comes last.
-
-    Returns:
-        The manifest.
+    """Write the files that define a campaign, its manifest last, and return that.
 
     Raises:
         OutputError: they cannot be written, or files of these names that we did not write are there.
@@ -71,14 +67,9 @@ def begin(plan: Plan, files: Growing) -> dict[str, Any]:
 def go_on(plan: Plan, files: Growing, *, flying: bool) -> dict[str, Any]:
     """The manifest of a campaign that is resumed, perhaps with more flights; see `require_same`.
 
-    Args:
-        plan: the campaign.
-        files: of its directory.
-        flying: whether anything is missing that has to be flown.
-
     Raises:
         FileError: there is none, or it is damaged.
-        InputError: other code would go on with it.
+        InputError: something has to be flown, and other code would fly it.
         OutputError: it cannot be written.
     """
     manifest = read_manifest(files.path)
@@ -132,7 +123,7 @@ def require_same(plan: Plan, directory: Path) -> None:
 
 
 def other_than_flew(manifest: Mapping[str, Any], plan: Plan) -> list[str]:
-    """Of `code`, `controller`, `versions` and `machine`, those that are not as when a campaign was begun.
+    """Of `code`, `controller`, `forces`, `versions` and `machine`, those that are not as when a campaign was begun.
 
     Imports a plug-in controller; what is to run, and what ran then, is logged to
     `scenarios.parts.foreign_code.LOGGER` before.
@@ -147,6 +138,7 @@ def _flown_by(plan: Plan) -> dict[str, Any]:
     return {
         "code": code_digest(),
         "controller": controller_digest(plan.scenario),
+        "forces": [find_code(force).digest for force in plan.scenario.forces] or None,
         "versions": versions(),
         "machine": machine(),
     }

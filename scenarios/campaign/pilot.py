@@ -20,11 +20,7 @@ from scenarios.schema.plugin import PluginSpec
 
 
 class CampaignPilot:
-    """Flies the flights of a campaign; sent to each process once.
-
-    Args:
-        plan: the campaign.
-    """
+    """Flies the flights of a campaign; sent to each process once."""
 
     def __init__(self, plan: Plan) -> None:
         self._plan = plan

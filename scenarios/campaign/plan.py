@@ -12,36 +12,29 @@ from typing import Any, Final
 import pyarrow as pa
 from pydantic import ValidationError
 
-from quadsim.errors import FileError, InputError, ParameterError, UnknownNameError
-from scenarios.campaign.distributions import Value, VarySpec
+from quadsim.errors import FileError, InputError, ParameterError
 from scenarios.campaign.draws import Draws, extremes
 from scenarios.campaign.results.events import Event, parse_event
 from scenarios.campaign.results.table import DRAW, TIMING, Row, make_schema
-from scenarios.campaign.spec import CampaignSpec
-from scenarios.loading import check_parts, parse_scenario, scenario_path
+from scenarios.campaign.spec import CampaignSpec, Value, VarySpec
+from scenarios.loading import check_parts, parse_scenario
 from scenarios.parts.limits import build_limits
 from scenarios.parts.vehicle import build_vehicle, resolve_vehicle
 from scenarios.schema.bases import locate_files, merge, read_scenario
 from scenarios.schema.problems import ScenarioError, describe
 from scenarios.schema.scenario import Scenario
 from scenarios.schema.settings import apply_setting, get_field, set_field
+from scenarios.shipped import campaign_path, scenario_path
 
-FIRST: Final = 5
-"""Flights of which one at least has to be possible."""
-LIBRARY: Final = Path(__file__).resolve().parent.parent / "campaigns"
+FIRST: Final = 5  # flights of which one at least has to be possible
 
 
 @dataclass(frozen=True)
 class Plan:
-    """A campaign's file and the scenario that its flights differ from.
+    """A campaign's file and the scenario that its flights differ from."""
 
-    Attributes:
-        spec: the file.
-        scenario: with the file's changes, and every number of its vehicle, in it.
-    """
-
-    spec: CampaignSpec
-    scenario: Scenario
+    spec: CampaignSpec  # the file
+    scenario: Scenario  # with the file's changes, and every number of its vehicle, in it
 
     @cached_property
     def draws(self) -> Draws:
@@ -137,26 +130,6 @@ class Plan:
         if isinstance(value, bool) or not isinstance(value, int | float):
             raise ParameterError(f"vary.{entry.name}", "relative", True, "false where what is drawn is no number")
         return value * given
-
-
-def campaign_names() -> list[str]:
-    """Names of the campaigns that ship, sorted."""
-    return sorted(path.stem for path in LIBRARY.glob("*.toml"))
-
-
-def campaign_path(name: str) -> Path:
-    """The file of a campaign that ships, or the path itself when it ends in `.toml`.
-
-    Raises:
-        FileError, UnknownNameError: there is none.
-    """
-    if name.endswith(".toml"):
-        if not Path(name).is_file():
-            raise FileError(name, "no such campaign file")
-        return Path(name)
-    if name not in campaign_names():
-        raise UnknownNameError("campaign", name, campaign_names(), hint="or give a path ending in .toml")
-    return LIBRARY / f"{name}.toml"
 
 
 def read_campaign(name: str) -> dict[str, Any]:

@@ -23,21 +23,14 @@ from scenarios.schema.scenario import Scenario
 
 @dataclass(frozen=True, kw_only=True)
 class Recorded:
-    """A flight of a finished campaign.
+    """A flight of a finished campaign."""
 
-    Attributes:
-        number: which.
-        row: its row of `flights.parquet`.
-        plan: the campaign.
-        scenario: what was flown.
-        otherwise: of `code`, `controller`, `versions` and `machine`, those that are not as when it was flown, so that
-            numbers may differ.
-    """
-
-    number: int
-    row: Mapping[str, Any]
-    plan: Plan
-    scenario: Scenario
+    number: int  # which
+    row: Mapping[str, Any]  # its row of `flights.parquet`
+    plan: Plan  # the campaign
+    scenario: Scenario  # what was flown
+    # of `code`, `controller`, `versions` and `machine`, those that are not as when it was flown, so that numbers may
+    # differ
     otherwise: Sequence[str]
 
     @property

@@ -42,27 +42,19 @@ ALL_FILES: Final = (
     *REPORT_FILES,
 )
 """What a campaign's directory holds in the end."""
-FLUSH_S: Final = 5.0
-"""How long an answer may wait in memory before it is on the disk [s]."""
+FLUSH_S: Final = 5.0  # how long an answer may wait in memory before it is on the disk [s]
 CHECK_EVERY: Final = 10
 """Flights after which the interval is looked at again, where it decides when to stop; of grids, whole turns."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Standing:
-    """How far a campaign is.
+    """How far a campaign is."""
 
-    Attributes:
-        flown: flights that are there.
-        flights: that there are to be.
-        failed: of those flown.
-        rate: flights per second of this session; 0 before the first.
-    """
-
-    flown: int
-    flights: int
-    failed: int
-    rate: float
+    flown: int  # flights that are there
+    flights: int  # that there are to be
+    failed: int  # of those flown
+    rate: float  # flights per second of this session; 0 before the first
 
 
 Watch = Callable[[Standing], None]
@@ -172,12 +164,10 @@ class _Progress:
 
     @property
     def missing(self) -> bool:
-        """Whether there is anything to fly."""
         return bool((self._outcomes < 0).any()) and not self._is_sure()
 
     @property
     def done(self) -> int:
-        """Flights that are there and count."""
         return int(np.count_nonzero(self._outcomes[: self.wanted] >= 0))
 
     def fly(self, engine: Engine) -> None:

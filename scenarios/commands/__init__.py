@@ -17,11 +17,11 @@ COMMANDS: Final[Mapping[str, str]] = {
     "video": "products:video",
     "view": "products:view",
     "scenario": "catalogue:scenario",
-    "vehicle": "catalogue:vehicle",
+    "vehicle": "vehicle_sheet:vehicle",
     "campaign": "campaigns:campaign",
     "replay": "campaigns:replay",
     "bench": "bench:bench",
-    "doctor": "catalogue:doctor",
+    "doctor": "doctor:doctor",
 }
 """Where each is, `module:function` in this package."""
 

@@ -24,13 +24,10 @@ from scenarios.campaign.statistics.wording import interval
 from scenarios.commands import console
 from scenarios.commands.console import stderr, stdout, styled
 
-MOST_LINES: Final = 8
-"""Of a table on the terminal; the report has them all."""
-LEAST_WORDS, MOST_WORDS = 20, 60
-"""Characters of a reason on the terminal, as there is room."""
+MOST_LINES: Final = 8  # of a table on the terminal; the report has them all
+LEAST_WORDS, MOST_WORDS = 20, 60  # Characters of a reason on the terminal, as there is room
 _TIME: Final = re.compile(r"^at t = \S+ s: ")
-LINE_EVERY: Final = 30.0
-"""Between two lines of progress where stderr is no terminal [s]."""
+LINE_EVERY: Final = 30.0  # between two lines of progress where stderr is no terminal [s]
 
 
 @contextlib.contextmanager

@@ -1,53 +1,57 @@
-"""`quadsim list`, `scenario`, `vehicle` and `doctor`: what there is, and what it says."""
+"""`quadsim list` and `scenario`: what there is, and what it says."""
 
 from __future__ import annotations
 
 import json
 from argparse import Namespace
-from collections.abc import Sequence
-from pathlib import Path
-from typing import Final, get_args
+from typing import Any, Final, get_args
 
 from mpc.solvers import SOLVERS
-from quadsim.assets import vehicle_names, vehicle_path
-from quadsim.errors import InputError, ParameterError
-from quadsim.vehicle import load_vehicle, vehicle_sources
-from scenarios.build import CONTROLLERS, resolve
-from scenarios.campaign.plan import campaign_names, read_campaign
+from quadsim.assets import read_toml, vehicle_names, vehicle_path
+from quadsim.errors import InputError
+from quadsim.vehicle import load_vehicle
 from scenarios.commands import EXIT_DONE, console
-from scenarios.commands.common import load
-from scenarios.loading import load_scenario, scenario_names
-from scenarios.parts.vehicle import build_vehicle
-from scenarios.schema.course import CsvSpec
-from scenarios.schema.scenario import Group, Scenario
+from scenarios.shipped import CONTROLLERS, Group, campaign_names, campaign_path, scenario_names, scenario_path
 
 _MEANT: Final = {"violated": "  (meant to violate a constraint)", "lost": "  (meant to be lost)"}
 """What `quadsim list` says of a scenario that is to defeat its controller."""
 
 
 def list_everything(options: Namespace) -> int:
-    """`quadsim list`."""
-    scenarios = [load_scenario(name) for name in scenario_names()]
+    """`quadsim list`; files that ship are right, and read without being checked."""
+    scenarios: dict[str, dict[str, Any]] = {
+        name: {"group": "other", "expect": "satisfied"} | read_toml(scenario_path(name)) for name in scenario_names()
+    }
     sections = {
-        "campaigns": {name: read_campaign(name)["description"] for name in campaign_names()},
+        "campaigns": {name: read_toml(campaign_path(name))["description"] for name in campaign_names()},
         "vehicles": {name: load_vehicle(vehicle_path(name)).description for name in vehicle_names()},
-        "controllers": dict(CONTROLLERS),
+        "controllers": CONTROLLERS,
         "solvers": {name: entry.line for name, entry in SOLVERS.items()},
     }
     if options.json:
-        about = {
-            "scenarios": {each.name: each.description for each in scenarios},
-            "groups": {each.name: each.group for each in scenarios},
-            "expected": {each.name: each.expect for each in scenarios},
-        }
+        keys = {"scenarios": "description", "groups": "group", "expected": "expect"}
+        about = {title: {name: each[key] for name, each in scenarios.items()} for title, key in keys.items()}
         print(json.dumps({**about, **sections}, indent=2))
-    else:
-        console.print_listing({**_by_group(scenarios), **sections})
+        return EXIT_DONE
+    by_group: dict[str, dict[str, str]] = {}
+    for group in get_args(Group):
+        lines = {
+            name: each["description"] + _MEANT.get(each["expect"], "")
+            for name, each in scenarios.items()
+            if each["group"] == group
+        }
+        by_group |= {f"scenarios: {group}": lines} if lines else {}
+    console.print_listing({**by_group, **sections})
     return EXIT_DONE
 
 
 def scenario(options: Namespace) -> int:
     """`quadsim scenario`."""
+    from scenarios.build import resolve
+    from scenarios.commands.common import load
+    from scenarios.parts.vehicle import build_vehicle
+    from scenarios.schema.course import CsvSpec
+
     if options.schema:
         from scenarios.schema.json_schema import scenario_schema
 
@@ -63,44 +67,3 @@ def scenario(options: Namespace) -> int:
         resolved = resolved.model_copy(update={"reference": resolved.reference.model_copy(update={"sha256": None})})
     print(resolved.to_toml(), end="")
     return EXIT_DONE
-
-
-def vehicle(options: Namespace) -> int:
-    """`quadsim vehicle`."""
-    from scenarios.commands.vehicle_sheet import make_sheet, sheet_tables, sheet_to_json
-
-    path = vehicle_path(options.vehicle)
-    loaded, sources = load_vehicle(path), vehicle_sources(path)
-    if options.out is not None:
-        from quadsim.report.film.video import render_portrait
-
-        if Path(options.out).suffix != ".png":
-            raise ParameterError("", "--out", options.out, "a file ending in .png")
-        render_portrait(loaded, Path(options.out))
-    sheet = make_sheet(loaded)
-    if options.json:
-        print(json.dumps(sheet_to_json(loaded, sheet, sources), indent=2))
-    else:
-        console.print_grids(sheet_tables(loaded, sheet, sources), options.out, prose=("unit", "source"))
-    return EXIT_DONE
-
-
-def doctor(options: Namespace) -> int:
-    """`quadsim doctor`."""
-    from scenarios.commands.doctor import examine
-
-    findings = examine()
-    if options.json:
-        print(json.dumps(findings, indent=2))
-    else:
-        console.print_listing(findings)
-    return EXIT_DONE
-
-
-def _by_group(scenarios: Sequence[Scenario]) -> dict[str, dict[str, str]]:
-    """One line per scenario, by group; those that are to defeat their controller say so."""
-    found: dict[str, dict[str, str]] = {}
-    for group in get_args(Group):
-        lines = {each.name: each.description + _MEANT.get(each.expect, "") for each in scenarios if each.group == group}
-        found |= {f"scenarios: {group}": lines} if lines else {}
-    return found

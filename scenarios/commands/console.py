@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from typing import Any, Final
 
 from rich.box import SIMPLE_HEAD
@@ -16,7 +16,7 @@ from rich.text import Text
 
 from quadsim.controller import law_name
 from quadsim.errors import printable
-from quadsim.report.flight_conditions import FOR_GOOD, failure_sentences, verdict_sentence
+from quadsim.report.comparison import FOR_GOOD, failure_sentences, verdict_sentence
 from quadsim.report.table import Cell, Grid, Mark, Row
 from scenarios.progress import Progress, silent
 
@@ -70,8 +70,7 @@ def print_listing(sections: Mapping[str, Mapping[str, str]]) -> None:
 
 def print_summary(summary: Mapping[str, Any], where: str | None) -> None:
     """A flight's outcome, tracking, audit and solver, from its summary."""
-    console = stdout()
-    flown = styled(f"  {summary['duration']:.2f} s flown")
+    console, flown = stdout(), styled(f"  {summary['duration']:.2f} s flown")
     console.print(styled((summary["scenario"], "bold"), "  ") + outcome(summary) + flown)
     if "course" in summary:
         console.print(summary["course"]["sentence"], soft_wrap=True)
@@ -79,9 +78,8 @@ def print_summary(summary: Mapping[str, Any], where: str | None) -> None:
         console.print(_tracking_table(summary["tracking"]))
     if summary["constraints"]:
         console.print(audit_table(summary["constraints"]))
-    if summary["tracking"]:
-        for line in _controller_lines(summary):
-            console.print(line)
+    for line in _controller_lines(summary) if summary["tracking"] else ():
+        console.print(line)
     for line in (*_effect_lines(summary), *failure_sentences(summary)):
         console.print(line, soft_wrap=True)
     if "reaudit" in summary:
@@ -129,23 +127,18 @@ def audit_table(constraints: Sequence[Mapping[str, Any]]) -> Table:
     caption = "beyond: seconds; tolerance: at the samples / at the physics rate"
     if any(not entry["required"] for entry in constraints):
         caption += ";  * reported, not required by the scenario"
-    table = _table("audit at the physics rate", caption=caption)
-    table.add_column("constraint", no_wrap=True)
-    for name in ("bounds", "sampled", "plant", "margin", "beyond", "tolerance"):
-        table.add_column(name, justify="right", no_wrap=True)
-    table.add_column("verdict", no_wrap=True)
-    for entry in constraints:
-        table.add_row(
+    head = ("constraint", "bounds", "sampled", "plant", "margin", "beyond", "tolerance", "verdict")
+    lines = [
+        (
             f"{entry['name']} [{entry['unit']}]",
             _range(entry["lower"], entry["upper"]),
-            _number(entry["peak_sampled"]),
-            _number(entry["peak_plant"]),
-            _number(entry["worst_margin"]),
-            _number(entry["time_violated"]),
+            *(_number(entry[name]) for name in ("peak_sampled", "peak_plant", "worst_margin", "time_violated")),
             f"{_number(entry['tolerance_sampled'])}/{_number(entry['tolerance'])}",
             _verdict(entry),
         )
-    return table
+        for entry in constraints
+    ]
+    return _table("audit at the physics rate", head, lines, caption=caption, left=("verdict",), rigid=True)
 
 
 def _verdict(entry: Mapping[str, Any]) -> Text:
@@ -157,13 +150,12 @@ def _verdict(entry: Mapping[str, Any]) -> Text:
 
 
 def _tracking_table(tracking: Mapping[str, Any]) -> Table:
-    table = _table("tracking, real minus filtered reference")
-    table.add_column("")
-    for channel, unit in tracking["unit"].items():
-        table.add_column(f"{channel} [{unit}]", justify="right")
-    for name in ("rmse", "max_error", "final_error", "overshoot"):
-        table.add_row(name.replace("_", " "), *(f"{tracking[name][channel]:.4g}" for channel in tracking["unit"]))
-    return table
+    head = ["", *(f"{channel} [{unit}]" for channel, unit in tracking["unit"].items())]
+    lines = [
+        (name.replace("_", " "), *(f"{tracking[name][channel]:.4g}" for channel in tracking["unit"]))
+        for name in ("rmse", "max_error", "final_error", "overshoot")
+    ]
+    return _table("tracking, real minus filtered reference", head, lines)
 
 
 def _controller_lines(summary: Mapping[str, Any]) -> Iterator[str]:
@@ -216,30 +208,24 @@ _BRIEF: Final = ("outcome", "required constraints", "RMS error", "verdict", "sta
 
 def print_comparison(rows: Sequence[Row], names: Sequence[str], where: str) -> None:
     """The comparison's answers side by side: outcomes, tracking, verdicts, times."""
-    console = stdout()
-    table = _table("comparison")
-    table.add_column("", no_wrap=True)
-    for name in names:
-        table.add_column(name, justify="right")
-    for row in rows:
-        if row.label.startswith(_BRIEF):
-            label = row.group if row.headline else row.label
-            unit = f" [{row.unit}]" if row.unit else ""
-            table.add_row(label + unit, *(_cell(cell) for cell in row.cells))
-    console.print(table)
-    console.print(styled("every number, plots and films: ", (where, "bold")), soft_wrap=True)
+    lines = [
+        (
+            (row.group if row.headline else row.label) + (f" [{row.unit}]" if row.unit else ""),
+            *(_cell(cell) for cell in row.cells),
+        )
+        for row in rows
+        if row.label.startswith(_BRIEF)
+    ]
+    stdout().print(_table("comparison", ["", *names], lines))
+    stdout().print(styled("every number, plots and films: ", (where, "bold")), soft_wrap=True)
 
 
 def print_grids(grids: Sequence[Grid], where: str | None, *, prose: Collection[str] = ()) -> None:
     """Tables of cases, one below the other, with what a reader has to know of each; `prose` names columns of words."""
     console = stdout()
     for grid in grids:
-        table = _table(grid.title, caption=grid.note.replace("`", "") or None)
-        for i, name in enumerate(grid.head):
-            table.add_column(name, justify="right" if i and name not in prose else "left", no_wrap=not i)
-        for line in grid.lines:
-            table.add_row(*(_cell(cell) for cell in line))
-        console.print(table)
+        lines = [[_cell(cell) for cell in line] for line in grid.lines]
+        console.print(_table(grid.title, grid.head, lines, caption=grid.note.replace("`", "") or None, left=prose))
         console.print()
     if where is not None:
         print_place(where)
@@ -264,17 +250,23 @@ def _range(lower: float | None, upper: float | None) -> str:
     return f"{_number(lower)}..{_number(upper)}"
 
 
-def _table(title: str, caption: str | None = None) -> Table:
-    return Table(
-        title=title,
-        title_justify="left",
-        title_style="bold",
-        caption=caption,
-        caption_justify="left",
-        box=SIMPLE_HEAD,
-        padding=0,
-        pad_edge=False,
-    )
+def _table(
+    title: str,
+    head: Sequence[str],
+    lines: Iterable[Iterable[Any]],
+    *,
+    caption: str | None = None,
+    left: Collection[str] = (),
+    rigid: bool = False,
+) -> Table:
+    """A table whose first column, and those named in `left`, are of words; in a `rigid` one no cell is wrapped."""
+    table = Table(title=title, title_justify="left", title_style="bold", box=SIMPLE_HEAD, padding=0, pad_edge=False)
+    table.caption, table.caption_justify = caption, "left"
+    for i, name in enumerate(head):
+        table.add_column(name, justify="right" if i and name not in left else "left", no_wrap=rigid or not i)
+    for line in lines:
+        table.add_row(*line)
+    return table
 
 
 @contextlib.contextmanager

@@ -1,10 +1,12 @@
-"""What this machine can do: packages, cores, rendering, viewer, solvers."""
+"""`quadsim doctor`: what this machine can do, its packages, cores, rendering, viewer, solvers."""
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
 import time as clock
+from argparse import Namespace
 
 import numpy as np
 
@@ -15,16 +17,17 @@ from quadsim.report.film.video import rendering_backend
 from quadsim.report.recording import viewer_problem
 from quadsim.vehicle import N_ROTORS
 from scenarios.build import build_controller
+from scenarios.commands import EXIT_DONE, console
 from scenarios.courses.make import build_reference
 from scenarios.loading import load_scenario
 from scenarios.machine import machine, versions
 from scenarios.parts.vehicle import build_initial_state, build_vehicle
 
 
-def examine() -> dict[str, dict[str, str]]:
-    """Findings by section, each a line a person can act on."""
+def doctor(options: Namespace) -> int:
+    """`quadsim doctor`: findings by section, each a line a person can act on."""
     here = machine()
-    return {
+    findings = {
         "machine": {
             "system": here["system"],
             "processor": f"{here['processor']}, {len(os.sched_getaffinity(0))} of {here['cores']} cores usable",
@@ -35,6 +38,11 @@ def examine() -> dict[str, dict[str, str]]:
         "viewer": {"native": viewer_problem() or "can be opened", "browser": "quadsim view RUN --web"},
         "solvers": {name: _try_solver(name) if entry.installed else entry.line for name, entry in SOLVERS.items()},
     }
+    if options.json:
+        print(json.dumps(findings, indent=2))
+    else:
+        console.print_listing(findings)
+    return EXIT_DONE
 
 
 def _rendering() -> str:

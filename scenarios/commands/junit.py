@@ -9,7 +9,7 @@ from xml.etree import ElementTree
 
 from quadsim.errors import printable
 from quadsim.outputs import writing_file
-from quadsim.report.flight_conditions import failure_sentences
+from quadsim.report.comparison import failure_sentences
 
 
 def write_junit(summary: Mapping[str, Any], path: Path) -> None:

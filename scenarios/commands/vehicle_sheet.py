@@ -1,102 +1,94 @@
-"""What a vehicle's numbers amount to: hover, thrust and torque margins, and the poles of its linear model."""
+"""`quadsim vehicle`: what its numbers amount to, of hover, thrust and torque margins and of the linear model."""
 
 from __future__ import annotations
 
 import itertools
+import json
 import math
+from argparse import Namespace
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 from scipy.optimize import linprog
 
 from mpc.model import continuous_model, discretise
+from quadsim.assets import vehicle_path
+from quadsim.errors import ParameterError
 from quadsim.report.table import Cell, Grid, format_number
 from quadsim.state import INDEX, Array
-from quadsim.vehicle import N_ROTORS, VEHICLE_UNITS, Vehicle
+from quadsim.vehicle import N_ROTORS, VEHICLE_UNITS, Vehicle, load_vehicle, vehicle_sources
+from scenarios.commands import EXIT_DONE, console
 
 AXES: Final = ("x", "y", "z")
-SHEET_PERIOD: Final = 0.05
-"""Control period of the discrete poles [s], the paper's."""
+SHEET_PERIOD: Final = 0.05  # control period of the discrete poles [s], the paper's
 _RPM: Final = 60.0 / (2.0 * math.pi)
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class TorqueRange:
-    """The torques about one body axis that hover leaves room for.
+    """The torques about one body axis that hover leaves room for."""
 
-    Attributes:
-        axis: x, y or z.
-        lowest: torque [N m].
-        highest: torque [N m].
-        lowest_pure: the same with no torque about the other two axes [N m].
-        highest_pure: the same with no torque about the other two axes [N m].
-        lowest_acceleration: what `lowest` gives from rest [rad/s^2].
-        highest_acceleration: what `highest` gives from rest [rad/s^2].
-    """
-
-    axis: str
-    lowest: float
-    highest: float
-    lowest_pure: float
-    highest_pure: float
-    lowest_acceleration: float
-    highest_acceleration: float
+    axis: str  # x, y or z
+    lowest: float  # torque [N m]
+    highest: float  # torque [N m]
+    lowest_pure: float  # the same with no torque about the other two axes [N m]
+    highest_pure: float  # the same with no torque about the other two axes [N m]
+    lowest_acceleration: float  # what `lowest` gives from rest [rad/s^2]
+    highest_acceleration: float  # what `highest` gives from rest [rad/s^2]
 
 
 @dataclass(frozen=True, kw_only=True)
 class VehicleSheet:
-    """Figures derived from a vehicle's numbers, all at hover.
+    """Figures derived from a vehicle's numbers, all at hover."""
 
-    Attributes:
-        weight: m g [N].
-        hover_speed: omega_bar [rad/s].
-        hover_speed_rpm: the same [rpm].
-        speed_range_used: where hover lies between the lowest speed, 0, and the highest, 1 [-].
-        thrust_to_weight: all rotors at their highest speed, over the weight [-].
-        climb_acceleration: largest upward acceleration from hover, level [m/s^2].
-        steady_tilt: largest tilt at which the rotors still carry the weight, cos(tilt) = 1 / thrust_to_weight [deg].
-        torques: about x, y and z.
-        thrust_slope: of one rotor, 2 b omega_bar [N s/rad].
-        input_slopes: largest entry of B_c in the rows of vz [m/s^2 per rad/s] and of the three rates [rad/s^2 per
-            rad/s]: the modelled effect of one rotor per rad/s.
-        integrator_chains: lengths of the chains of integrators that the linear model falls into, longest first.
-        continuous_poles: of A_c [1/s].
-        discrete_poles: of A at `period` [-].
-        period: tau_s [s].
-        lag_poles: of the rotors' speeds when they rise and fall, continuous [1/s], as far as the file gives them.
-        discrete_lag_poles: the same at `period` [-].
-    """
-
-    weight: float
-    hover_speed: float
-    hover_speed_rpm: float
-    speed_range_used: float
-    thrust_to_weight: float
-    climb_acceleration: float
+    weight: float  # m g [N]
+    hover_speed: float  # omega_bar [rad/s]
+    hover_speed_rpm: float  # the same [rpm]
+    speed_range_used: float  # where hover lies between the lowest speed, 0, and the highest, 1 [-]
+    thrust_to_weight: float  # all rotors at their highest speed, over the weight [-]
+    climb_acceleration: float  # largest upward acceleration from hover, level [m/s^2]
+    # largest tilt at which the rotors still carry the weight, cos(tilt) = 1 / thrust_to_weight [deg]
     steady_tilt: float
-    torques: tuple[TorqueRange, ...]
-    thrust_slope: float
+    torques: tuple[TorqueRange, ...]  # about x, y and z
+    thrust_slope: float  # of one rotor, 2 b omega_bar [N s/rad]
+    # largest entry of B_c in the rows of vz [m/s^2 per rad/s] and of the three rates [rad/s^2 per rad/s]: the modelled
+    # effect of one rotor per rad/s
     input_slopes: dict[str, float]
+    # lengths of the chains of integrators that the linear model falls into, longest first
     integrator_chains: tuple[int, ...]
-    continuous_poles: tuple[float, ...]
-    discrete_poles: tuple[float, ...]
-    period: float
+    continuous_poles: tuple[float, ...]  # of A_c [1/s]
+    discrete_poles: tuple[float, ...]  # of A at `period` [-]
+    period: float  # tau_s [s]
+    # of the rotors' speeds when they rise and fall, continuous [1/s], as far as the file gives them
     lag_poles: dict[str, float]
-    discrete_lag_poles: dict[str, float]
+    discrete_lag_poles: dict[str, float]  # the same at `period` [-]
 
 
-def make_sheet(vehicle: Vehicle, *, period: float = SHEET_PERIOD) -> VehicleSheet:
-    """The figures of a vehicle.
+def vehicle(options: Namespace) -> int:
+    """`quadsim vehicle`."""
+    path = vehicle_path(options.vehicle)
+    loaded, sources = load_vehicle(path), vehicle_sources(path)
+    if options.out is not None:
+        from quadsim.report.film.video import render_portrait
 
-    Args:
-        vehicle: the numbers.
-        period: control period of the discrete poles [s].
-    """
+        if Path(options.out).suffix != ".png":
+            raise ParameterError("", "--out", options.out, "a file ending in .png")
+        render_portrait(loaded, Path(options.out))
+    sheet = make_sheet(loaded)
+    if options.json:
+        print(json.dumps(sheet_to_json(loaded, sheet, sources), indent=2))
+    else:
+        console.print_grids(sheet_tables(loaded, sheet, sources), options.out, prose=("unit", "source"))
+    return EXIT_DONE
+
+
+def make_sheet(vehicle: Vehicle) -> VehicleSheet:
+    """The figures of a vehicle."""
     A_c, B_c = continuous_model(vehicle)
-    A, _ = discretise(A_c, B_c, period)
-    chains = integrator_chains(A_c)
+    A, _ = discretise(A_c, B_c, SHEET_PERIOD)
     ratio = (vehicle.speed_max / vehicle.hover_speed) ** 2
     lags = {name: value for name in ("rotor_rise", "rotor_fall") if (value := getattr(vehicle, name)) is not None}
     return VehicleSheet(
@@ -112,13 +104,13 @@ def make_sheet(vehicle: Vehicle, *, period: float = SHEET_PERIOD) -> VehicleShee
         input_slopes={
             name: float(np.abs(B_c[INDEX[name]]).max()) for name in ("vz", "roll_rate", "pitch_rate", "yaw_rate")
         },
-        integrator_chains=chains,
+        integrator_chains=integrator_chains(A_c),
         # A_c permutes to a strictly upper triangular matrix: chains of integrators, whose poles are its diagonal.
         continuous_poles=tuple(np.diag(A_c).tolist()),
         discrete_poles=tuple(np.diag(A).tolist()),
-        period=period,
+        period=SHEET_PERIOD,
         lag_poles={name: -1.0 / value for name, value in lags.items()},
-        discrete_lag_poles={name: math.exp(-period / value) for name, value in lags.items()},
+        discrete_lag_poles={name: math.exp(-SHEET_PERIOD / value) for name, value in lags.items()},
     )
 
 
@@ -129,19 +121,9 @@ def torque_ranges(vehicle: Vehicle) -> tuple[TorqueRange, ...]:
     times v, the thrust is its first row times v, and v_i lies between the squares of the speed limits.
     """
     ranges = []
-    for axis, name in enumerate(AXES):
+    for axis, (name, inertia) in enumerate(zip(AXES, vehicle.inertia, strict=True)):
         (low, high), (low_pure, high_pure) = (_extremes(vehicle, 1 + axis, pure=pure) for pure in (False, True))
-        ranges.append(
-            TorqueRange(
-                axis=name,
-                lowest=low,
-                highest=high,
-                lowest_pure=low_pure,
-                highest_pure=high_pure,
-                lowest_acceleration=low / vehicle.inertia[axis],
-                highest_acceleration=high / vehicle.inertia[axis],
-            )
-        )
+        ranges.append(TorqueRange(name, low, high, low_pure, high_pure, low / inertia, high / inertia))
     return tuple(ranges)
 
 
@@ -158,16 +140,11 @@ def integrator_chains(A_c: Array) -> tuple[int, ...]:
 
 def sheet_to_json(vehicle: Vehicle, sheet: VehicleSheet, sources: Mapping[str, str]) -> dict[str, Any]:
     """All of it as plain values: the vehicle, each parameter with unit and source, and what follows from them."""
-    return {
-        "name": vehicle.name,
-        "description": vehicle.description,
-        "parameters": {
-            name: {"value": value, "unit": unit, "source": sources[name]}
-            for name, unit in VEHICLE_UNITS.items()
-            if (value := getattr(vehicle, name)) is not None
-        },
-        "derived": asdict(sheet),
+    parameters = {
+        name: {"value": value, "unit": unit, "source": sources[name]} for name, value, unit in _parameters(vehicle)
     }
+    about = {"name": vehicle.name, "description": vehicle.description}
+    return {**about, "parameters": parameters, "derived": asdict(sheet)}
 
 
 def sheet_tables(vehicle: Vehicle, sheet: VehicleSheet, sources: Mapping[str, str]) -> list[Grid]:
@@ -192,14 +169,16 @@ def sheet_tables(vehicle: Vehicle, sheet: VehicleSheet, sources: Mapping[str, st
         _grid(
             "parameters",
             ("parameter", "value", "unit", "source"),
-            [
-                (name, _value(value), unit, sources[name])
-                for name, unit in VEHICLE_UNITS.items()
-                if (value := getattr(vehicle, name)) is not None
-            ],
+            [(name, _value(value), unit, sources[name]) for name, value, unit in _parameters(vehicle)],
             note="short names of sources are spelt out at the head of the vehicle's file",
         ),
     ]
+
+
+def _parameters(vehicle: Vehicle) -> list[tuple[str, Any, str]]:
+    """Name, value and unit of those that the file gives."""
+    given = ((name, getattr(vehicle, name), unit) for name, unit in VEHICLE_UNITS.items())
+    return [(name, value, unit) for name, value, unit in given if value is not None]
 
 
 def _extremes(vehicle: Vehicle, row: int, *, pure: bool) -> tuple[float, float]:
@@ -208,8 +187,7 @@ def _extremes(vehicle: Vehicle, row: int, *, pure: bool) -> tuple[float, float]:
     matrix = top * vehicle.allocation  # in v / speed_max^2, so that the programme is well scaled
     units = np.abs(matrix).max(axis=1)
     fixed = [0, *(other for other in (1, 2, 3) if pure and other != row)]
-    equal = np.zeros(len(fixed))
-    equal[0] = vehicle.mass * vehicle.gravity / units[0]
+    equal = [vehicle.mass * vehicle.gravity / units[0], *np.zeros(len(fixed) - 1)]
     found = []
     for sign in (1.0, -1.0):
         solution = linprog(

@@ -15,38 +15,23 @@ from scenarios.cost.study import CostStudy, Outcome, Sweep, SweepPoint
 
 @dataclass(frozen=True, kw_only=True)
 class Curve:
-    """A line through points; NaN where there is no value.
+    """A line through points; NaN where there is no value."""
 
-    Attributes:
-        label: its name.
-        x: (m,) of the points.
-        y: (m,) of the points.
-        colour: its place in the palette.
-        dashed: whether it stands for the flight without constraints.
-    """
-
-    label: str
-    x: Array
-    y: Array
-    colour: int
-    dashed: bool = False
+    label: str  # its name
+    x: Array  # (m,) of the points
+    y: Array  # (m,) of the points
+    colour: int  # its place in the palette
+    dashed: bool = False  # whether it stands for the flight without constraints
 
 
 @dataclass(frozen=True, kw_only=True)
 class Panel:
-    """Curves over one pair of axes.
+    """Curves over one pair of axes."""
 
-    Attributes:
-        label: of the vertical axis.
-        curves: what is drawn.
-        logarithmic: whether the vertical axis is.
-        never: x of the flights whose value is beyond all bounds: marked at the top.
-    """
-
-    label: str
-    curves: tuple[Curve, ...]
-    logarithmic: bool = False
-    never: tuple[float, ...] = ()
+    label: str  # of the vertical axis
+    curves: tuple[Curve, ...]  # what is drawn
+    logarithmic: bool = False  # whether the vertical axis is
+    never: tuple[float, ...] = ()  # x of the flights whose value is beyond all bounds: marked at the top
 
 
 def step_curves(study: CostStudy) -> list[Curve]:

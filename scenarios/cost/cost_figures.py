@@ -17,14 +17,7 @@ if TYPE_CHECKING:
 
 
 def write_cost_figures(study: CostStudy, directory: Path) -> list[Path]:
-    """Draw the step times of all candidates, and both sweeps.
-
-    Args:
-        study: what was measured.
-        directory: where the files go; made when it is not there.
-
-    Returns:
-        The files written: `cost_steps`, `cost_tilt` and `cost_horizon`, PNG and SVG of each.
+    """Draw step times and both sweeps: `cost_steps`, `cost_tilt` and `cost_horizon`, PNG and SVG of each.
 
     Raises:
         OutputError: the directory cannot be written.

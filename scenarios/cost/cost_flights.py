@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import multiprocessing
-import signal
+import functools
 from collections.abc import Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 
@@ -21,20 +19,88 @@ from quadsim.flight.log import ControlLog, FlightLog
 from quadsim.state import REFERENCE_STATES
 from scenarios.bench.queries import QueriedController, flight_between, recorded
 from scenarios.bench.timing import segments, time_in_turns
+from scenarios.bench.worker_pool import answer_all
 from scenarios.build import build_controller, build_problem
 from scenarios.cost.study import CandidateTimes, Outcome
 from scenarios.courses.make import build_course_steps
-from scenarios.machine import usable_cores
 from scenarios.parts.vehicle import build_vehicle
 from scenarios.progress import Progress
 from scenarios.run import fly_scenario
+from scenarios.schema.controller import ConstrainedSpec, UnconstrainedSpec
 from scenarios.schema.scenario import Scenario
 
+_NOT_THE_COURSE: Final = {
+    "name",
+    "description",
+    "group",
+    "expect",
+    "log_rate",
+    "vehicle",
+    "controller",
+    "lost",
+    "constraints",
+}
+"""Fields in which flights that are compared by their controllers may differ; vehicles are compared by their numbers."""
+
+
+def with_controller(scenario: Scenario, **changes: Any) -> Scenario:
+    """The scenario with other fields of its controller."""
+    return scenario.model_copy(update={"controller": scenario.controller.model_copy(update=changes)})
+
+
+def with_tilt(scenario: Scenario, tilt: float) -> Scenario:
+    """The constrained scenario with other bounds on roll and pitch [deg]."""
+    assert isinstance(scenario.controller, ConstrainedSpec)
+    bounds = {**scenario.controller.output_bounds, "roll": [-tilt, tilt], "pitch": [-tilt, tilt]}
+    return with_controller(scenario, output_bounds=bounds)
+
+
+def with_vehicles(
+    scenario: Scenario, arm_lengths: Sequence[float], drags: Sequence[float]
+) -> dict[tuple[float, float], Scenario]:
+    """The scenario with each pair of an arm length L [m] and a drag-to-thrust ratio d/b [m]."""
+
+    def varied(arm: float, drag: float) -> Scenario:
+        vehicle = scenario.vehicle.model_copy(update={"arm_length": arm, "drag_to_thrust": drag})
+        return scenario.model_copy(update={"vehicle": vehicle})
+
+    return {(arm, drag): varied(arm, drag) for arm in arm_lengths for drag in drags}
+
+
+def without_constraints(scenario: Scenario) -> Scenario:
+    """The counterpart: same weights and horizon, flown by the unconstrained controller."""
+    spec = scenario.controller
+    assert isinstance(spec, ConstrainedSpec)
+    free = UnconstrainedSpec(
+        type="unconstrained", horizon=spec.horizon, output_weights=spec.output_weights, input_weights=spec.input_weights
+    )
+    return scenario.model_copy(update={"controller": free})
+
+
+def course(scenario: Scenario) -> tuple[Any, ...]:
+    """What two flights must share to be compared by their controllers."""
+    shared = [name for name in type(scenario).model_fields if name not in _NOT_THE_COURSE]
+    return (*(getattr(scenario, name) for name in shared), build_vehicle(scenario))
+
+
+def named(scenarios: Sequence[Scenario]) -> dict[str, Scenario]:
+    """Scenarios by name, those that share one numbered."""
+    numbered: dict[str, Scenario] = {}
+    for each in scenarios:
+        shared = sum(each.name == other.name for other in numbered.values())
+        numbered[f"{each.name} ({shared + 1})" if shared else each.name] = each
+    return numbered
+
+
+def is_counterpart(scenario: Scenario, constrained: Scenario) -> bool:
+    """Whether an unconstrained flight of the course is the constrained one, but for its constraints."""
+    free = without_constraints(constrained)
+    return all(getattr(scenario, name) == getattr(free, name) for name in ("controller", "vehicle", "plant"))
+
+
 REPEATS: Final = 3
-SWEEP_STRIDE: Final = 3
-"""Of a flight in a sweep, one segment of so many is timed."""
-LONGEST_PASS: Final = 20.0
-"""A candidate that takes longer than this for all periods of a flight [s] is timed once."""
+SWEEP_STRIDE: Final = 3  # of a flight in a sweep, one segment of so many is timed
+LONGEST_PASS: Final = 20.0  # a candidate that takes longer than this for all periods of a flight [s] is timed once
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -92,21 +158,9 @@ def fly_all(
     """Fly what was not flown yet, over processes; results, with those given, by `key`."""
     results = dict(flown)
     wanted = {name: scenario for scenario in scenarios if (name := key(scenario)) not in results}
-    context = multiprocessing.get_context("spawn")  # a fork would take over whatever threads hold
-    pool = ProcessPoolExecutor(workers or usable_cores(), mp_context=context, initializer=_leave_interrupts_to_parent)
-    try:
-        futures = {pool.submit(fly, scenario): name for name, scenario in wanted.items()}
-        for done, future in enumerate(as_completed(futures), start=1):
-            results[futures[future]] = future.result()
-            progress("flights", done, len(futures))
-    finally:
-        pool.shutdown(cancel_futures=True)
+    done = answer_all(fly, [*wanted.values()], workers=workers, progress=functools.partial(progress, "flights"))
+    results |= zip(wanted, done, strict=True)
     return results
-
-
-def _leave_interrupts_to_parent() -> None:
-    """Ctrl-C reaches every process of a terminal; the parent alone is to say so."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 def time_candidates(

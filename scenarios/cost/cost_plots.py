@@ -110,7 +110,6 @@ def _title(panel: Panel) -> str:
 
 
 def _names(curves: Sequence[Curve]) -> str:
-    """The curves' names in their colours, as plotly reads HTML."""
     return ", ".join(
         f'<span style="color:{line_colour(curve.colour)}">{html.escape(curve.label)}</span>' for curve in curves
     )

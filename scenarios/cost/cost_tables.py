@@ -7,7 +7,7 @@ from typing import Any
 
 from quadsim.controller import SOLVED, UNCONSTRAINED
 from quadsim.flight.metrics import SETTLING_BAND, percentiles
-from quadsim.report.table import ABSENT, Cell, Grid, Mark, format_number, grid_to_markdown
+from quadsim.report.table import ABSENT, Cell, Grid, Mark, format_number, line, section
 from quadsim.state import Array
 from scenarios.cost.study import MEASURES, CandidateTimes, CostStudy, Outcome, Sweep, SweepPoint
 
@@ -25,10 +25,7 @@ def cost_tables(study: CostStudy) -> list[Grid]:
 
 def cost_markdown(study: CostStudy, sentences: Sequence[str]) -> str:
     """Sentences and tables as Markdown."""
-    parts = ["".join(f"- {sentence}\n" for sentence in sentences)]
-    for table in cost_tables(study):
-        parts.append(f"## {table.title}\n\n{grid_to_markdown(table)}\n{table.note}\n")
-    return "\n".join(parts)
+    return "\n".join(["".join(f"- {sentence}\n" for sentence in sentences), *map(section, cost_tables(study))])
 
 
 def format_outcome(outcome: Outcome) -> str:
@@ -94,20 +91,14 @@ def _times(study: CostStudy, name: str, step_ms: Array, candidate: CandidateTime
     if candidate is not None:
         rates = (format_number(float(f"{candidate.rate(measure):.3g}")) for measure in ("p99", "max"))
         whole = [*rates, str(candidate.failures)]
-    return (
-        Cell(text=name),
-        *(Cell(text=f"{found[measure]:.3g}") for measure in ("p50", "p95", "p99", "max")),
-        Cell(text=f"{100.0 * found['max'] / study.deadline_ms:.3g} %", mark=late),
-        *(Cell(text=text) for text in whole),
-    )
+    measures = (f"{found[measure]:.3g}" for measure in ("p50", "p95", "p99", "max"))
+    return line(name, *measures, Cell(text=f"{100.0 * found['max'] / study.deadline_ms:.3g} %", mark=late), *whole)
 
 
 def _flights(study: CostStudy) -> Grid:
     with_them, without = study.constrained, study.unconstrained
     others = list(study.others.values())
-    lines = [
-        _line("outcome", *map(format_outcome, (with_them, without)), ABSENT, ABSENT, *map(format_outcome, others)),
-    ]
+    lines = [line("outcome", *map(format_outcome, (with_them, without)), ABSENT, ABSENT, *map(format_outcome, others))]
     for key, measure in MEASURES.items():
         values = [outcome.number(key) for outcome in (with_them, without, *others)]
         lines.append(_compared(f"{measure.label} [{measure.unit}]", values))
@@ -138,7 +129,7 @@ def _compared(label: str, values: Sequence[float | None]) -> tuple[Cell, ...]:
     if first is not None and second is not None:
         difference = _difference(first, second)
         ratio = f"{first / second:.3g}" if second else ABSENT
-    return _line(label, *texts[:2], difference, ratio, *texts[2:])
+    return line(label, *texts[:2], difference, ratio, *texts[2:])
 
 
 def _difference(first: float, second: float) -> str:
@@ -172,41 +163,31 @@ def _sweep(sweep: Sweep, key: str, title: str) -> Grid:
 
 
 def _point(sweep: Sweep, point: SweepPoint, *, free: bool) -> tuple[Cell, ...]:
-    flown, without = point.constrained, point.unconstrained
-    mark = Mark.BEST if point.value == sweep.base else Mark.NONE
-    cells = [
-        Cell(text=f"{point.value:g}", mark=mark),
+    flown, without, settling = point.constrained, point.unconstrained, format_slowest(point.constrained)
+    cells: list[Cell | str] = [
+        Cell(text=f"{point.value:g}", mark=Mark.BEST if point.value == sweep.base else Mark.NONE),
         _outcome_cell(flown),
-        *(Cell(text=str(flown.statuses.get(status, 0))) for status in (SOLVED, UNCONSTRAINED)),
+        *(str(flown.statuses.get(status, 0)) for status in (SOLVED, UNCONSTRAINED)),
         Cell(text=str(flown.fallbacks), mark=Mark.BAD if flown.fallbacks else Mark.NONE),
-        Cell(text=f"{100.0 * flown.active / max(flown.periods, 1):.0f}"),
-        *(_tracked(flown, key) for key in ("rmse_x", "rmse_y", "rmse_z")),
-        _settling_cell(flown),
-        *(_tracked(flown, key) for key in ("tilt_sampled", "tilt_plant", "total_variation")),
-        *(Cell(text=f"{point.step_ms[key]:.3g}" if point.step_ms else ABSENT) for key in ("p50", "p99")),
+        f"{100.0 * flown.active / max(flown.periods, 1):.0f}",
+        *(format_number(flown.number(key)) for key in ("rmse_x", "rmse_y", "rmse_z")),
+        Cell(text=settling, mark=Mark.WARN if settling.startswith("never") else Mark.NONE),
+        *(format_number(flown.number(key)) for key in ("tilt_sampled", "tilt_plant", "total_variation")),
+        *(f"{point.step_ms[key]:.3g}" if point.step_ms else ABSENT for key in ("p50", "p99")),
     ]
     if free and without is not None:
-        tracked = (_tracked(without, key) for key in ("rmse_x", "tilt_plant", "total_variation"))
+        tracked = (format_number(without.number(key)) for key in ("rmse_x", "tilt_plant", "total_variation"))
         cells += [_outcome_cell(without), *tracked]
-    return tuple(cells)
+    return line(*cells)
 
 
 def _outcome_cell(outcome: Outcome) -> Cell:
     return Cell(text=format_outcome(outcome), mark=Mark.NONE if outcome.completed else Mark.BAD)
 
 
-def _tracked(outcome: Outcome, key: str) -> Cell:
-    return Cell(text=format_number(outcome.number(key)))
-
-
-def _settling_cell(outcome: Outcome) -> Cell:
-    phrase = format_slowest(outcome)
-    return Cell(text=phrase, mark=Mark.WARN if phrase.startswith("never") else Mark.NONE)
-
-
 def _sensitivity(study: CostStudy) -> Grid:
     outcomes = [variation.outcome for variation in study.variations]
-    lines = [_line("outcome", *map(format_outcome, outcomes), "")]
+    lines = [line("outcome", *map(format_outcome, outcomes), "")]
     for status in (SOLVED, UNCONSTRAINED):
         counts = [float(outcome.statuses.get(status, 0)) for outcome in outcomes]
         lines.append(_spread(f"periods {status}", counts))
@@ -229,8 +210,4 @@ def _sensitivity(study: CostStudy) -> Grid:
 def _spread(label: str, values: Sequence[float | None]) -> tuple[Cell, ...]:
     found = [value for value in values if value is not None]
     spread = _difference(max(found), min(found)).removeprefix("+") if found else ABSENT
-    return _line(label, *map(format_number, values), spread)
-
-
-def _line(*texts: str) -> tuple[Cell, ...]:
-    return tuple(Cell(text=text) for text in texts)
+    return line(label, *map(format_number, values), spread)

@@ -177,7 +177,6 @@ def _variations(study: CostStudy) -> Iterator[str]:
 
 
 def _two(value: float) -> str:
-    """Two significant digits."""
     return f"{float(f'{value:.2g}'):g}"
 
 

@@ -12,17 +12,22 @@ from mpc.solvers import SOLVERS, make_backend
 from quadsim.errors import InputError
 from quadsim.flight import metrics
 from quadsim.flight.rundir import SCENARIO_FILE
-from scenarios.cost.cost_flights import Flown, fly, fly_all, key, time_candidates, time_flights
-from scenarios.cost.study import CandidateTimes, CostStudy, Outcome, Sweep, SweepPoint, Variation
-from scenarios.cost.variants import (
+from scenarios.cost.cost_flights import (
+    Flown,
     course,
+    fly,
+    fly_all,
     is_counterpart,
+    key,
     named,
+    time_candidates,
+    time_flights,
     with_controller,
     with_tilt,
     with_vehicles,
     without_constraints,
 )
+from scenarios.cost.study import CandidateTimes, CostStudy, Outcome, Sweep, SweepPoint, Variation
 from scenarios.courses.make import build_course_steps, build_reference
 from scenarios.loading import load_scenario
 from scenarios.machine import machine
@@ -30,30 +35,20 @@ from scenarios.progress import Progress, silent
 from scenarios.schema.controller import ConstrainedSpec, UnconstrainedSpec, shared_tilt_bound
 from scenarios.schema.scenario import Scenario
 
-TILTS: Final = (2.0, 3.0, 4.0, 5.0, 7.0, 10.0, 15.0, 20.0)
-"""Bounds on roll and pitch that are tried [deg]."""
-HORIZONS: Final = (10, 15, 20, 30, 50, 75, 100)
-"""Horizons that are tried, N."""
-ARM_LENGTHS: Final = (0.2, 0.3, 0.5)
-"""L [m]; the paper gives none."""
-DRAGS: Final = (0.012, 0.024, 0.048)
-"""d/b [m]; the paper gives none."""
-SOLVERS_TIMED: Final = ("piqp-multistage", "piqp-dense", "qpoases")
-"""Both of this project, and the paper's own."""
+TILTS: Final = (2.0, 3.0, 4.0, 5.0, 7.0, 10.0, 15.0, 20.0)  # bounds on roll and pitch that are tried [deg]
+HORIZONS: Final = (10, 15, 20, 30, 50, 75, 100)  # horizons that are tried, N
+ARM_LENGTHS: Final = (0.2, 0.3, 0.5)  # L [m]; the paper gives none
+DRAGS: Final = (0.012, 0.024, 0.048)  # d/b [m]; the paper gives none
+SOLVERS_TIMED: Final = ("piqp-multistage", "piqp-dense", "qpoases")  # both of this project, and the paper's own
 LONGEST_UNASKED: Final = 120.0
 """A course that takes longer than this [s] is studied only when that is asked for: it is flown about thirty times."""
 
 
 def find_study(targets: Sequence[str], *, asked: bool | None) -> list[Scenario]:
-    """The scenarios of what is compared that a study is made from: a constrained one, then unconstrained ones.
+    """The first constrained scenario of runs or scenarios that are compared, and all unconstrained ones of its course.
 
-    Args:
-        targets: run directories, or scenarios.
-        asked: whether a study is wanted; None to find out: it is where a constrained and an unconstrained controller
-            fly the same course, which takes no longer than `LONGEST_UNASKED`.
-
-    Returns:
-        The first constrained scenario and all unconstrained ones of its course, or nothing where none is to be made.
+    Where `asked` is None a study is made where a constrained and an unconstrained controller fly the same course, which
+    takes no longer than `LONGEST_UNASKED`; nothing is returned where none is to be made.
 
     Raises:
         InputError: a study is asked for, and nothing is flown by a constrained controller.

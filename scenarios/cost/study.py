@@ -38,24 +38,15 @@ MEASURES: Final[dict[str, Measure]] = {
 
 @dataclass(frozen=True, kw_only=True)
 class Outcome:
-    """What became of one flight.
+    """What became of one flight."""
 
-    Attributes:
-        reason: why it ended early; None when it was completed.
-        flown: time flown [s].
-        statuses: periods by the controller's status.
-        fallbacks: periods in which an earlier plan was held.
-        active: periods with a constraint active at their optimum.
-        numbers: a value for each of `MEASURES`, over what was flown; empty when not one period was.
-        settling: the entries of `quadsim.flight.metrics.settling`, one per step of the course.
-    """
-
-    reason: str | None
-    flown: float
-    statuses: Mapping[str, int]
-    fallbacks: int
-    active: int
-    numbers: Mapping[str, float]
+    reason: str | None  # why it ended early; None when it was completed
+    flown: float  # time flown [s]
+    statuses: Mapping[str, int]  # periods by the controller's status
+    fallbacks: int  # periods in which an earlier plan was held
+    active: int  # periods with a constraint active at their optimum
+    numbers: Mapping[str, float]  # a value for each of `MEASURES`, over what was flown; empty when not one period was
+    # the entries of `quadsim.flight.metrics.settling`, one per step of the course
     settling: Sequence[Mapping[str, Any]]
 
     @property
@@ -75,19 +66,12 @@ class Outcome:
 
 @dataclass(frozen=True, kw_only=True)
 class CandidateTimes:
-    """A way to compute the commands, timed on the queries of one flight.
+    """A way to compute the commands, timed on the queries of one flight."""
 
-    Attributes:
-        name: what it is called.
-        step_ms: (K,) time of the whole controller step in each period, the median of all repeats [ms].
-        statuses: K texts, what each step answered.
-        repeats: how often each period was timed.
-    """
-
-    name: str
-    step_ms: Array
-    statuses: tuple[str, ...]
-    repeats: int
+    name: str  # what it is called
+    step_ms: Array  # (K,) time of the whole controller step in each period, the median of all repeats [ms]
+    statuses: tuple[str, ...]  # K texts, what each step answered
+    repeats: int  # how often each period was timed
 
     @property
     def shortcut(self) -> np.ndarray[Any, np.dtype[np.bool_]]:
@@ -106,89 +90,56 @@ class CandidateTimes:
 
 @dataclass(frozen=True, kw_only=True)
 class SweepPoint:
-    """The flights at one value of what is swept.
+    """The flights at one value of what is swept."""
 
-    Attributes:
-        value: that value.
-        constrained: the flight with constraints.
-        step_ms: median, percentiles and maximum of its controller's step [ms]; empty when not one period was flown.
-        unconstrained: the flight without them, where it depends on what is swept.
-    """
-
-    value: float
-    constrained: Outcome
+    value: float  # that value
+    constrained: Outcome  # the flight with constraints
+    # median, percentiles and maximum of its controller's step [ms]; empty when not one period was flown
     step_ms: Mapping[str, float]
-    unconstrained: Outcome | None = None
+    unconstrained: Outcome | None = None  # the flight without them, where it depends on what is swept
 
 
 @dataclass(frozen=True, kw_only=True)
 class Sweep:
-    """Flights that differ in one number.
+    """Flights that differ in one number."""
 
-    Attributes:
-        name: what is swept.
-        unit: its unit.
-        base: its value in the study's own flight; None where that has no one value.
-        points: in rising order of the value.
-    """
-
-    name: str
-    unit: str
-    base: float | None
-    points: tuple[SweepPoint, ...]
+    name: str  # what is swept
+    unit: str  # its unit
+    base: float | None  # its value in the study's own flight; None where that has no one value
+    points: tuple[SweepPoint, ...]  # in rising order of the value
 
 
 @dataclass(frozen=True, kw_only=True)
 class Variation:
-    """The constrained flight with other values of the vehicle's parameters that the paper leaves out.
+    """The constrained flight with other values of the vehicle's parameters that the paper leaves out."""
 
-    Attributes:
-        arm_length: L [m].
-        drag_to_thrust: d/b [m].
-        outcome: the flight.
-    """
-
-    arm_length: float
-    drag_to_thrust: float
-    outcome: Outcome
+    arm_length: float  # L [m]
+    drag_to_thrust: float  # d/b [m]
+    outcome: Outcome  # the flight
 
 
 @dataclass(frozen=True, kw_only=True)
 class CostStudy:
-    """What constraints cost, and what they buy, on one course.
+    """What constraints cost, and what they buy, on one course."""
 
-    Attributes:
-        name: of the constrained flight.
-        horizon: N, of both flights.
-        deadline_ms: the control period [ms].
-        duration: of the course [s].
-        constrained: the flight with constraints.
-        unconstrained: the same course, weights and horizon, without them.
-        others: compared flights of the course by unconstrained controllers with weights or a horizon of their own.
-        reference: settling of the filtered reference itself, had the vehicle followed it exactly.
-        candidates: timed on the queries of the constrained flight: the gain of the unconstrained optimum, the
-            constrained controller as it flew, and the QP in every period by one solver each.
-        left_out: solvers that could not take part, and what to do about it.
-        tilt: sweep of the bound on roll and pitch.
-        horizons: sweep of N.
-        variations: over the parameters that the paper leaves out.
-        machine: what the times were measured on.
-    """
-
-    name: str
-    horizon: int
-    deadline_ms: float
-    duration: float
-    constrained: Outcome
-    unconstrained: Outcome
+    name: str  # of the constrained flight
+    horizon: int  # N, of both flights
+    deadline_ms: float  # the control period [ms]
+    duration: float  # of the course [s]
+    constrained: Outcome  # the flight with constraints
+    unconstrained: Outcome  # the same course, weights and horizon, without them
+    # compared flights of the course by unconstrained controllers with weights or a horizon of their own
     others: Mapping[str, Outcome]
+    # settling of the filtered reference itself, had the vehicle followed it exactly
     reference: Sequence[Mapping[str, Any]]
+    # timed on the queries of the constrained flight: the gain of the unconstrained optimum, the constrained controller
+    # as it flew, and the QP in every period by one solver each
     candidates: tuple[CandidateTimes, ...]
-    left_out: Mapping[str, str]
-    tilt: Sweep
-    horizons: Sweep
-    variations: tuple[Variation, ...]
-    machine: Mapping[str, Any]
+    left_out: Mapping[str, str]  # solvers that could not take part, and what to do about it
+    tilt: Sweep  # sweep of the bound on roll and pitch
+    horizons: Sweep  # sweep of N
+    variations: tuple[Variation, ...]  # over the parameters that the paper leaves out
+    machine: Mapping[str, Any]  # what the times were measured on
 
     def to_json(self) -> dict[str, Any]:
         """Everything, as plain values; what a clock measured is under `contenders` and `step_ms` alone."""

@@ -15,38 +15,23 @@ EXACT: Final = (0.0, 0.0, 0.0, 0.0)
 
 @dataclass(frozen=True, kw_only=True)
 class Path:
-    """Poses from a beginning at time 0 to an end.
+    """Poses from a beginning at time 0 to an end."""
 
-    Attributes:
-        pose: times (M,) within [0, duration] [s] -> (M, 4) x, y, z [m], yaw [rad], world.
-        duration: [s].
-        kinks: times [s] at which the velocity, or its derivative, may jump.
-        resolution: to how much x, y, z [m], yaw [rad] were rounded; 0 where they are exact.
-    """
-
-    pose: Callable[[Array], Array]
-    duration: float
-    kinks: tuple[float, ...] = ()
-    resolution: tuple[float, ...] = EXACT
+    pose: Callable[[Array], Array]  # times (M,) within [0, duration] [s] -> (M, 4) x, y, z [m], yaw [rad], world
+    duration: float  # [s]
+    kinks: tuple[float, ...] = ()  # times [s] at which the velocity, or its derivative, may jump
+    resolution: tuple[float, ...] = EXACT  # to how much x, y, z [m], yaw [rad] were rounded; 0 where they are exact
 
 
 @dataclass(frozen=True, kw_only=True)
 class Course:
-    """The desired poses, before the filter of Eq. (31).
+    """The desired poses, before the filter of Eq. (31)."""
 
-    Attributes:
-        sample: times (M,) >= 0 [s] of the flight -> (M, 4) x, y, z [m], yaw [rad], world.
-        initial: (4,) what it is before the flight, and where the filter starts.
-        jumps: times [s] at which the pose itself jumps.
-        kinks: times [s] at which the velocity, or its derivative, may jump.
-        resolution: to how much x, y, z [m], yaw [rad] were rounded; 0 where they are exact.
-    """
-
-    sample: Callable[[Array], Array]
-    initial: Array
-    jumps: tuple[float, ...] = ()
-    kinks: tuple[float, ...] = ()
-    resolution: tuple[float, ...] = EXACT
+    sample: Callable[[Array], Array]  # times (M,) >= 0 [s] of the flight -> (M, 4) x, y, z [m], yaw [rad], world
+    initial: Array  # (4,) what it is before the flight, and where the filter starts
+    jumps: tuple[float, ...] = ()  # times [s] at which the pose itself jumps
+    kinks: tuple[float, ...] = ()  # times [s] at which the velocity, or its derivative, may jump
+    resolution: tuple[float, ...] = EXACT  # to how much x, y, z [m], yaw [rad] were rounded; 0 where they are exact
 
 
 def begin(path: Path, *, start: float, initial: Array) -> Course:

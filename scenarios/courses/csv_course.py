@@ -21,32 +21,22 @@ from scenarios.courses.legs import polyline
 
 POSE_HEADER: Final = ("t", "x", "y", "z", "yaw")
 VELOCITY_HEADER: Final = ("vx", "vy", "vz")
-LARGEST: Final = 1e6
-"""Largest magnitude of a number in the table, as in the scenario file."""
-MOST_ROWS: Final = 200_000
-"""Rows below the header: 200 s at 1 kHz.  Each is held in memory."""
+LARGEST: Final = 1e6  # largest magnitude of a number in the table, as in the scenario file
+MOST_ROWS: Final = 200_000  # rows below the header: 200 s at 1 kHz. Each is held in memory
 ROUNDED: Final = range(2, 8)
 """Decimals of a rounded column: with fewer its numbers are meant as they stand, with more nobody can tell."""
-LARGEST_FILE: Final = 64_000_000
-"""Size [bytes] of the largest file that is read."""
+LARGEST_FILE: Final = 64_000_000  # size [bytes] of the largest file that is read
 
 
 @dataclass(frozen=True, kw_only=True)
 class Table:
-    """A course's rows.
+    """A course's rows."""
 
-    Attributes:
-        t: (n,) increasing, the first at least 0 [s].
-        poses: (n, 4) x, y, z [m], yaw [rad], yaw unwrapped.
-        velocities: (n, 3) [m/s]; None where the file has none.
-        sha256: hash of the file.
-        resolution: one unit of the last decimal in each column of the poses [m, m, m, rad]; 0 where it is not rounded.
-    """
-
-    t: Array
-    poses: Array
-    velocities: Array | None
-    sha256: str
+    t: Array  # (n,) increasing, the first at least 0 [s]
+    poses: Array  # (n, 4) x, y, z [m], yaw [rad], yaw unwrapped
+    velocities: Array | None  # (n, 3) [m/s]; None where the file has none
+    sha256: str  # hash of the file
+    # one unit of the last decimal in each column of the poses [m, m, m, rad]; 0 where it is not rounded
     resolution: tuple[float, ...] = EXACT
 
 
@@ -107,20 +97,12 @@ def through_rows(table: Table) -> Path:
     straight = polyline(t, table.poses)
     if table.velocities is None:
         return replace(straight, resolution=table.resolution)
-    velocities = table.velocities
+    from scipy.interpolate import CubicHermiteSpline
+
+    cubics = CubicHermiteSpline(t, table.poses[:, :3], table.velocities)
 
     def pose(times: Array) -> Array:
-        i = np.clip(np.searchsorted(t, times, side="right") - 1, 0, t.size - 2)
-        h = (t[i + 1] - t[i])[:, None]
-        s = (times - t[i])[:, None] / h
-        before, after = table.poses[i, :3], table.poses[i + 1, :3]
-        poses = straight.pose(times)
-        poses[:, :3] = (
-            (1.0 + 2.0 * s) * (1.0 - s) ** 2 * before
-            + s**2 * (3.0 - 2.0 * s) * after
-            + h * s * (1.0 - s) * ((1.0 - s) * velocities[i] - s * velocities[i + 1])
-        )
-        return poses
+        return np.hstack([cubics(times), straight.pose(times)[:, 3:]])
 
     return Path(pose=pose, duration=straight.duration, kinks=straight.kinks, resolution=table.resolution)
 

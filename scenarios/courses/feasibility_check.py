@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike
 
-from quadsim.flight.feasibility import STENCIL, Feasibility, Mask, assess, demand
+from quadsim.flight.audit import Mask
+from quadsim.flight.feasibility import STENCIL, Feasibility, assess, demand
 from quadsim.state import Array
 from quadsim.vehicle import Vehicle
 from scenarios.courses.make import build_course, filtered, initial_pose

@@ -13,32 +13,20 @@ from scenarios.courses.course import Path
 
 @dataclass(frozen=True, kw_only=True)
 class Waypoint:
-    """A pose to reach in a straight line, and how long to stay there.
+    """A pose to reach in a straight line, and how long to stay there."""
 
-    Attributes:
-        pose: (4,) x, y, z [m], yaw [rad].
-        speed: on the way there [m/s].
-        hold: how long to stay there [s].
-    """
-
-    pose: Array
-    speed: float
-    hold: float = 0.0
+    pose: Array  # (4,) x, y, z [m], yaw [rad]
+    speed: float  # on the way there [m/s]
+    hold: float = 0.0  # how long to stay there [s]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Turn:
-    """A turn at constant rate.
+    """A turn at constant rate."""
 
-    Attributes:
-        start: when it begins [s].
-        yaw: where it ends [rad].
-        rate: magnitude [rad/s].
-    """
-
-    start: float
-    yaw: float
-    rate: float
+    start: float  # when it begins [s]
+    yaw: float  # where it ends [rad]
+    rate: float  # magnitude [rad/s]
 
 
 def polyline(t: Array, poses: Array) -> Path:

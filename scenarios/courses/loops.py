@@ -14,15 +14,10 @@ from scenarios.courses.course import Path
 
 @dataclass(frozen=True, kw_only=True)
 class Loop:
-    """A closed curve, or one that is closed seen from above, by an angle theta that grows by 2 pi per turn.
+    """A closed curve, or one that is closed seen from above, by an angle theta that grows by 2 pi per turn."""
 
-    Attributes:
-        position: theta (M,) [rad] -> (M, 3) [m], world.
-        heading: theta (M,) [rad] -> (M,) direction of travel about z [rad], without jumps.
-    """
-
-    position: Callable[[Array], Array]
-    heading: Callable[[Array], Array]
+    position: Callable[[Array], Array]  # theta (M,) [rad] -> (M, 3) [m], world
+    heading: Callable[[Array], Array]  # theta (M,) [rad] -> (M,) direction of travel about z [rad], without jumps
 
 
 def circle(
@@ -30,12 +25,7 @@ def circle(
 ) -> Loop:
     """A circle c + r (cos phi, sin phi, 0), phi = angle +- theta; for a helix z grows in proportion to theta.
 
-    Args:
-        centre: (3,) [m]; its z is where the curve begins.
-        radius: r [m].
-        angle: phi at the beginning [rad].
-        clockwise: seen from above.
-        climb_per_turn: [m].
+    Of the centre (3,) [m], z is where the curve begins; the angle is phi there [rad]; clockwise is seen from above.
     """
     sign = -1.0 if clockwise else 1.0
 
@@ -51,14 +41,9 @@ def circle(
 def figure_eight(
     *, centre: Array, half_length: float, half_width: float, angle: float = 0.0, clockwise: bool = False
 ) -> Loop:
-    """The lemniscate of Gerono, c + (a sin theta, b sin 2 theta, 0), its length turned by an angle from x.
+    """The lemniscate of Gerono, c + (a sin theta, b sin 2 theta, 0), its length turned by an angle from x [rad].
 
-    Args:
-        centre: (3,) crossing, where it begins [m].
-        half_length: a [m].
-        half_width: b [m].
-        angle: of the length [rad].
-        clockwise: whether the half that it begins with is flown clockwise seen from above.
+    It begins in the centre (3,) [m], where it crosses itself; clockwise, seen from above, is its first half.
     """
     sign = 1.0 if clockwise else -1.0
     cos, sin = math.cos(angle), math.sin(angle)
@@ -76,16 +61,11 @@ def figure_eight(
 
 
 def ramped(t: Array, *, rate: float, total: float, ramp: float) -> Array:
-    """An angle (M,) [rad] that gains its rate smoothly, keeps it, and loses it in the same way at the end.
+    """An angle (M,) [rad] that gains its rate [rad/s] smoothly, keeps it, and loses it in the same way at the end.
 
     The rate grows as S(s) = 35 s^4 - 84 s^5 + 70 s^6 - 20 s^7, s = t / ramp, so that all derivatives up to the fourth
-    are continuous: no step in the torques that the course asks for.
-
-    Args:
-        t: (M,) within 0 .. total / rate + ramp [s].
-        rate: [rad/s].
-        total: angle at the end [rad], at least rate ramp.
-        ramp: [s]; 0 for a rate that jumps.
+    are continuous: no step in the torques that the course asks for.  Without a ramp it jumps.  Times (M,) are within
+    0 .. total / rate + ramp [s], and the angle at the end, `total` [rad], is at least rate ramp.
     """
     duration = total / rate + ramp
     from_nearer_end = np.minimum(t, duration - t)

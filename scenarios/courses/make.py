@@ -183,10 +183,6 @@ def _csv(spec: CsvSpec, initial: Array) -> Course:
 def located(spec: CsvSpec, directory: FilePath) -> CsvSpec:
     """The table's whole path and its hash, so that a resolved scenario defines its flight.
 
-    Args:
-        spec: a path relative to `directory`, or to the working directory, or absolute.
-        directory: the scenario file's.
-
     Raises:
         FileError: what is there is no such table.
     """

@@ -4,55 +4,31 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
 from quadsim.state import Array
 from scenarios.courses.course import Path
 
+if TYPE_CHECKING:
+    from scipy.interpolate import BPoly
+
 SNAP: Final = 4
 ACCELERATION: Final = 2
 
 
-@dataclass(frozen=True, kw_only=True)
-class PiecewisePolynomial:
-    """Polynomials joined at knots.
+def smoothest(times: Array, values: Array, order: int) -> BPoly:
+    """The curve through values (n + 1, c) at times (n + 1,) [s], from rest to rest, least in a squared derivative.
 
-    Attributes:
-        knots: (n + 1,) increasing times [s].
-        coefficients: (n, p, c) of segment i in s = (t - knots[i]) / (knots[i + 1] - knots[i]), ascending powers.
+    The integral is of the derivative of an `order`, 4 for snap; the curve is a polynomial of degree 2 order - 1 between
+    two points (Mellinger & Kumar 2011, Sec. IV).  The quadratic program's equality constraints are met by taking for
+    unknowns the derivatives at the points, which neighbouring segments share, so that what is left of the KKT system is
+    R_PP d_P = -R_PF d_F, with d_F the derivatives that are given and d_P those that are free (Richter, Bry & Roy 2013,
+    Sec. 3.2).  Time is in mean segment durations, and the unknowns are scaled to a unit diagonal of R_PP.
     """
+    from scipy.interpolate import BPoly
 
-    knots: Array
-    coefficients: Array
-
-    def __call__(self, t: Array, order: int = 0) -> Array:
-        """(M, c) values, or their derivatives of an order [1/s^order], at times t (M,)."""
-        segment = np.searchsorted(self.knots[1:-1], t, side="right")
-        duration = np.diff(self.knots)[segment]
-        s = (t - self.knots[segment]) / duration
-        values = np.zeros((t.size, self.coefficients.shape[2]))
-        for power in range(self.coefficients.shape[1] - 1, order - 1, -1):  # Horner's scheme
-            values = values * s[:, None] + math.perm(power, order) * self.coefficients[segment, power]
-        return values / duration[:, None] ** order
-
-
-def smoothest(times: Array, values: Array, order: int) -> PiecewisePolynomial:
-    """The curve through `values`, at rest at both ends, with the least integral of a squared derivative.
-
-    It is a polynomial of degree 2 order - 1 between two points (Mellinger & Kumar 2011, Sec. IV).  The quadratic
-    program's equality constraints are met by taking for unknowns the derivatives at the points, which neighbouring
-    segments share, so that what is left of the KKT system is R_PP d_P = -R_PF d_F, with d_F the derivatives that are
-    given and d_P those that are free (Richter, Bry & Roy 2013, Sec. 3.2).  Time is in mean segment durations, and the
-    unknowns are scaled to a unit diagonal of R_PP.
-
-    Args:
-        times: (n + 1,) increasing [s].
-        values: (n + 1, c).
-        order: of that derivative: 4 for snap, 2 for acceleration.
-    """
     n, unit = times.size - 1, (times[-1] - times[0]) / (times.size - 1)
     durations = np.diff(times) / unit
     # Coefficients of one segment on s in [0, 1] from derivatives 0 .. order - 1 at s = 0 and at s = 1.
@@ -74,20 +50,11 @@ def smoothest(times: Array, values: Array, order: int) -> PiecewisePolynomial:
         unit_diagonal = 1.0 / np.sqrt(np.diag(R_PP))
         R_PP = unit_diagonal[:, None] * R_PP * unit_diagonal
         stacked[free] = -unit_diagonal[:, None] * np.linalg.solve(R_PP, unit_diagonal[:, None] * gradient)
-    coefficients = [
-        from_ends @ (scale[:, None] * stacked[i * order : (i + 2) * order]) for i, scale in enumerate(scales)
-    ]
-    return PiecewisePolynomial(knots=times, coefficients=np.array(coefficients))
+    return BPoly.from_derivatives(times, derivatives / unit ** np.arange(order)[:, None])
 
 
 def minimum_snap(start: Array, poses: Array, times: Sequence[float]) -> Path:
-    """Least snap of x, y, z and least angular acceleration of yaw through poses, at rest at both ends.
-
-    Args:
-        start: (4,) pose at time 0.
-        poses: (n, 4) x, y, z [m], yaw [rad].
-        times: (n,) when each is passed [s], increasing, the first above 0.
-    """
+    """Least snap of x, y, z and angular acceleration of yaw through poses (n, 4) at times (n,) [s], rest to rest."""
     knots, through = np.array([0.0, *times]), np.vstack([start, poses])
     position = smoothest(knots, through[:, :3], SNAP)
     yaw = smoothest(knots, through[:, 3:], ACCELERATION)
@@ -96,20 +63,11 @@ def minimum_snap(start: Array, poses: Array, times: Sequence[float]) -> Path:
 
 def _derivatives_at(s: float, order: int) -> Array:
     """(order, 2 order): derivatives 0 .. order - 1 at s of 1, s, s^2, ..."""
-    powers = range(2 * order)
-    rows = [[math.perm(p, k) * s ** (p - k) if p >= k else 0.0 for p in powers] for k in range(order)]
-    return np.array(rows, float)
+    return np.array([[math.perm(p, k) * s ** max(p - k, 0) for p in range(2 * order)] for k in range(order)], float)
 
 
 def _squared_derivative(order: int) -> Array:
     """(2 order, 2 order): integral over [0, 1] of the products of the derivatives of an order of s^i and s^j."""
-    powers = range(2 * order)
-    return np.array(
-        [
-            [
-                math.perm(i, order) * math.perm(j, order) / (i + j - 2 * order + 1) if min(i, j) >= order else 0.0
-                for j in powers
-            ]
-            for i in powers
-        ]
-    )
+    slopes = np.array([math.perm(i, order) for i in range(2 * order)], float)  # 0 below the order
+    degrees = np.add.outer(np.arange(2 * order), np.arange(2 * order)) - 2 * order + 1
+    return np.outer(slopes, slopes) / np.maximum(degrees, 1)

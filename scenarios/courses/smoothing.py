@@ -13,21 +13,15 @@ from scipy.linalg import solveh_banded
 
 from quadsim.state import Array, read_only
 
-_ORDER: Final = 4
-"""Of the differences that are kept small: those that a torque, and so a rotor's speed, follows from."""
+_ORDER: Final = 4  # of the differences that are kept small: those that a torque, and so a rotor's speed, follows from
 _WEIGHTS: Final = tuple(10.0**exponent for exponent in range(6, -3, -1))
 
 
 def smooth(values: Array, *, initial: float, response_time: float, period: float) -> Array:
-    """First-order filter F(x(k)) = x(k) + exp(-3 tau_s / tau_r) (F(x(k-1)) - x(k)).  Eq. (31).
+    """First-order filter F(x(k)) = x(k) + exp(-3 tau_s / tau_r) (F(x(k-1)) - x(k)) of values (M,).  Eq. (31).
 
-    The paper prints x(k-1) on the right; a first-order lag needs the previous *filtered* value there.
-
-    Args:
-        values: (M,) the unfiltered reference.
-        initial: filtered value before the first sample; the paper's flights start from the initial position.
-        response_time: tau_r [s], 95 % of a step; 0 for no filter.
-        period: tau_s [s].
+    The paper prints x(k-1) on the right; a first-order lag needs the previous *filtered* value there, which before the
+    first sample is `initial`.  The response time tau_r [s] is 95 % of a step; 0 for no filter.
     """
     if response_time == 0.0:
         return values.copy()
@@ -41,15 +35,11 @@ def smooth(values: Array, *, initial: float, response_time: float, period: float
 
 
 def within_rounding(values: Array, resolution: float, breaks: NDArray[np.bool_]) -> Array:
-    """The smoothest values that these may have been before they were rounded.
+    """The smoothest values that samples y (M,) may have been before they were rounded to a resolution; 0 for none.
 
     Whittaker-Henderson smoothing (Eilers 2003), min |z - y|^2 + w |D z|^2 with D the fourth differences, piece by
-    piece, with the largest weight w of `_WEIGHTS` that leaves every value within the resolution of what it was.
-
-    Args:
-        values: (M,) evenly spaced samples y.
-        resolution: one unit of the last decimal; 0 for exact values, which are returned as they are.
-        breaks: (M - 1,) whether the course has a corner or a jump between a sample and the next, which stays.
+    piece, with the largest weight w of `_WEIGHTS` that leaves every value within the resolution of what it was.  Breaks
+    (M - 1,) say where a corner or a jump between a sample and the next stays.
     """
     smoothed = values.copy()
     for piece in np.split(np.arange(values.size), np.flatnonzero(breaks) + 1) if resolution > 0.0 else ():

@@ -13,17 +13,11 @@ from quadsim.state import Array
 
 @dataclass(frozen=True, kw_only=True)
 class Window:
-    """A value held strictly between two instants, as in Eq. (30).
+    """A value held strictly between two instants, as in Eq. (30)."""
 
-    Attributes:
-        start: [s], excluded; at the instant itself the reference is elsewhere's value.
-        stop: [s], excluded.
-        value: [m], or [rad] for yaw.
-    """
-
-    start: float
-    stop: float
-    value: float
+    start: float  # [s], excluded; at the instant itself the reference is elsewhere's value
+    stop: float  # [s], excluded
+    value: float  # [m], or [rad] for yaw
 
 
 def steps(t: Array, windows: Sequence[Window], elsewhere: float) -> Array:
@@ -42,10 +36,7 @@ def steps(t: Array, windows: Sequence[Window], elsewhere: float) -> Array:
 def switches(windows: Sequence[Window], elsewhere: float, *, initial: float) -> list[tuple[float, float, float]]:
     """Where a piecewise constant reference steps: time [s], value before and value after, in order of time.
 
-    Args:
-        windows: as for `steps`; of windows that overlap, the last holds.
-        elsewhere: the value outside all windows.
-        initial: where the output is at time 0, from which the first step is counted.
+    Of windows that overlap, the last holds; the first step is counted from `initial`, where the output is at time 0.
     """
     instants = sorted({max(0.0, instant) for window in windows for instant in (window.start, window.stop)} | {0.0})
     held = [[window.value for window in windows if window.start <= t < window.stop] for t in instants]

@@ -14,7 +14,7 @@ from importlib.machinery import ModuleSpec
 from pathlib import Path
 from typing import Final
 
-from scenarios.schema.plugin import ENTRY_POINTS, PluginSpec
+from scenarios.schema.plugin import ENTRY_POINTS, ForceSpec, PluginSpec
 
 LOGGER: Final = logging.getLogger("quadsim.code")
 """Logs, before the code of a plug-in controller is imported, what is to run; the command line shows it."""
@@ -22,9 +22,10 @@ LOGGER: Final = logging.getLogger("quadsim.code")
 
 @dataclass(frozen=True, kw_only=True)
 class Code:
-    """The code that a scenario's `[controller]` names.
+    """The code that a scenario's `[controller]` or `[[forces]]` names.
 
     Attributes:
+        what: `controller` or `force`.
         type: what the scenario calls it.
         module: that is imported, and with it the packages it is in.
         attribute: what of it is called.
@@ -32,6 +33,7 @@ class Code:
         root: the file, or the folder of the whole package that it is in; None without a file.
     """
 
+    what: str
     type: str
     module: str
     attribute: str
@@ -48,20 +50,21 @@ class Code:
 
     def __str__(self) -> str:
         where = "a module that is not found" if self.file is None else f"{self.file}, {self.digest}"
-        return f"runs code that is not quadsim's: controller {self.type} from {where}"
+        return f"runs code that is not quadsim's: {self.what} {self.type} from {where}"
 
 
-def find_code(spec: PluginSpec) -> Code:
+def find_code(spec: PluginSpec | ForceSpec) -> Code:
     """Where a controller's code is, found as it will be for its import, and nothing of it imported."""
     module, attribute = place(spec.type)
     with searched(folders_of(spec)):
         top = _origin(module.partition(".")[0])
         file = _origin(module)
     root = top.parent if top is not None and top.name == "__init__.py" else top or file
-    return Code(type=spec.type, module=module, attribute=attribute, file=file, root=root)
+    what = "force" if isinstance(spec, ForceSpec) else "controller"
+    return Code(what=what, type=spec.type, module=module, attribute=attribute, file=file, root=root)
 
 
-def announce(spec: PluginSpec) -> Code:
+def announce(spec: PluginSpec | ForceSpec) -> Code:
     """Tell what is to run, before it does."""
     code = find_code(spec)
     LOGGER.info("%s", code)
@@ -86,7 +89,7 @@ def place(name: str) -> tuple[str, str]:
     return module, attribute
 
 
-def folders_of(spec: PluginSpec) -> list[str]:
+def folders_of(spec: PluginSpec | ForceSpec) -> list[str]:
     """Where a controller's module is looked for before the installed ones."""
     return list(dict.fromkeys([*([] if spec.folder is None else [spec.folder]), str(Path.cwd())]))
 

@@ -87,7 +87,7 @@ def build_fault(
         offset: of a bias, by axis: [m], [m/s], [deg] or [deg/s].
     """
     name = SensorName(sensor)
-    added = _three([0.0] * 3 if offset is None else list(offset), _UNITS[name])
+    added = _three(0.0 if offset is None else offset, _UNITS[name])
     affected = AXES if axes is None else tuple(sorted({"xyz".index(axis) for axis in axes}))
     return SensorFault(
         sensor=name, kind=FaultKind(kind), start=start, stop=start + duration, axes=affected, offset=added
@@ -96,9 +96,9 @@ def build_fault(
 
 def _sensor(name: SensorName, spec: AnySensorSpec) -> Sensor:
     of_axes = {field: _three(getattr(spec, field), _UNITS[name]) for field in ("noise", "bias", "bias_walk")}
-    return Sensor(name=name, **{**dict(spec), **of_axes})
+    return Sensor(name=name, **{**vars(spec), **of_axes})
 
 
-def _three(value: float | list[float], unit: float) -> tuple[float, float, float]:
-    x, y, z = value if isinstance(value, list) else [value] * 3
+def _three(value: float | Sequence[float], unit: float) -> tuple[float, float, float]:
+    x, y, z = [value] * 3 if isinstance(value, float | int) else value
     return unit * x, unit * y, unit * z

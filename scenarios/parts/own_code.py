@@ -1,4 +1,4 @@
-"""Controllers passed in as Python objects: classes, functions, or something with a `step`."""
+"""Controllers and forces passed in as Python objects: classes, functions, or something with a `step`."""
 
 from __future__ import annotations
 
@@ -10,11 +10,14 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Final
 
+import numpy as np
+
 from quadsim.controller import Controller
 from quadsim.errors import ParameterError
+from quadsim.sim.effects import Force
 from quadsim.vehicle import Vehicle
-from scenarios.parts.plugin import PluginController, make_law
-from scenarios.schema.plugin import PluginSpec
+from scenarios.parts.plugin import PluginController, make_force, make_law
+from scenarios.schema.plugin import ForceSpec, PluginSpec
 
 _INSTALLED: Final = tuple(sysconfig.get_paths()[name] for name in ("stdlib", "platstdlib", "purelib", "platlib"))
 
@@ -56,8 +59,28 @@ def set_up(law: object, spec: PluginSpec, vehicle: Vehicle, period: float) -> Co
     return PluginController(law, spec.horizon)
 
 
-def require_importable(law: object) -> None:
-    """Refuse a controller that other processes cannot import by its place.
+def refer_to_force(force: object) -> ForceSpec:
+    """How a scenario file names a force that was passed in, by the place of its code; see `refer_to`."""
+    spec = refer_to(force, horizon=1)
+    return ForceSpec(type=spec.type, folder=spec.folder, settings=spec.settings)
+
+
+def set_up_force(force: object, vehicle: Vehicle, rng: np.random.Generator) -> Force:
+    """A force that was passed in, as the plant takes it.
+
+    Raises:
+        InputError: it cannot be called as its kind is to be.
+    """
+    code, _ = _code_of(force)
+    if code is force or isinstance(force, functools.partial):
+        return make_force(code, refer_to_force(force), vehicle, rng)
+    if not callable(force):
+        raise ParameterError("", "forces", force, "a function force(time, state), or a class or an object called so")
+    return force
+
+
+def require_importable(law: object, what: str = "controller") -> None:
+    """Refuse a controller or force that other processes cannot import by its place.
 
     Raises:
         ParameterError: so it is, with what to do about it.
@@ -65,7 +88,7 @@ def require_importable(law: object) -> None:
     code, _ = _code_of(law)
     rule = "a class or a function at the top of a module, which worker processes import; "
     if code is not law and not isinstance(law, functools.partial):
-        raise ParameterError("", "controller", law, f"{rule}an object's state is not sent to them: pass its class")
+        raise ParameterError("", what, law, f"{rule}an object's state is not sent to them: pass its class")
     found: Any = sys.modules.get(code.__module__)
     for part in code.__qualname__.split("."):
         found = getattr(found, part, None)

@@ -16,10 +16,11 @@ import numpy as np
 
 from quadsim.controller import Command, Controller, Moment
 from quadsim.errors import CommandError, InputError, ParameterError, printable
+from quadsim.sim.effects import Force
 from quadsim.state import Array
 from quadsim.vehicle import N_ROTORS, Vehicle
 from scenarios.parts.foreign_code import announce, folders_of, searched
-from scenarios.schema.plugin import GIVEN, PluginSpec
+from scenarios.schema.plugin import GIVEN, ForceSpec, PluginSpec
 
 _WHOLE, _REAL = ("iterations", "active", "fallback"), ("slack", "primal_residual", "dual_residual", "solve_s")
 """What else a command has: whole numbers, and numbers."""
@@ -200,7 +201,38 @@ def make_law(code: Callable[..., Any], spec: PluginSpec, vehicle: Vehicle, perio
     return PluginController(law, spec.horizon)
 
 
-def _import(name: str, module: str, folders: list[str]) -> Any:
+def build_force(spec: ForceSpec, vehicle: Vehicle, rng: np.random.Generator) -> Force:
+    """Import a force of one's own; a class is called.
+
+    Raises:
+        InputError: there is no such code, it cannot be imported, or it does not take the settings.
+    """
+    code = announce(spec)
+    folders = folders_of(spec)
+    with searched(folders):
+        module = _import(spec.type, code.module, folders, "forces")
+        return make_force(_find(spec.type, module, code.attribute, "forces"), spec, vehicle, rng)
+
+
+def make_force(code: Callable[..., Any], spec: ForceSpec, vehicle: Vehicle, rng: np.random.Generator) -> Force:
+    """A force of a function force(time, state), or of a class, which is called; see `build_force`."""
+    attribute = getattr(code, "__qualname__", spec.type.partition(":")[2])
+    if not isinstance(code, type):
+        _check_call(attribute, code, {"time": 0.0, "state": None} | spec.settings, "forces", ("time", "state"))
+        return functools.update_wrapper(functools.partial(code, **spec.settings), code)
+    given = {"vehicle": vehicle, "rng": rng} | spec.settings
+    _check_call(attribute, code, given, "forces", ("vehicle", "rng"))
+    try:
+        force = code(given.pop("vehicle"), **given)
+    except ValueError as error:
+        raise InputError(f"forces.settings: {attribute} refuses them: {_said(error)}") from error
+    if not callable(force):
+        rule = f"a class with a method __call__(time, state), and {attribute} has none"
+        raise ParameterError("forces", "type", spec.type, rule)
+    return force
+
+
+def _import(name: str, module: str, folders: list[str], table: str = "controller") -> Any:
     try:
         found = importlib.import_module(module)
     except Exception as error:
@@ -211,13 +243,13 @@ def _import(name: str, module: str, folders: list[str]) -> Any:
                 f"of a module that there is: {error.name!r} is not where the scenario file is, not in the working "
                 f"directory {folders[-1]}, and not installed"
             )
-            raise ParameterError("controller", "type", name, rule) from None
-        raise InputError(f"controller.type: module {module!r} cannot be imported: {_said(error)}") from error
-    _check_origin(module, found, folders)
+            raise ParameterError(table, "type", name, rule) from None
+        raise InputError(f"{table}.type: module {module!r} cannot be imported: {_said(error)}") from error
+    _check_origin(module, found, folders, table)
     return found
 
 
-def _check_origin(module: str, found: Any, folders: list[str]) -> None:
+def _check_origin(module: str, found: Any, folders: list[str], table: str) -> None:
     """Refuse a module of the same name that was imported from elsewhere before."""
     file = getattr(found, "__file__", None)
     relative = Path(*module.split("."))
@@ -227,13 +259,13 @@ def _check_origin(module: str, found: Any, folders: list[str]) -> None:
         if wanted is not None:
             if file is not None and not wanted.samefile(file):
                 raise InputError(
-                    f"controller.type: {wanted} cannot be imported: a module {module!r} from {file} is loaded already; "
+                    f"{table}.type: {wanted} cannot be imported: a module {module!r} from {file} is loaded already; "
                     "rename one of them"
                 )
             return
 
 
-def _find(name: str, module: Any, attribute: str) -> Callable[..., Any]:
+def _find(name: str, module: Any, attribute: str, table: str = "controller") -> Callable[..., Any]:
     found = module
     for part in attribute.split("."):
         if not hasattr(found, part):
@@ -242,34 +274,41 @@ def _find(name: str, module: Any, attribute: str) -> Callable[..., Any]:
             guess = f"; did you mean {near[0]!r}?" if near else ""
             there = f" (there are: {', '.join(names)})" if names else ""
             where = getattr(found, "__name__", attribute)
-            raise InputError(f"controller.type: {where!r} has no {part!r}{guess}{there}")
+            raise InputError(f"{table}.type: {where!r} has no {part!r}{guess}{there}")
         found = getattr(found, part)
     if not callable(found):
-        raise ParameterError("controller", "type", name, f"a class or a function; {attribute} is {found!r:.100}")
+        raise ParameterError(table, "type", name, f"a class or a function; {attribute} is {found!r:.100}")
     return found
 
 
-def _check_call(attribute: str, factory: Callable[..., Any], given: dict[str, Any]) -> None:
-    """Refuse settings that a controller does not take, and a controller that does not take what all are given."""
+def _check_call(
+    attribute: str,
+    factory: Callable[..., Any],
+    given: dict[str, Any],
+    table: str = "controller",
+    always: tuple[str, ...] = GIVEN,
+) -> None:
+    """Refuse settings that code does not take, and code that does not take what all are given."""
     try:
         signature = inspect.signature(factory)
     except (TypeError, ValueError):  # of compiled code, which does not tell
         return
+    first = always[0]
     parameters = list(signature.parameters.values())
-    named = {name: value for name, value in given.items() if name != "vehicle"}  # which is given by its place
+    named = {name: value for name, value in given.items() if name != first}
     if not any(each.kind is each.VAR_KEYWORD for each in parameters):
         takes = [each.name for each in parameters[1:] if each.kind in (each.POSITIONAL_OR_KEYWORD, each.KEYWORD_ONLY)]
         for name in named:
             if name not in takes:
-                near = difflib.get_close_matches(name, set(takes) - set(GIVEN), n=1)
-                guess = f"; did you mean {near[0]!r}?" if near and name not in GIVEN else ""
-                field = "type" if name in GIVEN else "settings"
-                what = f"{attribute} takes no argument {name!r}{guess} (after the vehicle it takes: {', '.join(takes)})"
-                raise InputError(f"controller.{field}: {what}")
+                near = difflib.get_close_matches(name, set(takes) - set(always), n=1)
+                guess = f"; did you mean {near[0]!r}?" if near and name not in always else ""
+                field = "type" if name in always else "settings"
+                what = f"{attribute} takes no argument {name!r}{guess} (after the {first} it takes: {', '.join(takes)})"
+                raise InputError(f"{table}.{field}: {what}")
     try:
-        signature.bind(given["vehicle"], **named)
+        signature.bind(given[first], **named)
     except TypeError as error:
-        raise InputError(f"controller.settings: {attribute} cannot be called with them: {error}") from None
+        raise InputError(f"{table}.settings: {attribute} cannot be called with them: {error}") from None
 
 
 def _said(error: BaseException) -> str:

@@ -6,6 +6,7 @@ A table is a `Spec`, or a settings dataclass of the core, which is then its only
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Sequence
 from typing import Annotated, Any, Final, TypeGuard, get_type_hints
 
@@ -13,14 +14,11 @@ from annotated_types import DocInfo, Len
 from pydantic import BaseModel, ConfigDict
 from pydantic.fields import FieldInfo
 
-from quadsim.fields import Fraction, NonNegative, Number, Positive
-
-__all__ = ["Fraction", "NonNegative", "Number", "Positive"]  # and what stands here
+from quadsim.fields import Number
 
 MOST_ENTRIES: Final = 1000
 """Of a list of tables."""
 Triple = Annotated[list[Number], Len(3, 3)]
-Quadruple = Annotated[list[Number], Len(4, 4)]
 Pair = Annotated[list[Number], Len(2, 2)]
 LARGEST_SEED: Final = 2**63 - 1
 """The largest whole number that every reader of TOML takes."""
@@ -46,8 +44,12 @@ def is_table(kind: object) -> TypeGuard[type[Any]]:
 
 def fields_of(table: type[Any]) -> dict[str, FieldInfo]:
     """The fields of a table by their names, with types, limits, defaults and descriptions."""
-    if issubclass(table, BaseModel):
-        return table.model_fields
+    return table.model_fields if issubclass(table, BaseModel) else _declared(table)  # type: ignore[arg-type]
+
+
+@functools.cache
+def _declared(table: Any) -> dict[str, FieldInfo]:
+    """The fields of a dataclass."""
     hints = get_type_hints(table, include_extras=True)
     found = {}
     for field in sorted(dataclasses.fields(table), key=lambda field: _FIRST.get(field.name, len(_FIRST))):

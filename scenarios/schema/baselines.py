@@ -8,7 +8,8 @@ from annotated_types import Len
 from pydantic import Field, model_validator
 
 from mpc.baselines.preview import SMALLEST_PREVIEW
-from scenarios.schema.base import NonNegative, Positive, Spec
+from quadsim.fields import NonNegative, Positive
+from scenarios.schema.base import Spec
 from scenarios.schema.optimisation import LARGEST_HORIZON, InputBoundsSpec, InputWeightsSpec, Weight, require_states
 
 Tilt = Annotated[float, Field(ge=0.1, le=80.0)]

@@ -25,6 +25,8 @@ def locate_files(data: dict[str, Any], directory: Path) -> None:
             data[table][field] = str((directory / file).resolve())
     if "controller" in data:
         data["controller"] = located(data["controller"], directory)
+    if isinstance(data.get("forces"), list):
+        data["forces"] = [located(force, directory) for force in data["forces"]]
 
 
 def read_scenario(

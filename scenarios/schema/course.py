@@ -10,7 +10,8 @@ from typing import Annotated, Final, Literal
 from annotated_types import MaxLen
 from pydantic import Discriminator, Field, Tag, model_validator
 
-from scenarios.schema.base import MOST_ENTRIES, NonNegative, Number, Pair, Positive, Spec, Triple
+from quadsim.fields import NonNegative, Number, Positive
+from scenarios.schema.base import MOST_ENTRIES, Pair, Spec, Triple
 
 MOST_POINTS: Final = 200
 """Points or turns of one course; a longer one is a table, `type = "csv"`."""

@@ -8,12 +8,12 @@ from typing import Annotated, Literal
 from annotated_types import Len, doc
 from pydantic import Field, model_validator
 
-from quadsim.fields import Instant
+from quadsim.fields import Fraction, Instant, Positive
 from quadsim.sim.computation import Stall
 from quadsim.sim.effects.gust import Gust
 from quadsim.sim.effects.load import Payload
 from quadsim.sim.effects.wind import WindChange
-from scenarios.schema.base import Fraction, Positive, Spec, Triple
+from scenarios.schema.base import Spec, Triple
 
 
 class _Event(Spec):

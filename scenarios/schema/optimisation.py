@@ -10,9 +10,10 @@ from annotated_types import Len, MaxLen
 from pydantic import Discriminator, Field, Tag, model_validator
 
 from quadsim.errors import UnknownNameError
+from quadsim.fields import NonNegative, Number
 from quadsim.flight.audit import TERMS
 from quadsim.state import STATE_NAMES, STATE_UNITS
-from scenarios.schema.base import MOST_ENTRIES, NonNegative, Number, Pair, Spec, require_ordered
+from scenarios.schema.base import MOST_ENTRIES, Pair, Spec, require_ordered
 
 LARGEST_HORIZON: Final = 1000
 ANGLES: Final = frozenset(name for name, unit in zip(STATE_NAMES, STATE_UNITS, strict=True) if unit.startswith("rad"))

@@ -41,15 +41,41 @@ class PluginSpec(Spec):
 
     @model_validator(mode="after")
     def _check(self) -> PluginSpec:
-        if ":" in self.type and not re.fullmatch(f"{_NAME}:{_NAME}", self.type):
-            raise ValueError(f"type must be of the form {FORM}; got {self.type!r}")
-        for name, value in self.settings.items():
-            if not name.isidentifier() or name in GIVEN:
-                raise ValueError(f"settings.{name} must be named as an argument is, other than {', '.join(GIVEN)}")
-            if not _is_plain(value):
-                rule = "a finite number, a text, true or false, or a list or table of them"
-                raise ValueError(f"settings.{name} must be {rule}; got {value}")
+        _check_code(self.type, self.settings, GIVEN)
         return self
+
+
+class ForceSpec(Spec):
+    """A force of one's own, called once per physics step; see `quadsim.sim.effects.Force`.
+
+    A function force(time, state, **settings), or a class called as MyForce(vehicle, rng=..., **settings).
+    """
+
+    type: str = Field(description="its code, as package.module:name")
+    folder: str | None = Field(
+        default=None,
+        description="where its module is looked for first, from the scenario file; absent: beside that",
+    )
+    settings: dict[str, Any] = Field(default={}, description="what else it is called with, by the arguments' names")
+
+    @model_validator(mode="after")
+    def _check(self) -> ForceSpec:
+        if ":" not in self.type:
+            raise ValueError(f"type must be of the form {FORM}; got {self.type!r}")
+        _check_code(self.type, self.settings, ("vehicle", "rng", "time", "state"))
+        return self
+
+
+def _check_code(place: str, settings: Mapping[str, Any], given: tuple[str, ...]) -> None:
+    """Refuse a place that is none, and settings that are no arguments or cannot be written."""
+    if ":" in place and not re.fullmatch(f"{_NAME}:{_NAME}", place):
+        raise ValueError(f"type must be of the form {FORM}; got {place!r}")
+    for name, value in settings.items():
+        if not name.isidentifier() or name in given:
+            raise ValueError(f"settings.{name} must be named as an argument is, other than {', '.join(given)}")
+        if not _is_plain(value):
+            rule = "a finite number, a text, true or false, or a list or table of them"
+            raise ValueError(f"settings.{name} must be {rule}; got {value}")
 
 
 def is_plugin(name: str) -> bool:

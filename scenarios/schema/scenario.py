@@ -12,21 +12,24 @@ from annotated_types import MaxLen
 from pydantic import BeforeValidator, Field, ValidationError, create_model, model_validator
 from pydantic_core import PydanticCustomError
 
-from quadsim.errors import ParameterError
+from quadsim.errors import InputError, ParameterError
+from quadsim.fields import Positive
 from quadsim.flight.audit import Limit
 from quadsim.sim.computation import ComputationTime
 from quadsim.sim.effects import Effects
 from quadsim.sim.physics import steps_per_period
 from quadsim.vehicle import VEHICLE_UNITS, Vehicle
-from scenarios.schema.base import LARGEST_SEED, MOST_ENTRIES, Positive, Spec, Triple, fields_of
+from scenarios.schema.base import LARGEST_SEED, MOST_ENTRIES, Spec, Triple, fields_of
 from scenarios.schema.controller import ControllerSpec
 from scenarios.schema.course import ReferenceSpec
 from scenarios.schema.events import Event, PayloadDropEvent, PayloadPickupEvent, SensorFaultEvent
 from scenarios.schema.optimisation import BoundedSpec
+from scenarios.schema.plugin import ForceSpec
 from scenarios.schema.problems import ScenarioError, describe_all
 from scenarios.schema.sensors import EstimatorSpec, SensorsSpec, check_sensing
 from scenarios.schema.settings import set_field
 from scenarios.schema.writing import to_toml
+from scenarios.shipped import Group
 
 
 class VehicleSpec(Spec):
@@ -114,7 +117,6 @@ MOST_STEPS: Final = 10_000_000
 """Physics steps, and planned steps (periods times horizon), that one flight may take: each is held in memory."""
 
 
-Group = Literal["paper", "courses", "air", "faults", "ground", "sensors", "other"]
 Verdict = Literal["satisfied", "violated", "lost"]
 
 
@@ -150,6 +152,9 @@ class Scenario(Spec):
     reference: ReferenceSpec
     controller: ControllerSpec
     effects: Effects = Effects()
+    forces: Annotated[list[ForceSpec], MaxLen(MOST_ENTRIES)] = Field(
+        default=[], description="forces of one's own on the vehicle, each code that is called once per physics step"
+    )
     computation: ComputationTime | None = Field(default=None, description="absent: commands take no time")
     sensors: SensorsSpec | None = Field(default=None, description="absent: the controller receives the true state")
     estimator: EstimatorSpec | None = Field(
@@ -215,8 +220,15 @@ class Scenario(Spec):
 
         They are validated as JSON, where lists are tuples, texts are enumerations' values and tables are dataclasses,
         and nothing else is converted.  What JSON cannot hold, as dates, is infinite there, which is allowed nowhere.
+
+        Raises:
+            InputError: a number has more digits than can be written.
         """
-        return cls.model_validate_json(json.dumps(data, default=lambda _: math.inf))
+        try:
+            text = json.dumps(data, default=lambda _: math.inf)
+        except ValueError as error:
+            raise InputError(f"a scenario must be one that can be written: {error}") from error
+        return cls.model_validate_json(text)
 
     @property
     def periods(self) -> int:

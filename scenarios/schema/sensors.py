@@ -20,67 +20,59 @@ from annotated_types import Len, doc
 from pydantic import Discriminator, Field, Tag
 
 from quadsim.errors import ParameterError
+from quadsim.fields import NonNegative, Number, Vector
 from quadsim.sim.estimation.settings import EstimatorSettings
-from quadsim.sim.sensing.sensor import Outliers, Sensor, SensorName
-from scenarios.schema.base import Fraction, NonNegative, Number, Spec
+from quadsim.sim.sensing.sensor import Sampling, Sensor, SensorName
+from scenarios.schema.base import Spec
 
 
 def _number_or_list(value: object) -> str:
-    return "list" if isinstance(value, list) else "number"
+    return "list" if isinstance(value, list | tuple) else "number"
 
 
 Deviations = Annotated[
-    Annotated[NonNegative, Tag("number")] | Annotated[list[NonNegative], Len(3, 3), Tag("list")],
+    Annotated[NonNegative, Tag("number")] | Annotated[tuple[NonNegative, ...], Len(3, 3), Tag("list")],
     Discriminator(_number_or_list),
 ]
 """One standard deviation for all three axes, or one each."""
-Offsets = Annotated[
-    Annotated[Number, Tag("number")] | Annotated[list[Number], Len(3, 3), Tag("list")], Discriminator(_number_or_list)
-]
+Offsets = Annotated[Annotated[Number, Tag("number")] | Annotated[Vector, Tag("list")], Discriminator(_number_or_list)]
 """One offset for all three axes, or one each."""
 
 
-class _SensorSpec(Spec):
-    rate: Annotated[float, Field(ge=0.01, le=1e4)] = Field(
-        description="[Hz] samples per second, the first at t = 0; a divisor of the physics rate"
-    )
-    delay: Annotated[float, Field(ge=0.0, le=10.0)] = Field(
-        default=0.0, description="[s] from taking a sample to its arrival, a whole number of physics steps"
-    )
-    dropout: Fraction = Field(default=0.0, description="[-] probability of a sample being lost")
-    outliers: Outliers | None = Field(default=None, description="absent: none")
-
-
-class PositionSpec(_SensorSpec):
+@dataclass(frozen=True, kw_only=True)
+class PositionSpec(Sampling):
     """Position, world frame: satellite navigation or motion capture."""
 
-    noise: Deviations = Field(default=0.0, description="[m] standard deviation, one for all axes or x, y, z")
-    bias: Offsets = Field(default=0.0, description="[m] constant offset, one for all axes or x, y, z")
-    bias_walk: Deviations = Field(default=0.0, description="[m/sqrt(s)] random walk of the offset")
+    noise: Annotated[Deviations, doc("[m] standard deviation, one for all axes or x, y, z")] = 0.0
+    bias: Annotated[Offsets, doc("[m] constant offset, one for all axes or x, y, z")] = 0.0
+    bias_walk: Annotated[Deviations, doc("[m/sqrt(s)] random walk of the offset")] = 0.0
 
 
-class VelocitySpec(_SensorSpec):
+@dataclass(frozen=True, kw_only=True)
+class VelocitySpec(Sampling):
     """Velocity, world frame."""
 
-    noise: Deviations = Field(default=0.0, description="[m/s] standard deviation, one for all axes or x, y, z")
-    bias: Offsets = Field(default=0.0, description="[m/s] constant offset, one for all axes or x, y, z")
-    bias_walk: Deviations = Field(default=0.0, description="[m/s/sqrt(s)] random walk of the offset")
+    noise: Annotated[Deviations, doc("[m/s] standard deviation, one for all axes or x, y, z")] = 0.0
+    bias: Annotated[Offsets, doc("[m/s] constant offset, one for all axes or x, y, z")] = 0.0
+    bias_walk: Annotated[Deviations, doc("[m/s/sqrt(s)] random walk of the offset")] = 0.0
 
 
-class AttitudeSpec(_SensorSpec):
+@dataclass(frozen=True, kw_only=True)
+class AttitudeSpec(Sampling):
     """Roll, pitch and yaw, with errors that are small rotations about the body axes."""
 
-    noise: Deviations = Field(default=0.0, description="[deg] standard deviation, one for all body axes or x, y, z")
-    bias: Offsets = Field(default=0.0, description="[deg] constant rotation, one for all body axes or x, y, z")
-    bias_walk: Deviations = Field(default=0.0, description="[deg/sqrt(s)] random walk of that rotation")
+    noise: Annotated[Deviations, doc("[deg] standard deviation, one for all body axes or x, y, z")] = 0.0
+    bias: Annotated[Offsets, doc("[deg] constant rotation, one for all body axes or x, y, z")] = 0.0
+    bias_walk: Annotated[Deviations, doc("[deg/sqrt(s)] random walk of that rotation")] = 0.0
 
 
-class RatesSpec(_SensorSpec):
+@dataclass(frozen=True, kw_only=True)
+class RatesSpec(Sampling):
     """Body rates p, q, r: a rate gyro."""
 
-    noise: Deviations = Field(default=0.0, description="[deg/s] standard deviation, one for all body axes or x, y, z")
-    bias: Offsets = Field(default=0.0, description="[deg/s] constant offset, one for all body axes or x, y, z")
-    bias_walk: Deviations = Field(default=0.0, description="[deg/s/sqrt(s)] random walk of the offset")
+    noise: Annotated[Deviations, doc("[deg/s] standard deviation, one for all body axes or x, y, z")] = 0.0
+    bias: Annotated[Offsets, doc("[deg/s] constant offset, one for all body axes or x, y, z")] = 0.0
+    bias_walk: Annotated[Deviations, doc("[deg/s/sqrt(s)] random walk of the offset")] = 0.0
 
 
 AnySensorSpec = PositionSpec | VelocitySpec | AttitudeSpec | RatesSpec
@@ -122,13 +114,14 @@ def check_sensing(sensors: SensorsSpec | None, estimator: EstimatorSpec | None, 
         except ParameterError as error:
             raise ValueError(str(error)) from error
         if estimator is not None and not _all_positive(spec.noise):
+            noise = [*spec.noise] if isinstance(spec.noise, tuple) else spec.noise
             raise ValueError(
-                f"sensors.{name}.noise must be positive, for the estimator to weigh its samples; got {spec.noise}"
+                f"sensors.{name}.noise must be positive, for the estimator to weigh its samples; got {noise}"
             )
     missing = [name for name in (SensorName.POSITION, SensorName.ATTITUDE) if name not in present]
     if estimator is not None and missing:
         raise ValueError(f"estimator must have sensors.{missing[0]} to work with; got {[str(n) for n in present]}")
 
 
-def _all_positive(noise: float | list[float]) -> bool:
-    return min(noise) > 0.0 if isinstance(noise, list) else noise > 0.0
+def _all_positive(noise: float | tuple[float, ...]) -> bool:
+    return min(noise) > 0.0 if isinstance(noise, tuple) else noise > 0.0

@@ -9,15 +9,15 @@ import pytest
 from support import flight_queries, paper_problem, paper_reference
 
 from mpc.constraints import Constraint
-from mpc.exact.polish import polish
 from mpc.exact.shortcut import Shortcut
 from mpc.paper.condensed import condensed
 from mpc.qp import QP, Backend, Formulation, Solution, Vectors, kkt_residuals
 from mpc.solvers import SOLVERS, QPSolver, make_backend
-from mpc.solvers.piqp_dense import PiqpDense
+from mpc.solvers.piqp_backends import PiqpDense
 from mpc.staged import Staged
 from quadsim.controller import SOLVED
 from quadsim.state import Array
+from scenarios.bench.polish import polish
 from scenarios.flight import Flight
 
 STATE = np.zeros(12)

@@ -16,7 +16,6 @@ from ocp_peer import Period
 from support import changing_period, flight_queries, paper_problem, paper_reference, random_problem, with_terms
 
 from mpc.constraints import Penalty
-from mpc.exact.polish import polish
 from mpc.nonlinear.linearise import linearise
 from mpc.nonlinear.model import nonlinear_model
 from mpc.ocp import Problem, Rest
@@ -24,13 +23,13 @@ from mpc.paper.condensed import Condensed, condensed
 from mpc.qp import QP, Formulation, Solution, kkt_residuals
 from mpc.solvers import QPSolver
 from mpc.solvers.daqp_dense import DaqpDense
-from mpc.solvers.piqp_dense import PiqpDense
-from mpc.solvers.piqp_sparse import PiqpChanging, PiqpMultistage
+from mpc.solvers.piqp_backends import PiqpChanging, PiqpDense, PiqpMultistage
 from mpc.staged import Staged
 from quadsim.controller import SOLVED
 from quadsim.errors import ParameterError
 from quadsim.state import Array
 from quadsim.vehicle import Vehicle
+from scenarios.bench.polish import polish
 from scenarios.flight import Flight
 
 LAG = 0.05
@@ -85,7 +84,7 @@ def exact(form: Formulation, query: tuple[Array, Array, Array, Rest]) -> tuple[A
     return form.inputs(optimum.x), form.slacks(optimum.x), kkt_residuals(qp, optimum).worst / size
 
 
-@settings(max_examples=60)
+@settings(max_examples=40)
 @given(
     seed=st.integers(0, 2**32 - 1),
     horizon=st.integers(1, 12),

@@ -10,17 +10,16 @@ import scipy.linalg
 from support import paper_problem, random_problem
 
 from mpc.exact.axes import axes
-from mpc.exact.polish import polish
 from mpc.exact.shortcut import Shortcut
 from mpc.ocp import Objective, Problem, Rest, lqr_terminal_weight
 from mpc.paper.condensed import Condensed
 from mpc.qp import Formulation
 from mpc.solvers import QPSolver, Way
-from mpc.solvers.piqp_dense import PiqpDense
-from mpc.solvers.piqp_sparse import PiqpMultistage
+from mpc.solvers.piqp_backends import PiqpDense, PiqpMultistage
 from mpc.staged import Staged
 from quadsim.errors import ParameterError
 from quadsim.state import Array
+from scenarios.bench.polish import polish
 
 
 def terminated(problem: Problem) -> Problem:

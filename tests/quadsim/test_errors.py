@@ -14,6 +14,7 @@ from quadsim.errors import (
     DivergenceError,
     FileError,
     FlightError,
+    ForceError,
     InputError,
     InterruptedFlightError,
     LostError,
@@ -28,7 +29,7 @@ from quadsim.errors import (
 )
 
 EVERY = [kind for _, kind in inspect.getmembers(errors, inspect.isclass) if kind.__module__ == errors.__name__]
-FLIGHT = {FlightError, DivergenceError, LostError, CommandError, PlanExhaustedError, InterruptedFlightError}
+FLIGHT = {FlightError, DivergenceError, LostError, CommandError, ForceError, PlanExhaustedError, InterruptedFlightError}
 
 
 SAMPLES: list[QuadsimError] = [
@@ -45,6 +46,7 @@ SAMPLES: list[QuadsimError] = [
     DivergenceError("lost", time=1.0),
     LostError("speed", "the speed is", "m/s", value=51.0, limit=50.0, time=1.0),
     CommandError("not finite", time=1.0),
+    ForceError("not finite", time=1.0),
     PlanExhaustedError("no plan", time=1.0),
     InterruptedFlightError(time=1.0),
 ]

@@ -13,7 +13,6 @@ import pytest
 
 from quadsim.assets import models_dir, vehicle_names, vehicle_path
 from quadsim.errors import FileError, InputError, ParameterError, UnknownNameError
-from quadsim.flight.rundir import vehicle_to_json
 from quadsim.vehicle import OPTIONAL_PARAMETERS, VEHICLE_UNITS, Vehicle, load_vehicle, vehicle_sources
 
 FILE = vehicle_path("lopes2011")
@@ -169,7 +168,7 @@ def test_rotors_turn_as_published(name: str, turning: dict[tuple[int, int], str]
 @pytest.mark.parametrize("name", vehicle_names())
 def test_a_vehicle_survives_json(name: str) -> None:
     vehicle = load_vehicle(vehicle_path(name))
-    assert Vehicle(**json.loads(json.dumps(vehicle_to_json(vehicle)))) == vehicle
+    assert Vehicle(**json.loads(json.dumps(dataclasses.asdict(vehicle)))) == vehicle
 
 
 def test_a_vehicle_may_hover_at_the_ends_of_its_range(vehicle: Vehicle) -> None:

@@ -38,7 +38,7 @@ STATES = st.tuples(
 )
 
 
-@settings(max_examples=60, derandomize=True, database=None, deadline=None)
+@settings(max_examples=40, derandomize=True, database=None, deadline=None)
 @given(parts=STATES, speeds=within(250.0, 4).map(np.abs))
 def test_any_start_flies_or_ends_with_its_reason(parts: tuple, speeds: np.ndarray) -> None:  # type: ignore[type-arg]
     position, velocity, (level, yaw), rates = parts

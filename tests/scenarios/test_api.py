@@ -199,6 +199,79 @@ def test_what_is_no_law_is_refused(law: object, message: str, hover: Scenario) -
         quadsim.fly(hover, controller=law, progress=False)
 
 
+def pull(time: float, state: Array, newton: float = 0.5) -> Array:
+    """A force to the left, world frame."""
+    return np.array([0.0, newton, 0.0, 0.0, 0.0, 0.0])
+
+
+class Jerks:
+    """White force with memory: its random numbers are the scenario's."""
+
+    def __init__(self, vehicle: Vehicle, rng: np.random.Generator, share: float) -> None:
+        self.weight, self.rng, self.share, self.calls = vehicle.mass * vehicle.gravity, rng, share, 0
+
+    def reset(self) -> None:
+        self.calls = 0
+
+    def __call__(self, time: float, state: Array) -> Array:
+        self.calls += 1
+        return np.array([0.0, 0.0, self.share * self.weight * self.rng.standard_normal(), 0.0, 0.0, 0.0])
+
+
+def test_ones_own_force_acts(hover: Scenario) -> None:
+    """As the same constant force from a scenario's file, to rounding; recorded with the plant's wrench."""
+    free = hover.replace({"controller": {"type": "pid"}})
+    pushed = quadsim.fly(free, forces=[functools.partial(pull, newton=0.7)], progress=False)
+    same = quadsim.fly(free.replace({"effects.disturbance.force": [0.0, 0.7, 0.0]}), progress=False)
+    np.testing.assert_allclose(pushed.state["y"], same.state["y"], atol=1e-12)
+    assert pushed.state["y"].max() > 1e-3
+    assert pushed.log.plant.wrench is not None
+    assert pushed.log.plant.wrench[1:, 1].tolist() == pytest.approx([0.7] * 1000)
+    assert [spec.settings for spec in pushed.scenario.forces] == [{"newton": 0.7}]
+
+
+def test_a_force_with_memory_is_seeded(hover: Scenario) -> None:
+    force = functools.partial(Jerks, share=0.01)
+    first, again = (quadsim.fly(hover, forces=[force], progress=False) for _ in range(2))
+    other = quadsim.fly(hover.replace({"seed": 5}), forces=[force], progress=False)
+    assert np.array_equal(first.plant["vz"], again.plant["vz"])
+    assert not np.array_equal(first.plant["vz"], other.plant["vz"])
+
+
+def test_a_force_of_a_file_acts_in_a_sweep(hover: Scenario, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    source = "import numpy as np\ndef lift(time, state):\n    return np.array([0.0, 0.0, 1.0, 0.0, 0.0, 0.0])\n"
+    (tmp_path / "my_forces.py").write_text(source)
+    (tmp_path / "lifted.toml").write_text('base = "hover"\nduration = 1.0\n[[forces]]\ntype = "my_forces:lift"\n')
+    by_file = quadsim.fly(tmp_path / "lifted.toml", progress=False)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    lift = importlib.import_module("my_forces").lift
+    assert np.array_equal(by_file.plant["z"], quadsim.fly(hover, forces=[lift], progress=False).plant["z"])
+    swept = quadsim.sweep(hover, {"controller.horizon": [50]}, forces=[lift], workers=1, progress=False)
+    assert swept["rmse.z"].tolist() == [by_file.metrics["rmse.z"]]
+
+
+@pytest.mark.parametrize(
+    ("force", "message"),
+    [
+        (lambda time: np.zeros(6), "takes no argument 'state'"),
+        (functools.partial(pull, nwton=1.0), "takes no argument 'nwton'; did you mean 'newton'"),
+        (3.0, "a function force"),
+    ],
+)
+def test_what_is_no_force_is_refused(force: object, message: str, hover: Scenario) -> None:
+    with pytest.raises(InputError, match=message):
+        quadsim.fly(hover, forces=[force], progress=False)
+
+
+def test_a_force_that_fails_ends_the_flight_with_its_reason(hover: Scenario) -> None:
+    def bad(time: float, state: Array) -> Array:
+        return np.zeros(6) if time < 0.5 else np.full(5, np.nan)
+
+    flown = quadsim.fly(hover, forces=[bad], progress=False)
+    assert flown.outcome == "lost"
+    assert "at t = 0.500 s: the force bad must give six finite numbers" in str(flown.log.reason)
+
+
 def test_a_sweep_flies_every_combination(hover: Scenario) -> None:
     found = quadsim.sweep(
         hover,

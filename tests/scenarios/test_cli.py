@@ -5,12 +5,7 @@ from __future__ import annotations
 import errno
 import importlib.util
 import json
-import os
 import shutil
-import signal
-import subprocess
-import sys
-import time as clock
 import tomllib
 from collections.abc import Callable
 from pathlib import Path
@@ -23,10 +18,11 @@ from quadsim import __version__
 from quadsim.assets import vehicle_names
 from quadsim.errors import QuadsimError, RenderingUnavailableError
 from quadsim.flight import rundir
-from scenarios.campaign.plan import campaign_names
+from scenarios.campaign.plan import read_campaign
 from scenarios.cli import main
 from scenarios.commands import EXIT_DONE, EXIT_FAILED, EXIT_WRONG_INPUT
-from scenarios.loading import LIBRARY, load_scenario, scenario_names
+from scenarios.loading import load_scenario
+from scenarios.shipped import LIBRARY, campaign_names, scenario_names
 
 ROOT = Path(__file__).resolve().parents[2]
 TABLES = ("--no-video", "--no-recording", "--no-figures")
@@ -71,22 +67,21 @@ def test_list_as_json(capsys: pytest.CaptureFixture[str]) -> None:
     listed = json.loads(capsys.readouterr().out)
     assert list(listed) == ["scenarios", "groups", "expected", "campaigns", "vehicles", "controllers", "solvers"]
     assert list(listed["scenarios"]) == list(listed["groups"]) == list(listed["expected"]) == scenario_names()
-    assert listed["groups"]["paper-constrained"] == "paper"
-    assert listed["expected"]["paper-constrained"] == "satisfied"
+    checked = [load_scenario(name) for name in scenario_names()]
+    assert listed["scenarios"] == {scenario.name: scenario.description for scenario in checked}
+    assert listed["groups"] == {scenario.name: scenario.group for scenario in checked}
+    assert listed["expected"] == {scenario.name: scenario.expect for scenario in checked}
+    assert listed["campaigns"] == {name: read_campaign(name)["description"] for name in campaign_names()}
     assert list(listed["campaigns"]) == campaign_names()
     assert list(listed["solvers"]) == list(SOLVERS)
 
 
 def test_list_shows_scenarios_by_group_and_what_is_to_defeat_the_controller(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
-    meant = {"a": ("faults", "lost"), "b": ("air", "violated"), "c": ("air", "satisfied")}
-    made = {
-        name: load_scenario("hover", [f"name={name}", "description=d", f"group={group}", f"expect={expect}"])
-        for name, (group, expect) in meant.items()
-    }
-    monkeypatch.setattr("scenarios.commands.catalogue.scenario_names", lambda: list(made))
-    monkeypatch.setattr("scenarios.commands.catalogue.load_scenario", lambda name: made[name])
+    for name, group, expect in (("a", "faults", "lost"), ("b", "air", "violated"), ("c", "air", "satisfied")):
+        (tmp_path / f"{name}.toml").write_text(f'description = "d"\ngroup = "{group}"\nexpect = "{expect}"\n')
+    monkeypatch.setattr("scenarios.shipped.LIBRARY", tmp_path)
     assert main(["list"]) == EXIT_DONE
     lines = [" ".join(line.split()) for line in capsys.readouterr().out.splitlines()]
     assert lines[: lines.index("campaigns")] == [
@@ -150,7 +145,7 @@ def test_run_prints_tables_and_where_the_files_are(here: Path, capsys: pytest.Ca
         assert part in printed.out
     assert "written to runs/hover" in printed.out
     assert printed.err == ""
-    assert rundir.is_run(here / "runs" / "hover")
+    assert rundir.read_summary(here / "runs" / "hover")
 
 
 @pytest.mark.parametrize(
@@ -195,7 +190,7 @@ def test_a_violated_constraint_is_status_1_and_the_run_is_kept(here: Path, capsy
     assert "completed, a required constraint does not hold" in printed.out
     assert printed.out.count("VIOLATED") == 1
     assert printed.err == ""
-    assert rundir.is_run(here / "runs" / "hover")
+    assert rundir.read_summary(here / "runs" / "hover")
 
 
 def test_a_violated_constraint_that_is_not_required_is_status_0(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -510,175 +505,6 @@ def test_a_disk_that_fills_up_in_the_writing_is_status_2_and_leaves_nothing(
     assert left_in(here) == []
 
 
-# --- as a process of its own ---------------------------------------------------------------------------------------
-
-
-def environment() -> dict[str, str]:
-    return os.environ | {"PYTHONPATH": str(ROOT)}
-
-
-def quadsim(*arguments: str, cwd: Path) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "scenarios.cli", *arguments]
-    return subprocess.run(command, cwd=cwd, env=environment(), capture_output=True, text=True, check=False, timeout=60)
-
-
-def test_a_process_says_one_thing_and_shows_no_traceback(tmp_path: Path) -> None:
-    done = quadsim("run", "hover", "--set", "controller.horizon=0", cwd=tmp_path)
-    assert (done.returncode, done.stdout) == (EXIT_WRONG_INPUT, "")
-    assert done.stderr == "quadsim: hover.toml: controller.horizon must be >= 1; got 0\n"
-    assert left_in(tmp_path) == []
-
-
-@pytest.mark.parametrize("options", [[], ["--json"]])
-def test_a_reader_that_goes_away_gets_no_traceback_and_no_status_0(options: list[str]) -> None:
-    """`quadsim list | true`."""
-    command = [sys.executable, "-m", "scenarios.cli", "list", *options]
-    process = subprocess.Popen(command, env=environment(), stdout=subprocess.PIPE, stderr=subprocess.PIPE)
-    assert process.stdout is not None
-    assert process.stderr is not None
-    process.stdout.close()
-    said = process.stderr.read()
-    process.stderr.close()
-    assert (process.wait(timeout=60), said) == (EXIT_FAILED, b"")
-
-
-ITSELF = """
-import os, signal, sys, threading
-from scenarios.entry import main
-after, stop = float(sys.argv[1]), int(sys.argv[2])
-timers = [threading.Timer(after, os.kill, (os.getpid(), stop))]
-listen = signal.signal
-def listening(which, handler):
-    before = listen(which, handler)
-    if which == signal.SIGHUP and timers:  # the last that is listened to
-        timers.pop().start()
-    return before
-signal.signal = listening
-if signal.getsignal(signal.SIGHUP) is signal.SIG_IGN:
-    timers.pop().start()
-sys.argv[:] = ["quadsim", *sys.argv[3:]]
-sys.exit(main())
-"""
-
-
-@pytest.mark.parametrize("stop", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
-@pytest.mark.parametrize("delay", [0.0, 0.03, 0.1, 0.3])
-def test_who_is_told_to_stop_in_the_first_moments_ends_in_order(
-    tmp_path: Path, stop: signal.Signals, delay: float
-) -> None:
-    done = subprocess.run(
-        [sys.executable, "-c", ITSELF, str(delay), str(int(stop)), "run", "hover", "--set", "duration=600"],
-        cwd=tmp_path,
-        env=environment(),
-        capture_output=True,
-        text=True,
-        timeout=60,
-        preexec_fn=listening,
-    )
-    assert done.returncode == EXIT_FAILED, done.stderr
-    assert "Traceback" not in done.stderr
-    assert "interrupted (Ctrl-C)" in done.stderr + done.stdout
-    assert {path.name for path in tmp_path.iterdir()} <= {"runs"}
-
-
-SWALLOWED = """
-import os, signal, sys, time
-from scenarios import cli, entry
-class Dying:
-    def __del__(self):
-        os.kill(os.getpid(), signal.SIGINT)
-        time.sleep(0.1)
-def run():
-    Dying()
-    time.sleep(5)
-    return 0
-cli.main = run
-sys.exit(entry.main())
-"""
-
-
-def test_a_stop_that_python_ignores_is_heard(tmp_path: Path) -> None:
-    """It does so in destructors and callbacks, of which imports have many."""
-    done = subprocess.run(
-        [sys.executable, "-c", SWALLOWED],
-        cwd=tmp_path,
-        env=environment(),
-        capture_output=True,
-        timeout=60,
-        preexec_fn=listening,
-    )
-    assert done.returncode == EXIT_FAILED
-    assert done.stderr.startswith(b"quadsim: interrupted (Ctrl-C)")
-
-
-def listening() -> None:
-    """A shell's `&` has these signals ignored."""
-    for stop in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-        signal.signal(stop, signal.SIG_DFL)
-
-
-def test_who_was_started_by_nohup_goes_on(tmp_path: Path) -> None:
-    command = [sys.executable, "-c", ITSELF, "0.5", str(int(signal.SIGHUP)), "run", "hover", *TABLES, *SHORT]
-    done = subprocess.run(
-        command,
-        cwd=tmp_path,
-        env=environment(),
-        capture_output=True,
-        timeout=60,
-        preexec_fn=lambda: signal.signal(signal.SIGHUP, signal.SIG_IGN),
-    )
-    assert (done.returncode, done.stderr) == (EXIT_DONE, b"")
-
-
-@pytest.mark.parametrize("closed", [(1,), (2,), (0, 1, 2), (0,)])
-def test_closed_streams_do_no_harm(tmp_path: Path, closed: tuple[int, ...]) -> None:
-    done = subprocess.run(
-        [sys.executable, "-m", "scenarios.cli", "run", "hover", *TABLES, *SHORT, "--out", "run"],
-        cwd=tmp_path,
-        env=environment(),
-        capture_output=True,
-        text=True,
-        timeout=60,
-        preexec_fn=lambda: [os.close(number) for number in closed],
-    )
-    if 1 in closed:
-        told = "" if 2 in closed else "quadsim: stdout is closed; to do without what is printed: >/dev/null\n"
-        assert (done.returncode, done.stderr, list(tmp_path.iterdir())) == (EXIT_WRONG_INPUT, told, [])
-    else:
-        assert (done.returncode, done.stderr) == (EXIT_DONE, "")
-        rundir.load_run(tmp_path / "run")
-
-
-@pytest.mark.parametrize("stop", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
-def test_a_long_flight_that_is_stopped_is_kept_up_to_there(tmp_path: Path, stop: signal.Signals) -> None:
-    process = subprocess.Popen(
-        [sys.executable, "-m", "scenarios.cli", "run", "hover", *TABLES, "--set", "duration=1800", "--out", "run"],
-        cwd=tmp_path,
-        env=environment(),
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        preexec_fn=listening,
-    )
-    deadline = clock.monotonic() + 30.0
-    while not list(tmp_path.glob(".quadsim-*.partial")):
-        assert clock.monotonic() < deadline, "the flight did not begin"
-        clock.sleep(0.02)
-    clock.sleep(1.0)
-    process.send_signal(stop)
-    out, err = process.communicate(timeout=30)
-    assert (process.returncode, err) == (EXIT_FAILED, "")
-    assert "interrupted (Ctrl-C)" in out
-    assert [path.name for path in tmp_path.iterdir()] == ["run"]
-    run = rundir.load_run(tmp_path / "run")
-    assert run.summary["status"] == "aborted"
-    assert run.summary["reason"].endswith("interrupted (Ctrl-C)")
-    assert 0.0 < run.summary["duration"] < 1800.0
-    assert run.log.control.t.size * 0.05 == pytest.approx(run.summary["duration"])
-    assert run.log.plant.t[-1] == pytest.approx(run.summary["duration"])
-    assert rundir.damaged_files(run.directory, run.summary) == []
-
-
 def test_ctrl_c_outside_a_flight_is_status_1_and_leaves_nothing(
     here: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -699,15 +525,6 @@ def test_a_defect_of_our_own_shows_its_traceback(here: Path, monkeypatch: pytest
     monkeypatch.setattr("scenarios.run.fly", broken)
     with pytest.raises(ZeroDivisionError):
         main(["check", "hover"])
-
-
-@pytest.mark.skipif(not Path("/dev/full").exists(), reason="there is no /dev/full to write to")
-def test_output_that_cannot_be_written_is_said() -> None:
-    with Path("/dev/full").open("w") as full:
-        command = [sys.executable, "-m", "scenarios.cli", "list", "--json"]
-        done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, cwd=ROOT)
-    assert done.stderr == "quadsim: cannot write the output: No space left on device\n"
-    assert done.returncode == EXIT_WRONG_INPUT
 
 
 def test_a_seed_means_nothing_to_a_finished_run(hover_directory: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -30,7 +30,7 @@ from fault_injection import (
     recorded,
 )
 
-from mpc.solvers._piqp import STATUS
+from mpc.solvers.piqp_backends import STATUS
 from quadsim.errors import CommandError
 from quadsim.sim.plant import Plant
 from quadsim.sim.sensing.sensor import SensorName

@@ -43,35 +43,27 @@ STYLE: Final[dict[RcKeyType, Any]] = {
 
 
 def write_drawings(drawings: Mapping[str, Callable[[], Figure]], directory: Path) -> list[Path]:
-    """Draw figures by name and save each as PNG and SVG.
-
-    Args:
-        drawings: what draws each figure, by the name of its files; called in the style of all figures.
-        directory: where the files go, one that is being made; a file of a figure's name must not be there.
-
-    Returns:
-        The files written, PNG and SVG of each figure.
+    """Draw figures, each in the style of all, and save them by their names as PNG and SVG; the files written.
 
     Raises:
-        OutputError: the directory cannot be written.
+        OutputError: the directory, one that is being made, cannot be written, or holds a file of that name.
     """
     import matplotlib
 
     paths = []
+    options: dict[str, dict[str, Any]] = {"png": {"dpi": DPI}, "svg": {"metadata": {"Date": None}}}
     try:
         directory.mkdir(parents=True, exist_ok=True)
         with matplotlib.rc_context(STYLE):
             for name, draw in drawings.items():
                 figure = draw()
-                png, svg = directory / f"{name}.png", directory / f"{name}.svg"
                 if (layout := figure.get_layout_engine()) is not None:
                     layout.execute(figure)  # once for both files, neither of which is then drawn for it
                 figure.set_layout_engine(None)
-                with png.open("xb") as file:
-                    figure.savefig(file, format="png", dpi=DPI)
-                with svg.open("xb") as file:
-                    figure.savefig(file, format="svg", metadata={"Date": None})
-                paths += [png, svg]
+                for form, option in options.items():
+                    paths.append(directory / f"{name}.{form}")
+                    with paths[-1].open("xb") as file:
+                        figure.savefig(file, format=form, **option)
     except OSError as error:
         raise OutputError(directory, error.strerror or str(error)) from error
     return paths
@@ -92,11 +84,6 @@ def run_title(run: Run, what: str) -> str:
     return f"{run.name}{ended}: {what}"
 
 
-def run_end(run: Run) -> float:
-    """Last time of the flight [s]."""
-    return float(run.log.plant.t[-1])
-
-
 def keep_least_span(axes: Axes, unit: str) -> None:
     """Widen the vertical axis of a panel whose curves and bounds all stand still; see `quadsim.report.curves`."""
     curves = [np.asarray(line.get_ydata(), float) for line in axes.get_lines()]
@@ -106,11 +93,12 @@ def keep_least_span(axes: Axes, unit: str) -> None:
         axes.set_ylim(*ends)
 
 
-def finish_figure(figure: Figure, bottom: Sequence[Axes], shown: Mapping[str, Artist], end: float) -> None:
-    """Label the time axes and put the legend above all panels, where it hides nothing."""
+def finish_figure(figure: Figure, bottom: Sequence[Axes], shown: Mapping[str, Artist], end: float) -> Figure:
+    """The figure with its time axes labelled, and the legend above all panels, where it hides nothing."""
     for axes in bottom:
         axes.set_xlabel("time [s]")
         axes.set_xlim(-0.008 * end, end or 1.0)  # a peak in the first period stands clear of the axis
     figure.align_ylabels()
     if shown:
         figure.legend(list(shown.values()), list(shown), loc="outside upper right", ncols=len(shown))
+    return figure

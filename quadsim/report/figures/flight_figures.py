@@ -13,8 +13,8 @@ import numpy as np
 from quadsim.flight.audit import SIGNALS, Limit
 from quadsim.flight.rundir import Run
 from quadsim.report.comparison import distinct_courses, run_names
-from quadsim.report.curves import break_at_wraps, commanded_speeds, effect_curves
-from quadsim.report.figures.canvas import finish_figure, keep_least_span, new_figure, run_end, run_title, write_drawings
+from quadsim.report.curves import bounds_of, break_at_wraps, commanded_speeds, effect_curves, reference_curve
+from quadsim.report.figures.canvas import finish_figure, keep_least_span, new_figure, run_title, write_drawings
 from quadsim.report.palette import BOUND, REFERENCE, line_colour
 from quadsim.state import REFERENCE_NAMES, STATE_NAMES, Array
 from quadsim.vehicle import N_ROTORS
@@ -24,31 +24,25 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-PAPER_FIGURES: Final = {"paper-unconstrained": (2, 3), "paper-constrained": (4, 5)}
-"""Numbers in the paper of the figures of states and of inputs, by scenario."""
+PAPER_FIGURES: Final = {
+    "paper-unconstrained": ("figure2_", "figure3_"),
+    "paper-constrained": ("figure4_", "figure5_"),
+}
+"""Before the names of the figures of states and of inputs, by scenario: their numbers in the paper."""
 
 
 def write_figures(run: Run, directory: Path) -> list[Path]:
     """Draw one run: states and inputs in the paper's arrangement, the solve times, and its effects where it has any.
 
-    The two scenarios of the paper carry its figure numbers in their file names, e.g. `figure4_states.png`.
-
-    Args:
-        run: the run.
-        directory: where the files go; made when it is not there.
-
-    Returns:
-        The files written, PNG and SVG of each figure; none when no control period was flown.
-
-    Raises:
-        OutputError: the directory cannot be written.
+    The two scenarios of the paper carry its figure numbers in their file names, e.g. `figure4_states.png`.  Nothing is
+    drawn where no control period was flown; else see `quadsim.report.figures.canvas.write_drawings`.
     """
     if not run.log.control.t.size:
         return []
-    states, inputs = PAPER_FIGURES.get(run.name, (None, None))
+    states, inputs = PAPER_FIGURES.get(run.name, ("", ""))
     drawings = {
-        _file_name("states", states): lambda: _draw_states(run),
-        _file_name("inputs", inputs): lambda: _draw_inputs(run),
+        f"{states}states": lambda: _draw_states(run),
+        f"{inputs}inputs": lambda: _draw_inputs(run),
         "solve_times": lambda: _draw_solve_times(run),
     }
     if has_effects(run):
@@ -57,23 +51,11 @@ def write_figures(run: Run, directory: Path) -> list[Path]:
 
 
 def comparison_figure(runs: Sequence[Run], directory: Path) -> list[Path]:
-    """Overlay runs: position, roll and pitch, and between which speeds the rotors turned.
+    """Overlay one or more runs of any course and vehicle as `comparison.png` and `.svg`; errors as `write_drawings`.
 
-    Args:
-        runs: one or more; they need not be of one course or one vehicle.
-        directory: where `comparison.png` and `comparison.svg` go; made when it is not there.
-
-    Returns:
-        The two files.
-
-    Raises:
-        OutputError: the directory cannot be written.
+    They show position, roll and pitch, and between which speeds the rotors turned.
     """
     return write_drawings({"comparison": lambda: _draw_comparison(runs)}, directory)
-
-
-def _file_name(content: str, number: int | None) -> str:
-    return content if number is None else f"figure{number}_{content}"
 
 
 def _draw_states(run: Run) -> Figure:
@@ -82,8 +64,7 @@ def _draw_states(run: Run) -> Figure:
     shown: dict[str, Artist] = {}
     for axes, name in zip(panels.T.flat, ("x", "y", "z", "roll", "pitch", "yaw"), strict=True):
         shown |= draw_signal(axes, run, name)
-    finish_figure(figure, panels[-1], shown, run_end(run))
-    return figure
+    return finish_figure(figure, panels[-1], shown, run.end)
 
 
 def plot_signals(run: Run, names: Sequence[str]) -> list[Axes]:
@@ -110,7 +91,7 @@ def draw_signals(figure: Figure, run: Run, names: Sequence[str]) -> list[Axes]:
     for axes, name in zip(panels, names, strict=True):
         shown |= draw_signal(axes, run, name)
         axes.grid(alpha=0.4)
-    finish_figure(figure, panels[-1:], shown, run_end(run))
+    finish_figure(figure, panels[-1:], shown, run.end)
     return panels
 
 
@@ -127,7 +108,7 @@ def draw_signal(axes: Axes, run: Run, name: str) -> dict[str, Artist]:
             shown[label] = axes.plot(control.t, values, color=line_colour(i), drawstyle="steps-post", linewidth=1.0)[0]
     shown |= _draw_measured(axes, run, name) if name in STATE_NAMES else {}
     shown |= _draw_reference(axes, run, name)
-    shown |= _draw_bounds(axes, run.limits, name, run_end(run))
+    shown |= _draw_bounds(axes, run.limits, name, run.end)
     axes.set_ylabel(f"{name} [{signal.unit}]")
     keep_least_span(axes, signal.unit)
     return shown
@@ -145,11 +126,10 @@ def _draw_inputs(run: Run) -> Figure:
             shown[f"rotor {rotor + 1}"] = axes.plot(
                 run.log.control.t, values[:, rotor], color=line_colour(rotor), drawstyle="steps-post", linewidth=width
             )[0]
-        shown |= _draw_bounds(axes, run.limits, name, run_end(run))
+        shown |= _draw_bounds(axes, run.limits, name, run.end)
         axes.set_ylabel(label)
         keep_least_span(axes, SIGNALS[name].unit)
-    finish_figure(figure, panels[-1:], shown, run_end(run))
-    return figure
+    return finish_figure(figure, panels[-1:], shown, run.end)
 
 
 def _draw_solve_times(run: Run) -> Figure:
@@ -176,15 +156,14 @@ def _draw_solve_times(run: Run) -> Figure:
     times.legend(
         loc="lower left", bbox_to_anchor=(0.0, 1.0), borderaxespad=0.2, ncols=3, fontsize=8.2, columnspacing=1.2
     )
-    finish_figure(figure, (active,), {}, run_end(run))
-    return figure
+    return finish_figure(figure, (active,), {}, run.end)
 
 
 def _draw_comparison(runs: Sequence[Run]) -> Figure:
     figure = new_figure("", 9.6, 6.4)
     panels = figure.subplots(3, 2, sharex=True)
     signals = dict(zip(("x", "y", "z", "roll", "pitch", "speed"), panels.T.flat, strict=True))
-    end = max(run_end(run) for run in runs)
+    end = max(run.end for run in runs)
     shown: dict[str, Artist] = {}
     for run in distinct_courses(runs):
         for name in ("x", "y", "z"):
@@ -203,8 +182,7 @@ def _draw_comparison(runs: Sequence[Run]) -> Figure:
         axes.set_ylabel(f"{name} [{SIGNALS[name].unit}]")
         keep_least_span(axes, SIGNALS[name].unit)
     signals["speed"].set_ylabel("lowest to highest\nrotor speed [rad/s]")
-    finish_figure(figure, panels[-1], shown, end)
-    return figure
+    return finish_figure(figure, panels[-1], shown, end)
 
 
 def _draw_plant(axes: Axes, run: Run, name: str, colour: str) -> Artist:
@@ -229,22 +207,15 @@ def _draw_reference(axes: Axes, run: Run, name: str) -> dict[str, Artist]:
     """Draw the filtered reference of a signal that has one; returns the legend's entry for it."""
     if name not in REFERENCE_NAMES:
         return {}
-    values = run.log.control.reference[:, REFERENCE_NAMES.index(name)]
-    shown = np.degrees(values) if SIGNALS[name].unit == "deg" else values
-    line = axes.plot(run.log.control.t, shown, color=REFERENCE, linestyle=(0, (5, 2)), linewidth=1.1)[0]
+    values = reference_curve(run.log.control, name)
+    line = axes.plot(run.log.control.t, values, color=REFERENCE, linestyle=(0, (5, 2)), linewidth=1.1)[0]
     return {"reference, filtered": line}
 
 
 def _draw_bounds(axes: Axes, limits: Sequence[Limit], signal: str, end: float) -> dict[str, Artist]:
     """Draw the bounds on a signal over the times they hold for; returns the legend's entry for them."""
-    bounds = {
-        (bound, limit.start, min(limit.stop, end)): None
-        for limit in limits
-        for bound in (limit.lower, limit.upper)
-        if limit.signal == signal and limit.start < end and np.isfinite(bound)
-    }
     shown: dict[str, Artist] = {}
-    for bound, start, stop in bounds:
+    for bound, start, stop in bounds_of(limits, signal, end):
         shown["bound"] = axes.hlines(bound, start, stop, color=BOUND, linestyle="--", linewidth=1.1)
     return shown
 
@@ -289,8 +260,7 @@ def draw_effects(run: Run) -> Figure:
     bottom = [panels[name] for rows in (halves, wholes) if rows for name in dict.fromkeys(rows[-1])]
     for axes in bottom:
         axes.tick_params(labelbottom=True)
-    finish_figure(figure, bottom, shown, run_end(run))
-    return figure
+    return finish_figure(figure, bottom, shown, run.end)
 
 
 def _draw_triple(axes: Axes, t: Array, values: Array, names: Sequence[str], label: str, **style: Any) -> None:

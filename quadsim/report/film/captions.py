@@ -13,6 +13,7 @@ from PIL import Image
 from quadsim.controller import ACCEPTED, Phase, law_name
 from quadsim.flight.audit import Limit
 from quadsim.flight.rundir import Run
+from quadsim.report.comparison import failure_sentences
 from quadsim.report.film.frames import Footage, MarginTrack
 from quadsim.report.film.painter import (
     AMBER,
@@ -31,7 +32,6 @@ from quadsim.report.film.painter import (
     text_width,
 )
 from quadsim.report.film.topview import TopView
-from quadsim.report.flight_conditions import failure_sentences
 from quadsim.state import INDEX, REFERENCE_NAMES, REFERENCE_STATES, Array
 
 _Panel = Callable[[Painter, float, float, int], None]
@@ -158,32 +158,26 @@ class Overlay:
         painter.text(x, y, "attitude [deg]", size=13, colour=GREY)
         for j, name in enumerate(("roll", "pitch")):
             value, limit, row = math.degrees(self._footage.euler[i, j]), self._limit(name, i), y + 32 + 50 * j
-            finite = [abs(b) for b in _bounds(limit) if math.isfinite(b)]
-            span = 2.0 * max(finite) if finite else 30.0
-            broken = _breaks(limit, value)
+            span = 2.0 * max(map(abs, _bounds(limit)), default=15.0)
+            broken, shown = _breaks(limit, value), f"{round(value, 2) + 0.0:+.2f}"
             painter.text(x, row, name, size=17)
-            painter.text(
-                x + 262, row, f"{round(value, 2) + 0.0:+.2f}", size=17, colour=RED if broken else WHITE, anchor="ra"
-            )
+            painter.text(x + 262, row, shown, size=17, colour=RED if broken else WHITE, anchor="ra")
             painter.box(x, row + 25, 262, 9, FAINT)
             centre, unit = x + 131, 131 / span
             painter.box(centre, row + 25, unit * float(np.clip(value, -span, span)), 9, RED if broken else BLUE)
             painter.box(centre - 0.5, row + 23, 1, 13, GREY)
             for bound in _bounds(limit):
-                if math.isfinite(bound):
-                    painter.box(centre + unit * bound - 1, row + 21, 2.5, 17, RED if broken else AMBER)
+                painter.box(centre + unit * bound - 1, row + 21, 2.5, 17, RED if broken else AMBER)
 
     def _speeds(self, painter: Painter, x: float, y: float, i: int) -> None:
         limit = self._limit("speed", i)
-        upper = _bounds(limit)[1]
-        top = 1.25 * (upper if math.isfinite(upper) else self._run.vehicle.speed_max)
+        top = 1.25 * (limit.upper if limit and math.isfinite(limit.upper) else self._run.vehicle.speed_max)
         painter.text(x, y, "rotor speed [rad/s]", size=13, colour=GREY)
         self._bars(painter, x, y, self._footage.speeds[i], limit, (0.0, top), "{:.0f}")
 
     def _slews(self, painter: Painter, x: float, y: float, i: int) -> None:
         limit = self._limit("slew", i)
-        finite = [abs(bound) for bound in _bounds(limit) if math.isfinite(bound)]
-        span = 1.6 * max(finite) if finite else 20.0
+        span = 1.6 * max(map(abs, _bounds(limit)), default=12.5)
         painter.text(x, y, "step per period [rad/s]", size=13, colour=GREY)
         self._bars(painter, x, y, self._run.log.control.slews[self._footage.period[i]], limit, (-span, span), "{:+.1f}")
 
@@ -204,16 +198,10 @@ class Overlay:
             left, broken = x + 50 * j, _breaks(limit, value)
             painter.box(left, top, 34, height, FAINT)
             painter.box(left, zero, 34, -unit * float(np.clip(value, low, high)), RED if broken else BLUE)
-            painter.text(
-                left + 17,
-                top + height + 5,
-                form.format(round(value, 1) + 0.0),
-                size=13,
-                colour=RED if broken else WHITE,
-                anchor="ma",
-            )
+            shown = form.format(round(value, 1) + 0.0)
+            painter.text(left + 17, top + height + 5, shown, size=13, colour=RED if broken else WHITE, anchor="ma")
         for bound in _bounds(limit):
-            if math.isfinite(bound) and bound != 0.0:
+            if bound != 0.0:
                 painter.box(x - 4, zero - unit * bound - 1, 192, 2, AMBER)
 
     def _margins(self, painter: Painter, x: float, y: float, i: int) -> None:
@@ -241,11 +229,12 @@ def margin_rows(ranked: Sequence[MarginTrack], i: int) -> tuple[list[MarginTrack
     return begun[:_MOST_MARGINS], f"and {', '.join(parts)}" if parts else ""
 
 
-def _bounds(limit: Limit | None) -> tuple[float, float]:
-    return (-math.inf, math.inf) if limit is None else (limit.lower, limit.upper)
+def _bounds(limit: Limit | None) -> list[float]:
+    return [] if limit is None else [bound for bound in (limit.lower, limit.upper) if math.isfinite(bound)]
 
 
 def _breaks(limit: Limit | None, value: float) -> bool:
-    lower, upper = _bounds(limit)
-    tolerance = 0.0 if limit is None else max(limit.tolerance, 1e-6)
-    return not lower - tolerance <= value <= upper + tolerance
+    if limit is None:
+        return False
+    tolerance = max(limit.tolerance, 1e-6)
+    return not limit.lower - tolerance <= value <= limit.upper + tolerance

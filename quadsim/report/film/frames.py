@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
@@ -60,12 +60,7 @@ class Shot:
     @property
     def times(self) -> Array:
         """(count,) simulated times of the frames [s]."""
-        frames: Array = np.arange(self.first, self.first + self.count, dtype=float)
-        return self.start + self.speed / self.fps * frames
-
-    def to_json(self) -> dict[str, Any]:
-        """Plain values, which make the same shot again."""
-        return asdict(self)
+        return self.start + self.speed / self.fps * np.arange(self.first, self.first + self.count, dtype=float)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -186,13 +181,8 @@ def _row_before(t: Array, times: Array) -> np.ndarray[Any, np.dtype[np.intp]]:
 
 
 def _track(run: Run, limit: Limit, times: Array) -> MarginTrack:
-    signal = limit.source
-    if signal.plant is None:
-        t, values = run.log.control.t, signal.sampled(run.log.control)
-    else:
-        t, values = run.log.plant.t, signal.plant(run.log.plant)
-    inside = (t >= limit.start - 1e-9) & (t <= limit.stop + 1e-9)
-    margin = np.where(inside, limit.margin(values), np.nan)
+    t, values = limit.source.finest(run.log)
+    margin = np.where(limit.holds_at(t), limit.margin(values), np.nan)
     row, worst = _row_before(t, times), np.fmin.accumulate(margin)
     share = (float(worst[-1]) + limit.tolerance) / limit.half_band
     return MarginTrack(limit=limit, now=margin[row], worst=worst[row], share=np.inf if np.isnan(share) else share)

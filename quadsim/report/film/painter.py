@@ -30,12 +30,7 @@ _SHADE: Final = (np.arange(256) * 0.24 + 12.0).astype(np.uint8)
 
 
 class Painter:
-    """Draws on one picture; lengths are design pixels, scaled to the picture's real size.
-
-    Args:
-        image: what to draw on.
-        scale: real pixels per design pixel.
-    """
+    """Draws on one picture; lengths are design pixels, of `scale` real ones each."""
 
     def __init__(self, image: Image.Image, scale: float) -> None:
         self._canvas, self._scale = ImageDraw.Draw(image), scale

@@ -98,7 +98,7 @@ class Stage:
         # Aimed a little low, so that the vehicle stands above the captions.
         self._camera.lookat = shown.aim[i] - (0.0, 0.0, 0.55 * self._arm)
         self._renderer.update_scene(self._data, self._camera)
-        self._draw_course()
+        self._draw_path(shown.course, 0.018, _COURSE_COLOUR)
         self._draw_trail(i)
         self._draw_horizon(i)
         self._draw_thrusts(i)
@@ -118,10 +118,9 @@ class Stage:
         geom.emission = 0.5
         scene.ngeom += 1
 
-    def _draw_course(self) -> None:
-        course = self._footage.course
-        for start, stop in itertools.pairwise(course):
-            self._connect(mujoco.mjtGeom.mjGEOM_CAPSULE, 0.018 * self._arm, start, stop, _COURSE_COLOUR)
+    def _draw_path(self, points: Array, width: float, colour: tuple[float, float, float, float]) -> None:
+        for start, stop in itertools.pairwise(points):
+            self._connect(mujoco.mjtGeom.mjGEOM_CAPSULE, width * self._arm, start, stop, colour)
 
     def _draw_trail(self, i: int) -> None:
         now, times = self._footage.times[i], self._footage.path_times
@@ -138,9 +137,7 @@ class Stage:
         if self._run.log.predicted is None or self._run.log.control.phase[k] != Phase.FLYING:
             return
         predicted = self._run.log.predicted[k].astype(float)
-        predicted = predicted[thin(predicted, 0.02 * self._arm)]
-        for start, stop in itertools.pairwise(predicted):
-            self._connect(mujoco.mjtGeom.mjGEOM_CAPSULE, 0.028 * self._arm, start, stop, _HORIZON_COLOUR)
+        self._draw_path(predicted[thin(predicted, 0.02 * self._arm)], 0.028, _HORIZON_COLOUR)
 
     def _draw_thrusts(self, i: int) -> None:
         hover = self._run.vehicle.hover_speed
@@ -224,17 +221,15 @@ def probe() -> None:
     )
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
-    renderer = mujoco.Renderer(model, 32, 32)
-    renderer.update_scene(data)
-    picture = renderer.render()
-    renderer.close()
-    if not picture.any():
-        raise RuntimeError("the picture is black")
+    with mujoco.Renderer(model, 32, 32) as renderer:
+        renderer.update_scene(data)
+        if not renderer.render().any():
+            raise RuntimeError("the picture is black")
 
 
 def _ffmpeg(*arguments: str) -> None:
-    command = [imageio_ffmpeg.get_ffmpeg_exe(), "-y", "-loglevel", "error", *arguments]
-    subprocess.run(command, check=True, stdin=subprocess.DEVNULL)
+    start = (imageio_ffmpeg.get_ffmpeg_exe(), "-y", "-loglevel", "error")
+    subprocess.run([*start, *arguments], check=True, stdin=subprocess.DEVNULL)
 
 
 def main(arguments: list[str]) -> None:
@@ -243,8 +238,7 @@ def main(arguments: list[str]) -> None:
         case ["probe"]:
             probe()
         case ["film", shot, path]:
-            fields: dict[str, Any] = json.loads(shot)
-            film(Shot(**fields), Path(path))
+            film(Shot(**json.loads(shot)), Path(path))
         case ["join", segments, path]:
             join(Path(segments), Path(path))
         case ["gif", source, path, width]:

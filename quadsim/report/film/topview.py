@@ -17,14 +17,9 @@ _LONGEST_ARROW: Final = 34.0
 
 
 class TopView:
-    """A map of the course seen from above, with the height beside it.
+    """A map of the course seen from above, width by height [design pixels], with the flight's height beside it.
 
-    Args:
-        run: the flight.
-        footage: its frames.
-        width: of the map [design pixels].
-        height: of the map [design pixels].
-        acting: whether to show the wind as an arrow towards the vehicle, and the external force as one away from it.
+    Where `acting`, it shows the wind as an arrow towards the vehicle, and the external force as one away from it.
     """
 
     def __init__(self, run: Run, footage: Footage, width: float, height: float, *, acting: bool) -> None:

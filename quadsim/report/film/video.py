@@ -15,12 +15,13 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import IO, Final
 
+from quadsim.assets import own_packages
 from quadsim.errors import OutputError, ParameterError, RenderingUnavailableError
-from quadsim.flight.rundir import Run, load_run, vehicle_to_json
+from quadsim.flight.rundir import Run, load_run
 from quadsim.outputs import writing_file
 from quadsim.report.film.frames import Shot, film_span
 from quadsim.vehicle import Vehicle
@@ -137,21 +138,9 @@ def render_gif(
 
 
 def render_portrait(vehicle: Vehicle, path: Path, *, width: int = 1280, height: int = 720) -> None:
-    """Draw a vehicle standing on a floor of 10 cm squares, as a PNG that appears at `path` complete or not at all.
-
-    Args:
-        vehicle: what is drawn.
-        path: the PNG to write; an earlier one is replaced, if it is as we wrote it.
-        width: [pixels].
-        height: [pixels].
-
-    Raises:
-        OutputError: the picture cannot be written, or the renderer failed; nothing is left behind.
-        RenderingUnavailableError: this machine cannot render.
-    """
+    """Draw a vehicle standing on a floor of 10 cm squares, as a PNG of so many pixels; errors as `render_video`."""
     with _making(path, ".png") as new:
-        numbers = json.dumps(vehicle_to_json(vehicle))
-        task = ("portrait", numbers, str(new), str(width), str(height))
+        task = ("portrait", json.dumps(asdict(vehicle)), str(new), str(width), str(height))
         _work([task], rendering_backend(), new.parent)
 
 
@@ -170,9 +159,7 @@ def _film(shot: Shot, path: Path, workers: int | None, progress: Progress | None
     edges = [shot.count * piece // pieces for piece in range(pieces + 1)]
     shots = [replace(shot, first=a, count=b - a) for a, b in itertools.pairwise(edges)]
     names = [f"piece{piece}.mp4" for piece in range(pieces)]
-    tasks = [
-        ("film", json.dumps(part.to_json()), str(path.parent / name)) for part, name in zip(shots, names, strict=True)
-    ]
+    tasks = [("film", json.dumps(asdict(s)), str(path.parent / name)) for s, name in zip(shots, names, strict=True)]
     _work(tasks, backend, path.parent, None if progress is None else lambda done: progress(done, shot.count))
     listing = path.parent / "pieces.txt"
     listing.write_text("".join(f"file '{name}'\n" for name in names), encoding="utf-8")
@@ -194,9 +181,10 @@ def _making(path: Path, form: str) -> Iterator[Path]:
         raise OutputError(path, f"the renderer failed: {failure}") from failure
 
 
-def _environment(backend: str) -> dict[str, str]:
-    packages = os.pathsep.join(filter(None, (str(Path(__file__).resolve().parents[3]), os.environ.get("PYTHONPATH"))))
-    return {**os.environ, "MUJOCO_GL": backend, "PYOPENGL_PLATFORM": backend, "PYTHONPATH": packages}
+def _environment(backend: str, workers: int = 1) -> dict[str, str]:
+    # Side by side each worker keeps a core busy: threads of Mesa's software renderer would but take turns with them.
+    threads = {"LP_NUM_THREADS": "0"} if workers > 1 else {}
+    return {**threads, **os.environ, **own_packages(), "MUJOCO_GL": backend, "PYOPENGL_PLATFORM": backend}
 
 
 def _work(
@@ -204,23 +192,17 @@ def _work(
 ) -> None:
     """Run worker tasks side by side; when one fails, or anything is raised here, the others are killed.
 
-    Args:
-        tasks: arguments of each worker.
-        backend: OpenGL back end.
-        folder: where the workers' stderr goes.
-        report: called with the sum of the last numbers that the workers printed.
-
-    Raises:
-        _WorkerFailure: a worker failed.
+    Their stderr goes to `folder`; `report` is called with the sum of the last numbers that they printed.
     """
     with contextlib.ExitStack() as stack:
         watched = stack.enter_context(selectors.DefaultSelector())
         logs: list[IO[bytes]] = []
         done = [0] * len(tasks)
+        environment = _environment(backend, len(tasks))
         for i, task in enumerate(tasks):
             logs.append(stack.enter_context((folder / f"worker{i}.log").open("w+b")))
             process = stack.enter_context(
-                subprocess.Popen([*_WORKER, *task], env=_environment(backend), stdout=subprocess.PIPE, stderr=logs[i])
+                subprocess.Popen([*_WORKER, *task], env=environment, stdout=subprocess.PIPE, stderr=logs[i])
             )
             stack.callback(process.kill)  # runs before Popen's own exit, which waits; kills none that has ended
             assert process.stdout is not None
@@ -237,15 +219,10 @@ def _work(
                 watched.unregister(process.stdout)
                 if process.wait() != 0:
                     logs[i].seek(0)
-                    raise _WorkerFailure(_why(logs[i].read(), folder))
+                    full = shutil.disk_usage(folder).free < _LEAST_FREE_BYTES  # it could not even write that down
+                    raise _WorkerFailure("the disk is full" if full else _last_line(logs[i].read()))
 
 
 def _last_line(text: bytes) -> str:
     lines = text.decode(errors="replace").strip().splitlines()
     return lines[-1].strip() if lines else "it ended without a word"
-
-
-def _why(output: bytes, folder: Path) -> str:
-    """Why a worker failed; on a full disk it could not even write that down."""
-    full = shutil.disk_usage(folder).free < _LEAST_FREE_BYTES
-    return "the disk is full" if full else _last_line(output)

@@ -8,7 +8,7 @@ import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 from urllib.parse import quote
 
 from quadsim.errors import OutputError, ParameterError
@@ -16,15 +16,14 @@ from quadsim.flight.parquet import FLIGHT_FILE, HORIZON_FILE, PLANT_FILE, TIMING
 from quadsim.flight.rundir import FIGURES_DIR, RECORDING_FILE, SCENARIO_FILE, SUMMARY_FILE, VIDEO_FILE, Run
 from quadsim.outputs import write_text, writing
 from quadsim.outputs.paths import require_inside
-from quadsim.report.comparison import comparison_rows, outcome, required, run_names
+from quadsim.report.comparison import comparison_rows, outcome, required, run_names, verdict_cell
 from quadsim.report.figures.flight_figures import comparison_figure
-from quadsim.report.flight_conditions import verdict_cell
 from quadsim.report.narrative import comparison_sentences
 from quadsim.report.pages.page import PAGE_FILE, render_page
 from quadsim.report.palette import line_colour
 from quadsim.report.plots.flight_plots import comparison_plots
 from quadsim.report.plots.panels import Plot, plotly_script
-from quadsim.report.table import Cell, Grid, to_markdown
+from quadsim.report.table import Grid, to_markdown
 
 TABLE_FILE: Final = "comparison.md"
 
@@ -40,23 +39,6 @@ _FILES: Final = {
     HORIZON_FILE: "predictions (Parquet)",
 }
 """What is copied of a run directory beside its video and figures, and how links name it."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class _RunView:
-    """The template's context of one run; `video` and the targets of `files` are relative URLs."""
-
-    name: str
-    colour: str
-    directory: Path
-    description: str
-    outcome: Cell
-    required: Cell
-    verdict: Cell
-    vehicle: str
-    made_with: str
-    video: str | None
-    files: tuple[tuple[str, str], ...]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -133,8 +115,8 @@ def _folder_names(names: Sequence[str]) -> list[str]:
     return folders
 
 
-def _place(run: Run, name: str, folder: str, colour: str, page_directory: Path) -> _RunView:
-    """Copy what a run has to offer beside the page, and say where it is."""
+def _place(run: Run, name: str, folder: str, colour: str, page_directory: Path) -> dict[str, Any]:
+    """Copy what a run has to offer beside the page; the template's context of the run, with relative URLs."""
     place = page_directory / folder
     place.mkdir()
     files = []
@@ -150,19 +132,19 @@ def _place(run: Run, name: str, folder: str, colour: str, page_directory: Path) 
     if (run.directory / VIDEO_FILE).is_file():
         video = f"{folder}.mp4"
         shutil.copyfile(run.directory / VIDEO_FILE, page_directory / video)
-    return _RunView(
-        name=name,
-        colour=colour,
-        directory=run.directory,
-        description=run.summary.get("description", ""),
-        outcome=outcome(run.summary),
-        required=required(run.summary),
-        verdict=verdict_cell(run.summary),
-        vehicle=f"Vehicle: {run.vehicle.description or run.vehicle.name}, {run.vehicle.mass:g} kg",
-        made_with=_made_with(run),
-        video=None if video is None else quote(video),
-        files=tuple(files),
-    )
+    return {
+        "name": name,
+        "colour": colour,
+        "directory": run.directory,
+        "description": run.summary.get("description", ""),
+        "outcome": outcome(run.summary),
+        "required": required(run.summary),
+        "verdict": verdict_cell(run.summary),
+        "vehicle": f"Vehicle: {run.vehicle.description or run.vehicle.name}, {run.vehicle.mass:g} kg",
+        "made_with": _made_with(run),
+        "video": None if video is None else quote(video),
+        "files": files,
+    }
 
 
 def _made_with(run: Run) -> str:

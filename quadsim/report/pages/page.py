@@ -13,12 +13,9 @@ _TEMPLATES: Final = Path(__file__).resolve().parent.parent / "templates"
 
 
 def render_page(template: str, kind: str, **context: Any) -> str:
-    """A page from its template; whatever the context holds is printable text, unless the template says otherwise.
+    """A page of a kind, e.g. `comparison`, from its template in `quadsim/report/templates` and the variables of that.
 
-    Args:
-        template: its file in `quadsim/report/templates`.
-        kind: what the page is, e.g. `comparison`.
-        context: the template's variables.
+    Whatever these hold is printable text, unless the template says otherwise.
     """
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
 

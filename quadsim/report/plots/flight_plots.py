@@ -11,7 +11,7 @@ import numpy as np
 from quadsim.flight.audit import SIGNALS
 from quadsim.flight.rundir import Run
 from quadsim.report.comparison import distinct_courses, run_names
-from quadsim.report.curves import break_at_wraps
+from quadsim.report.curves import bounds_of, break_at_wraps, reference_curve
 from quadsim.report.palette import REFERENCE, line_colour
 from quadsim.report.plots.panels import (
     BOTTOM,
@@ -30,6 +30,8 @@ from quadsim.vehicle import N_ROTORS
 if TYPE_CHECKING:
     from plotly.graph_objects import Figure
 
+_Named = tuple[int, str]
+"""Number and name of a run, which set its colour and toggle."""
 _MOST_POINTS: Final = 3000
 _POINTS_OF_ALL_RUNS: Final = 12_000
 """Points that one quantity may have over all runs: keeps a page of two runs near 6 MB, and of ten below 8 MB."""
@@ -37,20 +39,15 @@ _POINTS_OF_ALL_RUNS: Final = 12_000
 
 def comparison_plots(runs: Sequence[Run]) -> list[Plot]:
     """All plots of the page, for the runs that flew at least one control period; none without such a run."""
-    flown = [(i, name, run) for i, (name, run) in enumerate(zip(run_names(runs), runs, strict=True))]
-    flown = [(i, name, run) for i, name, run in flown if run.log.control.t.size]
+    named = enumerate(zip(run_names(runs), runs, strict=True))
+    flown = [(i, name, run) for i, (name, run) in named if run.log.control.t.size]
     return list(_Plotter(flown).plots()) if flown else []
 
 
 def thin(values: Array, points: int) -> np.ndarray[Any, np.dtype[np.intp]]:
-    """Indices of at most about `points` values: the lowest and highest of each segment, so that no peak is lost.
+    """Rising indices of about `points` of the values (K,): the lowest and highest of each segment, so no peak is lost.
 
-    Args:
-        values: (K,); what is not finite is a gap.
-        points: how many to keep; all are kept where K is no larger.
-
-    Returns:
-        Rising indices, the first, the last, and all gaps included.
+    The first, the last, and all gaps, where a value is not finite, are kept.
     """
     if values.size <= points:
         return np.arange(values.size)
@@ -70,17 +67,14 @@ class _Plotter:
     def __init__(self, runs: Sequence[tuple[int, str, Run]]) -> None:
         self._runs = runs
         self._courses = distinct_courses([run for _, _, run in runs])
-        self._end = max(float(run.log.plant.t[-1]) for _, _, run in runs)
+        self._end = max(run.end for _, _, run in runs)
         self._points = min(_MOST_POINTS, max(200, _POINTS_OF_ALL_RUNS // len(runs)))
 
     def plots(self) -> Iterator[Plot]:
-        rotors = range(1, N_ROTORS + 1)
         yield self._states("course", "Course and heading", ("x", "y", "z", "yaw"))
         yield self._states("attitude", "Roll and pitch", ("roll", "pitch"))
-        yield self._inputs("speeds", "Rotor speeds", "speed", [f"rotor {i} [rad/s]" for i in rotors])
-        yield self._inputs(
-            "slews", "Steps of the rotor speeds, per period", "slew", [f"rotor {i} [rad/s]" for i in rotors]
-        )
+        yield self._inputs("speeds", "Rotor speeds", "speed")
+        yield self._inputs("slews", "Steps of the rotor speeds, per period", "slew")
         yield self._times()
         yield self._path()
 
@@ -92,17 +86,17 @@ class _Plotter:
             self._references(figure, panel, name)
             for i, label, run in self._runs:
                 drawn = break_at_wraps(run.log.plant.t, signal(run.log.plant), SIGNALS[name].unit)
-                self._line(figure, panel, i, label, *drawn)
+                self._line(figure, panel, (i, label), *drawn)
             self._bounds(figure, panel, name)
             keep_least_span(figure, panel, SIGNALS[name].unit)
         return self._timed(figure, key, title)
 
-    def _inputs(self, key: str, title: str, name: str, labels: Sequence[str]) -> Plot:
-        figure = panels(labels)
+    def _inputs(self, key: str, title: str, name: str) -> Plot:
+        figure = panels([f"rotor {i} [rad/s]" for i in range(1, N_ROTORS + 1)])
         for panel in range(N_ROTORS):
             for i, label, run in self._runs:
                 values = SIGNALS[name].sampled(run.log.control)[:, panel]
-                self._line(figure, panel, i, label, run.log.control.t, values, shape="hv")
+                self._line(figure, panel, (i, label), run.log.control.t, values, shape="hv")
             self._bounds(figure, panel, name)
             keep_least_span(figure, panel, SIGNALS[name].unit)
         return self._timed(figure, key, title)
@@ -114,9 +108,9 @@ class _Plotter:
             timing, control = run.log.timing, run.log.control
             for panel, values in enumerate((timing.step_ms, timing.solve_ms)):
                 read = np.where(values > 0.0, values, np.nan)  # a clock may read 0, which has no logarithm
-                self._line(figure, panel, i, label, timing.t, read, mode="markers")
+                self._line(figure, panel, (i, label), timing.t, read, mode="markers")
             for panel, counts in enumerate((control.iterations, control.active), start=2):
-                self._line(figure, panel, i, label, control.t, counts.astype(float), shape="hv")
+                self._line(figure, panel, (i, label), control.t, counts.astype(float), shape="hv")
         for panel in (0, 1):
             figure.update_yaxes(type="log", dtick=1, **place(panel))
         for deadline in {float(run.summary["controller"]["deadline_ms"]) for _, _, run in self._runs}:
@@ -143,54 +137,29 @@ class _Plotter:
         return finished(figure, "path", "Path in space", height=560, timed=False)
 
     def _line(
-        self,
-        figure: Figure,
-        panel: int,
-        i: int,
-        label: str,
-        t: Array,
-        values: Array,
-        *,
-        shape: str = "linear",
-        mode: str = "lines",
+        self, figure: Figure, panel: int, who: _Named, t: Array, values: Array, shape: str = "linear", **own: Any
     ) -> None:
+        colour = line_colour(who[0])
+        line, marker = {"color": colour, "width": 1.6, "shape": shape}, {"color": colour, "size": 3.5}
+        self._curve(figure, panel, t, values, **{"line": line, "marker": marker, **_identity(*who), **own})
+
+    def _curve(self, figure: Figure, panel: int, t: Array, values: Array, mode: str = "lines", **style: Any) -> None:
         from plotly.graph_objects import Scatter
 
         kept = thin(values, self._points)
-        figure.add_trace(
-            Scatter(
-                x=t[kept].astype(np.float32),
-                y=values[kept].astype(np.float32),
-                mode=mode,
-                line={"color": line_colour(i), "width": 1.6, "shape": shape},
-                marker={"color": line_colour(i), "size": 3.5},
-                **_identity(i, label),
-            ),
-            **place(panel),
-        )
+        x, y = t[kept].astype(np.float32), values[kept].astype(np.float32)
+        figure.add_trace(Scatter(x=x, y=y, mode=mode, **style), **place(panel))
 
     def _references(self, figure: Figure, panel: int, name: str) -> None:
         """Each distinct filtered reference of a quantity that has one."""
-        from plotly.graph_objects import Scatter
-
+        line = {"color": REFERENCE, "width": 1.6, "dash": "dash"}
         for run in self._courses if name in REFERENCE_NAMES else ():
-            values = run.log.control.reference[:, REFERENCE_NAMES.index(name)]
-            values = np.degrees(values) if SIGNALS[name].unit == "deg" else values
-            kept = thin(values, self._points)
-            x, y = run.log.control.t[kept].astype(np.float32), values[kept].astype(np.float32)
-            line = {"color": REFERENCE, "width": 1.6, "dash": "dash"}
-            figure.add_trace(Scatter(x=x, y=y, mode="lines", line=line, name="reference"), **place(panel))
+            values = reference_curve(run.log.control, name)
+            self._curve(figure, panel, run.log.control.t, values, line=line, name="reference")
 
     def _bounds(self, figure: Figure, panel: int, signal: str) -> None:
-        """Each distinct bound on a signal, once, over the times it holds for."""
-        bounds = {
-            (bound, limit.start, min(limit.stop, self._end)): None
-            for _, _, run in self._runs
-            for limit in run.limits
-            for bound in (limit.lower, limit.upper)
-            if limit.signal == signal and limit.start < self._end and np.isfinite(bound)
-        }
-        for bound, start, stop in bounds:
+        limits = [limit for _, _, run in self._runs for limit in run.limits]
+        for bound, start, stop in bounds_of(limits, signal, self._end):
             draw_bound(figure, panel, bound, start, stop)
 
     def _timed(self, figure: Figure, key: str, title: str) -> Plot:

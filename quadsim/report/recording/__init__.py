@@ -28,6 +28,7 @@ from typing import Final
 
 import numpy as np
 
+from quadsim.assets import own_packages
 from quadsim.errors import FileError, OutputError, ViewerUnavailableError
 from quadsim.flight.rundir import RECORDING_FILE, Run
 from quadsim.outputs import write_new
@@ -38,24 +39,15 @@ from quadsim.report.recording.style import on_screen
 from quadsim.report.recording.texts import send_texts
 from quadsim.report.recording.world import send_airframe, send_scene
 
-_VIEWER: Final = (
-    sys.executable,
-    "-c",
-    "import sys; from rerun_cli.__main__ import main; sys.exit(main())",
-    "--bind=127.0.0.1",
-    "--port=auto",
-)
+_CALL: Final = "import sys; from rerun_cli.__main__ import main; sys.exit(main())"
+_VIEWER: Final = (sys.executable, "-c", _CALL, "--bind=127.0.0.1", "--port=auto")
 """Starts a viewer of its own, which only this machine can reach."""
 _INTERRUPTED: Final = 130
 """The viewer's exit status after Ctrl-C."""
 
 
 def write_recording(run: Run, path: Path) -> None:
-    """Write a run as a rerun recording with its layout inside; the file appears complete or not at all.
-
-    Args:
-        run: a run, completed or aborted, of any length.
-        path: the `.rrd` to write; there must be none.
+    """Write a run, completed or not, as a new `.rrd` with its layout inside; it appears complete or not at all.
 
     Raises:
         OutputError: the file cannot be written or is there already, or the environment switches rerun off.
@@ -110,12 +102,11 @@ def recording_in_background(directory: Path) -> Iterator[None]:
     Raises:
         OutputError: the file cannot be written, as from `write_recording`.
     """
-    packages = os.pathsep.join(filter(None, (str(Path(__file__).resolve().parents[3]), os.environ.get("PYTHONPATH"))))
     with subprocess.Popen(
         [sys.executable, "-m", "quadsim.report.recording", str(directory)],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
-        env={**os.environ, "PYTHONPATH": packages},
+        env={**os.environ, **own_packages()},
         process_group=0,
     ) as process:
         try:
@@ -138,11 +129,9 @@ def viewer_problem() -> str | None:
 
 
 def open_viewer(path: Path, *, web: bool = False) -> None:
-    """Show a recording; returns when the viewer is closed or Ctrl-C is pressed.
+    """Show a recording in rerun's own window, or serve it, to this machine alone, for a browser.
 
-    Args:
-        path: an `.rrd` file.
-        web: whether to serve it, to this machine alone, for a browser; else rerun's own window shows it.
+    Returns when the viewer is closed or Ctrl-C is pressed.
 
     Raises:
         FileError: there is no such file.

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING
 
@@ -10,7 +9,7 @@ import numpy as np
 
 from quadsim.flight.audit import SIGNALS, Limit
 from quadsim.flight.rundir import Run
-from quadsim.report.curves import commanded_speeds, effect_curves, least_range
+from quadsim.report.curves import commanded_speeds, effect_curves, least_range, reference_curve
 from quadsim.report.recording.style import FRONT_PANELS, PANELS, TIMELINE
 from quadsim.state import POSITION, REFERENCE_NAMES, Array
 
@@ -22,7 +21,7 @@ def blueprint(run: Run) -> rrb.Blueprint:
     """Course, vehicle and summary on the left, plots on the right; nothing is left to be clicked or unfolded."""
     import rerun.blueprint as rrb
 
-    end, limits = float(run.log.plant.t[-1]), run.limits
+    end, limits = run.end, run.limits
     plots = [
         _plot(title, _contents(names, limits), end, ends=_least_range(run, names)) for title, names in PANELS.items()
     ]
@@ -112,13 +111,10 @@ def _contents(names: Sequence[str], limits: Iterable[Limit]) -> list[str]:
 
 def _least_range(run: Run, names: Sequence[str]) -> tuple[float, float] | None:
     """Ends of the axis of signals that stand still, with their references and bounds; see `quadsim.report.curves`."""
-    control, unit = run.log.control, SIGNALS[names[0]].unit
-    scale = math.degrees(1.0) if unit == "deg" else 1.0
-    signals = [SIGNALS[name] for name in names]
-    curves = [entry.plant(run.log.plant) if entry.plant else entry.sampled(control) for entry in signals]
-    curves += [scale * control.reference[:, REFERENCE_NAMES.index(name)] for name in names if name in REFERENCE_NAMES]
+    curves = [SIGNALS[name].finest(run.log)[1] for name in names]
+    curves += [reference_curve(run.log.control, name) for name in names if name in REFERENCE_NAMES]
     curves += [np.array([limit.lower, limit.upper]) for limit in run.limits if limit.signal in names]
-    return least_range(curves, unit)
+    return least_range(curves, SIGNALS[names[0]].unit)
 
 
 def _plot(

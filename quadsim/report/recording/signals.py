@@ -11,7 +11,7 @@ import numpy as np
 from quadsim.flight.audit import SIGNALS, Limit, margins_sampled
 from quadsim.flight.log import FlightLog
 from quadsim.flight.rundir import Run
-from quadsim.report.curves import break_at_wraps, commanded_speeds, effect_curves
+from quadsim.report.curves import break_at_wraps, commanded_speeds, effect_curves, reference_curve
 from quadsim.report.recording.style import BOUND, PANELS, REFERENCE, SERIES, VERDICTS, Colour, time_column
 from quadsim.state import REFERENCE_NAMES, Array
 from quadsim.vehicle import N_ROTORS
@@ -28,20 +28,16 @@ def send_signals(recording: rr.RecordingStream, log: FlightLog) -> None:
     for names in PANELS.values():
         for colour, name in zip(SERIES, names, strict=False):
             signal = SIGNALS[name]
-            if signal.plant is None:
-                t, values = log.control.t, signal.sampled(log.control)
-            else:
-                t, values = log.plant.t, signal.plant(log.plant)
+            t, values = signal.finest(log)
             if values.ndim == 1:
                 t, values = break_at_wraps(t, values, signal.unit)
                 _send_curves(recording, f"signals/{name}", t, values, {f"{name} [{signal.unit}]": colour})
             else:
                 rotors = {f"rotor {i} [{signal.unit}]": shade for i, shade in enumerate(SERIES, start=1)}
                 _send_curves(recording, f"signals/{name}", t, values, rotors, stepped=True)
-    for name, values in zip(REFERENCE_NAMES, log.control.reference.T, strict=True):
-        unit = SIGNALS[name].unit
-        shown = np.degrees(values) if unit == "deg" else values
-        _send_curves(recording, f"reference/{name}", log.control.t, shown, {f"{name} ref [{unit}]": REFERENCE})
+    for name in REFERENCE_NAMES:
+        values, label = reference_curve(log.control, name), f"{name} ref [{SIGNALS[name].unit}]"
+        _send_curves(recording, f"reference/{name}", log.control.t, values, {label: REFERENCE})
 
 
 def send_limit(recording: rr.RecordingStream, limit: Limit, log: FlightLog, colour: Colour) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -10,10 +10,10 @@ import numpy as np
 from quadsim.controller import ACCEPTED, Phase
 from quadsim.flight.metrics import unrecovered
 from quadsim.flight.rundir import Run
-from quadsim.report.comparison import tracking_values
-from quadsim.report.flight_conditions import fallback_sentence
+from quadsim.report.comparison import fallback_sentence, tracking_values
 from quadsim.report.narrative import condition_sentences
 from quadsim.report.recording.style import time_column
+from quadsim.state import Array
 
 if TYPE_CHECKING:
     import rerun as rr
@@ -23,20 +23,15 @@ def send_texts(recording: rr.RecordingStream, run: Run) -> None:
     """The summary, and what happened when: changes of the solver's status, and the end."""
     import rerun as rr
 
-    log, end = run.log.control, float(run.log.plant.t[-1])
-    answers = list(zip(log.status, log.fallback.tolist(), strict=True))
+    log = run.log.control
+    good = ACCEPTED | {Phase.LANDED}
     events = [
-        (
-            float(t),
-            f"{status}, fallback {fallback}",
-            "INFO" if status in ACCEPTED | {Phase.LANDED} and not fallback else "WARN",
-        )
-        for t, before, (status, fallback) in zip(log.t, [None, *answers], answers, strict=False)
-        if (status, fallback) != before
+        (t, f"{status}, fallback {fallback}", "INFO" if status in good and not fallback else "WARN")
+        for t, (status, fallback) in _changes(log.t, list(zip(log.status, log.fallback.tolist(), strict=True)))
     ]
     events += _phase_changes(run)
     events += _failures(run)
-    events.append((end, _outcome(run), "INFO" if run.log.reason is None else "ERROR"))
+    events.append((run.end, _outcome(run), "INFO" if run.log.reason is None else "ERROR"))
     times, texts, levels = zip(*sorted(events, key=lambda event: event[0]), strict=True)
     recording.log("summary", rr.TextDocument(_summary(run), media_type=rr.MediaType.MARKDOWN), static=True)
     recording.send_columns("events", [time_column(np.array(times))], rr.TextLog.columns(text=texts, level=levels))
@@ -48,10 +43,15 @@ def _phase_changes(run: Run) -> list[tuple[float, str, str]]:
     if all(phase == Phase.FLYING for phase in control.phase):
         return []
     return [
-        (float(t), f"phase: {phase}", "WARN" if phase == Phase.CRASHED else "INFO")
-        for t, before, phase in zip(control.t, [None, *control.phase], control.phase, strict=False)
-        if phase != before
+        (t, f"phase: {phase}", "WARN" if phase == Phase.CRASHED else "INFO")
+        for t, phase in _changes(control.t, control.phase)
     ]
+
+
+def _changes(t: Array, values: Sequence[Any]) -> list[tuple[float, Any]]:
+    """The first value and those that differ from the one before, each with its time [s]."""
+    pairs = zip(t.tolist(), [None, *values], values, strict=False)
+    return [(time, value) for time, before, value in pairs if value != before]
 
 
 def _failures(run: Run) -> list[tuple[float, str, str]]:

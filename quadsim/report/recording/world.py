@@ -9,22 +9,8 @@ import numpy as np
 
 from quadsim.controller import Phase
 from quadsim.flight.rundir import Run
-from quadsim.report.recording.style import (
-    AXES,
-    CARBON,
-    FLOWN,
-    FORCE,
-    FORWARD,
-    METAL,
-    PREDICTED,
-    REFERENCE,
-    SERIES,
-    SHELL,
-    WHOLE_PATH,
-    WIND,
-    Colour,
-    time_column,
-)
+from quadsim.report.recording import style
+from quadsim.report.recording.style import Colour, time_column
 from quadsim.state import EULER, POSITION, Array, euler_to_quaternion
 from quadsim.vehicle import N_ROTORS, Vehicle
 
@@ -43,47 +29,42 @@ def send_airframe(recording: rr.RecordingStream, vehicle: Vehicle) -> None:
     """The vehicle from primitives, in its body frame; what points forward is orange, rotors look as in the plots."""
     import rerun as rr
 
-    unit, rotors, azimuths = (
-        vehicle.arm_length / _DRAWN_ARM,
-        vehicle.rotor_positions,
-        np.radians(vehicle.rotor_azimuths),
-    )
+    unit, rotors, azimuths = _unit(vehicle), vehicle.rotor_positions, np.radians(vehicle.rotor_azimuths)
     up = np.array([0.0, 0.0, unit])
     gaps = np.linalg.norm(rotors[:, None] - rotors[None], axis=2)[~np.eye(N_ROTORS, dtype=bool)]
+    arm = [vehicle.arm_length / 2, 0.011 * unit, 0.011 * unit]
     parts: dict[str, rr.AsComponents] = {
         "arms": rr.Boxes3D(
             centers=rotors / 2,
-            half_sizes=np.tile([vehicle.arm_length / 2, 0.011 * unit, 0.011 * unit], (N_ROTORS, 1)),
+            half_sizes=np.tile(arm, (N_ROTORS, 1)),
             quaternions=_vector_first(euler_to_quaternion(azimuths[:, None] * [0.0, 0.0, 1.0])),
-            colors=[FORWARD if x > 0.1 * vehicle.arm_length else CARBON for x in rotors[:, 0]],
+            colors=[style.FORWARD if x > 0.1 * vehicle.arm_length else style.CARBON for x in rotors[:, 0]],
             fill_mode="solid",
         ),
         "hub": rr.Ellipsoids3D(
             centers=unit * np.array([[0.0, 0.0, 0.01], [0.065, 0.0, 0.0]]),
             half_sizes=unit * np.array([[0.065, 0.052, 0.034], [0.022, 0.022, 0.022]]),
-            colors=[SHELL, FORWARD],
+            colors=[style.SHELL, style.FORWARD],
             fill_mode="solid",
         ),
         "motors": rr.Cylinders3D(
             centers=rotors + 0.006 * up,
             lengths=[0.04 * unit] * N_ROTORS,
             radii=[0.023 * unit] * N_ROTORS,
-            colors=METAL,
+            colors=style.METAL,
             fill_mode="solid",
         ),
         "discs": rr.Cylinders3D(
             centers=rotors + 0.034 * up,
             lengths=[0.003 * unit] * N_ROTORS,
             radii=[min(0.125 * unit, 0.48 * float(gaps.min()))] * N_ROTORS,
-            colors=[(*colour[:3], 110) for colour in SERIES],
+            colors=[(*colour[:3], 110) for colour in style.SERIES],
             fill_mode="solid",
         ),
         "legs": rr.LineStrips3D(
-            [[0.45 * rotor, 0.6 * rotor - 0.12 * up] for rotor in rotors],
-            radii=0.007 * unit,
-            colors=CARBON,
+            [[0.45 * rotor, 0.6 * rotor - 0.12 * up] for rotor in rotors], radii=0.007 * unit, colors=style.CARBON
         ),
-        "thrust": rr.Arrows3D.from_fields(origins=rotors + 0.036 * up, radii=0.01 * unit, colors=list(SERIES)),
+        "thrust": rr.Arrows3D.from_fields(origins=rotors + 0.036 * up, radii=0.01 * unit, colors=list(style.SERIES)),
     }
     for name, part in parts.items():
         recording.log(f"world/vehicle/body/{name}", part, static=True)
@@ -97,12 +78,12 @@ def send_scene(recording: rr.RecordingStream, run: Run) -> None:
     position = plant.state[:, POSITION]
     thickness = min(0.02, 0.06 * run.vehicle.arm_length)
     axes = rr.Arrows3D(
-        origins=np.zeros((3, 3)), vectors=np.eye(3), radii=thickness, colors=AXES, labels=["x", "y", "z"]
+        origins=np.zeros((3, 3)), vectors=np.eye(3), radii=thickness, colors=style.AXES, labels=["x", "y", "z"]
     )
     recording.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
     recording.log("world/axes", axes, static=True)
-    _log_lines(recording, "world/reference", REFERENCE, 1.2, _dashes(control.reference[:, :3]))
-    _log_lines(recording, "world/path", WHOLE_PATH, 1.0, [position])
+    _log_lines(recording, "world/reference", style.REFERENCE, 1.2, _dashes(control.reference[:, :3]))
+    _log_lines(recording, "world/path", style.WHOLE_PATH, 1.0, [position])
 
     # The body turns below an entity that only moves: views that start there follow the vehicle without tilting.
     thrusts = np.zeros((plant.t.size, N_ROTORS, 3))
@@ -121,24 +102,29 @@ def send_scene(recording: rr.RecordingStream, run: Run) -> None:
         starts = np.searchsorted(plant.t, control.t - 1e-9)
         ends = np.append(starts[1:], plant.t.size - 1)
         pieces = [position[start : end + 1] for start, end in zip(starts, ends, strict=True)]
-        _log_lines(recording, "world/flown", FLOWN, 2.2)
+        _log_lines(recording, "world/flown", style.FLOWN, 2.2)
         recording.send_columns("world/flown", [time_column(plant.t[ends])], rr.LineStrips3D.columns(strips=pieces))
     if control.t.size and run.log.predicted is not None:
         horizons = np.concatenate([control.state[:, None, POSITION], run.log.predicted], axis=1)
         flying = np.array([phase == Phase.FLYING for phase in control.phase])
         # A prediction knows no ground: from there it would fall through it.
         shown = [horizon if aloft else horizon[:0] for horizon, aloft in zip(horizons, flying, strict=True)]
-        _log_lines(recording, "world/horizon", PREDICTED, 2.5)
+        _log_lines(recording, "world/horizon", style.PREDICTED, 2.5)
         recording.send_columns("world/horizon", [time_column(control.t)], rr.LineStrips3D.columns(strips=shown))
+
+
+def _unit(vehicle: Vehicle) -> float:
+    """The scale of the drawing."""
+    return vehicle.arm_length / _DRAWN_ARM
 
 
 def _send_force(recording: rr.RecordingStream, vehicle: Vehicle, t: Array, force: Array) -> None:
     """The external force (M, 3) [N] as an arrow in the world frame that moves with the vehicle."""
     import rerun as rr
 
-    entity, unit = "world/vehicle/external_force", vehicle.arm_length / _DRAWN_ARM
+    entity, unit = "world/vehicle/external_force", _unit(vehicle)
     above_the_discs = [0.0, 0.0, 0.08 * unit]
-    look = rr.Arrows3D.from_fields(origins=above_the_discs, radii=0.01 * unit, colors=FORCE)
+    look = rr.Arrows3D.from_fields(origins=above_the_discs, radii=0.01 * unit, colors=style.FORCE)
     scale = _FORCE_SCALE * vehicle.arm_length / (vehicle.mass * vehicle.gravity / N_ROTORS)
     recording.log(entity, look, static=True)
     recording.send_columns(entity, [time_column(t)], rr.Arrows3D.columns(vectors=scale * force))
@@ -148,8 +134,8 @@ def _send_wind(recording: rr.RecordingStream, vehicle: Vehicle, t: Array, wind: 
     """The wind (M, 3) [m/s] as an arrow in the world frame that meets the vehicle from upwind."""
     import rerun as rr
 
-    entity, unit = "world/vehicle/wind", vehicle.arm_length / _DRAWN_ARM
-    look = rr.Arrows3D.from_fields(radii=0.01 * unit, colors=WIND)
+    entity, unit = "world/vehicle/wind", _unit(vehicle)
+    look = rr.Arrows3D.from_fields(radii=0.01 * unit, colors=style.WIND)
     vectors = _WIND_LENGTH * vehicle.arm_length / float(np.linalg.norm(wind, axis=1).max()) * wind
     above_the_discs = np.array([0.0, 0.0, 0.08 * unit])
     recording.log(entity, look, static=True)
@@ -158,13 +144,17 @@ def _send_wind(recording: rr.RecordingStream, vehicle: Vehicle, t: Array, wind: 
 
 
 def _log_lines(
-    recording: rr.RecordingStream, entity: str, colour: Colour, width: float, strips: Sequence[Array] | None = None
+    recording: rr.RecordingStream,
+    entity: str,
+    colour: Colour,
+    width: float,
+    strips: Sequence[Array] | None = None,
 ) -> None:
     """Lines that stay, or the look alone of lines to come; `width` in points on the screen."""
     import rerun as rr
 
-    style = rr.LineStrips3D.from_fields(strips=strips, radii=rr.Radius.ui_points(width), colors=colour)
-    recording.log(entity, style, static=True)
+    look = rr.LineStrips3D.from_fields(strips=strips, radii=rr.Radius.ui_points(width), colors=colour)
+    recording.log(entity, look, static=True)
 
 
 def _dashes(points: Array) -> list[Array]:

@@ -110,13 +110,15 @@ class Effects:
         return spinning or dragged or lifted or self.disturbance is not None
 
 
-class Wind(Protocol):
-    """The air's motion along a flight; see `quadsim.sim.effects.wind.WindField`."""
+class Force(Protocol):
+    """A force of one's own on the vehicle: called once per physics step, at its begin.
 
-    def reset(self) -> None:
-        """Start again with the same wind."""
-        ...
+    What has memory may have a method `reset()`, called before a flight.
+    """
 
-    def advance(self, steps: int) -> Array:
-        """(steps, 3) wind velocity at the middle of each of the next physics steps, world frame [m/s]."""
+    def __call__(self, time: float, state: Array) -> Array:
+        """Force x, y, z in the world frame [N] and torque in the body frame [N m], (6,), at a time [s] and state (12,).
+
+        The yaw of the state is within +-pi.
+        """
         ...

@@ -7,15 +7,17 @@ of MuJoCo's step.  What follows from the rotors alone is worked out beforehand f
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Final
 
 import numpy as np
 
 from quadsim.sim.effects import Effects
-from quadsim.sim.effects.ground_effect import thrust_ratio
 from quadsim.state import Array
 from quadsim.vehicle import N_ROTORS, Vehicle
 
 Wrench = tuple[float, float, float, float, float, float]
+LOWEST_RATIO: Final = 0.5
+"""Lowest height of a rotor, in rotor radii, for which `thrust_ratio` is used: below, the thrust grows no further."""
 
 
 class StepForces:
@@ -28,21 +30,13 @@ class StepForces:
     - Gyroscopic and spin-up torque of rotors with inertia, -(d/dt + rates x) h z_b, with the angular momentum
       h = -sum_i spin_i J_r w_i of rotors that turn against their reaction torque.
     - Ground effect: what each rotor's thrust gains, by the height of its own disc; its torque gains nothing, as the
-      ratio is that of thrusts at the same power.  See `quadsim.sim.effects.ground_effect`.
+      ratio is that of thrusts at the same power.  See `thrust_ratio`.
 
-    The quadratic drag of the body is MuJoCo's own; see `quadsim.sim.airframe.build_spec`.
+    The quadratic drag of the body is MuJoCo's own; see `quadsim.sim.airframe.compile_model`.
     """
 
     def __init__(self, vehicle: Vehicle, effects: Effects, *, timestep: float, floor: float, disc: float) -> None:
-        """Set up.
-
-        Args:
-            vehicle: whose rotors they are.
-            effects: what acts on it.
-            timestep: physics step [s].
-            floor: height of the ground, world [m].
-            disc: height of the rotor discs, body frame [m].
-        """
+        """Set up, for a physics step [s] and heights of the ground, world [m], and of the discs, body frame [m]."""
         rotors, air, ground = effects.rotors, effects.air, effects.ground
         self._inertia = (rotors and rotors.inertia) or 0.0
         self._drag = (air and air.rotor_drag) or 0.0
@@ -143,3 +137,22 @@ class StepForces:
                 ty -= x * gain
             fx, fy, fz = fx + s * (xz + wy) * lift, fy + s * (yz - wx) * lift, fz + r22 * lift
         return fx, fy, fz, tx, ty, tz
+
+
+def thrust_ratio(height: float, radius: float) -> float:
+    """Thrust of a hovering rotor near the ground over its thrust far from it, at the same power.
+
+        T / T_inf = 1 / (1 - (R / (4 z))^2)
+
+    The ground acts as an image of the rotor below it, whose outflow slows the inflow: I. C. Cheeseman, W. E. Bennett,
+    "The Effect of the Ground on a Helicopter Rotor in Forward Flight", ARC R&M 3021, 1955.  Singular at z = R/4 and
+    good for z > R/2 alone (J. G. Leishman, "Principles of Helicopter Aerodynamics", Sec. 5.8): lower heights are taken
+    for z = R/2, where the ratio is 4/3.  Left out are forward speed, which weakens the effect, and what neighbouring
+    rotors add to it; the ratio is applied at equal rotor speeds, as simulators commonly do.
+
+    Args:
+        height: z, of the rotor above the ground [m]; may be negative in a crash.
+        radius: R, of the rotor [m]; positive.
+    """
+    image = 0.25 * radius / max(height, LOWEST_RATIO * radius)
+    return 1.0 / (1.0 - image * image)

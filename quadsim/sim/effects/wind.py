@@ -112,7 +112,9 @@ class WindField:
         self._means = np.array([mean, *(change.velocity for change in ordered)], float)
         self._change_times = np.array([change.at for change in ordered])
         self._gusts = gusts
-        self._along = _direction(self._means[0])
+        x, y, _ = self._means[0].tolist()
+        speed = math.hypot(x, y)
+        self._along = (x / speed, y / speed) if speed > 0.0 else (1.0, 0.0)
         self._timestep = timestep
         self._turbulence = None if turbulence is None else Turbulence(turbulence, timestep=timestep, rng=rng)
         self.reset()
@@ -140,10 +142,3 @@ class WindField:
             x, y = self._along  # spelt out, as a matrix product may round by the number of rows
             wind += np.stack([x * along - y * across, y * along + x * across, vertical], axis=1)
         return wind
-
-
-def _direction(mean: Array) -> tuple[float, float]:
-    """Horizontal unit vector (x, y) along a mean wind (3,); x where there is none."""
-    x, y, _ = mean.tolist()
-    speed = math.hypot(x, y)
-    return (x / speed, y / speed) if speed > 0.0 else (1.0, 0.0)

@@ -25,7 +25,6 @@ N_ERRORS: Final = 15
 MEAN_QUATERNION: Final = slice(6, 10)
 MEAN_RATES: Final = slice(10, 13)
 MEAN_GYRO_BIAS: Final = slice(13, 16)
-N_MEAN: Final = 16
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,7 +42,7 @@ class Estimate:
 
 def retract(mean: Array, error: Array) -> Array:
     """The mean (16,) moved by an error (15,); Solà 2017, Eq. (283)."""
-    moved = np.empty(N_MEAN)
+    moved = np.empty_like(mean)
     moved[:6] = mean[:6] + error[:6]
     w, x, y, z = mean[MEAN_QUATERNION].tolist()
     a, b, c = error[ATTITUDE].tolist()

@@ -62,12 +62,8 @@ class _Track:
     tallies: dict[SensorName, Tally] = field(default_factory=dict)
 
     def branch(self) -> _Track:
-        return _Track(
-            step=self.step,
-            estimate=self.estimate,
-            refused=dict(self.refused),
-            tallies={name: replace(tally) for name, tally in self.tallies.items()},
-        )
+        tallies = {name: replace(tally) for name, tally in self.tallies.items()}
+        return replace(self, refused=dict(self.refused), tallies=tallies)
 
 
 class ErrorStateFilter:
@@ -80,23 +76,17 @@ class ErrorStateFilter:
     def __init__(
         self, vehicle: Vehicle, sensors: Sequence[Sensor], settings: EstimatorSettings, *, timestep: float
     ) -> None:
-        """Set up, to be reset before use.
-
-        Args:
-            vehicle: the modelled vehicle.
-            sensors: the modelled sensors: their noise and the largest delay.
-            settings: its tuning.
-            timestep: physics step [s].
+        """Set up, to be reset before use, for the modelled vehicle and sensors and a physics step [s].
 
         Raises:
             ParameterError: a sensor is missing, or states a noise of zero.
         """
         from scipy.special import chdtri  # whose package takes a while to load, and few flights have an estimator
 
-        names = [sensor.name for sensor in sensors]
+        names = [str(sensor.name) for sensor in sensors]
         for name in NEEDED:
             if name not in names:
-                raise ParameterError("estimator", "sensors", [str(n) for n in names], f"such that {name} is among them")
+                raise ParameterError("estimator", "sensors", names, f"such that {name} is among them")
         for sensor in sensors:
             if min(sensor.noise) <= 0.0:
                 rule = "positive on every axis, for the estimator to weigh it"
@@ -162,7 +152,7 @@ class ErrorStateFilter:
                 self._waiting.append(sample)
             else:
                 self._track.tallies[sample.sensor].rejected += 1
-        self._waiting.sort(key=_order)
+        self._waiting.sort(key=lambda sample: (sample.taken, _NAMES.index(sample.sensor)))
         ripe = bisect.bisect_right(self._waiting, horizon, key=lambda sample: sample.taken)
         self._run(self._track, self._waiting[:ripe])
         del self._waiting[:ripe]
@@ -190,7 +180,8 @@ class ErrorStateFilter:
                 after = stand(self._model, track.estimate, duration)
             else:
                 after = predict(self._model, track.estimate, driven, duration)
-            if not _plausible(after):
+            size, spread = after.mean @ after.mean, after.covariance.trace()
+            if not (size < _LARGEST**2 and spread < _LARGEST_VARIANCE):
                 # Nothing is known any more: stay where it was, as unsure as at the start, and let the sensors speak.
                 after = Estimate(mean=track.estimate.mean, covariance=np.diag(np.square(self._initial())))
             track.estimate, track.step = after, until
@@ -209,11 +200,3 @@ class ErrorStateFilter:
         track.refused.pop(name, None)
         tally.accepted += 1
         tally.nis += distance
-
-
-def _order(sample: Sample) -> tuple[int, int]:
-    return sample.taken, _NAMES.index(sample.sensor)
-
-
-def _plausible(estimate: Estimate) -> bool:
-    return bool(estimate.mean @ estimate.mean < _LARGEST**2 and estimate.covariance.trace() < _LARGEST_VARIANCE)

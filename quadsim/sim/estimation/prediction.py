@@ -49,24 +49,15 @@ STILL_TIME: Final = 0.01
 """Time tau after which these velocities and rates are forgotten [s]."""
 
 
-def _chain() -> Array:
-    N = np.zeros((N_ERRORS, N_ERRORS))
-    N[POSITION, VELOCITY] = N[ATTITUDE, RATES] = np.eye(3)
-    return read_only(N)
-
-
-_CHAIN = _chain()
+_CHAIN = np.zeros((N_ERRORS, N_ERRORS))
 """The two double integrators, dp/dt = v and dtheta/dt = omega."""
+_CHAIN[POSITION, VELOCITY] = _CHAIN[ATTITUDE, RATES] = np.eye(3)
+read_only(_CHAIN)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Drive:
-    """What the rotors do.
-
-    Attributes:
-        acceleration: U / m [m/s^2], along body z.
-        torque: (tau_x, tau_y, tau_z) [N m], body.
-    """
+    """What the rotors do: U / m [m/s^2] along body z, and (tau_x, tau_y, tau_z) [N m], body."""
 
     acceleration: float
     torque: tuple[float, float, float]

@@ -61,33 +61,39 @@ class Outliers:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Sensor:
+class Sampling:
+    """When a sensor's samples are taken, when they arrive, and which do not."""
+
+    rate: Annotated[
+        float, Ge(0.01), Le(1e4), doc("[Hz] samples per second, the first at t = 0; a divisor of the physics rate")
+    ]
+    delay: Annotated[
+        float, Ge(0.0), Le(10.0), doc("[s] from taking a sample to its arrival, a whole number of physics steps")
+    ] = 0.0
+    dropout: Annotated[Fraction, doc("[-] probability of a sample being lost")] = 0.0
+    outliers: Annotated[Outliers | None, doc("absent: none")] = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sensor(Sampling):
     """One sensor, in the unit of its name (see `SensorName`); validated when made.
 
     A sample taken at t = j / rate is value + bias + walk(t) + noise.  It arrives `delay` later, or never.
 
     Attributes:
         name: what is measured.
-        rate: samples per second [Hz], the first at t = 0.
         noise: standard deviation per axis, white from sample to sample.
         bias: constant offset per axis.
         bias_walk: the bias's random walk per axis [unit/sqrt(s)]: its variance grows by bias_walk^2 t.
-        delay: from taking a sample to its arrival [s].
-        dropout: probability of a sample being lost.
-        outliers: gross errors among the noise; None for none.
 
     Raises:
         ParameterError: a value is not finite or not possible.
     """
 
     name: SensorName
-    rate: float
     noise: Vector = (0.0, 0.0, 0.0)
     bias: Vector = (0.0, 0.0, 0.0)
     bias_walk: Vector = (0.0, 0.0, 0.0)
-    delay: float = 0.0
-    dropout: float = 0.0
-    outliers: Outliers | None = None
 
     def __post_init__(self) -> None:
         owner = f"sensors.{self.name}"

@@ -3,85 +3,42 @@
 from __future__ import annotations
 
 import itertools
-import multiprocessing
-import signal
 import time as clock
 from collections.abc import Callable, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Final, TypeVar
+from typing import Final
 
 import numpy as np
 from threadpoolctl import threadpool_limits
 
 from quadsim import outputs
-from quadsim.controller import Command, Controller, Moment
 from quadsim.errors import ParameterError
 from quadsim.flight import metrics
 from quadsim.flight.log import FlightLog
+from quadsim.report.table import section
 from quadsim.state import INDEX, POSITION, Array
 from scenarios.bench.mismatch.conditions import CONDITIONS, QUICK_CONDITIONS
 from scenarios.bench.mismatch.controllers import FULL, QUICK_VARIANTS, VARIANTS, equip, tilt_bound
 from scenarios.bench.mismatch.survival import MismatchBench, MismatchFlight, mismatch_legend, mismatch_tables
-from scenarios.bench.solvers import section
+from scenarios.bench.timing import Stopwatch
+from scenarios.bench.worker_pool import answer_all
 from scenarios.build import build_controller, build_plant
 from scenarios.courses.make import build_reference
 from scenarios.loading import load_scenario
-from scenarios.machine import machine, usable_cores
+from scenarios.machine import machine
 from scenarios.parts.navigation import build_navigation
 from scenarios.parts.vehicle import build_vehicle
 from scenarios.progress import Progress, silent
 from scenarios.run import fly_once
 from scenarios.schema.scenario import Scenario
 
-Question = TypeVar("Question")
-Answer = TypeVar("Answer")
-
-
-def answer_all(
-    ask: Callable[[Question], Answer],
-    questions: Sequence[Question],
-    *,
-    workers: int | None = None,
-    progress: Callable[[int, int], None] = lambda done, total: None,
-) -> list[Answer]:
-    """Ask each question in a process, and collect the answers in order.
-
-    Args:
-        ask: a module's function, which processes can find by its name.
-        questions: what it is asked.
-        workers: processes; one per usable core by default.
-        progress: called with how many are done, of how many.
-    """
-    context = multiprocessing.get_context("spawn")  # a fork would take over whatever threads hold
-    count = min(workers or usable_cores(), len(questions) or 1)
-    pool = ProcessPoolExecutor(count, mp_context=context, initializer=_leave_interrupts_to_parent)
-    answers: dict[int, Answer] = {}
-    try:
-        futures = {pool.submit(ask, question): i for i, question in enumerate(questions)}
-        for future in as_completed(futures):
-            answers[futures[future]] = future.result()
-            progress(len(answers), len(questions))
-    finally:
-        pool.shutdown(cancel_futures=True)
-    return [answers[i] for i in range(len(questions))]
-
-
-def _leave_interrupts_to_parent() -> None:
-    """Ctrl-C reaches every process of a terminal; the parent alone is to say so."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-
-
 FORMAT: Final = "quadsim bench ladder"
-KIND: Final = "bench ladder"
-"""What `quadsim.outputs` calls its directory."""
+KIND: Final = "bench ladder"  # what `quadsim.outputs` calls its directory
 RESULTS_FILE: Final = "ladder.json"
 TABLES_FILE: Final = "ladder.md"
-TIMED: Final = 3
-"""Flights that steps are timed in: the machine's own slow spells are not the controller's."""
-QUICK_DURATION: Final = 12.0
-"""Of the flights with `--quick` [s]."""
+TIMED: Final = 3  # flights that steps are timed in: the machine's own slow spells are not the controller's
+QUICK_DURATION: Final = 12.0  # of the flights with `--quick` [s]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -172,7 +129,9 @@ def _fly(cell: Cell) -> tuple[FlightLog, Array, Scenario]:
     scenario = equip(_varied(cell), cell.controller, CONDITIONS[cell.condition])
     vehicle = build_vehicle(scenario)
     with threadpool_limits(limits=1):
-        controller = _Timed(build_controller(scenario, vehicle))
+        controller = build_controller(scenario, vehicle)
+        watch = Stopwatch(clock.thread_time)
+        watch.watch(controller, "step", "step")
         with build_plant(scenario, vehicle) as plant:
             log = fly_once(
                 scenario,
@@ -182,31 +141,7 @@ def _fly(cell: Cell) -> tuple[FlightLog, Array, Scenario]:
                 build_reference(scenario, scenario.periods + controller.horizon),
                 navigation=build_navigation(scenario, vehicle),
             )
-    return log, 1e3 * np.array(controller.step_s), scenario
-
-
-class _Timed:
-    """A controller, with a clock around its steps that stands still while other processes run."""
-
-    def __init__(self, inner: Controller) -> None:
-        self.inner = inner
-        self.name, self.solver, self.horizon = inner.name, inner.solver, inner.horizon
-        self.step_s: list[float] = []
-
-    def reset(self, speeds: Array) -> None:
-        """See `quadsim.controller.Controller.reset`."""
-        self.inner.reset(speeds)
-
-    def step(self, now: Moment, state: Array, reference: Array) -> Command:
-        """See `quadsim.controller.Controller.step`."""
-        started = clock.thread_time()
-        command = self.inner.step(now, state, reference)
-        self.step_s.append(clock.thread_time() - started)
-        return command
-
-    def predict(self, states: Array, plans: Array) -> Array:
-        """See `quadsim.controller.Controller.predict`."""
-        return self.inner.predict(states, plans)
+    return log, 1e3 * np.array(watch.laps["step"]), scenario
 
 
 def _varied(cell: Cell) -> Scenario:

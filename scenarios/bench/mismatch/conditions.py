@@ -2,28 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Final
+from typing import Final, NamedTuple
 
-WORN: Final = 0.2
-"""Share of its thrust and torque that the worn rotor loses."""
+WORN: Final = 0.2  # share of its thrust and torque that the worn rotor loses
 
 
-@dataclass(frozen=True, kw_only=True)
-class Condition:
-    """One mismatch between the plant and the controller's model.
+class Condition(NamedTuple):
+    """One mismatch between the plant and the controller's model."""
 
-    Attributes:
-        about: in a line.
-        settings: of the scenario file, by dotted paths.
-        rotor_lag: time constant that controllers with a model of it assume [s]; 0 for none.
-        delay: computation time that they assume [s].
-    """
-
-    about: str
-    settings: tuple[str, ...] = ()
-    rotor_lag: float = 0.0
-    delay: float = 0.0
+    about: str  # in a line
+    settings: tuple[str, ...] = ()  # of the scenario file, by dotted paths
+    rotor_lag: float = 0.0  # time constant that controllers with a model of it assume [s]; 0 for none
+    delay: float = 0.0  # computation time that they assume [s]
 
 
 def _lag(seconds: float) -> tuple[str, ...]:
@@ -46,51 +36,41 @@ def _worn(share: float) -> tuple[str, ...]:
 
 
 CONDITIONS: Final = {
-    "nominal": Condition(about="the paper's model, but for its linearisation"),
+    "nominal": Condition("the paper's model, but for its linearisation"),
     **{
         f"lag {1e3 * lag:g} ms": Condition(
-            about=f"rotors with a time constant of {1e3 * lag:g} ms; models of lag assume 50 ms",
-            settings=_lag(lag),
-            rotor_lag=0.05,
+            f"rotors with a time constant of {1e3 * lag:g} ms; models of lag assume 50 ms", _lag(lag), rotor_lag=0.05
         )
         for lag in (0.01, 0.02, 0.05, 0.08)
     },
-    "mass +30 %": Condition(about="30 % heavier than modelled", settings=("effects.load.mass_factor=1.3",)),
-    "mass -30 %": Condition(about="30 % lighter than modelled", settings=("effects.load.mass_factor=0.7",)),
+    "mass +30 %": Condition("30 % heavier than modelled", ("effects.load.mass_factor=1.3",)),
+    "mass -30 %": Condition("30 % lighter than modelled", ("effects.load.mass_factor=0.7",)),
     "wind 3 m/s": Condition(
-        about="3 m/s along x with Dryden turbulence, 7.7 m/s at 20 ft; rotor drag of 3e-4 kg/rad", settings=_wind(1.0)
+        "3 m/s along x with Dryden turbulence, 7.7 m/s at 20 ft; rotor drag of 3e-4 kg/rad", _wind(1.0)
     ),
     "sensor noise": Condition(
-        about="100 Hz, no estimator; position 0.01 m, velocity 0.05 m/s, attitude 0.26 deg, rates 0.3 deg/s, one "
-        "standard deviation",
-        settings=_noise(1.0),
+        "100 Hz, no estimator; position 0.01 m, velocity 0.05 m/s, attitude 0.26 deg, rates 0.3 deg/s, one standard "
+        "deviation",
+        _noise(1.0),
     ),
-    "worn rotor": Condition(
-        about=f"rotor 2 loses {100 * WORN:g} % of thrust and torque at 12 s, for good", settings=_worn(1.0)
-    ),
+    "worn rotor": Condition(f"rotor 2 loses {100 * WORN:g} % of thrust and torque at 12 s, for good", _worn(1.0)),
     "yaw 180 deg": Condition(
-        about="starts half a turn away from the heading that it is to have",
-        settings=("initial.euler=[0.0, 0.0, 180.0]",),
+        "starts half a turn away from the heading that it is to have", ("initial.euler=[0.0, 0.0, 180.0]",)
     ),
     **{
         f"delay {1e3 * delay:g} ms": Condition(
-            about=f"commands act {1e3 * delay:g} ms after the measurement; known to models of delay",
-            settings=(f"computation.delay={delay}",),
+            f"commands act {1e3 * delay:g} ms after the measurement; known to models of delay",
+            (f"computation.delay={delay}",),
             delay=delay,
         )
         for delay in (0.02, 0.05)
     },
     "all by half": Condition(
-        about="lag 25 ms, known; mass +15 %; wind 1.5 m/s with turbulence; half the noise; rotor 2 loses 10 %; yaw 90 "
-        "deg; commands 10 ms late, known",
-        settings=(
-            *_lag(0.025),
-            "effects.load.mass_factor=1.15",
-            *_wind(0.5),
-            *_noise(0.5),
-            *_worn(0.5),
-            "initial.euler=[0.0, 0.0, 90.0]",
-            "computation.delay=0.01",
+        "lag 25 ms, known; mass +15 %; wind 1.5 m/s with turbulence; half the noise; rotor 2 loses 10 %; yaw 90 deg; "
+        "commands 10 ms late, known",
+        (
+            *(*_lag(0.025), "effects.load.mass_factor=1.15", *_wind(0.5), *_noise(0.5), *_worn(0.5)),
+            *("initial.euler=[0.0, 0.0, 90.0]", "computation.delay=0.01"),
         ),
         rotor_lag=0.025,
         delay=0.01,

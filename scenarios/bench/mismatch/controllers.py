@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 from mpc.robust.observer import ObserverSettings
 from mpc.robust.tightening import TighteningSettings
@@ -23,20 +22,14 @@ OBSERVER: Final = ObserverSettings(torque_walk=0.2, force_walk=0.1)
 BASELINE_TILT: Final = 20.0
 """Largest tilt that LQR, PID and geometric controller command [deg].  They have no bounds on states, so this limit does
 for one; at the paper's 5 deg the geometric controller circles its goal, 8 m off after 60 s."""
-_NO_STEPS: Final = 1e6
-"""A bound on steps [rad/s] that bounds nothing."""
+_NO_STEPS: Final = 1e6  # a bound on steps [rad/s] that bounds nothing
 
 
-@dataclass(frozen=True, kw_only=True)
-class ControllerVariant:
-    """A controller of the benchmark.
+class ControllerVariant(NamedTuple):
+    """A controller of the benchmark."""
 
-    Attributes:
-        about: what it is, in a line.
-        spec: its table, from a constrained one and what a condition lets it know.
-    """
-
-    about: str
+    about: str  # what it is, in a line
+    # its table, from a constrained one and what a condition lets it know
     spec: Callable[[ConstrainedSpec, Condition, float], ControllerSpec]
 
 
@@ -73,12 +66,7 @@ def _paper(spec: ConstrainedSpec, condition: Condition, period: float) -> Constr
 
 
 def _robust(*, modelled: bool = True, **parts: Any) -> Callable[[ConstrainedSpec, Condition, float], RobustSpec]:
-    """The robust controller with soft bounds and some of its other parts.
-
-    Args:
-        modelled: whether the prediction knows rotor lag, delay and heading.
-        parts: other fields of `RobustSpec`.
-    """
+    """The robust controller with soft bounds, with or without a model of lag, delay and heading, and other parts."""
 
     def make(spec: ConstrainedSpec, condition: Condition, period: float) -> RobustSpec:
         known: dict[str, Any] = {}
@@ -126,38 +114,37 @@ def _speeds_alone(spec: ConstrainedSpec) -> InputBoundsSpec:
 
 
 VARIANTS: Final = {
-    "paper": ControllerVariant(about="the paper's constrained MPC, hard bounds, no fallback", spec=_paper),
+    "paper": ControllerVariant("the paper's constrained MPC, hard bounds, no fallback", _paper),
     "soft": ControllerVariant(
-        about=f"soft bounds on tilt, input weight {INPUT_WEIGHT:g}, move weight {MOVE_WEIGHT:g}; guarded, as are those "
-        "that build on it",
-        spec=_robust(modelled=False),
+        f"soft bounds on tilt, input weight {INPUT_WEIGHT:g}, move weight {MOVE_WEIGHT:g}; guarded, as are those that "
+        "build on it",
+        _robust(modelled=False),
     ),
-    "+ model": ControllerVariant(about="and a prediction that knows rotor lag, delay and heading", spec=_robust()),
-    "+ offset-free": ControllerVariant(about="and disturbances estimated", spec=_robust(offset_free=OBSERVER)),
+    "+ model": ControllerVariant("and a prediction that knows rotor lag, delay and heading", _robust()),
+    "+ offset-free": ControllerVariant("and disturbances estimated", _robust(offset_free=OBSERVER)),
     "+ tightening": ControllerVariant(
-        about="and output bounds tightened for disturbances and for the motion between samples",
-        spec=_robust(offset_free=OBSERVER, tightening=TighteningSettings()),
+        "and output bounds tightened for disturbances and for the motion between samples",
+        _robust(offset_free=OBSERVER, tightening=TighteningSettings()),
     ),
     "+ LTV": ControllerVariant(
-        about="as + offset-free, linearised at the present state in each period",
-        spec=_robust(offset_free=OBSERVER, linearisation="state"),
+        "as + offset-free, linearised at the present state in each period",
+        _robust(offset_free=OBSERVER, linearisation="state"),
     ),
     "+ iteration": ControllerVariant(
-        about="as + offset-free, linearised along its last plan: the real-time iteration",
-        spec=_robust(offset_free=OBSERVER, linearisation="trajectory"),
+        "as + offset-free, linearised along its last plan: the real-time iteration",
+        _robust(offset_free=OBSERVER, linearisation="trajectory"),
     ),
     "LQR": ControllerVariant(
-        about="infinite horizon, weights by Bryson's rule, in the heading frame; as the next two, it has no bounds "
-        f"but those on speeds, and commands no more than {BASELINE_TILT:g} deg of tilt",
-        spec=_lqr,
+        "infinite horizon, weights by Bryson's rule, in the heading frame; as the next two, it has no bounds but those "
+        f"on speeds, and commands no more than {BASELINE_TILT:g} deg of tilt",
+        _lqr,
     ),
-    "PID": ControllerVariant(about="cascaded, as autopilots fly it; gains from the lag it is given", spec=_pid),
+    "PID": ControllerVariant("cascaded, as autopilots fly it; gains from the lag it is given", _pid),
     "geometric": ControllerVariant(
-        about="on SE(3) with integrals (Goodarzi, Lee, Lee, 2013); gains from the lag it is given", spec=_geometric
+        "on SE(3) with integrals (Goodarzi, Lee, Lee, 2013); gains from the lag it is given", _geometric
     ),
 }
 """By their names in tables, in order.  The last three keep the bounds on speeds and no others: held to the paper's
 bounds on steps, which it knows nothing of, the LQR overturns on the nominal course."""
-FULL: Final = "+ tightening"
-"""The one with every part that tells it apart from the paper's."""
+FULL: Final = "+ tightening"  # the one with every part that tells it apart from the paper's
 QUICK_VARIANTS: Final = ("paper", "+ offset-free", "PID")

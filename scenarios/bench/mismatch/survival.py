@@ -10,32 +10,21 @@ from quadsim.report.table import ABSENT, Cell, Grid, Mark, format_number
 
 DIVERGED: Final = 10.0
 """Distance from the reference at the end [m] from which on a flight counts as lost, though nothing ended it."""
-OVERTURNED: Final = 90.0
-"""Roll or pitch [deg] from which on a flight counts as lost, whatever came after."""
+OVERTURNED: Final = 90.0  # roll or pitch [deg] from which on a flight counts as lost, whatever came after
 
 
 @dataclass(frozen=True, kw_only=True)
 class MismatchFlight:
-    """The outcome of one flight; numbers are over what was flown, None where that is not one period.
+    """The outcome of one flight; numbers are over what was flown, None where that is not one period."""
 
-    Attributes:
-        reason: why it ended early; None when it was completed.
-        flown: time flown [s].
-        rmse: tracking error by axis x, y, z [m].
-        end_error: distance of the vehicle from the reference at the last sample [m].
-        peak_tilt: largest magnitude of roll or pitch at the physics rate [deg].
-        violated: time at the physics rate with roll or pitch beyond its bound, tolerance 0 [s].
-        fallbacks: periods not flown by the controller's own optimum.
-        step_p99: 99th percentile of the processor time of the controller's step [ms]; None where it was not timed.
-    """
-
-    reason: str | None
-    flown: float
-    rmse: Mapping[str, float] | None
-    end_error: float | None
-    peak_tilt: float | None
-    violated: float
-    fallbacks: int
+    reason: str | None  # why it ended early; None when it was completed
+    flown: float  # time flown [s]
+    rmse: Mapping[str, float] | None  # tracking error by axis x, y, z [m]
+    end_error: float | None  # distance of the vehicle from the reference at the last sample [m]
+    peak_tilt: float | None  # largest magnitude of roll or pitch at the physics rate [deg]
+    violated: float  # time at the physics rate with roll or pitch beyond its bound, tolerance 0 [s]
+    fallbacks: int  # periods not flown by the controller's own optimum
+    # 99th percentile of the processor time of the controller's step [ms]; None where it was not timed
     step_p99: float | None
 
     @property
@@ -57,25 +46,15 @@ class MismatchFlight:
 
 @dataclass(frozen=True, kw_only=True)
 class MismatchBench:
-    """Controllers by conditions on one course.
+    """Controllers by conditions on one course."""
 
-    Attributes:
-        scenario: whose course.
-        duration: of each flight [s].
-        tilt_bound: of roll and pitch [deg].
-        controllers: what each one is, by its name.
-        conditions: what each one is, by its name.
-        flights: by controller and condition.
-        machine: what step times were measured on.
-    """
-
-    scenario: str
-    duration: float
-    tilt_bound: float
-    controllers: Mapping[str, str]
-    conditions: Mapping[str, str]
-    flights: Mapping[tuple[str, str], MismatchFlight]
-    machine: Mapping[str, Any]
+    scenario: str  # whose course
+    duration: float  # of each flight [s]
+    tilt_bound: float  # of roll and pitch [deg]
+    controllers: Mapping[str, str]  # what each one is, by its name
+    conditions: Mapping[str, str]  # what each one is, by its name
+    flights: Mapping[tuple[str, str], MismatchFlight]  # by controller and condition
+    machine: Mapping[str, Any]  # what step times were measured on
 
     def to_json(self) -> dict[str, Any]:
         """Everything, as plain values; what a clock measured stands under `step_p99` alone."""
@@ -86,10 +65,8 @@ class MismatchBench:
         return {**vars(self), "flights": flights}
 
 
-ARRIVED: Final = 0.05
-"""Distance from the reference at the end [m] that counts as arrived."""
-FAR: Final = 0.5
-"""The same that a reader should notice [m]."""
+ARRIVED: Final = 0.05  # distance from the reference at the end [m] that counts as arrived
+FAR: Final = 0.5  # the same that a reader should notice [m]
 TILT_TOLERANCE: Final = 0.05
 """How far beyond its bound tilt may be before a reader should notice [deg]; the paper scenarios' own tolerance."""
 
@@ -153,10 +130,7 @@ def _grid(measured: MismatchBench, key: str, title: str, cell: Callable[[Mismatc
         return cell(flight) if flight.survived else Cell(text=flight.fate, mark=Mark.BAD)
 
     lines = tuple(
-        (
-            Cell(text=condition),
-            *(shown(measured.flights[controller, condition]) for controller in measured.controllers),
-        )
+        (Cell(text=condition), *(shown(measured.flights[controller, condition]) for controller in measured.controllers))
         for condition in measured.conditions
     )
     return Grid(key=key, title=title, head=("", *measured.controllers), lines=lines, note=note)

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 from quadsim.report.figures.canvas import new_figure, write_drawings
 from quadsim.report.palette import BOUND
@@ -17,31 +16,21 @@ if TYPE_CHECKING:
 
 _SHADES: Final = ("#bfe3d3", "#f6edb5", "#f0b968")
 """Good, fair, poor; what is lost is drawn as bounds are."""
-_TILTED: Final = 0.5
-"""How far beyond its bound [deg] a tilt is still fair."""
+_TILTED: Final = 0.5  # how far beyond its bound [deg] a tilt is still fair
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Panel:
+class _Panel(NamedTuple):
     """A number of each flight, and up to where it is good, and fair."""
 
     title: str
     value: Callable[[MismatchFlight], float | None]
     good: float
     fair: float
-    digits: int
     unit: str
 
 
 def write_mismatch_figure(measured: MismatchBench, directory: Path) -> list[Path]:
-    """Draw the outcome of every controller in every condition.
-
-    Args:
-        measured: what was flown.
-        directory: where `ladder.png` and `ladder.svg` go; made when it is not there.
-
-    Returns:
-        The two files.
+    """Draw the outcome of every controller in every condition as `ladder.png` and `ladder.svg`; the two files.
 
     Raises:
         OutputError: the directory cannot be written.
@@ -51,23 +40,10 @@ def write_mismatch_figure(measured: MismatchBench, directory: Path) -> list[Path
 
 def _draw(measured: MismatchBench) -> Figure:
     bound = measured.tilt_bound
+    tilt = f"peak tilt between samples too [deg]; the bound is {bound:g} deg"
     panels = (
-        _Panel(
-            title="distance from the reference at the end [m]",
-            value=lambda flight: flight.end_error,
-            good=ARRIVED,
-            fair=FAR,
-            digits=2,
-            unit="m",
-        ),
-        _Panel(
-            title=f"peak tilt between samples too [deg]; the bound is {bound:g} deg",
-            value=lambda flight: flight.peak_tilt,
-            good=bound,
-            fair=bound + _TILTED,
-            digits=2,
-            unit="deg",
-        ),
+        _Panel("distance from the reference at the end [m]", lambda flight: flight.end_error, ARRIVED, FAR, "m"),
+        _Panel(tilt, lambda flight: flight.peak_tilt, bound, bound + _TILTED, "deg"),
     )
     width = 2.6 + 0.62 * len(measured.conditions)
     height = 1.9 + 2 * 0.27 * len(measured.controllers)
@@ -103,23 +79,17 @@ def _draw_panel(axes: Axes, measured: MismatchBench, panel: _Panel) -> None:
     axes.grid(visible=False)
     axes.spines[:].set_visible(False)
     axes.set_title(panel.title, loc="left", fontsize=9.5)
-    labels = (
-        f"up to {panel.good:g} {panel.unit}",
-        f"up to {panel.fair:g} {panel.unit}",
-        "more",
-        "lost",
-    )
+    labels = (f"up to {panel.good:g} {panel.unit}", f"up to {panel.fair:g} {panel.unit}", "more", "lost")
     keys = [Rectangle((0.0, 0.0), 1.0, 1.0, facecolor=colour) for colour in (*_SHADES, BOUND)]
     axes.legend(keys, labels, loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=4, fontsize=8.0, handlelength=1.0)
 
 
 def _look(flight: MismatchFlight, panel: _Panel) -> tuple[str, str]:
-    """A cell's colour, and what stands in it."""
     value = panel.value(flight)
     if not flight.survived or value is None:
         return BOUND, flight.fate.replace("lost, ", "")
     shade = _SHADES[0] if value <= panel.good else _SHADES[1] if value <= panel.fair else _SHADES[2]
-    return shade, f"{value:.{panel.digits}f}"
+    return shade, f"{value:.2f}"
 
 
 def _broken(name: str) -> str:

@@ -20,12 +20,11 @@ from quadsim.errors import MissingPackageError, ParameterError
 from scenarios.campaign.digests import code_digest
 from scenarios.campaign.engine.jobs import Jobs, read_jobs, submit
 from scenarios.campaign.engine.protocol import MOST_DEATHS, Answer, EngineError, Pace, Pilot, describe
-from scenarios.campaign.engine.supervisor_process import SupervisorProcess
+from scenarios.campaign.engine.supervisor import SupervisorProcess
 from scenarios.campaign.results.table import Row
 
 PATIENCE_S: Final = 60.0
-PATIENCE_WITH_JOBS_S: Final = 86400.0
-"""Jobs may stand in a queue for hours before the first worker is there."""
+PATIENCE_WITH_JOBS_S: Final = 86400.0  # jobs may stand in a queue for hours before the first worker is there
 _DECIDE_NUMBERS: Final = ("mujoco", "numpy", "scipy", "piqp")
 """Packages that have to be the same everywhere for the same flight to give the same numbers."""
 _ADDRESS: Final = re.compile(r"(tcp|tls|ws|wss|ucx)://\S+:\d+")
@@ -104,13 +103,10 @@ class DaskEngine:
 def fly_chunk(pickled: bytes, chunk: Sequence[int], expected: Mapping[str, str]) -> list[Answer]:
     """Have flights flown one after the other, beside a worker; those after a cancellation are left out.
 
-    Args:
-        pickled: the pilot, small against seconds of work; each worker makes it once.
-        chunk: the flights.
-        expected: versions that the worker has to have.
+    The pilot is small against seconds of work; each worker makes it once.
 
     Raises:
-        EngineError: it has others, or nobody can fly there.
+        EngineError: the worker has other versions than expected, or nobody can fly there.
     """
     worker = _distributed().get_worker()
     other = [f"{name} {found}, not {expected[name]}" for name, found in versions().items() if found != expected[name]]
@@ -126,8 +122,7 @@ def fly_chunk(pickled: bytes, chunk: Sequence[int], expected: Mapping[str, str])
     return answers
 
 
-_asides: dict[bytes, SupervisorProcess] = {}
-"""Of this worker: one at most, of the campaign that it flies."""
+_asides: dict[bytes, SupervisorProcess] = {}  # of this worker: one at most, of the campaign that it flies
 
 
 def _aside(pickled: bytes) -> SupervisorProcess:
@@ -183,7 +178,6 @@ class _Flights:
                 self._client.cancel([future for future, _ in self._flying.values()], force=True)
 
     def _look(self) -> None:
-        """See, now and then, who is there."""
         now = clock.monotonic()
         if now - self._looked < _LOOK_S:
             return

@@ -28,19 +28,12 @@ _NOT_TO_SET: Final = {
 
 @dataclass(frozen=True, kw_only=True)
 class Jobs:
-    """Jobs of a batch system, each of which starts one worker per core.
+    """Jobs of a batch system, each of which starts one worker per core."""
 
-    Attributes:
-        system: its name in dask-jobqueue, e.g. `slurm`.
-        jobs: how many.
-        cores: of each.
-        options: further options of dask-jobqueue, e.g. `memory`, `queue`, `walltime`.
-    """
-
-    system: str
-    jobs: int
-    cores: int
-    options: Mapping[str, Any]
+    system: str  # its name in dask-jobqueue, e.g. `slurm`
+    jobs: int  # how many
+    cores: int  # of each
+    options: Mapping[str, Any]  # further options of dask-jobqueue, e.g. `memory`, `queue`, `walltime`
 
     @property
     def workers(self) -> int:
@@ -93,10 +86,7 @@ def job_script(jobs: Jobs) -> str:
 
 
 def submit(jobs: Jobs) -> Any:
-    """Start a scheduler in this process and submit the jobs.
-
-    Returns:
-        the dask-jobqueue cluster; closing it ends the jobs.
+    """Start them; closing the dask-jobqueue cluster that this returns ends them.
 
     Raises:
         EngineError: they cannot be submitted from this machine.

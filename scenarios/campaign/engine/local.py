@@ -36,19 +36,13 @@ _AHEAD_S: Final = 1.0
 _SETTLED: Final = "scenarios.campaign.preload"
 """To be loaded by the server that forks the workers, and by no other process."""
 _MOST_STARTS: Final = 5
-_SILENCE_S: Final = 1.0
-"""After which supervisors are looked at: one that was stopped would keep silent for ever [s]."""
-_LEAVING_S: Final = 8.0
-"""For a supervisor to end everybody whom it keeps [s]."""
-_UNKNOWN: Final = 255
-"""The exit code of a process whose server died without reporting it."""
+_SILENCE_S: Final = 1.0  # after which supervisors are looked at: one that was stopped would keep silent for ever [s]
+_LEAVING_S: Final = 8.0  # for a supervisor to end everybody whom it keeps [s]
+_UNKNOWN: Final = 255  # the exit code of a process whose server died without reporting it
 
 
 class LocalEngine:
-    """Processes on this machine.
-
-    Args:
-        workers: how many; one per usable core by default.
+    """Processes on this machine, one per usable core by default.
 
     Raises:
         ParameterError: fewer than one.
@@ -134,7 +128,6 @@ class _Crew:
             yield from rows
 
     def dismiss(self) -> None:
-        """Stop everybody at once."""
         for supervisor in self._keepers:
             supervisor.dismiss()
         for supervisor in self._keepers:

@@ -15,9 +15,8 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Final
 
-_SET_DEATH_SIGNAL: Final = 1
+_SET_DEATH_SIGNAL: Final = 1  # of prctl(2), as the next
 _SET_CHILD_SUBREAPER: Final = 36
-"""Of prctl(2)."""
 _HELD: Final = ("RssAnon:", "RssShmem:", "VmSwap:")
 """Lines of /proc/PID/status: what a process holds that is not just a file's content, shared or not."""
 _HELD_ALONE: Final = ("Pss_Anon:", "Pss_Shmem:", "SwapPss:")
@@ -70,8 +69,7 @@ def has_strays(worker: int) -> bool:
 def end_children(group: int | None = None) -> None:
     """Kill all below this process, which has adopted orphans, and see that they are gone.
 
-    Args:
-        group: of processes that are killed in one stroke, first; those that keep multiplying do not outrun that.
+    A group of processes is killed first, in one stroke, which those that keep multiplying do not outrun.
     """
     if group is not None:
         with contextlib.suppress(ProcessLookupError, PermissionError):

@@ -20,8 +20,7 @@ MOST_DEATHS: Final = 10
 """Processes that may die while they fly a flight before it is given up: more than die by chance in one flight."""
 ONE_THREAD: Final = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
 """Environment of a process that flies: results do not depend on the core count."""
-CHUNK_S: Final = 10.0
-"""Work handed out at once [s]: long against what handing it out costs, short against a campaign."""
+CHUNK_S: Final = 10.0  # work handed out at once [s]: long against what handing it out costs, short against a campaign
 
 
 class EngineError(QuadsimError):
@@ -29,61 +28,37 @@ class EngineError(QuadsimError):
 
 
 class Pilot(Protocol):
-    """Flies flights, known by their numbers; pickled, and sent to each process once.
-
-    Attributes:
-        limits: of each flight.
-    """
+    """Flies flights, known by their numbers; pickled, and sent to each process once."""
 
     @property
     def limits(self) -> LimitsSpec:
-        """See the class."""
-        ...
+        """Of each flight."""
 
     def prepare(self) -> None:
         """Load what flights need, once in each process that flies; what fails here is reported by the flights."""
-        ...
 
     def fly(self, flight: int, progress: Progress = silent) -> Row:
-        """The row of a flight; plain values.
-
-        Args:
-            flight: which.
-            progress: called after each control period that is flown.
-        """
-        ...
+        """The row of a flight, plain values; reports each control period that is flown."""
 
     def lost(self, flight: int, reason: str, verdict: str = ERROR) -> Row:
         """The row of a flight that nobody came back from: its process died or met a limit, or `fly` raised."""
-        ...
 
 
 class Engine(Protocol):
-    """Has flights flown.
+    """Has flights flown."""
 
-    Attributes:
-        name: for the manifest.
-        workers: processes that fly at the same time.
-    """
-
-    name: str
+    name: str  # for the manifest
 
     @property
     def workers(self) -> int:
-        """See the class."""
-        ...
+        """Processes that fly at the same time."""
 
     def answers(self, pilot: Pilot, flights: Sequence[int]) -> Generator[Row]:
         """The rows, each flight's exactly once, in whatever order they come; closing the iterator stops all work.
 
-        Args:
-            pilot: flies them.
-            flights: no two alike.
-
         Raises:
             EngineError: there is nobody left to fly.
         """
-        ...
 
 
 class Answer(NamedTuple):
@@ -129,12 +104,7 @@ class Pace:
         return int(seconds * self._flights / max(self._seconds, 1e-9))
 
     def chunk(self, waiting: int, workers: int) -> int:
-        """Flights to hand to one worker: fewer near the end, so that all finish together.
-
-        Args:
-            waiting: flights not handed out.
-            workers: those who share them.
-        """
+        """Flights to hand to one worker: fewer near the end, so that all finish together."""
         return max(1, min(self.flights_in(CHUNK_S), fair_share(waiting, workers)))
 
 

@@ -108,23 +108,16 @@ def _rounding() -> tuple[float, ...]:
     return _ONE / _THREE, -_ONE / _THREE, _SMALLEST * _ONE
 
 
-FLIGHT: Final = struct.Struct("=q")
-"""A flight's number, as a supervisor hands it out."""
-SIZE: Final = struct.Struct("=Q")
-"""Of what follows, a pickled `FlightReport` [bytes]."""
+FLIGHT: Final = struct.Struct("=q")  # a flight's number, as a supervisor hands it out
+SIZE: Final = struct.Struct("=Q")  # of what follows, a pickled `FlightReport` [bytes]
 PULSE_BYTES: Final = 8
 
 
 class FlightReport(NamedTuple):
-    """What a worker says of a flight.
+    """What a worker says of a flight."""
 
-    Attributes:
-        answer: the outcome.
-        spent: whether the flight left something in the process that the next one would meet.
-    """
-
-    answer: Answer
-    spent: bool
+    answer: Answer  # the outcome
+    spent: bool  # whether the flight left something in the process that the next one would meet
 
 
 def fly_for(supervisor: int, pilot: Pilot, inbox: int, outbox: int, pulse: mmap) -> NoReturn:

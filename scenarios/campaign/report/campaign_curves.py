@@ -10,11 +10,10 @@ import numpy as np
 import pyarrow as pa
 
 from quadsim.state import Array
-from scenarios.campaign.results.columns import numbers, verdicts
-from scenarios.campaign.results.table import Summary, unit_of
+from scenarios.campaign.results.table import Summary, numbers, unit_of, verdicts
 from scenarios.campaign.results.verdicts import VERDICTS
 from scenarios.campaign.statistics.inference import ALPHA
-from scenarios.campaign.statistics.outliers import lowest_shown, robust_ends
+from scenarios.campaign.statistics.scatters import lowest_shown, robust_ends
 from scenarios.campaign.statistics.wording import label
 
 MAIN_METRICS: Final = (
@@ -30,38 +29,32 @@ _BINS: Final = 40
 
 @dataclass(frozen=True, kw_only=True)
 class Histogram:
-    """How a metric is distributed, by verdict.
+    """How a metric is distributed, by verdict."""
 
-    Attributes:
-        name: the metric.
-        label: its name, with its unit and what is not shown in its place.
-        edges: (B + 1,) ends of the bins.
-        counts: flights in each bin, (B,), by verdict.
-    """
-
-    name: str
-    label: str
-    edges: Array
-    counts: dict[str, Array]
+    name: str  # the metric
+    label: str  # its name, with its unit and what is not shown in its place
+    edges: Array  # (B + 1,) ends of the bins
+    counts: dict[str, Array]  # flights in each bin, (B,), by verdict
 
 
 @dataclass(frozen=True, kw_only=True)
 class Association:
-    """How a drawn number goes with an outcome.
+    """How a drawn number goes with an outcome; p-values are corrected for all tests of the campaign."""
 
-    Attributes:
-        rho: Spearman's rank correlation.
-        rho_is_sure: whether it is beyond chance, with all tests of the campaign taken together.
-        xi: Chatterjee's xi, of any dependence.
-        xi_is_sure: whether that is beyond chance.
-        p: the smaller of the two p-values, corrected.
-    """
+    rho: float  # Spearman's rank correlation
+    p_rho: float
+    xi: float  # Chatterjee's xi, of any dependence
+    p_xi: float
 
-    rho: float
-    rho_is_sure: bool
-    xi: float
-    xi_is_sure: bool
-    p: float
+    @property
+    def rho_is_sure(self) -> bool:
+        """Whether the rank correlation is beyond chance."""
+        return self.p_rho < ALPHA
+
+    @property
+    def xi_is_sure(self) -> bool:
+        """Whether the dependence is beyond chance."""
+        return self.p_xi < ALPHA
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -77,7 +70,7 @@ class Driver:
     def weakness(self) -> tuple[float, float]:
         """What drivers are ordered by, the strongest first: by the margin, or else by failure."""
         found = self.margin or self.failure
-        return (found.p, -max(abs(found.rho), found.xi)) if found else (2.0, 0.0)
+        return (min(found.p_rho, found.p_xi), -max(abs(found.rho), found.xi)) if found else (2.0, 0.0)
 
 
 def histograms(table: pa.Table) -> list[Histogram]:
@@ -118,13 +111,7 @@ def drivers(summary: Summary) -> list[Driver]:
 def _association(found: Mapping[str, Any] | None) -> Association | None:
     if found is None:
         return None
-    return Association(
-        rho=found["rho"],
-        rho_is_sure=found["p_holm"] < ALPHA,
-        xi=found["xi"],
-        xi_is_sure=found["p_xi_holm"] < ALPHA,
-        p=min(found["p_holm"], found["p_xi_holm"]),
-    )
+    return Association(rho=found["rho"], p_rho=found["p_holm"], xi=found["xi"], p_xi=found["p_xi_holm"])
 
 
 def sure_splits(summary: Summary) -> Iterator[tuple[str, str, str, Mapping[str, Any]]]:

@@ -15,16 +15,7 @@ from scenarios.campaign.report.campaign_curves import Association, convergence_r
 from scenarios.campaign.report.campaign_text import verdict_sentence
 from scenarios.campaign.results.table import Summary
 from scenarios.campaign.results.verdicts import VERDICTS
-from scenarios.campaign.statistics.scatters import (
-    COURSE,
-    Cloud,
-    Margins,
-    clipping,
-    clouds,
-    edges,
-    margins,
-    shown_flights,
-)
+from scenarios.campaign.statistics import scatters
 from scenarios.campaign.statistics.wording import side_by_side
 
 if TYPE_CHECKING:
@@ -35,26 +26,14 @@ if TYPE_CHECKING:
 _TRIANGLES: Final = {"down": "v", "up": "^", "left": "<", "right": ">"}
 _MOST_DRIVERS: Final = 10
 _MOST_SCATTERS: Final = 3
-_LINE: Final = 150
-"""Characters of a line below all panels."""
-_TICK_ROOM: Final = 60
-"""Characters that have room below a panel."""
+_LINE: Final = 150  # characters of a line below all panels
+_TICK_ROOM: Final = 60  # characters that have room below a panel
 _TICKS: Final = 6
-_FEW: Final = 50
-"""Flights of a verdict that are drawn larger, so as to be seen among the others."""
+_FEW: Final = 50  # flights of a verdict that are drawn larger, so as to be seen among the others
 
 
 def write_campaign_figure(name: str, table: pa.Table, summary: Summary, directory: Path) -> list[Path]:
-    """Draw how the estimate settles, the worst margins, what goes with them, and the strongest three of that.
-
-    Args:
-        name: the campaign's.
-        table: `flights.parquet`.
-        summary: its estimates.
-        directory: where `campaign.png` and `campaign.svg` go; made when it is not there.
-
-    Returns:
-        The two files.
+    """Draw `campaign.png` and `.svg`: how the estimate settles, worst margins, and what goes with them.
 
     Raises:
         OutputError: the directory cannot be written.
@@ -63,8 +42,8 @@ def write_campaign_figure(name: str, table: pa.Table, summary: Summary, director
 
 
 def _draw(name: str, table: pa.Table, summary: Summary) -> Figure:
-    drawn = margins(table)
-    parameters = _strongest(clouds(table, drawn), summary) if drawn is not None else []
+    drawn = scatters.margins(table)
+    parameters = _strongest(scatters.clouds(table, drawn), summary) if drawn is not None else []
     rows = 3 if len(parameters) > 1 else 2
     figure = new_figure(f"{name}: {verdict_sentence(summary)}", 9.6, 3.4 * rows)
     panels = figure.subplots(rows, 2).ravel()
@@ -78,13 +57,13 @@ def _draw(name: str, table: pa.Table, summary: Summary) -> Figure:
     if drawn is not None and parameters:
         for axes, cloud in zip(panels[3:], parameters, strict=False):
             _draw_scatter(axes, table, cloud, drawn)
-        curve = f"Curve: {COURSE}. " if any(cloud.course is not None for cloud in parameters) else ""
-        note = textwrap.fill(curve + clipping(drawn, parameters), _LINE)
+        curve = f"Curve: {scatters.COURSE}. " if any(cloud.course is not None for cloud in parameters) else ""
+        note = textwrap.fill(curve + scatters.clipping(drawn, parameters), _LINE)
         figure.supxlabel(note, x=0.01, ha="left", fontsize=8.0, color="#5b6067")
     return figure
 
 
-def _strongest(found: list[Cloud], summary: Summary) -> list[Cloud]:
+def _strongest(found: list[scatters.Cloud], summary: Summary) -> list[scatters.Cloud]:
     """The parameters that go most with the outcome, or the first ones where none of them can."""
     rank = {driver.name: i for i, driver in enumerate(drivers(summary))}
     return sorted(found, key=lambda cloud: rank.get(cloud.name, len(rank)))[:_MOST_SCATTERS]
@@ -182,11 +161,11 @@ def _draw_association(axes: Axes, row: float, found: Association, colour: str) -
     )
 
 
-def _draw_scatter(axes: Axes, table: pa.Table, cloud: Cloud, drawn: Margins) -> None:
+def _draw_scatter(axes: Axes, table: pa.Table, cloud: scatters.Cloud, drawn: scatters.Margins) -> None:
     from matplotlib.ticker import MaxNLocator
 
     axes.set_title(f"worst margin over {cloud.name}", loc="left", fontsize=9.5)
-    shown, beyond = shown_flights(table), edges(cloud, drawn)
+    shown, beyond = scatters.shown_flights(table), scatters.edges(cloud, drawn)
     for verdict in present(table):
         looks, rows = VERDICTS[verdict], shown[verdict]
         size = 2.6 if len(rows) > _FEW else 4.5

@@ -13,23 +13,11 @@ from quadsim.outputs import write_json, write_text, writing
 from quadsim.report.pages.page import PAGE_FILE, render_page
 from quadsim.report.plots.panels import plotly_script
 from quadsim.report.table import Mark
+from scenarios.campaign.report import campaign_tables
 from scenarios.campaign.report.campaign_figure import write_campaign_figure
-from scenarios.campaign.report.campaign_plots import campaign_plots
-from scenarios.campaign.report.campaign_tables import (
-    constraint_table,
-    driver_table,
-    event_table,
-    group_table,
-    level_tables,
-    manifest_table,
-    metric_table,
-    split_table,
-    worst_draws_table,
-    worst_table,
-)
+from scenarios.campaign.report.campaign_plots import campaign_plots, comparison_margins_plot
 from scenarios.campaign.report.campaign_text import campaign_sentences, verdict_sentence
 from scenarios.campaign.report.comparison_tables import comparison_markdown, comparison_tables, pairing
-from scenarios.campaign.report.margin_plots import comparison_margins_plot
 from scenarios.campaign.results.table import Summary
 from scenarios.campaign.statistics.comparison import Comparison
 from scenarios.campaign.statistics.scatters import clipping, clouds, margins, thinning
@@ -58,27 +46,16 @@ def write_report(
     failure: Sequence[str] = (),
     campaign: Path | None = None,
 ) -> Path:
-    """Write `index.html`, `campaign.png` and `campaign.svg`.
+    """Write `index.html`, `campaign.png` and `campaign.svg` into a directory that is being made; the page.
 
-    Args:
-        directory: where to write them, one that is being made.
-        table: `flights.parquet`.
-        summary: `scenarios.campaign.statistics.estimates.estimate` of that table.
-        manifest: how the campaign was made; nested tables are fine.
-        name: the campaign's.
-        description: what it is, in a line.
-        failure: the events that count as failure.
-        campaign: the campaign's directory, where that is another, to which the page links and as its commands name it.
-
-    Returns:
-        The page.
+    The page links to the files of `campaign`, the campaign's own directory where that is another, as its commands do.
 
     Raises:
         OutputError: the directory cannot be written.
     """
     campaign = directory if campaign is None else campaign
     write_campaign_figure(name, table, summary, directory)
-    plots = campaign_plots(table, summary)
+    plots, drawn = campaign_plots(table, summary), margins(table)
     page = render_page(
         "campaign.html.j2",
         "campaign",
@@ -87,19 +64,19 @@ def write_report(
         verdict=verdict_sentence(summary),
         mark=_mark(summary),
         sentences=campaign_sentences(summary),
-        events=event_table(summary, failure),
-        constraints=constraint_table(summary),
-        metrics=metric_table(summary),
-        drivers=driver_table(summary),
-        splits=split_table(summary),
-        groups=group_table(summary),
-        levels=level_tables(summary),
+        events=campaign_tables.event_table(summary, failure),
+        constraints=campaign_tables.constraint_table(summary),
+        metrics=campaign_tables.metric_table(summary),
+        drivers=campaign_tables.driver_table(summary),
+        splits=campaign_tables.split_table(summary),
+        groups=campaign_tables.group_table(summary),
+        levels=campaign_tables.level_tables(summary),
         lost=summary["verdicts"]["lost"],
-        worst=worst_table(summary, str(campaign)),
-        worst_draws=worst_draws_table(summary),
-        manifest=manifest_table(manifest),
+        worst=campaign_tables.worst_table(summary, str(campaign)),
+        worst_draws=campaign_tables.worst_draws_table(summary),
+        manifest=campaign_tables.manifest_table(manifest),
         plots=plots,
-        clipping=_clipping(table),
+        clipping="" if drawn is None else clipping(drawn, clouds(table, drawn)),
         thinning=thinning(table),
         files=[
             (label, quote(file))
@@ -118,28 +95,16 @@ def _mark(summary: Summary) -> Mark:
     return Mark.BAD if summary["events"]["failure"]["count"] else Mark.GOOD
 
 
-def _clipping(table: pa.Table) -> str:
-    """Which flights scatters draw at their edges, as a sentence; empty where there are none."""
-    drawn = margins(table)
-    return "" if drawn is None else clipping(drawn, clouds(table, drawn))
-
-
 COMPARISON_FILE: Final = "comparison.json"
 TABLE_FILE: Final = "comparison.md"
 
-KIND: Final = "campaign comparison"
-"""What `quadsim.outputs` calls such a directory."""
+KIND: Final = "campaign comparison"  # what `quadsim.outputs` calls such a directory
 
 
 def write_comparison_report(comparison: Comparison, directory: Path) -> Path:
-    """Write `index.html`, `comparison.json` and `comparison.md`, which appear together or not at all.
+    """Write `index.html`, `comparison.json` and `comparison.md`, which appear together or not at all; the page.
 
-    Args:
-        comparison: what to tell.
-        directory: what to write; an earlier comparison of campaigns or an empty directory there is replaced.
-
-    Returns:
-        The page.
+    An earlier comparison of campaigns or an empty directory there is replaced.
 
     Raises:
         OutputError: the directory cannot be written, or holds something else.

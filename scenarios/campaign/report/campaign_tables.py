@@ -6,7 +6,7 @@ import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, Final
 
-from quadsim.report.table import ABSENT, Cell, Grid, Mark, format_number
+from quadsim.report.table import ABSENT, Cell, Grid, Mark, format_number, line
 from scenarios.campaign.report.campaign_curves import Association, drivers, sure_splits
 from scenarios.campaign.results.table import Summary
 from scenarios.campaign.results.verdicts import HARMLESS
@@ -22,7 +22,7 @@ _GROUPS: Final = {
 def event_table(summary: Summary, failure: Sequence[str] = ()) -> Grid:
     """How often each event happened; `failure` names the events that count as failure."""
     lines = tuple(
-        _line(
+        line(
             *(name, str(found["count"]), *_shares(found)),
             *(percent(found["lower_one_sided"]), percent(found["upper_one_sided"])),
         )
@@ -55,7 +55,7 @@ def constraint_table(summary: Summary) -> Grid:
         margin = ABSENT if found["worst_margin"] is None else f"{format_number(found['worst_margin'])} {found['unit']}"
         flight = ABSENT if found["worst_flight"] is None else str(found["worst_flight"])
         count = Cell(text=str(failed["count"]), mark=mark)
-        lines.append((Cell(text=name), count, *_line(*_shares(failed), margin, flight)))
+        lines.append(line(name, count, *_shares(failed), margin, flight))
     return Grid(
         key="constraints",
         title="Constraints",
@@ -74,10 +74,8 @@ def metric_table(summary: Summary) -> Grid:
     """How every metric is distributed."""
     measures = ("mean", "sd", "min", "p5", "p50", "p95", "p99", "max")
     lines = tuple(
-        _line(
-            label(name, found["unit"]),
-            *(format_number(found[measure]) for measure in measures),
-            str(found["flights"]),
+        line(
+            label(name, found["unit"]), *(format_number(found[measure]) for measure in measures), str(found["flights"])
         )
         for name, found in summary["metrics"].items()
     )
@@ -96,11 +94,11 @@ def worst_table(summary: Summary, directory: str) -> Grid:
     """The worst flights, and how to fly one again."""
     worst = summary["worst"]
     lines = tuple(
-        (
-            Cell(text=str(flight["flight"])),
+        line(
+            str(flight["flight"]),
             Cell(text=flight["verdict"], mark=Mark.NONE if flight["verdict"] == HARMLESS else Mark.BAD),
-            *_line(format_number(flight["worst_margin"]), flight["worst_constraint"] or ABSENT),
-            *_line(format_number(flight["duration"])),
+            *(format_number(flight["worst_margin"]), flight["worst_constraint"] or ABSENT),
+            format_number(flight["duration"]),
             Cell(text=flight["reason"] or ABSENT, mark=Mark.TEXT),
         )
         for flight in worst
@@ -121,7 +119,7 @@ def worst_draws_table(summary: Summary) -> Grid:
     """What was drawn for the worst flights, a column for each."""
     worst = summary["worst"]
     lines = tuple(
-        _line(label(name, found["unit"]), *(_value(flight["draws"][name]) for flight in worst))
+        line(label(name, found["unit"]), *(_value(flight["draws"][name]) for flight in worst))
         for name, found in summary["parameters"].items()
     )
     return Grid(
@@ -134,7 +132,7 @@ def worst_draws_table(summary: Summary) -> Grid:
 
 def manifest_table(manifest: Mapping[str, Any]) -> Grid:
     """How the campaign was made, a line for each entry."""
-    lines = tuple((Cell(text=key), Cell(text=value, mark=Mark.TEXT)) for key, value in _flat(manifest))
+    lines = tuple(line(key, Cell(text=value, mark=Mark.TEXT)) for key, value in _flat(manifest))
     return Grid(key="manifest", title="How it was made", head=("", ""), lines=lines)
 
 
@@ -166,19 +164,11 @@ def _shares(found: Mapping[str, Any]) -> tuple[str, str]:
     return percent(found["share"]), interval(found["lower"], found["upper"])
 
 
-def _line(*texts: str) -> tuple[Cell, ...]:
-    return tuple(Cell(text=text) for text in texts)
-
-
 def driver_table(summary: Summary) -> Grid:
     """How each drawn number goes with the worst margin and with failure."""
-    listed = drivers(summary)
-    lines = []
-    for driver in listed:
-        cells = [Cell(text=driver.label)]
-        for outcome, found in (("worst_margin", driver.margin), ("failed", driver.failure)):
-            cells += _association(found, summary["parameters"][driver.name].get(outcome))
-        lines.append(tuple(cells))
+    lines = (
+        line(driver.label, *_association(driver.margin), *_association(driver.failure)) for driver in drivers(summary)
+    )
     return Grid(
         key="drivers-table",
         title="What goes with the outcome",
@@ -203,7 +193,7 @@ def split_table(summary: Summary) -> Grid:
     listed = list(sure_splits(summary))
     sure = f"{100.0 * summary['confidence']:g} % interval"
     lines = tuple(
-        _line(
+        line(
             event,
             f"{name} > {split['threshold']:.15g}{'' if unit == '-' else f' {unit}'}",
             *_side(split["low"]),
@@ -238,7 +228,7 @@ def group_table(summary: Summary) -> Grid:
     }
     size = max((len(found["groups"]) for found in listed.values()), default=0)
     lines = tuple(
-        _line(
+        line(
             label(name, found["unit"]),
             *(_group(group) for group in found["groups"]),
             *[ABSENT] * (size - len(found["groups"])),
@@ -263,7 +253,7 @@ def level_tables(summary: Summary) -> list[Grid]:
         if found["kind"] == "number" or not found["levels"]:
             continue
         lines = tuple(
-            _line(
+            line(
                 *(level, f"{share['count']} of {share['flights']}"),
                 *(percent(share["share"]), interval(share["lower"], share["upper"])),
             )
@@ -274,14 +264,14 @@ def level_tables(summary: Summary) -> list[Grid]:
     return grids
 
 
-def _association(found: Association | None, listed: Mapping[str, Any] | None) -> tuple[Cell, ...]:
-    if found is None or listed is None:
-        return _line(*[ABSENT] * 4)
-    return (
+def _association(found: Association | None) -> tuple[Cell, ...]:
+    if found is None:
+        return line(*[ABSENT] * 4)
+    return line(
         Cell(text=f"{found.rho:+.2f}", mark=Mark.BEST if found.rho_is_sure else Mark.NONE),
-        Cell(text=p_value(listed["p_holm"])),
+        p_value(found.p_rho),
         Cell(text=f"{found.xi:.2f}", mark=Mark.BEST if found.xi_is_sure else Mark.NONE),
-        Cell(text=p_value(listed["p_xi_holm"])),
+        p_value(found.p_xi),
     )
 
 

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from quadsim.report.table import ABSENT, Cell, Grid, Mark, format_number, grid_to_markdown
-from scenarios.campaign.statistics.comparison import Comparison, MetricComparison
-from scenarios.campaign.statistics.event_comparison import EventComparison
+from quadsim.report.table import ABSENT, Cell, Grid, Mark, format_number, line, section
+from scenarios.campaign.statistics.comparison import Comparison, EventComparison, MetricComparison
 from scenarios.campaign.statistics.inference import ALPHA, CONFIDENCE
 from scenarios.campaign.statistics.wording import label, p_value, percent, signed_interval, signed_points
 
@@ -18,11 +17,9 @@ def comparison_tables(comparison: Comparison) -> list[Grid]:
 
 def comparison_markdown(comparison: Comparison) -> str:
     """The verdict and its tables."""
-    parts = [f"# {comparison.names[1]} against {comparison.names[0]}\n", comparison.sentence + "\n"]
-    parts.append(pairing(comparison) + "\n")
-    for grid in comparison_tables(comparison):
-        parts += [f"## {grid.title}\n", grid_to_markdown(grid), grid.note + "\n"]
-    return "\n".join(parts)
+    head = f"# {comparison.names[1]} against {comparison.names[0]}\n"
+    texts = (head, comparison.sentence + "\n", pairing(comparison) + "\n")
+    return "\n".join([*texts, *map(section, comparison_tables(comparison))])
 
 
 def pairing(comparison: Comparison) -> str:
@@ -43,16 +40,8 @@ def _events(comparison: Comparison) -> Grid:
         key="events",
         title="Events",
         head=(
-            "event",
-            a,
-            b,
-            f"{a} alone",
-            f"{b} alone",
-            "both",
-            "p",
-            "after Holm",
-            "difference [points]",
-            f"{_SURE} interval",
+            *("event", a, b, f"{a} alone", f"{b} alone", "both"),
+            *("p", "after Holm", "difference [points]", f"{_SURE} interval"),
         ),
         lines=tuple(_event(event) for event in comparison.events),
         note="p: McNemar's exact test, two-sided, on the pairs in which one alone had the event, each event by itself; "
@@ -64,17 +53,10 @@ def _events(comparison: Comparison) -> Grid:
 
 def _event(event: EventComparison) -> tuple[Cell, ...]:
     counts = [f"{count} ({percent(count / event.pairs)})" for count in event.counts]
-    counted = _line(
-        event.event,
-        *counts,
-        str(event.only_a),
-        str(event.only_b),
-        str(event.both),
-        p_value(event.p),
-    )
-    mark = Mark.BEST if event.p_holm < ALPHA else Mark.NONE
-    corrected = Cell(text=p_value(event.p_holm), mark=mark)
-    return (*counted, corrected, *_line(signed_points(event.difference), signed_interval(event.lower, event.upper)))
+    pairs = map(str, (event.only_a, event.only_b, event.both))
+    corrected = Cell(text=p_value(event.p_holm), mark=Mark.BEST if event.p_holm < ALPHA else Mark.NONE)
+    difference = signed_points(event.difference), signed_interval(event.lower, event.upper)
+    return line(event.event, *counts, *pairs, p_value(event.p), corrected, *difference)
 
 
 def _metrics(comparison: Comparison) -> Grid:
@@ -98,20 +80,16 @@ def _metrics(comparison: Comparison) -> Grid:
 
 def _metric(metric: MetricComparison) -> tuple[Cell, ...]:
     found = metric.difference
-    return (
-        *_line(label(metric.name, metric.unit), format_number(metric.mean_a), format_number(metric.mean_b)),
+    return line(
+        *(label(metric.name, metric.unit), format_number(metric.mean_a), format_number(metric.mean_b)),
         *_difference(found.mean, found.lower, found.upper),
         *_difference(found.median, found.median_lower, found.median_upper),
-        *_line(str(found.pairs)),
+        str(found.pairs),
     )
 
 
 def _difference(value: float | None, lower: float | None, upper: float | None) -> tuple[Cell, ...]:
     if lower is None or upper is None:
-        return _line(format_number(value), ABSENT)
+        return line(format_number(value), ABSENT)
     mark = Mark.BEST if lower > 0.0 or upper < 0.0 else Mark.NONE
-    return Cell(text=format_number(value), mark=mark), Cell(text=f"{format_number(lower)} to {format_number(upper)}")
-
-
-def _line(*texts: str) -> tuple[Cell, ...]:
-    return tuple(Cell(text=text) for text in texts)
+    return line(Cell(text=format_number(value), mark=mark), f"{format_number(lower)} to {format_number(upper)}")

@@ -8,9 +8,8 @@ from __future__ import annotations
 import math
 import operator
 import re
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
 
@@ -31,41 +30,24 @@ _NAMED: Final[dict[str, tuple[str, bool | str]]] = {
 }
 """Column of each event that has a name, and its value there where the event holds."""
 _SPELLINGS: Final = {"failed": "failure", "violated": "violation", "crashed": "crash"}
-_OPERATIONS: Final[dict[str, Callable[[Any, Any], Any]]] = {
-    "<": operator.lt,
-    "<=": operator.le,
-    ">": operator.gt,
-    ">=": operator.ge,
-}
+_OPERATIONS: Final = {"<": operator.lt, "<=": operator.le, ">": operator.gt, ">=": operator.ge}
 _NEVER_COMPARED: Final = ("flight", "seed", "failed")
 """Columns that tell flights apart, or what other events make of them."""
 _COMPARISON: Final = re.compile(r"(?P<column>[^<>=]*?)\s*(?P<operation><=|>=|<|>)\s*(?P<number>[^<>=]*)")
 
-EVENT_NAMES: Final = tuple(_NAMED)
-"""The events that have a name; every other one is `COLUMN OP NUMBER`."""
+EVENT_NAMES: Final = tuple(_NAMED)  # the events that have a name; every other one is `COLUMN OP NUMBER`
 
 
-@dataclass(frozen=True, kw_only=True)
-class Event:
-    """Something that a flight's row shows to have happened, or not.
+class Event(NamedTuple):
+    """Something that a flight's row shows to have happened, or not."""
 
-    Attributes:
-        text: the event as it is written in one way: a name of `EVENT_NAMES`, or `COLUMN OP NUMBER`.
-        column_name: the column that shows it.
-        operation: `==`, `<`, `<=`, `>` or `>=`.
-        value: what the column is compared with.
-    """
-
-    text: str
-    column_name: str
-    operation: str
-    value: bool | str | float
+    text: str  # the event as it is written in one way: a name of `EVENT_NAMES`, or `COLUMN OP NUMBER`
+    column_name: str  # the column that shows it
+    operation: str  # `==`, `<`, `<=`, `>` or `>=`
+    value: bool | str | float  # what the column is compared with
 
     def holds(self, row: Mapping[str, Any]) -> bool:
-        """Whether it happened in one flight; so it did where the flight has no value.
-
-        Args:
-            row: a flight's values by column.
+        """Whether it happened in one flight, given its values by column; so it did where the flight has no value.
 
         Raises:
             UnknownNameError: there is no such column.
@@ -96,13 +78,13 @@ class Event:
         return np.array([self.holds({self.column_name: value}) for value in table[self.column_name].to_pylist()], bool)
 
 
-def parse_event(text: str, columns: Mapping[str, pa.DataType] | pa.Schema | None = None) -> Event:
+def parse_event(text: str, columns: Mapping[str, pa.DataType] | None = None) -> Event:
     """An event from its text.
 
     Args:
         text: a name of `EVENT_NAMES`, e.g. `failure` or `lost`, where `failed`, `violated` and `crashed` mean the same
             as their nouns; or `COLUMN OP NUMBER` with one of `< <= > >=`, e.g. `rmse.z > 0.5`.
-        columns: those that a comparison may name, with their types, or the schema of a table; None for any.
+        columns: those that a comparison may name, with their types; None for any.
 
     Raises:
         UnknownNameError: no event has that name, or there is no such column.
@@ -113,7 +95,7 @@ def parse_event(text: str, columns: Mapping[str, pa.DataType] | pa.Schema | None
     name = _SPELLINGS.get(text, text)
     if name in _NAMED:
         column, value = _NAMED[name]
-        return Event(text=name, column_name=column, operation="==", value=value)
+        return Event(name, column, "==", value)
     found = _COMPARISON.fullmatch(text)
     if found is None:
         hint = "or a comparison, COLUMN OP NUMBER with < <= > or >=, such as 'rmse.z > 0.5'"
@@ -124,22 +106,12 @@ def parse_event(text: str, columns: Mapping[str, pa.DataType] | pa.Schema | None
             f"event {text!r} must compare a column that measures a flight, such as rmse.z; {column!r} does not"
         )
     if columns is not None:
-        _require_number(column, columns, text)
+        if column not in columns:
+            raise UnknownNameError("column", column, [name for name, kind in columns.items() if _is_number(kind)])
+        if not _is_number(columns[column]):
+            raise _no_number(text, column)
     number = _number(found["number"], text)
-    return Event(
-        text=f"{column} {found['operation']} {number:.15g}",
-        column_name=column,
-        operation=found["operation"],
-        value=number,
-    )
-
-
-def _require_number(column: str, columns: Mapping[str, pa.DataType] | pa.Schema, event: str) -> None:
-    kinds = columns if isinstance(columns, Mapping) else dict(zip(columns.names, columns.types, strict=True))
-    if column not in kinds:
-        raise UnknownNameError("column", column, [name for name, kind in kinds.items() if _is_number(kind)])
-    if not _is_number(kinds[column]):
-        raise _no_number(event, column)
+    return Event(f"{column} {found['operation']} {number:.15g}", column, found["operation"], number)
 
 
 def _is_number(kind: pa.DataType) -> bool:

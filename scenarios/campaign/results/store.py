@@ -18,22 +18,16 @@ import pyarrow.parquet as pq
 
 from quadsim.errors import FileError
 from quadsim.outputs import Growing
-from scenarios.campaign.results.columns import numbers
-from scenarios.campaign.results.table import DRAW, TIMING, Row, make_table, read_table, split_times
+from scenarios.campaign.results.table import DRAW, TIMING, Row, make_table, numbers, read_table, split_times
 
 _NEEDED: Final = ("flight", "seed", "status", "verdict", "failed", "violated", "crashed", "worst_margin")
 """Columns that no version left out; `flight` to `violated` have a value in every row."""
 _FILLED: Final = _NEEDED[:6]
-LARGEST: Final = 1e100
-"""Magnitude of the largest number that a flight has; sums of squares of larger ones are infinite."""
+LARGEST: Final = 1e100  # magnitude of the largest number that a flight has; sums of squares of larger ones are infinite
 
 
 def read_flights(path: Path, schema: pa.Schema) -> pa.Table:
-    """`flights.parquet` of a campaign.
-
-    Args:
-        path: of the table.
-        schema: of the campaign, `table.make_schema`; a table of an older version may have fewer.
+    """`flights.parquet` of a campaign, whose schema it has; a table of an older version may have fewer columns.
 
     Raises:
         FileError: it cannot be read, a column is missing, not of the campaign or of another type, a number is too
@@ -84,12 +78,7 @@ _PART: Final = "part-*.parquet"
 
 
 class Store:
-    """The rows of a campaign on disk.
-
-    Args:
-        files: of the campaign's directory.
-        schema: see `scenarios.campaign.results.table.make_schema`.
-    """
+    """The rows of a campaign on disk, in the columns of `scenarios.campaign.results.table.make_schema`."""
 
     def __init__(self, files: Growing, schema: pa.Schema) -> None:
         self._files, self._directory, self._schema = files, files.path, schema
@@ -128,13 +117,7 @@ class Store:
         self._files.write({f"{PARTS_DIR}/part-{first:09d}.parquet": _encoded(make_table(rows, self._schema))})
 
     def close(self, flights: int) -> pa.Table:
-        """Put everything into its final two tables, and take the parts away.
-
-        Args:
-            flights: how many count; those beyond are left out.
-
-        Returns:
-            `flights.parquet`.
+        """Put the first so many flights into their final two tables, take the parts away, and return `flights.parquet`.
 
         Raises:
             OutputError: they cannot be written; the parts are still there.
@@ -164,14 +147,9 @@ class Store:
         require_columns(times, self._schema, path)
         if not times["flight"].equals(table["flight"]):
             times = table.select(["flight"])  # the process died between the two files
-        columns = [
-            table[name]
-            if name in table.column_names
-            else times[name]
-            if name in times.column_names
-            else pa.nulls(table.num_rows, kind)
-            for name, kind in zip(self._schema.names, self._schema.types, strict=True)
-        ]
+        there = {name: of[name] for of in (times, table) for name in of.column_names}
+        fields = zip(self._schema.names, self._schema.types, strict=True)
+        columns = [there[name] if name in there else pa.nulls(table.num_rows, kind) for name, kind in fields]
         return pa.Table.from_arrays(columns, schema=self._schema)
 
 

@@ -20,13 +20,12 @@ from quadsim.errors import FileError
 from quadsim.flight import metrics
 from quadsim.flight.audit import Finding, Limit
 from quadsim.flight.log import FlightLog, TimingLog
-from quadsim.state import REFERENCE_NAMES, REFERENCE_UNITS
-from scenarios.campaign.results.verdicts import ERROR
+from quadsim.state import REFERENCE_NAMES, REFERENCE_UNITS, Array
+from scenarios.campaign.results.events import Flags
+from scenarios.campaign.results.verdicts import ERROR, VERDICTS
 
-Row = dict[str, Any]
-"""One flight's values by column: numbers, texts, or None."""
-DRAW: Final = "draw."
-"""How the columns of drawn values begin."""
+Row = dict[str, Any]  # one flight's values by column: numbers, texts, or None
+DRAW: Final = "draw."  # how the columns of drawn values begin
 MARGIN, TIME_VIOLATED, SATISFIED = "margin.", "time_violated.", "satisfied."
 """How the columns of a constraint begin, before its name."""
 _MEASURES: Final = ("rmse", "max_error", "final_error", "overshoot")
@@ -54,8 +53,7 @@ _COMMANDS: Final = (
     ("iterations.max", "-", pa.int64()),
 )
 _WORST: Final = (("worst_margin", "-", pa.float64()), ("worst_constraint", "-", pa.string()))
-_COMMANDED: Final = ("speed", "slew")
-"""Signals that the controller sets itself."""
+_COMMANDED: Final = ("speed", "slew")  # signals that the controller sets itself
 TIMING: Final = (
     ("machine", "-", pa.string()),
     ("wall_s", "s", pa.float64()),
@@ -131,12 +129,7 @@ def flown_row(log: FlightLog, findings: Sequence[Finding], *, verdict: str, wall
 
 
 def failed_row(reason: str, verdict: str = ERROR) -> Row:
-    """What is kept of a flight that raised, whose process died, or that met a limit.
-
-    Args:
-        reason: in words.
-        verdict: `ERROR`, `TIMEOUT` or `MEMORY`.
-    """
+    """What is kept of a flight that raised, whose process died, or that met a limit of time or memory."""
     return {"status": verdict, "verdict": verdict, "reason": reason, "violated": True, "crashed": False}
 
 
@@ -233,3 +226,59 @@ def _storable(value: object) -> object:
 
 def _finite(value: float) -> float | None:
     return value if math.isfinite(value) else None
+
+
+Texts = np.ndarray[Any, np.dtype[np.object_]]
+_NO_METRIC: Final = ("flight", "seed", DRAW, MARGIN, TIME_VIOLATED, SATISFIED)
+Rows = np.ndarray[Any, np.dtype[np.intp]]
+Edges = np.ndarray[Any, np.dtype[np.str_]]
+
+
+def numbers(table: pa.Table, name: str) -> Array:
+    """(K,) a column of numbers or of truth values; NaN where a flight has none, or where there is no such column."""
+    if name not in table.column_names:
+        return np.full(table.num_rows, np.nan)
+    return np.array(table[name].cast(pa.float64()).to_numpy(), float)
+
+
+def flags(table: pa.Table, name: str, *, absent: bool) -> Flags:
+    """(K,) a column of truth values, with `absent` where a flight has none."""
+    return np.array(table[name].fill_null(absent).to_pylist(), bool)
+
+
+def texts(table: pa.Table, name: str) -> Texts:
+    """(K,) a column as text, `-` where a flight has none; truth values as `true` and `false`."""
+    words = {None: "-", True: "true", False: "false"} if pa.types.is_boolean(table[name].type) else {None: "-"}
+    return np.array([str(words.get(value, value)) for value in table[name].to_pylist()], object)
+
+
+def verdicts(table: pa.Table) -> dict[str, Flags]:
+    """(K,) which flights have each verdict."""
+    found = texts(table, "verdict")
+    return {verdict: np.asarray(found == verdict, bool) for verdict in VERDICTS}
+
+
+def draw_names(table: pa.Table) -> list[str]:
+    """The drawn parameters, in order."""
+    return [name.removeprefix(DRAW) for name in table.column_names if name.startswith(DRAW)]
+
+
+def constraint_names(table: pa.Table) -> list[str]:
+    """The constraints of the scenario, in order."""
+    return [name.removeprefix(SATISFIED) for name in table.column_names if name.startswith(SATISFIED)]
+
+
+def metric_names(table: pa.Table) -> list[str]:
+    """The columns that measure a flight by a number, `worst_margin` included."""
+    return [
+        field.name
+        for field in table.schema
+        if (pa.types.is_integer(field.type) or pa.types.is_floating(field.type))
+        and not field.name.startswith(_NO_METRIC)
+    ]
+
+
+def is_number(table: pa.Table, name: str) -> bool:
+    """Whether a column holds numbers, rather than texts or truth values."""
+    kind = table.schema.field(name).type
+    return bool(pa.types.is_integer(kind) or pa.types.is_floating(kind))

@@ -6,7 +6,7 @@ far smaller differences than two campaigns side by side would.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Any, Final
 
@@ -14,13 +14,124 @@ import numpy as np
 import pyarrow as pa
 
 from quadsim.errors import InputError
-from scenarios.campaign.results.columns import constraint_names, draw_names, numbers, texts
-from scenarios.campaign.results.events import Flags, parse_event
-from scenarios.campaign.results.table import DRAW, unit_of
-from scenarios.campaign.statistics.event_comparison import EventComparison, compare_events, events_of, other_differences
-from scenarios.campaign.statistics.inference import ALPHA, CONFIDENCE, PairedDifference, paired_difference
-from scenarios.campaign.statistics.paired_margins import ShownMargins, paired_margins
+from scenarios.campaign.results.events import EVENT_NAMES, Flags, parse_event
+from scenarios.campaign.results.table import (
+    DRAW,
+    SATISFIED,
+    constraint_names,
+    draw_names,
+    flags,
+    numbers,
+    texts,
+    unit_of,
+)
+from scenarios.campaign.statistics import inference
+from scenarios.campaign.statistics.scatters import ShownMargins, paired_margins
 from scenarios.campaign.statistics.wording import p_value, signed_interval, signed_points
+
+
+@dataclass(frozen=True, kw_only=True)
+class EventComparison:
+    """How often an event happened to one, to the other, and to both."""
+
+    event: str  # its name
+    both: int  # pairs in which it happened to both flights
+    only_a: int  # to the first campaign's alone
+    only_b: int  # to the second campaign's alone
+    neither: int  # to none of them
+    p: float  # two-sided p-value of McNemar's exact test
+    # that, corrected by Holm's method for all compared events that happened to one flight of a pair alone
+    p_holm: float
+    difference: float  # share of b - share of a
+    lower: float  # lower end of Tango's interval of that
+    upper: float  # its upper end
+
+    @property
+    def counts(self) -> tuple[int, int]:
+        """Flights of the first and of the second campaign in which it happened."""
+        return self.both + self.only_a, self.both + self.only_b
+
+    @property
+    def cells(self) -> tuple[int, int, int]:
+        """Pairs in which it happened to both, to the first alone, and to the second alone."""
+        return self.both, self.only_a, self.only_b
+
+    @property
+    def pairs(self) -> int:
+        """All pairs."""
+        return self.both + self.only_a + self.only_b + self.neither
+
+
+def events_of(a: pa.Table, b: pa.Table) -> dict[str, tuple[Flags, Flags]]:
+    """Everything that may have happened to a flight, (K,) of each campaign: failure first, constraints last."""
+    named = {name: parse_event(name) for name in EVENT_NAMES}
+    found = {name: (event.column(a), event.column(b)) for name, event in named.items()}
+    for name in constraint_names(a):
+        column = SATISFIED + name
+        found[f"{name} not held"] = (~flags(a, column, absent=False), ~flags(b, column, absent=False))
+    return found
+
+
+def compare_events(events: Mapping[str, tuple[Flags, Flags]]) -> tuple[EventComparison, ...]:
+    """Every event with its test, corrected for all of them but those that no flight of a pair had alone.
+
+    These have a p-value of 1 whatever the others are, so that there is nothing to correct for (Tarone, 1990).  Events
+    are given by name, as (K,) whether each happened to the flights of the first and of the second campaign.
+    """
+    alone = {event: (int((a & ~b).sum()), int((b & ~a).sum())) for event, (a, b) in events.items()}
+    tested = [event for event, counts in alone.items() if any(counts)]
+    corrected = dict(zip(tested, inference.holm([inference.mcnemar(*alone[event]) for event in tested]), strict=True))
+    found = []
+    for event, (a, b) in events.items():
+        only_a, only_b = alone[event]
+        both = int((a & b).sum())
+        lower, upper = inference.paired_shares(only_a, only_b, a.size)
+        found.append(
+            EventComparison(
+                event=event,
+                both=both,
+                only_a=only_a,
+                only_b=only_b,
+                neither=a.size - both - only_a - only_b,
+                p=inference.mcnemar(only_a, only_b),
+                p_holm=corrected.get(event, 1.0),
+                difference=(only_b - only_a) / a.size,
+                lower=lower,
+                upper=upper,
+            )
+        )
+    return tuple(found)
+
+
+def other_differences(events: Sequence[EventComparison], names: tuple[str, str]) -> str:
+    """What else than the first event happened more often to one of two campaigns, beyond chance or not, as a sentence.
+
+    A second event of the same numbers as the first, as violation is where it alone counts as failure, is not reported.
+    """
+    first, *others = events
+    others = [event for event in others if event.only_a != event.only_b]
+    others = [event for event in others if event.event != "violation" or event.cells != first.cells]
+    sure = [_told(event) for event in others if event.p_holm < inference.ALPHA]
+    rest = [_told(event) for event in others if event.p_holm >= inference.ALPHA]
+    parts = []
+    if sure:
+        parts.append(f"beyond chance in {', '.join(sure)}")
+    if rest:
+        parts.append(f"in count, but not beyond chance, in {', '.join(rest)}")
+    if not parts:
+        return ""
+    tests = sum(1 for event in events if event.only_a + event.only_b)
+    return (
+        f"Flights with {names[1]} and with {names[0]} {'also ' if first.p < inference.ALPHA else ''}differ "
+        f"{'; and '.join(parts)} (McNemar's exact test of each event, after Holm's correction for {tests})."
+    )
+
+
+def _told(event: EventComparison) -> str:
+    """An event with its counts, the second campaign's first, as in the sentence around it."""
+    count_a, count_b = event.counts
+    return f"{event.event} ({count_b} and {count_a}, {p_value(event.p_holm)})"
+
 
 COMPARED: Final = (
     *(f"rmse.{name}" for name in ("x", "y", "z", "yaw")),
@@ -35,21 +146,13 @@ COMPARED: Final = (
 
 @dataclass(frozen=True, kw_only=True)
 class MetricComparison:
-    """A metric over the pairs in which both flights were completed and have it.
+    """A metric over the pairs in which both flights were completed and have it."""
 
-    Attributes:
-        name: its column.
-        unit: its unit, `-` for none.
-        mean_a: mean of the first campaign over these pairs; None of no pairs.
-        mean_b: mean of the second.
-        difference: of the second less the first.
-    """
-
-    name: str
-    unit: str
-    mean_a: float | None
-    mean_b: float | None
-    difference: PairedDifference
+    name: str  # its column
+    unit: str  # its unit, `-` for none
+    mean_a: float | None  # mean of the first campaign over these pairs; None of no pairs
+    mean_b: float | None  # mean of the second
+    difference: inference.PairedDifference  # of the second less the first
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -82,7 +185,7 @@ class Comparison:
     def verdict(self) -> str:
         """`better`, `worse` or `not distinguishable`: of the second campaign, by its failures at a level of 5 %."""
         failure = self.events[0]
-        if failure.p >= ALPHA:
+        if failure.p >= inference.ALPHA:
             return "not distinguishable"
         return "better" if failure.only_b < failure.only_a else "worse"
 
@@ -101,7 +204,7 @@ class Comparison:
             f"{phrase}: of {self.flights} paired flights, {count_b} failed with {b} and {count_a} with {a} "
             f"({failure.only_b} with {b} alone, {failure.only_a} with {a} alone; McNemar's exact test, "
             f"{p_value(failure.p)}). The difference is {signed_points(failure.difference)} percentage points "
-            f"({100.0 * CONFIDENCE:g} %: {signed_interval(failure.lower, failure.upper)}). "
+            f"({100.0 * inference.CONFIDENCE:g} %: {signed_interval(failure.lower, failure.upper)}). "
             f"{other_differences(self.events, self.names)}"
         ).rstrip()
 
@@ -111,7 +214,7 @@ class Comparison:
             "names": list(self.names),
             "verdict": self.verdict,
             "sentence": self.sentence,
-            "confidence": CONFIDENCE,
+            "confidence": inference.CONFIDENCE,
             "flights": self.flights,
             "left_out": self.left_out,
             "completed": self.completed,
@@ -211,5 +314,5 @@ def _compare_metric(a: pa.Table, b: pa.Table, name: str, completed: Flags) -> Me
         unit=unit_of(a, name),
         mean_a=float(first.mean()) if first.size else None,
         mean_b=float(second.mean()) if second.size else None,
-        difference=paired_difference(first, second),
+        difference=inference.paired_difference(first, second),
     )

@@ -16,8 +16,7 @@ from quadsim.state import Array
 
 Counts = np.ndarray[Any, np.dtype[np.int_]]
 
-_EXACT_UP_TO: Final = 8
-"""Pairs up to which all permutations are counted for a rank correlation's p-value; 8! = 40 320."""
+_EXACT_UP_TO: Final = 8  # pairs up to which all permutations are counted for a rank correlation's p-value; 8! = 40 320
 _PERMUTED_UP_TO: Final = 40
 """Pairs up to which xi's p-value is from permutations; beyond, its asymptotic law is as good."""
 _PERMUTATIONS: Final = 9999
@@ -25,45 +24,27 @@ _PERMUTATIONS: Final = 9999
 
 @dataclass(frozen=True, kw_only=True)
 class Correlation:
-    """Spearman's rank correlation.
+    """Spearman's rank correlation."""
 
-    Attributes:
-        rho: from -1 to 1.
-        p: two-sided p-value of no association.
-        flights: pairs it was taken over.
-    """
-
-    rho: float
-    p: float
-    flights: int
+    rho: float  # from -1 to 1
+    p: float  # two-sided p-value of no association
+    flights: int  # pairs it was taken over
 
 
 @dataclass(frozen=True, kw_only=True)
 class Dependence:
-    """Chatterjee's xi.
+    """Chatterjee's xi."""
 
-    Attributes:
-        xi: about 0 where there is no dependence, 1 where the one number is a function of the other.
-        p: one-sided p-value of no dependence.
-        flights: pairs it was taken over.
-    """
-
-    xi: float
-    p: float
-    flights: int
+    xi: float  # about 0 where there is no dependence, 1 where the one number is a function of the other
+    p: float  # one-sided p-value of no dependence
+    flights: int  # pairs it was taken over
 
 
 def rank_correlation(x: Array, y: Array) -> Correlation | None:
-    """Spearman's rank correlation of pairs, ties at their mean rank.
+    """Spearman's rank correlation of pairs x, y (K,), ties at their mean rank.
 
-    The p-value counts all permutations of up to 8 pairs, and is from Student's t beyond.
-
-    Args:
-        x: (K,); pairs with a NaN do not count, infinities have their rank.
-        y: (K,).
-
-    Returns:
-        None of fewer than three pairs, or where one side is always the same.
+    The p-value counts all permutations of up to 8 pairs, and is from Student's t beyond.  Pairs with a NaN do not
+    count, infinities have their rank.  None of fewer than three pairs, or where one side is always the same.
     """
     pairs = _ranked(x, y)
     if pairs is None:
@@ -83,20 +64,12 @@ def rank_correlation(x: Array, y: Array) -> Correlation | None:
 
 
 def any_dependence(x: Array, y: Array, rng: np.random.Generator) -> Dependence | None:
-    """Chatterjee's xi of y on x: how near y is to a function of x, of whatever shape.
+    """Chatterjee's xi of y on x, (K,) each: how near y is to a function of x, of whatever shape.
 
-    Equal values of x are put in an order at random, as its author advises.  The p-value of a y with two values, such as
-    an event, is exact: xi then counts how often the event begins or ends as x grows, as the runs test does.  Else it is
-    from 9999 permutations of up to 40 pairs, and from xi's asymptotic law beyond.
-    Source: Chatterjee, Journal of the American Statistical Association 116 (2021).
-
-    Args:
-        x: (K,); pairs with a NaN do not count, infinities have their rank.
-        y: (K,).
-        rng: of ties and permutations.
-
-    Returns:
-        None of fewer than three pairs, or where one side is always the same.
+    Pairs count as for `rank_correlation`.  Equal values of x are put in an order at random, as its author advises.  The
+    p-value of a y with two values, such as an event, is exact: xi then counts how often the event begins or ends as x
+    grows, as the runs test does.  Else it is from 9999 permutations of up to 40 pairs, and beyond from xi's asymptotic
+    law.  Source: Chatterjee, Journal of the American Statistical Association 116 (2021).
     """
     pairs = _ranked(x, y)
     if pairs is None:
@@ -138,10 +111,8 @@ def _log_binomial(n: int, k: Counts) -> Array:
     return np.asarray(special.gammaln(n + 1) - special.gammaln(k + 1) - special.gammaln(n - k + 1))
 
 
-_GROUPS: Final = (5, 25)
-"""The fewest and the most groups that a curve is drawn through."""
-_GROUPS_PER_ROOT: Final = 0.8
-"""Groups, as a share of the square root of the flights."""
+_GROUPS: Final = (5, 25)  # the fewest and the most groups that a curve is drawn through
+_GROUPS_PER_ROOT: Final = 0.8  # groups, as a share of the square root of the flights
 _POINTS: Final = 80
 _TURN: Final = 0.3
 """Share of a curve's height by which both of its ends have to lie on one side of what is between them."""
@@ -149,15 +120,10 @@ _TURN: Final = 0.3
 
 @dataclass(frozen=True, kw_only=True)
 class Trend:
-    """A smooth curve over a drawn number.
+    """A smooth curve over a drawn number."""
 
-    Attributes:
-        x: (G,) values of the drawn number, rising.
-        y: (G,) what half of the flights near there exceed.
-    """
-
-    x: Array
-    y: Array
+    x: Array  # (G,) values of the drawn number, rising
+    y: Array  # (G,) what half of the flights near there exceed
 
     @property
     def turn(self) -> tuple[str, float] | None:
@@ -174,17 +140,11 @@ class Trend:
 def trend(x: Array, y: Array) -> Trend | None:
     """A cubic smoothing spline through the medians of groups of flights that are next to one another.
 
-    Flights are sorted by x and parted into 5 to 25 groups of about equal size, 0.8 times as many as the square root of
-    the flights.  Medians are taken since no outlier moves them; generalised cross-validation chooses how smooth the
-    spline is, and it is cut off at the highest and the lowest median.
+    Flights, finite x and y (K,), are sorted by x and parted into 5 to 25 groups of about equal size, 0.8 times as many
+    as the square root of the flights.  Medians are taken since no outlier moves them; generalised cross-validation
+    chooses how smooth the spline is, and it is cut off at the highest and the lowest median.  None of fewer than 40
+    flights, or where x has too few values for five groups.
     Source: scipy.interpolate.make_smoothing_spline, after Woltring, Advances in Engineering Software 8 (1986).
-
-    Args:
-        x: (K,) values of the drawn number; finite.
-        y: (K,) the outcome; finite.
-
-    Returns:
-        None of fewer than 40 flights, or where x has too few values for five groups.
     """
     from scipy.interpolate import make_smoothing_spline
 

@@ -10,12 +10,11 @@ import numpy as np
 import pyarrow as pa
 
 from quadsim.state import Array
-from scenarios.campaign.results.columns import draw_names, flags, is_number, numbers, texts, verdicts
 from scenarios.campaign.results.events import Flags, parse_event
-from scenarios.campaign.results.table import DRAW, unit_of
+from scenarios.campaign.results.table import DRAW, draw_names, flags, is_number, numbers, texts, unit_of, verdicts
 from scenarios.campaign.statistics.dependence import any_dependence, rank_correlation, trend
-from scenarios.campaign.statistics.inference import holm, proportion
-from scenarios.campaign.statistics.outliers import margin_ends
+from scenarios.campaign.statistics.inference import holm, share_of
+from scenarios.campaign.statistics.scatters import margin_ends
 from scenarios.campaign.statistics.splits import best_splits
 
 SPLIT_EVENTS: Final = ("failure", "violation", "lost")
@@ -33,9 +32,6 @@ def parameters(table: pa.Table) -> dict[str, Any]:
     under `turn`, where the course of the worst margin turns, `highest` or `lowest` at a value, or None.  All p-values
     of all parameters, outcomes and measures together are corrected by Holm's method: `p_holm`, `p_xi_holm`.
     Of what is drawn from names or truth values: the failures by level.
-
-    Args:
-        table: `flights.parquet`; of no flights as well.
     """
     failed = flags(table, "failed", absent=True)
     names = draw_names(table)
@@ -111,7 +107,7 @@ def _turn(values: Array, margin: Array) -> dict[str, Any] | None:
 
 def _levels(table: pa.Table, name: str, failed: Flags) -> dict[str, Any]:
     levels = texts(table, DRAW + name)
-    shares = {level: _share(failed[levels == level]) for level in sorted(set(levels))}
+    shares = {level: share_of(failed[levels == level]) for level in sorted(set(levels))}
     return {"kind": "name", "unit": unit_of(table, DRAW + name), "levels": shares}
 
 
@@ -126,10 +122,6 @@ def _groups(values: Array, failed: Flags) -> list[dict[str, Any]]:
     cuts = distinct[1:] if distinct.size <= size else np.quantile(values, np.arange(1, size) / size)
     group = np.searchsorted(cuts, values, side="right")
     return [
-        {"low": float(values[of].min()), "high": float(values[of].max()), **_share(failed[of])}
+        {"low": float(values[of].min()), "high": float(values[of].max()), **share_of(failed[of])}
         for of in (group == k for k in np.unique(group))
     ]
-
-
-def _share(happened: Flags) -> dict[str, Any]:
-    return asdict(proportion(int(happened.sum()), happened.size))

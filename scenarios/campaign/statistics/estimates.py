@@ -3,27 +3,29 @@
 from __future__ import annotations
 
 import math
-from dataclasses import asdict
 from typing import Any, Final
 
 import numpy as np
 import pyarrow as pa
 
 from quadsim.errors import ParameterError
-from scenarios.campaign.results.columns import (
+from scenarios.campaign.results.events import EVENT_NAMES, parse_event
+from scenarios.campaign.results.table import (
+    DRAW,
+    MARGIN,
+    SATISFIED,
     constraint_names,
     draw_names,
     flags,
     metric_names,
     numbers,
     texts,
+    unit_of,
     verdicts,
 )
-from scenarios.campaign.results.events import EVENT_NAMES, Flags, parse_event
-from scenarios.campaign.results.table import DRAW, MARGIN, SATISFIED, unit_of
 from scenarios.campaign.results.verdicts import VERDICTS
 from scenarios.campaign.statistics.drivers import parameters
-from scenarios.campaign.statistics.inference import CONFIDENCE, lower_bounds, proportion, upper_bounds
+from scenarios.campaign.statistics.inference import CONFIDENCE, lower_bounds, share_of, upper_bounds
 
 WORST_FLIGHTS: Final = 10
 _CURVE_POINTS: Final = 80
@@ -37,15 +39,12 @@ def estimate(table: pa.Table) -> dict[str, Any]:
     reached; `metrics`, over the flights that have each; `parameters`, how the outcome goes with each drawn parameter
     (`drivers.parameters`); `worst`, the ten worst flights; `convergence` of the shares of failure and
     violation over the first n flights.
-
-    Args:
-        table: `flights.parquet`; of no flights as well.
     """
     return {
         "flights": table.num_rows,
         "confidence": CONFIDENCE,
         "verdicts": {verdict: int(found.sum()) for verdict, found in verdicts(table).items()},
-        "events": {name: _share(parse_event(name).column(table)) for name in EVENT_NAMES},
+        "events": {name: share_of(parse_event(name).column(table)) for name in EVENT_NAMES},
         "metrics": {name: _metric(table, name) for name in metric_names(table)},
         "constraints": {name: _constraint(table, name) for name in constraint_names(table)},
         "parameters": parameters(table),
@@ -88,25 +87,18 @@ def ranking(table: pa.Table) -> np.ndarray[Any, np.dtype[np.intp]]:
     return np.lexsort(keys)
 
 
-def _share(happened: Flags) -> dict[str, Any]:
-    return asdict(proportion(int(happened.sum()), happened.size))
-
-
 def _metric(table: pa.Table, name: str) -> dict[str, Any]:
     values = numbers(table, name)
     values = values[np.isfinite(values)]
     found: dict[str, Any] = {"unit": unit_of(table, name), "flights": int(values.size)}
     if not values.size:
         return found | dict.fromkeys(("mean", "sd", "min", "p5", "p50", "p95", "p99", "max"))
-    p5, p50, p95, p99 = (float(value) for value in np.percentile(values, [5, 50, 95, 99]))
+    percentiles = np.percentile(values, [5, 50, 95, 99]).tolist()
     return found | {
         "mean": float(values.mean()),
         "sd": float(values.std(ddof=1)) if values.size > 1 else None,
         "min": float(values.min()),
-        "p5": p5,
-        "p50": p50,
-        "p95": p95,
-        "p99": p99,
+        **dict(zip(("p5", "p50", "p95", "p99"), percentiles, strict=True)),
         "max": float(values.max()),
     }
 
@@ -115,7 +107,7 @@ def _constraint(table: pa.Table, name: str) -> dict[str, Any]:
     margin = numbers(table, MARGIN + name)
     found: dict[str, Any] = {
         "unit": unit_of(table, MARGIN + name),
-        "not_satisfied": _share(~flags(table, SATISFIED + name, absent=False)),
+        "not_satisfied": share_of(~flags(table, SATISFIED + name, absent=False)),
         "worst_margin": None,
         "worst_flight": None,
     }
@@ -131,9 +123,7 @@ def _flight(table: pa.Table, row: int) -> dict[str, Any]:
     margin = values["worst_margin"]
     if margin is not None and not math.isfinite(margin):
         values["worst_margin"] = None
-    return {name: values[name] for name in shown} | {
-        "draws": {name: values[DRAW + name] for name in draw_names(table)},
-    }
+    return {name: values[name] for name in shown} | {"draws": {name: values[DRAW + name] for name in draw_names(table)}}
 
 
 def _convergence(table: pa.Table) -> dict[str, Any]:

@@ -8,67 +8,48 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Final
+from dataclasses import asdict, dataclass
+from typing import Any, Final
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy import optimize, stats
 
 from quadsim.state import Array
 
 CONFIDENCE: Final = 0.95
-ALPHA: Final = 0.05
-"""Level of the tests."""
+ALPHA: Final = 0.05  # level of the tests
 
 
 @dataclass(frozen=True, kw_only=True)
 class Proportion:
-    """A share of flights, with its Clopper-Pearson intervals.
+    """A share of flights, with its Clopper-Pearson intervals."""
 
-    Attributes:
-        count: flights in which it happened.
-        flights: of how many.
-        share: count / flights; None of no flights.
-        lower: lower end of the two-sided interval.
-        upper: upper end of the two-sided interval.
-        lower_one_sided: what the share is at least, with all the doubt on that side.
-        upper_one_sided: what the share is at most, with all the doubt on that side.
-    """
-
-    count: int
-    flights: int
-    share: float | None
-    lower: float
-    upper: float
-    lower_one_sided: float
-    upper_one_sided: float
+    count: int  # flights in which it happened
+    flights: int  # of how many
+    share: float | None  # count / flights; None of no flights
+    lower: float  # lower end of the two-sided interval
+    upper: float  # upper end of the two-sided interval
+    lower_one_sided: float  # what the share is at least, with all the doubt on that side
+    upper_one_sided: float  # what the share is at most, with all the doubt on that side
 
 
 @dataclass(frozen=True, kw_only=True)
 class PairedDifference:
-    """The differences b - a of pairs.
+    """The differences b - a of pairs."""
 
-    Attributes:
-        pairs: how many.
-        mean: their mean; None of no pairs.
-        lower: lower end of the mean's t interval; None of fewer than two pairs.
-        upper: its upper end.
-        median: their median.
-        median_lower: lower end of the median's distribution-free interval; None where too few pairs give none.
-        median_upper: its upper end.
-    """
-
-    pairs: int
-    mean: float | None
-    lower: float | None
-    upper: float | None
-    median: float | None
-    median_lower: float | None
-    median_upper: float | None
+    pairs: int  # how many
+    mean: float | None = None  # their mean; None of no pairs
+    lower: float | None = None  # lower end of the mean's t interval; None of fewer than two pairs
+    upper: float | None = None  # its upper end
+    median: float | None = None  # their median
+    # lower end of the median's distribution-free interval; None where too few pairs give none
+    median_lower: float | None = None
+    median_upper: float | None = None  # its upper end
 
 
-def upper_bounds(counts: Array, trials: Array, confidence: float = CONFIDENCE) -> Array:
-    """(K,) one-sided upper bounds on proportions: the largest p that gives so few with probability 1 - confidence.
+def upper_bounds(counts: ArrayLike, trials: ArrayLike, confidence: float = CONFIDENCE) -> Array:
+    """One-sided upper bounds on proportions, one or (K,): the largest p that gives so few with chance 1 - confidence.
 
     Source: Clopper and Pearson, Biometrika 26 (1934); 1 where all happened, and of no trials.
     """
@@ -78,20 +59,9 @@ def upper_bounds(counts: Array, trials: Array, confidence: float = CONFIDENCE) -
     return np.where(some, bounds, 1.0)
 
 
-def lower_bounds(counts: Array, trials: Array, confidence: float = CONFIDENCE) -> Array:
-    """(K,) one-sided lower bounds on proportions; 0 where none happened."""
-    counts, trials = np.asarray(counts, float), np.asarray(trials, float)
-    return 1.0 - upper_bounds(trials - counts, trials, confidence)
-
-
-def upper_bound(count: int, trials: int, confidence: float = CONFIDENCE) -> float:
-    """One proportion's one-sided upper bound; see `upper_bounds`."""
-    return float(upper_bounds(np.array([count]), np.array([trials]), confidence)[0])
-
-
-def lower_bound(count: int, trials: int, confidence: float = CONFIDENCE) -> float:
-    """One proportion's one-sided lower bound; see `lower_bounds`."""
-    return float(lower_bounds(np.array([count]), np.array([trials]), confidence)[0])
+def lower_bounds(counts: ArrayLike, trials: ArrayLike, confidence: float = CONFIDENCE) -> Array:
+    """One-sided lower bounds on proportions, one or (K,); 0 where none happened."""
+    return 1.0 - upper_bounds(np.asarray(trials, float) - np.asarray(counts, float), trials, confidence)
 
 
 def proportion(count: int, flights: int, confidence: float = CONFIDENCE) -> Proportion:
@@ -101,11 +71,16 @@ def proportion(count: int, flights: int, confidence: float = CONFIDENCE) -> Prop
         count=count,
         flights=flights,
         share=count / flights if flights else None,
-        lower=lower_bound(count, flights, either),
-        upper=upper_bound(count, flights, either),
-        lower_one_sided=lower_bound(count, flights, confidence),
-        upper_one_sided=upper_bound(count, flights, confidence),
+        lower=float(lower_bounds(count, flights, either)),
+        upper=float(upper_bounds(count, flights, either)),
+        lower_one_sided=float(lower_bounds(count, flights, confidence)),
+        upper_one_sided=float(upper_bounds(count, flights, confidence)),
     )
+
+
+def share_of(happened: np.ndarray[Any, np.dtype[np.bool_]]) -> dict[str, Any]:
+    """The `Proportion` of the flights (K,) to which something happened, as plain data for JSON."""
+    return asdict(proportion(int(happened.sum()), happened.size))
 
 
 def holm(p_values: Sequence[float]) -> list[float]:
@@ -120,12 +95,7 @@ def holm(p_values: Sequence[float]) -> list[float]:
 
 
 def mcnemar(only_a: int, only_b: int) -> float:
-    """Two-sided p-value of McNemar's exact test: the discordant pairs are equally likely to be of either kind.
-
-    Args:
-        only_a: pairs in which it happened to the first alone.
-        only_b: pairs in which it happened to the second alone.
-    """
+    """Two-sided p-value of McNemar's exact test: a discordant pair is as likely to be of the first as of the second."""
     discordant = only_a + only_b
     return float(stats.binomtest(only_a, discordant).pvalue) if discordant else 1.0
 
@@ -133,14 +103,9 @@ def mcnemar(only_a: int, only_b: int) -> float:
 def paired_shares(only_a: int, only_b: int, pairs: int, confidence: float = CONFIDENCE) -> tuple[float, float]:
     """Interval of the difference of paired proportions, share of b - share of a: Tango's score interval.
 
-    It holds every difference that a score test does not reject; with no difference, that is McNemar's test.
+    It holds every difference that a score test does not reject; with no difference, that is McNemar's test.  Of all
+    `pairs`, at least one, it happened to the first alone in `only_a`, and to the second alone in `only_b`.
     Source: Tango, Statistics in Medicine 17 (1998).
-
-    Args:
-        only_a: pairs in which it happened to the first alone.
-        only_b: pairs in which it happened to the second alone.
-        pairs: all pairs, at least one.
-        confidence: of the interval.
     """
     z = float(stats.norm.ppf(0.5 * (1.0 + confidence)))
     estimate = (only_b - only_a) / pairs
@@ -170,22 +135,15 @@ def _score_variance(difference: float, only_a: int, only_b: int, pairs: int) -> 
 
 
 def paired_difference(a: Array, b: Array, confidence: float = CONFIDENCE) -> PairedDifference:
-    """Mean and median of b - a, each with its interval.
+    """Mean and median of b - a, (K,) finite each, with their intervals.
 
     The mean's is Student's t interval.  The median's has order statistics at its ends, by inverting the sign test, and
     asks nothing of the distribution (Conover, Practical Nonparametric Statistics, 1999, 3.2).
-
-    Args:
-        a: (K,) finite.
-        b: (K,) finite.
-        confidence: of each interval.
     """
     differences = np.asarray(b, float) - np.asarray(a, float)
     n = differences.size
     if not n:
-        return PairedDifference(
-            pairs=0, mean=None, lower=None, upper=None, median=None, median_lower=None, median_upper=None
-        )
+        return PairedDifference(pairs=0)
     mean = float(differences.mean())
     half = None
     if n > 1:

@@ -12,14 +12,13 @@ import pyarrow as pa
 
 from quadsim.errors import InputError, ParameterError
 from scenarios.campaign.results.events import Event, parse_event
-from scenarios.campaign.statistics.inference import lower_bound, upper_bound
+from scenarios.campaign.statistics.inference import lower_bounds, upper_bounds
 from scenarios.campaign.statistics.wording import count_of, percent
 
 EXAMPLE: Final = "P(violation) < 0.01 @ 95%"
 _SHARES: Final = (Decimal("1e-9"), 1 - Decimal("1e-9"))
 _CONFIDENCES: Final = (Decimal("0.5"), Decimal("0.999999"))
-_MOST_TOLD: Final = 10**9
-"""Flights beyond which a message says only that it takes more."""
+_MOST_TOLD: Final = 10**9  # flights beyond which a message says only that it takes more
 _FORM: Final = re.compile(
     r"P\s*\((?P<event>[^()]*)\)\s*(?P<operation><=|>=|<|>)\s*(?P<share>[^<>=@]+?)\s*@\s*(?P<confidence>[^@%]+?)\s*%",
     re.IGNORECASE,
@@ -28,21 +27,13 @@ _FORM: Final = re.compile(
 
 @dataclass(frozen=True, kw_only=True)
 class Requirement:
-    """What is asked: the probability of an event on one side of a share, with this confidence.
+    """What is asked: the probability of an event on one side of a share, with this confidence."""
 
-    Attributes:
-        text: as it was given.
-        event: whose probability.
-        operation: `<`, `<=`, `>` or `>=`.
-        share: the limit on the probability, from 1e-9 to 1 - 1e-9.
-        confidence: of the one-sided bound, from 0.5 to 0.999999.
-    """
-
-    text: str
-    event: Event
-    operation: str
-    share: float
-    confidence: float
+    text: str  # as it was given
+    event: Event  # whose probability
+    operation: str  # `<`, `<=`, `>` or `>=`
+    share: float  # the limit on the probability, from 1e-9 to 1 - 1e-9
+    confidence: float  # of the one-sided bound, from 0.5 to 0.999999
 
     @property
     def at_most(self) -> bool:
@@ -58,24 +49,17 @@ class Requirement:
 
 @dataclass(frozen=True, kw_only=True)
 class Judgement:
-    """Whether the flights support a requirement.
+    """Whether the flights support a requirement."""
 
-    Attributes:
-        requirement: what was asked.
-        count: flights in which the event happened.
-        flights: of how many.
-        bound: the one-sided Clopper-Pearson bound at the requirement's confidence: upper where the probability is to
-            be small, lower where it is to be large.
-        holds: whether the bound supports the requirement.
-        least_flights: how many flights it takes at the very least, all of them without the event where it is to be
-            rare, and all with it where it is to be frequent.
-    """
-
-    requirement: Requirement
-    count: int
-    flights: int
+    requirement: Requirement  # what was asked
+    count: int  # flights in which the event happened
+    flights: int  # of how many
+    # the one-sided Clopper-Pearson bound at the requirement's confidence: upper where the probability is to be small,
+    # lower where it is to be large
     bound: float
-    holds: bool
+    holds: bool  # whether the bound supports the requirement
+    # how many flights it takes at the very least, all of them without the event where it is to be rare, and all with it
+    # where it is to be frequent
     least_flights: int
 
     @property
@@ -134,14 +118,10 @@ def parse_requirement(text: str) -> Requirement:
 
 
 def judge(table: pa.Table, requirement: Requirement) -> Judgement:
-    """Hold a campaign's flights against a requirement.
+    """Hold a campaign's flights, `flights.parquet`, against a requirement.
 
     It holds when the one-sided Clopper-Pearson bound at its confidence is on the side that is asked for; so it takes
     flights enough, and no flights support nothing.
-
-    Args:
-        table: `flights.parquet`.
-        requirement: what is asked.
 
     Raises:
         UnknownNameError: the table has no column that the event names.
@@ -149,7 +129,7 @@ def judge(table: pa.Table, requirement: Requirement) -> Judgement:
     """
     happened = requirement.event.column(table)
     count, flights = int(happened.sum()), happened.size
-    bound = (upper_bound if requirement.at_most else lower_bound)(count, flights, requirement.confidence)
+    bound = _bound(requirement, count, flights)
     return Judgement(
         requirement=requirement,
         count=count,
@@ -169,13 +149,14 @@ def least_flights(requirement: Requirement) -> int:
     kept = math.log1p(-requirement.share) if requirement.at_most else math.log(requirement.share)
     n = max(1, math.ceil(math.log1p(-requirement.confidence) / kept))
     near = range(max(1, n - 1), n + 2)
-    return next((k for k in near if requirement.supported_by(_best_bound(requirement, k))), n)
+    best = ((k, _bound(requirement, 0 if requirement.at_most else k, k)) for k in near)
+    return next((k for k, bound in best if requirement.supported_by(bound)), n)
 
 
-def _best_bound(requirement: Requirement, n: int) -> float:
-    if requirement.at_most:
-        return upper_bound(0, n, requirement.confidence)
-    return lower_bound(n, n, requirement.confidence)
+def _bound(requirement: Requirement, count: int, flights: int) -> float:
+    """The one-sided bound on the probability that is to be on the side that is asked for."""
+    bounds = upper_bounds if requirement.at_most else lower_bounds
+    return float(bounds(count, flights, requirement.confidence))
 
 
 def _number(owner: str, name: str, given: str, low: Decimal, high: Decimal) -> float:

@@ -6,69 +6,86 @@ they are; a caption has how many they are and how far out.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
 import pyarrow as pa
 
+from quadsim.report.palette import BOUND, LINES
 from quadsim.state import Array
-from scenarios.campaign.results.columns import Edges, Rows, draw_names, is_number, numbers, texts, verdicts
 from scenarios.campaign.results.events import Flags
-from scenarios.campaign.results.table import DRAW, unit_of
+from scenarios.campaign.results.table import DRAW, Edges, Rows, draw_names, is_number, numbers, texts, unit_of, verdicts
 from scenarios.campaign.statistics.dependence import Trend, trend
-from scenarios.campaign.statistics.outliers import margin_ends, robust_ends
 from scenarios.campaign.statistics.wording import count_of, label
 
-COURSE: Final = "half of the flights are above"
-"""What a curve through the flights of a scatter tells."""
-_GAP: Final = 0.06
-"""From the axis' end to what is drawn at the edge, as a share of the axis."""
+LOWEST_MARGIN: Final = -2.0
+"""Margins below this are drawn at the foot, so that a lost flight does not flatten all others."""
+_LEAST_DEPTH: Final = 0.25  # share of the height above 0 that is shown below it, however far from it the margins are
+_FENCE: Final = 5.0  # quartile ranges beyond the quartiles up to which values are drawn where they are
+
+
+def robust_ends(values: Array) -> tuple[float, float]:
+    """The smallest and the largest of some values, some of them finite, without those far out."""
+    finite = values[np.isfinite(values)]
+    low, high = _fences(finite)
+    inside = finite[(finite >= low) & (finite <= high)]
+    return float(inside.min()), float(inside.max())
+
+
+def lowest_shown(values: Array) -> float:
+    """The lowest of such margins that may be shown where it is: `LOWEST_MARGIN`, but where most are lower still."""
+    finite = values[np.isfinite(values)]
+    return LOWEST_MARGIN if np.median(finite) > LOWEST_MARGIN else float(np.percentile(finite, 5))
+
+
+def _fences(finite: Array) -> tuple[float, float]:
+    """Five quartile ranges beyond the quartiles."""
+    p5, q1, q3, p95 = np.percentile(finite, [5, 25, 75, 95])
+    reach = _FENCE * ((q3 - q1) or (p95 - p5)) or np.inf
+    return q1 - reach, q3 + reach
+
+
+def margin_ends(values: Array) -> tuple[float, float]:
+    """The ends between which worst margins are drawn where they are; 0, the end of what is allowed, is among them."""
+    finite = values[np.isfinite(values)]
+    fence, above = _fences(finite)
+    high = max(0.0, float(finite[finite <= above].max()))
+    below = max(min(fence, -_LEAST_DEPTH * high), lowest_shown(finite))
+    return min(0.0, float(finite[finite >= below].min())), high
+
+
+COURSE: Final = "half of the flights are above"  # what a curve through the flights of a scatter tells
+_GAP: Final = 0.06  # from the axis' end to what is drawn at the edge, as a share of the axis
 _MOST_POINTS: Final = 18_000
 """Points that all scatters of a page may have together: a page of 10 000 flights stays near 6 MB and quick to draw."""
+_MOST_PAIRS: Final = 4000  # that are drawn of a comparison
 
 
 @dataclass(frozen=True, kw_only=True)
 class Margins:
-    """The worst margins as they are drawn.
+    """The worst margins as they are drawn."""
 
-    Attributes:
-        y: (K,) heights; at the foot where a flight has no margin, or one below the axis, at the top of one above it.
-        true: (K,) the margins, NaN where there is none.
-        edge: (K,) `down`, `up`, or empty where a flight is drawn where it is.
-        shown: the ends between which margins are drawn where they are.
-        ends: of the axis, with what is drawn at its edges.
-    """
-
+    # (K,) heights; at the foot where a flight has no margin, or one below the axis, at the top of one above it
     y: Array
-    true: Array
-    edge: Edges
-    shown: tuple[float, float]
-    ends: tuple[float, float]
+    true: Array  # (K,) the margins, NaN where there is none
+    edge: Edges  # (K,) `down`, `up`, or empty where a flight is drawn where it is
+    shown: tuple[float, float]  # the ends between which margins are drawn where they are
+    ends: tuple[float, float]  # of the axis, with what is drawn at its edges
 
 
 @dataclass(frozen=True, kw_only=True)
 class Cloud:
-    """A drawn parameter of every flight, as horizontal positions.
+    """A drawn parameter of every flight, as horizontal positions."""
 
-    Attributes:
-        name: the parameter.
-        label: its name, with its unit where it has one.
-        x: (K,) its values; whole numbers, spread a little, where it is drawn from names.
-        edge: (K,) `left`, `right`, or empty where a flight is drawn where it is.
-        true: (K,) its values; as `x` where it is drawn from names.
-        names: what stands at 0, 1, ...; empty where it is a number.
-        course: of the worst margin over it; None where there are too few flights, and of names.
-    """
-
-    name: str
-    label: str
-    x: Array
-    edge: Edges
-    true: Array
-    names: tuple[str, ...]
-    course: Trend | None
+    name: str  # the parameter
+    label: str  # its name, with its unit where it has one
+    x: Array  # (K,) its values; whole numbers, spread a little, where it is drawn from names
+    edge: Edges  # (K,) `left`, `right`, or empty where a flight is drawn where it is
+    true: Array  # (K,) its values; as `x` where it is drawn from names
+    names: tuple[str, ...]  # what stands at 0, 1, ...; empty where it is a number
+    course: Trend | None  # of the worst margin over it; None where there are too few flights, and of names
 
 
 def margins(table: pa.Table) -> Margins | None:
@@ -92,7 +109,12 @@ def clouds(table: pa.Table, drawn: Margins) -> list[Cloud]:
         column = DRAW + name
         text = label(name, unit_of(table, column))
         if not is_number(table, column):
-            found.append(_levels(name, text, texts(table, column)))
+            values = texts(table, column)
+            names = tuple(sorted(set(values)))
+            spread = np.random.default_rng(0).uniform(-0.3, 0.3, values.size)  # as every time
+            x = np.array([names.index(value) for value in values], float) + spread
+            unclipped = np.full(x.size, "")
+            found.append(Cloud(name=name, label=text, x=x, edge=unclipped, true=x, names=names, course=None))
             continue
         true = numbers(table, column)
         low, high = robust_ends(true)
@@ -126,53 +148,84 @@ def thinning(table: pa.Table) -> str:
         for verdict, found in verdicts(table).items()
         if shown[verdict].size < found.sum()
     ]
-    if not parts:
-        return ""
-    return f"Drawn are {', '.join(parts)}, evenly spread by number; all others are shown in full."
+    return f"Drawn are {', '.join(parts)}, evenly spread by number; all others are shown in full." if parts else ""
 
 
 def clipping(drawn: Margins, parameters: list[Cloud]) -> str:
     """Which flights are drawn at the edges, how many, and how far out they are; empty where there are none."""
-    parts = [*_beyond_margins(drawn), *(part for cloud in parameters for part in _beyond(cloud))]
-    if not parts:
-        return ""
-    return f"Triangles at the edges stand for flights beyond the axes: {'; '.join(parts)}."
+    none, (low, high) = np.isnan(drawn.true), drawn.shown
+    parts = _told(drawn.true, (drawn.edge == "down") & ~none, "below", low)
+    if none.any():
+        parts.append(f"{count_of(int(none.sum()), 'flight')} without a margin, at the foot")
+    parts += _told(drawn.true, drawn.edge == "up", "above", high)
+    for cloud in parameters:
+        for edge, side, end in (("left", "below", np.min), ("right", "above", np.max)):
+            beyond = cloud.edge == edge
+            parts += _told(cloud.true, beyond, side, end(cloud.true[~beyond]), of=cloud.name)
+    return f"Triangles at the edges stand for flights beyond the axes: {'; '.join(parts)}." if parts else ""
 
 
-def _beyond_margins(drawn: Margins) -> Iterator[str]:
-    none = int(np.isnan(drawn.true).sum())
-    below, above = (drawn.edge == "down") & ~np.isnan(drawn.true), drawn.edge == "up"
-    if below.any():
-        yield _told(below, "with a margin below", drawn.shown[0], "down to", float(drawn.true[below].min()))
-    if none:
-        yield f"{count_of(none, 'flight')} without a margin, at the foot"
-    if above.any():
-        yield _told(above, "with a margin above", drawn.shown[1], "up to", float(drawn.true[above].max()))
-
-
-def _beyond(cloud: Cloud) -> Iterator[str]:
-    left, right = cloud.edge == "left", cloud.edge == "right"
-    if left.any():
-        least = float(cloud.true[~left].min())
-        yield _told(left, f"with {cloud.name} below", least, "down to", float(cloud.true[left].min()))
-    if right.any():
-        most = float(cloud.true[~right].max())
-        yield _told(right, f"with {cloud.name} above", most, "up to", float(cloud.true[right].max()))
-
-
-def _told(beyond: Flags, how: str, limit: float, as_far: str, extreme: float) -> str:
-    return f"{count_of(int(beyond.sum()), 'flight')} {how} {limit:.3g}, {as_far} {extreme:.3g}"
-
-
-def _levels(name: str, text: str, values: np.ndarray[Any, np.dtype[np.object_]]) -> Cloud:
-    names = tuple(sorted(set(values)))
-    spread = np.random.default_rng(0).uniform(-0.3, 0.3, values.size)  # as every time
-    x = np.array([names.index(value) for value in values], float) + spread
-    return Cloud(name=name, label=text, x=x, edge=np.full(x.size, ""), true=x, names=names, course=None)
+def _told(
+    values: Array, beyond: Flags, side: str, limit: float, *, of: str = "a margin", thing: str = "flight"
+) -> list[str]:
+    """How many have a value too far to one side to be drawn there, and how far out these are; nothing of none."""
+    if not beyond.any():
+        return []
+    as_far, extreme = ("down to", np.min) if side == "below" else ("up to", np.max)
+    count = count_of(int(beyond.sum()), thing)
+    return [f"{count} with {of} {side} {limit:.3g}, {as_far} {extreme(values[beyond]):.3g}"]
 
 
 def _evenly(rows: Rows, most: int) -> Rows:
     if rows.size <= most:
         return rows
-    places = np.round(np.linspace(0.0, rows.size - 1.0, most)).astype(int)
-    return np.asarray(rows[places])
+    return np.asarray(rows[np.round(np.linspace(0.0, rows.size - 1.0, most)).astype(int)])
+
+
+@dataclass(frozen=True, kw_only=True)
+class ShownMargins:
+    """Worst margins of pairs of flights, of a first and a second campaign, as they are drawn."""
+
+    flights: Rows  # (P,) their numbers
+    margins: Array  # (P, 2) of the first and the second campaign; what is beyond the axes is at their edge
+    true: Array  # (P, 2) the margins themselves
+    edge: Edges  # (P,) `down`, `up`, `left` or `right` where a pair is beyond the axes; else empty
+    beyond: str  # which pairs are drawn at the edges, and how far out they are, as a sentence; empty of none
+    kind: np.ndarray[Any, np.dtype[np.object_]]  # (P,) which of the two failed, in words
+    colours: dict[str, str]  # colour of each kind
+    lowest: float  # low end of both axes
+    highest: float  # high end of both axes
+    left_out: int  # pairs that are not drawn, as there are too many
+
+
+def paired_margins(a: pa.Table, b: pa.Table, failed: tuple[Flags, ...], names: Sequence[str]) -> ShownMargins | None:
+    """The worst margins of all pairs, and which of both (K,) failed, as drawn; None of fewer than two with margins."""
+    pairs = np.stack([numbers(a, "worst_margin"), numbers(b, "worst_margin")], axis=1)
+    there = np.flatnonzero(np.isfinite(pairs).all(axis=1))
+    if there.size < 2:
+        return None
+    rows, every = _evenly(there, _MOST_PAIRS), pairs[there]
+    kinds = ("none failed", f"{names[0]} alone failed", f"{names[1]} alone failed", "both failed")
+    low, high = margin_ends(every.ravel())
+    true = pairs[rows]
+    gap = _GAP * ((high - low) or 1.0)
+    drawn = np.where(true < low, low - gap, np.where(true > high, high + gap, true))
+    first, second = true.T  # the second campaign's is the vertical one
+    sides = [second < low, second > high, first < low, first > high]
+    least, most = every.min(axis=1), every.max(axis=1)
+    beyond = [
+        *_told(least, least < low, "below", low, thing="pair"),
+        *_told(most, most > high, "above", high, thing="pair"),
+    ]
+    return ShownMargins(
+        flights=numbers(a, "flight")[rows].astype(np.int32),
+        margins=drawn,
+        true=true,
+        edge=np.select(sides, ["down", "up", "left", "right"], default=""),
+        beyond=f"Triangles at the edges stand for pairs beyond the axes: {'; '.join(beyond)}." if beyond else "",
+        kind=np.array(kinds, object)[failed[0][rows] + 2 * failed[1][rows].astype(int)],
+        colours=dict(zip(kinds, (LINES[0], LINES[2], LINES[1], BOUND), strict=True)),
+        lowest=float(drawn.min()) - 0.6 * gap,
+        highest=float(drawn.max()) + 0.6 * gap,
+        left_out=there.size - rows.size,
+    )

@@ -21,43 +21,26 @@ from scenarios.campaign.statistics.inference import Proportion, proportion
 
 Counts = np.ndarray[Any, np.dtype[np.int_]]
 
-_ROUNDING: Final = 1.0 + 1e-7
-"""P-values of which one is no larger than this times the other are the same."""
+_ROUNDING: Final = 1.0 + 1e-7  # p-values of which one is no larger than this times the other are the same
 
 
 @dataclass(frozen=True, kw_only=True)
 class Split:
-    """A threshold on a drawn number.
+    """A threshold on a drawn number."""
 
-    Attributes:
-        threshold: a round number from `below` to `above`: flights up to it are on the low side.
-        below: the largest value on the low side.
-        above: the smallest value on the high side.
-        low: how often the event happened on the low side.
-        high: how often on the high side.
-        p_there: Fisher's two-sided p-value at this threshold, as if it had been chosen beforehand.
-        p: probability that the best threshold is as good by chance.
-    """
-
-    threshold: float
-    below: float
-    above: float
-    low: Proportion
-    high: Proportion
-    p_there: float
-    p: float
+    threshold: float  # a round number from `below` to `above`: flights up to it are on the low side
+    below: float  # the largest value on the low side
+    above: float  # the smallest value on the high side
+    low: Proportion  # how often the event happened on the low side
+    high: Proportion  # how often on the high side
+    p_there: float  # Fisher's two-sided p-value at this threshold, as if it had been chosen beforehand
+    p: float  # probability that the best threshold is as good by chance
 
 
 def best_splits(columns: Mapping[str, Array], happened: Flags) -> dict[str, Split | None]:
-    """The best threshold on each of several drawn numbers.
+    """The best threshold on each of several drawn numbers, (K,) by name, for an event that happened (K,) or not.
 
-    Args:
-        columns: (K,) values of each drawn number.
-        happened: (K,) whether the event happened.
-
-    Returns:
-        By name; None of a number that is always the same or not always there, and of an event that happened never or
-        always.
+    None of a number that is always the same or not always there, and of an event that happened never or always.
     """
     if happened.all() or not happened.any():
         return dict.fromkeys(columns)

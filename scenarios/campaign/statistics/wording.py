@@ -10,8 +10,7 @@ from typing import Any, Final
 from quadsim.report.table import ABSENT
 
 _MOST_DECIMALS: Final = 8
-_SHORTEST: Final = 5
-"""Characters that a line of every name may have."""
+_SHORTEST: Final = 5  # characters that a line of every name may have
 
 
 def percent(share: float | None, digits: int = 2) -> str:

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mpc.baselines.allocation import Allocation, allocate, make_allocation, wrench_of
+from mpc.baselines.allocation import Allocation, allocate, make_allocation
 from quadsim.assets import vehicle_path
 from quadsim.vehicle import load_vehicle
 
@@ -27,14 +27,14 @@ def box(name: str, seed: int) -> tuple[np.ndarray, np.ndarray]:
 
 def missed(allocation: Allocation, wrench: np.ndarray, speeds: np.ndarray) -> np.ndarray:
     """What of a wrench is not given, in units of what one rotor at hover gives."""
-    return (wrench_of(allocation, speeds) - wrench) / allocation.scale
+    return (allocation.M @ speeds**2 - wrench) / allocation.scale
 
 
 @given(name=NAMES, shares=SHARES)
 def test_a_wrench_that_can_be_given_is(name: str, shares: np.ndarray) -> None:
     vehicle, allocation = VEHICLES[name], ALLOCATIONS[name]
     speeds = shares * vehicle.speed_max
-    answer = allocate(allocation, wrench_of(allocation, speeds), np.zeros(4), np.full(4, vehicle.speed_max))
+    answer = allocate(allocation, allocation.M @ speeds**2, np.zeros(4), np.full(4, vehicle.speed_max))
     np.testing.assert_allclose(answer**2, speeds**2, atol=1e-9 * vehicle.speed_max**2)
 
 
@@ -44,7 +44,7 @@ def test_thrust_roll_and_pitch_are_kept_and_yaw_gives_way(name: str, shares: np.
     allocation = ALLOCATIONS[name]
     lower, upper = box(name, seed)
     possible = np.sqrt(lower**2 + shares * (upper**2 - lower**2))
-    wrench = wrench_of(allocation, possible)
+    wrench = allocation.M @ possible**2
     wrench[3] = yaw * allocation.scale[3]
     speeds = allocate(allocation, wrench, lower, upper)
     error = missed(allocation, wrench, speeds)

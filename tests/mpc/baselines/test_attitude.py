@@ -12,7 +12,6 @@ from scipy.spatial.transform import Rotation
 
 from mpc.baselines.attitude import (
     attitude_error,
-    attitude_error_function,
     attitude_for,
     hat,
     limit_force,
@@ -24,6 +23,11 @@ from mpc.baselines.attitude import (
 SEEDS = st.integers(0, 2**32 - 1)
 
 
+def psi_of(R: np.ndarray, R_d: np.ndarray) -> float:
+    """Psi(R, R_d) = tr(I - R_d' R) / 2, in [0, 2].  Lee, Leok, McClamroch (2010)."""
+    return 0.5 * (3.0 - float(np.trace(R_d.T @ R)))
+
+
 def rotations(seed: int, count: int = 2) -> list[np.ndarray]:
     return list(Rotation.random(count, random_state=seed).as_matrix())
 
@@ -32,20 +36,20 @@ def rotations(seed: int, count: int = 2) -> list[np.ndarray]:
 def test_the_error_function_is_a_distance_and_e_r_its_gradient(seed: int) -> None:
     """Psi >= 0, zero at R_d alone, symmetric; its change along R hat(eta) is e_R . eta; |e_R|^2 = Psi (2 - Psi)."""
     R, R_d = rotations(seed)
-    psi, e_R = attitude_error_function(R, R_d), attitude_error(R, R_d)
+    psi, e_R = psi_of(R, R_d), attitude_error(R, R_d)
     assert -1e-12 <= psi <= 2.0 + 1e-12
-    assert attitude_error_function(R_d, R) == pytest.approx(psi, abs=1e-12)
-    assert attitude_error_function(R, R) == pytest.approx(0.0, abs=1e-12)
+    assert psi_of(R_d, R) == pytest.approx(psi, abs=1e-12)
+    assert psi_of(R, R) == pytest.approx(0.0, abs=1e-12)
     eta = np.random.default_rng(seed).normal(size=3)
     h = 1e-6
-    ends = [attitude_error_function(R @ Rotation.from_rotvec(s * h * eta).as_matrix(), R_d) for s in (1.0, -1.0)]
+    ends = [psi_of(R @ Rotation.from_rotvec(s * h * eta).as_matrix(), R_d) for s in (1.0, -1.0)]
     assert (ends[0] - ends[1]) / (2.0 * h) == pytest.approx(float(e_R @ eta), abs=1e-8)
     assert float(e_R @ e_R) == pytest.approx(psi * (2.0 - psi), abs=1e-9)
 
 
 def test_half_a_turn_is_as_far_as_it_goes_and_has_no_gradient() -> None:
     R = np.diag([1.0, -1.0, -1.0])
-    assert attitude_error_function(R, np.eye(3)) == pytest.approx(2.0)
+    assert psi_of(R, np.eye(3)) == pytest.approx(2.0)
     np.testing.assert_allclose(attitude_error(R, np.eye(3)), 0.0, atol=1e-15)
 
 

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from mpc.baselines.attitude import attitude_error_function, vee
+from mpc.baselines.attitude import Motion, motion_of, vee
+from mpc.baselines.geometric import GeometricController, Integrals, Wanted
 from mpc.baselines.preview import Target
-from mpc.baselines.tracking import Gains, Integrals, Motion, Wanted, geometric_wrench, integrate, motion_of
 from quadsim.controller import Moment
 from quadsim.flight.log import FlightLog
 from quadsim.state import make_state, tilt
@@ -37,9 +37,9 @@ TARGET = Target(
 )
 
 
-def wanted_after(gains: Gains, vehicle: Vehicle, h: float) -> tuple[np.ndarray, Wanted]:
+def wanted_after(law: GeometricController, vehicle: Vehicle, h: float) -> tuple[np.ndarray, Wanted]:
     """R_c and what the law says of it, `h` [s] on, the vehicle having moved under the law's thrust."""
-    wrench, _ = geometric_wrench(gains, vehicle, MOTION, TARGET, NONE)
+    wrench, _ = law.wrench(MOTION, TARGET, NONE)
     acceleration = wrench[0] / vehicle.mass * MOTION.attitude[:, 2] - np.array([0.0, 0.0, vehicle.gravity])
     motion = replace(
         MOTION,
@@ -54,16 +54,16 @@ def wanted_after(gains: Gains, vehicle: Vehicle, h: float) -> tuple[np.ndarray, 
         yaw=TARGET.yaw + h * TARGET.yaw_rate,
         yaw_rate=TARGET.yaw_rate + h * TARGET.yaw_acceleration,
     )
-    _, wanted = geometric_wrench(gains, vehicle, motion, target, NONE)
+    _, wanted = law.wrench(motion, target, NONE)
     return wanted.attitude, wanted
 
 
 def test_the_wanted_rates_and_their_change_are_those_of_the_wanted_attitude(
     craft: Vehicle, build: Callable[..., Any]
 ) -> None:
-    gains, h = build("geometric", craft).gains, 1e-5
-    now = wanted_after(gains, craft, 0.0)[1]
-    (R_after, after), (R_before, before) = wanted_after(gains, craft, h), wanted_after(gains, craft, -h)
+    law, h = build("geometric", craft), 1e-5
+    now = wanted_after(law, craft, 0.0)[1]
+    (R_after, after), (R_before, before) = wanted_after(law, craft, h), wanted_after(law, craft, -h)
     rates = vee(now.attitude.T @ (R_after - R_before) / (2.0 * h))
     assert np.abs(now.rates).max() > 0.1
     np.testing.assert_allclose(now.rates, rates, atol=1e-6)
@@ -74,27 +74,27 @@ def test_thrust_lies_along_the_body_and_torque_leads_to_the_wanted_attitude(
     vehicle: Vehicle, build: Callable[..., Any]
 ) -> None:
     """Held at rest, Psi falls from any attitude under the moment alone: d/dt of Psi's rate is -e_R' (k_R e_R)."""
-    gains = build("geometric", vehicle).gains
+    law = build("geometric", vehicle)
     rng = np.random.default_rng(3)
     for attitude in Rotation.random(20, random_state=5).as_matrix():
         motion = replace(MOTION, attitude=attitude, rates=np.zeros(3), velocity=np.zeros(3), position=np.zeros(3))
         here = replace(
             TARGET, position=0.1 * rng.normal(size=3), velocity=np.zeros(3), acceleration=np.zeros(3), yaw_rate=0.0
         )
-        wrench, wanted = geometric_wrench(gains, vehicle, motion, here, NONE)
+        wrench, wanted = law.wrench(motion, here, NONE)
         at_rest = vee(wanted.attitude.T @ attitude)
         ahead = -attitude.T @ wanted.attitude @ wanted.acceleration
         turning = wrench[1:] / np.array(vehicle.inertia)
         rates_wanted = attitude.T @ wanted.attitude @ wanted.rates
-        np.testing.assert_allclose(turning, -gains.k_R * at_rest + gains.k_Omega * rates_wanted - ahead, atol=1e-9)
+        np.testing.assert_allclose(turning, -law.k_R * at_rest + law.k_Omega * rates_wanted - ahead, atol=1e-9)
 
 
 def test_a_wanted_force_beyond_the_tilt_limit_is_held_and_counts_as_at_rest(
     vehicle: Vehicle, build: Callable[..., Any]
 ) -> None:
-    gains = build("geometric", vehicle, tilt_max=20.0).gains
+    law = build("geometric", vehicle, tilt_max=20.0)
     far = replace(TARGET, position=np.array([50.0, 0.0, 0.0]), yaw_rate=0.0, yaw_acceleration=0.0)
-    _, wanted = geometric_wrench(gains, vehicle, MOTION, far, NONE)
+    _, wanted = law.wrench(MOTION, far, NONE)
     assert math.degrees(math.acos(wanted.attitude[2, 2])) == pytest.approx(20.0)
     np.testing.assert_allclose(wanted.rates, 0.0, atol=1e-12)
     np.testing.assert_allclose(wanted.acceleration, 0.0, atol=1e-12)
@@ -102,20 +102,19 @@ def test_a_wanted_force_beyond_the_tilt_limit_is_held_and_counts_as_at_rest(
 
 def test_a_heading_half_a_turn_away_is_sought_a_quarter_turn_away(vehicle: Vehicle, build: Callable[..., Any]) -> None:
     """Where e_R itself would vanish, it turns with all its might."""
-    gains, state = build("geometric", vehicle).gains, make_state()
+    law, state = build("geometric", vehicle), make_state()
     rest = {"position": np.zeros(3), "velocity": np.zeros(3), "acceleration": np.zeros(3)}
     for yaw in (math.pi, -math.pi, 3.0):
         target = Target(**rest, yaw=yaw, yaw_rate=0.0, yaw_acceleration=0.0)
-        wrench, _ = geometric_wrench(gains, vehicle, motion_of(state), target, NONE)
-        assert abs(wrench[3]) == pytest.approx(gains.k_R[2] * vehicle.inertia[2])
+        wrench, _ = law.wrench(motion_of(state), target, NONE)
+        assert abs(wrench[3]) == pytest.approx(law.k_R[2] * vehicle.inertia[2])
 
 
 def test_integrals_stop_at_their_limits(vehicle: Vehicle, build: Callable[..., Any]) -> None:
-    controller = build("geometric", vehicle, integral=True, sigma=0.5, sigma_R=0.25)
-    integrals, gains = NONE, controller.gains
+    law, integrals = build("geometric", vehicle, integral=True, sigma=0.5, sigma_R=0.25), NONE
     for _ in range(1000):
-        _, wanted = geometric_wrench(gains, vehicle, MOTION, TARGET, integrals)
-        integrals = integrate(gains, integrals, MOTION, TARGET, wanted, 0.05)
+        _, wanted = law.wrench(MOTION, TARGET, integrals)
+        integrals = law.integrate(integrals, MOTION, TARGET, wanted)
     np.testing.assert_allclose(np.abs(integrals.translation), 0.5)
     np.testing.assert_allclose(np.abs(integrals.rotation), 0.25)
 
@@ -131,7 +130,7 @@ def test_it_recovers_from_large_angles(
     log = fly_from(controller, craft, state, periods=360, course=np.array([0.0, 0.0, 100.0, yaw]))
     assert log.reason is None
     wanted = Rotation.from_euler("Z", yaw).as_matrix()
-    psi = [attitude_error_function(motion_of(row).attitude, wanted) for row in log.control.truth]
+    psi = [0.5 * (3.0 - np.trace(wanted.T @ motion_of(row).attitude)) for row in log.control.truth]
     assert psi[0] > 0.8
     assert psi[-1] < 1e-3
     assert tilt(log.control.truth)[60:].max() < math.radians(75.0)
@@ -144,14 +143,14 @@ def test_a_spinning_body_is_held_against_its_own_gyroscopic_torque(
     hummingbird_like: Vehicle, build: Callable[..., Any]
 ) -> None:
     """Upright, with errors of rate alone, J Omega' is -J k_Omega Omega and nothing else."""
-    gains, inertia = build("geometric", hummingbird_like).gains, np.array(hummingbird_like.inertia)
+    law, inertia = build("geometric", hummingbird_like), np.array(hummingbird_like.inertia)
     rates = np.array([0.5, -0.4, 0.6])
     motion = Motion(position=np.zeros(3), velocity=np.zeros(3), attitude=np.eye(3), rates=rates, yaw=0.0)
     rest = {"position": np.zeros(3), "velocity": np.zeros(3), "acceleration": np.zeros(3)}
     target = Target(**rest, yaw=0.0, yaw_rate=0.0, yaw_acceleration=0.0)
-    wrench, wanted = geometric_wrench(gains, hummingbird_like, motion, target, NONE)
+    wrench, wanted = law.wrench(motion, target, NONE)
     resulting = (wrench[1:] - np.cross(rates, inertia * rates)) / inertia
-    np.testing.assert_allclose(resulting, wanted.acceleration - gains.k_Omega * rates, atol=1e-9)
+    np.testing.assert_allclose(resulting, wanted.acceleration - law.k_Omega * rates, atol=1e-9)
 
 
 def test_integrals_rest_while_the_rotors_have_no_more(vehicle: Vehicle, build: Callable[..., Any]) -> None:

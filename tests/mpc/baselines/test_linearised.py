@@ -10,12 +10,11 @@ import pytest
 import scipy.linalg
 
 from mpc.baselines.allocation import allocate
-from mpc.baselines.cascade import Memory, fly_cascade
-from mpc.baselines.geometric import GeometricController
+from mpc.baselines.attitude import motion_of
+from mpc.baselines.geometric import GeometricController, Integrals
 from mpc.baselines.lqr import LQRSettings, lqr_gain
-from mpc.baselines.pid import CascadedPID
+from mpc.baselines.pid import CascadedPID, Memory
 from mpc.baselines.preview import Target
-from mpc.baselines.tracking import Integrals, geometric_wrench, integrate, motion_of
 from mpc.model import LinearModel, continuous_model, discretise, hover_model
 from mpc.ocp import Objective
 from quadsim.errors import ParameterError
@@ -42,20 +41,17 @@ def pid_law(controller: CascadedPID) -> Law:
         before = Memory(
             velocity_integral=memory[:3], rate_integral=memory[3:6], velocity=memory[6:9], rates=memory[9:12]
         )
-        lower, upper = NO_BOUNDS
-        speeds, after = fly_cascade(
-            controller.gains, controller.body, before, state, AT_REST, lower=lower, upper=upper, period=PERIOD
-        )
+        speeds, after = controller.fly(before, state, AT_REST, *NO_BOUNDS)
         return speeds, np.concatenate([after.velocity_integral, after.rate_integral, after.velocity, after.rates])
 
     return law
 
 
-def geometric_law(controller: GeometricController, vehicle: Vehicle, allocation: Any) -> Law:
+def geometric_law(controller: GeometricController, allocation: Any) -> Law:
     def law(state: Array, memory: Array) -> tuple[Array, Array]:
         integrals, motion = Integrals(translation=memory[:3], rotation=memory[3:]), motion_of(state)
-        wrench, wanted = geometric_wrench(controller.gains, vehicle, motion, AT_REST, integrals)
-        after = integrate(controller.gains, integrals, motion, AT_REST, wanted, PERIOD)
+        wrench, wanted = controller.wrench(motion, AT_REST, integrals)
+        after = controller.integrate(integrals, motion, AT_REST, wanted)
         return allocate(allocation, wrench, *NO_BOUNDS), np.concatenate([after.translation, after.rotation])
 
     return law
@@ -97,7 +93,7 @@ def law_of(name: str, vehicle: Vehicle, build: Callable[..., Any]) -> tuple[Law,
         gain = build("lqr", vehicle).gain
         return (lambda state, memory: (-gain @ state, memory)), 0
     controller = build("geometric", vehicle, integral=name == "geometric with integrals")
-    law, allocation = geometric_law(controller, vehicle, build("pid", vehicle).body.allocation), 6
+    law, allocation = geometric_law(controller, build("pid", vehicle).allocation), 6
     if name == "geometric with integrals":
         return law, allocation
     return (lambda state, memory: (law(state, np.zeros(6))[0], memory)), 0
@@ -123,11 +119,11 @@ def test_the_radius_tells_an_unstable_loop(vehicle: Vehicle, build: Callable[...
 def test_the_feed_forward_separates_position_from_attitude(craft: Vehicle, build: Callable[..., Any]) -> None:
     """(s^2 + k_Omega s + k_R)(s^2 + k_v s + k_x): fed back continuously, both pairs are where their gains put them."""
     controller = build("geometric", craft)
-    law, gains = geometric_law(controller, craft, build("pid", craft).body.allocation), controller.gains
+    law, settings = geometric_law(controller, build("pid", craft).allocation), controller.settings
     K, _ = jacobian(lambda state, memory: (law(state, np.zeros(6))[0], memory), 12)
     A, B = continuous_model(craft)
     poles = np.linalg.eigvals(A + B @ K)
-    pairs = [(gains.k_v, gains.k_x)] * 3 + list(zip(gains.k_Omega, gains.k_R, strict=True))
+    pairs = [(settings.k_v, settings.k_x)] * 3 + list(zip(controller.k_Omega, controller.k_R, strict=True))
     expected = np.concatenate([np.roots([1.0, *pair]) for pair in pairs])
     np.testing.assert_allclose(np.sort_complex(poles.round(6)), np.sort_complex(expected.round(6)), atol=1e-3)
 

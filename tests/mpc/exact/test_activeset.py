@@ -20,7 +20,7 @@ from mpc.ocp import Problem
 from mpc.paper.condensed import condensed
 from mpc.qp import QP, Solution, Vectors, kkt_residuals
 from mpc.solvers import QPSolver, Way
-from mpc.solvers.piqp_dense import PiqpDense
+from mpc.solvers.piqp_backends import PiqpDense
 from quadsim.controller import ACCEPTED, SOLVED
 from quadsim.state import Array
 
@@ -28,13 +28,15 @@ from quadsim.state import Array
 class Rows:
     """min 1/2 v' P v + c' v over lower <= G v <= upper, some rows with a penalty l1 e + l2 e^2 on their violation e."""
 
-    def __init__(self, P: Array, c: Array, G: Array, lower: Array, upper: Array, l1: Array, l2: Array) -> None:
+    def __init__(
+        self, P: Array, c: Array, G: Array, lower: Array, upper: Array, l1: Array, l2: Array, channels: int = 1
+    ) -> None:
         self.P, self.c, self.G, self.lower, self.upper, self.l1, self.l2 = P, c, G, lower, upper, l1, l2
         root = np.linalg.cholesky(P)
         half = scipy.linalg.solve_triangular(root, G.T, lower=True)
         self.free = -scipy.linalg.cho_solve((root, True), c)
         self.R = scipy.linalg.solve_triangular(root, half, lower=True, trans="T")
-        self.set = ActiveSet(half.T @ half, l1, l2)
+        self.set = ActiveSet(half.T @ half, l1, l2, channels)
 
     def solve(self, *starts: Side, most: int = module.MOST_STEPS) -> Solution | None:
         """Of `whole`; None where the method gives up."""
@@ -98,6 +100,18 @@ def random_rows(rng: np.random.Generator, *, n: int, rows: int, soft: float, lea
     return Rows(
         factor @ factor.T + 0.1 * np.eye(n), 3.0 * rng.normal(size=n), rng.normal(size=(rows, n)), lower, upper, l1, l2
     )
+
+
+def integrator(rng: np.random.Generator, *, steps: int, soft: float) -> Rows:
+    """Positions and speeds of a double integrator held within random bounds, some soft, on the way to a far target."""
+    speed = np.tril(np.ones((steps, steps)))
+    position = speed @ speed
+    target = rng.uniform(-200.0, 200.0)
+    P = position.T @ position + rng.uniform(1.0, 100.0) * np.eye(steps)
+    width = np.tile([rng.uniform(20.0, 150.0), rng.uniform(1.0, 10.0)], steps)
+    l1 = np.where(np.tile(rng.random(2), steps) < soft, rng.uniform(0.0, 200.0), np.inf)
+    rows = np.stack([position, speed], axis=1).reshape(2 * steps, steps)
+    return Rows(P, -position.T @ np.full(steps, target), rows, -width, width, l1, np.full(2 * steps, 5.0), channels=2)
 
 
 def random_start(rng: np.random.Generator, problem: Rows, share: float) -> Side:
@@ -166,6 +180,47 @@ def test_approximate_multipliers_tell_the_active_set(off: float) -> None:
         np.testing.assert_allclose(found.x, exact.x, atol=1e-7)
         if off == 0.0:
             assert found.iterations == 1
+
+
+@settings(max_examples=100)
+@given(seed=st.integers(0, 2**32 - 1), soft=st.sampled_from([0.0, 0.5, 1.0]), share=st.sampled_from([0.0, 0.3]))
+def test_it_agrees_with_an_interior_point_method(seed: int, soft: float, share: float) -> None:
+    """On bounds along the plan of a double integrator, whose active rows are neighbours: the same optimum as PIQP's."""
+    problem = integrator(np.random.default_rng(seed), steps=20, soft=soft)
+    found = problem.solve(random_start(np.random.default_rng(seed), problem, share))
+    backend, qp = PiqpDense(), problem.whole
+    backend.setup(qp)
+    whole = backend.solve(Vectors(c=qp.c, b=qp.b, h_l=qp.h_l, h_u=qp.h_u))
+    if found is None:
+        return
+    assert whole.status == SOLVED
+    assert problem.residual(found) < 1e-6
+    np.testing.assert_allclose(found.x[:20], whole.x[:20], atol=2e-3)
+
+
+def test_it_is_found_along_a_plan_and_mostly_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What the test above rests on; and where all changes at once lead nowhere, one at a time lead there."""
+    one_by_one, count = ActiveSet._one_by_one, [0]
+
+    def counted(self: ActiveSet, *arguments: Any) -> Any:
+        count[0] += 1
+        return one_by_one(self, *arguments)
+
+    monkeypatch.setattr(ActiveSet, "_one_by_one", counted)
+    problems = [integrator(np.random.default_rng(seed), steps=20, soft=0.5) for seed in range(60)]
+    at_once = [problem.solve(nothing(problem)) for problem in problems]
+    solved = [solution for solution in at_once if solution is not None]
+    assert len(solved) > 50
+    assert count[0] < 20
+    assert sum(solution.active > 3 for solution in solved) > 30
+    assert sum(solution.x[20:].max(initial=0.0) > 1e-3 for solution in solved) > 10
+    monkeypatch.setattr(ActiveSet, "_all_changed", lambda self, trial, bounds, careful: trial.side.copy())
+    count[0] = 0
+    for problem, first in zip(problems, at_once, strict=True):
+        again = problem.solve(nothing(problem))
+        if first is not None and again is not None:
+            np.testing.assert_allclose(again.x[:20], first.x[:20], atol=1e-7)
+    assert count[0] > 50
 
 
 def test_the_start_with_the_fewest_wrong_rows_is_taken(monkeypatch: pytest.MonkeyPatch) -> None:

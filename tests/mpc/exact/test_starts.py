@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from support import flight_queries, paper_problem
 
+from mpc.constraints import Constraint, Penalty
 from mpc.exact.shortcut import Shortcut
 from mpc.ocp import Problem, Rest
 from mpc.qp import Formulation
@@ -92,6 +95,37 @@ def agreed(problem: Problem, queries: list[Query], stride: int) -> dict[Way, int
             np.testing.assert_allclose(other.plan, answer.plan, rtol=1e-7, atol=0.0)
             np.testing.assert_allclose(other.slacks, answer.slacks, rtol=0.0, atol=1e-9)
     return ways
+
+
+def test_bounds_that_only_some_steps_have(constrained_flight: Flight) -> None:
+    """A height that late steps alone are held below: what is active moves to where there is no bound."""
+    problem = paper_problem()
+    height = np.zeros((1, 12))
+    height[0, 4] = 1.0
+    upper = np.full((50, 1), np.inf)
+    upper[20:] = 2.0
+    late = Constraint(
+        name="late",
+        C=height,
+        lower=np.full((50, 1), -np.inf),
+        upper=upper,
+        penalty=Penalty(l1=np.full(1, 100.0), l2=np.full(1, 10.0)),
+    )
+    problem = replace(problem, constraints=(late,))
+    quick, whole = (Shortcut(problem, QPSolver("daqp", problem)) for _ in range(2))
+    active = 0
+    for query in flight_queries(constrained_flight, problem, stride=1)[20:80]:
+        answer = quick.solve(*query)
+        whole.reset()
+        expected = whole._whole.solve(*query)
+        assert answer.solution.status in ACCEPTED
+        assert expected.solution.status in ACCEPTED
+        np.testing.assert_allclose(answer.plan, expected.plan, atol=1e-5)
+        active += bool(quick._side.reshape(50, -1)[20, -1])
+        moved = quick._starts()[0]
+        bound = np.where(moved > 0, problem.rows.upper.ravel(), problem.rows.lower.ravel())
+        assert np.isfinite(bound[moved != 0]).all()
+    assert active > 10
 
 
 def test_over_the_papers_flight(constrained_flight: Flight) -> None:

@@ -19,18 +19,15 @@ from scripted_controller import (
 
 from mpc.fallback.completion import StateCompletion
 from mpc.fallback.hover import (
+    ACCEPTABLE,
     ACCEPTABLE_ACCELERATION,
-    ACCEPTABLE_POSITION,
-    ACCEPTABLE_RATE,
-    ACCEPTABLE_TILT,
-    ACCEPTABLE_VELOCITY,
     HoverLaw,
 )
 from mpc.heading import predict_in_heading_frame, turn
 from mpc.model import LinearModel, hover_model
 from quadsim.assets import vehicle_path
 from quadsim.errors import ParameterError
-from quadsim.state import EULER, EULER_RATE, INDEX, POSITION, VELOCITY
+from quadsim.state import INDEX
 from quadsim.vehicle import Vehicle, load_vehicle
 
 VEHICLES = ("lopes2011", "hummingbird", "crazyflie2")
@@ -49,17 +46,9 @@ def test_every_vehicle_has_the_same_closed_loop(name: str) -> None:
 
 def test_the_gain_is_the_infinite_horizon_s() -> None:
     law = HoverLaw(model(), tilt=0.2)
-    size = np.empty(12)
-    for group, value in (
-        (POSITION, ACCEPTABLE_POSITION),
-        (VELOCITY, ACCEPTABLE_VELOCITY),
-        (EULER, ACCEPTABLE_TILT),
-        (EULER_RATE, ACCEPTABLE_RATE),
-    ):
-        size[list(group)] = value
     weight = law.slope.T @ np.diag(np.array(ACCEPTABLE_ACCELERATION) ** -2.0) @ law.slope
     A, B = model().A, model().B
-    P = scipy.linalg.solve_discrete_are(A, B, np.diag(size**-2.0), weight)
+    P = scipy.linalg.solve_discrete_are(A, B, np.diag(ACCEPTABLE**-2.0), weight)
     expected = np.linalg.solve(weight + B.T @ P @ B, B.T @ P @ A)
     error = random_state(1, 1e-3)
     np.testing.assert_allclose(law.correction(error, 0.0), -expected @ error, rtol=1e-6)

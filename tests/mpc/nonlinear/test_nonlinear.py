@@ -132,7 +132,7 @@ def test_linearisation_matches_complex_steps(vehicle: Vehicle, lag: float | None
     x, u = points(vehicle, 40, lag=lag, seed=substeps)
     A, B, c = linearise(model, x, u)
     assert A.shape == (40, model.n, model.n)
-    assert B.shape == (40, model.n, model.nu)
+    assert B.shape == (40, model.n, 4)
     joint = np.hstack([x, u])
     for i, column in enumerate(np.eye(model.n + 4)):
         nudged = joint + 1e-30j * column

@@ -25,7 +25,6 @@ def copied(short_run_directory: Path, tmp_path: Path) -> Path:
 
 
 def test_a_run_is_read_back(short_run: Run) -> None:
-    assert rundir.is_run(short_run.directory)
     assert short_run.name == "paper-constrained"
     assert short_run.vehicle.hover_speed == pytest.approx(192.8, rel=1e-6)
     assert short_run.log.status == "completed"
@@ -98,14 +97,13 @@ def test_what_is_no_summary_is_refused(copied: Path, content: bytes) -> None:
     (copied / "summary.json").write_bytes(content)
     with pytest.raises(FileError, match=r"summary\.json: is not a run's summary"):
         rundir.load_run(copied)
-    assert not rundir.is_run(copied)
 
 
 def test_a_directory_without_a_summary_is_no_run(tmp_path: Path) -> None:
     with pytest.raises(FileError, match=r"is not a run directory: it has no summary\.json"):
         rundir.read_summary(tmp_path)
-    assert not rundir.is_run(tmp_path)
-    assert not rundir.is_run(tmp_path / "nowhere")
+    with pytest.raises(FileError, match="is not a run directory"):
+        rundir.read_summary(tmp_path / "nowhere")
 
 
 @pytest.mark.parametrize(

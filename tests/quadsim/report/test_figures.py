@@ -43,6 +43,7 @@ def test_the_papers_scenario_gives_the_papers_figure_numbers(figures: dict[str, 
     ]
 
 
+@pytest.mark.usefixtures("sketched")
 def test_another_scenario_gives_plain_names(short_run: Run, tmp_path: Path) -> None:
     stems = [path.stem for path in write_figures(named(short_run, "hover"), tmp_path)]
     assert stems == ["states", "states", "inputs", "inputs", "solve_times", "solve_times"]
@@ -71,6 +72,7 @@ def test_panels_and_units_are_labelled(figures: dict[str, Path], name: str, expe
     assert expected | {"time [s]"} <= texts(figures[f"{name}.svg"])
 
 
+@pytest.mark.usefixtures("sketched")
 def test_bounds_are_drawn_where_the_flight_has_them(short_run: Run, figures: dict[str, Path], tmp_path: Path) -> None:
     bounds_and_legend = 2 * 2 + 1
     assert lines_of_colour(figures["figure4_states.svg"], BOUND) == bounds_and_legend
@@ -82,6 +84,7 @@ def test_bounds_are_drawn_where_the_flight_has_them(short_run: Run, figures: dic
     assert "bound" not in texts(states)
 
 
+@pytest.mark.usefixtures("sketched")
 def test_a_bound_that_begins_after_the_flight_is_left_out(short_run: Run, tmp_path: Path) -> None:
     late = dataclasses.replace(short_run, limits=(Limit(name="late", signal="roll", upper=5.0, start=100.0),))
     write_figures(late, tmp_path)
@@ -93,6 +96,7 @@ def test_the_same_flight_gives_the_same_bytes(short_run: Run, figures: dict[str,
         assert again.read_bytes() == figures[again.name].read_bytes(), again.name
 
 
+@pytest.mark.usefixtures("sketched")
 def test_an_aborted_flight_is_drawn_as_far_as_it_went(short_run: Run, tmp_path: Path) -> None:
     log = dataclasses.replace(short_run.log, reason="at t = 6.000 s: lost")
     write_figures(dataclasses.replace(short_run, log=log), tmp_path)
@@ -124,6 +128,7 @@ AIR = {"wind, world", "[m/s]", "x", "y", "z"}
 TOLD = {"position as measured,", "less the true one [m]", "less the true one [deg]", "x", "y", "z", "roll", "yaw"}
 
 
+@pytest.mark.usefixtures("sketched")
 @pytest.mark.parametrize(("effect", "expected"), [("lag", SPEEDS), ("wrench", FORCES), ("wind", AIR), ("told", TOLD)])
 def test_effects_are_drawn_where_there_are_any(short_run: Run, tmp_path: Path, effect: str, expected: set[str]) -> None:
     """Each by itself, with its panels and no others."""
@@ -148,6 +153,7 @@ def test_no_figures_without_a_control_period(empty_run: Run, tmp_path: Path) -> 
     assert write_figures(empty_run, tmp_path) == []
 
 
+@pytest.mark.usefixtures("sketched")
 def test_a_comparison_names_every_run_once(short_run: Run, tmp_path: Path) -> None:
     png, svg = comparison_figure([short_run, named(short_run, "other $x$ <b>")], tmp_path)
     assert png.name == "comparison.png"
@@ -170,6 +176,7 @@ def standing(run: Run) -> Run:
     return dataclasses.replace(run, limits=(), log=dataclasses.replace(run.log, plant=plant, control=control))
 
 
+@pytest.mark.usefixtures("sketched")
 def test_rounding_is_drawn_as_a_level_line(short_run: Run, tmp_path: Path) -> None:
     write_figures(standing(short_run), tmp_path)
     found = texts(tmp_path / "figure4_states.svg")
@@ -192,6 +199,7 @@ def test_a_roll_that_wraps_is_no_line_across_the_panel(
     assert np.nanmax(np.abs(np.diff(values))) < 10.0
 
 
+@pytest.mark.usefixtures("sketched")
 def test_states_are_drawn_as_told_beside_the_true_ones(
     short_run: Run, figures: dict[str, Path], tmp_path: Path
 ) -> None:

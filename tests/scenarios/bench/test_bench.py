@@ -18,14 +18,13 @@ from mpc.solvers import SOLVERS, Way
 from quadsim.errors import InputError, ParameterError, RenderingUnavailableError
 from quadsim.report.film.video import rendering_backend, worker_count
 from scenarios.bench.bench_results import Growth, RenderProfile, SolverBench
-from scenarios.bench.bench_tables import flight_tables, render_tables, solver_tables
+from scenarios.bench.bench_tables import flight_tables, render_tables, solver_tables, solver_targets
 from scenarios.bench.campaigns import bench_campaign, campaign_tables
 from scenarios.bench.candidates import Entry, StepCandidate, entries, judge, reference_optima
 from scenarios.bench.flight import bench_flight
 from scenarios.bench.queries import flight_between, recorded
 from scenarios.bench.solvers import bench_solvers
-from scenarios.bench.targets import solver_targets
-from scenarios.bench.timing import segments, time_in_turns
+from scenarios.bench.timing import Stopwatch, in_turns, segments, time_in_turns, time_python
 from scenarios.build import build_problem
 from scenarios.cli import main
 from scenarios.commands import EXIT_DONE, EXIT_WRONG_INPUT
@@ -117,6 +116,29 @@ def test_a_flight_goes_on_between_questions_and_is_not_timed() -> None:
     assert [name for name, _ in diary].count("between") == 9
     assert 1.0 <= laps.ms.min() < 20.0
     np.testing.assert_array_equal(laps.median, np.sort(laps.ms, axis=0)[1])
+
+
+def test_calls_are_watched_until_they_are_forgotten() -> None:
+    diary: list[tuple[str, int]] = []
+    slept, idle, watch = Answering("a", diary, 0.002), Answering("b", diary), Stopwatch()
+    watch.watch(slept, "answer", "answers")
+    watch.watch(idle, "answer", "never")
+    assert in_turns({"a": slept.answer, "b": lambda: slept.prepare(3)}, 2) == {"a": [None] * 2, "b": [None] * 2}
+    assert diary == [("a", 3)] * 2
+    assert len(watch.laps["answers"]) == 2
+    assert 0.004 <= watch.totals()["answers"] <= watch.elapsed
+    assert watch.totals().keys() == {"answers"}
+    watch.clear()
+    slept.answer()
+    assert len(watch.laps["answers"]) == 1
+
+
+def test_a_python_command_is_timed_or_says_what_is_wrong(tmp_path: Path) -> None:
+    found = time_python("-c", "import time; time.sleep(0.05); print('done')", tree=tmp_path)
+    assert (found.output, found.wall_s > 0.05) == ("done\n", True)
+    assert found.processor_s > 0.0
+    with pytest.raises(SystemExit, match="no such thing"):
+        time_python("-c", "import sys; print('no such thing', file=sys.stderr); sys.exit(2)", tree=tmp_path)
 
 
 def test_between_steps_the_plant_flies_a_period() -> None:

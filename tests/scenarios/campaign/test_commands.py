@@ -20,13 +20,7 @@ from quadsim.outputs import digest_of
 from scenarios.cli import main
 from scenarios.commands import EXIT_DONE, EXIT_FAILED, EXIT_WRONG_INPUT
 
-MASS = {
-    "name": "mass",
-    "fields": ["effects.load.mass_factor"],
-    "distribution": "uniform",
-    "low": 0.5,
-    "high": 1.5,
-}
+MASS = {"name": "mass", "fields": ["effects.load.mass_factor"], "distribution": "uniform", "low": 0.5, "high": 1.5}
 CAMPAIGN = {
     "name": "little",
     "scenario": "hover",
@@ -35,6 +29,10 @@ CAMPAIGN = {
     "set": {"duration": 0.5, "constraints": []},
     "vary": [MASS],
 }
+HASTY = (
+    "from scenarios.campaign import run; run.FLUSH_S = 0.3; from scenarios import entry; raise SystemExit(entry.main())"
+)
+"""A command line whose campaigns write what is flown as soon as it is there."""
 BARE = ("--no-video", "--no-recording", "--no-figures")
 
 
@@ -175,7 +173,7 @@ def test_wrong_input_is_status_2_with_one_message_and_flies_nothing(
 
 
 def test_ctrl_c_keeps_what_was_flown(file: Path) -> None:
-    command = [sys.executable, "-m", "scenarios.cli", "campaign", str(file), "--out", "c", "--flights", "2000"]
+    command = [sys.executable, "-c", HASTY, "campaign", str(file), "--out", "c", "--flights", "2000"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as campaign:
         parts = file.parent / "c" / "parts"
         while not (parts.is_dir() and any(parts.iterdir())):

@@ -11,7 +11,7 @@ SEED = 22
 
 
 def test_kills_lose_nothing_and_change_nothing(tmp_path: Path) -> None:
-    for flights in (20, 80, 320):  # where few are over before the first three kills, more
+    for flights in (40, 160, 640):  # where few are over before the first three kills, more
         directory = tmp_path / str(flights)
         directory.mkdir()
         outcome = kill_and_resume(directory, kills=6, flights=flights, duration=5.0, pause=0.3, seed=SEED)

@@ -9,16 +9,11 @@ import pytest
 import tomlkit
 
 from quadsim.errors import FileError, InputError, UnknownNameError
-from scenarios.campaign.plan import Plan, campaign_names, campaign_path, load_plan
+from scenarios.campaign.plan import Plan, load_plan
 from scenarios.loading import load_scenario
+from scenarios.shipped import campaign_names, campaign_path
 
-MASS = {
-    "name": "mass",
-    "fields": ["effects.load.mass_factor"],
-    "distribution": "uniform",
-    "low": 0.9,
-    "high": 1.1,
-}
+MASS = {"name": "mass", "fields": ["effects.load.mass_factor"], "distribution": "uniform", "low": 0.9, "high": 1.1}
 BASE: dict[str, Any] = {"name": "c", "scenario": "hover", "flights": 3, "vary": [MASS]}
 
 

@@ -35,13 +35,7 @@ CAMPAIGN: dict[str, Any] = {
     "failure": ["lost", "max_error.z > 0.2"],
     "set": {"duration": 0.5, "constraints": [], "controller": {"horizon": 10}},
     "vary": [
-        {
-            "name": "mass",
-            "fields": ["effects.load.mass_factor"],
-            "distribution": "uniform",
-            "low": 0.5,
-            "high": 1.5,
-        },
+        {"name": "mass", "fields": ["effects.load.mass_factor"], "distribution": "uniform", "low": 0.5, "high": 1.5}
     ],
 }
 
@@ -173,6 +167,7 @@ def test_a_width_that_is_no_share_is_refused(plan: Plan, tmp_path: Path, width: 
     assert not (tmp_path / "c").exists()
 
 
+@pytest.mark.usefixtures("sketched")
 def test_a_manifest_says_what_was_flown(plan: Plan, tmp_path: Path) -> None:
     result = module.fly_campaign(plan, tmp_path / "c", Alone())
     manifest = read_manifest(result.directory)
@@ -291,6 +286,7 @@ def test_files_of_ones_own_are_not_written_over(tmp_path: Path) -> None:
     assert path.read_text() == before
 
 
+@pytest.mark.usefixtures("sketched")
 def test_a_report_of_fewer_flights_goes(plan: Plan, tmp_path: Path) -> None:
     module.fly_campaign(plan, tmp_path / "c", Alone())
     fly_campaign(make_plan(tmp_path, flights=14), tmp_path / "c", Alone(), resume=True)

@@ -157,20 +157,24 @@ def test_a_controller_of_ones_own_names_itself_as_text(nasty: str) -> None:
     assert law.name == law.solver == printable(nasty)
 
 
-@pytest.mark.parametrize("name", ["[bold]run", "a\nb", "run\udcff", "\x1b[31mred", "\u202eevil"])
+@pytest.mark.usefixtures("sketched")
 def test_folders_of_any_name_are_compared_and_checked(
-    name: str, tmp_path: Path, short_run_directory: Path, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, short_run_directory: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """`\udcff` is how Python names a byte that is no UTF-8."""
-    runs = [shutil.copytree(short_run_directory, tmp_path / name / each) for each in (name, f"{name}2")]
-    page = tmp_path / name / "page"
+    """Runs of such names in such a folder; `\udcff` is how Python names a byte that is no UTF-8."""
+    names = ["[bold]run", "a\nb", "run\udcff", "\x1b[31mred", "\u202eevil"]
+    folder = tmp_path.joinpath(*names)
+    runs = [shutil.copytree(short_run_directory, folder / each) for each in names]
+    page = folder / "page"
     assert main(["compare", *map(str, runs), "--out", str(page)]) == EXIT_DONE
     assert main(["compare", *map(str, runs), "--out", str(page), "--markdown"]) == EXIT_DONE
-    assert main(["check", str(runs[0])]) == 1  # its windows are not reached
+    for run in runs:
+        assert main(["check", str(run)]) == 1  # its windows are not reached
     said = capsys.readouterr()
     for text in (said.out, said.err, (page / "comparison.md").read_text(), (page / "comparison.svg").read_text()):
         assert is_plain(text)
-    assert printable(name) in (page / "index.html").read_text()
+    for name in names:
+        assert printable(name) in (page / "index.html").read_text()
 
 
 def test_a_run_is_written_to_a_folder_whose_name_is_no_unicode(

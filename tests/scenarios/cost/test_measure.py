@@ -15,16 +15,15 @@ from support import Here
 from mpc.solvers import SOLVERS
 from quadsim.controller import Moment
 from quadsim.errors import InputError, MissingPackageError
-from quadsim.flight import rundir
 from quadsim.flight.metrics import percentiles
+from scenarios.bench import worker_pool
 from scenarios.bench.queries import QueriedController, recorded
 from scenarios.build import build_controller
 from scenarios.cli import main
 from scenarios.commands import EXIT_DONE, EXIT_WRONG_INPUT
-from scenarios.cost import cost_flights
+from scenarios.cost.cost_flights import without_constraints
 from scenarios.cost.measure import find_study, fly_variations, study_cost
 from scenarios.cost.study import CostStudy
-from scenarios.cost.variants import without_constraints
 from scenarios.flight import Outputs, summarise
 from scenarios.loading import load_scenario
 from scenarios.parts.vehicle import build_vehicle
@@ -51,7 +50,7 @@ def scenario(*settings: str, name: str = "paper-constrained") -> Scenario:
 def _here() -> Iterator[None]:
     """Flights are flown in this process; one test compares that with several."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(cost_flights, "ProcessPoolExecutor", Here)
+        patch.setattr(worker_pool, "ProcessPoolExecutor", Here)
         yield
 
 
@@ -71,7 +70,7 @@ def untimed(study: CostStudy) -> dict[str, Any]:
 
 
 def test_the_study_is_the_same_however_many_processes_fly(study: CostStudy, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(cost_flights, "ProcessPoolExecutor", ProcessPoolExecutor)
+    monkeypatch.setattr(worker_pool, "ProcessPoolExecutor", ProcessPoolExecutor)
     again = study_cost(scenario(), [scenario(name="paper-unconstrained")], workers=2, **SMALL)
     assert untimed(again) == untimed(study)
 
@@ -145,7 +144,7 @@ def test_variations_change_the_vehicle(study: CostStudy) -> None:
 def test_contenders_answer_what_was_asked_in_flight(study: CostStudy) -> None:
     gain, flown, dense = study.candidates
     assert [candidate.name for candidate in study.candidates] == [
-        *("unconstrained gain", "constrained, as flown", "QP by piqp-dense"),
+        *("unconstrained gain", "constrained, as flown", "QP by piqp-dense")
     ]
     assert {candidate.step_ms.size for candidate in study.candidates} == {80}
     assert 0 < flown.shortcut.sum() < 80
@@ -251,6 +250,7 @@ def test_a_run_without_a_readable_scenario_is_compared_all_the_same(runs: dict[s
         find_study(targets, asked=True)
 
 
+@pytest.mark.usefixtures("sketched")
 def test_compare_puts_the_study_on_the_page(
     runs: dict[str, str],
     study: CostStudy,
@@ -281,5 +281,4 @@ def test_a_study_without_a_constrained_flight_is_refused(
     assert main(arguments) == EXIT_WRONG_INPUT
     message = "quadsim: --cost needs a flight by a constrained controller among those that are compared\n"
     assert capsys.readouterr().err == message
-    assert not rundir.is_run(tmp_path / "page")
     assert not (tmp_path / "page").exists()

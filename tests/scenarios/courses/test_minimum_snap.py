@@ -9,20 +9,21 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.interpolate import BPoly, PPoly
 
 from quadsim.state import Array
-from scenarios.courses.minimum_snap import ACCELERATION, SNAP, PiecewisePolynomial, minimum_snap, smoothest
+from scenarios.courses.minimum_snap import ACCELERATION, SNAP, minimum_snap, smoothest
 
 TIMES = np.array([0.0, 1.5, 2.0, 5.0, 6.2])
 VALUES = np.array([[0.0, 1.0], [2.0, -1.0], [1.0, 0.5], [4.0, 3.0], [0.0, 0.0]])
 durations = st.lists(st.floats(0.1, 10.0), min_size=2, max_size=5)
 
 
-def cost(curve: PiecewisePolynomial, order: int) -> float:
+def cost(curve: BPoly | PPoly, order: int) -> float:
     """The integral of the squared derivative, by Gauss-Legendre quadrature, exact for these polynomials."""
     nodes, weights = np.polynomial.legendre.leggauss(10)
     total = 0.0
-    for start, stop in zip(curve.knots[:-1], curve.knots[1:], strict=True):
+    for start, stop in itertools.pairwise(curve.x):
         t = start + 0.5 * (stop - start) * (nodes + 1.0)
         total += 0.5 * (stop - start) * float(weights @ (curve(t, order) ** 2).sum(axis=1))
     return total
@@ -76,10 +77,11 @@ def test_one_segment_of_least_acceleration_is_the_known_cubic() -> None:
 @pytest.mark.parametrize("order", [ACCELERATION, SNAP])
 def test_the_whole_kkt_system_has_the_same_solution(order: int) -> None:
     curve = smoothest(TIMES, VALUES, order)
-    expected = kkt_solution(TIMES, VALUES, order)
-    for i, duration in enumerate(np.diff(TIMES)):
-        scale = duration ** np.arange(2 * order)
-        np.testing.assert_allclose(curve.coefficients[i], scale[:, None] * expected[i], rtol=1e-6, atol=1e-8)
+    expected = PPoly(np.moveaxis(kkt_solution(TIMES, VALUES, order)[:, ::-1], 1, 0), TIMES)
+    t = np.linspace(0.0, TIMES[-1], 200)
+    for k in range(2 * order):
+        size = np.abs(expected(t, k)).max()
+        np.testing.assert_allclose(curve(t, k), expected(t, k), rtol=1e-6, atol=1e-8 * size)
 
 
 @pytest.mark.parametrize("order", [ACCELERATION, SNAP])
@@ -113,13 +115,13 @@ def test_nothing_that_meets_the_conditions_costs_less(seed: int, order: int, gap
     rng = np.random.default_rng(seed)
     times = np.concatenate([[0.0], np.cumsum(gaps)])
     best = smoothest(times, rng.normal(size=(times.size, 1)), order)
-    bump = np.zeros((len(gaps), 2 * order + 2, 1))  # s^order (1 - s)^order: 0 with order - 1 derivatives at both ends
+    # s^order (1 - s)^order: 0 with order - 1 derivatives at both ends.
+    powers = np.arange(2 * order, -1, -1)
     shape = np.polynomial.polynomial.polymul(np.eye(order + 1)[order], np.polynomial.polynomial.polypow([1, -1], order))
-    bump[:, : shape.size, 0] = rng.normal(size=(len(gaps), 1)) * shape
-    added = PiecewisePolynomial(knots=times, coefficients=bump)
-    padded = np.zeros_like(bump)
-    padded[:, : 2 * order] = best.coefficients
-    both = PiecewisePolynomial(knots=times, coefficients=padded + bump)
+    bump = rng.normal(size=len(gaps)) * shape[powers][:, None] / np.array(gaps) ** powers[:, None]
+    added = PPoly(bump[:, :, None], times)
+    both = PPoly(bump[:, :, None].copy(), times)
+    both.c[1:] += PPoly.from_bernstein_basis(best).c
     assert cost(both, order) == pytest.approx(cost(best, order) + cost(added, order), rel=1e-6)
 
 
@@ -128,15 +130,9 @@ def test_perturbing_a_derivative_at_a_point_costs_more(k: int) -> None:
     """Through the derivatives at the points themselves: pieces rebuilt with one of them changed."""
     best = smoothest(TIMES, VALUES, SNAP)
     for change in (-0.1, 0.1):
-        pieces = []
-        for i, (start, stop) in enumerate(itertools.pairwise(TIMES)):
-            T, powers = stop - start, np.arange(8)
-            rows = [[math.perm(p, d) * s ** (p - d) if p >= d else 0 for p in powers] for s in (0, 1) for d in range(4)]
-            ends = np.array([T**d * best(np.array([t]), d)[0] for t in (start, stop) for d in range(4)])
-            if i in (1, 2):  # the point between segments 1 and 2
-                ends[(4 if i == 1 else 0) + k] += T**k * change
-            pieces.append(np.linalg.solve(np.array(rows, float), ends))
-        changed = PiecewisePolynomial(knots=TIMES, coefficients=np.array(pieces))
+        derivatives = np.stack([best(TIMES, d) for d in range(4)], axis=1)
+        derivatives[2, k] += change
+        changed = BPoly.from_derivatives(TIMES, derivatives)
         np.testing.assert_allclose(changed(TIMES), VALUES, atol=1e-10)
         assert cost(changed, SNAP) > cost(best, SNAP) * (1.0 + 1e-9)
 

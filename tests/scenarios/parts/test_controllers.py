@@ -28,7 +28,7 @@ from mpc.solvers import QPSolver
 from mpc.unconstrained import UnconstrainedMPC
 from quadsim.controller import LAW_NAMES, SOLVED, Controller, Moment
 from quadsim.errors import ParameterError
-from scenarios.build import CONTROLLERS, build_controller, build_plant, build_problem, resolve
+from scenarios.build import build_controller, build_plant, build_problem, resolve
 from scenarios.courses.feasibility_check import report
 from scenarios.courses.make import build_reference
 from scenarios.loading import load_scenario, parse_scenario
@@ -39,6 +39,7 @@ from scenarios.schema.json_schema import scenario_schema
 from scenarios.schema.plugin import FORM, LAWS
 from scenarios.schema.problems import ScenarioError
 from scenarios.schema.scenario import Scenario
+from scenarios.shipped import CONTROLLERS
 
 ROBUST: dict[str, Any] = {
     "type": "robust",
@@ -174,7 +175,7 @@ def test_at_a_price_that_is_high_enough_soft_bounds_are_hard_ones_from_any_state
     hard, soft, default = (robust(**{**usual, **parts, **price}) for price in prices)
     rng, reference, feasible, pressing, slacks = np.random.default_rng(0), np.zeros((50, 4)), 0, 0, []
     scale = np.array([10.0, 2.0, 10.0, 2.0, 10.0, 2.0, math.radians(5.0), 0.4, math.radians(5.0), 0.4, 1.0, 0.0])
-    for _ in range(150):
+    for _ in range(60):
         state, speeds = scale * rng.uniform(-1.0, 1.0, 12), HOVER + rng.uniform(-8.0, 8.0, 4)
         for law in (hard, soft, default):
             law.reset(speeds)
@@ -187,8 +188,8 @@ def test_at_a_price_that_is_high_enough_soft_bounds_are_hard_ones_from_any_state
         assert lenient.slack < 1e-7
         np.testing.assert_allclose(lenient.speeds, strict.speeds, atol=2e-3)
         slacks.append(usually.slack)
-    assert feasible > 100
-    assert pressing > 50
+    assert feasible > 40
+    assert pressing > 20
     assert np.mean(np.array(slacks) > 1e-7) < 0.12
     assert max(slacks) < math.radians(0.5)
 

@@ -12,9 +12,10 @@ from jsonschema import Draft202012Validator
 
 from quadsim.assets import read_toml
 from quadsim.flight.audit import SIGNALS
-from scenarios.loading import load_scenario, scenario_names, scenario_path
+from scenarios.loading import load_scenario
 from scenarios.schema.json_schema import scenario_schema
 from scenarios.schema.scenario import Group, Scenario
+from scenarios.shipped import scenario_names, scenario_path
 
 SCHEMA = scenario_schema()
 WHOLE, DIFFERENCE = SCHEMA["else"], SCHEMA["then"]

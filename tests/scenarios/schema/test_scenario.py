@@ -21,12 +21,13 @@ from quadsim.flight.audit import SIGNALS
 from quadsim.state import STATE_NAMES
 from quadsim.vehicle import OPTIONAL_PARAMETERS, VEHICLE_UNITS
 from scenarios.build import resolve
-from scenarios.loading import LIBRARY, load_scenario, parse_scenario, scenario_names, scenario_path
+from scenarios.loading import load_scenario, parse_scenario
 from scenarios.parts.limits import build_limits
 from scenarios.parts.vehicle import build_vehicle
 from scenarios.schema.problems import ScenarioError
 from scenarios.schema.scenario import MOST_STEPS, Scenario
 from scenarios.schema.settings import apply_setting
+from scenarios.shipped import LIBRARY, scenario_names, scenario_path
 
 
 def reread(scenario: Scenario) -> Scenario:

@@ -10,11 +10,12 @@ from pydantic import BaseModel, Field
 from support import scenario_table
 
 from scenarios.build import resolve
-from scenarios.loading import load_scenario, parse_scenario, scenario_names
+from scenarios.loading import load_scenario, parse_scenario
 from scenarios.parts.vehicle import build_vehicle
 from scenarios.schema.base import fields_of
 from scenarios.schema.scenario import Scenario
 from scenarios.schema.writing import WIDTH, headline, is_absent, tables_in, to_toml
+from scenarios.shipped import scenario_names
 
 EFFECTS = {
     "rotors": {"rise": 0.02, "efficiency": [1.0, 0.9, 1.0, 1.0]},

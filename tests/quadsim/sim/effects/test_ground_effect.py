@@ -2,7 +2,7 @@
 
 import pytest
 
-from quadsim.sim.effects.ground_effect import LOWEST_RATIO, thrust_ratio
+from quadsim.sim.effects.forces import LOWEST_RATIO, thrust_ratio
 
 
 @pytest.mark.parametrize(("ratio", "expected"), [(0.5, 4.0 / 3.0), (1.0, 16.0 / 15.0), (2.0, 64.0 / 63.0)])

@@ -34,7 +34,6 @@ import sys
 import time as clock
 from pathlib import Path
 from campaign_pilots import ToyPilot
-from scenarios.campaign.engine.local import LocalEngine
 
 if __name__ == "__main__":
     signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs inherit that it is ignored
@@ -287,7 +286,7 @@ def test_chunks_are_seconds_of_work_and_get_smaller_near_the_end() -> None:
 
 def test_the_memory_of_a_worker_does_not_grow() -> None:
     used: dict[int, list[int]] = {}
-    for number, row in enumerate(LocalEngine(1).answers(ToyPilot(), range(3000))):
+    for number, row in enumerate(LocalEngine(1).answers(ToyPilot(), range(2000))):
         if number % 500 == 499:
             worker = psutil.Process(row["process"])
             used.setdefault(worker.pid, []).append(worker.memory_info().rss)

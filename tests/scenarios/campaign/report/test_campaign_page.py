@@ -81,13 +81,14 @@ def test_the_page_tells_what_the_flights_show(thousand: pa.Table, reported: Path
         assert f"<span>{table}</span>" in text
     assert "<dt>versions.numpy</dt><dd>2</dd>" in text
     assert {path.name for path in directory.iterdir()} == {
-        *("index.html", "campaign.png", "campaign.svg", "flights.parquet"),
+        *("index.html", "campaign.png", "campaign.svg", "flights.parquet")
     }
     for url in re.findall(r'(?:href|src)="([^"#]+)"', text):
         assert url == "data:," or (directory / url).is_file(), url
     assert not re.search(r"""(?:src|href)=["']?(?:https?:)?//""", text)
 
 
+@pytest.mark.usefixtures("sketched")
 @pytest.mark.parametrize("case", CASES)
 def test_campaigns_of_every_kind_have_a_page(make_campaign: MakeCampaign, tmp_path: Path, case: str) -> None:
     flights, severity = CASES[case]
@@ -102,6 +103,7 @@ def test_campaigns_of_every_kind_have_a_page(make_campaign: MakeCampaign, tmp_pa
     assert ("What is measured of a lost flight, its margins too, ends where it was aborted." in text) is lost
 
 
+@pytest.mark.usefixtures("sketched")
 def test_a_campaign_without_required_constraints_has_a_page(thousand: pa.Table, tmp_path: Path) -> None:
     some = thousand.slice(0, 50)
     for name in ("worst_margin", "worst_constraint"):
@@ -112,6 +114,7 @@ def test_a_campaign_without_required_constraints_has_a_page(thousand: pa.Table, 
     assert "paper-robustness" in write(tmp_path / "out", some)
 
 
+@pytest.mark.usefixtures("sketched")
 def test_hostile_names_are_text(thousand: pa.Table, tmp_path: Path) -> None:
     names = [HOSTILE if name == "draw.wind" else name for name in thousand.column_names]
     table = thousand.rename_columns([name.replace(HOSTILE, f"draw.{HOSTILE}") for name in names])
@@ -121,6 +124,7 @@ def test_hostile_names_are_text(thousand: pa.Table, tmp_path: Path) -> None:
     assert "ValueError: &lt;b&gt;no&lt;/b&gt; step" in text
 
 
+@pytest.mark.usefixtures("sketched")
 def test_ten_thousand_flights_stay_small(make_campaign: MakeCampaign, tmp_path: Path) -> None:
     table = make_campaign(10_000)
     text = write(tmp_path / "out", table)
@@ -173,6 +177,7 @@ def test_a_lost_flight_does_not_flatten_the_others(thousand: pa.Table) -> None:
     )
 
 
+@pytest.mark.usefixtures("sketched")
 def test_outliers_are_drawn_at_the_edge_and_told(thousand: pa.Table, tmp_path: Path) -> None:
     table = thousand.slice(0, 200)
     for name, far in (("draw.wind", {3: 400.0, 5: -90.0}), ("worst_margin", {7: 55.0})):
@@ -213,7 +218,7 @@ def test_no_tick_label_is_turned(thousand: pa.Table) -> None:
         assert axes
         assert plot.key == "drivers" or all(axis["tickangle"] == 0 for axis in axes), plot.key
     assert side_by_side(["piqp-multistage-condensed", "daqp", "x" * 30, "of two words"], 40) == [
-        *("piqp-mult\nistage-c…", "daqp", "x" * 9 + "\n" + "x" * 8 + "…", "of two\nwords"),
+        *("piqp-mult\nistage-c…", "daqp", "x" * 9 + "\n" + "x" * 8 + "…", "of two\nwords")
     ]
 
 
@@ -227,7 +232,7 @@ def test_names_have_places(thousand: pa.Table) -> None:
 
 def test_shares_are_told_with_the_digits_they_need() -> None:
     assert [percent(share) for share in (0.0, 0.037, 0.5, 0.00372, 0.99973, 1.0, None)] == [
-        *("0 %", "3.7 %", "50.0 %", "0.37 %", "99.973 %", "100 %", "-"),
+        *("0 %", "3.7 %", "50.0 %", "0.37 %", "99.973 %", "100 %", "-")
     ]
     assert interval(0.0262, 0.0506) == "2.6 to 5.1 %"
     assert interval(0.0, 0.00368) == "0 to 0.37 %"
@@ -242,6 +247,7 @@ def test_figures_are_the_same_every_time(thousand: pa.Table, reported: Path, tmp
         assert (tmp_path / "again" / file).read_bytes() == (reported / file).read_bytes()
 
 
+@pytest.mark.usefixtures("sketched")
 def test_a_browser_draws_the_page_and_has_no_complaint(make_campaign: MakeCampaign, tmp_path: Path) -> None:
     write(tmp_path / "out", make_campaign(300), name=HOSTILE)
     page = tmp_path / "out" / "index.html"

@@ -96,7 +96,7 @@ def test_few_values_are_groups_of_their_own_and_few_flights_none(thousand: pa.Ta
     horizons = pa.array([20 + 10 * (k % 3) for k in range(1000)])
     found = estimate(thousand.set_column(i, "draw.horizon", horizons))["parameters"]["horizon"]["groups"]
     assert [(group["low"], group["high"], group["flights"]) for group in found] == [
-        *((20.0, 20.0, 334), (30.0, 30.0, 333), (40.0, 40.0, 333)),
+        *((20.0, 20.0, 334), (30.0, 30.0, 333), (40.0, 40.0, 333))
     ]
     assert len(estimate(thousand.slice(0, 30))["parameters"]["mass"]["groups"]) == 3
     assert estimate(thousand.slice(0, 11))["parameters"]["mass"]["groups"] == []

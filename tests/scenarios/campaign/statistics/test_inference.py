@@ -9,13 +9,11 @@ from scipy import optimize, stats
 
 from scenarios.campaign.statistics.inference import (
     holm,
-    lower_bound,
     lower_bounds,
     mcnemar,
     paired_difference,
     paired_shares,
     proportion,
-    upper_bound,
     upper_bounds,
 )
 
@@ -28,14 +26,14 @@ def test_the_interval_is_scipys(count: int, trials: int) -> None:
     one_sided = stats.binomtest(count, trials, alternative="less").proportion_ci(0.95, method="exact")
     assert found.upper_one_sided == pytest.approx(one_sided.high, abs=1e-9)
     other = stats.binomtest(count, trials, alternative="greater").proportion_ci(0.9, method="exact")
-    assert lower_bound(count, trials, 0.9) == pytest.approx(other.low, abs=1e-9)
+    assert lower_bounds(count, trials, 0.9) == pytest.approx(other.low, abs=1e-9)
     assert found.share == count / trials
 
 
 def test_bounds_in_closed_form() -> None:
-    assert upper_bound(0, 299, 0.95) == pytest.approx(1.0 - 0.05 ** (1.0 / 299.0), rel=1e-12)
-    assert lower_bound(50, 50, 0.99) == pytest.approx(0.01 ** (1.0 / 50.0), rel=1e-12)
-    assert (upper_bound(50, 50), lower_bound(0, 50)) == (1.0, 0.0)
+    assert upper_bounds(0, 299, 0.95) == pytest.approx(1.0 - 0.05 ** (1.0 / 299.0), rel=1e-12)
+    assert lower_bounds(50, 50, 0.99) == pytest.approx(0.01 ** (1.0 / 50.0), rel=1e-12)
+    assert (upper_bounds(50, 50), lower_bounds(0, 50)) == (1.0, 0.0)
     nothing = proportion(0, 0)
     assert (nothing.share, nothing.lower, nothing.upper, nothing.upper_one_sided) == (None, 0.0, 1.0, 1.0)
 

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from support import paper_problem, paper_reference
 
-from mpc.exact.polish import polish
 from mpc.paper.condensed import condensed
 from mpc.qp import kkt_residuals
 from mpc.solvers import SOLVERS, make_backend
-from mpc.solvers.piqp_dense import PiqpDense
+from mpc.solvers.piqp_backends import PiqpDense
+from scenarios.bench.polish import polish
 
 
 @pytest.mark.parametrize("name", ["piqp-dense", "piqp-multistage"])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time as clock
 
-from scenarios.bench.mismatch.benchmark import answer_all
+from scenarios.bench.worker_pool import answer_all
 
 
 def _slow_first(number: int) -> int:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from mpc.baselines.cascade import Memory, fly_cascade, force_within, fresh_memory, velocity_wanted
+from mpc.baselines.pid import Memory, force_within, velocity_wanted
 from mpc.baselines.preview import Target
 from quadsim.controller import Moment
 from quadsim.flight.log import FlightLog
@@ -22,27 +22,21 @@ REST = Target(
 )
 
 
+FRESH = Memory(velocity_integral=np.zeros(3), rate_integral=np.zeros(3))
+
+
 def one_period(
-    controller: Any, vehicle: Vehicle, state: Array, *, target: Target = REST, memory: Memory | None = None
+    controller: Any, vehicle: Vehicle, state: Array, *, target: Target = REST, memory: Memory = FRESH
 ) -> tuple[Array, Memory]:
-    return fly_cascade(
-        controller.gains,
-        controller.body,
-        memory or fresh_memory(),
-        state,
-        target,
-        lower=np.zeros(4),
-        upper=np.full(4, vehicle.speed_max),
-        period=0.05,
-    )
+    return controller.fly(memory, state, target, np.zeros(4), np.full(4, vehicle.speed_max))
 
 
 def test_the_velocity_wanted_is_limited_and_keeps_its_direction(vehicle: Vehicle, build: Callable[..., Any]) -> None:
-    gains = build("pid", vehicle, velocity_max=5.0).gains
+    settings = build("pid", vehicle, velocity_max=5.0).settings
     far = replace(REST, position=np.array([300.0, 400.0, -100.0]))
-    np.testing.assert_allclose(velocity_wanted(gains, np.zeros(3), far), [3.0, 4.0, -5.0])
+    np.testing.assert_allclose(velocity_wanted(settings, np.zeros(3), far), [3.0, 4.0, -5.0])
     near = replace(REST, position=np.array([1.0, 0.0, 0.0]), velocity=np.array([0.0, 0.5, 0.2]))
-    np.testing.assert_allclose(velocity_wanted(gains, np.zeros(3), near), [gains.bandwidths.position, 0.5, 0.2])
+    np.testing.assert_allclose(velocity_wanted(settings, np.zeros(3), near), [settings.bandwidths.position, 0.5, 0.2])
 
 
 @pytest.mark.parametrize("force", [(50.0, 0.0, 39.0), (0.0, -8.0, 90.0), (30.0, 40.0, 60.0), (3.0, 4.0, -20.0)])
@@ -96,7 +90,7 @@ def test_derivatives_act_on_the_measurement_not_on_the_error(vehicle: Vehicle, b
     slower = replace(memory, velocity=np.array([0.0, 0.0, -0.1]))
     held_back = one_period(controller, vehicle, state, memory=slower)[0]
     thrust = vehicle.thrust_coefficient * (held_back**2).sum()
-    expected = vehicle.mass * (vehicle.gravity - controller.gains.velocity_derivative * 2.0)
+    expected = vehicle.mass * (vehicle.gravity - controller.settings.velocity_derivative * 2.0)
     assert thrust == pytest.approx(expected)
 
 
@@ -145,4 +139,4 @@ def test_a_turning_target_is_turned_with(vehicle: Vehicle, build: Callable[..., 
     np.testing.assert_allclose(speeds, vehicle.hover_speed, rtol=1e-9)
     still, _ = one_period(controller, vehicle, make_state(euler=(0.0, 0.0, 0.4)), target=turning)
     torque = (vehicle.allocation @ still**2)[3]
-    assert torque == pytest.approx(vehicle.inertia[2] * controller.gains.bandwidths.yaw_rate * 0.8)
+    assert torque == pytest.approx(vehicle.inertia[2] * controller.settings.bandwidths.yaw_rate * 0.8)

@@ -7,8 +7,7 @@ from typing import Any
 import pytest
 
 from quadsim.flight.rundir import Run
-from quadsim.report.comparison import comparison_rows
-from quadsim.report.flight_conditions import failure_sentences, verdict, verdict_cell, verdict_sentence
+from quadsim.report.comparison import comparison_rows, failure_sentences, verdict, verdict_cell, verdict_sentence
 from quadsim.report.narrative import comparison_sentences
 from quadsim.report.table import Mark, Row
 
