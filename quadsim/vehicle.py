@@ -39,8 +39,8 @@ class Vehicle:
 
     name: Annotated[str, doc("short name")]
     description: Annotated[str, doc("one line for `quadsim list`")] = ""
-    mass: Annotated[float, doc("[kg]")]
-    gravity: Annotated[float, doc("[m/s^2]")]
+    mass: Annotated[float, doc("[kg] at take-off")]
+    gravity: Annotated[float, doc("[m/s^2] where it flies")]
     inertia: Annotated[Vector, doc("[kg m^2] Ixx, Iyy, Izz, body axes")]
     arm_length: Annotated[float, doc("[m] L, centre of mass to rotor axis")]
     rotor_azimuths: Annotated[
@@ -58,7 +58,7 @@ class Vehicle:
     rotor_rise: Annotated[float | None, doc("[s] time constant of a rotor's speed when it rises")] = None
     rotor_fall: Annotated[float | None, doc("[s] time constant of a rotor's speed when it falls")] = None
     rotor_inertia: Annotated[float | None, doc("[kg m^2] of one rotor about its axis")] = None
-    rotor_radius: Annotated[float | None, doc("[m] R")] = None
+    rotor_radius: Annotated[float | None, doc("[m] R, of a propeller")] = None
     rotor_drag: Annotated[float | None, doc("[N s^2/(m rad)] linear drag of one rotor")] = None
     body_drag: Annotated[Vector | None, doc("[m^2] C_d A along body x, y, z")] = None
 

@@ -35,7 +35,10 @@ ADDED = {
 """What makes a command cheap enough to run here."""
 
 
-PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
+OWN_VEHICLE = (
+    ROOT / "docs" / "own-vehicle.md"
+)  # whose lines build on each other: scenarios/design/test_own_vehicle_page.py
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted({*(ROOT / "docs").glob("*.md")} - {OWN_VEHICLE})]
 DOCUMENTS = "\n".join(path.read_text() for path in PAGES)
 LINES = [
     line.strip()
@@ -138,14 +141,14 @@ def test_documented_make_targets_exist() -> None:
         target
         for line in LINES
         if line.startswith("make ")
-        for target in re.findall(r" ([a-z]+)\b", line.partition("#")[0])
+        for target in re.findall(r" ([a-z-]+)\b", line.partition("#")[0])
     }
-    named = blocks | set(re.findall(r"`make ([a-z]+)", DOCUMENTS))
+    named = blocks | set(re.findall(r"`make ([a-z-]+)", DOCUMENTS))
     assert {"demo", "test", "setup", "check", "numbers"} <= named
     said = subprocess.run(
         ["make", "--no-print-directory", "help"], cwd=ROOT, capture_output=True, text=True, check=True
     )
-    offered = re.findall(r"^make (\w+) +\S", said.stdout, re.MULTILINE)
+    offered = re.findall(r"^make ([\w-]+) +\S", said.stdout, re.MULTILINE)
     phony = re.search(r"^\.PHONY: (.+)$", (ROOT / "Makefile").read_text(), re.MULTILINE)
     assert phony is not None
     assert sorted(offered) == sorted(phony[1].split())

@@ -18,7 +18,6 @@ from quadsim.vehicle import Vehicle
 from scenarios.courses.course import Course
 from scenarios.courses.make import build_course, filtered, initial_pose
 from scenarios.courses.smoothing import within_rounding
-from scenarios.parts.controllers import make_bounds, tightening_margins
 from scenarios.schema.optimisation import ANGLES, BoundedSpec
 from scenarios.schema.robust import RobustSpec
 
@@ -147,6 +146,8 @@ def _bounds(scenario: Scenario) -> dict[str, tuple[float, float]]:
 
 def _tightened(scenario: Scenario, vehicle: Vehicle) -> dict[str, tuple[float, float]]:
     """What tightening leaves of the output bounds at the end of the horizon, SI; none without it."""
+    from scenarios.parts.controllers import make_bounds, tightening_margins
+
     spec = scenario.controller
     if not isinstance(spec, RobustSpec):
         return {}

@@ -6,11 +6,11 @@ and an example, the numbers of a 1.5 kg quadrotor with 10 inch propellers.  A pa
 
 from __future__ import annotations
 
-import inspect
-import re
 import textwrap
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Final, get_type_hints
+
+from annotated_types import DocInfo
 
 from quadsim.vehicle import OPTIONAL_PARAMETERS, VEHICLE_UNITS, Vehicle
 
@@ -125,14 +125,14 @@ def vehicle_template() -> str:
 
 
 def parameter_meanings() -> dict[str, str]:
-    """What each parameter is, from the docstring of `quadsim.vehicle.Vehicle`."""
-    text = inspect.cleandoc(Vehicle.__doc__ or "")
-    listed = text.partition("Attributes:\n")[2].partition("\n\n")[0]
-    found: dict[str, Any] = {}
-    for entry in re.split(r"\n    (?=\w+: )", "\n" + listed):
-        name, _, meaning = entry.strip().partition(": ")
-        found[name] = " ".join(meaning.split())
-    return {name: found[name] for name in VEHICLE_UNITS}
+    """What each parameter is, from its declaration in `quadsim.vehicle.Vehicle`."""
+    hints = get_type_hints(Vehicle, include_extras=True)
+    return {
+        name: note.documentation.partition("] ")[2]
+        for name in VEHICLE_UNITS
+        for note in hints[name].__metadata__
+        if isinstance(note, DocInfo)
+    }
 
 
 def _comment(text: str) -> list[str]:

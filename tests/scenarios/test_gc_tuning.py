@@ -111,7 +111,7 @@ def test_what_is_frozen_for_good_stays_so() -> None:
     """In a process that lasts, a flight's own first freeze comes on top, and nothing is thawed."""
     script = """
 import gc
-from scenarios.gc_tuning import freeze_for_good
+from scenarios.gc_tuning import freeze_for_good, frozen
 freeze_for_good()
 before = gc.get_freeze_count()
 loaded = [[] for _ in range(1000)]

@@ -370,6 +370,7 @@ PARENT = """
 import sys
 from pathlib import Path
 from test_survival import Hostile, hold_the_interpreter
+from scenarios.campaign.engine.local import LocalEngine
 
 for _ in LocalEngine(2).answers(Hostile(harm=hold_the_interpreter, diary=Path(sys.argv[1])), [5]):
     pass

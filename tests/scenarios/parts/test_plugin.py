@@ -175,6 +175,7 @@ def test_without_predict_a_run_has_no_horizon_and_with_it_has_one(written: Write
 
 
 FULL = """
+from quadsim.controller import Command
 import numpy as np
 
 class Hover:

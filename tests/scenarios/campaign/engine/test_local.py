@@ -34,6 +34,7 @@ import sys
 import time as clock
 from pathlib import Path
 from campaign_pilots import ToyPilot
+from scenarios.campaign.engine.local import LocalEngine
 
 if __name__ == "__main__":
     signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs inherit that it is ignored
