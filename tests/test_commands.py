@@ -37,8 +37,6 @@ ADDED = {
 
 OWN_VEHICLE = ROOT / "docs" / "own-vehicle.md"
 """Its lines build on each other, and have a test of their own: scenarios/design/test_own_vehicle_page.py."""
-    ROOT / "docs" / "own-vehicle.md"
-)  # whose lines build on each other: scenarios/design/test_own_vehicle_page.py
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted({*(ROOT / "docs").glob("*.md")} - {OWN_VEHICLE})]
 DOCUMENTS = "\n".join(path.read_text() for path in PAGES)
 LINES = [
