@@ -356,11 +356,13 @@ def test_flights_are_compared(hover: Scenario, flight: Flight, tmp_path: Path) -
 
 
 def test_ctrl_c_ends_a_flight_in_order() -> None:
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # a library may have put its own there
     scenario = quadsim.load("hover").replace({"duration": 600.0})
     timer = threading.Timer(0.5, os.kill, (os.getpid(), signal.SIGINT))
     timer.start()
     flown = quadsim.fly(scenario, progress=False)
     timer.join()
+    signal.signal(signal.SIGINT, before)
     assert flown.log.interrupted
     assert 0.0 < flown.time[-1] < 599.0
     assert flown.outcome == "lost"
