@@ -5,12 +5,16 @@ Flies every scenario; neither the page nor the figures are kept in the repositor
 
 from __future__ import annotations
 
+import subprocess
+import sys
+import tempfile
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import get_args
 
 import matplotlib as mpl
 import numpy as np
+from make_numbers import markdown
 from make_scenarios import TITLES, nearest
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -77,6 +81,36 @@ def entry(name: str) -> tuple[Group, str]:
     )
 
 
+def session() -> str:
+    """The five commands of own-vehicle.md with what they print, as in a terminal, in a folder of their own."""
+    page = (DOCS / "own-vehicle.md").read_text(encoding="utf-8")
+    lines = page.partition("```sh\n")[2].partition("```")[0].splitlines()
+    shown = []
+    with tempfile.TemporaryDirectory() as folder:
+        for line in lines:
+            command = f"{Path(sys.executable).parent}/{line}"
+            command += " --no-video --no-recording --no-figures" if line.startswith("quadsim run") else ""
+            done = subprocess.run(command, shell=True, cwd=folder, capture_output=True, text=True, check=True)
+            shown.append(f"$ {line}\n{done.stdout}")
+    return "\n".join(shown)
+
+
+def first_times() -> str:
+    """What a first user of the Python interface waits for, each in a process of its own [s]; medians of three."""
+    load = 'import quadsim; scenario = quadsim.load("hover")'
+    steps = {"import quadsim": "pass", "load of a scenario": "import quadsim", "fly of hover, 10 s": load}
+    timed = {"import quadsim": "import quadsim", "load of a scenario": load.partition("; ")[2]}
+    rows = [("what", "time [s]")]
+    for name, before in steps.items():
+        code = f"{before}\nimport time\nt = time.perf_counter()\n{timed.get(name, 'quadsim.fly(scenario)')}\n"
+        code += "print(time.perf_counter() - t)"
+        runs = [
+            subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True) for _ in range(3)
+        ]
+        rows.append((name, f"{np.median([float(run.stdout) for run in runs]):.3f}"))
+    return markdown(rows)
+
+
 def main() -> None:
     """Fly everything and write the page."""
     FIGURES.mkdir(exist_ok=True)
@@ -88,6 +122,8 @@ def main() -> None:
         members = [text for of, text in entries if of == group]
         if members:
             parts += [f"## {TITLES.get(group, group)}\n", *members]
+    parts.append(f"## From a vehicle file to a good flight, in a terminal\n\n```text\n{session()}```\n")
+    parts.append(f"## What a first user waits for\n\n{first_times()}")
     PAGE.write_text("\n".join(parts), encoding="utf-8")
 
 

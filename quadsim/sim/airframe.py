@@ -38,7 +38,7 @@ _RIM: Final = 32
 """Points that stand for the rim of a rotor disc: its lowest point is missed by half a percent of its radius at most."""
 DRAG: Final = "drag"
 _BLUNT: Final = (0.5, 0.0, 0.0, 0.0, 0.0)
-"""Fluid coefficients that make MuJoCo's ellipsoid drag -rho C_blunt A |v| v into -rho A |v| v / 2, and nothing else."""
+"""Fluid coefficients that make MuJoCo's ellipsoid drag -rho C_blunt A |v| v into -rho A |v| v / 2; its added mass stays."""
 
 
 def outline(vehicle: Vehicle) -> Outline:
@@ -87,7 +87,8 @@ def compile_model(
         reweighed: whether the body's mass may be changed once compiled; see `quadsim.sim.effects.load.apply_mass`.
         body_drag: drag areas C_d A along the body axes [m^2], or None.  The drag is MuJoCo's own, on the ellipsoid
             whose projected areas they are: -rho A |v| v / 2 against the air that `option.wind` moves.  With it come
-            the ellipsoid's added-mass terms, a few grams of air.
+            the ellipsoid's added-mass terms: a few grams of air, and a torque where it flies aslant (Munk's moment),
+            which a vehicle of some 200 g feels at 5 m/s.
         air_density: rho [kg/m^3].
     """
     spec = mujoco.MjSpec.from_file(str(models_dir() / "quadrotor.xml"))
