@@ -38,7 +38,7 @@ _RIM: Final = 32
 """Points that stand for the rim of a rotor disc: its lowest point is missed by half a percent of its radius at most."""
 DRAG: Final = "drag"
 _BLUNT: Final = (0.5, 0.0, 0.0, 0.0, 0.0)
-"""Fluid coefficients that make MuJoCo's ellipsoid drag -rho C_blunt A |v| v into -rho A |v| v / 2; its added mass stays."""
+"""Fluid coefficients that make MuJoCo's ellipsoid drag -rho C_blunt A |v| v into -rho A |v| v / 2; added mass stays."""
 
 
 def outline(vehicle: Vehicle) -> Outline:
