@@ -175,7 +175,7 @@ def test_the_median_of_the_repeats_and_the_longest_of_all(bench: SolverBench) ->
         assert candidate.repeats == 2
 
 
-def test_contenders_are_the_default_each_solver_alone_and_daqp_both_ways(bench: SolverBench) -> None:
+def test_candidates_are_the_default_each_solver_alone_and_daqp_both_ways(bench: SolverBench) -> None:
     names = [candidate.name for candidate in bench.candidates]
     assert names == ["piqp-multistage + shortcut", "piqp-multistage", "daqp", "daqp + shortcut"]
     assert [sum(candidate.statuses.values()) for candidate in bench.candidates] == [60] * 4
@@ -227,7 +227,7 @@ def test_growth_is_fitted_over_the_long_horizons() -> None:
     assert replace(growth, horizons=(5, 10, 20, 40)).exponent("p50") is None  # two points fit anything
 
 
-def test_growth_covers_all_contenders_and_horizons(bench: SolverBench) -> None:
+def test_growth_covers_all_candidates_and_horizons(bench: SolverBench) -> None:
     assert {growth.name for growth in bench.growth} == {candidate.name for candidate in bench.candidates}
     for candidate in bench.candidates:
         kinds = {growth.kind for growth in bench.growth if growth.name == candidate.name}

@@ -141,7 +141,7 @@ def test_variations_change_the_vehicle(study: CostStudy) -> None:
     assert fly_variations(scenario(), arm_lengths=(0.5,), drags=(0.024,), workers=1)[0].outcome == other
 
 
-def test_contenders_answer_what_was_asked_in_flight(study: CostStudy) -> None:
+def test_candidates_answer_what_was_asked_in_flight(study: CostStudy) -> None:
     gain, flown, dense = study.candidates
     assert [candidate.name for candidate in study.candidates] == [
         *("unconstrained gain", "constrained, as flown", "QP by piqp-dense")
