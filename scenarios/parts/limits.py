@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 from quadsim.flight.audit import Limit, SumLimit
 from quadsim.flight.lost import LossCriteria
+from scenarios.schema.nonlinear import NonlinearPartsSpec
 from scenarios.schema.optimisation import BoundedSpec, PolytopeSpec
 
 if TYPE_CHECKING:
@@ -37,4 +38,4 @@ def build_limits(scenario: Scenario) -> tuple[Limit, ...]:
 
 def _polytopes(scenario: Scenario) -> list[PolytopeSpec]:
     controller = scenario.controller
-    return controller.polytopes if isinstance(controller, BoundedSpec) else []
+    return controller.polytopes if isinstance(controller, BoundedSpec | NonlinearPartsSpec) else []
