@@ -58,8 +58,8 @@ def fly(
         computation: how long commands take, in simulated time; none where absent.
         rng: what `computation` draws from.
         ground: what knows where the flight stands with the ground; it is flying throughout where absent.
-        loss: limits by the names of `quadsim.flight.lost.CRITERIA`, checked once per control period until it has crashed;
-            none where absent.
+        loss: limits by the names of `quadsim.flight.lost.CRITERIA`, checked once per control period until it has
+            crashed; none where absent.
         progress: called with the number of periods flown, after each.
 
     Returns:

@@ -9,8 +9,7 @@ import pytest
 
 from scenarios.campaign.report.campaign_tables import driver_table, split_table
 from scenarios.campaign.report.campaign_text import campaign_sentences
-from scenarios.campaign.statistics.drivers import parameters
-from scenarios.campaign.statistics.estimates import estimate
+from scenarios.campaign.statistics.estimates import estimate, parameters
 
 MakeCampaign = Callable[..., pa.Table]
 
