@@ -32,6 +32,9 @@ from quadsim.state import Array
 Found = TypeVar("Found")
 
 
+SEGMENT: Final = 20  # consecutive periods that a candidate answers before it is the next one's turn
+
+
 class Stopwatch:
     """Seconds since it was made, and those that calls took.
 
@@ -134,9 +137,6 @@ def undisturbed() -> Iterator[None]:
         gc.unfreeze()
         if collecting:
             gc.enable()
-
-
-SEGMENT: Final = 20  # consecutive periods that a candidate answers before it is the next one's turn
 
 
 class Candidate(Protocol):

@@ -21,6 +21,10 @@ Value = bool | Whole | Number | str | list[Number]
 Values = Annotated[list[Value], MinLen(1), MaxLen(MOST_ENTRIES)]
 
 
+MOST_FLIGHTS: Final = 1_000_000
+Sampling = Literal["random", "latin_hypercube", "sobol", "halton"]
+
+
 class _VarySpec(Spec):
     """What every entry of `[[vary]]` has."""
 
@@ -137,12 +141,6 @@ def _require_alike(values: Sequence[Value]) -> None:
         raise ValueError(f"values must all be of one kind; got {values}")
     if len({str(each) for each in values}) < len(values):
         raise ValueError(f"values must be distinct; got {values}")
-
-
-MOST_FLIGHTS: Final = 1_000_000
-
-
-Sampling = Literal["random", "latin_hypercube", "sobol", "halton"]
 
 
 class LimitsSpec(Spec):

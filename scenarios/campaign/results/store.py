@@ -26,6 +26,12 @@ _FILLED: Final = _NEEDED[:6]
 LARGEST: Final = 1e100  # magnitude of the largest number that a flight has; sums of squares of larger ones are infinite
 
 
+FLIGHTS_FILE: Final = "flights.parquet"
+TIMES_FILE: Final = "timing.parquet"
+PARTS_DIR: Final = "parts"
+_PART: Final = "part-*.parquet"
+
+
 def read_flights(path: Path, schema: pa.Schema) -> pa.Table:
     """`flights.parquet` of a campaign, whose schema it has; a table of an older version may have fewer columns.
 
@@ -69,12 +75,6 @@ def require_columns(table: pa.Table, schema: pa.Schema, path: Path, *, without: 
     flights = table["flight"].to_numpy()
     if flights.size and (flights[0] < 0 or (np.diff(flights) <= 0).any()):
         raise FileError(path, "has flights that are not numbered upwards from 0")
-
-
-FLIGHTS_FILE: Final = "flights.parquet"
-TIMES_FILE: Final = "timing.parquet"
-PARTS_DIR: Final = "parts"
-_PART: Final = "part-*.parquet"
 
 
 class Store:

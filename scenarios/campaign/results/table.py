@@ -64,6 +64,12 @@ TIMING: Final = (
 Summary = Mapping[str, Any]
 
 
+Texts = np.ndarray[Any, np.dtype[np.object_]]
+_NO_METRIC: Final = ("flight", "seed", DRAW, MARGIN, TIME_VIOLATED, SATISFIED)
+Rows = np.ndarray[Any, np.dtype[np.intp]]
+Edges = np.ndarray[Any, np.dtype[np.str_]]
+
+
 def make_schema(draws: Mapping[str, tuple[pa.DataType, str]], limits: Sequence[Limit]) -> pa.Schema:
     """The columns of a campaign, clock times last.
 
@@ -226,12 +232,6 @@ def _storable(value: object) -> object:
 
 def _finite(value: float) -> float | None:
     return value if math.isfinite(value) else None
-
-
-Texts = np.ndarray[Any, np.dtype[np.object_]]
-_NO_METRIC: Final = ("flight", "seed", DRAW, MARGIN, TIME_VIOLATED, SATISFIED)
-Rows = np.ndarray[Any, np.dtype[np.intp]]
-Edges = np.ndarray[Any, np.dtype[np.str_]]
 
 
 def numbers(table: pa.Table, name: str) -> Array:
