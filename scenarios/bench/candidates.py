@@ -28,8 +28,6 @@ from scenarios.progress import Progress
 
 WITH_SHORTCUT: Final = ("daqp",)  # solvers that are shown both with and without shortcuts, besides the default
 REFERENCE_SOLVER: Final = "piqp-dense"  # where the search for the optimum in closed form starts
-
-
 Query = Callable[[int], tuple[Array, Array, Array]]
 STEPS_TRIED: Final = (1, 2, 3, 4, 5, 6, 8, 10, 13, 17, 20, 25)
 

@@ -30,8 +30,6 @@ from threadpoolctl import threadpool_limits
 from quadsim.state import Array
 
 Found = TypeVar("Found")
-
-
 SEGMENT: Final = 20  # consecutive periods that a candidate answers before it is the next one's turn
 
 

@@ -19,8 +19,6 @@ Whole = Annotated[int, Field(ge=-LARGEST_SEED, le=LARGEST_SEED)]
 Value = bool | Whole | Number | str | list[Number]
 """What can be drawn from a list: whatever a field of a scenario may be, but for tables."""
 Values = Annotated[list[Value], MinLen(1), MaxLen(MOST_ENTRIES)]
-
-
 MOST_FLIGHTS: Final = 1_000_000
 Sampling = Literal["random", "latin_hypercube", "sobol", "halton"]
 

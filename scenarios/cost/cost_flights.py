@@ -41,8 +41,6 @@ _NOT_THE_COURSE: Final = {
     "constraints",
 }
 """Fields in which flights that are compared by their controllers may differ; vehicles are compared by their numbers."""
-
-
 REPEATS: Final = 3
 SWEEP_STRIDE: Final = 3  # of a flight in a sweep, one segment of so many is timed
 LONGEST_PASS: Final = 20.0  # a candidate that takes longer than this for all periods of a flight [s] is timed once

@@ -11,8 +11,6 @@ from quadsim.report.table import ABSENT, Cell, Grid, Mark, format_number
 DIVERGED: Final = 10.0
 """Distance from the reference at the end [m] from which on a flight counts as lost, though nothing ended it."""
 OVERTURNED: Final = 90.0  # roll or pitch [deg] from which on a flight counts as lost, whatever came after
-
-
 ARRIVED: Final = 0.05  # distance from the reference at the end [m] that counts as arrived
 FAR: Final = 0.5  # the same that a reader should notice [m]
 TILT_TOLERANCE: Final = 0.05

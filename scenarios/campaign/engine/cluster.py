@@ -32,8 +32,6 @@ _LOOK_S: Final = 1.0
 _CONNECT_S: Final = 10.0
 _FETCH_S: Final = 10.0
 _LOGGERS: Final = ("distributed", "distributed.client", "tornado.application", "asyncio")
-
-
 _supervisors: dict[bytes, SupervisorProcess] = {}  # of this worker: one at most, of the campaign that it flies
 
 

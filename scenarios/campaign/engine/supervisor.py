@@ -34,8 +34,6 @@ LOOK_S: Final = 0.2  # between two looks at a worker that flies [s]
 _TURN_S: Final = 1.0  # most that one look counts of the time since the last one [s]
 _LEAVING_S: Final = 1.0  # for a worker that says nothing more to be gone [s]
 _LARGEST: Final = 1 << 26  # no worker says more at once [bytes]
-
-
 _MAIN: Final = (
     "import json, sys; sys.path[:] = json.loads(sys.argv[2]); import scenarios.campaign.preload; "
     "from scenarios.campaign.engine.supervisor import main; main(int(sys.argv[1]))"

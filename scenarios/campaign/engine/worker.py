@@ -33,8 +33,6 @@ _LIMITS: Final = tuple(getattr(resource, name) for name in dir(resource) if name
 _TIMERS: Final = (signal.ITIMER_REAL, signal.ITIMER_VIRTUAL, signal.ITIMER_PROF)
 _ONE, _THREE, _SMALLEST = 1.0, 3.0, 5e-324
 _Settings = tuple[Any, ...]
-
-
 FLIGHT: Final = struct.Struct("=q")  # a flight's number, as a supervisor hands it out
 SIZE: Final = struct.Struct("=Q")  # of what follows, a pickled `FlightReport` [bytes]
 PULSE_BYTES: Final = 8

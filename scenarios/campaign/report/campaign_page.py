@@ -33,8 +33,6 @@ _FILES: Final = {
     "campaign.svg": "figure (SVG)",
 }
 """What the page links to, where it is there, and under which name."""
-
-
 COMPARISON_FILE: Final = "comparison.json"
 TABLE_FILE: Final = "comparison.md"
 KIND: Final = "campaign comparison"  # what `quadsim.outputs` calls such a directory

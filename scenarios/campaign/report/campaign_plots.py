@@ -34,8 +34,6 @@ if TYPE_CHECKING:
 
 OUTCOMES: Final = {"with the worst margin": LINES[0], "with failure": LINES[1]}
 _LOG_TICKS: Final = [float(digit * 10**power) for power in range(7) for digit in (1, 2, 5)]
-
-
 _EDGE_SIZE: Final = 8
 _TICK_ROOM: Final = 46  # characters that have room below a panel of a narrow page
 

@@ -24,8 +24,6 @@ _NEEDED: Final = ("flight", "seed", "status", "verdict", "failed", "violated", "
 """Columns that no version left out; `flight` to `violated` have a value in every row."""
 _FILLED: Final = _NEEDED[:6]
 LARGEST: Final = 1e100  # magnitude of the largest number that a flight has; sums of squares of larger ones are infinite
-
-
 FLIGHTS_FILE: Final = "flights.parquet"
 TIMES_FILE: Final = "timing.parquet"
 PARTS_DIR: Final = "parts"

@@ -62,8 +62,6 @@ TIMING: Final = (
 )
 """What a clock measured of a flight, and where; it stands in a table of its own."""
 Summary = Mapping[str, Any]
-
-
 Texts = np.ndarray[Any, np.dtype[np.object_]]
 _NO_METRIC: Final = ("flight", "seed", DRAW, MARGIN, TIME_VIOLATED, SATISFIED)
 Rows = np.ndarray[Any, np.dtype[np.intp]]

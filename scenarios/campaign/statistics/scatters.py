@@ -24,8 +24,6 @@ LOWEST_MARGIN: Final = -2.0
 """Margins below this are drawn at the foot, so that a lost flight does not flatten all others."""
 _LEAST_DEPTH: Final = 0.25  # share of the height above 0 that is shown below it, however far from it the margins are
 _FENCE: Final = 5.0  # quartile ranges beyond the quartiles up to which values are drawn where they are
-
-
 COURSE: Final = "half of the flights are above"  # what a curve through the flights of a scatter tells
 _GAP: Final = 0.06  # from the axis' end to what is drawn at the edge, as a share of the axis
 _MOST_POINTS: Final = 18_000
