@@ -46,7 +46,8 @@ LONG = (
     *("mpc/robust/test_robust.py", "scenarios/test_reaudit.py", "scenarios/test_run.py", "scenarios/test_cli.py"),
     *("mpc/test_staged.py", "scenarios/campaign/test_commands.py", "scenarios/test_mutations.py"),
     *("test_packaging.py", "mpc/test_diagnosis.py", "mpc/robust/test_tightening.py", "mpc/exact/test_shortcut.py"),
-    *("mpc/fallback/test_fallback_flights.py", "scenarios/test_soak.py", "scenarios/campaign/statistics/test_drivers.py"),
+    *("mpc/fallback/test_fallback_flights.py", "scenarios/test_soak.py"),
+    *("scenarios/campaign/statistics/test_drivers.py",),
 )
 """Modules that take longest; those not named take less than four seconds each."""
 
