@@ -7,7 +7,7 @@ import math
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any, Final, Literal
+from typing import TYPE_CHECKING, Any, Final, Literal
 
 import numpy as np
 
@@ -29,6 +29,9 @@ from scenarios.design.tuning import (
     Tuning,
     tune,
 )
+
+if TYPE_CHECKING:
+    from scenarios.schema.scenario import Scenario
 
 COURSES: Final = ("hover", "step", "figure-eight")
 LAWS: Final = ("robust", "lqr", "pid", "geometric")
@@ -77,14 +80,21 @@ class FirstScenario:
     """A scenario for a vehicle, line by line.
 
     Attributes:
-        head: comments above it.
+        notes: what it was made from, the comments above it.
         entries: its lines, those of a table together.
         size: of the course [m]: the step, or the figure's length; for hover a step's.
     """
 
-    head: tuple[str, ...]
+    notes: tuple[str, ...]
     entries: tuple[Entry, ...]
     size: float
+
+    @property
+    def scenario(self) -> Scenario:
+        """To be flown."""
+        from scenarios.loading import parse_scenario
+
+        return parse_scenario(self.to_data())
 
     def to_data(self) -> dict[str, Any]:
         """As nested tables, what parsing `to_toml` gives."""
@@ -105,7 +115,7 @@ class FirstScenario:
 
     def to_toml(self) -> str:
         """As a commented file."""
-        lines = [f"# {printable(text)}".rstrip() for text in self.head]
+        lines = [f"# {printable(text)}".rstrip() for text in self.notes]
         table = ""
         for entry in self.entries:
             if entry.table != table or (entry.table == "[constraints]" and entry.key == "name"):
@@ -158,10 +168,10 @@ def first_scenario(
         Entry(table="effects.air", key="", value=None, why="drag of the vehicle file"),
         *_constraints(vehicle, tuning, size if law == "robust" else None),
     )
-    return FirstScenario(head=_head(vehicle, tuning, course, law), entries=entries, size=size)
+    return FirstScenario(notes=_notes(vehicle, tuning, course, law), entries=entries, size=size)
 
 
-def _head(vehicle: Vehicle, tuning: Tuning, course: str, law: str) -> tuple[str, ...]:
+def _notes(vehicle: Vehicle, tuning: Tuning, course: str, law: str) -> tuple[str, ...]:
     can = tuning.authority
     limits = {
         "lag": f"the rotors' lag: 1 / ({LAG_RATIO:g} (T + tau / 2)), T = {1e3 * can.lag:.3g} ms",
