@@ -121,7 +121,7 @@ def _poles(sheet: VehicleSheet) -> list[tuple[str, ...]]:
     body = f"rigid body: {len(sheet.continuous_poles)} poles, chains of {chains} integrators"
     lines: list[tuple[str, ...]] = [(body, "0", "1")]
     for name, pole in sheet.lag_poles.items():
-        label = f"rotors that {'rise' if name == 'rotor_rise' else 'fall'}: {N_ROTORS} poles, unknown to the controller"
+        label = f"rotors that {'rise' if name == 'rotor_rise' else 'fall'}: {N_ROTORS} poles, not in this model"
         lines.append((label, format_number(pole), format_number(sheet.discrete_lag_poles[name])))
     return lines
 

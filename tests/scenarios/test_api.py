@@ -7,11 +7,13 @@ import functools
 import importlib
 import math
 import os
+import re
 import signal
 import subprocess
 import sys
 import threading
 from pathlib import Path
+from types import ModuleType
 
 import numpy as np
 import pytest
@@ -84,6 +86,21 @@ def test_every_public_name_is_there_and_documented(package: object) -> None:
         assert name in dir(package)
     with pytest.raises(AttributeError, match="no attribute 'nonsense'"):
         package.nonsense  # type: ignore[attr-defined]  # noqa: B018
+
+
+def test_the_page_of_the_api_has_every_name() -> None:
+    page = (EXAMPLES.parent / "docs/api.md").read_text(encoding="utf-8")
+    named = set(re.findall(r"^::: ((?:quadsim|mpc)\.\w+)$", page, re.MULTILINE))
+    rooms = {name for name in mpc.__all__ if isinstance(getattr(mpc, name), ModuleType)}
+    assert named == {f"quadsim.{name}" for name in quadsim.__all__} | {f"mpc.{name}" for name in {*mpc.__all__} - rooms}
+
+
+def test_commands_fly_load_and_measure_through_it_alone() -> None:
+    """They import nothing that does so by itself; types of what is returned, and its tables, they may."""
+    inner = r"scenarios\.(?:run|loading|build|courses|parts|cost|design\.(?!vehicle_figures)|campaign\.(?:replay|plan))"
+    for path in (EXAMPLES.parent / "scenarios/commands").glob("*.py"):
+        imported = re.findall(r"^ *from (scenarios\.[\w.]+) import", path.read_text(encoding="utf-8"), re.MULTILINE)
+        assert not [name for name in imported if re.match(inner, name)], path.name
 
 
 def test_importing_it_imports_nothing_heavy() -> None:
