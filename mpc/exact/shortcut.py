@@ -144,12 +144,12 @@ class Shortcut:
         return values
 
     def _starts(self) -> list[Side]:
-        """The last active set moved one step earlier, and as it was."""
-        moved, m = np.zeros_like(self._side), self._rows.l1.size
-        moved[:-m] = self._side[m:]
+        """The last active set moved one step earlier, its last step's held, and as it was."""
+        m = self._rows.l1.size
+        moved = np.concatenate((self._side[m:], self._side[-m:]))
         if self._uneven:
             moved[np.isinf(np.where(moved > 0, self._upper, self._lower))] = 0
-        return [moved, self._side]
+        return [moved, self._side] if self._side.any() else [moved]
 
     def _by_axes(
         self, plan: Array, free: Array, within: Flags, u_before: Array, starts: list[Side]
