@@ -9,7 +9,7 @@ acceleration alpha:
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Final
 
 import numpy as np
@@ -59,18 +59,18 @@ class Trim:
         return state
 
 
-def twisted(model: NonlinearModel, twist: Array) -> NonlinearModel:
-    """The model whose thrust brings about an angular acceleration; see `Trim.twist`."""
-    effectiveness = model.effectiveness.copy()
-    effectiveness[1:] += np.outer(twist, effectiveness[0])
-    return replace(model, effectiveness=effectiveness)
+def twisted(effectiveness: Array, twist: Array) -> Array:
+    """(4, 4) the effectiveness of a model whose thrust brings about an angular acceleration; see `Trim.twist`."""
+    found = effectiveness.copy()
+    found[1:] += twist[:, None] * effectiveness[0]
+    return found
 
 
 def equilibrium(model: NonlinearModel, *, acceleration: Array | None = None, twist: Array | None = None) -> Trim:
     """What rest takes under a model's disturbance; a rotor that would have to pull stands still.
 
     Args:
-        model: not yet `twisted`.
+        model: its effectiveness not yet `twisted`.
         acceleration: (3,) of the disturbance, world frame [m/s^2]; None for the model's.
         twist: (3,) see `Trim.twist`; None for none.
     """

@@ -136,8 +136,7 @@ def _advance_one(model: NonlinearModel, x: Array, u: Array) -> Array:
             a_3, b_3 = slopes(_moved(q, half, s_2), s_3, k + 2)
             s_4 = _moved(s, step, b_3)
             a_4, b_4 = slopes(_moved(q, step, s_3), s_4, k + 3)
-            # no acceleration depends on where the vehicle is, or on how fast it goes
-            p = _moved(p, step, _moved(v, sixth, _added(a_1, a_2, a_3)))
+            p = _moved(p, sixth, _weighted(v, _moved(v, half, a_1), _moved(v, half, a_2), _moved(v, step, a_3)))
             v = _moved(v, sixth, _weighted(a_1, a_2, a_3, a_4))
             q = _moved(q, sixth, _weighted(s, s_2, s_3, s_4))
             s = _moved(s, sixth, _weighted(b_1, b_2, b_3, b_4))
@@ -154,15 +153,10 @@ def _moved(start: Triple, by: float, slope: Triple) -> Triple:
     return a + by * d, b + by * e, c + by * f
 
 
-def _added(*triples: Triple) -> Triple:
-    x, y, z = map(sum, zip(*triples, strict=True))
-    return x, y, z
-
-
 def _weighted(first: Triple, second: Triple, third: Triple, fourth: Triple) -> Triple:
     """Six times the mean slope of a Runge-Kutta step."""
-    one, two, three = (a + 2.0 * (b + c) + d for a, b, c, d in zip(first, second, third, fourth, strict=True))
-    return one, two, three
+    (a, b, c), (d, e, f), (p, q, r), (x, y, z) = first, second, third, fourth
+    return a + 2.0 * (d + p) + x, b + 2.0 * (e + q) + y, c + 2.0 * (f + r) + z
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -150,7 +150,7 @@ class Condensed:
             l1, l2 = self._problem.rows.l1[soft], self._problem.rows.l2[soft]
             # Stationarity of a slack: l1 + 2 l2 e - |z| + z_box = 0.
             z_slacks = np.minimum(np.abs(multipliers[:, soft]) - l1 - 2.0 * l2 * slacks, 0.0)
-            x, z_box = np.append(x, slacks), np.append(z_box, z_slacks)
+            x, z_box = np.concatenate((x, slacks.ravel())), np.concatenate((z_box, z_slacks.ravel()))
         return replace(like, x=x, y=self._blank.b, z=z, z_box=z_box)
 
 

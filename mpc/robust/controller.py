@@ -53,8 +53,7 @@ LONGEST_SPAN: Final = 0.25
 _SAME_TIME: Final = 1e-6  # [s]
 _YAW: Final = INDEX["yaw"]
 _MOVING: Final = [*VELOCITY, *EULER, *EULER_RATE]
-_PLAUSIBLE: Final = PLAUSIBLE[list(REFERENCE_STATES)]
-"""Of references."""
+_PLAUSIBLE: Final = PLAUSIBLE[list(REFERENCE_STATES)]  # of references
 
 
 class RobustMPC:
@@ -205,14 +204,15 @@ class RobustMPC:
     def _believe(self) -> None:
         """Rest against the disturbance that is estimated now."""
         if self._observer is None:
-            self._twisted, self._resting, self.trim = self._model, self._model.acceleration, equilibrium(self._model)
+            self._effectiveness, self._resting = self._model.effectiveness, self._model.acceleration
+            self.trim: Trim = equilibrium(self._model)
             return
         x, y, _ = self._observer.estimate[:3].tolist()
         twist, gravity = self._observer.estimate[3:] / self._model.gravity, self._model.gravity
         lift = math.hypot(x, y, gravity)
-        self._twisted = twisted(self._model, twist)
+        self._effectiveness = twisted(self._model.effectiveness, twist)
         self._resting = self._acceleration((-x / lift, -y / lift, gravity / lift))
-        self.trim: Trim = equilibrium(self._model, acceleration=self._resting, twist=twist)
+        self.trim = equilibrium(self._model, acceleration=self._resting, twist=twist)
 
     def _acceleration(self, axis: Sequence[float]) -> Array:
         """(3,) that the estimated disturbance is, in the world frame [m/s^2], with thrust along an axis (3,) there."""
@@ -223,7 +223,8 @@ class RobustMPC:
 
     def _disturbed(self, state: Array, period: float) -> NonlinearModel:
         """The model of a period [s], disturbed as is estimated, with thrust as in a state (12,)."""
-        return replace(self._twisted, acceleration=self._acceleration(thrust_axis(state.tolist())), period=period)
+        acceleration = self._acceleration(thrust_axis(state.tolist()))
+        return replace(self._model, effectiveness=self._effectiveness, acceleration=acceleration, period=period)
 
     def _span(self, now: Moment) -> float:
         """Time since the last measured state [s]; infinite after a pause, or where the present one is not measured."""
