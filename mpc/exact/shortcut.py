@@ -71,11 +71,13 @@ class Shortcut:
         self._uneven = bool((endless != endless[0]).any())  # some steps have bounds that others lack
         self._steps, self._values = np.empty((N, nu)), np.empty(rows.lower.shape)
         self._side: Side = np.zeros(rows.lower.size, np.int8)
+        self._cold = True  # no period before: from nothing the search among all rows leads to dependent ones
         self._no_slacks = read_only(np.zeros((N, rows.soft.size)))
         qp = self.formulation.qp
-        self._no_equalities, self._no_rows = read_only(np.zeros(0)), read_only(np.zeros(qp.h_l.size))
-        self._no_box = read_only(np.concatenate([np.zeros(N * nu), -np.tile(rows.l1[rows.soft], N)]))
-        self._nothing = Active(z=self._no_rows, values=self._no_rows, side=np.zeros(0, np.int8), steps=0)
+        nothing, no_rows = read_only(np.zeros(0)), read_only(np.zeros(qp.h_l.size))
+        box = read_only(np.concatenate([np.zeros(N * nu), -np.tile(rows.l1[rows.soft], N)]))
+        self._no_multipliers = {"y": nothing, "z": no_rows, "z_box": box}
+        self._nothing = Active(z=nothing, values=nothing, side=np.zeros(0, np.int8), steps=0)
         grid = np.arange(rows.lower.size).reshape(rows.lower.shape)
         self._of_inputs_alone = ~np.broadcast_to(rows.C.any(axis=1), grid.shape)
         self._groups = []
@@ -95,12 +97,13 @@ class Shortcut:
 
     def reset(self) -> None:
         """See `mpc.solvers.Solver.reset`."""
-        self._side = np.zeros_like(self._side)
+        self._side, self._cold = np.zeros_like(self._side), True
         self._whole.reset()
 
     def solve(self, state: Array, desired: Array, u_before: Array, rest: Rest | None = None) -> Answer:
         """See `mpc.solvers.Solver.solve`."""
         started = clock.perf_counter()
+        cold, self._cold = self._cold, False
         x_s, u_s = self._rest if rest is None else rest
         dx, dy = (state, desired) if rest is None else (state - x_s, desired - self._C_r @ x_s)
         w, y = self._free.at(dx, dy, u_before - u_s)
@@ -119,15 +122,15 @@ class Shortcut:
         within = (self._lower <= free) & (free <= self._upper)
         if within.all():
             self._side = np.zeros_like(self._side)
-            nothing = self._nothing
-            solution = self._solution(plan, nothing, started, UNCONSTRAINED)
+            x = np.concatenate((plan.ravel(), self._no_slacks.ravel())) if self._no_slacks.size else plan.ravel()
+            solution = self._solution({"x": x, **self._no_multipliers}, self._nothing, started, UNCONSTRAINED)
             return Answer(plan=plan, slacks=self._no_slacks, solution=solution, way=Way.FREE)
         free = free.copy()  # the values' room is used again
         if np.isfinite(free).all():
             starts = self._starts()
             found, settled = self._by_axes(plan, free, within, u_before, starts)
             way = Way.WHOLE if found is None else Way.AXES
-            if found is None and settled and self._all is not None:
+            if found is None and settled and self._all is not None and not cold:
                 found = self._all.solve(plan, free, starts)
             if found is not None:
                 self._side = found.active.side
@@ -180,17 +183,13 @@ class Shortcut:
             values, shape = found.active.values, self._rows.lower.shape
             beyond = np.maximum(np.maximum(values - self._upper, self._lower - values), 0.0)
             slacks = (violated * beyond).reshape(shape)[:, self._rows.soft]
-        solution = self._solution(found.plan, found.active, started, SOLVED, slacks)
+        point = self.formulation.point(found.plan, slacks, found.active.z.reshape(self._rows.lower.shape))
+        solution = self._solution(point, found.active, started, SOLVED)
         return Answer(plan=found.plan, slacks=slacks, solution=solution, way=way)
 
-    def _solution(
-        self, plan: Array, active: Active, started: float, status: str, slacks: Array | None = None
-    ) -> Solution:
-        blank = Solution(
-            x=np.append(plan, self._no_slacks) if slacks is None and self._no_slacks.size else plan.ravel(),
-            y=self._no_equalities,
-            z=self._no_rows,
-            z_box=self._no_box,
+    def _solution(self, point: dict[str, Array], active: Active, started: float, status: str) -> Solution:
+        return Solution(
+            **point,
             status=status,
             iterations=active.steps,
             active=int(np.count_nonzero(active.side)),
@@ -198,9 +197,6 @@ class Shortcut:
             dual_residual=0.0,
             solve_s=clock.perf_counter() - started,
         )
-        if slacks is None:
-            return blank
-        return self.formulation.solution(blank, plan, slacks, active.z.reshape(self._rows.lower.shape))
 
     def _by_solver(
         self, plan: Array, free: Array, query: tuple[Array, Array, Array, Rest | None], started: float
@@ -223,7 +219,8 @@ class Shortcut:
                 self._side = found.active.side
                 answer = self._answer(found, Way.WHOLE, started)
         if answer.solution is given:
-            answer = replace(answer, solution=self.formulation.solution(given, answer.plan, answer.slacks, multipliers))
+            point = self.formulation.point(answer.plan, answer.slacks, multipliers)
+            answer = replace(answer, solution=replace(given, **point))
         solution = replace(
             answer.solution,
             iterations=given.iterations,
