@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Protocol, TypeAlias
+from typing import NamedTuple, Protocol, TypeAlias
 
 import numpy as np
 from scipy.sparse import csc_matrix
@@ -112,6 +112,15 @@ class QPRows:
         """The inverse: multipliers of the QP's rows (N K,) and of inputs (N nu,)."""
         z = np.minimum(np.maximum(multipliers[:, self._origin], self._least), self._most)
         return z.ravel(), np.dot(multipliers, self._of_box).ravel()
+
+
+class Point(NamedTuple):
+    """A primal point and the multipliers there; see `Solution`."""
+
+    x: Array
+    y: Array
+    z: Array
+    z_box: Array
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -17,7 +17,7 @@ from mpc.exact.free import FreeOptimum
 from mpc.ocp import Problem, Rest
 from mpc.paper.condensed import Condensed, condensed_cost, row_maps
 from mpc.paper.prediction import prediction
-from mpc.qp import Solution
+from mpc.qp import Point, Solution
 from mpc.solvers import Answer, Solver, Way
 from quadsim.controller import SOLVED, UNCONSTRAINED
 from quadsim.state import Array, Indices, read_only
@@ -71,12 +71,11 @@ class Shortcut:
         self._uneven = bool((endless != endless[0]).any())  # some steps have bounds that others lack
         self._steps, self._values = np.empty((N, nu)), np.empty(rows.lower.shape)
         self._side: Side = np.zeros(rows.lower.size, np.int8)
-        self._cold = True  # no period before: from nothing the search among all rows leads to dependent ones
         self._no_slacks = read_only(np.zeros((N, rows.soft.size)))
         qp = self.formulation.qp
         nothing, no_rows = read_only(np.zeros(0)), read_only(np.zeros(qp.h_l.size))
         box = read_only(np.concatenate([np.zeros(N * nu), -np.tile(rows.l1[rows.soft], N)]))
-        self._no_multipliers = {"y": nothing, "z": no_rows, "z_box": box}
+        self._no_multipliers = Point(nothing, nothing, no_rows, box)
         self._nothing = Active(z=nothing, values=nothing, side=np.zeros(0, np.int8), steps=0)
         grid = np.arange(rows.lower.size).reshape(rows.lower.shape)
         self._of_inputs_alone = ~np.broadcast_to(rows.C.any(axis=1), grid.shape)
@@ -97,13 +96,12 @@ class Shortcut:
 
     def reset(self) -> None:
         """See `mpc.solvers.Solver.reset`."""
-        self._side, self._cold = np.zeros_like(self._side), True
+        self._side = np.zeros_like(self._side)
         self._whole.reset()
 
     def solve(self, state: Array, desired: Array, u_before: Array, rest: Rest | None = None) -> Answer:
         """See `mpc.solvers.Solver.solve`."""
         started = clock.perf_counter()
-        cold, self._cold = self._cold, False
         x_s, u_s = self._rest if rest is None else rest
         dx, dy = (state, desired) if rest is None else (state - x_s, desired - self._C_r @ x_s)
         w, y = self._free.at(dx, dy, u_before - u_s)
@@ -123,14 +121,14 @@ class Shortcut:
         if within.all():
             self._side = np.zeros_like(self._side)
             x = np.concatenate((plan.ravel(), self._no_slacks.ravel())) if self._no_slacks.size else plan.ravel()
-            solution = self._solution({"x": x, **self._no_multipliers}, self._nothing, started, UNCONSTRAINED)
+            solution = self._solution(self._no_multipliers._replace(x=x), self._nothing, started, UNCONSTRAINED)
             return Answer(plan=plan, slacks=self._no_slacks, solution=solution, way=Way.FREE)
         free = free.copy()  # the values' room is used again
         if np.isfinite(free).all():
             starts = self._starts()
             found, settled = self._by_axes(plan, free, within, u_before, starts)
             way = Way.WHOLE if found is None else Way.AXES
-            if found is None and settled and self._all is not None and not cold:
+            if found is None and settled and self._all is not None:
                 found = self._all.solve(plan, free, starts)
             if found is not None:
                 self._side = found.active.side
@@ -187,9 +185,12 @@ class Shortcut:
         solution = self._solution(point, found.active, started, SOLVED)
         return Answer(plan=found.plan, slacks=slacks, solution=solution, way=way)
 
-    def _solution(self, point: dict[str, Array], active: Active, started: float, status: str) -> Solution:
+    def _solution(self, point: Point, active: Active, started: float, status: str) -> Solution:
         return Solution(
-            **point,
+            x=point.x,
+            y=point.y,
+            z=point.z,
+            z_box=point.z_box,
             status=status,
             iterations=active.steps,
             active=int(np.count_nonzero(active.side)),
@@ -220,7 +221,7 @@ class Shortcut:
                 answer = self._answer(found, Way.WHOLE, started)
         if answer.solution is given:
             point = self.formulation.point(answer.plan, answer.slacks, multipliers)
-            answer = replace(answer, solution=replace(given, **point))
+            answer = replace(answer, solution=replace(given, x=point.x, y=point.y, z=point.z, z_box=point.z_box))
         solution = replace(
             answer.solution,
             iterations=given.iterations,

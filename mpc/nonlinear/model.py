@@ -71,7 +71,7 @@ class NonlinearModel:
     @cached_property
     def allocation(self) -> Array:
         """(4, 4) the inverse of `effectiveness`."""
-        return read_only(np.linalg.inv(self.effectiveness))
+        return read_only(np.array(np.linalg.inv(self.effectiveness), float))
 
 
 def nonlinear_model(

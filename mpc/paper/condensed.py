@@ -15,7 +15,7 @@ from mpc.constraints import Rows
 from mpc.ocp import Problem, Rest
 from mpc.paper.cost import cost
 from mpc.paper.prediction import Prediction, prediction
-from mpc.qp import QP, QPRows, Solution, Vectors
+from mpc.qp import QP, Point, QPRows, Solution, Vectors
 from quadsim.state import Array, Indices
 
 
@@ -140,8 +140,8 @@ class Condensed:
         """See `mpc.qp.Formulation.multipliers`."""
         return self._rows.multipliers(solution.z, solution.z_box[: self._inputs])
 
-    def point(self, plan: Array, slacks: Array, multipliers: Array) -> dict[str, Array]:
-        """The x, y, z and z_box of this QP's `Solution`, of a plan (N, nu), slacks (N, m_s), rows' multipliers (N, m).
+    def point(self, plan: Array, slacks: Array, multipliers: Array) -> Point:
+        """This QP's point of a plan (N, nu), slacks (N, m_s) and rows' multipliers (N, m).
 
         Multipliers are positive at upper bounds and negative at lower ones.
         """
@@ -151,7 +151,7 @@ class Condensed:
             # Stationarity of a slack: l1 + 2 l2 e - |z| + z_box = 0.
             z_slacks = np.minimum(np.abs(multipliers[:, soft]) - l1 - 2.0 * l2 * slacks, 0.0)
             x, z_box = np.concatenate((x, slacks.ravel())), np.concatenate((z_box, z_slacks.ravel()))
-        return {"x": x, "y": self._blank.b, "z": z, "z_box": z_box}
+        return Point(x, self._blank.b, z, z_box)
 
 
 def _one_step_later(sizes: list[int], N: int) -> Indices:

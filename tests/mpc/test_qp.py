@@ -123,8 +123,8 @@ def test_multipliers_of_rows_are_those_of_the_qp_and_back() -> None:
     assert {"slews", "inputs", "late"} <= active
     assert "again" not in active
     back = form.point(form.inputs(optimum.x), form.slacks(optimum.x), rows)
-    np.testing.assert_array_equal(back["z"], optimum.z)
-    np.testing.assert_array_equal(back["z_box"], optimum.z_box)
+    np.testing.assert_array_equal(back.z, optimum.z)
+    np.testing.assert_array_equal(back.z_box, optimum.z_box)
     answer = Shortcut(problem, QPSolver("piqp-multistage", problem)).solve(np.zeros(12), desired, problem.model.u_bar)
     np.testing.assert_allclose(answer.plan, form.inputs(optimum.x), atol=1e-3)
     largest = float(np.abs(answer.solution.z).max())
