@@ -22,6 +22,8 @@ if TYPE_CHECKING:
     from mpc.nonlinear.settings import NonlinearSettings as NonlinearSettings
     from mpc.ocp import Objective as Objective
     from mpc.ocp import Problem as Problem
+    from mpc.ocp import Query as Query
+    from mpc.ocp import Unanswered as Unanswered
     from mpc.robust.controller import RobustMPC as RobustMPC
     from mpc.robust.settings import RobustSettings as RobustSettings
     from mpc.solvers import QPSolver as QPSolver
@@ -36,7 +38,7 @@ _PLACES = {
     "mpc.model": ("LinearModel", "hover_model"),
     "mpc.nonlinear.controller": ("NonlinearMPC",),
     "mpc.nonlinear.settings": ("NonlinearSettings",),
-    "mpc.ocp": ("Objective", "Problem"),
+    "mpc.ocp": ("Objective", "Problem", "Query", "Unanswered"),
     "mpc.robust.controller": ("RobustMPC",),
     "mpc.robust.settings": ("RobustSettings",),
     "mpc.solvers": ("QPSolver",),
