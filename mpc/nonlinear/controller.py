@@ -276,6 +276,7 @@ class NonlinearMPC:
         self._quaternion: Array | None
         self._last: tuple[float, Array] | None  # time and state of the last period
         self._asked: float
+        self._velocity = np.zeros(3)  # the reference's in the last period
         self._forget()
         self.unanswered: Unanswered | None = None
 
@@ -370,8 +371,8 @@ class NonlinearMPC:
         expected = advance_nodes(model, x, self._shares(self._acting))
         self._observer.learn(np.concatenate([measured[V] - expected[V], measured[W] - expected[W]]))
         if self.settings.disturbance is Disturbance.PATH:
-            before, now = self._velocity, nodes.states[0, V]
-            self._observer.estimate[:3] = along_path(self._observer.estimate[:3], before, now)
+            turned = along_path(self._observer.estimate[:3], self._velocity, nodes.states[0, V])
+            self._observer.estimate[:3] = turned
 
     def _follow(self, nodes: Nodes) -> None:
         """Believe what is estimated now, and how it goes on over the horizon."""
