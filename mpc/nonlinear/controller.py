@@ -135,12 +135,12 @@ class NonlinearMPC:
         x[3] = 1.0
         x[N_BODY:] = hover[: model.n - N_BODY]
         A, B, _ = linearise_nodes(model, x[None], hover[None])
-        rows, weights = settings.weights()
+        rows, weights = settings.outputs()
         objective = Objective(
             C_r=np.hstack([rows, np.zeros((len(rows), model.n - N_BODY))]),
             Q_y=np.diag(weights),
-            Q_u=settings.input_weight * np.eye(N_ROTORS),
-            Q_d=settings.move_weight * np.eye(N_ROTORS) if settings.move_weight else None,
+            Q_u=settings.weights.input * np.eye(N_ROTORS),
+            Q_d=settings.weights.move * np.eye(N_ROTORS) if settings.weights.move else None,
         )
         linear = LinearModel(A=A[0], B=B[0], u_bar=hover, period=model.step)
         if settings.terminal == "lqr":
@@ -246,8 +246,10 @@ class NonlinearMPC:
         x = np.empty(self._model.n)
         x[P], x[V] = state[POSITIONS], state[VELOCITIES]
         euler = state[ANGLES]
-        x[Q] = euler_to_quaternion(euler) if now.attitude is None else now.attitude
-        x[W] = euler_to_body_rates(euler, state[ANGLE_RATES]) if now.body_rates is None else now.body_rates
+        seen = now.attitude is not None and bool(np.isfinite(now.attitude).all())
+        x[Q] = now.attitude if seen else euler_to_quaternion(euler)
+        seen = now.body_rates is not None and bool(np.isfinite(now.body_rates).all())
+        x[W] = now.body_rates if seen else euler_to_body_rates(euler, state[ANGLE_RATES])
         if x.size > N_BODY:
             x[N_BODY:] = self._rotors
         return x

@@ -27,6 +27,30 @@ class AttitudeError(StrEnum):
 
 
 @dataclass(frozen=True, kw_only=True)
+class Weights:
+    """What squared distances from the reference cost; of three axes one number or one each."""
+
+    position: Weight = 10.0  # [1/m^2]
+    attitude: Weight = 0.1  # [1/rad^2], or of the squared difference; then one number
+    velocity: Weight = 0.05  # [1/(m/s)^2]
+    body_rates: Weight = 0.05  # [1/(rad/s)^2]
+    input: float = 0.1  # of an input's distance from the reference's, as shares
+    move: float = 0.0  # of its change from one node to the next; 0 for none
+
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            array = np.asarray(value, float)
+            least = -math.inf if name == "move" else 0.0
+            axes = ((),) if name in ("input", "move") else ((), (3,))
+            if array.shape not in axes or not np.isfinite(array).all() or not (array > least).all() or array.min() < 0.0:
+                rule = "positive: one number, or three" if len(axes) == 2 else "one positive number"
+                raise ParameterError("controller.weights", name, value, rule)
+
+
+_USUAL = Weights()
+
+
+@dataclass(frozen=True, kw_only=True)
 class NonlinearSettings:
     """Horizon, cost and model; the units are those of the states, inputs are shares of the largest.
 
@@ -42,12 +66,7 @@ class NonlinearSettings:
         drag: (3,) linear drag that the model knows, body axes [N s/m].
         quadratic_drag: (3,) drag quadratic in each component of the velocity [N s^2/m^2].
         attitude_error: what the weight of the attitude is of.
-        position: weight [1/m^2].
-        attitude: weight [1/rad^2], or of the squared difference; one number with that.
-        velocity: weight [1/(m/s)^2].
-        body_rates: weight [1/(rad/s)^2].
-        input_weight: of an input's distance from the reference's, shares.
-        move_weight: of its change from one node to the next; 0 for none.
+        weights: what distances from the reference cost.
         terminal: the last state's weight over that of the others, 0 for none; `lqr` for the Riccati equation's at hover.
         observer: tuning of the disturbance observer; None for no offset-free tracking.
         solver: QP solver, in `mpc.solvers.SOLVERS`; None for the one that is the fastest for the size.
@@ -64,12 +83,7 @@ class NonlinearSettings:
     drag: tuple[float, float, float] = (0.0, 0.0, 0.0)
     quadratic_drag: tuple[float, float, float] = (0.0, 0.0, 0.0)
     attitude_error: AttitudeError = AttitudeError.ERROR_STATE
-    position: Weight = 10.0
-    attitude: Weight = 0.1
-    velocity: Weight = 0.05
-    body_rates: Weight = 0.05
-    input_weight: float = 0.1
-    move_weight: float = 0.0
+    weights: Weights = _USUAL
     terminal: float | str = 0.0
     observer: ObserverSettings | None = None
     solver: str | None = None
@@ -78,22 +92,18 @@ class NonlinearSettings:
         for name in ("horizon", "stride", "iterations", "substeps"):
             if not isinstance(getattr(self, name), int) or getattr(self, name) < 1:
                 raise ParameterError("controller", name, getattr(self, name), "a whole number >= 1")
-        for name in ("position", "attitude", "velocity", "body_rates", "input_weight"):
-            value = np.asarray(getattr(self, name), float)
-            if value.shape not in ((), (3,)) or not ((value > 0.0) & np.isfinite(value)).all():
-                raise ParameterError("controller", name, getattr(self, name), "positive: one number, or three")
         if not isinstance(self.terminal, str) and not 0.0 <= self.terminal < math.inf:
             raise ParameterError("controller", "terminal", self.terminal, 'at least 0 and finite, or "lqr"')
-        if self.attitude_error is AttitudeError.DIFFERENCE and np.ndim(self.attitude):
+        if self.attitude_error is AttitudeError.DIFFERENCE and np.ndim(self.weights.attitude):
             rule = 'one number where attitude_error = "difference"'
-            raise ParameterError("controller", "attitude", self.attitude, rule)
+            raise ParameterError("controller.weights", "attitude", self.weights.attitude, rule)
 
-    def weights(self) -> tuple[Array, Array]:
+    def outputs(self) -> tuple[Array, Array]:
         """C_r (n_r, 13) and the diagonal of Q_y (n_r,), for states whose quaternion is q_r* q."""
-        difference = self.attitude_error is AttitudeError.DIFFERENCE
+        weights, difference = self.weights, self.attitude_error is AttitudeError.DIFFERENCE
         rows = np.eye(13) if difference else np.delete(np.eye(13), 3, axis=0)
-        attitude = np.full(4, self.attitude) if difference else 4.0 * _three(self.attitude)
-        parts = (_three(self.position), attitude, _three(self.velocity), _three(self.body_rates))
+        attitude = np.full(4, weights.attitude) if difference else 4.0 * _three(weights.attitude)
+        parts = (_three(weights.position), attitude, _three(weights.velocity), _three(weights.body_rates))
         return rows, np.concatenate(parts)
 
 

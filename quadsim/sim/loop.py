@@ -89,12 +89,19 @@ def fly(
             truth[k] = plant.state()
             since = physics_to_state(samples[-1].segment.physics) if ground and samples else truth[k : k + 1]
             states[k] = truth[k] if navigation is None else navigation.state()
+            attitude, body_rates = plant.attitude if navigation is None else navigation.attitude
             preview = reference[k + 1 : k + 1 + controller.horizon]
             phase = Phase.FLYING if ground is None else ground.advance(since, preview)
             if loss is not None and phase is not Phase.CRASHED:
                 check_loss(loss, k * period, truth[k], reference[k], lowest[k])
-            ahead = None if motion is None else motion.after(k)
-            now = Moment(time=k * period, phase=phase, acting=acting, motion=ahead)
+            now = Moment(
+                time=k * period,
+                phase=phase,
+                acting=acting,
+                attitude=attitude,
+                body_rates=body_rates,
+                motion=None if motion is None else motion.after(k),
+            )
             started = clock.perf_counter()
             command = controller.step(now, states[k], preview)
             step_s = clock.perf_counter() - started

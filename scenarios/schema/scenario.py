@@ -71,8 +71,8 @@ class InitialSpec(Spec):
 
     @model_validator(mode="after")
     def _check(self) -> InitialSpec:
-        if any(abs(angle) >= 90.0 for angle in self.euler[:2]):
-            raise ValueError(f"euler must have roll and pitch within +-90 deg; got {self.euler}")
+        if abs(self.euler[0]) > 180.0 or abs(self.euler[1]) >= 90.0:
+            raise ValueError(f"euler must have a roll within +-180 deg and a pitch within +-90 deg; got {self.euler}")
         if self.on_reference and any(self.euler[:2]):
             raise ValueError(f"euler must have roll and pitch 0 where on_reference is true; got {self.euler}")
         return self
