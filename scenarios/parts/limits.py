@@ -6,6 +6,7 @@ import math
 from typing import TYPE_CHECKING
 
 from quadsim.flight.audit import Limit, SumLimit
+from scenarios.schema.nonlinear import NonlinearPartsSpec
 from scenarios.schema.optimisation import BoundedSpec, PolytopeSpec
 
 if TYPE_CHECKING:
@@ -31,4 +32,4 @@ def build_limits(scenario: Scenario) -> tuple[Limit, ...]:
 
 def _polytopes(scenario: Scenario) -> list[PolytopeSpec]:
     controller = scenario.controller
-    return controller.polytopes if isinstance(controller, BoundedSpec) else []
+    return controller.polytopes if isinstance(controller, BoundedSpec | NonlinearPartsSpec) else []
