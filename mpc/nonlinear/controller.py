@@ -320,8 +320,9 @@ class NonlinearMPC:
         return command_of(speeds[0], plan, answer.solution.status, answer)
 
     def predict(self, states: Array, plans: Array) -> Array:
-        """See `quadsim.controller.Controller.predict`."""
-        model = replace(self._model, step=self._period, rotor_lag=None, substeps=1)
+        """See `quadsim.controller.Controller.predict`; with the disturbance estimated last, and without rotor lag."""
+        known = self._acceleration[0]
+        model = replace(self._model, step=self._period, rotor_lag=None, substeps=1, acceleration=known)
         x = np.zeros((len(states), N_BODY))
         x[:, P], x[:, V] = states[:, POSITIONS], states[:, VELOCITIES]
         x[:, Q] = euler_to_quaternion(states[:, ANGLES])
@@ -335,6 +336,11 @@ class NonlinearMPC:
             predicted[:, i, ANGLES] = euler
             predicted[:, i, ANGLE_RATES] = body_to_euler_rates(euler, x[:, W])
         return predicted
+
+    @property
+    def disturbance(self) -> Array:
+        """(6,) estimated acceleration now, world [m/s^2], and angular acceleration, body [rad/s^2]."""
+        return np.concatenate([self._acceleration[0], self._model.angular_acceleration])
 
     def _measured(self, now: Moment, state: Array) -> Array:
         """(n,) the model's state."""
