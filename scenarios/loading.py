@@ -7,6 +7,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from quadsim.errors import FileError, ParameterError
 from quadsim.flight.ground import AIRBORNE, TOUCH, clearance
 from quadsim.sim.airframe import outline
@@ -14,6 +16,7 @@ from quadsim.sim.effects.load import Load, mass_properties
 from quadsim.vehicle import Vehicle
 from scenarios.courses.make import build_course, located
 from scenarios.parts.effects import moving_air
+from scenarios.parts.limits import space_limits
 from scenarios.parts.vehicle import build_initial_state, build_vehicle
 from scenarios.schema.bases import read_scenario, replaced_tables, retyped
 from scenarios.schema.course import CsvSpec
@@ -39,6 +42,13 @@ def check_parts(scenario: Scenario) -> None:
     ground = scenario.effects.ground
     if ground is not None and (ground.contact or ground.effect):
         _check_start(scenario, vehicle)
+    for limit in space_limits(scenario):
+        start = limit.shape.clearance(np.zeros(1), np.array([scenario.initial.position])) - limit.radius
+        if limit.start <= 0.0 and start[0] < -limit.tolerance:
+            rule = (
+                f"clear of {limit.name}, by the radius of {limit.radius:.3g} m of the ball that stands for the vehicle"
+            )
+            raise ParameterError("initial", "position", scenario.initial.position, rule)
 
 
 def _check_start(scenario: Scenario, vehicle: Vehicle) -> None:

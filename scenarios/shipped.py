@@ -10,7 +10,7 @@ from quadsim.errors import FileError, UnknownNameError
 LIBRARY: Final = Path(__file__).resolve().parent / "library"
 CAMPAIGNS: Final = Path(__file__).resolve().parent / "campaigns"
 
-Group = Literal["paper", "courses", "air", "faults", "ground", "sensors", "other"]
+Group = Literal["paper", "courses", "air", "faults", "ground", "space", "sensors", "other"]
 
 CONTROLLERS: Final = {
     "unconstrained": "the paper's Sec. 4: a constant gain from the unconstrained optimum",
