@@ -7,6 +7,7 @@ by half-spaces.  The vehicle is a ball about its centre of mass (`quadsim.vehicl
 from __future__ import annotations
 
 import itertools
+import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
@@ -79,6 +80,19 @@ class Solid(NamedTuple):
             return (radius - a)[:, None], out[:, None, :]
         along = sides[:, 2, None] * np.array([0.0, 0.0, 1.0])
         return np.stack([radius - a, np.abs(local[:, 2]) - b], axis=1), np.stack([out, along], axis=1)
+
+    def support(self, ways: Array) -> Array:
+        """(n, 3) its points farthest along ways (n, 3), relative to the obstacle's position [m]."""
+        local = ways @ self.turn
+        a, b, _ = self.size
+        sides = np.where(local < 0.0, -1.0, 1.0)
+        if self.kind == "box":
+            return self.centre + (sides * self.size) @ self.turn.T
+        core = local * (1.0, 1.0, 0.0 if self.kind == "cylinder" else 1.0)
+        length = np.linalg.norm(core, axis=1, keepdims=True)
+        farthest = a * core / np.where(length > 0.0, length, 1.0)
+        farthest[:, 2] += b * sides[:, 2]
+        return self.centre + farthest @ self.turn.T
 
     @property
     def quaternion(self) -> Array:
@@ -320,8 +334,12 @@ class Region:
                 corner = np.linalg.solve(chosen, upper[list(planes)])
                 if (rows @ corner <= upper + 1e-9).all():
                     corners.setdefault(tuple((corner.round(6) + 0.0).tolist()), set()).update(planes)
-        pairs = itertools.combinations(corners.items(), 2)
-        return np.array([(a, b) for (a, of_a), (b, of_b) in pairs if len(of_a & of_b) >= 2]).reshape(-1, 2, 3)
+        found = []
+        for (a, of_a), (b, of_b) in itertools.combinations(corners.items(), 2):
+            shared = rows[sorted(of_a & of_b)]  # two at least that are not parallel, as where a face is cut off
+            if len(shared) > 1 and np.linalg.norm(np.cross(shared[0], shared), axis=1).max() > _PARALLEL:
+                found.append((a, b))
+        return np.array(found).reshape(-1, 2, 3)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -356,7 +374,8 @@ SHAPES: Final[dict[str, type[Any]]] = {
 def shape_to_json(shape: Constraining) -> dict[str, Any]:
     """A shape's fields, less those that are absent, and its kind as `type`."""
     stated = {name: value for name, value in asdict(shape).items() if value is not None and value != math.inf}
-    return {"type": type(shape).__name__.lower(), **stated}
+    written: dict[str, Any] = json.loads(json.dumps({"type": type(shape).__name__.lower(), **stated}))
+    return written  # with lists for tuples, as it is read
 
 
 def shape_from_json(entry: Mapping[str, Any]) -> Constraining:
@@ -387,22 +406,9 @@ def _frozen(value: Any) -> Any:
 
 
 def footprint(solid: Solid, low: float, high: float) -> Array | None:
-    """(n, 2) outline of a solid from above, between two heights relative to the obstacle's position [m]; None: none.
-
-    A capsule that lies aslant is outlined whole.
-    """
-    a, b, _ = solid.size
-    up = solid.turn[2]
-    reach = {"sphere": a, "capsule": a + b * abs(up[2]), "cylinder": b, "box": float(np.abs(up) @ solid.size)}
-    z = float(solid.centre[2])
-    if z - reach[solid.kind] > high or z + reach[solid.kind] < low:
+    """(n, 2) outline from above of a solid that reaches between two heights, relative to its obstacle; None: not."""
+    bottom, top = solid.support(np.array([[0.0, 0.0, -1.0], [0.0, 0.0, 1.0]]))[:, 2]
+    if bottom > high or top < low:
         return None
-    if solid.kind == "box":
-        corners = np.array([(1.0, 1.0), (-1.0, 1.0), (-1.0, -1.0), (1.0, -1.0)]) * solid.size[:2]
-        return solid.centre[:2] + corners @ solid.turn[:2, :2].T
-    around = np.linspace(0.0, 2.0 * np.pi, 33)[:-1]
-    ring = a * np.stack([np.cos(around), np.sin(around)], axis=1)
-    if solid.kind == "capsule":
-        along = b * solid.turn[:2, 2]
-        ring += np.where((ring @ along > 0.0)[:, None], along, -along)
-    return solid.centre[:2] + ring
+    around = np.linspace(0.0, 2.0 * np.pi, 65)[:-1]
+    return solid.support(np.stack([np.cos(around), np.sin(around), np.zeros(around.size)], axis=1))[:, :2]

@@ -181,8 +181,8 @@ def _differences(
 
 
 _DEMANDS: Final = (
-    "signal", "terms", "shape", "radius", "unit", "lower", "upper", "tolerance", "tolerance_sampled", "required", "start",
-    "stop",
+    "signal", "terms", "shape", "radius", "unit", "lower", "upper", "tolerance", "tolerance_sampled", "required",
+    "start", "stop",
 )  # fmt: skip
 """What the scenario says of a constraint."""
 

@@ -122,7 +122,9 @@ def test_feet_that_touch_at_a_steep_tilt_are_a_crash(roll: float, crashed: bool)
     state = at(0.0, roll=roll)
     state[INDEX["z"]] -= clearance(state[None], FEET, RADIUS, FLOOR)[0]
     touching, free = state, state + np.eye(12)[INDEX["z"]]
-    assert (PhaseMonitor(outline, period=PERIOD).advance(np.zeros(1), touching[None], to(1.0)) is Phase.CRASHED) is crashed
+    assert (
+        PhaseMonitor(outline, period=PERIOD).advance(np.zeros(1), touching[None], to(1.0)) is Phase.CRASHED
+    ) is crashed
     assert PhaseMonitor(outline, period=PERIOD).advance(np.zeros(1), free[None], to(1.0)) is Phase.FLYING
 
 
