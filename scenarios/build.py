@@ -86,4 +86,5 @@ def build_controller(scenario: Scenario, vehicle: Vehicle) -> Controller:
     Raises:
         InputError: it cannot be made from these numbers, or its code cannot be found or called.
     """
-    return make_controller(scenario.controller, vehicle, scenario.control_period)
+    shapes = (*scenario.obstacles, *scenario.regions)
+    return make_controller(scenario.controller, vehicle, scenario.control_period, shapes)
