@@ -12,7 +12,7 @@ import numpy as np
 from mpc.ocp import Problem, Query
 from mpc.solvers import Answer
 from mpc.solvers.piqp_backends import PiqpChanging
-from mpc.space.halfspaces import Space
+from mpc.space.halfspaces import LOOSE, Space
 from mpc.staged import Staged
 from quadsim.controller import ACCEPTED
 from quadsim.state import POSITION, Array
@@ -21,8 +21,6 @@ KEPT: Final = 1e-6
 """Violation of a half-space [m] that is taken for rounding."""
 SETTLED: Final = 1e-2
 """Change of all predicted positions [m] below which planes are not made anew in the same period."""
-MOST_SWAPS: Final = 5
-"""How often rows may be exchanged for others that a plan violates, before the plan is taken as it is."""
 _POSITION: Final = list(POSITION)
 
 
@@ -38,8 +36,8 @@ class Clearing:
     """A solver's optimum where it keeps all half-spaces, and else the optimum with them.
 
     The optimum of fewer constraints that satisfies all is the optimum: shortcuts of the solver hold wherever the way is
-    clear.  Where it is not, the whole QP is solved with the tightest half-spaces of each instant, which are exchanged
-    until the plan keeps those left out as well.
+    clear.  Where it is not, the whole QP is solved with the tightest half-spaces of each instant, and with twice as
+    many as long as the plan violates one that was left out.
 
     Args:
         problem: without half-spaces.
@@ -52,15 +50,12 @@ class Clearing:
         self, problem: Problem, solve: Callable[[Query], Answer], space: Space, *, changing: bool = False
     ) -> None:
         self.problem, self._solve, self._space = problem, solve, space
-        self._count = min(space.settings.rows, space.count)
-        normals = np.full((self._count, problem.horizon, 3), 3.0**-0.5)  # in general position
-        self._form = Staged(self._posed(normals, np.zeros(normals.shape[:2])), changing=changing)
+        self._changing = changing
         self.reset()
 
     def reset(self) -> None:
         """Forget the last plan."""
-        self._backend = PiqpChanging()
-        self._backend.setup(self._form.qp)
+        self._forms: dict[int, tuple[Staged, PiqpChanging]] = {}
         self._last: Array | None = None
 
     def solve(self, time: float, query: Query, yaw: float = 0.0) -> Cleared:
@@ -99,22 +94,32 @@ class Clearing:
 
     def _whole(self, query: Query, normals: Array, bounds: Array, states: Array, turn: Array) -> tuple[Answer, Array]:
         """The optimum with half-spaces of the world, and its states (N, n); `states` are those of the one without."""
-        for _ in range(MOST_SWAPS):
-            room = (normals * (states[:, _POSITION] @ turn)).sum(axis=2) - bounds
-            chosen = np.argsort(room, axis=0, kind="stable")[: self._count]
-            at = chosen, np.arange(bounds.shape[1])
-            answer = self._solved(query, self._posed(normals[at] @ turn.T, bounds[at]))
+        room, count = (normals * (states[:, _POSITION] @ turn)).sum(axis=2) - bounds, self._space.settings.rows
+        while True:
+            at = np.argsort(room, axis=0, kind="stable")[:count], np.arange(bounds.shape[1])
+            answer = self._solved(query, self._posed(normals[at] @ turn.T, bounds[at]), len(at[0]))
             if answer.solution.status not in ACCEPTED:
-                break
+                return answer, states
             states = _predicted(self.problem, query, answer.plan)
-            broken = (normals * (states[:, _POSITION] @ turn)).sum(axis=2) < bounds - KEPT
-            broken[at] = False
-            if not broken.any():
-                break
-        return answer, states
+            room = (normals * (states[:, _POSITION] @ turn)).sum(axis=2) - bounds
+            violated = room < -KEPT
+            violated[at] = False
+            if not violated.any():
+                return answer, states
+            room[at] = -LOOSE  # what was there stays
+            count *= 2
 
-    def _solved(self, query: Query, problem: Problem) -> Answer:
-        form, rest = self._form, query.rest or self.problem.rest
+    def _solved(self, query: Query, problem: Problem, count: int) -> Answer:
+        """The QP's answer with so many half-spaces at each instant."""
+        if count not in self._forms:
+            normals = np.full((count, problem.horizon, 3), 3.0**-0.5)  # in general position
+            form, backend = (
+                Staged(self._posed(normals, np.zeros(normals.shape[:2])), changing=self._changing),
+                PiqpChanging(),
+            )
+            backend.setup(form.qp)
+            self._forms[count] = form, backend
+        (form, backend), rest = self._forms[count], query.rest or self.problem.rest
         if query.steps is None:
             matrices = form.renewed(problem)
             vectors = form.vectors(*query[:3], rest, matrices)
@@ -122,7 +127,7 @@ class Clearing:
             A, B, c = query.steps
             matrices = form.renewed(problem, form.prepare(A, B))
             vectors = form.changed_vectors(matrices, c, *query[:3], rest)
-        solution = self._backend.solve_changed(form.changed(matrices, vectors))
+        solution = backend.solve_changed(form.changed(matrices, vectors))
         return Answer(plan=form.inputs(solution.x), slacks=form.slacks(solution.x), solution=solution)
 
 

@@ -16,6 +16,9 @@ class AvoidanceSettings:
 
     margin: Annotated[NonNegative, doc("[m] kept besides: planes change from instant to instant")] = 0.05
     rows: Annotated[
-        int, Ge(1), Le(50), doc("[-] half-spaces per predicted instant that the QP has; the tightest ones take turns")
+        int,
+        Ge(1),
+        Le(50),
+        doc("[-] half-spaces per predicted instant that the QP has, the tightest; more where it takes more"),
     ] = 6
     iterations: Annotated[int, Ge(1), Le(50), doc("[-] QPs per period at most, each along the last one's plan")] = 3
