@@ -183,3 +183,45 @@ def test_shapes_read_as_they_are_written() -> None:
     assert parse_scenario(tomllib.loads(asked.to_toml())) == asked
     assert isinstance(asked.obstacles[2], Wall)
     assert isinstance(asked.keep_in, Fence)
+
+
+AVOIDANCE = {"controller.output_bounds": {"roll": [-30.0, 30.0], "pitch": [-30.0, 30.0]}, "controller.avoidance": {}}
+
+
+@pytest.mark.parametrize("law", ["hover", "trajectory"])
+def test_the_robust_controller_keeps_clear_in_any_heading(law: str) -> None:
+    robust = {
+        "type": "robust", "horizon": 30, "soft": {}, "offset_free": {}, "linearisation": law, "heading": law == "hover",
+        "output_weights": {"x": 10.0, "y": 10.0, "z": 100.0, "yaw": 100.0}, "input_weights": {"speed": 9e-4},
+        "output_bounds": AVOIDANCE["controller.output_bounds"],
+        "input_bounds": {"speed": [0.0, 838.0], "slew": [-80.0, 80.0]}, "avoidance": {"soft": {}},
+        "tightening": {"acceleration": 0.2, "angular_acceleration": 0.2},
+    }  # fmt: skip
+    among = {"obstacles": [{**PILLAR, "position": [1.0, 0.2, 1.0]}], "initial.euler": [0.0, 0.0, 40.0]}
+    flight = fly_scenario(scenario({**among, "controller": robust}))
+    assert flight.outcome == "satisfied"
+    assert 0.04 < flight.findings[0].worst_margin < 0.3
+    assert abs(flight.state["y"]).max() > 0.1
+
+
+def test_who_does_not_avoid_touches_and_who_does_keeps_clear() -> None:
+    pillar = {"obstacles": [{**PILLAR, "position": [1.0, 0.2, 1.0]}]}
+    assert fly_scenario(scenario(pillar)).log.control.crashed
+    flight = fly_scenario(scenario({**pillar, **AVOIDANCE}))
+    assert flight.outcome == "satisfied"
+    assert flight.findings[0].worst_margin > 0.04  # of a margin of 0.05, between the samples
+
+
+def test_no_answer_among_obstacles_is_explained_by_their_names() -> None:
+    thrown = {
+        **BALL,
+        "radius": 2.0,
+        "position": [0.0, 4.5, 1.0],
+        "velocity": [0.0, -9.0, 0.0],
+        "acceleration": [0.0] * 3,
+    }
+    flight = fly_scenario(scenario({"obstacles": [thrown], **AVOIDANCE, "controller.fallback": {}}))
+    assert flight.diagnosis is not None
+    assert "cannot hold together" in flight.diagnosis["sentence"]
+    assert "obstacle ball" in flight.diagnosis["sentence"]
+    assert any("controller.avoidance.soft" in each["settings"] for each in flight.diagnosis["suggestions"])
