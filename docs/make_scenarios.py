@@ -26,6 +26,7 @@ TITLES: dict[Group, str] = {
     "air": "Wind, drag and rotors that lag",
     "faults": "Faults, loads and slow computers",
     "ground": "Take-off, landing and the ground",
+    "space": "Obstacles, windows and corridors",
     "sensors": "Sensors and estimation",
 }
 HEAD = (
