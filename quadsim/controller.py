@@ -51,6 +51,11 @@ class Moment:
         time: t_k [s].
         phase: where the flight stands with the ground.
         acting: (4,) command in force at t_k, u(k-1) [rad/s]; None where it is the controller's own last one.
+
+    Examples:
+        >>> import quadsim
+        >>> quadsim.Moment(time=0.05).phase.value
+        'flying'
     """
 
     time: float = 0.0
@@ -75,6 +80,13 @@ class Command:
         primal_residual: largest constraint violation the back end reports [its own scaling].
         dual_residual: largest gradient of the Lagrangian the back end reports.
         solve_s: wall time inside the solver [s].
+
+    Examples:
+        >>> import numpy as np
+        >>> import quadsim
+        >>> speeds = np.full(4, 200.0)
+        >>> quadsim.Command(speeds=speeds, plan=np.tile(speeds, (10, 1))).status
+        'solved'
     """
 
     speeds: Array

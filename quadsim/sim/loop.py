@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time as clock
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -13,7 +13,7 @@ import numpy as np
 from quadsim.controller import MISSED, Command, Controller, Moment, Phase
 from quadsim.errors import FlightError, InterruptedFlightError, LostError
 from quadsim.flight.log import ControlLog, FlightLog, PlantLog, TimingLog
-from quadsim.flight.lost import LossCriteria, check_loss
+from quadsim.flight.lost import check_loss
 from quadsim.sim.computation import Computation
 from quadsim.sim.physics import Segment, physics_to_state
 from quadsim.sim.plant import Plant
@@ -38,7 +38,7 @@ def fly(
     computation: Computation | None = None,
     rng: np.random.Generator | None = None,
     ground: PhaseMonitor | None = None,
-    loss: LossCriteria | None = None,
+    loss: Mapping[str, float] | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> FlightLog:
     """Fly a number of control periods.
@@ -58,7 +58,8 @@ def fly(
         computation: how long commands take, in simulated time; none where absent.
         rng: what `computation` draws from.
         ground: what knows where the flight stands with ground and obstacles; it is flying throughout where absent.
-        loss: when the vehicle is lost, looked at once per control period until it has crashed; never where absent.
+        loss: limits by the names of `quadsim.flight.lost.CRITERIA`, checked once per control period until it has
+            crashed; none where absent.
         progress: called with the number of periods flown, after each.
 
     Returns:

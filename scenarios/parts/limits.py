@@ -1,4 +1,4 @@
-"""From `[[constraints]]` and `[lost]` to what a flight is audited against, and what ends it."""
+"""From `[[constraints]]` and the polytopes of a controller to what a flight is audited against."""
 
 from __future__ import annotations
 
@@ -6,17 +6,11 @@ import math
 from typing import TYPE_CHECKING
 
 from quadsim.flight.audit import Limit, SpaceLimit, SumLimit
-from quadsim.flight.lost import LossCriteria
 from scenarios.parts.vehicle import build_vehicle
 from scenarios.schema.optimisation import BoundedSpec, PolytopeSpec
 
 if TYPE_CHECKING:
     from scenarios.schema.scenario import Scenario
-
-
-def build_loss(scenario: Scenario) -> LossCriteria:
-    """When the flight is lost."""
-    return LossCriteria(**{name: limit for name, limit in scenario.lost if limit is not False})
 
 
 def build_limits(scenario: Scenario) -> tuple[Limit, ...]:

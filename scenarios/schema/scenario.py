@@ -112,6 +112,11 @@ class LostSpec(Spec):
     depth: LimitOrOff = Field(default=50.0, description="[m] below the lowest of the start and the reference so far")
     speed: LimitOrOff = Field(default=50.0, description="[m/s] in any direction")
 
+    @property
+    def limits(self) -> dict[str, float]:
+        """The criteria that are on; see `quadsim.flight.lost`."""
+        return {name: limit for name, limit in self if limit is not False}
+
 
 LONGEST_FLIGHT: Final = 86_400.0
 MOST_STEPS: Final = 10_000_000

@@ -25,7 +25,7 @@ from scenarios.shipped import LIBRARY, scenario_names
 SHARED = ("paper-constrained", "paper-unconstrained", "paper-unconstrained-clipped")
 """With other modules."""
 LONGEST_DESCRIPTION = 100
-COMPARED = 6.0
+COMPARED = 3.0
 """Of a flight and of the same one again, at least [s]."""
 TELLS = 2.0
 """Time in which another seed shows, where it counts [s]."""
