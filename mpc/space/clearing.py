@@ -15,13 +15,12 @@ from mpc.solvers.piqp_backends import PiqpChanging
 from mpc.space.halfspaces import LOOSE, Space
 from mpc.staged import Staged
 from quadsim.controller import ACCEPTED
-from quadsim.state import POSITION, Array
+from quadsim.state import Array
 
 KEPT: Final = 1e-6
 """Violation of a half-space [m] that is taken for rounding."""
 SETTLED: Final = 1e-2
 """Change of all predicted positions [m] below which planes are not made anew in the same period."""
-_POSITION: Final = list(POSITION)
 
 
 class Cleared(NamedTuple):
@@ -58,10 +57,15 @@ class Clearing:
         self._forms: dict[int, tuple[Staged, PiqpChanging]] = {}
         self._last: Array | None = None
 
-    def solve(self, time: float, query: Query, yaw: float = 0.0) -> Cleared:
-        """The optimum for a query at the time [s] of its x(k).
+    def solve(self, time: float, query: Query, yaw: float = 0.0, along: Array | None = None) -> Cleared:
+        """The optimum for a query.
 
-        The states' axes x and y are turned from the world's by a yaw [rad].
+        Args:
+            time: of its x(k) [s].
+            query: what is asked.
+            yaw: by which the states' axes x and y are turned from the world's [rad].
+            along: (N, 3) positions of the plan that planes are made along [m]; where absent, those of the last optimum,
+                moved on by an instant.
         """
         turn = np.array([[math.cos(yaw), math.sin(yaw), 0.0], [-math.sin(yaw), math.cos(yaw), 0.0], [0.0, 0.0, 1.0]])
         t = time + self._space.period * np.arange(1, self.problem.horizon + 1, dtype=np.float64)
@@ -70,8 +74,9 @@ class Clearing:
         if answer.solution.status not in ACCEPTED:
             return Cleared(answer, problem, np.empty(0))
         states = _predicted(problem, query, answer.plan)
-        planned = states[:, _POSITION] @ turn
-        along = planned if last is None else np.concatenate([last[1:], 2.0 * last[-1:] - last[-2:-1]])
+        planned = states[:, self._space.positions] @ turn
+        if along is None:
+            along = planned if last is None else np.concatenate([last[1:], 2.0 * last[-1:] - last[-2:-1]])
         for _ in range(self._space.settings.iterations):
             normals, bounds = self._space.half_spaces(t, along)
             if ((normals * planned).sum(axis=2) >= bounds - KEPT).all():
@@ -80,7 +85,7 @@ class Clearing:
             if answer.solution.status not in ACCEPTED:
                 named = self._space.constraints(normals @ turn.T, bounds, problem.model.n)
                 return Cleared(answer, replace(problem, constraints=(*problem.constraints, *named)), states)
-            planned = states[:, _POSITION] @ turn
+            planned = states[:, self._space.positions] @ turn
             if np.abs(planned - along).max() < SETTLED:
                 break
             along = planned
@@ -94,14 +99,17 @@ class Clearing:
 
     def _whole(self, query: Query, normals: Array, bounds: Array, states: Array, turn: Array) -> tuple[Answer, Array]:
         """The optimum with half-spaces of the world, and its states (N, n); `states` are those of the one without."""
-        room, count = (normals * (states[:, _POSITION] @ turn)).sum(axis=2) - bounds, self._space.settings.rows
+        room, count = (
+            (normals * (states[:, self._space.positions] @ turn)).sum(axis=2) - bounds,
+            self._space.settings.rows,
+        )
         while True:
             at = np.argsort(room, axis=0, kind="stable")[:count], np.arange(bounds.shape[1])
             answer = self._solved(query, self._posed(normals[at] @ turn.T, bounds[at]), len(at[0]))
             if answer.solution.status not in ACCEPTED:
                 return answer, states
             states = _predicted(self.problem, query, answer.plan)
-            room = (normals * (states[:, _POSITION] @ turn)).sum(axis=2) - bounds
+            room = (normals * (states[:, self._space.positions] @ turn)).sum(axis=2) - bounds
             violated = room < -KEPT
             violated[at] = False
             if not violated.any():

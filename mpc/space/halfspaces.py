@@ -31,7 +31,6 @@ Shape: TypeAlias = AnyObstacle | Corridor | Fence
 
 LOOSE: Final = 1e3
 """By how much [m] a half-space that is not in force is left open."""
-_POSITION: Final = list(POSITION)
 
 
 class Space:
@@ -40,11 +39,12 @@ class Space:
     Args:
         shapes: the obstacles and regions.
         radius: of the ball that stands for the vehicle [m].
-        period: control period [s].
+        period: from one predicted instant to the next [s].
         horizon: N.
         settings: see `AvoidanceSettings`.
         margins: (N, 3) further ones along x, y, z at each predicted instant [m], as of a disturbance; None for none.
         penalty: l1 [1/m] and l2 [1/m^2] of violating a half-space; None for hard ones.
+        positions: which of the states are x, y, z.
     """
 
     def __init__(
@@ -57,8 +57,9 @@ class Space:
         settings: AvoidanceSettings,
         margins: Array | None = None,
         penalty: tuple[float, float] | None = None,
+        positions: Sequence[int] = POSITION,
     ) -> None:
-        self.settings, self.penalty, self.period = settings, penalty, period
+        self.settings, self.penalty, self.period, self.positions = settings, penalty, period, list(positions)
         self._shapes, self._kept = tuple(shapes), radius + settings.margin
         self._margins = np.zeros((horizon, 3)) if margins is None else margins
         self._names = [
@@ -93,7 +94,7 @@ class Space:
     def constraint(self, normals: Array, bounds: Array, states: int, *, name: str = "space") -> Constraint:
         """Half-spaces (m, N, 3), (m, N) as rows on so many states."""
         C = np.zeros((bounds.shape[1], len(bounds), states))
-        C[:, :, _POSITION] = normals.transpose(1, 0, 2)
+        C[:, :, self.positions] = normals.transpose(1, 0, 2)
         lower, (l1, l2) = bounds.T, (0.0, 0.0) if self.penalty is None else self.penalty
         penalty = Penalty(l1=np.full(len(bounds), l1), l2=np.full(len(bounds), l2))
         return Constraint(
