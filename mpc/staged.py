@@ -18,8 +18,9 @@ The pattern of the matrices is fixed when a `Staged` is built; where they change
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Final
 
 import numpy as np
@@ -27,6 +28,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csc_matrix
 
 from mpc.ocp import Problem, Rest
+from mpc.paper.prediction import condense_stages
 from mpc.qp import QP, QPRows, Solution, Vectors
 from quadsim.errors import ParameterError
 from quadsim.state import Array, Indices
@@ -110,22 +112,6 @@ class Layout:
         self.ends = np.arange(self.starts.size).reshape(self.starts.shape)
         cuts = L + M * np.arange(stages)
         self.lasts, self.firsts = self.inputs[cuts - 1], self.inputs[cuts]
-
-
-def condense_stages(start: Array, A: Array, B: Array, c: Array) -> Array:
-    """(J, L + 1, n, m + 1) states of J stages of L steps, as functions of the variables, the inputs the last, and of 1.
-
-    From the first of them (J, n, m + 1) by A (J, L, n, n), B (J, L, n, nu) and c (J, L, n).
-    """
-    (count, steps, n, nu), columns = B.shape, start.shape[2]
-    states = np.empty((count, steps + 1, n, columns))
-    states[:, 0] = start
-    for t in range(steps):
-        np.matmul(A[:, t], states[:, t], out=states[:, t + 1])
-        at = columns - 1 - (steps - t) * nu
-        states[:, t + 1, :, at : at + nu] = B[:, t]
-        states[:, t + 1, :, -1] += c[:, t]
-    return states
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -350,7 +336,7 @@ class Staged:
         gradient[at.tail] = np.einsum("jtnm,jtn->jm", matrices.tail[:, :-1], later)
         # The last state's target, C_r^+ (y_d - C_r x_s) from x_s; where Q_y weighs it, x_s has no part in it.
         gradient[at.starts[-1]] = -2.0 * (W_end @ (desired[-1] - objective.C_r @ rest.x) + Q_end @ rest.x)
-        gradient[at.inputs] -= 2.0 * objective.Q_u @ rest.u
+        gradient[at.inputs] -= rest.u @ (2.0 * objective.Q_u)
         gradient[at.inputs[0]] -= 2.0 * objective.move_weight @ u_before
         if rows.C.ndim == 2:
             values = known @ rows.C.T * ~rows.of_states
@@ -373,6 +359,14 @@ class Staged:
     def changed(self, matrices: Matrices, vectors: Vectors) -> QP:
         """The QP with other matrices and vectors."""
         return replace(self.qp.with_vectors(vectors), P=matrices.P, A=matrices.dynamics, G=matrices.rows)
+
+    def posed(
+        self, A: Array, B: Array, c: Array, state: Array, desired: Array, u_before: Array, rest: Rest
+    ) -> tuple[QP, Callable[[Array], Array]]:
+        """See `mpc.qp.ChangingFormulation.posed`."""
+        matrices = self.prepare(A, B)
+        qp = self.changed(matrices, self.changed_vectors(matrices, c, state, desired, u_before, rest))
+        return qp, partial(self.states, matrices, c, state)
 
     def inputs(self, x: Array) -> Array:
         """See `mpc.qp.Formulation.inputs`."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time as clock
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -39,6 +39,7 @@ def fly(
     rng: np.random.Generator | None = None,
     ground: PhaseMonitor | None = None,
     loss: Mapping[str, float] | None = None,
+    quaternions: bool = False,
     progress: Callable[[int], None] | None = None,
 ) -> FlightLog:
     """Fly a number of control periods.
@@ -60,6 +61,7 @@ def fly(
         ground: what knows where the flight stands with ground and obstacles; it is flying throughout where absent.
         loss: limits by the names of `quadsim.flight.lost.CRITERIA`, checked once per control period until it has
             crashed; none where absent.
+        quaternions: whether attitude and body rates are logged beside Euler angles and their rates.
         progress: called with the number of periods flown, after each.
 
     Returns:
@@ -74,6 +76,7 @@ def fly(
         ground.reset()
     truth = np.empty((periods, N_STATES))
     states = np.empty((periods, N_STATES))
+    attitudes, rates = np.empty((periods, 4)), np.empty((periods, 3))
     start = plant.physics
     heights = np.minimum(reference[:, REFERENCE_NAMES.index("z")], initial_state[INDEX["z"]])
     lowest = np.minimum.accumulate(heights).tolist()
@@ -86,6 +89,8 @@ def fly(
         for k in range(periods):
             truth[k] = plant.state()
             states[k] = truth[k] if navigation is None else navigation.state()
+            attitude, body_rates = plant.attitude if navigation is None else navigation.attitude
+            attitudes[k], rates[k] = attitude, body_rates
             preview = reference[k + 1 : k + 1 + controller.horizon]
             phase = Phase.FLYING
             if ground is not None:
@@ -93,7 +98,7 @@ def fly(
                 phase = ground.advance(since[:, 0], physics_to_state(since), preview)
             if loss is not None and phase is not Phase.CRASHED:
                 check_loss(loss, k * period, truth[k], reference[k], lowest[k])
-            now = Moment(time=k * period, phase=phase, acting=acting)
+            now = Moment(time=k * period, phase=phase, acting=acting, attitude=attitude, body_rates=body_rates)
             started = clock.perf_counter()
             command = controller.step(now, states[k], preview)
             step_s = clock.perf_counter() - started
@@ -137,6 +142,11 @@ def fly(
         ended = InterruptedFlightError(time=len(samples) * period)
     count = len(samples)
     control = _control_log(samples, states[:count], truth[:count], reference[:count], initial_speeds, period)
+    plant_log = _plant_log(samples, start, initial_speeds, float(initial_state[INDEX["yaw"]]), plant.timestep)
+    if quaternions:
+        control = replace(control, attitude=attitudes[:count], body_rates=rates[:count])
+        physics = np.concatenate([start[None], *(sample.segment.physics for sample in samples)])
+        plant_log = replace(plant_log, attitude=physics[:, 4:8], body_rates=physics[:, 11:14])
     commands = [sample.command for sample in samples]
     return FlightLog(
         control=control,
@@ -145,7 +155,7 @@ def fly(
             solve_ms=np.array([1e3 * command.solve_s for command in commands]),
             step_ms=np.array([1e3 * sample.step_s for sample in samples]),
         ),
-        plant=_plant_log(samples, start, initial_speeds, float(initial_state[INDEX["yaw"]]), plant.timestep),
+        plant=plant_log,
         predicted=_predict(controller, control.state, commands),
         reason=None if ended is None else str(ended),
         interrupted=isinstance(ended, InterruptedFlightError),

@@ -181,6 +181,12 @@ class Plant:
         self._yaw = float(state[EULER[2]])
         return state
 
+    @property
+    def attitude(self) -> tuple[Array, Array]:
+        """The true attitude now (4,), wxyz, body to world, sign continuous, and the body rates (3,) [rad/s]."""
+        physics = self._physics[0]
+        return physics[4:8].copy(), physics[11:14].copy()
+
     def applied(self, speeds: Array) -> Array:
         """The rotor speeds (4,) [rad/s] that a command asks for: it saturates at what rotors can do, and at zero."""
         return np.clip(speeds, *self._speed_range)

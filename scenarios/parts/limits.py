@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 from quadsim.flight.audit import Limit, SpaceLimit, SumLimit
 from scenarios.parts.vehicle import build_vehicle
+from scenarios.schema.nonlinear import NonlinearPartsSpec
 from scenarios.schema.optimisation import BoundedSpec, PolytopeSpec
 
 if TYPE_CHECKING:
@@ -60,4 +61,4 @@ def _sum_limits(scenario: Scenario) -> tuple[Limit, ...]:
 
 def _polytopes(scenario: Scenario) -> list[PolytopeSpec]:
     controller = scenario.controller
-    return controller.polytopes if isinstance(controller, BoundedSpec) else []
+    return controller.polytopes if isinstance(controller, BoundedSpec | NonlinearPartsSpec) else []

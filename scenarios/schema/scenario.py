@@ -24,6 +24,7 @@ from scenarios.schema.base import LARGEST_SEED, MOST_ENTRIES, Spec, Triple, fiel
 from scenarios.schema.controller import ControllerSpec
 from scenarios.schema.course import ReferenceSpec
 from scenarios.schema.events import Event, PayloadDropEvent, PayloadPickupEvent, SensorFaultEvent
+from scenarios.schema.nonlinear import NonlinearPartsSpec
 from scenarios.schema.optimisation import BoundedSpec
 from scenarios.schema.plugin import ForceSpec
 from scenarios.schema.problems import ScenarioError, describe_all
@@ -67,8 +68,8 @@ class InitialSpec(Spec):
 
     @model_validator(mode="after")
     def _check(self) -> InitialSpec:
-        if any(abs(angle) >= 90.0 for angle in self.euler[:2]):
-            raise ValueError(f"euler must have roll and pitch within +-90 deg; got {self.euler}")
+        if abs(self.euler[0]) > 180.0 or abs(self.euler[1]) >= 90.0:
+            raise ValueError(f"euler must have a roll within +-180 deg and a pitch within +-90 deg; got {self.euler}")
         return self
 
 
@@ -203,7 +204,7 @@ class Scenario(Spec):
         if self.initial.cold and not (self.effects.ground is not None and self.effects.ground.contact):
             raise ValueError("initial.cold must be false where effects.ground gives no floor to stand on; got true")
         check_sensing(self.sensors, self.estimator, timestep=self.plant.timestep)
-        polytopes = self.controller.polytopes if isinstance(self.controller, BoundedSpec) else []
+        polytopes = self.controller.polytopes if isinstance(self.controller, BoundedSpec | NonlinearPartsSpec) else []
         names = [constraint.name for constraint in self.constraints]
         names += [name for polytope in polytopes for name in polytope.row_names]
         names += [obstacle.name for obstacle in self.obstacles] + [region.name for region in self.regions]

@@ -204,6 +204,16 @@ def test_the_robust_controller_keeps_clear_in_any_heading(law: str) -> None:
     assert abs(flight.state["y"]).max() > 0.1
 
 
+@pytest.mark.parametrize("more", [{}, {"node": 0.1, "iterations": 2}, {"rotor_lag": 0.02, "offset_free": {}}])
+def test_the_nonlinear_controller_keeps_clear(more: Mapping[str, Any]) -> None:
+    nonlinear = {"type": "nonlinear", "horizon": 30, "terminal": "lqr", "avoidance": {"soft": {}}, **more}
+    pillar = {"obstacles": [{**PILLAR, "position": [1.0, 0.2, 1.0]}]}
+    flight = fly_scenario(scenario({**pillar, "controller": nonlinear}))
+    assert flight.outcome == "satisfied"
+    assert 0.03 < flight.findings[0].worst_margin < 0.3
+    assert abs(flight.state["y"]).max() > 0.1
+
+
 def test_who_does_not_avoid_touches_and_who_does_keeps_clear() -> None:
     pillar = {"obstacles": [{**PILLAR, "position": [1.0, 0.2, 1.0]}]}
     assert fly_scenario(scenario(pillar)).log.control.crashed
