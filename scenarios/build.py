@@ -41,6 +41,7 @@ def build_plant(scenario: Scenario, vehicle: Vehicle, forces: Sequence[Force] | 
     return Plant(
         vehicle,
         timestep=scenario.plant.timestep,
+        integrator=scenario.plant.integrator,
         limit_speeds=scenario.plant.limit_speeds,
         effects=scenario.effects.resolved(vehicle),
         changes=build_changes(scenario),

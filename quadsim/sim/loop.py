@@ -14,6 +14,7 @@ from quadsim.controller import MISSED, Command, Controller, Moment, Phase
 from quadsim.errors import FlightError, InterruptedFlightError, LostError
 from quadsim.flight.log import ControlLog, FlightLog, PlantLog, TimingLog
 from quadsim.flight.lost import check_loss
+from quadsim.motion import Motion
 from quadsim.sim.computation import Computation
 from quadsim.sim.physics import Segment, physics_to_state
 from quadsim.sim.plant import Plant
@@ -39,6 +40,7 @@ def fly(
     rng: np.random.Generator | None = None,
     ground: PhaseMonitor | None = None,
     loss: Mapping[str, float] | None = None,
+    motion: Motion | None = None,
     quaternions: bool = False,
     progress: Callable[[int], None] | None = None,
 ) -> FlightLog:
@@ -61,6 +63,7 @@ def fly(
         ground: what knows where the flight stands with ground and obstacles; it is flying throughout where absent.
         loss: limits by the names of `quadsim.flight.lost.CRITERIA`, checked once per control period until it has
             crashed; none where absent.
+        motion: of the reference from t_0 on, for controllers that use it; absent where only positions are known.
         quaternions: whether attitude and body rates are logged beside Euler angles and their rates.
         progress: called with the number of periods flown, after each.
 
@@ -98,7 +101,14 @@ def fly(
                 phase = ground.advance(since[:, 0], physics_to_state(since), preview)
             if loss is not None and phase is not Phase.CRASHED:
                 check_loss(loss, k * period, truth[k], reference[k], lowest[k])
-            now = Moment(time=k * period, phase=phase, acting=acting, attitude=attitude, body_rates=body_rates)
+            now = Moment(
+                time=k * period,
+                phase=phase,
+                acting=acting,
+                attitude=attitude,
+                body_rates=body_rates,
+                motion=None if motion is None else motion.after(k),
+            )
             started = clock.perf_counter()
             command = controller.step(now, states[k], preview)
             step_s = clock.perf_counter() - started

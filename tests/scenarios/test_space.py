@@ -235,3 +235,10 @@ def test_no_answer_among_obstacles_is_explained_by_their_names() -> None:
     assert "cannot hold together" in flight.diagnosis["sentence"]
     assert "obstacle ball" in flight.diagnosis["sentence"]
     assert any("controller.avoidance.soft" in each["settings"] for each in flight.diagnosis["suggestions"])
+
+
+def test_a_plant_without_contact_refuses_obstacles(tmp_path: Path) -> None:
+    path = tmp_path / "free.toml"
+    path.write_text(scenario({"obstacles": [PILLAR], "plant.integrator": "rk4"}).to_toml())
+    with pytest.raises(InputError, match=r"plant.integrator must be mujoco where there is obstacles; got 'rk4'"):
+        load_scenario(str(path))
