@@ -131,7 +131,7 @@ def reproduce(paper: str | Path | None = None, *, progress: Progress | bool = Tr
         progress: as of `fly`.
 
     Returns:
-        A reproduction for each paper: its `numbers`, each with `ours`, `difference` and `within`, and its table, `grid`.
+        A reproduction for each paper: `numbers`, each with `ours`, `difference` and `within`, and a table, `grid`.
 
     Raises:
         InputError: there is no such paper, or a number of it cannot be flown.
