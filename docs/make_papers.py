@@ -10,7 +10,7 @@ from make_numbers import Table, fly, markdown, write_page
 
 from quadsim.report.table import section
 from scenarios.flight import Flight
-from scenarios.papers.reproduction import reproduce
+from scenarios.many_flights import reproduce
 
 COURSES = ("loop4", "loop8", "lemniscate8")
 SEEDS = 16

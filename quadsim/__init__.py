@@ -42,8 +42,8 @@ if TYPE_CHECKING:
     from scenarios.junit import write_junit as write_junit
     from scenarios.many_flights import campaign as campaign
     from scenarios.many_flights import replay as replay
+    from scenarios.many_flights import reproduce as reproduce
     from scenarios.many_flights import sweep as sweep
-    from scenarios.papers.reproduction import reproduce as reproduce
     from scenarios.schema.json_schema import scenario_schema as scenario_schema
     from scenarios.schema.scenario import Scenario as Scenario
     from scenarios.self_check import doctor as doctor
@@ -73,8 +73,7 @@ _PLACES = {
     "scenarios.catalogue": ("Catalogue", "LibraryScenario", "catalogue", "scenarios"),
     "scenarios.flight": ("Flight",),
     "scenarios.junit": ("write_junit",),
-    "scenarios.many_flights": ("campaign", "replay", "sweep"),
-    "scenarios.papers.reproduction": ("reproduce",),
+    "scenarios.many_flights": ("campaign", "replay", "reproduce", "sweep"),
     "scenarios.schema.json_schema": ("scenario_schema",),
     "scenarios.schema.scenario": ("Scenario",),
     "scenarios.self_check": ("doctor",),

@@ -44,7 +44,7 @@ from quadsim.state import (
 Flags = NDArray[np.bool_]
 
 _GROUPS: Final = tuple(np.array(group) for group in (POSITION, VELOCITY, EULER, EULER_RATE))
-_RATES = _GROUPS[3]
+_ANGLES, _RATES = _GROUPS[2:]
 _TURNING: Final = np.array(EULER + EULER_RATE)
 _NO_RATES: Final = (math.nan, math.nan, math.nan)
 

@@ -7,16 +7,14 @@ import json
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, Final
 
 from quadsim.errors import InputError
 from quadsim.report.table import ABSENT, Cell, Grid, Mark, line
-from scenarios.papers.paper import NumberSpec, Paper, load_paper, scenario_of
-from scenarios.progress import Progress, reporting, silent
+from scenarios.papers.paper import NumberSpec, Paper, scenario_of
+from scenarios.progress import Progress, silent
 from scenarios.run import fly_scenario
 from scenarios.schema.settings import get_field
-from scenarios.shipped import paper_names
 
 HEAD: Final = ("number", "unit", "published", "ours", "difference", "tolerance", "reproduced")
 
@@ -121,30 +119,6 @@ class Reproduction:
             lines=tuple(number.cells() for number in self.numbers),
             note=". ".join(filter(None, [said, paper.about])),
         )
-
-
-def reproduce(paper: str | Path | None = None, *, progress: Progress | bool = True) -> tuple[Reproduction, ...]:
-    """Fly what papers publish, and hold it against their numbers.
-
-    Args:
-        paper: a name, or a path ending in `.toml`; every paper that ships where absent.
-        progress: as of `fly`.
-
-    Returns:
-        A reproduction for each paper: `numbers`, each with `ours`, `difference` and `within`, and a table, `grid`.
-
-    Raises:
-        InputError: there is no such paper, or a number of it cannot be flown.
-
-    Examples:
-        >>> import quadsim
-        >>> (found,) = quadsim.reproduce("quadrotor-uav", progress=False)
-        >>> found.within, found.numbers[2].spec.published, round(found.numbers[2].ours, 3)
-        (True, 250.0, 250.0)
-    """
-    papers = [load_paper(name) for name in ([str(paper)] if paper is not None else paper_names())]
-    with reporting(progress) as report:
-        return tuple(reproduce_paper(each, report) for each in papers)
 
 
 def reproduce_paper(
