@@ -313,8 +313,7 @@ class NonlinearMPC:
 
     def predict(self, states: Array, plans: Array) -> Array:
         """See `quadsim.controller.Controller.predict`; with the disturbance estimated last, and without rotor lag."""
-        known = self._acceleration[0]
-        model = replace(self._model, step=self._period, rotor_lag=None, substeps=1, acceleration=known)
+        model = replace(self._model, step=self._period, rotor_lag=None, substeps=1)
         x = np.zeros((len(states), N_BODY))
         x[:, P], x[:, V] = states[:, POSITIONS], states[:, VELOCITIES]
         x[:, Q] = euler_to_quaternion(states[:, ANGLES])
@@ -332,7 +331,7 @@ class NonlinearMPC:
     @property
     def disturbance(self) -> Array:
         """(6,) estimated acceleration now, world [m/s^2], and angular acceleration, body [rad/s^2]."""
-        return np.concatenate([self._acceleration[0], self._model.angular_acceleration])
+        return np.concatenate([self._model.acceleration, self._model.angular_acceleration])
 
     def _measured(self, now: Moment, state: Array) -> Array:
         """(n,) the model's state."""
