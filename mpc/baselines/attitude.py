@@ -15,7 +15,7 @@ LEAST_LIFT: Final = 0.2
 
 
 @dataclass(frozen=True, kw_only=True)
-class Motion:
+class Measured:
     """A measured state with its attitude as a rotation matrix."""
 
     position: Array  # x (3,), world [m]
@@ -25,16 +25,25 @@ class Motion:
     yaw: float  # [rad]
 
 
-def motion_of(state: Array) -> Motion:
-    """The motion that a state (12,) says."""
+def motion_of(state: Array, attitude: Array | None = None, rates: Array | None = None) -> Measured:
+    """The motion that a state (12,) says; attitude (4,) wxyz and body rates (3,) [rad/s] by themselves where given."""
     euler = state[list(EULER)]
-    return Motion(
+    return Measured(
         position=state[list(POSITION)],
         velocity=state[list(VELOCITY)],
-        attitude=body_to_world(euler),
-        rates=euler_to_body_rates(euler, state[list(EULER_RATE)]),
+        attitude=body_to_world(euler) if attitude is None else rotation(attitude),
+        rates=euler_to_body_rates(euler, state[list(EULER_RATE)]) if rates is None else rates,
         yaw=float(euler[2]),
     )
+
+
+def rotation(quaternion: Array) -> Array:
+    """(..., 3, 3) body to world of unit quaternions wxyz (..., 4)."""
+    w, v = quaternion[..., :1, None], quaternion[..., 1:]
+    x, y, z = np.moveaxis(v, -1, 0)
+    none = np.zeros_like(x)
+    cross = np.stack([none, -z, y, z, none, -x, -y, x, none], axis=-1).reshape(*x.shape, 3, 3)
+    return np.asarray(np.eye(3) + 2.0 * w * cross + 2.0 * cross @ cross)
 
 
 def hat(vector: Array) -> Array:
