@@ -4,10 +4,10 @@ The mean acceleration over a period that the model misses,
 
     d = (v(k) - v(k-1)) / tau_s + g e_z - mean(f / m R e_z + R d_drag),
 
-and the angular one likewise, are each followed by two states, the disturbance and its rate of change, with both poles of
-the error at exp(-bandwidth tau_s): the critically damped g-h filter (Morrison, "Introduction to Sequential Smoothing and
-Prediction", 1969).  A disturbance that changes steadily is met without lag, as that of drag on a curved path nearly is;
-the constant one of `mpc.robust.observer` comes late by its time constant.
+and the angular one likewise, are each followed by two states, the disturbance and its rate of change, with both poles
+of the error at exp(-bandwidth tau_s): the critically damped g-h filter (Morrison, "Introduction to Sequential Smoothing
+and Prediction", 1969).  A disturbance that changes steadily is met without lag, as that of drag on a curved path nearly
+is; the constant one of `mpc.robust.observer` comes late by its time constant.
 
 With f / m taken from the rotor commands this is the acceleration feedback of incremental nonlinear dynamic inversion
 (Tal and Karaman, "Accurate tracking of aggressive quadrotor trajectories using incremental nonlinear dynamic inversion
@@ -102,8 +102,10 @@ class RampObserver:
         self._change = np.where(value == self._value, self._change + self._gain_of_change * surprise, 0.0)
 
     def foreseen(self, ahead: float) -> tuple[Array, Array, Array]:
-        """(3,) each, so long [s] after the last measurement: acceleration and its rate of change, world axes [m/s^2,
-        m/s^3], and angular acceleration, body axes [rad/s^2].
+        """What is missed so long [s] after the last measurement, (3,) each.
+
+        Returns:
+            acceleration [m/s^2] and its rate of change [m/s^3], world axes; angular acceleration, body axes [rad/s^2].
         """
         value = self._value + (0.5 * self._period + ahead) * self._change  # estimated for the middle of the last period
         return value[:3], self._change[:3], value[3:]

@@ -1,7 +1,7 @@
 """Incremental nonlinear dynamic inversion (INDI) of the angular acceleration, an inner loop around any law.
 
-The law's rotor speeds say which wrench, and so which angular acceleration, it wants of its model.  At a rate
-of its own, above the control rate, the inner loop asks for the torque
+The law's rotor speeds say which wrench, and so which angular acceleration, it wants of its model.  At a rate of its
+own, above the control rate, the inner loop asks for the torque
 
     tau_c = tau_f + J (alpha_c - alpha_f),
 

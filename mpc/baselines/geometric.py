@@ -240,8 +240,7 @@ class GeometricController(FeedbackLaw):
             return np.concatenate([[A @ R[:, 2]], moment]), wanted
         half = 0.5 * settings.period
         up = R[:, 2] + half * R @ np.array([Omega[1], -Omega[0], 0.0])
-        along = A + m * self._drag[2] * target.velocity
-        along1 = A1 + m * self._drag[2] * target.acceleration
+        along, along1 = A + m * self._drag[2] * target.velocity, A1 + self._drag[2] * p1
         return np.concatenate([[(along + half * along1) @ up], moment]), wanted
 
     def integrate(self, integrals: Integrals, motion: Measured, target: Target, wanted: Wanted) -> Integrals:

@@ -227,6 +227,7 @@ def _baseline(spec: LQRSpec | PIDSpec | GeometricSpec, vehicle: Vehicle, period:
     from mpc.baselines.geometric import GeometricController, geometric_settings
     from mpc.baselines.lqr import LQR, LQRSettings, bryson_objective
     from mpc.baselines.pid import CascadedPID, pid_settings
+    from mpc.indi import Incremental
 
     held = spec.input_bounds
     bounds = None if held is None else ActuatorBounds.alike(_pair(held.speed), _pair(held.slew))
@@ -254,7 +255,18 @@ def _baseline(spec: LQRSpec | PIDSpec | GeometricSpec, vehicle: Vehicle, period:
     }
     if isinstance(spec, PIDSpec):
         return CascadedPID(vehicle, pid_settings(vehicle, velocity_max=spec.velocity, **shared))
-    return GeometricController(vehicle, geometric_settings(vehicle, integral=spec.integral, **shared))
+    geometric = GeometricController(
+        vehicle,
+        geometric_settings(
+            vehicle,
+            integral=spec.integral,
+            feedforward=spec.feedforward,
+            drag=spec.drag,
+            disturbance=spec.disturbance,
+            **shared,
+        ),
+    )
+    return geometric if spec.indi is None else Incremental(geometric, vehicle, spec.indi, geometric.bounds)
 
 
 def _rotor_lag(spec: RobustSpec, vehicle: Vehicle) -> float:
