@@ -28,7 +28,7 @@ class Rest(NamedTuple):
     """Where the model rests, x_s = A x_s + B (u_s - u_bar), and what the cost pulls inputs to."""
 
     x: Array  # (n,) x_s
-    u: Array  # (nu,) u_s [rad/s]
+    u: Array  # (nu,) u_s [rad/s]; (N, nu) where it is another in each step, with a model that changes
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -67,6 +67,10 @@ class Objective:
     def terminal_weights(self) -> tuple[Array, Array]:
         """The same for the last state, where x_s is the origin."""
         return self.weights if self.P is None else (self.P, self.P @ np.linalg.pinv(self.C_r))
+
+    def terminal_target(self, desired: Array, x_s: Array) -> Array:
+        """(n,) x_s + C_r^+ (y_d - C_r x_s), which a P is about; any state with C_r x = y_d where there is none."""
+        return np.asarray(x_s + np.linalg.pinv(self.C_r) @ (desired - self.C_r @ x_s))
 
     @property
     def move_weight(self) -> Array:

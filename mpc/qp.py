@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Protocol, TypeAlias
@@ -156,6 +157,29 @@ class Formulation(Protocol):
 
     def multipliers(self, solution: Solution) -> Array:
         """(N, m) the multipliers of the problem's rows (`mpc.constraints.Rows`), signed as in `Solution`."""
+        ...
+
+
+class ChangingFormulation(Protocol):
+    """One way to write it where matrices change from period to period."""
+
+    @property
+    def qp(self) -> QP:
+        """The QP of the problem's own model, with vectors for a zero state."""
+        ...
+
+    def posed(
+        self, A: Array, B: Array, c: Array, state: Array, desired: Array, u_before: Array, rest: Rest
+    ) -> tuple[QP, Callable[[Array], Array]]:
+        """The QP of A (N, n, n), B (N, n, nu), c (N, n), and what takes a primal point to the states (N, n)."""
+        ...
+
+    def inputs(self, x: Array) -> Array:
+        """See `Formulation.inputs`."""
+        ...
+
+    def slacks(self, x: Array) -> Array:
+        """See `Formulation.slacks`."""
         ...
 
 

@@ -18,8 +18,9 @@ The pattern of the matrices is fixed when a `Staged` is built; where they change
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Final
 
 import numpy as np
@@ -332,7 +333,7 @@ class Staged:
         gradient[at.tail] = np.einsum("jtnm,jtn->jm", matrices.tail[:, :-1], later)
         # The last state's target, C_r^+ (y_d - C_r x_s) from x_s; where Q_y weighs it, x_s has no part in it.
         gradient[at.starts[-1]] = -2.0 * (W_end @ (desired[-1] - objective.C_r @ rest.x) + Q_end @ rest.x)
-        gradient[at.inputs] -= 2.0 * objective.Q_u @ rest.u
+        gradient[at.inputs] -= rest.u @ (2.0 * objective.Q_u)
         gradient[at.inputs[0]] -= 2.0 * objective.move_weight @ u_before
         values = known @ rows.C.T * ~rows.of_states
         values[:-1] += known[1:] @ rows.C.T * rows.of_states
@@ -347,6 +348,14 @@ class Staged:
     def changed(self, matrices: Matrices, vectors: Vectors) -> QP:
         """The QP with other matrices and vectors."""
         return replace(self.qp.with_vectors(vectors), P=matrices.P, A=matrices.dynamics, G=matrices.rows)
+
+    def posed(
+        self, A: Array, B: Array, c: Array, state: Array, desired: Array, u_before: Array, rest: Rest
+    ) -> tuple[QP, Callable[[Array], Array]]:
+        """See `mpc.qp.ChangingFormulation.posed`."""
+        matrices = self.prepare(A, B)
+        qp = self.changed(matrices, self.changed_vectors(matrices, c, state, desired, u_before, rest))
+        return qp, partial(self.states, matrices, c, state)
 
     def inputs(self, x: Array) -> Array:
         """See `mpc.qp.Formulation.inputs`."""

@@ -23,6 +23,7 @@ LAW_NAMES: Final = {
     "unconstrained": "unconstrained MPC",
     "constrained": "constrained MPC",
     "robust": "robust MPC",
+    "nonlinear": "nonlinear MPC",
     "lqr": "LQR",
     "pid": "PID",
     "geometric": "geometric control",

@@ -44,6 +44,7 @@ def build_plant(
     return kind(
         vehicle,
         timestep=scenario.plant.timestep,
+        integrator=scenario.plant.integrator,
         limit_speeds=scenario.plant.limit_speeds,
         effects=scenario.effects.resolved(vehicle),
         changes=build_changes(scenario),

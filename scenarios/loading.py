@@ -35,7 +35,10 @@ def check_parts(scenario: Scenario) -> None:
     load = scenario.effects.resolved(vehicle).load or Load()
     mass_properties(vehicle, load, load.payloads)
     moving_air(scenario, vehicle)
-    build_course(scenario)
+    course = build_course(scenario)
+    if scenario.initial.on_reference and course.derivatives is None:
+        rule = f"false where the course states positions alone, as one of type {scenario.reference.type} does"
+        raise ParameterError("initial", "on_reference", True, rule)
     ground = scenario.effects.ground
     if ground is not None and (ground.contact or ground.effect):
         _check_start(scenario, vehicle)

@@ -16,6 +16,7 @@ CONTROLLERS: Final = {
     "unconstrained": "the paper's Sec. 4: a constant gain from the unconstrained optimum",
     "constrained": "the paper's Sec. 5: a QP's optimum in every period, tilt, rotor speeds and their steps bounded",
     "robust": "constrained, with soft bounds, rotor lag, delay, disturbances, heading and more, each switched on alone",
+    "nonlinear": "nonlinear MPC at any attitude: a quaternion model, sequential quadratic programming",
     "lqr": "infinite-horizon LQR on the hover model, following the reference's velocity",
     "pid": "cascaded PID, as autopilots fly it",
     "geometric": "geometric tracking control on SE(3)",

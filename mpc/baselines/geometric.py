@@ -221,14 +221,13 @@ class GeometricController(FeedbackLaw):
         asked = m * (-settings.k_x * e_x - settings.k_v * e_v - integrals.translation + weight + target.acceleration)
         asked -= m * disturbance.acceleration
         A = limit_force(asked, least=LEAST_LIFT * m * gravity, tilt=math.radians(settings.tilt_max))
-        at_rest = np.zeros(3), np.zeros(3)
-        free = np.array_equal(A, asked)
-        A1, A2 = self._force_derivatives(motion, target, A, e_v, disturbance) if free else at_rest
+        A1 = A2 = p1 = p2 = np.zeros(3)
+        if np.array_equal(A, asked):
+            A1, A2 = self._force_derivatives(motion, target, A, e_v, disturbance)
+            p1, p2 = m * target.acceleration, m * target.jerk
         wanted = wanted_attitude(
             (A, A1, A2),
-            (m * target.velocity, m * target.acceleration, m * target.jerk)
-            if free
-            else (m * target.velocity, *at_rest),
+            (m * target.velocity, p1, p2),
             self._drag,
             _heading(motion.yaw, target) if target.heading is None else target.heading,
         )

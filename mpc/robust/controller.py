@@ -35,9 +35,9 @@ from mpc.model import LinearModel, continuous_model, discretise, hover_model
 from mpc.nonlinear.linearise import linearise
 from mpc.nonlinear.model import NonlinearModel, advance, nonlinear_model, spun
 from mpc.ocp import Objective, Problem, Query, Rest, Unanswered, lqr_terminal_weight
-from mpc.robust.observer import DisturbanceObserver, thrust_axis
-from mpc.robust.observer import ObserverSettings as ObserverSettings
-from mpc.robust.relinearised import Relinearised
+from mpc.observer import DisturbanceObserver, thrust_axis
+from mpc.observer import ObserverSettings as ObserverSettings
+from mpc.relinearised import Relinearised
 from mpc.robust.settings import Linearisation as Linearisation
 from mpc.robust.settings import RobustSettings as RobustSettings
 from mpc.solvers import INVALID_DATA, Answer, QPSolver
@@ -257,7 +257,7 @@ class RobustMPC:
         if query.steps is None:
             return self._solver.solve(query.state, query.desired, query.u_before, query.rest)
         assert query.rest is not None
-        return self._relinearised.solve(*query.steps, query.state, query.desired, query.u_before, query.rest.u)
+        return self._relinearised.solve(*query.steps, query.state, query.desired, query.u_before, query.rest)
 
     def _query(self, x0: Array, reference: Array) -> Query:
         yaw = float(x0[_YAW])

@@ -14,6 +14,7 @@ from quadsim.controller import MISSED, Command, Controller, InnerLoop, Moment, P
 from quadsim.errors import FlightError, InterruptedFlightError, LostError
 from quadsim.flight.log import ControlLog, FlightLog, PlantLog, TimingLog
 from quadsim.flight.lost import LossCriteria, check_loss
+from quadsim.motion import Motion
 from quadsim.sim.computation import Computation
 from quadsim.sim.physics import Segment, inner_steps, physics_to_state
 from quadsim.sim.plant import Plant
@@ -41,6 +42,7 @@ def fly(
     rng: np.random.Generator | None = None,
     ground: PhaseMonitor | None = None,
     loss: LossCriteria | None = None,
+    motion: Motion | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> FlightLog:
     """Fly a number of control periods.
@@ -61,6 +63,7 @@ def fly(
         rng: what `computation` draws from.
         ground: what knows where the flight stands with the ground; it is flying throughout where absent.
         loss: when the vehicle is lost, looked at once per control period until it has crashed; never where absent.
+        motion: of the reference from t_0 on, for controllers that use it; absent where only positions are known.
         progress: called with the number of periods flown, after each.
 
     Returns:
@@ -88,11 +91,19 @@ def fly(
             truth[k] = plant.state()
             since = physics_to_state(samples[-1].segment.physics) if ground and samples else truth[k : k + 1]
             states[k] = truth[k] if navigation is None else navigation.state()
+            attitude, body_rates = plant.attitude if navigation is None else navigation.attitude
             preview = reference[k + 1 : k + 1 + controller.horizon]
             phase = Phase.FLYING if ground is None else ground.advance(since, preview)
             if loss is not None and phase is not Phase.CRASHED:
                 check_loss(loss, k * period, truth[k], reference[k], lowest[k])
-            now = Moment(time=k * period, phase=phase, acting=acting)
+            now = Moment(
+                time=k * period,
+                phase=phase,
+                acting=acting,
+                attitude=attitude,
+                body_rates=body_rates,
+                motion=None if motion is None else motion.after(k),
+            )
             started = clock.perf_counter()
             command = controller.step(now, states[k], preview)
             step_s = clock.perf_counter() - started

@@ -25,6 +25,7 @@ from quadsim.vehicle import N_ROTORS, Vehicle
 from scenarios.parts.plugin import build_plugin
 from scenarios.schema.baselines import GeometricSpec, LQRSpec, PIDSpec
 from scenarios.schema.controller import ConstrainedSpec, ControllerSpec, UnconstrainedSpec
+from scenarios.schema.nonlinear import NonlinearSpec
 from scenarios.schema.optimisation import ANGLES, BoundedSpec, InputWeightsSpec, SoftSpec, WeightedSpec
 from scenarios.schema.plugin import PluginSpec
 from scenarios.schema.robust import RobustSpec
@@ -121,9 +122,11 @@ def make_controller(spec: ControllerSpec, vehicle: Vehicle, period: float) -> Co
             return _unconstrained(make_problem(spec, vehicle, period))
         case ConstrainedSpec():
             law = _constrained(spec, make_problem(spec, vehicle, period))
-            return law if spec.fallback is None else guarded(law, spec, spec.fallback, vehicle, period)
+            return law if spec.fallback is None else _bounded(law, spec, spec.fallback, vehicle, period)
         case RobustSpec():
-            return guarded(_robust(spec, vehicle, period), spec, spec.fallback, vehicle, period)
+            return _bounded(_robust(spec, vehicle, period), spec, spec.fallback, vehicle, period)
+        case NonlinearSpec():
+            return _nonlinear(spec, vehicle, period)
         case LQRSpec() | PIDSpec() | GeometricSpec():
             return _baseline(spec, vehicle, period)
         case PluginSpec():
@@ -141,16 +144,57 @@ def posed_problem(spec: BoundedSpec, vehicle: Vehicle, period: float) -> Problem
     return make_problem(spec, vehicle, period)
 
 
-def guarded(
+def _bounded(
     law: Controller, spec: BoundedSpec, fallback: FallbackSettings, vehicle: Vehicle, period: float
+) -> Controller:
+    settings = replace(fallback, tilt=_fallback_tilt(spec, fallback))
+    return guarded(law, ActuatorBounds.of(make_bounds(spec)), settings, vehicle, period)
+
+
+def guarded(
+    law: Controller, bounds: ActuatorBounds, fallback: FallbackSettings, vehicle: Vehicle, period: float
 ) -> Controller:
     """The law within the fallback contract; the law itself where that is switched off."""
     from mpc.fallback.contract import Guarded
 
     if not fallback.enabled:
         return law
-    settings = replace(fallback, tilt=_fallback_tilt(spec, fallback))
-    return Guarded(law, hover_model(vehicle, period), bounds=ActuatorBounds.of(make_bounds(spec)), settings=settings)
+    return Guarded(law, hover_model(vehicle, period), bounds=bounds, settings=fallback)
+
+
+def _nonlinear(spec: NonlinearSpec, vehicle: Vehicle, period: float) -> Controller:
+    from mpc.nonlinear.controller import NonlinearMPC
+    from mpc.nonlinear.rigidbody import Inputs
+    from mpc.nonlinear.settings import AttitudeError, NonlinearSettings, Weights
+
+    stride = 1 if spec.node is None else round(spec.node / period)
+    if spec.node is not None and (stride < 1 or not math.isclose(stride * period, spec.node, rel_tol=1e-9)):
+        raise ParameterError("controller", "node", spec.node, f"a whole multiple of the control period of {period} s")
+    if spec.horizon % stride:
+        raise ParameterError("controller", "horizon", spec.horizon, f"a whole number of nodes, {stride} periods each")
+    held, axes = spec.input_bounds, spec.weights
+    bounds = ActuatorBounds.alike(
+        (vehicle.speed_min, vehicle.speed_max) if held.speed is None else _pair(held.speed),
+        (-math.inf, math.inf) if held.slew is None else _pair(held.slew),
+    )
+    settings = NonlinearSettings(
+        horizon=spec.horizon // stride,
+        stride=stride,
+        iterations=spec.iterations,
+        shift=spec.shift,
+        substeps=spec.substeps,
+        inputs=Inputs(spec.inputs),
+        rotor_lag=_rotor_lag(spec, vehicle),
+        drag=tuple(spec.drag),
+        quadratic_drag=tuple(spec.quadratic_drag),
+        attitude_error=AttitudeError(spec.attitude_error),
+        weights=Weights(**{name: tuple(w) if isinstance(w, list) else w for name, w in axes}),
+        terminal=0.0 if spec.terminal == "none" else spec.terminal,
+        observer=spec.offset_free,
+        solver=spec.solver,
+    )
+    law = NonlinearMPC(vehicle, period=period, settings=settings, bounds=bounds)
+    return guarded(law, bounds, spec.fallback, vehicle, period)
 
 
 def _constrained(spec: ConstrainedSpec, problem: Problem) -> Controller:
@@ -269,7 +313,7 @@ def _baseline(spec: LQRSpec | PIDSpec | GeometricSpec, vehicle: Vehicle, period:
     return geometric if spec.indi is None else Incremental(geometric, vehicle, spec.indi, geometric.bounds)
 
 
-def _rotor_lag(spec: RobustSpec, vehicle: Vehicle) -> float:
+def _rotor_lag(spec: RobustSpec | NonlinearSpec, vehicle: Vehicle) -> float:
     if spec.rotor_lag != "vehicle":
         return spec.rotor_lag
     if vehicle.rotor_rise is None:

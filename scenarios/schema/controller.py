@@ -12,6 +12,7 @@ from mpc.fallback.settings import FallbackSettings
 from mpc.solvers import SOLVERS
 from quadsim.errors import UnknownNameError
 from scenarios.schema.baselines import GeometricSpec, LQRSpec, PIDSpec
+from scenarios.schema.nonlinear import NonlinearSpec
 from scenarios.schema.optimisation import BoundedSpec, WeightedSpec
 from scenarios.schema.plugin import FORM, LAWS, PluginSpec, is_plugin
 from scenarios.schema.robust import RobustSpec
@@ -62,7 +63,9 @@ def _spelt_out(controller: Any) -> Any:
     """A law's name alone as the table that it stands for."""
     if isinstance(controller, str):
         return {"type": controller}
-    if not isinstance(controller, Mapping | WeightedSpec | LQRSpec | PIDSpec | GeometricSpec | PluginSpec):
+    if not isinstance(
+        controller, Mapping | WeightedSpec | NonlinearSpec | LQRSpec | PIDSpec | GeometricSpec | PluginSpec
+    ):
         raise PydanticCustomError("controller", "a table or a controller's name")
     return controller
 
@@ -71,6 +74,7 @@ _Table = Annotated[
     Annotated[UnconstrainedSpec, Tag("unconstrained")]
     | Annotated[ConstrainedSpec, Tag("constrained")]
     | Annotated[RobustSpec, Tag("robust")]
+    | Annotated[NonlinearSpec, Tag("nonlinear")]
     | Annotated[LQRSpec, Tag("lqr")]
     | Annotated[PIDSpec, Tag("pid")]
     | Annotated[GeometricSpec, Tag("geometric")]

@@ -18,7 +18,7 @@ from quadsim.fields import Positive
 from quadsim.flight.audit import Limit
 from quadsim.sim.computation import ComputationTime
 from quadsim.sim.effects import Effects
-from quadsim.sim.physics import inner_steps, steps_per_period
+from quadsim.sim.physics import Integrator, inner_steps, steps_per_period
 from quadsim.vehicle import VEHICLE_UNITS, Vehicle
 from scenarios.schema.base import LARGEST_SEED, MOST_ENTRIES, Spec, Triple, fields_of
 from scenarios.schema.controller import ControllerSpec
@@ -64,11 +64,18 @@ class InitialSpec(Spec):
     cold: bool = Field(
         default=False, description="whether it starts on the ground with rotors at rest, u(-1) = 0; else from hover"
     )
+    on_reference: bool = Field(
+        default=False,
+        description="whether it starts with velocity, attitude and body rates of the reference at t = 0 instead; only "
+        "with courses that state them (ramped_circle, ramped_lemniscate)",
+    )
 
     @model_validator(mode="after")
     def _check(self) -> InitialSpec:
-        if any(abs(angle) >= 90.0 for angle in self.euler[:2]):
-            raise ValueError(f"euler must have roll and pitch within +-90 deg; got {self.euler}")
+        if abs(self.euler[0]) > 180.0 or abs(self.euler[1]) >= 90.0:
+            raise ValueError(f"euler must have a roll within +-180 deg and a pitch within +-90 deg; got {self.euler}")
+        if self.on_reference and any(self.euler[:2]):
+            raise ValueError(f"euler must have roll and pitch 0 where on_reference is true; got {self.euler}")
         return self
 
 
@@ -76,6 +83,11 @@ class PlantSpec(Spec):
     """The simulated vehicle."""
 
     timestep: Annotated[float, Field(ge=1e-6, le=0.01)] = Field(default=1e-3, description="[s] physics step")
+    integrator: Integrator = Field(
+        default="mujoco",
+        description="mujoco: MuJoCo's Runge-Kutta step, forces that follow the motion held over it; rk4: that of a "
+        "free rigid body with all forces evaluated at each stage, for the rules of published simulations",
+    )
     limit_speeds: bool = Field(
         default=False, description="whether rotors saturate at the vehicle's speed_min and speed_max"
     )

@@ -24,7 +24,7 @@ from mpc.nonlinear.linearise import linearise
 from mpc.nonlinear.model import nonlinear_model
 from mpc.ocp import Objective, Problem, Rest, lqr_terminal_weight
 from mpc.robust.controller import Linearisation, RobustMPC, RobustSettings
-from mpc.robust.relinearised import Relinearised
+from mpc.relinearised import Relinearised
 from mpc.solvers import SOLVERS, QPSolver, Way
 from quadsim.controller import ACCEPTED, SOLVED, UNCONSTRAINED, Moment
 from quadsim.state import Array, make_state
@@ -330,7 +330,7 @@ def test_models_that_change_from_step_to_step_hold_it(soft: bool) -> None:
         given = changing_period(rng, problem)
         peer = ocp_peer.optimum(problem, given)
         answer = Relinearised(problem).solve(
-            given.A, given.B, given.c, given.state, given.desired, given.u_before, given.rest.u
+            given.A, given.B, given.c, given.state, given.desired, given.u_before, given.rest
         )
         assert (answer.solution.status == SOLVED) == (peer.solution.status == SOLVED)
         if peer.solution.status != SOLVED:

@@ -17,7 +17,7 @@ from mpc.constraints import Bounds, Penalty
 from mpc.model import discretise
 from mpc.nonlinear.model import advance, derivative, nonlinear_model
 from mpc.robust.controller import RobustMPC, RobustSettings
-from mpc.robust.observer import ObserverSettings
+from mpc.observer import ObserverSettings
 from mpc.robust.tightening import (
     ERROR_SHARE,
     SHORTEST_LAG,

@@ -22,7 +22,7 @@ from mpc.constraints import Bounds
 from mpc.fallback.contract import Guarded
 from mpc.ocp import Objective
 from mpc.robust.controller import Linearisation, RobustMPC, RobustSettings
-from mpc.robust.observer import ObserverSettings
+from mpc.observer import ObserverSettings
 from mpc.robust.tightening import TighteningSettings, margins
 from mpc.solvers import QPSolver
 from mpc.unconstrained import UnconstrainedMPC

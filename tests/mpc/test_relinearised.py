@@ -13,7 +13,7 @@ from support import changing_period, paper_problem, random_problem
 
 from mpc.constraints import Penalty
 from mpc.ocp import Problem
-from mpc.robust.relinearised import LARGEST, Relinearised
+from mpc.relinearised import LARGEST, Relinearised
 from mpc.solvers import Answer
 from quadsim.controller import ACCEPTED, SOLVED
 
@@ -25,7 +25,7 @@ def soft_problem() -> Problem:
 
 
 def solved(solver: Relinearised, now: Period) -> Answer:
-    return solver.solve(now.A, now.B, now.c, now.state, now.desired, now.u_before, now.rest.u)
+    return solver.solve(now.A, now.B, now.c, now.state, now.desired, now.u_before, now.rest)
 
 
 PARTS = ("A", "B", "c", "state", "desired", "u_before", "u_rest")

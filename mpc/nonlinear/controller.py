@@ -1,0 +1,325 @@
+"""Nonlinear MPC: sequential quadratic programming on the rigid body with a quaternion.
+
+Each period the model is linearised along the plan of the last one, at the nodes' states and inputs kept, and the QP
+
+    min  sum |C_r (s_i - s_i^r)|^2_Q + |u_i - u_i^r|^2_R    s.t.  s_{i+1} = A_i s_i + B_i u_i + c_i,  s_0 measured
+
+is solved: a full Gauss-Newton step, the real-time iteration (Diehl, Bock and Schloeder 2005).  Its states s have the
+quaternion q_r* q for q, with the node's reference q_r: a rotation of four numbers, by which both attitude errors of
+`AttitudeError` become linear with fixed weights.  A measured state enters as s_0 alone; node 0 is linearised at the state
+kept.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import Final
+
+import numpy as np
+
+from mpc.answer import ActuatorBounds, command_of
+from mpc.constraints import Constraint
+from mpc.model import LinearModel
+from mpc.nonlinear.reference import Nodes, nodes_of_motion, nodes_of_preview
+from mpc.nonlinear.rigidbody import (
+    N_BODY,
+    Inputs,
+    P,
+    Q,
+    V,
+    W,
+    advance_nodes,
+    linearise_nodes,
+    rigid_body,
+)
+from mpc.nonlinear.settings import AttitudeError, NonlinearSettings
+from mpc.ocp import Objective, Problem, Query, Rest, Unanswered, lqr_terminal_weight
+from mpc.relinearised import Relinearised
+from mpc.solvers import INVALID_DATA, Answer
+from quadsim.controller import ACCEPTED, GROUNDED, Command, Moment, Phase, stopped
+from quadsim.errors import ParameterError
+from quadsim.state import (
+    ANGLE_RATES,
+    ANGLES,
+    N_STATES,
+    POSITIONS,
+    VELOCITIES,
+    Array,
+    body_to_euler_rates,
+    euler_to_body_rates,
+    euler_to_quaternion,
+    quaternion_to_euler,
+)
+from quadsim.vehicle import N_ROTORS, Vehicle
+
+LARGEST_CONDENSED: Final = 80
+"""Inputs over the horizon up to which a condensed QP is solved faster than a staged one."""
+OUTSIDE: Final = 1e-6
+"""How far outside its bounds an input, a share of the largest, may be answered; it is then moved onto them."""
+_PLAUSIBLE: Final = 1e5
+
+
+def frames_of(quaternions: Array) -> Array:
+    """(M, 4, 4) matrices that take q to q_r* q, of q_r (M, 4)."""
+    return (quaternions @ _LEFT).reshape(-1, 4, 4)
+
+
+_LEFT: Final = np.array(
+    [
+        [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]],
+        [[0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 0, 1], [0, 0, -1, 0]],
+        [[0, 0, 1, 0], [0, 0, 0, -1], [-1, 0, 0, 0], [0, 1, 0, 0]],
+        [[0, 0, 0, 1], [0, 0, 1, 0], [0, -1, 0, 0], [-1, 0, 0, 0]],
+    ],
+    float,
+).reshape(4, 16)
+"""The left factor q_r* as a matrix, by each entry of q_r."""
+
+
+class NonlinearMPC:
+    """One step of sequential quadratic programming per period, or more; see the module.
+
+    Attributes:
+        problem: the optimisation; its states and inputs are those of the module.
+        unanswered: the first period since `reset` whose QP had no answer; None where all had.
+
+    Raises:
+        ParameterError: a number is not possible.
+    """
+
+    name: Final = "nonlinear"
+
+    def __init__(
+        self,
+        vehicle: Vehicle,
+        *,
+        period: float,
+        settings: NonlinearSettings,
+        bounds: ActuatorBounds | None = None,
+    ) -> None:
+        self.settings, self._vehicle, self._period = settings, vehicle, period
+        self._bounds = ActuatorBounds.of_vehicle(vehicle) if bounds is None else bounds
+        self._nodes = settings.horizon
+        self.horizon = settings.horizon * settings.stride
+        self._model = rigid_body(
+            vehicle,
+            period * settings.stride,
+            substeps=settings.substeps,
+            inputs=settings.inputs,
+            rotor_lag=settings.rotor_lag or None,
+            drag=np.array(settings.drag),
+            quadratic_drag=np.array(settings.quadratic_drag),
+        )
+        self._hover = vehicle.mass * vehicle.gravity / N_ROTORS
+        self.problem = self._problem()
+        small = self.problem.horizon * N_ROTORS <= LARGEST_CONDENSED
+        self.solver = settings.solver or ("piqp-dense" if small else "piqp-multistage")
+        self._qp = Relinearised(self.problem, self.solver, shortcut=True)
+        self._shift = settings.stride == 1 if settings.shift is None else settings.shift
+        self._lower, self._upper = self._shares(self._bounds.u_min), self._shares(self._bounds.u_max)
+        self._difference = settings.attitude_error is AttitudeError.DIFFERENCE
+        self._C_r = self.problem.objective.C_r
+        self.reset(np.full(N_ROTORS, vehicle.hover_speed))
+
+    def _shares(self, speeds: Array) -> Array:
+        return self._model.shares(self._vehicle.thrust_coefficient * np.square(speeds))
+
+    def _speeds(self, shares: Array) -> Array:
+        """Rotor speeds [rad/s] of inputs."""
+        return np.sqrt(self._model.thrusts(np.maximum(shares, 0.0)) / self._vehicle.thrust_coefficient)
+
+    def _problem(self) -> Problem:
+        settings, model = self.settings, self._model
+        hover, x = self._shares(np.full(N_ROTORS, self._vehicle.hover_speed)), np.zeros(model.n)
+        x[3] = 1.0
+        x[N_BODY:] = hover[: model.n - N_BODY]
+        A, B, _ = linearise_nodes(model, x[None], hover[None])
+        rows, weights = settings.outputs()
+        objective = Objective(
+            C_r=np.hstack([rows, np.zeros((len(rows), model.n - N_BODY))]),
+            Q_y=np.diag(weights),
+            Q_u=settings.weights.input * np.eye(N_ROTORS),
+            Q_d=settings.weights.move * np.eye(N_ROTORS) if settings.weights.move else None,
+        )
+        linear = LinearModel(A=A[0], B=B[0], u_bar=hover, period=model.step)
+        if settings.terminal == "lqr":
+            P = self._riccati(linear, objective)
+        else:
+            P = float(settings.terminal) * objective.weights[0]
+        lower, upper = self._shares(self._bounds.u_min), self._shares(self._bounds.u_max)
+        constraints = [Constraint(name="inputs", lower=lower, upper=upper, D=np.eye(N_ROTORS))]
+        constraints += self._slews()
+        return Problem(
+            model=linear,
+            horizon=settings.horizon,
+            objective=replace(objective, P=P),
+            constraints=tuple(constraints),
+        )
+
+    def _slews(self) -> list[Constraint]:
+        """Bounds on steps of speeds: from one node to the next `stride` times those of a period, but for the first."""
+        bounds, settings = self._bounds, self.settings
+        if not (np.isfinite(bounds.delta_min).any() or np.isfinite(bounds.delta_max).any()):
+            return []
+        if settings.inputs is not Inputs.SPEED:
+            rule = 'left out where inputs = "thrust": a step of a speed is not linear in thrusts; inputs = "speed"'
+            raise ParameterError("controller", "input_bounds.slew", bounds.delta_max.tolist(), rule)
+        steps = np.full((settings.horizon, 1), float(settings.stride))
+        steps[0] = 1.0
+        largest = self._vehicle.speed_max
+        lower, upper = steps * bounds.delta_min / largest, steps * bounds.delta_max / largest
+        return [Constraint(name="slews", lower=lower, upper=upper, E=np.eye(N_ROTORS))]
+
+    def _riccati(self, linear: LinearModel, objective: Objective) -> Array:
+        """P at hover, where the quaternion's scalar does not move, and costs nothing."""
+        kept = np.delete(np.arange(linear.n), 3)
+        reduced = replace(objective, C_r=objective.C_r[:, kept], P=None)
+        if self.settings.attitude_error is AttitudeError.DIFFERENCE:
+            rows = np.delete(np.arange(len(objective.C_r)), 3)
+            reduced = replace(reduced, C_r=reduced.C_r[rows], Q_y=objective.Q_y[np.ix_(rows, rows)])
+        part = replace(linear, A=linear.A[np.ix_(kept, kept)], B=linear.B[kept])
+        P = np.zeros((linear.n, linear.n))
+        P[np.ix_(kept, kept)] = lqr_terminal_weight(part, reduced)
+        return P
+
+    def reset(self, speeds: Array) -> None:
+        """Start anew after the command u(-1) (4,) [rad/s], with rotors at that speed."""
+        self._acting = np.array(speeds, float)
+        self._rotors = self._shares(self._acting)
+        self._plan: tuple[Array, Array] | None = None
+        self._quaternion: Array | None = None
+        self.unanswered: Unanswered | None = None
+
+    def step(self, now: Moment, state: Array, reference: Array) -> Command:
+        """See `quadsim.controller.Controller.step`.
+
+        Numbers that are not finite, or that lead to such, are answered with the status `invalid_data`.
+        """
+        if now.acting is not None:
+            self._acting = np.array(now.acting, float)
+        if now.phase in GROUNDED:
+            return self._stop(now.phase)
+        measured = self._measured(now, state)
+        if not (np.abs(measured) <= _PLAUSIBLE).all() or not (np.abs(reference) <= _PLAUSIBLE).all():
+            return self._refuse(INVALID_DATA)
+        nodes = self._reference(now, reference)
+        if self._quaternion is None:
+            self._quaternion = nodes.states[0, Q]
+        if measured[Q] @ self._quaternion < 0.0:
+            measured[Q] *= -1.0
+        self._quaternion = measured[Q].copy()
+        query, answer = self._iterate(measured, nodes)
+        status = self._rejection(answer)
+        if status is not None:
+            if status != INVALID_DATA and self.unanswered is None:
+                self.unanswered = Unanswered(problem=self.problem, query=query, status=status, time=now.time)
+            self._plan = None
+            return self._refuse(status, answer)
+        shares = np.minimum(np.maximum(answer.plan, self._lower), self._upper)
+        if self.settings.rotor_lag:
+            self._rotors = shares[0] + math.exp(-self._period / self.settings.rotor_lag) * (self._rotors - shares[0])
+        speeds = self._speeds(shares)
+        self._acting = speeds[0] = self._bounds.clip(speeds[0], self._acting)
+        plan = speeds if self.settings.stride == 1 else np.repeat(speeds, self.settings.stride, axis=0)
+        return command_of(speeds[0], plan, answer.solution.status, answer)
+
+    def predict(self, states: Array, plans: Array) -> Array:
+        """See `quadsim.controller.Controller.predict`."""
+        model = replace(self._model, step=self._period, rotor_lag=None, substeps=1)
+        x = np.zeros((len(states), N_BODY))
+        x[:, P], x[:, V] = states[:, POSITIONS], states[:, VELOCITIES]
+        x[:, Q] = euler_to_quaternion(states[:, ANGLES])
+        x[:, W] = euler_to_body_rates(states[:, ANGLES], states[:, ANGLE_RATES])
+        predicted = np.empty((*plans.shape[:2], N_STATES))
+        for i in range(plans.shape[1]):
+            x = advance_nodes(model, x, self._shares(plans[:, i]))
+            x[:, Q] /= np.linalg.norm(x[:, Q], axis=1, keepdims=True)
+            euler = quaternion_to_euler(x[:, Q])
+            predicted[:, i, POSITIONS], predicted[:, i, VELOCITIES] = x[:, P], x[:, V]
+            predicted[:, i, ANGLES] = euler
+            predicted[:, i, ANGLE_RATES] = body_to_euler_rates(euler, x[:, W])
+        return predicted
+
+    def _measured(self, now: Moment, state: Array) -> Array:
+        """(n,) the model's state."""
+        x = np.empty(self._model.n)
+        x[P], x[V] = state[POSITIONS], state[VELOCITIES]
+        euler = state[ANGLES]
+        seen = now.attitude is not None and bool(np.isfinite(now.attitude).all())
+        x[Q] = now.attitude if seen else euler_to_quaternion(euler)
+        seen = now.body_rates is not None and bool(np.isfinite(now.body_rates).all())
+        x[W] = now.body_rates if seen else euler_to_body_rates(euler, state[ANGLE_RATES])
+        if x.size > N_BODY:
+            x[N_BODY:] = self._rotors
+        return x
+
+    def _reference(self, now: Moment, reference: Array) -> Nodes:
+        stride = self.settings.stride
+        if now.motion is not None:
+            return nodes_of_motion(now.motion, self._nodes, stride)
+        return nodes_of_preview(reference, self._nodes, stride, self._period, self._hover)
+
+    def _iterate(self, measured: Array, nodes: Nodes) -> tuple[Query, Answer]:
+        """Steps of sequential quadratic programming from the plan kept."""
+        frames, n = frames_of(nodes.states[:, Q]), self._model.n
+        inputs = self._model.shares(nodes.thrusts)
+        wanted = nodes.states.copy()
+        wanted[:, Q] = (1.0, 0.0, 0.0, 0.0) if self._difference else 0.0
+        if n > N_BODY:
+            wanted = np.concatenate([wanted, np.concatenate([inputs, inputs[-1:]])], axis=1)
+        desired = wanted[1:] @ self._C_r.T
+        s0 = measured.copy()
+        s0[Q] = frames[0] @ measured[Q]
+        if self._plan is None:
+            start = np.concatenate([nodes.states, wanted[:, N_BODY:]], axis=1)
+            self._plan = start, np.minimum(np.maximum(inputs, self._lower), self._upper)
+        elif self._shift:
+            x, u = self._plan
+            self._plan = np.concatenate([x[1:], x[-1:]]), np.concatenate([u[1:], u[-1:]])
+        rest, before = Rest(wanted[-1], inputs), self._shares(self._acting)
+        for _ in range(self.settings.iterations):
+            x, u = self._plan
+            query = Query(s0, desired, before, rest, self._steps(x, u, frames))
+            assert query.steps is not None
+            answer = self._qp.solve(*query.steps, s0, desired, before, rest)
+            if self._qp.last is None:
+                break
+            states, plan = self._qp.last
+            found = np.concatenate([measured[None], states])
+            found[1:, Q] = (frames[1:].transpose(0, 2, 1) @ states[:, Q, None])[:, :, 0]
+            self._plan = found, plan
+            if self.settings.iterations > 1:
+                moved = max(np.abs(found - x).max(), np.abs(plan - u).max())
+                if moved <= self.settings.tolerance:
+                    break
+        return query, answer
+
+    def _steps(self, x: Array, u: Array, frames: Array) -> tuple[Array, Array, Array]:
+        """A, B, c along a plan of states (N + 1, n) and inputs (N, 4)."""
+        A, B, end = linearise_nodes(self._model, x[:-1], u, frames)
+        turned, end = x[:-1].copy(), end.copy()
+        turned[:, Q] = (frames[:-1] @ turned[:, Q, None])[:, :, 0]
+        end[:, Q] = (frames[1:] @ end[:, Q, None])[:, :, 0]
+        return A, B, end - (A @ turned[:, :, None])[:, :, 0] - (B @ u[:, :, None])[:, :, 0]
+
+    def _rejection(self, answer: Answer) -> str | None:
+        status, plan = answer.solution.status, answer.plan
+        if status not in ACCEPTED:
+            return status
+        if not np.isfinite(plan).all():
+            return "not_finite"
+        beyond = np.maximum(self._lower - plan, plan - self._upper).max()
+        return "out_of_bounds" if beyond > OUTSIDE else None
+
+    def _stop(self, phase: Phase) -> Command:
+        self._acting, _ = self._bounds.reach(self._acting)
+        self._plan, self._quaternion = None, None
+        return stopped(self._acting.copy(), self.horizon, phase)
+
+    def _refuse(self, status: str, answer: Answer | None = None) -> Command:
+        """The command in force, with what speaks against another."""
+        plan = np.tile(self._acting, (self.horizon, 1))
+        if answer is None:
+            return Command(speeds=plan[0].copy(), plan=plan, status=status)
+        return command_of(plan[0], plan, status, answer)

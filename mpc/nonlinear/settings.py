@@ -1,0 +1,116 @@
+"""What a nonlinear MPC is made from."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from enum import StrEnum
+
+import numpy as np
+
+from mpc.nonlinear.rigidbody import Inputs
+from mpc.observer import ObserverSettings
+from quadsim.errors import ParameterError
+from quadsim.state import Array
+
+Weight = float | tuple[float, float, float]
+"""One number for three axes, or one each."""
+
+
+class AttitudeError(StrEnum):
+    """What the weight of the attitude is of, with the reference q_r."""
+
+    ERROR_STATE = "error-state"
+    """2 vec(q_r* q), three components: the rotation vector to first order, and the same of q and -q."""
+    DIFFERENCE = "difference"
+    """q - q_r, four components, whose signs have to agree: to first order half the rotation vector."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Weights:
+    """What squared distances from the reference cost; of three axes one number or one each."""
+
+    position: Weight = 10.0  # [1/m^2]
+    attitude: Weight = 0.1  # [1/rad^2], or of the squared difference; then one number
+    velocity: Weight = 0.05  # [1/(m/s)^2]
+    body_rates: Weight = 0.05  # [1/(rad/s)^2]
+    input: float = 0.1  # of an input's distance from the reference's, as shares
+    move: float = 0.0  # of its change from one node to the next; 0 for none
+
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            array = np.asarray(value, float)
+            least = -math.inf if name == "move" else 0.0
+            axes = ((),) if name in ("input", "move") else ((), (3,))
+            if (
+                array.shape not in axes
+                or not np.isfinite(array).all()
+                or not (array > least).all()
+                or array.min() < 0.0
+            ):
+                rule = "positive: one number, or three" if len(axes) == 2 else "one positive number"
+                raise ParameterError("controller.weights", name, value, rule)
+
+
+_USUAL = Weights()
+
+
+@dataclass(frozen=True, kw_only=True)
+class NonlinearSettings:
+    """Horizon, cost and model; the units are those of the states, inputs are shares of the largest.
+
+    Attributes:
+        horizon: N, nodes.
+        stride: control periods from one node to the next.
+        iterations: most steps of sequential quadratic programming in a period; 1 is the real-time iteration.
+        tolerance: largest step of a state or an input that ends them.
+        shift: whether the plan is shifted by a node before it is linearised along; None: where the stride is 1.
+        substeps: Runge-Kutta steps from one node to the next.
+        inputs: what the inputs are shares of the largest of.
+        rotor_lag: time constant of the rotors' thrusts or speeds [s]; None for none.
+        drag: (3,) linear drag that the model knows, body axes [N s/m].
+        quadratic_drag: (3,) drag quadratic in each component of the velocity [N s^2/m^2].
+        attitude_error: what the weight of the attitude is of.
+        weights: what distances from the reference cost.
+        terminal: the last state's weight over that of the others, 0 for none; `lqr` for the Riccati equation's at hover.
+        observer: tuning of the disturbance observer; None for no offset-free tracking.
+        solver: QP solver, in `mpc.solvers.SOLVERS`; None for the one that is the fastest for the size.
+    """
+
+    horizon: int = 10
+    stride: int = 1
+    iterations: int = 1
+    tolerance: float = 1e-6
+    shift: bool | None = None
+    substeps: int = 1
+    inputs: Inputs = Inputs.THRUST
+    rotor_lag: float | None = None
+    drag: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    quadratic_drag: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    attitude_error: AttitudeError = AttitudeError.ERROR_STATE
+    weights: Weights = _USUAL
+    terminal: float | str = 0.0
+    observer: ObserverSettings | None = None
+    solver: str | None = None
+
+    def __post_init__(self) -> None:
+        for name in ("horizon", "stride", "iterations", "substeps"):
+            if not isinstance(getattr(self, name), int) or getattr(self, name) < 1:
+                raise ParameterError("controller", name, getattr(self, name), "a whole number >= 1")
+        if not isinstance(self.terminal, str) and not 0.0 <= self.terminal < math.inf:
+            raise ParameterError("controller", "terminal", self.terminal, 'at least 0 and finite, or "lqr"')
+        if self.attitude_error is AttitudeError.DIFFERENCE and np.ndim(self.weights.attitude):
+            rule = 'one number where attitude_error = "difference"'
+            raise ParameterError("controller.weights", "attitude", self.weights.attitude, rule)
+
+    def outputs(self) -> tuple[Array, Array]:
+        """C_r (n_r, 13) and the diagonal of Q_y (n_r,), for states whose quaternion is q_r* q."""
+        weights, difference = self.weights, self.attitude_error is AttitudeError.DIFFERENCE
+        rows = np.eye(13) if difference else np.delete(np.eye(13), 3, axis=0)
+        attitude = np.full(4, weights.attitude) if difference else 4.0 * _three(weights.attitude)
+        parts = (_three(weights.position), attitude, _three(weights.velocity), _three(weights.body_rates))
+        return rows, np.concatenate(parts)
+
+
+def _three(weight: Weight) -> Array:
+    return np.broadcast_to(np.asarray(weight, float), 3)
