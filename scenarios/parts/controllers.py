@@ -305,7 +305,7 @@ def _baseline(spec: LQRSpec | PIDSpec | GeometricSpec, vehicle: Vehicle, period:
             vehicle,
             integral=spec.integral,
             feedforward=spec.feedforward,
-            drag=spec.drag,
+            drag=tuple(spec.drag),
             disturbance=spec.disturbance,
             **shared,
         ),

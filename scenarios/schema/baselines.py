@@ -74,8 +74,8 @@ class GeometricSpec(_TunedSpec):
         default=False,
         description="whether the reference's jerk and snap are fed forward, and drag, by differential flatness",
     )
-    drag: Annotated[tuple[NonNegative, ...], Len(3, 3)] = Field(
-        default=(0.0, 0.0, 0.0), description="[1/s] linear drag along body x, y, z that feedforward takes into account"
+    drag: Annotated[list[NonNegative], Len(3, 3)] = Field(
+        default=[0.0, 0.0, 0.0], description="[1/s] linear drag along body x, y, z that feedforward takes into account"
     )
     disturbance: RampSettings | None = Field(default=None, description="absent: what the model misses is not observed")
     indi: INDISettings | None = Field(default=None, description="absent: rotors hold the commands for a period")
