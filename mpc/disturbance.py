@@ -17,6 +17,7 @@ and differential flatness", 2021), f / m R e_z - g e_z + d = v', with a predicti
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated, Final
 
@@ -31,6 +32,8 @@ FORCE_SHARE: Final = 0.5
 """Bandwidth of the force times the control period, where none is given."""
 TORQUE_SHARE: Final = 0.25
 """The same of the torque."""
+FITTED_FROM: Final = 1.0
+"""Speed along an axis [m/s] at which half the drag that would explain the force is believed."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,7 +46,13 @@ class RampSettings:
     torque: Annotated[
         Positive | None, doc(f"[rad/s] the same of the torque's; absent: {TORQUE_SHARE:g} / control period")
     ] = None
-    rotor_lag: Annotated[NonNegative, doc("[s] time constant by which rotors follow commands; 0 for at once")] = 0.0
+    drag_memory: Annotated[
+        Positive, doc("[s] over which linear drag is fitted to the force, for a nonlinear MPC's predictions")
+    ] = 1.0
+    rotor_lag: Annotated[
+        NonNegative | None,
+        doc("[s] time constant by which rotors follow commands; absent: the one that the controller predicts, or 0"),
+    ] = None
     largest_force: Annotated[Positive, doc("[m/s^2] larger estimates are clipped")] = 20.0
     largest_torque: Annotated[Positive, doc("[rad/s^2] larger estimates are clipped")] = 100.0
 
@@ -51,20 +60,40 @@ class RampSettings:
 class RampObserver:
     """The six filters, an evolving state: three of the force, world axes, and three of the torque, body axes."""
 
-    def __init__(self, settings: RampSettings, vehicle: Vehicle, period: float, drag: Array) -> None:
-        """`drag` (3,) is the linear drag that the model knows, body axes [1/s]."""
+    def __init__(
+        self,
+        settings: RampSettings,
+        vehicle: Vehicle,
+        period: float,
+        *,
+        drag: Sequence[float] = (0.0, 0.0, 0.0),
+        quadratic_drag: Sequence[float] = (0.0, 0.0, 0.0),
+    ) -> None:
+        """Set up.
+
+        Args:
+            settings: bandwidths and limits.
+            vehicle: the modelled vehicle.
+            period: tau_s [s].
+            drag: (3,) linear drag that the model knows, body axes [1/s].
+            quadratic_drag: (3,) the same of each component's square [1/m].
+        """
         force = FORCE_SHARE / period if settings.force is None else settings.force
         torque = TORQUE_SHARE / period if settings.torque is None else settings.torque
         pole = np.exp(-period * np.repeat([force, torque], 3))
         self._gain, self._gain_of_change = 1.0 - pole**2, (1.0 - pole) ** 2 / period
         self._largest = np.repeat([settings.largest_force, settings.largest_torque], 3)
-        self._vehicle, self._period, self._drag, self._lag = vehicle, period, drag, settings.rotor_lag
+        self._vehicle, self._period, self._lag = vehicle, period, settings.rotor_lag or 0.0
+        self._drag, self._quadratic = np.array(drag), np.array(quadratic_drag)
+        self._kept = math.exp(-period / settings.drag_memory)
+        self._ballast = FITTED_FROM**2 / (1.0 - self._kept)
         self._up = np.array([0.0, 0.0, vehicle.gravity])
         self.reset(np.full(4, vehicle.hover_speed))
 
     def reset(self, rotors: Array) -> None:
         """Forget: nothing disturbs, and the rotors turn at `rotors` (4,) [rad/s]."""
         self._value, self._change = np.zeros(6), np.zeros(6)
+        self._products, self._squares = np.zeros(3), np.zeros(3)
         self._rotors = np.array(rotors, float)
         self._last: tuple[Array, Array, Array, Array] | None = None
 
@@ -80,7 +109,8 @@ class RampObserver:
         period, J = self._period, np.array(self._vehicle.inertia)
         squares = self._mean_squares(speeds)
         axis, turning = attitude[:, 2], attitude @ np.array([rates[1], -rates[0], 0.0])
-        drag = -attitude @ (self._drag * (attitude.T @ velocity))
+        v_b = attitude.T @ velocity
+        drag = -attitude @ ((self._drag + self._quadratic * np.abs(v_b)) * v_b)
         now = velocity, rates, np.concatenate([axis, turning]), np.concatenate([drag, np.cross(rates, J * rates)])
         last, self._last = self._last, now
         if last is None:
@@ -100,6 +130,7 @@ class RampObserver:
         value = predicted + self._gain * surprise
         self._value = np.clip(value, -self._largest, self._largest)
         self._change = np.where(value == self._value, self._change + self._gain_of_change * surprise, 0.0)
+        self._fit(v_b, attitude.T @ self.foreseen(0.0)[0])
 
     def foreseen(self, ahead: float) -> tuple[Array, Array, Array]:
         """What is missed so long [s] after the last measurement, (3,) each.
@@ -109,6 +140,18 @@ class RampObserver:
         """
         value = self._value + (0.5 * self._period + ahead) * self._change  # estimated for the middle of the last period
         return value[:3], self._change[:3], value[3:]
+
+    @property
+    def drag(self) -> Array:
+        """(3,) linear drag beyond what the model knows, body axes [1/s]: what of the force follows the velocity.
+
+        The least squares of d_b + diag(drag) v_b, older samples with less weight; zero while the vehicle is slow.
+        """
+        return np.maximum(-self._products / (self._squares + self._ballast), 0.0)
+
+    def _fit(self, v_b: Array, d_b: Array) -> None:
+        self._products = self._kept * self._products + d_b * v_b
+        self._squares = self._kept * self._squares + v_b**2
 
     def _mean_squares(self, speeds: Array) -> Array:
         """(4,) mean squares of the rotor speeds over the period, which tend to `speeds` exponentially [rad^2/s^2]."""

@@ -101,7 +101,10 @@ class DisturbanceObserver:
         velocity = (measured - predicted)[_VELOCITY]
         along = velocity[2] / max(thrust_axis(measured)[2], _UPRIGHT)
         velocity = np.append(velocity[:2] - along * thrust_axis(measured)[:2], along)
-        surprise = np.concatenate([velocity, _body_rates(measured) - _body_rates(predicted)])
+        self.learn(np.concatenate([velocity, _body_rates(measured) - _body_rates(predicted)]))
+
+    def learn(self, surprise: Array) -> None:
+        """Take note of by how much three velocities and three body rates (6,) are other than predicted."""
         self.estimate = np.clip(self.estimate + self._gain * surprise, -self._largest, self._largest)
 
 

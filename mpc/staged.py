@@ -28,6 +28,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csc_matrix
 
 from mpc.ocp import Problem, Rest
+from mpc.paper.prediction import condense_stages
 from mpc.qp import QP, QPRows, Solution, Vectors
 from quadsim.errors import ParameterError
 from quadsim.state import Array, Indices
@@ -111,22 +112,6 @@ class Layout:
         self.ends = np.arange(self.starts.size).reshape(self.starts.shape)
         cuts = L + M * np.arange(stages)
         self.lasts, self.firsts = self.inputs[cuts - 1], self.inputs[cuts]
-
-
-def condense_stages(start: Array, A: Array, B: Array, c: Array) -> Array:
-    """(J, L + 1, n, m + 1) states of J stages of L steps, as functions of the variables, the inputs the last, and of 1.
-
-    From the first of them (J, n, m + 1) by A (J, L, n, n), B (J, L, n, nu) and c (J, L, n).
-    """
-    (count, steps, n, nu), columns = B.shape, start.shape[2]
-    states = np.empty((count, steps + 1, n, columns))
-    states[:, 0] = start
-    for t in range(steps):
-        np.matmul(A[:, t], states[:, t], out=states[:, t + 1])
-        at = columns - 1 - (steps - t) * nu
-        states[:, t + 1, :, at : at + nu] = B[:, t]
-        states[:, t + 1, :, -1] += c[:, t]
-    return states
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -30,6 +30,7 @@ from scenarios.parts.navigation import build_navigation
 from scenarios.parts.randomness import generator
 from scenarios.parts.vehicle import build_initial_speeds, build_initial_state, build_vehicle
 from scenarios.progress import Progress, silent
+from scenarios.schema.controller import NonlinearSpec
 from scenarios.schema.scenario import Scenario
 
 
@@ -70,6 +71,7 @@ def fly_once(
             ground=build_ground(scenario, vehicle),
             loss=build_loss(scenario),
             motion=motion,
+            quaternions=isinstance(scenario.controller, NonlinearSpec),
             progress=progress,
         )
 

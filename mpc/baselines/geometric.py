@@ -156,7 +156,7 @@ class GeometricController(FeedbackLaw):
         self._observer = (
             None
             if settings.disturbance is None
-            else RampObserver(settings.disturbance, vehicle, settings.period, self._drag)
+            else RampObserver(settings.disturbance, vehicle, settings.period, drag=settings.drag)
         )
         super().__init__(vehicle, settings)
         if settings.feedforward:

@@ -30,10 +30,14 @@ from mpc.nonlinear.rigidbody import (
     V,
     W,
     advance_nodes,
+    drag_acceleration,
     linearise_nodes,
+    product,
     rigid_body,
+    thrust_axis,
 )
 from mpc.nonlinear.settings import AttitudeError, NonlinearSettings
+from mpc.observer import DisturbanceObserver
 from mpc.ocp import Objective, Problem, Query, Rest, Unanswered, lqr_terminal_weight
 from mpc.relinearised import Relinearised
 from mpc.solvers import INVALID_DATA, Answer
@@ -58,6 +62,7 @@ LARGEST_CONDENSED: Final = 80
 OUTSIDE: Final = 1e-6
 """How far outside its bounds an input, a share of the largest, may be answered; it is then moved onto them."""
 _PLAUSIBLE: Final = 1e5
+_SAME_TIME: Final = 1e-6  # [s]
 
 
 def frames_of(quaternions: Array) -> Array:
@@ -111,11 +116,13 @@ class NonlinearMPC:
             drag=np.array(settings.drag),
             quadratic_drag=np.array(settings.quadratic_drag),
         )
+        self._inverse = np.linalg.inv(self._model.effectiveness)
         self._hover = vehicle.mass * vehicle.gravity / N_ROTORS
         self.problem = self._problem()
         small = self.problem.horizon * N_ROTORS <= LARGEST_CONDENSED
         self.solver = settings.solver or ("piqp-dense" if small else "piqp-multistage")
         self._qp = Relinearised(self.problem, self.solver, shortcut=True)
+        self._observer = None if settings.observer is None else DisturbanceObserver(settings.observer, period)
         self._shift = settings.stride == 1 if settings.shift is None else settings.shift
         self._lower, self._upper = self._shares(self._bounds.u_min), self._shares(self._bounds.u_max)
         self._difference = settings.attitude_error is AttitudeError.DIFFERENCE
@@ -186,9 +193,11 @@ class NonlinearMPC:
     def reset(self, speeds: Array) -> None:
         """Start anew after the command u(-1) (4,) [rad/s], with rotors at that speed."""
         self._acting = np.array(speeds, float)
-        self._rotors = self._shares(self._acting)
-        self._plan: tuple[Array, Array] | None = None
-        self._quaternion: Array | None = None
+        self._rotors = self._rotors_before = self._shares(self._acting)
+        self._plan: tuple[Array, Array] | None
+        self._quaternion: Array | None
+        self._last: tuple[float, Array] | None  # time and state of the last period
+        self._forget()
         self.unanswered: Unanswered | None = None
 
     def step(self, now: Moment, state: Array, reference: Array) -> Command:
@@ -198,6 +207,8 @@ class NonlinearMPC:
         """
         if now.acting is not None:
             self._acting = np.array(now.acting, float)
+        last, self._last = self._last, None
+        self._turn(now)
         if now.phase in GROUNDED:
             return self._stop(now.phase)
         measured = self._measured(now, state)
@@ -209,6 +220,11 @@ class NonlinearMPC:
         if measured[Q] @ self._quaternion < 0.0:
             measured[Q] *= -1.0
         self._quaternion = measured[Q].copy()
+        if now.phase is Phase.FLYING:
+            if self._observer is not None and last is not None:
+                self._learn(last, now.time, measured)
+            self._last = now.time, measured
+        nodes = self._balanced(nodes)
         query, answer = self._iterate(measured, nodes)
         status = self._rejection(answer)
         if status is not None:
@@ -217,8 +233,6 @@ class NonlinearMPC:
             self._plan = None
             return self._refuse(status, answer)
         shares = np.minimum(np.maximum(answer.plan, self._lower), self._upper)
-        if self.settings.rotor_lag:
-            self._rotors = shares[0] + math.exp(-self._period / self.settings.rotor_lag) * (self._rotors - shares[0])
         speeds = self._speeds(shares)
         self._acting = speeds[0] = self._bounds.clip(speeds[0], self._acting)
         plan = speeds if self.settings.stride == 1 else np.repeat(speeds, self.settings.stride, axis=0)
@@ -253,6 +267,58 @@ class NonlinearMPC:
         if x.size > N_BODY:
             x[N_BODY:] = self._rotors
         return x
+
+    def _turn(self, now: Moment) -> None:
+        """Let the rotors follow what was commanded since the last period."""
+        before, self._asked = self._asked, now.time
+        self._rotors_before = self._rotors
+        if self.settings.rotor_lag and math.isfinite(before):
+            left = math.exp(-(now.time - before) / self.settings.rotor_lag)
+            commanded = self._shares(self._acting)
+            self._rotors = commanded + left * (self._rotors - commanded)
+
+    def _learn(self, last: tuple[float, Array], time: float, measured: Array) -> None:
+        """Compare the measured state with what was to be expected after the last one, disturbances included."""
+        before, x = last
+        if not abs(time - before - self._period) <= _SAME_TIME:
+            return
+        assert self._observer is not None
+        model = replace(self._model, step=self._period)
+        if x.size > N_BODY:
+            x = np.concatenate([x[:N_BODY], self._rotors_before])
+        expected = advance_nodes(model, x, self._shares(self._acting))
+        self._observer.learn(np.concatenate([measured[V] - expected[V], measured[W] - expected[W]]))
+        estimate = self._observer.estimate
+        self._model = replace(self._model, acceleration=estimate[:3], angular_acceleration=estimate[3:])
+
+    def _balanced(self, nodes: Nodes) -> Nodes:
+        """The reference with what balances drag and the disturbance: thrust turned the least way, and torque."""
+        model = self._model
+        if not (model.drags or model.acceleration.any() or model.angular_acceleration.any()):
+            return nodes
+        states, thrusts = nodes.states.copy(), nodes.thrusts
+        q, mass = states[:, Q], self._vehicle.mass
+        axis = thrust_axis(q)
+        total = np.sum(thrusts, axis=1) / mass
+        force = np.concatenate([total, total[-1:]])[:, None] * axis
+        wanted = force - model.acceleration - drag_acceleration(model, q, states[:, V])
+        size = np.maximum(np.linalg.norm(wanted, axis=1), 1e-9)
+        # The least rotation from one axis to another is (1 + a . b, a x b), up to its length.
+        turn = np.concatenate([1.0 + np.sum(axis * wanted, axis=1)[:, None] / size[:, None],
+                               np.cross(axis, wanted) / size[:, None]], axis=1)
+        length = np.linalg.norm(turn, axis=1)
+        turn[length < 1e-6] = (1.0, 0.0, 0.0, 0.0)
+        turn /= np.linalg.norm(turn, axis=1, keepdims=True)
+        states[:, Q] = product(turn, q)
+        effort = np.concatenate([(size[:-1] - total)[:, None], np.tile(-model.angular_acceleration, (len(total), 1))], 1)
+        return Nodes(states, thrusts + effort @ self._inverse.T)
+
+    def _forget(self) -> None:
+        """Start without a plan, and assume no disturbance."""
+        self._plan, self._quaternion, self._last, self._asked = None, None, None, math.nan
+        if self._observer is not None:
+            self._observer.reset()
+            self._model = replace(self._model, acceleration=np.zeros(3), angular_acceleration=np.zeros(3))
 
     def _reference(self, now: Moment, reference: Array) -> Nodes:
         stride = self.settings.stride
@@ -314,7 +380,7 @@ class NonlinearMPC:
 
     def _stop(self, phase: Phase) -> Command:
         self._acting, _ = self._bounds.reach(self._acting)
-        self._plan, self._quaternion = None, None
+        self._forget()
         return stopped(self._acting.copy(), self.horizon, phase)
 
     def _refuse(self, status: str, answer: Answer | None = None) -> Command:

@@ -20,6 +20,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 from enum import StrEnum
+from functools import cache, cached_property
 from typing import Final
 
 import numpy as np
@@ -72,10 +73,17 @@ class RigidBody:
             raise ParameterError("controller", "substeps", self.substeps, "a whole number >= 1")
         if self.rotor_lag is not None and not 0.0 < self.rotor_lag < math.inf:
             raise ParameterError("controller", "rotor_lag", self.rotor_lag, "positive and finite, or None")
-        ixx, iyy, izz = self.inertia
-        gyration = (iyy - izz) / ixx, (izz - ixx) / iyy, (ixx - iyy) / izz
-        object.__setattr__(self, "_features", _features(gyration))
-        object.__setattr__(self, "_drags", bool(np.any(self.drag) or np.any(self.quadratic_drag)))
+
+    @cached_property
+    def features(self) -> Array:
+        """(11, 100): takes (q, omega, T q) to F, the Jacobian of (q, v, omega)' but for drag, by (q, v, omega)."""
+        ixx, iyy, izz = self.inertia.tolist()
+        return _features(((iyy - izz) / ixx, (izz - ixx) / iyy, (ixx - iyy) / izz))
+
+    @cached_property
+    def drags(self) -> bool:
+        """Whether there is drag."""
+        return bool(np.any(self.drag) or np.any(self.quadratic_drag))
 
     @property
     def n(self) -> int:
@@ -110,8 +118,8 @@ def rigid_body(vehicle: Vehicle, step: float, **others: object) -> RigidBody:
     )
 
 
+@cache
 def _features(gyration: tuple[float, float, float]) -> Array:
-    """(11, 100): takes (q, omega, T q) to F, the Jacobian of (q, v, omega)' but for drag, by (q, v, omega)."""
     F = np.zeros((11, _TURNING, _TURNING))
     w, x, y, z, p, q, r, Tw, Tx, Ty, Tz = range(11)
     half = 0.5
@@ -131,7 +139,7 @@ def _features(gyration: tuple[float, float, float]) -> Array:
     for row, (i, j, k) in enumerate(((q, r, 0), (r, p, 1), (p, q, 2))):
         F[j, 7 + row, i + 3] += gyration[k]
         F[i, 7 + row, j + 3] += gyration[k]
-    return F.reshape(11, -1)
+    return read_only(F.reshape(11, -1))
 
 
 _FIRST, _SECOND = np.array([1, 0, 2, 0, 1, 2]), np.array([3, 2, 3, 1, 1, 2])
@@ -194,8 +202,6 @@ def linearise_nodes(model: RigidBody, x: Array, u: Array, frames: Array | None =
     Y[:, :, -1] = x[:, 3:N_BODY]
     h = model.step / model.substeps
     drives = _drives(model, x, u)
-    features: Array = model._features  # type: ignore[attr-defined]
-    drags: bool = model._drags  # type: ignore[attr-defined]
     constant = model.acceleration - model.gravity * _UP
     half = np.repeat([0.5, 0.0, 0.5], [4, 3, 3])
     z, G = np.empty((M, 11)), np.zeros((M, _TURNING, m))
@@ -205,14 +211,14 @@ def linearise_nodes(model: RigidBody, x: Array, u: Array, frames: Array | None =
         q = state[:, _q]
         z[:, :4], z[:, 4:7] = q, state[:, _w]
         np.multiply(q, drive[:, 0, -1:], out=z[:, 7:])
-        F = (z @ features).reshape(M, _TURNING, _TURNING)
+        F = (z @ model.features).reshape(M, _TURNING, _TURNING)
         axis = (q[:, _FIRST] * q[:, _SECOND]) @ _THRUST_AXIS
         axis += _UP
         np.multiply(axis[:, :, None], drive[:, :1], out=G[:, _v, _TURNING:])
         G[:, _v, -1] += constant
         if lagging or k == 0:
             G[:, _w, _TURNING:] = drive[:, 1:]
-        dragging = _drag(model, F, state) if drags else None
+        dragging = _drag(model, F, state) if model.drags else None
         K = F @ Y
         K[:, :, -1] *= half
         K += G
@@ -295,6 +301,25 @@ def _drag(model: RigidBody, F: Array, state: Array) -> Array:
     return np.einsum("mab,mb->ma", R, pull)
 
 
+def drag_acceleration(model: RigidBody, q: Array, v: Array) -> Array:
+    """(..., 3) acceleration by drag, world [m/s^2], of quaternions (..., 4) and velocities (..., 3) [m/s]."""
+    R = rotation(q)
+    air = (np.swapaxes(R, -1, -2) @ v[..., None])[..., 0]
+    pull = -(model.drag * air + model.quadratic_drag * np.abs(air) * air) / model.mass
+    return np.asarray((R @ pull[..., None])[..., 0])
+
+
+def product(left: Array, right: Array) -> Array:
+    """Quaternion products (..., 4)."""
+    a, b, c, d = (left[..., i] for i in range(4))
+    w, x, y, z = (right[..., i] for i in range(4))
+    return np.stack(
+        [a * w - b * x - c * y - d * z, a * x + b * w + c * z - d * y, a * y - b * z + c * w + d * x,
+         a * z + b * y - c * x + d * w],
+        axis=-1,
+    )  # fmt: skip
+
+
 def advance_nodes(model: RigidBody, x: Array, u: Array) -> Array:
     """The states (..., n) one step after states x (..., n) under inputs u (..., 4), without derivatives."""
     h, lag = model.step / model.substeps, model.rotor_lag
@@ -321,11 +346,8 @@ def _derivative(model: RigidBody, body: Array, rotors: Array) -> Array:
         [-x * a - y * b - z * c, w * a + y * c - z * b, w * b - x * c + z * a, w * c + x * b - y * a], axis=-1
     )
     push = drive[..., :1] * thrust_axis(q) - model.gravity * _UP + model.acceleration
-    if model._drags:  # type: ignore[attr-defined]
-        R = rotation(q)
-        air = (np.swapaxes(R, -1, -2) @ v[..., None])[..., 0]
-        pull = -(model.drag * air + model.quadratic_drag * np.abs(air) * air) / model.mass
-        push = push + (R @ pull[..., None])[..., 0]
+    if model.drags:
+        push = push + drag_acceleration(model, q, v)
     momentum = model.inertia * rates
     spin = drive[..., 1:] - np.cross(rates, momentum) / model.inertia + model.angular_acceleration
     return np.concatenate([v, turn, push, spin], axis=-1)

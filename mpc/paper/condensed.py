@@ -16,9 +16,8 @@ import scipy.linalg
 from mpc.constraints import Rows
 from mpc.ocp import Problem, Rest
 from mpc.paper.cost import cost
-from mpc.paper.prediction import Prediction, prediction
+from mpc.paper.prediction import Prediction, condense_stages, prediction
 from mpc.qp import QP, QPRows, Solution, Vectors
-from mpc.staged import condense_stages
 from quadsim.state import Array, Indices
 
 

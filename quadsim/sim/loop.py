@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time as clock
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
@@ -43,6 +43,7 @@ def fly(
     ground: PhaseMonitor | None = None,
     loss: LossCriteria | None = None,
     motion: Motion | None = None,
+    quaternions: bool = False,
     progress: Callable[[int], None] | None = None,
 ) -> FlightLog:
     """Fly a number of control periods.
@@ -64,6 +65,7 @@ def fly(
         ground: what knows where the flight stands with the ground; it is flying throughout where absent.
         loss: when the vehicle is lost, looked at once per control period until it has crashed; never where absent.
         motion: of the reference from t_0 on, for controllers that use it; absent where only positions are known.
+        quaternions: whether attitude and body rates are logged beside Euler angles and their rates.
         progress: called with the number of periods flown, after each.
 
     Returns:
@@ -78,6 +80,7 @@ def fly(
         ground.reset()
     truth = np.empty((periods, N_STATES))
     states = np.empty((periods, N_STATES))
+    attitudes, rates = np.empty((periods, 4)), np.empty((periods, 3))
     start = plant.physics
     heights = np.minimum(reference[:, REFERENCE_NAMES.index("z")], initial_state[INDEX["z"]])
     lowest = np.minimum.accumulate(heights).tolist()
@@ -92,6 +95,7 @@ def fly(
             since = physics_to_state(samples[-1].segment.physics) if ground and samples else truth[k : k + 1]
             states[k] = truth[k] if navigation is None else navigation.state()
             attitude, body_rates = plant.attitude if navigation is None else navigation.attitude
+            attitudes[k], rates[k] = attitude, body_rates
             preview = reference[k + 1 : k + 1 + controller.horizon]
             phase = Phase.FLYING if ground is None else ground.advance(since, preview)
             if loss is not None and phase is not Phase.CRASHED:
@@ -147,6 +151,11 @@ def fly(
         ended = InterruptedFlightError(time=len(samples) * period)
     count = len(samples)
     control = _control_log(samples, states[:count], truth[:count], reference[:count], initial_speeds, period)
+    plant_log = _plant_log(samples, start, initial_speeds, float(initial_state[INDEX["yaw"]]), plant.timestep)
+    if quaternions:
+        control = replace(control, attitude=attitudes[:count], body_rates=rates[:count])
+        physics = np.concatenate([start[None], *(sample.segment.physics for sample in samples)])
+        plant_log = replace(plant_log, attitude=physics[:, 4:8], body_rates=physics[:, 11:14])
     commands = [sample.command for sample in samples]
     return FlightLog(
         control=control,
@@ -155,7 +164,7 @@ def fly(
             solve_ms=np.array([1e3 * command.solve_s for command in commands]),
             step_ms=np.array([1e3 * sample.step_s for sample in samples]),
         ),
-        plant=_plant_log(samples, start, initial_speeds, float(initial_state[INDEX["yaw"]]), plant.timestep),
+        plant=plant_log,
         predicted=_predict(controller, control.state, commands),
         reason=None if ended is None else str(ended),
         interrupted=isinstance(ended, InterruptedFlightError),

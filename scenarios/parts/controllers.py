@@ -24,8 +24,7 @@ from quadsim.state import INDEX, N_STATES, STATE_NAMES, Array
 from quadsim.vehicle import N_ROTORS, Vehicle
 from scenarios.parts.plugin import build_plugin
 from scenarios.schema.baselines import GeometricSpec, LQRSpec, PIDSpec
-from scenarios.schema.controller import ConstrainedSpec, ControllerSpec, UnconstrainedSpec
-from scenarios.schema.nonlinear import NonlinearSpec
+from scenarios.schema.controller import ConstrainedSpec, ControllerSpec, NonlinearSpec, UnconstrainedSpec
 from scenarios.schema.optimisation import ANGLES, BoundedSpec, InputWeightsSpec, SoftSpec, WeightedSpec
 from scenarios.schema.plugin import PluginSpec
 from scenarios.schema.robust import RobustSpec

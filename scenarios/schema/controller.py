@@ -12,7 +12,7 @@ from mpc.fallback.settings import FallbackSettings
 from mpc.solvers import SOLVERS
 from quadsim.errors import UnknownNameError
 from scenarios.schema.baselines import GeometricSpec, LQRSpec, PIDSpec
-from scenarios.schema.nonlinear import NonlinearSpec
+from scenarios.schema.nonlinear import NonlinearPartsSpec
 from scenarios.schema.optimisation import BoundedSpec, WeightedSpec
 from scenarios.schema.plugin import FORM, LAWS, PluginSpec, is_plugin
 from scenarios.schema.robust import RobustSpec
@@ -39,9 +39,30 @@ class ConstrainedSpec(BoundedSpec):
 
     @model_validator(mode="after")
     def _check(self) -> ConstrainedSpec:
-        if self.solver not in SOLVERS:
-            raise ValueError(f"solver: {UnknownNameError('solver', self.solver, SOLVERS)}")
+        _require_solver(self.solver)
         return self
+
+
+class NonlinearSpec(NonlinearPartsSpec):
+    """Nonlinear MPC at any attitude: steps of sequential quadratic programming in every period."""
+
+    type: Literal["nonlinear"] = Field(description="the control law, by its name in `quadsim list`")
+    solver: str | None = Field(
+        default=None,
+        description="QP solver, by its name in `quadsim list`; absent: the fastest for the size",
+        json_schema_extra={"enum": [*SOLVERS, None]},
+    )
+
+    @model_validator(mode="after")
+    def _check_solver(self) -> NonlinearSpec:
+        if self.solver is not None:
+            _require_solver(self.solver)
+        return self
+
+
+def _require_solver(name: str) -> None:
+    if name not in SOLVERS:
+        raise ValueError(f"solver: {UnknownNameError('solver', name, SOLVERS)}")
 
 
 def shared_tilt_bound(spec: ConstrainedSpec) -> float | None:

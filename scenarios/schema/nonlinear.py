@@ -1,4 +1,4 @@
-"""`[controller] type = "nonlinear"`: MPC on the rigid body with a quaternion; every field has a default."""
+"""`[controller] type = "nonlinear"`: MPC on the rigid body with a quaternion; each part a field with a default."""
 
 from __future__ import annotations
 
@@ -10,8 +10,6 @@ from pydantic import Discriminator, Field, Tag, model_validator
 from mpc.fallback.settings import FallbackSettings
 from mpc.observer import ObserverSettings
 from mpc.robust.tightening import SHORTEST_LAG
-from mpc.solvers import SOLVERS
-from quadsim.errors import UnknownNameError
 from quadsim.fields import NonNegative, Positive
 from scenarios.schema.base import Pair, Spec, require_ordered
 from scenarios.schema.optimisation import Horizon, Weight
@@ -67,10 +65,9 @@ class RotorBoundsSpec(Spec):
         return self
 
 
-class NonlinearSpec(Spec):
-    """Nonlinear MPC at any attitude: steps of sequential quadratic programming in every period."""
+class NonlinearPartsSpec(Spec):
+    """All of a nonlinear MPC but its QP solver."""
 
-    type: Literal["nonlinear"] = Field(description="the control law, by its name in `quadsim list`")
     horizon: Horizon = Field(default=20, description="[periods] how far it looks ahead, a whole number of nodes")
     node: Positive | None = Field(
         default=None, description="[s] from one node to the next, whole periods; absent: one period"
@@ -106,17 +103,10 @@ class NonlinearSpec(Spec):
     )
     offset_free: ObserverSettings | None = None
     input_bounds: RotorBoundsSpec = RotorBoundsSpec()
-    solver: str | None = Field(
-        default=None,
-        description="QP solver, by its name in `quadsim list`; absent: the fastest for the size",
-        json_schema_extra={"enum": [*SOLVERS, None]},
-    )
     fallback: FallbackSettings = FallbackSettings()
 
     @model_validator(mode="after")
-    def _check(self) -> NonlinearSpec:
-        if self.solver is not None and self.solver not in SOLVERS:
-            raise ValueError(f"solver: {UnknownNameError('solver', self.solver, SOLVERS)}")
+    def _check(self) -> NonlinearPartsSpec:
         if self.rotor_lag != "vehicle" and 0.0 < self.rotor_lag < SHORTEST_LAG:
             raise ValueError(f"rotor_lag must be 0, or at least {SHORTEST_LAG:g} s; got {self.rotor_lag:g}")
         if self.attitude_error == "difference" and isinstance(self.weights.attitude, list):

@@ -362,7 +362,7 @@ WRONG = {
     "controller.output_bounds.rol=[0, 1]": "controller.output_bounds.rol is not a state; did you mean 'roll'? (there "
     "are: x, vx, y, vy, z, vz, roll, roll_rate, pitch, pitch_rate, yaw, yaw_rate)",
     "controller.solver=daqp": "controller.solver is not a field of the scenario file ...",
-    "controller=lqt": "controller must be one of 'unconstrained', 'constrained', 'robust', 'lqr', 'pid', 'geometric', "
+    "controller=lqt": "controller must be one of 'unconstrained', 'constrained', 'robust', 'nonlinear', 'lqr', 'pid', 'geometric', "
     "'package.module:Class' in its field type; got 'lqt'; did you mean 'lqr'?",
     "controller={type='lqr', input_weights={speed=1}}": "controller.input_weights must be given where output_weights "
     "are, and nowhere else",
