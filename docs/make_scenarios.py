@@ -22,6 +22,7 @@ from scenarios.shipped import scenario_names
 PAGE = Path(__file__).resolve().parent / "scenarios.md"
 TITLES: dict[Group, str] = {
     "paper": "The paper's flights, and where its controller ends",
+    "papers": "Other papers, reproduced",
     "courses": "Courses and vehicles",
     "air": "Wind, drag and rotors that lag",
     "faults": "Faults, loads and slow computers",

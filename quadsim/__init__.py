@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from scenarios.api import make_controller as make_controller
     from scenarios.api import read as read
     from scenarios.api import replay as replay
+    from scenarios.api import reproduce as reproduce
     from scenarios.api import scenarios as scenarios
     from scenarios.api import sweep as sweep
     from scenarios.flight import Flight as Flight
@@ -47,6 +48,7 @@ _PLACES = {
         "make_controller",
         "read",
         "replay",
+        "reproduce",
         "scenarios",
         "sweep",
     ),

@@ -29,7 +29,7 @@ from scenarios.progress import Progress, silent
 from scenarios.reaudit import Reaudit, reaudit, stored_scenario
 from scenarios.run import fly_scenario, run_scenario
 from scenarios.schema.scenario import Scenario
-from scenarios.shipped import scenario_names
+from scenarios.shipped import paper_names, scenario_names
 
 if TYPE_CHECKING:
     from scenarios.campaign.engine.protocol import Engine
@@ -38,6 +38,7 @@ if TYPE_CHECKING:
     from scenarios.campaign.statistics.comparison import Comparison as CampaignComparison
     from scenarios.campaign.sweep import Sweep
     from scenarios.comparison import Comparison
+    from scenarios.papers.reproduction import Reproduction
 
 Setting = Mapping[str, Any] | Sequence[str]
 """Changes of a scenario: values by dotted path, or texts `dotted.path=value` as of `--set`."""
@@ -479,6 +480,33 @@ def replay(
     outputs = Outputs(video=video, recording=recording, figures=figures)
     with reporting(progress) as report:
         return replay_flight(recorded, target, outputs, report)
+
+
+def reproduce(paper: str | Path | None = None, *, progress: Progress | bool = True) -> tuple[Reproduction, ...]:
+    """Fly what papers publish, and hold it against their numbers.
+
+    Args:
+        paper: a name, or a path ending in `.toml`; every paper that ships where absent.
+        progress: as of `fly`.
+
+    Returns:
+        A reproduction for each paper: its `numbers`, each with `published`, `ours`, `difference` and `within`.
+
+    Raises:
+        InputError: there is no such paper, or a number of it cannot be flown.
+
+    Examples:
+        >>> import quadsim
+        >>> (found,) = quadsim.reproduce("quadrotor-uav")  # doctest: +SKIP
+        >>> found.within  # doctest: +SKIP
+        True
+    """
+    from scenarios.papers.paper import load_paper
+    from scenarios.papers.reproduction import reproduce_paper
+
+    papers = [load_paper(name) for name in ([str(paper)] if paper is not None else paper_names())]
+    with reporting(progress) as report:
+        return tuple(reproduce_paper(each, report) for each in papers)
 
 
 @contextlib.contextmanager

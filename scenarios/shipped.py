@@ -9,8 +9,9 @@ from quadsim.errors import FileError, UnknownNameError
 
 LIBRARY: Final = Path(__file__).resolve().parent / "library"
 CAMPAIGNS: Final = Path(__file__).resolve().parent / "campaigns"
+PAPERS: Final = Path(__file__).resolve().parent / "papers"
 
-Group = Literal["paper", "courses", "air", "faults", "ground", "sensors", "other"]
+Group = Literal["paper", "papers", "courses", "air", "faults", "ground", "sensors", "other"]
 
 CONTROLLERS: Final = {
     "unconstrained": "the paper's Sec. 4: a constant gain from the unconstrained optimum",
@@ -45,6 +46,16 @@ def campaign_names() -> list[str]:
 def campaign_path(name: str) -> Path:
     """The file of a campaign that ships; as `scenario_path`."""
     return _path("campaign", name, CAMPAIGNS)
+
+
+def paper_names() -> list[str]:
+    """Names of the papers whose numbers ship, sorted."""
+    return _names(PAPERS)
+
+
+def paper_path(name: str) -> Path:
+    """The file of a paper that ships; as `scenario_path`."""
+    return _path("paper", name, PAPERS)
 
 
 def _names(folder: Path) -> list[str]:
