@@ -17,12 +17,12 @@ and differential flatness", 2021), f / m R e_z - g e_z + d = v', with a predicti
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated, Final
 
 import numpy as np
 from annotated_types import doc
+from numpy.typing import ArrayLike
 
 from quadsim.fields import NonNegative, Positive
 from quadsim.state import Array
@@ -34,6 +34,7 @@ TORQUE_SHARE: Final = 0.25
 """The same of the torque."""
 FITTED_FROM: Final = 1.0
 """Speed along an axis [m/s] at which half the drag that would explain the force is believed."""
+_SAME_TIME: Final = 1e-6  # [s]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,8 +67,8 @@ class RampObserver:
         vehicle: Vehicle,
         period: float,
         *,
-        drag: Sequence[float] = (0.0, 0.0, 0.0),
-        quadratic_drag: Sequence[float] = (0.0, 0.0, 0.0),
+        drag: ArrayLike = (0.0, 0.0, 0.0),
+        quadratic_drag: ArrayLike = (0.0, 0.0, 0.0),
     ) -> None:
         """Set up.
 
@@ -84,7 +85,7 @@ class RampObserver:
         self._gain, self._gain_of_change = 1.0 - pole**2, (1.0 - pole) ** 2 / period
         self._largest = np.repeat([settings.largest_force, settings.largest_torque], 3)
         self._vehicle, self._period, self._lag = vehicle, period, settings.rotor_lag or 0.0
-        self._drag, self._quadratic = np.array(drag), np.array(quadratic_drag)
+        self._drag, self._quadratic = np.array(drag, float), np.array(quadratic_drag, float)
         self._kept = math.exp(-period / settings.drag_memory)
         self._ballast = FITTED_FROM**2 / (1.0 - self._kept)
         self._up = np.array([0.0, 0.0, vehicle.gravity])
@@ -96,11 +97,13 @@ class RampObserver:
         self._products, self._squares = np.zeros(3), np.zeros(3)
         self._rotors = np.array(rotors, float)
         self._last: tuple[Array, Array, Array, Array] | None = None
+        self._time = 0.0
 
-    def update(self, velocity: Array, attitude: Array, rates: Array, speeds: Array) -> None:
-        """Take note of a period's end.
+    def update(self, time: float, velocity: Array, attitude: Array, rates: Array, speeds: Array) -> None:
+        """Take note of a period's end; of one whose beginning was not seen only as a beginning.
 
         Args:
+            time: of the measurement [s].
             velocity: (3,) measured, world [m/s].
             attitude: (3, 3) measured, body to world.
             rates: (3,) measured, body [rad/s].
@@ -113,7 +116,8 @@ class RampObserver:
         drag = -attitude @ ((self._drag + self._quadratic * np.abs(v_b)) * v_b)
         now = velocity, rates, np.concatenate([axis, turning]), np.concatenate([drag, np.cross(rates, J * rates)])
         last, self._last = self._last, now
-        if last is None:
+        before, self._time = self._time, time
+        if last is None or abs(time - before - period) > _SAME_TIME:
             return
         # Means over the period from both its ends: of the thrust axis with its derivative too (Euler-Maclaurin).
         b = 0.5 * (last[2][:3] + axis) + period / 12.0 * (last[2][3:] - turning)

@@ -8,6 +8,7 @@ from typing import Final
 
 import numpy as np
 
+from mpc.nonlinear.rigidbody import rotation
 from quadsim.state import EULER, EULER_RATE, POSITION, VELOCITY, Array, body_to_world, euler_to_body_rates
 
 LEAST_LIFT: Final = 0.2
@@ -35,15 +36,6 @@ def motion_of(state: Array, attitude: Array | None = None, rates: Array | None =
         rates=euler_to_body_rates(euler, state[list(EULER_RATE)]) if rates is None else rates,
         yaw=float(euler[2]),
     )
-
-
-def rotation(quaternion: Array) -> Array:
-    """(..., 3, 3) body to world of unit quaternions wxyz (..., 4)."""
-    w, v = quaternion[..., :1, None], quaternion[..., 1:]
-    x, y, z = np.moveaxis(v, -1, 0)
-    none = np.zeros_like(x)
-    cross = np.stack([none, -z, y, z, none, -x, -y, x, none], axis=-1).reshape(*x.shape, 3, 3)
-    return np.asarray(np.eye(3) + 2.0 * w * cross + 2.0 * cross @ cross)
 
 
 def hat(vector: Array) -> Array:

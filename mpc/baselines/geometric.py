@@ -197,7 +197,7 @@ class GeometricController(FeedbackLaw):
         if now.phase is not Phase.FLYING:
             self._observer.reset(before)
             return UNDISTURBED
-        self._observer.update(motion.velocity, motion.attitude, motion.rates, before)
+        self._observer.update(now.time, motion.velocity, motion.attitude, motion.rates, before)
         return Disturbance(*self._observer.foreseen(0.5 * self.settings.period))
 
     def wrench(

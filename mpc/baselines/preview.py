@@ -9,7 +9,7 @@ from typing import Final
 
 import numpy as np
 
-from mpc.baselines.attitude import rotation
+from mpc.nonlinear.rigidbody import rotation
 from quadsim.errors import ParameterError
 from quadsim.motion import Motion
 from quadsim.state import Array, read_only

@@ -8,6 +8,7 @@ from enum import StrEnum
 
 import numpy as np
 
+from mpc.disturbance import RampSettings
 from mpc.nonlinear.rigidbody import Inputs
 from mpc.observer import ObserverSettings
 from quadsim.errors import ParameterError
@@ -74,6 +75,7 @@ class NonlinearSettings:
         weights: what distances from the reference cost.
         terminal: the last state's weight over that of the others, 0 for none; `lqr` for the Riccati equation's at hover.
         observer: tuning of the disturbance observer; None for no offset-free tracking.
+        ramp: tuning of the one that follows changing forces, and fits drag to them; None for none.
         solver: QP solver, in `mpc.solvers.SOLVERS`; None for the one that is the fastest for the size.
     """
 
@@ -91,6 +93,7 @@ class NonlinearSettings:
     weights: Weights = _USUAL
     terminal: float | str = 0.0
     observer: ObserverSettings | None = None
+    ramp: RampSettings | None = None
     solver: str | None = None
 
     def __post_init__(self) -> None:

@@ -162,6 +162,7 @@ def guarded(
 
 
 def _nonlinear(spec: NonlinearSpec, vehicle: Vehicle, period: float) -> Controller:
+    from mpc.indi import Incremental
     from mpc.nonlinear.controller import NonlinearMPC
     from mpc.nonlinear.rigidbody import Inputs
     from mpc.nonlinear.settings import AttitudeError, NonlinearSettings, Weights
@@ -190,10 +191,12 @@ def _nonlinear(spec: NonlinearSpec, vehicle: Vehicle, period: float) -> Controll
         weights=Weights(**{name: tuple(w) if isinstance(w, list) else w for name, w in axes}),
         terminal=0.0 if spec.terminal == "none" else spec.terminal,
         observer=spec.offset_free,
+        ramp=spec.disturbance,
         solver=spec.solver,
     )
-    law = NonlinearMPC(vehicle, period=period, settings=settings, bounds=bounds)
-    return guarded(law, bounds, spec.fallback, vehicle, period)
+    mpc = NonlinearMPC(vehicle, period=period, settings=settings, bounds=bounds)
+    law = guarded(mpc, bounds, spec.fallback, vehicle, period)
+    return law if spec.indi is None else Incremental(law, vehicle, spec.indi, bounds)
 
 
 def _constrained(spec: ConstrainedSpec, problem: Problem) -> Controller:

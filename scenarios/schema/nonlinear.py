@@ -7,7 +7,9 @@ from typing import Annotated, Literal
 from annotated_types import Len
 from pydantic import Discriminator, Field, Tag, model_validator
 
+from mpc.disturbance import RampSettings
 from mpc.fallback.settings import FallbackSettings
+from mpc.indi import INDISettings
 from mpc.observer import ObserverSettings
 from mpc.robust.tightening import SHORTEST_LAG
 from quadsim.fields import NonNegative, Positive
@@ -102,6 +104,10 @@ class NonlinearPartsSpec(Spec):
         default=[0.0, 0.0, 0.0], description="[N s^2/m^2] the same, of each component's square"
     )
     offset_free: ObserverSettings | None = None
+    disturbance: RampSettings | None = Field(
+        default=None, description="absent: no drag is fitted, no changing force followed; not beside offset_free"
+    )
+    indi: INDISettings | None = Field(default=None, description="absent: rotors hold the commands for a period")
     input_bounds: RotorBoundsSpec = RotorBoundsSpec()
     fallback: FallbackSettings = FallbackSettings()
 
@@ -113,6 +119,8 @@ class NonlinearPartsSpec(Spec):
             raise ValueError(
                 f'weights.attitude must be one number where attitude_error = "difference"; got {self.weights.attitude}'
             )
+        if self.offset_free is not None and self.disturbance is not None:
+            raise ValueError("disturbance must be absent where offset_free is given: both estimate the same force")
         if self.inputs == "thrust" and self.input_bounds.slew is not None:
             raise ValueError(
                 'input_bounds.slew must be absent where inputs = "thrust", in which steps of speeds are not linear: '
