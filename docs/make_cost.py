@@ -13,8 +13,8 @@ from quadsim.flight.metrics import percentiles
 from scenarios.bench.bench_results import SolverBench
 from scenarios.cost.cost_figures import write_cost_figures
 from scenarios.cost.cost_tables import cost_markdown
-from scenarios.cost.cost_text import cost_sentences
 from scenarios.cost.measure import SOLVERS_TIMED
+from scenarios.cost.section import cost_sentences
 from scenarios.cost.study import CandidateTimes, CostStudy
 
 

@@ -26,22 +26,19 @@ def resolve(scenario: Scenario, vehicle: Vehicle) -> Scenario:
     return resolve_vehicle(scenario, vehicle).model_copy(update={"effects": scenario.effects.resolved(vehicle)})
 
 
-def build_plant(
-    scenario: Scenario, vehicle: Vehicle, kind: type[Plant] = Plant, forces: Sequence[Force] | None = None
-) -> Plant:
+def build_plant(scenario: Scenario, vehicle: Vehicle, forces: Sequence[Force] | None = None) -> Plant:
     """The simulated vehicle, and what acts on it.
 
     Args:
         scenario: what is flown.
         vehicle: the modelled vehicle.
-        kind: the class of the plant.
         forces: of one's own, instead of those that the scenario names.
 
     Raises:
         InputError: a combination of effects is not possible, or a force cannot be imported.
     """
     rng = generator(scenario.seed, "forces")
-    return kind(
+    return Plant(
         vehicle,
         timestep=scenario.plant.timestep,
         integrator=scenario.plant.integrator,

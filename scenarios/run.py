@@ -25,7 +25,7 @@ from scenarios.courses.make import build_motion, build_reference
 from scenarios.flight import Flight, Outputs, write_run
 from scenarios.gc_tuning import frozen
 from scenarios.parts.effects import build_computation
-from scenarios.parts.limits import build_limits, build_loss
+from scenarios.parts.limits import build_limits
 from scenarios.parts.navigation import build_navigation
 from scenarios.parts.randomness import generator
 from scenarios.parts.vehicle import build_initial_speeds, build_initial_state, build_vehicle
@@ -69,7 +69,7 @@ def fly_once(
             computation=build_computation(scenario),
             rng=generator(scenario.seed, "computation"),
             ground=build_ground(scenario, vehicle),
-            loss=build_loss(scenario),
+            loss=scenario.lost.limits,
             motion=motion,
             quaternions=isinstance(scenario.controller, NonlinearSpec),
             progress=progress,

@@ -13,6 +13,8 @@ from unittest import mock
 import numpy as np
 from threadpoolctl import threadpool_limits
 
+from mpc.answer import Answer
+from mpc.exact.shortcut import Shortcut
 from mpc.fallback.contract import Guarded
 from mpc.solvers import piqp_backends
 from quadsim.controller import SOLVED, Command, Controller, Moment
@@ -182,14 +184,15 @@ def inject(injection: Injection, *, longest: float = LAST) -> Consequence:
     return fly_with([injection], longest=longest)[0]
 
 
-def fly_with(injections: Sequence[Injection], *, longest: float = LAST) -> list[Consequence]:
+def fly_with(injections: Sequence[Injection], *, longest: float = LAST, shortcut: bool = False) -> list[Consequence]:
     """Fly several in one flight, of the same controller and condition, in the order of their instants.
 
-    Each is judged until the next begins.
+    Each is judged until the next begins.  With the shortcut, the whole QP is solved where the solver is to fail, and
+    otherwise only where the shortcut has no answer: as in everyday flights, and in half the time.
     """
     first, last = injections[0], injections[-1]
     duration = min(last.stop + AFTER, LAST)
-    log, given = _fly(first.controller, first.condition, duration, injections)
+    log, given = _fly(first.controller, first.condition, duration, injections, shortcut=shortcut)
     sound, _ = _sound_flight(first.controller, first.condition, longest)
     control = log.control
     there = sound.control.truth[: control.t.size, list(POSITION)]
@@ -252,7 +255,7 @@ def _sound_flight(controller: str, condition: str, duration: float) -> tuple[Fli
 def _fly(
     controller: str, condition: str, duration: float, injections: Sequence[Injection], *, shortcut: bool = False
 ) -> tuple[FlightLog, Array]:
-    """A flight, and what the plant was given (M, 4); without the shortcut there is a QP in every period to fail."""
+    """A flight, and what the plant was given (M, 4); without the shortcut there is a QP in every period."""
     switch = f"controller.shortcut={str(shortcut).lower()}"
     settings = (f"duration={round(duration, 9)}", switch, "controller.fallback.enabled=true")
     scenario = load_scenario("paper-constrained", (*settings, *CONDITIONS[condition].settings))
@@ -291,7 +294,16 @@ class _FailingSolver:
 @contextlib.contextmanager
 def _failing_solver() -> Iterator[_FailingSolver]:
     failing = _FailingSolver()
-    with mock.patch.object(piqp_backends, "solve", partial(failing.solve, piqp_backends.solve)):
+    shortest = Shortcut.solve
+
+    def solve(shortcut: Shortcut, *query: Any) -> Answer:
+        """The whole QP where it is to fail: there is nothing to fail in a shortcut."""
+        return shortest(shortcut, *query) if failing.status == SOLVED else shortcut._whole.solve(*query)
+
+    with (
+        mock.patch.object(piqp_backends, "solve", partial(failing.solve, piqp_backends.solve)),
+        mock.patch.object(Shortcut, "solve", solve),
+    ):
         yield failing
 
 

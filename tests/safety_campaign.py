@@ -126,11 +126,12 @@ def planned(flights: int) -> list[str]:
     return [places.get(flight, "calm") for flight in range(flights)]
 
 
-def measure(flights: int = 60) -> dict[str, int]:
+def measure(flights: int = 60, *, workers: int = 2) -> dict[str, int]:
     """Fly a campaign with hostile flights, and one in which they are calm.
 
     Args:
         flights: of each of the two.
+        workers: how many fly them.
 
     Returns:
         `flights`; `hostile` ones, and those of each verdict (`hostile: error`); `calm` ones, and of these those whose
@@ -142,7 +143,10 @@ def measure(flights: int = 60) -> dict[str, int]:
         folders = [Path(directory, name) for name in ("calm", "hostile")]
         for folder in folders:
             folder.mkdir()
-        calm, hostile = (fly(folder, kinds, armed=armed) for folder, armed in zip(folders, (False, True), strict=True))
+        calm, hostile = (
+            fly(folder, kinds, armed=armed, workers=workers)
+            for folder, armed in zip(folders, (False, True), strict=True)
+        )
     flown = list(zip(kinds, calm.rows, hostile.rows, strict=True))
     verdicts = Counter(row["verdict"] for kind, _, row in flown if kind != "calm")
     return {

@@ -100,7 +100,7 @@ class Inputs:
     def most(self, writer: str) -> int:
         """How often a writer may go all the way."""
         most = WRITERS[writer][1]
-        return most if self.cases >= MANY else min(most, max(2, most * self.cases // MANY))
+        return most if self.cases >= MANY else min(most, max(1, most * self.cases // MANY))
 
     def __getitem__(self, name: str) -> str:
         return str(self.folder / name)

@@ -117,7 +117,7 @@ def test_documented_scenarios_and_settings_are_valid(line: str) -> None:
         load_scenario(scenario, options.settings)
 
 
-@pytest.mark.usefixtures("workplace")
+@pytest.mark.usefixtures("workplace", "sketched")
 @pytest.mark.parametrize("line", RUNNABLE)
 def test_documented_command_runs(line: str, capsys: pytest.CaptureFixture[str]) -> None:
     arguments = arguments_of(line)

@@ -13,13 +13,15 @@ kept.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import replace
 from typing import Final
 
 import numpy as np
+import scipy.linalg
 
 from mpc.answer import ActuatorBounds, command_of
-from mpc.constraints import Constraint
+from mpc.constraints import Constraint, Penalty
 from mpc.disturbance import RampObserver, RampSettings
 from mpc.model import LinearModel
 from mpc.nonlinear.reference import Nodes, nodes_of_motion, nodes_of_preview
@@ -48,6 +50,8 @@ from quadsim.errors import ParameterError
 from quadsim.state import (
     ANGLE_RATES,
     ANGLES,
+    EULER,
+    EULER_RATE,
     N_STATES,
     POSITIONS,
     VELOCITIES,
@@ -63,6 +67,17 @@ LARGEST_CONDENSED: Final = 80
 """Inputs over the horizon up to which a condensed QP is solved faster than a staged one."""
 OUTSIDE: Final = 1e-6
 """How far outside its bounds an input, a share of the largest, may be answered; it is then moved onto them."""
+TILT_SIDES: Final = 12
+"""Sides of the polygon within the circle that a bound on the tilt makes of the thrust axis's horizontal part; it takes
+up to 3.4 % of the bound's sine away."""
+_AXIS_SLOPES: Final = 2.0 * np.array(
+    [
+        [[0, 0, 1, 0], [0, 0, 0, 1], [1, 0, 0, 0], [0, 1, 0, 0]],
+        [[0, -1, 0, 0], [-1, 0, 0, 0], [0, 0, 0, 1], [0, 0, 1, 0]],
+    ],
+    float,
+)
+"""Take q to the derivatives of R(q) e_z along x, 2 (x z + w y), and y, 2 (y z - w x)."""
 _PLAUSIBLE: Final = 1e5
 _SAME_TIME: Final = 1e-6  # [s]
 
@@ -104,6 +119,7 @@ class NonlinearMPC:
         period: float,
         settings: NonlinearSettings,
         bounds: ActuatorBounds | None = None,
+        constraints: tuple[Constraint, ...] = (),
     ) -> None:
         self.settings, self._vehicle, self._period = settings, vehicle, period
         self._bounds = ActuatorBounds.of_vehicle(vehicle) if bounds is None else bounds
@@ -120,7 +136,8 @@ class NonlinearMPC:
         )
         self._inverse = np.linalg.inv(self._model.effectiveness)
         self._hover = vehicle.mass * vehicle.gravity / N_ROTORS
-        self.problem = self._problem()
+        self._tilted = settings.tilt is not None
+        self.problem = self._problem(constraints)
         small = self.problem.horizon * N_ROTORS <= LARGEST_CONDENSED
         self.solver = settings.solver or ("piqp-dense" if small else "piqp-multistage")
         self._qp = Relinearised(self.problem, self.solver, shortcut=True)
@@ -139,7 +156,7 @@ class NonlinearMPC:
         """Rotor speeds [rad/s] of inputs."""
         return np.sqrt(self._model.thrusts(np.maximum(shares, 0.0)) / self._vehicle.thrust_coefficient)
 
-    def _problem(self) -> Problem:
+    def _problem(self, constraints: tuple[Constraint, ...]) -> Problem:
         settings, model = self.settings, self._model
         hover, x = self._shares(np.full(N_ROTORS, self._vehicle.hover_speed)), np.zeros(model.n)
         x[3] = 1.0
@@ -157,15 +174,63 @@ class NonlinearMPC:
             P = self._riccati(linear, objective)
         else:
             P = float(settings.terminal) * objective.weights[0]
+        if self._tilted:  # two more states: the thrust axis along world x and y
+            none = np.zeros((2, 2))
+            A, B = scipy.linalg.block_diag(linear.A, none), np.vstack([linear.B, np.zeros((2, N_ROTORS))])
+            linear, P = replace(linear, A=A, B=B), scipy.linalg.block_diag(P, none)
+            objective = replace(objective, C_r=np.hstack([objective.C_r, np.zeros((len(rows), 2))]))
         lower, upper = self._shares(self._bounds.u_min), self._shares(self._bounds.u_max)
-        constraints = [Constraint(name="inputs", lower=lower, upper=upper, D=np.eye(N_ROTORS))]
-        constraints += self._slews()
         return Problem(
             model=linear,
             horizon=settings.horizon,
             objective=replace(objective, P=P),
-            constraints=tuple(constraints),
+            constraints=(
+                Constraint(name="inputs", lower=lower, upper=upper, D=np.eye(N_ROTORS)),
+                *self._slews(),
+                *self._turning(linear.n),
+                *(self._of_states(constraint, linear.n) for constraint in constraints),
+            ),
         )
+
+    def _turning(self, n: int) -> Iterator[Constraint]:
+        """Bounds on tilt and body rates."""
+        settings = self.settings
+        if self._tilted:
+            angles = math.tau / TILT_SIDES * np.arange(TILT_SIDES)
+            rows = np.zeros((TILT_SIDES, n))
+            rows[:, -2], rows[:, -1] = np.cos(angles), np.sin(angles)
+            upper = np.full(TILT_SIDES, math.sin(settings.tilt) * math.cos(math.pi / TILT_SIDES))
+            penalty = self._penalty(TILT_SIDES, 1.0 / math.cos(settings.tilt))  # of its sine, instead of the tilt
+            yield Constraint(name="tilt", lower=np.full(TILT_SIDES, -math.inf), upper=upper, C=rows, penalty=penalty)
+        rates = np.array(settings.largest_rates)
+        if np.isfinite(rates).any():
+            rows = np.eye(n)[W]
+            yield Constraint(name="body_rates", lower=-rates, upper=rates, C=rows, penalty=self._penalty(3, 1.0))
+
+    def _penalty(self, rows: int, scale: float) -> Penalty | None:
+        if self.settings.soft is None:
+            return None
+        l1, l2 = self.settings.soft
+        return Penalty(l1=np.full(rows, l1 * scale), l2=np.full(rows, l2 * scale**2))
+
+    def _of_states(self, constraint: Constraint, n: int) -> Constraint:
+        """Rows over the 12 states of `quadsim.state` and rotor speeds as rows over the model's.
+
+        Raises:
+            ParameterError: they are of what is not linear in those.
+        """
+        parts = {name: np.zeros((constraint.lower.shape[-1], size)) for name, size in (("C", n), ("D", N_ROTORS))}
+        if constraint.C is not None:
+            if constraint.C[:, [*EULER, *EULER_RATE]].any():
+                rule = "without Euler angles and their rates: controller.tilt and controller.body_rate bound the attitude"
+                raise ParameterError("controller", constraint.name, "of those", rule)
+            parts["C"][:, P], parts["C"][:, V] = constraint.C[:, POSITIONS], constraint.C[:, VELOCITIES]
+        if constraint.D is not None and constraint.D.any():
+            if self.settings.inputs is not Inputs.SPEED:
+                rule = 'without rotor speeds where inputs = "thrust", in which they are not linear: inputs = "speed"'
+                raise ParameterError("controller", constraint.name, "of those", rule)
+            parts["D"] = constraint.D * self._vehicle.speed_max
+        return replace(constraint, **parts)
 
     def _slews(self) -> list[Constraint]:
         """Bounds on steps of speeds: from one node to the next `stride` times those of a period, but for the first."""
@@ -366,11 +431,15 @@ class NonlinearMPC:
         wanted[:, Q] = (1.0, 0.0, 0.0, 0.0) if self._difference else 0.0
         if n > N_BODY:
             wanted = np.concatenate([wanted, np.concatenate([inputs, inputs[-1:]])], axis=1)
+        start = np.concatenate([nodes.states, wanted[:, N_BODY:]], axis=1)
+        if self._tilted:
+            wanted = np.concatenate([wanted, np.zeros((len(wanted), 2))], axis=1)
         desired = wanted[1:] @ self._C_r.T
         s0 = measured.copy()
         s0[Q] = frames[0] @ measured[Q]
+        if self._tilted:
+            s0 = np.append(s0, thrust_axis(measured[Q])[:2])
         if self._plan is None:
-            start = np.concatenate([nodes.states, wanted[:, N_BODY:]], axis=1)
             self._plan = start, np.minimum(np.maximum(inputs, self._lower), self._upper)
         elif self._shift:
             x, u = self._plan
@@ -383,7 +452,7 @@ class NonlinearMPC:
             answer = self._qp.solve(*query.steps, s0, desired, before, rest)
             if self._qp.last is None:
                 break
-            states, plan = self._qp.last
+            states, plan = self._qp.last[0][:, :n], self._qp.last[1]
             found = np.concatenate([measured[None], states])
             found[1:, Q] = (frames[1:].transpose(0, 2, 1) @ states[:, Q, None])[:, :, 0]
             self._plan = found, plan
@@ -399,7 +468,18 @@ class NonlinearMPC:
         turned, end = x[:-1].copy(), end.copy()
         turned[:, Q] = (frames[:-1] @ turned[:, Q, None])[:, :, 0]
         end[:, Q] = (frames[1:] @ end[:, Q, None])[:, :, 0]
-        return A, B, end - (A @ turned[:, :, None])[:, :, 0] - (B @ u[:, :, None])[:, :, 0]
+        c = end - (A @ turned[:, :, None])[:, :, 0] - (B @ u[:, :, None])[:, :, 0]
+        return self._with_axis(A, B, c, x[1:, Q], frames[1:]) if self._tilted else (A, B, c)
+
+    def _with_axis(self, A: Array, B: Array, c: Array, q: Array, frames: Array) -> tuple[Array, Array, Array]:
+        """The model with two more states, the thrust axis along world x and y, linearised at quaternions q (N, 4)."""
+        slope = _AXIS_SLOPES @ q[:, None, :, None]  # (N, 2, 4, 1)
+        known = thrust_axis(q)[:, :2] - (slope[..., 0] @ q[:, :, None])[:, :, 0]
+        rows = slope[..., 0] @ frames.transpose(0, 2, 1)  # by the quaternion in the node's frame
+        N, n = c.shape
+        wide, inputs = np.zeros((N, n + 2, n + 2)), np.concatenate([B, rows @ B[:, Q]], axis=1)
+        wide[:, :n, :n], wide[:, n:, :n] = A, rows @ A[:, Q]
+        return wide, inputs, np.concatenate([c, (rows @ c[:, Q, None])[:, :, 0] + known], axis=1)
 
     def _rejection(self, answer: Answer) -> str | None:
         status, plan = answer.solution.status, answer.plan

@@ -147,6 +147,8 @@ _THRUST_AXIS: Final = np.array(
     [[2.0, 0.0, 0.0], [2.0, 0.0, 0.0], [0.0, 2.0, 0.0], [0.0, -2.0, 0.0], [0.0, 0.0, -2.0], [0.0, 0.0, -2.0]]
 )
 _UP: Final = np.array([0.0, 0.0, 1.0])
+_EYE: Final = np.eye(3)
+_HALF: Final = np.repeat([0.5, 0.0, 0.5], [4, 3, 3])
 
 
 def thrust_axis(q: Array) -> Array:
@@ -166,13 +168,12 @@ def rotation(q: Array) -> Array:
 
 
 def _rotation_slopes() -> Array:
-    """(4, 4, 3, 3): the derivative of R(q) by q_j is sum_i q_i of these [j, i]."""
+    """(4, 36): takes q to the derivatives (4, 3, 3) of R(q) by its components."""
     found, basis = np.zeros((4, 4, 3, 3)), np.eye(4)
     for i in range(4):
         for j in range(4):  # R - I is a quadratic form: its polarisation
-            both = rotation(basis[i] + basis[j]) - rotation(basis[i]) - rotation(basis[j]) + np.eye(3)
-            found[j, i] = both
-    return found
+            found[i, j] = rotation(basis[i] + basis[j]) - rotation(basis[i]) - rotation(basis[j]) + np.eye(3)
+    return found.reshape(4, 36)
 
 
 _SLOPES: Final = _rotation_slopes()
@@ -193,17 +194,14 @@ def linearise_nodes(model: RigidBody, x: Array, u: Array, frames: Array | None =
     """
     M, n, lagging = len(x), model.n, model.rotor_lag is not None
     m = n - 3 + N_ROTORS + 1  # columns: q, v, omega, rotors, inputs, and the value
-    Y = np.zeros((M, _TURNING, m))
-    if frames is None:
-        Y[:, range(4), range(4)] = 1.0
-    else:
+    Y = np.empty((M, _TURNING, m))
+    Y[:] = np.eye(_TURNING, m)
+    if frames is not None:
         Y[:, _q, _q] = frames[:M].transpose(0, 2, 1)
-    Y[:, range(4, _TURNING), range(4, _TURNING)] = 1.0
     Y[:, :, -1] = x[:, 3:N_BODY]
     h = model.step / model.substeps
     drives = _drives(model, x, u)
     constant = model.acceleration - model.gravity * _UP
-    half = np.repeat([0.5, 0.0, 0.5], [4, 3, 3])
     z, G = np.empty((M, 11)), np.zeros((M, _TURNING, m))
 
     def slope(k: int, Y: Array) -> Array:
@@ -212,7 +210,7 @@ def linearise_nodes(model: RigidBody, x: Array, u: Array, frames: Array | None =
         z[:, :4], z[:, 4:7] = q, state[:, _w]
         np.multiply(q, drive[:, 0, -1:], out=z[:, 7:])
         F = (z @ model.features).reshape(M, _TURNING, _TURNING)
-        axis = (q[:, _FIRST] * q[:, _SECOND]) @ _THRUST_AXIS
+        axis = (q.take(_FIRST, axis=1) * q.take(_SECOND, axis=1)) @ _THRUST_AXIS
         axis += _UP
         np.multiply(axis[:, :, None], drive[:, :1], out=G[:, _v, _TURNING:])
         G[:, _v, -1] += constant
@@ -220,18 +218,22 @@ def linearise_nodes(model: RigidBody, x: Array, u: Array, frames: Array | None =
             G[:, _w, _TURNING:] = drive[:, 1:]
         dragging = _drag(model, F, state) if model.drags else None
         K = F @ Y
-        K[:, :, -1] *= half
+        K[:, :, -1] *= _HALF
         K += G
         if dragging is not None:
             K[:, _v, -1] += dragging
         return np.asarray(K)
 
-    travelled = np.zeros((M, 3, m))  # of position, without the straight motion
+    def ahead(K: Array, step: float) -> Array:
+        np.multiply(K, step, out=scratch)
+        return np.add(scratch, Y, out=scratch)
+
+    travelled, scratch = np.zeros((M, 3, m)), np.empty_like(Y)  # of position, without the straight motion
     for s in range(model.substeps):
         first = slope(4 * s, Y)
-        second = slope(4 * s + 1, Y + (0.5 * h) * first)
-        third = slope(4 * s + 2, Y + (0.5 * h) * second)
-        fourth = slope(4 * s + 3, Y + h * third)
+        second = slope(4 * s + 1, ahead(first, 0.5 * h))
+        third = slope(4 * s + 2, ahead(second, 0.5 * h))
+        fourth = slope(4 * s + 3, ahead(third, h))
         first += second
         first += third
         travelled += h * Y[:, _v] + (h * h / 6.0) * first[:, _v]
@@ -253,7 +255,7 @@ def _assemble(
     if frames is not None:
         Y[:, _q, :-1] = frames[1:] @ Y[:, _q, :-1]
     inputs = slice(n - 3, n - 3 + N_ROTORS)
-    A[:, range(3), range(3)] = 1.0
+    A[:, :3, :3] = _EYE
     A[:, P, 3:] = travelled[:, :, : n - 3]
     A[:, 3:N_BODY, 3:] = Y[:, :, : n - 3]
     B[:, P], B[:, 3:N_BODY] = travelled[:, :, inputs], Y[:, :, inputs]
@@ -289,16 +291,17 @@ def _drives(model: RigidBody, x: Array, u: Array) -> Array:
 def _drag(model: RigidBody, F: Array, state: Array) -> Array:
     """Add drag's derivatives to F (M, 10, 10); (M, 3) its acceleration [m/s^2], of states (M, 10)."""
     q, v = state[:, _q], state[:, _v]
-    R = rotation(q)
-    slopes = np.einsum("jiab,mi->mjab", _SLOPES, q)  # (M, 4, 3, 3)
-    body = np.einsum("mab,ma->mb", R, v)
-    pull = -(model.drag * body + model.quadratic_drag * np.abs(body) * body) / model.mass
-    rate = -(model.drag + 2.0 * model.quadratic_drag * np.abs(body)) / model.mass
-    RD = R * rate[:, None, :]
-    F[:, _v, _v] += RD @ R.transpose(0, 2, 1)
-    turned = np.einsum("mjab,ma->mbj", slopes, v)
-    F[:, _v, _q] += np.einsum("mjab,mb->maj", slopes, pull) + RD @ turned
-    return np.einsum("mab,mb->ma", R, pull)
+    slopes = (q @ _SLOPES).reshape(-1, 4, 3, 3)  # of R by each component of q, of which R - I is of second degree
+    R = 0.5 * (q[:, None] @ slopes.reshape(-1, 4, 9)).reshape(-1, 3, 3) + _EYE
+    body = (v[:, None] @ R)[:, 0]
+    size = np.abs(body)
+    pull = -(model.drag + model.quadratic_drag * size) * body / model.mass
+    rate = -(model.drag + 2.0 * model.quadratic_drag * size) / model.mass
+    damping = R * rate[:, None]
+    F[:, _v, _v] += damping @ R.transpose(0, 2, 1)
+    F[:, _v, _q] += (slopes @ pull[:, None, :, None])[..., 0].transpose(0, 2, 1)
+    F[:, _v, _q] += damping @ (v[:, None, None] @ slopes)[:, :, 0].transpose(0, 2, 1)
+    return (R @ pull[:, :, None])[:, :, 0]
 
 
 def drag_acceleration(model: RigidBody, q: Array, v: Array) -> Array:

@@ -74,6 +74,9 @@ class NonlinearSettings:
         attitude_error: what the weight of the attitude is of.
         weights: what distances from the reference cost.
         terminal: the last state's weight over that of the others, 0 for none; `lqr` for the Riccati equation's at hover.
+        tilt: largest angle between thrust axis and vertical [rad], below pi/2; None for no bound.
+        largest_rates: (3,) largest magnitudes of the body rates [rad/s]; infinite for no bound.
+        soft: (l1, l2) of exceeding these by 1 rad or 1 rad/s; None for hard bounds.
         observer: tuning of the disturbance observer; None for no offset-free tracking.
         ramp: tuning of the one that follows changing forces, and fits drag to them; None for none.
         solver: QP solver, in `mpc.solvers.SOLVERS`; None for the one that is the fastest for the size.
@@ -92,6 +95,9 @@ class NonlinearSettings:
     attitude_error: AttitudeError = AttitudeError.ERROR_STATE
     weights: Weights = _USUAL
     terminal: float | str = 0.0
+    tilt: float | None = None
+    largest_rates: tuple[float, float, float] = (math.inf, math.inf, math.inf)
+    soft: tuple[float, float] | None = None
     observer: ObserverSettings | None = None
     ramp: RampSettings | None = None
     solver: str | None = None
@@ -102,6 +108,8 @@ class NonlinearSettings:
                 raise ParameterError("controller", name, getattr(self, name), "a whole number >= 1")
         if not isinstance(self.terminal, str) and not 0.0 <= self.terminal < math.inf:
             raise ParameterError("controller", "terminal", self.terminal, 'at least 0 and finite, or "lqr"')
+        if self.tilt is not None and not 0.0 < self.tilt < 0.5 * math.pi:
+            raise ParameterError("controller", "tilt", self.tilt, "positive and below pi/2, or None")
         if self.attitude_error is AttitudeError.DIFFERENCE and np.ndim(self.weights.attitude):
             rule = 'one number where attitude_error = "difference"'
             raise ParameterError("controller.weights", "attitude", self.weights.attitude, rule)

@@ -169,13 +169,17 @@ class Condensed:
         gradient[:m] += square[:m, m]
         gradient[:m].reshape(N, nu)[:] -= rest.u @ (2.0 * objective.Q_u)
         gradient[:nu] -= 2.0 * objective.move_weight @ u_before
-        qp = replace(self._blank, P=P, c=gradient)
+        blank = self._blank
+        G, h_l, h_u = blank.G, blank.h_l, blank.h_u
         if count:
             values = _row_values(rows, S)
             values[0, :, -1] -= rows.E @ u_before
-            G, known = fixed.G.copy(), values[:, :, m]
-            G.reshape(N, count, -1)[:, :, :m] = values[:, :, :m]
-            qp = replace(qp, G=np.asfortranarray(G), h_l=(rows.lower - known).ravel(), h_u=(rows.upper - known).ravel())
+            filled, known = fixed.G.copy(), values[:, :, m]
+            filled.reshape(N, count, -1)[:, :, :m] = values[:, :, :m]
+            G, h_l, h_u = np.asfortranarray(filled), (rows.lower - known).ravel(), (rows.upper - known).ravel()
+        qp = QP(
+            P=P, c=gradient, A=blank.A, b=blank.b, G=G, h_l=h_l, h_u=h_u, x_l=blank.x_l, x_u=blank.x_u, later=blank.later
+        )
         return qp, lambda x: S[1:, :, :m] @ x[:m] + S[1:, :, m]
 
     def inputs(self, x: Array) -> Array:

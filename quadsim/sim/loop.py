@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time as clock
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Final
 
@@ -13,7 +13,7 @@ import numpy as np
 from quadsim.controller import MISSED, Command, Controller, InnerLoop, Moment, Phase
 from quadsim.errors import FlightError, InterruptedFlightError, LostError
 from quadsim.flight.log import ControlLog, FlightLog, PlantLog, TimingLog
-from quadsim.flight.lost import LossCriteria, check_loss
+from quadsim.flight.lost import check_loss
 from quadsim.motion import Motion
 from quadsim.sim.computation import Computation
 from quadsim.sim.physics import Segment, inner_steps, physics_to_state
@@ -41,7 +41,7 @@ def fly(
     computation: Computation | None = None,
     rng: np.random.Generator | None = None,
     ground: PhaseMonitor | None = None,
-    loss: LossCriteria | None = None,
+    loss: Mapping[str, float] | None = None,
     motion: Motion | None = None,
     quaternions: bool = False,
     progress: Callable[[int], None] | None = None,
@@ -63,7 +63,8 @@ def fly(
         computation: how long commands take, in simulated time; none where absent.
         rng: what `computation` draws from.
         ground: what knows where the flight stands with the ground; it is flying throughout where absent.
-        loss: when the vehicle is lost, looked at once per control period until it has crashed; never where absent.
+        loss: limits by the names of `quadsim.flight.lost.CRITERIA`, checked once per control period until it has
+            crashed; none where absent.
         motion: of the reference from t_0 on, for controllers that use it; absent where only positions are known.
         quaternions: whether attitude and body rates are logged beside Euler angles and their rates.
         progress: called with the number of periods flown, after each.

@@ -17,6 +17,8 @@ from scenarios.bench.bench_results import (
     Target,
 )
 
+PAPER_SOLVER: Final = "qpoases"  # the solver of the paper
+
 
 def solver_tables(bench: SolverBench) -> list[Grid]:
     """Candidates, the growth of their steps, the length of a stage, and the targets."""
@@ -186,9 +188,6 @@ def _milliseconds(value: float) -> str:
 
 def _residual(value: float | None) -> str:
     return ABSENT if value is None else f"{value:.0e}"
-
-
-PAPER_SOLVER: Final = "qpoases"  # the solver of the paper
 
 
 def solver_targets(bench: SolverBench) -> list[Target]:

@@ -30,6 +30,10 @@ from scenarios.parts.vehicle import build_vehicle, resolve_vehicle
 from scenarios.progress import Progress, silent
 from scenarios.schema.scenario import Scenario
 
+GROWING: Final = ("hover", ("duration=0.5",))
+"""What ever larger campaigns fly: so little that what a campaign adds shows."""
+_LOOK_EVERY: Final = 1.0  # between two looks at the workers' memory [s]
+
 
 @dataclass(frozen=True, kw_only=True)
 class CampaignRun:
@@ -157,11 +161,6 @@ def campaign_targets(profile: CampaignProfile) -> list[Target]:
         ),
         Target("memory of a worker", "< 300 MB", f"{memory:.0f} MB", memory < 300.0),
     ]
-
-
-GROWING: Final = ("hover", ("duration=0.5",))
-"""What ever larger campaigns fly: so little that what a campaign adds shows."""
-_LOOK_EVERY: Final = 1.0  # between two looks at the workers' memory [s]
 
 
 def bench_campaign(

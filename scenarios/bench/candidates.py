@@ -28,6 +28,8 @@ from scenarios.progress import Progress
 
 WITH_SHORTCUT: Final = ("daqp",)  # solvers that are shown both with and without shortcuts, besides the default
 REFERENCE_SOLVER: Final = "piqp-dense"  # where the search for the optimum in closed form starts
+Query = Callable[[int], tuple[Array, Array, Array]]
+STEPS_TRIED: Final = (1, 2, 3, 4, 5, 6, 8, 10, 13, 17, 20, 25)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -163,10 +165,6 @@ def judge(candidate: StepCandidate, queries: Queries, periods: Sequence[int], re
 def _failure(answer: Answer) -> str:
     """Why there was no command; a point that is called solved is rejected where it breaks the hard input bounds."""
     return "rejected" if answer.solution.status in ACCEPTED else answer.solution.status
-
-
-Query = Callable[[int], tuple[Array, Array, Array]]
-STEPS_TRIED: Final = (1, 2, 3, 4, 5, 6, 8, 10, 13, 17, 20, 25)
 
 
 def time_stages(

@@ -30,6 +30,7 @@ from threadpoolctl import threadpool_limits
 from quadsim.state import Array
 
 Found = TypeVar("Found")
+SEGMENT: Final = 20  # consecutive periods that a candidate answers before it is the next one's turn
 
 
 class Stopwatch:
@@ -134,9 +135,6 @@ def undisturbed() -> Iterator[None]:
         gc.unfreeze()
         if collecting:
             gc.enable()
-
-
-SEGMENT: Final = 20  # consecutive periods that a candidate answers before it is the next one's turn
 
 
 class Candidate(Protocol):

@@ -19,6 +19,8 @@ Whole = Annotated[int, Field(ge=-LARGEST_SEED, le=LARGEST_SEED)]
 Value = bool | Whole | Number | str | list[Number]
 """What can be drawn from a list: whatever a field of a scenario may be, but for tables."""
 Values = Annotated[list[Value], MinLen(1), MaxLen(MOST_ENTRIES)]
+MOST_FLIGHTS: Final = 1_000_000
+Sampling = Literal["random", "latin_hypercube", "sobol", "halton"]
 
 
 class _VarySpec(Spec):
@@ -137,12 +139,6 @@ def _require_alike(values: Sequence[Value]) -> None:
         raise ValueError(f"values must all be of one kind; got {values}")
     if len({str(each) for each in values}) < len(values):
         raise ValueError(f"values must be distinct; got {values}")
-
-
-MOST_FLIGHTS: Final = 1_000_000
-
-
-Sampling = Literal["random", "latin_hypercube", "sobol", "halton"]
 
 
 class LimitsSpec(Spec):

@@ -41,6 +41,9 @@ _NOT_THE_COURSE: Final = {
     "constraints",
 }
 """Fields in which flights that are compared by their controllers may differ; vehicles are compared by their numbers."""
+REPEATS: Final = 3
+SWEEP_STRIDE: Final = 3  # of a flight in a sweep, one segment of so many is timed
+LONGEST_PASS: Final = 20.0  # a candidate that takes longer than this for all periods of a flight [s] is timed once
 
 
 def with_controller(scenario: Scenario, **changes: Any) -> Scenario:
@@ -96,11 +99,6 @@ def is_counterpart(scenario: Scenario, constrained: Scenario) -> bool:
     """Whether an unconstrained flight of the course is the constrained one, but for its constraints."""
     free = without_constraints(constrained)
     return all(getattr(scenario, name) == getattr(free, name) for name in ("controller", "vehicle", "plant"))
-
-
-REPEATS: Final = 3
-SWEEP_STRIDE: Final = 3  # of a flight in a sweep, one segment of so many is timed
-LONGEST_PASS: Final = 20.0  # a candidate that takes longer than this for all periods of a flight [s] is timed once
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -10,7 +10,9 @@ from pydantic import Field, ValidationError, model_validator
 
 from quadsim.assets import read_toml
 from quadsim.fields import NonNegative, Number, Positive
+from scenarios.loading import check_parts, parse_scenario
 from scenarios.schema.base import MOST_ENTRIES, Pair, Spec
+from scenarios.schema.bases import merge, read_scenario
 from scenarios.schema.problems import ScenarioError, describe
 from scenarios.schema.scenario import Scenario
 from scenarios.shipped import paper_path, scenario_path
@@ -23,7 +25,7 @@ class NumberSpec(Spec):
 
     name: Text = Field(description="what it is, for tables")
     scenario: str = Field(description="a library name, or a path ending in .toml, relative to the paper's file")
-    set: dict[str, Any] = Field(default={}, description="fields of the scenario to replace, as tables of it")
+    set: dict[str, Any] = Field(default={}, description="tables that are merged over the scenario, as over a base")
     measure: str = Field(
         default="tracking.position_error.mean",
         description="dotted path into the flight's summary.json; an entry of a list by its name",
@@ -106,20 +108,10 @@ def scenario_of(paper: Paper, number: NumberSpec) -> Scenario:
     Raises:
         InputError: there is no such scenario, or it cannot be flown so.
     """
-    from scenarios.loading import check_parts, load_scenario
-
     beside = paper.path.parent / number.scenario
     found = str(beside) if number.scenario.endswith(".toml") and beside.is_file() else number.scenario
-    scenario = load_scenario(str(scenario_path(found)))
-    if number.set:
-        scenario = scenario.replace(dict(_leaves(number.set)))
-        check_parts(scenario)
+    path = scenario_path(found)
+    data = merge(read_scenario(path, scenario_path), number.set)
+    scenario = parse_scenario(data, source=f"{number.name}: {path.name}", directory=path.parent)
+    check_parts(scenario)
     return scenario
-
-
-def _leaves(tables: dict[str, Any], prefix: str = "") -> list[tuple[str, Any]]:
-    """The values of nested tables by their dotted paths."""
-    found: list[tuple[str, Any]] = []
-    for key, value in tables.items():
-        found += _leaves(value, f"{prefix}{key}.") if isinstance(value, dict) else [(prefix + key, value)]
-    return found

@@ -80,7 +80,23 @@ def make_bounds(spec: BoundedSpec) -> Bounds:
     )
 
 
-def make_polytopes(spec: BoundedSpec) -> tuple[Constraint, ...]:
+def _rates(bound: float | list[float] | None) -> tuple[float, float, float]:
+    """Largest magnitudes [rad/s] of bounds in deg/s."""
+    x, y, z = np.broadcast_to(np.radians(math.inf if bound is None else bound), 3).tolist()
+    return x, y, z
+
+
+def _outputs(spec: NonlinearSpec) -> tuple[Constraint, ...]:
+    """`output_bounds` and `polytopes` as rows over the 12 states and four rotor speeds."""
+    if not spec.output_bounds:
+        return make_polytopes(spec)
+    lower, upper = np.array([*spec.output_bounds.values()], float).T
+    penalty = None if spec.soft is None else make_penalty(spec.soft, lower.size)
+    rows = _selection([*spec.output_bounds])
+    return Constraint(name="outputs", lower=lower, upper=upper, C=rows, penalty=penalty), *make_polytopes(spec)
+
+
+def make_polytopes(spec: BoundedSpec | NonlinearSpec) -> tuple[Constraint, ...]:
     """`[[controller.polytopes]]` as rows over the 12 states and four rotor speeds, each in its own unit."""
     found = []
     for polytope in spec.polytopes:
@@ -190,11 +206,14 @@ def _nonlinear(spec: NonlinearSpec, vehicle: Vehicle, period: float) -> Controll
         attitude_error=AttitudeError(spec.attitude_error),
         weights=Weights(**{name: tuple(w) if isinstance(w, list) else w for name, w in axes}),
         terminal=0.0 if spec.terminal == "none" else spec.terminal,
+        tilt=None if spec.tilt is None else math.radians(spec.tilt),
+        largest_rates=_rates(spec.body_rate),
+        soft=None if spec.soft is None else (spec.soft.linear, spec.soft.quadratic),
         observer=spec.offset_free,
         ramp=spec.disturbance,
         solver=spec.solver,
     )
-    mpc = NonlinearMPC(vehicle, period=period, settings=settings, bounds=bounds)
+    mpc = NonlinearMPC(vehicle, period=period, settings=settings, bounds=bounds, constraints=_outputs(spec))
     law = guarded(mpc, bounds, spec.fallback, vehicle, period)
     return law if spec.indi is None else Incremental(law, vehicle, spec.indi, bounds)
 

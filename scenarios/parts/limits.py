@@ -1,4 +1,4 @@
-"""From `[[constraints]]` and `[lost]` to what a flight is audited against, and what ends it."""
+"""From `[[constraints]]` and the polytopes of a controller to what a flight is audited against."""
 
 from __future__ import annotations
 
@@ -6,16 +6,11 @@ import math
 from typing import TYPE_CHECKING
 
 from quadsim.flight.audit import Limit, SumLimit
-from quadsim.flight.lost import LossCriteria
+from scenarios.schema.nonlinear import NonlinearPartsSpec
 from scenarios.schema.optimisation import BoundedSpec, PolytopeSpec
 
 if TYPE_CHECKING:
     from scenarios.schema.scenario import Scenario
-
-
-def build_loss(scenario: Scenario) -> LossCriteria:
-    """When the flight is lost."""
-    return LossCriteria(**{name: limit for name, limit in scenario.lost if limit is not False})
 
 
 def build_limits(scenario: Scenario) -> tuple[Limit, ...]:
@@ -37,4 +32,4 @@ def build_limits(scenario: Scenario) -> tuple[Limit, ...]:
 
 def _polytopes(scenario: Scenario) -> list[PolytopeSpec]:
     controller = scenario.controller
-    return controller.polytopes if isinstance(controller, BoundedSpec) else []
+    return controller.polytopes if isinstance(controller, BoundedSpec | NonlinearPartsSpec) else []

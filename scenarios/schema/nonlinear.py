@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, Final, Literal
 
-from annotated_types import Len
+from annotated_types import Len, MaxLen
 from pydantic import Discriminator, Field, Tag, model_validator
 
 from mpc.disturbance import RampSettings
@@ -13,8 +13,8 @@ from mpc.indi import INDISettings
 from mpc.observer import ObserverSettings
 from mpc.robust.tightening import SHORTEST_LAG
 from quadsim.fields import NonNegative, Positive
-from scenarios.schema.base import Pair, Spec, require_ordered
-from scenarios.schema.optimisation import Horizon, Weight
+from scenarios.schema.base import MOST_ENTRIES, Pair, Spec, require_ordered
+from scenarios.schema.optimisation import Horizon, PolytopeSpec, SoftSpec, Weight
 from scenarios.schema.robust import Lag
 
 
@@ -26,6 +26,8 @@ def _number_or_text(value: object) -> str:
     return "text" if isinstance(value, str) else "number"
 
 
+LINEAR: Final = ("x", "vx", "y", "vy", "z", "vz")
+"""States that are so of the quaternion model too."""
 AxisWeights = Annotated[
     Annotated[Weight, Tag("number")] | Annotated[list[Weight], Len(3, 3), Tag("list")], Discriminator(_number_or_list)
 ]
@@ -103,6 +105,19 @@ class NonlinearPartsSpec(Spec):
     quadratic_drag: NonNegativeTriple = Field(
         default=[0.0, 0.0, 0.0], description="[N s^2/m^2] the same, of each component's square"
     )
+    output_bounds: dict[str, Pair] = Field(
+        default={}, description="[m, m/s] lower and upper bound, of positions and velocities by their states' names"
+    )
+    tilt: Annotated[float, Field(gt=0.0, lt=90.0)] | None = Field(
+        default=None, description="[deg] largest angle between thrust axis and vertical; absent: no bound"
+    )
+    body_rate: AxisWeights | None = Field(
+        default=None, description="[deg/s] largest magnitude, one or about body x, y, z; absent: no bound"
+    )
+    soft: SoftSpec | None = Field(default=None, description="of the three above; absent: hard")
+    polytopes: Annotated[list[PolytopeSpec], MaxLen(MOST_ENTRIES)] = Field(
+        default=[], description="bounds on sums of positions, velocities and, as inputs, rotor speeds; audited as well"
+    )
     offset_free: ObserverSettings | None = None
     disturbance: RampSettings | None = Field(
         default=None, description="absent: no drag is fitted, no changing force followed; not beside offset_free"
@@ -121,6 +136,10 @@ class NonlinearPartsSpec(Spec):
             )
         if self.offset_free is not None and self.disturbance is not None:
             raise ValueError("disturbance must be absent where offset_free is given: both estimate the same force")
+        for name, pair in self.output_bounds.items():
+            if name not in LINEAR:
+                raise ValueError(f"output_bounds must be of {', '.join(LINEAR)}; got {name!r}: tilt bounds the attitude")
+            require_ordered(f"output_bounds.{name}", pair)
         if self.inputs == "thrust" and self.input_bounds.slew is not None:
             raise ValueError(
                 'input_bounds.slew must be absent where inputs = "thrust", in which steps of speeds are not linear: '

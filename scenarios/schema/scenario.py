@@ -24,6 +24,7 @@ from scenarios.schema.base import LARGEST_SEED, MOST_ENTRIES, Spec, Triple, fiel
 from scenarios.schema.controller import ControllerSpec
 from scenarios.schema.course import ReferenceSpec
 from scenarios.schema.events import Event, PayloadDropEvent, PayloadPickupEvent, SensorFaultEvent
+from scenarios.schema.nonlinear import NonlinearPartsSpec
 from scenarios.schema.optimisation import BoundedSpec
 from scenarios.schema.plugin import ForceSpec
 from scenarios.schema.problems import ScenarioError, describe_all
@@ -124,6 +125,11 @@ class LostSpec(Spec):
     depth: LimitOrOff = Field(default=50.0, description="[m] below the lowest of the start and the reference so far")
     speed: LimitOrOff = Field(default=50.0, description="[m/s] in any direction")
 
+    @property
+    def limits(self) -> dict[str, float]:
+        """The criteria that are on; see `quadsim.flight.lost`."""
+        return {name: limit for name, limit in self if limit is not False}
+
 
 LONGEST_FLIGHT: Final = 86_400.0
 MOST_STEPS: Final = 10_000_000
@@ -206,7 +212,7 @@ class Scenario(Spec):
         if self.initial.cold and not (self.effects.ground is not None and self.effects.ground.contact):
             raise ValueError("initial.cold must be false where effects.ground gives no floor to stand on; got true")
         check_sensing(self.sensors, self.estimator, timestep=self.plant.timestep)
-        polytopes = self.controller.polytopes if isinstance(self.controller, BoundedSpec) else []
+        polytopes = self.controller.polytopes if isinstance(self.controller, BoundedSpec | NonlinearPartsSpec) else []
         names = [constraint.name for constraint in self.constraints]
         names += [name for polytope in polytopes for name in polytope.row_names]
         if len(set(names)) < len(names):

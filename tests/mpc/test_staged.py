@@ -208,6 +208,8 @@ def test_systems_that_change_agree_with_a_peer(horizon: int, steps: int, soft: b
         states = ocp_peer.trajectory(now, solver.plan(solution))[1:]
         np.testing.assert_allclose(solver.states(now, solution), states, atol=1e-6)
         assert kkt_residuals(solver.qp(now), solution).worst < 1e-5 * max(1.0, float(np.abs(solution.z).max()))
+        if solved == 4:
+            break
     assert solved >= 2
 
 

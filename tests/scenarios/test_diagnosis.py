@@ -9,6 +9,7 @@ import re
 import tomllib
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import cache, cached_property
 from pathlib import Path
 from typing import Any
 
@@ -139,7 +140,7 @@ class Asked:
     status: str
     unanswered: Unanswered | None
 
-    @property
+    @cached_property
     def found(self) -> dict[str, Any]:
         assert self.unanswered is not None
         found = diagnose(self.unanswered, self.scenario, self.vehicle)
@@ -175,6 +176,12 @@ def ask(file: str, case: Case, *more: str) -> Asked:
     )
 
 
+@cache
+def ask_once(file: str, name: str) -> Asked:
+    """One of `CASES`, for all tests that only look at the answer."""
+    return ask(file, CASES[name])
+
+
 def names(entries: list[dict[str, Any]]) -> set[str]:
     return {f"{entry['name']} {entry['side']}" for entry in entries}
 
@@ -189,7 +196,7 @@ def setting(field: str, value: object) -> str:
 @pytest.mark.parametrize("name", CASES)
 def test_each_culprit_is_named_and_each_suggestion_makes_it_feasible(name: str, file: str) -> None:
     case = CASES[name]
-    asked = ask(file, case)
+    asked = ask_once(file, name)
     assert asked.status not in ACCEPTED
     found = asked.found
     assert found["feasible"] is False
@@ -209,7 +216,7 @@ def test_each_culprit_is_named_and_each_suggestion_makes_it_feasible(name: str, 
 @pytest.mark.parametrize("name", CASES)
 def test_the_least_violation_is_that_of_an_independent_program(name: str, file: str) -> None:
     """Dense, of probed matrices, with bounds on inputs hard; where these cannot hold by themselves it has no answer."""
-    unanswered = ask(file, CASES[name]).unanswered
+    unanswered = ask_once(file, name).unanswered
     assert unanswered is not None
     conflict = find_conflict(unanswered)
     assert conflict is not None
@@ -224,7 +231,7 @@ def test_the_least_violation_is_that_of_an_independent_program(name: str, file: 
 def test_a_little_less_than_the_smallest_bound_is_not_enough(name: str, file: str) -> None:
     """The suggestion is rounded up by a hundredth of the change at most."""
     case = CASES[name]
-    asked = ask(file, case)
+    asked = ask_once(file, name)
     for suggestion in asked.found["suggestions"]:
         ((field, value), *others) = suggestion["settings"].items()
         if others or not isinstance(value, list):

@@ -15,7 +15,7 @@ from quadsim.controller import Command, Moment
 from quadsim.state import Array
 from scenarios import gc_tuning
 from scenarios.build import build_controller
-from scenarios.gc_tuning import COLLECT_EVERY, frozen
+from scenarios.gc_tuning import _PROCESS, COLLECT_EVERY, frozen
 from scenarios.loading import load_scenario
 from scenarios.run import fly_scenario
 
@@ -50,6 +50,15 @@ def passes() -> Iterator[list[Pass]]:
     gc.set_threshold(*thresholds)
 
 
+@pytest.fixture
+def thawed(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """Nothing was taken for lasting, as in a process that starts; the tests' own process has, see `conftest`."""
+    monkeypatch.setattr(_PROCESS, "lasting", False)
+    gc.unfreeze()
+    yield
+    gc.freeze()
+
+
 class _Noting:
     """A controller that notes what the collector looked through until its last step."""
 
@@ -70,6 +79,7 @@ class _Noting:
         return command
 
 
+@pytest.mark.usefixtures("thawed")
 def test_a_flight_sees_no_pass_over_what_was_there_before(passes: list[Pass], monkeypatch: pytest.MonkeyPatch) -> None:
     flown: list[_Noting] = []
     hoard: list[list[int]] = []
@@ -95,6 +105,7 @@ class _Knot:
         self.itself = self
 
 
+@pytest.mark.usefixtures("thawed")
 def test_what_flights_leave_in_cycles_is_collected_between_them() -> None:
     gc.disable()  # nobody else does
     try:

@@ -10,14 +10,12 @@ import pytest
 
 from quadsim.controller import Phase
 from quadsim.flight import rundir
-from quadsim.flight.lost import LossCriteria
 from quadsim.state import tilt
 from scenarios import cli
 from scenarios.campaign.pilot import CampaignPilot
 from scenarios.campaign.plan import load_plan
 from scenarios.flight import summarise
 from scenarios.loading import load_scenario
-from scenarios.parts.limits import build_loss
 from scenarios.run import fly_scenario
 from scenarios.schema.problems import ScenarioError
 
@@ -93,8 +91,8 @@ def test_each_criterion_is_on_unless_it_is_switched_off(unstable: str, settings:
 
 def test_the_criteria_are_written_out() -> None:
     scenario = load_scenario("hover", ["lost.tilt=false", "lost.depth=3"])
-    assert build_loss(load_scenario("hover")) == LossCriteria(tilt=120.0, distance=100.0, depth=50.0, speed=50.0)
-    assert build_loss(scenario) == LossCriteria(distance=100.0, depth=3.0, speed=50.0)
+    assert load_scenario("hover").lost.limits == {"tilt": 120.0, "distance": 100.0, "depth": 50.0, "speed": 50.0}
+    assert scenario.lost.limits == {"distance": 100.0, "depth": 3.0, "speed": 50.0}
     assert tomllib.loads(scenario.to_toml())["lost"] == {"tilt": False, "distance": 100.0, "depth": 3.0, "speed": 50.0}
 
 

@@ -11,6 +11,10 @@ from quadsim.report.table import ABSENT, Cell, Grid, Mark, format_number
 DIVERGED: Final = 10.0
 """Distance from the reference at the end [m] from which on a flight counts as lost, though nothing ended it."""
 OVERTURNED: Final = 90.0  # roll or pitch [deg] from which on a flight counts as lost, whatever came after
+ARRIVED: Final = 0.05  # distance from the reference at the end [m] that counts as arrived
+FAR: Final = 0.5  # the same that a reader should notice [m]
+TILT_TOLERANCE: Final = 0.05
+"""How far beyond its bound tilt may be before a reader should notice [deg]; the paper scenarios' own tolerance."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -63,12 +67,6 @@ class MismatchBench:
             for (controller, condition), flight in self.flights.items()
         ]
         return {**vars(self), "flights": flights}
-
-
-ARRIVED: Final = 0.05  # distance from the reference at the end [m] that counts as arrived
-FAR: Final = 0.5  # the same that a reader should notice [m]
-TILT_TOLERANCE: Final = 0.05
-"""How far beyond its bound tilt may be before a reader should notice [deg]; the paper scenarios' own tolerance."""
 
 
 def mismatch_tables(measured: MismatchBench) -> list[Grid]:

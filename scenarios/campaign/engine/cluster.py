@@ -32,6 +32,7 @@ _LOOK_S: Final = 1.0
 _CONNECT_S: Final = 10.0
 _FETCH_S: Final = 10.0
 _LOGGERS: Final = ("distributed", "distributed.client", "tornado.application", "asyncio")
+_supervisors: dict[bytes, SupervisorProcess] = {}  # of this worker: one at most, of the campaign that it flies
 
 
 class DaskEngine:
@@ -112,28 +113,25 @@ def fly_chunk(pickled: bytes, chunk: Sequence[int], expected: Mapping[str, str])
     other = [f"{name} {found}, not {expected[name]}" for name, found in versions().items() if found != expected[name]]
     if other:
         raise EngineError(f"the worker at {worker.address} has {', '.join(other)} as here: install the same there")
-    aside = _aside(pickled)
+    supervisor = _supervisor(pickled)
     key, answers = worker.get_current_task(), []
     for flight in chunk:
         task = worker.state.tasks.get(key)
         if task is None or task.state == "cancelled":
             break
-        answers.append(aside.fly(flight))
+        answers.append(supervisor.fly(flight))
     return answers
 
 
-_asides: dict[bytes, SupervisorProcess] = {}  # of this worker: one at most, of the campaign that it flies
-
-
-def _aside(pickled: bytes) -> SupervisorProcess:
+def _supervisor(pickled: bytes) -> SupervisorProcess:
     """What a worker starts once for a campaign; an earlier one's is ended."""
-    if pickled not in _asides:
+    if pickled not in _supervisors:
         pilot: Pilot = pickle.loads(pickled)
-        for other in _asides.values():
+        for other in _supervisors.values():
             other.stop()
-        _asides.clear()
-        _asides[pickled] = SupervisorProcess(pilot, pickled)
-    return _asides[pickled]
+        _supervisors.clear()
+        _supervisors[pickled] = SupervisorProcess(pilot, pickled)
+    return _supervisors[pickled]
 
 
 @cache

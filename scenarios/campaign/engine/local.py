@@ -37,7 +37,7 @@ _SETTLED: Final = "scenarios.campaign.preload"
 """To be loaded by the server that forks the workers, and by no other process."""
 _MOST_STARTS: Final = 5
 _SILENCE_S: Final = 1.0  # after which supervisors are looked at: one that was stopped would keep silent for ever [s]
-_LEAVING_S: Final = 8.0  # for a supervisor to end everybody whom it keeps [s]
+_LEAVING_S: Final = 8.0  # for a supervisor to end all processes below it [s]
 _UNKNOWN: Final = 255  # the exit code of a process whose server died without reporting it
 
 
@@ -62,11 +62,11 @@ class LocalEngine:
 
     def answers(self, pilot: Pilot, flights: Sequence[int]) -> Generator[Row]:
         """See `Engine.answers`."""
-        crew = _Crew(pilot, flights, min(self._workers, len(flights)))
+        pool = _Pool(pilot, flights, min(self._workers, len(flights)))
         try:
-            yield from crew.answers()
+            yield from pool.answers()
         finally:
-            crew.dismiss()
+            pool.dismiss()
 
 
 @dataclass(eq=False)
@@ -84,7 +84,7 @@ class _Supervisor:
     flights: deque[int] = field(default_factory=deque)
 
     def dismiss(self) -> None:
-        """Ask it to leave with everybody whom it keeps."""
+        """Ask it to leave with all processes below it."""
         with contextlib.suppress(OSError):
             self.pipe.send(None)
 
@@ -105,14 +105,14 @@ class _Supervisor:
         return f"by signal {-code}" if code < 0 else f"with exit status {code}"
 
 
-class _Crew:
+class _Pool:
     """The processes of one campaign, and the flights that are not answered yet."""
 
     def __init__(self, pilot: Pilot, flights: Sequence[int], size: int) -> None:
         self._pilot, self._size = pilot, size
         self._pickled = pickle.dumps(pilot)
         self._waiting, self._unanswered = deque(flights), len(flights)
-        self._keepers: list[_Supervisor] = []
+        self._supervisors: list[_Supervisor] = []
         self._deaths: Counter[int] = Counter()
         self._failed_starts = 0
         self._pace = Pace()
@@ -120,39 +120,39 @@ class _Crew:
         self._context.set_forkserver_preload([__name__, type(pilot).__module__, _SETTLED])
 
     def answers(self) -> Generator[Row]:
-        self._employ()
+        self._replenish()
         while self._unanswered:
             rows = self._hear()
             self._unanswered -= len(rows)
-            self._employ()  # before the caller gets to use what is answered, which may take a while
+            self._replenish()  # before the caller gets to use what is answered, which may take a while
             yield from rows
 
     def dismiss(self) -> None:
-        for supervisor in self._keepers:
+        for supervisor in self._supervisors:
             supervisor.dismiss()
-        for supervisor in self._keepers:
+        for supervisor in self._supervisors:
             supervisor.ending()
-        self._keepers.clear()
+        self._supervisors.clear()
 
-    def _employ(self) -> None:
+    def _replenish(self) -> None:
         """See that there are as many workers as can be used, and that all have work."""
-        for supervisor in [each for each in self._keepers if each.orphaned and not each.flights]:
-            self._keepers.remove(supervisor)
+        for supervisor in [each for each in self._supervisors if each.orphaned and not each.flights]:
+            self._supervisors.remove(supervisor)
             supervisor.dismiss()
             supervisor.ending()
-        while len(self._keepers) < min(self._size, self._unanswered):
-            self._hire()
-        for supervisor in self._keepers:
-            self._feed(supervisor)
+        while len(self._supervisors) < min(self._size, self._unanswered):
+            self._start_supervisor()
+        for supervisor in self._supervisors:
+            self._hand_out(supervisor)
 
-    def _hire(self) -> None:
+    def _start_supervisor(self) -> None:
         for start in range(_MOST_STARTS):
             ours, theirs = self._context.Pipe()
             process = self._context.Process(target=serve, args=(theirs, str(Path.cwd())), daemon=True)
             try:
                 with _undisturbed():
                     process.start()
-                    self._keepers.append(_Supervisor(process, ours, process.pid or 0))
+                    self._supervisors.append(_Supervisor(process, ours, process.pid or 0))
             except (OSError, EOFError) as error:  # the server was killed just now; the next start makes a new one
                 ours.close()
                 problem = error
@@ -167,14 +167,14 @@ class _Crew:
 
     def _hear(self) -> list[Row]:
         """Wait until a message comes or a process dies; all messages there are then."""
-        pipes = [supervisor.pipe for supervisor in self._keepers]
-        sentinels = [supervisor.process.sentinel for supervisor in self._keepers if not supervisor.orphaned]
+        pipes = [supervisor.pipe for supervisor in self._supervisors]
+        sentinels = [supervisor.process.sentinel for supervisor in self._supervisors if not supervisor.orphaned]
         heard = connection.wait([*pipes, *sentinels], timeout=_SILENCE_S)
         rows: list[Row] = []
         if not heard:
-            for supervisor in [each for each in self._keepers if is_stopped(each.pid)]:
-                rows += self._bury(supervisor)
-        for supervisor in list(self._keepers):
+            for supervisor in [each for each in self._supervisors if is_stopped(each.pid)]:
+                rows += self._remove(supervisor)
+        for supervisor in list(self._supervisors):
             supervisor.orphaned |= supervisor.process.sentinel in heard
             if supervisor.pipe in heard:
                 rows += self._listen(supervisor)
@@ -196,12 +196,12 @@ class _Crew:
                     case Ready():
                         supervisor.ready, self._failed_starts = True, 0
                     case _:  # what nobody asked for
-                        return rows + self._bury(supervisor)
+                        return rows + self._remove(supervisor)
         except (EOFError, OSError):
-            return rows + self._bury(supervisor)
+            return rows + self._remove(supervisor)
         return rows
 
-    def _feed(self, supervisor: _Supervisor) -> None:
+    def _hand_out(self, supervisor: _Supervisor) -> None:
         """Hand out more, unless the supervisor has enough or there is nothing left."""
         waiting = len(self._waiting)
         enough = min(self._pace.flights_in(_AHEAD_S), fair_share(waiting, self._size))
@@ -209,12 +209,12 @@ class _Crew:
             return
         chunk = [self._waiting.popleft() for _ in range(min(waiting, self._pace.chunk(waiting, self._size)))]
         supervisor.flights.extend(chunk)
-        with contextlib.suppress(OSError):  # as in `_hire`
+        with contextlib.suppress(OSError):  # as in `_start_supervisor`
             supervisor.pipe.send(chunk)
 
-    def _bury(self, supervisor: _Supervisor) -> list[Row]:
+    def _remove(self, supervisor: _Supervisor) -> list[Row]:
         """Take a dead supervisor's flights back; it may be the first of them that it died of."""
-        self._keepers.remove(supervisor)
+        self._supervisors.remove(supervisor)
         supervisor.process.kill()
         ending = supervisor.ending()
         end_session(supervisor.pid)  # it had no time for that

@@ -34,6 +34,10 @@ LOOK_S: Final = 0.2  # between two looks at a worker that flies [s]
 _TURN_S: Final = 1.0  # most that one look counts of the time since the last one [s]
 _LEAVING_S: Final = 1.0  # for a worker that says nothing more to be gone [s]
 _LARGEST: Final = 1 << 26  # no worker says more at once [bytes]
+_MAIN: Final = (
+    "import json, sys; sys.path[:] = json.loads(sys.argv[2]); import scenarios.campaign.preload; "
+    "from scenarios.campaign.engine.supervisor import main; main(int(sys.argv[1]))"
+)
 
 
 class Ready(NamedTuple):
@@ -259,12 +263,6 @@ class _Supervisor:
         self._dismiss()
         flight = self._flights.popleft()
         self._send(Answer(self._pilot.lost(flight, reason, verdict), self._spent))
-
-
-_MAIN: Final = (
-    "import json, sys; sys.path[:] = json.loads(sys.argv[2]); import scenarios.campaign.preload; "
-    "from scenarios.campaign.engine.supervisor import main; main(int(sys.argv[1]))"
-)
 
 
 class SupervisorProcess:

@@ -33,10 +33,13 @@ _LIMITS: Final = tuple(getattr(resource, name) for name in dir(resource) if name
 _TIMERS: Final = (signal.ITIMER_REAL, signal.ITIMER_VIRTUAL, signal.ITIMER_PROF)
 _ONE, _THREE, _SMALLEST = 1.0, 3.0, 5e-324
 _Settings = tuple[Any, ...]
+FLIGHT: Final = struct.Struct("=q")  # a flight's number, as a supervisor hands it out
+SIZE: Final = struct.Struct("=Q")  # of what follows, a pickled `FlightReport` [bytes]
+PULSE_BYTES: Final = 8
 
 
 class Traces:
-    """Looks for them.
+    """Finds what a flight has left behind in its process.
 
     What a process is like when this is made is how it should stay: its working directory, environment, signals,
     threads, limits, numpy's and the processor's ways with numbers, and what our modules, and those that they compute
@@ -106,11 +109,6 @@ def _folder() -> str:
 def _rounding() -> tuple[float, ...]:
     """What a library may change in the processor: how it rounds, and whether it knows the smallest numbers."""
     return _ONE / _THREE, -_ONE / _THREE, _SMALLEST * _ONE
-
-
-FLIGHT: Final = struct.Struct("=q")  # a flight's number, as a supervisor hands it out
-SIZE: Final = struct.Struct("=Q")  # of what follows, a pickled `FlightReport` [bytes]
-PULSE_BYTES: Final = 8
 
 
 class FlightReport(NamedTuple):

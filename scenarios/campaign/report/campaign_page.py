@@ -33,6 +33,9 @@ _FILES: Final = {
     "campaign.svg": "figure (SVG)",
 }
 """What the page links to, where it is there, and under which name."""
+COMPARISON_FILE: Final = "comparison.json"
+TABLE_FILE: Final = "comparison.md"
+KIND: Final = "campaign comparison"  # what `quadsim.outputs` calls such a directory
 
 
 def write_report(
@@ -93,12 +96,6 @@ def _mark(summary: Summary) -> Mark:
     if not summary["flights"]:
         return Mark.NONE
     return Mark.BAD if summary["events"]["failure"]["count"] else Mark.GOOD
-
-
-COMPARISON_FILE: Final = "comparison.json"
-TABLE_FILE: Final = "comparison.md"
-
-KIND: Final = "campaign comparison"  # what `quadsim.outputs` calls such a directory
 
 
 def write_comparison_report(comparison: Comparison, directory: Path) -> Path:

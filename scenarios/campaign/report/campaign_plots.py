@@ -34,6 +34,8 @@ if TYPE_CHECKING:
 
 OUTCOMES: Final = {"with the worst margin": LINES[0], "with failure": LINES[1]}
 _LOG_TICKS: Final = [float(digit * 10**power) for power in range(7) for digit in (1, 2, 5)]
+_EDGE_SIZE: Final = 8
+_TICK_ROOM: Final = 46  # characters that have room below a panel of a narrow page
 
 
 def campaign_plots(table: pa.Table, summary: Summary) -> dict[str, Plot]:
@@ -180,10 +182,6 @@ def _faded(colour: str, opacity: float) -> str:
     """A colour of the palette as rgba, which plotly asks for to fill an area."""
     red, green, blue = (int(colour[i : i + 2], 16) for i in (1, 3, 5))
     return f"rgba({red},{green},{blue},{opacity})"
-
-
-_EDGE_SIZE: Final = 8
-_TICK_ROOM: Final = 46  # characters that have room below a panel of a narrow page
 
 
 def verdict_keys(table: pa.Table) -> tuple[tuple[str, str], ...]:

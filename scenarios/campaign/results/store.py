@@ -24,6 +24,10 @@ _NEEDED: Final = ("flight", "seed", "status", "verdict", "failed", "violated", "
 """Columns that no version left out; `flight` to `violated` have a value in every row."""
 _FILLED: Final = _NEEDED[:6]
 LARGEST: Final = 1e100  # magnitude of the largest number that a flight has; sums of squares of larger ones are infinite
+FLIGHTS_FILE: Final = "flights.parquet"
+TIMES_FILE: Final = "timing.parquet"
+PARTS_DIR: Final = "parts"
+_PART: Final = "part-*.parquet"
 
 
 def read_flights(path: Path, schema: pa.Schema) -> pa.Table:
@@ -69,12 +73,6 @@ def require_columns(table: pa.Table, schema: pa.Schema, path: Path, *, without: 
     flights = table["flight"].to_numpy()
     if flights.size and (flights[0] < 0 or (np.diff(flights) <= 0).any()):
         raise FileError(path, "has flights that are not numbered upwards from 0")
-
-
-FLIGHTS_FILE: Final = "flights.parquet"
-TIMES_FILE: Final = "timing.parquet"
-PARTS_DIR: Final = "parts"
-_PART: Final = "part-*.parquet"
 
 
 class Store:

@@ -62,6 +62,10 @@ TIMING: Final = (
 )
 """What a clock measured of a flight, and where; it stands in a table of its own."""
 Summary = Mapping[str, Any]
+Texts = np.ndarray[Any, np.dtype[np.object_]]
+_NO_METRIC: Final = ("flight", "seed", DRAW, MARGIN, TIME_VIOLATED, SATISFIED)
+Rows = np.ndarray[Any, np.dtype[np.intp]]
+Edges = np.ndarray[Any, np.dtype[np.str_]]
 
 
 def make_schema(draws: Mapping[str, tuple[pa.DataType, str]], limits: Sequence[Limit]) -> pa.Schema:
@@ -226,12 +230,6 @@ def _storable(value: object) -> object:
 
 def _finite(value: float) -> float | None:
     return value if math.isfinite(value) else None
-
-
-Texts = np.ndarray[Any, np.dtype[np.object_]]
-_NO_METRIC: Final = ("flight", "seed", DRAW, MARGIN, TIME_VIOLATED, SATISFIED)
-Rows = np.ndarray[Any, np.dtype[np.intp]]
-Edges = np.ndarray[Any, np.dtype[np.str_]]
 
 
 def numbers(table: pa.Table, name: str) -> Array:

@@ -29,6 +29,16 @@ from scenarios.campaign.statistics import inference
 from scenarios.campaign.statistics.scatters import ShownMargins, paired_margins
 from scenarios.campaign.statistics.wording import p_value, signed_interval, signed_points
 
+COMPARED: Final = (
+    *(f"rmse.{name}" for name in ("x", "y", "z", "yaw")),
+    *(f"max_error.{name}" for name in ("x", "y", "z")),
+    "peak_tilt",
+    "worst_margin",
+    "total_variation",
+    "fallback_periods",
+)
+"""Metrics that are compared, where both campaigns have them."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class EventComparison:
@@ -111,8 +121,8 @@ def other_differences(events: Sequence[EventComparison], names: tuple[str, str])
     first, *others = events
     others = [event for event in others if event.only_a != event.only_b]
     others = [event for event in others if event.event != "violation" or event.cells != first.cells]
-    sure = [_told(event) for event in others if event.p_holm < inference.ALPHA]
-    rest = [_told(event) for event in others if event.p_holm >= inference.ALPHA]
+    sure = [_with_counts(event) for event in others if event.p_holm < inference.ALPHA]
+    rest = [_with_counts(event) for event in others if event.p_holm >= inference.ALPHA]
     parts = []
     if sure:
         parts.append(f"beyond chance in {', '.join(sure)}")
@@ -127,21 +137,10 @@ def other_differences(events: Sequence[EventComparison], names: tuple[str, str])
     )
 
 
-def _told(event: EventComparison) -> str:
+def _with_counts(event: EventComparison) -> str:
     """An event with its counts, the second campaign's first, as in the sentence around it."""
     count_a, count_b = event.counts
     return f"{event.event} ({count_b} and {count_a}, {p_value(event.p_holm)})"
-
-
-COMPARED: Final = (
-    *(f"rmse.{name}" for name in ("x", "y", "z", "yaw")),
-    *(f"max_error.{name}" for name in ("x", "y", "z")),
-    "peak_tilt",
-    "worst_margin",
-    "total_variation",
-    "fallback_periods",
-)
-"""Metrics that are compared, where both campaigns have them."""
 
 
 @dataclass(frozen=True, kw_only=True)

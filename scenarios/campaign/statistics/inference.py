@@ -64,17 +64,17 @@ def lower_bounds(counts: ArrayLike, trials: ArrayLike, confidence: float = CONFI
     return 1.0 - upper_bounds(np.asarray(trials, float) - np.asarray(counts, float), trials, confidence)
 
 
-def proportion(count: int, flights: int, confidence: float = CONFIDENCE) -> Proportion:
+def proportion(count: int, flights: int) -> Proportion:
     """A share of flights with its two-sided interval and its one-sided bounds, all Clopper-Pearson."""
-    either = 0.5 * (1.0 + confidence)
+    either = 0.5 * (1.0 + CONFIDENCE)
     return Proportion(
         count=count,
         flights=flights,
         share=count / flights if flights else None,
         lower=float(lower_bounds(count, flights, either)),
         upper=float(upper_bounds(count, flights, either)),
-        lower_one_sided=float(lower_bounds(count, flights, confidence)),
-        upper_one_sided=float(upper_bounds(count, flights, confidence)),
+        lower_one_sided=float(lower_bounds(count, flights)),
+        upper_one_sided=float(upper_bounds(count, flights)),
     )
 
 
@@ -100,14 +100,14 @@ def mcnemar(only_a: int, only_b: int) -> float:
     return float(stats.binomtest(only_a, discordant).pvalue) if discordant else 1.0
 
 
-def paired_shares(only_a: int, only_b: int, pairs: int, confidence: float = CONFIDENCE) -> tuple[float, float]:
+def paired_shares(only_a: int, only_b: int, pairs: int) -> tuple[float, float]:
     """Interval of the difference of paired proportions, share of b - share of a: Tango's score interval.
 
     It holds every difference that a score test does not reject; with no difference, that is McNemar's test.  Of all
     `pairs`, at least one, it happened to the first alone in `only_a`, and to the second alone in `only_b`.
     Source: Tango, Statistics in Medicine 17 (1998).
     """
-    z = float(stats.norm.ppf(0.5 * (1.0 + confidence)))
+    z = float(stats.norm.ppf(0.5 * (1.0 + CONFIDENCE)))
     estimate = (only_b - only_a) / pairs
 
     def excess(difference: float) -> float:
@@ -134,7 +134,7 @@ def _score_variance(difference: float, only_a: int, only_b: int, pairs: int) -> 
     return pairs * (2.0 * share_a + difference * (1.0 - difference))
 
 
-def paired_difference(a: Array, b: Array, confidence: float = CONFIDENCE) -> PairedDifference:
+def paired_difference(a: Array, b: Array) -> PairedDifference:
     """Mean and median of b - a, (K,) finite each, with their intervals.
 
     The mean's is Student's t interval.  The median's has order statistics at its ends, by inverting the sign test, and
@@ -148,8 +148,8 @@ def paired_difference(a: Array, b: Array, confidence: float = CONFIDENCE) -> Pai
     half = None
     if n > 1:
         spread = float(differences.std(ddof=1)) / math.sqrt(n)
-        half = float(stats.t.ppf(0.5 * (1.0 + confidence), n - 1)) * spread
-    ends = stats.quantile_test(differences, q=0.0, p=0.5).confidence_interval(confidence)
+        half = float(stats.t.ppf(0.5 * (1.0 + CONFIDENCE), n - 1)) * spread
+    ends = stats.quantile_test(differences, q=0.0, p=0.5).confidence_interval(CONFIDENCE)
     median_lower, median_upper = (float(end) if math.isfinite(end) else None for end in ends)
     return PairedDifference(
         pairs=n,

@@ -24,6 +24,11 @@ LOWEST_MARGIN: Final = -2.0
 """Margins below this are drawn at the foot, so that a lost flight does not flatten all others."""
 _LEAST_DEPTH: Final = 0.25  # share of the height above 0 that is shown below it, however far from it the margins are
 _FENCE: Final = 5.0  # quartile ranges beyond the quartiles up to which values are drawn where they are
+COURSE: Final = "half of the flights are above"  # what a curve through the flights of a scatter tells
+_GAP: Final = 0.06  # from the axis' end to what is drawn at the edge, as a share of the axis
+_MOST_POINTS: Final = 18_000
+"""Points that all scatters of a page may have together: a page of 10 000 flights stays near 6 MB and quick to draw."""
+_MOST_PAIRS: Final = 4000  # that are drawn of a comparison
 
 
 def robust_ends(values: Array) -> tuple[float, float]:
@@ -54,13 +59,6 @@ def margin_ends(values: Array) -> tuple[float, float]:
     high = max(0.0, float(finite[finite <= above].max()))
     below = max(min(fence, -_LEAST_DEPTH * high), lowest_shown(finite))
     return min(0.0, float(finite[finite >= below].min())), high
-
-
-COURSE: Final = "half of the flights are above"  # what a curve through the flights of a scatter tells
-_GAP: Final = 0.06  # from the axis' end to what is drawn at the edge, as a share of the axis
-_MOST_POINTS: Final = 18_000
-"""Points that all scatters of a page may have together: a page of 10 000 flights stays near 6 MB and quick to draw."""
-_MOST_PAIRS: Final = 4000  # that are drawn of a comparison
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -154,18 +152,18 @@ def thinning(table: pa.Table) -> str:
 def clipping(drawn: Margins, parameters: list[Cloud]) -> str:
     """Which flights are drawn at the edges, how many, and how far out they are; empty where there are none."""
     none, (low, high) = np.isnan(drawn.true), drawn.shown
-    parts = _told(drawn.true, (drawn.edge == "down") & ~none, "below", low)
+    parts = _count_beyond(drawn.true, (drawn.edge == "down") & ~none, "below", low)
     if none.any():
         parts.append(f"{count_of(int(none.sum()), 'flight')} without a margin, at the foot")
-    parts += _told(drawn.true, drawn.edge == "up", "above", high)
+    parts += _count_beyond(drawn.true, drawn.edge == "up", "above", high)
     for cloud in parameters:
         for edge, side, end in (("left", "below", np.min), ("right", "above", np.max)):
             beyond = cloud.edge == edge
-            parts += _told(cloud.true, beyond, side, end(cloud.true[~beyond]), of=cloud.name)
+            parts += _count_beyond(cloud.true, beyond, side, end(cloud.true[~beyond]), of=cloud.name)
     return f"Triangles at the edges stand for flights beyond the axes: {'; '.join(parts)}." if parts else ""
 
 
-def _told(
+def _count_beyond(
     values: Array, beyond: Flags, side: str, limit: float, *, of: str = "a margin", thing: str = "flight"
 ) -> list[str]:
     """How many have a value too far to one side to be drawn there, and how far out these are; nothing of none."""
@@ -214,8 +212,8 @@ def paired_margins(a: pa.Table, b: pa.Table, failed: tuple[Flags, ...], names: S
     sides = [second < low, second > high, first < low, first > high]
     least, most = every.min(axis=1), every.max(axis=1)
     beyond = [
-        *_told(least, least < low, "below", low, thing="pair"),
-        *_told(most, most > high, "above", high, thing="pair"),
+        *_count_beyond(least, least < low, "below", low, thing="pair"),
+        *_count_beyond(most, most > high, "above", high, thing="pair"),
     ]
     return ShownMargins(
         flights=numbers(a, "flight")[rows].astype(np.int32),

@@ -13,7 +13,6 @@ import pytest
 from quadsim.controller import Command, Controller, Moment, Phase
 from quadsim.errors import PlanExhaustedError
 from quadsim.flight.log import FlightLog
-from quadsim.flight.lost import LossCriteria
 from quadsim.sim.loop import fly
 from quadsim.sim.phase import PhaseMonitor
 from quadsim.sim.plant import Plant
@@ -153,7 +152,7 @@ def test_a_flight_that_ended_early_is_let_go_at_once(vehicle: Vehicle, speeds: A
 
 
 def fall(
-    vehicle: Vehicle, loss: LossCriteria, *, descent: float = 0.0, ground: PhaseMonitor | None = None
+    vehicle: Vehicle, loss: dict[str, float], *, descent: float = 0.0, ground: PhaseMonitor | None = None
 ) -> FlightLog:
     """Fly without thrust along a reference that goes down by `descent` [m] per period."""
     reference = np.zeros((PERIODS + HORIZON, 4))
@@ -174,7 +173,7 @@ def fall(
 
 def test_a_flight_that_is_lost_is_kept_up_to_there(vehicle: Vehicle) -> None:
     """A free fall is 0.5 m deep between the samples at 0.3 and 0.35 s."""
-    whole, cut = (fall(vehicle, LossCriteria(depth=depth)) for depth in (math.inf, 0.5))
+    whole, cut = (fall(vehicle, {"depth": depth}) for depth in (math.inf, 0.5))
     assert (whole.reason, whole.lost, whole.control.t.size) == (None, None, PERIODS)
     assert (cut.status, cut.lost, cut.interrupted) == ("aborted", "depth", False)
     found = "the depth below the lowest of start and reference is 0.60086 m"
@@ -185,7 +184,7 @@ def test_a_flight_that_is_lost_is_kept_up_to_there(vehicle: Vehicle) -> None:
 
 
 def test_a_course_that_goes_down_is_no_fall(vehicle: Vehicle) -> None:
-    assert fall(vehicle, LossCriteria(depth=0.5), descent=0.1).reason is None
+    assert fall(vehicle, {"depth": 0.5}, descent=0.1).reason is None
 
 
 def test_what_has_crashed_is_not_lost_as_well(vehicle: Vehicle) -> None:
@@ -199,4 +198,4 @@ def test_what_has_crashed_is_not_lost_as_well(vehicle: Vehicle) -> None:
         def advance(self, states: Array, preview: Array) -> Phase:
             return Phase.CRASHED
 
-    assert fall(vehicle, LossCriteria(depth=0.5), ground=Crashed()).reason is None
+    assert fall(vehicle, {"depth": 0.5}, ground=Crashed()).reason is None

@@ -191,7 +191,7 @@ def test_closing_the_iterator_ends_the_work_after_the_flights_in_the_air(two_wor
     next(answers)
     answers.close()
     begun = len(diary.read_text().splitlines())
-    clock.sleep(1.0)
+    clock.sleep(0.5)
     assert len(diary.read_text().splitlines()) <= begun + 2
 
 
@@ -263,7 +263,7 @@ def processes(tmp_path: Path) -> Iterator[Callable[..., subprocess.Popen[bytes]]
 def test_a_killed_scheduler_ends_the_campaign_with_what_was_answered(
     processes: Callable[..., subprocess.Popen[bytes]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(module, "_CONNECT_S", 4.0)  # as long as it is called again
+    monkeypatch.setattr(module, "_CONNECT_S", 1.0)  # as long as it is called again
     scheduler = processes("scheduler", "--host", "127.0.0.1", "--port", "0")
     processes("worker", "--nthreads", "1", "--nworkers", "2", "--death-timeout", "60")
     file = tmp_path / "scheduler.json"

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from scenarios.campaign.statistics.splits import Split, best_splits
+from scenarios.campaign.statistics.dependence import Split, best_splits
 
 
 def best(values: np.ndarray, happened: np.ndarray) -> Split:

@@ -14,7 +14,7 @@ from scenarios.cost.cost_curves import lost_at, step_curves, sweep_panels
 from scenarios.cost.cost_figures import write_cost_figures
 from scenarios.cost.cost_plots import cost_plots
 from scenarios.cost.cost_tables import cost_markdown, cost_tables
-from scenarios.cost.cost_text import cost_sentences
+from scenarios.cost.section import cost_sentences
 from scenarios.cost.study import MEASURES, CostStudy
 
 
