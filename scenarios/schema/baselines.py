@@ -83,7 +83,7 @@ class GeometricSpec(_TunedSpec):
     @model_validator(mode="after")
     def _check(self) -> GeometricSpec:
         if any(self.drag) and not self.feedforward:
-            raise ValueError("drag is for feedforward = true")
+            raise ValueError(f"drag must be zero where feedforward is not true; got {self.drag}")
         if self.feedforward and self.horizon <= PREVIEW_DEGREE:
             raise ValueError(
                 f"horizon must be at least {PREVIEW_DEGREE + 1} where feedforward is true; got {self.horizon}"

@@ -201,7 +201,10 @@ class Scenario(Spec):
                 raise ValueError(f"{name} must {period} a whole multiple of {what} = {unit} s; got {given}") from error
         indi: INDISettings | None = getattr(self.controller, "indi", None)
         if indi is not None:
-            inner_steps(indi.rate, self.plant.timestep)
+            try:
+                inner_steps(indi.rate, self.plant.timestep)
+            except ParameterError as error:
+                raise ValueError(str(error)) from error
         for what, count in (
             ("physics steps", self.periods * self.steps_per_period),
             ("planned steps", self.periods * self.controller.horizon),
