@@ -11,9 +11,10 @@ from quadsim.errors import FileError, ParameterError
 from quadsim.flight.ground import AIRBORNE, TOUCH, clearance
 from quadsim.sim.airframe import outline
 from quadsim.sim.effects.load import Load, mass_properties
+from quadsim.sim.rigid_body import check_free
 from quadsim.vehicle import Vehicle
 from scenarios.courses.make import build_course, located
-from scenarios.parts.effects import moving_air
+from scenarios.parts.effects import build_changes, moving_air
 from scenarios.parts.vehicle import build_initial_state, build_vehicle
 from scenarios.schema.bases import read_scenario, replaced_tables, retyped
 from scenarios.schema.course import CsvSpec
@@ -28,13 +29,16 @@ def check_parts(scenario: Scenario) -> None:
     """Refuse, before anything is flown, parts that do not go together.
 
     Raises:
-        InputError: there is no such vehicle, it cannot hover, an effect is not possible with it, the course cannot be
-            built, or the flight starts below the floor, or in the air with rotors at rest.
+        InputError: there is no such vehicle, it cannot hover, an effect is not possible with it or with the
+            integrator, the course cannot be built or does not state the motion that the flight is to start on, or the
+            flight starts below the floor, or in the air with rotors at rest.
     """
     vehicle = build_vehicle(scenario)
     load = scenario.effects.resolved(vehicle).load or Load()
     mass_properties(vehicle, load, load.payloads)
     moving_air(scenario, vehicle)
+    if scenario.plant.integrator == "rk4":
+        check_free(scenario.effects.resolved(vehicle), build_changes(scenario))
     course = build_course(scenario)
     if scenario.initial.on_reference and course.derivatives is None:
         rule = f"false where the course states positions alone, as one of type {scenario.reference.type} does"

@@ -102,7 +102,7 @@ class Plant:
         self._yaw = 0.0
         self._wind, self._own = wind, tuple(forces)
         if integrator == "rk4":
-            check_free(effects, reweighed=self._reweighed)
+            check_free(effects, changes)
         self._integrator = integrator
         self._by_step = effects.follows_state or wind is not None or bool(self._own) or integrator == "rk4"
         ordered = sorted(changes, key=lambda change: change.time)

@@ -7,29 +7,29 @@ simulation are to be flown, or the difference is to be measured, this one takes 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 from quadsim.errors import ParameterError
-from quadsim.sim.effects import Effects
+from quadsim.sim.effects import Effects, Load, PayloadChange, RotorChange
 from quadsim.sim.effects.forces import StepForces, Wrench
 from quadsim.vehicle import Vehicle
 
 Rates = tuple[list[float], Wrench]
 
 
-def check_free(effects: Effects, *, reweighed: bool) -> None:
+def check_free(effects: Effects, changes: Iterable[RotorChange | PayloadChange]) -> None:
     """Refuse what this integration does not know.
 
     Args:
         effects: resolved.
-        reweighed: whether mass or inertia differ from the vehicle's file, or change.
+        changes: what happens on the way.
 
     Raises:
         ParameterError: there is a floor to touch, a load, or drag of MuJoCo's.
     """
     unknown = {
         "contact with the ground": effects.ground is not None and effects.ground.contact,
-        "a load": reweighed,
+        "a load": effects.load not in (None, Load()) or any(isinstance(each, PayloadChange) for each in changes),
         "effects.air.body_drag": effects.air is not None and effects.air.body_drag is not None,
     }
     if found := [name for name, present in unknown.items() if present]:

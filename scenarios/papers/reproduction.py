@@ -74,11 +74,20 @@ class Reproduced:
             spec.name,
             spec.unit,
             f"{relation}{published}",
-            ABSENT if self.ours is None else f"{self.ours:.5g}",
-            ABSENT if self.difference is None else f"{self.difference:+.1e}",
+            self._shown(self.ours),
+            self._shown(self.difference, "+"),
             tolerance,
             verdict,
         )
+
+    def _shown(self, value: float | None, sign: str = "") -> str:
+        """A value to a tenth of the tolerance, or to four digits where there is none."""
+        if value is None:
+            return ABSENT
+        if not self.spec.tolerance:
+            return f"{value:{sign}.4g}"
+        digits = max(0, 1 - math.floor(math.log10(self.spec.tolerance)))
+        return f"{round(value, digits) + 0.0:{sign}.{digits}f}"
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -200,3 +200,11 @@ def test_a_start_on_a_reference_needs_one_that_states_it() -> None:
         load_scenario("circle", ["initial.on_reference=true"])
     with pytest.raises(ScenarioError, match="euler must have roll and pitch 0 where on_reference is true"):
         load_scenario("torrente-loop4-ideal", ["initial.euler=[1.0, 0.0, 0.0]"])
+
+
+@pytest.mark.parametrize(
+    "setting", ["effects.load.mass_factor=1.1", "events=[{type='payload_pickup', at=1.0, mass=0.1}]"]
+)
+def test_the_integrator_refuses_a_load_before_it_is_flown(setting: str) -> None:
+    with pytest.raises(ParameterError, match=re.escape("plant.integrator must be mujoco where there is a load")):
+        load_scenario("torrente-loop4-ideal", [setting])
