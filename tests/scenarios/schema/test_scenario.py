@@ -155,7 +155,9 @@ WRONG = {
     "log_rate=300": (
         "log_rate must have a period that is a whole multiple of the physics step plant.timestep = 0.001 s; got 300.0"
     ),
-    "initial.euler=[0, 90, 0]": "initial.euler must have a roll within +-180 deg and a pitch within +-90 deg; got [0.0, 90.0, 0.0]",
+    "initial.euler=[0, 90, 0]": (
+        "initial.euler must have a roll within +-180 deg and a pitch within +-90 deg; got [0.0, 90.0, 0.0]"
+    ),
     "controller={type='geometric',drag=[1,0,0]}": (
         "controller.drag must be zero where feedforward is not true; got [1.0, 0.0, 0.0]"
     ),
