@@ -113,8 +113,8 @@ def main() -> None:
         "0.0273 and 0.020 m.\nMean errors [m] without learning; the last column with a constant torque of 0.2, -0.1 "
         "and 0.03 N m:\n\n" + markdown(improved()),
         "## MuJoCo's integration and theirs\n\nTheir plant is integrated with the drag evaluated at all four stages of "
-        'a Runge-Kutta step, `plant.integrator = "rk4"`;\nMuJoCo\'s Runge-Kutta step holds the drag of its middle. With '
-        "steps of 0.5 ms they differ by this:\n\n" + markdown(integrations()),
+        'a Runge-Kutta step, `plant.integrator = "rk4"`;\nMuJoCo\'s Runge-Kutta step holds the drag of its middle. '
+        "With steps of 0.5 ms they differ by this:\n\n" + markdown(integrations()),
         HOW,
     ]
     write_page("papers.md", *parts)
