@@ -204,7 +204,7 @@ class Scenario(Spec):
             try:
                 inner_steps(indi.rate, self.plant.timestep)
             except ParameterError as error:
-                raise ValueError(str(error)) from error
+                raise ValueError(f"controller.indi.rate must be {error.rule}; got {indi.rate}") from error
         for what, count in (
             ("physics steps", self.periods * self.steps_per_period),
             ("planned steps", self.periods * self.controller.horizon),
