@@ -9,8 +9,8 @@ import numpy as np
 from make_numbers import Table, fly, markdown, write_page
 
 from quadsim.report.table import section
-from scenarios.api import reproduce
 from scenarios.flight import Flight
+from scenarios.many_flights import reproduce
 
 COURSES = ("loop4", "loop8", "lemniscate8")
 SEEDS = 16

@@ -57,6 +57,11 @@ class Moment:
             to be derived from the state.
         body_rates: (3,) measured body rates [rad/s]; None as before.
         motion: the reference from t_k on, where the course knows more than x, y, z, yaw.
+
+    Examples:
+        >>> import quadsim
+        >>> quadsim.Moment(time=0.05).phase.value
+        'flying'
     """
 
     time: float = 0.0
@@ -105,6 +110,13 @@ class Command:
         dual_residual: largest gradient of the Lagrangian the back end reports.
         solve_s: wall time inside the solver [s].
         inner: the inner loop that carries out commands from now on; None for rotors that hold `speeds`.
+
+    Examples:
+        >>> import numpy as np
+        >>> import quadsim
+        >>> speeds = np.full(4, 200.0)
+        >>> quadsim.Command(speeds=speeds, plan=np.tile(speeds, (10, 1))).status
+        'solved'
     """
 
     speeds: Array
