@@ -15,7 +15,6 @@ from scenarios.many_flights import reproduce
 COURSES = ("loop4", "loop8", "lemniscate8")
 SEEDS = 16
 FAST = "{velocity_noise=0.001,velocity_walk=0.001,force_walk=1.0,largest_force=20.0}"
-KNOWN = ("controller.drag=[0.3,0.3,0]", "controller.quadratic_drag=[0.08,0.08,0.08]")
 TORQUE = "effects.disturbance.torque=[0.2,-0.1,0.03]"
 GEOMETRIC = "controller={type = 'geometric', tilt = 80.0, feedforward = %s}"
 QUICK = "true, lag = 0.006, disturbance = {force = 40.0}, indi = {}"
@@ -74,8 +73,7 @@ def seeds() -> Table:
 
 LAWS = (
     ("nonlinear MPC", ()),
-    ("nonlinear MPC, drag law known", KNOWN),
-    ("the same, and INDI", (*KNOWN, "controller.indi={}")),
+    ("nonlinear MPC, drag law known", ("controller.drag=[0.3,0.3,0]", "controller.quadratic_drag=[0.08,0.08,0.08]")),
     ("nonlinear MPC, constant force observed: `offset_free`", (f"controller.offset_free={FAST}",)),
     ("nonlinear MPC, drag fitted in flight: `disturbance`", ("controller.disturbance={}",)),
     ("the same, and INDI", ("controller.disturbance={}", "controller.indi={}")),
