@@ -47,7 +47,7 @@ LONG = (
     *("mpc/test_staged.py", "scenarios/campaign/test_commands.py", "scenarios/test_mutations.py"),
     *("test_packaging.py", "mpc/test_diagnosis.py", "mpc/robust/test_tightening.py", "mpc/exact/test_shortcut.py"),
     *("mpc/fallback/test_fallback_flights.py", "scenarios/test_soak.py"),
-    *("scenarios/campaign/statistics/test_drivers.py",),
+    *("scenarios/campaign/statistics/test_drivers.py", "scenarios/papers/test_beyond.py"),
 )
 """Modules that take longest; those not named take less than four seconds each."""
 
