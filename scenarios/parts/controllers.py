@@ -182,7 +182,7 @@ def guarded(
 def _nonlinear(spec: NonlinearSpec, vehicle: Vehicle, period: float, shapes: Sequence[Shape]) -> Controller:
     from mpc.nonlinear.controller import NonlinearMPC
     from mpc.nonlinear.rigidbody import Inputs
-    from mpc.nonlinear.settings import AttitudeError, NonlinearSettings, Weights
+    from mpc.nonlinear.settings import AttitudeError, Disturbance, NonlinearSettings, Weights
 
     stride = 1 if spec.node is None else round(spec.node / period)
     if spec.node is not None and (stride < 1 or not math.isclose(stride * period, spec.node, rel_tol=1e-9)):
@@ -218,6 +218,7 @@ def _nonlinear(spec: NonlinearSpec, vehicle: Vehicle, period: float, shapes: Seq
         largest_rates=_three(math.inf if spec.body_rate is None else np.radians(spec.body_rate).tolist()),
         soft=None if spec.soft is None else (spec.soft.linear, spec.soft.quadratic),
         observer=spec.offset_free,
+        disturbance=Disturbance(spec.disturbance),
         solver=spec.solver,
     )
     law = NonlinearMPC(
