@@ -181,8 +181,12 @@ def test_the_users_backend_is_tried_first(monkeypatch: pytest.MonkeyPatch):
 
     monkeypatch.setenv("MUJOCO_GL", "osmesa")
     monkeypatch.setattr(subprocess, "run", run)
+    video._probe.cache_clear()
     assert rendering_backend() == "egl"
     assert asked == ["osmesa", "egl"]
+    assert rendering_backend() == "egl"
+    assert asked == ["osmesa", "egl", "osmesa"], "one that renders is not asked again"
+    video._probe.cache_clear()
 
 
 @pytest.fixture
