@@ -67,7 +67,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 
 def pytest_collection_finish() -> None:
-    """Leave all that is loaded out of the passes of Python's cycle collector, and have few: they took 9 % of the time."""
+    """Leave all that is loaded out of the passes of Python's cycle collector, and have few: they took 9 % of all."""
     freeze_for_good()
     gc.set_threshold(20_000, 20, 50)
 
