@@ -26,7 +26,7 @@ from scipy import sparse
 
 from mpc.constraints import Constraint, Penalty
 from mpc.ocp import Problem, Query, Unanswered
-from mpc.robust.relinearised import Relinearised
+from mpc.relinearised import Relinearised
 from mpc.solvers import QPSolver, refusal
 from mpc.staged import Staged
 from quadsim.controller import SOLVED
@@ -156,7 +156,7 @@ def _set_up(problem: Problem, query: Query) -> Callable[[Query], bool]:
     def is_solved(query: Query) -> bool:
         assert query.steps is not None
         rest = query.rest or problem.rest
-        answer = changing.solve(*query.steps, query.state, query.desired, query.u_before, rest.u)
+        answer = changing.solve(*query.steps, query.state, query.desired, query.u_before, rest)
         return answer.solution.status == SOLVED
 
     return is_solved
@@ -195,7 +195,7 @@ def _sides(problem: Problem) -> dict[Side, Constraint]:
     for place, (part, scales) in enumerate(zip(problem.every_constraint, _scales(problem), strict=True)):
         for row in range(scales.size if part.penalty is None else 0):
             matrices = {
-                name: None if matrix is None else matrix[[row]] / scales[row]
+                name: None if matrix is None else matrix[..., [row], :] / scales[row]
                 for name, matrix in (("C", part.C), ("D", part.D), ("E", part.E))
             }
             for upper in (False, True):

@@ -42,6 +42,7 @@ if TYPE_CHECKING:
     from scenarios.junit import write_junit as write_junit
     from scenarios.many_flights import campaign as campaign
     from scenarios.many_flights import replay as replay
+    from scenarios.many_flights import reproduce as reproduce
     from scenarios.many_flights import sweep as sweep
     from scenarios.schema.json_schema import scenario_schema as scenario_schema
     from scenarios.schema.scenario import Scenario as Scenario
@@ -72,7 +73,7 @@ _PLACES = {
     "scenarios.catalogue": ("Catalogue", "LibraryScenario", "catalogue", "scenarios"),
     "scenarios.flight": ("Flight",),
     "scenarios.junit": ("write_junit",),
-    "scenarios.many_flights": ("campaign", "replay", "sweep"),
+    "scenarios.many_flights": ("campaign", "replay", "reproduce", "sweep"),
     "scenarios.schema.json_schema": ("scenario_schema",),
     "scenarios.schema.scenario": ("Scenario",),
     "scenarios.self_check": ("doctor",),

@@ -8,6 +8,7 @@ from typing import Final, Protocol
 
 import numpy as np
 
+from quadsim.motion import Motion
 from quadsim.state import Array
 
 SOLVED: Final = "solved"
@@ -22,6 +23,7 @@ LAW_NAMES: Final = {
     "unconstrained": "unconstrained MPC",
     "constrained": "constrained MPC",
     "robust": "robust MPC",
+    "nonlinear": "nonlinear MPC",
     "lqr": "LQR",
     "pid": "PID",
     "geometric": "geometric control",
@@ -51,6 +53,10 @@ class Moment:
         time: t_k [s].
         phase: where the flight stands with the ground.
         acting: (4,) command in force at t_k, u(k-1) [rad/s]; None where it is the controller's own last one.
+        attitude: (4,) measured quaternion wxyz, body to world, sign continuous from period to period; None where it is
+            to be derived from the state.
+        body_rates: (3,) measured body rates [rad/s]; None as before.
+        motion: the reference from t_k on, where the course knows more than x, y, z, yaw.
 
     Examples:
         >>> import quadsim
@@ -61,6 +67,9 @@ class Moment:
     time: float = 0.0
     phase: Phase = Phase.FLYING
     acting: Array | None = None
+    attitude: Array | None = None
+    body_rates: Array | None = None
+    motion: Motion | None = None
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -108,6 +108,11 @@ def make_parser() -> argparse.ArgumentParser:
     _add_products(replay)
     replay.add_argument("--json", **_SUMMARY)
 
+    reproduce = command("reproduce", help="fly what papers publish: published, ours, difference; exit 1 if one is off")
+    reproduce.add_argument("paper", metavar="PAPER", nargs="?", help="name, or path to a TOML file (default: all)")
+    reproduce.add_argument("--junit", metavar="FILE", help="also write each number's verdict as JUnit XML")
+    reproduce.add_argument("--json", action="store_true", help="as JSON on stdout")
+
     _add_bench(command("bench", help="measure QP solvers, a flight, a film, and what controllers survive"))
 
     doctor = command("doctor", help="what this machine can do")

@@ -21,7 +21,7 @@ from quadsim.sim.plant import Plant
 from quadsim.state import Array
 from quadsim.vehicle import Vehicle
 from scenarios.build import build_controller, build_ground, build_plant, resolve
-from scenarios.courses.make import build_reference
+from scenarios.courses.make import build_motion, build_reference
 from scenarios.flight import Flight, Outputs, write_run
 from scenarios.gc_tuning import frozen
 from scenarios.parts.effects import build_computation
@@ -30,6 +30,7 @@ from scenarios.parts.navigation import build_navigation
 from scenarios.parts.randomness import generator
 from scenarios.parts.vehicle import build_initial_speeds, build_initial_state, build_vehicle
 from scenarios.progress import Progress, silent
+from scenarios.schema.controller import NonlinearSpec
 from scenarios.schema.scenario import Scenario
 
 
@@ -54,12 +55,13 @@ def fly_once(
         navigation: see `scenarios.parts.navigation.build_navigation`.
         progress: called with the number of periods flown, after each.
     """
+    motion = build_motion(scenario, vehicle)
     with frozen():
         return fly(
             plant,
             controller,
             reference,
-            initial_state=build_initial_state(scenario),
+            initial_state=build_initial_state(scenario, motion),
             initial_speeds=build_initial_speeds(scenario, vehicle),
             periods=scenario.periods,
             steps_per_period=scenario.steps_per_period,
@@ -68,6 +70,8 @@ def fly_once(
             rng=generator(scenario.seed, "computation"),
             ground=build_ground(scenario, vehicle),
             loss=scenario.lost.limits,
+            motion=motion,
+            quaternions=isinstance(scenario.controller, NonlinearSpec),
             progress=progress,
         )
 

@@ -9,13 +9,15 @@ from quadsim.errors import FileError, UnknownNameError
 
 LIBRARY: Final = Path(__file__).resolve().parent / "library"
 CAMPAIGNS: Final = Path(__file__).resolve().parent / "campaigns"
+PAPERS: Final = Path(__file__).resolve().parent / "papers"
 
-Group = Literal["paper", "courses", "air", "faults", "ground", "sensors", "other"]
+Group = Literal["paper", "papers", "courses", "air", "faults", "ground", "space", "sensors", "other"]
 
 CONTROLLERS: Final = {
     "unconstrained": "the paper's Sec. 4: a constant gain from the unconstrained optimum",
     "constrained": "the paper's Sec. 5: a QP's optimum in every period, tilt, rotor speeds and their steps bounded",
     "robust": "constrained, with soft bounds, rotor lag, delay, disturbances, heading and more, each switched on alone",
+    "nonlinear": "nonlinear MPC at any attitude: a quaternion model, sequential quadratic programming",
     "lqr": "infinite-horizon LQR on the hover model, following the reference's velocity",
     "pid": "cascaded PID, as autopilots fly it",
     "geometric": "geometric tracking control on SE(3)",
@@ -44,6 +46,16 @@ def campaign_names() -> list[str]:
 def campaign_path(name: str) -> Path:
     """The file of a campaign that ships; as `scenario_path`."""
     return _path("campaign", name, CAMPAIGNS)
+
+
+def paper_names() -> list[str]:
+    """Names of the papers whose numbers ship, sorted."""
+    return _names(PAPERS)
+
+
+def paper_path(name: str) -> Path:
+    """The file of a paper that ships; as `scenario_path`."""
+    return _path("paper", name, PAPERS)
 
 
 def _names(folder: Path) -> list[str]:

@@ -28,6 +28,8 @@ from mpc.heading import advance, turn
 from mpc.model import LinearModel
 from quadsim.controller import Moment
 from quadsim.state import (
+    ANGLE_RATES,
+    ANGLES,
     EULER,
     EULER_RATE,
     INDEX,
@@ -42,7 +44,7 @@ from quadsim.state import (
 Flags = NDArray[np.bool_]
 
 _GROUPS: Final = tuple(np.array(group) for group in (POSITION, VELOCITY, EULER, EULER_RATE))
-_RATES = _GROUPS[3]
+_ANGLES, _RATES = _GROUPS[2:]
 _TURNING: Final = np.array(EULER + EULER_RATE)
 _NO_RATES: Final = (math.nan, math.nan, math.nan)
 
@@ -51,6 +53,8 @@ PLAUSIBLE: Final = by_group(1e5, 1e3, 1e5, 1e3)
 """Largest magnitudes taken for a measurement [m, m/s, rad, rad/s]; a yaw counts its turns."""
 UNMOVED: Final = by_group(1e-3, 5e-3, 1e-3, 2e-2)
 """Distance of the prediction from repeated numbers beyond which these count as frozen [same]."""
+UPRIGHT: Final = 1.4
+"""Pitch [rad] up to which implausible rates of Euler angles are the measurement's fault, not the angles'."""
 NOISE: Final = by_group(0.01, 0.02, 0.005, 0.02)  # standard deviations ascribed to measured channels [same]
 ACCELERATION: Final = (1.0, 2.0)  # standard deviations of unmodelled accelerations [m/s^2, rad/s^2]
 UNKNOWN: Final = by_group(100.0, 10.0, 1.0, 1.0)
@@ -62,6 +66,21 @@ class CompletedMoment(Moment):
     """A moment whose state may in part be predicted rather than measured."""
 
     unseen: Array  # (12,) periods since each channel was measured; 0 for one that is
+
+
+def completed_moment(now: Moment, acting: Array, unseen: Array, known: Array) -> CompletedMoment:
+    """A moment with the command in force (4,) and which channels (12,) of the state `known` (12,) are not measured.
+
+    Its attitude and body rates are left out where the state's are predicted.  Next to a pitch of 90 deg the rates of
+    Euler angles are implausibly large; those of the body are not.
+    """
+    found = {**vars(now), "acting": acting, "unseen": unseen}
+    upright = abs(float(known[INDEX["pitch"]])) < UPRIGHT
+    if unseen[ANGLES].any():
+        found["attitude"] = None
+    if unseen[ANGLE_RATES].any() and upright:
+        found["body_rates"] = None
+    return CompletedMoment(**found)
 
 
 class StateCompletion:

@@ -27,7 +27,7 @@ import numpy as np
 
 from mpc.answer import ActuatorBounds, rejection, shifted
 from mpc.equilibrium import Trim
-from mpc.fallback.completion import PLAUSIBLE, CompletedMoment, StateCompletion
+from mpc.fallback.completion import PLAUSIBLE, CompletedMoment, StateCompletion, completed_moment
 from mpc.fallback.hover import HoverLaw
 from mpc.fallback.settings import USUAL_TILT
 from mpc.fallback.settings import FallbackSettings as FallbackSettings
@@ -101,7 +101,7 @@ class Guarded:
         """
         acting = self._before if now.acting is None or check_command(now.acting) is not None else now.acting
         known = self._completion.complete(state, acting, self.trim, free=now.phase is Phase.FLYING)
-        completed = CompletedMoment(**{**vars(now), "acting": acting.copy(), "unseen": self._completion.unseen.copy()})
+        completed = completed_moment(now, acting.copy(), self._completion.unseen.copy(), known)
         status, answer = self._ask(completed, known, reference)
         if now.phase in GROUNDED:
             self._forget()

@@ -6,7 +6,9 @@ of the cost add to them, other constraints add rows, and soft rows add slacks af
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import scipy.linalg
@@ -14,7 +16,7 @@ import scipy.linalg
 from mpc.constraints import Rows
 from mpc.ocp import Problem, Rest
 from mpc.paper.cost import cost
-from mpc.paper.prediction import Prediction, prediction
+from mpc.paper.prediction import Prediction, condense_stages, prediction
 from mpc.qp import QP, Point, QPRows, Solution, Vectors
 from quadsim.state import Array, Indices
 
@@ -63,6 +65,8 @@ def row_maps(rows: Rows | QPRows, maps: Prediction) -> RowMaps:
     Psi, Phi = maps.Psi.reshape(-1, n, maps.Psi.shape[1]), maps.Phi.reshape(-1, n, n)
     N, nu = len(Psi), Psi.shape[2] // len(Psi)
     # Rows of states alone are for x(k+1) .. x(k+N), the others for x(k) .. x(k+N-1).
+    if rows.C.ndim == 3:
+        raise ValueError("a condensed QP takes rows that are the same at all steps; solve these by the staged one")
     later, now = (rows.C * chosen[:, None] for chosen in (rows.of_states, ~rows.of_states))
     of_inputs, of_state = later @ Psi, later @ Phi
     of_inputs[1:] += now @ Psi[:-1]
@@ -116,6 +120,20 @@ class Condensed:
         nothing = np.zeros((N, problem.objective.C_r.shape[0]))
         self.qp = self._blank.with_vectors(self.vectors(np.zeros(model.n), nothing, model.u_bar))
 
+    @cached_property
+    def _changing(self) -> _Changing:
+        """What does not change where the model does."""
+        objective, blank = self._problem.objective, self._blank
+        factor = np.asarray(np.linalg.cholesky(objective.Q_y).T, float)
+        return _Changing(
+            root=factor @ objective.C_r,
+            target=factor,
+            root_end=_root(objective.terminal_weights[0]),
+            H=_input_hessian(self._problem),
+            P=np.array(blank.P),
+            G=np.array(blank.G, order="C"),
+        )
+
     def vectors(self, state: Array, desired: Array, u_before: Array, rest: Rest | None = None) -> Vectors:
         """See `mpc.qp.Formulation.vectors`."""
         terms, values, rows = self._cost, self._values, self._rows
@@ -127,6 +145,53 @@ class Condensed:
         shift = rows.C @ x_s + rows.D @ u_s + values.of_state @ dx - self._of_rest @ u_s
         shift[0] += rows.E @ (u_s - u_before)
         return Vectors(c=c, b=self._blank.b, h_l=(rows.lower - shift).ravel(), h_u=(rows.upper - shift).ravel())
+
+    def posed(
+        self, A: Array, B: Array, c: Array, state: Array, desired: Array, u_before: Array, rest: Rest
+    ) -> tuple[QP, Callable[[Array], Array]]:
+        """See `mpc.qp.ChangingFormulation.posed`: in absolute states and inputs, with a model that changes."""
+        objective, rows, m = self._problem.objective, self._rows, self._inputs
+        N, n, nu = B.shape
+        fixed, count = self._changing, len(rows.C)
+        start = np.zeros((1, n, m + 1))
+        start[0, :, -1] = state
+        # Columns are the inputs of all steps, and the last is what no input changes.
+        S = condense_stages(start, A[None], B[None], c[None])[0]
+        R = fixed.root @ S[1:N]
+        R[:, :, -1] -= desired[:-1] @ fixed.target.T
+        stacked = R.reshape(-1, m + 1)
+        if fixed.root_end is not None:
+            end = fixed.root_end @ S[N]
+            end[:, -1] -= fixed.root_end @ objective.terminal_target(desired[-1], rest.x)
+            stacked = np.concatenate([stacked, end])
+        square = stacked.T @ stacked
+        square *= 2.0
+        P, gradient = fixed.P.copy(order="F"), self._linear.copy()
+        np.add(square[:m, :m], fixed.H, out=P[:m, :m])
+        gradient[:m] += square[:m, m]
+        gradient[:m].reshape(N, nu)[:] -= rest.u @ (2.0 * objective.Q_u)
+        gradient[:nu] -= 2.0 * objective.move_weight @ u_before
+        blank = self._blank
+        G, h_l, h_u = blank.G, blank.h_l, blank.h_u
+        if count:
+            values = _row_values(rows, S)
+            values[0, :, -1] -= rows.E @ u_before
+            filled, known = fixed.G.copy(), values[:, :, m]
+            filled.reshape(N, count, -1)[:, :, :m] = values[:, :, :m]
+            G, h_l, h_u = np.asfortranarray(filled), (rows.lower - known).ravel(), (rows.upper - known).ravel()
+        qp = QP(
+            P=P,
+            c=gradient,
+            A=blank.A,
+            b=blank.b,
+            G=G,
+            h_l=h_l,
+            h_u=h_u,
+            x_l=blank.x_l,
+            x_u=blank.x_u,
+            later=blank.later,
+        )
+        return qp, lambda x: S[1:, :, :m] @ x[:m] + S[1:, :, m]
 
     def inputs(self, x: Array) -> Array:
         """See `mpc.qp.Formulation.inputs`."""
@@ -152,6 +217,44 @@ class Condensed:
             z_slacks = np.minimum(np.abs(multipliers[:, soft]) - l1 - 2.0 * l2 * slacks, 0.0)
             x, z_box = np.concatenate((x, slacks.ravel())), np.concatenate((z_box, z_slacks.ravel()))
         return Point(x, self._blank.b, z, z_box)
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Changing:
+    """The fixed parts of a QP whose model changes; copies of P and G are filled in each time."""
+
+    root: Array  # (n_r, n) of a state's cost |root x - target y_d|^2
+    target: Array  # (n_r, n_r)
+    root_end: Array | None  # (r, n) of the last state's; None where that costs nothing
+    H: Array  # (N nu, N nu) of inputs and their changes
+    P: Array  # (N nu + N m_s, N nu + N m_s)
+    G: Array  # (N m, N nu + N m_s)
+
+
+def _root(weight: Array) -> Array | None:
+    """(r, n) whose square is a weight (n, n) of rank r; None for 0."""
+    values, vectors = np.linalg.eigh(weight)
+    there = values > 1e-14 * max(values[-1], 0.0)
+    return (vectors[:, there] * np.sqrt(values[there])).T if there.any() else None
+
+
+def _input_hessian(problem: Problem) -> Array:
+    """Of inputs and their changes."""
+    objective, N, nu = problem.objective, problem.horizon, problem.model.nu
+    steps = np.kron(np.eye(N) - np.eye(N, k=-1), np.eye(nu))
+    moves = steps.T @ np.kron(np.eye(N), objective.move_weight) @ steps
+    return np.asarray(2.0 * (np.kron(np.eye(N), objective.Q_u) + moves))
+
+
+def _row_values(rows: QPRows, S: Array) -> Array:
+    """(N, m, N nu + 1) of rows, of the states' slopes S (N + 1, n, N nu + 1) by the inputs and 1."""
+    N, nu = len(S) - 1, (S.shape[2] - 1) // (len(S) - 1)
+    values = (rows.C * rows.of_states[:, None]) @ S[1:] + (rows.C * ~rows.of_states[:, None]) @ S[:-1]
+    by_step = values[:, :, :-1].reshape(N, len(rows.C), N, nu)
+    by_step[range(N), :, range(N)] += rows.D + rows.E
+    by_step[range(1, N), :, range(N - 1)] -= rows.E
+    values[:, :, :-1] = by_step.reshape(N, len(rows.C), -1)
+    return values
 
 
 def _one_step_later(sizes: list[int], N: int) -> Indices:

@@ -45,3 +45,19 @@ def rollout(model: LinearModel, states: Array, plans: Array) -> Array:
         state = state @ model.A.T + (plans[:, i] - model.u_bar) @ model.B.T
         predicted[:, i] = state
     return predicted
+
+
+def condense_stages(start: Array, A: Array, B: Array, c: Array) -> Array:
+    """(J, L + 1, n, m + 1) states of J stages of L steps, as functions of the variables, the inputs the last, and of 1.
+
+    From the first of them (J, n, m + 1) by A (J, L, n, n), B (J, L, n, nu) and c (J, L, n).
+    """
+    (count, steps, n, nu), columns = B.shape, start.shape[2]
+    states = np.empty((count, steps + 1, n, columns))
+    states[:, 0] = start
+    for t in range(steps):
+        np.matmul(A[:, t], states[:, t], out=states[:, t + 1])
+        at = columns - 1 - (steps - t) * nu
+        states[:, t + 1, :, at : at + nu] = B[:, t]
+        states[:, t + 1, :, -1] += c[:, t]
+    return states

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 
 from mpc.constraints import Penalty
-from mpc.robust.observer import ObserverSettings
+from mpc.observer import ObserverSettings
 from quadsim.errors import ParameterError
 from quadsim.state import Array
 

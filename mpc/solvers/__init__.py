@@ -30,6 +30,7 @@ class SolverEntry:
     backend: str  # `module:class` of the back end in this folder, imported when it is first used
     package: str  # distribution that it needs, and what it is imported as
     description: str  # one line
+    changing: str = ""  # the back end where matrices change, if it is another
     extra: str = "solvers"  # the extra of this project that installs the package; empty for one that is always there
 
     @property
@@ -50,13 +51,19 @@ class SolverEntry:
 
 SOLVERS: Final = {
     "piqp-multistage": SolverEntry(
-        Staged, "piqp_backends:PiqpMultistage", "piqp", "PIQP, multistage, partially condensed (default)", extra=""
+        Staged,
+        "piqp_backends:PiqpMultistage",
+        "piqp",
+        "PIQP, multistage, partially condensed (default)",
+        "piqp_backends:PiqpChanging",
+        extra="",
     ),
     "piqp-multistage-1": SolverEntry(
         partial(Staged, steps_per_stage=1),
         "piqp_backends:PiqpMultistage",
         "piqp",
         "PIQP, multistage, one stage per step",
+        "piqp_backends:PiqpChanging",
         extra="",
     ),
     "piqp-dense": SolverEntry(
@@ -64,6 +71,7 @@ SOLVERS: Final = {
         "piqp_backends:PiqpDense",
         "piqp",
         "PIQP, dense Cholesky, on the paper's condensed matrices",
+        "piqp_backends:PiqpDenseChanging",
         extra="",
     ),
     "daqp": SolverEntry(
@@ -103,8 +111,8 @@ INVALID_DATA: Final = "invalid_data"
 """Status of a query with numbers that no back end is asked about."""
 
 
-def make_backend(name: str) -> Backend:
-    """A fresh back end of a named solver.
+def make_backend(name: str, *, changing: bool = False) -> Backend:
+    """A fresh back end of a named solver, for matrices that are `changing` or not.
 
     Raises:
         UnknownNameError: there is no such solver.
@@ -115,7 +123,7 @@ def make_backend(name: str) -> Backend:
     entry = SOLVERS[name]
     if not entry.installed:
         raise MissingPackageError(f"the solver {name!r}", entry.package, extra=entry.extra)
-    module, _, kind = entry.backend.partition(":")
+    module, _, kind = ((changing and entry.changing) or entry.backend).partition(":")
     backend: Backend = getattr(importlib.import_module(f"{__name__}.{module}"), kind)()
     return backend
 

@@ -58,6 +58,10 @@ class _Piqp:
         """See `mpc.qp.Backend.solve`."""
         return solve(self._solver, vectors)
 
+    def solve_changed(self, qp: QP) -> Solution:
+        """Solve another QP of the same pattern."""
+        return solve(self._solver, qp.vectors, P=qp.P, A=qp.A, G=qp.G)
+
 
 class PiqpDense(_Piqp):
     """PIQP with a dense Cholesky factorisation, for dense QPs."""
@@ -79,14 +83,21 @@ class PiqpChanging(PiqpMultistage):
 
     def __init__(self) -> None:
         super().__init__()
-        settings = self._solver.settings
-        settings.preconditioner_iter = CHANGING_SCALINGS
-        settings.eps_abs = settings.eps_duality_gap_abs = CHANGING_TOLERANCE
-        settings.eps_rel = settings.eps_duality_gap_rel = 0.1 * CHANGING_TOLERANCE
+        _allow_changes(self._solver.settings)
 
-    def solve_changed(self, qp: QP) -> Solution:
-        """Solve another QP of the same pattern."""
-        return solve(self._solver, qp.vectors, P=qp.P, A=qp.A, G=qp.G)
+
+class PiqpDenseChanging(PiqpDense):
+    """The dense one for QPs whose matrices change."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        _allow_changes(self._solver.settings)
+
+
+def _allow_changes(settings: Any) -> None:
+    settings.preconditioner_iter = CHANGING_SCALINGS
+    settings.eps_abs = settings.eps_duality_gap_abs = CHANGING_TOLERANCE
+    settings.eps_rel = settings.eps_duality_gap_rel = 0.1 * CHANGING_TOLERANCE
 
 
 def solve(solver: Any, vectors: Vectors, **matrices: Matrix) -> Solution:

@@ -18,6 +18,11 @@ WRENCH: Final = {**{f"force_{axis}": "N" for axis in "xyz"}, **{f"torque_{axis}"
 WIND: Final = {f"wind_{axis}": "m/s" for axis in "xyz"}
 """Columns of the wind, world, with their units; only where there is any."""
 
+QUATERNION: Final = {f"q{axis}": "-" for axis in "wxyz"}
+"""Columns of the attitude, body to world, with their units; only of flights that may turn upside down."""
+BODY_RATES: Final = {f"body_rate_{axis}": "rad/s" for axis in "xyz"}
+"""Columns of the body rates, with their units; likewise."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class ControlLog:
@@ -39,6 +44,8 @@ class ControlLog:
         primal_residual: (K,) as reported by the back end.
         dual_residual: (K,) as reported by the back end.
         delay: (K,) simulated time from the measurement to the command [s].
+        attitude: (K, 4) quaternion wxyz as measured, sign continuous; None where Euler angles do.
+        body_rates: (K, 3) as measured [rad/s]; None where Euler angles do.
     """
 
     t: Array
@@ -56,6 +63,8 @@ class ControlLog:
     primal_residual: Array
     dual_residual: Array
     delay: Array
+    attitude: Array | None = None
+    body_rates: Array | None = None
 
     @property
     def measured_perfectly(self) -> bool:
@@ -92,6 +101,8 @@ class PlantLog:
         speeds: (M, 4) rotor speeds from t on [rad/s]; rotors that lag pass through them.
         wrench: (M, 6) external force, world [N], and torque, body frame [N m], from t on; None where there is none.
         wind: (M, 3) velocity of the air, world [m/s]; None without wind.
+        attitude: (M, 4) true quaternion wxyz; None where Euler angles do.
+        body_rates: (M, 3) true body rates [rad/s]; None where Euler angles do.
     """
 
     t: Array
@@ -99,6 +110,8 @@ class PlantLog:
     speeds: Array
     wrench: Array | None = None
     wind: Array | None = None
+    attitude: Array | None = None
+    body_rates: Array | None = None
 
     def every(self, stride: int) -> PlantLog:
         """Each `stride`-th row, from the first on."""

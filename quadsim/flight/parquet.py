@@ -16,7 +16,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from quadsim.errors import FileError
-from quadsim.flight.log import WIND, WRENCH, ControlLog, FlightLog, PlantLog, TimingLog
+from quadsim.flight.log import BODY_RATES, QUATERNION, WIND, WRENCH, ControlLog, FlightLog, PlantLog, TimingLog
 from quadsim.state import REFERENCE_NAMES, REFERENCE_UNITS, STATE_NAMES, STATE_UNITS, Array
 from quadsim.vehicle import N_ROTORS
 
@@ -46,6 +46,13 @@ def _state_columns(state: Array, prefix: str = "") -> Iterator[_Column]:
     return _columns(state, (prefix + name for name in STATE_NAMES), STATE_UNITS)
 
 
+def _optional(*groups: tuple[Array | None, Mapping[str, str]]) -> Iterator[_Column]:
+    """The columns of those groups that are there, each with its names and units."""
+    for rows, units in groups:
+        if rows is not None:
+            yield from _columns(rows, units, units.values())
+
+
 def _table(columns: Sequence[_Column], metadata: Mapping[str, str]) -> pa.Table:
     arrays, schema = [], []
     for name, unit, values in columns:
@@ -66,6 +73,7 @@ def _flight_table(log: ControlLog, metadata: Mapping[str, str]) -> pa.Table:
         *((name, "-", getattr(log, name)) for name in _COUNTS),
         *((name, unit, getattr(log, name)) for name, unit in _NUMBERS.items()),
         *([] if log.measured_perfectly else _state_columns(log.truth, _TRUE)),
+        *_optional((log.attitude, QUATERNION), (log.body_rates, BODY_RATES)),
     ]
     before = ",".join(repr(float(speed)) for speed in log.speeds_before)
     return _table(columns, {**metadata, "speeds_before": before})
@@ -73,8 +81,9 @@ def _flight_table(log: ControlLog, metadata: Mapping[str, str]) -> pa.Table:
 
 def _plant_table(log: PlantLog, metadata: Mapping[str, str]) -> pa.Table:
     columns = [("t", "s", log.t), *_state_columns(log.state), *_columns(log.speeds, _TURNING, _SPEED_UNITS)]
-    for rows, units in ((log.wrench, WRENCH), (log.wind, WIND)):
-        columns += [] if rows is None else _columns(rows, units, units.values())
+    columns += _optional(
+        (log.wrench, WRENCH), (log.wind, WIND), (log.attitude, QUATERNION), (log.body_rates, BODY_RATES)
+    )
     return _table(columns, metadata)
 
 
@@ -188,6 +197,8 @@ def read_log(directory: Path, *, reason: str | None = None) -> FlightLog:
             phase=_texts(flight, "phase"),
             **{name: _numbers(flight, name, np.int64) for name in _COUNTS},
             **{name: _numbers(flight, name) for name in _NUMBERS},
+            attitude=_stack_if_there(flight, list(QUATERNION)),
+            body_rates=_stack_if_there(flight, list(BODY_RATES)),
         )
         plant_log = PlantLog(
             t=_numbers(plant, "t"),
@@ -195,6 +206,8 @@ def read_log(directory: Path, *, reason: str | None = None) -> FlightLog:
             speeds=_stack(plant, _TURNING),
             wrench=_stack_if_there(plant, list(WRENCH)),
             wind=_stack_if_there(plant, list(WIND)),
+            attitude=_stack_if_there(plant, list(QUATERNION)),
+            body_rates=_stack_if_there(plant, list(BODY_RATES)),
         )
         timing_log = TimingLog(**{name: _numbers(timing, name) for name in _TIMES})
         predicted = _read_predicted(directory)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time as clock
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -14,6 +14,7 @@ from quadsim.controller import MISSED, Command, Controller, Moment, Phase
 from quadsim.errors import FlightError, InterruptedFlightError, LostError
 from quadsim.flight.log import ControlLog, FlightLog, PlantLog, TimingLog
 from quadsim.flight.lost import check_loss
+from quadsim.motion import Motion
 from quadsim.sim.computation import Computation
 from quadsim.sim.physics import Segment, physics_to_state
 from quadsim.sim.plant import Plant
@@ -39,6 +40,8 @@ def fly(
     rng: np.random.Generator | None = None,
     ground: PhaseMonitor | None = None,
     loss: Mapping[str, float] | None = None,
+    motion: Motion | None = None,
+    quaternions: bool = False,
     progress: Callable[[int], None] | None = None,
 ) -> FlightLog:
     """Fly a number of control periods.
@@ -57,9 +60,11 @@ def fly(
         navigation: measured or estimated state for the controller; the true state where absent.
         computation: how long commands take, in simulated time; none where absent.
         rng: what `computation` draws from.
-        ground: what knows where the flight stands with the ground; it is flying throughout where absent.
+        ground: what knows where the flight stands with ground and obstacles; it is flying throughout where absent.
         loss: limits by the names of `quadsim.flight.lost.CRITERIA`, checked once per control period until it has
             crashed; none where absent.
+        motion: of the reference from t_0 on, for controllers that use it; absent where only positions are known.
+        quaternions: whether attitude and body rates are logged beside Euler angles and their rates.
         progress: called with the number of periods flown, after each.
 
     Returns:
@@ -74,6 +79,7 @@ def fly(
         ground.reset()
     truth = np.empty((periods, N_STATES))
     states = np.empty((periods, N_STATES))
+    attitudes, rates = np.empty((periods, 4)), np.empty((periods, 3))
     start = plant.physics
     heights = np.minimum(reference[:, REFERENCE_NAMES.index("z")], initial_state[INDEX["z"]])
     lowest = np.minimum.accumulate(heights).tolist()
@@ -85,13 +91,24 @@ def fly(
     try:
         for k in range(periods):
             truth[k] = plant.state()
-            since = physics_to_state(samples[-1].segment.physics) if ground and samples else truth[k : k + 1]
             states[k] = truth[k] if navigation is None else navigation.state()
+            attitude, body_rates = plant.attitude if navigation is None else navigation.attitude
+            attitudes[k], rates[k] = attitude, body_rates
             preview = reference[k + 1 : k + 1 + controller.horizon]
-            phase = Phase.FLYING if ground is None else ground.advance(since, preview)
+            phase = Phase.FLYING
+            if ground is not None:
+                since = samples[-1].segment.physics if samples else start[None]
+                phase = ground.advance(since[:, 0], physics_to_state(since), preview)
             if loss is not None and phase is not Phase.CRASHED:
                 check_loss(loss, k * period, truth[k], reference[k], lowest[k])
-            now = Moment(time=k * period, phase=phase, acting=acting)
+            now = Moment(
+                time=k * period,
+                phase=phase,
+                acting=acting,
+                attitude=attitude,
+                body_rates=body_rates,
+                motion=None if motion is None else motion.after(k),
+            )
             started = clock.perf_counter()
             command = controller.step(now, states[k], preview)
             step_s = clock.perf_counter() - started
@@ -135,6 +152,11 @@ def fly(
         ended = InterruptedFlightError(time=len(samples) * period)
     count = len(samples)
     control = _control_log(samples, states[:count], truth[:count], reference[:count], initial_speeds, period)
+    plant_log = _plant_log(samples, start, initial_speeds, float(initial_state[INDEX["yaw"]]), plant.timestep)
+    if quaternions:
+        control = replace(control, attitude=attitudes[:count], body_rates=rates[:count])
+        physics = np.concatenate([start[None], *(sample.segment.physics for sample in samples)])
+        plant_log = replace(plant_log, attitude=physics[:, 4:8], body_rates=physics[:, 11:14])
     commands = [sample.command for sample in samples]
     return FlightLog(
         control=control,
@@ -143,7 +165,7 @@ def fly(
             solve_ms=np.array([1e3 * command.solve_s for command in commands]),
             step_ms=np.array([1e3 * sample.step_s for sample in samples]),
         ),
-        plant=_plant_log(samples, start, initial_speeds, float(initial_state[INDEX["yaw"]]), plant.timestep),
+        plant=plant_log,
         predicted=_predict(controller, control.state, commands),
         reason=None if ended is None else str(ended),
         interrupted=isinstance(ended, InterruptedFlightError),

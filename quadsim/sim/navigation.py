@@ -23,6 +23,7 @@ from quadsim.state import (
     VELOCITIES,
     Array,
     body_to_euler_rates,
+    euler_to_quaternion,
     quaternion_to_euler,
 )
 from quadsim.vehicle import Vehicle
@@ -34,6 +35,10 @@ class Navigation:
     Without an estimator the controller receives the last sample of each sensor that has arrived, however old, and the
     truth where there is no sensor; until the first sample arrives, the truth at t = 0.  With an estimator it
     receives the estimate, from the sensors that there are.
+
+    Attributes:
+        attitude: quaternion (4,), wxyz, body to world, sign continuous, and body rates (3,) [rad/s], of the last
+            `state`.
 
     Each sensor draws from a generator of its own, so that adding one, or its noise, leaves the others' draws alone.
     """
@@ -89,6 +94,7 @@ class Navigation:
             yaw: near which turn the yaw is [rad].
         """
         self._step, self._yaw, self._physics = 0, yaw, physics.copy()
+        self.attitude: tuple[Array, Array] = physics[4:8].copy(), physics[11:14].copy()
         self._held = {name: truth(name, physics[None])[0] for name in SensorName}
         self._in_flight: list[Sample] = []
         for sampler in self._samplers:
@@ -127,6 +133,9 @@ class Navigation:
                 self._held[sample.sensor] = sample.value
             received = self._held | {name: truth(name, self._physics[None])[0] for name in self._perfect}
         euler = received[SensorName.ATTITUDE].copy()
+        quaternion = euler_to_quaternion(euler) if self._filter is None else mean[MEAN_QUATERNION]
+        sign = -1.0 if quaternion @ self.attitude[0] < 0.0 else 1.0
+        self.attitude = sign * quaternion, received[SensorName.RATES].copy()
         state = np.empty(N_STATES)
         state[POSITIONS] = received[SensorName.POSITION]
         state[VELOCITIES] = received[SensorName.VELOCITY]

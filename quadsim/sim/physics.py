@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -20,6 +20,9 @@ from quadsim.state import (
     body_to_euler_rates,
     quaternion_to_euler,
 )
+
+Integrator = Literal["mujoco", "rk4"]
+"""Who takes the physics steps: MuJoCo, or `quadsim.sim.rigid_body`."""
 
 
 def steps_per_period(control_period: float, timestep: float) -> int:

@@ -15,12 +15,14 @@ from mujoco.rollout import Rollout
 
 from quadsim.controller import check_command
 from quadsim.errors import CommandError, DivergenceError, ForceError, ParameterError
-from quadsim.sim.airframe import BODY, compile_model, outline
+from quadsim.sim.airframe import BODY, compile_model, obstacle_body, outline
 from quadsim.sim.effects import Effects, Force, Load, Payload, PayloadChange, RotorChange, RotorDynamics
 from quadsim.sim.effects.forces import StepForces
 from quadsim.sim.effects.load import apply_mass, mass_properties
 from quadsim.sim.effects.wind import Air, WindField
-from quadsim.sim.physics import Segment, physics_to_state
+from quadsim.sim.physics import Integrator, Segment, physics_to_state
+from quadsim.sim.rigid_body import RigidBody, check_free
+from quadsim.space import Obstacle
 from quadsim.state import (
     ANGLE_RATES,
     ANGLES,
@@ -52,6 +54,8 @@ _AS_THE_FILE_SAYS: Final = Load()
 class Plant:
     """A vehicle in MuJoCo: fourth-order Runge-Kutta at a fixed step, commands held in between.
 
+    With `integrator="rk4"` the steps are those of `quadsim.sim.rigid_body` instead.
+
     Without effects rotors have their commanded speed at once, and a whole hold is one call of MuJoCo.  With effects
     that depend on how the vehicle moves, each step is taken by itself, with forces evaluated in its middle (second
     order).  Use as a context manager; it owns native memory.
@@ -73,7 +77,9 @@ class Plant:
         changes: Sequence[RotorChange | PayloadChange] = (),
         wind: WindField | None = None,
         forces: Sequence[Force] = (),
+        obstacles: Sequence[Obstacle] = (),
         rng: np.random.Generator | None = None,
+        integrator: Integrator = "mujoco",
     ) -> None:
         self.vehicle = vehicle
         self.timestep = timestep
@@ -89,7 +95,9 @@ class Plant:
             reweighed=self._reweighed,
             body_drag=air.body_drag,
             air_density=air.density,
+            obstacles=obstacles,
         )
+        self._moving = [obstacle for obstacle in obstacles if obstacle.moves]
         self._speed_range = (vehicle.speed_min, vehicle.speed_max) if limit_speeds else (0.0, math.inf)
         self._data = mujoco.MjData(self.model)
         mujoco.set_mju_user_warning(_discard)
@@ -97,7 +105,13 @@ class Plant:
         self._physics = np.zeros((1, mujoco.mj_stateSize(self.model, _FULL)))
         self._yaw = 0.0
         self._wind, self._own = wind, tuple(forces)
+        if integrator == "rk4":
+            check_free(effects, changes, obstacles)
+        self._integrator = integrator
         self._by_step = effects.follows_state or wind is not None or bool(self._own)
+        self._by_step = self._by_step or bool(self._moving) or integrator == "rk4"
+        bodies = [self.model.body(obstacle_body(obstacle)).id for obstacle in self._moving]
+        self._mocaps = self.model.body_mocapid[bodies]
         ordered = sorted(changes, key=lambda change: change.time)
         self._changes = [(math.ceil(change.time / timestep - 1e-6), change) for change in ordered]
         self._rng = rng if rng is not None else np.random.default_rng(0)
@@ -169,11 +183,21 @@ class Plant:
         shape = outline(self.vehicle)
         return StepForces(self.vehicle, self.effects, timestep=self.timestep, floor=shape.floor, disc=shape.disc)
 
+    @cached_property
+    def _body(self) -> RigidBody:
+        return RigidBody(self.vehicle, self._forces, self.timestep)
+
     def state(self) -> Array:
         """(12,) the true state now, yaw unwrapped since the last reset."""
         state = physics_to_state(self._physics, self._yaw)[0]
         self._yaw = float(state[EULER[2]])
         return state
+
+    @property
+    def attitude(self) -> tuple[Array, Array]:
+        """The true attitude now (4,), wxyz, body to world, sign continuous, and the body rates (3,) [rad/s]."""
+        physics = self._physics[0]
+        return physics[4:8].copy(), physics[11:14].copy()
 
     def applied(self, speeds: Array) -> Array:
         """The rotor speeds (4,) [rad/s] that a command asks for: it saturates at what rotors can do, and at zero."""
@@ -228,10 +252,14 @@ class Plant:
             before, self._speeds = speeds[:steps].copy(), speeds[steps].copy()
             middle, slopes = speeds[steps + 1 :], slopes[steps + 1 :]
         thrusts = self._efficiency * self.vehicle.thrust_coefficient * np.square(middle)
+        if self.effects.thrust_noise is not None:
+            largest = self.vehicle.thrust_coefficient * self.vehicle.speed_max**2
+            thrusts = self.effects.thrust_noise.applied(thrusts, largest, self._rng)
         wrench = wind = None
         if self._by_step:
             wind = None if self._wind is None else self._wind.advance(steps)
-            trajectory, wrench = self._take_steps(thrusts, middle, slopes, wind)
+            take = self._take_steps if self._integrator == "mujoco" else self._integrate
+            trajectory, wrench = take(thrusts, middle, slopes, wind)
         else:
             trajectory = self._run(thrusts)
         self._check(trajectory)
@@ -261,19 +289,20 @@ class Plant:
         model, data, steps = self.model, self._data, len(thrusts)
         mujoco.mj_setState(model, data, self._physics[0], _FULL)
         trajectory, wrench = np.empty((steps, self._physics.shape[1])), np.empty((steps, 6))
-        disturbance = self.effects.disturbance
-        noises = None if disturbance is None else disturbance.draw(steps, self.timestep, self._rng).tolist()
+        noises = self._noises(steps)
         air = np.zeros((steps, 3)) if wind is None else wind
         drags = self.effects.air is not None and self.effects.air.body_drag is not None
         moving_air = wind is not None and drags
-        there = self._efficiency > 0.0  # a lost propeller neither drags nor carries momentum
-        of_rotors = self._forces.of_rotors(speeds * there, slopes * there).tolist()
+        of_rotors = self._of_rotors(speeds, slopes)
         forces, step, velocity_before = self._forces.midway, mujoco.mj_step, self._velocity_before
         # Through memory views, which take and give a few numbers in a third of an array's time.
         qpos, qvel, fluid = data.qpos.data, data.qvel.data, data.qfrc_fluid
         applied, control, air_of_model = (_bytes(array) for array in (data.qfrc_applied, data.ctrl, model.opt.wind))
         states, wrenches = _bytes(trajectory).cast("d"), _bytes(wrench)
         row = trajectory.shape[1]
+        if self._moving:
+            times = self.time + self.timestep * np.arange(steps, dtype=np.float64)
+            places = np.stack([obstacle.places(times) for obstacle in self._moving], axis=1)
         for i, (thrust, rotors, breeze) in enumerate(zip(thrusts.tolist(), of_rotors, air.tolist(), strict=True)):
             velocity = qvel.tolist()
             acting: Sequence[float] = forces(qpos.tolist(), velocity, velocity_before, thrust, rotors, breeze)
@@ -281,29 +310,59 @@ class Plant:
             if noises is not None:
                 acting = list(map(add, acting, noises[i]))
             if self._own:
-                acting = list(map(add, acting, self._own_wrench(i * self.timestep)))
+                acting = list(map(add, acting, self._own_wrench(i * self.timestep, [*qpos, *qvel])))
             _SIX.pack_into(applied, 0, *acting)
             _SIX.pack_into(wrenches, i * _SIX.size, *acting)
             _FOUR.pack_into(control, 0, *thrust)
             if moving_air:
                 _THREE.pack_into(air_of_model, 0, *breeze)
+            if self._moving:
+                data.mocap_pos[self._mocaps] = places[i]
             step(model, data)
             first = row * i
             states[first + 1 : first + 8], states[first + 8 : first + row] = qpos, qvel
             if drags:
                 wrench[i] += fluid
         self._velocity_before = velocity_before
-        start = self._physics[0, :1]
-        trajectory[:, 0] = np.add.accumulate(np.concatenate([start, np.full(steps, self.timestep)]))[1:]
+        trajectory[:, 0] = self._clock(steps)
         return trajectory, wrench
 
-    def _own_wrench(self, since: float) -> list[float]:
+    def _integrate(self, thrusts: Array, speeds: Array, slopes: Array, wind: Array | None) -> tuple[Array, Array]:
+        """The same as `_take_steps` without MuJoCo, the forces evaluated at each stage of the step."""
+        steps = len(thrusts)
+        noises, of_rotors = self._noises(steps) or [[0.0] * 6] * steps, self._of_rotors(speeds, slopes)
+        air = [[0.0] * 3] * steps if wind is None else wind.tolist()
+        state, states, wrenches = self._physics[0, 1:].tolist(), [], []
+        for i, (thrust, rotors, breeze, held) in enumerate(zip(thrusts.tolist(), of_rotors, air, noises, strict=True)):
+            if self._own:
+                held = list(map(add, held, self._own_wrench(i * self.timestep, state)))
+            state, acted = self._body.advance(state, thrust, rotors, breeze, held)
+            states.append(state)
+            wrenches.append(acted)
+        return np.column_stack([self._clock(steps), states]), np.array(wrenches)
+
+    def _clock(self, steps: int) -> Array:
+        """(M,) times after each of the next steps [s], added up as MuJoCo does."""
+        times: Array = np.add.accumulate(np.concatenate([self._physics[0, :1], np.full(steps, self.timestep)]))[1:]
+        return times
+
+    def _noises(self, steps: int) -> list[list[float]] | None:
+        disturbance = self.effects.disturbance
+        return None if disturbance is None else disturbance.draw(steps, self.timestep, self._rng).tolist()
+
+    def _of_rotors(self, speeds: Array, slopes: Array) -> list[list[float]]:
+        there = self._efficiency > 0.0  # a lost propeller neither drags nor carries momentum
+        return self._forces.of_rotors(speeds * there, slopes * there).tolist()
+
+    def _own_wrench(self, since: float, motion: Sequence[float]) -> list[float]:
         """The sum of the forces of one's own, world [N] and body frame [N m], so long [s] after the hold's begin.
+
+        `motion` (13,) is MuJoCo's state then, but for the time.
 
         Raises:
             ForceError: one is not six finite numbers.
         """
-        physics, time = np.concatenate([[0.0], self._data.qpos, self._data.qvel]), self.time + since
+        physics, time = np.array([0.0, *motion]), self.time + since
         state, total = physics_to_state(physics[None])[0], np.zeros(6)
         for force in self._own:
             wrench = np.asarray(force(time, state.copy()), float)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final
@@ -11,6 +12,8 @@ import numpy as np
 from quadsim.state import Array
 
 EXACT: Final = (0.0, 0.0, 0.0, 0.0)
+Derivatives = Callable[[Array], tuple[Array, Array]]
+"""Times (M,) [s] -> velocity (M, 3) [m/s] and acceleration (M, 3) [m/s^2], world."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -21,6 +24,8 @@ class Path:
     duration: float  # [s]
     kinks: tuple[float, ...] = ()  # times [s] at which the velocity, or its derivative, may jump
     resolution: tuple[float, ...] = EXACT  # to how much x, y, z [m], yaw [rad] were rounded; 0 where they are exact
+    derivatives: Derivatives | None = None  # of the position, where they are known
+    free_heading: bool = False  # whether the heading is what leaves no rate about body z; else the initial one
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -32,6 +37,9 @@ class Course:
     jumps: tuple[float, ...] = ()  # times [s] at which the pose itself jumps
     kinks: tuple[float, ...] = ()  # times [s] at which the velocity, or its derivative, may jump
     resolution: tuple[float, ...] = EXACT  # to how much x, y, z [m], yaw [rad] were rounded; 0 where they are exact
+    derivatives: Derivatives | None = None  # of the position, where they are known
+    end: float = math.inf  # time [s] from which on it stays where it is
+    free_heading: bool = False  # whether the heading is what leaves no rate about body z; else the initial one
 
 
 def begin(path: Path, *, start: float, initial: Array) -> Course:
@@ -46,6 +54,13 @@ def begin(path: Path, *, start: float, initial: Array) -> Course:
         # The start is on the path, whatever the rounding of a control period's multiples.
         return np.where((since < -1e-9)[:, None], initial, poses)
 
+    def derivatives(t: Array) -> tuple[Array, Array]:
+        assert path.derivatives is not None
+        since = t - start
+        on_way = ((since > -1e-9) & (since < path.duration + 1e-9))[:, None]
+        velocity, acceleration = path.derivatives(np.clip(since, 0.0, path.duration))
+        return np.where(on_way, velocity, 0.0), np.where(on_way, acceleration, 0.0)
+
     elsewhere = not np.allclose(path.pose(np.zeros(1))[0], initial, rtol=0.0, atol=1e-9)
     ends = {0.0, path.duration}  # a path need not begin or end at rest
     return Course(
@@ -54,4 +69,7 @@ def begin(path: Path, *, start: float, initial: Array) -> Course:
         jumps=(start,) if elsewhere else (),
         kinks=tuple(start + time for time in sorted(ends | set(path.kinks))),
         resolution=path.resolution,
+        derivatives=None if path.derivatives is None else derivatives,
+        end=start + path.duration,
+        free_heading=path.free_heading,
     )

@@ -10,16 +10,21 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from mpc.flatness import motion_along
 from quadsim.errors import FileError, ParameterError
 from quadsim.flight.metrics import CourseStep
+from quadsim.motion import Motion
 from quadsim.state import REFERENCE_NAMES, Array
+from quadsim.vehicle import Vehicle
 from scenarios.courses.course import Course, Path, begin
 from scenarios.courses.csv_course import read_table, through_rows
 from scenarios.courses.legs import Turn, Waypoint, waypoints, yaw_turns
 from scenarios.courses.loops import circle, figure_eight, fly_round
 from scenarios.courses.minimum_snap import minimum_snap
+from scenarios.courses.ramped import circle_curve, fly_ramped, lemniscate_curve, ramped_phase
 from scenarios.courses.smoothing import smooth
 from scenarios.courses.steps import Window, steps, switches
+from scenarios.parts.vehicle import build_vehicle
 from scenarios.schema.course import (
     CLOSEST,
     CircleSpec,
@@ -27,6 +32,8 @@ from scenarios.schema.course import (
     FigureEightSpec,
     HelixSpec,
     MinimumSnapSpec,
+    RampedCircleSpec,
+    RampedLemniscateSpec,
     SnapPointSpec,
     StepsSpec,
     WaypointSpec,
@@ -59,6 +66,8 @@ def build_course(scenario: Scenario) -> Course:
         path = _waypoints(spec, initial)
     elif isinstance(spec, MinimumSnapSpec):
         path = _minimum_snap(spec, initial)
+    elif isinstance(spec, RampedCircleSpec | RampedLemniscateSpec):
+        path = _ramped(spec, initial, gravity=build_vehicle(scenario).gravity)
     else:
         path = _loop(spec, initial)
     return begin(path, start=spec.start, initial=initial)
@@ -83,6 +92,17 @@ def filtered(course: Course, scenario: Scenario, samples: int) -> Array:
         for values, initial in zip(course.sample(t).T, course.initial.tolist(), strict=True)
     ]
     return np.stack(channels, axis=1)
+
+
+def build_motion(scenario: Scenario, vehicle: Vehicle) -> Motion | None:
+    """The reference motion at t_k = k tau_s, to the course's end; None where the course states positions alone."""
+    course, period = build_course(scenario), scenario.control_period
+    if course.derivatives is None:
+        return None
+    t = np.arange(max(math.floor(course.end / period + 1e-6), 1) + 1, dtype=np.float64) * period
+    velocity, acceleration = course.derivatives(t)
+    yaw = float(course.initial[3]) if course.free_heading else np.full(len(t), course.initial[3])
+    return motion_along(course.sample(t)[:, :3], velocity, acceleration, period=period, vehicle=vehicle, yaw=yaw)
 
 
 def build_course_steps(scenario: Scenario) -> tuple[CourseStep, ...]:
@@ -171,6 +191,17 @@ def _loop(spec: CircleSpec | HelixSpec | FigureEightSpec, initial: Array) -> Pat
         yaw=float(initial[3]) if spec.yaw is None else math.radians(spec.yaw),
         along=spec.yaw_along_path,
     )
+
+
+def _ramped(spec: RampedCircleSpec | RampedLemniscateSpec, initial: Array, *, gravity: float) -> Path:
+    curve = circle_curve if isinstance(spec, RampedCircleSpec) else lemniscate_curve
+    phase = ramped_phase(
+        rate=spec.speed / spec.radius,
+        acceleration=spec.acceleration / spec.radius,
+        ramp=spec.ramp,
+        step=spec.sampling,
+    )
+    return fly_ramped(curve(spec.radius), phase, initial=initial, gravity=gravity, free_heading=spec.heading == "free")
 
 
 def _csv(spec: CsvSpec, initial: Array) -> Course:

@@ -20,17 +20,18 @@ from mpc.ocp import Objective, Problem, lqr_terminal_weight
 from mpc.robust.tightening import SHORTEST_LAG
 from quadsim.controller import Controller
 from quadsim.errors import InputError, ParameterError
-from quadsim.state import INDEX, N_STATES, STATE_NAMES, Array
+from quadsim.state import INDEX, N_STATES, POSITION, STATE_NAMES, Array
 from quadsim.vehicle import N_ROTORS, Vehicle
 from scenarios.parts.plugin import build_plugin
 from scenarios.schema.baselines import GeometricSpec, LQRSpec, PIDSpec
-from scenarios.schema.controller import ConstrainedSpec, ControllerSpec, UnconstrainedSpec
+from scenarios.schema.controller import ConstrainedSpec, ControllerSpec, NonlinearSpec, UnconstrainedSpec
 from scenarios.schema.optimisation import ANGLES, BoundedSpec, InputWeightsSpec, SoftSpec, WeightedSpec
 from scenarios.schema.plugin import PluginSpec
 from scenarios.schema.robust import RobustSpec
 
 if TYPE_CHECKING:
     from mpc.robust.controller import RobustMPC
+    from mpc.space.halfspaces import Shape, Space
 
 FALLBACK_SHARE: Final = 0.8
 """Tilt of the fallback over the tightest bound on it: the controller finds a vehicle that it can take over."""
@@ -80,7 +81,23 @@ def make_bounds(spec: BoundedSpec) -> Bounds:
     )
 
 
-def make_polytopes(spec: BoundedSpec) -> tuple[Constraint, ...]:
+def _three(numbers: float | Sequence[float]) -> tuple[float, float, float]:
+    """One number for three axes, or one each, as three."""
+    x, y, z = np.broadcast_to(numbers, 3).tolist()
+    return x, y, z
+
+
+def _outputs(spec: NonlinearSpec) -> tuple[Constraint, ...]:
+    """`output_bounds` and `polytopes` as rows over the 12 states and four rotor speeds."""
+    if not spec.output_bounds:
+        return make_polytopes(spec)
+    lower, upper = np.array([*spec.output_bounds.values()], float).T
+    penalty = None if spec.soft is None else make_penalty(spec.soft, lower.size)
+    rows = _selection([*spec.output_bounds])
+    return Constraint(name="outputs", lower=lower, upper=upper, C=rows, penalty=penalty), *make_polytopes(spec)
+
+
+def make_polytopes(spec: BoundedSpec | NonlinearSpec) -> tuple[Constraint, ...]:
     """`[[controller.polytopes]]` as rows over the 12 states and four rotor speeds, each in its own unit."""
     found = []
     for polytope in spec.polytopes:
@@ -110,8 +127,8 @@ def make_penalty(soft: SoftSpec, rows: int) -> Penalty:
     return Penalty(l1=np.full(rows, float(soft.linear)), l2=np.full(rows, float(soft.quadratic)))
 
 
-def make_controller(spec: ControllerSpec, vehicle: Vehicle, period: float) -> Controller:
-    """The law, set up and ready to be flown.
+def make_controller(spec: ControllerSpec, vehicle: Vehicle, period: float, shapes: Sequence[Shape] = ()) -> Controller:
+    """The law, set up and ready to be flown among obstacles and regions.
 
     Raises:
         InputError: it cannot be made from these numbers, or its code cannot be found or called.
@@ -120,10 +137,13 @@ def make_controller(spec: ControllerSpec, vehicle: Vehicle, period: float) -> Co
         case UnconstrainedSpec():
             return _unconstrained(make_problem(spec, vehicle, period))
         case ConstrainedSpec():
-            law = _constrained(spec, make_problem(spec, vehicle, period))
-            return law if spec.fallback is None else guarded(law, spec, spec.fallback, vehicle, period)
+            space = make_space(spec, vehicle, period, shapes)
+            law = _constrained(spec, make_problem(spec, vehicle, period), space)
+            return law if spec.fallback is None else _bounded(law, spec, spec.fallback, vehicle, period)
         case RobustSpec():
-            return guarded(_robust(spec, vehicle, period), spec, spec.fallback, vehicle, period)
+            return _bounded(_robust(spec, vehicle, period, shapes), spec, spec.fallback, vehicle, period)
+        case NonlinearSpec():
+            return _nonlinear(spec, vehicle, period, shapes)
         case LQRSpec() | PIDSpec() | GeometricSpec():
             return _baseline(spec, vehicle, period)
         case PluginSpec():
@@ -141,23 +161,111 @@ def posed_problem(spec: BoundedSpec, vehicle: Vehicle, period: float) -> Problem
     return make_problem(spec, vehicle, period)
 
 
-def guarded(
+def _bounded(
     law: Controller, spec: BoundedSpec, fallback: FallbackSettings, vehicle: Vehicle, period: float
+) -> Controller:
+    settings = replace(fallback, tilt=_fallback_tilt(spec, fallback))
+    return guarded(law, ActuatorBounds.of(make_bounds(spec)), settings, vehicle, period)
+
+
+def guarded(
+    law: Controller, bounds: ActuatorBounds, fallback: FallbackSettings, vehicle: Vehicle, period: float
 ) -> Controller:
     """The law within the fallback contract; the law itself where that is switched off."""
     from mpc.fallback.contract import Guarded
 
     if not fallback.enabled:
         return law
-    settings = replace(fallback, tilt=_fallback_tilt(spec, fallback))
-    return Guarded(law, hover_model(vehicle, period), bounds=ActuatorBounds.of(make_bounds(spec)), settings=settings)
+    return Guarded(law, hover_model(vehicle, period), bounds=bounds, settings=fallback)
 
 
-def _constrained(spec: ConstrainedSpec, problem: Problem) -> Controller:
+def _nonlinear(spec: NonlinearSpec, vehicle: Vehicle, period: float, shapes: Sequence[Shape]) -> Controller:
+    from mpc.nonlinear.controller import NonlinearMPC
+    from mpc.nonlinear.rigidbody import Inputs
+    from mpc.nonlinear.settings import AttitudeError, Disturbance, NonlinearSettings, Weights
+
+    stride = 1 if spec.node is None else round(spec.node / period)
+    if spec.node is not None and (stride < 1 or not math.isclose(stride * period, spec.node, rel_tol=1e-9)):
+        raise ParameterError("controller", "node", spec.node, f"a whole multiple of the control period of {period} s")
+    if spec.horizon % stride:
+        raise ParameterError("controller", "horizon", spec.horizon, f"a whole number of nodes, {stride} periods each")
+    held, axes = spec.input_bounds, spec.weights
+    bounds = ActuatorBounds.alike(
+        (vehicle.speed_min, vehicle.speed_max) if held.speed is None else _pair(held.speed),
+        (-math.inf, math.inf) if held.slew is None else _pair(held.slew),
+    )
+    settings = NonlinearSettings(
+        horizon=spec.horizon // stride,
+        stride=stride,
+        iterations=spec.iterations,
+        shift=spec.shift,
+        substeps=spec.substeps,
+        inputs=Inputs(spec.inputs),
+        rotor_lag=_rotor_lag(spec, vehicle),
+        drag=_three(spec.drag),
+        quadratic_drag=_three(spec.quadratic_drag),
+        attitude_error=AttitudeError(spec.attitude_error),
+        weights=Weights(
+            position=_three(axes.position),
+            attitude=_three(axes.attitude) if isinstance(axes.attitude, list) else axes.attitude,
+            velocity=_three(axes.velocity),
+            body_rates=_three(axes.body_rates),
+            input=axes.input,
+            move=axes.move,
+        ),
+        terminal=0.0 if spec.terminal == "none" else spec.terminal,
+        tilt=None if spec.tilt is None else math.radians(spec.tilt),
+        largest_rates=_three(math.inf if spec.body_rate is None else np.radians(spec.body_rate).tolist()),
+        soft=None if spec.soft is None else (spec.soft.linear, spec.soft.quadratic),
+        observer=spec.offset_free,
+        disturbance=Disturbance(spec.disturbance),
+        solver=spec.solver,
+    )
+    law = NonlinearMPC(
+        vehicle,
+        period=period,
+        settings=settings,
+        bounds=bounds,
+        constraints=_outputs(spec),
+        space=make_space(spec, vehicle, period, shapes, stride=stride),
+    )
+    return guarded(law, bounds, spec.fallback, vehicle, period)
+
+
+def make_space(
+    spec: BoundedSpec | NonlinearSpec,
+    vehicle: Vehicle,
+    period: float,
+    shapes: Sequence[Shape],
+    margins: Array | None = None,
+    stride: int = 1,
+) -> Space | None:
+    """The half-spaces of obstacles and regions, with further margins (N, 3) [m], at every `stride`-th period's end.
+
+    None where they are not kept.
+    """
+    if spec.avoidance is None or not shapes:
+        return None
+    from mpc.space.halfspaces import Space
+
+    soft = spec.avoidance.soft
+    return Space(
+        shapes,
+        radius=vehicle.enclosing_radius,
+        period=stride * period,
+        horizon=spec.horizon // stride,
+        settings=spec.avoidance,
+        margins=margins,
+        penalty=None if soft is None else (soft.linear, soft.quadratic),
+        positions=(0, 1, 2) if isinstance(spec, NonlinearSpec) else POSITION,
+    )
+
+
+def _constrained(spec: ConstrainedSpec, problem: Problem, space: Space | None) -> Controller:
     from mpc.constrained import ConstrainedMPC
     from mpc.solvers import QPSolver
 
-    return ConstrainedMPC(problem, QPSolver(spec.solver, problem), shortcut=spec.shortcut)
+    return ConstrainedMPC(problem, QPSolver(spec.solver, problem), shortcut=spec.shortcut, space=space)
 
 
 def _unconstrained(problem: Problem) -> Controller:
@@ -172,7 +280,7 @@ def _unconstrained(problem: Problem) -> Controller:
         ) from error
 
 
-def _robust(spec: RobustSpec, vehicle: Vehicle, period: float) -> RobustMPC:
+def _robust(spec: RobustSpec, vehicle: Vehicle, period: float, shapes: Sequence[Shape] = ()) -> RobustMPC:
     from mpc.robust.controller import Linearisation, RobustMPC, RobustSettings
 
     bounds, rotor_lag = make_bounds(spec), _rotor_lag(spec, vehicle)
@@ -198,6 +306,24 @@ def _robust(spec: RobustSpec, vehicle: Vehicle, period: float) -> RobustMPC:
         settings=settings,
         constraints=make_polytopes(spec),
         shortcut=spec.shortcut,
+        space=make_space(spec, vehicle, period, shapes, _position_margins(spec, vehicle, period)),
+    )
+
+
+def _position_margins(spec: RobustSpec, vehicle: Vehicle, period: float) -> Array | None:
+    """By how much half-spaces are tightened along x, y, z at each predicted state, (N, 3) [m]; None for not."""
+    if spec.tightening is None or spec.avoidance is None:
+        return None
+    from mpc.robust.tightening import position_margins
+
+    return position_margins(
+        vehicle,
+        period=period,
+        horizon=spec.horizon,
+        settings=spec.tightening,
+        rotor_lag=_rotor_lag(spec, vehicle),
+        delay=spec.delay,
+        estimated=spec.offset_free is not None,
     )
 
 
@@ -257,7 +383,7 @@ def _baseline(spec: LQRSpec | PIDSpec | GeometricSpec, vehicle: Vehicle, period:
     return GeometricController(vehicle, geometric_settings(vehicle, integral=spec.integral, **shared))
 
 
-def _rotor_lag(spec: RobustSpec, vehicle: Vehicle) -> float:
+def _rotor_lag(spec: RobustSpec | NonlinearSpec, vehicle: Vehicle) -> float:
     if spec.rotor_lag != "vehicle":
         return spec.rotor_lag
     if vehicle.rotor_rise is None:

@@ -35,7 +35,7 @@ def moving_air(scenario: Scenario, vehicle: Vehicle) -> Air | None:
     blown = any(isinstance(event, Gust | WindChange) for event in scenario.events)
     if not (any(air.wind) or air.turbulence is not None or blown):
         return None
-    if not air.rotor_drag and air.body_drag is None:
+    if not air.drags:
         rule = f"positive, or body_drag given, for the wind to push: the vehicle {vehicle.name!r} states no drag"
         raise ParameterError("effects.air", "rotor_drag", air.rotor_drag or 0.0, rule)
     return air

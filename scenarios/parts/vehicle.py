@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -9,6 +10,8 @@ import numpy as np
 
 from quadsim.assets import vehicle_path
 from quadsim.errors import InputError
+from quadsim.motion import Motion
+from quadsim.sim.physics import physics_to_state
 from quadsim.state import Array, make_state
 from quadsim.vehicle import N_ROTORS, OPTIONAL_PARAMETERS, VEHICLE_UNITS, Vehicle, load_vehicle
 
@@ -34,8 +37,11 @@ def resolve_vehicle(scenario: Scenario, vehicle: Vehicle) -> Scenario:
     return scenario.model_copy(update={"vehicle": scenario.vehicle.model_copy(update=numbers)})
 
 
-def build_initial_state(scenario: Scenario) -> Array:
-    """(12,) state at t = 0."""
+def build_initial_state(scenario: Scenario, motion: Motion | None = None) -> Array:
+    """(12,) state at t = 0, of the reference motion where the scenario starts on it."""
+    if scenario.initial.on_reference and motion is not None:
+        physics = np.array([0.0, *motion.position[0], *motion.attitude[0], *motion.velocity[0], *motion.body_rates[0]])
+        return physics_to_state(physics[None], yaw=math.radians(scenario.initial.euler[2]))[0]
     x, y, z = scenario.initial.position
     roll, pitch, yaw = np.radians(scenario.initial.euler)
     return make_state(position=(x, y, z), euler=(roll, pitch, yaw))

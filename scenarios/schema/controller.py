@@ -12,6 +12,7 @@ from mpc.fallback.settings import FallbackSettings
 from mpc.solvers import SOLVERS
 from quadsim.errors import UnknownNameError
 from scenarios.schema.baselines import GeometricSpec, LQRSpec, PIDSpec
+from scenarios.schema.nonlinear import NonlinearPartsSpec
 from scenarios.schema.optimisation import BoundedSpec, WeightedSpec
 from scenarios.schema.plugin import FORM, LAWS, PluginSpec, is_plugin
 from scenarios.schema.robust import RobustSpec
@@ -38,9 +39,30 @@ class ConstrainedSpec(BoundedSpec):
 
     @model_validator(mode="after")
     def _check(self) -> ConstrainedSpec:
-        if self.solver not in SOLVERS:
-            raise ValueError(f"solver: {UnknownNameError('solver', self.solver, SOLVERS)}")
+        _require_solver(self.solver)
         return self
+
+
+class NonlinearSpec(NonlinearPartsSpec):
+    """Nonlinear MPC at any attitude: steps of sequential quadratic programming in every period."""
+
+    type: Literal["nonlinear"] = Field(description="the control law, by its name in `quadsim list`")
+    solver: str | None = Field(
+        default=None,
+        description="QP solver, by its name in `quadsim list`; absent: the fastest for the size",
+        json_schema_extra={"enum": [*SOLVERS, None]},
+    )
+
+    @model_validator(mode="after")
+    def _check_solver(self) -> NonlinearSpec:
+        if self.solver is not None:
+            _require_solver(self.solver)
+        return self
+
+
+def _require_solver(name: str) -> None:
+    if name not in SOLVERS:
+        raise ValueError(f"solver: {UnknownNameError('solver', name, SOLVERS)}")
 
 
 def shared_tilt_bound(spec: ConstrainedSpec) -> float | None:
@@ -62,7 +84,9 @@ def _spelt_out(controller: Any) -> Any:
     """A law's name alone as the table that it stands for."""
     if isinstance(controller, str):
         return {"type": controller}
-    if not isinstance(controller, Mapping | WeightedSpec | LQRSpec | PIDSpec | GeometricSpec | PluginSpec):
+    if not isinstance(
+        controller, Mapping | WeightedSpec | NonlinearSpec | LQRSpec | PIDSpec | GeometricSpec | PluginSpec
+    ):
         raise PydanticCustomError("controller", "a table or a controller's name")
     return controller
 
@@ -71,6 +95,7 @@ _Table = Annotated[
     Annotated[UnconstrainedSpec, Tag("unconstrained")]
     | Annotated[ConstrainedSpec, Tag("constrained")]
     | Annotated[RobustSpec, Tag("robust")]
+    | Annotated[NonlinearSpec, Tag("nonlinear")]
     | Annotated[LQRSpec, Tag("lqr")]
     | Annotated[PIDSpec, Tag("pid")]
     | Annotated[GeometricSpec, Tag("geometric")]

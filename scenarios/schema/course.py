@@ -15,6 +15,8 @@ from scenarios.schema.base import MOST_ENTRIES, Pair, Spec, Triple
 
 MOST_POINTS: Final = 200
 """Points or turns of one course; a longer one is a table, `type = "csv"`."""
+MOST_SAMPLES: Final = 100_000
+"""Of the phase of a ramped course: 2000 s at 50 Hz."""
 CLOSEST: Final = 1e-3
 """Least distance [m] between points that a speed leads from one to the other, and least time [s] between points."""
 
@@ -205,6 +207,46 @@ class FigureEightSpec(_LoopSpec):
         return self.period or 2.0 * math.pi * math.hypot(along, 2.0 * across) / (self.speed or math.inf)
 
 
+class _RampedSpec(_StartedSpec):
+    speed: Speed = Field(
+        description="[m/s] v, the product of radius and rate that would be reached without ramps; the phase's own top "
+        "rate is somewhat higher"
+    )
+    acceleration: Speed = Field(default=1.0, description="[m/s^2] a, along the path, of radius and phase")
+    radius: Positive = Field(description="[m] r, seen from above; of a lemniscate half its length")
+    ramp: Time = Field(default=2.0, description="[s] T, over which the acceleration grows; below speed / acceleration")
+    heading: Literal["free", "held"] = Field(
+        default="free", description="free: no rate is left about body z, and the heading drifts; held: the initial yaw"
+    )
+    sampling: Time = Field(default=0.02, description="[s] step of the rectangle sums that make the phase")
+
+    @model_validator(mode="after")
+    def _check(self) -> _RampedSpec:
+        if self.response_time:
+            raise ValueError(f"response_time must be 0: the course is smooth by itself; got {self.response_time}")
+        longest = self.speed / self.acceleration
+        if self.ramp >= longest:
+            raise ValueError(f"ramp must be below speed / acceleration = {longest:g} s; got {self.ramp}")
+        if 2.0 * (longest + self.ramp) > MOST_SAMPLES * self.sampling:
+            least = 2.0 * (longest + self.ramp) / MOST_SAMPLES
+            raise ValueError(f"sampling must make at most {MOST_SAMPLES} samples, {least:.3g} s; got {self.sampling}")
+        return self
+
+
+class RampedCircleSpec(_RampedSpec):
+    """A level circle, clockwise seen from above, from the initial position, its northernmost point, towards +x."""
+
+    type: Literal["ramped_circle"] = Field(description="kind of course: a circle flown up to a speed and back to rest")
+
+
+class RampedLemniscateSpec(_RampedSpec):
+    """A level lemniscate of Gerono from the initial position, its tip in +x, towards +y."""
+
+    type: Literal["ramped_lemniscate"] = Field(
+        description="kind of course: a lemniscate flown up to a speed and back to rest"
+    )
+
+
 class TurnSpec(Spec):
     """A turn on the spot at constant rate."""
 
@@ -254,6 +296,8 @@ ReferenceSpec = Annotated[
     | Annotated[CircleSpec, Tag("circle")]
     | Annotated[HelixSpec, Tag("helix")]
     | Annotated[FigureEightSpec, Tag("figure_eight")]
+    | Annotated[RampedCircleSpec, Tag("ramped_circle")]
+    | Annotated[RampedLemniscateSpec, Tag("ramped_lemniscate")]
     | Annotated[YawTurnsSpec, Tag("yaw_turns")]
     | Annotated[CsvSpec, Tag("csv")],
     Discriminator(_kind),

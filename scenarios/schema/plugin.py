@@ -20,7 +20,7 @@ ENTRY_POINTS: Final = "quadsim.controllers"
 """The group under which installed packages announce controllers by short names."""
 GIVEN: Final = ("vehicle", "period", "horizon")
 """Arguments that every controller is called with."""
-LAWS: Final = ("unconstrained", "constrained", "robust", "lqr", "pid", "geometric")
+LAWS: Final = ("unconstrained", "constrained", "robust", "nonlinear", "lqr", "pid", "geometric")
 """The names of built-in controllers."""
 _NAME: Final = r"[^\W\d]\w*(?:\.[^\W\d]\w*)*"
 

@@ -7,7 +7,7 @@ from typing import Annotated, Final, Literal
 from pydantic import Discriminator, Field, Tag, model_validator
 
 from mpc.fallback.settings import FallbackSettings
-from mpc.robust.observer import ObserverSettings
+from mpc.observer import ObserverSettings
 from mpc.robust.tightening import SHORTEST_LAG, TighteningSettings
 from scenarios.schema.optimisation import BoundedSpec, SoftSpec, Weight
 

@@ -17,12 +17,14 @@ from quadsim.fields import Positive
 from quadsim.flight.audit import Limit
 from quadsim.sim.computation import ComputationTime
 from quadsim.sim.effects import Effects
-from quadsim.sim.physics import steps_per_period
+from quadsim.sim.physics import Integrator, steps_per_period
+from quadsim.space import AnyObstacle, Corridor, Fence
 from quadsim.vehicle import VEHICLE_UNITS, Vehicle
 from scenarios.schema.base import LARGEST_SEED, MOST_ENTRIES, Spec, Triple, fields_of
 from scenarios.schema.controller import ControllerSpec
 from scenarios.schema.course import ReferenceSpec
 from scenarios.schema.events import Event, PayloadDropEvent, PayloadPickupEvent, SensorFaultEvent
+from scenarios.schema.nonlinear import NonlinearPartsSpec
 from scenarios.schema.optimisation import BoundedSpec
 from scenarios.schema.plugin import ForceSpec
 from scenarios.schema.problems import ScenarioError, describe_all
@@ -63,11 +65,18 @@ class InitialSpec(Spec):
     cold: bool = Field(
         default=False, description="whether it starts on the ground with rotors at rest, u(-1) = 0; else from hover"
     )
+    on_reference: bool = Field(
+        default=False,
+        description="whether it starts with velocity, attitude and body rates of the reference at t = 0 instead; only "
+        "with courses that state them (ramped_circle, ramped_lemniscate)",
+    )
 
     @model_validator(mode="after")
     def _check(self) -> InitialSpec:
-        if any(abs(angle) >= 90.0 for angle in self.euler[:2]):
-            raise ValueError(f"euler must have roll and pitch within +-90 deg; got {self.euler}")
+        if abs(self.euler[0]) > 180.0 or abs(self.euler[1]) >= 90.0:
+            raise ValueError(f"euler must have a roll within +-180 deg and a pitch within +-90 deg; got {self.euler}")
+        if self.on_reference and any(self.euler[:2]):
+            raise ValueError(f"euler must have roll and pitch 0 where on_reference is true; got {self.euler}")
         return self
 
 
@@ -75,6 +84,11 @@ class PlantSpec(Spec):
     """The simulated vehicle."""
 
     timestep: Annotated[float, Field(ge=1e-6, le=0.01)] = Field(default=1e-3, description="[s] physics step")
+    integrator: Integrator = Field(
+        default="mujoco",
+        description="mujoco: MuJoCo's Runge-Kutta step, forces that follow the motion held over it; rk4: that of a "
+        "free rigid body with all forces evaluated at each stage, for the rules of published simulations",
+    )
     limit_speeds: bool = Field(
         default=False, description="whether rotors saturate at the vehicle's speed_min and speed_max"
     )
@@ -167,6 +181,13 @@ class Scenario(Spec):
     )
     events: Annotated[list[Event], MaxLen(MOST_ENTRIES)] = Field(default=[], description="what happens on the way")
     lost: LostSpec = LostSpec()
+    obstacles: Annotated[list[Annotated[AnyObstacle, Field(discriminator="type")]], MaxLen(MOST_ENTRIES)] = Field(
+        default=[], description="what the vehicle, a ball of its extent, must not touch: a touch is a crash"
+    )
+    corridors: Annotated[list[Corridor], MaxLen(MOST_ENTRIES)] = Field(
+        default=[], description="convex regions to stay in, each for a window of time"
+    )
+    keep_in: Fence | None = Field(default=None, description="a convex region to stay in throughout; absent: none")
     constraints: Annotated[list[Limit], MaxLen(MOST_ENTRIES)] = Field(
         default=[], description="what the flight is audited against; signals and their units are those of the audit"
     )
@@ -195,9 +216,10 @@ class Scenario(Spec):
         if self.initial.cold and not (self.effects.ground is not None and self.effects.ground.contact):
             raise ValueError("initial.cold must be false where effects.ground gives no floor to stand on; got true")
         check_sensing(self.sensors, self.estimator, timestep=self.plant.timestep)
-        polytopes = self.controller.polytopes if isinstance(self.controller, BoundedSpec) else []
+        polytopes = self.controller.polytopes if isinstance(self.controller, BoundedSpec | NonlinearPartsSpec) else []
         names = [constraint.name for constraint in self.constraints]
         names += [name for polytope in polytopes for name in polytope.row_names]
+        names += [obstacle.name for obstacle in self.obstacles] + [region.name for region in self.regions]
         if len(set(names)) < len(names):
             raise ValueError(f"constraints must have distinct names; got {names}")
         return self
@@ -234,6 +256,11 @@ class Scenario(Spec):
         except ValueError as error:
             raise InputError(f"a scenario must be one that can be written: {error}") from error
         return cls.model_validate_json(text)
+
+    @property
+    def regions(self) -> tuple[Corridor | Fence, ...]:
+        """The corridors, then the fence."""
+        return (*self.corridors, *([] if self.keep_in is None else [self.keep_in]))
 
     @property
     def periods(self) -> int:

@@ -30,11 +30,19 @@ SHARED = (
 LONGEST_DESCRIPTION = 100
 COMPARED = 3.0
 """Of a flight and of the same one again, at least [s]."""
+SHORT = 12.0
+"""Longest flight of another paper that is flown here [s]."""
 TELLS = 2.0
 """Time in which another seed shows, where it counts [s]."""
 
 
-@pytest.fixture(scope="module", params=scenario_names())
+def flown_here() -> list[str]:
+    """All but the long flights of other papers, which `quadsim reproduce` flies."""
+    scenarios = [load_scenario(name) for name in scenario_names()]
+    return [each.name for each in scenarios if each.group != "papers" or each.duration <= SHORT]
+
+
+@pytest.fixture(scope="module", params=flown_here())
 def flight(request: pytest.FixtureRequest, fly_once: Callable[..., Flight]) -> Flight:
     """Each scenario, flown once for the tests that ask for it one after another."""
     return fly_once(request.param) if request.param in SHARED else fly_scenario(load_scenario(request.param))
@@ -74,6 +82,7 @@ def draws(scenario: Scenario) -> bool:
         or scenario.estimator is not None
         or (scenario.computation is not None and scenario.computation.jitter > 0.0)
         or (air is not None and air.turbulence is not None)
+        or scenario.effects.thrust_noise is not None
         or (disturbance is not None and disturbance.force_noise + disturbance.torque_noise > 0.0)
     )
 

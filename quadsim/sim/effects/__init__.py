@@ -14,6 +14,7 @@ from quadsim.fields import NonNegative, Vector
 from quadsim.sim.effects.ground_effect import Ground
 from quadsim.sim.effects.load import Load, Payload
 from quadsim.sim.effects.rotors import RotorDynamics
+from quadsim.sim.effects.thrust_noise import ThrustNoise
 from quadsim.sim.effects.wind import Air
 from quadsim.state import Array
 from quadsim.vehicle import N_ROTORS, Vehicle
@@ -28,6 +29,7 @@ __all__ = [
     "PayloadChange",
     "RotorChange",
     "RotorDynamics",
+    "ThrustNoise",
 ]
 
 
@@ -87,6 +89,7 @@ class Effects:
     ground: Annotated[Ground | None, doc("a floor")] = None
     load: Annotated[Load | None, doc("errors of mass and inertia, payload")] = None
     disturbance: Annotated[Disturbance | None, doc("unmodelled force and torque")] = None
+    thrust_noise: Annotated[ThrustNoise | None, doc("thrust that is lost and fluctuates")] = None
 
     def resolved(self, vehicle: Vehicle) -> Effects:
         """With every size that is left to the vehicle.
@@ -105,7 +108,7 @@ class Effects:
     def follows_state(self) -> bool:
         """Whether a force depends on how the vehicle moves, so that each physics step has to be taken by itself."""
         spinning = self.rotors is not None and bool(self.rotors.inertia)
-        dragged = self.air is not None and (bool(self.air.rotor_drag) or self.air.body_drag is not None)
+        dragged = self.air is not None and self.air.drags
         lifted = self.ground is not None and self.ground.effect
         return spinning or dragged or lifted or self.disturbance is not None
 

@@ -31,8 +31,10 @@ class StepForces:
       h = -sum_i spin_i J_r w_i of rotors that turn against their reaction torque.
     - Ground effect: what each rotor's thrust gains, by the height of its own disc; its torque gains nothing, as the
       ratio is that of thrusts at the same power.  See `thrust_ratio`.
+    - Drag of the body along its axes, F_i = -(l_i + k_i |v_i|) v_i, v its velocity through the air in the body frame,
+      as simplified simulations have it (Torrente et al. 2021, "Data-Driven MPC for Quadrotors").
 
-    The quadratic drag of the body is MuJoCo's own; see `quadsim.sim.airframe.compile_model`.
+    The quadratic drag of `Air.body_drag` is MuJoCo's own; see `quadsim.sim.airframe.compile_model`.
     """
 
     def __init__(self, vehicle: Vehicle, effects: Effects, *, timestep: float, floor: float, disc: float) -> None:
@@ -40,7 +42,9 @@ class StepForces:
         rotors, air, ground = effects.rotors, effects.air, effects.ground
         self._inertia = (rotors and rotors.inertia) or 0.0
         self._drag = (air and air.rotor_drag) or 0.0
+        self._along_axes = list(zip(air.linear_drag, air.quadratic_drag, strict=True)) if air and air.axis_drag else []
         self._radius = ground.rotor_radius if ground is not None and ground.effect else None
+        self._of_pose = bool(self._drag or self._along_axes or self._radius is not None)
         self._timestep, self._floor, self._disc = timestep, floor, disc
         self._places: list[tuple[float, float]] = [(x, y) for x, y, _ in vehicle.rotor_positions.tolist()]
         k, spins = self._drag, np.array(vehicle.rotor_spins, float)
@@ -95,20 +99,35 @@ class StepForces:
         ux, uy, uz, a, b, c = qvel_before
         vx, vy, vz = vx + 0.5 * (vx - ux), vy + 0.5 * (vy - uy), vz + 0.5 * (vz - uz)
         p, q, r = p + 0.5 * (p - a), q + 0.5 * (q - b), r + 0.5 * (r - c)
+        x, y, height, w, i, j, k = qpos
+        half = 0.5 * self._timestep
+        if self._of_pose:
+            quarter = 0.5 * half  # dq/dt = q * (0, rates) / 2
+            w, i, j, k = (
+                w - quarter * (i * p + j * q + k * r),
+                i + quarter * (w * p + j * r - k * q),
+                j + quarter * (w * q + k * p - i * r),
+                k + quarter * (w * r + i * q - j * p),
+            )
+        pose = (x, y, height + half * vz, w, i, j, k)
+        return self.at(pose, (vx, vy, vz, p, q, r), thrusts, of_rotors, wind)
+
+    def at(
+        self,
+        qpos: Sequence[float],
+        qvel: Sequence[float],
+        thrusts: Sequence[float],
+        of_rotors: Sequence[float],
+        wind: Sequence[float],
+    ) -> Wrench:
+        """The same as `midway`, now."""
+        vx, vy, vz, p, q, r = qvel
         drag, drag_x, drag_y, drag_xy, momentum, tz = of_rotors
         fx = fy = fz = tx = ty = 0.0
-        if not (self._drag or self._radius is not None):
+        if not self._of_pose:
             return (fx, fy, fz, -q * momentum, p * momentum, tz) if self._inertia else (fx, fy, fz, tx, ty, tz)
 
         _, _, height, w, x, y, z = qpos
-        half = 0.5 * self._timestep
-        quarter = 0.5 * half  # dq/dt = q * (0, rates) / 2
-        w, x, y, z = (
-            w - quarter * (x * p + y * q + z * r),
-            x + quarter * (w * p + y * r - z * q),
-            y + quarter * (w * q + z * p - x * r),
-            z + quarter * (w * r + x * q - y * p),
-        )
         # Body to world, of a quaternion that need not be of unit length.
         xx, yy, zz = x * x, y * y, z * z
         wx, wy, xz, yz = w * x, w * y, x * z, y * z
@@ -124,11 +143,23 @@ class StepForces:
             bx, by = drag_y * r - drag * along_x, -drag_x * r - drag * along_y
             tz = tz + drag_y * along_x - drag_x * along_y - drag_xy * r
             fx, fy, fz = r00 * bx + r01 * by, r10 * bx + r11 * by, r20 * bx + r21 * by
+        if self._along_axes:
+            wz, xy = w * z, x * y
+            columns = (
+                (1.0 - s * (yy + zz), s * (xy + wz), r20),
+                (s * (xy - wz), 1.0 - s * (xx + zz), r21),
+                (s * (xz + wy), s * (yz - wx), 1.0 - s * (xx + yy)),
+            )
+            ax, ay, az = vx - wind[0], vy - wind[1], vz - wind[2]
+            for (cx, cy, cz), (linear, quadratic) in zip(columns, self._along_axes, strict=True):
+                along = cx * ax + cy * ay + cz * az
+                pull = -(linear + quadratic * abs(along)) * along
+                fx, fy, fz = fx + pull * cx, fy + pull * cy, fz + pull * cz
         if self._inertia:
             tx, ty = -q * momentum, p * momentum
         if self._radius is not None:
             r22 = 1.0 - s * (xx + yy)
-            above = height + half * vz - self._floor + r22 * self._disc
+            above = height - self._floor + r22 * self._disc
             lift = 0.0
             for (x, y), thrust in zip(self._places, thrusts, strict=True):
                 gain = thrust * (thrust_ratio(above + r20 * x + r21 * y, self._radius) - 1.0)

@@ -22,6 +22,9 @@ _BLOCK: Final = 4096
 """Physics steps whose wind is worked out at a time."""
 
 
+_Drag = Annotated[tuple[NonNegative, ...], Len(3, 3)]
+
+
 @dataclass(frozen=True, kw_only=True)
 class Air:
     """Drag, and the wind; see `quadsim.sim.effects.forces` and `quadsim.sim.effects.wind`."""
@@ -35,6 +38,10 @@ class Air:
         Annotated[tuple[Positive, ...], Len(3, 3)] | None,
         doc("[m^2] drag areas C_d A along body x, y, z; absent: the vehicle's, or none"),
     ] = None
+    linear_drag: Annotated[_Drag, doc("[N s/m] drag of the body per air speed along each body axis")] = (0.0, 0.0, 0.0)
+    quadratic_drag: Annotated[
+        _Drag, doc("[N s^2/m^2] drag of the body per square of the air speed along each body axis, axis by axis")
+    ] = (0.0, 0.0, 0.0)
     wind: Annotated[Vector, doc("[m/s] mean velocity of the air, world frame")] = (0.0, 0.0, 0.0)
     turbulence: Annotated[Dryden | None, doc("Dryden turbulence; absent: none")] = None
 
@@ -43,6 +50,9 @@ class Air:
             raise ParameterError("effects.air", "rotor_drag", self.rotor_drag, "at least 0 and finite")
         if self.body_drag is not None and not all(0.0 < area < math.inf for area in self.body_drag):
             raise ParameterError("effects.air", "body_drag", self.body_drag, "three positive and finite numbers")
+        for name in ("linear_drag", "quadratic_drag"):
+            if not all(0.0 <= drag < math.inf for drag in getattr(self, name)):
+                raise ParameterError("effects.air", name, getattr(self, name), "three finite numbers of at least 0")
         if not 0.0 < self.density < math.inf:
             raise ParameterError("effects.air", "density", self.density, "positive and finite")
         carried = self.turbulence is None or self.turbulence.airspeed is not None
@@ -51,6 +61,16 @@ class Air:
                 f"turbulence.airspeed must be given where no mean wind of {SLOWEST_AIRSPEED:g} to {FASTEST_AIRSPEED:g} "
                 f"m/s carries the turbulence past; got a wind of {[*self.wind]}"
             )
+
+    @property
+    def axis_drag(self) -> bool:
+        """Whether the body drags along its axes, by `linear_drag` or `quadratic_drag`."""
+        return any(self.linear_drag) or any(self.quadratic_drag)
+
+    @property
+    def drags(self) -> bool:
+        """Whether anything drags, once resolved: without it, wind pushes nothing."""
+        return bool(self.rotor_drag) or self.body_drag is not None or self.axis_drag
 
     def resolved(self, vehicle: Vehicle) -> Air:
         """With the sizes that are left to the vehicle, and to the mean wind."""

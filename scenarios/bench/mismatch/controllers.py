@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any, Final, NamedTuple
 
-from mpc.robust.observer import ObserverSettings
+from mpc.observer import ObserverSettings
 from mpc.robust.tightening import TighteningSettings
 from quadsim.errors import InputError
 from scenarios.bench.mismatch.conditions import Condition

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from mpc.robust.observer import DisturbanceObserver, ObserverSettings, observer_gain, thrust_axis
+from mpc.observer import DisturbanceObserver, ObserverSettings, observer_gain, thrust_axis
 from quadsim.errors import ParameterError
 from quadsim.state import EULER, EULER_RATE, VELOCITY, Array, body_to_euler_rates, body_to_world, make_state
 

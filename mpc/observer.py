@@ -102,7 +102,10 @@ class DisturbanceObserver:
         x, y, z = (found - wanted for found, wanted in zip(now[VELOCITIES], then[VELOCITIES], strict=True))
         along = z / max(axis[2], _UPRIGHT)
         velocity = x - along * axis[0], y - along * axis[1], along
-        surprise = [*velocity, *(found - wanted for found, wanted in zip(rates, expected_rates, strict=True))]
+        self.learn([*velocity, *(found - wanted for found, wanted in zip(rates, expected_rates, strict=True))])
+
+    def learn(self, surprise: Sequence[float] | Array) -> None:
+        """Take note of by how much three velocities and three body rates (6,) are other than predicted."""
         estimate = self.estimate + self._gain * surprise
         self.estimate = np.minimum(np.maximum(estimate, -self._largest), self._largest)
 

@@ -1,0 +1,103 @@
+"""Differential flatness: attitude, body rates and rotor thrusts along a sampled course of positions.
+
+The thrust axis is b = (a + g e_z) / |a + g e_z| (Mellinger and Kumar 2011, Sec. III).  What turns about it is either
+left free, so that no rate about body z remains, or held, so that body x stays as near as can be to the direction of a
+given yaw, and body y at a right angle to it.
+Derivatives along the samples are central differences, one-sided at both ends, as in the simplified simulation of
+Torrente et al., "Data-Driven MPC for Quadrotors" (2021), which leaves the heading free.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from quadsim.motion import Motion
+from quadsim.state import Array, read_only
+from quadsim.vehicle import Vehicle
+
+
+def motion_along(
+    position: Array, velocity: Array, acceleration: Array, *, period: float, vehicle: Vehicle, yaw: Array | float = 0.0
+) -> Motion:
+    """The reference motion of a vehicle that follows a course exactly, without drag.
+
+    Args:
+        position: (K, 3) world [m], K >= 2.
+        velocity: (K, 3) world [m/s].
+        acceleration: (K, 3) world [m/s^2], of no sample the free fall.
+        period: of the samples [s].
+        vehicle: mass, inertia, gravity and rotors.
+        yaw: (K,) direction from world x to which the heading is held [rad]; or where a free heading begins [rad].
+    """
+    attitude, rates = attitudes(acceleration, period=period, gravity=vehicle.gravity, yaw=yaw)
+    inertia = np.array(vehicle.inertia)
+    torque = inertia * np.gradient(rates, period, axis=0) + np.cross(rates, inertia * rates)
+    collective = vehicle.mass * np.linalg.norm(_pushed(acceleration, vehicle.gravity), axis=1)
+    squared = np.linalg.solve(vehicle.allocation, np.column_stack([collective, torque]).T).T
+    return Motion(
+        position=read_only(np.array(position, float)),
+        velocity=read_only(np.array(velocity, float)),
+        acceleration=read_only(np.array(acceleration, float)),
+        attitude=read_only(attitude),
+        body_rates=read_only(rates),
+        thrusts=read_only(vehicle.thrust_coefficient * squared),
+    )
+
+
+def attitudes(acceleration: Array, *, period: float, gravity: float, yaw: Array | float) -> tuple[Array, Array]:
+    """(K, 4) quaternions, and (K, 3) body rates [rad/s], along accelerations (K, 3); arguments as of `motion_along`."""
+    pushed = _pushed(acceleration, gravity)
+    b = pushed / np.linalg.norm(pushed, axis=1)[:, None]
+    least = np.column_stack([1.0 + b[:, 2], -b[:, 1], b[:, 0], np.zeros(len(b))])  # the least rotation of e_z to b
+    least /= np.linalg.norm(least, axis=1)[:, None]
+    least_rates = _body_rates(least, period)
+    if isinstance(yaw, float):
+        turn = yaw - period * np.concatenate([[0.0], np.cumsum(least_rates[1:, 2])])
+    else:
+        turn = _turn_to(least, yaw)
+    attitude = _multiply(least, _about_z(turn))
+    rates = _body_rates(attitude, period)
+    cos, sin, (wx, wy, wz) = np.cos(turn[0]), np.sin(turn[0]), least_rates[0]
+    rates[0] = cos * wx + sin * wy, cos * wy - sin * wx, wz  # without the turn, which has no step before it
+    return attitude, rates
+
+
+def _body_rates(attitude: Array, period: float) -> Array:
+    """(K, 3) body rates 2 vec(q* Dq) [rad/s] along quaternions (K, 4), a period [s] apart."""
+    conjugate = attitude * np.array([1.0, -1.0, -1.0, -1.0])
+    rates: Array = 2.0 * _multiply(conjugate, np.gradient(attitude, period, axis=0))[:, 1:]
+    return rates
+
+
+def _pushed(acceleration: Array, gravity: float) -> Array:
+    """(K, 3) specific force a + g e_z [m/s^2] of the rotors."""
+    return np.asarray(acceleration, float) + np.array([0.0, 0.0, gravity])
+
+
+def _turn_to(least: Array, yaw: Array) -> Array:
+    """(K,) angle about body z [rad], without jumps, that puts body y at a right angle to a yaw's direction."""
+    w, x, y, z = least.T
+    cos, sin = np.cos(yaw), np.sin(yaw)
+    of_x = cos * (1.0 - 2.0 * (y * y + z * z)) + sin * 2.0 * (x * y + w * z)
+    of_y = cos * 2.0 * (x * y - w * z) + sin * (1.0 - 2.0 * (x * x + z * z))
+    turn: Array = np.unwrap(np.arctan2(of_y, of_x))
+    return turn
+
+
+def _about_z(angle: Array) -> Array:
+    """(K, 4) quaternions of turns about z by angles (K,) [rad]."""
+    half, zero = 0.5 * angle, np.zeros_like(angle)
+    return np.column_stack([np.cos(half), zero, zero, np.sin(half)])
+
+
+def _multiply(p: Array, q: Array) -> Array:
+    """(K, 4) Hamilton products of quaternions wxyz."""
+    (pw, px, py, pz), (qw, qx, qy, qz) = p.T, q.T
+    return np.column_stack(
+        [
+            pw * qw - px * qx - py * qy - pz * qz,
+            pw * qx + px * qw + py * qz - pz * qy,
+            pw * qy - px * qz + py * qw + pz * qx,
+            pw * qz + px * qy - py * qx + pz * qw,
+        ]
+    )

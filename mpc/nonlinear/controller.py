@@ -1,0 +1,529 @@
+"""Nonlinear MPC: sequential quadratic programming on the rigid body with a quaternion.
+
+Each period the model is linearised along the plan of the last one, at the nodes' states and inputs kept, and the QP
+
+    min  sum |C_r (s_i - s_i^r)|^2_Q + |u_i - u_i^r|^2_R    s.t.  s_{i+1} = A_i s_i + B_i u_i + c_i,  s_0 measured
+
+is solved: a full Gauss-Newton step, the real-time iteration (Diehl, Bock and Schloeder 2005).  Its states s have the
+quaternion q_r* q for q, with the node's reference q_r: a rotation of four numbers, by which both attitude errors of
+`AttitudeError` become linear with fixed weights.  A measured state enters as s_0 alone; node 0 is linearised at the
+state kept.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import Final
+
+import numpy as np
+import scipy.linalg
+
+from mpc.answer import ActuatorBounds, command_of
+from mpc.constraints import Constraint, Penalty
+from mpc.model import LinearModel
+from mpc.nonlinear.reference import Nodes, nodes_of_motion, nodes_of_preview
+from mpc.nonlinear.rigidbody import (
+    N_BODY,
+    Inputs,
+    P,
+    Q,
+    V,
+    W,
+    advance_nodes,
+    drag_acceleration,
+    linearise_nodes,
+    product,
+    rigid_body,
+    thrust_axis,
+)
+from mpc.nonlinear.settings import AttitudeError, Disturbance, NonlinearSettings
+from mpc.observer import DisturbanceObserver
+from mpc.ocp import Objective, Problem, Query, Rest, Unanswered, lqr_terminal_weight
+from mpc.relinearised import Relinearised
+from mpc.solvers import INVALID_DATA, Answer
+from mpc.space.clearing import Clearing
+from mpc.space.halfspaces import Space
+from quadsim.controller import ACCEPTED, GROUNDED, Command, Moment, Phase, stopped
+from quadsim.errors import ParameterError
+from quadsim.state import (
+    ANGLE_RATES,
+    ANGLES,
+    EULER,
+    EULER_RATE,
+    N_STATES,
+    POSITIONS,
+    VELOCITIES,
+    Array,
+    body_to_euler_rates,
+    euler_to_body_rates,
+    euler_to_quaternion,
+    quaternion_to_euler,
+)
+from quadsim.vehicle import N_ROTORS, Vehicle
+
+LARGEST_CONDENSED: Final = 80
+"""Inputs over the horizon up to which a condensed QP is solved faster than a staged one."""
+OUTSIDE: Final = 1e-6
+"""How far outside its bounds an input, a share of the largest, may be answered; it is then moved onto them."""
+SLOW: Final = 1.0
+"""Speed [m/s] below which a disturbance is hardly taken for one that follows the velocity."""
+TILT_SIDES: Final = 12
+"""Sides of the polygon within the circle that a bound on the tilt makes of the thrust axis's horizontal part; it takes
+up to 3.4 % of the bound's sine away."""
+_AXIS_SLOPES: Final = 2.0 * np.array(
+    [
+        [[0, 0, 1, 0], [0, 0, 0, 1], [1, 0, 0, 0], [0, 1, 0, 0]],
+        [[0, -1, 0, 0], [-1, 0, 0, 0], [0, 0, 0, 1], [0, 0, 1, 0]],
+    ],
+    float,
+)
+"""Take q to the derivatives of R(q) e_z along x, 2 (x z + w y), and y, 2 (y z - w x)."""
+_PLAUSIBLE: Final = 1e5
+_SAME_TIME: Final = 1e-6  # [s]
+
+
+def along_path(acceleration: Array, now: Array, then: Array) -> Array:
+    """Accelerations (..., 3) at a velocity `now` (3,), at velocities `then` (..., 3): turned and scaled as these are.
+
+    Horizontally alone, and less the slower `now` is, to nothing at rest.
+    """
+    before, after = complex(now[0], now[1]), then[..., 0] + 1j * then[..., 1]
+    ratio = (after * before.conjugate() + SLOW**2) / (abs(before) ** 2 + SLOW**2)
+    turned = (acceleration[..., 0] + 1j * acceleration[..., 1]) * ratio
+    return np.stack([turned.real, turned.imag, acceleration[..., 2] + 0.0 * turned.real], axis=-1)
+
+
+def frames_of(quaternions: Array) -> Array:
+    """(M, 4, 4) matrices that take q to q_r* q, of q_r (M, 4)."""
+    return (quaternions @ _LEFT).reshape(-1, 4, 4)
+
+
+_LEFT: Final = np.array(
+    [
+        [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]],
+        [[0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 0, 1], [0, 0, -1, 0]],
+        [[0, 0, 1, 0], [0, 0, 0, -1], [-1, 0, 0, 0], [0, 1, 0, 0]],
+        [[0, 0, 0, 1], [0, 0, 1, 0], [0, -1, 0, 0], [-1, 0, 0, 0]],
+    ],
+    float,
+).reshape(4, 16)
+"""The left factor q_r* as a matrix, by each entry of q_r."""
+
+
+class NonlinearMPC:
+    """One step of sequential quadratic programming per period, or more; see the module.
+
+    Attributes:
+        problem: the optimisation; its states and inputs are those of the module.
+        unanswered: the first period since `reset` whose QP had no answer; None where all had.
+
+    Raises:
+        ParameterError: a number is not possible.
+    """
+
+    name: Final = "nonlinear"
+
+    def __init__(
+        self,
+        vehicle: Vehicle,
+        *,
+        period: float,
+        settings: NonlinearSettings,
+        bounds: ActuatorBounds | None = None,
+        constraints: tuple[Constraint, ...] = (),
+        space: Space | None = None,
+    ) -> None:
+        self.settings, self._vehicle, self._period = settings, vehicle, period
+        self._bounds = ActuatorBounds.of_vehicle(vehicle) if bounds is None else bounds
+        self._nodes = settings.horizon
+        self.horizon = settings.horizon * settings.stride
+        self._model = rigid_body(
+            vehicle,
+            period * settings.stride,
+            substeps=settings.substeps,
+            inputs=settings.inputs,
+            rotor_lag=settings.rotor_lag or None,
+            drag=np.array(settings.drag),
+            quadratic_drag=np.array(settings.quadratic_drag),
+        )
+        self._inverse = np.linalg.inv(self._model.effectiveness)
+        self._hover = vehicle.mass * vehicle.gravity / N_ROTORS
+        self._tilted = settings.tilt is not None
+        self.problem = self._problem(constraints)
+        small = self.problem.horizon * N_ROTORS <= LARGEST_CONDENSED
+        self.solver = settings.solver or ("piqp-dense" if small else "piqp-multistage")
+        self._qp = Relinearised(self.problem, self.solver, shortcut=True)
+        self._clearing = None if space is None else Clearing(self.problem, self._solve, space, changing=True)
+        self._observer = None if settings.observer is None else DisturbanceObserver(settings.observer, period)
+        self._shift = settings.stride == 1 if settings.shift is None else settings.shift
+        self._lower, self._upper = self._shares(self._bounds.u_min), self._shares(self._bounds.u_max)
+        self._difference = settings.attitude_error is AttitudeError.DIFFERENCE
+        self._C_r = self.problem.objective.C_r
+        self.reset(np.full(N_ROTORS, vehicle.hover_speed))
+
+    def _shares(self, speeds: Array) -> Array:
+        return self._model.shares(self._vehicle.thrust_coefficient * np.square(speeds))
+
+    def _speeds(self, shares: Array) -> Array:
+        """Rotor speeds [rad/s] of inputs."""
+        return np.sqrt(self._model.thrusts(np.maximum(shares, 0.0)) / self._vehicle.thrust_coefficient)
+
+    def _problem(self, constraints: tuple[Constraint, ...]) -> Problem:
+        settings, model = self.settings, self._model
+        hover, x = self._shares(np.full(N_ROTORS, self._vehicle.hover_speed)), np.zeros(model.n)
+        x[3] = 1.0
+        x[N_BODY:] = hover[: model.n - N_BODY]
+        A, B, _ = linearise_nodes(model, x[None], hover[None])
+        rows, weights = settings.outputs()
+        objective = Objective(
+            C_r=np.hstack([rows, np.zeros((len(rows), model.n - N_BODY))]),
+            Q_y=np.diag(weights),
+            Q_u=settings.weights.input * np.eye(N_ROTORS),
+            Q_d=settings.weights.move * np.eye(N_ROTORS) if settings.weights.move else None,
+        )
+        linear = LinearModel(A=A[0], B=B[0], u_bar=hover, period=model.step)
+        if settings.terminal == "lqr":
+            P = self._riccati(linear, objective)
+        else:
+            P = float(settings.terminal) * objective.weights[0]
+        if self._tilted:  # two more states: the thrust axis along world x and y
+            none = np.zeros((2, 2))
+            A, B = scipy.linalg.block_diag(linear.A, none), np.vstack([linear.B, np.zeros((2, N_ROTORS))])
+            linear, P = replace(linear, A=A, B=B), scipy.linalg.block_diag(P, none)
+            objective = replace(objective, C_r=np.hstack([objective.C_r, np.zeros((len(rows), 2))]))
+        lower, upper = self._shares(self._bounds.u_min), self._shares(self._bounds.u_max)
+        return Problem(
+            model=linear,
+            horizon=settings.horizon,
+            objective=replace(objective, P=P),
+            constraints=(
+                Constraint(name="inputs", lower=lower, upper=upper, D=np.eye(N_ROTORS)),
+                *self._slews(),
+                *self._turning(linear.n),
+                *(self._of_states(constraint, linear.n) for constraint in constraints),
+            ),
+        )
+
+    def _turning(self, n: int) -> Iterator[Constraint]:
+        """Bounds on tilt and body rates."""
+        settings = self.settings
+        if settings.tilt is not None:
+            angles = math.tau / TILT_SIDES * np.arange(TILT_SIDES)
+            rows = np.zeros((TILT_SIDES, n))
+            rows[:, -2], rows[:, -1] = np.cos(angles), np.sin(angles)
+            upper = np.full(TILT_SIDES, math.sin(settings.tilt) * math.cos(math.pi / TILT_SIDES))
+            penalty = self._penalty(TILT_SIDES, 1.0 / math.cos(settings.tilt))  # of its sine, instead of the tilt
+            yield Constraint(name="tilt", lower=np.full(TILT_SIDES, -math.inf), upper=upper, C=rows, penalty=penalty)
+        rates = np.array(settings.largest_rates)
+        if np.isfinite(rates).any():
+            rows = np.eye(n)[W]
+            yield Constraint(name="body_rates", lower=-rates, upper=rates, C=rows, penalty=self._penalty(3, 1.0))
+
+    def _penalty(self, rows: int, scale: float) -> Penalty | None:
+        if self.settings.soft is None:
+            return None
+        l1, l2 = self.settings.soft
+        return Penalty(l1=np.full(rows, l1 * scale), l2=np.full(rows, l2 * scale**2))
+
+    def _of_states(self, constraint: Constraint, n: int) -> Constraint:
+        """Rows over the 12 states of `quadsim.state` and rotor speeds as rows over the model's.
+
+        Raises:
+            ParameterError: they are of what is not linear in those.
+        """
+        parts = {name: np.zeros((constraint.lower.shape[-1], size)) for name, size in (("C", n), ("D", N_ROTORS))}
+        if constraint.C is not None:
+            if constraint.C[:, [*EULER, *EULER_RATE]].any():
+                rule = "without Euler angles and their rates; tilt and body_rate bound the attitude"
+                raise ParameterError("controller", constraint.name, "of those", rule)
+            parts["C"][:, P], parts["C"][:, V] = constraint.C[:, POSITIONS], constraint.C[:, VELOCITIES]
+        if constraint.D is not None and constraint.D.any():
+            if self.settings.inputs is not Inputs.SPEED:
+                rule = 'without rotor speeds where inputs = "thrust", in which they are not linear: inputs = "speed"'
+                raise ParameterError("controller", constraint.name, "of those", rule)
+            parts["D"] = constraint.D * self._vehicle.speed_max
+        return replace(constraint, C=parts["C"], D=parts["D"])
+
+    def _slews(self) -> list[Constraint]:
+        """Bounds on steps of speeds: from one node to the next `stride` times those of a period, but for the first."""
+        bounds, settings = self._bounds, self.settings
+        if not (np.isfinite(bounds.delta_min).any() or np.isfinite(bounds.delta_max).any()):
+            return []
+        if settings.inputs is not Inputs.SPEED:
+            rule = 'left out where inputs = "thrust": a step of a speed is not linear in thrusts; inputs = "speed"'
+            raise ParameterError("controller", "input_bounds.slew", bounds.delta_max.tolist(), rule)
+        steps = np.full((settings.horizon, 1), float(settings.stride))
+        steps[0] = 1.0
+        largest = self._vehicle.speed_max
+        lower, upper = steps * bounds.delta_min / largest, steps * bounds.delta_max / largest
+        return [Constraint(name="slews", lower=lower, upper=upper, E=np.eye(N_ROTORS))]
+
+    def _riccati(self, linear: LinearModel, objective: Objective) -> Array:
+        """P at hover, where the quaternion's scalar does not move, and costs nothing."""
+        kept = np.delete(np.arange(linear.n), 3)
+        reduced = replace(objective, C_r=objective.C_r[:, kept], P=None)
+        if self.settings.attitude_error is AttitudeError.DIFFERENCE:
+            rows = np.delete(np.arange(len(objective.C_r)), 3)
+            reduced = replace(reduced, C_r=reduced.C_r[rows], Q_y=objective.Q_y[np.ix_(rows, rows)])
+        part = replace(linear, A=linear.A[np.ix_(kept, kept)], B=linear.B[kept])
+        P = np.zeros((linear.n, linear.n))
+        P[np.ix_(kept, kept)] = lqr_terminal_weight(part, reduced)
+        return P
+
+    def reset(self, speeds: Array) -> None:
+        """Start anew after the command u(-1) (4,) [rad/s], with rotors at that speed."""
+        self._acting = np.array(speeds, float)
+        self._rotors = self._rotors_before = self._shares(self._acting)
+        self._plan: tuple[Array, Array] | None
+        self._quaternion: Array | None
+        self._last: tuple[float, Array] | None  # time and state of the last period
+        self._asked: float
+        self._velocity = np.zeros(3)  # the reference's in the last period
+        self._forget()
+        if self._clearing is not None:
+            self._clearing.reset()
+        self.unanswered: Unanswered | None = None
+
+    def step(self, now: Moment, state: Array, reference: Array) -> Command:
+        """See `quadsim.controller.Controller.step`.
+
+        Numbers that are not finite, or that lead to such, are answered with the status `invalid_data`.
+        """
+        if now.acting is not None:
+            self._acting = np.array(now.acting, float)
+        last, self._last = self._last, None
+        self._turn(now)
+        if now.phase in GROUNDED:
+            return self._stop(now.phase)
+        measured = self._measured(now, state)
+        if not (np.abs(measured) <= _PLAUSIBLE).all() or not (np.abs(reference) <= _PLAUSIBLE).all():
+            return self._refuse(INVALID_DATA)
+        nodes = self._reference(now, reference)
+        if self._quaternion is None:
+            self._quaternion = nodes.states[0, Q]
+        if measured[Q] @ self._quaternion < 0.0:
+            measured[Q] *= -1.0
+        self._quaternion = measured[Q].copy()
+        if now.phase is Phase.FLYING:
+            if self._observer is not None and last is not None:
+                self._learn(last, now.time, measured, nodes)
+            self._last, self._velocity = (now.time, measured), nodes.states[0, V]
+            self._follow(nodes)
+        nodes = self._balanced(nodes)
+        query, answer, problem = self._iterate(now.time, measured, nodes)
+        status = self._rejection(answer)
+        if status is not None:
+            if status != INVALID_DATA and self.unanswered is None:
+                self.unanswered = Unanswered(problem=problem, query=query, status=status, time=now.time)
+            self._plan = None
+            return self._refuse(status, answer)
+        shares = np.minimum(np.maximum(answer.plan, self._lower), self._upper)
+        speeds = self._speeds(shares)
+        self._acting = speeds[0] = self._bounds.clip(speeds[0], self._acting)
+        plan = speeds if self.settings.stride == 1 else np.repeat(speeds, self.settings.stride, axis=0)
+        return command_of(speeds[0], plan, answer.solution.status, answer)
+
+    def predict(self, states: Array, plans: Array) -> Array:
+        """See `quadsim.controller.Controller.predict`; with the disturbance estimated last, and without rotor lag."""
+        known = self._acceleration[0]
+        model = replace(self._model, step=self._period, rotor_lag=None, substeps=1, acceleration=known)
+        x = np.zeros((len(states), N_BODY))
+        x[:, P], x[:, V] = states[:, POSITIONS], states[:, VELOCITIES]
+        x[:, Q] = euler_to_quaternion(states[:, ANGLES])
+        x[:, W] = euler_to_body_rates(states[:, ANGLES], states[:, ANGLE_RATES])
+        predicted = np.empty((*plans.shape[:2], N_STATES))
+        for i in range(plans.shape[1]):
+            x = advance_nodes(model, x, self._shares(plans[:, i]))
+            x[:, Q] /= np.linalg.norm(x[:, Q], axis=1, keepdims=True)
+            euler = quaternion_to_euler(x[:, Q])
+            predicted[:, i, POSITIONS], predicted[:, i, VELOCITIES] = x[:, P], x[:, V]
+            predicted[:, i, ANGLES] = euler
+            predicted[:, i, ANGLE_RATES] = body_to_euler_rates(euler, x[:, W])
+        return predicted
+
+    @property
+    def disturbance(self) -> Array:
+        """(6,) estimated acceleration now, world [m/s^2], and angular acceleration, body [rad/s^2]."""
+        return np.concatenate([self._acceleration[0], self._model.angular_acceleration])
+
+    def _measured(self, now: Moment, state: Array) -> Array:
+        """(n,) the model's state."""
+        x = np.empty(self._model.n)
+        x[P], x[V] = state[POSITIONS], state[VELOCITIES]
+        euler = state[ANGLES]
+        seen = now.attitude is not None and bool(np.isfinite(now.attitude).all())
+        x[Q] = now.attitude if seen else euler_to_quaternion(euler)
+        seen = now.body_rates is not None and bool(np.isfinite(now.body_rates).all())
+        x[W] = now.body_rates if seen else euler_to_body_rates(euler, state[ANGLE_RATES])
+        if x.size > N_BODY:
+            x[N_BODY:] = self._rotors
+        return x
+
+    def _turn(self, now: Moment) -> None:
+        """Let the rotors follow what was commanded since the last period."""
+        before, self._asked = self._asked, now.time
+        self._rotors_before = self._rotors
+        if self.settings.rotor_lag and math.isfinite(before):
+            left = math.exp(-(now.time - before) / self.settings.rotor_lag)
+            commanded = self._shares(self._acting)
+            self._rotors = commanded + left * (self._rotors - commanded)
+
+    def _learn(self, last: tuple[float, Array], time: float, measured: Array, nodes: Nodes) -> None:
+        """Compare the measured state with what was to be expected after the last one, disturbances included."""
+        before, x = last
+        if not abs(time - before - self._period) <= _SAME_TIME:
+            return
+        assert self._observer is not None
+        # In the period that is over, and as it was believed then.
+        model = replace(self._model, step=self._period, acceleration=self._acceleration[0])
+        if x.size > N_BODY:
+            x = np.concatenate([x[:N_BODY], self._rotors_before])
+        expected = advance_nodes(model, x, self._shares(self._acting))
+        self._observer.learn(np.concatenate([measured[V] - expected[V], measured[W] - expected[W]]))
+        if self.settings.disturbance is Disturbance.PATH:
+            turned = along_path(self._observer.estimate[:3], self._velocity, nodes.states[0, V])
+            self._observer.estimate[:3] = turned
+
+    def _follow(self, nodes: Nodes) -> None:
+        """Believe what is estimated now, and how it goes on over the horizon."""
+        if self._observer is None:
+            return
+        estimate = self._observer.estimate
+        found = np.broadcast_to(estimate[:3], (len(nodes.states), 3))
+        if self.settings.disturbance is Disturbance.PATH:
+            found = along_path(found, nodes.states[0, V], nodes.states[:, V])
+        self._model = replace(self._model, acceleration=found[:-1], angular_acceleration=estimate[3:])
+        self._acceleration = found
+
+    def _balanced(self, nodes: Nodes) -> Nodes:
+        """The reference with what balances drag and the disturbance: thrust turned the least way, and torque."""
+        model = self._model
+        if not (model.drags or self._acceleration.any() or model.angular_acceleration.any()):
+            return nodes
+        states, thrusts = nodes.states.copy(), nodes.thrusts
+        q, mass = states[:, Q], self._vehicle.mass
+        axis = thrust_axis(q)
+        total = np.sum(thrusts, axis=1) / mass
+        force = np.concatenate([total, total[-1:]])[:, None] * axis
+        wanted = force - self._acceleration - drag_acceleration(model, q, states[:, V])
+        size = np.maximum(np.linalg.norm(wanted, axis=1), 1e-9)
+        # The least rotation from one axis to another is (1 + a . b, a x b), up to its length.
+        turn = np.concatenate(
+            [1.0 + np.sum(axis * wanted, axis=1)[:, None] / size[:, None], np.cross(axis, wanted) / size[:, None]],
+            axis=1,
+        )
+        length = np.linalg.norm(turn, axis=1)
+        turn[length < 1e-6] = (1.0, 0.0, 0.0, 0.0)
+        turn /= np.linalg.norm(turn, axis=1, keepdims=True)
+        states[:, Q] = product(turn, q)
+        effort = np.empty((len(total), 4))
+        effort[:, 0], effort[:, 1:] = size[:-1] - total, -model.angular_acceleration
+        return Nodes(states, thrusts + effort @ self._inverse.T)
+
+    def _forget(self) -> None:
+        """Start without a plan, and assume no disturbance."""
+        self._plan, self._quaternion, self._last, self._asked = None, None, None, math.nan
+        if self._observer is not None:
+            self._observer.reset()
+            self._model = replace(self._model, acceleration=np.zeros(3), angular_acceleration=np.zeros(3))
+        self._acceleration = np.zeros((self._nodes + 1, 3))  # of the disturbance at each node
+
+    def _reference(self, now: Moment, reference: Array) -> Nodes:
+        stride = self.settings.stride
+        if now.motion is not None:
+            return nodes_of_motion(now.motion, self._nodes, stride)
+        return nodes_of_preview(reference, self._nodes, stride, self._period, self._hover)
+
+    def _solve(self, query: Query) -> Answer:
+        assert query.steps is not None
+        assert query.rest is not None
+        return self._qp.solve(*query.steps, *query[:3], query.rest)
+
+    def _iterate(self, time: float, measured: Array, nodes: Nodes) -> tuple[Query, Answer, Problem]:
+        """Steps of sequential quadratic programming from the plan kept; the last problem is that of the answer."""
+        frames, n = frames_of(nodes.states[:, Q]), self._model.n
+        inputs = self._model.shares(nodes.thrusts)
+        wanted = nodes.states.copy()
+        wanted[:, Q] = (1.0, 0.0, 0.0, 0.0) if self._difference else 0.0
+        if n > N_BODY:
+            wanted = np.concatenate([wanted, np.concatenate([inputs, inputs[-1:]])], axis=1)
+        start = np.concatenate([nodes.states, wanted[:, N_BODY:]], axis=1)
+        if self._tilted:
+            wanted = np.concatenate([wanted, np.zeros((len(wanted), 2))], axis=1)
+        desired = wanted[1:] @ self._C_r.T
+        s0 = measured.copy()
+        s0[Q] = frames[0] @ measured[Q]
+        if self._tilted:
+            s0 = np.append(s0, thrust_axis(measured[Q])[:2])
+        if self._plan is None:
+            self._plan = start, np.minimum(np.maximum(inputs, self._lower), self._upper)
+        elif self._shift:
+            x, u = self._plan
+            self._plan = np.concatenate([x[1:], x[-1:]]), np.concatenate([u[1:], u[-1:]])
+        rest, before = Rest(wanted[-1], inputs), self._shares(self._acting)
+        share, before_that = 1.0, math.inf
+        for _ in range(self.settings.iterations):
+            x, u = self._plan
+            query = Query(s0, desired, before, rest, self._steps(x, u, frames))
+            if self._clearing is None:
+                answer, problem = self._solve(query), self.problem
+            else:
+                answer, problem, states = self._clearing.solve(time, query, along=x[1:, P])
+                self._qp.last = (states, answer.plan) if answer.solution.status in ACCEPTED else None
+            if self._qp.last is None:
+                break
+            states, plan = self._qp.last[0][:, :n], self._qp.last[1]
+            found = np.concatenate([measured[None], states])
+            found[1:, Q] = (frames[1:].transpose(0, 2, 1) @ states[:, Q, None])[:, :, 0]
+            self._plan = found, plan
+            if self.settings.iterations > 1:
+                moved = max(np.abs(found - x).max(), np.abs(plan - u).max())
+                if moved <= self.settings.tolerance:
+                    break
+                # Full Gauss-Newton steps may go to and fro for ever: where they do not shrink, shorter ones are taken.
+                share *= 0.5 if moved > 0.99 * before_that else 1.0
+                before_that = moved
+                self._plan = x + share * (found - x), u + share * (plan - u)
+        return query, answer, problem
+
+    def _steps(self, x: Array, u: Array, frames: Array) -> tuple[Array, Array, Array]:
+        """A, B, c along a plan of states (N + 1, n) and inputs (N, 4)."""
+        A, B, end = linearise_nodes(self._model, x[:-1], u, frames)
+        turned, end = x[:-1].copy(), end.copy()
+        turned[:, Q] = (frames[:-1] @ turned[:, Q, None])[:, :, 0]
+        end[:, Q] = (frames[1:] @ end[:, Q, None])[:, :, 0]
+        c = end - (A @ turned[:, :, None])[:, :, 0] - (B @ u[:, :, None])[:, :, 0]
+        return self._with_axis(A, B, c, x[1:, Q], frames[1:]) if self._tilted else (A, B, c)
+
+    def _with_axis(self, A: Array, B: Array, c: Array, q: Array, frames: Array) -> tuple[Array, Array, Array]:
+        """The model with two more states, the thrust axis along world x and y, linearised at quaternions q (N, 4)."""
+        slope = _AXIS_SLOPES @ q[:, None, :, None]  # (N, 2, 4, 1)
+        known = thrust_axis(q)[:, :2] - (slope[..., 0] @ q[:, :, None])[:, :, 0]
+        rows = slope[..., 0] @ frames.transpose(0, 2, 1)  # by the quaternion in the node's frame
+        N, n = c.shape
+        wide, inputs = np.zeros((N, n + 2, n + 2)), np.concatenate([B, rows @ B[:, Q]], axis=1)
+        wide[:, :n, :n], wide[:, n:, :n] = A, rows @ A[:, Q]
+        return wide, inputs, np.concatenate([c, (rows @ c[:, Q, None])[:, :, 0] + known], axis=1)
+
+    def _rejection(self, answer: Answer) -> str | None:
+        status, plan = answer.solution.status, answer.plan
+        if status not in ACCEPTED:
+            return status
+        if not np.isfinite(plan).all():
+            return "not_finite"
+        beyond = np.maximum(self._lower - plan, plan - self._upper).max()
+        return "out_of_bounds" if beyond > OUTSIDE else None
+
+    def _stop(self, phase: Phase) -> Command:
+        self._acting, _ = self._bounds.reach(self._acting)
+        self._forget()
+        return stopped(self._acting.copy(), self.horizon, phase)
+
+    def _refuse(self, status: str, answer: Answer | None = None) -> Command:
+        """The command in force, with what speaks against another."""
+        plan = np.tile(self._acting, (self.horizon, 1))
+        if answer is None:
+            return Command(speeds=plan[0].copy(), plan=plan, status=status)
+        return command_of(plan[0], plan, status, answer)

@@ -1,0 +1,50 @@
+"""What the nodes of a horizon are to be at: states, and the inputs that hold them."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from mpc.nonlinear.rigidbody import N_BODY, P, Q, V, W
+from quadsim.motion import Motion
+from quadsim.state import Array
+
+
+class Nodes(NamedTuple):
+    """The reference of N + 1 nodes, the first of them now."""
+
+    states: Array  # (N + 1, 13)
+    thrusts: Array  # (N, 4) of the rotors [N]
+
+
+def nodes_of_motion(motion: Motion, horizon: int, stride: int) -> Nodes:
+    """The samples k, k + stride, ...; where these end, the last of them again, and of thrusts the last but one."""
+    at = np.arange(0, horizon * stride + 1, stride)
+    there = at[: (len(motion) - 1) // stride + 1]
+    if there.size > horizon:
+        with_inputs = at[:-1]
+    else:
+        at = np.concatenate([there, np.full(at.size - there.size, there[-1])])
+        before = there[:-1] if there.size > 1 else there
+        with_inputs = np.concatenate([before, np.full(horizon - before.size, before[-1])])
+    states = np.empty((horizon + 1, N_BODY))
+    states[:, P], states[:, Q], states[:, V] = motion.position[at], motion.attitude[at], motion.velocity[at]
+    states[:, W] = motion.body_rates[at]
+    return Nodes(states, motion.thrusts[with_inputs])
+
+
+def nodes_of_preview(reference: Array, horizon: int, stride: int, period: float, hover: float) -> Nodes:
+    """Of x, y, z, yaw (N stride, 4) from t_{k+1} on: velocity by differences, level, rotors at a thrust of `hover` [N].
+
+    The first node, which costs nothing, is where the line through the first two samples is now.
+    """
+    steps = np.diff(reference, axis=0) if len(reference) > 1 else np.zeros((1, 4))
+    ahead = np.concatenate([[2.0 * reference[0] - reference[min(1, len(reference) - 1)]], reference])
+    rates = np.concatenate([steps[:1], steps[:1], 0.5 * (steps[:-1] + steps[1:]), steps[-1:]])[: len(ahead)] / period
+    chosen, rates = ahead[::stride], rates[::stride]
+    states = np.zeros((horizon + 1, N_BODY))
+    states[:, P], states[:, V] = chosen[:, :3], rates[:, :3]
+    half = 0.5 * chosen[:, 3]
+    states[:, 3], states[:, 6], states[:, 12] = np.cos(half), np.sin(half), rates[:, 3]
+    return Nodes(states, np.full((horizon, 4), hover))

@@ -1,0 +1,356 @@
+"""The rigid body with a quaternion: any attitude, no singularity, exact derivatives of all nodes in one pass.
+
+States are position p (world), quaternion q = (w, x, y, z) (Hamilton, body to world), velocity v (world) and body rates
+omega: 13; with rotor lag the four rotors' thrusts or speeds follow the inputs and are four more,
+
+    p' = v,    q' = 1/2 q (0, omega),    v' = T R(q) e_z - g e_z + R(q) d(R(q)' v) + a,
+    omega' = I^-1 (tau - omega x I omega) + alpha,    d(v_b) = -(D_1 v_b + D_2 |v_b| v_b) / m, component by component.
+
+R(q) is polynomial and never divided by |q|^2, so that the derivatives hold for a q of any length.  Inputs u are the
+rotors' thrusts or speeds as shares of the largest, held over a step of one node; T = thrust / m and I^-1 tau are known
+exactly at every instant of it.  The body is integrated by the classical Runge-Kutta method.
+
+All but the drag is of second degree in (q, omega), T and I^-1 tau given: with F the Jacobian of that part, which is
+linear in (q, omega, T q), its value is F x / 2.  So the derivatives and the value itself are the columns of one matrix
+that goes through the Runge-Kutta stages.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from enum import StrEnum
+from functools import cache, cached_property
+from typing import Final
+
+import numpy as np
+
+from quadsim.errors import ParameterError
+from quadsim.state import Array, read_only
+from quadsim.vehicle import N_ROTORS, Vehicle
+
+N_BODY: Final = 13
+"""States of the body; those of the rotors come after them."""
+P, Q, V, W = slice(0, 3), slice(3, 7), slice(7, 10), slice(10, 13)
+_TURNING: Final = 10
+"""Rows and columns of (q, v, omega), which the derivatives depend on."""
+_q, _v, _w = slice(0, 4), slice(4, 7), slice(7, 10)
+
+
+class Inputs(StrEnum):
+    """What the inputs are shares of the largest of."""
+
+    THRUST = "thrust"
+    SPEED = "speed"
+
+
+def _nothing() -> Array:
+    return read_only(np.zeros(3))
+
+
+@dataclass(frozen=True, kw_only=True)
+class RigidBody:
+    """x(k+1) = f(x(k), u(k)) over a time; see the module.  Another disturbance is a matter of `dataclasses.replace`."""
+
+    effectiveness: Array  # (4, 4) takes rotor thrusts [N] to T [m/s^2] and I^-1 tau [rad/s^2]
+    largest_thrust: float  # of a rotor [N]
+    inertia: Array  # (3,) [kg m^2]
+    mass: float  # [kg]
+    gravity: float  # [m/s^2]
+    step: float  # time between nodes [s]
+    substeps: int = 1  # Runge-Kutta steps in it
+    inputs: Inputs = Inputs.THRUST
+    rotor_lag: float | None = None  # time constant by which thrusts or speeds follow the inputs [s]; None for none
+    drag: Array = field(default_factory=_nothing)  # (3,) D_1, linear, body axes [N s/m]
+    quadratic_drag: Array = field(default_factory=_nothing)  # (3,) D_2, body axes [N s^2/m^2]
+    acceleration: Array = field(default_factory=_nothing)  # (3,) a of the disturbance, world frame [m/s^2]
+    angular_acceleration: Array = field(default_factory=_nothing)  # (3,) alpha of the disturbance, body frame [rad/s^2]
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.step < math.inf:
+            raise ParameterError("controller", "node", self.step, "positive and finite")
+        if not isinstance(self.substeps, int) or self.substeps < 1:
+            raise ParameterError("controller", "substeps", self.substeps, "a whole number >= 1")
+        if self.rotor_lag is not None and not 0.0 < self.rotor_lag < math.inf:
+            raise ParameterError("controller", "rotor_lag", self.rotor_lag, "positive and finite, or None")
+
+    @cached_property
+    def features(self) -> Array:
+        """(11, 100): takes (q, omega, T q) to F, the Jacobian of (q, v, omega)' but for drag, by (q, v, omega)."""
+        ixx, iyy, izz = self.inertia.tolist()
+        return _features(((iyy - izz) / ixx, (izz - ixx) / iyy, (ixx - iyy) / izz))
+
+    @cached_property
+    def drags(self) -> bool:
+        """Whether there is drag."""
+        return bool(np.any(self.drag) or np.any(self.quadratic_drag))
+
+    @property
+    def n(self) -> int:
+        """Number of states."""
+        return N_BODY if self.rotor_lag is None else N_BODY + N_ROTORS
+
+    def thrusts(self, shares: Array) -> Array:
+        """Rotor thrusts [N] of inputs, or of the rotors' states."""
+        return self.largest_thrust * (shares if self.inputs is Inputs.THRUST else np.square(shares))
+
+    def shares(self, thrusts: Array) -> Array:
+        """Inputs of rotor thrusts [N], negative ones counted as none where inputs are speeds."""
+        shares = np.asarray(thrusts) / self.largest_thrust
+        return shares if self.inputs is Inputs.THRUST else np.sqrt(np.maximum(shares, 0.0))
+
+
+def rigid_body(vehicle: Vehicle, step: float, **others: object) -> RigidBody:
+    """The vehicle's model, undisturbed; `others` are fields of `RigidBody`.
+
+    Raises:
+        ParameterError: a number is not possible.
+    """
+    resistance = np.array([vehicle.mass, *vehicle.inertia])
+    return RigidBody(
+        effectiveness=read_only(vehicle.allocation / vehicle.thrust_coefficient / resistance[:, None]),
+        largest_thrust=vehicle.thrust_coefficient * vehicle.speed_max**2,
+        inertia=read_only(np.array(vehicle.inertia)),
+        mass=vehicle.mass,
+        gravity=vehicle.gravity,
+        step=step,
+        **others,  # type: ignore[arg-type]
+    )
+
+
+@cache
+def _features(gyration: tuple[float, float, float]) -> Array:
+    F = np.zeros((11, _TURNING, _TURNING))
+    w, x, y, z, p, q, r, Tw = range(8)  # the last is the first of four, T q
+    half = 0.5
+    # q' = 1/2 q (0, omega): each term is sign/2 q_i omega_j in row k.
+    for k, i, j, sign in (
+        (0, x, p, -1), (0, y, q, -1), (0, z, r, -1),
+        (1, w, p, 1), (1, y, r, 1), (1, z, q, -1),
+        (2, w, q, 1), (2, x, r, -1), (2, z, p, 1),
+        (3, w, r, 1), (3, x, q, 1), (3, y, p, -1),
+    ):  # fmt: skip
+        F[j, k, i] += sign * half
+        F[i, k, j + 3] += sign * half
+    # v' = T R e_z: 2 T (x z + w y), 2 T (y z - w x), T (1 - 2 (x^2 + y^2)).
+    for row, i, j, sign in ((4, x, z, 2), (4, w, y, 2), (5, y, z, 2), (5, w, x, -2), (6, x, x, -2), (6, y, y, -2)):
+        F[j + Tw, row, i] += sign
+        F[i + Tw, row, j] += sign
+    for row, (i, j, k) in enumerate(((q, r, 0), (r, p, 1), (p, q, 2))):
+        F[j, 7 + row, i + 3] += gyration[k]
+        F[i, 7 + row, j + 3] += gyration[k]
+    return read_only(F.reshape(11, -1))
+
+
+_FIRST, _SECOND = np.array([1, 0, 2, 0, 1, 2]), np.array([3, 2, 3, 1, 1, 2])
+_THRUST_AXIS: Final = np.array(
+    [[2.0, 0.0, 0.0], [2.0, 0.0, 0.0], [0.0, 2.0, 0.0], [0.0, -2.0, 0.0], [0.0, 0.0, -2.0], [0.0, 0.0, -2.0]]
+)
+_UP: Final = np.array([0.0, 0.0, 1.0])
+_EYE: Final = np.eye(3)
+_HALF: Final = np.repeat([0.5, 0.0, 0.5], [4, 3, 3])
+
+
+def thrust_axis(q: Array) -> Array:
+    """R(q) e_z (..., 3) of quaternions (..., 4) of any length."""
+    return np.asarray((q[..., _FIRST] * q[..., _SECOND]) @ _THRUST_AXIS + _UP)
+
+
+def rotation(q: Array) -> Array:
+    """R(q) (..., 3, 3), polynomial, of quaternions (..., 4) of any length."""
+    w, x, y, z = (q[..., i] for i in range(4))
+    rows = [
+        [1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)],
+        [2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)],
+        [2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)],
+    ]
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def _rotation_slopes() -> Array:
+    """(4, 36): takes q to the derivatives (4, 3, 3) of R(q) by its components."""
+    found, basis = np.zeros((4, 4, 3, 3)), np.eye(4)
+    for i in range(4):
+        for j in range(4):  # R - I is a quadratic form: its polarisation
+            found[i, j] = rotation(basis[i] + basis[j]) - rotation(basis[i]) - rotation(basis[j]) + np.eye(3)
+    return found.reshape(4, 36)
+
+
+_SLOPES: Final = _rotation_slopes()
+
+
+def linearise_nodes(model: RigidBody, x: Array, u: Array, frames: Array | None = None) -> tuple[Array, Array, Array]:
+    """A, B and the end x(k+1) of the map from M nodes' states x (M, n) under inputs u (M, 4).
+
+    Args:
+        model: what moves.
+        x: states.
+        u: inputs.
+        frames: (M + 1, 4, 4) orthogonal matrices, where A and B are to be for states whose quaternion is multiplied by
+            them, the first M of them at the beginning of the steps and the last M at the end; None for the states.
+
+    Returns:
+        (M, n, n), (M, n, 4) and (M, n): exact derivatives of the Runge-Kutta map; the end is not multiplied by frames.
+    """
+    M, n, lagging = len(x), model.n, model.rotor_lag is not None
+    m = n - 3 + N_ROTORS + 1  # columns: q, v, omega, rotors, inputs, and the value
+    Y = np.empty((M, _TURNING, m))
+    Y[:] = np.eye(_TURNING, m)
+    if frames is not None:
+        Y[:, _q, _q] = frames[:M].transpose(0, 2, 1)
+    Y[:, :, -1] = x[:, 3:N_BODY]
+    h = model.step / model.substeps
+    drives = _drives(model, x, u)
+    constant = model.acceleration - model.gravity * _UP
+    z, G = np.empty((M, 11)), np.zeros((M, _TURNING, m))
+
+    def slope(k: int, Y: Array) -> Array:
+        state, drive = Y[:, :, -1], drives[k if lagging else 0]
+        q = state[:, _q]
+        z[:, :4], z[:, 4:7] = q, state[:, _w]
+        np.multiply(q, drive[:, 0, -1:], out=z[:, 7:])
+        F = (z @ model.features).reshape(M, _TURNING, _TURNING)
+        axis = (q.take(_FIRST, axis=1) * q.take(_SECOND, axis=1)) @ _THRUST_AXIS
+        axis += _UP
+        np.multiply(axis[:, :, None], drive[:, :1], out=G[:, _v, _TURNING:])
+        G[:, _v, -1] += constant
+        if lagging or k == 0:
+            G[:, _w, _TURNING:] = drive[:, 1:]
+        dragging = _drag(model, F, state) if model.drags else None
+        K = F @ Y
+        K[:, :, -1] *= _HALF
+        K += G
+        if dragging is not None:
+            K[:, _v, -1] += dragging
+        return np.asarray(K)
+
+    def ahead(K: Array, step: float) -> Array:
+        np.multiply(K, step, out=scratch)
+        return np.add(scratch, Y, out=scratch)
+
+    travelled, scratch = np.zeros((M, 3, m)), np.empty_like(Y)  # of position, without the straight motion
+    for s in range(model.substeps):
+        first = slope(4 * s, Y)
+        second = slope(4 * s + 1, ahead(first, 0.5 * h))
+        third = slope(4 * s + 2, ahead(second, 0.5 * h))
+        fourth = slope(4 * s + 3, ahead(third, h))
+        first += second
+        first += third
+        travelled += h * Y[:, _v] + (h * h / 6.0) * first[:, _v]
+        first += second
+        first += third
+        first += fourth
+        first *= h / 6.0
+        first += Y
+        Y = first
+    return _assemble(model, x, u, Y, travelled, frames)
+
+
+def _assemble(
+    model: RigidBody, x: Array, u: Array, Y: Array, travelled: Array, frames: Array | None
+) -> tuple[Array, Array, Array]:
+    M, n = len(x), model.n
+    A, B, end = np.zeros((M, n, n)), np.empty((M, n, N_ROTORS)), np.empty((M, n))
+    end[:, P], end[:, 3:N_BODY] = x[:, P] + travelled[:, :, -1], Y[:, :, -1]
+    if frames is not None:
+        Y[:, _q, :-1] = frames[1:] @ Y[:, _q, :-1]
+    inputs = slice(n - 3, n - 3 + N_ROTORS)
+    A[:, :3, :3] = _EYE
+    A[:, P, 3:] = travelled[:, :, : n - 3]
+    A[:, 3:N_BODY, 3:] = Y[:, :, : n - 3]
+    B[:, P], B[:, 3:N_BODY] = travelled[:, :, inputs], Y[:, :, inputs]
+    if model.rotor_lag is not None:
+        rotors, kept = np.arange(N_BODY, n), math.exp(-model.step / model.rotor_lag)
+        A[:, rotors, rotors] = kept
+        B[:, rotors] = (1.0 - kept) * np.eye(N_ROTORS)
+        end[:, N_BODY:] = u + kept * (x[:, N_BODY:] - u)
+    return A, B, end
+
+
+def _drives(model: RigidBody, x: Array, u: Array) -> Array:
+    """(K, M, 4, 4 or 8, and 1): slopes of (T, I^-1 tau) by the rotors' states and inputs, and values, at K instants."""
+    if model.rotor_lag is None:
+        decay = np.zeros(1)
+    else:
+        instants = (np.arange(model.substeps)[:, None] + [0.0, 0.5, 0.5, 1.0]).ravel()
+        decay = np.exp(-instants * (model.step / model.substeps / model.rotor_lag))
+    lagging = model.rotor_lag is not None
+    now = u[None] if not lagging else u + decay[:, None, None] * (x[:, N_BODY:] - u)  # (K, M, 4)
+    effect = model.effectiveness * model.largest_thrust
+    found = np.empty((len(decay), len(x), 4, N_ROTORS * (1 + lagging) + 1))
+    by_share = effect if model.inputs is Inputs.THRUST else effect * (2.0 * now[:, :, None, :])
+    found[..., -N_ROTORS - 1 : -1] = by_share
+    if lagging:
+        found[..., :N_ROTORS] = decay[:, None, None, None] * by_share
+        found[..., N_ROTORS:-1] *= 1.0 - decay[:, None, None, None]
+    found[..., -1] = (now if model.inputs is Inputs.THRUST else np.square(now)) @ effect.T
+    found[..., 1:, -1] += model.angular_acceleration
+    return found
+
+
+def _drag(model: RigidBody, F: Array, state: Array) -> Array:
+    """Add drag's derivatives to F (M, 10, 10); (M, 3) its acceleration [m/s^2], of states (M, 10)."""
+    q, v = state[:, _q], state[:, _v]
+    slopes = (q @ _SLOPES).reshape(-1, 4, 3, 3)  # of R by each component of q, of which R - I is of second degree
+    R = 0.5 * (q[:, None] @ slopes.reshape(-1, 4, 9)).reshape(-1, 3, 3) + _EYE
+    body = (v[:, None] @ R)[:, 0]
+    size = np.abs(body)
+    pull = -(model.drag + model.quadratic_drag * size) * body / model.mass
+    rate = -(model.drag + 2.0 * model.quadratic_drag * size) / model.mass
+    damping = R * rate[:, None]
+    F[:, _v, _v] += damping @ R.transpose(0, 2, 1)
+    F[:, _v, _q] += (slopes @ pull[:, None, :, None])[..., 0].transpose(0, 2, 1)
+    F[:, _v, _q] += damping @ (v[:, None, None] @ slopes)[:, :, 0].transpose(0, 2, 1)
+    return (R @ pull[:, :, None])[:, :, 0]
+
+
+def drag_acceleration(model: RigidBody, q: Array, v: Array) -> Array:
+    """(..., 3) acceleration by drag, world [m/s^2], of quaternions (..., 4) and velocities (..., 3) [m/s]."""
+    R = rotation(q)
+    air = (np.swapaxes(R, -1, -2) @ v[..., None])[..., 0]
+    pull = -(model.drag * air + model.quadratic_drag * np.abs(air) * air) / model.mass
+    return np.asarray((R @ pull[..., None])[..., 0])
+
+
+def product(left: Array, right: Array) -> Array:
+    """Quaternion products (..., 4)."""
+    a, b, c, d = (left[..., i] for i in range(4))
+    w, x, y, z = (right[..., i] for i in range(4))
+    return np.stack(
+        [a * w - b * x - c * y - d * z, a * x + b * w + c * z - d * y, a * y - b * z + c * w + d * x,
+         a * z + b * y - c * x + d * w],
+        axis=-1,
+    )  # fmt: skip
+
+
+def advance_nodes(model: RigidBody, x: Array, u: Array) -> Array:
+    """The states (..., n) one step after states x (..., n) under inputs u (..., 4), without derivatives."""
+    h, lag = model.step / model.substeps, model.rotor_lag
+    body = x[..., :N_BODY]
+    for s in range(model.substeps):
+        slopes: list[Array] = []
+        for fraction, weight in ((0.0, 0.0), (0.5, 0.5), (0.5, 0.5), (1.0, 1.0)):
+            at = body if not slopes else body + weight * h * slopes[-1]
+            now = u if lag is None else u + math.exp(-(s + fraction) * h / lag) * (x[..., N_BODY:] - u)
+            slopes.append(_derivative(model, at, now))
+        body = body + h / 6.0 * (slopes[0] + 2.0 * (slopes[1] + slopes[2]) + slopes[3])
+    if lag is None:
+        return np.asarray(body)
+    return np.concatenate([body, u + math.exp(-model.step / lag) * (x[..., N_BODY:] - u)], axis=-1)
+
+
+def _derivative(model: RigidBody, body: Array, rotors: Array) -> Array:
+    """d(p, q, v, omega)/dt (..., 13) with rotors at such shares (..., 4)."""
+    q, v, rates = body[..., Q], body[..., V], body[..., W]
+    drive = model.thrusts(rotors) @ model.effectiveness.T
+    w, x, y, z = (q[..., i] for i in range(4))
+    a, b, c = (rates[..., i] for i in range(3))
+    turn = 0.5 * np.stack(
+        [-x * a - y * b - z * c, w * a + y * c - z * b, w * b - x * c + z * a, w * c + x * b - y * a], axis=-1
+    )
+    push = drive[..., :1] * thrust_axis(q) - model.gravity * _UP + model.acceleration
+    if model.drags:
+        push = push + drag_acceleration(model, q, v)
+    momentum = model.inertia * rates
+    spin = drive[..., 1:] - np.cross(rates, momentum) / model.inertia + model.angular_acceleration
+    return np.concatenate([v, turn, push, spin], axis=-1)

@@ -1,0 +1,131 @@
+"""What a nonlinear MPC is made from."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from enum import StrEnum
+
+import numpy as np
+
+from mpc.nonlinear.rigidbody import Inputs
+from mpc.observer import ObserverSettings
+from quadsim.errors import ParameterError
+from quadsim.state import Array
+
+
+class Disturbance(StrEnum):
+    """How the estimated acceleration goes on over the horizon."""
+
+    CONSTANT = "constant"
+    """As it is, in the world frame: wind on a hovering vehicle, another mass."""
+    PATH = "path"
+    """Its horizontal part turns and grows with the reference's velocity, as drag does."""
+
+
+Weight = float | tuple[float, float, float]
+"""One number for three axes, or one each."""
+
+
+class AttitudeError(StrEnum):
+    """What the weight of the attitude is of, with the reference q_r."""
+
+    ERROR_STATE = "error-state"
+    """2 vec(q_r* q), three components: the rotation vector to first order, and the same of q and -q."""
+    DIFFERENCE = "difference"
+    """q - q_r, four components, whose signs have to agree: to first order half the rotation vector."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Weights:
+    """What squared distances from the reference cost; of three axes one number or one each."""
+
+    position: Weight = 10.0  # [1/m^2]
+    attitude: Weight = 0.1  # [1/rad^2], or of the squared difference; then one number
+    velocity: Weight = 0.05  # [1/(m/s)^2]
+    body_rates: Weight = 0.05  # [1/(rad/s)^2]
+    input: float = 0.1  # of an input's distance from the reference's, as shares
+    move: float = 0.0  # of its change from one node to the next; 0 for none
+
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            array = np.asarray(value, float)
+            axes = ((),) if name in ("input", "move") else ((), (3,))
+            inside = np.isfinite(array) & (array >= 0.0) & ((array > 0.0) | (name == "move"))
+            if array.shape not in axes or not inside.all():
+                rule = "positive: one number, or three" if len(axes) == 2 else "one positive number"
+                raise ParameterError("controller.weights", name, value, rule)
+
+
+_USUAL = Weights()
+
+
+@dataclass(frozen=True, kw_only=True)
+class NonlinearSettings:
+    """Horizon, cost and model; the units are those of the states, inputs are shares of the largest.
+
+    Attributes:
+        horizon: N, nodes.
+        stride: control periods from one node to the next.
+        iterations: most steps of sequential quadratic programming in a period; 1 is the real-time iteration.
+        tolerance: largest step of a state or an input that ends them.
+        shift: whether the plan is shifted by a node before it is linearised along; None: where the stride is 1.
+        substeps: Runge-Kutta steps from one node to the next.
+        inputs: what the inputs are shares of the largest of.
+        rotor_lag: time constant of the rotors' thrusts or speeds [s]; None for none.
+        drag: (3,) linear drag that the model knows, body axes [N s/m].
+        quadratic_drag: (3,) drag quadratic in each component of the velocity [N s^2/m^2].
+        attitude_error: what the weight of the attitude is of.
+        weights: what distances from the reference cost.
+        terminal: the last state's weight over that of the others, 0 for none; `lqr` for the Riccati equation's.
+        tilt: largest angle between thrust axis and vertical [rad], below pi/2; None for no bound.
+        largest_rates: (3,) largest magnitudes of the body rates [rad/s]; infinite for no bound.
+        soft: (l1, l2) of exceeding these by 1 rad or 1 rad/s; None for hard bounds.
+        observer: tuning of the disturbance observer; None for no offset-free tracking.
+        disturbance: how the acceleration that it estimates goes on over the horizon.
+        solver: QP solver, in `mpc.solvers.SOLVERS`; None for the one that is the fastest for the size.
+    """
+
+    horizon: int = 10
+    stride: int = 1
+    iterations: int = 1
+    tolerance: float = 1e-6
+    shift: bool | None = None
+    substeps: int = 1
+    inputs: Inputs = Inputs.THRUST
+    rotor_lag: float | None = None
+    drag: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    quadratic_drag: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    attitude_error: AttitudeError = AttitudeError.ERROR_STATE
+    weights: Weights = _USUAL
+    terminal: float | str = 0.0
+    tilt: float | None = None
+    largest_rates: tuple[float, float, float] = (math.inf, math.inf, math.inf)
+    soft: tuple[float, float] | None = None
+    observer: ObserverSettings | None = None
+    disturbance: Disturbance = Disturbance.CONSTANT
+    solver: str | None = None
+
+    def __post_init__(self) -> None:
+        for name in ("horizon", "stride", "iterations", "substeps"):
+            if not isinstance(getattr(self, name), int) or getattr(self, name) < 1:
+                raise ParameterError("controller", name, getattr(self, name), "a whole number >= 1")
+        if not isinstance(self.terminal, str) and not 0.0 <= self.terminal < math.inf:
+            raise ParameterError("controller", "terminal", self.terminal, 'at least 0 and finite, or "lqr"')
+        if self.tilt is not None and not 0.0 < self.tilt < 0.5 * math.pi:
+            raise ParameterError("controller", "tilt", self.tilt, "positive and below pi/2, or None")
+        if self.attitude_error is AttitudeError.DIFFERENCE and np.ndim(self.weights.attitude):
+            rule = 'one number where attitude_error = "difference"'
+            raise ParameterError("controller.weights", "attitude", self.weights.attitude, rule)
+
+    def outputs(self) -> tuple[Array, Array]:
+        """C_r (n_r, 13) and the diagonal of Q_y (n_r,), for states whose quaternion is q_r* q."""
+        weights, difference = self.weights, self.attitude_error is AttitudeError.DIFFERENCE
+        rows = np.eye(13) if difference else np.delete(np.eye(13), 3, axis=0)
+        attitude = np.full(4, weights.attitude) if difference else 4.0 * _three(weights.attitude)
+        parts = (_three(weights.position), attitude, _three(weights.velocity), _three(weights.body_rates))
+        return rows, np.concatenate(parts)
+
+
+def _three(weight: Weight) -> Array:
+    return np.broadcast_to(np.asarray(weight, float), 3)

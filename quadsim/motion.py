@@ -1,0 +1,37 @@
+"""What a course asks of a vehicle over time: positions and what follows from them, for controllers that look ahead."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from quadsim.state import Array
+
+
+@dataclass(frozen=True, kw_only=True)
+class Motion:
+    """A reference motion, K samples a control period apart, from one instant to the end of the course.
+
+    Attributes:
+        position: (K, 3) world [m].
+        velocity: (K, 3) world [m/s].
+        acceleration: (K, 3) world [m/s^2].
+        attitude: (K, 4) unit quaternions wxyz, body to world, sign continuous from sample to sample.
+        body_rates: (K, 3) body frame [rad/s].
+        thrusts: (K, 4) of the rotors [N], not clipped to what they can give.
+    """
+
+    position: Array
+    velocity: Array
+    acceleration: Array
+    attitude: Array
+    body_rates: Array
+    thrusts: Array
+
+    def __len__(self) -> int:
+        """K, the number of samples."""
+        return len(self.position)
+
+    def after(self, k: int) -> Motion:
+        """The motion from sample k on, as views; beyond the end its last sample, at which the course ends."""
+        first = min(k, len(self) - 1)
+        return Motion(**{name: samples[first:] for name, samples in vars(self).items()})

@@ -1,0 +1,120 @@
+"""Courses that speed up and slow down at a tangential acceleration: circle and lemniscate of an agile flight.
+
+The phase theta comes of an angular acceleration by rectangle sums, w_k = D sum_{i<=k} alpha_i and
+theta_k = D sum_{i<=k} w_i, as in the simplified simulation of Torrente et al., "Data-Driven MPC for Quadrotors" (2021).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from mpc.flatness import attitudes
+from quadsim.state import Array, quaternion_to_euler
+from scenarios.courses.course import Path
+
+
+@dataclass(frozen=True, kw_only=True)
+class Phase:
+    """An angle over samples a step apart, with its rate and acceleration; K samples."""
+
+    angle: Array  # (K,) theta [rad]
+    rate: Array  # (K,) w [rad/s]
+    acceleration: Array  # (K,) alpha [rad/s^2]
+    step: float  # [s]
+
+
+Curve = Callable[[Array, Array, Array], tuple[Array, Array, Array]]
+"""Angle, rate and acceleration (M,) -> position, velocity and acceleration (M, 3), world, from the origin on."""
+
+
+def ramped_phase(*, rate: float, acceleration: float, ramp: float, step: float) -> Phase:
+    """An angle that gains a rate [rad/s] at an acceleration [rad/s^2], and loses it at once in the same way.
+
+    The share s of the acceleration goes by phases, each sampled from its own start, its end excluded, with T = ramp:
+    sin^2(pi t / 2T) for T, 1 for rate / acceleration - T, cos(pi t / 2T) for 2 T, -1 as long as 1 before, and
+    sin^2(pi t / 2T) - 1 for T.
+
+    Args:
+        rate: that would be reached without ramps; the turn over adds 4 T acceleration / pi - T acceleration to it.
+        acceleration: largest magnitude.
+        ramp: T [s], less than rate / acceleration.
+        step: D, of the rectangle sums [s].
+    """
+    bend, full = 0.5 * math.pi / ramp, rate / acceleration - ramp
+
+    def within(length: float) -> Array:
+        return step * np.arange(math.ceil(length / step - 1e-9), dtype=np.float64)
+
+    rising, turning, constant = within(ramp), within(2.0 * ramp), np.ones(len(within(full)))
+    risen = np.square(np.sin(bend * rising))
+    share = np.concatenate([risen, constant, np.cos(bend * turning), -constant, risen - 1.0])
+    alpha = acceleration * share
+    omega = step * np.cumsum(alpha)
+    return Phase(angle=step * np.cumsum(omega), rate=omega, acceleration=alpha, step=step)
+
+
+def circle_curve(radius: float) -> Curve:
+    """A level circle, clockwise seen from above, begun at its northernmost point (y) towards x; radius [m]."""
+
+    def curve(theta: Array, omega: Array, alpha: Array) -> tuple[Array, Array, Array]:
+        sin, cos = np.sin(theta), np.cos(theta)
+        position = _level(radius * sin, radius * cos - radius)
+        velocity = _level(radius * omega * cos, -radius * omega * sin)
+        acceleration = _level(alpha * cos - omega**2 * sin, -alpha * sin - omega**2 * cos)
+        return position, velocity, radius * acceleration
+
+    return curve
+
+
+def lemniscate_curve(radius: float) -> Curve:
+    """A level lemniscate of Gerono, begun at its tip in x towards y; radius is half its length [m]."""
+
+    def curve(theta: Array, omega: Array, alpha: Array) -> tuple[Array, Array, Array]:
+        sin, cos, sin2, cos2 = np.sin(theta), np.cos(theta), np.sin(2.0 * theta), np.cos(2.0 * theta)
+        position = _level(radius * cos - radius, radius * sin * cos)
+        velocity = _level(-radius * omega * sin, radius * omega * cos2)
+        acceleration = _level(-alpha * sin - omega**2 * cos, alpha * cos2 - 2.0 * omega**2 * sin2)
+        return position, velocity, radius * acceleration
+
+    return curve
+
+
+def fly_ramped(curve: Curve, phase: Phase, *, initial: Array, gravity: float, free_heading: bool) -> Path:
+    """A curve flown from and to rest.
+
+    Args:
+        curve: where it leads, from the origin on.
+        phase: how far it is at each sample.
+        initial: (4,) x, y, z [m], yaw [rad] where it begins.
+        gravity: g [m/s^2]; with the acceleration it makes the attitude, and so the yaw.
+        free_heading: whether the heading is what leaves no rate about body z; else the initial one.
+    """
+    from scipy.interpolate import CubicSpline
+
+    knots = phase.step * np.arange(len(phase.angle), dtype=np.float64)
+    angle = CubicSpline(knots, phase.angle)
+
+    def at(t: Array) -> tuple[Array, Array, Array]:
+        return curve(angle(t), np.interp(t, knots, phase.rate), np.interp(t, knots, phase.acceleration))
+
+    accelerations = curve(phase.angle, phase.rate, phase.acceleration)[2]
+    heading = float(initial[3]) if free_heading else np.full(len(knots), initial[3])
+    attitude, _ = attitudes(accelerations, period=phase.step, gravity=gravity, yaw=heading)
+    yaw = np.unwrap(quaternion_to_euler(attitude)[:, 2])
+
+    def pose(t: Array) -> Array:
+        return np.column_stack([initial[:3] + at(t)[0], np.interp(t, knots, yaw)])
+
+    def derivatives(t: Array) -> tuple[Array, Array]:
+        _, velocity, acceleration = at(t)
+        return velocity, acceleration
+
+    return Path(pose=pose, duration=float(knots[-1]), derivatives=derivatives, free_heading=free_heading)
+
+
+def _level(x: Array, y: Array) -> Array:
+    return np.column_stack([x, y, np.zeros_like(x)])

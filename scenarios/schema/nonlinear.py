@@ -1,0 +1,150 @@
+"""`[controller] type = "nonlinear"`: MPC on the rigid body with a quaternion; each part a field with a default."""
+
+from __future__ import annotations
+
+from typing import Annotated, Final, Literal
+
+from annotated_types import Len, MaxLen
+from pydantic import Discriminator, Field, Tag, model_validator
+
+from mpc.fallback.settings import FallbackSettings
+from mpc.observer import ObserverSettings
+from mpc.robust.tightening import SHORTEST_LAG
+from quadsim.fields import NonNegative, Positive
+from scenarios.schema.base import MOST_ENTRIES, Pair, Spec, require_ordered
+from scenarios.schema.optimisation import AvoidanceSpec, Horizon, PolytopeSpec, SoftSpec, Weight
+from scenarios.schema.robust import Lag
+
+
+def _number_or_list(value: object) -> str:
+    return "list" if isinstance(value, list) else "number"
+
+
+def _number_or_text(value: object) -> str:
+    return "text" if isinstance(value, str) else "number"
+
+
+LINEAR: Final = ("x", "vx", "y", "vy", "z", "vz")
+"""States that are so of the quaternion model too."""
+AxisWeights = Annotated[
+    Annotated[Weight, Tag("number")] | Annotated[list[Weight], Len(3, 3), Tag("list")], Discriminator(_number_or_list)
+]
+"""One weight for three axes, or one each."""
+Terminal = Annotated[
+    Annotated[NonNegative, Tag("number")] | Annotated[Literal["none", "lqr"], Tag("text")],
+    Discriminator(_number_or_text),
+]
+NonNegativeTriple = Annotated[list[NonNegative], Len(3, 3)]
+
+
+class NonlinearWeightsSpec(Spec):
+    """What distances from the reference cost."""
+
+    position: AxisWeights = Field(default=10.0, description="[1/m^2] one weight, or x, y, z")
+    attitude: AxisWeights = Field(default=0.1, description="[1/rad^2] one weight, or about body x, y, z")
+    velocity: AxisWeights = Field(default=0.05, description="[1/(m/s)^2] one weight, or x, y, z")
+    body_rates: AxisWeights = Field(default=0.05, description="[1/(rad/s)^2] one weight, or about body x, y, z")
+    input: Weight = Field(default=0.1, description="[-] of an input's distance from the reference's, as shares")
+    move: NonNegative = Field(default=0.0, description="[-] of an input's change from one node to the next, as shares")
+
+
+class RotorBoundsSpec(Spec):
+    """Hard bounds on the rotor speeds and their steps, for every rotor."""
+
+    speed: Pair | None = Field(default=None, description="[rad/s] absent: what the vehicle's rotors hold")
+    slew: Pair | None = Field(
+        default=None, description='[rad/s per period] only where inputs = "speed"; absent: no bound'
+    )
+
+    @model_validator(mode="after")
+    def _check(self) -> RotorBoundsSpec:
+        if self.speed is not None:
+            require_ordered("speed", self.speed)
+            if self.speed[0] < 0.0:
+                raise ValueError(f"speed must have a lower bound >= 0 rad/s; got {self.speed}")
+        if self.slew is not None and not self.slew[0] <= 0.0 <= self.slew[1]:
+            raise ValueError(f"slew must allow a speed to be held, so contain 0; got {self.slew}")
+        return self
+
+
+class NonlinearPartsSpec(Spec):
+    """All of a nonlinear MPC but its QP solver."""
+
+    horizon: Horizon = Field(default=20, description="[periods] how far it looks ahead, a whole number of nodes")
+    node: Positive | None = Field(
+        default=None, description="[s] from one node to the next, whole periods; absent: one period"
+    )
+    iterations: Annotated[int, Field(ge=1, le=100)] = Field(
+        default=1, description="most steps of sequential quadratic programming in a period; 1: the real-time iteration"
+    )
+    shift: bool | None = Field(
+        default=None, description="whether the last plan is shifted by a node; absent: where a node is one period"
+    )
+    substeps: Annotated[int, Field(ge=1, le=100)] = Field(default=1, description="Runge-Kutta steps per node")
+    inputs: Literal["thrust", "speed"] = Field(
+        default="thrust", description="what the inputs are, as shares of the rotors' largest"
+    )
+    weights: NonlinearWeightsSpec = NonlinearWeightsSpec()
+    attitude_error: Literal["error-state", "difference"] = Field(
+        default="error-state",
+        description="error-state: twice the vector part of q_r* q, the angle to first order; difference: the four "
+        "components of q - q_r",
+    )
+    terminal: Terminal = Field(
+        default="none", description="weight of the last node: none, lqr, or a factor on that of the others"
+    )
+    rotor_lag: Lag = Field(
+        default=0.0,
+        description='[s] time constant by which rotors follow that is predicted, 0 for none; "vehicle": its rotor_rise',
+    )
+    drag: NonNegativeTriple = Field(
+        default=[0.0, 0.0, 0.0], description="[N s/m] linear drag that is predicted, along body x, y, z"
+    )
+    quadratic_drag: NonNegativeTriple = Field(
+        default=[0.0, 0.0, 0.0], description="[N s^2/m^2] the same, of each component's square"
+    )
+    output_bounds: dict[str, Pair] = Field(
+        default={}, description="[m, m/s] lower and upper bound, of positions and velocities by their states' names"
+    )
+    tilt: Annotated[float, Field(gt=0.0, lt=90.0)] | None = Field(
+        default=None, description="[deg] largest angle between thrust axis and vertical; absent: no bound"
+    )
+    body_rate: AxisWeights | None = Field(
+        default=None, description="[deg/s] largest magnitude, one or about body x, y, z; absent: no bound"
+    )
+    soft: SoftSpec | None = Field(default=None, description="of the three above; absent: hard")
+    avoidance: AvoidanceSpec | None = Field(
+        default=None, description="absent: it knows of no obstacles, corridors or fence, which are audited all the same"
+    )
+    polytopes: Annotated[list[PolytopeSpec], MaxLen(MOST_ENTRIES)] = Field(
+        default=[], description="bounds on sums of positions, velocities and, as inputs, rotor speeds; audited as well"
+    )
+    offset_free: ObserverSettings | None = None
+    disturbance: Literal["constant", "path"] = Field(
+        default="constant",
+        description="how the acceleration that offset_free estimates goes on: constant, or path: turning and growing "
+        "with the reference's horizontal velocity, as drag does",
+    )
+    input_bounds: RotorBoundsSpec = RotorBoundsSpec()
+    fallback: FallbackSettings = FallbackSettings()
+
+    @model_validator(mode="after")
+    def _check(self) -> NonlinearPartsSpec:
+        if self.rotor_lag != "vehicle" and 0.0 < self.rotor_lag < SHORTEST_LAG:
+            raise ValueError(f"rotor_lag must be 0, or at least {SHORTEST_LAG:g} s; got {self.rotor_lag:g}")
+        if self.attitude_error == "difference" and isinstance(self.weights.attitude, list):
+            raise ValueError(
+                f'weights.attitude must be one number where attitude_error = "difference"; got {self.weights.attitude}'
+            )
+        for name, pair in self.output_bounds.items():
+            if name not in LINEAR:
+                raise ValueError(
+                    f"output_bounds must be of {', '.join(LINEAR)}; got {name!r}: tilt bounds the attitude"
+                )
+            require_ordered(f"output_bounds.{name}", pair)
+        if self.inputs == "thrust" and self.input_bounds.slew is not None:
+            raise ValueError(
+                'input_bounds.slew must be absent where inputs = "thrust", in which steps of speeds are not linear: '
+                f'inputs = "speed"; got {self.input_bounds.slew}'
+            )
+        return self

@@ -1,0 +1,210 @@
+"""Ramped courses and their reference motion: published check values, flatness, and what does not go together."""
+
+from __future__ import annotations
+
+import math
+import re
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.integrate import cumulative_trapezoid
+
+from mpc.flatness import attitudes, motion_along
+from quadsim.errors import ParameterError
+from quadsim.motion import Motion
+from quadsim.state import Array, quaternion_to_euler
+from quadsim.vehicle import Vehicle
+from scenarios.courses.make import build_course, build_motion, build_reference
+from scenarios.courses.ramped import ramped_phase
+from scenarios.loading import load_scenario
+from scenarios.parts.vehicle import build_initial_state, build_vehicle
+from scenarios.schema.problems import ScenarioError
+from scenarios.schema.scenario import Scenario
+
+PERIOD = 0.02
+# Of the specification of the paper's simulation: sample, position, quaternion, velocity, body rates, thrusts over 20 N.
+CHECKS: dict[str, dict[int, str]] = {
+    "torrente-loop8-ideal": {
+        0: "0 0 1 1 0 0 0 0 0 0 0 0.001257 0 0.122483 0.122767 0.122767 0.122483",
+        100: "0.613333 -0.03776 1 0.998657 0.016473 0.04912 -0.000658 1.002372 -0.123893 0 "
+        "0.060734 -0.011098 -0.000036 0.123373 0.122977 0.123173 0.123624",
+        500: "4.876984 -6.102281 1 0.529202 0.298282 -0.346093 -0.714978 -1.82388 -8.069667 0 "
+        "0.102196 -1.387647 0.000119 0.213968 0.213711 0.206847 0.207541",
+        999: "-1.84707 -9.646324 1 -0.276701 -0.000013 0.000001 -0.960956 0 0 0 "
+        "-0.000684 0.003709 0 0.122739 0.12246 0.122511 0.12279",
+    },
+    "torrente-lemniscate8-ideal": {
+        100: "-0.03776 0.608701 1 0.998885 -0.044234 -0.016486 0.000684 -0.123893 0.979605 0 "
+        "0.045665 -0.060887 0.00005 0.122879 0.12263 0.123491 0.123695",
+        500: "-6.102281 -1.075161 1 0.848429 -0.356415 0.242788 0.306904 -8.069667 -7.469042 0 "
+        "-1.943781 2.871643 -0.004176 0.213241 0.082275 0.181419 0.304061",
+    },
+}
+
+
+def motion_of(scenario: Scenario) -> tuple[Motion, Vehicle]:
+    vehicle = build_vehicle(scenario)
+    motion = build_motion(scenario, vehicle)
+    assert motion is not None
+    return motion, vehicle
+
+
+def changed(**fields: Any) -> Scenario:
+    base = load_scenario("torrente-loop8-ideal")
+    return base.replace({f"reference.{name}": value for name, value in fields.items()})
+
+
+@pytest.mark.parametrize("name", CHECKS)
+def test_the_motion_is_that_of_the_specification(name: str) -> None:
+    motion, _ = motion_of(load_scenario(name))
+    assert len(motion) == 1000
+    for k, text in CHECKS[name].items():
+        rows = (motion.position, motion.attitude, motion.velocity, motion.body_rates, motion.thrusts / 20.0)
+        np.testing.assert_allclose(np.concatenate([row[k] for row in rows]), [*map(float, text.split())], atol=6e-7)
+
+
+def test_top_speeds_and_lengths_are_those_of_the_specification() -> None:
+    for name, samples, speed in (("loop4", 600, 4.273), ("loop8", 1000, 8.273), ("lemniscate8", 1000, 11.69)):
+        motion, _ = motion_of(load_scenario(f"torrente-{name}-ideal"))
+        assert len(motion) == samples
+        assert np.linalg.norm(motion.velocity, axis=1).max() == pytest.approx(speed, abs=6e-4)
+    assert motion.thrusts.min() / 20.0 == pytest.approx(-0.046, abs=5e-4)  # the lemniscate's, not clipped
+
+
+def test_the_phase_gains_and_loses_its_rate_by_rectangle_sums() -> None:
+    """Its length is 2 v / a + 2 T; the sums tend to integrals, and the end is at rest."""
+    phase = ramped_phase(rate=1.3, acceleration=0.25, ramp=1.1, step=1e-3)
+    assert len(phase.angle) == pytest.approx((2.0 * 1.3 / 0.25 + 2.2) / 1e-3, abs=2)
+    integral = cumulative_trapezoid(phase.acceleration, dx=1e-3, initial=0.0)
+    np.testing.assert_allclose(phase.rate, integral, atol=3e-4)
+    np.testing.assert_allclose(phase.angle, cumulative_trapezoid(integral, dx=1e-3, initial=0.0), atol=3e-3)
+    assert phase.rate.max() == pytest.approx(1.3 + 0.25 * 1.1 * (2.0 / math.pi - 0.5), abs=1e-3)
+    assert abs(phase.rate[-1]) < 1e-3
+
+
+@pytest.mark.parametrize("heading", ["free", "held"])
+@pytest.mark.parametrize("name", ["loop8", "lemniscate8"])
+def test_the_motion_is_flat(name: str, heading: str) -> None:
+    """The thrust axis carries a + g; rates are those of the attitudes; torque and thrust are those of the rotors."""
+    motion, vehicle = motion_of(load_scenario(f"torrente-{name}-ideal", [f"reference.heading={heading}"]))
+    w, x, y, z = motion.attitude.T
+    axis = np.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)], axis=1)
+    collective = motion.thrusts.sum(axis=1)
+    pushed = collective[:, None] / vehicle.mass * axis - [0.0, 0.0, vehicle.gravity]
+    np.testing.assert_allclose(pushed, motion.acceleration, atol=1e-10)
+    np.testing.assert_allclose(np.linalg.norm(motion.attitude, axis=1), 1.0, atol=1e-14)
+    assert (motion.attitude[1:] * motion.attitude[:-1]).sum(axis=1).min() > 0.99
+    half = motion.velocity[2:] - motion.velocity[:-2]  # central differences of the exact velocities
+    np.testing.assert_allclose(half / (2 * PERIOD), motion.acceleration[1:-1], atol=0.15)
+    if heading == "free":
+        assert np.abs(motion.body_rates[:, 2]).max() < 0.09
+    else:  # body y at a right angle to world x
+        np.testing.assert_allclose(2 * (x * y - w * z), 0.0, atol=1e-12)
+
+
+def test_a_free_heading_drifts_as_specified_and_the_reference_has_its_yaw() -> None:
+    scenario = load_scenario("torrente-loop8-ideal")
+    motion, _ = motion_of(scenario)
+    reference = build_reference(scenario, 1010)
+    euler = quaternion_to_euler(motion.attitude)
+    np.testing.assert_allclose(np.angle(np.exp(1j * (reference[:1000, 3] - euler[:, 2]))), 0.0, atol=1e-9)
+    assert reference[999, 3] == pytest.approx(-3.7023, abs=1e-3)  # at rest and level, yaw is the heading
+    np.testing.assert_array_equal(reference[999:], np.tile(reference[999], (11, 1)))
+
+
+def test_the_heading_begins_at_the_initial_yaw() -> None:
+    """A turned start turns body rates and attitudes with it, and nothing else."""
+    base = load_scenario("torrente-loop8-ideal")
+    turned = base.replace({"initial.euler": [0.0, 0.0, 40.0]})
+    (plain, _), (other, _) = motion_of(base), motion_of(turned)
+    np.testing.assert_allclose(other.position, plain.position, atol=1e-12)
+    cos, sin = math.cos(math.radians(40.0)), math.sin(math.radians(40.0))
+    x, y, z = plain.body_rates.T
+    np.testing.assert_allclose(other.body_rates, np.stack([cos * x + sin * y, cos * y - sin * x, z], axis=1), atol=1e-9)
+
+
+def test_the_course_is_the_same_at_another_control_period() -> None:
+    fine, coarse = changed(), load_scenario("torrente-loop8-ideal", ["control_period=0.05"])
+    t = 0.1 * np.arange(200)
+    np.testing.assert_allclose(build_course(fine).sample(t), build_course(coarse).sample(t), atol=1e-12)
+    motion, _ = motion_of(coarse)
+    assert len(motion) == 400  # the last sample at or before 19.98 s is 19.95 s
+
+
+def test_it_waits_for_its_start_at_rest() -> None:
+    scenario = load_scenario("torrente-loop8-ideal", ["reference.start=1.0", "duration=22.0"])
+    motion, _ = motion_of(scenario)
+    assert len(motion) == 1050
+    np.testing.assert_array_equal(motion.velocity[:50], 0.0)
+    later = motion.after(50)
+    plain, _ = motion_of(load_scenario("torrente-loop8-ideal"))
+    np.testing.assert_allclose(later.position, plain.position, atol=1e-12)
+    np.testing.assert_allclose(later.attitude, plain.attitude, atol=1e-12)
+
+
+def test_what_is_left_of_a_motion_ends_with_its_last_sample() -> None:
+    motion, _ = motion_of(load_scenario("torrente-loop4-ideal"))
+    assert len(motion.after(590)) == 10
+    assert len(motion.after(599)) == len(motion.after(10_000)) == 1
+    np.testing.assert_array_equal(motion.after(10_000).position[0], motion.position[-1])
+    assert np.shares_memory(motion.after(3).attitude, motion.attitude)
+
+
+def test_a_flight_starts_in_the_state_of_the_reference() -> None:
+    scenario = load_scenario("torrente-loop8-ideal")
+    motion, _ = motion_of(scenario)
+    state = build_initial_state(scenario, motion)
+    np.testing.assert_allclose(state, [0, 0, 0, 0, 1, 0, 0, 0, 0, 0.001257, 0, 0], atol=6e-7)
+    at_rest = scenario.replace({"initial.on_reference": False})
+    np.testing.assert_array_equal(build_initial_state(at_rest, motion)[5:], 0.0)
+
+
+def test_other_courses_state_no_motion() -> None:
+    scenario = load_scenario("circle")
+    assert build_motion(scenario, build_vehicle(scenario)) is None
+
+
+def test_flatness_of_a_hover_that_turns() -> None:
+    """A heading held along a turning direction leaves its rate about body z, and the torque of its acceleration."""
+    vehicle = build_vehicle(load_scenario("torrente-loop4-ideal"))
+    t = PERIOD * np.arange(200)
+    yaw: Array = 0.4 * t**2
+    still = np.zeros((200, 3))
+    motion = motion_along(still, still, still, period=PERIOD, vehicle=vehicle, yaw=yaw)
+    np.testing.assert_allclose(motion.body_rates[2:-2, 2], 0.8 * t[2:-2], atol=1e-3)
+    torque_z = motion.thrusts @ (vehicle.allocation[3] / vehicle.thrust_coefficient)
+    np.testing.assert_allclose(torque_z[4:-4], 0.06 * 0.8, atol=1e-3)
+    attitude, _ = attitudes(still, period=PERIOD, gravity=9.81, yaw=0.7)
+    np.testing.assert_allclose(quaternion_to_euler(attitude)[:, 2], 0.7)
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"ramp": 8.0}, "reference.ramp must be below speed / acceleration = 8 s; got 8.0"),
+        ({"response_time": 1.0}, "reference.response_time must be 0: the course is smooth by itself; got 1.0"),
+        ({"sampling": 0.0012, "acceleration": 0.1}, "reference.sampling must make at most 100000 samples, 0.00164 s"),
+        ({"heading": "north"}, "reference.heading must be one of 'free' or 'held'; got 'north'"),
+        ({"radius": 0.0}, "reference.radius must be > 0.0; got 0.0"),
+    ],
+)
+def test_what_cannot_be_flown_is_refused(fields: dict[str, Any], message: str) -> None:
+    with pytest.raises(ScenarioError, match=re.escape(message)):
+        changed(**fields)
+
+
+def test_a_start_on_a_reference_needs_one_that_states_it() -> None:
+    rule = "initial.on_reference must be false where the course states positions alone, as one of type circle does"
+    with pytest.raises(ParameterError, match=re.escape(rule)):
+        load_scenario("circle", ["initial.on_reference=true"])
+    with pytest.raises(ScenarioError, match="euler must have roll and pitch 0 where on_reference is true"):
+        load_scenario("torrente-loop4-ideal", ["initial.euler=[1.0, 0.0, 0.0]"])
+
+
+@pytest.mark.parametrize(
+    "setting", ["effects.load.mass_factor=1.1", "events=[{type='payload_pickup', at=1.0, mass=0.1}]"]
+)
+def test_the_integrator_refuses_a_load_before_it_is_flown(setting: str) -> None:
+    with pytest.raises(ParameterError, match=re.escape("plant.integrator must be mujoco where there is a load")):
+        load_scenario("torrente-loop4-ideal", [setting])

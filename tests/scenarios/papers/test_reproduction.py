@@ -1,0 +1,218 @@
+"""Published numbers flown again: the short ones of every paper, and what is said of one that is off."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+
+import quadsim
+from quadsim.errors import FileError, UnknownNameError
+from quadsim.report.table import grid_to_markdown
+from scenarios.cli import main
+from scenarios.commands import EXIT_DONE, EXIT_FAILED, EXIT_WRONG_INPUT
+from scenarios.loading import load_scenario
+from scenarios.papers.paper import NumberSpec, load_paper, scenario_of
+from scenarios.papers.reproduction import Reproduced, Reproduction, reproduce_paper
+from scenarios.run import fly_scenario
+from scenarios.schema.problems import ScenarioError
+from scenarios.shipped import paper_names, scenario_names
+
+ROOT = Path(__file__).resolve().parents[3]
+HEAD = 'title = "A paper"\nauthors = "N. N."\nabout = "A hover"\n'
+NUMBER = """
+[[numbers]]
+name = "time flown"
+scenario = "hover"
+set = { duration = 0.5, controller = { type = "pid" } }
+measure = "duration"
+unit = "s"
+published = %s
+%s
+source = "here"
+"""
+
+
+def written(folder: Path, *numbers: tuple[str, str]) -> str:
+    path = folder / "paper.toml"
+    path.write_text(HEAD + "".join(NUMBER % number for number in numbers))
+    return str(path)
+
+
+@pytest.fixture(scope="module")
+def loop4() -> Reproduction:
+    """The short flights of Torrente et al., as CI flies them."""
+    return reproduce_paper(
+        load_paper("torrente2021"), chosen=lambda spec: spec.scenario.startswith("torrente-loop4") and not spec.set
+    )
+
+
+def test_the_circle_at_4_m_s_is_reproduced(loop4: Reproduction) -> None:
+    assert [number.spec.published for number in loop4.numbers] == [0.0001, 0.1162, [0.1163, 0.1164]]
+    assert loop4.within, [number.sentence for number in loop4.numbers]
+
+
+def test_its_errors_have_the_digits_of_the_specification(loop4: Reproduction) -> None:
+    """Five decimals of a separate implementation; with noise its mean and deviation over seeds."""
+    ideal, drag, noise = (number.ours for number in loop4.numbers)
+    assert ideal == pytest.approx(0.00012, abs=5e-6)
+    assert drag == pytest.approx(0.11620, abs=5e-6)
+    assert noise == pytest.approx(0.1164, abs=2e-4)
+
+
+def test_its_lines_on_the_page_are_todays(loop4: Reproduction) -> None:
+    page = (ROOT / "docs/papers.md").read_text(encoding="utf-8").splitlines()
+    for line in grid_to_markdown(loop4.grid).splitlines():
+        assert line in page, "docs/papers.md is out of date: make reproduce"
+
+
+def test_the_first_seconds_at_8_m_s_are_those_of_the_specification() -> None:
+    """Positions under drag at 2 s and 5 s, where it is fastest; the heading has turned by then."""
+    flight = fly_scenario(load_scenario("torrente-loop8-drag", ["duration=5.02"]))
+    positions = flight.log.control.truth[[100, 250], 0:6:2]
+    expected = [[0.586204, -0.036271, 1.003212], [4.944455, -5.120605, 1.068593]]
+    np.testing.assert_allclose(positions, expected, atol=1e-6)
+
+
+def test_every_shipped_number_names_a_flight_that_can_be_flown() -> None:
+    assert paper_names() == ["quadrotor-uav", "torrente2021"]
+    for name in paper_names():
+        paper = load_paper(name)
+        for number in paper.numbers:
+            scenario_of(paper, number)
+        names = [number.name for number in paper.numbers]
+        assert len(set(names)) == len(names)
+    flown = {number.scenario for number in load_paper("torrente2021").numbers}
+    assert flown == {name for name in scenario_names() if load_scenario(name).group == "papers"}
+
+
+def test_the_published_number_stands_in_each_scenarios_description() -> None:
+    for number in load_paper("torrente2021").numbers:
+        if not number.set and number.measure.endswith("mean"):
+            texts = load_scenario(number.scenario).description
+            assert f"mean error {' to '.join(f'{value:.4f}' for value in sorted({*number.span}))} m" in texts
+
+
+@pytest.mark.parametrize(
+    ("relation", "ours", "within"),
+    [
+        ("equal", 1.01, True),
+        ("equal", 1.02, False),
+        ("equal", 0.98, False),
+        ("at most", 0.5, True),
+        ("at most", 1.02, False),
+        ("at least", 1.5, True),
+        ("at least", 0.98, False),
+    ],
+)
+def test_a_number_is_as_near_as_its_relation_and_tolerance_say(relation: Any, ours: float, within: bool) -> None:
+    spec = NumberSpec(name="n", scenario="hover", published=1.0, relation=relation, absolute=0.01, source="s")
+    assert Reproduced(spec=spec, ours=ours).within is within
+
+
+def test_of_several_published_numbers_the_nearest_counts() -> None:
+    spec = NumberSpec(name="n", scenario="hover", published=[1.0, 1.1], relative=0.1, source="s")
+    found = [Reproduced(spec=spec, ours=ours) for ours in (0.95, 1.05, 1.2, 1.3)]
+    assert [number.difference for number in found] == pytest.approx([-0.05, 0.0, 0.1, 0.2])
+    assert [number.within for number in found] == [True, True, True, False]
+
+
+def test_a_flight_that_ends_early_reproduces_nothing(tmp_path: Path) -> None:
+    path = Path(written(tmp_path, ("0.5", "absolute = 1.0")))
+    path.write_text(
+        path.read_text().replace(
+            "duration = 0.5",
+            "duration = 0.5, lost = { depth = 1e-9 }, initial = "
+            "{ position = [0.0, 0.0, 1.0], euler = [20.0, 0.0, 0.0] }",
+        )
+    )
+    (found,) = quadsim.reproduce(path, progress=False)
+    assert found.numbers[0].ours is None
+    assert not found.within
+    assert "depth below" in found.numbers[0].sentence
+    assert "| time flown | s | 0.5 | - | - | 1 | no |" in grid_to_markdown(found.grid)
+
+
+def test_the_command_prints_and_fails_beyond_tolerance(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    good = written(tmp_path, ("0.5", "absolute = 0.0"))
+    report = tmp_path / "verdicts.xml"
+    assert main(["reproduce", good, "--junit", str(report)]) == EXIT_DONE
+    shown = capsys.readouterr().out
+    assert "A paper" in shown
+    assert "time flown" in shown
+    assert ElementTree.parse(report).getroot().attrib["failures"] == "0"
+    off = written(tmp_path, ("0.5", "absolute = 0.0"), ("0.6", "relative = 0.01"))
+    assert main(["reproduce", off, "--json", "--junit", str(report)]) == EXIT_FAILED
+    told = json.loads(capsys.readouterr().out)
+    assert not told["reproduced"]
+    first, second = told["papers"][0]["numbers"]
+    assert first["within"]
+    assert not second["within"]
+    assert (second["published"], second["ours"], second["tolerance"]) == (0.6, 0.5, pytest.approx(0.006))
+    assert second["difference"] == pytest.approx(-0.1)
+    assert ElementTree.parse(report).getroot().attrib["failures"] == "1"
+
+
+def test_one_flight_serves_all_that_is_measured_of_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    flights = []
+
+    def counted(scenario: Any) -> Any:
+        flights.append(scenario)
+        return fly_scenario(scenario)
+
+    monkeypatch.setattr("scenarios.papers.reproduction.fly_scenario", counted)
+    quadsim.reproduce(written(tmp_path, ("0.5", "absolute = 0.0"), ("0.4", "absolute = 0.0")), progress=False)
+    assert len(flights) == 1
+
+
+def test_a_scenario_beside_the_papers_file_is_found(tmp_path: Path) -> None:
+    (tmp_path / "mine.toml").write_text('base = "hover"\nname = "mine"\ndescription = "mine"\n')
+    path = Path(written(tmp_path, ("0.5", "absolute = 0.0")))
+    path.write_text(path.read_text().replace('scenario = "hover"', 'scenario = "mine.toml"'))
+    paper = load_paper(str(path))
+    assert scenario_of(paper, paper.numbers[0]).name == "mine"
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("absolute = 0.0", "", "time flown.absolute must be given, or relative, but not both"),
+        ("absolute = 0.0", "absolute = 0.0\nrelative = 0.1", "time flown.absolute must be given, or relative, but not"),
+        (
+            "published = 0.5",
+            "published = [0.6, 0.5]",
+            "published must be a lower and a higher number of relation equal",
+        ),
+        ("published = 0.5", "published = 'half'", "time flown.published must be"),
+        ("published = 0.5", "publisht = 0.5", "time flown.publisht is not a field of the paper file; did you mean"),
+        ('source = "here"', "", "time flown.source is missing"),
+        ('title = "A paper"', "", "title is missing"),
+    ],
+)
+def test_a_wrong_file_is_refused(old: str, new: str, message: str, tmp_path: Path) -> None:
+    path = Path(written(tmp_path, ("0.5", "absolute = 0.0")))
+    path.write_text(path.read_text().replace(old, new))
+    with pytest.raises(ScenarioError, match=re.escape(message)):
+        load_paper(str(path))
+
+
+def test_what_cannot_be_flown_or_measured_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    text = Path(written(tmp_path, ("0.5", "absolute = 0.0"))).read_text()
+    path = tmp_path / "other.toml"
+    for old, new, message in (
+        ('"duration"', '"tracking.rmse.w"', "time flown: measure must lead to a number of the flight's summary"),
+        ('"duration"', '"scenario"', "time flown: measure must lead to a number of the flight's summary"),
+        ("duration = 0.5", "durations = 0.5", "durations is not a field of the scenario file"),
+        ('"hover"', '"hovers"', "no scenario named 'hovers'"),
+    ):
+        path.write_text(text.replace(old, new))
+        assert main(["reproduce", str(path)]) == EXIT_WRONG_INPUT
+        assert message in capsys.readouterr().err
+    for name, kind in (("torrente2020", UnknownNameError), (str(tmp_path / "none.toml"), FileError)):
+        with pytest.raises(kind):
+            quadsim.reproduce(name, progress=False)
