@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import fcntl
+import gc
 import os
 import pickle
 import sys
@@ -66,8 +67,9 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 
 def pytest_collection_finish() -> None:
-    """Leave all that is loaded out of the passes of Python's cycle collector: one takes 0.2 s and more by then."""
+    """Leave all that is loaded out of the passes of Python's cycle collector, and have few: they took 9 % of all."""
     freeze_for_good()
+    gc.set_threshold(20_000, 20, 50)
 
 
 def pytest_sessionstart() -> None:
