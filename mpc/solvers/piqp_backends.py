@@ -35,7 +35,7 @@ GAP: Final = 1e-10
 of the QP or another 4e-3 rad/s off, whatever `TOLERANCE` is."""
 
 ROUGH_TOLERANCE: Final = 1e-5
-"""Of a rough answer.  It takes 10 iterations of the 13 of `TOLERANCE` in the first period of the paper's flight."""
+"""Of a rough answer, absolute and relative: 9 iterations in the paper's first period, where `TOLERANCE` takes 13."""
 
 _TOLERANCES: Final = ("eps_abs", "eps_rel", "eps_duality_gap_abs", "eps_duality_gap_rel")
 
