@@ -262,7 +262,7 @@ def test_what_was_tried_in_vain_counts(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_the_first_whole_qp_is_solved_roughly_and_finished_exactly(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A rough answer is seconded by a tight one where it does not lead to the optimum; later periods have that alone."""
+    """A tight answer follows where a rough one does not lead to the optimum; later periods have that alone."""
     problem = paper_problem()
     desired = np.zeros((50, 4))
     desired[:, 0] = 10.0
