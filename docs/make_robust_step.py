@@ -26,9 +26,9 @@ FLIGHTS: Final = range(4)
 COLUMNS: Final = {"p50": "ms", "p99": "ms", "max": "ms", "flight": "s"}
 TEXT: Final = """\
 Flights of `paper-robustness-robust`, 60 s each, by two checkouts in turns, `{before}` and `{after}`: the median over
-runs of each ({runs}), processor time, at a load average of {load:.0f} on {cores} cores. A step is the whole of it, fallback contract included, between two periods of
-flight. `python docs/make_robust_step.py BEFORE` remakes this section, with a checkout of the former in the directory
-BEFORE.
+runs of each ({runs}), processor time, at a load average of {load:.0f} on {cores} cores. A step is
+the whole of it, fallback contract included, between two periods of flight. `python docs/make_robust_step.py BEFORE`
+remakes this section, with a checkout of the former in the directory BEFORE.
 
 {table}
 
