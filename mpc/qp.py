@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import NamedTuple, Protocol, TypeAlias
+from typing import NamedTuple, Protocol, TypeAlias, runtime_checkable
 
 import numpy as np
 from scipy.sparse import csc_matrix
@@ -202,6 +202,15 @@ class Backend(Protocol):
 
     def solve(self, vectors: Vectors) -> Solution:
         """Solve with new vectors; whatever happens is in the solution's status."""
+        ...
+
+
+@runtime_checkable
+class RoughBackend(Backend, Protocol):
+    """One that can save time where the active set is all that is wanted."""
+
+    def solve_roughly(self, vectors: Vectors) -> Solution:
+        """The same to a looser tolerance."""
         ...
 
 

@@ -89,6 +89,7 @@ class _Trial(NamedTuple):
         fall: (all rows,) S z.
         pieces: (k,) that the multipliers would be on.
         over: (all rows,) violation of inactive rows.
+        joining: (all rows,) which of them are violated.
         wrong: how many rows break the conditions.
         failed: the first active row that depends on those before it, counted from 1; 0 for none.
     """
@@ -102,6 +103,7 @@ class _Trial(NamedTuple):
     fall: Array
     pieces: Side
     over: Array
+    joining: NDArray[np.bool_]
     wrong: int
     failed: int
 
@@ -173,30 +175,37 @@ class ActiveSet:
     def _trial(self, side: Side, bounds: Array) -> _Trial:
         """The maximum of the dual function on the pieces that a side says."""
         active = side.nonzero()[0]
-        pieces = side[active]
+        pieces = taken = side.take(active)
         rows = self._S.take(active, 0, self._room[: active.size], "clip")  # a mode that takes no copy
         factor = rows.take(active, 1).T
-        excess, z, failed, violated = bounds[pieces, active], pieces.astype(float), 0, False
+        excess = z = bounds[taken, active]
         if active.size:
-            if self._soft and (beyond := (np.abs(pieces) == 2).nonzero()[0]).size:
+            entries = taken.tobytes() if self._soft else b""
+            violated = b"\x02" in entries or b"\xfe" in entries  # 2 or -2
+            if violated:
+                beyond = (np.abs(taken) == 2).nonzero()[0]
                 factor[beyond, beyond] += self._compliance[active[beyond]]
-                violated = True
             factor, z, failed = lapack.dposv(factor, excess, lower=1, overwrite_a=1)
-        if failed:
-            nothing = np.zeros(0)
-            return _Trial(side, active, rows, factor, excess, z, nothing, pieces, nothing, side.size, failed)
+            if failed:
+                nothing = np.zeros(0)
+                return _Trial(
+                    side, active, rows, factor, excess, z, nothing, taken, nothing, nothing > 0.0, side.size, failed
+                )
+            pieces = self._pieces(active, taken, z, violated=violated)
         fall = np.dot(z, rows)
         over = np.maximum(bounds[1] - fall, fall - bounds[-1])
         over[active] = 0.0
-        pieces = self._pieces(active, pieces, z, violated=violated)
-        wrong = int(np.count_nonzero(over > FEASIBLE)) + int(np.count_nonzero(pieces != side[active]))
-        return _Trial(side, active, rows, factor, excess, z, fall, pieces, over, wrong, 0)
+        joining = over > FEASIBLE
+        wrong = int(np.count_nonzero(joining))
+        if pieces is not taken:
+            wrong += int(np.count_nonzero(pieces != taken))
+        return _Trial(side, active, rows, factor, excess, z, fall, pieces, over, joining, wrong, 0)
 
     def _pieces(self, active: Indices, pieces: Side, z: Array, *, violated: bool) -> Side:
         """The pieces that multipliers (k,) of active rows would be on, next to those they were taken to be on."""
         size = z * pieces
-        if not violated and size.max(initial=0.0) <= self._least_l1:
-            return pieces * (size >= 0.0)
+        if not violated and size[size.argmax()] <= self._least_l1:
+            return pieces if size[size.argmin()] >= 0.0 else pieces * (size >= 0.0)
         sign = np.sign(pieces)
         size, outside = z * sign, pieces != sign
         beyond = size > np.where(outside, self._least[active], self._most[active])
@@ -216,10 +225,10 @@ class ActiveSet:
         if careful and dense and (leaving := (trial.pieces == 0).nonzero()[0]).size > FEW_LEAVING:
             stay = np.delete(leaving, np.abs(trial.z[leaving]).argmax())
             side[trial.active[stay]] = trial.side[trial.active[stay]]
-        over, later = trial.over, self._channels
-        joining = over > FEASIBLE
-        joining[later:] &= over[later:] >= over[:-later]
-        joining[:-later] &= over[:-later] >= over[later:]
+        over, joining, later = trial.over, trial.joining.copy(), self._channels
+        grows = over[later:] > over[:-later]
+        joining[:-later] &= ~grows
+        joining[later:] &= grows
         rows = joining.nonzero()[0]
         side[rows] = 2 * (bounds[1].take(rows) > trial.fall.take(rows)) - 1
         return side

@@ -18,7 +18,7 @@ from mpc.ocp import Problem, Rest
 from mpc.paper.condensed import Condensed, condensed_cost, row_maps
 from mpc.paper.prediction import prediction
 from mpc.qp import Point, Solution
-from mpc.solvers import Answer, Solver, Way
+from mpc.solvers import Answer, QPSolver, Solver, Way
 from quadsim.controller import SOLVED, UNCONSTRAINED
 from quadsim.state import Array, Indices, read_only
 
@@ -38,7 +38,9 @@ class Shortcut:
     1. no constraint at all: Eq. (22), a product for each axis of `mpc.exact.axes`; the status is then `unconstrained`;
     2. rows of states alone, axis by axis, by their multipliers (`mpc.exact.activeset`), from the last period's;
     3. all rows, likewise;
-    4. the whole QP by its solver, whose active set then leads to the exact optimum.
+    4. the whole QP by its solver, whose active set then leads to the exact optimum.  The first such QP after `reset`,
+       a flight's first period, is solved roughly where the solver can, and then again only where that does not lead
+       there.  Later ones are those that no active set near the last one answers; theirs seldom do.
 
     Along the plan active rows alternate, so that the last period's set, moved one step earlier, is nearly this one's;
     where margins grow along the horizon, it is nearly so unmoved.  Both are tried as a start.
@@ -88,6 +90,7 @@ class Shortcut:
                 if (N * max(own.size, axis.T.shape[1])) ** 2 <= LARGEST_MAP
             ]
         self._all = _Group(problem, rows, grid.ravel(), np.eye(nu)) if grid.size**2 <= LARGEST_MAP else None
+        self._first = True  # the next QP for the solver is the first one since `reset`
 
     @property
     def name(self) -> str:
@@ -96,7 +99,7 @@ class Shortcut:
 
     def reset(self) -> None:
         """See `mpc.solvers.Solver.reset`."""
-        self._side = np.zeros_like(self._side)
+        self._side, self._first = np.zeros_like(self._side), True
         self._whole.reset()
 
     def solve(self, state: Array, desired: Array, u_before: Array, rest: Rest | None = None) -> Answer:
@@ -203,31 +206,37 @@ class Shortcut:
         self, plan: Array, free: Array, query: tuple[Array, Array, Array, Rest | None], started: float
     ) -> Answer:
         """The solver's answer to the whole QP, made exact where its active set leads to the optimum."""
-        tried_s = clock.perf_counter() - started
-        answer = self._whole.solve(*query)
-        started = clock.perf_counter()
-        given = answer.solution
-        self._side = np.zeros_like(self._side)
-        if given.status != SOLVED:
-            solution = replace(given, solve_s=given.solve_s + tried_s)
-            return replace(answer, solution=solution)
-        multipliers = self._whole.formulation.multipliers(given)
-        if self._all is not None:
-            near = self._all.near(multipliers.ravel(), free)
-            self._side = near
-            found = self._all.solve(plan, free, [near])
-            if found is not None:
-                self._side = found.active.side
-                answer = self._answer(found, Way.WHOLE, started)
-        if answer.solution is given:
-            point = self.formulation.point(answer.plan, answer.slacks, multipliers)
-            answer = replace(answer, solution=replace(given, x=point.x, y=point.y, z=point.z, z_box=point.z_box))
+        spent_s, iterations = clock.perf_counter() - started, 0
+        whole = self._whole
+        solves = [whole.solve]
+        if self._first and self._all is not None and isinstance(whole, QPSolver) and whole.can_solve_roughly:
+            solves.insert(0, whole.solve_roughly)
+        self._side, self._first = np.zeros_like(self._side), False
+        for solve in solves:
+            answer = solve(*query)
+            started, given = clock.perf_counter(), answer.solution
+            iterations += given.iterations
+            if given.status == SOLVED:
+                multipliers = whole.formulation.multipliers(given)
+                found = None
+                if self._all is not None:
+                    self._side = self._all.near(multipliers.ravel(), free)
+                    found = self._all.solve(plan, free, [self._side])
+                if found is not None:
+                    self._side = found.active.side
+                    answer = self._answer(found, Way.WHOLE, started)
+                    spent_s += given.solve_s + answer.solution.solve_s
+                    break
+                point = self.formulation.point(answer.plan, answer.slacks, multipliers)
+                solution = replace(given, x=point.x, y=point.y, z=point.z, z_box=point.z_box)
+                answer = replace(answer, solution=solution)
+            spent_s += given.solve_s + clock.perf_counter() - started
         solution = replace(
             answer.solution,
-            iterations=given.iterations,
+            iterations=iterations,
             primal_residual=given.primal_residual,
             dual_residual=given.dual_residual,
-            solve_s=given.solve_s + tried_s + clock.perf_counter() - started,
+            solve_s=spent_s,
         )
         return replace(answer, solution=solution)
 

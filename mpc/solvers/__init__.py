@@ -16,7 +16,7 @@ import numpy as np
 
 from mpc.ocp import Problem, Rest
 from mpc.paper.condensed import Condensed
-from mpc.qp import QP, Backend, Formulation, Solution
+from mpc.qp import QP, Backend, Formulation, RoughBackend, Solution, Vectors
 from mpc.staged import Staged
 from quadsim.errors import MissingPackageError, UnknownNameError
 from quadsim.state import Array
@@ -190,8 +190,33 @@ class QPSolver:
 
         Data that is not finite is answered with the status `invalid_data`: no back end can be trusted to notice.
         """
+        return self._by(self._backend.solve, state, desired, u_before, rest)
+
+    @property
+    def can_solve_roughly(self) -> bool:
+        """Whether its back end has a rough answer to give."""
+        return isinstance(self._backend, RoughBackend)
+
+    def solve_roughly(self, state: Array, desired: Array, u_before: Array, rest: Rest | None = None) -> Answer:
+        """The same, only so well that the active set can be seen.
+
+        Raises:
+            TypeError: the back end has no rough answer to give.
+        """
+        if not isinstance(self._backend, RoughBackend):
+            raise TypeError(f"{self.name} has no rough answer to give")
+        return self._by(self._backend.solve_roughly, state, desired, u_before, rest)
+
+    def _by(
+        self,
+        solve: Callable[[Vectors], Solution],
+        state: Array,
+        desired: Array,
+        u_before: Array,
+        rest: Rest | None,
+    ) -> Answer:
         if math.isfinite(state.sum() + desired.sum() + u_before.sum()):
-            solution = self._backend.solve(self.formulation.vectors(state, desired, u_before, rest))
+            solution = solve(self.formulation.vectors(state, desired, u_before, rest))
         else:
             solution = refusal(self.formulation.qp)
         x = solution.x

@@ -88,7 +88,7 @@ def test_a_failure_in_the_first_period_has_no_plan_to_hold() -> None:
 
 def test_reset_forgets_the_plan() -> None:
     solver = FaultySolver({1: "numerics"})
-    controller = ConstrainedMPC(solver.problem, solver)
+    controller = ConstrainedMPC(solver.problem, solver, shortcut=False)  # which solves a first QP twice
     reference = paper_reference(60)[1:51]
     controller.reset(solver.problem.model.u_bar)
     controller.step(Moment(), STATE, reference)

@@ -252,13 +252,46 @@ def test_what_was_tried_in_vain_counts(monkeypatch: pytest.MonkeyPatch) -> None:
     query = np.zeros(12), desired, problem.model.u_bar
     whole = QPSolver("piqp-multistage", problem)
     given = whole.solve(*query)
-    monkeypatch.setattr(whole, "solve", lambda *_: given)
+    monkeypatch.setattr(whole, "solve_roughly", lambda *_: given)
     answer = Shortcut(problem, whole).solve(*query)
     assert answer.way is Way.WHOLE
     np.testing.assert_allclose(answer.plan, given.plan, atol=1e-3)
     assert answer.solution.solve_s > given.solution.solve_s
     assert answer.solution.iterations == given.solution.iterations
     assert answer.solution.primal_residual == given.solution.primal_residual
+
+
+def test_the_first_whole_qp_is_solved_roughly_and_finished_exactly(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A tight answer follows where a rough one does not lead to the optimum; later periods have that alone."""
+    problem = paper_problem()
+    desired = np.zeros((50, 4))
+    desired[:, 0] = 10.0
+    query = np.zeros(12), desired, problem.model.u_bar
+    whole = QPSolver("piqp-multistage", problem)
+    rough, tight = whole.solve_roughly(*query), whole.solve(*query)
+    assert rough.solution.iterations < tight.solution.iterations
+    quick = Shortcut(problem, whole)
+    finished = quick.solve(*query)
+    assert finished.solution.iterations == rough.solution.iterations
+    assert largest_residual(problem, finished, *query) < 1e-9
+    assert np.abs(finished.plan - tight.plan).max() < np.abs(rough.plan - tight.plan).max()
+    assert quick._all is not None
+    monkeypatch.setattr(quick._all, "solve", lambda *_: None)
+    both = rough.solution.iterations + tight.solution.iterations
+    for reset, iterations in ((True, both), (False, tight.solution.iterations)):
+        if reset:
+            quick.reset()
+        answer = quick.solve(*query)
+        assert answer.solution.iterations == iterations
+        np.testing.assert_array_equal(answer.plan, tight.plan)
+
+
+def test_back_ends_without_a_rough_answer_say_so() -> None:
+    pytest.importorskip("daqp")
+    solver = QPSolver("daqp", paper_problem())
+    assert not solver.can_solve_roughly
+    with pytest.raises(TypeError, match="daqp has no rough answer"):
+        solver.solve_roughly(np.zeros(12), np.zeros((50, 4)), np.zeros(4))
 
 
 def test_answers_to_a_whole_qp_too_large_to_polish_stand(monkeypatch: pytest.MonkeyPatch) -> None:
