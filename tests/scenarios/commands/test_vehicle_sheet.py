@@ -20,8 +20,8 @@ from quadsim.state import INDEX
 from quadsim.vehicle import N_ROTORS, VEHICLE_UNITS, Vehicle, load_vehicle
 from scenarios.cli import main
 from scenarios.commands import EXIT_DONE
-from scenarios.commands.vehicle_sheet import integrator_chains, make_sheet
 from scenarios.design.authority import torque_ranges
+from scenarios.design.vehicle_figures import integrator_chains, make_sheet
 from scenarios.loading import load_scenario
 from scenarios.run import fly_scenario
 
