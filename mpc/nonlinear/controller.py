@@ -22,6 +22,7 @@ import scipy.linalg
 
 from mpc.answer import ActuatorBounds, command_of
 from mpc.constraints import Constraint, Penalty
+from mpc.disturbance import RampObserver, RampSettings
 from mpc.model import LinearModel
 from mpc.nonlinear.reference import Nodes, nodes_of_motion, nodes_of_preview
 from mpc.nonlinear.rigidbody import (
@@ -36,6 +37,7 @@ from mpc.nonlinear.rigidbody import (
     linearise_nodes,
     product,
     rigid_body,
+    rotation,
     thrust_axis,
 )
 from mpc.nonlinear.settings import AttitudeError, NonlinearSettings
@@ -140,6 +142,7 @@ class NonlinearMPC:
         self.solver = settings.solver or ("piqp-dense" if small else "piqp-multistage")
         self._qp = Relinearised(self.problem, self.solver, shortcut=True)
         self._observer = None if settings.observer is None else DisturbanceObserver(settings.observer, period)
+        self._ramp = None if settings.ramp is None else self._make_ramp(settings.ramp)
         self._shift = settings.stride == 1 if settings.shift is None else settings.shift
         self._lower, self._upper = self._shares(self._bounds.u_min), self._shares(self._bounds.u_max)
         self._difference = settings.attitude_error is AttitudeError.DIFFERENCE
@@ -289,6 +292,8 @@ class NonlinearMPC:
         if now.phase is Phase.FLYING:
             if self._observer is not None and last is not None:
                 self._learn(last, now.time, measured)
+            if self._ramp is not None:
+                self._follow(self._ramp, now.time, measured)
             self._last = now.time, measured
         nodes = self._balanced(nodes)
         query, answer = self._iterate(measured, nodes)
@@ -357,6 +362,29 @@ class NonlinearMPC:
         estimate = self._observer.estimate
         self._model = replace(self._model, acceleration=estimate[:3], angular_acceleration=estimate[3:])
 
+    def _make_ramp(self, settings: RampSettings) -> RampObserver:
+        mass = self._vehicle.mass
+        return RampObserver(
+            settings if settings.rotor_lag is not None else replace(settings, rotor_lag=self.settings.rotor_lag),
+            self._vehicle,
+            self._period,
+            drag=np.array(self.settings.drag) / mass,
+            quadratic_drag=np.array(self.settings.quadratic_drag) / mass,
+        )
+
+    def _follow(self, ramp: RampObserver, time: float, measured: Array) -> None:
+        """Take what is observed for drag, as far as it follows the velocity, and for a constant force beyond."""
+        R, velocity = rotation(measured[Q] / np.linalg.norm(measured[Q])), measured[V]
+        ramp.update(time, velocity, R, measured[W], self._acting)
+        acceleration, _, angular = ramp.foreseen(0.5 * self._period)
+        drag = ramp.drag
+        self._model = replace(
+            self._model,
+            drag=self.settings.drag + self._vehicle.mass * drag,
+            acceleration=acceleration + R @ (drag * (R.T @ velocity)),
+            angular_acceleration=angular,
+        )
+
     def _balanced(self, nodes: Nodes) -> Nodes:
         """The reference with what balances drag and the disturbance: thrust turned the least way, and torque."""
         model = self._model
@@ -388,6 +416,10 @@ class NonlinearMPC:
         if self._observer is not None:
             self._observer.reset()
             self._model = replace(self._model, acceleration=np.zeros(3), angular_acceleration=np.zeros(3))
+        if self._ramp is not None:
+            self._ramp.reset(self._acting)
+            drag = np.array(self.settings.drag)
+            self._model = replace(self._model, drag=drag, acceleration=np.zeros(3), angular_acceleration=np.zeros(3))
 
     def _reference(self, now: Moment, reference: Array) -> Nodes:
         stride = self.settings.stride

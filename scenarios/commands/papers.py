@@ -9,7 +9,7 @@ from pathlib import Path
 from quadsim.outputs import require_file
 from scenarios.api import reproduce as reproduce_papers
 from scenarios.commands import EXIT_DONE, EXIT_FAILED, console
-from scenarios.commands.junit import write_cases
+from scenarios.junit import write_cases
 
 
 def reproduce(options: Namespace) -> int:

@@ -178,6 +178,7 @@ def guarded(
 
 
 def _nonlinear(spec: NonlinearSpec, vehicle: Vehicle, period: float) -> Controller:
+    from mpc.indi import Incremental
     from mpc.nonlinear.controller import NonlinearMPC
     from mpc.nonlinear.rigidbody import Inputs
     from mpc.nonlinear.settings import AttitudeError, NonlinearSettings, Weights
@@ -216,10 +217,12 @@ def _nonlinear(spec: NonlinearSpec, vehicle: Vehicle, period: float) -> Controll
         largest_rates=_three(math.inf if spec.body_rate is None else np.radians(spec.body_rate).tolist()),
         soft=None if spec.soft is None else (spec.soft.linear, spec.soft.quadratic),
         observer=spec.offset_free,
+        ramp=spec.disturbance,
         solver=spec.solver,
     )
-    law = NonlinearMPC(vehicle, period=period, settings=settings, bounds=bounds, constraints=_outputs(spec))
-    return guarded(law, bounds, spec.fallback, vehicle, period)
+    mpc = NonlinearMPC(vehicle, period=period, settings=settings, bounds=bounds, constraints=_outputs(spec))
+    law = guarded(mpc, bounds, spec.fallback, vehicle, period)
+    return law if spec.indi is None else Incremental(law, vehicle, spec.indi, bounds)
 
 
 def _constrained(spec: ConstrainedSpec, problem: Problem) -> Controller:
@@ -296,6 +299,7 @@ def _baseline(spec: LQRSpec | PIDSpec | GeometricSpec, vehicle: Vehicle, period:
     from mpc.baselines.geometric import GeometricController, geometric_settings
     from mpc.baselines.lqr import LQR, LQRSettings, bryson_objective
     from mpc.baselines.pid import CascadedPID, pid_settings
+    from mpc.indi import Incremental
 
     held = spec.input_bounds
     bounds = None if held is None else ActuatorBounds.alike(_pair(held.speed), _pair(held.slew))
@@ -323,7 +327,18 @@ def _baseline(spec: LQRSpec | PIDSpec | GeometricSpec, vehicle: Vehicle, period:
     }
     if isinstance(spec, PIDSpec):
         return CascadedPID(vehicle, pid_settings(vehicle, velocity_max=spec.velocity, **shared))
-    return GeometricController(vehicle, geometric_settings(vehicle, integral=spec.integral, **shared))
+    geometric = GeometricController(
+        vehicle,
+        geometric_settings(
+            vehicle,
+            integral=spec.integral,
+            feedforward=spec.feedforward,
+            drag=tuple(spec.drag),
+            disturbance=spec.disturbance,
+            **shared,
+        ),
+    )
+    return geometric if spec.indi is None else Incremental(geometric, vehicle, spec.indi, geometric.bounds)
 
 
 def _rotor_lag(spec: RobustSpec | NonlinearSpec, vehicle: Vehicle) -> float:
