@@ -12,6 +12,8 @@ from scenarios.bench.speed import LAWS, SpeedBench
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+_TOP = 40.0  # of the errors' axis [m], with room for the crosses above all errors
+
 
 def draw_speeds(measured: SpeedBench) -> Figure:
     """Error and share of violation over speed, a column of panels for each world."""
@@ -26,6 +28,7 @@ def draw_speeds(measured: SpeedBench) -> Figure:
     for (world, speeds), (errors, violations) in zip(measured.worlds.items(), panels.T, strict=True):
         errors.set_title(world, loc="left", fontsize=9.5)
         errors.set_yscale("log")
+        errors.yaxis.set_major_formatter("{x:g}")
         for law in measured.laws:
             flights = [measured.flights[world, speed, law] for speed in speeds]
             style = {**styles[law], "marker": "o", "markersize": 3.0}
@@ -33,11 +36,17 @@ def draw_speeds(measured: SpeedBench) -> Figure:
             errors.plot(speeds, whole, **style)
             violations.plot(speeds, [100.0 * flight.violated for flight in flights], **style)
             lost = [speed for speed, flight in zip(speeds, flights, strict=True) if flight.error is None]
-            row = 1.0 - 0.035 * measured.laws.index(law)
+            row = 0.98 - 0.02 * measured.laws.index(law)
             errors.plot(
-                lost, [row] * len(lost), "x", color=styles[law]["color"], transform=errors.get_xaxis_transform()
+                lost,
+                [row] * len(lost),
+                "x",
+                markersize=5.0,
+                color=styles[law]["color"],
+                transform=errors.get_xaxis_transform(),
             )
         violations.set_xlabel("speed [m/s]")
+    panels[0, 0].set_ylim(top=_TOP)
     panels[0, 0].set_ylabel("mean position error [m]; x: lost")
     panels[1, 0].set_ylabel("time beyond the tilt bound [%]")
     keys = [Line2D([], [], **styles[law]) for law in measured.laws]
