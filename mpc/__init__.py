@@ -18,6 +18,8 @@ if TYPE_CHECKING:
     from mpc.constraints import Penalty as Penalty
     from mpc.model import LinearModel as LinearModel
     from mpc.model import hover_model as hover_model
+    from mpc.nonlinear.controller import NonlinearMPC as NonlinearMPC
+    from mpc.nonlinear.settings import NonlinearSettings as NonlinearSettings
     from mpc.ocp import Objective as Objective
     from mpc.ocp import Problem as Problem
     from mpc.ocp import Query as Query
@@ -34,6 +36,8 @@ _PLACES = {
     "mpc.constrained": ("ConstrainedMPC",),
     "mpc.constraints": ("Bounds", "Constraint", "Penalty"),
     "mpc.model": ("LinearModel", "hover_model"),
+    "mpc.nonlinear.controller": ("NonlinearMPC",),
+    "mpc.nonlinear.settings": ("NonlinearSettings",),
     "mpc.ocp": ("Objective", "Problem", "Query", "Unanswered"),
     "mpc.robust.controller": ("RobustMPC",),
     "mpc.robust.settings": ("RobustSettings",),

@@ -104,7 +104,7 @@ class DisturbanceObserver:
         velocity = x - along * axis[0], y - along * axis[1], along
         self.learn([*velocity, *(found - wanted for found, wanted in zip(rates, expected_rates, strict=True))])
 
-    def learn(self, surprise: Array | Sequence[float]) -> None:
+    def learn(self, surprise: Sequence[float] | Array) -> None:
         """Take note of by how much three velocities and three body rates (6,) are other than predicted."""
         estimate = self.estimate + self._gain * surprise
         self.estimate = np.minimum(np.maximum(estimate, -self._largest), self._largest)

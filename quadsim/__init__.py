@@ -27,7 +27,6 @@ if TYPE_CHECKING:
     from scenarios.api import load as load
     from scenarios.api import make_controller as make_controller
     from scenarios.api import read as read
-    from scenarios.api import reproduce as reproduce
     from scenarios.api import resolve as resolve
     from scenarios.api import view as view
     from scenarios.benchmarks import bench_campaign as bench_campaign
@@ -35,7 +34,6 @@ if TYPE_CHECKING:
     from scenarios.benchmarks import bench_ladder as bench_ladder
     from scenarios.benchmarks import bench_render as bench_render
     from scenarios.benchmarks import bench_solvers as bench_solvers
-    from scenarios.benchmarks import bench_speed as bench_speed
     from scenarios.catalogue import Catalogue as Catalogue
     from scenarios.catalogue import LibraryScenario as LibraryScenario
     from scenarios.catalogue import catalogue as catalogue
@@ -44,6 +42,7 @@ if TYPE_CHECKING:
     from scenarios.junit import write_junit as write_junit
     from scenarios.many_flights import campaign as campaign
     from scenarios.many_flights import replay as replay
+    from scenarios.many_flights import reproduce as reproduce
     from scenarios.many_flights import sweep as sweep
     from scenarios.schema.json_schema import scenario_schema as scenario_schema
     from scenarios.schema.scenario import Scenario as Scenario
@@ -67,22 +66,14 @@ _PLACES = {
         "load",
         "make_controller",
         "read",
-        "reproduce",
         "resolve",
         "view",
     ),
-    "scenarios.benchmarks": (
-        "bench_campaign",
-        "bench_flight",
-        "bench_ladder",
-        "bench_render",
-        "bench_solvers",
-        "bench_speed",
-    ),
+    "scenarios.benchmarks": ("bench_campaign", "bench_flight", "bench_ladder", "bench_render", "bench_solvers"),
     "scenarios.catalogue": ("Catalogue", "LibraryScenario", "catalogue", "scenarios"),
     "scenarios.flight": ("Flight",),
     "scenarios.junit": ("write_junit",),
-    "scenarios.many_flights": ("campaign", "replay", "sweep"),
+    "scenarios.many_flights": ("campaign", "replay", "reproduce", "sweep"),
     "scenarios.schema.json_schema": ("scenario_schema",),
     "scenarios.schema.scenario": ("Scenario",),
     "scenarios.self_check": ("doctor",),

@@ -28,13 +28,11 @@ from scenarios.reaudit import Reaudit, reaudit, stored_scenario
 from scenarios.run import fly_scenario, run_scenario
 from scenarios.schema.course import CsvSpec
 from scenarios.schema.scenario import Scenario
-from scenarios.shipped import paper_names
 
 if TYPE_CHECKING:
     from quadsim.flight.feasibility import Feasibility
     from scenarios.campaign.statistics.comparison import Comparison as CampaignComparison
     from scenarios.comparison import Comparison
-    from scenarios.papers.reproduction import Reproduction
 
 Setting = Mapping[str, Any] | Sequence[str]
 """Changes of a scenario: values by dotted path, or texts `dotted.path=value` as of `--set`."""
@@ -405,33 +403,6 @@ def view(run: str | Path, *, web: bool = False) -> None:
     if recording.suffix != ".rrd":
         raise FileError(path, "is no recording; give a run directory or a file ending in .rrd")
     open_viewer(recording, web=web)
-
-
-def reproduce(paper: str | Path | None = None, *, progress: Progress | bool = True) -> tuple[Reproduction, ...]:
-    """Fly what papers publish, and hold it against their numbers.
-
-    Args:
-        paper: a name, or a path ending in `.toml`; every paper that ships where absent.
-        progress: as of `fly`.
-
-    Returns:
-        A reproduction for each paper: its `numbers`, each with `published`, `ours`, `difference` and `within`.
-
-    Raises:
-        InputError: there is no such paper, or a number of it cannot be flown.
-
-    Examples:
-        >>> import quadsim
-        >>> (found,) = quadsim.reproduce("quadrotor-uav")  # doctest: +SKIP
-        >>> found.within  # doctest: +SKIP
-        True
-    """
-    from scenarios.papers.paper import load_paper
-    from scenarios.papers.reproduction import reproduce_paper
-
-    papers = [load_paper(name) for name in ([str(paper)] if paper is not None else paper_names())]
-    with reporting(progress) as report:
-        return tuple(reproduce_paper(each, report) for each in papers)
 
 
 def named_by(scenario: Scenario, controller: object, forces: Sequence[object] = ()) -> Scenario:

@@ -15,16 +15,17 @@ if TYPE_CHECKING:
     from scenarios.campaign.run import Result
     from scenarios.campaign.statistics.requirement import Judgement
     from scenarios.flight import Flight
+    from scenarios.papers.reproduction import Reproduction
     from scenarios.reaudit import Reaudit
 
 
-def write_junit(result: Flight | Reaudit | Result, path: str | Path) -> Path:
-    """Write verdicts as JUnit XML: a test case per constraint and one for the flight, or one per requirement.
+def write_junit(result: Flight | Reaudit | Result | Sequence[Reproduction], path: str | Path) -> Path:
+    """Write verdicts as JUnit XML: a test case per constraint and one for the flight; per requirement; or per number.
 
     A constraint that is not required is a case that passes, with what was measured in its output.
 
     Args:
-        result: of `fly`, `read` or `check`, or of a `campaign` with requirements.
+        result: of `fly`, `read` or `check`, of a `campaign` with requirements, or of `reproduce`.
         path: an XML file.
 
     Returns:
@@ -41,6 +42,10 @@ def write_junit(result: Flight | Reaudit | Result, path: str | Path) -> Path:
         ...     'tests="8" failures="0"' in file.read_text()
         True
     """
+    if isinstance(result, Sequence):
+        numbers = [(each.paper.name, number) for each in result for number in each.numbers]
+        cases = [(f"{paper}: {number.spec.name}", number.within, number.sentence) for paper, number in numbers]
+        return write_cases("reproduce", cases, Path(path))
     summary = result.summary
     if "campaign" in summary:
         judged: Sequence[Judgement] = getattr(result, "judgements", ())

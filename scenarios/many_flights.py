@@ -1,4 +1,4 @@
-"""What `import quadsim` hands out of many flights: sweeps, campaigns, and a campaign's flight again."""
+"""What `import quadsim` hands out of many flights: sweeps, campaigns, a campaign's flight again, and papers."""
 
 from __future__ import annotations
 
@@ -15,12 +15,14 @@ from scenarios.flight import Outputs
 from scenarios.parts.own_code import require_importable
 from scenarios.progress import Progress, reporting
 from scenarios.schema.scenario import Scenario
+from scenarios.shipped import paper_names
 
 if TYPE_CHECKING:
     from scenarios.campaign.engine.protocol import Engine
     from scenarios.campaign.replay import Replay
     from scenarios.campaign.run import Result
     from scenarios.campaign.sweep import Sweep
+    from scenarios.papers.reproduction import Reproduction
 
 
 def sweep(
@@ -221,3 +223,30 @@ def make_engine(workers: int | None, cluster: str | None) -> Engine:
     from scenarios.campaign.engine.cluster import DaskEngine
 
     return DaskEngine(cluster)
+
+
+def reproduce(paper: str | Path | None = None, *, progress: Progress | bool = True) -> tuple[Reproduction, ...]:
+    """Fly what papers publish, and hold it against their numbers.
+
+    Args:
+        paper: a name, or a path ending in `.toml`; every paper that ships where absent.
+        progress: as of `fly`.
+
+    Returns:
+        A reproduction for each paper: `numbers`, each with `ours`, `difference` and `within`, and a table, `grid`.
+
+    Raises:
+        InputError: there is no such paper, or a number of it cannot be flown.
+
+    Examples:
+        >>> import quadsim
+        >>> (found,) = quadsim.reproduce("quadrotor-uav", progress=False)
+        >>> found.within, found.numbers[2].spec.published, round(found.numbers[2].ours, 3)
+        (True, 250.0, 250.0)
+    """
+    from scenarios.papers.paper import load_paper
+    from scenarios.papers.reproduction import reproduce_paper
+
+    papers = [load_paper(name) for name in ([str(paper)] if paper is not None else paper_names())]
+    with reporting(progress) as report:
+        return tuple(reproduce_paper(each, report) for each in papers)

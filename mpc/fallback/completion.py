@@ -28,6 +28,8 @@ from mpc.heading import advance, turn
 from mpc.model import LinearModel
 from quadsim.controller import Moment
 from quadsim.state import (
+    ANGLE_RATES,
+    ANGLES,
     EULER,
     EULER_RATE,
     INDEX,
@@ -74,9 +76,9 @@ def completed_moment(now: Moment, acting: Array, unseen: Array, known: Array) ->
     """
     found = {**vars(now), "acting": acting, "unseen": unseen}
     upright = abs(float(known[INDEX["pitch"]])) < UPRIGHT
-    if unseen[_ANGLES].any():
+    if unseen[ANGLES].any():
         found["attitude"] = None
-    if unseen[_RATES].any() and upright:
+    if unseen[ANGLE_RATES].any() and upright:
         found["body_rates"] = None
     return CompletedMoment(**found)
 

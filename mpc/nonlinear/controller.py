@@ -45,6 +45,8 @@ from mpc.observer import DisturbanceObserver
 from mpc.ocp import Objective, Problem, Query, Rest, Unanswered, lqr_terminal_weight
 from mpc.relinearised import Relinearised
 from mpc.solvers import INVALID_DATA, Answer
+from mpc.space.clearing import Clearing
+from mpc.space.halfspaces import Space
 from quadsim.controller import ACCEPTED, GROUNDED, Command, Moment, Phase, stopped
 from quadsim.errors import ParameterError
 from quadsim.state import (
@@ -120,6 +122,7 @@ class NonlinearMPC:
         settings: NonlinearSettings,
         bounds: ActuatorBounds | None = None,
         constraints: tuple[Constraint, ...] = (),
+        space: Space | None = None,
     ) -> None:
         self.settings, self._vehicle, self._period = settings, vehicle, period
         self._bounds = ActuatorBounds.of_vehicle(vehicle) if bounds is None else bounds
@@ -141,6 +144,7 @@ class NonlinearMPC:
         small = self.problem.horizon * N_ROTORS <= LARGEST_CONDENSED
         self.solver = settings.solver or ("piqp-dense" if small else "piqp-multistage")
         self._qp = Relinearised(self.problem, self.solver, shortcut=True)
+        self._clearing = None if space is None else Clearing(self.problem, self._solve, space, changing=True)
         self._observer = None if settings.observer is None else DisturbanceObserver(settings.observer, period)
         self._ramp = None if settings.ramp is None else self._make_ramp(settings.ramp)
         self._shift = settings.stride == 1 if settings.shift is None else settings.shift
@@ -266,7 +270,10 @@ class NonlinearMPC:
         self._quaternion: Array | None
         self._last: tuple[float, Array] | None  # time and state of the last period
         self._asked: float
+        self._velocity = np.zeros(3)  # the reference's in the last period
         self._forget()
+        if self._clearing is not None:
+            self._clearing.reset()
         self.unanswered: Unanswered | None = None
 
     def step(self, now: Moment, state: Array, reference: Array) -> Command:
@@ -296,11 +303,11 @@ class NonlinearMPC:
                 self._follow(self._ramp, now.time, measured)
             self._last = now.time, measured
         nodes = self._balanced(nodes)
-        query, answer = self._iterate(measured, nodes)
+        query, answer, problem = self._iterate(now.time, measured, nodes)
         status = self._rejection(answer)
         if status is not None:
             if status != INVALID_DATA and self.unanswered is None:
-                self.unanswered = Unanswered(problem=self.problem, query=query, status=status, time=now.time)
+                self.unanswered = Unanswered(problem=problem, query=query, status=status, time=now.time)
             self._plan = None
             return self._refuse(status, answer)
         shares = np.minimum(np.maximum(answer.plan, self._lower), self._upper)
@@ -310,7 +317,7 @@ class NonlinearMPC:
         return command_of(speeds[0], plan, answer.solution.status, answer)
 
     def predict(self, states: Array, plans: Array) -> Array:
-        """See `quadsim.controller.Controller.predict`."""
+        """See `quadsim.controller.Controller.predict`; with the disturbance estimated last, and without rotor lag."""
         model = replace(self._model, step=self._period, rotor_lag=None, substeps=1)
         x = np.zeros((len(states), N_BODY))
         x[:, P], x[:, V] = states[:, POSITIONS], states[:, VELOCITIES]
@@ -325,6 +332,11 @@ class NonlinearMPC:
             predicted[:, i, ANGLES] = euler
             predicted[:, i, ANGLE_RATES] = body_to_euler_rates(euler, x[:, W])
         return predicted
+
+    @property
+    def disturbance(self) -> Array:
+        """(6,) estimated acceleration now, world [m/s^2], and angular acceleration, body [rad/s^2]."""
+        return np.concatenate([self._model.acceleration, self._model.angular_acceleration])
 
     def _measured(self, now: Moment, state: Array) -> Array:
         """(n,) the model's state."""
@@ -427,8 +439,13 @@ class NonlinearMPC:
             return nodes_of_motion(now.motion, self._nodes, stride)
         return nodes_of_preview(reference, self._nodes, stride, self._period, self._hover)
 
-    def _iterate(self, measured: Array, nodes: Nodes) -> tuple[Query, Answer]:
-        """Steps of sequential quadratic programming from the plan kept."""
+    def _solve(self, query: Query) -> Answer:
+        assert query.steps is not None
+        assert query.rest is not None
+        return self._qp.solve(*query.steps, *query[:3], query.rest)
+
+    def _iterate(self, time: float, measured: Array, nodes: Nodes) -> tuple[Query, Answer, Problem]:
+        """Steps of sequential quadratic programming from the plan kept; the last problem is that of the answer."""
         frames, n = frames_of(nodes.states[:, Q]), self._model.n
         inputs = self._model.shares(nodes.thrusts)
         wanted = nodes.states.copy()
@@ -453,8 +470,11 @@ class NonlinearMPC:
         for _ in range(self.settings.iterations):
             x, u = self._plan
             query = Query(s0, desired, before, rest, self._steps(x, u, frames))
-            assert query.steps is not None
-            answer = self._qp.solve(*query.steps, s0, desired, before, rest)
+            if self._clearing is None:
+                answer, problem = self._solve(query), self.problem
+            else:
+                answer, problem, states = self._clearing.solve(time, query, along=x[1:, P])
+                self._qp.last = (states, answer.plan) if answer.solution.status in ACCEPTED else None
             if self._qp.last is None:
                 break
             states, plan = self._qp.last[0][:, :n], self._qp.last[1]
@@ -469,7 +489,7 @@ class NonlinearMPC:
                 share *= 0.5 if moved > 0.99 * before_that else 1.0
                 before_that = moved
                 self._plan = x + share * (found - x), u + share * (plan - u)
-        return query, answer
+        return query, answer, problem
 
     def _steps(self, x: Array, u: Array, frames: Array) -> tuple[Array, Array, Array]:
         """A, B, c along a plan of states (N + 1, n) and inputs (N, 4)."""

@@ -47,7 +47,7 @@ def inner_steps(rate: float, timestep: float) -> int:
     steps = round(1.0 / (rate * timestep))
     if steps < 1 or not math.isclose(steps * rate * timestep, 1.0, rel_tol=1e-9):
         rule = f"such that 1 / rate is a whole multiple of the physics step of {timestep} s"
-        raise ParameterError("controller.indi", "rate", rate, rule)
+        raise ParameterError("controller.inner", "rate", rate, rule)
     return steps
 
 

@@ -106,5 +106,5 @@ def test_on_the_ground_there_is_no_inner_loop(vehicle: Vehicle) -> None:
 
 
 def test_a_rate_that_is_no_whole_number_of_steps_is_refused(vehicle: Vehicle) -> None:
-    with pytest.raises(ParameterError, match=r"controller\.indi\.rate must be such that 1 / rate is a whole multiple"):
+    with pytest.raises(ParameterError, match=r"controller\.inner\.rate must be such that 1 / rate is a whole multiple"):
         flown(vehicle, Effects(), INDISettings(rate=300.0), periods=1)
