@@ -4,7 +4,7 @@
 
 .NOTPARALLEL:
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test peers check docs format types build numbers verification robustness first-flights reproduce soak campaigns kills safety pins clean
+.PHONY: help setup demo test peers check docs format types build numbers verification robustness first-flights reproduce speed soak campaigns kills safety pins clean
 
 VENV := .venv
 PY := $(VENV)/bin/python
@@ -42,9 +42,9 @@ demo: setup  ## fly the paper's two flights and compare them, under runs/ (OPTIO
 	@$(QUADSIM) compare $(RUNS)/paper-unconstrained $(RUNS)/paper-constrained --out $(RUNS)/comparison
 	@echo "Done. Open $(RUNS)/comparison/index.html in a browser."
 
-test peers verification robustness first-flights reproduce soak campaigns kills safety: export OMP_NUM_THREADS := 1
-test peers verification robustness first-flights reproduce soak campaigns kills safety: export OPENBLAS_NUM_THREADS := 1
-test peers verification robustness first-flights reproduce soak campaigns kills safety: export MKL_NUM_THREADS := 1
+test peers verification robustness first-flights reproduce speed soak campaigns kills safety: export OMP_NUM_THREADS := 1
+test peers verification robustness first-flights reproduce speed soak campaigns kills safety: export OPENBLAS_NUM_THREADS := 1
+test peers verification robustness first-flights reproduce speed soak campaigns kills safety: export MKL_NUM_THREADS := 1
 test: setup $(VENV)/.browser  ## run every test that needs no peer (OPTIONS="-k audit" for some)
 	@$(PY) -m pytest -q -n $(WORKERS) --dist loadscope $(OPTIONS)
 
@@ -93,6 +93,9 @@ first-flights: setup  ## make and fly first scenarios of many vehicles, remake d
 
 reproduce: setup  ## fly the numbers of every paper that ships and remake docs/papers.md: some five minutes
 	@$(PY) docs/make_papers.py
+
+speed: setup  ## fly every controller ever faster and remake docs/speed.md: some five minutes
+	@$(PY) docs/make_speed.py
 
 soak: setup  ## one simulated hour on end: memory and step time have to stay as they were
 	@$(PY) tests/soak.py --minutes 60

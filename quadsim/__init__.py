@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from scenarios.benchmarks import bench_ladder as bench_ladder
     from scenarios.benchmarks import bench_render as bench_render
     from scenarios.benchmarks import bench_solvers as bench_solvers
+    from scenarios.benchmarks import bench_speed as bench_speed
     from scenarios.catalogue import Catalogue as Catalogue
     from scenarios.catalogue import LibraryScenario as LibraryScenario
     from scenarios.catalogue import catalogue as catalogue
@@ -69,7 +70,14 @@ _PLACES = {
         "resolve",
         "view",
     ),
-    "scenarios.benchmarks": ("bench_campaign", "bench_flight", "bench_ladder", "bench_render", "bench_solvers"),
+    "scenarios.benchmarks": (
+        "bench_campaign",
+        "bench_flight",
+        "bench_ladder",
+        "bench_render",
+        "bench_solvers",
+        "bench_speed",
+    ),
     "scenarios.catalogue": ("Catalogue", "LibraryScenario", "catalogue", "scenarios"),
     "scenarios.flight": ("Flight",),
     "scenarios.junit": ("write_junit",),

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from scenarios.bench.bench_results import FlightProfile, RenderProfile, SolverBench
     from scenarios.bench.campaigns import CampaignProfile
     from scenarios.bench.mismatch.survival import MismatchBench
+    from scenarios.bench.speed import SpeedBench
 
 
 def bench_solvers(
@@ -182,6 +183,33 @@ def bench_ladder(
         found = measure()
         benchmark.write_mismatch(found, directory)
     return found
+
+
+def bench_speed(*, quick: bool = False, workers: int | None = None, progress: Progress | bool = True) -> SpeedBench:
+    """Fly every controller on agile courses at growing speed: where does linear control end?
+
+    Args:
+        quick: two controllers on one course, at two speeds.
+        workers: processes; one per usable core where absent.
+        progress: as of `fly`.
+
+    Returns:
+        How each flight went, in `flights` by course, speed [m/s] and controller.
+
+    Raises:
+        InputError: the number of processes is none.
+
+    Examples:
+        >>> import quadsim
+        >>> found = quadsim.bench_speed(quick=True)
+        >>> linear, nonlinear = (found.flights["loop, drag", 6.0, law].error for law in ("LQR", "nonlinear"))  # [m]
+        >>> nonlinear < 0.2 * linear
+        True
+    """
+    from scenarios.bench.speed import run_speeds
+
+    with reporting(progress) as report:
+        return run_speeds(quick=quick, workers=workers, progress=report)
 
 
 def bench_campaign(

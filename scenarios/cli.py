@@ -165,6 +165,10 @@ def _add_bench(bench: argparse.ArgumentParser) -> None:
     ladder.add_argument("--workers", **_NUMBER, help="processes (default: one per core)")
     ladder.add_argument("--quick", action="store_true", help="three controllers, three conditions, 12 s each")
 
+    speed = kind("speed", help="how well each controller follows agile courses, flown ever faster")
+    speed.add_argument("--workers", **_NUMBER, help="processes (default: one per core)")
+    speed.add_argument("--quick", action="store_true", help="two controllers on one course, at two speeds")
+
     campaign = kind("campaign", help="what many flights cost, by one worker and by two")
     campaign.add_argument("--flights", **_NUMBER, default=40, help="per worker and round (default: 40)")
     campaign.add_argument("--rounds", **_NUMBER, default=3, help="of one worker and two (default: 3)")
@@ -176,6 +180,7 @@ def _add_bench(bench: argparse.ArgumentParser) -> None:
             "--scenario", metavar="SCENARIO", default="paper-constrained", help="(default: %(default)s)"
         )
         _add_settings(parser)
+    for parser in (solvers, flight, render, ladder, speed, campaign):
         parser.add_argument("--json", action="store_true", help="print what was measured alone, as JSON on stdout")
 
 

@@ -27,6 +27,11 @@ def _measure(options: Namespace) -> tuple[Any, list[Grid]]:
     """What was measured, and its tables."""
     from scenarios.bench import bench_tables
 
+    if options.kind == "speed":
+        from scenarios.bench.speed import speed_tables
+
+        speeds = benchmarks.bench_speed(quick=options.quick, workers=options.workers, progress=not options.json)
+        return speeds, speed_tables(speeds)
     scenario, progress = load(options.scenario, options), not options.json
     match options.kind:
         case "solvers":
