@@ -413,6 +413,7 @@ class NonlinearMPC:
             x, u = self._plan
             self._plan = np.concatenate([x[1:], x[-1:]]), np.concatenate([u[1:], u[-1:]])
         rest, before = Rest(wanted[-1], inputs), self._shares(self._acting)
+        share, before_that = 1.0, math.inf
         for _ in range(self.settings.iterations):
             x, u = self._plan
             query = Query(s0, desired, before, rest, self._steps(x, u, frames))
@@ -428,6 +429,10 @@ class NonlinearMPC:
                 moved = max(np.abs(found - x).max(), np.abs(plan - u).max())
                 if moved <= self.settings.tolerance:
                     break
+                # Full Gauss-Newton steps may go to and fro for ever: where they do not shrink, shorter ones are taken.
+                share *= 0.5 if moved > 0.99 * before_that else 1.0
+                before_that = moved
+                self._plan = x + share * (found - x), u + share * (plan - u)
         return query, answer
 
     def _steps(self, x: Array, u: Array, frames: Array) -> tuple[Array, Array, Array]:

@@ -15,7 +15,7 @@ from mpc.constraints import Penalty
 from mpc.ocp import Problem
 from mpc.relinearised import LARGEST, Relinearised
 from mpc.solvers import Answer
-from quadsim.controller import ACCEPTED, SOLVED
+from quadsim.controller import ACCEPTED, SOLVED, UNCONSTRAINED
 
 
 def soft_problem() -> Problem:
@@ -86,3 +86,41 @@ def test_a_failure_leaves_the_next_solve_alone_and_nothing_to_remember() -> None
     hover = solved(solver, ocp_peer.period(problem, np.zeros(12), desired, u_bar))
     assert hover.solution.status == SOLVED
     np.testing.assert_allclose(hover.plan, np.tile(u_bar, (50, 1)), atol=1e-3)
+
+
+@pytest.mark.parametrize("solver", ["piqp-dense", "daqp"])
+@pytest.mark.parametrize("terminal", [0.0, 3.0])
+def test_condensed_and_staged_forms_have_one_optimum(solver: str, terminal: float) -> None:
+    """With weights of changes and of the last state, inputs pulled to others in each step, and without these."""
+    rng = np.random.default_rng(7)
+    problem = soft_problem()
+    Q_d = 0.3 * np.eye(problem.model.nu)
+    objective = replace(problem.objective, Q_d=Q_d, P=terminal * problem.objective.weights[0])
+    problem = replace(problem, objective=objective)
+    ways = Relinearised(problem), Relinearised(problem, solver), Relinearised(problem, solver, shortcut=True)
+    for _ in range(8):
+        now = changing_period(rng, problem)
+        u = now.rest.u + 0.2 * rng.normal(size=(problem.horizon, problem.model.nu))
+        now = replace(now, rest=now.rest._replace(u=u))
+        staged, condensed, shortcut = (solved(way, now) for way in ways)
+        for other in (condensed, shortcut):
+            assert {staged.solution.status, other.solution.status} <= ACCEPTED
+            np.testing.assert_allclose(other.plan, staged.plan, atol=1e-4)
+            np.testing.assert_allclose(other.slacks, staged.slacks, atol=1e-4)
+        assert ways[0].last is not None
+        assert ways[1].last is not None
+        np.testing.assert_allclose(ways[1].last[0], ways[0].last[0], atol=1e-4)
+
+
+def test_the_unconstrained_optimum_is_answered_where_it_violates_nothing() -> None:
+    problem = soft_problem()
+    wide = replace(problem.bounds, **{side: getattr(problem.bounds, side) * 1e4 for side in ("y_min", "y_max", "delta_min", "delta_max")})
+    assert problem.bounds is not None
+    centre = problem.model.u_bar
+    wide = replace(wide, u_min=centre - 1e4, u_max=centre + 1e4)
+    problem = replace(problem, bounds=wide)
+    now = changing_period(np.random.default_rng(3), problem)
+    way = Relinearised(problem, "piqp-dense", shortcut=True)
+    answer = solved(way, now)
+    assert answer.solution.status == UNCONSTRAINED
+    np.testing.assert_allclose(answer.plan, solved(Relinearised(problem), now).plan, atol=1e-5)

@@ -319,8 +319,9 @@ def test_the_robust_controller_holds_it(vehicle: Vehicle, parts: str, kind: str)
         assert largest(held, given, without.plan) > 1e-2
 
 
+@pytest.mark.parametrize("solver", ["piqp-multistage", "piqp-multistage-1", "piqp-dense", "daqp"])
 @pytest.mark.parametrize("soft", [False, True])
-def test_models_that_change_from_step_to_step_hold_it(soft: bool) -> None:
+def test_models_that_change_from_step_to_step_hold_it(soft: bool, solver: str) -> None:
     solved = 0
     for seed in range(12):
         rng = np.random.default_rng(seed)
@@ -329,10 +330,10 @@ def test_models_that_change_from_step_to_step_hold_it(soft: bool) -> None:
         problem = replace(problem, constraints=(row,))
         given = changing_period(rng, problem)
         peer = ocp_peer.optimum(problem, given)
-        answer = Relinearised(problem).solve(
+        answer = Relinearised(problem, solver, shortcut=True).solve(
             given.A, given.B, given.c, given.state, given.desired, given.u_before, given.rest
         )
-        assert (answer.solution.status == SOLVED) == (peer.solution.status == SOLVED)
+        assert (answer.solution.status in ACCEPTED) == (peer.solution.status == SOLVED)
         if peer.solution.status != SOLVED:
             continue
         solved += 1

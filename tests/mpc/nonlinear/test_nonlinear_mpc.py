@@ -1,0 +1,410 @@
+"""Nonlinear MPC: its optimum against an independent solver, flights at any attitude, bounds, refusals."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.optimize import minimize
+
+from mpc.answer import ActuatorBounds
+from mpc.constraints import Constraint
+from mpc.nonlinear.controller import NonlinearMPC
+from mpc.nonlinear.reference import nodes_of_motion, nodes_of_preview
+from mpc.nonlinear.rigidbody import N_BODY, Inputs, P, Q, V, W, advance_nodes, product, rigid_body, thrust_axis
+from mpc.nonlinear.settings import AttitudeError, NonlinearSettings, Weights
+from mpc.observer import ObserverSettings
+from quadsim.assets import vehicle_path
+from quadsim.controller import ACCEPTED, Command, Moment, Phase
+from quadsim.errors import ParameterError
+from quadsim.motion import Motion
+from quadsim.state import INDEX, N_STATES, POSITIONS, VELOCITIES, Array
+from quadsim.vehicle import load_vehicle
+
+VEHICLE = load_vehicle(vehicle_path("hummingbird"))
+PERIOD = 0.02
+HOVER = np.full(4, VEHICLE.hover_speed)
+ERRORS = list(AttitudeError)
+
+
+def law(bounds: ActuatorBounds | None = None, constraints: tuple[Constraint, ...] = (), **settings: Any) -> NonlinearMPC:
+    made = NonlinearSettings(**{"horizon": 10, "stride": 2, **settings})
+    return NonlinearMPC(VEHICLE, period=PERIOD, settings=made, bounds=bounds, constraints=constraints)
+
+
+def ask(controller: NonlinearMPC, x: Array, time: float = 0.0, reference: Array | None = None, **moment: Any) -> Command:
+    """The answer at a state (13,)."""
+    state = np.zeros(N_STATES)
+    state[POSITIONS], state[VELOCITIES] = x[P], x[V]
+    preview = np.zeros((controller.horizon, 4)) if reference is None else reference
+    return controller.step(Moment(time=time, attitude=x[Q], body_rates=x[W], **moment), state, preview)
+
+
+def at_rest(q: tuple[float, ...] = (1.0, 0.0, 0.0, 0.0)) -> Array:
+    x = np.zeros(N_BODY)
+    x[Q] = np.array(q) / np.linalg.norm(q)
+    return x
+
+
+def fly(controller: NonlinearMPC, x: Array, seconds: float, motion: Motion | None = None, **plant: Any) -> Array:
+    """States (K + 1, 13) of a flight in the model's own equations, of a disturbed or another vehicle by `plant`."""
+    model = rigid_body(VEHICLE, PERIOD, substeps=10, inputs=Inputs.SPEED, **plant)
+    states = [x]
+    controller.reset(HOVER)
+    for k in range(round(seconds / PERIOD)):
+        following = None if motion is None else motion.after(k)
+        command = ask(controller, states[-1], k * PERIOD, motion=following)
+        assert command.status in ACCEPTED
+        x = advance_nodes(model, states[-1], command.speeds / VEHICLE.speed_max)
+        x[Q] /= np.linalg.norm(x[Q])
+        states.append(x)
+    return np.array(states)
+
+
+def still(samples: int, attitude: Array, position: Array | None = None) -> Motion:
+    """A motion of samples of attitude (K, 4), with hover thrust."""
+    nothing = np.zeros((samples, 3))
+    thrusts = np.full((samples, 4), VEHICLE.mass * VEHICLE.gravity / 4.0)
+    where = nothing if position is None else position
+    return Motion(
+        position=where, velocity=nothing, acceleration=nothing, attitude=attitude, body_rates=nothing, thrusts=thrusts
+    )
+
+
+# --- its optimum ---------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("error", ERRORS)
+@pytest.mark.parametrize("inputs", Inputs)
+def test_converged_it_is_the_optimum_of_an_independent_solver(error: AttitudeError, inputs: Inputs) -> None:
+    """SLSQP on the nonlinear problem from its definition: rolled out, no QP, no derivative of ours."""
+    weights = Weights(position=(10.0, 8.0, 12.0), attitude=2.0, velocity=0.5, body_rates=0.05, input=0.02, move=0.01)
+    controller = law(
+        horizon=4, iterations=100, tolerance=1e-9, inputs=inputs, attitude_error=error, weights=weights, terminal=3.0
+    )
+    x0 = at_rest((0.98, 0.15, -0.1, 0.05))
+    x0[P], x0[V], x0[W] = (0.2, -0.1, -0.8), (0.5, 0.2, -0.4), (0.3, -0.5, 0.2)
+    command = ask(controller, x0)
+    model = rigid_body(VEHICLE, 2 * PERIOD, inputs=inputs)
+    hover = model.shares(np.full(4, VEHICLE.mass * VEHICLE.gravity / 4.0))
+
+    def cost(flat: Array) -> float:
+        u, x, total = flat.reshape(4, 4), x0, 0.0
+        for i in range(4):
+            x = advance_nodes(model, x, u[i])
+            turned = (
+                weights.attitude * np.sum((x[Q] - [1, 0, 0, 0]) ** 2)
+                if error is AttitudeError.DIFFERENCE
+                else weights.attitude * np.sum((2.0 * x[4:7]) ** 2)
+            )
+            stage = np.sum(np.array(weights.position) * x[P] ** 2) + turned
+            stage += weights.velocity * np.sum(x[V] ** 2) + weights.body_rates * np.sum(x[W] ** 2)
+            before = hover if i == 0 else u[i - 1]
+            total += (3.0 if i == 3 else 1.0) * stage
+            total += weights.input * np.sum((u[i] - hover) ** 2) + weights.move * np.sum((u[i] - before) ** 2)
+        return float(total)
+
+    found = minimize(
+        cost, np.tile(hover, 4), method="SLSQP", bounds=[(0.0, 1.0)] * 16, options={"ftol": 1e-15, "maxiter": 500}
+    )
+    ours = model.shares(VEHICLE.thrust_coefficient * np.square(command.plan[::2]))
+    assert cost(ours.ravel()) <= found.fun * (1.0 + 1e-9)
+    np.testing.assert_allclose(ours, found.x.reshape(4, 4), atol=1e-4)
+    assert ours.min() < 1e-6 or ours.max() > 1.0 - 1e-6  # a bound is active
+
+
+def test_the_real_time_iteration_comes_to_the_same_optimum_at_a_state_that_stays() -> None:
+    x = at_rest((0.95, 0.2, 0.1, 0.0))
+    x[P] = 0.3, 0.0, -0.2
+    exact = ask(law(iterations=50, tolerance=1e-11), x)
+    one = law(shift=False)
+    for _ in range(40):
+        command = ask(one, x, acting=HOVER)
+    np.testing.assert_allclose(command.plan, exact.plan, atol=1e-3 * VEHICLE.speed_max)
+
+
+def test_a_quaternion_and_its_opposite_are_one_attitude() -> None:
+    x = at_rest((0.9, 0.3, -0.2, 0.1))
+    other = x.copy()
+    other[Q] *= -1.0
+    np.testing.assert_allclose(ask(law(), other).speeds, ask(law(), x).speeds, rtol=1e-9)
+
+
+@pytest.mark.parametrize("solver", ["piqp-dense", "piqp-multistage", "daqp"])
+def test_solvers_agree(solver: str) -> None:
+    x = at_rest((0.5, 0.8, 0.1, 0.0))
+    plan = ask(law(solver=solver, inputs=Inputs.SPEED), x).plan
+    np.testing.assert_allclose(plan, ask(law(inputs=Inputs.SPEED), x).plan, atol=1e-2)
+
+
+# --- any attitude --------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("q", [(0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0), (0.05, 0.7, 0.7, 0.1)])
+def test_upside_down_it_turns_over_and_comes_back(q: tuple[float, ...]) -> None:
+    states = fly(law(horizon=20), at_rest(q), 4.0)
+    assert np.linalg.norm(states[-1, P]) < 0.02
+    assert thrust_axis(states[-1, Q])[2] > 0.999
+    assert np.abs(states[:, P]).max() < 2.0
+
+
+def test_a_flip_is_flown_through() -> None:
+    """A whole turn about body x in 0.6 s, two seconds in; the quaternion comes back with the other sign."""
+    t = PERIOD * np.arange(300)
+    angle = math.tau * np.clip((t - 2.0) / 0.6, 0.0, 1.0)
+    motion = still(300, np.stack([np.cos(angle / 2), np.sin(angle / 2), 0 * t, 0 * t], axis=1))
+    rates = np.zeros((300, 3))
+    rates[:, 0] = np.gradient(angle, PERIOD)
+    heavy = Weights(position=5.0, attitude=20.0, velocity=0.5, body_rates=0.05, input=0.1)
+    states = fly(law(horizon=20, weights=heavy), at_rest(), 6.0, replace(motion, body_rates=rates))
+    up = thrust_axis(states[:, Q])[:, 2]
+    assert up.min() < -0.9
+    assert states[-1, 3] < -0.99  # one whole turn on
+    np.testing.assert_allclose(states[-1, P], 0.0, atol=0.05)
+    assert np.linalg.norm(states[:, P], axis=1).max() < 4.0
+
+
+def test_a_vertical_loop_is_flown() -> None:
+    """Radius 2 m at 6 m/s, thrust towards its centre: the attitude goes once around about body y."""
+    radius, speed, lead = 2.0, 6.0, 100
+    omega = speed / radius
+    theta = omega * PERIOD * np.arange(round(math.tau / omega / PERIOD) + 1)
+    straight = PERIOD * speed * np.arange(-lead, 0)
+    x = np.concatenate([straight, radius * np.sin(theta), PERIOD * speed * np.arange(1, 151)])
+    z = np.concatenate([0 * straight, radius * (1.0 - np.cos(theta)), np.zeros(150)])
+    position = np.stack([x, 0 * x, z], axis=1)
+    velocity = np.gradient(position, PERIOD, axis=0)
+    acceleration = np.zeros_like(velocity)
+    acceleration[lead : lead + theta.size, 0] = -(speed**2) / radius * np.sin(theta)
+    acceleration[lead : lead + theta.size, 2] = speed**2 / radius * np.cos(theta)
+    force = acceleration + [0.0, 0.0, VEHICLE.gravity]
+    pitch = np.unwrap(np.arctan2(force[:, 0], force[:, 2]))
+    attitude = np.stack([np.cos(pitch / 2), 0 * pitch, np.sin(pitch / 2), 0 * pitch], axis=1)
+    rates = np.zeros_like(velocity)
+    rates[:, 1] = np.gradient(pitch, PERIOD)
+    thrusts = np.tile(VEHICLE.mass * np.linalg.norm(force, axis=1)[:, None] / 4.0, (1, 4))
+    motion = Motion(
+        position=position, velocity=velocity, acceleration=acceleration, attitude=attitude, body_rates=rates,
+        thrusts=thrusts,
+    )  # fmt: skip
+    start = at_rest()
+    start[P], start[V] = position[0], velocity[0]
+    states = fly(law(horizon=15), start, PERIOD * (len(x) - 1), motion)
+    assert thrust_axis(states[:, Q])[:, 2].min() < -0.7
+    far = np.linalg.norm(states[:-50, P] - position[:-50], axis=1)  # at the end it comes to rest
+    assert far.max() < 0.5
+    assert far[-1] < 0.05
+
+
+# --- references ----------------------------------------------------------------------------------------------------
+
+
+def test_nodes_near_the_end_repeat_the_last_that_is_there_and_inputs_the_one_before() -> None:
+    samples = np.arange(21.0)
+    spread = np.tile(samples[:, None], (1, 4))
+    motion = Motion(
+        position=spread[:, :3], velocity=spread[:, :3], acceleration=spread[:, :3], attitude=spread,
+        body_rates=spread[:, :3], thrusts=spread,
+    )  # fmt: skip
+    for k, states, inputs in (
+        (0, [0, 5, 10, 15], [0, 5, 10]),
+        (5, [5, 10, 15, 20], [5, 10, 15]),
+        (6, [6, 11, 16, 16], [6, 11, 11]),
+        (15, [15, 20, 20, 20], [15, 15, 15]),
+        (16, [16, 16, 16, 16], [16, 16, 16]),
+        (20, [20, 20, 20, 20], [20, 20, 20]),
+    ):
+        nodes = nodes_of_motion(motion.after(k), 3, 5)
+        np.testing.assert_array_equal(nodes.states[:, 0], states)
+        np.testing.assert_array_equal(nodes.thrusts[:, 0], inputs)
+
+
+def test_nodes_of_a_preview_have_its_velocity_and_its_yaw() -> None:
+    rows = np.arange(1, 21)[:, None] * [0.1, 0.0, -0.05, 0.2]
+    nodes = nodes_of_preview(rows, 4, 5, 0.1, 1.75)
+    np.testing.assert_allclose(nodes.states[:, 0], [0.0, 0.5, 1.0, 1.5, 2.0], atol=1e-12)
+    np.testing.assert_allclose(nodes.states[:, V], np.tile([1.0, 0.0, -0.5], (5, 1)), atol=1e-9)
+    np.testing.assert_allclose(nodes.states[:, 12], 2.0)
+    np.testing.assert_allclose(nodes.states[2, Q], [math.cos(1.0), 0.0, 0.0, math.sin(1.0)])
+    assert (nodes.thrusts == 1.75).all()
+
+
+# --- disturbances --------------------------------------------------------------------------------------------------
+
+
+DISTURBANCE = {"acceleration": np.array([1.0, -0.5, 0.8]), "angular_acceleration": np.array([2.0, -1.0, 0.5])}
+
+
+def test_a_constant_disturbance_leaves_no_error_with_the_observer_and_one_without() -> None:
+    quick = ObserverSettings(velocity_noise=0.01, velocity_walk=0.01, rate_noise=0.02)
+    with_it, without = (fly(law(observer=observer), at_rest(), 16.0, **DISTURBANCE) for observer in (quick, None))
+    assert np.linalg.norm(with_it[-1, P]) < 2e-3
+    assert np.linalg.norm(without[-1, P]) > 0.02
+
+
+def test_known_drag_is_balanced() -> None:
+    """A straight flight at 5 m/s."""
+    t = PERIOD * np.arange(400)
+    position = np.stack([5.0 * t, 0 * t, 0 * t], axis=1)
+    motion = replace(still(400, np.tile([1.0, 0, 0, 0], (400, 1)), position), velocity=np.tile([5.0, 0, 0], (400, 1)))
+    drag = {"drag": (0.2, 0.2, 0.0), "quadratic_drag": (0.05, 0.05, 0.05)}
+    start = at_rest()
+    start[V] = 5.0, 0.0, 0.0
+    known, unknown = (
+        fly(law(**settings), start, 6.0, motion, **{name: np.array(value) for name, value in drag.items()})
+        for settings in (drag, {})
+    )
+    at_end = position[300]
+    assert np.linalg.norm(known[300, P] - at_end) < 2e-3
+    assert np.linalg.norm(unknown[300, P] - at_end) > 0.1
+
+
+# --- bounds --------------------------------------------------------------------------------------------------------
+
+
+def furthest(states: Array) -> tuple[float, float]:
+    """Largest tilt [deg] and largest body rate [rad/s]."""
+    return float(np.degrees(np.arccos(thrust_axis(states[:, Q])[:, 2]).max())), float(np.abs(states[:, W]).max())
+
+
+def test_tilt_and_body_rates_are_bounded() -> None:
+    x = at_rest()
+    x[P] = 3.0, -3.0, 0.0
+    gentle = Weights(position=2.0, velocity=0.5, attitude=0.5, body_rates=0.2)
+    free, _ = furthest(fly(law(weights=gentle, horizon=20), x, 3.0))
+    held, _ = furthest(fly(law(weights=gentle, horizon=20, tilt=math.radians(15.0)), x, 3.0))
+    assert free > 25.0
+    assert 12.0 < held < 15.6
+    _, quick = furthest(fly(law(weights=gentle, horizon=20), x, 3.0))
+    _, slow = furthest(fly(law(weights=gentle, horizon=20, largest_rates=(1.0, 1.0, 1.0)), x, 3.0))
+    assert quick > 1.5
+    assert slow < 1.02
+
+
+def test_velocities_and_slews_are_bounded() -> None:
+    x = at_rest()
+    x[P] = 4.0, 0.0, 0.0
+    row = np.zeros((1, N_STATES))
+    row[0, INDEX["vx"]] = 1.0
+    fence = Constraint(name="slow", lower=np.array([-1.0]), upper=np.array([1.0]), C=row)
+    bounds = ActuatorBounds.alike((0.0, VEHICLE.speed_max), (-60.0, 60.0))
+    controller = law(bounds, (fence,), inputs=Inputs.SPEED, horizon=20)
+    states = fly(controller, x, 5.0)
+    assert -1.02 < states[:, 7].min() < -0.9
+    first = ask(law(bounds, (fence,), inputs=Inputs.SPEED, horizon=20), x, acting=HOVER)
+    assert np.abs(first.speeds - HOVER).max() <= 60.0 + 1e-6
+    assert np.abs(first.speeds - HOVER).max() > 59.0
+
+
+def test_what_is_not_linear_in_the_model_is_refused() -> None:
+    angle, speed = np.zeros((1, N_STATES)), np.array([[1.0, 0.0, 0.0, 0.0]])
+    angle[0, INDEX["roll"]] = 1.0
+    one = {"name": "mine", "lower": np.array([-1.0]), "upper": np.array([1.0])}
+    with pytest.raises(ParameterError, match=r"controller\.mine must be without Euler angles"):
+        law(constraints=(Constraint(C=angle, **one),))
+    with pytest.raises(ParameterError, match=r"controller\.mine must be without rotor speeds"):
+        law(constraints=(Constraint(D=speed, **one),))
+    with pytest.raises(ParameterError, match=r"controller\.input_bounds\.slew must be left out"):
+        law(ActuatorBounds.alike((0.0, 800.0), (-60.0, 60.0)))
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"horizon": 0}, "controller.horizon must be a whole number >= 1; got 0"),
+        ({"tilt": 2.0}, "controller.tilt must be positive and below pi/2, or None; got 2.0"),
+        ({"terminal": -1.0}, 'controller.terminal must be at least 0 and finite, or "lqr"; got -1.0'),
+        (
+            {"attitude_error": AttitudeError.DIFFERENCE, "weights": Weights(attitude=(1.0, 1.0, 2.0))},
+            'controller.weights.attitude must be one number where attitude_error = "difference"; got (1.0, 1.0, 2.0)',
+        ),
+    ],
+)
+def test_impossible_settings_are_refused(settings: dict[str, Any], message: str) -> None:
+    with pytest.raises(ParameterError) as caught:
+        NonlinearSettings(**settings)
+    assert str(caught.value) == message
+
+
+@pytest.mark.parametrize("wrong", [{"position": 0.0}, {"move": -1.0}, {"input": (1.0, 1.0, 1.0)}, {"velocity": math.inf}])
+def test_impossible_weights_are_refused(wrong: dict[str, Any]) -> None:
+    with pytest.raises(ParameterError, match=rf"controller\.weights\.{next(iter(wrong))} must be"):
+        Weights(**wrong)
+
+
+# --- what a controller must stand ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("number", [math.nan, math.inf, 1e7])
+def test_numbers_that_are_none_are_refused_and_do_no_harm(number: float) -> None:
+    controller, fresh = law(), law()
+    wrong = at_rest()
+    wrong[0] = number
+    command = ask(controller, wrong)
+    assert command.status == "invalid_data"
+    np.testing.assert_array_equal(command.speeds, HOVER)
+    np.testing.assert_array_equal(ask(controller, at_rest()).speeds, ask(fresh, at_rest()).speeds)
+    assert controller.unanswered is None
+
+
+def test_without_attitude_in_the_moment_it_is_taken_from_the_state() -> None:
+    state = np.zeros(N_STATES)
+    state[INDEX["roll"]], state[INDEX["pitch_rate"]] = 0.3, 0.4
+    reference = np.zeros((20, 4))
+    x = at_rest((math.cos(0.15), math.sin(0.15), 0.0, 0.0))
+    # d(pitch)/dt = q cos(roll) - r sin(roll) alone, and no yaw rate
+    x[W] = 0.0, 0.4 * math.cos(0.3), -0.4 * math.sin(0.3)
+    np.testing.assert_allclose(law().step(Moment(), state, reference).speeds, ask(law(), x).speeds, rtol=1e-9)
+
+
+def test_an_infeasible_problem_is_reported_with_its_query() -> None:
+    row = np.zeros((1, N_STATES))
+    row[0, INDEX["x"]] = 1.0
+    fence = Constraint(name="fence", lower=np.array([5.0]), upper=np.array([6.0]), C=row)
+    controller = law(constraints=(fence,))
+    command = ask(controller, at_rest())
+    assert command.status not in ACCEPTED
+    np.testing.assert_array_equal(command.speeds, HOVER)
+    assert controller.unanswered is not None
+    assert controller.unanswered.query.steps is not None
+
+
+def test_grounded_rotors_stop() -> None:
+    command = ask(law(), at_rest(), phase=Phase.LANDED)
+    assert command.status == "landed"
+    assert (command.speeds == VEHICLE.speed_min).all()
+
+
+def test_what_it_predicts_is_what_the_model_does() -> None:
+    controller = law()
+    x = at_rest((0.9, 0.3, 0.0, 0.1))
+    command = ask(controller, x)
+    state = np.zeros((1, N_STATES))
+    from quadsim.state import quaternion_to_euler
+
+    state[0, 6::2] = quaternion_to_euler(x[Q])
+    predicted = controller.predict(state, command.plan[None])
+    model = rigid_body(VEHICLE, PERIOD, inputs=Inputs.SPEED)
+    for i in range(command.plan.shape[0]):
+        x = advance_nodes(model, x, command.plan[i] / VEHICLE.speed_max)
+        x[Q] /= np.linalg.norm(x[Q])
+        np.testing.assert_allclose(predicted[0, i, POSITIONS], x[P], atol=1e-9)
+
+
+def test_turning_the_world_about_the_vertical_turns_the_answer_with_it() -> None:
+    """Position, velocity and attitude turned by one yaw, and the reference's yaw too: the same rotor speeds."""
+    x = at_rest((0.9, 0.3, -0.2, 0.1))
+    x[P], x[V] = (0.5, -0.2, 0.3), (0.1, 0.4, 0.0)
+    even = Weights(position=10.0, velocity=0.3)
+    plain = ask(law(weights=even), x)
+    yaw = 2.0
+    turn = np.array([[math.cos(yaw), -math.sin(yaw), 0.0], [math.sin(yaw), math.cos(yaw), 0.0], [0.0, 0.0, 1.0]])
+    other = x.copy()
+    other[P], other[V] = turn @ x[P], turn @ x[V]
+    other[Q] = product(np.array([math.cos(yaw / 2), 0.0, 0.0, math.sin(yaw / 2)]), x[Q])
+    reference = np.zeros((20, 4))
+    reference[:, 3] = yaw
+    np.testing.assert_allclose(ask(law(weights=even), other, reference=reference).speeds, plain.speeds, rtol=1e-9)
