@@ -67,8 +67,8 @@ class CompletedMoment(Moment):
 def completed_moment(now: Moment, acting: Array, unseen: Array, known: Array) -> CompletedMoment:
     """A moment with the command in force (4,) and which channels (12,) of the state `known` (12,) are not measured.
 
-    Its attitude and body rates are left out where the state's are predicted.  Next to a pitch of 90 deg, where the rates
-    of Euler angles are implausibly large, those of the body are not.
+    Its attitude and body rates are left out where the state's are predicted.  Next to a pitch of 90 deg the rates of
+    Euler angles are implausibly large; those of the body are not.
     """
     found = {**vars(now), "acting": acting, "unseen": unseen}
     upright = abs(float(known[INDEX["pitch"]])) < UPRIGHT

@@ -6,8 +6,8 @@ Each period the model is linearised along the plan of the last one, at the nodes
 
 is solved: a full Gauss-Newton step, the real-time iteration (Diehl, Bock and Schloeder 2005).  Its states s have the
 quaternion q_r* q for q, with the node's reference q_r: a rotation of four numbers, by which both attitude errors of
-`AttitudeError` become linear with fixed weights.  A measured state enters as s_0 alone; node 0 is linearised at the state
-kept.
+`AttitudeError` become linear with fixed weights.  A measured state enters as s_0 alone; node 0 is linearised at the
+state kept.
 """
 
 from __future__ import annotations
@@ -192,7 +192,7 @@ class NonlinearMPC:
     def _turning(self, n: int) -> Iterator[Constraint]:
         """Bounds on tilt and body rates."""
         settings = self.settings
-        if self._tilted:
+        if settings.tilt is not None:
             angles = math.tau / TILT_SIDES * np.arange(TILT_SIDES)
             rows = np.zeros((TILT_SIDES, n))
             rows[:, -2], rows[:, -1] = np.cos(angles), np.sin(angles)
@@ -219,7 +219,7 @@ class NonlinearMPC:
         parts = {name: np.zeros((constraint.lower.shape[-1], size)) for name, size in (("C", n), ("D", N_ROTORS))}
         if constraint.C is not None:
             if constraint.C[:, [*EULER, *EULER_RATE]].any():
-                rule = "without Euler angles and their rates: controller.tilt and controller.body_rate bound the attitude"
+                rule = "without Euler angles and their rates; tilt and body_rate bound the attitude"
                 raise ParameterError("controller", constraint.name, "of those", rule)
             parts["C"][:, P], parts["C"][:, V] = constraint.C[:, POSITIONS], constraint.C[:, VELOCITIES]
         if constraint.D is not None and constraint.D.any():
@@ -227,7 +227,7 @@ class NonlinearMPC:
                 rule = 'without rotor speeds where inputs = "thrust", in which they are not linear: inputs = "speed"'
                 raise ParameterError("controller", constraint.name, "of those", rule)
             parts["D"] = constraint.D * self._vehicle.speed_max
-        return replace(constraint, **parts)
+        return replace(constraint, C=parts["C"], D=parts["D"])
 
     def _slews(self) -> list[Constraint]:
         """Bounds on steps of speeds: from one node to the next `stride` times those of a period, but for the first."""
@@ -262,6 +262,7 @@ class NonlinearMPC:
         self._plan: tuple[Array, Array] | None
         self._quaternion: Array | None
         self._last: tuple[float, Array] | None  # time and state of the last period
+        self._asked: float
         self._forget()
         self.unanswered: Unanswered | None = None
 
@@ -369,13 +370,16 @@ class NonlinearMPC:
         wanted = force - model.acceleration - drag_acceleration(model, q, states[:, V])
         size = np.maximum(np.linalg.norm(wanted, axis=1), 1e-9)
         # The least rotation from one axis to another is (1 + a . b, a x b), up to its length.
-        turn = np.concatenate([1.0 + np.sum(axis * wanted, axis=1)[:, None] / size[:, None],
-                               np.cross(axis, wanted) / size[:, None]], axis=1)
+        turn = np.concatenate(
+            [1.0 + np.sum(axis * wanted, axis=1)[:, None] / size[:, None], np.cross(axis, wanted) / size[:, None]],
+            axis=1,
+        )
         length = np.linalg.norm(turn, axis=1)
         turn[length < 1e-6] = (1.0, 0.0, 0.0, 0.0)
         turn /= np.linalg.norm(turn, axis=1, keepdims=True)
         states[:, Q] = product(turn, q)
-        effort = np.concatenate([(size[:-1] - total)[:, None], np.tile(-model.angular_acceleration, (len(total), 1))], 1)
+        effort = np.empty((len(total), 4))
+        effort[:, 0], effort[:, 1:] = size[:-1] - total, -model.angular_acceleration
         return Nodes(states, thrusts + effort @ self._inverse.T)
 
     def _forget(self) -> None:

@@ -10,9 +10,9 @@ R(q) is polynomial and never divided by |q|^2, so that the derivatives hold for 
 rotors' thrusts or speeds as shares of the largest, held over a step of one node; T = thrust / m and I^-1 tau are known
 exactly at every instant of it.  The body is integrated by the classical Runge-Kutta method.
 
-All but the drag is of second degree in (q, omega), T and I^-1 tau given: with F the Jacobian of that part, which is linear
-in (q, omega, T q), its value is F x / 2.  So the derivatives and the value itself are the columns of one matrix that
-goes through the Runge-Kutta stages.
+All but the drag is of second degree in (q, omega), T and I^-1 tau given: with F the Jacobian of that part, which is
+linear in (q, omega, T q), its value is F x / 2.  So the derivatives and the value itself are the columns of one matrix
+that goes through the Runge-Kutta stages.
 """
 
 from __future__ import annotations
@@ -121,7 +121,7 @@ def rigid_body(vehicle: Vehicle, step: float, **others: object) -> RigidBody:
 @cache
 def _features(gyration: tuple[float, float, float]) -> Array:
     F = np.zeros((11, _TURNING, _TURNING))
-    w, x, y, z, p, q, r, Tw, Tx, Ty, Tz = range(11)
+    w, x, y, z, p, q, r, Tw = range(8)  # the last is the first of four, T q
     half = 0.5
     # q' = 1/2 q (0, omega): each term is sign/2 q_i omega_j in row k.
     for k, i, j, sign in (
@@ -179,9 +179,7 @@ def _rotation_slopes() -> Array:
 _SLOPES: Final = _rotation_slopes()
 
 
-def linearise_nodes(
-    model: RigidBody, x: Array, u: Array, frames: Array | None = None
-) -> tuple[Array, Array, Array]:
+def linearise_nodes(model: RigidBody, x: Array, u: Array, frames: Array | None = None) -> tuple[Array, Array, Array]:
     """A, B and the end x(k+1) of the map from M nodes' states x (M, n) under inputs u (M, 4).
 
     Args:
@@ -330,7 +328,7 @@ def advance_nodes(model: RigidBody, x: Array, u: Array) -> Array:
     h, lag = model.step / model.substeps, model.rotor_lag
     body = x[..., :N_BODY]
     for s in range(model.substeps):
-        slopes = []
+        slopes: list[Array] = []
         for fraction, weight in ((0.0, 0.0), (0.5, 0.5), (0.5, 0.5), (1.0, 1.0)):
             at = body if not slopes else body + weight * h * slopes[-1]
             now = u if lag is None else u + math.exp(-(s + fraction) * h / lag) * (x[..., N_BODY:] - u)

@@ -40,9 +40,9 @@ class Weights:
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
             array = np.asarray(value, float)
-            least = -math.inf if name == "move" else 0.0
             axes = ((),) if name in ("input", "move") else ((), (3,))
-            if array.shape not in axes or not np.isfinite(array).all() or not (array > least).all() or array.min() < 0.0:
+            inside = np.isfinite(array) & (array >= 0.0) & ((array > 0.0) | (name == "move"))
+            if array.shape not in axes or not inside.all():
                 rule = "positive: one number, or three" if len(axes) == 2 else "one positive number"
                 raise ParameterError("controller.weights", name, value, rule)
 
@@ -67,7 +67,7 @@ class NonlinearSettings:
         quadratic_drag: (3,) drag quadratic in each component of the velocity [N s^2/m^2].
         attitude_error: what the weight of the attitude is of.
         weights: what distances from the reference cost.
-        terminal: the last state's weight over that of the others, 0 for none; `lqr` for the Riccati equation's at hover.
+        terminal: the last state's weight over that of the others, 0 for none; `lqr` for the Riccati equation's.
         tilt: largest angle between thrust axis and vertical [rad], below pi/2; None for no bound.
         largest_rates: (3,) largest magnitudes of the body rates [rad/s]; infinite for no bound.
         soft: (l1, l2) of exceeding these by 1 rad or 1 rad/s; None for hard bounds.

@@ -122,13 +122,13 @@ class Condensed:
     def _changing(self) -> _Changing:
         """What does not change where the model does."""
         objective, blank = self._problem.objective, self._blank
-        P, m = np.array(blank.P), self._inputs
+        factor = np.asarray(np.linalg.cholesky(objective.Q_y).T, float)
         return _Changing(
-            root=(factor := np.linalg.cholesky(objective.Q_y).T) @ objective.C_r,
+            root=factor @ objective.C_r,
             target=factor,
             root_end=_root(objective.terminal_weights[0]),
             H=_input_hessian(self._problem),
-            P=P,
+            P=np.array(blank.P),
             G=np.array(blank.G, order="C"),
         )
 
@@ -178,7 +178,16 @@ class Condensed:
             filled.reshape(N, count, -1)[:, :, :m] = values[:, :, :m]
             G, h_l, h_u = np.asfortranarray(filled), (rows.lower - known).ravel(), (rows.upper - known).ravel()
         qp = QP(
-            P=P, c=gradient, A=blank.A, b=blank.b, G=G, h_l=h_l, h_u=h_u, x_l=blank.x_l, x_u=blank.x_u, later=blank.later
+            P=P,
+            c=gradient,
+            A=blank.A,
+            b=blank.b,
+            G=G,
+            h_l=h_l,
+            h_u=h_u,
+            x_l=blank.x_l,
+            x_u=blank.x_u,
+            later=blank.later,
         )
         return qp, lambda x: S[1:, :, :m] @ x[:m] + S[1:, :, m]
 

@@ -34,9 +34,9 @@ from mpc.heading import (
 from mpc.model import LinearModel, continuous_model, discretise, hover_model
 from mpc.nonlinear.linearise import linearise
 from mpc.nonlinear.model import NonlinearModel, advance, nonlinear_model, spun
-from mpc.ocp import Objective, Problem, Query, Rest, Unanswered, lqr_terminal_weight
 from mpc.observer import DisturbanceObserver, thrust_axis
 from mpc.observer import ObserverSettings as ObserverSettings
+from mpc.ocp import Objective, Problem, Query, Rest, Unanswered, lqr_terminal_weight
 from mpc.relinearised import Relinearised
 from mpc.robust.settings import Linearisation as Linearisation
 from mpc.robust.settings import RobustSettings as RobustSettings

@@ -123,7 +123,7 @@ def make_backend(name: str, *, changing: bool = False) -> Backend:
     entry = SOLVERS[name]
     if not entry.installed:
         raise MissingPackageError(f"the solver {name!r}", entry.package, extra=entry.extra)
-    module, _, kind = (changing and entry.changing or entry.backend).partition(":")
+    module, _, kind = ((changing and entry.changing) or entry.backend).partition(":")
     backend: Backend = getattr(importlib.import_module(f"{__name__}.{module}"), kind)()
     return backend
 

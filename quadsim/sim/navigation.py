@@ -37,7 +37,8 @@ class Navigation:
     receives the estimate, from the sensors that there are.
 
     Attributes:
-        attitude: quaternion (4,), wxyz, body to world, sign continuous, and body rates (3,) [rad/s] of the last `state`.
+        attitude: quaternion (4,), wxyz, body to world, sign continuous, and body rates (3,) [rad/s], of the last
+            `state`.
 
     Each sensor draws from a generator of its own, so that adding one, or its noise, leaves the others' draws alone.
     """

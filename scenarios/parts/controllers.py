@@ -80,9 +80,9 @@ def make_bounds(spec: BoundedSpec) -> Bounds:
     )
 
 
-def _rates(bound: float | list[float] | None) -> tuple[float, float, float]:
-    """Largest magnitudes [rad/s] of bounds in deg/s."""
-    x, y, z = np.broadcast_to(np.radians(math.inf if bound is None else bound), 3).tolist()
+def _three(numbers: float | Sequence[float]) -> tuple[float, float, float]:
+    """One number for three axes, or one each, as three."""
+    x, y, z = np.broadcast_to(numbers, 3).tolist()
     return x, y, z
 
 
@@ -200,13 +200,20 @@ def _nonlinear(spec: NonlinearSpec, vehicle: Vehicle, period: float) -> Controll
         substeps=spec.substeps,
         inputs=Inputs(spec.inputs),
         rotor_lag=_rotor_lag(spec, vehicle),
-        drag=tuple(spec.drag),
-        quadratic_drag=tuple(spec.quadratic_drag),
+        drag=_three(spec.drag),
+        quadratic_drag=_three(spec.quadratic_drag),
         attitude_error=AttitudeError(spec.attitude_error),
-        weights=Weights(**{name: tuple(w) if isinstance(w, list) else w for name, w in axes}),
+        weights=Weights(
+            position=_three(axes.position),
+            attitude=_three(axes.attitude) if isinstance(axes.attitude, list) else axes.attitude,
+            velocity=_three(axes.velocity),
+            body_rates=_three(axes.body_rates),
+            input=axes.input,
+            move=axes.move,
+        ),
         terminal=0.0 if spec.terminal == "none" else spec.terminal,
         tilt=None if spec.tilt is None else math.radians(spec.tilt),
-        largest_rates=_rates(spec.body_rate),
+        largest_rates=_three(math.inf if spec.body_rate is None else np.radians(spec.body_rate).tolist()),
         soft=None if spec.soft is None else (spec.soft.linear, spec.soft.quadratic),
         observer=spec.offset_free,
         solver=spec.solver,

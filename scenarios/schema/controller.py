@@ -84,7 +84,9 @@ def _spelt_out(controller: Any) -> Any:
     """A law's name alone as the table that it stands for."""
     if isinstance(controller, str):
         return {"type": controller}
-    if not isinstance(controller, Mapping | WeightedSpec | NonlinearSpec | LQRSpec | PIDSpec | GeometricSpec | PluginSpec):
+    if not isinstance(
+        controller, Mapping | WeightedSpec | NonlinearSpec | LQRSpec | PIDSpec | GeometricSpec | PluginSpec
+    ):
         raise PydanticCustomError("controller", "a table or a controller's name")
     return controller
 

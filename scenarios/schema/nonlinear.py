@@ -130,7 +130,9 @@ class NonlinearPartsSpec(Spec):
             )
         for name, pair in self.output_bounds.items():
             if name not in LINEAR:
-                raise ValueError(f"output_bounds must be of {', '.join(LINEAR)}; got {name!r}: tilt bounds the attitude")
+                raise ValueError(
+                    f"output_bounds must be of {', '.join(LINEAR)}; got {name!r}: tilt bounds the attitude"
+                )
             require_ordered(f"output_bounds.{name}", pair)
         if self.inputs == "thrust" and self.input_bounds.slew is not None:
             raise ValueError(

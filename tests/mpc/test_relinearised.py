@@ -114,7 +114,10 @@ def test_condensed_and_staged_forms_have_one_optimum(solver: str, terminal: floa
 
 def test_the_unconstrained_optimum_is_answered_where_it_violates_nothing() -> None:
     problem = soft_problem()
-    wide = replace(problem.bounds, **{side: getattr(problem.bounds, side) * 1e4 for side in ("y_min", "y_max", "delta_min", "delta_max")})
+    wide = replace(
+        problem.bounds,
+        **{side: getattr(problem.bounds, side) * 1e4 for side in ("y_min", "y_max", "delta_min", "delta_max")},
+    )
     assert problem.bounds is not None
     centre = problem.model.u_bar
     wide = replace(wide, u_min=centre - 1e4, u_max=centre + 1e4)

@@ -23,8 +23,8 @@ from mpc.model import LinearModel, continuous_model, discretise
 from mpc.nonlinear.linearise import linearise
 from mpc.nonlinear.model import nonlinear_model
 from mpc.ocp import Objective, Problem, Rest, lqr_terminal_weight
-from mpc.robust.controller import Linearisation, RobustMPC, RobustSettings
 from mpc.relinearised import Relinearised
+from mpc.robust.controller import Linearisation, RobustMPC, RobustSettings
 from mpc.solvers import SOLVERS, QPSolver, Way
 from quadsim.controller import ACCEPTED, SOLVED, UNCONSTRAINED, Moment
 from quadsim.state import Array, make_state

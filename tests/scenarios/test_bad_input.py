@@ -125,7 +125,11 @@ WRONG: list[tuple[str, str | list[str], str]] = [
         "initial.cold must be false where effects.ground gives no floor to stand on; got true",
     ),
     ("radius", "effects.ground={effect=true, rotor_radius=0}", "effects.ground.rotor_radius must be > 0.0; got 0"),
-    ("side", "initial.euler=[0, 100, 0]", "initial.euler must have a roll within +-180 deg and a pitch within +-90 deg;@"),
+    (
+        "side",
+        "initial.euler=[0, 100, 0]",
+        "initial.euler must have a roll within +-180 deg and a pitch within +-90 deg;@",
+    ),
     # load
     ("payload", "effects.load.payloads=[{mass=-1}]", "effects.load.payloads.0.mass must be > 0.0; got -1"),
     ("mass factor", "effects.load.mass_factor=0", "effects.load.mass_factor must be >= 0.05; got 0"),

@@ -30,12 +30,16 @@ HOVER = np.full(4, VEHICLE.hover_speed)
 ERRORS = list(AttitudeError)
 
 
-def law(bounds: ActuatorBounds | None = None, constraints: tuple[Constraint, ...] = (), **settings: Any) -> NonlinearMPC:
+def law(
+    bounds: ActuatorBounds | None = None, constraints: tuple[Constraint, ...] = (), **settings: Any
+) -> NonlinearMPC:
     made = NonlinearSettings(**{"horizon": 10, "stride": 2, **settings})
     return NonlinearMPC(VEHICLE, period=PERIOD, settings=made, bounds=bounds, constraints=constraints)
 
 
-def ask(controller: NonlinearMPC, x: Array, time: float = 0.0, reference: Array | None = None, **moment: Any) -> Command:
+def ask(
+    controller: NonlinearMPC, x: Array, time: float = 0.0, reference: Array | None = None, **moment: Any
+) -> Command:
     """The answer at a state (13,)."""
     state = np.zeros(N_STATES)
     state[POSITIONS], state[VELOCITIES] = x[P], x[V]
@@ -180,7 +184,7 @@ def test_a_vertical_loop_is_flown() -> None:
     acceleration = np.zeros_like(velocity)
     acceleration[lead : lead + theta.size, 0] = -(speed**2) / radius * np.sin(theta)
     acceleration[lead : lead + theta.size, 2] = speed**2 / radius * np.cos(theta)
-    force = acceleration + [0.0, 0.0, VEHICLE.gravity]
+    force = acceleration + np.array([0.0, 0.0, VEHICLE.gravity])
     pitch = np.unwrap(np.arctan2(force[:, 0], force[:, 2]))
     attitude = np.stack([np.cos(pitch / 2), 0 * pitch, np.sin(pitch / 2), 0 * pitch], axis=1)
     rates = np.zeros_like(velocity)
@@ -329,7 +333,9 @@ def test_impossible_settings_are_refused(settings: dict[str, Any], message: str)
     assert str(caught.value) == message
 
 
-@pytest.mark.parametrize("wrong", [{"position": 0.0}, {"move": -1.0}, {"input": (1.0, 1.0, 1.0)}, {"velocity": math.inf}])
+@pytest.mark.parametrize(
+    "wrong", [{"position": 0.0}, {"move": -1.0}, {"input": (1.0, 1.0, 1.0)}, {"velocity": math.inf}]
+)
 def test_impossible_weights_are_refused(wrong: dict[str, Any]) -> None:
     with pytest.raises(ParameterError, match=rf"controller\.weights\.{next(iter(wrong))} must be"):
         Weights(**wrong)

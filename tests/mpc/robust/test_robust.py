@@ -19,8 +19,8 @@ from mpc.heading import turn_horizontally
 from mpc.model import continuous_model, discretise, hover_model
 from mpc.nonlinear.linearise import linearise
 from mpc.nonlinear.model import NonlinearModel, advance, derivative, nonlinear_model
-from mpc.robust.controller import Linearisation, RobustMPC, RobustSettings
 from mpc.observer import ObserverSettings
+from mpc.robust.controller import Linearisation, RobustMPC, RobustSettings
 from mpc.solvers import QPSolver
 from quadsim.controller import ACCEPTED, SOLVED, UNCONSTRAINED, Moment, Phase
 from quadsim.errors import ParameterError

@@ -16,8 +16,8 @@ from support import paper_problem, paper_reference
 from mpc.constraints import Bounds, Penalty
 from mpc.model import discretise
 from mpc.nonlinear.model import advance, derivative, nonlinear_model
-from mpc.robust.controller import RobustMPC, RobustSettings
 from mpc.observer import ObserverSettings
+from mpc.robust.controller import RobustMPC, RobustSettings
 from mpc.robust.tightening import (
     ERROR_SHARE,
     SHORTEST_LAG,

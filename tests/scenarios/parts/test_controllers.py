@@ -20,9 +20,9 @@ from mpc.baselines.pid import CascadedPID
 from mpc.constrained import ConstrainedMPC
 from mpc.constraints import Bounds
 from mpc.fallback.contract import Guarded
+from mpc.observer import ObserverSettings
 from mpc.ocp import Objective
 from mpc.robust.controller import Linearisation, RobustMPC, RobustSettings
-from mpc.observer import ObserverSettings
 from mpc.robust.tightening import TighteningSettings, margins
 from mpc.solvers import QPSolver
 from mpc.unconstrained import UnconstrainedMPC
@@ -362,8 +362,8 @@ WRONG = {
     "controller.output_bounds.rol=[0, 1]": "controller.output_bounds.rol is not a state; did you mean 'roll'? (there "
     "are: x, vx, y, vy, z, vz, roll, roll_rate, pitch, pitch_rate, yaw, yaw_rate)",
     "controller.solver=daqp": "controller.solver is not a field of the scenario file ...",
-    "controller=lqt": "controller must be one of 'unconstrained', 'constrained', 'robust', 'nonlinear', 'lqr', 'pid', 'geometric', "
-    "'package.module:Class' in its field type; got 'lqt'; did you mean 'lqr'?",
+    "controller=lqt": "controller must be one of 'unconstrained', 'constrained', 'robust', 'nonlinear', 'lqr', 'pid', "
+    "'geometric', 'package.module:Class' in its field type; got 'lqt'; did you mean 'lqr'?",
     "controller={type='lqr', input_weights={speed=1}}": "controller.input_weights must be given where output_weights "
     "are, and nowhere else",
     "controller={type='lqr', output_weights={zz=1}, input_weights={speed=1}}": "controller.output_weights.zz is not a "

@@ -155,7 +155,9 @@ WRONG = {
     "log_rate=300": (
         "log_rate must have a period that is a whole multiple of the physics step plant.timestep = 0.001 s; got 300.0"
     ),
-    "initial.euler=[0, 90, 0]": "initial.euler must have a roll within +-180 deg and a pitch within +-90 deg; got [0.0, 90.0, 0.0]",
+    "initial.euler=[0, 90, 0]": (
+        "initial.euler must have a roll within +-180 deg and a pitch within +-90 deg; got [0.0, 90.0, 0.0]"
+    ),
     "reference.x=[{start=2,stop=2,value=0}]": "reference.x.0.start must be below stop = 2.0; got 2.0",
     "controller.output_bounds.roll=[5, -5]": (
         "controller.output_bounds.roll must have its lower bound below its upper; got [5.0, -5.0]"
