@@ -65,6 +65,8 @@ LARGEST_CONDENSED: Final = 80
 """Inputs over the horizon up to which a condensed QP is solved faster than a staged one."""
 OUTSIDE: Final = 1e-6
 """How far outside its bounds an input, a share of the largest, may be answered; it is then moved onto them."""
+SHORTEST: Final = 0.1
+"""Least share of a Gauss-Newton step that is taken where several are."""
 TILT_SIDES: Final = 12
 """Sides of the polygon within the circle that a bound on the tilt makes of the thrust axis's horizontal part; it takes
 up to 3.4 % of the bound's sine away."""
@@ -417,7 +419,7 @@ class NonlinearMPC:
             x, u = self._plan
             self._plan = np.concatenate([x[1:], x[-1:]]), np.concatenate([u[1:], u[-1:]])
         rest, before = Rest(wanted[-1], inputs), self._shares(self._acting)
-        share, before_that = 1.0, math.inf
+        share, last = 1.0, np.zeros(0)
         for _ in range(self.settings.iterations):
             x, u = self._plan
             query = Query(s0, desired, before, rest, self._steps(x, u, frames))
@@ -433,9 +435,12 @@ class NonlinearMPC:
                 moved = max(np.abs(found - x).max(), np.abs(plan - u).max())
                 if moved <= self.settings.tolerance:
                     break
-                # Full Gauss-Newton steps may go to and fro for ever: where they do not shrink, shorter ones are taken.
-                share *= 0.5 if moved > 0.99 * before_that else 1.0
-                before_that = moved
+                # Full Gauss-Newton steps may go to and fro for ever: the share of them that is taken follows from how
+                # much of the last one each undoes (Aitken's relaxation; Irons and Tuck 1969).
+                step = (plan - u).ravel()
+                undone = 1.0 - step @ last / (last @ last) if last.size else 1.0
+                share = min(max(share / max(undone, SHORTEST), SHORTEST), 1.0)
+                last = step
                 self._plan = x + share * (found - x), u + share * (plan - u)
         return query, answer
 
