@@ -69,7 +69,8 @@ build: setup  ## source archive and wheel in dist/; the wheel is installed alone
 	@$(PY) -m pytest -q tests/test_packaging.py
 	@ls dist
 
-docs: setup $(VENV)/.docs  ## build the documentation into site/, with a gallery of every scenario; a broken link fails
+docs: setup $(VENV)/.docs  ## build the documentation into site/, with a gallery; a broken link or a missing docstring fails
+	@$(PY) -m ruff check --quiet --select D1 --ignore D105,D107 quadsim mpc scenarios
 	@PYTHONPATH=docs $(PY) docs/make_gallery.py
 	@$(VENV)/bin/zensical build --clean
 	@sed -i 's|https://unpkg.com/iframe-worker/shim|assets/iframe-worker.js|' site/*.html

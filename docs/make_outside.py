@@ -107,12 +107,8 @@ def compare(before: Path, runs: int) -> list[tuple[str, ...]]:
     return rows
 
 
-def outside(page: str) -> str:
-    """The section as a page has it; empty where it has none."""
-    return "".join(page.partition(TITLE)[1:])
-
-
-def _commit(tree: Path) -> str:
+def commit(tree: Path) -> str:
+    """What a checkout is of, in short."""
     asked = ["git", "-C", str(tree), "rev-parse", "--short", "HEAD"]
     return subprocess.run(asked, capture_output=True, text=True, check=True).stdout.strip()
 
@@ -131,9 +127,9 @@ def main() -> None:
         parser.error("BEFORE is missing")
     from make_numbers import markdown
 
-    before, after = options.before.resolve(), _commit(ROOT)
+    before, after = options.before.resolve(), commit(ROOT)
     table = markdown(compare(before, options.runs)).rstrip()
-    text = TEXT.format(table=table, runs=options.runs, before=_commit(before), after=after)
+    text = TEXT.format(table=table, runs=options.runs, before=commit(before), after=after)
     page = PAGE.read_text(encoding="utf-8")
     PAGE.write_text(f"{page.partition(TITLE)[0].rstrip()}\n\n{TITLE}\n\n{text}", encoding="utf-8")
 

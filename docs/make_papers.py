@@ -9,8 +9,8 @@ import numpy as np
 from make_numbers import Table, fly, markdown, write_page
 
 from quadsim.report.table import section
-from scenarios.api import reproduce
 from scenarios.flight import Flight
+from scenarios.many_flights import reproduce
 
 COURSES = ("loop4", "loop8", "lemniscate8")
 SEEDS = 16
@@ -79,8 +79,8 @@ def main() -> None:
         "`tracking.position_error.rms`.\n",
         "## Noise over seeds\n\n" + markdown(seeds()),
         "## MuJoCo's integration and theirs\n\nTheir plant is integrated with the drag evaluated at all four stages of "
-        'a Runge-Kutta step, `plant.integrator = "rk4"`;\nMuJoCo\'s Runge-Kutta step holds the drag of its middle. With '
-        "steps of 0.5 ms they differ by this:\n\n" + markdown(integrations()),
+        'a Runge-Kutta step, `plant.integrator = "rk4"`;\nMuJoCo\'s Runge-Kutta step holds the drag of its middle. '
+        "With steps of 0.5 ms they differ by this:\n\n" + markdown(integrations()),
         HOW,
     ]
     write_page("papers.md", *parts)

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from make_cost import timed, write_cost
 from make_numbers import ROOT, Table, copy_figure, markdown, write_page
-from make_outside import outside
+from make_robust_step import TITLE as COMPARED
 
 from quadsim.report.table import section
 from scenarios.bench.bench_results import FlightProfile, RenderProfile, SolverBench
@@ -177,7 +177,7 @@ def main() -> None:
     else:
         flight, film = bench_flight(scenario), bench_render(scenario)
         commands, effects = markdown(whole_commands(flight, film)), markdown(effect_costs())
-        kept = outside(path.read_text(encoding="utf-8"))  # which compares two checkouts: docs/make_outside.py
+        kept = "".join(path.read_text(encoding="utf-8").partition(COMPARED)[1:])  # which compare two checkouts
         end = "\n".join([rest(flight, film, commands, effects, campaigns()), kept])
     bench = bench_solvers(scenario)
     with tempfile.TemporaryDirectory() as scratch:

@@ -18,8 +18,12 @@ if TYPE_CHECKING:
     from mpc.constraints import Penalty as Penalty
     from mpc.model import LinearModel as LinearModel
     from mpc.model import hover_model as hover_model
+    from mpc.nonlinear.controller import NonlinearMPC as NonlinearMPC
+    from mpc.nonlinear.settings import NonlinearSettings as NonlinearSettings
     from mpc.ocp import Objective as Objective
     from mpc.ocp import Problem as Problem
+    from mpc.ocp import Query as Query
+    from mpc.ocp import Unanswered as Unanswered
     from mpc.robust.controller import RobustMPC as RobustMPC
     from mpc.robust.settings import RobustSettings as RobustSettings
     from mpc.solvers import QPSolver as QPSolver
@@ -32,7 +36,9 @@ _PLACES = {
     "mpc.constrained": ("ConstrainedMPC",),
     "mpc.constraints": ("Bounds", "Constraint", "Penalty"),
     "mpc.model": ("LinearModel", "hover_model"),
-    "mpc.ocp": ("Objective", "Problem"),
+    "mpc.nonlinear.controller": ("NonlinearMPC",),
+    "mpc.nonlinear.settings": ("NonlinearSettings",),
+    "mpc.ocp": ("Objective", "Problem", "Query", "Unanswered"),
     "mpc.robust.controller": ("RobustMPC",),
     "mpc.robust.settings": ("RobustSettings",),
     "mpc.solvers": ("QPSolver",),

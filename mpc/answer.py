@@ -98,7 +98,7 @@ class ActuatorBounds:
 
         Steps that are so but for rounding stay as they are.
         """
-        steps = np.diff(plan, axis=0, prepend=before[None])
+        steps = plan - np.concatenate((before[None], plan[:-1]))
         if np.maximum(self.delta_min - steps, steps - self.delta_max).max() <= BOUND_TOLERANCE:
             return np.minimum(np.maximum(plan, self.u_min), self.u_max)
         clipped = np.empty_like(plan)

@@ -9,7 +9,7 @@ acceleration alpha:
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Final
 
 import numpy as np
@@ -37,11 +37,11 @@ class Trim:
     twist: Array = field(default_factory=lambda: np.zeros(3))
 
     def __post_init__(self) -> None:
-        if np.shape(self.speeds) != (N_ROTORS,) or not np.isfinite(self.speeds).all():
+        if np.shape(self.speeds) != (N_ROTORS,) or not all(map(math.isfinite, self.speeds)):
             raise ParameterError("trim", "speeds", self.speeds, f"{N_ROTORS} finite numbers")
-        if np.shape(self.lift) != (3,) or not (np.isfinite(self.lift).all() and self.lift[2] > 0.0):
+        if np.shape(self.lift) != (3,) or not (all(map(math.isfinite, self.lift)) and self.lift[2] > 0.0):
             raise ParameterError("trim", "lift", self.lift, "three finite numbers, the last one positive")
-        if np.shape(self.twist) != (3,) or not np.isfinite(self.twist).all():
+        if np.shape(self.twist) != (3,) or not all(map(math.isfinite, self.twist)):
             raise ParameterError("trim", "twist", self.twist, "three finite numbers")
 
     def lean(self, yaw: float) -> tuple[float, float]:
@@ -59,18 +59,26 @@ class Trim:
         return state
 
 
-def twisted(model: NonlinearModel, twist: Array) -> NonlinearModel:
-    """The model whose thrust brings about an angular acceleration; see `Trim.twist`."""
-    effectiveness = model.effectiveness.copy()
-    effectiveness[1:] += np.outer(twist, effectiveness[0])
-    return replace(model, effectiveness=effectiveness)
+def twisted(effectiveness: Array, twist: Array) -> Array:
+    """(4, 4) the effectiveness of a model whose thrust brings about an angular acceleration; see `Trim.twist`."""
+    found = effectiveness.copy()
+    found[1:] += twist[:, None] * effectiveness[0]
+    return found
 
 
-def equilibrium(model: NonlinearModel, twist: Array | None = None) -> Trim:
-    """What rest takes under a model's disturbance, `twisted` or not; a rotor that would have to pull stands still."""
-    a_x, a_y, a_z = model.acceleration.tolist()
+def equilibrium(model: NonlinearModel, *, acceleration: Array | None = None, twist: Array | None = None) -> Trim:
+    """What rest takes under a model's disturbance; a rotor that would have to pull stands still.
+
+    Args:
+        model: its effectiveness not yet `twisted`.
+        acceleration: (3,) of the disturbance, world frame [m/s^2]; None for the model's.
+        twist: (3,) see `Trim.twist`; None for none.
+    """
+    a_x, a_y, a_z = (model.acceleration if acceleration is None else acceleration).tolist()
+    twist = np.zeros(3) if twist is None else twist
     up = max(model.gravity - a_z, LEAST_LIFT * model.gravity)
     thrust = math.hypot(a_x, a_y, up)
-    drive = np.concatenate([[thrust], -model.angular_acceleration])
-    speeds = np.sqrt(np.maximum(np.linalg.solve(model.effectiveness, drive), 0.0))
-    return Trim(speeds=speeds, lift=np.array([-a_x, -a_y, up]), twist=np.zeros(3) if twist is None else twist)
+    drive = np.empty(N_ROTORS)
+    drive[0], drive[1:] = thrust, -model.angular_acceleration - thrust * twist
+    speeds = np.sqrt(np.maximum(np.dot(model.allocation, drive), 0.0))
+    return Trim(speeds=speeds, lift=np.array([-a_x, -a_y, up]), twist=twist)

@@ -22,10 +22,15 @@ _YAW: Final = INDEX["yaw"]
 _ACCELERATED: Final = [INDEX[name] for name in ("vz", "roll_rate", "pitch_rate", "yaw_rate")]
 
 
-def turn_horizontally(states: Array, angles: Array) -> Array:
+def turn_horizontally(states: Array, angles: Array | float) -> Array:
     """States (..., n), positions and velocities turned about world z by angles [rad] that broadcast to (...,)."""
     turned = np.array(states, float)
-    cosine, sine = np.cos(angles)[..., None], np.sin(angles)[..., None]
+    cosine: Array | float
+    sine: Array | float
+    if isinstance(angles, float):
+        cosine, sine = math.cos(angles), math.sin(angles)
+    else:
+        cosine, sine = np.cos(angles)[..., None], np.sin(angles)[..., None]
     along, across = states[..., 0:2], states[..., 2:4]  # x and vx, y and vy
     turned[..., 0:2] = cosine * along - sine * across
     turned[..., 2:4] = sine * along + cosine * across
@@ -75,15 +80,19 @@ def advance(model: LinearModel, state: Array, speeds: Array, trim: Trim) -> Arra
 
 def with_nearest_yaw(reference: Array, yaw: float, largest: float) -> Array:
     """The reference (N, 4) with a yaw that starts from the present one and has no larger jumps [rad]."""
+    yaws, steps = reference[:, 3], np.empty(len(reference))
+    steps[0] = yaws[0] - yaw
+    np.subtract(yaws[1:], yaws[:-1], out=steps[1:])
     turned = reference.copy()
-    turned[:, 3] = yaw + np.cumsum(np.clip(np.diff(reference[:, 3], prepend=yaw), -largest, largest))
+    turned[:, 3] = yaw + np.minimum(np.maximum(steps, -largest), largest).cumsum()
     return turned
 
 
 def seen_from(reference: Array, yaw: float) -> Array:
     """The reference (N, 4) in axes turned by a yaw [rad]."""
     cosine, sine = math.cos(yaw), math.sin(yaw)
+    x, y = reference[:, 0], reference[:, 1]
     seen = reference.copy()
-    seen[:, :2] = reference[:, :2] @ np.array([[cosine, -sine], [sine, cosine]])
+    seen[:, 0], seen[:, 1] = cosine * x + sine * y, cosine * y - sine * x
     seen[:, 3] -= yaw
     return seen

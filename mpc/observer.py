@@ -15,6 +15,7 @@ Predictive Control"; Pannocchia & Rawlings 2003).
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from typing import Annotated, Final
 
@@ -24,10 +25,8 @@ from annotated_types import doc
 
 from quadsim.errors import ParameterError
 from quadsim.fields import Positive
-from quadsim.state import EULER, EULER_RATE, VELOCITY, Array, euler_to_body_rates
+from quadsim.state import ANGLES, VELOCITIES, Array, body_rates_of
 
-_VELOCITY: Final = list(VELOCITY)
-_EULER: Final = list(EULER)
 _UPRIGHT: Final = 0.1
 """Smallest vertical part of the thrust axis from which on a change of vertical speed is attributed to thrust."""
 
@@ -98,23 +97,22 @@ class DisturbanceObserver:
 
     def update(self, measured: Array, predicted: Array) -> None:
         """Take note of a measured state (12,) and of what was predicted for it (12,), disturbances included."""
-        velocity = (measured - predicted)[_VELOCITY]
-        along = velocity[2] / max(thrust_axis(measured)[2], _UPRIGHT)
-        velocity = np.append(velocity[:2] - along * thrust_axis(measured)[:2], along)
-        self.learn(np.concatenate([velocity, _body_rates(measured) - _body_rates(predicted)]))
+        now, then = measured.tolist(), predicted.tolist()
+        axis, rates, expected_rates = thrust_axis(now), body_rates_of(now), body_rates_of(then)
+        x, y, z = (found - wanted for found, wanted in zip(now[VELOCITIES], then[VELOCITIES], strict=True))
+        along = z / max(axis[2], _UPRIGHT)
+        velocity = x - along * axis[0], y - along * axis[1], along
+        self.learn([*velocity, *(found - wanted for found, wanted in zip(rates, expected_rates, strict=True))])
 
-    def learn(self, surprise: Array) -> None:
+    def learn(self, surprise: Sequence[float] | Array) -> None:
         """Take note of by how much three velocities and three body rates (6,) are other than predicted."""
-        self.estimate = np.clip(self.estimate + self._gain * surprise, -self._largest, self._largest)
+        estimate = self.estimate + self._gain * surprise
+        self.estimate = np.minimum(np.maximum(estimate, -self._largest), self._largest)
 
 
-def thrust_axis(state: Array) -> Array:
+def thrust_axis(state: Sequence[float]) -> tuple[float, float, float]:
     """(3,) unit vector along which rotors push, in the world frame, of a state (12,)."""
-    roll, pitch, yaw = state[_EULER].tolist()
+    roll, pitch, yaw = state[ANGLES]
     ahead, left = math.cos(roll) * math.sin(pitch), -math.sin(roll)
     cosine, sine = math.cos(yaw), math.sin(yaw)
-    return np.array([cosine * ahead - sine * left, sine * ahead + cosine * left, math.cos(roll) * math.cos(pitch)])
-
-
-def _body_rates(state: Array) -> Array:
-    return euler_to_body_rates(state[_EULER], state[list(EULER_RATE)])
+    return cosine * ahead - sine * left, sine * ahead + cosine * left, math.cos(roll) * math.cos(pitch)

@@ -55,7 +55,12 @@ class Objective:
 
     def desired(self, reference: Array) -> Array:
         """Desired outputs y_r^d (..., n_r) of a reference (..., 4) for x, y, z, yaw; other states are wanted at 0."""
-        return reference @ self.C_r[:, REFERENCE_STATES].T
+        return np.matmul(reference, self._of_reference)
+
+    @cached_property
+    def _of_reference(self) -> Array:
+        """(4, n_r) what regulated outputs have of a reference."""
+        return self.C_r[:, REFERENCE_STATES].T
 
     @cached_property
     def weights(self) -> tuple[Array, Array]:

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cached_property
-from typing import Protocol, TypeAlias
+from typing import NamedTuple, Protocol, TypeAlias
 
 import numpy as np
 from scipy.sparse import csc_matrix
@@ -89,6 +88,11 @@ class QPRows:
         for row, j in zip(self._boxed, rows.input[self._boxed], strict=True):
             self.u_min[:, j] = np.maximum(self.u_min[:, j], rows.lower[:, row])
             self.u_max[:, j] = np.minimum(self.u_max[:, j], rows.upper[:, row])
+        # (N, K) bounds that rows of one side set to their multipliers, and (m, nu) which input a row bounds
+        self._least = np.where(np.isneginf(self.lower), 0.0, -np.inf)
+        self._most = np.where(np.isposinf(self.upper), 0.0, np.inf)
+        self._of_box = np.zeros((len(rows.C), problem.model.nu))
+        self._of_box[self._boxed, rows.input[self._boxed]] = 1.0
 
     def multipliers(self, z: Array, z_inputs: Array) -> Array:
         """(N, m) multipliers of the problem's rows, from those of the QP's rows (N K,) and of inputs (N nu,)."""
@@ -107,16 +111,17 @@ class QPRows:
 
     def split(self, multipliers: Array) -> tuple[Array, Array]:
         """The inverse: multipliers of the QP's rows (N K,) and of inputs (N nu,)."""
-        least, most, boxed = self._signs
-        z = np.minimum(np.maximum(multipliers[:, self._origin], least), most)
-        return z.ravel(), np.dot(multipliers, boxed).ravel()
+        z = np.minimum(np.maximum(multipliers[:, self._origin], self._least), self._most)
+        return z.ravel(), np.dot(multipliers, self._of_box).ravel()
 
-    @cached_property
-    def _signs(self) -> tuple[Array, Array, Array]:
-        """Bounds (N, K) that rows of one side set to their multipliers, and (m, nu) which input a row bounds."""
-        boxed = np.zeros((len(self._whole.C), self.u_min.shape[1]))
-        boxed[self._boxed, self._whole.input[self._boxed]] = 1.0
-        return np.where(np.isneginf(self.lower), 0.0, -np.inf), np.where(np.isposinf(self.upper), 0.0, np.inf), boxed
+
+class Point(NamedTuple):
+    """A primal point and the multipliers there; see `Solution`."""
+
+    x: Array
+    y: Array
+    z: Array
+    z_box: Array
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -18,42 +18,66 @@ if TYPE_CHECKING:
     from quadsim.controller import Moment as Moment
     from quadsim.errors import QuadsimError as QuadsimError
     from quadsim.vehicle import Vehicle as Vehicle
-    from scenarios.api import campaign as campaign
     from scenarios.api import check as check
     from scenarios.api import compare as compare
+    from scenarios.api import feasibility as feasibility
     from scenarios.api import film as film
+    from scenarios.api import fitting as fitting
     from scenarios.api import fly as fly
     from scenarios.api import load as load
-    from scenarios.api import load_vehicle as load_vehicle
     from scenarios.api import make_controller as make_controller
     from scenarios.api import read as read
-    from scenarios.api import replay as replay
-    from scenarios.api import reproduce as reproduce
-    from scenarios.api import scenarios as scenarios
-    from scenarios.api import sweep as sweep
+    from scenarios.api import resolve as resolve
+    from scenarios.api import view as view
+    from scenarios.benchmarks import bench_campaign as bench_campaign
+    from scenarios.benchmarks import bench_flight as bench_flight
+    from scenarios.benchmarks import bench_ladder as bench_ladder
+    from scenarios.benchmarks import bench_render as bench_render
+    from scenarios.benchmarks import bench_solvers as bench_solvers
+    from scenarios.catalogue import Catalogue as Catalogue
+    from scenarios.catalogue import LibraryScenario as LibraryScenario
+    from scenarios.catalogue import catalogue as catalogue
+    from scenarios.catalogue import scenarios as scenarios
     from scenarios.flight import Flight as Flight
+    from scenarios.junit import write_junit as write_junit
+    from scenarios.many_flights import campaign as campaign
+    from scenarios.many_flights import replay as replay
+    from scenarios.many_flights import reproduce as reproduce
+    from scenarios.many_flights import sweep as sweep
+    from scenarios.schema.json_schema import scenario_schema as scenario_schema
     from scenarios.schema.scenario import Scenario as Scenario
+    from scenarios.self_check import doctor as doctor
+    from scenarios.vehicles import draw_vehicle as draw_vehicle
+    from scenarios.vehicles import first_scenario as first_scenario
+    from scenarios.vehicles import load_vehicle as load_vehicle
+    from scenarios.vehicles import vehicle_report as vehicle_report
+    from scenarios.vehicles import vehicle_template as vehicle_template
 
 __version__ = "0.1.0"
 
 _PLACES = {
     "scenarios.api": (
-        "campaign",
         "check",
         "compare",
+        "feasibility",
         "film",
+        "fitting",
         "fly",
         "load",
-        "load_vehicle",
         "make_controller",
         "read",
-        "replay",
-        "reproduce",
-        "scenarios",
-        "sweep",
+        "resolve",
+        "view",
     ),
+    "scenarios.benchmarks": ("bench_campaign", "bench_flight", "bench_ladder", "bench_render", "bench_solvers"),
+    "scenarios.catalogue": ("Catalogue", "LibraryScenario", "catalogue", "scenarios"),
     "scenarios.flight": ("Flight",),
+    "scenarios.junit": ("write_junit",),
+    "scenarios.many_flights": ("campaign", "replay", "reproduce", "sweep"),
+    "scenarios.schema.json_schema": ("scenario_schema",),
     "scenarios.schema.scenario": ("Scenario",),
+    "scenarios.self_check": ("doctor",),
+    "scenarios.vehicles": ("draw_vehicle", "first_scenario", "load_vehicle", "vehicle_report", "vehicle_template"),
     "quadsim.controller": ("Command", "Moment"),
     "quadsim.errors": ("QuadsimError",),
     "quadsim.vehicle": ("Vehicle",),

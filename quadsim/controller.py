@@ -57,6 +57,11 @@ class Moment:
             to be derived from the state.
         body_rates: (3,) measured body rates [rad/s]; None as before.
         motion: the reference from t_k on, where the course knows more than x, y, z, yaw.
+
+    Examples:
+        >>> import quadsim
+        >>> quadsim.Moment(time=0.05).phase.value
+        'flying'
     """
 
     time: float = 0.0
@@ -84,6 +89,13 @@ class Command:
         primal_residual: largest constraint violation the back end reports [its own scaling].
         dual_residual: largest gradient of the Lagrangian the back end reports.
         solve_s: wall time inside the solver [s].
+
+    Examples:
+        >>> import numpy as np
+        >>> import quadsim
+        >>> speeds = np.full(4, 200.0)
+        >>> quadsim.Command(speeds=speeds, plan=np.tile(speeds, (10, 1))).status
+        'solved'
     """
 
     speeds: Array

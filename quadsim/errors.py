@@ -34,6 +34,14 @@ class QuadsimError(Exception):
     """Root of all errors raised on purpose; `exit_status` is what the command line returns for it.
 
     Errors cross from one process to another: they pickle whole, whatever their constructors ask for.
+
+    Examples:
+        >>> import quadsim
+        >>> try:
+        ...     quadsim.load("hovver")
+        ... except quadsim.QuadsimError as error:
+        ...     print(error.exit_status, str(error)[:44])
+        2 no scenario named 'hovver'; did you mean 'ho
     """
 
     exit_status = 2

@@ -8,7 +8,8 @@ and **Euler-angle rates**, not body rates. All functions take arrays with any le
 from __future__ import annotations
 
 import math
-from typing import Final
+from collections.abc import Sequence
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -100,14 +101,23 @@ def body_to_euler_rates(euler: Array, body_rates: Array) -> Array:
 def euler_to_body_rates(euler: Array, euler_rates: Array) -> Array:
     """Body rates (p, q, r) [rad/s] from Euler-angle rates; the inverse of `body_to_euler_rates`."""
     roll, pitch = euler[..., 0], euler[..., 1]
-    roll_rate, pitch_rate, yaw_rate = np.moveaxis(np.asarray(euler_rates, float), -1, 0)
-    return np.stack(
-        [
-            roll_rate - yaw_rate * np.sin(pitch),
-            pitch_rate * np.cos(roll) + yaw_rate * np.cos(pitch) * np.sin(roll),
-            -pitch_rate * np.sin(roll) + yaw_rate * np.cos(pitch) * np.cos(roll),
-        ],
-        axis=-1,
+    rates = np.moveaxis(np.asarray(euler_rates, float), -1, 0)
+    return np.stack(_body_rates(np.sin(roll), np.cos(roll), np.sin(pitch), np.cos(pitch), rates), axis=-1)
+
+
+def body_rates_of(state: Sequence[float]) -> tuple[float, float, float]:
+    """The same of one state (12,), finite, in plain numbers: sooner done than by arrays of three."""
+    roll, pitch, _ = state[ANGLES]
+    return _body_rates(math.sin(roll), math.cos(roll), math.sin(pitch), math.cos(pitch), state[ANGLE_RATES])
+
+
+def _body_rates(sin_roll: Any, cos_roll: Any, sin_pitch: Any, cos_pitch: Any, euler_rates: Any) -> tuple[Any, Any, Any]:
+    """Body rates (p, q, r) from Euler-angle rates, arrays or plain numbers."""
+    roll_rate, pitch_rate, yaw_rate = euler_rates
+    return (
+        roll_rate - yaw_rate * sin_pitch,
+        pitch_rate * cos_roll + yaw_rate * cos_pitch * sin_roll,
+        -pitch_rate * sin_roll + yaw_rate * cos_pitch * cos_roll,
     )
 
 

@@ -35,6 +35,13 @@ class Vehicle:
 
     Raises:
         ParameterError: a value is not finite or not possible, or the vehicle cannot hover within its rotors' range.
+
+    Examples:
+        >>> from dataclasses import replace
+        >>> import quadsim
+        >>> heavier = replace(quadsim.load_vehicle("hummingbird"), mass=0.8)  # [kg]
+        >>> round(heavier.hover_speed)  # [rad/s]
+        479
     """
 
     name: Annotated[str, doc("short name")]

@@ -1,58 +1,41 @@
-"""The public Python interface, as `import quadsim` hands it out: scenarios, flights, sweeps, campaigns, comparisons.
+"""What `import quadsim` hands out of scenarios and flights; the command line calls it and prints what it returns.
 
-The command line calls these functions and prints what they return.
+Beside it: `scenarios.many_flights`, `vehicles`, `catalogue`, `benchmarks`, `self_check`, `junit`.
 """
 
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
-from quadsim.assets import vehicle_path
 from quadsim.controller import Controller
-from quadsim.errors import InputError, ParameterError
+from quadsim.errors import FileError, InputError, ParameterError
 from quadsim.flight import rundir
 from quadsim.outputs import real_path
-from quadsim.vehicle import Vehicle
-from quadsim.vehicle import load_vehicle as read_vehicle
+from quadsim.outputs.paths import require_inside
 from scenarios.build import build_controller
+from scenarios.build import resolve as write_out
 from scenarios.flight import Flight, Outputs
 from scenarios.loading import check_parts, load_scenario
-from scenarios.parts.own_code import refer_to, refer_to_force, require_importable, set_up, set_up_force
+from scenarios.parts.own_code import refer_to, refer_to_force, set_up, set_up_force
 from scenarios.parts.plugin import build_force
 from scenarios.parts.randomness import generator
 from scenarios.parts.vehicle import build_vehicle
-from scenarios.progress import Progress, silent
+from scenarios.progress import Progress, reporting
 from scenarios.reaudit import Reaudit, reaudit, stored_scenario
 from scenarios.run import fly_scenario, run_scenario
+from scenarios.schema.course import CsvSpec
 from scenarios.schema.scenario import Scenario
-from scenarios.shipped import paper_names, scenario_names
 
 if TYPE_CHECKING:
-    from scenarios.campaign.engine.protocol import Engine
-    from scenarios.campaign.replay import Replay
-    from scenarios.campaign.run import Result
+    from quadsim.flight.feasibility import Feasibility
     from scenarios.campaign.statistics.comparison import Comparison as CampaignComparison
-    from scenarios.campaign.sweep import Sweep
     from scenarios.comparison import Comparison
-    from scenarios.papers.reproduction import Reproduction
 
 Setting = Mapping[str, Any] | Sequence[str]
 """Changes of a scenario: values by dotted path, or texts `dotted.path=value` as of `--set`."""
-
-
-def scenarios() -> list[str]:
-    """Names of the scenarios that ship, sorted.
-
-    Examples:
-        >>> import quadsim
-        >>> "paper-constrained" in quadsim.scenarios()
-        True
-    """
-    return scenario_names()
 
 
 def load(name: str | Path, changes: Setting = ()) -> Scenario:
@@ -79,22 +62,84 @@ def load(name: str | Path, changes: Setting = ()) -> Scenario:
     return scenario.replace(changes) if changes else scenario
 
 
-def load_vehicle(name: str | Path) -> Vehicle:
-    """The numbers of a vehicle.
+def resolve(scenario: Scenario | str | Path) -> Scenario:
+    """A scenario with every number that it leaves to its vehicle written out: a start for a file of one's own.
+
+    A course's table is no longer held to a hash, so that another may take its place.
 
     Args:
-        name: of one that ships, or a path ending in `.toml`.
+        scenario: it, or its name or file.
 
     Raises:
-        InputError: there is none, or it cannot fly.
+        InputError: it is missing or malformed.
 
     Examples:
         >>> import quadsim
-        >>> vehicle = quadsim.load_vehicle("hummingbird")
-        >>> vehicle.mass, round(vehicle.hover_speed)
-        (0.716, 453)
+        >>> scenario = quadsim.resolve("hover")
+        >>> scenario.vehicle.mass  # [kg]
+        4.0
+        >>> 'name = "hover"' in scenario.to_toml()
+        True
     """
-    return read_vehicle(vehicle_path(str(name)))
+    if not isinstance(scenario, Scenario):
+        scenario = load(scenario)
+    found = write_out(scenario, build_vehicle(scenario))
+    if isinstance(found.reference, CsvSpec):
+        return found.model_copy(update={"reference": found.reference.model_copy(update={"sha256": None})})
+    return found
+
+
+def feasibility(scenario: Scenario | str | Path) -> Feasibility:
+    """What a course asks of the vehicle and of the controller's bounds, tightened ones too; nothing is flown.
+
+    Args:
+        scenario: it, or its name or file.
+
+    Returns:
+        Peaks of the course (`tilt` [deg], `velocity` [m/s], `rotor_max` [rad/s] and others), the `problems` where a
+        limit or a bound is passed, and all that as a `sentence`.
+
+    Raises:
+        InputError: the course cannot be built.
+
+    Examples:
+        >>> import quadsim
+        >>> quadsim.feasibility("hover").problems
+        ()
+        >>> fast = quadsim.load("figure-eight").replace({"reference.period": 6.0, "reference.ramp": 3.0})
+        >>> quadsim.feasibility(fast).problems[0]
+        'roll up to 40.43 deg (bound 5)'
+    """
+    from scenarios.courses.feasibility_check import report
+
+    if not isinstance(scenario, Scenario):
+        scenario = load(scenario)
+    return report(scenario, build_vehicle(scenario))
+
+
+def fitting(scenario: Scenario | str | Path) -> str:
+    """At which speed, size or response time a course with `problems` would have none.
+
+    Args:
+        scenario: it, or its name or file.
+
+    Returns:
+        A sentence; empty where the course fits as it is, or at none of them down to a tenth.
+
+    Raises:
+        InputError: the course cannot be built.
+
+    Examples:
+        >>> import quadsim
+        >>> fast = quadsim.load("figure-eight").replace({"reference.period": 6.0, "reference.ramp": 3.0})
+        >>> quadsim.fitting(fast)
+        'It would fit at 31 % of its speed.'
+    """
+    from scenarios.courses.feasibility_check import fitting as find_fitting
+
+    if not isinstance(scenario, Scenario):
+        scenario = load(scenario)
+    return find_fitting(scenario, build_vehicle(scenario))
 
 
 def fly(
@@ -219,133 +264,6 @@ def make_controller(scenario: Scenario | str | Path) -> Controller:
     return build_controller(scenario, build_vehicle(scenario))
 
 
-def sweep(
-    scenario: Scenario | str | Path,
-    values: Mapping[str, Sequence[Any]],
-    *,
-    controller: object = None,
-    forces: Sequence[object] = (),
-    workers: int | None = None,
-    progress: bool = True,
-) -> Sweep:
-    """Fly a scenario once for every combination of some fields' values, all with the scenario's own seed.
-
-    Args:
-        scenario: what is flown, or its name or file.
-        values: what to try, by dotted path.
-        controller: who flies it, as of `fly`; a class or a function of a module that other processes can import.
-        forces: what acts on it, as of `fly`; the same.
-        workers: processes that fly; one per usable core where absent.
-        progress: whether to show a bar on a terminal.
-
-    Returns:
-        A row per flight, in the order of the combinations, the last field varying fastest.
-
-    Raises:
-        InputError: a value is not allowed, or the controller cannot be sent to other processes.
-
-    Examples:
-        >>> import quadsim
-        >>> scenario = quadsim.load("hover").replace({"duration": 1.0})
-        >>> found = quadsim.sweep(scenario, {"controller.horizon": [20, 40]}, workers=1)
-        >>> found["controller.horizon"].tolist(), found["verdict"].tolist()
-        ([20.0, 40.0], ['satisfied', 'satisfied'])
-    """
-    from scenarios.campaign.sweep import fly_sweep
-
-    if not isinstance(scenario, Scenario):
-        scenario = load(scenario)
-    with reporting(progress) as report:
-        return fly_sweep(flown_by(scenario, controller, forces), values, make_engine(workers, None), report)
-
-
-def campaign(
-    campaign: str | Path | Scenario,
-    *,
-    out: str | Path | None = None,
-    vary: Sequence[Mapping[str, Any]] = (),
-    flights: int | None = None,
-    seed: int | None = None,
-    changes: Sequence[str] = (),
-    controller: object = None,
-    forces: Sequence[object] = (),
-    require: Sequence[str] = (),
-    workers: int | None = None,
-    cluster: str | None = None,
-    resume: bool = False,
-    until_width: float | None = None,
-    report: bool = True,
-    progress: bool | Literal["lines"] = True,
-    **fields: Any,
-) -> Result:
-    """Fly a scenario many times, what may vary drawn at random.
-
-    Args:
-        campaign: one that ships or a campaign file; or a scenario, with the following in place of the file.
-        out: its directory, `runs/campaigns/NAME` where absent.
-        vary: of a scenario: what varies, entries as `[[vary]]` of a campaign file.
-        flights: how many, instead of the file's.
-        seed: of all draws, instead of the file's.
-        changes: of a file: texts `dotted.path=value` that change fields of its scenario.
-        controller: of a scenario: who flies, as of `sweep`.
-        forces: of a scenario: what acts on it, as of `sweep`.
-        require: requirements as texts, e.g. `P(failure) < 0.02`, that `judgements` judges.
-        workers: processes that fly; one per usable core where absent.
-        cluster: a dask cluster that flies instead, as of `--cluster`.
-        resume: whether to go on with what the directory holds.
-        until_width: width of the 95 % interval of the failure probability, from 0 to 1, at which to stop.
-        report: whether to write the page and its figure.
-        progress: whether to show a bar on a terminal; "lines" for a line now and then where stderr is none.
-        **fields: of a scenario: other fields of a campaign file, as `name`, `failure` or `sampling`.
-
-    Returns:
-        The results: `table` (a row per flight), `summary` (estimates with their intervals), and the `directory`.
-
-    Raises:
-        InputError: something cannot be flown so.
-        OutputError: a campaign is there already, or the directory cannot be written.
-        KeyboardInterrupt: a person stopped it; what was flown is there, and `resume` goes on with it.
-
-    Examples:
-        >>> import tempfile, quadsim
-        >>> scenario = quadsim.load("hover").replace({"duration": 1.0})
-        >>> mass = {"name": "mass", "fields": ["vehicle.mass"], "distribution": "uniform", "low": 4.0, "high": 4.4}
-        >>> with tempfile.TemporaryDirectory() as folder:
-        ...     found = quadsim.campaign(scenario, vary=[mass], flights=3, workers=1, out=folder + "/mass")
-        >>> found.table["verdict"].to_pylist()
-        ['satisfied', 'satisfied', 'satisfied']
-    """
-    from scenarios.campaign.plan import load_plan, make_plan
-    from scenarios.campaign.results.events import parse_event
-    from scenarios.campaign.run import fly_campaign
-    from scenarios.campaign.statistics.requirement import judge, parse_requirement
-    from scenarios.commands.campaign_console import progress as bar
-
-    if cluster is not None and workers is not None:
-        raise ParameterError("", "--workers", workers, "absent where --cluster says who flies")
-    requirements = [parse_requirement(text) for text in require]
-    if isinstance(campaign, Scenario):
-        asked = {"vary": [dict(entry) for entry in vary], "flights": flights, "seed": seed, **fields}
-        given = {name: value for name, value in asked.items() if value is not None}
-        plan = make_plan(flown_by(campaign, controller, forces), given)
-    elif vary or fields or controller is not None or forces:
-        raise InputError("vary, controller and other fields go with a scenario; a campaign file has its own")
-    else:
-        plan = load_plan(str(campaign), changes, flights=flights, seed=seed)
-    for requirement in requirements:
-        parse_event(requirement.event.text, plan.columns)
-    target = real_path(Path("runs") / "campaigns" / plan.spec.name if out is None else out)
-    engine = make_engine(workers, cluster)
-    try:
-        with bar(enabled=bool(progress), lines=progress == "lines") as watch:
-            result = fly_campaign(
-                plan, target, engine, resume=resume, until_width=until_width, report=report, watch=watch
-            )
-    except KeyboardInterrupt:
-        raise KeyboardInterrupt(f"{target} has what was flown") from None
-    return replace(result, judgements=tuple(judge(result.table, requirement) for requirement in requirements))
-
-
 def compare(
     *targets: Flight | Scenario | str | Path,
     out: str | Path | None = None,
@@ -423,6 +341,14 @@ def film(
         InputError: it is no run directory, or the file has another ending.
         RenderingUnavailableError: nothing can render here.
         OutputError: the file cannot be written.
+
+    Examples:
+        >>> import tempfile, quadsim
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     flown = quadsim.fly(quadsim.load("hover").replace({"duration": 0.2}))
+        ...     file = quadsim.film(flown.save(folder + "/run", video=False), workers=1)
+        ...     file.name, file.stat().st_size > 1000
+        ('flight.mp4', True)
     """
     from quadsim.report.film.video import render_gif, render_video
 
@@ -445,82 +371,38 @@ def film(
     return path
 
 
-def replay(
-    campaign: str | Path,
-    flight: int | None = None,
-    *,
-    out: str | Path | None = None,
-    video: bool = True,
-    recording: bool = True,
-    figures: bool = True,
-    progress: Progress | bool = True,
-) -> Replay:
-    """Fly one flight of a finished campaign again, with everything that a run directory has.
+def view(run: str | Path, *, web: bool = False) -> None:
+    """Open a run's recording in the rerun viewer; returns when the viewer is closed or Ctrl-C is pressed.
 
     Args:
-        campaign: its directory.
-        flight: which; the worst where absent.
-        out: the run directory, `runs/CAMPAIGN-N` where absent.
-        video: whether to film it.
-        recording: whether to write `flight.rrd`.
-        figures: whether to draw it.
-        progress: as of `fly`.
-
-    Returns:
-        The flight, and the columns of the campaign's table that it does not agree with, bit for bit.
+        run: directory of a run, or a file ending in `.rrd`.
+        web: whether to serve it to a browser, to this machine alone, instead.
 
     Raises:
-        InputError: there is no such campaign or flight.
-        OutputError: the directory cannot be written.
-    """
-    from scenarios.campaign.replay import recorded_flight, replay_flight
-
-    recorded = recorded_flight(Path(campaign), flight)
-    target = real_path(Path("runs") / recorded.scenario.name if out is None else out)
-    outputs = Outputs(video=video, recording=recording, figures=figures)
-    with reporting(progress) as report:
-        return replay_flight(recorded, target, outputs, report)
-
-
-def reproduce(paper: str | Path | None = None, *, progress: Progress | bool = True) -> tuple[Reproduction, ...]:
-    """Fly what papers publish, and hold it against their numbers.
-
-    Args:
-        paper: a name, or a path ending in `.toml`; every paper that ships where absent.
-        progress: as of `fly`.
-
-    Returns:
-        A reproduction for each paper: its `numbers`, each with `published`, `ours`, `difference` and `within`.
-
-    Raises:
-        InputError: there is no such paper, or a number of it cannot be flown.
+        FileError: there is no such recording.
+        ViewerUnavailableError: there is no display, or the viewer failed.
 
     Examples:
         >>> import quadsim
-        >>> (found,) = quadsim.reproduce("quadrotor-uav")  # doctest: +SKIP
-        >>> found.within  # doctest: +SKIP
-        True
+        >>> try:
+        ...     quadsim.view("runs/not-flown-yet")
+        ... except quadsim.QuadsimError as error:
+        ...     print(error)
+        runs/not-flown-yet: no such run or recording
     """
-    from scenarios.papers.paper import load_paper
-    from scenarios.papers.reproduction import reproduce_paper
+    from quadsim.report.recording import open_viewer
 
-    papers = [load_paper(name) for name in ([str(paper)] if paper is not None else paper_names())]
-    with reporting(progress) as report:
-        return tuple(reproduce_paper(each, report) for each in papers)
-
-
-@contextlib.contextmanager
-def reporting(progress: Progress | bool) -> Iterator[Progress]:
-    """Who is called with the progress: bars on a terminal, nobody, or what the caller gave."""
-    if callable(progress):
-        yield progress
-    elif not progress:
-        yield silent
-    else:
-        from scenarios.commands.console import progress_bars
-
-        with progress_bars(enabled=True) as bars:
-            yield bars
+    path = Path(run)
+    recording = path / rundir.RECORDING_FILE if path.is_dir() else path
+    if not path.exists():
+        raise FileError(path, "no such run or recording")
+    if path.is_dir():
+        require_inside(path)
+    if not recording.is_file():
+        raise FileError(path, f"has no {rundir.RECORDING_FILE}; run the scenario again without --no-recording")
+    if recording.suffix != ".rrd":
+        raise FileError(path, "is no recording; give a run directory or a file ending in .rrd")
+    open_viewer(recording, web=web)
 
 
 def named_by(scenario: Scenario, controller: object, forces: Sequence[object] = ()) -> Scenario:
@@ -535,27 +417,3 @@ def named_by(scenario: Scenario, controller: object, forces: Sequence[object] = 
         specs = [*scenario.forces, *map(refer_to_force, forces)]
         changes["forces"] = [spec.model_dump(exclude_none=True) for spec in specs]
     return scenario.replace(changes) if changes else scenario
-
-
-def flown_by(scenario: Scenario, controller: object, forces: Sequence[object] = ()) -> Scenario:
-    """The same, of code that other processes import by its place.
-
-    Raises:
-        ParameterError: they cannot.
-    """
-    if controller is not None and not isinstance(controller, str):
-        require_importable(controller)
-    for force in forces:
-        require_importable(force, "forces")
-    return named_by(scenario, controller, forces)
-
-
-def make_engine(workers: int | None, cluster: str | None) -> Engine:
-    """Who flies a campaign: processes of this machine, or a dask cluster."""
-    if cluster is None:
-        from scenarios.campaign.engine.local import LocalEngine
-
-        return LocalEngine(workers)
-    from scenarios.campaign.engine.cluster import DaskEngine
-
-    return DaskEngine(cluster)

@@ -64,17 +64,19 @@ class _Bound:
     entry: int
 
 
-def diagnose(unanswered: Unanswered, scenario: Scenario, vehicle: Vehicle) -> dict[str, Any] | None:
-    """`diagnosis` of a flight's summary; None where its controller's bounds are not a scenario file's.
+def diagnose(unanswered: Unanswered, scenario: Scenario, vehicle: Vehicle) -> dict[str, Any]:
+    """`diagnosis` of a flight's summary.
+
+    Where the controller is one's own, its bounds are not a scenario file's: they are named by the problem, and the
+    advice is by how much one of them alone would have to be wider.
 
     Args:
         unanswered: the first period without an answer.
-        scenario: what was flown, with a controller that has bounds.
+        scenario: what was flown.
         vehicle: the modelled vehicle.
     """
-    if not isinstance(scenario.controller, BoundedSpec):
-        return None
-    case = _Case(unanswered, scenario, scenario.controller, vehicle)
+    spec = scenario.controller
+    case = (_Case if isinstance(spec, BoundedSpec) else _OwnCase)(unanswered, scenario, spec, vehicle)
     conflict = find_conflict(unanswered)
     entries = [] if conflict is None else _merged([*case.entries(conflict)])
     suggestions = [] if conflict is None or conflict.feasible else [*case.suggestions(conflict)]
@@ -85,16 +87,16 @@ def diagnose(unanswered: Unanswered, scenario: Scenario, vehicle: Vehicle) -> di
         "conflict": entries,
         "suggestions": suggestions,
     }
-    return {**found, "sentence": _sentence(found), "advice": _advice(found)}
+    advice = case.widenings(conflict) if isinstance(case, _OwnCase) else _advice(found)
+    return {**found, "sentence": _sentence(found), "advice": advice}
 
 
 class _Case:
     """One period's problem and the file that it is of."""
 
-    def __init__(self, unanswered: Unanswered, scenario: Scenario, spec: BoundedSpec, vehicle: Vehicle) -> None:
+    def __init__(self, unanswered: Unanswered, scenario: Scenario, spec: Any, vehicle: Vehicle) -> None:
         self._unanswered, self._spec, self._vehicle = unanswered, spec, vehicle
         self._period, self._file = scenario.control_period, scenario.to_toml()
-        self._outputs = [name for name in STATE_NAMES if name in spec.output_bounds]
 
     def bound(self, side: Side) -> _Bound:
         """A side in the words of the file."""
@@ -105,7 +107,7 @@ class _Case:
                 name=name, rotor=rotor, side=which, unit="rad/s", factor=1.0, field=table + name, entry=int(side.upper)
             )
         if side.place == 0:
-            name = self._outputs[side.row]
+            name = [each for each in STATE_NAMES if each in self._spec.output_bounds][side.row]
             return _Bound(
                 name=name,
                 rotor=0,
@@ -240,6 +242,44 @@ class _Case:
         periods = recovery(self._unanswered, plan)
         if periods is not None:
             yield {"settings": settings, "after": round(periods * self._period, 9)}
+
+
+class _OwnCase(_Case):
+    """The same of a controller that no file describes."""
+
+    def bound(self, side: Side) -> _Bound:
+        """A side in the words of the problem."""
+        problem = self._unanswered.problem
+        name, rotor, factor, unit = problem.every_constraint[side.place].name, 0, 1.0, "-"
+        if problem.bounds is not None and side.place in _ROTORS:
+            name, rotor, unit = _ROTORS[side.place], side.row + 1, "rad/s"
+        elif problem.bounds is not None and side.place == 0:
+            name, factor, unit = problem.bounds.output(side.row)
+        elif len(problem.every_constraint[side.place].lower.T) > 1:
+            name = f"{name}, row {side.row + 1},"
+        which = ("lower", "upper")[side.upper]
+        return _Bound(name=name, rotor=rotor, side=which, unit=unit, factor=factor, field="", entry=side.row)
+
+    def suggestions(self, conflict: Conflict) -> Iterator[dict[str, Any]]:
+        """No changes of a file."""
+        yield from ()
+
+    def widenings(self, conflict: Conflict | None) -> str:
+        """By how much each side alone, that of all rotors together, would have to be wider."""
+        if conflict is None or conflict.feasible:
+            return ""
+        sides: dict[tuple[str, str], set[Side]] = {}
+        for side in (*conflict.violated, *conflict.in_the_way):
+            rows = range(N_ROTORS) if self.bound(side).rotor else (side.row,)
+            key = (self.bound(side).name, self.bound(side).side)
+            sides.setdefault(key, set()).update(side._replace(row=row) for row in rows)
+        found = []
+        for (name, which), alike in sides.items():
+            least, bound = smallest_widening(self._unanswered, alike), self.bound(next(iter(alike)))
+            if least is not None:
+                amount = f"{least * bound.factor:.3g} {bound.unit.replace('-', '')}".rstrip()
+                found.append(f"{name} {which} wider by {amount}")
+        return f"has an answer with {'; or '.join(found)}" if found else "no bound alone gives it an answer"
 
 
 def _named(bound: _Bound) -> dict[str, Any]:

@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 from support import Here
 
+import quadsim
 from quadsim.errors import RenderingUnavailableError
 from quadsim.report.film.video import rendering_backend
 from scenarios.cli import main, make_parser
@@ -80,6 +81,7 @@ def workplace(flown: Path, campaign: Path, tmp_path: Path, monkeypatch: pytest.M
     for place in (f"campaigns/{campaign.name}", "mine", "other"):
         shutil.copytree(campaign, tmp_path / "runs" / place)
     (tmp_path / "mine.toml").write_text('base = "paper-nominal"\nname = "mine"\nfailure = ["lost"]\n')
+    (tmp_path / "mine-vehicle.toml").write_text(quadsim.vehicle_template())
     for name in ("paper-unconstrained", "paper-constrained"):
         shutil.copytree(flown, tmp_path / "runs" / name)
     monkeypatch.chdir(tmp_path)

@@ -17,7 +17,7 @@ from mpc.exact.free import FreeOptimum
 from mpc.ocp import Problem, Rest
 from mpc.paper.condensed import Condensed, condensed_cost, row_maps
 from mpc.paper.prediction import prediction
-from mpc.qp import Solution
+from mpc.qp import Point, Solution
 from mpc.solvers import Answer, Solver, Way
 from quadsim.controller import SOLVED, UNCONSTRAINED
 from quadsim.state import Array, Indices, read_only
@@ -73,9 +73,10 @@ class Shortcut:
         self._side: Side = np.zeros(rows.lower.size, np.int8)
         self._no_slacks = read_only(np.zeros((N, rows.soft.size)))
         qp = self.formulation.qp
-        self._no_equalities, self._no_rows = read_only(np.zeros(0)), read_only(np.zeros(qp.h_l.size))
-        self._no_box = read_only(np.concatenate([np.zeros(N * nu), -np.tile(rows.l1[rows.soft], N)]))
-        self._nothing = Active(z=self._no_rows, values=self._no_rows, side=np.zeros(0, np.int8), steps=0)
+        nothing, no_rows = read_only(np.zeros(0)), read_only(np.zeros(qp.h_l.size))
+        box = read_only(np.concatenate([np.zeros(N * nu), -np.tile(rows.l1[rows.soft], N)]))
+        self._no_multipliers = Point(nothing, nothing, no_rows, box)
+        self._nothing = Active(z=nothing, values=nothing, side=np.zeros(0, np.int8), steps=0)
         grid = np.arange(rows.lower.size).reshape(rows.lower.shape)
         self._of_inputs_alone = ~np.broadcast_to(rows.C.any(axis=1), grid.shape)
         self._groups = []
@@ -119,8 +120,8 @@ class Shortcut:
         within = (self._lower <= free) & (free <= self._upper)
         if within.all():
             self._side = np.zeros_like(self._side)
-            nothing = self._nothing
-            solution = self._solution(plan, nothing, started, UNCONSTRAINED)
+            x = np.concatenate((plan.ravel(), self._no_slacks.ravel())) if self._no_slacks.size else plan.ravel()
+            solution = self._solution(self._no_multipliers._replace(x=x), self._nothing, started, UNCONSTRAINED)
             return Answer(plan=plan, slacks=self._no_slacks, solution=solution, way=Way.FREE)
         free = free.copy()  # the values' room is used again
         if np.isfinite(free).all():
@@ -144,12 +145,12 @@ class Shortcut:
         return values
 
     def _starts(self) -> list[Side]:
-        """The last active set moved one step earlier, and as it was."""
-        moved, m = np.zeros_like(self._side), self._rows.l1.size
-        moved[:-m] = self._side[m:]
+        """The last active set moved one step earlier, its last step's held, and as it was."""
+        m = self._rows.l1.size
+        moved = np.concatenate((self._side[m:], self._side[-m:]))
         if self._uneven:
             moved[np.isinf(np.where(moved > 0, self._upper, self._lower))] = 0
-        return [moved, self._side]
+        return [moved, self._side] if self._side.any() else [moved]
 
     def _by_axes(
         self, plan: Array, free: Array, within: Flags, u_before: Array, starts: list[Side]
@@ -180,17 +181,16 @@ class Shortcut:
             values, shape = found.active.values, self._rows.lower.shape
             beyond = np.maximum(np.maximum(values - self._upper, self._lower - values), 0.0)
             slacks = (violated * beyond).reshape(shape)[:, self._rows.soft]
-        solution = self._solution(found.plan, found.active, started, SOLVED, slacks)
+        point = self.formulation.point(found.plan, slacks, found.active.z.reshape(self._rows.lower.shape))
+        solution = self._solution(point, found.active, started, SOLVED)
         return Answer(plan=found.plan, slacks=slacks, solution=solution, way=way)
 
-    def _solution(
-        self, plan: Array, active: Active, started: float, status: str, slacks: Array | None = None
-    ) -> Solution:
-        blank = Solution(
-            x=np.append(plan, self._no_slacks) if slacks is None and self._no_slacks.size else plan.ravel(),
-            y=self._no_equalities,
-            z=self._no_rows,
-            z_box=self._no_box,
+    def _solution(self, point: Point, active: Active, started: float, status: str) -> Solution:
+        return Solution(
+            x=point.x,
+            y=point.y,
+            z=point.z,
+            z_box=point.z_box,
             status=status,
             iterations=active.steps,
             active=int(np.count_nonzero(active.side)),
@@ -198,9 +198,6 @@ class Shortcut:
             dual_residual=0.0,
             solve_s=clock.perf_counter() - started,
         )
-        if slacks is None:
-            return blank
-        return self.formulation.solution(blank, plan, slacks, active.z.reshape(self._rows.lower.shape))
 
     def _by_solver(
         self, plan: Array, free: Array, query: tuple[Array, Array, Array, Rest | None], started: float
@@ -223,7 +220,8 @@ class Shortcut:
                 self._side = found.active.side
                 answer = self._answer(found, Way.WHOLE, started)
         if answer.solution is given:
-            answer = replace(answer, solution=self.formulation.solution(given, answer.plan, answer.slacks, multipliers))
+            point = self.formulation.point(answer.plan, answer.slacks, multipliers)
+            answer = replace(answer, solution=replace(given, x=point.x, y=point.y, z=point.z, z_box=point.z_box))
         solution = replace(
             answer.solution,
             iterations=given.iterations,

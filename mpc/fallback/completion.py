@@ -15,6 +15,7 @@ predicted then.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Final
 
@@ -27,6 +28,8 @@ from mpc.heading import advance, turn
 from mpc.model import LinearModel
 from quadsim.controller import Moment
 from quadsim.state import (
+    ANGLE_RATES,
+    ANGLES,
     EULER,
     EULER_RATE,
     INDEX,
@@ -34,7 +37,7 @@ from quadsim.state import (
     POSITION,
     VELOCITY,
     Array,
-    euler_to_body_rates,
+    body_rates_of,
     read_only,
 )
 
@@ -43,6 +46,7 @@ Flags = NDArray[np.bool_]
 _GROUPS: Final = tuple(np.array(group) for group in (POSITION, VELOCITY, EULER, EULER_RATE))
 _ANGLES, _RATES = _GROUPS[2:]
 _TURNING: Final = np.array(EULER + EULER_RATE)
+_NO_RATES: Final = (math.nan, math.nan, math.nan)
 
 
 PLAUSIBLE: Final = by_group(1e5, 1e3, 1e5, 1e3)
@@ -72,9 +76,9 @@ def completed_moment(now: Moment, acting: Array, unseen: Array, known: Array) ->
     """
     found = {**vars(now), "acting": acting, "unseen": unseen}
     upright = abs(float(known[INDEX["pitch"]])) < UPRIGHT
-    if unseen[_ANGLES].any():
+    if unseen[ANGLES].any():
         found["attitude"] = None
-    if unseen[_RATES].any() and upright:
+    if unseen[ANGLE_RATES].any() and upright:
         found["body_rates"] = None
     return CompletedMoment(**found)
 
@@ -101,7 +105,7 @@ class StateCompletion:
         self._state = np.zeros(N_STATES)
         self._covariance: Array = np.diag(UNKNOWN**2)
         self._last = np.full(N_STATES, np.nan)
-        self._last_body_rates = np.full(3, np.nan)
+        self._last_body_rates = _NO_RATES
         self.unseen = np.full(N_STATES, np.inf)
 
     def complete(self, measured: Array, acting: Array, trim: Trim, *, free: bool = True) -> Array:
@@ -141,11 +145,9 @@ class StateCompletion:
 
         Rates are compared as the body's too, which a gyro measures: Euler-angle rates change with the attitude.
         """
-        repeated = np.asarray(measured == self._last)
-        body_rates = np.full(3, np.nan)
-        if seen[_TURNING].all():
-            body_rates = euler_to_body_rates(measured[_ANGLES], measured[_RATES])
-        if (np.abs(body_rates - self._last_body_rates) <= 1e-12 + 1e-9 * np.abs(body_rates)).all():
+        repeated, last = np.asarray(measured == self._last), self._last_body_rates
+        body_rates = body_rates_of(measured.tolist()) if seen[_TURNING].all() else _NO_RATES
+        if all(abs(rate - old) <= 1e-12 + 1e-9 * abs(rate) for rate, old in zip(body_rates, last, strict=True)):
             repeated[_RATES] = True
         self._last, self._last_body_rates = np.array(measured, float), body_rates
         return repeated

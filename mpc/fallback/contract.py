@@ -42,8 +42,7 @@ from quadsim.vehicle import N_ROTORS
 FAILURES: Final[tuple[type[Exception], ...]] = (FlightError, np.linalg.LinAlgError, ArithmeticError, RuntimeError)
 """What numerics and compiled back ends raise.  A programmer's mistakes (`TypeError`, `KeyError`, ...) end the run."""
 _MISTAKES: Final = (NotImplementedError, RecursionError)  # kinds of `RuntimeError` that are a programmer's, too
-
-
+_PLAUSIBLE: Final = PLAUSIBLE[list(REFERENCE_STATES)]  # of references
 _USUAL: Final = FallbackSettings()
 
 
@@ -156,7 +155,7 @@ class Guarded:
         if self._model.period * float(self._completion.unseen.max()) > self._settings.unseen:
             return "state_unknown", None
         shape = (self.horizon, len(REFERENCE_STATES))
-        if np.shape(reference) != shape or not (np.abs(reference) <= PLAUSIBLE[list(REFERENCE_STATES)]).all():
+        if np.shape(reference) != shape or not (np.abs(reference) <= _PLAUSIBLE).all():
             return "invalid_reference", None
         try:
             answer = self.inner.step(now, known.copy(), reference)

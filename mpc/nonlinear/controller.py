@@ -38,7 +38,7 @@ from mpc.nonlinear.rigidbody import (
     rigid_body,
     thrust_axis,
 )
-from mpc.nonlinear.settings import AttitudeError, NonlinearSettings
+from mpc.nonlinear.settings import AttitudeError, Disturbance, NonlinearSettings
 from mpc.observer import DisturbanceObserver
 from mpc.ocp import Objective, Problem, Query, Rest, Unanswered, lqr_terminal_weight
 from mpc.relinearised import Relinearised
@@ -67,6 +67,8 @@ OUTSIDE: Final = 1e-6
 """How far outside its bounds an input, a share of the largest, may be answered; it is then moved onto them."""
 SHORTEST: Final = 0.1
 """Least share of a Gauss-Newton step that is taken where several are."""
+SLOW: Final = 1.0
+"""Speed [m/s] below which a disturbance is hardly taken for one that follows the velocity."""
 TILT_SIDES: Final = 12
 """Sides of the polygon within the circle that a bound on the tilt makes of the thrust axis's horizontal part; it takes
 up to 3.4 % of the bound's sine away."""
@@ -80,6 +82,17 @@ _AXIS_SLOPES: Final = 2.0 * np.array(
 """Take q to the derivatives of R(q) e_z along x, 2 (x z + w y), and y, 2 (y z - w x)."""
 _PLAUSIBLE: Final = 1e5
 _SAME_TIME: Final = 1e-6  # [s]
+
+
+def along_path(acceleration: Array, now: Array, then: Array) -> Array:
+    """Accelerations (..., 3) at a velocity `now` (3,), at velocities `then` (..., 3): turned and scaled as these are.
+
+    Horizontally alone, and less the slower `now` is, to nothing at rest.
+    """
+    before, after = complex(now[0], now[1]), then[..., 0] + 1j * then[..., 1]
+    ratio = (after * before.conjugate() + SLOW**2) / (abs(before) ** 2 + SLOW**2)
+    turned = (acceleration[..., 0] + 1j * acceleration[..., 1]) * ratio
+    return np.stack([turned.real, turned.imag, acceleration[..., 2] + 0.0 * turned.real], axis=-1)
 
 
 def frames_of(quaternions: Array) -> Array:
@@ -265,6 +278,7 @@ class NonlinearMPC:
         self._quaternion: Array | None
         self._last: tuple[float, Array] | None  # time and state of the last period
         self._asked: float
+        self._velocity = np.zeros(3)  # the reference's in the last period
         self._forget()
         self.unanswered: Unanswered | None = None
 
@@ -290,8 +304,9 @@ class NonlinearMPC:
         self._quaternion = measured[Q].copy()
         if now.phase is Phase.FLYING:
             if self._observer is not None and last is not None:
-                self._learn(last, now.time, measured)
-            self._last = now.time, measured
+                self._learn(last, now.time, measured, nodes)
+            self._last, self._velocity = (now.time, measured), nodes.states[0, V]
+            self._follow(nodes)
         nodes = self._balanced(nodes)
         query, answer = self._iterate(measured, nodes)
         status = self._rejection(answer)
@@ -345,31 +360,44 @@ class NonlinearMPC:
             commanded = self._shares(self._acting)
             self._rotors = commanded + left * (self._rotors - commanded)
 
-    def _learn(self, last: tuple[float, Array], time: float, measured: Array) -> None:
+    def _learn(self, last: tuple[float, Array], time: float, measured: Array, nodes: Nodes) -> None:
         """Compare the measured state with what was to be expected after the last one, disturbances included."""
         before, x = last
         if not abs(time - before - self._period) <= _SAME_TIME:
             return
         assert self._observer is not None
-        model = replace(self._model, step=self._period)
+        # In the period that is over, and as it was believed then.
+        model = replace(self._model, step=self._period, acceleration=self._acceleration[0])
         if x.size > N_BODY:
             x = np.concatenate([x[:N_BODY], self._rotors_before])
         expected = advance_nodes(model, x, self._shares(self._acting))
         self._observer.learn(np.concatenate([measured[V] - expected[V], measured[W] - expected[W]]))
+        if self.settings.disturbance is Disturbance.PATH:
+            turned = along_path(self._observer.estimate[:3], self._velocity, nodes.states[0, V])
+            self._observer.estimate[:3] = turned
+
+    def _follow(self, nodes: Nodes) -> None:
+        """Believe what is estimated now, and how it goes on over the horizon."""
+        if self._observer is None:
+            return
         estimate = self._observer.estimate
-        self._model = replace(self._model, acceleration=estimate[:3], angular_acceleration=estimate[3:])
+        found = np.broadcast_to(estimate[:3], (len(nodes.states), 3))
+        if self.settings.disturbance is Disturbance.PATH:
+            found = along_path(found, nodes.states[0, V], nodes.states[:, V])
+        self._model = replace(self._model, acceleration=found[:-1], angular_acceleration=estimate[3:])
+        self._acceleration = found
 
     def _balanced(self, nodes: Nodes) -> Nodes:
         """The reference with what balances drag and the disturbance: thrust turned the least way, and torque."""
         model = self._model
-        if not (model.drags or model.acceleration.any() or model.angular_acceleration.any()):
+        if not (model.drags or self._acceleration.any() or model.angular_acceleration.any()):
             return nodes
         states, thrusts = nodes.states.copy(), nodes.thrusts
         q, mass = states[:, Q], self._vehicle.mass
         axis = thrust_axis(q)
         total = np.sum(thrusts, axis=1) / mass
         force = np.concatenate([total, total[-1:]])[:, None] * axis
-        wanted = force - model.acceleration - drag_acceleration(model, q, states[:, V])
+        wanted = force - self._acceleration - drag_acceleration(model, q, states[:, V])
         size = np.maximum(np.linalg.norm(wanted, axis=1), 1e-9)
         # The least rotation from one axis to another is (1 + a . b, a x b), up to its length.
         turn = np.concatenate(
@@ -390,6 +418,7 @@ class NonlinearMPC:
         if self._observer is not None:
             self._observer.reset()
             self._model = replace(self._model, acceleration=np.zeros(3), angular_acceleration=np.zeros(3))
+        self._acceleration = np.zeros((self._nodes + 1, 3))  # of the disturbance at each node
 
     def _reference(self, now: Moment, reference: Array) -> Nodes:
         stride = self.settings.stride

@@ -16,14 +16,18 @@ integrated by the classical Runge-Kutta method of fourth order.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass, field
-from typing import Final
+from functools import cache, cached_property
+from typing import Any, Final, TypeAlias
 
 import numpy as np
 
 from quadsim.errors import ParameterError
-from quadsim.state import N_STATES, Array, read_only
+from quadsim.state import ANGLE_RATES, ANGLES, N_STATES, POSITIONS, VELOCITIES, Array, read_only
 from quadsim.vehicle import N_ROTORS, Vehicle
+
+Triple: TypeAlias = tuple[float, float, float]
 
 SUBSTEPS: Final = 2
 """Runge-Kutta steps per period.  Over 50 ms from 30 deg of tilt, turning at 2 rad/s, commands 50 rad/s apart, two leave
@@ -56,13 +60,18 @@ class NonlinearModel:
             raise ParameterError("controller", "rotor_lag", self.rotor_lag, "positive and finite, or None")
         for name in ("acceleration", "angular_acceleration"):
             value = getattr(self, name)
-            if np.shape(value) != (3,) or not np.isfinite(value).all():
+            if np.shape(value) != (3,) or not all(map(math.isfinite, value)):
                 raise ParameterError("controller", name, value, "three finite numbers")
 
     @property
     def n(self) -> int:
         """Number of states."""
         return N_STATES if self.rotor_lag is None else N_STATES + N_ROTORS
+
+    @cached_property
+    def allocation(self) -> Array:
+        """(4, 4) the inverse of `effectiveness`."""
+        return read_only(np.array(np.linalg.inv(self.effectiveness), float))
 
 
 def nonlinear_model(
@@ -99,7 +108,55 @@ def derivative(model: NonlinearModel, x: Array, u: Array) -> Array:
 
 def advance(model: NonlinearModel, x: Array, u: Array) -> Array:
     """The states (..., n) one period after states x (..., n) under inputs u (..., 4) [rad/s]."""
-    return integrate(model, x, u).end
+    return _advance_one(model, x, u) if x.ndim == 1 else integrate(model, x, u).end
+
+
+def _advance_one(model: NonlinearModel, x: Array, u: Array) -> Array:
+    """`integrate`'s end for one state (n,), in plain numbers: arrays of three take several times as long."""
+    speeds, _ = _rotor_speeds(model, x[N_STATES:], u)
+    drive = np.dot(np.square(speeds), model.effectiveness.T).tolist()
+    constants = model.gyration.tolist(), model.gravity, model.acceleration.tolist(), model.angular_acceleration.tolist()
+    step = model.period / model.substeps
+    half, sixth = 0.5 * step, step / 6.0
+    sin, cos = math.sin, math.cos
+
+    def slopes(angles: Triple, rates: Triple, k: int) -> tuple[Triple, Triple]:
+        sines, cosines = [sin(angle) for angle in angles], [cos(angle) for angle in angles]
+        x, y, z, roll, pitch, yaw = _accelerations(sines, cosines, rates, drive[k], *constants)
+        return (x, y, z), (roll, pitch, yaw)
+
+    numbers = x.tolist()
+    p, v, q, s = numbers[POSITIONS], numbers[VELOCITIES], numbers[ANGLES], numbers[ANGLE_RATES]
+    try:
+        for k in range(0, 4 * model.substeps, 4):
+            a_1, b_1 = slopes(q, s, k)
+            s_2 = _moved(s, half, b_1)
+            a_2, b_2 = slopes(_moved(q, half, s), s_2, k + 1)
+            s_3 = _moved(s, half, b_2)
+            a_3, b_3 = slopes(_moved(q, half, s_2), s_3, k + 2)
+            s_4 = _moved(s, step, b_3)
+            a_4, b_4 = slopes(_moved(q, step, s_3), s_4, k + 3)
+            p = _moved(p, sixth, _weighted(v, _moved(v, half, a_1), _moved(v, half, a_2), _moved(v, step, a_3)))
+            v = _moved(v, sixth, _weighted(a_1, a_2, a_3, a_4))
+            q = _moved(q, sixth, _weighted(s, s_2, s_3, s_4))
+            s = _moved(s, sixth, _weighted(b_1, b_2, b_3, b_4))
+    except ValueError:  # an infinite angle, whose sine is no number
+        return np.full_like(x, np.nan)
+    end = np.empty_like(x)
+    end[POSITIONS], end[VELOCITIES], end[ANGLES], end[ANGLE_RATES] = p, v, q, s
+    end[N_STATES:] = speeds[-1, : x.size - N_STATES]
+    return end
+
+
+def _moved(start: Triple, by: float, slope: Triple) -> Triple:
+    (a, b, c), (d, e, f) = start, slope
+    return a + by * d, b + by * e, c + by * f
+
+
+def _weighted(first: Triple, second: Triple, third: Triple, fourth: Triple) -> Triple:
+    """Six times the mean slope of a Runge-Kutta step."""
+    (a, b, c), (d, e, f), (p, q, r), (x, y, z) = first, second, third, fourth
+    return a + 2.0 * (d + p) + x, b + 2.0 * (e + q) + y, c + 2.0 * (f + r) + z
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -117,17 +174,11 @@ class Passage:
 def integrate(model: NonlinearModel, x: Array, u: Array) -> Passage:
     """Integrate one period; arguments as for `advance`."""
     columns = np.moveaxis(x, -1, 0)
-    inputs = np.moveaxis(u, -1, 0)
     step = model.period / model.substeps
-    fractions = (np.arange(model.substeps)[:, None] + [0.0, 0.5, 0.5, 1.0]).ravel()
-    decay = np.zeros(fractions.size) if model.rotor_lag is None else np.exp(-fractions * step / model.rotor_lag)
-    if model.rotor_lag is None:
-        speeds = np.broadcast_to(inputs, (fractions.size, *inputs.shape))
-    else:
-        speeds = inputs + decay.reshape(-1, *np.ones(inputs.ndim, int)) * (columns[N_STATES:] - inputs)
+    speeds, decay = _rotor_speeds(model, columns[N_STATES:], np.moveaxis(u, -1, 0))
     drive = np.einsum("ij,kj...->ki...", model.effectiveness, np.square(speeds))
     q, s = columns[0:N_STATES:2], columns[1:N_STATES:2]  # positions and angles, and their rates
-    at_q, at_s = np.empty((2, fractions.size, *q.shape), q.dtype)
+    at_q, at_s = np.empty((2, decay.size, *q.shape), q.dtype)
     slopes = np.empty_like(at_q)
 
     def visit(k: int, q: Array, s: Array) -> Array:
@@ -135,7 +186,7 @@ def integrate(model: NonlinearModel, x: Array, u: Array) -> Passage:
         slopes[k] = accelerations(model, q[3:], s[3:], drive[k])
         return slopes[k]
 
-    for k in range(0, fractions.size, 4):
+    for k in range(0, decay.size, 4):
         half = 0.5 * step
         visit(k, q, s)
         visit(k + 1, q + half * at_s[k], s + half * slopes[k])
@@ -152,35 +203,61 @@ def integrate(model: NonlinearModel, x: Array, u: Array) -> Passage:
     )
 
 
+def _rotor_speeds(model: NonlinearModel, rotors: Array, inputs: Array) -> tuple[Array, Array]:
+    """(K, 4, ...) speeds of rotors (4, ...) under inputs (4, ...) at the instants of a `Passage`, and its `decay`."""
+    instants = _instants(model.substeps)
+    if model.rotor_lag is None:
+        return np.broadcast_to(inputs, (instants.size, *inputs.shape)), np.zeros(instants.size)
+    decay = np.exp(-instants * (model.period / model.substeps) / model.rotor_lag)
+    return inputs + decay.reshape(-1, *[1] * inputs.ndim) * (rotors - inputs), decay
+
+
+@cache
+def _instants(substeps: int) -> Array:
+    """(4 substeps,) instants at which Runge-Kutta's method evaluates slopes, in steps."""
+    return read_only((np.arange(substeps)[:, None] + [0.0, 0.5, 0.5, 1.0]).ravel())
+
+
 def accelerations(model: NonlinearModel, euler: Array, euler_rate: Array, drive: Array) -> Array:
-    """(6, ...) d2(p)/dt2 [m/s^2] and d2(eta)/dt2 [rad/s^2], of eta and its rate (3, ...) and of U/m, I^-1 tau (4, ...).
+    """(6, ...) d2(p)/dt2 [m/s^2] and d2(eta)/dt2 [rad/s^2], of eta, its rate (3, ...) and of U/m, I^-1 tau (4, ...)."""
+    constants = model.gyration, model.gravity, model.acceleration, model.angular_acceleration
+    return np.stack(_accelerations(np.sin(euler), np.cos(euler), euler_rate, drive, *constants))
+
+
+def _accelerations(
+    sines: Iterable[Any],
+    cosines: Iterable[Any],
+    rates: Iterable[Any],
+    drive: Iterable[Any],
+    gyration: Iterable[Any],
+    gravity: float,
+    acceleration: Iterable[Any],
+    angular_acceleration: Iterable[Any],
+) -> tuple[Any, Any, Any, Any, Any, Any]:
+    """See `accelerations`; entries are arrays or plain numbers.
 
     With a, b, c the rates of roll, pitch and yaw, E^-1 dE/dt d(eta)/dt is (-b c cos - sin(pitch) l / cos, a c cos,
     -l / cos), where l = b (a + c sin(pitch)) and cos is that of pitch.
     """
-    (sr, sp, sy), (cr, cp, cy) = np.sin(euler), np.cos(euler)
-    a, b, c = euler_rate
-    thrust = drive[0]
-    out = np.empty((6, *euler.shape[1:]), np.result_type(euler, drive))
-    level = thrust * sp * cr
-    side = thrust * sr
-    out[0] = cy * level + sy * side
-    out[1] = sy * level - cy * side
-    out[2] = thrust * cp * cr
+    (sr, sp, sy), (cr, cp, cy) = sines, cosines
+    a, b, c = rates
+    thrust, t_p, t_q, t_r = drive
+    k_p, k_q, k_r = gyration
+    d_x, d_y, d_z = acceleration
+    d_p, d_q, d_r = angular_acceleration
+    level, side = thrust * sp * cr, thrust * sr
     turn = c * cp
     p, q, r = a - c * sp, b * cr + turn * sr, turn * cr - b * sr
-    k_p, k_q, k_r = model.gyration
-    d_p, d_q, d_r = model.angular_acceleration
-    dp, dq, dr = drive[1] + k_p * q * r + d_p, drive[2] + k_q * r * p + d_q, drive[3] + k_r * p * q + d_r
+    dp, dq, dr = t_p + k_p * q * r + d_p, t_q + k_q * r * p + d_q, t_r + k_r * p * q + d_r
     yaw = (dq * sr + dr * cr + b * (a + c * sp)) / cp
-    out[3] = dp + b * turn + sp * yaw
-    out[4] = dq * cr - dr * sr - a * turn
-    out[5] = yaw
-    d_x, d_y, d_z = model.acceleration
-    out[0] += d_x
-    out[1] += d_y
-    out[2] += d_z - model.gravity
-    return out
+    return (
+        cy * level + sy * side + d_x,
+        sy * level - cy * side + d_y,
+        thrust * cp * cr + (d_z - gravity),
+        dp + b * turn + sp * yaw,
+        dq * cr - dr * sr - a * turn,
+        yaw,
+    )
 
 
 def spun(model: NonlinearModel, rotors: Array, command: Array, time: float) -> Array:

@@ -7,7 +7,7 @@ of the cost add to them, other constraints add rows, and soft rows add slacks af
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -17,7 +17,7 @@ from mpc.constraints import Rows
 from mpc.ocp import Problem, Rest
 from mpc.paper.cost import cost
 from mpc.paper.prediction import Prediction, condense_stages, prediction
-from mpc.qp import QP, QPRows, Solution, Vectors
+from mpc.qp import QP, Point, QPRows, Solution, Vectors
 from quadsim.state import Array, Indices
 
 
@@ -203,8 +203,8 @@ class Condensed:
         """See `mpc.qp.Formulation.multipliers`."""
         return self._rows.multipliers(solution.z, solution.z_box[: self._inputs])
 
-    def solution(self, like: Solution, plan: Array, slacks: Array, multipliers: Array) -> Solution:
-        """This QP's solution of a plan (N, nu), slacks (N, m_s), rows' multipliers (N, m) and what else `like` says.
+    def point(self, plan: Array, slacks: Array, multipliers: Array) -> Point:
+        """This QP's point of a plan (N, nu), slacks (N, m_s) and rows' multipliers (N, m).
 
         Multipliers are positive at upper bounds and negative at lower ones.
         """
@@ -213,8 +213,8 @@ class Condensed:
             l1, l2 = self._problem.rows.l1[soft], self._problem.rows.l2[soft]
             # Stationarity of a slack: l1 + 2 l2 e - |z| + z_box = 0.
             z_slacks = np.minimum(np.abs(multipliers[:, soft]) - l1 - 2.0 * l2 * slacks, 0.0)
-            x, z_box = np.append(x, slacks), np.append(z_box, z_slacks)
-        return replace(like, x=x, y=self._blank.b, z=z, z_box=z_box)
+            x, z_box = np.concatenate((x, slacks.ravel())), np.concatenate((z_box, z_slacks.ravel()))
+        return Point(x, self._blank.b, z, z_box)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -13,6 +13,7 @@ whatever A and B are worth.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Final
 
@@ -52,7 +53,7 @@ LONGEST_SPAN: Final = 0.25
 _SAME_TIME: Final = 1e-6  # [s]
 _YAW: Final = INDEX["yaw"]
 _MOVING: Final = [*VELOCITY, *EULER, *EULER_RATE]
-_REFERENCE: Final = list(REFERENCE_STATES)
+_PLAUSIBLE: Final = PLAUSIBLE[list(REFERENCE_STATES)]  # of references
 
 
 class RobustMPC:
@@ -150,7 +151,7 @@ class RobustMPC:
         self._ahead, self._asked = None, now.time
         if now.phase in GROUNDED:
             return self._stop(now.phase)
-        if not ((np.abs(state) <= PLAUSIBLE).all() and (np.abs(reference) <= PLAUSIBLE[_REFERENCE]).all()):
+        if not ((np.abs(state) <= PLAUSIBLE).all() and (np.abs(reference) <= _PLAUSIBLE).all()):
             return self._refuse(INVALID_DATA)
         if ahead is None or abs(now.time - asked - self._period) > _SAME_TIME:
             self._measured = -math.inf
@@ -192,7 +193,7 @@ class RobustMPC:
     def disturbance(self) -> Array:
         """(6,) estimated acceleration at rest, world [m/s^2], and angular acceleration, body [rad/s^2]."""
         thrust = self._model.effectiveness[0] @ np.square(self.trim.speeds)
-        return np.concatenate([self._resting.acceleration, thrust * self.trim.twist])
+        return np.concatenate([self._resting, thrust * self.trim.twist])
 
     def _forget(self) -> None:
         """Assume no disturbance."""
@@ -203,23 +204,27 @@ class RobustMPC:
     def _believe(self) -> None:
         """Rest against the disturbance that is estimated now."""
         if self._observer is None:
-            self._twisted = self._resting = self._model
+            self._effectiveness, self._resting = self._model.effectiveness, self._model.acceleration
             self.trim: Trim = equilibrium(self._model)
             return
-        estimate = self._observer.estimate
-        twist = estimate[3:] / self._model.gravity
-        lift = np.array([-estimate[0], -estimate[1], self._model.gravity])
-        self._twisted = twisted(self._model, twist)
-        self._resting = self._disturbed(lift / math.hypot(*lift), self._period)
-        self.trim = equilibrium(self._resting, twist)
+        x, y, _ = self._observer.estimate[:3].tolist()
+        twist, gravity = self._observer.estimate[3:] / self._model.gravity, self._model.gravity
+        lift = math.hypot(x, y, gravity)
+        self._effectiveness = twisted(self._model.effectiveness, twist)
+        self._resting = self._acceleration((-x / lift, -y / lift, gravity / lift))
+        self.trim = equilibrium(self._model, acceleration=self._resting, twist=twist)
 
-    def _disturbed(self, axis: Array, period: float) -> NonlinearModel:
-        """The model of a period [s], disturbed as is estimated, with thrust along an axis (3,) of the world."""
+    def _acceleration(self, axis: Sequence[float]) -> Array:
+        """(3,) that the estimated disturbance is, in the world frame [m/s^2], with thrust along an axis (3,) there."""
         if self._observer is None:
-            return replace(self._model, period=period)
-        acceleration = self._observer.estimate[2] * axis
-        acceleration[:2] += self._observer.estimate[:2]
-        return replace(self._twisted, acceleration=acceleration, period=period)
+            return self._model.acceleration
+        x, y, along = self._observer.estimate[:3].tolist()
+        return np.array([along * axis[0] + x, along * axis[1] + y, along * axis[2]])
+
+    def _disturbed(self, state: Array, period: float) -> NonlinearModel:
+        """The model of a period [s], disturbed as is estimated, with thrust as in a state (12,)."""
+        acceleration = self._acceleration(thrust_axis(state.tolist()))
+        return replace(self._model, effectiveness=self._effectiveness, acceleration=acceleration, period=period)
 
     def _span(self, now: Moment) -> float:
         """Time since the last measured state [s]; infinite after a pause, or where the present one is not measured."""
@@ -244,12 +249,14 @@ class RobustMPC:
         """State (12,) some time [s] after a state (12,) with such rotor speeds (4,), under the command in force."""
         if time <= 1e-9:
             return state
-        model = self._disturbed(thrust_axis(state), time)
+        model = self._disturbed(state, time)
         end = advance(model, np.concatenate([state, rotors])[: model.n], self._acting)
         return end[:N_STATES]
 
     def _later(self, reference: Array) -> Array:
         """The reference (N, 4) at the instants that the prediction is for, the delay later."""
+        if not self.settings.delay:
+            return reference
         later = np.concatenate([reference[1:], reference[-1:]])
         return reference + self.settings.delay / self._period * (later - reference)
 
@@ -269,7 +276,7 @@ class RobustMPC:
             yaw = 0.0
         else:
             reference = with_nearest_yaw(reference, yaw, self.settings.largest_turn)
-            x0 = turn_horizontally(x0, np.array(-yaw))
+            x0 = turn_horizontally(x0, -yaw)
             x0[_YAW] = 0.0
         u_s = self._balanced()
         x_s = self.trim.state(yaw, self._model.n)
@@ -279,12 +286,12 @@ class RobustMPC:
     def _balanced(self) -> Array:
         """(4,) speeds at rest [rad/s] that also balance what thrust twists now, which the hover matrices leave out."""
         thrust = self._model.effectiveness[0]
-        excess = thrust @ np.square(self._rotors) - thrust @ np.square(self.trim.speeds)
+        excess = np.dot(thrust, np.square(self._rotors) - np.square(self.trim.speeds))
         return np.asarray(self.trim.speeds - self._inverse[:, 1:] @ (excess * self.trim.twist))
 
     def _along_plan(self, x0: Array) -> tuple[Array, Array, Array]:
         """A (N, n, n), B (N, n, 4), c (N, n) of the predicted steps."""
-        model = self._disturbed(thrust_axis(x0), self._period)
+        model = self._disturbed(x0, self._period)
         last = self._relinearised.last
         if self.settings.linearisation is Linearisation.STATE or last is None:
             A, B, c = linearise(model, x0[None], self._acting[None])

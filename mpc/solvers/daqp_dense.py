@@ -1,7 +1,7 @@
 """DAQP: a dual active-set method that factorises the Hessian once and starts from the last active set.
 
-Where the QP tells which bound is the same one step later in the plan, that set may be moved one step earlier: where
-active bounds alternate along the plan, it is wrong nearly everywhere as it was.
+Where the QP tells which bound is the same one step later in the plan, that set is moved one step earlier: where active
+bounds alternate along the plan, it is wrong nearly everywhere as it was.
 
 Arnström, Bemporad and Axehill, A Dual Active-Set Solver for Embedded Quadratic Programming Using Recursive LDL'
 Updates, IEEE TAC 2022.
@@ -55,7 +55,6 @@ class DaqpDense:
         """See `mpc.qp.Backend.setup`."""
         self._qp = qp
         self._sense: Sense | None = None
-        self._last: Sense | None = None
         sense = np.zeros(qp.c.size + qp.h_l.size + qp.b.size, dtype=np.intc)
         sense[qp.c.size + qp.h_l.size :] = _EQUALITY
         hessian, rows = _common.dense(qp.P), _common.dense(_common.rows(qp))
@@ -76,17 +75,11 @@ class DaqpDense:
         return _common.solution(qp, x, info["lam"], status=status, iterations=info["iterations"], solve_s=elapsed)
 
     def _moved(self, multipliers: Array) -> Sense | None:
-        """The active set moved one step earlier; None where the one before would have been nearer unmoved.
-
-        DAQP then starts from the last one as it was, whose factors it has.
-        """
-        later, last = self._qp.later, self._last
+        """The active set moved one step earlier, with nothing active at the last step; None to start as it was."""
+        later = self._qp.later
         if later is None:
             return None
-        found = ((multipliers != 0.0) * (_ACTIVE + _LOWER * (multipliers < 0.0)))[: later.size]
-        self._last = found
-        if last is not None and np.count_nonzero(found != last[later]) > np.count_nonzero(found != last):
-            return None
+        found = (multipliers != 0.0) * (_ACTIVE + _LOWER * (multipliers < 0.0))
         sense = np.full(multipliers.size, _EQUALITY, dtype=np.intc)
-        sense[: later.size] = found[later]
+        sense[: later.size] = np.where(later == np.arange(later.size), 0, found[later])
         return sense

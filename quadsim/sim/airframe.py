@@ -9,6 +9,7 @@ import numpy as np
 
 from quadsim.assets import models_dir
 from quadsim.flight.ground import Outline
+from quadsim.sim.effects.body_drag import semi_axes
 from quadsim.state import Array, euler_to_quaternion
 from quadsim.vehicle import N_ROTORS, Vehicle
 
@@ -154,14 +155,13 @@ def _ground(spec: mujoco.MjSpec) -> None:
 
 def _add_drag(spec: mujoco.MjSpec, areas: tuple[float, ...], density: float) -> None:
     """Hang an ellipsoid on the body that nothing but the air meets, with pi r_y r_z = A_x and so on."""
-    ax, ay, az = areas
     spec.option.density = density
     for flag in _IDLE:  # with both, MuJoCo leaves out all passive forces
         spec.option.disableflags &= ~int(flag)
     spec.body(BODY).add_geom(
         name=DRAG,
         type=mujoco.mjtGeom.mjGEOM_ELLIPSOID,
-        size=[float(np.sqrt(a)) for a in (ay * az / (np.pi * ax), ax * az / (np.pi * ay), ax * ay / (np.pi * az))],
+        size=semi_axes(areas).tolist(),
         mass=0.0,
         contype=0,
         conaffinity=0,

@@ -4,16 +4,15 @@ from __future__ import annotations
 
 import json
 from argparse import Namespace
-from pathlib import Path
 
 from quadsim.errors import ParameterError
 from quadsim.flight import rundir
-from quadsim.outputs import real_path, require_file
-from scenarios.api import campaign as fly_campaign
+from quadsim.outputs import require_file
 from scenarios.commands import EXIT_DONE, EXIT_FAILED, console
 from scenarios.commands.common import print_summary
-from scenarios.commands.junit import write_cases
-from scenarios.flight import Outputs
+from scenarios.junit import write_junit
+from scenarios.many_flights import campaign as fly_campaign
+from scenarios.many_flights import replay as fly_again
 
 
 def campaign(options: Namespace) -> int:
@@ -46,8 +45,7 @@ def campaign(options: Namespace) -> int:
         return EXIT_FAILED
     judgements = result.judgements
     if options.junit is not None:
-        cases = [(judgement.requirement.text, judgement.holds, judgement.sentence) for judgement in judgements]
-        write_cases(result.summary["campaign"], cases, Path(options.junit))
+        write_junit(result, options.junit)
     if options.json:
         gate = [judgement.to_json() for judgement in judgements]
         print(json.dumps({**result.summary, "requirements": gate}, indent=2))
@@ -58,17 +56,18 @@ def campaign(options: Namespace) -> int:
 
 def replay(options: Namespace) -> int:
     """`quadsim replay`."""
-    from scenarios.campaign.replay import recorded_flight, replay_flight
     from scenarios.commands.campaign_console import print_replay
 
-    recorded = recorded_flight(Path(options.campaign), options.flight)
-    target = real_path(Path("runs") / recorded.scenario.name if options.out is None else options.out)
-    outputs = Outputs(video=options.video, recording=options.recording, figures=options.figures)
-    for note in recorded.notes:
-        console.say(note)
-    with console.progress_bars(enabled=not options.json) as progress:
-        found = replay_flight(recorded, target, outputs, progress)
-    print_summary(rundir.read_summary(target), options, where=str(target))
+    found = fly_again(
+        options.campaign,
+        options.flight,
+        out=options.out,
+        video=options.video,
+        recording=options.recording,
+        figures=options.figures,
+        progress=not options.json,
+    )
+    print_summary(rundir.read_summary(found.directory), options, where=str(found.directory))
     if not options.json:
-        print_replay(recorded.number, recorded.row, found.differing)
+        print_replay(found.recorded.number, found.recorded.row, found.differing)
     return EXIT_FAILED if found.differing else EXIT_DONE

@@ -4,73 +4,50 @@ from __future__ import annotations
 
 import json
 from argparse import Namespace
-from typing import Any, Final, get_args
+from typing import Final, get_args
 
-from mpc.solvers import SOLVERS
-from quadsim.assets import read_toml, vehicle_names, vehicle_path
 from quadsim.errors import InputError, ParameterError
-from quadsim.vehicle import load_vehicle
+from scenarios.catalogue import catalogue
 from scenarios.commands import EXIT_DONE, console
-from scenarios.shipped import CONTROLLERS, Group, campaign_names, campaign_path, scenario_names, scenario_path
+from scenarios.shipped import Group, scenario_names
 
 _MEANT: Final = {"violated": "  (meant to violate a constraint)", "lost": "  (meant to be lost)"}
 """What `quadsim list` says of a scenario that is to defeat its controller."""
 
 
 def list_everything(options: Namespace) -> int:
-    """`quadsim list`; files that ship are right, and read without being checked."""
-    scenarios: dict[str, dict[str, Any]] = {
-        name: {"group": "other", "expect": "satisfied"} | read_toml(scenario_path(name)) for name in scenario_names()
-    }
-    sections = {
-        "campaigns": {name: read_toml(campaign_path(name))["description"] for name in campaign_names()},
-        "vehicles": {name: load_vehicle(vehicle_path(name)).description for name in vehicle_names()},
-        "controllers": CONTROLLERS,
-        "solvers": {name: entry.line for name, entry in SOLVERS.items()},
-    }
+    """`quadsim list`."""
+    found = catalogue()
     if options.json:
-        keys = {"scenarios": "description", "groups": "group", "expected": "expect"}
-        about = {title: {name: each[key] for name, each in scenarios.items()} for title, key in keys.items()}
-        print(json.dumps({**about, **sections}, indent=2))
+        print(json.dumps(found.to_json(), indent=2))
         return EXIT_DONE
     by_group: dict[str, dict[str, str]] = {}
     for group in get_args(Group):
-        lines = {
-            name: each["description"] + _MEANT.get(each["expect"], "")
-            for name, each in scenarios.items()
-            if each["group"] == group
-        }
+        members = [each for each in found.scenarios.values() if each.group == group]
+        lines = {each.name: each.description + _MEANT.get(each.expect, "") for each in members}
         by_group |= {f"scenarios: {group}": lines} if lines else {}
-    console.print_listing({**by_group, **sections})
+    others = ("campaigns", "vehicles", "controllers", "solvers")
+    console.print_listing({**by_group, **{title: getattr(found, title) for title in others}})
     return EXIT_DONE
 
 
 def scenario(options: Namespace) -> int:
     """`quadsim scenario`."""
-    from scenarios.build import resolve
-    from scenarios.commands.common import load
-    from scenarios.parts.vehicle import build_vehicle
-    from scenarios.schema.course import CsvSpec
-
     if options.schema:
         from scenarios.schema.json_schema import scenario_schema
 
         print(json.dumps(scenario_schema(), indent=2))
         return EXIT_DONE
     if options.vehicle is not None:
-        from scenarios.design.first_scenario import COURSES, LAWS, first_scenario
+        from scenarios.vehicles import first_scenario
 
         given = {"a scenario": options.scenario, "--set": options.settings, "--seed": options.seed}
         for name, value in given.items():
             if value:
                 raise ParameterError("", "--for", options.vehicle, f"given without {name}")
-        made = first_scenario(
-            load_vehicle(vehicle_path(options.vehicle)),
-            options.vehicle,
-            course=options.course or COURSES[0],
-            law=options.controller or LAWS[0],
-        )
-        print(made.to_toml(), end="")
+        choice = {"course": options.course, "controller": options.controller}
+        asked = {name: value for name, value in choice.items() if value is not None}
+        print(first_scenario(options.vehicle, **asked).to_toml(), end="")
         return EXIT_DONE
     for name, value in (("--course", options.course), ("--controller", options.controller)):
         if value is not None:
@@ -79,9 +56,8 @@ def scenario(options: Namespace) -> int:
         raise InputError(
             f"scenario needs a name or a TOML file, or --schema (there are: {', '.join(scenario_names())})"
         )
-    loaded = load(options.scenario, options)
-    resolved = resolve(loaded, build_vehicle(loaded))
-    if isinstance(resolved.reference, CsvSpec):  # a start for one's own may have a table of its own
-        resolved = resolved.model_copy(update={"reference": resolved.reference.model_copy(update={"sha256": None})})
-    print(resolved.to_toml(), end="")
+    from scenarios.api import resolve
+    from scenarios.commands.common import load
+
+    print(resolve(load(options.scenario, options)).to_toml(), end="")
     return EXIT_DONE

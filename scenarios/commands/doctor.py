@@ -1,67 +1,19 @@
-"""`quadsim doctor`: what this machine can do, its packages, cores, rendering, viewer, solvers."""
+"""`quadsim doctor`."""
 
 from __future__ import annotations
 
 import json
-import os
-import shutil
-import time as clock
 from argparse import Namespace
 
-import numpy as np
-
-from mpc.solvers import SOLVERS
-from quadsim.controller import SOLVED, Moment
-from quadsim.errors import QuadsimError
-from quadsim.report.film.video import rendering_backend
-from quadsim.report.recording import viewer_problem
-from quadsim.vehicle import N_ROTORS
-from scenarios.build import build_controller
 from scenarios.commands import EXIT_DONE, console
-from scenarios.courses.make import build_reference
-from scenarios.loading import load_scenario
-from scenarios.machine import machine, versions
-from scenarios.parts.vehicle import build_initial_state, build_vehicle
+from scenarios.self_check import doctor as check_machine
 
 
 def doctor(options: Namespace) -> int:
-    """`quadsim doctor`: findings by section, each a line a person can act on."""
-    here = machine()
-    findings = {
-        "machine": {
-            "system": here["system"],
-            "processor": f"{here['processor']}, {len(os.sched_getaffinity(0))} of {here['cores']} cores usable",
-            "disk": f"{shutil.disk_usage('.').free / 1e9:.1f} GB free here",
-        },
-        "packages": versions(),
-        "rendering": {"video": _rendering()},
-        "viewer": {"native": viewer_problem() or "can be opened", "browser": "quadsim view RUN --web"},
-        "solvers": {name: _try_solver(name) if entry.installed else entry.line for name, entry in SOLVERS.items()},
-    }
+    """`quadsim doctor`."""
+    findings = check_machine()
     if options.json:
         print(json.dumps(findings, indent=2))
     else:
         console.print_listing(findings)
     return EXIT_DONE
-
-
-def _rendering() -> str:
-    try:
-        return f"renders off screen through {rendering_backend().upper()}"
-    except QuadsimError as error:
-        return str(error)
-
-
-def _try_solver(name: str) -> str:
-    """Solve the first step of the paper's constrained flight."""
-    scenario = load_scenario("paper-constrained", [f"controller.solver={name}", "controller.shortcut=false"])
-    vehicle = build_vehicle(scenario)
-    started = clock.perf_counter()
-    controller = build_controller(scenario, vehicle)
-    built = clock.perf_counter()
-    controller.reset(np.full(N_ROTORS, vehicle.hover_speed))
-    reference = build_reference(scenario, controller.horizon + 1)[1:]
-    command = controller.step(Moment(), build_initial_state(scenario), reference)
-    verdict = "works" if command.status == SOLVED else f"answers {command.status}"
-    setup_ms, step_ms = 1e3 * (built - started), 1e3 * (clock.perf_counter() - built)
-    return f"{verdict}: set up in {setup_ms:.0f} ms, first step in {step_ms:.1f} ms"

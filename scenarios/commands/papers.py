@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import json
 from argparse import Namespace
-from pathlib import Path
 
 from quadsim.outputs import require_file
-from scenarios.api import reproduce as reproduce_papers
 from scenarios.commands import EXIT_DONE, EXIT_FAILED, console
-from scenarios.commands.junit import write_cases
+from scenarios.junit import write_junit
+from scenarios.many_flights import reproduce as reproduce_papers
 
 
 def reproduce(options: Namespace) -> int:
@@ -18,12 +17,7 @@ def reproduce(options: Namespace) -> int:
         require_file(options.junit, ".xml")
     found = reproduce_papers(options.paper, progress=not options.json)
     if options.junit is not None:
-        cases = [
-            (f"{each.paper.name}: {number.spec.name}", number.within, number.sentence)
-            for each in found
-            for number in each.numbers
-        ]
-        write_cases("reproduce", cases, Path(options.junit))
+        write_junit(found, options.junit)
     within = all(each.within for each in found)
     if options.json:
         print(json.dumps({"reproduced": within, "papers": [each.to_json() for each in found]}, indent=2))

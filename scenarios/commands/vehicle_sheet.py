@@ -1,178 +1,42 @@
-"""`quadsim vehicle`: what its numbers amount to, of hover, thrust and torque margins and of the linear model."""
+"""`quadsim vehicle`: what its numbers amount to, as tables."""
 
 from __future__ import annotations
 
-import itertools
 import json
-import math
 from argparse import Namespace
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
-from pathlib import Path
-from typing import Any, Final
+from collections.abc import Sequence
 
-import numpy as np
-
-from mpc.model import continuous_model, discretise
-from quadsim.assets import vehicle_names, vehicle_path
-from quadsim.errors import InputError, ParameterError
+from quadsim.assets import vehicle_names
+from quadsim.errors import InputError
 from quadsim.report.table import Cell, Grid, format_number
-from quadsim.state import INDEX, Array
-from quadsim.vehicle import N_ROTORS, VEHICLE_UNITS, Vehicle, load_vehicle, vehicle_sources
+from quadsim.vehicle import N_ROTORS, Vehicle
 from scenarios.commands import EXIT_DONE, console
-from scenarios.design.authority import TorqueRange, authority, torque_ranges
-from scenarios.design.loop import delay_margin
-from scenarios.design.tuning import tune
-
-SHEET_PERIOD: Final = 0.05  # control period of the discrete poles [s], the paper's
-_RPM: Final = 60.0 / (2.0 * math.pi)
-
-
-@dataclass(frozen=True, kw_only=True)
-class Designed:
-    """What a controller made for a vehicle can do; see `scenarios.design.tuning`."""
-
-    time_constants: dict[str, float]  # one over the bandwidth of each axis [s]
-    limited_by: str  # what the bandwidth of x and y is the limit of: lag, torque or period
-    tilt_bound: float  # [deg]
-    level_acceleration: float  # largest within it [m/s^2]
-    period: float  # control period [s]
-    delay_margin: float  # delay beyond what the model knows of that its loop stands, without bounds [s]
-
-
-@dataclass(frozen=True, kw_only=True)
-class VehicleSheet:
-    """Figures derived from a vehicle's numbers, all at hover."""
-
-    weight: float  # m g [N]
-    hover_speed: float  # omega_bar [rad/s]
-    hover_speed_rpm: float  # the same [rpm]
-    speed_range_used: float  # where hover lies between the lowest speed, 0, and the highest, 1 [-]
-    thrust_to_weight: float  # all rotors at their highest speed, over the weight [-]
-    climb_acceleration: float  # largest upward acceleration from hover, level [m/s^2]
-    # largest tilt at which the rotors still carry the weight, cos(tilt) = 1 / thrust_to_weight [deg]
-    steady_tilt: float
-    torques: tuple[TorqueRange, ...]  # about x, y and z
-    thrust_slope: float  # of one rotor, 2 b omega_bar [N s/rad]
-    # largest entry of B_c in the rows of vz [m/s^2 per rad/s] and of the three rates [rad/s^2 per rad/s]: the modelled
-    # effect of one rotor per rad/s
-    input_slopes: dict[str, float]
-    # lengths of the chains of integrators that the linear model falls into, longest first
-    integrator_chains: tuple[int, ...]
-    continuous_poles: tuple[float, ...]  # of A_c [1/s]
-    discrete_poles: tuple[float, ...]  # of A at `period` [-]
-    period: float  # tau_s [s]
-    # of the rotors' speeds when they rise and fall, continuous [1/s], as far as the file gives them
-    lag_poles: dict[str, float]
-    discrete_lag_poles: dict[str, float]  # the same at `period` [-]
-    sink_acceleration: float  # largest downward acceleration from hover, level [m/s^2]
-    designed: Designed | None  # None where hover leaves nothing to control it with
+from scenarios.design.vehicle_figures import VehicleReport, VehicleSheet
+from scenarios.vehicles import draw_vehicle, vehicle_report, vehicle_template
 
 
 def vehicle(options: Namespace) -> int:
     """`quadsim vehicle`."""
     if options.template:
-        from scenarios.design.vehicle_template import vehicle_template
-
         print(vehicle_template(), end="")
         return EXIT_DONE
     if options.vehicle is None:
         names = ", ".join(vehicle_names())
         raise InputError(f"vehicle needs a name or a TOML file, or --template (there are: {names})")
-    path = vehicle_path(options.vehicle)
-    loaded, sources = load_vehicle(path), vehicle_sources(path)
     if options.out is not None:
-        from quadsim.report.film.video import render_portrait
-
-        if Path(options.out).suffix != ".png":
-            raise ParameterError("", "--out", options.out, "a file ending in .png")
-        render_portrait(loaded, Path(options.out))
-    sheet = make_sheet(loaded)
-    missed = None
-    if options.scenario is not None:
-        from scenarios.design.shortfalls import shortfalls
-        from scenarios.loading import load_scenario
-
-        missed = shortfalls(load_scenario(options.scenario), loaded)
+        draw_vehicle(options.vehicle, options.out)
+    found = vehicle_report(options.vehicle, scenario=options.scenario)
     if options.json:
-        about = {} if missed is None else {"scenario": options.scenario, "shortfalls": missed}
-        print(json.dumps(sheet_to_json(loaded, sheet, sources) | about, indent=2))
+        print(json.dumps(found.to_json(), indent=2))
     else:
-        tables = sheet_tables(loaded, sheet, sources)
-        tables += [] if missed is None else [shortfall_table(options.scenario, missed)]
-        console.print_grids(tables, options.out, prose=("unit", "source", "what and why"))
+        console.print_grids(vehicle_tables(found), options.out, prose=("unit", "source", "what and why"))
     return EXIT_DONE
 
 
-def make_sheet(vehicle: Vehicle) -> VehicleSheet:
-    """The figures of a vehicle."""
-    A_c, B_c = continuous_model(vehicle)
-    A, _ = discretise(A_c, B_c, SHEET_PERIOD)
-    can = authority(vehicle)
-    lags = {name: value for name in ("rotor_rise", "rotor_fall") if (value := getattr(vehicle, name)) is not None}
-    return VehicleSheet(
-        weight=vehicle.mass * vehicle.gravity,
-        hover_speed=vehicle.hover_speed,
-        hover_speed_rpm=_RPM * vehicle.hover_speed,
-        speed_range_used=can.hover_share,
-        thrust_to_weight=can.thrust_to_weight,
-        climb_acceleration=can.climb,
-        steady_tilt=math.degrees(can.steady_tilt),
-        torques=torque_ranges(vehicle),
-        thrust_slope=2.0 * vehicle.thrust_coefficient * vehicle.hover_speed,
-        input_slopes={
-            name: float(np.abs(B_c[INDEX[name]]).max()) for name in ("vz", "roll_rate", "pitch_rate", "yaw_rate")
-        },
-        integrator_chains=integrator_chains(A_c),
-        # A_c permutes to a strictly upper triangular matrix: chains of integrators, whose poles are its diagonal.
-        continuous_poles=tuple(np.diag(A_c).tolist()),
-        discrete_poles=tuple(np.diag(A).tolist()),
-        period=SHEET_PERIOD,
-        lag_poles={name: -1.0 / value for name, value in lags.items()},
-        discrete_lag_poles={name: math.exp(-SHEET_PERIOD / value) for name, value in lags.items()},
-        sink_acceleration=can.sink,
-        designed=_designed(vehicle),
-    )
-
-
-def _designed(vehicle: Vehicle) -> Designed | None:
-    try:
-        tuning = tune(vehicle)
-    except ParameterError:
-        return None
-    return Designed(
-        time_constants={"x, y": 1.0 / tuning.bandwidth, "z": 1.0 / tuning.height, "yaw": 1.0 / tuning.heading},
-        limited_by=tuning.limited_by,
-        tilt_bound=math.degrees(tuning.tilt),
-        level_acceleration=vehicle.gravity * tuning.acceleration,
-        period=tuning.period,
-        delay_margin=delay_margin(vehicle, tuning),
-    )
-
-
-def integrator_chains(A_c: Array) -> tuple[int, ...]:
-    """Sizes of the Jordan blocks of a nilpotent matrix (n, n), longest first: its chains of integrators.
-
-    rank A^(k-1) - rank A^k counts the blocks of size k or more.
-    """
-    ranks = [np.linalg.matrix_rank(np.linalg.matrix_power(A_c, k)) for k in range(A_c.shape[0] + 1)]
-    assert ranks[-1] == 0, "the hover model has poles away from zero"
-    at_least = [int(before - after) for before, after in itertools.pairwise(ranks)]
-    return tuple(sum(count > i for count in at_least) for i in range(at_least[0]))
-
-
-def sheet_to_json(vehicle: Vehicle, sheet: VehicleSheet, sources: Mapping[str, str]) -> dict[str, Any]:
-    """All of it as plain values: the vehicle, each parameter with unit and source, and what follows from them."""
-    parameters = {
-        name: {"value": value, "unit": unit, "source": sources[name]} for name, value, unit in _parameters(vehicle)
-    }
-    about = {"name": vehicle.name, "description": vehicle.description}
-    return {**about, "parameters": parameters, "derived": asdict(sheet)}
-
-
-def sheet_tables(vehicle: Vehicle, sheet: VehicleSheet, sources: Mapping[str, str]) -> list[Grid]:
-    """All of it as tables: figures, torques, linear model, parameters."""
-    return [
+def vehicle_tables(report: VehicleReport) -> list[Grid]:
+    """All of it as tables: figures, torques, what a controller can do, linear model, parameters, shortfalls."""
+    vehicle, sheet, sources = report.vehicle, report.figures, report.sources
+    tables = [
         _grid(f"{vehicle.name} at hover", ("", "value", "unit"), _figures(vehicle, sheet), note=vehicle.description),
         _grid(
             "torque authority at hover",
@@ -198,20 +62,14 @@ def sheet_tables(vehicle: Vehicle, sheet: VehicleSheet, sources: Mapping[str, st
         _grid(
             "parameters",
             ("parameter", "value", "unit", "source"),
-            [(name, _value(value), unit, sources[name]) for name, value, unit in _parameters(vehicle)],
+            [(name, _value(value), unit, sources[name]) for name, value, unit in report.parameters],
             note="short names of sources are spelt out at the head of the vehicle's file",
         ),
     ]
+    return tables if report.shortfalls is None else [*tables, _shortfalls(report.scenario or "", report.shortfalls)]
 
 
-def _parameters(vehicle: Vehicle) -> list[tuple[str, Any, str]]:
-    """Name, value and unit of those that the file gives."""
-    given = ((name, getattr(vehicle, name), unit) for name, unit in VEHICLE_UNITS.items())
-    return [(name, value, unit) for name, value, unit in given if value is not None]
-
-
-def shortfall_table(scenario: str, missed: Sequence[str]) -> Grid:
-    """Which bounds of a scenario a vehicle cannot meet; see `scenarios.design.shortfalls`."""
+def _shortfalls(scenario: str, missed: Sequence[str]) -> Grid:
     lines = [(str(i + 1), text) for i, text in enumerate(missed)] or [("-", "none: the vehicle meets all of them")]
     return _grid(f"bounds of {scenario} that it cannot meet", ("", "what and why"), lines)
 
@@ -242,11 +100,13 @@ def _abilities(sheet: VehicleSheet) -> list[tuple[str, ...]]:
     if made is None:
         return [sinks, ("none can be made: hover leaves nothing to control it with", "-", "")]
     why = {"lag": "the rotors' lag", "torque": "torque in reserve", "period": "the shortest control period"}
+    speed = "none" if made.level_speed is None else format_number(made.level_speed)
     labels = {"x, y": f"x, y, limited by {why[made.limited_by]}"}
     return [
         sinks,
         ("tilt bound", format_number(made.tilt_bound), "deg"),
         ("largest level acceleration within it", format_number(made.level_acceleration), "m/s^2"),
+        ("level speed at which the air turns it over", speed, "m/s" if made.level_speed is not None else ""),
         *(
             (f"time constant of {labels.get(axis, axis)}", format_number(time), "s")
             for axis, time in made.time_constants.items()
@@ -261,7 +121,7 @@ def _poles(sheet: VehicleSheet) -> list[tuple[str, ...]]:
     body = f"rigid body: {len(sheet.continuous_poles)} poles, chains of {chains} integrators"
     lines: list[tuple[str, ...]] = [(body, "0", "1")]
     for name, pole in sheet.lag_poles.items():
-        label = f"rotors that {'rise' if name == 'rotor_rise' else 'fall'}: {N_ROTORS} poles, unknown to the controller"
+        label = f"rotors that {'rise' if name == 'rotor_rise' else 'fall'}: {N_ROTORS} poles, not in this model"
         lines.append((label, format_number(pole), format_number(sheet.discrete_lag_poles[name])))
     return lines
 

@@ -9,6 +9,8 @@ from typing import Final
 import numpy as np
 from scipy.optimize import linprog
 
+from quadsim.sim.effects.body_drag import added_mass
+from quadsim.sim.effects.wind import SEA_LEVEL_DENSITY
 from quadsim.vehicle import Vehicle
 
 AXES: Final = ("x", "y", "z")
@@ -50,6 +52,7 @@ class Authority:
         turning: (3,) angular acceleration about body x, y, z that is to be had both ways, without torque about the
             other axes, while thrust carries the weight [rad/s^2].
         lag: the longer time constant of a rotor's speed [s]; 0 where the vehicle gives none.
+        munk: growth rate of a tilt by Munk's moment over the level air speed [1/m]; 0 without body drag.
     """
 
     thrust_to_weight: float
@@ -59,6 +62,7 @@ class Authority:
     sink: float
     turning: tuple[float, float, float]
     lag: float
+    munk: float
 
 
 def authority(vehicle: Vehicle) -> Authority:
@@ -77,7 +81,22 @@ def authority(vehicle: Vehicle) -> Authority:
         sink=(1.0 - (vehicle.speed_min / hover) ** 2) * vehicle.gravity,
         turning=(x, y, z),
         lag=max(vehicle.rotor_rise or 0.0, vehicle.rotor_fall or 0.0),
+        munk=_munk(vehicle),
     )
+
+
+def _munk(vehicle: Vehicle) -> float:
+    """The larger p / v of roll and pitch [1/m].
+
+    At a level speed v and a small tilt, air of added mass m turns the body by (m_z - m_x) v^2 tilt further across its
+    way (Munk, "The Aerodynamic Forces on Airship Hulls", NACA report 184, 1924): J tilt'' = (m_z - m_x) v^2 tilt, which
+    grows as exp(p t).
+    """
+    if vehicle.body_drag is None:
+        return 0.0
+    along = added_mass(vehicle.body_drag, SEA_LEVEL_DENSITY)
+    ixx, iyy, _ = vehicle.inertia
+    return math.sqrt(max(0.0, (along[2] - along[0]) / iyy, (along[2] - along[1]) / ixx))
 
 
 def torque_ranges(vehicle: Vehicle) -> tuple[TorqueRange, ...]:

@@ -7,7 +7,7 @@ import math
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final, Literal
 
 import numpy as np
 
@@ -30,10 +30,14 @@ from scenarios.design.tuning import (
     tune,
 )
 
+if TYPE_CHECKING:
+    from scenarios.schema.scenario import Scenario
+
 COURSES: Final = ("hover", "step", "figure-eight")
 LAWS: Final = ("robust", "lqr", "pid", "geometric")
 SHARE: Final = 0.6
-"""Largest acceleration of a figure eight, over the largest within the tilt bound."""
+"""Share of what the vehicle can do that a figure eight asks for: of the largest acceleration within the tilt bound, or
+of the fastest level speed where that is reached first."""
 EIGHT_RATIO: Final = 0.3
 """Turns of a figure eight per time [rad/s] over the loop's bandwidth: across it moves twice as fast."""
 STEP_RATIO: Final = 0.28
@@ -76,14 +80,21 @@ class FirstScenario:
     """A scenario for a vehicle, line by line.
 
     Attributes:
-        head: comments above it.
+        notes: what it was made from, the comments above it.
         entries: its lines, those of a table together.
         size: of the course [m]: the step, or the figure's length; for hover a step's.
     """
 
-    head: tuple[str, ...]
+    notes: tuple[str, ...]
     entries: tuple[Entry, ...]
     size: float
+
+    @property
+    def scenario(self) -> Scenario:
+        """To be flown."""
+        from scenarios.loading import parse_scenario
+
+        return parse_scenario(self.to_data())
 
     def to_data(self) -> dict[str, Any]:
         """As nested tables, what parsing `to_toml` gives."""
@@ -104,7 +115,7 @@ class FirstScenario:
 
     def to_toml(self) -> str:
         """As a commented file."""
-        lines = [f"# {printable(text)}".rstrip() for text in self.head]
+        lines = [f"# {printable(text)}".rstrip() for text in self.notes]
         table = ""
         for entry in self.entries:
             if entry.table != table or (entry.table == "[constraints]" and entry.key == "name"):
@@ -140,7 +151,7 @@ def first_scenario(
     name = re.sub(r"[^a-z0-9._-]+", "-", f"first-{vehicle.name}-{course}".lower())[:80]
     entries = (
         Entry(table="", key="name", value=name, why=""),
-        Entry(table="", key="description", value=_description(course, vehicle), why=""),
+        Entry(table="", key="description", value=_description(course, vehicle, tuning), why=""),
         Entry(table="", key="duration", value=duration, why="s"),
         Entry(
             table="",
@@ -157,10 +168,10 @@ def first_scenario(
         Entry(table="effects.air", key="", value=None, why="drag of the vehicle file"),
         *_constraints(vehicle, tuning, size if law == "robust" else None),
     )
-    return FirstScenario(head=_head(vehicle, tuning, course, law), entries=entries, size=size)
+    return FirstScenario(notes=_notes(vehicle, tuning, course, law), entries=entries, size=size)
 
 
-def _head(vehicle: Vehicle, tuning: Tuning, course: str, law: str) -> tuple[str, ...]:
+def _notes(vehicle: Vehicle, tuning: Tuning, course: str, law: str) -> tuple[str, ...]:
     can = tuning.authority
     limits = {
         "lag": f"the rotors' lag: 1 / ({LAG_RATIO:g} (T + tau / 2)), T = {1e3 * can.lag:.3g} ms",
@@ -169,7 +180,7 @@ def _head(vehicle: Vehicle, tuning: Tuning, course: str, law: str) -> tuple[str,
     }
     margin = delay_margin(vehicle, tuning)
     return (
-        f"A first flight of {_description(course, vehicle)}.",
+        f"A first flight of {_description(course, vehicle, tuning)}.",
         f"Made by: quadsim scenario --for VEHICLE --course {course}"
         + ("" if law == "robust" else f" --controller {law}"),
         "",
@@ -184,13 +195,27 @@ def _head(vehicle: Vehicle, tuning: Tuning, course: str, law: str) -> tuple[str,
     )
 
 
-def _description(course: str, vehicle: Vehicle) -> str:
+def _description(course: str, vehicle: Vehicle, tuning: Tuning) -> str:
     what = {
         "hover": "hover at 1 m",
         "step": f"steps of {STEP:g} m in x, y and z",
-        "figure-eight": f"a figure eight at {100.0 * SHARE:g} % of the largest acceleration within the tilt bound",
+        "figure-eight": f"a figure eight at {100.0 * SHARE:g} % of {_eight_limit(vehicle, tuning)}",
     }
     return f"{vehicle.name}: {what[course]}"
+
+
+def largest_eight(vehicle: Vehicle, tuning: Tuning) -> tuple[float, Literal["tilt", "speed"]]:
+    """The largest level acceleration [m/s^2] of a figure eight that the vehicle can fly, and what is reached there."""
+    tilting = vehicle.gravity * tuning.acceleration
+    # Of (a sin wt, a/2 sin 2wt) the largest speed is sqrt(2) a w.
+    moving = tuning.fastest * _EIGHT_PEAK * EIGHT_RATIO * tuning.bandwidth / math.sqrt(2.0)
+    return (moving, "speed") if moving < tilting else (tilting, "tilt")
+
+
+def _eight_limit(vehicle: Vehicle, tuning: Tuning) -> str:
+    if largest_eight(vehicle, tuning)[1] == "speed":
+        return f"the fastest level speed, {tuning.fastest:.3g} m/s"
+    return "the largest acceleration within the tilt bound"
 
 
 def _course(course: str, vehicle: Vehicle, tuning: Tuning) -> tuple[list[Entry], float, float]:
@@ -209,7 +234,7 @@ def _course(course: str, vehicle: Vehicle, tuning: Tuning) -> tuple[list[Entry],
             window = {"start": round(start + begin * hold, 9), "stop": round(start + until * hold, 9), "value": value}
             found.append(Entry(table="reference", key=axis, value=[window], why="s, s, m"))
         return found, round(start + 4.0 * hold, 9), STEP
-    acceleration = SHARE * vehicle.gravity * tuning.acceleration
+    acceleration = SHARE * largest_eight(vehicle, tuning)[0]
     length = _rounded(2.0 * acceleration / (_EIGHT_PEAK * (EIGHT_RATIO * tuning.bandwidth) ** 2), 3)
     turn = round(math.tau * math.sqrt(0.5 * length * _EIGHT_PEAK / acceleration), 3)
     ramp = round(0.5 * turn, 3)
@@ -226,7 +251,7 @@ def _course(course: str, vehicle: Vehicle, tuning: Tuning) -> tuple[list[Entry],
             table="reference",
             key="period",
             value=turn,
-            why=f"s: at most {acceleration:.3g} m/s^2, {SHARE:g} of g tan(tilt bound)",
+            why=f"s: at most {acceleration:.3g} m/s^2, at {100.0 * SHARE:g} % of {_eight_limit(vehicle, tuning)}",
         ),
         Entry(table="reference", key="ramp", value=ramp, why="s, half a turn to gain its speed, and to lose it"),
     ]

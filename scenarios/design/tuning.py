@@ -16,6 +16,10 @@
    place deviates by what the tilt bound itself would answer, g tan(tilt) / w^2; the rotor speed's weight follows from
    w by 1., those of height and heading likewise from theirs.  Changes of rotor speeds cost as much as the speeds
    themselves at `MOVE_RATIO` w.
+5. *Level speed*: that at which a tilt grows by Munk's moment at the rate w.  A pole p > 0 asks for a bandwidth above
+   p M / (M - 1), M the peak of the complementary sensitivity (Skogestad and Postlethwaite, "Multivariable Feedback
+   Control", 2005, Sec. 5.9): w = p is where no peak is large enough; at 60 % of that speed M is 2.5 or more.  Without
+   lag the Butterworth pattern itself is stable up to p = 2^(1/4) w (Hurwitz).
 """
 
 from __future__ import annotations
@@ -78,6 +82,7 @@ class Tuning:
         speed_weight: of a rotor's speed [s^2/rad^2].
         move_weight: of its change from period to period [s^2/rad^2].
         slew: largest changes of a command from one period to the next, down and up [rad/s].
+        fastest: level speed [m/s] at which Munk's moment outruns the loop; infinite without body drag.
     """
 
     authority: Authority
@@ -93,6 +98,7 @@ class Tuning:
     speed_weight: float
     move_weight: float
     slew: tuple[float, float]
+    fastest: float
 
     @property
     def acceleration(self) -> float:
@@ -145,6 +151,7 @@ def tune(vehicle: Vehicle, *, steepest: float = STEEPEST) -> Tuning:
             -(vehicle.hover_speed - vehicle.speed_min) * _reached(period, vehicle.rotor_fall),
             (vehicle.speed_max - vehicle.hover_speed) * _reached(period, vehicle.rotor_rise),
         ),
+        fastest=bandwidth / can.munk if can.munk else math.inf,
     )
 
 

@@ -180,7 +180,7 @@ def guarded(
 def _nonlinear(spec: NonlinearSpec, vehicle: Vehicle, period: float) -> Controller:
     from mpc.nonlinear.controller import NonlinearMPC
     from mpc.nonlinear.rigidbody import Inputs
-    from mpc.nonlinear.settings import AttitudeError, NonlinearSettings, Weights
+    from mpc.nonlinear.settings import AttitudeError, Disturbance, NonlinearSettings, Weights
 
     stride = 1 if spec.node is None else round(spec.node / period)
     if spec.node is not None and (stride < 1 or not math.isclose(stride * period, spec.node, rel_tol=1e-9)):
@@ -216,6 +216,7 @@ def _nonlinear(spec: NonlinearSpec, vehicle: Vehicle, period: float) -> Controll
         largest_rates=_three(math.inf if spec.body_rate is None else np.radians(spec.body_rate).tolist()),
         soft=None if spec.soft is None else (spec.soft.linear, spec.soft.quadratic),
         observer=spec.offset_free,
+        disturbance=Disturbance(spec.disturbance),
         solver=spec.solver,
     )
     law = NonlinearMPC(vehicle, period=period, settings=settings, bounds=bounds, constraints=_outputs(spec))

@@ -64,6 +64,11 @@ class PluginController:
         """Its QP solver; empty where it names none."""
         return _line(getattr(self._law, "solver", ""))
 
+    @property
+    def unanswered(self) -> object:
+        """The first problem without an answer, an `mpc.Unanswered`, where it keeps one."""
+        return getattr(self._law, "unanswered", None)
+
     def reset(self, speeds: Array) -> None:
         """See `quadsim.controller.Controller.reset`."""
         if hasattr(self._law, "reset"):

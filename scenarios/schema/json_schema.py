@@ -54,9 +54,14 @@ class _SchemaOfToml(GenerateJsonSchema):
 
 
 def scenario_schema() -> dict[str, Any]:
-    """The schema, as nested tables; without an identifier, so that it may lie anywhere.
+    """The JSON Schema of scenario files, as nested tables; without an identifier, so that it may lie anywhere.
 
     A file with a `base` says only what differs: of it nothing is required.
+
+    Examples:
+        >>> import quadsim
+        >>> quadsim.scenario_schema()["title"]
+        'A quadsim scenario'
     """
     whole = Scenario.model_json_schema(schema_generator=_SchemaOfToml)
     tables = whole.pop("$defs")

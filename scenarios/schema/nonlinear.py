@@ -117,6 +117,11 @@ class NonlinearPartsSpec(Spec):
         default=[], description="bounds on sums of positions, velocities and, as inputs, rotor speeds; audited as well"
     )
     offset_free: ObserverSettings | None = None
+    disturbance: Literal["constant", "path"] = Field(
+        default="constant",
+        description="how the acceleration that offset_free estimates goes on: constant, or path: turning and growing "
+        "with the reference's horizontal velocity, as drag does",
+    )
     input_bounds: RotorBoundsSpec = RotorBoundsSpec()
     fallback: FallbackSettings = FallbackSettings()
 

@@ -56,9 +56,18 @@ def test_what_is_beyond_the_rotors_stays_finite_and_upright(vehicle: Vehicle) ->
 def test_a_twisted_model_turns_as_its_thrust_pushes(vehicle: Vehicle) -> None:
     twist, speeds = np.array([0.3, -0.2, 0.1]), np.array([180.0, 200.0, 190.0, 210.0])
     plain = nonlinear_model(vehicle, 0.05)
-    turned = twisted(plain, twist).effectiveness @ speeds**2 - plain.effectiveness @ speeds**2
+    turned = twisted(plain.effectiveness, twist) @ speeds**2 - plain.effectiveness @ speeds**2
     assert turned[0] == 0.0
     np.testing.assert_allclose(turned[1:], twist * (plain.effectiveness[0] @ speeds**2), rtol=1e-9)
+
+
+def test_what_thrust_twists_is_held_at_rest(vehicle: Vehicle) -> None:
+    acceleration, twist = np.array([0.5, -1.0, 2.0]), np.array([0.3, -0.2, 0.1])
+    plain = nonlinear_model(vehicle, 0.05)
+    rest = equilibrium(plain, acceleration=acceleration, twist=twist)
+    disturbed = replace(plain, effectiveness=twisted(plain.effectiveness, twist), acceleration=acceleration)
+    np.testing.assert_allclose(derivative(disturbed, rest.state(), rest.speeds), 0.0, atol=1e-11)
+    np.testing.assert_array_equal(rest.twist, twist)
 
 
 @pytest.mark.parametrize(

@@ -66,8 +66,9 @@ def test_under_a_disturbance_it_is_anchored_where_the_vehicle_rests(vehicle: Veh
 def test_the_anchored_model_is_the_nonlinear_ones_linearisation_at_rest(vehicle: Vehicle) -> None:
     """With a torque that goes with thrust, as a worn rotor's: at rest rotors differ then, and so do their slopes."""
     twist = np.array([2.2, -1.0, 0.1])
-    disturbed = twisted(nonlinear_model(vehicle, 0.05, substeps=20), twist)
-    trim = equilibrium(disturbed, twist)
+    plain = nonlinear_model(vehicle, 0.05, substeps=20)
+    disturbed = replace(plain, effectiveness=twisted(plain.effectiveness, twist))
+    trim = equilibrium(plain, twist=twist)
     assert np.ptp(trim.speeds) > 20.0
     A, B, _ = linearise(disturbed, trim.state()[None], trim.speeds[None])
     model = anchored(hover_model(vehicle, 0.05), trim)

@@ -122,7 +122,7 @@ def test_multipliers_of_rows_are_those_of_the_qp_and_back() -> None:
     active = {name for name, column in zip(problem.rows.names, rows.T, strict=True) if column.any()}
     assert {"slews", "inputs", "late"} <= active
     assert "again" not in active
-    back = form.solution(optimum, form.inputs(optimum.x), form.slacks(optimum.x), rows)
+    back = form.point(form.inputs(optimum.x), form.slacks(optimum.x), rows)
     np.testing.assert_array_equal(back.z, optimum.z)
     np.testing.assert_array_equal(back.z_box, optimum.z_box)
     answer = Shortcut(problem, QPSolver("piqp-multistage", problem)).solve(np.zeros(12), desired, problem.model.u_bar)

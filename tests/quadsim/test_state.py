@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from quadsim.sim.physics import physics_to_state
 from quadsim.state import (
+    EULER_RATE,
     INDEX,
     N_STATES,
     REFERENCE_NAMES,
@@ -17,6 +18,7 @@ from quadsim.state import (
     STATE_NAMES,
     STATE_UNITS,
     Array,
+    body_rates_of,
     body_to_euler_rates,
     body_to_world,
     euler_to_body_rates,
@@ -74,6 +76,9 @@ def test_straight_up_and_down_give_a_pitch_and_no_nan(pitch: float) -> None:
 def test_rates_come_back(euler: Array, body: Array) -> None:
     back = euler_to_body_rates(euler, body_to_euler_rates(euler, body))
     np.testing.assert_allclose(back, body, atol=1e-10)
+    state = make_state(euler=(euler[0], euler[1], euler[2]))
+    state[list(EULER_RATE)] = body_to_euler_rates(euler, body)
+    np.testing.assert_allclose(body_rates_of(state.tolist()), back, rtol=1e-14, atol=1e-14)
 
 
 @given(euler=attitudes(1.0), body=rates)

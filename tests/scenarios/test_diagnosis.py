@@ -8,8 +8,8 @@ import math
 import re
 import tomllib
 from collections.abc import Callable
-from dataclasses import dataclass, field
-from functools import cache, cached_property
+from dataclasses import dataclass, field, replace
+from functools import cache, cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -17,11 +17,14 @@ import numpy as np
 import ocp_peer
 import pytest
 
-from mpc.diagnosis import find_conflict
+import mpc
+import quadsim
+from mpc.constrained import ConstrainedMPC
+from mpc.diagnosis import find_conflict, has_answer
 from mpc.fallback.contract import Guarded
 from mpc.fallback.settings import FallbackSettings
 from mpc.ocp import Unanswered
-from quadsim.controller import ACCEPTED, Controller, Moment
+from quadsim.controller import ACCEPTED, Command, Controller, Moment
 from quadsim.errors import PlanExhaustedError
 from quadsim.flight import metrics
 from quadsim.state import INDEX, Array, make_state
@@ -30,6 +33,7 @@ from scenarios.build import build_controller
 from scenarios.diagnosis import diagnose
 from scenarios.flight import Flight
 from scenarios.loading import load_scenario
+from scenarios.parts.controllers import make_controller
 from scenarios.parts.vehicle import build_vehicle
 from scenarios.schema.scenario import Scenario
 from scenarios.schema.settings import get_field
@@ -367,3 +371,55 @@ def test_the_example_of_the_documentation_is_what_a_flight_says(fly_once: Callab
 
 def test_fallback_counts_as_for_good_from_the_longest_time_on_one_shifted_plan() -> None:
     assert FallbackSettings().plan_age == metrics.UNRECOVERED
+
+
+class Keeping:
+    """A controller of one's own that keeps the problem that it could not solve."""
+
+    def __init__(self, vehicle: Vehicle, period: float, horizon: int, largest: float = 2.0) -> None:
+        law = make_controller(load_scenario("paper-constrained").controller, vehicle, period)
+        assert isinstance(law, ConstrainedMPC)
+        roll = mpc.Bounds(
+            C_c=np.eye(12)[[INDEX["roll"]]],
+            y_min=np.radians([-largest]),
+            y_max=np.radians([largest]),
+            delta_min=np.full(4, -10.0),
+            delta_max=np.full(4, 5.0),
+            u_min=np.zeros(4),
+            u_max=np.full(4, 250.0),
+        )
+        self.problem = replace(law.problem, horizon=horizon, bounds=roll)
+        self.inner = ConstrainedMPC(self.problem, mpc.QPSolver("piqp-multistage", self.problem))
+        self.unanswered: Unanswered | None = None
+
+    def step(self, now: Moment, state: Array, reference: Array) -> Command:
+        try:
+            return self.inner.step(now, state, reference)
+        finally:
+            self.unanswered = self.inner.unanswered
+
+
+def test_a_controller_of_ones_own_is_diagnosed_in_the_words_of_its_problem() -> None:
+    tilted = load_scenario("hover", ["duration=0.5", "initial.euler=[10.0, 0.0, 0.0]"])
+    flight = quadsim.fly(tilted, controller=Keeping)
+    found = flight.diagnosis
+    assert found is not None
+    assert found["conflict"][0] | {"by": 0.0} == {
+        "name": "roll",
+        "rotors": [],
+        "side": "upper",
+        "unit": "deg",
+        "field": "",
+        "by": 0.0,
+        "start": 0.05,
+        "stop": found["conflict"][0]["stop"],
+    }
+    least = float(re.search(r"has an answer with roll upper wider by (\S+) deg", found["advice"])[1])  # type: ignore[index]
+    assert flight.unanswered is not None
+    for amount, answered in ((least + 0.01, True), (least - 0.1, False)):
+        bounds = flight.unanswered.problem.bounds
+        assert bounds is not None
+        wider = replace(flight.unanswered.problem, bounds=replace(bounds, y_max=np.radians([2.0 + amount])))
+        assert has_answer(wider, flight.unanswered.query) == answered
+    enough = quadsim.fly(tilted, controller=partial(Keeping, largest=12.0))
+    assert enough.diagnosis is None

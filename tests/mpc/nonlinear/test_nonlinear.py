@@ -219,6 +219,17 @@ def test_any_leading_dimensions(vehicle: Vehicle, lag: float | None) -> None:
         np.testing.assert_allclose(together.reshape(6, -1), one_by_one, rtol=1e-13, atol=1e-13)
 
 
+def test_a_state_that_runs_away_is_no_number(vehicle: Vehicle) -> None:
+    """Where an angle grows beyond all numbers its sine is none, of one state as of many."""
+    model, x = nonlinear_model(vehicle, PERIOD), make_state(euler=(0.3, 0.5 * math.pi, 0.0))
+    x[list(EULER_RATE)] = 1e3
+    u = np.full(4, vehicle.hover_speed)
+    with np.errstate(all="ignore"):
+        assert not np.isfinite(advance(model, x[None], u[None])).all()
+        assert not np.isfinite(advance(model, x, u)).all()
+        assert np.isnan(advance(model, 1e200 * x, u)).all()
+
+
 @pytest.mark.parametrize(
     ("changes", "message"),
     [

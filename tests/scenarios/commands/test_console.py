@@ -19,7 +19,7 @@ from quadsim.state import Array
 from scenarios.cli import main
 from scenarios.commands import EXIT_DONE, EXIT_WRONG_INPUT, campaign_console, console
 from scenarios.commands.console import stdout, styled
-from scenarios.commands.junit import write_cases
+from scenarios.junit import write_cases
 from scenarios.parts.plugin import PluginController
 from tests.safety_mutations import unseal
 

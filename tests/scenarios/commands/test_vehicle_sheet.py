@@ -20,13 +20,13 @@ from quadsim.state import INDEX
 from quadsim.vehicle import N_ROTORS, VEHICLE_UNITS, Vehicle, load_vehicle
 from scenarios.cli import main
 from scenarios.commands import EXIT_DONE
-from scenarios.commands.vehicle_sheet import integrator_chains, make_sheet
 from scenarios.design.authority import torque_ranges
+from scenarios.design.vehicle_figures import integrator_chains, make_sheet
 from scenarios.loading import load_scenario
 from scenarios.run import fly_scenario
 
 VEHICLES = [load_vehicle(vehicle_path(name)) for name in vehicle_names()]
-CRAZYFLIE, HUMMINGBIRD, LOPES = VEHICLES
+CRAZYFLIE, HUMMINGBIRD, LOPES, _ = VEHICLES
 SKEWED = replace(HUMMINGBIRD, rotor_azimuths=(10.0, 100.0, -170.0, -80.0), speed_min=250.0)
 EVERY = pytest.mark.parametrize("vehicle", VEHICLES, ids=lambda vehicle: vehicle.name)
 
@@ -176,6 +176,7 @@ FLOWN = {
     "lopes2011": [],
     "hummingbird": ["input_weights.speed=9e-4", "input_bounds.speed=[0, 838]", "input_bounds.slew=[-80, 80]"],
     "crazyflie2": ["input_weights.speed=1e-4", "input_bounds.speed=[0, 2500]", "input_bounds.slew=[-250, 250]"],
+    "torrente2021": ["input_weights.speed=4e-4", "input_bounds.speed=[0, 1000]", "input_bounds.slew=[-100, 100]"],
 }
 
 

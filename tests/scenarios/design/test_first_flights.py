@@ -31,7 +31,7 @@ def test_the_robust_controller_flies_it_first_time(name: str) -> None:
 
 
 @pytest.mark.parametrize("law", LAWS[1:])
-@pytest.mark.parametrize("name", ["crazyflie2", "random-17"])
+@pytest.mark.parametrize("name", ["crazyflie2", "random-16", "random-17"])
 def test_baselines_fly_it_within_the_bounds(name: str, law: str) -> None:
     for course in COURSES[1:]:
         flight = fly_first(ALL[name], course, law)

@@ -93,7 +93,8 @@ def test_from_a_template_to_a_scenario_by_the_command_line(
     [
         (
             ["vehicle"],
-            "vehicle needs a name or a TOML file, or --template (there are: crazyflie2, hummingbird, lopes2011)",
+            "vehicle needs a name or a TOML file, or --template (there are: crazyflie2, hummingbird, lopes2011, "
+            "torrente2021)",
         ),
         (["scenario", "--for", "none"], "no vehicle named 'none'"),
         (

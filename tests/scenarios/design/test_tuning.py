@@ -12,9 +12,12 @@ from plausible_vehicles import HEAVIEST, LIGHTEST, QUICKEST, SLOWEST, STRONGEST,
 
 from mpc.model import continuous_model, discretise
 from quadsim.errors import ParameterError
-from quadsim.state import INDEX
+from quadsim.sim.effects import Air, Effects
+from quadsim.sim.plant import Plant
+from quadsim.state import INDEX, make_state
 from quadsim.vehicle import N_ROTORS, Vehicle
 from scenarios.design.authority import authority
+from scenarios.design.first_scenario import SHARE, first_scenario, largest_eight
 from scenarios.design.loop import delay_margin, gain, is_stable
 from scenarios.design.tuning import FASTEST, PERIOD_SHARE, tune
 
@@ -71,6 +74,41 @@ def test_weights_make_a_butterworth_pattern_of_the_stated_bandwidth() -> None:
         n = len(chosen)
         expected = np.sort([math.sin(math.pi * (2 * k + 1) / (2 * n)) for k in range(n)])
         np.testing.assert_allclose(np.sort(-poles.real / radius), expected, rtol=0.03)
+
+
+def test_a_tilt_grows_in_the_air_as_munk_says() -> None:
+    """In a level glide at 8 m/s, rotors at hover: the plant's own pitch, against exp(p t) + exp(-p t) over 2."""
+    vehicle = next(each for each in ALL if each.name == "random-16")
+    rate, tilt = 8.0 * authority(vehicle).munk, 1e-3
+    with Plant(vehicle, effects=Effects(air=Air(body_drag=vehicle.body_drag))) as plant:
+        start = make_state(position=(0.0, 0.0, 500.0), euler=(0.0, tilt, 0.0))
+        start[INDEX["vx"]] = 8.0
+        plant.reset(start)
+        plant.advance(plant.hover_speeds, 200)
+        state = plant.state()
+    assert state[INDEX["pitch"]] == pytest.approx(tilt * math.cosh(0.2 * rate), rel=0.02)
+
+
+def test_a_figure_eight_keeps_below_the_speed_at_which_the_air_turns_the_vehicle() -> None:
+    """Its speed, by the course that is flown, is 60 % of that at which p = w; else its acceleration is that of tilt."""
+    for vehicle in ALL:
+        tuning = tune(vehicle)
+        reference = first_scenario(vehicle, vehicle.name, course="figure-eight").to_data()["reference"]
+        speed = math.sqrt(0.5) * reference["length"] * math.tau / reference["period"]
+        assert speed <= 1.01 * SHARE * tuning.fastest
+        ends = largest_eight(vehicle, tuning)[1]
+        assert ends == ("speed" if vehicle.name == "random-16" else "tilt")
+        if ends == "speed":
+            assert speed == pytest.approx(SHARE * tuning.fastest, rel=0.01)
+    assert authority(next(each for each in ALL if each.name == "lopes2011")).munk == 0.0
+
+
+def test_a_butterworth_loop_stands_the_air_up_to_the_fourth_root_of_two() -> None:
+    """s^4 + a s^3 + (a^2/2 - p^2) s^2 + a s + 1 of bandwidth 1, a = 2.613: on the edge at p = 2^(1/4)."""
+    a = 2.0 * (math.cos(math.pi / 8.0) + math.sin(math.pi / 8.0))
+    for p, stable in ((0.99 * 2.0**0.25, True), (1.01 * 2.0**0.25, False)):
+        poles = np.roots([1.0, a, 0.5 * a**2 - p**2, a, 1.0])
+        assert (poles.real.max() < 0.0) == stable
 
 
 def test_a_delay_margin_is_where_a_simulated_loop_begins_to_grow() -> None:

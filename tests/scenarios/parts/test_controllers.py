@@ -20,6 +20,8 @@ from mpc.baselines.pid import CascadedPID
 from mpc.constrained import ConstrainedMPC
 from mpc.constraints import Bounds
 from mpc.fallback.contract import Guarded
+from mpc.nonlinear.controller import NonlinearMPC
+from mpc.nonlinear.settings import Weights
 from mpc.observer import ObserverSettings
 from mpc.ocp import Objective
 from mpc.robust.controller import Linearisation, RobustMPC, RobustSettings
@@ -306,6 +308,110 @@ def test_a_baseline_follows_a_step(name: str) -> None:
     error = flight.log.control.truth[-1, [0, 2, 4]] - flight.log.control.reference[-1, :3]
     assert flight.log.reason is None
     assert np.abs(error).max() < 0.02
+
+
+NONLINEAR: dict[str, Any] = {
+    "type": "nonlinear",
+    "horizon": 12,
+    "node": 0.15,
+    "iterations": 3,
+    "shift": True,
+    "substeps": 2,
+    "inputs": "speed",
+    "weights": {
+        "position": [1.0, 2.0, 3.0], "attitude": 4.0, "velocity": 5.0, "body_rates": 6.0, "input": 7.0, "move": 8.0,
+    },
+    "attitude_error": "difference",
+    "terminal": 2.0,
+    "rotor_lag": 0.03,
+    "drag": [0.1, 0.2, 0.3],
+    "quadratic_drag": [0.4, 0.5, 0.6],
+    "output_bounds": {"vx": [-1.0, 2.0]},
+    "tilt": 20.0,
+    "body_rate": [90.0, 180.0, 45.0],
+    "soft": {"linear": 9.0, "quadratic": 10.0},
+    "polytopes": [{"name": "wall", "of": ["x", "y"], "rows": [[1.0, 1.0]], "upper": [4.0]}],
+    "offset_free": {"force_walk": 0.3},
+    "disturbance": "path",
+    "input_bounds": {"speed": [10.0, 200.0], "slew": [-30.0, 20.0]},
+    "solver": "daqp",
+    "fallback": {"enabled": False},
+}  # fmt: skip
+
+
+def test_fields_of_nonlinear_mpc_arrive() -> None:
+    law = built(NONLINEAR)
+    assert isinstance(law, NonlinearMPC)
+    made, x = law.settings, math.radians(1.0)
+    assert (law.horizon, made.horizon, made.stride, law.solver) == (12, 4, 3, "daqp")
+    assert (made.iterations, made.shift, made.substeps, made.inputs) == (3, True, 2, "speed")
+    weights = Weights(
+        position=(1.0, 2.0, 3.0), attitude=4.0, velocity=(5.0,) * 3, body_rates=(6.0,) * 3, input=7.0, move=8.0
+    )
+    assert made.weights == weights
+    assert (made.attitude_error, made.terminal, made.rotor_lag) == ("difference", 2.0, 0.03)
+    assert (made.drag, made.quadratic_drag) == ((0.1, 0.2, 0.3), (0.4, 0.5, 0.6))
+    assert made.tilt == pytest.approx(20.0 * x)
+    assert made.largest_rates == pytest.approx((90.0 * x, 180.0 * x, 45.0 * x))
+    assert (made.soft, made.observer, made.disturbance) == ((9.0, 10.0), ObserverSettings(force_walk=0.3), "path")
+    constraints = {part.name: part for part in law.problem.every_constraint}
+    assert list(constraints) == ["inputs", "slews", "tilt", "body_rates", "outputs", "wall"]
+    np.testing.assert_allclose(constraints["inputs"].upper, 200.0 / build_vehicle(scenario("pid")).speed_max)
+    assert constraints["outputs"].penalty is not None
+    assert constraints["wall"].penalty is None
+
+
+def test_nonlinear_mpc_needs_no_field_and_is_within_the_fallback_contract() -> None:
+    law = built("nonlinear")
+    assert isinstance(law, Guarded)
+    assert isinstance(law.inner, NonlinearMPC)
+    assert not isinstance(built({"type": "nonlinear", "fallback": {"enabled": False}}), Guarded)
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"node": 0.07}, "controller.node must be a whole multiple of the control period of 0.05 s; got 0.07"),
+        ({"node": 0.15}, "controller.horizon must be a whole number of nodes, 3 periods each; got 20"),
+    ],
+)
+def test_nodes_that_do_not_fit_are_refused(fields: dict[str, Any], message: str) -> None:
+    with pytest.raises(ParameterError) as caught:
+        built({"type": "nonlinear", **fields})
+    assert str(caught.value) == message
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"solver": "piqp"}, "controller.solver: no solver named 'piqp'"),
+        ({"rotor_lag": 1e-9}, "controller.rotor_lag must be 0, or at least 0.0001 s; got 1e-09"),
+        ({"tilt": 90.0}, "controller.tilt must be < 90.0; got 90.0"),
+        (
+            {"output_bounds": {"roll": [-1.0, 1.0]}},
+            "output_bounds must be of x, vx, y, vy, z, vz; got 'roll'",
+        ),
+        (
+            {"input_bounds": {"slew": [-1.0, 1.0]}},
+            'input_bounds.slew must be absent where inputs = "thrust"',
+        ),
+        ({"input_bounds": {"speed": [-1.0, 1.0]}}, "controller.input_bounds.speed must have a lower bound >= 0 rad/s"),
+        ({"weights": {"position": 0.0}}, "controller.weights.position must be > 0.0; got 0.0"),
+        (
+            {"weights": {"position": [1.0, 2.0]}},
+            "weights.position must be a list of 3 numbers; got [1.0, 2.0]",
+        ),
+        (
+            {"attitude_error": "difference", "weights": {"attitude": [1.0, 1.0, 1.0]}},
+            'controller.weights.attitude must be one number where attitude_error = "difference"',
+        ),
+        ({"terminal": "lqg"}, "controller.terminal must be one of 'none' or 'lqr'; got 'lqg'"),
+    ],
+)
+def test_wrong_fields_of_nonlinear_mpc_are_named(fields: dict[str, Any], message: str) -> None:
+    with pytest.raises(ScenarioError) as caught:
+        scenario({"type": "nonlinear", **fields})
+    assert message in str(caught.value)
 
 
 def test_fields_of_the_baselines_arrive() -> None:

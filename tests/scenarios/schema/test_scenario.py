@@ -55,8 +55,9 @@ def test_defaults_are_written_out() -> None:
     assert table["seed"] == 0
     assert (table["group"], table["expect"]) == ("other", "satisfied")
     assert table["log_rate"] == 200.0
-    assert table["plant"] == {"timestep": 0.001, "limit_speeds": False}
-    assert table["initial"] == {"position": [0.0, 0.0, 0.0], "euler": [0.0, 0.0, 0.0], "cold": False}
+    assert table["plant"] == {"timestep": 0.001, "integrator": "mujoco", "limit_speeds": False}
+    at_rest = {"position": [0.0, 0.0, 0.0], "euler": [0.0, 0.0, 0.0], "cold": False, "on_reference": False}
+    assert table["initial"] == at_rest
     assert table["controller"]["solver"] == "piqp-multistage"
 
 
@@ -104,7 +105,8 @@ WRONG = {
     "duration=-1.0": "duration must be > 0.0; got -1.0",
     "duration=1e9": "duration must be <= 86400.0; got 1000000000.0",
     "control_period=0": "control_period must be > 0.0; got 0",
-    "group=nowhere": "group must be one of 'paper', 'courses', 'air', 'faults', 'ground', 'sensors' or 'other'; ...",
+    "group=nowhere": "group must be one of 'paper', 'papers', 'courses', 'air', 'faults', 'ground', 'sensors' or "
+    "'other'; ...",
     "expect=fine": "expect must be one of 'satisfied', 'violated' or 'lost'; got 'fine'",
     "name='" + 81 * "a" + "'": "name must be a text of 80 or fewer characters; got '" + 81 * "a" + "'",
     "seed=-1": "seed must be >= 0; got -1",

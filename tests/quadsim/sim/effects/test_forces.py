@@ -7,7 +7,9 @@ import math
 import numpy as np
 import pytest
 
+from quadsim.sim.airframe import compile_model
 from quadsim.sim.effects import Air, Disturbance, Effects, Ground
+from quadsim.sim.effects.body_drag import added_mass, semi_axes
 from quadsim.sim.effects.gust import Gust
 from quadsim.sim.effects.rotors import RotorDynamics
 from quadsim.sim.effects.wind import WindField
@@ -77,6 +79,18 @@ def test_body_drag_is_half_rho_area_speed_squared(vehicle: Vehicle, axis: int, n
     decay = 0.5 * 1.2 * areas[axis] / vehicle.mass  # dv/dt = -decay v^2
     assert speed == pytest.approx(8.0 / (1.0 + 8.0 * decay * 2.0), rel=1e-9)
     assert wrench[0, axis] == pytest.approx(-decay * vehicle.mass * 64.0, rel=1e-2)
+
+
+def test_added_mass_is_that_of_a_sphere_and_that_of_the_compiled_model(vehicle: Vehicle) -> None:
+    """A sphere takes half of the air in its place along."""
+    radius, areas = 0.2, (0.02, 0.03, 0.06)
+    sphere = added_mass([math.pi * radius**2] * 3, 1.2)
+    np.testing.assert_allclose(sphere, 0.5 * 1.2 * 4.0 / 3.0 * math.pi * radius**3)
+    model = compile_model(vehicle, body_drag=areas, air_density=1.2)
+    drag = model.geom("drag")
+    np.testing.assert_allclose(semi_axes(areas), drag.size)
+    virtual_mass = model.geom_fluid[drag.id][6:9]  # MuJoCo's integral is a quadrature
+    np.testing.assert_allclose(added_mass(areas, 1.2), 1.2 * virtual_mass, rtol=1e-3)
 
 
 def test_a_falling_vehicle_reaches_its_terminal_speed(vehicle: Vehicle) -> None:

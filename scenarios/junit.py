@@ -4,22 +4,53 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 from xml.etree import ElementTree
 
 from quadsim.errors import printable
 from quadsim.outputs import writing_file
 from quadsim.report.comparison import failure_sentences
 
+if TYPE_CHECKING:
+    from scenarios.campaign.run import Result
+    from scenarios.campaign.statistics.requirement import Judgement
+    from scenarios.flight import Flight
+    from scenarios.papers.reproduction import Reproduction
+    from scenarios.reaudit import Reaudit
 
-def write_junit(summary: Mapping[str, Any], path: Path) -> None:
-    """Write one test case per constraint, and one for the flight itself.
+
+def write_junit(result: Flight | Reaudit | Result | Sequence[Reproduction], path: str | Path) -> Path:
+    """Write verdicts as JUnit XML: a test case per constraint and one for the flight; per requirement; or per number.
 
     A constraint that is not required is a case that passes, with what was measured in its output.
 
+    Args:
+        result: of `fly`, `read` or `check`, of a `campaign` with requirements, or of `reproduce`.
+        path: an XML file.
+
+    Returns:
+        The file.
+
     Raises:
-        OutputError: the file cannot be written.
+        OutputError: it cannot be written.
+
+    Examples:
+        >>> import tempfile, quadsim
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     flown = quadsim.fly(quadsim.load("hover").replace({"duration": 1.0}))
+        ...     file = quadsim.write_junit(flown, folder + "/verdicts.xml")
+        ...     'tests="8" failures="0"' in file.read_text()
+        True
     """
+    if isinstance(result, Sequence):
+        numbers = [(each.paper.name, number) for each in result for number in each.numbers]
+        cases = [(f"{paper}: {number.spec.name}", number.within, number.sentence) for paper, number in numbers]
+        return write_cases("reproduce", cases, Path(path))
+    summary = result.summary
+    if "campaign" in summary:
+        judged: Sequence[Judgement] = getattr(result, "judgements", ())
+        cases = [(each.requirement.text, each.holds, each.sentence) for each in judged]
+        return write_cases(summary["campaign"], cases, Path(path))
     said = "; ".join(filter(None, [summary["reason"] or "completed", *failure_sentences(summary)]))
     whole = summary["status"] == "completed" and not summary["controller"].get("unrecovered")
     cases = [("flight", whole, said)]
@@ -27,16 +58,13 @@ def write_junit(summary: Mapping[str, Any], path: Path) -> None:
         (entry["name"], entry["satisfied"] or not entry["required"], _sentence(entry))
         for entry in summary["constraints"]
     ]
-    write_cases(summary["scenario"], cases, path)
+    return write_cases(summary["scenario"], cases, Path(path))
 
 
-def write_cases(suite: str, cases: Sequence[tuple[str, bool, str]], path: Path) -> None:
+def write_cases(suite: str, cases: Sequence[tuple[str, bool, str]], path: Path) -> Path:
     """Write test cases of a suite: the name of each, whether it passes, and its message.
 
     Characters that XML forbids, and others that steer a terminal, become escapes.
-
-    Raises:
-        OutputError: the file cannot be written.
     """
     name, failures = printable(f"quadsim.{suite}"), sum(not passed for _, passed, _ in cases)
     root = ElementTree.Element("testsuite", name=name, tests=str(len(cases)), failures=str(failures))
@@ -48,6 +76,7 @@ def write_cases(suite: str, cases: Sequence[tuple[str, bool, str]], path: Path) 
             ElementTree.SubElement(case, "failure", message=printable(sentence))
     with writing_file(path, ".xml") as file:
         file.write_bytes(ElementTree.tostring(root, encoding="utf-8", xml_declaration=True))
+    return path
 
 
 def _sentence(entry: Mapping[str, Any]) -> str:

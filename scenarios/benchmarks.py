@@ -1,0 +1,221 @@
+"""What `import quadsim` hands out of benchmarks: each measures on this machine, all contenders in one run."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from mpc.solvers import SOLVERS
+from quadsim.outputs import real_path, writing
+from scenarios.api import load
+from scenarios.progress import Progress, reporting
+from scenarios.schema.scenario import Scenario
+
+if TYPE_CHECKING:
+    from scenarios.bench.bench_results import FlightProfile, RenderProfile, SolverBench
+    from scenarios.bench.campaigns import CampaignProfile
+    from scenarios.bench.mismatch.survival import MismatchBench
+
+
+def bench_solvers(
+    scenario: Scenario | str | Path = "paper-constrained",
+    *,
+    out: str | Path | None = None,
+    solvers: Sequence[str] = (),
+    repeats: int = 5,
+    horizons: Sequence[int] = (10, 20, 50, 100, 200),
+    stride: int = 1,
+    progress: Progress | bool = True,
+) -> SolverBench:
+    """Time every installed QP solver on the QPs of one flight, judged by optima in closed form.
+
+    Args:
+        scenario: by a constrained controller, or its name or file.
+        out: directory for the results and their figure; nothing is written where absent.
+        solvers: names of `catalogue().solvers`; all where empty.
+        repeats: how often each question is put, at most.
+        horizons: N, for how times grow with it; empty for none.
+        stride: 20 periods of so many times 20 are asked.
+        progress: as of `fly`.
+
+    Returns:
+        Times [ms], residuals and failures of each solver, in `candidates`.
+
+    Raises:
+        InputError: an argument is wrong, or the flight is not one by a constrained controller.
+        OutputError: the directory cannot be written.
+
+    Examples:
+        >>> import quadsim
+        >>> short = quadsim.load("paper-constrained").replace({"duration": 2.0})
+        >>> found = quadsim.bench_solvers(short, solvers=["piqp-multistage"], repeats=1, horizons=[], stride=2)
+        >>> found.deadline_ms
+        50.0
+    """
+    from scenarios.bench import solvers as bench
+
+    scenario = scenario if isinstance(scenario, Scenario) else load(scenario)
+
+    def measure() -> SolverBench:
+        with reporting(progress) as report:
+            return bench.bench_solvers(
+                scenario,
+                repeats=repeats,
+                horizons=horizons,
+                solvers=tuple(solvers or SOLVERS),
+                stride=stride,
+                progress=report,
+            )
+
+    if out is None:
+        return measure()
+    with writing(real_path(out), bench.KIND) as directory:
+        found = measure()
+        bench.write_bench(found, directory)
+    return found
+
+
+def bench_flight(
+    scenario: Scenario | str | Path = "paper-constrained", *, repeats: int = 5, progress: Progress | bool = True
+) -> FlightProfile:
+    """Measure where the time of a flight goes: physics, controller, solver and the rest.
+
+    Args:
+        scenario: what is flown, or its name or file.
+        repeats: flights.
+        progress: as of `fly`.
+
+    Returns:
+        Seconds of the whole and of its parts.
+
+    Raises:
+        InputError: no repeat is asked for, or the flight does not go to its end.
+
+    Examples:
+        >>> import quadsim
+        >>> found = quadsim.bench_flight(quadsim.load("hover").replace({"duration": 1.0}), repeats=1)
+        >>> 0.0 < found.best <= found.median  # [s]
+        True
+    """
+    from scenarios.bench.flight import bench_flight as measure
+
+    with reporting(progress) as report:
+        return measure(scenario if isinstance(scenario, Scenario) else load(scenario), repeats=repeats, progress=report)
+
+
+def bench_render(
+    scenario: Scenario | str | Path = "paper-constrained",
+    *,
+    seconds: float = 4.0,
+    workers: int | None = None,
+    progress: Progress | bool = True,
+) -> RenderProfile:
+    """Measure what a film costs.
+
+    Args:
+        scenario: what is flown and filmed, or its name or file.
+        seconds: of film [s].
+        workers: rendering processes; one per usable core where absent.
+        progress: as of `fly`.
+
+    Returns:
+        The time of a frame, `frame_ms` [ms], and of the start of the processes.
+
+    Raises:
+        InputError: an argument is out of range.
+        RenderingUnavailableError: nothing can render here.
+
+    Examples:
+        >>> import quadsim
+        >>> quadsim.bench_render("hover", seconds=0.2, workers=1).frame_ms > 0.0
+        True
+    """
+    from scenarios.bench.film import bench_render as measure
+
+    scenario = scenario if isinstance(scenario, Scenario) else load(scenario)
+    with reporting(progress) as report:
+        return measure(scenario, seconds=seconds, workers=workers, progress=report)
+
+
+def bench_ladder(
+    scenario: str | Path = "paper-constrained",
+    changes: Sequence[str] = (),
+    *,
+    out: str | Path | None = None,
+    quick: bool = False,
+    workers: int | None = None,
+    progress: Progress | bool = True,
+) -> MismatchBench:
+    """Fly every controller in every condition, from rotor lag to a worn rotor: what does each survive?
+
+    Args:
+        scenario: name or file of a constrained one whose bounds on roll and pitch are the same.
+        changes: of it, texts `dotted.path=value`.
+        out: directory for the results and their figure; nothing is written where absent.
+        quick: three controllers and three conditions, 12 s each.
+        workers: processes; one per usable core where absent.
+        progress: as of `fly`.
+
+    Returns:
+        How each flight ended, in `flights` by controller and condition.
+
+    Raises:
+        InputError: the scenario cannot be flown so.
+        OutputError: the directory cannot be written.
+
+    Examples:
+        >>> import quadsim
+        >>> found = quadsim.bench_ladder(quick=True)
+        >>> found.duration, len(found.flights)  # [s]
+        (12.0, 9)
+    """
+    from scenarios.bench.mismatch import benchmark
+
+    def measure() -> MismatchBench:
+        with reporting(progress) as report:
+            return benchmark.run_mismatch(str(scenario), changes, quick=quick, workers=workers, progress=report)
+
+    if out is None:
+        return measure()
+    with writing(real_path(out), benchmark.KIND) as directory:
+        found = measure()
+        benchmark.write_mismatch(found, directory)
+    return found
+
+
+def bench_campaign(
+    scenario: Scenario | str | Path = "paper-constrained",
+    *,
+    flights: int = 40,
+    rounds: int = 3,
+    sizes: Sequence[int] = (10, 100, 1000, 10000),
+    progress: Progress | bool = True,
+) -> CampaignProfile:
+    """Measure what many flights cost, by one worker process and by two.
+
+    Args:
+        scenario: what is flown, or its name or file.
+        flights: per worker and round.
+        rounds: of one worker and of two.
+        sizes: flights of ever larger campaigns; empty for none.
+        progress: as of `fly`.
+
+    Returns:
+        Seconds and memory of each campaign.
+
+    Raises:
+        InputError: nothing is asked for.
+
+    Examples:
+        >>> import quadsim
+        >>> short = quadsim.load("hover").replace({"duration": 1.0})
+        >>> found = quadsim.bench_campaign(short, flights=2, rounds=1, sizes=[])
+        >>> len(found.rounds)
+        1
+    """
+    from scenarios.bench.campaigns import bench_campaign as measure
+
+    scenario = scenario if isinstance(scenario, Scenario) else load(scenario)
+    with reporting(progress) as report:
+        return measure(scenario, flights=flights, rounds=rounds, sizes=sizes, progress=report)

@@ -1,0 +1,162 @@
+"""What a vehicle's numbers amount to: hover, thrust and torque margins, the linear model, what a controller can do."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from typing import Any, Final
+
+import numpy as np
+
+from mpc.model import continuous_model, discretise
+from quadsim.errors import ParameterError
+from quadsim.state import INDEX, Array
+from quadsim.vehicle import VEHICLE_UNITS, Vehicle
+from scenarios.design.authority import TorqueRange, authority, torque_ranges
+from scenarios.design.loop import delay_margin
+from scenarios.design.tuning import tune
+
+SHEET_PERIOD: Final = 0.05  # control period of the discrete poles [s], the paper's
+_RPM: Final = 60.0 / (2.0 * math.pi)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Designed:
+    """What a controller made for a vehicle can do; see `scenarios.design.tuning`."""
+
+    time_constants: dict[str, float]  # one over the bandwidth of each axis [s]
+    limited_by: str  # what the bandwidth of x and y is the limit of: lag, torque or period
+    tilt_bound: float  # [deg]
+    level_acceleration: float  # largest within it [m/s^2]
+    level_speed: float | None  # at which the air tilts the body on as fast as the loop answers [m/s]; None: at none
+    period: float  # control period [s]
+    delay_margin: float  # delay beyond what the model knows of that its loop stands, without bounds [s]
+
+
+@dataclass(frozen=True, kw_only=True)
+class VehicleSheet:
+    """Figures derived from a vehicle's numbers, all at hover."""
+
+    weight: float  # m g [N]
+    hover_speed: float  # omega_bar [rad/s]
+    hover_speed_rpm: float  # the same [rpm]
+    speed_range_used: float  # where hover lies between the lowest speed, 0, and the highest, 1 [-]
+    thrust_to_weight: float  # all rotors at their highest speed, over the weight [-]
+    climb_acceleration: float  # largest upward acceleration from hover, level [m/s^2]
+    # largest tilt at which the rotors still carry the weight, cos(tilt) = 1 / thrust_to_weight [deg]
+    steady_tilt: float
+    torques: tuple[TorqueRange, ...]  # about x, y and z
+    thrust_slope: float  # of one rotor, 2 b omega_bar [N s/rad]
+    # largest entry of B_c in the rows of vz [m/s^2 per rad/s] and of the three rates [rad/s^2 per rad/s]: the modelled
+    # effect of one rotor per rad/s
+    input_slopes: dict[str, float]
+    # lengths of the chains of integrators that the linear model falls into, longest first
+    integrator_chains: tuple[int, ...]
+    continuous_poles: tuple[float, ...]  # of A_c [1/s]
+    discrete_poles: tuple[float, ...]  # of A at `period` [-]
+    period: float  # tau_s [s]
+    # of the rotors' speeds when they rise and fall, continuous [1/s], as far as the file gives them
+    lag_poles: dict[str, float]
+    discrete_lag_poles: dict[str, float]  # the same at `period` [-]
+    sink_acceleration: float  # largest downward acceleration from hover, level [m/s^2]
+    designed: Designed | None  # None where hover leaves nothing to control it with
+
+
+@dataclass(frozen=True, kw_only=True)
+class VehicleReport:
+    """What a vehicle can do.
+
+    Attributes:
+        vehicle: its numbers.
+        sources: of each parameter, as its file names them.
+        figures: what follows from the numbers.
+        scenario: that it was held against, or None.
+        shortfalls: which bounds of that scenario it cannot meet and why, a sentence each; None without a scenario.
+    """
+
+    vehicle: Vehicle
+    sources: Mapping[str, str]
+    figures: VehicleSheet
+    scenario: str | None = None
+    shortfalls: tuple[str, ...] | None = None
+
+    @property
+    def parameters(self) -> list[tuple[str, Any, str]]:
+        """Name, value and unit of those that the file gives."""
+        given = ((name, getattr(self.vehicle, name), unit) for name, unit in VEHICLE_UNITS.items())
+        return [(name, value, unit) for name, value, unit in given if value is not None]
+
+    def to_json(self) -> dict[str, Any]:
+        """All of it as plain values: the vehicle, each parameter with unit and source, and what follows from them."""
+        found: dict[str, Any] = {
+            "name": self.vehicle.name,
+            "description": self.vehicle.description,
+            "parameters": {
+                name: {"value": value, "unit": unit, "source": self.sources[name]}
+                for name, value, unit in self.parameters
+            },
+            "derived": asdict(self.figures),
+        }
+        if self.shortfalls is not None:
+            found |= {"scenario": self.scenario, "shortfalls": self.shortfalls}
+        return found
+
+
+def make_sheet(vehicle: Vehicle) -> VehicleSheet:
+    """The figures of a vehicle."""
+    A_c, B_c = continuous_model(vehicle)
+    A, _ = discretise(A_c, B_c, SHEET_PERIOD)
+    can = authority(vehicle)
+    lags = {name: value for name in ("rotor_rise", "rotor_fall") if (value := getattr(vehicle, name)) is not None}
+    return VehicleSheet(
+        weight=vehicle.mass * vehicle.gravity,
+        hover_speed=vehicle.hover_speed,
+        hover_speed_rpm=_RPM * vehicle.hover_speed,
+        speed_range_used=can.hover_share,
+        thrust_to_weight=can.thrust_to_weight,
+        climb_acceleration=can.climb,
+        steady_tilt=math.degrees(can.steady_tilt),
+        torques=torque_ranges(vehicle),
+        thrust_slope=2.0 * vehicle.thrust_coefficient * vehicle.hover_speed,
+        input_slopes={
+            name: float(np.abs(B_c[INDEX[name]]).max()) for name in ("vz", "roll_rate", "pitch_rate", "yaw_rate")
+        },
+        integrator_chains=integrator_chains(A_c),
+        # A_c permutes to a strictly upper triangular matrix: chains of integrators, whose poles are its diagonal.
+        continuous_poles=tuple(np.diag(A_c).tolist()),
+        discrete_poles=tuple(np.diag(A).tolist()),
+        period=SHEET_PERIOD,
+        lag_poles={name: -1.0 / value for name, value in lags.items()},
+        discrete_lag_poles={name: math.exp(-SHEET_PERIOD / value) for name, value in lags.items()},
+        sink_acceleration=can.sink,
+        designed=_designed(vehicle),
+    )
+
+
+def _designed(vehicle: Vehicle) -> Designed | None:
+    try:
+        tuning = tune(vehicle)
+    except ParameterError:
+        return None
+    return Designed(
+        time_constants={"x, y": 1.0 / tuning.bandwidth, "z": 1.0 / tuning.height, "yaw": 1.0 / tuning.heading},
+        limited_by=tuning.limited_by,
+        tilt_bound=math.degrees(tuning.tilt),
+        level_acceleration=vehicle.gravity * tuning.acceleration,
+        level_speed=tuning.fastest if math.isfinite(tuning.fastest) else None,
+        period=tuning.period,
+        delay_margin=delay_margin(vehicle, tuning),
+    )
+
+
+def integrator_chains(A_c: Array) -> tuple[int, ...]:
+    """Sizes of the Jordan blocks of a nilpotent matrix (n, n), longest first: its chains of integrators.
+
+    rank A^(k-1) - rank A^k counts the blocks of size k or more.
+    """
+    ranks = [np.linalg.matrix_rank(np.linalg.matrix_power(A_c, k)) for k in range(A_c.shape[0] + 1)]
+    assert ranks[-1] == 0, "the hover model has poles away from zero"
+    at_least = [int(before - after) for before, after in itertools.pairwise(ranks)]
+    return tuple(sum(count > i for count in at_least) for i in range(at_least[0]))

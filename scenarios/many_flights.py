@@ -1,0 +1,252 @@
+"""What `import quadsim` hands out of many flights: sweeps, campaigns, a campaign's flight again, and papers."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+from quadsim.errors import InputError, ParameterError
+from quadsim.outputs import real_path
+from scenarios.api import load, named_by
+from scenarios.flight import Outputs
+from scenarios.parts.own_code import require_importable
+from scenarios.progress import Progress, reporting
+from scenarios.schema.scenario import Scenario
+from scenarios.shipped import paper_names
+
+if TYPE_CHECKING:
+    from scenarios.campaign.engine.protocol import Engine
+    from scenarios.campaign.replay import Replay
+    from scenarios.campaign.run import Result
+    from scenarios.campaign.sweep import Sweep
+    from scenarios.papers.reproduction import Reproduction
+
+
+def sweep(
+    scenario: Scenario | str | Path,
+    values: Mapping[str, Sequence[Any]],
+    *,
+    controller: object = None,
+    forces: Sequence[object] = (),
+    workers: int | None = None,
+    progress: bool = True,
+) -> Sweep:
+    """Fly a scenario once for every combination of some fields' values, all with the scenario's own seed.
+
+    Args:
+        scenario: what is flown, or its name or file.
+        values: what to try, by dotted path.
+        controller: who flies it, as of `fly`; a class or a function of a module that other processes can import.
+        forces: what acts on it, as of `fly`; the same.
+        workers: processes that fly; one per usable core where absent.
+        progress: whether to show a bar on a terminal.
+
+    Returns:
+        A row per flight, in the order of the combinations, the last field varying fastest.
+
+    Raises:
+        InputError: a value is not allowed, or the controller cannot be sent to other processes.
+
+    Examples:
+        >>> import quadsim
+        >>> scenario = quadsim.load("hover").replace({"duration": 1.0})
+        >>> found = quadsim.sweep(scenario, {"controller.horizon": [20, 40]}, workers=1)
+        >>> found["controller.horizon"].tolist(), found["verdict"].tolist()
+        ([20.0, 40.0], ['satisfied', 'satisfied'])
+    """
+    from scenarios.campaign.sweep import fly_sweep
+
+    if not isinstance(scenario, Scenario):
+        scenario = load(scenario)
+    with reporting(progress) as report:
+        return fly_sweep(flown_by(scenario, controller, forces), values, make_engine(workers, None), report)
+
+
+def campaign(
+    campaign: str | Path | Scenario,
+    *,
+    out: str | Path | None = None,
+    vary: Sequence[Mapping[str, Any]] = (),
+    flights: int | None = None,
+    seed: int | None = None,
+    changes: Sequence[str] = (),
+    controller: object = None,
+    forces: Sequence[object] = (),
+    require: Sequence[str] = (),
+    workers: int | None = None,
+    cluster: str | None = None,
+    resume: bool = False,
+    until_width: float | None = None,
+    report: bool = True,
+    progress: bool | Literal["lines"] = True,
+    **fields: Any,
+) -> Result:
+    """Fly a scenario many times, what may vary drawn at random.
+
+    Args:
+        campaign: one that ships or a campaign file; or a scenario, with the following in place of the file.
+        out: its directory, `runs/campaigns/NAME` where absent.
+        vary: of a scenario: what varies, entries as `[[vary]]` of a campaign file.
+        flights: how many, instead of the file's.
+        seed: of all draws, instead of the file's.
+        changes: of a file: texts `dotted.path=value` that change fields of its scenario.
+        controller: of a scenario: who flies, as of `sweep`.
+        forces: of a scenario: what acts on it, as of `sweep`.
+        require: requirements as texts, e.g. `P(failure) < 0.02`, that `judgements` judges.
+        workers: processes that fly; one per usable core where absent.
+        cluster: a dask cluster that flies instead, as of `--cluster`.
+        resume: whether to go on with what the directory holds.
+        until_width: width of the 95 % interval of the failure probability, from 0 to 1, at which to stop.
+        report: whether to write the page and its figure.
+        progress: whether to show a bar on a terminal; "lines" for a line now and then where stderr is none.
+        **fields: of a scenario: other fields of a campaign file, as `name`, `failure` or `sampling`.
+
+    Returns:
+        The results: `table` (a row per flight), `summary` (estimates with their intervals), and the `directory`.
+
+    Raises:
+        InputError: something cannot be flown so.
+        OutputError: a campaign is there already, or the directory cannot be written.
+        KeyboardInterrupt: a person stopped it; what was flown is there, and `resume` goes on with it.
+
+    Examples:
+        >>> import tempfile, quadsim
+        >>> scenario = quadsim.load("hover").replace({"duration": 1.0})
+        >>> mass = {"name": "mass", "fields": ["vehicle.mass"], "distribution": "uniform", "low": 4.0, "high": 4.4}
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     found = quadsim.campaign(scenario, vary=[mass], flights=3, workers=1, out=folder + "/mass")
+        >>> found.table["verdict"].to_pylist()
+        ['satisfied', 'satisfied', 'satisfied']
+    """
+    from scenarios.campaign.plan import load_plan, make_plan
+    from scenarios.campaign.results.events import parse_event
+    from scenarios.campaign.run import fly_campaign
+    from scenarios.campaign.statistics.requirement import judge, parse_requirement
+    from scenarios.commands.campaign_console import progress as bar
+
+    if cluster is not None and workers is not None:
+        raise ParameterError("", "--workers", workers, "absent where --cluster says who flies")
+    requirements = [parse_requirement(text) for text in require]
+    if isinstance(campaign, Scenario):
+        asked = {"vary": [dict(entry) for entry in vary], "flights": flights, "seed": seed, **fields}
+        given = {name: value for name, value in asked.items() if value is not None}
+        plan = make_plan(flown_by(campaign, controller, forces), given)
+    elif vary or fields or controller is not None or forces:
+        raise InputError("vary, controller and other fields go with a scenario; a campaign file has its own")
+    else:
+        plan = load_plan(str(campaign), changes, flights=flights, seed=seed)
+    for requirement in requirements:
+        parse_event(requirement.event.text, plan.columns)
+    target = real_path(Path("runs") / "campaigns" / plan.spec.name if out is None else out)
+    engine = make_engine(workers, cluster)
+    try:
+        with bar(enabled=bool(progress), lines=progress == "lines") as watch:
+            result = fly_campaign(
+                plan, target, engine, resume=resume, until_width=until_width, report=report, watch=watch
+            )
+    except KeyboardInterrupt:
+        raise KeyboardInterrupt(f"{target} has what was flown") from None
+    return replace(result, judgements=tuple(judge(result.table, requirement) for requirement in requirements))
+
+
+def replay(
+    campaign: str | Path,
+    flight: int | None = None,
+    *,
+    out: str | Path | None = None,
+    video: bool = True,
+    recording: bool = True,
+    figures: bool = True,
+    progress: Progress | bool = True,
+) -> Replay:
+    """Fly one flight of a finished campaign again, with everything that a run directory has.
+
+    Args:
+        campaign: its directory.
+        flight: which; the worst where absent.
+        out: the run directory, `runs/CAMPAIGN-N` where absent.
+        video: whether to film it.
+        recording: whether to write `flight.rrd`.
+        figures: whether to draw it.
+        progress: as of `fly`.
+
+    Returns:
+        The flight, and the columns of the campaign's table that it does not agree with, bit for bit.
+
+    Raises:
+        InputError: there is no such campaign or flight.
+        OutputError: the directory cannot be written.
+
+    Examples:
+        >>> import tempfile, quadsim
+        >>> scenario = quadsim.load("hover").replace({"duration": 0.5})
+        >>> mass = {"name": "mass", "fields": ["vehicle.mass"], "distribution": "uniform", "low": 4.0, "high": 4.4}
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     found = quadsim.campaign(scenario, vary=[mass], flights=2, workers=1, out=folder + "/mass")
+        ...     again = quadsim.replay(found.directory, 1, out=folder + "/again", video=False)
+        >>> len(again.differing)  # columns that are not the same bit for bit
+        0
+    """
+    from scenarios.campaign.replay import recorded_flight, replay_flight
+
+    recorded = recorded_flight(Path(campaign), flight)
+    for note in recorded.notes:
+        logging.getLogger("quadsim").info(note)
+    target = real_path(Path("runs") / recorded.scenario.name if out is None else out)
+    outputs = Outputs(video=video, recording=recording, figures=figures)
+    with reporting(progress) as report:
+        return replay_flight(recorded, target, outputs, report)
+
+
+def flown_by(scenario: Scenario, controller: object, forces: Sequence[object] = ()) -> Scenario:
+    """The same, of code that other processes import by its place.
+
+    Raises:
+        ParameterError: they cannot.
+    """
+    if controller is not None and not isinstance(controller, str):
+        require_importable(controller)
+    for force in forces:
+        require_importable(force, "forces")
+    return named_by(scenario, controller, forces)
+
+
+def make_engine(workers: int | None, cluster: str | None) -> Engine:
+    """Who flies a campaign: processes of this machine, or a dask cluster."""
+    if cluster is None:
+        from scenarios.campaign.engine.local import LocalEngine
+
+        return LocalEngine(workers)
+    from scenarios.campaign.engine.cluster import DaskEngine
+
+    return DaskEngine(cluster)
+
+
+def reproduce(paper: str | Path | None = None, *, progress: Progress | bool = True) -> tuple[Reproduction, ...]:
+    """Fly what papers publish, and hold it against their numbers.
+
+    Args:
+        paper: a name, or a path ending in `.toml`; every paper that ships where absent.
+        progress: as of `fly`.
+
+    Returns:
+        A reproduction for each paper: its `numbers`, each with `published`, `ours`, `difference` and `within`.
+
+    Raises:
+        InputError: there is no such paper, or a number of it cannot be flown.
+
+    Examples:
+        >>> import quadsim
+        >>> (found,) = quadsim.reproduce("quadrotor-uav")  # doctest: +SKIP
+        >>> found.within  # doctest: +SKIP
+        True
+    """
+    from scenarios.papers.paper import load_paper
+    from scenarios.papers.reproduction import reproduce_paper
+
+    papers = [load_paper(name) for name in ([str(paper)] if paper is not None else paper_names())]
+    with reporting(progress) as report:
+        return tuple(reproduce_paper(each, report) for each in papers)

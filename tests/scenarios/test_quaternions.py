@@ -1,0 +1,92 @@
+"""Flights that may turn upside down: what is logged of their attitude, and what controllers receive of it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mpc.fallback.completion import completed_moment
+from mpc.nonlinear.rigidbody import thrust_axis
+from quadsim.controller import Command, Moment
+from quadsim.flight.parquet import log_tables, read_log, write_log
+from quadsim.state import ANGLE_RATES, ANGLES, N_STATES, Array, euler_to_body_rates, quaternion_to_euler, tilt
+from scenarios.flight import Flight
+from scenarios.loading import load_scenario
+from scenarios.run import fly_scenario
+
+
+@pytest.fixture(scope="module")
+def inverted() -> Flight:
+    return fly_scenario(load_scenario("inverted-start", ["duration=1", *ARRIVED]))
+
+
+ARRIVED = [f"constraints.{name}.start=0.9" for name in ("back_upright", "back_in_height")]
+
+
+class Listener:
+    """Holds the rotors at one speed and keeps what it is told."""
+
+    name, solver, horizon = "listener", "", 1
+
+    def reset(self, speeds: Array) -> None:
+        self.speeds, self.heard = speeds, list[tuple[Moment, Array]]()
+
+    def step(self, now: Moment, state: Array, reference: Array) -> Command:
+        self.heard.append((now, state))
+        return Command(speeds=self.speeds, plan=self.speeds[None])
+
+
+def test_attitude_and_body_rates_are_logged_and_read_back(inverted: Flight, tmp_path: Path) -> None:
+    log = inverted.log
+    write_log(tmp_path, log, plant_stride=5, metadata={})
+    again = read_log(tmp_path)
+    assert again.control.attitude is not None
+    assert again.plant.attitude is not None
+    np.testing.assert_array_equal(again.control.attitude, log.control.attitude)
+    np.testing.assert_array_equal(again.control.body_rates, log.control.body_rates)
+    assert log.plant.attitude is not None
+    np.testing.assert_array_equal(again.plant.attitude, log.plant.attitude[::5])
+    assert np.abs(np.diff(log.plant.attitude, axis=0)).max() < 0.05  # without a jump of the sign
+    np.testing.assert_allclose(tilt(log.plant.state), np.arccos(thrust_axis(log.plant.attitude)[:, 2]), atol=1e-6)
+    assert np.degrees(tilt(log.plant.state)).max() == pytest.approx(180.0, abs=0.1)
+
+
+def test_other_flights_have_no_such_columns() -> None:
+    tables = log_tables(fly_scenario(load_scenario("hover", ["duration=0.2"])).log, metadata={})
+    for name in ("flight", "plant"):
+        assert not {"qw", "body_rate_x"} & set(tables[name].column_names)
+
+
+@pytest.mark.parametrize("name", ["hover", "raw-sensors", "motion-capture"])
+def test_controllers_receive_the_attitude_that_belongs_to_their_state(name: str) -> None:
+    law = Listener()
+    fly_scenario(load_scenario(name, ["duration=1"]), law=law)
+    before = None
+    for now, state in law.heard:
+        assert now.attitude is not None
+        assert now.body_rates is not None
+        euler = quaternion_to_euler(now.attitude)
+        turned = np.angle(np.exp(1j * (euler - state[ANGLES])))
+        np.testing.assert_allclose(turned, 0.0, atol=1e-9)
+        np.testing.assert_allclose(euler_to_body_rates(state[ANGLES], state[ANGLE_RATES]), now.body_rates, atol=1e-9)
+        assert before is None or before @ now.attitude > 0.0
+        before = now.attitude
+
+
+def test_predicted_channels_are_not_passed_on_as_measured() -> None:
+    now = Moment(attitude=np.array([1.0, 0.0, 0.0, 0.0]), body_rates=np.ones(3))
+    known, seen = np.zeros(N_STATES), np.zeros(N_STATES)
+    whole = completed_moment(now, np.ones(4), seen, known)
+    assert whole.attitude is now.attitude
+    assert whole.body_rates is now.body_rates
+    for channels, attitude, rates in ((ANGLES, None, now.body_rates), (ANGLE_RATES, now.attitude, None)):
+        unseen = seen.copy()
+        unseen[channels] = 1.0
+        partly = completed_moment(now, np.ones(4), unseen, known)
+        assert partly.attitude is attitude
+        assert partly.body_rates is rates
+    steep = known.copy()
+    steep[8] = 1.55  # where rates of Euler angles are beyond belief, those of the body are not
+    assert completed_moment(now, np.ones(4), unseen, steep).body_rates is now.body_rates
