@@ -118,7 +118,7 @@ class Course:
 
     def plan(self, law: NonlinearMPC, question: Question, time: float) -> Array:
         """(N, 4) inputs that our controller answers."""
-        state = np.zeros(N_STATES[case])
+        state = np.zeros(N_STATES)
         state[POSITIONS], state[VELOCITIES] = question.state[:3], question.state[7:10]
         moment = Moment(
             time=time,
@@ -147,7 +147,7 @@ def _turned(q: Array, by: Array) -> Array:
 def optima(case: Case) -> Iterator[tuple[Found, Array]]:
     """IPOPT's optimum and our inputs (N, 4), converged, at random states along the course."""
     course, peer, rng = Course(case), Peer(case), np.random.default_rng(17)
-    law = course.law(iterations=100, tolerance=1e-8)
+    law = course.law(iterations=300, tolerance=1e-9)
     for k in rng.integers(0, len(course.motion) - 50, STATES[case]).tolist():
         question = course.question(k, rng, None, None)
         law.reset(course.speeds(question.before))
