@@ -27,6 +27,7 @@ TITLES: dict[Group, str] = {
     "air": "Wind, drag and rotors that lag",
     "faults": "Faults, loads and slow computers",
     "ground": "Take-off, landing and the ground",
+    "space": "Obstacles, windows and corridors",
     "sensors": "Sensors and estimation",
 }
 HEAD = (
@@ -63,7 +64,7 @@ def _share(finding: Finding) -> float:
     limit = finding.limit
     bounds = [abs(bound) for bound in (limit.lower, limit.upper) if math.isfinite(bound)]
     left = min(finding.worst_margin + limit.tolerance, finding.worst_margin_sampled + limit.tolerance_sampled)
-    return round(left / max(*bounds, limit.tolerance), 2)  # of equals the first: rounding decides nothing
+    return round(left / (max(*bounds, limit.tolerance) or 1.0), 2)  # of equals the first: rounding decides nothing
 
 
 def _criteria() -> str:

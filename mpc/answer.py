@@ -62,7 +62,7 @@ class ActuatorBounds:
     def of_problem(cls, problem: Problem) -> ActuatorBounds:
         """What an optimisation's hard rows on single inputs, or on single steps, leave in every period."""
         rows, nu = problem.rows, problem.model.nu
-        hard = np.isinf(rows.l1) & ~rows.C.any(axis=1)
+        hard = np.isinf(rows.l1) & ~rows.on_states
         found = []
         for rate, other in ((rows.D, rows.E), (rows.E, rows.D)):
             alone = hard & (np.count_nonzero(rate, axis=1) == 1) & ~other.any(axis=1)

@@ -11,6 +11,8 @@ from mpc.exact.shortcut import with_shortcut
 from mpc.ocp import Problem, Query, Unanswered
 from mpc.paper.prediction import rollout
 from mpc.solvers import INVALID_DATA, Answer, Solver, Way
+from mpc.space.clearing import Clearing
+from mpc.space.halfspaces import Space
 from quadsim.controller import GROUNDED, Command, Moment, Phase, stopped
 from quadsim.errors import PlanExhaustedError
 from quadsim.state import Array
@@ -23,7 +25,7 @@ class ConstrainedMPC:
     then `unconstrained`.  Only an answer that is the optimum, finite, and whose first action is within the hard input
     bounds is used.  Otherwise the previous plan, shifted by one step, is held (fallback level 1) for as long as it
     lasts, and then the flight is given up.  `shortcut`: whether to try less than the whole QP first
-    (`mpc.exact.shortcut`); the commands are the same.
+    (`mpc.exact.shortcut`); the commands are the same.  `space`: what to keep clear of.
 
     Attributes:
         problem: as given.
@@ -33,9 +35,12 @@ class ConstrainedMPC:
     name: Final = "constrained"
     _plan: Array | None
 
-    def __init__(self, problem: Problem, solver: Solver, *, shortcut: bool = True) -> None:
+    def __init__(self, problem: Problem, solver: Solver, *, shortcut: bool = True, space: Space | None = None) -> None:
         self.problem, self.horizon, self.solver = problem, problem.horizon, solver.name
         self._solver = with_shortcut(problem, solver) if shortcut else solver
+        self._clearing = (
+            None if space is None else Clearing(problem, lambda query: self._solver.solve(*query[:4]), space)
+        )
         self._bounds = ActuatorBounds.of_problem(problem)
         self._before, self._plan, self._held = problem.model.u_bar, None, 0
         self.unanswered: Unanswered | None = None
@@ -45,6 +50,8 @@ class ConstrainedMPC:
         self._before, self._plan, self._held = np.array(speeds, float), None, 0
         self.unanswered = None
         self._solver.reset()
+        if self._clearing is not None:
+            self._clearing.reset()
 
     def step(self, now: Moment, state: Array, reference: Array) -> Command:
         """See `quadsim.controller.Controller.step`.
@@ -59,8 +66,12 @@ class ConstrainedMPC:
         if now.phase in GROUNDED:
             return self._stop(now.phase)
         query = Query(state, self.problem.objective.desired(reference), self._before)
-        answer = self._solver.solve(query.state, query.desired, query.u_before)
-        return self._take(answer) if answer.way is Way.FREE else self._follow(now.time, query, answer)
+        problem = self.problem
+        if self._clearing is None:
+            answer = self._solver.solve(query.state, query.desired, query.u_before)
+        else:
+            answer, problem, _ = self._clearing.solve(now.time, query)
+        return self._take(answer) if answer.way is Way.FREE else self._follow(now.time, problem, query, answer)
 
     def predict(self, states: Array, plans: Array) -> Array:
         """See `quadsim.controller.Controller.predict`."""
@@ -77,18 +88,18 @@ class ConstrainedMPC:
         solution = answer.solution
         return Command(speeds=answer.plan[0].copy(), plan=answer.plan, status=solution.status, solve_s=solution.solve_s)
 
-    def _follow(self, time: float, query: Query, answer: Answer) -> Command:
-        problem = rejection(answer.solution.status, answer.plan[0], answer.plan, self._bounds, self._before)
-        if problem not in (None, INVALID_DATA) and self.unanswered is None:
-            self.unanswered = Unanswered(problem=self.problem, query=query, status=problem, time=time)
-        if problem is None:
+    def _follow(self, time: float, problem: Problem, query: Query, answer: Answer) -> Command:
+        refused = rejection(answer.solution.status, answer.plan[0], answer.plan, self._bounds, self._before)
+        if refused not in (None, INVALID_DATA) and self.unanswered is None:
+            self.unanswered = Unanswered(problem=problem, query=query, status=refused, time=time)
+        if refused is None:
             self._plan, self._held = answer.plan, 0
         elif self._plan is None or self._held + 1 >= self.horizon:
             held = f"after holding the last plan for {self._held} periods" if self._held else "with no plan to hold"
-            raise PlanExhaustedError(f"the solver answered {problem!r} {held}", time=time)
+            raise PlanExhaustedError(f"the solver answered {refused!r} {held}", time=time)
         else:
             self._held += 1
         self._before = self._bounds.clip(self._plan[self._held], self._before)
-        if problem is None:
+        if refused is None:
             return command_of(self._before, self._plan, answer.solution.status, answer)
-        return command_of(self._before, shifted(self._plan, self._held), problem, answer, fallback=1)
+        return command_of(self._before, shifted(self._plan, self._held), refused, answer, fallback=1)

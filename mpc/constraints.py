@@ -35,13 +35,14 @@ class Penalty:
 class Constraint:
     """lower <= C x(k+i) + D u(k+i) + E (u(k+i) - u(k+i-1)) <= upper.
 
-    Rows of states alone hold at x(k+1) .. x(k+N), all others at i = 0 .. N-1.
+    Rows of states alone hold at x(k+1) .. x(k+N), all others at i = 0 .. N-1.  Where rows differ from step to step, as
+    half-spaces along a plan do, C has them all: entry i is for x(k+i+1).
     """
 
     name: str  # as messages and audits name it
     lower: Array  # (m,), or (N, m) where the steps' bounds differ; infinite where there is no bound
     upper: Array  # likewise
-    C: Array | None = None  # (m, n); None for zeros
+    C: Array | None = None  # (m, n), or (N, m, n) where the steps' rows differ; None for zeros
     D: Array | None = None  # (m, nu); likewise
     E: Array | None = None  # (m, nu); likewise
     penalty: Penalty | None = None  # what violating it costs; None for a hard constraint
@@ -50,10 +51,12 @@ class Constraint:
         _check_order(f"{self.name}.lower", self.lower, "upper", self.upper)
         m = self.lower.shape[-1]
         given = [matrix for matrix in (self.C, self.D, self.E) if matrix is not None]
-        if not given or any(len(matrix) != m for matrix in given):
-            raise ParameterError("controller", self.name, [len(matrix) for matrix in given], f"{m} rows")
+        if not given or any(matrix.shape[-2] != m for matrix in given):
+            raise ParameterError("controller", self.name, [matrix.shape[-2] for matrix in given], f"{m} rows")
         if not all(np.isfinite(matrix).all() for matrix in given):
             raise ParameterError("controller", self.name, given, "finite numbers")
+        if self.C is not None and self.C.ndim == 3 and (self.D is not None or self.E is not None):
+            raise ParameterError("controller", self.name, self.C.shape, "rows of states alone where they differ")
         if self.penalty is not None and self.penalty.l1.size != m:
             raise ParameterError("controller", "l1", self.penalty.l1.shape, f"of shape ({m},)")
 
@@ -123,7 +126,7 @@ class Bounds:
 class Rows:
     """The rows of all constraints that bound anything, m of them, in the constraints' order."""
 
-    C: Array  # (m, n)
+    C: Array  # (m, n), or (N, m, n) where the steps' rows differ
     D: Array  # (m, nu)
     E: Array  # (m, nu)
     lower: Array  # (N, m)
@@ -134,6 +137,11 @@ class Rows:
     of_states: np.ndarray[tuple[int], np.dtype[np.bool_]]
     input: Indices  # (m,) the input that a hard row bounds by itself; -1 where it is no such row
     names: tuple[str, ...]  # (m,) of their constraints
+
+    @cached_property
+    def on_states(self) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
+        """(m,) whether states are in a row at all."""
+        return np.asarray(self.C.any(axis=(0, 2) if self.C.ndim == 3 else 1)).reshape(len(self.D))
 
     @cached_property
     def soft(self) -> Indices:

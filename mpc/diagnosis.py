@@ -195,7 +195,7 @@ def _sides(problem: Problem) -> dict[Side, Constraint]:
     for place, (part, scales) in enumerate(zip(problem.every_constraint, _scales(problem), strict=True)):
         for row in range(scales.size if part.penalty is None else 0):
             matrices = {
-                name: None if matrix is None else matrix[[row]] / scales[row]
+                name: None if matrix is None else matrix[..., [row], :] / scales[row]
                 for name, matrix in (("C", part.C), ("D", part.D), ("E", part.E))
             }
             for upper in (False, True):

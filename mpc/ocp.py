@@ -129,7 +129,8 @@ class Problem:
             m = constraint.lower.shape[-1]
             for name, matrix, columns in (("C", constraint.C, n), ("D", constraint.D, nu), ("E", constraint.E, nu)):
                 if matrix is not None:
-                    _check_shape(f"{constraint.name}.{name}", matrix, (m, columns))
+                    steps = (self.horizon,) if matrix.ndim == 3 else ()
+                    _check_shape(f"{constraint.name}.{name}", matrix, (*steps, m, columns))
             if constraint.lower.ndim == 2:
                 _check_shape(f"{constraint.name}.lower", constraint.lower, (self.horizon, m))
 
@@ -155,9 +156,16 @@ class Problem:
             raise ValueError("a constrained MPC needs a problem with bounds")
         N, n, nu = self.horizon, self.model.n, self.model.nu
         parts = [(part, part.lower.shape[-1]) for part in constraints]
+        differing = (N,) if any(part.C is not None and part.C.ndim == 3 for part in constraints) else ()
         C, D, E = (
-            np.concatenate([np.zeros((m, size)) if (M := getattr(part, name)) is None else M for part, m in parts])
-            for name, size in (("C", n), ("D", nu), ("E", nu))
+            np.concatenate(
+                [
+                    np.broadcast_to(0.0 if (M := getattr(part, name)) is None else M, (*steps, m, size))
+                    for part, m in parts
+                ],
+                axis=-2,
+            )
+            for name, size, steps in (("C", n, differing), ("D", nu, ()), ("E", nu, ()))
         )
         lower, upper = (
             np.concatenate([np.broadcast_to(getattr(part, side), (N, m)) for part, m in parts], axis=1)
@@ -166,10 +174,11 @@ class Problem:
         l1 = np.concatenate([np.full(m, math.inf) if part.penalty is None else part.penalty.l1 for part, m in parts])
         l2 = np.concatenate([np.zeros(m) if part.penalty is None else part.penalty.l2 for part, m in parts])
         names = [part.name for part, m in parts for _ in range(m)]
-        of_input = ~C.any(1) & ~E.any(1) & (np.count_nonzero(D, axis=1) == 1) & (D.max(axis=1, initial=0.0) == 1.0)
+        of_states = C.any(axis=-1) if C.ndim == 2 else C.any(axis=(0, 2))
+        of_input = ~of_states & ~E.any(1) & (np.count_nonzero(D, axis=1) == 1) & (D.max(axis=1, initial=0.0) == 1.0)
         bounded = np.flatnonzero((np.isfinite(lower) | np.isfinite(upper)).any(axis=0))
         return Rows(
-            C=C[bounded],
+            C=C[..., bounded, :],
             D=D[bounded],
             E=E[bounded],
             lower=lower[:, bounded],

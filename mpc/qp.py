@@ -61,7 +61,7 @@ class QPRows:
     """A problem's rows as a QP has them: bounds of single inputs in the box, a soft row as two with the same slack.
 
     Attributes:
-        C, D, E: (K, n), (K, nu), (K, nu).
+        C, D, E: (K, n), or (N, K, n) where the steps' rows differ, (K, nu), (K, nu).
         slack: (K, m_s) how slacks enter.
         lower, upper: (N, K).
         of_states: (K,) see `mpc.constraints.Rows`.
@@ -78,9 +78,14 @@ class QPRows:
         above = rows.soft[np.isfinite(rows.upper[:, rows.soft]).any(axis=0)]
         below = rows.soft[np.isfinite(rows.lower[:, rows.soft]).any(axis=0)]
         self._origin = origin = np.concatenate([hard, above, below])
-        of_rows = np.eye(len(rows.C))[:, rows.soft]
+        of_rows = np.eye(len(rows.D))[:, rows.soft]
         self.slack = np.concatenate([np.zeros((hard.size, rows.soft.size)), 0.0 - of_rows[above], of_rows[below]])
-        self.C, self.D, self.E, self.of_states = rows.C[origin], rows.D[origin], rows.E[origin], rows.of_states[origin]
+        self.C, self.D, self.E, self.of_states = (
+            rows.C[..., origin, :],
+            rows.D[origin],
+            rows.E[origin],
+            rows.of_states[origin],
+        )
         self.lower, self.upper = rows.lower[:, origin].copy(), rows.upper[:, origin].copy()
         self.lower[:, hard.size : hard.size + above.size] = -np.inf
         self.upper[:, hard.size + above.size :] = np.inf
@@ -91,13 +96,13 @@ class QPRows:
         # (N, K) bounds that rows of one side set to their multipliers, and (m, nu) which input a row bounds
         self._least = np.where(np.isneginf(self.lower), 0.0, -np.inf)
         self._most = np.where(np.isposinf(self.upper), 0.0, np.inf)
-        self._of_box = np.zeros((len(rows.C), problem.model.nu))
+        self._of_box = np.zeros((len(rows.D), problem.model.nu))
         self._of_box[self._boxed, rows.input[self._boxed]] = 1.0
 
     def multipliers(self, z: Array, z_inputs: Array) -> Array:
         """(N, m) multipliers of the problem's rows, from those of the QP's rows (N K,) and of inputs (N nu,)."""
         N = len(self.lower)
-        found = np.zeros((N, len(self._whole.C)))
+        found = np.zeros((N, len(self._whole.D)))
         for column, row in zip(z.reshape(N, -1).T, self._origin, strict=True):
             found[:, row] += column
         left = z_inputs.reshape(N, -1).copy()

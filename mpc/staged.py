@@ -125,6 +125,7 @@ class Matrices:
     P: csc_matrix  # cost
     dynamics: csc_matrix  # equality rows
     rows: csc_matrix  # inequality rows
+    own: QPRows  # what these are
 
 
 class MatrixBuilder:
@@ -161,7 +162,11 @@ class MatrixBuilder:
             (numbers[at.L :, now].reshape(stages, at.M, now.size), at.tail[:, None]),
             (numbers[cuts][:, now], at.lasts),
         ]
-        self._G = Pattern((numbers.size, at.size), inequalities, self._inequalities(head, tail), rounding)
+        self._G = Pattern((numbers.size, at.size), inequalities, self._inequalities(head, tail, rows), rounding)
+
+    def renew(self, matrices: Matrices, rows: QPRows) -> Matrices:
+        """The matrices with rows of the same pattern and other numbers."""
+        return replace(matrices, rows=self._G.matrix(self._inequalities(matrices.head, matrices.tail, rows)), own=rows)
 
     def build(self, A: Array, B: Array) -> Matrices:
         """The matrices of A (N, n, n), B (N, n, nu)."""
@@ -173,7 +178,8 @@ class MatrixBuilder:
             tail=tail,
             P=self._P.matrix(self._costs(head, tail)),
             dynamics=self._A.matrix(self._dynamics(head, tail)),
-            rows=self._G.matrix(self._inequalities(head, tail)),
+            rows=self._G.matrix(self._inequalities(head, tail, self._rows)),
+            own=self._rows,
         )
 
     def _slopes(self, A: Array, B: Array) -> tuple[Array, Array]:
@@ -214,18 +220,23 @@ class MatrixBuilder:
         starts = np.broadcast_to(np.eye(self._at.n), (len(self._at.starts), self._at.n, self._at.n))
         return [-head[:, -1], -tail[:, -1], starts]
 
-    def _inequalities(self, head: Array, tail: Array) -> list[Array]:
+    def _inequalities(self, head: Array, tail: Array, rows: QPRows) -> list[Array]:
         """G's blocks."""
-        at, rows, later, now = self._at, self._rows, self._later, self._now
+        at, later, now = self._at, self._later, self._now
         slack = np.broadcast_to(rows.slack, (at.N, *rows.slack.shape))
         before = np.broadcast_to(-rows.E[now], (len(at.lasts), now.size, at.nu))
+        C = rows.C[..., later, :]
+        first, middle, last, of_inputs = C, C, C, rows.C[..., now, :]
+        if C.ndim == 3:  # of states alone, which hold at the next step: the others are the same at all steps
+            first, middle, last = C[: at.L - 1], C[at.L - 1 : -1].reshape(len(tail), at.M, *C.shape[1:]), C[-1]
+            of_inputs = of_inputs[0]
         return [
-            rows.C[later] @ head[0, 1:-1],
-            rows.C[later] @ tail[:, :-1],
-            rows.C[later],
+            first @ head[0, 1:-1],
+            middle @ tail[:, :-1],
+            last,
             slack,
-            self._inputs_too(rows.C[now] @ head[:, :-1], at.L)[0],
-            self._inputs_too(rows.C[now] @ tail[:, :-1], at.M),
+            self._inputs_too(of_inputs @ head[:, :-1], at.L)[0],
+            self._inputs_too(of_inputs @ tail[:, :-1], at.M),
             before,
         ]
 
@@ -291,12 +302,19 @@ class Staged:
         """The QP's matrices for a model A (N, n, n), B (N, n, nu) that changes."""
         return self._builder.build(A, B)
 
-    def vectors(self, state: Array, desired: Array, u_before: Array, rest: Rest | None = None) -> Vectors:
-        """See `mpc.qp.Formulation.vectors`."""
+    def vectors(
+        self,
+        state: Array,
+        desired: Array,
+        u_before: Array,
+        rest: Rest | None = None,
+        matrices: Matrices | None = None,
+    ) -> Vectors:
+        """See `mpc.qp.Formulation.vectors`; with `matrices` that were `renewed`."""
         model, (x_s, u_s) = self._problem.model, self._problem.rest if rest is None else rest
         c = x_s - model.A @ x_s - model.B @ u_s
         every = np.broadcast_to(c, (self._at.N, c.size))
-        return self.changed_vectors(self.fixed, every, state, desired, u_before, Rest(x_s, u_s))
+        return self.changed_vectors(matrices or self.fixed, every, state, desired, u_before, Rest(x_s, u_s))
 
     def changed_vectors(
         self, matrices: Matrices, c: Array, state: Array, desired: Array, u_before: Array, rest: Rest
@@ -305,7 +323,7 @@ class Staged:
 
         At `rest` is what the cost pulls inputs to, and where the terminal weight is about.
         """
-        at, rows, objective = self._at, self._rows, self._problem.objective
+        at, rows, objective = self._at, matrices.own, self._problem.objective
         head, tail = (part[..., 0] for part in self._offsets(matrices, c, state))
         (Q, W), (Q_end, W_end) = objective.weights, objective.terminal_weights
         # Entry i is for x(k+i), i = 0 .. N-1; x(k) itself is past changing, and its slopes are zero.
@@ -320,8 +338,12 @@ class Staged:
         gradient[at.starts[-1]] = -2.0 * (W_end @ (desired[-1] - objective.C_r @ rest.x) + Q_end @ rest.x)
         gradient[at.inputs] -= rest.u @ (2.0 * objective.Q_u)
         gradient[at.inputs[0]] -= 2.0 * objective.move_weight @ u_before
-        values = known @ rows.C.T * ~rows.of_states
-        values[:-1] += known[1:] @ rows.C.T * rows.of_states
+        if rows.C.ndim == 2:
+            values = known @ rows.C.T * ~rows.of_states
+            values[:-1] += known[1:] @ rows.C.T * rows.of_states
+        else:
+            values = (rows.C @ known[:, :, None])[..., 0] * ~rows.of_states
+            values[:-1] += (rows.C[:-1] @ known[1:, :, None])[..., 0] * rows.of_states
         values[0] -= rows.E @ u_before
         return Vectors(
             c=gradient,
@@ -329,6 +351,10 @@ class Staged:
             h_l=(rows.lower - values).ravel(),
             h_u=(rows.upper - values).ravel(),
         )
+
+    def renewed(self, problem: Problem, matrices: Matrices | None = None) -> Matrices:
+        """The fixed or other matrices for a problem that differs in numbers of its constraints' rows alone."""
+        return self._builder.renew(matrices or self.fixed, QPRows(problem))
 
     def changed(self, matrices: Matrices, vectors: Vectors) -> QP:
         """The QP with other matrices and vectors."""

@@ -68,6 +68,7 @@ class Vehicle:
     rotor_radius: Annotated[float | None, doc("[m] R, of a propeller")] = None
     rotor_drag: Annotated[float | None, doc("[N s^2/(m rad)] linear drag of one rotor")] = None
     body_drag: Annotated[Vector | None, doc("[m^2] C_d A along body x, y, z")] = None
+    extent: Annotated[float | None, doc("[m] radius of the ball about the centre of mass that holds all of it")] = None
 
     def __post_init__(self) -> None:
         for name in ("mass", "gravity", "arm_length", "thrust_coefficient", "drag_to_thrust", "speed_max"):
@@ -153,6 +154,18 @@ class Vehicle:
         azimuth = np.radians(self.rotor_azimuths)
         directions = np.stack([np.cos(azimuth), np.sin(azimuth), np.zeros(N_ROTORS)], axis=1)
         return self.arm_length * directions.round(15)  # an arm along an axis lies on it exactly
+
+    @property
+    def enclosing_radius(self) -> float:
+        """Radius of the ball that stands for the vehicle among obstacles [m]: its extent, or to the propellers' tips.
+
+        Without a `rotor_radius` the propellers are as large as can be: neighbours just do not meet.
+        """
+        if self.extent is not None:
+            return self.extent
+        apart = np.linalg.norm(self.rotor_positions[:, None] - self.rotor_positions[None], axis=2)
+        widest = 0.5 * float(apart[~np.eye(N_ROTORS, dtype=bool)].min())
+        return self.arm_length + (widest if self.rotor_radius is None else self.rotor_radius)
 
     @property
     def allocation(self) -> Array:

@@ -47,16 +47,23 @@ def build_plant(scenario: Scenario, vehicle: Vehicle, forces: Sequence[Force] | 
         changes=build_changes(scenario),
         wind=build_wind(scenario, vehicle),
         forces=[build_force(spec, vehicle, rng) for spec in scenario.forces] if forces is None else forces,
+        obstacles=scenario.obstacles,
         rng=generator(scenario.seed, "disturbance"),
     )
 
 
 def build_ground(scenario: Scenario, vehicle: Vehicle) -> PhaseMonitor | None:
-    """What knows where the flight stands with the ground; None where there is none."""
+    """What knows where the flight stands with the ground and obstacles; None where there are none."""
     ground = scenario.effects.ground
-    if ground is None or not ground.contact:
+    there = ground is not None and ground.contact
+    if not there and not scenario.obstacles:
         return None
-    return PhaseMonitor(outline(vehicle), period=scenario.control_period)
+    return PhaseMonitor(
+        outline(vehicle) if there else None,
+        period=scenario.control_period,
+        obstacles=scenario.obstacles,
+        radius=vehicle.enclosing_radius,
+    )
 
 
 def build_problem(scenario: Scenario, vehicle: Vehicle) -> Problem:
@@ -77,4 +84,5 @@ def build_controller(scenario: Scenario, vehicle: Vehicle) -> Controller:
     Raises:
         InputError: it cannot be made from these numbers, or its code cannot be found or called.
     """
-    return make_controller(scenario.controller, vehicle, scenario.control_period)
+    shapes = (*scenario.obstacles, *scenario.regions)
+    return make_controller(scenario.controller, vehicle, scenario.control_period, shapes)

@@ -10,7 +10,7 @@ import json
 import math
 import tomllib
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Final
 
 import numpy as np
@@ -24,7 +24,7 @@ from quadsim.errors import InputError
 from quadsim.flight.audit import TERMS, sum_signal
 from quadsim.state import N_STATES, REFERENCE_STATES, STATE_NAMES
 from quadsim.vehicle import N_ROTORS, Vehicle
-from scenarios.parts.controllers import make_bounds, make_controller, posed_problem
+from scenarios.parts.controllers import make_bounds, make_controller, make_penalty, posed_problem
 from scenarios.schema.controller import ConstrainedSpec
 from scenarios.schema.optimisation import ANGLES, BoundedSpec, PolytopeSpec
 from scenarios.schema.robust import RobustSpec
@@ -118,6 +118,9 @@ class _Case:
                 entry=int(side.upper),
             )
         polytope = self._polytope(side)
+        if self._is_space(side):
+            name = self._unanswered.problem.every_constraint[side.place].name
+            return _Bound(name=name, rotor=0, side=which, unit="m", factor=1.0, field="", entry=side.row)
         if polytope is None:  # of a kind that this module has no words for
             name = f"{self._unanswered.problem.every_constraint[side.place].name}, row {side.row + 1},"
             return _Bound(name=name, rotor=0, side=which, unit="-", factor=1.0, field="", entry=side.row)
@@ -135,6 +138,11 @@ class _Case:
     def _polytope(self, side: Side) -> PolytopeSpec | None:
         name = self._unanswered.problem.every_constraint[side.place].name
         return next((polytope for polytope in self._spec.polytopes if polytope.name == name), None)
+
+    def _is_space(self, side: Side) -> bool:
+        """Whether it is a half-space of an obstacle or region."""
+        C = self._unanswered.problem.every_constraint[side.place].C
+        return C is not None and C.ndim == 3
 
     def entries(self, conflict: Conflict) -> Iterator[dict[str, Any]]:
         """What is violated, the largest share first, and what is in the way, each with its times and amount."""
@@ -174,6 +182,7 @@ class _Case:
         polytopes = (self._polytope(side) for side in conflict.violated if side.place not in (0, *_ROTORS))
         tables = ["controller.soft"] if any(side.place == 0 for side in conflict.violated) else []
         tables += dict.fromkeys(f"controller.polytopes.{each.name}.soft" for each in polytopes if each is not None)
+        tables += ["controller.avoidance.soft"] if any(map(self._is_space, conflict.violated)) else []
         found = [settings for table in tables if (settings := self._soft([table]))]
         if not found and len(tables) > 1 and (settings := self._soft(tables)):
             found = [settings]
@@ -208,7 +217,10 @@ class _Case:
             problem = posed_problem(spec, self._vehicle, self._period)
         except InputError:
             return False
-        return has_answer(problem, self._unanswered.query)
+        space = tuple(part for part in self._unanswered.problem.constraints if part.C is not None and part.C.ndim == 3)
+        if spec.avoidance is not None and (soft := spec.avoidance.soft) is not None:
+            space = tuple(replace(part, penalty=make_penalty(soft, part.lower.shape[1])) for part in space)
+        return has_answer(replace(problem, constraints=(*problem.constraints, *space)), self._unanswered.query)
 
     def _changed(self, settings: Settings) -> ConstrainedSpec | RobustSpec | None:
         """The controller with other fields; None where the file would be refused."""

@@ -7,14 +7,18 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from quadsim.errors import FileError, ParameterError
 from quadsim.flight.ground import AIRBORNE, TOUCH, clearance
 from quadsim.sim.airframe import outline
 from quadsim.sim.effects.load import Load, mass_properties
 from quadsim.sim.rigid_body import check_free
+from quadsim.state import POSITION
 from quadsim.vehicle import Vehicle
-from scenarios.courses.make import build_course, located
+from scenarios.courses.make import build_course, build_motion, located
 from scenarios.parts.effects import build_changes, moving_air
+from scenarios.parts.limits import space_limits
 from scenarios.parts.vehicle import build_initial_state, build_vehicle
 from scenarios.schema.bases import read_scenario, replaced_tables, retyped
 from scenarios.schema.course import CsvSpec
@@ -38,7 +42,7 @@ def check_parts(scenario: Scenario) -> None:
     mass_properties(vehicle, load, load.payloads)
     moving_air(scenario, vehicle)
     if scenario.plant.integrator == "rk4":
-        check_free(scenario.effects.resolved(vehicle), build_changes(scenario))
+        check_free(scenario.effects.resolved(vehicle), build_changes(scenario), scenario.obstacles)
     course = build_course(scenario)
     if scenario.initial.on_reference and course.derivatives is None:
         rule = f"false where the course states positions alone, as one of type {scenario.reference.type} does"
@@ -46,6 +50,13 @@ def check_parts(scenario: Scenario) -> None:
     ground = scenario.effects.ground
     if ground is not None and (ground.contact or ground.effect):
         _check_start(scenario, vehicle)
+    if limits := space_limits(scenario):
+        start = build_initial_state(scenario, build_motion(scenario, vehicle))[None, list(POSITION)]
+        for limit in limits:
+            clear = float(limit.shape.clearance(np.zeros(1), start)[0]) - limit.radius
+            if limit.start <= 0.0 and clear < -limit.tolerance:
+                ball = f"the radius of {limit.radius:.3g} m of the ball that stands for the vehicle"
+                raise ParameterError("initial", "position", start[0].tolist(), f"clear of {limit.name}, by {ball}")
 
 
 def _check_start(scenario: Scenario, vehicle: Vehicle) -> None:

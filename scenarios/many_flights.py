@@ -233,16 +233,16 @@ def reproduce(paper: str | Path | None = None, *, progress: Progress | bool = Tr
         progress: as of `fly`.
 
     Returns:
-        A reproduction for each paper: its `numbers`, each with `published`, `ours`, `difference` and `within`.
+        A reproduction for each paper: `numbers`, each with `ours`, `difference` and `within`, and a table, `grid`.
 
     Raises:
         InputError: there is no such paper, or a number of it cannot be flown.
 
     Examples:
         >>> import quadsim
-        >>> (found,) = quadsim.reproduce("quadrotor-uav")  # doctest: +SKIP
-        >>> found.within  # doctest: +SKIP
-        True
+        >>> (found,) = quadsim.reproduce("quadrotor-uav", progress=False)
+        >>> found.within, found.numbers[2].spec.published, round(found.numbers[2].ours, 3)
+        (True, 250.0, 250.0)
     """
     from scenarios.papers.paper import load_paper
     from scenarios.papers.reproduction import reproduce_paper

@@ -181,7 +181,8 @@ def _differences(
 
 
 _DEMANDS: Final = (
-    "signal", "terms", "unit", "lower", "upper", "tolerance", "tolerance_sampled", "required", "start", "stop",
+    "signal", "terms", "shape", "radius", "unit", "lower", "upper", "tolerance", "tolerance_sampled", "required",
+    "start", "stop",
 )  # fmt: skip
 """What the scenario says of a constraint."""
 
@@ -191,7 +192,7 @@ def _constraint_differences(
 ) -> Iterator[str]:
     """What a summary says of one constraint otherwise than the tables do."""
     again = rundir.limit_to_json(finding)
-    recorded = {"terms": None, **entry}
+    recorded = {"terms": None, "shape": None, "radius": None, **entry}
     for key in _DEMANDS:
         if recorded[key] != again.get(key):
             yield f"{key} is recorded as {recorded[key]!r:.80}, and is {again.get(key)!r:.80} in the scenario"

@@ -11,7 +11,7 @@ LIBRARY: Final = Path(__file__).resolve().parent / "library"
 CAMPAIGNS: Final = Path(__file__).resolve().parent / "campaigns"
 PAPERS: Final = Path(__file__).resolve().parent / "papers"
 
-Group = Literal["paper", "papers", "courses", "air", "faults", "ground", "sensors", "other"]
+Group = Literal["paper", "papers", "courses", "air", "faults", "ground", "space", "sensors", "other"]
 
 CONTROLLERS: Final = {
     "unconstrained": "the paper's Sec. 4: a constant gain from the unconstrained optimum",

@@ -43,6 +43,8 @@ from mpc.observer import DisturbanceObserver
 from mpc.ocp import Objective, Problem, Query, Rest, Unanswered, lqr_terminal_weight
 from mpc.relinearised import Relinearised
 from mpc.solvers import INVALID_DATA, Answer
+from mpc.space.clearing import Clearing
+from mpc.space.halfspaces import Space
 from quadsim.controller import ACCEPTED, GROUNDED, Command, Moment, Phase, stopped
 from quadsim.errors import ParameterError
 from quadsim.state import (
@@ -133,6 +135,7 @@ class NonlinearMPC:
         settings: NonlinearSettings,
         bounds: ActuatorBounds | None = None,
         constraints: tuple[Constraint, ...] = (),
+        space: Space | None = None,
     ) -> None:
         self.settings, self._vehicle, self._period = settings, vehicle, period
         self._bounds = ActuatorBounds.of_vehicle(vehicle) if bounds is None else bounds
@@ -154,6 +157,7 @@ class NonlinearMPC:
         small = self.problem.horizon * N_ROTORS <= LARGEST_CONDENSED
         self.solver = settings.solver or ("piqp-dense" if small else "piqp-multistage")
         self._qp = Relinearised(self.problem, self.solver, shortcut=True)
+        self._clearing = None if space is None else Clearing(self.problem, self._solve, space, changing=True)
         self._observer = None if settings.observer is None else DisturbanceObserver(settings.observer, period)
         self._shift = settings.stride == 1 if settings.shift is None else settings.shift
         self._lower, self._upper = self._shares(self._bounds.u_min), self._shares(self._bounds.u_max)
@@ -280,6 +284,8 @@ class NonlinearMPC:
         self._asked: float
         self._velocity = np.zeros(3)  # the reference's in the last period
         self._forget()
+        if self._clearing is not None:
+            self._clearing.reset()
         self.unanswered: Unanswered | None = None
 
     def step(self, now: Moment, state: Array, reference: Array) -> Command:
@@ -308,11 +314,11 @@ class NonlinearMPC:
             self._last, self._velocity = (now.time, measured), nodes.states[0, V]
             self._follow(nodes)
         nodes = self._balanced(nodes)
-        query, answer = self._iterate(measured, nodes)
+        query, answer, problem = self._iterate(now.time, measured, nodes)
         status = self._rejection(answer)
         if status is not None:
             if status != INVALID_DATA and self.unanswered is None:
-                self.unanswered = Unanswered(problem=self.problem, query=query, status=status, time=now.time)
+                self.unanswered = Unanswered(problem=problem, query=query, status=status, time=now.time)
             self._plan = None
             return self._refuse(status, answer)
         shares = np.minimum(np.maximum(answer.plan, self._lower), self._upper)
@@ -322,8 +328,9 @@ class NonlinearMPC:
         return command_of(speeds[0], plan, answer.solution.status, answer)
 
     def predict(self, states: Array, plans: Array) -> Array:
-        """See `quadsim.controller.Controller.predict`."""
-        model = replace(self._model, step=self._period, rotor_lag=None, substeps=1)
+        """See `quadsim.controller.Controller.predict`; with the disturbance estimated last, and without rotor lag."""
+        known = self._acceleration[0]
+        model = replace(self._model, step=self._period, rotor_lag=None, substeps=1, acceleration=known)
         x = np.zeros((len(states), N_BODY))
         x[:, P], x[:, V] = states[:, POSITIONS], states[:, VELOCITIES]
         x[:, Q] = euler_to_quaternion(states[:, ANGLES])
@@ -337,6 +344,11 @@ class NonlinearMPC:
             predicted[:, i, ANGLES] = euler
             predicted[:, i, ANGLE_RATES] = body_to_euler_rates(euler, x[:, W])
         return predicted
+
+    @property
+    def disturbance(self) -> Array:
+        """(6,) estimated acceleration now, world [m/s^2], and angular acceleration, body [rad/s^2]."""
+        return np.concatenate([self._acceleration[0], self._model.angular_acceleration])
 
     def _measured(self, now: Moment, state: Array) -> Array:
         """(n,) the model's state."""
@@ -426,8 +438,13 @@ class NonlinearMPC:
             return nodes_of_motion(now.motion, self._nodes, stride)
         return nodes_of_preview(reference, self._nodes, stride, self._period, self._hover)
 
-    def _iterate(self, measured: Array, nodes: Nodes) -> tuple[Query, Answer]:
-        """Steps of sequential quadratic programming from the plan kept."""
+    def _solve(self, query: Query) -> Answer:
+        assert query.steps is not None
+        assert query.rest is not None
+        return self._qp.solve(*query.steps, *query[:3], query.rest)
+
+    def _iterate(self, time: float, measured: Array, nodes: Nodes) -> tuple[Query, Answer, Problem]:
+        """Steps of sequential quadratic programming from the plan kept; the last problem is that of the answer."""
         frames, n = frames_of(nodes.states[:, Q]), self._model.n
         inputs = self._model.shares(nodes.thrusts)
         wanted = nodes.states.copy()
@@ -452,8 +469,11 @@ class NonlinearMPC:
         for _ in range(self.settings.iterations):
             x, u = self._plan
             query = Query(s0, desired, before, rest, self._steps(x, u, frames))
-            assert query.steps is not None
-            answer = self._qp.solve(*query.steps, s0, desired, before, rest)
+            if self._clearing is None:
+                answer, problem = self._solve(query), self.problem
+            else:
+                answer, problem, states = self._clearing.solve(time, query, along=x[1:, P])
+                self._qp.last = (states, answer.plan) if answer.solution.status in ACCEPTED else None
             if self._qp.last is None:
                 break
             states, plan = self._qp.last[0][:, :n], self._qp.last[1]
@@ -471,7 +491,7 @@ class NonlinearMPC:
                 share = min(max(share / max(undone, SHORTEST), SHORTEST), 1.0)
                 last = step
                 self._plan = x + share * (found - x), u + share * (plan - u)
-        return query, answer
+        return query, answer, problem
 
     def _steps(self, x: Array, u: Array, frames: Array) -> tuple[Array, Array, Array]:
         """A, B, c along a plan of states (N + 1, n) and inputs (N, 4)."""

@@ -65,6 +65,8 @@ def row_maps(rows: Rows | QPRows, maps: Prediction) -> RowMaps:
     Psi, Phi = maps.Psi.reshape(-1, n, maps.Psi.shape[1]), maps.Phi.reshape(-1, n, n)
     N, nu = len(Psi), Psi.shape[2] // len(Psi)
     # Rows of states alone are for x(k+1) .. x(k+N), the others for x(k) .. x(k+N-1).
+    if rows.C.ndim == 3:
+        raise ValueError("a condensed QP takes rows that are the same at all steps; solve these by the staged one")
     later, now = (rows.C * chosen[:, None] for chosen in (rows.of_states, ~rows.of_states))
     of_inputs, of_state = later @ Psi, later @ Phi
     of_inputs[1:] += now @ Psi[:-1]

@@ -42,7 +42,9 @@ from mpc.relinearised import Relinearised
 from mpc.robust.settings import Linearisation as Linearisation
 from mpc.robust.settings import RobustSettings as RobustSettings
 from mpc.solvers import INVALID_DATA, Answer, QPSolver
-from quadsim.controller import GROUNDED, Command, Moment, Phase, stopped
+from mpc.space.clearing import Clearing
+from mpc.space.halfspaces import Space
+from quadsim.controller import ACCEPTED, GROUNDED, Command, Moment, Phase, stopped
 from quadsim.errors import ParameterError
 from quadsim.state import EULER, EULER_RATE, INDEX, N_STATES, REFERENCE_STATES, VELOCITY, Array
 from quadsim.vehicle import N_ROTORS, Vehicle
@@ -85,6 +87,7 @@ class RobustMPC:
         settings: RobustSettings,
         constraints: tuple[Constraint, ...] = (),
         shortcut: bool = True,
+        space: Space | None = None,
     ) -> None:
         if settings.delay > period:
             raise ParameterError("controller", "delay", settings.delay, f"at most the control period of {period} s")
@@ -100,6 +103,8 @@ class RobustMPC:
             self._solver = with_shortcut(problem, whole) if shortcut else whole
         else:
             self._relinearised = Relinearised(problem)
+        changing = settings.linearisation is not Linearisation.HOVER
+        self._clearing = None if space is None else Clearing(problem, self._solve, space, changing=changing)
         self._observer = None if settings.observer is None else DisturbanceObserver(settings.observer, period)
         self.reset(np.full(N_ROTORS, vehicle.hover_speed))
 
@@ -131,6 +136,8 @@ class RobustMPC:
             self._solver.reset()
         else:
             self._relinearised.last = None
+        if self._clearing is not None:
+            self._clearing.reset()
         self._forget()
 
     @np.errstate(over="ignore", invalid="ignore", divide="ignore")  # numbers out of hand are refused, not warned of
@@ -167,14 +174,14 @@ class RobustMPC:
         if now.phase is Phase.FLYING:  # before, the ground holds the vehicle, which is nothing to learn from
             self._ahead = x0
         query = self._query(np.concatenate([x0, self._rotors])[: self._model.n], self._later(reference))
-        answer = self._solve(query)
-        problem = rejection(answer.solution.status, answer.plan[0], answer.plan, self._actuators, self._acting)
-        if problem is not None:
-            if problem != INVALID_DATA and self.unanswered is None:
+        answer, problem = self._answer(now.time, float(x0[_YAW]), query)
+        refused = rejection(answer.solution.status, answer.plan[0], answer.plan, self._actuators, self._acting)
+        if refused is not None:
+            if refused != INVALID_DATA and self.unanswered is None:
                 self.unanswered = Unanswered(
-                    problem=self.problem, query=query, status=problem, time=now.time, delay=self.settings.delay
+                    problem=problem, query=query, status=refused, time=now.time, delay=self.settings.delay
                 )
-            return self._refuse(problem, answer)
+            return self._refuse(refused, answer)
         plan = answer.plan.copy()
         self._acting = plan[0] = self._actuators.clip(plan[0], self._acting)
         return command_of(plan[0], plan, answer.solution.status, answer)
@@ -259,6 +266,16 @@ class RobustMPC:
             return reference
         later = np.concatenate([reference[1:], reference[-1:]])
         return reference + self.settings.delay / self._period * (later - reference)
+
+    def _answer(self, time: float, yaw: float, query: Query) -> tuple[Answer, Problem]:
+        """The optimum, and the problem that it is of."""
+        if self._clearing is None:
+            return self._solve(query), self.problem
+        turned = self.settings.heading and query.steps is None
+        answer, problem, states = self._clearing.solve(time + self.settings.delay, query, yaw if turned else 0.0)
+        if query.steps is not None and self._relinearised.last is not None:
+            self._relinearised.last = (states, answer.plan) if answer.solution.status in ACCEPTED else None
+        return answer, problem
 
     def _solve(self, query: Query) -> Answer:
         if query.steps is None:

@@ -38,13 +38,14 @@ from mpc.constraints import Bounds
 from mpc.model import continuous_model, discretise, lqr
 from quadsim.errors import ParameterError
 from quadsim.fields import NonNegative
-from quadsim.state import INDEX, N_STATES, Array, read_only
+from quadsim.state import INDEX, N_STATES, POSITION, Array, read_only
 from quadsim.vehicle import Vehicle
 
 LARGEST_SHARE: Final = 0.5  # of the room on either side of the middle of an output's bounds, no more is given up
 ERROR_SHARE: Final = 0.1  # output error, as a share of that room, to which the correction answers...
 SPEED_SHARE: Final = 0.025
 """...with about this share of the hover speed (Bryson's rule; Bryson and Ho, 1975, "Applied Optimal Control")."""
+POSITION_ERROR: Final = 0.05  # [m]
 SHORTEST_LAG: Final = 1e-4  # time constant of rotors [s] below which gains cannot be computed; far below any period
 
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(16)
@@ -139,6 +140,30 @@ def margins(
         )
         raise ParameterError("controller.tightening", most, getattr(settings, most), rule)
     return read_only(drawn_in)
+
+
+def position_margins(
+    vehicle: Vehicle,
+    *,
+    period: float,
+    horizon: int,
+    settings: TighteningSettings,
+    rotor_lag: float = 0.0,
+    delay: float = 0.0,
+    estimated: bool = False,
+) -> Array:
+    """By how much half-spaces are tightened along x, y and z at each predicted state, (N, 3) [m].
+
+    The correction weighs an error of `POSITION_ERROR` as it does one of `ERROR_SHARE` of an output's room.  Arguments
+    and errors as of `margins`.
+    """
+    A, B, E = disturbed_model(vehicle, rotor_lag)
+    C = np.eye(len(A))[list(POSITION)]
+    largest = (2.0 if estimated else 1.0) * np.repeat([settings.acceleration, settings.angular_acceleration], 3)
+    basis = observed(A, C)
+    A, B, C, E = basis.T @ A @ basis, basis.T @ B, C @ basis, basis.T @ E
+    K = correction(*discretise(A, B, period), C / POSITION_ERROR, SPEED_SHARE * vehicle.hover_speed)
+    return read_only(growth(A, B, C, E * largest, K, period=period, horizon=horizon, delay=delay))
 
 
 def between_samples(acceleration: float, period: float) -> float:

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from quadsim.errors import InputError, ParameterError, UnknownNameError
 from quadsim.fields import NonNegative, Number
 from quadsim.flight.log import ControlLog, FlightLog, PlantLog
+from quadsim.space import Constraining
 from quadsim.state import (
     EULER,
     INDEX,
@@ -95,6 +96,8 @@ TERMS: Final[dict[str, Signal]] = {
 """What a sum may have as its terms."""
 SUM: Final = "sum"
 """The signal of a limit on a sum of terms."""
+CLEARANCE: Final = "clearance"
+"""The signal of a limit in space: how far the ball that stands for the vehicle stays clear [m]."""
 
 
 def sum_signal(terms: tuple[tuple[str, float], ...]) -> Signal:
@@ -191,6 +194,34 @@ class SumLimit(Limit):
     def source(self) -> Signal:
         """What is bounded."""
         return sum_signal(self.terms)
+
+
+@dataclass(frozen=True, kw_only=True)
+class SpaceLimit(Limit):
+    """An obstacle to keep clear of, or a region to stay in.
+
+    Attributes:
+        shape: the obstacle or region.
+        radius: of the ball that stands for the vehicle [m].
+    """
+
+    signal: str = CLEARANCE
+    lower: float = 0.0
+    shape: Constraining
+    radius: float
+
+    def _check_signal(self) -> None:
+        if self.signal != CLEARANCE:
+            raise UnknownNameError("signal", self.signal, [CLEARANCE])
+
+    @property
+    def source(self) -> Signal:
+        """What is bounded."""
+        return Signal(
+            unit="m",
+            sampled=lambda log: self.shape.clearance(log.t, log.truth[:, POSITION]) - self.radius,
+            plant=lambda log: self.shape.clearance(log.t, log.state[:, POSITION]) - self.radius,
+        )
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from quadsim.errors import FileError
-from quadsim.flight.audit import Finding, Limit, SumLimit
+from quadsim.flight.audit import Finding, Limit, SpaceLimit, SumLimit
 from quadsim.flight.log import FlightLog
 from quadsim.flight.parquet import (
     FLIGHT_FILE,
@@ -25,6 +25,7 @@ from quadsim.flight.summary import SUMMARY_FILE as SUMMARY_FILE
 from quadsim.flight.summary import read_summary as read_summary
 from quadsim.flight.summary import summary_digest
 from quadsim.outputs import LOCK_FILE, MANIFEST_FILE, digest, digest_of, growing, to_json, write_json
+from quadsim.space import shape_from_json, shape_to_json
 from quadsim.vehicle import Vehicle
 
 SCENARIO_FILE: Final = "scenario.toml"
@@ -71,12 +72,13 @@ class Run:
 def limit_to_json(finding: Finding) -> dict[str, Any]:
     """One entry of `constraints` in `summary.json`; an absent bound, or a window the flight never reached, is null."""
     limit = finding.limit
-    stated = {name: value for name, value in vars(limit).items() if name not in ("name", "signal", "terms")}
+    stated = {name: value for name, value in vars(limit).items() if name not in ("name", "signal", "terms", "shape")}
     found = {name: value for name, value in vars(finding).items() if name != "limit"}
     return {
         "name": limit.name,
         "signal": limit.signal,
         **({"terms": dict(limit.terms)} if isinstance(limit, SumLimit) else {}),
+        **({"shape": shape_to_json(limit.shape)} if isinstance(limit, SpaceLimit) else {}),
         "unit": limit.unit,
         **{name: value if math.isfinite(value) else None for name, value in (stated | found).items()},
         "satisfied": finding.satisfied,
@@ -88,6 +90,8 @@ def limit_from_json(entry: Mapping[str, Any]) -> Limit:
     absent = {"lower": -math.inf, "upper": math.inf, "stop": math.inf}
     values = {field.name: entry[field.name] for field in fields(Limit)}
     values |= {name: bound for name, bound in absent.items() if values[name] is None}
+    if entry.get("shape"):
+        return SpaceLimit(shape=shape_from_json(entry["shape"]), radius=float(entry["radius"]), **values)
     if not entry.get("terms"):
         return Limit(**values)
     return SumLimit(terms=tuple((name, float(factor)) for name, factor in entry["terms"].items()), **values)

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from quadsim.errors import FileError, printable
-from quadsim.flight.audit import SIGNALS, SUM, TERMS, sum_signal
+from quadsim.flight.audit import CLEARANCE, SIGNALS, SUM, TERMS, sum_signal
 from quadsim.flight.form import MAYBE_NUMBER, MAYBE_TEXT, NUMBER, Each, Optional, misfits, read_json
 from quadsim.outputs.paths import require_inside
 from quadsim.state import REFERENCE_NAMES, STATE_NAMES
@@ -53,6 +53,8 @@ _CONSTRAINT: Final = {
     **dict.fromkeys(("tolerance", "tolerance_sampled", "start", "time_violated"), NUMBER),
     **dict.fromkeys(("required", "satisfied"), bool),
     "terms": Optional(Each(NUMBER)),
+    "shape": Optional(dict),
+    "radius": Optional(NUMBER),
     **dict.fromkeys(
         ("lower", "upper", "stop", "peak_sampled", "peak_plant", "worst_margin_sampled", "worst_margin", "worst_time"),
         MAYBE_NUMBER,
@@ -68,7 +70,7 @@ _VEHICLE: Final = {
     "rotor_azimuths": [NUMBER],
     "rotor_spins": [int],
     **dict.fromkeys(
-        ("rotor_rise", "rotor_fall", "rotor_inertia", "rotor_radius", "rotor_drag"), Optional(MAYBE_NUMBER)
+        ("rotor_rise", "rotor_fall", "rotor_inertia", "rotor_radius", "rotor_drag", "extent"), Optional(MAYBE_NUMBER)
     ),
     "body_drag": Optional(([NUMBER], type(None))),
 }
@@ -173,6 +175,8 @@ def _unit(entry: Mapping[str, Any]) -> str | None:
     """The unit of a constraint's signal; None where there is no such signal."""
     if entry["signal"] in SIGNALS:
         return SIGNALS[entry["signal"]].unit
+    if entry["signal"] == CLEARANCE:
+        return "m" if "shape" in entry and "radius" in entry else None
     terms = tuple(entry.get("terms", {}).items())
     known = entry["signal"] == SUM and terms and all(name in TERMS for name, _ in terms)
     return sum_signal(terms).unit if known else None

@@ -11,6 +11,7 @@ from typing import Final
 LINES: Final = ("#1b7fc4", "#e69f00", "#009e73", "#cc79a7", "#56b4e9", "#8c6d31")
 REFERENCE: Final = "#7a7f87"
 BOUND: Final = "#dc2f38"
+OBSTACLE: Final = "#b85c48"
 COURSE_COLOUR: Final = LINES[3]
 """Of a curve through a cloud of points."""
 

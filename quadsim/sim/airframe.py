@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Final
 
 import mujoco
@@ -10,6 +11,7 @@ import numpy as np
 from quadsim.assets import models_dir
 from quadsim.flight.ground import Outline
 from quadsim.sim.effects.body_drag import semi_axes
+from quadsim.space import Obstacle
 from quadsim.state import Array, euler_to_quaternion
 from quadsim.vehicle import N_ROTORS, Vehicle
 
@@ -35,6 +37,9 @@ _FRICTION: Final = (0.8, 0.005, 0.0001)
 the others MuJoCo's own."""
 _MEETS: Final = 1
 """The bit of contype and conaffinity by which floor and airframe meet."""
+_MEETS_OBSTACLES: Final = 2
+"""The bit of contype and conaffinity by which obstacles and the ball that stands for the vehicle meet."""
+OBSTACLE_COLOUR: Final = (0.72, 0.36, 0.28, 1.0)
 _RIM: Final = 32
 """Points that stand for the rim of a rotor disc: its lowest point is missed by half a percent of its radius at most."""
 DRAG: Final = "drag"
@@ -71,6 +76,7 @@ def compile_model(
     reweighed: bool = False,
     body_drag: tuple[float, ...] | None = None,
     air_density: float = 0.0,
+    obstacles: Sequence[Obstacle] = (),
 ) -> mujoco.MjModel:
     """Compile the airframe with every physical number taken from the vehicle.
 
@@ -91,6 +97,7 @@ def compile_model(
             the ellipsoid's added-mass terms: a few grams of air, and a torque where it flies aslant (Munk's moment),
             which a vehicle of some 200 g feels at 5 m/s.
         air_density: rho [kg/m^3].
+        obstacles: what the ball that stands for the vehicle meets; those that move are mocap bodies of their names.
     """
     spec = mujoco.MjSpec.from_file(str(models_dir() / "quadrotor.xml"))
     spec.option.timestep = timestep
@@ -112,6 +119,8 @@ def compile_model(
         _strip(spec, contact=contact)
     if body_drag is not None:
         _add_drag(spec, body_drag, air_density)
+    if obstacles:
+        _add_obstacles(spec, obstacles, vehicle.enclosing_radius)
     return spec.compile()
 
 
@@ -169,6 +178,29 @@ def _add_drag(spec: mujoco.MjSpec, areas: tuple[float, ...], density: float) -> 
         fluid_ellipsoid=1,
         fluid_coefs=list(_BLUNT),
     )
+
+
+def _add_obstacles(spec: mujoco.MjSpec, obstacles: Sequence[Obstacle], radius: float) -> None:
+    """Put obstacles into the scene, and around the vehicle the ball that meets them and nothing else."""
+    for flag in _CONTACT:
+        spec.option.disableflags &= ~int(flag)
+    ball = spec.body(BODY).add_geom(name="ball", type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[radius, 0.0, 0.0], group=4)
+    meeting = [(ball, 0, _MEETS_OBSTACLES)]
+    for obstacle in obstacles:
+        body = spec.worldbody.add_body(name=obstacle_body(obstacle), pos=obstacle.position, mocap=obstacle.moves)
+        for solid in obstacle.solids:
+            kind = getattr(mujoco.mjtGeom, f"mjGEOM_{solid.kind.upper()}")
+            geom = body.add_geom(type=kind, size=list(solid.size), pos=solid.centre, quat=solid.quaternion)
+            geom.rgba = OBSTACLE_COLOUR
+            meeting.append((geom, _MEETS_OBSTACLES, 0))
+    for geom, contype, conaffinity in meeting:
+        geom.mass, geom.contype, geom.conaffinity = 0.0, contype, conaffinity
+        geom.solref[: len(_STIFFNESS)], geom.friction = _STIFFNESS, _FRICTION
+
+
+def obstacle_body(obstacle: Obstacle) -> str:
+    """What its body in the model is called."""
+    return f"obstacle {obstacle.name}"
 
 
 def _strip(spec: mujoco.MjSpec, *, contact: bool) -> None:

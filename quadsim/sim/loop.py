@@ -60,7 +60,7 @@ def fly(
         navigation: measured or estimated state for the controller; the true state where absent.
         computation: how long commands take, in simulated time; none where absent.
         rng: what `computation` draws from.
-        ground: what knows where the flight stands with the ground; it is flying throughout where absent.
+        ground: what knows where the flight stands with ground and obstacles; it is flying throughout where absent.
         loss: limits by the names of `quadsim.flight.lost.CRITERIA`, checked once per control period until it has
             crashed; none where absent.
         motion: of the reference from t_0 on, for controllers that use it; absent where only positions are known.
@@ -91,12 +91,14 @@ def fly(
     try:
         for k in range(periods):
             truth[k] = plant.state()
-            since = physics_to_state(samples[-1].segment.physics) if ground and samples else truth[k : k + 1]
             states[k] = truth[k] if navigation is None else navigation.state()
             attitude, body_rates = plant.attitude if navigation is None else navigation.attitude
             attitudes[k], rates[k] = attitude, body_rates
             preview = reference[k + 1 : k + 1 + controller.horizon]
-            phase = Phase.FLYING if ground is None else ground.advance(since, preview)
+            phase = Phase.FLYING
+            if ground is not None:
+                since = samples[-1].segment.physics if samples else start[None]
+                phase = ground.advance(since[:, 0], physics_to_state(since), preview)
             if loss is not None and phase is not Phase.CRASHED:
                 check_loss(loss, k * period, truth[k], reference[k], lowest[k])
             now = Moment(

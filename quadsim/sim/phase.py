@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Final
 
 import numpy as np
 
 from quadsim.controller import Phase
 from quadsim.flight.ground import AIRBORNE, TOUCH, Outline, clearance
-from quadsim.state import INDEX, REFERENCE_NAMES, Array, tilt
+from quadsim.space import Obstacle
+from quadsim.state import INDEX, POSITION, REFERENCE_NAMES, Array, tilt
 
 ASKED_RISE: Final = 0.05
 """How far above the resting height a reference has to rise to ask for flight [m]."""
@@ -27,15 +29,22 @@ class PhaseMonitor:
       else `landed`; from `armed` it is `flying` as soon as the clearance exceeds `AIRBORNE`.
     - From `flying` it is `landed` once the feet have touched for `REST` and the whole preview stays on the ground.
     - Whatever it was, it has `crashed` for good when anything but the feet touches the ground, or when the feet do with
-      the vehicle tilted beyond `CAPSIZED`.
+      the vehicle tilted beyond `CAPSIZED`, or when the ball that stands for the vehicle touches an obstacle.
 
     Args:
-        outline: what may touch the ground, and where that is.
+        outline: what may touch the ground, and where that is; None where there is no ground.
         period: the control period [s].
+        obstacles: what must not be touched.
+        radius: of the ball that stands for the vehicle [m].
     """
 
-    def __init__(self, outline: Outline, *, period: float) -> None:
-        self._outline = outline
+    def __init__(
+        self, outline: Outline | None, *, period: float, obstacles: Sequence[Obstacle] = (), radius: float = 0.0
+    ) -> None:
+        self._outline, self._obstacles, self._radius = outline, obstacles, radius
+        if outline is None:
+            self.reset()
+            return
         self._asking = outline.floor + outline.foot_radius - float(outline.feet[:, 2].min()) + ASKED_RISE
         self._reach = float(np.linalg.norm(outline.hull, axis=1).max()) + TOUCH  # higher up nothing can touch
         self._periods_of_rest = math.ceil(REST / period - 1e-9)
@@ -46,19 +55,24 @@ class PhaseMonitor:
         self._phase: Phase | None = None
         self._touched = 0
 
-    def advance(self, states: Array, preview: Array) -> Phase:
+    def advance(self, t: Array, states: Array, preview: Array) -> Phase:
         """The phase of the control period that starts now.
 
         Args:
+            t: (M,) times of the states [s].
             states: (M, 12) true states since the last period began, the last of them now.
             preview: (N, 4) reference x, y, z [m], yaw [rad] that the controller is about to see.
         """
+        if self._touches_obstacle(t, states):
+            self._phase = Phase.CRASHED
+        if self._outline is None:
+            return self._phase or Phase.FLYING
         gap = float(clearance(states[-1:], self._outline.feet, self._outline.foot_radius, self._outline.floor)[0])
         self._touched = self._touched + 1 if gap <= TOUCH else 0
         asked = bool(preview[:, REFERENCE_NAMES.index("z")].max() > self._asking)
         if self._phase is None:
             self._phase = Phase.FLYING if gap > AIRBORNE else Phase.LANDED
-        if self._crashed(states):
+        if self._crashed(self._outline, states):
             self._phase = Phase.CRASHED
         elif self._phase is Phase.FLYING:
             if self._touched >= self._periods_of_rest and not asked:
@@ -69,9 +83,13 @@ class PhaseMonitor:
             self._phase = Phase.ARMED if asked else Phase.LANDED
         return self._phase
 
-    def _crashed(self, states: Array) -> bool:
+    def _touches_obstacle(self, t: Array, states: Array) -> bool:
+        points = states[:, POSITION]
+        return any(bool((each.clearance(t, points) <= self._radius).any()) for each in self._obstacles)
+
+    def _crashed(self, outline: Outline, states: Array) -> bool:
         if self._touched and np.degrees(tilt(states[-1:])[0]) > CAPSIZED:
             return True
-        if states[:, INDEX["z"]].min() - self._outline.floor > self._reach:
+        if states[:, INDEX["z"]].min() - outline.floor > self._reach:
             return False
-        return float(clearance(states, self._outline.hull, 0.0, self._outline.floor).min()) <= TOUCH
+        return float(clearance(states, outline.hull, 0.0, outline.floor).min()) <= TOUCH

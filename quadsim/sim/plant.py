@@ -15,13 +15,14 @@ from mujoco.rollout import Rollout
 
 from quadsim.controller import check_command
 from quadsim.errors import CommandError, DivergenceError, ForceError, ParameterError
-from quadsim.sim.airframe import BODY, compile_model, outline
+from quadsim.sim.airframe import BODY, compile_model, obstacle_body, outline
 from quadsim.sim.effects import Effects, Force, Load, Payload, PayloadChange, RotorChange, RotorDynamics
 from quadsim.sim.effects.forces import StepForces
 from quadsim.sim.effects.load import apply_mass, mass_properties
 from quadsim.sim.effects.wind import Air, WindField
 from quadsim.sim.physics import Integrator, Segment, physics_to_state
 from quadsim.sim.rigid_body import RigidBody, check_free
+from quadsim.space import Obstacle
 from quadsim.state import (
     ANGLE_RATES,
     ANGLES,
@@ -76,6 +77,7 @@ class Plant:
         changes: Sequence[RotorChange | PayloadChange] = (),
         wind: WindField | None = None,
         forces: Sequence[Force] = (),
+        obstacles: Sequence[Obstacle] = (),
         rng: np.random.Generator | None = None,
         integrator: Integrator = "mujoco",
     ) -> None:
@@ -93,7 +95,9 @@ class Plant:
             reweighed=self._reweighed,
             body_drag=air.body_drag,
             air_density=air.density,
+            obstacles=obstacles,
         )
+        self._moving = [obstacle for obstacle in obstacles if obstacle.moves]
         self._speed_range = (vehicle.speed_min, vehicle.speed_max) if limit_speeds else (0.0, math.inf)
         self._data = mujoco.MjData(self.model)
         mujoco.set_mju_user_warning(_discard)
@@ -102,9 +106,12 @@ class Plant:
         self._yaw = 0.0
         self._wind, self._own = wind, tuple(forces)
         if integrator == "rk4":
-            check_free(effects, changes)
+            check_free(effects, changes, obstacles)
         self._integrator = integrator
-        self._by_step = effects.follows_state or wind is not None or bool(self._own) or integrator == "rk4"
+        self._by_step = effects.follows_state or wind is not None or bool(self._own)
+        self._by_step = self._by_step or bool(self._moving) or integrator == "rk4"
+        bodies = [self.model.body(obstacle_body(obstacle)).id for obstacle in self._moving]
+        self._mocaps = self.model.body_mocapid[bodies]
         ordered = sorted(changes, key=lambda change: change.time)
         self._changes = [(math.ceil(change.time / timestep - 1e-6), change) for change in ordered]
         self._rng = rng if rng is not None else np.random.default_rng(0)
@@ -293,6 +300,9 @@ class Plant:
         applied, control, air_of_model = (_bytes(array) for array in (data.qfrc_applied, data.ctrl, model.opt.wind))
         states, wrenches = _bytes(trajectory).cast("d"), _bytes(wrench)
         row = trajectory.shape[1]
+        if self._moving:
+            times = self.time + self.timestep * np.arange(steps, dtype=np.float64)
+            places = np.stack([obstacle.places(times) for obstacle in self._moving], axis=1)
         for i, (thrust, rotors, breeze) in enumerate(zip(thrusts.tolist(), of_rotors, air.tolist(), strict=True)):
             velocity = qvel.tolist()
             acting: Sequence[float] = forces(qpos.tolist(), velocity, velocity_before, thrust, rotors, breeze)
@@ -306,6 +316,8 @@ class Plant:
             _FOUR.pack_into(control, 0, *thrust)
             if moving_air:
                 _THREE.pack_into(air_of_model, 0, *breeze)
+            if self._moving:
+                data.mocap_pos[self._mocaps] = places[i]
             step(model, data)
             first = row * i
             states[first + 1 : first + 8], states[first + 8 : first + row] = qpos, qvel

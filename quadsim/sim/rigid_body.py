@@ -12,23 +12,28 @@ from collections.abc import Iterable, Sequence
 from quadsim.errors import ParameterError
 from quadsim.sim.effects import Effects, Load, PayloadChange, RotorChange
 from quadsim.sim.effects.forces import StepForces, Wrench
+from quadsim.space import Obstacle
 from quadsim.vehicle import Vehicle
 
 Rates = tuple[list[float], Wrench]
 
 
-def check_free(effects: Effects, changes: Iterable[RotorChange | PayloadChange]) -> None:
+def check_free(
+    effects: Effects, changes: Iterable[RotorChange | PayloadChange], obstacles: Sequence[Obstacle] = ()
+) -> None:
     """Refuse what this integration does not know.
 
     Args:
         effects: resolved.
         changes: what happens on the way.
+        obstacles: what may be touched.
 
     Raises:
-        ParameterError: there is a floor to touch, a load, or drag of MuJoCo's.
+        ParameterError: there is a floor or an obstacle to touch, a load, or drag of MuJoCo's.
     """
     unknown = {
         "contact with the ground": effects.ground is not None and effects.ground.contact,
+        "obstacles": bool(obstacles),
         "a load": effects.load not in (None, Load()) or any(isinstance(each, PayloadChange) for each in changes),
         "effects.air.body_drag": effects.air is not None and effects.air.body_drag is not None,
     }

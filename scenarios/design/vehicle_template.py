@@ -95,6 +95,11 @@ ADVICE: Final[dict[str, Advice]] = {
         how="drag coefficient, about 1, times the area seen from the front, the side and above",
         without="no drag of the body",
     ),
+    "extent": Advice(
+        value=0.36,
+        how="measure from the centre of mass to what reaches farthest, propellers and feet included",
+        without="among obstacles it reaches to its propellers' tips: arm_length and rotor_radius",
+    ),
 }
 """By parameter; the same ones as `quadsim.vehicle.VEHICLE_UNITS`, or the import fails."""
 assert list(ADVICE) == list(VEHICLE_UNITS), set(ADVICE) ^ set(VEHICLE_UNITS)

@@ -20,7 +20,7 @@ from mpc.ocp import Objective, Problem, lqr_terminal_weight
 from mpc.robust.tightening import SHORTEST_LAG
 from quadsim.controller import Controller
 from quadsim.errors import InputError, ParameterError
-from quadsim.state import INDEX, N_STATES, STATE_NAMES, Array
+from quadsim.state import INDEX, N_STATES, POSITION, STATE_NAMES, Array
 from quadsim.vehicle import N_ROTORS, Vehicle
 from scenarios.parts.plugin import build_plugin
 from scenarios.schema.baselines import GeometricSpec, LQRSpec, PIDSpec
@@ -31,6 +31,7 @@ from scenarios.schema.robust import RobustSpec
 
 if TYPE_CHECKING:
     from mpc.robust.controller import RobustMPC
+    from mpc.space.halfspaces import Shape, Space
 
 FALLBACK_SHARE: Final = 0.8
 """Tilt of the fallback over the tightest bound on it: the controller finds a vehicle that it can take over."""
@@ -126,8 +127,8 @@ def make_penalty(soft: SoftSpec, rows: int) -> Penalty:
     return Penalty(l1=np.full(rows, float(soft.linear)), l2=np.full(rows, float(soft.quadratic)))
 
 
-def make_controller(spec: ControllerSpec, vehicle: Vehicle, period: float) -> Controller:
-    """The law, set up and ready to be flown.
+def make_controller(spec: ControllerSpec, vehicle: Vehicle, period: float, shapes: Sequence[Shape] = ()) -> Controller:
+    """The law, set up and ready to be flown among obstacles and regions.
 
     Raises:
         InputError: it cannot be made from these numbers, or its code cannot be found or called.
@@ -136,12 +137,13 @@ def make_controller(spec: ControllerSpec, vehicle: Vehicle, period: float) -> Co
         case UnconstrainedSpec():
             return _unconstrained(make_problem(spec, vehicle, period))
         case ConstrainedSpec():
-            law = _constrained(spec, make_problem(spec, vehicle, period))
+            space = make_space(spec, vehicle, period, shapes)
+            law = _constrained(spec, make_problem(spec, vehicle, period), space)
             return law if spec.fallback is None else _bounded(law, spec, spec.fallback, vehicle, period)
         case RobustSpec():
-            return _bounded(_robust(spec, vehicle, period), spec, spec.fallback, vehicle, period)
+            return _bounded(_robust(spec, vehicle, period, shapes), spec, spec.fallback, vehicle, period)
         case NonlinearSpec():
-            return _nonlinear(spec, vehicle, period)
+            return _nonlinear(spec, vehicle, period, shapes)
         case LQRSpec() | PIDSpec() | GeometricSpec():
             return _baseline(spec, vehicle, period)
         case PluginSpec():
@@ -177,7 +179,7 @@ def guarded(
     return Guarded(law, hover_model(vehicle, period), bounds=bounds, settings=fallback)
 
 
-def _nonlinear(spec: NonlinearSpec, vehicle: Vehicle, period: float) -> Controller:
+def _nonlinear(spec: NonlinearSpec, vehicle: Vehicle, period: float, shapes: Sequence[Shape]) -> Controller:
     from mpc.nonlinear.controller import NonlinearMPC
     from mpc.nonlinear.rigidbody import Inputs
     from mpc.nonlinear.settings import AttitudeError, Disturbance, NonlinearSettings, Weights
@@ -219,15 +221,51 @@ def _nonlinear(spec: NonlinearSpec, vehicle: Vehicle, period: float) -> Controll
         disturbance=Disturbance(spec.disturbance),
         solver=spec.solver,
     )
-    law = NonlinearMPC(vehicle, period=period, settings=settings, bounds=bounds, constraints=_outputs(spec))
+    law = NonlinearMPC(
+        vehicle,
+        period=period,
+        settings=settings,
+        bounds=bounds,
+        constraints=_outputs(spec),
+        space=make_space(spec, vehicle, period, shapes, stride=stride),
+    )
     return guarded(law, bounds, spec.fallback, vehicle, period)
 
 
-def _constrained(spec: ConstrainedSpec, problem: Problem) -> Controller:
+def make_space(
+    spec: BoundedSpec | NonlinearSpec,
+    vehicle: Vehicle,
+    period: float,
+    shapes: Sequence[Shape],
+    margins: Array | None = None,
+    stride: int = 1,
+) -> Space | None:
+    """The half-spaces of obstacles and regions, with further margins (N, 3) [m], at every `stride`-th period's end.
+
+    None where they are not kept.
+    """
+    if spec.avoidance is None or not shapes:
+        return None
+    from mpc.space.halfspaces import Space
+
+    soft = spec.avoidance.soft
+    return Space(
+        shapes,
+        radius=vehicle.enclosing_radius,
+        period=stride * period,
+        horizon=spec.horizon // stride,
+        settings=spec.avoidance,
+        margins=margins,
+        penalty=None if soft is None else (soft.linear, soft.quadratic),
+        positions=(0, 1, 2) if isinstance(spec, NonlinearSpec) else POSITION,
+    )
+
+
+def _constrained(spec: ConstrainedSpec, problem: Problem, space: Space | None) -> Controller:
     from mpc.constrained import ConstrainedMPC
     from mpc.solvers import QPSolver
 
-    return ConstrainedMPC(problem, QPSolver(spec.solver, problem), shortcut=spec.shortcut)
+    return ConstrainedMPC(problem, QPSolver(spec.solver, problem), shortcut=spec.shortcut, space=space)
 
 
 def _unconstrained(problem: Problem) -> Controller:
@@ -242,7 +280,7 @@ def _unconstrained(problem: Problem) -> Controller:
         ) from error
 
 
-def _robust(spec: RobustSpec, vehicle: Vehicle, period: float) -> RobustMPC:
+def _robust(spec: RobustSpec, vehicle: Vehicle, period: float, shapes: Sequence[Shape] = ()) -> RobustMPC:
     from mpc.robust.controller import Linearisation, RobustMPC, RobustSettings
 
     bounds, rotor_lag = make_bounds(spec), _rotor_lag(spec, vehicle)
@@ -268,6 +306,24 @@ def _robust(spec: RobustSpec, vehicle: Vehicle, period: float) -> RobustMPC:
         settings=settings,
         constraints=make_polytopes(spec),
         shortcut=spec.shortcut,
+        space=make_space(spec, vehicle, period, shapes, _position_margins(spec, vehicle, period)),
+    )
+
+
+def _position_margins(spec: RobustSpec, vehicle: Vehicle, period: float) -> Array | None:
+    """By how much half-spaces are tightened along x, y, z at each predicted state, (N, 3) [m]; None for not."""
+    if spec.tightening is None or spec.avoidance is None:
+        return None
+    from mpc.robust.tightening import position_margins
+
+    return position_margins(
+        vehicle,
+        period=period,
+        horizon=spec.horizon,
+        settings=spec.tightening,
+        rotor_lag=_rotor_lag(spec, vehicle),
+        delay=spec.delay,
+        estimated=spec.offset_free is not None,
     )
 
 

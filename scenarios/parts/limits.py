@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING
 
-from quadsim.flight.audit import Limit, SumLimit
+from quadsim.flight.audit import Limit, SpaceLimit, SumLimit
+from scenarios.parts.vehicle import build_vehicle
 from scenarios.schema.nonlinear import NonlinearPartsSpec
 from scenarios.schema.optimisation import BoundedSpec, PolytopeSpec
 
@@ -14,8 +15,36 @@ if TYPE_CHECKING:
 
 
 def build_limits(scenario: Scenario) -> tuple[Limit, ...]:
-    """What the flight is audited against: its constraints, and the controller's polytopes."""
-    return tuple(scenario.constraints) + tuple(
+    """What the flight is audited against: its constraints, obstacles and regions, and the controller's polytopes."""
+    return (*scenario.constraints, *_sum_limits(scenario), *space_limits(scenario))
+
+
+def space_limits(scenario: Scenario) -> tuple[SpaceLimit, ...]:
+    """The obstacles to keep clear of, then the regions to stay in."""
+    regions = scenario.regions
+    if not scenario.obstacles and not regions:
+        return ()
+    radius = build_vehicle(scenario).enclosing_radius
+    return (
+        *(SpaceLimit(name=obstacle.name, shape=obstacle, radius=radius) for obstacle in scenario.obstacles),
+        *(
+            SpaceLimit(
+                name=region.name,
+                shape=region,
+                radius=radius,
+                tolerance=region.tolerance,
+                tolerance_sampled=region.tolerance,
+                required=region.required,
+                start=region.start,
+                stop=region.stop,
+            )
+            for region in regions
+        ),
+    )
+
+
+def _sum_limits(scenario: Scenario) -> tuple[Limit, ...]:
+    return tuple(
         SumLimit(
             name=name,
             terms=tuple((of, factor) for of, factor in zip(polytope.of, row, strict=True) if factor),

@@ -12,7 +12,7 @@ from mpc.observer import ObserverSettings
 from mpc.robust.tightening import SHORTEST_LAG
 from quadsim.fields import NonNegative, Positive
 from scenarios.schema.base import MOST_ENTRIES, Pair, Spec, require_ordered
-from scenarios.schema.optimisation import Horizon, PolytopeSpec, SoftSpec, Weight
+from scenarios.schema.optimisation import AvoidanceSpec, Horizon, PolytopeSpec, SoftSpec, Weight
 from scenarios.schema.robust import Lag
 
 
@@ -113,6 +113,9 @@ class NonlinearPartsSpec(Spec):
         default=None, description="[deg/s] largest magnitude, one or about body x, y, z; absent: no bound"
     )
     soft: SoftSpec | None = Field(default=None, description="of the three above; absent: hard")
+    avoidance: AvoidanceSpec | None = Field(
+        default=None, description="absent: it knows of no obstacles, corridors or fence, which are audited all the same"
+    )
     polytopes: Annotated[list[PolytopeSpec], MaxLen(MOST_ENTRIES)] = Field(
         default=[], description="bounds on sums of positions, velocities and, as inputs, rotor speeds; audited as well"
     )

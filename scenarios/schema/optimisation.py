@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Annotated, Final, Literal
 
-from annotated_types import Len, MaxLen
+from annotated_types import Len, MaxLen, doc
 from pydantic import Discriminator, Field, Tag, model_validator
 
+from mpc.space.settings import AvoidanceSettings
 from quadsim.errors import UnknownNameError
 from quadsim.fields import NonNegative, Number
 from quadsim.flight.audit import TERMS
@@ -141,6 +143,13 @@ class PolytopeSpec(Spec):
         return [self.name] if len(self.rows) == 1 else [f"{self.name}_{i + 1}" for i in range(len(self.rows))]
 
 
+@dataclass(frozen=True, kw_only=True)
+class AvoidanceSpec(AvoidanceSettings):
+    """Half-spaces that keep clear of obstacles, and within corridors and the fence."""
+
+    soft: Annotated[SoftSpec | None, doc("[1/m, 1/m^2] what violating one costs; absent: hard")] = None
+
+
 class BoundedSpec(WeightedSpec):
     """One that also keeps bounds."""
 
@@ -150,6 +159,9 @@ class BoundedSpec(WeightedSpec):
     input_bounds: InputBoundsSpec
     polytopes: Annotated[list[PolytopeSpec], MaxLen(MOST_ENTRIES)] = Field(
         default=[], description="further bounds on sums of states and rotor speeds; audited as well"
+    )
+    avoidance: AvoidanceSpec | None = Field(
+        default=None, description="absent: it knows of no obstacles, corridors or fence, which are audited all the same"
     )
     shortcut: bool = Field(
         default=True, description="solve less than the whole QP where that yields its optimum; exact"

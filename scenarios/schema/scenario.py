@@ -18,6 +18,7 @@ from quadsim.flight.audit import Limit
 from quadsim.sim.computation import ComputationTime
 from quadsim.sim.effects import Effects
 from quadsim.sim.physics import Integrator, steps_per_period
+from quadsim.space import AnyObstacle, Corridor, Fence
 from quadsim.vehicle import VEHICLE_UNITS, Vehicle
 from scenarios.schema.base import LARGEST_SEED, MOST_ENTRIES, Spec, Triple, fields_of
 from scenarios.schema.controller import ControllerSpec
@@ -180,6 +181,13 @@ class Scenario(Spec):
     )
     events: Annotated[list[Event], MaxLen(MOST_ENTRIES)] = Field(default=[], description="what happens on the way")
     lost: LostSpec = LostSpec()
+    obstacles: Annotated[list[Annotated[AnyObstacle, Field(discriminator="type")]], MaxLen(MOST_ENTRIES)] = Field(
+        default=[], description="what the vehicle, a ball of its extent, must not touch: a touch is a crash"
+    )
+    corridors: Annotated[list[Corridor], MaxLen(MOST_ENTRIES)] = Field(
+        default=[], description="convex regions to stay in, each for a window of time"
+    )
+    keep_in: Fence | None = Field(default=None, description="a convex region to stay in throughout; absent: none")
     constraints: Annotated[list[Limit], MaxLen(MOST_ENTRIES)] = Field(
         default=[], description="what the flight is audited against; signals and their units are those of the audit"
     )
@@ -211,6 +219,7 @@ class Scenario(Spec):
         polytopes = self.controller.polytopes if isinstance(self.controller, BoundedSpec | NonlinearPartsSpec) else []
         names = [constraint.name for constraint in self.constraints]
         names += [name for polytope in polytopes for name in polytope.row_names]
+        names += [obstacle.name for obstacle in self.obstacles] + [region.name for region in self.regions]
         if len(set(names)) < len(names):
             raise ValueError(f"constraints must have distinct names; got {names}")
         return self
@@ -247,6 +256,11 @@ class Scenario(Spec):
         except ValueError as error:
             raise InputError(f"a scenario must be one that can be written: {error}") from error
         return cls.model_validate_json(text)
+
+    @property
+    def regions(self) -> tuple[Corridor | Fence, ...]:
+        """The corridors, then the fence."""
+        return (*self.corridors, *([] if self.keep_in is None else [self.keep_in]))
 
     @property
     def periods(self) -> int:

@@ -162,7 +162,7 @@ def _about_entries(kinds: Sequence[type[Any]]) -> tuple[str, ...]:
             )
             continue
         width = max(map(len, fields_of(kind)))
-        lines.append(f"each {{{', '.join(fields_of(kind))}}}: {headline(kind)}")
+        lines += textwrap.wrap(f"each {{{', '.join(fields_of(kind))}}}: {headline(kind)}", WIDTH - 2)
         lines += [f"  {name:<{width}}  {info.description or ''}" for name, info in fields_of(kind).items()]
     return tuple(lines)
 

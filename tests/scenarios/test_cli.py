@@ -65,7 +65,8 @@ def test_list_names_everything_with_one_line_each(capsys: pytest.CaptureFixture[
 def test_list_as_json(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["list", "--json"]) == EXIT_DONE
     listed = json.loads(capsys.readouterr().out)
-    assert list(listed) == ["scenarios", "groups", "expected", "campaigns", "vehicles", "controllers", "solvers"]
+    titles = ["scenarios", "groups", "expected", "campaigns", "vehicles", "controllers", "papers", "solvers"]
+    assert list(listed) == titles
     assert list(listed["scenarios"]) == list(listed["groups"]) == list(listed["expected"]) == scenario_names()
     checked = [load_scenario(name) for name in scenario_names()]
     assert listed["scenarios"] == {scenario.name: scenario.description for scenario in checked}

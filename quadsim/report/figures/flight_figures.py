@@ -10,13 +10,14 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from quadsim.flight.audit import SIGNALS, Limit
+from quadsim.flight.audit import SIGNALS, Limit, SpaceLimit
 from quadsim.flight.rundir import Run
 from quadsim.report.comparison import distinct_courses, run_names
 from quadsim.report.curves import bounds_of, break_at_wraps, commanded_speeds, effect_curves, reference_curve
 from quadsim.report.figures.canvas import finish_figure, keep_least_span, new_figure, run_title, write_drawings
-from quadsim.report.palette import BOUND, REFERENCE, line_colour
-from quadsim.state import REFERENCE_NAMES, STATE_NAMES, Array
+from quadsim.report.palette import BOUND, OBSTACLE, REFERENCE, line_colour
+from quadsim.report.scene import has_space, obstacles_in, outlines, region_edges
+from quadsim.state import POSITION, REFERENCE_NAMES, STATE_NAMES, Array
 from quadsim.vehicle import N_ROTORS
 
 if TYPE_CHECKING:
@@ -47,6 +48,8 @@ def write_figures(run: Run, directory: Path) -> list[Path]:
     }
     if has_effects(run):
         drawings["effects"] = lambda: draw_effects(run)
+    if has_space(run.limits):
+        drawings["space"] = lambda: draw_space(run)
     return write_drawings(drawings, directory)
 
 
@@ -218,6 +221,50 @@ def _draw_bounds(axes: Axes, limits: Sequence[Limit], signal: str, end: float) -
     for bound, start, stop in bounds_of(limits, signal, end):
         shown["bound"] = axes.hlines(bound, start, stop, color=BOUND, linestyle="--", linewidth=1.1)
     return shown
+
+
+_MOST_NAMED: Final = 9
+"""Obstacles and regions of which each is named in the legend."""
+_NEAR: Final = 3.0
+"""Clearance [m] below which a moving obstacle is drawn, and up to which curves are shown."""
+_EVERY: Final = 0.25
+"""How often it is drawn [s]."""
+
+
+def draw_space(run: Run) -> Figure:
+    """A flight among obstacles and regions from above, and how far it stays clear of each over time."""
+    figure = new_figure(run_title(run, "from above, and clearances"), 9.6, 7.4)
+    above, below = figure.subplots(2, 1, height_ratios=(3.0, 2.0))
+    shown: dict[str, Artist] = {}
+    clear = [limit for limit in run.limits if isinstance(limit, SpaceLimit)]
+    clearances = {limit.name: limit.source.finest(run.log) for limit in clear}
+    for obstacle in obstacles_in(run.limits):
+        t, values = clearances[obstacle.name]
+        near = t[values < _NEAR]
+        for instant in np.arange(near[0], near[-1], _EVERY) if obstacle.moves and near.size else [0.0]:
+            for outline, _ in outlines(obstacle, instant, 0.0, np.inf):
+                alpha = 0.3 if obstacle.moves else 0.55
+                shown["obstacle"] = above.fill(*outline.T, color=OBSTACLE, alpha=alpha, linewidth=0.0)[0]
+    for _, edges in region_edges(run):
+        for edge in edges[:, :, :2]:
+            shown["region"] = above.plot(*edge.T, color=BOUND, linestyle="--", linewidth=0.9)[0]
+    course, path = run.log.control.reference, run.log.plant.state[:, POSITION]
+    shown["reference, filtered"] = above.plot(
+        course[:, 0], course[:, 1], color=REFERENCE, linestyle=(0, (5, 2)), linewidth=1.1
+    )[0]
+    shown["flight"] = above.plot(path[:, 0], path[:, 1], color=line_colour(0))[0]
+    above.set_aspect("equal", adjustable="datalim")
+    above.set_xlabel("x [m]")
+    above.set_ylabel("y [m]")
+    for limit in clear:
+        t, values = clearances[limit.name]
+        below.plot(t, np.where(limit.holds_at(t), values, np.nan), linewidth=1.0, label=limit.name)
+    below.axhline(0.0, color=BOUND, linestyle="--", linewidth=1.1)
+    below.set_ylabel("clearance [m]")
+    below.set_ylim(top=min(below.get_ylim()[1], _NEAR))
+    if len(clear) <= _MOST_NAMED:
+        below.legend(loc="upper right", ncols=3, fontsize=8.0)
+    return finish_figure(figure, (below,), shown, run.end)
 
 
 _ERRORS: Final = {"position": ("x", "y", "z"), "attitude": ("roll", "pitch", "yaw")}

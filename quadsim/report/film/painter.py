@@ -23,6 +23,7 @@ AMBER: Final = (255, 184, 77)
 GREEN: Final = (120, 222, 150)
 CYAN: Final = (126, 232, 232)
 VIOLET: Final = (225, 120, 205)
+BRICK: Final = (206, 104, 82)
 
 _TEXTS: Final = 2048
 """Texts that are kept as pictures, of each size of font: a film shows most of its words in every frame."""
@@ -57,6 +58,10 @@ class Painter:
             self._canvas.line(
                 (points * self._scale).ravel().tolist(), fill=colour, width=max(1, round(width * self._scale))
             )
+
+    def polygon(self, points: Array, colour: Colour) -> None:
+        """Fill an outline (n, 2)."""
+        self._canvas.polygon((points * self._scale).ravel().tolist(), fill=colour)
 
     def dot(self, place: Array, radius: float, colour: Colour) -> None:
         """Fill a circle."""

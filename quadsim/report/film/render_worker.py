@@ -24,7 +24,8 @@ from quadsim.flight.rundir import Run, load_run
 from quadsim.report.film.captions import Overlay
 from quadsim.report.film.frames import Footage, Shot, make_footage, thin
 from quadsim.report.film.painter import Picture
-from quadsim.sim.airframe import FLOOR, PROPELLER_NAMES, compile_model
+from quadsim.report.scene import obstacles_in, region_edges
+from quadsim.sim.airframe import FLOOR, PROPELLER_NAMES, compile_model, obstacle_body
 from quadsim.state import Array
 from quadsim.vehicle import Vehicle
 
@@ -52,20 +53,24 @@ _TRAIL_COLOUR: Final = (0.12, 0.56, 1.0, 1.0)
 _HORIZON_COLOUR: Final = (0.35, 1.0, 0.55, 0.95)
 _THRUST_COLOUR: Final = (0.25, 0.70, 1.0, 0.85)
 _BROKEN_COLOUR: Final = (1.0, 0.2, 0.12, 0.95)
+_REGION_COLOUR: Final = (0.95, 0.95, 0.55, 0.5)
 _SHADOW_COLOUR: Final = (0.05, 0.07, 0.10, 0.45)
 
 
 class Stage:
     """A vehicle in its scene, rendered off screen; use as a context manager, it owns an OpenGL context.
 
-    Besides the airframe, frames show the reference path, the path flown in the last seconds, the predicted horizon,
-    one thrust arrow per rotor (red beyond the speed limit) and a shadow with a plumb line to the floor.
+    Besides the airframe and obstacles, frames show the regions in force, the reference path, the path flown in the last
+    seconds, the predicted horizon, one thrust arrow per rotor (red beyond the speed limit) and a shadow with a plumb
+    line to the floor.
     """
 
     def __init__(self, run: Run, footage: Footage, *, width: int, height: int) -> None:
         self._run, self._footage = run, footage
         self._arm = run.vehicle.arm_length
-        self._model = compile_model(run.vehicle, visuals=True)
+        self._obstacles = obstacles_in(run.limits)
+        self._model = compile_model(run.vehicle, visuals=True, obstacles=self._obstacles)
+        self._regions = list(region_edges(run))
         self._model.vis.quality.offsamples = 0
         self._model.vis.global_.offwidth, self._model.vis.global_.offheight = width, height
         lowest = max(float(footage.path[:, 2].min()), -_DEEPEST_FLOOR)
@@ -93,12 +98,21 @@ class Stage:
         for name, turned, spin in zip(PROPELLER_NAMES, shown.turned[i], self._run.vehicle.rotor_spins, strict=True):
             half = -0.5 * spin * turned / BLADE_SLOWDOWN  # a propeller turns against its reaction torque
             self._model.body(name).quat[:] = np.cos(half), 0.0, 0.0, np.sin(half)
+        for obstacle in self._obstacles:
+            if obstacle.moves:
+                body = self._model.body(obstacle_body(obstacle)).id
+                place = obstacle.places(shown.times[i : i + 1])[0]
+                self._data.mocap_pos[self._model.body_mocapid[body]] = place
         mujoco.mj_kinematics(self._model, self._data)
         mujoco.mj_camlight(self._model, self._data)
         # Aimed a little low, so that the vehicle stands above the captions.
         self._camera.lookat = shown.aim[i] - (0.0, 0.0, 0.55 * self._arm)
         self._renderer.update_scene(self._data, self._camera)
         self._draw_path(shown.course, 0.018, _COURSE_COLOUR)
+        for region, edges in self._regions:
+            if region.holds_at(shown.times[i : i + 1])[0]:
+                for start, stop in edges:
+                    self._connect(mujoco.mjtGeom.mjGEOM_CAPSULE, 0.04 * self._arm, start, stop, _REGION_COLOUR)
         self._draw_trail(i)
         self._draw_horizon(i)
         self._draw_thrusts(i)

@@ -9,17 +9,21 @@ import numpy as np
 
 from quadsim.flight.rundir import Run
 from quadsim.report.film.frames import Footage
-from quadsim.report.film.painter import AMBER, BLUE, CYAN, FAINT, GREEN, GREY, VIOLET, WHITE, Painter
+from quadsim.report.film.painter import AMBER, BLUE, BRICK, CYAN, FAINT, GREEN, GREY, VIOLET, WHITE, Painter
+from quadsim.report.scene import has_space, obstacles_in, outlines, region_edges
 from quadsim.state import Array
 
 _LONGEST_ARROW: Final = 34.0
 """How long the strongest level wind or force of a flight is drawn [design pixels]."""
+_AROUND: Final = 1.0
+"""How much more is shown around where there are obstacles or regions [m]."""
 
 
 class TopView:
     """A map of the course seen from above, width by height [design pixels], with the flight's height beside it.
 
-    Where `acting`, it shows the wind as an arrow towards the vehicle, and the external force as one away from it.
+    Obstacles at the vehicle's height are bright, others faint.  Where `acting`, it shows the wind as an arrow towards
+    the vehicle, and the external force as one away from it.
     """
 
     def __init__(self, run: Run, footage: Footage, width: float, height: float, *, acting: bool) -> None:
@@ -28,10 +32,15 @@ class TopView:
         self._wind = none if plant.wind is None or footage.wind is None else _arrows(footage.wind, plant.wind)
         self._force = none if plant.wrench is None or footage.force is None else _arrows(footage.force, plant.wrench)
         self._acting = acting
+        self._obstacles, self._regions = obstacles_in(run.limits), list(region_edges(run))
+        self._radius = run.vehicle.enclosing_radius
         low, high = footage.course.min(axis=0), footage.course.max(axis=0)
         slack = max(float((high - low).max()), 1.0)
         path = np.clip(footage.path, low - slack, high + slack)  # a lost vehicle leaves the map
         self._low, self._high = np.minimum(low, path.min(axis=0)), np.maximum(high, path.max(axis=0))
+        if has_space(run.limits):
+            self._low[:2] -= _AROUND
+            self._high[:2] += _AROUND
         self._middle = 0.5 * (self._low + self._high)
 
     def draw(self, painter: Painter, x: float, y: float, i: int) -> None:
@@ -50,6 +59,14 @@ class TopView:
         footage = self._footage
         flown = footage.path[: np.searchsorted(footage.path_times, footage.times[i], side="right")]
         painter.text(x + 10, y + 6, "from above", size=13, colour=GREY)
+        for obstacle in self._obstacles:
+            for outline, meets in outlines(obstacle, footage.times[i], footage.position[i, 2], self._radius):
+                points = centre + (np.clip(outline, self._low[:2], self._high[:2]) - self._middle[:2]) * (unit, -unit)
+                painter.polygon(points, BRICK if meets else FAINT)
+        for region, edges in self._regions:
+            for edge in edges if region.holds_at(footage.times[i : i + 1])[0] else ():
+                if not ((edge < self._low).all(axis=0) | (edge > self._high).all(axis=0))[:2].any():
+                    painter.line(place(edge), GREY, width=1.0)
         painter.line(place(footage.course), AMBER, width=1.2)
         painter.line(place(np.concatenate([flown, footage.position[i : i + 1]])), BLUE, width=2.2)
         spot = place(footage.position[i])

@@ -12,7 +12,7 @@ from quadsim.flight.audit import SIGNALS
 from quadsim.flight.rundir import Run
 from quadsim.report.comparison import distinct_courses, run_names
 from quadsim.report.curves import bounds_of, break_at_wraps, reference_curve
-from quadsim.report.palette import REFERENCE, line_colour
+from quadsim.report.palette import BOUND, OBSTACLE, REFERENCE, line_colour
 from quadsim.report.plots.panels import (
     BOTTOM,
     PANEL_HEIGHT,
@@ -24,6 +24,7 @@ from quadsim.report.plots.panels import (
     panels,
     place,
 )
+from quadsim.report.scene import has_space, obstacles_in, region_edges
 from quadsim.state import POSITION, REFERENCE_NAMES, Array
 from quadsim.vehicle import N_ROTORS
 
@@ -33,6 +34,8 @@ if TYPE_CHECKING:
 _Named = tuple[int, str]
 """Number and name of a run, which set its colour and toggle."""
 _MOST_POINTS: Final = 3000
+_WAYS: Final = 300
+"""In which the points of a solid are taken whose hull is drawn."""
 _POINTS_OF_ALL_RUNS: Final = 12_000
 """Points that one quantity may have over all runs: keeps a page of two runs near 6 MB, and of ten below 8 MB."""
 
@@ -125,6 +128,8 @@ class _Plotter:
             return Scatter3d(x=x, y=y, z=z, mode="lines", line=style, **identity)
 
         figure = Figure()
+        for limits in dict.fromkeys(run.limits for _, _, run in self._runs if has_space(run.limits)):
+            self._space(figure, next(run for _, _, run in self._runs if run.limits == limits))
         for run in self._courses:
             style = {"color": REFERENCE, "width": 3, "dash": "dash"}
             figure.add_trace(line(run.log.control.reference[:, :3], style, {"name": "reference"}))
@@ -135,6 +140,21 @@ class _Plotter:
         camera = {"eye": {"x": 1.2, "y": -1.7, "z": 0.8}, "center": {"x": 0.0, "y": 0.0, "z": -0.12}}
         figure.update_layout(scene={"aspectmode": "data", "camera": camera, **axes}, margin=dict.fromkeys("lrtb", 0))
         return finished(figure, "path", "Path in space", height=560, timed=False)
+
+    def _space(self, figure: Figure, run: Run) -> None:
+        """Obstacles, those that move where they are at first, and the edges of regions."""
+        from plotly.graph_objects import Mesh3d, Scatter3d
+
+        ways = np.random.default_rng(0).normal(size=(_WAYS, 3))
+        for obstacle in obstacles_in(run.limits):
+            for solid in obstacle.solids:
+                x, y, z = (np.unique(solid.support(ways).round(4), axis=0) + obstacle.position).T.astype(np.float32)
+                look: dict[str, Any] = {"color": OBSTACLE, "opacity": 0.6, "name": html.escape(obstacle.name)}
+                figure.add_trace(Mesh3d(x=x, y=y, z=z, alphahull=0, hoverinfo="name", **look))
+        for limit, edges in region_edges(run):
+            x, y, z = np.insert(edges, 2, np.nan, axis=1).reshape(-1, 3).T.astype(np.float32)
+            line, name = {"color": BOUND, "width": 2}, html.escape(limit.name)
+            figure.add_trace(Scatter3d(x=x, y=y, z=z, mode="lines", line=line, name=name, hoverinfo="name"))
 
     def _line(
         self, figure: Figure, panel: int, who: _Named, t: Array, values: Array, shape: str = "linear", **own: Any

@@ -37,7 +37,7 @@ from quadsim.report.recording.layout import blueprint
 from quadsim.report.recording.signals import send_effects, send_limit, send_signals, send_solver
 from quadsim.report.recording.style import on_screen
 from quadsim.report.recording.texts import send_texts
-from quadsim.report.recording.world import send_airframe, send_scene
+from quadsim.report.recording.world import send_airframe, send_scene, send_space
 
 _CALL: Final = "import sys; from rerun_cli.__main__ import main; sys.exit(main())"
 _VIEWER: Final = (sys.executable, "-c", _CALL, "--bind=127.0.0.1", "--port=auto")
@@ -71,6 +71,7 @@ def _encode(run: Run, path: Path) -> bytes:
         recording.send_blueprint(blueprint(run), make_active=True, make_default=True)
         send_airframe(recording, run.vehicle)
         send_scene(recording, run)
+        send_space(recording, run)
         send_signals(recording, run.log)
         for limit in run.limits:
             peers = [peer.name for peer in run.limits if peer.unit == limit.unit]  # in one plot of margins

@@ -52,6 +52,8 @@ SHELL: Final = (235, 238, 242, 255)
 FORWARD: Final = (245, 110, 30, 255)
 FORCE: Final = (225, 90, 200, 255)
 WIND: Final = (110, 220, 225, 255)
+OBSTACLE: Final = (184, 92, 72, 255)
+REGION: Final = (215, 205, 90, 255)
 AXES: Final = ((230, 90, 90, 255), (90, 200, 110, 255), (90, 140, 250, 255))
 
 VERDICTS: Final = {

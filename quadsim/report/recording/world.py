@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
@@ -11,6 +11,7 @@ from quadsim.controller import Phase
 from quadsim.flight.rundir import Run
 from quadsim.report.recording import style
 from quadsim.report.recording.style import Colour, time_column
+from quadsim.report.scene import obstacles_in, region_edges
 from quadsim.state import EULER, POSITION, Array, euler_to_quaternion
 from quadsim.vehicle import N_ROTORS, Vehicle
 
@@ -111,6 +112,43 @@ def send_scene(recording: rr.RecordingStream, run: Run) -> None:
         shown = [horizon if aloft else horizon[:0] for horizon, aloft in zip(horizons, flying, strict=True)]
         _log_lines(recording, "world/horizon", style.PREDICTED, 2.5)
         recording.send_columns("world/horizon", [time_column(control.t)], rr.LineStrips3D.columns(strips=shown))
+
+
+def send_space(recording: rr.RecordingStream, run: Run) -> None:
+    """Obstacles, which move where they do, and regions, which are there while they hold."""
+    import rerun as rr
+
+    look: dict[str, Any] = {"colors": style.OBSTACLE, "fill_mode": "solid"}
+    for obstacle in obstacles_in(run.limits):
+        entity = f"world/obstacles/{obstacle.name}"
+        for i, solid in enumerate(obstacle.solids):
+            a, b, _ = solid.size
+            turned = {"quaternions": _vector_first(solid.quaternion)[None], **look}
+            centres, radii = [solid.centre], [a]
+            part: rr.AsComponents
+            match solid.kind:
+                case "box":
+                    part = rr.Boxes3D(centers=centres, half_sizes=[solid.size], **turned)
+                case "sphere":
+                    part = rr.Ellipsoids3D(centers=centres, radii=radii, **look)
+                case "cylinder":
+                    part = rr.Cylinders3D(centers=centres, lengths=[2.0 * b], radii=radii, **turned)
+                case "capsule":
+                    begin = solid.centre - b * solid.turn[:, 2]
+                    part = rr.Capsules3D(translations=[begin], lengths=[2.0 * b], radii=radii, **turned)
+            recording.log(f"{entity}/{i}", part, static=True)
+        if obstacle.moves:
+            t = run.log.plant.t
+            moving = rr.Transform3D.columns(translation=obstacle.places(t))
+            recording.send_columns(entity, [time_column(t)], moving)
+        else:
+            recording.log(entity, rr.Transform3D(translation=obstacle.position), static=True)
+    for limit, edges in region_edges(run):
+        entity = f"world/regions/{limit.name}"
+        _log_lines(recording, entity, style.REGION, 1.2)
+        times = np.array([max(limit.start, 0.0), limit.stop])
+        strips = rr.LineStrips3D.columns(strips=[*edges]).partition([len(edges), 0][: 1 + np.isfinite(limit.stop)])
+        recording.send_columns(entity, [time_column(times[np.isfinite(times)])], strips)
 
 
 def _unit(vehicle: Vehicle) -> float:

@@ -12,6 +12,7 @@ from scipy.optimize import minimize
 
 from mpc.answer import ActuatorBounds
 from mpc.constraints import Constraint
+from mpc.diagnosis import find_conflict
 from mpc.nonlinear.controller import NonlinearMPC, along_path
 from mpc.nonlinear.reference import nodes_of_motion, nodes_of_preview
 from mpc.nonlinear.rigidbody import N_BODY, Inputs, P, Q, V, W, advance_nodes, product, rigid_body, thrust_axis
@@ -21,7 +22,7 @@ from quadsim.assets import vehicle_path
 from quadsim.controller import ACCEPTED, Command, Moment, Phase
 from quadsim.errors import ParameterError
 from quadsim.motion import Motion
-from quadsim.state import INDEX, N_STATES, POSITIONS, VELOCITIES, Array
+from quadsim.state import INDEX, N_STATES, POSITIONS, VELOCITIES, Array, quaternion_to_euler
 from quadsim.vehicle import load_vehicle
 
 VEHICLE = load_vehicle(vehicle_path("hummingbird"))
@@ -403,7 +404,10 @@ def test_an_infeasible_problem_is_reported_with_its_query() -> None:
     assert command.status not in ACCEPTED
     np.testing.assert_array_equal(command.speeds, HOVER)
     assert controller.unanswered is not None
-    assert controller.unanswered.query.steps is not None
+    conflict = find_conflict(controller.unanswered)
+    assert conflict is not None
+    names = [part.name for part in controller.problem.every_constraint]
+    assert {names[side.place] for side in conflict.violated} == {"fence"}
 
 
 def test_grounded_rotors_stop() -> None:
@@ -412,16 +416,20 @@ def test_grounded_rotors_stop() -> None:
     assert (command.speeds == VEHICLE.speed_min).all()
 
 
-def test_what_it_predicts_is_what_the_model_does() -> None:
-    controller = law()
+@pytest.mark.parametrize("observer", [None, ObserverSettings()])
+def test_what_it_predicts_is_what_the_model_does(observer: ObserverSettings | None) -> None:
+    """With the disturbance that is estimated: here the vehicle stays where it should have risen."""
+    controller = law(observer=observer, disturbance=Disturbance.PATH)
     x = at_rest((0.9, 0.3, 0.0, 0.1))
-    command = ask(controller, x)
+    for k in range(3):
+        command = ask(controller, x, k * PERIOD)
+    found = np.zeros(6) if observer is None else controller.disturbance
+    assert found.any() == (observer is not None)
     state = np.zeros((1, N_STATES))
-    from quadsim.state import quaternion_to_euler
-
     state[0, 6::2] = quaternion_to_euler(x[Q])
     predicted = controller.predict(state, command.plan[None])
-    model = rigid_body(VEHICLE, PERIOD, inputs=Inputs.SPEED)
+    disturbed = {"acceleration": found[:3], "angular_acceleration": found[3:]}
+    model = rigid_body(VEHICLE, PERIOD, inputs=Inputs.SPEED, **disturbed)
     for i in range(command.plan.shape[0]):
         x = advance_nodes(model, x, command.plan[i] / VEHICLE.speed_max)
         x[Q] /= np.linalg.norm(x[Q])

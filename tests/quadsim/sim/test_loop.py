@@ -195,7 +195,7 @@ def test_what_has_crashed_is_not_lost_as_well(vehicle: Vehicle) -> None:
         def reset(self) -> None:
             """Nothing is remembered."""
 
-        def advance(self, states: Array, preview: Array) -> Phase:
+        def advance(self, t: Array, states: Array, preview: Array) -> Phase:
             return Phase.CRASHED
 
     assert fall(vehicle, {"depth": 0.5}, ground=Crashed()).reason is None

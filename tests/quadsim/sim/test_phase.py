@@ -32,7 +32,7 @@ def to(z: float) -> Array:
 
 
 def phases(monitor: PhaseMonitor, flight: list[tuple[Array, Array]]) -> list[str]:
-    return [monitor.advance(state[None], preview).value for state, preview in flight]
+    return [monitor.advance(np.zeros(1), state[None], preview).value for state, preview in flight]
 
 
 @pytest.fixture
@@ -108,11 +108,11 @@ def test_rest_is_counted_in_whole_periods(period: float, samples: int) -> None:
 @pytest.mark.parametrize("before", [at(0.0), at(1.0)])
 def test_a_hull_that_touches_is_a_crash_for_good(monitor: PhaseMonitor, before: Array) -> None:
     """Rolled over, it lies on its rotors."""
-    assert monitor.advance(before[None], to(1.0)) is not Phase.CRASHED
+    assert monitor.advance(np.zeros(1), before[None], to(1.0)) is not Phase.CRASHED
     upside_down = at(FLOOR + 0.03, roll=180.0)
     assert phases(monitor, [(upside_down, to(1.0)), (at(1.0), to(1.0)), (at(0.0), to(0.0))]) == ["crashed"] * 3
     monitor.reset()
-    assert monitor.advance(before[None], to(0.0)) is not Phase.CRASHED
+    assert monitor.advance(np.zeros(1), before[None], to(0.0)) is not Phase.CRASHED
 
 
 @pytest.mark.parametrize(("roll", "crashed"), [(59.0, False), (61.0, True), (-61.0, True)])
@@ -122,8 +122,10 @@ def test_feet_that_touch_at_a_steep_tilt_are_a_crash(roll: float, crashed: bool)
     state = at(0.0, roll=roll)
     state[INDEX["z"]] -= clearance(state[None], FEET, RADIUS, FLOOR)[0]
     touching, free = state, state + np.eye(12)[INDEX["z"]]
-    assert (PhaseMonitor(outline, period=PERIOD).advance(touching[None], to(1.0)) is Phase.CRASHED) is crashed
-    assert PhaseMonitor(outline, period=PERIOD).advance(free[None], to(1.0)) is Phase.FLYING
+    assert (
+        PhaseMonitor(outline, period=PERIOD).advance(np.zeros(1), touching[None], to(1.0)) is Phase.CRASHED
+    ) is crashed
+    assert PhaseMonitor(outline, period=PERIOD).advance(np.zeros(1), free[None], to(1.0)) is Phase.FLYING
 
 
 def test_the_resting_height_follows_from_the_outline() -> None:
@@ -178,5 +180,5 @@ def test_a_flight_that_ends_in_the_air_has_no_touchdown_and_one_from_the_air_no_
 def test_a_bounce_on_the_hull_within_a_period_is_a_crash() -> None:
     """It touched between two samples and is clear again at the second."""
     path = np.stack([at(z, roll=180.0) for z in (0.5, -0.1, 0.5)])
-    assert PhaseMonitor(OUTLINE, period=PERIOD).advance(path, to(1.0)) is Phase.CRASHED
-    assert PhaseMonitor(OUTLINE, period=PERIOD).advance(path[2:], to(1.0)) is Phase.FLYING
+    assert PhaseMonitor(OUTLINE, period=PERIOD).advance(np.zeros(len(path)), path, to(1.0)) is Phase.CRASHED
+    assert PhaseMonitor(OUTLINE, period=PERIOD).advance(np.zeros(len(path) - 2), path[2:], to(1.0)) is Phase.FLYING

@@ -105,8 +105,8 @@ WRONG = {
     "duration=-1.0": "duration must be > 0.0; got -1.0",
     "duration=1e9": "duration must be <= 86400.0; got 1000000000.0",
     "control_period=0": "control_period must be > 0.0; got 0",
-    "group=nowhere": "group must be one of 'paper', 'papers', 'courses', 'air', 'faults', 'ground', 'sensors' or "
-    "'other'; ...",
+    "group=nowhere": "group must be one of 'paper', 'papers', 'courses', 'air', 'faults', 'ground', 'space', 'sensors' "
+    "or 'other'; ...",
     "expect=fine": "expect must be one of 'satisfied', 'violated' or 'lost'; got 'fine'",
     "name='" + 81 * "a" + "'": "name must be a text of 80 or fewer characters; got '" + 81 * "a" + "'",
     "seed=-1": "seed must be >= 0; got -1",

@@ -1,0 +1,1 @@
+"""Keeping clear of obstacles, and inside corridors and a fence."""

@@ -1,0 +1,120 @@
+"""Keeping clear of obstacles, and inside corridors and a fence, by half-spaces along the predicted positions.
+
+An obstacle's convex solid is kept clear of at each predicted instant by the plane through its nearest point to where
+the last plan was to be then, p_i, at distance d_i and with the outward normal n_i:
+
+    n_i . p >= n_i . p_i - d_i + r + m_i,
+
+r the radius of the ball that stands for the vehicle and m_i the margin.  Where p_i is inside, d_i is negative and the
+plane is that of the nearest way out.  Behind the plane lies all of the solid, so that what satisfies the half-space
+keeps clear at that instant, wherever p_i was: the restriction is safe, and it is conservative.  A moving obstacle is
+where it will be at that instant.  Corridors and the fence are half-spaces themselves, and exact.
+
+The planes change with the plan, so that the QP is solved again along the new one, a few times per period at most
+(sequential convex programming; Schulman et al., 2014, "Motion planning with sequential convex optimization and convex
+collision checking").
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Final, TypeAlias
+
+import numpy as np
+
+from mpc.constraints import Constraint, Penalty
+from mpc.space.settings import AvoidanceSettings
+from quadsim.space import AnyObstacle, Corridor, Fence, Obstacle
+from quadsim.state import POSITION, Array
+
+Shape: TypeAlias = AnyObstacle | Corridor | Fence
+
+LOOSE: Final = 1e3
+"""By how much [m] a half-space that is not in force is left open."""
+
+
+class Space:
+    """Obstacles and regions as half-spaces.
+
+    Args:
+        shapes: the obstacles and regions.
+        radius: of the ball that stands for the vehicle [m].
+        period: from one predicted instant to the next [s].
+        horizon: N.
+        settings: see `AvoidanceSettings`.
+        margins: (N, 3) further ones along x, y, z at each predicted instant [m], as of a disturbance; None for none.
+        penalty: l1 [1/m] and l2 [1/m^2] of violating a half-space; None for hard ones.
+        positions: which of the states are x, y, z.
+    """
+
+    def __init__(
+        self,
+        shapes: Sequence[Shape],
+        *,
+        radius: float,
+        period: float,
+        horizon: int,
+        settings: AvoidanceSettings,
+        margins: Array | None = None,
+        penalty: tuple[float, float] | None = None,
+        positions: Sequence[int] = POSITION,
+    ) -> None:
+        self.settings, self.penalty, self.period, self.positions = settings, penalty, period, list(positions)
+        self._shapes, self._kept = tuple(shapes), radius + settings.margin
+        self._margins = np.zeros((horizon, 3)) if margins is None else margins
+        self._names = [
+            shape.name
+            for shape in self._shapes
+            for _ in range(len(shape.solids) if isinstance(shape, Obstacle) else len(shape.half_spaces[1]))
+        ]
+
+    @property
+    def count(self) -> int:
+        """S, half-spaces of one instant."""
+        return len(self._names)
+
+    def half_spaces(self, t: Array, positions: Array) -> tuple[Array, Array]:
+        """Normals (S, N, 3) and bounds (S, N) [m] of normal . p >= bound, at times (N,) along positions (N, 3)."""
+        normals, bounds = [], []
+        for shape in self._shapes:
+            if isinstance(shape, Obstacle):
+                distance, normal = shape.clearances(t, positions)
+                bound = (normal * positions).sum(axis=2) - distance
+            else:
+                rows, upper = shape.half_spaces
+                normal = np.broadcast_to(-rows[:, None, :], (len(rows), len(t), 3))
+                # Also at the instants just before and after: what is between two of them is then inside as well.
+                in_force = (t > shape.start - self.period) & (t < shape.stop + self.period)
+                bound = np.where(in_force, -upper[:, None], (normal * positions).sum(axis=2) - LOOSE)
+            normals.append(normal)
+            bounds.append(bound)
+        every = np.concatenate(normals)
+        return every, np.concatenate(bounds) + self._kept + (np.abs(every) * self._margins).sum(axis=2)
+
+    def constraint(self, normals: Array, bounds: Array, states: int, *, name: str = "space") -> Constraint:
+        """Half-spaces (m, N, 3), (m, N) as rows on so many states."""
+        C = np.zeros((bounds.shape[1], len(bounds), states))
+        C[:, :, self.positions] = normals.transpose(1, 0, 2)
+        lower, (l1, l2) = bounds.T, (0.0, 0.0) if self.penalty is None else self.penalty
+        penalty = Penalty(l1=np.full(len(bounds), l1), l2=np.full(len(bounds), l2))
+        return Constraint(
+            name=name,
+            lower=lower,
+            upper=np.full_like(lower, np.inf),
+            C=C,
+            penalty=None if self.penalty is None else penalty,
+        )
+
+    def constraints(self, normals: Array, bounds: Array, states: int) -> tuple[Constraint, ...]:
+        """All half-spaces, one constraint per obstacle or region, by its name."""
+        names = np.array(self._names)
+        return tuple(
+            self.constraint(normals[names == name], bounds[names == name], states, name=_titled(shape))
+            for shape in self._shapes
+            for name in [shape.name]
+        )
+
+
+def _titled(shape: Shape) -> str:
+    kind = "obstacle" if isinstance(shape, Obstacle) else "corridor" if isinstance(shape, Corridor) else ""
+    return f"{kind} {shape.name}".strip()

@@ -1,0 +1,414 @@
+"""Constraints in space: obstacles, corridors and a fence; how far points keep clear of them, and which way is clear.
+
+An obstacle is a union of convex solids, still or moving without turning.  Corridors and the fence are convex and given
+by half-spaces.  The vehicle is a ball about its centre of mass (`quadsim.vehicle.Vehicle.enclosing_radius`).
+"""
+
+from __future__ import annotations
+
+import itertools
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from functools import cached_property
+from typing import Annotated, Any, ClassVar, Final, Literal, NamedTuple
+
+import numpy as np
+from annotated_types import Len, MaxLen, doc
+
+from quadsim.errors import InputError, ParameterError, UnknownNameError
+from quadsim.fields import NonNegative, Number, Positive, Vector
+from quadsim.state import Array
+
+MOST_PLACES: Final = 1000
+"""Of one obstacle's path, or half-spaces of one polytope."""
+_NAME: Final = {"pattern": "^[A-Za-z][A-Za-z0-9_-]*$"}
+_PARALLEL: Final = 1e-9
+"""Determinant of three unit normals below which their planes are taken to have no common point."""
+
+Name = Annotated[str, doc("what reports call it")]
+Pair = Annotated[tuple[Number, ...], Len(2, 2)]
+Sizes = Annotated[tuple[Positive, ...], Len(3, 3)]
+"""Along x, y, z."""
+
+
+class Solid(NamedTuple):
+    """A convex part of an obstacle.
+
+    Attributes:
+        kind: as MuJoCo calls it.
+        size: as MuJoCo has it [m]: radius; radius and half length along z; half edges; radius and half height.
+        centre: (3,) from the obstacle's position, world [m].
+        turn: (3, 3) from its own axes to the world's.
+    """
+
+    kind: Literal["sphere", "capsule", "box", "cylinder"]
+    size: tuple[float, float, float]
+    centre: Array
+    turn: Array
+
+    def clearance(self, points: Array) -> tuple[Array, Array]:
+        """Signed distance (K,) and outward normal (K, 3) of points (K, 3) relative to the obstacle's position [m].
+
+        Both are exact, outside and inside; the nearest point of the surface is p - distance * normal.
+        """
+        local = (points - self.centre) @ self.turn
+        over, ways = self._excess(local)
+        outside = np.maximum(over, 0.0)
+        far = np.linalg.norm(outside, axis=1)
+        nearest = np.take_along_axis(ways, over.argmax(axis=1)[:, None, None], axis=1)[:, 0]
+        away = (outside[:, :, None] * ways).sum(axis=1) / np.where(far > 0.0, far, 1.0)[:, None]
+        normal = np.where((far > 0.0)[:, None], away, nearest) @ self.turn.T
+        return far + np.minimum(over.max(axis=1), 0.0), normal
+
+    def _excess(self, local: Array) -> tuple[Array, Array]:
+        """How far points lie beyond each of the surfaces (K, j), orthogonal to each other, and the ways out."""
+        a, b, _ = self.size
+        sides = np.where(local < 0.0, -1.0, 1.0)
+        if self.kind == "box":
+            return np.abs(local) - self.size, sides[:, :, None] * np.eye(3)
+        core = local.copy()
+        if self.kind == "capsule":
+            core[:, 2] -= np.clip(core[:, 2], -b, b)
+        elif self.kind == "cylinder":
+            core[:, 2] = 0.0
+        radius = np.linalg.norm(core, axis=1)
+        core[radius == 0.0] = (1.0, 0.0, 0.0)
+        out = core / np.where(radius > 0.0, radius, 1.0)[:, None]
+        if self.kind != "cylinder":
+            return (radius - a)[:, None], out[:, None, :]
+        along = sides[:, 2, None] * np.array([0.0, 0.0, 1.0])
+        return np.stack([radius - a, np.abs(local[:, 2]) - b], axis=1), np.stack([out, along], axis=1)
+
+    def support(self, ways: Array) -> Array:
+        """(n, 3) its points farthest along ways (n, 3), relative to the obstacle's position [m]."""
+        local = ways @ self.turn
+        a, b, _ = self.size
+        sides = np.where(local < 0.0, -1.0, 1.0)
+        if self.kind == "box":
+            return self.centre + (sides * self.size) @ self.turn.T
+        core = local * (1.0, 1.0, 0.0 if self.kind == "cylinder" else 1.0)
+        length = np.linalg.norm(core, axis=1, keepdims=True)
+        farthest = a * core / np.where(length > 0.0, length, 1.0)
+        farthest[:, 2] += b * sides[:, 2]
+        return self.centre + farthest @ self.turn.T
+
+    @property
+    def quaternion(self) -> Array:
+        """(4,) of `turn`, scalar first."""
+        x, y, z = self.turn.T
+        w = math.sqrt(max(0.0, 1.0 + x[0] + y[1] + z[2]))
+        if w > 1e-6:
+            return np.array([w * w, y[2] - z[1], z[0] - x[2], x[1] - y[0]]) / (2.0 * w)
+        axis = np.sqrt(np.maximum(0.0, 1.0 + np.array([x[0], y[1], z[2]])) / 2.0)  # a half turn
+        first = int(axis.argmax())
+        return np.array([0.0, *np.where(self.turn[first] < 0.0, -axis, axis)])
+
+
+@dataclass(frozen=True, kw_only=True)
+class Place:
+    """Where a moving obstacle is at an instant."""
+
+    time: Annotated[Number, doc("[s]")]
+    position: Annotated[Vector, doc("[m] x, y, z of its centre, world")]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Obstacle:
+    """What a vehicle must not touch; it stands still, or moves on a stated path without turning."""
+
+    name: Name = field(metadata=_NAME)
+    position: Annotated[Vector, doc("[m] x, y, z of its centre, world; of one that moves until it starts")]
+    start: Annotated[NonNegative, doc("[s] when it starts to move")] = 0.0
+    velocity: Annotated[Vector, doc("[m/s] from start on")] = (0.0, 0.0, 0.0)
+    acceleration: Annotated[Vector, doc("[m/s^2] from start on, as of a thrown ball")] = (0.0, 0.0, 0.0)
+    path: Annotated[
+        tuple[Place, ...],
+        MaxLen(MOST_PLACES),
+        doc("instead of velocity: in straight lines from position at start to each place at its time"),
+    ] = ()
+
+    def __post_init__(self) -> None:
+        if self.path and (any(self.velocity) or any(self.acceleration)):
+            raise InputError(
+                f"path must be absent where velocity or acceleration is given; got {len(self.path)} places"
+            )
+        times = [self.start, *(place.time for place in self.path)]
+        if any(later <= earlier for earlier, later in itertools.pairwise(times)):
+            raise InputError(f"path must have rising times, all after start = {self.start}; got {times[1:]}")
+
+    @property
+    def moves(self) -> bool:
+        """Whether it ever does."""
+        return bool(self.path) or any(self.velocity) or any(self.acceleration)
+
+    @cached_property
+    def solids(self) -> tuple[Solid, ...]:
+        """What it is made of."""
+        raise NotImplementedError
+
+    def places(self, t: Array) -> Array:
+        """(K, 3) its position at times (K,) [m]."""
+        since = np.maximum(t - self.start, 0.0)[:, None]
+        if not self.path:
+            moved = since * np.array(self.velocity) + 0.5 * since**2 * np.array(self.acceleration)
+            return np.array(self.position) + moved
+        times = [self.start, *(place.time for place in self.path)]
+        positions = np.array([self.position, *(place.position for place in self.path)])
+        return np.stack([np.interp(t, times, column) for column in positions.T], axis=1)
+
+    def clearances(self, t: Array, points: Array) -> tuple[Array, Array]:
+        """Signed distance (s, K) [m] of points (K, 3) at times (K,) to each of its s solids, and normals (s, K, 3)."""
+        relative = points - self.places(t)
+        found = [solid.clearance(relative) for solid in self.solids]
+        return np.stack([distance for distance, _ in found]), np.stack([normal for _, normal in found])
+
+    def clearance(self, t: Array, points: Array) -> Array:
+        """(K,) signed distance [m]; inside a wall, whose solids overlap, at most that deep."""
+        return self.clearances(t, points)[0].min(axis=0)
+
+
+def _upright(yaw: float) -> Array:
+    """(3, 3) turn by a yaw [deg]."""
+    c, s = math.cos(math.radians(yaw)), math.sin(math.radians(yaw))
+    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sphere(Obstacle):
+    """A sphere."""
+
+    type: Annotated[Literal["sphere"], doc("kind of obstacle: sphere")] = "sphere"
+    radius: Annotated[Positive, doc("[m]")]
+
+    @cached_property
+    def solids(self) -> tuple[Solid, ...]:
+        """The sphere."""
+        return (Solid("sphere", (self.radius, 0.0, 0.0), np.zeros(3), np.eye(3)),)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Capsule(Obstacle):
+    """All that is no farther than a radius from a straight axis."""
+
+    type: Annotated[Literal["capsule"], doc("kind of obstacle: capsule")] = "capsule"
+    axis: Annotated[Vector, doc("[m] from one end of its axis to the other")]
+    radius: Annotated[Positive, doc("[m] about its axis")]
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not math.hypot(*self.axis) > 0.0:
+            raise InputError(f"axis must not be 0; a sphere has none; got {list(self.axis)}")
+
+    @cached_property
+    def solids(self) -> tuple[Solid, ...]:
+        """The capsule, its axis along z."""
+        axis = np.array(self.axis, float)
+        length = float(np.linalg.norm(axis))
+        z = axis / length
+        x = np.cross(z, np.eye(3)[np.abs(z).argmin()])
+        x /= np.linalg.norm(x)
+        turn = np.stack([x, np.cross(z, x), z], axis=1)
+        return (Solid("capsule", (self.radius, 0.5 * length, 0.0), np.zeros(3), turn),)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Box(Obstacle):
+    """An upright box."""
+
+    type: Annotated[Literal["box"], doc("kind of obstacle: box")] = "box"
+    size: Annotated[Sizes, doc("[m] its edges along its own x, y, z")]
+    yaw: Annotated[Number, doc("[deg] of its x axis, from the world's")] = 0.0
+
+    @cached_property
+    def solids(self) -> tuple[Solid, ...]:
+        """The box."""
+        x, y, z = self.size
+        return (Solid("box", (0.5 * x, 0.5 * y, 0.5 * z), np.zeros(3), _upright(self.yaw)),)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Cylinder(Obstacle):
+    """A vertical cylinder."""
+
+    type: Annotated[Literal["cylinder"], doc("kind of obstacle: cylinder")] = "cylinder"
+    radius: Annotated[Positive, doc("[m]")]
+    height: Annotated[Positive, doc("[m]")]
+
+    @cached_property
+    def solids(self) -> tuple[Solid, ...]:
+        """The cylinder."""
+        return (Solid("cylinder", (self.radius, 0.5 * self.height, 0.0), np.zeros(3), np.eye(3)),)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Wall(Obstacle):
+    """An upright wall with a rectangular window."""
+
+    type: Annotated[Literal["wall"], doc("kind of obstacle: wall")] = "wall"
+    size: Annotated[Sizes, doc("[m] thickness along its own x, width along y, height along z")]
+    yaw: Annotated[Number, doc("[deg] of its x axis, which goes through it, from the world's")] = 0.0
+    window: Annotated[Annotated[tuple[Positive, ...], Len(2, 2)], doc("[m] width and height of the opening")]
+    window_centre: Annotated[Pair, doc("[m] along its own y and z, from its centre")] = (0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for opening, middle, size in zip(self.window, self.window_centre, self.size[1:], strict=True):
+            if not abs(middle) + 0.5 * opening < 0.5 * size:
+                raise InputError(
+                    f"window must lie within the wall's width and height = {list(self.size[1:])}; got "
+                    f"{list(self.window)} about {list(self.window_centre)}"
+                )
+
+    @cached_property
+    def solids(self) -> tuple[Solid, ...]:
+        """What is left and right of the window, as high as the wall, and above and below it, as wide."""
+        turn = _upright(self.yaw)
+        thickness, width, height = self.size
+        found = []
+        for i, (opening, middle) in enumerate(zip(self.window, self.window_centre, strict=True)):
+            reach = 0.5 * (width, height)[i]
+            for low, high in ((-reach, middle - 0.5 * opening), (middle + 0.5 * opening, reach)):
+                half, centre = np.array([thickness, width, height]) / 2.0, np.zeros(3)
+                half[1 + i], centre[1 + i] = 0.5 * (high - low), 0.5 * (high + low)
+                found.append(Solid("box", (half[0], half[1], half[2]), turn @ centre, turn))
+        return tuple(found)
+
+
+AnyObstacle = Sphere | Capsule | Box | Cylinder | Wall
+
+
+@dataclass(frozen=True, kw_only=True)
+class Region:
+    """A convex region to stay in: an upright box, or half-spaces."""
+
+    position: Annotated[Vector | None, doc("[m] x, y, z of a box's centre, world")] = None
+    size: Annotated[Sizes | None, doc("[m] a box's edges along its own x, y, z")] = None
+    yaw: Annotated[Number, doc("[deg] of a box's x axis, from the world's")] = 0.0
+    rows: Annotated[
+        Annotated[tuple[Vector, ...], Len(1, MOST_PLACES)] | None,
+        doc("instead of a box: one list of three numbers a per half-space a . (x, y, z) <= upper"),
+    ] = None
+    upper: Annotated[tuple[Number, ...] | None, doc("[m, times the length of a] one per row")] = None
+    tolerance: Annotated[NonNegative, doc("[m] of the audit: allowed beyond")] = 0.0
+    required: Annotated[bool, doc("false: measured and reported, never a failure")] = True
+
+    def __post_init__(self) -> None:
+        box, polytope = (self.position, self.size), (self.rows, self.upper)
+        given = [part is not None for part in (*box, *polytope)]
+        if given not in ([True, True, False, False], [False, False, True, True]):
+            raise InputError("position must be given with size, or rows with upper, and not both")
+        if self.rows is not None and self.upper is not None:
+            if len(self.rows) != len(self.upper):
+                raise InputError(f"upper must have one number per row, {len(self.rows)}; got {list(self.upper)}")
+            for row in self.rows:
+                if not any(row):
+                    raise InputError(f"rows must be lists of 3 numbers, not all 0; got {list(row)}")
+
+    @cached_property
+    def half_spaces(self) -> tuple[Array, Array]:
+        """A (m, 3), rows of unit length, and b (m,) [m]: inside is A p <= b."""
+        if self.rows is not None:
+            rows, upper = np.array(self.rows, float), np.array(self.upper, float)
+            lengths = np.linalg.norm(rows, axis=1)
+            return rows / lengths[:, None], upper / lengths
+        axes = _upright(self.yaw).T
+        rows = np.concatenate([axes, -axes])
+        return rows, rows @ np.array(self.position, float) + 0.5 * np.tile(np.array(self.size, float), 2)
+
+    def clearance(self, t: Array, points: Array) -> Array:
+        """(K,) distance of points (K, 3) to the nearest bounding plane [m]; negative outside, there at most as far."""
+        rows, upper = self.half_spaces
+        return (upper - points @ rows.T).min(axis=1)
+
+    def edges(self, low: Array, high: Array) -> Array:
+        """(E, 2, 3) the edges of what of it lies between two corners [m], for drawing."""
+        rows, upper = self.half_spaces
+        rows = np.concatenate([rows, np.eye(3), -np.eye(3)])
+        upper = np.concatenate([upper, high, -np.asarray(low)])
+        corners: dict[tuple[float, ...], set[int]] = {}
+        for planes in itertools.combinations(range(len(rows)), 3):
+            chosen = rows[list(planes)]
+            if abs(chosen[0] @ np.cross(chosen[1], chosen[2])) > _PARALLEL:
+                corner = np.linalg.solve(chosen, upper[list(planes)])
+                if (rows @ corner <= upper + 1e-9).all():
+                    corners.setdefault(tuple((corner.round(6) + 0.0).tolist()), set()).update(planes)
+        found = []
+        for (a, of_a), (b, of_b) in itertools.combinations(corners.items(), 2):
+            shared = rows[sorted(of_a & of_b)]  # two at least that are not parallel, as where a face is cut off
+            if len(shared) > 1 and np.linalg.norm(np.cross(shared[0], shared), axis=1).max() > _PARALLEL:
+                found.append((a, b))
+        return np.array(found).reshape(-1, 2, 3)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Corridor(Region):
+    """A convex region to stay in for a window of time."""
+
+    name: Name = field(metadata=_NAME)
+    start: Annotated[Number, doc("[s] first time it holds")] = 0.0
+    stop: Annotated[Number, doc("[s] last time it holds; absent: the flight's end")] = math.inf
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not self.start <= self.stop:
+            raise ParameterError(f"corridors.{self.name}", "stop", self.stop, f"at least start = {self.start}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Fence(Region):
+    """A convex region to stay in throughout."""
+
+    name: ClassVar[str] = "keep_in"
+    start: ClassVar[float] = 0.0
+    stop: ClassVar[float] = math.inf
+
+
+Constraining = AnyObstacle | Corridor | Fence
+SHAPES: Final[dict[str, type[Any]]] = {
+    kind.__name__.lower(): kind for kind in (Sphere, Capsule, Box, Cylinder, Wall, Corridor, Fence)
+}
+
+
+def shape_to_json(shape: Constraining) -> dict[str, Any]:
+    """A shape's fields, less those that are absent, and its kind as `type`."""
+    stated = {name: value for name, value in asdict(shape).items() if value is not None and value != math.inf}
+    written: dict[str, Any] = json.loads(json.dumps({"type": type(shape).__name__.lower(), **stated}))
+    return written  # with lists for tuples, as it is read
+
+
+def shape_from_json(entry: Mapping[str, Any]) -> Constraining:
+    """The shape that `shape_to_json` wrote.
+
+    Raises:
+        InputError, TypeError, ValueError: it did not.
+    """
+    if entry.get("type") not in SHAPES:
+        raise UnknownNameError("shape", str(entry.get("type")), SHAPES)
+    kind = SHAPES[entry["type"]]
+    values = {name: _frozen(value) for name, value in entry.items() if name != "type"}
+    if "path" in values:
+        values["path"] = tuple(Place(time=time, position=tuple(p)) for time, p in map(_place, entry["path"]))
+    shape: Constraining = kind(**values)
+    points = np.zeros((1, 3))
+    if not np.isfinite(shape.clearance(np.zeros(1), points)).all():
+        raise InputError(f"{entry['type']} must be of finite numbers; got {entry}")
+    return shape
+
+
+def _place(entry: Mapping[str, Any]) -> tuple[float, Sequence[float]]:
+    return entry["time"], entry["position"]
+
+
+def _frozen(value: Any) -> Any:
+    return tuple(map(_frozen, value)) if isinstance(value, list) else value
+
+
+def footprint(solid: Solid, low: float, high: float) -> Array | None:
+    """(n, 2) outline from above of a solid that reaches between two heights, relative to its obstacle; None: not."""
+    bottom, top = solid.support(np.array([[0.0, 0.0, -1.0], [0.0, 0.0, 1.0]]))[:, 2]
+    if bottom > high or top < low:
+        return None
+    around = np.linspace(0.0, 2.0 * np.pi, 65)[:-1]
+    return solid.support(np.stack([np.cos(around), np.sin(around), np.zeros(around.size)], axis=1))[:, :2]

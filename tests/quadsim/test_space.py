@@ -1,0 +1,256 @@
+"""Signed distances and normals against brute force, paths, regions and their edges."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import math
+
+import mujoco
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from quadsim.errors import InputError
+from quadsim.space import (
+    AnyObstacle,
+    Box,
+    Capsule,
+    Corridor,
+    Cylinder,
+    Fence,
+    Obstacle,
+    Place,
+    Sphere,
+    Wall,
+    footprint,
+    shape_from_json,
+    shape_to_json,
+)
+from quadsim.state import Array
+
+STILL = np.zeros(1)
+SPACING = 0.04
+numbers, lengths = st.floats(-2.0, 2.0), st.floats(0.2, 2.0)
+vectors = st.tuples(numbers, numbers, numbers)
+shared = {"name": st.just("it"), "position": vectors}
+boxes = st.builds(Box, **shared, size=st.tuples(lengths, lengths, lengths), yaw=st.floats(-180.0, 180.0))
+walls = st.builds(
+    Wall,
+    **shared,
+    size=st.tuples(lengths, st.floats(1.5, 2.5), st.floats(1.5, 2.5)),
+    yaw=st.floats(-180.0, 180.0),
+    window=st.tuples(st.floats(0.3, 0.8), st.floats(0.3, 0.8)),
+    window_centre=st.tuples(st.floats(-0.3, 0.3), st.floats(-0.3, 0.3)),
+)
+round_ones = st.one_of(
+    st.builds(Sphere, **shared, radius=lengths),
+    st.builds(Capsule, **shared, axis=vectors.filter(lambda v: math.hypot(*v) > 0.2), radius=lengths),
+    st.builds(Cylinder, **shared, radius=lengths, height=lengths),
+)
+obstacles: st.SearchStrategy[AnyObstacle] = st.one_of(boxes, round_ones, walls)
+
+
+def holds(obstacle: AnyObstacle, points: Array) -> np.ndarray:
+    """Whether points (K, 3) lie inside, said another way than by distances."""
+    x, y, z = (points - obstacle.position).T
+    if isinstance(obstacle, Sphere):
+        return x**2 + y**2 + z**2 <= obstacle.radius**2
+    if isinstance(obstacle, Cylinder):
+        return (x**2 + y**2 <= obstacle.radius**2) & (np.abs(z) <= obstacle.height / 2)
+    if isinstance(obstacle, Capsule):
+        along = np.linspace(-0.5, 0.5, 4001)[:, None] * np.array(obstacle.axis)
+        return np.array(
+            [np.linalg.norm(p - along, axis=1).min() <= obstacle.radius for p in points - obstacle.position]
+        )
+    yaw = math.radians(obstacle.yaw)
+    along, across = math.cos(yaw) * x + math.sin(yaw) * y, math.cos(yaw) * y - math.sin(yaw) * x
+    local = np.stack([along, across, z], axis=1)
+    inside = (np.abs(local) <= np.array(obstacle.size) / 2).all(axis=1)
+    if isinstance(obstacle, Wall):
+        inside &= ~(np.abs(local[:, 1:] - obstacle.window_centre) < np.array(obstacle.window) / 2).all(axis=1)
+    return inside
+
+
+def surface(obstacle: AnyObstacle) -> Array:
+    """Points of the surface, none farther than `SPACING` from a point of it, by bisection along a grid's lines."""
+    reach = 0.5 * np.linalg.norm(getattr(obstacle, "size", getattr(obstacle, "axis", (0.0,)))) + 0.2
+    reach += getattr(obstacle, "radius", 0.0) + 0.5 * getattr(obstacle, "height", 0.0)
+    ticks = np.arange(-reach, reach, SPACING)
+    found = []
+    for axis in range(3):
+        grid = np.stack(np.meshgrid(ticks, ticks, indexing="ij"), -1).reshape(-1, 2)
+        grid = grid[np.random.default_rng(0).permutation(len(grid))[:300]]
+        lines = np.insert(grid[:, None, :].repeat(ticks.size, 1), axis, ticks, axis=2) + obstacle.position
+        inside = holds(obstacle, lines.reshape(-1, 3)).reshape(len(grid), ticks.size)
+        i, j = np.nonzero(inside[:, 1:] != inside[:, :-1])
+        low, high = lines[i, j].copy(), lines[i, j + 1].copy()
+        state = inside[i, j]
+        for _ in range(20):
+            middle = 0.5 * (low + high)
+            same = holds(obstacle, middle) == state
+            low[same], high[~same] = middle[same], middle[~same]
+        found.append(low)
+    return np.concatenate(found)
+
+
+@settings(max_examples=60, deadline=None)
+@given(obstacle=obstacles, points=st.lists(vectors, min_size=4, max_size=4))
+def test_the_nearest_point_is_of_the_surface(obstacle: AnyObstacle, points: list[tuple[float, float, float]]) -> None:
+    p = 2.0 * np.array(points)
+    distances, normals = obstacle.clearances(np.zeros(len(p)), p)
+    np.testing.assert_allclose(np.linalg.norm(normals, axis=2), 1.0, atol=1e-12)
+    nearest = distances.argmin(axis=0), np.arange(len(p))
+    distance, normal = distances[nearest], normals[nearest]
+    far = np.abs(distance) > 1e-5
+    np.testing.assert_array_equal((distance < 0.0)[far], holds(obstacle, p)[far])
+    if isinstance(obstacle, Wall):  # whose solids overlap
+        far &= distance > 0.0
+    foot = p - distance[:, None] * normal
+    assert holds(obstacle, foot - 1e-5 * normal)[far].all()
+    assert not holds(obstacle, foot + 1e-5 * normal)[far].any()
+
+
+@settings(max_examples=25, deadline=None)
+@given(obstacle=obstacles, points=st.lists(vectors, min_size=5, max_size=5))
+def test_no_point_of_the_surface_is_nearer(obstacle: AnyObstacle, points: list[tuple[float, float, float]]) -> None:
+    p = 2.0 * np.array(points)
+    distance = obstacle.clearance(np.zeros(len(p)), p)
+    if isinstance(obstacle, Capsule):
+        along = np.linspace(-0.5, 0.5, 4001)[:, None] * np.array(obstacle.axis) + obstacle.position
+        brute = np.linalg.norm(p[:, None] - along, axis=2).min(axis=1) - obstacle.radius
+        np.testing.assert_allclose(distance, brute, atol=2e-3)
+    else:
+        brute = np.linalg.norm(p[:, None] - surface(obstacle), axis=2).min(axis=1)
+        assert (np.abs(distance) <= brute + 1e-5).all()
+
+
+@settings(max_examples=60, deadline=None)
+@given(obstacle=obstacles, point=vectors, step=vectors)
+def test_the_normal_is_the_gradient_and_the_distance_no_steeper(
+    obstacle: AnyObstacle, point: tuple[float, ...], step: tuple[float, ...]
+) -> None:
+    p, d = 2.0 * np.array([point]), np.array([step])
+    before, after = (obstacle.clearance(STILL, q)[0] for q in (p, p + d))
+    assert abs(after - before) <= np.linalg.norm(d) + 1e-9
+    for solid in obstacle.solids:
+        relative, h = p - obstacle.position, 1e-6
+        distance, normal = solid.clearance(relative)
+        slope = [
+            (solid.clearance(relative + h * e)[0] - solid.clearance(relative - h * e)[0])[0] / (2 * h)
+            for e in np.eye(3)
+        ]
+        if np.linalg.norm(slope) > 1.0 - 1e-6:  # else on a ridge, where it has none
+            np.testing.assert_allclose(slope, normal[0], atol=1e-4)
+        if distance[0] > 0.0:  # a convex solid lies behind the plane through its nearest point
+            corners = 3.0 * np.random.default_rng(1).uniform(-1.0, 1.0, (2000, 3)) + solid.centre
+            within = corners[solid.clearance(corners)[0] <= 0.0]
+            assert ((relative - within) @ normal[0] >= distance[0] - 1e-9).all()
+
+
+@settings(max_examples=60, deadline=None)
+@given(obstacle=obstacles, point=vectors)
+def test_distances_are_those_of_mujoco(obstacle: AnyObstacle, point: tuple[float, ...]) -> None:
+    spec = mujoco.MjSpec()
+    for solid in obstacle.solids:
+        kind = getattr(mujoco.mjtGeom, f"mjGEOM_{solid.kind.upper()}")
+        spec.worldbody.add_geom(
+            type=kind, size=solid.size, pos=np.array(obstacle.position) + solid.centre, quat=solid.quaternion
+        )
+    ball = spec.worldbody.add_body(pos=2.0 * np.array(point))
+    ball.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[0.05, 0.0, 0.0])
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    ours = obstacle.clearances(STILL, 2.0 * np.array([point]))[0][:, 0] - 0.05
+    theirs = [mujoco.mj_geomDistance(model, data, i, model.ngeom - 1, 50.0, None) for i in range(model.ngeom - 1)]
+    for mine, its in zip(ours, theirs, strict=True):
+        if mine > 1e-3:
+            assert mine == pytest.approx(its, abs=2e-4)
+
+
+def test_obstacles_move_as_stated() -> None:
+    t = np.array([0.0, 1.0, 2.0, 3.0])
+    ball = Sphere(
+        name="ball", position=(1.0, 0.0, 2.0), radius=0.1, start=1.0, velocity=(2, 0, 3), acceleration=(0, 0, -9.81)
+    )
+    np.testing.assert_allclose(
+        ball.places(t), [[1, 0, 2], [1, 0, 2], [3, 0, 5 - 4.905], [5, 0, 8 - 4 * 4.905]], atol=1e-12
+    )
+    door = Box(
+        name="door",
+        position=(0.0, 0.0, 0.0),
+        size=(1, 1, 1),
+        path=(Place(time=2.0, position=(2.0, 0.0, 0.0)), Place(time=3.0, position=(2.0, 4.0, 0.0))),
+    )
+    np.testing.assert_allclose(door.places(t), [[0, 0, 0], [1, 0, 0], [2, 0, 0], [2, 4, 0]])
+    np.testing.assert_allclose(door.clearance(t, np.tile([2.0, 0.0, 0.0], (4, 1))), [1.5, 0.5, -0.5, 3.5])
+
+
+@given(points=st.lists(vectors, min_size=3, max_size=9), size=st.tuples(lengths, lengths, lengths), yaw=numbers)
+def test_a_region_s_clearance_is_the_ball_s_that_fits(
+    points: list[tuple[float, float, float]], size: tuple[float, float, float], yaw: float
+) -> None:
+    box, region = Box(name="b", position=(0, 0, 0), size=size, yaw=yaw), Fence(position=(0, 0, 0), size=size, yaw=yaw)
+    p = np.array(points)
+    t, solid = np.zeros(len(p)), box.clearance(np.zeros(len(p)), np.array(points))
+    inside = solid < 0.0
+    np.testing.assert_allclose(region.clearance(t, p)[inside], -solid[inside], atol=1e-12)
+    assert (region.clearance(t, p)[~inside] >= -solid[~inside] - 1e-12).all()
+    rows, upper = region.half_spaces
+    polytope = Corridor(name="c", rows=tuple(map(tuple, 3.0 * rows)), upper=tuple(3.0 * upper))
+    np.testing.assert_allclose(polytope.clearance(t, p), region.clearance(t, p), atol=1e-12)
+    assert len(region.edges(np.full(3, -9.0), np.full(3, 9.0))) == 12
+
+
+@given(obstacle=obstacles)
+def test_shapes_survive_json(obstacle: AnyObstacle) -> None:
+    corridor = Corridor(name="c", position=(0, 0, 0), size=(1, 2, 3), start=1.0)
+    for shape in (obstacle, corridor, Fence(rows=((1.0, 0.0, 0.0),), upper=(3.0,))):
+        assert shape_from_json(json.loads(json.dumps(shape_to_json(shape)))) == shape
+
+
+@settings(max_examples=40, deadline=None)
+@given(obstacle=st.one_of(boxes, round_ones))
+def test_footprints_are_as_wide_as_the_solid(obstacle: AnyObstacle) -> None:
+    for solid, angle in itertools.product(obstacle.solids, np.linspace(0.0, math.pi, 5)):
+        way = np.array([math.cos(angle), math.sin(angle), 0.0])
+        outline = footprint(solid, -50.0, 50.0)
+        assert outline is not None
+        gap, _ = solid.clearance(1e6 * way[None] + solid.centre)  # from so far away, to the plane that touches it
+        reach = ((outline - solid.centre[:2]) @ way[:2]).max()
+        assert 1e6 - gap[0] == pytest.approx(reach, abs=2e-2 * max(reach, 0.1))
+    assert footprint(obstacle.solids[0], 50.0, 60.0) is None
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: Capsule(name="a", position=(0, 0, 0), axis=(0, 0, 0), radius=1.0), "axis must not be 0"),
+        (lambda: Wall(name="a", position=(0, 0, 0), size=(1, 2, 2), window=(2, 1)), "window must lie within"),
+        (lambda: Fence(position=(0, 0, 0)), "position must be given with size, or rows with upper"),
+        (lambda: Fence(rows=((1, 0, 0),), upper=(1, 2)), "upper must have one number per row, 1"),
+        (lambda: Fence(rows=((0, 0, 0),), upper=(1,)), "not all 0"),
+        (lambda: Corridor(name="c", position=(0, 0, 0), size=(1, 1, 1), start=2, stop=1), "at least start = 2"),
+        (
+            lambda: Sphere(
+                name="a", position=(0, 0, 0), radius=1, velocity=(1, 0, 0), path=(Place(time=1, position=(0, 0, 0)),)
+            ),
+            "path must be absent where velocity",
+        ),
+        (
+            lambda: Sphere(name="a", position=(0, 0, 0), radius=1, start=2, path=(Place(time=1, position=(0, 0, 0)),)),
+            "rising times, all after start = 2",
+        ),
+        (lambda: shape_from_json({"type": "cube"}), "no shape named 'cube'"),
+    ],
+)
+def test_what_cannot_be_is_refused(make: object, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        make()  # type: ignore[operator]
+
+
+def test_an_obstacle_is_a_union_of_solids() -> None:
+    with pytest.raises(NotImplementedError):
+        _ = Obstacle(name="a", position=(0.0, 0.0, 0.0)).solids

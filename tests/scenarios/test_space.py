@@ -1,0 +1,244 @@
+"""Obstacles, corridors and the fence in scenarios: what is read, audited, touched, drawn and refused."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+import pytest
+
+from quadsim.controller import Phase
+from quadsim.errors import FileError, InputError
+from quadsim.flight.audit import SpaceLimit
+from quadsim.flight.rundir import load_run
+from quadsim.report.figures.flight_figures import write_figures
+from quadsim.report.plots.flight_plots import comparison_plots
+from quadsim.report.recording import write_recording
+from quadsim.report.scene import has_space, obstacles_in, outlines, region_edges
+from quadsim.sim.plant import Plant
+from quadsim.space import Cylinder, Fence, Sphere, Wall
+from quadsim.state import INDEX, POSITION
+from quadsim.vehicle import Vehicle
+from scenarios.flight import Flight, Outputs, write_run
+from scenarios.loading import load_scenario, parse_scenario
+from scenarios.reaudit import reaudit
+from scenarios.run import fly_scenario
+from scenarios.schema.scenario import Scenario
+
+PILLAR = {"type": "cylinder", "name": "pillar", "position": [1.0, 0.0, 1.0], "radius": 0.1, "height": 3.0}
+BALL = {
+    "type": "sphere", "name": "ball", "position": [0.5, 3.0, 1.0], "radius": 0.1, "start": 0.5,
+    "velocity": [0.0, -2.0, 1.0], "acceleration": [0.0, 0.0, -1.0],
+}  # fmt: skip
+WALL = {
+    "type": "wall", "name": "wall", "position": [2.5, 0.0, 1.0], "size": [0.1, 4.0, 2.0], "window": [1.4, 1.4],
+    "yaw": 10.0,
+}  # fmt: skip
+LOG = {"type": "capsule", "name": "log", "position": [0.0, 2.0, 0.0], "axis": [1.0, 1.0, 0.0], "radius": 0.1}
+CRATE = {
+    "type": "box", "name": "crate", "position": [0.0, -2.0, 0.0], "size": [0.5, 0.5, 0.5],
+    "path": [{"time": 1.0, "position": [1.0, -2.0, 0.0]}],
+}  # fmt: skip
+TUBE = {"name": "tube", "position": [0.0, 0.0, 1.0], "size": [3.0, 2.0, 2.0], "stop": 1.0}
+FENCE = {"rows": [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]], "upper": [1.9, 2.0]}
+
+
+def scenario(changes: Mapping[str, Any] = {}) -> Scenario:
+    """Four seconds straight along x, from hover, among what is asked for."""
+    base = load_scenario("hummingbird-figure-eight").replace(
+        {"duration": 4.0, "constraints": [], "reference": {"type": "waypoints", "start": 0.5, "response_time": 0.5}}
+        | {"reference": {"type": "waypoints", "start": 0.5, "points": [{"position": [2.0, 0.0, 1.0]}]}}
+    )
+    return base.replace(changes)
+
+
+@pytest.fixture(scope="module")
+def crashed() -> Flight:
+    return fly_scenario(
+        scenario({"obstacles": [PILLAR, BALL, WALL, LOG, CRATE], "corridors": [TUBE], "keep_in": FENCE})
+    )
+
+
+def test_tables_become_limits(crashed: Flight) -> None:
+    limits = [finding.limit for finding in crashed.findings]
+    assert [limit.name for limit in limits] == ["pillar", "ball", "wall", "log", "crate", "tube", "keep_in"]
+    assert [(limit.start, limit.stop) for limit in limits[-2:]] == [(0.0, 1.0), (0.0, np.inf)]
+    radius = crashed.vehicle.arm_length + (crashed.vehicle.rotor_radius or 0.0)
+    assert all(isinstance(limit, SpaceLimit) and limit.radius == radius and limit.unit == "m" for limit in limits)
+    again = Scenario.parse(scenario({"obstacles": [PILLAR, CRATE], "keep_in": FENCE}).model_dump(mode="json"))
+    assert again.obstacles[0] == Cylinder(name="pillar", position=(1.0, 0.0, 1.0), radius=0.1, height=3.0)
+
+
+def test_the_extent_is_the_vehicle_s_or_the_scenario_s() -> None:
+    asked = scenario({"obstacles": [PILLAR], "vehicle.extent": 0.05})
+    (finding,) = fly_scenario(asked).findings
+    assert isinstance(finding.limit, SpaceLimit)
+    assert finding.limit.radius == 0.05
+
+
+def test_a_touch_is_a_crash_at_the_distance_that_the_audit_measures(crashed: Flight) -> None:
+    assert crashed.outcome == "violated"
+    assert not crashed.findings[0].satisfied
+    log, limit = crashed.log, crashed.findings[0].limit
+    clearance = limit.source.finest(log)[1]
+    touch = log.plant.t[np.flatnonzero(clearance <= 0.0)[0]]
+    first = log.control.t[log.control.phase.index(Phase.CRASHED)]
+    period = crashed.scenario.control_period
+    assert touch <= first <= touch + period + 1e-9
+    assert clearance.min() > -0.02  # it bounces off
+
+
+def test_mujoco_meets_what_the_distance_says(vehicle: Vehicle) -> None:
+    """In each step MuJoCo has a contact where, and only where, the ball's distance is negative."""
+    pillar = Cylinder(name="pillar", position=(0.8, 0.0, 0.0), radius=0.1, height=3.0)
+    ball = Sphere(name="ball", position=(0.0, 3.0, 0.0), radius=0.2, velocity=(0.0, -2.0, 0.0))
+    seen = []
+    with Plant(vehicle, obstacles=[pillar, ball]) as plant:
+        radius = vehicle.enclosing_radius
+        state = np.zeros(12)
+        state[INDEX["vx"]] = 0.5
+        plant.reset(state)
+        for _ in range(1500):
+            time, before = plant.time, plant.state()[None, list(POSITION)]
+            gap = min(each.clearance(np.array([time]), before)[0] - radius for each in (pillar, ball))
+            plant.advance(plant.hover_speeds, 1)
+            data = plant._data
+            mujoco.mj_forward(plant.model, data)
+            seen.append((gap, data.ncon))
+    gaps, contacts = np.array(seen).T
+    clear = np.abs(gaps) > 5e-3  # a step apart
+    assert (gaps < -5e-3).any()
+    np.testing.assert_array_equal((contacts > 0)[clear], (gaps < 0.0)[clear])
+
+
+def test_obstacles_out_of_reach_change_nothing() -> None:
+    """Steps are then taken one by one where they move; the numbers are those of a flight without."""
+    far = {**PILLAR, "position": [50.0, 0.0, 1.0]}
+    plain, among = fly_scenario(scenario()), fly_scenario(scenario({"obstacles": [far]}))
+    np.testing.assert_allclose(among.log.plant.state, plain.log.plant.state, rtol=0.0, atol=1e-9)
+    assert among.outcome == "satisfied"
+
+
+def test_a_run_with_shapes_is_read_audited_again_and_drawn(crashed: Flight, tmp_path: Path) -> None:
+    directory = tmp_path / "run"
+    directory.mkdir()
+    write_run(crashed, directory, Outputs(video=False, recording=False, figures=False))
+    run = load_run(directory)
+    assert run.limits == tuple(finding.limit for finding in crashed.findings)
+    assert not reaudit(directory).satisfied
+    assert {path.stem for path in write_figures(run, tmp_path / "figures")} >= {"space"}
+    (path,) = [plot for plot in comparison_plots([run]) if plot.key == "path"]
+    assert path.json.count('"mesh3d"') == 8  # four of the wall
+    write_recording(run, tmp_path / "flight.rrd")
+    assert has_space(run.limits)
+    assert [len(edges) for _, edges in region_edges(run)] == [12, 12]
+    (outline, meets) = next(outlines(obstacles_in(run.limits)[0], 0.0, 1.0, 0.1))
+    np.testing.assert_allclose(np.linalg.norm(outline - [1.0, 0.0], axis=1), 0.1)
+    assert meets
+    assert not next(outlines(obstacles_in(run.limits)[0], 0.0, 3.0, 0.1))[1]
+
+
+def test_a_shape_that_was_changed_is_noticed(crashed: Flight, tmp_path: Path) -> None:
+    write_run(crashed, tmp_path, Outputs(video=False, recording=False, figures=False))
+    text = (tmp_path / "summary.json").read_text()
+    (tmp_path / "summary.json").write_text(text.replace('"radius": 0.1,', '"radius": 0.2,', 1))
+    with pytest.raises(FileError, match="shape is recorded as"):
+        reaudit(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"obstacles": [{**PILLAR, "type": "tree"}]}, "obstacles.pillar must be one of 'sphere'"),
+        ({"obstacles": [{**PILLAR, "radius": -1.0}]}, "obstacles.pillar.radius must be > 0"),
+        ({"obstacles": [{**WALL, "window": [5.0, 1.0]}]}, "window must lie within"),
+        ({"obstacles": [PILLAR, PILLAR]}, "constraints must have distinct names"),
+        ({"corridors": [{"name": "c", "size": [1.0, 1.0, 1.0]}]}, "position must be given with size"),
+        ({"keep_in": {**FENCE, "upper": [1.0]}}, "upper must have one number per row, 2"),
+        ({"obstacles": [{**PILLAR, "height": None}]}, "height"),
+    ],
+)
+def test_what_cannot_be_is_refused(changes: Mapping[str, Any], message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        scenario(changes)
+
+
+@pytest.mark.parametrize(
+    "changes", [{"obstacles": [{**PILLAR, "position": [0.3, 0.0, 1.0]}]}, {"keep_in": {**FENCE, "upper": [0.1, 2.0]}}]
+)
+def test_a_start_that_is_not_clear_is_refused(changes: Mapping[str, Any], tmp_path: Path) -> None:
+    path = tmp_path / "start.toml"
+    path.write_text(scenario(changes).to_toml())
+    with pytest.raises(InputError, match=r"initial.position must be clear of (pillar|keep_in), by the radius"):
+        load_scenario(str(path))
+
+
+def test_shapes_read_as_they_are_written() -> None:
+    asked = scenario({"obstacles": [PILLAR, BALL, WALL, LOG, CRATE], "corridors": [TUBE], "keep_in": FENCE})
+    import tomllib
+
+    assert parse_scenario(tomllib.loads(asked.to_toml())) == asked
+    assert isinstance(asked.obstacles[2], Wall)
+    assert isinstance(asked.keep_in, Fence)
+
+
+AVOIDANCE = {"controller.output_bounds": {"roll": [-30.0, 30.0], "pitch": [-30.0, 30.0]}, "controller.avoidance": {}}
+
+
+@pytest.mark.parametrize("law", ["hover", "trajectory"])
+def test_the_robust_controller_keeps_clear_in_any_heading(law: str) -> None:
+    robust = {
+        "type": "robust", "horizon": 30, "soft": {}, "offset_free": {}, "linearisation": law, "heading": law == "hover",
+        "output_weights": {"x": 10.0, "y": 10.0, "z": 100.0, "yaw": 100.0}, "input_weights": {"speed": 9e-4},
+        "output_bounds": AVOIDANCE["controller.output_bounds"],
+        "input_bounds": {"speed": [0.0, 838.0], "slew": [-80.0, 80.0]}, "avoidance": {"soft": {}},
+        "tightening": {"acceleration": 0.2, "angular_acceleration": 0.2},
+    }  # fmt: skip
+    among = {"obstacles": [{**PILLAR, "position": [1.0, 0.2, 1.0]}], "initial.euler": [0.0, 0.0, 40.0]}
+    flight = fly_scenario(scenario({**among, "controller": robust}))
+    assert flight.outcome == "satisfied"
+    assert 0.04 < flight.findings[0].worst_margin < 0.3
+    assert abs(flight.state["y"]).max() > 0.1
+
+
+@pytest.mark.parametrize("more", [{}, {"node": 0.1, "iterations": 2}, {"rotor_lag": 0.02, "offset_free": {}}])
+def test_the_nonlinear_controller_keeps_clear(more: Mapping[str, Any]) -> None:
+    nonlinear = {"type": "nonlinear", "horizon": 30, "terminal": "lqr", "avoidance": {"soft": {}}, **more}
+    pillar = {"obstacles": [{**PILLAR, "position": [1.0, 0.2, 1.0]}]}
+    flight = fly_scenario(scenario({**pillar, "controller": nonlinear}))
+    assert flight.outcome == "satisfied"
+    assert 0.03 < flight.findings[0].worst_margin < 0.3
+    assert abs(flight.state["y"]).max() > 0.1
+
+
+def test_who_does_not_avoid_touches_and_who_does_keeps_clear() -> None:
+    pillar = {"obstacles": [{**PILLAR, "position": [1.0, 0.2, 1.0]}]}
+    assert fly_scenario(scenario(pillar)).log.control.crashed
+    flight = fly_scenario(scenario({**pillar, **AVOIDANCE}))
+    assert flight.outcome == "satisfied"
+    assert flight.findings[0].worst_margin > 0.04  # of a margin of 0.05, between the samples
+
+
+def test_no_answer_among_obstacles_is_explained_by_their_names() -> None:
+    thrown = {
+        **BALL,
+        "radius": 2.0,
+        "position": [0.0, 4.5, 1.0],
+        "velocity": [0.0, -9.0, 0.0],
+        "acceleration": [0.0] * 3,
+    }
+    flight = fly_scenario(scenario({"obstacles": [thrown], **AVOIDANCE, "controller.fallback": {}}))
+    assert flight.diagnosis is not None
+    assert "cannot hold together" in flight.diagnosis["sentence"]
+    assert "obstacle ball" in flight.diagnosis["sentence"]
+    assert any("controller.avoidance.soft" in each["settings"] for each in flight.diagnosis["suggestions"])
+
+
+def test_a_plant_without_contact_refuses_obstacles(tmp_path: Path) -> None:
+    path = tmp_path / "free.toml"
+    path.write_text(scenario({"obstacles": [PILLAR], "plant.integrator": "rk4"}).to_toml())
+    with pytest.raises(InputError, match=r"plant.integrator must be mujoco where there is obstacles; got 'rk4'"):
+        load_scenario(str(path))
