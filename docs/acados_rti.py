@@ -62,9 +62,7 @@ class AcadosRTI:
         options.qp_tol = 1e-8
         ocp.code_export_directory = str(scratch / model.name)
         with contextlib.redirect_stdout(None):
-            self._solver = template.AcadosOcpSolver(
-                ocp, json_file=str(scratch / f"{model.name}.json"), verbose=False
-            )
+            self._solver = template.AcadosOcpSolver(ocp, json_file=str(scratch / f"{model.name}.json"), verbose=False)
 
     def start(self, states: Array, inputs: Array) -> None:
         """Linearise along states (N + 1, n) and inputs (N, 4) next."""
@@ -81,11 +79,6 @@ class AcadosRTI:
         solver.set(0, "lbx", x0)
         solver.set(0, "ubx", x0)
         return solver.solve(), solver.get(0, "u")
-
-    @property
-    def inside_ms(self) -> float:
-        """What the last step took by acados' own clock [ms]."""
-        return 1e3 * float(np.squeeze(self._solver.get_stats("time_tot")))
 
 
 def _templates(directory: Path) -> Any:

@@ -9,13 +9,15 @@ from __future__ import annotations
 import argparse
 import math
 import tempfile
-from functools import partial
+import time as clock
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 from acados_rti import AcadosRTI
-from make_numbers import ROOT, Table, markdown
+from make_numbers import ROOT, Table, markdown, write_page
+from make_performance import NONLINEAR as TITLE
+from make_robust_step import TITLE as NEXT
 from peers.casadi_ocp import Case, Peer
 from peers.nonlinear_optimum import PAPER
 
@@ -32,10 +34,7 @@ from scenarios.parts.vehicle import build_vehicle
 from scenarios.run import fly_scenario
 
 PAGE: Final = ROOT / "docs" / "performance.md"
-TITLE: Final = "## Nonlinear MPC"
-BEFORE: Final = "## Where the time of a flight goes"
-"""The section that it stands before where there is none yet."""
-LAGGED: Final = Case(name="N = 20, rotor lag", nodes=20, node=0.06, lag=0.02)
+LAGGED: Final = Case(name="rotor lag, N = 20", nodes=20, node=0.06, lag=0.02)
 FLIGHTS: Final[dict[str, tuple[Case, list[str]]]] = {
     "torrente-loop8-drag": (PAPER, []),
     "torrente-lemniscate8-drag": (PAPER, []),
@@ -51,21 +50,21 @@ PATIENT: Final = 20.0
 TARGETS: Final = {10: (0.30, 1.0), 20: (1.5, math.inf)}
 """Largest p50 and p99 of the default by N [ms]."""
 TEXT: Final = """\
-On one machine ({processor}, {cores} cores); each table in one run: read the ratios. `make nonlinear` remakes this
-section. What the controller was asked in flights of the library is put to it with other QP solvers, and to the same
-optimal control problem in CasADi (`tests/peers/casadi_ocp.py`), solved by acados and by IPOPT; as in the tables above
-the plant flies a period between two steps, and each step is the median of its repeats. All start along the reference
-in each segment of 20 periods, and go on along their own last plan; IPOPT converges, the others take one step of
-real-time iteration. acados is called from Python, its references set stage by stage; inside is by its own clock.
+`make nonlinear` remakes this section; processor time, on one machine ({processor}, {cores} cores), each table in one
+run: read the ratios. What the controller was asked in flights of the library, {asked} periods of each, is put to it
+with other QP solvers, and to the same optimal control problem in CasADi (`tests/peers/casadi_ocp.py`), solved by acados
+and by IPOPT. As in the tables above the plant flies a period between two steps, and each step is the median of its
+repeats. All start along the reference in each segment of 20 periods, and go on along their own last plan; IPOPT
+converges each time, the others take one step of the real-time iteration. u0 difference is the largest of a rotor's
+first input from `daqp`'s, as a share of the largest.
 
 {tables}
-
-- Of {free} the unconstrained optimum satisfies all bounds: the default finds it by one Cholesky factorisation.
-- acados is generated C (`SQP_RTI`, partial condensing, HPIPM); ours is NumPy. u0 difference is the largest of a rotor's
-  first input from the default's, as a share of the largest, over the questions asked. IPOPT's is that of an optimum
-  from a step towards it.
-- acados is no peer of `make peers`: its wheel, `comma-deps-acados`, brings a slim `casadi` that overwrites the peers',
-  its libraries find one another only when loaded in turn, and each problem takes a C compiler. `make nonlinear`
+- The unconstrained optimum satisfies all bounds in {free} of these periods: condensed, it is then found by one
+  Cholesky factorisation, whatever the solver. Elsewhere the difference is what PIQP's tolerance leaves.
+- acados is generated C (`SQP_RTI`, partial condensing, HPIPM), called from Python with the references of all nodes;
+  ours is NumPy.
+- acados is no peer of `make peers`: its wheel, `comma-deps-acados`, brings a slim `casadi` that would overwrite the
+  peers', its libraries find one another only when loaded in turn, and a problem takes a C compiler. `make nonlinear`
   installs it in a directory of its own.
 """
 
@@ -78,13 +77,16 @@ class Recorder:
         self.asked: list[tuple[Moment, Array, Array]] = []
 
     def reset(self, speeds: Array) -> None:
+        """See `quadsim.controller.Controller`."""
         self.law.reset(speeds)
 
     def step(self, now: Moment, state: Array, reference: Array) -> Command:
+        """Keep the question, and answer it."""
         self.asked.append((now, state.copy(), reference.copy()))
         return self.law.step(now, state, reference)
 
     def predict(self, states: Array, plans: Array) -> Array:
+        """See `quadsim.controller.Controller`."""
         return self.law.predict(states, plans)
 
 
@@ -97,12 +99,14 @@ class Ours:
         self.statuses: dict[int, str] = {}
 
     def prepare(self, period: int) -> None:
+        """See `scenarios.bench.timing.Candidate.prepare`; after a gap, start anew."""
         moment, state, reference = self._asked[period]
         if period != self._period + 1:
             self._law.reset(moment.acting)
         self._period, self._question = period, (moment, state, reference)
 
     def answer(self) -> None:
+        """See `scenarios.bench.timing.Candidate.answer`."""
         command = self._law.step(*self._question)
         self.first.setdefault(self._period, np.square(command.speeds / 1000.0))
         self.statuses.setdefault(self._period, command.status)
@@ -114,10 +118,10 @@ class InCasadi:
     def __init__(self, case: Case, solver: AcadosRTI | Peer, law: NonlinearMPC, asked: list[Any]) -> None:
         self._case, self._solver, self._law, self._asked, self._period = case, solver, law, asked, -2
         self.first: dict[int, Array] = {}
-        self.inside: list[float] = []
         self.failures = 0
 
     def prepare(self, period: int) -> None:
+        """See `scenarios.bench.timing.Candidate.prepare`; after a gap, start anew."""
         moment, state, _ = self._asked[period]
         nodes = nodes_of_motion(moment.motion, self._case.nodes, self._law.settings.stride)
         before, inputs = np.square(moment.acting / 1000.0), nodes.thrusts / 20.0
@@ -138,19 +142,19 @@ class InCasadi:
         self._before = before
 
     def answer(self) -> None:
+        """See `scenarios.bench.timing.Candidate.answer`."""
         if isinstance(self._solver, Peer):
             found = self._solver.optimum(*self._question, self._before)
             first, failed = found.inputs[0], not found.solved
         else:
             status, first = self._solver.step(*self._question)
             failed = status != 0
-            self.inside.append(self._solver.inside_ms)
         self.failures += failed
         self.first.setdefault(self._period, first)
 
 
-def measure(name: str, directory: Path, scratch: Path, stride: int) -> tuple[Table, str, Table]:
-    """A table of one flight's steps, how many are free, and its targets."""
+def measure(name: str, directory: Path, scratch: Path, stride: int) -> tuple[Table, str, Table, int]:
+    """A table of one flight's steps, how many are free, its targets, and how many steps there are."""
     case, settings = FLIGHTS[name]
     scenario = load_scenario(name.partition(",")[0], settings)
     vehicle = build_vehicle(scenario)
@@ -166,7 +170,7 @@ def measure(name: str, directory: Path, scratch: Path, stride: int) -> tuple[Tab
     default = Ours(law(), recorder.asked)
     acados = InCasadi(case, AcadosRTI(case, directory, scratch), recorder.law, recorder.asked)
     candidates: dict[str, Any] = {
-        f"{recorder.law.solver}, unconstrained optimum first (default)": default,
+        f"{recorder.law.solver} (default)": default,
         **{solver: Ours(law(solver=solver), recorder.asked) for solver in SOLVERS},
         "acados, HPIPM": acados,
         "IPOPT through CasADi": InCasadi(case, Peer(case), recorder.law, recorder.asked),
@@ -175,18 +179,23 @@ def measure(name: str, directory: Path, scratch: Path, stride: int) -> tuple[Tab
     periods = [period for segment in asked for period in segment]
     with flight_between(scenario, vehicle) as between:
         laps = time_in_turns(
-            candidates, asked, between=between, repeats=REPEATS, rng=np.random.default_rng(0), longest_pass=PATIENT
+            candidates,
+            asked,
+            between=between,
+            repeats=REPEATS,
+            rng=np.random.default_rng(0),
+            longest_pass=PATIENT,
+            now=clock.thread_time,
         )
     p50, p99 = np.percentile(laps[next(iter(candidates))].median, [50.0, 99.0])
-    rows: Table = [(f"`{name.partition(',')[0]}`, {case.name.rpartition(', N')[0] and ''}N = {case.nodes}"
-                    f"{', rotor lag' if case.lag else ''} [ms]", "p50", "p99", "max", "p50, ratio", "u0 difference")]
+    exact = candidates[SOLVERS[0]].first
+    head = f"`{name.partition(',')[0]}`, {case.name.partition(', ')[2]} [ms]"
+    rows: Table = [(head, "p50", "p99", "max", "p50, ratio", "u0 difference")]
     for each, candidate in candidates.items():
         ms = laps[each].median
-        apart = max(np.abs(candidate.first[k] - default.first[k]).max() for k in periods)
+        apart = max(np.abs(candidate.first[k] - exact[k]).max() for k in periods)
         middle, late = np.percentile(ms, [50.0, 99.0])
         rows.append((each, f"{middle:.3f}", f"{late:.3f}", f"{ms.max():.3f}", f"{middle / p50:.2f}", f"{apart:.0e}"))
-    rows.append(("acados inside", f"{np.median(acados.inside):.3f}", f"{np.percentile(acados.inside, 99):.3f}",
-                 f"{max(acados.inside):.3f}", f"{np.median(acados.inside) / p50:.2f}", "-"))  # fmt: skip
     assert all(default.statuses[k] in ACCEPTED for k in periods)
     assert not any(candidate.failures for candidate in candidates.values() if isinstance(candidate, InCasadi))
     free = sum(default.statuses[k] == UNCONSTRAINED for k in periods)
@@ -194,7 +203,7 @@ def measure(name: str, directory: Path, scratch: Path, stride: int) -> tuple[Tab
     targets = [(f"`{name}`, p50", f"<= {most:g} ms", f"{p50:.2f} ms", "met" if p50 <= most else "missed")]
     if math.isfinite(latest):
         targets.append((f"`{name}`, p99", f"<= {latest:g} ms", f"{p99:.2f} ms", "met" if p99 <= latest else "missed"))
-    return rows, f"{free} of {len(periods)}", targets
+    return rows, str(free), targets, len(periods)
 
 
 def main() -> None:
@@ -206,13 +215,14 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as scratch:
         found = [measure(name, options.acados, Path(scratch), options.stride) for name in FLIGHTS]
     targets: Table = [("quantity", "target", "measured", "verdict"), *(row for each in found for row in each[2])]
-    tables = "\n".join([*(markdown(rows) for rows, _, _ in found), markdown(targets)])
-    free = ", ".join(f"{free} questions" for _, free, _ in found)
-    section = f"{TITLE}\n\n{TEXT.format(tables=tables, free=free, **machine())}\n"
-    page = PAGE.read_text(encoding="utf-8")
-    start, _, rest = page.partition(TITLE if TITLE in page else BEFORE)
-    PAGE.write_text(start + section + BEFORE + rest.partition(BEFORE)[2] if TITLE in page else
-                    start + section + BEFORE + rest, encoding="utf-8")  # fmt: skip
+    tables = "\n".join([*(markdown(each[0]) for each in found), markdown(targets)])
+    free = ", ".join(each[1] for each in found[:-1]) + f" and {found[-1][1]}"
+    section = f"{TITLE}\n\n{TEXT.format(tables=tables, free=free, asked=found[0][3], **machine())}\n"
+    start, title, rest = PAGE.read_text(encoding="utf-8").partition(TITLE)
+    if not title:
+        start, before, rest = start.partition(NEXT)
+        rest = before + rest
+    write_page(PAGE.name, start + section + "".join(rest.partition(NEXT)[1:]))
 
 
 if __name__ == "__main__":

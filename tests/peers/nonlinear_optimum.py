@@ -37,7 +37,7 @@ STATES: Final = {PAPER: 20, LAGGED: 10}
 
 
 class Question(NamedTuple):
-    """A state (n,) after an input (4,), at sample k of the course, whose nodes are states (N + 1, 13), inputs (N, 4)."""
+    """A state (n,) after an input (4,), at sample k of the course, with nodes (N + 1, 13) and inputs (N, 4)."""
 
     k: int
     state: Array
