@@ -94,7 +94,7 @@ robustness: setup  ## remake docs/robustness.md: the mismatch benchmark and 50 f
 first-flights: setup  ## make and fly first scenarios of many vehicles, remake docs/first-flights.md: some five minutes
 	@PYTHONPATH=tests $(PY) docs/make_first_flights.py
 
-reproduce: setup  ## fly the numbers of every paper that ships and remake docs/papers.md: some three minutes
+reproduce: setup  ## fly the numbers of every paper that ships and remake docs/papers.md: some five minutes
 	@$(PY) docs/make_papers.py
 
 soak: setup  ## one simulated hour on end: memory and step time have to stay as they were

@@ -72,6 +72,26 @@ class Moment:
     motion: Motion | None = None
 
 
+class InnerLoop(Protocol):
+    """A loop inside the control period, faster than it: from commanded rotor speeds to those that rotors are given."""
+
+    @property
+    def rate(self) -> float:
+        """How often it is called [Hz]; a whole number of physics steps apart, the first time when a hold begins."""
+        ...
+
+    def speeds(self, time: float, commanded: Array, rates: Array, rotors: Array) -> Array:
+        """The rotor speeds to hold until the next call (4,) [rad/s].
+
+        Args:
+            time: when it is [s].
+            commanded: (4,) command in force [rad/s].
+            rates: (3,) true body rates [rad/s].
+            rotors: (4,) true rotor speeds [rad/s].
+        """
+        ...
+
+
 @dataclass(frozen=True, kw_only=True)
 class Command:
     """A controller's answer for one period, and how it was found.
@@ -89,6 +109,7 @@ class Command:
         primal_residual: largest constraint violation the back end reports [its own scaling].
         dual_residual: largest gradient of the Lagrangian the back end reports.
         solve_s: wall time inside the solver [s].
+        inner: the inner loop that carries out commands from now on; None for rotors that hold `speeds`.
 
     Examples:
         >>> import numpy as np
@@ -108,6 +129,7 @@ class Command:
     primal_residual: float = 0.0
     dual_residual: float = 0.0
     solve_s: float = 0.0
+    inner: InnerLoop | None = None
 
 
 GROUNDED: Final = frozenset({Phase.LANDED, Phase.CRASHED})

@@ -9,7 +9,16 @@ from typing import Any
 from mpc.solvers import SOLVERS
 from quadsim.assets import read_toml, vehicle_names, vehicle_path
 from quadsim.vehicle import load_vehicle
-from scenarios.shipped import CONTROLLERS, Group, campaign_names, campaign_path, scenario_names, scenario_path
+from scenarios.shipped import (
+    CONTROLLERS,
+    Group,
+    campaign_names,
+    campaign_path,
+    paper_names,
+    paper_path,
+    scenario_names,
+    scenario_path,
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,6 +52,7 @@ class Catalogue:
         campaigns: for `campaign`, with a sentence each, as all that follow.
         vehicles: for `load_vehicle` and `vehicle.file`.
         controllers: for `controller.type`.
+        papers: for `reproduce`, by their titles.
         solvers: for `controller.solver`; those that are not installed say so.
 
     Examples:
@@ -55,6 +65,7 @@ class Catalogue:
     campaigns: Mapping[str, str]
     vehicles: Mapping[str, str]
     controllers: Mapping[str, str]
+    papers: Mapping[str, str]
     solvers: Mapping[str, str]
 
     def to_json(self) -> dict[str, Any]:
@@ -67,6 +78,7 @@ class Catalogue:
             "campaigns": dict(self.campaigns),
             "vehicles": dict(self.vehicles),
             "controllers": dict(self.controllers),
+            "papers": dict(self.papers),
             "solvers": dict(self.solvers),
         }
 
@@ -106,5 +118,6 @@ def catalogue() -> Catalogue:
         campaigns={name: read_toml(campaign_path(name))["description"] for name in campaign_names()},
         vehicles={name: load_vehicle(vehicle_path(name)).description for name in vehicle_names()},
         controllers=CONTROLLERS,
+        papers={name: read_toml(paper_path(name))["title"] for name in paper_names()},
         solvers={name: entry.line for name, entry in SOLVERS.items()},
     )

@@ -91,10 +91,10 @@ def workplace(flown: Path, campaign: Path, tmp_path: Path, monkeypatch: pytest.M
 
 @pytest.fixture(scope="session")
 def flown(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A run of one second, which is 30 frames of film."""
+    """A run of 0.3 s, which is 9 frames of film."""
     directory = tmp_path_factory.mktemp("flown") / "paper-constrained"
     tables = Outputs(video=False, recording=False, figures=False)
-    run_scenario(load_scenario("paper-constrained", ["duration=1.0"]), directory, tables)
+    run_scenario(load_scenario("paper-constrained", ["duration=0.3"]), directory, tables)
     return directory
 
 

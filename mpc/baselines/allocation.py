@@ -17,7 +17,6 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from scipy.optimize import lsq_linear
 
 from quadsim.state import Array, read_only
 from quadsim.vehicle import Vehicle
@@ -67,6 +66,8 @@ def _less_yaw(squares: Array, yaw: Array, low: Array, high: Array) -> Array | No
 
 
 def _nearest(allocation: Allocation, wrench: Array, low: Array, high: Array) -> Array:
+    from scipy.optimize import lsq_linear  # not for those who only read settings
+
     unit = max(float(high.max()), 1.0)  # of the squares, so that the solver's numbers are about 1
     weights = np.array(WEIGHTS) / allocation.scale
     wrench = wrench.copy()  # thrust beyond all reach would drown the torques in its squares

@@ -8,6 +8,7 @@ from typing import Final
 
 import numpy as np
 
+from mpc.nonlinear.rigidbody import rotation
 from quadsim.state import EULER, EULER_RATE, POSITION, VELOCITY, Array, body_to_world, euler_to_body_rates
 
 LEAST_LIFT: Final = 0.2
@@ -15,7 +16,7 @@ LEAST_LIFT: Final = 0.2
 
 
 @dataclass(frozen=True, kw_only=True)
-class Motion:
+class Measured:
     """A measured state with its attitude as a rotation matrix."""
 
     position: Array  # x (3,), world [m]
@@ -25,14 +26,14 @@ class Motion:
     yaw: float  # [rad]
 
 
-def motion_of(state: Array) -> Motion:
-    """The motion that a state (12,) says."""
+def motion_of(state: Array, attitude: Array | None = None, rates: Array | None = None) -> Measured:
+    """The motion that a state (12,) says; attitude (4,) wxyz and body rates (3,) [rad/s] by themselves where given."""
     euler = state[list(EULER)]
-    return Motion(
+    return Measured(
         position=state[list(POSITION)],
         velocity=state[list(VELOCITY)],
-        attitude=body_to_world(euler),
-        rates=euler_to_body_rates(euler, state[list(EULER_RATE)]),
+        attitude=body_to_world(euler) if attitude is None else rotation(attitude),
+        rates=euler_to_body_rates(euler, state[list(EULER_RATE)]) if rates is None else rates,
         yaw=float(euler[2]),
     )
 

@@ -1,4 +1,8 @@
-"""Geometric tracking control on SE(3): Lee, Leok, McClamroch (2010), integrals by Goodarzi, Lee, Lee (2013)."""
+"""Geometric tracking control on SE(3): Lee, Leok, McClamroch (2010), integrals by Goodarzi, Lee, Lee (2013).
+
+With feed-forward by differential flatness: Faessler, Franchi, Scaramuzza, "Differential Flatness of Quadrotor Dynamics
+Subject to Rotor Drag for Accurate Tracking of High-Speed Trajectories", 2018.
+"""
 
 from __future__ import annotations
 
@@ -12,21 +16,21 @@ from mpc.answer import ActuatorBounds
 from mpc.baselines.allocation import allocate, make_allocation
 from mpc.baselines.attitude import (
     LEAST_LIFT,
-    Motion,
+    Measured,
     attitude_error,
     limit_force,
     motion_of,
     rate_error,
-    unit_derivatives,
-    vee,
 )
 from mpc.baselines.bandwidths import SEPARATION, YAW_SHARE, lag_to_allow_for
 from mpc.baselines.law import FeedbackLaw
 from mpc.baselines.limits import require_positive, require_within
-from mpc.baselines.preview import Target, target_of, wrapped
+from mpc.baselines.preview import PREVIEW_DEGREE, Target, differentiator, target_of, target_of_motion, wrapped
+from mpc.baselines.wanted import Wanted, wanted_attitude
+from mpc.disturbance import RampObserver, RampSettings
 from quadsim.controller import Command, Moment, Phase
 from quadsim.errors import ParameterError
-from quadsim.state import Array
+from quadsim.state import Array, read_only
 from quadsim.vehicle import Vehicle
 
 
@@ -49,6 +53,10 @@ class GeometricSettings:
         sigma: largest acceleration of the first integral, each axis [m/s^2].
         sigma_R: largest angular acceleration of the second, each axis [rad/s^2].
         tilt_max: largest tilt of the wanted force [deg]; Lee et al. (2010) know none.
+        feedforward: whether the reference's jerk and snap are fed forward too, drag with them, and commands aimed at
+            the middle of the period that they are held for.
+        drag: d_x, d_y, d_z of the acceleration -R diag(d) R' v that is fed forward [1/s].
+        disturbance: the observer of what the model misses; None for none.
         horizon: N, samples of preview; they tell the reference's velocity and acceleration.
         bounds: what commands are held to; None for the speeds that the rotors hold.
     """
@@ -66,6 +74,9 @@ class GeometricSettings:
     sigma: float = 5.0
     sigma_R: float = 5.0
     tilt_max: float = 45.0
+    feedforward: bool = False
+    drag: tuple[float, ...] = (0.0, 0.0, 0.0)
+    disturbance: RampSettings | None = None
     horizon: int = 10
     bounds: ActuatorBounds | None = None
 
@@ -77,6 +88,8 @@ class GeometricSettings:
                 raise ParameterError("controller", name, getattr(self, name), "at least 0 and finite")
         require_within("yaw_share", self.yaw_share, 0.05, 1.0)
         require_within("tilt_max", self.tilt_max, 0.1, 80.0)
+        if any(self.drag) and not self.feedforward:
+            raise ParameterError("controller", "drag", self.drag, "zero where feedforward is not true")
 
 
 def geometric_settings(
@@ -116,13 +129,16 @@ class Integrals:
     rotation: Array
 
 
-@dataclass(frozen=True, kw_only=True)
-class Wanted:
-    """The computed attitude R_c (3, 3), Omega_c (3,) [rad/s] and its derivative (3,) [rad/s^2], in its own axes."""
+@dataclass(frozen=True)
+class Disturbance:
+    """What the model misses: an acceleration and its rate of change, world, and an angular one, body; (3,) each."""
 
-    attitude: Array
-    rates: Array
     acceleration: Array
+    change: Array
+    angular: Array
+
+
+UNDISTURBED: Final = Disturbance(*(read_only(np.zeros(3)) for _ in range(3)))
 
 
 class GeometricController(FeedbackLaw):
@@ -136,8 +152,15 @@ class GeometricController(FeedbackLaw):
     name: Final = "geometric"
 
     def __init__(self, vehicle: Vehicle, settings: GeometricSettings) -> None:
+        self.settings, self._vehicle, self._drag = settings, vehicle, np.array(settings.drag)
+        self._observer = (
+            None
+            if settings.disturbance is None
+            else RampObserver(settings.disturbance, vehicle, settings.period, drag=settings.drag)
+        )
         super().__init__(vehicle, settings)
-        self.settings, self._vehicle = settings, vehicle
+        if settings.feedforward:
+            self._operator = differentiator(settings.horizon, settings.period, degree=PREVIEW_DEGREE)
         self.k_R = settings.k_R * np.array([1.0, 1.0, settings.yaw_share**2])
         self.k_Omega = settings.k_Omega * np.array([1.0, 1.0, settings.yaw_share])
         self._allocation = make_allocation(vehicle)
@@ -146,11 +169,20 @@ class GeometricController(FeedbackLaw):
         """Start anew after the command u(-1) (4,) [rad/s]."""
         super().reset(speeds)
         self._integrals = Integrals(translation=np.zeros(3), rotation=np.zeros(3))
+        if self._observer is not None:
+            self._observer.reset(speeds)
 
     def _command(self, now: Moment, state: Array, reference: Array, before: Array) -> Command:
         """The law's wrench as rotor speeds; the integrals rest while bounds keep it from being given."""
-        motion, target = motion_of(state), target_of(reference, self._operator)
-        wrench, wanted = self.wrench(motion, target, self._integrals)
+        if self.settings.feedforward or self._observer is not None:
+            motion = motion_of(state, now.attitude, now.body_rates)
+        else:  # the rounding of other flights stays as it is
+            motion = motion_of(state)
+        target = target_of(reference, self._operator)
+        if self.settings.feedforward and now.motion is not None:
+            yaw = np.array([target.yaw, target.yaw_rate, target.yaw_acceleration])
+            target = target_of_motion(now.motion, yaw, self.settings.period)
+        wrench, wanted = self.wrench(motion, target, self._integrals, self._observed(now, motion, before))
         lower, upper = self.bounds.reach(before)
         speeds = allocate(self._allocation, wrench, lower, upper)
         given = np.allclose(self._allocation.M @ speeds**2, wrench, rtol=0.0, atol=1e-6 * self._allocation.scale.max())
@@ -158,11 +190,27 @@ class GeometricController(FeedbackLaw):
             self._integrals = self.integrate(self._integrals, motion, target, wanted)
         return self._held_for_a_period(speeds)
 
-    def wrench(self, motion: Motion, target: Target, integrals: Integrals) -> tuple[Array, Wanted]:
+    def _observed(self, now: Moment, motion: Measured, before: Array) -> Disturbance:
+        """What the observer expects of the middle of the period that starts now; at rest until the vehicle flies."""
+        if self._observer is None:
+            return UNDISTURBED
+        if now.phase is not Phase.FLYING:
+            self._observer.reset(before)
+            return UNDISTURBED
+        self._observer.update(now.time, motion.velocity, motion.attitude, motion.rates, before)
+        return Disturbance(*self._observer.foreseen(0.5 * self.settings.period))
+
+    def wrench(
+        self, motion: Measured, target: Target, integrals: Integrals, disturbance: Disturbance = UNDISTURBED
+    ) -> tuple[Array, Wanted]:
         """[f, M_x, M_y, M_z] (4,) [N, N m], and the attitude that the moment turns to.
 
-        f = A . R e_3 with A = m (-k_x e_x - k_v e_v + g e_3 + x_d'') less the integral, and
-        M = -J (k_R e_R + k_Omega e_Omega) + Omega x J Omega - J (hat(Omega) R' R_c Omega_c - R' R_c Omega_c').
+        f = A . R e_3 with A = m (-k_x e_x - k_v e_v + g e_3 + x_d'' - d) less the integral, and
+        M = -J (k_R e_R + k_Omega e_Omega + d_Omega) + Omega x J Omega
+            - J (hat(Omega) R' R_c Omega_c - R' R_c Omega_c'),
+
+        with the observed disturbance d, d_Omega.  With feed-forward the drag at the reference's velocity counts too:
+        `wanted_attitude`, and f is that of half a period on.
 
         Where the limits of tilt or of lift hold A, the attitude that it asks for counts as one at rest.
         """
@@ -171,17 +219,30 @@ class GeometricController(FeedbackLaw):
         e_x, e_v = motion.position - target.position, motion.velocity - target.velocity
         weight = np.array([0.0, 0.0, gravity])
         asked = m * (-settings.k_x * e_x - settings.k_v * e_v - integrals.translation + weight + target.acceleration)
+        asked -= m * disturbance.acceleration
         A = limit_force(asked, least=LEAST_LIFT * m * gravity, tilt=math.radians(settings.tilt_max))
-        at_rest = np.zeros(3), np.zeros(3)
-        A1, A2 = self._force_derivatives(motion, target, A, e_v) if np.array_equal(A, asked) else at_rest
-        wanted = _wanted(A, A1, A2, motion.yaw, target)
+        A1 = A2 = p1 = p2 = np.zeros(3)
+        if np.array_equal(A, asked):
+            A1, A2 = self._force_derivatives(motion, target, A, e_v, disturbance)
+            p1, p2 = m * target.acceleration, m * target.jerk
+        wanted = wanted_attitude(
+            (A, A1, A2),
+            (m * target.velocity, p1, p2),
+            self._drag,
+            _heading(motion.yaw, target) if target.heading is None else target.heading,
+        )
         R_rel = R.T @ wanted.attitude
         e_R, e_Omega = attitude_error(R, wanted.attitude), rate_error(R, Omega, wanted.attitude, wanted.rates)
-        ahead = np.cross(Omega, R_rel @ wanted.rates) - R_rel @ wanted.acceleration
+        ahead = np.cross(Omega, R_rel @ wanted.rates) - R_rel @ wanted.acceleration + disturbance.angular
         moment = np.cross(Omega, J * Omega) - J * (self.k_R * e_R + self.k_Omega * e_Omega + integrals.rotation + ahead)
-        return np.concatenate([[A @ R[:, 2]], moment]), wanted
+        if not settings.feedforward:
+            return np.concatenate([[A @ R[:, 2]], moment]), wanted
+        half = 0.5 * settings.period
+        up = R[:, 2] + half * R @ np.array([Omega[1], -Omega[0], 0.0])
+        along, along1 = A + m * self._drag[2] * target.velocity, A1 + self._drag[2] * p1
+        return np.concatenate([[(along + half * along1) @ up], moment]), wanted
 
-    def integrate(self, integrals: Integrals, motion: Motion, target: Target, wanted: Wanted) -> Integrals:
+    def integrate(self, integrals: Integrals, motion: Measured, target: Target, wanted: Wanted) -> Integrals:
         """The integrals one period on: of e_v + c_1 e_x and of e_Omega + c_2 e_R, saturated."""
         settings = self.settings
         e_x, e_v = motion.position - target.position, motion.velocity - target.velocity
@@ -194,20 +255,32 @@ class GeometricController(FeedbackLaw):
             rotation=np.clip(rotation, -settings.sigma_R, settings.sigma_R),
         )
 
-    def _force_derivatives(self, motion: Motion, target: Target, A: Array, e_v: Array) -> tuple[Array, Array]:
-        """A' and A'' (3,), by the equations of motion under the law's own thrust; the target's jerk counts as zero."""
+    def _force_derivatives(
+        self, motion: Measured, target: Target, A: Array, e_v: Array, disturbance: Disturbance
+    ) -> tuple[Array, Array]:
+        """A' and A'' (3,), by the equations of motion under the law's own thrust, drag and disturbance.
+
+        The disturbance counts as one that changes steadily, drag along the body as one that turns with it.
+        """
         m, R, Omega, k_x, k_v = self._vehicle.mass, motion.attitude, motion.rates, self.settings.k_x, self.settings.k_v
         up, up1 = R[:, 2], R @ np.array([Omega[1], -Omega[0], 0.0])  # R e_3 and its derivative, R hat(Omega) e_3
-        f = max(float(A @ up), 0.0)
+        v_b = R.T @ motion.velocity
+        v_d = R.T @ target.velocity
+        f = max(float(A @ up) + m * self._drag[2] * v_d[2], 0.0)
         e_a = f / m * up - np.array([0.0, 0.0, self._vehicle.gravity]) - target.acceleration
-        A1 = -m * (k_x * e_v + k_v * e_a)
+        e_a += disturbance.acceleration - R @ (self._drag * v_b)
+        A1 = -m * (k_x * e_v + k_v * e_a) + m * (target.jerk - disturbance.change)
         f1 = float(A1 @ up + A @ up1)
-        e_j = f1 / m * up + f / m * up1
-        return A1, -m * (k_x * e_a + k_v * e_j)
+        e_j = f1 / m * up + f / m * up1 - target.jerk + disturbance.change
+        if self._drag.any():
+            along = self._drag[2] * (target.acceleration @ up + target.velocity @ up1)
+            v_b1 = R.T @ (e_a + target.acceleration) - np.cross(Omega, v_b)
+            e_j += along * up - R @ (np.cross(Omega, self._drag * v_b) + self._drag * v_b1)
+        return A1, -m * (k_x * e_a + k_v * e_j) + m * target.snap
 
 
-def _wanted(A: Array, A1: Array, A2: Array, yaw: float, target: Target) -> Wanted:
-    """R_c = [b_1c, b_2c, b_3c] with b_3c along A and b_1c as near to the heading as that leaves, and how it turns.
+def _heading(yaw: float, target: Target) -> Array:
+    """(3, 3) rows: the horizontal direction wanted for body x, its rate of change and that of this.
 
     e_R vanishes at half a turn, where it should be largest: a heading more than a quarter turn away is wanted a quarter
     turn away, and at rest.
@@ -220,17 +293,4 @@ def _wanted(A: Array, A1: Array, A2: Array, yaw: float, target: Target) -> Wante
         np.array([math.cos(heading), math.sin(heading), 0.0]),
         np.array([-math.sin(heading), math.cos(heading), 0.0]),
     )
-    h, h1, h2 = along, rate * across, acceleration * across - rate**2 * along
-    b3, b31, b32 = unit_derivatives(A, A1, A2)
-    b2, b21, b22 = unit_derivatives(
-        np.cross(b3, h),
-        np.cross(b31, h) + np.cross(b3, h1),
-        np.cross(b32, h) + 2.0 * np.cross(b31, h1) + np.cross(b3, h2),
-    )
-    b1 = np.cross(b2, b3)
-    b11 = np.cross(b21, b3) + np.cross(b2, b31)
-    b12 = np.cross(b22, b3) + 2.0 * np.cross(b21, b31) + np.cross(b2, b32)
-    R_c = np.stack([b1, b2, b3], axis=1)
-    Omega_c = vee(R_c.T @ np.stack([b11, b21, b31], axis=1))
-    acceleration_c = vee(R_c.T @ np.stack([b12, b22, b32], axis=1))  # of hat(Omega_c)^2 + hat(Omega_c'), skew
-    return Wanted(attitude=R_c, rates=Omega_c, acceleration=acceleration_c)
+    return np.stack([along, rate * across, acceleration * across - rate**2 * along])

@@ -13,7 +13,7 @@ import numpy as np
 
 from mpc.answer import ActuatorBounds
 from mpc.baselines.allocation import allocate, make_allocation
-from mpc.baselines.attitude import LEAST_LIFT, Motion, attitude_for, limit_force, motion_of, prioritised_error
+from mpc.baselines.attitude import LEAST_LIFT, Measured, attitude_for, limit_force, motion_of, prioritised_error
 from mpc.baselines.bandwidths import Bandwidths, bandwidths, lag_to_allow_for
 from mpc.baselines.law import FeedbackLaw
 from mpc.baselines.limits import require_positive, require_within
@@ -146,7 +146,7 @@ class CascadedPID(FeedbackLaw):
             rates=motion.rates,
         )
 
-    def _velocity_loop(self, memory: Memory, motion: Motion, target: Target) -> tuple[Array, Array]:
+    def _velocity_loop(self, memory: Memory, motion: Measured, target: Target) -> tuple[Array, Array]:
         """The force (3,) to command [N], world, and the velocity integral (3,) [m/s^2] of the next period."""
         settings, mass, gravity = self.settings, self._vehicle.mass, self._vehicle.gravity
         period, proportional = settings.period, settings.bandwidths.velocity
@@ -166,7 +166,7 @@ class CascadedPID(FeedbackLaw):
         integral = memory.velocity_integral + period * settings.velocity_integral * proportional * error
         return force, np.clip(integral, -gravity, gravity)
 
-    def _rates_wanted(self, motion: Motion, force: Array, target: Target) -> Array:
+    def _rates_wanted(self, motion: Measured, force: Array, target: Target) -> Array:
         """(3,) body rates to turn at [rad/s], by the attitude loop."""
         k, limit = self.settings.bandwidths, np.radians(self.settings.rate_max)
         error = prioritised_error(motion.attitude, attitude_for(force, target.yaw), self.settings.yaw_weight)

@@ -1,17 +1,27 @@
-"""A reference's velocity and acceleration now, from its next samples."""
+"""A reference's derivatives now, from its next samples."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import lru_cache
 from typing import Final
 
 import numpy as np
 
+from mpc.nonlinear.rigidbody import rotation
 from quadsim.errors import ParameterError
+from quadsim.motion import Motion
 from quadsim.state import Array, read_only
 
 SMALLEST_PREVIEW: Final = 3  # samples that a parabola needs
+PREVIEW_DEGREE: Final = 4  # of the polynomial through a preview that tells jerk and snap
+MOTION_DEGREE: Final = 5  # of the one through a motion's next samples, which are exact
+MOTION_SAMPLES: Final = 7
+
+
+def _nothing() -> Array:
+    return read_only(np.zeros(3))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -24,30 +34,36 @@ class Target:
     yaw: float  # [rad]
     yaw_rate: float  # [rad/s]
     yaw_acceleration: float  # [rad/s^2]
+    jerk: Array = field(default_factory=_nothing)  # (3,) [m/s^3]
+    snap: Array = field(default_factory=_nothing)  # (3,) [m/s^4]
+    heading: Array | None = None
+    """(3, 3) rows: the direction near which body x is wanted, any length but zero, its rate of change and that of this;
+    None where yaw says it."""
 
 
-def differentiator(samples: int, period: float) -> Array:
-    """(3, N): value, first and second derivative at t_k of samples at t_{k+1} .. t_{k+N}.
+def differentiator(samples: int, period: float, *, degree: int = 2, first: int = 1) -> Array:
+    """(degree + 1, N): value and derivatives at t_k of samples at t_{k + first} .. t_{k + first + N - 1}.
 
-    Those of the least-squares parabola through the samples (Savitzky and Golay, 1964), which N = 3 makes the ordinary
-    differences.  Where the reference's velocity jumps, as a filtered step's does, the second derivative is a smooth
-    hump of the jump's area over the N samples, not a spike.
+    Those of the least-squares polynomial through the samples (Savitzky and Golay, 1964), which N = degree + 1 makes the
+    ordinary differences.  Where the reference's velocity jumps, as a filtered step's does, the second derivative of a
+    parabola is a smooth hump of the jump's area over the N samples, not a spike.
 
     Raises:
         ParameterError: there are too few samples, or the period is not positive.
     """
-    if samples < SMALLEST_PREVIEW:
-        raise ParameterError("controller", "horizon", samples, f"at least {SMALLEST_PREVIEW}, to tell an acceleration")
+    if samples < degree + 1:
+        told = {SMALLEST_PREVIEW: "an acceleration", PREVIEW_DEGREE + 1: "a snap"}.get(degree + 1, "derivatives")
+        raise ParameterError("controller", "horizon", samples, f"at least {degree + 1}, to tell {told}")
     if not 0.0 < period < math.inf:
         raise ParameterError("controller", "period", period, "positive and finite")
-    t = period * np.arange(1, samples + 1)
-    fit = np.linalg.pinv(np.vander(t, 3, increasing=True))
-    return read_only(fit * np.array([[1.0], [1.0], [2.0]]))
+    t = period * np.arange(first, first + samples)
+    fit = np.linalg.pinv(np.vander(t, degree + 1, increasing=True))
+    return read_only(fit * np.array([[float(math.factorial(order))] for order in range(degree + 1)]))
 
 
 def target_of(reference: Array, operator: Array) -> Target:
-    """What to follow, from the preview (N, 4) of x, y, z [m], yaw [rad] and its `differentiator` (3, N)."""
-    value, rate, acceleration = operator @ reference
+    """What to follow, from the preview (N, 4) of x, y, z [m], yaw [rad] and its `differentiator` (degree + 1, N)."""
+    value, rate, acceleration, *higher = operator @ reference
     return Target(
         position=value[:3],
         velocity=rate[:3],
@@ -55,7 +71,41 @@ def target_of(reference: Array, operator: Array) -> Target:
         yaw=float(value[3]),
         yaw_rate=float(rate[3]),
         yaw_acceleration=float(acceleration[3]),
+        **{name: each[:3] for name, each in zip(("jerk", "snap"), higher, strict=False)},
     )
+
+
+def target_of_motion(motion: Motion, yaw: Array, period: float) -> Target:
+    """What to follow, from the present and next samples of a motion and the yaw (3,), its rate and acceleration.
+
+    All derivatives are those of the positions and attitudes, whatever velocities a course states of itself: they agree
+    with what the vehicle is asked to fly.  Near the course's end fewer samples tell fewer derivatives.
+    """
+    samples = min(len(motion), MOTION_SAMPLES)
+    degree = min(MOTION_DEGREE, samples - 1)
+    operator = _motion_operator(samples, degree, period)
+    found = np.zeros((MOTION_DEGREE, 3))  # position to snap
+    orders = min(degree + 1, MOTION_DEGREE)
+    found[:orders] = operator[:orders] @ motion.position[:samples]
+    heading = np.zeros((3, 3))
+    heading[: min(degree + 1, 3)] = operator[:3] @ rotation(motion.attitude[:samples])[:, :, 0]
+    position, velocity, acceleration, jerk, snap = found
+    return Target(
+        position=position,
+        velocity=velocity,
+        acceleration=acceleration,
+        jerk=jerk,
+        snap=snap,
+        yaw=float(yaw[0]),
+        yaw_rate=float(yaw[1]),
+        yaw_acceleration=float(yaw[2]),
+        heading=heading,
+    )
+
+
+@lru_cache(maxsize=32)
+def _motion_operator(samples: int, degree: int, period: float) -> Array:
+    return differentiator(samples, period, degree=degree, first=0)
 
 
 def wrapped(angle: float) -> float:

@@ -22,6 +22,7 @@ import scipy.linalg
 
 from mpc.answer import ActuatorBounds, command_of
 from mpc.constraints import Constraint, Penalty
+from mpc.disturbance import RampObserver, RampSettings
 from mpc.model import LinearModel
 from mpc.nonlinear.reference import Nodes, nodes_of_motion, nodes_of_preview
 from mpc.nonlinear.rigidbody import (
@@ -36,9 +37,10 @@ from mpc.nonlinear.rigidbody import (
     linearise_nodes,
     product,
     rigid_body,
+    rotation,
     thrust_axis,
 )
-from mpc.nonlinear.settings import AttitudeError, Disturbance, NonlinearSettings
+from mpc.nonlinear.settings import AttitudeError, NonlinearSettings
 from mpc.observer import DisturbanceObserver
 from mpc.ocp import Objective, Problem, Query, Rest, Unanswered, lqr_terminal_weight
 from mpc.relinearised import Relinearised
@@ -71,8 +73,6 @@ SHORTEST: Final = 0.1
 """Least share of a Gauss-Newton step that Aitken's relaxation takes where several are."""
 PATIENCE: Final = 8
 """After so many steps, none of them shorter than the shortest before, half as much of each is taken at most."""
-SLOW: Final = 1.0
-"""Speed [m/s] below which a disturbance is hardly taken for one that follows the velocity."""
 TILT_SIDES: Final = 12
 """Sides of the polygon within the circle that a bound on the tilt makes of the thrust axis's horizontal part; it takes
 up to 3.4 % of the bound's sine away."""
@@ -86,17 +86,6 @@ _AXIS_SLOPES: Final = 2.0 * np.array(
 """Take q to the derivatives of R(q) e_z along x, 2 (x z + w y), and y, 2 (y z - w x)."""
 _PLAUSIBLE: Final = 1e5
 _SAME_TIME: Final = 1e-6  # [s]
-
-
-def along_path(acceleration: Array, now: Array, then: Array) -> Array:
-    """Accelerations (..., 3) at a velocity `now` (3,), at velocities `then` (..., 3): turned and scaled as these are.
-
-    Horizontally alone, and less the slower `now` is, to nothing at rest.
-    """
-    before, after = complex(now[0], now[1]), then[..., 0] + 1j * then[..., 1]
-    ratio = (after * before.conjugate() + SLOW**2) / (abs(before) ** 2 + SLOW**2)
-    turned = (acceleration[..., 0] + 1j * acceleration[..., 1]) * ratio
-    return np.stack([turned.real, turned.imag, acceleration[..., 2] + 0.0 * turned.real], axis=-1)
 
 
 def frames_of(quaternions: Array) -> Array:
@@ -161,6 +150,7 @@ class NonlinearMPC:
         self._qp = Relinearised(self.problem, self.solver, shortcut=True)
         self._clearing = None if space is None else Clearing(self.problem, self._solve, space, changing=True)
         self._observer = None if settings.observer is None else DisturbanceObserver(settings.observer, period)
+        self._ramp = None if settings.ramp is None else self._make_ramp(settings.ramp)
         self._shift = settings.stride == 1 if settings.shift is None else settings.shift
         self._lower, self._upper = self._shares(self._bounds.u_min), self._shares(self._bounds.u_max)
         self._difference = settings.attitude_error is AttitudeError.DIFFERENCE
@@ -312,9 +302,10 @@ class NonlinearMPC:
         self._quaternion = measured[Q].copy()
         if now.phase is Phase.FLYING:
             if self._observer is not None and last is not None:
-                self._learn(last, now.time, measured, nodes)
-            self._last, self._velocity = (now.time, measured), nodes.states[0, V]
-            self._follow(nodes)
+                self._learn(last, now.time, measured)
+            if self._ramp is not None:
+                self._follow(self._ramp, now.time, measured)
+            self._last = now.time, measured
         nodes = self._balanced(nodes)
         query, answer, problem = self._iterate(now.time, measured, nodes)
         status = self._rejection(answer)
@@ -331,8 +322,7 @@ class NonlinearMPC:
 
     def predict(self, states: Array, plans: Array) -> Array:
         """See `quadsim.controller.Controller.predict`; with the disturbance estimated last, and without rotor lag."""
-        known = self._acceleration[0]
-        model = replace(self._model, step=self._period, rotor_lag=None, substeps=1, acceleration=known)
+        model = replace(self._model, step=self._period, rotor_lag=None, substeps=1)
         x = np.zeros((len(states), N_BODY))
         x[:, P], x[:, V] = states[:, POSITIONS], states[:, VELOCITIES]
         x[:, Q] = euler_to_quaternion(states[:, ANGLES])
@@ -350,7 +340,7 @@ class NonlinearMPC:
     @property
     def disturbance(self) -> Array:
         """(6,) estimated acceleration now, world [m/s^2], and angular acceleration, body [rad/s^2]."""
-        return np.concatenate([self._acceleration[0], self._model.angular_acceleration])
+        return np.concatenate([self._model.acceleration, self._model.angular_acceleration])
 
     def _measured(self, now: Moment, state: Array) -> Array:
         """(n,) the model's state."""
@@ -374,44 +364,54 @@ class NonlinearMPC:
             commanded = self._shares(self._acting)
             self._rotors = commanded + left * (self._rotors - commanded)
 
-    def _learn(self, last: tuple[float, Array], time: float, measured: Array, nodes: Nodes) -> None:
+    def _learn(self, last: tuple[float, Array], time: float, measured: Array) -> None:
         """Compare the measured state with what was to be expected after the last one, disturbances included."""
         before, x = last
         if not abs(time - before - self._period) <= _SAME_TIME:
             return
         assert self._observer is not None
-        # In the period that is over, and as it was believed then.
-        model = replace(self._model, step=self._period, acceleration=self._acceleration[0])
+        model = replace(self._model, step=self._period)
         if x.size > N_BODY:
             x = np.concatenate([x[:N_BODY], self._rotors_before])
         expected = advance_nodes(model, x, self._shares(self._acting))
         self._observer.learn(np.concatenate([measured[V] - expected[V], measured[W] - expected[W]]))
-        if self.settings.disturbance is Disturbance.PATH:
-            turned = along_path(self._observer.estimate[:3], self._velocity, nodes.states[0, V])
-            self._observer.estimate[:3] = turned
-
-    def _follow(self, nodes: Nodes) -> None:
-        """Believe what is estimated now, and how it goes on over the horizon."""
-        if self._observer is None:
-            return
         estimate = self._observer.estimate
-        found = np.broadcast_to(estimate[:3], (len(nodes.states), 3))
-        if self.settings.disturbance is Disturbance.PATH:
-            found = along_path(found, nodes.states[0, V], nodes.states[:, V])
-        self._model = replace(self._model, acceleration=found[:-1], angular_acceleration=estimate[3:])
-        self._acceleration = found
+        self._model = replace(self._model, acceleration=estimate[:3], angular_acceleration=estimate[3:])
+
+    def _make_ramp(self, settings: RampSettings) -> RampObserver:
+        mass = self._vehicle.mass
+        return RampObserver(
+            settings if settings.rotor_lag is not None else replace(settings, rotor_lag=self.settings.rotor_lag),
+            self._vehicle,
+            self._period,
+            drag=np.array(self.settings.drag) / mass,
+            quadratic_drag=np.array(self.settings.quadratic_drag) / mass,
+        )
+
+    def _follow(self, ramp: RampObserver, time: float, measured: Array) -> None:
+        """Take what is observed for drag, as far as it follows the velocity, and for a constant force beyond."""
+        R, velocity = rotation(measured[Q] / np.linalg.norm(measured[Q])), measured[V]
+        ramp.update(time, velocity, R, measured[W], self._acting)
+        acceleration, _, angular = ramp.foreseen(0.5 * self._period)
+        drag = ramp.drag
+        self._model = replace(
+            self._model,
+            drag=self.settings.drag + self._vehicle.mass * drag,
+            acceleration=acceleration + R @ (drag * (R.T @ velocity)),
+            angular_acceleration=angular,
+        )
 
     def _balanced(self, nodes: Nodes) -> Nodes:
         """The reference with what balances drag and the disturbance: thrust turned the least way, and torque."""
         model = self._model
-        if not (model.drags or self._acceleration.any() or model.angular_acceleration.any()):
+        if not (model.drags or model.acceleration.any() or model.angular_acceleration.any()):
             return nodes
         states, thrusts = nodes.states.copy(), nodes.thrusts
         q, mass = states[:, Q], self._vehicle.mass
         axis = thrust_axis(q)
         total = np.sum(thrusts, axis=1) / mass
         force = np.concatenate([total, total[-1:]])[:, None] * axis
-        wanted = force - self._acceleration - drag_acceleration(model, q, states[:, V])
+        wanted = force - model.acceleration - drag_acceleration(model, q, states[:, V])
         size = np.maximum(np.linalg.norm(wanted, axis=1), 1e-9)
         # The least rotation from one axis to another is (1 + a . b, a x b), up to its length.
         turn = np.concatenate(
@@ -432,7 +432,10 @@ class NonlinearMPC:
         if self._observer is not None:
             self._observer.reset()
             self._model = replace(self._model, acceleration=np.zeros(3), angular_acceleration=np.zeros(3))
-        self._acceleration = np.zeros((self._nodes + 1, 3))  # of the disturbance at each node
+        if self._ramp is not None:
+            self._ramp.reset(self._acting)
+            drag = np.array(self.settings.drag)
+            self._model = replace(self._model, drag=drag, acceleration=np.zeros(3), angular_acceleration=np.zeros(3))
 
     def _reference(self, now: Moment, reference: Array) -> Nodes:
         stride = self.settings.stride

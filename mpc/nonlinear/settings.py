@@ -8,20 +8,11 @@ from enum import StrEnum
 
 import numpy as np
 
+from mpc.disturbance import RampSettings
 from mpc.nonlinear.rigidbody import Inputs
 from mpc.observer import ObserverSettings
 from quadsim.errors import ParameterError
 from quadsim.state import Array
-
-
-class Disturbance(StrEnum):
-    """How the estimated acceleration goes on over the horizon."""
-
-    CONSTANT = "constant"
-    """As it is, in the world frame: wind on a hovering vehicle, another mass."""
-    PATH = "path"
-    """Its horizontal part turns and grows with the reference's velocity, as drag does."""
-
 
 Weight = float | tuple[float, float, float]
 """One number for three axes, or one each."""
@@ -82,7 +73,7 @@ class NonlinearSettings:
         largest_rates: (3,) largest magnitudes of the body rates [rad/s]; infinite for no bound.
         soft: (l1, l2) of exceeding these by 1 rad or 1 rad/s; None for hard bounds.
         observer: tuning of the disturbance observer; None for no offset-free tracking.
-        disturbance: how the acceleration that it estimates goes on over the horizon.
+        ramp: tuning of the one that follows changing forces, and fits drag to them; None for none.
         solver: QP solver, in `mpc.solvers.SOLVERS`; None for the one that is the fastest for the size.
     """
 
@@ -103,7 +94,7 @@ class NonlinearSettings:
     largest_rates: tuple[float, float, float] = (math.inf, math.inf, math.inf)
     soft: tuple[float, float] | None = None
     observer: ObserverSettings | None = None
-    disturbance: Disturbance = Disturbance.CONSTANT
+    ramp: RampSettings | None = None
     solver: str | None = None
 
     def __post_init__(self) -> None:

@@ -4,19 +4,19 @@ from __future__ import annotations
 
 import math
 import time as clock
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from quadsim.controller import MISSED, Command, Controller, Moment, Phase
+from quadsim.controller import MISSED, Command, Controller, InnerLoop, Moment, Phase
 from quadsim.errors import FlightError, InterruptedFlightError, LostError
 from quadsim.flight.log import ControlLog, FlightLog, PlantLog, TimingLog
 from quadsim.flight.lost import check_loss
 from quadsim.motion import Motion
 from quadsim.sim.computation import Computation
-from quadsim.sim.physics import Segment, physics_to_state
+from quadsim.sim.physics import Segment, inner_steps, physics_to_state
 from quadsim.sim.plant import Plant
 from quadsim.state import INDEX, N_STATES, REFERENCE_NAMES, Array
 from quadsim.vehicle import N_ROTORS
@@ -24,6 +24,8 @@ from quadsim.vehicle import N_ROTORS
 if TYPE_CHECKING:
     from quadsim.sim.navigation import Navigation
     from quadsim.sim.phase import PhaseMonitor
+
+_BODY_RATES: Final = slice(11, 14)  # in the plant's own state; see `quadsim.sim.physics.physics_to_state`
 
 
 def fly(
@@ -127,7 +129,7 @@ def fly(
                 acting, plan, age = command.speeds, command.plan, 0
                 holds.append((acting, steps_per_period - wait))
             holds = [(speeds, steps) for speeds, steps in holds if steps > 0]
-            flown = [(plant.advance(speeds, steps), plant.applied(speeds)) for speeds, steps in holds]
+            flown = [part for speeds, steps in holds for part in _hold(plant, command.inner, speeds, steps)]
             if navigation is not None:
                 for segment, speeds in flown:
                     held = np.broadcast_to(speeds, (len(segment.physics), N_ROTORS))
@@ -189,6 +191,21 @@ class Sample:
     step_s: float
     segment: Segment
     rotors: Array
+
+
+def _hold(plant: Plant, inner: InnerLoop | None, speeds: Array, steps: int) -> Iterator[tuple[Segment, Array]]:
+    """Advance under a command: segments of flight, each with the rotor speeds (4,) asked for during it [rad/s].
+
+    Raises:
+        ParameterError: the inner loop's period is not a whole number of physics steps.
+    """
+    if inner is None:
+        yield plant.advance(speeds, steps), plant.applied(speeds)
+        return
+    each = inner_steps(inner.rate, plant.timestep)
+    for first in range(0, steps, each):
+        asked = inner.speeds(plant.time, speeds, plant.physics[_BODY_RATES], plant.speeds)
+        yield plant.advance(asked, min(each, steps - first)), plant.applied(asked)
 
 
 def _control_log(

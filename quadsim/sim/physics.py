@@ -38,6 +38,19 @@ def steps_per_period(control_period: float, timestep: float) -> int:
     return steps
 
 
+def inner_steps(rate: float, timestep: float) -> int:
+    """How many physics steps lie between two calls of an inner loop.
+
+    Raises:
+        ParameterError: they are not a whole, positive number.
+    """
+    steps = round(1.0 / (rate * timestep))
+    if steps < 1 or not math.isclose(steps * rate * timestep, 1.0, rel_tol=1e-9):
+        rule = f"such that 1 / rate is a whole multiple of the physics step of {timestep} s"
+        raise ParameterError("controller.inner", "rate", rate, rule)
+    return steps
+
+
 def physics_to_state(physics: Array, yaw: float = 0.0) -> Array:
     """The paper's state from MuJoCo's.
 

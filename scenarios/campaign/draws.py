@@ -12,7 +12,7 @@ import warnings
 from typing import TYPE_CHECKING, Final, assert_never
 
 import numpy as np
-from scipy import stats
+import scipy  # whose `stats` takes half a second to load, where it is first used
 
 from quadsim.state import Array
 from scenarios.campaign.spec import (
@@ -73,7 +73,7 @@ def quantile(entry: VarySpec, share: float) -> Value:
             return float(entry.low * (entry.high / entry.low) ** share)
         case NormalSpec():
             low, high = ((end - entry.mean) / entry.deviation for end in entry.ends)
-            return float(stats.truncnorm.ppf(share, low, high, loc=entry.mean, scale=entry.deviation))
+            return float(scipy.stats.truncnorm.ppf(share, low, high, loc=entry.mean, scale=entry.deviation))
         case ChoiceSpec():
             edges = np.cumsum(entry.weights or [1.0] * len(entry.values))
             return entry.values[int(np.searchsorted(edges, share * edges[-1], side="right"))]
@@ -98,7 +98,8 @@ def _spread_points(spec: CampaignSpec) -> Array:
     size = len(spec.vary)
     if not size:
         return np.empty((spec.flights, 0))
-    kinds = {"latin_hypercube": stats.qmc.LatinHypercube, "sobol": stats.qmc.Sobol, "halton": stats.qmc.Halton}
+    qmc = scipy.stats.qmc
+    kinds = {"latin_hypercube": qmc.LatinHypercube, "sobol": qmc.Sobol, "halton": qmc.Halton}
     sampler = kinds[spec.sampling](size, rng=np.random.default_rng(np.random.SeedSequence(spec.seed)))
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # Sobol's points are balanced best in powers of two

@@ -31,7 +31,8 @@ class CampaignPilot:
         return self._plan.spec.limits
 
     def prepare(self) -> None:
-        """Import a plug-in controller."""
+        """Import a plug-in controller, and what draws need."""
+        self._plan.identity(0)
         controller = self._plan.scenario.controller
         if isinstance(controller, PluginSpec):
             with contextlib.suppress(Exception):

@@ -180,9 +180,10 @@ def guarded(
 
 
 def _nonlinear(spec: NonlinearSpec, vehicle: Vehicle, period: float, shapes: Sequence[Shape]) -> Controller:
+    from mpc.indi import Incremental
     from mpc.nonlinear.controller import NonlinearMPC
     from mpc.nonlinear.rigidbody import Inputs
-    from mpc.nonlinear.settings import AttitudeError, Disturbance, NonlinearSettings, Weights
+    from mpc.nonlinear.settings import AttitudeError, NonlinearSettings, Weights
 
     stride = 1 if spec.node is None else round(spec.node / period)
     if spec.node is not None and (stride < 1 or not math.isclose(stride * period, spec.node, rel_tol=1e-9)):
@@ -218,10 +219,10 @@ def _nonlinear(spec: NonlinearSpec, vehicle: Vehicle, period: float, shapes: Seq
         largest_rates=_three(math.inf if spec.body_rate is None else np.radians(spec.body_rate).tolist()),
         soft=None if spec.soft is None else (spec.soft.linear, spec.soft.quadratic),
         observer=spec.offset_free,
-        disturbance=Disturbance(spec.disturbance),
+        ramp=spec.disturbance,
         solver=spec.solver,
     )
-    law = NonlinearMPC(
+    mpc = NonlinearMPC(
         vehicle,
         period=period,
         settings=settings,
@@ -229,7 +230,8 @@ def _nonlinear(spec: NonlinearSpec, vehicle: Vehicle, period: float, shapes: Seq
         constraints=_outputs(spec),
         space=make_space(spec, vehicle, period, shapes, stride=stride),
     )
-    return guarded(law, bounds, spec.fallback, vehicle, period)
+    law = guarded(mpc, bounds, spec.fallback, vehicle, period)
+    return law if spec.indi is None else Incremental(law, vehicle, spec.indi, bounds)
 
 
 def make_space(
@@ -353,6 +355,7 @@ def _baseline(spec: LQRSpec | PIDSpec | GeometricSpec, vehicle: Vehicle, period:
     from mpc.baselines.geometric import GeometricController, geometric_settings
     from mpc.baselines.lqr import LQR, LQRSettings, bryson_objective
     from mpc.baselines.pid import CascadedPID, pid_settings
+    from mpc.indi import Incremental
 
     held = spec.input_bounds
     bounds = None if held is None else ActuatorBounds.alike(_pair(held.speed), _pair(held.slew))
@@ -380,7 +383,18 @@ def _baseline(spec: LQRSpec | PIDSpec | GeometricSpec, vehicle: Vehicle, period:
     }
     if isinstance(spec, PIDSpec):
         return CascadedPID(vehicle, pid_settings(vehicle, velocity_max=spec.velocity, **shared))
-    return GeometricController(vehicle, geometric_settings(vehicle, integral=spec.integral, **shared))
+    geometric = GeometricController(
+        vehicle,
+        geometric_settings(
+            vehicle,
+            integral=spec.integral,
+            feedforward=spec.feedforward,
+            drag=tuple(spec.drag),
+            disturbance=spec.disturbance,
+            **shared,
+        ),
+    )
+    return geometric if spec.indi is None else Incremental(geometric, vehicle, spec.indi, geometric.bounds)
 
 
 def _rotor_lag(spec: RobustSpec | NonlinearSpec, vehicle: Vehicle) -> float:

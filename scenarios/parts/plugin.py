@@ -6,6 +6,7 @@ import difflib
 import functools
 import importlib
 import inspect
+import math
 import traceback
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -126,6 +127,9 @@ class PluginController:
         for name in _REAL:
             if not isinstance(getattr(answer, name), int | float | np.integer | np.floating):
                 raise refuse(name, "a number")
+        rate = getattr(answer.inner, "rate", None)
+        if answer.inner is not None and not (isinstance(rate, int | float) and 0.0 < rate < math.inf):
+            raise refuse("inner", "None, or an inner loop with a positive rate")
         return replace(answer, speeds=speeds, plan=plan, status=_line(answer.status))
 
 

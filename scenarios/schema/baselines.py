@@ -7,7 +7,9 @@ from typing import Annotated, Literal
 from annotated_types import Len
 from pydantic import Field, model_validator
 
-from mpc.baselines.preview import SMALLEST_PREVIEW
+from mpc.baselines.preview import PREVIEW_DEGREE, SMALLEST_PREVIEW
+from mpc.disturbance import RampSettings
+from mpc.indi import INDISettings
 from quadsim.fields import NonNegative, Positive
 from scenarios.schema.base import Spec
 from scenarios.schema.optimisation import LARGEST_HORIZON, InputBoundsSpec, InputWeightsSpec, Weight, require_states
@@ -68,3 +70,22 @@ class GeometricSpec(_TunedSpec):
 
     type: Literal["geometric"] = Field(description="the control law, by its name in `quadsim list`")
     integral: bool = Field(default=False, description="whether position and attitude errors are integrated")
+    feedforward: bool = Field(
+        default=False,
+        description="whether the reference's jerk and snap are fed forward, and drag, by differential flatness",
+    )
+    drag: Annotated[list[NonNegative], Len(3, 3)] = Field(
+        default=[0.0, 0.0, 0.0], description="[1/s] linear drag along body x, y, z that feedforward takes into account"
+    )
+    disturbance: RampSettings | None = Field(default=None, description="absent: what the model misses is not observed")
+    indi: INDISettings | None = Field(default=None, description="absent: rotors hold the commands for a period")
+
+    @model_validator(mode="after")
+    def _check(self) -> GeometricSpec:
+        if any(self.drag) and not self.feedforward:
+            raise ValueError(f"drag must be zero where feedforward is not true; got {self.drag}")
+        if self.feedforward and self.horizon <= PREVIEW_DEGREE:
+            raise ValueError(
+                f"horizon must be at least {PREVIEW_DEGREE + 1} where feedforward is true; got {self.horizon}"
+            )
+        return self

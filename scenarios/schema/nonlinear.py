@@ -7,7 +7,9 @@ from typing import Annotated, Final, Literal
 from annotated_types import Len, MaxLen
 from pydantic import Discriminator, Field, Tag, model_validator
 
+from mpc.disturbance import RampSettings
 from mpc.fallback.settings import FallbackSettings
+from mpc.indi import INDISettings
 from mpc.observer import ObserverSettings
 from mpc.robust.tightening import SHORTEST_LAG
 from quadsim.fields import NonNegative, Positive
@@ -120,11 +122,10 @@ class NonlinearPartsSpec(Spec):
         default=[], description="bounds on sums of positions, velocities and, as inputs, rotor speeds; audited as well"
     )
     offset_free: ObserverSettings | None = None
-    disturbance: Literal["constant", "path"] = Field(
-        default="constant",
-        description="how the acceleration that offset_free estimates goes on: constant, or path: turning and growing "
-        "with the reference's horizontal velocity, as drag does",
+    disturbance: RampSettings | None = Field(
+        default=None, description="absent: no drag is fitted, no changing force followed; not beside offset_free"
     )
+    indi: INDISettings | None = Field(default=None, description="absent: rotors hold the commands for a period")
     input_bounds: RotorBoundsSpec = RotorBoundsSpec()
     fallback: FallbackSettings = FallbackSettings()
 
@@ -136,6 +137,8 @@ class NonlinearPartsSpec(Spec):
             raise ValueError(
                 f'weights.attitude must be one number where attitude_error = "difference"; got {self.weights.attitude}'
             )
+        if self.offset_free is not None and self.disturbance is not None:
+            raise ValueError("disturbance must be absent where offset_free is given: both estimate the same force")
         for name, pair in self.output_bounds.items():
             if name not in LINEAR:
                 raise ValueError(

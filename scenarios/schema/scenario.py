@@ -12,12 +12,13 @@ from annotated_types import MaxLen
 from pydantic import BeforeValidator, Field, ValidationError, create_model, model_validator
 from pydantic_core import PydanticCustomError
 
+from mpc.indi import INDISettings
 from quadsim.errors import InputError, ParameterError
 from quadsim.fields import Positive
 from quadsim.flight.audit import Limit
 from quadsim.sim.computation import ComputationTime
 from quadsim.sim.effects import Effects
-from quadsim.sim.physics import Integrator, steps_per_period
+from quadsim.sim.physics import Integrator, inner_steps, steps_per_period
 from quadsim.space import AnyObstacle, Corridor, Fence
 from quadsim.vehicle import VEHICLE_UNITS, Vehicle
 from scenarios.schema.base import LARGEST_SEED, MOST_ENTRIES, Spec, Triple, fields_of
@@ -206,6 +207,12 @@ class Scenario(Spec):
                 given = self.log_rate if name == "log_rate" else value
                 period = "have a period that is" if name == "log_rate" else "be"
                 raise ValueError(f"{name} must {period} a whole multiple of {what} = {unit} s; got {given}") from error
+        indi: INDISettings | None = getattr(self.controller, "indi", None)
+        if indi is not None:
+            try:
+                inner_steps(indi.rate, self.plant.timestep)
+            except ParameterError as error:
+                raise ValueError(f"controller.indi.rate must be {error.rule}; got {indi.rate}") from error
         for what, count in (
             ("physics steps", self.periods * self.steps_per_period),
             ("planned steps", self.periods * self.controller.horizon),

@@ -365,6 +365,7 @@ def test_a_campaign_of_a_scenario_judges_requirements(hover: Scenario, tmp_path:
         quadsim.campaign("paper-nominal", vary=[mass])
 
 
+@pytest.mark.usefixtures("sketched")
 def test_flights_are_compared(hover: Scenario, flight: Flight, tmp_path: Path) -> None:
     other = quadsim.fly(hover, progress=False)
     found = quadsim.compare(flight, other, progress=False)

@@ -22,7 +22,10 @@ from scenarios.run import fly_scenario
 from scenarios.schema.scenario import Group, LostSpec, Scenario
 from scenarios.shipped import LIBRARY, scenario_names
 
-SHARED = ("paper-constrained", "paper-unconstrained", "paper-unconstrained-clipped")
+SHARED = (
+    *("paper-constrained", "paper-unconstrained", "paper-unconstrained-clipped"),
+    *("gps-outage", "hard-landing", "lost-rotor", "nan-position"),
+)
 """With other modules."""
 LONGEST_DESCRIPTION = 100
 COMPARED = 3.0

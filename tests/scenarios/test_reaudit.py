@@ -8,7 +8,6 @@ import math
 import shutil
 from collections.abc import Callable
 from dataclasses import replace
-from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -22,9 +21,7 @@ from quadsim.flight.parquet import FLIGHT_FILE, PLANT_FILE, TIMING_FILE
 from scenarios.cli import main
 from scenarios.commands import EXIT_DONE, EXIT_FAILED, EXIT_WRONG_INPUT
 from scenarios.flight import Flight
-from scenarios.loading import load_scenario
 from scenarios.reaudit import reaudit
-from scenarios.run import fly_scenario
 from tests.safety_mutations import unseal
 
 TABLES = ("--no-video", "--no-recording", "--no-figures")
@@ -256,23 +253,16 @@ def test_the_tables_that_a_seed_determines_hold_no_digest(flown: Path) -> None:
         assert (rundir.SEAL.encode() in metadata) is sealed
 
 
-@cache
-def fly_once(name: str) -> Flight:
-    """A scenario of the library, cut short where nothing comes later."""
-    later = name in ("gps-outage", "nan-position", "lost-rotor", "hard-landing")
-    return fly_scenario(load_scenario(name, [] if later else ["duration=6.0"]))
-
-
 @pytest.mark.parametrize("rate", [1000.0, 200.0, 50.0, 1.0])
 @pytest.mark.parametrize("name", ["nan-position", "hard-landing", "lost-rotor", "crazyflie-real-rotors", "gps-outage"])
 def test_what_a_run_records_is_what_its_tables_give(
-    name: str, rate: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    name: str, rate: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fly_once: Callable[..., Flight]
 ) -> None:
     """Flights that break off, crash, are told no number: at any log rate the tables never contradict the record.
 
     Each is flown once: a log holds the plant at the physics rate, whatever the rate of its file.
     """
-    flight = fly_once(name)
+    flight = fly_once(name, *(["duration=6.0"] if name == "crazyflie-real-rotors" else []))  # nothing comes later
     scenario = flight.scenario.model_copy(update={"log_rate": rate})
     monkeypatch.setattr("scenarios.run.fly_scenario", lambda *_: replace(flight, scenario=scenario))
     out = str(tmp_path / "run")

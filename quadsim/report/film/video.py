@@ -7,6 +7,7 @@ frames, and one more joins the pieces without encoding again.
 from __future__ import annotations
 
 import contextlib
+import functools
 import itertools
 import json
 import os
@@ -47,9 +48,7 @@ def rendering_backend() -> str:
     tried: dict[str, str] = {}
     for backend in sorted(BACKENDS, key=lambda name: name != preferred):
         try:
-            subprocess.run(
-                [*_WORKER, "probe"], env=_environment(backend), check=True, capture_output=True, timeout=_PROBE_SECONDS
-            )
+            _probe(backend)
         except subprocess.CalledProcessError as error:
             tried[backend] = _last_line(error.stderr)
         except subprocess.TimeoutExpired:
@@ -57,6 +56,12 @@ def rendering_backend() -> str:
         else:
             return backend
     raise RenderingUnavailableError(tried)
+
+
+@functools.cache  # one that renders is not asked again by this process; one that does not, raises, and is
+def _probe(backend: str) -> None:
+    command = [*_WORKER, "probe"]
+    subprocess.run(command, env=_environment(backend), check=True, capture_output=True, timeout=_PROBE_SECONDS)
 
 
 def worker_count(frames: int, most: int | None = None) -> int:

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
-from scipy import special, stats
+import scipy
 
 from quadsim.state import Array
 from scenarios.campaign.results.events import Flags
@@ -63,7 +63,7 @@ def rank_correlation(x: Array, y: Array) -> Correlation | None:
         return None
     x, y = pairs
     if x.size > _EXACT_UP_TO:
-        found = stats.spearmanr(x, y)
+        found = scipy.stats.spearmanr(x, y)
         return Correlation(rho=float(found.statistic), p=float(found.pvalue), flights=x.size)
     centred = y - y.mean()
     scale = float(np.linalg.norm(x - x.mean()) * np.linalg.norm(centred))
@@ -71,7 +71,9 @@ def rank_correlation(x: Array, y: Array) -> Correlation | None:
     def statistic(ranks: Array, axis: int = -1) -> Any:
         return np.sum(ranks * centred, axis=axis) / scale
 
-    test = stats.permutation_test((x,), statistic, permutation_type="pairings", vectorized=True, n_resamples=np.inf)
+    test = scipy.stats.permutation_test(
+        (x,), statistic, permutation_type="pairings", vectorized=True, n_resamples=np.inf
+    )
     return Correlation(rho=float(test.statistic), p=float(test.pvalue), flights=x.size)
 
 
@@ -90,17 +92,17 @@ def any_dependence(x: Array, y: Array, rng: np.random.Generator) -> Dependence |
     y = y[np.lexsort((rng.random(x.size), x))]
     order = np.arange(float(y.size))
     if np.unique(y).size == 2:
-        xi = float(stats.chatterjeexi(order, y).statistic)
+        xi = float(scipy.stats.chatterjeexi(order, y).statistic)
         return Dependence(xi=xi, p=_p_of_few_runs(y > y.min()), flights=y.size)
-    permuted = stats.PermutationMethod(n_resamples=_PERMUTATIONS, rng=rng)
-    found = stats.chatterjeexi(order, y, method=permuted if y.size <= _PERMUTED_UP_TO else "asymptotic")
+    permuted = scipy.stats.PermutationMethod(n_resamples=_PERMUTATIONS, rng=rng)
+    found = scipy.stats.chatterjeexi(order, y, method=permuted if y.size <= _PERMUTED_UP_TO else "asymptotic")
     return Dependence(xi=float(found.statistic), p=float(found.pvalue), flights=y.size)
 
 
 def _ranked(x: Array, y: Array) -> tuple[Array, Array] | None:
     """Ranks of the pairs that have both; None where there is nothing to relate."""
     kept = ~(np.isnan(x) | np.isnan(y))
-    x, y = stats.rankdata(x[kept]), stats.rankdata(y[kept])
+    x, y = scipy.stats.rankdata(x[kept]), scipy.stats.rankdata(y[kept])
     return None if x.size < 3 or np.ptp(x) == 0.0 or np.ptp(y) == 0.0 else (x, y)
 
 
@@ -115,12 +117,12 @@ def _p_of_few_runs(happened: Flags) -> float:
         return _log_binomial(ones - 1, of_ones - 1) + _log_binomial(zeros - 1, of_zeros - 1)
 
     found = np.logaddexp(ways(fewer, more), ways(more, fewer))
-    return float(np.exp(special.logsumexp(found) - _log_binomial(happened.size, np.asarray(ones))))
+    return float(np.exp(scipy.special.logsumexp(found) - _log_binomial(happened.size, np.asarray(ones))))
 
 
 def _log_binomial(n: int, k: Counts) -> Array:
     """Logarithm of n over k; minus infinity where k > n."""
-    return np.asarray(special.gammaln(n + 1) - special.gammaln(k + 1) - special.gammaln(n - k + 1))
+    return np.asarray(scipy.special.gammaln(n + 1) - scipy.special.gammaln(k + 1) - scipy.special.gammaln(n - k + 1))
 
 
 @dataclass(frozen=True, kw_only=True)

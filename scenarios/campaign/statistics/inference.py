@@ -12,8 +12,8 @@ from dataclasses import asdict, dataclass
 from typing import Any, Final
 
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike
-from scipy import optimize, stats
 
 from quadsim.state import Array
 
@@ -55,7 +55,7 @@ def upper_bounds(counts: ArrayLike, trials: ArrayLike, confidence: float = CONFI
     """
     counts, trials = np.asarray(counts, float), np.asarray(trials, float)
     some = counts < trials
-    bounds = stats.beta.ppf(confidence, counts + 1.0, np.where(some, trials - counts, 1.0))
+    bounds = scipy.stats.beta.ppf(confidence, counts + 1.0, np.where(some, trials - counts, 1.0))
     return np.where(some, bounds, 1.0)
 
 
@@ -97,7 +97,7 @@ def holm(p_values: Sequence[float]) -> list[float]:
 def mcnemar(only_a: int, only_b: int) -> float:
     """Two-sided p-value of McNemar's exact test: a discordant pair is as likely to be of the first as of the second."""
     discordant = only_a + only_b
-    return float(stats.binomtest(only_a, discordant).pvalue) if discordant else 1.0
+    return float(scipy.stats.binomtest(only_a, discordant).pvalue) if discordant else 1.0
 
 
 def paired_shares(only_a: int, only_b: int, pairs: int) -> tuple[float, float]:
@@ -107,7 +107,7 @@ def paired_shares(only_a: int, only_b: int, pairs: int) -> tuple[float, float]:
     `pairs`, at least one, it happened to the first alone in `only_a`, and to the second alone in `only_b`.
     Source: Tango, Statistics in Medicine 17 (1998).
     """
-    z = float(stats.norm.ppf(0.5 * (1.0 + CONFIDENCE)))
+    z = float(scipy.stats.norm.ppf(0.5 * (1.0 + CONFIDENCE)))
     estimate = (only_b - only_a) / pairs
 
     def excess(difference: float) -> float:
@@ -119,7 +119,7 @@ def paired_shares(only_a: int, only_b: int, pairs: int) -> tuple[float, float]:
         if excess(limit) <= 0.0:
             return limit
         beside = estimate + 1e-7 * (limit - estimate)  # at the estimate itself both terms may be 0
-        return float(optimize.brentq(excess, beside, limit, xtol=1e-14))
+        return float(scipy.optimize.brentq(excess, beside, limit, xtol=1e-14))
 
     return end(-1.0), end(1.0)
 
@@ -148,8 +148,8 @@ def paired_difference(a: Array, b: Array) -> PairedDifference:
     half = None
     if n > 1:
         spread = float(differences.std(ddof=1)) / math.sqrt(n)
-        half = float(stats.t.ppf(0.5 * (1.0 + CONFIDENCE), n - 1)) * spread
-    ends = stats.quantile_test(differences, q=0.0, p=0.5).confidence_interval(CONFIDENCE)
+        half = float(scipy.stats.t.ppf(0.5 * (1.0 + CONFIDENCE), n - 1)) * spread
+    ends = scipy.stats.quantile_test(differences, q=0.0, p=0.5).confidence_interval(CONFIDENCE)
     median_lower, median_upper = (float(end) if math.isfinite(end) else None for end in ends)
     return PairedDifference(
         pairs=n,

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from mpc.baselines.attitude import Motion, motion_of, vee
+from mpc.baselines.attitude import Measured, motion_of, vee
 from mpc.baselines.geometric import GeometricController, Integrals, Wanted
 from mpc.baselines.preview import Target
 from quadsim.controller import Moment
@@ -20,7 +20,7 @@ from quadsim.state import make_state, tilt
 from quadsim.vehicle import Vehicle
 
 NONE = Integrals(translation=np.zeros(3), rotation=np.zeros(3))
-MOTION = Motion(
+MOTION = Measured(
     position=np.array([0.3, -0.2, 0.1]),
     velocity=np.array([0.5, 0.4, -0.3]),
     attitude=Rotation.from_euler("ZYX", [0.4, 0.2, -0.3]).as_matrix(),
@@ -145,7 +145,7 @@ def test_a_spinning_body_is_held_against_its_own_gyroscopic_torque(
     """Upright, with errors of rate alone, J Omega' is -J k_Omega Omega and nothing else."""
     law, inertia = build("geometric", hummingbird_like), np.array(hummingbird_like.inertia)
     rates = np.array([0.5, -0.4, 0.6])
-    motion = Motion(position=np.zeros(3), velocity=np.zeros(3), attitude=np.eye(3), rates=rates, yaw=0.0)
+    motion = Measured(position=np.zeros(3), velocity=np.zeros(3), attitude=np.eye(3), rates=rates, yaw=0.0)
     rest = {"position": np.zeros(3), "velocity": np.zeros(3), "acceleration": np.zeros(3)}
     target = Target(**rest, yaw=0.0, yaw_rate=0.0, yaw_acceleration=0.0)
     wrench, wanted = law.wrench(motion, target, NONE)

@@ -13,10 +13,10 @@ from scipy.optimize import minimize
 from mpc.answer import ActuatorBounds
 from mpc.constraints import Constraint
 from mpc.diagnosis import find_conflict
-from mpc.nonlinear.controller import NonlinearMPC, along_path
+from mpc.nonlinear.controller import NonlinearMPC
 from mpc.nonlinear.reference import nodes_of_motion, nodes_of_preview
 from mpc.nonlinear.rigidbody import N_BODY, Inputs, P, Q, V, W, advance_nodes, product, rigid_body, thrust_axis
-from mpc.nonlinear.settings import AttitudeError, Disturbance, NonlinearSettings, Weights
+from mpc.nonlinear.settings import AttitudeError, NonlinearSettings, Weights
 from mpc.observer import ObserverSettings
 from quadsim.assets import vehicle_path
 from quadsim.controller import ACCEPTED, Command, Moment, Phase
@@ -250,34 +250,6 @@ def test_a_constant_disturbance_leaves_no_error_with_the_observer_and_one_withou
     assert np.linalg.norm(without[-1, P]) > 0.02
 
 
-def test_a_disturbance_along_the_path_turns_and_grows_with_its_velocity() -> None:
-    found = along_path(np.array([-1.0, 0.0, 0.5]), np.array([100.0, 0.0, 0.0]), np.array([[0.0, 200.0, 9.0]]))
-    np.testing.assert_allclose(found, [[0.0, -2.0, 0.5]], atol=1e-3)
-    at_rest = along_path(np.array([1.0, 2.0, 3.0]), np.zeros(3), np.array([[0.0, 5.0, 0.0], [0.0, 0.0, 0.0]]))
-    np.testing.assert_array_equal(at_rest, np.tile([1.0, 2.0, 3.0], (2, 1)))
-
-
-def test_unknown_drag_on_a_circle_is_estimated_best_along_the_path() -> None:
-    t = PERIOD * np.arange(450)
-    radius, omega = 4.0, 1.25
-    angle, nothing = omega * t, 0.0 * t
-    position = radius * np.stack([np.sin(angle), 1.0 - np.cos(angle), nothing], axis=1)
-    velocity = radius * omega * np.stack([np.cos(angle), np.sin(angle), nothing], axis=1)
-    level = still(450, np.tile([1.0, 0, 0, 0], (450, 1)), position)
-    start = at_rest()
-    start[V] = velocity[0]
-    observer = ObserverSettings(
-        velocity_noise=0.001, velocity_walk=0.001, force_walk=1.0, rate_noise=0.01, largest_force=20.0
-    )
-    errors = {}
-    for kind in (None, *Disturbance):
-        settings = {} if kind is None else {"observer": observer, "disturbance": kind}
-        states = fly(law(**settings), start, 6.0, replace(level, velocity=velocity), drag=np.array([0.3, 0.3, 0.0]))
-        errors[kind] = np.linalg.norm(states[250:, P] - position[250 : len(states)], axis=1).mean()
-    assert errors[Disturbance.PATH] < 0.9 * errors[Disturbance.CONSTANT]
-    assert errors[Disturbance.CONSTANT] < 0.75 * errors[None]
-
-
 def test_known_drag_is_balanced() -> None:
     """A straight flight at 5 m/s."""
     t = PERIOD * np.arange(400)
@@ -419,7 +391,7 @@ def test_grounded_rotors_stop() -> None:
 @pytest.mark.parametrize("observer", [None, ObserverSettings()])
 def test_what_it_predicts_is_what_the_model_does(observer: ObserverSettings | None) -> None:
     """With the disturbance that is estimated: here the vehicle stays where it should have risen."""
-    controller = law(observer=observer, disturbance=Disturbance.PATH)
+    controller = law(observer=observer)
     x = at_rest((0.9, 0.3, 0.0, 0.1))
     for k in range(3):
         command = ask(controller, x, k * PERIOD)

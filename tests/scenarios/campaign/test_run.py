@@ -20,6 +20,7 @@ from scenarios.campaign import run as module
 from scenarios.campaign.engine.local import LocalEngine
 from scenarios.campaign.engine.protocol import Pilot
 from scenarios.campaign.manifest import read_manifest
+from scenarios.campaign.pilot import CampaignPilot
 from scenarios.campaign.plan import Plan, load_plan
 from scenarios.campaign.replay import recorded_flight, replay_flight
 from scenarios.campaign.results.table import Row, read_table
@@ -117,6 +118,14 @@ def test_what_was_flown_stays_and_the_rest_follows(
     assert [standing.flown for standing in seen] == list(range(6, 13))
     assert content(resumed) == content(whole)
     assert [session["flights"] for session in resumed.manifest["sessions"]] == [5, 7]
+
+
+def test_what_draws_need_is_loaded_before_a_flight(plan: Plan, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Half a second for statistics is no part of a flight's time."""
+    drawn: list[int] = []
+    monkeypatch.setattr(Plan, "identity", lambda _, flight: drawn.append(flight))
+    CampaignPilot(plan).prepare()
+    assert drawn == [0]
 
 
 def test_resuming_a_finished_campaign_flies_nothing(plan: Plan, whole: Result, flown: Path) -> None:

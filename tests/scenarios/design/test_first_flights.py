@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import tomllib
+from functools import cache
 from pathlib import Path
 
 import numpy as np
 import pytest
-from first_flights import fly_first, vehicles
+from first_flights import FirstFlight, fly_first, vehicles
 
 from mpc.baselines.lqr import bryson_objective
 from quadsim.errors import UnknownNameError
@@ -23,10 +24,15 @@ HARDEST = ("random-08", "random-13", "random-16", "random-17")
 """The slowest rotors, 10 and 20 kg, and the one that strays most."""
 
 
+@cache
+def flown(name: str, course: str, law: str) -> FirstFlight:
+    return fly_first(ALL[name], course, law)
+
+
 @pytest.mark.parametrize("name", [*SHIPPED, *HARDEST])
 def test_the_robust_controller_flies_it_first_time(name: str) -> None:
     for course in COURSES:
-        flight = fly_first(ALL[name], course, "robust")
+        flight = flown(name, course, "robust")
         assert flight.meets_the_bar, (course, flight)
 
 
@@ -34,13 +40,13 @@ def test_the_robust_controller_flies_it_first_time(name: str) -> None:
 @pytest.mark.parametrize("name", ["crazyflie2", "random-16", "random-17"])
 def test_baselines_fly_it_within_the_bounds(name: str, law: str) -> None:
     for course in COURSES[1:]:
-        flight = fly_first(ALL[name], course, law)
+        flight = flown(name, course, law)
         assert flight.outcome == "satisfied", (course, flight)
 
 
 def test_the_figure_eight_comes_near_to_what_it_is_made_for() -> None:
     """60 % of g tan(40 deg) is a tilt of 26.7 deg: a course that asks for less would prove nothing."""
-    flight = fly_first(ALL["hummingbird"], "figure-eight", "robust")
+    flight = flown("hummingbird", "figure-eight", "robust")
     assert 25.0 < flight.tilt < 32.0
 
 

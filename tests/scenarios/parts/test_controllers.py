@@ -332,7 +332,6 @@ NONLINEAR: dict[str, Any] = {
     "soft": {"linear": 9.0, "quadratic": 10.0},
     "polytopes": [{"name": "wall", "of": ["x", "y"], "rows": [[1.0, 1.0]], "upper": [4.0]}],
     "offset_free": {"force_walk": 0.3},
-    "disturbance": "path",
     "input_bounds": {"speed": [10.0, 200.0], "slew": [-30.0, 20.0]},
     "solver": "daqp",
     "fallback": {"enabled": False},
@@ -353,7 +352,7 @@ def test_fields_of_nonlinear_mpc_arrive() -> None:
     assert (made.drag, made.quadratic_drag) == ((0.1, 0.2, 0.3), (0.4, 0.5, 0.6))
     assert made.tilt == pytest.approx(20.0 * x)
     assert made.largest_rates == pytest.approx((90.0 * x, 180.0 * x, 45.0 * x))
-    assert (made.soft, made.observer, made.disturbance) == ((9.0, 10.0), ObserverSettings(force_walk=0.3), "path")
+    assert (made.soft, made.observer) == ((9.0, 10.0), ObserverSettings(force_walk=0.3))
     constraints = {part.name: part for part in law.problem.every_constraint}
     assert list(constraints) == ["inputs", "slews", "tilt", "body_rates", "outputs", "wall"]
     np.testing.assert_allclose(constraints["inputs"].upper, 200.0 / build_vehicle(scenario("pid")).speed_max)

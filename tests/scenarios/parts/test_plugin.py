@@ -251,6 +251,7 @@ def test_what_it_writes_over_is_its_own() -> None:
         ("fallback", None, "a whole number"),
         ("iterations", 2.5, "a whole number"),
         ("slack", "none", "a number"),
+        ("inner", 500.0, "None, or an inner loop with a positive rate"),
     ],
 )
 def test_a_command_with_a_wrong_part_is_refused_by_its_name(part: str, given: Any, rule: str) -> None:

@@ -160,6 +160,18 @@ WRONG = {
     "initial.euler=[0, 90, 0]": (
         "initial.euler must have a roll within +-180 deg and a pitch within +-90 deg; got [0.0, 90.0, 0.0]"
     ),
+    "controller={type='geometric',drag=[1,0,0]}": (
+        "controller.drag must be zero where feedforward is not true; got [1.0, 0.0, 0.0]"
+    ),
+    "controller={type='geometric',feedforward=true,horizon=4}": (
+        "controller.horizon must be at least 5 where feedforward is true; got 4"
+    ),
+    "controller={type='geometric',indi={rate=300}}": (
+        "controller.indi.rate must be such that 1 / rate is a whole multiple of the physics step of 0.001 s; got 300.0"
+    ),
+    "controller={type='nonlinear',offset_free={},disturbance={}}": (
+        "controller.disturbance must be absent where offset_free is given: both estimate the same force"
+    ),
     "reference.x=[{start=2,stop=2,value=0}]": "reference.x.0.start must be below stop = 2.0; got 2.0",
     "controller.output_bounds.roll=[5, -5]": (
         "controller.output_bounds.roll must have its lower bound below its upper; got [5.0, -5.0]"

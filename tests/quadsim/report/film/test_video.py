@@ -7,6 +7,7 @@ import os
 import subprocess
 import sys
 import warnings
+from collections.abc import Iterator
 from dataclasses import asdict, fields, replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -181,12 +182,16 @@ def test_the_users_backend_is_tried_first(monkeypatch: pytest.MonkeyPatch):
 
     monkeypatch.setenv("MUJOCO_GL", "osmesa")
     monkeypatch.setattr(subprocess, "run", run)
+    video._probe.cache_clear()
     assert rendering_backend() == "egl"
     assert asked == ["osmesa", "egl"]
+    assert rendering_backend() == "egl"
+    assert asked == ["osmesa", "egl", "osmesa"], "one that renders is not asked again"
+    video._probe.cache_clear()
 
 
 @pytest.fixture
-def fake_worker(monkeypatch: pytest.MonkeyPatch) -> None:
+def fake_worker(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """Workers that report one frame; the one that renders the first frames then waits, another fails."""
     script = (
         "import json, sys, time\n"
@@ -197,6 +202,8 @@ def fake_worker(monkeypatch: pytest.MonkeyPatch) -> None:
         "sys.exit('Traceback ...\\nGLError: the picture is lost')\n"
     )
     monkeypatch.setattr(video, "_WORKER", (sys.executable, "-c", script))
+    yield
+    video._probe.cache_clear()  # what it answered is not known of the real one
 
 
 @pytest.mark.usefixtures("fake_worker")

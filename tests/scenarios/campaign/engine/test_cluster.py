@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import json
+import multiprocessing.forkserver
 import os
 import signal
 import subprocess
@@ -13,6 +14,7 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
+import dask
 import distributed
 import psutil
 import pytest
@@ -49,6 +51,19 @@ low = 0.5
 high = 1.5
 """
 SLURM = '[slurm]\njobs = 2\ncores = 1\nmemory = "1GB"\nqueue = "short"\nwalltime = "00:10:00"\n'
+
+
+@pytest.fixture(scope="module", autouse=True)
+def forked() -> Iterator[None]:
+    """Workers are forked from a server that has loaded what they need: loading is most of what starting one takes."""
+    server, patch = multiprocessing.forkserver._forkserver, pytest.MonkeyPatch()
+    server._stop()  # who had it before wanted other modules
+    server.set_forkserver_preload(["distributed", "scenarios.campaign.engine.cluster", "scenarios.campaign.preload"])
+    patch.setattr("distributed.utils._forkserver_preload_set", True)
+    with dask.config.set({"distributed.worker.multiprocessing-method": "forkserver"}):
+        yield
+    patch.undo()
+    server._stop()
 
 
 def start_cluster(workers: int = 2, threads: int = 1) -> distributed.LocalCluster:

@@ -11,9 +11,12 @@ import pytest
 from browser import open_page
 
 from quadsim.errors import OutputError
+from quadsim.report.plots.panels import Plot
 from scenarios.campaign.report.campaign_curves import histograms
+from scenarios.campaign.report.campaign_figure import write_campaign_figure
 from scenarios.campaign.report.campaign_page import write_report
 from scenarios.campaign.report.campaign_plots import campaign_plots
+from scenarios.campaign.results.table import Summary
 from scenarios.campaign.statistics.estimates import estimate
 from scenarios.campaign.statistics.scatters import clipping, clouds, margins, shown_flights, thinning
 from scenarios.campaign.statistics.wording import interval, percent, side_by_side, signed_points
@@ -35,15 +38,16 @@ PROBE = """<script>
   document.body.append(report);
 })();
 </script>"""
+NAME = "paper-robustness"
 CASES = {"five": (5, 1.0), "clean": (60, 0.0), "lost": (40, 100.0), "one": (1, 1.0), "none": (0, 1.0)}
 
 
-def write(directory: Path, table: pa.Table, name: str = "paper-robustness") -> str:
+def write(directory: Path, table: pa.Table, name: str = NAME, summary: Summary | None = None) -> str:
     directory.mkdir(exist_ok=True)
     page = write_report(
         directory,
         table=table,
-        summary=json.loads(json.dumps(estimate(table))),
+        summary=json.loads(json.dumps(summary or estimate(table))),
         manifest=MANIFEST,
         name=name,
         description="What is flown.",
@@ -54,12 +58,22 @@ def write(directory: Path, table: pa.Table, name: str = "paper-robustness") -> s
 
 
 @pytest.fixture(scope="module")
-def reported(thousand: pa.Table, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def estimated(thousand: pa.Table) -> Summary:
+    return estimate(thousand)
+
+
+@pytest.fixture(scope="module")
+def plots(thousand: pa.Table, estimated: Summary) -> dict[str, Plot]:
+    return campaign_plots(thousand, estimated)
+
+
+@pytest.fixture(scope="module")
+def reported(thousand: pa.Table, estimated: Summary, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The directory of a campaign of a thousand flights, with its report."""
     directory = tmp_path_factory.mktemp("reported") / "runs" / "my campaign"
     directory.mkdir(parents=True)
     (directory / "flights.parquet").write_bytes(b"")
-    write(directory, thousand)
+    write(directory, thousand, summary=estimated)
     return directory
 
 
@@ -67,13 +81,13 @@ def without_scripts(page: str) -> str:
     return re.sub(r"<script.*?</script>", "", page, flags=re.DOTALL)
 
 
-def test_the_page_tells_what_the_flights_show(thousand: pa.Table, reported: Path) -> None:
+def test_the_page_tells_what_the_flights_show(estimated: Summary, reported: Path) -> None:
     directory = reported
     text = without_scripts((directory / "index.html").read_text())
     assert '<p class="verdict bad">30 of 1000 flights failed: 3.0 % (95 %: 2.0 to 4.3 %)</p>' in text
     assert "(violated, rmse.z &gt; 0.5)" in text
     assert "The worst margin goes most with wind (" in text
-    worst = estimate(thousand)["worst"][0]["flight"]
+    worst = estimated["worst"][0]["flight"]
     assert f"quadsim replay &#39;{directory}&#39; --flight {worst}<" in text
     for heading in ("How often", "Constraints", "Distributions", "What drives failure", "Worst flights"):
         assert f"<h2>{heading}</h2>" in text
@@ -110,8 +124,9 @@ def test_a_campaign_without_required_constraints_has_a_page(thousand: pa.Table, 
         i = some.column_names.index(name)
         some = some.set_column(i, some.schema.field(i), pa.nulls(50, some.schema.field(i).type))
     assert margins(some) is None
-    assert "scatter" not in campaign_plots(some, estimate(some))
-    assert "paper-robustness" in write(tmp_path / "out", some)
+    summary = estimate(some)
+    assert "scatter" not in campaign_plots(some, summary)
+    assert NAME in write(tmp_path / "out", some, summary=summary)
 
 
 @pytest.mark.usefixtures("sketched")
@@ -125,12 +140,17 @@ def test_hostile_names_are_text(thousand: pa.Table, tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("sketched")
-def test_ten_thousand_flights_stay_small(make_campaign: MakeCampaign, tmp_path: Path) -> None:
+def test_ten_thousand_flights_stay_small(
+    make_campaign: MakeCampaign, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     table = make_campaign(10_000)
-    text = write(tmp_path / "out", table)
+    summary = estimate(table)
+    drawn = campaign_plots(table, summary)
+    monkeypatch.setattr("scenarios.campaign.report.campaign_page.campaign_plots", lambda *_: drawn)
+    text = write(tmp_path / "out", table, summary=summary)
     assert len(text) < 15e6
     assert "Drawn are 500 of " in text
-    assert sum(len(plot.json) for plot in campaign_plots(table, estimate(table)).values()) < 1e6
+    assert sum(len(plot.json) for plot in drawn.values()) < 1e6
 
 
 def test_thinning_takes_flights_of_each_verdict_evenly(make_campaign: MakeCampaign) -> None:
@@ -191,29 +211,30 @@ def test_outliers_are_drawn_at_the_edge_and_told(thousand: pa.Table, tmp_path: P
     assert wind.x.max() < 7.0
     assert (wind.edge[3], wind.edge[5], drawn.edge[7]) == ("right", "left", "up")
     assert np.count_nonzero(wind.edge != "") == 2
-    text = " ".join(without_scripts(write(tmp_path / "out", table)).split())
+    summary = estimate(table)
+    text = " ".join(without_scripts(write(tmp_path / "out", table, summary=summary)).split())
     assert re.search(r"1 flight with a margin above 0\.\d+, up to 55;", text)
     assert re.search(r"1 flight with wind below \S+, down to -90; 1 flight with wind above 5\.\d+, up to 400\.", text)
     assert "to 400" in (tmp_path / "out" / "campaign.svg").read_text()
-    figure = json.loads(campaign_plots(table, estimate(table))["scatter"].json)
+    figure = json.loads(campaign_plots(table, summary)["scatter"].json)
     symbols = [trace["marker"]["symbol"] for trace in figure["data"] if trace["mode"] == "markers"]
     edges = [symbol for one in symbols if isinstance(one, list) for symbol in one]
     assert edges.count("triangle-right") == edges.count("triangle-left") == 1
     assert edges.count("triangle-up") == 9, "in every panel"
 
 
-def test_a_curve_is_drawn_over_every_number(thousand: pa.Table) -> None:
+def test_a_curve_is_drawn_over_every_number(thousand: pa.Table, plots: dict[str, Plot]) -> None:
     drawn = margins(thousand)
     assert drawn is not None
     for cloud in clouds(thousand, drawn):
         assert (cloud.course is None) is bool(cloud.names), cloud.name
-    figure = json.loads(campaign_plots(thousand, estimate(thousand))["scatter"].json)
+    figure = json.loads(plots["scatter"].json)
     assert sum(trace["mode"] == "lines" for trace in figure["data"]) == 7
 
 
-def test_no_tick_label_is_turned(thousand: pa.Table) -> None:
+def test_no_tick_label_is_turned(plots: dict[str, Plot]) -> None:
     """Turned ones run into the next row of panels."""
-    for plot in campaign_plots(thousand, estimate(thousand)).values():
+    for plot in plots.values():
         axes = [axis for key, axis in json.loads(plot.json)["layout"].items() if key.startswith("xaxis")]
         assert axes
         assert plot.key == "drivers" or all(axis["tickangle"] == 0 for axis in axes), plot.key
@@ -241,10 +262,12 @@ def test_shares_are_told_with_the_digits_they_need() -> None:
     assert [signed_points(value) for value in (-0.025, 0.0, 0.0004)] == ["-2.5", "0", "+0.040"]
 
 
-def test_figures_are_the_same_every_time(thousand: pa.Table, reported: Path, tmp_path: Path) -> None:
-    write(tmp_path / "again", thousand)
+def test_figures_are_the_same_every_time(
+    thousand: pa.Table, estimated: Summary, reported: Path, tmp_path: Path
+) -> None:
+    write_campaign_figure(NAME, thousand, json.loads(json.dumps(estimated)), tmp_path)
     for file in ("campaign.png", "campaign.svg"):
-        assert (tmp_path / "again" / file).read_bytes() == (reported / file).read_bytes()
+        assert (tmp_path / file).read_bytes() == (reported / file).read_bytes()
 
 
 @pytest.mark.usefixtures("sketched")
@@ -261,7 +284,7 @@ def test_a_browser_draws_the_page_and_has_no_complaint(make_campaign: MakeCampai
     assert "Chart Studio" not in report["buttons"]
 
 
-def test_a_place_that_cannot_be_is_told(thousand: pa.Table, tmp_path: Path) -> None:
+def test_a_place_that_cannot_be_is_told(thousand: pa.Table, estimated: Summary, tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     with pytest.raises(OutputError, match="Not a directory"):
-        write_report(tmp_path / "file" / "gone", table=thousand, summary=estimate(thousand), manifest={}, name="a")
+        write_report(tmp_path / "file" / "gone", table=thousand, summary=estimated, manifest={}, name="a")

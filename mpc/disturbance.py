@@ -1,0 +1,169 @@
+"""A force and a torque that the model does not explain, and how fast the force changes.
+
+The mean acceleration over a period that the model misses,
+
+    d = (v(k) - v(k-1)) / tau_s + g e_z - mean(f / m R e_z + R d_drag),
+
+and the angular one likewise, are each followed by two states, the disturbance and its rate of change, with both poles
+of the error at exp(-bandwidth tau_s): the critically damped g-h filter (Morrison, "Introduction to Sequential Smoothing
+and Prediction", 1969).  A disturbance that changes steadily is met without lag, as that of drag on a curved path nearly
+is; the constant one of `mpc.robust.observer` comes late by its time constant.
+
+With f / m taken from the rotor commands this is the acceleration feedback of incremental nonlinear dynamic inversion
+(Tal and Karaman, "Accurate tracking of aggressive quadrotor trajectories using incremental nonlinear dynamic inversion
+and differential flatness", 2021), f / m R e_z - g e_z + d = v', with a prediction in place of a low-pass filter's lag.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Annotated, Final
+
+import numpy as np
+from annotated_types import doc
+from numpy.typing import ArrayLike
+
+from quadsim.fields import NonNegative, Positive
+from quadsim.state import Array
+from quadsim.vehicle import Vehicle
+
+FORCE_SHARE: Final = 0.5
+"""Bandwidth of the force times the control period, where none is given."""
+TORQUE_SHARE: Final = 0.25
+"""The same of the torque."""
+FITTED_FROM: Final = 1.0
+"""Speed along an axis [m/s] at which half the drag that would explain the force is believed."""
+_SAME_TIME: Final = 1e-6  # [s]
+
+
+@dataclass(frozen=True, kw_only=True)
+class RampSettings:
+    """Unmodelled force, its rate of change, and torque: estimated in flight and compensated."""
+
+    force: Annotated[
+        Positive | None, doc(f"[rad/s] bandwidth of the force's estimate; absent: {FORCE_SHARE:g} / control period")
+    ] = None
+    torque: Annotated[
+        Positive | None, doc(f"[rad/s] the same of the torque's; absent: {TORQUE_SHARE:g} / control period")
+    ] = None
+    drag_memory: Annotated[
+        Positive, doc("[s] over which linear drag is fitted to the force, for a nonlinear MPC's predictions")
+    ] = 1.0
+    rotor_lag: Annotated[
+        NonNegative | None,
+        doc("[s] time constant by which rotors follow commands; absent: the one that the controller predicts, or 0"),
+    ] = None
+    largest_force: Annotated[Positive, doc("[m/s^2] larger estimates are clipped")] = 20.0
+    largest_torque: Annotated[Positive, doc("[rad/s^2] larger estimates are clipped")] = 100.0
+
+
+class RampObserver:
+    """The six filters, an evolving state: three of the force, world axes, and three of the torque, body axes."""
+
+    def __init__(
+        self,
+        settings: RampSettings,
+        vehicle: Vehicle,
+        period: float,
+        *,
+        drag: ArrayLike = (0.0, 0.0, 0.0),
+        quadratic_drag: ArrayLike = (0.0, 0.0, 0.0),
+    ) -> None:
+        """Set up.
+
+        Args:
+            settings: bandwidths and limits.
+            vehicle: the modelled vehicle.
+            period: tau_s [s].
+            drag: (3,) linear drag that the model knows, body axes [1/s].
+            quadratic_drag: (3,) the same of each component's square [1/m].
+        """
+        force = FORCE_SHARE / period if settings.force is None else settings.force
+        torque = TORQUE_SHARE / period if settings.torque is None else settings.torque
+        pole = np.exp(-period * np.repeat([force, torque], 3))
+        self._gain, self._gain_of_change = 1.0 - pole**2, (1.0 - pole) ** 2 / period
+        self._largest = np.repeat([settings.largest_force, settings.largest_torque], 3)
+        self._vehicle, self._period, self._lag = vehicle, period, settings.rotor_lag or 0.0
+        self._drag, self._quadratic = np.array(drag, float), np.array(quadratic_drag, float)
+        self._kept = math.exp(-period / settings.drag_memory)
+        self._ballast = FITTED_FROM**2 / (1.0 - self._kept)
+        self._up = np.array([0.0, 0.0, vehicle.gravity])
+        self.reset(np.full(4, vehicle.hover_speed))
+
+    def reset(self, rotors: Array) -> None:
+        """Forget: nothing disturbs, and the rotors turn at `rotors` (4,) [rad/s]."""
+        self._value, self._change = np.zeros(6), np.zeros(6)
+        self._products, self._squares = np.zeros(3), np.zeros(3)
+        self._rotors = np.array(rotors, float)
+        self._last: tuple[Array, Array, Array, Array] | None = None
+        self._time = 0.0
+
+    def update(self, time: float, velocity: Array, attitude: Array, rates: Array, speeds: Array) -> None:
+        """Take note of a period's end; of one whose beginning was not seen only as a beginning.
+
+        Args:
+            time: of the measurement [s].
+            velocity: (3,) measured, world [m/s].
+            attitude: (3, 3) measured, body to world.
+            rates: (3,) measured, body [rad/s].
+            speeds: (4,) commanded rotor speeds in force over the period that ends [rad/s].
+        """
+        period, J = self._period, np.array(self._vehicle.inertia)
+        squares = self._mean_squares(speeds)
+        axis, turning = attitude[:, 2], attitude @ np.array([rates[1], -rates[0], 0.0])
+        v_b = attitude.T @ velocity
+        drag = -attitude @ ((self._drag + self._quadratic * np.abs(v_b)) * v_b)
+        now = velocity, rates, np.concatenate([axis, turning]), np.concatenate([drag, np.cross(rates, J * rates)])
+        last, self._last = self._last, now
+        before, self._time = self._time, time
+        if last is None or abs(time - before - period) > _SAME_TIME:
+            return
+        # Means over the period from both its ends: of the thrust axis with its derivative too (Euler-Maclaurin).
+        b = 0.5 * (last[2][:3] + axis) + period / 12.0 * (last[2][3:] - turning)
+        drag, gyroscopic = np.split(0.5 * (last[3] + now[3]), 2)
+        thrust, torque = np.split(self._vehicle.allocation @ squares, [1])
+        missed = np.concatenate(
+            [
+                (velocity - last[0]) / period + self._up - thrust / self._vehicle.mass * b - drag,
+                (rates - last[1]) / period - (torque - gyroscopic) / J,
+            ]
+        )
+        predicted = self._value + period * self._change
+        surprise = missed - predicted
+        value = predicted + self._gain * surprise
+        self._value = np.clip(value, -self._largest, self._largest)
+        self._change = np.where(value == self._value, self._change + self._gain_of_change * surprise, 0.0)
+        self._fit(v_b, attitude.T @ self.foreseen(0.0)[0])
+
+    def foreseen(self, ahead: float) -> tuple[Array, Array, Array]:
+        """What is missed so long [s] after the last measurement, (3,) each.
+
+        Returns:
+            acceleration [m/s^2] and its rate of change [m/s^3], world axes; angular acceleration, body axes [rad/s^2].
+        """
+        value = self._value + (0.5 * self._period + ahead) * self._change  # estimated for the middle of the last period
+        return value[:3], self._change[:3], value[3:]
+
+    @property
+    def drag(self) -> Array:
+        """(3,) linear drag beyond what the model knows, body axes [1/s]: what of the force follows the velocity.
+
+        The least squares of d_b + diag(drag) v_b, older samples with less weight; zero while the vehicle is slow.
+        """
+        return np.maximum(-self._products / (self._squares + self._ballast), 0.0)
+
+    def _fit(self, v_b: Array, d_b: Array) -> None:
+        self._products = self._kept * self._products + d_b * v_b
+        self._squares = self._kept * self._squares + v_b**2
+
+    def _mean_squares(self, speeds: Array) -> Array:
+        """(4,) mean squares of the rotor speeds over the period, which tend to `speeds` exponentially [rad^2/s^2]."""
+        if self._lag == 0.0:
+            return np.square(speeds)
+        away, share = self._rotors - speeds, self._lag / self._period
+        left = math.exp(-1.0 / share)
+        self._rotors = speeds + left * away
+        return np.asarray(
+            speeds**2 + 2.0 * share * (1.0 - left) * speeds * away + 0.5 * share * (1.0 - left**2) * away**2
+        )

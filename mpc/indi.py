@@ -1,0 +1,125 @@
+"""Incremental nonlinear dynamic inversion (INDI) of the angular acceleration, an inner loop around any law.
+
+The law's rotor speeds say which wrench, and so which angular acceleration, it wants of its model.  At a rate of its
+own, above the control rate, the inner loop asks for the torque
+
+    tau_c = tau_f + J (alpha_c - alpha_f),
+
+increments on the torque that the measured rotor speeds give and the measured angular acceleration, both through one
+low-pass filter, so that they stay in step: Smeur, Chu, de Croon, "Adaptive incremental nonlinear dynamic inversion for
+attitude control of micro air vehicles", 2016; Tal and Karaman (2021); around a nonlinear MPC Sun, Romero, Foehn,
+Kaufmann, Scaramuzza, "A comparative study of nonlinear MPC and differential-flatness-based control for quadrotor agile
+flight", 2022.  Whatever torque the model does not know (drag of the body, a worn rotor, an offset centre of mass) is in
+alpha_f and is made up for; collective thrust passes.
+
+With the gyroscopic torque left outside the filter this is tau_c = tau(u) + filtered(tau - J alpha - omega x J omega),
+so that a vehicle that is as modelled flies the law's own speeds.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Annotated, Final
+
+import numpy as np
+from annotated_types import doc
+
+from mpc.baselines.allocation import allocate, make_allocation
+from quadsim.controller import GROUNDED, Command, Controller, Moment
+from quadsim.fields import Positive
+from quadsim.state import Array
+from quadsim.vehicle import Vehicle
+
+if TYPE_CHECKING:
+    from mpc.answer import ActuatorBounds
+
+DAMPING: Final = math.sqrt(0.5)
+"""Of the low-pass filter: Butterworth's, second order, as Tal and Karaman have it."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class INDISettings:
+    """INDI of the angular acceleration in an inner loop."""
+
+    rate: Annotated[Positive, doc("[Hz] of the inner loop; its period is a whole number of physics steps")] = 500.0
+    cutoff: Annotated[Positive, doc("[Hz] of the filter of measured angular accelerations and torques")] = 30.0
+
+
+class TorqueIncrement:
+    """The inner loop: commanded rotor speeds to those that turn the vehicle as the law's model would have turned.
+
+    See `quadsim.controller.InnerLoop`.
+
+    Attributes:
+        rate: how often it is called [Hz].
+    """
+
+    def __init__(self, vehicle: Vehicle, settings: INDISettings, bounds: ActuatorBounds) -> None:
+        self.rate = settings.rate
+        self._allocation, self._inertia, self._bounds = make_allocation(vehicle), np.array(vehicle.inertia), bounds
+        self._omega = 2.0 * math.pi * settings.cutoff
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget: no torque is unknown."""
+        self._last: tuple[float, Array] | None = None
+        self._filtered, self._slope = np.zeros(3), np.zeros(3)
+
+    def speeds(self, time: float, commanded: Array, rates: Array, rotors: Array) -> Array:
+        """The rotor speeds to hold until the next call (4,) [rad/s].
+
+        Args:
+            time: when it is [s].
+            commanded: (4,) what the law asks for [rad/s].
+            rates: (3,) measured body rates [rad/s].
+            rotors: (4,) measured rotor speeds [rad/s].
+        """
+        M, J = self._allocation.M, self._inertia
+        last, self._last = self._last, (time, rates.copy())
+        if last is not None and time > last[0]:
+            step = time - last[0]
+            middle = 0.5 * (rates + last[1])
+            missed = (M @ rotors**2)[1:] - J * (rates - last[1]) / step - np.cross(middle, J * middle)
+            self._filter(missed, step)
+        wrench = M @ commanded**2
+        wrench[1:] += self._filtered
+        return allocate(self._allocation, wrench, self._bounds.u_min, self._bounds.u_max)
+
+    def _filter(self, value: Array, step: float) -> None:
+        """One step of y'' = omega^2 (value - y) - 2 zeta omega y', implicit, so that it is stable at any rate."""
+        omega = self._omega
+        slope = (self._slope + step * omega**2 * (value - self._filtered)) / (
+            1.0 + 2.0 * DAMPING * omega * step + (omega * step) ** 2
+        )
+        self._filtered, self._slope = self._filtered + step * slope, slope
+
+
+class Incremental:
+    """A controller whose commands go through the inner loop."""
+
+    def __init__(self, inner: Controller, vehicle: Vehicle, settings: INDISettings, bounds: ActuatorBounds) -> None:
+        self.inner, self.name, self.solver, self.horizon = inner, inner.name, inner.solver, inner.horizon
+        self._loop = TorqueIncrement(vehicle, settings, bounds)
+
+    def reset(self, speeds: Array) -> None:
+        """Start anew after the command u(-1) (4,) [rad/s]."""
+        self.inner.reset(speeds)
+        self._loop.reset()
+
+    def step(self, now: Moment, state: Array, reference: Array) -> Command:
+        """The law's command, with the inner loop that is to carry it out; on the ground without."""
+        command = self.inner.step(now, state, reference)
+        if now.phase in GROUNDED:
+            self._loop.reset()
+            return command
+        return replace(command, inner=self._loop)
+
+    @property
+    def unanswered(self) -> object:
+        """That of the law, where it has one: the first period since `reset` whose QP had no answer."""
+        return getattr(self.inner, "unanswered", None)
+
+    def predict(self, states: Array, plans: Array) -> Array:
+        """See `quadsim.controller.Controller.predict`."""
+        return self.inner.predict(states, plans)

@@ -1,0 +1,138 @@
+"""Feed-forward by differential flatness with drag: open loop along the flat inputs, and the law on the trajectory."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+from scipy.spatial.transform import Rotation
+
+from mpc.baselines.attitude import Measured, hat
+from mpc.baselines.geometric import GeometricController, Integrals, geometric_settings
+from mpc.baselines.preview import PREVIEW_DEGREE, Target, target_of_motion
+from mpc.baselines.wanted import Wanted, wanted_attitude
+from mpc.flatness import motion_along
+from quadsim.errors import ParameterError
+from quadsim.state import Array
+from quadsim.vehicle import Vehicle
+
+PERIOD = 0.002
+NONE = Integrals(translation=np.zeros(3), rotation=np.zeros(3))
+DRAGS = [(0.0, 0.0, 0.0), (0.5, 0.5, 0.2), (0.6, 0.3, 0.1)]
+PLACES, RATES = np.array([2.0, 1.5, 0.5]), np.array([1.1, 1.7, 1.3])
+PHASES = np.array([0.3, 1.0, 2.0])
+
+
+def sine(t: float) -> list[Array]:
+    """Position to snap (3,) of a motion of three sines."""
+    return [PLACES * RATES**n * np.sin(RATES * t + PHASES + 0.5 * n * np.pi) for n in range(5)]
+
+
+def target_at(t: float) -> Target:
+    """The three sines, and a heading that turns steadily."""
+    position, velocity, acceleration, jerk, snap = sine(t)
+    return Target(
+        position=position,
+        velocity=velocity,
+        acceleration=acceleration,
+        jerk=jerk,
+        snap=snap,
+        yaw=0.4 * t,
+        yaw_rate=0.4,
+        yaw_acceleration=0.0,
+    )
+
+
+def flat(vehicle: Vehicle, drag: Array, t: float) -> tuple[float, Wanted]:
+    """Thrust [N] and attitude along the three sines."""
+    m, target = vehicle.mass, target_at(t)
+    force = m * (target.acceleration + np.array([0.0, 0.0, vehicle.gravity])), m * target.jerk, m * target.snap
+    momentum = m * target.velocity, m * target.acceleration, m * target.jerk
+    c, s = np.cos(target.yaw), np.sin(target.yaw)
+    heading = np.array([[c, s, 0.0], [-0.4 * s, 0.4 * c, 0.0], [-0.16 * c, -0.16 * s, 0.0]])
+    wanted = wanted_attitude(force, momentum, drag, heading)
+    return float(wanted.attitude[:, 2] @ (force[0] + drag[2] * momentum[0])), wanted
+
+
+@pytest.mark.parametrize("drag", DRAGS)
+def test_open_loop_along_the_flat_inputs_the_vehicle_stays_on_the_trajectory(
+    vehicle: Vehicle, drag: tuple[float, float, float]
+) -> None:
+    """The body with rotor drag, integrated under thrust and torque alone."""
+    vehicle = replace(vehicle, inertia=(0.02, 0.03, 0.04))
+    D, J, m = np.array(drag), np.array(vehicle.inertia), vehicle.mass
+
+    def slope(t: float, x: Array) -> Array:
+        thrust, wanted = flat(vehicle, D, t)
+        R, v, Omega = x[3:12].reshape(3, 3), x[12:15], x[15:]
+        torque = J * wanted.acceleration + np.cross(wanted.rates, J * wanted.rates)
+        acceleration = thrust / m * R[:, 2] - np.array([0.0, 0.0, vehicle.gravity]) - R @ (D * (R.T @ v))
+        turning = (torque - np.cross(Omega, J * Omega)) / J
+        return np.concatenate([v, (R @ hat(Omega)).ravel(), acceleration, turning])
+
+    begin, start = target_at(0.0), flat(vehicle, D, 0.0)[1]
+    x0 = np.concatenate([begin.position, start.attitude.ravel(), begin.velocity, start.rates])
+    times = np.linspace(0.0, 3.0, 31)
+    flown = solve_ivp(slope, (0.0, 3.0), x0, method="DOP853", t_eval=times, rtol=1e-11, atol=1e-12)
+    wanted = np.array([sine(t)[0] for t in times])
+    np.testing.assert_allclose(flown.y[:3].T, wanted, atol=1e-7)
+
+
+@pytest.mark.parametrize("drag", DRAGS)
+def test_on_the_trajectory_the_law_gives_the_flat_torque(vehicle: Vehicle, drag: tuple[float, float, float]) -> None:
+    vehicle = replace(vehicle, inertia=(0.02, 0.03, 0.04))
+    settings = geometric_settings(vehicle, period=PERIOD, feedforward=True, drag=drag, tilt_max=80.0)
+    law = GeometricController(vehicle, settings)
+    J = np.array(vehicle.inertia)
+    for t in (0.0, 0.7, 1.9):
+        _, wanted = flat(vehicle, np.array(drag), t)
+        target = target_at(t)
+        on_it = Measured(
+            position=target.position,
+            velocity=target.velocity,
+            attitude=wanted.attitude,
+            rates=wanted.rates,
+            yaw=target.yaw,
+        )
+        wrench, asked = law.wrench(on_it, target, NONE)
+        np.testing.assert_allclose(asked.attitude, wanted.attitude, atol=1e-12)
+        torque = J * wanted.acceleration + np.cross(wanted.rates, J * wanted.rates)
+        np.testing.assert_allclose(wrench[1:], torque, atol=1e-9 * np.abs(torque).max())
+        later, before = (flat(vehicle, np.array(drag), t + ahead)[0] for ahead in (0.5 * PERIOD, 0.0))
+        assert wrench[0] == pytest.approx(later, abs=0.05 * abs(later - before))  # of half a period on, to first order
+
+
+def test_a_motion_s_samples_tell_its_derivatives_and_near_its_end_as_many_as_they_can(vehicle: Vehicle) -> None:
+    period = 0.02
+    samples = [sine(period * k)[:3] for k in range(40)]
+    motion = motion_along(*np.array(samples).transpose(1, 0, 2), period=period, vehicle=vehicle)
+    yaw = np.zeros(3)
+    found, wanted = target_of_motion(motion.after(10), yaw, period), sine(10 * period)
+    for value, exact, share in zip(
+        (found.position, found.velocity, found.acceleration, found.jerk, found.snap),
+        wanted,
+        (1e-12, 1e-7, 1e-5, 1e-3, 2e-2),
+        strict=True,
+    ):
+        np.testing.assert_allclose(value, exact, atol=share * np.abs(exact).max())
+    assert found.heading is not None
+    w, x, y, z = motion.attitude[10]
+    np.testing.assert_allclose(found.heading[0], Rotation.from_quat([x, y, z, w]).as_matrix()[:, 0], atol=1e-12)
+    for left in (1, 2, 3, 6):
+        near_end = target_of_motion(motion.after(40 - left), yaw, period)
+        np.testing.assert_allclose(near_end.position, motion.position[-left], atol=1e-12)
+        assert bool(np.any(near_end.acceleration)) == (left >= 3)
+        assert bool(np.any(near_end.snap)) == (left >= 5)
+
+
+def test_drag_is_refused_where_nothing_is_fed_forward(vehicle: Vehicle) -> None:
+    with pytest.raises(ParameterError, match=r"controller\.drag must be zero where feedforward is not true"):
+        geometric_settings(vehicle, period=0.05, drag=(0.1, 0.1, 0.0))
+
+
+def test_a_preview_too_short_for_snap_is_refused(vehicle: Vehicle) -> None:
+    settings = geometric_settings(vehicle, period=0.05, feedforward=True, horizon=PREVIEW_DEGREE)
+    with pytest.raises(ParameterError, match=r"controller\.horizon must be at least 5, to tell a snap"):
+        GeometricController(vehicle, settings)

@@ -1,0 +1,110 @@
+"""INDI in an inner loop: nothing where the model holds, and torques that it does not know made up for."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from mpc.answer import ActuatorBounds
+from mpc.baselines.geometric import GeometricController, geometric_settings
+from mpc.indi import Incremental, INDISettings, TorqueIncrement
+from quadsim.controller import Moment, Phase
+from quadsim.errors import ParameterError
+from quadsim.flight.log import FlightLog
+from quadsim.sim.effects import Disturbance, Effects
+from quadsim.sim.effects.rotors import RotorDynamics
+from quadsim.sim.loop import fly
+from quadsim.sim.plant import Plant
+from quadsim.state import INDEX, Array, make_state
+from quadsim.vehicle import Vehicle
+
+STEP = 0.002
+OFFSET = (0.3, -0.2, 0.05)  # [N m]
+
+
+def turn(vehicle: Vehicle, torque: Array, duration: float, cutoff: float = 30.0) -> tuple[Array, Array]:
+    """Rates after a while of constant commands, with the inner loop and as the model has it; exact but for Euler."""
+    J, M = np.array(vehicle.inertia), vehicle.allocation
+    loop = TorqueIncrement(vehicle, INDISettings(cutoff=cutoff), ActuatorBounds.of_vehicle(vehicle))
+    commanded = vehicle.hover_speed + np.array([1.0, -0.5, -0.5, 0.5])
+    rates, modelled, rotors = np.array([0.4, 0.2, -0.3]), np.array([0.4, 0.2, -0.3]), commanded
+    for k in range(round(duration / STEP)):
+        rotors = loop.speeds(k * STEP, commanded, rates, rotors)
+        for _ in range(20):
+            rates = rates + STEP / 20 * ((M @ rotors**2)[1:] + torque - np.cross(rates, J * rates)) / J
+            modelled = modelled + STEP / 20 * ((M @ commanded**2)[1:] - np.cross(modelled, J * modelled)) / J
+    return rates, modelled
+
+
+def test_a_vehicle_as_modelled_flies_the_commanded_speeds(vehicle: Vehicle) -> None:
+    rates, modelled = turn(vehicle, np.zeros(3), 0.5)
+    np.testing.assert_allclose(rates, modelled, atol=1e-3 * np.abs(modelled).max())
+
+
+def test_an_unknown_torque_is_made_up_for_within_the_filter_s_time(vehicle: Vehicle) -> None:
+    """What is left is the rate gained before the filter follows: torque / J times its delay, 2 zeta / omega."""
+    torque = np.array(OFFSET)
+    delay = math.sqrt(2.0) / (2.0 * math.pi * 30.0)
+    rates, modelled = turn(vehicle, torque, 0.3)
+    gained = torque / np.array(vehicle.inertia) * (delay + STEP)
+    np.testing.assert_allclose(rates - modelled, gained, rtol=0.3, atol=0.01 * np.abs(gained).max())
+    later, modelled_later = turn(vehicle, torque, 0.5)
+    np.testing.assert_allclose(later - modelled_later, rates - modelled, atol=0.1 * np.abs(gained).max())
+
+
+def flown(vehicle: Vehicle, effects: Effects, settings: INDISettings | None, periods: int = 100) -> FlightLog:
+    law = GeometricController(vehicle, geometric_settings(vehicle, period=0.05))
+    controller = law if settings is None else Incremental(law, vehicle, settings, law.bounds)
+    with Plant(vehicle, effects=effects, limit_speeds=True) as plant:
+        return fly(
+            plant,
+            controller,
+            np.tile([0.0, 0.0, 5.0, 0.0], (periods + law.horizon, 1)),
+            initial_state=make_state(position=(0.0, 0.0, 5.0)),
+            initial_speeds=plant.hover_speeds,
+            periods=periods,
+            steps_per_period=50,
+        )
+
+
+@pytest.mark.parametrize("rotors", [None, RotorDynamics(rise=0.02, fall=0.02)])
+def test_a_constant_torque_moves_a_hovering_vehicle_a_tenth_as_far(
+    vehicle: Vehicle, rotors: RotorDynamics | None
+) -> None:
+    effects = Effects(disturbance=Disturbance(torque=OFFSET), rotors=rotors)
+    places = [
+        log.control.truth[:, [INDEX["x"], INDEX["y"]]]
+        for log in (flown(vehicle, effects, None), flown(vehicle, effects, INDISettings()))
+    ]
+    alone, aided = (np.linalg.norm(place, axis=1).max() for place in places)
+    assert aided < 0.1 * alone
+
+
+def test_the_log_has_the_law_s_commands_and_the_speeds_that_rotors_had(vehicle: Vehicle) -> None:
+    log = flown(vehicle, Effects(disturbance=Disturbance(torque=OFFSET)), INDISettings(rate=200.0), periods=20)
+    within = log.plant.speeds[500:550]
+    np.testing.assert_array_equal(within[0::5], within[4::5])
+    assert len(np.unique(within[:, 0])) > 5
+    wanted = (vehicle.allocation @ within[-1] ** 2 - vehicle.allocation @ log.control.speeds[10] ** 2)[1:]
+    np.testing.assert_allclose(wanted, -np.array(OFFSET), atol=0.05 * max(OFFSET))
+
+
+def test_an_undisturbed_flight_is_nearly_the_one_without(vehicle: Vehicle) -> None:
+    alone, aided = (flown(vehicle, Effects(), settings, periods=20) for settings in (None, INDISettings()))
+    np.testing.assert_allclose(aided.control.truth, alone.control.truth, atol=1e-9)
+
+
+def test_on_the_ground_there_is_no_inner_loop(vehicle: Vehicle) -> None:
+    law = GeometricController(vehicle, geometric_settings(vehicle, period=0.05))
+    controller = Incremental(law, vehicle, INDISettings(), law.bounds)
+    preview = np.zeros((law.horizon, 4))
+    assert controller.step(Moment(phase=Phase.LANDED), make_state(), preview).inner is None
+    assert controller.step(Moment(), make_state(), preview).inner is not None
+    assert (controller.name, controller.horizon, controller.unanswered) == ("geometric", 10, None)
+
+
+def test_a_rate_that_is_no_whole_number_of_steps_is_refused(vehicle: Vehicle) -> None:
+    with pytest.raises(ParameterError, match=r"controller\.inner\.rate must be such that 1 / rate is a whole multiple"):
+        flown(vehicle, Effects(), INDISettings(rate=300.0), periods=1)

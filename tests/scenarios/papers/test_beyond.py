@@ -1,0 +1,35 @@
+"""Better than published: below the errors of learned models without learning, and torques that INDI makes up for."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import pytest
+
+from scenarios.flight import Flight
+
+Fly = Callable[..., Flight]
+LEARNED = 0.020  # m, published of a learned model on the circle at 8 m/s, with noise
+TORQUE = "effects.disturbance.torque=[0.2,-0.1,0.03]"
+
+
+def error(flight: Flight) -> float:
+    assert flight.log.reason is None
+    return float(flight.metrics["position_error.mean"])
+
+
+@pytest.mark.parametrize(
+    ("name", "settings"),
+    [("torrente-loop8-flatness", ()), ("torrente-loop8-all", ("controller.disturbance={}",))],
+    ids=["flatness", "nonlinear"],
+)
+def test_the_circle_at_8_m_s_is_flown_better_than_by_learned_models(
+    fly_once: Fly, name: str, settings: tuple[str, ...]
+) -> None:
+    assert error(fly_once(name, *settings, "seed=3")) < LEARNED
+
+
+def test_nonlinear_mpc_with_indi_hardly_feels_a_constant_torque(fly_once: Fly) -> None:
+    alone = error(fly_once("torrente-loop4-ideal", TORQUE))
+    assert alone > 0.02
+    assert error(fly_once("torrente-loop4-ideal", TORQUE, "controller.indi={}")) < 0.02 * alone
