@@ -210,7 +210,7 @@ def main() -> None:
     """Measure everything and write the section."""
     parser = argparse.ArgumentParser(description=main.__doc__)
     parser.add_argument("acados", type=Path, help="the directory that comma-deps-acados is installed in")
-    parser.add_argument("--stride", type=int, default=3, help="one segment of 20 periods of so many is asked")
+    parser.add_argument("--stride", type=int, default=5, help="one segment of 20 periods of so many is asked")
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as scratch:
         found = [measure(name, options.acados, Path(scratch), options.stride) for name in FLIGHTS]
