@@ -4,7 +4,7 @@
 
 .NOTPARALLEL:
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test peers check docs format types build numbers verification robustness first-flights reproduce speed soak campaigns kills safety pins clean
+.PHONY: help setup demo test peers check docs format types build numbers verification nonlinear robustness first-flights reproduce speed soak campaigns kills safety pins clean
 
 VENV := .venv
 PY := $(VENV)/bin/python
@@ -42,9 +42,9 @@ demo: setup  ## fly the paper's two flights and compare them, under runs/ (OPTIO
 	@$(QUADSIM) compare $(RUNS)/paper-unconstrained $(RUNS)/paper-constrained --out $(RUNS)/comparison
 	@echo "Done. Open $(RUNS)/comparison/index.html in a browser."
 
-test peers verification robustness first-flights reproduce speed soak campaigns kills safety: export OMP_NUM_THREADS := 1
-test peers verification robustness first-flights reproduce speed soak campaigns kills safety: export OPENBLAS_NUM_THREADS := 1
-test peers verification robustness first-flights reproduce speed soak campaigns kills safety: export MKL_NUM_THREADS := 1
+test peers verification nonlinear robustness first-flights reproduce speed soak campaigns kills safety: export OMP_NUM_THREADS := 1
+test peers verification nonlinear robustness first-flights reproduce speed soak campaigns kills safety: export OPENBLAS_NUM_THREADS := 1
+test peers verification nonlinear robustness first-flights reproduce speed soak campaigns kills safety: export MKL_NUM_THREADS := 1
 test: setup $(VENV)/.browser  ## run every test that needs no peer (OPTIONS="-k audit" for some)
 	@$(PY) -m pytest -q -n $(WORKERS) --dist loadscope $(OPTIONS)
 
@@ -84,6 +84,9 @@ numbers: setup $(VENV)/.peers  ## remake the numbers in README.md and docs/, but
 
 verification: setup $(VENV)/.peers  ## remake docs/verification.md
 	@PYTHONPATH=tests $(PY) docs/make_verification.py
+
+nonlinear: setup $(VENV)/.peers $(VENV)/acados  ## remake the section on nonlinear MPC of docs/performance.md; takes a C compiler
+	@PYTHONPATH=tests $(PY) docs/make_nonlinear.py $(VENV)/acados
 
 robustness: setup  ## remake docs/robustness.md: the mismatch benchmark and 50 faults, some ten minutes
 	@PYTHONPATH=tests $(PY) docs/make_robustness.py
@@ -143,6 +146,11 @@ $(VENV)/.peers: $(VENV)/.installed
 	@echo "Installing the peers and the other QP solvers into $(VENV)"
 	@$(call quietly,$(PIP_INSTALL) --constraint constraints.txt --group peers && \
 		$(PIP_INSTALL) --constraint constraints.txt --no-build-isolation --editable '.[solvers]',$(NOT_INSTALLED))
+	@touch $@
+
+$(VENV)/acados: $(VENV)/.peers
+	@echo "Installing acados into $@: beside the peers it would overwrite their CasADi"
+	@$(call quietly,$(PIP_INSTALL) --no-deps --target $@ --group acados,$(NOT_INSTALLED))
 	@touch $@
 
 $(VENV)/.docs: $(VENV)/.installed

@@ -12,7 +12,6 @@ from pathlib import Path
 
 from make_cost import timed, write_cost
 from make_numbers import ROOT, Table, copy_figure, markdown, write_page
-from make_robust_step import TITLE as COMPARED
 
 from quadsim.report.table import section
 from scenarios.bench.bench_results import FlightProfile, RenderProfile, SolverBench
@@ -29,6 +28,8 @@ from scenarios.run import fly_scenario
 SCENARIO = "paper-constrained"
 REST = "## Where the time of a flight goes"
 """What begins with it stays as it is where steps alone are measured."""
+NONLINEAR = "## Nonlinear MPC"
+"""What begins with it is made by other commands: `make nonlinear`, and those that compare two checkouts."""
 
 REPEATS = 5
 
@@ -177,7 +178,7 @@ def main() -> None:
     else:
         flight, film = bench_flight(scenario), bench_render(scenario)
         commands, effects = markdown(whole_commands(flight, film)), markdown(effect_costs())
-        kept = "".join(path.read_text(encoding="utf-8").partition(COMPARED)[1:])  # which compare two checkouts
+        kept = "".join(path.read_text(encoding="utf-8").partition(NONLINEAR)[1:])
         end = "\n".join([rest(flight, film, commands, effects, campaigns()), kept])
     bench = bench_solvers(scenario)
     with tempfile.TemporaryDirectory() as scratch:

@@ -10,12 +10,13 @@ from collections.abc import Sequence
 
 import numpy as np
 from make_numbers import markdown, write_page
-from peers import agreement, closed_loop, constrained_qp, gain, open_loop, recorded
+from peers import agreement, closed_loop, constrained_qp, gain, nonlinear_optimum, open_loop, recorded
 from peers.agreement import Verdict
 from peers.checks import HEAD, Check
 from peers.closed_loop import ClosedLoop
 from peers.constrained_qp import ConstrainedQP
 from peers.gain import Comparison
+from peers.nonlinear_optimum import LAGGED, PAPER, Agreement
 from peers.open_loop import OpenLoop
 from peers.rotorpy_plant import INTEGRATOR
 from support import paper_problem
@@ -145,6 +146,28 @@ complementarity the largest product of a multiplier and the distance to its boun
 """
 
 
+def nonlinear_section(measured: Sequence[Agreement]) -> str:
+    """Nonlinear MPC."""
+    bounded = " and ".join(f"{agreement.bounded} of {2 * agreement.optima.size}" for agreement in measured)
+    return f"""\
+## Nonlinear MPC against CasADi and IPOPT
+
+Two optimal control problems on the rigid body with a quaternion, written once more in CasADi from their formulas alone
+(`tests/peers/casadi_ocp.py` imports nothing of quadsim), with all states as variables, and solved by IPOPT with exact
+second derivatives. The first is that of Torrente et al. (RA-L 2021), section by section as `torrente-loop8-drag` flies
+it. The second has N = 20 nodes, rotors that follow with a lag of {1e3 * LAGGED.lag:g} ms, the error-state attitude
+q_r* q, a weight and a bound on steps of rotor speeds, and a soft bound of {np.degrees(LAGGED.tilt):g} deg on the tilt.
+References are those of `{nonlinear_optimum.COURSE}`; states are random around them.
+
+- Converged: the controller's `iterations` go on until nothing moves, and so do IPOPT's.
+- Real-time iterations: one QP in each of so many consecutive periods, linearised along the last plan. IPOPT gets the
+  same QP from CasADi's derivatives, along its own last plan.
+
+Whole plans are compared. In {bounded} problems a bound is active. The QPs are solved by `daqp`, to rounding:
+
+{markdown([HEAD, *(check.row for agreement in measured for check in agreement.checks)])}"""
+
+
 def main() -> None:
     """Measure everything and write it."""
     with threadpool_limits(limits=1):
@@ -153,12 +176,14 @@ def main() -> None:
         gains = gain.measure(paper_problem(gain.SCENARIO))
         problem, queries = recorded.record()
         qp = constrained_qp.measure(problem, queries)
+        nonlinear = [nonlinear_optimum.measure(case) for case in (PAPER, LAGGED)]
         verdicts = [agreement.measure(name, problem, queries, qp.speeds) for name in SOLVERS]
     checks: list[Check] = [
         *plant.checks,
         *flight.checks,
         *(check for comparison in gains for check in comparison.checks),
         *qp.checks,
+        *(check for found in nonlinear for check in found.checks),
     ]
     table = markdown([HEAD, *(check.row for check in checks)])
     write_page(
@@ -169,6 +194,7 @@ def main() -> None:
         closed_loop_section(flight),
         gain_section(gains),
         constrained_section(qp),
+        nonlinear_section(nonlinear),
         agreement_section(verdicts),
     )
 

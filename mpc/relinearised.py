@@ -57,7 +57,7 @@ class Relinearised:
         """
         form = self._form
         self.last = None
-        if all(np.abs(part).max() <= LARGEST for part in (A, B, c, x0, desired, u_before, rest.u)):
+        if all(_small(part) for part in (A, B, c, x0, desired, u_before, rest.u)):
             qp, states = form.posed(A, B, c, x0, desired, u_before, rest)
             solution = (self._free(qp) if self._shortcut else None) or self._solve(qp)
         else:
@@ -99,3 +99,8 @@ class Relinearised:
             dual_residual=0.0,
             solve_s=clock.perf_counter() - started,
         )
+
+
+def _small(part: Array) -> bool:
+    """Whether no entry is beyond `LARGEST`, or no number; nearly always the sum of their squares is not either."""
+    return bool(np.vdot(part, part) <= LARGEST**2 or np.abs(part).max() <= LARGEST)

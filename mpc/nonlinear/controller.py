@@ -69,6 +69,10 @@ LARGEST_CONDENSED: Final = 80
 """Inputs over the horizon up to which a condensed QP is solved faster than a staged one."""
 OUTSIDE: Final = 1e-6
 """How far outside its bounds an input, a share of the largest, may be answered; it is then moved onto them."""
+SHORTEST: Final = 0.1
+"""Least share of a Gauss-Newton step that Aitken's relaxation takes where several are."""
+PATIENCE: Final = 8
+"""After so many steps, none of them shorter than the shortest before, half as much of each is taken at most."""
 TILT_SIDES: Final = 12
 """Sides of the polygon within the circle that a bound on the tilt makes of the thrust axis's horizontal part; it takes
 up to 3.4 % of the bound's sine away."""
@@ -466,7 +470,7 @@ class NonlinearMPC:
             x, u = self._plan
             self._plan = np.concatenate([x[1:], x[-1:]]), np.concatenate([u[1:], u[-1:]])
         rest, before = Rest(wanted[-1], inputs), self._shares(self._acting)
-        share, before_that = 1.0, math.inf
+        share, largest, last, least, patience = 1.0, 1.0, np.zeros(0), math.inf, PATIENCE
         for _ in range(self.settings.iterations):
             x, u = self._plan
             query = Query(s0, desired, before, rest, self._steps(x, u, frames))
@@ -485,9 +489,17 @@ class NonlinearMPC:
                 moved = max(np.abs(found - x).max(), np.abs(plan - u).max())
                 if moved <= self.settings.tolerance:
                     break
-                # Full Gauss-Newton steps may go to and fro for ever: where they do not shrink, shorter ones are taken.
-                share *= 0.5 if moved > 0.99 * before_that else 1.0
-                before_that = moved
+                # Full Gauss-Newton steps may go to and fro for ever: the share of them that is taken follows from how
+                # much of the last one each undoes (Aitken's relaxation; Irons and Tuck 1969), and falls for good where
+                # steps have not become shorter for long.
+                step = (plan - u).ravel()
+                undone = 1.0 - float(step @ last / (last @ last)) if last.size else 1.0
+                patience = PATIENCE if moved < 0.9 * least else patience - 1
+                least = min(least, moved)
+                if patience == 0:
+                    largest, patience = 0.5 * largest, PATIENCE
+                share = min(max(share / max(undone, SHORTEST), SHORTEST), largest)
+                last = step
                 self._plan = x + share * (found - x), u + share * (plan - u)
         return query, answer, problem
 

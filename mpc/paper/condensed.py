@@ -16,7 +16,7 @@ import scipy.linalg
 from mpc.constraints import Rows
 from mpc.ocp import Problem, Rest
 from mpc.paper.cost import cost
-from mpc.paper.prediction import Prediction, condense_stages, prediction
+from mpc.paper.prediction import Prediction, prediction
 from mpc.qp import QP, Point, QPRows, Solution, Vectors
 from quadsim.state import Array, Indices
 
@@ -132,6 +132,7 @@ class Condensed:
             H=_input_hessian(self._problem),
             P=np.array(blank.P),
             G=np.array(blank.G, order="C"),
+            S=_inputs_of_steps(self._problem),
         )
 
     def vectors(self, state: Array, desired: Array, u_before: Array, rest: Rest | None = None) -> Vectors:
@@ -153,10 +154,13 @@ class Condensed:
         objective, rows, m = self._problem.objective, self._rows, self._inputs
         N, n, nu = B.shape
         fixed, count = self._changing, len(rows.C)
-        start = np.zeros((1, n, m + 1))
-        start[0, :, -1] = state
-        # Columns are the inputs of all steps, and the last is what no input changes.
-        S = condense_stages(start, A[None], B[None], c[None])[0]
+        # Columns are the inputs of all steps, and the last is what no input changes; below the states of each step are
+        # its own inputs and 1, so that one product with [A B c] makes the next.
+        S, steps = fixed.S.copy(), np.concatenate([A, B, c[:, :, None]], axis=2)
+        S[0, :n, m] = state
+        for t in range(N):
+            np.dot(steps[t], S[t], out=S[t + 1, :n])
+        S = S[:, :n]
         R = fixed.root @ S[1:N]
         R[:, :, -1] -= desired[:-1] @ fixed.target.T
         stacked = R.reshape(-1, m + 1)
@@ -229,6 +233,15 @@ class _Changing:
     H: Array  # (N nu, N nu) of inputs and their changes
     P: Array  # (N nu + N m_s, N nu + N m_s)
     G: Array  # (N m, N nu + N m_s)
+    S: Array  # (N + 1, n + nu + 1, N nu + 1) each step's inputs and 1, as functions of all inputs and 1, below n zeros
+
+
+def _inputs_of_steps(problem: Problem) -> Array:
+    N, n, nu = problem.horizon, problem.model.n, problem.model.nu
+    found = np.zeros((N + 1, n + nu + 1, N * nu + 1))
+    found[:N, n:-1, :-1] = np.eye(N * nu).reshape(N, nu, N * nu)
+    found[:, -1, -1] = 1.0
+    return found
 
 
 def _root(weight: Array) -> Array | None:

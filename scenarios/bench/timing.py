@@ -173,6 +173,7 @@ def time_in_turns(
     rng: np.random.Generator,
     longest_pass: float = math.inf,
     patience: float = math.inf,
+    now: Callable[[], float] = clock.perf_counter,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> dict[str, StepTimes]:
     """Put all questions to all candidates, `repeats` times.
@@ -185,6 +186,7 @@ def time_in_turns(
         rng: decides the order within each segment.
         longest_pass: candidates whose first pass takes longer than this [s] make no other.
         patience: candidates that have not answered all in this time [s] are left out.
+        now: see `Stopwatch`.
         progress: called with how many turns are done, of how many.
 
     Returns:
@@ -201,7 +203,7 @@ def time_in_turns(
                 gc.collect()
                 for name in rng.permutation([name for name in racing if name in passes]).tolist():
                     left_ms = 1e3 * patience - sum(passes[name][-1])
-                    passes[name][-1] += _turn(candidates[name], segment, between, left_ms)
+                    passes[name][-1] += _turn(candidates[name], segment, between, left_ms, now)
                     if sum(passes[name][-1]) > 1e3 * patience:
                         del passes[name]
                     done += 1
@@ -210,7 +212,9 @@ def time_in_turns(
     return {name: StepTimes(ms=np.array(laps)) for name, laps in passes.items()}
 
 
-def _turn(candidate: Candidate, segment: range, between: Callable[[], None], left_ms: float) -> list[float]:
+def _turn(
+    candidate: Candidate, segment: range, between: Callable[[], None], left_ms: float, now: Callable[[], float]
+) -> list[float]:
     """The times of one segment [ms], or of as much of it as goes a little beyond the time left."""
     candidate.prepare(max(segment.start - 1, 0))
     candidate.answer()
@@ -220,7 +224,7 @@ def _turn(candidate: Candidate, segment: range, between: Callable[[], None], lef
             break
         candidate.prepare(period)
         between()
-        started = clock.perf_counter()
+        started = now()
         candidate.answer()
-        laps.append(1e3 * (clock.perf_counter() - started))
+        laps.append(1e3 * (now() - started))
     return laps

@@ -80,6 +80,12 @@ class RotorPyPlant:
         """(4,) rotor speeds now [rad/s]."""
         return self._vector[16:].copy()
 
+    @property
+    def attitude(self) -> tuple[Array, Array]:
+        """The quaternion wxyz (4,) and the body rates (3,) [rad/s] now."""
+        physics = self.physics
+        return physics[4:8], physics[11:14]
+
     def reset(self, state: Array, speeds: Array | None = None) -> None:
         """Put the vehicle at a state (12,) at time zero, in still air, its rotors at speeds (4,) [rad/s]."""
         self._vector[16:] = self.vehicle.hover_speed if speeds is None else speeds
