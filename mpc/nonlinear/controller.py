@@ -66,7 +66,7 @@ from quadsim.state import (
 from quadsim.vehicle import N_ROTORS, Vehicle
 
 LARGEST_CONDENSED: Final = 80
-"""Inputs over the horizon up to which a condensed QP is solved faster than a staged one."""
+"""Inputs and slacks over the horizon up to which a condensed QP is solved faster than a staged one."""
 OUTSIDE: Final = 1e-6
 """How far outside its bounds an input, a share of the largest, may be answered; it is then moved onto them."""
 SHORTEST: Final = 0.1
@@ -145,7 +145,7 @@ class NonlinearMPC:
         self._hover = vehicle.mass * vehicle.gravity / N_ROTORS
         self._tilted = settings.tilt is not None
         self.problem = self._problem(constraints)
-        small = self.problem.horizon * N_ROTORS <= LARGEST_CONDENSED
+        small = self.problem.horizon * (N_ROTORS + self.problem.rows.soft.size) <= LARGEST_CONDENSED
         self.solver = settings.solver or ("piqp-dense" if small else "piqp-multistage")
         self._qp = Relinearised(self.problem, self.solver, shortcut=True)
         self._clearing = None if space is None else Clearing(self.problem, self._solve, space, changing=True)
