@@ -231,14 +231,7 @@ class Shortcut:
                 solution = replace(given, x=point.x, y=point.y, z=point.z, z_box=point.z_box)
                 answer = replace(answer, solution=solution)
             spent_s += given.solve_s + clock.perf_counter() - started
-        solution = replace(
-            answer.solution,
-            iterations=iterations,
-            primal_residual=given.primal_residual,
-            dual_residual=given.dual_residual,
-            solve_s=spent_s,
-        )
-        return replace(answer, solution=solution)
+        return replace(answer, solution=replace(answer.solution, iterations=iterations, solve_s=spent_s))
 
 
 class _Found(NamedTuple):

@@ -41,8 +41,8 @@ class ControlLog:
         active: (K,) constraints active at the optimum.
         fallback: (K,) 0 none, higher = deeper.
         slack: (K,) largest softening of an output bound [rad].
-        primal_residual: (K,) as reported by the back end.
-        dual_residual: (K,) as reported by the back end.
+        primal_residual: (K,) as reported by the back end; 0 where an active set answers exactly.
+        dual_residual: (K,) likewise.
         delay: (K,) simulated time from the measurement to the command [s].
         attitude: (K, 4) quaternion wxyz as measured, sign continuous; None where Euler angles do.
         body_rates: (K, 3) as measured [rad/s]; None where Euler angles do.

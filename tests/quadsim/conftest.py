@@ -21,7 +21,8 @@ def empty_run(short_run: Run) -> Run:
     """A flight that ended before its first period was over: no numbers, no constraints reached."""
 
     def head(log: ControlLog | TimingLog, *kept: str) -> dict[str, object]:
-        return {field.name: getattr(log, field.name)[:0] for field in dataclasses.fields(log) if field.name not in kept}
+        columns = {field.name: getattr(log, field.name) for field in dataclasses.fields(log) if field.name not in kept}
+        return {name: column[:0] for name, column in columns.items() if column is not None}
 
     log = dataclasses.replace(
         short_run.log,

@@ -76,7 +76,9 @@ def rewrite(run: Run, directory: Path, rows: int, *, states: float = 1.0) -> Pat
     directory.mkdir()
     control, plant = run.log.control, run.log.plant
     cut = {
-        field.name: getattr(control, field.name)[:rows] for field in fields(control) if field.name != "speeds_before"
+        field.name: column[:rows]
+        for field in fields(control)
+        if field.name != "speeds_before" and (column := getattr(control, field.name)) is not None
     }
     last = np.searchsorted(plant.t, 0.05 * rows + 1e-9, side="right")
     log = replace(
