@@ -1,4 +1,4 @@
-"""What `import quadsim` hands out of benchmarks: each measures on this machine, all contenders in one run."""
+"""What `import quadsim` hands out of benchmarks: each measures on this machine, all candidates in one run."""
 
 from __future__ import annotations
 

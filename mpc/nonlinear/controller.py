@@ -20,7 +20,7 @@ from typing import Final
 import numpy as np
 import scipy.linalg
 
-from mpc.answer import ActuatorBounds, command_of
+from mpc.answer import ActuatorBounds, command_of, refused
 from mpc.constraints import Constraint, Penalty
 from mpc.disturbance import RampObserver, RampSettings
 from mpc.model import LinearModel
@@ -537,8 +537,4 @@ class NonlinearMPC:
         return stopped(self._acting.copy(), self.horizon, phase)
 
     def _refuse(self, status: str, answer: Answer | None = None) -> Command:
-        """The command in force, with what speaks against another."""
-        plan = np.tile(self._acting, (self.horizon, 1))
-        if answer is None:
-            return Command(speeds=plan[0].copy(), plan=plan, status=status)
-        return command_of(plan[0], plan, status, answer)
+        return refused(self._acting, self.horizon, status, answer)

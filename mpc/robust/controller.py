@@ -19,7 +19,7 @@ from typing import Final
 
 import numpy as np
 
-from mpc.answer import ActuatorBounds, command_of, rejection, shifted
+from mpc.answer import ActuatorBounds, command_of, refused, rejection, shifted
 from mpc.constraints import Bounds, Constraint
 from mpc.equilibrium import Trim, equilibrium, twisted
 from mpc.exact.shortcut import with_shortcut
@@ -246,11 +246,7 @@ class RobustMPC:
         return stopped(self._acting.copy(), self.horizon, phase)
 
     def _refuse(self, status: str, answer: Answer | None = None) -> Command:
-        """The command in force, with what speaks against another."""
-        plan = np.tile(self._acting, (self.horizon, 1))
-        if answer is None:
-            return Command(speeds=plan[0].copy(), plan=plan, status=status)
-        return command_of(plan[0], plan, status, answer)
+        return refused(self._acting, self.horizon, status, answer)
 
     def _after(self, time: float, state: Array, rotors: Array) -> Array:
         """State (12,) some time [s] after a state (12,) with such rotor speeds (4,), under the command in force."""
