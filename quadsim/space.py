@@ -33,6 +33,37 @@ Sizes = Annotated[tuple[Positive, ...], Len(3, 3)]
 """Along x, y, z."""
 
 
+def _clearance(kind: str, size: Array, centre: Array, turn: Array, points: Array) -> tuple[Array, Array]:
+    """See `Solid.clearance`; of s solids of a kind, with sizes and centres (s, 1, 3), turns (s, 3, 3), at (s, K, 3)."""
+    over, ways = _excess(kind, size, (points - centre) @ turn)
+    outside = np.maximum(over, 0.0)
+    far = np.linalg.norm(outside, axis=-1)
+    nearest = np.take_along_axis(ways, over.argmax(axis=-1)[..., None, None], axis=-2)[..., 0, :]
+    away = (outside[..., None] * ways).sum(axis=-2) / np.where(far > 0.0, far, 1.0)[..., None]
+    normal = np.where((far > 0.0)[..., None], away, nearest) @ np.swapaxes(turn, -1, -2)
+    return far + np.minimum(over.max(axis=-1), 0.0), normal
+
+
+def _excess(kind: str, size: Array, local: Array) -> tuple[Array, Array]:
+    """How far points lie beyond each of the surfaces (..., K, j), orthogonal to each other, and the ways out."""
+    a, b = size[..., 0], size[..., 1]
+    sides = np.where(local < 0.0, -1.0, 1.0)
+    if kind == "box":
+        return np.abs(local) - size, sides[..., None] * np.eye(3)
+    core = local.copy()
+    if kind == "capsule":
+        core[..., 2] -= np.clip(core[..., 2], -b, b)
+    elif kind == "cylinder":
+        core[..., 2] = 0.0
+    radius = np.linalg.norm(core, axis=-1)
+    core[radius == 0.0] = (1.0, 0.0, 0.0)
+    out = core / np.where(radius > 0.0, radius, 1.0)[..., None]
+    if kind != "cylinder":
+        return (radius - a)[..., None], out[..., None, :]
+    along = sides[..., 2, None] * np.array([0.0, 0.0, 1.0])
+    return np.stack([radius - a, np.abs(local[..., 2]) - b], axis=-1), np.stack([out, along], axis=-2)
+
+
 class Solid(NamedTuple):
     """A convex part of an obstacle.
 
@@ -53,33 +84,7 @@ class Solid(NamedTuple):
 
         Both are exact, outside and inside; the nearest point of the surface is p - distance * normal.
         """
-        local = (points - self.centre) @ self.turn
-        over, ways = self._excess(local)
-        outside = np.maximum(over, 0.0)
-        far = np.linalg.norm(outside, axis=1)
-        nearest = np.take_along_axis(ways, over.argmax(axis=1)[:, None, None], axis=1)[:, 0]
-        away = (outside[:, :, None] * ways).sum(axis=1) / np.where(far > 0.0, far, 1.0)[:, None]
-        normal = np.where((far > 0.0)[:, None], away, nearest) @ self.turn.T
-        return far + np.minimum(over.max(axis=1), 0.0), normal
-
-    def _excess(self, local: Array) -> tuple[Array, Array]:
-        """How far points lie beyond each of the surfaces (K, j), orthogonal to each other, and the ways out."""
-        a, b, _ = self.size
-        sides = np.where(local < 0.0, -1.0, 1.0)
-        if self.kind == "box":
-            return np.abs(local) - self.size, sides[:, :, None] * np.eye(3)
-        core = local.copy()
-        if self.kind == "capsule":
-            core[:, 2] -= np.clip(core[:, 2], -b, b)
-        elif self.kind == "cylinder":
-            core[:, 2] = 0.0
-        radius = np.linalg.norm(core, axis=1)
-        core[radius == 0.0] = (1.0, 0.0, 0.0)
-        out = core / np.where(radius > 0.0, radius, 1.0)[:, None]
-        if self.kind != "cylinder":
-            return (radius - a)[:, None], out[:, None, :]
-        along = sides[:, 2, None] * np.array([0.0, 0.0, 1.0])
-        return np.stack([radius - a, np.abs(local[:, 2]) - b], axis=1), np.stack([out, along], axis=1)
+        return _clearance(self.kind, np.array(self.size), self.centre, self.turn, points)
 
     def support(self, ways: Array) -> Array:
         """(n, 3) its points farthest along ways (n, 3), relative to the obstacle's position [m]."""
@@ -167,6 +172,35 @@ class Obstacle:
     def clearance(self, t: Array, points: Array) -> Array:
         """(K,) signed distance [m]; inside a wall, whose solids overlap, at most that deep."""
         return self.clearances(t, points)[0].min(axis=0)
+
+
+class Solids:
+    """The solids of several obstacles, in their order, measured all at once."""
+
+    def __init__(self, obstacles: Sequence[Obstacle]) -> None:
+        self._obstacles = tuple(obstacles)
+        every = [(i, solid) for i, obstacle in enumerate(obstacles) for solid in obstacle.solids]
+        self.count = len(every)
+        self._still = np.array([obstacle.position for obstacle in obstacles], float).reshape(-1, 1, 3)
+        self._groups = []
+        for kind in sorted({solid.kind for _, solid in every}):
+            at = [k for k, (_, solid) in enumerate(every) if solid.kind == kind]
+            size, centre, turn = (
+                np.array([getattr(every[k][1], name) for k in at]) for name in ("size", "centre", "turn")
+            )
+            owners = np.array([every[k][0] for k in at])
+            self._groups.append((kind, np.array(at), owners, size[:, None], centre[:, None], turn))
+
+    def clearances(self, t: Array, points: Array) -> tuple[Array, Array]:
+        """Signed distances (s, K) [m] and normals (s, K, 3); see `Obstacle.clearances`."""
+        places = np.repeat(self._still, len(t), axis=1)
+        for i, obstacle in enumerate(self._obstacles):
+            if obstacle.moves:
+                places[i] = obstacle.places(t)
+        distance, normal = np.empty((self.count, len(t))), np.empty((self.count, len(t), 3))
+        for kind, at, owners, size, centre, turn in self._groups:
+            distance[at], normal[at] = _clearance(kind, size, centre, turn, points - places[owners])
+        return distance, normal
 
 
 def _upright(yaw: float) -> Array:
