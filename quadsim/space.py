@@ -10,7 +10,7 @@ import itertools
 import json
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from typing import Annotated, Any, ClassVar, Final, Literal, NamedTuple
 
@@ -26,6 +26,9 @@ MOST_PLACES: Final = 1000
 _NAME: Final = {"pattern": "^[A-Za-z][A-Za-z0-9_-]*$"}
 _PARALLEL: Final = 1e-9
 """Determinant of three unit normals below which their planes are taken to have no common point."""
+
+_ROUNDING: Final = 1e-9
+"""Of lengths along a path [m]."""
 
 Name = Annotated[str, doc("what reports call it")]
 Pair = Annotated[tuple[Number, ...], Len(2, 2)]
@@ -378,16 +381,52 @@ class Region:
 
 @dataclass(frozen=True, kw_only=True)
 class Corridor(Region):
-    """A convex region to stay in for a window of time."""
+    """A convex region to stay in for a window of time, or of the reference's path."""
 
     name: Name = field(metadata=_NAME)
     start: Annotated[Number, doc("[s] first time it holds")] = 0.0
     stop: Annotated[Number, doc("[s] last time it holds; absent: the flight's end")] = math.inf
+    path: Annotated[
+        Annotated[tuple[NonNegative, ...], Len(2, 2)] | None,
+        doc("[m] instead of start and stop: from where to where the reference is along its path when it holds"),
+    ] = None
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        if self.path is not None:
+            if (self.start, self.stop) != (0.0, math.inf):
+                raise InputError(f"path must be absent where start or stop is given; got {list(self.path)}")
+            if not self.path[0] < self.path[1]:
+                raise InputError(f"path must be where it begins, and farther on where it ends; got {list(self.path)}")
         if not self.start <= self.stop:
             raise ParameterError(f"corridors.{self.name}", "stop", self.stop, f"at least start = {self.start}")
+
+    def timed(self, t: Array, positions: Array) -> Corridor:
+        """The same with its window along the path as one of time; itself where it has none.
+
+        Args:
+            t: (K,) rising times [s].
+            positions: (K, 3) of the reference then, in straight lines in between [m].
+
+        Raises:
+            ParameterError: the path is over before the window begins.
+        """
+        if self.path is None:
+            return self
+        steps = np.linalg.norm(np.diff(positions, axis=0), axis=1)
+        gone = np.concatenate([[0.0], np.cumsum(steps)])
+        begin, end = self.path
+        if gone[-1] < begin - _ROUNDING:
+            rule = f"within the {gone[-1]:.4g} m of the reference's path that are flown"
+            raise ParameterError(f"corridors.{self.name}", "path", list(self.path), rule)
+        # Where the reference rests at the window's begin or end, the window has all of that rest.
+        first, last = np.searchsorted(gone, begin - _ROUNDING), np.searchsorted(gone, end + _ROUNDING, "right") - 1
+
+        def passed(k: np.intp, at: float) -> float:
+            return float(t[k] + (at - gone[k]) / steps[k] * (t[k + 1] - t[k]))
+
+        start = float(t[0]) if first == 0 else passed(first - 1, begin)
+        return replace(self, path=None, start=start, stop=passed(last, end) if last < len(steps) else math.inf)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -422,7 +461,7 @@ def shape_from_json(entry: Mapping[str, Any]) -> Constraining:
         raise UnknownNameError("shape", str(entry.get("type")), SHAPES)
     kind = SHAPES[entry["type"]]
     values = {name: _frozen(value) for name, value in entry.items() if name != "type"}
-    if "path" in values:
+    if "path" in values and issubclass(kind, Obstacle):
         values["path"] = tuple(Place(time=time, position=tuple(p)) for time, p in map(_place, entry["path"]))
     shape: Constraining = kind(**values)
     points = np.zeros((1, 3))

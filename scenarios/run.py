@@ -25,7 +25,7 @@ from scenarios.courses.make import build_motion, build_reference
 from scenarios.flight import Flight, Outputs, write_run
 from scenarios.gc_tuning import frozen
 from scenarios.parts.effects import build_computation
-from scenarios.parts.limits import build_limits
+from scenarios.limits import build_limits
 from scenarios.parts.navigation import build_navigation
 from scenarios.parts.randomness import generator
 from scenarios.parts.vehicle import build_initial_speeds, build_initial_state, build_vehicle

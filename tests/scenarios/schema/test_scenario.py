@@ -22,7 +22,7 @@ from quadsim.state import STATE_NAMES
 from quadsim.vehicle import OPTIONAL_PARAMETERS, VEHICLE_UNITS
 from scenarios.build import resolve
 from scenarios.loading import load_scenario, parse_scenario
-from scenarios.parts.limits import build_limits
+from scenarios.limits import build_limits
 from scenarios.parts.vehicle import build_vehicle
 from scenarios.schema.problems import ScenarioError
 from scenarios.schema.scenario import MOST_STEPS, Scenario
