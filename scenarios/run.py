@@ -24,8 +24,8 @@ from scenarios.build import build_controller, build_ground, build_plant, resolve
 from scenarios.courses.make import build_motion, build_reference
 from scenarios.flight import Flight, Outputs, write_run
 from scenarios.gc_tuning import frozen
-from scenarios.parts.effects import build_computation
 from scenarios.limits import build_limits
+from scenarios.parts.effects import build_computation
 from scenarios.parts.navigation import build_navigation
 from scenarios.parts.randomness import generator
 from scenarios.parts.vehicle import build_initial_speeds, build_initial_state, build_vehicle

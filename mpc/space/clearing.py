@@ -75,20 +75,20 @@ class Clearing:
         problem = self.problem
         # Where the last plan touched half-spaces, this one is all but sure to: it is sought among them at once.
         among = self._changing and along is not None and self._touched(t, along)
-        if among:
-            planned, states, answer = along, None, None
-        else:
+        if along is None or not among:
             answer = self._solve(query)
             if answer.solution.status not in ACCEPTED:
                 return Cleared(answer, problem, np.empty(0))
             states = _predicted(problem, query, answer.plan)
             planned = states[:, self._space.positions] @ turn
-        if along is None:
-            along = planned if last is None else np.concatenate([last[1:], 2.0 * last[-1:] - last[-2:-1]])
-        for _ in range(self._space.settings.iterations):
+            if along is None:
+                along = planned if last is None else np.concatenate([last[1:], 2.0 * last[-1:] - last[-2:-1]])
+        else:
+            planned = along
+        for i in range(self._space.settings.iterations):
             normals, bounds = self._space.half_spaces(t, along)
             room = _room(normals, bounds, planned)
-            if states is not None and (room >= -KEPT).all():
+            if (room >= -KEPT).all() and not (among and i == 0):
                 break
             answer, states = self._whole(query, normals, bounds, room, turn)
             if answer.solution.status not in ACCEPTED:
@@ -110,7 +110,7 @@ class Clearing:
         return replace(self.problem, constraints=(*self.problem.constraints, added))
 
     def _whole(self, query: Query, normals: Array, bounds: Array, room: Array, turn: Array) -> tuple[Answer, Array]:
-        """The optimum with half-spaces of the world, and its states (N, n); `room` (S, N) is what tells the tightest."""
+        """The optimum with half-spaces of the world, and its states (N, n); `room` (S, N) tells the tightest."""
         count = self._space.settings.rows
         while True:
             at = np.argsort(room, axis=0, kind="stable")[:count], np.arange(bounds.shape[1])

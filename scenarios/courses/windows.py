@@ -26,5 +26,5 @@ def timed_regions(scenario: Scenario) -> tuple[Corridor | Fence, ...]:
     if all(isinstance(region, Fence) or region.path is None for region in regions):
         return regions
     reference = build_reference(scenario, scenario.periods + 1)[:, :3]
-    t = scenario.control_period * np.arange(len(reference))
+    t = scenario.control_period * np.arange(len(reference), dtype=np.float64)
     return tuple(region if isinstance(region, Fence) else region.timed(t, reference) for region in regions)
