@@ -231,7 +231,7 @@ ASIDE = {"name": "aside", "rows": [[0.0, -1.0, 0.0]], "upper": [-0.4]}  # y >= 0
 @pytest.mark.parametrize("law", ["constrained", "robust", "nonlinear"])
 @pytest.mark.parametrize("speed", [0.5, 0.8])
 def test_a_corridor_along_the_path_holds_where_the_reference_is(law: str, speed: float) -> None:
-    laws = {
+    laws: dict[str, dict[str, Any]] = {
         "constrained": AVOIDANCE,
         "robust": {"controller.type": "robust", "controller.solver": None, **AVOIDANCE},
         "nonlinear": {"controller": {"type": "nonlinear", "horizon": 30, "terminal": "lqr", "avoidance": {}}},
