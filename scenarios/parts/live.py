@@ -30,7 +30,7 @@ from quadsim.sim.navigation import Navigation
 from quadsim.sim.plant import Plant
 from quadsim.sim.sensing.sensor import SensorName
 from quadsim.vehicle import Vehicle
-from scenarios.parts.effects import build_changes, build_computation, check_changes, winds_of
+from scenarios.parts.effects import build_changes, build_computation, check_changes, moving_air, winds_of
 from scenarios.parts.navigation import build_faults
 from scenarios.schema.base import Spec
 from scenarios.schema.controller import ControllerSpec, changed
@@ -125,6 +125,7 @@ class Happenings:
                 raise _not_started_for(found)
             self._navigation.reschedule(build_faults(scenario))
         elif isinstance(found, Gust | WindChange):
+            moving_air(scenario, self._vehicle)
             if self._plant.wind is None:
                 raise _not_started_for(found)
             self._plant.wind.reschedule(*winds_of(scenario))
@@ -249,8 +250,7 @@ def _lasting(event: Event) -> float:
 
 
 def _not_started_for(event: Event) -> InputError:
-    drag = ", with a vehicle that has drag" if isinstance(event, Gust | WindChange) else ""
-    rule = f"of a kind that the flight was started for, with live=True or by an event of its scenario{drag}"
+    rule = "of a kind that the flight was started for, with live=True or by an event of its scenario"
     return ParameterError("event", "type", event.type, rule)
 
 
