@@ -111,7 +111,8 @@ def fly_once(
             raise ParameterError("events", "type", event.type, "another one where the parts were built before")
     loop = closed_loop(scenario, vehicle, plant, controller, reference, navigation=navigation)
     with frozen():
-        return complete(loop, periods=scenario.periods, progress=progress)
+        complete(loop, periods=scenario.periods, progress=progress)
+    return loop.log()
 
 
 class StartedFlight:

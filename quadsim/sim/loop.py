@@ -411,13 +411,15 @@ def fly(
     Returns:
         The flight, with plant rows at the physics rate.
     """
-    return complete(ClosedLoop(plant, controller, reference, **settings), periods=periods, progress=progress)
+    loop = ClosedLoop(plant, controller, reference, **settings)
+    complete(loop, periods=periods, progress=progress)
+    return loop.log()
 
 
-def complete(loop: ClosedLoop, *, periods: int, progress: Callable[[int], None] | None = None) -> FlightLog:
+def complete(loop: ClosedLoop, *, periods: int, progress: Callable[[int], None] | None = None) -> None:
     """Fly on until a number of control periods have been flown in all.
 
-    Whatever happens in flight ends up in the log: a typed flight error or Ctrl-C ends it early, with its reason and
+    Whatever happens in flight ends up in its log: a typed flight error or Ctrl-C ends it early, with its reason and
     everything up to it.
 
     Args:
@@ -434,7 +436,6 @@ def complete(loop: ClosedLoop, *, periods: int, progress: Callable[[int], None] 
         pass  # the loop has noted it
     except KeyboardInterrupt:
         loop.interrupt()
-    return loop.log()
 
 
 def one_period(sample: Sample, timestep: float) -> FlightLog:

@@ -25,7 +25,8 @@ SCENARIOS = {
     "robust": [
         "controller.horizon=12",
         "controller.tightening.acceleration=0.05",
-        "effects={air={rotor_drag=3e-4, wind=[2.0, 0.0, 0.0], turbulence={wind_speed_20ft=5.0}}, disturbance={force_noise=0.05}}",
+        "effects={air={rotor_drag=3e-4, wind=[2.0, 0.0, 0.0], turbulence={wind_speed_20ft=5.0}}}",
+        "effects.disturbance={force_noise=0.05}",
         "computation={delay=0.02, jitter=0.01}",
         "lost.distance=false",
     ],
