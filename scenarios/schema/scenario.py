@@ -296,6 +296,14 @@ class Scenario(Spec):
             found.append((event.at, changed(found[-1][1] if found else self.controller, event.fields)))
         return found
 
+    def controller_at(self, time: float) -> ControllerSpec:
+        """The controller that flies at a time [s]."""
+        found = self.controller
+        for at, spec in self.controller_changes:
+            if at <= time + 1e-9:
+                found = spec
+        return found
+
     @property
     def regions(self) -> tuple[Corridor | Fence, ...]:
         """The corridors, then the fence."""
