@@ -29,8 +29,9 @@ from scenarios.flight import Flight, Outputs, write_run
 from scenarios.gc_tuning import frozen
 from scenarios.parts.effects import build_computation
 from scenarios.parts.limits import build_limits
-from scenarios.parts.live import Happenings, Successor, prepared, unanswered_by
+from scenarios.parts.live import Happenings, Successor, unanswered_by
 from scenarios.parts.navigation import build_navigation
+from scenarios.parts.neutral import prepared
 from scenarios.parts.randomness import generator
 from scenarios.parts.vehicle import build_initial_speeds, build_initial_state, build_vehicle
 from scenarios.progress import Progress, silent

@@ -1,9 +1,4 @@
-"""What happens in a flight besides the course and the controller that it starts with, foreseen or not.
-
-A model is compiled, sensors are sampled and forces are evaluated in one way where something may happen to them, and in
-another where nothing can, with other last bits.  An event that changes nothing tells: it stands in the scenario of a
-live flight and in the one that is saved of it, whether or not anything of its kind happened.
-"""
+"""What happens in a flight besides the course and the controller that it starts with, foreseen or not."""
 
 from __future__ import annotations
 
@@ -14,7 +9,7 @@ from bisect import insort
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from operator import itemgetter
-from typing import TYPE_CHECKING, Any, Final, Literal, get_args
+from typing import TYPE_CHECKING, Any, Final
 
 from pydantic import BaseModel, ValidationError
 
@@ -22,7 +17,6 @@ from mpc.ocp import Unanswered
 from quadsim.controller import Controller
 from quadsim.errors import InputError, ParameterError
 from quadsim.sim.computation import Computation, Stall
-from quadsim.sim.effects import Air, Load
 from quadsim.sim.effects.gust import Gust
 from quadsim.sim.effects.wind import WindChange
 from quadsim.sim.loop import ClosedLoop
@@ -32,19 +26,17 @@ from quadsim.sim.sensing.sensor import SensorName
 from quadsim.vehicle import Vehicle
 from scenarios.parts.effects import build_changes, build_computation, check_changes, moving_air, winds_of
 from scenarios.parts.navigation import build_faults
+from scenarios.parts.neutral import neutral
 from scenarios.schema.base import Spec
 from scenarios.schema.controller import ControllerSpec, changed
 from scenarios.schema.events import (
     MOST_EVENTS,
     ControllerEvent,
     Event,
-    MassEvent,
     PayloadDropEvent,
     PayloadPickupEvent,
-    PushEvent,
     SensorFaultEvent,
     SetpointEvent,
-    WindEvent,
 )
 from scenarios.schema.problems import ScenarioError, describe_all
 
@@ -54,7 +46,6 @@ if TYPE_CHECKING:
 
 _DEPENDENT: Final = (ControllerEvent, PayloadDropEvent, PayloadPickupEvent, SensorFaultEvent)
 """The events that depend on what else the scenario has."""
-SensorText = Literal["position", "velocity", "attitude", "rates"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -154,7 +145,7 @@ class Happenings:
         for event in scenario.events:
             substitute = None if event.at < duration else neutral(scenario, event)
             if substitute is not None and substitute not in kept:
-                kept.append(substitute)
+                kept.insert(0, substitute)
         return scenario.model_copy(update={"duration": duration, "events": kept})
 
     def _stamped(self, event: Event | Mapping[str, Any]) -> Event:
@@ -252,50 +243,3 @@ def _lasting(event: Event) -> float:
 def _not_started_for(event: Event) -> InputError:
     rule = "of a kind that the flight was started for, with live=True or by an event of its scenario"
     return ParameterError("event", "type", event.type, rule)
-
-
-def prepared(scenario: Scenario, vehicle: Vehicle) -> Scenario:
-    """A scenario in whose flight anything may happen that can happen to its vehicle.
-
-    Wind needs drag to push; with the integrator rk4 the mass is fixed, and with an estimator there are the sensors that
-    it has.
-    """
-    air = scenario.effects.resolved(vehicle).air
-    kinds: list[Event] = [_push(scenario)]
-    if scenario.plant.integrator == "mujoco":
-        kinds.append(_mass(scenario))
-    if air is not None and air.drags:
-        kinds.append(_wind(scenario))
-    there = {} if scenario.sensors is None else scenario.sensors.present()
-    names = [*there] if scenario.estimator is not None else [*SensorName]
-    kinds += [_fault(scenario, name) for name in get_args(SensorText) if name in names]
-    added = [event for event in kinds if event not in scenario.events]
-    return scenario.model_copy(update={"events": [*scenario.events, *added]})
-
-
-def neutral(scenario: Scenario, event: Event) -> Event | None:
-    """An event at the start that changes nothing, and prepares a flight for one; None where it needs no preparing."""
-    if isinstance(event, PushEvent):
-        return _push(scenario)
-    if isinstance(event, MassEvent | PayloadPickupEvent | PayloadDropEvent):
-        return _mass(scenario)
-    if isinstance(event, Gust | WindChange):
-        return _wind(scenario)
-    return _fault(scenario, event.sensor) if isinstance(event, SensorFaultEvent) else None
-
-
-def _push(scenario: Scenario) -> PushEvent:
-    return PushEvent(type="push", at=0.0, duration=scenario.plant.timestep, force=(0.0, 0.0, 0.0))
-
-
-def _mass(scenario: Scenario) -> MassEvent:
-    return MassEvent(type="mass", at=0.0, factor=(scenario.effects.load or Load()).mass_factor)
-
-
-def _wind(scenario: Scenario) -> WindEvent:
-    return WindEvent(type="wind", at=0.0, velocity=(scenario.effects.air or Air()).wind)
-
-
-def _fault(scenario: Scenario, sensor: SensorText) -> SensorFaultEvent:
-    nothing, step = [0.0, 0.0, 0.0], scenario.plant.timestep
-    return SensorFaultEvent(type="sensor_fault", at=0.0, sensor=sensor, fault="bias", offset=nothing, duration=step)
