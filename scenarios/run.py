@@ -184,8 +184,7 @@ class StartedFlight:
             build=self._build if law is None else None,
         )
         self._threads = ThreadpoolController()
-        most = MOST_STEPS // max(scenario.steps_per_period, controller.horizon)
-        self._most = min(most, math.floor(LONGEST_FLIGHT / scenario.control_period))
+        self._longest = controller.horizon
 
     def __enter__(self) -> StartedFlight:
         return self
@@ -226,14 +225,17 @@ class StartedFlight:
         """Fly one control period.
 
         Args:
-            command: what to hold instead of the controller's answer: a command, or (4,) rotor speeds [rad/s].
+            command: what to hold instead of the controller's answer: a command, or (4,) rotor speeds [rad/s].  Its
+                scenario does not know of it, and flies without.
 
         Raises:
             FlightError: the flight has ended in this period, which is not part of it.
             InputError: it had ended before, or is as long as any may be.
         """
-        if self.k >= self._most:
-            raise InputError(f"a flight has at most {self._most} control periods of {self.scenario.control_period} s")
+        period, self._longest = self._started.control_period, max(self._longest, self.loop.controller.horizon)
+        most = MOST_STEPS // max(self._started.steps_per_period, self._longest)
+        if self.k >= min(most, math.floor(LONGEST_FLIGHT / period + 1e-6)):
+            raise InputError(f"a flight has at most {self.k} control periods of {period} s")
         if command is not None and not isinstance(command, Command):
             speeds = np.asarray(command, float)
             command = Command(speeds=speeds, plan=np.tile(speeds, (self.loop.controller.horizon, 1)))

@@ -95,6 +95,7 @@ class Happenings:
         self.scenario, self._vehicle, self._spec = scenario, vehicle, scenario.controller
         self._plant, self._navigation, self._reference, self._loop = plant, navigation, reference, loop
         self._build = build
+        self._recent: list[Event] = scenario.events  # those that the plant may still have to do with, and others
         self.unanswered: Unanswered | None = None
         self._due: list[tuple[int, float, int, SetpointEvent | ControllerEvent, Successor | None]] = []
         for event in scenario.events:
@@ -121,13 +122,14 @@ class Happenings:
                 raise _not_started_for(found)
             self._plant.wind.reschedule(*winds_of(scenario))
         else:
-            period, now = scenario.control_period, self._loop.time
-            recent = [each for each in scenario.events if each.at + _lasting(each) >= now - period]
+            past = self._loop.time - scenario.control_period
+            recent = [each for each in (*self._recent, found) if each.at + _lasting(each) >= past]
             changes = build_changes(scenario, recent)
             check_changes(scenario, self._vehicle, changes)
             if not self._plant.allows(changes):
                 raise _not_started_for(found)
             self._plant.reschedule(changes)
+            self._recent = recent
         self.scenario = scenario
         return found
 
