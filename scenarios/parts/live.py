@@ -62,7 +62,7 @@ class _Listed(Spec):
     events: list[Event]
 
 
-class Happenings:
+class FlightEvents:
     """The events of a flight, those of its scenario and those that are applied, each put to what it acts on.
 
     Attributes:
@@ -97,7 +97,7 @@ class Happenings:
         self._build = build
         self._recent: list[Event] = scenario.events  # those that the plant may still have to do with, and others
         self.unanswered: Unanswered | None = None
-        self._due: list[tuple[int, float, int, SetpointEvent | ControllerEvent, Successor | None]] = []
+        self._due: list[tuple[int, float, SetpointEvent | ControllerEvent, Successor | None]] = []
         for event in scenario.events:
             self._schedule(event)
         loop.before = self._begin
@@ -190,12 +190,12 @@ class Happenings:
         """Note what happens when a period begins, the first one from its time on, and not within the plant."""
         if isinstance(event, SetpointEvent | ControllerEvent):
             first = math.ceil(event.at / self.scenario.control_period - 1e-6)
-            insort(self._due, (first, event.at, len(self._due), event, ready), key=itemgetter(0, 1))
+            insort(self._due, (first, event.at, event, ready), key=itemgetter(0, 1))
 
     def _begin(self, k: int) -> None:
         """Let happen what is due when a period begins."""
         while self._due and self._due[0][0] <= k:
-            *_, event, ready = self._due.pop(0)
+            _, _, event, ready = self._due.pop(0)
             if isinstance(event, SetpointEvent):
                 self._reference.set(k, event.values)
                 self._loop.motion = None
