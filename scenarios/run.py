@@ -193,7 +193,8 @@ class StartedFlight:
         self.close()
 
     def close(self) -> None:
-        """Give back what the plant holds; what was flown stays."""
+        """Give back what the plant holds; what was flown stays, and nothing more is."""
+        self._events.close()
         self._plant.close()
 
     @property
@@ -230,8 +231,10 @@ class StartedFlight:
 
         Raises:
             FlightError: the flight has ended in this period, which is not part of it.
-            InputError: it had ended before, or is as long as any may be.
+            InputError: it had ended before, is closed, or is as long as any may be.
         """
+        if self.loop.before is None:
+            raise InputError("the flight is closed")
         period, self._longest = self._started.control_period, max(self._longest, self.loop.controller.horizon)
         most = MOST_STEPS // max(self._started.steps_per_period, self._longest)
         if self.k >= min(most, math.floor(LONGEST_FLIGHT / period + 1e-6)):

@@ -102,6 +102,10 @@ class FlightEvents:
             self._schedule(event)
         loop.before = self._begin
 
+    def close(self) -> None:
+        """Let go of what refers back here, so that nothing of the flight stays in a cycle."""
+        self._loop.before = self._build = None
+
     def apply(self, event: Event | Mapping[str, Any], successor: Successor | None = None) -> Event:
         """See `scenarios.run.StartedFlight.apply`."""
         found = self._stamped(event)

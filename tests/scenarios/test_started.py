@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import contextlib
+import gc
 import tomllib
+import weakref
 from typing import Any
 
 import numpy as np
@@ -219,6 +221,8 @@ def test_given_commands_fly_instead_of_the_controller() -> None:
         with pytest.raises(InputError, match=r"the flight has ended at t = 0\.500 s: the command is not finite"):
             started.step()
         assert started.flight().outcome == "lost"
+    with pytest.raises(InputError, match="the flight is closed"):
+        started.step()
 
 
 def test_margins_of_a_period_are_those_of_the_audit() -> None:
@@ -266,6 +270,20 @@ def test_a_script_that_starts_a_flight_reads_as_documented() -> None:
         event = started.apply({"type": "setpoint", "z": 0.5})
         assert event.at == 0.0
         assert quadsim.StartedFlight is type(started)
+
+
+def test_a_flight_that_is_closed_leaves_nothing_in_cycles() -> None:
+    """What was flown is many megabytes, and cycles are looked for rarely."""
+    gc.disable()
+    try:
+        with start(cut("robust"), live=True) as started:
+            started.step()
+        loop, last = weakref.ref(started.loop), weakref.ref(started.loop.last)
+        del started
+        assert loop() is None
+        assert last() is None
+    finally:
+        gc.enable()
 
 
 def threads() -> set[int]:
