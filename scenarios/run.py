@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from threadpoolctl import ThreadpoolController, threadpool_limits
 
 from quadsim.controller import Command, Controller
 from quadsim.errors import InputError, ParameterError
@@ -27,10 +26,12 @@ from scenarios.build import build_controller, build_ground, build_plant, resolve
 from scenarios.courses.make import build_motion, follow_course
 from scenarios.flight import Flight, Outputs, write_run
 from scenarios.gc_tuning import frozen
+from scenarios.one_thread import ONE_THREAD
 from scenarios.parts.effects import build_computation
 from scenarios.parts.limits import build_limits
-from scenarios.parts.live import Happenings, Successor, prepared, unanswered_by
+from scenarios.parts.live import FlightEvents, Successor, unanswered_by
 from scenarios.parts.navigation import build_navigation
+from scenarios.parts.neutral import prepared
 from scenarios.parts.randomness import generator
 from scenarios.parts.vehicle import build_initial_speeds, build_initial_state, build_vehicle
 from scenarios.progress import Progress, silent
@@ -152,13 +153,14 @@ class StartedFlight:
     ) -> None:
         """Set up at t = 0; see `start`."""
         self._started, self.vehicle, self.limits = scenario, build_vehicle(scenario), build_limits(scenario)
-        with threadpool_limits(limits=1):
+        ONE_THREAD.look_again()
+        with ONE_THREAD:
             if law is not None and any(isinstance(event, ControllerEvent) for event in scenario.events):
                 raise ParameterError("", "controller", law, "absent where an event changes the scenario's controller")
             controller = self._build(scenario.controller) if law is None else law
             for _, spec in scenario.controller_changes:
                 self._build(spec)  # to be refused before anything is flown; one by one, as each may take megabytes
-            self.controller, self.solver = controller.name, controller.solver
+            self._law = controller.name, controller.solver
             self._plant = build_plant(scenario, self.vehicle, forces=forces)
             self._navigation = build_navigation(scenario, self.vehicle)
             started = clock.perf_counter()
@@ -173,7 +175,7 @@ class StartedFlight:
                 recorded=recorded,
             )
             self._simulate_s = clock.perf_counter() - started
-        self._happenings = Happenings(
+        self._events = FlightEvents(
             scenario,
             self.vehicle,
             plant=self._plant,
@@ -182,9 +184,7 @@ class StartedFlight:
             loop=self.loop,
             build=self._build if law is None else None,
         )
-        self._threads = ThreadpoolController()
-        most = MOST_STEPS // max(scenario.steps_per_period, controller.horizon)
-        self._most = min(most, math.floor(LONGEST_FLIGHT / scenario.control_period))
+        self._longest = controller.horizon
 
     def __enter__(self) -> StartedFlight:
         return self
@@ -199,7 +199,7 @@ class StartedFlight:
     @property
     def scenario(self) -> Scenario:
         """What is flown, with the events that were applied."""
-        return self._happenings.scenario
+        return self._events.scenario
 
     @property
     def k(self) -> int:
@@ -218,27 +218,30 @@ class StartedFlight:
         Raises:
             FlightError: the vehicle is lost; the flight has ended.
         """
-        with self._threads.limit(limits=1):
+        with ONE_THREAD:
             return self.loop.observation
 
     def step(self, command: Command | Array | None = None) -> Sample:
         """Fly one control period.
 
         Args:
-            command: what to hold instead of the controller's answer: a command, or (4,) rotor speeds [rad/s].
+            command: what to hold instead of the controller's answer: a command, or (4,) rotor speeds [rad/s].  Its
+                scenario does not know of it, and flies without.
 
         Raises:
             FlightError: the flight has ended in this period, which is not part of it.
             InputError: it had ended before, or is as long as any may be.
         """
-        if self.k >= self._most:
-            raise InputError(f"a flight has at most {self._most} control periods of {self.scenario.control_period} s")
+        period, self._longest = self._started.control_period, max(self._longest, self.loop.controller.horizon)
+        most = MOST_STEPS // max(self._started.steps_per_period, self._longest)
+        if self.k >= min(most, math.floor(LONGEST_FLIGHT / period + 1e-6)):
+            raise InputError(f"a flight has at most {self.k} control periods of {period} s")
         if command is not None and not isinstance(command, Command):
             speeds = np.asarray(command, float)
             command = Command(speeds=speeds, plan=np.tile(speeds, (self.loop.controller.horizon, 1)))
         started = clock.perf_counter()
         try:
-            with self._threads.limit(limits=1):
+            with ONE_THREAD:
                 return self.loop.step(command)
         finally:
             self._simulate_s += clock.perf_counter() - started
@@ -247,7 +250,7 @@ class StartedFlight:
         """Fly on to the scenario's end; a flight error or Ctrl-C ends it early, in order."""
         started, periods = clock.perf_counter(), self.scenario.periods
         progress("flight", self.k, periods)
-        with self._threads.limit(limits=1), frozen():
+        with ONE_THREAD, frozen():
             complete(self.loop, periods=periods, progress=lambda done: progress("flight", done, periods))
         self._simulate_s += clock.perf_counter() - started
 
@@ -264,7 +267,7 @@ class StartedFlight:
         Raises:
             InputError: it is not allowed, or the flight was not started for events of its kind; nothing has changed.
         """
-        return self._happenings.apply(event, successor)
+        return self._events.apply(event, successor)
 
     def successor(self, fields: Mapping[str, Any]) -> Successor:
         """A controller of which some fields of `[controller]` are other than now, built; from any thread.
@@ -275,7 +278,7 @@ class StartedFlight:
         Raises:
             InputError: it cannot be built.
         """
-        return self._happenings.successor(fields)
+        return self._events.successor(fields)
 
     def margins(self, sample: Sample | None = None) -> dict[str, float]:
         """The signed margin of each constraint at its worst within one period; negative = violated.
@@ -304,7 +307,7 @@ class StartedFlight:
 
     def flight(self) -> Flight:
         """What has been flown so far, audited; its scenario is as long, and flies to the same bits."""
-        scenario = self._happenings.flown()
+        scenario = self._events.flown()
         self.loop.quaternions = needs_quaternions(scenario)
         log = self.loop.log()
         return Flight(
@@ -312,15 +315,15 @@ class StartedFlight:
             vehicle=self.vehicle,
             log=log,
             findings=audit(log, self.limits),
-            controller=self.controller,
-            solver=self.solver,
+            controller=self._law[0],
+            solver=self._law[1],
             simulate_s=self._simulate_s,
             tallies={} if self._navigation is None else self._navigation.tallies,
-            unanswered=self._happenings.unanswered or unanswered_by(self.loop.controller),
+            unanswered=self._events.unanswered or unanswered_by(self.loop.controller),
         )
 
     def _build(self, spec: ControllerSpec) -> Controller:
-        with threadpool_limits(limits=1):
+        with ONE_THREAD:
             return build_controller(self._started.model_copy(update={"controller": spec}), self.vehicle)
 
 

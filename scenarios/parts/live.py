@@ -1,9 +1,4 @@
-"""What happens in a flight besides the course and the controller that it starts with, foreseen or not.
-
-A model is compiled, sensors are sampled and forces are evaluated in one way where something may happen to them, and in
-another where nothing can, with other last bits.  An event that changes nothing tells: it stands in the scenario of a
-live flight and in the one that is saved of it, whether or not anything of its kind happened.
-"""
+"""What happens in a flight besides the course and the controller that it starts with, foreseen or not."""
 
 from __future__ import annotations
 
@@ -14,7 +9,7 @@ from bisect import insort
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from operator import itemgetter
-from typing import TYPE_CHECKING, Any, Final, Literal, get_args
+from typing import TYPE_CHECKING, Any, Final
 
 from pydantic import BaseModel, ValidationError
 
@@ -22,7 +17,6 @@ from mpc.ocp import Unanswered
 from quadsim.controller import Controller
 from quadsim.errors import InputError, ParameterError
 from quadsim.sim.computation import Computation, Stall
-from quadsim.sim.effects import Air, Load
 from quadsim.sim.effects.gust import Gust
 from quadsim.sim.effects.wind import WindChange
 from quadsim.sim.loop import ClosedLoop
@@ -32,19 +26,17 @@ from quadsim.sim.sensing.sensor import SensorName
 from quadsim.vehicle import Vehicle
 from scenarios.parts.effects import build_changes, build_computation, check_changes, moving_air, winds_of
 from scenarios.parts.navigation import build_faults
+from scenarios.parts.neutral import neutral
 from scenarios.schema.base import Spec
 from scenarios.schema.controller import ControllerSpec, changed
 from scenarios.schema.events import (
     MOST_EVENTS,
     ControllerEvent,
     Event,
-    MassEvent,
     PayloadDropEvent,
     PayloadPickupEvent,
-    PushEvent,
     SensorFaultEvent,
     SetpointEvent,
-    WindEvent,
 )
 from scenarios.schema.problems import ScenarioError, describe_all
 
@@ -54,7 +46,6 @@ if TYPE_CHECKING:
 
 _DEPENDENT: Final = (ControllerEvent, PayloadDropEvent, PayloadPickupEvent, SensorFaultEvent)
 """The events that depend on what else the scenario has."""
-SensorText = Literal["position", "velocity", "attitude", "rates"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -71,7 +62,7 @@ class _Listed(Spec):
     events: list[Event]
 
 
-class Happenings:
+class FlightEvents:
     """The events of a flight, those of its scenario and those that are applied, each put to what it acts on.
 
     Attributes:
@@ -104,8 +95,9 @@ class Happenings:
         self.scenario, self._vehicle, self._spec = scenario, vehicle, scenario.controller
         self._plant, self._navigation, self._reference, self._loop = plant, navigation, reference, loop
         self._build = build
+        self._recent: list[Event] = scenario.events  # those that the plant may still have to do with, and others
         self.unanswered: Unanswered | None = None
-        self._due: list[tuple[int, float, int, SetpointEvent | ControllerEvent, Successor | None]] = []
+        self._due: list[tuple[int, float, SetpointEvent | ControllerEvent, Successor | None]] = []
         for event in scenario.events:
             self._schedule(event)
         loop.before = self._begin
@@ -130,13 +122,14 @@ class Happenings:
                 raise _not_started_for(found)
             self._plant.wind.reschedule(*winds_of(scenario))
         else:
-            period, now = scenario.control_period, self._loop.time
-            recent = [each for each in scenario.events if each.at + _lasting(each) >= now - period]
+            past = self._loop.time - scenario.control_period
+            recent = [each for each in (*self._recent, found) if each.at + _lasting(each) >= past]
             changes = build_changes(scenario, recent)
             check_changes(scenario, self._vehicle, changes)
             if not self._plant.allows(changes):
                 raise _not_started_for(found)
             self._plant.reschedule(changes)
+            self._recent = recent
         self.scenario = scenario
         return found
 
@@ -154,7 +147,7 @@ class Happenings:
         for event in scenario.events:
             substitute = None if event.at < duration else neutral(scenario, event)
             if substitute is not None and substitute not in kept:
-                kept.append(substitute)
+                kept.insert(0, substitute)
         return scenario.model_copy(update={"duration": duration, "events": kept})
 
     def _stamped(self, event: Event | Mapping[str, Any]) -> Event:
@@ -197,12 +190,12 @@ class Happenings:
         """Note what happens when a period begins, the first one from its time on, and not within the plant."""
         if isinstance(event, SetpointEvent | ControllerEvent):
             first = math.ceil(event.at / self.scenario.control_period - 1e-6)
-            insort(self._due, (first, event.at, len(self._due), event, ready), key=itemgetter(0, 1))
+            insort(self._due, (first, event.at, event, ready), key=itemgetter(0, 1))
 
     def _begin(self, k: int) -> None:
         """Let happen what is due when a period begins."""
         while self._due and self._due[0][0] <= k:
-            *_, event, ready = self._due.pop(0)
+            _, _, event, ready = self._due.pop(0)
             if isinstance(event, SetpointEvent):
                 self._reference.set(k, event.values)
                 self._loop.motion = None
@@ -252,50 +245,3 @@ def _lasting(event: Event) -> float:
 def _not_started_for(event: Event) -> InputError:
     rule = "of a kind that the flight was started for, with live=True or by an event of its scenario"
     return ParameterError("event", "type", event.type, rule)
-
-
-def prepared(scenario: Scenario, vehicle: Vehicle) -> Scenario:
-    """A scenario in whose flight anything may happen that can happen to its vehicle.
-
-    Wind needs drag to push; with the integrator rk4 the mass is fixed, and with an estimator there are the sensors that
-    it has.
-    """
-    air = scenario.effects.resolved(vehicle).air
-    kinds: list[Event] = [_push(scenario)]
-    if scenario.plant.integrator == "mujoco":
-        kinds.append(_mass(scenario))
-    if air is not None and air.drags:
-        kinds.append(_wind(scenario))
-    there = {} if scenario.sensors is None else scenario.sensors.present()
-    names = [*there] if scenario.estimator is not None else [*SensorName]
-    kinds += [_fault(scenario, name) for name in get_args(SensorText) if name in names]
-    added = [event for event in kinds if event not in scenario.events]
-    return scenario.model_copy(update={"events": [*scenario.events, *added]})
-
-
-def neutral(scenario: Scenario, event: Event) -> Event | None:
-    """An event at the start that changes nothing, and prepares a flight for one; None where it needs no preparing."""
-    if isinstance(event, PushEvent):
-        return _push(scenario)
-    if isinstance(event, MassEvent | PayloadPickupEvent | PayloadDropEvent):
-        return _mass(scenario)
-    if isinstance(event, Gust | WindChange):
-        return _wind(scenario)
-    return _fault(scenario, event.sensor) if isinstance(event, SensorFaultEvent) else None
-
-
-def _push(scenario: Scenario) -> PushEvent:
-    return PushEvent(type="push", at=0.0, duration=scenario.plant.timestep, force=(0.0, 0.0, 0.0))
-
-
-def _mass(scenario: Scenario) -> MassEvent:
-    return MassEvent(type="mass", at=0.0, factor=(scenario.effects.load or Load()).mass_factor)
-
-
-def _wind(scenario: Scenario) -> WindEvent:
-    return WindEvent(type="wind", at=0.0, velocity=(scenario.effects.air or Air()).wind)
-
-
-def _fault(scenario: Scenario, sensor: SensorText) -> SensorFaultEvent:
-    nothing, step = [0.0, 0.0, 0.0], scenario.plant.timestep
-    return SensorFaultEvent(type="sensor_fault", at=0.0, sensor=sensor, fault="bias", offset=nothing, duration=step)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from quadsim.errors import printable
 from quadsim.state import REFERENCE_NAMES
-from scenarios.parts.live import neutral
+from scenarios.parts.neutral import neutral
 from scenarios.schema.events import (
     ControllerEvent,
     Event,

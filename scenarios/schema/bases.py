@@ -12,7 +12,7 @@ from quadsim.errors import FileError, InputError, ParameterError
 from scenarios.schema.base import DEEPEST, is_deeper
 from scenarios.schema.plugin import located
 
-LARGEST_FILE: Final = 4_000_000
+LARGEST_FILE: Final = 8_000_000
 """Size [bytes] of the largest file that is read; the longest scenario there can be is smaller."""
 
 

@@ -89,7 +89,7 @@ class SetpointEvent(_Event):
     @model_validator(mode="after")
     def _check(self) -> SetpointEvent:
         if not self.values:
-            raise ValueError(f"one of {', '.join(REFERENCE_NAMES)} must be given")
+            raise ValueError("x must be given, or y, z or yaw")
         return self
 
     @property

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import tomllib
 from typing import Any
 
@@ -9,13 +10,15 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from threadpoolctl import threadpool_info, threadpool_limits
 
 import quadsim
 from quadsim.errors import CommandError, FlightError, InputError
 from quadsim.sim.loop import ClosedLoop
 from scenarios.flight import Flight
 from scenarios.loading import load_scenario
-from scenarios.parts.live import prepared
+from scenarios.one_thread import ONE_THREAD
+from scenarios.parts.neutral import prepared
 from scenarios.parts.vehicle import build_vehicle
 from scenarios.run import fly_scenario, start
 from scenarios.schema.scenario import Scenario
@@ -263,3 +266,20 @@ def test_a_script_that_starts_a_flight_reads_as_documented() -> None:
         event = started.apply({"type": "setpoint", "z": 0.5})
         assert event.at == 0.0
         assert quadsim.StartedFlight is type(started)
+
+
+def threads() -> set[int]:
+    return {library["num_threads"] for library in threadpool_info()}
+
+
+def test_linear_algebra_has_one_thread_while_anybody_flies() -> None:
+    """Whoever leaves first, as a controller that is built elsewhere, does not let the others have more."""
+    with threadpool_limits(limits=2):
+        one, other = contextlib.ExitStack(), contextlib.ExitStack()
+        one.enter_context(ONE_THREAD)
+        other.enter_context(ONE_THREAD)
+        assert threads() == {1}
+        one.close()
+        assert threads() == {1}
+        other.close()
+        assert threads() == {2}
