@@ -10,6 +10,7 @@ import asyncio
 import math
 from collections import deque
 from collections.abc import Awaitable, Callable, Mapping
+from functools import partial
 from html import escape
 from importlib.util import find_spec
 from typing import Any, Final
@@ -125,17 +126,21 @@ class Page:
             self.stage.show(frame)
             if frame.k % _EVERY == 0 or self._pace.paused:
                 self._status.content = self._told(frame, factor)
-                self._margins.content = _bars(self._session.limits, frame)
+                self._margins.content = _bars(
+                    self._session.limits, frame, self._session.flights[-1].loop.controller.name
+                )
                 self._plot()
 
     def move(self, frame: Frame, share: float) -> None:
         """See `scenarios.live.pacing.View`."""
         with self._server.atomic():
-            moved = self.stage.move(frame, share)
-            if self._follow.value and moved.any():
+            at = self.stage.move(frame, share)
+            if self._follow.value:
                 for client in self._server.get_clients().values():
-                    camera = client.camera  # its look_at moves with it
-                    camera.position = camera.position + moved
+                    camera = client.camera
+                    away = np.asarray(camera.position) - camera.look_at
+                    camera.look_at = at
+                    camera.position = at + away
         self._server.flush()
 
     def ended(self, reason: str | None) -> None:
@@ -147,7 +152,9 @@ class Page:
             for slider in self._rest:
                 slider.value = 0.0
         else:
-            self._status.content = f'{STYLE}<div class="q bad">{escape(reason)}. Reset begins anew; Save keeps it.</div>'
+            self._status.content = (
+                f'{STYLE}<div class="q bad">{escape(reason)}. Reset begins anew; Save keeps it.</div>'
+            )
 
     # What is on the page
 
@@ -193,13 +200,13 @@ class Page:
         gui, session = self._server.gui, self._session
         gui.add_markdown("Drag the vehicle with the mouse to pull it.")
 
-        @self.stage.grab.on_drag("left")
-        async def _(event: Any) -> None:
+        async def pulled(event: Any) -> None:
             if event.client is None or not self._drives(event.client):
                 return
             to = None if event.phase == "end" else [float(each) for each in event.end_position]
             session.submit({"type": "pull"} if to is None else {"type": "pull", "to": to}, subject="pull")
 
+        self.stage.grab.on_drag("left")(pulled)
         wind = gui.add_vector2("Wind x, y [m/s]", (0.0, 0.0), min=(-12.0, -12.0), max=(12.0, 12.0), step=0.5)
         self._on(
             wind.on_update,
@@ -216,7 +223,9 @@ class Page:
         )
         mass = session.flights[0].vehicle.mass
         load = gui.add_number("Payload [kg]", round(0.1 * mass, 4), min=0.0, max=mass, step=round(0.01 * mass, 5))
-        self._button("Take payload", lambda event: session.submit({"type": "payload_pickup", "mass": float(load.value)}))
+        self._button(
+            "Take payload", lambda event: session.submit({"type": "payload_pickup", "mass": float(load.value)})
+        )
         self._button("Drop payload", lambda event: session.submit({"type": "payload_drop"}))
         factor = gui.add_slider("Mass factor", 0.7, 1.5, 0.01, 1.0)
         self._on(
@@ -231,7 +240,7 @@ class Page:
         for rotor in range(1, N_ROTORS + 1):
             wear = gui.add_slider(f"Rotor {rotor} loss", 0.0, 1.0, 0.05, 0.0)
             self._rest.append(wear)
-            self._on(wear.on_update, lambda event, rotor=rotor: self._wear(rotor, float(event.target.value)))
+            self._on(wear.on_update, partial(self._wear, rotor))
         sensor = gui.add_dropdown("Sensor", ("position", "velocity", "attitude", "rates"))
         fault = gui.add_dropdown("Fault", _FAULTS)
         self._button(
@@ -245,7 +254,8 @@ class Page:
             "Stall the computer", lambda event: session.submit({"type": "stall", "duration": float(late.value) / 1e3})
         )
 
-    def _wear(self, rotor: int, loss: float) -> None:
+    def _wear(self, rotor: int, event: Any) -> None:
+        loss = float(event.target.value)
         self._session.submit({"type": "wear", "rotor": rotor, "loss": loss}, subject=f"wear {rotor}")
 
     def _targets(self) -> None:
@@ -282,14 +292,19 @@ class Page:
         )
         self._steered = gui.add_text("Set-point velocity [m/s]", "0, 0, 0", disabled=True)
         for key, direction in _STEER.items():
-            command = gui.add_command(f"Fly {'+' if sum(direction) > 0 else '-'}{'xyz'[np.abs(direction).argmax()]}", hotkey=key)
-            self._on(command.on_trigger, lambda event, way=direction: self._fly(self._steer + _STEER_STEP * np.array(way)))
+            command = gui.add_command(
+                f"Fly {'+' if sum(direction) > 0 else '-'}{'xyz'[np.abs(direction).argmax()]}", hotkey=key
+            )
+            self._on(command.on_trigger, partial(self._fly_on, direction))
         self._on(gui.add_command("Stop the set-point", hotkey="X").on_trigger, lambda event: self._fly(np.zeros(3)))
         self._button("Stop set-point", lambda event: self._fly(np.zeros(3)))
 
     def _set_point(self, at: list[float]) -> None:
         self._fly(np.zeros(3))
         self._session.submit({"type": "setpoint", **dict(zip("xyz", at, strict=True))}, subject="setpoint")
+
+    def _fly_on(self, direction: tuple[int, int, int], event: Any) -> None:
+        self._fly(self._steer + _STEER_STEP * np.array(direction))
 
     def _fly(self, velocity: Any) -> None:
         self._steer = np.clip(velocity, -_STEER_MOST, _STEER_MOST)
@@ -305,7 +320,6 @@ class Page:
         self._show_knobs(self._session.scenario.controller)
 
     def _show_knobs(self, spec: ControllerSpec) -> None:
-        gui = self._server.gui
         for _, handles in self._fields.values():
             for handle in handles:
                 handle.remove()
@@ -315,8 +329,7 @@ class Page:
                 handles = self._inputs(knob)
                 self._fields[knob.path] = knob, handles
                 for handle in handles:
-                    self._on_later(handle.on_update, lambda event, path=knob.path: self._turn(path))
-        del gui
+                    self._on_later(handle.on_update, partial(self._turn, knob.path))
 
     def _inputs(self, knob: Knob) -> list[Any]:
         """The widgets of a field: two for a pair."""
@@ -332,14 +345,13 @@ class Page:
         step = 1 if isinstance(value, int) else None
         return [gui.add_number(knob.path, value, min=knob.minimum, max=knob.maximum, step=step, hint=knob.about)]
 
-    async def _turn(self, path: str) -> None:
-        knob, handles = self._fields[path]
+    async def _turn(self, path: str, event: Any) -> None:
+        _, handles = self._fields[path]
         value: Value | list[Any] = handles[0].value if len(handles) == 1 else [each.value for each in handles]
         await self._replace({path: value}, f"{path} = {value}")
 
     async def _take_over(self, spec: ControllerSpec, name: str) -> None:
-        fields = {key: value for key, value in spec.model_dump(mode="json", exclude_none=True).items()}
-        if await self._replace(fields, name):
+        if await self._replace(spec.model_dump(mode="json", exclude_none=True), name):
             self._show_knobs(spec)
 
     def _take(self, name: str) -> Any:
@@ -352,7 +364,9 @@ class Page:
         try:
             successor = await asyncio.to_thread(flight.successor, fields)
         except InputError as error:
-            self._said.content = f'{STYLE}<div class="q bad">refused, the controller before flies on: {escape(str(error))}</div>'
+            self._said.content = (
+                f'{STYLE}<div class="q bad">refused, the controller before flies on: {escape(str(error))}</div>'
+            )
             return False
         self._session.submit({"type": "controller", "fields": dict(fields)}, successor=successor)
         self._said.content = f'{STYLE}<div class="q">in force: {escape(what)}</div>'
@@ -406,17 +420,17 @@ class Page:
     async def _connected(self, client: Any) -> None:
         if self._driver is None:
             self._driver = client.client_id
-        unit = self.stage.unit
-        at = self.stage.frames[0].position
-        client.camera.position = np.asarray(at) + unit * np.array([-6.0, -9.0, 5.0])
-        client.camera.look_at = np.asarray(at)
+        unit, at = self.stage.unit, np.asarray(self.stage.frames[0].position)
+        client.camera.position = at + unit * np.array([-6.0, -9.0, 5.0])
+        client.camera.look_at = at
         take = client.gui.add_button("Take the controls", visible=self._driver != client.client_id)
 
-        @take.on_click
-        async def _(event: Any) -> None:
+        async def taken(event: Any) -> None:
             self._let_go()
             self._driver = client.client_id
             take.visible = False
+
+        take.on_click(taken)
 
     async def _left(self, client: Any) -> None:
         if self._driver == client.client_id:
@@ -505,14 +519,15 @@ class Page:
             f"<b>{frame.time:.2f} s</b> &times; {factor:.2f} of real time, "
             f"{'paused' if self._pace.paused else escape(sample.phase.value)}",
             f"<span{mark}>{escape(command.status)}</span>{back}, {command.active} active, "
-            f"step <b>{step:.2f}</b> of {deadline:g} ms" + (' <span class="bad">missed</span>' if sample.missed else ""),
+            f"step <b>{step:.2f}</b> of {deadline:g} ms"
+            + (' <span class="bad">missed</span>' if sample.missed else ""),
             f"tilt <b>{worst[4]:.1f}</b> deg, error <b>{np.linalg.norm(worst[1:4]):.2f}</b> m, pull "
             f"<b>{np.linalg.norm(frame.pull):.1f}</b> N",
         ]
         return f'{STYLE}<div class="q">' + "<br>".join(rows) + "</div>"
 
 
-def _bars(limits: tuple[Limit, ...], frame: Frame) -> str:
+def _bars(limits: tuple[Limit, ...], frame: Frame, other: str) -> str:
     """Margins as bars: full is the middle of the bounds, empty is at the bound, red is beyond."""
     rows = []
     for limit in limits:
@@ -528,7 +543,7 @@ def _bars(limits: tuple[Limit, ...], frame: Frame) -> str:
             red = margin < -limit.tolerance
             colour = BOUND if red else LINES[2] if i == 0 else LINES[4]
             fill = f'<div class="f" style="width:{100.0 * share:.0f}%;background:{colour}"></div>'
-            name = escape(limit.name) + (" (other)" if i else "")
+            name = escape(limit.name if i == 0 else f"{limit.name}, {other}")
             number = f'<td class="n{" bad" if red else ""}">{margin:+.3g} {escape(limit.unit)}</td>'
             rows.append(f'<tr><td>{name}</td><td class="t"><div class="r">{fill}</div></td>{number}</tr>')
     return f'<div class="q"><table>{"".join(rows)}</table></div>' if rows else ""

@@ -6,7 +6,7 @@ import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeGuard
 
 from quadsim.errors import FileError, InputError, ParameterError
 from scenarios.live.session import Session
@@ -69,5 +69,5 @@ def play(session: Session, script: Script) -> list[str]:
     return refused
 
 
-def _is_number(value: Any) -> bool:
+def _is_number(value: Any) -> TypeGuard[float]:
     return isinstance(value, int | float) and not isinstance(value, bool)

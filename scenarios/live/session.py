@@ -32,6 +32,7 @@ STRONGEST: Final = 0.3
 FORCE_STEP: Final = 1e-3
 """To which pulls are rounded [N]."""
 
+
 class Pull(NamedTuple):
     """A spring from a point of the body to a point of the world, held until it is let go."""
 
@@ -142,7 +143,9 @@ class Session:
         """What the flight is audited against."""
         return tuple(self.flights[0].limits)
 
-    def submit(self, table: Mapping[str, Any], *, subject: str | None = None, successor: Successor | None = None) -> None:
+    def submit(
+        self, table: Mapping[str, Any], *, subject: str | None = None, successor: Successor | None = None
+    ) -> None:
         """Let something happen from the next period on; from any thread."""
         self._queue.append(Input(table=dict(table), subject=subject, successor=successor))
 
@@ -223,11 +226,11 @@ class Session:
 
     def _wear(self, table: Mapping[str, Any]) -> None:
         rotor, loss = table.get("rotor"), table.get("loss")
-        if rotor not in range(1, N_ROTORS + 1):
+        if not isinstance(rotor, int) or rotor not in range(1, N_ROTORS + 1):
             raise ParameterError("wear", "rotor", rotor, f"1 to {N_ROTORS}")
         if not isinstance(loss, int | float) or not 0.0 <= loss <= 1.0:
             raise ParameterError("wear", "loss", loss, "from 0 to 1")
-        self._held.wear[int(rotor)] = float(loss)
+        self._held.wear[rotor] = float(loss)
 
     def _happen(self, event: Mapping[str, Any], successor: Successor | None = None) -> None:
         """Apply an event to every flight, to none of them if one refuses.
@@ -256,7 +259,9 @@ class Session:
             force = np.round(force / FORCE_STEP) * FORCE_STEP
         events: list[dict[str, Any]] = []
         if force.any():
-            events.append({"type": "push", "duration": self.period, "force": [round(each, 6) for each in force.tolist()]})
+            events.append(
+                {"type": "push", "duration": self.period, "force": [round(each, 6) for each in force.tolist()]}
+            )
         for rotor, loss in sorted(held.wear.items()):
             if loss > 0.0:
                 events.append({"type": "rotor_loss", "rotor": rotor, "loss": loss, "duration": self.period})

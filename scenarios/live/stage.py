@@ -15,9 +15,9 @@ from quadsim.flight.audit import SpaceLimit
 from quadsim.report.palette import BOUND, LINES, OBSTACLE, REFERENCE
 from quadsim.sim.airframe import BODY, compile_model
 from quadsim.space import Obstacle, Region, Solid
+from quadsim.state import Array
 from quadsim.vehicle import Vehicle
 from scenarios.live.session import Frame, Session
-from quadsim.state import Array
 
 TRAIL: Final = 400
 """Periods of the flown path that stay."""
@@ -57,7 +57,9 @@ class Stage:
         self._rotors = np.array(vehicle.rotor_positions)
         self._thrust = 1.2 * vehicle.arm_length / (vehicle.mass * vehicle.gravity / len(self._rotors))
         self._coefficient = vehicle.thrust_coefficient
-        scene.add_line_segments("/ground", points=_grid(), colors=(200, 204, 210), thickness=1.0, thickness_units="screen")
+        scene.add_line_segments(
+            "/ground", points=_grid(), colors=(200, 204, 210), thickness=1.0, thickness_units="screen"
+        )
         self.frames, self._arrows, self._horizons, self._paths = [], [], [], []
         for i in range(len(session.flights)):
             name = f"/vehicle{i}"
@@ -68,12 +70,16 @@ class Stage:
             self._arrows.append(scene.add_line_segments(f"{name}/thrust", none, rgb(LINES[1]), **line))
             dark = rgb(LINES[2] if i == 0 else LINES[4])
             length = session.flights[i].loop.controller.horizon
-            self._horizons.append((length, scene.add_line_segments(f"/horizon{i}", np.zeros((length, 2, 3)), dark, **line)))
+            self._horizons.append(
+                (length, scene.add_line_segments(f"/horizon{i}", np.zeros((length, 2, 3)), dark, **line))
+            )
             flown = rgb(LINES[0] if i == 0 else LINES[4])
             self._paths.append(scene.add_line_segments(f"/path{i}", np.zeros((TRAIL, 2, 3)), flown, **line))
         self._trails = [deque[Array](maxlen=TRAIL + 1) for _ in session.flights]
         grey, red = rgb(REFERENCE), rgb(BOUND)
-        self._ahead = scene.add_line_segments("/reference", _course(session), grey, thickness=1.5, thickness_units="screen")
+        self._ahead = scene.add_line_segments(
+            "/reference", _course(session), grey, thickness=1.5, thickness_units="screen"
+        )
         self._now = scene.add_icosphere("/goal", radius=0.25 * self.unit, color=grey, subdivisions=1, cast_shadow=False)
         self._hand = scene.add_line_segments("/hand", np.zeros((1, 2, 3)), red, thickness=4.0, thickness_units="screen")
         self.grab = scene.add_icosphere("/vehicle0/grab", radius=1.6 * self.unit, subdivisions=1, opacity=0.001)
@@ -107,15 +113,14 @@ class Stage:
             handle.visible = limit.start <= frame.time <= limit.stop
 
     def move(self, frame: Frame, share: float) -> Array:
-        """Draw the vehicles at a share of the period; by how much the first has moved since (3,) [m]."""
-        before = np.asarray(self.frames[0].position)
+        """Draw the vehicles at a share of the period; where the first is (3,) [m]."""
         for sample, handle in zip(frame.samples, self.frames, strict=True):
             if sample is not None:
                 physics = sample.segment.physics
                 row = physics[min(len(physics) - 1, int(share * len(physics)))]
                 handle.position, handle.wxyz = row[1:4], row[4:8]
-        moved: Array = np.asarray(self.frames[0].position) - before
-        return moved
+        at: Array = np.asarray(self.frames[0].position)
+        return at
 
     def reset(self) -> None:
         """Nothing has been flown."""
@@ -161,7 +166,8 @@ def _airframe(vehicle: Vehicle, shade: tuple[int, int, int], trimesh: Any) -> li
     mujoco.mj_kinematics(model, data)
     body = model.body(BODY).id
     origin, turn = data.xpos[body], data.xmat[body].reshape(3, 3)
-    solid, discs = [], []
+    solid: list[Any] = []
+    discs: list[Any] = []
     for geom in range(model.ngeom):
         if model.body_rootid[model.geom_bodyid[geom]] != body or model.geom_group[geom] > 2:
             continue
