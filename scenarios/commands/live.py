@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 import webbrowser
 from argparse import Namespace
+from collections.abc import Callable
 from pathlib import Path
 
 from quadsim.errors import ParameterError
@@ -52,7 +53,7 @@ def live(options: Namespace) -> int:
         session.close()
 
 
-def _serve(session: Session, options: Namespace, save: object) -> None:
+def _serve(session: Session, options: Namespace, save: Callable[[Session], str]) -> None:
     """Show the page and fly until Ctrl-C."""
     from scenarios.live.page import Page
 
@@ -62,7 +63,7 @@ def _serve(session: Session, options: Namespace, save: object) -> None:
             "the connection is not encrypted"
         )
     pace = Pace()
-    page = Page(session, pace, save=save, host=options.host, port=options.port, others=_others(session.scenario))  # type: ignore[arg-type]
+    page = Page(session, pace, save=save, host=options.host, port=options.port, others=_others(session.scenario))
     try:
         print(f"Open {page.address}  (Ctrl-C ends the session and saves it)", flush=True)
         if options.browser:
@@ -81,7 +82,7 @@ def _others(scenario: Scenario) -> dict[str, ControllerSpec]:
     found: dict[str, ControllerSpec] = {}
     for name in scenario_names():
         other = load_scenario(name)
-        if (other.vehicle, other.control_period) == (scenario.vehicle, scenario.control_period):
-            if other.controller not in [*found.values(), scenario.controller]:
-                found[f"{other.controller.type} of {name}"] = other.controller
+        same = (other.vehicle, other.control_period) == (scenario.vehicle, scenario.control_period)
+        if same and other.controller not in [*found.values(), scenario.controller]:
+            found[f"{other.controller.type} of {name}"] = other.controller
     return found

@@ -46,7 +46,8 @@ STYLE: Final = """<style>
 .q{font:12px/1.45 system-ui,sans-serif;padding:0 .6em}.q b{font-variant-numeric:tabular-nums}
 .q table{width:100%;border-collapse:collapse}.q td{padding:1px 4px 1px 0;white-space:nowrap}
 .q .t{width:45%;min-width:70px}.q .r{position:relative;height:9px;background:#8884;border-radius:3px;overflow:hidden}
-.q .f{position:absolute;left:0;top:0;bottom:0;border-radius:3px}.q .n{text-align:right;font-variant-numeric:tabular-nums}
+.q .f{position:absolute;left:0;top:0;bottom:0;border-radius:3px}
+.q .n{text-align:right;font-variant-numeric:tabular-nums}
 .q .bad{color:#dc2f38;font-weight:600}
 </style>"""
 
@@ -262,8 +263,8 @@ class Page:
         gui, session = self._server.gui, self._session
         unit = self.stage.unit
         gui.add_markdown(
-            "Drag the arrows beside the vehicle's goal, or type. Keys W, S, A, D, R, F fly the set-point along x, y, z; "
-            "X stops it."
+            "Drag the arrows beside the vehicle's goal, or type. Keys W, S, A, D, R, F fly the set-point along x, y "
+            "and z; X stops it."
         )
         here = np.asarray(session.flights[0].loop.course.row(0)[:3])
         self._handle = self._server.scene.add_transform_controls(
