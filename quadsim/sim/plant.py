@@ -122,6 +122,10 @@ class Plant:
         return self
 
     def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Give native memory back."""
         self._rollout.close()
 
     @property
