@@ -1,0 +1,153 @@
+"""A predictive safety filter: a wanted command passes where the robust MPC's constraints can still be kept after it.
+
+Wabersich and Zeilinger (2021), "A predictive safety filter for learning-based control of constrained nonlinear
+dynamical systems", with the model, the disturbance observer and the tightened bounds of `mpc.robust.controller`.  Once
+per period one QP is solved,
+
+    min_u  |u(k) - u_wanted|^2 + epsilon sum_i |u(k+i) - u_s|^2,    i = 0 .. N-1,
+
+subject to the robust MPC's constraints and to a condition on the end of the plan: what the bounds see of the state
+stands still there,
+
+    V' (A - I) (x(k+N) - x_s) = 0,    V a basis of the row space of [C; C A; ...],
+
+so that holding u_s from then on keeps every bound on states for ever.  The plan of one period, moved on, is then a plan
+of the next: as far as the disturbances are within the bounds stated for the tightening, the problem stays feasible.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Final
+
+import numpy as np
+import scipy.linalg
+
+from mpc.answer import ActuatorBounds, command_of, refused, rejection
+from mpc.constraints import Constraint, Penalty
+from mpc.equilibrium import Trim
+from mpc.ocp import Objective, Problem
+from mpc.robust.controller import RobustMPC
+from mpc.robust.settings import Linearisation
+from mpc.robust.tightening import observed
+from mpc.solvers import Answer
+from mpc.solvers.piqp_backends import PiqpMultistage
+from mpc.staged import Staged
+from quadsim.controller import Command, Moment
+from quadsim.errors import ParameterError
+from quadsim.state import Array
+
+LATER: Final = 1e-6
+"""epsilon: how far later inputs' distance from rest counts, against the first input's from what was wanted."""
+PENALTY: Final = 1e7
+"""l1 of violating a row, per unit, where the weight of the first input is 1: more than any multiplier of it."""
+STANDING: Final = 1e-4
+"""How fast what stands still at the plan's end may still change, per period [unit of the state]."""
+LOOSE: Final = 1e4
+"""A bound that is none, per period: PIQP is to see no infinite one that changes, or that is on both sides of a row."""
+PASSED: Final = 1e-2
+"""Difference from the wanted command [rad/s] that is rounding of the QP: the wanted one is then passed as it is."""
+
+
+class SafetyFilter:
+    """A controller that commands what it is asked to, as far as that is safe; see the module.
+
+    Where its QP has no answer the status says so, for `mpc.fallback.contract.Guarded` to fly the last good plan.
+
+    Args:
+        mpc: whose model, observer and constraints are used, one without half-spaces; it solves nothing itself.
+
+    Attributes:
+        wanted: (4,) the command to let pass in the next period [rad/s].
+
+    Raises:
+        ParameterError: the model is not that of hover.
+    """
+
+    name: Final = "safety-filter"
+    solver: Final = "piqp-multistage"
+
+    def __init__(self, mpc: RobustMPC) -> None:
+        if mpc.settings.linearisation is not Linearisation.HOVER:
+            rule = '"hover" for a safety filter'
+            raise ParameterError("controller", "linearisation", str(mpc.settings.linearisation), rule)
+        self._mpc, self.horizon = mpc, mpc.horizon
+        self._standing = _standing(mpc.problem)
+        self.problem = problem = _feasibility(mpc.problem, self._standing)
+        self._actuators = ActuatorBounds.of_problem(problem)
+        self._form = form = Staged(problem)
+        self._first = form.inputs(np.arange(form.qp.c.size))[0]
+        P = form.qp.P.copy()
+        P[self._first, self._first] += 2.0
+        self._backend = PiqpMultistage()
+        self._backend.setup(replace(form.qp, P=P))
+        first, last = (form.qp.h_u.reshape(self.horizon, -1)[i] for i in (0, -1))
+        self._ends = (first == LOOSE) & (last < LOOSE)  # rows that hold at the last state alone
+        self.wanted = problem.model.u_bar.copy()
+
+    @property
+    def trim(self) -> Trim:
+        """What holds the vehicle at rest against the disturbance that is estimated."""
+        return self._mpc.trim
+
+    def reset(self, speeds: Array) -> None:
+        """See `quadsim.controller.Controller.reset`."""
+        self._mpc.reset(speeds)
+        self.wanted = np.array(speeds, float)
+
+    def step(self, now: Moment, state: Array, reference: Array) -> Command:
+        """The nearest command to `wanted` after which the constraints can be kept."""
+        query = self._mpc.pose(now, state, reference)
+        if isinstance(query, Command):
+            return query
+        vectors = self._form.vectors(query.state, query.desired, query.u_before, query.rest)
+        vectors.c[self._first] -= 2.0 * self.wanted
+        if query.rest is not None:
+            for side in (vectors.h_l, vectors.h_u):
+                side.reshape(self.horizon, -1)[-1, self._ends] += self._standing @ query.rest.x
+        solution = self._backend.solve(vectors)
+        plan, slacks = self._form.inputs(solution.x), self._form.slacks(solution.x)
+        answer = Answer(plan=plan, slacks=slacks, solution=solution)
+        problem = rejection(solution.status, plan[0], plan, self._actuators, query.u_before)
+        if problem is not None:
+            return refused(query.u_before, self.horizon, problem, answer)
+        plan = plan.copy()
+        passed = np.abs(plan[0] - self.wanted).max() <= PASSED
+        plan[0] = self._actuators.clip(self.wanted if passed else plan[0], query.u_before)
+        return command_of(plan[0], plan, solution.status, answer)
+
+    def predict(self, states: Array, plans: Array) -> Array:
+        """See `quadsim.controller.Controller.predict`."""
+        return self._mpc.predict(states, plans)
+
+
+def _feasibility(problem: Problem, standing: Array) -> Problem:
+    """The constraints of a problem, the condition (m, n) on the plan's end, and a cost of inputs alone.
+
+    Rows on states are soft, so that there is an answer beyond them too, as after a disturbance larger than stated;
+    where they can be kept, so large a penalty is exact.
+    """
+    C_r, nu = problem.objective.C_r, problem.model.nu
+    objective = Objective(C_r=C_r, Q_y=LATER**2 * np.eye(len(C_r)), Q_u=LATER * np.eye(nu))
+    constraints = [part if part.C is None else _softened(part) for part in problem.every_constraint]
+    if len(standing):
+        bound = np.full((problem.horizon, len(standing)), LOOSE)
+        bound[-1] = STANDING
+        constraints.append(Constraint(name="standing", lower=-bound, upper=bound, C=standing))
+    return replace(problem, objective=objective, bounds=None, constraints=tuple(constraints))
+
+
+def _softened(part: Constraint) -> Constraint:
+    m = part.lower.shape[-1]
+    return replace(part, penalty=Penalty(l1=np.full(m, PENALTY), l2=np.zeros(m)))
+
+
+def _standing(problem: Problem) -> Array:
+    """(m, n) orthonormal rows, zero times x - x_s where what the bounds see of the state stands still."""
+    rows, A = problem.rows, problem.model.A
+    bounded = rows.C[rows.on_states]
+    if not len(bounded):
+        return np.empty((0, len(A)))
+    change = A - np.eye(len(A))
+    seen = observed(change, bounded).T @ change
+    return np.asarray(scipy.linalg.orth(seen.T, rcond=1e-9).T)
