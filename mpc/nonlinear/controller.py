@@ -23,6 +23,7 @@ import scipy.linalg
 from mpc.answer import ActuatorBounds, command_of, refused
 from mpc.constraints import Constraint, Penalty
 from mpc.disturbance import RampObserver, RampSettings
+from mpc.handover import observed, resized, within
 from mpc.model import LinearModel
 from mpc.nonlinear.reference import Nodes, nodes_of_motion, nodes_of_preview
 from mpc.nonlinear.rigidbody import (
@@ -279,6 +280,33 @@ class NonlinearMPC:
         if self._clearing is not None:
             self._clearing.reset()
         self.unanswered: Unanswered | None = None
+
+    def adopt(self, previous: object) -> None:
+        """Go on from what the law before knew: rotor speeds, disturbance, plan."""
+        law = within(previous, NonlinearMPC)
+        if law is not None:
+            alike = self.settings.inputs is law.settings.inputs
+            for name in ("_rotors", "_rotors_before"):
+                shares = getattr(law, name)
+                setattr(self, name, shares if alike else self._shares(law._speeds(shares)))
+            self._quaternion, self._asked = law._quaternion, law._asked
+            if law._last is not None:
+                time, x = law._last
+                self._last = time, np.concatenate([x[:N_BODY], self._rotors])[: self._model.n]
+            if (
+                law._plan is not None
+                and alike
+                and self._model.n == law._model.n
+                and self._model.step == law._model.step
+            ):
+                self._plan = resized(law._plan[0], self._nodes + 1), resized(law._plan[1], self._nodes)
+            if self._ramp is not None and law._ramp is not None:
+                self._ramp.adopt(law._ramp)
+        if self._observer is not None and (estimate := observed(previous)) is not None:
+            kept = law is not None and law._observer is not None
+            self._observer.adopt(law._observer.estimate if kept else estimate)
+            found = self._observer.estimate
+            self._model = replace(self._model, acceleration=found[:3], angular_acceleration=found[3:])
 
     def step(self, now: Moment, state: Array, reference: Array) -> Command:
         """See `quadsim.controller.Controller.step`.

@@ -85,6 +85,19 @@ class Navigation:
         self._perfect = tuple(name for name in SensorName if name not in sensed)
         self._filter = None if estimator is None else ErrorStateFilter(vehicle, sensors, estimator, timestep=timestep)
 
+    def reschedule(self, faults: Sequence[SensorFault]) -> None:
+        """Let these faults take the place of those before; samples already taken stay as they are.
+
+        Raises:
+            ParameterError: a sensor had no fault when this was made, and so is not watched for one.
+        """
+        watched = {sampler.sensor.name for sampler in self._samplers if sampler.watched}
+        for fault in faults:
+            if fault.sensor not in watched:
+                raise ParameterError("fault", "sensor", str(fault.sensor), "one that has had a fault from the start")
+        for sampler in self._samplers:
+            sampler.reschedule(faults)
+
     def reset(self, physics: Array, speeds: Array, yaw: float = 0.0) -> None:
         """Start again, with the same draws.
 

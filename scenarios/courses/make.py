@@ -18,6 +18,7 @@ from quadsim.state import REFERENCE_NAMES, Array
 from quadsim.vehicle import Vehicle
 from scenarios.courses.course import Course, Path, begin
 from scenarios.courses.csv_course import read_table, through_rows
+from scenarios.courses.followed import FollowedCourse
 from scenarios.courses.legs import Turn, Waypoint, waypoints, yaw_turns
 from scenarios.courses.loops import circle, figure_eight, fly_round
 from scenarios.courses.minimum_snap import minimum_snap
@@ -79,8 +80,14 @@ def initial_pose(scenario: Scenario) -> Array:
 
 
 def build_reference(scenario: Scenario, samples: int) -> Array:
-    """(samples, 4) filtered reference x, y, z [m], yaw [rad] at t_k = k tau_s.  Eqs. (30)-(31)."""
+    """(samples, 4) filtered reference x, y, z [m], yaw [rad] at t_k = k tau_s, but for set-points.  Eqs. (30)-(31)."""
     return filtered(build_course(scenario), scenario, samples)
+
+
+def follow_course(scenario: Scenario) -> FollowedCourse:
+    """The same row by row, with set-points on the way, known from the start to nobody."""
+    course, response_time = build_course(scenario), scenario.reference.response_time
+    return FollowedCourse(course, response_time=response_time, period=scenario.control_period)
 
 
 def filtered(course: Course, scenario: Scenario, samples: int) -> Array:
