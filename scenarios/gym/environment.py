@@ -6,36 +6,36 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import gymnasium
 import numpy as np
 from gymnasium.error import ResetNeeded
+from threadpoolctl import ThreadpoolController
 
 from quadsim.controller import Command, Controller, Moment, Phase
 from quadsim.errors import FlightError, InputError, ParameterError
 from quadsim.flight.audit import Limit
 from quadsim.flight.log import FlightLog, PlantLog
 from quadsim.sim.loop import Sample, one_period
-from quadsim.state import POSITION, REFERENCE_STATES, Array
+from quadsim.state import REFERENCE_STATES, Array
 from scenarios.api import load
 from scenarios.build import build_controller
 from scenarios.flight import Flight
 from scenarios.gym.actions import Action, make_actions
 from scenarios.gym.observations import USUAL, Observations
 from scenarios.gym.randomisation import make_plan
+from scenarios.gym.rendering import Screen, has_display, make_screen
 from scenarios.parts.limits import build_limits
 from scenarios.parts.vehicle import build_vehicle
 from scenarios.run import StartedFlight, start
 from scenarios.schema.base import LARGEST_SEED
 from scenarios.schema.scenario import Scenario
 
-if TYPE_CHECKING:
-    from scenarios.gym.rendering import Screen
-
 Reward = Callable[[Array, Array, Array], float]
 """From the true state (12,) after a step, the reference (4,) there, and the rotor speeds commanded (4,) [rad/s]."""
-RENDER_MODES: Final = ("rgb_array", "human")
+RENDER_MODES: Final = ("rgb_array", "human") if has_display() else ("rgb_array",)
+"""`human` where there is a display."""
 
 
 def nearness(state: Array, reference: Array, speeds: Array) -> float:
@@ -57,7 +57,7 @@ class QuadrotorEnv(gymnasium.Env):  # type: ignore[misc]
     `info` tells of each step, and of the start:
 
     - `margins`: signed margin of each constraint at its worst within the step, at the physics rate, in the constraint's
-      unit; negative = violated, NaN outside its time window.
+      unit; negative = violated, inf outside its time window.
     - `margins_sampled`: the same at the end of the step alone, all that a check at the control rate sees.
     - `constraint_values`: (m,) g = -margin in the order of `constraint_names`, so that g <= 0 holds; -inf outside.
     - `constraint_violation`: 1 where a required constraint was violated beyond its tolerances, else 0.
@@ -70,6 +70,8 @@ class QuadrotorEnv(gymnasium.Env):  # type: ignore[misc]
         actions: what actions are.
         observations: what is observed, with the unit of each entry.
     """
+
+    metadata: dict[str, Any] = {"render_modes": [*RENDER_MODES], "render_fps": 20}  # noqa: RUF012  as Gymnasium has it
 
     def __init__(
         self,
@@ -106,12 +108,13 @@ class QuadrotorEnv(gymnasium.Env):  # type: ignore[misc]
         self._plan = None if vary is None else make_plan(scenario, str(vary))
         self._base = scenario if self._plan is None else self._plan.scenario
         if render_mode not in (None, *RENDER_MODES):
-            raise ParameterError("", "render_mode", render_mode, f"{' or '.join(RENDER_MODES)}, or None")
+            rule = f"{' or '.join(RENDER_MODES)}, or None" + ("" if has_display() else "; human needs a display")
+            raise ParameterError("", "render_mode", render_mode, rule)
         horizon = self._base.controller.horizon
         preview = horizon if preview is None else preview
         if not 1 <= preview <= horizon:
             raise ParameterError("", "preview", preview, f"from 1 to controller.horizon = {horizon} periods")
-        self.metadata = {"render_modes": [*RENDER_MODES], "render_fps": max(1, round(1.0 / self._base.control_period))}
+        self.metadata = {**self.metadata, "render_fps": max(1, round(1.0 / self._base.control_period))}
         self.observations = Observations(observation, preview)
         self.actions = make_actions(action, self._base, build_vehicle(self._base))
         self.action_space, self.observation_space = self.actions.space, self.observations.space
@@ -124,7 +127,7 @@ class QuadrotorEnv(gymnasium.Env):  # type: ignore[misc]
         )
         self._flight: StartedFlight | None = None
         self._screen: Screen | None = None
-        self._started = False
+        self._started, self._threads = False, ThreadpoolController()
         self.scenario, self.limits = self._base, build_limits(self._base)
 
     @property
@@ -171,10 +174,10 @@ class QuadrotorEnv(gymnasium.Env):  # type: ignore[misc]
         self._flight = start(scenario, law=self._law)
         self.limits = self._flight.limits
         self._asked: _Asked | None = None
-        observed = self._observe()
+        observed, plant = self._observe(), self._flight.loop.log().plant
+        self._truth, self._rotors = plant.state[-1], plant.speeds[-1]
         if self.render_mode == "human":
             self._draw()
-        plant = self._flight.loop.log().plant
         return observed, self._info(*_start_margins(self.limits, plant))
 
     def step(self, action: Action) -> tuple[Array, float, bool, bool, dict[str, Any]]:
@@ -197,10 +200,10 @@ class QuadrotorEnv(gymnasium.Env):  # type: ignore[misc]
         try:
             sample = flight.step(command)
         except FlightError:
-            nothing = np.full(len(self.limits), np.nan)
+            nothing = np.full(len(self.limits), np.inf)
             return self._last, 0.0, True, False, self._info(nothing, nothing)
-        period = one_period(sample, flight.timestep)
-        state = period.plant.state[-1]
+        period = one_period(sample, self.scenario.plant.timestep)
+        self._truth, self._rotors = state, _ = period.plant.state[-1], period.plant.speeds[-1]
         try:
             observed, reference = self._observe(), flight.observation.reference
             terminated = flight.observation.moment.phase is Phase.CRASHED
@@ -224,7 +227,9 @@ class QuadrotorEnv(gymnasium.Env):  # type: ignore[misc]
         """
         flight = self.started
         if self._asked is None or self._asked.k != flight.k:
-            command = flight.answer()
+            seen = flight.observation
+            with self._threads.limit(limits=1):
+                command = self._law.step(seen.moment, seen.state, seen.preview)
             low, high = self.action_space.low, self.action_space.high
             self._asked = _Asked(flight.k, np.clip(self.actions.of(command.speeds), low, high), command)
         return self._asked.action
@@ -291,7 +296,7 @@ class QuadrotorEnv(gymnasium.Env):  # type: ignore[misc]
         return {
             "margins": dict(zip(names, worst.tolist(), strict=True)),
             "margins_sampled": dict(zip(names, sampled.tolist(), strict=True)),
-            "constraint_values": np.where(np.isnan(worst), -np.inf, -worst),
+            "constraint_values": -worst,
             "constraint_violation": int(any(beyond)),
             "cost": float(sum(beyond)),
             "time": flight.loop.time,
@@ -303,13 +308,11 @@ class QuadrotorEnv(gymnasium.Env):  # type: ignore[misc]
         return Phase.FLYING if self.started.loop.reason else self.started.observation.moment.phase
 
     def _draw(self) -> np.ndarray[Any, np.dtype[np.uint8]] | None:
-        from scenarios.gym.rendering import make_screen
-
         if self._screen is None:
             self._screen = make_screen(self.render_mode, self.scenario, self.started.vehicle, *self._size)
         loop = self.started.loop
         reference = loop.last.observation.preview[0] if loop.last is not None else loop.observation.reference
-        return self._screen.show(self.started.physics, reference[:3], self.started.speeds)
+        return self._screen.show(self._truth, self._rotors, reference, loop.time)
 
 
 @dataclass(frozen=True)
@@ -368,13 +371,13 @@ def _margins(limits: Sequence[Limit], period: FlightLog) -> tuple[Array, Array]:
             t, values = t[1:], values[1:]
         margins = np.where(limit.holds_at(t), limit.margin(values), np.inf)
         worst[i], sampled[i] = margins.min(), margins[-1]
-    return np.where(np.isinf(worst), np.nan, worst), np.where(np.isinf(sampled), np.nan, sampled)
+    return worst, sampled
 
 
 def _start_margins(limits: Sequence[Limit], plant: PlantLog) -> tuple[Array, Array]:
-    """(m,), twice, of the state at the start; NaN of what exists at control samples alone."""
+    """(m,), twice, of the state at the start; inf of what exists at control samples alone."""
     found = [
-        np.nan if limit.source.plant is None or not limit.holds_at(plant.t)[0]
+        np.inf if limit.source.plant is None or not limit.holds_at(plant.t)[0]
         else float(limit.margin(limit.source.plant(plant))[0])
         for limit in limits
     ]  # fmt: skip

@@ -16,6 +16,8 @@ from quadsim.vehicle import N_ROTORS
 Part = Literal["state", "preview", "ahead", "command"]
 
 USUAL: Final[tuple[Part, ...]] = ("state", "preview", "command")
+LARGEST: Final = 1e6
+"""Magnitude that the plant takes for divergence."""
 _REFERENCE: Final = list(REFERENCE_STATES)
 
 
@@ -38,7 +40,7 @@ class Observations:
     Attributes:
         parts: their names.
         layout: an `Entry` for each entry.
-        space: unbounded.
+        space: up to `LARGEST`, which no flight passes; what a faulty sensor gives, such as NaN, is not in it.
     """
 
     def __init__(self, parts: Sequence[str], preview: int) -> None:
@@ -59,7 +61,7 @@ class Observations:
         }
         self.parts = tuple(parts)
         self.layout = tuple(Entry(name=name, unit=unit) for part in parts for name, unit in entries[part])
-        self.space = Box(-np.inf, np.inf, (len(self.layout),), dtype=np.float64)
+        self.space = Box(-LARGEST, LARGEST, (len(self.layout),), dtype=np.float64)
 
     def of(self, state: Array, preview: Array, command: Array) -> Array:
         """The observation of a state (12,), a preview (n, 4) and a command (4,)."""
