@@ -33,7 +33,7 @@ from mpc.robust.tightening import observed
 from mpc.solvers import Answer
 from mpc.solvers.piqp_backends import PiqpMultistage
 from mpc.staged import Staged
-from quadsim.controller import Command, Moment
+from quadsim.controller import UNCONSTRAINED, Command, Moment
 from quadsim.errors import ParameterError
 from quadsim.state import Array
 
@@ -96,7 +96,10 @@ class SafetyFilter:
         self.wanted = np.array(speeds, float)
 
     def step(self, now: Moment, state: Array, reference: Array) -> Command:
-        """The nearest command to `wanted` after which the constraints can be kept."""
+        """The nearest command to `wanted` after which the constraints can be kept.
+
+        One that passes as it is, the optimum without constraints, has the status `unconstrained`.
+        """
         query = self._mpc.pose(now, state, reference)
         if isinstance(query, Command):
             return query
@@ -114,7 +117,7 @@ class SafetyFilter:
         plan = plan.copy()
         passed = np.abs(plan[0] - self.wanted).max() <= PASSED
         plan[0] = self._actuators.clip(self.wanted if passed else plan[0], query.u_before)
-        return command_of(plan[0], plan, solution.status, answer)
+        return command_of(plan[0], plan, UNCONSTRAINED if passed else solution.status, answer)
 
     def predict(self, states: Array, plans: Array) -> Array:
         """See `quadsim.controller.Controller.predict`."""

@@ -230,8 +230,23 @@ class QuadrotorEnv(gymnasium.Env):  # type: ignore[misc]
             seen = flight.observation
             with self._threads.limit(limits=1):
                 command = self._law.step(seen.moment, seen.state, seen.preview)
-            low, high = self.action_space.low, self.action_space.high
-            self._asked = _Asked(flight.k, np.clip(self.actions.of(command.speeds), low, high), command)
+            self.action_for(command)
+        assert self._asked is not None
+        return self._asked.action
+
+    @property
+    def controller_status(self) -> str:
+        """The status of what was asked for last; see `quadsim.controller.Command`."""
+        return "" if self._asked is None else self._asked.command.status
+
+    def action_for(self, command: Command) -> Action:
+        """The action that stands for a command: taken next, the very command is flown, with its plan and status.
+
+        Raises:
+            ParameterError: actions are thrust and rates.
+        """
+        low, high = self.action_space.low, self.action_space.high
+        self._asked = _Asked(self.started.k, np.clip(self.actions.of(command.speeds), low, high), command)
         return self._asked.action
 
     def flight(self) -> Flight:
