@@ -34,8 +34,8 @@ class Actions(Protocol):
 
     space: Box
 
-    def command(self, action: Action, body_rates: Array, horizon: int) -> Command:
-        """The command (its plan of so many rows) for an action (4,), at body rates (3,) [rad/s]."""
+    def command(self, action: Action, body_rates: Array | None, horizon: int) -> Command:
+        """The command (its plan of so many rows) for an action (4,), at body rates (3,) [rad/s], where they are known."""
         ...
 
     def of(self, speeds: Array) -> Action:
@@ -53,7 +53,7 @@ class RotorSpeeds:
     def __init__(self, bounds: ActuatorBounds) -> None:
         self.space = Box(bounds.u_min, bounds.u_max, dtype=np.float64)
 
-    def command(self, action: Action, body_rates: Array, horizon: int) -> Command:
+    def command(self, action: Action, body_rates: Array | None, horizon: int) -> Command:
         """See `Actions`."""
         return _held(np.asarray(action, float), horizon)
 
@@ -69,7 +69,7 @@ class Deviations:
         self.space = Box(-1.0, 1.0, (N_ROTORS,), dtype=np.float32)
         self._hover, self._down, self._up = hover, hover - bounds.u_min, bounds.u_max - hover
 
-    def command(self, action: Action, body_rates: Array, horizon: int) -> Command:
+    def command(self, action: Action, body_rates: Array | None, horizon: int) -> Command:
         """See `Actions`."""
         action = np.asarray(action, float)
         return _held(self._hover + action * np.where(action < 0.0, self._down, self._up), horizon)
@@ -94,12 +94,12 @@ class ThrustAndRates:
         least, most = (vehicle.thrust_coefficient * float(np.sum(ends**2)) for ends in (bounds.u_min, bounds.u_max))
         self._weight, self._down, self._up = weight, weight - least, most - weight
 
-    def command(self, action: Action, body_rates: Array, horizon: int) -> Command:
+    def command(self, action: Action, body_rates: Array | None, horizon: int) -> Command:
         """See `Actions`."""
         thrust, *rates = np.asarray(action, float).tolist()
         self._loop.thrust = self._weight + thrust * (self._down if thrust < 0.0 else self._up)
         self._loop.rates = np.multiply(rates, LARGEST_RATES)
-        return self._loop.command(body_rates, horizon)
+        return self._loop.command(np.zeros(3) if body_rates is None else body_rates, horizon)
 
     def of(self, speeds: Array) -> Action:
         """See `Actions`."""

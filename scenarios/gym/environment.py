@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -17,7 +17,7 @@ from quadsim.controller import Command, Controller, Moment, Phase
 from quadsim.errors import FlightError, InputError, ParameterError
 from quadsim.flight.audit import Limit
 from quadsim.flight.log import FlightLog, PlantLog
-from quadsim.sim.loop import Sample, one_period
+from quadsim.sim.loop import Observation, one_period
 from quadsim.state import REFERENCE_STATES, Array
 from scenarios.api import load
 from scenarios.build import build_controller
@@ -174,11 +174,11 @@ class QuadrotorEnv(gymnasium.Env):  # type: ignore[misc]
         self._flight = start(scenario, law=self._law)
         self.limits = self._flight.limits
         self._asked: _Asked | None = None
-        observed, plant = self._observe(), self._flight.loop.log().plant
+        self._seen, plant = self._flight.observation, self._flight.loop.log().plant
         self._truth, self._rotors = plant.state[-1], plant.speeds[-1]
         if self.render_mode == "human":
             self._draw()
-        return observed, self._info(*_start_margins(self.limits, plant))
+        return self._vector(self._seen), self._info(*_start_margins(self.limits, plant))
 
     def step(self, action: Action) -> tuple[Array, float, bool, bool, dict[str, Any]]:
         """Fly one control period.
@@ -191,30 +191,31 @@ class QuadrotorEnv(gymnasium.Env):  # type: ignore[misc]
         flight = self.started
         if flight.done:
             raise ResetNeeded(f"the episode has ended ({flight.loop.reason or 'the scenario is over'}); call reset()")
-        asked = self._asked
+        asked, seen = self._asked, self._seen
         command = (
             asked.command
             if asked is not None and asked.k == flight.k and np.array_equal(asked.action, action)
-            else self.actions.command(action, self._body_rates(), self._law.horizon)
+            else self.actions.command(action, seen.moment.body_rates, self._law.horizon)
         )
-        try:
-            sample = flight.step(command)
-        except FlightError:
-            nothing = np.full(len(self.limits), np.inf)
-            return self._last, 0.0, True, False, self._info(nothing, nothing)
-        period = one_period(sample, self.scenario.plant.timestep)
-        self._truth, self._rotors = state, _ = period.plant.state[-1], period.plant.speeds[-1]
-        try:
-            observed, reference = self._observe(), flight.observation.reference
-            terminated = flight.observation.moment.phase is Phase.CRASHED
-        except FlightError:  # lost: the controller would not be asked any more
-            reference = sample.observation.preview[0]
-            observed = self._seen(state, sample.observation.preview[1:], sample.speeds)
-            terminated = True
+        nothing = np.full(len(self.limits), np.inf)
+        with self._threads.limit(limits=1):
+            try:
+                sample = flight.loop.step(command)
+            except FlightError:
+                return self._vector(seen), 0.0, True, False, self._info(nothing, nothing)
+            period = one_period(sample, self.scenario.plant.timestep)
+            self._truth, self._rotors = state, _ = period.plant.state[-1], period.plant.speeds[-1]
+            try:
+                self._seen = flight.loop.observation
+            except FlightError:  # lost: no controller would be asked any more
+                moment = replace(seen.moment, acting=sample.speeds)
+                rows = seen.preview
+                self._seen = replace(seen, state=state, reference=rows[0], preview=rows[1:], moment=moment)
+        terminated = flight.loop.reason is not None or self._seen.moment.phase is Phase.CRASHED
         if self.render_mode == "human":
             self._draw()
-        info = self._info(*_margins(self.limits, period))
-        return observed, float(self._reward(state, reference, sample.speeds)), terminated, False, info
+        reward = float(self._reward(state, self._seen.reference, sample.speeds))
+        return self._vector(self._seen), reward, terminated, False, self._info(*_margins(self.limits, period))
 
     def controller_action(self) -> Action:
         """What the scenario's own controller would do now, asked once per period.
@@ -227,7 +228,7 @@ class QuadrotorEnv(gymnasium.Env):  # type: ignore[misc]
         """
         flight = self.started
         if self._asked is None or self._asked.k != flight.k:
-            seen = flight.observation
+            seen = self._seen
             with self._threads.limit(limits=1):
                 command = self._law.step(seen.moment, seen.state, seen.preview)
             self.action_for(command)
@@ -285,49 +286,36 @@ class QuadrotorEnv(gymnasium.Env):  # type: ignore[misc]
             seed = self._base.seed if first else int(self.np_random.integers(2**31))
         return self._base.model_copy(update={"seed": seed})
 
-    def _observe(self) -> Array:
-        seen = self.started.observation
-        assert seen.moment.acting is not None
-        self._last = self._seen(seen.state, seen.preview, seen.moment.acting)
-        return self._last.copy()
-
-    def _seen(self, state: Array, preview: Array, speeds: Array) -> Array:
-        """The observation; beyond its end the reference stays where it is."""
-        missing = self._preview - len(preview)
-        rows = preview[: self._preview] if missing <= 0 else np.concatenate([preview, np.repeat(preview[-1:], missing, 0)])
-        return self.observations.of(state, rows, speeds)
-
-    def _body_rates(self) -> Array:
-        rates = self.started.observation.moment.body_rates
-        return np.zeros(3) if rates is None else rates
+    def _vector(self, seen: Observation) -> Array:
+        """What is observed; beyond its end the reference stays where it is."""
+        rows, acting = seen.preview, seen.moment.acting
+        assert acting is not None
+        if len(rows) < self._preview:
+            last = rows[-1:] if len(rows) else seen.reference[None]
+            rows = np.concatenate([rows, np.repeat(last, self._preview - len(rows), axis=0)])
+        return self.observations.of(seen.state, rows[: self._preview], acting)
 
     def _info(self, worst: Array, sampled: Array) -> dict[str, Any]:
         beyond = [
             limit.required and (margin < -limit.tolerance or at_end < -limit.tolerance_sampled)
             for limit, margin, at_end in zip(self.limits, worst.tolist(), sampled.tolist(), strict=True)
         ]
-        flight = self.started
-        names = self.constraint_names
+        loop, names = self.started.loop, self.constraint_names
         return {
             "margins": dict(zip(names, worst.tolist(), strict=True)),
             "margins_sampled": dict(zip(names, sampled.tolist(), strict=True)),
             "constraint_values": -worst,
             "constraint_violation": int(any(beyond)),
             "cost": float(sum(beyond)),
-            "time": flight.loop.time,
-            "phase": str(flight.loop.last.phase if flight.loop.reason and flight.loop.last else self._phase()),
-            "reason": flight.loop.reason or "",
+            "time": loop.time,
+            "phase": str(self._seen.moment.phase),
+            "reason": loop.reason or "",
         }
-
-    def _phase(self) -> Phase:
-        return Phase.FLYING if self.started.loop.reason else self.started.observation.moment.phase
 
     def _draw(self) -> np.ndarray[Any, np.dtype[np.uint8]] | None:
         if self._screen is None:
             self._screen = make_screen(self.render_mode, self.scenario, self.started.vehicle, *self._size)
-        loop = self.started.loop
-        reference = loop.last.observation.preview[0] if loop.last is not None else loop.observation.reference
-        return self._screen.show(self._truth, self._rotors, reference, loop.time)
+        return self._screen.show(self._truth, self._rotors, self._seen.reference, self.started.loop.time)
 
 
 @dataclass(frozen=True)

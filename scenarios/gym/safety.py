@@ -67,7 +67,7 @@ class MPCSafetyFilter(gymnasium.Wrapper):  # type: ignore[misc]
 
     def step(self, action: Action) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         """See `gymnasium.Env.step`."""
-        wanted = self._base.actions.command(action, np.zeros(3), 1).speeds
+        wanted = self._base.actions.command(action, None, 1).speeds
         command = self.answer(wanted)
         correction = float(np.abs(command.speeds - wanted).max())
         intervened = command.status != UNCONSTRAINED
