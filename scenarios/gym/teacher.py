@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from quadsim.errors import FlightError
 from quadsim.outputs import write_new
 from quadsim.state import Array
 from scenarios.gym.actions import Action
@@ -37,7 +38,7 @@ def expert(
         episodes: how many; the first is reset with `seed`, the others without one.
         seed: as of `QuadrotorEnv.reset`.
         agent: who flies instead of the controller, from an observation to an action; the table still has the
-            controller's actions, as data aggregation (DAgger) wants them.
+            controller's actions, as data aggregation (DAgger) wants them, as long as the controller has any.
         out: a Parquet file to write as well, where there is none yet.
         options: as of `make_env`; actions are deviations where nothing else is said, and cannot be rates.
 
@@ -66,7 +67,10 @@ def expert(
         observed, _ = env.reset(seed=seed if episode == 0 else None)
         ended, period = False, 0
         while not ended:
-            action = base.controller_action()
+            try:
+                action = base.controller_action()
+            except FlightError:
+                break
             asked = base.controller_status
             seen = observed
             observed, _, terminated, truncated, info = env.step(action if agent is None else agent(seen))
