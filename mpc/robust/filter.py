@@ -39,8 +39,8 @@ from quadsim.state import Array
 
 LATER: Final = 1e-6
 """epsilon: how far later inputs' distance from rest counts, against the first input's from what was wanted."""
-PENALTY: Final = 1e7
-"""l1 of violating a row, per unit, where the weight of the first input is 1: more than any multiplier of it."""
+PENALTY: Final = 1e5
+"""l1 of violating a row by as much as it has room on one side, where the weight of the first input is 1."""
 STANDING: Final = 1e-4
 """How fast what stands still at the plan's end may still change, per period [unit of the state]."""
 LOOSE: Final = 1e4
@@ -141,8 +141,10 @@ def _feasibility(problem: Problem, standing: Array) -> Problem:
 
 
 def _softened(part: Constraint) -> Constraint:
-    m = part.lower.shape[-1]
-    return replace(part, penalty=Penalty(l1=np.full(m, PENALTY), l2=np.zeros(m)))
+    lower, upper = np.atleast_2d(part.lower)[0], np.atleast_2d(part.upper)[0]
+    largest = np.where(np.isfinite(lower), np.where(np.isfinite(upper), 0.5 * (upper - lower), np.abs(lower)), np.abs(upper))
+    room = np.where(np.isfinite(largest) & (largest > 0.0), largest, 1.0)
+    return replace(part, penalty=Penalty(l1=PENALTY / room, l2=np.zeros(room.size)))
 
 
 def _standing(problem: Problem) -> Array:
