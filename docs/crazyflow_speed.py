@@ -1,4 +1,4 @@
-"""How fast crazyflow's environment steps, in an environment that has it: `make_gym.py --crazyflow PYTHON` calls this."""
+"""How fast crazyflow steps; `make_gym.py --crazyflow PYTHON` calls this with an interpreter that has it."""
 
 from __future__ import annotations
 

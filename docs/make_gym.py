@@ -1,4 +1,4 @@
-"""Remake the numbers and the figure of docs/gym.md: `make gym`, some fifteen minutes; `make_gym.py speed` one part of it.
+"""Remake the numbers and the figure of docs/gym.md: `make gym`, some ten minutes; `make_gym.py speed` a part of it.
 
 `--crazyflow PYTHON` times crazyflow beside it, with the interpreter of an environment that has it.
 """
@@ -173,7 +173,13 @@ def draw(shown: dict[str, Any]) -> Callable[[], Any]:
             right.plot(plant["t"], lean, label=name)
             env.close()
         right.axhline(5.0, color="tab:red", linewidth=1.0, label="5 deg")
-        right.set(xlabel="time [s]", ylabel="tilt [deg]", ylim=(0.0, 12.0), xlim=(0.0, 15.0), title="A random agent in turbulence")
+        right.set(
+            xlabel="time [s]",
+            ylabel="tilt [deg]",
+            ylim=(0.0, 12.0),
+            xlim=(0.0, 15.0),
+            title="A random agent in turbulence",
+        )
         right.legend(fontsize=8)
         return drawing
 

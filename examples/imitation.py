@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import tomllib
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +19,7 @@ import quadsim.gym
 
 Array = NDArray[np.float64]
 
-OBSERVED = {"observation": ("ahead", "state", "command"), "action": "speeds"}
+OBSERVED: dict[str, Any] = {"observation": ("ahead", "state", "command"), "action": "speeds"}
 AHEAD = [1, 2, 4, 7, 11, 16, 22, 29, 37, 45, 50]
 """Periods ahead of which the student sees the reference."""
 MOVING = [1, 3, 5, 6, 7, 8, 9, 11]
@@ -100,7 +101,9 @@ class Network:
 
     def _gradient(self, x: Array, y: Array) -> list[Array]:
         layers = self._layers(x)
-        back, weights, offsets = 2.0 * (layers[-1] - y) / y.size, [], []
+        back = 2.0 * (layers[-1] - y) / y.size
+        weights: list[Array] = []
+        offsets: list[Array] = []
         for i in reversed(range(len(self.offsets))):
             weights.insert(0, layers[i].T @ back)
             offsets.insert(0, back.sum(axis=0))

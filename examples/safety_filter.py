@@ -50,7 +50,9 @@ def main(names: list[str]) -> None:
             while not (terminated or truncated):
                 _, _, terminated, truncated, info = env.step(env.action_space.sample())
                 steps, largest = steps + 1, max(largest, LARGEST - info["margins"]["tilt"])
-            how = f"stepped in {env.interventions} times" if isinstance(env, quadsim.gym.MPCSafetyFilter) else "no filter"
+            how = (
+                f"stepped in {env.interventions} times" if isinstance(env, quadsim.gym.MPCSafetyFilter) else "no filter"
+            )
             print(f"{name}: {steps} steps, tilt up to {largest:.2f} deg, {'lost' if terminated else 'flown'}; {how}")
             env.close()
 

@@ -124,7 +124,7 @@ class _Nearest:
     def __init__(self, problem: Problem, standing: Array) -> None:
         self._form = form = Staged(problem)
         self._horizon, self._at_rest = problem.horizon, standing
-        self._first = form.inputs(np.arange(form.qp.c.size))[0]
+        self._first = form.inputs(np.arange(form.qp.c.size, dtype=np.float64))[0].astype(np.intp)
         P = form.qp.P.copy()
         P[self._first, self._first] += 2.0
         self._backend = PiqpMultistage()

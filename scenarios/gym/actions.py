@@ -35,7 +35,7 @@ class Actions(Protocol):
     space: Box
 
     def command(self, action: Action, body_rates: Array | None, horizon: int) -> Command:
-        """The command (its plan of so many rows) for an action (4,), at body rates (3,) [rad/s], where they are known."""
+        """The command, a plan of so many rows, for an action (4,) at body rates (3,) [rad/s], if these are known."""
         ...
 
     def of(self, speeds: Array) -> Action:
@@ -71,8 +71,8 @@ class Deviations:
 
     def command(self, action: Action, body_rates: Array | None, horizon: int) -> Command:
         """See `Actions`."""
-        action = np.asarray(action, float)
-        return _held(self._hover + action * np.where(action < 0.0, self._down, self._up), horizon)
+        shares = np.asarray(action, np.float64)
+        return _held(self._hover + shares * np.where(shares < 0.0, self._down, self._up), horizon)
 
     def of(self, speeds: Array) -> Action:
         """See `Actions`; beyond [-1, 1] where the speeds are beyond their bounds."""
@@ -103,7 +103,9 @@ class ThrustAndRates:
 
     def of(self, speeds: Array) -> Action:
         """See `Actions`."""
-        raise ParameterError("", "action", "rates", "deviations or speeds: rotor speeds are no thrust and rates to hold")
+        raise ParameterError(
+            "", "action", "rates", "deviations or speeds: rotor speeds are no thrust and rates to hold"
+        )
 
 
 def make_actions(kind: str, scenario: Scenario, vehicle: Vehicle) -> Actions:
@@ -116,13 +118,14 @@ def make_actions(kind: str, scenario: Scenario, vehicle: Vehicle) -> Actions:
     if kind not in get_args(ActionKind):
         raise UnknownNameError("action", str(kind), get_args(ActionKind))
     spec = scenario.controller
-    bounded = isinstance(spec, BoundedSpec)
-    bounds = ActuatorBounds.of(make_bounds(spec)) if bounded else ActuatorBounds.of_vehicle(vehicle)
+    if isinstance(spec, BoundedSpec):
+        bounds, owner = ActuatorBounds.of(make_bounds(spec)), "controller.input_bounds"
+    else:
+        bounds, owner = ActuatorBounds.of_vehicle(vehicle), f"vehicle {vehicle.name}"
     if kind == "speeds":
         return RotorSpeeds(bounds)
     hover = vehicle.hover_speed
     if not (bounds.u_min.max() < hover < bounds.u_max.min()):
-        owner = "controller.input_bounds" if bounded else f"vehicle {vehicle.name}"
         given = [float(bounds.u_min[0]), float(bounds.u_max[0])]
         raise ParameterError(owner, "speed", given, f"below and above the hover speed, {hover:.4g} rad/s")
     if kind == "deviations":

@@ -229,6 +229,7 @@ class QuadrotorEnv(gymnasium.Env):  # type: ignore[misc]
         flight = self.started
         if self._asked is None or self._asked.k != flight.k:
             seen = self._seen
+            self.actions.of(np.zeros(4))  # which those that stand for no speeds refuse
             with self._threads.limit(limits=1):
                 command = self._law.step(seen.moment, seen.state, seen.preview)
             self.action_for(command)

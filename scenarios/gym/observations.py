@@ -45,30 +45,35 @@ class Observations:
 
     def __init__(self, parts: Sequence[str], preview: int) -> None:
         if not parts or len(set(parts)) < len(parts):
-            raise ParameterError("", "observation", list(parts), f"one or more of {', '.join(get_args(Part))}, once each")
+            raise ParameterError(
+                "", "observation", list(parts), f"one or more of {', '.join(get_args(Part))}, once each"
+            )
         for part in parts:
             if part not in get_args(Part):
                 raise UnknownNameError("part of the observation", str(part), get_args(Part))
         units = [STATE_UNITS[i] for i in REFERENCE_STATES]
         rows = [
-            (f"{name}[{i}]", unit) for i in range(1, preview + 1) for name, unit in zip(REFERENCE_NAMES, units, strict=True)
+            (f"{name}[{i}]", unit)
+            for i in range(1, preview + 1)
+            for name, unit in zip(REFERENCE_NAMES, units, strict=True)
         ]
-        entries = {
+        entries: dict[str, list[tuple[str, str]]] = {
             "state": list(zip(STATE_NAMES, STATE_UNITS, strict=True)),
             "preview": rows,
             "ahead": [(f"{name} ahead", unit) for name, unit in rows],
             "command": [(f"u{i + 1}", "rad/s") for i in range(N_ROTORS)],
         }
-        self.parts = tuple(parts)
+        self.parts: tuple[str, ...] = tuple(parts)
         self.layout = tuple(Entry(name=name, unit=unit) for part in parts for name, unit in entries[part])
         self.space = Box(-LARGEST, LARGEST, (len(self.layout),), dtype=np.float64)
 
     def of(self, state: Array, preview: Array, command: Array) -> Array:
         """The observation of a state (12,), a preview (n, 4) and a command (4,)."""
-        values = {
-            "state": lambda: state,
-            "preview": lambda: preview.ravel(),
-            "ahead": lambda: (preview - state[_REFERENCE]).ravel(),
-            "command": lambda: command,
+        ahead = preview - state[_REFERENCE] if "ahead" in self.parts else preview
+        values: dict[str, Array] = {
+            "state": state,
+            "preview": preview.ravel(),
+            "ahead": ahead.ravel(),
+            "command": command,
         }
-        return np.concatenate([values[part]() for part in self.parts])
+        return np.concatenate([values[part] for part in self.parts])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tomllib
+from typing import Any
 
 from scenarios.campaign.plan import Plan, read_campaign
 from scenarios.campaign.plan import make_plan as plan_of
@@ -21,5 +22,5 @@ def make_plan(scenario: Scenario, campaign: str) -> Plan:
     if data.get("set"):
         merged = merge(tomllib.loads(scenario.to_toml()), data["set"])
         scenario = parse_scenario(merged, source=f"{scenario.name}, as {campaign} sets it")
-    kept = {key: data[key] for key in ("name", "flights", "seed", "sampling", "vary") if key in data}
+    kept: dict[str, Any] = {key: data[key] for key in ("name", "flights", "seed", "sampling", "vary") if key in data}
     return plan_of(scenario, kept)

@@ -66,6 +66,7 @@ class _Window:
                 mujoco.mj_forward(self._model, self._data)
                 self._viewer.cam.lookat[:] = position
             self._viewer.sync()
+        return None
 
     def close(self) -> None:
         self._viewer.close()

@@ -62,7 +62,9 @@ def expert(
 
     env = make_env(scenario, **options)
     base = env.unwrapped
-    rows: dict[str, list[Any]] = {name: [] for name in ("episode", "period", "observation", "action", "status", "violated")}
+    rows: dict[str, list[Any]] = {
+        name: [] for name in ("episode", "period", "observation", "action", "status", "violated")
+    }
     for episode in range(episodes):
         observed, _ = env.reset(seed=seed if episode == 0 else None)
         ended, period = False, 0

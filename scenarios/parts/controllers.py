@@ -160,7 +160,9 @@ def make_filter(spec: RobustSpec, vehicle: Vehicle, period: float) -> tuple[Safe
     from mpc.robust.filter import SafetyFilter
 
     if spec.avoidance is not None:
-        raise ParameterError("controller", "avoidance", "given", "absent for a safety filter, which keeps no half-spaces")
+        raise ParameterError(
+            "controller", "avoidance", "given", "absent for a safety filter, which keeps no half-spaces"
+        )
     found = SafetyFilter(_robust(spec.model_copy(update={"shortcut": False}), vehicle, period))
     return found, _bounded(found, spec, spec.fallback, vehicle, period)
 

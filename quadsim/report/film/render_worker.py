@@ -288,7 +288,7 @@ def _ffmpeg(*arguments: str) -> None:
 
 
 def main(arguments: list[str]) -> None:
-    """Do a task: `probe`, `serve`, `film SHOT MP4`, `join LIST MP4`, `gif MP4 GIF WIDTH`, `portrait VEHICLE PNG W H`."""
+    """Do `probe`, `serve`, `film SHOT MP4`, `join LIST MP4`, `gif MP4 GIF WIDTH` or `portrait VEHICLE PNG W H`."""
     match arguments:
         case ["probe"]:
             probe()

@@ -15,7 +15,7 @@ from mpc.paper.condensed import Condensed
 from mpc.robust.controller import RobustMPC, RobustSettings
 from mpc.robust.filter import STANDING, SafetyFilter
 from mpc.solvers import make_backend
-from quadsim.controller import UNCONSTRAINED, Moment
+from quadsim.controller import UNCONSTRAINED, Command, Moment
 from quadsim.state import INDEX, Array
 from scenarios.loading import load_scenario
 from scenarios.parts.vehicle import build_vehicle
@@ -47,7 +47,7 @@ def make_filter() -> SafetyFilter:
     return SafetyFilter(mpc)
 
 
-def asked(filter_: SafetyFilter, state: Array, wanted: Array, acting: Array = HOVER):  # noqa: ANN201
+def asked(filter_: SafetyFilter, state: Array, wanted: Array, acting: Array = HOVER) -> Command:
     filter_.reset(acting)
     filter_.wanted = wanted
     return filter_.step(Moment(acting=acting), state, np.zeros((HORIZON, 4)))
@@ -60,7 +60,7 @@ def tilted(roll: float, rate: float, yaw: float = 0.0) -> Array:
 
 
 def test_a_safe_command_passes() -> None:
-    wanted = HOVER + [1.0, -2.0, 1.0, -2.0]
+    wanted = HOVER + np.array([1.0, -2.0, 1.0, -2.0])
     command = asked(make_filter(), np.zeros(12), wanted)
     assert command.status == UNCONSTRAINED
     assert np.array_equal(command.speeds, wanted)

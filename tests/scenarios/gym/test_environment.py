@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import subprocess
 import sys
 from pathlib import Path
@@ -76,7 +77,8 @@ def test_raw_speeds_are_float64_within_the_controllers_bounds() -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "action"), [("motion-capture", "deviations"), ("late-commands", "speeds"), ("torrente-loop4-drag", "speeds")]
+    ("name", "action"),
+    [("motion-capture", "deviations"), ("late-commands", "speeds"), ("torrente-loop4-drag", "speeds")],
 )
 def test_an_episode_of_the_own_controller_has_the_bytes_of_a_run(name: str, action: str, tmp_path: Path) -> None:
     scenario = short(name)
@@ -95,14 +97,15 @@ def test_an_episode_of_the_own_controller_has_the_bytes_of_a_run(name: str, acti
 
 def test_margins_see_a_violation_that_samples_miss() -> None:
     """The paper's controller bounds samples of a linear model, and is beyond 5 deg of roll between some of them."""
-    env = quadsim.gym.make_env(short("paper-constrained", 14.0))
+    env = quadsim.gym.make_env(short("paper-constrained", 27.0))
     told = flown(env)
     missed = [
         now["margins"]["roll"]
-        for before, now in zip(told[:-1], told[1:], strict=True)
+        for before, now in itertools.pairwise(told)
         if now["margins"]["roll"] < 0.0 <= min(before["margins_sampled"]["roll"], now["margins_sampled"]["roll"])
     ]
-    assert len(missed) > 5
+    assert len(missed) >= 3
+    assert all(info["constraint_values"][0] == -info["margins"]["roll"] for info in told)
     plant = env.unwrapped.flight().plant
     assert np.degrees(np.abs(plant["roll"])).max() == pytest.approx(5.0 - min(i["margins"]["roll"] for i in told))
 
@@ -118,7 +121,7 @@ def test_cost_counts_required_constraints_beyond_their_tolerance() -> None:
         highest = heights["z"][50 * k + 1 : 50 * k + 51].max()
         assert info["margins"]["height"] == pytest.approx(1.0 - highest, abs=1e-12)
         beyond = bool(highest > 1.01)
-        assert info["cost"] == beyond + (beyond and info["time"] > 0.9)
+        assert info["cost"] == beyond + (beyond and info["time"] > 0.89)
         assert info["constraint_violation"] == int(beyond)
         assert np.isinf(info["margins"]["later"]) == (info["time"] < 0.89)
     assert infos[0]["cost"] == 0.0
@@ -130,7 +133,7 @@ def test_a_lost_vehicle_terminates_and_time_truncates() -> None:
     env.reset()
     ended = False
     while not ended:
-        observed, reward, terminated, truncated, info = env.step(np.array([1, -1, 0, 0], np.float32))
+        observed, _, terminated, truncated, info = env.step(np.array([1, -1, 0, 0], np.float32))
         ended = terminated or truncated
     assert terminated
     assert not truncated
@@ -247,7 +250,7 @@ def test_the_inner_loop_flies_thrust_and_body_rates() -> None:
     thrust = vehicle.thrust_coefficient * np.sum(plant.speeds[-2] ** 2)
     weight = vehicle.mass * vehicle.gravity
     most = vehicle.thrust_coefficient * 4 * 250.0**2
-    assert thrust == pytest.approx(weight + 0.2 * (most - weight), rel=1e-9)
+    assert thrust == pytest.approx(weight + 0.2 * (most - weight), rel=1e-7)
     assert observed[INDEX["vz"]] > 0.5
     with pytest.raises(ParameterError, match="deviations or speeds"):
         env.controller_action()
@@ -292,6 +295,7 @@ def test_pictures_follow_the_vehicle() -> None:
 
 
 def test_without_gymnasium_the_extra_is_named() -> None:
-    code = "import sys; sys.modules['gymnasium'] = None\nimport quadsim\ntry:\n    import quadsim.gym\nexcept quadsim.QuadsimError as error:\n    print(error)"
+    code = "import sys; sys.modules['gymnasium'] = None\nimport quadsim.errors\n"
+    code += "try:\n    import quadsim.gym\nexcept quadsim.errors.MissingPackageError as error:\n    print(error)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "quadsim.gym needs the package 'gymnasium': pip install 'quadsim[gym]'"
