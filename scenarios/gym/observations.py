@@ -52,11 +52,8 @@ class Observations:
             if part not in get_args(Part):
                 raise UnknownNameError("part of the observation", str(part), get_args(Part))
         units = [STATE_UNITS[i] for i in REFERENCE_STATES]
-        rows = [
-            (f"{name}[{i}]", unit)
-            for i in range(1, preview + 1)
-            for name, unit in zip(REFERENCE_NAMES, units, strict=True)
-        ]
+        named = list(zip(REFERENCE_NAMES, units, strict=True))
+        rows = [(f"{name}[{i}]", unit) for i in range(1, preview + 1) for name, unit in named]
         entries: dict[str, list[tuple[str, str]]] = {
             "state": list(zip(STATE_NAMES, STATE_UNITS, strict=True)),
             "preview": rows,
