@@ -28,11 +28,12 @@ def within(previous: object, kind: type[Law]) -> Law | None:
 
 def observed(previous: object) -> Array | None:
     """(6,) what the law before, or one within it, estimates to disturb: accelerations [m/s^2] and angular ones."""
-    while previous is not None:
-        estimate = getattr(previous, "disturbance", None)
-        if np.shape(estimate) == (6,):
-            return np.array(estimate, float)
-        previous = getattr(previous, "inner", None)
+    law: Any = previous
+    while law is not None:
+        estimate: Any = getattr(law, "disturbance", None)
+        if isinstance(estimate, np.ndarray) and estimate.shape == (6,):
+            return estimate
+        law = getattr(law, "inner", None)
     return None
 
 

@@ -84,6 +84,8 @@ class Guarded:
         self._good: tuple[Array, Array] | None  # the state (12,) of the last accepted answer, and its plan (N, 4)
         self._foreseen: Array | None
         self._target: Array | None
+        self._age: int  # periods in fallback
+        self._hovered: int  # of them on level 2 or 3
         self.reset(model.u_bar)
 
     def reset(self, speeds: Array) -> None:

@@ -293,18 +293,15 @@ class NonlinearMPC:
             if law._last is not None:
                 time, x = law._last
                 self._last = time, np.concatenate([x[:N_BODY], self._rotors])[: self._model.n]
-            if (
-                law._plan is not None
-                and alike
-                and self._model.n == law._model.n
-                and self._model.step == law._model.step
-            ):
+            alike = alike and self._model.n == law._model.n and self._model.step == law._model.step
+            if law._plan is not None and alike:
                 self._plan = resized(law._plan[0], self._nodes + 1), resized(law._plan[1], self._nodes)
             if self._ramp is not None and law._ramp is not None:
                 self._ramp.adopt(law._ramp)
-        if self._observer is not None and (estimate := observed(previous)) is not None:
-            kept = law is not None and law._observer is not None
-            self._observer.adopt(law._observer.estimate if kept else estimate)
+        own = None if law is None else law._observer
+        estimate = observed(previous) if own is None else own.estimate
+        if self._observer is not None and estimate is not None:
+            self._observer.adopt(estimate)
             found = self._observer.estimate
             self._model = replace(self._model, acceleration=found[:3], angular_acceleration=found[3:])
 

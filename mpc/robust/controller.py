@@ -150,9 +150,10 @@ class RobustMPC:
             if self.settings.delay == law.settings.delay:
                 self._ahead = law._ahead
             self._adopt_plan(law)
-        if self._observer is not None and (estimate := observed(previous)) is not None:
-            kept = law is not None and law._observer is not None
-            self._observer.adopt(law._observer.estimate if kept else estimate)
+        own = None if law is None else law._observer
+        estimate = observed(previous) if own is None else own.estimate
+        if self._observer is not None and estimate is not None:
+            self._observer.adopt(estimate)
             self._believe()
 
     @np.errstate(over="ignore", invalid="ignore", divide="ignore")  # numbers out of hand are refused, not warned of

@@ -120,8 +120,12 @@ class ClosedLoop:
     Attributes:
         k: control periods flown so far.
         period: length of one [s].
-        computation: how long commands take, in simulated time; None where they take none.  May be exchanged between
-            periods.
+        controller: what flies it now; see `switch`.
+        computation: how long commands take, in simulated time; None where they take none.
+        motion: of the reference from t_0 on; None where only positions are known.
+        quaternions: whether attitude and body rates are logged beside Euler angles and their rates.
+        answered: the latest time at which a command has come so far [s].
+        before: called with k when a period begins, before anything of it is measured; what changes then acts in it.
         reason: why the flight has ended early; None while it has not.
     """
 
@@ -166,7 +170,9 @@ class ClosedLoop:
         plant.reset(initial_state, initial_speeds)
         controller.reset(initial_speeds)
         self.k, self.period = 0, steps_per_period * plant.timestep
-        self.computation = computation
+        self.controller, self.computation, self.motion = controller, computation, motion
+        self.answered = 0.0
+        self.before: Callable[[int], None] | None = None
         self.reason: str | None = None
         self._criterion: str | None = None
         self._interrupted = False
@@ -177,8 +183,7 @@ class ClosedLoop:
             ground.reset()
         self._plant, self._navigation, self._ground = plant, navigation, ground
         self._reference: Reference = Rows(values=reference) if isinstance(reference, np.ndarray) else reference
-        self._controllers = [(0, controller)]
-        self._steps, self._loss, self._motion, self._quaternions = steps_per_period, loss, motion, quaternions
+        self._steps, self._loss, self.quaternions = steps_per_period, loss, quaternions
         self._draws = rng if rng is not None else np.random.default_rng(0)
         self._start = plant.physics
         self._initial_speeds = np.array(initial_speeds, float)
@@ -188,16 +193,13 @@ class ClosedLoop:
         self._observed: Observation | None = None
         self._samples: list[Sample] | None = [] if recorded else None
         self._last: Sample | None = None
+        self._predicted: list[Array | None] = []  # of the controllers before this one, and how many periods they flew
+        self._switched = 0
 
     @property
-    def controller(self) -> Controller:
-        """What flies it now."""
-        return self._controllers[-1][1]
-
-    @property
-    def controllers(self) -> tuple[tuple[int, Controller], ...]:
-        """All that have flown it, each with the first of its periods."""
-        return tuple(self._controllers)
+    def observed(self) -> bool:
+        """Whether the period that starts now has been observed."""
+        return self._observed is not None
 
     @property
     def time(self) -> float:
@@ -214,18 +216,19 @@ class ClosedLoop:
 
         It is reset, and then told of the one before it where it has a method `adopt(previous)`: an observer, a plan
         and the state of a fallback go on by it.
+
+        Raises:
+            InputError: the period that starts now is observed already, by the preview of the one before.
         """
-        previous = self.controller
+        if self._observed is not None:
+            raise InputError("a controller takes over before a period is observed, not after")
         controller.reset(self._acting.copy())
         adopt = getattr(controller, "adopt", None)
         if adopt is not None:
-            adopt(previous)
-        if self._controllers[-1][0] == self.k:
-            self._controllers.pop()
-        self._controllers.append((self.k, controller))
-        if self._observed is not None:
-            preview = self._reference.preview(self.k, controller.horizon)
-            self._observed = replace(self._observed, preview=preview)
+            adopt(self.controller)
+        if self.k > self._switched:
+            self._predicted.append(self._predict())
+        self.controller, self._switched = controller, self.k
 
     @property
     def observation(self) -> Observation:
@@ -282,7 +285,7 @@ class ClosedLoop:
         samples = self._samples
         control = _control_log(samples, self._initial_speeds, self.period)
         plant_log = _plant_log(samples, self._start, self._initial_speeds, self._yaw, self._plant.timestep)
-        if self._quaternions:
+        if self.quaternions:
             moments = [sample.observation.moment for sample in samples]
             attitudes = np.array([moment.attitude for moment in moments], float).reshape(-1, 4)
             rates = np.array([moment.body_rates for moment in moments], float).reshape(-1, 3)
@@ -293,7 +296,7 @@ class ClosedLoop:
             control=control,
             timing=_timing_log(samples, control.t),
             plant=plant_log,
-            predicted=_predict(self._controllers, control.state, [sample.command for sample in samples]),
+            predicted=_joined([*self._predicted, *([self._predict()] if self.k > self._switched else [])]),
             reason=self.reason,
             interrupted=self._interrupted,
             lost=self._criterion,
@@ -310,6 +313,8 @@ class ClosedLoop:
 
     def _observe(self) -> Observation:
         k, plant, navigation = self.k, self._plant, self._navigation
+        if self.before is not None:
+            self.before(k)
         truth = plant.state()
         state = truth.copy() if navigation is None else navigation.state()
         attitude, body_rates = plant.attitude if navigation is None else navigation.attitude
@@ -327,9 +332,19 @@ class ClosedLoop:
             acting=self._acting,
             attitude=attitude,
             body_rates=body_rates,
-            motion=None if self._motion is None else self._motion.after(k),
+            motion=None if self.motion is None else self.motion.after(k),
         )
         return Observation(k=k, state=state, truth=truth, reference=row, preview=preview, moment=now)
+
+    def _predict(self) -> Array | None:
+        """Positions (K, N, 3) [m] that the controller predicted in its periods; None where it has no model."""
+        predict = getattr(self.controller, "predict", None)
+        samples = (self._samples or [])[self._switched :]
+        if predict is None or not samples:
+            return None
+        states = np.stack([sample.observation.state for sample in samples])
+        found: Array = predict(states, np.stack([sample.command.plan for sample in samples]))[:, :, [0, 2, 4]]
+        return found
 
     def _fly(self, observed: Observation, given: Command | None) -> Sample:
         plant, computation, steps, now = self._plant, self.computation, self._steps, observed.moment
@@ -339,6 +354,7 @@ class ClosedLoop:
             command = self.controller.step(now, observed.state, observed.preview)
             step_s = clock.perf_counter() - started
         delay = 0.0 if computation is None else computation.taken(now.time, command, self._draws)
+        self.answered = max(self.answered, now.time + delay)
         wait = math.ceil(delay / plant.timestep - 1e-6)
         missed = wait > steps  # one that comes just in time acts from the next period on
         due = min(wait, steps)
@@ -395,13 +411,15 @@ def fly(
     Returns:
         The flight, with plant rows at the physics rate.
     """
-    return complete(ClosedLoop(plant, controller, reference, **settings), periods=periods, progress=progress)
+    loop = ClosedLoop(plant, controller, reference, **settings)
+    complete(loop, periods=periods, progress=progress)
+    return loop.log()
 
 
-def complete(loop: ClosedLoop, *, periods: int, progress: Callable[[int], None] | None = None) -> FlightLog:
+def complete(loop: ClosedLoop, *, periods: int, progress: Callable[[int], None] | None = None) -> None:
     """Fly on until a number of control periods have been flown in all.
 
-    Whatever happens in flight ends up in the log: a typed flight error or Ctrl-C ends it early, with its reason and
+    Whatever happens in flight ends up in its log: a typed flight error or Ctrl-C ends it early, with its reason and
     everything up to it.
 
     Args:
@@ -418,7 +436,6 @@ def complete(loop: ClosedLoop, *, periods: int, progress: Callable[[int], None] 
         pass  # the loop has noted it
     except KeyboardInterrupt:
         loop.interrupt()
-    return loop.log()
 
 
 def one_period(sample: Sample, timestep: float) -> FlightLog:
@@ -501,24 +518,10 @@ def _times(count: int, spacing: float) -> Array:
     return np.round(np.arange(count) * spacing, 9)
 
 
-def _predict(
-    controllers: list[tuple[int, Controller]], states: Array, commands: list[Command]
-) -> np.ndarray[Any, np.dtype[np.float32]] | None:
-    """Predicted positions (K, N, 3) [m], each period by its controller; None where one of them has no model.
-
-    N is the shortest horizon.
-    """
-    ends = [first for first, _ in controllers[1:]] + [len(commands)]
-    flown = [(first, min(end, len(commands)), each) for (first, each), end in zip(controllers, ends, strict=True)]
-    found = []
-    for first, end, controller in flown:
-        predict = getattr(controller, "predict", None)  # a controller without a model has none
-        if predict is None:
-            return None
-        if first < end:
-            plans = np.stack([command.plan for command in commands[first:end]])
-            found.append(predict(states[first:end], plans)[:, :, [0, 2, 4]])
-    if not found:
+def _joined(parts: list[Array | None]) -> np.ndarray[Any, np.dtype[np.float32]] | None:
+    """The positions that each controller predicted, as far ahead as all of them did; None where one did not."""
+    found = [part for part in parts if part is not None]
+    if not found or len(found) < len(parts):
         return None
-    shortest = min(positions.shape[1] for positions in found)
-    return np.ascontiguousarray(np.concatenate([each[:, :shortest] for each in found]), dtype=np.float32)
+    shortest = min(part.shape[1] for part in found)
+    return np.ascontiguousarray(np.concatenate([part[:, :shortest] for part in found]), dtype=np.float32)

@@ -85,16 +85,12 @@ class Navigation:
         self._perfect = tuple(name for name in SensorName if name not in sensed)
         self._filter = None if estimator is None else ErrorStateFilter(vehicle, sensors, estimator, timestep=timestep)
 
-    def reschedule(self, faults: Sequence[SensorFault]) -> None:
-        """Let these faults take the place of those before; samples already taken stay as they are.
+    def watches(self, sensor: SensorName) -> bool:
+        """Whether a sensor has had a fault in view from the start, and so may have another."""
+        return any(sampler.watched for sampler in self._samplers if sampler.sensor.name is sensor)
 
-        Raises:
-            ParameterError: a sensor had no fault when this was made, and so is not watched for one.
-        """
-        watched = {sampler.sensor.name for sampler in self._samplers if sampler.watched}
-        for fault in faults:
-            if fault.sensor not in watched:
-                raise ParameterError("fault", "sensor", str(fault.sensor), "one that has had a fault from the start")
+    def reschedule(self, faults: Sequence[SensorFault]) -> None:
+        """Let these faults take the place of those before, of sensors watched; samples already taken stay."""
         for sampler in self._samplers:
             sampler.reschedule(faults)
 

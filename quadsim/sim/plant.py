@@ -142,6 +142,11 @@ class Plant:
         self._rollout.close()
 
     @property
+    def wind(self) -> WindField | None:
+        """How the air moves; None where it never does."""
+        return self._wind
+
+    @property
     def time(self) -> float:
         """Simulated time [s]."""
         return float(self._physics[0, 0])
@@ -245,15 +250,13 @@ class Plant:
             parts.append(self._hold(target, until - self._step))
         return Segment.join(parts)
 
-    def reschedule(self, changes: Sequence[Change]) -> None:
-        """Let from now on happen what these say; what has happened stays, and of these is left out.
+    def allows(self, changes: Sequence[Change]) -> bool:
+        """Whether it was made for changes of these kinds, as it was for those that it was made with."""
+        weighing = not self._reweighed and any(isinstance(each, LOADING) for each in changes)
+        return not (weighing or (not self._by_step and any(isinstance(each, PushChange) for each in changes)))
 
-        Raises:
-            ParameterError: the model was not compiled for one of them: it has to be among those that it is made with.
-        """
-        for kind, possible in ((LOADING, self._reweighed), (PushChange, self._by_step)):
-            if not possible and any(isinstance(each, kind) for each in changes):
-                raise ParameterError("plant", "changes", changes, "of the kinds that the plant was made with")
+    def reschedule(self, changes: Sequence[Change]) -> None:
+        """Let from now on happen what these say, of kinds that it `allows`; what is past of them is left out."""
         self._pending = deque(entry for entry in self._scheduled(changes) if entry[0] >= self._step)
 
     def _scheduled(self, changes: Sequence[Change]) -> list[tuple[int, Change]]:

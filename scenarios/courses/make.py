@@ -42,6 +42,7 @@ from scenarios.schema.course import (
     WindowSpec,
     YawTurnsSpec,
 )
+from scenarios.schema.events import SetpointEvent
 
 if TYPE_CHECKING:
     from scenarios.schema.scenario import Scenario
@@ -115,15 +116,18 @@ def build_motion(scenario: Scenario, vehicle: Vehicle) -> Motion | None:
 def build_course_steps(scenario: Scenario) -> tuple[CourseStep, ...]:
     """The steps of the unfiltered course, channel by channel; a start away from the course is a step at 0.
 
-    Only a course of windows has steps whose settling can be watched.
+    Only a course of windows has steps whose settling can be watched, and only on axes that no set-point takes from it.
     """
     if not isinstance(scenario.reference, StepsSpec):
         return ()
+    taken = {name for event in scenario.events if isinstance(event, SetpointEvent) for name in event.values}
     preview = scenario.controller.horizon * scenario.control_period
     found = []
     for name, (windows, elsewhere), start in zip(
         REFERENCE_NAMES, _channels(scenario, scenario.reference), initial_pose(scenario).tolist(), strict=True
     ):
+        if name in taken:
+            continue
         flown = [step for step in switches(windows, elsewhere, initial=start) if step[0] < scenario.duration]
         ends = [*(time - preview for time, _, _ in flown[1:]), scenario.duration]
         for (time, before, after), until in zip(flown, ends, strict=False):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from operator import itemgetter
 from typing import TYPE_CHECKING, TypeVar
 
@@ -117,6 +117,18 @@ def build_changes(scenario: Scenario, events: Sequence[Event] | None = None) -> 
             fall = event.rise if event.fall is None else event.fall
             found.append(LagChange(time=event.at, rise=event.rise, fall=fall))
     return tuple(found)
+
+
+def check_changes(scenario: Scenario, vehicle: Vehicle, changes: Iterable[Change]) -> None:
+    """Refuse what the vehicle cannot have happen to it.
+
+    Raises:
+        ParameterError: rotors with inertia are to change their speed at once.
+    """
+    rotors = scenario.effects.resolved(vehicle).rotors or RotorDynamics()
+    for change in changes:
+        if isinstance(change, LagChange):
+            rotors.lagging(change.rise, change.fall)
 
 
 def _losses(scenario: Scenario, events: Sequence[Event]) -> Iterator[RotorChange]:

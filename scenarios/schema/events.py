@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Final, Literal
 
 from annotated_types import Len, doc
 from pydantic import Field, model_validator
@@ -17,6 +18,9 @@ from quadsim.sim.effects.wind import WindChange
 from quadsim.state import REFERENCE_NAMES
 from scenarios.schema.base import Spec, Triple
 from scenarios.schema.plugin import is_plain
+
+MOST_EVENTS: Final = 20_000
+"""Of one flight: a person's hand for a quarter of an hour, 20 times a second."""
 
 
 class _Event(Spec):
@@ -85,14 +89,15 @@ class SetpointEvent(_Event):
     @model_validator(mode="after")
     def _check(self) -> SetpointEvent:
         if not self.values:
-            raise ValueError(f"one of {', '.join(REFERENCE_NAMES)} must be given")
+            raise ValueError("x must be given, or y, z or yaw")
         return self
 
     @property
     def values(self) -> dict[str, float]:
-        """What is given, by the names of the axes; [m] and [deg]."""
+        """What is given, by the names of the axes; [m] and [rad]."""
         given = {name: getattr(self, name) for name in REFERENCE_NAMES}
-        return {name: value for name, value in given.items() if value is not None}
+        scales = {"yaw": math.radians(1.0)}
+        return {name: scales.get(name, 1.0) * value for name, value in given.items() if value is not None}
 
 
 class ControllerEvent(_Event):

@@ -11,8 +11,7 @@ from typing import Any, Final
 
 from pydantic import Field, model_validator
 
-from scenarios.schema.base import Spec
-from scenarios.schema.optimisation import Horizon
+from scenarios.schema.base import Horizon, Spec
 
 FORM: Final = "package.module:Class"
 """What the text that names a controller looks like."""

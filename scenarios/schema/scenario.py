@@ -25,6 +25,7 @@ from scenarios.schema.base import LARGEST_SEED, MOST_ENTRIES, Spec, Triple, fiel
 from scenarios.schema.controller import ControllerSpec, changed
 from scenarios.schema.course import ReferenceSpec
 from scenarios.schema.events import (
+    MOST_EVENTS,
     ControllerEvent,
     Event,
     PayloadDropEvent,
@@ -143,10 +144,6 @@ MOST_STEPS: Final = 10_000_000
 """Physics steps, and planned steps (periods times horizon), that one flight may take: each is held in memory."""
 
 
-MOST_EVENTS: Final = 20_000
-"""Of one flight: a person's hand for a quarter of an hour, 20 times a second."""
-
-
 Verdict = Literal["satisfied", "violated", "lost"]
 
 
@@ -205,6 +202,15 @@ class Scenario(Spec):
 
     @model_validator(mode="after")
     def _check(self) -> Scenario:
+        self.require_consistent()
+        return self
+
+    def require_consistent(self) -> None:
+        """Refuse fields that do not go together, each of which may stand by itself.
+
+        Raises:
+            ValueError: so they are.
+        """
         for name, value, unit in (
             ("control_period", self.control_period, self.plant.timestep),
             ("duration", self.duration, self.control_period),
@@ -241,7 +247,6 @@ class Scenario(Spec):
         names += [obstacle.name for obstacle in self.obstacles] + [region.name for region in self.regions]
         if len(set(names)) < len(names):
             raise ValueError(f"constraints must have distinct names; got {names}")
-        return self
 
     def _check_events(self) -> None:
         carried, controller = len(self.effects.load.payloads) if self.effects.load is not None else 0, self.controller
@@ -289,6 +294,14 @@ class Scenario(Spec):
         events = (event for event in self.events if isinstance(event, ControllerEvent))
         for event in sorted(events, key=lambda event: event.at):
             found.append((event.at, changed(found[-1][1] if found else self.controller, event.fields)))
+        return found
+
+    def controller_at(self, time: float) -> ControllerSpec:
+        """The controller that flies at a time [s]."""
+        found = self.controller
+        for at, spec in self.controller_changes:
+            if at <= time + 1e-9:
+                found = spec
         return found
 
     @property
