@@ -11,7 +11,6 @@ from typing import Any, Final
 import gymnasium
 import numpy as np
 from gymnasium.error import ResetNeeded
-from threadpoolctl import ThreadpoolController
 
 from quadsim.controller import Command, Controller, Moment, Phase
 from quadsim.errors import FlightError, InputError, ParameterError
@@ -26,6 +25,7 @@ from scenarios.gym.actions import Action, make_actions
 from scenarios.gym.observations import USUAL, Observations
 from scenarios.gym.randomisation import make_plan
 from scenarios.gym.rendering import Screen, has_display, make_screen
+from scenarios.one_thread import ONE_THREAD
 from scenarios.parts.limits import build_limits
 from scenarios.parts.vehicle import build_vehicle
 from scenarios.run import StartedFlight, start
@@ -127,7 +127,7 @@ class QuadrotorEnv(gymnasium.Env):  # type: ignore[misc]
         )
         self._flight: StartedFlight | None = None
         self._screen: Screen | None = None
-        self._started, self._threads = False, ThreadpoolController()
+        self._started = False
         self.scenario, self.limits = self._base, build_limits(self._base)
 
     @property
@@ -170,8 +170,9 @@ class QuadrotorEnv(gymnasium.Env):  # type: ignore[misc]
         vehicle = build_vehicle(scenario)
         if self._plan is not None:
             self.actions = make_actions(self._action, scenario, vehicle)
-        self._law = OnDemand(lambda: build_controller(scenario, vehicle), scenario.controller.horizon)
-        self._flight = start(scenario, law=self._law)
+        law = OnDemand(lambda: build_controller(scenario, vehicle), scenario.controller.horizon)
+        self._law = None if scenario.controller_changes else law  # events that change it need the controller itself
+        self._flight = start(scenario, self._law)
         self.limits = self._flight.limits
         self._asked: _Asked | None = None
         self._seen, plant = self._flight.observation, self._flight.loop.log().plant
@@ -195,10 +196,10 @@ class QuadrotorEnv(gymnasium.Env):  # type: ignore[misc]
         command = (
             asked.command
             if asked is not None and asked.k == flight.k and np.array_equal(asked.action, action)
-            else self.actions.command(action, seen.moment.body_rates, self._law.horizon)
+            else self.actions.command(action, seen.moment.body_rates, flight.loop.controller.horizon)
         )
         nothing = np.full(len(self.limits), np.inf)
-        with self._threads.limit(limits=1):
+        with ONE_THREAD:
             try:
                 sample = flight.loop.step(command)
             except FlightError:
@@ -230,8 +231,8 @@ class QuadrotorEnv(gymnasium.Env):  # type: ignore[misc]
         if self._asked is None or self._asked.k != flight.k:
             seen = self._seen
             self.actions.of(np.zeros(4))  # which those that stand for no speeds refuse
-            with self._threads.limit(limits=1):
-                command = self._law.step(seen.moment, seen.state, seen.preview)
+            with ONE_THREAD:
+                command = flight.loop.controller.step(seen.moment, seen.state, seen.preview)
             self.action_for(command)
         assert self._asked is not None
         return self._asked.action
@@ -253,7 +254,8 @@ class QuadrotorEnv(gymnasium.Env):  # type: ignore[misc]
 
     def flight(self) -> Flight:
         """This episode so far as a flight: audited, to be saved and drawn like any other."""
-        return self.started.flight()
+        flight = self.started.flight()
+        return flight if self._law is None else replace(flight, controller=self._law.name, solver=self._law.solver)
 
     def render(self) -> np.ndarray[Any, np.dtype[np.uint8]] | None:
         """The picture (height, width, 3) in the mode `rgb_array`; the window of `human` is drawn by each step.

@@ -7,13 +7,13 @@ from typing import Any
 
 import gymnasium
 import numpy as np
-from threadpoolctl import ThreadpoolController
 
 from quadsim.controller import UNCONSTRAINED, Command
 from quadsim.errors import ParameterError
 from quadsim.vehicle import Vehicle
 from scenarios.gym.actions import Action
 from scenarios.gym.environment import QuadrotorEnv
+from scenarios.one_thread import ONE_THREAD
 from scenarios.parts.controllers import make_filter
 from scenarios.schema.robust import RobustSpec
 
@@ -50,7 +50,6 @@ class MPCSafetyFilter(gymnasium.Wrapper):  # type: ignore[misc]
             raise ParameterError("controller", "type", scenario.controller.type, "robust, for a safety filter")
         self._base, self._spec = base, scenario.controller
         self._vehicle: Vehicle | None = None
-        self._threads = ThreadpoolController()
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """See `gymnasium.Env.reset`."""
@@ -83,5 +82,5 @@ class MPCSafetyFilter(gymnasium.Wrapper):  # type: ignore[misc]
         seen, horizon = self._base.started.observation, self._law.horizon
         preview = seen.preview[:horizon]
         preview = np.concatenate([preview, np.repeat(preview[-1:], horizon - len(preview), axis=0)])
-        with self._threads.limit(limits=1):
+        with ONE_THREAD:
             return self._law.step(seen.moment, seen.state, preview)
