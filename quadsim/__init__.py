@@ -45,6 +45,7 @@ if TYPE_CHECKING:
     from scenarios.many_flights import replay as replay
     from scenarios.many_flights import reproduce as reproduce
     from scenarios.many_flights import sweep as sweep
+    from scenarios.many_flights import tune as tune
     from scenarios.schema.json_schema import scenario_schema as scenario_schema
     from scenarios.schema.scenario import Scenario as Scenario
     from scenarios.self_check import doctor as doctor
@@ -81,7 +82,7 @@ _PLACES = {
     "scenarios.catalogue": ("Catalogue", "LibraryScenario", "catalogue", "scenarios"),
     "scenarios.flight": ("Flight",),
     "scenarios.junit": ("write_junit",),
-    "scenarios.many_flights": ("campaign", "replay", "reproduce", "sweep"),
+    "scenarios.many_flights": ("campaign", "replay", "reproduce", "sweep", "tune"),
     "scenarios.schema.json_schema": ("scenario_schema",),
     "scenarios.schema.scenario": ("Scenario",),
     "scenarios.self_check": ("doctor",),
