@@ -149,6 +149,7 @@ def _add_tune(tune: argparse.ArgumentParser) -> None:
     add("--workers", **_NUMBER, help="processes (default: one per core)")
     add("--cluster", metavar="ADDRESS", help="fly on a Dask cluster, as quadsim campaign does")
     add("--resume", action="store_true", help="go on with what is there")
+    add("--report", action=argparse.BooleanOptionalAction, default=True, help="write the report, HTML pages")
     add("--json", **_SUMMARY)
 
 

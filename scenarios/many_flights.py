@@ -162,6 +162,7 @@ def tune(
     workers: int | None = None,
     cluster: str | None = None,
     resume: bool = False,
+    report: bool = True,
     progress: bool | Literal["lines"] = True,
 ) -> TuningResult:
     """Search fields of a scenario, and hold the answer against the start on fresh draws.
@@ -174,6 +175,7 @@ def tune(
         workers: processes that fly; one per usable core where absent.
         cluster: a dask cluster that flies instead, as of `--cluster`.
         resume: whether to go on with what the directory holds.
+        report: whether to write the pages and their figures.
         progress: whether to show a bar on a terminal; "lines" for a line now and then where stderr is none.
 
     Returns:
@@ -204,7 +206,7 @@ def tune(
     target = real_path(Path("runs") / "tunings" / plan.spec.name if out is None else out)
     try:
         with bar(enabled=bool(progress), lines=progress == "lines") as watch:
-            return carry_out(plan, target, make_engine(workers, cluster), resume=resume, watch=watch)
+            return carry_out(plan, target, make_engine(workers, cluster), resume=resume, report=report, watch=watch)
     except KeyboardInterrupt:
         raise KeyboardInterrupt(f"{target} has what was flown") from None
 

@@ -61,6 +61,7 @@ def summarise(plan: TuningPlan, found: Found, start: pa.Table, best: pa.Table) -
         "description": plan.spec.description,
         "scenario": plan.scenario.name,
         "require": plan.requirement.text,
+        "counted": f"P({plan.guard.text}) {plan.requirement.operation} {plan.requirement.share:g}",
         "answer": found.answer.candidate,
         "trials": len(found.scores) - 1,
         "search_flights": sum(each.flights for each in found.scores),

@@ -16,7 +16,7 @@ from quadsim.assets import read_toml
 from quadsim.errors import FileError, InputError, ParameterError, UnknownNameError
 from scenarios.campaign.changes import changed, check_ends
 from scenarios.campaign.plan import Plan, cell, column_type, flown_scenario, locate, read_campaign
-from scenarios.campaign.results.events import parse_event
+from scenarios.campaign.results.events import Event, parse_event
 from scenarios.campaign.spec import Value, VaryBase
 from scenarios.campaign.statistics.requirement import Requirement, parse_requirement
 from scenarios.parts.limits import build_limits
@@ -52,7 +52,7 @@ class TuningPlan:
 
     @cached_property
     def schema(self) -> pa.Schema:
-        """The columns of all flights of the search: a campaign's, with the candidate and its values before the draws."""
+        """The columns of all flights of the search: a campaign's, and the candidate with its values."""
         first, *others = self.start.schema
         own = [("candidate", "-", pa.int64())]
         own += [(SEARCHED + entry.name, entry.unit, column_type(entry)) for entry in self.spec.search]
@@ -62,6 +62,11 @@ class TuningPlan:
     def requirement(self) -> Requirement:
         """The bound on the probability of an event."""
         return parse_requirement(self.spec.require)
+
+    @cached_property
+    def guard(self) -> Event:
+        """The event that counts in the search."""
+        return self.requirement.event if self.spec.guard is None else parse_event(self.spec.guard)
 
     @cached_property
     def expressions(self) -> tuple[Expression, ...]:
@@ -125,16 +130,19 @@ class TuningPlan:
                 require_columns(expression, self.start.columns)
             except UnknownNameError as error:
                 raise InputError(f"objectives.{self.spec.objectives[i].name}.expression: {error}") from error
-        try:
-            parse_event(self.requirement.event.text, self.start.columns)
-        except InputError as error:
-            raise InputError(f"require: {error}") from error
+        for field, event in (("require", self.requirement.event), ("guard", self.guard)):
+            try:
+                parse_event(event.text, self.start.columns)
+            except InputError as error:
+                raise InputError(f"{field}: {error}") from error
         check_ends(self.spec.search, self._at, table="search")
 
     def _at(self, entry: VaryBase, value: Value) -> Scenario:
         found = self.candidate({entry.name: value}, self.spec.name)
         if build_limits(found) != build_limits(self.scenario):
-            rule = "of fields that leave alone what flights are held against: constraints, obstacles, regions, polytopes"
+            rule = (
+                "of fields that leave alone what flights are held against: constraints, obstacles, regions, polytopes"
+            )
             raise ParameterError(f"search.{entry.name}", "fields", entry.fields, rule)
         return found
 

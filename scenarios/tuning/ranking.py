@@ -14,6 +14,7 @@ from typing import Any, Final
 import numpy as np
 
 from quadsim.state import Array
+from scenarios.campaign.results.events import Flags
 from scenarios.campaign.results.table import Row
 from scenarios.tuning.objective import STATISTICS
 from scenarios.tuning.plan import START, TuningPlan
@@ -27,7 +28,7 @@ class Score:
 
     candidate: int
     flights: int  # that it flew
-    count: int  # of them, those with the event of the requirement
+    count: int  # of them, those with the event that counts
     completed: int  # of them, those that were completed and have every objective
     values: tuple[float, ...]  # of the objectives, corrected for the draws that it did not meet
     excess: float  # share of flights with the event, less what is allowed; 1 where no flight was completed
@@ -47,13 +48,14 @@ def score(plan: TuningPlan, rows: Mapping[int, Sequence[Row]], candidate: int) -
         candidate: which.
     """
     own, start = rows[candidate], rows[START]
-    happened = sum(plan.requirement.event.holds(row) for row in own)
+    happened = sum(plan.guard.holds(row) for row in own)
     found = objective_values(plan, own)
-    whole = np.isfinite(found).all(axis=1)
+    whole: Flags = np.asarray(np.isfinite(found).all(axis=1))
     values = (UNKNOWN,) * len(plan.expressions)
     if whole.any():
         reference = objective_values(plan, start)
-        met, there = np.isfinite(reference).all(axis=1), reference[: len(own)]
+        met: Flags = np.asarray(np.isfinite(reference).all(axis=1))
+        there = reference[: len(own)]
         both = whole & met[: len(own)]
         statistics = [STATISTICS[objective.statistic] for objective in plan.spec.objectives]
         values = tuple(
@@ -89,7 +91,8 @@ def ranked(scores: Sequence[Score]) -> list[Score]:
     """
     feasible = [each for each in scores if each.feasible]
     values = np.array([each.values for each in feasible]).reshape(len(feasible), -1)
-    order = np.lexsort(([each.candidate for each in feasible], distances(values), fronts(values)))
+    numbers = np.array([each.candidate for each in feasible], int)
+    order = np.lexsort((numbers, distances(values), fronts(values)))
     others = sorted((each for each in scores if not each.feasible), key=lambda each: (each.excess, each.values))
     return [*(feasible[i] for i in order), *others]
 
@@ -137,12 +140,14 @@ def answer(plan: TuningPlan, scores: Sequence[Score]) -> Score:
         return ranked([each for each in scores if each.flights == plan.most])[0]
     start = next(each for each in scores if each.candidate == START)
     no_worse = [
-        each
-        for each in front
-        if start.feasible and all(a <= b for a, b in zip(each.values, start.values, strict=True))
+        each for each in front if start.feasible and all(a <= b for a, b in zip(each.values, start.values, strict=True))
     ]
     near = distances(np.array([each.values for each in front]))
     allowed = {each.candidate for each in no_worse or front}
     return min(
-        ((distance, each.candidate, each) for distance, each in zip(near, front, strict=True) if each.candidate in allowed)
+        (
+            (distance, each.candidate, each)
+            for distance, each in zip(near, front, strict=True)
+            if each.candidate in allowed
+        )
     )[2]

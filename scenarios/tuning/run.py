@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import tempfile
 import time as clock
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
@@ -75,7 +75,13 @@ class TuningResult:
 
 
 def tune(
-    plan: TuningPlan, directory: Path, engine: Engine, *, resume: bool = False, watch: Watch = lambda standing: None
+    plan: TuningPlan,
+    directory: Path,
+    engine: Engine,
+    *,
+    resume: bool = False,
+    report: bool = True,
+    watch: Watch = lambda standing: None,
 ) -> TuningResult:
     """Search, or go on with it, and hold the answer against the start.
 
@@ -88,6 +94,7 @@ def tune(
         directory: where its results go.
         engine: who flies.
         resume: whether to go on with what the directory holds, perhaps with more trials.
+        report: whether to write the pages and their figures.
         watch: called with the progress, as answers come.
 
     Raises:
@@ -116,7 +123,7 @@ def tune(
             found = _conclude(plan, search, flights)
             files.remove(path.name for path in sorted(directory.glob("front-*.toml")))
             files.write({ANSWER_FILE: found.best.to_toml().encode(), **_front(plan, found)})
-            result = _validate(plan, files, engine, found, table, watch)
+            result = _validate(plan, files, engine, found, table, report=report, watch=watch)
             manifest["status"] = "complete"
         except BaseException:
             manifest["status"] = "interrupted"
@@ -239,7 +246,7 @@ def _front(plan: TuningPlan, found: Found) -> dict[str, bytes]:
 
 
 def _validate(
-    plan: TuningPlan, files: Growing, engine: Engine, found: Found, table: pa.Table, watch: Watch
+    plan: TuningPlan, files: Growing, engine: Engine, found: Found, table: pa.Table, *, report: bool, watch: Watch
 ) -> TuningResult:
     """Fly the start and the answer on fresh draws, compare them, and write what came of it all."""
     best = found.answer.candidate
@@ -250,16 +257,20 @@ def _validate(
         directory = files.path / folder
         folders.append(folder)
         resume = records.is_campaign(directory)
-        tables.append(fly_campaign(campaign, directory, engine, resume=resume, watch=watch).table)
+        tables.append(fly_campaign(campaign, directory, engine, resume=resume, report=report, watch=watch).table)
     comparison = None
     if best != START:
         comparison = compare(tables[0], tables[1], NAMES)
+    if comparison is not None and report:
         write_comparison_report(comparison, files.path / COMPARISON_DIR)
     summary = summarise(plan, found, tables[0], tables[-1])
     files.write({SUMMARY_FILE: to_json(summary).encode()})
-    with tempfile.TemporaryDirectory() as scratch:
-        write_report(Path(scratch), summary=summary, tables=tables, campaigns=folders)
-        files.write({name: (Path(scratch) / name).read_bytes() for name in REPORT_FILES})
+    if report:
+        with tempfile.TemporaryDirectory() as scratch:
+            write_report(Path(scratch), summary=summary, tables=tables, campaigns=folders)
+            files.write({name: (Path(scratch) / name).read_bytes() for name in REPORT_FILES})
+    else:
+        files.remove(REPORT_FILES)
     return TuningResult(directory=files.path, best=found.best, table=table, summary=summary, comparison=comparison)
 
 
@@ -296,8 +307,8 @@ def _go_on(plan: TuningPlan, files: Growing) -> dict[str, Any]:
         differing.append("trials")
     if differing:
         raise InputError(
-            f"{files.path}: --resume goes on with the same tuning alone, and its {', '.join(differing)} differs from the "
-            "one there; more trials and more fresh flights may follow; choose another --out"
+            f"{files.path}: --resume goes on with the same tuning alone, and its {', '.join(differing)} differs from "
+            "the one there; more trials and more fresh flights may follow; choose another --out"
         )
     other = [name for name in records.other_than_flew(manifest, plan.start) if name != "machine"]
     if manifest["optuna"] != require_optuna().__version__:

@@ -166,16 +166,14 @@ class Search:
         """The start as a trial's parameters; none where it is outside of what is searched."""
         found = {}
         for entry in self._plan.spec.search:
-            if entry.name not in self._plan.start_values:
+            value = self._plan.start_values.get(entry.name)
+            if isinstance(entry, ChoiceSpec):
+                inside = value in entry.values
+            else:
+                inside = isinstance(value, int | float) and entry.low <= value <= entry.high
+            if value is None or not inside:
                 return {}
-            value = cell(self._plan.start_values[entry.name])
-            if isinstance(entry, IntegerSpec):
-                value = int(value) if float(value) == int(value) else value
-            allowed = map(cell, entry.values) if isinstance(entry, ChoiceSpec) else None
-            inside = value in allowed if allowed is not None else entry.low <= value <= entry.high
-            if not inside:
-                return {}
-            found[entry.name] = value
+            found[entry.name] = cell(value) if isinstance(entry, ChoiceSpec) else value
         return found
 
     def _write(self) -> None:
@@ -186,18 +184,19 @@ class Search:
 
 
 def _value(entry: SearchSpec, parameter: Any) -> Value:
-    if isinstance(entry, ChoiceSpec):
-        return next(value for value in entry.values if cell(value) == parameter)
-    return parameter  # type: ignore[no-any-return]
+    found: Value = parameter
+    return next(value for value in entry.values if cell(value) == found) if isinstance(entry, ChoiceSpec) else found
 
 
 def _distribution(optuna: Any, entry: SearchSpec) -> BaseDistribution:
-    kinds = optuna.distributions
+    kinds, found = optuna.distributions, None
     if isinstance(entry, ChoiceSpec):
-        return kinds.CategoricalDistribution([cell(value) for value in entry.values])  # type: ignore[no-any-return]
-    if isinstance(entry, IntegerSpec):
-        return kinds.IntDistribution(entry.low, entry.high)  # type: ignore[no-any-return]
-    return kinds.FloatDistribution(entry.low, entry.high, log=isinstance(entry, LogUniformSpec))  # type: ignore[no-any-return]
+        found = kinds.CategoricalDistribution([cell(value) for value in entry.values])
+    elif isinstance(entry, IntegerSpec):
+        found = kinds.IntDistribution(entry.low, entry.high)
+    else:
+        found = kinds.FloatDistribution(entry.low, entry.high, log=isinstance(entry, LogUniformSpec))
+    return found
 
 
 def _read(files: Growing) -> list[Mapping[str, Any]]:
@@ -221,7 +220,7 @@ def _journal(logs: list[Mapping[str, Any]]) -> Any:
     """A back end of Optuna's journal storage that keeps its entries in a list."""
     from optuna.storages.journal import BaseJournalBackend
 
-    class Kept(BaseJournalBackend):
+    class Kept(BaseJournalBackend):  # type: ignore[misc]
         def read_logs(self, log_number_from: int) -> Iterable[dict[str, Any]]:
             return [dict(log) for log in logs[log_number_from:]]
 

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Final, Literal
+from typing import Annotated, Any, Final, Literal
 
 import tomlkit
 from annotated_types import MaxLen, MinLen
 from pydantic import Field, model_validator
 
 from quadsim.errors import InputError
+from scenarios.campaign.results.events import parse_event
 from scenarios.campaign.spec import (
     MOST_FLIGHTS,
     CampaignSpec,
@@ -83,6 +84,11 @@ class TuningSpec(Spec):
         description='what no answer may fail, e.g. "P(violation) < 0.01 @ 95%": in the search by the share of flights, '
         "on fresh draws with that confidence"
     )
+    guard: str | None = Field(
+        default=None,
+        description='an event that counts instead of that of require in the search, e.g. "worst_margin < 0.02": few '
+        "flights see near misses before they see failures",
+    )
     fresh: FreshSpec = FreshSpec()
     objectives: Annotated[list[ObjectiveSpec], MinLen(1), MaxLen(2)] = Field(
         description="one, or two for a Pareto front"
@@ -110,13 +116,18 @@ class TuningSpec(Spec):
             asked = parse_requirement(self.require)
         except InputError as error:
             raise ValueError(f"require: {error}") from error
+        try:
+            parse_event(self.guard or asked.event.text)
+        except InputError as error:
+            raise ValueError(f"guard: {error}") from error
         if not asked.at_most:
             raise ValueError(f"require must keep a probability small, with < or <=; got {self.require!r}")
         return self
 
     def to_toml(self) -> str:
         """The file with every field, defaults included; reading it gives this tuning again."""
-        document = tomlkit.parse(to_toml(self))
+        document: Any = tomlkit.parse(to_toml(self))
         for name in OWN:
-            document["campaign"].remove(name)  # type: ignore[union-attr]
-        return document.as_string()
+            document["campaign"].remove(name)
+        text: str = document.as_string()
+        return text

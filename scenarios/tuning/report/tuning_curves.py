@@ -70,7 +70,9 @@ def ends(drawn: Sequence[Candidates], axis: str) -> tuple[float, float]:
 def front(summary: Summary) -> tuple[Array, Array]:
     """The Pareto front as a line: second objective, first objective."""
     there = {each["candidate"]: each["values"] for each in summary["candidates"]}
-    points = np.array([there[candidate] for candidate in summary["front"]], float).reshape(-1, len(summary["objectives"]))
+    points = np.array([there[candidate] for candidate in summary["front"]], float).reshape(
+        -1, len(summary["objectives"])
+    )
     order = np.argsort(points[:, -1])
     return points[order, -1], points[order, 0]
 

@@ -28,10 +28,11 @@ def verdict_sentence(summary: Summary) -> str:
 def sentences(summary: Summary) -> list[str]:
     """What the search and the fresh flights show, one fact each."""
     fresh, event = summary["fresh"], summary["event"]
+    feasible = sum(each["feasible"] for each in summary["candidates"])
     found = [
         f"{count_of(summary['trials'], 'candidate')} and the start flew {summary['search_flights']} flights, each the "
-        f"first of the same {summary['draws']} draws; {sum(each['feasible'] for each in summary['candidates'])} of them "
-        f"kept {summary['require'].partition('@')[0].strip()} there by the share of flights."
+        f"first of the same {summary['draws']} draws; {feasible} of them "
+        f"kept {summary['counted']} there by the share of flights."
     ]
     for each in summary["objectives"] if summary["answer"] != START else ():
         if each["kept"] is None:
@@ -100,16 +101,18 @@ def objective_table(summary: Summary) -> Grid:
             *("start, fresh", "best, fresh", "kept", "optimism [points]"),
         ),
         lines=tuple(lines),
-        note="Search: over the draws that chose the answer, among so many candidates that luck chose with them. Fresh: "
-        "over draws that nothing was chosen by, of the pairs that both completed. Optimism: what was kept less what was "
-        "promised, in percentage points of the start; above 0, the search promised too much.",
+        note="Search: over the draws that chose the answer, so that luck chose with them. Fresh: over draws that chose "
+        "nothing, of the pairs that both completed. Optimism: what was kept less what was promised, in percentage "
+        "points of the start; above 0, the search promised too much.",
     )
 
 
 def candidate_table(summary: Summary) -> Grid:
     """The candidates that flew all draws, the best first."""
     whole = [each for each in summary["candidates"] if each["flights"] == summary["draws"]]
-    order = sorted(whole, key=lambda each: (not each["feasible"], each["excess"] > 0 and each["excess"], each["values"]))
+    order = sorted(
+        whole, key=lambda each: (not each["feasible"], each["excess"] > 0 and each["excess"], each["values"])
+    )
     names = [entry["name"] for entry in summary["search"]]
     lines = []
     for each in order[:_MOST_SHOWN]:
@@ -122,7 +125,7 @@ def candidate_table(summary: Summary) -> Grid:
             line(title, *values, f"{each['count']} of {each['flights']}", *(_value(each["search"][n]) for n in names))
         )
     objectives = (label(each["name"], each["unit"]) for each in summary["objectives"])
-    event = summary["require"].partition("(")[2].partition(")")[0]
+    event = summary["counted"].partition("(")[2].partition(")")[0]
     return Grid(
         key="candidates",
         title="Candidates that flew all draws of the search",
@@ -146,7 +149,7 @@ def importance_table(summary: Summary) -> Grid:
         head=("field", *found),
         lines=tuple(lines),
         note="PED-ANOVA (Watanabe, Bansal and Hutter, 2023): how far the best tenth of the feasible candidates differs "
-        "from all of them, field by field, as shares of the sum. The search itself crowds where it is good, so that few "
+        "from all of them, field by field, as shares of the sum. The search crowds where it is good, so that few "
         "candidates say little.",
     )
 
