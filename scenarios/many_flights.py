@@ -189,10 +189,29 @@ def tune(
         KeyboardInterrupt: a person stopped it; what was flown is there, and `resume` goes on with it.
 
     Examples:
-        >>> import quadsim
-        >>> found = quadsim.tune("hummingbird-figure-eight", workers=2)  # doctest: +SKIP
-        >>> quadsim.fly(found.best).outcome  # doctest: +SKIP
-        'satisfied'
+        >>> import tempfile, pathlib, quadsim
+        >>> text = '''
+        ... name = "little"
+        ... trials = 2
+        ... batch = 2
+        ... flights = [1]
+        ... require = "P(lost) < 0.9 @ 50%"
+        ... fresh = { flights = 2 }
+        ... objectives = [{ name = "error", expression = "rmse.z" }]
+        ... campaign = { scenario = "hover", set = { duration = 0.5, constraints = [] } }
+        ... [[search]]
+        ... name = "horizon"
+        ... fields = ["controller.horizon"]
+        ... distribution = "integer"
+        ... low = 10
+        ... high = 20
+        ... '''
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     file = pathlib.Path(folder) / "little.toml"
+        ...     _ = file.write_text(text)
+        ...     found = quadsim.tune(file, out=folder + "/little", workers=1, report=False)
+        >>> len(found.summary["candidates"]), found.holds
+        (3, True)
     """
     from scenarios.commands.campaign_console import progress as bar
     from scenarios.tuning.plan import load_tuning

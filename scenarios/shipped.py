@@ -1,4 +1,4 @@
-"""What ships, by name: scenarios, campaigns and controllers.  Found without anything heavy, for `quadsim list`."""
+"""What ships, by name, from scenarios to papers.  Found without anything heavy, for `quadsim list`."""
 
 from __future__ import annotations
 

@@ -90,7 +90,7 @@ def ranked(scores: Sequence[Score]) -> list[Score]:
     better than in every objective come first, and so on; within such a front, those near the ideal point.
     """
     feasible = [each for each in scores if each.feasible]
-    values = np.array([each.values for each in feasible]).reshape(len(feasible), -1)
+    values = np.array([each.values for each in feasible]).reshape(len(feasible), len(scores[0].values))
     numbers = np.array([each.candidate for each in feasible], int)
     order = np.lexsort((numbers, distances(values), fronts(values)))
     others = sorted((each for each in scores if not each.feasible), key=lambda each: (each.excess, each.values))
