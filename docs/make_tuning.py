@@ -16,6 +16,7 @@ from make_numbers import copy_figure, write_page
 import quadsim
 from quadsim.flight.form import read_json
 from quadsim.report.table import Grid, format_number, line, section
+from scenarios.campaign.statistics.wording import count_of
 from scenarios.shipped import tuning_names
 from scenarios.tuning.objective import parse_expression
 from scenarios.tuning.report import tuning_tables
@@ -51,16 +52,17 @@ def part(name: str, directory: Path) -> str:
     manifest = read_json(directory / "manifest.json", {}, "a tuning's manifest")
     copy_figure(directory / "tuning.png", f"tuning-{name}.png", 256)
     times = [session["wall_s"] for session in manifest["sessions"]]
-    machine = manifest["machine"]
+    machine, most = manifest["machine"], max(session["workers"] for session in manifest["sessions"])
+    workers = f"{count_of(most, 'worker')} ({machine['processor']}, {machine['cores']} cores)"
     return "\n".join(
         [
             f"## {name}\n\n{summary['description']}.\n",
             f"**{tuning_tables.verdict_sentence(summary)}.** {' '.join(tuning_tables.sentences(summary))}\n",
             f"![{name}: candidates, importance, fresh flights](tuning-{name}.png)\n",
-            *(section(grid, 3) for grid in (*tuning_tables.tables(summary), tuning_tables.importance_table(summary))),
+            *(section(grid, 3) for grid in tuning_tables.tables(summary)),
+            section(tuning_tables.importance_table(summary), 3),
             section(nominal(directory, summary), 3),
-            f"Flown in {sum(times) / 60.0:.0f} minutes of wall clock ({machine['processor']}, {machine['cores']} cores, "
-            f"workers: {', '.join(sorted({str(session['workers']) for session in manifest['sessions']}))}).\n",
+            f"Wall clock {sum(times) / 60.0:.0f} min with {workers}.\n",
         ]
     )
 
@@ -75,7 +77,7 @@ def main() -> None:
     parts = [part(name, carry_out(name, there=options.there, workers=options.workers)) for name in names]
     write_page(
         "tuning.md",
-        "# What tuning finds\n\nMade by `make tuning` from the tunings that ship. How tunings work: [tune.md](tune.md). "
+        "# What tuning finds\n\nMade by `make tuning` from the tunings that ship. How tunings work: [tune.md](tune.md).\n"
         "Search: the draws that chose the answer; fresh: draws that chose nothing.\n",
         *parts,
     )

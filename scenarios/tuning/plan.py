@@ -12,7 +12,6 @@ from typing import Any, Final
 import pyarrow as pa
 from pydantic import ValidationError
 
-from quadsim.assets import read_toml
 from quadsim.errors import FileError, InputError, ParameterError, UnknownNameError
 from scenarios.campaign.changes import changed, check_ends
 from scenarios.campaign.plan import Plan, cell, column_type, flown_scenario, locate, read_campaign
@@ -20,7 +19,7 @@ from scenarios.campaign.results.events import Event, parse_event
 from scenarios.campaign.spec import Value, VaryBase
 from scenarios.campaign.statistics.requirement import Requirement, parse_requirement
 from scenarios.parts.limits import build_limits
-from scenarios.schema.bases import LARGEST_FILE, merge
+from scenarios.schema.bases import merge, read_scenario
 from scenarios.schema.problems import ScenarioError, describe
 from scenarios.schema.scenario import Scenario
 from scenarios.schema.settings import get_field
@@ -160,14 +159,12 @@ def load_tuning(name: str, *, trials: int | None = None, seed: int | None = None
     """
     path = tuning_path(name)
     try:
-        if path.stat().st_size > LARGEST_FILE:
-            raise FileError(path, f"must be of {LARGEST_FILE} or fewer bytes")
-        data = read_toml(path)
-        campaign = data.get("campaign")
-        if isinstance(campaign, dict):
-            data["campaign"] = _whole_campaign(campaign, path.parent)
-    except (RecursionError, OSError) as error:
-        raise FileError(path, f"cannot be read ({getattr(error, 'strerror', None) or 'nested too deep'})") from error
+        data = read_scenario(path, tuning_path, locate=_locate)
+        _locate(data, path.parent)
+        if isinstance(campaign := data.get("campaign"), dict):
+            data["campaign"] = _whole_campaign(campaign)
+    except OSError as error:
+        raise FileError(path, f"cannot be read ({error.strerror})") from error
     data |= {key: value for key, value in (("trials", trials), ("seed", seed)) if value is not None}
     return make_tuning(data, path)
 
@@ -180,7 +177,11 @@ def make_tuning(data: Mapping[str, Any], path: Path) -> TuningPlan:
     """
     filled = dict(data)
     if isinstance(campaign := data.get("campaign"), dict):
-        filled["campaign"] = {"name": "tuned", "flights": 1, **campaign}  # the tuning's own take their place
+        flights = data.get("flights") or TuningSpec.model_fields["flights"].default
+        most = (
+            flights[-1] if isinstance(flights, list) else flights
+        )  # what is wrong with it is told of the tuning's own
+        filled["campaign"] = {"name": "tuned", "flights": most if isinstance(most, int) else 1, **campaign}
     try:
         spec = TuningSpec.model_validate(filled)
     except ValidationError as error:
@@ -197,7 +198,7 @@ def make_tuning(data: Mapping[str, Any], path: Path) -> TuningPlan:
     return plan
 
 
-def _whole_campaign(campaign: dict[str, Any], directory: Path) -> dict[str, Any]:
+def _whole_campaign(campaign: Mapping[str, Any]) -> dict[str, Any]:
     """The tables of `[campaign]`, merged over its base's.
 
     Raises:
@@ -208,11 +209,17 @@ def _whole_campaign(campaign: dict[str, Any], directory: Path) -> dict[str, Any]
         raise InputError(f"campaign must not have {given[0]}: a tuning has its own")
     own = dict(campaign)
     base = own.pop("base", None)
-    locate(own, directory)
     if base is None:
         return own
     if not isinstance(base, str):
         raise ParameterError("campaign", "base", base, "a campaign's name or a path ending in .toml")
-    beside = directory / base
-    inherited = read_campaign(str(beside) if base.endswith(".toml") and beside.is_file() else base)
-    return merge({name: value for name, value in inherited.items() if name not in OWN}, own)
+    return merge({name: value for name, value in read_campaign(base).items() if name not in OWN}, own)
+
+
+def _locate(data: dict[str, Any], directory: Path) -> None:
+    """Make the paths in a tuning's tables independent of its folder, in place."""
+    if isinstance(campaign := data.get("campaign"), dict):
+        locate(campaign, directory)
+        base = campaign.get("base")
+        if isinstance(base, str) and base.endswith(".toml") and (directory / base).is_file():
+            campaign["base"] = str((directory / base).resolve())

@@ -96,6 +96,16 @@ def test_those_that_ship_can_be_flown(name: str) -> None:
     assert set(plan.start_values) == {each.name for each in plan.spec.search}
 
 
+def test_a_file_may_say_what_differs_alone(tmp_path: Path) -> None:
+    write_tuning(tmp_path, campaign=campaign(base="held.toml"))
+    (tmp_path / "held.toml").write_text('base = "paper-nominal"\nname = "held"\nfailure = ["lost"]\n', encoding="utf-8")
+    (tmp_path / "shorter.toml").write_text('base = "little.toml"\ntrials = 12\n', encoding="utf-8")
+    found = load_tuning(str(tmp_path / "shorter.toml")).spec
+    assert (found.trials, found.batch, found.name) == (12, 6, "little")
+    assert found.campaign.failure == ["lost"]
+    assert [each.name for each in found.campaign.vary][-1] == "pitch"
+
+
 def test_a_file_written_out_is_the_same_tuning(tmp_path: Path) -> None:
     plan = load_tuning(str(write_tuning(tmp_path)))
     written = tmp_path / "again.toml"
