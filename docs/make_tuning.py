@@ -77,7 +77,7 @@ def main() -> None:
     parts = [part(name, carry_out(name, there=options.there, workers=options.workers)) for name in names]
     write_page(
         "tuning.md",
-        "# What tuning finds\n\nMade by `make tuning` from the tunings that ship. How tunings work: [tune.md](tune.md).\n"
+        "# What tuning finds\n\nMade by `make tuning` from the tunings that ship, as [tune.md](tune.md) says.\n"
         "Search: the draws that chose the answer; fresh: draws that chose nothing.\n",
         *parts,
     )
