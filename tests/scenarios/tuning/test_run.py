@@ -5,6 +5,11 @@ from __future__ import annotations
 import functools
 import importlib
 import json
+import os
+import signal
+import subprocess
+import sys
+import time as clock
 from pathlib import Path
 from typing import Any
 
@@ -120,6 +125,41 @@ def test_an_interrupted_search_ends_as_it_would_have(
     assert [session["flights"] for session in manifest["sessions"]] == [5, 21, 40, 7, len(last.flown) - fresh]
 
 
+KILLED = """
+import sys, time
+from pathlib import Path
+from scenarios.tuning.plan import load_tuning
+from scenarios.tuning.run import tune
+from tuning_formula import Formula
+
+class Slow(Formula):
+    def answers(self, pilot, flights):
+        for row in super().answers(pilot, flights):
+            time.sleep(0.01)
+            yield row
+
+tune(load_tuning(sys.argv[1]), Path(sys.argv[2]), Slow(), report=False)
+"""
+
+
+def test_a_killed_search_ends_as_it_would_have(plan: TuningPlan, whole: TuningResult, tmp_path: Path) -> None:
+    """SIGKILL, once some flights of the second batch are on the disk."""
+    target = tmp_path / "t"
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+    command = [sys.executable, "-c", KILLED, str(tmp_path / "little.toml"), str(target)]
+    process = subprocess.Popen(command, env=environment)
+    until = clock.monotonic() + 120.0
+    while len(list((target / "parts").glob("*.parquet"))) < 6:
+        assert process.poll() is None
+        assert clock.monotonic() < until
+        clock.sleep(0.005)
+    process.kill()
+    assert process.wait() == -signal.SIGKILL
+    engine = Formula()
+    assert content(tune(plan, target, engine, resume=True)) == content(whole)
+    assert len(engine.flown) < whole.table.num_rows
+
+
 def test_more_trials_may_follow(plan: TuningPlan, whole: TuningResult, tmp_path: Path) -> None:
     few = load_tuning(str(write_tuning(tmp_path)), trials=12)
     tune(few, tmp_path / "t", Formula())
@@ -213,7 +253,7 @@ def test_without_optuna_the_message_names_the_extra(
     plan: TuningPlan, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     search = importlib.import_module("scenarios.tuning.search")
-    monkeypatch.setitem(__import__("sys").modules, "optuna", None)
+    monkeypatch.setitem(sys.modules, "optuna", None)
     with pytest.raises(
         MissingPackageError, match=r"a tuning needs the package 'optuna': pip install 'quadsim\[tune\]'"
     ):
