@@ -53,11 +53,7 @@ def begin(plan: Plan, files: Growing) -> dict[str, Any]:
         "flown": 0,
         "files": {name: digest(text) for name, text in texts.items()},
         **flown_by(plan),
-        **(
-            {"controller_code": find_code(own).digest}
-            if isinstance(own := plan.scenario.controller, PluginSpec)
-            else {}
-        ),
+        **controller_code(plan),
         "sessions": [],
     }
     write(manifest, files)
@@ -131,6 +127,12 @@ def other_than_flew(manifest: Mapping[str, Any], plan: Plan) -> list[str]:
     if isinstance(plan.scenario.controller, PluginSpec):
         announce_recorded(plan.scenario.controller, manifest.get("controller_code", manifest.get("controller")))
     return [name for name, value in flown_by(plan).items() if manifest.get(name) != value]
+
+
+def controller_code(plan: Plan) -> dict[str, Any]:
+    """The digest of a controller that is not ours, for `other_than_flew` to tell of."""
+    own = plan.scenario.controller
+    return {"controller_code": find_code(own).digest} if isinstance(own, PluginSpec) else {}
 
 
 def flown_by(plan: Plan) -> dict[str, Any]:

@@ -78,7 +78,7 @@ def _draw_importance(axes: Axes, summary: curves.Summary) -> None:
         axes.barh(rows, [100.0 * shares.get(name, 0.0) for name in names], height, color=LINES[i], label=objective)
     axes.set_yticks(range(len(names)), names)
     axes.invert_yaxis()
-    axes.legend(fontsize=7.0, loc="lower right")
+    axes.legend(fontsize=7.0)
 
 
 def _draw_pairs(axes: Axes, summary: curves.Summary, tables: Sequence[pa.Table]) -> None:

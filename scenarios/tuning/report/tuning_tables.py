@@ -16,7 +16,8 @@ _MOST_SHOWN: Final = 12
 def verdict_sentence(summary: Summary) -> str:
     """What is better, by how much, on fresh draws."""
     if summary["answer"] == START:
-        return f"No candidate of {summary['trials']} was better than the start"
+        both = " in both objectives" if len(summary["objectives"]) == 2 else ""
+        return f"No candidate of {summary['trials']} was better than the start{both}"
     parts = [
         f"{each['name']} {format_number(each['fresh_best'])} against {format_number(each['fresh_start'])}"
         f"{'' if each['unit'] == '-' else ' ' + each['unit']} ({_percent(each['kept'])})"
