@@ -22,6 +22,7 @@ from scenarios.tuning.objective import parse_expression
 from scenarios.tuning.report import tuning_tables
 
 MADE_OF = Path("runs") / "tunings"
+BESIDE = {"paper-robust": "paper-constrained"}  # a scenario whose nominal flight stands beside a tuning's
 
 
 def carry_out(name: str, *, there: bool, workers: int | None) -> Path:
@@ -31,8 +32,10 @@ def carry_out(name: str, *, there: bool, workers: int | None) -> Path:
 
 
 def nominal(directory: Path, summary: dict[str, Any]) -> Grid:
-    """The start and the answer as they fly with nothing drawn."""
-    flights = [quadsim.fly(quadsim.load(directory / name), progress=False) for name in ("scenario.toml", "best.toml")]
+    """The start and the answer as they fly with nothing drawn, and what is to stand beside them."""
+    flown: dict[str, str | Path] = {"start": directory / "scenario.toml", "best": directory / "best.toml"}
+    flown |= {name: name for tuning, name in BESIDE.items() if tuning == summary["tuning"]}
+    flights = [quadsim.fly(quadsim.load(file), progress=False) for file in flown.values()]
     lines = []
     for objective in summary["objectives"]:
         expression = parse_expression(objective["expression"])
@@ -41,9 +44,7 @@ def nominal(directory: Path, summary: dict[str, Any]) -> Grid:
     for axis in ("x", "y", "z"):
         lines.append(line(f"rmse.{axis} [m]", *(format_number(flight.metrics[f"rmse.{axis}"]) for flight in flights)))
     lines.append(line("verdict", *(flight.outcome for flight in flights)))
-    return Grid(
-        key="nominal", title="With nothing drawn", head=("one flight each", "start", "best"), lines=tuple(lines)
-    )
+    return Grid(key="nominal", title="With nothing drawn", head=("one flight each", *flown), lines=tuple(lines))
 
 
 def part(name: str, directory: Path) -> str:
@@ -57,7 +58,8 @@ def part(name: str, directory: Path) -> str:
     return "\n".join(
         [
             f"## {name}\n\n{summary['description']}.\n",
-            f"**{tuning_tables.verdict_sentence(summary)}.** {' '.join(tuning_tables.sentences(summary))}\n",
+            f"**{tuning_tables.verdict_sentence(summary)}.**\n",
+            "".join(f"- {sentence}\n" for sentence in tuning_tables.sentences(summary)),
             f"![{name}: candidates, importance, fresh flights](tuning-{name}.png)\n",
             *(section(grid, 3) for grid in tuning_tables.tables(summary)),
             section(tuning_tables.importance_table(summary), 3),

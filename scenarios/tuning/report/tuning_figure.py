@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 import pyarrow as pa
@@ -19,6 +20,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+_LINE: Final = 96  # characters of a line of the title
+
 
 def write_tuning_figure(summary: curves.Summary, tables: Sequence[pa.Table], directory: Path) -> list[Path]:
     """Draw `tuning.png` and `.svg`: the candidates, what matters, and the fresh flights pair by pair.
@@ -30,7 +33,8 @@ def write_tuning_figure(summary: curves.Summary, tables: Sequence[pa.Table], dir
 
 
 def _draw(summary: curves.Summary, tables: Sequence[pa.Table]) -> Figure:
-    figure = new_figure(f"{summary['tuning']}: {verdict_sentence(summary)}", 9.6, 3.8)
+    title = textwrap.fill(f"{summary['tuning']}: {verdict_sentence(summary)}", _LINE)
+    figure = new_figure(title, 9.6, 4.0)
     first, second, third = figure.subplots(1, 3, width_ratios=(1.25, 1.0, 1.0))
     _draw_candidates(first, summary)
     _draw_importance(second, summary)
