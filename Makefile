@@ -4,7 +4,7 @@
 
 .NOTPARALLEL:
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test peers check docs format types build numbers verification nonlinear robustness first-flights reproduce speed soak campaigns kills safety pins clean
+.PHONY: help setup demo test peers check docs format types build numbers verification nonlinear robustness first-flights reproduce speed soak campaigns tuning kills safety pins clean
 
 VENV := .venv
 PY := $(VENV)/bin/python
@@ -42,9 +42,9 @@ demo: setup  ## fly the paper's two flights and compare them, under runs/ (OPTIO
 	@$(QUADSIM) compare $(RUNS)/paper-unconstrained $(RUNS)/paper-constrained --out $(RUNS)/comparison
 	@echo "Done. Open $(RUNS)/comparison/index.html in a browser."
 
-test peers verification nonlinear robustness first-flights reproduce speed soak campaigns kills safety: export OMP_NUM_THREADS := 1
-test peers verification nonlinear robustness first-flights reproduce speed soak campaigns kills safety: export OPENBLAS_NUM_THREADS := 1
-test peers verification nonlinear robustness first-flights reproduce speed soak campaigns kills safety: export MKL_NUM_THREADS := 1
+test peers verification nonlinear robustness first-flights reproduce speed soak campaigns tuning kills safety: export OMP_NUM_THREADS := 1
+test peers verification nonlinear robustness first-flights reproduce speed soak campaigns tuning kills safety: export OPENBLAS_NUM_THREADS := 1
+test peers verification nonlinear robustness first-flights reproduce speed soak campaigns tuning kills safety: export MKL_NUM_THREADS := 1
 test: setup $(VENV)/.browser  ## run every test that needs no peer (OPTIONS="-k audit" for some)
 	@$(PY) -m pytest -q -n $(WORKERS) --dist loadscope $(OPTIONS)
 
@@ -105,6 +105,9 @@ soak: setup  ## one simulated hour on end: memory and step time have to stay as 
 
 campaigns: setup  ## fly the campaigns that ship and remake docs/paper-robustness.md, an hour and a quarter; goes on with what is there
 	@$(PY) docs/make_campaigns.py
+
+tuning: setup  ## carry out the tunings that ship and remake docs/tuning.md, up to half an hour each; goes on with what is there
+	@$(PY) docs/make_tuning.py
 
 safety: setup  ## attack all that writes or reads files, and remake the counts on docs/safety.md: some forty minutes
 	@PYTHONPATH=tests $(PY) docs/make_safety.py

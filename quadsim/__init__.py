@@ -46,6 +46,7 @@ if TYPE_CHECKING:
     from scenarios.many_flights import replay as replay
     from scenarios.many_flights import reproduce as reproduce
     from scenarios.many_flights import sweep as sweep
+    from scenarios.many_flights import tune as tune
     from scenarios.run import StartedFlight as StartedFlight
     from scenarios.schema.json_schema import scenario_schema as scenario_schema
     from scenarios.schema.scenario import Scenario as Scenario
@@ -84,7 +85,7 @@ _PLACES = {
     "scenarios.catalogue": ("Catalogue", "LibraryScenario", "catalogue", "scenarios"),
     "scenarios.flight": ("Flight",),
     "scenarios.junit": ("write_junit",),
-    "scenarios.many_flights": ("campaign", "replay", "reproduce", "sweep"),
+    "scenarios.many_flights": ("campaign", "replay", "reproduce", "sweep", "tune"),
     "scenarios.run": ("StartedFlight",),
     "scenarios.schema.json_schema": ("scenario_schema",),
     "scenarios.schema.scenario": ("Scenario",),

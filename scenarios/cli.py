@@ -115,6 +115,7 @@ def make_parser() -> argparse.ArgumentParser:
     reproduce.add_argument("--junit", metavar="FILE", help="also write each number's verdict as JUnit XML")
     reproduce.add_argument("--json", action="store_true", help="as JSON on stdout")
 
+    _add_tune(command("tune", help="search fields of a scenario; the answer is held against the start on fresh draws"))
     _add_bench(command("bench", help="measure QP solvers, a flight, a film, and what controllers survive"))
 
     doctor = command("doctor", help="what this machine can do")
@@ -151,6 +152,19 @@ def _add_campaign(campaign: argparse.ArgumentParser) -> None:
     add("--report", action=argparse.BooleanOptionalAction, default=True, help="write the report, an HTML page")
     add("--junit", metavar="FILE", help="also write the requirements' verdicts as JUnit XML")
     _add_settings(campaign)
+    add("--json", **_SUMMARY)
+
+
+def _add_tune(tune: argparse.ArgumentParser) -> None:
+    add = tune.add_argument
+    add("file", metavar="FILE", help="name of a tuning that ships, or path to a TOML file")
+    add("--out", metavar="DIR", help="tuning's directory (default: runs/tunings/NAME)")
+    add("--trials", **_NUMBER, help="so many candidates instead of the file's")
+    add("--seed", **_NUMBER, help="replace the seed, of the search and of its draws")
+    add("--workers", **_NUMBER, help="processes (default: one per core)")
+    add("--cluster", metavar="ADDRESS", help="fly on a Dask cluster, as quadsim campaign does")
+    add("--resume", action="store_true", help="go on with what is there")
+    add("--report", action=argparse.BooleanOptionalAction, default=True, help="write the report, HTML pages")
     add("--json", **_SUMMARY)
 
 

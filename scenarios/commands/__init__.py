@@ -21,6 +21,7 @@ COMMANDS: Final[Mapping[str, str]] = {
     "vehicle": "vehicle_sheet:vehicle",
     "campaign": "campaigns:campaign",
     "replay": "campaigns:replay",
+    "tune": "tunings:tune",
     "reproduce": "papers:reproduce",
     "bench": "bench:bench",
     "doctor": "doctor:doctor",
