@@ -1,4 +1,4 @@
-"""Remake docs/speed.md and its figure, `quadsim bench speed` with words: `make speed`, some five minutes.
+"""Remake docs/speed.md and its figure, `quadsim bench speed` with words: `make speed`, some six minutes.
 
 No clock decides any of it; tests/scenarios/bench/test_speed.py flies the short ones.
 """
@@ -85,10 +85,10 @@ def page(measured: SpeedBench) -> str:
             "# Where linear control ends\n\nMade by `make speed`, its numbers by flights; `quadsim bench speed` prints "
             f"the tables.\n\nEvery controller flies a course ever faster:\n\n{speed_legend(measured)}\n"
             f"Roll and pitch are bounded by what the course takes without drag and {ROOM:g} deg more, at most "
-            f"{STEEPEST:g} deg; the controllers\nwithout bounds limit the tilt that they ask for to it. Nothing is "
-            "random, so no number has an interval; what noise would add\nto the loop is in "
-            "[papers.md](papers.md#noise-over-seeds). A vehicle farther off than the course's size, or tilted by more "
-            "than\n120 deg, is lost.\n",
+            f"{STEEPEST:g} deg; the controllers\nwithout bounds limit the tilt that they ask for to it. Where "
+            "sensors measure, numbers are means over seeds, with the 95 % interval of the mean error; elsewhere\n"
+            "nothing is random. What noise adds to the loop is in [papers.md](papers.md#noise-over-seeds). A vehicle "
+            "farther off than the course's size,\nor tilted by more than 120 deg, is lost.\n",
             "![Mean position error and share of the time beyond the tilt bound over speed](speed.png)\n",
             section(reach),
             f"## What is seen\n\n{markdown(counts(measured))}\nFollowed: a mean error of at most {NEAR:g} m, and "
