@@ -21,7 +21,6 @@ from quadsim.motion import Motion
 from quadsim.state import Array, read_only
 from quadsim.vehicle import Vehicle
 
-
 STEEP: Final = math.cos(math.radians(150.0))
 """Lowest vertical component of the thrust axis up to which an attitude is described by a least rotation."""
 
