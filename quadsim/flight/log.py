@@ -73,7 +73,7 @@ class ControlLog:
 
     @property
     def measured_error(self) -> Array:
-        """(K, 12) measured less true state; of attitude and rates as logged, a rotation vector and body rates, body axes.
+        """(K, 12) measured less true state; of an attitude that is logged a rotation vector and body rates, body axes.
 
         Of flights whose attitude is not logged the differences of Euler angles and of their rates.
         """
