@@ -19,9 +19,10 @@ TORQUE = "effects.disturbance.torque=[0.2,-0.1,0.03]"
 GEOMETRIC = "controller={type = 'geometric', tilt = 80.0, feedforward = %s}"
 QUICK = "true, lag = 0.006, disturbance = {force = 40.0}, indi = {}"
 DETAILS = """
-Three details that no field says are held by `tests/scenarios/papers/test_details.py` to the numbers of that separate implementation: the reference window
-one sample late (circle at 4 m/s, ideal, 0.04073 m; at 8 m/s with drag, 0.1852 m), drag by component in the world frame (circle at 8 m/s, 0.2492 m), and
-the first command from a guess of zero (0.122371 and 0.122879), from which ours, begun along the reference, differs by the guess alone.
+Three details that no field says are held by `tests/scenarios/papers/test_details.py` to the numbers of that separate
+implementation: the reference window one sample late (circle at 4 m/s, ideal, 0.04073 m; at 8 m/s with drag, 0.1852
+m), drag by component in the world frame (circle at 8 m/s, 0.2492 m), and the first command from a guess of zero
+(0.122371 and 0.122879), from which ours, begun along the reference, differs by the guess alone.
 """
 HOW = """## How to add a paper
 
