@@ -24,10 +24,8 @@ READING = """\
   off by centimetres at 4 m/s and by a metre or more at 12, nonlinear MPC by millimetres.
 - Up to some 50 deg, where the plant is not as modelled, nonlinear MPC by itself pays little. Under drag a PID, which
   integrates, is nearer up to 8 m/s; with real rotors linear MPC is off by at most twice as much. To observe the force
-  pays more there: `nonlinear +` under drag and on the Crazyflie, `geometric +` under drag and on the Hummingbird.
-- To observe it does not pay everywhere: on the Hummingbird `nonlinear +` is farther off than `nonlinear`.
-- Nonlinear need not be MPC: `geometric +` has the smallest error on the loop as modelled and up to 6 m/s on the
-  Hummingbird. It bounds only what it asks for, and is beyond its bound at the highest speeds, where its rotors
+  pays more there: `nonlinear +` under drag and with real rotors, `geometric +` under drag and on the Hummingbird.
+- Nonlinear need not be MPC: `geometric +` has the smallest error on the loop as modelled . It bounds only what it asks for, and is beyond its bound at the highest speeds, where its rotors
   saturate; `nonlinear` never is.
 - Within a wide bound linear MPC plans what its model does not describe. `constrained`, with hard bounds and without
   estimated disturbances, is lost where `robust` survives far off the course; on the Crazyflie at 5 m/s both are lost.

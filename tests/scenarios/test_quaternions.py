@@ -78,8 +78,8 @@ def test_a_loop_by_sensors_is_flown_audited_and_logged(fly_once: Callable[..., F
     yaw = np.degrees(log.plant.state[:, INDEX["yaw"]])
     assert abs(yaw[-1]) < 2.0  # as before the loop, in the plant, and at the samples as measured
     assert abs(np.degrees(log.control.state[-1, INDEX["yaw"]])) < 2.0
-    rmse = flight.metrics
-    assert all(rmse[f"estimation.rmse.{name}"] < np.radians(0.3) for name in ("roll", "pitch", "yaw"))
+    rmse = flight.summary["estimation"]["rmse"]
+    assert all(rmse[name] < np.radians(0.3) for name in ("roll", "pitch", "yaw"))
     assert np.degrees(np.abs(log.control.measured_error[:, ANGLES])).max() < 1.0  # past the vertical, too
 
 
@@ -117,7 +117,7 @@ def test_a_flip_by_sensors_is_flown() -> None:
     angle = 2.0 * np.pi * np.clip((t - 1.0) / 0.5, 0.0, 1.0)
     nothing, still = np.zeros((t.size, 3)), np.zeros((t.size, 1))
     motion = Motion(
-        position=nothing + [0.0, 0.0, 10.0],
+        position=np.tile([0.0, 0.0, 10.0], (t.size, 1)),
         velocity=nothing,
         acceleration=nothing,
         attitude=np.column_stack([np.cos(angle / 2.0), np.sin(angle / 2.0), still, still]),
