@@ -25,8 +25,8 @@ READING = """\
 - Up to some 50 deg, where the plant is not as modelled, nonlinear MPC by itself pays little. Under drag a PID, which
   integrates, is nearer up to 8 m/s; with real rotors linear MPC is off by at most twice as much. To observe the force
   pays more there: `nonlinear +` under drag and with real rotors, `geometric +` under drag and on the Hummingbird.
-- Nonlinear need not be MPC: `geometric +` has the smallest error on the loop as modelled . It bounds only what it asks for, and is beyond its bound at the highest speeds, where its rotors
-  saturate; `nonlinear` never is.
+- Nonlinear need not be MPC: `geometric +` has the smallest error on the loop as modelled . It bounds only what it
+  asks for, and is beyond its bound at the highest speeds, where its rotors saturate; `nonlinear` never is.
 - Within a wide bound linear MPC plans what its model does not describe. `constrained`, with hard bounds and without
   estimated disturbances, is lost where `robust` survives far off the course; on the Crazyflie at 5 m/s both are lost.
 - The LQR is a metre off at 4 m/s already: it follows the reference's velocity, not its acceleration.
