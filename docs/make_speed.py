@@ -27,6 +27,8 @@ READING = """\
   pays more there: `nonlinear +` under drag and with real rotors, `geometric +` under drag and on the Hummingbird.
 - Nonlinear need not be MPC: `geometric +` has the smallest error on the loop as modelled . It bounds only what it
   asks for, and is beyond its bound at the highest speeds, where its rotors saturate; `nonlinear` never is.
+- By sensors to observe forces does not pay: the estimate's noise passes up to the observers' bandwidths, `nonlinear +`
+  is farther off than `nonlinear`, and a seed of `geometric +` is lost at 6 m/s.
 - Within a wide bound linear MPC plans what its model does not describe. `constrained`, with hard bounds and without
   estimated disturbances, is lost where `robust` survives far off the course; on the Crazyflie at 5 m/s both are lost.
 - The LQR is a metre off at 4 m/s already: it follows the reference's velocity, not its acceleration.
