@@ -97,7 +97,7 @@ first-flights: setup  ## make and fly first scenarios of many vehicles, remake d
 reproduce: setup  ## fly the numbers of every paper that ships and remake docs/papers.md: some five minutes
 	@$(PY) docs/make_papers.py
 
-speed: setup  ## fly every controller ever faster and remake docs/speed.md: some five minutes
+speed: setup  ## fly every controller ever faster and remake docs/speed.md: some six minutes
 	@$(PY) docs/make_speed.py
 
 soak: setup  ## one simulated hour on end: memory and step time have to stay as they were
