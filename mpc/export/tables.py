@@ -14,13 +14,13 @@ Inputs that move nothing the cost or a row sees are one more axis, without state
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
 import scipy.linalg
 
-from mpc.constraints import Rows
+from mpc.constraints import Constraint, Rows
 from mpc.exact.axes import Axis, axes
 from mpc.ocp import Problem
 from mpc.paper.condensed import condensed_cost, row_maps
@@ -94,11 +94,13 @@ class Tables:
 
 
 def tables(problem: Problem) -> Tables:
-    """The numbers of a problem with constraints.
+    """The numbers of a problem.
 
     Raises:
         ParameterError: it is too large, or its rows differ from step to step.
     """
+    if not problem.every_constraint:
+        problem = replace(problem, constraints=(_no_constraint(problem.model.nu),))
     rows = problem.rows
     if rows.C.ndim == 3:
         raise ParameterError("controller", "constraints", "rows that differ from step to step", "the same at all steps")
@@ -118,7 +120,7 @@ def tables(problem: Problem) -> Tables:
     alike = bool((rows.lower == rows.lower[0]).all() and (rows.upper == rows.upper[0]).all())
     steps = slice(0, 1) if alike else slice(None)
     scale = _scale(found, row_tables, T, N)
-    room = min(N * m, max(LEAST_ROOM, math.ceil(ROOM_PER_STEP * N)))
+    room = max(1, min(N * m, max(LEAST_ROOM, math.ceil(ROOM_PER_STEP * N))))
     return Tables(
         problem=problem,
         axes=found,
@@ -126,11 +128,16 @@ def tables(problem: Problem) -> Tables:
         lower=rows.lower[steps],
         upper=rows.upper[steps],
         scale=scale,
-        tolerance=1.0 / scale.min(axis=0),
+        tolerance=1.0 / scale.min(axis=0, initial=math.inf),
         T=T,
         T_inverse=T_inverse,
         room=room,
     )
+
+
+def _no_constraint(nu: int) -> Constraint:
+    nothing = np.full(nu, -math.inf)
+    return Constraint(name="none", lower=nothing, upper=-nothing, D=np.eye(nu))
 
 
 def _all_axes(problem: Problem) -> tuple[list[Axis], Array]:

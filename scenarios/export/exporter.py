@@ -2,31 +2,30 @@
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
 from typing import Final, Literal, get_args
 
 import numpy as np
 
-from mpc.answer import ActuatorBounds
 from mpc.export.ctext import number
-from mpc.export.source import DATA, HEADER, SOURCE, Precision, data, header, part, solver
-from mpc.export.tables import Tables, tables
-from mpc.ocp import Problem
+from mpc.export.source import DATA, HEADER, SOURCE, Precision, part, sources
+from mpc.fallback.contract import Guarded
+from mpc.robust.controller import RobustMPC
 from quadsim.errors import ExportError, ParameterError
 from quadsim.outputs import real_path, require_directory, write_text, writing
 from quadsim.state import Array
-from quadsim.vehicle import Vehicle
 from scenarios.api import load
-from scenarios.export.record import Recording, record
-from scenarios.parts.controllers import make_problem
+from scenarios.build import build_controller
+from scenarios.export.record import MPC, Recording, record
 from scenarios.parts.vehicle import build_vehicle
-from scenarios.schema.controller import ConstrainedSpec
+from scenarios.schema.controller import ConstrainedSpec, UnconstrainedSpec
+from scenarios.schema.optimisation import BoundedSpec
+from scenarios.schema.robust import RobustSpec
 from scenarios.schema.scenario import Scenario
 
 KIND: Final = "export"  # what `quadsim.outputs` calls such a directory
 Target = Literal["posix"]
-EXPORTED: Final = "constrained"
+EXPORTED: Final = "unconstrained, constrained and robust"
 
 
 def export(
@@ -62,45 +61,56 @@ def export(
         scenario = load(scenario)
     directory = real_path(out)
     require_directory(directory, KIND)
-    files = sources(scenario, precision) | vector_files(record(scenario))
-    files |= {"main.c": part("main.c"), "Makefile": part(f"Makefile.{target}"), "LICENSE": part("LICENSE")}
+    files = controller_files(scenario, precision) | vector_files(record(scenario))
+    files |= {
+        "README.md": _readme(scenario, precision),
+        "main.c": part("main.c"),
+        "Makefile": part(f"Makefile.{target}"),
+        "LICENSE": part("LICENSE"),
+    }
     with writing(directory, KIND) as partial:
         for name, text in files.items():
             write_text(partial / name, text)
     return directory
 
 
-def sources(scenario: Scenario, precision: Precision) -> dict[str, str]:
-    """The controller's own files, by name, and a README.
+def controller_files(scenario: Scenario, precision: Precision) -> dict[str, str]:
+    """The controller's own files, by name.
 
     Raises:
         ExportError: this controller cannot be exported.
     """
-    vehicle = build_vehicle(scenario)
-    found = tables(exported_problem(scenario, vehicle))
-    bounds = ActuatorBounds.of_problem(found.problem)
-    title = f"{scenario.name}: {scenario.description}" if scenario.description else scenario.name
-    text = title.replace("*/", "* /").replace("/*", "/ *").encode("ascii", "backslashreplace").decode()
-    return {
-        HEADER: header(found, precision=precision, title=text),
-        SOURCE: solver(found) + part("answer.c") + part("constrained.c"),
-        DATA: data(found, bounds, rests=False),
-        "README.md": _readme(text, found, precision),
-    }
+    law = exported_law(scenario)
+    robust = (build_vehicle(scenario), law.settings) if isinstance(law, RobustMPC) else None
+    return sources(law.problem, precision=precision, title=_title(scenario), robust=robust)
 
 
-def exported_problem(scenario: Scenario, vehicle: Vehicle) -> Problem:
-    """The optimisation of a controller that can be exported.
+def exported_law(scenario: Scenario) -> MPC:
+    """The law that is exported, without what guards it.
 
     Raises:
-        ExportError: it cannot.
+        ExportError: it cannot be exported.
     """
     spec = scenario.controller
-    if not isinstance(spec, ConstrainedSpec):
-        raise ExportError(f"its controller is {spec.type!r}; exported are: {EXPORTED}")
-    if spec.avoidance is not None and (scenario.obstacles or scenario.regions):
+    if not isinstance(spec, UnconstrainedSpec | ConstrainedSpec | RobustSpec):
+        raise ExportError(f"its controller is {spec.type!r}; exported are {EXPORTED}")
+    if isinstance(spec, RobustSpec) and spec.linearisation != "hover":
+        raise ExportError(
+            f"its model is another in each period, linearisation = {spec.linearisation!r}; exported is 'hover'"
+        )
+    if isinstance(spec, BoundedSpec) and spec.avoidance is not None and (scenario.obstacles or scenario.regions):
         raise ExportError("its half-spaces around obstacles are others in each period; leave out controller.avoidance")
-    return make_problem(spec, vehicle, scenario.control_period)
+    law = build_controller(scenario, build_vehicle(scenario))
+    law = law.inner if isinstance(law, Guarded) else law
+    assert isinstance(law, MPC)
+    return law
+
+
+def _title(scenario: Scenario) -> str:
+    """The scenario's name and description as they can stand in a comment."""
+    title = f"{scenario.name}: {scenario.description}" if scenario.description else scenario.name
+    title = title.replace("*/", "* /").replace("/*", "/ *").replace("\\", "/")
+    return title.encode("ascii", "replace").decode().replace("\n", " ")
 
 
 def vector_files(recording: Recording) -> dict[str, str]:
@@ -130,31 +140,27 @@ def _row(numbers: Array) -> str:
     return "{" + ", ".join(map(number, np.ravel(numbers).tolist())) + "}"
 
 
-def _readme(title: str, found: Tables, precision: Precision) -> str:
-    problem, size = found.problem, 8 if precision == "double" else 4
-    constants = size * math.ceil(sum(part.responses.size / 2 + part.closed.size + part.K.size for part in found.axes))
-    memory = size * found.room * (found.room + 1) // 2
-    return f"""# {title}
+def _readme(scenario: Scenario, precision: Precision) -> str:
+    return f"""# {_title(scenario)}
 
-A model predictive controller as C99, exported from quadsim in {precision} precision: N = {problem.horizon} periods of
-{problem.model.period:g} s, {len(found.rows)} rows of constraints in each.  It needs nothing but a compiler: no
-allocation, no recursion, no global state, and of the C library `memcpy` and `memset`.
+A model predictive controller as C99 in {precision} precision, exported from quadsim: {scenario.controller.type}, to be
+asked every {scenario.control_period:g} s.  It needs nothing but a compiler: no allocation, no recursion, no global
+state, and of the C library `memcpy` and `memset`.
 
 | file | is |
 |---|---|
-| `{HEADER}` | the interface: state order, units, frames |
+| `{HEADER}` | the interface: state order, units, frames, and the sizes |
 | `{SOURCE}`, `{DATA}` | the controller and its numbers |
-| `vectors.h`, `vectors.c` | the periods of the flight that it was recorded on |
+| `vectors.h`, `vectors.c` | the periods of the flight that it was recorded on, with the exact answers |
 | `main.c`, `Makefile` | `make check` runs these periods and compares |
 
 ```c
 static quadsim_mpc mpc;
 quadsim_mpc_reset(&mpc, speeds);          /* the command in force */
-/* every {problem.model.period:g} s: */
+/* every {scenario.control_period:g} s: */
 status = quadsim_mpc_step(&mpc, state, reference, acting, command);
 ```
 
-The struct takes some {memory // 1000} kB, the constants {constants // 1000} kB, which can stay in flash.
 Solve once before take-off: the first step starts without an active set and takes the most changes of it.
-`mpc.changes` says how many each step took.
+`mpc.changes` says how many each step took.  Compile with `-ffp-contract=off`, and every processor gives the same bits.
 """
