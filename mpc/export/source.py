@@ -199,7 +199,7 @@ def data(found: Tables, bounds: ActuatorBounds | None, *, rests: bool) -> str:
         reals("TOLERANCE", found.tolerance if found.rows else np.ones(1)),
     ]
     for g, axis in enumerate(found.axes):
-        blocks += _axis_arrays(g, axis)
+        blocks += _axis_arrays(g, axis, needed=bool(found.rows))
     blocks += [
         structs("axis", "AXES", (_axis(g, axis, _shapes(found)) for g, axis in enumerate(found.axes))),
         *_rows(found),
@@ -207,7 +207,9 @@ def data(found: Tables, bounds: ActuatorBounds | None, *, rests: bool) -> str:
     return "\n".join(blocks)
 
 
-def _axis_arrays(g: int, axis: AxisTables) -> list[str]:
+def _axis_arrays(g: int, axis: AxisTables, *, needed: bool) -> list[str]:
+    """The arrays of an axis; its responses only where there are rows."""
+    responses = _tidy(lower_packed(axis.responses)) if needed else np.zeros(1)
     return [
         small_integers(f"STATE_{g}", axis.states),
         small_integers(f"TARGET_{g}", axis.targets),
@@ -221,7 +223,7 @@ def _axis_arrays(g: int, axis: AxisTables) -> list[str]:
         reals(f"V_{g}", axis.V),
         reals(f"V_END_{g}", axis.V_end),
         reals(f"C_{g}", axis.C),
-        reals(f"RESPONSES_{g}", _tidy(lower_packed(axis.responses))),
+        reals(f"RESPONSES_{g}", responses),
     ]
 
 

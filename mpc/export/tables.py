@@ -99,8 +99,7 @@ def tables(problem: Problem) -> Tables:
     Raises:
         ParameterError: it is too large, or its rows differ from step to step.
     """
-    if not problem.every_constraint:
-        problem = replace(problem, constraints=(_no_constraint(problem.model.nu),))
+    problem = with_constraints(problem)
     rows = problem.rows
     if rows.C.ndim == 3:
         raise ParameterError("controller", "constraints", "rows that differ from step to step", "the same at all steps")
@@ -135,9 +134,13 @@ def tables(problem: Problem) -> Tables:
     )
 
 
-def _no_constraint(nu: int) -> Constraint:
-    nothing = np.full(nu, -math.inf)
-    return Constraint(name="none", lower=nothing, upper=-nothing, D=np.eye(nu))
+def with_constraints(problem: Problem) -> Problem:
+    """A problem without constraints with one that bounds nothing; any other as it is."""
+    if problem.every_constraint:
+        return problem
+    nothing = np.full(problem.model.nu, -math.inf)
+    none = Constraint(name="none", lower=nothing, upper=-nothing, D=np.eye(problem.model.nu))
+    return replace(problem, constraints=(none,))
 
 
 def _all_axes(problem: Problem) -> tuple[list[Axis], Array]:

@@ -10,6 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mpc.constrained import ConstrainedMPC
+from mpc.exact.axes import axes
+from mpc.exact.free import FreeOptimum
+from mpc.export.tables import with_constraints
 from mpc.fallback.completion import CompletedMoment
 from mpc.fallback.contract import Guarded
 from mpc.robust.controller import RobustMPC
@@ -110,11 +113,25 @@ def _answers(
     """Status (K,) and command (K, 4) of a controller that is asked so from its reset on."""
     law.reset(speeds)
     status, commands = np.full(len(asked), REFUSED), np.empty((len(asked), 4))
+    if isinstance(law, UnconstrainedMPC):
+        status[:], commands[:] = 0, _free_commands(law, asked)
+        return status, commands
     for k, (state, acting, reference) in enumerate(asked):
         commands[k] = acting
         with contextlib.suppress(PlanExhaustedError):
             command = law.step(Moment(time=k * period, acting=acting), state, reference)
             if command.status in ACCEPTED:
-                answer = None if isinstance(law, UnconstrainedMPC) else law.answer
-                status[k], commands[k] = 0 if answer is None else WAYS[answer.way], command.speeds
+                assert law.answer is not None
+                status[k], commands[k] = WAYS[law.answer.way], command.speeds
     return status, commands
+
+
+def _free_commands(law: UnconstrainedMPC, asked: list[tuple[Array, Array, Array]]) -> Array:
+    """(K, 4) axis by axis: the one gain of Eq. (24) has lost half its digits at N = 100."""
+    problem = with_constraints(law.problem)
+    parts, u_bar = axes(problem), problem.model.u_bar
+    T, optimum = np.hstack([part.T for part in parts]), FreeOptimum(problem, parts)
+    desired = problem.objective.desired
+    return np.array(
+        [u_bar + T @ optimum.at(state, desired(path), before - u_bar)[0][:, 0] for state, before, path in asked]
+    )
