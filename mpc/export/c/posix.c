@@ -29,8 +29,9 @@ int target_read(void)
     if (poll(&line, 1, 1) < 1) {
         return -1;
     }
-    if (read(STDIN_FILENO, &byte, 1) < 1)
-        exit(0); /* the other end has closed */
+    if (read(STDIN_FILENO, &byte, 1) < 1) { /* the other end has closed */
+        exit(0);
+    }
     return byte;
 }
 

@@ -77,7 +77,7 @@ static void reply(void)
     target_write(&answer, sizeof answer);
 }
 
-/* Solve a question, unless it is old; 1 where it is fresh. */
+/* Solve a question, unless it is old; 1 where it brings a fresh state. */
 static int solve(const struct question *question)
 {
     uint32_t rows = question->number - answer.number; /* new ones, those lost included */
@@ -98,7 +98,7 @@ static int solve(const struct question *question)
     if (question->kind == STEP) {
         answer.status = quadsim_mpc_step(&mpc, question->state, window, question->acting, answer.command);
     }
-    return 1;
+    return question->kind != ROW;
 }
 
 int main(void)
