@@ -69,6 +69,18 @@ class ParameterError(InputError):
         self.owner, self.name, self.value, self.rule = owner, name, value, rule
 
 
+class ExportError(InputError):
+    """A controller that has no C of its own.
+
+    Attributes:
+        reason: why, as the end of "... cannot be exported: ...".
+    """
+
+    def __init__(self, reason: str) -> None:
+        super().__init__(f"this scenario's controller cannot be exported: {reason}")
+        self.reason = reason
+
+
 class UnknownNameError(InputError):
     """A name that is not one of a known set; the message lists the set and the nearest member, or those that are meant.
 

@@ -113,6 +113,14 @@ def make_parser() -> argparse.ArgumentParser:
     reproduce.add_argument("--junit", metavar="FILE", help="also write each number's verdict as JUnit XML")
     reproduce.add_argument("--json", action="store_true", help="as JSON on stdout")
 
+    export = command("export", help="write a scenario's controller as self-contained C99, with its recorded periods")
+    export.add_argument("scenario", metavar="SCENARIO", help=_SCENARIO)
+    export.add_argument("--out", metavar="DIR", required=True, help="directory, replacing an earlier export")
+    export.add_argument("--precision", default="double", help="of all numbers: double or float (default: double)")
+    machine = "what its programs are for: posix, cortex-m7 or cortex-m4f (default: posix)"
+    export.add_argument("--target", metavar="NAME", default="posix", help=machine)
+    _add_settings(export)
+
     _add_bench(command("bench", help="measure QP solvers, a flight, a film, and what controllers survive"))
 
     doctor = command("doctor", help="what this machine can do")

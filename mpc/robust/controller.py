@@ -68,6 +68,7 @@ class RobustMPC:
         problem: the optimisation, its states perhaps with the rotor speeds.
         trim: what holds the vehicle at rest against the disturbance that is estimated.
         unanswered: the first period since `reset` whose QP had no answer; None where all had.
+        answer: of the last period that had one to solve; None before the first.
 
     Raises:
         ParameterError: a number or a shape is not possible.
@@ -75,6 +76,7 @@ class RobustMPC:
 
     name: Final = "robust"
     solver: Final = SOLVER
+    answer: Answer | None = None
 
     def __init__(
         self,
@@ -175,6 +177,7 @@ class RobustMPC:
             self._ahead = x0
         query = self._query(np.concatenate([x0, self._rotors])[: self._model.n], self._later(reference))
         answer, problem = self._answer(now.time, float(x0[_YAW]), query)
+        self.answer = answer
         refused = rejection(answer.solution.status, answer.plan[0], answer.plan, self._actuators, self._acting)
         if refused is not None:
             if refused != INVALID_DATA and self.unanswered is None:

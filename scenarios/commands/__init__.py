@@ -21,6 +21,7 @@ COMMANDS: Final[Mapping[str, str]] = {
     "campaign": "campaigns:campaign",
     "replay": "campaigns:replay",
     "reproduce": "papers:reproduce",
+    "export": "export:export",
     "bench": "bench:bench",
     "doctor": "doctor:doctor",
 }
