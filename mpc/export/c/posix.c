@@ -1,5 +1,5 @@
 /* A POSIX system as a target. */
-#define _POSIX_C_SOURCE 200809L
+#define _POSIX_C_SOURCE 200809L /* NOLINT: POSIX reserves it for this */
 #include "target.h"
 
 #include <poll.h>

@@ -14,7 +14,7 @@
 #define TICKS 0xFFFFFFU
 #define FAULT 3U /* exit status of whatever is not expected */
 
-extern uint32_t stack_top, data_start, data_end, data_source, bss_start, bss_end; /* mps2.ld */
+extern uint32_t stack_top[], data_start[], data_end[], data_source[], bss_start[], bss_end[]; /* mps2.ld */
 int main(void);
 void reset(void);
 void fault(void);
@@ -44,13 +44,13 @@ void fault(void)
 
 void reset(void)
 {
-    const uint32_t *from = &data_source;
+    const uint32_t *from = data_source;
     CPACR |= 0xFU << 20; /* else the first instruction of the FPU faults */
     __asm__ volatile("dsb\n\tisb" ::: "memory");
-    for (uint32_t *to = &data_start; to < &data_end; to++, from++) {
+    for (uint32_t *to = data_start; to != data_end; to++, from++) {
         *to = *from;
     }
-    for (uint32_t *to = &bss_start; to < &bss_end; to++) {
+    for (uint32_t *to = bss_start; to != bss_end; to++) {
         *to = 0;
     }
     SYST_RELOAD = TICKS;
@@ -68,7 +68,7 @@ struct vectors {
 
 extern const struct vectors vectors;
 __attribute__((section(".vectors"))) const struct vectors vectors = {
-    &stack_top, {reset, fault, fault, fault, fault, fault, fault, fault, fault, fault, fault, fault, fault, fault, fault}};
+    stack_top, {reset, fault, fault, fault, fault, fault, fault, fault, fault, fault, fault, fault, fault, fault, fault}};
 
 uint32_t target_ticks(void)
 {
