@@ -30,6 +30,29 @@ def header(found: Tables, *, precision: Precision, title: str, state: str = "") 
     return text.replace("@REAL@", real).replace("@SIZES@", _sizes(found, precision)).replace("@STATE@", state)
 
 
+def solver(found: Tables) -> str:
+    """The solver's source, with the dynamic programming of each size of axis."""
+    shapes = _shapes(found)
+    text = [part("axis.c").replace("@n@", str(n)).replace("@m@", str(m)) for n, m in shapes]
+    cases = []
+    for shape, (n, m) in enumerate(shapes):
+        cases.append(f"    case {shape}:" if shape < len(shapes) - 1 else "    default:")
+        cases.append(f"        plan_backwards_{n}x{m}(axis, pull, push, w);")
+        cases.append(f"        plan_forwards_{n}x{m}(axis, start, w, values);")
+        cases.append("        break;")
+    plan = (
+        "\n/* The optimum w [N][m] of an axis without rows, from x(k), and the values [N][M] of its rows' C x. */\n"
+        "static void plan(const struct axis *axis, const real *pull, const real *push, const real *start, real *w,\n"
+        "                 real *values)\n{\n    switch (axis->shape) {\n" + "\n".join(cases) + "\n    }\n}\n"
+    )
+    return part("solver.c").replace("@AXES@\n", "".join([*text, plan]))
+
+
+def _shapes(found: Tables) -> list[tuple[int, int]]:
+    """The sizes (n, m) of axes, each once."""
+    return list(dict.fromkeys((len(axis.B), axis.inputs) for axis in found.axes))
+
+
 def _sizes(found: Tables, precision: Precision) -> str:
     widest = max(axis.inputs for axis in found.axes)
     sizes = {
@@ -69,7 +92,7 @@ def data(found: Tables, bounds: ActuatorBounds, *, rests: bool) -> str:
     ]
     for g, axis in enumerate(found.axes):
         blocks += _axis_arrays(g, axis)
-    blocks += [structs("axis", "AXES", (_axis(g, axis) for g, axis in enumerate(found.axes))), *_rows(found)]
+    blocks += [structs("axis", "AXES", (_axis(g, axis, _shapes(found)) for g, axis in enumerate(found.axes))), *_rows(found)]
     return "\n".join(blocks)
 
 
@@ -96,9 +119,9 @@ def _tidy(values: Array) -> Array:
     return np.where(np.abs(values) < 1e-18 * np.abs(values).max(initial=0.0), 0.0, values)
 
 
-def _axis(g: int, axis: AxisTables) -> str:
+def _axis(g: int, axis: AxisTables, shapes: list[tuple[int, int]]) -> str:
     n, m = axis.B.shape
-    sizes = f"{n}, {m}, {axis.first}, {len(axis.rows)}, {len(axis.targets)}, {int(axis.before)}"
+    sizes = f"{n}, {m}, {axis.first}, {len(axis.rows)}, {len(axis.targets)}, {shapes.index((n, m))}, {int(axis.before)}"
     names = ["STATE", "TARGET", "ROW", "B", "CLOSED", "K", "INVERSE", "W", "W_END", "V", "V_END", "C", "RESPONSES"]
     return ", ".join([sizes, *(f"{name}_{g}" for name in names)])
 

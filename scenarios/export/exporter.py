@@ -10,7 +10,7 @@ import numpy as np
 
 from mpc.answer import ActuatorBounds
 from mpc.export.ctext import number
-from mpc.export.source import DATA, HEADER, SOURCE, Precision, data, header, part
+from mpc.export.source import DATA, HEADER, SOURCE, Precision, data, header, part, solver
 from mpc.export.tables import Tables, tables
 from mpc.export.targets import TARGETS, Target
 from mpc.ocp import Problem
@@ -84,7 +84,7 @@ def sources(scenario: Scenario, precision: Precision) -> dict[str, str]:
     text = title.replace("*/", "* /").replace("/*", "/ *").encode("ascii", "backslashreplace").decode()
     return {
         HEADER: header(found, precision=precision, title=text),
-        SOURCE: part("solver.c") + part("answer.c") + part("constrained.c"),
+        SOURCE: solver(found) + part("answer.c") + part("constrained.c"),
         DATA: data(found, bounds, rests=False),
         "README.md": _readme(text, found, precision),
     }

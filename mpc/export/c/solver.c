@@ -17,6 +17,7 @@ enum { AXIS_STATES = QUADSIM_AXIS_STATES, AXIS_INPUTS = QUADSIM_AXIS_INPUTS };
  * row. */
 struct axis {
     int states, inputs, first, outputs, targets; /* n, m, where w is among all axes' inputs, o, r */
+    int shape;                                   /* n and m, as a number */
     int before;                                  /* whether the last m states are the inputs before */
     const unsigned char *state;                  /* which of the problem's states the first n are */
     const unsigned char *target;                 /* [r] which of x, y, z, yaw of the reference it follows */
@@ -70,14 +71,16 @@ enum verdict { SOLVED, INFEASIBLE, GAVE_UP };
 
 static int is_finite(const real *numbers, int count)
 {
+    real even = R(0.0), odd = R(0.0); /* sums of zeros, and of NaN where a number is none, or infinite */
     int i;
-    for (i = 0; i < count; i++) {
-        const real nothing = numbers[i] - numbers[i];
-        if (!(nothing >= R(0.0) && nothing <= R(0.0))) {
-            return 0;
-        }
+    for (i = 0; i + 1 < count; i += 2) {
+        even += numbers[i] * R(0.0);
+        odd += numbers[i + 1] * R(0.0);
     }
-    return 1;
+    if (count % 2 == 1) {
+        even += numbers[count - 1] * R(0.0);
+    }
+    return even + odd >= R(0.0);
 }
 
 static real magnitude(real number)
@@ -93,91 +96,20 @@ static real clipped(real number, real lower, real upper)
 
 static real dot(const real *left, const real *right, int count)
 {
-    real sum = R(0.0);
+    real sum[4] = {R(0.0), R(0.0), R(0.0), R(0.0)};
     int i;
-    for (i = 0; i < count; i++) {
-        sum += left[i] * right[i];
+    for (i = 0; i + 3 < count; i += 4) { /* four sums at a time, so that none waits for the one before */
+        sum[0] += left[i] * right[i];
+        sum[1] += left[i + 1] * right[i + 1];
+        sum[2] += left[i + 2] * right[i + 2];
+        sum[3] += left[i + 3] * right[i + 3];
     }
-    return sum;
-}
-
-/* sum += matrix vector, of [rows][columns] */
-static void add_product(real *sum, const real *matrix, const real *vector, int rows, int columns)
-{
-    int i;
-    for (i = 0; i < rows; i++) {
-        sum[i] += dot(matrix + i * columns, vector, columns);
+    for (; i < count; i++) {
+        sum[0] += left[i] * right[i];
     }
+    return (sum[0] + sum[1]) + (sum[2] + sum[3]);
 }
-
-/* sum += share matrix' vector, of [rows][columns] */
-static void add_transposed(real *sum, real share, const real *matrix, const real *vector, int rows, int columns)
-{
-    int i, j;
-    for (i = 0; i < rows; i++) {
-        const real factor = share * vector[i];
-        for (j = 0; j < columns; j++) {
-            sum[j] += matrix[i * columns + j] * factor;
-        }
-    }
-}
-
-/* ---- one axis's optimum without rows ------------------------------------------------------------------------------ */
-
-/* Dynamic programming backwards: w_i = k_i without the feedback -K_i x_i.
- * The cost has the linear terms -2 pull_i' x_{i+1} - 2 push_i' w_i. */
-static void plan_backwards(const struct axis *axis, const real *pull, const real *push, real *w)
-{
-    const int n = axis->states, m = axis->inputs;
-    real slope[AXIS_STATES], sum[AXIS_INPUTS];
-    int i;
-    memcpy(slope, pull + (N - 1) * n, (size_t)n * sizeof(real));
-    for (i = N - 1; i >= 0; i--) {
-        memcpy(sum, push + i * m, (size_t)m * sizeof(real));
-        add_transposed(sum, R(1.0), axis->B, slope, n, m);
-        memset(w + i * m, 0, (size_t)m * sizeof(real));
-        add_product(w + i * m, axis->inverse + i * m * m, sum, m, m);
-        if (i > 0) {
-            real earlier[AXIS_STATES];
-            memcpy(earlier, pull + (i - 1) * n, (size_t)n * sizeof(real));
-            add_transposed(earlier, R(1.0), axis->closed + i * n * n, slope, n, n);
-            add_transposed(earlier, R(-1.0), axis->K + i * m * n, push + i * m, m, n);
-            memcpy(slope, earlier, (size_t)n * sizeof(real));
-        }
-    }
-}
-
-/* The rows' C x at the end of a step, or at its beginning. */
-static void put_outputs(const struct axis *axis, int later, const real *x, real *values)
-{
-    int c;
-    for (c = 0; c < axis->outputs; c++) {
-        if (ROWS[axis->row[c]].later == later) {
-            values[axis->row[c]] = dot(axis->C + c * axis->states, x, axis->states);
-        }
-    }
-}
-
-/* And forwards, from x(k): w_i = k_i - K_i x_i, and the values [N][M] of the rows' C x. */
-static void plan_forwards(const struct axis *axis, const real *start, real *w, real *values)
-{
-    const int n = axis->states, m = axis->inputs;
-    real x[AXIS_STATES], next[AXIS_STATES];
-    int i, a;
-    memcpy(x, start, (size_t)n * sizeof(real));
-    for (i = 0; i < N; i++) {
-        memset(next, 0, sizeof(next));
-        add_product(next, axis->closed + i * n * n, x, n, n);
-        add_product(next, axis->B, w + i * m, n, m);
-        for (a = 0; a < m; a++) {
-            w[i * m + a] -= dot(axis->K + (i * m + a) * n, x, n);
-        }
-        put_outputs(axis, 0, x, values + i * M);
-        put_outputs(axis, 1, next, values + i * M);
-        memcpy(x, next, sizeof(x));
-    }
-}
-
+@AXES@
 /* ---- rows --------------------------------------------------------------------------------------------------------- */
 
 /* values [N][M] += the terms of inputs u [N][4]; u(k-1) is before. */
@@ -200,13 +132,17 @@ static void add_terms(const real *u, const real *before, real *values)
 /* u [N][4] = T w, of the axes' inputs w, axis after axis. */
 static void inputs_of_axes(const real *w, real *u)
 {
-    int g, i, j;
+    int g, i, j, a;
     memset(u, 0, (size_t)(N * NU) * sizeof(real));
     for (g = 0; g < QUADSIM_PARTS; g++) {
         const int m = AXES[g].inputs;
-        for (i = 0; i < N; i++) {
-            for (j = 0; j < NU; j++) {
-                u[i * NU + j] += dot(T + j * NU + AXES[g].first, w + AXES[g].first * N + i * m, m);
+        const real *own = w + AXES[g].first * N;
+        for (a = 0; a < m; a++) {
+            const real *column = T + AXES[g].first + a;
+            for (i = 0; i < N; i++) {
+                for (j = 0; j < NU; j++) {
+                    u[i * NU + j] += column[j * NU] * own[i * m + a];
+                }
             }
         }
     }
@@ -295,17 +231,14 @@ static real *factor_row(quadsim_mpc *mpc, int j)
 static real next_pivot(quadsim_mpc *mpc, int row, int side)
 {
     real sums[ROOM + 1], *next = factor_row(mpc, mpc->count), rest;
-    int i, j;
+    int j;
     find_responses(mpc, row, sums);
     rest = sums[mpc->count];
     if (side == 2 || side == -2) {
         rest += ROWS[row % M].compliance;
     }
     for (j = 0; j < mpc->count; j++) {
-        const real *earlier = factor_row(mpc, j);
-        for (i = 0; i < j; i++) {
-            sums[j] -= earlier[i] * sums[i];
-        }
+        sums[j] -= dot(factor_row(mpc, j), sums, j);
     }
     for (j = 0; j < mpc->count; j++) {
         next[j] = sums[j] / mpc->pivot[j];
@@ -563,8 +496,8 @@ static int collect(quadsim_mpc *mpc, int g)
         const real half = R(-0.5) * mpc->z[j];
         if (kind->axis == g) {
             const int at = kind->later ? step : step - 1;
-            if (at >= 0) {
-                add_transposed(mpc->pull + at * n, R(1.0), axis->C + kind->output * n, &half, 1, n);
+            for (a = 0; at >= 0 && a < n; a++) {
+                mpc->pull[at * n + a] += half * axis->C[kind->output * n + a];
             }
             touched = 1;
         }
@@ -587,8 +520,7 @@ static void respond_axis(quadsim_mpc *mpc, int g)
     real *dw = mpc->dw + axis->first * N;
     int i, c;
     if (collect(mpc, g)) {
-        plan_backwards(axis, mpc->pull, mpc->push, dw);
-        plan_forwards(axis, at_rest, dw, mpc->shift);
+        plan(axis, mpc->pull, mpc->push, at_rest, dw, mpc->shift);
         return;
     }
     memset(dw, 0, (size_t)(N * axis->inputs) * sizeof(real));
@@ -629,15 +561,16 @@ static int belongs(int row, int only)
 /* The inactive row that is violated most, as of unit length, and its side; -1 for none. */
 static int most_violated(const quadsim_mpc *mpc, int only, int *side)
 {
-    const real tolerated = FEASIBLE * mpc->slack;
     real most = R(0.0);
-    int found = -1, row;
-    for (row = 0; row < N * M; row++) {
-        if (mpc->side[row] == 0 && belongs(row, only)) {
+    int found = -1, i, r;
+    for (r = 0; r < M; r++) {
+        const real tolerated = FEASIBLE * mpc->slack * TOLERANCE[r];
+        for (i = 0; belongs(r, only) && i < N; i++) {
+            const int row = i * M + r;
             const real value = mpc->value[row] + mpc->shift[row];
             const real above = value - upper_bound(row), below = lower_bound(row) - value;
             const real over = above > below ? above : below;
-            if (over > tolerated * TOLERANCE[row % M] && over * SCALE[row] > most) {
+            if (over > tolerated && mpc->side[row] == 0 && over * SCALE[row] > most) {
                 most = over * SCALE[row];
                 *side = above > below ? 1 : -1;
                 found = row;
@@ -792,13 +725,54 @@ static enum verdict optimum(quadsim_mpc *mpc, int only, const signed char *set)
 
 /* ---- the optimum ----------------------------------------------------------------------------------------------------- */
 
+/* Deviations from rest at which an axis starts: of its states, and of the inputs before, away (4,), where it has them.
+ * still (n,) is its state at rest. */
+static void find_start(const struct axis *axis, const real *state, const real *rest, const real *away, real *start,
+                       real *still)
+{
+    const int n = axis->states, own = axis->before ? n - axis->inputs : n;
+    int j;
+    for (j = 0; j < own; j++) {
+        still[j] = rest[axis->state[j]];
+        start[j] = state[axis->state[j]] - still[j];
+    }
+    for (j = own; j < n; j++) {
+        still[j] = R(0.0);
+        start[j] = dot(T_INVERSE + (axis->first + j - own) * NU, away, NU);
+    }
+}
+
+/* pull [N][n] of the reference [N][4] and of the state at rest. */
+static void find_pull(const struct axis *axis, const real *reference, const real *rest, const real *still, real *pull)
+{
+    static const unsigned char STATE_OF[4] = {0, 2, 4, 10}; /* which state x, y, z, yaw of the reference are */
+    const int n = axis->states, r = axis->targets;
+    real rests[AXIS_STATES], rests_last[AXIS_STATES];
+    int i, j, t;
+    for (j = 0; j < n; j++) {
+        rests[j] = QUADSIM_RESTS ? -dot(axis->V + j * n, still, n) : R(0.0);
+        rests_last[j] = QUADSIM_RESTS ? -dot(axis->V_end + j * n, still, n) : R(0.0);
+    }
+    for (i = 0; i < N; i++) {
+        const real *W = i < N - 1 ? axis->W : axis->W_end;
+        for (j = 0; j < n; j++) {
+            pull[i * n + j] = i < N - 1 ? rests[j] : rests_last[j];
+        }
+        for (t = 0; t < r; t++) {
+            const real wanted = reference[i * 4 + axis->target[t]] - rest[STATE_OF[axis->target[t]]];
+            for (j = 0; j < n; j++) {
+                pull[i * n + j] += W[j * r + t] * wanted;
+            }
+        }
+    }
+}
+
 /* w of the free optimum, u in rotor speeds, and the rows' values.
  * state is x(k), rest and trim where the model rests, (x_s, u_s). */
 static void find_free(quadsim_mpc *mpc, const real *state, const real *reference, const real *rest, const real *trim,
                       const real *acting)
 {
-    static const unsigned char REFERENCE_STATE[4] = {0, 2, 4, 10};
-    real start[AXIS_STATES], still[AXIS_STATES], wanted[4], away[NU];
+    real start[AXIS_STATES], still[AXIS_STATES], away[NU];
     int g, i, j;
     memset(mpc->value, 0, sizeof(mpc->value));
     memset(mpc->push, 0, sizeof(mpc->push));
@@ -807,40 +781,21 @@ static void find_free(quadsim_mpc *mpc, const real *state, const real *reference
     }
     for (g = 0; g < QUADSIM_PARTS; g++) {
         const struct axis *axis = &AXES[g];
-        const int n = axis->states, moved = axis->before ? axis->inputs : 0;
-        real *w = mpc->w + axis->first * N;
-        memset(still, 0, sizeof(still));
-        for (j = 0; j < n - moved; j++) {
-            still[j] = rest[axis->state[j]];
-            start[j] = state[axis->state[j]] - still[j];
-        }
-        for (j = 0; j < moved; j++) {
-            start[n - moved + j] = dot(T_INVERSE + (axis->first + j) * NU, away, NU);
-        }
-        memset(mpc->pull, 0, (size_t)(N * n) * sizeof(real));
-        for (i = 0; i < N; i++) {
-            for (j = 0; j < axis->targets; j++) {
-                wanted[j] = reference[i * 4 + axis->target[j]] - rest[REFERENCE_STATE[axis->target[j]]];
-            }
-            add_product(mpc->pull + i * n, i < N - 1 ? axis->W : axis->W_end, wanted, n, axis->targets);
-#if QUADSIM_RESTS
-            for (j = 0; j < n; j++) {
-                mpc->pull[i * n + j] -= dot((i < N - 1 ? axis->V : axis->V_end) + j * n, still, n);
-            }
-#endif
-        }
-        plan_backwards(axis, mpc->pull, mpc->push, w);
-        plan_forwards(axis, start, w, mpc->value);
+        find_start(axis, state, rest, away, start, still);
+        find_pull(axis, reference, rest, still, mpc->pull);
+        plan(axis, mpc->pull, mpc->push, start, mpc->w + axis->first * N, mpc->value);
         for (j = 0; j < axis->outputs; j++) {
-            const real there = dot(axis->C + j * n, still, n);
+            const real there = dot(axis->C + j * axis->states, still, axis->states);
             for (i = 0; i < N; i++) {
                 mpc->value[i * M + axis->row[j]] += there;
             }
         }
     }
     inputs_of_axes(mpc->w, mpc->u);
-    for (i = 0; i < N * NU; i++) {
-        mpc->u[i] += trim[i % NU];
+    for (i = 0; i < N; i++) {
+        for (j = 0; j < NU; j++) {
+            mpc->u[i * NU + j] += trim[j];
+        }
     }
     add_terms(mpc->u, acting, mpc->value);
 }
@@ -918,7 +873,7 @@ static enum quadsim_status optimise(quadsim_mpc *mpc, const real *state, const r
     mpc->count = 0;
     mpc->slack = R(1.0);
     find_free(mpc, state, reference, rest, trim, acting);
-    if (!is_finite(mpc->u, N * NU) || !is_finite(mpc->value, N * M)) {
+    if (!is_finite(mpc->u, N * NU)) {
         return QUADSIM_BEFORE;
     }
     memset(mpc->side, 0, sizeof(mpc->side));
