@@ -1,7 +1,8 @@
-"""An export's programs: built with its Makefile, and run, where their processor is another, in an emulator."""
+"""An export's programs: built with its Makefile and run, in an emulator where their processor is another."""
 
 from __future__ import annotations
 
+import contextlib
 import os
 import select
 import shutil
@@ -49,22 +50,22 @@ def build(directory: Path, program: str, *settings: str) -> Path:
     return directory / program
 
 
-class Emulator:
-    """A program on an emulated processor, and the serial line to it; see `scenarios.export.serial_line.Line`.
+class Program:
+    """A program that runs, and the serial line to it; see `scenarios.export.serial_line.Line`.
 
     Args:
-        target: whose emulator.
-        image: the program.
+        target: what it was built for.
+        image: its file.
     """
 
     def __init__(self, target: Target, image: Path) -> None:
         self._messages = tempfile.TemporaryFile()
-        command = [*target.emulation, "-serial", "stdio", "-kernel", str(image)]
+        command = [*target.emulation, "-serial", "stdio", "-kernel", str(image)] if target.board else [str(image)]
         self._process = subprocess.Popen(
             command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=self._messages, bufsize=0
         )
 
-    def __enter__(self) -> Emulator:
+    def __enter__(self) -> Program:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
@@ -75,10 +76,8 @@ class Emulator:
     def send(self, data: bytes) -> None:
         """Send all of it; to a program that has ended nothing."""
         assert self._process.stdin is not None
-        try:
+        with contextlib.suppress(BrokenPipeError):
             self._process.stdin.write(data)
-        except BrokenPipeError:
-            pass
 
     def receive(self, count: int) -> bytes:
         """So many bytes; fewer where the program has ended, or says nothing for `PATIENCE`."""

@@ -77,6 +77,7 @@ int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size)
         }
         if ((manners & 128) != 0) {
             quadsim_mpc_reset(mpc, acting);
+            memcpy(command, HOVER, sizeof command); /* in force where acting is not finite */
         }
         memcpy(before, is_finite(acting, 4) ? acting : command, sizeof before);
         status = quadsim_mpc_step(mpc, state, reference, acting, command);
