@@ -120,6 +120,14 @@ class MissingPackageError(InputError):
         self.what, self.package, self.extra = what, package, extra
 
 
+class MissingProgramError(InputError):
+    """Something asked for needs a program that is not installed; the message says how to get it."""
+
+    def __init__(self, what: str, program: str, *, packages: str) -> None:
+        super().__init__(f"{what} needs {program!r}: apt-get install --no-install-recommends {packages}")
+        self.what, self.program, self.packages = what, program, packages
+
+
 class OutputError(QuadsimError, OSError):
     """Results cannot be written: directory not writable, disk full; nothing is left behind."""
 

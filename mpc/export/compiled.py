@@ -23,9 +23,10 @@ from quadsim.controller import GROUNDED, SOLVED, UNCONSTRAINED, Command, Moment,
 from quadsim.state import EULER, EULER_RATE, VELOCITY, Array
 from quadsim.vehicle import Vehicle
 
-STATUSES: Final = (UNCONSTRAINED, SOLVED, SOLVED, "axes_clipped", "plan_shifted", "command_held")
+STATUSES: Final = (UNCONSTRAINED, SOLVED, SOLVED, "clipped", "shifted", "before")
 """What `enum quadsim_status` is in a flight's log."""
 FALLBACK: Final = (0, 0, 0, 1, 2, 3)
+"""And its fallback level."""
 SOLVER: Final = "compiled"
 """What stands for the name of a solver."""
 _MOVING: Final = [*VELOCITY, *EULER, *EULER_RATE]

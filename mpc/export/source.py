@@ -130,7 +130,7 @@ def robust_data(vehicle: Vehicle, period: float, settings: RobustSettings) -> st
 
     def decay(time: Array | float) -> Array:
         """Share of rotor speeds that is left after a time [s]."""
-        return np.exp(-np.asarray(time) / lag) if lag else np.zeros(np.shape(time))
+        return np.asarray(np.exp(-np.asarray(time) / lag) if lag else np.zeros(np.shape(time)), float)
 
     flags = {
         "SUBSTEPS": (SUBSTEPS, "Runge-Kutta steps of a prediction"),
@@ -209,7 +209,7 @@ def data(found: Tables, bounds: ActuatorBounds | None, *, rests: bool) -> str:
 
 def _axis_arrays(g: int, axis: AxisTables, *, needed: bool) -> list[str]:
     """The arrays of an axis; its responses only where there are rows."""
-    responses = _tidy(lower_packed(axis.responses)) if needed else np.zeros(1)
+    responses: Array = _tidy(lower_packed(axis.responses)) if needed else np.zeros(1)
     return [
         small_integers(f"STATE_{g}", axis.states),
         small_integers(f"TARGET_{g}", axis.targets),

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Final, Literal, get_args
+from typing import Final, get_args
 
 import numpy as np
 
 from mpc.export.ctext import number
 from mpc.export.source import DATA, HEADER, SOURCE, Precision, part, sources
+from mpc.export.targets import TARGETS, Target
 from mpc.fallback.contract import Guarded
 from mpc.robust.controller import RobustMPC
 from quadsim.errors import ExportError, ParameterError
@@ -24,12 +25,11 @@ from scenarios.schema.robust import RobustSpec
 from scenarios.schema.scenario import Scenario
 
 KIND: Final = "export"  # what `quadsim.outputs` calls such a directory
-Target = Literal["posix"]
 EXPORTED: Final = "unconstrained, constrained and robust"
 
 
 def export(
-    scenario: Scenario | str | Path, out: str | Path, *, precision: Precision = "double", target: Target = "posix"
+    scenario: Scenario | str | Path, out: str | Path, *, precision: Precision = "double", target: str = "posix"
 ) -> Path:
     """Write a scenario's controller as self-contained C99, with the periods of the scenario's flight as test vectors.
 
@@ -40,7 +40,8 @@ def export(
         scenario: it, or its name or file.
         out: the directory; an earlier export there is replaced.
         precision: of all numbers, `double` or `float`.
-        target: what its `main` and its Makefile are for.
+        target: the machine that its programs are for: `posix`, or `cortex-m7` or `cortex-m4f` on a board that QEMU
+            emulates.
 
     Returns:
         The directory.
@@ -54,7 +55,7 @@ def export(
         >>> import quadsim
         >>> directory = quadsim.export(quadsim.load("hover", {"duration": 1.0}), "c")  # doctest: +SKIP
     """
-    for name, value, allowed in (("precision", precision, get_args(Precision)), ("target", target, get_args(Target))):
+    for name, value, allowed in (("precision", precision, get_args(Precision)), ("target", target, tuple(TARGETS))):
         if value not in allowed:
             raise ParameterError("", f"--{name}", value, f"one of {', '.join(allowed)}")
     if not isinstance(scenario, Scenario):
@@ -62,12 +63,7 @@ def export(
     directory = real_path(out)
     require_directory(directory, KIND)
     files = controller_files(scenario, precision) | vector_files(record(scenario))
-    files |= {
-        "README.md": _readme(scenario, precision),
-        "main.c": part("main.c"),
-        "Makefile": part(f"Makefile.{target}"),
-        "LICENSE": part("LICENSE"),
-    }
+    files |= {"README.md": _readme(scenario, precision), **programs(TARGETS[target])}
     with writing(directory, KIND) as partial:
         for name, text in files.items():
             write_text(partial / name, text)
@@ -83,6 +79,12 @@ def controller_files(scenario: Scenario, precision: Precision) -> dict[str, str]
     law = exported_law(scenario)
     robust = (build_vehicle(scenario), law.settings) if isinstance(law, RobustMPC) else None
     return sources(law.problem, precision=precision, title=_title(scenario), robust=robust)
+
+
+def programs(target: Target) -> dict[str, str]:
+    """What runs the controller on a machine, by file name."""
+    names = ("main.c", "serial.c", "target.h", *target.sources, "LICENSE")
+    return {name: part(name) for name in names} | {"Makefile": target.makefile + part("Makefile")}
 
 
 def exported_law(scenario: Scenario) -> MPC:
@@ -153,6 +155,8 @@ state, and of the C library `memcpy` and `memset`.
 | `{SOURCE}`, `{DATA}` | the controller and its numbers |
 | `vectors.h`, `vectors.c` | the periods of the flight that it was recorded on, with the exact answers |
 | `main.c`, `Makefile` | `make check` runs these periods and compares |
+| `serial.c` | the controller behind a serial line, with checksums and a watchdog: a start for an integration |
+| `target.h` and what implements it | the clock, the console and the serial line that these two need of a machine |
 
 ```c
 static quadsim_mpc mpc;
