@@ -11,17 +11,15 @@ from typing import Final
 import numpy as np
 
 from mpc.answer import ActuatorBounds
-from mpc.constrained import ConstrainedMPC
 from mpc.equilibrium import Trim
+from mpc.export.source import Exportable
 from mpc.fallback.completion import CompletedMoment
 from mpc.heading import predict_in_heading_frame
 from mpc.model import hover_model
 from mpc.paper.prediction import rollout
-from mpc.robust.controller import LONGEST_SPAN, RobustMPC
-from mpc.unconstrained import UnconstrainedMPC
+from mpc.robust.settings import LONGEST_SPAN
 from quadsim.controller import GROUNDED, SOLVED, UNCONSTRAINED, Command, Moment, Phase, stopped
 from quadsim.state import EULER, EULER_RATE, VELOCITY, Array
-from quadsim.vehicle import Vehicle
 
 STATUSES: Final = (UNCONSTRAINED, SOLVED, SOLVED, "clipped", "shifted", "before")
 """What `enum quadsim_status` is in a flight's log."""
@@ -32,8 +30,6 @@ SOLVER: Final = "compiled"
 _MOVING: Final = [*VELOCITY, *EULER, *EULER_RATE]
 _SAME_TIME: Final = 1e-6  # [s]
 
-ExportedMPC = ConstrainedMPC | RobustMPC | UnconstrainedMPC
-
 
 class CompiledMPC:
     """A law that was exported and compiled with `c/shim.c`; it answers as the C does, whatever there is no optimum for.
@@ -41,20 +37,21 @@ class CompiledMPC:
     Args:
         library: the compiled file.
         law: what it was exported from.
-        vehicle: that modelled.
     """
 
-    def __init__(self, library: Path, law: ExportedMPC, vehicle: Vehicle) -> None:
-        self.name, self.horizon, self.solver = law.name, law.horizon, SOLVER
-        self.problem = law.problem
-        self._robust = isinstance(law, RobustMPC)
-        self._nominal = hover_model(vehicle, law.problem.model.period)
-        self._bounds = ActuatorBounds.of_problem(law.problem) if law.problem.every_constraint else None
+    solver: Final = SOLVER
+
+    def __init__(self, library: Path, law: Exportable) -> None:
+        self.name, self.problem, self.horizon = law.name, law.problem, law.problem.horizon
+        self._robust = law.settings is not None
+        self._nominal = hover_model(law.vehicle, law.problem.model.period)
+        self._unbounded = not law.problem.every_constraint  # whose law is the gain: no status tells of a free optimum
+        self._bounds = None if self._unbounded else ActuatorBounds.of_problem(law.problem)
         self._library = ctypes.CDLL(str(library))
         self._library.quadsim_shim_size.restype = ctypes.c_size_t
-        self._asked, self._answers = np.zeros(18 + 4 * law.horizon), np.zeros(18 + 4 * law.horizon)
+        self._asked, self._answers = np.zeros(18 + 4 * self.horizon), np.zeros(18 + 4 * self.horizon)
         self._state, self._acting = self._asked[:12], self._asked[12:16]
-        self._path = self._asked[16:-2].reshape(law.horizon, 4)
+        self._path = self._asked[16:-2].reshape(self.horizon, 4)
         self._memory = ctypes.create_string_buffer(self._library.quadsim_shim_size() + 64)
         start = -(-ctypes.addressof(self._memory) // 64) * 64
         self._arguments = tuple(
@@ -97,7 +94,7 @@ class CompiledMPC:
         return Command(
             speeds=self._before.copy(),
             plan=plan if accepted else np.tile(self._before, (N, 1)),
-            status=STATUSES[way],
+            status=SOLVED if self._unbounded else STATUSES[way],
             iterations=int(changes),
             active=int(active) if accepted else 0,
             fallback=FALLBACK[way],

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from importlib import resources
 from typing import Final, Literal
 
@@ -32,38 +33,48 @@ def part(name: str) -> str:
     return (resources.files("mpc.export") / "c" / name).read_text(encoding="utf-8")
 
 
-def sources(
-    problem: Problem,
-    *,
-    precision: Precision,
-    title: str,
-    robust: tuple[Vehicle, RobustSettings] | None = None,
-) -> dict[str, str]:
+@dataclass(frozen=True, kw_only=True)
+class Exportable:
+    """What an exported controller is made from.
+
+    Attributes:
+        name: of the law.
+        problem: its optimisation.
+        vehicle: that modelled.
+        settings: the parts of the robust controller; None for the paper's controllers.
+    """
+
+    name: str
+    problem: Problem
+    vehicle: Vehicle
+    settings: RobustSettings | None = None
+
+
+def sources(law: Exportable, *, precision: Precision, title: str) -> dict[str, str]:
     """The controller's files, by name.
 
     Args:
-        problem: its optimisation.
+        law: the controller.
         precision: of all numbers.
         title: a line that says which it is, in ASCII.
-        robust: the modelled vehicle and the parts of the robust controller; None for the paper's controllers.
 
     Raises:
         ParameterError: the problem is too large, or its rows differ from step to step.
     """
+    problem, settings = law.problem, law.settings
     found = tables(problem)
     bounds = ActuatorBounds.of_problem(problem) if problem.every_constraint else None
     real = "double" if precision == "double" else "float"
     head = part(HEADER).replace("@TITLE@", title).replace("@PERIOD@", f"{problem.model.period:g}")
     head = head.replace("@REAL@", real).replace("@SIZES@", _sizes(found, precision))
-    numbers = data(found, bounds, rests=robust is not None)
-    if robust is None:
-        law = ["answer.c", "constrained.c"]
-    else:
-        law = ["elementary.c", "answer.c", "robust.c"]
-        numbers += robust_data(robust[0], problem.model.period, robust[1])
+    numbers = data(found, bounds, rests=settings is not None)
+    parts = ["answer.c", "constrained.c"]
+    if settings is not None:
+        parts = ["elementary.c", "answer.c", "robust.c"]
+        numbers += robust_data(law.vehicle, problem.model.period, settings)
     return {
-        HEADER: head.replace("@STATE@", "" if robust is None else ROBUST_STATE),
-        SOURCE: solver(found) + "".join(map(part, law)),
+        HEADER: head.replace("@STATE@", "" if settings is None else ROBUST_STATE),
+        SOURCE: solver(found) + "".join(map(part, parts)),
         DATA: numbers,
     }
 

@@ -171,7 +171,7 @@ def _axis(problem: Problem, rows: Rows, part: Axis, first: int) -> AxisTables:
         A, B = part.problem.model.A, part.problem.model.B
         (Q, W), (Q_end, W_end) = part.problem.objective.weights, part.problem.objective.terminal_weights
         C_r = part.problem.objective.C_r
-        of_reference = objective.C_r[np.ix_(part.regulated, list(REFERENCE_STATES))]
+        of_reference = objective.C_r[part.regulated][:, REFERENCE_STATES]
     else:
         A, B, Q, Q_end = np.zeros((0, 0)), np.zeros((0, m)), np.zeros((0, 0)), np.zeros((0, 0))
         W, W_end, C_r, of_reference = np.zeros((0, 0)), np.zeros((0, 0)), np.zeros((0, 0)), np.zeros((0, 4))
@@ -200,7 +200,7 @@ def _axis(problem: Problem, rows: Rows, part: Axis, first: int) -> AxisTables:
         own = rows.part(part.outputs, part.states, m)
         G = row_maps(own, maps).of_inputs
     else:
-        H, G = 2.0 * np.kron(np.eye(N), Q_u), np.zeros((N, 0, N * m))
+        H, G = np.asarray(2.0 * np.kron(np.eye(N), Q_u), float), np.zeros((N, 0, N * m))
     channels = np.concatenate([np.eye(N * m).reshape(N, m, N * m), G], axis=1).reshape(-1, N * m)
     half = scipy.linalg.solve_triangular(np.linalg.cholesky(H), channels.T, lower=True)
     return AxisTables(

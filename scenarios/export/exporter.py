@@ -8,24 +8,18 @@ from typing import Final, get_args
 import numpy as np
 
 from mpc.export.ctext import number
-from mpc.export.source import DATA, HEADER, SOURCE, Precision, part, sources
+from mpc.export.source import DATA, HEADER, SOURCE, Exportable, Precision, part, sources
 from mpc.export.targets import TARGETS, Target
-from mpc.fallback.contract import Guarded
-from mpc.robust.controller import RobustMPC
-from quadsim.errors import ExportError, ParameterError
+from quadsim.errors import ParameterError
 from quadsim.outputs import real_path, require_directory, write_text, writing
 from quadsim.state import Array
 from scenarios.api import load
-from scenarios.build import build_controller
-from scenarios.export.record import MPC, Recording, record
+from scenarios.export.record import Recording, record
+from scenarios.parts.controllers import exportable
 from scenarios.parts.vehicle import build_vehicle
-from scenarios.schema.controller import ConstrainedSpec, UnconstrainedSpec
-from scenarios.schema.optimisation import BoundedSpec
-from scenarios.schema.robust import RobustSpec
 from scenarios.schema.scenario import Scenario
 
 KIND: Final = "export"  # what `quadsim.outputs` calls such a directory
-EXPORTED: Final = "unconstrained, constrained and robust"
 
 
 def export(
@@ -76,36 +70,23 @@ def controller_files(scenario: Scenario, precision: Precision) -> dict[str, str]
     Raises:
         ExportError: this controller cannot be exported.
     """
-    law = exported_law(scenario)
-    robust = (build_vehicle(scenario), law.settings) if isinstance(law, RobustMPC) else None
-    return sources(law.problem, precision=precision, title=_title(scenario), robust=robust)
+    return sources(exported_law(scenario), precision=precision, title=_title(scenario))
+
+
+def exported_law(scenario: Scenario) -> Exportable:
+    """What is exported: the scenario's controller without what guards it.
+
+    Raises:
+        ExportError: it cannot be exported.
+    """
+    shapes = (*scenario.obstacles, *scenario.regions)
+    return exportable(scenario.controller, build_vehicle(scenario), scenario.control_period, shapes)
 
 
 def programs(target: Target) -> dict[str, str]:
     """What runs the controller on a machine, by file name."""
     names = ("main.c", "serial.c", "target.h", *target.sources, "LICENSE")
     return {name: part(name) for name in names} | {"Makefile": target.makefile + part("Makefile")}
-
-
-def exported_law(scenario: Scenario) -> MPC:
-    """The law that is exported, without what guards it.
-
-    Raises:
-        ExportError: it cannot be exported.
-    """
-    spec = scenario.controller
-    if not isinstance(spec, UnconstrainedSpec | ConstrainedSpec | RobustSpec):
-        raise ExportError(f"its controller is {spec.type!r}; exported are {EXPORTED}")
-    if isinstance(spec, RobustSpec) and spec.linearisation != "hover":
-        raise ExportError(
-            f"its model is another in each period, linearisation = {spec.linearisation!r}; exported is 'hover'"
-        )
-    if isinstance(spec, BoundedSpec) and spec.avoidance is not None and (scenario.obstacles or scenario.regions):
-        raise ExportError("its half-spaces around obstacles are others in each period; leave out controller.avoidance")
-    law = build_controller(scenario, build_vehicle(scenario))
-    law = law.inner if isinstance(law, Guarded) else law
-    assert isinstance(law, MPC)
-    return law
 
 
 def _title(scenario: Scenario) -> str:

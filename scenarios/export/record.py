@@ -24,6 +24,7 @@ from quadsim.state import Array
 from scenarios.build import build_controller
 from scenarios.parts.vehicle import build_vehicle
 from scenarios.run import fly_scenario
+from scenarios.schema.optimisation import WeightedSpec
 from scenarios.schema.scenario import Scenario
 
 MPC = ConstrainedMPC | RobustMPC | UnconstrainedMPC
@@ -85,6 +86,8 @@ class Recorder:
 
 def record(scenario: Scenario) -> Recording:
     """Fly a scenario, note each period, and ask a controller that starts with the first of them for the answers."""
+    if isinstance(scenario.controller, WeightedSpec) and scenario.controller.compiled:
+        scenario = scenario.replace({"controller.compiled": False})
     law = build_controller(scenario, build_vehicle(scenario))
     inner = law.inner if isinstance(law, Guarded) else law
     assert isinstance(inner, MPC)

@@ -8,33 +8,40 @@ import shutil
 import stat
 import subprocess
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Callable, Hashable, Mapping
 from pathlib import Path
 from typing import Final
 
 from mpc.export.compiled import CompiledMPC
-from mpc.export.source import part
+from mpc.export.source import Exportable, part, sources
 from quadsim.errors import CompilerError, OutputError
 from quadsim.outputs import write_new
-from quadsim.vehicle import Vehicle
-from scenarios.export.exporter import controller_files, exported_law
-from scenarios.schema.scenario import Scenario
 
 FLAGS: Final = ("-std=c99", "-O3", "-ffp-contract=off", "-fPIC", "-shared")
 """Without contraction all processors, and all levels of optimisation, have the same bits."""
 COMPILERS: Final = ("cc", "gcc", "clang")
 
 
-def compiled_controller(scenario: Scenario, vehicle: Vehicle) -> CompiledMPC:
-    """The scenario's controller as compiled C, without what guards it.
+_READY: dict[Hashable, tuple[Path, Exportable]] = {}
+"""What this process has compiled, or found: a campaign's flights mostly have the same controller."""
+
+
+def compiled_controller(key: Hashable, make: Callable[[], Exportable]) -> CompiledMPC:
+    """A controller as compiled C.
+
+    Args:
+        key: the same for the same controller.
+        make: called where that is new to this process.
 
     Raises:
         ExportError: this controller cannot be exported.
         CompilerError: there is no compiler, or it fails.
         OutputError: the cache directory cannot be written.
     """
-    files = controller_files(scenario, "double")
-    return CompiledMPC(compiled(files), exported_law(scenario), vehicle)
+    if key not in _READY:
+        law = make()
+        _READY[key] = compiled(sources(law, precision="double", title=law.name)), law
+    return CompiledMPC(*_READY[key])
 
 
 def compiled(files: Mapping[str, str]) -> Path:
