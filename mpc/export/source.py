@@ -71,7 +71,7 @@ def sources(law: Exportable, *, precision: Precision, title: str) -> dict[str, s
     parts = ["answer.c", "constrained.c"]
     if settings is not None:
         parts = ["elementary.c", "answer.c", "robust.c"]
-        numbers += robust_data(law.vehicle, problem.model.period, settings)
+        numbers += robust_data(law.vehicle, problem.model.period, settings) + "\n" + reals("MODES", found.modes)
     return {
         HEADER: head.replace("@STATE@", "" if settings is None else ROBUST_STATE),
         SOURCE: solver(found) + "".join(map(part, parts)),

@@ -26,7 +26,7 @@ from mpc.ocp import Problem
 from mpc.paper.condensed import condensed_cost, row_maps
 from mpc.paper.prediction import prediction
 from quadsim.errors import ParameterError
-from quadsim.state import REFERENCE_STATES, Array
+from quadsim.state import N_STATES, REFERENCE_STATES, Array
 
 ROUNDING: Final = 1e-13
 """Share of the largest number of a row of C_r, D, E, or T below which one is taken for a product of rounding."""
@@ -90,6 +90,7 @@ class Tables:
     tolerance: Array  # (m,) the largest of these roots
     T: Array  # (nu, nu) u - u_s = T w
     T_inverse: Array
+    modes: Array  # (nu, nu) takes rotor speeds that are states to what stands for them, one of each axis
     room: int  # active rows that there is room for
 
 
@@ -100,6 +101,10 @@ def tables(problem: Problem) -> Tables:
         ParameterError: it is too large, or its rows differ from step to step.
     """
     problem = with_constraints(problem)
+    modes = np.eye(problem.model.nu)
+    if problem.model.n == N_STATES + problem.model.nu:
+        modes = _modes(problem)
+        problem = _in_modes(problem, modes)
     rows = problem.rows
     if rows.C.ndim == 3:
         raise ParameterError("controller", "constraints", "rows that differ from step to step", "the same at all steps")
@@ -130,6 +135,7 @@ def tables(problem: Problem) -> Tables:
         tolerance=1.0 / scale.min(axis=0, initial=math.inf),
         T=T,
         T_inverse=T_inverse,
+        modes=modes,
         room=room,
     )
 
@@ -141,6 +147,37 @@ def with_constraints(problem: Problem) -> Problem:
     nothing = np.full(problem.model.nu, -math.inf)
     none = Constraint(name="none", lower=nothing, upper=-nothing, D=np.eye(problem.model.nu))
     return replace(problem, constraints=(none,))
+
+
+def _modes(problem: Problem) -> Array:
+    """T^-1 of the problem without rotor lag: speeds that all follow their inputs alike then fall into the axes."""
+    model, objective, n = problem.model, problem.objective, N_STATES
+    without = Problem(
+        model=replace(model, A=model.A[:n, :n], B=model.B[:n]),
+        horizon=problem.horizon,
+        objective=replace(objective, C_r=objective.C_r[:, :n], P=None if objective.P is None else objective.P[:n, :n]),
+        constraints=tuple(
+            part if part.C is None else replace(part, C=part.C[:, :n]) for part in problem.every_constraint
+        ),
+    )
+    return np.array(np.linalg.inv(_all_axes(without)[1]), float)
+
+
+def _in_modes(problem: Problem, modes: Array) -> Problem:
+    """The problem whose last states are `modes` times the rotor speeds."""
+    model, objective = problem.model, problem.objective
+    to = scipy.linalg.block_diag(np.eye(N_STATES), modes)
+    back = np.linalg.inv(to)
+    A, B = to @ model.A @ back, to @ model.B
+    for matrix in (A, B):
+        matrix[np.abs(matrix) < ROUNDING * np.abs(matrix).max()] = 0.0
+    P = None if objective.P is None else _symmetric(back.T @ objective.P @ back)
+    return Problem(
+        model=replace(model, A=A, B=B),
+        horizon=problem.horizon,
+        objective=replace(objective, P=P),
+        constraints=problem.every_constraint,
+    )
 
 
 def _all_axes(problem: Problem) -> tuple[list[Axis], Array]:

@@ -15,22 +15,27 @@ from mpc.exact.free import FreeOptimum
 from mpc.export.tables import with_constraints
 from mpc.fallback.completion import CompletedMoment
 from mpc.fallback.contract import Guarded
+from mpc.paper.condensed import Condensed
+from mpc.qp import Solution, kkt_residuals
 from mpc.robust.controller import RobustMPC
 from mpc.solvers import Way
 from mpc.unconstrained import UnconstrainedMPC
 from quadsim.controller import ACCEPTED, Command, Moment, Phase
 from quadsim.errors import ExportError, PlanExhaustedError
 from quadsim.state import Array
+from scenarios.bench.polish import polish
 from scenarios.build import build_controller
 from scenarios.parts.vehicle import build_vehicle
 from scenarios.run import fly_scenario
-from scenarios.schema.optimisation import WeightedSpec
+from scenarios.schema.optimisation import BoundedSpec
 from scenarios.schema.scenario import Scenario
 
 MPC = ConstrainedMPC | RobustMPC | UnconstrainedMPC
 WAYS: Final = {Way.FREE: 0, Way.AXES: 1, Way.WHOLE: 2}
 REFUSED: Final = 3
 """Least status of a period without an optimum."""
+EXACT: Final = 1e-7
+"""KKT residuals of a QP that are taken for rounding."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -86,8 +91,9 @@ class Recorder:
 
 def record(scenario: Scenario) -> Recording:
     """Fly a scenario, note each period, and ask a controller that starts with the first of them for the answers."""
-    if isinstance(scenario.controller, WeightedSpec) and scenario.controller.compiled:
-        scenario = scenario.replace({"controller.compiled": False})
+    scenario = scenario.replace({"controller.compiled": False})
+    if isinstance(scenario.controller, BoundedSpec):
+        scenario = scenario.replace({"controller.shortcut": True})
     law = build_controller(scenario, build_vehicle(scenario))
     inner = law.inner if isinstance(law, Guarded) else law
     assert isinstance(inner, MPC)
@@ -126,6 +132,8 @@ def _answers(
             if command.status in ACCEPTED:
                 assert law.answer is not None
                 status[k], commands[k] = WAYS[law.answer.way], command.speeds
+                if isinstance(law, ConstrainedMPC) and not _is_exact(law.answer.solution):
+                    status[k], commands[k] = _polished(law, state, reference, acting)
     return status, commands
 
 
@@ -138,3 +146,24 @@ def _free_commands(law: UnconstrainedMPC, asked: list[tuple[Array, Array, Array]
     return np.array(
         [u_bar + T @ optimum.at(state, desired(path), before - u_bar)[0][:, 0] for state, before, path in asked]
     )
+
+
+def _is_exact(solution: Solution) -> bool:
+    """Whether a solution is not a solver's approximation."""
+    return solution.primal_residual == solution.dual_residual == 0.0
+
+
+def _polished(law: ConstrainedMPC, state: Array, reference: Array, acting: Array) -> tuple[int, Array]:
+    """Status and command of the exact optimum next to the last answer, which is the solver's."""
+    problem, answer = law.problem, law.answer
+    assert answer is not None
+    form = Condensed(problem)
+    qp = form.qp.with_vectors(form.vectors(state, problem.objective.desired(reference), acting))
+    exact = polish(qp, answer.solution)
+    left = kkt_residuals(qp, exact)
+    if max(left.stationarity, left.primal) > EXACT:
+        return WAYS[answer.way], answer.plan[0]
+    multipliers, rows = form.multipliers(exact), problem.rows
+    active = np.abs(multipliers).max(axis=0, initial=0.0) > 0.0
+    whole = (active & ~rows.of_states).any() or (rows.C.any(axis=1) & ~rows.of_states).any()
+    return WAYS[Way.WHOLE if whole else Way.AXES], form.inputs(exact.x)[0]

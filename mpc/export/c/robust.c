@@ -217,6 +217,15 @@ static void see_reference(const real *reference, real yaw, real sine, real cosin
     }
 }
 
+/* The last states [NX], which stand for the rotors' speeds where these lag. */
+static void put_modes(const real *speeds, real *state)
+{
+    int j;
+    for (j = 0; j < NX - 12; j++) {
+        state[12 + j] = dot(MODES + j * NU, speeds, NU);
+    }
+}
+
 /* Where the model rests: x_s at the present place, u_s with what balances the torque that thrust twists now. */
 static void find_rest(const quadsim_mpc *mpc, const real *state, real sine, real cosine, real *rest, real *speeds)
 {
@@ -236,10 +245,8 @@ static void find_rest(const quadsim_mpc *mpc, const real *state, real sine, real
     }
     for (j = 0; j < NU; j++) {
         speeds[j] = mpc->trim[j] - excess_thrust * dot(SLOPE_INVERSE + j * NU + 1, mpc->twist, 3);
-        if (NX > 12) {
-            rest[NX - NU + j] = speeds[j];
-        }
     }
+    put_modes(speeds, rest);
 }
 
 /* The optimum from a state at the instant from which the command acts. */
@@ -256,9 +263,7 @@ static enum quadsim_status solve_ahead(quadsim_mpc *mpc, const real *ahead, cons
         state[VY] = cosine * ahead[VY] - sine * ahead[VX];
         state[YAW] = R(0.0);
     }
-    if (NX > 12) {
-        memcpy(state + (NX - NU), mpc->rotors, sizeof(mpc->rotors));
-    }
+    put_modes(mpc->rotors, state);
     see_reference(reference, ahead[YAW], sine, cosine, mpc->reference);
     find_rest(mpc, state, sine, cosine, rest, speeds);
     return optimise(mpc, state, mpc->reference, rest, speeds, acting, axes);
