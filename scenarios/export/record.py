@@ -16,7 +16,7 @@ from mpc.export.tables import with_constraints
 from mpc.fallback.completion import CompletedMoment
 from mpc.fallback.contract import Guarded
 from mpc.paper.condensed import Condensed
-from mpc.qp import Solution, kkt_residuals
+from mpc.qp import kkt_residuals
 from mpc.robust.controller import RobustMPC
 from mpc.solvers import Way
 from mpc.unconstrained import UnconstrainedMPC
@@ -106,11 +106,12 @@ def record(scenario: Scenario) -> Recording:
         raise ExportError("its flight has no period in the air, with everything measured, to record")
     states, acting, windows = (np.array(column) for column in zip(*asked, strict=True))
     status, commands = _answers(inner, scenario.control_period, acting[0], asked)
+    known = len(status)
     return Recording(
         speeds=acting[0],
-        state=states,
-        acting=acting,
-        path=np.concatenate([windows[:-1, 0], windows[-1]]),
+        state=states[:known],
+        acting=acting[:known],
+        path=np.concatenate([windows[: known - 1, 0], windows[known - 1]]),
         status=status,
         command=commands,
     )
@@ -119,22 +120,31 @@ def record(scenario: Scenario) -> Recording:
 def _answers(
     law: MPC, period: float, speeds: Array, asked: list[tuple[Array, Array, Array]]
 ) -> tuple[NDArray[np.int64], Array]:
-    """Status (K,) and command (K, 4) of a controller that is asked so from its reset on."""
-    law.reset(speeds)
-    status, commands = np.full(len(asked), REFUSED), np.empty((len(asked), 4))
+    """Status (K,) and command (K, 4) of a controller that is asked so from its reset on.
+
+    They end before the first period whose optimum is known as a solver's approximation alone.
+    """
     if isinstance(law, UnconstrainedMPC):
-        status[:], commands[:] = 0, _free_commands(law, asked)
-        return status, commands
+        return np.zeros(len(asked), np.int64), _free_commands(law, asked)
+    law.reset(speeds)
+    found: list[tuple[int, Array]] = []
     for k, (state, acting, reference) in enumerate(asked):
-        commands[k] = acting
+        answer = REFUSED, acting
         with contextlib.suppress(PlanExhaustedError):
             command = law.step(Moment(time=k * period, acting=acting), state, reference)
             if command.status in ACCEPTED:
                 assert law.answer is not None
-                status[k], commands[k] = WAYS[law.answer.way], command.speeds
-                if isinstance(law, ConstrainedMPC) and not _is_exact(law.answer.solution):
-                    status[k], commands[k] = _polished(law, state, reference, acting)
-    return status, commands
+                answer = WAYS[law.answer.way], command.speeds
+                if (
+                    law.answer.solution.primal_residual or law.answer.solution.dual_residual
+                ):  # not solved in closed form
+                    polished = _polished(law, state, reference, acting) if isinstance(law, ConstrainedMPC) else None
+                    if polished is None:
+                        break
+                    answer = polished
+        found.append(answer)
+    status, commands = zip(*found, strict=True)
+    return np.array(status), np.array(commands)
 
 
 def _free_commands(law: UnconstrainedMPC, asked: list[tuple[Array, Array, Array]]) -> Array:
@@ -148,21 +158,16 @@ def _free_commands(law: UnconstrainedMPC, asked: list[tuple[Array, Array, Array]
     )
 
 
-def _is_exact(solution: Solution) -> bool:
-    """Whether a solution is not a solver's approximation."""
-    return solution.primal_residual == solution.dual_residual == 0.0
-
-
-def _polished(law: ConstrainedMPC, state: Array, reference: Array, acting: Array) -> tuple[int, Array]:
-    """Status and command of the exact optimum next to the last answer, which is the solver's."""
+def _polished(law: ConstrainedMPC, state: Array, reference: Array, acting: Array) -> tuple[int, Array] | None:
+    """Status and command of the exact optimum next to the last answer, the solver's; None where it is not found."""
     problem, answer = law.problem, law.answer
     assert answer is not None
     form = Condensed(problem)
     qp = form.qp.with_vectors(form.vectors(state, problem.objective.desired(reference), acting))
     exact = polish(qp, answer.solution)
     left = kkt_residuals(qp, exact)
-    if max(left.stationarity, left.primal) > EXACT:
-        return WAYS[answer.way], answer.plan[0]
+    if max(left.stationarity, left.primal, left.dual) > EXACT:
+        return None
     multipliers, rows = form.multipliers(exact), problem.rows
     active = np.abs(multipliers).max(axis=0, initial=0.0) > 0.0
     whole = (active & ~rows.of_states).any() or (rows.C.any(axis=1) & ~rows.of_states).any()
