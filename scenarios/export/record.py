@@ -15,15 +15,12 @@ from mpc.exact.free import FreeOptimum
 from mpc.export.tables import with_constraints
 from mpc.fallback.completion import CompletedMoment
 from mpc.fallback.contract import Guarded
-from mpc.paper.condensed import Condensed
-from mpc.qp import kkt_residuals
 from mpc.robust.controller import RobustMPC
 from mpc.solvers import Way
 from mpc.unconstrained import UnconstrainedMPC
 from quadsim.controller import ACCEPTED, Command, Moment, Phase
 from quadsim.errors import ExportError, PlanExhaustedError
 from quadsim.state import Array
-from scenarios.bench.polish import polish
 from scenarios.build import build_controller
 from scenarios.parts.vehicle import build_vehicle
 from scenarios.run import fly_scenario
@@ -34,8 +31,6 @@ MPC = ConstrainedMPC | RobustMPC | UnconstrainedMPC
 WAYS: Final = {Way.FREE: 0, Way.AXES: 1, Way.WHOLE: 2}
 REFUSED: Final = 3
 """Least status of a period without an optimum."""
-EXACT: Final = 1e-7
-"""KKT residuals of a QP that are taken for rounding."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -156,19 +151,3 @@ def _free_commands(law: UnconstrainedMPC, asked: list[tuple[Array, Array, Array]
     return np.array(
         [u_bar + T @ optimum.at(state, desired(path), before - u_bar)[0][:, 0] for state, before, path in asked]
     )
-
-
-def _polished(law: ConstrainedMPC, state: Array, reference: Array, acting: Array) -> tuple[int, Array] | None:
-    """Status and command of the exact optimum next to the last answer, the solver's; None where it is not found."""
-    problem, answer = law.problem, law.answer
-    assert answer is not None
-    form = Condensed(problem)
-    qp = form.qp.with_vectors(form.vectors(state, problem.objective.desired(reference), acting))
-    exact = polish(qp, answer.solution)
-    left = kkt_residuals(qp, exact)
-    if max(left.stationarity, left.primal, left.dual) > EXACT:
-        return None
-    multipliers, rows = form.multipliers(exact), problem.rows
-    active = np.abs(multipliers).max(axis=0, initial=0.0) > 0.0
-    whole = (active & ~rows.of_states).any() or (rows.C.any(axis=1) & ~rows.of_states).any()
-    return WAYS[Way.WHOLE if whole else Way.AXES], form.inputs(exact.x)[0]
