@@ -130,13 +130,8 @@ def _answers(
             if command.status in ACCEPTED:
                 assert law.answer is not None
                 answer = WAYS[law.answer.way], command.speeds
-                if (
-                    law.answer.solution.primal_residual or law.answer.solution.dual_residual
-                ):  # not solved in closed form
-                    polished = _polished(law, state, reference, acting) if isinstance(law, ConstrainedMPC) else None
-                    if polished is None:
-                        break
-                    answer = polished
+                if law.answer.solution.primal_residual or law.answer.solution.dual_residual:
+                    break
         found.append(answer)
     status, commands = zip(*found, strict=True)
     return np.array(status), np.array(commands)
