@@ -53,11 +53,13 @@ struct term {
 #ifdef QUADSIM_FLOAT
 static const real FEASIBLE = 2e-5F;   /* violation of a bound */
 static const real DEPENDENT = 3e-6F;  /* what other rows leave over of a row that is their combination */
+static const real ROUNDED = 4e-7F;    /* of the largest multiplier, what rounding makes of a row's value */
 static const real WRONG = 1e-6F;      /* multiplier of the wrong sign */
 static const real NOTHING_OF = 1e-5F; /* share of a row in a combination */
 #else
 static const real FEASIBLE = 1e-11;
 static const real DEPENDENT = 1e-11;
+static const real ROUNDED = 1e-15;
 static const real WRONG = 1e-12;
 static const real NOTHING_OF = 1e-10;
 #endif
@@ -531,11 +533,24 @@ static void respond_axis(quadsim_mpc *mpc, int g)
     }
 }
 
+/* The size of the largest multiplier, as of rows of unit length. */
+static real largest_multiplier(const quadsim_mpc *mpc)
+{
+    real largest = R(0.0);
+    int j;
+    for (j = 0; j < mpc->count; j++) {
+        const real size = magnitude(mpc->z[j]) / SCALE[mpc->row[j]];
+        largest = size > largest ? size : largest;
+    }
+    return largest;
+}
+
 /* The same of one axis alone, or of all and of all rows. */
 static void respond(quadsim_mpc *mpc, int only)
 {
     static const real before[NU] = {R(0.0)};
     int g;
+    mpc->largest = largest_multiplier(mpc);
     if (only >= 0) {
         respond_axis(mpc, only);
         return;
@@ -558,13 +573,19 @@ static int belongs(int row, int only)
     return only == ALL || (only == OTHERS ? others : kind->axis == only && !others);
 }
 
+/* Violation of a row of unit length that is taken for rounding. */
+static real tolerance(const quadsim_mpc *mpc)
+{
+    return FEASIBLE * mpc->slack + ROUNDED * mpc->largest;
+}
+
 /* The inactive row that is violated most, as of unit length, and its side; -1 for none. */
 static int most_violated(const quadsim_mpc *mpc, int only, int *side)
 {
     real most = R(0.0);
     int found = -1, i, r;
     for (r = 0; r < M; r++) {
-        const real tolerated = FEASIBLE * mpc->slack * TOLERANCE[r];
+        const real tolerated = tolerance(mpc) * TOLERANCE[r];
         for (i = 0; belongs(r, only) && i < N; i++) {
             const int row = i * M + r;
             const real value = mpc->value[row] + mpc->shift[row];
@@ -583,7 +604,7 @@ static int most_violated(const quadsim_mpc *mpc, int only, int *side)
 /* Whether a row is violated by so little that it may be rounding. */
 static int is_slight(const quadsim_mpc *mpc, int row)
 {
-    const real value = mpc->value[row] + mpc->shift[row], much = R(100.0) * FEASIBLE * TOLERANCE[row % M];
+    const real value = mpc->value[row] + mpc->shift[row], much = R(100.0) * tolerance(mpc) * TOLERANCE[row % M];
     return value < upper_bound(row) + much && value > lower_bound(row) - much;
 }
 
@@ -620,7 +641,7 @@ static int is_exact(const quadsim_mpc *mpc)
 {
     int j;
     for (j = 0; j < mpc->count; j++) {
-        if (!(magnitude(residual(mpc, j)) <= R(10.0) * FEASIBLE * mpc->slack * TOLERANCE[mpc->row[j] % M])) {
+        if (!(magnitude(residual(mpc, j)) <= R(10.0) * tolerance(mpc) * TOLERANCE[mpc->row[j] % M])) {
             return 0;
         }
     }
@@ -842,6 +863,7 @@ static enum verdict solve_axes(quadsim_mpc *mpc, const real *trim, real axes[NU]
     memset(mpc->shift, 0, sizeof(mpc->shift));
     memset(mpc->dw, 0, sizeof(mpc->dw));
     mpc->slack = R(1.0);
+    mpc->largest = R(0.0);
     for (g = 0; g < QUADSIM_PARTS; g++) {
         if (most_violated(mpc, g, &side) >= 0 && optimum(mpc, g, mpc->last) != SOLVED) {
             return GAVE_UP;
@@ -872,6 +894,7 @@ static enum quadsim_status optimise(quadsim_mpc *mpc, const real *state, const r
     mpc->changes = 0;
     mpc->count = 0;
     mpc->slack = R(1.0);
+    mpc->largest = R(0.0);
     find_free(mpc, state, reference, rest, trim, acting);
     if (!is_finite(mpc->u, N * NU)) {
         return QUADSIM_BEFORE;
