@@ -576,7 +576,8 @@ static int belongs(int row, int only)
 /* Violation of a row of unit length that is taken for rounding. */
 static real tolerance(const quadsim_mpc *mpc)
 {
-    return FEASIBLE * mpc->slack + ROUNDED * mpc->largest;
+    const real rounded = ROUNDED * mpc->largest, most = R(15.0) * FEASIBLE; /* without end where there is no optimum */
+    return FEASIBLE * mpc->slack + (rounded < most ? rounded : most);
 }
 
 /* The inactive row that is violated most, as of unit length, and its side; -1 for none. */
