@@ -592,7 +592,7 @@ static int most_violated(const quadsim_mpc *mpc, int only, int *side)
             const real value = mpc->value[row] + mpc->shift[row];
             const real above = value - upper_bound(row), below = lower_bound(row) - value;
             const real over = above > below ? above : below;
-            if (over > tolerated && mpc->side[row] == 0 && over * SCALE[row] > most) {
+            if (over > tolerated && mpc->side[row] == 0 && row != mpc->passed_over && over * SCALE[row] > most) {
                 most = over * SCALE[row];
                 *side = above > below ? 1 : -1;
                 found = row;
@@ -671,6 +671,8 @@ static enum verdict improve(quadsim_mpc *mpc, int only)
             const enum verdict verdict = enter(mpc, row, side);
             if ((row == left || mpc->spent >= MOST_CHANGES / 2) && mpc->slack < MOST_SLACK) {
                 mpc->slack *= R(2.0); /* in circles, within rounding */
+            } else if (row == left && is_slight(mpc, row)) {
+                mpc->passed_over = row;
             }
             if (verdict != SOLVED) {
                 return verdict;
@@ -693,6 +695,7 @@ static void start_cold(quadsim_mpc *mpc, int only)
 {
     int row;
     mpc->count = mpc->solved = mpc->spent = 0;
+    mpc->passed_over = -1;
     mpc->slack = R(1.0);
     for (row = 0; row < N * M; row++) {
         if (belongs(row, only)) {
@@ -896,6 +899,7 @@ static enum quadsim_status optimise(quadsim_mpc *mpc, const real *state, const r
     mpc->count = 0;
     mpc->slack = R(1.0);
     mpc->largest = R(0.0);
+    mpc->passed_over = -1;
     find_free(mpc, state, reference, rest, trim, acting);
     if (!is_finite(mpc->u, N * NU)) {
         return QUADSIM_BEFORE;
