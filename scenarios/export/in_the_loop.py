@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tempfile
+from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
@@ -83,7 +84,8 @@ def fly_exported(
     """Fly a scenario with its controller exported, compiled and run by its target: processor in the loop.
 
     The controller's program is `serial.c` of the export, at the other end of a serial line: a Cortex-M's UART in QEMU,
-    for `posix` a pipe.  What it is asked and answers are bytes; the flight is audited as any other.
+    for `posix` a pipe.  What it is asked and answers are bytes; the flight is audited as any other, but that a float
+    may pass a bound on speeds and their steps by the spacing of floats there.
 
     Args:
         scenario: it, or its name or file.
@@ -106,6 +108,8 @@ def fly_exported(
     files = sources(scenario, precision) | programs(machine)
     require_programs(machine, "to fly an exported controller")
     problem = exported_problem(scenario, build_vehicle(scenario))
+    if precision == "float":
+        scenario = _allowing(scenario, float(np.spacing(np.float32(ActuatorBounds.of_problem(problem).u_max.max()))))
     with tempfile.TemporaryDirectory(prefix="quadsim-") as scratch, reporting(progress) as report:
         directory = Path(scratch)
         for name, text in files.items():
@@ -117,3 +121,18 @@ def fly_exported(
             if out is None:
                 return fly_scenario(scenario, report, law)
             return run_scenario(scenario, real_path(out), Outputs(video=False), report, law)
+
+
+def _allowing(scenario: Scenario, spacing: float) -> Scenario:
+    """The scenario with tolerances of at least `spacing` [rad/s] on speeds and their steps."""
+    limits = [
+        replace(
+            limit,
+            tolerance=max(spacing, limit.tolerance),
+            tolerance_sampled=max(spacing, limit.tolerance_sampled),
+        )
+        if limit.signal in ("speed", "slew")
+        else limit
+        for limit in scenario.constraints
+    ]
+    return scenario.model_copy(update={"constraints": limits})
