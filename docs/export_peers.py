@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import subprocess
 import sys
 import tarfile
@@ -17,7 +16,6 @@ import scipy.sparse
 from make_numbers import ROOT
 
 from mpc.export.ctext import reals
-from mpc.export.targets import TARGETS, Target
 from mpc.ocp import Problem
 from mpc.paper.condensed import Condensed
 from quadsim.state import Array
@@ -25,7 +23,7 @@ from scenarios.export.record import Recording
 
 SOURCES: Final = ROOT / "tests" / "firmware" / "peers"
 OURS: Final = ROOT / "mpc" / "export" / "c"
-FLAGS: Final = "-O2 -std=gnu99 -ffp-contract=off -ffunction-sections -fdata-sections -w".split()
+FLAGS: Final = ["-O2", "-std=gnu99", "-ffp-contract=off", "-ffunction-sections", "-fdata-sections", "-w"]
 ASSIGNED: Final = {"double": [], "float": ["-DPEER_FLOAT", "-fsingle-precision-constant"]}
 
 

@@ -81,6 +81,10 @@ class ExportError(InputError):
         self.reason = reason
 
 
+class CompilerError(InputError):
+    """There is no C compiler, or it did not compile what was exported."""
+
+
 class UnknownNameError(InputError):
     """A name that is not one of a known set; the message lists the set and the nearest member, or those that are meant.
 

@@ -7,6 +7,7 @@ from collections.abc import Iterable, Sequence
 from typing import Final
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from quadsim.state import Array
 
@@ -35,7 +36,7 @@ def bounded(values: Array) -> Array:
     return np.clip(values, -NO_BOUND, NO_BOUND)
 
 
-def reals(name: str, values: Array) -> str:
+def reals(name: str, values: ArrayLike) -> str:
     """A constant array of numbers, row by row; of one zero where there are none."""
     return _array("real", name, [number(value) for value in np.ravel(values).tolist()] or ["R(0.0)"])
 

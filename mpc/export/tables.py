@@ -14,19 +14,19 @@ Inputs that move nothing the cost or a row sees are one more axis, without state
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
 import scipy.linalg
 
-from mpc.constraints import Rows
+from mpc.constraints import Constraint, Rows
 from mpc.exact.axes import Axis, axes
 from mpc.ocp import Problem
 from mpc.paper.condensed import condensed_cost, row_maps
 from mpc.paper.prediction import prediction
 from quadsim.errors import ParameterError
-from quadsim.state import REFERENCE_STATES, Array
+from quadsim.state import N_STATES, REFERENCE_STATES, Array
 
 ROUNDING: Final = 1e-13
 """Share of the largest number of a row of C_r, D, E, or T below which one is taken for a product of rounding."""
@@ -90,15 +90,21 @@ class Tables:
     tolerance: Array  # (m,) the largest of these roots
     T: Array  # (nu, nu) u - u_s = T w
     T_inverse: Array
+    modes: Array  # (nu, nu) takes rotor speeds that are states to what stands for them, one of each axis
     room: int  # active rows that there is room for
 
 
 def tables(problem: Problem) -> Tables:
-    """The numbers of a problem with constraints.
+    """The numbers of a problem.
 
     Raises:
         ParameterError: it is too large, or its rows differ from step to step.
     """
+    problem = with_constraints(problem)
+    modes = np.eye(problem.model.nu)
+    if problem.model.n == N_STATES + problem.model.nu:
+        modes = _modes(problem)
+        problem = _in_modes(problem, modes)
     rows = problem.rows
     if rows.C.ndim == 3:
         raise ParameterError("controller", "constraints", "rows that differ from step to step", "the same at all steps")
@@ -118,7 +124,7 @@ def tables(problem: Problem) -> Tables:
     alike = bool((rows.lower == rows.lower[0]).all() and (rows.upper == rows.upper[0]).all())
     steps = slice(0, 1) if alike else slice(None)
     scale = _scale(found, row_tables, T, N)
-    room = min(N * m, max(LEAST_ROOM, math.ceil(ROOM_PER_STEP * N)))
+    room = max(1, min(N * m, max(LEAST_ROOM, math.ceil(ROOM_PER_STEP * N))))
     return Tables(
         problem=problem,
         axes=found,
@@ -126,10 +132,51 @@ def tables(problem: Problem) -> Tables:
         lower=rows.lower[steps],
         upper=rows.upper[steps],
         scale=scale,
-        tolerance=1.0 / scale.min(axis=0),
+        tolerance=1.0 / scale.min(axis=0, initial=math.inf),
         T=T,
         T_inverse=T_inverse,
+        modes=modes,
         room=room,
+    )
+
+
+def with_constraints(problem: Problem) -> Problem:
+    """A problem without constraints with one that bounds nothing; any other as it is."""
+    if problem.every_constraint:
+        return problem
+    nothing = np.full(problem.model.nu, -math.inf)
+    none = Constraint(name="none", lower=nothing, upper=-nothing, D=np.eye(problem.model.nu))
+    return replace(problem, constraints=(none,))
+
+
+def _modes(problem: Problem) -> Array:
+    """T^-1 of the problem without rotor lag: speeds that all follow their inputs alike then fall into the axes."""
+    model, objective, n = problem.model, problem.objective, N_STATES
+    without = Problem(
+        model=replace(model, A=model.A[:n, :n], B=model.B[:n]),
+        horizon=problem.horizon,
+        objective=replace(objective, C_r=objective.C_r[:, :n], P=None if objective.P is None else objective.P[:n, :n]),
+        constraints=tuple(
+            part if part.C is None else replace(part, C=part.C[:, :n]) for part in problem.every_constraint
+        ),
+    )
+    return np.array(np.linalg.inv(_all_axes(without)[1]), float)
+
+
+def _in_modes(problem: Problem, modes: Array) -> Problem:
+    """The problem whose last states are `modes` times the rotor speeds."""
+    model, objective = problem.model, problem.objective
+    to = scipy.linalg.block_diag(np.eye(N_STATES), modes)
+    back = np.linalg.inv(to)
+    A, B = to @ model.A @ back, to @ model.B
+    for matrix in (A, B):
+        matrix[np.abs(matrix) < ROUNDING * np.abs(matrix).max()] = 0.0
+    P = None if objective.P is None else _symmetric(back.T @ objective.P @ back)
+    return Problem(
+        model=replace(model, A=A, B=B),
+        horizon=problem.horizon,
+        objective=replace(objective, P=P),
+        constraints=problem.every_constraint,
     )
 
 
@@ -161,7 +208,7 @@ def _axis(problem: Problem, rows: Rows, part: Axis, first: int) -> AxisTables:
         A, B = part.problem.model.A, part.problem.model.B
         (Q, W), (Q_end, W_end) = part.problem.objective.weights, part.problem.objective.terminal_weights
         C_r = part.problem.objective.C_r
-        of_reference = objective.C_r[np.ix_(part.regulated, list(REFERENCE_STATES))]
+        of_reference = objective.C_r[part.regulated][:, REFERENCE_STATES]
     else:
         A, B, Q, Q_end = np.zeros((0, 0)), np.zeros((0, m)), np.zeros((0, 0)), np.zeros((0, 0))
         W, W_end, C_r, of_reference = np.zeros((0, 0)), np.zeros((0, 0)), np.zeros((0, 0)), np.zeros((0, 4))
@@ -190,7 +237,7 @@ def _axis(problem: Problem, rows: Rows, part: Axis, first: int) -> AxisTables:
         own = rows.part(part.outputs, part.states, m)
         G = row_maps(own, maps).of_inputs
     else:
-        H, G = 2.0 * np.kron(np.eye(N), Q_u), np.zeros((N, 0, N * m))
+        H, G = np.asarray(2.0 * np.kron(np.eye(N), Q_u), float), np.zeros((N, 0, N * m))
     channels = np.concatenate([np.eye(N * m).reshape(N, m, N * m), G], axis=1).reshape(-1, N * m)
     half = scipy.linalg.solve_triangular(np.linalg.cholesky(H), channels.T, lower=True)
     return AxisTables(

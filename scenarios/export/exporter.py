@@ -2,31 +2,24 @@
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
 from typing import Final, get_args
 
 import numpy as np
 
-from mpc.answer import ActuatorBounds
 from mpc.export.ctext import number
-from mpc.export.source import DATA, HEADER, SOURCE, Precision, data, header, part, solver
-from mpc.export.tables import Tables, tables
+from mpc.export.source import DATA, HEADER, SOURCE, Exportable, Precision, part, sources
 from mpc.export.targets import TARGETS, Target
-from mpc.ocp import Problem
-from quadsim.errors import ExportError, ParameterError
+from quadsim.errors import ParameterError
 from quadsim.outputs import real_path, require_directory, write_text, writing
 from quadsim.state import Array
-from quadsim.vehicle import Vehicle
 from scenarios.api import load
 from scenarios.export.record import Recording, record
-from scenarios.parts.controllers import make_problem
+from scenarios.parts.controllers import exportable
 from scenarios.parts.vehicle import build_vehicle
-from scenarios.schema.controller import ConstrainedSpec
 from scenarios.schema.scenario import Scenario
 
 KIND: Final = "export"  # what `quadsim.outputs` calls such a directory
-EXPORTED: Final = "constrained"
 
 
 def export(
@@ -63,31 +56,31 @@ def export(
         scenario = load(scenario)
     directory = real_path(out)
     require_directory(directory, KIND)
-    files = sources(scenario, precision) | vector_files(record(scenario))
-    files |= programs(TARGETS[target])
+    files = controller_files(scenario, precision) | vector_files(record(scenario))
+    files |= {"README.md": _readme(scenario, precision), **programs(TARGETS[target])}
     with writing(directory, KIND) as partial:
         for name, text in files.items():
             write_text(partial / name, text)
     return directory
 
 
-def sources(scenario: Scenario, precision: Precision) -> dict[str, str]:
-    """The controller's own files, by name, and a README.
+def controller_files(scenario: Scenario, precision: Precision) -> dict[str, str]:
+    """The controller's own files, by name.
 
     Raises:
         ExportError: this controller cannot be exported.
     """
-    vehicle = build_vehicle(scenario)
-    found = tables(exported_problem(scenario, vehicle))
-    bounds = ActuatorBounds.of_problem(found.problem)
-    title = f"{scenario.name}: {scenario.description}" if scenario.description else scenario.name
-    text = title.replace("*/", "* /").replace("/*", "/ *").encode("ascii", "backslashreplace").decode()
-    return {
-        HEADER: header(found, precision=precision, title=text),
-        SOURCE: solver(found) + part("answer.c") + part("constrained.c"),
-        DATA: data(found, bounds, rests=False),
-        "README.md": _readme(text, found, precision),
-    }
+    return sources(exported_law(scenario), precision=precision, title=_title(scenario))
+
+
+def exported_law(scenario: Scenario) -> Exportable:
+    """What is exported: the scenario's controller without what guards it.
+
+    Raises:
+        ExportError: it cannot be exported.
+    """
+    shapes = (*scenario.obstacles, *scenario.regions)
+    return exportable(scenario.controller, build_vehicle(scenario), scenario.control_period, shapes)
 
 
 def programs(target: Target) -> dict[str, str]:
@@ -96,18 +89,11 @@ def programs(target: Target) -> dict[str, str]:
     return {name: part(name) for name in names} | {"Makefile": target.makefile + part("Makefile")}
 
 
-def exported_problem(scenario: Scenario, vehicle: Vehicle) -> Problem:
-    """The optimisation of a controller that can be exported.
-
-    Raises:
-        ExportError: it cannot.
-    """
-    spec = scenario.controller
-    if not isinstance(spec, ConstrainedSpec):
-        raise ExportError(f"its controller is {spec.type!r}; exported are: {EXPORTED}")
-    if spec.avoidance is not None and (scenario.obstacles or scenario.regions):
-        raise ExportError("its half-spaces around obstacles are others in each period; leave out controller.avoidance")
-    return make_problem(spec, vehicle, scenario.control_period)
+def _title(scenario: Scenario) -> str:
+    """The scenario's name and description as they can stand in a comment."""
+    title = f"{scenario.name}: {scenario.description}" if scenario.description else scenario.name
+    title = title.replace("*/", "* /").replace("/*", "/ *").replace("\\", "/")
+    return title.encode("ascii", "replace").decode().replace("\n", " ")
 
 
 def vector_files(recording: Recording) -> dict[str, str]:
@@ -137,21 +123,18 @@ def _row(numbers: Array) -> str:
     return "{" + ", ".join(map(number, np.ravel(numbers).tolist())) + "}"
 
 
-def _readme(title: str, found: Tables, precision: Precision) -> str:
-    problem, size = found.problem, 8 if precision == "double" else 4
-    constants = size * math.ceil(sum(part.responses.size / 2 + part.closed.size + part.K.size for part in found.axes))
-    memory = size * found.room * (found.room + 1) // 2
-    return f"""# {title}
+def _readme(scenario: Scenario, precision: Precision) -> str:
+    return f"""# {_title(scenario)}
 
-A model predictive controller as C99, exported from quadsim in {precision} precision: N = {problem.horizon} periods of
-{problem.model.period:g} s, {len(found.rows)} rows of constraints in each.  It needs nothing but a compiler: no
-allocation, no recursion, no global state, and of the C library `memcpy` and `memset`.
+A model predictive controller as C99 in {precision} precision, exported from quadsim: {scenario.controller.type}, to be
+asked every {scenario.control_period:g} s.  It needs nothing but a compiler: no allocation, no recursion, no global
+state, and of the C library `memcpy` and `memset`.
 
 | file | is |
 |---|---|
-| `{HEADER}` | the interface: state order, units, frames |
+| `{HEADER}` | the interface: state order, units, frames, and the sizes |
 | `{SOURCE}`, `{DATA}` | the controller and its numbers |
-| `vectors.h`, `vectors.c` | the periods of the flight that it was recorded on |
+| `vectors.h`, `vectors.c` | the periods of the flight that it was recorded on, with the exact answers |
 | `main.c`, `Makefile` | `make check` runs these periods and compares |
 | `serial.c` | the controller behind a serial line, with checksums and a watchdog: a start for an integration |
 | `target.h` and what implements it | the clock, the console and the serial line that these two need of a machine |
@@ -159,11 +142,10 @@ allocation, no recursion, no global state, and of the C library `memcpy` and `me
 ```c
 static quadsim_mpc mpc;
 quadsim_mpc_reset(&mpc, speeds);          /* the command in force */
-/* every {problem.model.period:g} s: */
+/* every {scenario.control_period:g} s: */
 status = quadsim_mpc_step(&mpc, state, reference, acting, command);
 ```
 
-The struct takes some {memory // 1000} kB, the constants {constants // 1000} kB, which can stay in flash.
 Solve once before take-off: the first step starts without an active set and takes the most changes of it.
-`mpc.changes` says how many each step took.
+`mpc.changes` says how many each step took.  Compile with `-ffp-contract=off`, and every processor gives the same bits.
 """

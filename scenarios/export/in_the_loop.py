@@ -5,31 +5,26 @@ from __future__ import annotations
 import tempfile
 from dataclasses import replace
 from pathlib import Path
-from typing import Final
 
 import numpy as np
 
 from mpc.answer import ActuatorBounds
+from mpc.export.compiled import FALLBACK, STATUSES
 from mpc.export.source import Precision
 from mpc.export.targets import TARGETS, Target
 from mpc.ocp import Problem
-from quadsim.controller import GROUNDED, SOLVED, UNCONSTRAINED, Command, Moment, stopped
+from quadsim.controller import GROUNDED, SOLVED, Command, Moment, stopped
 from quadsim.outputs import real_path, write_text
 from quadsim.state import Array
+from quadsim.vehicle import N_ROTORS
 from scenarios.export.emulation import Program, build, require_programs
-from scenarios.export.exporter import exported_problem, programs, sources
+from scenarios.export.exporter import controller_files, exported_law, programs
 from scenarios.export.serial_line import SerialMPC
 from scenarios.flight import Flight, Outputs
 from scenarios.loading import load_scenario
-from scenarios.parts.vehicle import build_vehicle
 from scenarios.progress import Progress, reporting
 from scenarios.run import fly_scenario, run_scenario
 from scenarios.schema.scenario import Scenario
-
-STATUS: Final = (UNCONSTRAINED, SOLVED, SOLVED, "clipped", "shifted", "before")
-"""What a flight's log calls the statuses of `quadsim_mpc.h`."""
-OPTIMAL: Final = 3
-"""Statuses below are optima."""
 
 
 class MPCInTheLoop:
@@ -43,12 +38,13 @@ class MPCInTheLoop:
 
     def __init__(self, serial: SerialMPC, problem: Problem, name: str, target: Target) -> None:
         self.name, self.solver, self.horizon = name, f"C99 on {target.title}", problem.horizon
-        self.ways = [0] * len(STATUS)
-        self._serial, self._bounds, self._before = serial, ActuatorBounds.of_problem(problem), problem.model.u_bar
+        self.ways = [0] * len(STATUSES)
+        self._serial, self._before = serial, problem.model.u_bar[:N_ROTORS]
+        self._bounds = ActuatorBounds.of_problem(problem) if problem.every_constraint else None
 
     def reset(self, speeds: Array) -> None:
         """See `quadsim.controller.Controller.reset`."""
-        self._before, self.ways = np.array(speeds, float), [0] * len(STATUS)
+        self._before, self.ways = np.array(speeds, float), [0] * len(STATUSES)
         self._serial.reset(speeds)
 
     def step(self, now: Moment, state: Array, reference: Array) -> Command:
@@ -59,7 +55,7 @@ class MPCInTheLoop:
         """
         acting = self._before if now.acting is None else now.acting
         if now.phase in GROUNDED:
-            self._before, _ = self._bounds.reach(acting)
+            self._before = np.zeros(N_ROTORS) if self._bounds is None else self._bounds.reach(acting)[0]
             self._serial.reset(self._before)
             return stopped(self._before.copy(), self.horizon, now.phase)
         reply = self._serial.step(now.time, state, reference, acting)
@@ -68,8 +64,8 @@ class MPCInTheLoop:
         return Command(
             speeds=reply.command.copy(),
             plan=np.tile(reply.command, (self.horizon, 1)),
-            status=STATUS[reply.status],
-            fallback=max(0, reply.status - OPTIMAL + 1),
+            status=SOLVED if self._bounds is None else STATUSES[reply.status],
+            fallback=FALLBACK[reply.status],
         )
 
 
@@ -105,10 +101,10 @@ def fly_exported(
     if not isinstance(scenario, Scenario):
         scenario = load_scenario(str(scenario))
     machine = TARGETS[target]
-    files = sources(scenario, precision) | programs(machine)
+    files = controller_files(scenario, precision) | programs(machine)
     require_programs(machine, "to fly an exported controller")
-    problem = exported_problem(scenario, build_vehicle(scenario))
-    if precision == "float":
+    problem = exported_law(scenario).problem
+    if precision == "float" and problem.every_constraint:
         scenario = _allowing(scenario, float(np.spacing(np.float32(ActuatorBounds.of_problem(problem).u_max.max()))))
     with tempfile.TemporaryDirectory(prefix="quadsim-") as scratch, reporting(progress) as report:
         directory = Path(scratch)

@@ -53,7 +53,9 @@ typedef struct quadsim_mpc {
     int count;                                                   /* active rows */
     int spent;                                                   /* changes of the active set in this search */
     int solved;                                                  /* of them, those whose forward is up to date */
+    int passed_over;                                             /* a row that comes and goes within rounding, or -1 */
     quadsim_real slack;                                          /* by which tolerances are relaxed */
+    quadsim_real largest;                                        /* multiplier, as of rows of unit length */
     short row[QUADSIM_ROOM];                                     /* which they are */
     quadsim_real z[QUADSIM_ROOM];                                /* their multipliers */
     quadsim_real goal[QUADSIM_ROOM];                             /* the multipliers that their bounds ask for */

@@ -53,11 +53,13 @@ struct term {
 #ifdef QUADSIM_FLOAT
 static const real FEASIBLE = 2e-5F;   /* violation of a bound */
 static const real DEPENDENT = 3e-6F;  /* what other rows leave over of a row that is their combination */
+static const real ROUNDED = 4e-7F;    /* of the largest multiplier, what rounding makes of a row's value */
 static const real WRONG = 1e-6F;      /* multiplier of the wrong sign */
 static const real NOTHING_OF = 1e-5F; /* share of a row in a combination */
 #else
 static const real FEASIBLE = 1e-11;
 static const real DEPENDENT = 1e-11;
+static const real ROUNDED = 1e-15;
 static const real WRONG = 1e-12;
 static const real NOTHING_OF = 1e-10;
 #endif
@@ -531,11 +533,24 @@ static void respond_axis(quadsim_mpc *mpc, int g)
     }
 }
 
+/* The size of the largest multiplier, as of rows of unit length. */
+static real largest_multiplier(const quadsim_mpc *mpc)
+{
+    real largest = R(0.0);
+    int j;
+    for (j = 0; j < mpc->count; j++) {
+        const real size = magnitude(mpc->z[j]) / SCALE[mpc->row[j]];
+        largest = size > largest ? size : largest;
+    }
+    return largest;
+}
+
 /* The same of one axis alone, or of all and of all rows. */
 static void respond(quadsim_mpc *mpc, int only)
 {
     static const real before[NU] = {R(0.0)};
     int g;
+    mpc->largest = largest_multiplier(mpc);
     if (only >= 0) {
         respond_axis(mpc, only);
         return;
@@ -558,19 +573,26 @@ static int belongs(int row, int only)
     return only == ALL || (only == OTHERS ? others : kind->axis == only && !others);
 }
 
+/* Violation of a row of unit length that is taken for rounding. */
+static real tolerance(const quadsim_mpc *mpc)
+{
+    const real rounded = ROUNDED * mpc->largest, most = R(15.0) * FEASIBLE; /* without end where there is no optimum */
+    return FEASIBLE * mpc->slack + (rounded < most ? rounded : most);
+}
+
 /* The inactive row that is violated most, as of unit length, and its side; -1 for none. */
 static int most_violated(const quadsim_mpc *mpc, int only, int *side)
 {
     real most = R(0.0);
     int found = -1, i, r;
     for (r = 0; r < M; r++) {
-        const real tolerated = FEASIBLE * mpc->slack * TOLERANCE[r];
+        const real tolerated = tolerance(mpc) * TOLERANCE[r];
         for (i = 0; belongs(r, only) && i < N; i++) {
             const int row = i * M + r;
             const real value = mpc->value[row] + mpc->shift[row];
             const real above = value - upper_bound(row), below = lower_bound(row) - value;
             const real over = above > below ? above : below;
-            if (over > tolerated && mpc->side[row] == 0 && over * SCALE[row] > most) {
+            if (over > tolerated && mpc->side[row] == 0 && row != mpc->passed_over && over * SCALE[row] > most) {
                 most = over * SCALE[row];
                 *side = above > below ? 1 : -1;
                 found = row;
@@ -583,7 +605,7 @@ static int most_violated(const quadsim_mpc *mpc, int only, int *side)
 /* Whether a row is violated by so little that it may be rounding. */
 static int is_slight(const quadsim_mpc *mpc, int row)
 {
-    const real value = mpc->value[row] + mpc->shift[row], much = R(100.0) * FEASIBLE * TOLERANCE[row % M];
+    const real value = mpc->value[row] + mpc->shift[row], much = R(100.0) * tolerance(mpc) * TOLERANCE[row % M];
     return value < upper_bound(row) + much && value > lower_bound(row) - much;
 }
 
@@ -620,7 +642,7 @@ static int is_exact(const quadsim_mpc *mpc)
 {
     int j;
     for (j = 0; j < mpc->count; j++) {
-        if (!(magnitude(residual(mpc, j)) <= R(10.0) * FEASIBLE * mpc->slack * TOLERANCE[mpc->row[j] % M])) {
+        if (!(magnitude(residual(mpc, j)) <= R(10.0) * tolerance(mpc) * TOLERANCE[mpc->row[j] % M])) {
             return 0;
         }
     }
@@ -649,6 +671,8 @@ static enum verdict improve(quadsim_mpc *mpc, int only)
             const enum verdict verdict = enter(mpc, row, side);
             if ((row == left || mpc->spent >= MOST_CHANGES / 2) && mpc->slack < MOST_SLACK) {
                 mpc->slack *= R(2.0); /* in circles, within rounding */
+            } else if (row == left && is_slight(mpc, row)) {
+                mpc->passed_over = row;
             }
             if (verdict != SOLVED) {
                 return verdict;
@@ -671,6 +695,7 @@ static void start_cold(quadsim_mpc *mpc, int only)
 {
     int row;
     mpc->count = mpc->solved = mpc->spent = 0;
+    mpc->passed_over = -1;
     mpc->slack = R(1.0);
     for (row = 0; row < N * M; row++) {
         if (belongs(row, only)) {
@@ -842,6 +867,7 @@ static enum verdict solve_axes(quadsim_mpc *mpc, const real *trim, real axes[NU]
     memset(mpc->shift, 0, sizeof(mpc->shift));
     memset(mpc->dw, 0, sizeof(mpc->dw));
     mpc->slack = R(1.0);
+    mpc->largest = R(0.0);
     for (g = 0; g < QUADSIM_PARTS; g++) {
         if (most_violated(mpc, g, &side) >= 0 && optimum(mpc, g, mpc->last) != SOLVED) {
             return GAVE_UP;
@@ -872,6 +898,8 @@ static enum quadsim_status optimise(quadsim_mpc *mpc, const real *state, const r
     mpc->changes = 0;
     mpc->count = 0;
     mpc->slack = R(1.0);
+    mpc->largest = R(0.0);
+    mpc->passed_over = -1;
     find_free(mpc, state, reference, rest, trim, acting);
     if (!is_finite(mpc->u, N * NU)) {
         return QUADSIM_BEFORE;
