@@ -58,7 +58,7 @@ static const real WRONG = 1e-6F;      /* multiplier of the wrong sign */
 static const real NOTHING_OF = 1e-5F; /* share of a row in a combination */
 #else
 static const real FEASIBLE = 1e-11;
-static const real DEPENDENT = 1e-11;
+static const real DEPENDENT = 1e-9;
 static const real ROUNDED = 1e-15;
 static const real WRONG = 1e-12;
 static const real NOTHING_OF = 1e-10;
