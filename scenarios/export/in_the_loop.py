@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tempfile
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,9 +13,10 @@ from mpc.export.compiled import FALLBACK, STATUSES
 from mpc.export.source import Precision
 from mpc.export.targets import TARGETS, Target
 from mpc.ocp import Problem
-from quadsim.controller import GROUNDED, Command, Moment, stopped
+from quadsim.controller import GROUNDED, SOLVED, Command, Moment, stopped
 from quadsim.outputs import real_path, write_text
 from quadsim.state import Array
+from quadsim.vehicle import N_ROTORS
 from scenarios.export.emulation import Program, build, require_programs
 from scenarios.export.exporter import controller_files, exported_law, programs
 from scenarios.export.serial_line import SerialMPC
@@ -37,7 +39,8 @@ class MPCInTheLoop:
     def __init__(self, serial: SerialMPC, problem: Problem, name: str, target: Target) -> None:
         self.name, self.solver, self.horizon = name, f"C99 on {target.title}", problem.horizon
         self.ways = [0] * len(STATUSES)
-        self._serial, self._bounds, self._before = serial, ActuatorBounds.of_problem(problem), problem.model.u_bar
+        self._serial, self._before = serial, problem.model.u_bar[:N_ROTORS]
+        self._bounds = ActuatorBounds.of_problem(problem) if problem.every_constraint else None
 
     def reset(self, speeds: Array) -> None:
         """See `quadsim.controller.Controller.reset`."""
@@ -52,7 +55,7 @@ class MPCInTheLoop:
         """
         acting = self._before if now.acting is None else now.acting
         if now.phase in GROUNDED:
-            self._before, _ = self._bounds.reach(acting)
+            self._before = np.zeros(N_ROTORS) if self._bounds is None else self._bounds.reach(acting)[0]
             self._serial.reset(self._before)
             return stopped(self._before.copy(), self.horizon, now.phase)
         reply = self._serial.step(now.time, state, reference, acting)
@@ -61,7 +64,7 @@ class MPCInTheLoop:
         return Command(
             speeds=reply.command.copy(),
             plan=np.tile(reply.command, (self.horizon, 1)),
-            status=STATUSES[reply.status],
+            status=SOLVED if self._bounds is None else STATUSES[reply.status],
             fallback=FALLBACK[reply.status],
         )
 
@@ -77,7 +80,8 @@ def fly_exported(
     """Fly a scenario with its controller exported, compiled and run by its target: processor in the loop.
 
     The controller's program is `serial.c` of the export, at the other end of a serial line: a Cortex-M's UART in QEMU,
-    for `posix` a pipe.  What it is asked and answers are bytes; the flight is audited as any other.
+    for `posix` a pipe.  What it is asked and answers are bytes; the flight is audited as any other, but that a float
+    may pass a bound on speeds and their steps by the spacing of floats there.
 
     Args:
         scenario: it, or its name or file.
@@ -100,6 +104,8 @@ def fly_exported(
     files = controller_files(scenario, precision) | programs(machine)
     require_programs(machine, "to fly an exported controller")
     problem = exported_law(scenario).problem
+    if precision == "float" and problem.every_constraint:
+        scenario = _allowing(scenario, float(np.spacing(np.float32(ActuatorBounds.of_problem(problem).u_max.max()))))
     with tempfile.TemporaryDirectory(prefix="quadsim-") as scratch, reporting(progress) as report:
         directory = Path(scratch)
         for name, text in files.items():
@@ -111,3 +117,18 @@ def fly_exported(
             if out is None:
                 return fly_scenario(scenario, report, law)
             return run_scenario(scenario, real_path(out), Outputs(video=False), report, law)
+
+
+def _allowing(scenario: Scenario, spacing: float) -> Scenario:
+    """The scenario with tolerances of at least `spacing` [rad/s] on speeds and their steps."""
+    limits = [
+        replace(
+            limit,
+            tolerance=max(spacing, limit.tolerance),
+            tolerance_sampled=max(spacing, limit.tolerance_sampled),
+        )
+        if limit.signal in ("speed", "slew")
+        else limit
+        for limit in scenario.constraints
+    ]
+    return scenario.model_copy(update={"constraints": limits})

@@ -112,7 +112,10 @@ class SerialMPC:
     def _ask(self, time: float, kind: Kind, state: Array, row: Array, acting: Array) -> Reply:
         self._number += 1
         self._line.send(self._frames.question(kind, self._number, state, row, acting))
-        reply = self._frames.reply(self._line.receive(self._frames.answer_size))
-        if reply is None or reply.number != self._number:
-            raise FlightError(f"the controller at the serial line gave no answer to question {self._number}", time=time)
-        return reply
+        while True:
+            reply = self._frames.reply(self._line.receive(self._frames.answer_size))
+            if reply is None:
+                problem = f"the controller at the serial line gave no answer to question {self._number}"
+                raise FlightError(problem, time=time)
+            if reply.number == self._number:  # else what its watchdog had sent meanwhile
+                return reply

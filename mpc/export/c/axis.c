@@ -33,7 +33,7 @@ static void plan_backwards_@n@x@m@(const struct axis *axis, const real *pull, co
                 earlier[j] += axis->closed[(i * n + l) * n + j] * slope[l];
             }
         }
-        for (j = 0; j < n; j++) {
+        for (j = 0; i > 0 && j < n; j++) {
             slope[j] = earlier[j];
         }
     }

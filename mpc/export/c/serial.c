@@ -34,6 +34,7 @@ struct answer {
 static quadsim_mpc mpc;
 static quadsim_real window[4 * N];
 static struct answer answer; /* the last one; its mark is 0 before there is one */
+static int flying;           /* whether a state has come since the start */
 
 static uint32_t crc32(const void *bytes, size_t count)
 {
@@ -77,7 +78,7 @@ static void reply(void)
     target_write(&answer, sizeof answer);
 }
 
-/* Solve a question, unless it is old; 1 where it brings a fresh state. */
+/* Solve a question, unless it is old; 1 where it is a fresh state. */
 static int solve(const struct question *question)
 {
     uint32_t rows = question->number - answer.number; /* new ones, those lost included */
@@ -85,6 +86,7 @@ static int solve(const struct question *question)
         quadsim_mpc_reset(&mpc, question->acting);
         memcpy(answer.command, question->acting, sizeof answer.command);
         answer.mark = MARK;
+        flying = 0;
         rows = N;
     } else if (answer.mark != MARK || rows == 0U || rows > UINT32_MAX / 2U) {
         return 0;
@@ -96,9 +98,10 @@ static int solve(const struct question *question)
     answer.number = question->number;
     answer.status = QUADSIM_BEFORE;
     if (question->kind == STEP) {
+        flying = 1;
         answer.status = quadsim_mpc_step(&mpc, question->state, window, question->acting, answer.command);
     }
-    return question->kind != ROW;
+    return question->kind == STEP;
 }
 
 int main(void)
@@ -113,7 +116,7 @@ int main(void)
             if (answer.mark == MARK && question.number == answer.number) {
                 reply();
             }
-        } else if (WATCHDOG_MS > 0 && answer.mark == MARK && target_ticks() - fresh > WATCHDOG_MS * target_ticks_per_ms) {
+        } else if (WATCHDOG_MS > 0 && flying && target_ticks() - fresh > WATCHDOG_MS * target_ticks_per_ms) {
             fresh = target_ticks();
             answer.status = QUADSIM_BEFORE;
             reply();

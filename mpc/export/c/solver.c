@@ -828,10 +828,9 @@ static void find_free(quadsim_mpc *mpc, const real *state, const real *reference
 /* The last active set moved one step earlier, its last step's held. */
 static void shift_set(quadsim_mpc *mpc)
 {
-    int row;
-    for (row = 0; row < (N - 1) * M; row++) {
-        mpc->last[row] = mpc->last[row + M];
-    }
+    /* By way of side, which begins anew: of a loop a compiler makes memmove. */
+    memcpy(mpc->side, mpc->last + M, sizeof(mpc->side) - M);
+    memcpy(mpc->last, mpc->side, sizeof(mpc->side) - M);
 }
 
 /* Whether an active set has a row that is not of one axis's states alone. */
@@ -904,6 +903,7 @@ static enum quadsim_status optimise(quadsim_mpc *mpc, const real *state, const r
     if (!is_finite(mpc->u, N * NU)) {
         return QUADSIM_BEFORE;
     }
+    shift_set(mpc);
     memset(mpc->side, 0, sizeof(mpc->side));
     memset(mpc->shift, 0, sizeof(mpc->shift));
     if (most_violated(mpc, ALL, &side) < 0) {
@@ -911,7 +911,6 @@ static enum quadsim_status optimise(quadsim_mpc *mpc, const real *state, const r
         memset(mpc->last, 0, sizeof(mpc->last));
         return QUADSIM_FREE;
     }
-    shift_set(mpc);
     found = QUADSIM_MIXED ? INFEASIBLE : solve_axes(mpc, trim, axes);
     if (found == SOLVED) {
         put_plan(mpc, trim);
