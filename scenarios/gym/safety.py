@@ -56,7 +56,9 @@ class MPCSafetyFilter(gymnasium.Wrapper):  # type: ignore[misc]
         if not isinstance(base, QuadrotorEnv):
             raise ParameterError("", "env", type(base).__name__, "an environment of quadsim.gym")
         base.actions.of(np.zeros(4))
-        scenario = base.scenario if controller is None else base.scenario.replace({"controller": dict(controller)})
+        scenario = base.scenario
+        if controller is not None:
+            scenario = scenario.replace({"controller": dict(controller)})
         if not isinstance(scenario.controller, RobustSpec):
             raise ParameterError("controller", "type", scenario.controller.type, "robust, for a safety filter")
         self._base, self._spec = base, scenario.controller
