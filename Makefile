@@ -105,6 +105,9 @@ reproduce: setup  ## fly the numbers of every paper that ships and remake docs/p
 speed: setup  ## fly every controller ever faster and remake docs/speed.md: some six minutes
 	@$(PY) docs/make_speed.py
 
+gym: setup  ## remake the numbers and the figure of docs/gym.md: some ten minutes
+	@$(PY) docs/make_gym.py
+
 soak: setup  ## one simulated hour on end: memory and step time have to stay as they were
 	@$(PY) tests/soak.py --minutes 60
 

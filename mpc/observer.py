@@ -101,7 +101,7 @@ class DisturbanceObserver:
 
     def adopt(self, estimate: Array) -> None:
         """Go on from an estimate (6,)."""
-        self.estimate = np.minimum(np.maximum(estimate, -self._largest), self._largest)
+        self.estimate = np.minimum(np.maximum(estimate, -self.largest), self.largest)
 
     def update(self, measured: Array, predicted: Array) -> None:
         """Take note of a measured state (12,) and of what was predicted for it (12,), disturbances included."""
