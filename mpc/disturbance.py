@@ -99,6 +99,13 @@ class RampObserver:
         self._last: tuple[Array, Array, Array, Array] | None = None
         self._time = 0.0
 
+    def adopt(self, other: RampObserver) -> None:
+        """Go on from where another one is."""
+        self._value = np.clip(other._value, -self._largest, self._largest)
+        self._change, self._rotors = other._change, other._rotors
+        self._products, self._squares = other._products, other._squares
+        self._last, self._time = other._last, other._time
+
     def update(self, time: float, velocity: Array, attitude: Array, rates: Array, speeds: Array) -> None:
         """Take note of a period's end; of one whose beginning was not seen only as a beginning.
 

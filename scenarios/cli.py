@@ -71,6 +71,8 @@ def make_parser() -> argparse.ArgumentParser:
     compare.add_argument("--cost", action=argparse.BooleanOptionalAction, default=None, help=cost)
     compare.add_argument("--markdown", action="store_true", help="print the table as Markdown")
 
+    _add_live(command("live", help="fly in the browser: push, turn every knob, keep it as a scenario"))
+
     video = command("video", help="film a finished run")
     video.add_argument("run", metavar="RUN", help="run directory")
     video.add_argument("--out", metavar="FILE", help="MP4 or GIF file (default: RUN/flight.mp4)")
@@ -119,6 +121,19 @@ def make_parser() -> argparse.ArgumentParser:
     doctor = command("doctor", help="what this machine can do")
     doctor.add_argument("--json", action="store_true", help="as JSON on stdout")
     return parser
+
+
+def _add_live(live: argparse.ArgumentParser) -> None:
+    add = live.add_argument
+    add("scenario", metavar="SCENARIO_OR_RUN", help=f"{_SCENARIO}, or the directory of a run to fly on from")
+    add("--against", metavar="SCENARIO", help="a second vehicle, flown by the controller of this scenario")
+    add("--out", metavar="DIR", help="run directory (default: runs/SCENARIO-live)")
+    add("--script", metavar="FILE", help="TOML file of inputs and times: no browser, as fast as it goes")
+    add("--port", **_NUMBER, default=0, help="to listen on (default: any free one)")
+    add("--host", metavar="ADDRESS", default="127.0.0.1", help="other than this machine: for a network that you trust")
+    add("--browser", action=argparse.BooleanOptionalAction, default=True, help="open the browser")
+    add("--video", action=argparse.BooleanOptionalAction, default=False, help="film what was flown")
+    _add_settings(live)
 
 
 def _add_campaign(campaign: argparse.ArgumentParser) -> None:

@@ -24,6 +24,7 @@ from mpc.constraints import Bounds, Constraint
 from mpc.equilibrium import Trim, equilibrium, twisted
 from mpc.exact.shortcut import with_shortcut
 from mpc.fallback.completion import PLAUSIBLE, CompletedMoment
+from mpc.handover import observed, resized, within
 from mpc.heading import (
     anchored,
     predict_in_heading_frame,
@@ -140,6 +141,21 @@ class RobustMPC:
             self._clearing.reset()
         self._forget()
 
+    def adopt(self, previous: object) -> None:
+        """Go on from what the law before knew: rotor speeds, disturbance, plan."""
+        law = within(previous, RobustMPC)
+        if law is not None:
+            self._rotors = law._rotors.copy()
+            self._asked, self._measured = law._asked, law._measured
+            if self.settings.delay == law.settings.delay:
+                self._ahead = law._ahead
+            self._adopt_plan(law)
+        own = None if law is None else law._observer
+        estimate = observed(previous) if own is None else own.estimate
+        if self._observer is not None and estimate is not None:
+            self._observer.adopt(estimate)
+            self._believe()
+
     @np.errstate(over="ignore", invalid="ignore", divide="ignore")  # numbers out of hand are refused, not warned of
     def step(self, now: Moment, state: Array, reference: Array) -> Command:
         """See `quadsim.controller.Controller.step`.
@@ -201,6 +217,14 @@ class RobustMPC:
         """(6,) estimated acceleration at rest, world [m/s^2], and angular acceleration, body [rad/s^2]."""
         thrust = self._model.effectiveness[0] @ np.square(self.trim.speeds)
         return np.concatenate([self._resting, thrust * self.trim.twist])
+
+    def _adopt_plan(self, law: RobustMPC) -> None:
+        """Linearise along the plan of the law before."""
+        if Linearisation.HOVER in (self.settings.linearisation, law.settings.linearisation):
+            return
+        if law._relinearised.last is not None and law._model.n == self._model.n:
+            states, plan = law._relinearised.last
+            self._relinearised.last = resized(states, self.horizon), resized(plan, self.horizon)
 
     def _forget(self) -> None:
         """Assume no disturbance."""

@@ -127,7 +127,8 @@ class FlightLog:
         control: one row per control period.
         timing: clock times, one row per control period.
         plant: the plant, at the physics rate after a flight, at the log rate when read from a file.
-        predicted: (K, N, 3) float32 positions [m] predicted at each period for t_{k+1} .. t_{k+N}, or None.
+        predicted: (K, N, 3) float32 positions [m] predicted at each period for t_{k+1} .. t_{k+N}, N the shortest
+            horizon of its controllers; None where one of them has no model.
         reason: why the flight ended early; None when it was completed.
         interrupted: whether the person flying ended it.
         lost: which of the loss criteria ended it, e.g. `tilt`; None where none did.

@@ -85,6 +85,15 @@ class Navigation:
         self._perfect = tuple(name for name in SensorName if name not in sensed)
         self._filter = None if estimator is None else ErrorStateFilter(vehicle, sensors, estimator, timestep=timestep)
 
+    def watches(self, sensor: SensorName) -> bool:
+        """Whether a sensor has had a fault in view from the start, and so may have another."""
+        return any(sampler.watched for sampler in self._samplers if sampler.sensor.name is sensor)
+
+    def reschedule(self, faults: Sequence[SensorFault]) -> None:
+        """Let these faults take the place of those before, of sensors watched; samples already taken stay."""
+        for sampler in self._samplers:
+            sampler.reschedule(faults)
+
     def reset(self, physics: Array, speeds: Array, yaw: float = 0.0) -> None:
         """Start again, with the same draws.
 

@@ -18,8 +18,8 @@ from scenarios.campaign.draws import Draws, extremes
 from scenarios.campaign.results.events import Event, parse_event
 from scenarios.campaign.results.table import DRAW, TIMING, Row, make_schema
 from scenarios.campaign.spec import CampaignSpec, Value, VaryBase
+from scenarios.limits import build_limits
 from scenarios.loading import check_parts, parse_scenario
-from scenarios.parts.limits import build_limits
 from scenarios.parts.vehicle import build_vehicle, resolve_vehicle
 from scenarios.schema.bases import locate_files, merge, read_scenario
 from scenarios.schema.problems import ScenarioError, describe

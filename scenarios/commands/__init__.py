@@ -14,6 +14,7 @@ COMMANDS: Final[Mapping[str, str]] = {
     "run": "flights:run",
     "check": "flights:check",
     "compare": "compare:compare",
+    "live": "live:live",
     "video": "products:video",
     "view": "products:view",
     "scenario": "catalogue:scenario",

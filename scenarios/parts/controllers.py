@@ -260,6 +260,7 @@ def make_space(
         margins=margins,
         penalty=None if soft is None else (soft.linear, soft.quadratic),
         positions=(0, 1, 2) if isinstance(spec, NonlinearSpec) else POSITION,
+        largest=isinstance(spec, NonlinearSpec),
     )
 
 

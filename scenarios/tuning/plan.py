@@ -18,7 +18,7 @@ from scenarios.campaign.plan import Plan, cell, column_type, flown_scenario, loc
 from scenarios.campaign.results.events import Event, parse_event
 from scenarios.campaign.spec import Value, VaryBase
 from scenarios.campaign.statistics.requirement import Requirement, parse_requirement
-from scenarios.parts.limits import build_limits
+from scenarios.limits import build_limits
 from scenarios.schema.bases import merge, read_scenario
 from scenarios.schema.problems import ScenarioError, describe
 from scenarios.schema.scenario import Scenario

@@ -47,6 +47,9 @@ _MOST_MARGINS: Final = 6
 
 _LAST: Final = 1.0
 """Time at a film's end [s] in which it says why a QP had no answer, or that the flight stayed in fallback."""
+_SHOWN: Final = 2.0
+"""Time [s] for which it says what has happened."""
+_MOST_EVENTS: Final = 3
 _MOST_LINES: Final = 10
 """Of that: more would reach the strip at the bottom."""
 _WIDEST: Final = 140
@@ -117,6 +120,8 @@ class Overlay:
         ):
             if vectors is not None:
                 lines.append((f"{what} {np.linalg.norm(vectors[i]):.2g} {unit}", 14, colour))
+        happened = [event for event in self._run.summary.get("events", ()) if 0.0 <= time - event["time"] <= _SHOWN]
+        lines += [(event["text"][:_WIDEST], 15, AMBER) for event in happened[-_MOST_EVENTS:]]
         reason = self._run.log.reason
         if reason is not None and time >= control.t[-1]:
             lines.append((f"aborted {reason}"[:130], 15, RED))
