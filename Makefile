@@ -167,4 +167,4 @@ $(VENV)/.renders: $(VENV)/.installed
 
 $(VENV)/.browser: $(VENV)/.installed
 	@if $(HAS_BROWSER) || { { $(call apt,chromium); } && $(HAS_BROWSER); }; then touch $@; \
-	else echo "Until then the tests that open the comparison page in a browser are skipped." >&2; fi
+	else echo "Until then the tests that open pages in a browser are skipped." >&2; fi

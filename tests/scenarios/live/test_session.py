@@ -215,7 +215,7 @@ def test_a_script_is_kept_as_a_run_that_flies_to_the_same_bytes(
 ) -> None:
     script, kept, again = tmp_path / "script.toml", tmp_path / "kept", tmp_path / "again"
     script.write_text(SCRIPT, encoding="utf-8")
-    line = ["live", "hover", "--script", str(script), "--out", str(kept), "--set", "controller.horizon=10"]
+    line = ["live", "robust", "--script", str(script), "--out", str(kept), "--set", "controller.horizon=20"]
     assert main(line) == 0
     assert "3.00 s" in capsys.readouterr().out
     main(["run", str(kept / "scenario.toml"), "--out", str(again), "--no-video", "--no-recording", "--no-figures"])
