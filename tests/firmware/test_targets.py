@@ -65,7 +65,9 @@ def test_contraction_is_what_would_change_bits(answers: Answers) -> None:
     assert bits(answers("posix", "double", *AARCH64, CONTRACTED)) != bits(answers("posix", "double"))
 
 
-@pytest.mark.parametrize(("board", "precision"), [("cortex-m7", "double"), ("cortex-m7", "float"), ("cortex-m4f", "float")])
+@pytest.mark.parametrize(
+    ("board", "precision"), [("cortex-m7", "double"), ("cortex-m7", "float"), ("cortex-m4f", "float")]
+)
 def test_a_step_takes_few_instructions(board: str, precision: str, answers: Answers) -> None:
     """Instructions, not cycles: the emulator has neither caches nor wait states."""
     steps = np.array([int(answer[7], 16) * TICK for answer in answers(board, precision)])
