@@ -40,12 +40,15 @@ if TYPE_CHECKING:
     from scenarios.catalogue import LibraryScenario as LibraryScenario
     from scenarios.catalogue import catalogue as catalogue
     from scenarios.catalogue import scenarios as scenarios
+    from scenarios.export.exporter import export as export
+    from scenarios.export.in_the_loop import fly_exported as fly_exported
     from scenarios.flight import Flight as Flight
     from scenarios.junit import write_junit as write_junit
     from scenarios.many_flights import campaign as campaign
     from scenarios.many_flights import replay as replay
     from scenarios.many_flights import reproduce as reproduce
     from scenarios.many_flights import sweep as sweep
+    from scenarios.many_flights import tune as tune
     from scenarios.run import StartedFlight as StartedFlight
     from scenarios.schema.json_schema import scenario_schema as scenario_schema
     from scenarios.schema.scenario import Scenario as Scenario
@@ -82,9 +85,11 @@ _PLACES = {
         "bench_speed",
     ),
     "scenarios.catalogue": ("Catalogue", "LibraryScenario", "catalogue", "scenarios"),
+    "scenarios.export.exporter": ("export",),
+    "scenarios.export.in_the_loop": ("fly_exported",),
     "scenarios.flight": ("Flight",),
     "scenarios.junit": ("write_junit",),
-    "scenarios.many_flights": ("campaign", "replay", "reproduce", "sweep"),
+    "scenarios.many_flights": ("campaign", "replay", "reproduce", "sweep", "tune"),
     "scenarios.run": ("StartedFlight",),
     "scenarios.schema.json_schema": ("scenario_schema",),
     "scenarios.schema.scenario": ("Scenario",),

@@ -17,8 +17,8 @@ from quadsim.sim.rigid_body import check_free
 from quadsim.state import POSITION
 from quadsim.vehicle import Vehicle
 from scenarios.courses.make import build_course, build_motion, located
+from scenarios.limits import space_limits
 from scenarios.parts.effects import build_changes, check_changes, moving_air
-from scenarios.parts.limits import space_limits
 from scenarios.parts.vehicle import build_initial_state, build_vehicle
 from scenarios.schema.bases import read_scenario, replaced_tables, retyped
 from scenarios.schema.course import CsvSpec

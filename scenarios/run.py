@@ -26,9 +26,9 @@ from scenarios.build import build_controller, build_ground, build_plant, resolve
 from scenarios.courses.make import build_motion, follow_course
 from scenarios.flight import Flight, Outputs, write_run
 from scenarios.gc_tuning import frozen
+from scenarios.limits import build_limits
 from scenarios.one_thread import ONE_THREAD
 from scenarios.parts.effects import build_computation
-from scenarios.parts.limits import build_limits
 from scenarios.parts.live import FlightEvents, Successor, unanswered_by
 from scenarios.parts.navigation import build_navigation
 from scenarios.parts.neutral import prepared

@@ -146,7 +146,7 @@ class NonlinearMPC:
         self._hover = vehicle.mass * vehicle.gravity / N_ROTORS
         self._tilted = settings.tilt is not None
         self.problem = self._problem(constraints)
-        small = self.problem.horizon * (N_ROTORS + self.problem.rows.soft.size) <= LARGEST_CONDENSED
+        small = self.problem.horizon * (N_ROTORS + self.problem.rows.slacks.size) <= LARGEST_CONDENSED
         self.solver = settings.solver or ("piqp-dense" if small else "piqp-multistage")
         self._qp = Relinearised(self.problem, self.solver, shortcut=True)
         self._clearing = None if space is None else Clearing(self.problem, self._solve, space, changing=True)
@@ -220,7 +220,7 @@ class NonlinearMPC:
         if self.settings.soft is None:
             return None
         l1, l2 = self.settings.soft
-        return Penalty(l1=np.full(rows, l1 * scale), l2=np.full(rows, l2 * scale**2))
+        return Penalty(l1=np.full(rows, l1 * scale), l2=np.full(rows, l2 * scale**2), largest=True)
 
     def _of_states(self, constraint: Constraint, n: int) -> Constraint:
         """Rows over the 12 states of `quadsim.state` and rotor speeds as rows over the model's.

@@ -69,7 +69,7 @@ def _error(j: int) -> Signal:
 
 def _estimate_error(i: int) -> Signal:
     unit, scale = shown_unit(STATE_UNITS[i])
-    return Signal(unit=unit, sampled=lambda log: scale * (log.state[:, i] - log.truth[:, i]), plant=None)
+    return Signal(unit=unit, sampled=lambda log: scale * log.measured_error[:, i], plant=None)
 
 
 SIGNALS: Final[dict[str, Signal]] = {

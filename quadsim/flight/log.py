@@ -11,7 +11,7 @@ from typing import Any, Final
 import numpy as np
 
 from quadsim.controller import Phase
-from quadsim.state import Array
+from quadsim.state import ANGLE_RATES, ANGLES, Array, euler_to_body_rates, euler_to_quaternion
 
 WRENCH: Final = {**{f"force_{axis}": "N" for axis in "xyz"}, **{f"torque_{axis}": "N m" for axis in "xyz"}}
 """Columns of the external force, world, and torque, body frame, with their units; only where there is any."""
@@ -70,6 +70,24 @@ class ControlLog:
     def measured_perfectly(self) -> bool:
         """Whether the measured state was the true one throughout."""
         return self.state is self.truth or bool(np.array_equal(self.state, self.truth))
+
+    @property
+    def measured_error(self) -> Array:
+        """(K, 12) measured less true state; of an attitude that is logged a rotation vector and body rates, body axes.
+
+        Of flights whose attitude is not logged the differences of Euler angles and of their rates.
+        """
+        error = self.state - self.truth
+        if self.attitude is not None and self.body_rates is not None:
+            angles, rates = self.truth[:, ANGLES], self.truth[:, ANGLE_RATES]
+            w, x, y, z = euler_to_quaternion(angles).T
+            a, b, c, d = self.attitude.T
+            half = np.column_stack(
+                [w * b - x * a - y * d + z * c, w * c - y * a + x * d - z * b, w * d - z * a - x * c + y * b]
+            )
+            error[:, ANGLES] = 2.0 * np.copysign(1.0, w * a + x * b + y * c + z * d)[:, None] * half
+            error[:, ANGLE_RATES] = self.body_rates - euler_to_body_rates(angles, rates)
+        return error
 
     @property
     def crashed(self) -> bool:

@@ -207,6 +207,11 @@ class ClosedLoop:
         return self.k * self.period
 
     @property
+    def course(self) -> Reference:
+        """What is followed."""
+        return self._reference
+
+    @property
     def last(self) -> Sample | None:
         """The period flown last; None before the first."""
         return self._last

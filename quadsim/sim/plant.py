@@ -45,6 +45,7 @@ from quadsim.state import (
     POSITIONS,
     VELOCITIES,
     Array,
+    YawTurns,
     euler_to_body_rates,
     euler_to_quaternion,
 )
@@ -116,7 +117,7 @@ class Plant:
         mujoco.set_mju_user_warning(_discard)
         self._rollout = Rollout(nthread=0)
         self._physics = np.zeros((1, mujoco.mj_stateSize(self.model, _FULL)))
-        self._yaw = 0.0
+        self._yaw = YawTurns(0.0)
         self._wind, self._own = wind, tuple(forces)
         if integrator == "rk4":
             check_free(effects, changes, obstacles)
@@ -185,7 +186,7 @@ class Plant:
         self._physics[0] = np.concatenate(
             [[0.0], state[POSITIONS], euler_to_quaternion(euler), state[VELOCITIES], rates]
         )
-        self._yaw = float(euler[2])
+        self._yaw = YawTurns(float(euler[2]))
         self._step = 0
         self._pending = deque(self._changes)
         self._rotors = self.effects.rotors or RotorDynamics()
@@ -214,8 +215,8 @@ class Plant:
 
     def state(self) -> Array:
         """(12,) the true state now, yaw unwrapped since the last reset."""
-        state = physics_to_state(self._physics, self._yaw)[0]
-        self._yaw = float(state[EULER[2]])
+        state = physics_to_state(self._physics)[0]
+        state[EULER[2]] = self._yaw.unwrapped(state[ANGLES])
         return state
 
     @property

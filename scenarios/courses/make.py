@@ -22,7 +22,7 @@ from scenarios.courses.followed import FollowedCourse
 from scenarios.courses.legs import Turn, Waypoint, waypoints, yaw_turns
 from scenarios.courses.loops import circle, figure_eight, fly_round
 from scenarios.courses.minimum_snap import minimum_snap
-from scenarios.courses.ramped import circle_curve, fly_ramped, lemniscate_curve, ramped_phase
+from scenarios.courses.ramped import circle_curve, fly_ramped, lemniscate_curve, ramped_phase, upright_circle_curve
 from scenarios.courses.smoothing import smooth
 from scenarios.courses.steps import Window, steps, switches
 from scenarios.parts.vehicle import build_vehicle
@@ -205,14 +205,19 @@ def _loop(spec: CircleSpec | HelixSpec | FigureEightSpec, initial: Array) -> Pat
 
 
 def _ramped(spec: RampedCircleSpec | RampedLemniscateSpec, initial: Array, *, gravity: float) -> Path:
-    curve = circle_curve if isinstance(spec, RampedCircleSpec) else lemniscate_curve
+    if isinstance(spec, RampedLemniscateSpec):
+        curve = lemniscate_curve(spec.radius)
+    elif spec.plane == "vertical":
+        curve = upright_circle_curve(spec.radius, float(initial[3]))
+    else:
+        curve = circle_curve(spec.radius)
     phase = ramped_phase(
         rate=spec.speed / spec.radius,
         acceleration=spec.acceleration / spec.radius,
         ramp=spec.ramp,
         step=spec.sampling,
     )
-    return fly_ramped(curve(spec.radius), phase, initial=initial, gravity=gravity, free_heading=spec.heading == "free")
+    return fly_ramped(curve, phase, initial=initial, gravity=gravity, free_heading=spec.heading == "free")
 
 
 def _csv(spec: CsvSpec, initial: Array) -> Course:

@@ -25,8 +25,8 @@ from scenarios.gym.actions import Action, make_actions
 from scenarios.gym.observations import USUAL, Observations
 from scenarios.gym.randomisation import make_plan
 from scenarios.gym.rendering import Screen, has_display, make_screen
+from scenarios.limits import build_limits
 from scenarios.one_thread import ONE_THREAD
-from scenarios.parts.limits import build_limits
 from scenarios.parts.vehicle import build_vehicle
 from scenarios.run import StartedFlight, start
 from scenarios.schema.base import LARGEST_SEED

@@ -193,7 +193,7 @@ class Scenario(Spec):
         default=[], description="what the vehicle, a ball of its extent, must not touch: a touch is a crash"
     )
     corridors: Annotated[list[Corridor], MaxLen(MOST_ENTRIES)] = Field(
-        default=[], description="convex regions to stay in, each for a window of time"
+        default=[], description="convex regions to stay in, each for a window of time or of the path"
     )
     keep_in: Fence | None = Field(default=None, description="a convex region to stay in throughout; absent: none")
     constraints: Annotated[list[Limit], MaxLen(MOST_ENTRIES)] = Field(
