@@ -8,12 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import quadsim
-
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "examples"))
 
-import imitation  # noqa: E402
-import safety_filter  # noqa: E402
+import imitation
+import safety_filter
 
 
 def test_the_gradient_is_that_of_the_mean_squared_error() -> None:
