@@ -105,8 +105,8 @@ reproduce: setup  ## fly the numbers of every paper that ships and remake docs/p
 speed: setup  ## fly every controller ever faster and remake docs/speed.md: some six minutes
 	@$(PY) docs/make_speed.py
 
-gym: setup  ## remake the numbers and the figure of docs/gym.md: some ten minutes
-	@$(PY) docs/make_gym.py
+gym: setup  ## remake the numbers and the figure of docs/gym.md: some ten minutes; CRAZYFLOW=PYTHON times that beside it
+	@$(PY) docs/make_gym.py $(if $(CRAZYFLOW),--crazyflow $(CRAZYFLOW))
 
 soak: setup  ## one simulated hour on end: memory and step time have to stay as they were
 	@$(PY) tests/soak.py --minutes 60
