@@ -46,9 +46,9 @@ class Guard:
             return "a header is there twice"
         if not self._is_ours(host, port):
             return "this server goes by another name"
-        if origin is not None and not self._is_ours(urlsplit(origin).netloc, port):
+        if origin is not None and not self._is_ours(origin.partition("://")[2], port):
             return "a page of another site may not connect"
-        given = [*parse_qs(urlsplit(path).query).get("token", []), *self._cookies(headers, port)]
+        given = [*parse_qs(path.partition("?")[2]).get("token", []), *self._cookies(headers, port)]
         if not any(secrets.compare_digest(each.encode(), self.token.encode()) for each in given):
             return "open the address that quadsim live printed: it has a token"
         return None
@@ -72,7 +72,7 @@ class Guard:
                 if refused is not None:
                     return connection.respond(HTTPStatus.FORBIDDEN, f"quadsim: {refused}\n")
                 response = None if process_request is None else process_request(connection, request)
-                if response is not None and "token" in parse_qs(urlsplit(request.path).query):
+                if response is not None and "token" in parse_qs(request.path.partition("?")[2]):
                     response.headers["Set-Cookie"] = self.cookie(port)
                 return response
 

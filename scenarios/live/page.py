@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import dataclasses
 import io
 import math
 from collections import deque
@@ -42,6 +43,7 @@ _STEER: Final = {"W": (1, 0, 0), "S": (-1, 0, 0), "A": (0, 1, 0), "D": (0, -1, 0
 _STEER_STEP: Final = 0.5
 """[m/s] by which a key changes it."""
 _STEER_MOST: Final = 5.0
+_NO_VELOCITY: Final = "0, 0, 0"
 _ACTIVE: Final = 0.05
 """Share of a bound's scale within which a margin counts as active."""
 _FAULTS: Final = ("dropout", "freeze", "nan")
@@ -104,11 +106,11 @@ class Page:
         shown = host if host in LOOPBACK or host not in ("0.0.0.0", "::") else "127.0.0.1"
         self.address = f"http://{shown}:{found}/?token={self._guard.token}"
         self._driver: int | None = None
+        self._takes: dict[int, Any] = {}  # the button of each client that takes the controls
         self._aims: dict[int, Any] = {}  # where each client looks, from the vehicle [m]
         self._steer = np.zeros(3)
         self._history: deque[tuple[float, ...]] = deque(maxlen=round(SECONDS / session.period))
         self._frame: Frame | None = None
-        self._serializer: Any = None
         self._server.gui.configure_theme(show_logo=False, show_share_button=False, control_width="medium")
         self._server.gui.set_panel_label(f"quadsim live: {session.scenario.name}")
         self.stage = Stage(self._server.scene, session)
@@ -158,8 +160,12 @@ class Page:
             self._history.clear()
             self.stage.reset()
             self._steer[:] = 0.0
-            for slider in self._rest:
-                slider.value = 0.0
+            for widget, value in self._rest:
+                widget.value = value
+            self._handle.position = np.array(self._place.value)
+            self._steered.value = _NO_VELOCITY
+            self._said.content = ""
+            self._show_knobs(self._session.scenario.controller)
         else:
             self._status.content = (
                 f'{STYLE}<div class="q bad">{escape(reason)}. Reset begins anew; Save keeps it.</div>'
@@ -171,7 +177,7 @@ class Page:
         gui = self._server.gui
         self._status = gui.add_html(f'{STYLE}<div class="q">starting</div>')
         self._margins = gui.add_html("")
-        self._rest: list[Any] = []
+        self._rest: list[tuple[Any, Any]] = []  # widgets, and what they are at the begin of a flight
         with gui.add_folder("Run"):
             run = {"Pause": self._toggle, "Step": self._step, "Reset": self._reset}
             self._group("Flight", run)
@@ -247,8 +253,9 @@ class Page:
         )
         for rotor in range(1, N_ROTORS + 1):
             wear = gui.add_slider(f"Rotor {rotor} loss", 0.0, 1.0, 0.05, 0.0)
-            self._rest.append(wear)
+            self._rest.append((wear, 0.0))
             self._on(wear.on_update, partial(self._wear, rotor))
+        self._rest += [(wind, (0.0, 0.0)), (factor, 1.0), (lag, 0)]
         sensor = gui.add_dropdown("Sensor", ("position", "velocity", "attitude", "rates"))
         fault = gui.add_dropdown("Fault", _FAULTS)
         self._button(
@@ -277,7 +284,7 @@ class Page:
         self._handle = self._server.scene.add_transform_controls(
             "/target", scale=3.0 * unit, position=here, disable_rotations=True, disable_sliders=True
         )
-        place = gui.add_vector3("Set-point [m]", tuple(map(float, here)), step=0.1)
+        place = self._place = gui.add_vector3("Set-point [m]", tuple(map(float, here)), step=0.1)
 
         async def dragged(event: Any) -> None:
             if event.client is not None and self._drives(event.client):
@@ -308,7 +315,8 @@ class Page:
             yaw.on_update,
             lambda event: session.submit({"type": "setpoint", "yaw": float(event.target.value)}, subject="yaw"),
         )
-        self._steered = gui.add_text("Set-point velocity [m/s]", "0, 0, 0", disabled=True)
+        self._rest += [(place, place.value), (yaw, 0)]
+        self._steered = gui.add_text("Set-point velocity [m/s]", _NO_VELOCITY, disabled=True)
         for key, direction in _STEER.items():
             command = gui.add_command(
                 f"Fly {'+' if sum(direction) > 0 else '-'}{'xyz'[np.abs(direction).argmax()]}", hotkey=key
@@ -365,9 +373,15 @@ class Page:
         return [gui.add_number(knob.path, value, min=knob.minimum, max=knob.maximum, step=step, hint=knob.about)]
 
     async def _turn(self, path: str, event: Any) -> None:
-        _, handles = self._fields[path]
-        value: Value | list[Any] = handles[0].value if len(handles) == 1 else [each.value for each in handles]
-        await self._replace({path: value}, f"{path} = {value}")
+        knob, handles = self._fields[path]
+        values = tuple(each.value for each in handles)
+        value: Value = values[0] if len(handles) == 1 else values
+        if await self._replace({path: value}, f"{path} = {value}"):
+            self._fields[path] = dataclasses.replace(knob, value=value), handles
+            return
+        before = knob.value if isinstance(knob.value, tuple) else (knob.value,)
+        for handle, each in zip(handles, before, strict=True):
+            handle.value = each
 
     async def _take_over(self, spec: ControllerSpec, name: str) -> None:
         if await self._replace(spec.model_dump(mode="json", exclude_none=True), name):
@@ -446,25 +460,26 @@ class Page:
         client.camera.look_at = at + self._aims[client.client_id]
         client.camera.position = client.camera.look_at + away
         take = client.gui.add_button("Take the controls", visible=self._driver != client.client_id)
+        self._takes[client.client_id] = take
 
         async def taken(event: Any) -> None:
-            self._let_go()
-            self._driver = client.client_id
-            take.visible = False
+            self._hand_over(client.client_id)
 
         take.on_click(taken)
 
     async def _left(self, client: Any) -> None:
         self._aims.pop(client.client_id, None)
+        self._takes.pop(client.client_id, None)
         if self._driver == client.client_id:
-            self._let_go()
-            rest = [each for each in self._server.get_clients() if each != client.client_id]
-            self._driver = min(rest, default=None)
+            self._hand_over(min(self._takes, default=None))
 
-    def _let_go(self) -> None:
-        """Nobody holds the vehicle, or flies the set-point, any more."""
+    def _hand_over(self, driver: int | None) -> None:
+        """Give a client the controls; nobody holds the vehicle, or flies the set-point, any more."""
         self._session.submit({"type": "pull"}, subject="pull")
         self._fly(np.zeros(3))
+        self._driver = driver
+        for client, take in self._takes.items():
+            take.visible = client != driver
 
     def _drives(self, client: Any) -> bool:
         if client.client_id == self._driver:

@@ -51,6 +51,8 @@ PROTOCOL = Subprotocol(f"viser-v{viser.__version__}")
         ({"Host": "127.0.0.1:8080", "Origin": "http://127.0.0.1:9090", "Cookie": "quadsim-8080={token}"}, "", False),
         ({"Host": "127.0.0.1:8080", "Origin": "null", "Cookie": "quadsim-8080={token}"}, "", False),
         ({"Host": "[::1"}, "?token={token}", False),
+        ({"Host": "127.0.0.1:8080", "Origin": "http://[::1"}, "?token={token}", False),
+        ({"Host": "127.0.0.1:8080"}, "/[?token=guessed", False),
     ],
 )
 def test_who_is_let_in(headers: dict[str, str], query: str, let_in: bool) -> None:
@@ -209,6 +211,7 @@ def test_a_controller_is_changed_in_flight_and_one_that_cannot_be_is_refused(tab
     lower.fill("260")  # above the upper one
     lower.press("Enter")
     tab.get_by_text("the controller before flies on").wait_for()
+    served.wait(lambda: lower.input_value() != "260")  # what flies on
     assert served.session.flights[0].loop.controller.horizon == 12
     assert served.session.reason is None
 
@@ -230,6 +233,18 @@ def test_pause_stands_still_and_save_keeps_what_flies_again_to_the_bit(tab: Any,
     served.wait(lambda: served.session.k > k + 3)
 
 
+def test_a_reset_puts_everything_back(tab: Any, served: Served) -> None:
+    k = served.session.k
+    tab.get_by_role("button", name="Reset", exact=True).click()
+    served.wait(lambda: served.session.k < k)
+    field = tab.locator("label", has_text="horizon").locator("xpath=ancestor::div[.//input][1]").locator("input")
+    served.wait(lambda: field.input_value() == "10")
+    tab.get_by_role("tab", name="Push").click()
+    row = tab.locator("label", has_text="Mass factor").locator("xpath=ancestor::div[.//*[@role='slider']][1]")
+    served.wait(lambda: row.get_by_role("slider").get_attribute("aria-valuenow") == "1")
+    assert served.session.flights[0].loop.controller.horizon == 10
+
+
 def test_a_second_page_watches(browser: Any, served: Served, tab: Any, tmp_path: Path) -> None:
     phone = browser.new_page(viewport={"width": 390, "height": 800})
     phone.set_default_timeout(1e3 * PATIENCE)
@@ -239,6 +254,9 @@ def test_a_second_page_watches(browser: Any, served: Served, tab: Any, tmp_path:
     phone.get_by_role("button", name="Pause", exact=True).click()
     phone.get_by_text("You watch").first.wait_for()
     assert served.pace.paused == before
+    for page in (phone, tab):  # from one to the other, and back
+        page.get_by_role("button", name="Take the controls").click()
+        page.get_by_role("button", name="Take the controls").wait_for(state="hidden")
     picture = phone.screenshot(path=tmp_path / "phone.png")
     assert len(picture) > 10_000
     phone.close()
