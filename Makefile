@@ -4,7 +4,7 @@
 
 .NOTPARALLEL:
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test peers check docs format types build numbers verification nonlinear robustness first-flights reproduce speed soak campaigns tuning kills safety pins clean
+.PHONY: help setup demo test peers check docs format types build numbers verification nonlinear robustness first-flights reproduce speed soak campaigns live tuning kills safety firmware pins clean
 
 VENV := .venv
 PY := $(VENV)/bin/python
@@ -20,6 +20,8 @@ PYTHON ?= $(firstword $(foreach name,$(CANDIDATES),$(shell $(name) -c '$(SUPPORT
 PIP_INSTALL := $(PY) -m pip install --quiet --disable-pip-version-check
 NOT_INSTALLED := The packages could not be installed. With a network at hand: make setup
 RENDERS := $(PY) -c 'from quadsim.report.film.video import rendering_backend; rendering_backend()' 2>/dev/null
+FIRMWARE_TOOLS := gcc arm-none-eabi-gcc qemu-system-arm aarch64-linux-gnu-gcc qemu-aarch64 clang cppcheck clang-tidy
+HAS_FIRMWARE_TOOLS := (for tool in $(FIRMWARE_TOOLS); do command -v $$tool || exit; done) >/dev/null
 HAS_BROWSER := { command -v chromium || command -v chromium-browser || command -v google-chrome; } >/dev/null
 
 # $(call quietly,COMMAND,ADVICE): runs a command silently; if it fails, shows its last errors, then the advice.
@@ -42,14 +44,17 @@ demo: setup  ## fly the paper's two flights and compare them, under runs/ (OPTIO
 	@$(QUADSIM) compare $(RUNS)/paper-unconstrained $(RUNS)/paper-constrained --out $(RUNS)/comparison
 	@echo "Done. Open $(RUNS)/comparison/index.html in a browser."
 
-test peers verification nonlinear robustness first-flights reproduce speed soak campaigns tuning kills safety: export OMP_NUM_THREADS := 1
-test peers verification nonlinear robustness first-flights reproduce speed soak campaigns tuning kills safety: export OPENBLAS_NUM_THREADS := 1
-test peers verification nonlinear robustness first-flights reproduce speed soak campaigns tuning kills safety: export MKL_NUM_THREADS := 1
+test peers firmware verification nonlinear robustness first-flights reproduce speed soak campaigns tuning kills safety: export OMP_NUM_THREADS := 1
+test peers firmware verification nonlinear robustness first-flights reproduce speed soak campaigns tuning kills safety: export OPENBLAS_NUM_THREADS := 1
+test peers firmware verification nonlinear robustness first-flights reproduce speed soak campaigns tuning kills safety: export MKL_NUM_THREADS := 1
 test: setup $(VENV)/.browser  ## run every test that needs no peer (OPTIONS="-k audit" for some)
 	@$(PY) -m pytest -q -n $(WORKERS) --dist loadscope $(OPTIONS)
 
 peers: setup $(VENV)/.peers  ## install the peers and every solver, and hold quadsim against them
 	@$(PY) -m pytest -q -n $(WORKERS) --dist loadscope tests/peers $(OPTIONS)
+
+firmware: setup $(VENV)/.firmware  ## compile exported controllers for every target, emulate, analyse and fuzz them
+	@$(PY) -m pytest -q tests/firmware $(OPTIONS)
 
 check: setup  ## lint, formatting and types
 	@$(PY) -m ruff check
@@ -100,6 +105,9 @@ reproduce: setup  ## fly the numbers of every paper that ships and remake docs/p
 speed: setup  ## fly every controller ever faster and remake docs/speed.md: some six minutes
 	@$(PY) docs/make_speed.py
 
+gym: setup  ## remake the numbers and the figure of docs/gym.md: some ten minutes; CRAZYFLOW=PYTHON times that beside it
+	@$(PY) docs/make_gym.py $(if $(CRAZYFLOW),--crazyflow $(CRAZYFLOW))
+
 soak: setup  ## one simulated hour on end: memory and step time have to stay as they were
 	@$(PY) tests/soak.py --minutes 60
 
@@ -108,6 +116,9 @@ campaigns: setup  ## fly the campaigns that ship and remake docs/paper-robustnes
 
 tuning: setup  ## carry out the tunings that ship and remake docs/tuning.md, up to half an hour each; goes on with what is there
 	@$(PY) docs/make_tuning.py
+
+live: setup $(VENV)/.browser  ## remake the numbers of docs/live.md: load, latency and bandwidth of a session; a minute
+	@$(PY) docs/make_live.py
 
 safety: setup  ## attack all that writes or reads files, and remake the counts on docs/safety.md: some forty minutes
 	@PYTHONPATH=tests $(PY) docs/make_safety.py
@@ -168,3 +179,9 @@ $(VENV)/.renders: $(VENV)/.installed
 $(VENV)/.browser: $(VENV)/.installed
 	@if $(HAS_BROWSER) || { { $(call apt,chromium); } && $(HAS_BROWSER); }; then touch $@; \
 	else echo "Until then the tests that open pages in a browser are skipped." >&2; fi
+
+$(VENV)/.firmware: $(VENV)/.installed
+	@if $(HAS_FIRMWARE_TOOLS) || { { $(call apt,gcc libc6-dev gcc-arm-none-eabi libnewlib-arm-none-eabi qemu-system-arm \
+		gcc-aarch64-linux-gnu libc6-dev-arm64-cross qemu-user clang cppcheck clang-tidy); } && \
+		$(HAS_FIRMWARE_TOOLS); }; then touch $@; \
+	else echo "Until then the tests of exported controllers that lack a tool are skipped." >&2; fi

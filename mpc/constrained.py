@@ -31,9 +31,11 @@ class ConstrainedMPC:
     Attributes:
         problem: as given.
         unanswered: the first period since `reset` whose QP had no answer; None where all had.
+        answer: the last period's; None before the first.
     """
 
     name: Final = "constrained"
+    answer: Answer | None = None
     _plan: Array | None
 
     def __init__(self, problem: Problem, solver: Solver, *, shortcut: bool = True, space: Space | None = None) -> None:
@@ -78,6 +80,7 @@ class ConstrainedMPC:
             answer = self._solver.solve(query.state, query.desired, query.u_before)
         else:
             answer, problem, _ = self._clearing.solve(now.time, query)
+        self.answer = answer
         return self._take(answer) if answer.way is Way.FREE else self._follow(now.time, problem, query, answer)
 
     def predict(self, states: Array, plans: Array) -> Array:

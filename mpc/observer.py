@@ -27,7 +27,7 @@ from quadsim.errors import ParameterError
 from quadsim.fields import Positive
 from quadsim.state import ANGLES, VELOCITIES, Array, body_rates_of
 
-_UPRIGHT: Final = 0.1
+UPRIGHT: Final = 0.1
 """Smallest vertical part of the thrust axis from which on a change of vertical speed is attributed to thrust."""
 
 
@@ -72,6 +72,10 @@ class DisturbanceObserver:
 
     What is predicted starts from what was measured a period ago, so that the estimate of v itself is not kept: noise
     of a measurement enters twice, with opposite signs, and the gains are those for twice its variance.
+
+    Attributes:
+        gain: (6,) of the disturbances on the surprise in their velocities and rates [1/s].
+        largest: (6,) magnitude of an estimate.
     """
 
     def __init__(self, settings: ObserverSettings, period: float) -> None:
@@ -85,8 +89,8 @@ class DisturbanceObserver:
         _, torque = observer_gain(
             period, noise=doubled * settings.rate_noise, walk=settings.rate_walk, change=settings.torque_walk
         )
-        self._gain = np.repeat([force, torque], 3)
-        self._largest = np.repeat([settings.largest_force, settings.largest_torque], 3)
+        self.gain = np.repeat([force, torque], 3)
+        self.largest = np.repeat([settings.largest_force, settings.largest_torque], 3)
         self.reset()
 
     def reset(self) -> None:
@@ -97,21 +101,21 @@ class DisturbanceObserver:
 
     def adopt(self, estimate: Array) -> None:
         """Go on from an estimate (6,)."""
-        self.estimate = np.minimum(np.maximum(estimate, -self._largest), self._largest)
+        self.estimate = np.minimum(np.maximum(estimate, -self.largest), self.largest)
 
     def update(self, measured: Array, predicted: Array) -> None:
         """Take note of a measured state (12,) and of what was predicted for it (12,), disturbances included."""
         now, then = measured.tolist(), predicted.tolist()
         axis, rates, expected_rates = thrust_axis(now), body_rates_of(now), body_rates_of(then)
         x, y, z = (found - wanted for found, wanted in zip(now[VELOCITIES], then[VELOCITIES], strict=True))
-        along = z / max(axis[2], _UPRIGHT)
+        along = z / max(axis[2], UPRIGHT)
         velocity = x - along * axis[0], y - along * axis[1], along
         self.learn([*velocity, *(found - wanted for found, wanted in zip(rates, expected_rates, strict=True))])
 
     def learn(self, surprise: Sequence[float] | Array) -> None:
         """Take note of by how much three velocities and three body rates (6,) are other than predicted."""
-        estimate = self.estimate + self._gain * surprise
-        self.estimate = np.minimum(np.maximum(estimate, -self._largest), self._largest)
+        estimate = self.estimate + self.gain * surprise
+        self.estimate = np.minimum(np.maximum(estimate, -self.largest), self.largest)
 
 
 def thrust_axis(state: Sequence[float]) -> tuple[float, float, float]:

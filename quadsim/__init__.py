@@ -40,6 +40,8 @@ if TYPE_CHECKING:
     from scenarios.catalogue import LibraryScenario as LibraryScenario
     from scenarios.catalogue import catalogue as catalogue
     from scenarios.catalogue import scenarios as scenarios
+    from scenarios.export.exporter import export as export
+    from scenarios.export.in_the_loop import fly_exported as fly_exported
     from scenarios.flight import Flight as Flight
     from scenarios.junit import write_junit as write_junit
     from scenarios.many_flights import campaign as campaign
@@ -83,6 +85,8 @@ _PLACES = {
         "bench_speed",
     ),
     "scenarios.catalogue": ("Catalogue", "LibraryScenario", "catalogue", "scenarios"),
+    "scenarios.export.exporter": ("export",),
+    "scenarios.export.in_the_loop": ("fly_exported",),
     "scenarios.flight": ("Flight",),
     "scenarios.junit": ("write_junit",),
     "scenarios.many_flights": ("campaign", "replay", "reproduce", "sweep", "tune"),

@@ -69,6 +69,22 @@ class ParameterError(InputError):
         self.owner, self.name, self.value, self.rule = owner, name, value, rule
 
 
+class ExportError(InputError):
+    """A controller that has no C of its own.
+
+    Attributes:
+        reason: why, as the end of "... cannot be exported: ...".
+    """
+
+    def __init__(self, reason: str) -> None:
+        super().__init__(f"this scenario's controller cannot be exported: {reason}")
+        self.reason = reason
+
+
+class CompilerError(InputError):
+    """There is no C compiler, or it did not compile what was exported."""
+
+
 class UnknownNameError(InputError):
     """A name that is not one of a known set; the message lists the set and the nearest member, or those that are meant.
 
@@ -102,6 +118,14 @@ class MissingPackageError(InputError):
     def __init__(self, what: str, package: str, *, extra: str) -> None:
         super().__init__(f"{what} needs the package {package!r}: pip install 'quadsim[{extra}]'")
         self.what, self.package, self.extra = what, package, extra
+
+
+class MissingProgramError(InputError):
+    """Something asked for needs a program that is not installed; the message says how to get it."""
+
+    def __init__(self, what: str, program: str, *, packages: str) -> None:
+        super().__init__(f"{what} needs {program!r}: apt-get install --no-install-recommends {packages}")
+        self.what, self.program, self.packages = what, program, packages
 
 
 class OutputError(QuadsimError, OSError):

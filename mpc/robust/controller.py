@@ -40,6 +40,7 @@ from mpc.observer import DisturbanceObserver, thrust_axis
 from mpc.observer import ObserverSettings as ObserverSettings
 from mpc.ocp import Objective, Problem, Query, Rest, Unanswered, lqr_terminal_weight
 from mpc.relinearised import Relinearised
+from mpc.robust.settings import LONGEST_SPAN
 from mpc.robust.settings import Linearisation as Linearisation
 from mpc.robust.settings import RobustSettings as RobustSettings
 from mpc.solvers import INVALID_DATA, Answer, QPSolver
@@ -51,12 +52,43 @@ from quadsim.state import EULER, EULER_RATE, INDEX, N_STATES, REFERENCE_STATES, 
 from quadsim.vehicle import N_ROTORS, Vehicle
 
 SOLVER: Final = "piqp-multistage"  # solves what the shortcuts leave
-LONGEST_SPAN: Final = 0.25
-"""Longest time between two measured states [s] for their difference to tell of a disturbance; a sensor of 4 Hz."""
 _SAME_TIME: Final = 1e-6  # [s]
 _YAW: Final = INDEX["yaw"]
 _MOVING: Final = [*VELOCITY, *EULER, *EULER_RATE]
 _PLAUSIBLE: Final = PLAUSIBLE[list(REFERENCE_STATES)]  # of references
+
+
+def robust_problem(
+    vehicle: Vehicle,
+    *,
+    period: float,
+    horizon: int,
+    objective: Objective,
+    bounds: Bounds,
+    settings: RobustSettings,
+    constraints: tuple[Constraint, ...] = (),
+) -> Problem:
+    """The optimisation of the hover model, its states perhaps with the rotor speeds; see `RobustMPC`.
+
+    Raises:
+        ParameterError: a number or a shape is not possible.
+    """
+    if settings.delay > period:
+        raise ParameterError("controller", "delay", settings.delay, f"at most the control period of {period} s")
+    A, B = discretise(*continuous_model(vehicle, settings.rotor_lag), period)
+    model = LinearModel(A=A, B=B, u_bar=hover_model(vehicle, period).u_bar, period=period)
+    objective = replace(objective, C_r=_widened(objective.C_r, model.n), Q_d=settings.move_weight)
+    if settings.terminal:
+        objective = replace(objective, P=lqr_terminal_weight(model, objective))
+    return Problem(
+        model=model,
+        horizon=horizon,
+        objective=objective,
+        bounds=replace(bounds, C_c=_widened(bounds.C_c, model.n), penalty=settings.penalty, margins=settings.margins),
+        constraints=tuple(
+            part if part.C is None else replace(part, C=_widened(part.C, model.n)) for part in constraints
+        ),
+    )
 
 
 class RobustMPC:
@@ -69,6 +101,7 @@ class RobustMPC:
         problem: the optimisation, its states perhaps with the rotor speeds.
         trim: what holds the vehicle at rest against the disturbance that is estimated.
         unanswered: the first period since `reset` whose QP had no answer; None where all had.
+        answer: of the last period that had one to solve; None before the first.
 
     Raises:
         ParameterError: a number or a shape is not possible.
@@ -76,6 +109,7 @@ class RobustMPC:
 
     name: Final = "robust"
     solver: Final = SOLVER
+    answer: Answer | None = None
 
     def __init__(
         self,
@@ -90,14 +124,20 @@ class RobustMPC:
         shortcut: bool = True,
         space: Space | None = None,
     ) -> None:
-        if settings.delay > period:
-            raise ParameterError("controller", "delay", settings.delay, f"at most the control period of {period} s")
         self._vehicle, self.settings, self.horizon, self._period = vehicle, settings, horizon, period
         self._nominal = hover_model(vehicle, period)
         self._model = nonlinear_model(vehicle, period, rotor_lag=settings.rotor_lag or None)
         self._inverse = np.linalg.inv(slope(self._nominal))
         self._objective = objective
-        self.problem = problem = self._problem(objective, bounds, constraints)
+        self.problem = problem = robust_problem(
+            vehicle,
+            period=period,
+            horizon=horizon,
+            objective=objective,
+            bounds=bounds,
+            settings=settings,
+            constraints=constraints,
+        )
         self._actuators = ActuatorBounds.of_problem(problem)
         if settings.linearisation is Linearisation.HOVER:
             whole = QPSolver(SOLVER, problem)
@@ -108,22 +148,6 @@ class RobustMPC:
         self._clearing = None if space is None else Clearing(problem, self._solve, space, changing=changing)
         self._observer = None if settings.observer is None else DisturbanceObserver(settings.observer, period)
         self.reset(np.full(N_ROTORS, vehicle.hover_speed))
-
-    def _problem(self, objective: Objective, bounds: Bounds, constraints: tuple[Constraint, ...]) -> Problem:
-        """The optimisation of the hover model, its states perhaps with the rotor speeds."""
-        settings, n = self.settings, self._model.n
-        A, B = discretise(*continuous_model(self._vehicle, settings.rotor_lag), self._period)
-        model = LinearModel(A=A, B=B, u_bar=self._nominal.u_bar, period=self._period)
-        objective = replace(objective, C_r=_widened(objective.C_r, n), Q_d=settings.move_weight)
-        if settings.terminal:
-            objective = replace(objective, P=lqr_terminal_weight(model, objective))
-        return Problem(
-            model=model,
-            horizon=self.horizon,
-            objective=objective,
-            bounds=replace(bounds, C_c=_widened(bounds.C_c, n), penalty=settings.penalty, margins=settings.margins),
-            constraints=tuple(part if part.C is None else replace(part, C=_widened(part.C, n)) for part in constraints),
-        )
 
     def reset(self, speeds: Array) -> None:
         """Start anew after the command u(-1) (4,) [rad/s], with rotors at that speed."""
@@ -163,6 +187,7 @@ class RobustMPC:
         if isinstance(query, Command):
             return query
         answer, problem = self._answer(now.time, query)
+        self.answer = answer
         refused = rejection(answer.solution.status, answer.plan[0], answer.plan, self._actuators, self._acting)
         if refused is not None:
             if refused != INVALID_DATA and self.unanswered is None:

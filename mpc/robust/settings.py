@@ -5,11 +5,15 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from enum import StrEnum
+from typing import Final
 
 from mpc.constraints import Penalty
 from mpc.observer import ObserverSettings
 from quadsim.errors import ParameterError
 from quadsim.state import Array
+
+LONGEST_SPAN: Final = 0.25
+"""Longest time between two measured states [s] for their difference to tell of a disturbance; a sensor of 4 Hz."""
 
 
 class Linearisation(StrEnum):

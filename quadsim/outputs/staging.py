@@ -40,6 +40,7 @@ _HALF_MADE: Final = (
     "*.parquet", "*.rrd", "*.mp4", "*.gif", "*.png", "*.svg", "*.html", "*.log", "*.new", "new.*", "pieces.txt",
     "summary.json", "scenario.toml", "bench.json", "ladder.json", "comparison.json", "cost.json", "owner.json",
     "solvers.md", "ladder.md", "comparison.md", "cost.md", MANIFEST_FILE,
+    "*.c", "*.h", "*.ld", "Makefile", "README.md", "LICENSE",
 )  # fmt: skip
 """Names of the files that we make; anything else in the staging directory of a process that was killed stays."""
 _SLOT, _ASIDE, _NAME = "swap-", "aside", "name"

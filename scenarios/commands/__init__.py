@@ -23,6 +23,7 @@ COMMANDS: Final[Mapping[str, str]] = {
     "replay": "campaigns:replay",
     "tune": "tunings:tune",
     "reproduce": "papers:reproduce",
+    "export": "export:export",
     "bench": "bench:bench",
     "doctor": "doctor:doctor",
 }

@@ -19,7 +19,7 @@ from mpc.model import hover_model
 from mpc.ocp import Objective, Problem, lqr_terminal_weight
 from mpc.robust.tightening import SHORTEST_LAG
 from quadsim.controller import Controller
-from quadsim.errors import InputError, ParameterError
+from quadsim.errors import ExportError, InputError, ParameterError
 from quadsim.state import INDEX, N_STATES, POSITION, STATE_NAMES, Array
 from quadsim.vehicle import N_ROTORS, Vehicle
 from scenarios.parts.plugin import build_plugin
@@ -30,8 +30,10 @@ from scenarios.schema.plugin import PluginSpec
 from scenarios.schema.robust import RobustSpec
 
 if TYPE_CHECKING:
+    from mpc.export.source import Exportable
     from mpc.robust.controller import RobustMPC
     from mpc.robust.filter import SafetyFilter
+    from mpc.robust.settings import RobustSettings
     from mpc.space.halfspaces import Shape, Space
 
 FALLBACK_SHARE: Final = 0.8
@@ -136,13 +138,16 @@ def make_controller(spec: ControllerSpec, vehicle: Vehicle, period: float, shape
     """
     match spec:
         case UnconstrainedSpec():
-            return _unconstrained(make_problem(spec, vehicle, period))
+            return _compiled(spec, vehicle, period) or _unconstrained(make_problem(spec, vehicle, period))
         case ConstrainedSpec():
-            space = make_space(spec, vehicle, period, shapes)
-            law = _constrained(spec, make_problem(spec, vehicle, period), space)
+            law = _compiled(spec, vehicle, period, shapes)
+            if law is None:
+                space = make_space(spec, vehicle, period, shapes)
+                law = _constrained(spec, make_problem(spec, vehicle, period), space)
             return law if spec.fallback is None else _bounded(law, spec, spec.fallback, vehicle, period)
         case RobustSpec():
-            return _bounded(_robust(spec, vehicle, period, shapes), spec, spec.fallback, vehicle, period)
+            law = _compiled(spec, vehicle, period, shapes) or _robust(spec, vehicle, period, shapes)
+            return _bounded(law, spec, spec.fallback, vehicle, period)
         case NonlinearSpec():
             return _nonlinear(spec, vehicle, period, shapes)
         case LQRSpec() | PIDSpec() | GeometricSpec():
@@ -174,8 +179,46 @@ def posed_problem(spec: BoundedSpec, vehicle: Vehicle, period: float) -> Problem
         InputError: it cannot be made from these numbers.
     """
     if isinstance(spec, RobustSpec):
-        return _robust(spec.model_copy(update={"shortcut": False}), vehicle, period).problem
+        return _robust_problem(spec, vehicle, period, _robust_settings(spec, vehicle, period))
     return make_problem(spec, vehicle, period)
+
+
+def exportable(spec: ControllerSpec, vehicle: Vehicle, period: float, shapes: Sequence[Shape] = ()) -> Exportable:
+    """What a controller that can be exported as C is made from.
+
+    Raises:
+        ExportError: it cannot be exported.
+        InputError: it cannot be made from these numbers.
+    """
+    from mpc.export.source import Exportable
+
+    if not isinstance(spec, UnconstrainedSpec | ConstrainedSpec | RobustSpec):
+        raise ExportError(f"it is {spec.type!r}; exported are unconstrained, constrained and robust")
+    if isinstance(spec, RobustSpec) and spec.linearisation != "hover":
+        raise ExportError(f"its model is another in each period: linearisation = {spec.linearisation!r}, not 'hover'")
+    if isinstance(spec, BoundedSpec) and spec.avoidance is not None and shapes:
+        raise ExportError("its half-spaces around obstacles are others in each period: leave out controller.avoidance")
+    settings = _robust_settings(spec, vehicle, period) if isinstance(spec, RobustSpec) else None
+    if isinstance(spec, RobustSpec) and settings is not None:
+        problem = _robust_problem(spec, vehicle, period, settings)
+    else:
+        problem = make_problem(spec, vehicle, period)
+    return Exportable(name=spec.type, problem=problem, vehicle=vehicle, settings=settings)
+
+
+def _compiled(
+    spec: UnconstrainedSpec | ConstrainedSpec | RobustSpec,
+    vehicle: Vehicle,
+    period: float,
+    shapes: Sequence[Shape] = (),
+) -> Controller | None:
+    """The law as compiled C; None where it is to be flown in Python."""
+    if not spec.compiled:
+        return None
+    from scenarios.parts.compiler import compiled_controller
+
+    key = spec.model_dump_json(), repr(vehicle), period, bool(shapes)
+    return compiled_controller(key, lambda: exportable(spec, vehicle, period, shapes))
 
 
 def _bounded(
@@ -300,14 +343,12 @@ def _unconstrained(problem: Problem) -> Controller:
         ) from error
 
 
-def _robust(spec: RobustSpec, vehicle: Vehicle, period: float, shapes: Sequence[Shape] = ()) -> RobustMPC:
-    from mpc.robust.controller import Linearisation, RobustMPC, RobustSettings
+def _robust_settings(spec: RobustSpec, vehicle: Vehicle, period: float) -> RobustSettings:
+    from mpc.robust.settings import Linearisation, RobustSettings
 
-    bounds, rotor_lag = make_bounds(spec), _rotor_lag(spec, vehicle)
-    soft = spec.soft
-    settings = RobustSettings(
-        penalty=None if soft is None else make_penalty(soft, bounds.y_min.size),
-        rotor_lag=rotor_lag,
+    return RobustSettings(
+        penalty=None if spec.soft is None else make_penalty(spec.soft, len(spec.output_bounds)),
+        rotor_lag=_rotor_lag(spec, vehicle),
         delay=spec.delay,
         observer=spec.offset_free,
         heading=spec.heading,
@@ -317,13 +358,32 @@ def _robust(spec: RobustSpec, vehicle: Vehicle, period: float, shapes: Sequence[
         terminal=spec.terminal == "lqr",
         margins=tightening_margins(spec, vehicle, period),
     )
+
+
+def _robust_problem(spec: RobustSpec, vehicle: Vehicle, period: float, settings: RobustSettings) -> Problem:
+    from mpc.robust.controller import robust_problem
+
+    return robust_problem(
+        vehicle,
+        period=period,
+        horizon=spec.horizon,
+        objective=make_objective(spec.output_weights, spec.input_weights),
+        bounds=make_bounds(spec),
+        settings=settings,
+        constraints=make_polytopes(spec),
+    )
+
+
+def _robust(spec: RobustSpec, vehicle: Vehicle, period: float, shapes: Sequence[Shape] = ()) -> RobustMPC:
+    from mpc.robust.controller import RobustMPC
+
     return RobustMPC(
         vehicle,
         period=period,
         horizon=spec.horizon,
         objective=make_objective(spec.output_weights, spec.input_weights),
-        bounds=bounds,
-        settings=settings,
+        bounds=make_bounds(spec),
+        settings=_robust_settings(spec, vehicle, period),
         constraints=make_polytopes(spec),
         shortcut=spec.shortcut,
         space=make_space(spec, vehicle, period, shapes, _position_margins(spec, vehicle, period)),

@@ -69,6 +69,10 @@ class WeightedSpec(Spec):
         default=None,
         description="weight of the last predicted state: lqr, of the Riccati equation; absent: as of all others",
     )
+    compiled: bool = Field(
+        default=False,
+        description="fly its export as C99, compiled once by this machine's C compiler, in place of Python's steps",
+    )
 
     @model_validator(mode="after")
     def _check_weights(self) -> WeightedSpec:

@@ -1,0 +1,123 @@
+"""DAQP, OSQP and TinyMPC on the problem of an exported controller: their own C on its recorded periods."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import tarfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+import osqp
+import scipy.linalg
+import scipy.sparse
+from make_numbers import ROOT
+
+from mpc.export.ctext import reals
+from mpc.ocp import Problem
+from mpc.paper.condensed import Condensed
+from quadsim.state import Array
+from scenarios.export.record import Recording
+
+SOURCES: Final = ROOT / "tests" / "firmware" / "peers"
+OURS: Final = ROOT / "mpc" / "export" / "c"
+FLAGS: Final = ["-O2", "-std=gnu99", "-ffp-contract=off", "-ffunction-sections", "-fdata-sections", "-w"]
+ASSIGNED: Final = {"double": [], "float": ["-DPEER_FLOAT", "-fsingle-precision-constant"]}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Condition:
+    """The condensed QP of a problem: min 1/2 x'Hx + c'x, lower <= [x; G x + shift] <= upper.
+
+    `c` (n, q) and `shift` (m, q) are linear in what a period asks: state, reference, u(k-1) and 1.
+    """
+
+    H: Array
+    G: Array
+    c: Array
+    shift: Array
+    lower: Array
+    upper: Array
+
+
+def condition(problem: Problem) -> Condition:
+    """The QP, its vectors by their values for one question at a time."""
+    condensed, N, n, nu = Condensed(problem), problem.horizon, problem.model.n, problem.model.nu
+    asked = n + 4 * N + nu
+
+    def vectors(question: Array) -> Array:
+        reference = question[n : n + 4 * N].reshape(N, 4)
+        found = condensed.vectors(question[:n], problem.objective.desired(reference), question[n + 4 * N :])
+        return np.concatenate([found.c, -found.h_u])
+
+    offset = vectors(np.zeros(asked))
+    slopes = np.array([vectors(row) - offset for row in np.eye(asked)]).T
+    maps, qp, size = np.column_stack([slopes, offset]), condensed.qp, N * nu
+    shift, rows = maps[size:].copy(), problem.rows
+    upper = np.concatenate([qp.x_u, np.tile(_hard(problem, rows.upper), N)])
+    lower = np.concatenate([qp.x_l, np.tile(_hard(problem, rows.lower), N)])
+    shift[:, -1] += upper[size:]
+    return Condition(H=qp.P, G=qp.G, c=maps[:size], shift=shift, lower=lower, upper=upper)
+
+
+def _hard(problem: Problem, bound: Array) -> Array:
+    assert np.isinf(problem.rows.l1).all()
+    return bound[0, problem.rows.input < 0]
+
+
+def _header(path: Path, sizes: dict[str, int], arrays: dict[str, Array]) -> None:
+    lines = [f"#define {name} {value}" for name, value in sizes.items()]
+    path.write_text("\n".join([*lines, *(reals(name, values) for name, values in arrays.items())]), encoding="utf-8")
+
+
+def write_problem(directory: Path, problem: Condition, recording: Recording, maps: Array) -> None:
+    """What peer.c reads."""
+    periods, asked = len(recording.state), maps.shape[1]
+    sizes = {"PERIODS": periods, "VECTORS": len(maps), "ASKED": asked}
+    arrays = {"STATE": recording.state, "PATH": recording.path, "ACTING": recording.acting, "MAP": maps}
+    _header(directory / "problem.h", sizes, arrays)
+
+
+def write_daqp(directory: Path, qp: Condition, recording: Recording) -> list[Path]:
+    """DAQP's data in least-distance form, and its sources from the package index."""
+    R = np.linalg.cholesky(qp.H).T
+    inverse = scipy.linalg.solve_triangular(R, np.eye(len(R)))
+    norms = np.linalg.norm(inverse, axis=1)
+    rows = qp.G @ inverse
+    lengths = np.linalg.norm(rows, axis=1)
+    size, count = len(R), len(R) + len(rows)
+    arrays = {
+        "ROOT_INVERSE": (inverse / norms[:, None])[np.triu_indices(size)],
+        "ROWS": rows / lengths[:, None],
+        "SCALING": np.concatenate([1.0 / norms, 1.0 / lengths]),
+        "LOWER": qp.lower,
+        "UPPER": qp.upper,
+    }
+    _header(directory / "daqp_data.h", {"SIZE": size, "COUNT": count, "BOXED": size}, arrays)
+    free = -scipy.linalg.cho_solve((R, False), qp.c)
+    write_problem(directory, qp, recording, np.vstack([free, qp.G @ free + qp.shift]))
+    command = [sys.executable, "-m", "pip", "download", "--quiet", "--no-deps", "--no-binary", "daqp", "daqp"]
+    subprocess.run([*command, "--dest", str(directory)], check=True)
+    (archive,) = directory.glob("daqp-*.tar.gz")
+    with tarfile.open(archive) as packed:
+        packed.extractall(directory, filter="data")
+    source = directory / archive.name.removesuffix(".tar.gz") / "csrc"
+    return [source / "include", *(source / "src" / f"{name}.c" for name in ("daqp", "auxiliary", "factorization"))]
+
+
+def write_osqp(directory: Path, qp: Condition, recording: Recording, precision: str) -> list[Path]:
+    """OSQP's generated code."""
+    A = scipy.sparse.csc_matrix(np.vstack([np.eye(len(qp.H)), qp.G]))
+    solver, H = osqp.OSQP(), scipy.sparse.csc_matrix(np.triu(qp.H))
+    solver.setup(H, np.zeros(len(qp.H)), A, qp.lower, qp.upper, verbose=False, eps_abs=1e-4, eps_rel=1e-4)
+    code = directory / "code"
+    solver.codegen(str(code), parameters="vectors", use_float=precision == "float", force_rewrite=True)
+    _header(
+        directory / "osqp_data.h",
+        {"SIZE": len(qp.H), "COUNT": len(qp.lower)},
+        {"LOWER": qp.lower, "UPPER": qp.upper},
+    )
+    write_problem(directory, qp, recording, np.vstack([qp.c, qp.shift]))
+    return [code, code / "inc" / "public", code / "inc" / "private", code / "workspace.c", *(code / "src").glob("*.c")]

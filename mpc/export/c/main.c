@@ -1,0 +1,51 @@
+/* Answers the recorded periods.  Prints of each, in hexadecimal digits, its number, its status, the changes of the active
+ * set, the bits of the four commands, and the ticks that it took.  Exit status 1 where a status is not the recorded one,
+ * or a command is farther from the exact optimum than it may be. */
+#include "target.h"
+#include "vectors.h"
+
+static quadsim_mpc mpc;
+
+/* Write a value's bytes, the most significant first, and a blank; returns what follows. */
+static char *put(char *line, const void *value, size_t bytes)
+{
+    const unsigned char *byte = (const unsigned char *)value + bytes; /* all targets are little-endian */
+    for (; bytes > 0; bytes--) {
+        byte--;
+        *line++ = "0123456789abcdef"[*byte >> 4];
+        *line++ = "0123456789abcdef"[*byte & 15U];
+    }
+    *line++ = ' ';
+    return line;
+}
+
+int main(void)
+{
+    int k, j, failed = 0;
+    quadsim_mpc_reset(&mpc, quadsim_vectors_speeds);
+    for (k = 0; k < quadsim_vectors_count; k++) {
+        const struct quadsim_vector *asked = &quadsim_vectors[k];
+        const uint32_t started = target_ticks();
+        char line[128], *end = line;
+        quadsim_real command[4];
+        const int status = (int)quadsim_mpc_step(&mpc, asked->state, quadsim_vectors_path[k], asked->acting, command);
+        const uint32_t ticks = target_ticks() - started;
+        /* From QUADSIM_CLIPPED on there is no optimum to compare with. */
+        const int optimal = asked->status < (int)QUADSIM_CLIPPED;
+        end = put(end, &k, sizeof k);
+        end = put(end, &status, sizeof status);
+        end = put(end, &mpc.changes, sizeof mpc.changes);
+        for (j = 0; j < 4; j++) {
+            const quadsim_real off = command[j] - asked->command[j];
+            end = put(end, &command[j], sizeof command[j]);
+            failed |= optimal && !(off <= QUADSIM_VECTORS_TOLERANCE && off >= -QUADSIM_VECTORS_TOLERANCE);
+        }
+        end = put(end, &ticks, sizeof ticks);
+        end[-1] = '\n';
+        *end = '\0';
+        target_print(line);
+        failed |= optimal ? status != asked->status : status < (int)QUADSIM_CLIPPED;
+    }
+    target_print(failed ? "wrong: a status or a command is not the recorded one\n" : "right\n");
+    return failed;
+}

@@ -1,0 +1,125 @@
+/* The controller behind a serial line: a question with state and reference comes, an answer with the command goes.
+ *
+ * Each is one struct, as it lies in memory, that ends with the CRC-32 of all before.  What is corrupt, cut short or old
+ * is dropped; a question that comes twice is solved once and answered twice; a row of the reference that was lost is
+ * replaced by the next.  Where no fresh state has come for 100 ms the last command is sent again, with the status
+ * QUADSIM_BEFORE, and so each 100 ms until one comes. */
+#include <string.h>
+
+#include "quadsim_mpc.h"
+#include "target.h"
+
+#ifndef WATCHDOG_MS
+#define WATCHDOG_MS 100 /* 0 for none */
+#endif
+#define MARK 0x4D504351U
+#define N QUADSIM_HORIZON
+
+enum kind { START, ROW, STEP }; /* anew, after u(-1) = acting; a row of the reference alone; all */
+
+struct question {
+    uint32_t mark, number;  /* MARK; one more with each question */
+    quadsim_real state[12]; /* x(k), as in quadsim_mpc.h */
+    quadsim_real row[4];    /* reference at t(k + N); those at t(k + 1) .. t(k + N - 1) have come before */
+    quadsim_real acting[4]; /* u(k - 1) [rad/s] */
+    uint32_t kind, crc;
+};
+
+struct answer {
+    uint32_t mark, number; /* the question's */
+    quadsim_real command[4]; /* u(k) [rad/s] */
+    uint32_t status, crc;
+};
+
+static quadsim_mpc mpc;
+static quadsim_real window[4 * N];
+static struct answer answer; /* the last one; its mark is 0 before there is one */
+static int flying;           /* whether a state has come since the start */
+
+static uint32_t crc32(const void *bytes, size_t count)
+{
+    const unsigned char *next = bytes;
+    uint32_t crc = 0xFFFFFFFFU;
+    for (; count > 0; count--) {
+        crc ^= *next++;
+        for (int bit = 0; bit < 8; bit++) {
+            crc = (crc >> 1) ^ ((crc & 1U) != 0U ? 0xEDB88320U : 0U);
+        }
+    }
+    return ~crc;
+}
+
+/* Take the next byte, if one has come; 1 where a whole question ends with it. */
+static int receive(struct question *question)
+{
+    static unsigned char bytes[sizeof(struct question)];
+    static size_t count;
+    const int byte = target_read();
+    if (byte < 0) {
+        return 0;
+    }
+    bytes[count++] = (unsigned char)byte;
+    if (count < sizeof bytes) {
+        return 0;
+    }
+    memcpy(question, bytes, sizeof bytes);
+    if (question->mark == MARK && question->crc == crc32(bytes, offsetof(struct question, crc))) {
+        count = 0;
+        return 1;
+    }
+    count--; /* one may begin at any byte */
+    memmove(bytes, bytes + 1, count);
+    return 0;
+}
+
+static void reply(void)
+{
+    answer.crc = crc32(&answer, offsetof(struct answer, crc));
+    target_write(&answer, sizeof answer);
+}
+
+/* Solve a question, unless it is old; 1 where it is a fresh state. */
+static int solve(const struct question *question)
+{
+    uint32_t rows = question->number - answer.number; /* new ones, those lost included */
+    if (question->kind == START) {
+        quadsim_mpc_reset(&mpc, question->acting);
+        memcpy(answer.command, question->acting, sizeof answer.command);
+        answer.mark = MARK;
+        flying = 0;
+        rows = N;
+    } else if (answer.mark != MARK || rows == 0U || rows > UINT32_MAX / 2U) {
+        return 0;
+    }
+    for (rows = rows < N ? rows : N; rows > 0U; rows--) {
+        memmove(window, window + 4, sizeof window - sizeof question->row);
+        memcpy(window + 4 * (N - 1), question->row, sizeof question->row);
+    }
+    answer.number = question->number;
+    answer.status = QUADSIM_BEFORE;
+    if (question->kind == STEP) {
+        flying = 1;
+        answer.status = quadsim_mpc_step(&mpc, question->state, window, question->acting, answer.command);
+    }
+    return question->kind == STEP;
+}
+
+int main(void)
+{
+    static struct question question;
+    uint32_t fresh = target_ticks();
+    for (;;) {
+        if (receive(&question)) {
+            if (solve(&question)) {
+                fresh = target_ticks();
+            }
+            if (answer.mark == MARK && question.number == answer.number) {
+                reply();
+            }
+        } else if (WATCHDOG_MS > 0 && flying && target_ticks() - fresh > WATCHDOG_MS * target_ticks_per_ms) {
+            fresh = target_ticks();
+            answer.status = QUADSIM_BEFORE;
+            reply();
+        }
+    }
+}

@@ -1,0 +1,35 @@
+/* Recorded periods of the scenario's flight: what the controller was asked, and the exact answers. */
+#ifndef QUADSIM_VECTORS_H
+#define QUADSIM_VECTORS_H
+
+#include "quadsim_mpc.h"
+
+#ifdef __cplusplus
+extern "C" {
+#endif
+
+#define QUADSIM_VECTORS @COUNT@
+#define QUADSIM_VECTORS_ROWS (QUADSIM_VECTORS + QUADSIM_HORIZON - 1)
+#ifdef QUADSIM_FLOAT
+#define QUADSIM_VECTORS_TOLERANCE 2e-2F /* [rad/s] of a command from the exact optimum */
+#else
+#define QUADSIM_VECTORS_TOLERANCE 1e-8
+#endif
+
+struct quadsim_vector {
+    quadsim_real state[12];  /* measured */
+    quadsim_real acting[4];  /* command in force [rad/s] */
+    quadsim_real command[4]; /* first command of the exact optimum; the command in force where there is none [rad/s] */
+    int status;              /* enum quadsim_status; QUADSIM_CLIPPED stands for all that are no optimum */
+};
+
+extern const int quadsim_vectors_count;
+extern const quadsim_real quadsim_vectors_speeds[4];                    /* command before the first [rad/s] */
+extern const quadsim_real quadsim_vectors_path[QUADSIM_VECTORS_ROWS][4]; /* period k's reference begins at row k */
+extern const struct quadsim_vector quadsim_vectors[QUADSIM_VECTORS];
+
+#ifdef __cplusplus
+}
+#endif
+
+#endif

@@ -1,0 +1,314 @@
+"""The numbers that a problem's optimum is computed from without a linear algebra library.
+
+Axis by axis (`mpc.exact.axes`), the inputs u - u_s = T w fall into parts w that no cost ties together.  For each axis
+
+- the optimum without rows of a linear-quadratic problem with any linear terms is one pass of dynamic programming
+  backwards, with gains K_i that do not depend on them, and one forwards: O(N) numbers in place of the O(N^2) of
+  Eq. (22).  Where changes of inputs cost something, the input before is one more state;
+- the responses G H^-1 G' of its inputs and of its rows' outputs to one another, of which an active set's system is
+  made, are a table.
+
+Inputs that move nothing the cost or a row sees are one more axis, without states.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+import scipy.linalg
+
+from mpc.constraints import Constraint, Rows
+from mpc.exact.axes import Axis, axes
+from mpc.ocp import Problem
+from mpc.paper.condensed import condensed_cost, row_maps
+from mpc.paper.prediction import prediction
+from quadsim.errors import ParameterError
+from quadsim.state import N_STATES, REFERENCE_STATES, Array
+
+ROUNDING: Final = 1e-13
+"""Share of the largest number of a row of C_r, D, E, or T below which one is taken for a product of rounding."""
+ROOM_PER_STEP: Final = 2.56
+"""Active rows that there is room for, per step of the horizon."""
+LEAST_ROOM: Final = 64
+LARGEST: Final = 2**20
+"""Entries of all responses beyond which a problem is not exported: 8 MiB."""
+LEAST_QUADRATIC: Final = 1e-9
+"""Share of l1 that stands in for a quadratic penalty of zero; see `mpc.exact.activeset`."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class AxisTables:
+    """One axis: n states, of which the last m are the inputs before where changes cost something, and m inputs."""
+
+    states: list[int]  # which of the problem's states the first n are
+    before: bool  # whether the inputs before are states
+    inputs: int  # m
+    first: int  # where w is among all axes' inputs
+    rows: list[int]  # which of the problem's rows have its states, o of them
+    targets: list[int]  # which of x, y, z, yaw of the reference it follows, r of them
+    A: Array  # (n, n)
+    B: Array  # (n, m)
+    closed: Array  # (N, n, n) A - B K_i
+    K: Array  # (N, m, n) w_i = k_i - K_i x_i
+    inverse: Array  # (N, m, m) (R + B' P_{i+1} B)^-1
+    W: Array  # (n, r) linear term of a state's cost by the reference
+    W_end: Array  # (n, r) of the last state's
+    V: Array  # (n, n) by its state at rest, states that are references left out
+    V_end: Array  # (n, n)
+    C: Array  # (o, n) its rows
+    responses: Array  # (N (m + o), N (m + o)) of inputs and outputs of each step to one another
+
+
+@dataclass(frozen=True, kw_only=True)
+class RowTables:
+    """A row of each step: C x, at the step's end or its beginning, and terms of inputs of the step and the one before.
+
+    The row's value is C x + sum of coefficient u_input(step - lag).
+    """
+
+    name: str
+    axis: int  # -1 for a row without states
+    later: bool  # C x is that at the step's end
+    terms: list[tuple[float, int, int]]  # coefficient, input, lag
+    l1: float  # linear penalty; infinite of a hard row
+    compliance: float  # 1 / (2 l2)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Tables:
+    """A problem in numbers."""
+
+    problem: Problem
+    axes: list[AxisTables]
+    rows: list[RowTables]
+    lower: Array  # (N, m), (1, m) where all steps have the same
+    upper: Array
+    scale: Array  # (N, m) 1 over the root of a row's response to itself
+    tolerance: Array  # (m,) the largest of these roots
+    T: Array  # (nu, nu) u - u_s = T w
+    T_inverse: Array
+    modes: Array  # (nu, nu) takes rotor speeds that are states to what stands for them, one of each axis
+    room: int  # active rows that there is room for
+
+
+def tables(problem: Problem) -> Tables:
+    """The numbers of a problem.
+
+    Raises:
+        ParameterError: it is too large, or its rows differ from step to step.
+    """
+    problem = with_constraints(problem)
+    modes = np.eye(problem.model.nu)
+    if problem.model.n == N_STATES + problem.model.nu:
+        modes = _modes(problem)
+        problem = _in_modes(problem, modes)
+    rows = problem.rows
+    if rows.C.ndim == 3:
+        raise ParameterError("controller", "constraints", "rows that differ from step to step", "the same at all steps")
+    parts, T = _all_axes(problem)
+    entries = sum((problem.horizon * (part.T.shape[1] + part.outputs.size)) ** 2 // 2 for part in parts)
+    if entries > LARGEST:
+        rule = f"so short that its responses have at most {LARGEST} numbers; they have {entries}"
+        raise ParameterError("controller", "horizon", problem.horizon, rule)
+    T_inverse = np.array(np.linalg.inv(T), float)
+    T_inverse[np.abs(T_inverse) < ROUNDING * np.abs(T_inverse).max()] = 0.0
+    found, first = [], 0
+    for part in parts:
+        found.append(_axis(problem, rows, part, first))
+        first += part.T.shape[1]
+    row_tables = [_row(rows, i, found) for i in range(rows.l1.size)]
+    N, m = rows.lower.shape
+    alike = bool((rows.lower == rows.lower[0]).all() and (rows.upper == rows.upper[0]).all())
+    steps = slice(0, 1) if alike else slice(None)
+    scale = _scale(found, row_tables, T, N)
+    room = max(1, min(N * m, max(LEAST_ROOM, math.ceil(ROOM_PER_STEP * N))))
+    return Tables(
+        problem=problem,
+        axes=found,
+        rows=row_tables,
+        lower=rows.lower[steps],
+        upper=rows.upper[steps],
+        scale=scale,
+        tolerance=1.0 / scale.min(axis=0, initial=math.inf),
+        T=T,
+        T_inverse=T_inverse,
+        modes=modes,
+        room=room,
+    )
+
+
+def with_constraints(problem: Problem) -> Problem:
+    """A problem without constraints with one that bounds nothing; any other as it is."""
+    if problem.every_constraint:
+        return problem
+    nothing = np.full(problem.model.nu, -math.inf)
+    none = Constraint(name="none", lower=nothing, upper=-nothing, D=np.eye(problem.model.nu))
+    return replace(problem, constraints=(none,))
+
+
+def _modes(problem: Problem) -> Array:
+    """T^-1 of the problem without rotor lag: speeds that all follow their inputs alike then fall into the axes."""
+    model, objective, n = problem.model, problem.objective, N_STATES
+    without = Problem(
+        model=replace(model, A=model.A[:n, :n], B=model.B[:n]),
+        horizon=problem.horizon,
+        objective=replace(objective, C_r=objective.C_r[:, :n], P=None if objective.P is None else objective.P[:n, :n]),
+        constraints=tuple(
+            part if part.C is None else replace(part, C=part.C[:, :n]) for part in problem.every_constraint
+        ),
+    )
+    return np.array(np.linalg.inv(_all_axes(without)[1]), float)
+
+
+def _in_modes(problem: Problem, modes: Array) -> Problem:
+    """The problem whose last states are `modes` times the rotor speeds."""
+    model, objective = problem.model, problem.objective
+    to = scipy.linalg.block_diag(np.eye(N_STATES), modes)
+    back = np.linalg.inv(to)
+    A, B = to @ model.A @ back, to @ model.B
+    for matrix in (A, B):
+        matrix[np.abs(matrix) < ROUNDING * np.abs(matrix).max()] = 0.0
+    P = None if objective.P is None else _symmetric(back.T @ objective.P @ back)
+    return Problem(
+        model=replace(model, A=A, B=B),
+        horizon=problem.horizon,
+        objective=replace(objective, P=P),
+        constraints=problem.every_constraint,
+    )
+
+
+def _all_axes(problem: Problem) -> tuple[list[Axis], Array]:
+    """The axes, the last perhaps one that moves nothing, and T (nu, nu) of all of them."""
+    parts, nu = axes(problem), problem.model.nu
+    T = np.hstack([part.T for part in parts])
+    T[np.abs(T) < ROUNDING] = 0.0
+    missing = nu - T.shape[1]
+    if missing:
+        _, _, rest = np.linalg.svd((problem.objective.Q_u @ T).T)
+        parts.append(_idle(problem, rest[-missing:].T))
+        T = np.array(np.hstack([T, rest[-missing:].T]), float)
+    return parts, T
+
+
+def _idle(problem: Problem, T: Array) -> Axis:
+    """The axis of inputs that move nothing."""
+    nothing = np.zeros(0, np.int64)
+    return Axis(problem=problem, states=nothing, regulated=nothing, outputs=nothing, T=T, T_inverse=T.T)
+
+
+def _axis(problem: Problem, rows: Rows, part: Axis, first: int) -> AxisTables:
+    objective, N, m = problem.objective, problem.horizon, part.T.shape[1]
+    Q_u = _symmetric(part.T.T @ objective.Q_u @ part.T)
+    moves = objective.Q_d is not None
+    n = part.states.size
+    if n:
+        A, B = part.problem.model.A, part.problem.model.B
+        (Q, W), (Q_end, W_end) = part.problem.objective.weights, part.problem.objective.terminal_weights
+        C_r = part.problem.objective.C_r
+        of_reference = objective.C_r[part.regulated][:, REFERENCE_STATES]
+    else:
+        A, B, Q, Q_end = np.zeros((0, 0)), np.zeros((0, m)), np.zeros((0, 0)), np.zeros((0, 0))
+        W, W_end, C_r, of_reference = np.zeros((0, 0)), np.zeros((0, 0)), np.zeros((0, 0)), np.zeros((0, 4))
+    targets = np.flatnonzero(of_reference.any(axis=0))
+    still = np.diag([float(state not in REFERENCE_STATES) for state in part.states])
+    V, V_end = W @ C_r @ still, W_end @ C_r @ still
+    W, W_end = W @ of_reference[:, targets], W_end @ of_reference[:, targets]
+    C = rows.C[np.ix_(part.outputs, part.states)]
+    R, S = Q_u, np.zeros((m, n))
+    if moves:
+        Q_d = _symmetric(part.T.T @ np.asarray(objective.Q_d) @ part.T)
+        A = scipy.linalg.block_diag(A, np.zeros((m, m)))
+        B = np.vstack([B, np.eye(m)])
+        Q, Q_end = scipy.linalg.block_diag(Q, Q_d), scipy.linalg.block_diag(Q_end, np.zeros((m, m)))
+        V, V_end = (scipy.linalg.block_diag(weight, np.zeros((m, m))) for weight in (V, V_end))
+        W, W_end, C = (
+            np.vstack([W, np.zeros((m, W.shape[1]))]),
+            np.vstack([W_end, np.zeros((m, W.shape[1]))]),
+            np.hstack([C, np.zeros((len(C), m))]),
+        )
+        R, S = Q_u + Q_d, np.hstack([S, -Q_d])
+    K, inverse = _gains(A, B, Q, Q_end, R, S, N)
+    if n:
+        maps = prediction(part.problem.model, N)
+        H = condensed_cost(part.problem, maps).H
+        own = rows.part(part.outputs, part.states, m)
+        G = row_maps(own, maps).of_inputs
+    else:
+        H, G = np.asarray(2.0 * np.kron(np.eye(N), Q_u), float), np.zeros((N, 0, N * m))
+    channels = np.concatenate([np.eye(N * m).reshape(N, m, N * m), G], axis=1).reshape(-1, N * m)
+    half = scipy.linalg.solve_triangular(np.linalg.cholesky(H), channels.T, lower=True)
+    return AxisTables(
+        states=part.states.tolist(),
+        before=moves,
+        inputs=m,
+        first=first,
+        rows=part.outputs.tolist(),
+        targets=targets.tolist(),
+        A=A,
+        B=B,
+        closed=A - B @ K,
+        K=K,
+        inverse=inverse,
+        W=W,
+        W_end=W_end,
+        V=V,
+        V_end=V_end,
+        C=C,
+        responses=half.T @ half,
+    )
+
+
+def _gains(A: Array, B: Array, Q: Array, Q_end: Array, R: Array, S: Array, N: int) -> tuple[Array, Array]:
+    """K_i (N, m, n) and (R + B' P_{i+1} B)^-1 (N, m, m) of the Riccati recursion, costs x'Qx + 2 u'Sx + u'Ru."""
+    K, inverse, P = np.zeros((N, *B.T.shape)), np.zeros((N, *R.shape)), Q_end
+    for i in reversed(range(N)):
+        inverse[i] = _symmetric(np.array(np.linalg.inv(R + B.T @ P @ B), float))
+        M = B.T @ P @ A + S
+        K[i] = inverse[i] @ M
+        P = _symmetric(Q + A.T @ P @ A - M.T @ K[i])
+    return K, inverse
+
+
+def _symmetric(matrix: Array) -> Array:
+    return np.asarray(0.5 * (matrix + matrix.T))
+
+
+def _row(rows: Rows, i: int, found: list[AxisTables]) -> RowTables:
+    axis = next((g for g, part in enumerate(found) if i in part.rows), -1)
+    now, before = rows.D[i] + rows.E[i], -rows.E[i]
+    terms = [(float(now[j]), j, 0) for j in np.flatnonzero(now).tolist()]
+    terms += [(float(before[j]), j, 1) for j in np.flatnonzero(before).tolist()]
+    l1, l2 = float(rows.l1[i]), float(rows.l2[i])
+    hard = math.isinf(l1)
+    return RowTables(
+        name=rows.names[i],
+        axis=axis,
+        later=bool(rows.of_states[i]),
+        terms=terms,
+        l1=l1,
+        compliance=0.0 if hard else 0.5 / max(l2, LEAST_QUADRATIC * max(l1, 1.0)),
+    )
+
+
+def _scale(found: list[AxisTables], rows: list[RowTables], T: Array, N: int) -> Array:
+    """(N, m) 1 over the root of each row's response to itself."""
+    scale = np.zeros((N, len(rows)))
+    for r, row in enumerate(rows):
+        for i in range(N):
+            total = 0.0
+            for g, part in enumerate(found):
+                width = part.inputs + len(part.rows)
+                slope = np.zeros(N * width)
+                if row.axis == g:
+                    slope[i * width + part.inputs + part.rows.index(r)] = 1.0
+                for coefficient, j, lag in row.terms:
+                    if i >= lag:
+                        at = (i - lag) * width
+                        slope[at : at + part.inputs] += coefficient * T[j, part.first : part.first + part.inputs]
+                there = np.flatnonzero(slope)
+                total += float(slope[there] @ part.responses[np.ix_(there, there)] @ slope[there])
+            scale[i, r] = 1.0 / math.sqrt(total) if total > 0.0 else 0.0
+    return scale

@@ -1,0 +1,77 @@
+"""The machines that an export is made for, as the first lines of its Makefile."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+EMULATOR: Final = "qemu-system-arm"
+TICK: Final = 40
+"""Instructions of the emulated processors between two ticks of their clock, with `-icount shift=0`."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Target:
+    """A machine: how its programs are compiled, and how they are run.
+
+    Attributes:
+        name: what `--target` calls it.
+        title: what a person calls it.
+        sources: the file that implements `target.h`, and others that it takes.
+        compiler: command.
+        machine: flags that choose the processor.
+        link: flags of the linker.
+        board: what QEMU calls the machine to emulate; none where programs are run as they are.
+    """
+
+    name: str
+    title: str
+    sources: tuple[str, ...]
+    compiler: str
+    machine: str = ""
+    link: str = ""
+    board: str = ""
+
+    @property
+    def emulation(self) -> tuple[str, ...]:
+        """The command that runs an image, but for the image and what the serial line is; empty without an emulator."""
+        if not self.board:
+            return ()
+        options = f"-M {self.board} -nographic -monitor none -semihosting -icount shift=0"
+        return (EMULATOR, *options.split())
+
+    @property
+    def makefile(self) -> str:
+        """The first lines of the Makefile."""
+        run = " ".join(["timeout 600", *self.emulation, "-serial none -kernel"]) if self.board else ""
+        lines = {
+            "COMPILER": self.compiler,
+            "MACHINE": self.machine,
+            "MACHINE_LINK": self.link,
+            "TARGET": self.sources[0].replace(".c", ".o"),
+            "RUN": run,
+        }
+        return "".join(f"{name} = {value}".rstrip() + "\n" for name, value in lines.items())
+
+
+def _cortex(name: str, title: str, machine: str, board: str) -> Target:
+    return Target(
+        name=name,
+        title=title,
+        sources=("startup.c", "mps2.ld"),
+        compiler="arm-none-eabi-gcc",
+        machine=f"{machine} -mfloat-abi=hard -mthumb",
+        link="-nostartfiles -T mps2.ld --specs=nano.specs",
+        board=board,
+    )
+
+
+TARGETS: Final = {
+    target.name: target
+    for target in (
+        Target(name="posix", title="POSIX", sources=("posix.c",), compiler="cc"),
+        _cortex("cortex-m7", "Cortex-M7", "-mcpu=cortex-m7 -mfpu=fpv5-d16", "mps2-an500"),
+        _cortex("cortex-m4f", "Cortex-M4F", "-mcpu=cortex-m4 -mfpu=fpv4-sp-d16", "mps2-an386"),
+    )
+}
+"""By name; the Cortex-M7 has an FPU for doubles, the Cortex-M4F one for floats alone."""

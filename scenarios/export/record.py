@@ -1,0 +1,148 @@
+"""A flight's periods as test vectors: what the controller was asked, and what the exact answer is."""
+
+from __future__ import annotations
+
+import contextlib
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mpc.constrained import ConstrainedMPC
+from mpc.exact.axes import axes
+from mpc.exact.free import FreeOptimum
+from mpc.export.tables import with_constraints
+from mpc.fallback.completion import CompletedMoment
+from mpc.fallback.contract import Guarded
+from mpc.robust.controller import RobustMPC
+from mpc.solvers import Way
+from mpc.unconstrained import UnconstrainedMPC
+from quadsim.controller import ACCEPTED, Command, Moment, Phase
+from quadsim.errors import ExportError, PlanExhaustedError
+from quadsim.state import Array
+from scenarios.build import build_controller
+from scenarios.parts.vehicle import build_vehicle
+from scenarios.run import fly_scenario
+from scenarios.schema.optimisation import BoundedSpec
+from scenarios.schema.scenario import Scenario
+
+MPC = ConstrainedMPC | RobustMPC | UnconstrainedMPC
+WAYS: Final = {Way.FREE: 0, Way.AXES: 1, Way.WHOLE: 2}
+REFUSED: Final = 3
+"""Least status of a period without an optimum."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Recording:
+    """K periods of one flight, without a gap.
+
+    Attributes:
+        speeds: (4,) the command before the first [rad/s].
+        state: (K, 12) as the controller was given it.
+        acting: (K, 4) command in force before each [rad/s].
+        path: (K + N - 1, 4) references; period k is given N rows from row k on.
+        status: (K,) as of `enum quadsim_status`: `REFUSED` for all that are no optimum.
+        command: (K, 4) the optimum's first command; the one before where there is none [rad/s].
+    """
+
+    speeds: Array
+    state: Array
+    acting: Array
+    path: Array
+    status: NDArray[np.int64]
+    command: Array
+
+
+class Recorder:
+    """An MPC whose questions are noted: from where the flight begins to where it ends, or where a measurement lacks."""
+
+    def __init__(self, inner: MPC) -> None:
+        self.inner, self.name, self.solver, self.horizon = inner, inner.name, inner.solver, inner.horizon
+        self.asked: list[tuple[Array, Array, Array]] = []
+        """State (12,), command in force (4,) and reference (N, 4) of each period."""
+        self._before, self._ended = np.zeros(4), False
+
+    def reset(self, speeds: Array) -> None:
+        """See `quadsim.controller.Controller.reset`."""
+        self.asked, self._before, self._ended = [], np.array(speeds, float), False
+        self.inner.reset(speeds)
+
+    def step(self, now: Moment, state: Array, reference: Array) -> Command:
+        """See `quadsim.controller.Controller.step`."""
+        flying = now.phase is Phase.FLYING and not (isinstance(now, CompletedMoment) and now.unseen.any())
+        self._ended |= bool(self.asked) and not flying
+        if flying and not self._ended:
+            acting = self._before if now.acting is None else now.acting
+            self.asked.append((state.copy(), np.array(acting, float), np.array(reference, float)))
+        command = self.inner.step(now, state, reference)
+        self._before = command.speeds.copy()
+        return command
+
+    def predict(self, states: Array, plans: Array) -> Array:
+        """See `quadsim.controller.Controller.predict`."""
+        return self.inner.predict(states, plans)
+
+
+def record(scenario: Scenario) -> Recording:
+    """Fly a scenario, note each period, and ask a controller that starts with the first of them for the answers."""
+    scenario = scenario.replace({"controller.compiled": False})
+    if isinstance(scenario.controller, BoundedSpec):
+        scenario = scenario.replace({"controller.shortcut": True})
+    law = build_controller(scenario, build_vehicle(scenario))
+    inner = law.inner if isinstance(law, Guarded) else law
+    assert isinstance(inner, MPC)
+    recorder = Recorder(inner)
+    if isinstance(law, Guarded):
+        law.inner = recorder
+    fly_scenario(scenario, law=law if isinstance(law, Guarded) else recorder)
+    asked = recorder.asked
+    if not asked:
+        raise ExportError("its flight has no period in the air, with everything measured, to record")
+    states, acting, windows = (np.array(column) for column in zip(*asked, strict=True))
+    status, commands = _answers(inner, scenario.control_period, acting[0], asked)
+    known = len(status)
+    return Recording(
+        speeds=acting[0],
+        state=states[:known],
+        acting=acting[:known],
+        path=np.concatenate([windows[: known - 1, 0], windows[known - 1]]),
+        status=status,
+        command=commands,
+    )
+
+
+def _answers(
+    law: MPC, period: float, speeds: Array, asked: list[tuple[Array, Array, Array]]
+) -> tuple[NDArray[np.int64], Array]:
+    """Status (K,) and command (K, 4) of a controller that is asked so from its reset on.
+
+    They end before the first period whose optimum is known as a solver's approximation alone.
+    """
+    if isinstance(law, UnconstrainedMPC):
+        return np.zeros(len(asked), np.int64), _free_commands(law, asked)
+    law.reset(speeds)
+    found: list[tuple[int, Array]] = []
+    for k, (state, acting, reference) in enumerate(asked):
+        answer = REFUSED, acting
+        with contextlib.suppress(PlanExhaustedError):
+            command = law.step(Moment(time=k * period, acting=acting), state, reference)
+            if command.status in ACCEPTED:
+                assert law.answer is not None
+                answer = WAYS[law.answer.way], command.speeds
+                if law.answer.solution.primal_residual or law.answer.solution.dual_residual:
+                    break
+        found.append(answer)
+    status, commands = zip(*found, strict=True)
+    return np.array(status), np.array(commands)
+
+
+def _free_commands(law: UnconstrainedMPC, asked: list[tuple[Array, Array, Array]]) -> Array:
+    """(K, 4) axis by axis: the one gain of Eq. (24) has lost half its digits at N = 100."""
+    problem = with_constraints(law.problem)
+    parts, u_bar = axes(problem), problem.model.u_bar
+    T, optimum = np.hstack([part.T for part in parts]), FreeOptimum(problem, parts)
+    desired = problem.objective.desired
+    return np.array(
+        [u_bar + T @ optimum.at(state, desired(path), before - u_bar)[0][:, 0] for state, before, path in asked]
+    )

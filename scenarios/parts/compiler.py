@@ -1,0 +1,126 @@
+"""Exported C, compiled once and kept by its hash in a cache directory of the user's own."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import shutil
+import stat
+import subprocess
+import tempfile
+from collections.abc import Callable, Hashable, Mapping, Sequence
+from pathlib import Path
+from typing import Final
+
+from mpc.export.compiled import CompiledMPC
+from mpc.export.source import Exportable, part, sources
+from quadsim.errors import CompilerError, OutputError
+from quadsim.outputs import write_new
+
+FLAGS: Final = ("-std=c99", "-O3", "-ffp-contract=off", "-fPIC", "-shared")
+"""Without contraction all processors, and all levels of optimisation, have the same bits."""
+ROOM_PER_STEP: Final = 5
+"""Active rows that there is room for, per step of the horizon: all that are independent, and memory is no matter here.
+Rotors that spin up from standstill at their largest steps take more of both than an export has."""
+CHANGES: Final = 3000
+"""The same of the changes of the active set in a search."""
+COMPILERS: Final = ("cc", "gcc", "clang")
+
+
+_READY: dict[Hashable, tuple[Path, Exportable]] = {}
+"""What this process has compiled, or found: a campaign's flights mostly have the same controller."""
+
+
+def compiled_controller(key: Hashable, make: Callable[[], Exportable]) -> CompiledMPC:
+    """A controller as compiled C.
+
+    Args:
+        key: the same for the same controller.
+        make: called where that is new to this process.
+
+    Raises:
+        ExportError: this controller cannot be exported.
+        CompilerError: there is no compiler, or it fails.
+        OutputError: the cache directory cannot be written.
+    """
+    if key not in _READY:
+        law = make()
+        room = ROOM_PER_STEP * law.problem.horizon
+        _READY[key] = compiled(sources(law, precision="double", title=law.name), room, CHANGES), law
+    return CompiledMPC(*_READY[key])
+
+
+def compiled(files: Mapping[str, str], room: int | None = None, changes: int | None = None) -> Path:
+    """The shared library of a controller's files and of `shim.c`, from the cache where it is there.
+
+    Args:
+        files: see `mpc.export.source.sources`.
+        room: active rows that there is room for; None for the export's own.
+        changes: of the active set after which a search is given up; likewise.
+
+    Raises:
+        CompilerError: there is no compiler, or it fails.
+        OutputError: the cache directory cannot be written, or is not the user's alone.
+    """
+    compiler = _compiler()
+    sources = {**files, "shim.c": part("shim.c")}
+    sizes = {"ROOM": room, "CHANGES": changes}
+    flags = (*FLAGS, *(f"-DQUADSIM_{name}={size}" for name, size in sizes.items() if size is not None))
+    digest = hashlib.sha256()
+    for text in (_version(compiler), *flags, *(f"{name}\0{sources[name]}" for name in sorted(sources))):
+        digest.update(text.encode() + b"\0")
+    library = _cache() / f"{digest.hexdigest()}.so"
+    if not library.exists():
+        content = _compile(compiler, flags, sources)
+        try:
+            write_new(library, content)
+        except OutputError:
+            if not library.exists():  # else another process was sooner
+                raise
+    return library
+
+
+def _compiler() -> str:
+    named = os.environ.get("CC")
+    found = next(filter(None, map(shutil.which, [named] if named else COMPILERS)), None)
+    if found is None:
+        looked = f"CC = {named!r}" if named else ", ".join(COMPILERS)
+        raise CompilerError(
+            f"no C compiler found ({looked}); install one, e.g. apt-get install gcc, or leave out controller.compiled"
+        )
+    return found
+
+
+def _version(compiler: str) -> str:
+    return subprocess.run([compiler, "--version"], capture_output=True, text=True, check=False).stdout
+
+
+def _compile(compiler: str, flags: Sequence[str], sources: Mapping[str, str]) -> bytes:
+    with tempfile.TemporaryDirectory(prefix="quadsim-c-") as name:
+        folder = Path(name)
+        for file, text in sources.items():
+            (folder / file).write_text(text, encoding="utf-8")
+        command = [compiler, *flags, "-o", "shim.so", "shim.c"]
+        done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
+        if done.returncode:
+            raise CompilerError(f"{' '.join(command)} failed: {(done.stderr or done.stdout).strip()[:2000]}")
+        return (folder / "shim.so").read_bytes()
+
+
+def _cache() -> Path:
+    """The directory, made where there is none; refused where others could put code there.
+
+    Raises:
+        OutputError: it cannot be made, or is not the user's alone.
+    """
+    base = os.environ.get("XDG_CACHE_HOME", "")
+    root = Path(base) if Path(base).is_absolute() else Path.home() / ".cache"
+    folder = root / "quadsim" / "compiled"
+    try:
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        found = folder.lstat()
+    except OSError as error:
+        raise OutputError(folder, error.strerror or str(error)) from error
+    if not stat.S_ISDIR(found.st_mode) or found.st_uid != os.getuid() or found.st_mode & 0o022:
+        raise OutputError(folder, "it holds code that will be run, so it has to be yours and writable by you alone")
+    return folder

@@ -1,0 +1,66 @@
+"""Exported controllers, compiled; what takes a tool that is not installed is skipped, in CI an error."""
+
+from __future__ import annotations
+
+import functools
+import shutil
+import subprocess
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from mpc.export.targets import TARGETS
+from scenarios.export.exporter import export
+from scenarios.loading import load_scenario
+
+Answer = tuple[str, ...]
+"""Number, status, changes, four commands, ticks, as main.c prints them."""
+Export = Callable[..., Path]
+Answers = Callable[..., list[Answer]]
+Run = Callable[..., subprocess.CompletedProcess[str]]
+
+
+@pytest.fixture(scope="session")
+def run() -> Run:
+    """Runs a command; skips where its program is not installed; fails with what it said unless told not to check."""
+
+    def call(*command: object, check: bool = True, **options: object) -> subprocess.CompletedProcess[str]:
+        words = [str(word) for word in command]
+        if shutil.which(words[0]) is None:
+            pytest.skip(f"{words[0]} is not installed: make firmware")
+        done = subprocess.run(words, capture_output=True, text=True, timeout=300, **options)  # type: ignore[call-overload]
+        assert done.returncode == 0 or not check, "\n".join([*words, done.stdout[-2000:], done.stderr[-4000:]])
+        return done
+
+    return call
+
+
+@pytest.fixture(scope="session")
+def exported(tmp_path_factory: pytest.TempPathFactory) -> Export:
+    """The export of a scenario with settings, for a target and in a precision; each is written once."""
+
+    @functools.cache
+    def write(target: str, precision: str, *settings: str, scenario: str = "paper-constrained") -> Path:
+        found = load_scenario(scenario, list(settings))
+        return export(found, tmp_path_factory.mktemp("export") / "c", precision=precision, target=target)  # type: ignore[arg-type]
+
+    return write
+
+
+@pytest.fixture(scope="session")
+def answers(exported: Export, run: Run, tmp_path_factory: pytest.TempPathFactory) -> Answers:
+    """What a target answers to all recorded periods, built with settings of its Makefile; each is run once."""
+
+    @functools.cache
+    def ask(target: str, precision: str, *make: str) -> list[Answer]:
+        directory = tmp_path_factory.mktemp("build") / "c"
+        shutil.copytree(exported(target, precision), directory)
+        if TARGETS[target].board:
+            run(TARGETS[target].compiler, "--version")
+            run("qemu-system-arm", "--version")
+        done = run("make", "-C", directory, "check", *make)
+        lines = [tuple(line.split()) for line in (done.stdout + done.stderr).splitlines()]
+        return [line for line in lines if len(line) == 8]
+
+    return ask

@@ -1,0 +1,100 @@
+/* Steps of a controller from arbitrary bytes, for libFuzzer: whatever comes in, the command is finite and within every
+ * bound, the status is one of six, and the active set changes no more often than it may. */
+#include <stdint.h>
+#include <stdio.h>
+#include <stdlib.h>
+
+#include "quadsim_mpc.c"
+
+#define STEPS 8 /* of an input at most, after a reset */
+
+int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size);
+
+static unsigned long steps;
+static int told; /* whether it will be */
+
+static void tell(void)
+{
+    (void)printf("steps: %lu\n", steps);
+    (void)fflush(stdout);
+}
+
+static void require(int holds, const char *what)
+{
+    if (!holds) {
+        (void)fprintf(stderr, "violated: %s\n", what);
+        abort();
+    }
+}
+
+/* The next number: near what flies, or far from it, or whatever the bits say. */
+static real take(const uint8_t **data, size_t *left, int manner, real centre, real scale)
+{
+    int16_t share = 0;
+    real number = R(0.0);
+    const size_t bytes = manner == 3 ? sizeof number : sizeof share;
+    if (*left < bytes) {
+        return centre;
+    }
+    if (manner == 3) {
+        memcpy(&number, *data, bytes);
+    } else {
+        memcpy(&share, *data, bytes);
+        number = centre + scale * (manner == 2 ? R(100.0) : R(1.0)) * (real)share / R(32768.0);
+    }
+    *data += bytes;
+    *left -= bytes;
+    return number;
+}
+
+int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size)
+{
+    static const real scale[12] = {R(1.0), R(2.0), R(1.0), R(2.0), R(1.0), R(2.0),
+                                   R(0.1), R(1.0), R(0.1), R(1.0), R(0.5), R(1.0)};
+    quadsim_mpc *mpc = malloc(sizeof *mpc);      /* on the heap, where the sanitizer sees both of its ends */
+    real *reference = malloc(sizeof(real) * N * 4);
+    real command[4];
+    int i, j;
+    if (!told) {
+        told = !atexit(tell);
+    }
+    memcpy(command, HOVER, sizeof command);
+    quadsim_mpc_reset(mpc, command);
+    for (i = 0; i < N * 4; i++) {
+        reference[i] = R(0.0);
+    }
+    for (i = 0; i < STEPS && size > 0; i++) {
+        const int manners = *data++;
+        real state[12], acting[4], before[4];
+        enum quadsim_status status = QUADSIM_BEFORE;
+        size--;
+        for (j = 0; j < 12; j++) {
+            state[j] = take(&data, &size, manners & 3, R(0.0), scale[j]);
+        }
+        memmove(reference, reference + 4, sizeof(real) * (N - 1) * 4);
+        for (j = 0; j < 4; j++) {
+            reference[(N - 1) * 4 + j] = take(&data, &size, (manners >> 2) & 3, R(0.0), R(3.0));
+            acting[j] = (manners & 64) != 0 ? command[j] : take(&data, &size, (manners >> 4) & 3, HOVER[j], R(80.0));
+        }
+        if ((manners & 128) != 0) {
+            quadsim_mpc_reset(mpc, acting);
+            memcpy(command, HOVER, sizeof command); /* in force where acting is not finite */
+        }
+        memcpy(before, is_finite(acting, 4) ? acting : command, sizeof before);
+        status = quadsim_mpc_step(mpc, state, reference, acting, command);
+        steps++;
+        require(status >= QUADSIM_FREE && status <= QUADSIM_BEFORE, "a status");
+        require(is_finite(command, 4), "a finite command");
+        require(mpc->changes >= 0 && mpc->changes <= 4 * MOST_CHANGES, "a limited number of changes");
+        for (j = 0; j < 4; j++) {
+            require(command[j] >= SPEED_MIN[j] && command[j] <= SPEED_MAX[j], "bounds on speeds");
+            if (before[j] >= SPEED_MIN[j] && before[j] <= SPEED_MAX[j]) {
+                require(command[j] - before[j] >= STEP_MIN[j] - R(1e-4) && command[j] - before[j] <= STEP_MAX[j] + R(1e-4),
+                        "bounds on steps of speeds");
+            }
+        }
+    }
+    free(reference);
+    free(mpc);
+    return 0;
+}

@@ -1,0 +1,57 @@
+"""Steps from arbitrary bytes, under the sanitizers: no fault, no hang, and commands within their bounds."""
+
+from __future__ import annotations
+
+import os
+import re
+from pathlib import Path
+
+import pytest
+from firmware.conftest import Export, Run
+
+HERE = Path(__file__).parent
+SANITIZERS = "-fsanitize=fuzzer,address,undefined -fno-sanitize-recover=all".split()
+SECONDS = 8
+"""Of each target; the variable FUZZ_RUNS has a number of inputs instead, of four steps or so each."""
+HANGS = 30
+"""Seconds of one input that are taken for a hang; the hardest takes half a second on a busy machine."""
+CONTROLLERS = {
+    "short": ("double", "controller.horizon=10", "duration=5"),
+    "short, float": ("float", "controller.horizon=10", "duration=5"),
+    "whole": ("double",),
+}
+
+
+@pytest.mark.parametrize("name", CONTROLLERS)
+def test_arbitrary_bytes_lead_to_commands_within_bounds(name: str, exported: Export, run: Run, tmp_path: Path) -> None:
+    """A short horizon makes many steps; the whole one has the paths that only many active rows take."""
+    directory, program = exported("posix", *CONTROLLERS[name]), tmp_path / "fuzz"
+    compile = ["clang", "-g", "-O2", "-std=c99", "-ffp-contract=off", *SANITIZERS, "-I", directory]
+    built = run(*compile, "-o", program, HERE / "fuzz.c", check=False)
+    if "cannot find" in built.stderr:
+        pytest.skip("clang has no sanitizers: make firmware")
+    assert built.returncode == 0, built.stderr
+    runs = os.environ.get("FUZZ_RUNS")
+    length = f"-runs={runs}" if runs else f"-max_total_time={SECONDS}"
+    done = run(program, length, f"-timeout={HANGS}", "-max_len=600", "-len_control=0", "-seed=1", cwd=tmp_path)
+    (steps,) = re.findall(r"^steps: (\d+)$", done.stdout, re.MULTILINE)
+    print(f"{name}: {steps} steps from arbitrary bytes")
+    assert int(steps) > 100
+
+
+def test_a_command_out_of_bounds_is_found(exported: Export, run: Run, tmp_path: Path) -> None:
+    """The target can fail: with a controller that does not clip, it does at once."""
+    directory = exported("posix", "double", "controller.horizon=10", "duration=5")
+    text = (directory / "quadsim_mpc.c").read_text()
+    clip = "command[j] = mpc->before[j] = clipped(speeds[j], lower, upper);"
+    assert clip in text
+    (tmp_path / "quadsim_mpc.c").write_text(
+        text.replace(clip, "(void)upper, command[j] = mpc->before[j] = lower + speeds[j];")
+    )
+    compile = ["clang", "-O1", "-std=c99", *SANITIZERS, "-I", tmp_path, "-I", directory]
+    built = run(*compile, "-o", tmp_path / "fuzz", HERE / "fuzz.c", check=False)
+    if "cannot find" in built.stderr:
+        pytest.skip("clang has no sanitizers: make firmware")
+    done = run(tmp_path / "fuzz", "-runs=2000", "-max_len=600", "-len_control=0", cwd=tmp_path, check=False)
+    assert done.returncode != 0
+    assert "violated: bounds on" in done.stderr

@@ -1,0 +1,64 @@
+"""Processor in the loop: flights whose controller answers from an emulated Cortex-M, over its UART."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mpc.export.targets import TARGETS
+from quadsim.errors import FlightError, MissingProgramError
+from scenarios.cli import main
+from scenarios.export.emulation import Program, require_programs
+from scenarios.export.in_the_loop import fly_exported
+from scenarios.export.serial_line import SerialMPC
+from scenarios.loading import load_scenario
+from scenarios.run import fly_scenario
+
+CASES = {
+    "double": ("cortex-m7", "double", "paper-constrained", 1e-6),
+    "float": ("cortex-m4f", "float", "paper-constrained", 0.1),
+    "robust": ("posix", "double", "robust", 1e-6),
+    "unconstrained": ("posix", "double", "paper-unconstrained", 1e-4),
+}
+"""Target, precision, scenario, and how far commands of the two flights may be apart [rad/s]."""
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_a_flight_by_the_target_is_the_flight_by_python(name: str) -> None:
+    """The closed loop, so that a difference in one period comes back in all later ones."""
+    target, precision, scenario, apart = CASES[name]
+    compiler = TARGETS[target].compiler
+    if shutil.which(compiler) is None:
+        pytest.skip(f"{compiler} is not installed: make firmware")
+    short = load_scenario(scenario, ["duration=6.0"])
+    found, wanted = fly_exported(short, target=target, precision=precision, progress=False), fly_scenario(short)
+    assert found.log.control.status == wanted.log.control.status
+    assert np.abs(found.command - wanted.command).max() <= apart
+    assert [finding.satisfied for finding in found.findings] == [finding.satisfied for finding in wanted.findings]
+
+
+def test_the_command_flies_and_writes_a_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    arguments = "export hover --set duration=1.0 --out c --target cortex-m7 --fly".split()
+    assert main(arguments) == 0
+    assert (tmp_path / "c" / "startup.c").is_file()
+    assert (tmp_path / "runs" / "hover-cortex-m7" / "summary.json").is_file()
+    assert "C99 on Cortex-M7" in capsys.readouterr().out
+
+
+def test_a_program_that_ends_ends_the_flight(tmp_path: Path) -> None:
+    with Program(TARGETS["posix"], Path("/bin/true")) as line:
+        law = SerialMPC(line, "double", 2)
+        with pytest.raises(FlightError, match=r"at t = 0\.500 s: the controller at the serial line gave no answer"):
+            law.step(0.5, np.zeros(12), np.zeros((2, 4)), np.zeros(4))
+
+
+def test_what_is_not_installed_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("PATH", "")
+    with pytest.raises(MissingProgramError, match="needs 'make': apt-get install .* qemu-system-arm"):
+        require_programs(TARGETS["cortex-m7"], "to fly an exported controller")

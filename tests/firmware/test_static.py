@@ -1,0 +1,115 @@
+"""What compilers and analysers find in exported C: nothing, and what is planted there."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import pytest
+from firmware.conftest import Export, Run
+
+from mpc.export.targets import TARGETS
+
+WARNINGS = (
+    "-std=c99 -O2 -Wall -Wextra -Wconversion -Wdouble-promotion -Wshadow -Wcast-qual -Wvla -pedantic -Werror "
+    "-ffp-contract=off"
+).split()
+TIDY = ",".join(
+    [
+        "-*,bugprone-*,cert-*,clang-analyzer-*,misc-no-recursion",
+        "-bugprone-easily-swappable-parameters",  # (rows, columns) is an order that all of linear algebra shares
+        "-bugprone-implicit-widening-of-multiplication-result",  # indices are below 2^20: the exporter refuses more
+        "-bugprone-signed-char-misuse,-cert-str34-c",  # signed char is a small number here, no text
+    ]
+)
+CPPCHECK = ["--quiet", "--std=c99", "--enable=warning,style,performance,portability", "--error-exitcode=1"]
+CPPCHECK += ["--suppress=variableScope", "--suppress=unusedStructMember"]  # of members that other controllers use
+ALLOWED = {"memcpy", "memset"}
+EXPORTS = {
+    "double": ("cortex-m7", "double"),
+    "float": ("cortex-m4f", "float"),
+}
+PROGRAMS = ("main.c", "serial.c", "vectors.c", "quadsim_mpc.c")
+
+
+@pytest.mark.parametrize("compiler", ["gcc", "clang", "arm-none-eabi-gcc"])
+@pytest.mark.parametrize("precision", EXPORTS)
+def test_compilers_have_nothing_to_say(
+    precision: str, compiler: str, exported: Export, run: Run, tmp_path: Path
+) -> None:
+    bare = compiler.startswith("arm")
+    directory = exported(*EXPORTS[precision]) if bare else exported("posix", precision)
+    machine = TARGETS[EXPORTS[precision][0]].machine.split() if bare else []
+    for name in (*PROGRAMS, "startup.c" if bare else "posix.c"):
+        run(compiler, *machine, *WARNINGS, "-c", directory / name, "-o", tmp_path / "object.o")
+
+
+def test_analysers_find_nothing(exported: Export, run: Run, tmp_path: Path) -> None:
+    directory = exported("posix", "double")
+    sources = [directory / name for name in ("quadsim_mpc.c", "main.c", "serial.c", "posix.c")]
+    for source in sources:
+        run("gcc", *WARNINGS, "-fanalyzer", "-c", source, "-o", tmp_path / "object.o")
+    run("cppcheck", *CPPCHECK, *sources, exported("cortex-m7", "double") / "startup.c")
+    run("clang-tidy", "-quiet", f"-checks={TIDY}", "-warnings-as-errors=*", *sources, "--", "-std=c99")
+
+
+def undefined(source: Path, board: str, run: Run, made: Path) -> set[str]:
+    """Symbols that a source asks others for."""
+    target = TARGETS[board]
+    run(target.compiler, *target.machine.split(), "-std=c99", "-O2", "-c", source, "-o", made)
+    return {line.split()[-1] for line in run("arm-none-eabi-nm", "-u", made).stdout.splitlines()}
+
+
+@pytest.mark.parametrize("precision", EXPORTS)
+def test_a_controller_asks_the_library_for_copies_alone(
+    precision: str, exported: Export, run: Run, tmp_path: Path
+) -> None:
+    """No malloc, no mathematics, and in float no emulated doubles, which a Cortex-M4F would need."""
+    board, _ = EXPORTS[precision]
+    assert undefined(exported(board, precision) / "quadsim_mpc.c", board, run, tmp_path / "asked.o") <= ALLOWED
+
+
+PLANTED = """
+#include "quadsim_mpc.h"
+#include <stdlib.h>
+int quadsim_planted(int count, quadsim_real *numbers);
+int quadsim_planted(int count, quadsim_real *numbers)
+{{
+    {body}
+}}
+"""
+FAULTS = {
+    "recursion": ("tidy", "return count > 0 ? quadsim_planted(count - 1, numbers) : 0;", "misc-no-recursion"),
+    "allocation": ("nm", "numbers[0] = *(quadsim_real *)malloc(8);\n    return count;", "malloc"),
+    "double in float": ("nm", "numbers[0] = (float)((double)numbers[0] * 0.1);\n    return count;", "__aeabi_d"),
+    "promotion": ("gcc", "return numbers[0] * 0.1 > 1.0 ? count : 0;", "double-promotion"),
+    "too small": ("gcc", "numbers[0] = 1e-60F;\n    return count;", "truncated to zero"),
+    "beyond an array": ("cppcheck", "int few[2] = {{1, 2}};\n    return few[2] + count;", "arrayIndexOutOfBounds"),
+    "array of unknown size": ("gcc", "int some[count];\n    some[0] = 1;\n    return some[0];", "vla"),
+    "memory not set": (
+        "gcc -fanalyzer",
+        "int *some = malloc(4);\n    return some ? *some + count : 0;",
+        "uninitialized",
+    ),
+}
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_what_is_planted_is_found(fault: str, exported: Export, run: Run, tmp_path: Path) -> None:
+    """Each trap that exported C could fall into: recursion, allocation, doubles, numbers too small and others."""
+    tool, body, finding = FAULTS[fault]
+    source, header = tmp_path / "planted.c", exported("cortex-m4f", "float")
+    source.write_text(PLANTED.format(body=body.format()))
+    include = f"-I{header}"
+    if tool == "nm":
+        shutil.copy(header / "quadsim_mpc.h", tmp_path)
+        assert any(name.startswith(finding) for name in undefined(source, "cortex-m4f", run, tmp_path / "planted.o"))
+        return
+    commands = {
+        "tidy": ["clang-tidy", "-quiet", f"-checks={TIDY}", "-warnings-as-errors=*", source, "--", "-std=c99", include],
+        "cppcheck": ["cppcheck", *CPPCHECK, include, source],
+    }
+    compile = [*tool.split(), *WARNINGS, include, "-c", source, "-o", tmp_path / "planted.o"]
+    done = run(*commands.get(tool, compile), check=False)
+    assert done.returncode != 0
+    assert finding in done.stdout + done.stderr

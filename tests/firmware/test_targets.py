@@ -1,0 +1,106 @@
+"""Every target computes the same bits as the host over all recorded periods, within bounds on size, stack and work."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from firmware.conftest import Answer, Answers, Export, Run
+
+from mpc.export.targets import TARGETS, TICK
+from scenarios.export.emulation import build
+
+HERE = Path(__file__).parent
+BOARDS = [name for name, target in TARGETS.items() if target.board]
+AARCH64 = ("CC=aarch64-linux-gnu-gcc", "MACHINE_LINK=-static", "RUN=qemu-aarch64")
+OTHERS = {
+    "cortex-m7": ("cortex-m7",),
+    "cortex-m4f": ("cortex-m4f",),
+    "aarch64": ("posix", *AARCH64),
+    "host, unoptimised": ("posix", "CFLAGS=-O0 -std=c99"),
+    "host, clang": ("posix", "CC=clang", "CFLAGS=-O3 -std=c99"),
+}
+CONTRACTED = "ALWAYS=-ffp-contract=fast"
+MEDIAN, RARE, WARM, COLD = 0.13e6, 3.5e6, 7.5e6, 32e6
+"""Instructions of a step at most, of the Cortex-M7 in double and of both in float: p50, p99, max after the first, it."""
+FLASH, MEMORY = {"double": 200_000, "float": 105_000}, {"double": 90_000, "float": 46_000}
+"""Bytes at most: of code and constants; of the controller's struct."""
+FRAME, STACK = 1400, 4000
+"""Bytes at most: of a function; in all."""
+
+
+def bits(found: list[Answer]) -> list[Answer]:
+    """Without the ticks."""
+    return [answer[:7] for answer in found]
+
+
+@pytest.mark.parametrize("board", BOARDS)
+def test_a_board_starts_counts_and_stops(board: str, exported: Export, run: Run, tmp_path: Path) -> None:
+    target, directory = TARGETS[board], exported(board, "double")
+    flags = f"{target.machine} -O2 -std=gnu99 -I {directory}".split()
+    image = tmp_path / "bare.elf"
+    link = f"-nostartfiles -T {directory / 'mps2.ld'} --specs=nano.specs".split()
+    run(target.compiler, *flags, "-o", image, HERE / "bare.c", directory / "startup.c", *link)
+    emulate = (*target.emulation, "-serial", "stdio", "-kernel", image)
+    done = run(*emulate, input="abcq")
+    assert (done.stdout, done.stderr) == ("bc", "as many ticks\n")
+    for fault in "fn":
+        assert run(*emulate, input=fault, check=False).returncode == 3
+
+
+@pytest.mark.parametrize("precision", ["double", "float"])
+@pytest.mark.parametrize("other", OTHERS)
+def test_every_target_answers_the_same_bits(other: str, precision: str, answers: Answers) -> None:
+    target, *make = OTHERS[other]
+    host, found = answers("posix", precision), answers(target, precision, *make)
+    assert len(host) == 1200
+    assert {int(answer[1], 16) for answer in host} == {0, 1, 2}  # every way to an optimum
+    assert bits(found) == bits(host)
+
+
+def test_contraction_is_what_would_change_bits(answers: Answers) -> None:
+    """The flag is there for a reason: with it on, an aarch64 fuses products and sums."""
+    assert bits(answers("posix", "double", *AARCH64, CONTRACTED)) != bits(answers("posix", "double"))
+
+
+@pytest.mark.parametrize(
+    ("board", "precision"), [("cortex-m7", "double"), ("cortex-m7", "float"), ("cortex-m4f", "float")]
+)
+def test_a_step_takes_few_instructions(board: str, precision: str, answers: Answers) -> None:
+    """Instructions, not cycles: the emulator has neither caches nor wait states."""
+    steps = np.array([int(answer[7], 16) * TICK for answer in answers(board, precision)])
+    assert np.median(steps) <= MEDIAN
+    assert np.percentile(steps, 99) <= RARE
+    assert steps[1:].max() <= WARM
+    assert steps[0] <= COLD
+
+
+@pytest.mark.parametrize(("board", "precision"), [("cortex-m7", "double"), ("cortex-m4f", "float")])
+def test_a_controller_fits(board: str, precision: str, exported: Export, run: Run, tmp_path: Path) -> None:
+    directory, tools = exported(board, precision), "arm-none-eabi-size"
+    run(TARGETS[board].compiler, "--version")
+    build(directory, "vectors.elf")
+    flash, data, zeroed = map(int, run(tools, directory / "quadsim_mpc.o").stdout.splitlines()[1].split()[:3])
+    assert flash <= FLASH[precision]
+    assert (data, zeroed) == (0, 0)  # no state but the caller's
+    symbols = run("arm-none-eabi-nm", "-S", directory / "main.o").stdout
+    (size,) = re.findall(r"^\S+ (\S+) \S mpc$", symbols, re.MULTILINE)
+    assert int(size, 16) <= MEMORY[precision]
+    frames = [line.split("\t") for line in (directory / "quadsim_mpc.su").read_text().splitlines()]
+    assert {kind for _, _, kind in frames} == {"static"}
+    assert max(int(size) for _, size, _ in frames) <= FRAME
+
+
+@pytest.mark.parametrize(("board", "precision"), [("cortex-m7", "double"), ("cortex-m4f", "float")])
+def test_the_stack_is_small(board: str, precision: str, exported: Export, run: Run, tmp_path: Path) -> None:
+    """Painted below main, and looked at after all recorded periods."""
+    directory = exported(board, precision)
+    target, image = TARGETS[board], tmp_path / "stack.elf"
+    sources = [directory / name for name in ("quadsim_mpc.c", "vectors.c", "startup.c")]
+    flags = f"{target.machine} -O2 -std=gnu99 -ffp-contract=off -I {directory}".split()
+    link = f"-nostartfiles -T {directory / 'mps2.ld'} --specs=nano.specs".split()
+    run(target.compiler, *flags, "-o", image, HERE / "stack.c", *sources, *link)
+    done = run(*target.emulation, "-serial", "none", "-kernel", image)
+    assert 0 < int(done.stderr, 16) <= STACK
