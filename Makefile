@@ -175,7 +175,7 @@ $(VENV)/.renders: $(VENV)/.installed
 
 $(VENV)/.browser: $(VENV)/.installed
 	@if $(HAS_BROWSER) || { { $(call apt,chromium); } && $(HAS_BROWSER); }; then touch $@; \
-	else echo "Until then the tests that open the comparison page in a browser are skipped." >&2; fi
+	else echo "Until then the tests that open pages in a browser are skipped." >&2; fi
 
 $(VENV)/.firmware: $(VENV)/.installed
 	@if $(HAS_FIRMWARE_TOOLS) || { { $(call apt,gcc libc6-dev gcc-arm-none-eabi libnewlib-arm-none-eabi qemu-system-arm \
