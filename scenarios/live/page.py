@@ -36,7 +36,7 @@ from scenarios.schema.controller import ControllerSpec
 SECONDS: Final = 20.0
 """Of the plots."""
 _EVERY: Final = 4
-"""Periods from one update of panel and plots to the next: a fifth of a second at 20 Hz."""
+"""Periods from one update of the panel to the next, a fifth of a second at 20 Hz; plots take two of these."""
 _SPEEDS: Final = ("0.1", "0.25", "0.5", "1", "2", "4")
 _STEER: Final = {"W": (1, 0, 0), "S": (-1, 0, 0), "A": (0, 1, 0), "D": (0, -1, 0), "R": (0, 0, 1), "F": (0, 0, -1)}
 """Keys, and the direction of the set-point's velocity that each adds to."""
@@ -139,6 +139,7 @@ class Page:
                 self._margins.content = _bars(
                     self._session.limits, frame, self._session.flights[-1].loop.controller.name
                 )
+            if frame.k % (2 * _EVERY) == 0 or self._pace.paused:
                 self._plot()
 
     def pose(self, frame: Frame, share: float) -> None:
@@ -538,7 +539,7 @@ class Page:
     def _plot(self) -> None:
         if len(self._history) < 2:
             return
-        table = np.array(self._history).T
+        table = np.array(self._history)[::2].T  # plots are the most of what is sent
         first = 1
         for plot, count in zip(self._plots, (3, 2, 4, 1), strict=True):
             plot.data = (table[0], *table[first : first + count])
