@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import ctypes
-import re
 from dataclasses import dataclass
 
 import numpy as np
 
-from mpc.export.source import HEADER
 from quadsim.state import Array
 from scenarios.export.exporter import controller_files
 from scenarios.export.record import Recording
@@ -30,10 +28,7 @@ class Host:
     """One controller struct of a compiled library."""
 
     def __init__(self, scenario: Scenario, precision: str = "double", room: int | None = None) -> None:
-        files = controller_files(scenario, precision)
-        if room is not None:
-            files[HEADER] = re.sub(r"(?<=QUADSIM_ROOM )\d+", str(room), files[HEADER])
-        self.library = ctypes.CDLL(str(compiled(files)))
+        self.library = ctypes.CDLL(str(compiled(controller_files(scenario, precision), room)))
         self.library.quadsim_shim_size.restype = ctypes.c_size_t
         self.library.quadsim_shim_step.restype = None
         self.horizon = scenario.controller.horizon

@@ -111,10 +111,12 @@ def _sizes(found: Tables, precision: Precision) -> str:
         "PARTS": (len(found.axes), "parts that the problem falls into"),
         "AXIS_STATES": (max(1, *(len(axis.B) for axis in found.axes)), "of the largest axis"),
         "AXIS_INPUTS": (widest, "likewise"),
-        "ROOM": (found.room, "active rows that there is room for"),
         "ENTRIES": (1 + widest * max((len(row.terms) for row in found.rows), default=0), "of the largest row"),
     }
     lines = [f"#define QUADSIM_{name} {value} /* {meaning} */" for name, (value, meaning) in sizes.items()]
+    room = f"#define QUADSIM_ROOM {found.room} /* active rows that there is room for; more take more memory */"
+    changes = "#define QUADSIM_CHANGES 500 /* of the active set in a search, after which it is given up */"
+    lines += ["#ifndef QUADSIM_ROOM", room, "#endif", "#ifndef QUADSIM_CHANGES", changes, "#endif"]
     return "\n".join(["#define QUADSIM_FLOAT 1", *lines] if precision == "float" else lines)
 
 

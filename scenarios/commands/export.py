@@ -10,7 +10,6 @@ from quadsim.outputs import real_path
 from scenarios.commands import EXIT_DONE, EXIT_FAILED, console
 from scenarios.commands.common import load
 from scenarios.export.exporter import export as write_export
-from scenarios.export.in_the_loop import fly_exported
 
 
 def export(options: Namespace) -> int:
@@ -20,6 +19,8 @@ def export(options: Namespace) -> int:
     print(f"Wrote {directory}: make -C {directory} check compiles it and runs its recorded periods")
     if not options.fly:
         return EXIT_DONE
+    from scenarios.export.in_the_loop import fly_exported
+
     run = real_path(Path("runs") / f"{scenario.name}-{options.target}")
     flight = fly_exported(scenario, run, precision=options.precision, target=options.target)
     console.print_summary(rundir.read_summary(run), str(run))

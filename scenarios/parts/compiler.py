@@ -8,7 +8,7 @@ import shutil
 import stat
 import subprocess
 import tempfile
-from collections.abc import Callable, Hashable, Mapping
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from pathlib import Path
 from typing import Final
 
@@ -19,6 +19,11 @@ from quadsim.outputs import write_new
 
 FLAGS: Final = ("-std=c99", "-O3", "-ffp-contract=off", "-fPIC", "-shared")
 """Without contraction all processors, and all levels of optimisation, have the same bits."""
+ROOM_PER_STEP: Final = 5
+"""Active rows that there is room for, per step of the horizon: all that are independent, and memory is no matter here.
+Rotors that spin up from standstill at their largest steps take more of both than an export has."""
+CHANGES: Final = 3000
+"""The same of the changes of the active set in a search."""
 COMPILERS: Final = ("cc", "gcc", "clang")
 
 
@@ -40,12 +45,18 @@ def compiled_controller(key: Hashable, make: Callable[[], Exportable]) -> Compil
     """
     if key not in _READY:
         law = make()
-        _READY[key] = compiled(sources(law, precision="double", title=law.name)), law
+        room = ROOM_PER_STEP * law.problem.horizon
+        _READY[key] = compiled(sources(law, precision="double", title=law.name), room, CHANGES), law
     return CompiledMPC(*_READY[key])
 
 
-def compiled(files: Mapping[str, str]) -> Path:
+def compiled(files: Mapping[str, str], room: int | None = None, changes: int | None = None) -> Path:
     """The shared library of a controller's files and of `shim.c`, from the cache where it is there.
+
+    Args:
+        files: see `mpc.export.source.sources`.
+        room: active rows that there is room for; None for the export's own.
+        changes: of the active set after which a search is given up; likewise.
 
     Raises:
         CompilerError: there is no compiler, or it fails.
@@ -53,12 +64,14 @@ def compiled(files: Mapping[str, str]) -> Path:
     """
     compiler = _compiler()
     sources = {**files, "shim.c": part("shim.c")}
+    sizes = {"ROOM": room, "CHANGES": changes}
+    flags = (*FLAGS, *(f"-DQUADSIM_{name}={size}" for name, size in sizes.items() if size is not None))
     digest = hashlib.sha256()
-    for text in (_version(compiler), *FLAGS, *(f"{name}\0{sources[name]}" for name in sorted(sources))):
+    for text in (_version(compiler), *flags, *(f"{name}\0{sources[name]}" for name in sorted(sources))):
         digest.update(text.encode() + b"\0")
     library = _cache() / f"{digest.hexdigest()}.so"
     if not library.exists():
-        content = _compile(compiler, sources)
+        content = _compile(compiler, flags, sources)
         try:
             write_new(library, content)
         except OutputError:
@@ -82,12 +95,12 @@ def _version(compiler: str) -> str:
     return subprocess.run([compiler, "--version"], capture_output=True, text=True, check=False).stdout
 
 
-def _compile(compiler: str, sources: Mapping[str, str]) -> bytes:
+def _compile(compiler: str, flags: Sequence[str], sources: Mapping[str, str]) -> bytes:
     with tempfile.TemporaryDirectory(prefix="quadsim-c-") as name:
         folder = Path(name)
         for file, text in sources.items():
             (folder / file).write_text(text, encoding="utf-8")
-        command = [compiler, *FLAGS, "-o", "shim.so", "shim.c"]
+        command = [compiler, *flags, "-o", "shim.so", "shim.c"]
         done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
         if done.returncode:
             raise CompilerError(f"{' '.join(command)} failed: {(done.stderr or done.stdout).strip()[:2000]}")

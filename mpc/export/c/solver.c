@@ -65,7 +65,7 @@ static const real NOTHING_OF = 1e-10;
 #endif
 static const real NO_BOUND = R(1e29);
 static const real MOST_SLACK = R(8.0); /* by which tolerances are relaxed where rows come and go */
-enum { MOST_CHANGES = 500 };           /* of the active set in a search */
+enum { MOST_CHANGES = QUADSIM_CHANGES }; /* of the active set in a search */
 
 enum verdict { SOLVED, INFEASIBLE, GAVE_UP };
 
