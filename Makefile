@@ -4,7 +4,7 @@
 
 .NOTPARALLEL:
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test peers check docs format types build numbers verification nonlinear robustness first-flights reproduce speed soak campaigns kills safety firmware export-numbers pins clean
+.PHONY: help setup demo test peers check docs format types build numbers verification nonlinear robustness first-flights reproduce speed soak campaigns tuning kills safety firmware export-numbers pins clean
 
 VENV := .venv
 PY := $(VENV)/bin/python
@@ -45,9 +45,9 @@ demo: setup  ## fly the paper's two flights and compare them, under runs/ (OPTIO
 	@$(QUADSIM) compare $(RUNS)/paper-unconstrained $(RUNS)/paper-constrained --out $(RUNS)/comparison
 	@echo "Done. Open $(RUNS)/comparison/index.html in a browser."
 
-test peers firmware export-numbers verification nonlinear robustness first-flights reproduce speed soak campaigns kills safety: export OMP_NUM_THREADS := 1
-test peers firmware export-numbers verification nonlinear robustness first-flights reproduce speed soak campaigns kills safety: export OPENBLAS_NUM_THREADS := 1
-test peers firmware export-numbers verification nonlinear robustness first-flights reproduce speed soak campaigns kills safety: export MKL_NUM_THREADS := 1
+test peers firmware export-numbers verification nonlinear robustness first-flights reproduce speed soak campaigns tuning kills safety: export OMP_NUM_THREADS := 1
+test peers firmware export-numbers verification nonlinear robustness first-flights reproduce speed soak campaigns tuning kills safety: export OPENBLAS_NUM_THREADS := 1
+test peers firmware export-numbers verification nonlinear robustness first-flights reproduce speed soak campaigns tuning kills safety: export MKL_NUM_THREADS := 1
 test: setup $(VENV)/.browser  ## run every test that needs no peer (OPTIONS="-k audit" for some)
 	@$(PY) -m pytest -q -n $(WORKERS) --dist loadscope $(OPTIONS)
 
@@ -106,7 +106,7 @@ reproduce: setup  ## fly the numbers of every paper that ships and remake docs/p
 export-numbers: setup $(VENV)/.firmware  ## remake docs/export.md: exported controllers and peers on emulated targets; some ten minutes
 	@$(PY) docs/make_export.py
 
-speed: setup  ## fly every controller ever faster and remake docs/speed.md: some five minutes
+speed: setup  ## fly every controller ever faster and remake docs/speed.md: some six minutes
 	@$(PY) docs/make_speed.py
 
 soak: setup  ## one simulated hour on end: memory and step time have to stay as they were
@@ -114,6 +114,9 @@ soak: setup  ## one simulated hour on end: memory and step time have to stay as 
 
 campaigns: setup  ## fly the campaigns that ship and remake docs/paper-robustness.md, an hour and a quarter; goes on with what is there
 	@$(PY) docs/make_campaigns.py
+
+tuning: setup  ## carry out the tunings that ship and remake docs/tuning.md, up to half an hour each; goes on with what is there
+	@$(PY) docs/make_tuning.py
 
 safety: setup  ## attack all that writes or reads files, and remake the counts on docs/safety.md: some forty minutes
 	@PYTHONPATH=tests $(PY) docs/make_safety.py

@@ -21,8 +21,8 @@ from quadsim.flight.audit import SIGNALS
 from quadsim.state import STATE_NAMES
 from quadsim.vehicle import OPTIONAL_PARAMETERS, VEHICLE_UNITS
 from scenarios.build import resolve
+from scenarios.limits import build_limits
 from scenarios.loading import load_scenario, parse_scenario
-from scenarios.parts.limits import build_limits
 from scenarios.parts.vehicle import build_vehicle
 from scenarios.schema.problems import ScenarioError
 from scenarios.schema.scenario import MOST_STEPS, Scenario
