@@ -225,8 +225,8 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as directory:
         scratch = Path(directory)
         sizes = sizes_table(recording, scratch / "sizes")
-        text = (scratch / "sizes" / f"{PAPER}-double-cortex-m7" / "quadsim_mpc.c").read_text(encoding="utf-8")
-        (changes,) = re.findall(r"MOST_CHANGES = (\d+)", text)
+        header = (scratch / "sizes" / f"{PAPER}-double-cortex-m7" / "quadsim_mpc.h").read_text(encoding="utf-8")
+        (changes,) = re.findall(r"define QUADSIM_CHANGES (\d+)", header)
         mine = ours(PAPER, "double", "cortex-m7", scratch / "mine")
         page = TEXT.format(
             scenario=PAPER,
