@@ -31,8 +31,9 @@ PAGE, FIGURES = DOCS / "gallery.md", DOCS / "gallery"
 SIDES = np.array([-1.0, 1.0])
 HEAD = """# Gallery
 
-Every scenario that ships: its path (dashed: the reference), roll and pitch with their bounds, the verdict, and
-the constraint that came nearest to its bound, with its smallest margin at the physics rate.
+Every scenario that ships: its path (dashed: the reference), roll and pitch with their bounds, or the tilt where the
+vehicle may turn upside down, the verdict, and the constraint that came nearest to its bound, with its smallest margin
+at the physics rate.
 `quadsim run NAME` flies one, films it and writes its recording; `quadsim scenario NAME` prints its file.
 All numbers in tables: [scenarios](scenarios.md). Made by `make docs`.
 """
@@ -55,11 +56,15 @@ def draw(flight: Flight, file: Path) -> None:
     space.tick_params(labelsize=6, pad=-2)
     space.locator_params(nbins=4)
     axes: Axes = figure.add_subplot(right)
-    shown = draw_signal(axes, flight.run, "roll")
-    pitch = axes.plot(state["t"], np.degrees(state["pitch"]), color=line_colour(2), linewidth=1.0, zorder=1.9)
-    shown = {"roll": shown.pop("flight"), "pitch": pitch[0], **shown}
+    if flight.log.plant.attitude is None:
+        shown = draw_signal(axes, flight.run, "roll")
+        pitch = axes.plot(state["t"], np.degrees(state["pitch"]), color=line_colour(2), linewidth=1.0, zorder=1.9)
+        shown = {"roll": shown.pop("flight"), "pitch": pitch[0], **shown}
+        axes.set_ylabel("roll, pitch [deg]")
+    else:  # may turn upside down
+        shown = draw_signal(axes, flight.run, "tilt")
+        shown = {"tilt": shown.pop("flight"), **shown}
     axes.legend(shown.values(), shown, ncols=len(shown), frameon=False, loc="lower left", bbox_to_anchor=(0.0, 1.0))
-    axes.set_ylabel("roll, pitch [deg]")
     axes.set_xlabel("time [s]")
     figure.savefig(file, format="svg", metadata={"Date": None})
 

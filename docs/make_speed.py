@@ -1,4 +1,4 @@
-"""Remake docs/speed.md and its figure, `quadsim bench speed` with words: `make speed`, some five minutes.
+"""Remake docs/speed.md and its figure, `quadsim bench speed` with words: `make speed`, some six minutes.
 
 No clock decides any of it; tests/scenarios/bench/test_speed.py flies the short ones.
 """
@@ -24,11 +24,11 @@ READING = """\
   off by centimetres at 4 m/s and by a metre or more at 12, nonlinear MPC by millimetres.
 - Up to some 50 deg, where the plant is not as modelled, nonlinear MPC by itself pays little. Under drag a PID, which
   integrates, is nearer up to 8 m/s; with real rotors linear MPC is off by at most twice as much. To observe the force
-  pays more there: `nonlinear +` under drag and on the Crazyflie, `geometric +` under drag and on the Hummingbird.
-- To observe it does not pay everywhere: on the Hummingbird `nonlinear +` is farther off than `nonlinear`.
-- Nonlinear need not be MPC: `geometric +` has the smallest error on the loop as modelled and up to 6 m/s on the
-  Hummingbird. It bounds only what it asks for, and is beyond its bound at the highest speeds, where its rotors
-  saturate; `nonlinear` never is.
+  pays more there: `nonlinear +` under drag and with real rotors, `geometric +` under drag and on the Hummingbird.
+- Nonlinear need not be MPC: `geometric +` has the smallest error on the loop as modelled . It bounds only what it
+  asks for, and is beyond its bound at the highest speeds, where its rotors saturate; `nonlinear` never is.
+- By sensors to observe forces does not pay: the estimate's noise passes up to the observers' bandwidths, `nonlinear +`
+  is farther off than `nonlinear`, and a seed of `geometric +` is lost at 6 m/s.
 - Within a wide bound linear MPC plans what its model does not describe. `constrained`, with hard bounds and without
   estimated disturbances, is lost where `robust` survives far off the course; on the Crazyflie at 5 m/s both are lost.
 - The LQR is a metre off at 4 m/s already: it follows the reference's velocity, not its acceleration.
@@ -85,10 +85,10 @@ def page(measured: SpeedBench) -> str:
             "# Where linear control ends\n\nMade by `make speed`, its numbers by flights; `quadsim bench speed` prints "
             f"the tables.\n\nEvery controller flies a course ever faster:\n\n{speed_legend(measured)}\n"
             f"Roll and pitch are bounded by what the course takes without drag and {ROOM:g} deg more, at most "
-            f"{STEEPEST:g} deg; the controllers\nwithout bounds limit the tilt that they ask for to it. Nothing is "
-            "random, so no number has an interval; what noise would add\nto the loop is in "
-            "[papers.md](papers.md#noise-over-seeds). A vehicle farther off than the course's size, or tilted by more "
-            "than\n120 deg, is lost.\n",
+            f"{STEEPEST:g} deg; the controllers\nwithout bounds limit the tilt that they ask for to it. Where "
+            "sensors measure, numbers are means over seeds, with the 95 % interval of the mean error; elsewhere\n"
+            "nothing is random. What noise adds to the loop is in [papers.md](papers.md#noise-over-seeds). A vehicle "
+            "farther off than the course's size,\nor tilted by more than 120 deg, is lost.\n",
             "![Mean position error and share of the time beyond the tilt bound over speed](speed.png)\n",
             section(reach),
             f"## What is seen\n\n{markdown(counts(measured))}\nFollowed: a mean error of at most {NEAR:g} m, and "

@@ -8,6 +8,7 @@ import numpy as np
 
 from mpc.answer import ActuatorBounds, command_of, rejection, shifted
 from mpc.exact.shortcut import with_shortcut
+from mpc.handover import resized, within
 from mpc.ocp import Problem, Query, Unanswered
 from mpc.paper.prediction import rollout
 from mpc.solvers import INVALID_DATA, Answer, Solver, Way
@@ -54,6 +55,12 @@ class ConstrainedMPC:
         self._solver.reset()
         if self._clearing is not None:
             self._clearing.reset()
+
+    def adopt(self, previous: object) -> None:
+        """Hold the plan of the law before, should no QP have an answer."""
+        law = within(previous, ConstrainedMPC)
+        if law is not None and law._plan is not None:
+            self._plan, self._held = resized(law._plan, self.horizon), law._held
 
     def step(self, now: Moment, state: Array, reference: Array) -> Command:
         """See `quadsim.controller.Controller.step`.

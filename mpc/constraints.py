@@ -23,12 +23,15 @@ class Penalty:
 
     l1: Array  # (m,) at least 0
     l2: Array  # (m,) at least 0
+    largest: bool = False  # whether each step's rows have one slack, that of the largest violation; l1, l2 are then one
 
     def __post_init__(self) -> None:
         for name in ("l1", "l2"):
             value = getattr(self, name)
             if value.shape != self.l1.shape or value.ndim != 1 or not (np.isfinite(value) & (value >= 0.0)).all():
                 raise ParameterError("controller", name, value, "one finite number >= 0 per constrained output")
+            if self.largest and (value != value[:1]).any():
+                raise ParameterError("controller", name, value, "the same number for all rows that share a slack")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -133,6 +136,7 @@ class Rows:
     upper: Array  # likewise
     l1: Array  # (m,) what violating a row costs; l1 is infinite of hard ones
     l2: Array  # likewise
+    slack: Indices  # (m,) which slack of its step a soft row has; -1 of hard ones
     # (m,) whether a row is of the state alone: entry i is then for x(k+i+1), otherwise for x(k+i), u(k+i)
     of_states: np.ndarray[tuple[int], np.dtype[np.bool_]]
     input: Indices  # (m,) the input that a hard row bounds by itself; -1 where it is no such row
@@ -148,6 +152,11 @@ class Rows:
         """(m_s,) which rows are soft."""
         return np.flatnonzero(np.isfinite(self.l1))
 
+    @cached_property
+    def slacks(self) -> Indices:
+        """(m_s,) the first row of each slack; all soft ones where none is shared."""
+        return self.soft[np.unique(self.slack[self.soft], return_index=True)[1]]
+
     def part(self, rows: Indices, states: Indices, inputs: int) -> Rows:
         """Some rows of states alone, on some states, of a problem with so many inputs."""
         nothing = np.zeros((rows.size, inputs))
@@ -160,7 +169,13 @@ class Rows:
             upper=self.upper[:, rows],
             l1=self.l1[rows],
             l2=self.l2[rows],
+            slack=renumbered(self.slack[rows]),
             of_states=self.of_states[rows],
             input=self.input[rows],
             names=tuple(self.names[row] for row in rows),
         )
+
+
+def renumbered(slack: Indices) -> Indices:
+    """Slacks' numbers (m,) without gaps, -1 of hard rows kept."""
+    return np.asarray(np.unique(np.concatenate([[-1], slack]), return_inverse=True)[1][1:] - 1)

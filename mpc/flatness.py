@@ -3,17 +3,26 @@
 The thrust axis is b = (a + g e_z) / |a + g e_z| (Mellinger and Kumar 2011, Sec. III).  What turns about it is either
 left free, so that no rate about body z remains, or held, so that body x stays as near as can be to the direction of a
 given yaw, and body y at a right angle to it.
+A free heading along a course that turns the vehicle upside down, where no least rotation from upright is left, is
+carried from sample to sample by the least rotation from one thrust axis to the next.
 Derivatives along the samples are central differences, one-sided at both ends, as in the simplified simulation of
 Torrente et al., "Data-Driven MPC for Quadrotors" (2021), which leaves the heading free.
 """
 
 from __future__ import annotations
 
+import math
+from typing import Final
+
 import numpy as np
 
+from quadsim.errors import ParameterError
 from quadsim.motion import Motion
 from quadsim.state import Array, read_only
 from quadsim.vehicle import Vehicle
+
+STEEP: Final = math.cos(math.radians(150.0))
+"""Lowest vertical component of the thrust axis up to which an attitude is described by a least rotation."""
 
 
 def motion_along(
@@ -45,9 +54,18 @@ def motion_along(
 
 
 def attitudes(acceleration: Array, *, period: float, gravity: float, yaw: Array | float) -> tuple[Array, Array]:
-    """(K, 4) quaternions, and (K, 3) body rates [rad/s], along accelerations (K, 3); arguments as of `motion_along`."""
+    """(K, 4) quaternions, and (K, 3) body rates [rad/s], along accelerations (K, 3); arguments as of `motion_along`.
+
+    Raises:
+        ParameterError: the heading is to be held upside down.
+    """
     pushed = _pushed(acceleration, gravity)
     b = pushed / np.linalg.norm(pushed, axis=1)[:, None]
+    if b[:, 2].min() < STEEP:
+        if not isinstance(yaw, float):
+            raise ParameterError("reference", "heading", "held", "free where the course turns the vehicle upside down")
+        attitude = _carried(b, yaw)
+        return attitude, _body_rates(attitude, period)
     least = np.column_stack([1.0 + b[:, 2], -b[:, 1], b[:, 0], np.zeros(len(b))])  # the least rotation of e_z to b
     least /= np.linalg.norm(least, axis=1)[:, None]
     least_rates = _body_rates(least, period)
@@ -60,6 +78,19 @@ def attitudes(acceleration: Array, *, period: float, gravity: float, yaw: Array 
     cos, sin, (wx, wy, wz) = np.cos(turn[0]), np.sin(turn[0]), least_rates[0]
     rates[0] = cos * wx + sin * wy, cos * wy - sin * wx, wz  # without the turn, which has no step before it
     return attitude, rates
+
+
+def _carried(b: Array, yaw: float) -> Array:
+    """(K, 4) quaternions with thrust axes b (K, 3), each turned from the one before by the least rotation."""
+    before = np.concatenate([[[0.0, 0.0, 1.0]], b[:-1]])
+    turn = np.column_stack([1.0 + np.sum(before * b, axis=1), np.cross(before, b)])
+    turn /= np.linalg.norm(turn, axis=1)[:, None]
+    attitude = np.empty((len(b), 4))
+    now = _about_z(np.array([yaw]))
+    for k in range(len(b)):
+        now = _multiply(turn[k : k + 1], now)
+        attitude[k] = now[0]
+    return attitude
 
 
 def _body_rates(attitude: Array, period: float) -> Array:

@@ -26,6 +26,7 @@ import numpy as np
 from annotated_types import doc
 
 from mpc.baselines.allocation import allocate, make_allocation
+from mpc.handover import hand_over, within
 from quadsim.controller import GROUNDED, Command, Controller, Moment
 from quadsim.fields import Positive
 from quadsim.state import Array
@@ -65,6 +66,10 @@ class TorqueIncrement:
         """Forget: no torque is unknown."""
         self._last: tuple[float, Array] | None = None
         self._filtered, self._slope = np.zeros(3), np.zeros(3)
+
+    def adopt(self, other: TorqueIncrement) -> None:
+        """Go on from where another one is."""
+        self._last, self._filtered, self._slope = other._last, other._filtered, other._slope
 
     def speeds(self, time: float, commanded: Array, rates: Array, rotors: Array) -> Array:
         """The rotor speeds to hold until the next call (4,) [rad/s].
@@ -106,6 +111,13 @@ class Incremental:
         """Start anew after the command u(-1) (4,) [rad/s]."""
         self.inner.reset(speeds)
         self._loop.reset()
+
+    def adopt(self, previous: object) -> None:
+        """Go on from what the law before knew, and from the filter's state."""
+        hand_over(self.inner, previous)
+        law = within(previous, Incremental)
+        if law is not None:
+            self._loop.adopt(law._loop)
 
     def step(self, now: Moment, state: Array, reference: Array) -> Command:
         """The law's command, with the inner loop that is to carry it out; on the ground without."""

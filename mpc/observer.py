@@ -99,6 +99,10 @@ class DisturbanceObserver:
         """(6,) acceleration along world x and y and along thrust [m/s^2], and angular acceleration, body, while thrust
         holds the weight [rad/s^2]."""
 
+    def adopt(self, estimate: Array) -> None:
+        """Go on from an estimate (6,)."""
+        self.estimate = np.minimum(np.maximum(estimate, -self.largest), self.largest)
+
     def update(self, measured: Array, predicted: Array) -> None:
         """Take note of a measured state (12,) and of what was predicted for it (12,), disturbances included."""
         now, then = measured.tolist(), predicted.tolist()

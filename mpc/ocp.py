@@ -18,7 +18,7 @@ from typing import NamedTuple
 import numpy as np
 import scipy.linalg
 
-from mpc.constraints import Bounds, Constraint, Rows
+from mpc.constraints import Bounds, Constraint, Rows, renumbered
 from mpc.model import LinearModel
 from quadsim.errors import ParameterError
 from quadsim.state import REFERENCE_STATES, Array
@@ -174,6 +174,13 @@ class Problem:
         l1 = np.concatenate([np.full(m, math.inf) if part.penalty is None else part.penalty.l1 for part, m in parts])
         l2 = np.concatenate([np.zeros(m) if part.penalty is None else part.penalty.l2 for part, m in parts])
         names = [part.name for part, m in parts for _ in range(m)]
+        first = np.cumsum([0, *(m for _, m in parts)])
+        slack = np.concatenate(
+            [
+                np.full(m, -1) if part.penalty is None else k + (0 if part.penalty.largest else 1) * np.arange(m)
+                for (part, m), k in zip(parts, first, strict=False)
+            ]
+        )
         of_states = C.any(axis=-1) if C.ndim == 2 else C.any(axis=(0, 2))
         of_input = ~of_states & ~E.any(1) & (np.count_nonzero(D, axis=1) == 1) & (D.max(axis=1, initial=0.0) == 1.0)
         bounded = np.flatnonzero((np.isfinite(lower) | np.isfinite(upper)).any(axis=0))
@@ -185,6 +192,7 @@ class Problem:
             upper=upper[:, bounded],
             l1=l1[bounded],
             l2=l2[bounded],
+            slack=renumbered(slack[bounded]),
             of_states=np.asarray(~D[bounded].any(axis=1) & ~E[bounded].any(axis=1)).reshape(bounded.size),
             input=np.where(np.isinf(l1) & of_input, np.argmax(D, axis=1), -1)[bounded],
             names=tuple(names[i] for i in bounded),

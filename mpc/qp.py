@@ -58,7 +58,7 @@ class QP:
 
 
 class QPRows:
-    """A problem's rows as a QP has them: bounds of single inputs in the box, a soft row as two with the same slack.
+    """A problem's rows as a QP has them: bounds of single inputs in the box, a soft row as one or two with its slack.
 
     Attributes:
         C, D, E: (K, n), or (N, K, n) where the steps' rows differ, (K, nu), (K, nu).
@@ -78,8 +78,8 @@ class QPRows:
         above = rows.soft[np.isfinite(rows.upper[:, rows.soft]).any(axis=0)]
         below = rows.soft[np.isfinite(rows.lower[:, rows.soft]).any(axis=0)]
         self._origin = origin = np.concatenate([hard, above, below])
-        of_rows = np.eye(len(rows.D))[:, rows.soft]
-        self.slack = np.concatenate([np.zeros((hard.size, rows.soft.size)), 0.0 - of_rows[above], of_rows[below]])
+        of_rows = (rows.slack[:, None] == np.arange(rows.slacks.size)).astype(float)
+        self.slack = np.concatenate([np.zeros((hard.size, rows.slacks.size)), 0.0 - of_rows[above], of_rows[below]])
         self.C, self.D, self.E, self.of_states = (
             rows.C[..., origin, :],
             rows.D[origin],
@@ -162,7 +162,7 @@ class Formulation(Protocol):
         ...
 
     def slacks(self, x: Array) -> Array:
-        """(N, m_s) the slacks of soft rows in a primal point."""
+        """(N, m_s) the slacks in a primal point."""
         ...
 
     def multipliers(self, solution: Solution) -> Array:

@@ -135,7 +135,7 @@ class MatrixBuilder:
         self._at, self._rows, objective = at, rows, problem.objective
         self._Q, self._Q_end = objective.weights[0], objective.terminal_weights[0]
         self._input_weight, self._move_weight = 2.0 * objective.Q_u, 2.0 * objective.move_weight
-        soft = problem.rows.soft
+        soft = problem.rows.slacks
         self._slack_weight = 2.0 * np.tile(problem.rows.l2[soft], at.N)[:, None, None]
         self._input_costs = {steps: self._input_cost(steps) for steps in (at.L, at.M)}
         if changing:  # of numbers in general position an entry is zero only where it always is
@@ -282,7 +282,7 @@ class Staged:
         steps = usual_steps(model.nu) if steps_per_stage is None else steps_per_stage
         if not isinstance(steps, int) or steps < 1:
             raise ParameterError("controller", "steps_per_stage", steps, "a whole number >= 1")
-        self._problem, self._rows, soft = problem, QPRows(problem), problem.rows.soft
+        self._problem, self._rows, soft = problem, QPRows(problem), problem.rows.slacks
         self._at = at = Layout(N, model.n, model.nu, soft.size, steps)
         self._builder = MatrixBuilder(problem, self._rows, at, changing=changing)
         self._linear = np.zeros(at.size)

@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from scenarios.api import make_controller as make_controller
     from scenarios.api import read as read
     from scenarios.api import resolve as resolve
+    from scenarios.api import start as start
     from scenarios.api import view as view
     from scenarios.benchmarks import bench_campaign as bench_campaign
     from scenarios.benchmarks import bench_flight as bench_flight
@@ -47,6 +48,8 @@ if TYPE_CHECKING:
     from scenarios.many_flights import replay as replay
     from scenarios.many_flights import reproduce as reproduce
     from scenarios.many_flights import sweep as sweep
+    from scenarios.many_flights import tune as tune
+    from scenarios.run import StartedFlight as StartedFlight
     from scenarios.schema.json_schema import scenario_schema as scenario_schema
     from scenarios.schema.scenario import Scenario as Scenario
     from scenarios.self_check import doctor as doctor
@@ -70,6 +73,7 @@ _PLACES = {
         "make_controller",
         "read",
         "resolve",
+        "start",
         "view",
     ),
     "scenarios.benchmarks": (
@@ -85,7 +89,8 @@ _PLACES = {
     "scenarios.export.in_the_loop": ("fly_exported",),
     "scenarios.flight": ("Flight",),
     "scenarios.junit": ("write_junit",),
-    "scenarios.many_flights": ("campaign", "replay", "reproduce", "sweep"),
+    "scenarios.many_flights": ("campaign", "replay", "reproduce", "sweep", "tune"),
+    "scenarios.run": ("StartedFlight",),
     "scenarios.schema.json_schema": ("scenario_schema",),
     "scenarios.schema.scenario": ("Scenario",),
     "scenarios.self_check": ("doctor",),

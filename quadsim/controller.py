@@ -142,7 +142,11 @@ def stopped(speeds: Array, horizon: int, phase: Phase) -> Command:
 
 
 class Controller(Protocol):
-    """A feedback law run once per control period."""
+    """A feedback law run once per control period.
+
+    One that takes over in flight may have a method `adopt(previous)`, called after `reset` with the controller before
+    it, from which it may copy what it has learnt and planned.
+    """
 
     @property
     def name(self) -> str:

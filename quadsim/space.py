@@ -10,7 +10,7 @@ import itertools
 import json
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from typing import Annotated, Any, ClassVar, Final, Literal, NamedTuple
 
@@ -27,10 +27,44 @@ _NAME: Final = {"pattern": "^[A-Za-z][A-Za-z0-9_-]*$"}
 _PARALLEL: Final = 1e-9
 """Determinant of three unit normals below which their planes are taken to have no common point."""
 
+_ROUNDING: Final = 1e-9
+"""Of lengths along a path [m]."""
+
 Name = Annotated[str, doc("what reports call it")]
 Pair = Annotated[tuple[Number, ...], Len(2, 2)]
 Sizes = Annotated[tuple[Positive, ...], Len(3, 3)]
 """Along x, y, z."""
+
+
+def _clearance(kind: str, size: Array, centre: Array, turn: Array, points: Array) -> tuple[Array, Array]:
+    """See `Solid.clearance`; of s solids of a kind, with sizes and centres (s, 1, 3), turns (s, 3, 3), at (s, K, 3)."""
+    over, ways = _excess(kind, size, (points - centre) @ turn)
+    outside = np.maximum(over, 0.0)
+    far = np.linalg.norm(outside, axis=-1)
+    nearest = np.take_along_axis(ways, over.argmax(axis=-1)[..., None, None], axis=-2)[..., 0, :]
+    away = (outside[..., None] * ways).sum(axis=-2) / np.where(far > 0.0, far, 1.0)[..., None]
+    normal = np.where((far > 0.0)[..., None], away, nearest) @ np.swapaxes(turn, -1, -2)
+    return far + np.minimum(over.max(axis=-1), 0.0), normal
+
+
+def _excess(kind: str, size: Array, local: Array) -> tuple[Array, Array]:
+    """How far points lie beyond each of the surfaces (..., K, j), orthogonal to each other, and the ways out."""
+    a, b = size[..., 0], size[..., 1]
+    sides = np.where(local < 0.0, -1.0, 1.0)
+    if kind == "box":
+        return np.abs(local) - size, sides[..., None] * np.eye(3)
+    core = local.copy()
+    if kind == "capsule":
+        core[..., 2] -= np.clip(core[..., 2], -b, b)
+    elif kind == "cylinder":
+        core[..., 2] = 0.0
+    radius = np.linalg.norm(core, axis=-1)
+    core[radius == 0.0] = (1.0, 0.0, 0.0)
+    out = core / np.where(radius > 0.0, radius, 1.0)[..., None]
+    if kind != "cylinder":
+        return (radius - a)[..., None], out[..., None, :]
+    along = sides[..., 2, None] * np.array([0.0, 0.0, 1.0])
+    return np.stack([radius - a, np.abs(local[..., 2]) - b], axis=-1), np.stack([out, along], axis=-2)
 
 
 class Solid(NamedTuple):
@@ -53,33 +87,7 @@ class Solid(NamedTuple):
 
         Both are exact, outside and inside; the nearest point of the surface is p - distance * normal.
         """
-        local = (points - self.centre) @ self.turn
-        over, ways = self._excess(local)
-        outside = np.maximum(over, 0.0)
-        far = np.linalg.norm(outside, axis=1)
-        nearest = np.take_along_axis(ways, over.argmax(axis=1)[:, None, None], axis=1)[:, 0]
-        away = (outside[:, :, None] * ways).sum(axis=1) / np.where(far > 0.0, far, 1.0)[:, None]
-        normal = np.where((far > 0.0)[:, None], away, nearest) @ self.turn.T
-        return far + np.minimum(over.max(axis=1), 0.0), normal
-
-    def _excess(self, local: Array) -> tuple[Array, Array]:
-        """How far points lie beyond each of the surfaces (K, j), orthogonal to each other, and the ways out."""
-        a, b, _ = self.size
-        sides = np.where(local < 0.0, -1.0, 1.0)
-        if self.kind == "box":
-            return np.abs(local) - self.size, sides[:, :, None] * np.eye(3)
-        core = local.copy()
-        if self.kind == "capsule":
-            core[:, 2] -= np.clip(core[:, 2], -b, b)
-        elif self.kind == "cylinder":
-            core[:, 2] = 0.0
-        radius = np.linalg.norm(core, axis=1)
-        core[radius == 0.0] = (1.0, 0.0, 0.0)
-        out = core / np.where(radius > 0.0, radius, 1.0)[:, None]
-        if self.kind != "cylinder":
-            return (radius - a)[:, None], out[:, None, :]
-        along = sides[:, 2, None] * np.array([0.0, 0.0, 1.0])
-        return np.stack([radius - a, np.abs(local[:, 2]) - b], axis=1), np.stack([out, along], axis=1)
+        return _clearance(self.kind, np.array(self.size), self.centre, self.turn, points)
 
     def support(self, ways: Array) -> Array:
         """(n, 3) its points farthest along ways (n, 3), relative to the obstacle's position [m]."""
@@ -167,6 +175,35 @@ class Obstacle:
     def clearance(self, t: Array, points: Array) -> Array:
         """(K,) signed distance [m]; inside a wall, whose solids overlap, at most that deep."""
         return self.clearances(t, points)[0].min(axis=0)
+
+
+class Solids:
+    """The solids of several obstacles, in their order, measured all at once."""
+
+    def __init__(self, obstacles: Sequence[Obstacle]) -> None:
+        self._obstacles = tuple(obstacles)
+        every = [(i, solid) for i, obstacle in enumerate(obstacles) for solid in obstacle.solids]
+        self.count = len(every)
+        self._still = np.array([obstacle.position for obstacle in obstacles], float).reshape(-1, 1, 3)
+        self._groups = []
+        for kind in sorted({solid.kind for _, solid in every}):
+            at = [k for k, (_, solid) in enumerate(every) if solid.kind == kind]
+            size, centre, turn = (
+                np.array([getattr(every[k][1], name) for k in at]) for name in ("size", "centre", "turn")
+            )
+            owners = np.array([every[k][0] for k in at])
+            self._groups.append((kind, np.array(at), owners, size[:, None], centre[:, None], turn))
+
+    def clearances(self, t: Array, points: Array) -> tuple[Array, Array]:
+        """Signed distances (s, K) [m] and normals (s, K, 3); see `Obstacle.clearances`."""
+        places = np.repeat(self._still, len(t), axis=1)
+        for i, obstacle in enumerate(self._obstacles):
+            if obstacle.moves:
+                places[i] = obstacle.places(t)
+        distance, normal = np.empty((self.count, len(t))), np.empty((self.count, len(t), 3))
+        for kind, at, owners, size, centre, turn in self._groups:
+            distance[at], normal[at] = _clearance(kind, size, centre, turn, points - places[owners])
+        return distance, normal
 
 
 def _upright(yaw: float) -> Array:
@@ -344,16 +381,52 @@ class Region:
 
 @dataclass(frozen=True, kw_only=True)
 class Corridor(Region):
-    """A convex region to stay in for a window of time."""
+    """A convex region to stay in for a window of time, or of the reference's path."""
 
     name: Name = field(metadata=_NAME)
     start: Annotated[Number, doc("[s] first time it holds")] = 0.0
     stop: Annotated[Number, doc("[s] last time it holds; absent: the flight's end")] = math.inf
+    path: Annotated[
+        Annotated[tuple[NonNegative, ...], Len(2, 2)] | None,
+        doc("[m] instead of start and stop: from where to where the reference is along its path when it holds"),
+    ] = None
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        if self.path is not None:
+            if (self.start, self.stop) != (0.0, math.inf):
+                raise InputError(f"path must be absent where start or stop is given; got {list(self.path)}")
+            if not self.path[0] < self.path[1]:
+                raise InputError(f"path must be where it begins, and farther on where it ends; got {list(self.path)}")
         if not self.start <= self.stop:
             raise ParameterError(f"corridors.{self.name}", "stop", self.stop, f"at least start = {self.start}")
+
+    def timed(self, t: Array, positions: Array) -> Corridor:
+        """The same with its window along the path as one of time; itself where it has none.
+
+        Args:
+            t: (K,) rising times [s].
+            positions: (K, 3) of the reference then, in straight lines in between [m].
+
+        Raises:
+            ParameterError: the path is over before the window begins.
+        """
+        if self.path is None:
+            return self
+        steps = np.linalg.norm(np.diff(positions, axis=0), axis=1)
+        gone = np.concatenate([[0.0], np.cumsum(steps)])
+        begin, end = self.path
+        if gone[-1] < begin - _ROUNDING:
+            rule = f"within the {gone[-1]:.4g} m of the reference's path that are flown"
+            raise ParameterError(f"corridors.{self.name}", "path", list(self.path), rule)
+        # Where the reference rests at the window's begin or end, the window has all of that rest.
+        first, last = np.searchsorted(gone, begin - _ROUNDING), np.searchsorted(gone, end + _ROUNDING, "right") - 1
+
+        def passed(k: np.intp, at: float) -> float:
+            return float(t[k] + (at - gone[k]) / steps[k] * (t[k + 1] - t[k]))
+
+        start = float(t[0]) if first == 0 else passed(first - 1, begin)
+        return replace(self, path=None, start=start, stop=passed(last, end) if last < len(steps) else math.inf)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -388,7 +461,7 @@ def shape_from_json(entry: Mapping[str, Any]) -> Constraining:
         raise UnknownNameError("shape", str(entry.get("type")), SHAPES)
     kind = SHAPES[entry["type"]]
     values = {name: _frozen(value) for name, value in entry.items() if name != "type"}
-    if "path" in values:
+    if "path" in values and issubclass(kind, Obstacle):
         values["path"] = tuple(Place(time=time, position=tuple(p)) for time, p in map(_place, entry["path"]))
     shape: Constraining = kind(**values)
     points = np.zeros((1, 3))

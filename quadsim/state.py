@@ -139,6 +139,27 @@ def tilt(states: Array) -> Array:
     return angle
 
 
+class YawTurns:
+    """Keeps count of a yaw's whole turns, sample by sample.
+
+    Past the vertical, Euler's yaw turns by 180 deg either way: upside down it is nearest to the last one, and upright
+    again nearest to the last upright one.  A loop so leaves the yaw as it was.
+    """
+
+    def __init__(self, yaw: float) -> None:
+        self._last = self._upright = yaw
+
+    def unwrapped(self, euler: Array) -> float:
+        """The yaw [rad] of roll, pitch, yaw (3,), with its turns; where not finite, as it is."""
+        roll, pitch, yaw = euler.tolist()
+        if math.isfinite(roll + pitch + yaw):
+            upright = math.cos(roll) * math.cos(pitch) >= 0.0
+            yaw += 2.0 * math.pi * round(((self._upright if upright else self._last) - yaw) / (2.0 * math.pi))
+            self._last = yaw
+            self._upright = yaw if upright else self._upright
+        return float(yaw)
+
+
 def make_state(
     *,
     position: tuple[float, float, float] = (0.0, 0.0, 0.0),

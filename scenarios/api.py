@@ -15,6 +15,7 @@ from quadsim.errors import FileError, InputError, ParameterError
 from quadsim.flight import rundir
 from quadsim.outputs import real_path
 from quadsim.outputs.paths import require_inside
+from quadsim.sim.effects import Force
 from scenarios.build import build_controller
 from scenarios.build import resolve as write_out
 from scenarios.flight import Flight, Outputs
@@ -25,7 +26,8 @@ from scenarios.parts.randomness import generator
 from scenarios.parts.vehicle import build_vehicle
 from scenarios.progress import Progress, reporting
 from scenarios.reaudit import Reaudit, reaudit, stored_scenario
-from scenarios.run import fly_scenario, run_scenario
+from scenarios.run import StartedFlight, fly_scenario, run_scenario
+from scenarios.run import start as start_flight
 from scenarios.schema.course import CsvSpec
 from scenarios.schema.scenario import Scenario
 
@@ -192,6 +194,50 @@ def fly(
         >>> bool(quadsim.fly(scenario, forces=[side_wind]).state["x"][-1] > 0.01)
         True
     """
+    referring, law, own = _set_up(scenario, controller, forces)
+    with reporting(progress) as report:
+        if out is None:
+            return fly_scenario(referring, report, law, own)
+        outputs = Outputs(video=video, recording=recording, figures=figures)
+        return run_scenario(referring, real_path(out), outputs, report, law, own)
+
+
+def start(
+    scenario: Scenario | str | Path,
+    *,
+    controller: object = None,
+    forces: Sequence[object] = (),
+    live: bool = False,
+    recorded: bool = True,
+) -> StartedFlight:
+    """Build everything that a flight needs, for a script of one's own to fly it period by period.
+
+    Args:
+        scenario: what is flown, or its name or file.
+        controller: as of `fly`.
+        forces: as of `fly`.
+        live: whether anything may be applied to it that can happen to its vehicle; else what its scenario's events are
+            of, and set-points, stalls, rotor losses and lags, and other controllers.
+        recorded: whether all periods are kept, some 10 kB each; without them there is no `StartedFlight.flight`.
+
+    Raises:
+        InputError: the scenario cannot be flown, or the controller cannot be set up.
+
+    Examples:
+        >>> import quadsim
+        >>> with quadsim.start("hover") as started:
+        ...     while started.k < 20:
+        ...         sample = started.step()
+        ...     started.flight().outcome
+        'satisfied'
+    """
+    return start_flight(*_set_up(scenario, controller, forces), live=live, recorded=recorded)
+
+
+def _set_up(
+    scenario: Scenario | str | Path, controller: object, forces: Sequence[object]
+) -> tuple[Scenario, Controller | None, list[Force] | None]:
+    """A scenario that refers to what was passed in, checked, and these parts as the closed loop takes them."""
     if not isinstance(scenario, Scenario):
         scenario = load(scenario)
     referring, law, own = named_by(scenario, controller, forces), None, None
@@ -203,11 +249,7 @@ def fly(
         own = [build_force(spec, vehicle, rng) for spec in scenario.forces]
         own += [set_up_force(force, vehicle, rng) for force in forces]
     check_parts(referring)
-    with reporting(progress) as report:
-        if out is None:
-            return fly_scenario(referring, report, law, own)
-        outputs = Outputs(video=video, recording=recording, figures=figures)
-        return run_scenario(referring, real_path(out), outputs, report, law, own)
+    return referring, law, own
 
 
 def read(directory: str | Path) -> Flight:

@@ -12,6 +12,7 @@ from quadsim.sim.effects import Force
 from quadsim.sim.phase import PhaseMonitor
 from quadsim.sim.plant import Plant
 from quadsim.vehicle import Vehicle
+from scenarios.courses.windows import timed_regions
 from scenarios.parts.controllers import make_controller, make_problem
 from scenarios.parts.effects import build_changes, build_wind
 from scenarios.parts.plugin import build_force
@@ -84,5 +85,5 @@ def build_controller(scenario: Scenario, vehicle: Vehicle) -> Controller:
     Raises:
         InputError: it cannot be made from these numbers, or its code cannot be found or called.
     """
-    shapes = (*scenario.obstacles, *scenario.regions)
+    shapes = (*scenario.obstacles, *timed_regions(scenario))
     return make_controller(scenario.controller, vehicle, scenario.control_period, shapes)

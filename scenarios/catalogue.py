@@ -18,6 +18,8 @@ from scenarios.shipped import (
     paper_path,
     scenario_names,
     scenario_path,
+    tuning_names,
+    tuning_path,
 )
 
 
@@ -50,6 +52,7 @@ class Catalogue:
     Attributes:
         scenarios: for `load` and `fly`.
         campaigns: for `campaign`, with a sentence each, as all that follow.
+        tunings: for `tune`.
         vehicles: for `load_vehicle` and `vehicle.file`.
         controllers: for `controller.type`.
         papers: for `reproduce`, by their titles.
@@ -63,6 +66,7 @@ class Catalogue:
 
     scenarios: Mapping[str, LibraryScenario]
     campaigns: Mapping[str, str]
+    tunings: Mapping[str, str]
     vehicles: Mapping[str, str]
     controllers: Mapping[str, str]
     papers: Mapping[str, str]
@@ -76,6 +80,7 @@ class Catalogue:
             "groups": {each.name: each.group for each in shipped},
             "expected": {each.name: each.expect for each in shipped},
             "campaigns": dict(self.campaigns),
+            "tunings": dict(self.tunings),
             "vehicles": dict(self.vehicles),
             "controllers": dict(self.controllers),
             "papers": dict(self.papers),
@@ -103,7 +108,7 @@ def scenarios() -> dict[str, LibraryScenario]:
 
 
 def catalogue() -> Catalogue:
-    """Everything that ships: scenarios, campaigns, vehicles, controllers and QP solvers.
+    """Everything that ships: scenarios, campaigns, tunings, vehicles, controllers and QP solvers.
 
     Examples:
         >>> import quadsim
@@ -116,6 +121,7 @@ def catalogue() -> Catalogue:
     return Catalogue(
         scenarios=scenarios(),
         campaigns={name: read_toml(campaign_path(name))["description"] for name in campaign_names()},
+        tunings={name: read_toml(tuning_path(name))["description"] for name in tuning_names()},
         vehicles={name: load_vehicle(vehicle_path(name)).description for name in vehicle_names()},
         controllers=CONTROLLERS,
         papers={name: read_toml(paper_path(name))["title"] for name in paper_names()},

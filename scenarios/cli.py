@@ -71,6 +71,8 @@ def make_parser() -> argparse.ArgumentParser:
     compare.add_argument("--cost", action=argparse.BooleanOptionalAction, default=None, help=cost)
     compare.add_argument("--markdown", action="store_true", help="print the table as Markdown")
 
+    _add_live(command("live", help="fly in the browser: push, turn every knob, keep it as a scenario"))
+
     video = command("video", help="film a finished run")
     video.add_argument("run", metavar="RUN", help="run directory")
     video.add_argument("--out", metavar="FILE", help="MP4 or GIF file (default: RUN/flight.mp4)")
@@ -123,11 +125,25 @@ def make_parser() -> argparse.ArgumentParser:
     export.add_argument("--fly", action="store_true", help=fly)
     _add_settings(export)
 
+    _add_tune(command("tune", help="search fields of a scenario; the answer is held against the start on fresh draws"))
     _add_bench(command("bench", help="measure QP solvers, a flight, a film, and what controllers survive"))
 
     doctor = command("doctor", help="what this machine can do")
     doctor.add_argument("--json", action="store_true", help="as JSON on stdout")
     return parser
+
+
+def _add_live(live: argparse.ArgumentParser) -> None:
+    add = live.add_argument
+    add("scenario", metavar="SCENARIO_OR_RUN", help=f"{_SCENARIO}, or the directory of a run to fly on from")
+    add("--against", metavar="SCENARIO", help="a second vehicle, flown by the controller of this scenario")
+    add("--out", metavar="DIR", help="run directory (default: runs/SCENARIO-live)")
+    add("--script", metavar="FILE", help="TOML file of inputs and times: no browser, as fast as it goes")
+    add("--port", **_NUMBER, default=0, help="to listen on (default: any free one)")
+    add("--host", metavar="ADDRESS", default="127.0.0.1", help="other than this machine: for a network that you trust")
+    add("--browser", action=argparse.BooleanOptionalAction, default=True, help="open the browser")
+    add("--video", action=argparse.BooleanOptionalAction, default=False, help="film what was flown")
+    _add_settings(live)
 
 
 def _add_campaign(campaign: argparse.ArgumentParser) -> None:
@@ -146,6 +162,19 @@ def _add_campaign(campaign: argparse.ArgumentParser) -> None:
     add("--report", action=argparse.BooleanOptionalAction, default=True, help="write the report, an HTML page")
     add("--junit", metavar="FILE", help="also write the requirements' verdicts as JUnit XML")
     _add_settings(campaign)
+    add("--json", **_SUMMARY)
+
+
+def _add_tune(tune: argparse.ArgumentParser) -> None:
+    add = tune.add_argument
+    add("file", metavar="FILE", help="name of a tuning that ships, or path to a TOML file")
+    add("--out", metavar="DIR", help="tuning's directory (default: runs/tunings/NAME)")
+    add("--trials", **_NUMBER, help="so many candidates instead of the file's")
+    add("--seed", **_NUMBER, help="replace the seed, of the search and of its draws")
+    add("--workers", **_NUMBER, help="processes (default: one per core)")
+    add("--cluster", metavar="ADDRESS", help="fly on a Dask cluster, as quadsim campaign does")
+    add("--resume", action="store_true", help="go on with what is there")
+    add("--report", action=argparse.BooleanOptionalAction, default=True, help="write the report, HTML pages")
     add("--json", **_SUMMARY)
 
 

@@ -30,6 +30,7 @@ from scenarios.courses.feasibility_check import report
 from scenarios.courses.make import build_course_steps
 from scenarios.machine import machine, usable_cores, versions
 from scenarios.parts.effects import build_computation
+from scenarios.parts.story import story
 from scenarios.progress import Progress, silent
 from scenarios.schema.scenario import Scenario, Verdict
 
@@ -128,7 +129,11 @@ class Flight:
             return self.recorded.get("diagnosis")
         from scenarios.diagnosis import diagnose
 
-        return None if self.unanswered is None else diagnose(self.unanswered, self.scenario, self.vehicle)
+        if self.unanswered is None:
+            return None
+        spec = self.scenario.controller_at(self.unanswered.time)
+        posed = self.scenario.model_copy(update={"controller": spec, "events": []})
+        return diagnose(self.unanswered, posed, self.vehicle)
 
     @property
     def audit(self) -> tuple[Finding, ...]:
@@ -370,6 +375,7 @@ def summarise(flight: Flight) -> dict[str, Any]:
         "duration": round(log.control.t.size * scenario.control_period, 9),
         "seed": scenario.seed,
         "course": asdict(report(scenario, flight.vehicle)),
+        **({"events": events} if (events := story(scenario, log.control.t.size * scenario.control_period)) else {}),
         "tracking": numbers["tracking"],
         "constraints": [rundir.limit_to_json(finding) for finding in flight.findings],
         "control": numbers["control"],

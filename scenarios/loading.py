@@ -17,8 +17,8 @@ from quadsim.sim.rigid_body import check_free
 from quadsim.state import POSITION
 from quadsim.vehicle import Vehicle
 from scenarios.courses.make import build_course, build_motion, located
-from scenarios.parts.effects import build_changes, moving_air
-from scenarios.parts.limits import space_limits
+from scenarios.limits import space_limits
+from scenarios.parts.effects import build_changes, check_changes, moving_air
 from scenarios.parts.vehicle import build_initial_state, build_vehicle
 from scenarios.schema.bases import read_scenario, replaced_tables, retyped
 from scenarios.schema.course import CsvSpec
@@ -41,8 +41,10 @@ def check_parts(scenario: Scenario) -> None:
     load = scenario.effects.resolved(vehicle).load or Load()
     mass_properties(vehicle, load, load.payloads)
     moving_air(scenario, vehicle)
+    changes = build_changes(scenario)
+    check_changes(scenario, vehicle, changes)
     if scenario.plant.integrator == "rk4":
-        check_free(scenario.effects.resolved(vehicle), build_changes(scenario), scenario.obstacles)
+        check_free(scenario.effects.resolved(vehicle), changes, scenario.obstacles)
     course = build_course(scenario)
     if scenario.initial.on_reference and course.derivatives is None:
         rule = f"false where the course states positions alone, as one of type {scenario.reference.type} does"

@@ -1,4 +1,4 @@
-"""What `import quadsim` hands out of many flights: sweeps, campaigns, a campaign's flight again, and papers."""
+"""What `import quadsim` hands out of many flights: sweeps, campaigns, one flight again, tuning, and papers."""
 
 from __future__ import annotations
 
@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from scenarios.campaign.run import Result
     from scenarios.campaign.sweep import Sweep
     from scenarios.papers.reproduction import Reproduction
+    from scenarios.tuning.run import TuningResult
 
 
 def sweep(
@@ -150,6 +151,83 @@ def campaign(
     except KeyboardInterrupt:
         raise KeyboardInterrupt(f"{target} has what was flown") from None
     return replace(result, judgements=tuple(judge(result.table, requirement) for requirement in requirements))
+
+
+def tune(
+    tuning: str | Path,
+    *,
+    out: str | Path | None = None,
+    trials: int | None = None,
+    seed: int | None = None,
+    workers: int | None = None,
+    cluster: str | None = None,
+    resume: bool = False,
+    report: bool = True,
+    progress: bool | Literal["lines"] = True,
+) -> TuningResult:
+    """Search fields of a scenario, and hold the answer against the start on fresh draws.
+
+    Args:
+        tuning: one that ships, or a tuning file.
+        out: its directory, `runs/tunings/NAME` where absent.
+        trials: candidates, instead of the file's.
+        seed: of the search and its draws, instead of the file's.
+        workers: processes that fly; one per usable core where absent.
+        cluster: a dask cluster that flies instead, as of `--cluster`.
+        resume: whether to go on with what the directory holds.
+        report: whether to write the pages and their figures.
+        progress: whether to show a bar on a terminal; "lines" for a line now and then where stderr is none.
+
+    Returns:
+        `best` (the scenario that was found), `summary` (the search, the fresh flights, how optimistic the one was of
+        the other), `comparison` (flight by flight), `holds`, and the `directory`.
+
+    Raises:
+        InputError: something cannot be flown so.
+        MissingPackageError: the extra `tune` is not installed.
+        OutputError: a tuning is there already, or the directory cannot be written.
+        KeyboardInterrupt: a person stopped it; what was flown is there, and `resume` goes on with it.
+
+    Examples:
+        >>> import tempfile, pathlib, quadsim
+        >>> text = '''
+        ... name = "little"
+        ... trials = 2
+        ... batch = 2
+        ... flights = [1]
+        ... require = "P(lost) < 0.9 @ 50%"
+        ... fresh = { flights = 2 }
+        ... objectives = [{ name = "error", expression = "rmse.z" }]
+        ... campaign = { scenario = "hover", set = { duration = 0.5, constraints = [] } }
+        ... [[search]]
+        ... name = "horizon"
+        ... fields = ["controller.horizon"]
+        ... distribution = "integer"
+        ... low = 10
+        ... high = 20
+        ... '''
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     file = pathlib.Path(folder) / "little.toml"
+        ...     _ = file.write_text(text)
+        ...     found = quadsim.tune(file, out=folder + "/little", workers=1, report=False)
+        >>> len(found.summary["candidates"]), found.holds
+        (3, True)
+    """
+    from scenarios.commands.campaign_console import progress as bar
+    from scenarios.tuning.plan import load_tuning
+    from scenarios.tuning.run import tune as carry_out
+    from scenarios.tuning.search import require_optuna
+
+    if cluster is not None and workers is not None:
+        raise ParameterError("", "--workers", workers, "absent where --cluster says who flies")
+    require_optuna()
+    plan = load_tuning(str(tuning), trials=trials, seed=seed)
+    target = real_path(Path("runs") / "tunings" / plan.spec.name if out is None else out)
+    try:
+        with bar(enabled=bool(progress), lines=progress == "lines") as watch:
+            return carry_out(plan, target, make_engine(workers, cluster), resume=resume, report=report, watch=watch)
+    except KeyboardInterrupt:
+        raise KeyboardInterrupt(f"{target} has what was flown") from None
 
 
 def replay(

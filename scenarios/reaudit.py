@@ -21,8 +21,8 @@ from quadsim.flight import metrics, rundir
 from quadsim.flight.audit import Finding, audit
 from quadsim.flight.log import FlightLog
 from quadsim.flight.parquet import FLIGHT_FILE, HORIZON_FILE, PLANT_FILE, TIMING_FILE
+from scenarios.limits import build_limits
 from scenarios.loading import parse_scenario
-from scenarios.parts.limits import build_limits
 from scenarios.schema.bases import read_whole
 from scenarios.schema.plugin import LAWS, is_plugin
 from scenarios.schema.scenario import Scenario

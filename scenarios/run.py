@@ -2,36 +2,88 @@
 
 from __future__ import annotations
 
+import math
 import time as clock
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
-from threadpoolctl import threadpool_limits
+import numpy as np
 
-from mpc.ocp import Unanswered
-from quadsim.controller import Controller
+from quadsim.controller import Command, Controller
+from quadsim.errors import InputError, ParameterError
 from quadsim.flight import rundir
-from quadsim.flight.audit import audit
+from quadsim.flight.audit import audit, smallest_margins
 from quadsim.flight.log import FlightLog
 from quadsim.outputs import writing
 from quadsim.sim.effects import Force
-from quadsim.sim.loop import fly
+from quadsim.sim.loop import ClosedLoop, Observation, Reference, Sample, complete, one_period
 from quadsim.sim.navigation import Navigation
 from quadsim.sim.plant import Plant
 from quadsim.state import Array
 from quadsim.vehicle import Vehicle
 from scenarios.build import build_controller, build_ground, build_plant, resolve
-from scenarios.courses.make import build_motion, build_reference
+from scenarios.courses.make import build_motion, follow_course
 from scenarios.flight import Flight, Outputs, write_run
 from scenarios.gc_tuning import frozen
+from scenarios.limits import build_limits
+from scenarios.one_thread import ONE_THREAD
 from scenarios.parts.effects import build_computation
-from scenarios.parts.limits import build_limits
+from scenarios.parts.live import FlightEvents, Successor, unanswered_by
 from scenarios.parts.navigation import build_navigation
+from scenarios.parts.neutral import prepared
 from scenarios.parts.randomness import generator
 from scenarios.parts.vehicle import build_initial_speeds, build_initial_state, build_vehicle
 from scenarios.progress import Progress, silent
-from scenarios.schema.controller import NonlinearSpec
-from scenarios.schema.scenario import Scenario
+from scenarios.schema.controller import ControllerSpec, NonlinearSpec
+from scenarios.schema.events import ControllerEvent, Event, SetpointEvent
+from scenarios.schema.scenario import LONGEST_FLIGHT, MOST_STEPS, Scenario
+
+
+def closed_loop(
+    scenario: Scenario,
+    vehicle: Vehicle,
+    plant: Plant,
+    controller: Controller,
+    reference: Array | Reference,
+    *,
+    navigation: Navigation | None,
+    recorded: bool = True,
+) -> ClosedLoop:
+    """The loop of a scenario, at t = 0.
+
+    Args:
+        scenario: what is flown.
+        vehicle: the modelled vehicle.
+        plant: see `scenarios.build.build_plant`.
+        controller: see `scenarios.build.build_controller`.
+        reference: (K + N, 4), or an object; see `scenarios.courses.make`.
+        navigation: see `scenarios.parts.navigation.build_navigation`.
+        recorded: whether all periods are kept.
+    """
+    motion = build_motion(scenario, vehicle)
+    return ClosedLoop(
+        plant,
+        controller,
+        reference,
+        initial_state=build_initial_state(scenario, motion),
+        initial_speeds=build_initial_speeds(scenario, vehicle),
+        steps_per_period=scenario.steps_per_period,
+        navigation=navigation,
+        computation=build_computation(scenario),
+        rng=generator(scenario.seed, "computation"),
+        ground=build_ground(scenario, vehicle),
+        loss=scenario.lost.limits,
+        motion=motion,
+        quaternions=needs_quaternions(scenario),
+        recorded=recorded,
+    )
+
+
+def needs_quaternions(scenario: Scenario) -> bool:
+    """Whether one of its controllers flies at any attitude."""
+    specs = (scenario.controller, *(spec for _, spec in scenario.controller_changes))
+    return any(isinstance(spec, NonlinearSpec) for spec in specs)
 
 
 def fly_once(
@@ -47,33 +99,259 @@ def fly_once(
     """Fly a scenario with a plant and a controller that were built for it, undisturbed by Python's cycle collector.
 
     Args:
-        scenario: what is flown.
+        scenario: what is flown; without events `setpoint` and `controller`, which are not of these parts.
         vehicle: the modelled vehicle.
-        plant: see `scenarios.build.build_plant`.
-        controller: see `scenarios.build.build_controller`.
-        reference: (K + N, 4); see `scenarios.courses.make.build_reference`.
-        navigation: see `scenarios.parts.navigation.build_navigation`.
+        plant: see `closed_loop`, as the others.
+        controller: what flies it.
+        reference: (K + N, 4).
+        navigation: what tells the controller the state.
         progress: called with the number of periods flown, after each.
     """
-    motion = build_motion(scenario, vehicle)
+    for event in scenario.events:
+        if isinstance(event, SetpointEvent | ControllerEvent):
+            raise ParameterError("events", "type", event.type, "another one where the parts were built before")
+    loop = closed_loop(scenario, vehicle, plant, controller, reference, navigation=navigation)
     with frozen():
-        return fly(
-            plant,
-            controller,
-            reference,
-            initial_state=build_initial_state(scenario, motion),
-            initial_speeds=build_initial_speeds(scenario, vehicle),
-            periods=scenario.periods,
-            steps_per_period=scenario.steps_per_period,
-            navigation=navigation,
-            computation=build_computation(scenario),
-            rng=generator(scenario.seed, "computation"),
-            ground=build_ground(scenario, vehicle),
-            loss=scenario.lost.limits,
-            motion=motion,
-            quaternions=isinstance(scenario.controller, NonlinearSpec),
-            progress=progress,
+        complete(loop, periods=scenario.periods, progress=progress)
+    return loop.log()
+
+
+class StartedFlight:
+    """A flight that is flown period by period: everything built and checked, nothing flown yet.
+
+    What happens on the way comes from the scenario's events, and from `apply`.  A period depends on these and on the
+    seed alone, never on a clock: the scenario of `flight` flies to the same bits.  Linear algebra is held to one
+    thread in each step.  It is for one thread at a time, but for `successor`; it owns native memory: `close` it, or use
+    it as a context manager.
+
+    Attributes:
+        vehicle: the modelled vehicle.
+        limits: what the flight is audited against.
+        loop: the closed loop; its `controller` is what flies now.
+
+    Examples:
+        >>> import quadsim
+        >>> with quadsim.start("hover", live=True) as started:
+        ...     while started.k < 40:
+        ...         sample = started.step()
+        ...         if started.k == 20:
+        ...             event = started.apply({"type": "push", "duration": 0.5, "force": [2.0, 0.0, 0.0]})
+        ...     flight = started.flight()
+        >>> event.at, flight.time.size, bool(flight.state["x"][-1] > 0.01)
+        (1.0, 40, True)
+        >>> bool((quadsim.fly(flight.scenario).command == flight.command).all())
+        True
+    """
+
+    def __init__(
+        self,
+        scenario: Scenario,
+        law: Controller | None = None,
+        forces: Sequence[Force] | None = None,
+        *,
+        recorded: bool = True,
+    ) -> None:
+        """Set up at t = 0; see `start`."""
+        self._started, self.vehicle, self.limits = scenario, build_vehicle(scenario), build_limits(scenario)
+        ONE_THREAD.look_again()
+        with ONE_THREAD:
+            if law is not None and any(isinstance(event, ControllerEvent) for event in scenario.events):
+                raise ParameterError("", "controller", law, "absent where an event changes the scenario's controller")
+            controller = self._build(scenario.controller) if law is None else law
+            for _, spec in scenario.controller_changes:
+                self._build(spec)  # to be refused before anything is flown; one by one, as each may take megabytes
+            self._law = controller.name, controller.solver
+            self._plant = build_plant(scenario, self.vehicle, forces=forces)
+            self._navigation = build_navigation(scenario, self.vehicle)
+            started = clock.perf_counter()
+            reference = follow_course(scenario)
+            self.loop = closed_loop(
+                scenario,
+                self.vehicle,
+                self._plant,
+                controller,
+                reference,
+                navigation=self._navigation,
+                recorded=recorded,
+            )
+            self._simulate_s = clock.perf_counter() - started
+        self._events = FlightEvents(
+            scenario,
+            self.vehicle,
+            plant=self._plant,
+            navigation=self._navigation,
+            reference=reference,
+            loop=self.loop,
+            build=self._build if law is None else None,
         )
+        self._longest = controller.horizon
+
+    def __enter__(self) -> StartedFlight:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Give back what the plant holds; what was flown stays, and nothing more is."""
+        self._events.close()
+        self._plant.close()
+
+    @property
+    def scenario(self) -> Scenario:
+        """What is flown, with the events that were applied."""
+        return self._events.scenario
+
+    @property
+    def k(self) -> int:
+        """Control periods flown so far."""
+        return self.loop.k
+
+    @property
+    def done(self) -> bool:
+        """Whether it has come to its scenario's end, or ended before; without an early end it may be flown on."""
+        return self.loop.reason is not None or self.k >= self.scenario.periods
+
+    @property
+    def observation(self) -> Observation:
+        """What the period that starts now begins with; what is applied from then on acts in the one after it.
+
+        Raises:
+            FlightError: the vehicle is lost; the flight has ended.
+        """
+        with ONE_THREAD:
+            return self.loop.observation
+
+    def step(self, command: Command | Array | None = None) -> Sample:
+        """Fly one control period.
+
+        Args:
+            command: what to hold instead of the controller's answer: a command, or (4,) rotor speeds [rad/s].  Its
+                scenario does not know of it, and flies without.
+
+        Raises:
+            FlightError: the flight has ended in this period, which is not part of it.
+            InputError: it had ended before, is closed, or is as long as any may be.
+        """
+        if self.loop.before is None:
+            raise InputError("the flight is closed")
+        period, self._longest = self._started.control_period, max(self._longest, self.loop.controller.horizon)
+        most = MOST_STEPS // max(self._started.steps_per_period, self._longest)
+        if self.k >= min(most, math.floor(LONGEST_FLIGHT / period + 1e-6)):
+            raise InputError(f"a flight has at most {self.k} control periods of {period} s")
+        if command is not None and not isinstance(command, Command):
+            speeds = np.asarray(command, float)
+            command = Command(speeds=speeds, plan=np.tile(speeds, (self.loop.controller.horizon, 1)))
+        started = clock.perf_counter()
+        try:
+            with ONE_THREAD:
+                return self.loop.step(command)
+        finally:
+            self._simulate_s += clock.perf_counter() - started
+
+    def complete(self, progress: Progress = silent) -> None:
+        """Fly on to the scenario's end; a flight error or Ctrl-C ends it early, in order."""
+        started, periods = clock.perf_counter(), self.scenario.periods
+        progress("flight", self.k, periods)
+        with ONE_THREAD, frozen():
+            complete(self.loop, periods=periods, progress=lambda done: progress("flight", done, periods))
+        self._simulate_s += clock.perf_counter() - started
+
+    def apply(self, event: Event | Mapping[str, Any], successor: Successor | None = None) -> Event:
+        """Let something happen from the next period on that is not observed yet, as an event of the file would.
+
+        Args:
+            event: an entry of `events`; its `at` follows.
+            successor: of an event `controller`, what `successor` gave for its fields; else it is built here.
+
+        Returns:
+            The event with its time, as the scenario has it now.
+
+        Raises:
+            InputError: it is not allowed, or the flight was not started for events of its kind; nothing has changed.
+        """
+        return self._events.apply(event, successor)
+
+    def successor(self, fields: Mapping[str, Any]) -> Successor:
+        """A controller of which some fields of `[controller]` are other than now, built; from any thread.
+
+        Args:
+            fields: as of an event `controller`.
+
+        Raises:
+            InputError: it cannot be built.
+        """
+        return self._events.successor(fields)
+
+    def margins(self, sample: Sample | None = None) -> dict[str, float]:
+        """The signed margin of each constraint at its worst within one period; negative = violated.
+
+        At the physics rate, begin and end included, in the constraint's unit; NaN outside its time window.
+
+        Args:
+            sample: which period; the last one flown where absent.
+        """
+        sample = self.loop.last if sample is None else sample
+        if sample is None:
+            raise InputError("no period has been flown yet")
+        return smallest_margins(one_period(sample, self._plant.timestep), self.limits)
+
+    def violations(self, sample: Sample | None = None) -> dict[str, float]:
+        """How far each constraint is exceeded beyond its tolerance within one period: g <= 0 where it holds.
+
+        In its unit, at its worst; minus infinity outside its time window.
+
+        Args:
+            sample: which period; the last one flown where absent.
+        """
+        margins = self.margins(sample)
+        beyond = {limit.name: -(margins[limit.name] + limit.tolerance) for limit in self.limits}
+        return {name: -math.inf if math.isnan(value) else value for name, value in beyond.items()}
+
+    def flight(self) -> Flight:
+        """What has been flown so far, audited; its scenario is as long, and flies to the same bits."""
+        scenario = self._events.flown()
+        self.loop.quaternions = needs_quaternions(scenario)
+        log = self.loop.log()
+        return Flight(
+            scenario=resolve(scenario, self.vehicle),
+            vehicle=self.vehicle,
+            log=log,
+            findings=audit(log, self.limits),
+            controller=self._law[0],
+            solver=self._law[1],
+            simulate_s=self._simulate_s,
+            tallies={} if self._navigation is None else self._navigation.tallies,
+            unanswered=self._events.unanswered or unanswered_by(self.loop.controller),
+        )
+
+    def _build(self, spec: ControllerSpec) -> Controller:
+        with ONE_THREAD:
+            return build_controller(self._started.model_copy(update={"controller": spec}), self.vehicle)
+
+
+def start(
+    scenario: Scenario,
+    law: Controller | None = None,
+    forces: Sequence[Force] | None = None,
+    *,
+    live: bool = False,
+    recorded: bool = True,
+) -> StartedFlight:
+    """Build everything that a scenario's flight needs, and fly nothing yet.
+
+    Args:
+        scenario: what is flown.
+        law: who flies it, instead of what is built from the scenario's `controller`.
+        forces: what acts on it, instead of what is built from the scenario's `forces`.
+        live: whether anything may happen in it that can happen to its vehicle; else what its scenario's events are of.
+        recorded: whether all periods are kept, for `StartedFlight.flight`: some 10 kB each.
+
+    Raises:
+        InputError: something cannot be built.
+    """
+    flown = prepared(scenario, build_vehicle(scenario)) if live else scenario
+    return StartedFlight(flown, law, forces, recorded=recorded)
 
 
 def fly_scenario(
@@ -92,36 +370,9 @@ def fly_scenario(
         law: who flies it, instead of what is built from the scenario's `controller`.
         forces: what acts on it, instead of what is built from the scenario's `forces`.
     """
-    vehicle = build_vehicle(scenario)
-    with threadpool_limits(limits=1):
-        controller = build_controller(scenario, vehicle) if law is None else law
-        with build_plant(scenario, vehicle, forces=forces) as plant:
-            navigation = build_navigation(scenario, vehicle)
-            started = clock.perf_counter()
-            reference = build_reference(scenario, scenario.periods + controller.horizon)
-            progress("flight", 0, scenario.periods)
-            log = fly_once(
-                scenario,
-                vehicle,
-                plant,
-                controller,
-                reference,
-                navigation=navigation,
-                progress=lambda done: progress("flight", done, scenario.periods),
-            )
-            simulate_s = clock.perf_counter() - started
-    unanswered = getattr(controller, "unanswered", None)  # a controller of another kind has none
-    return Flight(
-        scenario=resolve(scenario, vehicle),
-        vehicle=vehicle,
-        log=log,
-        findings=audit(log, build_limits(scenario)),
-        controller=controller.name,
-        solver=controller.solver,
-        simulate_s=simulate_s,
-        tallies={} if navigation is None else navigation.tallies,
-        unanswered=unanswered if isinstance(unanswered, Unanswered) else None,
-    )
+    with start(scenario, law, forces) as started:
+        started.complete(progress)
+        return started.flight()
 
 
 def run_scenario(

@@ -1,4 +1,4 @@
-"""What ships, by name: scenarios, campaigns and controllers.  Found without anything heavy, for `quadsim list`."""
+"""What ships, by name, from scenarios to papers.  Found without anything heavy, for `quadsim list`."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from quadsim.errors import FileError, UnknownNameError
 
 LIBRARY: Final = Path(__file__).resolve().parent / "library"
 CAMPAIGNS: Final = Path(__file__).resolve().parent / "campaigns"
+TUNINGS: Final = Path(__file__).resolve().parent / "tunings"
 PAPERS: Final = Path(__file__).resolve().parent / "papers"
 
 Group = Literal["paper", "papers", "courses", "air", "faults", "ground", "space", "sensors", "other"]
@@ -46,6 +47,16 @@ def campaign_names() -> list[str]:
 def campaign_path(name: str) -> Path:
     """The file of a campaign that ships; as `scenario_path`."""
     return _path("campaign", name, CAMPAIGNS)
+
+
+def tuning_names() -> list[str]:
+    """Names of the tunings that ship, sorted."""
+    return _names(TUNINGS)
+
+
+def tuning_path(name: str) -> Path:
+    """The file of a tuning that ships; as `scenario_path`."""
+    return _path("tuning", name, TUNINGS)
 
 
 def paper_names() -> list[str]:

@@ -49,6 +49,7 @@ LONG = (
     *("test_packaging.py", "mpc/test_diagnosis.py", "mpc/robust/test_tightening.py", "mpc/exact/test_shortcut.py"),
     *("mpc/fallback/test_fallback_flights.py", "scenarios/test_soak.py"),
     *("scenarios/campaign/statistics/test_drivers.py", "scenarios/papers/test_beyond.py"),
+    *("scenarios/tuning/test_run.py", "scenarios/tuning/report/test_tuning_page.py"),
 )
 """Modules that take longest; those not named take less than four seconds each."""
 

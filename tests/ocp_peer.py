@@ -114,18 +114,21 @@ def cost(problem: Problem, given: Period, plan: Array) -> float:
     total = float(np.square(residuals(problem, given, plan)).sum())
     for constraint in constraints(problem):
         if constraint.penalty is not None:
-            e = violation(constraint, given, plan)
-            total += float((e @ constraint.penalty.l1 + np.square(e) @ constraint.penalty.l2).sum())
+            e, penalty = violation(constraint, given, plan), constraint.penalty
+            l1, l2 = penalty.l1, penalty.l2
+            if penalty.largest:
+                e, l1, l2 = e.max(axis=1, keepdims=True), l1[:1], l2[:1]
+            total += float((e @ l1 + np.square(e) @ l2).sum())
     return total
 
 
 def dense_qp(problem: Problem, given: Period) -> QP:
-    """In [u(k); ..; u(k+N-1); e], the slacks e of soft rows time by time."""
+    """In [u(k); ..; u(k+N-1); e], the slacks e time by time."""
     N, nu = given.B.shape[0], given.B.shape[2]
     M, r0 = _probed(lambda plan: residuals(problem, given, plan), N, nu)
     hard: list[tuple[Array, Array, Array]] = []
     soft: list[tuple[Array, Array, Array]] = []
-    l1, l2 = np.zeros((N, 0)), np.zeros((N, 0))
+    l1, l2, shares = np.zeros((N, 0)), np.zeros((N, 0)), []
     for part in constraints(problem):
         slopes, known = _probed(lambda plan, part=part: values(part, given, plan).ravel(), N, nu)  # type: ignore[misc]
         m = part.lower.shape[-1]
@@ -136,20 +139,25 @@ def dense_qp(problem: Problem, given: Period) -> QP:
         rows = slopes.reshape(N, m, N * nu)[:, bounded], lower - known, upper - known
         (hard if part.penalty is None else soft).append(rows)
         if part.penalty is not None:
-            l1 = np.hstack([l1, np.tile(part.penalty.l1[bounded], (N, 1))])
-            l2 = np.hstack([l2, np.tile(part.penalty.l2[bounded], (N, 1))])
+            own = bounded if not part.penalty.largest else np.arange(m) == 0
+            shares.append(np.ones((bounded.sum(), 1)) if part.penalty.largest else np.eye(bounded.sum()))
+            l1 = np.hstack([l1, np.tile(part.penalty.l1[own], (N, 1))])
+            l2 = np.hstack([l2, np.tile(part.penalty.l2[own], (N, 1))])
     n_s = l1.size
     G, low, high = _stacked(hard, N * nu)
     S, soft_low, soft_high = _stacked(soft, N * nu)
-    none = np.zeros((len(G), n_s))
+    none, E = (
+        np.zeros((len(G), n_s)),
+        np.kron(np.eye(N), scipy.linalg.block_diag(*shares)) if shares else np.zeros((0, 0)),
+    )
     return QP(
         P=scipy.linalg.block_diag(2.0 * M.T @ M, np.diag(2.0 * l2.ravel())),
         c=np.concatenate([2.0 * M.T @ r0, l1.ravel()]),
         A=np.zeros((0, N * nu + n_s)),
         b=np.zeros(0),
-        G=np.vstack([np.hstack([G, none]), np.hstack([S, np.eye(n_s)]), np.hstack([S, -np.eye(n_s)])]),
-        h_l=np.concatenate([low, soft_low, np.full(n_s, -math.inf)]),
-        h_u=np.concatenate([high, np.full(n_s, math.inf), soft_high]),
+        G=np.vstack([np.hstack([G, none]), np.hstack([S, E]), np.hstack([S, -E])]),
+        h_l=np.concatenate([low, soft_low, np.full(len(S), -math.inf)]),
+        h_u=np.concatenate([high, np.full(len(S), math.inf), soft_high]),
         x_l=np.concatenate([np.full(N * nu, -math.inf), np.zeros(n_s)]),
         x_u=np.full(N * nu + n_s, math.inf),
     )

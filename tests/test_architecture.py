@@ -38,6 +38,7 @@ OF_ONE_ROOM = (
     "dask",
     "dask_jobqueue",
     "distributed",
+    "optuna",
 )
 IMPORT_NAMES = {"pillow": "PIL", "rerun-sdk": "rerun"}
 """Distributions whose import name is not their own."""

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 from support import Here
+from tuning_formula import write_tuning
 
 import quadsim
 from quadsim.errors import RenderingUnavailableError
@@ -31,6 +32,7 @@ ADDED = {
     "bench render": (*SHORT, "--seconds", "0.2"),
     "bench ladder": ("--set", "controller.horizon=5"),
     "campaign": ("--set", "duration=1.0", "--flights", "2", "--no-report", "--out", "campaign"),
+    "tune": ("--no-report",),
     "replay": ("--no-video", "--no-recording", "--no-figures"),
 }
 """What makes a command cheap enough to run here."""
@@ -81,6 +83,9 @@ def workplace(flown: Path, campaign: Path, tmp_path: Path, monkeypatch: pytest.M
     for place in (f"campaigns/{campaign.name}", "mine", "other"):
         shutil.copytree(campaign, tmp_path / "runs" / place)
     (tmp_path / "mine.toml").write_text('base = "paper-nominal"\nname = "mine"\nfailure = ["lost"]\n')
+    write_tuning(tmp_path, trials=2, batch=2, flights=[1], require="P(lost) < 0.9 @ 50%", fresh={"flights": 2}).rename(
+        tmp_path / "tuning.toml"
+    )
     (tmp_path / "mine-vehicle.toml").write_text(quadsim.vehicle_template())
     for name in ("paper-unconstrained", "paper-constrained"):
         shutil.copytree(flown, tmp_path / "runs" / name)

@@ -84,13 +84,17 @@ def test_convergence_in_the_documents_is_what_the_gains_give() -> None:
     assert numbers.markdown(numbers.lqr_convergence()) in (ROOT / "docs/numbers.md").read_text(encoding="utf-8")
 
 
-def test_the_example_in_the_page_on_effects_is_a_scenario(tmp_path: Path) -> None:
+def test_the_examples_in_the_page_on_effects_are_a_scenario(tmp_path: Path) -> None:
     page = (ROOT / "docs/effects.md").read_text(encoding="utf-8")
-    (example,) = re.findall(r"```toml\n(.*?)```", page, flags=re.DOTALL)
-    (tmp_path / "gusty.toml").write_text(example, encoding="utf-8")
+    example, events = re.findall(r"```toml\n(.*?)```", page, flags=re.DOTALL)
+    (tmp_path / "gusty.toml").write_text(example + events, encoding="utf-8")
     scenario = load_scenario(str(tmp_path / "gusty.toml"), ["duration=16.0"])
     assert scenario.effects.air is not None
-    assert fly_scenario(scenario).log.plant.wind is not None
+    assert [event.type for event in scenario.events] == ["gust", "push", "setpoint", "controller"]
+    log = fly_scenario(scenario).log
+    assert log.plant.wind is not None
+    assert log.predicted is not None
+    assert log.predicted.shape[1] == 30
 
 
 def test_documents_link_to_files_that_exist() -> None:

@@ -28,6 +28,7 @@ from mpc.baselines.limits import require_positive, require_within
 from mpc.baselines.preview import PREVIEW_DEGREE, Target, differentiator, target_of, target_of_motion, wrapped
 from mpc.baselines.wanted import Wanted, wanted_attitude
 from mpc.disturbance import RampObserver, RampSettings
+from mpc.handover import within
 from quadsim.controller import Command, Moment, Phase
 from quadsim.errors import ParameterError
 from quadsim.state import Array, read_only
@@ -171,6 +172,14 @@ class GeometricController(FeedbackLaw):
         self._integrals = Integrals(translation=np.zeros(3), rotation=np.zeros(3))
         if self._observer is not None:
             self._observer.reset(speeds)
+
+    def adopt(self, previous: object) -> None:
+        """Go on from the integrals and the observer of the law before."""
+        law = within(previous, GeometricController)
+        if law is not None:
+            self._integrals = law._integrals
+            if self._observer is not None and law._observer is not None:
+                self._observer.adopt(law._observer)
 
     def _command(self, now: Moment, state: Array, reference: Array, before: Array) -> Command:
         """The law's wrench as rotor speeds; the integrals rest while bounds keep it from being given."""

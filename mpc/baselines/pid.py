@@ -18,6 +18,7 @@ from mpc.baselines.bandwidths import Bandwidths, bandwidths, lag_to_allow_for
 from mpc.baselines.law import FeedbackLaw
 from mpc.baselines.limits import require_positive, require_within
 from mpc.baselines.preview import Target, target_of
+from mpc.handover import within
 from quadsim.controller import Command, Moment, Phase
 from quadsim.state import Array
 from quadsim.vehicle import Vehicle
@@ -110,6 +111,12 @@ class CascadedPID(FeedbackLaw):
         """Start anew after the command u(-1) (4,) [rad/s]."""
         super().reset(speeds)
         self._memory = Memory(velocity_integral=np.zeros(3), rate_integral=np.zeros(3))
+
+    def adopt(self, previous: object) -> None:
+        """Go on from the integrals of the PID before."""
+        law = within(previous, CascadedPID)
+        if law is not None:
+            self._memory = law._memory
 
     def _command(self, now: Moment, state: Array, reference: Array, before: Array) -> Command:
         """One period of all loops, integrals at rest until the vehicle flies."""

@@ -282,9 +282,10 @@ def with_shortcut(problem: Problem, whole: Solver) -> Solver:
 
     The map to the free optimum grows with the square of the horizon, the QP in proportion to it: beyond `LARGEST_MAP`
     entries nothing is tried.  Nor is it where the Hessian is so ill-conditioned, by a long horizon or weights far
-    apart, that the gains are not exact, nor where rows differ from step to step: `mpc.space.clearing` has those.
+    apart, that the gains are not exact, nor where rows share a slack, or differ from step to step: `mpc.space.clearing`
+    has those.
     """
-    if problem.rows.C.ndim == 3:
+    if problem.rows.C.ndim == 3 or problem.rows.slacks.size < problem.rows.soft.size:
         return whole
     N = problem.horizon
     entries = sum(

@@ -108,6 +108,11 @@ class StateCompletion:
         self._last_body_rates = _NO_RATES
         self.unseen = np.full(N_STATES, np.inf)
 
+    def adopt(self, other: StateCompletion) -> None:
+        """Go on from where another one is."""
+        self._state, self._covariance, self.unseen = other._state, other._covariance, other.unseen
+        self._last, self._last_body_rates = other._last, other._last_body_rates
+
     def complete(self, measured: Array, acting: Array, trim: Trim, *, free: bool = True) -> Array:
         """The whole state (12,) now.
 

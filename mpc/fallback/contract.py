@@ -31,6 +31,7 @@ from mpc.fallback.completion import PLAUSIBLE, CompletedMoment, StateCompletion,
 from mpc.fallback.hover import HoverLaw
 from mpc.fallback.settings import USUAL_TILT
 from mpc.fallback.settings import FallbackSettings as FallbackSettings
+from mpc.handover import hand_over, resized, within
 from mpc.heading import anchored, predict_in_heading_frame
 from mpc.model import LinearModel
 from mpc.ocp import Unanswered
@@ -83,6 +84,8 @@ class Guarded:
         self._good: tuple[Array, Array] | None  # the state (12,) of the last accepted answer, and its plan (N, 4)
         self._foreseen: Array | None
         self._target: Array | None
+        self._age: int  # periods in fallback
+        self._hovered: int  # of them on level 2 or 3
         self.reset(model.u_bar)
 
     def reset(self, speeds: Array) -> None:
@@ -92,6 +95,18 @@ class Guarded:
         self._completion.reset()
         self._forget()
         self.inner.reset(self._before.copy())
+
+    def adopt(self, previous: object) -> None:
+        """Go on from the level of fallback, the state and the plan of the contract before, and hand over within it."""
+        hand_over(self.inner, previous)
+        law = within(previous, Guarded)
+        if law is None:
+            return
+        self._completion.adopt(law._completion)
+        self._age, self._target, self._hovered = law._age, law._target, law._hovered
+        if law._good is not None:
+            state, plan = law._good
+            self._good = state, resized(plan, self.horizon)
 
     def step(self, now: Moment, state: Array, reference: Array) -> Command:
         """The first level's command that can be had; see `quadsim.controller.Controller.step`.

@@ -23,6 +23,7 @@ import scipy.linalg
 from mpc.answer import ActuatorBounds, command_of, refused
 from mpc.constraints import Constraint, Penalty
 from mpc.disturbance import RampObserver, RampSettings
+from mpc.handover import observed, resized, within
 from mpc.model import LinearModel
 from mpc.nonlinear.reference import Nodes, nodes_of_motion, nodes_of_preview
 from mpc.nonlinear.rigidbody import (
@@ -145,7 +146,7 @@ class NonlinearMPC:
         self._hover = vehicle.mass * vehicle.gravity / N_ROTORS
         self._tilted = settings.tilt is not None
         self.problem = self._problem(constraints)
-        small = self.problem.horizon * (N_ROTORS + self.problem.rows.soft.size) <= LARGEST_CONDENSED
+        small = self.problem.horizon * (N_ROTORS + self.problem.rows.slacks.size) <= LARGEST_CONDENSED
         self.solver = settings.solver or ("piqp-dense" if small else "piqp-multistage")
         self._qp = Relinearised(self.problem, self.solver, shortcut=True)
         self._clearing = None if space is None else Clearing(self.problem, self._solve, space, changing=True)
@@ -219,7 +220,7 @@ class NonlinearMPC:
         if self.settings.soft is None:
             return None
         l1, l2 = self.settings.soft
-        return Penalty(l1=np.full(rows, l1 * scale), l2=np.full(rows, l2 * scale**2))
+        return Penalty(l1=np.full(rows, l1 * scale), l2=np.full(rows, l2 * scale**2), largest=True)
 
     def _of_states(self, constraint: Constraint, n: int) -> Constraint:
         """Rows over the 12 states of `quadsim.state` and rotor speeds as rows over the model's.
@@ -279,6 +280,30 @@ class NonlinearMPC:
         if self._clearing is not None:
             self._clearing.reset()
         self.unanswered: Unanswered | None = None
+
+    def adopt(self, previous: object) -> None:
+        """Go on from what the law before knew: rotor speeds, disturbance, plan."""
+        law = within(previous, NonlinearMPC)
+        if law is not None:
+            alike = self.settings.inputs is law.settings.inputs
+            for name in ("_rotors", "_rotors_before"):
+                shares = getattr(law, name)
+                setattr(self, name, shares if alike else self._shares(law._speeds(shares)))
+            self._quaternion, self._asked = law._quaternion, law._asked
+            if law._last is not None:
+                time, x = law._last
+                self._last = time, np.concatenate([x[:N_BODY], self._rotors])[: self._model.n]
+            alike = alike and self._model.n == law._model.n and self._model.step == law._model.step
+            if law._plan is not None and alike:
+                self._plan = resized(law._plan[0], self._nodes + 1), resized(law._plan[1], self._nodes)
+            if self._ramp is not None and law._ramp is not None:
+                self._ramp.adopt(law._ramp)
+        own = None if law is None else law._observer
+        estimate = observed(previous) if own is None else own.estimate
+        if self._observer is not None and estimate is not None:
+            self._observer.adopt(estimate)
+            found = self._observer.estimate
+            self._model = replace(self._model, acceleration=found[:3], angular_acceleration=found[3:])
 
     def step(self, now: Moment, state: Array, reference: Array) -> Command:
         """See `quadsim.controller.Controller.step`.

@@ -95,7 +95,7 @@ class Condensed:
         self._cost, self._values = condensed_cost(problem, self._maps), row_maps(self._rows, self._maps)
         rows = self._rows
         self._inputs, m_s = N * nu, rows.slack.shape[1]
-        soft = problem.rows.soft
+        soft = problem.rows.slacks
         l1, l2 = np.tile(problem.rows.l1[soft], N), np.tile(problem.rows.l2[soft], N)
         self._linear = np.concatenate([np.zeros(self._inputs), l1])
         G = np.zeros((N, len(rows.C), self._inputs + N * m_s))

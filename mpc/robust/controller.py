@@ -24,6 +24,7 @@ from mpc.constraints import Bounds, Constraint
 from mpc.equilibrium import Trim, equilibrium, twisted
 from mpc.exact.shortcut import with_shortcut
 from mpc.fallback.completion import PLAUSIBLE, CompletedMoment
+from mpc.handover import observed, resized, within
 from mpc.heading import (
     anchored,
     predict_in_heading_frame,
@@ -164,9 +165,43 @@ class RobustMPC:
             self._clearing.reset()
         self._forget()
 
+    def adopt(self, previous: object) -> None:
+        """Go on from what the law before knew: rotor speeds, disturbance, plan."""
+        law = within(previous, RobustMPC)
+        if law is not None:
+            self._rotors = law._rotors.copy()
+            self._asked, self._measured = law._asked, law._measured
+            if self.settings.delay == law.settings.delay:
+                self._ahead = law._ahead
+            self._adopt_plan(law)
+        own = None if law is None else law._observer
+        estimate = observed(previous) if own is None else own.estimate
+        if self._observer is not None and estimate is not None:
+            self._observer.adopt(estimate)
+            self._believe()
+
     @np.errstate(over="ignore", invalid="ignore", divide="ignore")  # numbers out of hand are refused, not warned of
     def step(self, now: Moment, state: Array, reference: Array) -> Command:
-        """See `quadsim.controller.Controller.step`.
+        """See `quadsim.controller.Controller.step`; what is answered without a QP: `pose`."""
+        query = self.pose(now, state, reference)
+        if isinstance(query, Command):
+            return query
+        answer, problem = self._answer(now.time, query)
+        self.answer = answer
+        refused = rejection(answer.solution.status, answer.plan[0], answer.plan, self._actuators, self._acting)
+        if refused is not None:
+            if refused != INVALID_DATA and self.unanswered is None:
+                self.unanswered = Unanswered(
+                    problem=problem, query=query, status=refused, time=now.time, delay=self.settings.delay
+                )
+            return self._refuse(refused, answer)
+        plan = answer.plan.copy()
+        self._acting = plan[0] = self._actuators.clip(plan[0], self._acting)
+        return command_of(plan[0], plan, answer.solution.status, answer)
+
+    @np.errstate(over="ignore", invalid="ignore", divide="ignore")  # numbers out of hand are refused, not warned of
+    def pose(self, now: Moment, state: Array, reference: Array) -> Query | Command:
+        """What this period's problem is solved for, once per period; or the answer, where nothing is to be solved.
 
         Numbers that are not finite, not `mpc.fallback.completion.PLAUSIBLE`, or lead to such are answered with the
         status `invalid_data`, and do not update the observer.  Neither does a state that is in part predicted
@@ -195,21 +230,10 @@ class RobustMPC:
         x0 = self._after(self.settings.delay, state, rotors)
         if not np.isfinite(x0).all():
             return self._refuse(INVALID_DATA)
+        self._yaw = float(x0[_YAW])
         if now.phase is Phase.FLYING:  # before, the ground holds the vehicle, which is nothing to learn from
             self._ahead = x0
-        query = self._query(np.concatenate([x0, self._rotors])[: self._model.n], self._later(reference))
-        answer, problem = self._answer(now.time, float(x0[_YAW]), query)
-        self.answer = answer
-        refused = rejection(answer.solution.status, answer.plan[0], answer.plan, self._actuators, self._acting)
-        if refused is not None:
-            if refused != INVALID_DATA and self.unanswered is None:
-                self.unanswered = Unanswered(
-                    problem=problem, query=query, status=refused, time=now.time, delay=self.settings.delay
-                )
-            return self._refuse(refused, answer)
-        plan = answer.plan.copy()
-        self._acting = plan[0] = self._actuators.clip(plan[0], self._acting)
-        return command_of(plan[0], plan, answer.solution.status, answer)
+        return self._query(np.concatenate([x0, self._rotors])[: self._model.n], self._later(reference))
 
     def predict(self, states: Array, plans: Array) -> Array:
         """See `quadsim.controller.Controller.predict`.
@@ -226,6 +250,14 @@ class RobustMPC:
         """(6,) estimated acceleration at rest, world [m/s^2], and angular acceleration, body [rad/s^2]."""
         thrust = self._model.effectiveness[0] @ np.square(self.trim.speeds)
         return np.concatenate([self._resting, thrust * self.trim.twist])
+
+    def _adopt_plan(self, law: RobustMPC) -> None:
+        """Linearise along the plan of the law before."""
+        if Linearisation.HOVER in (self.settings.linearisation, law.settings.linearisation):
+            return
+        if law._relinearised.last is not None and law._model.n == self._model.n:
+            states, plan = law._relinearised.last
+            self._relinearised.last = resized(states, self.horizon), resized(plan, self.horizon)
 
     def _forget(self) -> None:
         """Assume no disturbance."""
@@ -288,12 +320,12 @@ class RobustMPC:
         later = np.concatenate([reference[1:], reference[-1:]])
         return reference + self.settings.delay / self._period * (later - reference)
 
-    def _answer(self, time: float, yaw: float, query: Query) -> tuple[Answer, Problem]:
+    def _answer(self, time: float, query: Query) -> tuple[Answer, Problem]:
         """The optimum, and the problem that it is of."""
         if self._clearing is None:
             return self._solve(query), self.problem
         turned = self.settings.heading and query.steps is None
-        answer, problem, states = self._clearing.solve(time + self.settings.delay, query, yaw if turned else 0.0)
+        answer, problem, states = self._clearing.solve(time + self.settings.delay, query, self._yaw if turned else 0.0)
         if query.steps is not None and self._relinearised.last is not None:
             self._relinearised.last = (states, answer.plan) if answer.solution.status in ACCEPTED else None
         return answer, problem

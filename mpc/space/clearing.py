@@ -19,6 +19,8 @@ from quadsim.state import Array
 
 KEPT: Final = 1e-6
 """Violation of a half-space [m] that is taken for rounding."""
+NEAR: Final = 1e-2
+"""Distance from a half-space [m] within which a plan is taken to touch it."""
 SETTLED: Final = 1e-2
 """Change of all predicted positions [m] below which planes are not made anew in the same period."""
 
@@ -70,18 +72,25 @@ class Clearing:
         turn = np.array([[math.cos(yaw), math.sin(yaw), 0.0], [-math.sin(yaw), math.cos(yaw), 0.0], [0.0, 0.0, 1.0]])
         t = time + self._space.period * np.arange(1, self.problem.horizon + 1, dtype=np.float64)
         last, self._last = self._last, None
-        answer, problem = self._solve(query), self.problem
-        if answer.solution.status not in ACCEPTED:
-            return Cleared(answer, problem, np.empty(0))
-        states = _predicted(problem, query, answer.plan)
-        planned = states[:, self._space.positions] @ turn
-        if along is None:
-            along = planned if last is None else np.concatenate([last[1:], 2.0 * last[-1:] - last[-2:-1]])
-        for _ in range(self._space.settings.iterations):
+        problem = self.problem
+        # Where the last plan touched half-spaces, this one is all but sure to: it is sought among them at once.
+        among = self._changing and along is not None and self._touched(t, along)
+        if along is None or not among:
+            answer = self._solve(query)
+            if answer.solution.status not in ACCEPTED:
+                return Cleared(answer, problem, np.empty(0))
+            states = _predicted(problem, query, answer.plan)
+            planned = states[:, self._space.positions] @ turn
+            if along is None:
+                along = planned if last is None else np.concatenate([last[1:], 2.0 * last[-1:] - last[-2:-1]])
+        else:
+            planned = along
+        for i in range(self._space.settings.iterations):
             normals, bounds = self._space.half_spaces(t, along)
-            if ((normals * planned).sum(axis=2) >= bounds - KEPT).all():
+            room = _room(normals, bounds, planned)
+            if (room >= -KEPT).all() and not (among and i == 0):
                 break
-            answer, states = self._whole(query, normals, bounds, states, turn)
+            answer, states = self._whole(query, normals, bounds, room, turn)
             if answer.solution.status not in ACCEPTED:
                 named = self._space.constraints(normals @ turn.T, bounds, problem.model.n)
                 return Cleared(answer, replace(problem, constraints=(*problem.constraints, *named)), states)
@@ -92,24 +101,24 @@ class Clearing:
         self._last = planned
         return Cleared(answer, problem, states)
 
+    def _touched(self, t: Array, along: Array) -> bool:
+        return bool((_room(*self._space.half_spaces(t, along), along) < NEAR).any())
+
     def _posed(self, normals: Array, bounds: Array) -> Problem:
         """The problem with chosen half-spaces (m, N, 3), (m, N) in the states' axes."""
         added = self._space.constraint(normals, bounds, self.problem.model.n)
         return replace(self.problem, constraints=(*self.problem.constraints, added))
 
-    def _whole(self, query: Query, normals: Array, bounds: Array, states: Array, turn: Array) -> tuple[Answer, Array]:
-        """The optimum with half-spaces of the world, and its states (N, n); `states` are those of the one without."""
-        room, count = (
-            (normals * (states[:, self._space.positions] @ turn)).sum(axis=2) - bounds,
-            self._space.settings.rows,
-        )
+    def _whole(self, query: Query, normals: Array, bounds: Array, room: Array, turn: Array) -> tuple[Answer, Array]:
+        """The optimum with half-spaces of the world, and its states (N, n); `room` (S, N) tells the tightest."""
+        count = self._space.settings.rows
         while True:
             at = np.argsort(room, axis=0, kind="stable")[:count], np.arange(bounds.shape[1])
             answer = self._solved(query, self._posed(normals[at] @ turn.T, bounds[at]), len(at[0]))
             if answer.solution.status not in ACCEPTED:
-                return answer, states
+                return answer, np.empty(0)
             states = _predicted(self.problem, query, answer.plan)
-            room = (normals * (states[:, self._space.positions] @ turn)).sum(axis=2) - bounds
+            room = _room(normals, bounds, states[:, self._space.positions] @ turn)
             violated = room < -KEPT
             violated[at] = False
             if not violated.any():
@@ -137,6 +146,11 @@ class Clearing:
             vectors = form.changed_vectors(matrices, c, *query[:3], rest)
         solution = backend.solve_changed(form.changed(matrices, vectors))
         return Answer(plan=form.inputs(solution.x), slacks=form.slacks(solution.x), solution=solution)
+
+
+def _room(normals: Array, bounds: Array, positions: Array) -> Array:
+    """(S, N) how far positions (N, 3) are inside half-spaces [m]."""
+    return np.asarray((normals * positions).sum(axis=2) - bounds)
 
 
 def _predicted(problem: Problem, query: Query, plan: Array) -> Array:

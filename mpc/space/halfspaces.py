@@ -24,7 +24,7 @@ import numpy as np
 
 from mpc.constraints import Constraint, Penalty
 from mpc.space.settings import AvoidanceSettings
-from quadsim.space import AnyObstacle, Corridor, Fence, Obstacle
+from quadsim.space import AnyObstacle, Corridor, Fence, Obstacle, Solids
 from quadsim.state import POSITION, Array
 
 Shape: TypeAlias = AnyObstacle | Corridor | Fence
@@ -44,6 +44,7 @@ class Space:
         settings: see `AvoidanceSettings`.
         margins: (N, 3) further ones along x, y, z at each predicted instant [m], as of a disturbance; None for none.
         penalty: l1 [1/m] and l2 [1/m^2] of violating a half-space; None for hard ones.
+        largest: whether it is of the largest violation at each instant, instead of all.
         positions: which of the states are x, y, z.
     """
 
@@ -58,15 +59,25 @@ class Space:
         margins: Array | None = None,
         penalty: tuple[float, float] | None = None,
         positions: Sequence[int] = POSITION,
+        largest: bool = False,
     ) -> None:
+        self._largest = largest
         self.settings, self.penalty, self.period, self.positions = settings, penalty, period, list(positions)
         self._shapes, self._kept = tuple(shapes), radius + settings.margin
         self._margins = np.zeros((horizon, 3)) if margins is None else margins
-        self._names = [
-            shape.name
-            for shape in self._shapes
-            for _ in range(len(shape.solids) if isinstance(shape, Obstacle) else len(shape.half_spaces[1]))
-        ]
+        self._solids = Solids([shape for shape in self._shapes if isinstance(shape, Obstacle)])
+        self._names: list[str] = []
+        self._regions: list[tuple[Corridor | Fence, slice]] = []
+        of_solids: list[int] = []
+        for shape in self._shapes:
+            first = len(self._names)
+            count = len(shape.solids) if isinstance(shape, Obstacle) else len(shape.half_spaces[1])
+            self._names += [shape.name] * count
+            if isinstance(shape, Obstacle):
+                of_solids += range(first, first + count)
+            else:
+                self._regions.append((shape, slice(first, first + count)))
+        self._of_solids = np.array(of_solids, np.intp)
 
     @property
     def count(self) -> int:
@@ -75,28 +86,23 @@ class Space:
 
     def half_spaces(self, t: Array, positions: Array) -> tuple[Array, Array]:
         """Normals (S, N, 3) and bounds (S, N) [m] of normal . p >= bound, at times (N,) along positions (N, 3)."""
-        normals, bounds = [], []
-        for shape in self._shapes:
-            if isinstance(shape, Obstacle):
-                distance, normal = shape.clearances(t, positions)
-                bound = (normal * positions).sum(axis=2) - distance
-            else:
-                rows, upper = shape.half_spaces
-                normal = np.broadcast_to(-rows[:, None, :], (len(rows), len(t), 3))
-                # Also at the instants just before and after: what is between two of them is then inside as well.
-                in_force = (t > shape.start - self.period) & (t < shape.stop + self.period)
-                bound = np.where(in_force, -upper[:, None], (normal * positions).sum(axis=2) - LOOSE)
-            normals.append(normal)
-            bounds.append(bound)
-        every = np.concatenate(normals)
-        return every, np.concatenate(bounds) + self._kept + (np.abs(every) * self._margins).sum(axis=2)
+        normals, bounds = np.empty((self.count, len(t), 3)), np.empty((self.count, len(t)))
+        distance, normal = self._solids.clearances(t, positions)
+        normals[self._of_solids], bounds[self._of_solids] = normal, (normal * positions).sum(axis=2) - distance
+        for region, at in self._regions:
+            rows, upper = region.half_spaces
+            normals[at] = -rows[:, None, :]
+            # Also at the instants just before and after: what is between two of them is then inside as well.
+            in_force = (t > region.start - self.period) & (t < region.stop + self.period)
+            bounds[at] = np.where(in_force, -upper[:, None], (normals[at] * positions).sum(axis=2) - LOOSE)
+        return normals, bounds + self._kept + (np.abs(normals) * self._margins).sum(axis=2)
 
     def constraint(self, normals: Array, bounds: Array, states: int, *, name: str = "space") -> Constraint:
         """Half-spaces (m, N, 3), (m, N) as rows on so many states."""
         C = np.zeros((bounds.shape[1], len(bounds), states))
         C[:, :, self.positions] = normals.transpose(1, 0, 2)
         lower, (l1, l2) = bounds.T, (0.0, 0.0) if self.penalty is None else self.penalty
-        penalty = Penalty(l1=np.full(len(bounds), l1), l2=np.full(len(bounds), l2))
+        penalty = Penalty(l1=np.full(len(bounds), l1), l2=np.full(len(bounds), l2), largest=self._largest)
         return Constraint(
             name=name,
             lower=lower,

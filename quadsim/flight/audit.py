@@ -7,7 +7,7 @@ reads the plant at the physics rate, and states its tolerances: a verdict is `ma
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Annotated, Final
 
@@ -69,7 +69,7 @@ def _error(j: int) -> Signal:
 
 def _estimate_error(i: int) -> Signal:
     unit, scale = shown_unit(STATE_UNITS[i])
-    return Signal(unit=unit, sampled=lambda log: scale * (log.state[:, i] - log.truth[:, i]), plant=None)
+    return Signal(unit=unit, sampled=lambda log: scale * log.measured_error[:, i], plant=None)
 
 
 SIGNALS: Final[dict[str, Signal]] = {
@@ -264,6 +264,16 @@ def margins_sampled(limit: Limit, log: FlightLog) -> Array:
 def margins_at(limit: Limit, t: Array, values: Array) -> Array:
     """(K,) signed margins of a limit on the values of its signal at times t (K,), NaN outside its time window."""
     return np.where(limit.holds_at(t), limit.margin(values), np.nan)
+
+
+def smallest_margins(log: FlightLog, limits: Sequence[Limit]) -> dict[str, float]:
+    """The smallest signed margin of each limit by its name, at the finest rate there is; NaN outside its time window.
+
+    Args:
+        log: of one control period or more; its plant rows at the physics rate.
+        limits: distinct names.
+    """
+    return {limit.name: _worst(limit, *limit.source.finest(log))[1] for limit in limits}
 
 
 def audit(log: FlightLog, limits: tuple[Limit, ...]) -> tuple[Finding, ...]:

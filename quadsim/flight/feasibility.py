@@ -191,7 +191,7 @@ def _attitudes(pushed: Array, yaw: Array) -> Array:
     cos, sin = np.cos(yaw), np.sin(yaw)
     forward = cos * pushed[:, 0] + sin * pushed[:, 1]
     left = cos * pushed[:, 1] - sin * pushed[:, 0]
-    pitch = np.arctan2(forward, pushed[:, 2])
+    pitch = np.unwrap(np.arctan2(forward, pushed[:, 2]))  # upside down it goes on beyond 180 deg
     roll = np.arctan2(-left, np.hypot(forward, pushed[:, 2]))
     return np.stack([roll, pitch, yaw], axis=1)
 

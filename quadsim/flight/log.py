@@ -11,7 +11,7 @@ from typing import Any, Final
 import numpy as np
 
 from quadsim.controller import Phase
-from quadsim.state import Array
+from quadsim.state import ANGLE_RATES, ANGLES, Array, euler_to_body_rates, euler_to_quaternion
 
 WRENCH: Final = {**{f"force_{axis}": "N" for axis in "xyz"}, **{f"torque_{axis}": "N m" for axis in "xyz"}}
 """Columns of the external force, world, and torque, body frame, with their units; only where there is any."""
@@ -72,6 +72,24 @@ class ControlLog:
         return self.state is self.truth or bool(np.array_equal(self.state, self.truth))
 
     @property
+    def measured_error(self) -> Array:
+        """(K, 12) measured less true state; of an attitude that is logged a rotation vector and body rates, body axes.
+
+        Of flights whose attitude is not logged the differences of Euler angles and of their rates.
+        """
+        error = self.state - self.truth
+        if self.attitude is not None and self.body_rates is not None:
+            angles, rates = self.truth[:, ANGLES], self.truth[:, ANGLE_RATES]
+            w, x, y, z = euler_to_quaternion(angles).T
+            a, b, c, d = self.attitude.T
+            half = np.column_stack(
+                [w * b - x * a - y * d + z * c, w * c - y * a + x * d - z * b, w * d - z * a - x * c + y * b]
+            )
+            error[:, ANGLES] = 2.0 * np.copysign(1.0, w * a + x * b + y * c + z * d)[:, None] * half
+            error[:, ANGLE_RATES] = self.body_rates - euler_to_body_rates(angles, rates)
+        return error
+
+    @property
     def crashed(self) -> bool:
         """Whether anything but the feet met the ground."""
         return str(Phase.CRASHED) in self.phase
@@ -127,7 +145,8 @@ class FlightLog:
         control: one row per control period.
         timing: clock times, one row per control period.
         plant: the plant, at the physics rate after a flight, at the log rate when read from a file.
-        predicted: (K, N, 3) float32 positions [m] predicted at each period for t_{k+1} .. t_{k+N}, or None.
+        predicted: (K, N, 3) float32 positions [m] predicted at each period for t_{k+1} .. t_{k+N}, N the shortest
+            horizon of its controllers; None where one of them has no model.
         reason: why the flight ended early; None when it was completed.
         interrupted: whether the person flying ended it.
         lost: which of the loss criteria ended it, e.g. `tilt`; None where none did.

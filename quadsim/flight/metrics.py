@@ -167,7 +167,7 @@ def estimation(log: ControlLog) -> dict[str, Any]:
 
     Samples that are no numbers, as a failed sensor gives them, are counted and left out.
     """
-    error = log.state - log.truth
+    error = log.measured_error
     finite = np.isfinite(error)
     counted = np.maximum(finite.sum(axis=0), 1)
     known = np.where(finite, error, 0.0)

@@ -98,6 +98,7 @@ FORM: Final = {
     "as_expected": Optional(bool),
     "seed": Optional(int),
     "course": Optional({**_COURSE, "jumps": [NUMBER], "problems": [str], "sentence": str}),
+    "events": Optional([{"time": NUMBER, "text": str}]),
     "tracking": dict,
     "constraints": [_CONSTRAINT],
     "control": dict,

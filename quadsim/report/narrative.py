@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
+from typing import Final
 
 from quadsim.flight.rundir import Run
 from quadsim.report.comparison import (
@@ -22,6 +23,8 @@ from quadsim.report.comparison import (
 )
 from quadsim.report.table import format_number
 
+_MOST_EVENTS: Final = 12
+"""Of a flight that a sentence names."""
 _Named = Sequence[tuple[str, Summary]]
 
 
@@ -64,6 +67,8 @@ def condition_sentences(named: _Named) -> Iterator[str]:
     for sentence, names in courses.items():
         yield f"{_list(names)}: {sentence[0].lower()}{sentence[1:]}"
     for name, summary in named:
+        if events := summary.get("events"):
+            yield f"On the way of {name}: {'; '.join(event_sentences(events))}."
         yield from _ground_sentences(name, summary)
         yield from _estimation_sentences(name, summary)
         if delays := nested(summary, "computation", "delay_ms"):
@@ -72,6 +77,12 @@ def condition_sentences(named: _Named) -> Iterator[str]:
                 f"Commands of {name} come {format_number(delays['p50'])} ms after their measurement in the median and "
                 f"{format_number(delays['max'])} ms at most; {missed or 'none'} too late to be used."
             )
+
+
+def event_sentences(events: Sequence[Summary]) -> list[str]:
+    """What happened when, the first of them where there are many."""
+    said = [f"{event['text']} at {format_number(event['time'])} s" for event in events[:_MOST_EVENTS]]
+    return said + ([f"{len(events) - _MOST_EVENTS} more"] if len(events) > _MOST_EVENTS else [])
 
 
 def _ground_sentences(name: str, summary: Summary) -> Iterator[str]:

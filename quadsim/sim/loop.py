@@ -6,12 +6,12 @@ import math
 import time as clock
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, Protocol
 
 import numpy as np
 
 from quadsim.controller import MISSED, Command, Controller, InnerLoop, Moment, Phase
-from quadsim.errors import FlightError, InterruptedFlightError, LostError
+from quadsim.errors import FlightError, InputError, InterruptedFlightError, LostError
 from quadsim.flight.log import ControlLog, FlightLog, PlantLog, TimingLog
 from quadsim.flight.lost import check_loss
 from quadsim.motion import Motion
@@ -26,171 +26,432 @@ if TYPE_CHECKING:
     from quadsim.sim.phase import PhaseMonitor
 
 _BODY_RATES: Final = slice(11, 14)  # in the plant's own state; see `quadsim.sim.physics.physics_to_state`
+_HEIGHT: Final = REFERENCE_NAMES.index("z")
 
 
-def fly(
-    plant: Plant,
-    controller: Controller,
-    reference: Array,
-    *,
-    initial_state: Array,
-    initial_speeds: Array,
-    periods: int,
-    steps_per_period: int,
-    navigation: Navigation | None = None,
-    computation: Computation | None = None,
-    rng: np.random.Generator | None = None,
-    ground: PhaseMonitor | None = None,
-    loss: Mapping[str, float] | None = None,
-    motion: Motion | None = None,
-    quaternions: bool = False,
-    progress: Callable[[int], None] | None = None,
-) -> FlightLog:
-    """Fly a number of control periods.
+class Reference(Protocol):
+    """A filtered reference x, y, z [m], yaw [rad] that need not be known ahead."""
 
-    Whatever happens in flight ends up in the log: a typed flight error or Ctrl-C ends it early, with its reason and
-    everything up to it.
+    def row(self, k: int) -> Array:
+        """(4,) at t_k."""
+        ...
 
-    Args:
-        plant: what is flown; it is reset first.
-        controller: what flies it; it is reset first.
-        reference: (periods + N, 4) filtered x, y, z [m], yaw [rad], row k at t_k, N the controller's preview.
-        initial_state: (12,).
-        initial_speeds: (4,) u(-1), and the rotor speeds at the start [rad/s].
-        periods: K.
-        steps_per_period: physics steps per control period.
-        navigation: measured or estimated state for the controller; the true state where absent.
-        computation: how long commands take, in simulated time; none where absent.
-        rng: what `computation` draws from.
-        ground: what knows where the flight stands with ground and obstacles; it is flying throughout where absent.
-        loss: limits by the names of `quadsim.flight.lost.CRITERIA`, checked once per control period until it has
-            crashed; none where absent.
-        motion: of the reference from t_0 on, for controllers that use it; absent where only positions are known.
-        quaternions: whether attitude and body rates are logged beside Euler angles and their rates.
-        progress: called with the number of periods flown, after each.
+    def preview(self, k: int, n: int) -> Array:
+        """(n, 4) at t_{k+1} .. t_{k+n}, as far as it is known at t_k."""
+        ...
 
-    Returns:
-        The flight, with plant rows at the physics rate.
+
+@dataclass(frozen=True, kw_only=True)
+class Rows:
+    """A reference that is known from the start: `values` (K + N, 4), row k at t_k."""
+
+    values: Array
+
+    def row(self, k: int) -> Array:
+        """See `Reference`."""
+        row: Array = self.values[k]
+        return row
+
+    def preview(self, k: int, n: int) -> Array:
+        """See `Reference`."""
+        rows: Array = self.values[k + 1 : k + 1 + n]
+        return rows
+
+
+@dataclass(frozen=True, kw_only=True)
+class Observation:
+    """What a control period begins with.
+
+    Attributes:
+        k: which period.
+        state: (12,) as measured, or estimated.
+        truth: (12,) as it is.
+        reference: (4,) filtered x, y, z [m], yaw [rad] at t_k.
+        preview: (N, 4) the same at t_{k+1} .. t_{k+N}, as far as it is known.
+        moment: when it is, and what a controller may know besides; `moment.acting` is u(k-1).
     """
-    plant.reset(initial_state, initial_speeds)
-    controller.reset(initial_speeds)
-    period = steps_per_period * plant.timestep
-    if navigation is not None:
-        navigation.reset(plant.physics, initial_speeds, yaw=float(initial_state[INDEX["yaw"]]))
-    if ground is not None:
-        ground.reset()
-    truth = np.empty((periods, N_STATES))
-    states = np.empty((periods, N_STATES))
-    attitudes, rates = np.empty((periods, 4)), np.empty((periods, 3))
-    start = plant.physics
-    heights = np.minimum(reference[:, REFERENCE_NAMES.index("z")], initial_state[INDEX["z"]])
-    lowest = np.minimum.accumulate(heights).tolist()
-    samples: list[Sample] = []
-    acting = np.array(initial_speeds, float)
-    plan, age = acting[None], 0  # the last plan that came in time, and how many periods ago
-    draws = rng if rng is not None else np.random.default_rng(0)
-    ended: FlightError | None = None
-    try:
-        for k in range(periods):
-            truth[k] = plant.state()
-            states[k] = truth[k] if navigation is None else navigation.state()
-            attitude, body_rates = plant.attitude if navigation is None else navigation.attitude
-            attitudes[k], rates[k] = attitude, body_rates
-            preview = reference[k + 1 : k + 1 + controller.horizon]
-            phase = Phase.FLYING
-            if ground is not None:
-                since = samples[-1].segment.physics if samples else start[None]
-                phase = ground.advance(since[:, 0], physics_to_state(since), preview)
-            if loss is not None and phase is not Phase.CRASHED:
-                check_loss(loss, k * period, truth[k], reference[k], lowest[k])
-            now = Moment(
-                time=k * period,
-                phase=phase,
-                acting=acting,
-                attitude=attitude,
-                body_rates=body_rates,
-                motion=None if motion is None else motion.after(k),
-            )
-            started = clock.perf_counter()
-            command = controller.step(now, states[k], preview)
-            step_s = clock.perf_counter() - started
-            delay = 0.0 if computation is None else computation.taken(now.time, command, draws)
-            wait = math.ceil(delay / plant.timestep - 1e-6)
-            missed = wait > steps_per_period  # one that comes just in time acts from the next period on
-            due = min(wait, steps_per_period)
-            if computation is not None and computation.plan:
-                due = min(due, math.ceil(computation.delay / plant.timestep - 1e-6))
-            planned = plan[min(age + 1, len(plan) - 1)]  # its last row beyond its end
-            holds = [(acting, due), (planned, min(wait, steps_per_period) - due)]
-            if missed:
-                age += 1
-                acting = holds[1][0] if holds[1][1] else acting
-            else:
-                acting, plan, age = command.speeds, command.plan, 0
-                holds.append((acting, steps_per_period - wait))
-            holds = [(speeds, steps) for speeds, steps in holds if steps > 0]
-            flown = [part for speeds, steps in holds for part in _hold(plant, command.inner, speeds, steps)]
-            if navigation is not None:
-                for segment, speeds in flown:
-                    held = np.broadcast_to(speeds, (len(segment.physics), N_ROTORS))
-                    navigation.advance(segment.physics, held, standing=phase in (Phase.LANDED, Phase.ARMED))
-            samples.append(
-                Sample(
-                    command=command,
-                    speeds=acting,
-                    phase=phase,
-                    delay=delay,
-                    missed=missed,
-                    step_s=step_s,
-                    segment=Segment.join([segment for segment, _ in flown]),
-                    rotors=plant.speeds,
-                )
-            )
-            if progress is not None:
-                progress(k + 1)
-    except FlightError as error:
-        ended = error.with_traceback(None)  # which would hold this frame, and all that was flown, in a cycle
-    except KeyboardInterrupt:
-        ended = InterruptedFlightError(time=len(samples) * period)
-    count = len(samples)
-    control = _control_log(samples, states[:count], truth[:count], reference[:count], initial_speeds, period)
-    plant_log = _plant_log(samples, start, initial_speeds, float(initial_state[INDEX["yaw"]]), plant.timestep)
-    if quaternions:
-        control = replace(control, attitude=attitudes[:count], body_rates=rates[:count])
-        physics = np.concatenate([start[None], *(sample.segment.physics for sample in samples)])
-        plant_log = replace(plant_log, attitude=physics[:, 4:8], body_rates=physics[:, 11:14])
-    commands = [sample.command for sample in samples]
-    return FlightLog(
-        control=control,
-        timing=TimingLog(
-            t=control.t,
-            solve_ms=np.array([1e3 * command.solve_s for command in commands]),
-            step_ms=np.array([1e3 * sample.step_s for sample in samples]),
-        ),
-        plant=plant_log,
-        predicted=_predict(controller, control.state, commands),
-        reason=None if ended is None else str(ended),
-        interrupted=isinstance(ended, InterruptedFlightError),
-        lost=ended.criterion if isinstance(ended, LostError) else None,
-    )
+
+    k: int
+    state: Array
+    truth: Array
+    reference: Array
+    preview: Array
+    moment: Moment
 
 
 @dataclass(frozen=True, kw_only=True)
 class Sample:
     """One control period as it was flown.
 
-    `speeds` (4,) [rad/s] are the command in force at its end, an earlier one if `command` was missed, and `rotors` (4,)
-    how fast the rotors turned then; `delay` [s] is simulated, `step_s` [s] the wall time of the controller's step.
+    Attributes:
+        observation: what it began with.
+        command: what the controller answered, or what was given instead.
+        speeds: (4,) the command in force at its end, an earlier one if `command` was missed [rad/s].
+        delay: simulated time from the measurement to the command [s].
+        missed: whether the command came too late to be used.
+        step_s: wall time of the controller's step [s]; 0 where the command was given.
+        before: (14,) MuJoCo's state at its begin; see `quadsim.sim.physics.physics_to_state`.
+        segment: its physics steps.
+        rotors: (4,) how fast the rotors turned at its end [rad/s].
     """
 
+    observation: Observation
     command: Command
     speeds: Array
-    phase: Phase
     delay: float
     missed: bool
     step_s: float
+    before: Array
     segment: Segment
     rotors: Array
+
+    @property
+    def phase(self) -> Phase:
+        """Where the flight stood with the ground."""
+        return self.observation.moment.phase
+
+
+class ClosedLoop:
+    """A flight that is taken period by period.
+
+    Batch flights, live sessions, learning environments and scripts drive the same loop.  Plant, controller and
+    navigation are reset first.
+
+    Attributes:
+        k: control periods flown so far.
+        period: length of one [s].
+        controller: what flies it now; see `switch`.
+        computation: how long commands take, in simulated time; None where they take none.
+        motion: of the reference from t_0 on; None where only positions are known.
+        quaternions: whether attitude and body rates are logged beside Euler angles and their rates.
+        answered: the latest time at which a command has come so far [s].
+        before: called with k when a period begins, before anything of it is measured; what changes then acts in it.
+        reason: why the flight has ended early; None while it has not.
+    """
+
+    def __init__(
+        self,
+        plant: Plant,
+        controller: Controller,
+        reference: Array | Reference,
+        *,
+        initial_state: Array,
+        initial_speeds: Array,
+        steps_per_period: int,
+        navigation: Navigation | None = None,
+        computation: Computation | None = None,
+        rng: np.random.Generator | None = None,
+        ground: PhaseMonitor | None = None,
+        loss: Mapping[str, float] | None = None,
+        motion: Motion | None = None,
+        quaternions: bool = False,
+        recorded: bool = True,
+    ) -> None:
+        """Set up at t = 0.
+
+        Args:
+            plant: what is flown.
+            controller: what flies it.
+            reference: (K + N, 4) filtered x, y, z [m], yaw [rad], row k at t_k, K the periods to be flown and N the
+                controller's preview; or an object with `row(k)` and `preview(k, n)`.
+            initial_state: (12,).
+            initial_speeds: (4,) u(-1), and the rotor speeds at the start [rad/s].
+            steps_per_period: physics steps per control period.
+            navigation: measured or estimated state for the controller; the true state where absent.
+            computation: how long commands take, in simulated time; none where absent.
+            rng: what `computation` draws from.
+            ground: what knows where the flight stands with ground and obstacles; it is flying throughout where absent.
+            loss: limits by the names of `quadsim.flight.lost.CRITERIA`, checked once per control period until it has
+                crashed; none where absent.
+            motion: of the reference from t_0 on, for controllers that use it; absent where only positions are known.
+            quaternions: whether attitude and body rates are logged beside Euler angles and their rates.
+            recorded: whether all periods are kept, for `log`: some 10 kB each.
+        """
+        plant.reset(initial_state, initial_speeds)
+        controller.reset(initial_speeds)
+        self.k, self.period = 0, steps_per_period * plant.timestep
+        self.controller, self.computation, self.motion = controller, computation, motion
+        self.answered = 0.0
+        self.before: Callable[[int], None] | None = None
+        self.reason: str | None = None
+        self._criterion: str | None = None
+        self._interrupted = False
+        self._yaw = float(initial_state[INDEX["yaw"]])
+        if navigation is not None:
+            navigation.reset(plant.physics, initial_speeds, yaw=self._yaw)
+        if ground is not None:
+            ground.reset()
+        self._plant, self._navigation, self._ground = plant, navigation, ground
+        self._reference: Reference = Rows(values=reference) if isinstance(reference, np.ndarray) else reference
+        self._steps, self._loss, self.quaternions = steps_per_period, loss, quaternions
+        self._draws = rng if rng is not None else np.random.default_rng(0)
+        self._start = plant.physics
+        self._initial_speeds = np.array(initial_speeds, float)
+        self._lowest = float(initial_state[INDEX["z"]])
+        self._acting = self._initial_speeds
+        self._plan, self._age = self._acting[None], 0  # the last plan that came in time, and how many periods ago
+        self._observed: Observation | None = None
+        self._samples: list[Sample] | None = [] if recorded else None
+        self._last: Sample | None = None
+        self._predicted: list[Array | None] = []  # of the controllers before this one, and how many periods they flew
+        self._switched = 0
+
+    @property
+    def observed(self) -> bool:
+        """Whether the period that starts now has been observed."""
+        return self._observed is not None
+
+    @property
+    def time(self) -> float:
+        """t_k, when the next period starts [s]."""
+        return self.k * self.period
+
+    @property
+    def course(self) -> Reference:
+        """What is followed."""
+        return self._reference
+
+    @property
+    def last(self) -> Sample | None:
+        """The period flown last; None before the first."""
+        return self._last
+
+    def switch(self, controller: Controller) -> None:
+        """Let another controller fly from the period that starts now on.
+
+        It is reset, and then told of the one before it where it has a method `adopt(previous)`: an observer, a plan
+        and the state of a fallback go on by it.
+
+        Raises:
+            InputError: the period that starts now is observed already, by the preview of the one before.
+        """
+        if self._observed is not None:
+            raise InputError("a controller takes over before a period is observed, not after")
+        controller.reset(self._acting.copy())
+        adopt = getattr(controller, "adopt", None)
+        if adopt is not None:
+            adopt(self.controller)
+        if self.k > self._switched:
+            self._predicted.append(self._predict())
+        self.controller, self._switched = controller, self.k
+
+    @property
+    def observation(self) -> Observation:
+        """What the period that starts now begins with, made once.
+
+        Raises:
+            FlightError: the vehicle is lost; the flight has ended.
+        """
+        if self._observed is None:
+            self._check_going_on()
+            try:
+                self._observed = self._observe()
+            except FlightError as error:
+                self._end(error)
+                raise
+        return self._observed
+
+    def step(self, command: Command | None = None) -> Sample:
+        """Fly one control period.
+
+        Args:
+            command: held instead of the controller's answer, which is not asked then.
+
+        Raises:
+            FlightError: the flight has ended in this period, which is not part of it.
+            InputError: it had ended before.
+        """
+        self._check_going_on()
+        try:
+            if self._observed is None:
+                self._observed = self._observe()
+            sample = self._fly(self._observed, command)
+        except FlightError as error:
+            self._end(error)
+            raise
+        self.k, self._observed, self._last = self.k + 1, None, sample
+        if self._samples is not None:
+            self._samples.append(sample)
+        return sample
+
+    def interrupt(self) -> None:
+        """End the flight here, as the person flying does by Ctrl-C."""
+        self._interrupted = True
+        self._end(InterruptedFlightError(time=self.time))
+
+    def log(self) -> FlightLog:
+        """All periods flown so far, with plant rows at the physics rate.
+
+        Raises:
+            InputError: they were not kept.
+        """
+        if self._samples is None:
+            raise InputError("no period of this flight was kept: it was begun with recorded=False")
+        samples = self._samples
+        control = _control_log(samples, self._initial_speeds, self.period)
+        plant_log = _plant_log(samples, self._start, self._initial_speeds, self._yaw, self._plant.timestep)
+        if self.quaternions:
+            moments = [sample.observation.moment for sample in samples]
+            attitudes = np.array([moment.attitude for moment in moments], float).reshape(-1, 4)
+            rates = np.array([moment.body_rates for moment in moments], float).reshape(-1, 3)
+            control = replace(control, attitude=attitudes, body_rates=rates)
+            physics = np.concatenate([self._start[None], *(sample.segment.physics for sample in samples)])
+            plant_log = replace(plant_log, attitude=physics[:, 4:8], body_rates=physics[:, 11:14])
+        return FlightLog(
+            control=control,
+            timing=_timing_log(samples, control.t),
+            plant=plant_log,
+            predicted=_joined([*self._predicted, *([self._predict()] if self.k > self._switched else [])]),
+            reason=self.reason,
+            interrupted=self._interrupted,
+            lost=self._criterion,
+        )
+
+    def _check_going_on(self) -> None:
+        if self.reason is not None:
+            raise InputError(f"the flight has ended {self.reason}")
+
+    def _end(self, error: FlightError) -> None:
+        """Note why the flight ended; not the error itself, which would hold all that was flown in a cycle."""
+        self.reason = str(error)
+        self._criterion = error.criterion if isinstance(error, LostError) else None
+
+    def _observe(self) -> Observation:
+        k, plant, navigation = self.k, self._plant, self._navigation
+        if self.before is not None:
+            self.before(k)
+        truth = plant.state()
+        state = truth.copy() if navigation is None else navigation.state()
+        attitude, body_rates = plant.attitude if navigation is None else navigation.attitude
+        row, preview = self._reference.row(k), self._reference.preview(k, self.controller.horizon)
+        phase = Phase.FLYING
+        if self._ground is not None:
+            since = self._start[None] if self._last is None else self._last.segment.physics
+            phase = self._ground.advance(since[:, 0], physics_to_state(since), preview)
+        self._lowest = min(self._lowest, float(row[_HEIGHT]))
+        if self._loss is not None and phase is not Phase.CRASHED:
+            check_loss(self._loss, self.time, truth, row, self._lowest)
+        now = Moment(
+            time=self.time,
+            phase=phase,
+            acting=self._acting,
+            attitude=attitude,
+            body_rates=body_rates,
+            motion=None if self.motion is None else self.motion.after(k),
+        )
+        return Observation(k=k, state=state, truth=truth, reference=row, preview=preview, moment=now)
+
+    def _predict(self) -> Array | None:
+        """Positions (K, N, 3) [m] that the controller predicted in its periods; None where it has no model."""
+        predict = getattr(self.controller, "predict", None)
+        samples = (self._samples or [])[self._switched :]
+        if predict is None or not samples:
+            return None
+        states = np.stack([sample.observation.state for sample in samples])
+        found: Array = predict(states, np.stack([sample.command.plan for sample in samples]))[:, :, [0, 2, 4]]
+        return found
+
+    def _fly(self, observed: Observation, given: Command | None) -> Sample:
+        plant, computation, steps, now = self._plant, self.computation, self._steps, observed.moment
+        step_s, command = 0.0, given
+        if command is None:
+            started = clock.perf_counter()
+            command = self.controller.step(now, observed.state, observed.preview)
+            step_s = clock.perf_counter() - started
+        delay = 0.0 if computation is None else computation.taken(now.time, command, self._draws)
+        self.answered = max(self.answered, now.time + delay)
+        wait = math.ceil(delay / plant.timestep - 1e-6)
+        missed = wait > steps  # one that comes just in time acts from the next period on
+        due = min(wait, steps)
+        if computation is not None and computation.plan:
+            due = min(due, math.ceil(computation.delay / plant.timestep - 1e-6))
+        planned = self._plan[min(self._age + 1, len(self._plan) - 1)]  # its last row beyond its end
+        holds = [(self._acting, due), (planned, min(wait, steps) - due)]
+        if missed:
+            self._age += 1
+            acting = holds[1][0] if holds[1][1] else self._acting
+        else:
+            acting, self._plan, self._age = command.speeds, command.plan, 0
+            holds.append((acting, steps - wait))
+        before = plant.physics
+        holds = [(speeds, count) for speeds, count in holds if count > 0]
+        flown = [part for speeds, count in holds for part in _hold(plant, command.inner, speeds, count)]
+        if self._navigation is not None:
+            for segment, speeds in flown:
+                held = np.broadcast_to(speeds, (len(segment.physics), N_ROTORS))
+                self._navigation.advance(segment.physics, held, standing=now.phase in (Phase.LANDED, Phase.ARMED))
+        self._acting = acting
+        return Sample(
+            observation=observed,
+            command=command,
+            speeds=acting,
+            delay=delay,
+            missed=missed,
+            step_s=step_s,
+            before=before,
+            segment=Segment.join([segment for segment, _ in flown]),
+            rotors=plant.speeds,
+        )
+
+
+def fly(
+    plant: Plant,
+    controller: Controller,
+    reference: Array | Reference,
+    *,
+    periods: int,
+    progress: Callable[[int], None] | None = None,
+    **settings: Any,
+) -> FlightLog:
+    """Fly a number of control periods.
+
+    Args:
+        plant: what is flown; it is reset first.
+        controller: what flies it; it is reset first.
+        reference: as of `ClosedLoop`.
+        periods: K.
+        progress: called with the number of periods flown, after each.
+        settings: what else `ClosedLoop` takes.
+
+    Returns:
+        The flight, with plant rows at the physics rate.
+    """
+    loop = ClosedLoop(plant, controller, reference, **settings)
+    complete(loop, periods=periods, progress=progress)
+    return loop.log()
+
+
+def complete(loop: ClosedLoop, *, periods: int, progress: Callable[[int], None] | None = None) -> None:
+    """Fly on until a number of control periods have been flown in all.
+
+    Whatever happens in flight ends up in its log: a typed flight error or Ctrl-C ends it early, with its reason and
+    everything up to it.
+
+    Args:
+        loop: the flight.
+        periods: K.
+        progress: called with the number of periods flown, after each.
+    """
+    try:
+        while loop.k < periods:
+            loop.step()
+            if progress is not None:
+                progress(loop.k)
+    except FlightError:
+        pass  # the loop has noted it
+    except KeyboardInterrupt:
+        loop.interrupt()
+
+
+def one_period(sample: Sample, timestep: float) -> FlightLog:
+    """One control period as a log of its own: a row, and the plant's rows from its begin to its end, both included."""
+    moment = sample.observation.moment
+    assert moment.acting is not None
+    yaw = float(sample.observation.truth[INDEX["yaw"]])
+    control = replace(_control_log([sample], moment.acting, 0.0), t=_times(2, moment.time)[1:])
+    plant = _plant_log([sample], sample.before, moment.acting, yaw, timestep)
+    plant = replace(plant, t=np.round(moment.time + plant.t, 9))
+    return FlightLog(control=control, timing=_timing_log([sample], control.t), plant=plant)
 
 
 def _hold(plant: Plant, inner: InnerLoop | None, speeds: Array, steps: int) -> Iterator[tuple[Segment, Array]]:
@@ -208,9 +469,9 @@ def _hold(plant: Plant, inner: InnerLoop | None, speeds: Array, steps: int) -> I
         yield plant.advance(asked, min(each, steps - first)), plant.applied(asked)
 
 
-def _control_log(
-    samples: list[Sample], states: Array, truth: Array, reference: Array, initial_speeds: Array, period: float
-) -> ControlLog:
+def _control_log(samples: list[Sample], initial_speeds: Array, period: float) -> ControlLog:
+    observed = [sample.observation for sample in samples]
+
     def column(name: str, kind: type) -> np.ndarray[Any, np.dtype[Any]]:
         return np.array([getattr(sample.command, name) for sample in samples], dtype=kind)
 
@@ -218,9 +479,9 @@ def _control_log(
     late = np.array([sample.missed for sample in samples], dtype=bool)
     return ControlLog(
         t=_times(len(samples), period),
-        state=states,
-        truth=truth,
-        reference=reference,
+        state=np.array([each.state for each in observed], float).reshape(-1, N_STATES),
+        truth=np.array([each.truth for each in observed], float).reshape(-1, N_STATES),
+        reference=np.array([each.reference for each in observed], float).reshape(-1, len(REFERENCE_NAMES)),
         speeds=np.array([sample.speeds for sample in samples], float).reshape(-1, N_ROTORS),
         speeds_before=np.array(initial_speeds, float),
         status=tuple(MISSED if sample.missed else sample.command.status for sample in samples),
@@ -232,6 +493,14 @@ def _control_log(
         primal_residual=column("primal_residual", float),
         dual_residual=column("dual_residual", float),
         delay=np.array([sample.delay for sample in samples], float),
+    )
+
+
+def _timing_log(samples: list[Sample], t: Array) -> TimingLog:
+    return TimingLog(
+        t=t,
+        solve_ms=np.array([1e3 * sample.command.solve_s for sample in samples]),
+        step_ms=np.array([1e3 * sample.step_s for sample in samples]),
     )
 
 
@@ -254,9 +523,10 @@ def _times(count: int, spacing: float) -> Array:
     return np.round(np.arange(count) * spacing, 9)
 
 
-def _predict(controller: Controller, states: Array, commands: list[Command]) -> np.ndarray | None:
-    predict = getattr(controller, "predict", None)  # a controller without a model has none
-    if not commands or predict is None:
+def _joined(parts: list[Array | None]) -> np.ndarray[Any, np.dtype[np.float32]] | None:
+    """The positions that each controller predicted, as far ahead as all of them did; None where one did not."""
+    found = [part for part in parts if part is not None]
+    if not found or len(found) < len(parts):
         return None
-    plans = np.stack([command.plan for command in commands])
-    return np.ascontiguousarray(predict(states, plans)[:, :, [0, 2, 4]], dtype=np.float32)
+    shortest = min(part.shape[1] for part in found)
+    return np.ascontiguousarray(np.concatenate([part[:, :shortest] for part in found]), dtype=np.float32)

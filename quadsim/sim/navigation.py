@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import math
 from collections.abc import Sequence
 from operator import attrgetter
 
@@ -22,6 +21,7 @@ from quadsim.state import (
     POSITIONS,
     VELOCITIES,
     Array,
+    YawTurns,
     body_to_euler_rates,
     euler_to_quaternion,
     quaternion_to_euler,
@@ -85,6 +85,15 @@ class Navigation:
         self._perfect = tuple(name for name in SensorName if name not in sensed)
         self._filter = None if estimator is None else ErrorStateFilter(vehicle, sensors, estimator, timestep=timestep)
 
+    def watches(self, sensor: SensorName) -> bool:
+        """Whether a sensor has had a fault in view from the start, and so may have another."""
+        return any(sampler.watched for sampler in self._samplers if sampler.sensor.name is sensor)
+
+    def reschedule(self, faults: Sequence[SensorFault]) -> None:
+        """Let these faults take the place of those before, of sensors watched; samples already taken stay."""
+        for sampler in self._samplers:
+            sampler.reschedule(faults)
+
     def reset(self, physics: Array, speeds: Array, yaw: float = 0.0) -> None:
         """Start again, with the same draws.
 
@@ -93,7 +102,7 @@ class Navigation:
             speeds: (4,) rotor speeds in force [rad/s].
             yaw: near which turn the yaw is [rad].
         """
-        self._step, self._yaw, self._physics = 0, yaw, physics.copy()
+        self._step, self._yaw, self._physics = 0, YawTurns(yaw), physics.copy()
         self.attitude: tuple[Array, Array] = physics[4:8].copy(), physics[11:14].copy()
         self._held = {name: truth(name, physics[None])[0] for name in SensorName}
         self._in_flight: list[Sample] = []
@@ -140,9 +149,7 @@ class Navigation:
         state[POSITIONS] = received[SensorName.POSITION]
         state[VELOCITIES] = received[SensorName.VELOCITY]
         state[ANGLE_RATES] = body_to_euler_rates(euler, received[SensorName.RATES])
-        if math.isfinite(euler[2]):
-            euler[2] += 2.0 * math.pi * round((self._yaw - float(euler[2])) / (2.0 * math.pi))
-            self._yaw = float(euler[2])
+        euler[2] = self._yaw.unwrapped(euler)
         state[ANGLES] = euler
         return state
 

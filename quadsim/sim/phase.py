@@ -10,7 +10,7 @@ import numpy as np
 
 from quadsim.controller import Phase
 from quadsim.flight.ground import AIRBORNE, TOUCH, Outline, clearance
-from quadsim.space import Obstacle
+from quadsim.space import Obstacle, Solids
 from quadsim.state import INDEX, POSITION, REFERENCE_NAMES, Array, tilt
 
 ASKED_RISE: Final = 0.05
@@ -41,7 +41,7 @@ class PhaseMonitor:
     def __init__(
         self, outline: Outline | None, *, period: float, obstacles: Sequence[Obstacle] = (), radius: float = 0.0
     ) -> None:
-        self._outline, self._obstacles, self._radius = outline, obstacles, radius
+        self._outline, self._obstacles, self._radius = outline, Solids(obstacles), radius
         if outline is None:
             self.reset()
             return
@@ -84,8 +84,7 @@ class PhaseMonitor:
         return self._phase
 
     def _touches_obstacle(self, t: Array, states: Array) -> bool:
-        points = states[:, POSITION]
-        return any(bool((each.clearance(t, points) <= self._radius).any()) for each in self._obstacles)
+        return bool((self._obstacles.clearances(t, states[:, POSITION])[0] <= self._radius).any())
 
     def _crashed(self, outline: Outline, states: Array) -> bool:
         if self._touched and np.degrees(tilt(states[-1:])[0]) > CAPSIZED:

@@ -60,7 +60,7 @@ def physics_to_state(physics: Array, yaw: float = 0.0) -> Array:
 
     Returns:
         (M, 12) states with Euler-angle rates (Sec. 2.2 takes body rates for them; see `quadsim.state`), yaw
-        unwrapped along the rows.
+        unwrapped along the rows, as by `quadsim.state.YawTurns`.
     """
     state = np.empty((physics.shape[0], N_STATES))
     euler = quaternion_to_euler(physics[:, 4:8])
@@ -71,6 +71,13 @@ def physics_to_state(physics: Array, yaw: float = 0.0) -> Array:
         euler[:, 2] = np.unwrap(euler[:, 2])
     turns = round((yaw - float(euler[0, 2])) / (2.0 * math.pi)) if len(euler) and math.isfinite(euler[0, 2]) else 0
     euler[:, 2] += 2.0 * math.pi * turns
+    upright = np.cos(euler[:, 0]) * np.cos(euler[:, 1]) >= 0.0
+    last = yaw
+    for first in np.flatnonzero(np.diff(upright)) + 1:  # as `quadsim.state.YawTurns`
+        if not upright[first]:
+            last = float(euler[first - 1, 2])
+        elif math.isfinite(euler[first, 2]):
+            euler[first:, 2] += 2.0 * math.pi * round((last - float(euler[first, 2])) / (2.0 * math.pi))
     state[:, ANGLES] = euler
     return state
 

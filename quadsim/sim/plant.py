@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections import deque
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import cached_property
 from operator import add
 from struct import Struct
@@ -16,7 +18,19 @@ from mujoco.rollout import Rollout
 from quadsim.controller import check_command
 from quadsim.errors import CommandError, DivergenceError, ForceError, ParameterError
 from quadsim.sim.airframe import BODY, compile_model, obstacle_body, outline
-from quadsim.sim.effects import Effects, Force, Load, Payload, PayloadChange, RotorChange, RotorDynamics
+from quadsim.sim.effects import (
+    LOADING,
+    Change,
+    Effects,
+    Force,
+    LagChange,
+    Load,
+    MassChange,
+    Payload,
+    PushChange,
+    RotorChange,
+    RotorDynamics,
+)
 from quadsim.sim.effects.forces import StepForces
 from quadsim.sim.effects.load import apply_mass, mass_properties
 from quadsim.sim.effects.wind import Air, WindField
@@ -31,6 +45,7 @@ from quadsim.state import (
     POSITIONS,
     VELOCITIES,
     Array,
+    YawTurns,
     euler_to_body_rates,
     euler_to_quaternion,
 )
@@ -74,7 +89,7 @@ class Plant:
         timestep: float = 1e-3,
         limit_speeds: bool = False,
         effects: Effects = _CALM,
-        changes: Sequence[RotorChange | PayloadChange] = (),
+        changes: Sequence[Change] = (),
         wind: WindField | None = None,
         forces: Sequence[Force] = (),
         obstacles: Sequence[Obstacle] = (),
@@ -84,9 +99,8 @@ class Plant:
         self.vehicle = vehicle
         self.timestep = timestep
         self.effects = effects
-        self._rotors, air = effects.rotors or RotorDynamics(), effects.air or Air()
-        self._load = effects.load or _AS_THE_FILE_SAYS
-        self._reweighed = self._load != _AS_THE_FILE_SAYS or any(isinstance(each, PayloadChange) for each in changes)
+        self._load, air = effects.load or _AS_THE_FILE_SAYS, effects.air or Air()
+        self._reweighed = self._load != _AS_THE_FILE_SAYS or any(isinstance(each, LOADING) for each in changes)
         self.model = compile_model(
             vehicle,
             timestep=timestep,
@@ -103,17 +117,17 @@ class Plant:
         mujoco.set_mju_user_warning(_discard)
         self._rollout = Rollout(nthread=0)
         self._physics = np.zeros((1, mujoco.mj_stateSize(self.model, _FULL)))
-        self._yaw = 0.0
+        self._yaw = YawTurns(0.0)
         self._wind, self._own = wind, tuple(forces)
         if integrator == "rk4":
             check_free(effects, changes, obstacles)
         self._integrator = integrator
         self._by_step = effects.follows_state or wind is not None or bool(self._own)
         self._by_step = self._by_step or bool(self._moving) or integrator == "rk4"
+        self._by_step = self._by_step or any(isinstance(each, PushChange) for each in changes)
         bodies = [self.model.body(obstacle_body(obstacle)).id for obstacle in self._moving]
         self._mocaps = self.model.body_mocapid[bodies]
-        ordered = sorted(changes, key=lambda change: change.time)
-        self._changes = [(math.ceil(change.time / timestep - 1e-6), change) for change in ordered]
+        self._changes = self._scheduled(changes)
         self._rng = rng if rng is not None else np.random.default_rng(0)
         self._rng_start = self._rng.bit_generator.state
         self.reset(np.zeros(N_STATES))
@@ -122,7 +136,16 @@ class Plant:
         return self
 
     def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Give native memory back."""
         self._rollout.close()
+
+    @property
+    def wind(self) -> WindField | None:
+        """How the air moves; None where it never does."""
+        return self._wind
 
     @property
     def time(self) -> float:
@@ -163,14 +186,17 @@ class Plant:
         self._physics[0] = np.concatenate(
             [[0.0], state[POSITIONS], euler_to_quaternion(euler), state[VELOCITIES], rates]
         )
-        self._yaw = float(euler[2])
+        self._yaw = YawTurns(float(euler[2]))
         self._step = 0
-        self._pending = list(self._changes)
+        self._pending = deque(self._changes)
+        self._rotors = self.effects.rotors or RotorDynamics()
         self._speeds = self.hover_speeds if speeds is None else np.array(speeds, float)
         self._efficiency = np.array(self._rotors.efficiency)
         self._velocity_before = self._physics[0, 8:].tolist()
         if self._reweighed:
-            self._carry(list(self._load.payloads))
+            self._carry(self._load.payloads, self._load.mass_factor)
+        if self._by_step:
+            self._forces.push(())
         self._rng.bit_generator.state = self._rng_start
         if self._wind is not None:
             self._wind.reset()
@@ -189,8 +215,8 @@ class Plant:
 
     def state(self) -> Array:
         """(12,) the true state now, yaw unwrapped since the last reset."""
-        state = physics_to_state(self._physics, self._yaw)[0]
-        self._yaw = float(state[EULER[2]])
+        state = physics_to_state(self._physics)[0]
+        state[EULER[2]] = self._yaw.unwrapped(state[ANGLES])
         return state
 
     @property
@@ -225,18 +251,39 @@ class Plant:
             parts.append(self._hold(target, until - self._step))
         return Segment.join(parts)
 
+    def allows(self, changes: Sequence[Change]) -> bool:
+        """Whether it was made for changes of these kinds, as it was for those that it was made with."""
+        weighing = not self._reweighed and any(isinstance(each, LOADING) for each in changes)
+        return not (weighing or (not self._by_step and any(isinstance(each, PushChange) for each in changes)))
+
+    def reschedule(self, changes: Sequence[Change]) -> None:
+        """Let from now on happen what these say, of kinds that it `allows`; what is past of them is left out."""
+        self._pending = deque(entry for entry in self._scheduled(changes) if entry[0] >= self._step)
+
+    def _scheduled(self, changes: Sequence[Change]) -> list[tuple[int, Change]]:
+        """Changes in the order of time, each with the physics step before which it happens."""
+        ordered = sorted(changes, key=lambda change: change.time)
+        return [(math.ceil(change.time / self.timestep - 1e-6), change) for change in ordered]
+
     def _change(self) -> None:
         """Let happen what is due before the next step."""
         while self._pending and self._pending[0][0] <= self._step:
-            _, change = self._pending.pop(0)
+            _, change = self._pending.popleft()
             if isinstance(change, RotorChange):
                 self._efficiency[change.rotor - 1] = change.efficiency
+            elif isinstance(change, MassChange):
+                self._carry(self._payloads, change.factor)
+            elif isinstance(change, LagChange):
+                self._rotors = self._rotors.lagging(change.rise, change.fall)
+            elif isinstance(change, PushChange):
+                self._forces.push(change.pushes)
             else:
-                self._carry([] if change.payload is None else [*self._payloads, change.payload])
+                self._carry(() if change.payload is None else (*self._payloads, change.payload), self._mass_factor)
 
-    def _carry(self, payloads: list[Payload]) -> None:
-        self._payloads = payloads
-        apply_mass(self.model, BODY, mass_properties(self.vehicle, self._load, payloads))
+    def _carry(self, payloads: tuple[Payload, ...], mass_factor: float) -> None:
+        self._payloads, self._mass_factor = payloads, mass_factor
+        load = replace(self._load, mass_factor=mass_factor)
+        apply_mass(self.model, BODY, mass_properties(self.vehicle, load, payloads))
 
     def _hold(self, target: Array, steps: int) -> Segment:
         """Advance while nothing but the vehicle and the air changes."""

@@ -10,7 +10,7 @@ import math
 from collections.abc import Iterable, Sequence
 
 from quadsim.errors import ParameterError
-from quadsim.sim.effects import Effects, Load, PayloadChange, RotorChange
+from quadsim.sim.effects import LOADING, Change, Effects, Load
 from quadsim.sim.effects.forces import StepForces, Wrench
 from quadsim.space import Obstacle
 from quadsim.vehicle import Vehicle
@@ -18,9 +18,7 @@ from quadsim.vehicle import Vehicle
 Rates = tuple[list[float], Wrench]
 
 
-def check_free(
-    effects: Effects, changes: Iterable[RotorChange | PayloadChange], obstacles: Sequence[Obstacle] = ()
-) -> None:
+def check_free(effects: Effects, changes: Iterable[Change], obstacles: Sequence[Obstacle] = ()) -> None:
     """Refuse what this integration does not know.
 
     Args:
@@ -34,7 +32,7 @@ def check_free(
     unknown = {
         "contact with the ground": effects.ground is not None and effects.ground.contact,
         "obstacles": bool(obstacles),
-        "a load": effects.load not in (None, Load()) or any(isinstance(each, PayloadChange) for each in changes),
+        "a load": effects.load not in (None, Load()) or any(isinstance(each, LOADING) for each in changes),
         "effects.air.body_drag": effects.air is not None and effects.air.body_drag is not None,
     }
     if found := [name for name, present in unknown.items() if present]:

@@ -15,8 +15,8 @@ from scenarios.bench.bench_results import FlightProfile
 from scenarios.bench.timing import Stopwatch, one_core
 from scenarios.build import build_controller, build_plant
 from scenarios.courses.make import build_reference
+from scenarios.limits import build_limits
 from scenarios.machine import machine
-from scenarios.parts.limits import build_limits
 from scenarios.parts.navigation import build_navigation
 from scenarios.parts.vehicle import build_vehicle
 from scenarios.progress import Progress, silent

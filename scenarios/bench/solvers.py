@@ -28,8 +28,8 @@ from scenarios.flight import Flight
 from scenarios.machine import machine, versions
 from scenarios.progress import Progress, silent
 from scenarios.run import fly_scenario
+from scenarios.schema.base import LARGEST_HORIZON
 from scenarios.schema.controller import ConstrainedSpec
-from scenarios.schema.optimisation import LARGEST_HORIZON
 from scenarios.schema.scenario import Scenario
 
 RESULTS_FILE: Final = "bench.json"

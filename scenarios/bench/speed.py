@@ -10,11 +10,12 @@ from __future__ import annotations
 import copy
 import itertools
 import math
-from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
 from typing import Any, Final
 
 import numpy as np
+from scipy.special import stdtrit
 
 from quadsim.assets import vehicle_path
 from quadsim.errors import ParameterError
@@ -39,6 +40,9 @@ TOLERANCE: Final = 0.5
 """[deg] beyond the bound that is no violation."""
 NEAR: Final = 0.25
 """[m] mean error up to which a course counts as followed."""
+SEEDS: Final = 5
+"""Flights of each controller at each speed where the world is random."""
+CONFIDENCE: Final = 0.95
 NODE: Final = 0.1
 """[s] from node to node of the nonlinear MPC at most, as Torrente et al. (2021) have it."""
 QUICK_WORLD, QUICK_SPEEDS, QUICK_LAWS = "loop, drag", (4.0, 6.0), ("LQR", "nonlinear")
@@ -55,6 +59,7 @@ class World:
         speeds: to fly at [m/s].
         course: the table `[reference]` and the duration [s] at a speed [m/s] and a control period [s].
         changes: of the vehicle's first scenario, whose plant has lag, inertia and drag of the vehicle's file.
+        seeds: flights at each speed; 1 where nothing is random.
     """
 
     about: str
@@ -63,6 +68,7 @@ class World:
     speeds: tuple[float, ...]
     course: Callable[[float, float], tuple[Table, float]]
     changes: Table
+    seeds: int = 1
 
 
 def _loop(speed: float, period: float) -> tuple[Table, float]:
@@ -79,6 +85,15 @@ def _eight(speed: float, period: float) -> tuple[Table, float]:
 
 _PLANT: Final = {"timestep": 0.0005, "integrator": "rk4", "limit_speeds": True}
 _DRAG: Final = {"air": {"linear_drag": [0.3, 0.3, 0.0], "quadratic_drag": [0.08, 0.08, 0.08]}}
+_SENSED: Final = {
+    "sensors": {
+        "position": {"rate": 100.0, "noise": 0.01},
+        "attitude": {"rate": 100.0, "noise": 0.26},
+        "rates": {"rate": 500.0, "noise": 0.43, "bias_walk": 0.0022},
+    },
+    "estimator": {"type": "error_state"},
+}
+"""Those of the library's `motion-capture`."""
 _LOOP: Final[Table] = {
     "vehicle": "torrente2021",
     "size": 10.0,
@@ -107,6 +122,15 @@ WORLDS: Final = {
         speeds=(3.0, 4.0, 5.0, 6.0, 7.0),
         course=_eight,
         changes={},
+    ),
+    "hummingbird, sensors": World(
+        about=f"the same by motion capture (1 cm, 0.26 deg, 100 Hz), a gyro and a Kalman filter; {SEEDS} seeds",
+        vehicle="hummingbird",
+        size=4.0,
+        speeds=(4.0, 6.0),
+        course=_eight,
+        changes=_SENSED,
+        seeds=SEEDS,
     ),
 }
 
@@ -207,12 +231,12 @@ LAWS: Final = {
 
 @dataclass(frozen=True, kw_only=True)
 class SpeedFlight:
-    """One flight; numbers are over what was flown.
+    """One flight, or several seeds of it; numbers are over what was flown, and means over the seeds but for the tilt.
 
     Attributes:
         bound: on roll and pitch [deg].
-        reason: why it ended early; None where it was completed.
-        error: mean distance from the reference [m]; None where the flight was lost.
+        reason: why one ended early; None where all were completed.
+        error: mean distance from the reference [m]; None where a flight was lost.
         tilt: largest angle between thrust axis and vertical at the physics rate [deg].
         violated: share of the time, at the physics rate, with roll or pitch beyond the bound by more than `TOLERANCE`.
         saturated: share of periods with a rotor commanded to its lowest or highest speed.
@@ -226,6 +250,34 @@ class SpeedFlight:
     violated: float
     saturated: float
     fallback: float
+    seeds: int = 1
+    """Flights."""
+    lost: int = 0
+    """How many of them ended early."""
+    half: float | None = None
+    """Half the 95 % interval of the mean error [m], Student's t; None of one flight, or where one was lost."""
+
+
+def merged(flights: Sequence[SpeedFlight]) -> SpeedFlight:
+    """Seeds of one flight as one."""
+    if len(flights) == 1:
+        return flights[0]
+    errors = np.array([flight.error for flight in flights if flight.error is not None])
+    whole, n = len(errors) == len(flights), len(flights)
+    quantile = float(stdtrit(n - 1, 0.5 * (1.0 + CONFIDENCE)))
+    return replace(
+        flights[0],
+        reason=next((flight.reason for flight in flights if flight.reason is not None), None),
+        error=float(errors.mean()) if whole else None,
+        tilt=max(flight.tilt for flight in flights),
+        **{
+            name: float(np.mean([getattr(flight, name) for flight in flights]))
+            for name in ("violated", "saturated", "fallback")
+        },
+        seeds=n,
+        lost=n - len(errors),
+        half=quantile * float(errors.std(ddof=1)) / math.sqrt(n) if whole else None,
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -263,7 +315,7 @@ class SpeedBench:
 def run_speeds(*, quick: bool = False, workers: int | None = None, progress: Progress = silent) -> SpeedBench:
     """Fly every controller in every world at every speed.
 
-    Nothing is random; results are the same however many processes fly.
+    Results are the same however many processes fly.
 
     Args:
         quick: two controllers on the loop with drag, at two speeds.
@@ -278,18 +330,20 @@ def run_speeds(*, quick: bool = False, workers: int | None = None, progress: Pro
     cells = [(world, speed, law) for world in WORLDS for speed in WORLDS[world].speeds for law in LAWS]
     if quick:
         cells = [cell for cell in cells if cell[0] == QUICK_WORLD and cell[1] in QUICK_SPEEDS and cell[2] in QUICK_LAWS]
-    found = answer_all(fly_cell, cells, workers=workers, progress=lambda done, total: progress("flights", done, total))
-    return SpeedBench(flights=dict(zip(cells, found, strict=True)))
+    asked = [(*cell, seed) for cell in cells for seed in range(WORLDS[cell[0]].seeds)]
+    found = answer_all(fly_cell, asked, workers=workers, progress=lambda done, total: progress("flights", done, total))
+    flights = iter(found)
+    return SpeedBench(flights={cell: merged(list(itertools.islice(flights, WORLDS[cell[0]].seeds))) for cell in cells})
 
 
-def fly_cell(cell: tuple[str, float, str]) -> SpeedFlight:
-    """Fly one controller in one world at one speed, here."""
+def fly_cell(cell: tuple[str, float, str, int]) -> SpeedFlight:
+    """Fly one controller in one world at one speed with one seed, here."""
     world, speed, law = WORLDS[cell[0]], cell[1], LAWS[cell[2]]
     vehicle = load_vehicle(vehicle_path(world.vehicle))
     data = first_scenario(vehicle, world.vehicle, course="figure-eight").to_data()
     tuned, period = data["controller"], data["control_period"]
     data["reference"], data["duration"] = world.course(speed, period)
-    data |= {"constraints": [], "lost": {"distance": world.size}, **copy.deepcopy(world.changes)}
+    data |= {"seed": cell[3], "constraints": [], "lost": {"distance": world.size}, **copy.deepcopy(world.changes)}
     bound = min(STEEPEST, round(report(parse_scenario(data), vehicle).tilt + ROOM))
     data["controller"] = law.table(Given(vehicle=vehicle, tuned=tuned, period=period, bound=bound))
     log = fly_scenario(parse_scenario(data)).log
@@ -305,14 +359,24 @@ def fly_cell(cell: tuple[str, float, str]) -> SpeedFlight:
         violated=float(beyond.mean()),
         saturated=float(at_end.any(axis=1).mean()),
         fallback=float((log.control.fallback > 0).mean()),
+        lost=int(log.reason is not None),
     )
+
+
+_ERRORS: Final = "The smallest at each speed is bold. ±: half the 95 % interval of the mean over seeds."
 
 
 def speed_tables(measured: SpeedBench) -> list[Grid]:
     """How far each controller goes, then errors, violations, tilts and saturation."""
     return [
         _reach(measured),
-        _grid(measured, "error", "Mean position error, m", _error, "The smallest at each speed is bold."),
+        _grid(
+            measured,
+            "error",
+            "Mean position error, m",
+            _error,
+            "The smallest at each speed is bold. ±: half the 95 % interval of the mean over seeds.",
+        ),
         _grid(
             measured,
             "violated",
@@ -373,8 +437,9 @@ def _grid(measured: SpeedBench, key: str, title: str, cell: Callable[[SpeedFligh
 
 def _error(flight: SpeedFlight, best: bool) -> Cell:
     if flight.error is None:
-        return Cell(text="lost", mark=Mark.BAD)
-    return Cell(text=f"{flight.error:.3f}", mark=Mark.BEST if best else Mark.NONE)
+        return Cell(text="lost" if flight.lost == flight.seeds else f"{flight.lost} lost", mark=Mark.BAD)
+    spread = "" if flight.half is None else f" ± {flight.half:.3f}"
+    return Cell(text=f"{flight.error:.3f}{spread}", mark=Mark.BEST if best else Mark.NONE)
 
 
 def _share(share: float) -> Cell:

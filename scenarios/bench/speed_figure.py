@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from quadsim.report.figures.canvas import new_figure
 from quadsim.report.palette import LINES, REFERENCE
 from scenarios.bench.speed import LAWS, SpeedBench
@@ -32,8 +34,8 @@ def draw_speeds(measured: SpeedBench) -> Figure:
         for law in measured.laws:
             flights = [measured.flights[world, speed, law] for speed in speeds]
             style = {**styles[law], "marker": "o", "markersize": 3.0}
-            whole = [math.nan if flight.error is None else flight.error for flight in flights]
-            errors.plot(speeds, whole, **style)
+            whole = np.array([math.nan if flight.error is None else flight.error for flight in flights])
+            errors.errorbar(speeds, whole, yerr=[flight.half or 0.0 for flight in flights], **style)
             violations.plot(speeds, [100.0 * flight.violated for flight in flights], **style)
             lost = [speed for speed, flight in zip(speeds, flights, strict=True) if flight.error is None]
             row = 0.98 - 0.02 * measured.laws.index(law)

@@ -18,10 +18,12 @@ from quadsim.state import Array
 from scenarios.campaign.spec import (
     ChoiceSpec,
     GridSpec,
+    IntegerSpec,
     LogUniformSpec,
     NormalSpec,
     UniformSpec,
     Value,
+    VaryBase,
     VarySpec,
 )
 
@@ -74,6 +76,8 @@ def quantile(entry: VarySpec, share: float) -> Value:
         case NormalSpec():
             low, high = ((end - entry.mean) / entry.deviation for end in entry.ends)
             return float(scipy.stats.truncnorm.ppf(share, low, high, loc=entry.mean, scale=entry.deviation))
+        case IntegerSpec():
+            return entry.low + int((entry.high - entry.low + 1) * share)
         case ChoiceSpec():
             edges = np.cumsum(entry.weights or [1.0] * len(entry.values))
             return entry.values[int(np.searchsorted(edges, share * edges[-1], side="right"))]
@@ -83,14 +87,18 @@ def quantile(entry: VarySpec, share: float) -> Value:
             assert_never(entry)
 
 
-def extremes(entry: VarySpec) -> list[Value]:
+def extremes(entry: VaryBase) -> list[Value]:
     """The values at the ends of a distribution, or all of a list: if these can be flown, the others can."""
-    if isinstance(entry, ChoiceSpec | GridSpec):
-        return list(entry.values)
-    if isinstance(entry, NormalSpec):
-        ends = zip(entry.ends, (_TAIL, 1.0 - _TAIL), strict=True)
-        return [end if math.isfinite(end) else quantile(entry, share) for end, share in ends]
-    return [entry.low, entry.high]
+    match entry:
+        case ChoiceSpec() | GridSpec():
+            return list(entry.values)
+        case NormalSpec():
+            ends = zip(entry.ends, (_TAIL, 1.0 - _TAIL), strict=True)
+            return [end if math.isfinite(end) else quantile(entry, share) for end, share in ends]
+        case UniformSpec() | LogUniformSpec() | IntegerSpec():
+            return [entry.low, entry.high]
+        case _:
+            raise AssertionError(f"{type(entry).__name__} has no ends")
 
 
 def _spread_points(spec: CampaignSpec) -> Array:

@@ -52,12 +52,8 @@ def begin(plan: Plan, files: Growing) -> dict[str, Any]:
         "flights": plan.spec.flights,
         "flown": 0,
         "files": {name: digest(text) for name, text in texts.items()},
-        **_flown_by(plan),
-        **(
-            {"controller_code": find_code(own).digest}
-            if isinstance(own := plan.scenario.controller, PluginSpec)
-            else {}
-        ),
+        **flown_by(plan),
+        **controller_code(plan),
         "sessions": [],
     }
     write(manifest, files)
@@ -130,10 +126,16 @@ def other_than_flew(manifest: Mapping[str, Any], plan: Plan) -> list[str]:
     """
     if isinstance(plan.scenario.controller, PluginSpec):
         announce_recorded(plan.scenario.controller, manifest.get("controller_code", manifest.get("controller")))
-    return [name for name, value in _flown_by(plan).items() if manifest.get(name) != value]
+    return [name for name, value in flown_by(plan).items() if manifest.get(name) != value]
 
 
-def _flown_by(plan: Plan) -> dict[str, Any]:
+def controller_code(plan: Plan) -> dict[str, Any]:
+    """The digest of a controller that is not ours, for `other_than_flew` to tell of."""
+    own = plan.scenario.controller
+    return {"controller_code": find_code(own).digest} if isinstance(own, PluginSpec) else {}
+
+
+def flown_by(plan: Plan) -> dict[str, Any]:
     """What numbers come from besides the campaign's own files."""
     return {
         "code": code_digest(),

@@ -13,17 +13,18 @@ import pyarrow as pa
 from pydantic import ValidationError
 
 from quadsim.errors import FileError, InputError, ParameterError
+from scenarios.campaign.changes import Change, changed, check_ends
 from scenarios.campaign.draws import Draws, extremes
 from scenarios.campaign.results.events import Event, parse_event
 from scenarios.campaign.results.table import DRAW, TIMING, Row, make_schema
-from scenarios.campaign.spec import CampaignSpec, Value, VarySpec
+from scenarios.campaign.spec import CampaignSpec, Value, VaryBase
+from scenarios.limits import build_limits
 from scenarios.loading import check_parts, parse_scenario
-from scenarios.parts.limits import build_limits
 from scenarios.parts.vehicle import build_vehicle, resolve_vehicle
 from scenarios.schema.bases import locate_files, merge, read_scenario
 from scenarios.schema.problems import ScenarioError, describe
 from scenarios.schema.scenario import Scenario
-from scenarios.schema.settings import apply_setting, get_field, set_field
+from scenarios.schema.settings import apply_setting
 from scenarios.shipped import campaign_path, scenario_path
 
 FIRST: Final = 5  # flights of which one at least has to be possible
@@ -44,7 +45,7 @@ class Plan:
     @cached_property
     def schema(self) -> pa.Schema:
         """The columns of its results."""
-        kinds = {entry.name: (_column_type(entry), entry.unit) for entry in self.spec.vary}
+        kinds = {entry.name: (column_type(entry), entry.unit) for entry in self.spec.vary}
         return make_schema(kinds, build_limits(self.scenario))
 
     @property
@@ -78,7 +79,7 @@ class Plan:
 
     def identity(self, flight: int) -> Row:
         """The columns that tell one flight from the others."""
-        drawn = {DRAW + name: _cell(value) for name, value in self.draws.values(flight).items()}
+        drawn = {DRAW + name: cell(value) for name, value in self.draws.values(flight).items()}
         return {"flight": flight, "seed": self.draws.seed(flight), **drawn}
 
     def check(self) -> None:
@@ -89,16 +90,11 @@ class Plan:
                 flights can; or a failure event is about a column that the results do not have.
         """
         _ = self.failure
-        for entry in self.spec.vary:
-            for value in extremes(entry):
-                try:
-                    check_parts(self._varied([(entry, value)], name=self.scenario.name, seed=0))
-                except ScenarioError as error:
-                    raise ScenarioError(f"vary.{entry.name} at {value!r}", error.problems) from error
-                except InputError as error:
-                    message = str(error)
-                    where = "" if message.startswith("vary.") else f"vary.{entry.name} at {value!r}: "
-                    raise InputError(where + message) from error
+        check_ends(
+            self.spec.vary,
+            lambda entry, value: self._varied([(entry, value)], name=self.scenario.name, seed=0),
+            table="vary",
+        )
         refusals = [self._refusal(flight) for flight in range(min(FIRST, self.spec.flights))]
         if all(refusals):
             raise InputError(f"none of the first {len(refusals)} flights can be flown, the first since {refusals[0]}")
@@ -111,25 +107,8 @@ class Plan:
             return error
         return None
 
-    def _varied(self, changes: Sequence[tuple[VarySpec, Value]], *, name: str, seed: int) -> Scenario:
-        data: dict[str, Any] = merge(self._data, {})
-        for entry, value in changes:
-            for field in entry.fields:
-                set_field(data, field, self._scaled(entry, field, value), asked=f"vary.{entry.name}.fields")
-        return parse_scenario({**data, "name": name, "seed": seed}, source=name)
-
-    def _scaled(self, entry: VarySpec, field: str, value: Value) -> Value:
-        if not entry.relative:
-            return value
-        given = get_field(merge(self._data, {}), field)
-        if isinstance(given, bool) or not isinstance(given, int | float):
-            if given is None:
-                self._varied([(entry.model_copy(update={"relative": False}), value)], name=self.scenario.name, seed=0)
-            rule = f"false where the scenario has no number at {field}"
-            raise ParameterError(f"vary.{entry.name}", "relative", True, rule)
-        if isinstance(value, bool) or not isinstance(value, int | float):
-            raise ParameterError(f"vary.{entry.name}", "relative", True, "false where what is drawn is no number")
-        return value * given
+    def _varied(self, changes: Sequence[Change], *, name: str, seed: int) -> Scenario:
+        return changed(self._data, changes, table="vary", name=name, seed=seed)
 
 
 def read_campaign(name: str) -> dict[str, Any]:
@@ -140,8 +119,8 @@ def read_campaign(name: str) -> dict[str, Any]:
     """
     try:
         path = campaign_path(name)
-        data = read_scenario(path, campaign_path, locate=_locate)
-        _locate(data, path.parent)
+        data = read_scenario(path, campaign_path, locate=locate)
+        locate(data, path.parent)
         return data
     except OSError as error:
         raise FileError(str(error.filename)[:100], f"cannot be read ({error.strerror})") from error
@@ -162,7 +141,7 @@ def load_plan(name: str, settings: Sequence[str] = (), *, flights: int | None = 
     path, data = campaign_path(name), read_campaign(name)
     data |= {key: value for key, value in (("flights", flights), ("seed", seed)) if value is not None}
     spec = parse_campaign(data, source=path.name)
-    plan = Plan(spec=spec, scenario=_scenario(spec, path, settings))
+    plan = Plan(spec=spec, scenario=flown_scenario(spec, path, settings))
     plan.check()
     return plan
 
@@ -193,8 +172,12 @@ def parse_campaign(data: Mapping[str, Any], *, source: str) -> CampaignSpec:
         raise ScenarioError(source, problems) from error
 
 
-def _scenario(spec: CampaignSpec, path: Path, settings: Sequence[str]) -> Scenario:
-    """The scenario of a campaign's file, with its changes and then those of the command line."""
+def flown_scenario(spec: CampaignSpec, path: Path, settings: Sequence[str] = ()) -> Scenario:
+    """The scenario of a campaign's file, with its changes and then those of the command line.
+
+    Raises:
+        InputError: it cannot be read or flown.
+    """
     file = scenario_path(spec.scenario)
     data = merge(read_scenario(file, scenario_path), spec.set)
     drawn = {field: entry.name for entry in spec.vary if not entry.relative for field in entry.fields}
@@ -214,7 +197,7 @@ def _scenario(spec: CampaignSpec, path: Path, settings: Sequence[str]) -> Scenar
     return resolve_vehicle(scenario, build_vehicle(scenario))
 
 
-def _locate(data: dict[str, Any], directory: Path) -> None:
+def locate(data: dict[str, Any], directory: Path) -> None:
     """Make the paths in a campaign's tables independent of its folder, in place."""
     file, changes = data.get("scenario"), data.get("set")
     if isinstance(file, str) and file.endswith(".toml") and (directory / file).is_file():
@@ -223,14 +206,15 @@ def _locate(data: dict[str, Any], directory: Path) -> None:
         locate_files(changes, directory)
 
 
-def _column_type(entry: VarySpec) -> pa.DataType:
+def column_type(entry: VaryBase) -> pa.DataType:
+    """The type of the column that holds an entry's values."""
     first = extremes(entry)[0]
     if isinstance(first, bool):
         return pa.bool_()
     return pa.float64() if isinstance(first, int | float) else pa.string()
 
 
-def _cell(value: Value) -> Value | str:
+def cell(value: Value) -> Value | str:
     """A drawn value as it stands in the results: lists as texts, whole numbers as numbers."""
     if isinstance(value, bool | str):
         return value

@@ -23,8 +23,8 @@ MOST_FLIGHTS: Final = 1_000_000
 Sampling = Literal["random", "latin_hypercube", "sobol", "halton"]
 
 
-class _VarySpec(Spec):
-    """What every entry of `[[vary]]` has."""
+class VaryBase(Spec):
+    """What every entry of `[[vary]]` has, and of `[[search]]`."""
 
     name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]*$", max_length=60)] = Field(
         description="letters, digits, _ and -; the column `draw.NAME` of the results"
@@ -37,7 +37,7 @@ class _VarySpec(Spec):
     relative: bool = Field(default=False, description="whether the drawn number multiplies what the scenario has")
 
 
-class UniformSpec(_VarySpec):
+class UniformSpec(VaryBase):
     """Every value between two bounds is equally likely."""
 
     distribution: Literal["uniform"]
@@ -46,11 +46,11 @@ class UniformSpec(_VarySpec):
 
     @model_validator(mode="after")
     def _check(self) -> UniformSpec:
-        _require_range(self.low, self.high)
+        require_range(self.low, self.high)
         return self
 
 
-class LogUniformSpec(_VarySpec):
+class LogUniformSpec(VaryBase):
     """The logarithm is uniform: every factor is equally likely."""
 
     distribution: Literal["log_uniform"]
@@ -59,11 +59,11 @@ class LogUniformSpec(_VarySpec):
 
     @model_validator(mode="after")
     def _check(self) -> LogUniformSpec:
-        _require_range(self.low, self.high)
+        require_range(self.low, self.high)
         return self
 
 
-class NormalSpec(_VarySpec):
+class NormalSpec(VaryBase):
     """A normal distribution, cut off where `low` or `high` say so."""
 
     distribution: Literal["normal"]
@@ -75,7 +75,7 @@ class NormalSpec(_VarySpec):
     @model_validator(mode="after")
     def _check(self) -> NormalSpec:
         low, high = self.ends
-        _require_range(low, high)
+        require_range(low, high)
         if low > self.mean + 8.0 * self.deviation or high < self.mean - 8.0 * self.deviation:
             raise ValueError(
                 f"mean must be within 8 standard deviations of the range {low:g} to {high:g}, or nothing is ever drawn "
@@ -89,7 +89,7 @@ class NormalSpec(_VarySpec):
         return -math.inf if self.low is None else self.low, math.inf if self.high is None else self.high
 
 
-class ChoiceSpec(_VarySpec):
+class ChoiceSpec(VaryBase):
     """One of several values, each with its own weight."""
 
     distribution: Literal["choice"]
@@ -100,7 +100,7 @@ class ChoiceSpec(_VarySpec):
 
     @model_validator(mode="after")
     def _check(self) -> ChoiceSpec:
-        _require_alike(self.values)
+        require_alike(self.values)
         if self.weights is not None and len(self.weights) != len(self.values):
             raise ValueError(f"weights must be as many as values, {len(self.values)}; got {len(self.weights)}")
         if self.weights is not None and not sum(self.weights) > 0.0:
@@ -108,7 +108,20 @@ class ChoiceSpec(_VarySpec):
         return self
 
 
-class GridSpec(_VarySpec):
+class IntegerSpec(VaryBase):
+    """Every whole number between two bounds, both included, is equally likely."""
+
+    distribution: Literal["integer"]
+    low: Whole
+    high: Whole
+
+    @model_validator(mode="after")
+    def _check(self) -> IntegerSpec:
+        require_range(self.low, self.high)
+        return self
+
+
+class GridSpec(VaryBase):
     """Every value in turn; several grids make every combination, the last one changing fastest."""
 
     distribution: Literal["grid"]
@@ -116,21 +129,22 @@ class GridSpec(_VarySpec):
 
     @model_validator(mode="after")
     def _check(self) -> GridSpec:
-        _require_alike(self.values)
+        require_alike(self.values)
         return self
 
 
 VarySpec = Annotated[
-    UniformSpec | LogUniformSpec | NormalSpec | ChoiceSpec | GridSpec, Field(discriminator="distribution")
+    UniformSpec | LogUniformSpec | NormalSpec | IntegerSpec | ChoiceSpec | GridSpec, Field(discriminator="distribution")
 ]
 
 
-def _require_range(low: float, high: float) -> None:
+def require_range(low: float, high: float) -> None:
+    """Refuse a range without a width."""
     if not low < high:
         raise ValueError(f"low must be below high; got {low:g} and {high:g}")
 
 
-def _require_alike(values: Sequence[Value]) -> None:
+def require_alike(values: Sequence[Value]) -> None:
     """Refuse values of different kinds, which cannot stand in one column."""
     kinds = {
         "a number" if isinstance(each, int | float) and not isinstance(each, bool) else type(each) for each in values
@@ -184,7 +198,7 @@ class CampaignSpec(Spec):
         names = [entry.name for entry in self.vary]
         if len(set(names)) < len(names):
             raise ValueError(f"vary must have distinct names; got {names}")
-        self._check_fields()
+        check_fields(self.vary, "vary", {})
         grids = [entry.name for entry in self.vary if isinstance(entry, GridSpec)]
         if grids and self.sampling in ("sobol", "halton"):
             rule = (
@@ -203,19 +217,6 @@ class CampaignSpec(Spec):
                 raise ValueError(f"failure has an entry {text!r} that is no event: {error}") from error
         return self
 
-    def _check_fields(self) -> None:
-        """Refuse fields that two entries draw, and those that are not for drawing."""
-        owners: dict[str, str] = {}
-        for entry in self.vary:
-            for field in entry.fields:
-                if field == "seed":
-                    raise ValueError(f"vary.{entry.name}.fields must not have seed: every flight has one of its own")
-                if field.split(".")[-1] == "name":
-                    raise ValueError(f"vary.{entry.name}.fields must not have {field}: results are identified by names")
-                if field in owners:
-                    raise ValueError(f"vary.{entry.name}.fields must not have {field}, which {owners[field]} draws")
-                owners[field] = entry.name
-
     @property
     def cells(self) -> int:
         """Combinations that the grids make; 1 without any."""
@@ -224,3 +225,25 @@ class CampaignSpec(Spec):
     def to_toml(self) -> str:
         """The file with every field, defaults included; reading it gives this campaign again."""
         return to_toml(self)
+
+
+def check_fields(entries: Sequence[VaryBase], table: str, owners: dict[str, str]) -> None:
+    """Refuse fields that two entries replace, and those that are not to be replaced.
+
+    Args:
+        entries: of the file.
+        table: of the file that has them.
+        owners: by field, who replaces it; the entries' own are added.
+
+    Raises:
+        ValueError: naming the entry and the field.
+    """
+    for entry in entries:
+        for field in entry.fields:
+            if field == "seed":
+                raise ValueError(f"{table}.{entry.name}.fields must not have seed: every flight has one of its own")
+            if field.split(".")[-1] == "name":
+                raise ValueError(f"{table}.{entry.name}.fields must not have {field}: results are identified by names")
+            if field in owners:
+                raise ValueError(f"{table}.{entry.name}.fields must not have {field}, which {owners[field]} draws")
+            owners[field] = entry.name

@@ -26,7 +26,7 @@ def list_everything(options: Namespace) -> int:
         members = [each for each in found.scenarios.values() if each.group == group]
         lines = {each.name: each.description + _MEANT.get(each.expect, "") for each in members}
         by_group |= {f"scenarios: {group}": lines} if lines else {}
-    others = ("campaigns", "vehicles", "controllers", "papers", "solvers")
+    others = ("campaigns", "tunings", "vehicles", "controllers", "papers", "solvers")
     console.print_listing({**by_group, **{title: getattr(found, title) for title in others}})
     return EXIT_DONE
 

@@ -180,7 +180,11 @@ def _controller_lines(summary: Mapping[str, Any]) -> Iterator[str]:
 
 
 def _effect_lines(summary: Mapping[str, Any]) -> Iterator[str]:
-    """What a flight's effects did, where it has them: ground, late commands, errors of the estimate."""
+    """What a flight's effects did, where it has them: events, ground, late commands, errors of the estimate."""
+    if events := summary.get("events"):
+        from quadsim.report.narrative import event_sentences
+
+        yield f"on the way: {'; '.join(event_sentences(events))}"
     if "ground" in summary:
         ground = summary["ground"]
         left = "started in the air" if ground["started"] == "flying" else "never left it"

@@ -18,6 +18,7 @@ from quadsim.vehicle import Vehicle
 from scenarios.courses.course import Course
 from scenarios.courses.make import build_course, filtered, initial_pose
 from scenarios.courses.smoothing import within_rounding
+from scenarios.schema.events import SetpointEvent
 from scenarios.schema.optimisation import ANGLES, BoundedSpec
 from scenarios.schema.robust import RobustSpec
 
@@ -26,7 +27,7 @@ if TYPE_CHECKING:
 
 
 def report(scenario: Scenario, vehicle: Vehicle) -> Feasibility:
-    """What the filtered course asks for, against the vehicle's limits and the controller's bounds.
+    """What the filtered course asks for, up to a set-point, against the vehicle's limits and the controller's bounds.
 
     A table that was rounded is taken for the smoothest one within its last decimal: differences of the fourth order
     would make of 0.1 mm steps of tens of rad/s, which no controller flies.
@@ -34,7 +35,7 @@ def report(scenario: Scenario, vehicle: Vehicle) -> Feasibility:
     Raises:
         InputError: the course cannot be built.
     """
-    return _asked(build_course(scenario), scenario, vehicle, duration=scenario.duration)
+    return _asked(build_course(scenario), scenario, vehicle, duration=_followed(scenario))
 
 
 def fitting(scenario: Scenario, vehicle: Vehicle) -> str:
@@ -46,7 +47,7 @@ def fitting(scenario: Scenario, vehicle: Vehicle) -> str:
     Returns:
         A sentence; empty where the course fits as it is, or at none of them down to a tenth.
     """
-    course, duration, filtered_by = build_course(scenario), scenario.duration, scenario.reference.response_time
+    course, duration, filtered_by = build_course(scenario), _followed(scenario), scenario.reference.response_time
 
     def slower(share: float) -> bool:
         return not _asked(_scaled(course, pace=share), scenario, vehicle, duration=duration / share).problems
@@ -69,6 +70,12 @@ def fitting(scenario: Scenario, vehicle: Vehicle) -> str:
     if filtered_by > 0.0 and (share := _largest(smoother)) is not None:
         ways.append(f"with a response time of {filtered_by / share:.3g} s")
     return f"It would fit {', or '.join(ways)}." if ways else ""
+
+
+def _followed(scenario: Scenario) -> float:
+    """How long the course is followed [s]: up to the first set-point."""
+    until = min((event.at for event in scenario.events if isinstance(event, SetpointEvent)), default=scenario.duration)
+    return max(until, scenario.control_period)
 
 
 def _largest(fits: Callable[[float], bool]) -> float | None:

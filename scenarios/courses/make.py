@@ -18,10 +18,11 @@ from quadsim.state import REFERENCE_NAMES, Array
 from quadsim.vehicle import Vehicle
 from scenarios.courses.course import Course, Path, begin
 from scenarios.courses.csv_course import read_table, through_rows
+from scenarios.courses.followed import FollowedCourse
 from scenarios.courses.legs import Turn, Waypoint, waypoints, yaw_turns
 from scenarios.courses.loops import circle, figure_eight, fly_round
 from scenarios.courses.minimum_snap import minimum_snap
-from scenarios.courses.ramped import circle_curve, fly_ramped, lemniscate_curve, ramped_phase
+from scenarios.courses.ramped import circle_curve, fly_ramped, lemniscate_curve, ramped_phase, upright_circle_curve
 from scenarios.courses.smoothing import smooth
 from scenarios.courses.steps import Window, steps, switches
 from scenarios.parts.vehicle import build_vehicle
@@ -41,6 +42,7 @@ from scenarios.schema.course import (
     WindowSpec,
     YawTurnsSpec,
 )
+from scenarios.schema.events import SetpointEvent
 
 if TYPE_CHECKING:
     from scenarios.schema.scenario import Scenario
@@ -79,8 +81,14 @@ def initial_pose(scenario: Scenario) -> Array:
 
 
 def build_reference(scenario: Scenario, samples: int) -> Array:
-    """(samples, 4) filtered reference x, y, z [m], yaw [rad] at t_k = k tau_s.  Eqs. (30)-(31)."""
+    """(samples, 4) filtered reference x, y, z [m], yaw [rad] at t_k = k tau_s, but for set-points.  Eqs. (30)-(31)."""
     return filtered(build_course(scenario), scenario, samples)
+
+
+def follow_course(scenario: Scenario) -> FollowedCourse:
+    """The same row by row, with set-points on the way, known from the start to nobody."""
+    course, response_time = build_course(scenario), scenario.reference.response_time
+    return FollowedCourse(course, response_time=response_time, period=scenario.control_period)
 
 
 def filtered(course: Course, scenario: Scenario, samples: int) -> Array:
@@ -108,15 +116,18 @@ def build_motion(scenario: Scenario, vehicle: Vehicle) -> Motion | None:
 def build_course_steps(scenario: Scenario) -> tuple[CourseStep, ...]:
     """The steps of the unfiltered course, channel by channel; a start away from the course is a step at 0.
 
-    Only a course of windows has steps whose settling can be watched.
+    Only a course of windows has steps whose settling can be watched, and only on axes that no set-point takes from it.
     """
     if not isinstance(scenario.reference, StepsSpec):
         return ()
+    taken = {name for event in scenario.events if isinstance(event, SetpointEvent) for name in event.values}
     preview = scenario.controller.horizon * scenario.control_period
     found = []
     for name, (windows, elsewhere), start in zip(
         REFERENCE_NAMES, _channels(scenario, scenario.reference), initial_pose(scenario).tolist(), strict=True
     ):
+        if name in taken:
+            continue
         flown = [step for step in switches(windows, elsewhere, initial=start) if step[0] < scenario.duration]
         ends = [*(time - preview for time, _, _ in flown[1:]), scenario.duration]
         for (time, before, after), until in zip(flown, ends, strict=False):
@@ -194,14 +205,19 @@ def _loop(spec: CircleSpec | HelixSpec | FigureEightSpec, initial: Array) -> Pat
 
 
 def _ramped(spec: RampedCircleSpec | RampedLemniscateSpec, initial: Array, *, gravity: float) -> Path:
-    curve = circle_curve if isinstance(spec, RampedCircleSpec) else lemniscate_curve
+    if isinstance(spec, RampedLemniscateSpec):
+        curve = lemniscate_curve(spec.radius)
+    elif spec.plane == "vertical":
+        curve = upright_circle_curve(spec.radius, float(initial[3]))
+    else:
+        curve = circle_curve(spec.radius)
     phase = ramped_phase(
         rate=spec.speed / spec.radius,
         acceleration=spec.acceleration / spec.radius,
         ramp=spec.ramp,
         step=spec.sampling,
     )
-    return fly_ramped(curve(spec.radius), phase, initial=initial, gravity=gravity, free_heading=spec.heading == "free")
+    return fly_ramped(curve, phase, initial=initial, gravity=gravity, free_heading=spec.heading == "free")
 
 
 def _csv(spec: CsvSpec, initial: Array) -> Course:

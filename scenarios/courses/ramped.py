@@ -70,6 +70,22 @@ def circle_curve(radius: float) -> Curve:
     return curve
 
 
+def upright_circle_curve(radius: float, yaw: float) -> Curve:
+    """A vertical circle towards a yaw [rad], begun at its lowest point; radius [m]."""
+
+    def curve(theta: Array, omega: Array, alpha: Array) -> tuple[Array, Array, Array]:
+        ahead = np.array([math.cos(yaw), math.sin(yaw), 0.0])
+        up = np.array([0.0, 0.0, 1.0])
+        sin, cos = np.sin(theta)[:, None], np.cos(theta)[:, None]
+        square, change = np.square(omega)[:, None], alpha[:, None]
+        position = sin * ahead + (1.0 - cos) * up
+        velocity = omega[:, None] * (cos * ahead + sin * up)
+        acceleration = (change * cos - square * sin) * ahead + (change * sin + square * cos) * up
+        return radius * position, radius * velocity, radius * acceleration
+
+    return curve
+
+
 def lemniscate_curve(radius: float) -> Curve:
     """A level lemniscate of Gerono, begun at its tip in x towards y; radius is half its length [m]."""
 
@@ -92,6 +108,9 @@ def fly_ramped(curve: Curve, phase: Phase, *, initial: Array, gravity: float, fr
         initial: (4,) x, y, z [m], yaw [rad] where it begins.
         gravity: g [m/s^2]; with the acceleration it makes the attitude, and so the yaw.
         free_heading: whether the heading is what leaves no rate about body z; else the initial one.
+
+    The yaw is that of the attitude; of a curve that turns the vehicle upside down, where Euler's yaw turns by 180 deg,
+    the initial one.
     """
     from scipy.interpolate import CubicSpline
 
@@ -104,7 +123,8 @@ def fly_ramped(curve: Curve, phase: Phase, *, initial: Array, gravity: float, fr
     accelerations = curve(phase.angle, phase.rate, phase.acceleration)[2]
     heading = float(initial[3]) if free_heading else np.full(len(knots), initial[3])
     attitude, _ = attitudes(accelerations, period=phase.step, gravity=gravity, yaw=heading)
-    yaw = np.unwrap(quaternion_to_euler(attitude)[:, 2])
+    inverted = bool((accelerations[:, 2] + gravity < 0.0).any())
+    yaw = np.full(len(knots), initial[3]) if inverted else np.unwrap(quaternion_to_euler(attitude)[:, 2])
 
     def pose(t: Array) -> Array:
         return np.column_stack([initial[:3] + at(t)[0], np.interp(t, knots, yaw)])

@@ -32,6 +32,7 @@ from scenarios.schema.robust import RobustSpec
 if TYPE_CHECKING:
     from mpc.export.source import Exportable
     from mpc.robust.controller import RobustMPC
+    from mpc.robust.filter import SafetyFilter
     from mpc.robust.settings import RobustSettings
     from mpc.space.halfspaces import Shape, Space
 
@@ -153,6 +154,22 @@ def make_controller(spec: ControllerSpec, vehicle: Vehicle, period: float, shape
             return _baseline(spec, vehicle, period)
         case PluginSpec():
             return build_plugin(spec, vehicle, period)
+
+
+def make_filter(spec: RobustSpec, vehicle: Vehicle, period: float) -> tuple[SafetyFilter, Controller]:
+    """The safety filter with a robust MPC's constraints, and the same within its fallback contract, which flies.
+
+    Raises:
+        InputError: it cannot be made from these numbers.
+    """
+    from mpc.robust.filter import SafetyFilter
+
+    if spec.avoidance is not None:
+        raise ParameterError(
+            "controller", "avoidance", "given", "absent for a safety filter, which keeps no half-spaces"
+        )
+    found = SafetyFilter(_robust(spec.model_copy(update={"shortcut": False}), vehicle, period))
+    return found, _bounded(found, spec, spec.fallback, vehicle, period)
 
 
 def posed_problem(spec: BoundedSpec, vehicle: Vehicle, period: float) -> Problem:
@@ -303,6 +320,7 @@ def make_space(
         margins=margins,
         penalty=None if soft is None else (soft.linear, soft.quadratic),
         positions=(0, 1, 2) if isinstance(spec, NonlinearSpec) else POSITION,
+        largest=isinstance(spec, NonlinearSpec),
     )
 
 

@@ -3,21 +3,35 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
-from typing import TYPE_CHECKING
+from collections.abc import Iterable, Iterator, Sequence
+from operator import itemgetter
+from typing import TYPE_CHECKING, TypeVar
 
 from mpc.fallback.settings import FallbackSettings
 from quadsim.errors import ParameterError
 from quadsim.fields import filled
 from quadsim.sim.computation import Computation, ComputationTime, Stall
-from quadsim.sim.effects import Air, PayloadChange, RotorChange, RotorDynamics
+from quadsim.sim.effects import (
+    Air,
+    Change,
+    LagChange,
+    MassChange,
+    PayloadChange,
+    PushChange,
+    RotorChange,
+    RotorDynamics,
+)
 from quadsim.sim.effects.gust import Gust
 from quadsim.sim.effects.wind import WindChange, WindField
 from quadsim.vehicle import Vehicle
 from scenarios.parts.randomness import generator
 from scenarios.schema.events import (
+    Event,
+    MassEvent,
     PayloadDropEvent,
     PayloadPickupEvent,
+    PushEvent,
+    RotorLagEvent,
     RotorLossEvent,
 )
 
@@ -50,14 +64,22 @@ def build_wind(scenario: Scenario, vehicle: Vehicle) -> WindField | None:
     air = moving_air(scenario, vehicle)
     if air is None:
         return None
+    gusts, changes = winds_of(scenario)
     return WindField(
         mean=air.wind,
-        gusts=tuple(event for event in scenario.events if isinstance(event, Gust)),
-        changes=tuple(event for event in scenario.events if isinstance(event, WindChange)),
+        gusts=gusts,
+        changes=changes,
         turbulence=air.turbulence,
         timestep=scenario.plant.timestep,
         rng=generator(scenario.seed, "wind"),
     )
+
+
+def winds_of(scenario: Scenario) -> tuple[tuple[Gust, ...], tuple[WindChange, ...]]:
+    """The gusts, and the steps of the mean wind."""
+    events = scenario.events
+    gusts = tuple(event for event in events if isinstance(event, Gust))
+    return gusts, tuple(event for event in events if isinstance(event, WindChange))
 
 
 def build_computation(scenario: Scenario) -> Computation | None:
@@ -75,27 +97,66 @@ def _has_fallback(scenario: Scenario) -> bool:
     return isinstance(fallback, FallbackSettings) and fallback.enabled
 
 
-def build_changes(scenario: Scenario) -> tuple[RotorChange | PayloadChange, ...]:
-    """What happens to rotors and payload on the way, in any order."""
-    found: list[RotorChange | PayloadChange] = [*_losses(scenario)]
-    for event in scenario.events:
+def build_changes(scenario: Scenario, events: Sequence[Event] | None = None) -> tuple[Change, ...]:
+    """What happens to rotors, mass and payload on the way, and what pushes the vehicle, in any order.
+
+    Args:
+        scenario: what is flown.
+        events: those that count, instead of all that the scenario has.
+    """
+    events = scenario.events if events is None else events
+    found: list[Change] = [*_losses(scenario, events), *_pushes(events)]
+    for event in events:
         if isinstance(event, PayloadPickupEvent):
             found.append(PayloadChange(time=event.at, payload=event))
         elif isinstance(event, PayloadDropEvent):
             found.append(PayloadChange(time=event.at, payload=None))
+        elif isinstance(event, MassEvent):
+            found.append(MassChange(time=event.at, factor=event.factor))
+        elif isinstance(event, RotorLagEvent):
+            fall = event.rise if event.fall is None else event.fall
+            found.append(LagChange(time=event.at, rise=event.rise, fall=fall))
     return tuple(found)
 
 
-def _losses(scenario: Scenario) -> Iterator[RotorChange]:
+def check_changes(scenario: Scenario, vehicle: Vehicle, changes: Iterable[Change]) -> None:
+    """Refuse what the vehicle cannot have happen to it.
+
+    Raises:
+        ParameterError: rotors with inertia are to change their speed at once.
+    """
+    rotors = scenario.effects.resolved(vehicle).rotors or RotorDynamics()
+    for change in changes:
+        if isinstance(change, LagChange):
+            rotors.lagging(change.rise, change.fall)
+
+
+def _losses(scenario: Scenario, events: Sequence[Event]) -> Iterator[RotorChange]:
     """Each rotor's share whenever one of its losses begins or ends: the product of what all losses in force leave."""
-    losses = [event for event in scenario.events if isinstance(event, RotorLossEvent)]
+    losses = [event for event in events if isinstance(event, RotorLossEvent)]
     rotors = scenario.effects.rotors or RotorDynamics()
     for rotor, worn in enumerate(rotors.efficiency, start=1):
-        spans = [
-            (loss.at, math.inf if loss.duration is None else loss.at + loss.duration, 1.0 - loss.loss)
-            for loss in losses
-            if loss.rotor == rotor
-        ]
-        for time in sorted({time for start, stop, _ in spans for time in (start, stop) if time < math.inf}):
-            left = math.prod(share for start, stop, share in spans if start <= time < stop)
+        for time, in_force in _in_force([loss for loss in losses if loss.rotor == rotor]):
+            left = math.prod(1.0 - loss.loss for loss in in_force)
             yield RotorChange(time=time, rotor=rotor, efficiency=worn * left)
+
+
+def _pushes(events: Sequence[Event]) -> Iterator[PushChange]:
+    for time, in_force in _in_force([event for event in events if isinstance(event, PushEvent)]):
+        yield PushChange(time=time, pushes=tuple(in_force))
+
+
+_Lasting = TypeVar("_Lasting", RotorLossEvent, PushEvent)
+
+
+def _in_force(events: Sequence[_Lasting]) -> Iterator[tuple[float, list[_Lasting]]]:
+    """The instants [s] at which events begin or end, and those in force from then on, in their own order."""
+    turns: dict[float, tuple[set[int], set[int]]] = {}
+    for i, event in enumerate(events):
+        turns.setdefault(event.at, (set(), set()))[0].add(i)
+        if event.duration is not None:
+            turns.setdefault(event.at + event.duration, (set(), set()))[1].add(i)
+    in_force: set[int] = set()
+    for time, (begun, ended) in sorted(turns.items(), key=itemgetter(0)):
+        in_force = (in_force | begun) - ended
+        yield time, [events[i] for i in sorted(in_force)]

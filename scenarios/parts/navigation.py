@@ -36,8 +36,22 @@ def build_navigation(scenario: Scenario, vehicle: Vehicle) -> Navigation | None:
     Raises:
         ParameterError: a fault of a sensor that the estimator does not have.
     """
-    sensors = () if scenario.sensors is None else build_sensors(scenario)
-    faults = tuple(
+    sensors, faults = () if scenario.sensors is None else build_sensors(scenario), build_faults(scenario)
+    if not sensors and not faults and scenario.estimator is None:
+        return None
+    return Navigation(
+        vehicle,
+        timestep=scenario.plant.timestep,
+        sensors=sensors,
+        rng=generator(scenario.seed, "sensors"),
+        faults=faults,
+        estimator=scenario.estimator,
+    )
+
+
+def build_faults(scenario: Scenario) -> tuple[SensorFault, ...]:
+    """What befalls the sensors."""
+    return tuple(
         build_fault(
             event.sensor,
             event.fault,
@@ -48,16 +62,6 @@ def build_navigation(scenario: Scenario, vehicle: Vehicle) -> Navigation | None:
         )
         for event in scenario.events
         if isinstance(event, SensorFaultEvent)
-    )
-    if not sensors and not faults and scenario.estimator is None:
-        return None
-    return Navigation(
-        vehicle,
-        timestep=scenario.plant.timestep,
-        sensors=sensors,
-        rng=generator(scenario.seed, "sensors"),
-        faults=faults,
-        estimator=scenario.estimator,
     )
 
 

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from mpc.handover import hand_over
 from quadsim.controller import Command, Controller, Moment
 from quadsim.errors import CommandError, InputError, ParameterError, printable
 from quadsim.sim.effects import Force
@@ -74,6 +75,10 @@ class PluginController:
         """See `quadsim.controller.Controller.reset`."""
         if hasattr(self._law, "reset"):
             self._law.reset(speeds.copy())
+
+    def adopt(self, previous: object) -> None:
+        """See `quadsim.controller.Controller`; one's own law before is handed over itself."""
+        hand_over(self._law, previous._law if isinstance(previous, PluginController) else previous)
 
     def step(self, now: Moment, state: Array, reference: Array) -> Command:
         """See `quadsim.controller.Controller.step`.

@@ -8,20 +8,37 @@ from __future__ import annotations
 import dataclasses
 import functools
 from collections.abc import Sequence
-from typing import Annotated, Any, Final, TypeGuard, get_type_hints
+from typing import Annotated, Any, Final, Literal, TypeGuard, get_type_hints
 
 from annotated_types import DocInfo, Len
-from pydantic import BaseModel, ConfigDict
+from pydantic import BaseModel, ConfigDict, Discriminator, Field, Tag
 from pydantic.fields import FieldInfo
 
 from quadsim.fields import Number
 
 MOST_ENTRIES: Final = 1000
 """Of a list of tables."""
+DEEPEST: Final = 20
+"""Tables and lists within one another; a scenario has a third of them."""
 Triple = Annotated[list[Number], Len(3, 3)]
 Pair = Annotated[list[Number], Len(2, 2)]
+LARGEST_HORIZON: Final = 1000
+Horizon = Annotated[int, Field(ge=1, le=LARGEST_HORIZON)]
 LARGEST_SEED: Final = 2**63 - 1
 """The largest whole number that every reader of TOML takes."""
+
+
+Seconds = Annotated[float, Field(ge=0.0, le=10.0)]
+
+
+def _number_or_text(value: object) -> str:
+    return "text" if isinstance(value, str) else "number"
+
+
+Lag = Annotated[
+    Annotated[Seconds, Tag("number")] | Annotated[Literal["vehicle"], Tag("text")], Discriminator(_number_or_text)
+]
+"""A time constant, or that of the vehicle file."""
 
 
 _FIRST: Final = {"at": 0, "type": 1}
@@ -62,3 +79,16 @@ def require_ordered(name: str, pair: Sequence[float]) -> None:
     """Refuse a pair of bounds whose lower is not below its upper."""
     if not pair[0] < pair[1]:
         raise ValueError(f"{name} must have its lower bound below its upper; got {list(pair)}")
+
+
+def is_deeper(value: Any, levels: int) -> bool:
+    """Whether tables and lists stand within one another more than so many levels deep."""
+    layer = [value]
+    for _ in range(levels + 1):
+        layer = [
+            inner
+            for each in layer
+            if isinstance(each, dict | list)
+            for inner in (each.values() if isinstance(each, dict) else each)
+        ]
+    return bool(layer)

@@ -9,12 +9,11 @@ from typing import Any, Final
 
 from quadsim.assets import read_toml
 from quadsim.errors import FileError, InputError, ParameterError
+from scenarios.schema.base import DEEPEST, is_deeper
 from scenarios.schema.plugin import located
 
-LARGEST_FILE: Final = 4_000_000
+LARGEST_FILE: Final = 8_000_000
 """Size [bytes] of the largest file that is read; the longest scenario there can be is smaller."""
-DEEPEST: Final = 20
-"""Tables and lists within one another; a scenario has a third of them."""
 
 
 def locate_files(data: dict[str, Any], directory: Path) -> None:
@@ -127,19 +126,6 @@ def merge(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
         else:
             merged[key] = copy.deepcopy(value)
     return merged
-
-
-def is_deeper(value: Any, levels: int) -> bool:
-    """Whether tables and lists stand within one another more than so many levels deep."""
-    layer = [value]
-    for _ in range(levels + 1):
-        layer = [
-            inner
-            for each in layer
-            if isinstance(each, dict | list)
-            for inner in (each.values() if isinstance(each, dict) else each)
-        ]
-    return bool(layer)
 
 
 def _read(path: Path) -> dict[str, Any]:

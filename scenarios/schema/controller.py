@@ -2,20 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import json
+from collections.abc import Iterator, Mapping
 from typing import Annotated, Any, Literal
 
-from pydantic import BeforeValidator, Discriminator, Field, Tag, model_validator
+from pydantic import BeforeValidator, Discriminator, Field, Tag, ValidationError, model_validator
 from pydantic_core import PydanticCustomError
 
 from mpc.fallback.settings import FallbackSettings
 from mpc.solvers import SOLVERS
 from quadsim.errors import UnknownNameError
+from scenarios.schema.base import Spec
 from scenarios.schema.baselines import GeometricSpec, LQRSpec, PIDSpec
 from scenarios.schema.nonlinear import NonlinearPartsSpec
 from scenarios.schema.optimisation import BoundedSpec, WeightedSpec
 from scenarios.schema.plugin import FORM, LAWS, PluginSpec, is_plugin
+from scenarios.schema.problems import ScenarioError, describe_all
 from scenarios.schema.robust import RobustSpec
+from scenarios.schema.settings import set_field
+from scenarios.schema.writing import is_absent
 
 
 class UnconstrainedSpec(WeightedSpec):
@@ -104,3 +109,44 @@ _Table = Annotated[
 ]
 ControllerSpec = Annotated[_Table, BeforeValidator(_spelt_out, json_schema_input_type=_Table | str)]
 """Any of the laws, distinguished by its type; one whose fields all have defaults may be given by its name alone."""
+
+
+class _Holder(Spec):
+    """A table that has a controller, for messages to name it."""
+
+    controller: ControllerSpec
+
+
+def changed(spec: ControllerSpec, fields: Mapping[str, Any]) -> ControllerSpec:
+    """A controller of which some fields have other values.
+
+    Args:
+        spec: the one before; of another, or of its own, `type` it is replaced whole.
+        fields: values by dotted path; a table within changes what it names of the one there.
+
+    Raises:
+        ScenarioError: a field is not there, or its value is not allowed.
+    """
+    data: dict[str, Any] = {} if "type" in fields else _plain(spec.model_dump(mode="json"))
+    for path, value in _leaves(fields):
+        set_field(data, path, value, asked="fields")
+    found = {"controller": data}
+    try:
+        return _Holder.model_validate_json(json.dumps(found)).controller
+    except ValidationError as error:
+        raise ScenarioError("controller", describe_all(error, found, _Holder)) from error
+
+
+def _leaves(fields: Mapping[str, Any], above: str = "") -> Iterator[tuple[str, Any]]:
+    for name, value in fields.items():
+        if isinstance(value, Mapping) and value:
+            yield from _leaves(value, f"{above}{name}.")
+        else:
+            yield above + name, value
+
+
+def _plain(value: Any) -> Any:
+    """Tables without what is left out of a file."""
+    if isinstance(value, dict):
+        return {name: _plain(each) for name, each in value.items() if not is_absent(each)}
+    return [_plain(each) for each in value] if isinstance(value, list) else value

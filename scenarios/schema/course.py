@@ -234,9 +234,21 @@ class _RampedSpec(_StartedSpec):
 
 
 class RampedCircleSpec(_RampedSpec):
-    """A level circle, clockwise seen from above, from the initial position, its northernmost point, towards +x."""
+    """A level circle, clockwise seen from above, from the initial position, its northernmost point, towards +x.
+
+    Or a vertical one, from its lowest point towards the initial yaw.
+    """
 
     type: Literal["ramped_circle"] = Field(description="kind of course: a circle flown up to a speed and back to rest")
+    plane: Literal["level", "vertical"] = Field(
+        default="level", description="vertical: upside down at the top, where it is fast enough; the heading is free"
+    )
+
+    @model_validator(mode="after")
+    def _check_plane(self) -> RampedCircleSpec:
+        if self.plane == "vertical" and self.heading == "held":
+            raise ValueError("heading must be free where plane is vertical; got held")
+        return self
 
 
 class RampedLemniscateSpec(_RampedSpec):

@@ -2,18 +2,25 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
-from typing import Annotated, Literal
+from typing import Annotated, Any, Final, Literal
 
 from annotated_types import Len, doc
 from pydantic import Field, model_validator
 
-from quadsim.fields import Fraction, Instant, Positive
+from quadsim.fields import Fraction, Instant, NonNegative, Number, Positive
 from quadsim.sim.computation import Stall
 from quadsim.sim.effects.gust import Gust
-from quadsim.sim.effects.load import Payload
+from quadsim.sim.effects.load import Factor, Payload
+from quadsim.sim.effects.push import Push
 from quadsim.sim.effects.wind import WindChange
+from quadsim.state import REFERENCE_NAMES
 from scenarios.schema.base import Spec, Triple
+from scenarios.schema.plugin import is_plain
+
+MOST_EVENTS: Final = 20_000
+"""Of one flight: a person's hand for a quarter of an hour, 20 times a second."""
 
 
 class _Event(Spec):
@@ -43,6 +50,71 @@ class PayloadDropEvent(_Event):
     """The vehicle lets go of all it carries."""
 
     type: Literal["payload_drop"] = Field(description="kind of event: payload_drop")
+
+
+class MassEvent(_Event):
+    """The vehicle's mass becomes another one, whatever it carries besides."""
+
+    type: Literal["mass"] = Field(description="kind of event: mass")
+    factor: Factor = Field(description="[-] real mass over the file's from then on, instead of load.mass_factor")
+
+
+class RotorLagEvent(_Event):
+    """The rotors follow their commands more quickly or more slowly."""
+
+    type: Literal["rotor_lag"] = Field(description="kind of event: rotor_lag")
+    rise: NonNegative = Field(description="[s] time constant while speeding up; 0: at once")
+    fall: NonNegative | None = Field(default=None, description="[s] time constant while slowing down; absent: the same")
+
+
+@dataclass(frozen=True, kw_only=True)
+class PushEvent(Push):
+    """Something pushes the vehicle."""
+
+    type: Annotated[Literal["push"], doc("kind of event: push")]
+
+
+class SetpointEvent(_Event):
+    """The reference leaves the course: an axis that is given holds its value until it is given another one.
+
+    It is not known ahead: the reference goes there by its filter from the next control sample on.
+    """
+
+    type: Literal["setpoint"] = Field(description="kind of event: setpoint")
+    x: Number | None = Field(default=None, description="[m] world; absent: as before")
+    y: Number | None = Field(default=None, description="[m] world; absent: as before")
+    z: Number | None = Field(default=None, description="[m] world, upwards; absent: as before")
+    yaw: Number | None = Field(default=None, description="[deg]; absent: as before")
+
+    @model_validator(mode="after")
+    def _check(self) -> SetpointEvent:
+        if not self.values:
+            raise ValueError("x must be given, or y, z or yaw")
+        return self
+
+    @property
+    def values(self) -> dict[str, float]:
+        """What is given, by the names of the axes; [m] and [rad]."""
+        given = {name: getattr(self, name) for name in REFERENCE_NAMES}
+        scales = {"yaw": math.radians(1.0)}
+        return {name: scales.get(name, 1.0) * value for name, value in given.items() if value is not None}
+
+
+class ControllerEvent(_Event):
+    """The controller becomes another one, which goes on from what the one before it has learnt and planned."""
+
+    type: Literal["controller"] = Field(description="kind of event: controller")
+    fields: Annotated[dict[str, Any], Len(1, 1000)] = Field(
+        description="fields of [controller], dotted, and their values from then on; with a type among them, all of it"
+    )
+
+    @model_validator(mode="after")
+    def _check(self) -> ControllerEvent:
+        for name, value in self.fields.items():
+            if not is_plain(value):
+                rule = "a finite number, a text, true or false, or a list or table of them"
+                raise ValueError(f"fields.{name} must be {rule}; got {value}")
+        return self
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -94,7 +166,18 @@ class StallEvent(Stall):
 
 
 Event = Annotated[
-    RotorLossEvent | PayloadPickupEvent | PayloadDropEvent | GustEvent | WindEvent | SensorFaultEvent | StallEvent,
+    RotorLossEvent
+    | RotorLagEvent
+    | MassEvent
+    | PayloadPickupEvent
+    | PayloadDropEvent
+    | PushEvent
+    | GustEvent
+    | WindEvent
+    | SensorFaultEvent
+    | StallEvent
+    | SetpointEvent
+    | ControllerEvent,
     Field(discriminator="type"),
 ]
 """One entry of the list, distinguished by its type."""

@@ -13,9 +13,8 @@ from mpc.indi import INDISettings
 from mpc.observer import ObserverSettings
 from mpc.robust.tightening import SHORTEST_LAG
 from quadsim.fields import NonNegative, Positive
-from scenarios.schema.base import MOST_ENTRIES, Pair, Spec, require_ordered
-from scenarios.schema.optimisation import AvoidanceSpec, Horizon, PolytopeSpec, SoftSpec, Weight
-from scenarios.schema.robust import Lag
+from scenarios.schema.base import MOST_ENTRIES, Horizon, Lag, Pair, Spec, require_ordered
+from scenarios.schema.optimisation import AvoidanceSpec, PolytopeSpec, SoftSpec, Weight
 
 
 def _number_or_list(value: object) -> str:

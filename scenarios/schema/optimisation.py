@@ -15,14 +15,12 @@ from quadsim.errors import UnknownNameError
 from quadsim.fields import NonNegative, Number
 from quadsim.flight.audit import TERMS
 from quadsim.state import STATE_NAMES, STATE_UNITS
-from scenarios.schema.base import MOST_ENTRIES, Pair, Spec, require_ordered
+from scenarios.schema.base import MOST_ENTRIES, Horizon, Pair, Spec, require_ordered
 
-LARGEST_HORIZON: Final = 1000
 ANGLES: Final = frozenset(name for name, unit in zip(STATE_NAMES, STATE_UNITS, strict=True) if unit.startswith("rad"))
 """States that scenario files give in degrees (per second)."""
 
 Weight = Annotated[float, Field(gt=0.0, le=1e12)]
-Horizon = Annotated[int, Field(ge=1, le=LARGEST_HORIZON)]
 
 
 def _number_or_list(value: object) -> str:

@@ -11,8 +11,7 @@ from typing import Any, Final
 
 from pydantic import Field, model_validator
 
-from scenarios.schema.base import Spec
-from scenarios.schema.optimisation import Horizon
+from scenarios.schema.base import Horizon, Spec
 
 FORM: Final = "package.module:Class"
 """What the text that names a controller looks like."""
@@ -73,7 +72,7 @@ def _check_code(place: str, settings: Mapping[str, Any], given: tuple[str, ...])
     for name, value in settings.items():
         if not name.isidentifier() or name in given:
             raise ValueError(f"settings.{name} must be named as an argument is, other than {', '.join(given)}")
-        if not _is_plain(value):
+        if not is_plain(value):
             rule = "a finite number, a text, true or false, or a list or table of them"
             raise ValueError(f"settings.{name} must be {rule}; got {value}")
 
@@ -100,10 +99,10 @@ def located(controller: Any, beside: Path) -> Any:
     return {**table, "folder": str(beside.resolve())} if found else controller
 
 
-def _is_plain(value: Any) -> bool:
+def is_plain(value: Any) -> bool:
     """Whether a value is one that TOML and JSON can hold, and no date."""
     if isinstance(value, dict):
-        return all(map(_is_plain, value.values()))
+        return all(map(is_plain, value.values()))
     if isinstance(value, list):
-        return all(map(_is_plain, value))
+        return all(map(is_plain, value))
     return isinstance(value, bool | int | str) or (isinstance(value, float) and math.isfinite(value))

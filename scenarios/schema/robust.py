@@ -4,27 +4,16 @@ from __future__ import annotations
 
 from typing import Annotated, Final, Literal
 
-from pydantic import Discriminator, Field, Tag, model_validator
+from pydantic import Field, model_validator
 
 from mpc.fallback.settings import FallbackSettings
 from mpc.observer import ObserverSettings
 from mpc.robust.tightening import SHORTEST_LAG, TighteningSettings
+from scenarios.schema.base import Lag, Seconds
 from scenarios.schema.optimisation import BoundedSpec, SoftSpec, Weight
 
 TURNED: Final = frozenset({"x", "vx", "y", "vy", "yaw"})
 """States that have other values in axes turned by the yaw."""
-
-Seconds = Annotated[float, Field(ge=0.0, le=10.0)]
-
-
-def _number_or_text(value: object) -> str:
-    return "text" if isinstance(value, str) else "number"
-
-
-Lag = Annotated[
-    Annotated[Seconds, Tag("number")] | Annotated[Literal["vehicle"], Tag("text")], Discriminator(_number_or_text)
-]
-"""A time constant, or that of the vehicle file."""
 
 
 class RobustSpec(BoundedSpec):

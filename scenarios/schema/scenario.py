@@ -22,9 +22,16 @@ from quadsim.sim.physics import Integrator, inner_steps, steps_per_period
 from quadsim.space import AnyObstacle, Corridor, Fence
 from quadsim.vehicle import VEHICLE_UNITS, Vehicle
 from scenarios.schema.base import LARGEST_SEED, MOST_ENTRIES, Spec, Triple, fields_of
-from scenarios.schema.controller import ControllerSpec
+from scenarios.schema.controller import ControllerSpec, changed
 from scenarios.schema.course import ReferenceSpec
-from scenarios.schema.events import Event, PayloadDropEvent, PayloadPickupEvent, SensorFaultEvent
+from scenarios.schema.events import (
+    MOST_EVENTS,
+    ControllerEvent,
+    Event,
+    PayloadDropEvent,
+    PayloadPickupEvent,
+    SensorFaultEvent,
+)
 from scenarios.schema.nonlinear import NonlinearPartsSpec
 from scenarios.schema.optimisation import BoundedSpec
 from scenarios.schema.plugin import ForceSpec
@@ -180,13 +187,13 @@ class Scenario(Spec):
     estimator: EstimatorSpec | None = Field(
         default=None, description="absent: the controller receives the sensors' samples as they arrive"
     )
-    events: Annotated[list[Event], MaxLen(MOST_ENTRIES)] = Field(default=[], description="what happens on the way")
+    events: Annotated[list[Event], MaxLen(MOST_EVENTS)] = Field(default=[], description="what happens on the way")
     lost: LostSpec = LostSpec()
     obstacles: Annotated[list[Annotated[AnyObstacle, Field(discriminator="type")]], MaxLen(MOST_ENTRIES)] = Field(
         default=[], description="what the vehicle, a ball of its extent, must not touch: a touch is a crash"
     )
     corridors: Annotated[list[Corridor], MaxLen(MOST_ENTRIES)] = Field(
-        default=[], description="convex regions to stay in, each for a window of time"
+        default=[], description="convex regions to stay in, each for a window of time or of the path"
     )
     keep_in: Fence | None = Field(default=None, description="a convex region to stay in throughout; absent: none")
     constraints: Annotated[list[Limit], MaxLen(MOST_ENTRIES)] = Field(
@@ -195,6 +202,15 @@ class Scenario(Spec):
 
     @model_validator(mode="after")
     def _check(self) -> Scenario:
+        self.require_consistent()
+        return self
+
+    def require_consistent(self) -> None:
+        """Refuse fields that do not go together, each of which may stand by itself.
+
+        Raises:
+            ValueError: so they are.
+        """
         for name, value, unit in (
             ("control_period", self.control_period, self.plant.timestep),
             ("duration", self.duration, self.control_period),
@@ -207,19 +223,21 @@ class Scenario(Spec):
                 given = self.log_rate if name == "log_rate" else value
                 period = "have a period that is" if name == "log_rate" else "be"
                 raise ValueError(f"{name} must {period} a whole multiple of {what} = {unit} s; got {given}") from error
-        indi: INDISettings | None = getattr(self.controller, "indi", None)
-        if indi is not None:
-            try:
-                inner_steps(indi.rate, self.plant.timestep)
-            except ParameterError as error:
-                raise ValueError(f"controller.indi.rate must be {error.rule}; got {indi.rate}") from error
+        self._check_events()
+        specs = [self.controller, *(spec for _, spec in self.controller_changes)]
+        for spec in specs:
+            indi: INDISettings | None = getattr(spec, "indi", None)
+            if indi is not None:
+                try:
+                    inner_steps(indi.rate, self.plant.timestep)
+                except ParameterError as error:
+                    raise ValueError(f"controller.indi.rate must be {error.rule}; got {indi.rate}") from error
         for what, count in (
             ("physics steps", self.periods * self.steps_per_period),
-            ("planned steps", self.periods * self.controller.horizon),
+            ("planned steps", self.periods * max(spec.horizon for spec in specs)),
         ):
             if count > MOST_STEPS:
                 raise ValueError(f"duration must make at most {MOST_STEPS} {what}; got {count} of them")
-        self._check_events()
         if self.initial.cold and not (self.effects.ground is not None and self.effects.ground.contact):
             raise ValueError("initial.cold must be false where effects.ground gives no floor to stand on; got true")
         check_sensing(self.sensors, self.estimator, timestep=self.plant.timestep)
@@ -229,10 +247,9 @@ class Scenario(Spec):
         names += [obstacle.name for obstacle in self.obstacles] + [region.name for region in self.regions]
         if len(set(names)) < len(names):
             raise ValueError(f"constraints must have distinct names; got {names}")
-        return self
 
     def _check_events(self) -> None:
-        carried = len(self.effects.load.payloads) if self.effects.load is not None else 0
+        carried, controller = len(self.effects.load.payloads) if self.effects.load is not None else 0, self.controller
         for i, event in sorted(enumerate(self.events), key=lambda entry: entry[1].at):
             if event.at >= self.duration:
                 raise ValueError(f"events.{i}.at must be before the flight's end, {self.duration} s; got {event.at}")
@@ -247,6 +264,12 @@ class Scenario(Spec):
                 if event.sensor not in present:
                     rule = f"one that the estimator has, of {', '.join(present)}"
                     raise ValueError(f"events.{i}.sensor must be {rule}; got {event.sensor!r}")
+            elif isinstance(event, ControllerEvent):
+                try:
+                    controller = changed(controller, event.fields)
+                except InputError as error:
+                    problems = getattr(error, "problems", (error,))
+                    raise ValueError(f"events.{i}.fields: {'; '.join(map(str, problems))}") from error
 
     @classmethod
     def read(cls, data: Mapping[str, Any]) -> Scenario:
@@ -263,6 +286,23 @@ class Scenario(Spec):
         except ValueError as error:
             raise InputError(f"a scenario must be one that can be written: {error}") from error
         return cls.model_validate_json(text)
+
+    @property
+    def controller_changes(self) -> list[tuple[float, ControllerSpec]]:
+        """Each controller that takes over from the one before it, and when [s], in order of time."""
+        found: list[tuple[float, ControllerSpec]] = []
+        events = (event for event in self.events if isinstance(event, ControllerEvent))
+        for event in sorted(events, key=lambda event: event.at):
+            found.append((event.at, changed(found[-1][1] if found else self.controller, event.fields)))
+        return found
+
+    def controller_at(self, time: float) -> ControllerSpec:
+        """The controller that flies at a time [s]."""
+        found = self.controller
+        for at, spec in self.controller_changes:
+            if at <= time + 1e-9:
+                found = spec
+        return found
 
     @property
     def regions(self) -> tuple[Corridor | Fence, ...]:

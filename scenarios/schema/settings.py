@@ -7,7 +7,7 @@ import tomllib
 from typing import Any
 
 from quadsim.errors import ParameterError, UnknownNameError
-from scenarios.schema.bases import DEEPEST, is_deeper
+from scenarios.schema.base import DEEPEST, is_deeper
 
 
 def apply_setting(data: dict[str, Any], setting: str) -> None:

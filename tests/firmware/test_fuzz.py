@@ -10,7 +10,7 @@ import pytest
 from firmware.conftest import Export, Run
 
 HERE = Path(__file__).parent
-SANITIZERS = "-fsanitize=fuzzer,address,undefined -fno-sanitize-recover=all".split()
+SANITIZERS = ["-fsanitize=fuzzer,address,undefined", "-fno-sanitize-recover=all"]
 SECONDS = 8
 """Of each target; the variable FUZZ_RUNS has a number of inputs instead, of four steps or so each."""
 HANGS = 30
@@ -23,9 +23,7 @@ CONTROLLERS = {
 
 
 @pytest.mark.parametrize("name", CONTROLLERS)
-def test_arbitrary_bytes_lead_to_commands_within_bounds(
-    name: str, exported: Export, run: Run, tmp_path: Path
-) -> None:
+def test_arbitrary_bytes_lead_to_commands_within_bounds(name: str, exported: Export, run: Run, tmp_path: Path) -> None:
     """A short horizon makes many steps; the whole one has the paths that only many active rows take."""
     directory, program = exported("posix", *CONTROLLERS[name]), tmp_path / "fuzz"
     compile = ["clang", "-g", "-O2", "-std=c99", "-ffp-contract=off", *SANITIZERS, "-I", directory]
@@ -47,7 +45,9 @@ def test_a_command_out_of_bounds_is_found(exported: Export, run: Run, tmp_path: 
     text = (directory / "quadsim_mpc.c").read_text()
     clip = "command[j] = mpc->before[j] = clipped(speeds[j], lower, upper);"
     assert clip in text
-    (tmp_path / "quadsim_mpc.c").write_text(text.replace(clip, "(void)upper, command[j] = mpc->before[j] = lower + speeds[j];"))
+    (tmp_path / "quadsim_mpc.c").write_text(
+        text.replace(clip, "(void)upper, command[j] = mpc->before[j] = lower + speeds[j];")
+    )
     compile = ["clang", "-O1", "-std=c99", *SANITIZERS, "-I", tmp_path, "-I", directory]
     built = run(*compile, "-o", tmp_path / "fuzz", HERE / "fuzz.c", check=False)
     if "cannot find" in built.stderr:

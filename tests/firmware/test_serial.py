@@ -107,7 +107,9 @@ def test_corrupt_and_cut_frames_are_dropped_and_the_next_is_found(terminal: Term
         frame = bytearray(pilot.period(k))
         spoilt = bytearray(frame)
         spoilt[draw.randrange(len(spoilt))] ^= 1 << draw.randrange(8)
-        terminal.send([bytes(spoilt), bytes(frame[: draw.randrange(1, len(frame))]), draw.randbytes(97), frame[:4]][k % 4])
+        terminal.send(
+            [bytes(spoilt), bytes(frame[: draw.randrange(1, len(frame))]), draw.randbytes(97), frame[:4]][k % 4]
+        )
         # What has come may take the place of a frame's first bytes until as many more have: whole ones follow.
         reply = pilot.tell(bytes(frame) * 3)
         assert np.abs(reply.command - asked.command[k]).max() <= 1e-8

@@ -10,10 +10,10 @@ from firmware.conftest import Export, Run
 
 from mpc.export.targets import TARGETS
 
-WARNINGS = (
-    "-std=c99 -O2 -Wall -Wextra -Wconversion -Wdouble-promotion -Wshadow -Wcast-qual -Wvla -pedantic -Werror "
-    "-ffp-contract=off"
-).split()
+WARNINGS = [
+    *("-std=c99", "-O2", "-Wall", "-Wextra", "-Wconversion", "-Wdouble-promotion", "-Wshadow", "-Wcast-qual", "-Wvla"),
+    *("-pedantic", "-Werror", "-ffp-contract=off"),
+]
 TIDY = ",".join(
     [
         "-*,bugprone-*,cert-*,clang-analyzer-*,misc-no-recursion",
@@ -34,7 +34,9 @@ PROGRAMS = ("main.c", "serial.c", "vectors.c", "quadsim_mpc.c")
 
 @pytest.mark.parametrize("compiler", ["gcc", "clang", "arm-none-eabi-gcc"])
 @pytest.mark.parametrize("precision", EXPORTS)
-def test_compilers_have_nothing_to_say(precision: str, compiler: str, exported: Export, run: Run, tmp_path: Path) -> None:
+def test_compilers_have_nothing_to_say(
+    precision: str, compiler: str, exported: Export, run: Run, tmp_path: Path
+) -> None:
     bare = compiler.startswith("arm")
     directory = exported(*EXPORTS[precision]) if bare else exported("posix", precision)
     machine = TARGETS[EXPORTS[precision][0]].machine.split() if bare else []
@@ -59,7 +61,9 @@ def undefined(source: Path, board: str, run: Run, made: Path) -> set[str]:
 
 
 @pytest.mark.parametrize("precision", EXPORTS)
-def test_a_controller_asks_the_library_for_copies_alone(precision: str, exported: Export, run: Run, tmp_path: Path) -> None:
+def test_a_controller_asks_the_library_for_copies_alone(
+    precision: str, exported: Export, run: Run, tmp_path: Path
+) -> None:
     """No malloc, no mathematics, and in float no emulated doubles, which a Cortex-M4F would need."""
     board, _ = EXPORTS[precision]
     assert undefined(exported(board, precision) / "quadsim_mpc.c", board, run, tmp_path / "asked.o") <= ALLOWED
@@ -82,7 +86,11 @@ FAULTS = {
     "too small": ("gcc", "numbers[0] = 1e-60F;\n    return count;", "truncated to zero"),
     "beyond an array": ("cppcheck", "int few[2] = {{1, 2}};\n    return few[2] + count;", "arrayIndexOutOfBounds"),
     "array of unknown size": ("gcc", "int some[count];\n    some[0] = 1;\n    return some[0];", "vla"),
-    "memory not set": ("gcc -fanalyzer", "int *some = malloc(4);\n    return some ? *some + count : 0;", "uninitialized"),
+    "memory not set": (
+        "gcc -fanalyzer",
+        "int *some = malloc(4);\n    return some ? *some + count : 0;",
+        "uninitialized",
+    ),
 }
 
 

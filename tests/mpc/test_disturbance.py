@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -23,6 +24,7 @@ def fly(
 ) -> list[tuple[float, Array, Array]]:
     """A body under commands that shake it, with exact integration; instants, attitudes and velocities measured."""
     J, g, hover = np.array(vehicle.inertia), np.array([0.0, 0.0, vehicle.gravity]), vehicle.hover_speed
+    spin = (vehicle.rotor_inertia or 0.0) * np.array(vehicle.rotor_spins)
     x = np.concatenate([np.eye(3).ravel(), [2.0, -1.0, 0.5], [0.1, -0.2, 0.3], np.full(4, hover)])
     shake = np.array([[1, -1, 1, -1], [1, 0, -1, 0], [0, 1, 0, -1]]) * 0.03 * hover
     seen, speeds = [], np.full(4, hover)
@@ -37,8 +39,10 @@ def fly(
             rotors = x[15:] if lag else speeds
             thrust, *torque = vehicle.allocation @ rotors**2
             dv = thrust / vehicle.mass * R[:, 2] - g + force(t, R, v)
-            turning = (torque - np.cross(Omega, J * Omega)) / J + angular
             spinning = (speeds - x[15:]) / lag if lag else np.zeros(4)
+            torque[2] += spin @ spinning
+            momentum = J * Omega - [0.0, 0.0, spin @ rotors]
+            turning = (torque - np.cross(Omega, momentum)) / J + angular
             return np.concatenate([(R @ hat(Omega)).ravel(), dv, turning, spinning])
 
         x = solve_ivp(slope, (time, time + PERIOD), x, rtol=1e-9, atol=1e-10).y[:, -1]
@@ -56,6 +60,19 @@ def test_a_force_that_changes_steadily_is_foreseen_without_lag(vehicle: Vehicle,
     np.testing.assert_allclose(acceleration, start + (seen[-1][0] + 0.1) * change, atol=0.01)
     np.testing.assert_allclose(rate, change, atol=0.05)
     np.testing.assert_allclose(turning, 0.0, atol=0.02)
+
+
+def test_torque_that_spins_the_rotors_up_is_no_disturbance(vehicle: Vehicle) -> None:
+    lag, heavy = 0.03, replace(vehicle, rotor_inertia=0.005 * vehicle.inertia[2])
+    settings, angular = RampSettings(rotor_lag=lag), np.zeros(3)
+    found = []
+    for modelled in (heavy, vehicle):
+        observer = RampObserver(settings, modelled, PERIOD)
+        observer.reset(np.full(4, vehicle.hover_speed))
+        fly(heavy, observer, lambda t, R, v: np.zeros(3), angular, 60, lag=lag)
+        found.append(np.abs(observer.foreseen(0.0)[2]).max())
+    assert found[0] < 0.02
+    assert found[1] > 0.2
 
 
 def test_rotors_that_lag_after_a_large_step_are_no_disturbance(vehicle: Vehicle) -> None:

@@ -21,6 +21,7 @@ from mpc.nonlinear.model import nonlinear_model
 from mpc.ocp import Problem, Rest
 from mpc.paper.condensed import Condensed, condensed
 from mpc.qp import QP, Formulation, Solution, kkt_residuals
+from mpc.relinearised import Relinearised
 from mpc.solvers import QPSolver
 from mpc.solvers.daqp_dense import DaqpDense
 from mpc.solvers.piqp_backends import PiqpChanging, PiqpDense, PiqpMultistage
@@ -66,9 +67,9 @@ def changing(problem: Problem, steps: int) -> Changing:
     return Changing(form, backend)
 
 
-def softened(problem: Problem, l1: list[float], l2: list[float]) -> Problem:
+def softened(problem: Problem, l1: list[float], l2: list[float], *, largest: bool = False) -> Problem:
     assert problem.bounds is not None
-    penalty = Penalty(l1=np.array(l1), l2=np.array(l2))
+    penalty = Penalty(l1=np.array(l1), l2=np.array(l2), largest=largest)
     return replace(problem, bounds=replace(problem.bounds, penalty=penalty))
 
 
@@ -184,15 +185,19 @@ def test_constant_matrices_make_the_papers_plan(constrained_flight: Flight, step
 
 @pytest.mark.parametrize("steps", [1, 2, 4])
 @pytest.mark.parametrize("horizon", [1, 3, 7, 10])
-@pytest.mark.parametrize("soft", [False, True])
+@pytest.mark.parametrize("soft", [False, True, "largest"])
 @pytest.mark.parametrize("terms", [(), ("Q_d", "margins"), ("P", "constraints")])
-def test_systems_that_change_agree_with_a_peer(horizon: int, steps: int, soft: bool, terms: tuple[str, ...]) -> None:
+def test_systems_that_change_agree_with_a_peer(
+    horizon: int, steps: int, soft: bool | str, terms: tuple[str, ...]
+) -> None:
     """Moves weighed, bounds tightened, a terminal weight and further rows: the peer rolls all of them out by itself."""
     rng = np.random.default_rng(100 * horizon + steps)
     solved = 0
     for _ in range(8):
         problem = random_problem(rng, horizon=horizon, n=3, nu=2, n_c=2)
-        if soft:
+        if soft == "largest":
+            problem = softened(problem, [5.0, 5.0], [2.0, 2.0], largest=True)
+        elif soft:
             problem = softened(problem, [30.0, 5.0], [2.0, 0.0])
         problem = with_terms(rng, problem, terms)
         now = changing_period(rng, problem)
@@ -205,6 +210,9 @@ def test_systems_that_change_agree_with_a_peer(horizon: int, steps: int, soft: b
         solved += 1
         np.testing.assert_allclose(solver.plan(solution), peer.plan, atol=2e-4)
         np.testing.assert_allclose(solver.slacks(solution), peer.slacks, atol=2e-4)
+        whole = Relinearised(problem, "piqp-dense").solve(*vars(now).values())
+        np.testing.assert_allclose(whole.plan, peer.plan, atol=2e-4)
+        np.testing.assert_allclose(whole.slacks, peer.slacks, atol=2e-4)
         states = ocp_peer.trajectory(now, solver.plan(solution))[1:]
         np.testing.assert_allclose(solver.states(now, solution), states, atol=1e-6)
         assert kkt_residuals(solver.qp(now), solution).worst < 1e-5 * max(1.0, float(np.abs(solution.z).max()))

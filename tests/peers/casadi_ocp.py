@@ -142,7 +142,7 @@ class Peer:
         N, n = case.nodes, case.n
         X, U, x_r, u_r = cs.SX.sym("X", n, N + 1), cs.SX.sym("U", 4, N), cs.SX.sym("x_r", 13, N), cs.SX.sym("u_r", 4, N)
         before, sides = cs.SX.sym("before", 4), 12 if case.tilt else 0
-        E = cs.SX.sym("E", sides, N) if any(case.penalty) else cs.SX(sides, N)
+        E = cs.SX.sym("E", 1, N) if any(case.penalty) else cs.SX(1, N)  # of the largest violation
         cost, rows, lower, upper = cs.SX(0), [], [], []
         for i in range(N):
             step = U[:, i] - (U[:, i - 1] if i else before)
@@ -156,12 +156,12 @@ class Peer:
                 lower, upper = lower + [-case.steps[i]] * 4, upper + [case.steps[i]] * 4
             if sides:
                 axis, angles = rotation(X[3:7, i + 1])[:, 2], math.tau / sides * np.arange(sides)
-                rows.append(cs.DM(np.cos(angles)) * axis[0] + cs.DM(np.sin(angles)) * axis[1] - E[:, i])
+                rows.append(cs.DM(np.cos(angles)) * axis[0] + cs.DM(np.sin(angles)) * axis[1] - E[0, i])
                 bound = math.sin(case.tilt) * math.cos(math.pi / sides)
                 lower, upper = lower + [-math.inf] * sides, upper + [bound] * sides
                 l1, l2 = case.penalty
-                excess = E[:, i] / math.cos(case.tilt)  # sines to angles
-                cost += l1 * cs.sum1(excess) + l2 * cs.sumsqr(excess)
+                excess = E[0, i] / math.cos(case.tilt)  # sines to angles
+                cost += l1 * excess + l2 * excess**2
         w = cs.veccat(X, U, *([E] if any(case.penalty) else []))
         g = cs.vertcat(*rows)
         p, at = cs.veccat(x_r, u_r, before), cs.SX.sym("at", w.shape)

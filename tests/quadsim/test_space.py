@@ -22,6 +22,7 @@ from quadsim.space import (
     Fence,
     Obstacle,
     Place,
+    Solids,
     Sphere,
     Wall,
     footprint,
@@ -207,8 +208,38 @@ def test_a_region_s_clearance_is_the_ball_s_that_fits(
 @given(obstacle=obstacles)
 def test_shapes_survive_json(obstacle: AnyObstacle) -> None:
     corridor = Corridor(name="c", position=(0, 0, 0), size=(1, 2, 3), start=1.0)
-    for shape in (obstacle, corridor, Fence(rows=((1.0, 0.0, 0.0),), upper=(3.0,))):
+    along = Corridor(name="d", position=(0, 0, 0), size=(1, 2, 3), path=(1.0, 2.0))
+    for shape in (obstacle, corridor, along, Fence(rows=((1.0, 0.0, 0.0),), upper=(3.0,))):
         assert shape_from_json(json.loads(json.dumps(shape_to_json(shape)))) == shape
+
+
+def test_a_window_of_the_path_is_one_of_time() -> None:
+    t, x = np.arange(8.0), np.array([0.0, 0.0, 1.0, 2.0, 2.0, 2.0, 4.0, 4.0])  # rests at 0, 2 and 4 m
+    positions = np.stack([x, -x, np.zeros(8)], axis=1) / math.sqrt(2.0)
+    for path, window in {
+        (0.0, 1.0): (0.0, 2.0),
+        (0.5, 1.5): (1.5, 2.5),
+        (2.0, 3.0): (3.0, 5.5),
+        (1.0, 2.0): (2.0, 5.0),
+        (3.0, 9.0): (5.5, math.inf),
+    }.items():
+        found = Corridor(name="c", position=(0, 0, 0), size=(1, 1, 1), path=path).timed(t, positions)
+        assert (found.start, found.stop) == pytest.approx(window)
+        assert found.path is None
+    with pytest.raises(InputError, match=r"corridors.c.path must be within the 4 m of the reference's path"):
+        Corridor(name="c", position=(0, 0, 0), size=(1, 1, 1), path=(4.5, 5.0)).timed(t, positions)
+
+
+@settings(max_examples=20, deadline=None)
+@given(shapes=st.lists(obstacles, min_size=1, max_size=5))
+def test_many_are_measured_as_each_alone(shapes: list[AnyObstacle]) -> None:
+    t, p = np.linspace(0.0, 3.0, 9), np.random.default_rng(0).normal(scale=2.0, size=(9, 3))
+    for found, wanted in zip(
+        Solids(shapes).clearances(t, p),
+        map(np.concatenate, zip(*(each.clearances(t, p) for each in shapes), strict=True)),
+        strict=True,
+    ):
+        np.testing.assert_allclose(found, wanted, atol=1e-14)
 
 
 @settings(max_examples=40, deadline=None)

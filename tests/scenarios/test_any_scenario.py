@@ -81,6 +81,7 @@ EFFECTS = some(
         ),
     }
 )
+FIELDS = some({"type": st.just("pid")}, horizon=st.integers(5, 30))
 AT = {"at": number(0.0, 0.19), "duration": number(1e-3, 1.0)}
 SENSOR_NAMES = st.sampled_from(["position", "velocity", "attitude", "rates"])
 EVENTS = st.lists(
@@ -88,6 +89,11 @@ EVENTS = st.lists(
         some({}, type=st.just("rotor_loss"), rotor=st.integers(1, 4), loss=number(0.01, 1.0), **AT),
         some({}, type=st.just("payload_pickup"), at=AT["at"], mass=number(0.001, 5.0)),
         some({}, type=st.just("payload_drop"), at=AT["at"]),
+        some({}, type=st.just("mass"), at=AT["at"], factor=number(0.1, 5.0)),
+        some({"fall": number(0.0, 1.0)}, type=st.just("rotor_lag"), at=AT["at"], rise=number(0.0, 1.0)),
+        some({"point": vector(0.5)}, type=st.just("push"), force=vector(20.0), **AT),
+        some({"yaw": number(-400.0, 400.0)}, type=st.just("setpoint"), at=AT["at"], z=number(-5.0, 5.0)),
+        st.fixed_dictionaries({"type": st.just("controller"), "at": AT["at"], "fields": FIELDS}),
         some({}, type=st.just("gust"), velocity=vector(20.0), **AT),
         some({}, type=st.just("wind"), velocity=vector(20.0), at=AT["at"]),
         some({}, type=st.just("stall"), **AT),

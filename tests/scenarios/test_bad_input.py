@@ -16,12 +16,13 @@ from scenarios.courses import csv_course
 from scenarios.loading import load_scenario, parse_scenario
 from scenarios.schema import bases
 from scenarios.schema.base import MOST_ENTRIES
+from scenarios.schema.events import MOST_EVENTS
 from scenarios.schema.problems import ScenarioError
 
 MINE = 'base = "hover"\nname = "mine"\n'
 ESTIMATOR = ["estimator.type=error_state", "sensors.attitude={rate=100, noise=1}"]
 COLD = ["initial.cold=true", "effects.ground.contact=true"]
-STALLS = "events=[" + ", ".join(["{type='stall', at=1, duration=0.1}"] * (MOST_ENTRIES + 1)) + "]"
+STALLS = "events=[" + ", ".join(["{type='stall', at=1, duration=0.1}"] * (MOST_EVENTS + 1)) + "]"
 
 
 def event(kind: str, rest: str = "") -> str:
@@ -184,7 +185,43 @@ WRONG: list[tuple[str, str | list[str], str]] = [
         ],
         "events.0.sensor must be one that the estimator has, of position, attitude; got 'rates'",
     ),
-    ("too many", STALLS, "events must be of 1000 or fewer entries; got 1001"),
+    ("too many", STALLS, "events must be of 20000 or fewer entries; got 20001"),
+    ("push nowhere", event("push", "duration=1"), "events.0.force is missing"),
+    ("push for no time", event("push", "duration=0, force=[1, 0, 0]"), "events.0.duration must be > 0.0; got 0"),
+    ("no set-point", event("setpoint"), "events.0.x must be given, or y, z or yaw"),
+    ("no mass", event("mass", "factor=0"), "events.0.factor must be >= 0.05; got 0"),
+    ("lag backwards", event("rotor_lag", "rise=-0.1"), "events.0.rise must be >= 0.0; got -0.1"),
+    (
+        "inertia at once",
+        ["effects.rotors={rise=0.05, fall=0.05, inertia=1e-5}", event("rotor_lag", "rise=0")],
+        "effects.rotors.inertia must be 0 where rotors change their speed at once@",
+    ),
+    ("no fields", event("controller", "fields={}"), "events.0.fields must be@"),
+    (
+        "no such field",
+        event("controller", "fields={horizn=3}"),
+        "events.0.fields: controller.horizn is not a field of the scenario file; did you mean 'horizon'?@",
+    ),
+    (
+        "no such weight",
+        event("controller", "fields={'output_weights.z'=-1.0}"),
+        "events.0.fields: controller.output_weights.z must be > 0.0; got -1.0",
+    ),
+    (
+        "a law with parts missing",
+        event("controller", "fields={type='constrained'}"),
+        "events.0.fields: controller.horizon is missing;@",
+    ),
+    (
+        "through a number",
+        event("controller", "fields={'horizon.of'=1}"),
+        "events.0.fields: fields must be a path to a field; horizon has none; got 'horizon.of'",
+    ),
+    (
+        "mass that rk4 does not know",
+        ["plant.integrator=rk4", event("mass", "factor=1.1")],
+        "plant.integrator must be mujoco where there is a load; got 'rk4'",
+    ),
     # sensors, estimator, computation
     ("gps", "sensors.gps.rate=10", "sensors.gps is not a field of the scenario file (there are: position,@"),
     (
@@ -339,7 +376,7 @@ def test_a_file_that_is_too_large_is_not_read(tmp_path: Path, monkeypatch: pytes
 def test_the_longest_lists_fit_into_a_file() -> None:
     entry = '[[events]]\ntype = "sensor_fault"\nat = 1.0\nsensor = "position"\nfault = "bias"\nduration = 1.0\n'
     lines = 2 * len(entry) * MOST_ENTRIES  # comments as long as the entries themselves
-    assert 5 * lines < bases.LARGEST_FILE
+    assert 4 * lines + 2 * len(entry) * MOST_EVENTS < bases.LARGEST_FILE
 
 
 def test_many_problems_are_counted_not_listed() -> None:

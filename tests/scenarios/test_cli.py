@@ -22,7 +22,7 @@ from scenarios.campaign.plan import read_campaign
 from scenarios.cli import main
 from scenarios.commands import EXIT_DONE, EXIT_FAILED, EXIT_WRONG_INPUT
 from scenarios.loading import load_scenario
-from scenarios.shipped import LIBRARY, campaign_names, scenario_names
+from scenarios.shipped import LIBRARY, campaign_names, scenario_names, tuning_names
 
 ROOT = Path(__file__).resolve().parents[2]
 TABLES = ("--no-video", "--no-recording", "--no-figures")
@@ -57,7 +57,15 @@ def test_list_names_everything_with_one_line_each(capsys: pytest.CaptureFixture[
     assert main(["list"]) == EXIT_DONE
     printed = capsys.readouterr()
     lines = {line.split()[0]: line.split(maxsplit=1)[1:] for line in printed.out.splitlines() if line.strip()}
-    for name in (*scenario_names(), *campaign_names(), *vehicle_names(), *SOLVERS, "unconstrained", "constrained"):
+    for name in (
+        *scenario_names(),
+        *campaign_names(),
+        *tuning_names(),
+        *vehicle_names(),
+        *SOLVERS,
+        "unconstrained",
+        "constrained",
+    ):
         assert len(lines[name][0]) > 10
     assert printed.err == ""
 
@@ -65,7 +73,7 @@ def test_list_names_everything_with_one_line_each(capsys: pytest.CaptureFixture[
 def test_list_as_json(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["list", "--json"]) == EXIT_DONE
     listed = json.loads(capsys.readouterr().out)
-    titles = ["scenarios", "groups", "expected", "campaigns", "vehicles", "controllers", "papers", "solvers"]
+    titles = ["scenarios", "groups", "expected", "campaigns", "tunings", "vehicles", "controllers", "papers", "solvers"]
     assert list(listed) == titles
     assert list(listed["scenarios"]) == list(listed["groups"]) == list(listed["expected"]) == scenario_names()
     checked = [load_scenario(name) for name in scenario_names()]

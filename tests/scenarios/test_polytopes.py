@@ -14,8 +14,8 @@ from quadsim.flight.audit import SUM, TERMS, audit
 from quadsim.state import INDEX
 from quadsim.vehicle import N_ROTORS
 from scenarios.build import build_controller, build_problem
+from scenarios.limits import build_limits
 from scenarios.loading import load_scenario, parse_scenario
-from scenarios.parts.limits import build_limits
 from scenarios.parts.vehicle import build_vehicle
 from scenarios.schema.problems import ScenarioError
 from tests.support import scenario_table, small_log

@@ -43,6 +43,7 @@ CRATE = {
     "path": [{"time": 1.0, "position": [1.0, -2.0, 0.0]}],
 }  # fmt: skip
 TUBE = {"name": "tube", "position": [0.0, 0.0, 1.0], "size": [3.0, 2.0, 2.0], "stop": 1.0}
+ALONG = {"name": "tube", "position": [0.0, 0.0, 1.0], "size": [3.0, 2.0, 2.0]}
 FENCE = {"rows": [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]], "upper": [1.9, 2.0]}
 
 
@@ -157,6 +158,9 @@ def test_a_shape_that_was_changed_is_noticed(crashed: Flight, tmp_path: Path) ->
         ({"obstacles": [{**WALL, "window": [5.0, 1.0]}]}, "window must lie within"),
         ({"obstacles": [PILLAR, PILLAR]}, "constraints must have distinct names"),
         ({"corridors": [{"name": "c", "size": [1.0, 1.0, 1.0]}]}, "position must be given with size"),
+        ({"corridors": [{**TUBE, "path": [0.0, 1.0]}]}, "path must be absent where start or stop is given"),
+        ({"corridors": [{**ALONG, "path": [1.0, 1.0]}]}, "farther on where it ends; got"),
+        ({"corridors": [{**ALONG, "path": [1.0]}]}, "path must"),
         ({"keep_in": {**FENCE, "upper": [1.0]}}, "upper must have one number per row, 2"),
         ({"obstacles": [{**PILLAR, "height": None}]}, "height"),
     ],
@@ -173,6 +177,13 @@ def test_a_start_that_is_not_clear_is_refused(changes: Mapping[str, Any], tmp_pa
     path = tmp_path / "start.toml"
     path.write_text(scenario(changes).to_toml())
     with pytest.raises(InputError, match=r"initial.position must be clear of (pillar|keep_in), by the radius"):
+        load_scenario(str(path))
+
+
+def test_a_path_that_is_over_before_the_window_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "short.toml"
+    path.write_text(scenario({"corridors": [{**ALONG, "path": [90.0, 91.0]}]}).to_toml())
+    with pytest.raises(InputError, match=r"corridors.tube.path must be within the .* m of the reference's path"):
         load_scenario(str(path))
 
 
@@ -212,6 +223,32 @@ def test_the_nonlinear_controller_keeps_clear(more: Mapping[str, Any]) -> None:
     assert flight.outcome == "satisfied"
     assert 0.03 < flight.findings[0].worst_margin < 0.3
     assert abs(flight.state["y"]).max() > 0.1
+
+
+ASIDE = {"name": "aside", "rows": [[0.0, -1.0, 0.0]], "upper": [-0.4]}  # y >= 0.4, the vehicle's ball inside
+
+
+@pytest.mark.parametrize("law", ["constrained", "robust", "nonlinear"])
+@pytest.mark.parametrize("speed", [0.5, 0.8])
+def test_a_corridor_along_the_path_holds_where_the_reference_is(law: str, speed: float) -> None:
+    laws: dict[str, dict[str, Any]] = {
+        "constrained": AVOIDANCE,
+        "robust": {"controller.type": "robust", "controller.solver": None, **AVOIDANCE},
+        "nonlinear": {"controller": {"type": "nonlinear", "horizon": 30, "terminal": "lqr", "avoidance": {}}},
+    }
+    flown = {"corridors": [{**ASIDE, "path": [0.9, 1.3]}], "reference.speed": speed, "duration": 8.0}
+    blind = fly_scenario(scenario(flown))
+    (found,) = [each for each in blind.findings if each.limit.name == "aside"]
+    reference = blind.log.control.reference[:, :3]
+    gone = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(reference, axis=0), axis=1))])
+    inside = found.limit.holds_at(blind.log.control.t)
+    np.testing.assert_array_equal(inside, (gone >= 0.9) & (gone <= 1.3))
+    assert inside.any()
+    assert not found.satisfied
+    flight = fly_scenario(scenario({**flown, **laws[law]}))
+    (found,) = [each for each in flight.findings if each.limit.name == "aside"]
+    assert found.satisfied
+    assert abs(flight.state["y"][[0, -1]]).max() < 0.1  # aside there alone
 
 
 def test_who_does_not_avoid_touches_and_who_does_keeps_clear() -> None:

@@ -65,8 +65,13 @@ def _draw_states(run: Run) -> Figure:
     figure = new_figure(run_title(run, "position and attitude"), 9.6, 6.4)
     panels = figure.subplots(3, 2, sharex=True)
     shown: dict[str, Artist] = {}
-    for axes, name in zip(panels.T.flat, ("x", "y", "z", "roll", "pitch", "yaw"), strict=True):
+    plant = run.log.plant
+    names = ("x", "y", "z", "tilt") if plant.attitude is not None else ("x", "y", "z", "roll", "pitch", "yaw")
+    for axes, name in zip(panels.T.flat, names, strict=False):
         shown |= draw_signal(axes, run, name)
+    if plant.attitude is not None and plant.body_rates is not None:  # may turn upside down
+        _draw_several(panels[1, 1], plant.t, plant.attitude, "wxyz", "quaternion")
+        _draw_several(panels[2, 1], plant.t, np.degrees(plant.body_rates), "xyz", "body rates [deg/s]")
     return finish_figure(figure, panels[-1], shown, run.end)
 
 
@@ -295,14 +300,14 @@ def draw_effects(run: Run) -> Figure:
             shown["acting"] = panels[name].plot(log.plant.t, turned, color=line_colour(0), linewidth=1.0)[0]
             panels[name].set_ylabel(f"{name} [rad/s]")
     for entry in curves:
-        _draw_triple(panels[entry.key], log.plant.t, entry.values, "xyz", f"{entry.title}\n[{entry.unit}]")
+        _draw_several(panels[entry.key], log.plant.t, entry.values, "xyz", f"{entry.title}\n[{entry.unit}]")
         keep_least_span(panels[entry.key], entry.unit)
     if not log.control.measured_perfectly:
         for what, names in _ERRORS.items():
             signals = [SIGNALS[f"{name}_estimate_error"] for name in names]
             values = np.stack([signal.sampled(log.control) for signal in signals], axis=1)
             label = f"{what} as measured,\nless the true one [{signals[0].unit}]"
-            _draw_triple(panels[what], log.control.t, values, names, label, drawstyle="steps-post")
+            _draw_several(panels[what], log.control.t, values, names, label, drawstyle="steps-post")
             keep_least_span(panels[what], signals[0].unit)
     bottom = [panels[name] for rows in (halves, wholes) if rows for name in dict.fromkeys(rows[-1])]
     for axes in bottom:
@@ -310,9 +315,9 @@ def draw_effects(run: Run) -> Figure:
     return finish_figure(figure, bottom, shown, run.end)
 
 
-def _draw_triple(axes: Axes, t: Array, values: Array, names: Sequence[str], label: str, **style: Any) -> None:
-    """Draw three curves (M, 3), with the panel's own legend above it, where it hides nothing."""
+def _draw_several(axes: Axes, t: Array, values: Array, names: Sequence[str], label: str, **style: Any) -> None:
+    """Draw curves (M, n), with the panel's own legend above it, where it hides nothing."""
     for i, (name, column) in enumerate(zip(names, values.T, strict=True)):
         axes.plot(t, column, color=line_colour(1 + i), linewidth=1.0, label=name, **style)
     axes.set_ylabel(label)
-    axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), borderaxespad=0.1, ncols=3)
+    axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), borderaxespad=0.1, ncols=len(names))

@@ -32,6 +32,7 @@ from quadsim.report.film.painter import (
     text_width,
 )
 from quadsim.report.film.topview import TopView
+from quadsim.report.table import ABSENT
 from quadsim.state import INDEX, REFERENCE_NAMES, REFERENCE_STATES, Array
 
 _Panel = Callable[[Painter, float, float, int], None]
@@ -47,6 +48,9 @@ _MOST_MARGINS: Final = 6
 
 _LAST: Final = 1.0
 """Time at a film's end [s] in which it says why a QP had no answer, or that the flight stayed in fallback."""
+_SHOWN: Final = 2.0
+"""Time [s] for which it says what has happened."""
+_MOST_EVENTS: Final = 3
 _MOST_LINES: Final = 10
 """Of that: more would reach the strip at the bottom."""
 _WIDEST: Final = 140
@@ -117,6 +121,8 @@ class Overlay:
         ):
             if vectors is not None:
                 lines.append((f"{what} {np.linalg.norm(vectors[i]):.2g} {unit}", 14, colour))
+        happened = [event for event in self._run.summary.get("events", ()) if 0.0 <= time - event["time"] <= _SHOWN]
+        lines += [(event["text"][:_WIDEST], 15, AMBER) for event in happened[-_MOST_EVENTS:]]
         reason = self._run.log.reason
         if reason is not None and time >= control.t[-1]:
             lines.append((f"aborted {reason}"[:130], 15, RED))
@@ -150,15 +156,21 @@ class Overlay:
             factor, digits = (math.degrees(1.0), 1) if angle else (1.0, 2)
             now, wanted, row = factor * values[j], factor * reference[j], y + 24 + 27 * j
             painter.text(x, row, f"{name} [{'deg' if angle else 'm'}]", colour=GREY)
+            unknown = angle and self._footage.tilt is not None and self._footage.tilt[i] > 0.5 * math.pi
             for right, value, colour in ((118, now, WHITE), (192, wanted, AMBER), (262, now - wanted, GREY)):
-                shown = round(value, digits) + 0.0  # no "-0.00"
-                painter.text(x + right, row, f"{shown:+.{digits}f}", colour=colour, anchor="ra")
+                shown = f"{round(value, digits) + 0.0:+.{digits}f}"  # no "-0.00"
+                text = ABSENT if unknown and colour is not AMBER else shown  # upside down there is no heading to hold
+                painter.text(x + right, row, text, colour=colour, anchor="ra")
 
     def _attitude(self, painter: Painter, x: float, y: float, i: int) -> None:
         painter.text(x, y, "attitude [deg]", size=13, colour=GREY)
-        for j, name in enumerate(("roll", "pitch")):
-            value, limit, row = math.degrees(self._footage.euler[i, j]), self._limit(name, i), y + 32 + 50 * j
-            span = 2.0 * max(map(abs, _bounds(limit)), default=15.0)
+        signals, tilted = dict(zip(("roll", "pitch"), self._footage.euler[i], strict=False)), self._footage.tilt
+        if tilted is not None:  # past the vertical roll jumps by 180 deg
+            signals = {"tilt": tilted[i], "pitch": signals["pitch"]}
+        for j, (name, angle) in enumerate(signals.items()):
+            value, limit, row = math.degrees(angle), self._limit(name, i), y + 32 + 50 * j
+            whole = {"tilt": 180.0, "pitch": 90.0}
+            span = 2.0 * max(map(abs, _bounds(limit)), default=15.0) if tilted is None else whole[name]
             broken, shown = _breaks(limit, value), f"{round(value, 2) + 0.0:+.2f}"
             painter.text(x, row, name, size=17)
             painter.text(x + 262, row, shown, size=17, colour=RED if broken else WHITE, anchor="ra")

@@ -10,7 +10,7 @@ import numpy as np
 from quadsim.errors import FileError, ParameterError
 from quadsim.flight.audit import Limit
 from quadsim.flight.rundir import Run
-from quadsim.state import EULER, POSITION, Array, euler_to_quaternion
+from quadsim.state import EULER, POSITION, Array, euler_to_quaternion, tilt
 
 _CAMERA_MEMORY: Final = 0.7
 """Time constant [s] of the camera's smoothing, forward and backward."""
@@ -97,6 +97,8 @@ class Footage:
         position: (F, 3) [m], world.
         euler: (F, 3) roll, pitch, yaw [rad], of the plant row before the frame.
         quaternion: (F, 4) attitude, scalar first.
+        tilt: (F,) angle between the thrust axis and the vertical [rad], of the plant row before the frame; None of
+            flights that Euler angles describe.
         speeds: (F, 4) rotor speeds [rad/s].
         turned: (F, 4) angle each rotor has turned since the start [rad].
         aim: (F, 3) what the camera looks at [m].
@@ -113,6 +115,7 @@ class Footage:
     position: Array
     euler: Array
     quaternion: Array
+    tilt: Array | None
     speeds: Array
     turned: Array
     aim: Array
@@ -163,6 +166,7 @@ def make_footage(run: Run, times: Array) -> Footage:
         period=_row_before(control.t, times),
         position=position,
         euler=plant.state[row][:, EULER],
+        tilt=None if plant.attitude is None else tilt(plant.state[row]),
         quaternion=quaternion / np.linalg.norm(quaternion, axis=1, keepdims=True),
         speeds=plant.speeds[row],
         turned=(1.0 - share) * turned[row] + share * turned[after],

@@ -8,11 +8,12 @@ from __future__ import annotations
 
 import itertools
 import json
+import pickle
 import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, BinaryIO, Final
 
 import imageio
 import imageio_ffmpeg
@@ -21,6 +22,7 @@ import numpy as np
 
 from quadsim.controller import Phase
 from quadsim.flight.rundir import Run, load_run
+from quadsim.report.film.camera import REQUEST
 from quadsim.report.film.captions import Overlay
 from quadsim.report.film.frames import Footage, Shot, make_footage, thin
 from quadsim.report.film.painter import Picture
@@ -228,6 +230,45 @@ def draw_portrait(vehicle: Vehicle, path: Path, width: int, height: int) -> None
         imageio.imwrite(path, renderer.render())
 
 
+def serve(requests: BinaryIO, pictures: BinaryIO) -> None:
+    """Draw one state after the other, as `quadsim.report.film.camera.Camera` asks for them, until it asks no more."""
+    vehicle, obstacles, width, height = pickle.load(requests)
+    model = compile_model(vehicle, visuals=True, obstacles=obstacles)
+    model.vis.quality.offsamples = 0
+    model.vis.global_.offwidth, model.vis.global_.offheight = width, height
+    data, camera = mujoco.MjData(model), mujoco.MjvCamera()
+    camera.distance = CAMERA_DISTANCE * vehicle.arm_length
+    camera.azimuth, camera.elevation = CAMERA_AZIMUTH, CAMERA_ELEVATION
+    floor = float(model.geom(FLOOR).pos[2])
+    lowest = 0.0
+    with mujoco.Renderer(model, height, width, max_geom=_MOST_GEOMS) as renderer:
+        for flag in (mujoco.mjtRndFlag.mjRND_SHADOW, mujoco.mjtRndFlag.mjRND_REFLECTION):
+            renderer.scene.flags[flag] = 0
+        while len(request := requests.read(REQUEST.size)) == REQUEST.size:
+            time, *numbers = REQUEST.unpack(request)
+            data.qpos[:7], goal, turned = numbers[:7], numbers[7:10], numbers[10:]
+            for name, angle, spin in zip(PROPELLER_NAMES, turned, vehicle.rotor_spins, strict=True):
+                half = -0.5 * spin * angle / BLADE_SLOWDOWN  # a propeller turns against its reaction torque
+                model.body(name).quat[:] = np.cos(half), 0.0, 0.0, np.sin(half)
+            for obstacle in obstacles:
+                if obstacle.moves:
+                    body = model.body(obstacle_body(obstacle)).id
+                    data.mocap_pos[model.body_mocapid[body]] = obstacle.places(np.array([time]))[0]
+            lowest = max(min(lowest, numbers[2]), -_DEEPEST_FLOOR)
+            model.geom(FLOOR).pos[2] = lowest + floor
+            mujoco.mj_kinematics(model, data)
+            mujoco.mj_camlight(model, data)
+            camera.lookat = numbers[:3]
+            renderer.update_scene(data, camera)
+            scene = renderer.scene
+            sphere, size = mujoco.mjtGeom.mjGEOM_SPHERE, np.full(3, 0.15 * vehicle.arm_length)
+            colour = np.array(_COURSE_COLOUR, np.float32)
+            mujoco.mjv_initGeom(scene.geoms[scene.ngeom], sphere, size, np.array(goal), np.eye(3).ravel(), colour)
+            scene.ngeom += 1
+            pictures.write(renderer.render().tobytes())
+            pictures.flush()
+
+
 def probe() -> None:
     """Render one tiny picture, and fail unless there is something in it."""
     model = mujoco.MjModel.from_xml_string(
@@ -247,10 +288,12 @@ def _ffmpeg(*arguments: str) -> None:
 
 
 def main(arguments: list[str]) -> None:
-    """Do one task: `probe`, `film SHOT MP4`, `join LIST MP4`, `gif MP4 GIF WIDTH` or `portrait VEHICLE PNG W H`."""
+    """Do `probe`, `serve`, `film SHOT MP4`, `join LIST MP4`, `gif MP4 GIF WIDTH` or `portrait VEHICLE PNG W H`."""
     match arguments:
         case ["probe"]:
             probe()
+        case ["serve"]:
+            serve(sys.stdin.buffer, sys.stdout.buffer)
         case ["film", shot, path]:
             film(Shot(**json.loads(shot)), Path(path))
         case ["join", segments, path]:

@@ -186,6 +186,17 @@ def _making(path: Path, form: str) -> Iterator[Path]:
         raise OutputError(path, f"the renderer failed: {failure}") from failure
 
 
+def worker_process(task: str, backend: str) -> subprocess.Popen[bytes]:
+    """A worker that stays, with pipes to it and from it."""
+    return subprocess.Popen(
+        [*_WORKER, task],
+        env=_environment(backend),
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+    )
+
+
 def _environment(backend: str, workers: int = 1) -> dict[str, str]:
     # Side by side each worker keeps a core busy: threads of Mesa's software renderer would but take turns with them.
     threads = {"LP_NUM_THREADS": "0"} if workers > 1 else {}

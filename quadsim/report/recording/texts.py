@@ -31,6 +31,7 @@ def send_texts(recording: rr.RecordingStream, run: Run) -> None:
     ]
     events += _phase_changes(run)
     events += _failures(run)
+    events += [(event["time"], event["text"], "WARN") for event in run.summary.get("events", ())]
     events.append((run.end, _outcome(run), "INFO" if run.log.reason is None else "ERROR"))
     times, texts, levels = zip(*sorted(events, key=lambda event: event[0]), strict=True)
     recording.log("summary", rr.TextDocument(_summary(run), media_type=rr.MediaType.MARKDOWN), static=True)

@@ -12,7 +12,8 @@ from annotated_types import doc
 from quadsim.errors import ParameterError
 from quadsim.fields import NonNegative, Vector
 from quadsim.sim.effects.ground_effect import Ground
-from quadsim.sim.effects.load import Load, Payload
+from quadsim.sim.effects.load import Factor, Load, Payload
+from quadsim.sim.effects.push import Push
 from quadsim.sim.effects.rotors import RotorDynamics
 from quadsim.sim.effects.thrust_noise import ThrustNoise
 from quadsim.sim.effects.wind import Air
@@ -21,12 +22,17 @@ from quadsim.vehicle import N_ROTORS, Vehicle
 
 __all__ = [
     "Air",
+    "Change",
     "Disturbance",
     "Effects",
     "Ground",
+    "LagChange",
     "Load",
+    "MassChange",
     "Payload",
     "PayloadChange",
+    "Push",
+    "PushChange",
     "RotorChange",
     "RotorDynamics",
     "ThrustNoise",
@@ -78,6 +84,37 @@ class PayloadChange:
 
     time: float
     payload: Payload | None
+
+
+@dataclass(frozen=True, kw_only=True)
+class MassChange:
+    """From `time` [s] on, the vehicle's mass is `factor` times its file's, whatever it carries besides."""
+
+    time: float
+    factor: Factor
+
+
+@dataclass(frozen=True, kw_only=True)
+class LagChange:
+    """From `time` [s] on, rotors have these time constants of speeding up and slowing down [s]; 0 for at once."""
+
+    time: float
+    rise: float
+    fall: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class PushChange:
+    """From `time` [s] on, these pushes act and no others."""
+
+    time: float
+    pushes: tuple[Push, ...]
+
+
+Change = RotorChange | PayloadChange | MassChange | LagChange | PushChange
+"""What happens to the vehicle on the way."""
+LOADING = (PayloadChange, MassChange)
+"""The changes of what the vehicle weighs, for which its model is compiled another way."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -11,7 +11,7 @@ from typing import Final
 
 import numpy as np
 
-from quadsim.sim.effects import Effects
+from quadsim.sim.effects import Effects, Push
 from quadsim.state import Array
 from quadsim.vehicle import N_ROTORS, Vehicle
 
@@ -33,6 +33,7 @@ class StepForces:
       ratio is that of thrusts at the same power.  See `thrust_ratio`.
     - Drag of the body along its axes, F_i = -(l_i + k_i |v_i|) v_i, v its velocity through the air in the body frame,
       as simplified simulations have it (Torrente et al. 2021, "Data-Driven MPC for Quadrotors").
+    - Pushes: each a force F in the world frame, and the torque r x R' F of its point r of the body.
 
     The quadratic drag of `Air.body_drag` is MuJoCo's own; see `quadsim.sim.airframe.compile_model`.
     """
@@ -44,7 +45,8 @@ class StepForces:
         self._drag = (air and air.rotor_drag) or 0.0
         self._along_axes = list(zip(air.linear_drag, air.quadratic_drag, strict=True)) if air and air.axis_drag else []
         self._radius = ground.rotor_radius if ground is not None and ground.effect else None
-        self._of_pose = bool(self._drag or self._along_axes or self._radius is not None)
+        self._always_of_pose = bool(self._drag or self._along_axes or self._radius is not None)
+        self.push(())
         self._timestep, self._floor, self._disc = timestep, floor, disc
         self._places: list[tuple[float, float]] = [(x, y) for x, y, _ in vehicle.rotor_positions.tolist()]
         k, spins = self._drag, np.array(vehicle.rotor_spins, float)
@@ -52,6 +54,11 @@ class StepForces:
         share = [np.full(N_ROTORS, k), k * x, k * y, k * (x * x + y * y), -self._inertia * spins]
         self._of_speed = np.stack(share, axis=1)  # (4, 5) what each rotor adds to a row of `of_rotors`, per rad/s
         self._of_slope = self._inertia * spins  # (4,) per rad/s^2
+
+    def push(self, pushes: Sequence[Push]) -> None:
+        """Let these act from now on, and no others."""
+        self._pushes = [(push.force, push.point) for push in pushes if any(push.force)]
+        self._of_pose = self._always_of_pose or bool(self._pushes)
 
     def of_rotors(self, speeds: Array, accelerations: Array) -> Array:
         """What the forces take from the rotors, whatever the motion.
@@ -157,6 +164,14 @@ class StepForces:
                 fx, fy, fz = fx + pull * cx, fy + pull * cy, fz + pull * cz
         if self._inertia:
             tx, ty = -q * momentum, p * momentum
+        if self._pushes:
+            wz, xy = w * z, x * y
+            for (px, py, pz), (rx, ry, rz) in self._pushes:
+                fx, fy, fz = fx + px, fy + py, fz + pz
+                bx = (1.0 - s * (yy + zz)) * px + s * (xy + wz) * py + r20 * pz
+                by = s * (xy - wz) * px + (1.0 - s * (xx + zz)) * py + r21 * pz
+                bz = s * (xz + wy) * px + s * (yz - wx) * py + (1.0 - s * (xx + yy)) * pz
+                tx, ty, tz = tx + ry * bz - rz * by, ty + rz * bx - rx * bz, tz + rx * by - ry * bx
         if self._radius is not None:
             r22 = 1.0 - s * (xx + yy)
             above = height - self._floor + r22 * self._disc

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated
 
 import numpy as np
@@ -67,10 +67,23 @@ class RotorDynamics:
         """
         inertia = vehicle.rotor_inertia or 0.0
         found = filled(self, rise=vehicle.rotor_rise, fall=vehicle.rotor_fall, inertia=inertia)
-        if found.inertia and not found.acceleration and not (found.rise and found.fall):
-            rule = "0 where rotors change their speed at once: that would take an infinite torque"
-            raise ParameterError("effects.rotors", "inertia", found.inertia, rule)
+        found._check_torque()
         return found
+
+    def lagging(self, rise: float, fall: float) -> RotorDynamics:
+        """With other time constants [s].
+
+        Raises:
+            ParameterError: rotors with inertia change their speed at once.
+        """
+        found = replace(self, rise=rise, fall=fall)
+        found._check_torque()
+        return found
+
+    def _check_torque(self) -> None:
+        if self.inertia and not self.acceleration and not (self.rise and self.fall):
+            rule = "0 where rotors change their speed at once: that would take an infinite torque"
+            raise ParameterError("effects.rotors", "inertia", self.inertia, rule)
 
     def respond(self, speeds: Array, target: Array, elapsed: Array) -> tuple[Array, Array]:
         """Speeds and accelerations some time after a command.

@@ -128,37 +128,50 @@ class WindField:
         check_velocity("wind", "mean", mean)
         if not 0.0 < timestep < math.inf:
             raise ParameterError("wind", "timestep", timestep, "a finite time > 0 s")
-        ordered = sorted(changes, key=lambda change: change.at)
-        self._means = np.array([mean, *(change.velocity for change in ordered)], float)
-        self._change_times = np.array([change.at for change in ordered])
-        self._gusts = gusts
-        x, y, _ = self._means[0].tolist()
+        self._mean, self._made, self._turbulent = mean, 0, np.empty((0, 3))
+        x, y, _ = mean
         speed = math.hypot(x, y)
         self._along = (x / speed, y / speed) if speed > 0.0 else (1.0, 0.0)
         self._timestep = timestep
         self._turbulence = None if turbulence is None else Turbulence(turbulence, timestep=timestep, rng=rng)
+        self.reschedule(gusts, changes)
         self.reset()
 
     def reset(self) -> None:
         """Rewind: the same wind again."""
-        self._made, self._ahead = 0, np.empty((0, 3))  # steps whose wind is known, and that of the last of them
+        # Steps whose wind is known, that of the last of them, and what of it is turbulence.
+        self._made, self._ahead, self._turbulent = 0, np.empty((0, 3)), np.empty((0, 3))
         if self._turbulence is not None:
             self._turbulence.reset()
+
+    def reschedule(self, gusts: tuple[Gust, ...], changes: tuple[WindChange, ...]) -> None:
+        """Let these gusts and steps of the mean take the place of those before, from the next physics step on."""
+        ordered = sorted(changes, key=lambda change: change.at)
+        self._means = np.array([self._mean, *(change.velocity for change in ordered)], float)
+        self._change_times = np.array([change.at for change in ordered])
+        self._gusts = gusts
+        self._ahead = self._air(self._made - len(self._turbulent), self._turbulent)
 
     def advance(self, steps: int) -> Array:
         """(steps, 3) wind velocity at the middle of each of the next physics steps, world frame, z up [m/s]."""
         while len(self._ahead) < steps:
-            self._ahead = np.concatenate([self._ahead, self._next_block()])
-        wind, self._ahead = self._ahead[:steps].copy(), self._ahead[steps:]
+            block = self._next_turbulence()
+            self._ahead = np.concatenate([self._ahead, self._air(self._made, block)])
+            self._turbulent = np.concatenate([self._turbulent, block])
+            self._made += len(block)
+        wind, self._ahead, self._turbulent = self._ahead[:steps].copy(), self._ahead[steps:], self._turbulent[steps:]
         return wind
 
-    def _next_block(self) -> Array:
-        middles = self._timestep * (np.arange(_BLOCK, dtype=np.float64) + (self._made + 0.5))
-        self._made += _BLOCK
+    def _air(self, first: int, turbulence: Array) -> Array:
+        """(M, 3) wind in the middle of each of M physics steps from `first` on, of which (M, 3) is turbulence."""
+        middles = self._timestep * (np.arange(len(turbulence), dtype=np.float64) + (first + 0.5))
         wind: Array = self._means[np.searchsorted(self._change_times, middles, side="right")]
         wind += gust_velocity(self._gusts, middles)
-        if self._turbulence is not None:
-            along, across, vertical = self._turbulence.advance(_BLOCK).T
-            x, y = self._along  # spelt out, as a matrix product may round by the number of rows
-            wind += np.stack([x * along - y * across, y * along + x * across, vertical], axis=1)
-        return wind
+        return wind if self._turbulence is None else wind + turbulence
+
+    def _next_turbulence(self) -> Array:
+        if self._turbulence is None:
+            return np.zeros((_BLOCK, 3))
+        along, across, vertical = self._turbulence.advance(_BLOCK).T
+        x, y = self._along  # spelt out, as a matrix product may round by the number of rows
+        return np.stack([x * along - y * across, y * along + x * across, vertical], axis=1)

@@ -68,9 +68,20 @@ class Sampler:
         self._latency = sensor.latency(timestep)
         self._noise, self._bias = np.array(sensor.noise), np.array(sensor.bias)
         self._step = np.array(sensor.bias_walk) * math.sqrt(self._stride * timestep)
-        self._faults = tuple((fault, fault.window(timestep)) for fault in faults if fault.sensor is sensor.name)
+        self._timestep = timestep
+        self.reschedule(faults)
         self._initial = tuple(rng.spawn(4))
         self.reset()
+
+    @property
+    def watched(self) -> bool:
+        """Whether it knows of any fault, and so what a frozen sensor would repeat."""
+        return bool(self._faults)
+
+    def reschedule(self, faults: Sequence[SensorFault]) -> None:
+        """Let these faults, of this sensor and others, take the place of those before."""
+        of_this = (fault for fault in faults if fault.sensor is self.sensor.name)
+        self._faults = tuple((fault, fault.window(self._timestep)) for fault in of_this)
 
     def reset(self) -> None:
         """Start again, with the same draws."""

@@ -73,7 +73,7 @@ class Event(NamedTuple):
         """
         if self.column_name not in table.column_names:
             raise UnknownNameError("column", self.column_name, table.column_names)
-        if self.operation != "==" and not _is_number(table.schema.field(self.column_name).type):
+        if self.operation != "==" and not is_number(table.schema.field(self.column_name).type):
             raise _no_number(self.text, self.column_name)
         return np.array([self.holds({self.column_name: value}) for value in table[self.column_name].to_pylist()], bool)
 
@@ -107,14 +107,14 @@ def parse_event(text: str, columns: Mapping[str, pa.DataType] | None = None) -> 
         )
     if columns is not None:
         if column not in columns:
-            raise UnknownNameError("column", column, [name for name, kind in columns.items() if _is_number(kind)])
-        if not _is_number(columns[column]):
+            raise UnknownNameError("column", column, [name for name, kind in columns.items() if is_number(kind)])
+        if not is_number(columns[column]):
             raise _no_number(text, column)
     number = _number(found["number"], text)
     return Event(f"{column} {found['operation']} {number:.15g}", column, found["operation"], number)
 
 
-def _is_number(kind: pa.DataType) -> bool:
+def is_number(kind: pa.DataType) -> bool:
     """Whether a column's values, numbers or truth values, can be compared with a number."""
     from pyarrow import types
 

@@ -32,8 +32,15 @@ ESTIMATION = {
     "not_finite": 10,
     "samples": {"position": {"accepted": 95, "rejected": 5, "nis": 1.0}},
 }
+EVENTS = [{"time": 2.0, "text": "rotor 2 loses 20 %"}, {"time": 3.5, "text": "a push of 4 N for 0.2 s"}]
 COMPUTATION = {"delay_ms": {"p50": 12.0, "p95": 30.0, "p99": 45.0, "max": 60.0}, "missed": 3}
-EVERYTHING = {"course": COURSE, "ground": GROUND, "estimation": ESTIMATION, "computation": COMPUTATION}
+EVERYTHING = {
+    "course": COURSE,
+    "events": EVENTS,
+    "ground": GROUND,
+    "estimation": ESTIMATION,
+    "computation": COMPUTATION,
+}
 
 
 def having(run: Run, scenario: str, **entries: Any) -> Run:
@@ -115,6 +122,7 @@ def test_a_verdict_needs_no_expectation_and_minds_required_constraints_alone(bar
 def test_sentences_tell_what_each_flight_met(bare_run: Run) -> None:
     told = comparison_sentences([having(bare_run, "one", **EVERYTHING), having(bare_run, "two", course=COURSE)])
     assert "one and two: the course asks for up to 5.61 deg of tilt." in told, "one course, told once"
+    assert "On the way of one: rotor 2 loses 20 % at 2 s; a push of 4 N for 0.2 s at 3.5 s." in told
     assert (
         "one takes off at 2.155 s, meets the ground at 15.88 s (0.05 m/s downwards, 1.2 deg of tilt) and is landed at "
         "the end."
@@ -126,6 +134,13 @@ def test_sentences_tell_what_each_flight_met(bare_run: Run) -> None:
     assert (
         "Commands of one come 12 ms after their measurement in the median and 60 ms at most; 3 too late to be used."
     ) in told
+
+
+def test_of_many_events_the_first_are_told(bare_run: Run) -> None:
+    many = [{"time": float(i), "text": "a push of 1 N"} for i in range(30)]
+    (told,) = (each for each in comparison_sentences([having(bare_run, "one", events=many)]) if "On the way" in each)
+    assert told.count("a push of 1 N at") == 12
+    assert told.endswith("at 11 s; 18 more.")
 
 
 def test_bounds_that_differ_are_told_with_each_run(bare_run: Run) -> None:

@@ -24,6 +24,7 @@ from scenarios.bench.speed import (
     SpeedBench,
     SpeedFlight,
     fly_cell,
+    merged,
     run_speeds,
     speed_legend,
     speed_tables,
@@ -36,7 +37,7 @@ from scenarios.loading import parse_scenario
 WELL = SpeedFlight(bound=40.0, reason=None, error=0.1, tilt=35.0, violated=0.0, saturated=0.2, fallback=0.0)
 FAR = replace(WELL, error=2.0 * NEAR)
 BEYOND = replace(WELL, error=0.05, tilt=45.0, violated=0.125)
-LOST = replace(WELL, reason="lost", error=None, tilt=121.0, violated=0.5)
+LOST = replace(WELL, reason="lost", error=None, tilt=121.0, violated=0.5, lost=1)
 
 
 @pytest.fixture
@@ -71,7 +72,7 @@ def test_quick_flies_two_controllers_at_two_speeds(monkeypatch: pytest.MonkeyPat
 
 
 def test_a_loss_is_a_result() -> None:
-    lost = fly_cell(("loop, drag", 14.0, "LQR"))
+    lost = fly_cell(("loop, drag", 14.0, "LQR", 0))
     assert lost.reason is not None
     assert "lost" in lost.reason
     assert lost.error is None
@@ -86,6 +87,20 @@ def test_every_controller_is_one_that_a_scenario_may_have(world: str) -> None:
     given = Given(vehicle=vehicle, tuned=data["controller"], period=data["control_period"], bound=50.0)
     types = [parse_scenario({**data, "controller": law.table(given)}).controller.type for law in LAWS.values()]
     assert types == ["lqr", "pid", "constrained", "robust", "geometric", "geometric", "nonlinear", "nonlinear"]
+
+
+def test_seeds_differ_and_are_merged_with_their_interval() -> None:
+    first, again, other = (fly_cell(("hummingbird, sensors", 6.0, "LQR", seed)) for seed in (0, 0, 1))
+    assert first == again
+    assert first.error != other.error
+    near, far = (replace(WELL, error=error) for error in (0.1, 0.3))
+    both = merged([near, far])
+    assert both.error == pytest.approx(0.2)
+    assert both.half == pytest.approx(12.7062 * 0.1, rel=1e-4)  # Student's t of one degree of freedom
+    assert (both.seeds, both.lost, both.reason) == (2, 0, None)
+    one = merged([near, LOST])
+    assert (one.error, one.half, one.lost, one.reason, one.tilt) == (None, None, 1, "lost", 121.0)
+    assert one.violated == 0.25
 
 
 def test_no_process_is_refused() -> None:

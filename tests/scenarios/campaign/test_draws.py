@@ -76,6 +76,15 @@ def test_grids_make_every_combination_equally_often() -> None:
     assert len(set(column(spec, "p1"))) == 12
 
 
+def test_integers_are_equally_often_each_whole_number_of_their_range() -> None:
+    spec = campaign({"distribution": "integer", "low": -1, "high": 3}, flights=2000)
+    values = column(spec)
+    assert {type(value) for value in values} == {int}
+    assert sorted(set(values)) == list(range(-1, 4))
+    assert stats.chisquare(np.bincount(np.add(values, 1))).pvalue > 0.01
+    assert extremes(spec.vary[0]) == [-1, 3]
+
+
 def test_whole_numbers_stay_whole() -> None:
     assert column(campaign({"distribution": "choice", "values": [10]}, flights=1)) == [10]
     assert isinstance(column(campaign({"distribution": "choice", "values": [10]}, flights=1))[0], int)

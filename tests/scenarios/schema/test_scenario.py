@@ -21,8 +21,8 @@ from quadsim.flight.audit import SIGNALS
 from quadsim.state import STATE_NAMES
 from quadsim.vehicle import OPTIONAL_PARAMETERS, VEHICLE_UNITS
 from scenarios.build import resolve
+from scenarios.limits import build_limits
 from scenarios.loading import load_scenario, parse_scenario
-from scenarios.parts.limits import build_limits
 from scenarios.parts.vehicle import build_vehicle
 from scenarios.schema.problems import ScenarioError
 from scenarios.schema.scenario import MOST_STEPS, Scenario
@@ -197,7 +197,8 @@ WRONG = {
     "constraints=[{name='a', signal='x'}]": "constraints.a.lower must be given, or upper, or both",
     "controller.type=unconstrained": (
         "controller.solver is not a field of the scenario file "
-        "(there are: horizon, output_weights, input_weights, terminal, compiled, type)\n  controller.output_bounds is not ..."
+        "(there are: horizon, output_weights, input_weights, terminal, compiled, type)\n"
+        "  controller.output_bounds is not ..."
     ),
 }
 

@@ -376,6 +376,15 @@ def test_the_last_second_says_why_there_was_no_answer_and_that_the_fallback_went
     assert len(small._headlines(2)) == 2
 
 
+def test_captions_tell_what_has_just_happened(short_run: Run) -> None:
+    events = [{"time": 0.1 * i, "text": f"push {i}"} for i in range(5)] + [{"time": 3.0, "text": "a gust"}]
+    run = replace(short_run, summary={**short_run.summary, "events": events})
+    overlay = Overlay(run, make_footage(run, np.array([0.15, 0.5, 2.9, 3.5, 5.1])), width=1280, height=720)
+    texts = {event["text"] for event in events}
+    told = [[text for text, _, _ in overlay._headlines(i) if text in texts] for i in range(5)]
+    assert told == [["push 0", "push 1"], ["push 2", "push 3", "push 4"], [], ["a gust"], []]
+
+
 def test_captions_tell_the_phase_where_there_is_a_ground(short_run: Run):
     def at_phase(*phases: str) -> Run:
         control = short_run.log.control

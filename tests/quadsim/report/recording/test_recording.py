@@ -269,6 +269,12 @@ def test_events_tell_each_change_of_the_solver_and_the_end(record: Callable[[Run
     np.testing.assert_allclose(content.times("/events"), times, atol=1e-9)
 
 
+def test_events_tell_what_happened_on_the_way(record: Callable[[Run], Content], short_run: Run) -> None:
+    summary = {**short_run.summary, "events": [{"time": 0.5, "text": "rotor 2 loses 20 %"}]}
+    content = record(dataclasses.replace(short_run, summary=summary))
+    assert "rotor 2 loses 20 %" in [row[0] for row in content.rows("/events", "text")]
+
+
 def test_events_tell_why_there_was_no_answer_and_when_the_fallback_began_for_good(
     record: Callable[[Run], Content], short_run: Run
 ) -> None:

@@ -6,6 +6,7 @@ import math
 from typing import TYPE_CHECKING
 
 from quadsim.flight.audit import Limit, SpaceLimit, SumLimit
+from scenarios.courses.windows import timed_regions
 from scenarios.parts.vehicle import build_vehicle
 from scenarios.schema.nonlinear import NonlinearPartsSpec
 from scenarios.schema.optimisation import BoundedSpec, PolytopeSpec
@@ -21,7 +22,7 @@ def build_limits(scenario: Scenario) -> tuple[Limit, ...]:
 
 def space_limits(scenario: Scenario) -> tuple[SpaceLimit, ...]:
     """The obstacles to keep clear of, then the regions to stay in."""
-    regions = scenario.regions
+    regions = timed_regions(scenario)
     if not scenario.obstacles and not regions:
         return ()
     radius = build_vehicle(scenario).enclosing_radius

@@ -1,0 +1,181 @@
+"""A predictive safety filter: a wanted command passes where the robust MPC's constraints can still be kept after it.
+
+Wabersich and Zeilinger (2021), "A predictive safety filter for learning-based control of constrained nonlinear
+dynamical systems", with the model, the disturbance observer and the tightened bounds of `mpc.robust.controller`.  Once
+per period one QP is solved,
+
+    min_u  |u(k) - u_wanted|^2 + epsilon sum_i |u(k+i) - u_s|^2,    i = 0 .. N-1,
+
+subject to the robust MPC's constraints and to a condition on the end of the plan: what the bounds see of the state
+stands still there,
+
+    V' (A - I) (x(k+N) - x_s) = 0,    V a basis of the row space of [C; C A; ...],
+
+so that holding u_s from then on keeps every bound on states for ever.  The plan of one period, moved on, is then a plan
+of the next: as far as the disturbances are within the bounds stated for the tightening, the problem stays feasible.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Final
+
+import numpy as np
+import scipy.linalg
+
+from mpc.answer import ActuatorBounds, command_of, refused, rejection
+from mpc.constraints import Constraint, Penalty
+from mpc.equilibrium import Trim
+from mpc.ocp import Objective, Problem, Query
+from mpc.robust.controller import RobustMPC
+from mpc.robust.settings import Linearisation
+from mpc.robust.tightening import observed
+from mpc.solvers import Answer
+from mpc.solvers.piqp_backends import PiqpMultistage
+from mpc.staged import Staged
+from quadsim.controller import ACCEPTED, UNCONSTRAINED, Command, Moment
+from quadsim.errors import ParameterError
+from quadsim.state import Array
+
+LATER: Final = 1e-6
+"""epsilon: how far later inputs' distance from rest counts, against the first input's from what was wanted."""
+PENALTY: Final = 1e4
+"""l1 of violating a soft row by as much as it has room on one side, where the weight of the first input is 1."""
+STANDING: Final = 1e-4
+"""How fast what stands still at the plan's end may still change, per period [unit of the state]."""
+LOOSE: Final = 1e2
+"""A bound that is none, per period: PIQP is to see no infinite one that changes, or that is on both sides of a row."""
+END: Final = "standing"
+"""The name of the constraint on the plan's end."""
+PASSED: Final = 1e-2
+"""Difference from the wanted command [rad/s] that is rounding of the QP: the wanted one is then passed as it is."""
+
+
+class SafetyFilter:
+    """A controller that commands what it is asked to, as far as that is safe; see the module.
+
+    Where the constraints cannot be kept, as after a disturbance larger than stated, those on states are softened and
+    the QP is solved once more.  Where that has no answer either, the status says so, for
+    `mpc.fallback.contract.Guarded` to fly the last good plan.
+
+    Args:
+        mpc: whose model, observer and constraints are used, one without half-spaces; it solves nothing itself.
+
+    Attributes:
+        problem: the constraints, all hard.
+        wanted: (4,) the command to let pass in the next period [rad/s].
+
+    Raises:
+        ParameterError: the model is not that of hover.
+    """
+
+    name: Final = "safety-filter"
+    solver: Final = "piqp-multistage"
+
+    def __init__(self, mpc: RobustMPC) -> None:
+        if mpc.settings.linearisation is not Linearisation.HOVER:
+            rule = '"hover" for a safety filter'
+            raise ParameterError("controller", "linearisation", str(mpc.settings.linearisation), rule)
+        self._mpc, self.horizon = mpc, mpc.horizon
+        standing = _standing(mpc.problem)
+        self.problem = _feasibility(mpc.problem, standing)
+        self._actuators = ActuatorBounds.of_problem(self.problem)
+        self._nearest, self._softened = _Nearest(self.problem, standing), _Nearest(_softened(self.problem), standing)
+        self.wanted = self.problem.model.u_bar.copy()
+
+    @property
+    def trim(self) -> Trim:
+        """What holds the vehicle at rest against the disturbance that is estimated."""
+        return self._mpc.trim
+
+    def reset(self, speeds: Array) -> None:
+        """See `quadsim.controller.Controller.reset`."""
+        self._mpc.reset(speeds)
+        self.wanted = np.array(speeds, float)
+
+    def step(self, now: Moment, state: Array, reference: Array) -> Command:
+        """The nearest command to `wanted` after which the constraints can be kept.
+
+        One that passes as it is, the optimum without constraints, has the status `unconstrained`.
+        """
+        query = self._mpc.pose(now, state, reference)
+        if isinstance(query, Command):
+            return query
+        answer = self._nearest.solve(query, self.wanted)
+        if answer.solution.status not in ACCEPTED:
+            answer = self._softened.solve(query, self.wanted)
+        plan, status = answer.plan, answer.solution.status
+        problem = rejection(status, plan[0], plan, self._actuators, query.u_before)
+        if problem is not None:
+            return refused(query.u_before, self.horizon, problem, answer)
+        plan = plan.copy()
+        passed = np.abs(plan[0] - self.wanted).max() <= PASSED
+        plan[0] = self._actuators.clip(self.wanted if passed else plan[0], query.u_before)
+        return command_of(plan[0], plan, UNCONSTRAINED if passed else status, answer)
+
+    def predict(self, states: Array, plans: Array) -> Array:
+        """See `quadsim.controller.Controller.predict`."""
+        return self._mpc.predict(states, plans)
+
+
+class _Nearest:
+    """The QP of a problem whose first input is to be near a wanted one."""
+
+    def __init__(self, problem: Problem, standing: Array) -> None:
+        self._form = form = Staged(problem)
+        self._horizon, self._at_rest = problem.horizon, standing
+        self._first = form.inputs(np.arange(form.qp.c.size, dtype=np.float64))[0].astype(np.intp)
+        P = form.qp.P.copy()
+        P[self._first, self._first] += 2.0
+        self._backend = PiqpMultistage()
+        self._backend.setup(replace(form.qp, P=P))
+        earlier, last = (form.qp.h_u.reshape(self._horizon, -1)[i] for i in (0, -1))
+        self._ends = (earlier == LOOSE) & (last < LOOSE)  # rows that hold at the last state alone
+
+    def solve(self, query: Query, wanted: Array) -> Answer:
+        """The plan whose first input is nearest to `wanted` (4,) [rad/s]."""
+        vectors = self._form.vectors(query.state, query.desired, query.u_before, query.rest)
+        vectors.c[self._first] -= 2.0 * wanted
+        if query.rest is not None:
+            for side in (vectors.h_l, vectors.h_u):
+                side.reshape(self._horizon, -1)[-1, self._ends] += self._at_rest @ query.rest.x
+        solution = self._backend.solve(vectors)
+        plan, slacks = self._form.inputs(solution.x), self._form.slacks(solution.x)
+        return Answer(plan=plan.copy(), slacks=slacks, solution=solution)
+
+
+def _feasibility(problem: Problem, standing: Array) -> Problem:
+    """The constraints of a problem, all hard, the condition (m, n) on the plan's end, and a cost of inputs alone."""
+    C_r, nu = problem.objective.C_r, problem.model.nu
+    objective = Objective(C_r=C_r, Q_y=LATER**2 * np.eye(len(C_r)), Q_u=LATER * np.eye(nu))
+    constraints = [replace(part, penalty=None) for part in problem.every_constraint]
+    if len(standing):
+        bound = np.full((problem.horizon, len(standing)), LOOSE)
+        bound[-1] = STANDING
+        constraints.append(Constraint(name=END, lower=-bound, upper=bound, C=standing))
+    return replace(problem, objective=objective, bounds=None, constraints=tuple(constraints))
+
+
+def _softened(problem: Problem) -> Problem:
+    """The same with all constraints on states soft, but for that on the plan's end."""
+    soft = [part if part.C is None or part.name == END else _soft(part) for part in problem.constraints]
+    return replace(problem, constraints=tuple(soft))
+
+
+def _soft(part: Constraint) -> Constraint:
+    lower, upper = np.atleast_2d(part.lower)[-1], np.atleast_2d(part.upper)[-1]
+    both = np.isfinite(lower) & np.isfinite(upper)
+    one = np.abs(np.where(np.isfinite(lower), lower, upper))
+    room = np.where(both, 0.5 * (upper - lower), np.where(one > 0.0, one, 1.0))
+    return replace(part, penalty=Penalty(l1=PENALTY / room, l2=np.zeros(room.size)))
+
+
+def _standing(problem: Problem) -> Array:
+    """(m, n) orthonormal rows, zero times x - x_s where what the bounds see of the state stands still."""
+    rows, A = problem.rows, problem.model.A
+    bounded = rows.C[rows.on_states]
+    if not len(bounded):
+        return np.empty((0, len(A)))
+    change = A - np.eye(len(A))
+    seen = observed(change, bounded).T @ change
+    return np.asarray(scipy.linalg.orth(seen.T, rcond=1e-9).T)

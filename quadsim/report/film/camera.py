@@ -1,0 +1,97 @@
+"""Pictures of single states while they are flown, rendered in a child process that stays."""
+
+from __future__ import annotations
+
+import pickle
+import subprocess
+from collections.abc import Sequence
+from struct import Struct
+from typing import Any, Final
+
+import numpy as np
+
+from quadsim.errors import ParameterError, RenderingUnavailableError
+from quadsim.report.film.video import rendering_backend, worker_process
+from quadsim.space import Obstacle
+from quadsim.state import EULER, POSITION, Array, euler_to_quaternion
+from quadsim.vehicle import Vehicle
+
+REQUEST: Final = Struct("15d")
+"""Time [s], position [m] and quaternion wxyz of the vehicle, position of the reference [m], rotors' angles [rad]."""
+_FRAME: Final = 1.0 / 30.0
+"""How far rotors have turned from one picture to the next, as times their speed [s]."""
+
+
+class Camera:
+    """Follows the vehicle; close it, or use it as a context manager.
+
+    Args:
+        vehicle: what is drawn.
+        obstacles: likewise.
+        width: [pixels].
+        height: [pixels].
+
+    Raises:
+        RenderingUnavailableError: this machine cannot render.
+        ParameterError: a size that cannot be.
+    """
+
+    def __init__(self, vehicle: Vehicle, obstacles: Sequence[Obstacle], *, width: int, height: int) -> None:
+        for name, value in (("width", width), ("height", height)):
+            if not 16 <= value <= 4096:
+                raise ParameterError("", name, value, "from 16 to 4096 pixels")
+        self._shape, self._turned = (height, width, 3), np.zeros(4)
+        self._backend = rendering_backend()
+        self._process: subprocess.Popen[bytes] = worker_process("serve", self._backend)
+        self._send(pickle.dumps((vehicle, tuple(obstacles), width, height)))
+
+    def __enter__(self) -> Camera:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def picture(
+        self, state: Array, rotors: Array, reference: Array, time: float
+    ) -> np.ndarray[Any, np.dtype[np.uint8]]:
+        """One picture (height, width, 3).
+
+        Args:
+            state: (12,).
+            rotors: (4,) speeds [rad/s].
+            reference: (3,) where to, or (4,) with yaw [m].
+            time: [s], for what moves.
+
+        Raises:
+            RenderingUnavailableError: the renderer has ended.
+        """
+        self._turned = self._turned + _FRAME * rotors
+        pose = [*state[list(POSITION)], *euler_to_quaternion(state[list(EULER)])]
+        self._send(REQUEST.pack(time, *pose, *reference[:3], *self._turned))
+        assert self._process.stdout is not None
+        size = int(np.prod(self._shape))
+        data = self._process.stdout.read(size)
+        if len(data) < size:
+            raise self._ended()
+        return np.frombuffer(data, np.uint8).reshape(self._shape).copy()
+
+    def close(self) -> None:
+        """End the child process."""
+        process = self._process
+        if process.poll() is None:
+            process.kill()
+        for pipe in (process.stdin, process.stdout):
+            assert pipe is not None
+            pipe.close()
+        process.wait()
+
+    def _send(self, request: bytes) -> None:
+        assert self._process.stdin is not None
+        try:
+            self._process.stdin.write(request)
+            self._process.stdin.flush()
+        except BrokenPipeError as error:
+            raise self._ended() from error
+
+    def _ended(self) -> RenderingUnavailableError:
+        return RenderingUnavailableError({self._backend: "the renderer has ended"})

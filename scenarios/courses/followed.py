@@ -1,0 +1,71 @@
+"""The reference as it is followed: a course through its filter, which set-points may leave on the way."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Final
+
+import numpy as np
+
+from quadsim.state import REFERENCE_NAMES, Array
+from scenarios.courses.course import Course
+from scenarios.courses.smoothing import smooth
+
+_BLOCK: Final = 256
+"""Rows that the course is sampled for, and filtered, at a time."""
+
+
+class FollowedCourse:
+    """Rows r(k) = y(k) + exp(-3 tau_s / tau_r) (r(k-1) - y(k)) of a course's samples y(k).  Eq. (31).
+
+    A set-point is not known ahead: given at t_k, it takes the place of the samples from k+1 on, axis by axis, and the
+    filter runs on from row k.  An axis keeps its set-point until it is given another one.
+    """
+
+    def __init__(self, course: Course, *, response_time: float, period: float) -> None:
+        """Set up at t = 0.
+
+        Args:
+            course: before its filter.
+            response_time: tau_r [s]; 0 for no filter.
+            period: tau_s [s].
+        """
+        self._course, self._response_time, self._period = course, response_time, period
+        self._samples = self._rows = np.empty((0, len(REFERENCE_NAMES)))
+        self._setpoint: dict[int, float] = {}
+
+    def row(self, k: int) -> Array:
+        """(4,) x, y, z [m], yaw [rad] at t_k."""
+        self._extend(k + 1)
+        row: Array = self._rows[k]
+        return row
+
+    def preview(self, k: int, n: int) -> Array:
+        """(n, 4) the same at t_{k+1} .. t_{k+n}, as far as it is known at t_k."""
+        self._extend(k + 1 + n)
+        rows: Array = self._rows[k + 1 : k + 1 + n]
+        return rows
+
+    def set(self, k: int, values: Mapping[str, float]) -> None:
+        """A set-point that is given at t_k, by the names of its axes [m, rad]."""
+        self._extend(k + 1)
+        self._setpoint |= {REFERENCE_NAMES.index(name): value for name, value in values.items()}
+        self._rows = self._rows[: k + 1]
+
+    def _extend(self, count: int) -> None:
+        """Know that many rows, or more."""
+        while len(self._samples) < count:
+            t = self._period * np.arange(len(self._samples), len(self._samples) + _BLOCK, dtype=np.float64)
+            self._samples = np.concatenate([self._samples, self._course.sample(t)])
+        if len(self._rows) >= count:
+            return
+        known = len(self._rows)
+        samples = self._samples[known : -(-count // _BLOCK) * _BLOCK].copy()
+        for channel, value in self._setpoint.items():
+            samples[:, channel] = value
+        before = self._rows[-1] if known else self._course.initial
+        further = [
+            smooth(values, initial=last, response_time=self._response_time, period=self._period)
+            for values, last in zip(samples.T, before.tolist(), strict=True)
+        ]
+        self._rows = np.concatenate([self._rows, np.stack(further, axis=1)])

@@ -1,0 +1,93 @@
+"""The environments' ids, one per scenario of the library, and environments of any scenario."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, Final
+
+import gymnasium
+from gymnasium.envs.registration import EnvSpec
+from gymnasium.vector import VectorEnv
+
+from quadsim.sim.physics import steps_per_period
+from scenarios.api import load
+from scenarios.schema.bases import read_scenario
+from scenarios.schema.scenario import Scenario
+from scenarios.shipped import scenario_names, scenario_path
+
+ENTRY_POINT: Final = "scenarios.gym.environment:QuadrotorEnv"
+
+
+def environment_id(name: str) -> str:
+    """`quadsim/HummingbirdFigureEight-v0` for `hummingbird-figure-eight`."""
+    words = name.replace("_", "-").replace(".", "-").split("-")
+    return f"quadsim/{''.join(word[:1].upper() + word[1:] for word in words)}-v0"
+
+
+def register_library() -> None:
+    """Register the scenarios that ship; they are right, and not checked."""
+    for name in scenario_names():
+        if environment_id(name) not in gymnasium.registry:
+            data = read_scenario(scenario_path(name), scenario_path)
+            periods = steps_per_period(data["duration"], data["control_period"])
+            gymnasium.register(**_description(name, name, periods))
+
+
+def _description(name: str, scenario: Scenario | str, periods: int) -> dict[str, Any]:
+    return {
+        "id": environment_id(name),
+        "entry_point": ENTRY_POINT,
+        "max_episode_steps": periods,
+        "kwargs": {"scenario": scenario},
+    }
+
+
+def _specification(scenario: Scenario | str | Path) -> EnvSpec:
+    if not isinstance(scenario, Scenario):
+        scenario = load(scenario)
+    return EnvSpec(**_description(scenario.name, scenario, scenario.periods))
+
+
+def make_env(scenario: Scenario | str | Path, **options: Any) -> gymnasium.Env[Any, Any]:
+    """The environment of any scenario, with the wrappers of `gymnasium.make`: its time limit is the duration.
+
+    Args:
+        scenario: it, or its name or file.
+        options: what `QuadrotorEnv` takes: `action`, `observation`, `preview`, `vary`, `reward`, `render_mode`, ...
+
+    Raises:
+        InputError: the scenario or an option is not possible.
+
+    Examples:
+        >>> import quadsim.gym
+        >>> env = quadsim.gym.make_env("hover", action="speeds", observation=("state",))
+        >>> observation, info = env.reset(seed=7)
+        >>> observation.shape, env.spec.max_episode_steps, info["constraint_violation"]
+        ((12,), 200, 0)
+        >>> env.close()
+    """
+    return gymnasium.make(_specification(scenario), **options)
+
+
+def make_vec(scenario: Scenario | str | Path, num_envs: int, **options: Any) -> VectorEnv:
+    """The same several times over, each in a process of its own; an episode's end is reset in the next step.
+
+    Args:
+        scenario: it, or its name or file.
+        num_envs: how many.
+        options: as of `make_env`.
+
+    Raises:
+        InputError: as of `make_env`.
+
+    Examples:
+        >>> import quadsim.gym
+        >>> envs = quadsim.gym.make_vec("hover", 2)
+        >>> envs.reset(seed=7)[0].shape, str(envs.metadata["autoreset_mode"])
+        ((2, 216), 'AutoresetMode.NEXT_STEP')
+        >>> envs.close()
+    """
+    from gymnasium.vector import AutoresetMode
+
+    modes = {"autoreset_mode": AutoresetMode.NEXT_STEP}
+    return gymnasium.make_vec(_specification(scenario), num_envs, "async", vector_kwargs=modes, **options)

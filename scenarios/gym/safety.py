@@ -1,0 +1,86 @@
+"""MPC as a safety filter: an agent's actions pass where the robust MPC's constraints stay feasible after them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import gymnasium
+import numpy as np
+
+from quadsim.controller import UNCONSTRAINED, Command
+from quadsim.errors import ParameterError
+from quadsim.vehicle import Vehicle
+from scenarios.gym.actions import Action
+from scenarios.gym.environment import QuadrotorEnv
+from scenarios.one_thread import ONE_THREAD
+from scenarios.parts.controllers import make_filter
+from scenarios.schema.robust import RobustSpec
+
+
+class MPCSafetyFilter(gymnasium.Wrapper):  # type: ignore[misc]
+    """Passes an action, or else the nearest one after which the constraints can be kept; see `mpc.robust.filter`.
+
+    `info["filter"]` tells of each step: `intervened`, `correction` (by how much it changed any rotor's speed at most
+    [rad/s]), and `fallback` (0 while its QP had an answer; see `quadsim.controller.Command`).  The episode's flight has
+    the status `unconstrained` in periods whose action passed.
+
+    Attributes:
+        steps: steps of this episode.
+        interventions: in how many of them it stepped in.
+    """
+
+    def __init__(self, env: gymnasium.Env[Any, Any], controller: Mapping[str, Any] | None = None) -> None:
+        """Wrap an environment whose actions are rotor speeds or deviations.
+
+        Args:
+            env: of `quadsim.gym`.
+            controller: the table of a robust MPC, as in a scenario file; the scenario's own where absent.
+
+        Raises:
+            InputError: the environment is another, or the controller is none that can filter.
+        """
+        super().__init__(env)
+        base = env.unwrapped
+        if not isinstance(base, QuadrotorEnv):
+            raise ParameterError("", "env", type(base).__name__, "an environment of quadsim.gym")
+        base.actions.of(np.zeros(4))
+        scenario = base.scenario if controller is None else base.scenario.replace({"controller": dict(controller)})
+        if not isinstance(scenario.controller, RobustSpec):
+            raise ParameterError("controller", "type", scenario.controller.type, "robust, for a safety filter")
+        self._base, self._spec = base, scenario.controller
+        self._vehicle: Vehicle | None = None
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """See `gymnasium.Env.reset`."""
+        found = self.env.reset(seed=seed, options=options)
+        started = self._base.started
+        if started.vehicle != self._vehicle:
+            self._filter, self._law = make_filter(self._spec, started.vehicle, started.scenario.control_period)
+            self._vehicle = started.vehicle
+        acting = started.observation.moment.acting
+        assert acting is not None
+        self._law.reset(acting)
+        self.steps = self.interventions = 0
+        return found
+
+    def step(self, action: Action) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        """See `gymnasium.Env.step`."""
+        wanted = self._base.actions.command(action, None, 1).speeds
+        command = self.answer(wanted)
+        correction = float(np.abs(command.speeds - wanted).max())
+        intervened = command.status != UNCONSTRAINED
+        self.steps += 1
+        self.interventions += intervened
+        observed, reward, terminated, truncated, info = self.env.step(self._base.action_for(command))
+        told = {"intervened": intervened, "correction": correction, "fallback": command.fallback}
+        return observed, reward, terminated, truncated, {**info, "filter": told}
+
+    def answer(self, wanted: np.ndarray[Any, np.dtype[np.float64]]) -> Command:
+        """What is flown in this period for wanted rotor speeds (4,) [rad/s]; asked once per period."""
+        self._filter.wanted = wanted
+        seen, horizon = self._base.started.observation, self._law.horizon
+        preview = seen.preview[:horizon]
+        preview = np.concatenate([preview, np.repeat(preview[-1:], horizon - len(preview), axis=0)])
+        with ONE_THREAD:
+            return self._law.step(seen.moment, seen.state, preview)

@@ -1,0 +1,114 @@
+"""Who may open a session's page: whoever has its address, from this machine, in a page that it served itself.
+
+A browser lets any site connect to servers on the loopback interface, so that each request is checked: `Host` against
+names that a foreign site may have bound to this machine, `Origin` against pages of others, and a token, which stands in
+the address that is printed and is kept as a cookie.
+"""
+
+from __future__ import annotations
+
+import ipaddress
+import secrets
+from collections.abc import Iterator
+from contextlib import contextmanager
+from http import HTTPStatus
+from http.cookies import CookieError, SimpleCookie
+from typing import Any, Final
+from urllib.parse import parse_qs, urlsplit
+
+LOOPBACK: Final = frozenset({"127.0.0.1", "localhost", "::1"})
+
+
+class Guard:
+    """Checks requests.
+
+    Args:
+        host: what the server listens on.
+
+    Attributes:
+        token: what the address has to have.
+    """
+
+    def __init__(self, host: str) -> None:
+        self._host, self.token = host, secrets.token_urlsafe(24)
+
+    def refusal(self, headers: Any, path: str, port: int) -> str | None:
+        """Why a request is refused; None where it is let in.
+
+        Args:
+            headers: of the request.
+            path: of the request, with its query.
+            port: that it came in by.
+        """
+        if not self._is_ours(headers.get("Host", ""), port):
+            return "this server goes by another name"
+        origin = headers.get("Origin")
+        if origin is not None and not self._is_ours(urlsplit(origin).netloc, port):
+            return "a page of another site may not connect"
+        given = [*parse_qs(urlsplit(path).query).get("token", []), *self._cookies(headers, port)]
+        if not any(secrets.compare_digest(each.encode(), self.token.encode()) for each in given):
+            return "open the address that quadsim live printed: it has a token"
+        return None
+
+    def cookie(self, port: int) -> str:
+        """The header that keeps the token in the browser; cookies do not know ports, hence its name."""
+        return f"{self._name(port)}={self.token}; HttpOnly; SameSite=Strict; Path=/"
+
+    @contextmanager
+    def installed(self) -> Iterator[None]:
+        """Have the server that viser starts meanwhile check its requests."""
+        from viser.infra import _infra
+
+        library = _infra.websockets.asyncio.server
+        serve = library.serve
+
+        def guarded(*args: Any, process_request: Any = None, **options: Any) -> Any:
+            def check(connection: Any, request: Any) -> Any:
+                port = connection.local_address[1]
+                refused = self.refusal(request.headers, request.path, port)
+                if refused is not None:
+                    return connection.respond(HTTPStatus.FORBIDDEN, f"quadsim: {refused}\n")
+                response = None if process_request is None else process_request(connection, request)
+                if response is not None and "token" in parse_qs(urlsplit(request.path).query):
+                    response.headers["Set-Cookie"] = self.cookie(port)
+                return response
+
+            return serve(*args, process_request=check, **options)
+
+        library.serve = guarded
+        try:
+            yield
+        finally:
+            library.serve = serve
+
+    def _is_ours(self, netloc: str, port: int) -> bool:
+        """Whether `HOST:PORT` is this server."""
+        try:
+            parts = urlsplit(f"//{netloc}")
+            host, given = parts.hostname or "", parts.port
+        except ValueError:
+            return False
+        if given != port:
+            return False
+        if host in LOOPBACK or host == self._host:
+            return True
+        return self._host not in LOOPBACK and _is_address(host)  # no site can be bound to the name of an address
+
+    def _cookies(self, headers: Any, port: int) -> list[str]:
+        try:
+            found = SimpleCookie(headers.get("Cookie", ""))
+        except CookieError:
+            return []
+        return [found[self._name(port)].value] if self._name(port) in found else []
+
+    @staticmethod
+    def _name(port: int) -> str:
+        return f"quadsim-{port}"
+
+
+def _is_address(host: str) -> bool:
+    try:
+        ipaddress.ip_address(host)
+    except ValueError:
+        return False
+    return True

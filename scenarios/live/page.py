@@ -1,0 +1,550 @@
+"""The page of a live session, drawn by viser, which is imported here alone.
+
+All clients see the same page; one drives, the others watch.  Callbacks run in viser's thread and do no more than submit
+inputs, give orders to the pace and change what is shown.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import math
+from collections import deque
+from collections.abc import Awaitable, Callable, Mapping
+from functools import partial
+from html import escape
+from importlib.util import find_spec
+from typing import Any, Final
+
+import numpy as np
+
+from quadsim.controller import ACCEPTED
+from quadsim.errors import InputError, MissingPackageError, OutputError, ParameterError
+from quadsim.flight.audit import Limit
+from quadsim.report.palette import BOUND, LINES
+from quadsim.state import quaternion_to_euler
+from quadsim.vehicle import N_ROTORS
+from scenarios.live.guard import LOOPBACK, Guard
+from scenarios.live.knobs import Knob, Value, knobs
+from scenarios.live.pacing import Pace
+from scenarios.live.session import Frame, Session
+from scenarios.live.stage import Stage
+from scenarios.schema.controller import ControllerSpec
+
+SECONDS: Final = 20.0
+"""Of the plots."""
+_EVERY: Final = 4
+"""Periods from one update of panel and plots to the next: a fifth of a second at 20 Hz."""
+_SPEEDS: Final = ("0.1", "0.25", "0.5", "1", "2", "4")
+_STEER: Final = {"W": (1, 0, 0), "S": (-1, 0, 0), "A": (0, 1, 0), "D": (0, -1, 0), "R": (0, 0, 1), "F": (0, 0, -1)}
+"""Keys, and the direction of the set-point's velocity that each adds to."""
+_STEER_STEP: Final = 0.5
+"""[m/s] by which a key changes it."""
+_STEER_MOST: Final = 5.0
+_FAULTS: Final = ("dropout", "freeze", "nan")
+
+STYLE: Final = """<style>
+.q{font:12px/1.45 system-ui,sans-serif;padding:0 .6em}.q b{font-variant-numeric:tabular-nums}
+.q table{width:100%;border-collapse:collapse}.q td{padding:1px 4px 1px 0;white-space:nowrap}
+.q .t{width:45%;min-width:70px}.q .r{position:relative;height:9px;background:#8884;border-radius:3px;overflow:hidden}
+.q .f{position:absolute;left:0;top:0;bottom:0;border-radius:3px}
+.q .n{text-align:right;font-variant-numeric:tabular-nums}
+.q .bad{color:#dc2f38;font-weight:600}
+</style>"""
+
+
+class Page:
+    """A session's page.
+
+    Args:
+        session: what is shown.
+        pace: what drives it.
+        save: writes the run directory of what has been flown and says where; in the thread that flies.
+        host: to listen on.
+        port: likewise; 0 for any free one.
+        others: controllers by name that may take over.
+
+    Raises:
+        MissingPackageError: viser is not installed.
+        ParameterError: the port is in use.
+
+    Attributes:
+        address: to open.
+    """
+
+    def __init__(
+        self,
+        session: Session,
+        pace: Pace,
+        *,
+        save: Callable[[Session], str],
+        host: str = "127.0.0.1",
+        port: int = 0,
+        others: Mapping[str, ControllerSpec],
+    ) -> None:
+        if find_spec("viser") is None:
+            raise MissingPackageError("quadsim live", "viser", extra="live")
+        import viser
+        from viser import _messages
+
+        self._session, self._pace, self._save, self._others = session, pace, save, others
+        self._guard = Guard(host)
+        with self._guard.installed():
+            self._server: Any = viser.ViserServer(host=host, port=port, label="quadsim live", verbose=False)
+        found = self._server.get_port()
+        if port not in (0, found):
+            self._server.stop()
+            raise ParameterError("", "--port", port, "a port that is free")
+        for message in (_messages.ShareUrlRequest, _messages.ShareUrlDisconnect):  # a tunnel that any client may open
+            self._server._websock_server.unregister_handler(message)
+        shown = host if host in LOOPBACK or host not in ("0.0.0.0", "::") else "127.0.0.1"
+        self.address = f"http://{shown}:{found}/?token={self._guard.token}"
+        self._driver: int | None = None
+        self._steer = np.zeros(3)
+        self._history: deque[tuple[float, ...]] = deque(maxlen=round(SECONDS / session.period))
+        self._frame: Frame | None = None
+        self._serializer: Any = None
+        self._server.gui.configure_theme(show_logo=False, show_share_button=False, control_width="medium")
+        self._server.gui.set_panel_label(f"quadsim live: {session.scenario.name}")
+        self.stage = Stage(self._server.scene, session)
+        self._fields: dict[str, tuple[Knob, list[Any]]] = {}
+        self._build()
+        self._server.on_client_connect(self._connected)
+        self._server.on_client_disconnect(self._left)
+
+    def close(self) -> None:
+        """Stop serving."""
+        self._server.stop()
+
+    # What the thread that flies calls
+
+    def show(self, frame: Frame, factor: float) -> None:
+        """See `scenarios.live.pacing.View`."""
+        self._frame = frame
+        self._remember(frame)
+        for said in frame.refused:
+            self._tell(f"refused: {said}")
+        with self._server.atomic():
+            self.stage.show(frame)
+            if frame.k % _EVERY == 0 or self._pace.paused:
+                self._status.content = self._told(frame, factor)
+                self._margins.content = _bars(
+                    self._session.limits, frame, self._session.flights[-1].loop.controller.name
+                )
+                self._plot()
+
+    def move(self, frame: Frame, share: float) -> None:
+        """See `scenarios.live.pacing.View`."""
+        with self._server.atomic():
+            at = self.stage.move(frame, share)
+            if self._follow.value:
+                for client in self._server.get_clients().values():
+                    camera = client.camera
+                    away = np.asarray(camera.position) - camera.look_at
+                    camera.look_at = at
+                    camera.position = at + away
+        self._server.flush()
+
+    def ended(self, reason: str | None) -> None:
+        """See `scenarios.live.pacing.View`."""
+        if reason is None:
+            self._history.clear()
+            self.stage.reset()
+            self._steer[:] = 0.0
+            for slider in self._rest:
+                slider.value = 0.0
+        else:
+            self._status.content = (
+                f'{STYLE}<div class="q bad">{escape(reason)}. Reset begins anew; Save keeps it.</div>'
+            )
+
+    # What is on the page
+
+    def _build(self) -> None:
+        gui = self._server.gui
+        self._status = gui.add_html(f'{STYLE}<div class="q">starting</div>')
+        self._margins = gui.add_html("")
+        self._rest: list[Any] = []
+        with gui.add_folder("Run"):
+            run = {"Pause": self._toggle, "Step": self._step, "Reset": self._reset}
+            self._group("Flight", run)
+            speed = gui.add_dropdown("Speed", _SPEEDS, initial_value="1", hint="simulated over real time")
+            self._on(speed.on_update, lambda event: setattr(self._pace, "speed", float(event.target.value)))
+            self._follow = gui.add_checkbox("Camera follows", True)
+            self._group("Keep", {"Save": self._save_now, "Scenario": self._download, "Scene": self._scene})
+        tabs = gui.add_tab_group()
+        with tabs.add_tab("Push"):
+            self._pushes()
+        with tabs.add_tab("Target"):
+            self._targets()
+        with tabs.add_tab("Controller"):
+            self._knobs_folder = gui.add_folder("Fields")
+            self._controller_tab()
+        with tabs.add_tab("Plots"):
+            x, zero = np.array([0.0, 1.0]), np.zeros(2)
+            self._plots = [
+                gui.add_uplot(
+                    (x, *([zero] * len(names))),
+                    ({"label": "t [s]"}, *({"label": n, "stroke": c} for n, c in zip(names, LINES, strict=False))),
+                    scales={"x": {"time": False}},
+                    aspect=1.9,
+                    title=title,
+                )
+                for title, names in (
+                    ("Position error [m]", ("x", "y", "z")),
+                    ("Tilt and yaw error [deg]", ("tilt", "yaw")),
+                    ("Rotor speeds [rad/s]", ("1", "2", "3", "4")),
+                    ("Step [ms]", ("step",)),
+                )
+            ]
+
+    def _pushes(self) -> None:
+        gui, session = self._server.gui, self._session
+        gui.add_markdown("Drag the vehicle with the mouse to pull it.")
+
+        async def pulled(event: Any) -> None:
+            if event.client is None or not self._drives(event.client):
+                return
+            to = None if event.phase == "end" else [float(each) for each in event.end_position]
+            session.submit({"type": "pull"} if to is None else {"type": "pull", "to": to}, subject="pull")
+
+        self.stage.grab.on_drag("left")(pulled)
+        wind = gui.add_vector2("Wind x, y [m/s]", (0.0, 0.0), min=(-12.0, -12.0), max=(12.0, 12.0), step=0.5)
+        self._on(
+            wind.on_update,
+            lambda event: session.submit(
+                {"type": "wind", "velocity": [*map(float, event.target.value), 0.0]}, subject="wind"
+            ),
+        )
+        gust = gui.add_vector2("Gust x, y [m/s]", (6.0, 0.0), min=(-15.0, -15.0), max=(15.0, 15.0), step=0.5)
+        self._button(
+            "Gust",
+            lambda event: session.submit(
+                {"type": "gust", "velocity": [*map(float, gust.value), 0.0], "duration": 1.0}, subject="gust"
+            ),
+        )
+        mass = session.flights[0].vehicle.mass
+        load = gui.add_number("Payload [kg]", round(0.1 * mass, 4), min=0.0, max=mass, step=round(0.01 * mass, 5))
+        self._button(
+            "Take payload", lambda event: session.submit({"type": "payload_pickup", "mass": float(load.value)})
+        )
+        self._button("Drop payload", lambda event: session.submit({"type": "payload_drop"}))
+        factor = gui.add_slider("Mass factor", 0.7, 1.5, 0.01, 1.0)
+        self._on(
+            factor.on_update,
+            lambda event: session.submit({"type": "mass", "factor": float(event.target.value)}, subject="mass"),
+        )
+        lag = gui.add_slider("Rotor lag [ms]", 0, 100, 5, 0)
+        self._on(
+            lag.on_update,
+            lambda event: session.submit({"type": "rotor_lag", "rise": float(event.target.value) / 1e3}, subject="lag"),
+        )
+        for rotor in range(1, N_ROTORS + 1):
+            wear = gui.add_slider(f"Rotor {rotor} loss", 0.0, 1.0, 0.05, 0.0)
+            self._rest.append(wear)
+            self._on(wear.on_update, partial(self._wear, rotor))
+        sensor = gui.add_dropdown("Sensor", ("position", "velocity", "attitude", "rates"))
+        fault = gui.add_dropdown("Fault", _FAULTS)
+        self._button(
+            "Fail sensor for 1 s",
+            lambda event: session.submit(
+                {"type": "sensor_fault", "sensor": sensor.value, "fault": fault.value, "duration": 1.0}
+            ),
+        )
+        late = gui.add_number("Late commands [ms]", 200, min=10, max=5000, step=10)
+        self._button(
+            "Stall the computer", lambda event: session.submit({"type": "stall", "duration": float(late.value) / 1e3})
+        )
+
+    def _wear(self, rotor: int, event: Any) -> None:
+        loss = float(event.target.value)
+        self._session.submit({"type": "wear", "rotor": rotor, "loss": loss}, subject=f"wear {rotor}")
+
+    def _targets(self) -> None:
+        gui, session = self._server.gui, self._session
+        unit = self.stage.unit
+        gui.add_markdown(
+            "Drag the arrows beside the vehicle's goal, or type. Keys W, S, A, D, R, F fly the set-point along x, y "
+            "and z; X stops it."
+        )
+        here = np.asarray(session.flights[0].loop.course.row(0)[:3])
+        self._handle = self._server.scene.add_transform_controls(
+            "/target", scale=3.0 * unit, position=here, disable_rotations=True, disable_sliders=True
+        )
+        place = gui.add_vector3("Set-point [m]", tuple(map(float, here)), step=0.1)
+
+        async def dragged(event: Any) -> None:
+            if event.client is not None and self._drives(event.client):
+                at = [round(float(each), 2) for each in event.target.position]
+                place.value = tuple(at)
+                self._set_point(at)
+
+        self._handle.on_update(dragged)
+
+        def typed(event: Any) -> None:
+            at = [float(each) for each in event.target.value]
+            self._handle.position = np.array(at)
+            self._set_point(at)
+
+        self._on(place.on_update, typed)
+        yaw = gui.add_slider("Yaw [deg]", -180, 180, 5, 0)
+        self._on(
+            yaw.on_update,
+            lambda event: session.submit({"type": "setpoint", "yaw": float(event.target.value)}, subject="yaw"),
+        )
+        self._steered = gui.add_text("Set-point velocity [m/s]", "0, 0, 0", disabled=True)
+        for key, direction in _STEER.items():
+            command = gui.add_command(
+                f"Fly {'+' if sum(direction) > 0 else '-'}{'xyz'[np.abs(direction).argmax()]}", hotkey=key
+            )
+            self._on(command.on_trigger, partial(self._fly_on, direction))
+        self._on(gui.add_command("Stop the set-point", hotkey="X").on_trigger, lambda event: self._fly(np.zeros(3)))
+        self._button("Stop set-point", lambda event: self._fly(np.zeros(3)))
+
+    def _set_point(self, at: list[float]) -> None:
+        self._fly(np.zeros(3))
+        self._session.submit({"type": "setpoint", **dict(zip("xyz", at, strict=True))}, subject="setpoint")
+
+    def _fly_on(self, direction: tuple[int, int, int], event: Any) -> None:
+        self._fly(self._steer + _STEER_STEP * np.array(direction))
+
+    def _fly(self, velocity: Any) -> None:
+        self._steer = np.clip(velocity, -_STEER_MOST, _STEER_MOST)
+        self._steered.value = ", ".join(f"{each:g}" for each in self._steer)
+        self._session.submit({"type": "steer", "velocity": self._steer.tolist()}, subject="steer")
+
+    def _controller_tab(self) -> None:
+        gui = self._server.gui
+        names = ["as started", *self._others]
+        chosen = gui.add_dropdown("Controller", names)
+        self._said = gui.add_html("")
+        self._button("Take this controller", lambda event: self._take(chosen.value))
+        self._show_knobs(self._session.scenario.controller)
+
+    def _show_knobs(self, spec: ControllerSpec) -> None:
+        for _, handles in self._fields.values():
+            for handle in handles:
+                handle.remove()
+        self._fields.clear()
+        with self._knobs_folder:
+            for knob in knobs(spec):
+                handles = self._inputs(knob)
+                self._fields[knob.path] = knob, handles
+                for handle in handles:
+                    self._on_later(handle.on_update, partial(self._turn, knob.path))
+
+    def _inputs(self, knob: Knob) -> list[Any]:
+        """The widgets of a field: two for a pair."""
+        gui, value = self._server.gui, knob.value
+        if isinstance(value, bool):
+            return [gui.add_checkbox(knob.path, value, hint=knob.about)]
+        if isinstance(value, str):
+            return [gui.add_dropdown(knob.path, knob.choices, initial_value=value, hint=knob.about)]
+        if isinstance(value, tuple):
+            limits = {"min": knob.minimum, "max": knob.maximum, "hint": knob.about}
+            names = (f"{knob.path} lower", f"{knob.path} upper")
+            return [gui.add_number(name, each, **limits) for name, each in zip(names, value, strict=True)]
+        step = 1 if isinstance(value, int) else None
+        return [gui.add_number(knob.path, value, min=knob.minimum, max=knob.maximum, step=step, hint=knob.about)]
+
+    async def _turn(self, path: str, event: Any) -> None:
+        _, handles = self._fields[path]
+        value: Value | list[Any] = handles[0].value if len(handles) == 1 else [each.value for each in handles]
+        await self._replace({path: value}, f"{path} = {value}")
+
+    async def _take_over(self, spec: ControllerSpec, name: str) -> None:
+        if await self._replace(spec.model_dump(mode="json", exclude_none=True), name):
+            self._show_knobs(spec)
+
+    def _take(self, name: str) -> Any:
+        spec = self._session.scenario.controller if name == "as started" else self._others[name]
+        return self._take_over(spec, name)
+
+    async def _replace(self, fields: Mapping[str, Any], what: str) -> bool:
+        """Build a controller beside the flight and let it take over; where it cannot be built, say why."""
+        flight = self._session.flights[0]
+        try:
+            successor = await asyncio.to_thread(flight.successor, fields)
+        except InputError as error:
+            self._said.content = (
+                f'{STYLE}<div class="q bad">refused, the controller before flies on: {escape(str(error))}</div>'
+            )
+            return False
+        self._session.submit({"type": "controller", "fields": dict(fields)}, successor=successor)
+        self._said.content = f'{STYLE}<div class="q">in force: {escape(what)}</div>'
+        return True
+
+    # Buttons
+
+    def _toggle(self, event: Any) -> None:
+        self._pace.pause(not self._pace.paused)
+
+    def _step(self, event: Any) -> None:
+        if not self._pace.paused:
+            self._toggle(event)
+        self._pace.single()
+
+    def _reset(self, event: Any) -> None:
+        def anew(session: Session) -> None:
+            session.reset()
+            self.ended(None)
+
+        self._pace.order(anew)
+
+    def _save_now(self, event: Any) -> None:
+        client = event.client
+
+        def keep(session: Session) -> None:
+            try:
+                said = f"saved: {self._save(session)}"
+            except (InputError, OutputError) as error:
+                said = f"not saved: {error}"
+            client.add_notification("Save", said)
+
+        self._pace.order(keep)
+
+    def _download(self, event: Any) -> None:
+        client = event.client
+
+        def send(session: Session) -> None:
+            if session.k:
+                text = session.flight().scenario.to_toml()
+                client.send_file_download(f"{session.scenario.name}.toml", text.encode(), save_immediately=True)
+
+        self._pace.order(send)
+
+    def _scene(self, event: Any) -> None:
+        html = self._server.scene.as_html()
+        event.client.send_file_download(f"{self._session.scenario.name}.html", html.encode(), save_immediately=True)
+
+    # Who drives
+
+    async def _connected(self, client: Any) -> None:
+        if self._driver is None:
+            self._driver = client.client_id
+        unit, at = self.stage.unit, np.asarray(self.stage.frames[0].position)
+        client.camera.position = at + unit * np.array([-6.0, -9.0, 5.0])
+        client.camera.look_at = at
+        take = client.gui.add_button("Take the controls", visible=self._driver != client.client_id)
+
+        async def taken(event: Any) -> None:
+            self._let_go()
+            self._driver = client.client_id
+            take.visible = False
+
+        take.on_click(taken)
+
+    async def _left(self, client: Any) -> None:
+        if self._driver == client.client_id:
+            self._let_go()
+            rest = [each for each in self._server.get_clients() if each != client.client_id]
+            self._driver = min(rest, default=None)
+
+    def _let_go(self) -> None:
+        """Nobody holds the vehicle, or flies the set-point, any more."""
+        self._session.submit({"type": "pull"}, subject="pull")
+        self._fly(np.zeros(3))
+
+    def _drives(self, client: Any) -> bool:
+        if client.client_id == self._driver:
+            return True
+        client.add_notification("You watch", "Another page has the controls: Take the controls changes that.")
+        return False
+
+    def _button(self, label: str, act: Callable[[Any], Any]) -> Any:
+        button = self._server.gui.add_button(label)
+        self._on_later(button.on_click, act)
+        return button
+
+    def _group(self, label: str, acts: Mapping[str, Callable[[Any], Any]]) -> None:
+        """Buttons in a row."""
+        buttons = self._server.gui.add_button_group(label, tuple(acts))
+        self._on_later(buttons.on_click, lambda event: acts[event.target.value](event))
+
+    def _on(self, register: Callable[[Any], Any], act: Callable[[Any], None]) -> None:
+        """Call for what the driving client does; not for what Python sets, which has no client."""
+
+        async def called(event: Any) -> None:
+            if event.client is not None and self._drives(event.client):
+                act(event)
+
+        register(called)
+
+    def _on_later(self, register: Callable[[Any], Any], act: Callable[[Any], Awaitable[Any] | None]) -> None:
+        """The same of what may take a while, and is awaited."""
+
+        async def called(event: Any) -> None:
+            if event.client is not None and self._drives(event.client):
+                found = act(event)
+                if found is not None and hasattr(found, "__await__"):
+                    await found
+
+        register(called)
+
+    def _tell(self, text: str) -> None:
+        for client in self._server.get_clients().values():
+            client.add_notification("quadsim", text)
+
+    # Numbers
+
+    def _remember(self, frame: Frame) -> None:
+        sample = frame.samples[0]
+        if sample is None:
+            return
+        observed, physics = sample.observation, sample.segment.physics[-1]
+        error = observed.truth[[0, 2, 4]] - observed.reference[:3]
+        yaw = quaternion_to_euler(physics[None, 4:8])[0, 2] - observed.reference[3]
+        up = 1.0 - 2.0 * (physics[5] ** 2 + physics[6] ** 2)
+        tilt = math.degrees(math.acos(min(1.0, max(-1.0, up))))
+        yaw = math.degrees(math.remainder(yaw, 2.0 * math.pi))
+        self._history.append((frame.time, *error, tilt, yaw, *sample.speeds, 1e3 * sample.step_s))
+
+    def _plot(self) -> None:
+        if len(self._history) < 2:
+            return
+        table = np.array(self._history).T
+        first = 1
+        for plot, count in zip(self._plots, (3, 2, 4, 1), strict=True):
+            plot.data = (table[0], *table[first : first + count])
+            first += count
+
+    def _told(self, frame: Frame, factor: float) -> str:
+        sample = frame.samples[0]
+        if sample is None:
+            return str(self._status.content)
+        command, deadline = sample.command, 1e3 * self._session.period
+        step = 1e3 * sample.step_s
+        worst = self._history[-1] if self._history else (0.0,) * 11
+        mark = "" if command.status in ACCEPTED else ' class="bad"'
+        back = "" if command.fallback == 0 else f' <span class="bad">fallback {command.fallback}</span>'
+        rows = [
+            f"<b>{frame.time:.2f} s</b> &times; {factor:.2f} of real time, "
+            f"{'paused' if self._pace.paused else escape(sample.phase.value)}",
+            f"<span{mark}>{escape(command.status)}</span>{back}, {command.active} active, "
+            f"step <b>{step:.2f}</b> of {deadline:g} ms"
+            + (' <span class="bad">missed</span>' if sample.missed else ""),
+            f"tilt <b>{worst[4]:.1f}</b> deg, error <b>{np.linalg.norm(worst[1:4]):.2f}</b> m, pull "
+            f"<b>{np.linalg.norm(frame.pull):.1f}</b> N",
+        ]
+        return f'{STYLE}<div class="q">' + "<br>".join(rows) + "</div>"
+
+
+def _bars(limits: tuple[Limit, ...], frame: Frame, other: str) -> str:
+    """Margins as bars: full is the middle of the bounds, empty is at the bound, red is beyond."""
+    rows = []
+    for limit in limits:
+        values = [margins.get(limit.name, math.nan) for margins in frame.margins]
+        for i, margin in enumerate(values):
+            if math.isnan(margin):
+                continue
+            scale = 0.5 * (limit.upper - limit.lower)
+            if not math.isfinite(scale):
+                bound = limit.upper if math.isfinite(limit.upper) else limit.lower
+                scale = abs(bound) or 1.0
+            share = min(1.0, abs(margin) / scale)
+            red = margin < -limit.tolerance
+            colour = BOUND if red else LINES[2] if i == 0 else LINES[4]
+            fill = f'<div class="f" style="width:{100.0 * share:.0f}%;background:{colour}"></div>'
+            name = escape(limit.name if i == 0 else f"{limit.name}, {other}")
+            number = f'<td class="n{" bad" if red else ""}">{margin:+.3g} {escape(limit.unit)}</td>'
+            rows.append(f'<tr><td>{name}</td><td class="t"><div class="r">{fill}</div></td>{number}</tr>')
+    return f'<div class="q"><table>{"".join(rows)}</table></div>' if rows else ""

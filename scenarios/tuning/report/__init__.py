@@ -1,0 +1,1 @@
+"""What a person looks at of a tuning: tables, figure, plots and page."""

@@ -1,0 +1,133 @@
+"""The tuning file: a campaign, the fields that are searched, what is to be small, and which failures are too many."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Final, Literal
+
+import tomlkit
+from annotated_types import MaxLen, MinLen
+from pydantic import Field, model_validator
+
+from quadsim.errors import InputError
+from scenarios.campaign.results.events import parse_event
+from scenarios.campaign.spec import (
+    MOST_FLIGHTS,
+    CampaignSpec,
+    ChoiceSpec,
+    IntegerSpec,
+    LogUniformSpec,
+    UniformSpec,
+    check_fields,
+)
+from scenarios.campaign.statistics.requirement import parse_requirement
+from scenarios.schema.base import LARGEST_SEED, Spec
+from scenarios.schema.writing import to_toml
+from scenarios.tuning.objective import parse_expression
+
+MOST_TRIALS: Final = 100_000
+MOST_FIELDS: Final = 50
+OWN: Final = ("flights", "seed", "name", "description")
+"""Fields of a campaign that a tuning has itself."""
+Seed = Annotated[int, Field(ge=0, le=LARGEST_SEED)]
+SearchSpec = Annotated[UniformSpec | LogUniformSpec | IntegerSpec | ChoiceSpec, Field(discriminator="distribution")]
+
+
+class ObjectiveSpec(Spec):
+    """A number that is to be small."""
+
+    name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]*$", max_length=60)] = Field(
+        description="letters, digits, _ and -"
+    )
+    expression: Annotated[str, Field(max_length=500)] = Field(
+        description="of a flight: columns of a campaign's results, numbers, + - * / **, sqrt, abs, min, max; minus it "
+        "where more is better"
+    )
+    unit: Annotated[str, Field(max_length=20)] = Field(default="-", description="of it, for tables and plots")
+    statistic: Literal["mean", "median", "max"] = Field(
+        default="mean", description="of the flights that were completed: their mean, median or max"
+    )
+
+    @model_validator(mode="after")
+    def _check(self) -> ObjectiveSpec:
+        try:
+            parse_expression(self.expression)
+        except InputError as error:
+            raise ValueError(f"expression {error}") from error
+        return self
+
+
+class FreshSpec(Spec):
+    """The draws, new to both, on which the answer is held against the start."""
+
+    flights: Annotated[int, Field(ge=2, le=MOST_FLIGHTS)] = Field(default=300, description="of each of the two")
+    seed: Seed = Field(default=1, description="of these draws; not that of the search")
+
+
+class TuningSpec(Spec):
+    """A search for better values of a scenario's fields."""
+
+    name: Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9._-]*$", max_length=60)] = Field(
+        description="letters a-z, digits and . _ -; names the tuning's directory"
+    )
+    description: str = Field(default="", description="one line")
+    seed: Seed = Field(default=0, description="of the draws that all candidates meet, and of the search")
+    trials: Annotated[int, Field(ge=1, le=MOST_TRIALS)] = Field(
+        description="candidates besides the start; a multiple of batch"
+    )
+    batch: Annotated[int, Field(ge=1, le=1000)] = Field(default=12, description="candidates that are proposed at once")
+    flights: Annotated[list[Annotated[int, Field(ge=1, le=MOST_FLIGHTS)]], MinLen(1), MaxLen(10)] = Field(
+        default=[4, 12, 36],
+        description="rising: every candidate of a batch flies the first number of draws, the best of them go on to the "
+        "next, as many as cost about the same again",
+    )
+    require: str = Field(
+        description='what no answer may fail, e.g. "P(violation) < 0.01 @ 95%": in the search by the share of flights, '
+        "on fresh draws with that confidence"
+    )
+    guard: str | None = Field(
+        default=None,
+        description='an event that counts instead of that of require in the search, e.g. "worst_margin < 0.02": few '
+        "flights see near misses before they see failures",
+    )
+    fresh: FreshSpec = FreshSpec()
+    objectives: Annotated[list[ObjectiveSpec], MinLen(1), MaxLen(2)] = Field(
+        description="one, or two for a Pareto front"
+    )
+    search: Annotated[list[SearchSpec], MinLen(1), MaxLen(MOST_FIELDS)] = Field(description="what is searched")
+    campaign: CampaignSpec = Field(description="what is flown: fields of a campaign file, or a campaign as its base")
+
+    @model_validator(mode="after")
+    def _check(self) -> TuningSpec:
+        if self.trials % self.batch:
+            raise ValueError(f"trials must be a multiple of batch, {self.batch}; got {self.trials}")
+        if any(after <= before for before, after in zip(self.flights, self.flights[1:], strict=False)):
+            raise ValueError(f"flights must rise; got {self.flights}")
+        if self.fresh.seed == self.seed:
+            raise ValueError(f"fresh.seed must not be seed, {self.seed}, whose draws choose the answer")
+        for what, entries in (("objectives", self.objectives), ("search", self.search)):
+            names = [entry.name for entry in entries]
+            if len(set(names)) < len(names):
+                raise ValueError(f"{what} must have distinct names; got {names}")
+        for entry in self.search:
+            if isinstance(entry, ChoiceSpec) and entry.weights is not None:
+                raise ValueError(f"search.{entry.name}.weights must be absent: nothing is drawn")
+        check_fields(self.search, "search", {field: each.name for each in self.campaign.vary for field in each.fields})
+        try:
+            asked = parse_requirement(self.require)
+        except InputError as error:
+            raise ValueError(f"require: {error}") from error
+        try:
+            parse_event(self.guard or asked.event.text)
+        except InputError as error:
+            raise ValueError(f"guard: {error}") from error
+        if not asked.at_most:
+            raise ValueError(f"require must keep a probability small, with < or <=; got {self.require!r}")
+        return self
+
+    def to_toml(self) -> str:
+        """The file with every field, defaults included; reading it gives this tuning again."""
+        document: Any = tomlkit.parse(to_toml(self))
+        for name in OWN:
+            document["campaign"].remove(name)
+        text: str = document.as_string()
+        return text

@@ -1,0 +1,125 @@
+"""The safety filter's QP: the nearest command, found by another solver too, whose plan keeps every bound for ever."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from support import paper_problem
+
+from mpc.constraints import Bounds
+from mpc.ocp import Objective
+from mpc.paper.condensed import Condensed
+from mpc.robust.controller import RobustMPC, RobustSettings
+from mpc.robust.filter import STANDING, SafetyFilter
+from mpc.solvers import make_backend
+from quadsim.controller import UNCONSTRAINED, Command, Moment
+from quadsim.state import INDEX, Array
+from scenarios.loading import load_scenario
+from scenarios.parts.vehicle import build_vehicle
+
+HORIZON, PERIOD = 40, 0.05
+VEHICLE = build_vehicle(load_scenario("paper-constrained"))
+HOVER = np.full(4, VEHICLE.hover_speed)
+
+
+def bounds() -> Bounds:
+    found = paper_problem().bounds
+    assert found is not None
+    return replace(found, delta_min=np.full(4, -10.0), delta_max=np.full(4, 10.0))
+
+
+def objective() -> Objective:
+    return paper_problem().objective
+
+
+def make_filter() -> SafetyFilter:
+    mpc = RobustMPC(
+        VEHICLE,
+        period=PERIOD,
+        horizon=HORIZON,
+        objective=objective(),
+        bounds=bounds(),
+        settings=RobustSettings(heading=True),
+    )
+    return SafetyFilter(mpc)
+
+
+def asked(filter_: SafetyFilter, state: Array, wanted: Array, acting: Array = HOVER) -> Command:
+    filter_.reset(acting)
+    filter_.wanted = wanted
+    return filter_.step(Moment(acting=acting), state, np.zeros((HORIZON, 4)))
+
+
+def tilted(roll: float, rate: float, yaw: float = 0.0) -> Array:
+    state = np.zeros(12)
+    state[[INDEX["roll"], INDEX["roll_rate"], INDEX["yaw"]]] = np.radians([roll, rate, yaw])
+    return state
+
+
+def test_a_safe_command_passes() -> None:
+    wanted = HOVER + np.array([1.0, -2.0, 1.0, -2.0])
+    command = asked(make_filter(), np.zeros(12), wanted)
+    assert command.status == UNCONSTRAINED
+    assert np.array_equal(command.speeds, wanted)
+
+
+@pytest.mark.parametrize("yaw", [0.0, 140.0])
+@pytest.mark.parametrize("wanted", [[10.0, 10.0, -10.0, -10.0], [-10.0, 10.0, 10.0, -10.0]])
+def test_an_unsafe_one_becomes_the_nearest_whose_plan_keeps_the_bounds(wanted: list[float], yaw: float) -> None:
+    state = tilted(4.0, 10.0, yaw)
+    filter_ = make_filter()
+    command = asked(filter_, state, HOVER + wanted)
+    assert command.status == "solved"
+    assert np.abs(command.speeds - HOVER - wanted).max() > 0.1
+    # The prediction of its plan keeps 5 deg, and stands still at the end.
+    model, x = filter_.problem.model, state.copy()
+    x[INDEX["yaw"]] = 0.0
+    for speeds in command.plan:
+        x = model.A @ x + model.B @ (speeds - HOVER)
+        assert np.abs(np.degrees(x[[INDEX["roll"], INDEX["pitch"]]])).max() < 5.0 + 1e-4
+    assert np.abs(x[[INDEX["roll_rate"], INDEX["pitch_rate"]]]).max() < 1.01 * STANDING / PERIOD
+    steps = np.diff(command.plan, axis=0, prepend=HOVER[None])
+    assert np.abs(steps).max() < 10.0 + 1e-6
+    # Another form of the QP, and another solver of it.
+    form = Condensed(filter_.problem)
+    P = np.array(form.qp.P)
+    P[:4, :4] += 2.0 * np.eye(4)
+    level = state.copy()
+    level[INDEX["yaw"]] = 0.0
+    vectors = form.vectors(level, np.zeros((HORIZON, 4)), HOVER)
+    vectors.c[:4] -= 2.0 * (HOVER + wanted)
+    backend = make_backend("piqp-dense")
+    backend.setup(replace(form.qp.with_vectors(vectors), P=np.asfortranarray(P)))
+    other = form.inputs(backend.solve(vectors).x)[0]
+    assert command.speeds == pytest.approx(other, abs=1e-3)
+    # No command that is nearer can be kept: moving on towards what was wanted breaks a bound of the prediction.
+    assert np.linalg.norm(command.speeds - HOVER - wanted) > 0.1
+
+
+def test_the_plan_of_one_period_is_one_of_the_next() -> None:
+    """Without disturbances a filter that was feasible stays so, whatever is wanted."""
+    filter_, rng, state, acting = make_filter(), np.random.default_rng(0), np.zeros(12), HOVER
+    model = filter_.problem.model
+    filter_.reset(acting)
+    for k in range(60):
+        filter_.wanted = HOVER + rng.uniform(-40.0, 40.0, 4)
+        command = filter_.step(Moment(time=k * PERIOD, acting=acting), state, np.zeros((HORIZON, 4)))
+        assert command.status in ("solved", UNCONSTRAINED)
+        assert command.slack < 1e-6
+        acting, yaw = command.speeds, state[INDEX["yaw"]]
+        turned = state.copy()
+        turned[INDEX["yaw"]] = 0.0
+        state = model.A @ turned + model.B @ (acting - HOVER)
+        state[INDEX["yaw"]] += yaw
+        assert np.abs(state[[INDEX["roll"], INDEX["pitch"]]]).max() < math.radians(5.0) + 1e-6
+
+
+def test_numbers_out_of_hand_are_refused() -> None:
+    state = np.zeros(12)
+    state[0] = np.nan
+    command = asked(make_filter(), state, HOVER)
+    assert command.status == "invalid_data"
+    assert np.array_equal(command.speeds, HOVER)

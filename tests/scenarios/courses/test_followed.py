@@ -1,0 +1,73 @@
+"""The reference as it is followed, against the filter of the whole course and of the set-points that leave it."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from quadsim.state import Array
+from scenarios.courses.feasibility_check import report
+from scenarios.courses.followed import FollowedCourse
+from scenarios.courses.make import build_course, build_course_steps, build_reference, follow_course
+from scenarios.loading import load_scenario
+from scenarios.parts.vehicle import build_vehicle
+from scenarios.schema.scenario import Scenario
+
+SAMPLES = 700
+
+
+def rows(followed: FollowedCourse, count: int = SAMPLES) -> Array:
+    return np.array([followed.row(k) for k in range(count)])
+
+
+@pytest.mark.parametrize("name", ["paper-constrained", "figure-eight", "csv-trefoil", "minimum-snap", "nonlinear"])
+def test_without_set_points_it_is_the_filtered_course(name: str) -> None:
+    scenario = load_scenario(name)
+    followed = follow_course(scenario)
+    np.testing.assert_array_equal(rows(followed), build_reference(scenario, SAMPLES))
+    np.testing.assert_array_equal(followed.preview(10, 50), build_reference(scenario, SAMPLES)[11:61])
+
+
+def test_a_set_point_runs_the_filter_on_from_its_row() -> None:
+    scenario = load_scenario("paper-constrained")
+    course, tau_r, tau_s = build_course(scenario), scenario.reference.response_time, scenario.control_period
+    keep = math.exp(-3.0 * tau_s / tau_r)
+    followed = follow_course(scenario)
+    before = build_reference(scenario, SAMPLES)
+    preview = followed.preview(100, 50)
+    followed.set(100, {"x": 2.0})
+    followed.set(300, {"yaw": -1.0, "x": 0.5})
+    found = rows(followed)
+    expected = course.sample(tau_s * np.arange(SAMPLES))
+    expected[101:, 0], expected[301:, 0], expected[301:, 3] = 2.0, 0.5, -1.0
+    last = course.initial
+    for k, sample in enumerate(expected):
+        expected[k] = last = sample + keep * (last - sample)
+    np.testing.assert_array_equal(found, expected)
+    np.testing.assert_array_equal(found[:101], before[:101])  # what was in force stays
+    np.testing.assert_array_equal(found[:, 1:3], before[:, 1:3])  # the other axes stay on the course
+    np.testing.assert_array_equal(preview, before[101:151])  # what was known then
+    assert (followed.preview(300, 3)[:, 0] == found[301:304, 0]).all()
+
+
+def test_without_a_response_time_a_set_point_is_reached_at_once() -> None:
+    followed = follow_course(load_scenario("hover", ["reference.response_time=0.0"]))
+    before = followed.row(0)[2]
+    followed.set(5, {"z": 3.0})
+    assert rows(followed, 10)[:, 2].tolist() == [before] * 6 + [3.0] * 4
+
+
+def with_setpoint(at: float) -> Scenario:
+    return load_scenario("paper-constrained", [f"events=[{{type='setpoint', at={at}, x=0.1}}]"])
+
+
+def test_what_is_reported_of_a_course_is_what_was_followed_of_it() -> None:
+    plain = load_scenario("paper-constrained")
+    assert {step.channel for step in build_course_steps(plain)} == {"x", "y", "z", "yaw"}
+    assert {step.channel for step in build_course_steps(with_setpoint(5.0))} == {"y", "z", "yaw"}
+    vehicle = build_vehicle(plain)
+    whole, nearly = report(plain, vehicle), report(with_setpoint(59.9), vehicle)
+    assert nearly.tilt == whole.tilt
+    assert report(with_setpoint(0.05), vehicle).tilt < 0.1 * whole.tilt

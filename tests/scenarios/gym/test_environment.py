@@ -1,0 +1,301 @@
+"""Environments: the field's conventions, honest constraint information, and the bytes of `quadsim run`."""
+
+from __future__ import annotations
+
+import itertools
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.error import ResetNeeded
+from gymnasium.utils.env_checker import check_env
+from gymnasium.vector import AutoresetMode
+
+import quadsim
+import quadsim.gym
+from quadsim.errors import InputError, ParameterError, RenderingUnavailableError, UnknownNameError
+from quadsim.report.film.video import rendering_backend
+from quadsim.state import INDEX
+from scenarios.campaign.plan import load_plan
+from scenarios.gym import environment
+from scenarios.shipped import scenario_names
+
+HOVER = np.zeros(4, np.float32)
+
+
+def short(name: str, duration: float = 1.0, **changes: Any) -> quadsim.Scenario:
+    return quadsim.load(name).replace({"duration": duration, **changes})
+
+
+def flown(env: gymnasium.Env[Any, Any], seed: int | None = None) -> list[dict[str, Any]]:
+    """An episode of the scenario's own controller: `info` of the start and of each step."""
+    _, info = env.reset(seed=seed)
+    told, ended = [info], False
+    while not ended:
+        observed, reward, terminated, truncated, info = env.step(env.unwrapped.controller_action())
+        assert observed in env.observation_space
+        assert 0.0 < reward <= 1.0
+        told.append(info)
+        ended = terminated or truncated
+    return told
+
+
+def test_every_scenario_of_the_library_has_an_id_and_its_duration() -> None:
+    specs = {name: gymnasium.spec(quadsim.gym.environment_id(name)) for name in scenario_names()}
+    assert specs["hummingbird-figure-eight"].id == "quadsim/HummingbirdFigureEight-v0"
+    assert len({spec.id for spec in specs.values()}) == len(specs)
+    for name in ("paper-constrained", "robust-lag50", "torrente-loop8-all"):
+        assert specs[name].max_episode_steps == quadsim.load(name).periods
+
+
+def drawing_works() -> bool:
+    try:
+        rendering_backend()
+    except RenderingUnavailableError:
+        return False
+    return True
+
+
+@pytest.mark.parametrize("action", ["deviations", "rates"])
+def test_the_checker_finds_nothing(action: str) -> None:
+    env = quadsim.gym.make_env("motion-capture", action=action, width=64, height=48)
+    check_env(env.unwrapped, skip_render_check=action == "rates" or not drawing_works())
+
+
+def test_raw_speeds_are_float64_within_the_controllers_bounds() -> None:
+    env = quadsim.gym.make_env("paper-constrained", action="speeds")
+    assert env.action_space.dtype == np.float64
+    assert env.action_space.low.tolist() == [0.0] * 4
+    assert env.action_space.high.tolist() == [250.0] * 4
+    free = quadsim.gym.make_env("torrente-loop4-drag", action="speeds").unwrapped
+    vehicle = quadsim.load_vehicle(free.scenario.vehicle.file)
+    assert free.action_space.high.tolist() == [vehicle.speed_max] * 4
+
+
+@pytest.mark.parametrize(
+    ("name", "action"),
+    [("motion-capture", "deviations"), ("late-commands", "speeds"), ("torrente-loop4-drag", "speeds")],
+)
+def test_an_episode_of_the_own_controller_has_the_bytes_of_a_run(name: str, action: str, tmp_path: Path) -> None:
+    scenario = short(name)
+    flight = quadsim.fly(scenario.replace({"seed": 7}), progress=False)
+    flight.save(tmp_path / "run", video=False, recording=False, figures=False)
+    env = quadsim.gym.make_env(scenario, action=action)
+    told = flown(env, seed=7)
+    env.unwrapped.flight().save(tmp_path / "episode", video=False, recording=False, figures=False)
+    for file in ("flight.parquet", "plant.parquet"):
+        assert (tmp_path / "run" / file).read_bytes() == (tmp_path / "episode" / file).read_bytes()
+    for i, finding in enumerate(flight.audit):
+        worst = min(info["margins"][finding.limit.name] for info in told)
+        assert worst == -max(info["constraint_values"][i] for info in told)
+        assert worst == pytest.approx(finding.worst_margin, abs=1e-9) or not finding.limit.holds_at(flight.time).any()
+
+
+def test_margins_see_a_violation_that_samples_miss() -> None:
+    """The paper's controller bounds samples of a linear model, and is beyond 5 deg of roll between some of them."""
+    env = quadsim.gym.make_env(short("paper-constrained", 27.0))
+    told = flown(env)
+    missed = [
+        now["margins"]["roll"]
+        for before, now in itertools.pairwise(told)
+        if now["margins"]["roll"] < 0.0 <= min(before["margins_sampled"]["roll"], now["margins_sampled"]["roll"])
+    ]
+    assert len(missed) >= 3
+    assert all(info["constraint_values"][0] == -info["margins"]["roll"] for info in told)
+    plant = env.unwrapped.flight().plant
+    assert np.degrees(np.abs(plant["roll"])).max() == pytest.approx(5.0 - min(i["margins"]["roll"] for i in told))
+
+
+def test_cost_counts_required_constraints_beyond_their_tolerance() -> None:
+    limit = {"name": "height", "signal": "z", "upper": 1.0, "tolerance": 0.01, "tolerance_sampled": 0.01}
+    limits = [limit, {**limit, "name": "wish", "required": False}, {**limit, "name": "later", "start": 0.9}]
+    env = quadsim.gym.make_env(short("hover", 1.0, constraints=limits))
+    env.reset()
+    infos = [env.step(np.full(4, 0.5, np.float32))[4] for _ in range(20)]
+    heights = env.unwrapped.flight().plant
+    for k, info in enumerate(infos):
+        highest = heights["z"][50 * k + 1 : 50 * k + 51].max()
+        assert info["margins"]["height"] == pytest.approx(1.0 - highest, abs=1e-12)
+        beyond = bool(highest > 1.01)
+        assert info["cost"] == beyond + (beyond and info["time"] > 0.89)
+        assert info["constraint_violation"] == int(beyond)
+        assert np.isinf(info["margins"]["later"]) == (info["time"] < 0.89)
+    assert infos[0]["cost"] == 0.0
+    assert infos[-1]["cost"] == 2.0
+
+
+def test_a_lost_vehicle_terminates_and_time_truncates() -> None:
+    env = quadsim.gym.make_env(short("hover", 3.0))
+    env.reset()
+    ended = False
+    while not ended:
+        observed, _, terminated, truncated, info = env.step(np.array([1, -1, 0, 0], np.float32))
+        ended = terminated or truncated
+    assert terminated
+    assert not truncated
+    assert "lost" in info["reason"]
+    assert observed in env.observation_space
+    with pytest.raises(ResetNeeded, match="lost"):
+        env.unwrapped.step(HOVER)
+    env.reset()
+    steps = [env.step(HOVER)[2:4] for _ in range(60)]
+    assert steps == [(False, False)] * 59 + [(False, True)]
+    with pytest.raises(ResetNeeded, match="over"):
+        env.unwrapped.step(HOVER)
+    with pytest.raises(ResetNeeded, match="reset"):
+        quadsim.gym.QuadrotorEnv("hover").step(HOVER)
+
+
+def test_an_action_that_is_no_number_ends_the_flight() -> None:
+    env = quadsim.gym.QuadrotorEnv("hover")
+    env.reset()
+    _, reward, terminated, _, info = env.step(np.full(4, np.nan))
+    assert (reward, terminated) == (0.0, True)
+    assert "not finite" in info["reason"]
+
+
+def test_observations_are_what_the_layout_says() -> None:
+    parts = ("command", "ahead", "preview", "state")
+    env = quadsim.gym.QuadrotorEnv("paper-constrained", observation=parts, preview=2)
+    observed, _ = env.reset()
+    named = dict(zip([entry.name for entry in env.observations.layout], observed, strict=True))
+    assert named["yaw"] == pytest.approx(np.radians(30.0))
+    assert named["yaw[2] ahead"] == pytest.approx(named["yaw[2]"] - named["yaw"])
+    assert named["u1"] == pytest.approx(env.started.vehicle.hover_speed)
+    assert {entry.unit for entry in env.observations.layout} == {"m", "m/s", "rad", "rad/s"}
+    for _ in range(3):
+        seen = env.step(HOVER)[0]
+    assert np.array_equal(seen[-12:], env.started.observation.state)
+
+
+def test_seeds_are_those_of_the_scenario() -> None:
+    env = quadsim.gym.QuadrotorEnv(short("motion-capture", seed=5))
+    first, _ = env.reset()
+    assert env.scenario.seed == 5
+    second, _ = env.reset()
+    drawn = env.scenario.seed
+    assert drawn not in (0, 5)
+    again, _ = env.reset(seed=5)
+    assert np.array_equal(first, again)
+    assert not np.array_equal(first, second)
+    env.reset()
+    assert env.scenario.seed == drawn
+
+
+def test_a_campaign_varies_each_episode() -> None:
+    env = quadsim.gym.QuadrotorEnv("paper-constrained", vary="paper-robustness")
+    plan = load_plan("paper-robustness")
+    env.reset(options={"flight": 3})
+    drawn = plan.of(3)
+    assert env.scenario.effects == drawn.effects
+    assert env.scenario.seed == drawn.seed
+    assert env.started.vehicle.name == "lopes2011"
+    env.reset(seed=1)
+    first = env.scenario
+    env.reset()
+    assert env.scenario.effects != first.effects
+    env.reset(seed=1)
+    assert env.scenario == first
+
+
+def test_wrong_options_are_named() -> None:
+    make = quadsim.gym.QuadrotorEnv
+    with pytest.raises(UnknownNameError, match="no action named 'torque'"):
+        make("hover", action="torque")
+    with pytest.raises(UnknownNameError, match="no part of the observation named 'wind'"):
+        make("hover", observation=("wind",))
+    with pytest.raises(ParameterError, match="observation must be one or more"):
+        make("hover", observation=())
+    with pytest.raises(ParameterError, match=r"preview must be from 1 to controller.horizon = 50"):
+        make("hover", preview=51)
+    with pytest.raises(ParameterError, match="render_mode must be rgb_array"):
+        make("hover", render_mode="ansi")
+    with pytest.raises(UnknownNameError, match="no campaign named 'nothing'"):
+        make("hover", vary="nothing")
+    slow = quadsim.load("hover").replace({"controller.input_bounds.speed": [0.0, 150.0]})
+    with pytest.raises(ParameterError, match="below and above the hover speed"):
+        make(slow)
+    env = make("hover")
+    with pytest.raises(ParameterError, match="seed must be from 0"):
+        env.reset(seed=-1)
+    with pytest.raises(InputError, match="options must not have wind; they may have flight"):
+        env.reset(options={"wind": 1})
+    with pytest.raises(ParameterError, match=r"options.flight must be absent"):
+        env.reset(options={"flight": 1})
+    varied = make("paper-constrained", vary="paper-nominal")
+    with pytest.raises(ParameterError, match=r"options.flight must be from 0 to"):
+        varied.reset(options={"flight": -1})
+
+
+def test_no_display_no_window(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(environment, "RENDER_MODES", ("rgb_array",))
+    monkeypatch.setattr(environment, "has_display", lambda: False)
+    with pytest.raises(ParameterError, match="human needs a display"):
+        quadsim.gym.QuadrotorEnv("hover", render_mode="human")
+
+
+def test_the_inner_loop_flies_thrust_and_body_rates() -> None:
+    scenario = short("hover", constraints=[])
+    env = quadsim.gym.QuadrotorEnv(scenario, action="rates", observation=("state",))
+    observed, _ = env.reset()
+    for _ in range(10):
+        observed = env.step(np.array([0.2, 0.1, -0.05, 0.1], np.float32))[0]
+    plant, vehicle = env.flight().log.plant, env.started.vehicle
+    body = env.started.observation.moment.body_rates
+    assert body == pytest.approx([0.6, -0.3, 0.2], abs=0.02)
+    thrust = vehicle.thrust_coefficient * np.sum(plant.speeds[-2] ** 2)
+    weight = vehicle.mass * vehicle.gravity
+    most = vehicle.thrust_coefficient * 4 * 250.0**2
+    assert thrust == pytest.approx(weight + 0.2 * (most - weight), rel=1e-7)
+    assert observed[INDEX["vz"]] > 0.5
+    with pytest.raises(ParameterError, match="deviations or speeds"):
+        env.controller_action()
+
+
+def test_deviations_are_undone_by_their_inverse() -> None:
+    env = quadsim.gym.QuadrotorEnv("hover")
+    action = np.array([-1.0, -0.3, 0.0, 1.0], np.float32)
+    speeds = env.actions.command(action, None, 1).speeds
+    assert speeds[[0, 3]].tolist() == [0.0, 250.0]
+    assert env.actions.of(speeds) == pytest.approx(action, abs=1e-7)
+
+
+def test_processes_reset_in_the_step_after_an_end() -> None:
+    envs = quadsim.gym.make_vec(short("hover", 0.2), 2, observation=("state",))
+    assert envs.metadata["autoreset_mode"] is AutoresetMode.NEXT_STEP
+    start, _ = envs.reset(seed=[1, 2])
+    actions = np.full((2, 4), 0.1, np.float32)
+    ends = [envs.step(actions)[3].tolist() for _ in range(4)]
+    assert ends == [[False, False]] * 3 + [[True, True]]
+    again, rewards, _, truncated, infos = envs.step(actions)
+    envs.close()
+    assert np.array_equal(again, start)
+    assert rewards.tolist() == [0.0, 0.0]
+    assert not truncated.any()
+    assert infos["margins"]["roll"].tolist() == [5.0, 5.0]
+
+
+@pytest.mark.skipif(not drawing_works(), reason="no off-screen OpenGL")
+def test_pictures_follow_the_vehicle() -> None:
+    env = quadsim.gym.make_env(short("hover"), render_mode="rgb_array", width=80, height=60)
+    env.reset()
+    first = env.render()
+    for _ in range(5):
+        env.step(np.array([0.2, -0.2, 0.2, -0.2], np.float32))
+    second = env.render()
+    env.close()
+    assert first.shape == second.shape == (60, 80, 3)
+    assert first.dtype == np.uint8
+    assert first.std() > 5.0
+    assert not np.array_equal(first, second)
+
+
+def test_without_gymnasium_the_extra_is_named() -> None:
+    code = "import sys; sys.modules['gymnasium'] = None\nimport quadsim.errors\n"
+    code += "try:\n    import quadsim.gym\nexcept quadsim.errors.MissingPackageError as error:\n    print(error)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "quadsim.gym needs the package 'gymnasium': pip install 'quadsim[gym]'"

@@ -1,0 +1,73 @@
+"""The safety filter around an environment: a random agent behind it holds what it loses without."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+
+import quadsim
+import quadsim.gym
+from quadsim.errors import ParameterError
+
+ROOT = Path(__file__).resolve().parents[3]
+sys.path.insert(0, str(ROOT / "examples"))
+
+from safety_filter import CONTROLLER, filtered_air  # noqa: E402
+
+
+def random_episode(env: gymnasium.Env[Any, Any], seed: int) -> tuple[list[dict[str, Any]], bool]:
+    env.reset(seed=seed)
+    env.action_space.seed(seed)
+    told, ended = [], False
+    while not ended:
+        _, _, terminated, truncated, info = env.step(env.action_space.sample())
+        told.append(info)
+        ended = terminated or truncated
+    return told, terminated
+
+
+def test_a_random_agent_holds_five_degrees_of_tilt_behind_it_and_crashes_without() -> None:
+    scenario = filtered_air("turbulence").replace({"duration": 5.0})
+    env = quadsim.gym.MPCSafetyFilter(quadsim.gym.make_env(scenario))
+    told, terminated = random_episode(env, seed=0)
+    assert not terminated
+    assert min(info["margins"]["tilt"] for info in told) >= 0.0
+    stepped_in = [info["filter"]["intervened"] for info in told]
+    assert 0 < sum(stepped_in) < len(told) == env.steps
+    assert env.interventions == sum(stepped_in)
+    assert all((info["filter"]["correction"] > 0.0) == info["filter"]["intervened"] for info in told)
+    status = env.unwrapped.flight().log.control.status
+    assert [each != "unconstrained" for each in status] == stepped_in
+    told, terminated = random_episode(quadsim.gym.make_env(scenario), seed=0)
+    assert terminated
+    assert "tilted" in told[-1]["reason"]
+
+
+def test_what_is_safe_passes_to_the_bit() -> None:
+    env = quadsim.gym.MPCSafetyFilter(quadsim.gym.make_env(filtered_air("gust"), action="speeds"))
+    env.reset(seed=0)
+    wanted = env.unwrapped.started.vehicle.hover_speed + np.array([0.5, 0.25, -0.5, 0.125])
+    info = env.step(wanted)[4]
+    assert info["filter"] == {"intervened": False, "correction": 0.0, "fallback": 0}
+    assert np.array_equal(env.unwrapped.flight().command[0], wanted)
+
+
+def test_what_cannot_be_filtered_is_refused() -> None:
+    with pytest.raises(ParameterError, match="an environment of quadsim"):
+        quadsim.gym.MPCSafetyFilter(gymnasium.make("Pendulum-v1"))
+    with pytest.raises(ParameterError, match="deviations or speeds"):
+        quadsim.gym.MPCSafetyFilter(quadsim.gym.make_env("robust", action="rates"))
+    with pytest.raises(ParameterError, match=r"controller.type must be robust"):
+        quadsim.gym.MPCSafetyFilter(quadsim.gym.make_env("paper-constrained"))
+    relinearised = {**CONTROLLER, "linearisation": "state"}
+    env = quadsim.gym.MPCSafetyFilter(quadsim.gym.make_env("gust"), relinearised)
+    with pytest.raises(ParameterError, match="hover"):
+        env.reset()
+    env = quadsim.gym.MPCSafetyFilter(quadsim.gym.make_env("corridor"))
+    with pytest.raises(ParameterError, match="no half-spaces"):
+        env.reset()

@@ -1,0 +1,186 @@
+"""The page of a session: who gets in, and what a browser does with it."""
+
+from __future__ import annotations
+
+import shutil
+import threading
+import time as clock
+import urllib.error
+import urllib.request
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from scenarios.live.guard import Guard
+from scenarios.live.pacing import Pace
+from scenarios.live.page import Page
+from scenarios.live.session import Session
+from scenarios.loading import load_scenario
+from scenarios.run import fly_scenario
+
+ARGUMENTS = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"]
+PATIENCE = 60.0
+
+
+@pytest.mark.parametrize(
+    ("headers", "query", "let_in"),
+    [
+        ({"Host": "127.0.0.1:8080"}, "?token={token}", True),
+        ({"Host": "localhost:8080", "Cookie": "quadsim-8080={token}"}, "", True),
+        ({"Host": "127.0.0.1:8080", "Origin": "http://127.0.0.1:8080", "Cookie": "quadsim-8080={token}"}, "", True),
+        ({"Host": "127.0.0.1:8080"}, "", False),
+        ({"Host": "127.0.0.1:8080"}, "?token=guessed", False),
+        ({"Host": "127.0.0.1:8080", "Cookie": "quadsim-9090={token}"}, "", False),
+        ({"Host": "evil.example:8080", "Cookie": "quadsim-8080={token}"}, "", False),
+        ({"Host": "127.0.0.1:8080", "Origin": "http://evil.example", "Cookie": "quadsim-8080={token}"}, "", False),
+        ({"Host": "127.0.0.1:8080", "Origin": "http://127.0.0.1:9090", "Cookie": "quadsim-8080={token}"}, "", False),
+        ({"Host": "127.0.0.1:8080", "Origin": "null", "Cookie": "quadsim-8080={token}"}, "", False),
+        ({"Host": "[::1"}, "?token={token}", False),
+    ],
+)
+def test_who_is_let_in(headers: dict[str, str], query: str, let_in: bool) -> None:
+    guard = Guard("127.0.0.1")
+    filled = {name: value.replace("{token}", guard.token) for name, value in headers.items()}
+    assert (guard.refusal(filled, "/" + query.replace("{token}", guard.token), 8080) is None) == let_in
+
+
+@dataclass
+class Served:
+    """A session that flies in a thread of its own."""
+
+    session: Session
+    pace: Pace
+    page: Page
+
+    def wait(self, until: Callable[[], bool]) -> None:
+        limit = clock.monotonic() + PATIENCE
+        while not until():
+            assert clock.monotonic() < limit
+            clock.sleep(0.02)
+
+
+@pytest.fixture(scope="module")
+def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
+    target = tmp_path_factory.mktemp("live") / "kept"
+
+    def save(session: Session) -> str:
+        session.flight().save(target, video=False, recording=False, figures=False)
+        return str(target)
+
+    session, pace = Session(load_scenario("hover", ["controller.horizon=10"])), Pace()
+    page = Page(session, pace, save=save, others={"PID": load_scenario("hover", ["controller=pid"]).controller})
+    thread = threading.Thread(target=pace.drive, args=(session, page))
+    thread.start()
+    yield Served(session, pace, page)
+    pace.stop()
+    thread.join()
+    page.close()
+    session.close()
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    api = pytest.importorskip("playwright.sync_api", reason="no Playwright here: pip install playwright")
+    found = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+    if found is None:
+        pytest.skip("no Chromium here: install the package 'chromium' to open the page in a browser")
+    with api.sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=found, args=ARGUMENTS)
+        yield browser
+        browser.close()
+
+
+@pytest.fixture(scope="module")
+def tab(browser: Any, served: Served) -> Iterator[Any]:
+    tab = browser.new_page(viewport={"width": 900, "height": 700})
+    tab.set_default_timeout(1e3 * PATIENCE)
+    tab.goto(served.page.address)
+    tab.get_by_text("of real time").wait_for()
+    yield tab
+    tab.close()
+
+
+def test_the_address_alone_opens_the_page(served: Served) -> None:
+    bare = served.page.address.partition("?")[0]
+    with pytest.raises(urllib.error.HTTPError, match="403"):
+        urllib.request.urlopen(bare)
+    with urllib.request.urlopen(served.page.address) as response:
+        assert "HttpOnly" in response.headers["Set-Cookie"]
+
+
+def test_a_push_by_the_mouse_acts_and_ends(tab: Any, served: Served) -> None:
+    box = tab.locator("canvas").first.bounding_box()
+    x, y = box["x"] + box["width"] / 2.0, box["y"] + box["height"] / 2.0
+    tab.mouse.move(x, y)
+    tab.wait_for_timeout(600)
+    tab.mouse.move(x + 2.0, y)
+    tab.wait_for_timeout(600)
+    tab.mouse.down()
+    for i in range(8):
+        tab.mouse.move(x + 8.0 * i, y - 4.0 * i)
+        tab.wait_for_timeout(80)
+    served.wait(
+        lambda: any(event.type == "push" and any(event.force) for event in served.session.flights[0].scenario.events)
+    )
+    tab.mouse.up()
+    served.wait(lambda: served.session._held.pull is None)
+
+
+def test_a_slider_turns(tab: Any, served: Served) -> None:
+    row = tab.locator("label", has_text="Mass factor").locator("xpath=ancestor::div[.//*[@role='slider']][1]")
+    row.get_by_role("slider").focus()
+    tab.keyboard.press("ArrowRight")
+    served.wait(
+        lambda: any(
+            event.type == "mass" and event.factor == 1.01 for event in served.session.flights[0].scenario.events
+        )
+    )
+
+
+def test_a_controller_is_changed_in_flight_and_one_that_cannot_be_is_refused(tab: Any, served: Served) -> None:
+    tab.get_by_role("tab", name="Controller").click()
+    field = tab.locator("label", has_text="horizon").locator("xpath=ancestor::div[.//input][1]").locator("input")
+    field.fill("12")
+    field.press("Enter")
+    served.wait(lambda: served.session.flights[0].loop.controller.horizon == 12)
+    lower = tab.locator("label", has_text="speed lower").locator("xpath=ancestor::div[.//input][1]").locator("input")
+    lower.fill("260")  # above the upper one
+    lower.press("Enter")
+    tab.get_by_text("the controller before flies on").wait_for()
+    assert served.session.flights[0].loop.controller.horizon == 12
+    assert served.session.reason is None
+
+
+def test_pause_stands_still_and_save_keeps_what_flies_again_to_the_bit(tab: Any, served: Served) -> None:
+    tab.get_by_role("button", name="Pause", exact=True).click()
+    served.wait(lambda: served.pace.paused)
+    clock.sleep(0.2)
+    k = served.session.k
+    tab.get_by_role("button", name="Step", exact=True).click()
+    served.wait(lambda: served.session.k == k + 1)
+    tab.get_by_role("button", name="Save", exact=True).click()
+    tab.get_by_text("saved:").first.wait_for()
+    flight = served.session.flight()
+    again = fly_scenario(flight.scenario)
+    assert np.array_equal(again.command, flight.command)
+    assert np.array_equal(again.log.plant.state, flight.log.plant.state)
+    tab.get_by_role("button", name="Pause", exact=True).click()
+    served.wait(lambda: served.session.k > k + 3)
+
+
+def test_a_second_page_watches(browser: Any, served: Served, tab: Any, tmp_path: Path) -> None:
+    phone = browser.new_page(viewport={"width": 390, "height": 800})
+    phone.set_default_timeout(1e3 * PATIENCE)
+    phone.goto(served.page.address)
+    phone.get_by_text("of real time").wait_for()
+    before = served.pace.paused
+    phone.get_by_role("button", name="Pause", exact=True).click()
+    phone.get_by_text("You watch").first.wait_for()
+    assert served.pace.paused == before
+    picture = phone.screenshot(path=tmp_path / "phone.png")
+    assert len(picture) > 10_000
+    phone.close()

@@ -1,0 +1,247 @@
+"""What a person does in a session is data: the scenario that is kept flies to the same bits."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from quadsim.errors import InputError
+from scenarios.cli import main
+from scenarios.live.knobs import knobs
+from scenarios.live.pacing import LATE, Pace
+from scenarios.live.script import play, read_script
+from scenarios.live.session import STRONGEST, Frame, Session
+from scenarios.loading import load_scenario
+from scenarios.run import fly_scenario
+from scenarios.schema.scenario import Scenario
+
+SCRIPT = """\
+duration = 3.0
+inputs = [
+  { at = 0.5, type = "pull", to = [2.0, 0.0, 1.0] },
+  { at = 1.0, type = "pull" },
+  { at = 1.2, type = "wear", rotor = 3, loss = 0.1 },
+  { at = 1.6, type = "wear", rotor = 3, loss = 0.0 },
+  { at = 2.0, type = "controller", fields = { "input_weights.speed" = 0.02 } },
+]
+"""
+
+
+def number(low: float, high: float) -> st.SearchStrategy[float]:
+    return st.floats(low, high).map(lambda value: round(value, 3))
+
+
+INPUTS = st.one_of(
+    st.builds(lambda to: {"type": "pull", "to": to}, st.lists(number(-2.0, 2.0), min_size=3, max_size=3)),
+    st.just({"type": "pull"}),
+    st.builds(lambda rotor, loss: {"type": "wear", "rotor": rotor, "loss": loss}, st.integers(1, 4), number(0.0, 0.2)),
+    st.builds(lambda v: {"type": "steer", "velocity": v}, st.lists(number(-1.0, 1.0), min_size=3, max_size=3)),
+    st.builds(lambda x: {"type": "setpoint", "x": x}, number(-1.0, 1.0)),
+    st.builds(lambda mass: {"type": "payload_pickup", "mass": mass}, number(0.01, 0.3)),
+    st.builds(lambda weight: {"type": "controller", "fields": {"output_weights.x": weight}}, number(1.0, 50.0)),
+    st.builds(lambda factor: {"type": "mass", "factor": factor}, number(0.8, 1.2)),
+)
+
+
+@pytest.fixture(scope="module")
+def hover() -> Scenario:
+    return load_scenario("hover", ["controller.horizon=10"])
+
+
+@pytest.fixture
+def session(hover: Scenario) -> Iterator[Session]:
+    session = Session(hover)
+    yield session
+    session.close()
+
+
+def flown(session: Session, periods: int) -> list[Frame]:
+    return [session.advance() for _ in range(periods)]
+
+
+def same_bits(session: Session, which: int = 0) -> bool:
+    flight = session.flight(which)
+    again = fly_scenario(flight.scenario)
+    return np.array_equal(again.log.plant.state, flight.log.plant.state) and np.array_equal(
+        again.command, flight.command
+    )
+
+
+@settings(max_examples=8, deadline=None)
+@given(st.lists(st.tuples(st.integers(0, 20), INPUTS), max_size=12))
+def test_a_kept_session_flies_to_the_same_bits(given: list[tuple[int, dict[str, Any]]]) -> None:
+    session = Session(load_scenario("paper-constrained", ["controller.horizon=10"]), load_scenario("robust").controller)
+    try:
+        for k in range(24):
+            for at, table in given:
+                if at == k:
+                    session.submit(table, subject=table["type"])
+            if session.reason is None:
+                session.advance()
+        assert same_bits(session)
+        assert same_bits(session, 1)
+    finally:
+        session.close()
+
+
+def test_a_pull_moves_the_vehicle_and_ends(session: Session) -> None:
+    flown(session, 5)
+    session.submit({"type": "pull", "to": [50.0, 0.0, 1.0]}, subject="pull")
+    pulled = flown(session, 20)
+    weight = session.flights[0].vehicle.mass * session.flights[0].vehicle.gravity
+    assert np.linalg.norm(pulled[0].pull) == pytest.approx(STRONGEST * weight, rel=1e-3)
+    session.submit({"type": "pull"}, subject="pull")
+    assert not flown(session, 1)[0].pull.any()
+    assert session.flight().state["x"].max() > 0.05
+
+
+def test_of_one_subject_the_last_input_counts(session: Session) -> None:
+    for x in (1.0, 2.0, 3.0):
+        session.submit({"type": "setpoint", "x": x}, subject="setpoint")
+    flown(session, 2)
+    points = [event for event in session.flight().scenario.events if event.type == "setpoint"]
+    assert [event.x for event in points] == [3.0]
+
+
+def test_what_is_refused_is_said_and_changes_nothing(session: Session) -> None:
+    flown(session, 2)
+    before = session.flight().scenario.events
+    for table in (
+        {"type": "wear", "rotor": 5, "loss": 0.1},
+        {"type": "wear", "rotor": 1, "loss": 2.0},
+        {"type": "pull", "to": [float("nan"), 0.0, 0.0]},
+        {"type": "steer", "velocity": "north"},
+        {"type": "controller", "fields": {"horizon": 0}},
+        {"type": "nonsense"},
+        {},
+    ):
+        session.submit(table)
+        (said,) = session.advance().refused
+        assert said
+    assert session.flight().scenario.events == before
+
+
+def test_a_second_vehicle_feels_the_same(hover: Scenario) -> None:
+    session = Session(hover, load_scenario("robust").controller)
+    flown(session, 3)
+    session.submit({"type": "pull", "to": [3.0, 0.0, 1.0]})
+    flown(session, 10)
+    pushes = [[event for event in session.flight(i).scenario.events if event.type == "push"] for i in range(2)]
+    session.close()
+    assert len(pushes[0]) > 5
+    assert pushes[0] == pushes[1]
+
+
+def test_a_reset_begins_anew(session: Session) -> None:
+    flown(session, 4)
+    session.submit({"type": "payload_pickup", "mass": 0.1})
+    session.reset()
+    assert session.k == 0
+    flown(session, 1)
+    assert not [event for event in session.flight().scenario.events if event.type == "payload_pickup"]
+
+
+def test_a_lost_flight_ends_the_session_with_its_reason(session: Session) -> None:
+    for rotor in range(1, 5):
+        session.submit({"type": "wear", "rotor": rotor, "loss": 1.0})
+    while session.reason is None and session.k < 400:
+        session.advance()
+    assert "lost" in (session.reason or "")
+    with pytest.raises(InputError, match="ended"):
+        session.advance()
+    assert session.flight().outcome == "lost"
+    assert same_bits(session)
+
+
+def test_knobs_have_units_and_limits() -> None:
+    found = {knob.path: knob for knob in knobs(load_scenario("robust").controller)}
+    assert found["horizon"].minimum == 1
+    assert found["output_bounds.roll"].value == (-5.0, 5.0)
+    assert "[m/s]" in found["offset_free.velocity_noise"].about
+    assert set(found["linearisation"].choices) == {"hover", "state", "trajectory"}
+    assert "type" not in found
+
+
+class Clock:
+    """Time that passes when it is waited for, and some more."""
+
+    def __init__(self, extra: float) -> None:
+        self.now, self.extra = 0.0, extra
+
+    def __call__(self) -> float:
+        self.now += self.extra
+        return self.now
+
+
+class Nobody:
+    """Looks at nothing."""
+
+    def show(self, frame: Frame, factor: float) -> None:
+        self.factor = factor
+
+    def move(self, frame: Frame, share: float) -> None:
+        pass
+
+    def ended(self, reason: str | None) -> None:
+        pass
+
+
+def test_a_slow_machine_flies_every_period_and_says_how_slow_it_is(session: Session) -> None:
+    pace, view = Pace(Clock(LATE)), Nobody()
+    frames: list[int] = []
+    pace.drive(session, view, until=lambda frame: frames.append(frame.k) or frame.k == 9)  # type: ignore[func-returns-value]
+    assert frames == [*range(10)]
+    assert view.factor < 0.2
+
+
+def test_paused_it_flies_single_periods(session: Session) -> None:
+    pace = Pace()
+    pace.pause(True)
+    pace.single()
+    pace.single()
+    pace.order(lambda session: None)
+    pace.drive(session, Nobody(), until=lambda frame: frame.k == 1)
+    assert session.k == 2
+
+
+def test_a_script_is_kept_as_a_run_that_flies_to_the_same_bytes(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    script, kept, again = tmp_path / "script.toml", tmp_path / "kept", tmp_path / "again"
+    script.write_text(SCRIPT, encoding="utf-8")
+    line = ["live", "hover", "--script", str(script), "--out", str(kept), "--set", "controller.horizon=10"]
+    assert main(line) == 0
+    assert "3.00 s" in capsys.readouterr().out
+    main(["run", str(kept / "scenario.toml"), "--out", str(again), "--no-video", "--no-recording", "--no-figures"])
+    for table in ("flight.parquet", "plant.parquet"):
+        assert (kept / table).read_bytes() == (again / table).read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("duration = 0", "duration must be above 0"),
+        ("duration = 1\ninputs = [{ at = 2.0 }]", "at must be from 0 to below duration"),
+        ("duration = 1\ninputs = 3", "inputs must be tables"),
+        ("duration = 1\nspeed = 3", "unknown: speed"),
+        ("duration = ", "no TOML"),
+    ],
+)
+def test_a_script_that_is_none_is_refused(tmp_path: Path, text: str, said: str) -> None:
+    path = tmp_path / "script.toml"
+    path.write_text(text, encoding="utf-8")
+    with pytest.raises(InputError, match=said):
+        read_script(path)
+
+
+def test_a_script_says_what_was_refused(session: Session, tmp_path: Path) -> None:
+    path = tmp_path / "script.toml"
+    path.write_text('duration = 0.2\ninputs = [{ at = 0.1, type = "nonsense" }]', encoding="utf-8")
+    (said,) = play(session, read_script(path))
+    assert "nonsense" in said

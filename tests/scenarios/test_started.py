@@ -1,0 +1,303 @@
+"""A flight that is flown period by period: the batch flight's bits, and those of its own scenario flown again."""
+
+from __future__ import annotations
+
+import contextlib
+import gc
+import tomllib
+import weakref
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from threadpoolctl import threadpool_info, threadpool_limits
+
+import quadsim
+from quadsim.errors import CommandError, FlightError, InputError
+from quadsim.sim.loop import ClosedLoop
+from scenarios.flight import Flight
+from scenarios.loading import load_scenario
+from scenarios.one_thread import ONE_THREAD
+from scenarios.parts.neutral import prepared
+from scenarios.parts.vehicle import build_vehicle
+from scenarios.run import fly_scenario, start
+from scenarios.schema.scenario import Scenario
+
+PERIODS = 16
+SCENARIOS = {
+    "robust": [
+        "controller.horizon=12",
+        "controller.tightening.acceleration=0.05",
+        "effects={air={rotor_drag=3e-4, wind=[2.0, 0.0, 0.0], turbulence={wind_speed_20ft=5.0}}}",
+        "effects.disturbance={force_noise=0.05}",
+        "computation={delay=0.02, jitter=0.01}",
+        "lost.distance=false",
+    ],
+    "paper-constrained": ["controller.horizon=10", "controller.fallback={}"],
+    "motion-capture": [],
+    "nonlinear": [],
+    "take-off-and-landing": [],
+}
+
+
+def number(low: float, high: float) -> st.SearchStrategy[float]:
+    return st.floats(low, high).map(lambda value: round(value, 3))
+
+
+def vector(largest: float) -> st.SearchStrategy[list[float]]:
+    return st.lists(number(-largest, largest), min_size=3, max_size=3)
+
+
+LASTING = number(0.001, 0.5)
+SENSOR = st.sampled_from(["position", "velocity", "attitude", "rates"])
+FIELDS = st.sampled_from(
+    [
+        {"output_weights.x": 40.0},
+        {"output_weights": {"z": 300.0}},
+        {"weights.position": 30.0},
+        {"horizon": 8},
+        {"horizon": 20},
+        {"type": "pid"},
+        {"type": "geometric", "horizon": 12},
+        {"input_bounds.slew": [-40.0, 40.0]},
+        {"fallback.enabled": False},
+        {"delay": 0.01},
+        {"solver": "piqp-dense"},
+    ]
+)
+
+
+def kind(name: str, **fields: st.SearchStrategy[Any]) -> st.SearchStrategy[dict[str, Any]]:
+    return st.fixed_dictionaries({"type": st.just(name), **fields})
+
+
+INPUT = st.one_of(
+    kind("push", duration=LASTING, force=vector(3.0), point=vector(0.1)),
+    kind("setpoint", x=number(-1.0, 1.0), yaw=number(-90.0, 90.0)),
+    kind("setpoint", z=number(-0.5, 0.5)),
+    kind("controller", fields=FIELDS),
+    kind("mass", factor=number(0.8, 1.3)),
+    kind("rotor_lag", rise=number(0.0, 0.1)),
+    kind("rotor_lag", rise=number(0.0, 0.1), fall=number(0.0, 0.1)),
+    kind("rotor_loss", rotor=st.integers(1, 4), loss=number(0.01, 0.2), duration=LASTING),
+    kind("rotor_loss", rotor=st.integers(1, 4), loss=number(0.01, 0.1)),
+    kind("payload_pickup", mass=number(0.01, 0.3), position=vector(0.05)),
+    kind("payload_drop"),
+    kind("wind", velocity=vector(4.0)),
+    kind("gust", velocity=vector(4.0), duration=LASTING),
+    kind("sensor_fault", sensor=SENSOR, fault=st.sampled_from(["dropout", "freeze", "nan"]), duration=LASTING),
+    kind("sensor_fault", sensor=SENSOR, fault=st.just("bias"), offset=vector(0.2), duration=LASTING),
+    kind("stall", duration=LASTING),
+)
+INPUTS = st.lists(st.tuples(st.integers(0, PERIODS - 1), st.booleans(), INPUT), max_size=14)
+
+
+def cut(name: str) -> Scenario:
+    """A scenario as long as the sessions below, of which the library's events are left."""
+    scenario = load_scenario(name, SCENARIOS[name])
+    return scenario.model_copy(update={"duration": round(PERIODS * scenario.control_period, 9)})
+
+
+def assert_same_bits(one: Flight, other: Flight) -> None:
+    for table in ("control", "plant"):
+        for name, found in vars(getattr(one.log, table)).items():
+            wanted = getattr(getattr(other.log, table), name)
+            assert type(found) is type(wanted), name
+            if isinstance(found, np.ndarray):
+                np.testing.assert_array_equal(found, wanted, err_msg=name)
+            else:
+                assert found == wanted, name
+    assert one.log.reason == other.log.reason
+    if one.log.predicted is None:
+        assert other.log.predicted is None
+    else:
+        np.testing.assert_array_equal(one.log.predicted, other.log.predicted)
+
+
+def written_and_read(scenario: Scenario) -> Scenario:
+    return Scenario.parse(tomllib.loads(scenario.to_toml()))
+
+
+@pytest.mark.parametrize("name", SCENARIOS)
+def test_periods_by_hand_are_the_batch_flight(name: str) -> None:
+    scenario = cut(name)
+    with start(scenario) as started:
+        while not started.done:
+            assert started.step().observation.k == started.k - 1
+        stepped = started.flight()
+    assert_same_bits(stepped, fly_scenario(scenario))
+    assert stepped.scenario == fly_scenario(scenario).scenario
+
+
+@settings(max_examples=40)
+@given(name=st.sampled_from([*SCENARIOS]), inputs=INPUTS)
+def test_what_was_applied_flies_again_to_the_bit(name: str, inputs: list[tuple[int, bool, dict[str, Any]]]) -> None:
+    """Inputs of every kind at any period, before it is observed or after; what is refused changes nothing."""
+    applied = 0
+    with start(cut(name), live=True) as started:
+        try:
+            for k in range(PERIODS):
+                for _, observed, event in (each for each in inputs if each[0] == k):
+                    if observed:
+                        assert started.observation.k == k
+                    before = started.scenario
+                    try:
+                        found = started.apply(event)
+                    except InputError:
+                        assert started.scenario is before
+                    else:
+                        applied += 1
+                        assert found.at >= k * before.control_period - 1e-9
+                started.step()
+        except FlightError:
+            assert started.done
+        flight = started.flight()
+    assert len(flight.scenario.events) <= applied + len(prepared(cut(name), build_vehicle(cut(name))).events)
+    assert_same_bits(flight, fly_scenario(written_and_read(flight.scenario)))
+
+
+def test_a_shorter_flight_keeps_what_it_was_compiled_for() -> None:
+    """The payload of 4 s, which is not in a flight of 1 s, changes the last bits of its first second."""
+    scenario = load_scenario("payload-pickup", ["events=[{type='payload_pickup', at=4.0, mass=0.4}]"])
+    with start(scenario) as started:
+        while started.k < 20:
+            started.step()
+        flight = started.flight()
+    assert flight.scenario.duration == 1.0
+    assert [event.type for event in flight.scenario.events] == ["mass"]
+    assert_same_bits(flight, fly_scenario(flight.scenario))
+
+
+def test_a_flight_goes_on_beyond_its_scenario() -> None:
+    scenario = cut("robust")
+    with start(scenario, live=True) as started:
+        while started.k < 2 * PERIODS:
+            started.step()
+            if started.k == PERIODS:
+                assert started.done
+                started.apply({"type": "push", "duration": 0.1, "force": [1.0, 0.0, 0.0]})
+        flight = started.flight()
+    assert flight.scenario.periods == 2 * PERIODS
+    assert_same_bits(flight, fly_scenario(flight.scenario))
+
+
+def test_a_controller_built_elsewhere_takes_over_as_one_built_here() -> None:
+    with start(cut("robust"), live=True) as one, start(cut("robust"), live=True) as other:
+        fields = {"output_weights.x": 40.0}
+        successor = one.successor(fields)
+        for started, ready in ((one, successor), (other, None)):
+            for k in range(PERIODS):
+                if k == 5:
+                    started.apply({"type": "controller", "fields": fields}, ready)
+                started.step()
+            assert (started.loop.controller is successor.controller) == (started is one)
+        assert_same_bits(one.flight(), other.flight())
+
+
+def test_a_flight_refuses_what_it_was_not_started_for() -> None:
+    with start(load_scenario("hover")) as started:
+        for event in ({"type": "push", "duration": 0.1, "force": [1, 0, 0]}, {"type": "mass", "factor": 1.1}):
+            with pytest.raises(InputError, match=r"event.type must be of a kind that the flight was started for.*live"):
+                started.apply(event)
+        with pytest.raises(InputError, match="for the wind to push"):
+            started.apply({"type": "wind", "velocity": [1, 0, 0]})
+        with pytest.raises(InputError, match=r"events.0.force is missing"):
+            started.apply({"type": "push", "duration": 0.1})
+        with pytest.raises(InputError, match=r"events.0.fields: .*horizon must be >= 1; got 0"):
+            started.apply({"type": "controller", "fields": {"horizon": 0}})
+        assert not started.scenario.events
+
+
+def test_given_commands_fly_instead_of_the_controller() -> None:
+    with start(load_scenario("hover")) as started:
+        for _ in range(10):
+            sample = started.step(np.full(4, 215.0))
+        assert sample.step_s == 0.0
+        assert sample.segment.physics[-1, 10] > 0.1  # [m/s] upwards: hover takes less
+        with pytest.raises(CommandError):
+            started.step(np.full(4, np.nan))
+        with pytest.raises(InputError, match=r"the flight has ended at t = 0\.500 s: the command is not finite"):
+            started.step()
+        assert started.flight().outcome == "lost"
+    with pytest.raises(InputError, match="the flight is closed"):
+        started.step()
+
+
+def test_margins_of_a_period_are_those_of_the_audit() -> None:
+    """The smallest of all periods' is the audit's, and each is that of its rows at the physics rate."""
+    scenario = load_scenario("paper-constrained", ["duration=4.0"])
+    found: list[dict[str, float]] = []
+    with start(scenario) as started:
+        while not started.done:
+            sample = started.step()
+            found.append(started.margins())
+            beyond = started.violations(sample)
+            for limit in started.limits:
+                margin = found[-1][limit.name]
+                assert beyond[limit.name] == (-np.inf if np.isnan(margin) else -margin - limit.tolerance)
+        flight = started.flight()
+    for finding in flight.findings:
+        per_period = np.array([margins[finding.limit.name] for margins in found])
+        np.testing.assert_array_equal(np.nanmin([*per_period, np.inf]), np.nanmin([finding.worst_margin, np.inf]))
+        starts = flight.margins[finding.limit.name]
+        if finding.limit.source.plant is None:
+            np.testing.assert_array_equal(per_period, starts)
+        else:  # the end of a period is the begin of the next
+            assert (per_period <= starts + 1e-12).all()
+            assert (per_period[:-1] >= np.minimum(starts[:-1], starts[1:]) - 1e-12).all()
+
+
+def test_without_a_record_there_is_no_log() -> None:
+    with start(load_scenario("hover"), recorded=False) as started:
+        started.step()
+        assert set(started.margins()) == {limit.name for limit in started.limits}
+        with pytest.raises(InputError, match="no period of this flight was kept"):
+            started.flight()
+
+
+def test_a_controller_takes_over_before_a_period_is_observed() -> None:
+    with start(load_scenario("hover")) as started:
+        loop: ClosedLoop = started.loop
+        assert started.observation.k == 0
+        with pytest.raises(InputError, match="before a period is observed"):
+            loop.switch(loop.controller)
+
+
+def test_a_script_that_starts_a_flight_reads_as_documented() -> None:
+    with quadsim.start("hover", live=True) as started:
+        event = started.apply({"type": "setpoint", "z": 0.5})
+        assert event.at == 0.0
+        assert quadsim.StartedFlight is type(started)
+
+
+def test_a_flight_that_is_closed_leaves_nothing_in_cycles() -> None:
+    """What was flown is many megabytes, and cycles are looked for rarely."""
+    gc.disable()
+    try:
+        with start(cut("robust"), live=True) as started:
+            started.step()
+        loop, last = weakref.ref(started.loop), weakref.ref(started.loop.last)
+        del started
+        assert loop() is None
+        assert last() is None
+    finally:
+        gc.enable()
+
+
+def threads() -> set[int]:
+    return {library["num_threads"] for library in threadpool_info()}
+
+
+def test_linear_algebra_has_one_thread_while_anybody_flies() -> None:
+    """Whoever leaves first, as a controller that is built elsewhere, does not let the others have more."""
+    with threadpool_limits(limits=2):
+        one, other = contextlib.ExitStack(), contextlib.ExitStack()
+        one.enter_context(ONE_THREAD)
+        other.enter_context(ONE_THREAD)
+        assert threads() == {1}
+        one.close()
+        assert threads() == {1}
+        other.close()
+        assert threads() == {2}

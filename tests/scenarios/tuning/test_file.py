@@ -1,0 +1,113 @@
+"""What a tuning file may say: every wrong field refused by its name, in one message, with status 2."""
+
+from __future__ import annotations
+
+import copy
+from pathlib import Path
+from typing import Any
+
+import pytest
+from tuning_formula import TUNING, write_tuning
+
+from quadsim.errors import InputError
+from scenarios.cli import main
+from scenarios.shipped import tuning_names
+from scenarios.tuning.plan import load_tuning
+
+
+def entry(**changes: Any) -> list[dict[str, Any]]:
+    """`[[search]]` with its first entry changed; None takes a field away."""
+    first = {**TUNING["search"][0], **changes}
+    return [{name: value for name, value in first.items() if value is not None}, TUNING["search"][1]]
+
+
+def campaign(**changes: Any) -> dict[str, Any]:
+    return {**copy.deepcopy(TUNING["campaign"]), **changes}
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"trials": 7}, "trials must be a multiple of batch, 6; got 7"),
+        ({"flights": [4, 4]}, r"flights must rise; got \[4, 4\]"),
+        ({"fresh": {"seed": 0}}, "fresh.seed must not be seed, 0, whose draws choose the answer"),
+        ({"require": "P(violation) > 0.2 @ 50%"}, "require must keep a probability small, with < or <="),
+        ({"require": "never"}, r"require: requirement 'never' must read P\(EVENT\)"),
+        ({"require": "P(rmse.q > 1) < 0.1 @ 90%"}, "require: no column named 'rmse.q'"),
+        ({"guard": "worse"}, "guard: no event named 'worse'"),
+        ({"guard": "rmse.q > 1"}, "guard: no column named 'rmse.q'"),
+        ({"search": []}, "search must be of 1 or more entries"),
+        ({"search": entry(low=2.0)}, "search.speed.low must be below high; got 2 and 1"),
+        ({"search": entry(low=0.0)}, "search.speed.low must be > 0"),
+        ({"search": entry(distribution="normal")}, "search.speed must be one of 'uniform', 'log_uniform', 'integer'"),
+        ({"search": entry(low=None)}, "search.speed.low is missing"),
+        ({"search": entry(fields=["controller.input_weights.sped"])}, "search.speed at 0.0001: .*sped is not a field"),
+        ({"search": entry(fields=["seed"])}, "search.speed.fields must not have seed"),
+        ({"search": entry(fields=["effects.load.mass_factor"])}, "must not have effects.load.mass_factor, which mass"),
+        ({"search": entry(name="z")}, r"search must have distinct names; got \['z', 'z'\]"),
+        (
+            {"search": entry(fields=["controller.output_bounds"])},
+            "search.speed at 0.0001: controller.output_bounds must",
+        ),
+        (
+            {"objectives": [{"name": "error", "expression": "rmse.q"}]},
+            "objectives.error.expression: no column of numbers",
+        ),
+        (
+            {"objectives": [{"name": "error", "expression": "verdict"}]},
+            "objectives.error.expression: no column of numb",
+        ),
+        ({"objectives": [{"name": "e", "expression": "open('x')"}]}, "objectives.e.expression must be made of columns"),
+        ({"objectives": [{"name": "e", "expression": "rmse.x +"}]}, "objectives.e.expression must be arithmetic on"),
+        ({"objectives": 3 * TUNING["objectives"]}, "objectives must be of 2 or fewer entries; got 3"),
+        ({"campaign": campaign(seed=3)}, "campaign must not have seed: a tuning has its own"),
+        ({"campaign": campaign(base="papers")}, "no campaign named 'papers'"),
+        ({"campaign": campaign(scenario="hove")}, "no scenario named 'hove'; did you mean 'hover'"),
+        ({"campaign": campaign(failure=["fell"])}, "campaign.failure has an entry 'fell' that is no event"),
+        ({"trails": 3}, "trails is not a field of the tuning file; did you mean 'trials'"),
+    ],
+)
+def test_a_wrong_field_is_refused_by_its_name(tmp_path: Path, changes: dict[str, Any], message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        load_tuning(str(write_tuning(tmp_path, **changes)))
+
+
+def test_what_flights_are_held_against_is_not_searched(tmp_path: Path) -> None:
+    held = campaign(set={**TUNING["campaign"]["set"], "constraints": [{"name": "hold_z", "lower": -0.1, "upper": 0.1}]})
+    search = entry(fields=["constraints.hold_z.upper"])
+    with pytest.raises(InputError, match=r"search\.speed\.fields must be of fields that leave alone what flights are"):
+        load_tuning(str(write_tuning(tmp_path, search=search, campaign=held)))
+
+
+def test_the_command_says_it_in_one_line_with_status_2(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = write_tuning(tmp_path, trials=7)
+    assert main(["tune", str(path), "--out", str(tmp_path / "t")]) == 2
+    assert capsys.readouterr().err == "quadsim: little.toml: trials must be a multiple of batch, 6; got 7\n"
+    assert main(["tune", "nope", "--workers", "1"]) == 2
+    assert "no tuning named 'nope'" in capsys.readouterr().err
+    assert main(["tune", str(path), "--workers", "1", "--cluster", "tcp://a:1"]) == 2
+    assert not (tmp_path / "t").exists()
+
+
+@pytest.mark.parametrize("name", tuning_names())
+def test_those_that_ship_can_be_flown(name: str) -> None:
+    plan = load_tuning(name)
+    assert plan.spec.name == name
+    assert set(plan.start_values) == {each.name for each in plan.spec.search}
+
+
+def test_a_file_may_say_what_differs_alone(tmp_path: Path) -> None:
+    write_tuning(tmp_path, campaign=campaign(base="held.toml"))
+    (tmp_path / "held.toml").write_text('base = "paper-nominal"\nname = "held"\nfailure = ["lost"]\n', encoding="utf-8")
+    (tmp_path / "shorter.toml").write_text('base = "little.toml"\ntrials = 12\n', encoding="utf-8")
+    found = load_tuning(str(tmp_path / "shorter.toml")).spec
+    assert (found.trials, found.batch, found.name) == (12, 6, "little")
+    assert found.campaign.failure == ["lost"]
+    assert [each.name for each in found.campaign.vary][-1] == "pitch"
+
+
+def test_a_file_written_out_is_the_same_tuning(tmp_path: Path) -> None:
+    plan = load_tuning(str(write_tuning(tmp_path)))
+    written = tmp_path / "again.toml"
+    written.write_text(plan.spec.to_toml(), encoding="utf-8")
+    assert load_tuning(str(written)) == plan

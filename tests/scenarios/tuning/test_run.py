@@ -1,0 +1,260 @@
+"""Whole tunings: a known best, the same draws for all, a bound on failures, and the same answer however interrupted."""
+
+from __future__ import annotations
+
+import functools
+import importlib
+import json
+import os
+import signal
+import subprocess
+import sys
+import time as clock
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from tuning_formula import BEST_SPEED, BEST_Z, Formula, error_of, write_tuning
+
+from quadsim.errors import InputError, MissingPackageError, OutputError
+from scenarios.campaign.engine.local import LocalEngine
+from scenarios.campaign.results.table import read_table
+from scenarios.loading import load_scenario
+from scenarios.run import fly_scenario
+from scenarios.tuning import run as module
+from scenarios.tuning.plan import START, TuningPlan, load_tuning
+from scenarios.tuning.run import SUMMARY_FILE, TuningResult
+
+tune = functools.partial(module.tune, report=False)
+
+
+@pytest.fixture
+def plan(tmp_path: Path) -> TuningPlan:
+    return load_tuning(str(write_tuning(tmp_path)))
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> TuningResult:
+    """The tuning, undisturbed; nobody changes its directory."""
+    here = tmp_path_factory.mktemp("whole")
+    return tune(load_tuning(str(write_tuning(here))), here / "t", Formula())
+
+
+def content(result: TuningResult) -> tuple[bytes, ...]:
+    names = ("flights.parquet", SUMMARY_FILE, "best.toml", "start/flights.parquet")
+    return tuple((result.directory / name).read_bytes() for name in names)
+
+
+def test_a_known_optimum_is_found(whole: TuningResult) -> None:
+    controller: Any = whole.best.controller
+    assert abs(np.log10(controller.input_weights.speed / BEST_SPEED)) < 0.5
+    assert abs(controller.output_weights["z"] - BEST_Z) < 200.0
+    start = next(each for each in whole.summary["candidates"] if each["candidate"] == START)
+    best = next(each for each in whole.summary["candidates"] if each["candidate"] == whole.summary["answer"])
+    assert best["values"][0] < start["values"][0]
+    assert whole.holds
+
+
+def test_the_answer_flies(whole: TuningResult) -> None:
+    found = load_scenario(str(whole.directory / "best.toml"))
+    assert found == whole.best
+    assert fly_scenario(found).outcome == "satisfied"
+
+
+def test_all_candidates_meet_the_same_draws(whole: TuningResult) -> None:
+    rows = whole.table.to_pylist()
+    most = whole.summary["draws"]
+    seeds: dict[int, set[tuple[int, float]]] = {}
+    for row in rows:
+        assert row["candidate"] == row["flight"] // most
+        seeds.setdefault(row["flight"] % most, set()).add((row["seed"], row["draw.mass"]))
+    assert len(seeds) == most
+    assert {len(met) for met in seeds.values()} == {1}
+
+
+def test_a_few_candidates_fly_much_and_most_fly_little(whole: TuningResult) -> None:
+    flown = [each["flights"] for each in whole.summary["candidates"] if each["candidate"] != START]
+    assert [flown.count(flights) for flights in (2, 4, 8)] == [4 * 3, 4 * 1, 4 * 2]
+
+
+def test_few_flights_are_corrected_by_what_the_start_did_there(whole: TuningResult, plan: TuningPlan) -> None:
+    """The formula's luck is the same for all candidates, so that any number of flights gives the score of all."""
+    luck = float(np.mean([error_of(plan.start.of(draw)) for draw in range(plan.most)])) - error_of(plan.start.scenario)
+    for each in whole.summary["candidates"]:
+        values = {} if each["candidate"] == START else each["search"]
+        expected = error_of(plan.candidate(values, "little")) + luck
+        assert each["values"][0] == pytest.approx(expected, rel=1e-9)
+
+
+def test_fresh_draws_are_others_and_the_optimism_is_told(whole: TuningResult) -> None:
+    assert whole.comparison is not None
+    fresh = json.loads((whole.directory / SUMMARY_FILE).read_text())["objectives"][0]
+    (gain,) = whole.summary["objectives"]
+    assert gain == fresh
+    assert whole.comparison.flights == 20
+    of_search = set(whole.table["seed"].to_pylist())
+    tables = [whole.directory / name / "flights.parquet" for name in ("start", f"candidate-{whole.summary['answer']}")]
+    seeds = [set(read_table(path)["seed"].to_pylist()) for path in tables]
+    assert seeds[0] == seeds[1]
+    assert not seeds[0] & of_search
+    assert gain["promised"] == pytest.approx((gain["best"] - gain["start"]) / gain["start"])
+    assert gain["optimism"] == pytest.approx(gain["kept"] - gain["promised"])
+    # the formula has the same difference on every draw
+    assert gain["mean_difference"] == pytest.approx(gain["best"] - gain["start"])
+
+
+def test_an_interrupted_search_ends_as_it_would_have(plan: TuningPlan, whole: TuningResult, tmp_path: Path) -> None:
+    flown: list[int] = []
+    for stops_after, stopped_by in ((5, KeyboardInterrupt), (21, RuntimeError), (40, KeyboardInterrupt), (7, OSError)):
+        engine = Formula(stops_after=stops_after, stopped_by=stopped_by, backwards=len(flown) % 2 == 1)
+        with pytest.raises(stopped_by):
+            tune(plan, tmp_path / "t", engine, resume=True)
+        flown += engine.flown
+    last = Formula(backwards=True)
+    result = tune(plan, tmp_path / "t", last, resume=True)
+    assert content(result) == content(whole)
+    flown += last.flown
+    fresh = 2 * plan.spec.fresh.flights
+    assert len(flown) == whole.table.num_rows + fresh  # nothing was flown twice
+    manifest = json.loads((tmp_path / "t" / "manifest.json").read_text())
+    assert manifest["status"] == "complete"
+    assert [session["flights"] for session in manifest["sessions"]] == [5, 21, 40, 7, len(last.flown) - fresh]
+
+
+KILLED = """
+import sys, time
+from pathlib import Path
+from scenarios.tuning.plan import load_tuning
+from scenarios.tuning.run import tune
+from tuning_formula import Formula
+
+class Slow(Formula):
+    def answers(self, pilot, flights):
+        for row in super().answers(pilot, flights):
+            time.sleep(0.01)
+            yield row
+
+tune(load_tuning(sys.argv[1]), Path(sys.argv[2]), Slow(), report=False)
+"""
+
+
+def test_a_killed_search_ends_as_it_would_have(plan: TuningPlan, whole: TuningResult, tmp_path: Path) -> None:
+    """SIGKILL, once some flights of the second batch are on the disk."""
+    target = tmp_path / "t"
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+    command = [sys.executable, "-c", KILLED, str(tmp_path / "little.toml"), str(target)]
+    process = subprocess.Popen(command, env=environment)
+    until = clock.monotonic() + 120.0
+    while len(list((target / "parts").glob("*.parquet"))) < 6:
+        assert process.poll() is None
+        assert clock.monotonic() < until
+        clock.sleep(0.005)
+    process.kill()
+    assert process.wait() == -signal.SIGKILL
+    engine = Formula()
+    assert content(tune(plan, target, engine, resume=True)) == content(whole)
+    assert len(engine.flown) < whole.table.num_rows
+
+
+def test_more_trials_may_follow(plan: TuningPlan, whole: TuningResult, tmp_path: Path) -> None:
+    few = load_tuning(str(write_tuning(tmp_path)), trials=12)
+    tune(few, tmp_path / "t", Formula())
+    assert content(tune(plan, tmp_path / "t", Formula(), resume=True)) == content(whole)
+
+
+def test_another_seed_searches_elsewhere(whole: TuningResult, tmp_path: Path) -> None:
+    other = load_tuning(str(write_tuning(tmp_path)), seed=7, trials=6)
+    found = tune(other, tmp_path / "t", Formula())
+    searched = [result.summary["candidates"][1]["search"] for result in (whole, found)]
+    assert searched[0] != searched[1]
+
+
+def test_candidates_that_fail_too_often_are_no_answer(tmp_path: Path) -> None:
+    """The best of the bowl violates: the answer is the best beside it."""
+
+    def violated(scenario: Any) -> bool:
+        return bool(scenario.controller.output_weights["z"] > 250.0)
+
+    plan = load_tuning(str(write_tuning(tmp_path)))
+    result = tune(plan, tmp_path / "t", Formula(violated=violated))
+    controller: Any = result.best.controller
+    assert controller.output_weights["z"] <= 250.0
+    feasible = [each for each in result.summary["candidates"] if each["feasible"]]
+    assert all(each["search"]["z"] <= 250.0 for each in feasible)
+    assert result.holds
+
+
+def test_where_all_fail_the_answer_says_so(tmp_path: Path) -> None:
+    plan = load_tuning(str(write_tuning(tmp_path, trials=6)))
+    result = tune(plan, tmp_path / "t", Formula(violated=lambda scenario: True))
+    assert not result.holds
+    assert not result.summary["front"]
+
+
+def test_two_objectives_have_a_front_of_files_that_fly(tmp_path: Path) -> None:
+    objectives = [
+        {"name": "error", "expression": "rmse.x"},
+        {"name": "z", "expression": "search.z", "statistic": "max"},
+    ]
+    with pytest.raises(InputError, match=r"objectives\.z\.expression: no column of numbers named 'search\.z'"):
+        load_tuning(str(write_tuning(tmp_path, objectives=objectives)))
+    objectives[1]["expression"] = "sqrt(rmse.x) * draw.mass - 3 * rmse.x"
+    plan = load_tuning(str(write_tuning(tmp_path, objectives=objectives, trials=12)))
+    result = tune(plan, tmp_path / "t", Formula())
+    values = {each["candidate"]: each["values"] for each in result.summary["candidates"]}
+    front = [values[candidate] for candidate in result.summary["front"]]
+    assert len(front) > 1
+    assert front == sorted(front)
+    assert [second for _, second in front] == sorted((second for _, second in front), reverse=True)
+    files = {path.name for path in result.directory.glob("front-*.toml")}
+    assert files == {f"front-{candidate}.toml" for candidate in result.summary["front"]}
+    load_scenario(str(result.directory / min(files)))
+
+
+def test_processes_fly_the_same_search(tmp_path: Path) -> None:
+    """Real flights, by one process and by two: the same bytes."""
+    changes: dict[str, Any] = {"trials": 4, "batch": 4, "flights": [1, 2], "fresh": {"flights": 2, "seed": 1}}
+    plan = load_tuning(str(write_tuning(tmp_path, **changes)))
+    results = [tune(plan, tmp_path / f"{workers}", LocalEngine(workers)) for workers in (1, 2)]
+    assert content(results[0]) == content(results[1])
+    assert results[0].table["status"].to_pylist() == ["completed"] * results[0].table.num_rows
+
+
+# --- what is refused -----------------------------------------------------------------------------------------------
+
+
+def test_a_tuning_is_not_flown_over_without_asking(plan: TuningPlan, whole: TuningResult) -> None:
+    with pytest.raises(OutputError, match="a tuning is already there; go on with it by --resume"):
+        tune(plan, whole.directory, Formula())
+
+
+@pytest.mark.parametrize(
+    ("changes", "named"),
+    [
+        ({"seed": 5}, "seed"),
+        ({"batch": 12}, "batch"),
+        ({"trials": 12}, "trials"),
+        ({"require": "P(lost) < 0.2 @ 50%"}, "require"),
+        ({"campaign": {"scenario": "hover", "set": {"duration": 1.0}}}, "scenario, campaign"),
+    ],
+)
+def test_another_tuning_is_not_gone_on_with(
+    whole: TuningResult, tmp_path: Path, changes: dict[str, Any], named: str
+) -> None:
+    with pytest.raises(InputError, match=f"goes on with the same tuning alone, and its {named} differs"):
+        tune(load_tuning(str(write_tuning(tmp_path, **changes))), whole.directory, Formula(), resume=True)
+
+
+def test_without_optuna_the_message_names_the_extra(
+    plan: TuningPlan, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    search = importlib.import_module("scenarios.tuning.search")
+    monkeypatch.setitem(sys.modules, "optuna", None)
+    with pytest.raises(
+        MissingPackageError, match=r"a tuning needs the package 'optuna': pip install 'quadsim\[tune\]'"
+    ):
+        search.require_optuna()
+    with pytest.raises(MissingPackageError):
+        tune(plan, tmp_path / "t", Formula())
+    assert not (tmp_path / "t").exists()
