@@ -109,6 +109,9 @@ export-numbers: setup $(VENV)/.firmware  ## remake docs/export.md: exported cont
 speed: setup  ## fly every controller ever faster and remake docs/speed.md: some six minutes
 	@$(PY) docs/make_speed.py
 
+gym: setup  ## remake the numbers and the figure of docs/gym.md: some ten minutes
+	@$(PY) docs/make_gym.py
+
 soak: setup  ## one simulated hour on end: memory and step time have to stay as they were
 	@$(PY) tests/soak.py --minutes 60
 

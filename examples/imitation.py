@@ -168,9 +168,9 @@ def behind_filter(student: Student, scenario: quadsim.Scenario) -> quadsim.Fligh
     return flight
 
 
-def compared(student: Student, flights: int = 20) -> dict[str, list[quadsim.Flight]]:
+def compared(student: Student, flights: int = 20, duration: float = 30.0) -> dict[str, list[quadsim.Flight]]:
     """Teacher, student and student behind the filter, each on the same courses, which none has seen."""
-    courses = [course(seed) for seed in range(flights)]
+    courses = [course(seed).replace({"duration": duration}) for seed in range(flights)]
     return {
         "teacher": [quadsim.fly(each, progress=False) for each in courses],
         "student": [quadsim.fly(each, controller=student, progress=False) for each in courses],

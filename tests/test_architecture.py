@@ -129,9 +129,9 @@ def test_imports_are_told_apart() -> None:
 
 
 def test_the_testbed_imports_nothing_of_ours(imports: list[Import]) -> None:
-    """But for `import quadsim`, which hands out what users call, late."""
+    """But for `import quadsim` and `import quadsim.gym`, which hand out what users call, late."""
     found = [i for i in imports if i.importer.startswith("quadsim") and i.library in {"mpc", "scenarios", "piqp"}]
-    assert {i.importer for i in found} == {"quadsim"}
+    assert {i.importer for i in found} == {"quadsim", "quadsim.gym"}
     assert not [i for i in found if i.at_start]
 
 
@@ -162,6 +162,10 @@ def test_a_library_to_draw_with_is_imported_by_figures_or_plots_alone_and_late(
 ) -> None:
     uses = [item for item in imports if item.library == library]
     assert not [item for item in uses if item.at_start or not re.fullmatch(FOR_DRAWING[library], item.importer)]
+
+
+def test_gymnasium_is_imported_by_the_environments_alone(imports: list[Import]) -> None:
+    assert {i.room for i in imports if i.library == "gymnasium"} == {"scenarios.gym"}
 
 
 def test_the_render_worker_is_imported_by_nobody(imports: list[Import]) -> None:

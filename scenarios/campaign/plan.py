@@ -92,7 +92,7 @@ class Plan:
         _ = self.failure
         check_ends(
             self.spec.vary,
-            lambda entry, value: self._varied([(entry, value)], name=self.scenario.name, seed=0),
+            lambda entry, value: check_parts(self._varied([(entry, value)], name=self.scenario.name, seed=0)),
             table="vary",
         )
         refusals = [self._refusal(flight) for flight in range(min(FIRST, self.spec.flights))]
@@ -108,7 +108,10 @@ class Plan:
         return None
 
     def _varied(self, changes: Sequence[Change], *, name: str, seed: int) -> Scenario:
-        return changed(self._data, changes, table="vary", name=name, seed=seed)
+        def parse(data: dict[str, Any]) -> Scenario:
+            return parse_scenario({**data, "name": name, "seed": seed}, source=name)
+
+        return changed(self._data, changes, parse, table="vary")
 
 
 def read_campaign(name: str) -> dict[str, Any]:

@@ -69,6 +69,16 @@ class QuadrotorEnv(gymnasium.Env):  # type: ignore[misc]
         limits: its constraints, as the audit has them.
         actions: what actions are.
         observations: what is observed, with the unit of each entry.
+
+    Examples:
+        >>> import numpy as np
+        >>> import quadsim.gym
+        >>> env = quadsim.gym.QuadrotorEnv("hover", observation=("state",))
+        >>> observation, info = env.reset(seed=0)
+        >>> observation, reward, terminated, truncated, info = env.step(np.full(4, 0.1, np.float32))
+        >>> observation.shape, terminated, info["margins"]["roll"]
+        ((12,), False, 5.0)
+        >>> env.close()
     """
 
     metadata: dict[str, Any] = {"render_modes": [*RENDER_MODES], "render_fps": 20}  # noqa: RUF012  as Gymnasium has it

@@ -19,7 +19,13 @@ ENTRY_POINT: Final = "scenarios.gym.environment:QuadrotorEnv"
 
 
 def environment_id(name: str) -> str:
-    """`quadsim/HummingbirdFigureEight-v0` for `hummingbird-figure-eight`."""
+    """The id of a scenario of that name.
+
+    Examples:
+        >>> import quadsim.gym
+        >>> quadsim.gym.environment_id("hummingbird-figure-eight")
+        'quadsim/HummingbirdFigureEight-v0'
+    """
     words = name.replace("_", "-").replace(".", "-").split("-")
     return f"quadsim/{''.join(word[:1].upper() + word[1:] for word in words)}-v0"
 

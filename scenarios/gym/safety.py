@@ -28,6 +28,17 @@ class MPCSafetyFilter(gymnasium.Wrapper):  # type: ignore[misc]
     Attributes:
         steps: steps of this episode.
         interventions: in how many of them it stepped in.
+
+    Examples:
+        >>> import numpy as np
+        >>> import quadsim.gym
+        >>> env = quadsim.gym.MPCSafetyFilter(quadsim.gym.make_env("robust", action="speeds"))
+        >>> observation, info = env.reset(seed=0)
+        >>> for _ in range(20):
+        ...     observation, reward, terminated, truncated, info = env.step(np.array([250.0, 0.0, 0.0, 250.0]))
+        >>> env.interventions, info["margins"]["pitch"] > 0.0, terminated
+        (20, True, False)
+        >>> env.close()
     """
 
     def __init__(self, env: gymnasium.Env[Any, Any], controller: Mapping[str, Any] | None = None) -> None:
@@ -45,7 +56,9 @@ class MPCSafetyFilter(gymnasium.Wrapper):  # type: ignore[misc]
         if not isinstance(base, QuadrotorEnv):
             raise ParameterError("", "env", type(base).__name__, "an environment of quadsim.gym")
         base.actions.of(np.zeros(4))
-        scenario = base.scenario if controller is None else base.scenario.replace({"controller": dict(controller)})
+        scenario = base.scenario
+        if controller is not None:
+            scenario = scenario.replace({"controller": dict(controller)})
         if not isinstance(scenario.controller, RobustSpec):
             raise ParameterError("controller", "type", scenario.controller.type, "robust, for a safety filter")
         self._base, self._spec = base, scenario.controller

@@ -26,7 +26,7 @@ class View(Protocol):
         """Show a period that has been flown; `factor` is simulated over real time."""
         ...
 
-    def move(self, frame: Frame, share: float) -> None:
+    def pose(self, frame: Frame, share: float) -> None:
         """Draw the vehicle at a share of the period, 0 to 1."""
         ...
 
@@ -106,7 +106,7 @@ class Pace:
                 continue
             view.show(frame, self._measured(session.period))
             for pose in range(1, POSES + 1):
-                view.move(frame, pose / POSES)
+                view.pose(frame, pose / POSES)
                 self._wait(session.period / self.speed / POSES)
             if session.reason is not None:
                 view.ended(session.reason)

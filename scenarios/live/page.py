@@ -132,10 +132,10 @@ class Page:
                 )
                 self._plot()
 
-    def move(self, frame: Frame, share: float) -> None:
+    def pose(self, frame: Frame, share: float) -> None:
         """See `scenarios.live.pacing.View`."""
         with self._server.atomic():
-            at = self.stage.move(frame, share)
+            at = self.stage.pose(frame, share)
             if self._follow.value:
                 for client in self._server.get_clients().values():
                     camera = client.camera

@@ -112,7 +112,7 @@ class Stage:
         for limit, handle in self._regions:
             handle.visible = limit.start <= frame.time <= limit.stop
 
-    def move(self, frame: Frame, share: float) -> Array:
+    def pose(self, frame: Frame, share: float) -> Array:
         """Draw the vehicles at a share of the period; where the first is (3,) [m]."""
         for sample, handle in zip(frame.samples, self.frames, strict=True):
             if sample is not None:

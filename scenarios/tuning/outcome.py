@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 import pyarrow as pa
@@ -16,8 +16,11 @@ from scenarios.campaign.statistics.inference import paired_difference
 from scenarios.campaign.statistics.requirement import judge
 from scenarios.schema.scenario import Scenario
 from scenarios.tuning.objective import STATISTICS
-from scenarios.tuning.plan import START, TuningPlan, Values
 from scenarios.tuning.ranking import Score, objective_values
+from scenarios.tuning.spec import START
+
+if TYPE_CHECKING:
+    from scenarios.tuning.plan import TuningPlan, Values
 
 NAMES: Final = ("start", "best")  # what the two are called that fly fresh draws
 

@@ -19,6 +19,7 @@ from scenarios.campaign.results.events import Event, parse_event
 from scenarios.campaign.spec import Value, VaryBase
 from scenarios.campaign.statistics.requirement import Requirement, parse_requirement
 from scenarios.limits import build_limits
+from scenarios.loading import check_parts, parse_scenario
 from scenarios.schema.bases import merge, read_scenario
 from scenarios.schema.problems import ScenarioError, describe
 from scenarios.schema.scenario import Scenario
@@ -27,7 +28,6 @@ from scenarios.shipped import tuning_path
 from scenarios.tuning.objective import Expression, parse_expression, require_columns
 from scenarios.tuning.spec import OWN, TuningSpec
 
-START: Final = 0  # the candidate that is the scenario as it is
 SEARCHED: Final = "search."  # how the columns of searched values begin
 Values = Mapping[str, Value]  # of a candidate, by the names of the entries of `[[search]]`; empty of the start
 
@@ -83,7 +83,9 @@ class TuningPlan:
             InputError: it is none.
         """
         changes = [(entry, values[entry.name]) for entry in self.spec.search if entry.name in values]
-        return changed(self._data, changes, table="search", name=name, seed=self.scenario.seed)
+        return changed(
+            self._data, changes, lambda data: parse_scenario({**data, "name": name}, source=name), table="search"
+        )
 
     def of(self, values: Values, *, name: str | None = None, fresh: bool = False) -> Plan:
         """The campaign of a candidate: on the draws of the search, or on fresh ones.
@@ -134,16 +136,16 @@ class TuningPlan:
                 parse_event(event.text, self.start.columns)
             except InputError as error:
                 raise InputError(f"{field}: {error}") from error
-        check_ends(self.spec.search, self._at, table="search")
+        check_ends(self.spec.search, self._check_at, table="search")
 
-    def _at(self, entry: VaryBase, value: Value) -> Scenario:
+    def _check_at(self, entry: VaryBase, value: Value) -> None:
         found = self.candidate({entry.name: value}, self.spec.name)
         if build_limits(found) != build_limits(self.scenario):
             rule = (
                 "of fields that leave alone what flights are held against: constraints, obstacles, regions, polytopes"
             )
             raise ParameterError(f"search.{entry.name}", "fields", entry.fields, rule)
-        return found
+        check_parts(found)
 
 
 def load_tuning(name: str, *, trials: int | None = None, seed: int | None = None) -> TuningPlan:

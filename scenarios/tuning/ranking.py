@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
@@ -17,7 +17,10 @@ from quadsim.state import Array
 from scenarios.campaign.results.events import Flags
 from scenarios.campaign.results.table import Row
 from scenarios.tuning.objective import STATISTICS
-from scenarios.tuning.plan import START, TuningPlan
+from scenarios.tuning.spec import START
+
+if TYPE_CHECKING:
+    from scenarios.tuning.plan import TuningPlan
 
 UNKNOWN: Final = 1e9  # an objective of a candidate that completed no flight
 

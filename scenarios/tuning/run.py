@@ -27,10 +27,11 @@ from scenarios.campaign.statistics.comparison import Comparison, compare
 from scenarios.schema.scenario import Scenario
 from scenarios.tuning.outcome import NAMES, Found, summarise
 from scenarios.tuning.pilot import TuningPilot
-from scenarios.tuning.plan import START, TuningPlan, Values
+from scenarios.tuning.plan import TuningPlan, Values
 from scenarios.tuning.ranking import Score, answer, pareto, ranked, score
 from scenarios.tuning.report.tuning_page import write_report
 from scenarios.tuning.search import JOURNAL_FILE, Search, require_optuna
+from scenarios.tuning.spec import START
 
 KIND: Final = "tuning"  # what `quadsim.outputs` calls a tuning's directory
 FORMAT: Final = "quadsim tuning"

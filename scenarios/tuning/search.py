@@ -15,14 +15,15 @@ from quadsim.errors import FileError, MissingPackageError
 from quadsim.outputs import Growing
 from scenarios.campaign.plan import cell
 from scenarios.campaign.spec import ChoiceSpec, IntegerSpec, LogUniformSpec, Value
-from scenarios.tuning.plan import START, TuningPlan, Values
 from scenarios.tuning.ranking import Score
-from scenarios.tuning.spec import SearchSpec
+from scenarios.tuning.spec import START, SearchSpec
 
 if TYPE_CHECKING:
     from optuna.distributions import BaseDistribution
     from optuna.study import Study
     from optuna.trial import FrozenTrial
+
+    from scenarios.tuning.plan import TuningPlan, Values
 
 JOURNAL_FILE: Final = "journal.log"
 _LEAST: Final = 4  # feasible trials from which importance is told

@@ -24,6 +24,7 @@ from scenarios.schema.base import LARGEST_SEED, Spec
 from scenarios.schema.writing import to_toml
 from scenarios.tuning.objective import parse_expression
 
+START: Final = 0  # the candidate that is the scenario as it is
 MOST_TRIALS: Final = 100_000
 MOST_FIELDS: Final = 50
 OWN: Final = ("flights", "seed", "name", "description")

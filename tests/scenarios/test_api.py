@@ -20,6 +20,7 @@ import pytest
 
 import mpc
 import quadsim
+import quadsim.gym
 from quadsim.controller import Moment
 from quadsim.errors import InputError, OutputError, ParameterError, RenderingUnavailableError, UnknownNameError
 from quadsim.flight import rundir
@@ -61,7 +62,7 @@ RENDERS = {"film", "draw_vehicle", "bench_render"}
 """Whose examples need a machine that renders."""
 
 
-@pytest.mark.parametrize("name", quadsim.__all__)
+@pytest.mark.parametrize("name", [*quadsim.__all__, *(f"gym.{name}" for name in quadsim.gym.__all__)])
 def test_every_docstring_has_an_example_that_runs(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -71,7 +72,7 @@ def test_every_docstring_has_an_example_that_runs(
         except RenderingUnavailableError as error:
             pytest.skip(str(error))
     monkeypatch.chdir(tmp_path)
-    public = quadsim.__getattr__(name)
+    public = functools.reduce(getattr, name.split("."), quadsim)
     runner = doctest.DocTestRunner(verbose=False)
     for example in doctest.DocTestFinder().find(public, name, module=sys.modules[public.__module__]):
         runner.run(example)
@@ -79,7 +80,7 @@ def test_every_docstring_has_an_example_that_runs(
     assert runner.failures == 0, capsys.readouterr().out
 
 
-@pytest.mark.parametrize("package", [quadsim, mpc])
+@pytest.mark.parametrize("package", [quadsim, quadsim.gym, mpc])
 def test_every_public_name_is_there_and_documented(package: object) -> None:
     for name in package.__all__:  # type: ignore[attr-defined]
         assert getattr(package, name).__doc__, name
@@ -90,9 +91,10 @@ def test_every_public_name_is_there_and_documented(package: object) -> None:
 
 def test_the_page_of_the_api_has_every_name() -> None:
     page = (EXAMPLES.parent / "docs/api.md").read_text(encoding="utf-8")
-    named = set(re.findall(r"^::: ((?:quadsim|mpc)\.\w+)$", page, re.MULTILINE))
+    named = set(re.findall(r"^::: ((?:quadsim|quadsim\.gym|mpc)\.\w+)$", page, re.MULTILINE))
     rooms = {name for name in mpc.__all__ if isinstance(getattr(mpc, name), ModuleType)}
-    assert named == {f"quadsim.{name}" for name in quadsim.__all__} | {f"mpc.{name}" for name in {*mpc.__all__} - rooms}
+    handed_out = {quadsim: {*quadsim.__all__}, quadsim.gym: {*quadsim.gym.__all__}, mpc: {*mpc.__all__} - rooms}
+    assert named == {f"{package.__name__}.{name}" for package, names in handed_out.items() for name in names}
 
 
 def test_commands_fly_load_and_measure_through_it_alone() -> None:

@@ -13,7 +13,7 @@ from quadsim.report.palette import BOUND, LINES, REFERENCE
 from quadsim.state import Array
 from scenarios.campaign.statistics.wording import label
 from scenarios.tuning.objective import parse_expression
-from scenarios.tuning.plan import START
+from scenarios.tuning.spec import START
 
 Summary = Mapping[str, Any]
 KINDS: Final = {

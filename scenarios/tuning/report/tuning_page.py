@@ -12,10 +12,10 @@ from quadsim.outputs import write_text
 from quadsim.report.pages.page import PAGE_FILE, render_page
 from quadsim.report.plots.panels import plotly_script
 from quadsim.report.table import Mark
-from scenarios.tuning.plan import START
 from scenarios.tuning.report import tuning_tables
 from scenarios.tuning.report.tuning_figure import write_tuning_figure
 from scenarios.tuning.report.tuning_plots import tuning_plots
+from scenarios.tuning.spec import START
 
 _FILES: Final = {
     "best.toml": "the answer (TOML)",

@@ -7,7 +7,7 @@ from typing import Any, Final
 
 from quadsim.report.table import ABSENT, Cell, Grid, Mark, format_number, line
 from scenarios.campaign.statistics.wording import count_of, label, p_value, signed_points
-from scenarios.tuning.plan import START
+from scenarios.tuning.spec import START
 
 Summary = Mapping[str, Any]
 _MOST_SHOWN: Final = 12

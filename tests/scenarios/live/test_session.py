@@ -185,7 +185,7 @@ class Nobody:
     def show(self, frame: Frame, factor: float) -> None:
         self.factor = factor
 
-    def move(self, frame: Frame, share: float) -> None:
+    def pose(self, frame: Frame, share: float) -> None:
         pass
 
     def ended(self, reason: str | None) -> None:

@@ -23,8 +23,9 @@ from scenarios.campaign.results.table import read_table
 from scenarios.loading import load_scenario
 from scenarios.run import fly_scenario
 from scenarios.tuning import run as module
-from scenarios.tuning.plan import START, TuningPlan, load_tuning
+from scenarios.tuning.plan import TuningPlan, load_tuning
 from scenarios.tuning.run import SUMMARY_FILE, TuningResult
+from scenarios.tuning.spec import START
 
 tune = functools.partial(module.tune, report=False)
 

@@ -11,10 +11,11 @@ from tuning_formula import write_tuning
 
 from quadsim.errors import FileError
 from quadsim.outputs import growing
-from scenarios.tuning.plan import START, TuningPlan, load_tuning
+from scenarios.tuning.plan import TuningPlan, load_tuning
 from scenarios.tuning.ranking import Score
 from scenarios.tuning.run import KIND
 from scenarios.tuning.search import JOURNAL_FILE, Search
+from scenarios.tuning.spec import START
 
 
 @pytest.fixture

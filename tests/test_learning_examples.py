@@ -1,0 +1,72 @@
+"""The examples on learning: a gradient that is one, a student that is audited, a filter that is needed."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import quadsim
+
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "examples"))
+
+import imitation  # noqa: E402
+import safety_filter  # noqa: E402
+
+
+def test_the_gradient_is_that_of_the_mean_squared_error() -> None:
+    network, rng = imitation.Network((5, 4, 3, 2)), np.random.default_rng(0)
+    x, y = rng.normal(size=(7, 5)), rng.normal(size=(7, 2))
+
+    def error() -> float:
+        return float(np.mean((network._layers(x)[-1] - y) ** 2))
+
+    parameters = [*network.weights[:-1], *network.offsets]
+    for parameter, slope in zip(parameters, network._gradient(x, y), strict=True):
+        for index in np.ndindex(parameter.shape):
+            there, step = parameter[index], 1e-6
+            parameter[index] = there + step
+            above = error()
+            parameter[index] = there - step
+            below = error()
+            parameter[index] = there
+            assert slope[index] == pytest.approx((above - below) / (2.0 * step), abs=1e-8)
+
+
+def test_features_are_the_same_from_an_observation_and_from_a_controllers_arguments() -> None:
+    rng = np.random.default_rng(0)
+    state, preview, command = rng.normal(size=12), rng.normal(size=(50, 4)), rng.normal(size=4)
+    observed = np.concatenate([(preview - state[[0, 2, 4, 10]]).ravel(), state, command])
+    found = imitation.of_observation(observed, 200.0)
+    assert found == pytest.approx(imitation.features(state, preview, command, 200.0), abs=1e-12)
+
+
+def test_the_network_learns_beyond_its_linear_map() -> None:
+    rng = np.random.default_rng(0)
+    x = rng.normal(size=(400, 3))
+    y = np.column_stack([x @ [1.0, -1.0, 0.5], np.clip(2.0 * x[:, 0], -1.0, 1.0)])
+    network = imitation.Network((3, 16, 16, 2))
+    linear = np.linalg.lstsq(x, y, rcond=None)[0]
+    assert network.fit(x, y, epochs=300, rate=1e-2) < 0.3 * np.sqrt(np.mean((x @ linear - y) ** 2))
+
+
+def test_a_student_is_audited_like_its_teacher(capsys: pytest.CaptureFixture[str]) -> None:
+    student = imitation.learn(courses=1, rounds=0, epochs=2)
+    assert "round 0: 600 samples" in capsys.readouterr().out
+    flights = imitation.compared(student, flights=1, duration=3.0)
+    assert [flights[name][0].controller for name in ("teacher", "student")] == ["constrained", "student"]
+    limits = [{finding.limit.name for finding in each[0].audit} for each in flights.values()]
+    assert limits == [{"roll", "pitch", "speed", "slew"}] * 3
+    assert flights["teacher"][0].satisfied
+    assert imitation.beyond(flights["student"][0]) > imitation.TOLERANCE  # hardly taught at all
+    assert imitation.beyond(flights["student behind the filter"][0]) < imitation.TOLERANCE
+
+
+def test_the_filter_is_needed(capsys: pytest.CaptureFixture[str]) -> None:
+    safety_filter.main(["gust"])
+    behind, alone = capsys.readouterr().out.splitlines()
+    assert behind.startswith("gust: 180 steps, tilt up to 4.")
+    assert "flown; stepped in" in behind
+    assert alone.endswith("lost; no filter")
