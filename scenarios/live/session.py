@@ -274,8 +274,10 @@ class Session:
                 for flight in self.flights:
                     if flight.loop.reason is None:
                         flight.apply(event)
-            except InputError as error:
-                refused.append(str(error))
+            except InputError as error:  # as where a scenario is full of events
+                refused.append(f"{error}; all is let go")
+                self._held = _Held()
+                return np.zeros(3)
         return force
 
 

@@ -14,6 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import quadsim
+import scenarios.parts.live
 from quadsim.errors import InputError
 from scenarios.cli import main
 from scenarios.commands import EXIT_WRONG_INPUT
@@ -149,6 +150,18 @@ def test_what_is_refused_is_said_and_changes_nothing(session: Session) -> None:
         (said,) = session.advance().refused
         assert said
     assert session.flight().scenario.events == before
+
+
+def test_what_cannot_be_held_any_more_is_let_go_and_said_once(
+    session: Session, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(scenarios.parts.live, "MOST_EVENTS", 20)
+    session.submit({"type": "pull", "to": [0.3, 0.0, 1.0]})
+    session.submit({"type": "wear", "rotor": 2, "loss": 0.02})
+    (said,) = [said for frame in flown(session, 30) for said in frame.refused]
+    assert "20 or fewer" in said
+    assert session.reason is None
+    assert same_bits(session)
 
 
 def test_a_second_vehicle_feels_the_same(hover: Scenario) -> None:
