@@ -42,7 +42,7 @@ _STEER: Final = {"W": (1, 0, 0), "S": (-1, 0, 0), "A": (0, 1, 0), "D": (0, -1, 0
 _STEER_STEP: Final = 0.5
 """[m/s] by which a key changes it."""
 _STEER_MOST: Final = 5.0
-_ACTIVE: Final = 0.05
+_ACTIVE: Final = 0.1
 """Share of a bound's scale within which a margin counts as active."""
 _FAULTS: Final = ("dropout", "freeze", "nan")
 
