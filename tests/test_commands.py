@@ -33,6 +33,7 @@ ADDED = {
     "bench ladder": ("--set", "controller.horizon=5"),
     "campaign": ("--set", "duration=1.0", "--flights", "2", "--no-report", "--out", "campaign"),
     "tune": ("--no-report",),
+    "live": ("--script", "push.toml"),
     "replay": ("--no-video", "--no-recording", "--no-figures"),
 }
 """What makes a command cheap enough to run here."""
@@ -48,8 +49,9 @@ LINES = [
     for line in block.splitlines()
 ]
 QUADSIM = [line.partition("#")[0].strip() for line in LINES if line.startswith("quadsim ")]
-RUNNABLE = [line for line in QUADSIM if not line.startswith("quadsim view") and "--cluster" not in line]
-"""`view` opens a window and stays; a cluster has tests of its own."""
+ELSEWHERE = ("quadsim view", "--cluster", "--fly")
+"""`view` opens a window and stays; a cluster, and what takes an emulator, have tests of their own."""
+RUNNABLE = [line for line in QUADSIM if not any(word in line for word in ELSEWHERE)]
 
 
 def arguments_of(line: str) -> list[str]:
@@ -87,6 +89,9 @@ def workplace(flown: Path, campaign: Path, tmp_path: Path, monkeypatch: pytest.M
         tmp_path / "tuning.toml"
     )
     (tmp_path / "mine-vehicle.toml").write_text(quadsim.vehicle_template())
+    (tmp_path / "push.toml").write_text(
+        'duration = 0.2\ninputs = [{ at = 0.1, type = "pull", to = [1.0, 0.0, 1.0] }]\n'
+    )
     for name in ("paper-unconstrained", "paper-constrained"):
         shutil.copytree(flown, tmp_path / "runs" / name)
     monkeypatch.chdir(tmp_path)
