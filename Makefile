@@ -4,7 +4,7 @@
 
 .NOTPARALLEL:
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test peers check docs format types build numbers verification nonlinear robustness first-flights reproduce speed soak campaigns tuning kills safety firmware export-numbers pins clean
+.PHONY: help setup demo test peers check docs format types build numbers verification nonlinear robustness first-flights reproduce speed soak campaigns live tuning kills safety firmware export-numbers pins clean
 
 VENV := .venv
 PY := $(VENV)/bin/python
@@ -120,6 +120,9 @@ campaigns: setup  ## fly the campaigns that ship and remake docs/paper-robustnes
 
 tuning: setup  ## carry out the tunings that ship and remake docs/tuning.md, up to half an hour each; goes on with what is there
 	@$(PY) docs/make_tuning.py
+
+live: setup $(VENV)/.browser  ## remake the numbers of docs/live.md: load, latency and bandwidth of a session; a minute
+	@$(PY) docs/make_live.py
 
 safety: setup  ## attack all that writes or reads files, and remake the counts on docs/safety.md: some forty minutes
 	@PYTHONPATH=tests $(PY) docs/make_safety.py

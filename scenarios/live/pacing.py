@@ -105,8 +105,8 @@ class Pace:
                 view.ended(session.reason)
                 continue
             view.show(frame, self._measured(session.period))
-            for pose in range(1, POSES + 1):
-                view.pose(frame, pose / POSES)
+            for share in range(1, POSES + 1):
+                view.pose(frame, share / POSES)
                 self._wait(session.period / self.speed / POSES)
             if session.reason is not None:
                 view.ended(session.reason)

@@ -35,7 +35,7 @@ from scenarios.schema.controller import ControllerSpec
 SECONDS: Final = 20.0
 """Of the plots."""
 _EVERY: Final = 4
-"""Periods from one update of panel and plots to the next: a fifth of a second at 20 Hz."""
+"""Periods from one update of the panel to the next, a fifth of a second at 20 Hz; plots take two of these."""
 _SPEEDS: Final = ("0.1", "0.25", "0.5", "1", "2", "4")
 _STEER: Final = {"W": (1, 0, 0), "S": (-1, 0, 0), "A": (0, 1, 0), "D": (0, -1, 0), "R": (0, 0, 1), "F": (0, 0, -1)}
 """Keys, and the direction of the set-point's velocity that each adds to."""
@@ -49,10 +49,10 @@ _FAULTS: Final = ("dropout", "freeze", "nan")
 STYLE: Final = """<style>
 .q{font:12px/1.45 system-ui,sans-serif;padding:0 .6em}.q b{font-variant-numeric:tabular-nums}
 .q table{width:100%;border-collapse:collapse}.q td{padding:1px 4px 1px 0;white-space:nowrap}
-.q .t{width:35%;min-width:50px}.q .r{position:relative;height:9px;background:#8884;border-radius:3px;overflow:hidden}
+.q .t{width:30%;min-width:40px}.q .r{position:relative;height:9px;background:#8884;border-radius:3px;overflow:hidden}
 .q .f{position:absolute;left:0;top:0;bottom:0;border-radius:3px}
 .q .n{text-align:right;font-variant-numeric:tabular-nums}
-.q .w{min-width:3.7em}.q .bad{color:#dc2f38;font-weight:600}.q .act{font-weight:600}.q .act .w{color:#b26b00}
+.q .w{width:3.9em;font-size:11px}.q .bad{color:#dc2f38;font-weight:600}.q .act{font-weight:600}.q .act .w{color:#b26b00}
 </style>"""
 
 
@@ -137,6 +137,7 @@ class Page:
                 self._margins.content = _bars(
                     self._session.limits, frame, self._session.flights[-1].loop.controller.name
                 )
+            if frame.k % (2 * _EVERY) == 0 or self._pace.paused:
                 self._plot()
 
     def pose(self, frame: Frame, share: float) -> None:
@@ -148,8 +149,9 @@ class Page:
                     if client.client_id in self._aims:
                         camera = client.camera
                         away = np.asarray(camera.position) - camera.look_at
-                        camera.look_at = at + self._aims[client.client_id]
-                        camera.position = camera.look_at + away
+                        look_at = at + self._aims[client.client_id]
+                        camera.position = look_at + away  # which moves where it looks
+                        camera.look_at = look_at
         self._server.flush()
 
     def ended(self, reason: str | None) -> None:
@@ -298,7 +300,9 @@ class Page:
             origin, direction = np.array(event.ray_origin), np.array(event.ray_direction)
             if origin[2] * direction[2] < 0.0:  # it meets the ground
                 meets = origin - origin[2] / direction[2] * direction
-                at = [round(float(each), 2) for each in (*meets[:2], place.value[2])]
+                sample = None if self._frame is None else self._frame.samples[0]
+                height = place.value[2] if sample is None else sample.observation.reference[2]
+                at = [round(float(each), 2) for each in (*meets[:2], height)]
                 self._handle.position, place.value = np.array(at), tuple(at)
                 self._set_point(at)
 
@@ -442,9 +446,10 @@ class Page:
         unit, at = self.stage.unit, np.asarray(self.stage.frames[0].position)
         away = unit * np.array([-4.0, -6.0, 3.0])
         upright = client.camera.aspect < 1.0  # a phone, whose lower half is the panel
-        self._aims[client.client_id] = np.array([0.0, 0.0, -0.35 * np.linalg.norm(away)]) * upright
-        client.camera.look_at = at + self._aims[client.client_id]
-        client.camera.position = client.camera.look_at + away
+        self._aims[client.client_id] = np.array([0.0, 0.0, -0.5 * np.linalg.norm(away)]) * upright
+        look_at = at + self._aims[client.client_id]
+        client.camera.position = look_at + away  # which moves where it looks
+        client.camera.look_at = look_at
         take = client.gui.add_button("Take the controls", visible=self._driver != client.client_id)
 
         async def taken(event: Any) -> None:
@@ -523,7 +528,7 @@ class Page:
     def _plot(self) -> None:
         if len(self._history) < 2:
             return
-        table = np.array(self._history).T
+        table = np.array(self._history)[::2].T  # plots are the most of what is sent
         first = 1
         for plot, count in zip(self._plots, (3, 2, 4, 1), strict=True):
             plot.data = (table[0], *table[first : first + count])
@@ -568,9 +573,9 @@ def _bars(limits: tuple[Limit, ...], frame: Frame, other: str) -> str:
             colour = BOUND if red else LINES[1] if active else LINES[2] if i == 0 else LINES[4]
             mark = "bad" if red else "act" if active else ""
             fill = f'<div class="f" style="width:{100.0 * share:.0f}%;background:{colour}"></div>'
-            name = escape(limit.name if i == 0 else f"{limit.name}, {other}")
+            name = escape(limit.name if i == 0 else f"by {other}")
             said = "violated" if red else "active" if active else ""
-            number = f'<td class="n">{margin:+.3g} {escape(limit.unit)}</td><td class="w">{said}</td>'
+            number = f'<td class="n">{margin:+.2g} {escape(limit.unit)}</td><td class="w">{said}</td>'
             rows.append(
                 f'<tr class="{mark}"><td>{name}</td><td class="t"><div class="r">{fill}</div></td>{number}</tr>'
             )

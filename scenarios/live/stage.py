@@ -19,8 +19,10 @@ from quadsim.state import Array
 from quadsim.vehicle import Vehicle
 from scenarios.live.session import Frame, Session
 
-TRAIL: Final = 400
-"""Periods of the flown path that stay."""
+TRAIL: Final = 200
+"""Points of the flown path that stay."""
+_EVERY: Final = 2
+"""Periods from one to the next; every point is sent anew with each."""
 _FACES: Final = 12
 """Of what is round."""
 _WIDE: Final = 20.0
@@ -95,8 +97,9 @@ class Stage:
             thrusts = self._coefficient * np.square(sample.rotors)
             tips = self._rotors + np.outer(thrusts, [0.0, 0.0, self._thrust])
             self._arrows[i].points = np.stack([self._rotors, tips], axis=1).astype(np.float32)
-            self._trails[i].append(sample.segment.physics[-1, 1:4])
-            self._paths[i].points = _segments(np.array(self._trails[i]), TRAIL)
+            if frame.k % _EVERY == 0:
+                self._trails[i].append(sample.segment.physics[-1, 1:4])
+                self._paths[i].points = _segments(np.array(self._trails[i]), TRAIL)
             length, line = self._horizons[i]
             if horizon is not None:
                 line.points = _segments(horizon, length)
