@@ -109,8 +109,8 @@ export-numbers: setup $(VENV)/.firmware  ## remake docs/export.md: exported cont
 speed: setup  ## fly every controller ever faster and remake docs/speed.md: some six minutes
 	@$(PY) docs/make_speed.py
 
-gym: setup  ## remake the numbers and the figure of docs/gym.md: some ten minutes
-	@$(PY) docs/make_gym.py
+gym: setup  ## remake the numbers and the figure of docs/gym.md: some ten minutes; CRAZYFLOW=PYTHON times that beside it
+	@$(PY) docs/make_gym.py $(if $(CRAZYFLOW),--crazyflow $(CRAZYFLOW))
 
 soak: setup  ## one simulated hour on end: memory and step time have to stay as they were
 	@$(PY) tests/soak.py --minutes 60
@@ -179,7 +179,7 @@ $(VENV)/.renders: $(VENV)/.installed
 
 $(VENV)/.browser: $(VENV)/.installed
 	@if $(HAS_BROWSER) || { { $(call apt,chromium); } && $(HAS_BROWSER); }; then touch $@; \
-	else echo "Until then the tests that open the comparison page in a browser are skipped." >&2; fi
+	else echo "Until then the tests that open pages in a browser are skipped." >&2; fi
 
 $(VENV)/.firmware: $(VENV)/.installed
 	@if $(HAS_FIRMWARE_TOOLS) || { { $(call apt,gcc libc6-dev gcc-arm-none-eabi libnewlib-arm-none-eabi qemu-system-arm \

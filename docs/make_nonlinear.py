@@ -1,7 +1,7 @@
 """Remake the section of docs/performance.md on steps of nonlinear MPC: `make nonlinear`.
 
-What the controller was asked in two flights is put to it with several QP solvers, to acados' real-time iteration and to
-IPOPT, in turns (`scenarios.bench.timing`).
+What the controller was asked in two flights is put to it with several QP solvers, to acados' real-time iteration, to
+IPOPT and to do-mpc, in turns (`scenarios.bench.timing`).
 """
 
 from __future__ import annotations
@@ -19,7 +19,8 @@ from make_numbers import ROOT, Table, markdown, write_page
 from make_performance import NONLINEAR as TITLE
 from make_robust_step import TITLE as NEXT
 from peers.casadi_ocp import Case, Peer
-from peers.nonlinear_optimum import PAPER
+from peers.do_mpc_ocp import DoMPC
+from peers.nonlinear_optimum import ALLOWED, PAPER
 
 from mpc.nonlinear.controller import NonlinearMPC
 from mpc.nonlinear.reference import nodes_of_motion
@@ -52,17 +53,19 @@ TARGETS: Final = {10: (0.30, 1.0), 20: (1.5, math.inf)}
 TEXT: Final = """\
 `make nonlinear` remakes this section; processor time, on one machine ({processor}, {cores} cores), each table in one
 run: read the ratios. What the controller was asked in flights of the library, {asked} periods of each, is put to it
-with other QP solvers, and to the same optimal control problem in CasADi (`tests/peers/casadi_ocp.py`), solved by acados
-and by IPOPT. As in the tables above the plant flies a period between two steps, and each step is the median of its
-repeats. All start along the reference in each segment of 20 periods, and go on along their own last plan; IPOPT
-converges each time, the others take one step of the real-time iteration. u0 difference is the largest of a rotor's
-first input from `daqp`'s, as a share of the largest.
+with other QP solvers, and to the same optimal control problem in CasADi (`tests/peers/casadi_ocp.py`), solved by
+acados, by IPOPT, and by do-mpc, which calls IPOPT. As in the tables above the plant flies a period between two steps,
+and each step is the median of its repeats. IPOPT starts along the reference each time and converges; the others do in
+each segment of 20 periods, go on along their own last plan, and take one step of the real-time iteration. u0 difference
+is the largest of a rotor's first input from `daqp`'s, as a share of the largest.
 
 {tables}
 - The unconstrained optimum satisfies all bounds in {free} of these periods: condensed, it is then found by one
   Cholesky factorisation, whatever the solver. Elsewhere the difference is what PIQP's tolerance leaves.
 - acados is generated C (`SQP_RTI`, partial condensing, HPIPM), called from Python with the references of all nodes;
   ours is NumPy.
+- IPOPT's differences are those of converged optima from one step of the real-time iteration. With ours converged as
+  well, `tests/peers` holds both IPOPT's and do-mpc's inputs to {ALLOWED:g} of the largest.
 - acados is no peer of `make peers`: its wheel, `comma-deps-acados`, brings a slim `casadi` that would overwrite the
   peers', its libraries find one another only when loaded in turn, and a problem takes a C compiler. `make nonlinear`
   installs it in a directory of its own.
@@ -113,9 +116,9 @@ class Ours:
 
 
 class InCasadi:
-    """acados or IPOPT as a candidate, with a case's states and nodes made before the clock starts."""
+    """A case by acados, IPOPT or do-mpc as a candidate, with a case's states and nodes made before the clock starts."""
 
-    def __init__(self, case: Case, solver: AcadosRTI | Peer, law: NonlinearMPC, asked: list[Any]) -> None:
+    def __init__(self, case: Case, solver: AcadosRTI | Peer | DoMPC, law: NonlinearMPC, asked: list[Any]) -> None:
         self._case, self._solver, self._law, self._asked, self._period = case, solver, law, asked, -2
         self.first: dict[int, Array] = {}
         self.failures = 0
@@ -143,12 +146,12 @@ class InCasadi:
 
     def answer(self) -> None:
         """See `scenarios.bench.timing.Candidate.answer`."""
-        if isinstance(self._solver, Peer):
-            found = self._solver.optimum(*self._question, self._before)
-            first, failed = found.inputs[0], not found.solved
-        else:
+        if isinstance(self._solver, AcadosRTI):
             status, first = self._solver.step(*self._question)
             failed = status != 0
+        else:
+            found = self._solver.optimum(*self._question, self._before)
+            first, failed = found.inputs[0], not found.solved
         self.failures += failed
         self.first.setdefault(self._period, first)
 
@@ -174,6 +177,7 @@ def measure(name: str, directory: Path, scratch: Path, stride: int) -> tuple[Tab
         **{solver: Ours(law(solver=solver), recorder.asked) for solver in SOLVERS},
         "acados, HPIPM": acados,
         "IPOPT through CasADi": InCasadi(case, Peer(case), recorder.law, recorder.asked),
+        "IPOPT through do-mpc": InCasadi(case, DoMPC(case), recorder.law, recorder.asked),
     }
     asked = segments(len(recorder.asked), stride)
     periods = [period for segment in asked for period in segment]
@@ -217,7 +221,7 @@ def main() -> None:
     targets: Table = [("quantity", "target", "measured", "verdict"), *(row for each in found for row in each[2])]
     tables = "\n".join([*(markdown(each[0]) for each in found), markdown(targets)])
     free = ", ".join(each[1] for each in found[:-1]) + f" and {found[-1][1]}"
-    section = f"{TITLE}\n\n{TEXT.format(tables=tables, free=free, asked=found[0][3], **machine())}\n"
+    section = f"{TITLE}\n\n{TEXT.format(ALLOWED=ALLOWED, tables=tables, free=free, asked=found[0][3], **machine())}\n"
     start, title, rest = PAGE.read_text(encoding="utf-8").partition(TITLE)
     if not title:
         start, before, rest = start.partition(NEXT)

@@ -37,7 +37,7 @@ class BodyRateLoop:
 
     def __init__(self, vehicle: Vehicle, *, rate: float, bandwidth: float, bounds: ActuatorBounds) -> None:
         self.rate, self._bandwidth, self._bounds = rate, bandwidth, bounds
-        self._allocation, self._inertia = make_allocation(vehicle), np.array(vehicle.inertia)
+        self._allocation, self._inertia = make_allocation(vehicle), vehicle.inertia
         self.thrust, self.rates = vehicle.mass * vehicle.gravity, np.zeros(3)
 
     def speeds(self, time: float, commanded: Array, rates: Array, rotors: Array) -> Array:
@@ -46,9 +46,16 @@ class BodyRateLoop:
 
     def asked(self, rates: Array) -> Array:
         """Rotor speeds (4,) [rad/s] at body rates (3,) [rad/s]."""
-        J = self._inertia
-        torque = J * (self._bandwidth * (self.rates - rates)) + np.cross(rates, J * rates)
-        wrench = np.array([self.thrust, *torque])
+        (p, q, r), (J_x, J_y, J_z), k = rates.tolist(), self._inertia, self._bandwidth
+        p_c, q_c, r_c = self.rates.tolist()
+        wrench = np.array(
+            [
+                self.thrust,
+                J_x * k * (p_c - p) + (J_z - J_y) * q * r,
+                J_y * k * (q_c - q) + (J_x - J_z) * r * p,
+                J_z * k * (r_c - r) + (J_y - J_x) * p * q,
+            ]
+        )
         return allocate(self._allocation, wrench, self._bounds.u_min, self._bounds.u_max)
 
     def command(self, rates: Array, horizon: int) -> Command:

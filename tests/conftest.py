@@ -47,6 +47,7 @@ LONG = (
     *("mpc/robust/test_robust.py", "scenarios/test_reaudit.py", "scenarios/test_run.py", "scenarios/test_cli.py"),
     *("mpc/test_staged.py", "scenarios/campaign/test_commands.py", "scenarios/test_mutations.py"),
     *("test_packaging.py", "mpc/test_diagnosis.py", "mpc/robust/test_tightening.py", "mpc/exact/test_shortcut.py"),
+    *("scenarios/gym/test_environment.py", "test_learning_examples.py"),
     *("mpc/fallback/test_fallback_flights.py", "scenarios/test_soak.py"),
     *("scenarios/campaign/statistics/test_drivers.py", "scenarios/papers/test_beyond.py"),
     *("scenarios/tuning/test_run.py", "scenarios/tuning/report/test_tuning_page.py"),

@@ -33,6 +33,7 @@ ADDED = {
     "bench ladder": ("--set", "controller.horizon=5"),
     "campaign": ("--set", "duration=1.0", "--flights", "2", "--no-report", "--out", "campaign"),
     "tune": ("--no-report",),
+    "live": ("--script", "push.toml"),
     "replay": ("--no-video", "--no-recording", "--no-figures"),
 }
 """What makes a command cheap enough to run here."""
@@ -88,6 +89,9 @@ def workplace(flown: Path, campaign: Path, tmp_path: Path, monkeypatch: pytest.M
         tmp_path / "tuning.toml"
     )
     (tmp_path / "mine-vehicle.toml").write_text(quadsim.vehicle_template())
+    (tmp_path / "push.toml").write_text(
+        'duration = 0.2\ninputs = [{ at = 0.1, type = "pull", to = [1.0, 0.0, 1.0] }]\n'
+    )
     for name in ("paper-unconstrained", "paper-constrained"):
         shutil.copytree(flown, tmp_path / "runs" / name)
     monkeypatch.chdir(tmp_path)

@@ -8,12 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import quadsim
-
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "examples"))
 
-import imitation  # noqa: E402
-import safety_filter  # noqa: E402
+import imitation
+import safety_filter
 
 
 def test_the_gradient_is_that_of_the_mean_squared_error() -> None:
@@ -70,3 +68,10 @@ def test_the_filter_is_needed(capsys: pytest.CaptureFixture[str]) -> None:
     assert behind.startswith("gust: 180 steps, tilt up to 4.")
     assert "flown; stepped in" in behind
     assert alone.endswith("lost; no filter")
+
+
+def test_the_count_of_violations_that_samples_miss_is_todays() -> None:
+    import make_gym
+
+    table = make_gym.markdown(make_gym.between_samples()[0])
+    assert table in make_gym.PAGE.read_text(encoding="utf-8"), "docs/gym.md is out of date: make gym"

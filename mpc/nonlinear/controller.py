@@ -161,6 +161,9 @@ class NonlinearMPC:
     def _shares(self, speeds: Array) -> Array:
         return self._model.shares(self._vehicle.thrust_coefficient * np.square(speeds))
 
+    def _clip(self, shares: Array) -> Array:
+        return np.minimum(np.maximum(shares, self._lower), self._upper)
+
     def _speeds(self, shares: Array) -> Array:
         """Rotor speeds [rad/s] of inputs."""
         return np.sqrt(self._model.thrusts(np.maximum(shares, 0.0)) / self._vehicle.thrust_coefficient)
@@ -339,8 +342,7 @@ class NonlinearMPC:
                 self.unanswered = Unanswered(problem=problem, query=query, status=status, time=now.time)
             self._plan = None
             return self._refuse(status, answer)
-        shares = np.minimum(np.maximum(answer.plan, self._lower), self._upper)
-        speeds = self._speeds(shares)
+        speeds = self._speeds(self._clip(answer.plan))
         self._acting = speeds[0] = self._bounds.clip(speeds[0], self._acting)
         plan = speeds if self.settings.stride == 1 else np.repeat(speeds, self.settings.stride, axis=0)
         return command_of(speeds[0], plan, answer.solution.status, answer)
@@ -490,7 +492,7 @@ class NonlinearMPC:
         if self._tilted:
             s0 = np.append(s0, thrust_axis(measured[Q])[:2])
         if self._plan is None:
-            self._plan = start, np.minimum(np.maximum(inputs, self._lower), self._upper)
+            self._plan = start, self._clip(inputs)
         elif self._shift:
             x, u = self._plan
             self._plan = np.concatenate([x[1:], x[-1:]]), np.concatenate([u[1:], u[-1:]])
@@ -551,10 +553,10 @@ class NonlinearMPC:
         status, plan = answer.solution.status, answer.plan
         if status not in ACCEPTED:
             return status
-        if not np.isfinite(plan).all():
-            return "not_finite"
-        beyond = np.maximum(self._lower - plan, plan - self._upper).max()
-        return "out_of_bounds" if beyond > OUTSIDE else None
+        beyond = np.abs(plan - self._clip(plan)).max()
+        if beyond <= OUTSIDE:
+            return None
+        return "out_of_bounds" if np.isfinite(plan).all() else "not_finite"
 
     def _stop(self, phase: Phase) -> Command:
         self._acting, _ = self._bounds.reach(self._acting)

@@ -8,7 +8,7 @@ import numpy as np
 
 from mpc.nonlinear.rigidbody import N_BODY, P, Q, V, W
 from quadsim.motion import Motion
-from quadsim.state import Array
+from quadsim.state import Array, Indices
 
 
 class Nodes(NamedTuple):
@@ -20,11 +20,14 @@ class Nodes(NamedTuple):
 
 def nodes_of_motion(motion: Motion, horizon: int, stride: int) -> Nodes:
     """The samples k, k + stride, ...; where these end, the last of them again, and of thrusts the last but one."""
-    at = np.arange(0, horizon * stride + 1, stride)
-    there = at[: (len(motion) - 1) // stride + 1]
-    if there.size > horizon:
-        with_inputs = at[:-1]
+    at: slice | Indices
+    with_inputs: slice | Indices
+    last = (len(motion) - 1) // stride
+    if last >= horizon:
+        at, with_inputs = slice(0, horizon * stride + 1, stride), slice(0, horizon * stride, stride)
     else:
+        at = np.arange(0, horizon * stride + 1, stride)
+        there = at[: last + 1]
         at = np.concatenate([there, np.full(at.size - there.size, there[-1])])
         before = there[:-1] if there.size > 1 else there
         with_inputs = np.concatenate([before, np.full(horizon - before.size, before[-1])])

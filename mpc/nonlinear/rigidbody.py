@@ -142,18 +142,20 @@ def _features(gyration: tuple[float, float, float]) -> Array:
     return read_only(F.reshape(11, -1))
 
 
-_FIRST, _SECOND = np.array([1, 0, 2, 0, 1, 2]), np.array([3, 2, 3, 1, 1, 2])
+_PAIRS: Final = np.array([1, 0, 2, 0, 1, 2, 3, 2, 3, 1, 1, 2])
 _THRUST_AXIS: Final = np.array(
     [[2.0, 0.0, 0.0], [2.0, 0.0, 0.0], [0.0, 2.0, 0.0], [0.0, -2.0, 0.0], [0.0, 0.0, -2.0], [0.0, 0.0, -2.0]]
 )
 _UP: Final = np.array([0.0, 0.0, 1.0])
 _EYE: Final = np.eye(3)
+_START: Final = np.eye(_TURNING, _TURNING + 2 * N_ROTORS + 1)
 _HALF: Final = np.repeat([0.5, 0.0, 0.5], [4, 3, 3])
 
 
 def thrust_axis(q: Array) -> Array:
     """R(q) e_z (..., 3) of quaternions (..., 4) of any length."""
-    return np.asarray((q[..., _FIRST] * q[..., _SECOND]) @ _THRUST_AXIS + _UP)
+    pairs = q.take(_PAIRS, axis=-1)
+    return np.asarray((pairs[..., :6] * pairs[..., 6:]) @ _THRUST_AXIS + _UP)
 
 
 def rotation(q: Array) -> Array:
@@ -195,7 +197,7 @@ def linearise_nodes(model: RigidBody, x: Array, u: Array, frames: Array | None =
     M, n, lagging = len(x), model.n, model.rotor_lag is not None
     m = n - 3 + N_ROTORS + 1  # columns: q, v, omega, rotors, inputs, and the value
     Y = np.empty((M, _TURNING, m))
-    Y[:] = np.eye(_TURNING, m)
+    Y[:] = _START[:, :m]
     if frames is not None:
         Y[:, _q, _q] = frames[:M].transpose(0, 2, 1)
     Y[:, :, -1] = x[:, 3:N_BODY]
@@ -203,19 +205,20 @@ def linearise_nodes(model: RigidBody, x: Array, u: Array, frames: Array | None =
     drives = _drives(model, x, u)
     constant = model.acceleration - model.gravity * _UP
     z, G = np.empty((M, 11)), np.zeros((M, _TURNING, m))
+    # Views are taken once: at ten nodes a step is made of calls, not of sums.
+    z_q, z_w, z_Tq, features = z[:, :4], z[:, 4:7], z[:, 7:], model.features
+    G_v, G_end, G_w = G[:, _v, _TURNING:], G[:, _v, -1], G[:, _w, _TURNING:]
 
     def slope(k: int, Y: Array) -> Array:
         state, drive = Y[:, :, -1], drives[k if lagging else 0]
         q = state[:, _q]
-        z[:, :4], z[:, 4:7] = q, state[:, _w]
-        np.multiply(q, drive[:, 0, -1:], out=z[:, 7:])
-        F = (z @ model.features).reshape(M, _TURNING, _TURNING)
-        axis = (q.take(_FIRST, axis=1) * q.take(_SECOND, axis=1)) @ _THRUST_AXIS
-        axis += _UP
-        np.multiply(axis[:, :, None], drive[:, :1], out=G[:, _v, _TURNING:])
-        G[:, _v, -1] += constant
+        z_q[:], z_w[:] = q, state[:, _w]
+        np.multiply(q, drive[:, 0, -1:], out=z_Tq)
+        F = (z @ features).reshape(M, _TURNING, _TURNING)
+        np.multiply(thrust_axis(q)[:, :, None], drive[:, :1], out=G_v)
+        np.add(G_end, constant, out=G_end)
         if lagging or k == 0:
-            G[:, _w, _TURNING:] = drive[:, 1:]
+            G_w[:] = drive[:, 1:]
         dragging = _drag(model, F, state) if model.drags else None
         K = F @ Y
         K[:, :, -1] *= _HALF

@@ -130,6 +130,8 @@ class Condensed:
             target=factor,
             root_end=_root(objective.terminal_weights[0]),
             H=_input_hessian(self._problem),
+            of_inputs=2.0 * objective.Q_u,
+            of_move=2.0 * objective.move_weight,
             P=np.array(blank.P),
             G=np.array(blank.G, order="C"),
             S=_inputs_of_steps(self._problem),
@@ -156,7 +158,8 @@ class Condensed:
         fixed, count = self._changing, len(rows.C)
         # Columns are the inputs of all steps, and the last is what no input changes; below the states of each step are
         # its own inputs and 1, so that one product with [A B c] makes the next.
-        S, steps = fixed.S.copy(), np.concatenate([A, B, c[:, :, None]], axis=2)
+        S, steps = np.empty_like(fixed.S), np.concatenate([A, B, c[:, :, None]], axis=2)
+        S[0, :n], S[:, n:] = 0.0, fixed.S[:, n:]
         S[0, :n, m] = state
         for t in range(N):
             np.dot(steps[t], S[t], out=S[t + 1, :n])
@@ -171,10 +174,10 @@ class Condensed:
         square = stacked.T @ stacked
         square *= 2.0
         P, gradient = fixed.P.copy(order="F"), self._linear.copy()
-        np.add(square[:m, :m], fixed.H, out=P[:m, :m])
+        np.add(square.T[:m, :m], fixed.H.T, out=P[:m, :m])  # symmetric both
         gradient[:m] += square[:m, m]
-        gradient[:m].reshape(N, nu)[:] -= rest.u @ (2.0 * objective.Q_u)
-        gradient[:nu] -= 2.0 * objective.move_weight @ u_before
+        gradient[:m].reshape(N, nu)[:] -= rest.u @ fixed.of_inputs
+        gradient[:nu] -= fixed.of_move @ u_before
         blank = self._blank
         G, h_l, h_u = blank.G, blank.h_l, blank.h_u
         if count:
@@ -231,6 +234,8 @@ class _Changing:
     target: Array  # (n_r, n_r)
     root_end: Array | None  # (r, n) of the last state's; None where that costs nothing
     H: Array  # (N nu, N nu) of inputs and their changes
+    of_inputs: Array  # (nu, nu) of an input's gradient
+    of_move: Array  # (nu, nu) of the first change's
     P: Array  # (N nu + N m_s, N nu + N m_s)
     G: Array  # (N m, N nu + N m_s)
     S: Array  # (N + 1, n + nu + 1, N nu + 1) each step's inputs and 1, as functions of all inputs and 1, below n zeros

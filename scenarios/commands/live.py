@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import os
 import sys
 import webbrowser
 from argparse import Namespace
 from collections.abc import Callable
 from pathlib import Path
 
-from quadsim.errors import ParameterError
-from quadsim.outputs import real_path
+from quadsim.errors import OutputError, ParameterError
+from quadsim.flight.rundir import KIND
+from quadsim.outputs import real_path, require_directory
 from scenarios.commands import EXIT_DONE, EXIT_FAILED, console
 from scenarios.commands.common import load
 from scenarios.live.pacing import Pace
@@ -31,6 +33,7 @@ def live(options: Namespace) -> int:
     against = None if options.against is None else load(options.against, Namespace(settings=[], seed=None)).controller
     script = None if options.script is None else read_script(options.script)
     target = real_path(Path("runs") / f"{scenario.name}-live" if options.out is None else options.out)
+    _require_writable(target)
     session = Session(scenario, against)
 
     def save(session: Session) -> str:
@@ -51,6 +54,18 @@ def live(options: Namespace) -> int:
         return EXIT_DONE if session.reason is None else EXIT_FAILED
     finally:
         session.close()
+
+
+def _require_writable(target: Path) -> None:
+    """Refuse, before anything is flown, a place that could not be written.
+
+    Raises:
+        OutputError: it could not.
+    """
+    require_directory(target, KIND)
+    parent = next(each for each in target.parents if each.exists())
+    if not os.access(parent, os.W_OK | os.X_OK):
+        raise OutputError(target, f"{parent} is not writable")
 
 
 def _serve(session: Session, options: Namespace, save: Callable[[Session], str]) -> None:

@@ -40,9 +40,12 @@ class Guard:
             path: of the request, with its query.
             port: that it came in by.
         """
-        if not self._is_ours(headers.get("Host", ""), port):
+        try:
+            host, origin = headers.get("Host", ""), headers.get("Origin")
+        except LookupError:  # of the library's headers, where one is there twice
+            return "a header is there twice"
+        if not self._is_ours(host, port):
             return "this server goes by another name"
-        origin = headers.get("Origin")
         if origin is not None and not self._is_ours(urlsplit(origin).netloc, port):
             return "a page of another site may not connect"
         given = [*parse_qs(urlsplit(path).query).get("token", []), *self._cookies(headers, port)]
@@ -97,7 +100,7 @@ class Guard:
     def _cookies(self, headers: Any, port: int) -> list[str]:
         try:
             found = SimpleCookie(headers.get("Cookie", ""))
-        except CookieError:
+        except (CookieError, LookupError):
             return []
         return [found[self._name(port)].value] if self._name(port) in found else []
 

@@ -7,6 +7,8 @@ inputs, give orders to the pace and change what is shown.
 from __future__ import annotations
 
 import asyncio
+import contextlib
+import io
 import math
 from collections import deque
 from collections.abc import Awaitable, Callable, Mapping
@@ -40,15 +42,17 @@ _STEER: Final = {"W": (1, 0, 0), "S": (-1, 0, 0), "A": (0, 1, 0), "D": (0, -1, 0
 _STEER_STEP: Final = 0.5
 """[m/s] by which a key changes it."""
 _STEER_MOST: Final = 5.0
+_ACTIVE: Final = 0.05
+"""Share of a bound's scale within which a margin counts as active."""
 _FAULTS: Final = ("dropout", "freeze", "nan")
 
 STYLE: Final = """<style>
 .q{font:12px/1.45 system-ui,sans-serif;padding:0 .6em}.q b{font-variant-numeric:tabular-nums}
 .q table{width:100%;border-collapse:collapse}.q td{padding:1px 4px 1px 0;white-space:nowrap}
-.q .t{width:45%;min-width:70px}.q .r{position:relative;height:9px;background:#8884;border-radius:3px;overflow:hidden}
+.q .t{width:35%;min-width:50px}.q .r{position:relative;height:9px;background:#8884;border-radius:3px;overflow:hidden}
 .q .f{position:absolute;left:0;top:0;bottom:0;border-radius:3px}
 .q .n{text-align:right;font-variant-numeric:tabular-nums}
-.q .bad{color:#dc2f38;font-weight:600}
+.q .w{min-width:3.7em}.q .bad{color:#dc2f38;font-weight:600}.q .act{font-weight:600}.q .act .w{color:#b26b00}
 </style>"""
 
 
@@ -88,17 +92,19 @@ class Page:
 
         self._session, self._pace, self._save, self._others = session, pace, save, others
         self._guard = Guard(host)
-        with self._guard.installed():
+        silent = contextlib.redirect_stdout(io.StringIO())  # viser prints an address that has no token
+        with silent, self._guard.installed():
             self._server: Any = viser.ViserServer(host=host, port=port, label="quadsim live", verbose=False)
         found = self._server.get_port()
         if port not in (0, found):
-            self._server.stop()
+            self.close()
             raise ParameterError("", "--port", port, "a port that is free")
         for message in (_messages.ShareUrlRequest, _messages.ShareUrlDisconnect):  # a tunnel that any client may open
             self._server._websock_server.unregister_handler(message)
         shown = host if host in LOOPBACK or host not in ("0.0.0.0", "::") else "127.0.0.1"
         self.address = f"http://{shown}:{found}/?token={self._guard.token}"
         self._driver: int | None = None
+        self._aims: dict[int, Any] = {}  # where each client looks, from the vehicle [m]
         self._steer = np.zeros(3)
         self._history: deque[tuple[float, ...]] = deque(maxlen=round(SECONDS / session.period))
         self._frame: Frame | None = None
@@ -113,7 +119,8 @@ class Page:
 
     def close(self) -> None:
         """Stop serving."""
-        self._server.stop()
+        with contextlib.redirect_stdout(io.StringIO()):
+            self._server.stop()
 
     # What the thread that flies calls
 
@@ -138,10 +145,11 @@ class Page:
             at = self.stage.pose(frame, share)
             if self._follow.value:
                 for client in self._server.get_clients().values():
-                    camera = client.camera
-                    away = np.asarray(camera.position) - camera.look_at
-                    camera.look_at = at
-                    camera.position = at + away
+                    if client.client_id in self._aims:
+                        camera = client.camera
+                        away = np.asarray(camera.position) - camera.look_at
+                        camera.look_at = at + self._aims[client.client_id]
+                        camera.position = camera.look_at + away
         self._server.flush()
 
     def ended(self, reason: str | None) -> None:
@@ -177,7 +185,6 @@ class Page:
         with tabs.add_tab("Target"):
             self._targets()
         with tabs.add_tab("Controller"):
-            self._knobs_folder = gui.add_folder("Fields")
             self._controller_tab()
         with tabs.add_tab("Plots"):
             x, zero = np.array([0.0, 1.0]), np.zeros(2)
@@ -263,8 +270,8 @@ class Page:
         gui, session = self._server.gui, self._session
         unit = self.stage.unit
         gui.add_markdown(
-            "Drag the arrows beside the vehicle's goal, or type. Keys W, S, A, D, R, F fly the set-point along x, y "
-            "and z; X stops it."
+            "Drag the arrows beside the vehicle's goal, shift-click on the ground, or type. Keys W, S, A, D, R, F fly "
+            "the set-point along x, y and z; X stops it."
         )
         here = np.asarray(session.flights[0].loop.course.row(0)[:3])
         self._handle = self._server.scene.add_transform_controls(
@@ -286,6 +293,16 @@ class Page:
             self._set_point(at)
 
         self._on(place.on_update, typed)
+
+        def clicked(event: Any) -> None:
+            origin, direction = np.array(event.ray_origin), np.array(event.ray_direction)
+            if origin[2] * direction[2] < 0.0:  # it meets the ground
+                meets = origin - origin[2] / direction[2] * direction
+                at = [round(float(each), 2) for each in (*meets[:2], place.value[2])]
+                self._handle.position, place.value = np.array(at), tuple(at)
+                self._set_point(at)
+
+        self._on(self._server.scene.on_click(modifier="shift"), clicked)
         yaw = gui.add_slider("Yaw [deg]", -180, 180, 5, 0)
         self._on(
             yaw.on_update,
@@ -318,6 +335,7 @@ class Page:
         chosen = gui.add_dropdown("Controller", names)
         self._said = gui.add_html("")
         self._button("Take this controller", lambda event: self._take(chosen.value))
+        self._knobs_folder = gui.add_folder("Fields")
         self._show_knobs(self._session.scenario.controller)
 
     def _show_knobs(self, spec: ControllerSpec) -> None:
@@ -422,8 +440,11 @@ class Page:
         if self._driver is None:
             self._driver = client.client_id
         unit, at = self.stage.unit, np.asarray(self.stage.frames[0].position)
-        client.camera.position = at + unit * np.array([-6.0, -9.0, 5.0])
-        client.camera.look_at = at
+        away = unit * np.array([-4.0, -6.0, 3.0])
+        upright = client.camera.aspect < 1.0  # a phone, whose lower half is the panel
+        self._aims[client.client_id] = np.array([0.0, 0.0, -0.35 * np.linalg.norm(away)]) * upright
+        client.camera.look_at = at + self._aims[client.client_id]
+        client.camera.position = client.camera.look_at + away
         take = client.gui.add_button("Take the controls", visible=self._driver != client.client_id)
 
         async def taken(event: Any) -> None:
@@ -434,6 +455,7 @@ class Page:
         take.on_click(taken)
 
     async def _left(self, client: Any) -> None:
+        self._aims.pop(client.client_id, None)
         if self._driver == client.client_id:
             self._let_go()
             rest = [each for each in self._server.get_clients() if each != client.client_id]
@@ -529,7 +551,7 @@ class Page:
 
 
 def _bars(limits: tuple[Limit, ...], frame: Frame, other: str) -> str:
-    """Margins as bars: full is the middle of the bounds, empty is at the bound, red is beyond."""
+    """Margins as bars: full is the middle of the bounds, empty is at the bound; amber is active, red is violated."""
     rows = []
     for limit in limits:
         values = [margins.get(limit.name, math.nan) for margins in frame.margins]
@@ -542,9 +564,14 @@ def _bars(limits: tuple[Limit, ...], frame: Frame, other: str) -> str:
                 scale = abs(bound) or 1.0
             share = min(1.0, abs(margin) / scale)
             red = margin < -limit.tolerance
-            colour = BOUND if red else LINES[2] if i == 0 else LINES[4]
+            active = not red and margin <= _ACTIVE * scale
+            colour = BOUND if red else LINES[1] if active else LINES[2] if i == 0 else LINES[4]
+            mark = "bad" if red else "act" if active else ""
             fill = f'<div class="f" style="width:{100.0 * share:.0f}%;background:{colour}"></div>'
             name = escape(limit.name if i == 0 else f"{limit.name}, {other}")
-            number = f'<td class="n{" bad" if red else ""}">{margin:+.3g} {escape(limit.unit)}</td>'
-            rows.append(f'<tr><td>{name}</td><td class="t"><div class="r">{fill}</div></td>{number}</tr>')
+            said = "violated" if red else "active" if active else ""
+            number = f'<td class="n">{margin:+.3g} {escape(limit.unit)}</td><td class="w">{said}</td>'
+            rows.append(
+                f'<tr class="{mark}"><td>{name}</td><td class="t"><div class="r">{fill}</div></td>{number}</tr>'
+            )
     return f'<div class="q"><table>{"".join(rows)}</table></div>' if rows else ""

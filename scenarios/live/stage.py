@@ -57,7 +57,7 @@ class Stage:
         self._rotors = np.array(vehicle.rotor_positions)
         self._thrust = 1.2 * vehicle.arm_length / (vehicle.mass * vehicle.gravity / len(self._rotors))
         self._coefficient = vehicle.thrust_coefficient
-        scene.add_line_segments(
+        self._ground = scene.add_line_segments(
             "/ground", points=_grid(), colors=(200, 204, 210), thickness=1.0, thickness_units="screen"
         )
         self.frames, self._arrows, self._horizons, self._paths = [], [], [], []
@@ -104,6 +104,7 @@ class Stage:
         first = frame.samples[0]
         if first is not None:
             self._now.position = first.observation.reference[:3]
+            self._ground.position = (*np.round(first.segment.physics[-1, 1:3]), 0.0)
             at, scale = first.segment.physics[-1, 1:4], 3.0 * self.unit / (0.1 * self._weight)
             self._hand.points = np.array([[at, at + scale * frame.pull]], dtype=np.float32)
         self._hand.visible = bool(frame.pull.any())

@@ -126,11 +126,10 @@ def residual(case: Case, x: cs.SX, x_r: cs.SX) -> cs.SX:
 
 
 class Found(NamedTuple):
-    """States (N + 1, n), inputs (N, 4), what they cost, and whether IPOPT calls them optimal."""
+    """States (N + 1, n), inputs (N, 4), and whether IPOPT calls them optimal."""
 
     states: Array
     inputs: Array
-    cost: float
     solved: bool
 
 
@@ -194,4 +193,4 @@ class Peer:
         found = solver(x0=guess, p=p, lbx=low, ubx=high, lbg=self._rows[0], ubg=self._rows[1])
         w = found["x"].full().ravel()
         states, inputs = w[: n * (N + 1)].reshape(N + 1, n), w[n * (N + 1) :][: 4 * N].reshape(N, 4)
-        return Found(states, inputs, float(found["f"]), bool(solver.stats()["success"]))
+        return Found(states, inputs, bool(solver.stats()["success"]))

@@ -10,6 +10,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from peers.casadi_ocp import Case, Found, Peer
 from peers.checks import Check
+from peers.do_mpc_ocp import DoMPC
 
 from mpc.answer import ActuatorBounds
 from mpc.nonlinear.controller import NonlinearMPC
@@ -144,9 +145,9 @@ def _turned(q: Array, by: Array) -> Array:
     return np.concatenate([[q[0] * d - q[1:] @ v], q[0] * v + d * q[1:] + np.cross(q[1:], v)])
 
 
-def optima(case: Case) -> Iterator[tuple[Found, Array]]:
-    """IPOPT's optimum and our inputs (N, 4), converged, at random states along the course."""
-    course, peer, rng = Course(case), Peer(case), np.random.default_rng(17)
+def optima(case: Case, peer: Peer | DoMPC) -> Iterator[tuple[Found, Array]]:
+    """A peer's optimum and our inputs (N, 4), converged, at random states along the course."""
+    course, rng = Course(case), np.random.default_rng(17)
     law = course.law(iterations=300, tolerance=1e-9)
     for k in rng.integers(0, len(course.motion) - 50, STATES[case]).tolist():
         question = course.question(k, rng, None, None)
@@ -181,7 +182,7 @@ def measure(case: Case) -> Agreement:
     Raises:
         ArithmeticError: IPOPT did not solve a problem.
     """
-    whole, each = list(optima(case)), list(steps(case))
+    whole, each = list(optima(case, Peer(case))), list(steps(case))
     if not all(found.solved for found, _ in (*whole, *each)):
         raise ArithmeticError(f"{case.name}: IPOPT did not solve every problem")
     differences = [np.array([np.abs(found.inputs - ours).max() for found, ours in pairs]) for pairs in (whole, each)]

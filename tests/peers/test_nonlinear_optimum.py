@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from peers.casadi_ocp import Case, Peer
 from peers.checks import Check
-from peers.nonlinear_optimum import LAGGED, PAPER, PERIOD, STATES, Course, measure
+from peers.do_mpc_ocp import DoMPC
+from peers.nonlinear_optimum import ALLOWED, LAGGED, PAPER, PERIOD, STATES, Course, measure, optima
 
 
 @pytest.mark.parametrize("case", [PAPER, LAGGED], ids=lambda case: case.name)
@@ -22,6 +23,33 @@ def test_optima_and_real_time_iterations_are_the_same(
     for check in agreement.checks:
         hold(check)
         told(check.row)
+
+
+def test_optima_are_those_of_do_mpc(hold: Callable[[Check], None]) -> None:
+    pairs = list(optima(PAPER, DoMPC(PAPER)))
+    assert len(pairs) == STATES[PAPER]
+    assert all(found.solved for found, _ in pairs)
+    apart = max(np.abs(found.inputs - ours).max() for found, ours in pairs)
+    hold(Check(what="converged inputs, as shares of the largest", peer="do-mpc", measured=apart, allowed=ALLOWED))
+
+
+def test_do_mpc_is_given_the_same_problem() -> None:
+    """With rotor lag, the error-state attitude, shares of speeds and a weight on moves."""
+    case = replace(LAGGED, tilt=0.0, steps=(), penalty=(0.0, 0.0))
+    course, rng, whole, by_do_mpc = Course(LAGGED), np.random.default_rng(3), Peer(case), DoMPC(case)
+    for k in (300, 400):
+        question = course.question(k, rng, None, None)
+        of = question.state, question.states, question.inputs, question.before
+        found, other = whole.optimum(*of), by_do_mpc.optimum(*of)
+        assert found.solved
+        assert other.solved
+        assert np.abs(found.inputs - other.inputs).max() < ALLOWED
+        assert np.abs(found.states - other.states).max() < ALLOWED
+
+
+def test_do_mpc_takes_no_bounds_on_steps_or_tilt() -> None:
+    with pytest.raises(ValueError, match="more than bounds on inputs"):
+        DoMPC(LAGGED)
 
 
 def test_a_weight_that_is_another_is_seen() -> None:

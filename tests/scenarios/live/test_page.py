@@ -3,17 +3,26 @@
 from __future__ import annotations
 
 import shutil
+import signal
+import subprocess
+import sys
 import threading
 import time as clock
 import urllib.error
 import urllib.request
 from collections.abc import Callable, Iterator
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+from urllib.parse import urlsplit
 
 import numpy as np
 import pytest
+import viser
+from websockets.exceptions import InvalidStatus
+from websockets.sync.client import connect
+from websockets.typing import Subprotocol
 
 from scenarios.live.guard import Guard
 from scenarios.live.pacing import Pace
@@ -24,6 +33,8 @@ from scenarios.run import fly_scenario
 
 ARGUMENTS = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"]
 PATIENCE = 60.0
+ROOT = Path(__file__).resolve().parents[3]
+PROTOCOL = Subprotocol(f"viser-v{viser.__version__}")
 
 
 @pytest.mark.parametrize(
@@ -80,6 +91,53 @@ def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
     thread.join()
     page.close()
     session.close()
+
+
+def test_ten_clients_are_served_and_foreign_ones_are_not(served: Served) -> None:
+    address = urlsplit(served.page.address)
+    url, own = f"ws://{address.netloc}/", f"http://{address.netloc}"
+    cookie = {"Cookie": f"quadsim-{address.port}={address.query.partition('=')[2]}"}
+    for headers in ({}, {**cookie, "Origin": "http://evil.example"}, {**cookie, "Host": "evil.example"}):
+        with pytest.raises(InvalidStatus, match="403"):
+            connect(url, subprotocols=[PROTOCOL], additional_headers=headers)
+    own_page = {**cookie, "Origin": own}
+    with ExitStack() as stack:
+        clients = [
+            stack.enter_context(
+                connect(url, subprotocols=[PROTOCOL], additional_headers=own_page, max_size=None, close_timeout=0.2)
+            )
+            for _ in range(10)
+        ]
+        k = served.session.k
+        for client in clients:
+            assert all(client.recv(timeout=PATIENCE) for _ in range(3))
+        served.wait(lambda: served.session.k > k + 10)
+
+
+def test_a_closed_page_ends_its_push(browser: Any, served: Served) -> None:
+    page = browser.new_page(viewport={"width": 400, "height": 300})
+    page.set_default_timeout(1e3 * PATIENCE)
+    page.goto(served.page.address)
+    page.get_by_text("of real time").wait_for()
+    served.session.submit({"type": "pull", "to": [0.1, 0.0, 1.0]}, subject="pull")
+    served.wait(lambda: served.session._held.pull is not None)
+    page.close()
+    served.wait(lambda: served.session._held.pull is None)
+
+
+def test_an_interrupt_keeps_what_was_flown(tmp_path: Path) -> None:
+    kept = tmp_path / "kept"
+    line = ["live", "hover", "--no-browser", "--set", "controller.horizon=5", "--out", str(kept)]
+    code = "import sys; from scenarios.cli import main; sys.exit(main(sys.argv[1:]))"
+    process = subprocess.Popen([sys.executable, "-c", code, *line], stdout=subprocess.PIPE, text=True, cwd=ROOT)
+    assert process.stdout is not None
+    assert "token=" in process.stdout.readline()
+    clock.sleep(1.0)
+    process.send_signal(signal.SIGINT)
+    said, _ = process.communicate(timeout=2.0 * PATIENCE)
+    assert str(kept) in said
+    assert process.returncode == 0
+    assert load_scenario(str(kept / "scenario.toml")).duration > 0.0
 
 
 @pytest.fixture(scope="module")

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+import tomllib
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -11,11 +13,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+import quadsim
 from quadsim.errors import InputError
 from scenarios.cli import main
+from scenarios.commands import EXIT_WRONG_INPUT
 from scenarios.live.knobs import knobs
 from scenarios.live.pacing import LATE, Pace
-from scenarios.live.script import play, read_script
+from scenarios.live.script import Script, play, read_script
 from scenarios.live.session import STRONGEST, Frame, Session
 from scenarios.loading import load_scenario
 from scenarios.run import fly_scenario
@@ -215,7 +219,7 @@ def test_a_script_is_kept_as_a_run_that_flies_to_the_same_bytes(
 ) -> None:
     script, kept, again = tmp_path / "script.toml", tmp_path / "kept", tmp_path / "again"
     script.write_text(SCRIPT, encoding="utf-8")
-    line = ["live", "hover", "--script", str(script), "--out", str(kept), "--set", "controller.horizon=10"]
+    line = ["live", "robust", "--script", str(script), "--out", str(kept), "--set", "controller.horizon=20"]
     assert main(line) == 0
     assert "3.00 s" in capsys.readouterr().out
     main(["run", str(kept / "scenario.toml"), "--out", str(again), "--no-video", "--no-recording", "--no-figures"])
@@ -238,6 +242,39 @@ def test_a_script_that_is_none_is_refused(tmp_path: Path, text: str, said: str) 
     path.write_text(text, encoding="utf-8")
     with pytest.raises(InputError, match=said):
         read_script(path)
+
+
+def test_where_it_cannot_be_kept_nothing_is_flown(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "letter.txt").write_text("dear")
+    script = tmp_path / "script.toml"
+    script.write_text(SCRIPT, encoding="utf-8")
+    assert main(["live", "hover", "--script", str(script), "--out", str(tmp_path / "mine")]) == EXIT_WRONG_INPUT
+    assert "mine" in capsys.readouterr().err
+
+
+def test_a_finished_run_is_flown_on(tmp_path: Path) -> None:
+    short, on, script = tmp_path / "short", tmp_path / "on", tmp_path / "script.toml"
+    outputs = ("--no-video", "--no-recording", "--no-figures")
+    main(["run", "hover", "--set", "duration=0.5", "--set", "controller.horizon=5", *outputs, "--out", str(short)])
+    script.write_text("duration = 1.0", encoding="utf-8")
+    assert main(["live", str(short), "--script", str(script), "--out", str(on)]) == 0
+    assert load_scenario(str(on / "scenario.toml")).duration == 1.0
+    before, after = (quadsim.read(each).command for each in (short, on))
+    assert np.array_equal(after[: len(before)], before)
+
+
+def test_the_script_on_the_page_plays() -> None:
+    page = (Path(__file__).resolve().parents[3] / "docs" / "live.md").read_text(encoding="utf-8")
+    (text,) = re.findall(r"```toml\n(.*?)```", page, re.DOTALL)
+    session = Session(load_scenario("robust"))
+    try:
+        data = tomllib.loads(text)
+        script = Script(duration=data["duration"], inputs=tuple((each.pop("at"), each) for each in data["inputs"]))
+        assert play(session, script) == []
+        assert session.reason is None
+    finally:
+        session.close()
 
 
 def test_a_script_says_what_was_refused(session: Session, tmp_path: Path) -> None:
