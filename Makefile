@@ -4,7 +4,7 @@
 
 .NOTPARALLEL:
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test peers check docs format types build numbers verification nonlinear robustness first-flights reproduce speed soak campaigns live tuning kills safety firmware pins clean
+.PHONY: help setup demo test peers check docs format types build numbers verification nonlinear robustness first-flights gym reproduce speed soak campaigns live tuning kills safety firmware export-numbers pins clean
 
 VENV := .venv
 PY := $(VENV)/bin/python
@@ -21,7 +21,8 @@ PIP_INSTALL := $(PY) -m pip install --quiet --disable-pip-version-check
 NOT_INSTALLED := The packages could not be installed. With a network at hand: make setup
 RENDERS := $(PY) -c 'from quadsim.report.film.video import rendering_backend; rendering_backend()' 2>/dev/null
 FIRMWARE_TOOLS := gcc arm-none-eabi-gcc qemu-system-arm aarch64-linux-gnu-gcc qemu-aarch64 clang cppcheck clang-tidy
-HAS_FIRMWARE_TOOLS := (for tool in $(FIRMWARE_TOOLS); do command -v $$tool || exit; done) >/dev/null
+HAS_FIRMWARE_TOOLS := (for tool in $(FIRMWARE_TOOLS); do command -v $$tool || exit; done && \
+	echo 'int LLVMFuzzerTestOneInput(void) { return 0; }' | clang -fsanitize=fuzzer -x c -o /dev/null -) >/dev/null 2>&1
 HAS_BROWSER := { command -v chromium || command -v chromium-browser || command -v google-chrome; } >/dev/null
 
 # $(call quietly,COMMAND,ADVICE): runs a command silently; if it fails, shows its last errors, then the advice.
@@ -34,7 +35,7 @@ apt = if [ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null; then \
 	else echo "Missing on this machine; run: sudo apt-get install --no-install-recommends $(1)" >&2; false; fi
 
 help:  ## list these targets
-	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "make %-12s %s\n", $$1, $$2 }' Makefile
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "make %-14s %s\n", $$1, $$2 }' Makefile
 
 setup: $(VENV)/.installed $(VENV)/.renders  ## make .venv with everything pinned, ready for the others
 
@@ -44,9 +45,9 @@ demo: setup  ## fly the paper's two flights and compare them, under runs/ (OPTIO
 	@$(QUADSIM) compare $(RUNS)/paper-unconstrained $(RUNS)/paper-constrained --out $(RUNS)/comparison
 	@echo "Done. Open $(RUNS)/comparison/index.html in a browser."
 
-test peers firmware verification nonlinear robustness first-flights reproduce speed soak campaigns tuning kills safety: export OMP_NUM_THREADS := 1
-test peers firmware verification nonlinear robustness first-flights reproduce speed soak campaigns tuning kills safety: export OPENBLAS_NUM_THREADS := 1
-test peers firmware verification nonlinear robustness first-flights reproduce speed soak campaigns tuning kills safety: export MKL_NUM_THREADS := 1
+test peers firmware export-numbers verification nonlinear robustness first-flights reproduce speed soak campaigns tuning kills safety: export OMP_NUM_THREADS := 1
+test peers firmware export-numbers verification nonlinear robustness first-flights reproduce speed soak campaigns tuning kills safety: export OPENBLAS_NUM_THREADS := 1
+test peers firmware export-numbers verification nonlinear robustness first-flights reproduce speed soak campaigns tuning kills safety: export MKL_NUM_THREADS := 1
 test: setup $(VENV)/.browser  ## run every test that needs no peer (OPTIONS="-k audit" for some)
 	@$(PY) -m pytest -q -n $(WORKERS) --dist loadscope $(OPTIONS)
 
@@ -101,6 +102,9 @@ first-flights: setup  ## make and fly first scenarios of many vehicles, remake d
 
 reproduce: setup  ## fly the numbers of every paper that ships and remake docs/papers.md: some five minutes
 	@$(PY) docs/make_papers.py
+
+export-numbers: setup $(VENV)/.firmware  ## remake docs/export.md: exported controllers and peers on emulated targets; some ten minutes
+	@$(PY) docs/make_export.py
 
 speed: setup  ## fly every controller ever faster and remake docs/speed.md: some six minutes
 	@$(PY) docs/make_speed.py
@@ -182,6 +186,6 @@ $(VENV)/.browser: $(VENV)/.installed
 
 $(VENV)/.firmware: $(VENV)/.installed
 	@if $(HAS_FIRMWARE_TOOLS) || { { $(call apt,gcc libc6-dev gcc-arm-none-eabi libnewlib-arm-none-eabi qemu-system-arm \
-		gcc-aarch64-linux-gnu libc6-dev-arm64-cross qemu-user clang cppcheck clang-tidy); } && \
+		gcc-aarch64-linux-gnu libc6-dev-arm64-cross qemu-user clang libclang-rt-dev cppcheck clang-tidy); } && \
 		$(HAS_FIRMWARE_TOOLS); }; then touch $@; \
 	else echo "Until then the tests of exported controllers that lack a tool are skipped." >&2; fi

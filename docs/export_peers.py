@@ -1,21 +1,24 @@
-"""DAQP, OSQP and TinyMPC on the problem of an exported controller: their own C on its recorded periods."""
+"""DAQP's and OSQP's own C on the problem of an exported controller and its recorded periods."""
 
 from __future__ import annotations
 
 import subprocess
 import sys
 import tarfile
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 import osqp
 import scipy.linalg
 import scipy.sparse
 from make_numbers import ROOT
+from numpy.typing import NDArray
 
 from mpc.export.ctext import reals
+from mpc.export.targets import TICK, Target
 from mpc.ocp import Problem
 from mpc.paper.condensed import Condensed
 from quadsim.state import Array
@@ -121,3 +124,62 @@ def write_osqp(directory: Path, qp: Condition, recording: Recording, precision: 
     )
     write_problem(directory, qp, recording, np.vstack([qp.c, qp.shift]))
     return [code, code / "inc" / "public", code / "inc" / "private", code / "workspace.c", *(code / "src").glob("*.c")]
+
+
+TOOLS: Final = ("size", "arm-none-eabi-size")
+"""What tells the size of object files: of this machine's, and of a board's."""
+
+
+class Measured(NamedTuple):
+    """What a program answered to the recorded periods, what it took, and its size."""
+
+    status: NDArray[np.int64]  # (K,) of `quadsim_mpc.h`; of a peer 1 without an optimum
+    changes: NDArray[np.int64]  # (K,) of the active set, or iterations
+    command: Array  # (K, 4) [rad/s]
+    ticks: NDArray[np.int64]  # (K,) [instructions], of a POSIX system [ns]
+    flash: int  # bytes of code and constants
+    memory: int  # bytes that change
+
+
+def answered(text: str, target: Target, flash: int = 0, memory: int = 0) -> Measured:
+    """Read what main.c or peer.c has printed."""
+    rows = [line.split() for line in text.splitlines() if len(line.split()) == 8]
+    whole = [[int(row[i], 16) for row in rows] for i in (1, 2, 7)]
+    kind = ">f8" if len(rows[0][3]) == 16 else ">f4"
+    bits = bytes.fromhex("".join(word for row in rows for word in row[3:7]))
+    status, changes, ticks = (np.array(column) for column in whole)
+    command = np.frombuffer(bits, kind).reshape(-1, 4).astype(float)
+    return Measured(status, changes, command, ticks * (TICK if target.board else 1), flash, memory)
+
+
+def size(tool: str, files: Iterable[Path]) -> tuple[int, int]:
+    """Bytes of object files: code and constants, and what changes."""
+    lines = subprocess.run([tool, *files], capture_output=True, text=True, check=True).stdout.splitlines()[1:]
+    text, data, zeroed = np.array([[int(word) for word in line.split()[:3]] for line in lines]).sum(axis=0)
+    return int(text + data), int(data + zeroed)
+
+
+def run_peer(
+    name: str, directory: Path, problem: Problem, recording: Recording, target: Target, precision: str
+) -> Measured:
+    """Compile a peer for a target and let it answer the recorded periods."""
+    qp = condition(problem)
+    own: list[str] = []
+    if name == "daqp":
+        parts = write_daqp(directory, qp, recording)
+        own = ["-DDAQP_NO_SOFT_WEIGHTS", *(["-DDAQP_SINGLE_PRECISION"] if precision == "float" else [])]
+    else:
+        parts = write_osqp(directory, qp, recording, precision)
+    folders = [*(part for part in parts if part.is_dir()), directory, SOURCES, OURS]
+    flags = [*target.machine.split(), *FLAGS, *ASSIGNED[precision], *own, *(f"-I{folder}" for folder in folders)]
+    theirs = [part for part in parts if not part.is_dir()] + [SOURCES / f"peer_{name}.c"]
+    objects = []
+    for source in [*theirs, SOURCES / "peer.c", OURS / target.sources[0]]:
+        objects.append(directory / f"{source.stem}.o")
+        subprocess.run([target.compiler, *flags, "-c", source, "-o", objects[-1]], check=True)
+    image, link = directory / "peer.elf", target.link.replace("mps2.ld", str(OURS / "mps2.ld")).split()
+    link += ["--specs=nosys.specs"] if target.board else []
+    subprocess.run([target.compiler, *flags, "-o", image, *objects, *link, "-Wl,--gc-sections", "-lm"], check=True)
+    command = [*target.emulation, "-serial", "none", "-kernel", image] if target.board else [image]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    return answered(done.stdout + done.stderr, target, *size(TOOLS[bool(target.board)], objects[: len(theirs)]))

@@ -115,8 +115,6 @@ def make_parser() -> argparse.ArgumentParser:
     reproduce.add_argument("--junit", metavar="FILE", help="also write each number's verdict as JUnit XML")
     reproduce.add_argument("--json", action="store_true", help="as JSON on stdout")
 
-    _add_tune(command("tune", help="search fields of a scenario; the answer is held against the start on fresh draws"))
-
     export = command("export", help="write a scenario's controller as self-contained C99, with its recorded periods")
     export.add_argument("scenario", metavar="SCENARIO", help=_SCENARIO)
     export.add_argument("--out", metavar="DIR", required=True, help="directory, replacing an earlier export")
@@ -127,6 +125,7 @@ def make_parser() -> argparse.ArgumentParser:
     export.add_argument("--fly", action="store_true", help=fly)
     _add_settings(export)
 
+    _add_tune(command("tune", help="search fields of a scenario; the answer is held against the start on fresh draws"))
     _add_bench(command("bench", help="measure QP solvers, a flight, a film, and what controllers survive"))
 
     doctor = command("doctor", help="what this machine can do")

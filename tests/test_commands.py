@@ -49,8 +49,9 @@ LINES = [
     for line in block.splitlines()
 ]
 QUADSIM = [line.partition("#")[0].strip() for line in LINES if line.startswith("quadsim ")]
-RUNNABLE = [line for line in QUADSIM if not line.startswith("quadsim view") and "--cluster" not in line]
-"""`view` opens a window and stays; a cluster has tests of its own."""
+ELSEWHERE = ("quadsim view", "--cluster", "--fly")
+"""`view` opens a window and stays; a cluster, and what takes an emulator, have tests of their own."""
+RUNNABLE = [line for line in QUADSIM if not any(word in line for word in ELSEWHERE)]
 
 
 def arguments_of(line: str) -> list[str]:

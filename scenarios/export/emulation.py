@@ -7,7 +7,6 @@ import os
 import select
 import shutil
 import subprocess
-import tempfile
 from pathlib import Path
 from types import TracebackType
 from typing import Final
@@ -59,10 +58,9 @@ class Program:
     """
 
     def __init__(self, target: Target, image: Path) -> None:
-        self._messages = tempfile.TemporaryFile()
         command = [*target.emulation, "-serial", "stdio", "-kernel", str(image)] if target.board else [str(image)]
         self._process = subprocess.Popen(
-            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=self._messages, bufsize=0
+            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, bufsize=0
         )
 
     def __enter__(self) -> Program:
@@ -71,7 +69,6 @@ class Program:
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
         self._process.kill()
         self._process.communicate()
-        self._messages.close()
 
     def send(self, data: bytes) -> None:
         """Send all of it; to a program that has ended nothing."""

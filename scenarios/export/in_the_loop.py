@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tempfile
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -35,6 +36,8 @@ class MPCInTheLoop:
     Attributes:
         ways: how many periods had which status of `quadsim_mpc.h`.
     """
+
+    predict: Callable[[Array, Array], Array]  # there is none: plans stay where they are made
 
     def __init__(self, serial: SerialMPC, problem: Problem, name: str, target: Target) -> None:
         self.name, self.solver, self.horizon = name, f"C99 on {target.title}", problem.horizon

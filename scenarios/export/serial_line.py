@@ -1,4 +1,4 @@
-"""The other end of the serial line of `mpc/export/c/serial.c`: questions of state and reference, answers of commands."""
+"""The other end of the serial line of `mpc/export/c/serial.c`: questions of state and reference, and answers."""
 
 from __future__ import annotations
 

@@ -10,7 +10,7 @@ import pytest
 from firmware.conftest import Export, Run
 
 HERE = Path(__file__).parent
-SANITIZERS = "-fsanitize=fuzzer,address,undefined -fno-sanitize-recover=all".split()
+SANITIZERS = ["-fsanitize=fuzzer,address,undefined", "-fno-sanitize-recover=all"]
 SECONDS = 8
 """Of each target; the variable FUZZ_RUNS has a number of inputs instead, of four steps or so each."""
 HANGS = 30

@@ -44,7 +44,7 @@ def test_the_command_flies_and_writes_a_run(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    arguments = "export hover --set duration=1.0 --out c --target cortex-m7 --fly".split()
+    arguments = ["export", "hover", "--set", "duration=1.0", "--out", "c", "--target", "cortex-m7", "--fly"]
     assert main(arguments) == 0
     assert (tmp_path / "c" / "startup.c").is_file()
     assert (tmp_path / "runs" / "hover-cortex-m7" / "summary.json").is_file()
@@ -60,5 +60,5 @@ def test_a_program_that_ends_ends_the_flight(tmp_path: Path) -> None:
 
 def test_what_is_not_installed_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PATH", "")
-    with pytest.raises(MissingProgramError, match="needs 'make': apt-get install .* qemu-system-arm"):
+    with pytest.raises(MissingProgramError, match=r"needs 'make': apt-get install .* qemu-system-arm"):
         require_programs(TARGETS["cortex-m7"], "to fly an exported controller")

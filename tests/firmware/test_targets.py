@@ -24,7 +24,7 @@ OTHERS = {
 }
 CONTRACTED = "ALWAYS=-ffp-contract=fast"
 MEDIAN, RARE, WARM, COLD = 0.13e6, 3.5e6, 7.5e6, 32e6
-"""Instructions of a step at most, of the Cortex-M7 in double and of both in float: p50, p99, max after the first, it."""
+"""Instructions of a step at most, of the Cortex-M7 in double and of both in float: p50, p99, warm, the first."""
 FLASH, MEMORY = {"double": 200_000, "float": 105_000}, {"double": 90_000, "float": 46_000}
 """Bytes at most: of code and constants; of the controller's struct."""
 FRAME, STACK = 1400, 4000

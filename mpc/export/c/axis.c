@@ -2,7 +2,7 @@
 /* ---- the optimum without rows, of an axis of @n@ states and @m@ inputs: the same text for every such pair ------------- */
 
 /* Dynamic programming backwards: w_i = k_i, without its feedback -K_i x_i.
- * The cost has the linear terms -2 pull_i' x_{i+1} - 2 push_i' w_i. */
+ * The cost has the linear terms -2 pull_i' x_{i+1} - 2 push_i' w_i, the latter where push is not NULL. */
 static void plan_backwards_@n@x@m@(const struct axis *axis, const real *pull, const real *push, real *w)
 {
     enum { n = @n@, m = @m@ };
@@ -13,7 +13,7 @@ static void plan_backwards_@n@x@m@(const struct axis *axis, const real *pull, co
     }
     for (i = N - 1; i >= 0; i--) {
         for (a = 0; a < m; a++) {
-            sum[a] = push[i * m + a];
+            sum[a] = push != NULL ? push[i * m + a] : R(0.0);
             for (j = 0; j < n; j++) {
                 sum[a] += axis->B[j * m + a] * slope[j];
             }
@@ -26,7 +26,7 @@ static void plan_backwards_@n@x@m@(const struct axis *axis, const real *pull, co
         }
         for (j = 0; i > 0 && j < n; j++) {
             earlier[j] = pull[(i - 1) * n + j];
-            for (a = 0; a < m; a++) {
+            for (a = 0; push != NULL && a < m; a++) {
                 earlier[j] -= axis->K[(i * m + a) * n + j] * push[i * m + a];
             }
             for (l = 0; l < n; l++) {

@@ -114,18 +114,22 @@ static real dot(const real *left, const real *right, int count)
 @AXES@
 /* ---- rows --------------------------------------------------------------------------------------------------------- */
 
-/* values [N][M] += the terms of inputs u [N][4]; u(k-1) is before. */
+/* Add the terms of inputs u [N][4] to the rows' values [N][M]; u(k-1) is before. */
 static void add_terms(const real *u, const real *before, real *values)
 {
     int i, r, t;
     for (r = 0; r < M; r++) {
+        for (i = 0; ROWS[r].axis < 0 && i < N; i++) {
+            values[i * M + r] = R(0.0);
+        }
         for (t = ROWS[r].first; t < ROWS[r].past; t++) {
             const struct term term = TERMS[t];
+            const real *at = u + term.input;
             if (term.lag > 0) {
                 values[r] += term.coefficient * before[term.input];
             }
-            for (i = term.lag; i < N; i++) {
-                values[i * M + r] += term.coefficient * u[(i - term.lag) * NU + term.input];
+            for (i = term.lag; i < N; i++, at += NU) {
+                values[i * M + r] += term.coefficient * *at;
             }
         }
     }
@@ -135,15 +139,14 @@ static void add_terms(const real *u, const real *before, real *values)
 static void inputs_of_axes(const real *w, real *u)
 {
     int g, i, j, a;
-    memset(u, 0, (size_t)(N * NU) * sizeof(real));
     for (g = 0; g < QUADSIM_PARTS; g++) {
-        const int m = AXES[g].inputs;
-        const real *own = w + AXES[g].first * N;
+        const int m = AXES[g].inputs, first = AXES[g].first;
         for (a = 0; a < m; a++) {
-            const real *column = T + AXES[g].first + a;
             for (i = 0; i < N; i++) {
+                const real own = w[first * N + i * m + a];
                 for (j = 0; j < NU; j++) {
-                    u[i * NU + j] += column[j * NU] * own[i * m + a];
+                    const real part = T[j * NU + first + a] * own;
+                    u[i * NU + j] = first + a == 0 ? part : u[i * NU + j] + part;
                 }
             }
         }
@@ -587,13 +590,16 @@ static int most_violated(const quadsim_mpc *mpc, int only, int *side)
     int found = -1, i, r;
     for (r = 0; r < M; r++) {
         const real tolerated = tolerance(mpc) * TOLERANCE[r];
-        for (i = 0; belongs(r, only) && i < N; i++) {
-            const int row = i * M + r;
+        const int steps = belongs(r, only) ? N : 0;
+        for (i = 0; i < steps; i++) {
+            const int row = i * M + r, bound = QUADSIM_BOUNDS_DIFFER ? row : r;
             const real value = mpc->value[row] + mpc->shift[row];
-            const real above = value - upper_bound(row), below = lower_bound(row) - value;
-            const real over = above > below ? above : below;
-            if (over > tolerated && mpc->side[row] == 0 && row != mpc->passed_over && over * SCALE[row] > most) {
-                most = over * SCALE[row];
+            const real above = value - UPPER[bound], below = LOWER[bound] - value;
+            if (!(above > tolerated || below > tolerated) || mpc->side[row] != 0 || row == mpc->passed_over) {
+                continue;
+            }
+            if ((above > below ? above : below) * SCALE[row] > most) {
+                most = (above > below ? above : below) * SCALE[row];
                 *side = above > below ? 1 : -1;
                 found = row;
             }
@@ -772,22 +778,20 @@ static void find_pull(const struct axis *axis, const real *reference, const real
 {
     static const unsigned char STATE_OF[4] = {0, 2, 4, 10}; /* which state x, y, z, yaw of the reference are */
     const int n = axis->states, r = axis->targets;
-    real rests[AXIS_STATES], rests_last[AXIS_STATES];
     int i, j, t;
     for (j = 0; j < n; j++) {
-        rests[j] = QUADSIM_RESTS ? -dot(axis->V + j * n, still, n) : R(0.0);
-        rests_last[j] = QUADSIM_RESTS ? -dot(axis->V_end + j * n, still, n) : R(0.0);
-    }
-    for (i = 0; i < N; i++) {
-        const real *W = i < N - 1 ? axis->W : axis->W_end;
-        for (j = 0; j < n; j++) {
-            pull[i * n + j] = i < N - 1 ? rests[j] : rests_last[j];
+        const real rests = QUADSIM_RESTS ? -dot(axis->V + j * n, still, n) : R(0.0);
+        for (i = 0; i < N - 1; i++) {
+            pull[i * n + j] = rests;
         }
+        pull[(N - 1) * n + j] = QUADSIM_RESTS ? -dot(axis->V_end + j * n, still, n) : R(0.0);
         for (t = 0; t < r; t++) {
-            const real wanted = reference[i * 4 + axis->target[t]] - rest[STATE_OF[axis->target[t]]];
-            for (j = 0; j < n; j++) {
-                pull[i * n + j] += W[j * r + t] * wanted;
+            const real weight = axis->W[j * r + t], origin = rest[STATE_OF[axis->target[t]]];
+            const real *wanted = reference + axis->target[t];
+            for (i = 0; magnitude(weight) > R(0.0) && i < N - 1; i++) {
+                pull[i * n + j] += weight * (wanted[i * 4] - origin);
             }
+            pull[(N - 1) * n + j] += axis->W_end[j * r + t] * (wanted[(N - 1) * 4] - origin);
         }
     }
 }
@@ -799,8 +803,6 @@ static void find_free(quadsim_mpc *mpc, const real *state, const real *reference
 {
     real start[AXIS_STATES], still[AXIS_STATES], away[NU];
     int g, i, j;
-    memset(mpc->value, 0, sizeof(mpc->value));
-    memset(mpc->push, 0, sizeof(mpc->push));
     for (j = 0; j < NU; j++) {
         away[j] = acting[j] - trim[j];
     }
@@ -808,7 +810,7 @@ static void find_free(quadsim_mpc *mpc, const real *state, const real *reference
         const struct axis *axis = &AXES[g];
         find_start(axis, state, rest, away, start, still);
         find_pull(axis, reference, rest, still, mpc->pull);
-        plan(axis, mpc->pull, mpc->push, start, mpc->w + axis->first * N, mpc->value);
+        plan(axis, mpc->pull, NULL, start, mpc->w + axis->first * N, mpc->value);
         for (j = 0; j < axis->outputs; j++) {
             const real there = dot(axis->C + j * axis->states, still, axis->states);
             for (i = 0; i < N; i++) {
@@ -823,6 +825,22 @@ static void find_free(quadsim_mpc *mpc, const real *state, const real *reference
         }
     }
     add_terms(mpc->u, acting, mpc->value);
+}
+
+/* Whether the free optimum keeps all bounds, to rounding. */
+static int keeps_bounds(const quadsim_mpc *mpc)
+{
+    int i, r;
+    for (i = 0; i < N; i++) {
+        for (r = 0; r < M; r++) {
+            const int row = i * M + r, bound = QUADSIM_BOUNDS_DIFFER ? row : r;
+            const real value = mpc->value[row], tolerated = FEASIBLE * TOLERANCE[r];
+            if (!(value <= UPPER[bound] + tolerated && value >= LOWER[bound] - tolerated)) {
+                return 0;
+            }
+        }
+    }
+    return 1;
 }
 
 /* The last active set moved one step earlier, its last step's held. */
@@ -893,7 +911,6 @@ static enum quadsim_status optimise(quadsim_mpc *mpc, const real *state, const r
 {
     enum verdict found;
     signed char start[N * M];
-    int side = 0;
     mpc->changes = 0;
     mpc->count = 0;
     mpc->slack = R(1.0);
@@ -903,14 +920,13 @@ static enum quadsim_status optimise(quadsim_mpc *mpc, const real *state, const r
     if (!is_finite(mpc->u, N * NU)) {
         return QUADSIM_BEFORE;
     }
-    shift_set(mpc);
-    memset(mpc->side, 0, sizeof(mpc->side));
-    memset(mpc->shift, 0, sizeof(mpc->shift));
-    if (most_violated(mpc, ALL, &side) < 0) {
+    if (keeps_bounds(mpc)) {
         memcpy(mpc->plan, mpc->u, sizeof(mpc->plan));
         memset(mpc->last, 0, sizeof(mpc->last));
         return QUADSIM_FREE;
     }
+    shift_set(mpc);
+    memset(mpc->side, 0, sizeof(mpc->side));
     found = QUADSIM_MIXED ? INFEASIBLE : solve_axes(mpc, trim, axes);
     if (found == SOLVED) {
         put_plan(mpc, trim);

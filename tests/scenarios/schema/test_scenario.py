@@ -197,7 +197,8 @@ WRONG = {
     "constraints=[{name='a', signal='x'}]": "constraints.a.lower must be given, or upper, or both",
     "controller.type=unconstrained": (
         "controller.solver is not a field of the scenario file "
-        "(there are: horizon, output_weights, input_weights, terminal, type)\n  controller.output_bounds is not ..."
+        "(there are: horizon, output_weights, input_weights, terminal, compiled, type)\n"
+        "  controller.output_bounds is not ..."
     ),
 }
 
