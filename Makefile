@@ -4,7 +4,7 @@
 
 .NOTPARALLEL:
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test peers check docs format types build numbers verification nonlinear robustness first-flights reproduce speed soak campaigns live tuning kills safety firmware export-numbers pins clean
+.PHONY: help setup demo test peers check docs format types build numbers verification nonlinear robustness first-flights gym reproduce speed soak campaigns live tuning kills safety firmware export-numbers pins clean
 
 VENV := .venv
 PY := $(VENV)/bin/python

@@ -64,8 +64,9 @@ is exported to again after `make clean`.
 
 The controller of {scenario}, N = {horizon}, {periods} recorded periods of its flight, of which {ways}. Flash is code
 and constants of the controller alone, RAM its struct, which the caller owns, stack its largest frame. **Instructions
-are counted by an emulator: they are not cycles.** It has no caches, no wait states of flash, no pipeline; a processor
-takes more than one cycle for some and flash is slow where it is not cached. No hardware was at hand.
+of a step, in millions, are counted by an emulator: they are not cycles.** It has no caches, no wait states of flash, no
+pipeline; a processor takes more than one cycle for some, and flash is slow where it is not cached. No hardware was at
+hand.
 
 {sizes}
 The first step begins on the ground without an active set, and takes by far the most: solve once before take-off. Error
@@ -74,7 +75,7 @@ is the largest distance of any command from the exact optimum.
 Others of the library, in double on the Cortex-M7:
 
 {others}
-On this computer ({processor}), in double, best of {repeats} passes: {host} a step.
+On this computer ({processor}), in double, each period the best of {repeats} passes: {host}.
 
 ## Peers on the same problem
 

@@ -1,4 +1,4 @@
-"""Remake the numbers of docs/live.md: what serving a session costs, and how soon a knob acts.  `make live`, a minute."""
+"""Remake the numbers of docs/live.md: what a session costs, and how soon a knob acts.  `make live`, a minute."""
 
 from __future__ import annotations
 

@@ -89,7 +89,7 @@ def page(measured: SpeedBench) -> str:
             "sensors measure, numbers are means over seeds, with the 95 % interval of the mean error; elsewhere\n"
             "nothing is random. What noise adds to the loop is in [papers.md](papers.md#noise-over-seeds). A vehicle "
             "farther off than the course's size,\nor tilted by more than 120 deg, is lost.\n",
-            "![Mean position error and share of the time beyond the tilt bound over speed](speed.png)\n",
+            "[![Mean position error and share of the time beyond the tilt bound over speed](speed.png)](speed.png)\n",
             section(reach),
             f"## What is seen\n\n{markdown(counts(measured))}\nFollowed: a mean error of at most {NEAR:g} m, and "
             f"within the bound all the time. Steep: the course takes some {STEEP - ROOM:g} deg or more.\n\n{READING}\n"

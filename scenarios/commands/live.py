@@ -12,6 +12,7 @@ from pathlib import Path
 from quadsim.errors import OutputError, ParameterError
 from quadsim.flight.rundir import KIND
 from quadsim.outputs import real_path, require_directory
+from scenarios.api import load as load_scenario
 from scenarios.commands import EXIT_DONE, EXIT_FAILED, console
 from scenarios.commands.common import load
 from scenarios.live.pacing import Pace
@@ -92,8 +93,6 @@ def _serve(session: Session, options: Namespace, save: Callable[[Session], str])
 
 def _others(scenario: Scenario) -> dict[str, ControllerSpec]:
     """Controllers of the library that fly the same vehicle at the same period."""
-    from scenarios.loading import load_scenario
-
     found: dict[str, ControllerSpec] = {}
     for name in scenario_names():
         other = load_scenario(name)

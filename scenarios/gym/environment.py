@@ -128,13 +128,8 @@ class QuadrotorEnv(gymnasium.Env):  # type: ignore[misc]
         self.observations = Observations(observation, preview)
         self.actions = make_actions(action, self._base, build_vehicle(self._base))
         self.action_space, self.observation_space = self.actions.space, self.observations.space
-        self.render_mode, self._size, self._preview, self._reward, self._action = (
-            render_mode,
-            (width, height),
-            preview,
-            reward,
-            action,
-        )
+        self.render_mode, self._size = render_mode, (width, height)
+        self._preview, self._reward, self._action = preview, reward, action
         self._flight: StartedFlight | None = None
         self._screen: Screen | None = None
         self._started = False
@@ -236,6 +231,7 @@ class QuadrotorEnv(gymnasium.Env):  # type: ignore[misc]
 
         Raises:
             ParameterError: actions are thrust and rates, which a controller does not answer with.
+            FlightError: the controller has no answer; a flight of its own would end here.
         """
         flight = self.started
         if self._asked is None or self._asked.k != flight.k:

@@ -44,17 +44,17 @@ _STEER_STEP: Final = 0.5
 """[m/s] by which a key changes it."""
 _STEER_MOST: Final = 5.0
 _NO_VELOCITY: Final = "0, 0, 0"
-_ACTIVE: Final = 0.05
+_ACTIVE: Final = 0.1
 """Share of a bound's scale within which a margin counts as active."""
 _FAULTS: Final = ("dropout", "freeze", "nan")
 
 STYLE: Final = """<style>
 .q{font:12px/1.45 system-ui,sans-serif;padding:0 .6em}.q b{font-variant-numeric:tabular-nums}
 .q table{width:100%;border-collapse:collapse}.q td{padding:1px 4px 1px 0;white-space:nowrap}
-.q .t{width:35%;min-width:50px}.q .r{position:relative;height:9px;background:#8884;border-radius:3px;overflow:hidden}
+.q .t{width:30%;min-width:40px}.q .r{position:relative;height:9px;background:#8884;border-radius:3px;overflow:hidden}
 .q .f{position:absolute;left:0;top:0;bottom:0;border-radius:3px}
 .q .n{text-align:right;font-variant-numeric:tabular-nums}
-.q .w{min-width:3.7em}.q .bad{color:#dc2f38;font-weight:600}.q .act{font-weight:600}.q .act .w{color:#b26b00}
+.q .w{width:3.9em;font-size:11px}.q .bad{color:#dc2f38;font-weight:600}.q .act{font-weight:600}.q .act .w{color:#b26b00}
 </style>"""
 
 
@@ -151,8 +151,9 @@ class Page:
                     if client.client_id in self._aims:
                         camera = client.camera
                         away = np.asarray(camera.position) - camera.look_at
-                        camera.look_at = at + self._aims[client.client_id]
-                        camera.position = camera.look_at + away
+                        look_at = at + self._aims[client.client_id]
+                        camera.position = look_at + away  # which moves where it looks
+                        camera.look_at = look_at
         self._server.flush()
 
     def ended(self, reason: str | None) -> None:
@@ -306,7 +307,9 @@ class Page:
             origin, direction = np.array(event.ray_origin), np.array(event.ray_direction)
             if origin[2] * direction[2] < 0.0:  # it meets the ground
                 meets = origin - origin[2] / direction[2] * direction
-                at = [round(float(each), 2) for each in (*meets[:2], place.value[2])]
+                sample = None if self._frame is None else self._frame.samples[0]
+                height = place.value[2] if sample is None else sample.observation.reference[2]
+                at = [round(float(each), 2) for each in (*meets[:2], height)]
                 self._handle.position, place.value = np.array(at), tuple(at)
                 self._set_point(at)
 
@@ -457,9 +460,10 @@ class Page:
         unit, at = self.stage.unit, np.asarray(self.stage.frames[0].position)
         away = unit * np.array([-4.0, -6.0, 3.0])
         upright = client.camera.aspect < 1.0  # a phone, whose lower half is the panel
-        self._aims[client.client_id] = np.array([0.0, 0.0, -0.35 * np.linalg.norm(away)]) * upright
-        client.camera.look_at = at + self._aims[client.client_id]
-        client.camera.position = client.camera.look_at + away
+        self._aims[client.client_id] = np.array([0.0, 0.0, -0.5 * np.linalg.norm(away)]) * upright
+        look_at = at + self._aims[client.client_id]
+        client.camera.position = look_at + away  # which moves where it looks
+        client.camera.look_at = look_at
         take = client.gui.add_button("Take the controls", visible=self._driver != client.client_id)
         self._takes[client.client_id] = take
 
@@ -584,9 +588,9 @@ def _bars(limits: tuple[Limit, ...], frame: Frame, other: str) -> str:
             colour = BOUND if red else LINES[1] if active else LINES[2] if i == 0 else LINES[4]
             mark = "bad" if red else "act" if active else ""
             fill = f'<div class="f" style="width:{100.0 * share:.0f}%;background:{colour}"></div>'
-            name = escape(limit.name if i == 0 else f"{limit.name}, {other}")
+            name = escape(limit.name if i == 0 else f"by {other}")
             said = "violated" if red else "active" if active else ""
-            number = f'<td class="n">{margin:+.3g} {escape(limit.unit)}</td><td class="w">{said}</td>'
+            number = f'<td class="n">{margin:+.2g} {escape(limit.unit)}</td><td class="w">{said}</td>'
             rows.append(
                 f'<tr class="{mark}"><td>{name}</td><td class="t"><div class="r">{fill}</div></td>{number}</tr>'
             )

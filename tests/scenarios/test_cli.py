@@ -531,7 +531,7 @@ def test_a_defect_of_our_own_shows_its_traceback(here: Path, monkeypatch: pytest
         raise ZeroDivisionError
 
     assert not issubclass(ZeroDivisionError, QuadsimError)
-    monkeypatch.setattr("scenarios.run.fly", broken)
+    monkeypatch.setattr("scenarios.run.complete", broken)
     with pytest.raises(ZeroDivisionError):
         main(["check", "hover"])
 
