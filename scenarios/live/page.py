@@ -11,8 +11,9 @@ import contextlib
 import dataclasses
 import io
 import math
+import warnings
 from collections import deque
-from collections.abc import Awaitable, Callable, Mapping
+from collections.abc import Awaitable, Callable, Iterator, Mapping
 from functools import partial
 from html import escape
 from importlib.util import find_spec
@@ -144,7 +145,7 @@ class Page:
 
     def pose(self, frame: Frame, share: float) -> None:
         """See `scenarios.live.pacing.View`."""
-        with self._server.atomic():
+        with _unless_gone(), self._server.atomic():
             at = self.stage.pose(frame, share)
             if self._follow.value:
                 for client in self._server.get_clients().values():
@@ -434,7 +435,8 @@ class Page:
                 said = f"saved: {self._save(session)}"
             except (InputError, OutputError) as error:
                 said = f"not saved: {error}"
-            client.add_notification("Save", said)
+            with _unless_gone():
+                client.add_notification("Save", said)
 
         self._pace.order(keep)
 
@@ -523,8 +525,9 @@ class Page:
         register(called)
 
     def _tell(self, text: str) -> None:
-        for client in self._server.get_clients().values():
-            client.add_notification("quadsim", text)
+        with _unless_gone():
+            for client in self._server.get_clients().values():
+                client.add_notification("quadsim", text)
 
     # Numbers
 
@@ -568,6 +571,14 @@ class Page:
             f"<b>{np.linalg.norm(frame.pull):.1f}</b> N",
         ]
         return f'{STYLE}<div class="q">' + "<br>".join(rows) + "</div>"
+
+
+@contextlib.contextmanager
+def _unless_gone() -> Iterator[None]:
+    """Send to clients that may close their page meanwhile, of which viser warns."""
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message=r"Queued a \w+ on a closed connection")
+        yield
 
 
 def _bars(limits: tuple[Limit, ...], frame: Frame, other: str) -> str:
