@@ -5,6 +5,7 @@ Flies every scenario; neither the page nor the figures are kept in the repositor
 
 from __future__ import annotations
 
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -20,6 +21,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 import quadsim
+from quadsim.errors import RenderingUnavailableError
 from quadsim.report.figures.flight_figures import draw_signal
 from quadsim.report.palette import REFERENCE, line_colour
 from scenarios.flight import Flight
@@ -29,6 +31,8 @@ from scenarios.schema.scenario import Group
 DOCS = Path(__file__).resolve().parent
 PAGE, FIGURES = DOCS / "gallery.md", DOCS / "gallery"
 SIDES = np.array([-1.0, 1.0])
+FILMED = ("power-loop", "inverted-start", "window", "thrown-ball")
+"""Scenarios whose films are on the page too, where films can be made."""
 HEAD = """# Gallery
 
 Every scenario that ships: its path (dashed: the reference), roll and pitch with their bounds, or the tilt where the
@@ -69,10 +73,22 @@ def draw(flight: Flight, file: Path) -> None:
     figure.savefig(file, format="svg", metadata={"Date": None})
 
 
+def film(flight: Flight, file: Path) -> str:
+    """The film of a flight as the page shows it; nothing where none can be made."""
+    with tempfile.TemporaryDirectory() as folder:
+        try:
+            run = flight.save(Path(folder) / "run", recording=False, figures=False)
+        except RenderingUnavailableError:
+            return ""
+        shutil.copy(run / "flight.mp4", file)
+    return f'<video controls muted loop preload="metadata" width="100%" src="gallery/{file.name}"></video>\n'
+
+
 def entry(name: str) -> tuple[Group, str]:
     """Fly and draw a scenario; its group, and its section of the page."""
     flight = quadsim.fly(name, progress=False)
     draw(flight, FIGURES / f"{name}.svg")
+    clip = film(flight, FIGURES / f"{name}.mp4") if name in FILMED else ""
     scenario, rmse = flight.scenario, ", ".join(f"{flight.metrics[f'rmse.{axis}']:.3f}" for axis in "xyz")
     numbers = [
         f"**{flight.outcome}**",
@@ -82,7 +98,7 @@ def entry(name: str) -> tuple[Group, str]:
     ]
     return scenario.group, (
         f"### {name}\n\n{scenario.description}.\n\n![Path and attitude of {name}](gallery/{name}.svg)\n\n"
-        f"{' · '.join(numbers)}\n"
+        f"{' · '.join(numbers)}\n{clip and chr(10) + clip}"
     )
 
 
