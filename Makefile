@@ -54,8 +54,8 @@ test: setup $(VENV)/.browser  ## run every test that needs no peer (OPTIONS="-k 
 peers: setup $(VENV)/.peers  ## install the peers and every solver, and hold quadsim against them
 	@$(PY) -m pytest -q -n $(WORKERS) --dist loadscope tests/peers $(OPTIONS)
 
-firmware: setup $(VENV)/.firmware  ## compile exported controllers for every target, emulate, analyse and fuzz them
-	@$(PY) -m pytest -q tests/firmware $(OPTIONS)
+firmware: setup $(VENV)/.firmware $(VENV)/.peers  ## compile exported controllers for every target, emulate, analyse and fuzz them
+	@$(PY) -m pytest -q -n $(WORKERS) --dist loadscope tests/firmware $(OPTIONS)
 
 check: setup  ## lint, formatting and types
 	@$(PY) -m ruff check

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 import sys
+import threading
+import time as clock
 from typing import Any, Final, Protocol
 
 import mujoco
@@ -17,6 +19,8 @@ from scenarios.schema.scenario import Scenario
 
 Picture = np.ndarray[Any, np.dtype[np.uint8]]
 DISPLAYS: Final = ("DISPLAY", "WAYLAND_DISPLAY")
+_CLOSING: Final = 5.0
+"""[s] that a window may take to close."""
 
 
 def has_display() -> bool:
@@ -48,14 +52,17 @@ class _Pictures:
 
 
 class _Window:
-    """MuJoCo's own viewer, with the vehicle where it is."""
+    """MuJoCo's own viewer, with the vehicle where it is, no quicker than real time."""
 
     def __init__(self, scenario: Scenario, vehicle: Vehicle) -> None:
         import mujoco.viewer as viewer  # which loads GLFW
 
         self._model = compile_model(vehicle, visuals=True, obstacles=scenario.obstacles)
         self._data = mujoco.MjData(self._model)
+        others = set(threading.enumerate())
         self._viewer = viewer.launch_passive(self._model, self._data, show_left_ui=False, show_right_ui=False)
+        self._threads = [thread for thread in threading.enumerate() if thread not in others]
+        self._period, self._due = scenario.control_period, clock.monotonic()
         self._viewer.cam.distance = 8.0 * vehicle.arm_length
 
     def show(self, state: Array, rotors: Array, reference: Array, time: float) -> Picture | None:
@@ -66,10 +73,14 @@ class _Window:
                 mujoco.mj_forward(self._model, self._data)
                 self._viewer.cam.lookat[:] = position
             self._viewer.sync()
+            self._due = max(self._due + self._period, clock.monotonic() - self._period)
+            clock.sleep(max(0.0, self._due - clock.monotonic()))
         return None
 
     def close(self) -> None:
         self._viewer.close()
+        for thread in self._threads:  # a window that still closes while Python ends takes the process with it
+            thread.join(_CLOSING)
 
 
 def make_screen(mode: str | None, scenario: Scenario, vehicle: Vehicle, width: int, height: int) -> Screen:

@@ -11,7 +11,9 @@ import pytest
 from quadsim import errors
 from quadsim.errors import (
     CommandError,
+    CompilerError,
     DivergenceError,
+    ExportError,
     FileError,
     FlightError,
     ForceError,
@@ -19,6 +21,7 @@ from quadsim.errors import (
     InterruptedFlightError,
     LostError,
     MissingPackageError,
+    MissingProgramError,
     OutputError,
     ParameterError,
     PlanExhaustedError,
@@ -39,6 +42,9 @@ SAMPLES: list[QuadsimError] = [
     UnknownNameError("solver", "piqp-dens", ["piqp-dense"], hint="see quadsim list"),
     FileError("a/b.toml", "no such file"),
     MissingPackageError("solver 'daqp'", "daqp", extra="daqp"),
+    MissingProgramError("to compile", "make", packages="make gcc"),
+    CompilerError("a"),
+    ExportError("its matrices change"),
     OutputError("a/b.toml", "the disk is full"),
     RenderingUnavailableError({"egl": "no libEGL"}),
     ViewerUnavailableError("a"),

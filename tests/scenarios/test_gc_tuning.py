@@ -70,9 +70,9 @@ class _Noting:
 
     def reset(self, speeds: Array) -> None:
         self._controller.reset(speeds)
-        gc.enable()
 
     def step(self, now: Moment, state: Array, reference: Array) -> Command:
+        gc.enable()
         command: Command = self._controller.step(now, state, reference)
         self.made += [[] for _ in range(100)]  # so that there are young ones to look through
         self.in_flight = self._passes.copy()
