@@ -75,7 +75,10 @@ class _Plotter:
 
     def plots(self) -> Iterator[Plot]:
         yield self._states("course", "Course and heading", ("x", "y", "z", "yaw"))
-        yield self._states("attitude", "Roll and pitch", ("roll", "pitch"))
+        if all(run.log.plant.attitude is None for _, _, run in self._runs):
+            yield self._states("attitude", "Roll and pitch", ("roll", "pitch"))
+        else:  # some may turn upside down
+            yield self._states("attitude", "Tilt, roll and pitch", ("tilt", "roll", "pitch"))
         yield self._inputs("speeds", "Rotor speeds", "speed")
         yield self._inputs("slews", "Steps of the rotor speeds, per period", "slew")
         yield self._times()

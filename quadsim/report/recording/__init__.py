@@ -4,7 +4,8 @@ Everything stands on one timeline, `sim_time`, the simulated time:
 
     world/...           vehicle, thrusts, external force, wind, flown path, reference, and the horizon predicted at each
                         control period of flight
-    signals/NAME        what can be limited, by the names and in the units of `quadsim.flight.audit.SIGNALS`
+    signals/NAME        what can be limited, by the names and in the units of `quadsim.flight.audit.SIGNALS`; of
+                        flights that may turn upside down quaternion and body_rates as well
     reference/NAME      what x, y, z and yaw should be
     limits/NAME         the bounds, drawn with their signal
     margins/NAME        signed distance to the nearer bound at the control samples; negative = violated

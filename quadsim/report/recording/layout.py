@@ -10,7 +10,7 @@ import numpy as np
 from quadsim.flight.audit import SIGNALS, Limit
 from quadsim.flight.rundir import Run
 from quadsim.report.curves import commanded_speeds, effect_curves, least_range, reference_curve
-from quadsim.report.recording.style import FRONT_PANELS, PANELS, TIMELINE
+from quadsim.report.recording.style import FRONT_PANELS, TIMELINE, panels
 from quadsim.state import POSITION, REFERENCE_NAMES, Array
 
 if TYPE_CHECKING:
@@ -23,8 +23,11 @@ def blueprint(run: Run) -> rrb.Blueprint:
 
     end, limits = run.end, run.limits
     plots = [
-        _plot(title, _contents(names, limits), end, ends=_least_range(run, names)) for title, names in PANELS.items()
+        _plot(title, _contents(names, limits), end, ends=_least_range(run, names))
+        for title, names in panels(run.log).items()
     ]
+    if run.log.plant.attitude is not None:
+        plots += [_plot("Quaternion", ["signals/quaternion"], end), _plot("Body rates", ["signals/body_rates"], end)]
     margins = [
         _plot(f"Margins [{unit}]", [f"margins/{limit.name}" for limit in limits if limit.unit == unit], end)
         for unit in dict.fromkeys(limit.unit for limit in limits)

@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from quadsim.flight.audit import SIGNALS, Limit, margins_sampled
-from quadsim.flight.log import FlightLog
+from quadsim.flight.log import BODY_RATES, QUATERNION, FlightLog
 from quadsim.flight.rundir import Run
 from quadsim.report.curves import break_at_wraps, commanded_speeds, effect_curves, reference_curve
-from quadsim.report.recording.style import BOUND, PANELS, REFERENCE, SERIES, VERDICTS, Colour, time_column
+from quadsim.report.recording.style import BOUND, REFERENCE, SERIES, VERDICTS, Colour, panels, time_column
 from quadsim.state import REFERENCE_NAMES, Array
 from quadsim.vehicle import N_ROTORS
 
@@ -24,8 +24,11 @@ _ACTIVE: Final = 0.002
 
 
 def send_signals(recording: rr.RecordingStream, log: FlightLog) -> None:
-    """Every signal there is, at the log rate where it exists between the control samples; and the reference."""
-    for names in PANELS.values():
+    """Every signal there is, at the log rate where it exists between the control samples; and the reference.
+
+    Of flights that may turn upside down quaternion and body rates as well.
+    """
+    for names in panels(log).values():
         for colour, name in zip(SERIES, names, strict=False):
             signal = SIGNALS[name]
             t, values = signal.finest(log)
@@ -35,6 +38,16 @@ def send_signals(recording: rr.RecordingStream, log: FlightLog) -> None:
             else:
                 rotors = {f"rotor {i} [{signal.unit}]": shade for i, shade in enumerate(SERIES, start=1)}
                 _send_curves(recording, f"signals/{name}", t, values, rotors, stepped=True)
+    plant = log.plant
+    for name, vectors, columns in (
+        ("quaternion", plant.attitude, QUATERNION),
+        ("body_rates", plant.body_rates, BODY_RATES),
+    ):
+        if vectors is not None:
+            named = {
+                f"{column} [{unit}]": colour for (column, unit), colour in zip(columns.items(), SERIES, strict=False)
+            }
+            _send_curves(recording, f"signals/{name}", plant.t, vectors, named)
     for name in REFERENCE_NAMES:
         values, label = reference_curve(log.control, name), f"{name} ref [{SIGNALS[name].unit}]"
         _send_curves(recording, f"reference/{name}", log.control.t, values, {label: REFERENCE})

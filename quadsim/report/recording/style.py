@@ -12,6 +12,8 @@ from quadsim.vehicle import N_ROTORS
 if TYPE_CHECKING:
     import rerun as rr
 
+    from quadsim.flight.log import FlightLog
+
 TIMELINE: Final = "sim_time"
 
 PANELS: Final[dict[str, tuple[str, ...]]] = {
@@ -28,10 +30,22 @@ PANELS: Final[dict[str, tuple[str, ...]]] = {
 }
 """Title of each plot, and its signals; every signal is in one, so that every limit is drawn."""
 assert sorted(name for names in PANELS.values() for name in names) == sorted(SIGNALS)
+_ANY_ATTITUDE: Final = {
+    "Roll and pitch": ("Tilt", ("tilt",)),
+    "Yaw and tilt": ("Roll, pitch and yaw", ("roll", "pitch", "yaw", "yaw_error")),
+}
+"""What takes a plot's place where the vehicle may turn upside down: Euler angles jump there."""
 FRONT_PANELS: Final = 4
 """How many of the plots are seen first."""
 
 Colour = tuple[int, int, int, int]
+
+
+def panels(log: FlightLog) -> dict[str, tuple[str, ...]]:
+    """The plots of a flight, `FRONT_PANELS` of them first."""
+    if log.plant.attitude is None:
+        return PANELS
+    return dict(_ANY_ATTITUDE.get(title, (title, names)) for title, names in PANELS.items())
 
 
 def on_screen(colour: str) -> Colour:

@@ -89,7 +89,8 @@ def send_scene(recording: rr.RecordingStream, run: Run) -> None:
     # The body turns below an entity that only moves: views that start there follow the vehicle without tilting.
     thrusts = np.zeros((plant.t.size, N_ROTORS, 3))
     thrusts[..., 2] = run.vehicle.arm_length * np.square(plant.speeds / run.vehicle.hover_speed)
-    attitude = _vector_first(euler_to_quaternion(plant.state[:, EULER]))
+    turned = euler_to_quaternion(plant.state[:, EULER]) if plant.attitude is None else plant.attitude
+    attitude = _vector_first(turned)
     arrows = rr.Arrows3D.columns(vectors=thrusts.reshape(-1, 3)).partition([N_ROTORS] * plant.t.size)
     recording.send_columns("world/vehicle", [time_column(plant.t)], rr.Transform3D.columns(translation=position))
     recording.send_columns("world/vehicle/body", [time_column(plant.t)], rr.Transform3D.columns(quaternion=attitude))

@@ -22,7 +22,7 @@ from quadsim.errors import FileError, OutputError, ViewerUnavailableError
 from quadsim.flight.audit import SIGNALS, Limit, margins_sampled
 from quadsim.flight.rundir import Run
 from quadsim.report.recording import layout, open_viewer, texts, viewer_problem, world, write_recording
-from quadsim.report.recording.style import PANELS, TIMELINE, VERDICTS
+from quadsim.report.recording.style import FRONT_PANELS, PANELS, TIMELINE, VERDICTS, panels
 from quadsim.state import EULER, INDEX, POSITION, body_to_world
 
 
@@ -344,6 +344,22 @@ def test_a_roll_that_wraps_has_gaps(record: Callable[[Run], Content], short_run:
     drawn = np.ravel(record(dataclasses.replace(short_run, log=turned)).rows("/signals/roll", "scalars"))
     assert np.nanmax(np.abs(np.diff(drawn))) < 10.0
     assert np.count_nonzero(np.isnan(drawn)) == 3
+
+
+def test_a_vehicle_upside_down_has_its_quaternion(record: Callable[[Run], Content], short_run: Run) -> None:
+    plant = short_run.log.plant
+    half = 0.5 * 3.0 * plant.t  # a roll at a steady rate, through upside down
+    attitude = np.stack([np.cos(half), np.sin(half), 0.0 * half, 0.0 * half], axis=1)
+    turned = dataclasses.replace(plant, attitude=attitude, body_rates=np.tile([3.0, 0.0, 0.0], (plant.t.size, 1)))
+    run = dataclasses.replace(short_run, log=dataclasses.replace(short_run.log, plant=turned))
+    content = record(run)
+    np.testing.assert_array_equal(content.rows("/signals/quaternion", "scalars"), attitude)
+    np.testing.assert_array_equal(content.rows("/signals/body_rates", "scalars"), turned.body_rates)
+    x, y, z, w = np.array(content.rows("/world/vehicle/body", "quaternion"))[:, 0].T
+    np.testing.assert_allclose(np.stack([w, x, y, z], axis=1), attitude, atol=1e-6)
+    assert panels(run.log)["Tilt"] == ("tilt",)
+    assert list(panels(run.log)).index("Tilt") < FRONT_PANELS
+    assert {name for names in panels(run.log).values() for name in names} == set(SIGNALS)
 
 
 def test_a_lost_vehicle_leaves_the_picture(short_run: Run) -> None:
