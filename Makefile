@@ -121,7 +121,7 @@ campaigns: setup  ## fly the campaigns that ship and remake docs/paper-robustnes
 tuning: setup  ## carry out the tunings that ship and remake docs/tuning.md, up to half an hour each; goes on with what is there
 	@$(PY) docs/make_tuning.py
 
-live: setup $(VENV)/.browser  ## remake the numbers of docs/live.md: load, latency and bandwidth of a session; a minute
+live: setup $(VENV)/.browser  ## film a session and remake the numbers of docs/live.md: load, latency and bandwidth; a minute
 	@$(PY) docs/make_live.py
 
 safety: setup  ## attack all that writes or reads files, and remake the counts on docs/safety.md: some forty minutes

@@ -46,8 +46,8 @@ def live(options: Namespace) -> int:
             while session.reason is None and session.k < scenario.periods:
                 session.advance()
         if script is not None:
-            for said in play(session, script):
-                console.say(f"refused: {said}")
+            for reason in play(session, script):
+                console.say(f"refused: {reason}")
         else:
             _serve(session, options, save)
         if session.k:

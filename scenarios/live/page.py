@@ -131,12 +131,12 @@ class Page:
         """See `scenarios.live.pacing.View`."""
         self._frame = frame
         self._remember(frame)
-        for said in frame.refused:
-            self._tell(f"refused: {said}")
+        for reason in frame.refused:
+            self._notify(f"refused: {reason}")
         with self._server.atomic():
             self.stage.show(frame)
             if frame.k % _EVERY == 0 or self._pace.paused:
-                self._status.content = self._told(frame, factor)
+                self._status.content = self._state(frame, factor)
                 self._margins.content = _bars(
                     self._session.limits, frame, self._session.flights[-1].loop.controller.name
                 )
@@ -167,7 +167,7 @@ class Page:
                 widget.value = value
             self._handle.position = np.array(self._place.value)
             self._steered.value = _NO_VELOCITY
-            self._said.content = ""
+            self._answer.content = ""
             self._show_knobs(self._session.scenario.controller)
         else:
             self._status.content = (
@@ -346,7 +346,7 @@ class Page:
         gui = self._server.gui
         names = ["as started", *self._others]
         chosen = gui.add_dropdown("Controller", names)
-        self._said = gui.add_html("")
+        self._answer = gui.add_html("")
         self._button("Take this controller", lambda event: self._take(chosen.value))
         self._knobs_folder = gui.add_folder("Fields")
         self._show_knobs(self._session.scenario.controller)
@@ -402,12 +402,12 @@ class Page:
         try:
             successor = await asyncio.to_thread(flight.successor, fields)
         except InputError as error:
-            self._said.content = (
+            self._answer.content = (
                 f'{STYLE}<div class="q bad">refused, the controller before flies on: {escape(str(error))}</div>'
             )
             return False
         self._session.submit({"type": "controller", "fields": dict(fields)}, successor=successor)
-        self._said.content = f'{STYLE}<div class="q">in force: {escape(what)}</div>'
+        self._answer.content = f'{STYLE}<div class="q">in force: {escape(what)}</div>'
         return True
 
     # Buttons
@@ -432,11 +432,11 @@ class Page:
 
         def keep(session: Session) -> None:
             try:
-                said = f"saved: {self._save(session)}"
+                result = f"saved: {self._save(session)}"
             except (InputError, OutputError) as error:
-                said = f"not saved: {error}"
+                result = f"not saved: {error}"
             with _unless_gone():
-                client.add_notification("Save", said)
+                client.add_notification("Save", result)
 
         self._pace.order(keep)
 
@@ -524,7 +524,7 @@ class Page:
 
         register(called)
 
-    def _tell(self, text: str) -> None:
+    def _notify(self, text: str) -> None:
         with _unless_gone():
             for client in self._server.get_clients().values():
                 client.add_notification("quadsim", text)
@@ -552,7 +552,7 @@ class Page:
             plot.data = (table[0], *table[first : first + count])
             first += count
 
-    def _told(self, frame: Frame, factor: float) -> str:
+    def _state(self, frame: Frame, factor: float) -> str:
         sample = frame.samples[0]
         if sample is None:
             return str(self._status.content)
@@ -599,9 +599,9 @@ def _bars(limits: tuple[Limit, ...], frame: Frame, other: str) -> str:
             colour = BOUND if red else LINES[1] if active else LINES[2] if i == 0 else LINES[4]
             mark = "bad" if red else "act" if active else ""
             fill = f'<div class="f" style="width:{100.0 * share:.0f}%;background:{colour}"></div>'
-            name = escape(limit.name if i == 0 else f"by {other}")
-            said = "violated" if red else "active" if active else ""
-            number = f'<td class="n">{margin:+.2g} {escape(limit.unit)}</td><td class="w">{said}</td>'
+            name = escape(limit.name if i == 0 else other)
+            verdict = "violated" if red else "active" if active else ""
+            number = f'<td class="n">{margin:+.2g} {escape(limit.unit)}</td><td class="w">{verdict}</td>'
             rows.append(
                 f'<tr class="{mark}"><td>{name}</td><td class="t"><div class="r">{fill}</div></td>{number}</tr>'
             )

@@ -157,7 +157,7 @@ class Session:
         """
         if self.reason is not None:
             raise InputError(f"the flight has ended: {self.reason}")
-        refused = [said for each in self._taken() if (said := self._apply(each)) is not None]
+        refused = [reason for each in self._taken() if (reason := self._apply(each)) is not None]
         pull = self._hold(refused)
         samples: list[Sample | None] = []
         for flight in self.flights:
