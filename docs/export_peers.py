@@ -26,7 +26,7 @@ from scenarios.export.record import Recording
 
 SOURCES: Final = ROOT / "tests" / "firmware" / "peers"
 OURS: Final = ROOT / "mpc" / "export" / "c"
-FLAGS: Final = ["-O2", "-std=gnu99", "-ffp-contract=off", "-ffunction-sections", "-fdata-sections", "-w"]
+FLAGS: Final = ["-O3", "-std=gnu99", "-ffp-contract=off", "-ffunction-sections", "-fdata-sections", "-w"]
 ASSIGNED: Final = {"double": [], "float": ["-DPEER_FLOAT", "-fsingle-precision-constant"]}
 
 
