@@ -60,7 +60,7 @@ def _cortex(name: str, title: str, machine: str, board: str) -> Target:
         title=title,
         sources=("startup.c", "mps2.ld"),
         compiler="arm-none-eabi-gcc",
-        machine=f"{machine} -mfloat-abi=hard -mthumb",
+        machine=f"{machine} -mfloat-abi=hard -mthumb -fno-tree-loop-distribute-patterns",  # no memmove made of a loop
         link="-nostartfiles -T mps2.ld --specs=nano.specs",
         board=board,
     )

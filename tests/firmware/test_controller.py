@@ -37,7 +37,7 @@ FLIGHTS = (
 OTHERS = ("hummingbird-figure-eight", "paper-constrained-heavy", "robust-lag50", "robust-worn-rotor", "polytopes")
 TOLERANCE = {"double": 1e-8, "float": 2e-2}  # [rad/s]
 STRICT = (
-    *("-std=c99", "-O2", "-Wall", "-Wextra", "-Wconversion", "-Wdouble-promotion", "-Wshadow", "-Wcast-qual"),
+    *("-std=c99", "-O3", "-Wall", "-Wextra", "-Wconversion", "-Wdouble-promotion", "-Wshadow", "-Wcast-qual"),
     *("-pedantic", "-Werror", "-ffp-contract=off", "-fsyntax-only"),
 )
 

@@ -11,7 +11,7 @@ from firmware.conftest import Export, Run
 from mpc.export.targets import TARGETS
 
 WARNINGS = [
-    *("-std=c99", "-O2", "-Wall", "-Wextra", "-Wconversion", "-Wdouble-promotion", "-Wshadow", "-Wcast-qual", "-Wvla"),
+    *("-std=c99", "-O3", "-Wall", "-Wextra", "-Wconversion", "-Wdouble-promotion", "-Wshadow", "-Wcast-qual", "-Wvla"),
     *("-pedantic", "-Werror", "-ffp-contract=off"),
 ]
 TIDY = ",".join(
@@ -56,7 +56,7 @@ def test_analysers_find_nothing(exported: Export, run: Run, tmp_path: Path) -> N
 def undefined(source: Path, board: str, run: Run, made: Path) -> set[str]:
     """Symbols that a source asks others for."""
     target = TARGETS[board]
-    run(target.compiler, *target.machine.split(), "-std=c99", "-O2", "-c", source, "-o", made)
+    run(target.compiler, *target.machine.split(), "-std=c99", "-O3", "-c", source, "-o", made)
     return {line.split()[-1] for line in run("arm-none-eabi-nm", "-u", made).stdout.splitlines()}
 
 
