@@ -106,7 +106,7 @@ reproduce: setup  ## fly the numbers of every paper that ships and remake docs/p
 export-numbers: setup $(VENV)/.firmware  ## remake docs/export.md: exported controllers and peers on emulated targets; some ten minutes
 	@$(PY) docs/make_export.py
 
-speed: setup  ## fly every controller ever faster and remake docs/speed.md: some six minutes
+speed: setup  ## fly every controller ever faster and remake docs/speed.md: some two minutes
 	@$(PY) docs/make_speed.py
 
 gym: setup  ## remake the numbers and the figure of docs/gym.md: some ten minutes; CRAZYFLOW=PYTHON times that beside it
