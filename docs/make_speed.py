@@ -1,4 +1,4 @@
-"""Remake docs/speed.md and its figure, `quadsim bench speed` with words: `make speed`, some six minutes.
+"""Remake docs/speed.md and its figure, `quadsim bench speed` with words: `make speed`, some two minutes.
 
 No clock decides any of it; tests/scenarios/bench/test_speed.py flies the short ones.
 """

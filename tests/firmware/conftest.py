@@ -29,7 +29,8 @@ def run() -> Run:
         words = [str(word) for word in command]
         if shutil.which(words[0]) is None:
             pytest.skip(f"{words[0]} is not installed: make firmware")
-        done = subprocess.run(words, capture_output=True, text=True, timeout=900, **options)  # type: ignore[call-overload]
+        options = {"timeout": 900, **options}
+        done = subprocess.run(words, capture_output=True, text=True, **options)  # type: ignore[call-overload]
         assert done.returncode == 0 or not check, "\n".join([*words, done.stdout[-2000:], done.stderr[-4000:]])
         return done
 

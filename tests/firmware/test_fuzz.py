@@ -12,7 +12,9 @@ from firmware.conftest import Export, Run
 HERE = Path(__file__).parent
 SANITIZERS = ["-fsanitize=fuzzer,address,undefined", "-fno-sanitize-recover=all"]
 SECONDS = 8
-"""Of each target; the variable FUZZ_RUNS has a number of inputs instead, of four steps or so each."""
+"""Of each controller; the variable FUZZ_RUNS has a number of inputs instead, of four steps or so each."""
+LONGEST = 7200
+"""Seconds of those."""
 HANGS = 30
 """Seconds of one input that are taken for a hang; the hardest takes half a second on a busy machine."""
 CONTROLLERS = {
@@ -26,14 +28,16 @@ CONTROLLERS = {
 def test_arbitrary_bytes_lead_to_commands_within_bounds(name: str, exported: Export, run: Run, tmp_path: Path) -> None:
     """A short horizon makes many steps; the whole one has the paths that only many active rows take."""
     directory, program = exported("posix", *CONTROLLERS[name]), tmp_path / "fuzz"
-    compile = ["clang", "-g", "-O2", "-std=c99", "-ffp-contract=off", *SANITIZERS, "-I", directory]
+    compile = ["clang", "-g", "-O3", "-std=c99", "-ffp-contract=off", *SANITIZERS, "-I", directory]
     built = run(*compile, "-o", program, HERE / "fuzz.c", check=False)
     if "cannot find" in built.stderr:
         pytest.skip("clang has no sanitizers: make firmware")
     assert built.returncode == 0, built.stderr
     runs = os.environ.get("FUZZ_RUNS")
     length = f"-runs={runs}" if runs else f"-max_total_time={SECONDS}"
-    done = run(program, length, f"-timeout={HANGS}", "-max_len=600", "-len_control=0", "-seed=1", cwd=tmp_path)
+    done = run(
+        program, length, f"-timeout={HANGS}", "-max_len=600", "-len_control=0", "-seed=1", cwd=tmp_path, timeout=LONGEST
+    )
     (steps,) = re.findall(r"^steps: (\d+)$", done.stdout, re.MULTILINE)
     print(f"{name}: {steps} steps from arbitrary bytes")
     assert int(steps) > 100
