@@ -19,6 +19,7 @@ import distributed
 import psutil
 import pytest
 from campaign_pilots import ToyPilot, known, living, until, value_of
+from tuning_formula import write_tuning
 
 from quadsim.errors import FileError, InputError, MissingPackageError, ParameterError, UnknownNameError
 from scenarios.campaign.engine import cluster as module
@@ -31,6 +32,8 @@ from scenarios.campaign.results.table import Row
 from scenarios.campaign.run import SUMMARY_FILE, Standing, fly_campaign
 from scenarios.campaign.spec import LimitsSpec
 from scenarios.progress import Progress, silent
+from scenarios.tuning.plan import load_tuning
+from scenarios.tuning.run import tune
 
 ROOT = Path(__file__).resolve().parents[4]
 FLIGHTS = range(40)
@@ -149,6 +152,15 @@ def test_a_worker_killed_in_mid_campaign_costs_nothing_but_time(two_workers: str
     assert len({row["process"] for row in rows}) >= 2
     assert killed
     assert not living({killed})
+
+
+def test_a_tuning_has_the_same_bytes_on_a_cluster(two_workers: str, tmp_path: Path) -> None:
+    sizes = {"trials": 4, "batch": 2, "flights": [1, 2], "fresh": {"flights": 2, "seed": 1}}
+    plan = load_tuning(str(write_tuning(tmp_path, **sizes)))
+    here = tune(plan, tmp_path / "here", LocalEngine(workers=1), report=False)
+    there = tune(plan, tmp_path / "there", DaskEngine(two_workers), report=False)
+    for name in ("flights.parquet", SUMMARY_FILE, "best.toml", "start/flights.parquet"):
+        assert (here.directory / name).read_bytes() == (there.directory / name).read_bytes(), name
 
 
 def test_a_campaign_whose_worker_is_killed_ends_in_the_same_bytes(two_workers: str, tmp_path: Path) -> None:
