@@ -121,7 +121,7 @@ def rejection(status: str, speeds: Array, plan: Array, bounds: ActuatorBounds, b
 
 
 def command_of(speeds: Array, plan: Array, status: str, answer: Answer, *, fallback: int = 0) -> Command:
-    """Speeds (4,) and a plan (N, 4) as a command under a status, with what the solver says of its answer."""
+    """Speeds (4,) and a plan (N, 4) as a command under a status, with the solver's report on its answer."""
     solution, accepted = answer.solution, status in ACCEPTED
     return Command(
         speeds=speeds.copy(),

@@ -205,7 +205,7 @@ def vehicle_sources(path: Path) -> dict[str, str]:
 
 
 def _read_entries(path: Path) -> tuple[dict[str, str], dict[str, dict[str, Any]]]:
-    """What a vehicle file says of itself, and its parameters, each with value, unit and source."""
+    """A vehicle file's description and parameters, each with value, unit and source."""
     texts: dict[str, str] = {}
     entries: dict[str, dict[str, Any]] = {}
     for key, entry in read_toml(path).items():

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 
 class FeedbackLaw(ABC):
-    """A controller that solves nothing: a subclass says what it commands in the air, `_command`."""
+    """A controller that solves nothing: a subclass defines what it commands in flight, `_command`."""
 
     solver: Final = ""
 

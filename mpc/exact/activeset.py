@@ -173,7 +173,7 @@ class ActiveSet:
         return self._one_by_one(best.copy(), free, bounds, step, most)
 
     def _trial(self, side: Side, bounds: Array) -> _Trial:
-        """The maximum of the dual function on the pieces that a side says."""
+        """The maximum of the dual function on the pieces given by a side."""
         active = side.nonzero()[0]
         pieces = taken = side.take(active)
         rows = self._S.take(active, 0, self._room[: active.size], "clip")  # a mode that takes no copy
@@ -251,8 +251,8 @@ class ActiveSet:
             if stops.size:  # as far as all stay on their pieces
                 rows = active[stops]
                 kink = np.where(trial.pieces[stops] == 0, 0.0, np.sign(side[rows]) * self._l1[rows])
-                way = (trial.z - z[active])[stops]
-                share = np.maximum((kink - z[rows]) / np.where(way == 0.0, np.inf, way), 0.0)
+                step = (trial.z - z[active])[stops]
+                share = np.maximum((kink - z[rows]) / np.where(step == 0.0, np.inf, step), 0.0)
                 least = share.min()
                 z[active] += least * (trial.z - z[active])
                 first = share <= least
@@ -284,7 +284,7 @@ class ActiveSet:
         return Active(z=z, values=free - fall, side=trial.side, steps=steps)
 
     def near(self, z: Array, free: Array, lower: Array, upper: Array) -> Side:
-        """The active set that approximate multipliers (rows,) tell of: those that outweigh the distance to a bound."""
+        """The active set that approximate multipliers (rows,) indicate: those that outweigh the distance to a bound."""
         values, reach = free - self._S @ z, z * self._S.diagonal()
         side = (reach > upper - values).astype(np.int8) - (-reach > values - lower)
         return np.where(np.abs(z) > (1.0 - ROUNDED) * self._l1, 2 * side, side).astype(np.int8) if self._soft else side

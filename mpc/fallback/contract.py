@@ -54,7 +54,7 @@ class Guarded:
     commands pass unchanged.
 
     Attributes:
-        inner: the controller asked first, through the protocol alone.
+        inner: the controller called first, through the protocol alone.
         law: what levels 1 to 3 are made of.
 
     Args:
@@ -117,7 +117,7 @@ class Guarded:
         acting = self._before if now.acting is None or check_command(now.acting) is not None else now.acting
         known = self._completion.complete(state, acting, self.trim, free=now.phase is Phase.FLYING)
         completed = completed_moment(now, acting.copy(), self._completion.unseen.copy(), known)
-        status, answer = self._ask(completed, known, reference)
+        status, answer = self._call(completed, known, reference)
         if now.phase in GROUNDED:
             self._forget()
             command = stopped(self._bounds.reach(acting)[0], self.horizon, now.phase)
@@ -164,7 +164,7 @@ class Guarded:
         self._good, self._foreseen, self._age = None, None, 0
         self._target, self._hovered = None, 0
 
-    def _ask(self, now: CompletedMoment, known: Array, reference: Array) -> tuple[str, Command | None]:
+    def _call(self, now: CompletedMoment, known: Array, reference: Array) -> tuple[str, Command | None]:
         """The inner controller's answer where one was given, and its status: an accepted one is good to fly."""
         assert now.acting is not None
         if self._model.period * float(self._completion.unseen.max()) > self._settings.unseen:

@@ -110,7 +110,7 @@ def log_tables(log: FlightLog, *, plant_stride: int = 1, metadata: Mapping[str, 
 def write_log(directory: Path, log: FlightLog, *, plant_stride: int, metadata: Mapping[str, str]) -> None:
     """Write a flight's Parquet files into an existing directory.
 
-    Every `plant_stride`-th physics step is a row of `plant.parquet`; `metadata`, texts without a clock reading, is kept
+    Every `plant_stride`-th physics step is a row of `plant.parquet`; `metadata`, texts without clock times, is stored
     in each file's schema.
     """
     for name, table in log_tables(log, plant_stride=plant_stride, metadata=metadata).items():

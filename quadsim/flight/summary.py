@@ -153,7 +153,7 @@ def read_summary(directory: Path) -> dict[str, Any]:
 
 
 def contradictions(summary: Mapping[str, Any]) -> Iterator[str]:
-    """What a summary says of itself that cannot be."""
+    """What a summary states that is inconsistent."""
     if (summary["status"] == "completed") != (summary["reason"] is None):
         yield f"status is {summary['status']!r:.40}, and reason is {summary['reason']!r:.80}"
     names = [entry["name"] for entry in summary["constraints"]]

@@ -129,7 +129,7 @@ def _is_inside(name: str) -> bool:
 
 
 def is_manifest(path: Path) -> bool:
-    """Whether a file says that it is a manifest, whatever its name."""
+    """Whether a file's content is a manifest, whatever its name."""
     with path.open("rb") as file:
         return file.read(len(_START)) == _START
 

@@ -31,7 +31,7 @@ _IDLE: Final = (mujoco.mjtDisableBit.mjDSBL_SPRING, mujoco.mjtDisableBit.mjDSBL_
 _CONTACT: Final = (mujoco.mjtDisableBit.mjDSBL_CONSTRAINT, mujoco.mjtDisableBit.mjDSBL_CONTACT)
 """Stages that only a body which may meet the ground needs."""
 _STIFFNESS: Final = (0.005, 1.0)
-"""Time constant [s] and damping ratio of a contact (MuJoCo's solref); five steps, where MuJoCo asks for two or more."""
+"""Time constant [s] and damping ratio of a contact (MuJoCo's solref); five steps, where MuJoCo requires two or more."""
 _FRICTION: Final = (0.8, 0.005, 0.0001)
 """Sliding [-], torsional and rolling [m] friction between rubber feet and a hard floor; the first is a textbook value,
 the others MuJoCo's own."""

@@ -106,13 +106,13 @@ def test_back_ends_do_not_accept_a_measured_nan() -> None:
 
 
 def test_slews_count_from_the_command_that_acts() -> None:
-    """Where an earlier command was dropped, the next one is bound to what acts, not to what was asked for."""
+    """Where an earlier command was dropped, the next one is bound to what acts, not to what was commanded."""
     problem = paper_problem()
     controller = ConstrainedMPC(problem, QPSolver("piqp-multistage", problem))
     reference = paper_reference(51)[1:]
     controller.reset(problem.model.u_bar)
-    asked = controller.step(Moment(), STATE, reference).speeds
-    acting = asked - 7.0
+    commanded = controller.step(Moment(), STATE, reference).speeds
+    acting = commanded - 7.0
     after = controller.step(Moment(time=0.05, acting=acting), STATE, reference).speeds
     assert problem.bounds is not None
     np.testing.assert_allclose(after, acting + problem.bounds.delta_max, atol=1e-6)  # it climbs as fast as it may

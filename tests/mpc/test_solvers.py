@@ -140,7 +140,7 @@ def test_unknown_solver_lists_those_there_are() -> None:
     ("name", "package", "extra"),
     [("daqp", "daqp", "daqp"), ("qpoases", "casadi", "solvers"), ("proxqp", "proxsuite", "solvers")],
 )
-def test_a_solver_that_is_not_installed_says_how_to_get_it(
+def test_a_solver_that_is_not_installed_names_its_package(
     name: str, package: str, extra: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(importlib.util, "find_spec", lambda module: None)
@@ -150,7 +150,7 @@ def test_a_solver_that_is_not_installed_says_how_to_get_it(
     assert not SOLVERS[name].installed
 
 
-def test_entries_tell_what_they_are() -> None:
+def test_entries_describe_themselves() -> None:
     for name in ALWAYS:
         entry = SOLVERS[name]
         assert entry.installed

@@ -294,13 +294,13 @@ def test_matrices_made_once_serve_many_periods(constrained_flight: Flight, vehic
     for which, now in [(0, periods[0]), (0, periods[1]), (1, periods[2]), (1, periods[3]), (0, periods[4])]:
         given = now.c, now.state, now.desired, now.u_before, now.rest
         again = form.prepare(periods[which].A, periods[which].B)
-        kept, fresh = (
+        updated, fresh = (
             form.changed(matrices, form.changed_vectors(matrices, *given)) for matrices in (made[which], again)
         )
         for name in ("P", "A", "G"):
-            assert (getattr(kept, name) != getattr(fresh, name)).nnz == 0
+            assert (getattr(updated, name) != getattr(fresh, name)).nnz == 0
         for name in ("c", "b", "h_l", "h_u"):
-            np.testing.assert_array_equal(getattr(kept, name), getattr(fresh, name))
+            np.testing.assert_array_equal(getattr(updated, name), getattr(fresh, name))
 
 
 # Soft bounds

@@ -58,7 +58,7 @@ typedef struct quadsim_mpc {
     quadsim_real largest;                                        /* multiplier, as of rows of unit length */
     short row[QUADSIM_ROOM];                                     /* which they are */
     quadsim_real z[QUADSIM_ROOM];                                /* their multipliers */
-    quadsim_real goal[QUADSIM_ROOM];                             /* the multipliers that their bounds ask for */
+    quadsim_real goal[QUADSIM_ROOM];                             /* the multipliers that their bounds require */
     quadsim_real forward[QUADSIM_ROOM];                          /* L^-1 of the right side */
     quadsim_real pivot[QUADSIM_ROOM];                            /* D of L D L' */
     quadsim_real factor[QUADSIM_ROOM * (QUADSIM_ROOM + 1) / 2]; /* L, row by row, below its diagonal of ones */

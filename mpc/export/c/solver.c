@@ -390,10 +390,10 @@ static int move_to_goal(quadsim_mpc *mpc)
     int stop = -1, j;
     for (j = 0; j < mpc->count; j++) {
         const int row = mpc->row[j];
-        const real off = wrong_by(mpc, row, mpc->goal[j]), way = mpc->goal[j] - mpc->z[j];
+        const real off = wrong_by(mpc, row, mpc->goal[j]), step = mpc->goal[j] - mpc->z[j];
         if (off > R(0.0)) {
-            const real room = room_of(row, mpc->side[row], mpc->z[j], way);
-            const real part = way > R(0.0) || way < R(0.0) ? room / magnitude(way) : R(0.0);
+            const real room = room_of(row, mpc->side[row], mpc->z[j], step);
+            const real part = step > R(0.0) || step < R(0.0) ? room / magnitude(step) : R(0.0);
             if (stop < 0 || part < share || (part <= share && off > worst)) {
                 share = part;
                 worst = off;
@@ -451,7 +451,7 @@ static int first_stop(const quadsim_mpc *mpc, int row, int side, real z, real di
     return stop;
 }
 
-/* A violated row joins; active ones that it depends on make way. */
+/* A violated row joins; active ones that it depends on leave. */
 static enum verdict enter(quadsim_mpc *mpc, int row, int side)
 {
     real combination[ROOM], z = R(0.0), length, direction;
@@ -717,7 +717,7 @@ static int has_bound(int row, int side)
 }
 
 /* The active rows of a set, at most as many as there is room for, and their multipliers as near to what their bounds
- * ask for as their sides let them. */
+ * require as far as their sides allow. */
 static void start_warm(quadsim_mpc *mpc, int only, const signed char *set)
 {
     int row, j;
@@ -741,7 +741,7 @@ static void start_warm(quadsim_mpc *mpc, int only, const signed char *set)
     }
 }
 
-/* The optimum over the rows of one axis, or over all, from a set, and again without one if that leads nowhere. */
+/* The optimum over the rows of one axis, or over all, from a set, and again without one if that fails. */
 static enum verdict optimum(quadsim_mpc *mpc, int only, const signed char *set)
 {
     enum verdict verdict;
@@ -846,7 +846,7 @@ static int keeps_bounds(const quadsim_mpc *mpc)
 /* The last active set moved one step earlier, its last step's held. */
 static void shift_set(quadsim_mpc *mpc)
 {
-    /* By way of side, which begins anew: of a loop a compiler makes memmove. */
+    /* Through side, which begins anew: of a loop a compiler makes memmove. */
     memcpy(mpc->side, mpc->last + M, sizeof(mpc->side) - M);
     memcpy(mpc->last, mpc->side, sizeof(mpc->side) - M);
 }

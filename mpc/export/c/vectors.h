@@ -1,4 +1,4 @@
-/* Recorded periods of the scenario's flight: what the controller was asked, and the exact answers. */
+/* Recorded periods of the scenario's flight: the controller's inputs, and the exact answers. */
 #ifndef QUADSIM_VECTORS_H
 #define QUADSIM_VECTORS_H
 

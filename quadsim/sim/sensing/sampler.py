@@ -46,7 +46,7 @@ class Sample(NamedTuple):
 
 
 def truth(name: SensorName, physics: Array) -> Array:
-    """What a perfect sensor says (M, 3) of MuJoCo's states (M, 14)."""
+    """A perfect sensor's samples (M, 3) of MuJoCo's states (M, 14)."""
     values = physics[:, _COLUMNS[name]]
     return quaternion_to_euler(values) if name is SensorName.ATTITUDE else values.copy()
 

@@ -133,7 +133,7 @@ def test_a_process_that_dies_while_it_swaps_costs_nothing(
             exchange(self, new, target)
         elif moment == "between two steps":
             new.with_name(staging._NAME).write_bytes(b"run")
-            target.rename(new.with_name(staging._ASIDE))
+            target.rename(new.with_name(staging._PREVIOUS))
         raise SystemExit
 
     with monkeypatch.context() as patch:
