@@ -1,7 +1,7 @@
 """Collective thrust and body rates flown by an inner loop: proportional in the rates, on the exact rotor map.
 
 The torque demanded is tau = J k (omega_c - omega) + omega x J omega, so that each rate follows its command as a
-first-order lag of 1/k while rotors have room; thrust gives way last but for yaw (`mpc.baselines.allocation`).
+first-order lag of 1/k while rotors have room; thrust is limited before yaw (`mpc.baselines.allocation`).
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from quadsim.state import Array
 from quadsim.vehicle import N_ROTORS, Vehicle
 
 STATUS: Final = "given"
-"""Of a command that no controller of ours made."""
+"""Of a command from no controller."""
 
 
 class BodyRateLoop:

@@ -49,7 +49,7 @@ class ConstrainedMPC:
         self.unanswered: Unanswered | None = None
 
     def reset(self, speeds: Array) -> None:
-        """Start anew after the command u(-1) (4,) [rad/s]."""
+        """Restart after the command u(-1) (4,) [rad/s]."""
         self._before, self._plan, self._held = np.array(speeds, float), None, 0
         self.unanswered = None
         self._solver.reset()

@@ -206,7 +206,7 @@ class InterruptedFlightError(FlightError):
 
 
 def _restore(kind: type[QuadsimError], arguments: tuple[object, ...], values: dict[str, object]) -> QuadsimError:
-    """An error as it was, its message and its values, without making it anew from them."""
+    """An error as it was, its message and its values, not rebuilt from them."""
     error = kind.__new__(kind)
     error.args = arguments
     error.__dict__.update(values)

@@ -300,7 +300,7 @@ class Wall(Obstacle):
 
     @cached_property
     def solids(self) -> tuple[Solid, ...]:
-        """What is left and right of the window, as high as the wall, and above and below it, as wide."""
+        """The wall left and right of the window, as high as the wall, and above and below it, as wide."""
         turn = _upright(self.yaw)
         thickness, width, height = self.size
         found = []

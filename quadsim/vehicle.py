@@ -30,7 +30,7 @@ class Vehicle:
     f_i = b w_i^2 [N] and the reaction torque spin_i d w_i^2 [N m] about body +z (Sec. 2.2).
 
     Linear drag is a force -rotor_drag w v_perp on a rotor, v_perp its velocity through the air in the rotor's plane
-    (Martin and Salaun, 2010; Furrer et al., 2016).  What stands in `OPTIONAL_PARAMETERS` is None where its file does
+    (Martin and Salaun, 2010; Furrer et al., 2016).  What is in `OPTIONAL_PARAMETERS` is None where its file does
     not give it.
 
     Raises:
@@ -157,7 +157,7 @@ class Vehicle:
 
     @property
     def enclosing_radius(self) -> float:
-        """Radius of the ball that stands for the vehicle among obstacles [m]: its extent, or to the propellers' tips.
+        """Radius of the vehicle's bounding ball among obstacles [m]: its extent, or to the propellers' tips.
 
         Without a `rotor_radius` the propellers are as large as can be: neighbours just do not meet.
         """

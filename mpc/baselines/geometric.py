@@ -167,7 +167,7 @@ class GeometricController(FeedbackLaw):
         self._allocation = make_allocation(vehicle)
 
     def reset(self, speeds: Array) -> None:
-        """Start anew after the command u(-1) (4,) [rad/s]."""
+        """Restart after the command u(-1) (4,) [rad/s]."""
         super().reset(speeds)
         self._integrals = Integrals(translation=np.zeros(3), rotation=np.zeros(3))
         if self._observer is not None:

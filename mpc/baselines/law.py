@@ -35,7 +35,7 @@ class FeedbackLaw(ABC):
         self.reset(self.model.u_bar)
 
     def reset(self, speeds: Array) -> None:
-        """Start anew after the command u(-1) (4,) [rad/s]."""
+        """Restart after the command u(-1) (4,) [rad/s]."""
         self._before = np.array(speeds, float)
 
     def step(self, now: Moment, state: Array, reference: Array) -> Command:

@@ -96,7 +96,7 @@ def _stands_lag(vehicle: Vehicle, period: float, objective: Objective) -> bool:
 
 
 def lqr_gain(model: LinearModel, objective: Objective) -> Array:
-    """K (nu, n) of u = u_bar - K (xi - xi_r), which minimises the sum of xi' C_r' Q_y C_r xi + u' Q_u u for ever.
+    """K (nu, n) of u = u_bar - K (xi - xi_r), which minimises the infinite sum of xi' C_r' Q_y C_r xi + u' Q_u u.
 
     K = (Q_u + B' P B)^-1 B' P A, P the solution of the discrete algebraic Riccati equation.
 

@@ -108,7 +108,7 @@ class CascadedPID(FeedbackLaw):
         self._largest = LARGEST_THRUST * 4.0 * vehicle.thrust_coefficient * highest**2  # thrust to command [N]
 
     def reset(self, speeds: Array) -> None:
-        """Start anew after the command u(-1) (4,) [rad/s]."""
+        """Restart after the command u(-1) (4,) [rad/s]."""
         super().reset(speeds)
         self._memory = Memory(velocity_integral=np.zeros(3), rate_integral=np.zeros(3))
 

@@ -38,11 +38,11 @@ FEASIBLE: Final = 1e-9
 DEPENDENT: Final = 1e-12
 """Share of an active row's S_ii that other active rows leave over, below which it is taken for their combination."""
 LEAST_QUADRATIC: Final = 1e-9
-"""Share of l1 that stands in for a quadratic penalty of zero."""
+"""Share of l1 that replaces a quadratic penalty of zero."""
 ROUNDING: Final = 1e-12
 """Share of l1 by which a multiplier may pass it."""
 FEW: Final = 8
-"""Wrong rows of a start with which no other one is looked at."""
+"""Wrong rows of a start with which no other one is tried."""
 ROUNDED: Final = 1e-6
 """Share of l1 by which an approximate multiplier of a violated row may stay below it."""
 CAREFUL: Final = 4

@@ -26,7 +26,7 @@ STATUSES: Final = (UNCONSTRAINED, SOLVED, SOLVED, "clipped", "shifted", "before"
 FALLBACK: Final = (0, 0, 0, 1, 2, 3)
 """And its fallback level."""
 SOLVER: Final = "compiled"
-"""What stands for the name of a solver."""
+"""In place of a solver's name."""
 _MOVING: Final = [*VELOCITY, *EULER, *EULER_RATE]
 _SAME_TIME: Final = 1e-6  # [s]
 

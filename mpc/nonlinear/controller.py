@@ -271,7 +271,7 @@ class NonlinearMPC:
         return P
 
     def reset(self, speeds: Array) -> None:
-        """Start anew after the command u(-1) (4,) [rad/s], with rotors at that speed."""
+        """Restart after the command u(-1) (4,) [rad/s], with rotors at that speed."""
         self._acting = np.array(speeds, float)
         self._rotors = self._rotors_before = self._shares(self._acting)
         self._plan: tuple[Array, Array] | None
@@ -516,7 +516,7 @@ class NonlinearMPC:
                 moved = max(np.abs(found - x).max(), np.abs(plan - u).max())
                 if moved <= self.settings.tolerance:
                     break
-                # Full Gauss-Newton steps may go to and fro for ever: the share of them that is taken follows from how
+                # Full Gauss-Newton steps may oscillate: the share of them that is taken follows from how
                 # much of the last one each undoes (Aitken's relaxation; Irons and Tuck 1969), and falls for good where
                 # steps have not become shorter for long.
                 step = (plan - u).ravel()

@@ -150,7 +150,7 @@ class RobustMPC:
         self.reset(np.full(N_ROTORS, vehicle.hover_speed))
 
     def reset(self, speeds: Array) -> None:
-        """Start anew after the command u(-1) (4,) [rad/s], with rotors at that speed."""
+        """Restart after the command u(-1) (4,) [rad/s], with rotors at that speed."""
         self._acting = np.array(speeds, float)
         # Rotor speeds and state at the instant from which this period's command acts, the delay after its beginning.
         self._rotors = self._acting.copy()

@@ -11,7 +11,7 @@ stands still there,
 
     V' (A - I) (x(k+N) - x_s) = 0,    V a basis of the row space of [C; C A; ...],
 
-so that holding u_s from then on keeps every bound on states for ever.  The plan of one period, moved on, is then a plan
+so that holding u_s from then on keeps every bound on states forever.  The plan of one period, moved on, is then a plan
 of the next: as far as the disturbances are within the bounds stated for the tightening, the problem stays feasible.
 """
 

@@ -181,7 +181,7 @@ class QPSolver:
         self._backend.setup(self.formulation.qp)
 
     def reset(self) -> None:
-        """See `Solver.reset`: back ends that start from their last answer, start from scratch anew."""
+        """See `Solver.reset`: back ends that start from their last answer, restart from scratch."""
         self._backend = make_backend(self.name)
         self._backend.setup(self.formulation.qp)
 

@@ -22,7 +22,7 @@ ROUNDING: Final = 1e-6
 NEAR: Final = 1e-2
 """Distance from a half-space [m] within which a plan is taken to touch it."""
 SETTLED: Final = 1e-2
-"""Change of all predicted positions [m] below which planes are not made anew in the same period."""
+"""Change of all predicted positions [m] below which planes are not recomputed in the same period."""
 
 
 class Cleared(NamedTuple):

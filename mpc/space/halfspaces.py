@@ -5,7 +5,7 @@ the last plan was to be then, p_i, at distance d_i and with the outward normal n
 
     n_i . p >= n_i . p_i - d_i + r + m_i,
 
-r the radius of the ball that stands for the vehicle and m_i the margin.  Where p_i is inside, d_i is negative and the
+r the radius of the vehicle's bounding ball and m_i the margin.  Where p_i is inside, d_i is negative and the
 plane is that of the nearest way out.  Behind the plane lies all of the solid, so that what satisfies the half-space
 keeps clear at that instant, wherever p_i was: the restriction is safe, and it is conservative.  A moving obstacle is
 where it will be at that instant.  Corridors and the fence are half-spaces themselves, and exact.
@@ -38,7 +38,7 @@ class Space:
 
     Args:
         shapes: the obstacles and regions.
-        radius: of the ball that stands for the vehicle [m].
+        radius: of the vehicle's bounding ball [m].
         period: from one predicted instant to the next [s].
         horizon: N.
         settings: see `AvoidanceSettings`.

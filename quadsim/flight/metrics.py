@@ -19,7 +19,7 @@ SETTLING_BAND: Final = 0.05
 """Half width of the band an output has to stay in to be settled, as a share of the step."""
 
 UNRECOVERED: Final = 1.0
-"""Time that a flight has to be in fallback at its end for that to count as for good [s]: the longest that one shifted
+"""Time that a flight has to be in fallback at its end for that to count as permanent [s]: the longest that one shifted
 plan is held, unless a scenario sets another."""
 
 

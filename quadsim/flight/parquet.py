@@ -144,7 +144,7 @@ def _write(table: pa.Table, path: Path) -> None:
 
 
 def _read(path: Path, read: Callable[[BinaryIO], Any] = pq.read_table) -> Any:
-    if not path.is_file():  # a pipe would be read for ever
+    if not path.is_file():  # reading a pipe would not end
         raise FileError(path, "is not a readable Parquet file (it is missing or no file)")
     try:
         with path.open("rb") as file:

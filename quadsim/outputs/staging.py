@@ -98,7 +98,7 @@ class Staging:
             _refuse(target, problem(slot))
         except BaseException:  # also where it cannot be read, or by Ctrl-C
             self._exchange(slot, target)
-            raise  # somebody may have saved something in the new one meanwhile: `dissolve` takes only what is quadsim's
+            raise  # the new one may hold a user's files by now: `dissolve` takes only what is quadsim's
         with contextlib.suppress(OSError):  # the new one is in place; `dissolve` reports what cannot be removed
             slot.unlink() if is_file(slot) else remove_listed(slot)
 
@@ -211,7 +211,7 @@ def _is_abandoned(staging: Staging) -> bool:
     try:
         owner = json.loads(staging.owner.read_bytes())
         now, state = _identity(int(owner["pid"])), staging.path.lstat()
-        safe = state.st_uid == os.geteuid() and not state.st_mode & 0o022  # nobody else moves things in it
+        safe = state.st_uid == os.geteuid() and not state.st_mode & 0o022  # no one else can move things in it
         ours = safe and owner["inode"] == state.st_ino and owner["host"] == now["host"]
         alive = owner["boot"] == now["boot"] and owner["started"] == now["started"]
     except (ValueError, TypeError, LookupError, OverflowError, RecursionError):

@@ -1,4 +1,4 @@
-"""What stands in the scene of a flight: obstacles and regions, as reports draw them."""
+"""The scene of a flight: obstacles and regions, as reports draw them."""
 
 from __future__ import annotations
 

@@ -28,14 +28,14 @@ class PhaseMonitor:
     - On the ground it is `armed` while the previewed reference rises more than `TAKEOFF_RISE` above the resting height,
       else `landed`; from `armed` it is `flying` as soon as the clearance exceeds `AIRBORNE`.
     - From `flying` it is `landed` once the feet have touched for `REST` and the whole preview stays on the ground.
-    - Whatever it was, it has `crashed` for good when anything but the feet touches the ground, or when the feet do with
-      the vehicle tilted beyond `CAPSIZED`, or when the ball that stands for the vehicle touches an obstacle.
+    - From any phase, it has `crashed` for good when anything but the feet touches the ground, or when the feet do with
+      the vehicle tilted beyond `CAPSIZED`, or when the vehicle's bounding ball touches an obstacle.
 
     Args:
         outline: what may touch the ground, and where that is; None where there is no ground.
         period: the control period [s].
         obstacles: what must not be touched.
-        radius: of the ball that stands for the vehicle [m].
+        radius: of the vehicle's bounding ball [m].
     """
 
     def __init__(

@@ -257,7 +257,7 @@ class Plant:
         return not (weighing or (not self._by_step and any(isinstance(each, PushChange) for each in changes)))
 
     def reschedule(self, changes: Sequence[Change]) -> None:
-        """Let from now on happen what these say, of kinds that it `allows`; what is past of them is left out."""
+        """Schedule these changes, of kinds that it `allows`; past ones are left out."""
         self._pending = deque(entry for entry in self._scheduled(changes) if entry[0] >= self._step)
 
     def _scheduled(self, changes: Sequence[Change]) -> list[tuple[int, Change]]:

@@ -26,7 +26,7 @@ static void put_active(const quadsim_mpc *mpc, double *answers)
     }
 }
 
-/* Inputs: state [12], acting [4], reference [N][4]; whether the last period's end may be learnt from, and this one's.
+/* Inputs: state [12], acting [4], reference [N][4]; whether the last period's end may update the observer, and this one's.
  * Answered: status, changes, active rows, slack, command [4], plan [N][4]; then trim, lift and twist. */
 void quadsim_shim_step(quadsim_mpc *mpc, const double *inputs, double *answers)
 {

@@ -301,7 +301,7 @@ static int append(quadsim_mpc *mpc, int row, int side, real z)
     return 1;
 }
 
-/* Move what stands after a row that leaves one place ahead; its column of L goes to removed. */
+/* Move what follows a row that leaves forward by one; its column of L goes to removed. */
 static void close_gap(quadsim_mpc *mpc, int gap, real *removed)
 {
     int i, j;
@@ -321,7 +321,7 @@ static void close_gap(quadsim_mpc *mpc, int gap, real *removed)
     }
 }
 
-/* A row leaves.  L D L' of what stands after it gains pivot column column' (Gill, Golub, Murray and Saunders, 1974). */
+/* A row leaves.  L D L' of what follows it gains pivot column column' (Gill, Golub, Murray and Saunders, 1974). */
 static void leave(quadsim_mpc *mpc, int gap)
 {
     real column[ROOM], share = mpc->pivot[gap];
@@ -356,7 +356,7 @@ static real least_size(int row, int side)
     return side == 2 || side == -2 ? ROWS[row % M].l1 : R(0.0);
 }
 
-/* How far a multiplier may move in a direction [+1 or -1] before its side ends; negative: for ever. */
+/* How far a multiplier may move in a direction [+1 or -1] before its side ends; negative: never. */
 static real room_of(int row, int side, real z, real direction)
 {
     const real sign = side > 0 ? R(1.0) : R(-1.0), size = sign * z;
@@ -846,7 +846,7 @@ static int keeps_bounds(const quadsim_mpc *mpc)
 /* The last active set moved one step earlier, its last step's held. */
 static void shift_set(quadsim_mpc *mpc)
 {
-    /* Through side, which begins anew: of a loop a compiler makes memmove. */
+    /* Through side, which is reset: compilers turn a loop into memmove. */
     memcpy(mpc->side, mpc->last + M, sizeof(mpc->side) - M);
     memcpy(mpc->last, mpc->side, sizeof(mpc->side) - M);
 }

@@ -33,7 +33,7 @@ Factor = Annotated[float, Ge(0.05), Le(20.0)]
 
 @dataclass(frozen=True, kw_only=True)
 class Load:
-    """How the vehicle that flies differs from its file, which the controller goes on believing."""
+    """How the vehicle that flies differs from its file, which the controller still assumes."""
 
     mass_factor: Annotated[Factor, doc("[-] real mass over the file's")] = 1.0
     inertia_factor: Annotated[

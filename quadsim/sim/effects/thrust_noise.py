@@ -1,4 +1,4 @@
-"""Thrust that is lost and fluctuates, drawn anew in each physics step."""
+"""Thrust that is lost and fluctuates, drawn in each physics step."""
 
 from __future__ import annotations
 

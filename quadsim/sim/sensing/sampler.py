@@ -20,7 +20,7 @@ _COLUMNS = {
     SensorName.ATTITUDE: slice(4, 8),
     SensorName.RATES: slice(11, 14),
 }
-"""Where a sensor's quantity stands in MuJoCo's state; see `quadsim.sim.physics.physics_to_state`."""
+"""Where a sensor's quantity is in MuJoCo's state; see `quadsim.sim.physics.physics_to_state`."""
 
 _BLOCK: Final = 256
 """Samples whose errors are drawn at a time."""

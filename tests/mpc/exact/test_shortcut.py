@@ -330,9 +330,7 @@ def test_there_is_none_where_its_map_is_too_large(monkeypatch: pytest.MonkeyPatc
 @pytest.mark.parametrize(
     ("sideways", "height", "method"), [(0.0, 0.0, Method.FREE), (3.0, 0.0, Method.AXES), (0.0, 8.0, Method.WHOLE)]
 )
-def test_steps_leave_no_memory_behind_and_allocate_nothing_large(
-    sideways: float, height: float, method: Method
-) -> None:
+def test_steps_leak_no_memory_and_allocate_nothing_large(sideways: float, height: float, method: Method) -> None:
     """All methods of a step: at the reference, before it moves away, 8 m below it."""
     problem = paper_problem()
     controller = ConstrainedMPC(problem, QPSolver("piqp-multistage", problem))
