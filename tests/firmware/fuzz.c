@@ -1,4 +1,4 @@
-/* Steps of a controller from arbitrary bytes, for libFuzzer: whatever comes in, the command is finite and within every
+/* Steps of a controller from arbitrary bytes, for libFuzzer: for any input, the command is finite and within every
  * bound, the status is one of six, and the active set changes no more often than it may. */
 #include <stdint.h>
 #include <stdio.h>

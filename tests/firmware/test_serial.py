@@ -43,7 +43,7 @@ def terminal(exported: Export, run: Run) -> Iterator[Terminal]:
 
 
 class Autopilot:
-    """The other end: numbers its questions, and can spoil them."""
+    """The other end: numbers its questions, and can corrupt them."""
 
     def __init__(self, line: Terminal, recorded: Recording) -> None:
         self.line, self.recorded, self.frames, self.number = line, recorded, Frames("double"), 0
@@ -105,10 +105,10 @@ def test_corrupt_and_cut_frames_are_dropped_and_the_next_is_found(terminal: Term
     pilot.start()
     for k in range(12):
         frame = bytearray(pilot.period(k))
-        spoilt = bytearray(frame)
-        spoilt[draw.randrange(len(spoilt))] ^= 1 << draw.randrange(8)
+        corrupted = bytearray(frame)
+        corrupted[draw.randrange(len(corrupted))] ^= 1 << draw.randrange(8)
         terminal.send(
-            [bytes(spoilt), bytes(frame[: draw.randrange(1, len(frame))]), draw.randbytes(97), frame[:4]][k % 4]
+            [bytes(corrupted), bytes(frame[: draw.randrange(1, len(frame))]), draw.randbytes(97), frame[:4]][k % 4]
         )
         # What has come may take the place of a frame's first bytes until as many more have: whole ones follow.
         reply = pilot.send(bytes(frame) * 3)

@@ -34,9 +34,7 @@ PROGRAMS = ("main.c", "serial.c", "vectors.c", "quadsim_mpc.c")
 
 @pytest.mark.parametrize("compiler", ["gcc", "clang", "arm-none-eabi-gcc"])
 @pytest.mark.parametrize("precision", EXPORTS)
-def test_compilers_have_nothing_to_say(
-    precision: str, compiler: str, exported: Export, run: Run, tmp_path: Path
-) -> None:
+def test_compilers_give_no_warning(precision: str, compiler: str, exported: Export, run: Run, tmp_path: Path) -> None:
     bare = compiler.startswith("arm")
     directory = exported(*EXPORTS[precision]) if bare else exported("posix", precision)
     machine = TARGETS[EXPORTS[precision][0]].machine.split() if bare else []

@@ -33,7 +33,7 @@ def test_it_demands_thrust_and_the_torque_of_a_first_order_lag(vehicle: Vehicle)
     assert acceleration == pytest.approx(BANDWIDTH * (loop.rates - rates))
 
 
-def test_beyond_what_rotors_have_yaw_gives_way_first(vehicle: Vehicle) -> None:
+def test_beyond_the_rotors_limits_yaw_is_reduced_first(vehicle: Vehicle) -> None:
     loop = make_loop(vehicle)
     loop.rates = np.array([1.0, 0.0, 20.0])
     wrench: Array = vehicle.allocation @ loop.commanded(np.zeros(3)) ** 2

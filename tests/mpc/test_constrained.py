@@ -20,7 +20,7 @@ STATE[10] = np.pi / 6
 
 
 class FaultySolver(QPSolver):
-    """The real solver, whose answers are spoilt in chosen calls."""
+    """The real solver, whose answers are corrupted in chosen calls."""
 
     def __init__(self, faults: dict[int, str], horizon: int = 50) -> None:
         self.problem = paper_problem("paper-constrained", f"controller.horizon={horizon}")
@@ -42,7 +42,7 @@ class FaultySolver(QPSolver):
 
 def fly(faults: dict[int, str], periods: int, horizon: int = 50) -> list[Command]:
     solver = FaultySolver(faults, horizon)
-    controller = ConstrainedMPC(solver.problem, solver, shortcut=not faults)  # which might mend a spoilt plan
+    controller = ConstrainedMPC(solver.problem, solver, shortcut=not faults)  # which might repair a corrupted plan
     controller.reset(solver.problem.model.u_bar)
     reference = paper_reference(periods + horizon + 1)
     return [controller.step(Moment(time=0.05 * k), STATE, reference[k + 1 : k + 1 + horizon]) for k in range(periods)]

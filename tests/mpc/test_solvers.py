@@ -54,11 +54,11 @@ def test_a_failure_leaves_the_next_solve_alone(name: str) -> None:
     np.testing.assert_allclose(hover.plan, np.tile(problem.model.u_bar, (50, 1)), atol=1e-3)
 
 
-@pytest.mark.parametrize(("place", "spoilt"), [(0, np.nan), (1, np.nan), (2, np.nan), (2, np.inf), (2, -np.inf)])
-def test_data_that_is_not_finite_reaches_no_back_end(place: int, spoilt: float) -> None:
+@pytest.mark.parametrize(("place", "corrupted"), [(0, np.nan), (1, np.nan), (2, np.nan), (2, np.inf), (2, -np.inf)])
+def test_data_that_is_not_finite_reaches_no_back_end(place: int, corrupted: float) -> None:
     problem = paper_problem()
     query = [np.zeros(12), problem.objective.desired(np.zeros((50, 4))), problem.model.u_bar.copy()]
-    query[place].flat[0] = spoilt
+    query[place].flat[0] = corrupted
     solver = QPSolver("piqp-multistage", problem)
     answer = solver.solve(*query)
     assert answer.solution.status == "invalid_data"
@@ -156,5 +156,5 @@ def test_entries_describe_themselves() -> None:
         assert entry.installed
         assert entry.line == entry.description
         assert entry.version[0].isdigit()
-    absent = replace(SOLVERS["daqp"], package="a_package_that_nobody_has")
+    absent = replace(SOLVERS["daqp"], package="a_package_that_does_not_exist")
     assert not absent.installed

@@ -38,7 +38,7 @@ LAG = 0.05
 
 @dataclass(frozen=True)
 class Changing:
-    """A problem whose model changes, staged and solved anew each time, in any number of steps per stage."""
+    """A problem whose model changes, staged and solved again each time, in any number of steps per stage."""
 
     form: Staged
     backend: PiqpChanging
@@ -285,7 +285,7 @@ def test_updated_values_solve_as_a_fresh_setup(constrained_flight: Flight, vehic
 
 
 def test_matrices_made_once_serve_many_periods(constrained_flight: Flight, vehicle: Vehicle) -> None:
-    """Used again, and in turn with others, they make the same QP as matrices made anew."""
+    """Used again, and in turn with others, they make the same QP as matrices rebuilt."""
     problem = softened(lagging(paper_problem(), vehicle), [2e5, 2e5], [1e4, 1e4])
     problem = replace(problem, objective=replace(problem.objective, Q_d=5.0 * np.eye(4)))
     form = Staged(problem, steps_per_stage=4, changing=True)

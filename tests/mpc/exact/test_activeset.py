@@ -162,7 +162,7 @@ def test_rows_are_active_and_violated_in_random_problems(soft: float) -> None:
 
 @pytest.mark.parametrize("off", [0.0, 1e-7, 1e-3, 1.0])
 def test_approximate_multipliers_give_the_active_set(off: float) -> None:
-    """Of an interior-point method's, as they are and spoilt: one step suffices where they are good."""
+    """Of an interior-point method's, as they are and corrupted: one step suffices where they are good."""
     for seed in range(50):
         rng = np.random.default_rng(seed)
         problem = random_rows(rng, n=8, rows=8, soft=0.5, least=0.1)
@@ -327,7 +327,7 @@ def certified(qp: QP, solution: Solution) -> Array | None:
     """The optimum x, in extended precision, of the rows that a solution calls active; None where it proves not to be.
 
     Feasible, with multipliers of the right signs and the gradient they must have, x is the one optimum of a strictly
-    convex QP, whoever called what active.
+    convex QP, for any initial active set.
     """
     n, wide = qp.c.size, np.longdouble
     rows = np.vstack([np.eye(n), np.asarray(qp.G)])

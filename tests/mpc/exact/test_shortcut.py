@@ -209,7 +209,7 @@ def test_what_no_axis_can_hold_is_reported_by_the_whole_qp() -> None:
 
 
 def test_a_bound_that_no_axis_has_is_left_to_the_whole_qp() -> None:
-    """An output made of nothing, beyond its bounds: infeasible, whatever the axes make of theirs."""
+    """An output made of nothing, beyond its bounds: infeasible, for any solution of the axes."""
     problem = paper_problem()
     assert problem.bounds is not None
     C_c, y_min = np.vstack([problem.bounds.C_c, np.zeros(12)]), np.append(problem.bounds.y_min, 0.5)
@@ -241,7 +241,7 @@ def test_steps_may_be_bounded_for_some_inputs_alone(solver: str) -> None:
     assert np.abs(np.diff(plans[0], axis=0)).max(axis=0)[[1, 2]].max() <= 5.0 + 1e-6
 
 
-def test_what_was_tried_in_vain_counts(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_failed_attempts_count(monkeypatch: pytest.MonkeyPatch) -> None:
     """Ten metres to the side at once: pitch can be held within 5 deg, at steps of the rotors beyond their bounds.
 
     The time that it took is added to the solver's, whose iterations are the ones that count.
@@ -286,7 +286,7 @@ def test_the_first_whole_qp_is_solved_roughly_and_finished_exactly(monkeypatch: 
         np.testing.assert_array_equal(answer.plan, tight.plan)
 
 
-def test_back_ends_without_a_rough_answer_say_so() -> None:
+def test_back_ends_without_a_rough_answer_are_marked() -> None:
     pytest.importorskip("daqp")
     solver = QPSolver("daqp", paper_problem())
     assert not solver.can_solve_roughly
@@ -384,7 +384,7 @@ def test_it_is_exact_over_long_horizons(horizon: int) -> None:
     np.testing.assert_allclose(plan[0], answer.plan[0], atol=1e-4)
 
 
-def test_there_is_none_where_rounding_has_spoilt_the_gains() -> None:
+def test_there_is_none_where_rounding_has_corrupted_the_gains() -> None:
     """A long horizon and inputs that cost next to nothing: cond(H) nears what double precision holds."""
     options = ("controller.horizon=200", "controller.input_weights.speed=1e-5")
     problem = paper_problem("paper-constrained", *options)

@@ -86,7 +86,7 @@ def test_what_was_believed_last_holds_while_nothing_is_measured() -> None:
 
 
 @pytest.mark.parametrize("trim", [None, 3.0, "absent", RuntimeError("no")])
-def test_a_controller_that_does_not_say_hovers_level(trim: Any) -> None:
+def test_a_controller_without_a_valid_trim_hovers_level(trim: Any) -> None:
     class Silent(Scripted):
         def __getattr__(self, name: str) -> Any:
             if trim == "absent" or name != "trim":

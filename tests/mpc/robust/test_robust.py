@@ -255,7 +255,7 @@ def test_what_is_stated_is_not_taken_for_a_disturbance(vehicle: Vehicle) -> None
 
 @pytest.mark.parametrize("factor", [0.7, 1.3])
 def test_a_wrong_mass_is_no_force_sideways(vehicle: Vehicle, factor: float) -> None:
-    """On a course that tilts the vehicle to and fro; in rest it is all in what thrust does."""
+    """On a course that tilts the vehicle back and forth; at rest thrust explains it all."""
     heavy = nonlinear_model(replace(vehicle, mass=factor * vehicle.mass), PERIOD)
     reference = np.zeros((200, 4))
     reference[60:120, 0] = 2.0
@@ -323,7 +323,7 @@ def test_nothing_is_learned_over_a_pause(vehicle: Vehicle, gap: int) -> None:
 def test_predicted_states_teach_nothing_and_long_spans_of_them_neither(
     vehicle: Vehicle, predicted: int, learned: bool
 ) -> None:
-    """From a slow sensor's next measurement it learns; after a longer outage it starts anew."""
+    """From a slow sensor's next measurement it learns; after a longer outage it restarts."""
     controller, acting = robust(vehicle, **EVERYTHING), np.full(4, vehicle.hover_speed)
     measured, guessed = np.zeros(12), np.zeros(12)
     guessed[INDEX["vx"]] = 1.0
@@ -390,7 +390,7 @@ def test_a_flight_turned_by_any_yaw_is_the_same_flight(vehicle: Vehicle, lineari
     (states, commands), (turned_states, turned_commands) = flights
     back = turn_horizontally(turned_states, np.full(30, -turn))
     back[:, INDEX["yaw"]] -= turn
-    # Where it is linearised anew, the QP itself is turned: then it is solved to its tolerance only.
+    # Where it is relinearised, the QP itself is turned: then it is solved to its tolerance only.
     np.testing.assert_allclose(back, states, atol=1e-6 if linearisation is Linearisation.HOVER else 1e-4)
     np.testing.assert_allclose(turned_commands, commands, atol=1e-2)
 
@@ -451,9 +451,9 @@ def test_numbers_out_of_hand_are_refused_and_forgotten(
     for channel in (1, 4, 7, 8, 11):
         controller.reset(acting)
         controller.step(Moment(acting=acting), np.zeros(12), HOLD)
-        spoilt = np.zeros(12)
-        spoilt[channel] = value
-        command = controller.step(Moment(acting=acting), spoilt, HOLD)
+        corrupted = np.zeros(12)
+        corrupted[channel] = value
+        command = controller.step(Moment(acting=acting), corrupted, HOLD)
         assert command.status not in ACCEPTED
         np.testing.assert_array_equal(command.plan, np.tile(acting, (50, 1)))
         after = controller.step(Moment(acting=acting), np.zeros(12), HOLD)
@@ -515,7 +515,7 @@ def test_its_own_last_command_acts_where_none_is_given(vehicle: Vehicle) -> None
     assert acting.min() > vehicle.hover_speed + 10.0
 
 
-def test_reset_starts_anew(vehicle: Vehicle) -> None:
+def test_reset_restarts(vehicle: Vehicle) -> None:
     controller = robust(vehicle, **{**EVERYTHING, "linearisation": Linearisation.TRAJECTORY})
     plant = replace(nonlinear_model(vehicle, PERIOD), acceleration=np.array([0.3, 0.0, 0.2]))
     start, reference = make_state(position=(0.2, 0.0, 0.0)), np.zeros((60, 4))

@@ -427,7 +427,7 @@ def test_a_directory_to_which_nothing_was_added_is_as_before(tmp_path: Path) -> 
 def test_what_is_saved_into_the_new_one_before_it_goes_back_stays(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, how: str
 ) -> None:
-    """Somebody else's things come to light in the swap; in that moment more is saved where they were."""
+    """Foreign files are found in the swap; at that moment more is saved where they were."""
     target = tmp_path / "target"
     exchange, times = staging.Staging._exchange, iter(range(9))
 

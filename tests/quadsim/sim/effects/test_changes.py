@@ -78,7 +78,7 @@ def test_rotors_follow_by_another_time_constant(vehicle: Vehicle) -> None:
 
 
 def test_what_is_due_later_may_be_put_otherwise(vehicle: Vehicle) -> None:
-    """Rescheduled half way, a plant flies as one scheduled from the start; what is past is not done again."""
+    """Rescheduled midway, a plant flies as one scheduled from the start; what is past is not done again."""
     first, second = MassChange(time=0.05, factor=1.1), MassChange(time=0.15, factor=0.9)
     with Plant(vehicle, changes=[first, second]) as scheduled, Plant(vehicle, changes=[first]) as later:
         expected = scheduled.advance(scheduled.hover_speeds, HOLD).physics
