@@ -78,7 +78,7 @@ def _header(path: Path, sizes: dict[str, int], arrays: dict[str, Array]) -> None
 def write_problem(directory: Path, problem: Condition, recording: Recording, maps: Array) -> None:
     """What peer.c reads."""
     periods, asked = len(recording.state), maps.shape[1]
-    sizes = {"PERIODS": periods, "VECTORS": len(maps), "ASKED": asked}
+    sizes = {"PERIODS": periods, "VECTORS": len(maps), "INPUTS": asked}
     arrays = {"STATE": recording.state, "PATH": recording.path, "ACTING": recording.acting, "MAP": maps}
     _header(directory / "problem.h", sizes, arrays)
 

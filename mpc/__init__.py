@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from mpc.solvers import QPSolver as QPSolver
     from mpc.unconstrained import UnconstrainedMPC as UnconstrainedMPC
 
-_PLACES = {
+_MODULES = {
     "mpc.baselines.geometric": ("GeometricController",),
     "mpc.baselines.lqr": ("LQR",),
     "mpc.baselines.pid": ("CascadedPID",),
@@ -44,14 +44,14 @@ _PLACES = {
     "mpc.solvers": ("QPSolver",),
     "mpc.unconstrained": ("UnconstrainedMPC",),
 }
-_PUBLIC = {name: module for module, names in _PLACES.items() for name in names}
-_ROOMS = ("baselines", "exact", "fallback", "nonlinear", "paper", "robust", "solvers")
-__all__ = [*_PUBLIC, *_ROOMS]
+_PUBLIC = {name: module for module, names in _MODULES.items() for name in names}
+_SUBPACKAGES = ("baselines", "exact", "fallback", "nonlinear", "paper", "robust", "solvers")
+__all__ = [*_PUBLIC, *_SUBPACKAGES]
 
 
 def __getattr__(name: str) -> Any:
     """Import a public name, or a subpackage, when it is first used."""
-    if name in _ROOMS:
+    if name in _SUBPACKAGES:
         return importlib.import_module(f"mpc.{name}")
     if name not in _PUBLIC:
         raise AttributeError(f"module 'mpc' has no attribute {name!r}")
@@ -60,4 +60,4 @@ def __getattr__(name: str) -> Any:
 
 def __dir__() -> list[str]:
     """The public names, imported or not."""
-    return sorted({*globals(), *_PUBLIC, *_ROOMS})
+    return sorted({*globals(), *_PUBLIC, *_SUBPACKAGES})

@@ -121,7 +121,7 @@ def rejection(status: str, speeds: Array, plan: Array, bounds: ActuatorBounds, b
 
 
 def command_of(speeds: Array, plan: Array, status: str, answer: Answer, *, fallback: int = 0) -> Command:
-    """Speeds (4,) and a plan (N, 4) as a command under a status, with what the solver says of its answer."""
+    """Speeds (4,) and a plan (N, 4) as a command under a status, with the solver's report on its answer."""
     solution, accepted = answer.solution, status in ACCEPTED
     return Command(
         speeds=speeds.copy(),
@@ -138,7 +138,7 @@ def command_of(speeds: Array, plan: Array, status: str, answer: Answer, *, fallb
 
 
 def refused(acting: Array, horizon: int, status: str, answer: Answer | None = None) -> Command:
-    """The command in force (4,) held over the horizon, with what speaks against another."""
+    """The command in force (4,) held over the horizon, with the reason for refusing another."""
     plan = np.tile(acting, (horizon, 1))
     if answer is None:
         return Command(speeds=plan[0].copy(), plan=plan, status=status)
@@ -146,5 +146,5 @@ def refused(acting: Array, horizon: int, status: str, answer: Answer | None = No
 
 
 def shifted(plan: Array, steps: int) -> Array:
-    """What is left of a plan (N, nu) after some steps, its last input held."""
+    """The rest of a plan (N, nu) after some steps, its last input held."""
     return np.concatenate([plan[steps:], np.repeat(plan[-1:], steps, axis=0)])

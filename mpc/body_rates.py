@@ -1,7 +1,7 @@
 """Collective thrust and body rates flown by an inner loop: proportional in the rates, on the exact rotor map.
 
-The torque asked for is tau = J k (omega_c - omega) + omega x J omega, so that each rate follows its command as a
-first-order lag of 1/k while rotors have room; thrust gives way last but for yaw (`mpc.baselines.allocation`).
+The torque demanded is tau = J k (omega_c - omega) + omega x J omega, so that each rate follows its command as a
+first-order lag of 1/k while rotors have room; thrust is limited before yaw (`mpc.baselines.allocation`).
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from quadsim.state import Array
 from quadsim.vehicle import N_ROTORS, Vehicle
 
 STATUS: Final = "given"
-"""Of a command that no controller of ours made."""
+"""Of a command from no controller."""
 
 
 class BodyRateLoop:
@@ -42,9 +42,9 @@ class BodyRateLoop:
 
     def speeds(self, time: float, commanded: Array, rates: Array, rotors: Array) -> Array:
         """See `quadsim.controller.InnerLoop`."""
-        return self.asked(rates)
+        return self.commanded(rates)
 
-    def asked(self, rates: Array) -> Array:
+    def commanded(self, rates: Array) -> Array:
         """Rotor speeds (4,) [rad/s] at body rates (3,) [rad/s]."""
         (p, q, r), (J_x, J_y, J_z), k = rates.tolist(), self._inertia, self._bandwidth
         p_c, q_c, r_c = self.rates.tolist()
@@ -59,6 +59,6 @@ class BodyRateLoop:
         return allocate(self._allocation, wrench, self._bounds.u_min, self._bounds.u_max)
 
     def command(self, rates: Array, horizon: int) -> Command:
-        """A period's command, from the body rates (3,) at its begin; `speeds` are those asked for first."""
-        speeds = self.asked(rates)
+        """A period's command, from the body rates (3,) at its begin; `speeds` are those commanded first."""
+        speeds = self.commanded(rates)
         return Command(speeds=speeds, plan=np.broadcast_to(speeds, (horizon, N_ROTORS)), status=STATUS, inner=self)

@@ -11,7 +11,7 @@ from mpc.exact.shortcut import with_shortcut
 from mpc.handover import resized, within
 from mpc.ocp import Problem, Query, Unanswered
 from mpc.paper.prediction import rollout
-from mpc.solvers import INVALID_DATA, Answer, Solver, Way
+from mpc.solvers import INVALID_DATA, Answer, Method, Solver
 from mpc.space.clearing import Clearing
 from mpc.space.halfspaces import Space
 from quadsim.controller import GROUNDED, Command, Moment, Phase, stopped
@@ -49,7 +49,7 @@ class ConstrainedMPC:
         self.unanswered: Unanswered | None = None
 
     def reset(self, speeds: Array) -> None:
-        """Start anew after the command u(-1) (4,) [rad/s]."""
+        """Restart after the command u(-1) (4,) [rad/s]."""
         self._before, self._plan, self._held = np.array(speeds, float), None, 0
         self.unanswered = None
         self._solver.reset()
@@ -81,7 +81,7 @@ class ConstrainedMPC:
         else:
             answer, problem, _ = self._clearing.solve(now.time, query)
         self.answer = answer
-        return self._take(answer) if answer.way is Way.FREE else self._follow(now.time, problem, query, answer)
+        return self._take(answer) if answer.method is Method.FREE else self._follow(now.time, problem, query, answer)
 
     def predict(self, states: Array, plans: Array) -> Array:
         """See `quadsim.controller.Controller.predict`."""

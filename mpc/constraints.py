@@ -177,5 +177,5 @@ class Rows:
 
 
 def renumbered(slack: Indices) -> Indices:
-    """Slacks' numbers (m,) without gaps, -1 of hard rows kept."""
+    """Slacks' numbers (m,) without gaps, -1 of hard rows held."""
     return np.asarray(np.unique(np.concatenate([[-1], slack]), return_inverse=True)[1][1:] - 1)

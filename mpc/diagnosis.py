@@ -6,12 +6,12 @@ An elastic problem has a slack e >= 0 for each bound at each step, and is a line
 
 s half of what lies between a row's bounds, so that rows of any unit count alike.  It always has an answer, and that is
 zero if, and only if, the QP has one.  Bounds on inputs alone come first: what they allow is what actuators can do, and
-bounds on states are to give way to it.  Of these, those with slack are *violated*.  Those that are *in the way* have
+bounds on states are relaxed for it.  Of these, those with slack are *violated*.  Those that are *blocking* have
 none, and each is needed: without it less violation would do.  They are found by the multipliers, and then by leaving
 out one after the other (Chinneck and Dravnieks, 1991, "Locating minimal infeasible constraint sets in linear
 programs").
 
-It walks the constraints' rows and knows no kind.  Soft constraints never stand in the way of an answer.
+It uses the constraints' rows, of any kind.  Soft constraints never make a problem infeasible.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ SOLVER: Final = "piqp-multistage"
 FEASIBLE: Final = 1e-6
 """Violation, as a share of half of what lies between a row's bounds, below which it is rounding."""
 PRICED: Final = 1e-9
-"""Multiplier of a bound, in shares per share, above which it may be in the way."""
+"""Multiplier of a bound, in shares per share, above which it may be blocking."""
 
 
 class Side(NamedTuple):
@@ -56,7 +56,7 @@ class Side(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class Violation:
-    """A bound that has to give way.
+    """A bound that has to be relaxed.
 
     Attributes:
         amount: the most that it is violated by, in its row's own unit.
@@ -76,13 +76,13 @@ class Conflict:
 
     Attributes:
         total: the sum of all violations, as shares.
-        violated: the bounds that have to give way.
-        in_the_way: the bounds that hold, and without each of which less violation would do.
+        violated: the bounds that have to be relaxed.
+        blocking: the bounds that hold, and without each of which less violation would do.
     """
 
     total: float
     violated: Mapping[Side, Violation]
-    in_the_way: tuple[Side, ...]
+    blocking: tuple[Side, ...]
 
     @property
     def feasible(self) -> bool:
@@ -116,7 +116,7 @@ def find_conflict(unanswered: Unanswered) -> Conflict | None:
             )
             sides[side] = _moved(sides[side], share + FEASIBLE)  # for what comes next, as wide as it has to be
         held |= _needed(problem, query, present, elastic, found, giving)
-    return Conflict(total=total, violated=violated, in_the_way=tuple(sorted(held - violated.keys())))
+    return Conflict(total=total, violated=violated, blocking=tuple(sorted(held - violated.keys())))
 
 
 def smallest_widening(unanswered: Unanswered, sides: Collection[Side]) -> float | None:
@@ -147,7 +147,7 @@ def recovery(unanswered: Unanswered, plan: Array) -> int | None:
 
 
 def _set_up(problem: Problem, query: Query) -> Callable[[Query], bool]:
-    """Tells of queries of this one's kind whether they are solved."""
+    """Whether queries of this one's kind are solved."""
     if query.steps is None:
         fixed = QPSolver(SOLVER, problem)
         return lambda query: fixed.solve(*query[:4]).solution.status == SOLVED
@@ -222,11 +222,11 @@ def _needed(
 ) -> set[Side]:
     """Of the bounds that are held, those without each of which there is less violation; no fewer would do."""
 
-    def is_enough(kept: Mapping[Side, Constraint]) -> bool:
-        less = _relaxed(problem, query, kept, elastic)
+    def is_enough(held: Mapping[Side, Constraint]) -> bool:
+        less = _relaxed(problem, query, held, elastic)
         return less is not None and less.total >= found.total * (1.0 - 1e-6) - FEASIBLE
 
-    # Multipliers may fall by powers of ten along a chain of bounds, each at the next step, to less than can be told.
+    # Multipliers may fall by powers of ten along a chain of bounds, each at the next step, below what can be resolved.
     priced = {side: one for side, one in sides.items() if side in found.priced or side in giving}
     present = priced if is_enough(priced) else dict(sides)
     for side in sorted(present.keys() - set(giving)):
@@ -261,18 +261,18 @@ def _relaxed(
     matrices = form.prepare(A, B)
     vectors = form.changed_vectors(matrices, c, *query[:3], query.rest or problem.rest)
     qp = form.changed(matrices, vectors)
-    named, places = (
+    named, columns = (
         [side for side in sides if side in elastic],
         form.slacks(np.arange(qp.c.size, dtype=float)).astype(int),
     )
     basis, cost, box = sparse.identity(qp.c.size, format="csc"), np.zeros(qp.c.size), np.stack([qp.x_l, qp.x_u], 1)
-    cost[places] = 1.0
+    cost[columns] = 1.0
     if together is not None:
         weights = np.zeros(qp.c.size)
-        weights[places] = [1.0 / together[side] for side in named]
-        kept = np.setdiff1d(np.arange(qp.c.size), places)
-        basis = sparse.hstack([basis[:, kept], sparse.csc_matrix(weights[:, None])], format="csc")
-        cost, box = np.append(np.zeros(kept.size), 1.0), np.vstack([box[kept], [0.0, math.inf]])
+        weights[columns] = [1.0 / together[side] for side in named]
+        others = np.setdiff1d(np.arange(qp.c.size), columns)
+        basis = sparse.hstack([basis[:, others], sparse.csc_matrix(weights[:, None])], format="csc")
+        cost, box = np.append(np.zeros(others.size), 1.0), np.vstack([box[others], [0.0, math.inf]])
     above, below = np.isfinite(qp.h_u), np.isfinite(qp.h_l)
     found = linprog(
         cost,

@@ -92,8 +92,8 @@ class RampObserver:
         inertia = (vehicle.rotor_inertia or 0.0) if self._lag else 0.0
         self._momentum = -inertia * np.array(vehicle.rotor_spins, float)
         self._drag, self._quadratic = np.array(drag, float), np.array(quadratic_drag, float)
-        self._kept = math.exp(-period / settings.drag_memory)
-        self._ballast = FITTED_FROM**2 / (1.0 - self._kept)
+        self._decay = math.exp(-period / settings.drag_memory)
+        self._ballast = FITTED_FROM**2 / (1.0 - self._decay)
         self._up = np.array([0.0, 0.0, vehicle.gravity])
         self.reset(np.full(4, vehicle.hover_speed))
 
@@ -170,8 +170,8 @@ class RampObserver:
         return np.maximum(-self._products / (self._squares + self._ballast), 0.0)
 
     def _fit(self, v_b: Array, d_b: Array) -> None:
-        self._products = self._kept * self._products + d_b * v_b
-        self._squares = self._kept * self._squares + v_b**2
+        self._products = self._decay * self._products + d_b * v_b
+        self._squares = self._decay * self._squares + v_b**2
 
     def _mean_squares(self, speeds: Array) -> Array:
         """(4,) mean squares of the rotor speeds over the period, which tend to `speeds` exponentially [rad^2/s^2]."""

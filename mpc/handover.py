@@ -19,7 +19,7 @@ def hand_over(law: object, previous: object) -> None:
 
 
 def within(previous: object, kind: type[Law]) -> Law | None:
-    """A law of one's own kind, or the first such within it, as inside a fallback contract; None where there is none."""
+    """A law of the given kind, or the first such within it, as inside a fallback contract; None where there is none."""
     found: Any = previous
     while found is not None and not isinstance(found, kind):
         found = getattr(found, "inner", None)

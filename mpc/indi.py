@@ -1,7 +1,7 @@
 """Incremental nonlinear dynamic inversion (INDI) of the angular acceleration, an inner loop around any law.
 
-The law's rotor speeds say which wrench, and so which angular acceleration, it wants of its model.  At a rate of its
-own, above the control rate, the inner loop asks for the torque
+The law's rotor speeds give the wrench, and so the angular acceleration, that its model demands.  At a rate of its
+own, above the control rate, the inner loop demands the torque
 
     tau_c = tau_f + J (alpha_c - alpha_f),
 
@@ -76,7 +76,7 @@ class TorqueIncrement:
 
         Args:
             time: when it is [s].
-            commanded: (4,) what the law asks for [rad/s].
+            commanded: (4,) what the law demands [rad/s].
             rates: (3,) measured body rates [rad/s].
             rotors: (4,) measured rotor speeds [rad/s].
         """
@@ -108,7 +108,7 @@ class Incremental:
         self._loop = TorqueIncrement(vehicle, settings, bounds)
 
     def reset(self, speeds: Array) -> None:
-        """Start anew after the command u(-1) (4,) [rad/s]."""
+        """Restart after the command u(-1) (4,) [rad/s]."""
         self.inner.reset(speeds)
         self._loop.reset()
 

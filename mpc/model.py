@@ -71,7 +71,7 @@ def discretise(A_c: Array, B_c: Array, period: float) -> tuple[Array, Array]:
 
 
 def lqr(A: Array, B: Array, Q: Array, R: Array) -> Array:
-    """K (nu, n) of u = -K x, which minimises the sum of x' Q x + u' R u for ever, x(k+1) = A x(k) + B u(k).
+    """K (nu, n) of u = -K x, which minimises the infinite sum of x' Q x + u' R u, x(k+1) = A x(k) + B u(k).
 
     Raises:
         numpy.linalg.LinAlgError: there is no such gain.

@@ -70,7 +70,7 @@ def observer_gain(period: float, *, noise: float, walk: float, change: float) ->
 class DisturbanceObserver:
     """The six filters, an evolving state.
 
-    What is predicted starts from what was measured a period ago, so that the estimate of v itself is not kept: noise
+    What is predicted starts from what was measured a period ago, so that the estimate of v itself is not stored: noise
     of a measurement enters twice, with opposite signs, and the gains are those for twice its variance.
 
     Attributes:

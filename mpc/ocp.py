@@ -219,7 +219,7 @@ class Query(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class Unanswered:
-    """The first problem of a flight that had no answer; `mpc.diagnosis` says why.
+    """The first problem of a flight that had no answer; `mpc.diagnosis` explains why.
 
     Attributes:
         problem: what was to be solved.

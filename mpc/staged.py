@@ -46,16 +46,16 @@ def usual_steps(inputs: int) -> int:
 
 
 class Pattern:
-    """A sparse matrix assembled from blocks (..., rows, columns) that keep their places.
+    """A sparse matrix assembled from blocks (..., rows, columns) that keep their positions.
 
-    Places are the rows (..., rows) and the columns (..., columns) of each block.  What is zero in the first blocks, or
+    These are the rows (..., rows) and the columns (..., columns) of each block.  What is zero in the first blocks, or
     below the share `rounding` of the largest of its block's row and of its block's column, is left out for good.
     """
 
     def __init__(
-        self, shape: tuple[int, int], places: Sequence[tuple[Indices, Indices]], blocks: list[Array], rounding: float
+        self, shape: tuple[int, int], positions: Sequence[tuple[Indices, Indices]], blocks: list[Array], rounding: float
     ) -> None:
-        pairs = list(zip(places, blocks, strict=True))
+        pairs = list(zip(positions, blocks, strict=True))
         rows = np.concatenate([np.broadcast_to(at[0][..., :, None], block.shape).ravel() for at, block in pairs])
         columns = np.concatenate([np.broadcast_to(at[1][..., None, :], block.shape).ravel() for at, block in pairs])
         order = np.lexsort((rows, columns))

@@ -61,7 +61,7 @@ if TYPE_CHECKING:
 
 __version__ = "0.1.0"
 
-_PLACES = {
+_MODULES = {
     "scenarios.api": (
         "check",
         "compare",
@@ -99,7 +99,7 @@ _PLACES = {
     "quadsim.errors": ("QuadsimError",),
     "quadsim.vehicle": ("Vehicle",),
 }
-_PUBLIC = {name: module for module, names in _PLACES.items() for name in names}
+_PUBLIC = {name: module for module, names in _MODULES.items() for name in names}
 __all__ = [*_PUBLIC]
 
 

@@ -21,8 +21,8 @@ def models_dir() -> Path:
 
 def own_packages() -> dict[str, str]:
     """The entry of its environment by which a child process finds quadsim where this one did."""
-    places = (str(Path(__file__).resolve().parents[1]), os.environ.get("PYTHONPATH"))
-    return {"PYTHONPATH": os.pathsep.join(filter(None, places))}
+    folders = (str(Path(__file__).resolve().parents[1]), os.environ.get("PYTHONPATH"))
+    return {"PYTHONPATH": os.pathsep.join(filter(None, folders))}
 
 
 def vehicle_names() -> list[str]:

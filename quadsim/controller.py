@@ -47,7 +47,7 @@ class Phase(StrEnum):
 
 @dataclass(frozen=True, kw_only=True)
 class Moment:
-    """When a controller is asked, and what it may know besides the measured state.
+    """When a controller is called, and what it may use besides the measured state.
 
     Attributes:
         time: t_k [s].

@@ -33,7 +33,7 @@ def printable(text: str, *, keep: str = "") -> str:
 class QuadsimError(Exception):
     """Root of all errors raised on purpose; `exit_status` is what the command line returns for it.
 
-    Errors cross from one process to another: they pickle whole, whatever their constructors ask for.
+    Errors cross from one process to another: they pickle whole, whatever arguments their constructors need.
 
     Examples:
         >>> import quadsim
@@ -113,7 +113,7 @@ class FileError(InputError):
 
 
 class MissingPackageError(InputError):
-    """Something asked for needs an optional package that is not installed; the message says how to get it."""
+    """What was requested needs an optional package that is not installed; the message names it."""
 
     def __init__(self, what: str, package: str, *, extra: str) -> None:
         super().__init__(f"{what} needs the package {package!r}: pip install 'quadsim[{extra}]'")
@@ -121,7 +121,7 @@ class MissingPackageError(InputError):
 
 
 class MissingProgramError(InputError):
-    """Something asked for needs a program that is not installed; the message says how to get it."""
+    """What was requested needs a program that is not installed; the message names it."""
 
     def __init__(self, what: str, program: str, *, packages: str) -> None:
         super().__init__(f"{what} needs {program!r}: apt-get install --no-install-recommends {packages}")
@@ -191,7 +191,7 @@ class CommandError(FlightError):
 
 
 class ForceError(FlightError):
-    """A force of one's own that is not six finite numbers."""
+    """A user-defined force that is not six finite numbers."""
 
 
 class PlanExhaustedError(FlightError):
@@ -206,7 +206,7 @@ class InterruptedFlightError(FlightError):
 
 
 def _restore(kind: type[QuadsimError], arguments: tuple[object, ...], values: dict[str, object]) -> QuadsimError:
-    """An error as it was, its message and its values, without making it anew from them."""
+    """An error as it was, its message and its values, not rebuilt from them."""
     error = kind.__new__(kind)
     error.args = arguments
     error.__dict__.update(values)

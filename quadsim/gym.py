@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from scenarios.gym.safety import MPCSafetyFilter as MPCSafetyFilter
     from scenarios.gym.teacher import expert as expert
 
-_PLACES = {
+_MODULES = {
     "MPCSafetyFilter": "scenarios.gym.safety",
     "QuadrotorEnv": "scenarios.gym.environment",
     "environment_id": "scenarios.gym.registration",
@@ -32,19 +32,19 @@ _PLACES = {
     "make_env": "scenarios.gym.registration",
     "make_vec": "scenarios.gym.registration",
 }
-__all__ = [*_PLACES]
+__all__ = [*_MODULES]
 
 
 def __getattr__(name: str) -> Any:
     """Import a public name when it is first used."""
-    if name not in _PLACES:
+    if name not in _MODULES:
         raise AttributeError(f"module 'quadsim.gym' has no attribute {name!r}")
-    return globals().setdefault(name, getattr(importlib.import_module(_PLACES[name]), name))
+    return globals().setdefault(name, getattr(importlib.import_module(_MODULES[name]), name))
 
 
 def __dir__() -> list[str]:
     """The public names, imported or not."""
-    return sorted({*globals(), *_PLACES})
+    return sorted({*globals(), *_MODULES})
 
 
 def _register() -> None:

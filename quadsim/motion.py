@@ -1,4 +1,4 @@
-"""What a course asks of a vehicle over time: positions and what follows from them, for controllers that look ahead."""
+"""What a course requires of a vehicle over time, for controllers with preview."""
 
 from __future__ import annotations
 

@@ -21,7 +21,7 @@ from quadsim.errors import InputError, ParameterError, UnknownNameError
 from quadsim.fields import NonNegative, Number, Positive, Vector
 from quadsim.state import Array
 
-MOST_PLACES: Final = 1000
+MAX_POSITIONS: Final = 1000
 """Of one obstacle's path, or half-spaces of one polytope."""
 _NAME: Final = {"pattern": "^[A-Za-z][A-Za-z0-9_-]*$"}
 _PARALLEL: Final = 1e-9
@@ -133,14 +133,14 @@ class Obstacle:
     acceleration: Annotated[Vector, doc("[m/s^2] from start on, as of a thrown ball")] = (0.0, 0.0, 0.0)
     path: Annotated[
         tuple[Place, ...],
-        MaxLen(MOST_PLACES),
+        MaxLen(MAX_POSITIONS),
         doc("instead of velocity: in straight lines from position at start to each place at its time"),
     ] = ()
 
     def __post_init__(self) -> None:
         if self.path and (any(self.velocity) or any(self.acceleration)):
             raise InputError(
-                f"path must be absent where velocity or acceleration is given; got {len(self.path)} places"
+                f"path must be absent where velocity or acceleration is given; got {len(self.path)} positions"
             )
         times = [self.start, *(place.time for place in self.path)]
         if any(later <= earlier for earlier, later in itertools.pairwise(times)):
@@ -156,7 +156,7 @@ class Obstacle:
         """What it is made of."""
         raise NotImplementedError
 
-    def places(self, t: Array) -> Array:
+    def positions(self, t: Array) -> Array:
         """(K, 3) its position at times (K,) [m]."""
         since = np.maximum(t - self.start, 0.0)[:, None]
         if not self.path:
@@ -168,7 +168,7 @@ class Obstacle:
 
     def clearances(self, t: Array, points: Array) -> tuple[Array, Array]:
         """Signed distance (s, K) [m] of points (K, 3) at times (K,) to each of its s solids, and normals (s, K, 3)."""
-        relative = points - self.places(t)
+        relative = points - self.positions(t)
         found = [solid.clearance(relative) for solid in self.solids]
         return np.stack([distance for distance, _ in found]), np.stack([normal for _, normal in found])
 
@@ -196,13 +196,13 @@ class Solids:
 
     def clearances(self, t: Array, points: Array) -> tuple[Array, Array]:
         """Signed distances (s, K) [m] and normals (s, K, 3); see `Obstacle.clearances`."""
-        places = np.repeat(self._still, len(t), axis=1)
+        origins = np.repeat(self._still, len(t), axis=1)
         for i, obstacle in enumerate(self._obstacles):
             if obstacle.moves:
-                places[i] = obstacle.places(t)
+                origins[i] = obstacle.positions(t)
         distance, normal = np.empty((self.count, len(t))), np.empty((self.count, len(t), 3))
         for kind, at, owners, size, centre, turn in self._groups:
-            distance[at], normal[at] = _clearance(kind, size, centre, turn, points - places[owners])
+            distance[at], normal[at] = _clearance(kind, size, centre, turn, points - origins[owners])
         return distance, normal
 
 
@@ -300,7 +300,7 @@ class Wall(Obstacle):
 
     @cached_property
     def solids(self) -> tuple[Solid, ...]:
-        """What is left and right of the window, as high as the wall, and above and below it, as wide."""
+        """The wall left and right of the window, as high as the wall, and above and below it, as wide."""
         turn = _upright(self.yaw)
         thickness, width, height = self.size
         found = []
@@ -324,7 +324,7 @@ class Region:
     size: Annotated[Sizes | None, doc("[m] a box's edges along its own x, y, z")] = None
     yaw: Annotated[Number, doc("[deg] of a box's x axis, from the world's")] = 0.0
     rows: Annotated[
-        Annotated[tuple[Vector, ...], Len(1, MOST_PLACES)] | None,
+        Annotated[tuple[Vector, ...], Len(1, MAX_POSITIONS)] | None,
         doc("instead of a box: one list of three numbers a per half-space a . (x, y, z) <= upper"),
     ] = None
     upper: Annotated[tuple[Number, ...] | None, doc("[m, times the length of a] one per row")] = None

@@ -30,7 +30,7 @@ class Vehicle:
     f_i = b w_i^2 [N] and the reaction torque spin_i d w_i^2 [N m] about body +z (Sec. 2.2).
 
     Linear drag is a force -rotor_drag w v_perp on a rotor, v_perp its velocity through the air in the rotor's plane
-    (Martin and Salaun, 2010; Furrer et al., 2016).  What stands in `OPTIONAL_PARAMETERS` is None where its file does
+    (Martin and Salaun, 2010; Furrer et al., 2016).  What is in `OPTIONAL_PARAMETERS` is None where its file does
     not give it.
 
     Raises:
@@ -157,7 +157,7 @@ class Vehicle:
 
     @property
     def enclosing_radius(self) -> float:
-        """Radius of the ball that stands for the vehicle among obstacles [m]: its extent, or to the propellers' tips.
+        """Radius of the vehicle's bounding ball among obstacles [m]: its extent, or to the propellers' tips.
 
         Without a `rotor_radius` the propellers are as large as can be: neighbours just do not meet.
         """
@@ -205,7 +205,7 @@ def vehicle_sources(path: Path) -> dict[str, str]:
 
 
 def _read_entries(path: Path) -> tuple[dict[str, str], dict[str, dict[str, Any]]]:
-    """What a vehicle file says of itself, and its parameters, each with value, unit and source."""
+    """A vehicle file's description and parameters, each with value, unit and source."""
     texts: dict[str, str] = {}
     entries: dict[str, dict[str, Any]] = {}
     for key, entry in read_toml(path).items():

@@ -151,14 +151,14 @@ class _Case:
             bound = self.bound(side)
             first, last = (round(delay + steps * period, 9) for steps in (found.first, found.last))
             yield {**_named(bound), "by": found.amount * bound.factor, "start": first, "stop": last}
-        for side in conflict.in_the_way:
+        for side in conflict.blocking:
             yield {**_named(self.bound(side)), "by": 0.0, "start": None, "stop": None}
 
     def suggestions(self, conflict: Conflict) -> Iterator[dict[str, Any]]:
         """Changes of the file that give the period an answer: of one bound, the least first; softness; the fallback."""
         giving = {self.bound(side).field for side in conflict.violated}
         fields: dict[str, set[Side]] = {}
-        for side in (*conflict.violated, *conflict.in_the_way):
+        for side in (*conflict.violated, *conflict.blocking):
             field = self.bound(side).field
             if field and (side in conflict.violated or field not in giving):
                 rotors = range(N_ROTORS) if side.place in _ROTORS else (side.row,)
@@ -281,7 +281,7 @@ class _OwnCase(_Case):
         if conflict is None or conflict.feasible:
             return ""
         sides: dict[tuple[str, str], set[Side]] = {}
-        for side in (*conflict.violated, *conflict.in_the_way):
+        for side in (*conflict.violated, *conflict.blocking):
             rows = range(N_ROTORS) if self.bound(side).rotor else (side.row,)
             key = (self.bound(side).name, self.bound(side).side)
             sides.setdefault(key, set()).update(side._replace(row=row) for row in rows)

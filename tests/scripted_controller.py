@@ -63,7 +63,7 @@ def random_state(seed: int, scale: float = 0.1) -> Array:
 
 @dataclass
 class Scripted:
-    """Plans hover with one rotor a little faster, does in each period what it is told to, and keeps what it was asked.
+    """Plans hover with one rotor a little faster, follows a script, and records its calls.
 
     A script's entry changes fields of that answer, or is raised.
     """
@@ -72,15 +72,15 @@ class Scripted:
     horizon: int = 30
     name: str = "scripted"
     solver: str = "none"
-    asked: list[tuple[Moment, Array]] = field(default_factory=list)
+    calls: list[tuple[Moment, Array]] = field(default_factory=list)
     resets: list[Array] = field(default_factory=list)
 
     def reset(self, speeds: Array) -> None:
         self.resets.append(speeds)
 
     def step(self, now: Moment, state: Array, reference: Array) -> Command:
-        entry = self.script.get(len(self.asked), {})
-        self.asked.append((now, state.copy()))
+        entry = self.script.get(len(self.calls), {})
+        self.calls.append((now, state.copy()))
         if isinstance(entry, Exception):
             raise entry
         plan = np.tile(model().u_bar, (self.horizon, 1))
@@ -102,7 +102,7 @@ def guard(inner: Any, **options: Any) -> Guarded:
     return guarded
 
 
-def ask(guarded: Guarded, state: Array | None = None, **now: Any) -> Command:
+def call(guarded: Guarded, state: Array | None = None, **now: Any) -> Command:
     return guarded.step(Moment(**now), np.zeros(12) if state is None else state, np.zeros((guarded.horizon, 4)))
 
 
@@ -114,7 +114,7 @@ def following(guarded: Guarded, periods: int) -> list[Command]:
     """Commands while the vehicle moves as the model says."""
     state, commands = np.zeros(12), []
     for _ in range(periods):
-        commands.append(ask(guarded, state))
+        commands.append(call(guarded, state))
         state = advance(state, commands[-1].speeds)
     return commands
 

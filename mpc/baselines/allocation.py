@@ -1,4 +1,4 @@
-"""From thrust and torques to rotor speeds within bounds: yaw gives way first.
+"""From thrust and torques to rotor speeds within bounds: yaw is limited first.
 
 Squared speeds s = w^2 make the wrench linear, wrench = M s (Sec. 2.2).  A wrench outside what the bounds leave is met
 in two stages:
@@ -23,7 +23,7 @@ from quadsim.vehicle import Vehicle
 
 WEIGHTS: Final = (30.0, 1000.0, 1000.0, 1.0)
 """Weights of thrust, roll, pitch and yaw in stage 2: squared, about a thousandfold from one to the next."""
-LARGEST_SPEED: Final = 1e4  # stands for no upper bound [rad/s]; no rotor gets there
+LARGEST_SPEED: Final = 1e4  # in place of no upper bound [rad/s]; no rotor reaches it
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -12,7 +12,7 @@ from mpc.nonlinear.rigidbody import rotation
 from quadsim.state import EULER, EULER_RATE, POSITION, VELOCITY, Array, body_to_world, euler_to_body_rates
 
 LEAST_LIFT: Final = 0.2
-"""Share of the weight below which thrust is not asked to fall, so that torques keep their authority.  Ours."""
+"""Share of the weight below which thrust is not reduced, so that torques keep their authority.  Ours."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -27,7 +27,7 @@ class Measured:
 
 
 def motion_of(state: Array, attitude: Array | None = None, rates: Array | None = None) -> Measured:
-    """The motion that a state (12,) says; attitude (4,) wxyz and body rates (3,) [rad/s] by themselves where given."""
+    """The motion of a state (12,); attitude (4,) wxyz and body rates (3,) [rad/s] by themselves where given."""
     euler = state[list(EULER)]
     return Measured(
         position=state[list(POSITION)],
@@ -51,9 +51,9 @@ def vee(matrix: Array) -> Array:
 
 
 def limit_force(force: Array, *, least: float, tilt: float) -> Array:
-    """A force (3,) [N], world, that a vehicle may be asked for: up by `least` [N], leant by `tilt` [rad] at most.
+    """A force (3,) [N], world, that may be demanded of a vehicle: up by `least` [N], leant by `tilt` [rad] at most.
 
-    The vertical part is kept where it is enough; the horizontal part keeps its direction.
+    The vertical part is unchanged where it is enough; the horizontal part keeps its direction.
     """
     upward = max(float(force[2]), least)
     horizontal = math.hypot(force[0], force[1])
@@ -77,7 +77,7 @@ def prioritised_error(attitude: Array, wanted: Array, yaw_weight: float) -> Arra
     """Attitude error (3,) about the body axes [rad for small errors], heading last; attitudes (3, 3) body to world.
 
     2 sgn(q_0) times the vector part of the error quaternion q = q_tilt q_yaw: the shortest rotation that brings body z
-    where it is wanted, then the rest, a turn about it of which only the share `yaw_weight`, in (0, 1], is asked for.
+    where it is wanted, then the rest, a turn about it of which only the share `yaw_weight`, in (0, 1], is demanded.
     Brescianini, Hehn, D'Andrea, "Nonlinear quadrocopter attitude control", ETH Zurich, 2013; PX4's
     AttitudeControl.  The yaw part is divided by the weight, so that small errors of all three axes count alike.
     """

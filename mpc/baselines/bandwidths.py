@@ -16,7 +16,7 @@ YAW_SHARE: Final = 0.4  # bandwidth of heading over that of roll and pitch: abou
 
 @dataclass(frozen=True, kw_only=True)
 class Bandwidths:
-    """Bandwidths of the loops of a cascade [rad/s], each the gain from an error to the rate of change asked for.
+    """Bandwidths of the loops of a cascade [rad/s], each the gain from an error to the rate of change demanded.
 
     Attributes:
         rate: of roll and pitch rate; an angular acceleration per rate error.
@@ -40,7 +40,7 @@ class Bandwidths:
 
 
 def lag_to_allow_for(vehicle: Vehicle, period: float) -> float:
-    """The delay [s] that gains have to stand besides sampling: the rotors' own lag, but half a period at least."""
+    """The delay [s] that gains have to tolerate besides sampling: the rotors' own lag, but half a period at least."""
     return max(0.5 * period, vehicle.rotor_rise or 0.0, vehicle.rotor_fall or 0.0)
 
 

@@ -58,7 +58,7 @@ class GeometricSettings:
             the middle of the period that they are held for.
         drag: d_x, d_y, d_z of the acceleration -R diag(d) R' v that is fed forward [1/s].
         disturbance: the observer of what the model misses; None for none.
-        horizon: N, samples of preview; they tell the reference's velocity and acceleration.
+        horizon: N, samples of preview; they give the reference's velocity and acceleration.
         bounds: what commands are held to; None for the speeds that the rotors hold.
     """
 
@@ -167,7 +167,7 @@ class GeometricController(FeedbackLaw):
         self._allocation = make_allocation(vehicle)
 
     def reset(self, speeds: Array) -> None:
-        """Start anew after the command u(-1) (4,) [rad/s]."""
+        """Restart after the command u(-1) (4,) [rad/s]."""
         super().reset(speeds)
         self._integrals = Integrals(translation=np.zeros(3), rotation=np.zeros(3))
         if self._observer is not None:
@@ -221,17 +221,17 @@ class GeometricController(FeedbackLaw):
         with the observed disturbance d, d_Omega.  With feed-forward the drag at the reference's velocity counts too:
         `wanted_attitude`, and f is that of half a period on.
 
-        Where the limits of tilt or of lift hold A, the attitude that it asks for counts as one at rest.
+        Where the limits of tilt or of lift hold A, the attitude that it demands counts as one at rest.
         """
         settings, m, gravity = self.settings, self._vehicle.mass, self._vehicle.gravity
         J, R, Omega = np.array(self._vehicle.inertia), motion.attitude, motion.rates
         e_x, e_v = motion.position - target.position, motion.velocity - target.velocity
         weight = np.array([0.0, 0.0, gravity])
-        asked = m * (-settings.k_x * e_x - settings.k_v * e_v - integrals.translation + weight + target.acceleration)
-        asked -= m * disturbance.acceleration
-        A = limit_force(asked, least=LEAST_LIFT * m * gravity, tilt=math.radians(settings.tilt_max))
+        demanded = m * (-settings.k_x * e_x - settings.k_v * e_v - integrals.translation + weight + target.acceleration)
+        demanded -= m * disturbance.acceleration
+        A = limit_force(demanded, least=LEAST_LIFT * m * gravity, tilt=math.radians(settings.tilt_max))
         A1 = A2 = p1 = p2 = np.zeros(3)
-        if np.array_equal(A, asked):
+        if np.array_equal(A, demanded):
             A1, A2 = self._force_derivatives(motion, target, A, e_v, disturbance)
             p1, p2 = m * target.acceleration, m * target.jerk
         wanted = wanted_attitude(

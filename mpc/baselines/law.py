@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 
 class FeedbackLaw(ABC):
-    """A controller that solves nothing: a subclass says what it commands in the air, `_command`."""
+    """A controller that solves nothing: a subclass defines what it commands in flight, `_command`."""
 
     solver: Final = ""
 
@@ -35,7 +35,7 @@ class FeedbackLaw(ABC):
         self.reset(self.model.u_bar)
 
     def reset(self, speeds: Array) -> None:
-        """Start anew after the command u(-1) (4,) [rad/s]."""
+        """Restart after the command u(-1) (4,) [rad/s]."""
         self._before = np.array(speeds, float)
 
     def step(self, now: Moment, state: Array, reference: Array) -> Command:

@@ -41,10 +41,10 @@ class LQRSettings:
     Attributes:
         period: tau_s [s].
         objective: weights of one period of the infinite sum; `bryson_objective` gives some for any vehicle.
-        horizon: N, samples of preview; they tell the reference's velocity, and N periods are planned.
+        horizon: N, samples of preview; they give the reference's velocity, and N periods are planned.
         heading_frame: whether errors are turned into axes along the measured yaw, so that any heading flies.
-        tilt_max: largest tilt that errors of x, y and their rates ask for [deg], or None.  The law is linear: without a
-            limit a large error asks for more tilt than the model, or the vehicle, stands.
+        tilt_max: largest tilt that errors of x, y and their rates demand [deg], or None.  The law is linear: without a
+            limit a large error demands more tilt than the model, or the vehicle, tolerates.
         bounds: what commands are held to, the law itself knowing none; None for the speeds that the rotors hold.
 
     Raises:
@@ -96,7 +96,7 @@ def _stands_lag(vehicle: Vehicle, period: float, objective: Objective) -> bool:
 
 
 def lqr_gain(model: LinearModel, objective: Objective) -> Array:
-    """K (nu, n) of u = u_bar - K (xi - xi_r), which minimises the sum of xi' C_r' Q_y C_r xi + u' Q_u u for ever.
+    """K (nu, n) of u = u_bar - K (xi - xi_r), which minimises the infinite sum of xi' C_r' Q_y C_r xi + u' Q_u u.
 
     K = (Q_u + B' P B)^-1 B' P A, P the solution of the discrete algebraic Riccati equation.
 
@@ -119,7 +119,7 @@ def lqr_gain(model: LinearModel, objective: Objective) -> Array:
 class LQR(FeedbackLaw):
     """u = u_bar - K (xi - xi_r), the reference's state xi_r being its pose and velocity, upright.
 
-    Heading errors count the short way round.  Speeds that leave the bounds are held to them as `allocate` says; thrust,
+    Heading errors count the short way round.  Speeds that leave the bounds are held to them as by `allocate`; thrust,
     roll and pitch torque go before yaw.
     """
 
@@ -130,7 +130,7 @@ class LQR(FeedbackLaw):
         self.settings = settings
         self.gain = lqr_gain(self.model, settings.objective)
         self._allocation = make_allocation(vehicle)
-        self._tilt_asked = np.linalg.pinv(self.gain[:, TILT]) @ self.gain[:, HORIZONTAL]
+        self._tilt_demand = np.linalg.pinv(self.gain[:, TILT]) @ self.gain[:, HORIZONTAL]
 
     def _command(self, now: Moment, state: Array, reference: Array, before: Array) -> Command:
         """The law's command and the model's forecast of the next."""
@@ -170,23 +170,23 @@ class LQR(FeedbackLaw):
         return targets
 
     def _limited(self, error: Array) -> Array:
-        """The error (12,), its horizontal part scaled down where it asks for more tilt than allowed.
+        """The error (12,), its horizontal part scaled down where it demands more tilt than allowed.
 
         K e = K_tilt (tilt + G e_horizontal) + ..., so -G e_horizontal is the tilt that the law steers to.
         """
         if self.settings.tilt_max is None:
             return error
-        asked = float(np.linalg.norm(self._tilt_asked @ error[HORIZONTAL]))
+        demanded = float(np.linalg.norm(self._tilt_demand @ error[HORIZONTAL]))
         allowed = math.radians(self.settings.tilt_max)
-        if asked <= allowed:
+        if demanded <= allowed:
             return error
         limited = error.copy()
-        limited[HORIZONTAL] *= allowed / asked
+        limited[HORIZONTAL] *= allowed / demanded
         return limited
 
     def _held(self, speeds: Array, lower: Array, upper: Array) -> Array:
         """Speeds (4,) between `lower` and `upper` (4,) [rad/s] that give the wrench of `speeds`, or nearly so."""
         if ((lower <= speeds) & (speeds <= upper)).all():
             return speeds
-        # Thrust goes with the square; a speed below zero asks for what no rotor gives, and counts with its sign.
+        # Thrust goes with the square; a speed below zero demands what no rotor gives, and counts with its sign.
         return allocate(self._allocation, self._allocation.M @ (speeds * np.abs(speeds)), lower, upper)

@@ -25,7 +25,7 @@ from quadsim.vehicle import Vehicle
 
 HORIZONTAL_MARGIN: Final = 0.3  # share of the largest thrust that climbing leaves to the sides: PX4's MPC_THR_XY_MARG
 LARGEST_THRUST: Final = 0.85
-"""Share of all rotors' highest thrust that is asked for: PX4's mixer takes back up to 15 % of it for yaw."""
+"""Share of all rotors' highest thrust that is demanded: PX4's mixer takes back up to 15 % of it for yaw."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,11 +39,11 @@ class PIDSettings:
         rate_integral: the same of the rate loop [1/s].
         velocity_derivative: share of the measured acceleration that is taken back.
         rate_derivative: share of the measured angular acceleration that is taken back; late by a period, less than 1.
-        yaw_weight: share of the heading error asked for while turning the thrust; PX4's MC_YAW_WEIGHT.
+        yaw_weight: share of the heading error corrected while turning the thrust; PX4's MC_YAW_WEIGHT.
         tilt_max: largest tilt commanded [deg]; PX4's MPC_TILTMAX_AIR.
         velocity_max: largest velocity commanded, horizontal and vertical [m/s]; PX4's MPC_XY_VEL_MAX.
         rate_max: largest body rates commanded, roll, pitch, yaw [deg/s]; PX4's MC_ROLLRATE_MAX and so on.
-        horizon: N, samples of preview; they tell the reference's velocity and acceleration.
+        horizon: N, samples of preview; they give the reference's velocity and acceleration.
         bounds: what commands are held to; None for the speeds that the rotors hold.
     """
 
@@ -108,7 +108,7 @@ class CascadedPID(FeedbackLaw):
         self._largest = LARGEST_THRUST * 4.0 * vehicle.thrust_coefficient * highest**2  # thrust to command [N]
 
     def reset(self, speeds: Array) -> None:
-        """Start anew after the command u(-1) (4,) [rad/s]."""
+        """Restart after the command u(-1) (4,) [rad/s]."""
         super().reset(speeds)
         self._memory = Memory(velocity_integral=np.zeros(3), rate_integral=np.zeros(3))
 

@@ -15,7 +15,7 @@ from quadsim.motion import Motion
 from quadsim.state import Array, read_only
 
 SMALLEST_PREVIEW: Final = 3  # samples that a parabola needs
-PREVIEW_DEGREE: Final = 4  # of the polynomial through a preview that tells jerk and snap
+PREVIEW_DEGREE: Final = 4  # of the polynomial through a preview that gives jerk and snap
 MOTION_DEGREE: Final = 5  # of the one through a motion's next samples, which are exact
 MOTION_SAMPLES: Final = 7
 
@@ -38,7 +38,7 @@ class Target:
     snap: Array = field(default_factory=_nothing)  # (3,) [m/s^4]
     heading: Array | None = None
     """(3, 3) rows: the direction near which body x is wanted, any length but zero, its rate of change and that of this;
-    None where yaw says it."""
+    None where yaw gives it."""
 
 
 def differentiator(samples: int, period: float, *, degree: int = 2, first: int = 1) -> Array:
@@ -52,8 +52,8 @@ def differentiator(samples: int, period: float, *, degree: int = 2, first: int =
         ParameterError: there are too few samples, or the period is not positive.
     """
     if samples < degree + 1:
-        told = {SMALLEST_PREVIEW: "an acceleration", PREVIEW_DEGREE + 1: "a snap"}.get(degree + 1, "derivatives")
-        raise ParameterError("controller", "horizon", samples, f"at least {degree + 1}, to tell {told}")
+        derivative = {SMALLEST_PREVIEW: "an acceleration", PREVIEW_DEGREE + 1: "a snap"}.get(degree + 1, "derivatives")
+        raise ParameterError("controller", "horizon", samples, f"at least {degree + 1}, for {derivative}")
     if not 0.0 < period < math.inf:
         raise ParameterError("controller", "period", period, "positive and finite")
     t = period * np.arange(first, first + samples)
@@ -79,7 +79,7 @@ def target_of_motion(motion: Motion, yaw: Array, period: float) -> Target:
     """What to follow, from the present and next samples of a motion and the yaw (3,), its rate and acceleration.
 
     All derivatives are those of the positions and attitudes, whatever velocities a course states of itself: they agree
-    with what the vehicle is asked to fly.  Near the course's end fewer samples tell fewer derivatives.
+    with what the vehicle has to fly.  Near the course's end fewer samples give fewer derivatives.
     """
     samples = min(len(motion), MOTION_SAMPLES)
     degree = min(MOTION_DEGREE, samples - 1)

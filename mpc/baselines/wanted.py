@@ -1,4 +1,4 @@
-"""The attitude that a force and a heading ask for under rotor drag, how it turns, and how that changes."""
+"""The attitude that a force and a heading require under rotor drag, how it turns, and how that changes."""
 
 from __future__ import annotations
 

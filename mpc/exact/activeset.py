@@ -38,11 +38,11 @@ FEASIBLE: Final = 1e-9
 DEPENDENT: Final = 1e-12
 """Share of an active row's S_ii that other active rows leave over, below which it is taken for their combination."""
 LEAST_QUADRATIC: Final = 1e-9
-"""Share of l1 that stands in for a quadratic penalty of zero."""
+"""Share of l1 that replaces a quadratic penalty of zero."""
 ROUNDING: Final = 1e-12
 """Share of l1 by which a multiplier may pass it."""
 FEW: Final = 8
-"""Wrong rows of a start with which no other one is looked at."""
+"""Wrong rows of a start with which no other one is tried."""
 ROUNDED: Final = 1e-6
 """Share of l1 by which an approximate multiplier of a violated row may stay below it."""
 CAREFUL: Final = 4
@@ -173,7 +173,7 @@ class ActiveSet:
         return self._one_by_one(best.copy(), free, bounds, step, most)
 
     def _trial(self, side: Side, bounds: Array) -> _Trial:
-        """The maximum of the dual function on the pieces that a side says."""
+        """The maximum of the dual function on the pieces given by a side."""
         active = side.nonzero()[0]
         pieces = taken = side.take(active)
         rows = self._S.take(active, 0, self._room[: active.size], "clip")  # a mode that takes no copy
@@ -251,8 +251,8 @@ class ActiveSet:
             if stops.size:  # as far as all stay on their pieces
                 rows = active[stops]
                 kink = np.where(trial.pieces[stops] == 0, 0.0, np.sign(side[rows]) * self._l1[rows])
-                way = (trial.z - z[active])[stops]
-                share = np.maximum((kink - z[rows]) / np.where(way == 0.0, np.inf, way), 0.0)
+                step = (trial.z - z[active])[stops]
+                share = np.maximum((kink - z[rows]) / np.where(step == 0.0, np.inf, step), 0.0)
                 least = share.min()
                 z[active] += least * (trial.z - z[active])
                 first = share <= least
@@ -284,7 +284,7 @@ class ActiveSet:
         return Active(z=z, values=free - fall, side=trial.side, steps=steps)
 
     def near(self, z: Array, free: Array, lower: Array, upper: Array) -> Side:
-        """The active set that approximate multipliers (rows,) tell of: those that outweigh the distance to a bound."""
+        """The active set that approximate multipliers (rows,) indicate: those that outweigh the distance to a bound."""
         values, reach = free - self._S @ z, z * self._S.diagonal()
         side = (reach > upper - values).astype(np.int8) - (-reach > values - lower)
         return np.where(np.abs(z) > (1.0 - ROUNDED) * self._l1, 2 * side, side).astype(np.int8) if self._soft else side

@@ -14,8 +14,8 @@ from mpc.paper.prediction import prediction
 from quadsim.state import Array
 
 ROUNDING: Final = 1e-4
-"""Error of an input held throughout, whose gain is known to be one, beyond which rounding is taken to have spoilt the
-gains."""
+"""Error of an input held throughout, whose gain is known to be one, above which the gains are not
+exact."""
 
 
 class FreeOptimum:

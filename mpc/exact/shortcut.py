@@ -18,7 +18,7 @@ from mpc.ocp import Problem, Rest
 from mpc.paper.condensed import Condensed, condensed_cost, row_maps
 from mpc.paper.prediction import prediction
 from mpc.qp import Point, Solution
-from mpc.solvers import Answer, QPSolver, Solver, Way
+from mpc.solvers import Answer, Method, QPSolver, Solver
 from quadsim.controller import SOLVED, UNCONSTRAINED
 from quadsim.state import Array, Indices, read_only
 
@@ -125,17 +125,17 @@ class Shortcut:
             self._side = np.zeros_like(self._side)
             x = np.concatenate((plan.ravel(), self._no_slacks.ravel())) if self._no_slacks.size else plan.ravel()
             solution = self._solution(self._no_multipliers._replace(x=x), self._nothing, started, UNCONSTRAINED)
-            return Answer(plan=plan, slacks=self._no_slacks, solution=solution, way=Way.FREE)
+            return Answer(plan=plan, slacks=self._no_slacks, solution=solution, method=Method.FREE)
         free = free.copy()  # the values' room is used again
         if np.isfinite(free).all():
             starts = self._starts()
             found, settled = self._by_axes(plan, free, within, u_before, starts)
-            way = Way.WHOLE if found is None else Way.AXES
+            method = Method.WHOLE if found is None else Method.AXES
             if found is None and settled and self._all is not None:
                 found = self._all.solve(plan, free, starts)
             if found is not None:
                 self._side = found.active.side
-                return self._answer(found, way, started)
+                return self._answer(found, method, started)
         return self._by_solver(plan, free, (state, desired, u_before, rest), started)
 
     def _values_of_inputs(self, plan: Array, u_before: Array) -> Array:
@@ -178,7 +178,7 @@ class Shortcut:
             return None, True
         return _Found(plan, Active(z=z, values=values, side=side, steps=steps)), True
 
-    def _answer(self, found: _Found, way: Way, started: float) -> Answer:
+    def _answer(self, found: _Found, method: Method, started: float) -> Answer:
         slacks = self._no_slacks
         if slacks.size and (violated := np.abs(found.active.side) == 2).any():
             values, shape = found.active.values, self._rows.lower.shape
@@ -186,7 +186,7 @@ class Shortcut:
             slacks = (violated * beyond).reshape(shape)[:, self._rows.soft]
         point = self.formulation.point(found.plan, slacks, found.active.z.reshape(self._rows.lower.shape))
         solution = self._solution(point, found.active, started, SOLVED)
-        return Answer(plan=found.plan, slacks=slacks, solution=solution, way=way)
+        return Answer(plan=found.plan, slacks=slacks, solution=solution, method=method)
 
     def _solution(self, point: Point, active: Active, started: float, status: str) -> Solution:
         return Solution(
@@ -224,7 +224,7 @@ class Shortcut:
                     found = self._all.solve(plan, free, [self._side])
                 if found is not None:
                     self._side = found.active.side
-                    answer = self._answer(found, Way.WHOLE, started)
+                    answer = self._answer(found, Method.WHOLE, started)
                     spent_s += given.solve_s + answer.solution.solve_s
                     break
                 point = self.formulation.point(answer.plan, answer.slacks, multipliers)
@@ -273,7 +273,7 @@ class _Group:
         return _Found(plan - np.dot(change, self._T), found)
 
     def near(self, z: Array, free: Array) -> Side:
-        """The active set that approximate multipliers of all rows tell of; see `ActiveSet.near`."""
+        """The active set that approximate multipliers of all rows indicate; see `ActiveSet.near`."""
         return self._set.near(z, free, self._lower, self._upper)
 
 

@@ -26,7 +26,7 @@ STATUSES: Final = (UNCONSTRAINED, SOLVED, SOLVED, "clipped", "shifted", "before"
 FALLBACK: Final = (0, 0, 0, 1, 2, 3)
 """And its fallback level."""
 SOLVER: Final = "compiled"
-"""What stands for the name of a solver."""
+"""In place of a solver's name."""
 _MOVING: Final = [*VELOCITY, *EULER, *EULER_RATE]
 _SAME_TIME: Final = 1e-6  # [s]
 
@@ -45,17 +45,17 @@ class CompiledMPC:
         self.name, self.problem, self.horizon = law.name, law.problem, law.problem.horizon
         self._robust = law.settings is not None
         self._nominal = hover_model(law.vehicle, law.problem.model.period)
-        self._unbounded = not law.problem.every_constraint  # whose law is the gain: no status tells of a free optimum
+        self._unbounded = not law.problem.every_constraint  # whose law is the gain: no status reports a free optimum
         self._bounds = None if self._unbounded else ActuatorBounds.of_problem(law.problem)
         self._library = ctypes.CDLL(str(library))
         self._library.quadsim_shim_size.restype = ctypes.c_size_t
-        self._asked, self._answers = np.zeros(18 + 4 * self.horizon), np.zeros(18 + 4 * self.horizon)
-        self._state, self._acting = self._asked[:12], self._asked[12:16]
-        self._path = self._asked[16:-2].reshape(self.horizon, 4)
+        self._inputs, self._answers = np.zeros(18 + 4 * self.horizon), np.zeros(18 + 4 * self.horizon)
+        self._state, self._acting = self._inputs[:12], self._inputs[12:16]
+        self._path = self._inputs[16:-2].reshape(self.horizon, 4)
         self._memory = ctypes.create_string_buffer(self._library.quadsim_shim_size() + 64)
         start = -(-ctypes.addressof(self._memory) // 64) * 64
         self._arguments = tuple(
-            map(ctypes.c_void_p, (start, self._asked.ctypes.data, self._answers.ctypes.data))
+            map(ctypes.c_void_p, (start, self._inputs.ctypes.data, self._answers.ctypes.data))
         )  # the same each time
         self._step = self._library.quadsim_shim_step
         self._step.restype = None
@@ -64,9 +64,9 @@ class CompiledMPC:
     def reset(self, speeds: Array) -> None:
         """See `quadsim.controller.Controller.reset`."""
         self._before = np.array(speeds, float)
-        self._asked[:4] = self._before
+        self._inputs[:4] = self._before
         self._library.quadsim_shim_reset(self._arguments[0], self._arguments[1])
-        self._asked_at = self._measured = -math.inf
+        self._called_at = self._measured = -math.inf
         self.trim = Trim(speeds=self._nominal.u_bar, lift=np.array([0.0, 0.0, 1.0]))
         """What holds the vehicle at rest against the disturbance that is estimated."""
 
@@ -77,27 +77,27 @@ class CompiledMPC:
             return self._stop(acting, now.phase)
         self._state[:], self._acting[:], self._path[:] = state, acting, reference
         if self._robust:
-            self._asked[-2], self._asked[-1] = self._may_learn(now), now.phase is Phase.FLYING
+            self._inputs[-2], self._inputs[-1] = self._may_learn(now), now.phase is Phase.FLYING
         started = clock.perf_counter()
         self._step(*self._arguments)
         spent_s = clock.perf_counter() - started
         found = self._answers.copy()
         status, changes, active, slack = found[:4].tolist()
-        way, N = int(status), self.horizon
+        method, N = int(status), self.horizon
         self._before = found[4:8]
         if self._robust:
             at = 8 + 4 * N
             self.trim = Trim(speeds=found[at : at + 4], lift=found[at + 4 : at + 7], twist=found[at + 7 : at + 10])
         plan = found[8 : 8 + 4 * N].reshape(N, 4)
         plan[0] = self._before
-        accepted = FALLBACK[way] == 0
+        accepted = FALLBACK[method] == 0
         return Command(
             speeds=self._before.copy(),
             plan=plan if accepted else np.tile(self._before, (N, 1)),
-            status=SOLVED if self._unbounded else STATUSES[way],
+            status=SOLVED if self._unbounded else STATUSES[method],
             iterations=int(changes),
             active=int(active) if accepted else 0,
-            fallback=FALLBACK[way],
+            fallback=FALLBACK[method],
             slack=slack if accepted else 0.0,
             solve_s=spent_s,
         )
@@ -115,9 +115,9 @@ class CompiledMPC:
 
     def _may_learn(self, now: Moment) -> bool:
         """Whether what was expected for now may be held against the state; see `RobustMPC.step`."""
-        if abs(now.time - self._asked_at - self._nominal.period) > _SAME_TIME:
+        if abs(now.time - self._called_at - self._nominal.period) > _SAME_TIME:
             self._measured = -math.inf
-        self._asked_at = now.time
+        self._called_at = now.time
         if isinstance(now, CompletedMoment) and now.unseen[_MOVING].any():
             return False
         span, self._measured = now.time - self._measured, now.time

@@ -14,7 +14,7 @@ from quadsim.state import Array
 LEAST_FLOAT: Final = 1.2e-38
 """Magnitude below which a number is 0: single precision would truncate it, which is an error of some compilers."""
 NO_BOUND: Final = 1e30
-"""What stands for infinity."""
+"""In place of infinity."""
 
 
 def number(value: float) -> str:

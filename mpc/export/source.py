@@ -56,7 +56,7 @@ def sources(law: Exportable, *, precision: Precision, title: str) -> dict[str, s
     Args:
         law: the controller.
         precision: of all numbers.
-        title: a line that says which it is, in ASCII.
+        title: a line that identifies it, in ASCII.
 
     Raises:
         ParameterError: the problem is too large, or its rows differ from step to step.

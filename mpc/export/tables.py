@@ -36,7 +36,7 @@ LEAST_ROOM: Final = 64
 LARGEST: Final = 2**20
 """Entries of all responses beyond which a problem is not exported: 8 MiB."""
 LEAST_QUADRATIC: Final = 1e-9
-"""Share of l1 that stands in for a quadratic penalty of zero; see `mpc.exact.activeset`."""
+"""Share of l1 that replaces a quadratic penalty of zero; see `mpc.exact.activeset`."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -90,7 +90,7 @@ class Tables:
     tolerance: Array  # (m,) the largest of these roots
     T: Array  # (nu, nu) u - u_s = T w
     T_inverse: Array
-    modes: Array  # (nu, nu) takes rotor speeds that are states to what stands for them, one of each axis
+    modes: Array  # (nu, nu) takes rotor speeds that are states to the modes in their place, one of each axis
     room: int  # active rows that there is room for
 
 

@@ -101,7 +101,7 @@ class StateCompletion:
         self.reset()
 
     def reset(self) -> None:
-        """Start anew: nothing measured yet; at rest, level and at the origin is assumed."""
+        """Restart: nothing measured yet; at rest, level and at the origin is assumed."""
         self._state = np.zeros(N_STATES)
         self._covariance: Array = np.diag(UNKNOWN**2)
         self._last = np.full(N_STATES, np.nan)

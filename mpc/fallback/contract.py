@@ -9,7 +9,7 @@ Each period, the first of these that can be had:
 3. descent: the same, sinking at a steady speed, once level 2 has lasted too long.
 
 The inner controller is called in every period in which the state is known, so that recovery is automatic.  It receives
-the command in force, so that its bounds on steps refer to what acts, whoever commanded it, and which channels of the
+the command in force, so that its bounds on steps refer to what acts, whatever commanded it, and which channels of the
 state are predicted rather than measured (`mpc.fallback.completion.CompletedMoment`).
 
 One that estimates disturbances gives the equilibrium under them as an attribute `trim` (`mpc.equilibrium.Trim`).
@@ -54,7 +54,7 @@ class Guarded:
     commands pass unchanged.
 
     Attributes:
-        inner: the controller asked first, through the protocol alone.
+        inner: the controller called first, through the protocol alone.
         law: what levels 1 to 3 are made of.
 
     Args:
@@ -89,7 +89,7 @@ class Guarded:
         self.reset(model.u_bar)
 
     def reset(self, speeds: Array) -> None:
-        """Start anew after the command u(-1) (4,) [rad/s]."""
+        """Restart after the command u(-1) (4,) [rad/s]."""
         usable = check_command(speeds) is None
         self._before = np.array(speeds, float) if usable else self._model.u_bar.copy()
         self._completion.reset()
@@ -111,13 +111,13 @@ class Guarded:
     def step(self, now: Moment, state: Array, reference: Array) -> Command:
         """The first level's command that can be had; see `quadsim.controller.Controller.step`.
 
-        Whatever becomes of the inner controller, this raises none of its `FAILURES`, whose names become the status.
+        However the inner controller fails, this raises none of its `FAILURES`, whose names become the status.
         While grounded, rotors are taken to their lowest speed as fast as the bounds allow.
         """
         acting = self._before if now.acting is None or check_command(now.acting) is not None else now.acting
         known = self._completion.complete(state, acting, self.trim, free=now.phase is Phase.FLYING)
         completed = completed_moment(now, acting.copy(), self._completion.unseen.copy(), known)
-        status, answer = self._ask(completed, known, reference)
+        status, answer = self._call(completed, known, reference)
         if now.phase in GROUNDED:
             self._forget()
             command = stopped(self._bounds.reach(acting)[0], self.horizon, now.phase)
@@ -164,7 +164,7 @@ class Guarded:
         self._good, self._foreseen, self._age = None, None, 0
         self._target, self._hovered = None, 0
 
-    def _ask(self, now: CompletedMoment, known: Array, reference: Array) -> tuple[str, Command | None]:
+    def _call(self, now: CompletedMoment, known: Array, reference: Array) -> tuple[str, Command | None]:
         """The inner controller's answer where one was given, and its status: an accepted one is good to fly."""
         assert now.acting is not None
         if self._model.period * float(self._completion.unseen.max()) > self._settings.unseen:
@@ -185,7 +185,7 @@ class Guarded:
         return rejection(answer.status, answer.speeds, answer.plan, self._bounds, now.acting) or answer.status, answer
 
     def _accept(self, answer: Command, acting: Array) -> Command:
-        """A good answer, moved onto its bounds; so is what it plans for later, which may act unasked."""
+        """A good answer, moved onto its bounds; so is what it plans for later, which may act without a call."""
         speeds = self._bounds.clip(answer.speeds, acting)
         later = self._bounds.clip_plan(answer.plan[1:], speeds) if self.horizon > 1 else answer.plan[1:]
         return replace(answer, speeds=speeds, plan=np.concatenate([speeds[None], later]), fallback=0)
@@ -199,7 +199,7 @@ class Guarded:
         return replace(spent, speeds=plan[0].copy(), plan=plan, status=status, active=0, slack=0.0, fallback=level)
 
     def _shifted(self, known: Array, acting: Array, *, lost: bool) -> Array | None:
-        """What is left of the last good plan (N, 4), corrected now; None once it is of no use, and then for good."""
+        """The rest of the last good plan (N, 4), corrected now; None once it is unusable, from then on."""
         if self._good is None:
             return None
         (state, plan), age = self._good, self._age

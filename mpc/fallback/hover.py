@@ -8,7 +8,7 @@ speeds: the closed loop is then the same for every vehicle.
     acceleration = -K (xi - xi_target)    u = u_s + S^-1 acceleration
 
 u_s holds the vehicle at rest against what is known to disturb it; see `mpc.equilibrium.Trim`.  S takes rotor speeds to
-accelerations along z and about x, y, z.  K acts on horizontal errors through the tilt that it asks for, beside that at
+accelerations along z and about x, y, z.  K acts on horizontal errors through the tilt that it demands, beside that at
 rest, tilt* = -(k_p e_p + k_v e_v) / k_tilt.  The sum is bounded here: exactly the LQR within the bound, and no more
 tilt than that beyond.
 """
@@ -70,7 +70,7 @@ class HoverLaw:
         model: the hover model.
         gain: (4, 12) K, from errors in the heading frame to accelerations.
         slope: (4, 4) S; see `mpc.heading.slope`.
-        tilt: largest roll and pitch asked for together [rad].
+        tilt: largest roll and pitch demanded together [rad].
 
     Raises:
         ParameterError: the model is not a quadrotor's, or the tilt is not between 0 and 90 deg.

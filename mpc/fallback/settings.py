@@ -25,7 +25,7 @@ class FallbackSettings:
     """
 
     enabled: Annotated[bool, doc("false: what the controller does without an answer is its own")] = True
-    unseen: Annotated[Positive, doc("[s] longest time that predictions stand in for a missing measurement")] = 1.5
+    unseen: Annotated[Positive, doc("[s] longest time that predictions replace a missing measurement")] = 1.5
     plan_age: Annotated[Positive, doc("[s] longest time on one shifted plan")] = 1.0
     position: Annotated[Positive, doc("[m] largest distance from that plan")] = 0.5
     velocity: Annotated[Positive, doc("[m/s] the same of a velocity")] = 1.0

@@ -1,13 +1,13 @@
 """Nonlinear MPC: sequential quadratic programming on the rigid body with a quaternion.
 
-Each period the model is linearised along the plan of the last one, at the nodes' states and inputs kept, and the QP
+Each period the model is linearised along the plan of the last one, at the nodes' stored states and inputs, and the QP
 
     min  sum |C_r (s_i - s_i^r)|^2_Q + |u_i - u_i^r|^2_R    s.t.  s_{i+1} = A_i s_i + B_i u_i + c_i,  s_0 measured
 
 is solved: a full Gauss-Newton step, the real-time iteration (Diehl, Bock and Schloeder 2005).  Its states s have the
 quaternion q_r* q for q, with the node's reference q_r: a rotation of four numbers, by which both attitude errors of
 `AttitudeError` become linear with fixed weights.  A measured state enters as s_0 alone; node 0 is linearised at the
-state kept.
+stored state.
 """
 
 from __future__ import annotations
@@ -260,24 +260,24 @@ class NonlinearMPC:
 
     def _riccati(self, linear: LinearModel, objective: Objective) -> Array:
         """P at hover, where the quaternion's scalar does not move, and costs nothing."""
-        kept = np.delete(np.arange(linear.n), 3)
-        reduced = replace(objective, C_r=objective.C_r[:, kept], P=None)
+        others = np.delete(np.arange(linear.n), 3)
+        reduced = replace(objective, C_r=objective.C_r[:, others], P=None)
         if self.settings.attitude_error is AttitudeError.DIFFERENCE:
             rows = np.delete(np.arange(len(objective.C_r)), 3)
             reduced = replace(reduced, C_r=reduced.C_r[rows], Q_y=objective.Q_y[np.ix_(rows, rows)])
-        part = replace(linear, A=linear.A[np.ix_(kept, kept)], B=linear.B[kept])
+        part = replace(linear, A=linear.A[np.ix_(others, others)], B=linear.B[others])
         P = np.zeros((linear.n, linear.n))
-        P[np.ix_(kept, kept)] = lqr_terminal_weight(part, reduced)
+        P[np.ix_(others, others)] = lqr_terminal_weight(part, reduced)
         return P
 
     def reset(self, speeds: Array) -> None:
-        """Start anew after the command u(-1) (4,) [rad/s], with rotors at that speed."""
+        """Restart after the command u(-1) (4,) [rad/s], with rotors at that speed."""
         self._acting = np.array(speeds, float)
         self._rotors = self._rotors_before = self._shares(self._acting)
         self._plan: tuple[Array, Array] | None
         self._quaternion: Array | None
         self._last: tuple[float, Array] | None  # time and state of the last period
-        self._asked: float
+        self._called_at: float
         self._velocity = np.zeros(3)  # the reference's in the last period
         self._forget()
         if self._clearing is not None:
@@ -292,7 +292,7 @@ class NonlinearMPC:
             for name in ("_rotors", "_rotors_before"):
                 shares = getattr(law, name)
                 setattr(self, name, shares if alike else self._shares(law._speeds(shares)))
-            self._quaternion, self._asked = law._quaternion, law._asked
+            self._quaternion, self._called_at = law._quaternion, law._called_at
             if law._last is not None:
                 time, x = law._last
                 self._last = time, np.concatenate([x[:N_BODY], self._rotors])[: self._model.n]
@@ -384,7 +384,7 @@ class NonlinearMPC:
 
     def _turn(self, now: Moment) -> None:
         """Let the rotors follow what was commanded since the last period."""
-        before, self._asked = self._asked, now.time
+        before, self._called_at = self._called_at, now.time
         self._rotors_before = self._rotors
         if self.settings.rotor_lag and math.isfinite(before):
             left = math.exp(-(now.time - before) / self.settings.rotor_lag)
@@ -455,7 +455,7 @@ class NonlinearMPC:
 
     def _forget(self) -> None:
         """Start without a plan, and assume no disturbance."""
-        self._plan, self._quaternion, self._last, self._asked = None, None, None, math.nan
+        self._plan, self._quaternion, self._last, self._called_at = None, None, None, math.nan
         if self._observer is not None:
             self._observer.reset()
             self._model = replace(self._model, acceleration=np.zeros(3), angular_acceleration=np.zeros(3))
@@ -476,7 +476,7 @@ class NonlinearMPC:
         return self._qp.solve(*query.steps, *query[:3], query.rest)
 
     def _iterate(self, time: float, measured: Array, nodes: Nodes) -> tuple[Query, Answer, Problem]:
-        """Steps of sequential quadratic programming from the plan kept; the last problem is that of the answer."""
+        """Steps of sequential quadratic programming from the stored plan; the last problem is that of the answer."""
         frames, n = frames_of(nodes.states[:, Q]), self._model.n
         inputs = self._model.shares(nodes.thrusts)
         wanted = nodes.states.copy()
@@ -516,7 +516,7 @@ class NonlinearMPC:
                 moved = max(np.abs(found - x).max(), np.abs(plan - u).max())
                 if moved <= self.settings.tolerance:
                     break
-                # Full Gauss-Newton steps may go to and fro for ever: the share of them that is taken follows from how
+                # Full Gauss-Newton steps may oscillate: the share of them that is taken follows from how
                 # much of the last one each undoes (Aitken's relaxation; Irons and Tuck 1969), and falls for good where
                 # steps have not become shorter for long.
                 step = (plan - u).ravel()

@@ -67,9 +67,9 @@ def _assemble(model: NonlinearModel, Y: Array) -> tuple[Array, Array]:
     if model.rotor_lag is not None:
         rotors = np.arange(N_STATES, model.n)
         A[:, _ROWS[:, None], rotors] = Y[:, :, 6:-N_ROTORS]
-        kept = np.exp(-model.period / model.rotor_lag)
-        A[:, rotors, rotors] = kept
-        B[:, rotors, range(N_ROTORS)] = 1.0 - kept
+        decay = np.exp(-model.period / model.rotor_lag)
+        A[:, rotors, rotors] = decay
+        B[:, rotors, range(N_ROTORS)] = 1.0 - decay
     return A, B
 
 

@@ -263,10 +263,10 @@ def _assemble(
     A[:, 3:N_BODY, 3:] = Y[:, :, : n - 3]
     B[:, P], B[:, 3:N_BODY] = travelled[:, :, inputs], Y[:, :, inputs]
     if model.rotor_lag is not None:
-        rotors, kept = np.arange(N_BODY, n), math.exp(-model.step / model.rotor_lag)
-        A[:, rotors, rotors] = kept
-        B[:, rotors] = (1.0 - kept) * np.eye(N_ROTORS)
-        end[:, N_BODY:] = u + kept * (x[:, N_BODY:] - u)
+        rotors, decay = np.arange(N_BODY, n), math.exp(-model.step / model.rotor_lag)
+        A[:, rotors, rotors] = decay
+        B[:, rotors] = (1.0 - decay) * np.eye(N_ROTORS)
+        end[:, N_BODY:] = u + decay * (x[:, N_BODY:] - u)
     return A, B, end
 
 

@@ -94,7 +94,7 @@ def robust_problem(
 class RobustMPC:
     """One optimum per period; see the module.
 
-    It holds no earlier plan: where nothing is solved, the status says so, with the command in force, for
+    It holds no earlier plan: where nothing is solved, the status reports it, with the command in force, for
     `mpc.fallback.contract.Guarded` to act on.  Objective, bounds and constraints are for the paper's 12 states.
 
     Attributes:
@@ -150,12 +150,12 @@ class RobustMPC:
         self.reset(np.full(N_ROTORS, vehicle.hover_speed))
 
     def reset(self, speeds: Array) -> None:
-        """Start anew after the command u(-1) (4,) [rad/s], with rotors at that speed."""
+        """Restart after the command u(-1) (4,) [rad/s], with rotors at that speed."""
         self._acting = np.array(speeds, float)
         # Rotor speeds and state at the instant from which this period's command acts, the delay after its beginning.
         self._rotors = self._acting.copy()
         self._ahead: Array | None = None
-        self._asked = self._measured = -math.inf
+        self._called_at = self._measured = -math.inf
         self.unanswered: Unanswered | None = None
         if self.settings.linearisation is Linearisation.HOVER:
             self._solver.reset()
@@ -170,7 +170,7 @@ class RobustMPC:
         law = within(previous, RobustMPC)
         if law is not None:
             self._rotors = law._rotors.copy()
-            self._asked, self._measured = law._asked, law._measured
+            self._called_at, self._measured = law._called_at, law._measured
             if self.settings.delay == law.settings.delay:
                 self._ahead = law._ahead
             self._adopt_plan(law)
@@ -211,15 +211,15 @@ class RobustMPC:
         if now.acting is not None:
             self._acting = np.array(now.acting, float)
         rest = self._period - self.settings.delay
-        ahead, before, asked = self._ahead, self._rotors, self._asked
+        ahead, before, called_at = self._ahead, self._rotors, self._called_at
         rotors = spun(self._model, before, self._acting, rest)
         self._rotors = spun(self._model, rotors, self._acting, self.settings.delay)
-        self._ahead, self._asked = None, now.time
+        self._ahead, self._called_at = None, now.time
         if now.phase in GROUNDED:
             return self._stop(now.phase)
         if not ((np.abs(state) <= PLAUSIBLE).all() and (np.abs(reference) <= _PLAUSIBLE).all()):
             return self._refuse(INVALID_DATA)
-        if ahead is None or abs(now.time - asked - self._period) > _SAME_TIME:
+        if ahead is None or abs(now.time - called_at - self._period) > _SAME_TIME:
             self._measured = -math.inf
         span = self._span(now)
         if self._observer is not None and ahead is not None and span <= LONGEST_SPAN and now.phase is Phase.FLYING:

@@ -1,4 +1,4 @@
-"""A predictive safety filter: a wanted command passes where the robust MPC's constraints can still be kept after it.
+"""A predictive safety filter: it passes a wanted command after which the robust MPC's constraints can still hold.
 
 Wabersich and Zeilinger (2021), "A predictive safety filter for learning-based control of constrained nonlinear
 dynamical systems", with the model, the disturbance observer and the tightened bounds of `mpc.robust.controller`.  Once
@@ -11,7 +11,7 @@ stands still there,
 
     V' (A - I) (x(k+N) - x_s) = 0,    V a basis of the row space of [C; C A; ...],
 
-so that holding u_s from then on keeps every bound on states for ever.  The plan of one period, moved on, is then a plan
+so that holding u_s from then on keeps every bound on states forever.  The plan of one period, moved on, is then a plan
 of the next: as far as the disturbances are within the bounds stated for the tightening, the problem stays feasible.
 """
 
@@ -52,10 +52,10 @@ PASSED: Final = 1e-2
 
 
 class SafetyFilter:
-    """A controller that commands what it is asked to, as far as that is safe; see the module.
+    """A controller that commands what is requested, as far as that is safe; see the module.
 
-    Where the constraints cannot be kept, as after a disturbance larger than stated, those on states are softened and
-    the QP is solved once more.  Where that has no answer either, the status says so, for
+    Where the constraints cannot hold, as after a disturbance larger than stated, those on states are softened and
+    the QP is solved once more.  Where that has no answer either, the status reports it, for
     `mpc.fallback.contract.Guarded` to fly the last good plan.
 
     Args:
@@ -94,7 +94,7 @@ class SafetyFilter:
         self.wanted = np.array(speeds, float)
 
     def step(self, now: Moment, state: Array, reference: Array) -> Command:
-        """The nearest command to `wanted` after which the constraints can be kept.
+        """The nearest command to `wanted` after which the constraints can hold.
 
         One that passes as it is, the optimum without constraints, has the status `unconstrained`.
         """

@@ -13,7 +13,7 @@ from quadsim.errors import ParameterError
 from quadsim.state import Array
 
 LONGEST_SPAN: Final = 0.25
-"""Longest time between two measured states [s] for their difference to tell of a disturbance; a sensor of 4 Hz."""
+"""Longest time between two measured states [s] for their difference to show a disturbance; a sensor of 4 Hz."""
 
 
 class Linearisation(StrEnum):
@@ -38,7 +38,7 @@ class RobustSettings:
         observer: tuning of the disturbance observer; None for no offset-free tracking.
         heading: whether the hover model is turned by the yaw.  The weights of x and y are then those forward and to the
             left; where these differ, flights to different headings do.
-        largest_turn: how far the prediction is asked to turn at once [rad], from the present yaw or from one period to
+        largest_turn: how far the prediction may turn at once [rad], from the present yaw or from one period to
             the next; it goes on from there.  Of no effect on the hover model without `heading`.
         move_weight: Q_d (4, 4), of a command's change from one period to the next; None for none.
         linearisation: where the prediction is linearised.

@@ -2,7 +2,7 @@
 
 Let the vehicle differ from its prediction by accelerations w of at most a stated size.  Where the prediction holds an
 estimate of the disturbance, itself within the stated bounds, a disturbance that changes sign is w = 2 times these away
-from it, and that is what is counted then.  Following a plan with the correction -K e at each sample, the error e after
+from it, and that is counted then.  Following a plan with the correction -K e at each sample, the error e after
 i periods is bounded in each output by
 
     r_i = int_0^d |C e^(A_c s) E| w ds + sum_{j=0}^{i-1} int_0^tau |C (A - B K)^j e^(A_c (s + d)) E| w ds,

@@ -108,7 +108,7 @@ SOLVERS: Final = {
 
 
 INVALID_DATA: Final = "invalid_data"
-"""Status of a query with numbers that no back end is asked about."""
+"""Status of a query with numbers that is passed to no back end."""
 
 
 def make_backend(name: str, *, changing: bool = False) -> Backend:
@@ -128,7 +128,7 @@ def make_backend(name: str, *, changing: bool = False) -> Backend:
     return backend
 
 
-class Way(StrEnum):
+class Method(StrEnum):
     """How an optimum was found: see `mpc.exact.shortcut`."""
 
     FREE = "the unconstrained optimum"
@@ -143,7 +143,7 @@ class Answer:
     plan: Array  # (N, nu) inputs [rad/s]; to be used only when the solution's status is accepted
     slacks: Array  # (N, m_s) by how much soft rows are violated
     solution: Solution  # to the QP of the solver's formulation
-    way: Way = Way.WHOLE  # how it was found
+    method: Method = Method.WHOLE  # how it was found
 
 
 class Solver(Protocol):
@@ -181,7 +181,7 @@ class QPSolver:
         self._backend.setup(self.formulation.qp)
 
     def reset(self) -> None:
-        """See `Solver.reset`: back ends that start from their last answer, start from scratch anew."""
+        """See `Solver.reset`: back ends that start from their last answer, restart from scratch."""
         self._backend = make_backend(self.name)
         self._backend.setup(self.formulation.qp)
 

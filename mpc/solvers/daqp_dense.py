@@ -1,6 +1,6 @@
 """DAQP: a dual active-set method that factorises the Hessian once and starts from the last active set.
 
-Where the QP tells which bound is the same one step later in the plan, that set is moved one step earlier: where active
+Where the QP states which bound is the same one step later in the plan, that set is moved one step earlier: where active
 bounds alternate along the plan, it is wrong nearly everywhere as it was.
 
 Arnström, Bemporad and Axehill, A Dual Active-Set Solver for Embedded Quadratic Programming Using Recursive LDL'

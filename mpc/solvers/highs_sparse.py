@@ -32,7 +32,7 @@ LARGEST_VIOLATION: Final = 1e-5  # of any row or box entry by a point that HiGHS
 
 STATUS: Final = {
     highspy.HighsModelStatus.kOptimal: SOLVED,
-    highspy.HighsModelStatus.kNotset: "non_convex",  # said of the model by the QP solver alone
+    highspy.HighsModelStatus.kNotset: "non_convex",  # set by the QP solver alone
     highspy.HighsModelStatus.kSolveError: "numerics",
     highspy.HighsModelStatus.kInfeasible: "primal_infeasible",
     highspy.HighsModelStatus.kUnboundedOrInfeasible: "primal_infeasible",
@@ -100,15 +100,15 @@ class HighsSparse:
 
 @contextlib.contextmanager
 def hushed() -> Iterator[None]:
-    """Send what C writes to stdout nowhere: the QP solver says `error` there, silent or not, when it loses its way."""
+    """Discard what C writes to stdout: the QP solver prints `error` there, silent or not, when it fails."""
     libc = ctypes.CDLL(None)
     libc.fflush(None)
-    kept, nowhere = os.dup(1), os.open(os.devnull, os.O_WRONLY)
+    saved, null = os.dup(1), os.open(os.devnull, os.O_WRONLY)
     try:
-        os.dup2(nowhere, 1)
+        os.dup2(null, 1)
         yield
     finally:
         libc.fflush(None)
-        os.dup2(kept, 1)
-        os.close(kept)
-        os.close(nowhere)
+        os.dup2(saved, 1)
+        os.close(saved)
+        os.close(null)

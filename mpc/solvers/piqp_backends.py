@@ -43,7 +43,7 @@ CHANGING_TOLERANCE: Final = 1e-8
 """Where matrices change; PIQP's own.  A tenth of it takes 3 more of 20 iterations where tilt is at its bound."""
 
 CHANGING_SCALINGS: Final = 3
-"""Passes of PIQP's scaling, which new matrices need anew: its usual ten take 0.2 ms longer, and save nothing."""
+"""Passes of PIQP's scaling, which new matrices need again: its usual ten take 0.2 ms longer, and save nothing."""
 
 
 class _Piqp:
@@ -120,7 +120,7 @@ def solve(solver: Any, vectors: Vectors, **matrices: Matrix) -> Solution:
     """Update the vectors, and matrices where there are others, solve, copy everything out.
 
     PIQP's result arrays are views that the next solve overwrites, and a failed solve leaves a finite x: the
-    status is the only thing to go by.  Sizes are ours to get right, since a wrong one keeps the old data silently.
+    status is the only thing to go by.  Sizes must be right: a wrong one keeps the old data silently.
     One update for all: two would scale the data twice.
     """
     started = clock.perf_counter()

@@ -39,7 +39,7 @@ FAILURES: Final = {"infeasib": "primal_infeasible", "unbounded": "dual_infeasibl
 class QpoasesDense:
     """Back end for dense QPs; see `mpc.qp.Backend`.
 
-    CasADi hands the matrices over with each call; qpOASES then factorises anew, from the active set of the call before.
+    CasADi hands the matrices over with each call; qpOASES then refactorises, from the active set of the call before.
     """
 
     def setup(self, qp: QP) -> None:

@@ -17,12 +17,12 @@ from mpc.staged import Staged
 from quadsim.controller import ACCEPTED
 from quadsim.state import Array
 
-KEPT: Final = 1e-6
+ROUNDING: Final = 1e-6
 """Violation of a half-space [m] that is taken for rounding."""
 NEAR: Final = 1e-2
 """Distance from a half-space [m] within which a plan is taken to touch it."""
 SETTLED: Final = 1e-2
-"""Change of all predicted positions [m] below which planes are not made anew in the same period."""
+"""Change of all predicted positions [m] below which planes are not recomputed in the same period."""
 
 
 class Cleared(NamedTuple):
@@ -64,7 +64,7 @@ class Clearing:
 
         Args:
             time: of its x(k) [s].
-            query: what is asked.
+            query: the state, reference and last input.
             yaw: by which the states' axes x and y are turned from the world's [rad].
             along: (N, 3) positions of the plan that planes are made along [m]; where absent, those of the last optimum,
                 moved on by an instant.
@@ -88,7 +88,7 @@ class Clearing:
         for i in range(self._space.settings.iterations):
             normals, bounds = self._space.half_spaces(t, along)
             room = _room(normals, bounds, planned)
-            if (room >= -KEPT).all() and not (among and i == 0):
+            if (room >= -ROUNDING).all() and not (among and i == 0):
                 break
             answer, states = self._whole(query, normals, bounds, room, turn)
             if answer.solution.status not in ACCEPTED:
@@ -110,7 +110,7 @@ class Clearing:
         return replace(self.problem, constraints=(*self.problem.constraints, added))
 
     def _whole(self, query: Query, normals: Array, bounds: Array, room: Array, turn: Array) -> tuple[Answer, Array]:
-        """The optimum with half-spaces of the world, and its states (N, n); `room` (S, N) tells the tightest."""
+        """The optimum with half-spaces of the world, and its states (N, n); `room` (S, N) gives the tightest."""
         count = self._space.settings.rows
         while True:
             at = np.argsort(room, axis=0, kind="stable")[:count], np.arange(bounds.shape[1])
@@ -119,7 +119,7 @@ class Clearing:
                 return answer, np.empty(0)
             states = _predicted(self.problem, query, answer.plan)
             room = _room(normals, bounds, states[:, self._space.positions] @ turn)
-            violated = room < -KEPT
+            violated = room < -ROUNDING
             violated[at] = False
             if not violated.any():
                 return answer, states

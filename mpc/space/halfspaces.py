@@ -1,11 +1,11 @@
 """Keeping clear of obstacles, and inside corridors and a fence, by half-spaces along the predicted positions.
 
-An obstacle's convex solid is kept clear of at each predicted instant by the plane through its nearest point to where
+An obstacle's convex solid is avoided at each predicted instant by the plane through its nearest point to where
 the last plan was to be then, p_i, at distance d_i and with the outward normal n_i:
 
     n_i . p >= n_i . p_i - d_i + r + m_i,
 
-r the radius of the ball that stands for the vehicle and m_i the margin.  Where p_i is inside, d_i is negative and the
+r the radius of the vehicle's bounding ball and m_i the margin.  Where p_i is inside, d_i is negative and the
 plane is that of the nearest way out.  Behind the plane lies all of the solid, so that what satisfies the half-space
 keeps clear at that instant, wherever p_i was: the restriction is safe, and it is conservative.  A moving obstacle is
 where it will be at that instant.  Corridors and the fence are half-spaces themselves, and exact.
@@ -38,7 +38,7 @@ class Space:
 
     Args:
         shapes: the obstacles and regions.
-        radius: of the ball that stands for the vehicle [m].
+        radius: of the vehicle's bounding ball [m].
         period: from one predicted instant to the next [s].
         horizon: N.
         settings: see `AvoidanceSettings`.
@@ -63,7 +63,7 @@ class Space:
     ) -> None:
         self._largest = largest
         self.settings, self.penalty, self.period, self.positions = settings, penalty, period, list(positions)
-        self._shapes, self._kept = tuple(shapes), radius + settings.margin
+        self._shapes, self._distance = tuple(shapes), radius + settings.margin
         self._margins = np.zeros((horizon, 3)) if margins is None else margins
         self._solids = Solids([shape for shape in self._shapes if isinstance(shape, Obstacle)])
         self._names: list[str] = []
@@ -95,7 +95,7 @@ class Space:
             # Also at the instants just before and after: what is between two of them is then inside as well.
             in_force = (t > region.start - self.period) & (t < region.stop + self.period)
             bounds[at] = np.where(in_force, -upper[:, None], (normals[at] * positions).sum(axis=2) - LOOSE)
-        return normals, bounds + self._kept + (np.abs(normals) * self._margins).sum(axis=2)
+        return normals, bounds + self._distance + (np.abs(normals) * self._margins).sum(axis=2)
 
     def constraint(self, normals: Array, bounds: Array, states: int, *, name: str = "space") -> Constraint:
         """Half-spaces (m, N, 3), (m, N) as rows on so many states."""

@@ -1,4 +1,4 @@
-"""How obstacles, corridors and the fence are kept."""
+"""How obstacles, corridors and the fence are enforced."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from quadsim.fields import NonNegative
 class AvoidanceSettings:
     """How closely."""
 
-    margin: Annotated[NonNegative, doc("[m] kept besides: planes change from instant to instant")] = 0.05
+    margin: Annotated[NonNegative, doc("[m] added: planes change from instant to instant")] = 0.05
     rows: Annotated[
         int,
         Ge(1),

@@ -97,7 +97,7 @@ TERMS: Final[dict[str, Signal]] = {
 SUM: Final = "sum"
 """The signal of a limit on a sum of terms."""
 CLEARANCE: Final = "clearance"
-"""The signal of a limit in space: how far the ball that stands for the vehicle stays clear [m]."""
+"""The signal of a limit in space: how far the vehicle's bounding ball stays clear [m]."""
 
 
 def sum_signal(terms: tuple[tuple[str, float], ...]) -> Signal:
@@ -202,7 +202,7 @@ class SpaceLimit(Limit):
 
     Attributes:
         shape: the obstacle or region.
-        radius: of the ball that stands for the vehicle [m].
+        radius: of the vehicle's bounding ball [m].
     """
 
     signal: str = CLEARANCE

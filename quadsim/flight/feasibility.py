@@ -1,9 +1,9 @@
-"""What a course asks of a vehicle, before it is flown: differential flatness.
+"""What a course requires of a vehicle, before it is flown: differential flatness.
 
 A quadrotor's attitude, rates, torques and rotor speeds follow from where it shall be, its yaw, and their derivatives
 (Mellinger & Kumar 2011, Sec. III).  Derivatives are central differences at the control period: of the samples that a
-controller is given, nothing in between is known to it, and a corner asks for what turns it within a period.  Three
-places are left out, where differences would be numbers without a meaning:
+controller is given, nothing in between is known to it, and a corner requires a turn within one period.  Three
+cases are left out, where differences would be meaningless:
 
 - around a jump of the course itself no acceleration is counted (hover is taken);
 - around a kink, where the velocity or its derivative may jump, no torque is counted;
@@ -167,7 +167,7 @@ def assess(
         bounds: lower and upper bound by name, a state of `quadsim.state` in SI, `speed` [rad/s] of the rotors or `slew`
             [rad/s per period].
         tightened: what tightening leaves of them at the end of the horizon, of states; looked at where the bounds
-            themselves are kept.
+            themselves hold.
         jumps: times [s] at which the course jumps.
     """
     bounds = bounds or {}
@@ -246,11 +246,11 @@ def _sentence(
     allowed = f" (bound {min(tilts):.4g} deg)" if tilts else ""
     times = ", ".join(f"{time:g}" for time in jumps[:4]) + (", ..." if len(jumps) > 4 else "")
     turned = f", a yaw of {round(peaks['yaw'], 1):g} deg" if peaks["yaw"] > 0.5 else ""
-    subject = f"The course steps (at t = {times} s); what is left asks" if jumps else "The course asks"
-    asked = (
-        f"{subject} for up to {round(peaks['tilt'], 2):g} deg of tilt{allowed}, "
+    subject = f"The course steps (at t = {times} s); the rest requires" if jumps else "The course requires"
+    sentence = (
+        f"{subject} up to {round(peaks['tilt'], 2):g} deg of tilt{allowed}, "
         f"{round(peaks['velocity'], 2):g} m/s{turned}, "
         f"and rotor speeds of {peaks['rotor_min']:.4g} to {peaks['rotor_max']:.4g} rad/s "
         f"(limits {vehicle.speed_min:.4g} and {vehicle.speed_max:.4g} rad/s)."
     )
-    return f"{asked} It cannot be followed exactly: {'; '.join(problems)}." if problems else asked
+    return f"{sentence} It cannot be followed exactly: {'; '.join(problems)}." if problems else sentence

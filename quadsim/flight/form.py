@@ -1,4 +1,4 @@
-"""The form of data that a file holds: whoever wrote it, what is read on from here has the types that it says.
+"""The form of data that a file holds: whatever wrote it, what is read has the declared types.
 
 A form is a type, a tuple of forms of which one has to fit, a list of one form for each entry, a mapping for a table
 with these fields at least, or `Each` for a table of any names.  A number is finite; true and false are none.

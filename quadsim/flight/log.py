@@ -133,8 +133,8 @@ class PlantLog:
 
     def every(self, stride: int) -> PlantLog:
         """Each `stride`-th row, from the first on."""
-        kept: dict[str, Any] = {name: None if rows is None else rows[::stride] for name, rows in vars(self).items()}
-        return PlantLog(**kept)
+        thinned: dict[str, Any] = {name: None if rows is None else rows[::stride] for name, rows in vars(self).items()}
+        return PlantLog(**thinned)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,4 +1,4 @@
-"""When a flight is lost: how far the vehicle may tilt, stray, sink and race before nobody would call it flight."""
+"""When a flight is lost: the largest tilt, deviation, sink and speed that still count as flight."""
 
 from __future__ import annotations
 

@@ -19,8 +19,8 @@ SETTLING_BAND: Final = 0.05
 """Half width of the band an output has to stay in to be settled, as a share of the step."""
 
 UNRECOVERED: Final = 1.0
-"""Time that a flight has to be in fallback at its end for that to count as for good [s]: the longest that one shifted
-plan is held, unless a scenario says otherwise."""
+"""Time that a flight has to be in fallback at its end for that to count as permanent [s]: the longest that one shifted
+plan is held, unless a scenario sets another."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -147,7 +147,7 @@ def controller(log: ControlLog, timing: TimingLog, deadline_ms: float) -> dict[s
 
 
 def unrecovered(log: ControlLog) -> int:
-    """Periods in fallback up to the flight's end, from which it never recovered; 0 where they last too short to tell.
+    """Periods in fallback up to the flight's end, from which it never recovered; 0 where they are too short to count.
 
     They count from `UNRECOVERED` on, or where the whole flight was in fallback.
     """
@@ -209,7 +209,7 @@ def flight_numbers(log: FlightLog, deadline_ms: float, course: Sequence[CourseSt
     Args:
         log: the flight.
         deadline_ms: the control period [ms].
-        course: the steps that `tracking.settling` tells of.
+        course: the steps that `tracking.settling` is about.
     """
     if not log.control.t.size:
         return {"tracking": {}, "control": {}, "controller": {}}
@@ -224,7 +224,7 @@ def flight_numbers(log: FlightLog, deadline_ms: float, course: Sequence[CourseSt
 def _spread(distances: Array) -> dict[str, float]:
     """Mean, root mean square and maximum of distances (K,).
 
-    Papers often print the mean of the distance as RMSE; the two are told apart by their names here.
+    Papers often print the mean of the distance as RMSE; here the two have different names.
     """
     rms = math.sqrt(float(np.mean(np.square(distances))))
     return {"mean": float(distances.mean()), "rms": rms, "max": float(distances.max())}

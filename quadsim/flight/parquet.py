@@ -110,7 +110,7 @@ def log_tables(log: FlightLog, *, plant_stride: int = 1, metadata: Mapping[str, 
 def write_log(directory: Path, log: FlightLog, *, plant_stride: int, metadata: Mapping[str, str]) -> None:
     """Write a flight's Parquet files into an existing directory.
 
-    Every `plant_stride`-th physics step is a row of `plant.parquet`; `metadata`, texts without a clock reading, is kept
+    Every `plant_stride`-th physics step is a row of `plant.parquet`; `metadata`, texts without clock times, is stored
     in each file's schema.
     """
     for name, table in log_tables(log, plant_stride=plant_stride, metadata=metadata).items():
@@ -144,7 +144,7 @@ def _write(table: pa.Table, path: Path) -> None:
 
 
 def _read(path: Path, read: Callable[[BinaryIO], Any] = pq.read_table) -> Any:
-    if not path.is_file():  # a pipe would be read for ever
+    if not path.is_file():  # reading a pipe would not end
         raise FileError(path, "is not a readable Parquet file (it is missing or no file)")
     try:
         with path.open("rb") as file:

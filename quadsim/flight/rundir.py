@@ -165,7 +165,7 @@ def adding(directory: Path, name: str) -> Iterator[Path]:
 def seal(directory: Path, summary: Mapping[str, Any]) -> None:
     """Write the summary of a run whose files are all there, with their hashes, and its digest into `timing.parquet`.
 
-    So the summary says when another file is changed, and `timing.parquet` when the summary is.
+    So the summary shows a change of another file, and `timing.parquet` one of the summary.
 
     Raises:
         OutputError: they cannot be written.

@@ -129,14 +129,14 @@ FORM: Final = {
     "files": Each(str),
 }
 _TOGETHER: Final = {"worst_margin": ("worst_time", "peak_plant"), "worst_margin_sampled": ("peak_sampled",)}
-"""Of a constraint: what is there wherever a margin is."""
+"""Of a constraint: present wherever a margin is."""
 
 
 def read_summary(directory: Path) -> dict[str, Any]:
     """`summary.json` of a run directory, with all of its form.
 
     Raises:
-        FileError: there is none, it is not one of ours, it contradicts itself, or a link leads out of the directory.
+        FileError: there is none, quadsim did not write it, it contradicts itself, or a link leads out of the directory.
     """
     require_inside(directory)
     path = directory / SUMMARY_FILE
@@ -153,7 +153,7 @@ def read_summary(directory: Path) -> dict[str, Any]:
 
 
 def contradictions(summary: Mapping[str, Any]) -> Iterator[str]:
-    """What a summary says of itself that cannot be."""
+    """What a summary states that is inconsistent."""
     if (summary["status"] == "completed") != (summary["reason"] is None):
         yield f"status is {summary['status']!r:.40}, and reason is {summary['reason']!r:.80}"
     names = [entry["name"] for entry in summary["constraints"]]

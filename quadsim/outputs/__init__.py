@@ -5,7 +5,7 @@ known by its content: a directory of quadsim's has a manifest, `.quadsim.json`, 
 file by itself ends in the SHA-256 of all that stands before.  That is looked at before work begins, and again when the
 earlier one has been moved out of the way, in the very step in which the new one takes its name: if there is anything
 else by then, it is moved back.  What is removed is unlinked file by file, each only if its content is the one listed.
-A staging directory says whose it is; those of processes that were killed go with the next output in the same folder.
+A staging directory names its owner; those of killed processes are removed with the next output in the same folder.
 """
 
 from __future__ import annotations

@@ -120,7 +120,7 @@ class Growing:
 
 @contextlib.contextmanager
 def growing(directory: Path | str, kind: str) -> Iterator[Growing]:
-    """Add files to a directory of quadsim's, or to a new or empty one; one process at a time, and whoever dies lets go.
+    """Add files to a directory of quadsim's, or to a new or empty one; one process at a time, by a lock.
 
     Raises:
         OutputError: it cannot be written, another process writes there, or it is of another kind, or not quadsim's.

@@ -24,7 +24,7 @@ _SEALS: Final = {
     ".png": (b"\n", b"\n"),
     ".gif": (b"\n", b"\n"),
 }
-"""What stands around a file's seal at its end, where readers of its format pass over it."""
+"""What is around a file's seal at its end, where readers of its format pass over it."""
 _LONGEST_SEAL: Final = 200
 
 
@@ -129,7 +129,7 @@ def _is_inside(name: str) -> bool:
 
 
 def is_manifest(path: Path) -> bool:
-    """Whether a file says that it is a manifest, whatever its name."""
+    """Whether a file's content is a manifest, whatever its name."""
     with path.open("rb") as file:
         return file.read(len(_START)) == _START
 
@@ -192,7 +192,7 @@ def seal(path: Path, form: str) -> None:
 
 
 def is_sealed(path: Path, form: str | None = None) -> bool:
-    """Whether this is a file that was sealed, in that form or any, and that nobody changed since."""
+    """Whether this is a file that was sealed, in that form or any, and not changed since."""
     if not is_file(path):
         return False
     size = path.stat().st_size

@@ -87,7 +87,7 @@ def output_errors(path: Path) -> Iterator[None]:
 
 
 def as_output_error(path: Path, error: OSError) -> OutputError:
-    """The system's error as one of ours, which it may be already."""
+    """The system's error as an `OutputError`, which it may be already."""
     return error if isinstance(error, OutputError) else OutputError(path, error.strerror or str(error))
 
 

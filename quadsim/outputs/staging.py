@@ -43,7 +43,7 @@ _HALF_MADE: Final = (
     "*.c", "*.h", "*.ld", "Makefile", "README.md", "LICENSE",
 )  # fmt: skip
 """Names of the files that we make; anything else in the staging directory of a process that was killed stays."""
-_SLOT, _ASIDE, _NAME = "swap-", "aside", "name"
+_SLOT, _PREVIOUS, _NAME = "swap-", "previous", "name"
 """In a staging directory: what is replaced, each in a slot; where it takes two steps, with the name that it had."""
 _NO_REPLACE, _EXCHANGE = 1, 2
 _CURRENT_DIRECTORY: Final = -100
@@ -68,7 +68,7 @@ class Staging:
 
     @property
     def owner(self) -> Path:
-        """Says whose it is; locked as long as that process lives."""
+        """Names the owner; locked as long as that process lives."""
         return self.path / "owner.json"
 
     def put(self, new: Path, target: Path, problem: Callable[[Path], str | None]) -> None:
@@ -98,23 +98,23 @@ class Staging:
             _refuse(target, problem(slot))
         except BaseException:  # also where it cannot be read, or by Ctrl-C
             self._exchange(slot, target)
-            raise  # somebody may have saved something in the new one meanwhile: `dissolve` takes only what is quadsim's
-        with contextlib.suppress(OSError):  # the new one stands; what cannot be removed `dissolve` tells
+            raise  # the new one may hold a user's files by now: `dissolve` takes only what is quadsim's
+        with contextlib.suppress(OSError):  # the new one is in place; `dissolve` reports what cannot be removed
             slot.unlink() if is_file(slot) else remove_listed(slot)
 
     def _exchange(self, slot: Path, target: Path) -> None:
         """Swap two names; in one step where the system can."""
         if _renameat2(slot, target, _EXCHANGE):
             return
-        aside = slot.with_name(_ASIDE)
+        previous = slot.with_name(_PREVIOUS)
         slot.with_name(_NAME).write_bytes(os.fsencode(os.path.relpath(target, self.path.parent)))
-        target.rename(aside)
+        target.rename(previous)
         try:
             _rename(slot, target)
         except OSError:
-            _rename(aside, target)  # or it stays where it is, where somebody has its name by now
+            _rename(previous, target)  # or it stays, where its name is taken by now
             raise
-        aside.rename(slot)
+        previous.rename(slot)
         slot.with_name(_NAME).unlink()
 
     def close(self) -> None:
@@ -185,7 +185,7 @@ def _sign(staging: Staging) -> int:
 
 
 def _identity(pid: int) -> dict[str, Any]:
-    """What tells a process from every other: its number, when it started, since which start of which machine."""
+    """What identifies a process: its number, when it started, since which start of which machine."""
     started = boot = ""
     with contextlib.suppress(OSError, IndexError):
         started = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8").rpartition(")")[2].split()[19]
@@ -211,7 +211,7 @@ def _is_abandoned(staging: Staging) -> bool:
     try:
         owner = json.loads(staging.owner.read_bytes())
         now, state = _identity(int(owner["pid"])), staging.path.lstat()
-        safe = state.st_uid == os.geteuid() and not state.st_mode & 0o022  # nobody else moves things in it
+        safe = state.st_uid == os.geteuid() and not state.st_mode & 0o022  # no one else can move things in it
         ours = safe and owner["inode"] == state.st_ino and owner["host"] == now["host"]
         alive = owner["boot"] == now["boot"] and owner["started"] == now["started"]
     except (ValueError, TypeError, LookupError, OverflowError, RecursionError):
@@ -249,13 +249,13 @@ def _remove_own(path: Path, *, beside: Path) -> None:
 
 
 def _restore(slot: Path, folder: Path) -> None:
-    """Give what was moved aside its name again, where a process died in the midst of two steps."""
+    """Rename back what was moved, where a process died between two steps."""
     name = slot / _NAME
     if not is_file(name):
         return
     target = Path(os.fsdecode(name.read_bytes()))
-    if os.path.lexists(slot / _ASIDE) and not target.is_absolute() and ".." not in target.parts:
-        _rename(slot / _ASIDE, folder / target)  # refused where something has it by now
+    if os.path.lexists(slot / _PREVIOUS) and not target.is_absolute() and ".." not in target.parts:
+        _rename(slot / _PREVIOUS, folder / target)  # refused where something has it by now
     name.unlink()
 
 

@@ -118,7 +118,7 @@ def fallback_sentence(periods: int) -> str:
 
 
 def failure_sentences(summary: Summary) -> list[str]:
-    """What kept the controller from its optimum: fallback for good, and why the first QP without an answer had none."""
+    """What prevented the optimum: fallback for good, and why the first QP without an answer had none."""
     periods, found = summary["controller"].get("unrecovered"), summary.get("diagnosis")
     sentences = [fallback_sentence(periods)] if periods else []
     return sentences + ([] if found is None else [found["sentence"], *filter(None, [found["advice"]])])
@@ -175,7 +175,7 @@ def format_bounds(entry: Summary, unit: str = "") -> str:
 
 
 def format_excess(entry: Summary) -> str:
-    """How far a constraint was exceeded; says so where that was at the samples alone, in what was commanded."""
+    """How far a constraint was exceeded; marked where that was at the samples alone, in what was commanded."""
     at_samples = entry["worst_margin"] >= -entry["tolerance"]
     margin = entry["worst_margin_sampled"] if at_samples else entry["worst_margin"]
     return f"by {format_number(-margin)} {entry['unit']}{' at the samples' if at_samples else ''}"
@@ -330,9 +330,9 @@ _FLIGHT: Final[tuple[_Line, ...]] = (
 )
 _COURSE: Final[tuple[_Line, ...]] = (
     ("largest tilt required", "deg", _number("course", "tilt")),
-    ("highest speed asked for", "m/s", _number("course", "velocity")),
-    ("lowest rotor speed asked for", "rad/s", _number("course", "rotor_min")),
-    ("highest rotor speed asked for", "rad/s", _number("course", "rotor_max")),
+    ("highest speed required", "m/s", _number("course", "velocity")),
+    ("lowest rotor speed required", "rad/s", _number("course", "rotor_min")),
+    ("highest rotor speed required", "rad/s", _number("course", "rotor_max")),
     ("jumps", "", _listed("jumps", "at {:g} s", Mark.NONE)),
     ("beyond the bounds", "", _listed("problems", "{}", Mark.WARN)),
 )

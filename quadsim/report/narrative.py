@@ -81,8 +81,8 @@ def condition_sentences(named: _Named) -> Iterator[str]:
 
 def event_sentences(events: Sequence[Summary]) -> list[str]:
     """What happened when, the first of them where there are many."""
-    said = [f"{event['text']} at {format_number(event['time'])} s" for event in events[:_MOST_EVENTS]]
-    return said + ([f"{len(events) - _MOST_EVENTS} more"] if len(events) > _MOST_EVENTS else [])
+    sentences = [f"{event['text']} at {format_number(event['time'])} s" for event in events[:_MOST_EVENTS]]
+    return sentences + ([f"{len(events) - _MOST_EVENTS} more"] if len(events) > _MOST_EVENTS else [])
 
 
 def _ground_sentences(name: str, summary: Summary) -> Iterator[str]:

@@ -1,4 +1,4 @@
-"""What stands in the scene of a flight: obstacles and regions, as reports draw them."""
+"""The scene of a flight: obstacles and regions, as reports draw them."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def region_edges(run: Run) -> Iterator[tuple[SpaceLimit, Array]]:
 
 def outlines(obstacle: Obstacle, t: float, z: float, radius: float) -> Iterator[tuple[Array, bool]]:
     """From above, each solid's outline (n, 2) [m] at a time, and whether it is as high as a ball of a radius at z."""
-    place = obstacle.places(np.array([t]))[0]
+    place = obstacle.positions(np.array([t]))[0]
     for solid in obstacle.solids:
         outline = footprint(solid, -np.inf, np.inf)
         assert outline is not None

@@ -31,14 +31,14 @@ _IDLE: Final = (mujoco.mjtDisableBit.mjDSBL_SPRING, mujoco.mjtDisableBit.mjDSBL_
 _CONTACT: Final = (mujoco.mjtDisableBit.mjDSBL_CONSTRAINT, mujoco.mjtDisableBit.mjDSBL_CONTACT)
 """Stages that only a body which may meet the ground needs."""
 _STIFFNESS: Final = (0.005, 1.0)
-"""Time constant [s] and damping ratio of a contact (MuJoCo's solref); five steps, where MuJoCo asks for two or more."""
+"""Time constant [s] and damping ratio of a contact (MuJoCo's solref); five steps, where MuJoCo requires two or more."""
 _FRICTION: Final = (0.8, 0.005, 0.0001)
 """Sliding [-], torsional and rolling [m] friction between rubber feet and a hard floor; the first is a textbook value,
 the others MuJoCo's own."""
 _MEETS: Final = 1
 """The bit of contype and conaffinity by which floor and airframe meet."""
 _MEETS_OBSTACLES: Final = 2
-"""The bit of contype and conaffinity by which obstacles and the ball that stands for the vehicle meet."""
+"""The bit of contype and conaffinity by which obstacles and the vehicle's bounding ball meet."""
 OBSTACLE_COLOUR: Final = (0.72, 0.36, 0.28, 1.0)
 _RIM: Final = 32
 """Points that stand for the rim of a rotor disc: its lowest point is missed by half a percent of its radius at most."""
@@ -87,7 +87,7 @@ def compile_model(
         vehicle: the numbers.
         timestep: physics step [s].
         limit_speeds: whether thrusts saturate at the vehicle's rotor speed range; else any thrust >= 0 acts.
-        visuals: whether to keep what is there to be looked at and read (geoms, lights, cameras, sensors), fitted to the
+        visuals: whether to keep what only shows or measures (geoms, lights, cameras, sensors), fitted to the
             vehicle's arms.  None of it moves the vehicle: without it every state is the same to the last bit, in half
             the time.
         contact: whether feet and hull meet the floor.
@@ -97,7 +97,7 @@ def compile_model(
             the ellipsoid's added-mass terms: a few grams of air, and a torque where it flies aslant (Munk's moment),
             which a vehicle of some 200 g feels at 5 m/s.
         air_density: rho [kg/m^3].
-        obstacles: what the ball that stands for the vehicle meets; those that move are mocap bodies of their names.
+        obstacles: what the vehicle's bounding ball meets; those that move are mocap bodies of their names.
     """
     spec = mujoco.MjSpec.from_file(str(models_dir() / "quadrotor.xml"))
     spec.option.timestep = timestep

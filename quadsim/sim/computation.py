@@ -54,7 +54,7 @@ class Computation(ComputationTime):
     processor is, and the wait for the end of a stall.  A command that comes after the next period's begin has missed
     its deadline and is dropped.  What acts until one comes is the command before it or, with `plan`, the next step of
     the last plan that came in time: where commands are due `delay` after their measurement, the actuators' side has
-    that plan and goes on by it.
+    that plan and continues it.
 
     Attributes:
         stalls: when the computer answers nothing.

@@ -165,7 +165,7 @@ class ClosedLoop:
                 crashed; none where absent.
             motion: of the reference from t_0 on, for controllers that use it; absent where only positions are known.
             quaternions: whether attitude and body rates are logged beside Euler angles and their rates.
-            recorded: whether all periods are kept, for `log`: some 10 kB each.
+            recorded: whether all periods are stored, for `log`: some 10 kB each.
         """
         plant.reset(initial_state, initial_speeds)
         controller.reset(initial_speeds)
@@ -219,7 +219,7 @@ class ClosedLoop:
     def switch(self, controller: Controller) -> None:
         """Let another controller fly from the period that starts now on.
 
-        It is reset, and then told of the one before it where it has a method `adopt(previous)`: an observer, a plan
+        It is reset, and then given the one before it where it has a method `adopt(previous)`: an observer, a plan
         and the state of a fallback go on by it.
 
         Raises:
@@ -255,7 +255,7 @@ class ClosedLoop:
         """Fly one control period.
 
         Args:
-            command: held instead of the controller's answer, which is not asked then.
+            command: held instead of the controller's answer, which is not called then.
 
         Raises:
             FlightError: the flight has ended in this period, which is not part of it.
@@ -283,10 +283,10 @@ class ClosedLoop:
         """All periods flown so far, with plant rows at the physics rate.
 
         Raises:
-            InputError: they were not kept.
+            InputError: they were not recorded.
         """
         if self._samples is None:
-            raise InputError("no period of this flight was kept: it was begun with recorded=False")
+            raise InputError("no period of this flight was recorded: it was begun with recorded=False")
         samples = self._samples
         control = _control_log(samples, self._initial_speeds, self.period)
         plant_log = _plant_log(samples, self._start, self._initial_speeds, self._yaw, self._plant.timestep)
@@ -455,7 +455,7 @@ def one_period(sample: Sample, timestep: float) -> FlightLog:
 
 
 def _hold(plant: Plant, inner: InnerLoop | None, speeds: Array, steps: int) -> Iterator[tuple[Segment, Array]]:
-    """Advance under a command: segments of flight, each with the rotor speeds (4,) asked for during it [rad/s].
+    """Advance under a command: segments of flight, each with the rotor speeds (4,) commanded during it [rad/s].
 
     Raises:
         ParameterError: the inner loop's period is not a whole number of physics steps.
@@ -465,8 +465,8 @@ def _hold(plant: Plant, inner: InnerLoop | None, speeds: Array, steps: int) -> I
         return
     each = inner_steps(inner.rate, plant.timestep)
     for first in range(0, steps, each):
-        asked = inner.speeds(plant.time, speeds, plant.physics[_BODY_RATES], plant.speeds)
-        yield plant.advance(asked, min(each, steps - first)), plant.applied(asked)
+        commanded = inner.speeds(plant.time, speeds, plant.physics[_BODY_RATES], plant.speeds)
+        yield plant.advance(commanded, min(each, steps - first)), plant.applied(commanded)
 
 
 def _control_log(samples: list[Sample], initial_speeds: Array, period: float) -> ControlLog:

@@ -118,7 +118,7 @@ class Navigation:
     def advance(self, physics: Array, commands: Array, *, standing: bool = False) -> None:
         """Take note of a segment of flight: (M, 14) true states after each physics step, (M, 4) rotor speeds [rad/s].
 
-        `standing` is what a land detector says of the feet when the segment began.
+        `standing` is the land detector's state of the feet when the segment began.
         """
         if not len(physics):
             return
@@ -163,7 +163,7 @@ class Navigation:
             self._in_flight += sampler.sample(physics, first)
 
     def _arrived(self) -> list[Sample]:
-        """The samples that have arrived since last asked, the oldest first; the rest stay on their way."""
+        """The samples that have arrived since the last call, the oldest first; the rest stay on their way."""
         arrived = [sample for sample in self._in_flight if sample.arrival <= self._step]
         self._in_flight = [sample for sample in self._in_flight if sample.arrival > self._step]
         return sorted(arrived, key=attrgetter("taken"))

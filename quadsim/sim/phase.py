@@ -13,8 +13,8 @@ from quadsim.flight.ground import AIRBORNE, TOUCH, Outline, clearance
 from quadsim.space import Obstacle, Solids
 from quadsim.state import INDEX, POSITION, REFERENCE_NAMES, Array, tilt
 
-ASKED_RISE: Final = 0.05
-"""How far above the resting height a reference has to rise to ask for flight [m]."""
+TAKEOFF_RISE: Final = 0.05
+"""How far above the resting height a reference has to rise to require flight [m]."""
 REST: Final = 0.2
 """How long the feet have to touch the ground without a break for the vehicle to have landed [s]."""
 CAPSIZED: Final = 60.0
@@ -22,20 +22,20 @@ CAPSIZED: Final = 60.0
 
 
 class PhaseMonitor:
-    """Tells, once per control period, whether the vehicle stands, is about to take off, flies or has crashed.
+    """Determines, once per control period, whether the vehicle stands, is about to take off, flies or has crashed.
 
     - The first state decides: `landed` up to a clearance of `AIRBORNE`, else `flying`.
-    - On the ground it is `armed` while the previewed reference rises more than `ASKED_RISE` above the resting height,
+    - On the ground it is `armed` while the previewed reference rises more than `TAKEOFF_RISE` above the resting height,
       else `landed`; from `armed` it is `flying` as soon as the clearance exceeds `AIRBORNE`.
     - From `flying` it is `landed` once the feet have touched for `REST` and the whole preview stays on the ground.
-    - Whatever it was, it has `crashed` for good when anything but the feet touches the ground, or when the feet do with
-      the vehicle tilted beyond `CAPSIZED`, or when the ball that stands for the vehicle touches an obstacle.
+    - From any phase, it has `crashed` for good when anything but the feet touches the ground, or when the feet do with
+      the vehicle tilted beyond `CAPSIZED`, or when the vehicle's bounding ball touches an obstacle.
 
     Args:
         outline: what may touch the ground, and where that is; None where there is no ground.
         period: the control period [s].
         obstacles: what must not be touched.
-        radius: of the ball that stands for the vehicle [m].
+        radius: of the vehicle's bounding ball [m].
     """
 
     def __init__(
@@ -45,7 +45,7 @@ class PhaseMonitor:
         if outline is None:
             self.reset()
             return
-        self._asking = outline.floor + outline.foot_radius - float(outline.feet[:, 2].min()) + ASKED_RISE
+        self._takeoff_height = outline.floor + outline.foot_radius - float(outline.feet[:, 2].min()) + TAKEOFF_RISE
         self._reach = float(np.linalg.norm(outline.hull, axis=1).max()) + TOUCH  # higher up nothing can touch
         self._periods_of_rest = math.ceil(REST / period - 1e-9)
         self.reset()
@@ -69,18 +69,18 @@ class PhaseMonitor:
             return self._phase or Phase.FLYING
         gap = float(clearance(states[-1:], self._outline.feet, self._outline.foot_radius, self._outline.floor)[0])
         self._touched = self._touched + 1 if gap <= TOUCH else 0
-        asked = bool(preview[:, REFERENCE_NAMES.index("z")].max() > self._asking)
+        wanted = bool(preview[:, REFERENCE_NAMES.index("z")].max() > self._takeoff_height)
         if self._phase is None:
             self._phase = Phase.FLYING if gap > AIRBORNE else Phase.LANDED
         if self._crashed(self._outline, states):
             self._phase = Phase.CRASHED
         elif self._phase is Phase.FLYING:
-            if self._touched >= self._periods_of_rest and not asked:
+            if self._touched >= self._periods_of_rest and not wanted:
                 self._phase = Phase.LANDED
         elif self._phase is Phase.ARMED and gap > AIRBORNE:
             self._phase = Phase.FLYING
         elif self._phase is not Phase.CRASHED:
-            self._phase = Phase.ARMED if asked else Phase.LANDED
+            self._phase = Phase.ARMED if wanted else Phase.LANDED
         return self._phase
 
     def _touches_obstacle(self, t: Array, states: Array) -> bool:

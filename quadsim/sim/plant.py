@@ -63,7 +63,7 @@ _NUMERICAL_WARNINGS: Final = (
     mujoco.mjtWarning.mjWARN_BADCTRL,
 )
 _CALM: Final = Effects()
-_AS_THE_FILE_SAYS: Final = Load()
+_AS_IN_THE_FILE: Final = Load()
 
 
 class Plant:
@@ -76,7 +76,7 @@ class Plant:
     order).  Use as a context manager; it owns native memory.
 
     Attributes:
-        vehicle: what flies, as its file says.
+        vehicle: what flies, as in its file.
         timestep: physics step [s].
         effects: what acts on it, resolved; see `quadsim.sim.effects.Effects.resolved`.
         model: the compiled model, not to be changed.
@@ -99,8 +99,8 @@ class Plant:
         self.vehicle = vehicle
         self.timestep = timestep
         self.effects = effects
-        self._load, air = effects.load or _AS_THE_FILE_SAYS, effects.air or Air()
-        self._reweighed = self._load != _AS_THE_FILE_SAYS or any(isinstance(each, LOADING) for each in changes)
+        self._load, air = effects.load or _AS_IN_THE_FILE, effects.air or Air()
+        self._reweighed = self._load != _AS_IN_THE_FILE or any(isinstance(each, LOADING) for each in changes)
         self.model = compile_model(
             vehicle,
             timestep=timestep,
@@ -226,7 +226,7 @@ class Plant:
         return physics[4:8].copy(), physics[11:14].copy()
 
     def applied(self, speeds: Array) -> Array:
-        """The rotor speeds (4,) [rad/s] that a command asks for: it saturates at what rotors can do, and at zero."""
+        """The rotor speeds (4,) [rad/s] that a command demands: it saturates at what rotors can do, and at zero."""
         return np.clip(speeds, *self._speed_range)
 
     def advance(self, speeds: Array, steps: int) -> Segment:
@@ -257,7 +257,7 @@ class Plant:
         return not (weighing or (not self._by_step and any(isinstance(each, PushChange) for each in changes)))
 
     def reschedule(self, changes: Sequence[Change]) -> None:
-        """Let from now on happen what these say, of kinds that it `allows`; what is past of them is left out."""
+        """Schedule these changes, of kinds that it `allows`; past ones are left out."""
         self._pending = deque(entry for entry in self._scheduled(changes) if entry[0] >= self._step)
 
     def _scheduled(self, changes: Sequence[Change]) -> list[tuple[int, Change]]:
@@ -349,7 +349,7 @@ class Plant:
         row = trajectory.shape[1]
         if self._moving:
             times = self.time + self.timestep * np.arange(steps, dtype=np.float64)
-            places = np.stack([obstacle.places(times) for obstacle in self._moving], axis=1)
+            positions = np.stack([obstacle.positions(times) for obstacle in self._moving], axis=1)
         for i, (thrust, rotors, breeze) in enumerate(zip(thrusts.tolist(), of_rotors, air.tolist(), strict=True)):
             velocity = qvel.tolist()
             acting: Sequence[float] = forces(qpos.tolist(), velocity, velocity_before, thrust, rotors, breeze)
@@ -364,7 +364,7 @@ class Plant:
             if moving_air:
                 _THREE.pack_into(air_of_model, 0, *breeze)
             if self._moving:
-                data.mocap_pos[self._mocaps] = places[i]
+                data.mocap_pos[self._mocaps] = positions[i]
             step(model, data)
             first = row * i
             states[first + 1 : first + 8], states[first + 8 : first + row] = qpos, qvel
@@ -402,7 +402,7 @@ class Plant:
         return self._forces.of_rotors(speeds * there, slopes * there).tolist()
 
     def _own_wrench(self, since: float, motion: Sequence[float]) -> list[float]:
-        """The sum of the forces of one's own, world [N] and body frame [N m], so long [s] after the hold's begin.
+        """The sum of the user-defined forces, world [N] and body frame [N m], so long [s] after the hold's begin.
 
         `motion` (13,) is MuJoCo's state then, but for the time.
 

@@ -95,9 +95,9 @@ class StepCandidate:
             self.answers.setdefault(self._period, (self._asked.command, self._solver.last))
 
     def ways(self, periods: Sequence[int]) -> np.ndarray[tuple[int], np.dtype[np.object_]]:
-        """The `mpc.solvers.Way` in which each period was answered."""
+        """The `mpc.solvers.Method` in which each period was answered."""
         self.keep()
-        return np.array([self.answers[period][1].way for period in periods], dtype=object)
+        return np.array([self.answers[period][1].method for period in periods], dtype=object)
 
     def statuses(self, periods: Sequence[int]) -> tuple[str, ...]:
         """What each period was answered."""

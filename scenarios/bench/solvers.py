@@ -11,7 +11,7 @@ from typing import Final
 import numpy as np
 
 from mpc.ocp import Problem
-from mpc.solvers import SOLVERS, Way
+from mpc.solvers import SOLVERS, Method
 from mpc.unconstrained import UnconstrainedMPC
 from quadsim import outputs
 from quadsim.controller import ACCEPTED
@@ -221,7 +221,7 @@ def _growth(
     Steps by the whole QP and by either shortcut are counted apart: their shares change with N.  At the flight's own N
     they are those of the candidates, `own`, which are not timed again.
     """
-    grown: dict[tuple[Entry, Way], list[tuple[int, float, float]]] = {}
+    grown: dict[tuple[Entry, Method], list[tuple[int, float, float]]] = {}
     failures: dict[str, dict[int, int]] = {}
     dropped: dict[str, str] = {}
     periods = [period for segment in asked for period in segment]
@@ -243,7 +243,7 @@ def _growth(
             found = timed[entry.name]
             if found.failures:
                 failures.setdefault(entry.name, {})[N] = found.failures
-            for way in Way:
+            for way in Method:
                 if (found.ways == way).any():
                     p50, p99 = np.percentile(found.step_ms[found.ways == way], [50, 99])
                     grown.setdefault((entry, way), []).append((N, float(p50), float(p99)))
@@ -253,7 +253,7 @@ def _growth(
         Growth(
             name=entry.name,
             kind=str(way) if entry.shortcut else "",
-            whole=way is Way.WHOLE,
+            whole=way is Method.WHOLE,
             horizons=tuple(N for N, _, _ in times),
             p50=tuple(p50 for _, p50, _ in times),
             p99=tuple(p99 for _, _, p99 in times),

@@ -16,7 +16,7 @@ from mpc.export.tables import with_constraints
 from mpc.fallback.completion import CompletedMoment
 from mpc.fallback.contract import Guarded
 from mpc.robust.controller import RobustMPC
-from mpc.solvers import Way
+from mpc.solvers import Method
 from mpc.unconstrained import UnconstrainedMPC
 from quadsim.controller import ACCEPTED, Command, Moment, Phase
 from quadsim.errors import ExportError, PlanExhaustedError
@@ -28,7 +28,7 @@ from scenarios.schema.optimisation import BoundedSpec
 from scenarios.schema.scenario import Scenario
 
 MPC = ConstrainedMPC | RobustMPC | UnconstrainedMPC
-WAYS: Final = {Way.FREE: 0, Way.AXES: 1, Way.WHOLE: 2}
+WAYS: Final = {Method.FREE: 0, Method.AXES: 1, Method.WHOLE: 2}
 REFUSED: Final = 3
 """Least status of a period without an optimum."""
 
@@ -129,7 +129,7 @@ def _answers(
             command = law.step(Moment(time=k * period, acting=acting), state, reference)
             if command.status in ACCEPTED:
                 assert law.answer is not None
-                answer = WAYS[law.answer.way], command.speeds
+                answer = WAYS[law.answer.method], command.speeds
                 if law.answer.solution.primal_residual or law.answer.solution.dual_residual:
                     break
         found.append(answer)

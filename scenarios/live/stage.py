@@ -112,7 +112,7 @@ class Stage:
             self._hand.points = np.array([[at, at + scale * frame.pull]], dtype=np.float32)
         self._hand.visible = bool(frame.pull.any())
         for obstacle, handle in self._moving:
-            handle.position = obstacle.places(np.array([frame.time]))[0]
+            handle.position = obstacle.positions(np.array([frame.time]))[0]
         for limit, handle in self._regions:
             handle.visible = limit.start <= frame.time <= limit.stop
 

@@ -112,10 +112,10 @@ def test_what_cannot_be_exported_is_refused_with_its_reason(
     name: str, reason: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(["export", name, "--out", str(tmp_path / "c")]) == 2
-    said = capsys.readouterr().err
-    assert said.startswith("quadsim: this scenario's controller cannot be exported: ")
-    assert reason in said
-    assert said.count("\n") == 1
+    message = capsys.readouterr().err
+    assert message.startswith("quadsim: this scenario's controller cannot be exported: ")
+    assert reason in message
+    assert message.count("\n") == 1
     assert not (tmp_path / "c").exists()
 
 

@@ -23,7 +23,7 @@ Run = Callable[..., subprocess.CompletedProcess[str]]
 
 @pytest.fixture(scope="session")
 def run() -> Run:
-    """Runs a command; skips where its program is not installed; fails with what it said unless told not to check."""
+    """Runs a command; skips where its program is not installed; fails with its output unless `check` is false."""
 
     def call(*command: object, check: bool = True, **options: object) -> subprocess.CompletedProcess[str]:
         words = [str(word) for word in command]
@@ -54,7 +54,7 @@ def answers(exported: Export, run: Run, tmp_path_factory: pytest.TempPathFactory
     """What a target answers to all recorded periods, built with settings of its Makefile; each is run once."""
 
     @functools.cache
-    def ask(target: str, precision: str, *make: str) -> list[Answer]:
+    def check(target: str, precision: str, *make: str) -> list[Answer]:
         directory = tmp_path_factory.mktemp("build") / "c"
         shutil.copytree(exported(target, precision), directory)
         if TARGETS[target].board:
@@ -64,4 +64,4 @@ def answers(exported: Export, run: Run, tmp_path_factory: pytest.TempPathFactory
         lines = [tuple(line.split()) for line in (done.stdout + done.stderr).splitlines()]
         return [line for line in lines if len(line) == 8]
 
-    return ask
+    return check

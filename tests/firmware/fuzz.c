@@ -1,4 +1,4 @@
-/* Steps of a controller from arbitrary bytes, for libFuzzer: whatever comes in, the command is finite and within every
+/* Steps of a controller from arbitrary bytes, for libFuzzer: for any input, the command is finite and within every
  * bound, the status is one of six, and the active set changes no more often than it may. */
 #include <stdint.h>
 #include <stdio.h>
@@ -11,9 +11,9 @@
 int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size);
 
 static unsigned long steps;
-static int told; /* whether it will be */
+static int registered; /* whether it will be printed */
 
-static void tell(void)
+static void report(void)
 {
     (void)printf("steps: %lu\n", steps);
     (void)fflush(stdout);
@@ -27,7 +27,7 @@ static void require(int holds, const char *what)
     }
 }
 
-/* The next number: near what flies, or far from it, or whatever the bits say. */
+/* The next number: near what flies, or far from it, or any bits. */
 static real take(const uint8_t **data, size_t *left, int manner, real centre, real scale)
 {
     int16_t share = 0;
@@ -55,8 +55,8 @@ int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size)
     real *reference = malloc(sizeof(real) * N * 4);
     real command[4];
     int i, j;
-    if (!told) {
-        told = !atexit(tell);
+    if (!registered) {
+        registered = !atexit(report);
     }
     memcpy(command, HOVER, sizeof command);
     quadsim_mpc_reset(mpc, command);

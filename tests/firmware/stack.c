@@ -20,8 +20,8 @@ int main(void)
     quadsim_mpc_reset(&mpc, quadsim_vectors_speeds);
     for (k = 0; k < quadsim_vectors_count; k++) {
         quadsim_real command[4];
-        const struct quadsim_vector *asked = &quadsim_vectors[k];
-        (void)quadsim_mpc_step(&mpc, asked->state, quadsim_vectors_path[k], asked->acting, command);
+        const struct quadsim_vector *recorded = &quadsim_vectors[k];
+        (void)quadsim_mpc_step(&mpc, recorded->state, quadsim_vectors_path[k], recorded->acting, command);
     }
     while (bottom[untouched] == PAINT) {
         untouched++;

@@ -49,7 +49,7 @@ def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path / "quadsim" / "compiled"
 
 
-def test_a_library_is_compiled_once_and_kept_for_the_user_alone(cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_library_is_compiled_once_and_stored_for_the_user_only(cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     scenario = quadsim.load("hover", {**COMPILED, "duration": 0.5})
     quadsim.fly(scenario, progress=False)
     (library,) = cache.iterdir()

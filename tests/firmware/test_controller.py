@@ -151,9 +151,9 @@ def test_more_active_rows_than_there_is_room_for_end_as_defined() -> None:
     flight = recording("paper-constrained")
     for host in (usual, small):
         host.reset(flight.speeds)
-    asked = flight.state[0], flight.path[: usual.horizon], flight.acting[0]
-    assert usual.step(*asked).status == 2
-    reply = small.step(*asked)
+    arguments = flight.state[0], flight.path[: usual.horizon], flight.acting[0]
+    assert usual.step(*arguments).status == 2
+    reply = small.step(*arguments)
     assert reply.status == 3
     assert ((reply.command - flight.acting[0] <= 5.0) & (reply.command - flight.acting[0] >= -10.0)).all()
 
@@ -166,14 +166,14 @@ BROKEN = (np.nan, np.inf, -np.inf, 1e300)
 @pytest.mark.parametrize("what", ["state", "reference", "acting"])
 def test_input_that_is_none_leads_to_the_command_before(name: str, what: str, value: float) -> None:
     flight, host = recording(name), Host(load_scenario(name))
-    asked = {
+    arguments = {
         "state": flight.state[0].copy(),
         "reference": flight.path[: host.horizon].copy(),
         "acting": flight.acting[0].copy(),
     }
     host.reset(flight.speeds)
-    first = host.step(**asked)
-    broken = {**asked, what: asked[what].copy()}
+    first = host.step(**arguments)
+    broken = {**arguments, what: arguments[what].copy()}
     broken[what].flat[1] = value
     reply = host.step(**broken)
     assert reply.status == 5 if not np.isfinite(value) or name == "robust" else reply.status >= REFUSED
@@ -182,7 +182,7 @@ def test_input_that_is_none_leads_to_the_command_before(name: str, what: str, va
     assert (reply.command <= 250.0).all()
     if what == "acting" and not np.isfinite(value):
         np.testing.assert_array_equal(reply.command, first.command)
-    assert host.step(**asked).status == first.status  # and the next one is answered again
+    assert host.step(**arguments).status == first.status  # and the next one is answered again
 
 
 def test_a_plan_is_held_shifted_where_there_is_no_optimum() -> None:

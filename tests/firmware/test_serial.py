@@ -30,7 +30,7 @@ NOTHING = np.zeros(4)
 
 
 @pytest.fixture(scope="module")
-def asked() -> Recording:
+def recorded() -> Recording:
     return record(load_scenario("paper-constrained", [SHORT]))
 
 
@@ -43,26 +43,26 @@ def terminal(exported: Export, run: Run) -> Iterator[Terminal]:
 
 
 class Autopilot:
-    """The other end: numbers its questions, and can spoil them."""
+    """The other end: numbers its questions, and can corrupt them."""
 
-    def __init__(self, line: Terminal, asked: Recording) -> None:
-        self.line, self.asked, self.frames, self.number = line, asked, Frames("double"), 0
+    def __init__(self, line: Terminal, recorded: Recording) -> None:
+        self.line, self.recorded, self.frames, self.number = line, recorded, Frames("double"), 0
 
     def question(self, kind: Kind, row: Array, k: int = 0) -> bytes:
         self.number += 1
-        acting = self.asked.speeds if kind is Kind.START else self.asked.acting[k]
-        return self.frames.question(kind, self.number, self.asked.state[k], row, acting)
+        acting = self.recorded.speeds if kind is Kind.START else self.recorded.acting[k]
+        return self.frames.question(kind, self.number, self.recorded.state[k], row, acting)
 
     def start(self) -> None:
         """Fill the window but for the last row of the first period."""
-        self.tell(self.question(Kind.START, self.asked.path[0]))
-        for row in self.asked.path[1 : N - 1]:
-            self.tell(self.question(Kind.ROW, row))
+        self.send(self.question(Kind.START, self.recorded.path[0]))
+        for row in self.recorded.path[1 : N - 1]:
+            self.send(self.question(Kind.ROW, row))
 
     def period(self, k: int) -> bytes:
-        return self.question(Kind.STEP, self.asked.path[k + N - 1], k)
+        return self.question(Kind.STEP, self.recorded.path[k + N - 1], k)
 
-    def tell(self, data: bytes) -> Reply:
+    def send(self, data: bytes) -> Reply:
         """The answer to a question, but for what the watchdog has sent meanwhile, on a busy machine."""
         self.line.send(data)
         return self.hear_last()
@@ -79,81 +79,81 @@ class Autopilot:
         return reply
 
 
-def test_answers_are_those_of_the_recorded_periods(terminal: Terminal, asked: Recording) -> None:
-    pilot = Autopilot(terminal, asked)
+def test_answers_are_those_of_the_recorded_periods(terminal: Terminal, recorded: Recording) -> None:
+    pilot = Autopilot(terminal, recorded)
     pilot.start()
-    for k in range(len(asked.state)):
-        reply = pilot.tell(pilot.period(k))
-        assert (reply.number, reply.status) == (pilot.number, asked.status[k])
-        assert np.abs(reply.command - asked.command[k]).max() <= 1e-8
+    for k in range(len(recorded.state)):
+        reply = pilot.send(pilot.period(k))
+        assert (reply.number, reply.status) == (pilot.number, recorded.status[k])
+        assert np.abs(reply.command - recorded.command[k]).max() <= 1e-8
 
 
-def test_a_doubled_question_is_solved_once_and_answered_twice(terminal: Terminal, asked: Recording) -> None:
-    pilot = Autopilot(terminal, asked)
+def test_a_doubled_question_is_solved_once_and_answered_twice(terminal: Terminal, recorded: Recording) -> None:
+    pilot = Autopilot(terminal, recorded)
     pilot.start()
     for k in range(10):
         frame = pilot.period(k)
-        first, again = pilot.tell(frame + frame), pilot.hear_last()
+        first, again = pilot.send(frame + frame), pilot.hear_last()
         assert first.number == again.number == pilot.number
         assert np.array_equal(first.command, again.command)
-        assert np.abs(first.command - asked.command[k]).max() <= 1e-8  # a second step would have moved the window on
+        assert np.abs(first.command - recorded.command[k]).max() <= 1e-8  # a second step would have moved the window on
 
 
-def test_corrupt_and_cut_frames_are_dropped_and_the_next_is_found(terminal: Terminal, asked: Recording) -> None:
+def test_corrupt_and_cut_frames_are_dropped_and_the_next_is_found(terminal: Terminal, recorded: Recording) -> None:
     """Bits turned, ends missing, noise between frames, and noise that begins as a frame does."""
-    pilot, draw = Autopilot(terminal, asked), random.Random(1)
+    pilot, draw = Autopilot(terminal, recorded), random.Random(1)
     pilot.start()
     for k in range(12):
         frame = bytearray(pilot.period(k))
-        spoilt = bytearray(frame)
-        spoilt[draw.randrange(len(spoilt))] ^= 1 << draw.randrange(8)
+        corrupted = bytearray(frame)
+        corrupted[draw.randrange(len(corrupted))] ^= 1 << draw.randrange(8)
         terminal.send(
-            [bytes(spoilt), bytes(frame[: draw.randrange(1, len(frame))]), draw.randbytes(97), frame[:4]][k % 4]
+            [bytes(corrupted), bytes(frame[: draw.randrange(1, len(frame))]), draw.randbytes(97), frame[:4]][k % 4]
         )
         # What has come may take the place of a frame's first bytes until as many more have: whole ones follow.
-        reply = pilot.tell(bytes(frame) * 3)
-        assert np.abs(reply.command - asked.command[k]).max() <= 1e-8
+        reply = pilot.send(bytes(frame) * 3)
+        assert np.abs(reply.command - recorded.command[k]).max() <= 1e-8
         while terminal.receive(pilot.frames.answer_size, 0.02):
             pass
 
 
-def test_lost_rows_of_the_reference_are_replaced_by_the_next(terminal: Terminal, asked: Recording) -> None:
+def test_lost_rows_of_the_reference_are_replaced_by_the_next(terminal: Terminal, recorded: Recording) -> None:
     """Three of ten periods are lost: answers go on, and differ only by the rows and the periods that were missed."""
-    pilot = Autopilot(terminal, asked)
+    pilot = Autopilot(terminal, recorded)
     pilot.start()
     for k in range(10):
         frame = pilot.period(k)
         if k not in (3, 4, 7):
-            reply = pilot.tell(frame)
+            reply = pilot.send(frame)
             assert reply.number == pilot.number
             assert reply.status <= 2
-            assert np.abs(reply.command - asked.command[k]).max() <= (1e-8 if k < 3 else 1e-2)
+            assert np.abs(reply.command - recorded.command[k]).max() <= (1e-8 if k < 3 else 1e-2)
 
 
-def test_an_old_question_is_not_answered(terminal: Terminal, asked: Recording) -> None:
-    pilot = Autopilot(terminal, asked)
+def test_an_old_question_is_not_answered(terminal: Terminal, recorded: Recording) -> None:
+    pilot = Autopilot(terminal, recorded)
     pilot.start()
     old = pilot.period(0)
-    pilot.tell(old)
-    fresh = pilot.tell(pilot.period(1))
+    pilot.send(old)
+    fresh = pilot.send(pilot.period(1))
     pilot.line.send(old)
     late = pilot.hear()  # the watchdog's
     assert (late.number, late.status) == (fresh.number, BEFORE)
 
 
-def test_without_a_fresh_state_the_last_command_is_repeated(terminal: Terminal, asked: Recording) -> None:
-    """Each 100 ms, said to be no optimum, until a state comes; rows alone are no state."""
+def test_without_a_fresh_state_the_last_command_is_repeated(terminal: Terminal, recorded: Recording) -> None:
+    """Each 100 ms, with a status that is no optimum, until a state comes; rows alone are no state."""
     assert terminal.receive(1, 0.4) == b""  # not before the first
-    pilot = Autopilot(terminal, asked)
+    pilot = Autopilot(terminal, recorded)
     pilot.start()
-    wanted = pilot.tell(pilot.period(0))
+    wanted = pilot.send(pilot.period(0))
     heard, started = [pilot.hear()], clock.monotonic()
     while len(heard) < 5:
         heard.append(pilot.hear())
     assert 0.35 <= clock.monotonic() - started <= 3.0  # 0.4 s, and a busy machine
     assert {(reply.number, reply.status) for reply in heard} == {(wanted.number, BEFORE)}
     assert all(np.array_equal(reply.command, wanted.command) for reply in heard)
-    assert pilot.tell(pilot.period(1)).status == asked.status[1]
+    assert pilot.send(pilot.period(1)).status == recorded.status[1]
 
 
 def test_a_flight_over_the_line_by_the_example() -> None:
@@ -161,13 +161,13 @@ def test_a_flight_over_the_line_by_the_example() -> None:
     assert done.stdout.startswith("satisfied: 40 commands over the line"), done.stderr
 
 
-def test_a_whole_flight_asks_for_one_row_a_period(terminal: Terminal, asked: Recording, answers: Answers) -> None:
+def test_a_whole_flight_needs_one_row_a_period(terminal: Terminal, recorded: Recording, answers: Answers) -> None:
     sent: list[bytes] = []
     send = terminal.send
     terminal.send = lambda data: (sent.append(data), send(data))[1]  # type: ignore[method-assign]
     law = SerialMPC(terminal, "double", N)
-    law.reset(asked.speeds)
-    for k in range(len(asked.state)):
-        reply = law.step(0.05 * k, asked.state[k], asked.path[k : k + N], asked.acting[k])
-        assert np.abs(reply.command - asked.command[k]).max() <= 1e-8
-    assert len(sent) == N + len(asked.state)
+    law.reset(recorded.speeds)
+    for k in range(len(recorded.state)):
+        reply = law.step(0.05 * k, recorded.state[k], recorded.path[k : k + N], recorded.acting[k])
+        assert np.abs(reply.command - recorded.command[k]).max() <= 1e-8
+    assert len(sent) == N + len(recorded.state)

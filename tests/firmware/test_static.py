@@ -34,9 +34,7 @@ PROGRAMS = ("main.c", "serial.c", "vectors.c", "quadsim_mpc.c")
 
 @pytest.mark.parametrize("compiler", ["gcc", "clang", "arm-none-eabi-gcc"])
 @pytest.mark.parametrize("precision", EXPORTS)
-def test_compilers_have_nothing_to_say(
-    precision: str, compiler: str, exported: Export, run: Run, tmp_path: Path
-) -> None:
+def test_compilers_give_no_warning(precision: str, compiler: str, exported: Export, run: Run, tmp_path: Path) -> None:
     bare = compiler.startswith("arm")
     directory = exported(*EXPORTS[precision]) if bare else exported("posix", precision)
     machine = TARGETS[EXPORTS[precision][0]].machine.split() if bare else []
@@ -54,19 +52,19 @@ def test_analysers_find_nothing(exported: Export, run: Run, tmp_path: Path) -> N
 
 
 def undefined(source: Path, board: str, run: Run, made: Path) -> set[str]:
-    """Symbols that a source asks others for."""
+    """Undefined symbols of a source."""
     target = TARGETS[board]
     run(target.compiler, *target.machine.split(), "-std=c99", "-O3", "-c", source, "-o", made)
     return {line.split()[-1] for line in run("arm-none-eabi-nm", "-u", made).stdout.splitlines()}
 
 
 @pytest.mark.parametrize("precision", EXPORTS)
-def test_a_controller_asks_the_library_for_copies_alone(
+def test_a_controller_needs_the_library_for_copies_only(
     precision: str, exported: Export, run: Run, tmp_path: Path
 ) -> None:
     """No malloc, no mathematics, and in float no emulated doubles, which a Cortex-M4F would need."""
     board, _ = EXPORTS[precision]
-    assert undefined(exported(board, precision) / "quadsim_mpc.c", board, run, tmp_path / "asked.o") <= ALLOWED
+    assert undefined(exported(board, precision) / "quadsim_mpc.c", board, run, tmp_path / "needed.o") <= ALLOWED
 
 
 PLANTED = """

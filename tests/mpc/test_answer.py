@@ -131,7 +131,7 @@ def off(first: float, row: int = 0) -> Array:
         (SOLVED, PLAN, None),
         (UNCONSTRAINED, PLAN, None),
         ("max_iterations", PLAN, "max_iterations"),
-        ("primal_infeasible", PLAN * np.nan, "primal_infeasible"),  # what its solver says comes first
+        ("primal_infeasible", PLAN * np.nan, "primal_infeasible"),  # its solver's status comes first
         ("", PLAN, ""),
         (SOLVED, off(math.nan), "not_finite"),
         (SOLVED, off(math.inf, row=4), "not_finite"),
@@ -143,7 +143,7 @@ def off(first: float, row: int = 0) -> Array:
         (SOLVED, off(40.0, row=1), None),  # only the first action reaches the plant
     ],
 )
-def test_rejection_tells_why(status: str, plan: Array, reason: str | None) -> None:
+def test_rejection_gives_the_reason(status: str, plan: Array, reason: str | None) -> None:
     assert rejection(status, plan[0], plan, BOUNDS, HOVER) == reason
 
 

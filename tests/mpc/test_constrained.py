@@ -20,7 +20,7 @@ STATE[10] = np.pi / 6
 
 
 class FaultySolver(QPSolver):
-    """The real solver, whose answers are spoilt in chosen calls."""
+    """The real solver, whose answers are corrupted in chosen calls."""
 
     def __init__(self, faults: dict[int, str], horizon: int = 50) -> None:
         self.problem = paper_problem("paper-constrained", f"controller.horizon={horizon}")
@@ -42,7 +42,7 @@ class FaultySolver(QPSolver):
 
 def fly(faults: dict[int, str], periods: int, horizon: int = 50) -> list[Command]:
     solver = FaultySolver(faults, horizon)
-    controller = ConstrainedMPC(solver.problem, solver, shortcut=not faults)  # which might mend a spoilt plan
+    controller = ConstrainedMPC(solver.problem, solver, shortcut=not faults)  # which might repair a corrupted plan
     controller.reset(solver.problem.model.u_bar)
     reference = paper_reference(periods + horizon + 1)
     return [controller.step(Moment(time=0.05 * k), STATE, reference[k + 1 : k + 1 + horizon]) for k in range(periods)]
@@ -106,13 +106,13 @@ def test_back_ends_do_not_accept_a_measured_nan() -> None:
 
 
 def test_slews_count_from_the_command_that_acts() -> None:
-    """Where an earlier command was dropped, the next one is bound to what acts, not to what was asked for."""
+    """Where an earlier command was dropped, the next one is bound to what acts, not to what was commanded."""
     problem = paper_problem()
     controller = ConstrainedMPC(problem, QPSolver("piqp-multistage", problem))
     reference = paper_reference(51)[1:]
     controller.reset(problem.model.u_bar)
-    asked = controller.step(Moment(), STATE, reference).speeds
-    acting = asked - 7.0
+    commanded = controller.step(Moment(), STATE, reference).speeds
+    acting = commanded - 7.0
     after = controller.step(Moment(time=0.05, acting=acting), STATE, reference).speeds
     assert problem.bounds is not None
     np.testing.assert_allclose(after, acting + problem.bounds.delta_max, atol=1e-6)  # it climbs as fast as it may

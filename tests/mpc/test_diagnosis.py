@@ -71,20 +71,20 @@ def test_it_is_zero_where_and_only_where_there_is_an_answer(
 
 @given(**RANDOM)
 @example(seed=164, terms=TERMS[-1], changing=False, far=0.1)  # multipliers down to 1e-8 along a chain of bounds,
-@example(seed=179393, terms=TERMS[-1], changing=False, far=0.1)  # and to less than the solver tells
+@example(seed=179393, terms=TERMS[-1], changing=False, far=0.1)  # and to less than the solver resolves
 @settings(max_examples=25)
 def test_what_is_named_is_a_conflict_by_itself_and_each_part_of_it_is_needed(
     seed: int, terms: tuple[str, ...], changing: bool, far: float
 ) -> None:
-    """Of bounds on states: without all others they stay as large, and shrink without any one that is in the way."""
+    """Of bounds on states: without all others they stay as large, and shrink without any one that is blocking."""
     unanswered = posed(seed, terms, changing=changing, far=far)
     problem, now = unanswered.problem, period(unanswered)
     assume(ocp_peer.least_violation(problem, now) is not None)
     conflict = conflict_of(unanswered)
     assume(conflict.total > NEAR)
-    named = {*conflict.violated, *conflict.in_the_way}
+    named = {*conflict.violated, *conflict.blocking}
     assert ocp_peer.least_violation(problem, now, named) == pytest.approx(conflict.total, rel=1e-5)
-    for side in conflict.in_the_way:
+    for side in conflict.blocking:
         less = ocp_peer.least_violation(problem, now, named - {side})
         assert less is not None
         assert less < conflict.total * (1.0 - 1e-7)
@@ -98,7 +98,7 @@ def test_what_is_named_is_a_conflict_by_itself_and_each_part_of_it_is_needed(
 def test_the_smallest_widening_is_enough_and_no_less_is(
     seed: int, terms: tuple[str, ...], changing: bool, far: float
 ) -> None:
-    """Each bound that gives way by itself, and all of them together."""
+    """Each violated bound by itself, and all of them together."""
     unanswered = posed(seed, terms, changing=changing, far=far)
     problem, query = unanswered.problem, unanswered.query
     conflict = conflict_of(unanswered)
@@ -142,10 +142,10 @@ BAND = Constraint(name="band", lower=-np.ones(1), upper=np.ones(1), C=np.eye(1))
 
 
 def test_an_integrator_by_hand() -> None:
-    """By one a step, 2, 1, .. violates the bound of 1 once, by 1; the lower bound on inputs is in the way."""
+    """By one a step, 2, 1, .. violates the bound of 1 once, by 1; the lower bound on inputs is blocking."""
     unanswered = integrator(BAND)
     conflict = conflict_of(unanswered)
-    assert conflict.in_the_way == (Side(0, 0, False),)
+    assert conflict.blocking == (Side(0, 0, False),)
     ((side, found),) = conflict.violated.items()
     assert side == Side(1, 0, True)
     assert (found.amount, found.share, found.first, found.last) == (pytest.approx(1.0), pytest.approx(1.0), 1, 1)
@@ -157,13 +157,13 @@ def test_an_integrator_by_hand() -> None:
 
 
 def test_bounds_on_inputs_come_first_and_states_give_way_to_what_is_left() -> None:
-    """Inputs >= 3 against <= 1: the one with the wider scale gives way; then states follow from inputs of 1 to 3."""
+    """Inputs >= 3 against <= 1: the one with the wider scale is relaxed; then states follow from inputs of 1 to 3."""
     pushed = Constraint(name="pushed", lower=np.array([3.0]), upper=np.array([np.inf]), D=np.eye(1))
     conflict = conflict_of(integrator(BAND, pushed))
     assert conflict.violated[Side(2, 0, False)].amount == pytest.approx(2.0)
     assert conflict.violated[Side(2, 0, False)].first == 0
     assert conflict.violated[Side(2, 0, False)].last == 3
-    # Inputs of 1 at least, once 3 has given way to that: 4, 5, 6, 7 from 3.
+    # Inputs of 1 at least, once 3 is relaxed to that: 4, 5, 6, 7 from 3.
     assert conflict.violated[Side(1, 0, True)].amount == pytest.approx(6.0, abs=1e-4)
 
 
@@ -171,12 +171,12 @@ def test_soft_constraints_are_never_in_conflict() -> None:
     soft = replace(BAND, penalty=Penalty(l1=np.ones(1), l2=np.ones(1)))
     conflict = conflict_of(integrator(soft))
     assert conflict.feasible
-    assert (conflict.total, conflict.in_the_way) == (pytest.approx(0.0), ())
+    assert (conflict.total, conflict.blocking) == (pytest.approx(0.0), ())
 
 
-def test_what_is_kept_of_a_period_is_no_view_of_what_goes_on() -> None:
+def test_what_is_stored_of_a_period_is_a_copy() -> None:
     state, before = np.zeros(1), np.zeros(1)
     problem = integrator().problem
-    kept = Unanswered(problem=problem, query=Query(state, np.zeros((4, 1)), before), status="unsolved", time=0.0)
+    stored = Unanswered(problem=problem, query=Query(state, np.zeros((4, 1)), before), status="unsolved", time=0.0)
     state[:], before[:] = 1.0, 1.0
-    assert (kept.query.state, kept.query.u_before) == (0.0, 0.0)
+    assert (stored.query.state, stored.query.u_before) == (0.0, 0.0)

@@ -47,7 +47,7 @@ def test_the_same_numbers_make_no_bump(law: str) -> None:
 
 
 def test_without_what_was_learnt_there_is_one(monkeypatch: pytest.MonkeyPatch) -> None:
-    """What the test above would say if nothing were handed over: the observer begins anew."""
+    """The test above if nothing were handed over: the observer restarts."""
     monkeypatch.setattr("mpc.fallback.contract.Guarded.adopt", lambda self, previous: None)
     name, changes, fields = LAWS["robust"]
     assert jump(flown(name, fields, changes), flown(name, {}, changes))[60:].max() > 0.5

@@ -47,7 +47,7 @@ def test_a_prediction_turns_with_its_heading(vehicle: Vehicle) -> None:
 
 @pytest.mark.parametrize("yaw", [0.0, 2.0])
 def test_under_a_disturbance_it_is_anchored_where_the_vehicle_rests(vehicle: Vehicle, yaw: float) -> None:
-    """There it stays; and a level vehicle at hover speed is pushed away as the disturbance says."""
+    """There it stays; and a level vehicle at hover speed is pushed away as by the disturbance."""
     model, push = hover_model(vehicle, 0.05), np.array([0.3, -0.2, 0.25])
     disturbed = replace(
         nonlinear_model(vehicle, 0.05), acceleration=push, angular_acceleration=np.array([0.5, -0.3, 0.1])

@@ -74,11 +74,11 @@ def test_a_constant_torque_moves_a_hovering_vehicle_a_tenth_as_far(
     vehicle: Vehicle, rotors: RotorDynamics | None
 ) -> None:
     effects = Effects(disturbance=Disturbance(torque=OFFSET), rotors=rotors)
-    places = [
+    paths = [
         log.control.truth[:, [INDEX["x"], INDEX["y"]]]
         for log in (flown(vehicle, effects, None), flown(vehicle, effects, INDISettings()))
     ]
-    alone, aided = (np.linalg.norm(place, axis=1).max() for place in places)
+    alone, aided = (np.linalg.norm(path, axis=1).max() for path in paths)
     assert aided < 0.1 * alone
 
 

@@ -119,7 +119,7 @@ def test_impossible_penalties_are_refused(l1: list[float], l2: list[float]) -> N
 
 
 def test_rows_are_all_that_bound_anything_in_the_constraints_order() -> None:
-    """Rows without a bound are left out; others are told apart by what they are on, and by their price."""
+    """Rows without a bound are left out; others are distinguished by what they are on, and by their penalty."""
     problem = random_problem(np.random.default_rng(0), horizon=3, n_c=2)
     assert problem.bounds is not None
     endless = np.full(2, np.inf)

@@ -44,7 +44,7 @@ def test_kkt_conditions_hold_over_the_flight(constrained_flight: Flight, name: s
 
 
 def test_first_input_agrees_with_solvers_of_other_families(constrained_flight: Flight) -> None:
-    """Interior point, active set, operator splitting; the last gives up on some, and says so."""
+    """Interior point, active set, operator splitting; the last fails on some, with that status."""
     problem = paper_problem()
     ours, daqp, osqp = (QPSolver(name, problem) for name in ("piqp-multistage", "daqp", "osqp"))
     agreed = 0
@@ -84,9 +84,9 @@ def test_answers_are_copies_that_the_next_solve_leaves_alone() -> None:
     solver = QPSolver("piqp-multistage", problem)
     desired = problem.objective.desired(paper_reference(60)[1:51])
     first = solver.solve(STATE, desired, problem.model.u_bar)
-    kept = first.plan.copy(), first.solution.x.copy(), first.solution.y.copy()
+    before = first.plan.copy(), first.solution.x.copy(), first.solution.y.copy()
     solver.solve(-STATE, -desired, problem.model.u_bar)
-    for now, then in zip((first.plan, first.solution.x, first.solution.y), kept, strict=True):
+    for now, then in zip((first.plan, first.solution.x, first.solution.y), before, strict=True):
         np.testing.assert_array_equal(now, then)
 
 

@@ -31,7 +31,7 @@ def solved(solver: Relinearised, now: Period) -> Answer:
 PARTS = ("A", "B", "c", "state", "desired", "u_before", "u_rest")
 
 
-def spoilt(now: Period, part: str, number: float) -> Period:
+def corrupted(now: Period, part: str, number: float) -> Period:
     """With one number of it another."""
     if part == "u_rest":
         u = now.rest.u.copy()
@@ -49,7 +49,7 @@ def test_data_that_is_not_finite_or_of_no_vehicle_is_refused(part: str, number: 
     problem = soft_problem()
     now, solver = changing_period(np.random.default_rng(2), problem), Relinearised(problem)
     before = solved(solver, now)
-    answer = solved(solver, spoilt(now, part, number))
+    answer = solved(solver, corrupted(now, part, number))
     assert answer.solution.status == "invalid_data"
     assert solver.last is None
     for ours, usual in ((answer.plan, before.plan), (answer.slacks, before.slacks)):

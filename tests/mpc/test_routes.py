@@ -1,6 +1,6 @@
 """A kind of constraint that only this test has, C x + D u + E (u - u_before), through every route to an optimum.
 
-That it holds is told by rolling the model out, and what the optimum is by a peer: see `ocp_peer`.
+Feasibility is checked by rolling the model out, the optimum by a peer: see `ocp_peer`.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from mpc.nonlinear.model import nonlinear_model
 from mpc.ocp import Objective, Problem, Rest, lqr_terminal_weight
 from mpc.relinearised import Relinearised
 from mpc.robust.controller import Linearisation, RobustMPC, RobustSettings
-from mpc.solvers import SOLVERS, QPSolver, Way
+from mpc.solvers import SOLVERS, Method, QPSolver
 from quadsim.controller import ACCEPTED, SOLVED, UNCONSTRAINED, Moment
 from quadsim.state import Array, make_state
 from quadsim.vehicle import Vehicle
@@ -154,7 +154,7 @@ def test_the_shortcut_holds_it(which: str | int, soft: bool) -> None:
 @pytest.mark.parametrize("side", ["lower", "upper"])
 @pytest.mark.parametrize("soft", [False, True])
 def test_the_free_optimum_is_taken_where_and_only_where_it_keeps_it(row: int, side: str, soft: bool) -> None:
-    """A bound just beyond the free optimum's extreme value stands in no way; just before it, it does."""
+    """A bound just beyond the free optimum's extreme value is inactive; just before it, active."""
     problem, given, wide, _ = paper(soft=soft)
     query = 0.01 * given.state, 0.01 * given.desired, given.u_before
     near = ocp_peer.period(problem, *query)
@@ -165,14 +165,14 @@ def test_the_free_optimum_is_taken_where_and_only_where_it_keeps_it(row: int, si
         return Shortcut(one, QPSolver("piqp-multistage", one)).solve(*query)
 
     free = answered(wide)
-    assert (free.way, free.solution.status) == (Way.FREE, UNCONSTRAINED)
+    assert (free.method, free.solution.status) == (Method.FREE, UNCONSTRAINED)
     reached = ocp_peer.values(wide, near, free.plan)[:, row]
     extreme, outwards = (reached.min(), -1.0) if side == "lower" else (reached.max(), 1.0)
-    for distance, way in ((1e-7, Way.FREE), (-1e-4, Way.WHOLE)):
+    for distance, method in ((1e-7, Method.FREE), (-1e-4, Method.WHOLE)):
         bound = getattr(wide, side).copy()
         bound[row] = extreme + outwards * distance
         answer = answered(replace(wide, **{side: bound}))
-        assert answer.way is way
+        assert answer.method is method
         if not soft:
             assert largest(replace(wide, **{side: bound}), near, answer.plan) < 1e-8
 
@@ -200,7 +200,7 @@ def test_rows_of_states_alone_are_held_axis_by_axis(soft: bool) -> None:
     without = ocp_peer.optimum(replace(problem, constraints=()), given)
     assert (ocp_peer.violation(row, given, without.plan).max(axis=0) > 1e-2).all()
     answer = Shortcut(problem, QPSolver("piqp-multistage", problem)).solve(np.zeros(12), desired, problem.model.u_bar)
-    assert answer.way is Way.AXES
+    assert answer.method is Method.AXES
     np.testing.assert_allclose(answer.plan, peer.plan, rtol=0.0, atol=1e-5)
     beyond = ocp_peer.violation(row, given, answer.plan)
     assert (beyond.max() > 1e-3) == soft

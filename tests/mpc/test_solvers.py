@@ -54,11 +54,11 @@ def test_a_failure_leaves_the_next_solve_alone(name: str) -> None:
     np.testing.assert_allclose(hover.plan, np.tile(problem.model.u_bar, (50, 1)), atol=1e-3)
 
 
-@pytest.mark.parametrize(("place", "spoilt"), [(0, np.nan), (1, np.nan), (2, np.nan), (2, np.inf), (2, -np.inf)])
-def test_data_that_is_not_finite_reaches_no_back_end(place: int, spoilt: float) -> None:
+@pytest.mark.parametrize(("place", "corrupted"), [(0, np.nan), (1, np.nan), (2, np.nan), (2, np.inf), (2, -np.inf)])
+def test_data_that_is_not_finite_reaches_no_back_end(place: int, corrupted: float) -> None:
     problem = paper_problem()
     query = [np.zeros(12), problem.objective.desired(np.zeros((50, 4))), problem.model.u_bar.copy()]
-    query[place].flat[0] = spoilt
+    query[place].flat[0] = corrupted
     solver = QPSolver("piqp-multistage", problem)
     answer = solver.solve(*query)
     assert answer.solution.status == "invalid_data"
@@ -140,7 +140,7 @@ def test_unknown_solver_lists_those_there_are() -> None:
     ("name", "package", "extra"),
     [("daqp", "daqp", "daqp"), ("qpoases", "casadi", "solvers"), ("proxqp", "proxsuite", "solvers")],
 )
-def test_a_solver_that_is_not_installed_says_how_to_get_it(
+def test_a_solver_that_is_not_installed_names_its_package(
     name: str, package: str, extra: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(importlib.util, "find_spec", lambda module: None)
@@ -150,11 +150,11 @@ def test_a_solver_that_is_not_installed_says_how_to_get_it(
     assert not SOLVERS[name].installed
 
 
-def test_entries_tell_what_they_are() -> None:
+def test_entries_describe_themselves() -> None:
     for name in ALWAYS:
         entry = SOLVERS[name]
         assert entry.installed
         assert entry.line == entry.description
         assert entry.version[0].isdigit()
-    absent = replace(SOLVERS["daqp"], package="a_package_that_nobody_has")
+    absent = replace(SOLVERS["daqp"], package="a_package_that_does_not_exist")
     assert not absent.installed

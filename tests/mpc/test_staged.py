@@ -38,7 +38,7 @@ LAG = 0.05
 
 @dataclass(frozen=True)
 class Changing:
-    """A problem whose model changes, staged and solved anew each time, in any number of steps per stage."""
+    """A problem whose model changes, staged and solved again each time, in any number of steps per stage."""
 
     form: Staged
     backend: PiqpChanging
@@ -285,7 +285,7 @@ def test_updated_values_solve_as_a_fresh_setup(constrained_flight: Flight, vehic
 
 
 def test_matrices_made_once_serve_many_periods(constrained_flight: Flight, vehicle: Vehicle) -> None:
-    """Used again, and in turn with others, they make the same QP as matrices made anew."""
+    """Used again, and in turn with others, they make the same QP as matrices rebuilt."""
     problem = softened(lagging(paper_problem(), vehicle), [2e5, 2e5], [1e4, 1e4])
     problem = replace(problem, objective=replace(problem.objective, Q_d=5.0 * np.eye(4)))
     form = Staged(problem, steps_per_stage=4, changing=True)
@@ -294,13 +294,13 @@ def test_matrices_made_once_serve_many_periods(constrained_flight: Flight, vehic
     for which, now in [(0, periods[0]), (0, periods[1]), (1, periods[2]), (1, periods[3]), (0, periods[4])]:
         given = now.c, now.state, now.desired, now.u_before, now.rest
         again = form.prepare(periods[which].A, periods[which].B)
-        kept, fresh = (
+        updated, fresh = (
             form.changed(matrices, form.changed_vectors(matrices, *given)) for matrices in (made[which], again)
         )
         for name in ("P", "A", "G"):
-            assert (getattr(kept, name) != getattr(fresh, name)).nnz == 0
+            assert (getattr(updated, name) != getattr(fresh, name)).nnz == 0
         for name in ("c", "b", "h_l", "h_u"):
-            np.testing.assert_array_equal(getattr(kept, name), getattr(fresh, name))
+            np.testing.assert_array_equal(getattr(updated, name), getattr(fresh, name))
 
 
 # Soft bounds

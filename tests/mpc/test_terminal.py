@@ -14,7 +14,7 @@ from mpc.exact.shortcut import Shortcut
 from mpc.ocp import Objective, Problem, Rest, lqr_terminal_weight
 from mpc.paper.condensed import Condensed
 from mpc.qp import Formulation
-from mpc.solvers import QPSolver, Way
+from mpc.solvers import Method, QPSolver
 from mpc.solvers.piqp_backends import PiqpDense, PiqpMultistage
 from mpc.staged import Staged
 from quadsim.errors import ParameterError
@@ -52,7 +52,7 @@ def gain(problem: Problem) -> Array:
 def first_inputs(problem: Problem, query: tuple[Array, Array, Array, Rest]) -> dict[str, Array]:
     """By the free optimum, the condensed QP and the staged one."""
     answer = Shortcut(problem, QPSolver("piqp-multistage", problem)).solve(*query)
-    assert answer.way is Way.FREE
+    assert answer.method is Method.FREE
     found = {"free": answer.plan[0]}
     forms: tuple[Formulation, ...] = (Condensed(problem), Staged(problem, steps_per_stage=3))
     for form in forms:

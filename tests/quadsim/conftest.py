@@ -20,8 +20,8 @@ def aborted_run(short_run: Run) -> Run:
 def empty_run(short_run: Run) -> Run:
     """A flight that ended before its first period was over: no numbers, no constraints reached."""
 
-    def head(log: ControlLog | TimingLog, *kept: str) -> dict[str, object]:
-        columns = {field.name: getattr(log, field.name) for field in dataclasses.fields(log) if field.name not in kept}
+    def head(log: ControlLog | TimingLog, *whole: str) -> dict[str, object]:
+        columns = {field.name: getattr(log, field.name) for field in dataclasses.fields(log) if field.name not in whole}
         return {name: column[:0] for name, column in columns.items() if column is not None}
 
     log = dataclasses.replace(

@@ -1,4 +1,4 @@
-"""Errors: one root, an exit status each, the values kept, a message a person can act on."""
+"""Errors: one root, an exit status each, the values stored, a message a person can act on."""
 
 from __future__ import annotations
 
@@ -83,7 +83,7 @@ def test_errors_are_also_what_python_calls_them() -> None:
     assert issubclass(OutputError, OSError)
 
 
-def test_a_parameter_error_keeps_what_it_says() -> None:
+def test_a_parameter_error_stores_its_values() -> None:
     error = ParameterError("vehicle", "mass", -1.0, "positive")
     assert str(error) == "vehicle.mass must be positive; got -1.0"
     assert (error.owner, error.name, error.value, error.rule) == ("vehicle", "mass", -1.0, "positive")
@@ -116,7 +116,7 @@ def test_file_and_output_errors_name_the_path() -> None:
         assert message.endswith(error.problem)
 
 
-def test_no_rendering_says_what_was_tried_and_what_to_install() -> None:
+def test_no_rendering_reports_what_was_tried_and_what_to_install() -> None:
     error = RenderingUnavailableError({"egl": "no libEGL", "osmesa": "no libOSMesa"})
     assert error.tried == {"egl": "no libEGL", "osmesa": "no libOSMesa"}
     for part in ("egl: no libEGL; osmesa: no libOSMesa", "apt-get install", "libegl1", "libosmesa6", "--no-video"):
@@ -124,7 +124,7 @@ def test_no_rendering_says_what_was_tried_and_what_to_install() -> None:
     assert issubclass(ViewerUnavailableError, QuadsimError)
 
 
-def test_a_flight_error_says_when() -> None:
+def test_a_flight_error_gives_its_time() -> None:
     error = DivergenceError("lost", time=1.25)
     assert str(error) == "at t = 1.250 s: lost"
     assert error.time == 1.25

@@ -54,7 +54,7 @@ obstacles: st.SearchStrategy[AnyObstacle] = st.one_of(boxes, round_ones, walls)
 
 
 def holds(obstacle: AnyObstacle, points: Array) -> np.ndarray:
-    """Whether points (K, 3) lie inside, said another way than by distances."""
+    """Whether points (K, 3) lie inside, computed without distances."""
     x, y, z = (points - obstacle.position).T
     if isinstance(obstacle, Sphere):
         return x**2 + y**2 + z**2 <= obstacle.radius**2
@@ -177,7 +177,7 @@ def test_obstacles_move_as_stated() -> None:
         name="ball", position=(1.0, 0.0, 2.0), radius=0.1, start=1.0, velocity=(2, 0, 3), acceleration=(0, 0, -9.81)
     )
     np.testing.assert_allclose(
-        ball.places(t), [[1, 0, 2], [1, 0, 2], [3, 0, 5 - 4.905], [5, 0, 8 - 4 * 4.905]], atol=1e-12
+        ball.positions(t), [[1, 0, 2], [1, 0, 2], [3, 0, 5 - 4.905], [5, 0, 8 - 4 * 4.905]], atol=1e-12
     )
     door = Box(
         name="door",
@@ -185,7 +185,7 @@ def test_obstacles_move_as_stated() -> None:
         size=(1, 1, 1),
         path=(Place(time=2.0, position=(2.0, 0.0, 0.0)), Place(time=3.0, position=(2.0, 4.0, 0.0))),
     )
-    np.testing.assert_allclose(door.places(t), [[0, 0, 0], [1, 0, 0], [2, 0, 0], [2, 4, 0]])
+    np.testing.assert_allclose(door.positions(t), [[0, 0, 0], [1, 0, 0], [2, 0, 0], [2, 4, 0]])
     np.testing.assert_allclose(door.clearance(t, np.tile([2.0, 0.0, 0.0], (4, 1))), [1.5, 0.5, -0.5, 3.5])
 
 

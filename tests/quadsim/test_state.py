@@ -103,7 +103,7 @@ def test_at_hover_both_sets_of_rates_are_equal_and_only_there() -> None:
     assert np.abs(body_to_euler_rates(np.array([0.3, 0.3, 0.0]), body) - body).max() > 0.05
 
 
-def test_leading_dimensions_are_kept() -> None:
+def test_leading_dimensions_are_preserved() -> None:
     euler = np.random.default_rng(0).uniform(-1.0, 1.0, (4, 5, 3))
     assert body_to_world(euler).shape == (4, 5, 3, 3)
     assert euler_to_quaternion(euler).shape == (4, 5, 4)

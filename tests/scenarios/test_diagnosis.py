@@ -60,53 +60,53 @@ class Case:
     state: Array = field(default_factory=lambda: make_state())
     acting: float | None = None
     violated: tuple[str, ...] = ()
-    in_the_way: tuple[str, ...] = ()
+    blocking: tuple[str, ...] = ()
     field: str = ""
 
 
 CASES = {
     "start beyond the tilt bound": Case(
-        state=TILTED, violated=("roll upper",), in_the_way=("slew lower", "slew upper"), field="output_bounds.roll"
+        state=TILTED, violated=("roll upper",), blocking=("slew lower", "slew upper"), field="output_bounds.roll"
     ),
     "slew too small to come back": Case(
         settings=("controller.input_bounds.slew=[-1.0, 0.5]",),
         state=moving("roll_rate", math.radians(10.0), euler=(math.radians(4.9), 0.0, 0.0)),
         violated=("roll upper",),
-        in_the_way=("slew lower", "slew upper"),
+        blocking=("slew lower", "slew upper"),
         field="output_bounds.roll",
     ),
     "speeds too low to hover": Case(
         settings=("controller.input_bounds.speed=[0.0, 190.0]", "controller.output_bounds.vz=[-0.1, 1.0]"),
         acting=190.0,
         violated=("vz lower",),
-        in_the_way=("speed upper",),
+        blocking=("speed upper",),
         field="input_bounds.speed",
     ),
     "a polytope against a bound": Case(
         settings=("controller.output_bounds.vz=[-0.2, 0.2]", f"controller.polytopes=[{CLIMB}]"),
         state=moving("vz", 0.2),
         violated=("climb lower",),
-        in_the_way=("vz upper",),
+        blocking=("vz upper",),
         field="polytopes.climb.lower",
     ),
     "two polytopes": Case(
         settings=(f"controller.polytopes=[{LEAST}, {MOST}]",),
         violated=("least lower",),
-        in_the_way=("most upper",),
+        blocking=("most upper",),
         field="polytopes.least.lower",
     ),
     "falling too fast": Case(
         settings=("controller.output_bounds.vz=[-0.5, 0.5]",),
         state=moving("vz", -2.0),
         violated=("vz lower",),
-        in_the_way=("slew upper",),
+        blocking=("slew upper",),
         field="output_bounds.vz",
     ),
     "tightened bounds": Case(
         settings=("controller.type=robust", "controller.tightening={}"),
         state=moving("roll_rate", math.radians(9.0), euler=(math.radians(5.5), 0.0, 0.0)),
         violated=("roll upper",),
-        in_the_way=("slew lower", "slew upper"),
+        blocking=("slew lower", "slew upper"),
         field="output_bounds.roll",
     ),
     "outside the fence": Case(
@@ -116,13 +116,13 @@ CASES = {
         field="polytopes.fence.upper",
     ),
     "the last command outside the bounds": Case(
-        acting=290.0, violated=("speed upper",), in_the_way=("slew lower",), field="input_bounds.slew"
+        acting=290.0, violated=("speed upper",), blocking=("slew lower",), field="input_bounds.slew"
     ),
     "linearised along the trajectory": Case(
         settings=("controller.type=robust", 'controller.linearisation="trajectory"'),
         state=TILTED,
         violated=("roll upper",),
-        in_the_way=("slew lower", "slew upper"),
+        blocking=("slew lower", "slew upper"),
         field="output_bounds.roll",
     ),
     "rotors that lag, and a delay": Case(
@@ -205,8 +205,8 @@ def test_each_culprit_is_named_and_each_suggestion_makes_it_feasible(name: str, 
     found = asked.found
     assert found["feasible"] is False
     assert names([entry for entry in found["conflict"] if entry["by"]]) == set(case.violated)
-    assert names([entry for entry in found["conflict"] if not entry["by"]]) >= set(case.in_the_way)
-    for part in (*case.violated, *case.in_the_way):
+    assert names([entry for entry in found["conflict"] if not entry["by"]]) >= set(case.blocking)
+    for part in (*case.violated, *case.blocking):
         word, side = part.split()
         assert re.search(rf"\b{word}\b[^;]*\b{side}\b", found["sentence"])
     widened = [each["settings"] for each in found["suggestions"] if len(each["settings"]) == 1 and not each["after"]]

@@ -253,7 +253,7 @@ def test_without_a_record_there_is_no_log() -> None:
     with start(load_scenario("hover"), recorded=False) as started:
         started.step()
         assert set(started.margins()) == {limit.name for limit in started.limits}
-        with pytest.raises(InputError, match="no period of this flight was kept"):
+        with pytest.raises(InputError, match="no period of this flight was recorded"):
             started.flight()
 
 

@@ -13,7 +13,7 @@ static void put_command(quadsim_mpc *mpc, const real *speeds, const real *acting
     }
 }
 
-/* The command of an optimum, or what is left without one. */
+/* The command of an optimum, or the fallback without one. */
 static enum quadsim_status answer(quadsim_mpc *mpc, enum quadsim_status found, const real *axes, const real *acting,
                                   real *command)
 {

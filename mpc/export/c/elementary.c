@@ -57,7 +57,7 @@ static real arc_tangent(real tangent)
     if (tangent > R(2.4375)) {
         base = HALF_PI;
         x = R(-1.0) / tangent;
-    } else if (tangent > R(0.4375)) { /* atan(1/2), or atan(1), or atan(3/2), and what is left */
+    } else if (tangent > R(0.4375)) { /* atan(1/2), or atan(1), or atan(3/2), and the rest */
         const real middle = tangent < R(0.6875) ? R(0.5) : (tangent < R(1.1875) ? R(1.0) : R(1.5));
         base = tangent < R(0.6875) ? R(0.4636476090008061)
                                    : (tangent < R(1.1875) ? R(0.7853981633974483) : R(0.982793723247329));

@@ -24,19 +24,19 @@ int main(void)
     int k, j, failed = 0;
     quadsim_mpc_reset(&mpc, quadsim_vectors_speeds);
     for (k = 0; k < quadsim_vectors_count; k++) {
-        const struct quadsim_vector *asked = &quadsim_vectors[k];
+        const struct quadsim_vector *recorded = &quadsim_vectors[k];
         const uint32_t started = target_ticks();
         char line[128], *end = line;
         quadsim_real command[4];
-        const int status = (int)quadsim_mpc_step(&mpc, asked->state, quadsim_vectors_path[k], asked->acting, command);
+        const int status = (int)quadsim_mpc_step(&mpc, recorded->state, quadsim_vectors_path[k], recorded->acting, command);
         const uint32_t ticks = target_ticks() - started;
         /* From QUADSIM_CLIPPED on there is no optimum to compare with. */
-        const int optimal = asked->status < (int)QUADSIM_CLIPPED;
+        const int optimal = recorded->status < (int)QUADSIM_CLIPPED;
         end = put(end, &k, sizeof k);
         end = put(end, &status, sizeof status);
         end = put(end, &mpc.changes, sizeof mpc.changes);
         for (j = 0; j < 4; j++) {
-            const quadsim_real off = command[j] - asked->command[j];
+            const quadsim_real off = command[j] - recorded->command[j];
             end = put(end, &command[j], sizeof command[j]);
             failed |= optimal && !(off <= QUADSIM_VECTORS_TOLERANCE && off >= -QUADSIM_VECTORS_TOLERANCE);
         }
@@ -44,7 +44,7 @@ int main(void)
         end[-1] = '\n';
         *end = '\0';
         target_print(line);
-        failed |= optimal ? status != asked->status : status < (int)QUADSIM_CLIPPED;
+        failed |= optimal ? status != recorded->status : status < (int)QUADSIM_CLIPPED;
     }
     target_print(failed ? "wrong: a status or a command is not the recorded one\n" : "right\n");
     return failed;

@@ -24,7 +24,7 @@ typedef @REAL@ quadsim_real;
 
 @SIZES@
 
-/* How a command was found.  The first three are the optimum; the others are what is left where there is none, or none
+/* How a command was found.  The first three are the optimum; the others are fallbacks where there is none, or none
  * was found, in this order. */
 enum quadsim_status {
     QUADSIM_FREE = 0,    /* the optimum without constraints keeps them all */
@@ -58,13 +58,13 @@ typedef struct quadsim_mpc {
     quadsim_real largest;                                        /* multiplier, as of rows of unit length */
     short row[QUADSIM_ROOM];                                     /* which they are */
     quadsim_real z[QUADSIM_ROOM];                                /* their multipliers */
-    quadsim_real goal[QUADSIM_ROOM];                             /* the multipliers that their bounds ask for */
+    quadsim_real goal[QUADSIM_ROOM];                             /* the multipliers that their bounds require */
     quadsim_real forward[QUADSIM_ROOM];                          /* L^-1 of the right side */
     quadsim_real pivot[QUADSIM_ROOM];                            /* D of L D L' */
     quadsim_real factor[QUADSIM_ROOM * (QUADSIM_ROOM + 1) / 2]; /* L, row by row, below its diagonal of ones */
 @STATE@} quadsim_mpc;
 
-/* Start anew after the command u(-1) [rad/s]. */
+/* Restart after the command u(-1) [rad/s]. */
 void quadsim_mpc_reset(quadsim_mpc *mpc, const quadsim_real speeds[4]);
 
 /* The command of the period that starts now, always finite and within the bounds on rotor speeds. */

@@ -26,23 +26,23 @@ static void put_active(const quadsim_mpc *mpc, double *answers)
     }
 }
 
-/* Asked: state [12], acting [4], reference [N][4]; whether the last period's end may be learnt from, and this one's.
+/* Inputs: state [12], acting [4], reference [N][4]; whether the last period's end may update the observer, and this one's.
  * Answered: status, changes, active rows, slack, command [4], plan [N][4]; then trim, lift and twist. */
-void quadsim_shim_step(quadsim_mpc *mpc, const double *asked, double *answers)
+void quadsim_shim_step(quadsim_mpc *mpc, const double *inputs, double *answers)
 {
     real state[12], acting[NU], reference[N * 4], command[NU];
     int i;
     for (i = 0; i < 12; i++) {
-        state[i] = (real)asked[i];
+        state[i] = (real)inputs[i];
     }
     for (i = 0; i < NU; i++) {
-        acting[i] = (real)asked[12 + i];
+        acting[i] = (real)inputs[12 + i];
     }
     for (i = 0; i < N * 4; i++) {
-        reference[i] = (real)asked[16 + i];
+        reference[i] = (real)inputs[16 + i];
     }
 #ifdef QUADSIM_OBSERVES
-    mpc->known = mpc->known && asked[16 + N * 4] > 0.0;
+    mpc->known = mpc->known && inputs[16 + N * 4] > 0.0;
 #endif
     answers[0] = (double)quadsim_mpc_step(mpc, state, reference, acting, command);
     answers[1] = (double)mpc->changes;
@@ -54,7 +54,7 @@ void quadsim_shim_step(quadsim_mpc *mpc, const double *asked, double *answers)
         answers[8 + i] = (double)mpc->plan[i];
     }
 #ifdef QUADSIM_OBSERVES
-    mpc->known = mpc->known && asked[17 + N * 4] > 0.0;
+    mpc->known = mpc->known && inputs[17 + N * 4] > 0.0;
     for (i = 0; i < NU; i++) {
         answers[8 + N * NU + i] = (double)mpc->trim[i];
     }

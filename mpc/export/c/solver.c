@@ -301,7 +301,7 @@ static int append(quadsim_mpc *mpc, int row, int side, real z)
     return 1;
 }
 
-/* Move what stands after a row that leaves one place ahead; its column of L goes to removed. */
+/* Move what follows a row that leaves forward by one; its column of L goes to removed. */
 static void close_gap(quadsim_mpc *mpc, int gap, real *removed)
 {
     int i, j;
@@ -321,7 +321,7 @@ static void close_gap(quadsim_mpc *mpc, int gap, real *removed)
     }
 }
 
-/* A row leaves.  L D L' of what stands after it gains pivot column column' (Gill, Golub, Murray and Saunders, 1974). */
+/* A row leaves.  L D L' of what follows it gains pivot column column' (Gill, Golub, Murray and Saunders, 1974). */
 static void leave(quadsim_mpc *mpc, int gap)
 {
     real column[ROOM], share = mpc->pivot[gap];
@@ -356,7 +356,7 @@ static real least_size(int row, int side)
     return side == 2 || side == -2 ? ROWS[row % M].l1 : R(0.0);
 }
 
-/* How far a multiplier may move in a direction [+1 or -1] before its side ends; negative: for ever. */
+/* How far a multiplier may move in a direction [+1 or -1] before its side ends; negative: never. */
 static real room_of(int row, int side, real z, real direction)
 {
     const real sign = side > 0 ? R(1.0) : R(-1.0), size = sign * z;
@@ -390,10 +390,10 @@ static int move_to_goal(quadsim_mpc *mpc)
     int stop = -1, j;
     for (j = 0; j < mpc->count; j++) {
         const int row = mpc->row[j];
-        const real off = wrong_by(mpc, row, mpc->goal[j]), way = mpc->goal[j] - mpc->z[j];
+        const real off = wrong_by(mpc, row, mpc->goal[j]), step = mpc->goal[j] - mpc->z[j];
         if (off > R(0.0)) {
-            const real room = room_of(row, mpc->side[row], mpc->z[j], way);
-            const real part = way > R(0.0) || way < R(0.0) ? room / magnitude(way) : R(0.0);
+            const real room = room_of(row, mpc->side[row], mpc->z[j], step);
+            const real part = step > R(0.0) || step < R(0.0) ? room / magnitude(step) : R(0.0);
             if (stop < 0 || part < share || (part <= share && off > worst)) {
                 share = part;
                 worst = off;
@@ -451,7 +451,7 @@ static int first_stop(const quadsim_mpc *mpc, int row, int side, real z, real di
     return stop;
 }
 
-/* A violated row joins; active ones that it depends on make way. */
+/* A violated row joins; active ones that it depends on leave. */
 static enum verdict enter(quadsim_mpc *mpc, int row, int side)
 {
     real combination[ROOM], z = R(0.0), length, direction;
@@ -717,7 +717,7 @@ static int has_bound(int row, int side)
 }
 
 /* The active rows of a set, at most as many as there is room for, and their multipliers as near to what their bounds
- * ask for as their sides let them. */
+ * require as far as their sides allow. */
 static void start_warm(quadsim_mpc *mpc, int only, const signed char *set)
 {
     int row, j;
@@ -741,7 +741,7 @@ static void start_warm(quadsim_mpc *mpc, int only, const signed char *set)
     }
 }
 
-/* The optimum over the rows of one axis, or over all, from a set, and again without one if that leads nowhere. */
+/* The optimum over the rows of one axis, or over all, from a set, and again without one if that fails. */
 static enum verdict optimum(quadsim_mpc *mpc, int only, const signed char *set)
 {
     enum verdict verdict;
@@ -846,7 +846,7 @@ static int keeps_bounds(const quadsim_mpc *mpc)
 /* The last active set moved one step earlier, its last step's held. */
 static void shift_set(quadsim_mpc *mpc)
 {
-    /* By way of side, which begins anew: of a loop a compiler makes memmove. */
+    /* Through side, which is reset: compilers turn a loop into memmove. */
     memcpy(mpc->side, mpc->last + M, sizeof(mpc->side) - M);
     memcpy(mpc->last, mpc->side, sizeof(mpc->side) - M);
 }

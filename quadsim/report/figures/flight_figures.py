@@ -293,9 +293,9 @@ def draw_effects(run: Run) -> Figure:
     panels = figure.subplot_mosaic([list(row) for row in halves + wholes], sharex=True)
     shown: dict[str, Artist] = {}
     if commanded is not None:
-        for name, asked, turned in zip(_ROTORS, commanded.T, log.plant.speeds.T, strict=True):
+        for name, command, turned in zip(_ROTORS, commanded.T, log.plant.speeds.T, strict=True):
             shown["commanded"] = panels[name].plot(
-                log.plant.t, asked, color=REFERENCE, drawstyle="steps-post", linewidth=1.0
+                log.plant.t, command, color=REFERENCE, drawstyle="steps-post", linewidth=1.0
             )[0]
             shown["acting"] = panels[name].plot(log.plant.t, turned, color=line_colour(0), linewidth=1.0)[0]
             panels[name].set_ylabel(f"{name} [rad/s]")

@@ -47,9 +47,9 @@ _MOST_MARGINS: Final = 6
 
 
 _LAST: Final = 1.0
-"""Time at a film's end [s] in which it says why a QP had no answer, or that the flight stayed in fallback."""
+"""Time at a film's end [s] in which it states why a QP had no answer, or that the flight stayed in fallback."""
 _SHOWN: Final = 2.0
-"""Time [s] for which it says what has happened."""
+"""Time [s] for which it shows what has happened."""
 _MOST_EVENTS: Final = 3
 _MOST_LINES: Final = 10
 """Of that: more would reach the strip at the bottom."""
@@ -127,8 +127,8 @@ class Overlay:
         if reason is not None and time >= control.t[-1]:
             lines.append((f"aborted {reason}"[:130], 15, RED))
         if time >= self._footage.times[-1] - _LAST:
-            said = [textwrap.wrap(sentence, _WIDEST) for sentence in failure_sentences(self._run.summary)]
-            parts = [part for sentence in said for part in sentence]
+            wrapped = [textwrap.wrap(sentence, _WIDEST) for sentence in failure_sentences(self._run.summary)]
+            parts = [part for sentence in wrapped for part in sentence]
             lines += [(part, 14, AMBER) for part in parts[:_MOST_LINES]]
             if len(parts) > _MOST_LINES:
                 lines.append(("... all of it is in summary.json", 14, AMBER))
@@ -232,7 +232,7 @@ class Overlay:
 
 
 def margin_rows(ranked: Sequence[MarginTrack], i: int) -> tuple[list[MarginTrack], str]:
-    """The limits that frame `i` shows, the first of those whose window has begun, and what is said of the others."""
+    """The limits that frame `i` shows, the first of those whose window has begun, and the text about the others."""
     begun = [track for track in ranked if not math.isnan(track.worst[i])]
     hidden = begun[_MOST_MARGINS:]
     broken = sum(track.worst[i] < -track.limit.tolerance for track in hidden)

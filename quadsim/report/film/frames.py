@@ -207,7 +207,7 @@ def _smooth(t: Array, values: Array) -> Array:
 
 def thin(points: Array, tolerance: float) -> np.ndarray[Any, np.dtype[np.intp]]:
     """Rows of a path (n, 3) that show it within `tolerance` [m], first and last included (Ramer-Douglas-Peucker)."""
-    kept, open_spans = {0, len(points) - 1}, [(0, len(points) - 1)]
+    thinned, open_spans = {0, len(points) - 1}, [(0, len(points) - 1)]
     while open_spans:
         first, last = open_spans.pop()
         inner, chord = points[first + 1 : last] - points[first], points[last] - points[first]
@@ -217,6 +217,6 @@ def thin(points: Array, tolerance: float) -> np.ndarray[Any, np.dtype[np.intp]]:
         apart = np.linalg.norm(inner - along[:, None] * chord, axis=1)
         if apart.max() > tolerance:
             middle = first + 1 + int(np.argmax(apart))
-            kept.add(middle)
+            thinned.add(middle)
             open_spans += [(first, middle), (middle, last)]
-    return np.array(sorted(kept))
+    return np.array(sorted(thinned))

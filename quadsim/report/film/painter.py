@@ -26,7 +26,7 @@ VIOLET: Final = (225, 120, 205)
 BRICK: Final = (206, 104, 82)
 
 _TEXTS: Final = 2048
-"""Texts that are kept as pictures, of each size of font: a film shows most of its words in every frame."""
+"""Texts that are cached as pictures, of each size of font: a film shows most of its words in every frame."""
 _SHADE: Final = (np.arange(256) * 0.24 + 12.0).astype(np.uint8)
 
 
@@ -68,7 +68,7 @@ class Painter:
         self._canvas.circle((place * self._scale).tolist(), radius * self._scale, fill=colour)
 
     def arrow(self, start: Array, reach: Array, colour: Colour) -> None:
-        """Draw from a place (2,) as far as `reach` (2,) says; nothing where that is shorter than its head."""
+        """Draw from a place (2,) by `reach` (2,); nothing where that is shorter than its head."""
         head, length = 6.0, math.hypot(*reach)
         if length < head:
             return

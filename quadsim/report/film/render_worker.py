@@ -103,7 +103,7 @@ class Stage:
         for obstacle in self._obstacles:
             if obstacle.moves:
                 body = self._model.body(obstacle_body(obstacle)).id
-                place = obstacle.places(shown.times[i : i + 1])[0]
+                place = obstacle.positions(shown.times[i : i + 1])[0]
                 self._data.mocap_pos[self._model.body_mocapid[body]] = place
         mujoco.mj_kinematics(self._model, self._data)
         mujoco.mj_camlight(self._model, self._data)
@@ -231,7 +231,7 @@ def draw_portrait(vehicle: Vehicle, path: Path, width: int, height: int) -> None
 
 
 def serve(requests: BinaryIO, pictures: BinaryIO) -> None:
-    """Draw one state after the other, as `quadsim.report.film.camera.Camera` asks for them, until it asks no more."""
+    """Draw one state after the other, as `quadsim.report.film.camera.Camera` requests them, until there are no more."""
     vehicle, obstacles, width, height = pickle.load(requests)
     model = compile_model(vehicle, visuals=True, obstacles=obstacles)
     model.vis.quality.offsamples = 0
@@ -253,7 +253,7 @@ def serve(requests: BinaryIO, pictures: BinaryIO) -> None:
             for obstacle in obstacles:
                 if obstacle.moves:
                     body = model.body(obstacle_body(obstacle)).id
-                    data.mocap_pos[model.body_mocapid[body]] = obstacle.places(np.array([time]))[0]
+                    data.mocap_pos[model.body_mocapid[body]] = obstacle.positions(np.array([time]))[0]
             lowest = max(min(lowest, numbers[2]), -_DEEPEST_FLOOR)
             model.geom(FLOOR).pos[2] = lowest + floor
             mujoco.mj_kinematics(model, data)

@@ -39,7 +39,7 @@ Progress = Callable[[int, int], None]
 
 
 def rendering_backend() -> str:
-    """The OpenGL back end, `egl` or `osmesa`, that renders on this machine; MUJOCO_GL says which to try first.
+    """The OpenGL back end, `egl` or `osmesa`, that renders on this machine; MUJOCO_GL names the one to try first.
 
     Raises:
         RenderingUnavailableError: none does; with the output of each.
@@ -58,7 +58,7 @@ def rendering_backend() -> str:
     raise RenderingUnavailableError(tried)
 
 
-@functools.cache  # one that renders is not asked again by this process; one that does not, raises, and is
+@functools.cache  # a working one is not tried again by this process; one that raises is
 def _probe(backend: str) -> None:
     command = [*_WORKER, "probe"]
     subprocess.run(command, env=_environment(backend), check=True, capture_output=True, timeout=_PROBE_SECONDS)

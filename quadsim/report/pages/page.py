@@ -15,7 +15,7 @@ _TEMPLATES: Final = Path(__file__).resolve().parent.parent / "templates"
 def render_page(template: str, kind: str, **context: Any) -> str:
     """A page of a kind, e.g. `comparison`, from its template in `quadsim/report/templates` and the variables of that.
 
-    Whatever these hold is printable text, unless the template says otherwise.
+    Whatever these hold is printable text, unless the template states otherwise.
     """
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
 

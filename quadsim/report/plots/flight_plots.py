@@ -50,7 +50,7 @@ def comparison_plots(runs: Sequence[Run]) -> list[Plot]:
 def thin(values: Array, points: int) -> np.ndarray[Any, np.dtype[np.intp]]:
     """Rising indices of about `points` of the values (K,): the lowest and highest of each segment, so no peak is lost.
 
-    The first, the last, and all gaps, where a value is not finite, are kept.
+    The first, the last, and all gaps, where a value is not finite, are retained.
     """
     if values.size <= points:
         return np.arange(values.size)
@@ -60,8 +60,8 @@ def thin(values: Array, points: int) -> np.ndarray[Any, np.dtype[np.intp]]:
     rows = -(-values.size // stride)
     segments = np.pad(values, (0, rows * stride - values.size), mode="edge").reshape(rows, stride)
     starts = stride * np.arange(rows)
-    kept = np.concatenate([[0, values.size - 1], starts + segments.argmin(axis=1), starts + segments.argmax(axis=1)])
-    return np.unique(np.minimum(np.concatenate([kept, gaps]), values.size - 1))
+    thinned = np.concatenate([[0, values.size - 1], starts + segments.argmin(axis=1), starts + segments.argmax(axis=1)])
+    return np.unique(np.minimum(np.concatenate([thinned, gaps]), values.size - 1))
 
 
 class _Plotter:
@@ -169,8 +169,8 @@ class _Plotter:
     def _curve(self, figure: Figure, panel: int, t: Array, values: Array, mode: str = "lines", **style: Any) -> None:
         from plotly.graph_objects import Scatter
 
-        kept = thin(values, self._points)
-        x, y = t[kept].astype(np.float32), values[kept].astype(np.float32)
+        thinned = thin(values, self._points)
+        x, y = t[thinned].astype(np.float32), values[thinned].astype(np.float32)
         figure.add_trace(Scatter(x=x, y=y, mode=mode, **style), **place(panel))
 
     def _references(self, figure: Figure, panel: int, name: str) -> None:

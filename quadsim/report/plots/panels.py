@@ -31,7 +31,7 @@ class Plot:
         height: its height [pixels].
         timed: whether its horizontal axes are time, linked with those of the other plots.
         json: the figure as plotly's JSON, safe inside a script element.
-        key_colours: names of its lines and their colours, where the page is to tell them above it.
+        key_colours: names of its lines and their colours, where the page shows them above it.
     """
 
     key: str

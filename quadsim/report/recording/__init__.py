@@ -9,7 +9,7 @@ Everything stands on one timeline, `sim_time`, the simulated time:
     reference/NAME      what x, y, z and yaw should be
     limits/NAME         the bounds, drawn with their signal
     margins/NAME        signed distance to the nearer bound at the control samples; negative = violated
-    verdicts/NAME       what that says: holds, active, violated
+    verdicts/NAME       its verdict: holds, active, violated
     solver/NAME         what each step of the controller took and answered
     effects/NAME        external force and torque, wind, commands that rotors do not follow at once; where there are any
     events, summary     texts

@@ -140,7 +140,7 @@ def send_space(recording: rr.RecordingStream, run: Run) -> None:
             recording.log(f"{entity}/{i}", part, static=True)
         if obstacle.moves:
             t = run.log.plant.t
-            moving = rr.Transform3D.columns(translation=obstacle.places(t))
+            moving = rr.Transform3D.columns(translation=obstacle.positions(t))
             recording.send_columns(entity, [time_column(t)], moving)
         else:
             recording.log(entity, rr.Transform3D(translation=obstacle.position), static=True)

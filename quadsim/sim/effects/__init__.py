@@ -151,7 +151,7 @@ class Effects:
 
 
 class Force(Protocol):
-    """A force of one's own on the vehicle: called once per physics step, at its begin.
+    """A user-defined force on the vehicle: called once per physics step, at its begin.
 
     What has memory may have a method `reset()`, called before a flight.
     """

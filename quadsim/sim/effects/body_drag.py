@@ -1,4 +1,4 @@
-"""The ellipsoid that stands for the body in the air: its semi-axes, and the air that it takes along."""
+"""The ellipsoid in place of the body for drag: its semi-axes, and its added mass."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """Forces that follow from how the vehicle moves, evaluated once per physics step.
 
 Written with plain numbers: it runs a thousand times per simulated second, where small arrays would cost more than all
-of MuJoCo's step.  What follows from the rotors alone is worked out beforehand for many steps at once.
+of MuJoCo's step.  What follows from the rotors alone is computed for many steps at once.
 """
 
 from __future__ import annotations

@@ -33,7 +33,7 @@ Factor = Annotated[float, Ge(0.05), Le(20.0)]
 
 @dataclass(frozen=True, kw_only=True)
 class Load:
-    """How the vehicle that flies differs from its file, which the controller goes on believing."""
+    """How the vehicle that flies differs from its file, which the controller still assumes."""
 
     mass_factor: Annotated[Factor, doc("[-] real mass over the file's")] = 1.0
     inertia_factor: Annotated[
@@ -73,11 +73,11 @@ def mass_properties(vehicle: Vehicle, load: Load, payloads: Sequence[Payload]) -
         rule = f"such that no moment of {np.diagonal(own).tolist()} kg m^2 exceeds the sum of the other two"
         raise ParameterError("effects.load", "inertia_factor", list(load.inertia_factor), rule)
     masses = np.array([vehicle.mass * load.mass_factor, *(payload.mass for payload in payloads)])
-    places = np.array([load.centre_of_mass, *(payload.position for payload in payloads)], float)
+    positions = np.array([load.centre_of_mass, *(payload.position for payload in payloads)], float)
     total = float(masses.sum())
-    centre = masses @ places / total
+    centre = masses @ positions / total
     inertia = own
-    for mass, arm in zip(masses, places - centre, strict=True):
+    for mass, arm in zip(masses, positions - centre, strict=True):
         inertia = inertia + mass * (arm @ arm * np.eye(3) - np.outer(arm, arm))
     return MassProperties(mass=total, centre=centre, inertia=inertia)
 

@@ -1,4 +1,4 @@
-"""Thrust that is lost and fluctuates, drawn anew in each physics step."""
+"""Thrust that is lost and fluctuates, drawn in each physics step."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class ThrustNoise:
                 raise ParameterError("effects.thrust_noise", name, getattr(self, name), "at least 0 and finite")
 
     def applied(self, thrusts: Array, largest: float, rng: np.random.Generator) -> Array:
-        """The thrusts (M, 4) [N] over M steps that are given where these are asked for, of `largest` [N] at most."""
+        """The thrusts (M, 4) [N] over M steps that result where these are commanded, of `largest` [N] at most."""
         share = thrusts / largest
         lost = self.loss * np.square(share) + self.deviation * np.sqrt(share) * rng.standard_normal(share.shape)
         given: Array = largest * np.clip(share - lost, 0.0, 1.0)

@@ -37,7 +37,7 @@ SLOWEST_AIRSPEED, FASTEST_AIRSPEED = 0.01, 200.0
 """[m/s] at which turbulence may pass; at the slower one, it takes hours."""
 _METRES_PER_FOOT: Final = 0.3048
 _BLOCK: Final = 4096
-"""Samples made at a time: their number is fixed, so that it makes no difference how many are asked for at once."""
+"""Samples made at a time: their number is fixed, so that it makes no difference how many are drawn at once."""
 _OUTPUT: Final = np.array([[1.0, *2 * [math.sqrt(1.5)]], [0.0, *2 * [(1.0 - math.sqrt(3.0)) / math.sqrt(2.0)]]])
 """(2, 3) what the states a and b of `discretise` give to u, v, w at unit sigma; from the partial fractions of H."""
 

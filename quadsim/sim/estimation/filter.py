@@ -1,9 +1,9 @@
 """The error-state extended Kalman filter over time: samples in the order they were taken, however late they arrive.
 
 The filter stands at the fusion horizon, now less the largest delay: every sample taken before has arrived and has been
-used, in the order of the time stamps.  What has arrived since is kept, and each time an estimate is asked for it is
+used, in the order of the time stamps.  What has arrived since is stored, and each time an estimate is requested it is
 used on a copy that runs on to now; so a late sample corrects the past it belongs to.  Rotor speeds, and whether the
-vehicle stood, are kept likewise for each step since the horizon.
+vehicle stood, are stored likewise for each step since the horizon.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ NEEDED: Final = (SensorName.POSITION, SensorName.ATTITUDE)
 """Sensors without which position or heading would drift without bound."""
 _NAMES: Final = list(SensorName)
 _LARGEST: Final = 1e6
-"""A mean or a sample beyond this in magnitude [SI units], or not a number, tells nothing."""
+"""A mean or a sample beyond this in magnitude [SI units], or not a number, is no information."""
 _LARGEST_VARIANCE: Final = 1e15
 """The same for the trace of a covariance."""
 
@@ -156,8 +156,8 @@ class ErrorStateFilter:
         ripe = bisect.bisect_right(self._waiting, horizon, key=lambda sample: sample.taken)
         self._run(self._track, self._waiting[:ripe])
         del self._waiting[:ripe]
-        kept = bisect.bisect_right(self._starts, self._track.step) - 1
-        del self._starts[:kept], self._drives[:kept]
+        first = bisect.bisect_right(self._starts, self._track.step) - 1
+        del self._starts[:first], self._drives[:first]
 
     def estimate(self, step: int) -> Estimate:
         """The estimate at a physics step, no earlier than the last one that was given."""

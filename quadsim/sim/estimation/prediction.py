@@ -174,14 +174,14 @@ def _gathered(density: Array) -> tuple[Array, Array, Array]:
 
 
 def _blocks() -> tuple[Array, Array, Array]:
-    kept, variance, walk = np.ones(N_ERRORS), np.zeros(N_ERRORS), np.zeros(N_ERRORS)
-    kept[VELOCITY] = kept[RATES] = 0.0
+    retained, variance, walk = np.ones(N_ERRORS), np.zeros(N_ERRORS), np.zeros(N_ERRORS)
+    retained[VELOCITY] = retained[RATES] = 0.0
     variance[VELOCITY], variance[RATES] = STILL_VELOCITY**2, STILL_RATE**2
     walk[POSITION], walk[ATTITUDE] = STILL_TIME * STILL_VELOCITY**2, STILL_TIME * STILL_RATE**2
-    return read_only(np.outer(kept, kept)), read_only(np.diag(variance)), read_only(np.diag(walk))
+    return read_only(np.outer(retained, retained)), read_only(np.diag(variance)), read_only(np.diag(walk))
 
 
-_KEPT, _VARIANCE, _WALK = _blocks()
+_RETAINED, _VARIANCE, _WALK = _blocks()
 """(15, 15) each: 1 where neither velocity nor rates have a part and else 0; their variance; the growth of the rest."""
 
 
@@ -200,6 +200,6 @@ def stand(model: MotionModel, estimate: Estimate, duration: float) -> Estimate:
     """
     mean = estimate.mean.copy()
     mean[VELOCITY] = mean[MEAN_RATES] = 0.0
-    covariance = _KEPT * estimate.covariance + _VARIANCE + duration * _WALK
+    covariance = _RETAINED * estimate.covariance + _VARIANCE + duration * _WALK
     covariance[GYRO_BIAS, GYRO_BIAS] += duration * model.noise[0][GYRO_BIAS, GYRO_BIAS]
     return Estimate(mean=mean, covariance=covariance)

@@ -58,7 +58,7 @@ OBSERVATION: Final = {name: _observation(name) for name in SensorName}
 
 
 def innovation(name: SensorName, mean: Array, value: Array) -> Array:
-    """(3,) what a sample (3,) says beyond the mean (16,), in the sensor's unit."""
+    """(3,) a sample (3,) less that predicted by the mean (16,), in the sensor's unit."""
     if name is SensorName.ATTITUDE:
         w, x, y, z = mean[MEAN_QUATERNION].tolist()
         roll, pitch, yaw = value.tolist()

@@ -20,7 +20,7 @@ _COLUMNS = {
     SensorName.ATTITUDE: slice(4, 8),
     SensorName.RATES: slice(11, 14),
 }
-"""Where a sensor's quantity stands in MuJoCo's state; see `quadsim.sim.physics.physics_to_state`."""
+"""Where a sensor's quantity is in MuJoCo's state; see `quadsim.sim.physics.physics_to_state`."""
 
 _BLOCK: Final = 256
 """Samples whose errors are drawn at a time."""
@@ -46,7 +46,7 @@ class Sample(NamedTuple):
 
 
 def truth(name: SensorName, physics: Array) -> Array:
-    """What a perfect sensor says (M, 3) of MuJoCo's states (M, 14)."""
+    """A perfect sensor's samples (M, 3) of MuJoCo's states (M, 14)."""
     values = physics[:, _COLUMNS[name]]
     return quaternion_to_euler(values) if name is SensorName.ATTITUDE else values.copy()
 

@@ -18,7 +18,7 @@ static char *append(char *line, const void *value, int bytes)
 
 int main(void)
 {
-    static real vectors[VECTORS], asked[ASKED];
+    static real vectors[VECTORS], inputs[INPUTS];
     uint32_t k;
     for (k = 0; k < PERIODS; k++) {
         char line[128], *end = line;
@@ -26,19 +26,19 @@ int main(void)
         int i, j, iterations;
         uint32_t ticks, status;
         for (i = 0; i < 12; i++) {
-            asked[i] = STATE[k * 12 + i];
+            inputs[i] = STATE[k * 12 + i];
         }
-        for (i = 0; i < ASKED - 17; i++) {
-            asked[12 + i] = PATH[k * 4 + i];
+        for (i = 0; i < INPUTS - 17; i++) {
+            inputs[12 + i] = PATH[k * 4 + i];
         }
         for (i = 0; i < 4; i++) {
-            asked[ASKED - 5 + i] = ACTING[k * 4 + i];
+            inputs[INPUTS - 5 + i] = ACTING[k * 4 + i];
         }
-        asked[ASKED - 1] = R(1.0);
+        inputs[INPUTS - 1] = R(1.0);
         for (i = 0; i < VECTORS; i++) {
             vectors[i] = R(0.0);
-            for (j = 0; j < ASKED; j++) {
-                vectors[i] += MAP[i * ASKED + j] * asked[j];
+            for (j = 0; j < INPUTS; j++) {
+                vectors[i] += MAP[i * INPUTS + j] * inputs[j];
             }
         }
         ticks = target_ticks();

@@ -1,4 +1,4 @@
-"""The mixer: exact where it can be, yaw first to give way, always within bounds."""
+"""The mixer: exact where it can be, yaw limited first, always within bounds."""
 
 from __future__ import annotations
 
@@ -39,8 +39,8 @@ def test_a_wrench_that_can_be_given_is(name: str, shares: np.ndarray) -> None:
 
 
 @given(name=NAMES, shares=SHARES, yaw=st.floats(-20.0, 20.0), seed=st.integers(0, 10**6))
-def test_thrust_roll_and_pitch_are_kept_and_yaw_gives_way(name: str, shares: np.ndarray, yaw: float, seed: int) -> None:
-    """Of a point within the bounds, with another yaw torque asked for than it gives."""
+def test_thrust_roll_and_pitch_have_priority_over_yaw(name: str, shares: np.ndarray, yaw: float, seed: int) -> None:
+    """Of a point within the bounds, with another yaw torque demanded than it gives."""
     allocation = ALLOCATIONS[name]
     lower, upper = box(name, seed)
     possible = np.sqrt(lower**2 + shares * (upper**2 - lower**2))
@@ -54,7 +54,7 @@ def test_thrust_roll_and_pitch_are_kept_and_yaw_gives_way(name: str, shares: np.
 
 @settings(max_examples=50)
 @given(name=NAMES, seed=st.integers(0, 10**6), size=st.sampled_from([1.0, 10.0, 1e4]))
-def test_whatever_is_asked_the_speeds_are_finite_and_within_bounds(name: str, seed: int, size: float) -> None:
+def test_for_any_demand_the_speeds_are_finite_and_within_bounds(name: str, seed: int, size: float) -> None:
     allocation = ALLOCATIONS[name]
     lower, upper = box(name, seed)
     wrench = size * np.random.default_rng(seed).normal(size=4) * allocation.scale

@@ -21,13 +21,13 @@ from quadsim.vehicle import Vehicle
 PERIOD = 0.002
 NONE = Integrals(translation=np.zeros(3), rotation=np.zeros(3))
 DRAGS = [(0.0, 0.0, 0.0), (0.5, 0.5, 0.2), (0.6, 0.3, 0.1)]
-PLACES, RATES = np.array([2.0, 1.5, 0.5]), np.array([1.1, 1.7, 1.3])
+AMPLITUDES, RATES = np.array([2.0, 1.5, 0.5]), np.array([1.1, 1.7, 1.3])
 PHASES = np.array([0.3, 1.0, 2.0])
 
 
 def sine(t: float) -> list[Array]:
     """Position to snap (3,) of a motion of three sines."""
-    return [PLACES * RATES**n * np.sin(RATES * t + PHASES + 0.5 * n * np.pi) for n in range(5)]
+    return [AMPLITUDES * RATES**n * np.sin(RATES * t + PHASES + 0.5 * n * np.pi) for n in range(5)]
 
 
 def target_at(t: float) -> Target:
@@ -96,15 +96,15 @@ def test_on_the_trajectory_the_law_gives_the_flat_torque(vehicle: Vehicle, drag:
             rates=wanted.rates,
             yaw=target.yaw,
         )
-        wrench, asked = law.wrench(on_it, target, NONE)
-        np.testing.assert_allclose(asked.attitude, wanted.attitude, atol=1e-12)
+        wrench, commanded = law.wrench(on_it, target, NONE)
+        np.testing.assert_allclose(commanded.attitude, wanted.attitude, atol=1e-12)
         torque = J * wanted.acceleration + np.cross(wanted.rates, J * wanted.rates)
         np.testing.assert_allclose(wrench[1:], torque, atol=1e-9 * np.abs(torque).max())
         later, before = (flat(vehicle, np.array(drag), t + ahead)[0] for ahead in (0.5 * PERIOD, 0.0))
         assert wrench[0] == pytest.approx(later, abs=0.05 * abs(later - before))  # of half a period on, to first order
 
 
-def test_a_motion_s_samples_tell_its_derivatives_and_near_its_end_as_many_as_they_can(vehicle: Vehicle) -> None:
+def test_a_motion_s_samples_give_its_derivatives_and_near_its_end_as_many_as_they_can(vehicle: Vehicle) -> None:
     period = 0.02
     samples = [sine(period * k)[:3] for k in range(40)]
     motion = motion_along(*np.array(samples).transpose(1, 0, 2), period=period, vehicle=vehicle)
@@ -134,5 +134,5 @@ def test_drag_is_refused_where_nothing_is_fed_forward(vehicle: Vehicle) -> None:
 
 def test_a_preview_too_short_for_snap_is_refused(vehicle: Vehicle) -> None:
     settings = geometric_settings(vehicle, period=0.05, feedforward=True, horizon=PREVIEW_DEGREE)
-    with pytest.raises(ParameterError, match=r"controller\.horizon must be at least 5, to tell a snap"):
+    with pytest.raises(ParameterError, match=r"controller\.horizon must be at least 5, for a snap"):
         GeometricController(vehicle, settings)

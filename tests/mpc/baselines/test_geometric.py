@@ -38,7 +38,7 @@ TARGET = Target(
 
 
 def wanted_after(law: GeometricController, vehicle: Vehicle, h: float) -> tuple[np.ndarray, Wanted]:
-    """R_c and what the law says of it, `h` [s] on, the vehicle having moved under the law's thrust."""
+    """R_c and the law's rates of it, `h` [s] on, the vehicle having moved under the law's thrust."""
     wrench, _ = law.wrench(MOTION, TARGET, NONE)
     acceleration = wrench[0] / vehicle.mass * MOTION.attitude[:, 2] - np.array([0.0, 0.0, vehicle.gravity])
     motion = replace(

@@ -110,7 +110,7 @@ def test_every_loop_is_stable_at_20_hz_and_with_its_rotors_own_lag(
     assert spectral_radius(craft, law, memory, delay=0.02) < 1.0
 
 
-def test_the_radius_tells_an_unstable_loop(vehicle: Vehicle, build: Callable[..., Any]) -> None:
+def test_the_radius_shows_an_unstable_loop(vehicle: Vehicle, build: Callable[..., Any]) -> None:
     """With rotors far slower than the gains allow for."""
     law, memory = law_of("pid", vehicle, build)
     assert spectral_radius(vehicle, law, memory, lag=0.4) > 1.0

@@ -130,7 +130,7 @@ def test_the_lqr_plans_what_its_model_goes_on_to_do(vehicle: Vehicle, build: Cal
 
 
 def test_a_turning_target_is_turned_with(vehicle: Vehicle, build: Callable[..., Any]) -> None:
-    """On the heading and turning as fast, no yaw torque is asked for; tilted, the turn is still about world z."""
+    """On the heading and turning as fast, no yaw torque is demanded; tilted, the turn is still about world z."""
     controller = build("pid", vehicle)
     turning = replace(REST, yaw=0.4, yaw_rate=0.8)
     state = make_state(euler=(0.0, 0.0, 0.4))

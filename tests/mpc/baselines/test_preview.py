@@ -12,7 +12,7 @@ from quadsim.errors import ParameterError
 
 
 @pytest.mark.parametrize("samples", [3, 10, 25])
-def test_a_parabola_is_told_exactly(samples: int) -> None:
+def test_a_parabola_is_differentiated_exactly(samples: int) -> None:
     t = 0.1 * np.arange(1, samples + 1)
     reference = np.stack([1.0 + 2.0 * t - 3.0 * t**2, 4.0 * t, t**2, 0.5 - t + 0.25 * t**2], axis=1)
     target = target_of(reference, differentiator(samples, 0.1))

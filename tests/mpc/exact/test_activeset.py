@@ -19,7 +19,7 @@ from mpc.exact.shortcut import Shortcut
 from mpc.ocp import Problem
 from mpc.paper.condensed import condensed
 from mpc.qp import QP, Solution, Vectors, kkt_residuals
-from mpc.solvers import QPSolver, Way
+from mpc.solvers import Method, QPSolver
 from mpc.solvers.piqp_backends import PiqpDense
 from quadsim.controller import ACCEPTED, SOLVED
 from quadsim.state import Array
@@ -161,8 +161,8 @@ def test_rows_are_active_and_violated_in_random_problems(soft: float) -> None:
 
 
 @pytest.mark.parametrize("off", [0.0, 1e-7, 1e-3, 1.0])
-def test_approximate_multipliers_tell_the_active_set(off: float) -> None:
-    """Of an interior-point method's, as they are and spoilt: one step suffices where they are good."""
+def test_approximate_multipliers_give_the_active_set(off: float) -> None:
+    """Of an interior-point method's, as they are and corrupted: one step suffices where they are good."""
     for seed in range(50):
         rng = np.random.default_rng(seed)
         problem = random_rows(rng, n=8, rows=8, soft=0.5, least=0.1)
@@ -199,7 +199,7 @@ def test_it_agrees_with_an_interior_point_method(seed: int, soft: float, share: 
 
 
 def test_it_is_found_along_a_plan_and_mostly_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    """What the test above rests on; and where all changes at once lead nowhere, one at a time lead there."""
+    """What the test above rests on; and where all changes at once fail, one at a time succeeds."""
     one_by_one, count = ActiveSet._one_by_one, [0]
 
     def counted(self: ActiveSet, *arguments: Any) -> Any:
@@ -247,7 +247,7 @@ def twice(upper: Array, *, soft: bool = False) -> Rows:
     return Rows(np.eye(2), np.array([-2.0, 0.0]), G, np.full(2, -5.0), upper, penalty, np.full(2, 1.0))
 
 
-def test_dependent_rows_are_given_up_or_told_apart() -> None:
+def test_dependent_rows_are_dropped_or_distinguished() -> None:
     """Both active at one bound, no multipliers are the only ones; with bounds apart the tighter row is the active one.
 
     Soft ones have multipliers that are theirs alone.
@@ -327,7 +327,7 @@ def certified(qp: QP, solution: Solution) -> Array | None:
     """The optimum x, in extended precision, of the rows that a solution calls active; None where it proves not to be.
 
     Feasible, with multipliers of the right signs and the gradient they must have, x is the one optimum of a strictly
-    convex QP, whoever called what active.
+    convex QP, for any initial active set.
     """
     n, wide = qp.c.size, np.longdouble
     rows = np.vstack([np.eye(n), np.asarray(qp.G)])
@@ -414,7 +414,7 @@ def test_whole_qps_are_brought_to_the_optimum(ratio: float, room: float, off: fl
 
 
 def test_active_constraints_that_depend_on_each_other() -> None:
-    """The paper's vehicle told to drop 100 m: its rotors slow down by 10 rad/s a step, and then stand still.
+    """The paper's vehicle commanded to drop 100 m: its rotors slow down by 10 rad/s a step, and then stand still.
 
     With hover at 200 rad/s the twentieth step ends at zero: that step, those before it and the bound of zero depend on
     each other.  The answer is right, or none, and the solver's stands.
@@ -435,9 +435,9 @@ def test_active_constraints_that_depend_on_each_other() -> None:
 
 @pytest.mark.parametrize(("ratio", "exact"), [(1.0, 1e-10), (1e9, 1e-5)])
 def test_every_way_ends_at_the_optimum(ratio: float, exact: float) -> None:
-    """Without a QP, axis by axis and by the whole QP: docs/controllers.md tells these numbers."""
-    errors: dict[Way, list[float]] = {way: [] for way in Way}
-    asked = 0
+    """Without a QP, axis by axis and by the whole QP: docs/controllers.md states these numbers."""
+    errors: dict[Method, list[float]] = {method: [] for method in Method}
+    queries = 0
     for seed in range(100):
         rng = np.random.default_rng(seed)
         problem = spread(random_axes(rng, horizon=6, room=float(rng.choice([1.0, 10.0, 1000.0]))), rng, ratio)
@@ -448,9 +448,9 @@ def test_every_way_ends_at_the_optimum(ratio: float, exact: float) -> None:
             continue
         formulation = condensed(problem)
         x = certified(formulation.qp.with_vectors(formulation.vectors(*query)), answer.solution)
-        asked += 1
+        queries += 1
         if x is not None:
-            errors[answer.way].append(np.abs(answer.plan.ravel() - x).max())
+            errors[answer.method].append(np.abs(answer.plan.ravel() - x).max())
     assert min(map(len, errors.values())) > 10
-    assert sum(map(len, errors.values())) >= 0.95 * asked
+    assert sum(map(len, errors.values())) >= 0.95 * queries
     assert max(map(max, errors.values())) < exact

@@ -100,7 +100,7 @@ def test_one_piece_is_one_axis() -> None:
         np.testing.assert_array_equal(ours, its)
 
 
-def test_a_bounded_axis_that_nothing_moves_or_that_nothing_is_asked_of_leaves_one_piece() -> None:
+def test_a_bounded_axis_that_nothing_moves_or_without_a_set_point_leaves_one_piece() -> None:
     problem = paper_problem()
     B = problem.model.B.copy()
     B[[STATE_NAMES.index(name) for name in ("y", "vy", "roll", "roll_rate")]] = 0.0
@@ -112,7 +112,7 @@ def test_a_bounded_axis_that_nothing_moves_or_that_nothing_is_asked_of_leaves_on
     assert names(indifferent) == set()
 
 
-def test_an_unbounded_axis_that_nothing_is_asked_of_is_left_out() -> None:
+def test_an_unbounded_axis_without_a_set_point_is_left_out() -> None:
     problem = paper_problem(
         "paper-constrained",
         "controller.output_weights={x=1.0, y=1.0, z=1.0}",
@@ -122,7 +122,7 @@ def test_an_unbounded_axis_that_nothing_is_asked_of_is_left_out() -> None:
 
 
 def test_a_row_of_nothing_leaves_one_piece() -> None:
-    """By a weight on it with another row, what it is asked to be would count."""
+    """By a weight on it with another row, its set-point would count."""
     problem = paper_problem()
     C_r = problem.objective.C_r.copy()
     C_r[0] = 0.0
@@ -140,7 +140,7 @@ def cost(problem: Problem, state: Array, desired: Array, moves: Array) -> float:
 
 
 def test_costs_and_outputs_fall_apart() -> None:
-    """Whatever the inputs of an axis, they change its own cost, states and outputs, and nobody else's."""
+    """Whatever the inputs of an axis, they change its own cost, states and outputs, and no other's."""
     rng = np.random.default_rng(3)
     problem = random_axes(rng, horizon=5, room=1.0)
     assert problem.bounds is not None

@@ -16,7 +16,7 @@ from mpc.exact.axes import axes
 from mpc.exact.free import FreeOptimum
 from mpc.exact.shortcut import Shortcut
 from mpc.ocp import Problem, Rest, lqr_terminal_weight
-from mpc.solvers import QPSolver, Way
+from mpc.solvers import Method, QPSolver
 from quadsim.controller import ACCEPTED, SOLVED
 from quadsim.state import Array
 
@@ -59,14 +59,14 @@ def test_every_way_ends_at_the_peers_optimum(seed: int, terms: set[str], size: f
 @pytest.mark.parametrize("terms", [(), ("Q_d",), ("P",), ("rest",), TERMS])
 def test_every_way_is_taken(terms: tuple[str, ...]) -> None:
     """What the test above rests on; and that these terms leave the axes apart."""
-    ways = []
+    methods = []
     for seed in range(60):
         rng = np.random.default_rng(seed)
         size, room = float(rng.choice([0.05, 2.0])), float(rng.choice([1.0, 1000.0]))
         problem, query = drawn(rng, terms, size=size, room=room)
         assert len(axes(problem)) == 3
-        ways.append(Shortcut(problem, QPSolver("piqp-multistage", problem)).solve(*query).way)
-    assert min(ways.count(way) for way in Way) >= 5
+        methods.append(Shortcut(problem, QPSolver("piqp-multistage", problem)).solve(*query).method)
+    assert min(methods.count(method) for method in Method) >= 5
 
 
 def test_moves_that_tie_the_axes_leave_one_piece() -> None:
@@ -81,7 +81,7 @@ def test_moves_that_tie_the_axes_leave_one_piece() -> None:
 
 
 def test_values_of_rows_are_those_of_the_plan() -> None:
-    """C x along the free optimum, rolled out; deviations from rest are all that it is told."""
+    """C x along the free optimum, rolled out; it receives only deviations from rest."""
     problem, (state, desired, before, rest) = drawn(np.random.default_rng(2), TERMS, size=0.5, room=1.0)
     parts = axes(problem)
     free = FreeOptimum(problem, parts)

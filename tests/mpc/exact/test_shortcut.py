@@ -1,4 +1,4 @@
-"""The ways around the whole QP: they answer exactly where no other constraint bars the way, and with its solution."""
+"""Shortcuts around the whole QP: exact where no other constraint is violated, with its solution."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from mpc.paper.condensed import condensed
 from mpc.paper.constraints import inequalities
 from mpc.paper.prediction import prediction
 from mpc.qp import kkt_residuals
-from mpc.solvers import Answer, QPSolver, Way
+from mpc.solvers import Answer, Method, QPSolver
 from mpc.unconstrained import sequence_gains
 from quadsim.controller import SOLVED, UNCONSTRAINED, Moment
 from quadsim.state import Array
@@ -34,8 +34,8 @@ def shortcut(problem: Problem, solver: str = "piqp-multistage") -> Shortcut:
 def free_plan(problem: Problem, state: Array, desired: Array, u_before: Array) -> Array | None:
     """The plan, where no QP was needed."""
     answer = shortcut(problem).solve(state, desired, u_before)
-    assert (answer.way is Way.FREE) == (answer.solution.status == UNCONSTRAINED)
-    return answer.plan if answer.way is Way.FREE else None
+    assert (answer.method is Method.FREE) == (answer.solution.status == UNCONSTRAINED)
+    return answer.plan if answer.method is Method.FREE else None
 
 
 def largest_residual(problem: Problem, answer: Answer, *query: Array) -> float:
@@ -89,13 +89,13 @@ def test_axis_by_axis_is_the_whole_where_and_only_where_inputs_stay_in_bounds(
     n, nu = problem.model.n, problem.model.nu
     query = (size * rng.normal(size=n), size * rng.normal(size=(horizon, n)), problem.model.u_bar)
     found, whole = shortcut(problem).solve(*query), QPSolver("piqp-dense", problem).solve(*query)
-    if found.way is Way.WHOLE:
+    if found.method is Method.WHOLE:
         bounds = problem.bounds
         assert bounds is not None
         far = np.full(nu, 1e9)
         wide = replace(bounds, u_min=bounds.u_min - far, u_max=bounds.u_max + far, delta_min=-far, delta_max=far)
         without = shortcut(replace(problem, bounds=wide)).solve(*query)
-        if without.solution.status == SOLVED and without.way is not Way.WHOLE:
+        if without.solution.status == SOLVED and without.method is not Method.WHOLE:
             steps = np.diff(without.plan, axis=0, prepend=query[2][None])
             inside = (bounds.u_min <= without.plan) & (without.plan <= bounds.u_max)
             assert not (inside & (bounds.delta_min <= steps) & (steps <= bounds.delta_max)).all()
@@ -108,18 +108,18 @@ def test_axis_by_axis_is_the_whole_where_and_only_where_inputs_stay_in_bounds(
 
 def test_every_way_is_taken_by_random_problems() -> None:
     """What the test above rests on."""
-    ways = []
+    methods = []
     for seed in range(60):
         rng = np.random.default_rng(seed)
         problem = random_axes(rng, horizon=6, room=float(rng.choice([1.0, 1000.0])))
         size, n = rng.choice([0.1, 2.0]), problem.model.n
-        ways.append(shortcut(problem).solve(size * rng.normal(size=n), np.zeros((6, n)), problem.model.u_bar).way)
-    assert min(ways.count(way) for way in Way) >= 5
+        methods.append(shortcut(problem).solve(size * rng.normal(size=n), np.zeros((6, n)), problem.model.u_bar).method)
+    assert min(methods.count(method) for method in Method) >= 5
 
 
 @pytest.mark.parametrize("part", ["u_min", "u_max", "delta_min", "delta_max", "y_min", "y_max"])
 def test_each_kind_of_constraint_is_seen(part: str) -> None:
-    """A bound tightened until it is just beyond the optimum's extreme bars the way; just before, it does not."""
+    """A bound tightened until it is just beyond the optimum's extreme is inactive; just before it, active."""
     problem = paper_problem()
     assert problem.bounds is not None
     state, desired = np.zeros(12), np.zeros((50, 4))
@@ -145,25 +145,25 @@ def test_each_kind_of_constraint_is_seen(part: str) -> None:
 
 @pytest.mark.parametrize("solver", ["piqp-multistage", "daqp"])
 def test_its_answer_is_the_solution_of_the_whole_qp(constrained_flight: Flight, solver: str) -> None:
-    """Over the paper's flight: the same plan, whichever way it is found."""
+    """Over the paper's flight: the same plan, whichever method it is found."""
     problem, log = paper_problem(), constrained_flight.log.control
     quick, whole = shortcut(problem, solver), QPSolver("daqp", problem)
     reference = paper_reference(log.t.size + 50)
     before = np.vstack([log.speeds_before, log.speeds[:-1]])
-    ways = []
+    methods = []
     for k in range(0, log.t.size, 8):
         query = log.state[k], problem.objective.desired(reference[k + 1 : k + 51]), before[k]
         answer, expected = quick.solve(*query), whole.solve(*query)
         assert expected.solution.status == SOLVED
         assert largest_residual(problem, answer, *query) < 1e-7
         np.testing.assert_allclose(answer.plan, expected.plan, atol=1e-6)
-        if answer.way is Way.AXES:
+        if answer.method is Method.AXES:
             assert answer.solution.status == SOLVED
             assert min(answer.solution.active, answer.solution.iterations) > 0
-        ways.append(answer.way)
-    assert ways.count(Way.FREE) == sum(status == UNCONSTRAINED for status in log.status[::8])
-    assert ways.count(Way.AXES) == pytest.approx(70, abs=4)
-    assert ways.count(Way.WHOLE) == pytest.approx(6, abs=3)
+        methods.append(answer.method)
+    assert methods.count(Method.FREE) == sum(status == UNCONSTRAINED for status in log.status[::8])
+    assert methods.count(Method.AXES) == pytest.approx(70, abs=4)
+    assert methods.count(Method.WHOLE) == pytest.approx(6, abs=3)
 
 
 def test_commands_with_and_without_it_are_the_same(constrained_flight: Flight) -> None:
@@ -187,29 +187,29 @@ def test_a_measured_nan_is_never_feasible() -> None:
     problem = paper_problem()
     quick, hover = shortcut(problem), problem.model.u_bar
     desired = np.zeros((50, 4))
-    assert quick.solve(np.zeros(12), desired, hover).way is Way.FREE
+    assert quick.solve(np.zeros(12), desired, hover).method is Method.FREE
     for query in (
         (np.full(12, np.nan), desired, hover),
         (np.zeros(12), desired * np.nan, hover),
         (np.zeros(12), desired, hover * np.nan),
     ):
         answer = quick.solve(*query)
-        assert answer.way is Way.WHOLE
+        assert answer.method is Method.WHOLE
         assert answer.solution.status == "invalid_data"
 
 
-def test_what_no_axis_can_hold_is_told_by_the_whole_qp() -> None:
+def test_what_no_axis_can_hold_is_reported_by_the_whole_qp() -> None:
     """A roll that no torque could bring back within its bounds before the first predicted state."""
     problem = paper_problem()
     tilted = np.zeros(12)
     tilted[6] = 0.5
     answer = shortcut(problem).solve(tilted, np.zeros((50, 4)), problem.model.u_bar)
-    assert answer.way is Way.WHOLE
+    assert answer.method is Method.WHOLE
     assert answer.solution.status == "primal_infeasible"
 
 
 def test_a_bound_that_no_axis_has_is_left_to_the_whole_qp() -> None:
-    """An output made of nothing, beyond its bounds: infeasible, whatever the axes make of theirs."""
+    """An output made of nothing, beyond its bounds: infeasible, for any solution of the axes."""
     problem = paper_problem()
     assert problem.bounds is not None
     C_c, y_min = np.vstack([problem.bounds.C_c, np.zeros(12)]), np.append(problem.bounds.y_min, 0.5)
@@ -217,9 +217,9 @@ def test_a_bound_that_no_axis_has_is_left_to_the_whole_qp() -> None:
     desired = np.zeros((50, 4))
     desired[:, 0] = 3.0 * np.linspace(0.0, 1.0, 50) ** 4
     query = np.zeros(12), desired, problem.model.u_bar
-    assert shortcut(problem).solve(*query).way is Way.AXES
+    assert shortcut(problem).solve(*query).method is Method.AXES
     impossible = shortcut(replace(problem, bounds=bounds)).solve(*query)
-    assert (impossible.way, impossible.solution.status) == (Way.WHOLE, "primal_infeasible")
+    assert (impossible.method, impossible.solution.status) == (Method.WHOLE, "primal_infeasible")
 
 
 @pytest.mark.parametrize("solver", ["piqp-multistage", "piqp-dense"])
@@ -235,16 +235,16 @@ def test_steps_may_be_bounded_for_some_inputs_alone(solver: str) -> None:
     for upper in (some, wide):
         one = replace(problem, bounds=replace(problem.bounds, delta_max=upper, delta_min=-upper))
         answer = shortcut(one, solver).solve(np.zeros(12), desired, problem.model.u_bar)
-        assert (answer.way, answer.solution.status) == (Way.WHOLE, SOLVED)
+        assert (answer.method, answer.solution.status) == (Method.WHOLE, SOLVED)
         plans.append(answer.plan)
     np.testing.assert_allclose(*plans, atol=1e-3)
     assert np.abs(np.diff(plans[0], axis=0)).max(axis=0)[[1, 2]].max() <= 5.0 + 1e-6
 
 
-def test_what_was_tried_in_vain_counts(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_failed_attempts_count(monkeypatch: pytest.MonkeyPatch) -> None:
     """Ten metres to the side at once: pitch can be held within 5 deg, at steps of the rotors beyond their bounds.
 
-    The time that it took is told with the solver's, whose iterations are the ones that count.
+    The time that it took is added to the solver's, whose iterations are the ones that count.
     """
     problem = paper_problem()
     desired = np.zeros((50, 4))
@@ -254,7 +254,7 @@ def test_what_was_tried_in_vain_counts(monkeypatch: pytest.MonkeyPatch) -> None:
     given = whole.solve(*query)
     monkeypatch.setattr(whole, "solve_roughly", lambda *_: given)
     answer = Shortcut(problem, whole).solve(*query)
-    assert answer.way is Way.WHOLE
+    assert answer.method is Method.WHOLE
     np.testing.assert_allclose(answer.plan, given.plan, atol=1e-3)
     assert answer.solution.solve_s > given.solution.solve_s
     assert answer.solution.iterations == given.solution.iterations
@@ -286,7 +286,7 @@ def test_the_first_whole_qp_is_solved_roughly_and_finished_exactly(monkeypatch: 
         np.testing.assert_array_equal(answer.plan, tight.plan)
 
 
-def test_back_ends_without_a_rough_answer_say_so() -> None:
+def test_back_ends_without_a_rough_answer_are_marked() -> None:
     pytest.importorskip("daqp")
     solver = QPSolver("daqp", paper_problem())
     assert not solver.can_solve_roughly
@@ -295,7 +295,7 @@ def test_back_ends_without_a_rough_answer_say_so() -> None:
 
 
 def test_answers_to_a_whole_qp_too_large_to_polish_stand(monkeypatch: pytest.MonkeyPatch) -> None:
-    """500 rows and entries of the box, or 500^2 entries of the matrix that tells their multipliers."""
+    """500 rows and entries of the box, or 500^2 entries of the matrix that gives their multipliers."""
     problem = paper_problem()
     desired = np.zeros((50, 4))
     desired[:, 0] = 10.0
@@ -304,7 +304,7 @@ def test_answers_to_a_whole_qp_too_large_to_polish_stand(monkeypatch: pytest.Mon
     for largest, polished in ((500**2, True), (500**2 - 1, False)):
         monkeypatch.setattr(shortcut_module, "LARGEST_MAP", largest)
         answer = shortcut(problem).solve(*query)
-        assert answer.way is Way.WHOLE
+        assert answer.method is Method.WHOLE
         assert (largest_residual(problem, answer, *query) < 1e-9) is polished
         assert np.array_equal(answer.plan, whole) is not polished
 
@@ -328,16 +328,16 @@ def test_there_is_none_where_its_map_is_too_large(monkeypatch: pytest.MonkeyPatc
 
 
 @pytest.mark.parametrize(
-    ("aside", "height", "way"), [(0.0, 0.0, Way.FREE), (3.0, 0.0, Way.AXES), (0.0, 8.0, Way.WHOLE)]
+    ("sideways", "height", "method"), [(0.0, 0.0, Method.FREE), (3.0, 0.0, Method.AXES), (0.0, 8.0, Method.WHOLE)]
 )
-def test_steps_leave_no_memory_behind_and_allocate_nothing_large(aside: float, height: float, way: Way) -> None:
-    """All ways through a step: at the reference, before it moves away, 8 m below it."""
+def test_steps_leak_no_memory_and_allocate_nothing_large(sideways: float, height: float, method: Method) -> None:
+    """All methods of a step: at the reference, before it moves away, 8 m below it."""
     problem = paper_problem()
     controller = ConstrainedMPC(problem, QPSolver("piqp-multistage", problem))
     controller.reset(problem.model.u_bar)
     reference = np.tile([0.0, 0.0, height, 0.0], (50, 1))
-    reference[:, 0] = aside * np.linspace(0.0, 1.0, 50) ** 4
-    assert shortcut(problem).solve(np.zeros(12), reference, problem.model.u_bar).way is way
+    reference[:, 0] = sideways * np.linspace(0.0, 1.0, 50) ** 4
+    assert shortcut(problem).solve(np.zeros(12), reference, problem.model.u_bar).method is method
     state = np.zeros(12)
     for _ in range(50):
         controller.step(Moment(), state, reference)
@@ -354,18 +354,18 @@ def test_steps_leave_no_memory_behind_and_allocate_nothing_large(aside: float, h
         after, peak = tracemalloc.get_traced_memory()
     finally:
         tracemalloc.stop()
-    assert status == (UNCONSTRAINED if way is Way.FREE else SOLVED)
+    assert status == (UNCONSTRAINED if method is Method.FREE else SOLVED)
     assert after - before < 2_000  # flat: less than 40 bytes a step
     # The condensed H alone has 320 kB; the whole QP's polish needs that for its active rows, twice.
-    assert peak - before < (800_000 if way is Way.WHOLE else 80_000)
+    assert peak - before < (800_000 if method is Method.WHOLE else 80_000)
 
 
 def test_without_output_bounds_the_inputs_decide() -> None:
     problem = paper_problem("paper-constrained", "controller.output_bounds={}")
     quick, far = shortcut(problem), np.zeros(12)
-    assert quick.solve(far, np.zeros((50, 4)), problem.model.u_bar).way is Way.FREE
+    assert quick.solve(far, np.zeros((50, 4)), problem.model.u_bar).method is Method.FREE
     far[4] = -100.0
-    assert quick.solve(far, np.zeros((50, 4)), problem.model.u_bar).way is Way.WHOLE
+    assert quick.solve(far, np.zeros((50, 4)), problem.model.u_bar).method is Method.WHOLE
 
 
 @pytest.mark.parametrize("horizon", [50, 100, 200])
@@ -384,7 +384,7 @@ def test_it_is_exact_over_long_horizons(horizon: int) -> None:
     np.testing.assert_allclose(plan[0], answer.plan[0], atol=1e-4)
 
 
-def test_there_is_none_where_rounding_has_spoilt_the_gains() -> None:
+def test_there_is_none_where_rounding_has_corrupted_the_gains() -> None:
     """A long horizon and inputs that cost next to nothing: cond(H) nears what double precision holds."""
     options = ("controller.horizon=200", "controller.input_weights.speed=1e-5")
     problem = paper_problem("paper-constrained", *options)

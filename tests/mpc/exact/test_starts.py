@@ -13,7 +13,7 @@ from mpc.exact.shortcut import Shortcut
 from mpc.ocp import Problem, Rest
 from mpc.qp import Formulation
 from mpc.robust.controller import RobustMPC
-from mpc.solvers import Answer, QPSolver, Solver, Way
+from mpc.solvers import Answer, Method, QPSolver, Solver
 from quadsim.controller import ACCEPTED
 from quadsim.state import Array
 from scenarios.build import build_controller, build_plant
@@ -28,7 +28,7 @@ Query = tuple[Array, Array, Array, Rest]
 
 
 class Recording:
-    """A solver that keeps what it is asked."""
+    """A solver that records its queries."""
 
     def __init__(self, solver: Solver) -> None:
         self._solver = solver
@@ -71,18 +71,18 @@ def robust_queries() -> tuple[Problem, list[Query]]:
     return problem, recording.queries
 
 
-def agreed(problem: Problem, queries: list[Query], stride: int) -> dict[Way, int]:
-    """How often each way was taken; each answer from a warm start is that from a cold one, by either meaning of it.
+def agreed(problem: Problem, queries: list[Query], stride: int) -> dict[Method, int]:
+    """How often each method was taken; each answer from a warm start is that from a cold one, in both senses.
 
     Rows count as held within 1e-9 of their bound, which late in the plan is worth 1e-6 rad/s: the whole plans agree
     less well than the first inputs.
     """
     warm, reset, fresh = (Shortcut(problem, QPSolver("piqp-multistage", problem)) for _ in range(3))
     empty = fresh._side.copy()
-    ways = dict.fromkeys(Way, 0)
+    methods = dict.fromkeys(Method, 0)
     for k, query in enumerate(queries):
         answer = warm.solve(*query)
-        ways[answer.way] += 1
+        methods[answer.method] += 1
         assert answer.solution.status in ACCEPTED
         if k % stride:
             continue
@@ -90,11 +90,11 @@ def agreed(problem: Problem, queries: list[Query], stride: int) -> dict[Way, int
         fresh._side = empty.copy()
         for cold in (reset, fresh):
             other = cold.solve(*query)
-            assert (other.way is Way.FREE) == (answer.way is Way.FREE)
+            assert (other.method is Method.FREE) == (answer.method is Method.FREE)
             np.testing.assert_allclose(other.plan[0], answer.plan[0], rtol=1e-9, atol=0.0)
             np.testing.assert_allclose(other.plan, answer.plan, rtol=1e-7, atol=0.0)
             np.testing.assert_allclose(other.slacks, answer.slacks, rtol=0.0, atol=1e-9)
-    return ways
+    return methods
 
 
 def test_bounds_that_only_some_steps_have(constrained_flight: Flight) -> None:
@@ -131,15 +131,15 @@ def test_bounds_that_only_some_steps_have(constrained_flight: Flight) -> None:
 def test_over_the_papers_flight(constrained_flight: Flight) -> None:
     problem = paper_problem()
     queries = [(*query, problem.rest) for query in flight_queries(constrained_flight, problem, stride=1)]
-    ways = agreed(problem, queries, stride=5)
-    assert min(ways.values()) > 10
-    assert ways[Way.AXES] > 300
+    methods = agreed(problem, queries, stride=5)
+    assert min(methods.values()) > 10
+    assert methods[Method.AXES] > 300
 
 
 def test_over_a_robust_flight(robust_queries: tuple[Problem, list[Query]]) -> None:
     problem, queries = robust_queries
     assert problem.rows.soft.size == 2
     assert len(queries) > 200
-    ways = agreed(problem, queries, stride=3)
-    assert ways[Way.FREE] > 20
-    assert ways[Way.AXES] + ways[Way.WHOLE] > 20
+    methods = agreed(problem, queries, stride=3)
+    assert methods[Method.FREE] > 20
+    assert methods[Method.AXES] + methods[Method.WHOLE] > 20

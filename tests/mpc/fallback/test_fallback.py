@@ -11,7 +11,7 @@ from scripted_controller import (
     PERIOD,
     Scripted,
     advance,
-    ask,
+    call,
     failing,
     following,
     guard,
@@ -29,7 +29,7 @@ from quadsim.state import INDEX, VELOCITY, Array
 
 def test_a_good_answer_passes_unchanged() -> None:
     inner = Scripted()
-    command = ask(guard(inner))
+    command = call(guard(inner))
     answer = inner.step(Moment(), np.zeros(12), np.zeros((30, 4)))
     np.testing.assert_array_equal(command.speeds, answer.speeds)
     np.testing.assert_array_equal(command.plan, answer.plan)
@@ -72,7 +72,7 @@ def test_a_failure_that_is_raised_is_recorded(error: Exception, status: str) -> 
 @pytest.mark.parametrize("mistake", [TypeError, KeyError, AttributeError, NotImplementedError, RecursionError])
 def test_a_programmer_s_mistake_is_not_hidden(mistake: type[Exception]) -> None:
     with pytest.raises(mistake):
-        ask(guard(Scripted({0: mistake("oops")})))
+        call(guard(Scripted({0: mistake("oops")})))
 
 
 @pytest.mark.parametrize(
@@ -94,7 +94,7 @@ def test_an_answer_that_only_claims_to_be_good_is_not_used(answer: dict[str, Arr
 
 def test_rounding_beyond_the_bounds_is_taken_away() -> None:
     high = np.full(4, 250.0 + 5e-7)
-    command = ask(guard(Scripted({0: {"speeds": high, "plan": np.tile(high, (30, 1))}})), acting=np.full(4, 249.0))
+    command = call(guard(Scripted({0: {"speeds": high, "plan": np.tile(high, (30, 1))}})), acting=np.full(4, 249.0))
     assert command.fallback == 0
     assert command.speeds.tolist() == [250.0] * 4
     assert command.plan.max() == 250.0
@@ -102,7 +102,7 @@ def test_rounding_beyond_the_bounds_is_taken_away() -> None:
 
 def test_what_a_good_answer_plans_for_later_is_brought_into_bounds() -> None:
     plan = np.full((30, 4), 1e300)
-    command = ask(guard(Scripted({0: {"plan": plan}})))
+    command = call(guard(Scripted({0: {"plan": plan}})))
     assert command.fallback == 0
     assert command.plan.max() == 250.0
     assert np.diff(command.plan, axis=0).max() <= 5.0 + 1e-9
@@ -113,25 +113,25 @@ def test_a_reference_that_is_none_is_not_passed_on(reference: Array) -> None:
     inner = Scripted()
     command = guard(inner).step(Moment(), np.zeros(12), reference)
     assert (command.status, command.fallback) == ("invalid_reference", 2)
-    assert not inner.asked
+    assert not inner.calls
 
 
 def test_off_its_plan_the_vehicle_is_pulled_back() -> None:
     guarded = guard(Scripted(failing([1])))
-    plan = ask(guarded).plan
+    plan = call(guarded).plan
     off = np.zeros(12)
     off[INDEX["z"]] = -0.2
-    command = ask(guarded, off)
+    command = call(guarded, off)
     assert command.fallback == 1
     assert (command.speeds > plan[1] + 1.0).all()  # too low: faster
 
 
 def test_what_pulls_it_back_keeps_the_bounds() -> None:
     guarded = guard(Scripted(failing([1])))
-    before = ask(guarded).speeds
+    before = call(guarded).speeds
     off = np.zeros(12)
     off[[INDEX["roll"], INDEX["roll_rate"]]] = 0.19, 0.9
-    command = ask(guarded, off)
+    command = call(guarded, off)
     assert command.fallback == 1
     steps = command.speeds - before
     assert (steps.min(), steps.max()) == (pytest.approx(-10.0), pytest.approx(5.0))
@@ -141,12 +141,12 @@ def test_what_pulls_it_back_keeps_the_bounds() -> None:
 @pytest.mark.parametrize(("channel", "value"), [("x", 0.51), ("vy", -1.1), ("roll", 0.21), ("yaw_rate", 1.1)])
 def test_far_off_its_plan_the_vehicle_hovers(channel: str, value: float) -> None:
     guarded = guard(Scripted(failing(range(1, 9))))
-    ask(guarded)
+    call(guarded)
     off = np.zeros(12)
     off[INDEX[channel]] = value
-    assert ask(guarded, 0.9 * off).fallback == 1
-    assert ask(guarded, off).fallback == 2
-    assert ask(guarded).fallback == 2  # the plan is given up for good
+    assert call(guarded, 0.9 * off).fallback == 1
+    assert call(guarded, off).fallback == 2
+    assert call(guarded).fallback == 2  # the plan is given up for good
 
 
 @pytest.mark.parametrize(("horizon", "held"), [(30, 20), (8, 7)])
@@ -155,7 +155,7 @@ def test_levels_follow_one_another_and_recovery_is_automatic(horizon: int, held:
     commands = following(guard(inner), 202)
     levels = [command.fallback for command in commands]
     assert levels == [0] + held * [1] + 100 * [2] + (199 - held - 100) * [3] + [0, 0]
-    np.testing.assert_array_equal(inner.asked[-1][0].acting, commands[-2].speeds)
+    np.testing.assert_array_equal(inner.calls[-1][0].acting, commands[-2].speeds)
 
 
 def test_hover_brakes_then_holds_place_height_and_heading() -> None:
@@ -164,7 +164,7 @@ def test_hover_brakes_then_holds_place_height_and_heading() -> None:
     state[[INDEX["vx"], INDEX["z"], INDEX["yaw"]]] = 2.0, 5.0, 2.5
     track = []
     for _ in range(250):
-        state = advance(state, ask(guarded, state).speeds)
+        state = advance(state, call(guarded, state).speeds)
         track.append(state)
     np.testing.assert_allclose(state[[INDEX["z"], INDEX["yaw"]]], [5.0, 2.5], atol=1e-3)
     np.testing.assert_allclose(state[list(VELOCITY)], 0.0, atol=2e-3)
@@ -183,48 +183,48 @@ def test_descent_sinks_at_its_speed() -> None:
     assert state[INDEX["z"]] == pytest.approx(-0.4 * 130 * PERIOD, abs=0.02)
 
 
-def test_a_missing_measurement_is_stood_in_for_and_then_the_controller_is_not_asked() -> None:
+def test_a_missing_measurement_is_replaced_and_then_the_controller_is_not_called() -> None:
     inner = Scripted()
     guarded = guard(inner, settings=FallbackSettings(unseen=0.5))
     following(guarded, 3)
-    blind = [ask(guarded, np.full(12, math.nan)) for _ in range(12)]
+    blind = [call(guarded, np.full(12, math.nan)) for _ in range(12)]
     assert [command.fallback for command in blind] == 10 * [0] + 2 * [2]
     assert [command.status for command in blind] == 10 * ["solved"] + 2 * ["state_unknown"]
-    assert np.isfinite([state for _, state in inner.asked]).all()
-    assert ask(guarded).fallback == 0
+    assert np.isfinite([state for _, state in inner.calls]).all()
+    assert call(guarded).fallback == 0
 
 
 def test_a_state_that_was_never_measured_is_not_passed_on() -> None:
     inner = Scripted()
     unmeasured = np.zeros(12)
     unmeasured[0] = math.nan
-    assert ask(guard(inner), unmeasured).status == "state_unknown"
-    assert not inner.asked
+    assert call(guard(inner), unmeasured).status == "state_unknown"
+    assert not inner.calls
 
 
 @pytest.mark.parametrize("acting", [np.full(4, math.nan), np.full(3, 190.0), np.full(4, 1e7)])
 def test_an_impossible_command_in_force_is_replaced_by_its_own_last_one(acting: Array) -> None:
     inner = Scripted()
     guarded = guard(inner)
-    last = ask(guarded).speeds
-    ask(guarded, acting=acting)
-    np.testing.assert_array_equal(inner.asked[1][0].acting, last)
+    last = call(guarded).speeds
+    call(guarded, acting=acting)
+    np.testing.assert_array_equal(inner.calls[1][0].acting, last)
     guarded.reset(acting)
     np.testing.assert_array_equal(inner.resets[-1], model().u_bar)
 
 
 def test_steps_start_from_the_command_in_force() -> None:
     guarded = guard(Scripted(failing(range(9))))
-    assert ask(guarded, acting=np.full(4, 120.0)).speeds.tolist() == [125.0] * 4
+    assert call(guarded, acting=np.full(4, 120.0)).speeds.tolist() == [125.0] * 4
 
 
 def test_reset_forgets_plan_and_measurements() -> None:
     guarded = guard(Scripted(failing([1, 2])))
-    ask(guarded)
+    call(guarded)
     guarded.reset(model().u_bar)
-    assert ask(guarded).fallback == 2
+    assert call(guarded).fallback == 2
     guarded.reset(model().u_bar)
-    assert ask(guarded, np.full(12, math.nan)).status == "state_unknown"
+    assert call(guarded, np.full(12, math.nan)).status == "state_unknown"
 
 
 @pytest.mark.parametrize("phase", [Phase.LANDED, Phase.CRASHED])
@@ -232,9 +232,9 @@ def test_on_the_ground_rotors_stop_whatever_the_controller_answers(phase: Phase)
     inner = Scripted({1: RuntimeError("no")})
     guarded = guard(inner)
     for state in (np.zeros(12), np.zeros(12), np.full(12, math.nan)):
-        command = ask(guarded, state, phase=phase, acting=np.full(4, 15.0))
+        command = call(guarded, state, phase=phase, acting=np.full(4, 15.0))
         assert (command.status, command.fallback, command.speeds.tolist()) == (str(phase), 0, [5.0] * 4)
-    assert inner.asked[0][0].phase is phase
+    assert inner.calls[0][0].phase is phase
 
 
 def test_prediction_is_the_inner_controller_s_where_it_has_one() -> None:
@@ -253,17 +253,17 @@ def test_prediction_is_the_inner_controller_s_where_it_has_one() -> None:
     assert guarded.predict(states, plans).shape == (1, 30, 12)
 
 
-def test_the_controller_is_told_what_is_predicted() -> None:
+def test_the_controller_receives_what_is_predicted() -> None:
     inner = Scripted()
     guarded = guard(inner)
     partly = np.zeros(12)
     partly[INDEX["vz"]] = math.nan
     for time, state in enumerate((np.zeros(12), partly, partly, np.zeros(12))):
-        ask(guarded, state, time=float(time))
-    told = [now for now, _ in inner.asked]
-    assert all(isinstance(now, CompletedMoment) for now in told)
-    assert [now.time for now in told] == [0.0, 1.0, 2.0, 3.0]
-    unseen = np.array([now.unseen for now in told if isinstance(now, CompletedMoment)])
+        call(guarded, state, time=float(time))
+    moments = [now for now, _ in inner.calls]
+    assert all(isinstance(now, CompletedMoment) for now in moments)
+    assert [now.time for now in moments] == [0.0, 1.0, 2.0, 3.0]
+    unseen = np.array([now.unseen for now in moments if isinstance(now, CompletedMoment)])
     assert unseen[:, INDEX["vz"]].tolist() == [0.0, 1.0, 2.0, 0.0]
     assert not np.delete(unseen, INDEX["vz"], axis=1).any()
 

@@ -55,7 +55,7 @@ def test_nothing_bad_ever_leaves(steps: list[Any], hover: float) -> None:
             assert np.isfinite(state).all()
             assert now.acting is not None
             assert np.isfinite(now.acting).all()
-            self.script = {len(self.asked): self.answer}
+            self.script = {len(self.calls): self.answer}
             return super().step(now, state, reference)
 
         def predict(self, states: Array, plans: Array) -> Array:

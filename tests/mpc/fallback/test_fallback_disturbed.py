@@ -11,8 +11,8 @@ from scripted_controller import (
     Pressed,
     Scripted,
     advance,
-    ask,
     at_rest,
+    call,
     failing,
     guard,
     level,
@@ -31,7 +31,7 @@ def test_every_level_holds_what_presses_the_vehicle(yaw: float) -> None:
     guarded.reset(pressed().speeds)
     state, levels = at_rest(yaw), []
     for _ in range(200):
-        command = ask(guarded, state)
+        command = call(guarded, state)
         levels.append(command.fallback)
         state = advance(state, command.speeds, pressed())
         if command.fallback < 3:
@@ -48,7 +48,7 @@ def test_without_that_it_would_be_pressed_away() -> None:
     guarded.reset(pressed().speeds)
     state = at_rest(0.0)
     for _ in range(120):
-        state = advance(state, ask(guarded, state).speeds, pressed())
+        state = advance(state, call(guarded, state).speeds, pressed())
     assert np.abs(state - at_rest(0.0))[list(POSITION)].max() > 1.0
 
 
@@ -67,8 +67,8 @@ def test_missing_channels_follow_what_presses_the_vehicle() -> None:
     guarded.reset(pressed().speeds)
     state = at_rest(2.0) + 0.01
     for k in range(25):
-        ask(guarded, state if k < 3 else np.full(12, math.nan))
-        np.testing.assert_allclose(inner.asked[-1][1], state, atol=1e-9)
+        call(guarded, state if k < 3 else np.full(12, math.nan))
+        np.testing.assert_allclose(inner.calls[-1][1], state, atol=1e-9)
         state = advance(state, pressed().speeds, pressed())
 
 
@@ -78,15 +78,15 @@ def test_what_was_believed_last_holds_while_nothing_is_measured() -> None:
     guarded.reset(pressed().speeds)
     state = at_rest(0.0)
     for k in range(100):
-        command = ask(guarded, state if k < 3 else np.full(12, math.nan))
+        command = call(guarded, state if k < 3 else np.full(12, math.nan))
         state = advance(state, command.speeds, pressed())
     assert command.status == "state_unknown"
-    assert len(inner.asked) < 40
+    assert len(inner.calls) < 40
     np.testing.assert_allclose(state, at_rest(0.0), atol=1e-9)
 
 
 @pytest.mark.parametrize("trim", [None, 3.0, "absent", RuntimeError("no")])
-def test_a_controller_that_does_not_say_hovers_level(trim: Any) -> None:
+def test_a_controller_without_a_valid_trim_hovers_level(trim: Any) -> None:
     class Silent(Scripted):
         def __getattr__(self, name: str) -> Any:
             if trim == "absent" or name != "trim":

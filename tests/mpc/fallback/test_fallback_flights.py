@@ -45,7 +45,7 @@ START, FAULT, DURATION = 10.0, 2.0, 6.0
 
 
 class FaultySolver(QPSolver):
-    """The real solver, whose answers are spoilt, or which raises, in chosen calls."""
+    """The real solver, which returns corrupted answers, or raises, in chosen calls."""
 
     def __init__(self, faults: dict[int, str | Exception]) -> None:
         super().__init__("piqp-multistage", problem())
@@ -200,7 +200,7 @@ def test_a_solver_that_never_recovers_ends_in_a_landing(vehicle: Vehicle) -> Non
         ground=PhaseMonitor(shape, period=PERIOD),
     )
     assert log.control.fallback[-1] == 3
-    assert set(log.control.phase) == {"flying"}  # not crashed; its reference still asks for flight
+    assert set(log.control.phase) == {"flying"}  # not crashed; its reference still demands flight
     assert clearance(log.plant.state[-1:], shape.feet, shape.foot_radius, shape.floor)[0] < 2e-3
     assert log.plant.state[:, INDEX["vz"]].min() > -0.7
     assert np.abs(log.plant.state[-1, list(VELOCITY)]).max() < 0.05

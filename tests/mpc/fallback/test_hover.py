@@ -54,7 +54,7 @@ def test_the_gain_is_the_infinite_horizon_s() -> None:
     np.testing.assert_allclose(law.correction(error, 0.0), -expected @ error, rtol=1e-6)
 
 
-def test_rotor_speeds_accelerate_as_the_vehicle_says(vehicle: Vehicle) -> None:
+def test_rotor_speeds_accelerate_as_the_vehicle_defines(vehicle: Vehicle) -> None:
     allocation = 2.0 * vehicle.hover_speed * vehicle.allocation
     resistance = np.array([vehicle.mass, *vehicle.inertia])
     np.testing.assert_allclose(HoverLaw(model(), tilt=0.2).slope, allocation / resistance[:, None], atol=1e-12)
@@ -71,7 +71,7 @@ def test_law_and_prediction_turn_with_the_heading(yaw: float) -> None:
     np.testing.assert_allclose(advance(T @ state + ahead, speeds), T @ advance(state, speeds) + ahead, atol=1e-12)
 
 
-def test_far_away_the_law_asks_for_its_tilt_and_no_more() -> None:
+def test_far_away_the_law_demands_its_largest_tilt_and_no_more() -> None:
     law = HoverLaw(model(), tilt=0.15)
     leaning = np.zeros(12)
     leaning[INDEX["x"]] = -500.0

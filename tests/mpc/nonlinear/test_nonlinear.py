@@ -175,11 +175,11 @@ def test_rotor_states_are_exact_whatever_the_lag(vehicle: Vehicle) -> None:
         model = nonlinear_model(vehicle, PERIOD, rotor_lag=lag)
         x, u = points(vehicle, 5, lag=lag)
         A, B, c = linearise(model, x, u)
-        kept = math.exp(-PERIOD / lag)
-        np.testing.assert_allclose(A[:, 12:], np.tile(np.eye(4, 16, 12) * kept, (5, 1, 1)), atol=1e-15)
-        np.testing.assert_allclose(B[:, 12:], np.tile(np.eye(4) * (1.0 - kept), (5, 1, 1)), atol=1e-15)
+        decay = math.exp(-PERIOD / lag)
+        np.testing.assert_allclose(A[:, 12:], np.tile(np.eye(4, 16, 12) * decay, (5, 1, 1)), atol=1e-15)
+        np.testing.assert_allclose(B[:, 12:], np.tile(np.eye(4) * (1.0 - decay), (5, 1, 1)), atol=1e-15)
         np.testing.assert_allclose(c[:, 12:], 0.0, atol=1e-12)
-        np.testing.assert_allclose(advance(model, x, u)[:, 12:], u + kept * (x[:, 12:] - u), rtol=1e-14)
+        np.testing.assert_allclose(advance(model, x, u)[:, 12:], u + decay * (x[:, 12:] - u), rtol=1e-14)
 
 
 def test_a_vanishing_lag_leaves_the_model_without(vehicle: Vehicle) -> None:

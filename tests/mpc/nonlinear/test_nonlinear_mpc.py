@@ -38,7 +38,7 @@ def law(
     return NonlinearMPC(VEHICLE, period=PERIOD, settings=made, bounds=bounds, constraints=constraints)
 
 
-def ask(
+def call(
     controller: NonlinearMPC, x: Array, time: float = 0.0, reference: Array | None = None, **moment: Any
 ) -> Command:
     """The answer at a state (13,)."""
@@ -61,7 +61,7 @@ def fly(controller: NonlinearMPC, x: Array, seconds: float, motion: Motion | Non
     controller.reset(HOVER)
     for k in range(round(seconds / PERIOD)):
         following = None if motion is None else motion.after(k)
-        command = ask(controller, states[-1], k * PERIOD, motion=following)
+        command = call(controller, states[-1], k * PERIOD, motion=following)
         assert command.status in ACCEPTED
         x = advance_nodes(model, states[-1], command.speeds / VEHICLE.speed_max)
         x[Q] /= np.linalg.norm(x[Q])
@@ -92,7 +92,7 @@ def test_converged_it_is_the_optimum_of_an_independent_solver(error: AttitudeErr
     )
     x0 = at_rest((0.98, 0.15, -0.1, 0.05))
     x0[P], x0[V], x0[W] = (0.2, -0.1, -0.8), (0.5, 0.2, -0.4), (0.3, -0.5, 0.2)
-    command = ask(controller, x0)
+    command = call(controller, x0)
     model = rigid_body(VEHICLE, 2 * PERIOD, inputs=inputs)
     hover = model.shares(np.full(4, VEHICLE.mass * VEHICLE.gravity / 4.0))
 
@@ -124,10 +124,10 @@ def test_converged_it_is_the_optimum_of_an_independent_solver(error: AttitudeErr
 def test_the_real_time_iteration_comes_to_the_same_optimum_at_a_state_that_stays() -> None:
     x = at_rest((0.95, 0.2, 0.1, 0.0))
     x[P] = 0.3, 0.0, -0.2
-    exact = ask(law(iterations=50, tolerance=1e-11), x)
+    exact = call(law(iterations=50, tolerance=1e-11), x)
     one = law(shift=False)
     for _ in range(40):
-        command = ask(one, x, acting=HOVER)
+        command = call(one, x, acting=HOVER)
     np.testing.assert_allclose(command.plan, exact.plan, atol=1e-3 * VEHICLE.speed_max)
 
 
@@ -135,14 +135,14 @@ def test_a_quaternion_and_its_opposite_are_one_attitude() -> None:
     x = at_rest((0.9, 0.3, -0.2, 0.1))
     other = x.copy()
     other[Q] *= -1.0
-    np.testing.assert_allclose(ask(law(), other).speeds, ask(law(), x).speeds, rtol=1e-9)
+    np.testing.assert_allclose(call(law(), other).speeds, call(law(), x).speeds, rtol=1e-9)
 
 
 @pytest.mark.parametrize("solver", ["piqp-dense", "piqp-multistage", "daqp"])
 def test_solvers_agree(solver: str) -> None:
     x = at_rest((0.5, 0.8, 0.1, 0.0))
-    plan = ask(law(solver=solver, inputs=Inputs.SPEED), x).plan
-    np.testing.assert_allclose(plan, ask(law(inputs=Inputs.SPEED), x).plan, atol=1e-2)
+    plan = call(law(solver=solver, inputs=Inputs.SPEED), x).plan
+    np.testing.assert_allclose(plan, call(law(inputs=Inputs.SPEED), x).plan, atol=1e-2)
 
 
 # --- any attitude --------------------------------------------------------------------------------------------------
@@ -299,7 +299,7 @@ def test_velocities_and_slews_are_bounded() -> None:
     controller = law(bounds, (fence,), inputs=Inputs.SPEED, horizon=20)
     states = fly(controller, x, 5.0)
     assert -1.02 < states[:, 7].min() < -0.9
-    first = ask(law(bounds, (fence,), inputs=Inputs.SPEED, horizon=20), x, acting=HOVER)
+    first = call(law(bounds, (fence,), inputs=Inputs.SPEED, horizon=20), x, acting=HOVER)
     assert np.abs(first.speeds - HOVER).max() <= 60.0 + 1e-6
     assert np.abs(first.speeds - HOVER).max() > 59.0
 
@@ -350,10 +350,10 @@ def test_numbers_that_are_none_are_refused_and_do_no_harm(number: float) -> None
     controller, fresh = law(), law()
     wrong = at_rest()
     wrong[0] = number
-    command = ask(controller, wrong)
+    command = call(controller, wrong)
     assert command.status == "invalid_data"
     np.testing.assert_array_equal(command.speeds, HOVER)
-    np.testing.assert_array_equal(ask(controller, at_rest()).speeds, ask(fresh, at_rest()).speeds)
+    np.testing.assert_array_equal(call(controller, at_rest()).speeds, call(fresh, at_rest()).speeds)
     assert controller.unanswered is None
 
 
@@ -364,7 +364,7 @@ def test_without_attitude_in_the_moment_it_is_taken_from_the_state() -> None:
     x = at_rest((math.cos(0.15), math.sin(0.15), 0.0, 0.0))
     # d(pitch)/dt = q cos(roll) - r sin(roll) alone, and no yaw rate
     x[W] = 0.0, 0.4 * math.cos(0.3), -0.4 * math.sin(0.3)
-    np.testing.assert_allclose(law().step(Moment(), state, reference).speeds, ask(law(), x).speeds, rtol=1e-9)
+    np.testing.assert_allclose(law().step(Moment(), state, reference).speeds, call(law(), x).speeds, rtol=1e-9)
 
 
 def test_an_infeasible_problem_is_reported_with_its_query() -> None:
@@ -372,7 +372,7 @@ def test_an_infeasible_problem_is_reported_with_its_query() -> None:
     row[0, INDEX["x"]] = 1.0
     fence = Constraint(name="fence", lower=np.array([5.0]), upper=np.array([6.0]), C=row)
     controller = law(constraints=(fence,))
-    command = ask(controller, at_rest())
+    command = call(controller, at_rest())
     assert command.status not in ACCEPTED
     np.testing.assert_array_equal(command.speeds, HOVER)
     assert controller.unanswered is not None
@@ -383,7 +383,7 @@ def test_an_infeasible_problem_is_reported_with_its_query() -> None:
 
 
 def test_grounded_rotors_stop() -> None:
-    command = ask(law(), at_rest(), phase=Phase.LANDED)
+    command = call(law(), at_rest(), phase=Phase.LANDED)
     assert command.status == "landed"
     assert (command.speeds == VEHICLE.speed_min).all()
 
@@ -394,7 +394,7 @@ def test_what_it_predicts_is_what_the_model_does(observer: ObserverSettings | No
     controller = law(observer=observer)
     x = at_rest((0.9, 0.3, 0.0, 0.1))
     for k in range(3):
-        command = ask(controller, x, k * PERIOD)
+        command = call(controller, x, k * PERIOD)
     found = np.zeros(6) if observer is None else controller.disturbance
     assert found.any() == (observer is not None)
     state = np.zeros((1, N_STATES))
@@ -413,7 +413,7 @@ def test_turning_the_world_about_the_vertical_turns_the_answer_with_it() -> None
     x = at_rest((0.9, 0.3, -0.2, 0.1))
     x[P], x[V] = (0.5, -0.2, 0.3), (0.1, 0.4, 0.0)
     even = Weights(position=10.0, velocity=0.3)
-    plain = ask(law(weights=even), x)
+    plain = call(law(weights=even), x)
     yaw = 2.0
     turn = np.array([[math.cos(yaw), -math.sin(yaw), 0.0], [math.sin(yaw), math.cos(yaw), 0.0], [0.0, 0.0, 1.0]])
     other = x.copy()
@@ -421,4 +421,4 @@ def test_turning_the_world_about_the_vertical_turns_the_answer_with_it() -> None
     other[Q] = product(np.array([math.cos(yaw / 2), 0.0, 0.0, math.sin(yaw / 2)]), x[Q])
     reference = np.zeros((20, 4))
     reference[:, 3] = yaw
-    np.testing.assert_allclose(ask(law(weights=even), other, reference=reference).speeds, plain.speeds, rtol=1e-9)
+    np.testing.assert_allclose(call(law(weights=even), other, reference=reference).speeds, plain.speeds, rtol=1e-9)

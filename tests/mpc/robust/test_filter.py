@@ -47,7 +47,7 @@ def make_filter() -> SafetyFilter:
     return SafetyFilter(mpc)
 
 
-def asked(filter_: SafetyFilter, state: Array, wanted: Array, acting: Array = HOVER) -> Command:
+def filtered(filter_: SafetyFilter, state: Array, wanted: Array, acting: Array = HOVER) -> Command:
     filter_.reset(acting)
     filter_.wanted = wanted
     return filter_.step(Moment(acting=acting), state, np.zeros((HORIZON, 4)))
@@ -61,7 +61,7 @@ def tilted(roll: float, rate: float, yaw: float = 0.0) -> Array:
 
 def test_a_safe_command_passes() -> None:
     wanted = HOVER + np.array([1.0, -2.0, 1.0, -2.0])
-    command = asked(make_filter(), np.zeros(12), wanted)
+    command = filtered(make_filter(), np.zeros(12), wanted)
     assert command.status == UNCONSTRAINED
     assert np.array_equal(command.speeds, wanted)
 
@@ -71,7 +71,7 @@ def test_a_safe_command_passes() -> None:
 def test_an_unsafe_one_becomes_the_nearest_whose_plan_keeps_the_bounds(wanted: list[float], yaw: float) -> None:
     state = tilted(4.0, 10.0, yaw)
     filter_ = make_filter()
-    command = asked(filter_, state, HOVER + wanted)
+    command = filtered(filter_, state, HOVER + wanted)
     assert command.status == "solved"
     assert np.abs(command.speeds - HOVER - wanted).max() > 0.1
     # The prediction of its plan keeps 5 deg, and stands still at the end.
@@ -95,7 +95,7 @@ def test_an_unsafe_one_becomes_the_nearest_whose_plan_keeps_the_bounds(wanted: l
     backend.setup(replace(form.qp.with_vectors(vectors), P=np.asfortranarray(P)))
     other = form.inputs(backend.solve(vectors).x)[0]
     assert command.speeds == pytest.approx(other, abs=1e-3)
-    # No command that is nearer can be kept: moving on towards what was wanted breaks a bound of the prediction.
+    # No command that is nearer is safe: moving on towards what was wanted breaks a bound of the prediction.
     assert np.linalg.norm(command.speeds - HOVER - wanted) > 0.1
 
 
@@ -120,6 +120,6 @@ def test_the_plan_of_one_period_is_one_of_the_next() -> None:
 def test_numbers_out_of_hand_are_refused() -> None:
     state = np.zeros(12)
     state[0] = np.nan
-    command = asked(make_filter(), state, HOVER)
+    command = filtered(make_filter(), state, HOVER)
     assert command.status == "invalid_data"
     assert np.array_equal(command.speeds, HOVER)

@@ -89,7 +89,7 @@ def believing(controller: RobustMPC, estimate: Array) -> None:
 
 
 def moments(flight: Flight, first: int, periods: int) -> Iterator[tuple[Moment, Array, Array]]:
-    """What a controller was told in successive periods of a flight."""
+    """What a controller received in successive periods of a flight."""
     log = flight.log.control
     reference, before = paper_reference(log.t.size + 50), np.vstack([log.speeds_before, log.speeds[:-1]])
     for k in range(first, first + periods):
@@ -122,11 +122,11 @@ def test_the_hover_matrices_are_the_papers_without_lag_and_the_nonlinear_models_
 
 
 @pytest.mark.parametrize("parts", [{}, {"penalty": SOFT}, EVERYTHING])
-def test_a_period_without_an_active_constraint_says_so(vehicle: Vehicle, parts: dict[str, Any]) -> None:
+def test_a_period_without_an_active_constraint_has_its_status(vehicle: Vehicle, parts: dict[str, Any]) -> None:
     """And one with some is solved; models that change have no such shortcut."""
-    now, aside = Moment(acting=np.full(4, vehicle.hover_speed)), np.tile([5.0, 0.0, 0.0, 0.0], (50, 1))
+    now, shifted = Moment(acting=np.full(4, vehicle.hover_speed)), np.tile([5.0, 0.0, 0.0, 0.0], (50, 1))
     controller = robust(vehicle, **parts)
-    for reference, status in ((HOLD, UNCONSTRAINED), (aside, SOLVED), (HOLD, UNCONSTRAINED)):
+    for reference, status in ((HOLD, UNCONSTRAINED), (shifted, SOLVED), (HOLD, UNCONSTRAINED)):
         controller.reset(np.full(4, vehicle.hover_speed))
         command = controller.step(now, np.zeros(12), reference)
         assert command.status == status
@@ -138,7 +138,7 @@ def test_a_period_without_an_active_constraint_says_so(vehicle: Vehicle, parts: 
 # Soft bounds
 
 
-def test_soft_bounds_are_hard_ones_wherever_these_can_be_kept(constrained_flight: Flight, vehicle: Vehicle) -> None:
+def test_soft_bounds_are_hard_ones_wherever_these_are_feasible(constrained_flight: Flight, vehicle: Vehicle) -> None:
     hard, soft = robust(vehicle), robust(vehicle, penalty=SOFT)
     active = 0
     for moment, state, reference in moments(constrained_flight, 190, 40):
@@ -151,7 +151,7 @@ def test_soft_bounds_are_hard_ones_wherever_these_can_be_kept(constrained_flight
     assert active > 100
 
 
-def test_soft_bounds_that_cannot_be_kept_are_left_by_no_more_than_must_be(vehicle: Vehicle) -> None:
+def test_infeasible_soft_bounds_are_violated_by_no_more_than_necessary(vehicle: Vehicle) -> None:
     """The largest slack is that of the next sample, which inputs hardly reach; ten times the price changes nothing."""
     tilted = make_state(euler=(math.radians(12.0), 0.0, 0.0))
     now = Moment(acting=np.full(4, vehicle.hover_speed))
@@ -208,7 +208,7 @@ def test_along_the_last_plan_the_prediction_is_the_nonlinear_models(vehicle: Veh
 @pytest.mark.parametrize("yaw", [0.0, 2.0])
 @pytest.mark.parametrize("linearisation", list(Linearisation))
 def test_rest_under_a_disturbance_is_an_equilibrium(vehicle: Vehicle, yaw: float, linearisation: Linearisation) -> None:
-    """Also of the controller: told that it rests where it shall, it commands what holds it there."""
+    """Also of the controller: at rest at its set-point, it commands what holds it there."""
     controller = robust(vehicle, rotor_lag=0.03, heading=True, observer=ObserverSettings(), linearisation=linearisation)
     believing(controller, np.array([0.4, -0.3, 0.5, 0.5, -0.3, 0.1]))
     force, torque = np.split(controller.disturbance, 2)
@@ -255,7 +255,7 @@ def test_what_is_stated_is_not_taken_for_a_disturbance(vehicle: Vehicle) -> None
 
 @pytest.mark.parametrize("factor", [0.7, 1.3])
 def test_a_wrong_mass_is_no_force_sideways(vehicle: Vehicle, factor: float) -> None:
-    """On a course that tilts the vehicle to and fro; in rest it is all in what thrust does."""
+    """On a course that tilts the vehicle back and forth; at rest thrust explains it all."""
     heavy = nonlinear_model(replace(vehicle, mass=factor * vehicle.mass), PERIOD)
     reference = np.zeros((200, 4))
     reference[60:120, 0] = 2.0
@@ -312,7 +312,7 @@ def test_nothing_is_learned_on_the_ground_or_from_what_is_no_number(vehicle: Veh
 
 @pytest.mark.parametrize("gap", [0, 2, 40])
 def test_nothing_is_learned_over_a_pause(vehicle: Vehicle, gap: int) -> None:
-    """What was expected a period later says nothing of any other instant."""
+    """What was expected a period later applies to no other instant."""
     controller, acting = robust(vehicle, **EVERYTHING), np.full(4, vehicle.hover_speed)
     controller.step(Moment(time=1.0, acting=acting), np.zeros(12), HOLD)
     controller.step(Moment(time=1.0 + gap * PERIOD, acting=acting), moving((0.0, 0.0, 0.2)), HOLD)
@@ -323,7 +323,7 @@ def test_nothing_is_learned_over_a_pause(vehicle: Vehicle, gap: int) -> None:
 def test_predicted_states_teach_nothing_and_long_spans_of_them_neither(
     vehicle: Vehicle, predicted: int, learned: bool
 ) -> None:
-    """From a slow sensor's next measurement it learns; after a longer outage it starts anew."""
+    """From a slow sensor's next measurement it learns; after a longer outage it restarts."""
     controller, acting = robust(vehicle, **EVERYTHING), np.full(4, vehicle.hover_speed)
     measured, guessed = np.zeros(12), np.zeros(12)
     guessed[INDEX["vx"]] = 1.0
@@ -390,26 +390,26 @@ def test_a_flight_turned_by_any_yaw_is_the_same_flight(vehicle: Vehicle, lineari
     (states, commands), (turned_states, turned_commands) = flights
     back = turn_horizontally(turned_states, np.full(30, -turn))
     back[:, INDEX["yaw"]] -= turn
-    # Where it is linearised anew, the QP itself is turned: then it is solved to its tolerance only.
+    # Where it is relinearised, the QP itself is turned: then it is solved to its tolerance only.
     np.testing.assert_allclose(back, states, atol=1e-6 if linearisation is Linearisation.HOVER else 1e-4)
     np.testing.assert_allclose(turned_commands, commands, atol=1e-2)
 
 
-def test_far_from_its_yaw_the_vehicle_is_asked_for_a_part_of_the_turn_at_once(vehicle: Vehicle) -> None:
-    """Half a turn away asks for no more than the largest turn does; so do jumps on the way."""
+def test_far_from_its_yaw_the_vehicle_is_commanded_a_part_of_the_turn_at_once(vehicle: Vehicle) -> None:
+    """Half a turn away demands no more than the largest turn does; so do jumps on the way."""
     far, near, jumping, twice = (HOLD.copy() for _ in range(4))
     far[:, 3], near[:, 3] = math.pi, 0.02
     jumping[0, 3], jumping[1:, 3] = 0.02, -4.0
     twice[0, 3] = 0.02
     controller = robust(vehicle, heading=True, weight=0.1, largest_turn=0.02)
 
-    def asked(reference: Array) -> Array:
+    def commanded(reference: Array) -> Array:
         controller.reset(np.full(4, vehicle.hover_speed))
         return controller.step(Moment(), np.zeros(12), reference).plan
 
-    np.testing.assert_allclose(asked(far), asked(near), atol=1e-9)
-    np.testing.assert_allclose(asked(jumping), asked(twice), atol=1e-9)
-    assert 0.1 < np.abs(asked(near)[0] - vehicle.hover_speed).max() < 4.0  # not at the bound on its step
+    np.testing.assert_allclose(commanded(far), commanded(near), atol=1e-9)
+    np.testing.assert_allclose(commanded(jumping), commanded(twice), atol=1e-9)
+    assert 0.1 < np.abs(commanded(near)[0] - vehicle.hover_speed).max() < 4.0  # not at the bound on its step
 
 
 # Delay
@@ -418,7 +418,7 @@ def test_far_from_its_yaw_the_vehicle_is_asked_for_a_part_of_the_turn_at_once(ve
 @pytest.mark.parametrize("delay", [0.02, PERIOD])
 @pytest.mark.parametrize("rotor_lag", [0.0, 0.03])
 def test_a_delay_is_answered_from_where_the_vehicle_will_be(vehicle: Vehicle, delay: float, rotor_lag: float) -> None:
-    """As by a controller without delay that is asked there and then."""
+    """As by a controller without delay called at that instant."""
     model = nonlinear_model(vehicle, PERIOD, rotor_lag=rotor_lag or None)
     state = moving((0.5, 0.0, 0.2), position=(0.3, -0.2, 0.1), euler=(0.02, -0.03, 0.4))
     before, acting = np.full(4, vehicle.hover_speed), vehicle.hover_speed + np.array([1.0, -2.0, 3.0, -1.0])
@@ -451,9 +451,9 @@ def test_numbers_out_of_hand_are_refused_and_forgotten(
     for channel in (1, 4, 7, 8, 11):
         controller.reset(acting)
         controller.step(Moment(acting=acting), np.zeros(12), HOLD)
-        spoilt = np.zeros(12)
-        spoilt[channel] = value
-        command = controller.step(Moment(acting=acting), spoilt, HOLD)
+        corrupted = np.zeros(12)
+        corrupted[channel] = value
+        command = controller.step(Moment(acting=acting), corrupted, HOLD)
         assert command.status not in ACCEPTED
         np.testing.assert_array_equal(command.plan, np.tile(acting, (50, 1)))
         after = controller.step(Moment(acting=acting), np.zeros(12), HOLD)
@@ -481,7 +481,7 @@ def test_numbers_that_get_out_of_hand_on_the_way_spoil_nothing(
         assert np.isfinite(controller.disturbance).all()
 
 
-def test_what_is_not_solved_holds_the_command_in_force_and_says_so(vehicle: Vehicle) -> None:
+def test_what_is_not_solved_holds_the_command_in_force_with_its_status(vehicle: Vehicle) -> None:
     controller = robust(vehicle)
     acting = np.full(4, 120.0)
     tilted = make_state(euler=(math.radians(30.0), 0.0, 0.0))
@@ -501,21 +501,21 @@ def test_on_the_ground_rotors_are_stopped_as_fast_as_allowed(vehicle: Vehicle, p
     assert [command.speeds.tolist() for command in stops] == [[5.0] * 4, [0.0] * 4, [0.0] * 4]
 
 
-def test_its_own_last_command_acts_where_none_is_told(vehicle: Vehicle) -> None:
-    told, untold = robust(vehicle, **EVERYTHING), robust(vehicle, **EVERYTHING)
+def test_its_own_last_command_acts_where_none_is_given(vehicle: Vehicle) -> None:
+    given, without = robust(vehicle, **EVERYTHING), robust(vehicle, **EVERYTHING)
     state = make_state(position=(0.0, 0.0, -3.0))
     acting = np.full(4, vehicle.hover_speed)
-    for controller in (told, untold):
+    for controller in (given, without):
         controller.reset(acting)
     for _ in range(4):
-        expected = told.step(Moment(acting=acting), state, HOLD)
-        np.testing.assert_array_equal(untold.step(Moment(), state, HOLD).speeds, expected.speeds)
+        expected = given.step(Moment(acting=acting), state, HOLD)
+        np.testing.assert_array_equal(without.step(Moment(), state, HOLD).speeds, expected.speeds)
         assert np.all(expected.speeds <= acting + 5.0)
         acting = expected.speeds
     assert acting.min() > vehicle.hover_speed + 10.0
 
 
-def test_reset_starts_anew(vehicle: Vehicle) -> None:
+def test_reset_restarts(vehicle: Vehicle) -> None:
     controller = robust(vehicle, **{**EVERYTHING, "linearisation": Linearisation.TRAJECTORY})
     plant = replace(nonlinear_model(vehicle, PERIOD), acceleration=np.array([0.3, 0.0, 0.2]))
     start, reference = make_state(position=(0.2, 0.0, 0.0)), np.zeros((60, 4))

@@ -148,7 +148,7 @@ def test_margin_is_what_the_worst_disturbance_does_and_no_more(
     def respond(w: Array) -> Array:
         return errors(vehicle, w, rotor_lag=rotor_lag, delay=delay, substeps=substeps)
 
-    # What a push during each step does to roll at the end tells the worst course of pushes.
+    # What a push during each step does to roll at the end gives the worst course of pushes.
     single = np.zeros((length, 6, length))
     single[range(length), about_x, range(length)] = 1.0
     worst = np.zeros((length, 6, 1))
@@ -285,7 +285,7 @@ def test_disturbances_too_large_for_the_bounds_are_refused(vehicle: Vehicle, nam
         tilt_margins(vehicle, TighteningSettings(**{name: given}))
 
 
-def test_an_output_without_a_name_is_told_by_its_row(vehicle: Vehicle) -> None:
+def test_an_output_without_a_name_is_named_by_its_row(vehicle: Vehicle) -> None:
     """As only Python code can make one: a sum of two states."""
     bounds = tilt_bounds()
     C_c = bounds.C_c.copy()
@@ -302,7 +302,7 @@ def test_an_output_without_a_name_is_told_by_its_row(vehicle: Vehicle) -> None:
         )
 
 
-def test_a_delay_beyond_a_period_is_told_as_such(vehicle: Vehicle) -> None:
+def test_a_delay_beyond_a_period_is_reported(vehicle: Vehicle) -> None:
     with pytest.raises(ParameterError, match=r"^controller\.delay must be at most the control period of .*; got 1\.0$"):
         tilt_margins(vehicle, delay=1.0)
 
@@ -416,7 +416,7 @@ def outward(t: float, tilts: Array) -> Array:
 def pushed_tilt(vehicle: Vehicle, course: Course, *, rotor_lag: float, delay: float, estimated: bool) -> float:
     """Largest roll or pitch [rad] of the nonlinear model over six seconds under a disturbance, every 2 ms.
 
-    Its rotors lag, and its commands are late, as the controller is told.
+    Its rotors lag, and its commands are late, as the controller knows.
     """
     substeps = 25
     drawn_in = tilt_margins(vehicle, rotor_lag=rotor_lag, delay=delay, estimated=estimated)

@@ -1,4 +1,4 @@
-"""Half-spaces along plans, the optimum among them against a dense QP, and what stands aside or fails."""
+"""Half-spaces along plans, the optimum among them against a dense QP, and what is skipped or fails."""
 
 from __future__ import annotations
 
@@ -57,8 +57,8 @@ def query(problem: Problem, *, goal: float = 2.0, speed: float = 0.8) -> Query:
 def clearing(problem: Problem, among: Space, calls: list[Answer] | None = None, *, changing: bool = False) -> Clearing:
     solver = with_shortcut(problem, QPSolver("piqp-multistage", problem))
 
-    def solve(asked: Query) -> Answer:
-        answer = solver.solve(*asked[:4])
+    def solve(posed: Query) -> Answer:
+        answer = solver.solve(*posed[:4])
         if calls is not None:
             calls.append(answer)
         return answer
@@ -66,15 +66,15 @@ def clearing(problem: Problem, among: Space, calls: list[Answer] | None = None, 
     return Clearing(problem, solve, among, changing=changing)
 
 
-def by_dense_qp(problem: Problem, asked: Query, normals: Array, bounds: Array) -> Array:
+def by_dense_qp(problem: Problem, posed: Query, normals: Array, bounds: Array) -> Array:
     """The plan (N, nu) of the condensed QP with hard half-spaces (S, N, 3), (S, N) as rows of its own."""
     form, maps = Condensed(problem), prediction(problem.model, N)
-    vectors = form.vectors(*asked[:3])
+    vectors = form.vectors(*posed[:3])
     chosen = np.zeros((len(bounds), N, N * 12))
     for i in range(N):
         chosen[:, i, 12 * i + np.array(POSITION)] = normals[:, i]
     rows = chosen.reshape(-1, N * 12)
-    free = maps.Phi @ asked.state - maps.Psi @ np.tile(problem.model.u_bar, N)
+    free = maps.Phi @ posed.state - maps.Psi @ np.tile(problem.model.u_bar, N)
     qp = form.qp.with_vectors(vectors)
     qp = replace(
         qp,
@@ -106,8 +106,8 @@ def test_what_satisfies_the_half_space_keeps_clear(
     log = Capsule(name="log", position=(0.2, 0.1, 0.0), axis=axis, radius=0.3)
     normals, bounds = space(log, horizon=1, margin=0.1).half_spaces(np.zeros(1), np.array([at]))
     p = 2.0 * np.array(points)
-    kept = p @ normals[0, 0] >= bounds[0, 0]
-    assert (log.clearance(np.zeros(5), p)[kept] >= RADIUS + 0.1 - 1e-9).all()
+    outside = p @ normals[0, 0] >= bounds[0, 0]
+    assert (log.clearance(np.zeros(5), p)[outside] >= RADIUS + 0.1 - 1e-9).all()
     onto = p + np.outer(bounds[0, 0] - p @ normals[0, 0], normals[0, 0])
     assert (log.clearance(np.zeros(5), onto) >= RADIUS + 0.1 - 1e-9).all()
 
@@ -124,26 +124,26 @@ def test_regions_are_exact_and_hold_in_their_window() -> None:
 
 
 def test_the_optimum_is_that_of_a_dense_qp(problem: Problem) -> None:
-    among, asked = space(PILLAR, FENCE, rows=7), query(problem)
-    found = clearing(problem, among).solve(0.0, asked)
+    among, posed = space(PILLAR, FENCE, rows=7), query(problem)
+    found = clearing(problem, among).solve(0.0, posed)
     assert found.answer.solution.status == SOLVED
-    free = clearing(problem, space(Sphere(name="far", position=(50.0, 0.0, 0.0), radius=1.0))).solve(0.0, asked)
+    free = clearing(problem, space(Sphere(name="far", position=(50.0, 0.0, 0.0), radius=1.0))).solve(0.0, posed)
     assert np.abs(found.answer.plan - free.answer.plan).max() > 1.0
     normals, bounds = among.half_spaces(PERIOD * np.arange(1, N + 1), free.states[:, list(POSITION)])
-    np.testing.assert_allclose(found.answer.plan, by_dense_qp(problem, asked, normals, bounds), atol=2e-3)
-    kept = (normals * found.states[:, list(POSITION)]).sum(axis=2) - bounds
-    assert kept.min() > -1e-5
-    assert kept.min() < 1e-3  # active
+    np.testing.assert_allclose(found.answer.plan, by_dense_qp(problem, posed, normals, bounds), atol=2e-3)
+    room = (normals * found.states[:, list(POSITION)]).sum(axis=2) - bounds
+    assert room.min() > -1e-5
+    assert room.min() < 1e-3  # active
 
 
-def test_rows_are_added_until_all_half_spaces_are_kept(problem: Problem) -> None:
-    asked, few, many = query(problem), space(PILLAR, FENCE, rows=1), space(PILLAR, FENCE, rows=7)
-    ours, whole = (clearing(problem, among).solve(0.0, asked) for among in (few, many))
+def test_rows_are_added_until_all_half_spaces_are_satisfied(problem: Problem) -> None:
+    posed, few, many = query(problem), space(PILLAR, FENCE, rows=1), space(PILLAR, FENCE, rows=7)
+    ours, whole = (clearing(problem, among).solve(0.0, posed) for among in (few, many))
     np.testing.assert_allclose(ours.answer.plan, whole.answer.plan, atol=2e-3)
     normals, bounds = few.half_spaces(
         PERIOD * np.arange(1, N + 1),
         clearing(problem, space(Sphere(name="far", position=(50.0, 0.0, 0.0), radius=1.0)))
-        .solve(0.0, asked)
+        .solve(0.0, posed)
         .states[:, list(POSITION)],
     )
     assert ((normals * ours.states[:, list(POSITION)]).sum(axis=2) - bounds).min() > -1e-4
@@ -175,20 +175,20 @@ def test_a_moving_obstacle_counts_where_it_will_be(problem: Problem) -> None:
 
 
 def test_axes_turned_by_a_yaw_make_no_difference(problem: Problem) -> None:
-    asked, yaw = query(problem), 0.3
+    posed, yaw = query(problem), 0.3
     turned = replace(PILLAR, position=(np.cos(yaw) - 0.45 * np.sin(yaw), np.sin(yaw) + 0.45 * np.cos(yaw), 0.0))
-    plain = clearing(problem, space(PILLAR)).solve(0.0, asked)
-    ours = clearing(problem, space(turned)).solve(0.0, asked, yaw)
+    plain = clearing(problem, space(PILLAR)).solve(0.0, posed)
+    ours = clearing(problem, space(turned)).solve(0.0, posed, yaw)
     np.testing.assert_allclose(ours.answer.plan, plain.answer.plan, atol=1e-4)
 
 
 def test_steps_of_their_own_make_no_difference_where_they_are_the_model_s(problem: Problem) -> None:
-    asked, model = query(problem), problem.model
-    plain = clearing(problem, space(PILLAR)).solve(0.0, asked)
+    posed, model = query(problem), problem.model
+    plain = clearing(problem, space(PILLAR)).solve(0.0, posed)
     steps = (np.tile(model.A, (N, 1, 1)), np.tile(model.B, (N, 1, 1)), np.tile(-model.B @ model.u_bar, (N, 1)))
-    own = clearing(problem, space(PILLAR), changing=True).solve(0.0, asked._replace(steps=steps))
-    np.testing.assert_allclose(own.answer.plan, plain.answer.plan, atol=1e-3)
-    np.testing.assert_allclose(own.states, plain.states, atol=1e-5)
+    changing = clearing(problem, space(PILLAR), changing=True).solve(0.0, posed._replace(steps=steps))
+    np.testing.assert_allclose(changing.answer.plan, plain.answer.plan, atol=1e-3)
+    np.testing.assert_allclose(changing.states, plain.states, atol=1e-5)
 
 
 def test_soft_half_spaces_give_way_and_hard_ones_are_named(problem: Problem) -> None:
@@ -203,14 +203,14 @@ def test_soft_half_spaces_give_way_and_hard_ones_are_named(problem: Problem) -> 
     assert hard.problem.constraints[0].C.shape == (N, 1, 12)
 
 
-def test_what_takes_rows_for_the_same_at_all_steps_refuses_or_stands_aside(problem: Problem) -> None:
+def test_what_takes_rows_for_the_same_at_all_steps_refuses_or_is_skipped(problem: Problem) -> None:
     among = space(PILLAR)
     normals, bounds = among.half_spaces(np.zeros(N), np.zeros((N, 3)))
-    posed = replace(problem, constraints=among.constraints(normals, bounds, 12))
+    constrained = replace(problem, constraints=among.constraints(normals, bounds, 12))
     with pytest.raises(ValueError, match="same at all steps"):
-        Condensed(posed)
-    whole = QPSolver("piqp-multistage", posed)
-    assert with_shortcut(posed, whole) is whole
+        Condensed(constrained)
+    whole = QPSolver("piqp-multistage", constrained)
+    assert with_shortcut(constrained, whole) is whole
     assert isinstance(whole.formulation, Staged)
 
 

@@ -67,7 +67,7 @@ def test_samples_have_a_tolerance_of_their_own(sampled: float, satisfied: bool) 
 @pytest.mark.parametrize(
     ("start", "stop", "peak", "margin"),
     [
-        (0.0, 0.1, 0.0, 1.0),  # 0 and 1 are equally near to a bound: the first is told
+        (0.0, 0.1, 0.0, 1.0),  # 0 and 1 are equally near to a bound: the first is reported
         (0.0, 0.15, 2.5, -0.5),  # both ends belong to the window
         (0.15, 0.15, 2.5, -0.5),
         (0.16, 0.24, 1.9, 0.1),

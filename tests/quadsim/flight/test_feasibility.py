@@ -1,4 +1,4 @@
-"""What a course asks of a vehicle: against closed forms, balances of momentum, and every sentence said about it."""
+"""What a course requires of a vehicle: against closed forms, balances of momentum, and every sentence."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ PERIOD = 0.01
 ROLL, PITCH = INDEX["roll"], INDEX["pitch"]
 
 
-def asked(
+def demanded(
     vehicle: Vehicle, course: Callable[[Array], tuple[Array, ...]], *, period: float = PERIOD, seconds: float = 2.0
 ) -> tuple[Array, Demand]:
     """Times and demand of a course given as t -> x, y, z, yaw."""
@@ -34,18 +34,18 @@ def winding(t: Array) -> tuple[Array, ...]:
     return np.sin(1.5 * t), np.cos(t) + 0.3 * t**2, np.sin(2.0 * t), 0.8 * np.sin(1.1 * t) + t
 
 
-def test_hover_asks_for_the_hover_speed_and_nothing_else(vehicle: Vehicle) -> None:
-    _, found = asked(vehicle, lambda t: (0.0 * t, 0.0 * t + 3.0, 0.0 * t - 1.0, 0.0 * t + 0.5))
+def test_hover_requires_the_hover_speed_and_nothing_else(vehicle: Vehicle) -> None:
+    _, found = demanded(vehicle, lambda t: (0.0 * t, 0.0 * t + 3.0, 0.0 * t - 1.0, 0.0 * t + 0.5))
     np.testing.assert_allclose(found.speeds, vehicle.hover_speed, rtol=1e-12)
     np.testing.assert_allclose(found.state[0], [0, 0, 3, 0, -1, 0, 0, 0, 0, 0, 0.5, 0], atol=1e-15)
     assert not found.torque.any()
     assert not tilt(found.state).any()
 
 
-def test_a_circle_asks_for_the_tilt_of_its_centripetal_acceleration(vehicle: Vehicle) -> None:
+def test_a_circle_requires_the_tilt_of_its_centripetal_acceleration(vehicle: Vehicle) -> None:
     """tan(tilt) = v^2 / (r g), where v^2 / r of a sampled circle is r (2 - 2 cos(w h)) / h^2."""
     radius, rate = 2.0, 1.2
-    _, found = asked(vehicle, lambda t: (radius * np.cos(rate * t), radius * np.sin(rate * t), 0.0 * t, 0.0 * t))
+    _, found = demanded(vehicle, lambda t: (radius * np.cos(rate * t), radius * np.sin(rate * t), 0.0 * t, 0.0 * t))
     sampled = radius * (2.0 - 2.0 * math.cos(rate * PERIOD)) / PERIOD**2
     np.testing.assert_allclose(tilt(found.state), math.atan(sampled / vehicle.gravity), rtol=1e-9)
     np.testing.assert_allclose(tilt(found.state), math.atan(radius * rate**2 / vehicle.gravity), rtol=2e-5)
@@ -57,7 +57,7 @@ def test_a_circle_asks_for_the_tilt_of_its_centripetal_acceleration(vehicle: Veh
 def test_the_nose_to_the_centre_of_a_circle_is_a_pitch_alone(vehicle: Vehicle) -> None:
     """Seen from a yaw that turns along, the attitude is constant; the body turns by the yaw rate about the vertical."""
     radius, rate = 2.0, 1.2
-    _, found = asked(
+    _, found = demanded(
         vehicle, lambda t: (radius * np.cos(rate * t), radius * np.sin(rate * t), 0.0 * t, rate * t + math.pi)
     )
     pitch = math.atan(radius * rate**2 / vehicle.gravity)
@@ -69,17 +69,17 @@ def test_the_nose_to_the_centre_of_a_circle_is_a_pitch_alone(vehicle: Vehicle) -
     np.testing.assert_allclose(found.torque, np.tile(gyroscopic, (len(found.torque), 1)), rtol=1e-4, atol=1e-7)
 
 
-def test_a_helix_asks_for_no_more_tilt_than_its_circle(vehicle: Vehicle) -> None:
+def test_a_helix_requires_no_more_tilt_than_its_circle(vehicle: Vehicle) -> None:
     radius, rate = 2.0, 1.2
     turn = (lambda t: radius * np.cos(rate * t), lambda t: radius * np.sin(rate * t))
-    _, level = asked(vehicle, lambda t: (turn[0](t), turn[1](t), 0.0 * t, 0.0 * t))
-    _, climbing = asked(vehicle, lambda t: (turn[0](t), turn[1](t), 0.7 * t, 0.0 * t))
+    _, level = demanded(vehicle, lambda t: (turn[0](t), turn[1](t), 0.0 * t, 0.0 * t))
+    _, climbing = demanded(vehicle, lambda t: (turn[0](t), turn[1](t), 0.7 * t, 0.0 * t))
     np.testing.assert_allclose(climbing.speeds, level.speeds, rtol=1e-7)
     np.testing.assert_allclose(climbing.state[:, INDEX["vz"]], 0.7, rtol=1e-9)
 
 
 def test_going_up_and_down_is_thrust_alone(vehicle: Vehicle) -> None:
-    t, found = asked(vehicle, lambda t: (0.0 * t, 0.0 * t, 0.5 * np.sin(2.0 * t), 0.0 * t))
+    t, found = demanded(vehicle, lambda t: (0.0 * t, 0.0 * t, 0.5 * np.sin(2.0 * t), 0.0 * t))
     thrust = vehicle.mass * (vehicle.gravity - 0.5 * 4.0 * np.sin(2.0 * t))
     np.testing.assert_allclose(found.thrust, thrust, rtol=1e-4)
     expected = np.sqrt(thrust / (4.0 * vehicle.thrust_coefficient))
@@ -87,7 +87,7 @@ def test_going_up_and_down_is_thrust_alone(vehicle: Vehicle) -> None:
 
 
 def test_a_yaw_that_swings_is_the_torque_of_its_angular_acceleration(vehicle: Vehicle) -> None:
-    t, found = asked(vehicle, lambda t: (0.0 * t, 0.0 * t, 0.0 * t, 0.3 * np.sin(2.0 * t)))
+    t, found = demanded(vehicle, lambda t: (0.0 * t, 0.0 * t, 0.0 * t, 0.3 * np.sin(2.0 * t)))
     np.testing.assert_allclose(found.torque[:, 2], -vehicle.inertia[2] * 1.2 * np.sin(2.0 * t), atol=1e-5)
     np.testing.assert_allclose(found.torque[:, :2], 0.0, atol=1e-12)
     squared = np.linalg.solve(vehicle.allocation, np.column_stack([found.thrust, found.torque]).T).T
@@ -96,15 +96,15 @@ def test_a_yaw_that_swings_is_the_torque_of_its_angular_acceleration(vehicle: Ve
 
 def test_a_sway_is_the_torque_of_the_pitch_that_it_needs(vehicle: Vehicle) -> None:
     """The pitch is atan(a_x / g), the torque I_yy times its second derivative, taken of the closed form."""
-    t, found = asked(vehicle, lambda t: (0.2 * np.sin(2.0 * t), 0.0 * t, 0.0 * t, 0.0 * t))
+    t, found = demanded(vehicle, lambda t: (0.2 * np.sin(2.0 * t), 0.0 * t, 0.0 * t, 0.0 * t))
     fine = np.linspace(-0.1, 2.1, 2201)
     pitch = np.arctan(-0.8 * np.sin(2.0 * fine) / vehicle.gravity)
     expected = vehicle.inertia[1] * np.gradient(np.gradient(pitch, fine), fine)
     np.testing.assert_allclose(found.torque[:, 1], np.interp(t, fine, expected), atol=1e-5)
 
 
-def test_the_thrust_along_body_z_accelerates_the_vehicle_as_asked(vehicle: Vehicle) -> None:
-    _, found = asked(vehicle, winding)
+def test_the_thrust_along_body_z_accelerates_the_vehicle_as_required(vehicle: Vehicle) -> None:
+    _, found = demanded(vehicle, winding)
     up = body_to_world(found.state[:, EULER])[:, :, 2]
     acceleration = found.thrust[:, None] / vehicle.mass * up - [0.0, 0.0, vehicle.gravity]
     np.testing.assert_allclose(acceleration, found.acceleration, atol=1e-12)
@@ -115,7 +115,7 @@ def test_the_torque_changes_the_angular_momentum() -> None:
     vehicle = lopsided()
 
     def imbalance(period: float) -> float:
-        _, found = asked(vehicle, winding, period=period)
+        _, found = demanded(vehicle, winding, period=period)
         euler = found.state[:, EULER]
         rotation = body_to_world(euler)
         body_rates = euler_to_body_rates(euler, found.state[:, EULER_RATE])
@@ -123,22 +123,22 @@ def test_the_torque_changes_the_angular_momentum() -> None:
         change = (momentum[2:] - momentum[:-2]) / (2.0 * period)
         return float(np.abs(change - np.einsum("kij,kj->ki", rotation, found.torque)[1:-1]).max())
 
-    assert imbalance(0.01) < 0.03 * np.abs(asked(vehicle, winding)[1].torque).max()
+    assert imbalance(0.01) < 0.03 * np.abs(demanded(vehicle, winding)[1].torque).max()
     assert imbalance(0.01) / imbalance(0.005) == pytest.approx(4.0, rel=0.05)
 
 
 @given(turn=st.floats(-10.0, 10.0))
-def test_the_same_course_in_another_direction_asks_for_the_same(turn: float) -> None:
+def test_the_same_course_in_another_direction_requires_the_same(turn: float) -> None:
     def turned(t: Array) -> tuple[Array, ...]:
         x, y, z, yaw = winding(t)
         return math.cos(turn) * x - math.sin(turn) * y, math.sin(turn) * x + math.cos(turn) * y, z, yaw + turn
 
-    _, there = asked(lopsided(), turned, seconds=0.2)
-    _, here = asked(lopsided(), winding, seconds=0.2)
+    _, there = demanded(lopsided(), turned, seconds=0.2)
+    _, here = demanded(lopsided(), winding, seconds=0.2)
     np.testing.assert_allclose(there.speeds, here.speeds, rtol=1e-5)
 
 
-def test_what_is_asked_for_at_a_jump_is_left_out(vehicle: Vehicle) -> None:
+def test_the_demand_at_a_jump_is_left_out(vehicle: Vehicle) -> None:
     poses = np.zeros((14, 4))
     poses[7:, 0] = 1.0
     jumps = np.arange(13) == 6
@@ -152,7 +152,7 @@ def test_what_is_asked_for_at_a_jump_is_left_out(vehicle: Vehicle) -> None:
     np.testing.assert_array_equal(left_out.state[:, POSITION[0]], poses[2:-2, 0])
 
 
-def test_a_kink_asks_for_a_tilt_but_for_no_torque(vehicle: Vehicle) -> None:
+def test_a_kink_requires_a_tilt_but_no_torque(vehicle: Vehicle) -> None:
     """A leg at 0.1 m/s that begins at once: the acceleration that gains its speed within one period."""
     t = PERIOD * np.arange(-7, 7)
     poses = np.zeros((14, 4))
@@ -164,12 +164,12 @@ def test_a_kink_asks_for_a_tilt_but_for_no_torque(vehicle: Vehicle) -> None:
     assert np.abs(demand(poses, PERIOD, vehicle).torque).max() > 10.0
 
 
-def test_a_course_within_everything_is_said_to_be(vehicle: Vehicle) -> None:
-    _, needed = asked(vehicle, lambda t: (0.2 * np.cos(t), 0.2 * np.sin(t), 0.0 * t, 0.0 * t))
+def test_a_course_within_all_limits_is_reported_feasible(vehicle: Vehicle) -> None:
+    _, needed = demanded(vehicle, lambda t: (0.2 * np.cos(t), 0.2 * np.sin(t), 0.0 * t, 0.0 * t))
     found = assess(needed, vehicle, bounds={"roll": (-0.1, 0.1), "speed": (0.0, 250.0), "slew": (-10.0, 5.0)})
     assert found.problems == ()
     assert found.sentence == (
-        "The course asks for up to 1.17 deg of tilt (bound 5.73 deg), 0.2 m/s, and rotor speeds of 192.8 to 192.8 "
+        "The course requires up to 1.17 deg of tilt (bound 5.73 deg), 0.2 m/s, and rotor speeds of 192.8 to 192.8 "
         "rad/s (limits 0 and 250 rad/s)."
     )
     assert found.thrust_to_weight == pytest.approx(math.hypot(1.0, 0.2 / vehicle.gravity), rel=1e-5)
@@ -178,11 +178,11 @@ def test_a_course_within_everything_is_said_to_be(vehicle: Vehicle) -> None:
 
 
 def test_every_limit_and_bound_that_is_left_is_named(vehicle: Vehicle) -> None:
-    _, needed = asked(vehicle, lambda t: (np.sin(2.0 * t), 0.0 * t, np.sin(2.0 * t) * 0.5, 3.0 * t), seconds=6.0)
+    _, needed = demanded(vehicle, lambda t: (np.sin(2.0 * t), 0.0 * t, np.sin(2.0 * t) * 0.5, 3.0 * t), seconds=6.0)
     bounds = {"roll": (-0.2, 0.2), "vx": (-1.0, 5.0), "yaw_rate": (-1.0, 1.0), "speed": (180.0, 260.0)}
     found = assess(needed, replace(vehicle, speed_max=200.0), bounds={**bounds, "slew": (-0.1, 0.1)}, jumps=(1.0,))
     names = [problem.rsplit(" (", 1) for problem in found.problems]
-    assert [(said.split(" up")[0].split(" down")[0], kind) for said, kind in names] == [
+    assert [(text.split(" up")[0].split(" down")[0], kind) for text, kind in names] == [
         ("rotor speed", "limit 200)"),
         ("roll", "bound 11.46)"),
         ("roll", "bound -11.46)"),
@@ -195,7 +195,7 @@ def test_every_limit_and_bound_that_is_left_is_named(vehicle: Vehicle) -> None:
     assert f"rotor speed up to {needed.speeds.max():.4g} rad/s (limit 200)" in found.problems
     assert f"vx down to {needed.state[:, INDEX['vx']].min():.4g} m/s (bound -1)" in found.problems
     assert "rad/s per period" in found.problems[-1]
-    assert found.sentence.startswith("The course steps (at t = 1 s); what is left asks for up to ")
+    assert found.sentence.startswith("The course steps (at t = 1 s); the rest requires up to ")
     assert found.sentence.endswith(f" It cannot be followed exactly: {'; '.join(found.problems)}.")
     assert found.yaw_rate == pytest.approx(math.degrees(3.0))
     assert found.yaw == pytest.approx(math.degrees(18.0))
@@ -203,13 +203,13 @@ def test_every_limit_and_bound_that_is_left_is_named(vehicle: Vehicle) -> None:
 
 
 def test_falling_faster_than_free_is_thrust_downwards(vehicle: Vehicle) -> None:
-    _, needed = asked(vehicle, lambda t: (0.0 * t, 0.0 * t, -t * t * vehicle.gravity, 0.0 * t))
+    _, needed = demanded(vehicle, lambda t: (0.0 * t, 0.0 * t, -t * t * vehicle.gravity, 0.0 * t))
     found = assess(needed, vehicle)
     assert found.tilt == pytest.approx(180.0)
 
 
-def test_a_torque_beyond_the_thrust_asks_a_rotor_to_push_down(vehicle: Vehicle) -> None:
-    _, needed = asked(vehicle, lambda t: (0.0 * t, 0.0 * t, 0.0 * t, 2.0 * np.sin(8.0 * t)))
+def test_a_torque_beyond_the_thrust_requires_a_rotor_to_push_down(vehicle: Vehicle) -> None:
+    _, needed = demanded(vehicle, lambda t: (0.0 * t, 0.0 * t, 0.0 * t, 2.0 * np.sin(8.0 * t)))
     found = assess(needed, vehicle)
     assert found.rotor_min == needed.speeds.min() < 0.0
     assert f"rotor speed down to {found.rotor_min:.4g} rad/s (limit 0)" in found.problems
@@ -218,12 +218,12 @@ def test_a_torque_beyond_the_thrust_asks_a_rotor_to_push_down(vehicle: Vehicle) 
 
 
 def test_many_jumps_are_not_all_listed(vehicle: Vehicle) -> None:
-    _, needed = asked(vehicle, lambda t: (0.0 * t,) * 4)
+    _, needed = demanded(vehicle, lambda t: (0.0 * t,) * 4)
     assert "steps (at t = 0, 1, 2, 3, ... s)" in assess(needed, vehicle, jumps=[0.0, 1.0, 2.0, 3.0, 4.0]).sentence
 
 
 def test_a_finding_is_strict_json(vehicle: Vehicle) -> None:
-    _, needed = asked(vehicle, winding)
+    _, needed = demanded(vehicle, winding)
     found = assess(needed, vehicle, bounds={"roll": (-0.01, 0.01)}, jumps=(1.0,))
     back = json.loads(json.dumps(asdict(found), allow_nan=False))
     assert back["jumps"] == [1.0]

@@ -59,7 +59,7 @@ def test_distance_is_from_the_reference_and_depth_below_the_lowest_it_has_been()
     assert loss(state(z=-90.0), lowest=-60.0) == ""
 
 
-def test_the_reason_says_which_criterion_its_value_its_limit_and_the_time() -> None:
+def test_the_reason_names_which_criterion_its_value_its_limit_and_the_time() -> None:
     with pytest.raises(LostError) as caught:
         check_loss(LIMITS, 1.5, state(roll=math.radians(131.0)), np.zeros(4), 0.0)
     reason = "at t = 1.500 s: lost: the thrust axis is tilted by 131 deg, beyond lost.tilt = 120 deg"

@@ -158,7 +158,7 @@ def test_the_controllers_counts_and_times() -> None:
     [
         ([0] * 20, 0),
         ([2, *[0] * 19], 0),  # it recovered
-        ([0] * 11 + [1] * 9, 0),  # 0.9 s, too short to tell
+        ([0] * 11 + [1] * 9, 0),  # 0.9 s, too short to count
         ([0] * 10 + [1] * 9 + [3], 10),
         ([1] * 5 + [0] + [1] * 14, 14),
         ([2, 2, 1], 3),  # the whole of a short flight

@@ -1,4 +1,4 @@
-"""A run directory is read back, and tells when it was tampered with."""
+"""A run directory is read back, and shows when it was modified."""
 
 from __future__ import annotations
 
@@ -103,7 +103,7 @@ def test_a_directory_without_a_summary_is_no_run(tmp_path: Path) -> None:
     with pytest.raises(FileError, match=r"is not a run directory: it has no summary\.json"):
         rundir.read_summary(tmp_path)
     with pytest.raises(FileError, match="is not a run directory"):
-        rundir.read_summary(tmp_path / "nowhere")
+        rundir.read_summary(tmp_path / "missing")
 
 
 @pytest.mark.parametrize(

@@ -87,7 +87,7 @@ def test_a_leftover_with_something_of_a_persons_in_it_stays(tmp_path: Path, capl
 
 
 @pytest.mark.parametrize("change", ["another inode", "another host", "alive", "no owner", "nonsense", "locked"])
-def test_what_may_be_another_ones_is_left_alone(tmp_path: Path, change: str) -> None:
+def test_what_may_be_foreign_is_not_touched(tmp_path: Path, change: str) -> None:
     with killed("writing", tmp_path / "run") as left:
         owner = json.loads((left / "owner.json").read_text())
         if change == "another inode":
@@ -133,7 +133,7 @@ def test_a_process_that_dies_while_it_swaps_costs_nothing(
             exchange(self, new, target)
         elif moment == "between two steps":
             new.with_name(staging._NAME).write_bytes(b"run")
-            target.rename(new.with_name(staging._ASIDE))
+            target.rename(new.with_name(staging._PREVIOUS))
         raise SystemExit
 
     with monkeypatch.context() as patch:

@@ -54,7 +54,7 @@ def chained(run: Path) -> None:
 
 
 def linked_to_nothing(run: Path) -> None:
-    (run / "flight.mp4").symlink_to("../nowhere")
+    (run / "flight.mp4").symlink_to("../missing")
 
 
 WAYS = [linked_file, linked_folder, linked_deep, linked_table, linked_summary, chained, linked_to_nothing]
@@ -69,9 +69,9 @@ def test_a_run_with_a_link_out_of_it_is_refused(
     way(run)
     options = ["--out", str(tmp_path / "page")] if command == "compare" else []
     assert main([command, str(run), *options]) == EXIT_WRONG_INPUT
-    said = capsys.readouterr()
-    assert f"is a link that leads out of {run}; nothing is read through it" in said.err
-    assert (said.out, said.err.count("\n")) == ("", 1)
+    printed = capsys.readouterr()
+    assert f"is a link that leads out of {run}; nothing is read through it" in printed.err
+    assert (printed.out, printed.err.count("\n")) == ("", 1)
     assert not (tmp_path / "page").exists()
 
 

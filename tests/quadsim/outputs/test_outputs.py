@@ -54,7 +54,7 @@ def test_nothing_is_left_when_the_block_fails(tmp_path: Path, error: type[BaseEx
     assert listing(tmp_path) == []
 
 
-def test_a_disk_that_fills_up_is_said_and_leaves_nothing(tmp_path: Path) -> None:
+def test_a_disk_that_fills_up_is_reported_and_leaves_nothing(tmp_path: Path) -> None:
     target = tmp_path / "new" / "run"
     with pytest.raises(OutputError, match=f"^cannot write {target}: No space left"), writing(target, KIND):
         raise OSError(errno.ENOSPC, "No space left on device")
@@ -68,7 +68,7 @@ def test_a_file_in_it_that_cannot_be_written_is_named_as_if_it_were_there(tmp_pa
     assert listing(tmp_path) == []
 
 
-def test_a_full_disk_is_said_before_anything_is_done(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_full_disk_is_reported_before_anything_is_done(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(shutil, "disk_usage", lambda _: shutil._ntuple_diskusage(10**9, 10**9 - 4096, 4096))
     with pytest.raises(OutputError, match="the disk is full"), writing(tmp_path / "new" / "run", KIND):
         pytest.fail("the block must not be entered")
@@ -242,7 +242,7 @@ def test_a_path_without_links_and_dots_stays_as_it_is(
 
 
 @pytest.mark.parametrize(("name", "message"), [("loop", "leads back to itself"), ("a\0b", "null byte")])
-def test_a_path_that_leads_nowhere_is_refused(tmp_path: Path, name: str, message: str) -> None:
+def test_a_path_that_does_not_exist_is_refused(tmp_path: Path, name: str, message: str) -> None:
     (tmp_path / "loop").symlink_to("pool")
     (tmp_path / "pool").symlink_to("loop")
     for refuse in (lambda path: require_directory(path, KIND), lambda path: require_file(path, ".xml")):
@@ -427,7 +427,7 @@ def test_a_directory_to_which_nothing_was_added_is_as_before(tmp_path: Path) -> 
 def test_what_is_saved_into_the_new_one_before_it_goes_back_stays(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, how: str
 ) -> None:
-    """Somebody else's things come to light in the swap; in that moment more is saved where they were."""
+    """Foreign files are found in the swap; at that moment more is saved where they were."""
     target = tmp_path / "target"
     exchange, times = staging.Staging._exchange, iter(range(9))
 

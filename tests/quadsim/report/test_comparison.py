@@ -1,4 +1,4 @@
-"""The rows and sentences of a comparison say what the summaries say."""
+"""The rows and sentences of a comparison agree with the summaries."""
 
 import copy
 import dataclasses
@@ -52,7 +52,7 @@ def test_values_are_the_summarys_with_angles_in_degrees(short_run: Run) -> None:
     assert row(rows, "bounds", "Constraint arrival_x").cells[0].text == "-0.01 .. 0.01, from 59 s"
 
 
-def test_a_law_goes_by_its_name_and_ones_own_by_what_it_says(short_run: Run) -> None:
+def test_a_law_has_its_name_and_a_custom_one_its_description(short_run: Run) -> None:
     for recorded, shown in (("geometric", "geometric control"), ("constrained", "constrained MPC"), ("mine", "mine")):
         summary = {**short_run.summary, "controller": {**short_run.summary["controller"], "name": recorded}}
         rows = comparison_rows([dataclasses.replace(short_run, summary=summary)])
@@ -96,8 +96,8 @@ def test_an_aborted_flight_is_never_best(short_run: Run, worse_run: Run, aborted
 
 def test_verdicts_carry_their_tolerances_and_what_is_required(short_run: Run, worse_run: Run) -> None:
     rows = comparison_rows([short_run, worse_run])
-    kept, exceeded = row(rows, "verdict", "Constraint roll").cells
-    assert (kept.text, kept.mark) == ("holds (tolerance 0.01 / 0.05 deg)", Mark.GOOD)
+    held, exceeded = row(rows, "verdict", "Constraint roll").cells
+    assert (held.text, held.mark) == ("holds (tolerance 0.01 / 0.05 deg)", Mark.GOOD)
     assert exceeded.text == "exceeded by 2.5 deg, not required (tolerance 0.01 / 0.05 deg)"
     assert exceeded.mark is Mark.WARN
     violated = row(rows, "verdict", "Constraint speed").cells[1]
@@ -108,21 +108,21 @@ def test_verdicts_carry_their_tolerances_and_what_is_required(short_run: Run, wo
     assert marks(row(rows, "deadline misses")) == [Mark.NONE, Mark.BAD]
 
 
-def test_a_bound_exceeded_in_the_commands_alone_says_so(short_run: Run) -> None:
+def test_a_bound_exceeded_in_the_commands_alone_is_marked(short_run: Run) -> None:
     summary: dict[str, Any] = copy.deepcopy(short_run.summary)
     (entry,) = (each for each in summary["constraints"] if each["name"] == "speed")
     entry.update(worst_margin_sampled=-120.0, worst_margin=0.0, time_violated=0.0, satisfied=False, required=False)
     clipped = dataclasses.replace(short_run, summary=summary)
     verdict = row(comparison_rows([clipped]), "verdict", "Constraint speed").cells[0].text
     assert verdict.startswith("exceeded by 120 rad/s at the samples, not required")
-    assert any("exceeds it by 120 rad/s at the samples." in told for told in comparison_sentences([clipped]))
+    assert any("exceeds it by 120 rad/s at the samples." in sentence for sentence in comparison_sentences([clipped]))
 
 
 def test_different_courses_are_pointed_out(short_run: Run) -> None:
     control = dataclasses.replace(short_run.log.control, reference=short_run.log.control.reference + 1.0)
     other = dataclasses.replace(short_run, log=dataclasses.replace(short_run.log, control=control))
-    assert not any("courses" in told for told in comparison_sentences([short_run, short_run]))
-    assert any("2 different courses" in told for told in comparison_sentences([short_run, other]))
+    assert not any("courses" in sentence for sentence in comparison_sentences([short_run, short_run]))
+    assert any("2 different courses" in sentence for sentence in comparison_sentences([short_run, other]))
 
 
 def test_a_constraint_that_a_run_lacks_is_shown_as_absent(short_run: Run) -> None:
@@ -133,21 +133,21 @@ def test_a_constraint_that_a_run_lacks_is_shown_as_absent(short_run: Run) -> Non
 
 
 def test_sentences_state_the_difference_in_numbers(short_run: Run, worse_run: Run, aborted_run: Run) -> None:
-    told = "\n".join(comparison_sentences([short_run, worse_run, aborted_run]))
-    assert "paper-constrained and worse were flown to the end." in told
-    assert f"lost was aborted after 6 s: {aborted_run.summary['reason']}." in told
-    assert "worse exceeds it by 2.5 deg, for 0.75 s in all" in told
-    assert "worse violates it by 2.5 rad/s" in told
-    assert "In the median, worse takes 3 times as long as" in told
-    assert "1 deadline missed." in told
+    sentences = "\n".join(comparison_sentences([short_run, worse_run, aborted_run]))
+    assert "paper-constrained and worse were flown to the end." in sentences
+    assert f"lost was aborted after 6 s: {aborted_run.summary['reason']}." in sentences
+    assert "worse exceeds it by 2.5 deg, for 0.75 s in all" in sentences
+    assert "worse violates it by 2.5 rad/s" in sentences
+    assert "In the median, worse takes 3 times as long as" in sentences
+    assert "1 deadline missed." in sentences
 
 
 def test_one_run_and_an_empty_one_have_sentences_too(short_run: Run, empty_run: Run) -> None:
     (outcome, *_rest) = comparison_sentences([short_run])
     assert outcome == "paper-constrained was flown to the end."
-    told = comparison_sentences([empty_run])
-    assert told[0] == "ended-at-once was aborted after 0 s: at t = 0.000 s: the command is not finite."
-    (unreached,) = (sentence for sentence in told if "before it was held" in sentence)
+    sentences = comparison_sentences([empty_run])
+    assert sentences[0] == "ended-at-once was aborted after 0 s: at t = 0.000 s: the command is not finite."
+    (unreached,) = (sentence for sentence in sentences if "before it was held" in sentence)
     assert unreached.startswith("ended-at-once ended before it was held to roll, pitch,")
 
 

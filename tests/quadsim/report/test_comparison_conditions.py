@@ -1,4 +1,4 @@
-"""What a comparison and its sentences say of verdicts, courses, ground, told states and late commands."""
+"""A comparison's rows and sentences on verdicts, courses, ground, measured states and late commands."""
 
 import copy
 import dataclasses
@@ -18,7 +18,7 @@ COURSE = {
     "rotor_max": 201.9,
     "jumps": [1.0, 7.0],
     "problems": ["pitch up to 5.61 deg (bound 5)"],
-    "sentence": "The course asks for up to 5.61 deg of tilt.",
+    "sentence": "The course requires up to 5.61 deg of tilt.",
 }
 GROUND = {
     "takeoff_time": 2.155,
@@ -50,8 +50,8 @@ def having(run: Run, scenario: str, **entries: Any) -> Run:
 @pytest.fixture
 def bare_run(short_run: Run) -> Run:
     """The short flight as an older version wrote it: nothing of what this module tests."""
-    told = {key: value for key, value in short_run.summary.items() if key not in {*EVERYTHING, "expected", "diagnosis"}}
-    return having(dataclasses.replace(short_run, summary=told), "bare")
+    bare = {key: value for key, value in short_run.summary.items() if key not in {*EVERYTHING, "expected", "diagnosis"}}
+    return having(dataclasses.replace(short_run, summary=bare), "bare")
 
 
 def cells(rows: list[Row], group: str, label: str) -> list[str]:
@@ -59,7 +59,7 @@ def cells(rows: list[Row], group: str, label: str) -> list[str]:
     return [cell.text for cell in found.cells]
 
 
-def test_rows_say_what_the_summary_says_and_a_dash_where_it_is_silent(bare_run: Run) -> None:
+def test_rows_agree_with_the_summary_and_have_a_dash_where_it_has_no_entry(bare_run: Run) -> None:
     rows = comparison_rows([having(bare_run, "full", **EVERYTHING), bare_run])
     assert cells(rows, "Course", "largest tilt required") == ["5.61", "-"]
     assert cells(rows, "Course", "jumps") == ["at 1 s; at 7 s", "-"]
@@ -86,9 +86,9 @@ def test_a_flight_that_never_touches_the_ground_or_crashes_on_it(bare_run: Run) 
     assert cells(rows, "Ground", "touchdown at") == ["-", "15.88"]
     (end,) = (row for row in rows if row.label == "at the end")
     assert [cell.mark for cell in end.cells] == [Mark.NONE, Mark.BAD]
-    told = comparison_sentences([aloft, crashed])
-    assert "aloft is flying at the end." in told
-    assert any(sentence.startswith("crashed takes off") and sentence.endswith("and crashes.") for sentence in told)
+    sentences = comparison_sentences([aloft, crashed])
+    assert "aloft is flying at the end." in sentences
+    assert any(sentence.startswith("crashed takes off") and sentence.endswith("and crashes.") for sentence in sentences)
 
 
 @pytest.mark.parametrize(
@@ -108,8 +108,8 @@ def test_a_verdict_is_held_against_the_one_the_scenario_states(
     run = having(bare_run, "flight", status=status, constraints=constraints, expected=expected, as_expected=as_expected)
     found = verdict_cell(run.summary)
     assert (found.text, found.mark) == (text, mark)
-    told = [each for each in comparison_sentences([run]) if "scenario states" in each]
-    assert (not told) if sentence is None else (sentence in told[0])
+    sentences = [each for each in comparison_sentences([run]) if "scenario states" in each]
+    assert (not sentences) if sentence is None else (sentence in sentences[0])
 
 
 def test_a_verdict_needs_no_expectation_and_minds_required_constraints_alone(bare_run: Run) -> None:
@@ -119,40 +119,40 @@ def test_a_verdict_needs_no_expectation_and_minds_required_constraints_alone(bar
     assert verdict_cell(summary).mark is Mark.NONE
 
 
-def test_sentences_tell_what_each_flight_met(bare_run: Run) -> None:
-    told = comparison_sentences([having(bare_run, "one", **EVERYTHING), having(bare_run, "two", course=COURSE)])
-    assert "one and two: the course asks for up to 5.61 deg of tilt." in told, "one course, told once"
-    assert "On the way of one: rotor 2 loses 20 % at 2 s; a push of 4 N for 0.2 s at 3.5 s." in told
+def test_sentences_report_what_each_flight_met(bare_run: Run) -> None:
+    sentences = comparison_sentences([having(bare_run, "one", **EVERYTHING), having(bare_run, "two", course=COURSE)])
+    assert "one and two: the course requires up to 5.61 deg of tilt." in sentences, "one course, stated once"
+    assert "On the way of one: rotor 2 loses 20 % at 2 s; a push of 4 N for 0.2 s at 3.5 s." in sentences
     assert (
         "one takes off at 2.155 s, meets the ground at 15.88 s (0.05 m/s downwards, 1.2 deg of tilt) and is landed at "
         "the end."
-    ) in told
+    ) in sentences
     assert (
         "The controller of one received the position with an RMS error of 0.013 m and the attitude with one of "
         "0.573 deg, and no number in 10 periods."
-    ) in told
+    ) in sentences
     assert (
         "Commands of one come 12 ms after their measurement in the median and 60 ms at most; 3 too late to be used."
-    ) in told
+    ) in sentences
 
 
-def test_of_many_events_the_first_are_told(bare_run: Run) -> None:
+def test_of_many_events_the_first_are_listed(bare_run: Run) -> None:
     many = [{"time": float(i), "text": "a push of 1 N"} for i in range(30)]
-    (told,) = (each for each in comparison_sentences([having(bare_run, "one", events=many)]) if "On the way" in each)
-    assert told.count("a push of 1 N at") == 12
-    assert told.endswith("at 11 s; 18 more.")
+    (text,) = (each for each in comparison_sentences([having(bare_run, "one", events=many)]) if "On the way" in each)
+    assert text.count("a push of 1 N at") == 12
+    assert text.endswith("at 11 s; 18 more.")
 
 
-def test_bounds_that_differ_are_told_with_each_run(bare_run: Run) -> None:
+def test_bounds_that_differ_are_listed_with_each_run(bare_run: Run) -> None:
     entry = {**bare_run.summary["constraints"][0], "name": "roll", "satisfied": False, "worst_margin": -1.0}
     entry |= {"worst_margin_sampled": -1.0, "time_violated": 0.0, "required": True, "start": 0.0, "stop": None}
     wide = {**entry, "lower": -20.0, "upper": None, "start": 8.0}
     one, two = (having(bare_run, name, constraints=[each]) for name, each in (("one", entry), ("two", wide)))
-    told = comparison_sentences([one, two])
+    sentences = comparison_sentences([one, two])
     assert (
         "roll, whose bounds differ: one (-5 .. 5 deg) violates it by 1 deg; two (at least -20 deg, from 8 s) violates "
         "it by 1 deg."
-    ) in told
+    ) in sentences
     assert "roll, -5 .. 5 deg: one violates it by 1 deg." in comparison_sentences([one])
 
 
@@ -167,7 +167,7 @@ DIAGNOSIS = {
 }
 
 
-def test_fallback_for_good_is_no_success_and_is_said_with_its_reason(bare_run: Run) -> None:
+def test_fallback_for_good_is_no_success_and_is_reported_with_its_reason(bare_run: Run) -> None:
     held = [{**entry, "satisfied": True} for entry in bare_run.summary["constraints"]]
     controller = {**bare_run.summary["controller"], "unrecovered": 318}
     good = having(bare_run, "good", constraints=held)
@@ -181,11 +181,11 @@ def test_fallback_for_good_is_no_success_and_is_said_with_its_reason(bare_run: R
     assert verdict_sentence(having(stuck, "both", constraints=bare_run.summary["constraints"]).summary).startswith(
         "does"
     )
-    told = comparison_sentences([good, stuck])
-    assert "stuck ends in fallback for good; its scenario states the verdict satisfied." in told
-    said = ["318 periods in fallback, never recovered", DIAGNOSIS["sentence"], DIAGNOSIS["advice"]]
-    assert failure_sentences(stuck.summary) == said
-    assert f"stuck: {'; '.join(map(str, said))}." in told
-    assert not [sentence for sentence in told if sentence.startswith("good:")]
+    sentences = comparison_sentences([good, stuck])
+    assert "stuck ends in fallback for good; its scenario states the verdict satisfied." in sentences
+    reasons = ["318 periods in fallback, never recovered", DIAGNOSIS["sentence"], DIAGNOSIS["advice"]]
+    assert failure_sentences(stuck.summary) == reasons
+    assert f"stuck: {'; '.join(map(str, reasons))}." in sentences
+    assert not [sentence for sentence in sentences if sentence.startswith("good:")]
     assert cells(comparison_rows([good, stuck]), "Solver", "in fallback for good") == ["0", "318"]
-    assert failure_sentences(having(good, "solver", diagnosis={**DIAGNOSIS, "advice": ""}).summary) == [said[1]]
+    assert failure_sentences(having(good, "solver", diagnosis={**DIAGNOSIS, "advice": ""}).summary) == [reasons[1]]

@@ -190,24 +190,24 @@ def test_no_runs_are_an_error(tmp_path: Path) -> None:
 
 def test_thinning_keeps_ends_and_extremes() -> None:
     values = np.random.default_rng(0).normal(size=10_007)
-    kept = thin(values, 500)
-    assert kept.size <= 502
-    assert np.all(np.diff(kept) > 0)
-    assert {0, values.size - 1, int(values.argmin()), int(values.argmax())} <= set(kept.tolist())
+    thinned = thin(values, 500)
+    assert thinned.size <= 502
+    assert np.all(np.diff(thinned) > 0)
+    assert {0, values.size - 1, int(values.argmin()), int(values.argmax())} <= set(thinned.tolist())
     assert np.array_equal(thin(values[:300], 300), np.arange(300))
 
 
 def test_thinning_keeps_gaps() -> None:
     values = np.sin(np.arange(10_000.0))
     values[[10, 5000]] = np.nan
-    kept = thin(values, 500)
-    assert kept.size <= 504
-    assert {10, 5000} <= set(kept.tolist())
-    assert np.nanmax(values[kept]) == np.nanmax(values)
+    thinned = thin(values, 500)
+    assert thinned.size <= 504
+    assert {10, 5000} <= set(thinned.tolist())
+    assert np.nanmax(values[thinned]) == np.nanmax(values)
 
 
 @pytest.mark.usefixtures("sketched")
-def test_the_page_tells_the_verdict_against_the_one_expected(short_run: Run, tmp_path: Path) -> None:
+def test_the_page_shows_the_verdict_against_the_one_expected(short_run: Run, tmp_path: Path) -> None:
     summary = {**short_run.summary, "expected": "lost", "as_expected": False, "constraints": []}
     page = write_comparison([dataclasses.replace(short_run, summary=summary)], tmp_path / "out").read_text()
     assert 'verdict:\n      <span class="bad">satisfied, expected: lost</span>' in page

@@ -23,7 +23,7 @@ def test_curves_that_move_apart_from_one_another_or_have_no_unit_fit_their_axis_
     assert least_range([np.full(4, np.nan)], "deg") is None
 
 
-def test_an_angle_has_a_gap_at_each_wrap_and_nowhere_else() -> None:
+def test_an_angle_has_a_gap_at_each_wrap_and_only_there() -> None:
     t = np.linspace(0.0, 2.0, 201)
     wrapped = (360.0 * t + 180.0) % 360.0 - 180.0  # two turns in two seconds
     times, values = break_at_wraps(t, wrapped, "deg")

@@ -107,7 +107,7 @@ def test_an_ideal_flight_has_no_figure_of_effects(figures: dict[str, Path]) -> N
     assert "effects.png" not in figures
 
 
-def with_effects(run: Run, *, wrench: bool = False, wind: bool = False, lag: bool = False, told: bool = False) -> Run:
+def with_effects(run: Run, *, wrench: bool = False, wind: bool = False, lag: bool = False, state: bool = False) -> Run:
     """The flight as if it had met with some effects."""
     plant, control = run.log.plant, run.log.control
     rng = np.random.default_rng(0)
@@ -117,7 +117,7 @@ def with_effects(run: Run, *, wrench: bool = False, wind: bool = False, lag: boo
         plant = dataclasses.replace(plant, wind=rng.normal(size=(plant.t.size, 3)))
     if lag:
         plant = dataclasses.replace(plant, speeds=plant.speeds + 1.0)
-    if told:
+    if state:
         control = dataclasses.replace(control, state=control.state + 0.01)
     return dataclasses.replace(run, log=dataclasses.replace(run.log, plant=plant, control=control))
 
@@ -125,11 +125,11 @@ def with_effects(run: Run, *, wrench: bool = False, wind: bool = False, lag: boo
 SPEEDS = {"rotor 1 [rad/s]", "rotor 4 [rad/s]", "commanded", "acting"}
 FORCES = {"external force, world", "[N]", "external torque, body", "[N m]", "x", "y", "z"}
 AIR = {"wind, world", "[m/s]", "x", "y", "z"}
-TOLD = {"position as measured,", "less the true one [m]", "less the true one [deg]", "x", "y", "z", "roll", "yaw"}
+STATE = {"position as measured,", "less the true one [m]", "less the true one [deg]", "x", "y", "z", "roll", "yaw"}
 
 
 @pytest.mark.usefixtures("sketched")
-@pytest.mark.parametrize(("effect", "expected"), [("lag", SPEEDS), ("wrench", FORCES), ("wind", AIR), ("told", TOLD)])
+@pytest.mark.parametrize(("effect", "expected"), [("lag", SPEEDS), ("wrench", FORCES), ("wind", AIR), ("state", STATE)])
 def test_effects_are_drawn_where_there_are_any(short_run: Run, tmp_path: Path, effect: str, expected: set[str]) -> None:
     """Each by itself, with its panels and no others."""
     run = with_effects(short_run, **{effect: True})
@@ -137,14 +137,14 @@ def test_effects_are_drawn_where_there_are_any(short_run: Run, tmp_path: Path, e
     write_drawings({"effects": lambda: draw_effects(run)}, tmp_path)
     found = texts(tmp_path / "effects.svg")
     assert expected | {"time [s]", "paper-constrained: effects"} <= found
-    others = (SPEEDS | FORCES | AIR | TOLD) - expected
+    others = (SPEEDS | FORCES | AIR | STATE) - expected
     assert not others & found
 
 
 def test_all_effects_are_drawn_together(short_run: Run, tmp_path: Path) -> None:
-    run = with_effects(short_run, wrench=True, wind=True, lag=True, told=True)
+    run = with_effects(short_run, wrench=True, wind=True, lag=True, state=True)
     assert tmp_path / "effects.png" in write_figures(run, tmp_path)
-    assert texts(tmp_path / "effects.svg") >= SPEEDS | FORCES | AIR | TOLD
+    assert texts(tmp_path / "effects.svg") >= SPEEDS | FORCES | AIR | STATE
     picture = imread(tmp_path / "effects.png")[..., :3]
     assert 0.01 < np.mean(np.any(picture < 0.95, axis=-1)) < 0.5
 
@@ -200,18 +200,18 @@ def test_a_roll_that_wraps_is_no_line_across_the_panel(
 
 
 @pytest.mark.usefixtures("sketched")
-def test_states_are_drawn_as_told_beside_the_true_ones(
+def test_states_are_drawn_as_measured_beside_the_true_ones(
     short_run: Run, figures: dict[str, Path], tmp_path: Path
 ) -> None:
     assert "measured" not in texts(figures["figure4_states.svg"])
-    write_figures(with_effects(short_run, told=True), tmp_path)
+    write_figures(with_effects(short_run, state=True), tmp_path)
     assert {"flight", "measured"} <= texts(tmp_path / "figure4_states.svg")
-    told = lines_of_colour(tmp_path / "figure4_states.svg", line_colour(1))
-    assert told - lines_of_colour(figures["figure4_states.svg"], line_colour(1)) == 6 + 1, "six panels and the legend"
+    drawn = lines_of_colour(tmp_path / "figure4_states.svg", line_colour(1))
+    assert drawn - lines_of_colour(figures["figure4_states.svg"], line_colour(1)) == 6 + 1, "six panels and the legend"
 
 
 def test_each_panel_of_effects_has_a_legend_of_its_own(short_run: Run) -> None:
-    figure = draw_effects(with_effects(short_run, wind=True, told=True))
+    figure = draw_effects(with_effects(short_run, wind=True, state=True))
     legends = {axes.get_ylabel().split()[0]: axes.get_legend() for axes in figure.axes}
     named = {what: [text.get_text() for text in legend.get_texts()] for what, legend in legends.items() if legend}
     assert named == {"wind,": ["x", "y", "z"], "position": ["x", "y", "z"], "attitude": ["roll", "pitch", "yaw"]}

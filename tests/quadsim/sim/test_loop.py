@@ -24,7 +24,7 @@ PERIODS, STEPS, HORIZON = 10, 50, 4
 
 @dataclass
 class Scripted:
-    """A controller that commands what it is told to, and may raise."""
+    """A controller that commands what it is given, and may raise."""
 
     speeds: Array
     raises: dict[int, BaseException] = field(default_factory=dict)
@@ -171,7 +171,7 @@ def fall(
         )
 
 
-def test_a_flight_that_is_lost_is_kept_up_to_there(vehicle: Vehicle) -> None:
+def test_a_flight_that_is_lost_is_recorded_up_to_there(vehicle: Vehicle) -> None:
     """A free fall is 0.5 m deep between the samples at 0.3 and 0.35 s."""
     whole, cut = (fall(vehicle, {"depth": depth}) for depth in (math.inf, 0.5))
     assert (whole.reason, whole.lost, whole.control.t.size) == (None, None, PERIODS)

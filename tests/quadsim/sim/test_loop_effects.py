@@ -1,4 +1,4 @@
-"""The closed loop with late commands, sensors and a ground: who is told what, and when."""
+"""The closed loop with late commands, sensors and a ground: who receives what, and when."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ PERIOD, STEPS = 0.05, 50
 
 @dataclass
 class Scripted:
-    """Commands what it is told to, stops when grounded, and keeps what it was asked."""
+    """Commands what it is given, stops when grounded, and records its calls."""
 
     speeds: Array
     name: str = "scripted"
@@ -151,7 +151,7 @@ def test_drawn_delays_are_the_seed_s(vehicle: Vehicle, speeds: Array) -> None:
     assert np.any(delays(3) != delays(4))
 
 
-def test_the_controller_is_told_what_the_sensors_say(vehicle: Vehicle, speeds: Array) -> None:
+def test_the_controller_receives_the_sensors_samples(vehicle: Vehicle, speeds: Array) -> None:
     sensors = [Sensor(name=SensorName.POSITION, rate=20.0, noise=(0.1, 0.1, 0.1))]
     navigation = Navigation(vehicle, timestep=1e-3, sensors=sensors, rng=np.random.default_rng(0))
     controller = Scripted(speeds)
@@ -159,30 +159,30 @@ def test_the_controller_is_told_what_the_sensors_say(vehicle: Vehicle, speeds: A
         log = fly_scripted(plant, controller, navigation=navigation)
     np.testing.assert_array_equal(controller.states, log.control.state)
     np.testing.assert_allclose(log.control.truth, log.plant.state[:-1:STEPS], atol=1e-12)
-    told = log.control.state - log.control.truth
-    assert 0.02 < np.abs(told[:, [0, 2, 4]]).max() < 0.5
-    np.testing.assert_allclose(np.delete(told, [0, 2, 4], axis=1), 0.0, atol=1e-12)
+    deviation = log.control.state - log.control.truth
+    assert 0.02 < np.abs(deviation[:, [0, 2, 4]]).max() < 0.5
+    np.testing.assert_allclose(np.delete(deviation, [0, 2, 4], axis=1), 0.0, atol=1e-12)
     numbers = estimation(log.control)
-    assert numbers["rmse"]["x"] == pytest.approx(np.sqrt(np.mean(told[:, 0] ** 2)))
+    assert numbers["rmse"]["x"] == pytest.approx(np.sqrt(np.mean(deviation[:, 0] ** 2)))
     assert numbers["max_error"]["vx"] < 1e-12
     assert numbers["not_finite"] == 0
 
 
-def test_the_estimator_is_told_what_rotors_can_do_of_the_command(vehicle: Vehicle) -> None:
-    told: list[Array] = []
+def test_the_estimator_receives_the_saturated_command(vehicle: Vehicle) -> None:
+    received: list[Array] = []
 
     class Witness(Navigation):
         def advance(self, physics: Array, commands: Array, *, standing: bool = False) -> None:
-            told.append(commands[0].copy())
+            received.append(commands[0].copy())
             super().advance(physics, commands, standing=standing)
 
     navigation = Witness(vehicle, timestep=1e-3, sensors=[], rng=np.random.default_rng(0))
     with Plant(vehicle, limit_speeds=True) as plant:
         fly_scripted(plant, Scripted(np.full((2, 4), 300.0)), navigation=navigation)
-    np.testing.assert_array_equal(told, np.full((2, 4), vehicle.speed_max))
+    np.testing.assert_array_equal(received, np.full((2, 4), vehicle.speed_max))
 
 
-def test_a_sensor_that_says_no_number_is_counted(vehicle: Vehicle, speeds: Array) -> None:
+def test_a_sample_that_is_not_a_number_is_counted(vehicle: Vehicle, speeds: Array) -> None:
     fault = SensorFault(sensor=SensorName.RATES, kind=FaultKind.NAN, start=0.1, stop=0.2)
     navigation = Navigation(vehicle, timestep=1e-3, sensors=[], rng=np.random.default_rng(0), faults=[fault])
     with Plant(vehicle) as plant:

@@ -1,4 +1,4 @@
-"""What a controller is told, with and without an estimator."""
+"""What a controller receives, with and without an estimator."""
 
 from __future__ import annotations
 
@@ -40,8 +40,8 @@ def physics(vehicle: Vehicle, speeds: Array) -> Array:
         return np.vstack([plant.physics, plant.advance(speeds, STEPS).physics])
 
 
-def told(navigation: Navigation, physics: Array, speeds: Array, *, chunk: int = 50, yaw: float = 0.0) -> Array:
-    """(K, 12) what the controller is told at the start and after each 50 steps, told of it in chunks."""
+def observed(navigation: Navigation, physics: Array, speeds: Array, *, chunk: int = 50, yaw: float = 0.0) -> Array:
+    """(K, 12) what the controller receives at the start and after each 50 steps, advanced in chunks."""
     navigation.reset(physics[0], speeds, yaw)
     states = [navigation.state()]
     for step in range(0, STEPS, chunk):
@@ -55,11 +55,11 @@ def build(vehicle: Vehicle, *sensors: Sensor, seed: int = 0, **more: Any) -> Nav
     return Navigation(vehicle, timestep=TIMESTEP, sensors=sensors, rng=np.random.default_rng(seed), **more)
 
 
-def test_without_sensors_the_truth_is_told(vehicle: Vehicle, physics: Array, speeds: Array) -> None:
-    states = told(build(vehicle), physics, speeds, yaw=math.radians(179.0))
+def test_without_sensors_the_truth_is_passed_on(vehicle: Vehicle, physics: Array, speeds: Array) -> None:
+    states = observed(build(vehicle), physics, speeds, yaw=math.radians(179.0))
     np.testing.assert_allclose(states, physics_to_state(physics, math.radians(179.0))[::50], atol=1e-12)
     assert states[-1, INDEX["yaw"]] > math.pi
-    again = told(build(vehicle), physics, speeds, yaw=math.radians(179.0) - 4.0 * math.pi)
+    again = observed(build(vehicle), physics, speeds, yaw=math.radians(179.0) - 4.0 * math.pi)
     np.testing.assert_allclose(again[:, INDEX["yaw"]], states[:, INDEX["yaw"]] - 4.0 * math.pi, atol=1e-12)
 
 
@@ -71,13 +71,13 @@ def test_yaw_is_counted_over_whole_turns(estimator: EstimatorSettings | None, ve
         start[INDEX["yaw_rate"]] = spin
         plant.reset(start, hover)
         physics = np.vstack([plant.physics, plant.advance(hover, STEPS).physics])
-    yaw = told(build(vehicle, *SENSORS, estimator=estimator), physics, hover)[:, INDEX["yaw"]]
+    yaw = observed(build(vehicle, *SENSORS, estimator=estimator), physics, hover)[:, INDEX["yaw"]]
     np.testing.assert_allclose(yaw, spin * 0.05 * np.arange(13), atol=0.05)  # 1.8 turns
 
 
 def test_the_last_sample_to_arrive_is_held(vehicle: Vehicle, physics: Array, speeds: Array) -> None:
     late = Sensor(name=SensorName.POSITION, rate=4.0, delay=0.12)  # taken at 0, 0.25, 0.5 s
-    states = told(build(vehicle, late), physics, speeds)
+    states = observed(build(vehicle, late), physics, speeds)
     truth = physics_to_state(physics)
     taken = [0, 0, 0, 0, 0, 0, 0, 0, 250, 250, 250, 250, 250]  # the last at 0.6 s, before 0.62
     np.testing.assert_array_equal(states[:, [0, 2, 4]], truth[taken][:, [0, 2, 4]])
@@ -99,30 +99,30 @@ def test_nan_reaches_the_controller_where_nothing_stops_it(
 ) -> None:
     """The sensors are perfect otherwise; what is no rate makes no Euler rate either."""
     fault = SensorFault(sensor=name, kind=FaultKind.NAN, start=0.2, stop=0.4, axes=(axis,))
-    states = told(build(vehicle, faults=(fault,)), physics, speeds)
+    states = observed(build(vehicle, faults=(fault,)), physics, speeds)
     assert np.isfinite(states[[0, 1, 2, 3, 8, 9, 10]]).all()
     assert np.isnan(states[4:8]).any(axis=1).all()
     if columns is not None:
         expected = [INDEX[columns[axis]]]
         others = [INDEX[name] for name in ("x", "y", "z", "vx", "vy", "vz", "roll", "pitch", "yaw")]
         assert [i for i in others if np.isnan(states[4, i])] == expected
-    np.testing.assert_allclose(states[8:], told(build(vehicle), physics, speeds)[8:], atol=1e-12)
+    np.testing.assert_allclose(states[8:], observed(build(vehicle), physics, speeds)[8:], atol=1e-12)
 
 
 @pytest.mark.parametrize("estimator", [None, EstimatorSettings()], ids=["held", "estimated"])
-def test_what_is_told_depends_on_the_seed_alone(
+def test_what_is_observed_depends_on_the_seed_alone(
     estimator: EstimatorSettings | None, vehicle: Vehicle, physics: Array, speeds: Array
 ) -> None:
     navigation = build(vehicle, *SENSORS, estimator=estimator)
-    once = told(navigation, physics, speeds)
-    assert np.array_equal(told(navigation, physics, speeds), once)  # reset: the same again
-    assert np.array_equal(told(build(vehicle, *SENSORS, estimator=estimator), physics, speeds, chunk=25), once)
-    assert not np.array_equal(told(build(vehicle, *SENSORS, seed=1, estimator=estimator), physics, speeds), once)
+    once = observed(navigation, physics, speeds)
+    assert np.array_equal(observed(navigation, physics, speeds), once)  # reset: the same again
+    assert np.array_equal(observed(build(vehicle, *SENSORS, estimator=estimator), physics, speeds, chunk=25), once)
+    assert not np.array_equal(observed(build(vehicle, *SENSORS, seed=1, estimator=estimator), physics, speeds), once)
 
 
 def test_one_sensor_leaves_the_draws_of_the_others_alone(vehicle: Vehicle, physics: Array, speeds: Array) -> None:
     more = (*SENSORS, Sensor(name=SensorName.VELOCITY, rate=20.0, noise=NOISE))
-    few, many = (told(build(vehicle, *sensors), physics, speeds) for sensors in (SENSORS, more))
+    few, many = (observed(build(vehicle, *sensors), physics, speeds) for sensors in (SENSORS, more))
     same = [i for i in range(12) if i not in (INDEX["vx"], INDEX["vy"], INDEX["vz"])]
     assert np.array_equal(few[:, same], many[:, same])
     assert not np.array_equal(few, many)
@@ -130,7 +130,7 @@ def test_one_sensor_leaves_the_draws_of_the_others_alone(vehicle: Vehicle, physi
 
 def test_the_estimate_is_near_the_truth_and_its_yaw_unwrapped(vehicle: Vehicle, physics: Array, speeds: Array) -> None:
     navigation = build(vehicle, *SENSORS, estimator=EstimatorSettings())
-    states = told(navigation, physics, speeds, yaw=math.radians(179.0))
+    states = observed(navigation, physics, speeds, yaw=math.radians(179.0))
     error = states - physics_to_state(physics, math.radians(179.0))[::50]
     assert np.abs(error[-1, [0, 2, 4]]).max() < 0.05
     assert np.abs(error[-1, [6, 8, 10]]).max() < 0.02

@@ -82,7 +82,7 @@ def test_a_take_off_called_off_on_the_ground(monitor: PhaseMonitor) -> None:
     assert phases(monitor, [(at(0.0), to(1.0)), (at(0.0), to(0.0))]) == ["armed", "landed"]
 
 
-def test_small_rises_ask_for_nothing(monitor: PhaseMonitor) -> None:
+def test_small_rises_require_no_take_off(monitor: PhaseMonitor) -> None:
     assert phases(monitor, [(at(0.0), to(0.049)), (at(0.0), to(0.051))]) == ["landed", "armed"]
 
 

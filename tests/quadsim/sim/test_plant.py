@@ -117,11 +117,11 @@ def test_state_comes_out_with_euler_rates_and_unwrapped_yaw(vehicle: Vehicle) ->
     np.testing.assert_allclose(physics_to_state(np.concatenate(rows))[-1, 10], 16.0, atol=1e-9)
 
 
-def test_start_is_the_state_asked_for(vehicle: Vehicle) -> None:
-    asked = np.random.default_rng(0).uniform(-1, 1, 12)
+def test_start_is_the_state_requested(vehicle: Vehicle) -> None:
+    requested = np.random.default_rng(0).uniform(-1, 1, 12)
     with Plant(vehicle) as plant:
-        plant.reset(asked)
-        np.testing.assert_allclose(plant.state(), asked, atol=1e-12)
+        plant.reset(requested)
+        np.testing.assert_allclose(plant.state(), requested, atol=1e-12)
         plant.reset(make_state(euler=(0.0, 0.0, 7.0)))  # a yaw beyond pi stays what it was
         np.testing.assert_allclose(plant.state()[10], 7.0, atol=1e-12)
 
@@ -155,7 +155,7 @@ def test_divergence_is_raised_and_not_reset_away(
     assert list(tmp_path.iterdir()) == []  # no MUJOCO_LOG.TXT
 
 
-def test_rotors_saturate_only_where_the_scenario_says_so(vehicle: Vehicle) -> None:
+def test_rotors_saturate_only_where_the_scenario_limits_them(vehicle: Vehicle) -> None:
     fast = np.full(4, 300.0)
     with Plant(vehicle) as free, Plant(vehicle, limit_speeds=True) as limited:
         for plant, speed in ((free, 300.0), (limited, vehicle.speed_max)):

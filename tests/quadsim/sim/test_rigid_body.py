@@ -1,4 +1,4 @@
-"""The Runge-Kutta plant of our own: an independent integration, its order, MuJoCo's steps, and what it refuses."""
+"""The Runge-Kutta plant: an independent integration, its order, MuJoCo's steps, and what it refuses."""
 
 from __future__ import annotations
 
@@ -124,7 +124,7 @@ def test_every_other_effect_acts_as_in_mujoco(effects: Effects, torrente: Vehicl
     np.testing.assert_allclose(ends[0], ends[1], rtol=0.0, atol=2e-6)
 
 
-def test_forces_of_ones_own_act_too_and_are_told_when_they_are_none(torrente: Vehicle) -> None:
+def test_user_defined_forces_act_too_and_are_refused_when_invalid(torrente: Vehicle) -> None:
     def spring(_: float, state: Array) -> Array:
         return np.array([*(-2.0 * state[[0, 2, 4]]), 0.0, 0.0, 0.0])
 
@@ -160,7 +160,7 @@ def test_what_it_does_not_know_is_refused(settings: dict[str, Any], named: str, 
         Plant(torrente, integrator="rk4", **settings)
 
 
-def test_drag_along_the_axes_alone_slows_a_fall_as_its_closed_form_says(torrente: Vehicle) -> None:
+def test_drag_along_the_axes_alone_slows_a_fall_as_its_closed_form(torrente: Vehicle) -> None:
     """Without thrust, level: m dw/dt = m g - k w^2 has w = w_t tanh(g t / w_t)."""
     terminal = math.sqrt(torrente.mass * torrente.gravity / 0.08)
     for integrator in ("rk4", "mujoco"):

@@ -14,7 +14,7 @@ import make_cost
 import numpy as np
 import pytest
 
-from mpc.solvers import SOLVERS, Way
+from mpc.solvers import SOLVERS, Method
 from quadsim.errors import InputError, ParameterError, RenderingUnavailableError
 from quadsim.report.film.video import rendering_backend, worker_count
 from scenarios.bench.bench_results import Growth, RenderProfile, SolverBench
@@ -231,7 +231,7 @@ def test_growth_covers_all_candidates_and_horizons(bench: SolverBench) -> None:
     assert {growth.name for growth in bench.growth} == {candidate.name for candidate in bench.candidates}
     for candidate in bench.candidates:
         kinds = {growth.kind for growth in bench.growth if growth.name == candidate.name}
-        assert kinds <= (set(Way) if candidate.shortcut else {""})
+        assert kinds <= (set(Method) if candidate.shortcut else {""})
     for growth in bench.growth:
         assert growth.horizons == (5, 20, 24, 30)
         assert all(0.0 < p50 <= p99 for p50, p99 in zip(growth.p50, growth.p99, strict=True))

@@ -36,7 +36,7 @@ def test_the_papers_course_steps_and_what_its_filter_leaves_is_beyond_the_bound(
     assert finding.tilt == pytest.approx(20.0, abs=0.1)
     assert [problem.split()[0] for problem in finding.problems] == ["roll", "roll", "pitch", "pitch"]
     assert finding.sentence.startswith(
-        "The course steps (at t = 0, 10, 20, 40 s); what is left asks for up to 19.96 deg of tilt (bound 5 deg), "
+        "The course steps (at t = 0, 10, 20, 40 s); the rest requires up to 19.96 deg of tilt (bound 5 deg), "
     )
 
 

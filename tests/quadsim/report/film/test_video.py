@@ -60,7 +60,7 @@ def decode(path: Path) -> np.ndarray:
 
 
 def metadata(path: Path) -> dict[str, Any]:
-    """What ffmpeg says about an MP4."""
+    """Metadata of an MP4, by ffmpeg."""
     reader = imageio_ffmpeg.read_frames(path)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", ResourceWarning)
@@ -94,7 +94,7 @@ def rewrite(run: Run, directory: Path, rows: int, *, states: float = 1.0) -> Pat
     return directory
 
 
-def test_the_film_has_the_frames_asked_for(film: tuple[Path, list[tuple[int, int]]]):
+def test_the_film_has_the_frames_requested(film: tuple[Path, list[tuple[int, int]]]):
     path, _ = film
     frames, meta = decode(path), metadata(path)
     assert frames.shape == (30, 720, 1280, 3)
@@ -174,10 +174,10 @@ def test_without_a_backend_the_error_lists_what_was_tried(
 
 
 def test_the_users_backend_is_tried_first(monkeypatch: pytest.MonkeyPatch):
-    asked: list[str] = []
+    tried: list[str] = []
 
     def run(_: object, *, env: dict[str, str], **__: object) -> None:
-        asked.append(env["MUJOCO_GL"])
+        tried.append(env["MUJOCO_GL"])
         assert env["PYOPENGL_PLATFORM"] == env["MUJOCO_GL"]
         if env["MUJOCO_GL"] == "osmesa":
             raise subprocess.CalledProcessError(1, "probe", stderr=b"Traceback\nImportError: no OSMesa here\n")
@@ -186,9 +186,9 @@ def test_the_users_backend_is_tried_first(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(subprocess, "run", run)
     video._probe.cache_clear()
     assert rendering_backend() == "egl"
-    assert asked == ["osmesa", "egl"]
+    assert tried == ["osmesa", "egl"]
     assert rendering_backend() == "egl"
-    assert asked == ["osmesa", "egl", "osmesa"], "one that renders is not asked again"
+    assert tried == ["osmesa", "egl", "osmesa"], "one that renders is not tried again"
     video._probe.cache_clear()
 
 
@@ -209,7 +209,7 @@ def fake_worker(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 
 
 @pytest.mark.usefixtures("fake_worker")
-def test_a_worker_that_fails_on_a_full_disk_is_told_so(
+def test_a_worker_that_fails_on_a_full_disk_is_reported(
     short_run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(video.shutil, "disk_usage", lambda folder: SimpleNamespace(free=0))
@@ -252,7 +252,7 @@ def test_ctrl_c_kills_the_workers(short_run: Run, tmp_path: Path, monkeypatch: p
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_film_goes_nowhere_without_a_folder(short_run: Run, tmp_path: Path):
+def test_a_film_without_a_folder_is_refused(short_run: Run, tmp_path: Path):
     with pytest.raises(OutputError, match="No such file"):
         render_video(short_run.directory, tmp_path / "missing" / "film.mp4", stop=0.1)
 
@@ -273,7 +273,7 @@ def test_impossible_films_are_refused(short_run: Run, tmp_path: Path, options: d
         render_video(short_run.directory, tmp_path / "film.mp4", **options)
 
 
-def test_a_shot_tells_its_times():
+def test_a_shot_gives_its_times():
     shot = Shot(run="x", fps=10, start=2.0, speed=4.0, first=5, count=3)
     assert shot.times == pytest.approx([4.0, 4.4, 4.8])
     assert Shot(**asdict(shot)) == shot
@@ -311,11 +311,11 @@ def test_the_camera_is_smooth_and_never_far(short_run: Run):
 def test_thinning_keeps_the_path_within_its_tolerance():
     angle = np.linspace(0.0, np.pi, 2000)
     arc = np.stack([np.cos(angle), np.sin(angle), 0.0 * angle], axis=1)
-    kept = thin(arc, 0.01)
-    assert kept[0] == 0
-    assert kept[-1] == 1999
-    assert len(kept) < 30
-    sagitta = 1.0 - np.cos(0.5 * np.diff(angle[kept]))
+    thinned = thin(arc, 0.01)
+    assert thinned[0] == 0
+    assert thinned[-1] == 1999
+    assert len(thinned) < 30
+    sagitta = 1.0 - np.cos(0.5 * np.diff(angle[thinned]))
     assert sagitta.max() <= 0.01 + 1e-9
     assert thin(np.zeros((5, 3)), 0.01).tolist() == [0, 4]
     assert thin(np.zeros((1, 3)), 0.01).tolist() == [0]
@@ -346,14 +346,14 @@ def pixels(run: Run, colour: tuple[int, int, int], time: float = 1.0) -> int:
         ("infeasible", False),
     ],
 )
-def test_captions_tell_an_optimum_from_a_failure(short_run: Run, status: str, good: bool):
+def test_captions_distinguish_an_optimum_from_a_failure(short_run: Run, status: str, good: bool):
     control = replace(short_run.log.control, status=(status,) * short_run.log.control.t.size)
     run = replace(short_run, log=replace(short_run.log, control=control))
     assert (pixels(run, GREEN) > pixels(run, RED)) == good
     assert (pixels(run, RED) == 0) == good
 
 
-def test_the_last_second_says_why_there_was_no_answer_and_that_the_fallback_went_on(short_run: Run) -> None:
+def test_the_last_second_shows_why_there_was_no_answer_and_that_the_fallback_went_on(short_run: Run) -> None:
     long = "cannot hold together: " + "; ".join(["roll upper at +0.15 s .. +0.40 s by 0.8 deg"] * 6)
     controller = {**short_run.summary["controller"], "unrecovered": 40}
     found = {"sentence": long, "advice": "to try: more"}
@@ -362,10 +362,10 @@ def test_the_last_second_says_why_there_was_no_answer_and_that_the_fallback_went
     overlay = Overlay(run, footage, width=1280, height=720)
     lines = [[text for text, _, _ in overlay._headlines(i)] for i in range(3)]
     assert not [text for text in lines[0] if "recovered" in text]
-    said = lines[2][lines[2].index("40 periods in fallback, never recovered") :]
-    assert lines[1][-len(said) :] == said
-    assert " ".join(said[1:]) == f"{long} to try: more"
-    assert len(said) == 5
+    shown = lines[2][lines[2].index("40 periods in fallback, never recovered") :]
+    assert lines[1][-len(shown) :] == shown
+    assert " ".join(shown[1:]) == f"{long} to try: more"
+    assert len(shown) == 5
     overlay.draw(np.full((720, 1280, 3), 128, np.uint8), 2)
     endless = {"sentence": "; ".join([long] * 20), "advice": ""}
     much = Overlay(replace(run, summary={**run.summary, "diagnosis": endless}), footage, width=1280, height=720)
@@ -376,28 +376,28 @@ def test_the_last_second_says_why_there_was_no_answer_and_that_the_fallback_went
     assert len(small._headlines(2)) == 2
 
 
-def test_captions_tell_what_has_just_happened(short_run: Run) -> None:
+def test_captions_show_what_has_just_happened(short_run: Run) -> None:
     events = [{"time": 0.1 * i, "text": f"push {i}"} for i in range(5)] + [{"time": 3.0, "text": "a gust"}]
     run = replace(short_run, summary={**short_run.summary, "events": events})
     overlay = Overlay(run, make_footage(run, np.array([0.15, 0.5, 2.9, 3.5, 5.1])), width=1280, height=720)
     texts = {event["text"] for event in events}
-    told = [[text for text, _, _ in overlay._headlines(i) if text in texts] for i in range(5)]
-    assert told == [["push 0", "push 1"], ["push 2", "push 3", "push 4"], [], ["a gust"], []]
+    shown = [[text for text, _, _ in overlay._headlines(i) if text in texts] for i in range(5)]
+    assert shown == [["push 0", "push 1"], ["push 2", "push 3", "push 4"], [], ["a gust"], []]
 
 
-def test_captions_tell_the_phase_where_there_is_a_ground(short_run: Run):
+def test_captions_show_the_phase_where_there_is_a_ground(short_run: Run):
     def at_phase(*phases: str) -> Run:
         control = short_run.log.control
         phase = (*phases, *("flying",) * (control.t.size - len(phases)))
         return replace(short_run, log=replace(short_run.log, control=replace(control, phase=phase)))
 
     without = pixels(at_phase(), GREEN)
-    assert pixels(at_phase("landed"), GREEN) > without, "told throughout a flight with a ground"
+    assert pixels(at_phase("landed"), GREEN) > without, "shown throughout a flight with a ground"
     assert pixels(at_phase("landed"), GREEN) != pixels(at_phase(*("armed",) * 40), GREEN)
 
 
 @pytest.mark.parametrize(("entry", "columns", "colour"), [("wind", 3, CYAN), ("wrench", 6, VIOLET)])
-def test_captions_tell_the_wind_and_the_external_force(short_run: Run, entry: str, columns: int, colour: Colour):
+def test_captions_show_the_wind_and_the_external_force(short_run: Run, entry: str, columns: int, colour: Colour):
     def acting(x: float) -> Run:
         plant = short_run.log.plant
         values = np.zeros((plant.t.size, columns))
@@ -442,14 +442,14 @@ def bounded(run: Run, *limits: Limit) -> Run:
 
 
 def rows(run: Run, *times: float) -> list[tuple[list[str], str]]:
-    """Names of the limits, and what is said of the others, in frames at these times."""
+    """Names of the limits, and the text about the others, in frames at these times."""
     footage = make_footage(run, np.array(times))
     ranked = sorted(footage.margins, key=lambda track: track.rank)
     found = [margin_rows(ranked, i) for i in range(len(times))]
     return [([track.limit.name for track in shown], rest) for shown, rest in found]
 
 
-def test_violated_limits_come_first_then_the_nearest_and_the_film_says_how_many_more(short_run: Run) -> None:
+def test_violated_limits_come_first_then_the_nearest_and_the_film_shows_how_many_more(short_run: Run) -> None:
     """In the order of the file the one that is violated by metres stands eighth, and was never seen."""
     run_mismatch = short_run.log.plant.state[-1, INDEX["z"]]
     assert run_mismatch > 2.0

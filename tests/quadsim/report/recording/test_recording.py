@@ -239,13 +239,13 @@ def test_forces_torques_wind_and_lagging_rotors_have_their_curves(
     )
 
 
-def test_a_force_that_is_nowhere_is_not_drawn(record: Callable[[Run], Content], short_run: Run) -> None:
+def test_a_force_without_a_position_is_not_drawn(record: Callable[[Run], Content], short_run: Run) -> None:
     plant = dataclasses.replace(short_run.log.plant, wrench=np.zeros((short_run.log.plant.t.size, 6)))
     content = record(dataclasses.replace(short_run, log=dataclasses.replace(short_run.log, plant=plant)))
     assert not [entity for entity in content.entities if "effects" in entity or "external_force" in entity]
 
 
-def test_events_tell_each_change_of_the_solver_and_the_end(record: Callable[[Run], Content], short_run: Run) -> None:
+def test_events_report_each_change_of_the_solver_and_the_end(record: Callable[[Run], Content], short_run: Run) -> None:
     control = short_run.log.control
     status, fallback = [SOLVED] * control.t.size, control.fallback.copy()
     status[20:30] = [UNCONSTRAINED] * 10
@@ -269,13 +269,13 @@ def test_events_tell_each_change_of_the_solver_and_the_end(record: Callable[[Run
     np.testing.assert_allclose(content.times("/events"), times, atol=1e-9)
 
 
-def test_events_tell_what_happened_on_the_way(record: Callable[[Run], Content], short_run: Run) -> None:
+def test_events_report_what_happened_on_the_way(record: Callable[[Run], Content], short_run: Run) -> None:
     summary = {**short_run.summary, "events": [{"time": 0.5, "text": "rotor 2 loses 20 %"}]}
     content = record(dataclasses.replace(short_run, summary=summary))
     assert "rotor 2 loses 20 %" in [row[0] for row in content.rows("/events", "text")]
 
 
-def test_events_tell_why_there_was_no_answer_and_when_the_fallback_began_for_good(
+def test_events_report_why_there_was_no_answer_and_when_the_fallback_began_for_good(
     record: Callable[[Run], Content], short_run: Run
 ) -> None:
     control = short_run.log.control
@@ -287,12 +287,12 @@ def test_events_tell_why_there_was_no_answer_and_when_the_fallback_began_for_goo
     summary = {**short_run.summary, "diagnosis": found, "controller": controller}
     content = record(dataclasses.replace(short_run, log=log, summary=summary))
     levels = content.rows("/events", "level")
-    told = {
+    solver_events = {
         row[0]: round(float(time), 9)
         for time, row, level in zip(content.times("/events"), content.rows("/events", "text"), levels, strict=True)
         if level == ["ERROR"]
     }
-    assert told == {
+    assert solver_events == {
         "cannot hold together: roll upper by 1 deg": 1.0,
         "to try: more": 1.0,
         "40 periods in fallback, never recovered": 4.0,
@@ -307,11 +307,11 @@ def on_the_ground(run: Run, *phases: str) -> Run:
     return dataclasses.replace(run, log=dataclasses.replace(run.log, control=dataclasses.replace(control, phase=phase)))
 
 
-def test_events_tell_the_phases_of_a_flight_with_a_ground(record: Callable[[Run], Content], short_run: Run) -> None:
+def test_events_report_the_phases_of_a_flight_with_a_ground(record: Callable[[Run], Content], short_run: Run) -> None:
     content = record(on_the_ground(short_run, *["landed"] * 5, *["armed"] * 5))
     times, rows = content.times("/events"), content.rows("/events", "text")
-    told = {round(float(time), 9): row[0] for time, row in zip(times, rows, strict=True) if "phase" in row[0]}
-    assert told == {0.0: "phase: landed", 0.25: "phase: armed", 0.5: "phase: flying"}
+    phases = {round(float(time), 9): row[0] for time, row in zip(times, rows, strict=True) if "phase" in row[0]}
+    assert phases == {0.0: "phase: landed", 0.25: "phase: armed", 0.5: "phase: flying"}
     assert np.all(np.diff(times) >= 0.0)
     assert [level for _, text, level in texts._phase_changes(on_the_ground(short_run, "crashed"))] == ["WARN", "INFO"]
 
@@ -377,12 +377,12 @@ def test_the_axis_of_what_stands_still_has_the_least_span(short_run: Run) -> Non
     assert layout._least_range(short_run, ("x_estimate_error",)) == (-0.005, 0.005)
 
 
-def test_the_summary_tells_what_the_flight_met(short_run: Run) -> None:
+def test_the_summary_reports_what_the_flight_met(short_run: Run) -> None:
     summary = {**short_run.summary, "expected": "lost", "as_expected": False}
-    summary["course"] = {"sentence": "The course asks for nothing."}
+    summary["course"] = {"sentence": "The course requires nothing."}
     text = texts._summary(dataclasses.replace(short_run, summary=summary))
     assert "its scenario states the verdict lost." in text
-    assert "paper-constrained: the course asks for nothing." in text
+    assert "paper-constrained: the course requires nothing." in text
     yaw = math.degrees(short_run.summary["tracking"]["rmse"]["yaw"])
     assert f"yaw {yaw:.3g} deg" in text
 
@@ -512,7 +512,7 @@ def test_a_full_disk_leaves_nothing(short_run: Run, tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_place_that_cannot_be_written_is_said(short_run: Run, tmp_path: Path) -> None:
+def test_a_place_that_cannot_be_written_is_reported(short_run: Run, tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     with pytest.raises(OutputError, match="Not a directory"):
         write_recording(short_run, tmp_path / "file" / "flight.rrd")
@@ -520,7 +520,7 @@ def test_a_place_that_cannot_be_written_is_said(short_run: Run, tmp_path: Path) 
         write_recording(short_run, tmp_path / "missing" / "flight.rrd")
 
 
-def test_rerun_switched_off_is_said(short_run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_rerun_switched_off_is_reported(short_run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("RERUN", "off")
     with pytest.raises(OutputError, match="environment variable RERUN"):
         write_recording(short_run, tmp_path / "flight.rrd")
@@ -582,7 +582,7 @@ def test_without_a_display_the_browser_is_proposed(path: Path, monkeypatch: pyte
     assert viewer_problem() is None
 
 
-def test_a_recording_that_is_not_there_is_said(tmp_path: Path) -> None:
+def test_a_recording_that_is_missing_is_reported(tmp_path: Path) -> None:
     with pytest.raises(FileError, match="no such recording"):
         open_viewer(tmp_path / "flight.rrd", web=True)
 

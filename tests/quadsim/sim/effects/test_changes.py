@@ -78,10 +78,10 @@ def test_rotors_follow_by_another_time_constant(vehicle: Vehicle) -> None:
 
 
 def test_what_is_due_later_may_be_put_otherwise(vehicle: Vehicle) -> None:
-    """Rescheduled half way, a plant flies as one that was told from the start; what is past is not done again."""
+    """Rescheduled midway, a plant flies as one scheduled from the start; what is past is not done again."""
     first, second = MassChange(time=0.05, factor=1.1), MassChange(time=0.15, factor=0.9)
-    with Plant(vehicle, changes=[first, second]) as told, Plant(vehicle, changes=[first]) as later:
-        expected = told.advance(told.hover_speeds, HOLD).physics
+    with Plant(vehicle, changes=[first, second]) as scheduled, Plant(vehicle, changes=[first]) as later:
+        expected = scheduled.advance(scheduled.hover_speeds, HOLD).physics
         begin = later.advance(later.hover_speeds, 100).physics
         later.reschedule([first, second])
         np.testing.assert_array_equal(np.vstack([begin, later.advance(later.hover_speeds, 100).physics]), expected)

@@ -24,9 +24,9 @@ def test_inertia_of_many_points_is_the_sum_over_points(vehicle: Vehicle) -> None
     payloads = [Payload(mass=0.7, position=(0.1, -0.2, -0.3)), Payload(mass=0.2, position=(0.0, 0.4, 0.05))]
     offset = np.array([0.02, -0.01, 0.03])
     masses = np.array([*[vehicle.mass / 6.0] * 6, 0.7, 0.2])
-    places = np.array([*[point + offset for point in points], *[payload.position for payload in payloads]])
-    centre = masses @ places / masses.sum()
-    arms = places - centre
+    positions = np.array([*[point + offset for point in points], *[payload.position for payload in payloads]])
+    centre = masses @ positions / masses.sum()
+    arms = positions - centre
     inertia = sum(m * (r @ r * np.eye(3) - np.outer(r, r)) for m, r in zip(masses, arms, strict=True))
     found = mass_properties(vehicle, Load(centre_of_mass=(0.02, -0.01, 0.03)), payloads)
     assert found.mass == pytest.approx(vehicle.mass + 0.9)

@@ -130,7 +130,7 @@ def spinning_bodies(vehicle: Vehicle, inertia: float, rates: Array, speeds: Arra
     data = mujoco.MjData(model)
     data.qvel[3:6], data.qvel[6:10] = rates, speeds
     mujoco.mj_forward(model, data)
-    # Motor torques that give the rotors the asked accelerations relative to the body: solve M a + c = f for them.
+    # Motor torques that give the rotors the required accelerations relative to the body: solve M a + c = f for them.
     mass = np.zeros((model.nv, model.nv))
     mujoco.mj_fullM(model, data, mass)
     free = np.r_[0:6]

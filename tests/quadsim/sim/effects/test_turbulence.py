@@ -67,7 +67,7 @@ def test_the_time_step_is_van_loans(ratio: float) -> None:
 
 
 @pytest.mark.parametrize("ratio", RATIOS)
-def test_the_stationary_covariance_is_kept_by_every_step(ratio: float) -> None:
+def test_the_stationary_covariance_is_preserved_by_every_step(ratio: float) -> None:
     transition, factor = discretise(ratio)
     np.testing.assert_allclose(transition @ STATIONARY @ transition.T + factor @ factor.T, STATIONARY, atol=1e-15)
 

@@ -1,4 +1,4 @@
-"""Wind: mean, changes and gusts against closed forms, and that it is the same however it is asked for."""
+"""Wind: mean, changes and gusts against closed forms, for any number of steps drawn at once."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ def test_of_two_changes_at_one_time_the_later_counts() -> None:
 
 
 @pytest.mark.parametrize("parts", [(1,) * 300 + (5700,), (50,) * 120, (4095, 1, 1, 1903), (0, 6000)])
-def test_the_wind_does_not_depend_on_how_many_steps_are_asked_for_at_once(parts: tuple[int, ...]) -> None:
+def test_the_wind_does_not_depend_on_how_many_steps_are_drawn_at_once(parts: tuple[int, ...]) -> None:
     """To the last bit, across the blocks that turbulence is made in."""
 
     def make() -> WindField:

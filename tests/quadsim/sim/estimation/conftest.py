@@ -90,7 +90,7 @@ def run(
     standing: range = range(0),
     **faults: Any,
 ) -> tuple[ErrorStateFilter, Array, Array, list[float]]:
-    """One seed through sensors and filter, which is told that the vehicle stands in chunks that begin in `standing`.
+    """One seed through sensors and filter, which receives that the vehicle stands in chunks that begin in `standing`.
 
     Returns:
         The filter, its errors (K, 15) against the truth after each `chunk` steps, gyro bias included, its standard

@@ -1,4 +1,4 @@
-"""Consistency over seeds: is the filter as good as it says?
+"""Consistency over seeds: does the filter's covariance match its errors?
 
 Truth is a rigid body disturbed by white force and torque of the very densities that the filter assumes; the first
 estimate is wrong by a draw of the stated covariance, the gyro's bias too.  Then the normalised estimation error squared
@@ -50,7 +50,7 @@ def within(total: float, count: int) -> bool:
 
 
 @pytest.mark.parametrize("sensors", [SENSORS, LATE], ids=["prompt", "late"])
-def test_errors_and_innovations_are_what_the_filter_says(
+def test_errors_and_innovations_match_the_filters_covariance(
     sensors: tuple[Sensor, ...], motion: Any, run_filter: Callable[..., Any]
 ) -> None:
     last, middle = [], []
@@ -72,7 +72,7 @@ def test_errors_and_innovations_are_what_the_filter_says(
 
 
 @pytest.mark.parametrize("factor", [0.5, 2.0])
-def test_a_filter_told_the_wrong_noise_fails_the_same_test(
+def test_a_filter_with_the_wrong_noise_fails_the_same_test(
     factor: float, motion: Any, run_filter: Callable[..., Any]
 ) -> None:
     believed = tuple(replace(s, noise=tuple(np.sqrt(factor) * np.array(s.noise))) for s in SENSORS)

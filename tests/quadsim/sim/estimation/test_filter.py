@@ -59,15 +59,15 @@ def test_the_estimate_is_better_than_the_samples(gentle: Any, run_filter: SIMULA
     assert rms(errors, slice(6, 9)) < 0.5 * ATTITUDE.noise[0]
 
 
-def test_late_samples_are_worth_what_their_time_stamp_says(
+def test_late_samples_are_weighted_by_their_time_stamp(
     vehicle: Vehicle, simulate_motion: SIMULATE, run_filter: SIMULATE
 ) -> None:
-    """Falling, a tenth of a second is worth many times the noise; the naive filter is not told of the delay."""
+    """Falling, a tenth of a second is worth many times the noise; the naive filter does not know the delay."""
     motion = simulate_motion(SETTINGS, 0.9 * hover(vehicle, 2000), seeds=6, rng=np.random.default_rng(2))
     late = (replace(POSITION, delay=0.1), replace(VELOCITY, delay=0.1), ATTITUDE, RATES)
     prompt, fused, naive = (
-        rms([run_filter(motion, sensors, SETTINGS, seed=s, believed=told)[1][20:] for s in range(6)], slice(0, 3))
-        for sensors, told in ((SENSORS, SENSORS), (late, late), (late, SENSORS))
+        rms([run_filter(motion, sensors, SETTINGS, seed=s, believed=believed)[1][20:] for s in range(6)], slice(0, 3))
+        for sensors, believed in ((SENSORS, SENSORS), (late, late), (late, SENSORS))
     )
     assert fused < 1.5 * prompt
     assert naive > 5.0 * fused
@@ -77,7 +77,7 @@ def test_a_filter_at_a_late_horizon_finds_what_a_prompt_one_does(gentle: Any, ru
     """The same samples with and without a horizon: only the order of the computation differs."""
     far = Sensor(
         name=SensorName.VELOCITY, rate=0.1, noise=(1e6, 1e6, 1e6), delay=0.2
-    )  # tells nothing, moves the horizon
+    )  # no information, moves the horizon
     none = replace(far, delay=0.0)
     sensors = (POSITION, ATTITUDE, RATES)
     _, prompt, deviations, _ = run_filter(gentle, (*sensors, none), SETTINGS, seed=0)

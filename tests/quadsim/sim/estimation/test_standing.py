@@ -62,9 +62,9 @@ def takeoff(vehicle: Vehicle, simulate_motion: Callable[..., Any]) -> Any:
 def test_who_stands_keeps_the_pose_and_has_no_motion(model: MotionModel, estimate: Estimate) -> None:
     h = 0.004
     after = stand(model, estimate, h)
-    kept = [0, 1, 2, 6, 7, 8, 9, 13, 14, 15]
-    assert np.array_equal(after.mean[kept], estimate.mean[kept])
-    assert np.array_equal(np.delete(after.mean, kept), np.zeros(6))
+    retained = [0, 1, 2, 6, 7, 8, 9, 13, 14, 15]
+    assert np.array_equal(after.mean[retained], estimate.mean[retained])
+    assert np.array_equal(np.delete(after.mean, retained), np.zeros(6))
 
     pose, motion = [0, 1, 2, 6, 7, 8, 12, 13, 14], [3, 4, 5, 9, 10, 11]
     assert np.array_equal(
@@ -95,13 +95,13 @@ def test_it_is_believed_to_stand_and_the_gyros_bias_is_found(takeoff: Any, run_f
         filter_, errors, deviations, _ = run_filter(takeoff, SENSORS, believed, seed=seed, standing=range(REST))
         ground = slice(1, REST // 50)
         assert np.abs(errors[ground, 0:3]).max() < 0.02
-        assert np.abs(errors[ground, 3:6]).max() < 1e-12  # what a sample of position says is no motion
+        assert np.abs(errors[ground, 3:6]).max() < 1e-12  # a sample of position shows no motion
         assert np.degrees(np.abs(errors[REST // 50, 12:15])).max() < 0.15
         assert np.all(np.abs(errors[ground.stop :]) < 5.0 * deviations[ground.stop :])  # and in flight
         assert sum(tally.rejected for tally in filter_.tallies.values()) < 5
 
 
-def test_who_is_not_told_has_it_fall(takeoff: Any, run_filter: Callable[..., Any]) -> None:
+def test_without_the_land_detector_the_estimate_falls(takeoff: Any, run_filter: Callable[..., Any]) -> None:
     filter_, errors, _, _ = run_filter(takeoff, SENSORS, SETTINGS, seed=0)
     assert errors[REST // 50 - 1, 5] > 2.0
     assert filter_.tallies[SensorName.POSITION].rejected > 50

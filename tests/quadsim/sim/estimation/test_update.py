@@ -93,7 +93,7 @@ def test_doubt_lets_any_sample_pass_and_keeps_the_mean(name: SensorName, estimat
         (SensorName.RATES, [9, 12], []),
     ],
 )
-def test_doubt_is_of_what_led_astray_too(
+def test_inflation_includes_the_state_that_misled(
     name: SensorName, seen: list[int], leading: list[int], estimate: Estimate
 ) -> None:
     """The variance of a rate of change grows by the square of the innovation over the time it took to come about."""

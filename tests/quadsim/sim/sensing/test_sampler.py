@@ -44,7 +44,7 @@ def errors(samples: list[Sample], physics: Array) -> Array:
 
 
 @pytest.mark.parametrize("name", list(SensorName))
-def test_a_perfect_sensor_tells_the_truth(name: SensorName, physics: Array) -> None:
+def test_a_perfect_sensor_reports_the_truth(name: SensorName, physics: Array) -> None:
     samples = sampler(Sensor(name=name, rate=100.0)).sample(physics, 0)
     assert [sample.taken for sample in samples] == list(range(0, STEPS + 1, 10))
     assert np.abs(errors(samples, physics)).max() < 1e-12

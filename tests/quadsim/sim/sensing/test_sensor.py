@@ -1,4 +1,4 @@
-"""What a sensor may be, and what is said of everything else."""
+"""Which sensors are allowed, and the message for all others."""
 
 from __future__ import annotations
 
