@@ -1,7 +1,7 @@
 """Why a flight's QP had no answer, in the words and units of the scenario file, and what to try.
 
 What is suggested is a change of the file, and each was tried: the problem is built anew from the changed file, and
-solved for the same period.  It says nothing about the flight that would follow.
+solved for the same period.  It predicts nothing about the flight that would follow.
 """
 
 from __future__ import annotations
@@ -226,7 +226,7 @@ class _Case:
         """The controller with other fields; None where the file would be refused."""
         table = tomllib.loads(self._file)
         for field, value in settings.items():
-            set_field(table, field, value, asked="diagnosis")
+            set_field(table, field, value, source="diagnosis")
         if "controller.type" in settings:
             law = table["controller"]
             table["controller"] = {name: value for name, value in law.items() if name in RobustSpec.model_fields}

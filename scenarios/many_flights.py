@@ -12,7 +12,7 @@ from quadsim.errors import InputError, ParameterError
 from quadsim.outputs import real_path
 from scenarios.api import load, named_by
 from scenarios.flight import Outputs
-from scenarios.parts.own_code import require_importable
+from scenarios.parts.user_code import require_importable
 from scenarios.progress import Progress, reporting
 from scenarios.schema.scenario import Scenario
 from scenarios.shipped import paper_names
@@ -129,11 +129,11 @@ def campaign(
     from scenarios.commands.campaign_console import progress as bar
 
     if cluster is not None and workers is not None:
-        raise ParameterError("", "--workers", workers, "absent where --cluster says who flies")
+        raise ParameterError("", "--workers", workers, "absent with --cluster")
     requirements = [parse_requirement(text) for text in require]
     if isinstance(campaign, Scenario):
-        asked = {"vary": [dict(entry) for entry in vary], "flights": flights, "seed": seed, **fields}
-        given = {name: value for name, value in asked.items() if value is not None}
+        requested = {"vary": [dict(entry) for entry in vary], "flights": flights, "seed": seed, **fields}
+        given = {name: value for name, value in requested.items() if value is not None}
         plan = make_plan(flown_by(campaign, controller, forces), given)
     elif vary or fields or controller is not None or forces:
         raise InputError("vary, controller and other fields go with a scenario; a campaign file has its own")
@@ -219,7 +219,7 @@ def tune(
     from scenarios.tuning.search import require_optuna
 
     if cluster is not None and workers is not None:
-        raise ParameterError("", "--workers", workers, "absent where --cluster says who flies")
+        raise ParameterError("", "--workers", workers, "absent with --cluster")
     require_optuna()
     plan = load_tuning(str(tuning), trials=trials, seed=seed)
     target = real_path(Path("runs") / "tunings" / plan.spec.name if out is None else out)

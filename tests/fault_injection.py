@@ -228,7 +228,7 @@ def judge(given: Array) -> tuple[bool, bool]:
 
 @contextlib.contextmanager
 def recorded(plant: Plant) -> Iterator[list[Array]]:
-    """Everything (4,) that the plant is told to hold, before it looks at it."""
+    """Everything (4,) that the plant is commanded to hold, before it looks at it."""
     given: list[Array] = []
     real = plant.advance
 

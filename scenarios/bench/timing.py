@@ -94,7 +94,7 @@ def time_python(*arguments: str, tree: Path) -> CommandTime:
     """Run Python in a checkout, on one thread of linear algebra, and time it.
 
     Raises:
-        SystemExit: with what it said, where its exit status is neither 0 nor 1: a flight may violate its constraints.
+        SystemExit: with its output, where its exit status is neither 0 nor 1: a flight may violate its constraints.
     """
     import resource  # no such thing on Windows
 
@@ -123,7 +123,7 @@ def one_core() -> Iterator[int | None]:
 
 @contextlib.contextmanager
 def undisturbed() -> Iterator[None]:
-    """Linear algebra on one thread; cycles are collected where that is asked for alone."""
+    """Linear algebra on one thread; cycles are collected only on request."""
     collecting = gc.isenabled()
     gc.collect()
     gc.freeze()
@@ -138,7 +138,7 @@ def undisturbed() -> Iterator[None]:
 
 
 class Candidate(Protocol):
-    """Something that answers questions, numbered by the period they were asked in."""
+    """Something that answers questions, numbered by their period."""
 
     def prepare(self, period: int) -> None:
         """Get ready; not timed."""
@@ -166,7 +166,7 @@ def segments(periods: int, stride: int) -> list[range]:
 
 def time_in_turns(
     candidates: Mapping[str, Candidate],
-    asked: Sequence[range],
+    timed: Sequence[range],
     *,
     between: Callable[[], None],
     repeats: int,
@@ -180,7 +180,7 @@ def time_in_turns(
 
     Args:
         candidates: by name.
-        asked: segments of periods.
+        timed: segments of periods.
         between: what a flight does between two questions; not timed.
         repeats: passes over all questions.
         rng: decides the order within each segment.
@@ -193,13 +193,13 @@ def time_in_turns(
         Each candidate's times, in the order of the questions; none of those that left.
     """
     passes: dict[str, list[list[float]]] = {name: [] for name in candidates}
-    total, done = repeats * len(asked) * len(candidates), 0
+    total, done = repeats * len(timed) * len(candidates), 0
     with undisturbed():
         for _ in range(repeats):
             racing = [name for name, laps in passes.items() if sum(map(sum, laps[:1])) <= 1e3 * longest_pass]
             for name in racing:
                 passes[name].append([])
-            for segment in asked:
+            for segment in timed:
                 gc.collect()
                 for name in rng.permutation([name for name in racing if name in passes]).tolist():
                     left_ms = 1e3 * patience - sum(passes[name][-1])

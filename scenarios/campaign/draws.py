@@ -30,11 +30,11 @@ from scenarios.campaign.spec import (
 if TYPE_CHECKING:
     from scenarios.campaign.spec import CampaignSpec
 
-_TAIL: Final = 1e-3  # share of a distribution beyond the values that stand for its ends
+_TAIL: Final = 1e-3  # share of a distribution beyond the values taken as its ends
 
 
 class Draws:
-    """What the flights of a campaign are drawn to be; the same for the same file, whoever asks, in whatever order."""
+    """The drawn values of a campaign's flights; the same for the same file, in any process and order."""
 
     def __init__(self, spec: CampaignSpec) -> None:
         self._spec = spec

@@ -1,4 +1,4 @@
-"""A campaign's directory: what says what is flown, with what, and how far it got."""
+"""A campaign's directory: its plan, code and progress."""
 
 from __future__ import annotations
 
@@ -130,7 +130,7 @@ def other_than_flew(manifest: Mapping[str, Any], plan: Plan) -> list[str]:
 
 
 def controller_code(plan: Plan) -> dict[str, Any]:
-    """The digest of a controller that is not ours, for `other_than_flew` to tell of."""
+    """The digest of a user-defined controller, for `other_than_flew`."""
     own = plan.scenario.controller
     return {"controller_code": find_code(own).digest} if isinstance(own, PluginSpec) else {}
 

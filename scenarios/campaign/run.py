@@ -1,4 +1,4 @@
-"""A campaign flown: an engine flies what is missing, its answers are kept as they come, the whole is summed up."""
+"""Fly a campaign: an engine flies what is missing, its answers are saved as they come, the whole is summed up."""
 
 from __future__ import annotations
 
@@ -101,7 +101,7 @@ def fly_campaign(
 ) -> Result:
     """Fly a campaign, or what is missing of it.
 
-    Each flight's row is the same whoever flies it, in whatever order; so is the table of all.  Whatever ends this
+    Each flight's row is the same with any worker and order; so is the table of all.  Whatever ends this
     early, what was flown stays, and `resume` goes on with it.
 
     Args:

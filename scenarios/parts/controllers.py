@@ -304,7 +304,7 @@ def make_space(
 ) -> Space | None:
     """The half-spaces of obstacles and regions, with further margins (N, 3) [m], at every `stride`-th period's end.
 
-    None where they are not kept.
+    None where they are not recorded.
     """
     if spec.avoidance is None or not shapes:
         return None

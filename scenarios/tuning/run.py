@@ -86,14 +86,14 @@ def tune(
 ) -> TuningResult:
     """Search, or go on with it, and hold the answer against the start.
 
-    The same file gives the same answer, whoever flies, in whatever order, interrupted or not.  Beside `ALL_FILES`, the
+    The same file gives the same answer with any workers and order, interrupted or not.  Beside `ALL_FILES`, the
     directory has the campaigns on fresh draws, `start/` and `candidate-N/`, their `comparison/`, and of two objectives
     `front-N.toml` for each point of the Pareto front.
 
     Args:
         plan: the tuning.
         directory: where its results go.
-        engine: who flies.
+        engine: flies them.
         resume: whether to go on with what the directory holds, perhaps with more trials.
         report: whether to write the pages and their figures.
         watch: called with the progress, as answers come.
@@ -153,7 +153,7 @@ class _Flights:
         self._total = plan.most + plan.spec.trials // plan.spec.batch * per_batch
 
     def fly(self, candidates: Mapping[int, Values], flights: int) -> None:
-        """Have candidates fly the first so many draws, but for those that they have flown."""
+        """Have candidates fly their first draws, except those already flown."""
         numbers = [c * self._plan.most + draw for c in candidates for draw in range(flights)]
         missing = [number for number in numbers if number not in self._rows]
         if not missing:
@@ -167,7 +167,7 @@ class _Flights:
                     self.flown += 1
                     if clock.perf_counter() - self._flushed > FLUSH_S:
                         self._flush(waiting)
-                    self._tell()
+                    self._report()
         finally:
             self._flush(waiting)
 
@@ -192,7 +192,7 @@ class _Flights:
         self._store.append(waiting)
         waiting.clear()  # not before: by Ctrl-C it is appended once more, to the same file
 
-    def _tell(self) -> None:
+    def _report(self) -> None:
         rate = self.flown / max(clock.perf_counter() - self._started, 1e-9)
         failed = sum(bool(row["failed"]) for row in self._rows.values())
         self._watch(Standing(flown=len(self._rows), flights=self._total, failed=failed, rate=rate))
@@ -208,7 +208,7 @@ def _search(plan: TuningPlan, search: Search, flights: _Flights) -> None:
     """All batches, each by successive halving: all its candidates fly a few draws, the best of them go on to more."""
     flights.fly({START: {}}, plan.most)
     search.begin(flights.scores([START])[0])
-    while search.unfinished or search.asked <= plan.spec.trials:
+    while search.unfinished or search.proposed <= plan.spec.trials:
         batch = search.ask()
         going_on = list(batch)
         for number, candidates in zip(plan.spec.flights, _halving(plan), strict=True):

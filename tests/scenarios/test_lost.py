@@ -1,4 +1,4 @@
-"""`[lost]`: a flight that nobody would call one ends as lost, whatever its scenario asks for."""
+"""`[lost]`: an obviously failed flight ends as lost, whatever its scenario requires."""
 
 from __future__ import annotations
 

@@ -60,7 +60,7 @@ class DaskEngine:
 
     @cached_property
     def workers(self) -> int:
-        """Workers that the jobs will start, or that the scheduler knows when this is first asked.
+        """Workers that the jobs will start, or that the scheduler knows at the first call.
 
         Raises:
             EngineError: no scheduler answers.
@@ -259,7 +259,7 @@ class _Flights:
         return [self._pilot.lost(flight, f"its process died {self._deaths[flight]} times")]
 
     def _gone(self) -> EngineError:
-        return EngineError(f"{self._where} is gone; what was flown is kept: go on with --resume")
+        return EngineError(f"{self._where} is gone; finished flights are saved: continue with --resume")
 
 
 def _jobs(file: str) -> Jobs:

@@ -28,7 +28,7 @@ _MODULES: Final = (
     *("builtins", "gc", "math", "os", "random", "time", "warnings"),
     *("mujoco", "numpy", "numpy.linalg", "piqp", "scipy.linalg"),
 )
-"""Besides our own packages: modules that flights use, in which somebody may put something else."""
+"""Besides our own packages: modules that flights use, which user code may replace."""
 _LIMITS: Final = tuple(getattr(resource, name) for name in dir(resource) if name.startswith("RLIMIT_"))
 _TIMERS: Final = (signal.ITIMER_REAL, signal.ITIMER_VIRTUAL, signal.ITIMER_PROF)
 _ONE, _THREE, _SMALLEST = 1.0, 3.0, 5e-324
@@ -112,7 +112,7 @@ def _rounding() -> tuple[float, ...]:
 
 
 class FlightReport(NamedTuple):
-    """What a worker says of a flight."""
+    """A worker's report on a flight."""
 
     answer: Answer  # the outcome
     spent: bool  # whether the flight left something in the process that the next one would meet

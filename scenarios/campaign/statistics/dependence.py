@@ -1,7 +1,7 @@
 """Whether an outcome depends on a drawn number: in one direction, in any way, or from a threshold on.
 
 A rank correlation sees what rises or falls throughout, and is blind to what does harm at both ends.  Chatterjee's xi
-sees any dependence, and asks for more flights.  Of an event, Fisher's exact test chooses the threshold.  Its p-value
+sees any dependence, and needs more flights.  Of an event, Fisher's exact test chooses the threshold.  Its p-value
 there is too good, since the best of many was taken; the chance that the best of all thresholds is as good where the
 event has nothing to do with the number is found exactly, by following all orders of the flights at once (Boulesteix,
 Biometrical Journal 48, 2006, with Fisher's p-value in place of chi-squared).
@@ -101,8 +101,8 @@ def any_dependence(x: Array, y: Array, rng: np.random.Generator) -> Dependence |
 
 def _ranked(x: Array, y: Array) -> tuple[Array, Array] | None:
     """Ranks of the pairs that have both; None where there is nothing to relate."""
-    kept = ~(np.isnan(x) | np.isnan(y))
-    x, y = scipy.stats.rankdata(x[kept]), scipy.stats.rankdata(y[kept])
+    valid = ~(np.isnan(x) | np.isnan(y))
+    x, y = scipy.stats.rankdata(x[valid]), scipy.stats.rankdata(y[valid])
     return None if x.size < 3 or np.ptp(x) == 0.0 or np.ptp(y) == 0.0 else (x, y)
 
 

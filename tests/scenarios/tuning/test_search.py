@@ -38,13 +38,13 @@ def carry_on(plan: TuningPlan, directory: Path, batches: int, *, again: bool) ->
         search = Search(plan, files)
         search.begin(scored(START, 5.0))
         for _ in range(batches):
-            asked = search.ask()
+            batch = search.ask()
             if again:
                 search = Search(plan, files)
                 assert search.unfinished
-                assert search.ask() == asked
-            found.append(asked)
-            search.tell([scored(number, distance(values)) for number, values in asked.items()])
+                assert search.ask() == batch
+            found.append(batch)
+            search.tell([scored(number, distance(values)) for number, values in batch.items()])
     return found
 
 
@@ -82,22 +82,22 @@ def test_a_start_outside_of_the_ranges_is_no_trial_of_the_search(tmp_path: Path)
         found = Search(plan, files)
         found.begin(scored(START, 5.0))
         assert found.candidates() == {START: {}}
-        asked = found.ask()
-    assert sorted(asked) == [1, 2, 3, 4, 5, 6]
-    assert {values["n"] for values in asked.values()} <= set(range(20, 31))
-    assert {values["s"] for values in asked.values()} <= set(choice["values"])
+        batch = found.ask()
+    assert sorted(batch) == [1, 2, 3, 4, 5, 6]
+    assert {values["n"] for values in batch.values()} <= set(range(20, 31))
+    assert {values["s"] for values in batch.values()} <= set(choice["values"])
 
 
-def test_a_field_that_matters_is_told_from_one_that_does_not(plan: TuningPlan, tmp_path: Path) -> None:
+def test_a_field_that_matters_is_distinguished_from_one_that_does_not(plan: TuningPlan, tmp_path: Path) -> None:
     with growing(tmp_path / "t", KIND) as files:
         search = Search(plan, files)
         search.begin(scored(START, 300.0))
         scores = [scored(START, 300.0)]
         assert search.importance(scores, 0) == {}
         for _ in range(8):
-            asked = search.ask()
-            batch = [scored(number, distance(values)) for number, values in asked.items()]
-            search.tell(batch)
+            batch = search.ask()
+            scores = [scored(number, distance(values)) for number, values in batch.items()]
+            search.tell(scores)
             scores += batch
         found = search.importance(scores, 0)
     assert sum(found.values()) == pytest.approx(1.0)
