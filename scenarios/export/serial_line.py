@@ -44,7 +44,7 @@ class Line(Protocol):
         ...
 
     def receive(self, count: int) -> bytes:
-        """So many bytes; fewer where the other end has gone, or answers no more."""
+        """`count` bytes; fewer where the other end has closed, or no longer answers."""
         ...
 
 

@@ -236,7 +236,7 @@ def test_a_study_is_made_where_its_question_is_posed(runs: dict[str, str]) -> No
 
 
 def test_a_long_course_is_studied_only_on_request(runs: dict[str, str], monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("scenarios.cost.measure.LONGEST_UNASKED", 3.0)
+    monkeypatch.setattr("scenarios.cost.measure.LONGEST_UNREQUESTED", 3.0)
     both = [runs["paper-constrained"], runs["paper-unconstrained"]]
     assert find_study(both, requested=None) == []
     assert len(find_study(both, requested=True)) == 2
