@@ -161,7 +161,7 @@ def fly(
 
     Args:
         scenario: what is flown, or its name or file.
-        controller: who flies it, instead of the scenario's: a class, called as MyLaw(vehicle, period=..., horizon=...)
+        controller: flies it, instead of the scenario's: a class, called as MyLaw(vehicle, period=..., horizon=...)
             and with a method `step(now, state, reference)`; a function `law(now, state, reference)` that gives four
             rotor speeds [rad/s]; an object with such a `step`; or a text `package.module:Class`.  Further arguments of
             a class through `functools.partial`.

@@ -153,7 +153,7 @@ def _add_campaign(campaign: argparse.ArgumentParser) -> None:
     add("--workers", **_NUMBER, help="processes (default: one per core)")
     scheduler = "a scheduler's address, tcp://HOST:PORT, or a TOML file that describes a batch system's jobs"
     add("--cluster", metavar="ADDRESS", help=f"fly on a Dask cluster: {scheduler}")
-    add("--resume", action="store_true", help="go on with what is there")
+    add("--resume", action="store_true", help="continue what is there")
     add("--flights", **_NUMBER, help="number of flights, instead of the file's")
     width = "stop once the 95 %% interval of the failure probability is as narrow as this, e.g. 0.05"
     add("--until-width", type=float, metavar="W", help=width)
@@ -173,7 +173,7 @@ def _add_tune(tune: argparse.ArgumentParser) -> None:
     add("--seed", **_NUMBER, help="replace the seed, of the search and of its draws")
     add("--workers", **_NUMBER, help="processes (default: one per core)")
     add("--cluster", metavar="ADDRESS", help="fly on a Dask cluster, as quadsim campaign does")
-    add("--resume", action="store_true", help="go on with what is there")
+    add("--resume", action="store_true", help="continue what is there")
     add("--report", action=argparse.BooleanOptionalAction, default=True, help="write the report, HTML pages")
     add("--json", **_SUMMARY)
 

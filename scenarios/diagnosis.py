@@ -145,7 +145,7 @@ class _Case:
         return C is not None and C.ndim == 3
 
     def entries(self, conflict: Conflict) -> Iterator[dict[str, Any]]:
-        """What is violated, the largest share first, and what is in the way, each with its times and amount."""
+        """What is violated, the largest share first, and what blocks it, each with its times and amount."""
         delay, period = self._unanswered.delay, self._period
         for side, found in sorted(conflict.violated.items(), key=lambda item: -item[1].share):
             bound = self.bound(side)

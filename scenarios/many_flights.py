@@ -40,7 +40,7 @@ def sweep(
     Args:
         scenario: what is flown, or its name or file.
         values: what to try, by dotted path.
-        controller: who flies it, as of `fly`; a class or a function of a module that other processes can import.
+        controller: as of `fly`; a class or a function of a module that other processes can import.
         forces: what acts on it, as of `fly`; the same.
         workers: processes that fly; one per usable core where absent.
         progress: whether to show a bar on a terminal.
@@ -94,12 +94,12 @@ def campaign(
         flights: how many, instead of the file's.
         seed: of all draws, instead of the file's.
         changes: of a file: texts `dotted.path=value` that change fields of its scenario.
-        controller: of a scenario: who flies, as of `sweep`.
+        controller: of a scenario, as of `sweep`.
         forces: of a scenario: what acts on it, as of `sweep`.
         require: requirements as texts, e.g. `P(failure) < 0.02`, that `judgements` judges.
         workers: processes that fly; one per usable core where absent.
         cluster: a dask cluster that flies instead, as of `--cluster`.
-        resume: whether to go on with what the directory holds.
+        resume: whether to continue what the directory holds.
         until_width: width of the 95 % interval of the failure probability, from 0 to 1, at which to stop.
         report: whether to write the page and its figure.
         progress: whether to show a bar on a terminal; "lines" for a line now and then where stderr is none.
@@ -111,7 +111,7 @@ def campaign(
     Raises:
         InputError: something cannot be flown so.
         OutputError: a campaign is there already, or the directory cannot be written.
-        KeyboardInterrupt: a person stopped it; what was flown is there, and `resume` goes on with it.
+        KeyboardInterrupt: a person stopped it; what was flown is there, and `resume` continues it.
 
     Examples:
         >>> import tempfile, quadsim
@@ -174,7 +174,7 @@ def tune(
         seed: of the search and its draws, instead of the file's.
         workers: processes that fly; one per usable core where absent.
         cluster: a dask cluster that flies instead, as of `--cluster`.
-        resume: whether to go on with what the directory holds.
+        resume: whether to continue what the directory holds.
         report: whether to write the pages and their figures.
         progress: whether to show a bar on a terminal; "lines" for a line now and then where stderr is none.
 
@@ -186,7 +186,7 @@ def tune(
         InputError: something cannot be flown so.
         MissingPackageError: the extra `tune` is not installed.
         OutputError: a tuning is there already, or the directory cannot be written.
-        KeyboardInterrupt: a person stopped it; what was flown is there, and `resume` goes on with it.
+        KeyboardInterrupt: a person stopped it; what was flown is there, and `resume` continues it.
 
     Examples:
         >>> import tempfile, pathlib, quadsim
@@ -293,7 +293,7 @@ def flown_by(scenario: Scenario, controller: object, forces: Sequence[object] = 
 
 
 def make_engine(workers: int | None, cluster: str | None) -> Engine:
-    """Who flies a campaign: processes of this machine, or a dask cluster."""
+    """The workers of a campaign: processes of this machine, or a dask cluster."""
     if cluster is None:
         from scenarios.campaign.engine.local import LocalEngine
 

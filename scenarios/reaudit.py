@@ -105,7 +105,7 @@ def reaudit(directory: Path, *, products: bool = True) -> Reaudit:
 def stored_scenario(directory: Path) -> Scenario:
     """The scenario of a run, as its directory has it; no other file is read for it.
 
-    Its controller is not needed: another one stands for one of an installed package that is not installed here.
+    Its controller is not needed: another one replaces that of a package that is not installed here.
 
     Raises:
         InputError: it is missing or malformed.
@@ -218,7 +218,7 @@ def _constraint_differences(
 def _time_beyond(finding: Finding, scenario: Scenario, log: FlightLog) -> tuple[float, float]:
     """The least and the most time beyond a bound and its tolerance that the tables leave possible [s].
 
-    Rows at the log rate stand for one physics step each at least, and the last of them may come before the end.
+    Rows at the log rate cover one physics step each at least, and the last of them may come before the end.
     """
     signal, limit, seen = finding.limit.source, finding.limit, finding.time_violated
     row = 1.0 / scenario.log_rate if scenario.plant_stride > 1 else 0.0

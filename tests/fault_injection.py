@@ -140,7 +140,7 @@ class Consequence:
 
 
 def draw(count: int, *, seed: int = 0, earliest: float = 1.0, latest: float = LAST - AFTER - 1.0) -> list[Injection]:
-    """Faults of all kinds, in turns in a random order, at so many random instants; each for both controllers.
+    """Faults of all kinds, in turns in a random order, at this many random instants; each for both controllers.
 
     The robust controller meets each kind under a disturbance first, then in all conditions in turns.
     """
@@ -159,7 +159,7 @@ def draw(count: int, *, seed: int = 0, earliest: float = 1.0, latest: float = LA
 
 
 def draw_flight(controller: str, condition: str, count: int, *, seed: int) -> list[Injection]:
-    """So many different faults for one flight, over all of it, each after what came of the one before."""
+    """This many different faults for one flight, over all of it, each after what came of the one before."""
     rng = np.random.default_rng(seed)
     kinds = faults()
     chosen = [kinds[i] for i in rng.permutation(len(kinds))[:count]]

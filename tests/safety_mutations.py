@@ -272,7 +272,7 @@ def is_false(claimed: dict[str, Any], truth: dict[str, Any]) -> bool:
 
 
 def measure_summaries(count: int, seed: int = 0) -> dict[str, int]:
-    """So many runs, most with a mutated `summary.json`, some with a mutated table, each before several commands.
+    """Check many runs, most with a mutated `summary.json`, some with a mutated table, each before several commands.
 
     Returns:
         Counts of `cases`, of those `refused`, of `tracebacks`, `false_verdicts` and `wrong_answers` (no clear message).

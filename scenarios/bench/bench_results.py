@@ -188,7 +188,7 @@ class RenderProfile:
         return 1e3 * (self.wall_s - self.start_s) / self.frames
 
     def film_s(self, duration: float) -> float:
-        """Wall time of a film of so many seconds [s], from the two numbers above."""
+        """Wall time of a film of this many seconds [s], from the two numbers above."""
         return self.start_s + 1e-3 * self.frame_ms * math.ceil(duration * self.fps)
 
     def to_json(self) -> dict[str, Any]:

@@ -171,7 +171,7 @@ def bench_campaign(
     sizes: Sequence[int] = (10, 100, 1000, 10000),
     progress: Progress = silent,
 ) -> CampaignProfile:
-    """Fly campaigns of so many flights per worker by one worker and by two, in turns, and then ever larger ones by two.
+    """Fly campaigns of `flights` per worker by one worker and by two, in turns, and then ever larger ones by two.
 
     Raises:
         ParameterError: nothing is requested.

@@ -1,6 +1,6 @@
 """The one place where times are taken: of calls and commands, of whole runs in turns, and of a controller's steps.
 
-What is compared is timed in turns, so that what the machine does meanwhile meets all of it.  Steps are timed as a
+What is compared is timed in turns, so that other load on the machine affects all of it.  Steps are timed as a
 flight sees them: between two questions the plant flies a period, which leaves in the caches what it leaves there in a
 flight.  A question is put a few times, and its time is the median: what a flight sees but for the machine's stalls.
 
@@ -37,7 +37,7 @@ class Stopwatch:
     """Seconds since it was made, and those that calls took.
 
     Args:
-        now: a clock [s]: `time.perf_counter`, or `time.thread_time`, which stands still while other processes run.
+        now: a clock [s]: `time.perf_counter`, or `time.thread_time`, which pauses while other processes run.
     """
 
     def __init__(self, now: Callable[[], float] = clock.perf_counter) -> None:
@@ -74,7 +74,7 @@ class Stopwatch:
 
 
 def in_turns(runs: Mapping[str, Callable[[], Found]], repeats: int) -> dict[str, list[Found]]:
-    """What each of several runs returned, each so many times, in turns."""
+    """What each of several runs returned, each repeatedly, in turns."""
     found: dict[str, list[Found]] = {name: [] for name in runs}
     for _ in range(repeats):
         for name, run in runs.items():

@@ -1,7 +1,7 @@
 """What is drawn for each flight of a campaign.
 
 Each flight's own generator is seeded by `SeedSequence([campaign seed, flight])`, so that neither the number of flights
-nor who flies them matters; spread samplings take the points of `scipy.stats.qmc` in order instead.  Points in the unit
+nor the worker matters; spread samplings take the points of `scipy.stats.qmc` in order instead.  Points in the unit
 cube become values through the inverse of each distribution function.
 """
 

@@ -73,7 +73,7 @@ def go_on(plan: Plan, files: Growing, *, flying: bool) -> dict[str, Any]:
         differing = [name for name in other_than_flew(manifest, plan) if name != "machine"]
         if differing:
             raise InputError(
-                f"{files.path}: --resume goes on with the same code alone, and this one differs from what flew the "
+                f"{files.path}: --resume needs the same code, and this one differs from what flew the "
                 f"first flights ({', '.join(differing)}): half of the numbers would be another program's; choose "
                 "another --out"
             )
@@ -97,7 +97,7 @@ def write(manifest: Mapping[str, Any], files: Growing) -> None:
 
 
 def require_same(plan: Plan, directory: Path) -> None:
-    """Refuse to go on with a campaign by another one.
+    """Refuse to continue a campaign by another one.
 
     Raises:
         FileError: there is none, or it is damaged.
@@ -113,7 +113,7 @@ def require_same(plan: Plan, directory: Path) -> None:
     if differing:
         rule = "; more flights may follow, except of a latin_hypercube" if differing == ["flights"] else ""
         raise InputError(
-            f"{directory}: --resume goes on with the same campaign alone, and its {', '.join(differing)} differs from "
+            f"{directory}: --resume needs the same campaign, and its {', '.join(differing)} differs from "
             f"the one there{rule}; choose another --out"
         )
 

@@ -1,4 +1,4 @@
-"""Who may open a session's page: whoever has its address, from this machine, in a page that it served itself.
+"""Access to a session's page: with its address, from this machine, in a page that it served itself.
 
 A browser lets any site connect to servers on the loopback interface, so that each request is checked: `Host` against
 names that a foreign site may have bound to this machine, `Origin` against pages of others, and a token, which stands in

@@ -84,7 +84,7 @@ def tune(
     report: bool = True,
     watch: Watch = lambda standing: None,
 ) -> TuningResult:
-    """Search, or go on with it, and hold the answer against the start.
+    """Search, or continue it, and hold the answer against the start.
 
     The same file gives the same answer with any workers and order, interrupted or not.  Beside `ALL_FILES`, the
     directory has the campaigns on fresh draws, `start/` and `candidate-N/`, their `comparison/`, and of two objectives
@@ -94,7 +94,7 @@ def tune(
         plan: the tuning.
         directory: where its results go.
         engine: flies them.
-        resume: whether to go on with what the directory holds, perhaps with more trials.
+        resume: whether to continue what the directory holds, perhaps with more trials.
         report: whether to write the pages and their figures.
         watch: called with the progress, as answers come.
 
@@ -107,7 +107,7 @@ def tune(
     session: dict[str, Any] = {"engine": engine.name, "workers": engine.workers, "flights": 0, "wall_s": None}
     going_on = (directory / MANIFEST_FILE).is_file()
     if going_on and not resume:
-        raise OutputError(directory, "a tuning is already there; go on with it by --resume, or choose another --out")
+        raise OutputError(directory, "a tuning is already there; continue it with --resume, or choose another --out")
     with growing(directory, KIND) as files:
         files.require(ALL_FILES)
         manifest = _go_on(plan, files) if going_on else _begin(plan)
@@ -309,7 +309,7 @@ def _go_on(plan: TuningPlan, files: Growing) -> dict[str, Any]:
         differing.append("trials")
     if differing:
         raise InputError(
-            f"{files.path}: --resume goes on with the same tuning alone, and its {', '.join(differing)} differs from "
+            f"{files.path}: --resume needs the same tuning, and its {', '.join(differing)} differs from "
             "the one there; more trials and more fresh flights may follow; choose another --out"
         )
     other = [name for name in records.other_than_flew(manifest, plan.start) if name != "machine"]
@@ -317,7 +317,7 @@ def _go_on(plan: TuningPlan, files: Growing) -> dict[str, Any]:
         other.append("optuna")
     if other:
         raise InputError(
-            f"{files.path}: --resume goes on with the same code alone, and this one differs from what began it "
+            f"{files.path}: --resume needs the same code, and this one differs from what began it "
             f"({', '.join(other)}); choose another --out"
         )
     return {**manifest, "status": "running"}

@@ -24,7 +24,7 @@ import numpy as np
 
 
 class Unstable:
-    """Rolls the wrong way, and ever more of it."""
+    """Rolls in the wrong direction, ever faster."""
 
     def __init__(self, vehicle, period, horizon):
         self.hover = vehicle.hover_speed

@@ -199,7 +199,7 @@ class _Supervisor:
             self._worker = None
 
     def _listen(self) -> bool:
-        """Wait for whatever happens next, but not for long while somebody flies; False when it is time to leave."""
+        """Wait for whatever happens next, but not for long during a flight; False when it is time to leave."""
         worker, started = self._worker, clock.monotonic()
         watched: list[Connection | int] = [self._pipe, *((worker.outbox,) if worker else ())]
         happened = connection.wait(watched, timeout=LOOK_S if self._flying else None)
@@ -207,7 +207,7 @@ class _Supervisor:
             self._hear(worker)
         elif worker is not None and self._flying:
             waited = clock.monotonic() - started
-            self._watch(worker, min(waited, _TURN_S))  # while this process had no turn, nobody may have had one
+            self._watch(worker, min(waited, _TURN_S))  # while this process was idle, it may have been too
         if self._pipe in happened:
             chunk = self._pipe.recv()
             if chunk is None:
@@ -234,7 +234,7 @@ class _Supervisor:
                 self._dismiss()  # so that the next flight does not meet what this one left
 
     def _lose(self, ending: str) -> None:
-        """The worker is gone, or no good, and maybe a flight with it."""
+        """The worker is gone, or unusable, and perhaps a flight with it."""
         flying = self._flying
         self._dismiss()
         if flying:

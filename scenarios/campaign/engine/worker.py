@@ -42,7 +42,7 @@ class Traces:
     """Finds what a flight has left behind in its process.
 
     What a process is like when this is made is how it should stay: its working directory, environment, signals,
-    threads, limits, numpy's and the processor's ways with numbers, and what our modules, and those that they compute
+    threads, limits, the arithmetic of numpy and the processor, and what our modules, and those that they compute
     with, consist of.  What a controller's own module keeps in its own variables is not looked for.
     """
 
@@ -119,7 +119,7 @@ class FlightReport(NamedTuple):
 
 
 def fly_for(supervisor: int, pilot: Pilot, inbox: int, outbox: int, pulse: mmap) -> NoReturn:
-    """Fly until somebody ends this process.
+    """Fly until this process is ended.
 
     Args:
         supervisor: the process that this one was forked from, and is not to outlive.
@@ -153,7 +153,7 @@ def fly_for(supervisor: int, pilot: Pilot, inbox: int, outbox: int, pulse: mmap)
 
 
 def _identity(descriptor: int) -> tuple[int, int]:
-    """What a file descriptor stands for: a controller that closes it may open another file in its place."""
+    """What a file descriptor refers to: a controller that closes it may open another file in its place."""
     try:
         found = os.fstat(descriptor)
     except OSError:

@@ -1,4 +1,4 @@
-"""Whether an outcome depends on a drawn number: in one direction, in any way, or from a threshold on.
+"""Whether an outcome depends on a drawn number: in one direction, in any form, or from a threshold on.
 
 A rank correlation sees what rises or falls throughout, and is blind to what does harm at both ends.  Chatterjee's xi
 sees any dependence, and needs more flights.  Of an event, Fisher's exact test chooses the threshold.  Its p-value
@@ -111,7 +111,7 @@ def _p_of_few_runs(happened: Flags) -> float:
     ones = int(happened.sum())
     zeros = happened.size - ones
     runs = np.arange(2, int(np.count_nonzero(np.diff(happened))) + 2)
-    fewer, more = runs // 2, (runs + 1) // 2  # runs of the one value and of the other, or the other way round
+    fewer, more = runs // 2, (runs + 1) // 2  # runs of the one value and of the other, or the reverse
 
     def ways(of_ones: Counts, of_zeros: Counts) -> Array:
         return _log_binomial(ones - 1, of_ones - 1) + _log_binomial(zeros - 1, of_zeros - 1)
@@ -225,7 +225,7 @@ def best_splits(columns: Mapping[str, Array], happened: Flags) -> dict[str, Spli
 
 
 def _fisher(counts: Counts, flights: int, count: int) -> Array:
-    """(D, K - 1) p-values at each cut, of so many events among the first 1, 2, ... flights."""
+    """(D, K - 1) p-values at each cut, of this many events among the first 1, 2, ... flights."""
     found = np.empty(counts.shape)
     for size, tails in enumerate(_tails(flights, count)):
         found[:, size] = tails[counts[:, size]]

@@ -37,7 +37,7 @@ _CURVE_POINTS: Final = 80
 SPLIT_EVENTS: Final = ("failure", "violation", "lost")
 """Events for which a threshold is looked for, where they are not the same flights as an earlier one's."""
 _GROUPS: Final = ((50, 5), (12, 3))
-"""Flights from which a drawn number's values are looked at in so many groups of about equal size."""
+"""Flights from which a drawn number's values are looked at in this many groups of about equal size."""
 
 
 def estimate(table: pa.Table) -> dict[str, Any]:

@@ -182,7 +182,7 @@ def test_ctrl_c_keeps_what_was_flown(file: Path) -> None:
         campaign.send_signal(signal.SIGINT)
         _, output = campaign.communicate(timeout=30.0)
         assert campaign.returncode == EXIT_FAILED
-    assert "interrupted (Ctrl-C); c has what was flown, --resume goes on with it" in output
+    assert "interrupted (Ctrl-C); c has what was flown, --resume continues it" in output
     assert "Traceback" not in output
     manifest = json.loads((file.parent / "c" / "manifest.json").read_text())
     assert manifest["status"] == "interrupted"

@@ -89,7 +89,7 @@ def by_two(tmp_path_factory: pytest.TempPathFactory) -> Result:
 
 @pytest.fixture
 def flown(whole: Result, tmp_path: Path) -> Path:
-    """A copy of its directory to go on with, or to tamper with."""
+    """A copy of its directory to continue, or to tamper with."""
     return Path(shutil.copytree(whole.directory, tmp_path / "c"))
 
 
@@ -192,7 +192,7 @@ def test_a_manifest_states_what_was_flown(plan: Plan, tmp_path: Path) -> None:
 
 
 def test_a_campaign_is_not_overwritten_without_a_request(plan: Plan, flown: Path) -> None:
-    with pytest.raises(OutputError, match="a campaign is already there; go on with it by --resume"):
+    with pytest.raises(OutputError, match="a campaign is already there; continue it with --resume"):
         fly_campaign(plan, flown, Alone())
 
 

@@ -226,7 +226,7 @@ def test_processes_fly_the_same_search(tmp_path: Path) -> None:
 
 
 def test_a_tuning_is_not_overwritten_without_a_request(plan: TuningPlan, whole: TuningResult) -> None:
-    with pytest.raises(OutputError, match="a tuning is already there; go on with it by --resume"):
+    with pytest.raises(OutputError, match="a tuning is already there; continue it with --resume"):
         tune(plan, whole.directory, Formula())
 
 
@@ -243,7 +243,7 @@ def test_a_tuning_is_not_overwritten_without_a_request(plan: TuningPlan, whole: 
 def test_another_tuning_is_not_gone_on_with(
     whole: TuningResult, tmp_path: Path, changes: dict[str, Any], named: str
 ) -> None:
-    with pytest.raises(InputError, match=f"goes on with the same tuning alone, and its {named} differs"):
+    with pytest.raises(InputError, match=f"--resume needs the same tuning, and its {named} differs"):
         tune(load_tuning(str(write_tuning(tmp_path, **changes))), whole.directory, Formula(), resume=True)
 
 

@@ -1,4 +1,4 @@
-"""Optuna's study of a tuning: its journal is Optuna's own form, and what is proposed does not hang on the process."""
+"""Optuna's study of a tuning: its journal is Optuna's own form, and what is proposed does not depend on the process."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def distance(values: Any) -> float:
 
 
 def carry_on(plan: TuningPlan, directory: Path, batches: int, *, again: bool) -> list[dict[int, Any]]:
-    """So many batches, each by a study of its own where `again`, as after a kill."""
+    """The batches, each by a new study where `again`, as after a kill."""
     found = []
     with growing(directory, KIND) as files:
         search = Search(plan, files)
@@ -48,7 +48,7 @@ def carry_on(plan: TuningPlan, directory: Path, batches: int, *, again: bool) ->
     return found
 
 
-def test_what_is_proposed_does_not_hang_on_the_process(plan: TuningPlan, tmp_path: Path) -> None:
+def test_what_is_proposed_does_not_depend_on_the_process(plan: TuningPlan, tmp_path: Path) -> None:
     whole, broken = (carry_on(plan, tmp_path / f"{again}", 4, again=again) for again in (False, True))
     assert whole == broken
     assert [sorted(batch) for batch in whole] == [list(range(1 + 6 * i, 7 + 6 * i)) for i in range(4)]
@@ -95,9 +95,9 @@ def test_a_field_that_matters_is_distinguished_from_one_that_does_not(plan: Tuni
         scores = [scored(START, 300.0)]
         assert search.importance(scores, 0) == {}
         for _ in range(8):
-            batch = search.ask()
-            scores = [scored(number, distance(values)) for number, values in batch.items()]
-            search.tell(scores)
+            candidates = search.ask()
+            batch = [scored(number, distance(values)) for number, values in candidates.items()]
+            search.tell(batch)
             scores += batch
         found = search.importance(scores, 0)
     assert sum(found.values()) == pytest.approx(1.0)

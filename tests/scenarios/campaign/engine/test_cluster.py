@@ -240,7 +240,7 @@ def test_no_worker_for_too_long_is_reported() -> None:
     with start_cluster(workers=0) as cluster:
         engine = DaskEngine(cluster.scheduler_address, patience=0.5)
         assert engine.workers == 0
-        with pytest.raises(EngineError, match=r"no worker for 0.5 s; start some, and go on with --resume"):
+        with pytest.raises(EngineError, match=r"no worker for 0.5 s; start some, then use --resume"):
             fly(engine, ToyPilot())
 
 
@@ -361,9 +361,7 @@ def test_what_is_neither_address_nor_file_is_refused(tmp_path: Path) -> None:
         DaskEngine("tcp://127.0.0.1:9", patience=0.0)
 
 
-def test_without_the_extra_the_message_gives_the_install_command(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+def test_without_the_extra_the_message_names_it(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setitem(sys.modules, "dask_jobqueue", None)
     with pytest.raises(
         MissingPackageError, match=r"needs the package 'dask-jobqueue': pip install 'quadsim\[cluster\]'"

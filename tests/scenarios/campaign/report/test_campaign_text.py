@@ -23,7 +23,7 @@ MakeCampaign = Callable[..., pa.Table]
 
 
 def flown(verdicts: dict[str, int], held: dict[str, int], margin: float | None = 1.0) -> dict[str, Any]:
-    """The summary of so many flights of each verdict, of which so many held each constraint."""
+    """The summary of given numbers of flights by verdict, and by constraint held."""
     verdict = [name for name, count in verdicts.items() for _ in range(count)]
     n = len(verdict)
     bad = [name != "satisfied" for name in verdict]
