@@ -119,7 +119,7 @@ class Consequence:
         injection: what was done.
         reason: why the flight ended early; None when it did not.
         finite: whether everything that the plant was given was finite.
-        within: whether it kept the bounds on speeds and steps.
+        within: whether it held the bounds on speeds and steps.
         fallback: deepest level.
         furthest: largest distance from the flight without the fault [m].
         back: time from the fault's end to the last instant out of `NEAR` [s]; 0 for none.
@@ -135,7 +135,7 @@ class Consequence:
 
     @property
     def harmless(self) -> bool:
-        """Whether the contract was kept."""
+        """Whether the contract held."""
         return self.reason is None and self.finite and self.within and self.back <= SOON
 
 

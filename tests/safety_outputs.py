@@ -1,4 +1,4 @@
-"""Random trees, random places, every command that writes: nothing that is not ours may change by one byte."""
+"""Random trees, random paths, every command that writes: no foreign file may change by one byte."""
 
 from __future__ import annotations
 

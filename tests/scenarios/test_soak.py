@@ -26,7 +26,7 @@ def test_a_leak_and_a_slowdown_are_reported() -> None:
     assert found.drift == pytest.approx(0.5)
 
 
-@pytest.mark.skipif(not soak.MEMORY.exists(), reason="this system does not tell a process's memory")
+@pytest.mark.skipif(not soak.MEMORY.exists(), reason="this system does not report a process's memory")
 def test_three_minutes_leave_memory_and_step_time_as_they_were() -> None:
     """Step times of a busy machine wander by tens of percent; `make soak` requires a tenth."""
     command = [sys.executable, str(SCRIPT), "--minutes", "3", "--drift", "0.6"]
