@@ -26,9 +26,9 @@ HAS_FIRMWARE_TOOLS := (for tool in $(FIRMWARE_TOOLS); do command -v $$tool || ex
 HAS_BROWSER := { command -v chromium || command -v chromium-browser || command -v google-chrome; } >/dev/null
 
 # $(call quietly,COMMAND,ADVICE): runs a command silently; if it fails, shows its last errors, then the advice.
-quietly = { said=$$({ $(1); } 2>&1) || { echo "$$said" | grep -iE '^(E:|error)' | tail -n 3; echo "$(2)"; false; } >&2; }
+quietly = { output=$$({ $(1); } 2>&1) || { echo "$$output" | grep -iE '^(E:|error)' | tail -n 3; echo "$(2)"; false; } >&2; }
 
-# $(call apt,PACKAGES): installs system packages as root, else says how to.
+# $(call apt,PACKAGES): installs system packages as root, else prints how to.
 apt = if [ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null; then \
 	echo "Installing $(1)" && $(call quietly,apt-get -qq update && DEBIAN_FRONTEND=noninteractive \
 		apt-get -qq install --yes --no-install-recommends $(1),Could not install $(1) through apt.); \
@@ -71,7 +71,7 @@ types: setup  ## types alone
 
 build: setup  ## source archive and wheel in dist/; the wheel is installed alone and flown
 	@rm -rf dist
-	@$(call quietly,$(PY) -m build --no-isolation,The packages could not be built: $(PY) -m build --no-isolation says why.)
+	@$(call quietly,$(PY) -m build --no-isolation,The packages could not be built: $(PY) -m build --no-isolation shows why.)
 	@$(PY) -m pytest -q tests/test_packaging.py
 	@ls dist
 

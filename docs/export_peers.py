@@ -34,7 +34,7 @@ ASSIGNED: Final = {"double": [], "float": ["-DPEER_FLOAT", "-fsingle-precision-c
 class Condition:
     """The condensed QP of a problem: min 1/2 x'Hx + c'x, lower <= [x; G x + shift] <= upper.
 
-    `c` (n, q) and `shift` (m, q) are linear in what a period asks: state, reference, u(k-1) and 1.
+    `c` (n, q) and `shift` (m, q) are linear in a period's inputs: state, reference, u(k-1) and 1.
     """
 
     H: Array
@@ -48,15 +48,15 @@ class Condition:
 def condition(problem: Problem) -> Condition:
     """The QP, its vectors by their values for one question at a time."""
     condensed, N, n, nu = Condensed(problem), problem.horizon, problem.model.n, problem.model.nu
-    asked = n + 4 * N + nu
+    inputs = n + 4 * N + nu
 
     def vectors(question: Array) -> Array:
         reference = question[n : n + 4 * N].reshape(N, 4)
         found = condensed.vectors(question[:n], problem.objective.desired(reference), question[n + 4 * N :])
         return np.concatenate([found.c, -found.h_u])
 
-    offset = vectors(np.zeros(asked))
-    slopes = np.array([vectors(row) - offset for row in np.eye(asked)]).T
+    offset = vectors(np.zeros(inputs))
+    slopes = np.array([vectors(row) - offset for row in np.eye(inputs)]).T
     maps, qp, size = np.column_stack([slopes, offset]), condensed.qp, N * nu
     shift, rows = maps[size:].copy(), problem.rows
     upper = np.concatenate([qp.x_u, np.tile(_hard(problem, rows.upper), N)])
@@ -127,7 +127,7 @@ def write_osqp(directory: Path, qp: Condition, recording: Recording, precision: 
 
 
 TOOLS: Final = ("size", "arm-none-eabi-size")
-"""What tells the size of object files: of this machine's, and of a board's."""
+"""The programs that measure object files: of this machine's, and of a board's."""
 
 
 class Measured(NamedTuple):

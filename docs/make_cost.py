@@ -48,7 +48,7 @@ def answer(study: CostStudy) -> Table:
     times = {candidate.name: percentiles(candidate.step_ms) for candidate in study.candidates}
     text = {name: ", ".join(f"{found[key]:.3g}" for key in ("p50", "p99", "max")) for name, found in times.items()}
     lost = [f"{point.value:g}" for point in study.horizons.points if not point.unconstrained.completed]
-    kept = [f"{point.value:g}" for point in study.horizons.points if not point.constrained.completed]
+    completed = [f"{point.value:g}" for point in study.horizons.points if not point.constrained.completed]
     rows: Table = [
         (f"{study.name}, same weights and horizon", "with its constraints", "without"),
         pair("RMS error x, y, z [m]", ("rmse_x", "rmse_y", "rmse_z")),
@@ -56,7 +56,7 @@ def answer(study: CostStudy) -> Table:
         pair("highest speed, largest step [rad/s]", ("speed_max", "step_max")),
         pair("total variation of the commands [rad/s]", ("total_variation",), ".0f"),
         ("periods without a QP", f"{flown.shortcut.sum()} of {flown.shortcut.size}", "all"),
-        ("horizons N at which the vehicle is lost", ", ".join(kept) or "none", ", ".join(lost) or "none"),
+        ("horizons N at which the vehicle is lost", ", ".join(completed) or "none", ", ".join(lost) or "none"),
         ("controller step: median, p99, max [ms]", text[flown.name], text[gain.name]),
         ("largest loop rate [Hz]", *(f"{each.rate('max'):.0f}" for each in (flown, gain))),
     ]

@@ -56,7 +56,7 @@ make -C c serial.elf                                      # the controller behin
 ```
 
 The first two need no compiler but for `--fly`; the others `gcc-arm-none-eabi`, and QEMU to run what they made. For this
-computer: `--target posix`. In half the memory: `--precision float`. `c/README.md` says which file is what;
+computer: `--target posix`. In half the memory: `--precision float`. `c/README.md` describes the files;
 `c/quadsim_mpc.h` is the interface, with the order of states, units and frames. A directory in which `make` has built
 is exported to again after `make clean`.
 
@@ -103,7 +103,7 @@ A float may pass a bound on speeds and their steps by the spacing of floats ther
 ## On your flight computer
 
 - Call `quadsim_mpc_step` once a period, and give it the command that is in force: `acting`. It always gives a command
-  that is finite and within the bounds on speeds; its status says whether it is an optimum, and if not what was left:
+  that is finite and within the bounds on speeds; its status states whether it is an optimum, and if not what remained:
   the axes' optimum clipped, the last plan shifted, the command before. Whether to fly on with these is yours to decide.
 - `serial.c` is a start: one struct with a CRC-32 each way. What is corrupt, cut or old is dropped, what comes twice is
   solved once. Without a fresh state for 100 ms the last command is sent again with the status `QUADSIM_BEFORE`, until

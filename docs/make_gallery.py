@@ -1,6 +1,6 @@
 """Make docs/gallery.md and its figures, a picture and the numbers of every scenario that ships: `make docs`.
 
-Flies every scenario; neither the page nor the figures are kept in the repository.
+Flies every scenario; neither the page nor the figures are stored in the repository.
 """
 
 from __future__ import annotations

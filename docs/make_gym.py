@@ -187,7 +187,7 @@ def draw(shown: dict[str, Any]) -> Callable[[], Any]:
 
 
 def main() -> None:
-    """Remake what was asked for, or everything."""
+    """Remake what was requested, or everything."""
     parts = ("samples", "safety", "imitation", "speed")
     parser = argparse.ArgumentParser()
     parser.add_argument("parts", nargs="*", choices=[*parts, []], default=[])

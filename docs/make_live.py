@@ -87,7 +87,7 @@ def latencies(session: Session, page: Page) -> list[float]:
 
 
 def pull(tab: Tab, x: float, y: float, seconds: float) -> None:
-    """Drag the vehicle, at the middle of the picture, by so many pixels, and hold it for a while."""
+    """Drag the vehicle, at the middle of the picture, by this many pixels, and hold it for a while."""
     box = tab.locator("canvas").first.bounding_box()
     assert box is not None
     begin = np.array([box["x"] + 0.5 * box["width"], box["y"] + 0.5 * box["height"]])

@@ -1,6 +1,6 @@
 """Remake the section of docs/performance.md on steps of nonlinear MPC: `make nonlinear`.
 
-What the controller was asked in two flights is put to it with several QP solvers, to acados' real-time iteration, to
+The controller's queries in two flights are given to it with several QP solvers, to acados' real-time iteration, to
 IPOPT and to do-mpc, in turns (`scenarios.bench.timing`).
 """
 
@@ -52,7 +52,7 @@ TARGETS: Final = {10: (0.30, 1.0), 20: (1.5, math.inf)}
 """Largest p50 and p99 of the default by N [ms]."""
 TEXT: Final = """\
 `make nonlinear` remakes this section; processor time, on one machine ({processor}, {cores} cores), each table in one
-run: read the ratios. What the controller was asked in flights of the library, {asked} periods of each, is put to it
+run: read the ratios. The controller's queries in flights of the library, {timed} periods of each, are given to it
 with other QP solvers, and to the same optimal control problem in CasADi (`tests/peers/casadi_ocp.py`), solved by
 acados, by IPOPT, and by do-mpc, which calls IPOPT. As in the tables above the plant flies a period between two steps,
 and each step is the median of its repeats. IPOPT starts along the reference each time and converges; the others do in
@@ -73,19 +73,19 @@ is the largest of a rotor's first input from `daqp`'s, as a share of the largest
 
 
 class Recorder:
-    """A controller whose questions are kept."""
+    """A controller whose queries are recorded."""
 
     def __init__(self, law: NonlinearMPC) -> None:
         self.law, self.horizon, self.name, self.solver = law, law.horizon, law.name, law.solver
-        self.asked: list[tuple[Moment, Array, Array]] = []
+        self.queries: list[tuple[Moment, Array, Array]] = []
 
     def reset(self, speeds: Array) -> None:
         """See `quadsim.controller.Controller`."""
         self.law.reset(speeds)
 
     def step(self, now: Moment, state: Array, reference: Array) -> Command:
-        """Keep the question, and answer it."""
-        self.asked.append((now, state.copy(), reference.copy()))
+        """Record the query, and answer it."""
+        self.queries.append((now, state.copy(), reference.copy()))
         return self.law.step(now, state, reference)
 
     def predict(self, states: Array, plans: Array) -> Array:
@@ -96,14 +96,14 @@ class Recorder:
 class Ours:
     """Our controller as a candidate; see `scenarios.bench.timing.Candidate`."""
 
-    def __init__(self, law: NonlinearMPC, asked: list[tuple[Moment, Array, Array]]) -> None:
-        self._law, self._asked, self._period = law, asked, -2
+    def __init__(self, law: NonlinearMPC, queries: list[tuple[Moment, Array, Array]]) -> None:
+        self._law, self._queries, self._period = law, queries, -2
         self.first: dict[int, Array] = {}
         self.statuses: dict[int, str] = {}
 
     def prepare(self, period: int) -> None:
         """See `scenarios.bench.timing.Candidate.prepare`; after a gap, start anew."""
-        moment, state, reference = self._asked[period]
+        moment, state, reference = self._queries[period]
         if period != self._period + 1:
             self._law.reset(moment.acting)
         self._period, self._question = period, (moment, state, reference)
@@ -118,14 +118,14 @@ class Ours:
 class InCasadi:
     """A case by acados, IPOPT or do-mpc as a candidate, with a case's states and nodes made before the clock starts."""
 
-    def __init__(self, case: Case, solver: AcadosRTI | Peer | DoMPC, law: NonlinearMPC, asked: list[Any]) -> None:
-        self._case, self._solver, self._law, self._asked, self._period = case, solver, law, asked, -2
+    def __init__(self, case: Case, solver: AcadosRTI | Peer | DoMPC, law: NonlinearMPC, queries: list[Any]) -> None:
+        self._case, self._solver, self._law, self._queries, self._period = case, solver, law, queries, -2
         self.first: dict[int, Array] = {}
         self.failures = 0
 
     def prepare(self, period: int) -> None:
         """See `scenarios.bench.timing.Candidate.prepare`; after a gap, start anew."""
-        moment, state, _ = self._asked[period]
+        moment, state, _ = self._queries[period]
         nodes = nodes_of_motion(moment.motion, self._case.nodes, self._law.settings.stride)
         before, inputs = np.square(moment.acting / 1000.0), nodes.thrusts / 20.0
         if period != self._period + 1:
@@ -170,21 +170,21 @@ def measure(name: str, directory: Path, scratch: Path, stride: int) -> tuple[Tab
 
     recorder = Recorder(law())
     fly_scenario(scenario, law=recorder)
-    default = Ours(law(), recorder.asked)
-    acados = InCasadi(case, AcadosRTI(case, directory, scratch), recorder.law, recorder.asked)
+    default = Ours(law(), recorder.queries)
+    acados = InCasadi(case, AcadosRTI(case, directory, scratch), recorder.law, recorder.queries)
     candidates: dict[str, Any] = {
         f"{recorder.law.solver} (default)": default,
-        **{solver: Ours(law(solver=solver), recorder.asked) for solver in SOLVERS},
+        **{solver: Ours(law(solver=solver), recorder.queries) for solver in SOLVERS},
         "acados, HPIPM": acados,
-        "IPOPT through CasADi": InCasadi(case, Peer(case), recorder.law, recorder.asked),
-        "IPOPT through do-mpc": InCasadi(case, DoMPC(case), recorder.law, recorder.asked),
+        "IPOPT through CasADi": InCasadi(case, Peer(case), recorder.law, recorder.queries),
+        "IPOPT through do-mpc": InCasadi(case, DoMPC(case), recorder.law, recorder.queries),
     }
-    asked = segments(len(recorder.asked), stride)
-    periods = [period for segment in asked for period in segment]
+    timed = segments(len(recorder.queries), stride)
+    periods = [period for segment in timed for period in segment]
     with flight_between(scenario, vehicle) as between:
         laps = time_in_turns(
             candidates,
-            asked,
+            timed,
             between=between,
             repeats=REPEATS,
             rng=np.random.default_rng(0),
@@ -214,14 +214,14 @@ def main() -> None:
     """Measure everything and write the section."""
     parser = argparse.ArgumentParser(description=main.__doc__)
     parser.add_argument("acados", type=Path, help="the directory that comma-deps-acados is installed in")
-    parser.add_argument("--stride", type=int, default=5, help="one segment of 20 periods of so many is asked")
+    parser.add_argument("--stride", type=int, default=5, help="one segment of 20 periods in this number is timed")
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as scratch:
         found = [measure(name, options.acados, Path(scratch), options.stride) for name in FLIGHTS]
     targets: Table = [("quantity", "target", "measured", "verdict"), *(row for each in found for row in each[2])]
     tables = "\n".join([*(markdown(each[0]) for each in found), markdown(targets)])
     free = ", ".join(each[1] for each in found[:-1]) + f" and {found[-1][1]}"
-    section = f"{TITLE}\n\n{TEXT.format(ALLOWED=ALLOWED, tables=tables, free=free, asked=found[0][3], **machine())}\n"
+    section = f"{TITLE}\n\n{TEXT.format(ALLOWED=ALLOWED, tables=tables, free=free, timed=found[0][3], **machine())}\n"
     start, title, rest = PAGE.read_text(encoding="utf-8").partition(TITLE)
     if not title:
         start, before, rest = start.partition(NEXT)

@@ -195,7 +195,7 @@ def write_page(name: str, *parts: str) -> None:
 
 
 def copy_figure(drawn: Path, name: str, colours: int) -> None:
-    """Put a figure into docs/ with so many colours, which makes it small."""
+    """Put a figure into docs/ with this many colours, which makes it small."""
     figure = Image.open(drawn).convert("RGB")
     figure.quantize(colours, dither=Image.Dither.NONE).save(ROOT / "docs" / name, optimize=True)
 

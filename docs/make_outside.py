@@ -109,8 +109,8 @@ def compare(before: Path, runs: int) -> list[tuple[str, ...]]:
 
 def commit(tree: Path) -> str:
     """What a checkout is of, in short."""
-    asked = ["git", "-C", str(tree), "rev-parse", "--short", "HEAD"]
-    return subprocess.run(asked, capture_output=True, text=True, check=True).stdout.strip()
+    command = ["git", "-C", str(tree), "rev-parse", "--short", "HEAD"]
+    return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
 
 
 def main() -> None:

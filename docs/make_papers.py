@@ -19,7 +19,7 @@ TORQUE = "effects.disturbance.torque=[0.2,-0.1,0.03]"
 GEOMETRIC = "controller={type = 'geometric', tilt = 80.0, feedforward = %s}"
 QUICK = "true, lag = 0.006, disturbance = {force = 40.0}, indi = {}"
 DETAILS = """
-Three details that no field says are held by `tests/scenarios/papers/test_details.py` to the numbers of that separate
+Three details without a field are compared by `tests/scenarios/papers/test_details.py` with the numbers of that separate
 implementation: the reference window one sample late (circle at 4 m/s, ideal, 0.04073 m; at 8 m/s with drag, 0.1852
 m), drag by component in the world frame (circle at 8 m/s, 0.2492 m), and the first command from a guess of zero
 (0.122371 and 0.122879), from which ours, begun along the reference, differs by the guess alone.
@@ -109,7 +109,7 @@ def main() -> None:
         "```sh\nquadsim reproduce quadrotor-uav\n```\n\n"
         "flies one paper again and prints what it publishes, ours, and the difference; without a name, all.\n",
         *(section(found.grid) for found in reproduce()),
-        "A line with a colon changes one detail of the flight, and says what it is worth; its number is from a "
+        "A line with a colon changes one detail of the flight, and shows its effect; its number is from a "
         "separate implementation.\nThe mean of the position error, which that paper calls RMSE, is "
         "`tracking.position_error.mean` of `summary.json`; the true root\nmean square is "
         "`tracking.position_error.rms`.\n" + DETAILS,

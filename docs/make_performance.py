@@ -178,8 +178,8 @@ def main() -> None:
     else:
         flight, film = bench_flight(scenario), bench_render(scenario)
         commands, effects = markdown(whole_commands(flight, film)), markdown(effect_costs())
-        kept = "".join(path.read_text(encoding="utf-8").partition(NONLINEAR)[1:])
-        end = "\n".join([rest(flight, film, commands, effects, campaigns()), kept])
+        section = "".join(path.read_text(encoding="utf-8").partition(NONLINEAR)[1:])
+        end = "\n".join([rest(flight, film, commands, effects, campaigns()), section])
     bench = bench_solvers(scenario)
     with tempfile.TemporaryDirectory() as scratch:
         write_bench(bench, Path(scratch))

@@ -50,7 +50,7 @@ def targets(measured: MismatchBench) -> Grid:
         ),
     )
     return Grid(
-        key="asked",
+        key="requirements",
         title=f"Requirements on {FULL}",
         head=("requirement", "met"),
         lines=tuple(line(*texts) for texts in lines),

@@ -18,7 +18,7 @@ from scenarios.bench.timing import Stopwatch
 
 SUMMARIES, CAMPAIGNS = (partial(safety_mutations.as_ordinary_user, kind) for kind in ("summaries", "campaigns"))
 ATTACKS: dict[str, tuple[Callable[[int], Mapping[str, int]], int]] = {
-    "Random trees and places, for every command that writes": (safety_outputs.measure, 2000),
+    "Random trees and paths, for every command that writes": (safety_outputs.measure, 2000),
     "The same, drawn anew": (partial(safety_outputs.measure, number=1), 700),
     "Changed `summary.json` and tables of runs, read by every command": (SUMMARIES, 2000),
     "Changed files of campaigns, read by every command": (CAMPAIGNS, 2000),
@@ -26,7 +26,7 @@ ATTACKS: dict[str, tuple[Callable[[int], Mapping[str, int]], int]] = {
     "One campaign with controllers that hang, fork, eat memory, exit": (safety_campaign.measure, 60),
 }
 """What was tried: by which function, and how often."""
-ASIDE = 4  # so many of them go on in processes of their own, as an ordinary user, and side by side
+PARALLEL = 4  # the first attacks run in parallel, in processes of their own, as an ordinary user
 
 
 def counts(scale: float) -> str:
@@ -42,8 +42,8 @@ def counts(scale: float) -> str:
 
     names = list(ATTACKS)
     with ThreadPoolExecutor() as beside:
-        outcomes = list(beside.map(go, names[:ASIDE]))
-    outcomes += [go(name) for name in names[ASIDE:]]
+        outcomes = list(beside.map(go, names[:PARALLEL]))
+    outcomes += [go(name) for name in names[PARALLEL:]]
     lines = tuple(itertools.starmap(line, zip(names, outcomes, strict=True)))
     return grid_to_markdown(Grid(key="counts", title="What was tried", head=("attack", "outcome"), lines=lines))
 

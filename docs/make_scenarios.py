@@ -78,7 +78,7 @@ def page(flights: dict[str, Flight]) -> str:
     parts = [
         "# The scenarios\n\nMade by `make numbers`; nothing here is typed by hand.\n\n"
         f"{count} scenarios ship. `quadsim run NAME` flies one; `quadsim scenario NAME` prints its whole file with "
-        "comments, to start your\nown from; the files, in `scenarios/library`, say in a comment "
+        "comments, to start your\nown from; comments in the files, in `scenarios/library`, state "
         "what each shows and with what numbers.\n",
         "The verdict is *satisfied* (flown to its end, every required constraint holds), *violated* (one does not, the "
         "vehicle\ncrashes, or the controller ends in [fallback for good](controllers.md#fallback)) or *lost* (the "

@@ -25,8 +25,8 @@ READING = """\
 - Up to some 50 deg, where the plant is not as modelled, nonlinear MPC by itself pays little. Under drag a PID, which
   integrates, is nearer up to 8 m/s; with real rotors linear MPC is off by at most twice as much. To observe the force
   pays more there: `nonlinear +` under drag and with real rotors, `geometric +` under drag and on the Hummingbird.
-- Nonlinear need not be MPC: `geometric +` has the smallest error on the loop as modelled . It bounds only what it
-  asks for, and is beyond its bound at the highest speeds, where its rotors saturate; `nonlinear` never is.
+- Nonlinear need not be MPC: `geometric +` has the smallest error on the loop as modelled. It bounds only what it
+  commands, and is beyond its bound at the highest speeds, where its rotors saturate; `nonlinear` never is.
 - By sensors to observe forces does not pay: the estimate's noise passes up to the observers' bandwidths, `nonlinear +`
   is farther off than `nonlinear`, and a seed of `geometric +` is lost at 6 m/s.
 - Within a wide bound linear MPC plans what its model does not describe. `constrained`, with hard bounds and without
@@ -85,7 +85,7 @@ def page(measured: SpeedBench) -> str:
             "# Where linear control ends\n\nMade by `make speed`, its numbers by flights; `quadsim bench speed` prints "
             f"the tables.\n\nEvery controller flies a course ever faster:\n\n{speed_legend(measured)}\n"
             f"Roll and pitch are bounded by what the course takes without drag and {ROOM:g} deg more, at most "
-            f"{STEEPEST:g} deg; the controllers\nwithout bounds limit the tilt that they ask for to it. Where "
+            f"{STEEPEST:g} deg; the controllers\nwithout bounds limit the tilt that they command to it. Where "
             "sensors measure, numbers are means over seeds, with the 95 % interval of the mean error; elsewhere\n"
             "nothing is random. What noise adds to the loop is in [papers.md](papers.md#noise-over-seeds). A vehicle "
             "farther off than the course's size,\nor tilted by more than 120 deg, is lost.\n",

@@ -1,6 +1,6 @@
 """Carry out the tunings that ship, and remake docs/tuning.md with its figures: `make tuning`.
 
-On two quiet cores the flights take less than half an hour each.  They are kept under runs/tunings/, and resumed where
+On two quiet cores the flights take less than half an hour each.  They are saved under runs/tunings/, and resumed where
 they were stopped; remove that folder to fly them all anew.  With --there nothing is flown, and the page is made of the
 tunings as they are, which an earlier version of the code may have flown.
 """
@@ -76,7 +76,7 @@ def main() -> None:
     parts = [part(name, carry_out(name, there=options.there, workers=options.workers)) for name in names]
     write_page(
         "tuning.md",
-        "# What tuning finds\n\nMade by `make tuning` from the tunings that ship, as [tune.md](tune.md) says.\n"
+        "# What tuning finds\n\nMade by `make tuning` from the tunings that ship, as [tune.md](tune.md) describes.\n"
         "Search: the draws that chose the answer; fresh: draws that chose nothing.\n",
         *parts,
     )

@@ -29,7 +29,7 @@ from scenarios.parts.vehicle import build_vehicle
 INTRODUCTION = """\
 # Verification
 
-Is it right? Here quadsim is held against software that nobody here wrote, by figures that anyone can remake.
+Is it right? Here quadsim is compared with software that others wrote, by figures that anyone can remake.
 `make peers` installs the peers at the versions of `constraints.txt` and holds every check below;
 `make verification` measures them again and writes this page. The code is in `tests/peers`, one file per
 comparison. A page whose versions or digits are not today's fails `make peers`; figures that rounding decides may differ
@@ -160,7 +160,7 @@ q_r* q, a weight and a bound on steps of rotor speeds, and a soft bound of {np.d
 References are those of `{nonlinear_optimum.COURSE}`; states are random around them.
 
 - Converged: the controller's `iterations` go on until nothing moves, and so do IPOPT's.
-- Real-time iterations: one QP in each of so many consecutive periods, linearised along the last plan. IPOPT gets the
+- Real-time iterations: one QP in each of many consecutive periods, linearised along the last plan. IPOPT gets the
   same QP from CasADi's derivatives, along its own last plan.
 
 Whole plans are compared. In {bounded} problems a bound is active. The QPs are solved by `daqp`, to rounding:

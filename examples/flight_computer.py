@@ -1,4 +1,4 @@
-"""A flight computer: an exported controller in C as a program of its own, asked for commands over a serial line.
+"""A flight computer: an exported controller in C as a program of its own, queried over a serial line.
 
 The C is `serial.c` of the export, the same on a Cortex-M behind its UART; here the line is a pseudo-terminal, and this
 script the autopilot at its other end.  Takes a C compiler and make:
@@ -35,7 +35,7 @@ class Terminal:
         os.write(self.line, data)
 
     def receive(self, count: int, patience: float = 5.0) -> bytes:
-        """So many bytes; fewer where none comes for so many seconds."""
+        """`count` bytes; fewer where none comes within the timeout."""
         data = b""
         while len(data) < count and select.select([self.line], [], [], patience)[0]:
             data += os.read(self.line, count - len(data))

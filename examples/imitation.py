@@ -1,7 +1,7 @@
 """A network imitates the paper's controller, and is audited like it: `python examples/imitation.py`, two minutes.
 
 The teacher flies courses of random steps, the student learns its commands by least squares, then flies itself while the
-teacher says what it would have done (data aggregation: Ross, Gordon and Bagnell, 2011, "A reduction of imitation
+teacher labels them with its own actions (data aggregation: Ross, Gordon and Bagnell, 2011, "A reduction of imitation
 learning and structured prediction to no-regret online learning").  Both then fly courses that neither has seen.
 """
 
@@ -131,7 +131,7 @@ class Student:
 
 
 def learn(*, courses: int = 12, rounds: int = 3, epochs: int = 100) -> Student:
-    """A student of the paper's controller: of its own flights first, then of what it says of the student's."""
+    """A student of the paper's controller: of its own flights first, then of its labels for the student's."""
     vehicle = quadsim.load_vehicle("lopes2011")
     student, seed = Student(Network((INPUTS, 64, 64, 4)), vehicle), 1000
     x, y = np.empty((0, INPUTS)), np.empty((0, 4))
@@ -152,7 +152,7 @@ def learn(*, courses: int = 12, rounds: int = 3, epochs: int = 100) -> Student:
 def behind_filter(student: Student, scenario: quadsim.Scenario) -> quadsim.Flight:
     """The student's flight where only those commands pass after which the robust MPC can still hold 5 deg."""
     table = tomllib.loads(quadsim.load("robust").to_toml())["controller"]
-    most = {"roll_rate": 30.0, "pitch_rate": 30.0, "yaw_rate": 30.0, "vz": 3.0}  # deg/s, m/s: nobody is to spin or dive
+    most = {"roll_rate": 30.0, "pitch_rate": 30.0, "yaw_rate": 30.0, "vz": 3.0}  # deg/s, m/s: no spin or dive
     limits = list(most.values())
     calm = {"of": list(most), "rows": np.eye(4).tolist(), "lower": [-each for each in limits], "upper": limits}
     table["polytopes"] = [{"name": "calm", **calm}]

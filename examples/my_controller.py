@@ -11,7 +11,7 @@ Array = NDArray[np.float64]
 
 
 class MyController:
-    """Errors ask for an acceleration, that for roll and pitch, and these for torques; gains are per unit mass."""
+    """Errors give an acceleration, that gives roll and pitch, and these give torques; gains are per unit mass."""
 
     def __init__(self, vehicle: Vehicle, period: float, horizon: int, stiffness: float = 1.5, lead: int = 8) -> None:
         self.vehicle, self.period, self.stiffness, self.lead = vehicle, period, stiffness, min(lead, horizon - 3)

@@ -20,9 +20,9 @@ from scenarios.build import build_controller
 from scenarios.build import resolve as write_out
 from scenarios.flight import Flight, Outputs
 from scenarios.loading import check_parts, load_scenario
-from scenarios.parts.own_code import refer_to, refer_to_force, set_up, set_up_force
 from scenarios.parts.plugin import build_force
 from scenarios.parts.randomness import generator
+from scenarios.parts.user_code import refer_to, refer_to_force, set_up, set_up_force
 from scenarios.parts.vehicle import build_vehicle
 from scenarios.progress import Progress, reporting
 from scenarios.reaudit import Reaudit, reaudit, stored_scenario
@@ -92,7 +92,7 @@ def resolve(scenario: Scenario | str | Path) -> Scenario:
 
 
 def feasibility(scenario: Scenario | str | Path) -> Feasibility:
-    """What a course asks of the vehicle and of the controller's bounds, tightened ones too; nothing is flown.
+    """What a course requires of the vehicle and of the controller's bounds, tightened ones too; nothing is flown.
 
     Args:
         scenario: it, or its name or file.
@@ -161,7 +161,7 @@ def fly(
 
     Args:
         scenario: what is flown, or its name or file.
-        controller: who flies it, instead of the scenario's: a class, called as MyLaw(vehicle, period=..., horizon=...)
+        controller: flies it, instead of the scenario's: a class, called as MyLaw(vehicle, period=..., horizon=...)
             and with a method `step(now, state, reference)`; a function `law(now, state, reference)` that gives four
             rotor speeds [rad/s]; an object with such a `step`; or a text `package.module:Class`.  Further arguments of
             a class through `functools.partial`.
@@ -218,7 +218,7 @@ def start(
         forces: as of `fly`.
         live: whether anything may be applied to it that can happen to its vehicle; else what its scenario's events are
             of, and set-points, stalls, rotor losses and lags, and other controllers.
-        recorded: whether all periods are kept, some 10 kB each; without them there is no `StartedFlight.flight`.
+        recorded: whether all periods are recorded, some 10 kB each; without them there is no `StartedFlight.flight`.
 
     Raises:
         InputError: the scenario cannot be flown, or the controller cannot be set up.
@@ -348,7 +348,7 @@ def check(directory: str | Path) -> Reaudit:
     """Audit a finished run again from its tables, and hold its summary and its files' hashes against that.
 
     Raises:
-        FileError: a file is missing, changed or damaged, or the summary is not what the tables say.
+        FileError: a file is missing, changed or damaged, or the summary contradicts the tables.
 
     Examples:
         >>> import tempfile, quadsim

@@ -37,7 +37,7 @@ def bench_solvers(
         solvers: names of `catalogue().solvers`; all where empty.
         repeats: how often each question is put, at most.
         horizons: N, for how times grow with it; empty for none.
-        stride: 20 periods of so many times 20 are asked.
+        stride: one segment of 20 periods in every `stride` is timed.
         progress: as of `fly`.
 
     Returns:
@@ -91,7 +91,7 @@ def bench_flight(
         Seconds of the whole and of its parts.
 
     Raises:
-        InputError: no repeat is asked for, or the flight does not go to its end.
+        InputError: no repeat is requested, or the flight does not go to its end.
 
     Examples:
         >>> import quadsim
@@ -233,7 +233,7 @@ def bench_campaign(
         Seconds and memory of each campaign.
 
     Raises:
-        InputError: nothing is asked for.
+        InputError: nothing is requested.
 
     Examples:
         >>> import quadsim

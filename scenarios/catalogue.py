@@ -56,7 +56,7 @@ class Catalogue:
         vehicles: for `load_vehicle` and `vehicle.file`.
         controllers: for `controller.type`.
         papers: for `reproduce`, by their titles.
-        solvers: for `controller.solver`; those that are not installed say so.
+        solvers: for `controller.solver`; those that are not installed are marked.
 
     Examples:
         >>> import quadsim

@@ -95,7 +95,7 @@ def make_parser() -> argparse.ArgumentParser:
         "vehicle", metavar="VEHICLE", nargs="?", help="a shipped vehicle's name, or path to a TOML file"
     )
     vehicle.add_argument("--template", action="store_true", help="print a commented vehicle file to fill in instead")
-    vehicle.add_argument("--scenario", metavar="SCENARIO", help="say which of its bounds the vehicle cannot meet")
+    vehicle.add_argument("--scenario", metavar="SCENARIO", help="report which of its bounds the vehicle cannot meet")
     vehicle.add_argument("--out", metavar="FILE", help="PNG file to draw it to, on a floor of 10 cm squares")
     vehicle.add_argument("--json", action="store_true", help="as JSON on stdout")
 
@@ -153,8 +153,8 @@ def _add_campaign(campaign: argparse.ArgumentParser) -> None:
     add("--workers", **_NUMBER, help="processes (default: one per core)")
     scheduler = "a scheduler's address, tcp://HOST:PORT, or a TOML file that describes a batch system's jobs"
     add("--cluster", metavar="ADDRESS", help=f"fly on a Dask cluster: {scheduler}")
-    add("--resume", action="store_true", help="go on with what is there")
-    add("--flights", **_NUMBER, help="so many instead of the file's")
+    add("--resume", action="store_true", help="continue what is there")
+    add("--flights", **_NUMBER, help="number of flights, instead of the file's")
     width = "stop once the 95 %% interval of the failure probability is as narrow as this, e.g. 0.05"
     add("--until-width", type=float, metavar="W", help=width)
     require = 'exit 1 unless the flights support it, e.g. "P(violation) < 0.01 @ 95%%"; may be repeated'
@@ -169,11 +169,11 @@ def _add_tune(tune: argparse.ArgumentParser) -> None:
     add = tune.add_argument
     add("file", metavar="FILE", help="name of a tuning that ships, or path to a TOML file")
     add("--out", metavar="DIR", help="tuning's directory (default: runs/tunings/NAME)")
-    add("--trials", **_NUMBER, help="so many candidates instead of the file's")
+    add("--trials", **_NUMBER, help="number of candidates, instead of the file's")
     add("--seed", **_NUMBER, help="replace the seed, of the search and of its draws")
     add("--workers", **_NUMBER, help="processes (default: one per core)")
     add("--cluster", metavar="ADDRESS", help="fly on a Dask cluster, as quadsim campaign does")
-    add("--resume", action="store_true", help="go on with what is there")
+    add("--resume", action="store_true", help="continue what is there")
     add("--report", action=argparse.BooleanOptionalAction, default=True, help="write the report, HTML pages")
     add("--json", **_SUMMARY)
 
@@ -185,12 +185,12 @@ def _add_bench(bench: argparse.ArgumentParser) -> None:
     solvers = kind("solvers", help="every installed QP solver on the queries of one flight, in one run")
     add = solvers.add_argument
     add("--out", metavar="DIR", default="runs/bench-solvers", help="directory (default: %(default)s)")
-    add("--repeats", **_NUMBER, default=5, help="ask each question so often (default: 5)")
+    add("--repeats", **_NUMBER, default=5, help="repetitions of each measurement (default: 5)")
     horizons = "horizons for the growth of the step, or none (default: 10,20,50,100,200)"
     add("--horizons", **numbers, default=[10, 20, 50, 100, 200], help=horizons)
     this = "time this one; may be repeated (default: all)"
     add("--solver", dest="solvers", metavar="NAME", action="append", help=this)
-    add("--stride", **_NUMBER, default=1, help="ask 20 periods of each so many times 20 (default: 1, all)")
+    add("--stride", **_NUMBER, default=1, help="time one segment of 20 periods in every N (default: 1, all)")
 
     flight = kind("flight", help="where the time of a flight goes")
     flight.add_argument("--repeats", **_NUMBER, default=5, help="flights (default: 5)")
@@ -251,7 +251,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if arguments is None:  # as a process of its own
         collect_rarely()  # saves 5 % of a run
     try:
-        with _told():
+        with _notices():
             status = find_command(options.command)(options)
         sys.stdout.flush()
         return status
@@ -271,31 +271,31 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 @contextlib.contextmanager
-def _told() -> Iterator[None]:
-    """Show on stderr what the program tells of itself meanwhile: what code that is not its own it runs."""
-    logger, teller = logging.getLogger("quadsim"), _Teller()
+def _notices() -> Iterator[None]:
+    """Show the program's notices on stderr: which user-defined code it runs."""
+    logger, handler = logging.getLogger("quadsim"), _NoticeHandler()
     before = logger.level
-    logger.addHandler(teller)
+    logger.addHandler(handler)
     logger.setLevel(logging.INFO)
     try:
         yield
     finally:
-        logger.removeHandler(teller)
+        logger.removeHandler(handler)
         logger.setLevel(before)
 
 
-class _Teller(logging.Handler):
-    """Shows on stderr what the program tells of itself, each thing once."""
+class _NoticeHandler(logging.Handler):
+    """Shows the program's notices on stderr, each once."""
 
     def __init__(self) -> None:
         super().__init__(logging.INFO)
-        self._told: set[str] = set()
+        self._shown: set[str] = set()
 
     def emit(self, record: logging.LogRecord) -> None:
         """See `logging.Handler.emit`."""
         text = record.getMessage()
-        if text not in self._told:
-            self._told.add(text)
+        if text not in self._shown:
+            self._shown.add(text)
             print(f"quadsim: {printable(text)}", file=sys.stderr, flush=True)
 
 

@@ -64,7 +64,7 @@ def compare_flights(
 
     Args:
         targets: one or more.
-        out: the directory of the page; what has to be flown is kept beside it, in `OUT-runs`.
+        out: the directory of the page; what has to be flown is saved beside it, in `OUT-runs`.
         cost: whether to study what constraints cost; None: where a constrained and an unconstrained controller fly the
             same course of at most 120 s.
         progress: called with (what, done, total).
@@ -82,7 +82,7 @@ def compare_flights(
         require_directory(out, KIND)
     notes = [note for target in targets for note in _checked(target)]
     named = [_name_of(target) for target in targets]
-    studied = find_study(named, asked=cost) if out is not None else []
+    studied = find_study(named, requested=cost) if out is not None else []
     with tempfile.TemporaryDirectory() as scratch:
         beside = Path(scratch) if out is None else out.parent / f"{out.name}-runs"
         runs = tuple(_run_of(target, beside, progress, pictures=out is not None) for target in targets)

@@ -1,7 +1,7 @@
 """Why a flight's QP had no answer, in the words and units of the scenario file, and what to try.
 
 What is suggested is a change of the file, and each was tried: the problem is built anew from the changed file, and
-solved for the same period.  It says nothing about the flight that would follow.
+solved for the same period.  It predicts nothing about the flight that would follow.
 """
 
 from __future__ import annotations
@@ -145,7 +145,7 @@ class _Case:
         return C is not None and C.ndim == 3
 
     def entries(self, conflict: Conflict) -> Iterator[dict[str, Any]]:
-        """What is violated, the largest share first, and what is in the way, each with its times and amount."""
+        """What is violated, the largest share first, and what blocks it, each with its times and amount."""
         delay, period = self._unanswered.delay, self._period
         for side, found in sorted(conflict.violated.items(), key=lambda item: -item[1].share):
             bound = self.bound(side)
@@ -226,7 +226,7 @@ class _Case:
         """The controller with other fields; None where the file would be refused."""
         table = tomllib.loads(self._file)
         for field, value in settings.items():
-            set_field(table, field, value, asked="diagnosis")
+            set_field(table, field, value, source="diagnosis")
         if "controller.type" in settings:
             law = table["controller"]
             table["controller"] = {name: value for name, value in law.items() if name in RobustSpec.model_fields}

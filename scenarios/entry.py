@@ -1,4 +1,4 @@
-"""The process of the `quadsim` command: whoever tells it to stop, from its first moment on, ends it in order.
+"""The process of the `quadsim` command: any stop signal, from its first moment on, ends it in order.
 
 Ctrl-C, SIGTERM and SIGHUP all are `KeyboardInterrupt`, unless the process was started with them ignored, as by `nohup`.
 """
@@ -75,7 +75,7 @@ def main() -> int:
             print("quadsim: interrupted (Ctrl-C); nothing half written was left behind", file=sys.stderr)
         return 1
     finally:
-        for stop in heard:  # what is done is done, and the status says how
+        for stop in heard:  # what is done is done, and the status reports how
             signal.signal(stop, signal.SIG_IGN)
 
 

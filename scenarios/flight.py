@@ -114,7 +114,7 @@ class Flight:
 
     @property
     def outcome(self) -> Verdict:
-        """The verdict in one word; `lost` is a flight that was aborted, whoever ended it."""
+        """The verdict in one word; `lost` is a flight that was aborted, by any cause."""
         if self.log.reason is not None:
             return "lost"
         return "satisfied" if self.satisfied else "violated"

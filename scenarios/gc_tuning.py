@@ -42,7 +42,7 @@ def frozen() -> Iterator[None]:
     """Leave what exists out of all passes while the block, a flight, runs; collect between flights.
 
     Freezing takes no time, but starts the collector's counts anew, so that by itself it would never look through
-    everything again.  In a process that froze for good the first flight adds what it loaded; nothing is unfrozen.
+    everything again.  In a process that froze permanently the first flight adds what it loaded; nothing is unfrozen.
     """
     if not _PROCESS.lasting or not _PROCESS.flights:
         gc.freeze()

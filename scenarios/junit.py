@@ -51,9 +51,9 @@ def write_junit(result: Flight | Reaudit | Result | Sequence[Reproduction], path
         judged: Sequence[Judgement] = getattr(result, "judgements", ())
         cases = [(each.requirement.text, each.holds, each.sentence) for each in judged]
         return write_cases(summary["campaign"], cases, Path(path))
-    said = "; ".join(filter(None, [summary["reason"] or "completed", *failure_sentences(summary)]))
+    text = "; ".join(filter(None, [summary["reason"] or "completed", *failure_sentences(summary)]))
     whole = summary["status"] == "completed" and not summary["controller"].get("unrecovered")
-    cases = [("flight", whole, said)]
+    cases = [("flight", whole, text)]
     cases += [
         (entry["name"], entry["satisfied"] or not entry["required"], _sentence(entry))
         for entry in summary["constraints"]

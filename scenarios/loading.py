@@ -57,7 +57,7 @@ def check_parts(scenario: Scenario) -> None:
         for limit in limits:
             clear = float(limit.shape.clearance(np.zeros(1), start)[0]) - limit.radius
             if limit.start <= 0.0 and clear < -limit.tolerance:
-                ball = f"the radius of {limit.radius:.3g} m of the ball that stands for the vehicle"
+                ball = f"the radius of {limit.radius:.3g} m of the ball that represents the vehicle"
                 raise ParameterError("initial", "position", start[0].tolist(), f"clear of {limit.name}, by {ball}")
 
 
@@ -103,7 +103,7 @@ def load_scenario(name: str, settings: Sequence[str] = ()) -> Scenario:
 
 
 def _of_types(problems: Sequence[str], path: Path, read: Mapping[str, Any], data: Mapping[str, Any]) -> Iterator[str]:
-    """Why fields of a table are missing, or are too many: another type was asked for than `read` from the file."""
+    """Why fields of a table are missing, or are too many: another type was requested than `read` from the file."""
     unfit = (problem for problem in problems if problem.endswith(" is missing") or " is not a field of " in problem)
     wrong = {problem.partition(".")[0] for problem in unfit}
     given = retyped(read, data)

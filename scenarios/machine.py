@@ -27,7 +27,7 @@ def machine() -> dict[str, Any]:
 
 @cache
 def processor_name() -> str:
-    """The processor's model, as far as the system tells."""
+    """The processor's model, as far as the system reports it."""
     try:
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
     except OSError:

@@ -12,7 +12,7 @@ from quadsim.errors import InputError, ParameterError
 from quadsim.outputs import real_path
 from scenarios.api import load, named_by
 from scenarios.flight import Outputs
-from scenarios.parts.own_code import require_importable
+from scenarios.parts.user_code import require_importable
 from scenarios.progress import Progress, reporting
 from scenarios.schema.scenario import Scenario
 from scenarios.shipped import paper_names
@@ -40,7 +40,7 @@ def sweep(
     Args:
         scenario: what is flown, or its name or file.
         values: what to try, by dotted path.
-        controller: who flies it, as of `fly`; a class or a function of a module that other processes can import.
+        controller: as of `fly`; a class or a function of a module that other processes can import.
         forces: what acts on it, as of `fly`; the same.
         workers: processes that fly; one per usable core where absent.
         progress: whether to show a bar on a terminal.
@@ -94,12 +94,12 @@ def campaign(
         flights: how many, instead of the file's.
         seed: of all draws, instead of the file's.
         changes: of a file: texts `dotted.path=value` that change fields of its scenario.
-        controller: of a scenario: who flies, as of `sweep`.
+        controller: of a scenario, as of `sweep`.
         forces: of a scenario: what acts on it, as of `sweep`.
         require: requirements as texts, e.g. `P(failure) < 0.02`, that `judgements` judges.
         workers: processes that fly; one per usable core where absent.
         cluster: a dask cluster that flies instead, as of `--cluster`.
-        resume: whether to go on with what the directory holds.
+        resume: whether to continue what the directory holds.
         until_width: width of the 95 % interval of the failure probability, from 0 to 1, at which to stop.
         report: whether to write the page and its figure.
         progress: whether to show a bar on a terminal; "lines" for a line now and then where stderr is none.
@@ -111,7 +111,7 @@ def campaign(
     Raises:
         InputError: something cannot be flown so.
         OutputError: a campaign is there already, or the directory cannot be written.
-        KeyboardInterrupt: a person stopped it; what was flown is there, and `resume` goes on with it.
+        KeyboardInterrupt: a person stopped it; what was flown is there, and `resume` continues it.
 
     Examples:
         >>> import tempfile, quadsim
@@ -129,11 +129,11 @@ def campaign(
     from scenarios.commands.campaign_console import progress as bar
 
     if cluster is not None and workers is not None:
-        raise ParameterError("", "--workers", workers, "absent where --cluster says who flies")
+        raise ParameterError("", "--workers", workers, "absent with --cluster")
     requirements = [parse_requirement(text) for text in require]
     if isinstance(campaign, Scenario):
-        asked = {"vary": [dict(entry) for entry in vary], "flights": flights, "seed": seed, **fields}
-        given = {name: value for name, value in asked.items() if value is not None}
+        requested = {"vary": [dict(entry) for entry in vary], "flights": flights, "seed": seed, **fields}
+        given = {name: value for name, value in requested.items() if value is not None}
         plan = make_plan(flown_by(campaign, controller, forces), given)
     elif vary or fields or controller is not None or forces:
         raise InputError("vary, controller and other fields go with a scenario; a campaign file has its own")
@@ -174,7 +174,7 @@ def tune(
         seed: of the search and its draws, instead of the file's.
         workers: processes that fly; one per usable core where absent.
         cluster: a dask cluster that flies instead, as of `--cluster`.
-        resume: whether to go on with what the directory holds.
+        resume: whether to continue what the directory holds.
         report: whether to write the pages and their figures.
         progress: whether to show a bar on a terminal; "lines" for a line now and then where stderr is none.
 
@@ -186,7 +186,7 @@ def tune(
         InputError: something cannot be flown so.
         MissingPackageError: the extra `tune` is not installed.
         OutputError: a tuning is there already, or the directory cannot be written.
-        KeyboardInterrupt: a person stopped it; what was flown is there, and `resume` goes on with it.
+        KeyboardInterrupt: a person stopped it; what was flown is there, and `resume` continues it.
 
     Examples:
         >>> import tempfile, pathlib, quadsim
@@ -219,7 +219,7 @@ def tune(
     from scenarios.tuning.search import require_optuna
 
     if cluster is not None and workers is not None:
-        raise ParameterError("", "--workers", workers, "absent where --cluster says who flies")
+        raise ParameterError("", "--workers", workers, "absent with --cluster")
     require_optuna()
     plan = load_tuning(str(tuning), trials=trials, seed=seed)
     target = real_path(Path("runs") / "tunings" / plan.spec.name if out is None else out)
@@ -293,7 +293,7 @@ def flown_by(scenario: Scenario, controller: object, forces: Sequence[object] = 
 
 
 def make_engine(workers: int | None, cluster: str | None) -> Engine:
-    """Who flies a campaign: processes of this machine, or a dask cluster."""
+    """The workers of a campaign: processes of this machine, or a dask cluster."""
     if cluster is None:
         from scenarios.campaign.engine.local import LocalEngine
 

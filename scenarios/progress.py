@@ -10,12 +10,12 @@ Progress = Callable[[str, int, int], None]
 
 
 def silent(stage: str, done: int, total: int) -> None:
-    """Report progress to nobody."""
+    """Report no progress."""
 
 
 @contextlib.contextmanager
 def reporting(progress: Progress | bool) -> Iterator[Progress]:
-    """Who is called with the progress: bars on a terminal, nobody, or what the caller gave."""
+    """What is called with the progress: bars on a terminal, none, or the caller's function."""
     if callable(progress):
         yield progress
     elif not progress:

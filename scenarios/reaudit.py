@@ -29,18 +29,18 @@ from scenarios.schema.scenario import Scenario
 
 TABLES: Final = (FLIGHT_FILE, PLANT_FILE, TIMING_FILE)
 OURS: Final = {*TABLES, HORIZON_FILE, rundir.SCENARIO_FILE, rundir.RECORDING_FILE, rundir.VIDEO_FILE}
-"""Files that nobody but a run writes under these names."""
+"""Files that only a run writes under these names."""
 ROUNDING: Final = 1e-9
 """By how much numbers may differ that another machine's arithmetic made, of 1 or of the larger number."""
 ROUNDING_TILT: Final = 1e-6
 """The same for the tilt: near level an arc cosine has half of a number's digits."""
-MOST_SAID: Final = 6
+MOST_REPORTED: Final = 6
 """Differences that one message names."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Reaudit:
-    """What a run's tables say of it.
+    """The audit from a run's tables.
 
     Attributes:
         summary: `summary.json`.
@@ -70,7 +70,7 @@ def reaudit(directory: Path, *, products: bool = True) -> Reaudit:
         products: whether film, recording and figures have to be there too; they can be made again.
 
     Raises:
-        FileError: a file is missing, changed or damaged, or the summary is not what the tables say; the message names
+        FileError: a file is missing, changed or damaged, or the summary contradicts the tables; the message names
             what differs.
     """
     summary = rundir.read_summary(directory)
@@ -83,13 +83,13 @@ def reaudit(directory: Path, *, products: bool = True) -> Reaudit:
         log = rundir.load_run(directory).log
         findings = audit(log, build_limits(scenario))
     except InputError as error:
-        raise _said(directory, differing or [f"it cannot be audited again: {error}"]) from error
+        raise _contradiction(directory, differing or [f"it cannot be audited again: {error}"]) from error
     differing += _differences(summary, scenario, log, findings)
     if differing:
-        raise _said(directory, differing)
+        raise _contradiction(directory, differing)
     notes = [] if sealed else ["its summary has no digest, as those of older versions: changes of it may not show"]
     if others := _unlisted(directory, summary):
-        shown = ", ".join(others[:MOST_SAID]) + (" ..." if len(others) > MOST_SAID else "")
+        shown = ", ".join(others[:MOST_REPORTED]) + (" ..." if len(others) > MOST_REPORTED else "")
         notes.append(f"not of this run: {printable(shown)}")
     whole = summary["reason"] is None and log.control.t.size == scenario.periods and not log.control.crashed
     whole = whole and not metrics.unrecovered(log.control)
@@ -105,7 +105,7 @@ def reaudit(directory: Path, *, products: bool = True) -> Reaudit:
 def stored_scenario(directory: Path) -> Scenario:
     """The scenario of a run, as its directory has it; no other file is read for it.
 
-    Its controller is not needed: another one stands for one of an installed package that is not installed here.
+    Its controller is not needed: another one replaces that of a package that is not installed here.
 
     Raises:
         InputError: it is missing or malformed.
@@ -147,7 +147,7 @@ def _unlisted(directory: Path, summary: Mapping[str, Any]) -> list[str]:
 def _differences(
     summary: Mapping[str, Any], scenario: Scenario, log: FlightLog, findings: Sequence[Finding]
 ) -> Iterator[str]:
-    """What a summary says otherwise than the run's scenario and tables do."""
+    """Where a summary differs from the run's scenario and tables."""
     whole = log.control.t.size == scenario.periods
     stated = {
         "scenario": scenario.name,
@@ -157,7 +157,7 @@ def _differences(
     }
     for key, value in stated.items():
         if key in summary and summary[key] != value:
-            yield f"{key} is recorded as {summary[key]!r:.80}, and the run's files say {value!r:.80}"
+            yield f"{key} is recorded as {summary[key]!r:.80}, and the run's files give {value!r:.80}"
     if summary["status"] == "completed" and not whole:
         yield f"status is recorded as 'completed', and {log.control.t.size} of {scenario.periods} periods were flown"
     entries = summary["constraints"]
@@ -184,13 +184,13 @@ _DEMANDS: Final = (
     "signal", "terms", "shape", "radius", "unit", "lower", "upper", "tolerance", "tolerance_sampled", "required",
     "start", "stop",
 )  # fmt: skip
-"""What the scenario says of a constraint."""
+"""The scenario's fields of a constraint."""
 
 
 def _constraint_differences(
     entry: Mapping[str, Any], finding: Finding, scenario: Scenario, log: FlightLog
 ) -> Iterator[str]:
-    """What a summary says of one constraint otherwise than the tables do."""
+    """Where a summary differs from the tables in one constraint."""
     again = rundir.limit_to_json(finding)
     recorded = {"terms": None, "shape": None, "radius": None, **entry}
     for key in _DEMANDS:
@@ -218,7 +218,7 @@ def _constraint_differences(
 def _time_beyond(finding: Finding, scenario: Scenario, log: FlightLog) -> tuple[float, float]:
     """The least and the most time beyond a bound and its tolerance that the tables leave possible [s].
 
-    Rows at the log rate stand for one physics step each at least, and the last of them may come before the end.
+    Rows at the log rate cover one physics step each at least, and the last of them may come before the end.
     """
     signal, limit, seen = finding.limit.source, finding.limit, finding.time_violated
     row = 1.0 / scenario.log_rate if scenario.plant_stride > 1 else 0.0
@@ -239,7 +239,7 @@ def _is_close(recorded: float | None, again: float | None, rounding: float) -> b
     return math.isclose(recorded, again, rel_tol=rounding, abs_tol=rounding)
 
 
-def _said(directory: Path, differing: Sequence[str]) -> FileError:
-    shown = "; ".join(differing[:MOST_SAID])
-    more = f"; and {len(differing) - MOST_SAID} more" if len(differing) > MOST_SAID else ""
+def _contradiction(directory: Path, differing: Sequence[str]) -> FileError:
+    shown = "; ".join(differing[:MOST_REPORTED])
+    more = f"; and {len(differing) - MOST_REPORTED} more" if len(differing) > MOST_REPORTED else ""
     return FileError(directory, f"is not as it was written: {printable(shown)}{more}")

@@ -59,7 +59,7 @@ def closed_loop(
         controller: see `scenarios.build.build_controller`.
         reference: (K + N, 4), or an object; see `scenarios.courses.make`.
         navigation: see `scenarios.parts.navigation.build_navigation`.
-        recorded: whether all periods are kept.
+        recorded: whether all periods are recorded.
     """
     motion = build_motion(scenario, vehicle)
     return ClosedLoop(
@@ -104,7 +104,7 @@ def fly_once(
         plant: see `closed_loop`, as the others.
         controller: what flies it.
         reference: (K + N, 4).
-        navigation: what tells the controller the state.
+        navigation: gives the controller the state.
         progress: called with the number of periods flown, after each.
     """
     for event in scenario.events:
@@ -119,7 +119,7 @@ def fly_once(
 class StartedFlight:
     """A flight that is flown period by period: everything built and checked, nothing flown yet.
 
-    What happens on the way comes from the scenario's events, and from `apply`.  A period depends on these and on the
+    What happens in flight comes from the scenario's events, and from `apply`.  A period depends on these and on the
     seed alone, never on a clock: the scenario of `flight` flies to the same bits.  Linear algebra is held to one
     thread in each step.  It is for one thread at a time, but for `successor`; it owns native memory: `close` it, or use
     it as a context manager.
@@ -342,10 +342,10 @@ def start(
 
     Args:
         scenario: what is flown.
-        law: who flies it, instead of what is built from the scenario's `controller`.
+        law: flies it, instead of what is built from the scenario's `controller`.
         forces: what acts on it, instead of what is built from the scenario's `forces`.
         live: whether anything may happen in it that can happen to its vehicle; else what its scenario's events are of.
-        recorded: whether all periods are kept, for `StartedFlight.flight`: some 10 kB each.
+        recorded: whether all periods are recorded, for `StartedFlight.flight`: some 10 kB each.
 
     Raises:
         InputError: something cannot be built.
@@ -367,7 +367,7 @@ def fly_scenario(
     Args:
         scenario: what is flown.
         progress: called with (what, done, total).
-        law: who flies it, instead of what is built from the scenario's `controller`.
+        law: flies it, instead of what is built from the scenario's `controller`.
         forces: what acts on it, instead of what is built from the scenario's `forces`.
     """
     with start(scenario, law, forces) as started:

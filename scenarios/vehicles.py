@@ -131,7 +131,7 @@ def first_scenario(vehicle: str | Path, *, course: str = "hover", controller: st
         controller: robust, or lqr, pid, geometric with their own defaults.
 
     Returns:
-        The `scenario` to fly; `to_toml()`, its file, says of each number where it comes from; `notes` sums that up.
+        The `scenario` to fly; `to_toml()`, its file, gives the source of each number; `notes` sums that up.
 
     Raises:
         InputError: there is no such vehicle, course or controller, or hover leaves nothing to control the vehicle with.

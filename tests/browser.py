@@ -10,11 +10,11 @@ from pathlib import Path
 import pytest
 
 ADVICE = ("GL Driver Message", "willReadFrequently")
-"""What Chromium says of the speed of plotly.js without a graphics card; a page cannot mend it."""
+"""Chromium's advice on the speed of plotly.js without a graphics card; a page cannot mend it."""
 
 
 def open_page(page: Path, profile: Path) -> tuple[str, list[str]]:
-    """The page as headless Chromium builds it, and what its console said."""
+    """The page as headless Chromium builds it, and what its console printed."""
     browser = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
     if browser is None:
         pytest.skip("no Chromium here: install the package 'chromium' to open the page in a browser")
@@ -26,5 +26,5 @@ def open_page(page: Path, profile: Path) -> tuple[str, list[str]]:
     ]
     environment = {**os.environ, "LC_ALL": "C.UTF-8"}
     done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=True, env=environment)
-    said = [line for line in done.stderr.splitlines() if "CONSOLE" in line]
-    return done.stdout, [line for line in said if not any(advice in line for advice in ADVICE)]
+    output = [line for line in done.stderr.splitlines() if "CONSOLE" in line]
+    return done.stdout, [line for line in output if not any(advice in line for advice in ADVICE)]

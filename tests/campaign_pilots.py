@@ -1,4 +1,4 @@
-"""A pilot that needs no simulator and tells who flew what, and a look at who is still there."""
+"""A pilot that needs no simulator and records which process flew what, and a list of the processes left."""
 
 from __future__ import annotations
 

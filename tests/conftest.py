@@ -26,7 +26,7 @@ from scenarios.loading import load_scenario
 from scenarios.parts.vehicle import build_vehicle
 from scenarios.run import fly_scenario, run_scenario
 
-# What is compiled is kept, also where the environment asks for the contrary: the workers, and all processes that tests
+# Compiled code is cached, whatever the environment sets: the workers, and all processes that tests
 # start, would compile the same modules again.  `make clean` removes it.
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 sys.dont_write_bytecode = False

@@ -1,4 +1,4 @@
-"""An exported controller, compiled for this machine, asked period by period."""
+"""An exported controller, compiled for this machine, queried period by period."""
 
 from __future__ import annotations
 
@@ -33,16 +33,16 @@ class Host:
         self.library.quadsim_shim_step.restype = None
         self.horizon = scenario.controller.horizon
         self.memory = ctypes.create_string_buffer(self.library.quadsim_shim_size())
-        self.asked, self.answers = np.zeros(18 + 4 * self.horizon), np.zeros(18 + 4 * self.horizon)
-        self.asked[-2:] = 1.0
+        self.inputs, self.answers = np.zeros(18 + 4 * self.horizon), np.zeros(18 + 4 * self.horizon)
+        self.inputs[-2:] = 1.0
 
     def reset(self, speeds: Array) -> None:
         start = np.array(speeds, float)
         self.library.quadsim_shim_reset(self.memory, ctypes.c_void_p(start.ctypes.data))
 
     def step(self, state: Array, reference: Array, acting: Array) -> Reply:
-        self.asked[:12], self.asked[12:16], self.asked[16:-2] = state, acting, reference.ravel()
-        pointers = (ctypes.c_void_p(array.ctypes.data) for array in (self.asked, self.answers))
+        self.inputs[:12], self.inputs[12:16], self.inputs[16:-2] = state, acting, reference.ravel()
+        pointers = (ctypes.c_void_p(array.ctypes.data) for array in (self.inputs, self.answers))
         self.library.quadsim_shim_step(self.memory, *pointers)
         found = self.answers.copy()
         return Reply(int(found[0]), int(found[1]), found[4:8], found[8 : 8 + 4 * self.horizon].reshape(-1, 4))

@@ -119,7 +119,7 @@ class Consequence:
         injection: what was done.
         reason: why the flight ended early; None when it did not.
         finite: whether everything that the plant was given was finite.
-        within: whether it kept the bounds on speeds and steps.
+        within: whether it held the bounds on speeds and steps.
         fallback: deepest level.
         furthest: largest distance from the flight without the fault [m].
         back: time from the fault's end to the last instant out of `NEAR` [s]; 0 for none.
@@ -135,12 +135,12 @@ class Consequence:
 
     @property
     def harmless(self) -> bool:
-        """Whether the contract was kept."""
+        """Whether the contract held."""
         return self.reason is None and self.finite and self.within and self.back <= SOON
 
 
 def draw(count: int, *, seed: int = 0, earliest: float = 1.0, latest: float = LAST - AFTER - 1.0) -> list[Injection]:
-    """Faults of all kinds, in turns in a random order, at so many random instants; each for both controllers.
+    """Faults of all kinds, in turns in a random order, at this many random instants; each for both controllers.
 
     The robust controller meets each kind under a disturbance first, then in all conditions in turns.
     """
@@ -159,7 +159,7 @@ def draw(count: int, *, seed: int = 0, earliest: float = 1.0, latest: float = LA
 
 
 def draw_flight(controller: str, condition: str, count: int, *, seed: int) -> list[Injection]:
-    """So many different faults for one flight, over all of it, each after what came of the one before."""
+    """This many different faults for one flight, over all of it, each after what came of the one before."""
     rng = np.random.default_rng(seed)
     kinds = faults()
     chosen = [kinds[i] for i in rng.permutation(len(kinds))[:count]]
@@ -228,7 +228,7 @@ def judge(given: Array) -> tuple[bool, bool]:
 
 @contextlib.contextmanager
 def recorded(plant: Plant) -> Iterator[list[Array]]:
-    """Everything (4,) that the plant is told to hold, before it looks at it."""
+    """Everything (4,) that the plant is commanded to hold, before it looks at it."""
     given: list[Array] = []
     real = plant.advance
 

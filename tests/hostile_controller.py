@@ -152,17 +152,17 @@ def takes_memory_at_once() -> Any:
 
 @_kind("memory")
 def takes_memory_in_small_pieces() -> None:
-    kept = []
+    held = []
     while True:
-        kept.append(bytearray(1 << 20))
+        held.append(bytearray(1 << 20))
 
 
 @_kind("memory")
 def takes_shared_memory() -> None:
-    kept = []
+    held = []
     while True:
-        kept.append(mmap.mmap(-1, 1 << 26))
-        kept[-1][::4096] = bytes(len(kept[-1]) // 4096)
+        held.append(mmap.mmap(-1, 1 << 26))
+        held[-1][::4096] = bytes(len(held[-1]) // 4096)
 
 
 @_kind("memory")

@@ -17,7 +17,7 @@ def counts_of(script: str, *arguments: str) -> dict[str, int]:
     """What a script below `tests/` counts, given on its last line as JSON; it runs in an empty directory.
 
     Raises:
-        RuntimeError: it failed; what it said.
+        RuntimeError: it failed; what it printed.
     """
     with tempfile.TemporaryDirectory() as place:
         scratch = Path(place).resolve() / "scratch"

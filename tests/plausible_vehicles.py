@@ -21,10 +21,10 @@ QUICKEST, SLOWEST = 0.01, 0.12
 
 
 def plausible_vehicles(count: int, seed: int) -> list[Vehicle]:
-    """So many vehicles, spread evenly over the logarithm of mass, thrust to weight and lag (a Latin hypercube)."""
+    """Vehicles, spread evenly over the logarithm of mass, thrust to weight and lag (a Latin hypercube)."""
     rng = np.random.default_rng(seed)
-    places = np.stack([(rng.permutation(count) + rng.random(count)) / count for _ in range(3)], axis=1)
-    return [_vehicle(f"random-{i + 1:02d}", place, rng, cross=i % 2 == 0) for i, place in enumerate(places.tolist())]
+    positions = np.stack([(rng.permutation(count) + rng.random(count)) / count for _ in range(3)], axis=1)
+    return [_vehicle(f"random-{i + 1:02d}", place, rng, cross=i % 2 == 0) for i, place in enumerate(positions.tolist())]
 
 
 def _vehicle(name: str, place: list[float], rng: np.random.Generator, *, cross: bool) -> Vehicle:

@@ -60,13 +60,13 @@ class Flown:
         rows: of its flights.
         seconds: that it took.
         left: processes that outlived it.
-        said: on stderr.
+        output: on stderr.
     """
 
     rows: list[Row]
     seconds: float
     left: int
-    said: str
+    output: str
 
 
 def write(directory: Path, kinds: Sequence[str], *, armed: bool) -> Path:
@@ -107,7 +107,7 @@ def fly(directory: Path, kinds: Sequence[str], *, armed: bool, workers: int = 2)
     json.loads(ran.stdout)  # whatever controllers print, this is the campaign's answer alone
     clock.sleep(0.2)
     rows = pq.read_table(directory / "out" / FLIGHTS_FILE).to_pylist()
-    return Flown(rows=rows, seconds=seconds, left=_marked(mark), said=ran.stderr.decode())
+    return Flown(rows=rows, seconds=seconds, left=_marked(mark), output=ran.stderr.decode())
 
 
 def _marked(mark: str) -> int:
@@ -122,8 +122,8 @@ def _marked(mark: str) -> int:
 def planned(flights: int) -> list[str]:
     """The kind of each flight: every kind of harm once, where there are so many flights, calm ones evenly between."""
     kinds = sorted(KINDS)[:flights]
-    places = {round((i + 0.5) * flights / len(kinds) - 0.5): kind for i, kind in enumerate(kinds)}
-    return [places.get(flight, "calm") for flight in range(flights)]
+    positions = {round((i + 0.5) * flights / len(kinds) - 0.5): kind for i, kind in enumerate(kinds)}
+    return [positions.get(flight, "calm") for flight in range(flights)]
 
 
 def measure(flights: int = 60, *, workers: int = 2) -> dict[str, int]:

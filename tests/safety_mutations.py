@@ -1,4 +1,4 @@
-"""Run and campaign directories as a hostile or broken world leaves them, and what every command says of them.
+"""Run and campaign directories after tampering or damage, and what every command reports of them.
 
 Nothing may end in a traceback, whatever a file holds, and `quadsim check` must never let a false verdict pass.
 
@@ -127,12 +127,12 @@ def put_table(table: pa.Table, path: Path) -> None:
 # --- summaries -----------------------------------------------------------------------------------------------------
 
 
-def places(data: Any, path: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
+def paths_in(data: Any, path: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
     """The paths of all values in nested tables and lists."""
     entries = data.items() if isinstance(data, dict) else enumerate(data) if isinstance(data, list) else ()
     for key, value in entries:
         yield (*path, key)
-        yield from places(value, (*path, key))
+        yield from paths_in(value, (*path, key))
 
 
 def at(data: Any, path: tuple[Any, ...]) -> Any:
@@ -146,7 +146,7 @@ def mutated_json(data: Any, rng: random.Random) -> Any:
     """The same with one to three values deleted, replaced, nudged, repeated or swapped."""
     data = copy.deepcopy(data)
     for _ in range(rng.choice((1, 1, 1, 2, 3))):
-        paths = list(places(data))
+        paths = list(paths_in(data))
         if not paths:
             return rng.choice(JUNK)
         path = rng.choice(paths)
@@ -257,14 +257,14 @@ def mutate_table_of_run(directory: Path, rng: random.Random) -> str:
     return f"{way} of {name}"
 
 
-def is_false(told: dict[str, Any], truth: dict[str, Any]) -> bool:
-    """Whether a summary that passed says better things of a flight than are so."""
-    if not truth["satisfied"] or any(told.get(key, truth[key]) != truth[key] for key in VERDICT):
+def is_false(claimed: dict[str, Any], truth: dict[str, Any]) -> bool:
+    """Whether a summary that passed reports a flight as better than it was."""
+    if not truth["satisfied"] or any(claimed.get(key, truth[key]) != truth[key] for key in VERDICT):
         return True
-    if [entry["name"] for entry in told["constraints"]] != [entry["name"] for entry in truth["constraints"]]:
+    if [entry["name"] for entry in claimed["constraints"]] != [entry["name"] for entry in truth["constraints"]]:
         return True
     bounds = ("signal", "unit", "lower", "upper", "tolerance", "tolerance_sampled", "required", "start", "stop")
-    for entry, true in zip(told["constraints"], truth["constraints"], strict=True):
+    for entry, true in zip(claimed["constraints"], truth["constraints"], strict=True):
         milder = (entry["worst_margin"] or 0.0) > (true["worst_margin"] or 0.0) + 1e-5
         if milder or any(entry[key] != true[key] for key in (*bounds, "satisfied")):
             return True
@@ -272,7 +272,7 @@ def is_false(told: dict[str, Any], truth: dict[str, Any]) -> bool:
 
 
 def measure_summaries(count: int, seed: int = 0) -> dict[str, int]:
-    """So many runs, most with a mutated `summary.json`, some with a mutated table, each before several commands.
+    """Check many runs, most with a mutated `summary.json`, some with a mutated table, each before several commands.
 
     Returns:
         Counts of `cases`, of those `refused`, of `tracebacks`, `false_verdicts` and `wrong_answers` (no clear message).
@@ -430,9 +430,9 @@ def mutate_campaign(directory: Path, rng: random.Random) -> str:
     else:
         put(path, mutated_text(path.read_bytes(), rng) if name not in TABLES else _flipped(path, rng))
     if rng.random() < 0.6 and name != "manifest.json" and is_plain_file(path) and is_plain_file(manifest):
-        told = json.loads(manifest.read_text())
-        told["files"][name] = "sha256:" + hashlib.sha256(path.read_bytes()).hexdigest()
-        put(manifest, json.dumps(told, indent=2).encode())
+        claimed = json.loads(manifest.read_text())
+        claimed["files"][name] = "sha256:" + hashlib.sha256(path.read_bytes()).hexdigest()
+        put(manifest, json.dumps(claimed, indent=2).encode())
     return f"{kind} of {name}"
 
 
@@ -520,8 +520,8 @@ def _judge(tally: Tally, case: int, command: str, answer: Answer, given: bytes) 
         tally.wrong_answers += 1
     else:
         return
-    told = f"case {case}, {command}: status {answer.status}\n{answer.err[-1500:]}\ngiven: {given[:300]!r}"
-    tally.failures.append(told)
+    failure = f"case {case}, {command}: status {answer.status}\n{answer.err[-1500:]}\ngiven: {given[:300]!r}"
+    tally.failures.append(failure)
 
 
 @contextlib.contextmanager

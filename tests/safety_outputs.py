@@ -1,4 +1,4 @@
-"""Random trees, random places, every command that writes: nothing that is not ours may change by one byte."""
+"""Random trees, random paths, every command that writes: no foreign file may change by one byte."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ NAMES: Final = (
     *("keep", "notes.md", "thesis.txt", ".draft.partial", ".quadsim-0.partial", ".lock", ".quadsim.json", "parts"),
     *("index.html", "summary.json", "scenario.toml", "campaign.toml", "manifest.json", "flight.mp4", "figures"),
 )
-PLACES: Final = st.lists(
+LOCATIONS: Final = st.lists(
     st.sampled_from(
         [name for name in (*NAMES, "..", ".", "nope", "", "p", "p", "run", "run") if "partial" not in name]
     ),
@@ -70,7 +70,7 @@ ENTRIES: Final = st.builds(
     Entry,
     st.lists(st.sampled_from(NAMES), min_size=1, max_size=3).map(tuple),
     st.sampled_from(["file", "file", "folder", "link", "fifo", "run", "comparison", "campaign", "junit", "dead"]),
-    st.one_of(st.sampled_from(["", "mine", "<meta name='generator' content='quadsim comparison'>"]), PLACES),
+    st.one_of(st.sampled_from(["", "mine", "<meta name='generator' content='quadsim comparison'>"]), LOCATIONS),
 )
 SAVED: Final = st.builds(Entry, st.just(()), st.sampled_from(["file", "folder", "into"]), st.just("mine"))
 """What somebody saves at the target while the command runs."""
@@ -94,8 +94,8 @@ class Inputs:
             ["compare", self["run"], "--out", self["comparison"]],
             ["campaign", self["small.toml"], "--out", self["campaign"], "--workers", "1"],
         ):
-            status, said = call(command)
-            assert status == 0, said
+            status, message = call(command)
+            assert status == 0, message
 
     def most(self, writer: str) -> int:
         """How often a writer may go all the way."""
@@ -206,7 +206,7 @@ def state(base: Path) -> dict[str, str]:
 
 
 def call(command: Sequence[str]) -> tuple[int, str]:
-    """Run a command line in this process: its exit status, and what it said on stderr."""
+    """Run a command line in this process: its exit status, and what it printed on stderr."""
     out = io.TextIOWrapper(io.BytesIO(), encoding="utf-8")
     err = io.TextIOWrapper(io.BytesIO(), encoding="utf-8", errors="backslashreplace")
     with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
@@ -273,19 +273,19 @@ def check_case(
         whole = late
 
     with saved_meanwhile(meanwhile, target, note):
-        status, said = call(command)
+        status, message = call(command)
     after = state(base)
     inputs.counted["cases"] += 1
     inputs.counted[f"{writer}: {'done' if status != 2 else 'refused'}"] += 1
-    assert status in (0, 1, 2), said
-    assert "Traceback" not in said
+    assert status in (0, 1, 2), message
+    assert "Traceback" not in message
     changed = {path for path, what in before.items() if after.get(path) != what}
     empty = {str(target)} if stat.S_ISDIR(target.lstat().st_mode if os.path.lexists(target) else 0) else set()
-    assert not changed - empty, f"{sorted(changed - empty)} changed; {said}"
+    assert not changed - empty, f"{sorted(changed - empty)} changed; {message}"
     if status == 2:
-        assert said.count("\n") == 1, said
-        assert said.startswith("quadsim: "), said
-        assert after == whole, f"left behind or lost: {sorted(after.items() ^ whole.items())}; {said}"
+        assert message.count("\n") == 1, message
+        assert message.startswith("quadsim: "), message
+        assert after == whole, f"left behind or lost: {sorted(after.items() ^ whole.items())}; {message}"
     else:
         assert not [path for path in after if ".quadsim-" in path and path not in whole], "a staging directory stays"
 
@@ -305,7 +305,7 @@ def attack(scratch: Path, count: int, number: int) -> dict[str, int]:
         phases=[Phase.generate, Phase.shrink],
         suppress_health_check=list(HealthCheck),
     )
-    @given(st.lists(ENTRIES, max_size=6), st.sampled_from(writers), PLACES, st.none() | SAVED, st.booleans())
+    @given(st.lists(ENTRIES, max_size=6), st.sampled_from(writers), LOCATIONS, st.none() | SAVED, st.booleans())
     def cases(tree: list[Entry], writer: str, place: str, meanwhile: Entry | None, absolute: bool) -> None:
         out = f"{scratch / 'case'}/{place}" if absolute else place
         try:
@@ -325,7 +325,7 @@ def measure(count: int, number: int = 0) -> dict[str, int]:
     """Go through so many cases as an ordinary user, where this one is root; how many were refused and done.
 
     Raises:
-        RuntimeError: a case failed; it is told.
+        RuntimeError: a case failed; it is reported.
     """
     return counts_of(Path(__file__).name, str(count), str(number))
 
@@ -370,8 +370,8 @@ def measure_kills(count: int, number: int = 0) -> dict[str, int]:
             ["run", "hover", *SHORT, "--out", "run"],
             ["campaign", "small.toml", "--out", "campaign", "--resume"],
         ):
-            status, said = call(command)
-            assert status == 0, said
+            status, message = call(command)
+            assert status == 0, message
         os.chdir(ROOT)
         after = state(base)
         assert not [path for path in after if ".quadsim-" in path], "leftovers stay"

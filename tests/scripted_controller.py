@@ -1,4 +1,4 @@
-"""A controller that answers as it is told to, the guard around it, and the paper's model for both to fly by."""
+"""A controller that answers as instructed, the guard around it, and the paper's model for both to fly by."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def pressed() -> Trim:
 
 
 def advance(state: Array, speeds: Array, trim: Trim | None = None) -> Array:
-    """The state (12,) a period later, undisturbed unless told otherwise."""
+    """The state (12,) a period later, by default undisturbed."""
     return advance_from(model(), state, speeds, trim or level())
 
 
@@ -111,7 +111,7 @@ def failing(periods: Sequence[int], **answer: Any) -> dict[int, dict[str, Any] |
 
 
 def following(guarded: Guarded, periods: int) -> list[Command]:
-    """Commands while the vehicle moves as the model says."""
+    """Commands while the vehicle moves as the model predicts."""
     state, commands = np.zeros(12), []
     for _ in range(periods):
         commands.append(call(guarded, state))

@@ -3,7 +3,7 @@
     python tests/soak.py --minutes 60
 
 The full robust controller flies the paper's course lap after lap without ever being reset, with a vehicle heavier than
-it believes, so that there is always something to estimate.  No log is kept, which would grow by design.
+it believes, so that there is always something to estimate.  No log is recorded, which would grow by design.
 """
 
 from __future__ import annotations
@@ -129,7 +129,7 @@ def _fly_lap(
 
 
 def resident() -> float:
-    """Memory of this process that is in use [bytes]; Linux alone says."""
+    """Memory of this process that is in use [bytes]; Linux only."""
     return float(MEMORY.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
 
 
@@ -150,7 +150,7 @@ def main() -> int:
     print(f"memory: {found.memory[0] / 2**20:.1f} MiB after the first lap, {100.0 * found.growth:+.2f} % at the end")
     print(f"median step: {first:.3f} ms in the first tenth, {last:.3f} ms in the last, {100.0 * found.drift:+.1f} %")
     flat = found.growth <= GROWTH and found.drift <= options.drift and found.failures == 0
-    print("flat" if flat else "NOT FLAT", f"(asked: memory {100.0 * GROWTH:g} %, step {100.0 * options.drift:g} %)")
+    print("flat" if flat else "NOT FLAT", f"(required: memory {100.0 * GROWTH:g} %, step {100.0 * options.drift:g} %)")
     return 0 if flat else 1
 
 

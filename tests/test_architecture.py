@@ -112,7 +112,7 @@ def declared() -> set[str]:
     return {IMPORT_NAMES.get(name, name.replace("-", "_")) for name in names}
 
 
-def test_imports_are_told_apart() -> None:
+def test_imports_are_distinguished() -> None:
     source = (
         "import a.b\nfrom typing import TYPE_CHECKING\nif TYPE_CHECKING:\n    import c\nelse:\n    pass\n"
         "class K:\n    import d\n    def f(self):\n        from quadsim import state, __version__\n"
@@ -260,7 +260,7 @@ def test_one_package_alone_removes_and_replaces_files() -> None:
         "p.replace",
     ]
     found = {name: removals(path.read_text()) for name, path in modules().items() if not name.startswith(OUTPUTS)}
-    asked_for = {"files.remove", "self._files.remove", "scenario.replace"}  # of `Growing`, and of a scenario's fields
-    assert {name: calls for name, calls in found.items() if set(calls) - asked_for} == {}
+    allowed = {"files.remove", "self._files.remove", "scenario.replace"}  # of `Growing`, and of a scenario's fields
+    assert {name: calls for name, calls in found.items() if set(calls) - allowed} == {}
     trees = {name: removals(path.read_text()).count("shutil.rmtree") for name, path in modules().items()}
     assert {name: count for name, count in trees.items() if count} == {f"{OUTPUTS}.staging": 1}

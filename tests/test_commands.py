@@ -61,7 +61,7 @@ def arguments_of(line: str) -> list[str]:
 
 
 def promised_file(options: Namespace) -> Path | None:
-    """What a command writes, as the documents tell it."""
+    """What a command writes, as the documents show it."""
     match options.command:
         case "run":
             return Path(options.out or f"runs/{options.scenario}") / "summary.json"
@@ -156,10 +156,10 @@ def test_documented_make_targets_exist() -> None:
     }
     named = blocks | set(re.findall(r"`make ([a-z-]+)", DOCUMENTS))
     assert {"demo", "test", "setup", "check", "numbers"} <= named
-    said = subprocess.run(
+    output = subprocess.run(
         ["make", "--no-print-directory", "help"], cwd=ROOT, capture_output=True, text=True, check=True
     )
-    offered = re.findall(r"^make ([\w-]+) +\S", said.stdout, re.MULTILINE)
+    offered = re.findall(r"^make ([\w-]+) +\S", output.stdout, re.MULTILINE)
     phony = re.search(r"^\.PHONY: (.+)$", (ROOT / "Makefile").read_text(), re.MULTILINE)
     assert phony is not None
     assert sorted(offered) == sorted(phony[1].split())

@@ -1,4 +1,4 @@
-"""The worked example: short, flown as the README says, and by entry point."""
+"""The worked example: short, flown as in the README, and by entry point."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def test_an_installed_one_flies_by_the_name_of_its_entry_point(monkeypatch: pyte
 
 
 def test_it_is_of_thirty_lines() -> None:
-    """Of code: documentation and imports aside."""
+    """Of code, without documentation and imports."""
     tree = ast.parse((EXAMPLES / "my_controller.py").read_text(encoding="utf-8"))
     (law,) = (node for node in tree.body if isinstance(node, ast.ClassDef))
     assert law.end_lineno is not None

@@ -89,8 +89,8 @@ def test_source_archive_can_be_built_and_tested_from(archives: Archives) -> None
 
 def test_wheel_flies_alone(installed: Path, tmp_path: Path) -> None:
     code = "import quadsim, mpc, scenarios; print(quadsim.__file__, mpc.__file__, scenarios.__file__)"
-    places = run_alone([installed / "python", "-c", code], tmp_path).split()
-    assert all(Path(place).is_relative_to(installed.parent) for place in places), places
+    found = run_alone([installed / "python", "-c", code], tmp_path).split()
+    assert all(Path(place).is_relative_to(installed.parent) for place in found), found
 
     assert "paper-constrained" in run_alone([installed / "quadsim", "list"], tmp_path)
 
@@ -105,14 +105,14 @@ def test_wheel_flies_alone(installed: Path, tmp_path: Path) -> None:
 
 
 def test_version_is_the_same_everywhere(archives: Archives) -> None:
-    said = subprocess.run(
+    printed = subprocess.run(
         [sys.executable, "-m", "scenarios.cli", "--version"], cwd=ROOT, capture_output=True, text=True
     )
     changes = re.search(r"^## \[(.+?)\]", (ROOT / "CHANGELOG.md").read_text(), re.MULTILINE)
     citation = re.search(r"^version: (.+)$", (ROOT / "CITATION.cff").read_text(), re.MULTILINE)
     assert changes is not None
     assert citation is not None
-    assert said.stdout.strip() == f"quadsim {__version__}"
+    assert printed.stdout.strip() == f"quadsim {__version__}"
     assert archives.wheel.name == f"quadsim-{__version__}-py3-none-any.whl"
     assert (changes[1], citation[1]) == (__version__, __version__)
 

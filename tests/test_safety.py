@@ -5,7 +5,7 @@ from __future__ import annotations
 import safety_outputs
 
 
-def test_nothing_that_is_not_ours_changes_wherever_a_command_is_told_to_write() -> None:
+def test_foreign_files_never_change_wherever_a_command_writes() -> None:
     counted = safety_outputs.measure(60, number=1)
     assert counted["cases"] >= 50
     assert counted["done"] >= 10

@@ -54,7 +54,7 @@ def error_of(scenario: Scenario) -> float:
 
 @dataclass
 class Formula:
-    """An engine that flies nothing: `violated` says of which scenarios a constraint does not hold.
+    """An engine that flies nothing: `violated` decides for which scenarios a constraint does not hold.
 
     In order or backwards, and stopped by an exception after so many flights.
     """

@@ -19,7 +19,7 @@ class Target(NamedTuple):
     """A target, beside what was measured."""
 
     what: str  # the quantity
-    asked: str  # the target, in words
+    required: str  # the target, in words
     measured: str  # the value, in words
     met: bool  # whether it is within the limit
 
@@ -60,7 +60,7 @@ class Growth:
     whole: bool = True  # whether these are steps that solve the whole QP
     # periods that the candidate left without their optimum, by the N at which it did
     failures: Mapping[int, int] = field(default_factory=dict)
-    dropped: str = ""  # why it went no further; empty for one that went all the way
+    dropped: str = ""  # why it went no further; empty for one that reached the end
 
     @property
     def label(self) -> str:
@@ -93,14 +93,14 @@ class SolverBench:
     scenario: str  # whose flight
     horizon: int  # N of that flight
     deadline_ms: float  # its control period [ms]
-    asked: int  # periods asked, K
+    asked: int  # periods timed, K
     flown: int  # periods of the flight
     candidates: tuple[CandidateResult, ...]  # the default controller first
     # (K,) whole step of the gain that the controller would be without its constraints [ms]; None where there is none
     gain_ms: Array | None
     left_out: Mapping[str, str]  # solvers that did not take part, and why
     growth: tuple[Growth, ...]  # of each candidate; empty where that was not measured
-    growth_asked: int  # periods asked at each horizon
+    growth_asked: int  # periods timed at each horizon
     stages: tuple[StageLength, ...]  # of the whole QP
     reference_kkt: float  # worst KKT residual of the optimum that first inputs are compared with
     versions: Mapping[str, str]  # of what the numbers depend on
@@ -188,7 +188,7 @@ class RenderProfile:
         return 1e3 * (self.wall_s - self.start_s) / self.frames
 
     def film_s(self, duration: float) -> float:
-        """Wall time of a film of so many seconds [s], from the two numbers above."""
+        """Wall time of a film of this many seconds [s], from the two numbers above."""
         return self.start_s + 1e-3 * self.frame_ms * math.ceil(duration * self.fps)
 
     def to_json(self) -> dict[str, Any]:

@@ -44,7 +44,7 @@ class CampaignRun:
     wall_s: float  # from the first process started to the last answer [s]
     busy_s: float  # what the flights took, summed [s]
     concluding_s: float  # final tables, estimates and report [s]
-    memory_mb: float | None  # largest proportional set size of a worker [MB]; None where the system does not tell
+    memory_mb: float | None  # largest proportional set size of a worker [MB]; None where the system does not report it
     bytes: int  # size of `flights.parquet`
 
     @property
@@ -104,7 +104,7 @@ class CampaignProfile:
 
 
 def campaign_tables(profile: CampaignProfile) -> list[Grid]:
-    """The rounds, the growth, and what was asked."""
+    """The rounds, the growth, and the targets."""
     rounds = Grid(
         key="campaign",
         title="What a campaign costs",
@@ -148,7 +148,7 @@ def _growth(profile: CampaignProfile) -> Grid:
 
 
 def campaign_targets(profile: CampaignProfile) -> list[Target]:
-    """What was asked of throughput, scaling, overhead and memory."""
+    """The targets for throughput, scaling, overhead and memory."""
     hour = profile.per_core_hour * profile.duration / 60.0
     memory = math.nan if profile.memory_mb is None else profile.memory_mb
     throughput = f"60 s flights of {profile.scenario} per core-hour, the median round"
@@ -171,10 +171,10 @@ def bench_campaign(
     sizes: Sequence[int] = (10, 100, 1000, 10000),
     progress: Progress = silent,
 ) -> CampaignProfile:
-    """Fly campaigns of so many flights per worker by one worker and by two, in turns, and then ever larger ones by two.
+    """Fly campaigns of `flights` per worker by one worker and by two, in turns, and then ever larger ones by two.
 
     Raises:
-        ParameterError: nothing is asked for.
+        ParameterError: nothing is requested.
     """
     for name, value in (("flights", flights), ("rounds", rounds), ("sizes", min(sizes, default=1))):
         if value < 1:
@@ -226,7 +226,7 @@ def _timed(scenario: Scenario, flights: int, workers: int, *, report: bool) -> C
 
 
 class _Memory:
-    """The largest proportional set size [MB] that a worker was seen to have; None where the system does not tell."""
+    """The largest proportional set size [MB] of any worker; None where the system does not report it."""
 
     def __init__(self) -> None:
         self.largest: float | None = None
@@ -241,7 +241,7 @@ class _Memory:
 
 
 def _proportional(pid: int | None) -> float | None:
-    """A process's share of the memory that it uses [MB]; None where the system does not tell."""
+    """A process's share of the memory that it uses [MB]; None where the system does not report it."""
     try:
         text = Path(f"/proc/{pid}/smaps_rollup").read_text(encoding="ascii")
     except OSError:

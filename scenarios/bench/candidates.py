@@ -67,14 +67,14 @@ class _Witnessed:
 
 
 class StepCandidate:
-    """A constrained controller that is given a flight's queries, and whose solver's answers are kept."""
+    """A constrained controller that is given a flight's queries, and whose solver's answers are recorded."""
 
     def __init__(self, entry: Entry, problem: Problem, queries: Queries) -> None:
         self.entry, self.problem = entry, problem
         whole = QPSolver(entry.solver, problem)
         self._solver = _Witnessed(with_shortcut(problem, whole) if entry.shortcut else whole)
         self.formulation = self._solver.formulation
-        self._asked = QueriedController(ConstrainedMPC(problem, self._solver, shortcut=False), queries)
+        self._queried = QueriedController(ConstrainedMPC(problem, self._solver, shortcut=False), queries)
         self.answers: dict[int, tuple[Command | None, Answer]] = {}
         """What was answered in the first pass, by period: the command, if any, and the solver's answer."""
         self._period: int | None = None
@@ -83,16 +83,16 @@ class StepCandidate:
         """See `scenarios.bench.timing.Candidate.prepare`; keeps what was answered last."""
         self.keep()
         self._period, self._solver.last = period, None
-        self._asked.prepare(period)
+        self._queried.prepare(period)
 
     def answer(self) -> None:
         """See `scenarios.bench.timing.Candidate.answer`."""
-        self._asked.answer()
+        self._queried.answer()
 
     def keep(self) -> None:
         """Keep the last answer, if it is the first to its question."""
         if self._period is not None and self._solver.last is not None:
-            self.answers.setdefault(self._period, (self._asked.command, self._solver.last))
+            self.answers.setdefault(self._period, (self._queried.command, self._solver.last))
 
     def ways(self, periods: Sequence[int]) -> np.ndarray[tuple[int], np.dtype[np.object_]]:
         """The `mpc.solvers.Method` in which each period was answered."""
@@ -102,7 +102,7 @@ class StepCandidate:
     def statuses(self, periods: Sequence[int]) -> tuple[str, ...]:
         """What each period was answered."""
         self.keep()
-        return tuple(self._asked.statuses[period] for period in periods)
+        return tuple(self._queried.statuses[period] for period in periods)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -170,7 +170,7 @@ def _failure(answer: Answer) -> str:
 def time_stages(
     problem: Problem,
     queries: Queries,
-    asked: Sequence[range],
+    timed: Sequence[range],
     race: Callable[..., dict[str, StepTimes]],
     progress: Progress,
 ) -> tuple[StageLength, ...]:
@@ -181,9 +181,9 @@ def time_stages(
     for length in sorted({*STEPS_TRIED, default}):
         candidates[length] = _QPEntrant(Staged(problem, steps_per_stage=length), PiqpMultistage(), query)
     named = {str(steps): candidate for steps, candidate in candidates.items()}
-    laps = race(named, asked, progress=partial(progress, "stages"))
+    laps = race(named, timed, progress=partial(progress, "stages"))
     found_active = candidates[default].active
-    active = np.array([found_active[period] > 0 for segment in asked for period in segment])
+    active = np.array([found_active[period] > 0 for segment in timed for period in segment])
     counted = active if active.any() else np.ones_like(active)
     found = []
     for steps, candidate in candidates.items():

@@ -24,7 +24,7 @@ WIDTH, HEIGHT, FPS = 1280, 720, 30
 def bench_render(
     scenario: Scenario, *, seconds: float = SECONDS, workers: int | None = None, progress: Progress = silent
 ) -> RenderProfile:
-    """Fly the first seconds of a scenario and film them, by one process per usable core, or at most so many.
+    """Fly the first seconds of a scenario and film them, by one process per usable core, or at most `workers`.
 
     Raises:
         ParameterError: an argument is out of range.

@@ -30,7 +30,7 @@ def bench_flight(scenario: Scenario, *, repeats: int = REPEATS, progress: Progre
     """Fly a scenario again and again on one core, in turns with and without clocks around its parts.
 
     Raises:
-        ParameterError: no repeat is asked for.
+        ParameterError: no repeat is requested.
         InputError: the flight does not go to its end.
     """
     if repeats < 1:

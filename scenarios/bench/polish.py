@@ -1,7 +1,7 @@
 """The exact optimum of a QP from an approximate one.
 
 An interior-point method stops short of the optimum: next to a constraint that is hardly active its point is off by as
-much as the square root of the duality gap it was allowed.  But it tells which constraints are active, and with those as
+much as the square root of the duality gap it was allowed.  But it shows which constraints are active, and with those as
 equalities the KKT conditions are linear.  Where their solution violates a constraint that was left out, that one is
 active; where a multiplier has the wrong sign, its constraint is not.  To solve again with what was learnt is the
 primal-dual active set method (Hintermueller, Ito and Kunisch, SIAM J. Optim. 13(3), 2003), a Newton method for the KKT
@@ -44,7 +44,7 @@ def polish(qp: QP, solution: Solution) -> Solution:
 
     Returns:
         The solution with x and all multipliers replaced.  Of a poor start it may not be the optimum:
-        `mpc.qp.kkt_residuals` tells.
+        `mpc.qp.kkt_residuals` shows.
     """
     n, rows = qp.c.size, qp.h_l.size
     P = _dense(qp.P)

@@ -34,12 +34,12 @@ from scenarios.schema.scenario import Scenario
 
 RESULTS_FILE: Final = "bench.json"
 TABLES_FILE: Final = "solvers.md"
-FORMAT: Final = "quadsim bench solvers"  # what `bench.json` says it is
+FORMAT: Final = "quadsim bench solvers"  # the `format` of `bench.json`
 KIND: Final = "bench of solvers"  # what `quadsim.outputs` calls its directory
 
 REPEATS: Final = 3
 HORIZONS: Final = (10, 20, 50, 100, 200)
-GROWTH_STRIDE: Final = 6  # one segment of so many is asked at each horizon and of each form of the QP
+GROWTH_STRIDE: Final = 6  # one segment in this number is timed at each horizon and for each form of the QP
 LONGEST_PASS: Final = 20.0  # a candidate whose first pass takes longer [s] is timed once
 GAIN: Final = "unconstrained gain"  # what the controller would be without its constraints
 PATIENCE: Final = 60.0  # a candidate that takes longer for the questions at one horizon [s] is dropped
@@ -78,7 +78,7 @@ def bench_solvers(
         repeats: how often each question is put, at most.
         horizons: N for the growth; empty for none.
         solvers: names in `SOLVERS`; those that are not installed are left out.
-        stride: one segment of 20 periods of so many is asked; of the growth and the forms, one of six of those.
+        stride: one segment of 20 periods in this number is timed; for growth and forms, one in six of those.
         progress: called with how much is done, of how much.
 
     Raises:
@@ -96,7 +96,7 @@ def bench_solvers(
     few = segments(flight.log.control.t.size, stride * GROWTH_STRIDE)
     with flight_between(scenario, flight.vehicle) as between:
         race = partial(time_in_turns, between=between, repeats=repeats, rng=rng)
-        candidates, own, gain, asked, reference_kkt = _time_candidates(
+        candidates, own, gain, queried, reference_kkt = _time_candidates(
             flight, problem, taking_part, race, stride=stride, progress=progress
         )
         growth = _growth(flight, problem, taking_part, race, horizons, few, own, progress)
@@ -106,7 +106,7 @@ def bench_solvers(
         scenario=scenario.name,
         horizon=problem.horizon,
         deadline_ms=1e3 * scenario.control_period,
-        asked=asked,
+        asked=queried,
         flown=flight.log.control.t.size,
         candidates=candidates,
         gain_ms=gain,
@@ -163,15 +163,15 @@ def _time_candidates(
     stride: int,
     progress: Progress,
 ) -> tuple[tuple[CandidateResult, ...], dict[str, _Timed], Array | None, int, float]:
-    """Candidates, their steps, the gain's, the number of periods asked, and the reference's worst KKT residual."""
+    """Candidates, their steps, the gain's, the number of periods timed, and the reference's worst KKT residual."""
     queries = recorded(flight.scenario, flight.log.control, problem.horizon)
-    asked = segments(queries.t.size, stride)
-    periods = [period for segment in asked for period in segment]
+    chosen = segments(queries.t.size, stride)
+    periods = [period for segment in chosen for period in segment]
     reference = reference_optima(problem, queries, periods)
     candidates = {entry.name: StepCandidate(entry, problem, queries) for entry in taking_part}
     laps = race(
         {**_gain(problem, queries), **candidates},
-        asked,
+        chosen,
         longest_pass=LONGEST_PASS,
         progress=partial(progress, "candidates"),
     )
@@ -212,7 +212,7 @@ def _growth(
     taking_part: Sequence[Entry],
     race: Race,
     horizons: Sequence[int],
-    asked: Sequence[range],
+    chosen: Sequence[range],
     own: Mapping[str, _Timed],
     progress: Progress,
 ) -> tuple[Growth, ...]:
@@ -224,7 +224,7 @@ def _growth(
     grown: dict[tuple[Entry, Method], list[tuple[int, float, float]]] = {}
     failures: dict[str, dict[int, int]] = {}
     dropped: dict[str, str] = {}
-    periods = [period for segment in asked for period in segment]
+    periods = [period for segment in chosen for period in segment]
     deadline_ms = 1e3 * flight.scenario.control_period
     for N in sorted(set(horizons)):
         racing = [entry for entry in taking_part if entry.name not in dropped]
@@ -234,7 +234,7 @@ def _growth(
             queries, longer = recorded(flight.scenario, flight.log.control, N), replace(problem, horizon=N)
             candidates = {entry.name: StepCandidate(entry, longer, queries) for entry in racing}
             report = partial(progress, f"N = {N}")
-            laps = race(candidates, asked, longest_pass=LONGEST_PASS, patience=PATIENCE, progress=report)
+            laps = race(candidates, chosen, longest_pass=LONGEST_PASS, patience=PATIENCE, progress=report)
             timed = {name: _Timed.of(candidates[name], periods, lap) for name, lap in laps.items()}
         for entry in racing:
             if entry.name not in timed:

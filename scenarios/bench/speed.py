@@ -150,7 +150,7 @@ class Given:
         return self.vehicle.rotor_rise or 0.0
 
     def baseline(self, **fields: Any) -> Table:
-        """Of a law that plans nothing: it limits the tilt that it asks for."""
+        """Of a law that plans nothing: it limits the tilt that it commands."""
         return {"tilt": self.bound, **fields}
 
     def robust(self) -> Table:
@@ -164,8 +164,8 @@ class Given:
 
     def constrained(self) -> Table:
         """The paper's with the same weights and bounds."""
-        kept = ("horizon", "output_weights", "input_weights", "output_bounds", "input_bounds")
-        return {"type": "constrained", **{name: value for name, value in self.robust().items() if name in kept}}
+        shared = ("horizon", "output_weights", "input_weights", "output_bounds", "input_bounds")
+        return {"type": "constrained", **{name: value for name, value in self.robust().items() if name in shared}}
 
     def nonlinear(self, **fields: Any) -> Table:
         """By its default weights, over the same time ahead."""
@@ -330,8 +330,8 @@ def run_speeds(*, quick: bool = False, workers: int | None = None, progress: Pro
     cells = [(world, speed, law) for world in WORLDS for speed in WORLDS[world].speeds for law in LAWS]
     if quick:
         cells = [cell for cell in cells if cell[0] == QUICK_WORLD and cell[1] in QUICK_SPEEDS and cell[2] in QUICK_LAWS]
-    asked = [(*cell, seed) for cell in cells for seed in range(WORLDS[cell[0]].seeds)]
-    found = answer_all(fly_cell, asked, workers=workers, progress=lambda done, total: progress("flights", done, total))
+    flown = [(*cell, seed) for cell in cells for seed in range(WORLDS[cell[0]].seeds)]
+    found = answer_all(fly_cell, flown, workers=workers, progress=lambda done, total: progress("flights", done, total))
     flights = iter(found)
     return SpeedBench(flights={cell: merged(list(itertools.islice(flights, WORLDS[cell[0]].seeds))) for cell in cells})
 
@@ -347,7 +347,7 @@ def fly_cell(cell: tuple[str, float, str, int]) -> SpeedFlight:
     bound = min(STEEPEST, round(report(parse_scenario(data), vehicle).tilt + ROOM))
     data["controller"] = law.table(Given(vehicle=vehicle, tuned=tuned, period=period, bound=bound))
     log = fly_scenario(parse_scenario(data)).log
-    # A row of the plant stands for the step that follows it; the last has none.
+    # A row of the plant covers the step that follows it; the last has none.
     states, speeds = log.plant.state[:-1], log.control.speeds
     beyond = np.degrees(np.abs(states[:, [INDEX["roll"], INDEX["pitch"]]]).max(axis=1)) > bound + TOLERANCE
     at_end = (speeds <= vehicle.speed_min) | (speeds >= vehicle.speed_max)

@@ -1,6 +1,6 @@
 """The one place where times are taken: of calls and commands, of whole runs in turns, and of a controller's steps.
 
-What is compared is timed in turns, so that what the machine does meanwhile meets all of it.  Steps are timed as a
+What is compared is timed in turns, so that other load on the machine affects all of it.  Steps are timed as a
 flight sees them: between two questions the plant flies a period, which leaves in the caches what it leaves there in a
 flight.  A question is put a few times, and its time is the median: what a flight sees but for the machine's stalls.
 
@@ -37,7 +37,7 @@ class Stopwatch:
     """Seconds since it was made, and those that calls took.
 
     Args:
-        now: a clock [s]: `time.perf_counter`, or `time.thread_time`, which stands still while other processes run.
+        now: a clock [s]: `time.perf_counter`, or `time.thread_time`, which pauses while other processes run.
     """
 
     def __init__(self, now: Callable[[], float] = clock.perf_counter) -> None:
@@ -74,7 +74,7 @@ class Stopwatch:
 
 
 def in_turns(runs: Mapping[str, Callable[[], Found]], repeats: int) -> dict[str, list[Found]]:
-    """What each of several runs returned, each so many times, in turns."""
+    """What each of several runs returned, each repeatedly, in turns."""
     found: dict[str, list[Found]] = {name: [] for name in runs}
     for _ in range(repeats):
         for name, run in runs.items():
@@ -94,7 +94,7 @@ def time_python(*arguments: str, tree: Path) -> CommandTime:
     """Run Python in a checkout, on one thread of linear algebra, and time it.
 
     Raises:
-        SystemExit: with what it said, where its exit status is neither 0 nor 1: a flight may violate its constraints.
+        SystemExit: with its output, where its exit status is neither 0 nor 1: a flight may violate its constraints.
     """
     import resource  # no such thing on Windows
 
@@ -123,7 +123,7 @@ def one_core() -> Iterator[int | None]:
 
 @contextlib.contextmanager
 def undisturbed() -> Iterator[None]:
-    """Linear algebra on one thread; cycles are collected where that is asked for alone."""
+    """Linear algebra on one thread; cycles are collected only on request."""
     collecting = gc.isenabled()
     gc.collect()
     gc.freeze()
@@ -138,7 +138,7 @@ def undisturbed() -> Iterator[None]:
 
 
 class Candidate(Protocol):
-    """Something that answers questions, numbered by the period they were asked in."""
+    """Something that answers questions, numbered by their period."""
 
     def prepare(self, period: int) -> None:
         """Get ready; not timed."""
@@ -166,7 +166,7 @@ def segments(periods: int, stride: int) -> list[range]:
 
 def time_in_turns(
     candidates: Mapping[str, Candidate],
-    asked: Sequence[range],
+    timed: Sequence[range],
     *,
     between: Callable[[], None],
     repeats: int,
@@ -180,7 +180,7 @@ def time_in_turns(
 
     Args:
         candidates: by name.
-        asked: segments of periods.
+        timed: segments of periods.
         between: what a flight does between two questions; not timed.
         repeats: passes over all questions.
         rng: decides the order within each segment.
@@ -193,13 +193,13 @@ def time_in_turns(
         Each candidate's times, in the order of the questions; none of those that left.
     """
     passes: dict[str, list[list[float]]] = {name: [] for name in candidates}
-    total, done = repeats * len(asked) * len(candidates), 0
+    total, done = repeats * len(timed) * len(candidates), 0
     with undisturbed():
         for _ in range(repeats):
             racing = [name for name, laps in passes.items() if sum(map(sum, laps[:1])) <= 1e3 * longest_pass]
             for name in racing:
                 passes[name].append([])
-            for segment in asked:
+            for segment in timed:
                 gc.collect()
                 for name in rng.permutation([name for name in racing if name in passes]).tolist():
                     left_ms = 1e3 * patience - sum(passes[name][-1])

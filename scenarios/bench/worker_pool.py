@@ -1,4 +1,4 @@
-"""Many questions asked of a function, over processes."""
+"""Many calls of a function, over processes."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ Answer = TypeVar("Answer")
 
 
 def answer_all(
-    ask: Callable[[Question], Answer],
+    function: Callable[[Question], Answer],
     questions: Sequence[Question],
     *,
     workers: int | None = None,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> list[Answer]:
-    """Ask a module's function each question in a process, one per usable core by default; the answers in order."""
+    """Call a module's function for each question in a process, one per usable core by default; the answers in order."""
     context = multiprocessing.get_context("spawn")  # a fork would take over whatever threads hold
     count = min(workers or usable_cores(), len(questions) or 1)
     pool = ProcessPoolExecutor(count, mp_context=context, initializer=_leave_interrupts_to_parent)
     answers: dict[int, Answer] = {}
     try:
-        futures = {pool.submit(ask, question): i for i, question in enumerate(questions)}
+        futures = {pool.submit(function, question): i for i, question in enumerate(questions)}
         for future in as_completed(futures):
             answers[futures[future]] = future.result()
             progress(len(answers), len(questions))
@@ -37,5 +37,5 @@ def answer_all(
 
 
 def _leave_interrupts_to_parent() -> None:
-    """Ctrl-C reaches every process of a terminal; the parent alone is to say so."""
+    """Ctrl-C reaches every process of a terminal; only the parent reports it."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)

@@ -1,4 +1,4 @@
-"""Campaigns: many flights of one scenario, and what they say with which confidence.
+"""Campaigns: many flights of one scenario, and what they show with which confidence.
 
 In the order in which a campaign passes through them:
 

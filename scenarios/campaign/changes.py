@@ -35,7 +35,7 @@ def changed(data: Mapping[str, Any], changes: Sequence[Change], parse: Parse, *,
     for entry, value in changes:
         for field in entry.fields:
             new = _scaled(data, entry, field, value, parse, table) if entry.relative else value
-            set_field(after, field, new, asked=f"{table}.{entry.name}.fields")
+            set_field(after, field, new, source=f"{table}.{entry.name}.fields")
     return parse(after)
 
 

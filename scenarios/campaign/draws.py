@@ -1,7 +1,7 @@
 """What is drawn for each flight of a campaign.
 
 Each flight's own generator is seeded by `SeedSequence([campaign seed, flight])`, so that neither the number of flights
-nor who flies them matters; spread samplings take the points of `scipy.stats.qmc` in order instead.  Points in the unit
+nor the worker matters; spread samplings take the points of `scipy.stats.qmc` in order instead.  Points in the unit
 cube become values through the inverse of each distribution function.
 """
 
@@ -30,11 +30,11 @@ from scenarios.campaign.spec import (
 if TYPE_CHECKING:
     from scenarios.campaign.spec import CampaignSpec
 
-_TAIL: Final = 1e-3  # share of a distribution beyond the values that stand for its ends
+_TAIL: Final = 1e-3  # share of a distribution beyond the values taken as its ends
 
 
 class Draws:
-    """What the flights of a campaign are drawn to be; the same for the same file, whoever asks, in whatever order."""
+    """The drawn values of a campaign's flights; the same for the same file, in any process and order."""
 
     def __init__(self, spec: CampaignSpec) -> None:
         self._spec = spec

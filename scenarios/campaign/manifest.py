@@ -1,4 +1,4 @@
-"""A campaign's directory: what says what is flown, with what, and how far it got."""
+"""A campaign's directory: its plan, code and progress."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ def go_on(plan: Plan, files: Growing, *, flying: bool) -> dict[str, Any]:
         differing = [name for name in other_than_flew(manifest, plan) if name != "machine"]
         if differing:
             raise InputError(
-                f"{files.path}: --resume goes on with the same code alone, and this one differs from what flew the "
+                f"{files.path}: --resume needs the same code, and this one differs from what flew the "
                 f"first flights ({', '.join(differing)}): half of the numbers would be another program's; choose "
                 "another --out"
             )
@@ -97,7 +97,7 @@ def write(manifest: Mapping[str, Any], files: Growing) -> None:
 
 
 def require_same(plan: Plan, directory: Path) -> None:
-    """Refuse to go on with a campaign by another one.
+    """Refuse to continue a campaign by another one.
 
     Raises:
         FileError: there is none, or it is damaged.
@@ -113,7 +113,7 @@ def require_same(plan: Plan, directory: Path) -> None:
     if differing:
         rule = "; more flights may follow, except of a latin_hypercube" if differing == ["flights"] else ""
         raise InputError(
-            f"{directory}: --resume goes on with the same campaign alone, and its {', '.join(differing)} differs from "
+            f"{directory}: --resume needs the same campaign, and its {', '.join(differing)} differs from "
             f"the one there{rule}; choose another --out"
         )
 
@@ -130,7 +130,7 @@ def other_than_flew(manifest: Mapping[str, Any], plan: Plan) -> list[str]:
 
 
 def controller_code(plan: Plan) -> dict[str, Any]:
-    """The digest of a controller that is not ours, for `other_than_flew` to tell of."""
+    """The digest of a user-defined controller, for `other_than_flew`."""
     own = plan.scenario.controller
     return {"controller_code": find_code(own).digest} if isinstance(own, PluginSpec) else {}
 

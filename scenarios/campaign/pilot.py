@@ -48,13 +48,13 @@ class CampaignPilot:
         except MemoryError as error:
             most = f"limits.memory is {self.limits.memory:g} MB"
             return self._row(flight, failed_row(f"{describe(error)} ({most})", MEMORY))
-        except Exception as error:  # of a plug-in controller, say: the campaign goes on without it
+        except Exception as error:  # e.g. of a user-defined controller: the campaign continues without it
             return self._row(flight, failed_row(describe(error)))
-        return self._row(flight, _kept(flown, clock.perf_counter() - started))
+        return self._row(flight, _recorded(flown, clock.perf_counter() - started))
 
     def row_of(self, flight: int, flown: Flight) -> Row:
         """The row of a flight that was flown elsewhere; it has no clock times of its own."""
-        return self._row(flight, _kept(flown, 0.0))
+        return self._row(flight, _recorded(flown, 0.0))
 
     def lost(self, flight: int, reason: str, verdict: str = ERROR) -> Row:
         """The row of a flight that no process came back from."""
@@ -65,6 +65,6 @@ class CampaignPilot:
         return row | {"failed": any(event.holds(row) for event in self._plan.failure)}
 
 
-def _kept(flight: Flight, wall_s: float) -> Row:
+def _recorded(flight: Flight, wall_s: float) -> Row:
     """What a campaign keeps of a flight."""
     return flown_row(flight.log, flight.findings, verdict=flight.outcome, wall_s=wall_s, machine=processor_name())

@@ -78,7 +78,7 @@ class Plan:
         return self._varied(changes, name=name, seed=self.draws.seed(flight))
 
     def identity(self, flight: int) -> Row:
-        """The columns that tell one flight from the others."""
+        """The columns that identify a flight."""
         drawn = {DRAW + name: cell(value) for name, value in self.draws.values(flight).items()}
         return {"flight": flight, "seed": self.draws.seed(flight), **drawn}
 

@@ -1,4 +1,4 @@
-"""A campaign flown: an engine flies what is missing, its answers are kept as they come, the whole is summed up."""
+"""Fly a campaign: an engine flies what is missing, its answers are saved as they come, the whole is summed up."""
 
 from __future__ import annotations
 
@@ -101,14 +101,14 @@ def fly_campaign(
 ) -> Result:
     """Fly a campaign, or what is missing of it.
 
-    Each flight's row is the same whoever flies it, in whatever order; so is the table of all.  Whatever ends this
-    early, what was flown stays, and `resume` goes on with it.
+    Each flight's row is the same with any worker and order; so is the table of all.  Whatever ends this
+    early, what was flown stays, and `resume` continues it.
 
     Args:
         plan: the campaign.
         directory: where its results go.
-        engine: who flies.
-        resume: whether to go on with what the directory holds; without it there must be nothing there.
+        engine: flies them.
+        resume: whether to continue what the directory holds; without it there must be nothing there.
         until_width: width of the 95 % interval of the failure probability, from 0 to 1, at which to stop.
         report: whether to write the page and its figure.
         watch: called with the progress, as answers come.
@@ -122,7 +122,7 @@ def fly_campaign(
         raise ParameterError("", "--until-width", until_width, "between 0 and 1")
     session: dict[str, Any] = {"engine": engine.name, "workers": engine.workers, "flights": 0, "wall_s": None}
     if records.is_campaign(directory) and not resume:
-        raise OutputError(directory, "a campaign is already there; go on with it by --resume, or choose another --out")
+        raise OutputError(directory, "a campaign is already there; continue it with --resume, or choose another --out")
     with growing(directory, records.KIND) as files:
         going_on = records.is_campaign(directory)
         if going_on:

@@ -64,7 +64,7 @@ class LogUniformSpec(VaryBase):
 
 
 class NormalSpec(VaryBase):
-    """A normal distribution, cut off where `low` or `high` say so."""
+    """A normal distribution, truncated at `low` and `high`."""
 
     distribution: Literal["normal"]
     mean: Number

@@ -78,7 +78,7 @@ def fly_sweep(
     Args:
         scenario: what is flown.
         values: what to try, by dotted path.
-        engine: who flies.
+        engine: flies them.
         progress: called with (what, done, total).
 
     Raises:

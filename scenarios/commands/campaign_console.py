@@ -46,13 +46,13 @@ def progress(*, enabled: bool, lines: bool = True) -> Iterator[Watch]:
     else:
         printed = clock.perf_counter()
 
-        def tell(standing: Standing) -> None:
+        def show(standing: Standing) -> None:
             nonlocal printed
             if clock.perf_counter() - printed > LINE_EVERY or standing.flown == standing.flights:
                 printed = clock.perf_counter()
                 screen.print(describe(standing), soft_wrap=True)
 
-        yield tell
+        yield show
 
 
 def describe(standing: Standing) -> str:

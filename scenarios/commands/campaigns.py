@@ -41,7 +41,7 @@ def campaign(options: Namespace) -> int:
     except KeyboardInterrupt as stop:
         if not stop.args:  # before the first flight
             raise
-        console.say(f"interrupted (Ctrl-C); {stop}, --resume goes on with it")
+        console.say(f"interrupted (Ctrl-C); {stop}, --resume continues it")
         return EXIT_FAILED
     judgements = result.judgements
     if options.junit is not None:

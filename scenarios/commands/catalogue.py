@@ -1,4 +1,4 @@
-"""`quadsim list` and `scenario`: what there is, and what it says."""
+"""`quadsim list` and `scenario`: what there is, and its text."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from scenarios.commands import EXIT_DONE, console
 from scenarios.shipped import Group, scenario_names
 
 _MEANT: Final = {"violated": "  (meant to violate a constraint)", "lost": "  (meant to be lost)"}
-"""What `quadsim list` says of a scenario that is to defeat its controller."""
+"""The mark in `quadsim list` of a scenario that is to defeat its controller."""
 
 
 def list_everything(options: Namespace) -> int:
@@ -46,8 +46,8 @@ def scenario(options: Namespace) -> int:
             if value:
                 raise ParameterError("", "--for", options.vehicle, f"given without {name}")
         choice = {"course": options.course, "controller": options.controller}
-        asked = {name: value for name, value in choice.items() if value is not None}
-        print(first_scenario(options.vehicle, **asked).to_toml(), end="")
+        chosen = {name: value for name, value in choice.items() if value is not None}
+        print(first_scenario(options.vehicle, **chosen).to_toml(), end="")
         return EXIT_DONE
     for name, value in (("--course", options.course), ("--controller", options.controller)):
         if value is not None:

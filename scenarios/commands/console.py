@@ -22,7 +22,7 @@ from scenarios.progress import Progress, silent
 
 
 class PlainConsole(Console):
-    """Shows every string as it is, whoever wrote it: paths, names, reasons, summaries.
+    """Shows every string as it is, from any source: paths, names, reasons, summaries.
 
     What is to have a style is a `rich.text.Text`, made by `styled`.
     """
@@ -96,7 +96,7 @@ def print_place(where: str) -> None:
 
 
 def say(text: str) -> None:
-    """Tell a person, or a log, something that is no result."""
+    """Print a message that is no result."""
     stderr().print(f"quadsim: {text}", soft_wrap=True)
 
 
@@ -106,7 +106,7 @@ def is_watched() -> bool:
 
 
 def print_notice(text: str) -> None:
-    """Tell a person at a terminal something that work begins with."""
+    """Print a notice before the work, on a terminal only."""
     console = stderr()
     if console.is_terminal:
         console.print(text, soft_wrap=True)
@@ -184,7 +184,7 @@ def _effect_lines(summary: Mapping[str, Any]) -> Iterator[str]:
     if events := summary.get("events"):
         from quadsim.report.narrative import event_sentences
 
-        yield f"on the way: {'; '.join(event_sentences(events))}"
+        yield f"events: {'; '.join(event_sentences(events))}"
     if "ground" in summary:
         ground = summary["ground"]
         left = "started in the air" if ground["started"] == "flying" else "never left it"

@@ -60,8 +60,8 @@ def check(options: Namespace) -> int:
 
 
 def _announce(scenario: Scenario, options: Namespace) -> None:
-    """Say what the course asks for, before it is flown; the summary says it again."""
+    """Report what the course requires, before it is flown; the summary repeats it."""
     if not options.json:
-        asked = feasibility(scenario)
-        fits = fitting(scenario) if asked.problems and console.is_watched() else ""
-        console.print_notice(f"{asked.sentence} {fits}".rstrip())
+        required = feasibility(scenario)
+        fits = fitting(scenario) if required.problems and console.is_watched() else ""
+        console.print_notice(f"{required.sentence} {fits}".rstrip())

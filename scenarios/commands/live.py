@@ -75,7 +75,7 @@ def _serve(session: Session, options: Namespace, save: Callable[[Session], str])
 
     if options.host not in ("127.0.0.1", "localhost"):
         console.say(
-            f"listening on {options.host}: whoever on that network has the address below can fly this session; "
+            f"listening on {options.host}: anyone on that network with the address below can fly this session; "
             "the connection is not encrypted"
         )
     pace = Pace()

@@ -28,7 +28,7 @@ def tune(options: Namespace) -> int:
     except KeyboardInterrupt as stop:
         if not stop.args:  # before the first flight
             raise
-        console.say(f"interrupted (Ctrl-C); {stop}, --resume goes on with it")
+        console.say(f"interrupted (Ctrl-C); {stop}, --resume continues it")
         return EXIT_FAILED
     if options.json:
         print(json.dumps(result.summary, indent=2))

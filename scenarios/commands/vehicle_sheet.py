@@ -50,7 +50,7 @@ def vehicle_tables(report: VehicleReport) -> list[Grid]:
                 )
                 for torque in sheet.torques
             ],
-            note="thrust kept at the weight, every rotor within its range; pure: no torque about the other axes",
+            note="thrust held at the weight, every rotor within its range; pure: no torque about the other axes",
         ),
         _grid(
             "what a controller made for it can do",

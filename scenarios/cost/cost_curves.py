@@ -21,7 +21,7 @@ class Curve:
     x: Array  # (m,) of the points
     y: Array  # (m,) of the points
     colour: int  # its place in the palette
-    dashed: bool = False  # whether it stands for the flight without constraints
+    dashed: bool = False  # whether it shows the flight without constraints
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -46,13 +46,13 @@ def _draw_steps(study: CostStudy) -> Figure:
 
 def _draw_sweep(study: CostStudy, sweep: Sweep, over: str) -> Figure:
     figure = new_figure(f"{study.name}: what constraints cost {over}", 9.6, 8.0)
-    places = figure.subplots(3, 2, sharex=True)
-    for axes, panel in zip(places.flat, sweep_panels(study, sweep), strict=True):
+    panels = figure.subplots(3, 2, sharex=True)
+    for axes, panel in zip(panels.flat, sweep_panels(study, sweep), strict=True):
         _draw_panel(axes, panel)
         _draw_marks(axes, sweep, panel)
         if sweep.base is not None:
             axes.axvline(sweep.base, color=REFERENCE, linestyle=":", linewidth=1.0)
-    for axes in places[-1]:
+    for axes in panels[-1]:
         axes.set_xlabel(f"{sweep.name} [{sweep.unit}]")
     figure.align_ylabels()
     with_them, without = lost_at(sweep)

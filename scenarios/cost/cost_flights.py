@@ -42,7 +42,7 @@ _NOT_THE_COURSE: Final = {
 }
 """Fields in which flights that are compared by their controllers may differ; vehicles are compared by their numbers."""
 REPEATS: Final = 3
-SWEEP_STRIDE: Final = 3  # of a flight in a sweep, one segment of so many is timed
+SWEEP_STRIDE: Final = 3  # of a flight in a sweep, one segment in this number is timed
 LONGEST_PASS: Final = 20.0  # a candidate that takes longer than this for all periods of a flight [s] is timed once
 
 
@@ -182,12 +182,12 @@ def time_candidates(
             controllers[f"QP by {solver}"] = ConstrainedMPC(problem, QPSolver(solver, problem), shortcut=False)
         except MissingPackageError as error:
             left_out[solver] = str(error)
-    asked = {
+    requested = {
         name: QueriedController(each, recorded(scenario, log, problem.horizon)) for name, each in controllers.items()
     }
     with flight_between(scenario, vehicle) as between:
         laps = time_in_turns(
-            asked,
+            requested,
             segments(log.t.size, 1),
             between=between,
             repeats=REPEATS,
@@ -202,7 +202,7 @@ def time_candidates(
             statuses=tuple(each.statuses[period] for period in range(log.t.size)),
             repeats=len(laps[name].ms),
         )
-        for name, each in asked.items()
+        for name, each in requested.items()
     )
     return tuple(candidates), left_out
 

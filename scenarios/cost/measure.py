@@ -40,30 +40,30 @@ HORIZONS: Final = (10, 15, 20, 30, 50, 75, 100)  # horizons that are tried, N
 ARM_LENGTHS: Final = (0.2, 0.3, 0.5)  # L [m]; the paper gives none
 DRAGS: Final = (0.012, 0.024, 0.048)  # d/b [m]; the paper gives none
 SOLVERS_TIMED: Final = ("piqp-multistage", "piqp-dense", "qpoases")  # both of this project, and the paper's own
-LONGEST_UNASKED: Final = 120.0
-"""A course that takes longer than this [s] is studied only when that is asked for: it is flown about thirty times."""
+LONGEST_UNREQUESTED: Final = 120.0
+"""A course that takes longer than this [s] is studied only on request: it is flown about thirty times."""
 
 
-def find_study(targets: Sequence[str], *, asked: bool | None) -> list[Scenario]:
+def find_study(targets: Sequence[str], *, requested: bool | None) -> list[Scenario]:
     """The first constrained scenario of runs or scenarios that are compared, and all unconstrained ones of its course.
 
-    Where `asked` is None a study is made where a constrained and an unconstrained controller fly the same course, which
-    takes no longer than `LONGEST_UNASKED`; nothing is returned where none is to be made.
+    Where `requested` is None a study is made where a constrained and an unconstrained controller fly one course, which
+    takes no longer than `LONGEST_UNREQUESTED`; nothing is returned where none is to be made.
 
     Raises:
-        InputError: a study is asked for, and nothing is flown by a constrained controller.
+        InputError: a study is requested, and nothing is flown by a constrained controller.
     """
-    if asked is False:
+    if requested is False:
         return []
     try:
         scenarios = [load_scenario(_scenario_of(target)) for target in targets]
     except InputError:
-        if asked:
+        if requested:
             raise
         return []  # a run can be compared all the same, and what is no run is refused when it is read
     constrained = next((each for each in scenarios if isinstance(each.controller, ConstrainedSpec)), None)
     if constrained is None:
-        if asked:
+        if requested:
             raise InputError("--cost needs a flight by a constrained controller among those that are compared")
         return []
     assert isinstance(constrained.controller, ConstrainedSpec)
@@ -73,10 +73,10 @@ def find_study(targets: Sequence[str], *, asked: bool | None) -> list[Scenario]:
         if isinstance(each.controller, UnconstrainedSpec) and course(each) == course(constrained)
     ]
     flyable = SOLVERS[constrained.controller.solver].installed
-    if asked is None and (not others or constrained.duration > LONGEST_UNASKED or not flyable):
+    if requested is None and (not others or constrained.duration > LONGEST_UNREQUESTED or not flyable):
         return []
     if not flyable:
-        make_backend(constrained.controller.solver)  # says what is missing, before anything is flown
+        make_backend(constrained.controller.solver)  # reports what is missing, before anything is flown
     return [constrained, *others]
 
 

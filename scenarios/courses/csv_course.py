@@ -24,7 +24,7 @@ VELOCITY_HEADER: Final = ("vx", "vy", "vz")
 LARGEST: Final = 1e6  # largest magnitude of a number in the table, as in the scenario file
 MOST_ROWS: Final = 200_000  # rows below the header: 200 s at 1 kHz. Each is held in memory
 ROUNDED: Final = range(2, 8)
-"""Decimals of a rounded column: with fewer its numbers are meant as they stand, with more nobody can tell."""
+"""Decimals of a rounded column: with fewer its numbers are exact, with more nobody can know."""
 LARGEST_FILE: Final = 64_000_000  # size [bytes] of the largest file that is read
 
 
@@ -65,7 +65,7 @@ def read_table(path: FilePath) -> Table:
     header = tuple(rows[0]) if rows else ()
     if header not in (POSE_HEADER, POSE_HEADER + VELOCITY_HEADER):
         wanted = f"{','.join(POSE_HEADER)} or {','.join(POSE_HEADER + VELOCITY_HEADER)}"
-        raise FileError(path, f"row 1: the header must be {wanted}; got {_told(header)}")
+        raise FileError(path, f"row 1: the header must be {wanted}; got {_header_text(header)}")
     if len(rows) < 3:
         raise FileError(path, f"must have 2 or more rows below its header; got {len(rows) - 1}")
     if len(rows) > MOST_ROWS + 1:
@@ -136,7 +136,7 @@ def _parse_row(path: FilePath, number: int, row: list[str], header: tuple[str, .
     return values
 
 
-def _told(header: tuple[str, ...]) -> str:
+def _header_text(header: tuple[str, ...]) -> str:
     """What a header is, without its words: who names a file in a scenario may not be the one whose file it is."""
     known = [name for name in header if name in POSE_HEADER + VELOCITY_HEADER]
     return f"{len(header)} columns, {','.join(known) if known else 'none'} of them" if header else "none"

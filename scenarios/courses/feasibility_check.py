@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 
 def report(scenario: Scenario, vehicle: Vehicle) -> Feasibility:
-    """What the filtered course asks for, up to a set-point, against the vehicle's limits and the controller's bounds.
+    """What the filtered course requires, up to a set-point, against the vehicle's limits and the controller's bounds.
 
     A table that was rounded is taken for the smoothest one within its last decimal: differences of the fourth order
     would make of 0.1 mm steps of tens of rad/s, which no controller flies.
@@ -35,7 +35,7 @@ def report(scenario: Scenario, vehicle: Vehicle) -> Feasibility:
     Raises:
         InputError: the course cannot be built.
     """
-    return _asked(build_course(scenario), scenario, vehicle, duration=_followed(scenario))
+    return _required(build_course(scenario), scenario, vehicle, duration=_followed(scenario))
 
 
 def fitting(scenario: Scenario, vehicle: Vehicle) -> str:
@@ -50,15 +50,15 @@ def fitting(scenario: Scenario, vehicle: Vehicle) -> str:
     course, duration, filtered_by = build_course(scenario), _followed(scenario), scenario.reference.response_time
 
     def slower(share: float) -> bool:
-        return not _asked(_scaled(course, pace=share), scenario, vehicle, duration=duration / share).problems
+        return not _required(_scaled(course, pace=share), scenario, vehicle, duration=duration / share).problems
 
     def smaller(share: float) -> bool:
-        return not _asked(_scaled(course, size=share), scenario, vehicle, duration=duration).problems
+        return not _required(_scaled(course, size=share), scenario, vehicle, duration=duration).problems
 
     def smoother(share: float) -> bool:
         changed = scenario.reference.model_copy(update={"response_time": filtered_by / share})
         softened = scenario.model_copy(update={"reference": changed})
-        return not _asked(course, softened, vehicle, duration=duration).problems
+        return not _required(course, softened, vehicle, duration=duration).problems
 
     if smaller(1.0):
         return ""
@@ -105,8 +105,8 @@ def _scaled(course: Course, *, pace: float = 1.0, size: float = 1.0) -> Course:
     )
 
 
-def _asked(course: Course, scenario: Scenario, vehicle: Vehicle, *, duration: float) -> Feasibility:
-    """What a course, in place of the scenario's and for so long [s], asks for."""
+def _required(course: Course, scenario: Scenario, vehicle: Vehicle, *, duration: float) -> Feasibility:
+    """What a course, in place of the scenario's and for this duration [s], requires."""
     period = scenario.control_period
     samples = round(duration / period) + 1
     flown = filtered(course, scenario, samples + STENCIL)
@@ -161,7 +161,7 @@ def _tightened(scenario: Scenario, vehicle: Vehicle) -> dict[str, tuple[float, f
     bounds = make_bounds(spec)
     try:
         margins = tightening_margins(spec, vehicle, scenario.control_period)
-    except ParameterError:  # which is said where the controller is made
+    except ParameterError:  # which is reported where the controller is made
         return {}
     if margins is None:
         return {}

@@ -1,4 +1,4 @@
-"""The reference as it is followed: a course through its filter, which set-points may leave on the way."""
+"""The reference as it is followed: a course through its filter, which set-points may replace in flight."""
 
 from __future__ import annotations
 

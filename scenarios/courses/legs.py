@@ -16,7 +16,7 @@ class Waypoint:
     """A pose to reach in a straight line, and how long to stay there."""
 
     pose: Array  # (4,) x, y, z [m], yaw [rad]
-    speed: float  # on the way there [m/s]
+    speed: float  # of the leg [m/s]
     hold: float = 0.0  # how long to stay there [s]
 
 

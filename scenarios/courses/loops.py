@@ -64,7 +64,7 @@ def ramped(t: Array, *, rate: float, total: float, ramp: float) -> Array:
     """An angle (M,) [rad] that gains its rate [rad/s] smoothly, keeps it, and loses it in the same way at the end.
 
     The rate grows as S(s) = 35 s^4 - 84 s^5 + 70 s^6 - 20 s^7, s = t / ramp, so that all derivatives up to the fourth
-    are continuous: no step in the torques that the course asks for.  Without a ramp it jumps.  Times (M,) are within
+    are continuous: no step in the torques that the course requires.  Without a ramp it jumps.  Times (M,) are within
     0 .. total / rate + ramp [s], and the angle at the end, `total` [rad], is at least rate ramp.
     """
     duration = total / rate + ramp

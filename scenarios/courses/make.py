@@ -86,7 +86,7 @@ def build_reference(scenario: Scenario, samples: int) -> Array:
 
 
 def follow_course(scenario: Scenario) -> FollowedCourse:
-    """The same row by row, with set-points on the way, known from the start to nobody."""
+    """The same row by row, with set-points in flight, not known in advance."""
     course, response_time = build_course(scenario), scenario.reference.response_time
     return FollowedCourse(course, response_time=response_time, period=scenario.control_period)
 

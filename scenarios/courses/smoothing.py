@@ -13,7 +13,7 @@ from scipy.linalg import solveh_banded
 
 from quadsim.state import Array, read_only
 
-_ORDER: Final = 4  # of the differences that are kept small: those that a torque, and so a rotor's speed, follows from
+_ORDER: Final = 4  # of the minimised differences: those that determine a torque, and so a rotor's speed
 _WEIGHTS: Final = tuple(10.0**exponent for exponent in range(6, -3, -1))
 
 
@@ -39,7 +39,7 @@ def within_rounding(values: Array, resolution: float, breaks: NDArray[np.bool_])
 
     Whittaker-Henderson smoothing (Eilers 2003), min |z - y|^2 + w |D z|^2 with D the fourth differences, piece by
     piece, with the largest weight w of `_WEIGHTS` that leaves every value within the resolution of what it was.  Breaks
-    (M - 1,) say where a corner or a jump between a sample and the next stays.
+    (M - 1,) mark where a corner or a jump between a sample and the next stays.
     """
     smoothed = values.copy()
     for piece in np.split(np.arange(values.size), np.flatnonzero(breaks) + 1) if resolution > 0.0 else ():

@@ -100,7 +100,7 @@ def _munk(vehicle: Vehicle) -> float:
 
 
 def torque_ranges(vehicle: Vehicle) -> tuple[TorqueRange, ...]:
-    """The largest torques of each sign about x, y, z with the thrust kept at the weight and every rotor in its range.
+    """The largest torques of each sign about x, y, z with the thrust held at the weight and every rotor in its range.
 
     A linear programme in the squared speeds v_i = w_i^2: the torque about an axis is a row of the allocation matrix
     times v, the thrust is its first row times v, and v_i lies between the squares of the speed limits.

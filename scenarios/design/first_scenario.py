@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 COURSES: Final = ("hover", "step", "figure-eight")
 LAWS: Final = ("robust", "lqr", "pid", "geometric")
 SHARE: Final = 0.6
-"""Share of what the vehicle can do that a figure eight asks for: of the largest acceleration within the tilt bound, or
+"""Share of what the vehicle can do that a figure eight requires: of the largest acceleration within the tilt bound, or
 of the fastest level speed where that is reached first."""
 EIGHT_RATIO: Final = 0.3
 """Turns of a figure eight per time [rad/s] over the loop's bandwidth: across it moves twice as fast."""
@@ -45,13 +45,13 @@ STEP_RATIO: Final = 0.28
 STEP: Final = 1.0
 """[m]"""
 ROOM: Final = 0.15
-"""Largest error that is allowed on the way, over the size of the course; the RMS error is a third of that or less."""
+"""Largest error allowed in flight, over the size of the course; the RMS error is a third of that or less."""
 SOFT: Final = (2e4, 1e3)
 """l1 and l2 of the tilt bounds over the weight of x, as the defaults have them with the paper's weight of 10."""
 LQR_TILT: Final = 30.0
 BASELINE_SHARE: Final = 0.9
 """Tilt [deg] that an LQR is limited to, and share of the tilt bound that the other baselines are: they only limit what
-they ask for."""
+they require."""
 GRID: Final = 0.2
 """Durations are multiples of it [s], and so of every control period."""
 _EIGHT_PEAK: Final = float(np.hypot(np.sin(angle := np.linspace(0.0, math.pi, 721)), 2.0 * np.sin(2.0 * angle)).max())
@@ -300,7 +300,7 @@ def _robust(vehicle: Vehicle, tuning: Tuning) -> Iterator[Entry]:
 def _baseline(law: str, vehicle: Vehicle, tuning: Tuning) -> Iterator[Entry]:
     tilt = min(LQR_TILT, BASELINE_SHARE * _tilt(tuning)) if law == "lqr" else BASELINE_SHARE * _tilt(tuning)
     yield Entry(table="controller", key="type", value=law, why="its gains are its own defaults for the vehicle")
-    why = "deg, largest that it asks for; below the audit's, since it plans nothing"
+    why = "deg, largest that it commands; below the audit's, since it plans nothing"
     yield Entry(table="controller", key="tilt", value=round(tilt, 3), why=why)
     yield from _inputs(vehicle, tuning)
 
@@ -324,8 +324,8 @@ def _constraints(vehicle: Vehicle, tuning: Tuning, size: float | None) -> Iterat
         if tolerance:
             pairs |= {"tolerance": tolerance, "tolerance_sampled": tolerance}
         for key, value in pairs.items():
-            said = {"lower": why, "tolerance": "rounding"}.get(key, "")
-            yield Entry(table="[constraints]", key=key, value=value, why=said)
+            comment = {"lower": why, "tolerance": "rounding"}.get(key, "")
+            yield Entry(table="[constraints]", key=key, value=value, why=comment)
 
     for name in ("roll", "pitch"):
         yield from entry(name, name, (-tilt, tilt), 0.0, "deg, the tilt bound, at every instant")

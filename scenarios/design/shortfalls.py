@@ -44,10 +44,10 @@ def shortfalls(scenario: Scenario, vehicle: Vehicle) -> tuple[str, ...]:
         ):
             sides = f"{'...' if limit.lower is None else f'{limit.lower:g}'} to {limit.upper if limit.upper else 0:g}"
             found.append(f"constraint {limit.name}: hover is {vehicle.hover_speed:.4g} rad/s, the audit allows {sides}")
-    if any("hover is" in line for line in found):  # the course's rotor speeds would say it again
+    if any("hover is" in line for line in found):  # the course's rotor speeds would repeat it
         return tuple(found)
     problems = report(scenario, vehicle).problems
-    found += [f"the course asks for {problem}" for problem in problems]
+    found += [f"the course requires {problem}" for problem in problems]
     fits = fitting(scenario, vehicle) if problems else ""
     return (*found, fits) if fits else tuple(found)
 
@@ -59,7 +59,7 @@ def _inputs(bounds: InputBoundsSpec, vehicle: Vehicle, period: float) -> list[st
         found.append(f"controller.input_bounds.speed: hover is {hover:.4g} rad/s, the scenario allows {upper:g}")
     elif hover < lower:
         found.append(
-            f"controller.input_bounds.speed: hover is {hover:.4g} rad/s, the scenario asks for at least {lower:g}"
+            f"controller.input_bounds.speed: hover is {hover:.4g} rad/s, the scenario requires at least {lower:g}"
         )
     if upper > vehicle.speed_max:
         found.append(

@@ -10,13 +10,13 @@
      2 sqrt(tilt / alpha) = 1 / w;
    - `FASTEST`, so that a period of 10 ms or more is enough.
 2. *Period*: the longest with tau w <= `PERIOD_SHARE`, 40 samples in each period of the loop's own motion (Astroem and
-   Wittenmark, "Computer-Controlled Systems", 1997, ask for 15 to 60).
+   Wittenmark, "Computer-Controlled Systems", 1997, recommend 15 to 60).
 3. *Horizon*: `HORIZON_TIMES` / w, in which the loop's own motion has died out.
 4. *Weights* by Bryson's rule, 1 / (largest accepted deviation)^2 (Bryson and Ho, "Applied Optimal Control", 1975): the
    place deviates by what the tilt bound itself would answer, g tan(tilt) / w^2; the rotor speed's weight follows from
    w by 1., those of height and heading likewise from theirs.  Changes of rotor speeds cost as much as the speeds
    themselves at `MOVE_RATIO` w.
-5. *Level speed*: that at which a tilt grows by Munk's moment at the rate w.  A pole p > 0 asks for a bandwidth above
+5. *Level speed*: that at which a tilt grows by Munk's moment at the rate w.  A pole p > 0 requires a bandwidth above
    p M / (M - 1), M the peak of the complementary sensitivity (Skogestad and Postlethwaite, "Multivariable Feedback
    Control", 2005, Sec. 5.9): w = p is where no peak is large enough; at 60 % of that speed M is 2.5 or more.  Without
    lag the Butterworth pattern itself is stable up to p = 2^(1/4) w (Hurwitz).

@@ -77,7 +77,7 @@ class Program:
             self._process.stdin.write(data)
 
     def receive(self, count: int) -> bytes:
-        """So many bytes; fewer where the program has ended, or says nothing for `PATIENCE`."""
+        """`count` bytes; fewer where the program has ended, or sends nothing for `PATIENCE`."""
         assert self._process.stdout is not None
         line, data = self._process.stdout.fileno(), b""
         while len(data) < count and select.select([line], [], [], PATIENCE)[0]:

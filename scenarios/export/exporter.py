@@ -41,7 +41,7 @@ def export(
         The directory.
 
     Raises:
-        ExportError: this controller cannot be exported; the message says why.
+        ExportError: this controller cannot be exported; the message gives the reason.
         InputError: something else is wrong with the input.
         OutputError: the directory cannot be written.
 
@@ -127,7 +127,7 @@ def _readme(scenario: Scenario, precision: Precision) -> str:
     return f"""# {_title(scenario)}
 
 A model predictive controller as C99 in {precision} precision, exported from quadsim: {scenario.controller.type}, to be
-asked every {scenario.control_period:g} s.  It needs nothing but a compiler: no allocation, no recursion, no global
+called every {scenario.control_period:g} s.  It needs nothing but a compiler: no allocation, no recursion, no global
 state, and of the C library `memcpy` and `memset`.
 
 | file | is |
@@ -147,5 +147,5 @@ status = quadsim_mpc_step(&mpc, state, reference, acting, command);
 ```
 
 Solve once before take-off: the first step starts without an active set and takes the most changes of it.
-`mpc.changes` says how many each step took.  Compile with `-ffp-contract=off`, and every processor gives the same bits.
+`mpc.changes` is the number in each step.  Compile with `-ffp-contract=off`, and every processor gives the same bits.
 """

@@ -83,7 +83,7 @@ def fly_exported(
     """Fly a scenario with its controller exported, compiled and run by its target: processor in the loop.
 
     The controller's program is `serial.c` of the export, at the other end of a serial line: a Cortex-M's UART in QEMU,
-    for `posix` a pipe.  What it is asked and answers are bytes; the flight is audited as any other, but that a float
+    for `posix` a pipe.  Its queries and answers are bytes; the flight is audited as any other, but that a float
     may pass a bound on speeds and their steps by the spacing of floats there.
 
     Args:
@@ -94,7 +94,7 @@ def fly_exported(
         progress: see `quadsim.fly`.
 
     Raises:
-        ExportError: this controller cannot be exported; the message says why.
+        ExportError: this controller cannot be exported; the message gives the reason.
         MissingProgramError: a compiler or an emulator is not installed.
 
     Examples:

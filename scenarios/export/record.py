@@ -1,4 +1,4 @@
-"""A flight's periods as test vectors: what the controller was asked, and what the exact answer is."""
+"""A flight's periods as test vectors: the controller's inputs, and the exact answers."""
 
 from __future__ import annotations
 
@@ -59,22 +59,22 @@ class Recorder:
 
     def __init__(self, inner: MPC) -> None:
         self.inner, self.name, self.solver, self.horizon = inner, inner.name, inner.solver, inner.horizon
-        self.asked: list[tuple[Array, Array, Array]] = []
+        self.queries: list[tuple[Array, Array, Array]] = []
         """State (12,), command in force (4,) and reference (N, 4) of each period."""
         self._before, self._ended = np.zeros(4), False
 
     def reset(self, speeds: Array) -> None:
         """See `quadsim.controller.Controller.reset`."""
-        self.asked, self._before, self._ended = [], np.array(speeds, float), False
+        self.queries, self._before, self._ended = [], np.array(speeds, float), False
         self.inner.reset(speeds)
 
     def step(self, now: Moment, state: Array, reference: Array) -> Command:
         """See `quadsim.controller.Controller.step`."""
         flying = now.phase is Phase.FLYING and not (isinstance(now, CompletedMoment) and now.unseen.any())
-        self._ended |= bool(self.asked) and not flying
+        self._ended |= bool(self.queries) and not flying
         if flying and not self._ended:
             acting = self._before if now.acting is None else now.acting
-            self.asked.append((state.copy(), np.array(acting, float), np.array(reference, float)))
+            self.queries.append((state.copy(), np.array(acting, float), np.array(reference, float)))
         command = self.inner.step(now, state, reference)
         self._before = command.speeds.copy()
         return command
@@ -85,7 +85,7 @@ class Recorder:
 
 
 def record(scenario: Scenario) -> Recording:
-    """Fly a scenario, note each period, and ask a controller that starts with the first of them for the answers."""
+    """Fly a scenario, record each period, and compute the answers of a controller that starts with the first."""
     scenario = scenario.replace({"controller.compiled": False})
     if isinstance(scenario.controller, BoundedSpec):
         scenario = scenario.replace({"controller.shortcut": True})
@@ -96,11 +96,11 @@ def record(scenario: Scenario) -> Recording:
     if isinstance(law, Guarded):
         law.inner = recorder
     fly_scenario(scenario, law=law if isinstance(law, Guarded) else recorder)
-    asked = recorder.asked
-    if not asked:
+    queries = recorder.queries
+    if not queries:
         raise ExportError("its flight has no period in the air, with everything measured, to record")
-    states, acting, windows = (np.array(column) for column in zip(*asked, strict=True))
-    status, commands = _answers(inner, scenario.control_period, acting[0], asked)
+    states, acting, windows = (np.array(column) for column in zip(*queries, strict=True))
+    status, commands = _answers(inner, scenario.control_period, acting[0], queries)
     known = len(status)
     return Recording(
         speeds=acting[0],
@@ -113,17 +113,17 @@ def record(scenario: Scenario) -> Recording:
 
 
 def _answers(
-    law: MPC, period: float, speeds: Array, asked: list[tuple[Array, Array, Array]]
+    law: MPC, period: float, speeds: Array, queries: list[tuple[Array, Array, Array]]
 ) -> tuple[NDArray[np.int64], Array]:
-    """Status (K,) and command (K, 4) of a controller that is asked so from its reset on.
+    """Status (K,) and command (K, 4) of a controller for these queries after its reset.
 
     They end before the first period whose optimum is known as a solver's approximation alone.
     """
     if isinstance(law, UnconstrainedMPC):
-        return np.zeros(len(asked), np.int64), _free_commands(law, asked)
+        return np.zeros(len(queries), np.int64), _free_commands(law, queries)
     law.reset(speeds)
     found: list[tuple[int, Array]] = []
-    for k, (state, acting, reference) in enumerate(asked):
+    for k, (state, acting, reference) in enumerate(queries):
         answer = REFUSED, acting
         with contextlib.suppress(PlanExhaustedError):
             command = law.step(Moment(time=k * period, acting=acting), state, reference)
@@ -137,12 +137,12 @@ def _answers(
     return np.array(status), np.array(commands)
 
 
-def _free_commands(law: UnconstrainedMPC, asked: list[tuple[Array, Array, Array]]) -> Array:
+def _free_commands(law: UnconstrainedMPC, queries: list[tuple[Array, Array, Array]]) -> Array:
     """(K, 4) axis by axis: the one gain of Eq. (24) has lost half its digits at N = 100."""
     problem = with_constraints(law.problem)
     parts, u_bar = axes(problem), problem.model.u_bar
     T, optimum = np.hstack([part.T for part in parts]), FreeOptimum(problem, parts)
     desired = problem.objective.desired
     return np.array(
-        [u_bar + T @ optimum.at(state, desired(path), before - u_bar)[0][:, 0] for state, before, path in asked]
+        [u_bar + T @ optimum.at(state, desired(path), before - u_bar)[0][:, 0] for state, before, path in queries]
     )

@@ -18,7 +18,7 @@ _LETTER: Final = {"double": "d", "float": "f"}
 
 
 class Kind(IntEnum):
-    """What a question asks for."""
+    """The kind of a query."""
 
     START = 0
     """Begin anew after u(-1), the reference its one row throughout."""
@@ -44,7 +44,7 @@ class Line(Protocol):
         ...
 
     def receive(self, count: int) -> bytes:
-        """So many bytes; fewer where the other end has gone, or answers no more."""
+        """`count` bytes; fewer where the other end has closed, or no longer answers."""
         ...
 
 
@@ -102,14 +102,14 @@ class SerialMPC:
             FlightError: no answer came, or none that is whole.
         """
         if not len(self._window):
-            self._ask(time, Kind.START, state, reference[0], self._speeds)
+            self._query(time, Kind.START, state, reference[0], self._speeds)
         if not np.array_equal(self._window[1:], reference[:-1]):
             for row in reference[:-1]:
-                self._ask(time, Kind.ROW, state, row, acting)
+                self._query(time, Kind.ROW, state, row, acting)
         self._window = np.array(reference)
-        return self._ask(time, Kind.STEP, state, reference[-1], acting)
+        return self._query(time, Kind.STEP, state, reference[-1], acting)
 
-    def _ask(self, time: float, kind: Kind, state: Array, row: Array, acting: Array) -> Reply:
+    def _query(self, time: float, kind: Kind, state: Array, row: Array, acting: Array) -> Reply:
         self._number += 1
         self._line.send(self._frames.question(kind, self._number, state, row, acting))
         while True:

@@ -35,7 +35,7 @@ class Actions(Protocol):
     space: Box
 
     def command(self, action: Action, body_rates: Array | None, horizon: int) -> Command:
-        """The command, a plan of so many rows, for an action (4,) at body rates (3,) [rad/s], if these are known."""
+        """The command, a plan of this many rows, for an action (4,) at body rates (3,) [rad/s], if these are known."""
         ...
 
     def of(self, speeds: Array) -> Action:

@@ -54,7 +54,7 @@ class QuadrotorEnv(gymnasium.Env):  # type: ignore[misc]
     is terminated when the vehicle is lost by a criterion of `[lost]`, has crashed, or has diverged; `make_env` and
     `gymnasium.make` truncate it at the scenario's duration.
 
-    `info` tells of each step, and of the start:
+    `info` at each step, and at the start:
 
     - `margins`: signed margin of each constraint at its worst within the step, at the physics rate, in the constraint's
       unit; negative = violated, inf outside its time window.
@@ -179,7 +179,7 @@ class QuadrotorEnv(gymnasium.Env):  # type: ignore[misc]
         self._law = None if scenario.controller_changes else law  # events that change it need the controller itself
         self._flight = start(scenario, self._law)
         self.limits = self._flight.limits
-        self._asked: _Asked | None = None
+        self._queried: _Queried | None = None
         self._seen, plant = self._flight.observation, self._flight.loop.log().plant
         self._truth, self._rotors = plant.state[-1], plant.speeds[-1]
         if self.render_mode == "human":
@@ -197,10 +197,10 @@ class QuadrotorEnv(gymnasium.Env):  # type: ignore[misc]
         flight = self.started
         if flight.done:
             raise ResetNeeded(f"the episode has ended ({flight.loop.reason or 'the scenario is over'}); call reset()")
-        asked, seen = self._asked, self._seen
+        queried, seen = self._queried, self._seen
         command = (
-            asked.command
-            if asked is not None and asked.k == flight.k and np.array_equal(asked.action, action)
+            queried.command
+            if queried is not None and queried.k == flight.k and np.array_equal(queried.action, action)
             else self.actions.command(action, seen.moment.body_rates, flight.loop.controller.horizon)
         )
         nothing = np.full(len(self.limits), np.inf)
@@ -213,7 +213,7 @@ class QuadrotorEnv(gymnasium.Env):  # type: ignore[misc]
             self._truth, self._rotors = state, _ = period.plant.state[-1], period.plant.speeds[-1]
             try:
                 self._seen = flight.loop.observation
-            except FlightError:  # lost: no controller would be asked any more
+            except FlightError:  # lost: no controller would be called any more
                 moment = replace(seen.moment, acting=sample.speeds)
                 rows = seen.preview
                 self._seen = replace(seen, state=state, reference=rows[0], preview=rows[1:], moment=moment)
@@ -224,7 +224,7 @@ class QuadrotorEnv(gymnasium.Env):  # type: ignore[misc]
         return self._vector(self._seen), reward, terminated, False, self._info(*_margins(self.limits, period))
 
     def controller_action(self) -> Action:
-        """What the scenario's own controller would do now, asked once per period.
+        """What the scenario's own controller would do now, computed once per period.
 
         Where that very action is taken next, the controller's command is flown to the bit, with its plan and status:
         such an episode is the flight of `quadsim run`.
@@ -234,29 +234,29 @@ class QuadrotorEnv(gymnasium.Env):  # type: ignore[misc]
             FlightError: the controller has no answer; a flight of its own would end here.
         """
         flight = self.started
-        if self._asked is None or self._asked.k != flight.k:
+        if self._queried is None or self._queried.k != flight.k:
             seen = self._seen
-            self.actions.of(np.zeros(4))  # which those that stand for no speeds refuse
+            self.actions.of(np.zeros(4))  # which those without equivalent speeds refuse
             with ONE_THREAD:
                 command = flight.loop.controller.step(seen.moment, seen.state, seen.preview)
             self.action_for(command)
-        assert self._asked is not None
-        return self._asked.action
+        assert self._queried is not None
+        return self._queried.action
 
     @property
     def controller_status(self) -> str:
-        """The status of what was asked for last; see `quadsim.controller.Command`."""
-        return "" if self._asked is None else self._asked.command.status
+        """The status of the last query; see `quadsim.controller.Command`."""
+        return "" if self._queried is None else self._queried.command.status
 
     def action_for(self, command: Command) -> Action:
-        """The action that stands for a command: taken next, the very command is flown, with its plan and status.
+        """The action equivalent to a command: taken next, that very command is flown, with its plan and status.
 
         Raises:
             ParameterError: actions are thrust and rates.
         """
         low, high = self.action_space.low, self.action_space.high
-        self._asked = _Asked(self.started.k, np.clip(self.actions.of(command.speeds), low, high), command)
-        return self._asked.action
+        self._queried = _Queried(self.started.k, np.clip(self.actions.of(command.speeds), low, high), command)
+        return self._queried.action
 
     def flight(self) -> Flight:
         """This episode so far as a flight: audited, to be saved and drawn like any other."""
@@ -328,7 +328,7 @@ class QuadrotorEnv(gymnasium.Env):  # type: ignore[misc]
 
 
 @dataclass(frozen=True)
-class _Asked:
+class _Queried:
     """What the controller answered in a period."""
 
     k: int
@@ -337,7 +337,7 @@ class _Asked:
 
 
 class OnDemand:
-    """A scenario's controller that is made when it is first asked: agents fly without it."""
+    """A scenario's controller that is made at its first call: agents fly without it."""
 
     def __init__(self, build: Callable[[], Controller], horizon: int) -> None:
         self._build, self.horizon = build, horizon
@@ -345,7 +345,7 @@ class OnDemand:
 
     @property
     def name(self) -> str:
-        """That of the controller; `agent` where it was never asked."""
+        """That of the controller; `agent` where it was never called."""
         return "agent" if self._inner is None else self._inner.name
 
     @property

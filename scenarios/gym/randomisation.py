@@ -22,5 +22,5 @@ def make_plan(scenario: Scenario, campaign: str) -> Plan:
     if data.get("set"):
         merged = merge(tomllib.loads(scenario.to_toml()), data["set"])
         scenario = parse_scenario(merged, source=f"{scenario.name}, as {campaign} sets it")
-    kept: dict[str, Any] = {key: data[key] for key in ("name", "flights", "seed", "sampling", "vary") if key in data}
-    return plan_of(scenario, kept)
+    plan: dict[str, Any] = {key: data[key] for key in ("name", "flights", "seed", "sampling", "vary") if key in data}
+    return plan_of(scenario, plan)

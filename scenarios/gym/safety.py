@@ -19,9 +19,9 @@ from scenarios.schema.robust import RobustSpec
 
 
 class MPCSafetyFilter(gymnasium.Wrapper):  # type: ignore[misc]
-    """Passes an action, or else the nearest one after which the constraints can be kept; see `mpc.robust.filter`.
+    """Passes an action, or else the nearest one after which the constraints can be held; see `mpc.robust.filter`.
 
-    `info["filter"]` tells of each step: `intervened`, `correction` (by how much it changed any rotor's speed at most
+    `info["filter"]` at each step: `intervened`, `correction` (by how much it changed any rotor's speed at most
     [rad/s]), and `fallback` (0 while its QP had an answer; see `quadsim.controller.Command`).  The episode's flight has
     the status `unconstrained` in periods whose action passed.
 
@@ -86,11 +86,11 @@ class MPCSafetyFilter(gymnasium.Wrapper):  # type: ignore[misc]
         self.steps += 1
         self.interventions += intervened
         observed, reward, terminated, truncated, info = self.env.step(self._base.action_for(command))
-        told = {"intervened": intervened, "correction": correction, "fallback": command.fallback}
-        return observed, reward, terminated, truncated, {**info, "filter": told}
+        report = {"intervened": intervened, "correction": correction, "fallback": command.fallback}
+        return observed, reward, terminated, truncated, {**info, "filter": report}
 
     def answer(self, wanted: np.ndarray[Any, np.dtype[np.float64]]) -> Command:
-        """What is flown in this period for wanted rotor speeds (4,) [rad/s]; asked once per period."""
+        """What is flown in this period for wanted rotor speeds (4,) [rad/s]; computed once per period."""
         self._filter.wanted = wanted
         seen, horizon = self._base.started.observation, self._law.horizon
         preview = seen.preview[:horizon]

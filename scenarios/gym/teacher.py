@@ -37,10 +37,10 @@ def expert(
         scenario: it, or its name or file.
         episodes: how many; the first is reset with `seed`, the others without one.
         seed: as of `QuadrotorEnv.reset`.
-        agent: who flies instead of the controller, from an observation to an action; the table still has the
+        agent: flies instead of the controller, from an observation to an action; the table still has the
             controller's actions, as data aggregation (DAgger) wants them, as long as the controller has any.
         out: a Parquet file to write as well, where there is none yet.
-        options: as of `make_env`; actions are deviations where nothing else is said, and cannot be rates.
+        options: as of `make_env`; actions are deviations by default, and cannot be rates.
 
     Returns:
         A row per period: `episode`, `period`, `observation` and `action` (lists of fixed size), and the controller's
@@ -73,10 +73,10 @@ def expert(
                 action = base.controller_action()
             except FlightError:
                 break
-            asked = base.controller_status
+            status = base.controller_status
             seen = observed
             observed, _, terminated, truncated, info = env.step(action if agent is None else agent(seen))
-            values = (episode, period, seen, action, asked, bool(info["constraint_violation"]))
+            values = (episode, period, seen, action, status, bool(info["constraint_violation"]))
             for column, value in zip(rows.values(), values, strict=True):
                 column.append(value)
             ended, period = terminated or truncated, period + 1

@@ -1,8 +1,8 @@
-"""Who may open a session's page: whoever has its address, from this machine, in a page that it served itself.
+"""Access to a session's page: with its address, from this machine, in a page that it served itself.
 
 A browser lets any site connect to servers on the loopback interface, so that each request is checked: `Host` against
 names that a foreign site may have bound to this machine, `Origin` against pages of others, and a token, which stands in
-the address that is printed and is kept as a cookie.
+the address that is printed and is stored as a cookie.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ class Guard:
         return None
 
     def cookie(self, port: int) -> str:
-        """The header that keeps the token in the browser; cookies do not know ports, hence its name."""
+        """The header that keeps the token in the browser; cookies ignore ports, hence its name."""
         return f"{self._name(port)}={self.token}; HttpOnly; SameSite=Strict; Path=/"
 
     @contextmanager

@@ -74,7 +74,7 @@ def _about(knob: Knob, about: str) -> Knob:
 
 
 def _plain(schema: Mapping[str, Any], root: Mapping[str, Any], value: Any) -> tuple[Mapping[str, Any], str]:
-    """A schema without references and alternatives, as far as they tell of a value, and what it is about."""
+    """A schema without references and alternatives, as far as they describe a value, and what it is about."""
     about = schema.get("description", "")
     while True:
         if "$ref" in schema:

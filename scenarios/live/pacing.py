@@ -52,7 +52,7 @@ class Pace:
 
     @property
     def paused(self) -> bool:
-        """Whether it stands still."""
+        """Whether it is paused."""
         return self._paused
 
     @property
@@ -61,7 +61,7 @@ class Pace:
         return self._stopped
 
     def pause(self, paused: bool) -> None:
-        """Stand still, or go on."""
+        """Pause or continue."""
         with self._changed:
             self._paused, self._due = paused, self._now()
             self._flown.clear()

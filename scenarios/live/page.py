@@ -65,7 +65,7 @@ class Page:
     Args:
         session: what is shown.
         pace: what drives it.
-        save: writes the run directory of what has been flown and says where; in the thread that flies.
+        save: writes the run directory of what has been flown and reports where; in the simulation thread.
         host: to listen on.
         port: likewise; 0 for any free one.
         others: controllers by name that may take over.
@@ -397,7 +397,7 @@ class Page:
         return self._take_over(spec, name)
 
     async def _replace(self, fields: Mapping[str, Any], what: str) -> bool:
-        """Build a controller beside the flight and let it take over; where it cannot be built, say why."""
+        """Build a controller beside the flight and let it take over; where it cannot be built, report why."""
         flight = self._session.flights[0]
         try:
             successor = await asyncio.to_thread(flight.successor, fields)
@@ -481,7 +481,7 @@ class Page:
             self._hand_over(min(self._takes, default=None))
 
     def _hand_over(self, driver: int | None) -> None:
-        """Give a client the controls; nobody holds the vehicle, or flies the set-point, any more."""
+        """Give a client the controls; the pull and the manual set-point end."""
         self._session.submit({"type": "pull"}, subject="pull")
         self._fly(np.zeros(3))
         self._driver = driver

@@ -14,7 +14,7 @@ from scenarios.live.session import Session
 
 @dataclass(frozen=True, kw_only=True)
 class Script:
-    """What somebody does.
+    """What a user does.
 
     Attributes:
         duration: of the session [s].

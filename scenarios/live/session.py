@@ -1,4 +1,4 @@
-"""A live session: one queue of inputs, flown period by period, kept as a scenario that flies to the same bits.
+"""A live session: one queue of inputs, flown period by period, saved as a scenario that flies to the same bits.
 
 No clock, no view and no socket in here.  Inputs come from any thread; what happens to the vehicle depends on the
 scenario and on the periods at which they act alone.
@@ -89,7 +89,7 @@ class _Held:
 
 
 class Session:
-    """A flight, or two of the same vehicle by different controllers, and the inputs of whoever takes part.
+    """A flight, or two of the same vehicle by different controllers, and the users' inputs.
 
     Args:
         scenario: what is flown.

@@ -41,7 +41,7 @@ class Reproduced:
 
     @property
     def within(self) -> bool:
-        """Whether ours is as near as the file asks; not, where the flight ended early."""
+        """Whether ours is within the file's tolerance; not, where the flight ended early."""
         if self.difference is None:
             return False
         beyond = {"equal": abs(self.difference), "at most": self.difference, "at least": -self.difference}
@@ -60,8 +60,8 @@ class Reproduced:
     def sentence(self) -> str:
         """The verdict for a report."""
         _, unit, published, ours, difference, tolerance, _ = (cell.text for cell in self.cells())
-        said = f"published {published} {unit}, ours {ours} (difference {difference}, tolerance {tolerance})"
-        return f"{said}: {self.reason}" if self.reason else said
+        text = f"published {published} {unit}, ours {ours} (difference {difference}, tolerance {tolerance})"
+        return f"{text}: {self.reason}" if self.reason else text
 
     def cells(self) -> tuple[Cell, ...]:
         """Its line of the table."""
@@ -111,13 +111,13 @@ class Reproduction:
     def grid(self) -> Grid:
         """The table."""
         paper = self.paper
-        said = ", ".join(filter(None, [paper.authors, paper.publication]))
+        citation = ", ".join(filter(None, [paper.authors, paper.publication]))
         return Grid(
             key=paper.name,
             title=paper.title,
             head=HEAD,
             lines=tuple(number.cells() for number in self.numbers),
-            note=". ".join(filter(None, [said, paper.about])),
+            note=". ".join(filter(None, [citation, paper.about])),
         )
 
 

@@ -1,4 +1,4 @@
-"""Exported C, compiled once and kept by its hash in a cache directory of the user's own."""
+"""Exported C, compiled once and cached by its hash in the user's cache directory."""
 
 from __future__ import annotations
 

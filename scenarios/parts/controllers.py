@@ -126,7 +126,7 @@ def make_polytopes(spec: BoundedSpec | NonlinearSpec) -> tuple[Constraint, ...]:
 
 
 def make_penalty(soft: SoftSpec, rows: int) -> Penalty:
-    """The price of violating each of so many rows."""
+    """The price of violating each of this many rows."""
     return Penalty(l1=np.full(rows, float(soft.linear)), l2=np.full(rows, float(soft.quadratic)))
 
 
@@ -304,7 +304,7 @@ def make_space(
 ) -> Space | None:
     """The half-spaces of obstacles and regions, with further margins (N, 3) [m], at every `stride`-th period's end.
 
-    None where they are not kept.
+    None where they are not recorded.
     """
     if spec.avoidance is None or not shapes:
         return None

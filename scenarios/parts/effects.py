@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 
 
 def moving_air(scenario: Scenario, vehicle: Vehicle) -> Air | None:
-    """The resolved air where it moves at some time of the flight, or None where it stands still throughout.
+    """The resolved air where it moves at some time of the flight, or None where it is still throughout.
 
     Raises:
         ParameterError: there is wind, and nothing that it could push.
@@ -56,7 +56,7 @@ def moving_air(scenario: Scenario, vehicle: Vehicle) -> Air | None:
 
 
 def build_wind(scenario: Scenario, vehicle: Vehicle) -> WindField | None:
-    """The motion of the air, or None where it stands still throughout.
+    """The motion of the air, or None where it is still throughout.
 
     Raises:
         ParameterError: there is wind, and nothing that it could push.
@@ -98,7 +98,7 @@ def _has_fallback(scenario: Scenario) -> bool:
 
 
 def build_changes(scenario: Scenario, events: Sequence[Event] | None = None) -> tuple[Change, ...]:
-    """What happens to rotors, mass and payload on the way, and what pushes the vehicle, in any order.
+    """What happens to rotors, mass and payload in flight, and what pushes the vehicle, in any order.
 
     Args:
         scenario: what is flown.

@@ -65,7 +65,7 @@ def find_code(spec: PluginSpec | ForceSpec) -> Code:
 
 
 def announce(spec: PluginSpec | ForceSpec) -> Code:
-    """Tell what is to run, before it does."""
+    """Report what is to run, before it does."""
     code = find_code(spec)
     LOGGER.info("%s", code)
     return code
@@ -106,10 +106,10 @@ def searched(folders: Sequence[str]) -> Iterator[None]:
         sys.path[:] = before
 
 
-def digest(places: Iterable[Path]) -> str:
+def digest(paths: Iterable[Path]) -> str:
     """SHA-256 of the code, models and scenarios in files and folders."""
     found = hashlib.sha256()
-    for root in places:
+    for root in paths:
         files = [root] if root.is_file() else sorted(root.rglob("*"))
         for path in files:
             if path.suffix in (".py", ".toml", ".xml") and path.is_file():

@@ -87,7 +87,7 @@ class FlightEvents:
             scenario: what is flown.
             vehicle: the modelled vehicle.
             plant: what is flown.
-            navigation: what tells the controller the state.
+            navigation: gives the controller the state.
             reference: what is followed.
             loop: the closed loop; what happens at a period's begin does from then on.
             build: makes a controller; None where the one that flies is one's own, and stays.
@@ -147,12 +147,12 @@ class FlightEvents:
         if k in (0, scenario.periods) or self._loop.reason is not None:
             return scenario
         duration = round(k * scenario.control_period, 9)
-        kept = [event for event in scenario.events if event.at < duration]
+        events = [event for event in scenario.events if event.at < duration]
         for event in scenario.events:
             substitute = None if event.at < duration else neutral(scenario, event)
-            if substitute is not None and substitute not in kept:
-                kept.insert(0, substitute)
-        return scenario.model_copy(update={"duration": duration, "events": kept})
+            if substitute is not None and substitute not in events:
+                events.insert(0, substitute)
+        return scenario.model_copy(update={"duration": duration, "events": events})
 
     def _stamped(self, event: Event | Mapping[str, Any]) -> Event:
         """An event with the time at which it happens, to act from the first period on that is not observed yet."""

@@ -1,4 +1,4 @@
-"""From `[sensors]`, `[estimator]` and the sensors' faults to what tells the controller the state."""
+"""From `[sensors]`, `[estimator]` and the sensors' faults to the state that the controller receives."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _UNITS: Final = {
 
 
 def build_navigation(scenario: Scenario, vehicle: Vehicle) -> Navigation | None:
-    """What tells the controller the state; None where that is the true one.
+    """The source of the controller's state; None where that is the true one.
 
     Args:
         scenario: what is flown.
@@ -50,7 +50,7 @@ def build_navigation(scenario: Scenario, vehicle: Vehicle) -> Navigation | None:
 
 
 def build_faults(scenario: Scenario) -> tuple[SensorFault, ...]:
-    """What befalls the sensors."""
+    """The faults of the sensors."""
     return tuple(
         build_fault(
             event.sensor,
@@ -86,7 +86,7 @@ def build_fault(
         sensor: `position`, `velocity`, `attitude` or `rates`.
         kind: `dropout`, `freeze`, `nan` or `bias`.
         start: [s].
-        duration: [s]; infinite for good.
+        duration: [s]; infinite: permanent.
         axes: of nan, which of `x`, `y`, `z`; all where absent.
         offset: of a bias, by axis: [m], [m/s], [deg] or [deg/s].
     """

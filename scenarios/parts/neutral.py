@@ -1,7 +1,7 @@
-"""What a flight is started with so that more may happen in it than its scenario says.
+"""What a flight is started with so that more may happen in it than in its scenario.
 
 A model is compiled, sensors are sampled and forces are evaluated in one way where something may happen to them, and in
-another where nothing can, with other last bits.  An event that changes nothing tells: it stands in the scenario of a
+another where nothing can, with other last bits.  An event that changes nothing decides: it is in the scenario of a
 live flight and in the one that is saved of it, whether or not anything of its kind happened.
 """
 

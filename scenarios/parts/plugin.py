@@ -208,7 +208,7 @@ def make_law(code: Callable[..., Any], spec: PluginSpec, vehicle: Vehicle, perio
     except InputError:
         raise
     except ValueError as error:
-        raise InputError(f"controller.settings: {attribute} refuses them: {_said(error)}") from error
+        raise InputError(f"controller.settings: {attribute} refuses them: {_reason(error)}") from error
     if not callable(getattr(law, "step", None)):
         rule = f"something with a method step(now, state, reference); {attribute}(...) gave {type(law).__name__}"
         raise ParameterError("controller", "type", spec.type, rule)
@@ -239,7 +239,7 @@ def make_force(code: Callable[..., Any], spec: ForceSpec, vehicle: Vehicle, rng:
     try:
         force = code(given.pop("vehicle"), **given)
     except ValueError as error:
-        raise InputError(f"forces.settings: {attribute} refuses them: {_said(error)}") from error
+        raise InputError(f"forces.settings: {attribute} refuses them: {_reason(error)}") from error
     if not callable(force):
         rule = f"a class with a method __call__(time, state), and {attribute} has none"
         raise ParameterError("forces", "type", spec.type, rule)
@@ -258,7 +258,7 @@ def _import(name: str, module: str, folders: list[str], table: str = "controller
                 f"directory {folders[-1]}, and not installed"
             )
             raise ParameterError(table, "type", name, rule) from None
-        raise InputError(f"{table}.type: module {module!r} cannot be imported: {_said(error)}") from error
+        raise InputError(f"{table}.type: module {module!r} cannot be imported: {_reason(error)}") from error
     _check_origin(module, found, folders, table)
     return found
 
@@ -305,7 +305,7 @@ def _check_call(
     """Refuse settings that code does not take, and code that does not take what all are given."""
     try:
         signature = inspect.signature(factory)
-    except (TypeError, ValueError):  # of compiled code, which does not tell
+    except (TypeError, ValueError):  # of compiled code, which has no signature
         return
     first = always[0]
     parameters = list(signature.parameters.values())
@@ -325,7 +325,7 @@ def _check_call(
         raise InputError(f"{table}.settings: {attribute} cannot be called with them: {error}") from None
 
 
-def _said(error: BaseException) -> str:
+def _reason(error: BaseException) -> str:
     """An exception in one line, with the line of code that it is from."""
     text = " ".join(f"{type(error).__name__}: {error}".split())
     if isinstance(error, SyntaxError):  # which names its line itself

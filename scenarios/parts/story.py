@@ -1,4 +1,4 @@
-"""What happened on the way, in words: for the summary, and so for pages, recordings and films."""
+"""What happened in flight, in words: for the summary, and so for pages, recordings and films."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from scenarios.schema.scenario import Scenario
 
 _MOST: Final = 3
-"""Events of one kind in a row that are told one by one; more of them are told in one."""
+"""Events of one kind in a row that are reported one by one; more of them in one entry."""
 _LONGEST: Final = 200
 _FAULTS: Final = {"dropout": "gives no samples", "freeze": "is frozen", "nan": "gives no numbers", "bias": "is offset"}
 
@@ -38,22 +38,22 @@ _FAULTS: Final = {"dropout": "gives no samples", "freeze": "is frozen", "nan": "
 def story(scenario: Scenario, duration: float) -> list[dict[str, Any]]:
     """`events` of a summary: `time` [s] and `text` of what happened in so long [s], in order of time.
 
-    What changes nothing, as at a live flight's beginning, is not told.
+    What changes nothing, as at a live flight's beginning, is left out.
     """
     events = sorted((event for event in scenario.events if event.at < duration), key=lambda event: event.at)
     happened = [event for event in events if event != neutral(scenario, event)]
-    told = []
+    entries = []
     for _, group in groupby(happened, key=lambda event: event.type):
         alike = list(group)
         if len(alike) <= _MOST:
-            told += [{"time": event.at, "text": _told(event)} for event in alike]
+            entries += [{"time": event.at, "text": _text(event)} for event in alike]
         else:
-            text = f"{len(alike)} times until {alike[-1].at:g} s: {_told(alike[0])} first, {_told(alike[-1])} last"
-            told.append({"time": alike[0].at, "text": text})
-    return told
+            text = f"{len(alike)} times until {alike[-1].at:g} s: {_text(alike[0])} first, {_text(alike[-1])} last"
+            entries.append({"time": alike[0].at, "text": text})
+    return entries
 
 
-def _told(event: Event) -> str:
+def _text(event: Event) -> str:
     return printable("".join(_parts(event)))[:_LONGEST]
 
 

@@ -1,1 +1,1 @@
-"""The scenario file: what it may say, checked field by field; one module per table."""
+"""The scenario file, checked field by field; one module per table."""

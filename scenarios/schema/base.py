@@ -82,7 +82,7 @@ def require_ordered(name: str, pair: Sequence[float]) -> None:
 
 
 def is_deeper(value: Any, levels: int) -> bool:
-    """Whether tables and lists stand within one another more than so many levels deep."""
+    """Whether tables and lists are nested more than this many levels deep."""
     layer = [value]
     for _ in range(levels + 1):
         layer = [

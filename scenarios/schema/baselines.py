@@ -19,7 +19,7 @@ Tilt = Annotated[float, Field(ge=0.1, le=80.0)]
 
 class _BaselineSpec(Spec):
     horizon: Annotated[int, Field(ge=SMALLEST_PREVIEW, le=LARGEST_HORIZON)] = Field(
-        default=10, description="[periods] N, of the reference seen ahead, which tell its velocity and acceleration"
+        default=10, description="[periods] N, of the reference ahead, which give its velocity and acceleration"
     )
     input_bounds: InputBoundsSpec | None = Field(
         default=None,
@@ -40,7 +40,7 @@ class LQRSpec(_BaselineSpec):
         default=None, description="[1/(rad/s)^2] diagonal of Q_u; given where output_weights are"
     )
     heading: bool = Field(default=True, description="whether errors are turned into axes along the present yaw")
-    tilt: Tilt = Field(default=30.0, description="[deg] largest tilt that position errors ask for")
+    tilt: Tilt = Field(default=30.0, description="[deg] largest tilt commanded for position errors")
 
     @model_validator(mode="after")
     def _check(self) -> LQRSpec:

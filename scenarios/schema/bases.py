@@ -1,4 +1,4 @@
-"""`base = "paper-constrained"`: a scenario file that says only how it differs from another one."""
+"""`base = "paper-constrained"`: a scenario file that holds only its differences from another one."""
 
 from __future__ import annotations
 

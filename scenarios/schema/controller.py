@@ -86,7 +86,7 @@ def _law(controller: object) -> str | None:
 
 
 def _spelt_out(controller: Any) -> Any:
-    """A law's name alone as the table that it stands for."""
+    """A law's name alone as its table."""
     if isinstance(controller, str):
         return {"type": controller}
     if not isinstance(
@@ -129,7 +129,7 @@ def changed(spec: ControllerSpec, fields: Mapping[str, Any]) -> ControllerSpec:
     """
     data: dict[str, Any] = {} if "type" in fields else _plain(spec.model_dump(mode="json"))
     for path, value in _leaves(fields):
-        set_field(data, path, value, asked="fields")
+        set_field(data, path, value, source="fields")
     found = {"controller": data}
     try:
         return _Holder.model_validate_json(json.dumps(found)).controller

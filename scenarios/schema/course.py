@@ -66,9 +66,9 @@ class WaypointSpec(Spec):
     """A point to fly to in a straight line at constant speed, and how long to stay there."""
 
     position: Triple = Field(description="[m] x, y, z, world")
-    yaw: Number | None = Field(default=None, description="[deg] yaw there, turned to on the way; that before if absent")
+    yaw: Number | None = Field(default=None, description="[deg] yaw there; the previous one if absent")
     hold: NonNegative = Field(default=0.0, description="[s] how long to stay there")
-    speed: Speed | None = Field(default=None, description="[m/s] on the way there; that of the course if absent")
+    speed: Speed | None = Field(default=None, description="[m/s] of the leg; that of the course if absent")
 
 
 class WaypointsSpec(_StartedSpec):
@@ -120,7 +120,7 @@ class MinimumSnapSpec(_StartedSpec):
 class _LoopSpec(_StartedSpec):
     period: Time | None = Field(default=None, description="[s] of one turn at full speed; either period or speed")
     speed: Speed | None = Field(default=None, description="[m/s] along the path at full speed; either period or speed")
-    turns: Number = Field(default=1.0, description="[-] how many turns; negative: the other way round")
+    turns: Number = Field(default=1.0, description="[-] how many turns; negative: reversed")
     ramp: NonNegative = Field(
         default=5.0, description="[s] over which it gains its speed smoothly, and loses it at the end; 0 for at once"
     )
@@ -264,7 +264,7 @@ class TurnSpec(Spec):
 
     start: NonNegative = Field(description="[s] when it begins; a turn that is not over then ends")
     yaw: Number = Field(description="[deg] where it ends; 360 is a whole turn from 0")
-    rate: Speed = Field(description="[deg/s] how fast it turns, either way")
+    rate: Speed = Field(description="[deg/s] how fast it turns, in either direction")
 
 
 class YawTurnsSpec(_CourseSpec):

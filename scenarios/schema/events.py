@@ -1,4 +1,4 @@
-"""`[[events]]`: what happens on the way, "at t = 12 s rotor 2 loses 20 %"."""
+"""`[[events]]`: what happens in flight, "at t = 12 s rotor 2 loses 20 %"."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class _Event(Spec):
 
 
 class RotorLossEvent(_Event):
-    """A rotor loses thrust, for good or for a while."""
+    """A rotor loses thrust, permanently or for a time."""
 
     type: Literal["rotor_loss"] = Field(description="kind of event: rotor_loss")
     rotor: Annotated[int, Field(ge=1, le=4)] = Field(description="which rotor, 1 to 4")

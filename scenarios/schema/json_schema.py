@@ -1,6 +1,6 @@
 """The scenario file as JSON Schema (Draft 2020-12), for editors: fields, types, ranges, units and meanings.
 
-What no schema can say, such as a period that must be a whole multiple of another, is checked when the file is read.
+What no schema can express, such as a period that must be a whole multiple of another, is checked when the file is read.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ class _SchemaOfToml(GenerateJsonSchema):
     schema_dialect = DIALECT
 
     def field_title_should_be_set(self, schema: Any) -> bool:
-        """Titles such as `Control Period` say no more than the name."""
+        """Titles such as `Control Period` add nothing to the name."""
         return False
 
     def nullable_schema(self, schema: core_schema.NullableSchema) -> dict[str, Any]:
@@ -38,7 +38,7 @@ class _SchemaOfToml(GenerateJsonSchema):
         return self.generate_inner(schema["schema"])
 
     def dataclass_schema(self, schema: core_schema.DataclassSchema) -> dict[str, Any]:
-        """The same with what a settings dataclass says of its fields; see `quadsim.fields`."""
+        """The same with a settings dataclass's description of its fields; see `quadsim.fields`."""
         found, table = super().dataclass_schema(schema), schema["cls"]
         found["description"] = f"{headline(table)}."
         for name, field in fields_of(table).items():
@@ -56,7 +56,7 @@ class _SchemaOfToml(GenerateJsonSchema):
 def scenario_schema() -> dict[str, Any]:
     """The JSON Schema of scenario files, as nested tables; without an identifier, so that it may lie anywhere.
 
-    A file with a `base` says only what differs: of it nothing is required.
+    A file with a `base` holds only what differs: none of its fields is required.
 
     Examples:
         >>> import quadsim
@@ -86,5 +86,5 @@ def _loosened(schema: Any) -> Any:
         return schema.replace(_TABLES, _TABLES + _PARTIAL) if schema.startswith(_TABLES) else schema
     if not isinstance(schema, dict):
         return schema
-    kept = {key: value for key, value in schema.items() if key not in ("required", "discriminator")}
-    return {"anyOf" if key == "oneOf" else key: _loosened(value) for key, value in kept.items()}
+    optional = {key: value for key, value in schema.items() if key not in ("required", "discriminator")}
+    return {"anyOf" if key == "oneOf" else key: _loosened(value) for key, value in optional.items()}

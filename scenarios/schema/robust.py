@@ -34,7 +34,7 @@ class RobustSpec(BoundedSpec):
     heading: bool = Field(default=False, description="whether the hover model is turned by the present yaw")
     largest_turn: Annotated[float, Field(gt=0.0, le=180.0)] = Field(
         default=30.0,
-        description="[deg] how far it is asked to turn at once, from the present yaw or from one period to the next",
+        description="[deg] largest step of the yaw reference, from the present yaw or from one period to the next",
     )
     move_weight: Weight | None = Field(
         default=None, description="[1/(rad/s)^2] diagonal of Q_d, of a command's change from one period to the next"

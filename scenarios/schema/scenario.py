@@ -187,7 +187,7 @@ class Scenario(Spec):
     estimator: EstimatorSpec | None = Field(
         default=None, description="absent: the controller receives the sensors' samples as they arrive"
     )
-    events: Annotated[list[Event], MaxLen(MOST_EVENTS)] = Field(default=[], description="what happens on the way")
+    events: Annotated[list[Event], MaxLen(MOST_EVENTS)] = Field(default=[], description="what happens in flight")
     lost: LostSpec = LostSpec()
     obstacles: Annotated[list[Annotated[AnyObstacle, Field(discriminator="type")]], MaxLen(MOST_ENTRIES)] = Field(
         default=[], description="what the vehicle, a ball of its extent, must not touch: a touch is a crash"
@@ -355,7 +355,7 @@ class Scenario(Spec):
         """
         data = tomllib.loads(self.to_toml())
         for path, value in changes.items():
-            set_field(data, path, value.tolist() if hasattr(value, "tolist") else value, asked="replace")
+            set_field(data, path, value.tolist() if hasattr(value, "tolist") else value, source="replace")
         return Scenario.parse(data, source=self.name)
 
     def to_toml(self) -> str:

@@ -25,11 +25,11 @@ def apply_setting(data: dict[str, Any], setting: str) -> None:
     value = _parse_value(text.strip())
     if len(keys) > DEEPEST or is_deeper(value, DEEPEST):
         raise ParameterError("", "--set", setting[:100], f"of at most {DEEPEST} tables and lists within one another")
-    set_field(data, path.strip(), value, asked="--set", given=setting)
+    set_field(data, path.strip(), value, source="--set", given=setting)
 
 
-def set_field(data: dict[str, Any], path: str, value: Any, *, asked: str, given: str | None = None) -> None:
-    """Replace or add a field; tables on the way that are absent are made.
+def set_field(data: dict[str, Any], path: str, value: Any, *, source: str, given: str | None = None) -> None:
+    """Replace or add a field; missing tables on the path are added.
 
     An entry of a list of tables is addressed by its name, as in `constraints.roll.upper`, or, where it has none, by its
     index, as in `events.0.at`; a number of a list by its index, as in `initial.euler.2`.
@@ -38,7 +38,7 @@ def set_field(data: dict[str, Any], path: str, value: Any, *, asked: str, given:
         data: the tables, changed in place.
         path: dotted.
         value: of TOML; None for a field that is to be absent.
-        asked: who asks, for the message.
+        source: of the request, for the message.
         given: what was given, for the message; the path where absent.
 
     Raises:
@@ -46,13 +46,13 @@ def set_field(data: dict[str, Any], path: str, value: Any, *, asked: str, given:
         UnknownNameError: a list has no such entry.
     """
     *through, last = path.split(".")
-    holder = _holder(data, through, asked=asked, given=given or path)
+    holder = _holder(data, through, source=source, given=given or path)
     if isinstance(holder, dict) and value is None:
         holder.pop(last, None)
     elif isinstance(holder, dict):
         holder[last] = value
     else:
-        _require_numbers(holder, path, asked=asked, given=given or path)
+        _require_numbers(holder, path, source=source, given=given or path)
         holder[_index(holder, ".".join(through), last)] = value
 
 
@@ -63,14 +63,14 @@ def get_field(data: dict[str, Any], path: str) -> Any:
         ParameterError, UnknownNameError: as `set_field`.
     """
     *through, last = path.split(".")
-    holder = _holder(data, through, asked="field", given=path)
+    holder = _holder(data, through, source="field", given=path)
     if isinstance(holder, dict):
         return holder.get(last)
-    _require_numbers(holder, path, asked="field", given=path)
+    _require_numbers(holder, path, source="field", given=path)
     return holder[_index(holder, ".".join(through), last)]
 
 
-def _holder(data: dict[str, Any], through: list[str], *, asked: str, given: str) -> dict[str, Any] | list[Any]:
+def _holder(data: dict[str, Any], through: list[str], *, source: str, given: str) -> dict[str, Any] | list[Any]:
     """The table or list at the end of a path."""
     held: Any = data
     for depth, key in enumerate(through):
@@ -79,7 +79,7 @@ def _holder(data: dict[str, Any], through: list[str], *, asked: str, given: str)
         else:
             held = held.setdefault(key, {})
         if not isinstance(held, dict | list) or held == []:
-            raise ParameterError("", asked, given, f"a path to a field; {key} has none")
+            raise ParameterError("", source, given, f"a path to a field; {key} has none")
     return held
 
 
@@ -91,10 +91,10 @@ def _index(entries: list[Any], where: str, key: str) -> int:
     return names.index(key)
 
 
-def _require_numbers(entries: list[Any], path: str, *, asked: str, given: str) -> None:
+def _require_numbers(entries: list[Any], path: str, *, source: str, given: str) -> None:
     """Refuse a path that ends at an entry which is a table."""
     if any(isinstance(entry, dict | list) for entry in entries):
-        raise ParameterError("", asked, given, f"a path to a field; {path} is an entry of a list")
+        raise ParameterError("", source, given, f"a path to a field; {path} is an entry of a list")
 
 
 def _parse_value(text: str) -> Any:

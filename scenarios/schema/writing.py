@@ -172,7 +172,7 @@ def _type_first(field: tuple[str, FieldInfo]) -> bool:
 
 
 def _labelled(name: str, info: FieldInfo) -> str:
-    """A field's name, and of one that tells kinds apart its value too."""
+    """A field's name, and of one that distinguishes types its value too."""
     choices = get_args(info.annotation) if get_origin(info.annotation) is Literal else ()
     return f'{name} = "{choices[0]}"' if name == "type" and len(choices) == 1 else name
 

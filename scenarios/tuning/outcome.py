@@ -100,7 +100,7 @@ def _gain(search_start: float, search_best: float, start: Array, best: Array, st
     fresh_start, fresh_best = of(start[both]), of(best[both])
     paired = paired_difference(start[both], best[both])
     promised = (search_best - search_start) / abs(search_start) if search_start else None
-    kept = (fresh_best - fresh_start) / abs(fresh_start) if fresh_start else None
+    confirmed = (fresh_best - fresh_start) / abs(fresh_start) if fresh_start else None
     return {
         "fresh_start": fresh_start,
         "fresh_best": fresh_best,
@@ -109,8 +109,8 @@ def _gain(search_start: float, search_best: float, start: Array, best: Array, st
         "lower": paired.lower,
         "upper": paired.upper,
         "promised": promised,
-        "kept": kept,
-        "optimism": None if promised is None or kept is None else kept - promised,
+        "kept": confirmed,
+        "optimism": None if promised is None or confirmed is None else confirmed - promised,
     }
 
 

@@ -99,7 +99,7 @@ class TuningPlan:
         return Plan(self.spec.campaign.model_copy(update=changes), self.candidate(values, name))
 
     def identity(self, candidate: int, values: Values) -> dict[str, Any]:
-        """The columns that tell a candidate from the others."""
+        """The columns that identify a candidate."""
         shown = values or self.start_values
         searched = {SEARCHED + entry.name: shown.get(entry.name) for entry in self.spec.search}
         return {
@@ -180,9 +180,7 @@ def make_tuning(data: Mapping[str, Any], path: Path) -> TuningPlan:
     filled = dict(data)
     if isinstance(campaign := data.get("campaign"), dict):
         flights = data.get("flights") or TuningSpec.model_fields["flights"].default
-        most = (
-            flights[-1] if isinstance(flights, list) else flights
-        )  # what is wrong with it is told of the tuning's own
+        most = flights[-1] if isinstance(flights, list) else flights  # errors name the tuning's
         filled["campaign"] = {"name": "tuned", "flights": most if isinstance(most, int) else 1, **campaign}
     try:
         spec = TuningSpec.model_validate(filled)

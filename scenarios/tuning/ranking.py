@@ -27,7 +27,7 @@ UNKNOWN: Final = 1e9  # an objective of a candidate that completed no flight
 
 @dataclass(frozen=True, kw_only=True)
 class Score:
-    """What a candidate's flights say of it."""
+    """The results of a candidate's flights."""
 
     candidate: int
     flights: int  # that it flew

@@ -84,17 +84,17 @@ def tune(
     report: bool = True,
     watch: Watch = lambda standing: None,
 ) -> TuningResult:
-    """Search, or go on with it, and hold the answer against the start.
+    """Search, or continue it, and hold the answer against the start.
 
-    The same file gives the same answer, whoever flies, in whatever order, interrupted or not.  Beside `ALL_FILES`, the
+    The same file gives the same answer with any workers and order, interrupted or not.  Beside `ALL_FILES`, the
     directory has the campaigns on fresh draws, `start/` and `candidate-N/`, their `comparison/`, and of two objectives
     `front-N.toml` for each point of the Pareto front.
 
     Args:
         plan: the tuning.
         directory: where its results go.
-        engine: who flies.
-        resume: whether to go on with what the directory holds, perhaps with more trials.
+        engine: flies them.
+        resume: whether to continue what the directory holds, perhaps with more trials.
         report: whether to write the pages and their figures.
         watch: called with the progress, as answers come.
 
@@ -107,7 +107,7 @@ def tune(
     session: dict[str, Any] = {"engine": engine.name, "workers": engine.workers, "flights": 0, "wall_s": None}
     going_on = (directory / MANIFEST_FILE).is_file()
     if going_on and not resume:
-        raise OutputError(directory, "a tuning is already there; go on with it by --resume, or choose another --out")
+        raise OutputError(directory, "a tuning is already there; continue it with --resume, or choose another --out")
     with growing(directory, KIND) as files:
         files.require(ALL_FILES)
         manifest = _go_on(plan, files) if going_on else _begin(plan)
@@ -153,7 +153,7 @@ class _Flights:
         self._total = plan.most + plan.spec.trials // plan.spec.batch * per_batch
 
     def fly(self, candidates: Mapping[int, Values], flights: int) -> None:
-        """Have candidates fly the first so many draws, but for those that they have flown."""
+        """Have candidates fly their first draws, except those already flown."""
         numbers = [c * self._plan.most + draw for c in candidates for draw in range(flights)]
         missing = [number for number in numbers if number not in self._rows]
         if not missing:
@@ -167,7 +167,7 @@ class _Flights:
                     self.flown += 1
                     if clock.perf_counter() - self._flushed > FLUSH_S:
                         self._flush(waiting)
-                    self._tell()
+                    self._report()
         finally:
             self._flush(waiting)
 
@@ -192,7 +192,7 @@ class _Flights:
         self._store.append(waiting)
         waiting.clear()  # not before: by Ctrl-C it is appended once more, to the same file
 
-    def _tell(self) -> None:
+    def _report(self) -> None:
         rate = self.flown / max(clock.perf_counter() - self._started, 1e-9)
         failed = sum(bool(row["failed"]) for row in self._rows.values())
         self._watch(Standing(flown=len(self._rows), flights=self._total, failed=failed, rate=rate))
@@ -208,7 +208,7 @@ def _search(plan: TuningPlan, search: Search, flights: _Flights) -> None:
     """All batches, each by successive halving: all its candidates fly a few draws, the best of them go on to more."""
     flights.fly({START: {}}, plan.most)
     search.begin(flights.scores([START])[0])
-    while search.unfinished or search.asked <= plan.spec.trials:
+    while search.unfinished or search.proposed <= plan.spec.trials:
         batch = search.ask()
         going_on = list(batch)
         for number, candidates in zip(plan.spec.flights, _halving(plan), strict=True):
@@ -309,7 +309,7 @@ def _go_on(plan: TuningPlan, files: Growing) -> dict[str, Any]:
         differing.append("trials")
     if differing:
         raise InputError(
-            f"{files.path}: --resume goes on with the same tuning alone, and its {', '.join(differing)} differs from "
+            f"{files.path}: --resume needs the same tuning, and its {', '.join(differing)} differs from "
             "the one there; more trials and more fresh flights may follow; choose another --out"
         )
     other = [name for name in records.other_than_flew(manifest, plan.start) if name != "machine"]
@@ -317,7 +317,7 @@ def _go_on(plan: TuningPlan, files: Growing) -> dict[str, Any]:
         other.append("optuna")
     if other:
         raise InputError(
-            f"{files.path}: --resume goes on with the same code alone, and this one differs from what began it "
+            f"{files.path}: --resume needs the same code, and this one differs from what began it "
             f"({', '.join(other)}); choose another --out"
         )
     return {**manifest, "status": "running"}

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from scenarios.tuning.plan import TuningPlan, Values
 
 JOURNAL_FILE: Final = "journal.log"
-_LEAST: Final = 4  # feasible trials from which importance is told
+_LEAST: Final = 4  # fewest feasible trials for importances
 
 
 def require_optuna() -> Any:
@@ -73,7 +73,7 @@ class Search:
         self._space = {entry.name: _distribution(optuna, entry) for entry in plan.spec.search}
 
     @property
-    def asked(self) -> int:
+    def proposed(self) -> int:
         """Candidates that were proposed, with the start."""
         return len(self._study.get_trials(deepcopy=False))
 
@@ -84,7 +84,7 @@ class Search:
 
     def begin(self, score: Score) -> None:
         """Let the search know the start, if its values are within the ranges."""
-        if self.asked:
+        if self.proposed:
             return
         params = self._start_parameters()
         with _quiet():
@@ -101,17 +101,17 @@ class Search:
     def ask(self) -> dict[int, Values]:
         """A batch of candidates, by their numbers: the one that is not scored yet, or a new one.
 
-        The same study is asked in the same way, whatever process asks: each batch has a sampler with a seed of its own.
+        The same study gives the same batch in any process: each batch has a sampler with its own seed.
         """
         running = [trial for trial in self._study.get_trials(deepcopy=False) if not trial.state.is_finished()]
         if running:
             return {trial.number: self._values(trial) for trial in running}
         with _quiet():
             self._study.sampler = self._sampler()
-            asked = [self._study.ask(self._space) for _ in range(self._plan.spec.batch)]
+            proposed = [self._study.ask(self._space) for _ in range(self._plan.spec.batch)]
         self._write()
         trials = self._study.get_trials(deepcopy=False)
-        return {trial.number: self._values(trials[trial.number]) for trial in asked}
+        return {trial.number: self._values(trials[trial.number]) for trial in proposed}
 
     def tell(self, scores: Sequence[Score]) -> None:
         """The scores of a batch."""
@@ -123,7 +123,7 @@ class Search:
 
     def _sampler(self) -> Any:
         """One for the next batch, with a seed of that batch."""
-        seed = np.random.SeedSequence([self._plan.spec.seed, self.asked]).generate_state(1)
+        seed = np.random.SeedSequence([self._plan.spec.seed, self.proposed]).generate_state(1)
         return self._optuna.samplers.TPESampler(
             seed=int(seed[0]),
             multivariate=True,
@@ -138,7 +138,7 @@ class Search:
         return {START: {}, **{trial.number: self._values(trial) for trial in trials if trial.number != START}}
 
     def importance(self, scores: Sequence[Score], objective: int) -> dict[str, float]:
-        """How much of what tells good candidates from the others is each field's, by name; empty of too few.
+        """The share of each field, by name, in what distinguishes good candidates; empty for too few.
 
         Source: Watanabe, Bansal and Hutter, PED-ANOVA, IJCAI 2023, over the feasible candidates.
         """
@@ -218,22 +218,22 @@ def _read(files: Growing) -> list[Mapping[str, Any]]:
 
 
 def _journal(logs: list[Mapping[str, Any]]) -> Any:
-    """A back end of Optuna's journal storage that keeps its entries in a list."""
+    """A back end of Optuna's journal storage with its entries in a list."""
     from optuna.storages.journal import BaseJournalBackend
 
-    class Kept(BaseJournalBackend):  # type: ignore[misc]
+    class InMemory(BaseJournalBackend):  # type: ignore[misc]
         def read_logs(self, log_number_from: int) -> Iterable[dict[str, Any]]:
             return [dict(log) for log in logs[log_number_from:]]
 
         def append_logs(self, entries: list[dict[str, Any]]) -> None:
             logs.extend(json.loads(json.dumps(entry)) for entry in entries)
 
-    return Kept()
+    return InMemory()
 
 
 @contextlib.contextmanager
 def _quiet() -> Iterator[None]:
-    """What Optuna says of itself, that a part is experimental say, is for its developers."""
+    """Suppress Optuna's notices, such as those on experimental parts."""
     logger = logging.getLogger("optuna")
     level = logger.level
     logger.setLevel(logging.ERROR)

@@ -114,14 +114,14 @@ class TuningSpec(Spec):
                 raise ValueError(f"search.{entry.name}.weights must be absent: nothing is drawn")
         check_fields(self.search, "search", {field: each.name for each in self.campaign.vary for field in each.fields})
         try:
-            asked = parse_requirement(self.require)
+            required = parse_requirement(self.require)
         except InputError as error:
             raise ValueError(f"require: {error}") from error
         try:
-            parse_event(self.guard or asked.event.text)
+            parse_event(self.guard or required.event.text)
         except InputError as error:
             raise ValueError(f"guard: {error}") from error
-        if not asked.at_most:
+        if not required.at_most:
             raise ValueError(f"require must keep a probability small, with < or <=; got {self.require!r}")
         return self
 

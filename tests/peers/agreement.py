@@ -27,9 +27,9 @@ HEAD: Final = (
     "complementarity",
 )
 SLOW: Final = {"osqp": 10, "highs": 10}
-"""Solvers that are asked every so many periods only; they take 0.1 s and more for each."""
+"""Solvers that are called every so many periods only; they take 0.1 s and more for each."""
 MAY_FAIL: Final = frozenset(SLOW)
-"""Solvers that give up on some of the QPs, and say so."""
+"""Solvers that give up on some of the QPs, and report it."""
 ALLOWED_DIFFERENCE, ALLOWED_RESIDUAL = 1e-3, 1e-2
 """Of what a solver calls solved: its first input from the reference [rad/s], and its worst KKT residual."""
 
@@ -40,14 +40,14 @@ class Verdict:
 
     Attributes:
         solver: its name in `SOLVERS`.
-        asked: number of QPs.
+        queried: number of QPs.
         failures: how many it did not call solved.
         difference: its first inputs from the reference, the largest over rotors and QPs [rad/s].
         residuals: of its solutions, in the units of the QP it was given.
     """
 
     solver: str
-    asked: int
+    queried: int
     failures: int
     difference: float
     residuals: KKTResiduals
@@ -60,7 +60,7 @@ class Verdict:
         return (
             f"`{self.solver}`",
             versioned(SOLVERS[self.solver].package),
-            str(self.asked),
+            str(self.queried),
             str(self.failures),
             *(f"{figure:.1e}" for figure in figures),
         )
@@ -68,7 +68,7 @@ class Verdict:
     @property
     def checks(self) -> tuple[Check, ...]:
         """Its first inputs and its residuals, and its failures unless they are its habit."""
-        name, peer = f"`{self.solver}`, {self.asked} QPs", SOLVERS[self.solver].package
+        name, peer = f"`{self.solver}`, {self.queried} QPs", SOLVERS[self.solver].package
         checks = (
             Check(
                 what=f"{name}: first input",
@@ -87,7 +87,7 @@ class Verdict:
 
 
 def measure(name: str, problem: Problem, queries: Sequence[Query], reference: Array) -> Verdict:
-    """Ask one solver, every period or, of `SLOW` ones, every so many.
+    """Call one solver, every period or, of `SLOW` ones, every so many.
 
     Args:
         name: in `SOLVERS`.
@@ -96,9 +96,9 @@ def measure(name: str, problem: Problem, queries: Sequence[Query], reference: Ar
         reference: (K, 4) first inputs to compare with [rad/s].
     """
     solver, every = QPSolver(name, problem), SLOW.get(name, 1)
-    asked, expected_inputs = queries[::every], reference[::every]
+    queried, expected_inputs = queries[::every], reference[::every]
     differences, residuals = [], []
-    for query, expected in zip(asked, expected_inputs, strict=True):
+    for query, expected in zip(queried, expected_inputs, strict=True):
         answer = solver.solve(query.state, query.desired, query.u_before)
         if answer.solution.status != SOLVED:
             continue
@@ -107,8 +107,8 @@ def measure(name: str, problem: Problem, queries: Sequence[Query], reference: Ar
         differences.append(np.abs(answer.plan[0] - expected).max())
     return Verdict(
         solver=name,
-        asked=len(asked),
-        failures=len(asked) - len(residuals),
+        queried=len(queried),
+        failures=len(queried) - len(residuals),
         difference=float(np.max(differences, initial=0.0)),
         residuals=KKTResiduals(
             stationarity=_worst([each.stationarity for each in residuals]),

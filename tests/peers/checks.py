@@ -1,4 +1,4 @@
-"""A comparison with software nobody here wrote, as a value: what was measured, and what is allowed.
+"""A comparison with software that others wrote, as a value: what was measured, and what is allowed.
 
 A row of a page is today's when it has today's versions and, where rounding decides the digits, today's magnitudes.
 """

@@ -43,18 +43,18 @@ def hold(record_property: Callable[[str, object], None]) -> Callable[[Check], No
 
 
 @pytest.fixture
-def told(page: str) -> Callable[[tuple[str, ...]], None]:
+def on_page(page: str) -> Callable[[tuple[str, ...]], None]:
     """Fail if the page does not have a row, with today's versions and magnitudes."""
 
-    def told_one(row: tuple[str, ...]) -> None:
+    def row_on_page(row: tuple[str, ...]) -> None:
         assert outdated(row, page) is None, f"{PAGE.name} is out of date: make verification"
 
-    return told_one
+    return row_on_page
 
 
 @pytest.fixture(scope="session")
 def recording() -> tuple[Problem, tuple[Query, ...]]:
-    """What the controller was asked in the paper's constrained flight."""
+    """What the controller was given in the paper's constrained flight."""
     return recorded.record()
 
 

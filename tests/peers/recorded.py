@@ -1,4 +1,4 @@
-"""What the constrained controller was asked in the paper's flight."""
+"""What the constrained controller was given in the paper's flight."""
 
 from __future__ import annotations
 
@@ -39,13 +39,13 @@ def record() -> tuple[Problem, tuple[Query, ...]]:
     flight = fly_scenario(load_scenario(SCENARIO))
     log = flight.log.control
     problem = build_problem(flight.scenario, flight.vehicle)
-    asked = recorded(flight.scenario, log, problem.horizon)
-    desired = problem.objective.desired(asked.reference)
+    queried = recorded(flight.scenario, log, problem.horizon)
+    desired = problem.objective.desired(queried.reference)
     queries = tuple(
         Query(
-            state=asked.state[k],
+            state=queried.state[k],
             desired=desired[k + 1 : k + 1 + problem.horizon],
-            u_before=asked.speeds_before[k],
+            u_before=queried.speeds_before[k],
             status=log.status[k],
             speeds=log.speeds[k],
         )

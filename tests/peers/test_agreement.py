@@ -22,14 +22,14 @@ def test_what_a_solver_calls_solved_is_optimal(
     queries: tuple[Query, ...],
     against_qpmpc: ConstrainedQP,
     hold: Callable[[Check], None],
-    told: Callable[[tuple[str, ...]], None],
+    on_page: Callable[[tuple[str, ...]], None],
 ) -> None:
     verdict = agreement.measure(name, problem, queries, against_qpmpc.speeds)
-    assert verdict.failures < verdict.asked, "it solved nothing"
+    assert verdict.failures < verdict.queried, "it solved nothing"
     for check in verdict.checks:
         hold(check)
     if name not in agreement.MAY_FAIL:
-        told(verdict.row)
+        on_page(verdict.row)
 
 
 def test_a_wrong_reference_is_seen(problem: Problem, queries: tuple[Query, ...], against_qpmpc: ConstrainedQP) -> None:

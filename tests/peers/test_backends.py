@@ -16,7 +16,7 @@ from scenarios.commands import EXIT_DONE
 
 
 @pytest.mark.parametrize("name", SOLVERS)
-def test_an_infeasible_qp_is_said_to_be_and_harms_no_later_one(name: str, capfd: pytest.CaptureFixture[str]) -> None:
+def test_an_infeasible_qp_is_reported_and_harms_no_later_one(name: str, capfd: pytest.CaptureFixture[str]) -> None:
     problem = paper_problem()
     solver = QPSolver(name, problem)
     tilted = np.zeros(12)
@@ -51,7 +51,7 @@ def test_nothing_in_a_first_solve_is_printed(name: str, capfd: pytest.CaptureFix
     assert capfd.readouterr() == ("", "")
 
 
-def test_what_highs_says_from_c_is_not_heard(capfd: pytest.CaptureFixture[str]) -> None:
+def test_output_of_highs_from_c_is_suppressed(capfd: pytest.CaptureFixture[str]) -> None:
     """Its QP solver prints `error` now and then, not each time on the same data."""
     libc = ctypes.CDLL(None)
     with hushed():

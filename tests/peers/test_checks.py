@@ -1,4 +1,4 @@
-"""A check that does not hold, and a page that is out of date, are told."""
+"""A check that does not hold, and a page that is out of date, are reported."""
 
 from __future__ import annotations
 

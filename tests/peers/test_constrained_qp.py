@@ -19,13 +19,13 @@ from quadsim.errors import ParameterError
 
 
 def test_first_inputs_are_the_same(
-    against_qpmpc: ConstrainedQP, hold: Callable[[Check], None], told: Callable[[tuple[str, ...]], None]
+    against_qpmpc: ConstrainedQP, hold: Callable[[Check], None], on_page: Callable[[tuple[str, ...]], None]
 ) -> None:
     assert against_qpmpc.differences.size == 1200
     assert against_qpmpc.constrained.sum() > 300, "hardly a constraint is active: little is compared"
     for check in against_qpmpc.checks:
         hold(check)
-        told(check.row)
+        on_page(check.row)
 
 
 def test_the_shortcut_was_taken_where_no_constraint_is_active(
@@ -35,12 +35,12 @@ def test_the_shortcut_was_taken_where_no_constraint_is_active(
     np.testing.assert_array_equal(~against_qpmpc.constrained, taken)
 
 
-def test_the_page_tells_how_many_are_constrained(against_qpmpc: ConstrainedQP, page: str) -> None:
+def test_the_page_shows_how_many_are_constrained(against_qpmpc: ConstrainedQP, page: str) -> None:
     assert f"In {against_qpmpc.constrained.sum()} of the {against_qpmpc.differences.size} periods" in page
 
 
 def test_a_reference_one_sample_late_is_seen(problem: Problem, queries: tuple[Query, ...]) -> None:
-    """The index of the targets, which a constant reference would not tell."""
+    """The index of the targets, which a constant reference would not show."""
     peer, ours = QpmpcController(problem), QPSolver(OURS, problem)
     late = [replace(query, desired=np.roll(query.desired, 1, axis=0)) for query in queries[::100]]
     differences = [

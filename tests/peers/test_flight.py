@@ -16,12 +16,12 @@ def measured() -> ClosedLoop:
 
 
 def test_the_whole_flight_is_the_same(
-    measured: ClosedLoop, hold: Callable[[Check], None], told: Callable[[tuple[str, ...]], None]
+    measured: ClosedLoop, hold: Callable[[Check], None], on_page: Callable[[tuple[str, ...]], None]
 ) -> None:
     assert (measured.mujoco.reason, measured.rotorpy.reason) == (None, None)
     assert measured.rotorpy.control.t.size == measured.scenario.periods
     for check in measured.checks:
         hold(check)
-        told(check.row)
+        on_page(check.row)
     for row in measured.rows:
-        told(row)
+        on_page(row)

@@ -17,13 +17,13 @@ def measured() -> tuple[Comparison, ...]:
 
 
 def test_gain_is_that_of_both_lqrs(
-    measured: tuple[Comparison, ...], hold: Callable[[Check], None], told: Callable[[tuple[str, ...]], None]
+    measured: tuple[Comparison, ...], hold: Callable[[Check], None], on_page: Callable[[tuple[str, ...]], None]
 ) -> None:
     for comparison in measured:
-        told(comparison.row)
+        on_page(comparison.row)
         for check in comparison.checks:
             hold(check)
-            told(check.row)
+            on_page(check.row)
 
 
 def test_gain_tends_to_that_of_the_infinite_horizon(measured: tuple[Comparison, ...]) -> None:

@@ -23,17 +23,17 @@ def measured(vehicle: Vehicle) -> OpenLoop:
 
 
 def test_both_plants_fly_the_same(
-    measured: OpenLoop, hold: Callable[[Check], None], told: Callable[[tuple[str, ...]], None], page: str
+    measured: OpenLoop, hold: Callable[[Check], None], on_page: Callable[[tuple[str, ...]], None], page: str
 ) -> None:
     assert np.degrees(measured.tilt) > 90.0, "the vehicle stays upright: little of the dynamics is compared"
     assert f"tilts by up to {np.degrees(measured.tilt):.0f} deg" in page
     for check in measured.checks:
         hold(check)
-        told(check.row)
+        on_page(check.row)
 
 
 def test_the_difference_is_of_fourth_order_in_mujocos_step(
-    measured: OpenLoop, told: Callable[[tuple[str, ...]], None]
+    measured: OpenLoop, on_page: Callable[[tuple[str, ...]], None]
 ) -> None:
     """What is left is our integrator's error, and no other model: halving the step divides it by 16."""
     steps = np.log(open_loop.TIMESTEPS)
@@ -41,7 +41,7 @@ def test_the_difference_is_of_fourth_order_in_mujocos_step(
         errors = np.log([getattr(difference, name) for difference in measured.differences])
         np.testing.assert_allclose(np.diff(errors) / np.diff(steps), 4.0, atol=0.3)
     for row in measured.rows:
-        told(row)
+        on_page(row)
 
 
 def test_a_wrong_inertia_is_seen(measured: OpenLoop) -> None:

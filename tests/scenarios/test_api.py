@@ -173,7 +173,7 @@ def test_it_is_drawn(flight: Flight) -> None:
 
 
 def test_a_saved_flight_is_the_run_that_the_command_writes(flight: Flight, tmp_path: Path) -> None:
-    """The same bytes of Parquet; read again it says the same."""
+    """The same bytes of Parquet; read again it is the same."""
     flight.save(tmp_path / "saved", video=False, recording=False, figures=False)
     quadsim.fly(flight.scenario, out=tmp_path / "run", video=False, recording=False, figures=False, progress=False)
     for name in ("flight.parquet", "plant.parquet", "horizon.parquet", "scenario.toml"):
@@ -189,7 +189,7 @@ def test_a_saved_flight_is_the_run_that_the_command_writes(flight: Flight, tmp_p
         read.save(tmp_path / "again")
 
 
-def test_ones_own_law_flies(hover: Scenario) -> None:
+def test_a_custom_law_flies(hover: Scenario) -> None:
     by_function = quadsim.fly(hover, controller=hover_law, progress=False)
     assert by_function.controller == "hover_law"
     assert by_function.scenario.controller.type == f"{__name__}:hover_law"
@@ -210,7 +210,7 @@ def test_a_law_from_a_file_flies_the_same(hover: Scenario, monkeypatch: pytest.M
     monkeypatch.syspath_prepend(str(EXAMPLES))
     law = importlib.import_module("my_controller").MyController
     passed = quadsim.fly(hover, controller=law, progress=False)
-    named = quadsim.fly(passed.scenario, progress=False)  # its file alone says who flew
+    named = quadsim.fly(passed.scenario, progress=False)  # from its file alone
     assert np.array_equal(passed.command, named.command)
 
 
@@ -246,7 +246,7 @@ class Jerks:
         return np.array([0.0, 0.0, self.share * self.weight * self.rng.standard_normal(), 0.0, 0.0, 0.0])
 
 
-def test_ones_own_force_acts(hover: Scenario) -> None:
+def test_a_custom_force_acts(hover: Scenario) -> None:
     """As the same constant force from a scenario's file, to rounding; recorded with the plant's wrench."""
     free = hover.replace({"controller": {"type": "pid"}})
     pushed = quadsim.fly(free, forces=[functools.partial(pull, newton=0.7)], progress=False)
@@ -321,7 +321,7 @@ def test_a_sweep_flies_every_combination(hover: Scenario) -> None:
         quadsim.sweep(hover, {"controller.horizon": [0]}, workers=1)
 
 
-def test_ones_own_law_is_sent_to_other_processes_by_its_place(
+def test_a_custom_law_is_sent_to_other_processes_by_its_place(
     hover: Scenario, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     source = "import numpy as np\ndef steady(now, state, reference, speed=210.0):\n    return np.full(4, speed)\n"

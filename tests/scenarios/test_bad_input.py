@@ -29,7 +29,7 @@ def event(kind: str, rest: str = "") -> str:
     return f"events=[{{type='{kind}', at=1{rest and ', '}{rest}}}]"
 
 
-# Given by --set on hover: the message, in which @ stands for anything.
+# Given by --set on hover: the message; @ matches anything.
 WRONG: list[tuple[str, str | list[str], str]] = [
     # rotors
     ("no lag", "effects.rotors.rise=0", "effects.rotors.rise must be > 0.0; got 0"),
@@ -306,13 +306,13 @@ WRONG: list[tuple[str, str | list[str], str]] = [
 def test_what_cannot_be_flown_is_refused_when_it_is_read(given: str | list[str], message: str) -> None:
     with pytest.raises(InputError) as caught:
         load_scenario("hover", [given] if isinstance(given, str) else given)
-    assert_says(str(caught.value).removeprefix("hover.toml: "), message)
+    assert_message(str(caught.value).removeprefix("hover.toml: "), message)
     assert caught.value.exit_status == 2
 
 
-def assert_says(said: str, message: str) -> None:
-    """Hold what was said against a message in which @ stands for anything on its line."""
-    assert re.fullmatch(".*".join(map(re.escape, message.split("@"))), said), said
+def assert_message(error: str, message: str) -> None:
+    """Compare an error with a message in which @ matches anything on its line."""
+    assert re.fullmatch(".*".join(map(re.escape, message.split("@"))), error), error
 
 
 # --- files ---------------------------------------------------------------------------------------------------------
@@ -356,14 +356,14 @@ def test_a_file_that_cannot_be_flown_is_refused(tmp_path: Path, text: str, messa
     path.write_text(text)
     with pytest.raises(InputError) as caught:
         load_scenario(str(path))
-    assert_says(str(caught.value), message)
+    assert_message(str(caught.value), message)
 
 
 def test_a_misspelt_base_is_guessed(tmp_path: Path) -> None:
     (tmp_path / "x.toml").write_text('bas = "hover"')
     with pytest.raises(ScenarioError) as caught:
         load_scenario(str(tmp_path / "x.toml"))
-    assert_says(caught.value.problems[-1], "bas is not a field of the scenario file; did you mean 'base'? @")
+    assert_message(caught.value.problems[-1], "bas is not a field of the scenario file; did you mean 'base'? @")
 
 
 def test_a_file_that_is_too_large_is_not_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -424,7 +424,7 @@ def test_a_course_that_cannot_be_read_is_refused_by_row_and_column(
     path.write_bytes(content if isinstance(content, bytes) else content.encode())
     with pytest.raises(InputError) as caught:
         load_scenario("hover", [f"reference={{type='csv', file='{path}'}}"])
-    assert_says(str(caught.value), f"{path}: {message}")
+    assert_message(str(caught.value), f"{path}: {message}")
 
 
 @pytest.mark.parametrize("content", [b"\xef\xbb\xbf" + ROWS.encode(), ROWS.replace("\n", "\r\n").encode()])
@@ -467,7 +467,7 @@ IMPOSSIBLE = {
 
 @pytest.mark.parametrize(("line", "message"), IMPOSSIBLE.items(), ids=IMPOSSIBLE)
 @pytest.mark.parametrize("command", ["run", "check", "scenario", "compare"])
-def test_every_command_says_it_once_and_writes_nothing(
+def test_every_command_reports_it_once_and_writes_nothing(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
@@ -478,12 +478,12 @@ def test_every_command_says_it_once_and_writes_nothing(
     monkeypatch.chdir(tmp_path)
     Path("mine.toml").write_text(f"{MINE}{line}\n")
     arguments: Sequence[str] = [command, "mine.toml"]
-    if command == "compare":  # said before the one that is right is flown
+    if command == "compare":  # reported before the valid one is flown
         arguments = [command, "hover", "mine.toml", "--out", "page"]
     assert main(arguments) == 2
     out, err = capsys.readouterr()
     assert out == ""
-    assert_says(err.removesuffix("\n"), f"quadsim: {message}")
+    assert_message(err.removesuffix("\n"), f"quadsim: {message}")
     assert [path.name for path in tmp_path.iterdir()] == ["mine.toml"]
 
 
@@ -504,7 +504,7 @@ def test_a_vehicle_that_cannot_fly_is_refused(
     assert main(["vehicle", str(path)]) == 2
     out, err = capsys.readouterr()
     assert out == ""
-    assert_says(err.removesuffix("\n"), f"quadsim: {message}")
+    assert_message(err.removesuffix("\n"), f"quadsim: {message}")
 
 
 # --- what is allowed, however unwise -------------------------------------------------------------------------------

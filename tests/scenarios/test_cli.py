@@ -107,7 +107,7 @@ def test_list_shows_scenarios_by_group_and_what_is_to_defeat_the_controller(
 # --- scenario ------------------------------------------------------------------------------------------------------
 
 
-def test_a_printed_scenario_is_a_file_of_ones_own(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_printed_scenario_is_a_scenario_file(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["scenario", "hover", *SHORT, "--set", "vehicle.mass=4.2", "--seed", "7"]) == EXIT_DONE
     printed = capsys.readouterr()
     assert printed.err == ""
@@ -186,14 +186,14 @@ def test_settings_and_seed_reach_the_flight(here: Path, capsys: pytest.CaptureFi
     assert summary["seed"] == 9
 
 
-def test_a_file_of_ones_own_is_flown(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_file_of_the_user_is_flown(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
     text = (LIBRARY / "hover.toml").read_text().replace('name = "hover"', 'name = "mine"', 1)
     (here / "my.toml").write_text(text)
     assert main(["run", "my.toml", *SHORT, *TABLES, "--json"]) == EXIT_DONE
     assert rundir.read_summary(here / "runs" / "mine")["scenario"] == "mine"
 
 
-def test_a_violated_constraint_is_status_1_and_the_run_is_kept(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_violated_constraint_is_status_1_and_the_run_is_saved(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["run", "hover", *SHORT, *TABLES, "--set", "constraints.speed.upper=150.0"]) == EXIT_FAILED
     printed = capsys.readouterr()
     assert "completed, a required constraint does not hold" in printed.out
@@ -288,7 +288,7 @@ def test_check_writes_its_verdicts_as_junit(
     assert left_in(here) == ["verdicts.xml"]
 
 
-def test_junit_passes_what_is_not_required_and_tells_what_was_measured(
+def test_junit_passes_what_is_not_required_and_reports_what_was_measured(
     here: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     settings = ["--set", "constraints.speed.upper=150.0", "--set", "constraints.speed.required=false"]
@@ -298,7 +298,7 @@ def test_junit_passes_what_is_not_required_and_tells_what_was_measured(
     assert suite.findtext("testcase[@name='speed']/system-out", "").startswith("worst margin -42.8")
 
 
-def test_junit_tells_an_aborted_flight_with_its_reason(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_junit_reports_an_aborted_flight_with_its_reason(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
     settings = ["--set", "initial.euler=[60.0, 0.0, 0.0]", "--junit", "verdicts.xml"]
     assert main(["check", "hover", *SHORT, *settings]) == EXIT_FAILED
     failure = ElementTree.parse("verdicts.xml").find("testcase[@name='flight']/failure")

@@ -54,7 +54,7 @@ def moving(name: str, value: float, **place: Any) -> Array:
 
 @dataclass(frozen=True, kw_only=True)
 class Case:
-    """A conflict: what is asked for, which bounds give way and which of the others must be named as in the way."""
+    """A conflict: the state, the bounds that give way, and those that must be named as blocking."""
 
     settings: tuple[str, ...] = ()
     state: Array = field(default_factory=lambda: make_state())
@@ -135,8 +135,8 @@ CASES = {
 
 
 @dataclass(frozen=True, kw_only=True)
-class Asked:
-    """A controller that was asked once."""
+class Queried:
+    """A controller after one call."""
 
     scenario: Scenario
     vehicle: Vehicle
@@ -161,7 +161,7 @@ def file(tmp_path_factory: pytest.TempPathFactory) -> str:
     return str(path)
 
 
-def ask(file: str, case: Case, *more: str) -> Asked:
+def query_case(file: str, case: Case, *more: str) -> Queried:
     """Have the case's controller step once, without a simulator."""
     scenario = load_scenario(file, [*case.settings, *more])
     vehicle = build_vehicle(scenario)
@@ -171,7 +171,7 @@ def ask(file: str, case: Case, *more: str) -> Asked:
     status = "plan_exhausted_error"
     with contextlib.suppress(PlanExhaustedError):
         status = controller.step(Moment(acting=acting), case.state, np.zeros((controller.horizon, 4))).status
-    return Asked(
+    return Queried(
         scenario=scenario,
         vehicle=vehicle,
         controller=controller,
@@ -181,9 +181,9 @@ def ask(file: str, case: Case, *more: str) -> Asked:
 
 
 @cache
-def ask_once(file: str, name: str) -> Asked:
+def query_cached(file: str, name: str) -> Queried:
     """One of `CASES`, for all tests that only look at the answer."""
-    return ask(file, CASES[name])
+    return query_case(file, CASES[name])
 
 
 def names(entries: list[dict[str, Any]]) -> set[str]:
@@ -200,9 +200,9 @@ def setting(field: str, value: object) -> str:
 @pytest.mark.parametrize("name", CASES)
 def test_each_culprit_is_named_and_each_suggestion_makes_it_feasible(name: str, file: str) -> None:
     case = CASES[name]
-    asked = ask_once(file, name)
-    assert asked.status not in ACCEPTED
-    found = asked.found
+    queried = query_cached(file, name)
+    assert queried.status not in ACCEPTED
+    found = queried.found
     assert found["feasible"] is False
     assert names([entry for entry in found["conflict"] if entry["by"]]) == set(case.violated)
     assert names([entry for entry in found["conflict"] if not entry["by"]]) >= set(case.blocking)
@@ -214,13 +214,13 @@ def test_each_culprit_is_named_and_each_suggestion_makes_it_feasible(name: str, 
     for suggestion in found["suggestions"]:
         if suggestion["after"] is None:
             changed = [setting(*item) for item in suggestion["settings"].items()]
-            assert ask(file, case, *changed).status in ACCEPTED, changed
+            assert query_case(file, case, *changed).status in ACCEPTED, changed
 
 
 @pytest.mark.parametrize("name", CASES)
 def test_the_least_violation_is_that_of_an_independent_program(name: str, file: str) -> None:
     """Dense, of probed matrices, with bounds on inputs hard; where these cannot hold by themselves it has no answer."""
-    unanswered = ask_once(file, name).unanswered
+    unanswered = query_cached(file, name).unanswered
     assert unanswered is not None
     conflict = find_conflict(unanswered)
     assert conflict is not None
@@ -235,14 +235,14 @@ def test_the_least_violation_is_that_of_an_independent_program(name: str, file: 
 def test_a_little_less_than_the_smallest_bound_is_not_enough(name: str, file: str) -> None:
     """The suggestion is rounded up by a hundredth of the change at most."""
     case = CASES[name]
-    asked = ask_once(file, name)
-    for suggestion in asked.found["suggestions"]:
+    queried = query_cached(file, name)
+    for suggestion in queried.found["suggestions"]:
         ((field, value), *others) = suggestion["settings"].items()
         if others or not isinstance(value, list):
             continue
-        before = get_field(tomllib.loads(asked.scenario.to_toml()), field)
+        before = get_field(tomllib.loads(queried.scenario.to_toml()), field)
         less = [old + 0.97 * (new - old) for old, new in zip(before, value, strict=True)]
-        assert ask(file, case, setting(field, less)).status not in ACCEPTED
+        assert query_case(file, case, setting(field, less)).status not in ACCEPTED
 
 
 def given(unanswered: Unanswered) -> ocp_peer.Period:
@@ -254,13 +254,13 @@ def given(unanswered: Unanswered) -> ocp_peer.Period:
     return ocp_peer.Period(A=A, B=B, c=c, state=query.state, desired=query.desired, u_before=query.u_before, rest=rest)
 
 
-def entry_of(asked: Asked, name: str) -> dict[str, Any]:
-    return next(entry for entry in asked.found["conflict"] if entry["name"] == name and entry["by"])
+def entry_of(queried: Queried, name: str) -> dict[str, Any]:
+    return next(entry for entry in queried.found["conflict"] if entry["name"] == name and entry["by"])
 
 
 def test_amounts_in_closed_form(file: str) -> None:
     """By hand, from the model's matrices and the bounds on steps of -10 and 5 rad/s alone."""
-    tilted = ask(file, CASES["start beyond the tilt bound"])
+    tilted = query_case(file, CASES["start beyond the tilt bound"])
     assert tilted.unanswered is not None
     model = tilted.unanswered.problem.model
     row = model.B[INDEX["roll"]]
@@ -270,33 +270,33 @@ def test_amounts_in_closed_form(file: str) -> None:
     assert (entry["start"], entry["unit"]) == (0.05, "deg")
 
     lift = float(model.B[INDEX["vz"]].sum())  # of vz in a period, per rad/s of all rotors
-    falling = entry_of(ask(file, CASES["falling too fast"]), "vz")
+    falling = entry_of(query_case(file, CASES["falling too fast"]), "vz")
     after = -2.0 + lift * np.cumsum(5.0 * np.arange(1, 51))
     assert falling["by"] == pytest.approx(-0.5 - after[0], abs=1e-6)
     assert (falling["start"], falling["stop"]) == (0.05, pytest.approx(0.05 * np.count_nonzero(after < -0.5)))
 
-    hovering = ask(file, CASES["speeds too low to hover"])
+    hovering = query_case(file, CASES["speeds too low to hover"])
     entry, sinking = entry_of(hovering, "vz"), lift * (190.0 - float(model.u_bar[0])) * np.arange(1, 51)
     assert entry["by"] == pytest.approx(-0.1 - sinking[-1], abs=1e-6)
     assert (entry["start"], entry["stop"]) == (pytest.approx(0.05 * (1 + np.count_nonzero(sinking >= -0.1))), 2.5)
 
-    fenced = entry_of(ask(file, CASES["outside the fence"]), "fence")
+    fenced = entry_of(query_case(file, CASES["outside the fence"]), "fence")
     assert fenced["by"] == pytest.approx(3.2, abs=1e-3)
     assert (fenced["start"], fenced["unit"]) == (0.05, "m")
-    total = entry_of(ask(file, CASES["two polytopes"]), "least")
+    total = entry_of(query_case(file, CASES["two polytopes"]), "least")
     assert (total["by"], total["start"], total["stop"]) == (pytest.approx(20.0), 0.0, 2.45)
-    climbing = entry_of(ask(file, CASES["a polytope against a bound"]), "climb")
+    climbing = entry_of(query_case(file, CASES["a polytope against a bound"]), "climb")
     assert (climbing["by"], climbing["start"], climbing["stop"]) == (pytest.approx(0.3), 0.05, 2.5)
 
-    fast = entry_of(ask(file, CASES["the last command outside the bounds"]), "speed")
+    fast = entry_of(query_case(file, CASES["the last command outside the bounds"]), "speed")
     assert (fast["by"], fast["start"], fast["stop"]) == (pytest.approx(30.0), 0.0, 0.1)
     assert fast["rotors"] == [1, 2, 3, 4]
 
 
 def test_a_tightened_bound_is_violated_by_what_is_beyond_it(file: str) -> None:
-    asked = ask(file, CASES["tightened bounds"])
-    assert asked.unanswered is not None
-    problem = asked.unanswered.problem
+    queried = query_case(file, CASES["tightened bounds"])
+    assert queried.unanswered is not None
+    problem = queried.unanswered.problem
     assert problem.bounds is not None
     assert problem.bounds.margins is not None
     row = problem.model.B[INDEX["roll"]]
@@ -304,21 +304,21 @@ def test_a_tightened_bound_is_violated_by_what_is_beyond_it(file: str) -> None:
     rolls = unforced + float(np.where(row > 0.0, -10.0, 5.0) @ row)
     assert rolls < math.radians(5.0)
     beyond = rolls - (math.radians(5.0) - problem.bounds.margins[0, 0])
-    assert entry_of(asked, "roll")["by"] == pytest.approx(math.degrees(beyond), abs=1e-6)
+    assert entry_of(queried, "roll")["by"] == pytest.approx(math.degrees(beyond), abs=1e-6)
 
 
 def test_times_are_those_of_the_prediction_behind_its_delay(file: str) -> None:
-    assert entry_of(ask(file, CASES["rotors that lag, and a delay"]), "roll")["start"] == 0.07
+    assert entry_of(query_case(file, CASES["rotors that lag, and a delay"]), "roll")["start"] == 0.07
 
 
 def test_the_fallback_is_suggested_with_the_time_after_which_it_helps(file: str) -> None:
     """The contract itself flies the model from there, and the optimum is accepted again in that period."""
     case = CASES["start beyond the tilt bound"]
-    asked = ask(file, case)
-    after = next(each["after"] for each in asked.found["suggestions"] if "controller.fallback" in each["settings"])
-    guarded, model = ask(file, case, "controller.fallback={}").controller, asked.unanswered.problem.model  # type: ignore[union-attr]
+    queried = query_case(file, case)
+    after = next(each["after"] for each in queried.found["suggestions"] if "controller.fallback" in each["settings"])
+    guarded, model = query_case(file, case, "controller.fallback={}").controller, queried.unanswered.problem.model  # type: ignore[union-attr]
     assert isinstance(guarded, Guarded)
-    state, acting = case.state, np.full(4, asked.vehicle.hover_speed)
+    state, acting = case.state, np.full(4, queried.vehicle.hover_speed)
     guarded.reset(acting)
     for k in range(50):
         command = guarded.step(Moment(time=0.05 * k, acting=acting), state, np.zeros((50, 4)))
@@ -329,29 +329,29 @@ def test_the_fallback_is_suggested_with_the_time_after_which_it_helps(file: str)
     assert k > 0
 
 
-def test_a_solver_that_fails_where_all_constraints_can_hold_is_told_apart(file: str) -> None:
-    asked = ask(file, CASES["start beyond the tilt bound"], "controller.output_bounds.roll=[-90.0, 90.0]")
-    assert asked.unanswered is None
-    controller = ask(file, CASES["start beyond the tilt bound"]).unanswered
+def test_a_solver_that_fails_where_all_constraints_can_hold_is_distinguished(file: str) -> None:
+    queried = query_case(file, CASES["start beyond the tilt bound"], "controller.output_bounds.roll=[-90.0, 90.0]")
+    assert queried.unanswered is None
+    controller = query_case(file, CASES["start beyond the tilt bound"]).unanswered
     assert controller is not None
     level = controller.query._replace(state=make_state())
     failed = Unanswered(problem=controller.problem, query=level, status="max_iterations", time=1.0)
-    found = diagnose(failed, asked.scenario, asked.vehicle)
+    found = diagnose(failed, queried.scenario, queried.vehicle)
     assert found is not None
     assert (found["feasible"], found["conflict"], found["suggestions"], found["advice"]) == (True, [], [], "")
     assert found["sentence"].endswith("it is the solver that failed")
 
 
 def test_it_is_the_same_each_time_and_holds_copies(file: str) -> None:
-    asked = ask(file, CASES["outside the fence"])
-    assert json.dumps(asked.found) == json.dumps(ask(file, CASES["outside the fence"]).found)
-    assert asked.unanswered is not None
-    asked.controller.reset(np.full(4, asked.vehicle.hover_speed))
-    assert getattr(asked.controller, "unanswered", 1) is None
+    queried = query_case(file, CASES["outside the fence"])
+    assert json.dumps(queried.found) == json.dumps(query_case(file, CASES["outside the fence"]).found)
+    assert queried.unanswered is not None
+    queried.controller.reset(np.full(4, queried.vehicle.hover_speed))
+    assert getattr(queried.controller, "unanswered", 1) is None
 
 
 def test_the_words_of_the_file(file: str) -> None:
-    found = ask(file, CASES["start beyond the tilt bound"]).found
+    found = query_case(file, CASES["start beyond the tilt bound"]).found
     assert found["sentence"].startswith(
         "no answer at t = 0.00 s (primal_infeasible); cannot hold together: roll upper at +0.05 s .. +0.15 s by 14 deg;"
     )
@@ -360,12 +360,12 @@ def test_the_words_of_the_file(file: str) -> None:
     assert "controller.fallback = {} (level hover; an answer again after 0.20 s, by the model)" in found["advice"]
 
 
-def test_the_example_of_the_documentation_is_what_a_flight_says(fly_once: Callable[..., Flight]) -> None:
+def test_the_example_of_the_documentation_is_what_a_flight_reports(fly_once: Callable[..., Flight]) -> None:
     found = fly_once("paper-constrained-lag20").diagnosis
     assert found is not None
     text = (Path(__file__).resolve().parents[2] / "docs" / "controllers.md").read_text(encoding="utf-8")
-    said, advised = re.findall(r"```text\n(no answer .*)\n(to try: .*); \.\.\.\n```", text)[0]
-    assert found["sentence"] == said
+    sentence, advised = re.findall(r"```text\n(no answer .*)\n(to try: .*); \.\.\.\n```", text)[0]
+    assert found["sentence"] == sentence
     assert found["advice"].startswith(advised)
 
 
@@ -399,7 +399,7 @@ class Keeping:
             self.unanswered = self.inner.unanswered
 
 
-def test_a_controller_of_ones_own_is_diagnosed_in_the_words_of_its_problem() -> None:
+def test_a_controller_of_the_user_is_diagnosed_in_the_words_of_its_problem() -> None:
     tilted = load_scenario("hover", ["duration=0.5", "initial.euler=[10.0, 0.0, 0.0]"])
     flight = quadsim.fly(tilted, controller=Keeping)
     found = flight.diagnosis

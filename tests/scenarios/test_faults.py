@@ -1,4 +1,4 @@
-"""Faults at the solver, the sensors and the computer on the paper's course, disturbed or not: the contract is kept.
+"""Faults at the solver, the sensors and the computer on the paper's course, disturbed or not: the contract holds.
 
 A dozen here, over the whole flight; `make robustness` flies fifty for both controllers, one by one.
 """
@@ -41,7 +41,7 @@ EACH = 4
 """Faults per flight."""
 
 
-def test_every_fault_that_is_asked_for_is_there() -> None:
+def test_every_requested_fault_is_there() -> None:
     names = {fault.name for fault in faults()}
     assert {f"solver: {status}" for status in STATUSES} < names
     assert {*STATUS.values()} - {*STATUSES} == {"solved"}
@@ -93,7 +93,7 @@ def test_faults_all_over_the_flight_are_harmless(seed: int, controller: str, con
         assert found.furthest > 0.0  # it did happen
 
 
-def test_what_is_not_recovered_from_is_told() -> None:
+def test_what_is_not_recovered_from_is_reported() -> None:
     """Twelve seconds without one optimum: hover, descent, and a course that is not caught up with soon."""
     hopeless = failing("gone", ["numerics"] * 240)
     found = inject(Injection(controller="paper", fault=hopeless, start=2.0), longest=26.0)

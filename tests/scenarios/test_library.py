@@ -32,7 +32,7 @@ COMPARED = 3.0
 """Of a flight and of the same one again, at least [s]."""
 SHORT = 12.0
 """Longest flight of another paper that is flown here [s]."""
-TELLS = 2.0
+PREVIEW = 2.0
 """Time in which another seed shows, where it counts [s]."""
 
 
@@ -44,7 +44,7 @@ def flown_here() -> list[str]:
 
 @pytest.fixture(scope="module", params=flown_here())
 def flight(request: pytest.FixtureRequest, fly_once: Callable[..., Flight]) -> Flight:
-    """Each scenario, flown once for the tests that ask for it one after another."""
+    """Each scenario, flown once for all tests that use it."""
     return fly_once(request.param) if request.param in SHARED else fly_scenario(load_scenario(request.param))
 
 
@@ -96,7 +96,7 @@ def estimation_rmse(log: FlightLog, columns: list[int]) -> float:
     return float(np.sqrt(np.mean((log.control.state - log.control.truth)[20:, columns] ** 2)))
 
 
-# What the comments and descriptions of some files say in words.
+# What the comments and descriptions of some files state.
 
 
 def lag20_is_infeasible(flight: Flight) -> None:
@@ -131,7 +131,7 @@ def payload_drop_ends_the_error(flight: Flight) -> None:
     assert abs(error(flight, "z")) < 1e-3
 
 
-def worn_rotor_stays_aside(flight: Flight) -> None:
+def worn_rotor_leaves_an_offset(flight: Flight) -> None:
     assert error(flight, "y") == pytest.approx(-0.68, abs=0.01)
 
 
@@ -213,7 +213,7 @@ SHOWN: dict[str, Callable[[Flight], None]] = {
     "steady-wind": wind_leaves_an_offset,
     "gust": gust_leaves_none,
     "payload-drop": payload_drop_ends_the_error,
-    "worn-rotor": worn_rotor_stays_aside,
+    "worn-rotor": worn_rotor_leaves_an_offset,
     "stalled-solver": stall_misses_fifteen,
     "late-commands": jitter_misses_one_in_twenty,
     "take-off-and-landing": lands_gently,
@@ -239,11 +239,11 @@ def test_it_has_the_verdict_that_its_file_states(flight: Flight) -> None:
 
 def test_every_number_in_its_log_is_finite(flight: Flight) -> None:
     control, plant = flight.log.control, flight.log.plant
-    told = control.state.copy()
-    if flight.scenario.name == "nan-position":  # what the sensor said then; nothing else
-        told[np.ix_((control.t > 2.99) & (control.t < 3.51), [0, 2, 4])] = 0.0
+    measured = control.state.copy()
+    if flight.scenario.name == "nan-position":  # what the sensor measured then; nothing else
+        measured[np.ix_((control.t > 2.99) & (control.t < 3.51), [0, 2, 4])] = 0.0
         assert np.isnan(control.state).any()
-    assert np.isfinite(told).all()
+    assert np.isfinite(measured).all()
     for name in ("t", "truth", "reference", "speeds", "slack", "delay"):
         assert np.isfinite(getattr(control, name)).all(), name
     found = np.array([status in ACCEPTED for status in control.status])
@@ -261,14 +261,14 @@ def test_it_is_reproducible_and_its_seed_counts_where_something_is_random(flight
     first = numbers(flight.log, periods, steps)
     if draws(scenario):
         assert numbers(flown_again(scenario, periods, seed=scenario.seed), periods, steps) == first
-        soon = math.ceil(TELLS / scenario.control_period)
+        soon = math.ceil(PREVIEW / scenario.control_period)
         other = numbers(flown_again(scenario, soon, seed=scenario.seed + 1), soon, steps)
         assert all(ours != theirs for ours, theirs in zip(numbers(flight.log, soon, steps), other, strict=True))
     else:
         assert numbers(flown_again(scenario, periods, seed=scenario.seed + 1), periods, steps) == first
 
 
-def test_it_shows_what_its_file_says(flight: Flight) -> None:
+def test_it_shows_what_its_file_states(flight: Flight) -> None:
     if flight.scenario.name in SHOWN:
         SHOWN[flight.scenario.name](flight)
 

@@ -1,4 +1,4 @@
-"""`[lost]`: a flight that nobody would call one ends as lost, whatever its scenario asks for."""
+"""`[lost]`: an obviously failed flight ends as lost, whatever its scenario requires."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ import numpy as np
 
 
 class Unstable:
-    """Rolls the wrong way, and ever more of it."""
+    """Rolls in the wrong direction, ever faster."""
 
     def __init__(self, vehicle, period, horizon):
         self.hover = vehicle.hover_speed

@@ -79,7 +79,7 @@ def test_clipped_flight_shows_what_a_real_rotor_would_do(fly_once: Callable[...,
 
 
 def test_constraints_make_the_profile_smoother(constrained_flight: Flight, unconstrained_flight: Flight) -> None:
-    """Sec. 7 says so; total variation of the commands says by how much."""
+    """Sec. 7 states it; total variation of the commands measures it."""
 
     def total_variation(flight: Flight) -> float:
         return float(np.abs(flight.log.control.slews).sum())

@@ -29,7 +29,7 @@ def quadsim(*arguments: str, cwd: Path) -> subprocess.CompletedProcess[str]:
     return subprocess.run(command, cwd=cwd, env=environment(), capture_output=True, text=True, check=False, timeout=60)
 
 
-def test_a_process_says_one_thing_and_shows_no_traceback(tmp_path: Path) -> None:
+def test_a_process_prints_one_message_and_no_traceback(tmp_path: Path) -> None:
     done = quadsim("run", "hover", "--set", "controller.horizon=0", cwd=tmp_path)
     assert (done.returncode, done.stdout) == (EXIT_WRONG_INPUT, "")
     assert done.stderr == "quadsim: hover.toml: controller.horizon must be >= 1; got 0\n"
@@ -44,9 +44,9 @@ def test_a_reader_that_goes_away_gets_no_traceback_and_no_status_0(options: list
     assert process.stdout is not None
     assert process.stderr is not None
     process.stdout.close()
-    said = process.stderr.read()
+    output = process.stderr.read()
     process.stderr.close()
-    assert (process.wait(timeout=60), said) == (EXIT_FAILED, b"")
+    assert (process.wait(timeout=60), output) == (EXIT_FAILED, b"")
 
 
 ITSELF = """
@@ -75,9 +75,7 @@ sys.exit(main())
         *((stop, delay) for stop in (signal.SIGTERM, signal.SIGHUP) for delay in (0.0, 0.1)),
     ],
 )
-def test_who_is_told_to_stop_in_the_first_moments_ends_in_order(
-    tmp_path: Path, stop: signal.Signals, delay: float
-) -> None:
+def test_a_signal_in_the_first_moments_ends_it_in_order(tmp_path: Path, stop: signal.Signals, delay: float) -> None:
     done = subprocess.run(
         [sys.executable, "-c", ITSELF, str(delay), str(int(stop)), "run", "hover", "--set", "duration=600"],
         cwd=tmp_path,
@@ -160,15 +158,15 @@ def test_closed_streams_do_no_harm(tmp_path: Path, closed: tuple[int, ...]) -> N
         preexec_fn=lambda: [os.close(number) for number in closed],
     )
     if 1 in closed:
-        told = "" if 2 in closed else "quadsim: stdout is closed; to do without what is printed: >/dev/null\n"
-        assert (done.returncode, done.stderr, list(tmp_path.iterdir())) == (EXIT_WRONG_INPUT, told, [])
+        message = "" if 2 in closed else "quadsim: stdout is closed; to do without what is printed: >/dev/null\n"
+        assert (done.returncode, done.stderr, list(tmp_path.iterdir())) == (EXIT_WRONG_INPUT, message, [])
     else:
         assert (done.returncode, done.stderr) == (EXIT_DONE, "")
         rundir.load_run(tmp_path / "run")
 
 
 @pytest.mark.parametrize("stop", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
-def test_a_long_flight_that_is_stopped_is_kept_up_to_there(tmp_path: Path, stop: signal.Signals) -> None:
+def test_a_long_flight_that_is_stopped_is_saved_up_to_there(tmp_path: Path, stop: signal.Signals) -> None:
     process = subprocess.Popen(
         [sys.executable, "-m", "scenarios.cli", "run", "hover", *TABLES, "--set", "duration=1800", "--out", "run"],
         cwd=tmp_path,
@@ -201,7 +199,7 @@ def test_a_long_flight_that_is_stopped_is_kept_up_to_there(tmp_path: Path, stop:
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="there is no /dev/full to write to")
-def test_output_that_cannot_be_written_is_said() -> None:
+def test_output_that_cannot_be_written_is_reported() -> None:
     with Path("/dev/full").open("w") as full:
         command = [sys.executable, "-m", "scenarios.cli", "list", "--json"]
         done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, cwd=ROOT)

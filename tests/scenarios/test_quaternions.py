@@ -43,7 +43,7 @@ ARRIVED = [f"constraints.{name}.start=0.9" for name in ("back_upright", "back_in
 
 
 class Listener:
-    """Holds the rotors at one speed and keeps what it is told."""
+    """Holds the rotors at one speed and keeps what it is given."""
 
     name, solver, horizon = "listener", "", 1
 

@@ -1,4 +1,4 @@
-"""`quadsim check RUN`: audited again from the tables, and every lie about them is said."""
+"""`quadsim check RUN`: audited again from the tables, and every contradiction reported."""
 
 from __future__ import annotations
 
@@ -68,9 +68,9 @@ def test_a_run_as_it_was_written_is_checked_and_its_verdict_made_again(
 ) -> None:
     for name, status in (("good", EXIT_DONE), ("bad", EXIT_FAILED)):
         assert main(["check", str(flown / name)]) == status
-        said = capsys.readouterr()
-        assert "audited again from the tables, 200 rows per second: as recorded" in said.out
-        assert said.err == ""
+        output = capsys.readouterr()
+        assert "audited again from the tables, 200 rows per second: as recorded" in output.out
+        assert output.err == ""
         assert main(["check", str(flown / name), "--json"]) == status
         again = json.loads(capsys.readouterr().out)["reaudit"]
         assert again["satisfied"] is (status == EXIT_DONE)
@@ -80,9 +80,9 @@ def test_one_sed_does_not_make_a_violated_run_hold(runs: Path, capsys: pytest.Ca
     path = runs / "bad" / rundir.SUMMARY_FILE
     path.write_text(path.read_text().replace('"satisfied": false', '"satisfied": true'))
     assert main(["check", str(runs / "bad")]) == EXIT_WRONG_INPUT
-    said = capsys.readouterr()
-    assert said.out == ""
-    assert "summary.json: contradicts itself: speed: satisfied is true, and its worst margins say otherwise" in said.err
+    text = capsys.readouterr()
+    assert text.out == ""
+    assert "summary.json: contradicts itself: speed: satisfied is true, and its worst margins say otherwise" in text.err
 
 
 def all_well(summary: dict[str, Any]) -> None:
@@ -109,27 +109,27 @@ LIES: dict[str, tuple[Change, str]] = {
     "not required": (loosened, "required is recorded as False, and is True in the scenario"),
     "no constraints": (none, "the constraints recorded are none, and the scenario's roll, pitch"),
     "satisfied alone": (lambda summary: summary.update(satisfied=True), "satisfied is recorded as True"),
-    "longer": (lambda summary: summary.update(duration=60.0), "duration is recorded as 60.0, and the run's files say"),
+    "longer": (lambda summary: summary.update(duration=60.0), "duration is recorded as 60.0, and the run's files give"),
     "another": (lambda summary: summary.update(scenario="paper"), "scenario is recorded as 'paper'"),
     "expected": (lambda summary: summary.update(expected="violated"), "expected is recorded as 'violated'"),
 }
 
 
 @pytest.mark.parametrize(("change", "message"), LIES.values(), ids=LIES)
-def test_a_verdict_that_the_tables_do_not_give_is_said(
+def test_a_verdict_that_the_tables_do_not_give_is_reported(
     runs: Path, change: Change, message: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     rewrite(runs / "bad", change)
     for command in (["check"], ["compare", "--out", str(runs / "page")], ["video"]):
         assert main([*command[:1], str(runs / "bad"), *command[1:]]) == EXIT_WRONG_INPUT
-        said = capsys.readouterr()
-        assert message in said.err
-        assert said.err.count("\n") == 1
+        output = capsys.readouterr()
+        assert message in output.err
+        assert output.err.count("\n") == 1
     assert not (runs / "page").exists()
 
 
 def test_every_number_of_the_summary_is_sealed(flown: Path, tmp_path: Path) -> None:
-    """Also those that no table has: clock times, versions, what the course asks for."""
+    """Also those that no table has: clock times, versions, what the course requires."""
     run = shutil.copytree(flown / "good", tmp_path / "run")
     summary = json.loads((run / rundir.SUMMARY_FILE).read_text())
     for path in (("wall_s", "total"), ("versions", "numpy"), ("course", "sentence"), ("tracking", "rmse", "x")):
@@ -201,19 +201,19 @@ def test_a_run_whose_scenario_names_another_file_reads_none(flown: Path, tmp_pat
         reaudit(run)
 
 
-def test_an_older_run_is_audited_and_that_it_has_no_digest_is_said(
+def test_an_older_run_is_audited_and_that_it_has_no_digest_is_reported(
     flown: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     run = shutil.copytree(flown / "good", tmp_path / "run")
     unseal(run)
     assert main(["check", str(run)]) == EXIT_DONE
-    said = capsys.readouterr().err
+    output = capsys.readouterr().err
     assert (
-        said == f"quadsim: {run}: its summary has no digest, as those of older versions: changes of it may not show\n"
+        output == f"quadsim: {run}: its summary has no digest, as those of older versions: changes of it may not show\n"
     )
 
 
-def test_files_of_others_are_said_and_files_of_ours_that_are_not_listed_are_an_error(
+def test_files_of_others_are_reported_and_files_of_ours_that_are_not_listed_are_an_error(
     flown: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     run = shutil.copytree(flown / "good", tmp_path / "run")
@@ -258,7 +258,7 @@ def test_the_tables_that_a_seed_determines_hold_no_digest(flown: Path) -> None:
 def test_what_a_run_records_is_what_its_tables_give(
     name: str, rate: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fly_once: Callable[..., Flight]
 ) -> None:
-    """Flights that break off, crash, are told no number: at any log rate the tables never contradict the record.
+    """Flights that end early, crash, or lack measurements: at any log rate the tables never contradict the record.
 
     Each is flown once: a log holds the plant at the physics rate, whatever the rate of its file.
     """
@@ -292,16 +292,16 @@ def stuck(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return target
 
 
-def test_fallback_for_good_is_no_success_and_says_why(stuck: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_permanent_fallback_is_no_success_and_reports_why(stuck: Path, capsys: pytest.CaptureFixture[str]) -> None:
     summary = rundir.read_summary(stuck)
     assert all(entry["satisfied"] for entry in summary["constraints"] if entry["required"])
     assert (summary["satisfied"], summary["as_expected"], summary["controller"]["unrecovered"]) == (False, False, 10)
     assert main(["check", str(stuck), "--junit", str(stuck.parent / "verdicts.xml")]) == EXIT_FAILED
-    said = capsys.readouterr().out
-    assert "completed, but in fallback for good  0.50 s flown" in said
-    assert "10 periods in fallback, never recovered\n" in said
-    assert "cannot hold together: left upper at +0.05 s .. +2.50 s by " in said
-    assert "to try: controller." in said
+    output = capsys.readouterr().out
+    assert "completed, but in fallback for good  0.50 s flown" in output
+    assert "10 periods in fallback, never recovered\n" in output
+    assert "cannot hold together: left upper at +0.05 s .. +2.50 s by " in output
+    assert "to try: controller." in output
     assert 'message="completed; 10 periods in fallback, never recovered; no answer at t = 0.00 s' in (
         stuck.parent / "verdicts.xml"
     ).read_text(encoding="utf-8")

@@ -164,7 +164,7 @@ def test_the_seed_is_recorded(tmp_path: Path) -> None:
     assert pq.read_schema(flown.directory / FLIGHT_FILE).metadata[b"seed"] == b"7"
 
 
-def test_durations_are_told_without_rounding_errors(tmp_path: Path) -> None:
+def test_durations_are_reported_without_rounding_errors(tmp_path: Path) -> None:
     settings = ("control_period=0.1", "duration=0.3", "controller.horizon=10")
     assert run(tmp_path / "run", *settings).summary["duration"] == 0.3  # 3 * 0.1 is not
 
@@ -320,7 +320,7 @@ def test_a_recording_that_cannot_be_made_leaves_nothing(
 
 
 @pytest.mark.parametrize("cores", [1, 2])
-def test_outputs_are_made_as_asked_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, cores: int) -> None:
+def test_outputs_are_made_as_requested(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, cores: int) -> None:
     """Where there are cores for it, the recording by a process of its own."""
     monkeypatch.setattr("scenarios.flight.usable_cores", lambda: cores)
     run_scenario(load_scenario("hover", [SHORT]), tmp_path / "run", Outputs(video=False))

@@ -19,16 +19,16 @@ def measured(memory: list[float], medians: list[float]) -> soak.Soak:
     return soak.Soak(minutes=1.0, memory=np.array(memory), step_ms=step_ms, failures=0, end_error=0.0, laps_compared=1)
 
 
-def test_a_leak_and_a_slowdown_are_told() -> None:
+def test_a_leak_and_a_slowdown_are_reported() -> None:
     found = measured([100.0, 101.0, 103.0], [9.0, 2.0, 3.0])
     assert found.growth == pytest.approx(0.03)
     assert found.medians == (2.0, 3.0)  # the first lap warms up
     assert found.drift == pytest.approx(0.5)
 
 
-@pytest.mark.skipif(not soak.MEMORY.exists(), reason="this system does not tell a process's memory")
+@pytest.mark.skipif(not soak.MEMORY.exists(), reason="this system does not report a process's memory")
 def test_three_minutes_leave_memory_and_step_time_as_they_were() -> None:
-    """Step times of a busy machine wander by tens of percent; `make soak` asks for a tenth."""
+    """Step times of a busy machine wander by tens of percent; `make soak` requires a tenth."""
     command = [sys.executable, str(SCRIPT), "--minutes", "3", "--drift", "0.6"]
     done = subprocess.run(command, cwd=SCRIPT.parent.parent, capture_output=True, text=True, check=False)
     assert (done.returncode, done.stderr) == (0, ""), done.stdout + done.stderr

@@ -48,7 +48,7 @@ FENCE = {"rows": [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]], "upper": [1.9, 2.0]}
 
 
 def scenario(changes: Mapping[str, Any] = {}) -> Scenario:
-    """Four seconds straight along x, from hover, among what is asked for."""
+    """Four seconds straight along x, from hover, among given obstacles."""
     base = load_scenario("hummingbird-figure-eight").replace(
         {"duration": 4.0, "constraints": [], "reference": {"type": "waypoints", "start": 0.5, "response_time": 0.5}}
         | {"reference": {"type": "waypoints", "start": 0.5, "points": [{"position": [2.0, 0.0, 1.0]}]}}
@@ -74,8 +74,8 @@ def test_tables_become_limits(crashed: Flight) -> None:
 
 
 def test_the_extent_is_the_vehicle_s_or_the_scenario_s() -> None:
-    asked = scenario({"obstacles": [PILLAR], "vehicle.extent": 0.05})
-    (finding,) = fly_scenario(asked).findings
+    given = scenario({"obstacles": [PILLAR], "vehicle.extent": 0.05})
+    (finding,) = fly_scenario(given).findings
     assert isinstance(finding.limit, SpaceLimit)
     assert finding.limit.radius == 0.05
 
@@ -92,7 +92,7 @@ def test_a_touch_is_a_crash_at_the_distance_that_the_audit_measures(crashed: Fli
     assert clearance.min() > -0.02  # it bounces off
 
 
-def test_mujoco_meets_what_the_distance_says(vehicle: Vehicle) -> None:
+def test_mujoco_contacts_agree_with_the_distance(vehicle: Vehicle) -> None:
     """In each step MuJoCo has a contact where, and only where, the ball's distance is negative."""
     pillar = Cylinder(name="pillar", position=(0.8, 0.0, 0.0), radius=0.1, height=3.0)
     ball = Sphere(name="ball", position=(0.0, 3.0, 0.0), radius=0.2, velocity=(0.0, -2.0, 0.0))
@@ -188,12 +188,12 @@ def test_a_path_that_is_over_before_the_window_is_refused(tmp_path: Path) -> Non
 
 
 def test_shapes_read_as_they_are_written() -> None:
-    asked = scenario({"obstacles": [PILLAR, BALL, WALL, LOG, CRATE], "corridors": [TUBE], "keep_in": FENCE})
+    given = scenario({"obstacles": [PILLAR, BALL, WALL, LOG, CRATE], "corridors": [TUBE], "keep_in": FENCE})
     import tomllib
 
-    assert parse_scenario(tomllib.loads(asked.to_toml())) == asked
-    assert isinstance(asked.obstacles[2], Wall)
-    assert isinstance(asked.keep_in, Fence)
+    assert parse_scenario(tomllib.loads(given.to_toml())) == given
+    assert isinstance(given.obstacles[2], Wall)
+    assert isinstance(given.keep_in, Fence)
 
 
 AVOIDANCE = {"controller.output_bounds": {"roll": [-30.0, 30.0], "pitch": [-30.0, 30.0]}, "controller.avoidance": {}}
@@ -225,7 +225,7 @@ def test_the_nonlinear_controller_keeps_clear(more: Mapping[str, Any]) -> None:
     assert abs(flight.state["y"]).max() > 0.1
 
 
-ASIDE = {"name": "aside", "rows": [[0.0, -1.0, 0.0]], "upper": [-0.4]}  # y >= 0.4, the vehicle's ball inside
+OFFSET = {"name": "offset", "rows": [[0.0, -1.0, 0.0]], "upper": [-0.4]}  # y >= 0.4, the vehicle's ball inside
 
 
 @pytest.mark.parametrize("law", ["constrained", "robust", "nonlinear"])
@@ -236,9 +236,9 @@ def test_a_corridor_along_the_path_holds_where_the_reference_is(law: str, speed:
         "robust": {"controller.type": "robust", "controller.solver": None, **AVOIDANCE},
         "nonlinear": {"controller": {"type": "nonlinear", "horizon": 30, "terminal": "lqr", "avoidance": {}}},
     }
-    flown = {"corridors": [{**ASIDE, "path": [0.9, 1.3]}], "reference.speed": speed, "duration": 8.0}
+    flown = {"corridors": [{**OFFSET, "path": [0.9, 1.3]}], "reference.speed": speed, "duration": 8.0}
     blind = fly_scenario(scenario(flown))
-    (found,) = [each for each in blind.findings if each.limit.name == "aside"]
+    (found,) = [each for each in blind.findings if each.limit.name == "offset"]
     reference = blind.log.control.reference[:, :3]
     gone = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(reference, axis=0), axis=1))])
     inside = found.limit.holds_at(blind.log.control.t)
@@ -246,9 +246,9 @@ def test_a_corridor_along_the_path_holds_where_the_reference_is(law: str, speed:
     assert inside.any()
     assert not found.satisfied
     flight = fly_scenario(scenario({**flown, **laws[law]}))
-    (found,) = [each for each in flight.findings if each.limit.name == "aside"]
+    (found,) = [each for each in flight.findings if each.limit.name == "offset"]
     assert found.satisfied
-    assert abs(flight.state["y"][[0, -1]]).max() < 0.1  # aside there alone
+    assert abs(flight.state["y"][[0, -1]]).max() < 0.1  # offset there alone
 
 
 def test_who_does_not_avoid_touches_and_who_does_keeps_clear() -> None:

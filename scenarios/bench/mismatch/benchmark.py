@@ -152,7 +152,7 @@ def _judge(log: FlightLog, step_ms: Array, bound: float, scenario: Scenario) -> 
     control = log.control
     flown = bool(control.t.size)
     end = control.truth[-1, list(POSITION)] - control.reference[-1, :3] if flown else None
-    # A row of the plant stands for the step that follows it; the last has none.
+    # A row of the plant covers the step that follows it; the last has none.
     tilts = np.degrees(np.abs(log.plant.state[:-1, [INDEX["roll"], INDEX["pitch"]]]).max(axis=1))
     violated = np.count_nonzero(tilts > bound) * scenario.plant.timestep
     return MismatchFlight(

@@ -53,7 +53,7 @@ CONDITIONS: Final = {
         "deviation",
         _noise(1.0),
     ),
-    "worn rotor": Condition(f"rotor 2 loses {100 * WORN:g} % of thrust and torque at 12 s, for good", _worn(1.0)),
+    "worn rotor": Condition(f"rotor 2 loses {100 * WORN:g} % of thrust and torque at 12 s, permanently", _worn(1.0)),
     "yaw 180 deg": Condition(
         "starts half a turn away from the heading that it is to have", ("initial.euler=[0.0, 0.0, 180.0]",)
     ),

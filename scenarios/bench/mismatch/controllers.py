@@ -146,5 +146,5 @@ VARIANTS: Final = {
 }
 """By their names in tables, in order.  The last three keep the bounds on speeds and no others: held to the paper's
 bounds on steps, which it knows nothing of, the LQR overturns on the nominal course."""
-FULL: Final = "+ tightening"  # the one with every part that tells it apart from the paper's
+FULL: Final = "+ tightening"  # the one with all differences from the paper's
 QUICK_VARIANTS: Final = ("paper", "+ offset-free", "PID")

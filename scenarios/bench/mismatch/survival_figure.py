@@ -72,8 +72,8 @@ def _draw_panel(axes: Axes, measured: MismatchBench, panel: _Panel) -> None:
             )
     axes.set_xlim(0.0, len(measured.conditions))
     axes.set_ylim(len(measured.controllers), 0.0)
-    places = [column + 0.5 for column in range(len(measured.conditions))]
-    axes.set_xticks(places, [_broken(name) for name in measured.conditions], fontsize=7.5)
+    positions = [column + 0.5 for column in range(len(measured.conditions))]
+    axes.set_xticks(positions, [_broken(name) for name in measured.conditions], fontsize=7.5)
     axes.set_yticks([row + 0.5 for row in range(len(measured.controllers))], [*measured.controllers], fontsize=8.5)
     axes.tick_params(length=0.0)
     axes.grid(visible=False)

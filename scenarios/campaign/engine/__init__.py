@@ -1,1 +1,1 @@
-"""Who flies the flights of a campaign: processes on this machine, or a cluster."""
+"""The workers of a campaign: processes on this machine, or a cluster."""

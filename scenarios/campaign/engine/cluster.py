@@ -40,7 +40,7 @@ class DaskEngine:
 
     Args:
         cluster: the scheduler's address, e.g. `tcp://10.0.0.1:8786`, or a TOML file for `jobs.read_jobs`.
-        patience: how long to go on without any worker [s]; by default a minute, or a day with jobs of a batch system.
+        patience: how long to wait without any worker [s]; by default a minute, or a day with jobs of a batch system.
 
     Raises:
         InputError: the address or the file is wrong.
@@ -60,7 +60,7 @@ class DaskEngine:
 
     @cached_property
     def workers(self) -> int:
-        """Workers that the jobs will start, or that the scheduler knows when this is first asked.
+        """Workers that the jobs will start, or that the scheduler knows at the first call.
 
         Raises:
             EngineError: no scheduler answers.
@@ -107,7 +107,7 @@ def fly_chunk(pickled: bytes, chunk: Sequence[int], expected: Mapping[str, str])
     The pilot is small against seconds of work; each worker makes it once.
 
     Raises:
-        EngineError: the worker has other versions than expected, or nobody can fly there.
+        EngineError: the worker has other versions than expected, or no worker can fly there.
     """
     worker = _distributed().get_worker()
     other = [f"{name} {found}, not {expected[name]}" for name, found in versions().items() if found != expected[name]]
@@ -195,7 +195,7 @@ class _Flights:
         if workers:
             self._seen = now
         elif now - self._seen > self._patience:
-            raise EngineError(f"{self._where}: no worker for {self._patience:g} s; start some, and go on with --resume")
+            raise EngineError(f"{self._where}: no worker for {self._patience:g} s; start some, then use --resume")
 
     def _hand_out(self) -> None:
         while self._waiting and len(self._flying) < self._workers:
@@ -231,7 +231,7 @@ class _Flights:
             answers: list[Answer] = future.result(timeout=_FETCH_S)
         except _distributed().CancelledError as error:
             raise self._gone() from error
-        except (OSError, TimeoutError):  # whoever had them died, and nobody else does
+        except (OSError, TimeoutError):  # their worker died, no other has them
             self._waiting.extendleft(reversed(chunk))
             return []
         self._waiting.extendleft(reversed(chunk[len(answers) :]))  # of a chunk that was called off, and yet came
@@ -259,7 +259,7 @@ class _Flights:
         return [self._pilot.lost(flight, f"its process died {self._deaths[flight]} times")]
 
     def _gone(self) -> EngineError:
-        return EngineError(f"{self._where} is gone; what was flown is kept: go on with --resume")
+        return EngineError(f"{self._where} is gone; finished flights are saved: continue with --resume")
 
 
 def _jobs(file: str) -> Jobs:

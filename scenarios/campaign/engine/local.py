@@ -84,14 +84,14 @@ class _Supervisor:
     flights: deque[int] = field(default_factory=deque)
 
     def dismiss(self) -> None:
-        """Ask it to leave with all processes below it."""
+        """Request its end, with all processes below it."""
         with contextlib.suppress(OSError):
             self.pipe.send(None)
 
     def ending(self) -> str:
         """How it ended, after a while by force; frees what it held."""
         until = clock.monotonic() + _LEAVING_S
-        with contextlib.suppress(EOFError, OSError):  # which says that it is gone, also after its server's death
+        with contextlib.suppress(EOFError, OSError):  # a sign that it is gone, also after its server's death
             while self.pipe.poll(max(until - clock.monotonic(), 0.0)):
                 self.pipe.recv_bytes()
             self.process.kill()
@@ -160,7 +160,7 @@ class _Pool:
                 continue
             finally:
                 theirs.close()
-            with contextlib.suppress(OSError):  # it is dead already, which its pipe will tell
+            with contextlib.suppress(OSError):  # it is dead already, which its pipe will show
                 ours.send_bytes(self._pickled)
             return
         raise EngineError(f"no supervisor process can be started here ({type(problem).__name__}: {problem})")
@@ -195,7 +195,7 @@ class _Pool:
                         raise EngineError(f"a worker process cannot fly here: {reason}")
                     case Ready():
                         supervisor.ready, self._failed_starts = True, 0
-                    case _:  # what nobody asked for
+                    case _:  # unrequested
                         return rows + self._remove(supervisor)
         except (EOFError, OSError):
             return rows + self._remove(supervisor)

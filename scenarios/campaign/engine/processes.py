@@ -1,6 +1,6 @@
 """What Linux lets a process know and decide of those below it: who they are, what they hold, that none outlives it.
 
-Other systems have nothing of this: there nobody is adopted, and what processes hold is not known.
+Other systems have nothing of this: there no process is adopted, and what processes hold is not known.
 """
 
 from __future__ import annotations
@@ -88,12 +88,12 @@ def end_children(group: int | None = None) -> None:
 
 
 def is_stopped(pid: int) -> bool:
-    """Whether somebody has stopped a process, as SIGSTOP does."""
+    """Whether a process is stopped, as SIGSTOP does."""
     return _state(Path(f"/proc/{pid}"))[:1] == ["T"]
 
 
 def end_session(session: int) -> None:
-    """Kill whoever belongs to a session, whose leader is dead and is not to be survived."""
+    """Kill the processes of a session whose leader is dead."""
     for folder in Path("/proc").glob("[0-9]*"):
         with contextlib.suppress(OSError, LookupError):
             if int(_state(folder)[3]) == session:
@@ -101,7 +101,7 @@ def end_session(session: int) -> None:
 
 
 def _state(process: Path) -> list[str]:
-    """What /proc/PID/stat says after the name: state, parent, group, session; nothing of a process that is gone."""
+    """/proc/PID/stat after the name: state, parent, group, session; nothing of a process that is gone."""
     try:
         return (process / "stat").read_text(encoding="ascii", errors="replace").rpartition(")")[2].split()
     except OSError:

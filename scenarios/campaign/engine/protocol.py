@@ -41,7 +41,7 @@ class Pilot(Protocol):
         """The row of a flight, plain values; reports each control period that is flown."""
 
     def lost(self, flight: int, reason: str, verdict: str = ERROR) -> Row:
-        """The row of a flight that nobody came back from: its process died or met a limit, or `fly` raised."""
+        """The row of a flight without a result: its process died or met a limit, or `fly` raised."""
 
 
 class Engine(Protocol):
@@ -57,7 +57,7 @@ class Engine(Protocol):
         """The rows, each flight's exactly once, in whatever order they come; closing the iterator stops all work.
 
         Raises:
-            EngineError: there is nobody left to fly.
+            EngineError: no worker is left.
         """
 
 
@@ -76,7 +76,7 @@ def fly_one(pilot: Pilot, flight: int, progress: Progress = silent) -> Answer:
         pickle.dumps(row)  # it has to get home
     except MemoryError as error:
         row = pilot.lost(flight, describe(error), MEMORY)
-    except BaseException as error:  # a plug-in controller may ask to leave, or raise what ends loops
+    except BaseException as error:  # a user-defined controller may exit, or raise what ends loops
         row = pilot.lost(flight, describe(error))
     gc.collect()  # what a flight leaves in cycles, a dozen megabytes sometimes, is not to wait for the next ones
     return Answer(row, clock.perf_counter() - started)

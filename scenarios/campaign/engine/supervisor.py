@@ -1,7 +1,7 @@
 """A process that starts a worker, hands it flights, watches it from outside and ends it with all that it started.
 
 No controller ever runs in it: whatever one does, hang with the interpreter held, fork, take all memory, block signals,
-it does to the worker, which the supervisor replaces.  It leaves when its parent does, and nobody stays behind.
+it does to the worker, which the supervisor replaces.  It ends with its parent, and leaves no process.
 """
 
 from __future__ import annotations
@@ -32,8 +32,8 @@ from scenarios.gc_tuning import collect_rarely, freeze_for_good
 
 LOOK_S: Final = 0.2  # between two looks at a worker that flies [s]
 _TURN_S: Final = 1.0  # most that one look counts of the time since the last one [s]
-_LEAVING_S: Final = 1.0  # for a worker that says nothing more to be gone [s]
-_LARGEST: Final = 1 << 26  # no worker says more at once [bytes]
+_LEAVING_S: Final = 1.0  # for a worker without output to end [s]
+_LARGEST: Final = 1 << 26  # largest message of a worker [bytes]
 _MAIN: Final = (
     "import json, sys; sys.path[:] = json.loads(sys.argv[2]); import scenarios.campaign.preload; "
     "from scenarios.campaign.engine.supervisor import main; main(int(sys.argv[1]))"
@@ -56,20 +56,20 @@ class Died(NamedTuple):
     ending: str
 
 
-Message = Ready | Unfit | Died | Answer  # what a supervisor tells its parent
+Message = Ready | Unfit | Died | Answer  # from a supervisor to its parent
 
 
 def serve(pipe: Connection, folder: str) -> None:
-    """Have flights flown until the parent says that it is enough, or is gone, even in the middle of a flight.
+    """Have flights flown until the parent ends it, or is gone, even in the middle of a flight.
 
     Each flight is answered as soon as it is flown, so that a death loses one at most.
 
     Args:
-        pipe: brings the pickled pilot, then chunks, lists of flights, at last None; takes what is said.
+        pipe: brings the pickled pilot, then chunks, lists of flights, at last None; takes the answers.
         folder: the parent's working directory.
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches every process of a terminal; the parent sees to it
-    os.setsid()  # so that its parent can end whom it left, if somebody kills it
+    os.setsid()  # so that its parent can end its children, if it is killed
     with contextlib.suppress(AttributeError, TypeError, OSError):
         os.close(forkserver._forkserver._forkserver_alive_fd)  # type: ignore[attr-defined]  # what is written there kills the server
     collect_rarely()
@@ -113,11 +113,11 @@ class _Worker:
             os.write(self._inbox, FLIGHT.pack(flight))
 
     def hear(self) -> FlightReport | None:
-        """What it says, once it is there as a whole.
+        """Its message, once it is complete.
 
         Raises:
-            EOFError: it will never say anything again.
-            ValueError: what it says is nothing that a worker says.
+            EOFError: it will send no more messages.
+            ValueError: the message is not one of a worker.
         """
         piece = os.read(self.outbox, 1 << 20)
         if not piece:
@@ -199,7 +199,7 @@ class _Supervisor:
             self._worker = None
 
     def _listen(self) -> bool:
-        """Wait for whatever happens next, but not for long while somebody flies; False when it is time to leave."""
+        """Wait for whatever happens next, but not for long during a flight; False when it is time to leave."""
         worker, started = self._worker, clock.monotonic()
         watched: list[Connection | int] = [self._pipe, *((worker.outbox,) if worker else ())]
         happened = connection.wait(watched, timeout=LOOK_S if self._flying else None)
@@ -207,7 +207,7 @@ class _Supervisor:
             self._hear(worker)
         elif worker is not None and self._flying:
             waited = clock.monotonic() - started
-            self._watch(worker, min(waited, _TURN_S))  # while this process had no turn, nobody may have had one
+            self._watch(worker, min(waited, _TURN_S))  # while this process was idle, it may have been too
         if self._pipe in happened:
             chunk = self._pipe.recv()
             if chunk is None:
@@ -221,7 +221,7 @@ class _Supervisor:
             if report is None:
                 return
             if not self._flying or report.answer.row["flight"] != self._flights[0]:
-                raise ValueError("nobody asked")
+                raise ValueError("unrequested")
         except EOFError:
             self._lose(worker.ending())
         except (ValueError, LookupError, AttributeError, TypeError) as error:
@@ -234,7 +234,7 @@ class _Supervisor:
                 self._dismiss()  # so that the next flight does not meet what this one left
 
     def _lose(self, ending: str) -> None:
-        """The worker is gone, or no good, and maybe a flight with it."""
+        """The worker is gone, or unusable, and perhaps a flight with it."""
         flying = self._flying
         self._dismiss()
         if flying:
@@ -266,7 +266,7 @@ class _Supervisor:
 
 
 class SupervisorProcess:
-    """Flies one flight at a time beside this process; whoever dies of it is replaced."""
+    """Flies one flight at a time beside this process; a worker that dies is replaced."""
 
     def __init__(self, pilot: Pilot, pickled: bytes) -> None:
         self._pilot, self._pickled = pilot, pickled
@@ -277,7 +277,7 @@ class SupervisorProcess:
         """What became of a flight, after as many tries as its process may die.
 
         Raises:
-            EngineError: nobody can fly here.
+            EngineError: no worker can fly here.
         """
         ending = ""
         for _ in range(MOST_DEATHS):

@@ -28,7 +28,7 @@ _MODULES: Final = (
     *("builtins", "gc", "math", "os", "random", "time", "warnings"),
     *("mujoco", "numpy", "numpy.linalg", "piqp", "scipy.linalg"),
 )
-"""Besides our own packages: modules that flights use, in which somebody may put something else."""
+"""Besides our own packages: modules that flights use, which user code may replace."""
 _LIMITS: Final = tuple(getattr(resource, name) for name in dir(resource) if name.startswith("RLIMIT_"))
 _TIMERS: Final = (signal.ITIMER_REAL, signal.ITIMER_VIRTUAL, signal.ITIMER_PROF)
 _ONE, _THREE, _SMALLEST = 1.0, 3.0, 5e-324
@@ -42,7 +42,7 @@ class Traces:
     """Finds what a flight has left behind in its process.
 
     What a process is like when this is made is how it should stay: its working directory, environment, signals,
-    threads, limits, numpy's and the processor's ways with numbers, and what our modules, and those that they compute
+    threads, limits, the arithmetic of numpy and the processor, and what our modules, and those that they compute
     with, consist of.  What a controller's own module keeps in its own variables is not looked for.
     """
 
@@ -112,14 +112,14 @@ def _rounding() -> tuple[float, ...]:
 
 
 class FlightReport(NamedTuple):
-    """What a worker says of a flight."""
+    """A worker's report on a flight."""
 
     answer: Answer  # the outcome
     spent: bool  # whether the flight left something in the process that the next one would meet
 
 
 def fly_for(supervisor: int, pilot: Pilot, inbox: int, outbox: int, pulse: mmap) -> NoReturn:
-    """Fly until somebody ends this process.
+    """Fly until this process is ended.
 
     Args:
         supervisor: the process that this one was forked from, and is not to outlive.
@@ -153,7 +153,7 @@ def fly_for(supervisor: int, pilot: Pilot, inbox: int, outbox: int, pulse: mmap)
 
 
 def _identity(descriptor: int) -> tuple[int, int]:
-    """What a file descriptor stands for: a controller that closes it may open another file in its place."""
+    """What a file descriptor refers to: a controller that closes it may open another file in its place."""
     try:
         found = os.fstat(descriptor)
     except OSError:

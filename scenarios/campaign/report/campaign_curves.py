@@ -23,7 +23,7 @@ MAIN_METRICS: Final = (
     "total_variation",
     "fallback_periods",
 )
-"""What a reader of a campaign asks for first."""
+"""What a reader of a campaign looks for first."""
 _BINS: Final = 40
 
 
@@ -59,7 +59,7 @@ class Association:
 
 @dataclass(frozen=True, kw_only=True)
 class Driver:
-    """How a drawn number goes with the outcomes, None where there is none to tell."""
+    """How a drawn number goes with the outcomes, None where there is none."""
 
     name: str
     label: str
@@ -137,7 +137,7 @@ def converging(summary: Summary) -> dict[str, str]:
 
 
 def convergence_range(summary: Summary, events: Sequence[str]) -> tuple[float, float]:
-    """Ends of the axis of shares [%]: what the intervals of the last nine tenths of all flights ask for."""
+    """Ends of the axis of shares [%]: those of the intervals of the last nine tenths of all flights."""
     curves = summary["convergence"]
     n = np.asarray(curves["flights"], float)
     settled = n >= 0.1 * n[-1]

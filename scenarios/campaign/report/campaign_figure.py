@@ -51,7 +51,7 @@ def _draw(name: str, table: pa.Table, summary: Summary) -> Figure:
     _draw_margins(panels[1], table)
     _draw_drivers(panels[2], summary)
     if drawn is None or not parameters:
-        _say(panels[3], "no margins, or nothing drawn")
+        _note(panels[3], "no margins, or nothing drawn")
     for axes in panels[3 + max(len(parameters), 1) :]:
         axes.set_axis_off()
     if drawn is not None and parameters:
@@ -74,7 +74,7 @@ def _draw_convergence(axes: Axes, summary: Summary) -> None:
 
     axes.set_title("share of failed flights, in its interval", loc="left", fontsize=9.5)
     if not summary["flights"]:
-        _say(axes, "no flights")
+        _note(axes, "no flights")
         return
     curves = summary["convergence"]
     n = curves["flights"]
@@ -96,7 +96,7 @@ def _draw_margins(axes: Axes, table: pa.Table) -> None:
     axes.set_title("worst margin; 0: end of what is allowed", loc="left", fontsize=9.5)
     drawn = next((histogram for histogram in histograms(table) if histogram.name == "worst_margin"), None)
     if drawn is None:
-        _say(axes, "no margins that differ")
+        _note(axes, "no margins that differ")
         return
     below = np.zeros(drawn.edges.size - 1)
     for verdict in present(table):
@@ -129,7 +129,7 @@ def _draw_drivers(axes: Axes, summary: Summary) -> None:
     axes.set_title("what goes with the outcome", loc="left", fontsize=9.5)
     strongest = drivers(summary)[:_MOST_DRIVERS]
     if not strongest:
-        _say(axes, "nothing to correlate")
+        _note(axes, "nothing to correlate")
         return
     outcomes = (
         ("worst margin", LINES[0], -0.2, [driver.margin for driver in strongest]),
@@ -192,7 +192,7 @@ def _draw_scatter(axes: Axes, table: pa.Table, cloud: scatters.Cloud, drawn: sca
     axes.set_xlabel(cloud.label)
 
 
-def _say(axes: Axes, what: str) -> None:
+def _note(axes: Axes, what: str) -> None:
     """An empty panel, and why it is so."""
     axes.text(0.5, 0.5, what, transform=axes.transAxes, ha="center", va="center", color="#5b6067")
     axes.set_xticks([])

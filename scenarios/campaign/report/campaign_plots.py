@@ -179,7 +179,7 @@ def _measures(
 
 
 def _faded(colour: str, opacity: float) -> str:
-    """A colour of the palette as rgba, which plotly asks for to fill an area."""
+    """A colour of the palette as rgba, as plotly needs to fill an area."""
     red, green, blue = (int(colour[i : i + 2], 16) for i in (1, 3, 5))
     return f"rgba({red},{green},{blue},{opacity})"
 

@@ -189,7 +189,7 @@ def driver_table(summary: Summary) -> Grid:
 
 
 def split_table(summary: Summary) -> Grid:
-    """The thresholds on drawn numbers that tell flights with an event from those without, beyond chance."""
+    """The thresholds on drawn numbers that separate flights with an event from those without, beyond chance."""
     listed = list(sure_splits(summary))
     sure = f"{100.0 * summary['confidence']:g} % interval"
     lines = tuple(

@@ -67,7 +67,7 @@ def _bounds(summary: Summary) -> Iterator[str]:
 
 
 def _bound(event: Mapping[str, Any]) -> str:
-    """The one-sided bound that says more: from below where most flights had the event."""
+    """The more informative one-sided bound: from below where most flights had the event."""
     if event["share"] > 0.5:
         return f"at least {percent(event['lower_one_sided'])}"
     return f"at most {percent(event['upper_one_sided'])}"
@@ -95,7 +95,7 @@ def _constraints(summary: Summary) -> Iterator[str]:
 
 
 def driver_sentences(summary: Summary) -> Iterator[str]:
-    """What goes with the outcome in one direction, and what in another way."""
+    """What the outcome depends on, monotonically and otherwise."""
     for outcome, noun in _OUTCOMES.items():
         associations = {name: found.get(outcome) for name, found in summary["parameters"].items()}
         tested = {name: found for name, found in associations.items() if found}
@@ -115,8 +115,8 @@ def driver_sentences(summary: Summary) -> Iterator[str]:
                 f"{noun} {'also ' if strongest else ''}depends on {listed}, without rising or falling throughout: "
                 "Chatterjee's xi, p-value after Holm's correction."
             )
-        told_by_threshold = outcome == "failed" and any(event == "failure" for event, *_ in sure_splits(summary))
-        if tested and not (strongest or surest or told_by_threshold):
+        has_threshold = outcome == "failed" and any(event == "failure" for event, *_ in sure_splits(summary))
+        if tested and not (strongest or surest or has_threshold):
             yield (
                 f"{noun} goes with no drawn number beyond chance (rank correlation, and Chatterjee's xi for any "
                 "dependence; 5 % after Holm's correction for all tests)."

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 import numpy as np
 
 from quadsim.errors import InputError, ParameterError, UnknownNameError
-from scenarios.campaign.results.verdicts import OWN_EVENTS
+from scenarios.campaign.results.verdicts import VERDICT_EVENTS
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -26,13 +26,13 @@ _NAMED: Final[dict[str, tuple[str, bool | str]]] = {
     "violation": ("violated", True),
     "lost": ("verdict", "lost"),
     "crash": ("crashed", True),
-    **{verdict: ("verdict", verdict) for verdict in OWN_EVENTS},
+    **{verdict: ("verdict", verdict) for verdict in VERDICT_EVENTS},
 }
 """Column of each event that has a name, and its value there where the event holds."""
 _SPELLINGS: Final = {"failed": "failure", "violated": "violation", "crashed": "crash"}
 _OPERATIONS: Final = {"<": operator.lt, "<=": operator.le, ">": operator.gt, ">=": operator.ge}
 _NEVER_COMPARED: Final = ("flight", "seed", "failed")
-"""Columns that tell flights apart, or what other events make of them."""
+"""Columns that identify flights, or are covered by other events."""
 _COMPARISON: Final = re.compile(r"(?P<column>[^<>=]*?)\s*(?P<operation><=|>=|<|>)\s*(?P<number>[^<>=]*)")
 
 EVENT_NAMES: Final = tuple(_NAMED)  # the events that have a name; every other one is `COLUMN OP NUMBER`
@@ -41,7 +41,7 @@ EVENT_NAMES: Final = tuple(_NAMED)  # the events that have a name; every other o
 class Event(NamedTuple):
     """Something that a flight's row shows to have happened, or not."""
 
-    text: str  # the event as it is written in one way: a name of `EVENT_NAMES`, or `COLUMN OP NUMBER`
+    text: str  # the event in its standard form: a name of `EVENT_NAMES`, or `COLUMN OP NUMBER`
     column_name: str  # the column that shows it
     operation: str  # `==`, `<`, `<=`, `>` or `>=`
     value: bool | str | float  # what the column is compared with
@@ -51,7 +51,7 @@ class Event(NamedTuple):
 
         Raises:
             UnknownNameError: there is no such column.
-            InputError: a number is asked for, and the column holds text.
+            InputError: a number is required, and the column holds text.
         """
         if self.column_name not in row:
             raise UnknownNameError("column", self.column_name, row)
@@ -69,7 +69,7 @@ class Event(NamedTuple):
 
         Raises:
             UnknownNameError: there is no such column.
-            InputError: a number is asked for, and the column holds text.
+            InputError: a number is required, and the column holds text.
         """
         if self.column_name not in table.column_names:
             raise UnknownNameError("column", self.column_name, table.column_names)

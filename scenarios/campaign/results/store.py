@@ -115,7 +115,7 @@ class Store:
         self._files.write({f"{PARTS_DIR}/part-{first:09d}.parquet": _encoded(make_table(rows, self._schema))})
 
     def close(self, flights: int) -> pa.Table:
-        """Put the first so many flights into their final two tables, take the parts away, and return `flights.parquet`.
+        """Put the first `count` flights into their final two tables, take the parts away, and return `flights.parquet`.
 
         Raises:
             OutputError: they cannot be written; the parts are still there.

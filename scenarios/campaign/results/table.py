@@ -133,7 +133,7 @@ def flown_row(log: FlightLog, findings: Sequence[Finding], *, verdict: str, wall
 
 
 def failed_row(reason: str, verdict: str = ERROR) -> Row:
-    """What is kept of a flight that raised, whose process died, or that met a limit of time or memory."""
+    """The row of a flight that raised, whose process died, or that met a limit of time or memory."""
     return {"status": verdict, "verdict": verdict, "reason": reason, "violated": True, "crashed": False}
 
 

@@ -8,7 +8,7 @@ from quadsim.report.palette import BOUND, LINES, REFERENCE
 
 ERROR: Final = "error"  # status and verdict of a flight that raised, or whose process died
 TIMEOUT: Final = "timeout"  # those of a flight that was ended since it, or a step of its controller, took too long
-MEMORY: Final = "memory"  # those of a flight that asked for too much memory
+MEMORY: Final = "memory"  # those of a flight that needed too much memory
 HARMLESS: Final = "satisfied"
 
 
@@ -40,5 +40,5 @@ VERDICTS: Final = {
 }
 """In the order in which they are drawn and counted."""
 
-OWN_EVENTS: Final = tuple(name for name in VERDICTS if name not in (HARMLESS, "violated"))
+VERDICT_EVENTS: Final = tuple(name for name in VERDICTS if name not in (HARMLESS, "violated"))
 """Verdicts that are events of their own name; `violation` is every verdict but `satisfied`."""

@@ -1,1 +1,1 @@
-"""What a campaign's flights say, and how sure that is."""
+"""What a campaign's flights show, and with which confidence."""

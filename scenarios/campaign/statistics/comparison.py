@@ -1,6 +1,6 @@
 """Two campaigns flown on the same draws: is the second better, and how sure is that?
 
-Flights of one number meet the same drawn values and the same random numbers, so they are compared in pairs; that tells
+Flights of one number have the same drawn values and random numbers, so they are compared in pairs: this detects
 far smaller differences than two campaigns side by side would.
 """
 
@@ -235,7 +235,7 @@ def compare(
     Args:
         table_a: `flights.parquet` of the first.
         table_b: of the second.
-        names: of the first and the second; where they are the same, the comparison tells them apart as such.
+        names: of the first and the second; where they are the same, the comparison distinguishes them as such.
         failures: the events that each counts as failure; None where they are known to be the same.
 
     Raises:
@@ -306,8 +306,8 @@ def _require_alike(a: pa.Table, b: pa.Table, column: str, names: Sequence[str]) 
 
 def _compare_metric(a: pa.Table, b: pa.Table, name: str, completed: Flags) -> MetricComparison:
     first, second = numbers(a, name), numbers(b, name)
-    kept = completed & np.isfinite(first) & np.isfinite(second)
-    first, second = first[kept], second[kept]
+    valid = completed & np.isfinite(first) & np.isfinite(second)
+    first, second = first[valid], second[valid]
     return MetricComparison(
         name=name,
         unit=unit_of(a, name),

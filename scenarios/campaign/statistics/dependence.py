@@ -1,7 +1,7 @@
-"""Whether an outcome depends on a drawn number: in one direction, in any way, or from a threshold on.
+"""Whether an outcome depends on a drawn number: in one direction, in any form, or from a threshold on.
 
 A rank correlation sees what rises or falls throughout, and is blind to what does harm at both ends.  Chatterjee's xi
-sees any dependence, and asks for more flights.  Of an event, Fisher's exact test chooses the threshold.  Its p-value
+sees any dependence, and needs more flights.  Of an event, Fisher's exact test chooses the threshold.  Its p-value
 there is too good, since the best of many was taken; the chance that the best of all thresholds is as good where the
 event has nothing to do with the number is found exactly, by following all orders of the flights at once (Boulesteix,
 Biometrical Journal 48, 2006, with Fisher's p-value in place of chi-squared).
@@ -101,8 +101,8 @@ def any_dependence(x: Array, y: Array, rng: np.random.Generator) -> Dependence |
 
 def _ranked(x: Array, y: Array) -> tuple[Array, Array] | None:
     """Ranks of the pairs that have both; None where there is nothing to relate."""
-    kept = ~(np.isnan(x) | np.isnan(y))
-    x, y = scipy.stats.rankdata(x[kept]), scipy.stats.rankdata(y[kept])
+    valid = ~(np.isnan(x) | np.isnan(y))
+    x, y = scipy.stats.rankdata(x[valid]), scipy.stats.rankdata(y[valid])
     return None if x.size < 3 or np.ptp(x) == 0.0 or np.ptp(y) == 0.0 else (x, y)
 
 
@@ -111,7 +111,7 @@ def _p_of_few_runs(happened: Flags) -> float:
     ones = int(happened.sum())
     zeros = happened.size - ones
     runs = np.arange(2, int(np.count_nonzero(np.diff(happened))) + 2)
-    fewer, more = runs // 2, (runs + 1) // 2  # runs of the one value and of the other, or the other way round
+    fewer, more = runs // 2, (runs + 1) // 2  # runs of the one value and of the other, or the reverse
 
     def ways(of_ones: Counts, of_zeros: Counts) -> Array:
         return _log_binomial(ones - 1, of_ones - 1) + _log_binomial(zeros - 1, of_zeros - 1)
@@ -225,7 +225,7 @@ def best_splits(columns: Mapping[str, Array], happened: Flags) -> dict[str, Spli
 
 
 def _fisher(counts: Counts, flights: int, count: int) -> Array:
-    """(D, K - 1) p-values at each cut, of so many events among the first 1, 2, ... flights."""
+    """(D, K - 1) p-values at each cut, of this many events among the first 1, 2, ... flights."""
     found = np.empty(counts.shape)
     for size, tails in enumerate(_tails(flights, count)):
         found[:, size] = tails[counts[:, size]]

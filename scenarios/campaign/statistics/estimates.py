@@ -37,11 +37,11 @@ _CURVE_POINTS: Final = 80
 SPLIT_EVENTS: Final = ("failure", "violation", "lost")
 """Events for which a threshold is looked for, where they are not the same flights as an earlier one's."""
 _GROUPS: Final = ((50, 5), (12, 3))
-"""Flights from which a drawn number's values are looked at in so many groups of about equal size."""
+"""Flights from which a drawn number's values are looked at in this many groups of about equal size."""
 
 
 def estimate(table: pa.Table) -> dict[str, Any]:
-    """Everything a campaign's summary says of its flights, as plain data for JSON.
+    """Everything in a campaign's summary about its flights, as plain data for JSON.
 
     Keys: `flights`; `confidence` of every interval; `verdicts`, flights of each; `events` and `constraints`, by name,
     as proportions (`inference.Proportion`), a constraint's being that it did not hold or was not
@@ -152,10 +152,10 @@ def _convergence(table: pa.Table) -> dict[str, Any]:
 
 
 def parameters(table: pa.Table) -> dict[str, Any]:
-    """What a campaign's summary says of each drawn parameter, as plain data for JSON.
+    """A campaign's summary of each drawn parameter, as plain data for JSON.
 
     Of a number: its `unit`; under `worst_margin` and `failed` Spearman's `rho` with that outcome and Chatterjee's `xi`
-    of that outcome, with their p-values `p` and `p_xi`; under `splits`, by event, the threshold that best tells the
+    of that outcome, with their p-values `p` and `p_xi`; under `splits`, by event, the threshold that best separates
     flights with the event (`dependence.Split`); failures by `groups` of its values from the lowest on;
     under `turn`, where the course of the worst margin turns, `highest` or `lowest` at a value, or None.  All p-values
     of all parameters, outcomes and measures together are corrected by Holm's method: `p_holm`, `p_xi_holm`.

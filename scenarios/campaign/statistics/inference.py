@@ -138,7 +138,7 @@ def paired_difference(a: Array, b: Array) -> PairedDifference:
     """Mean and median of b - a, (K,) finite each, with their intervals.
 
     The mean's is Student's t interval.  The median's has order statistics at its ends, by inverting the sign test, and
-    asks nothing of the distribution (Conover, Practical Nonparametric Statistics, 1999, 3.2).
+    assumes nothing about the distribution (Conover, Practical Nonparametric Statistics, 1999, 3.2).
     """
     differences = np.asarray(b, float) - np.asarray(a, float)
     n = differences.size

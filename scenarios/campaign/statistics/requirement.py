@@ -18,7 +18,7 @@ from scenarios.campaign.statistics.wording import count_of, percent
 EXAMPLE: Final = "P(violation) < 0.01 @ 95%"
 _SHARES: Final = (Decimal("1e-9"), 1 - Decimal("1e-9"))
 _CONFIDENCES: Final = (Decimal("0.5"), Decimal("0.999999"))
-_MOST_TOLD: Final = 10**9  # flights beyond which a message says only that it takes more
+_MOST_REPORTED: Final = 10**9  # flights beyond which a message states only that it takes more
 _FORM: Final = re.compile(
     r"P\s*\((?P<event>[^()]*)\)\s*(?P<operation><=|>=|<|>)\s*(?P<share>[^<>=@]+?)\s*@\s*(?P<confidence>[^@%]+?)\s*%",
     re.IGNORECASE,
@@ -27,7 +27,7 @@ _FORM: Final = re.compile(
 
 @dataclass(frozen=True, kw_only=True)
 class Requirement:
-    """What is asked: the probability of an event on one side of a share, with this confidence."""
+    """The probability of an event on one side of a share, with this confidence."""
 
     text: str  # as it was given
     event: Event  # whose probability
@@ -41,7 +41,7 @@ class Requirement:
         return self.operation.startswith("<")
 
     def supported_by(self, bound: float) -> bool:
-        """Whether a one-sided bound on the probability is on the side that is asked for."""
+        """Whether a one-sided bound on the probability is on the required side."""
         strict = len(self.operation) == 1
         inside = bound < self.share if self.at_most else bound > self.share
         return inside or (not strict and bound == self.share)
@@ -51,7 +51,7 @@ class Requirement:
 class Judgement:
     """Whether the flights support a requirement."""
 
-    requirement: Requirement  # what was asked
+    requirement: Requirement
     count: int  # flights in which the event happened
     flights: int  # of how many
     # the one-sided Clopper-Pearson bound at the requirement's confidence: upper where the probability is to be small,
@@ -65,24 +65,24 @@ class Judgement:
     @property
     def sentence(self) -> str:
         """The judgement with its numbers."""
-        asked = self.requirement
+        required = self.requirement
         share = f" ({percent(self.count / self.flights)})" if self.flights else ""
         phrase = (
-            f"{asked.text} {'holds' if self.holds else 'does not hold'}: {asked.event.text} in {self.count} of "
-            f"{count_of(self.flights, 'flight')}{share}, so with {100.0 * asked.confidence:g} % confidence at "
-            f"{'most' if asked.at_most else 'least'} {percent(self.bound, digits=3)}."
+            f"{required.text} {'holds' if self.holds else 'does not hold'}: {required.event.text} in {self.count} of "
+            f"{count_of(self.flights, 'flight')}{share}, so with {100.0 * required.confidence:g} % confidence at "
+            f"{'most' if required.at_most else 'least'} {percent(self.bound, digits=3)}."
         )
         if self.flights >= self.least_flights:
             return phrase
         least = f"at least {count_of(self.least_flights, 'flight')}"
-        if self.least_flights > _MOST_TOLD:
-            least = f"more than {_MOST_TOLD:,} flights"
-        return f"{phrase} It takes {least}, {'none' if asked.at_most else 'all'} of them with that event."
+        if self.least_flights > _MOST_REPORTED:
+            least = f"more than {_MOST_REPORTED:,} flights"
+        return f"{phrase} It takes {least}, {'none' if required.at_most else 'all'} of them with that event."
 
     def to_json(self) -> dict[str, Any]:
         """Plain data for `summary.json`."""
-        asked = asdict(self.requirement) | {"event": self.requirement.event.text}
-        return asdict(self) | {"requirement": asked, "sentence": self.sentence}
+        required = asdict(self.requirement) | {"event": self.requirement.event.text}
+        return asdict(self) | {"requirement": required, "sentence": self.sentence}
 
 
 def parse_requirement(text: str) -> Requirement:
@@ -120,7 +120,7 @@ def parse_requirement(text: str) -> Requirement:
 def judge(table: pa.Table, requirement: Requirement) -> Judgement:
     """Hold a campaign's flights, `flights.parquet`, against a requirement.
 
-    It holds when the one-sided Clopper-Pearson bound at its confidence is on the side that is asked for; so it takes
+    It holds when the one-sided Clopper-Pearson bound at its confidence is on the required side; so it takes
     flights enough, and no flights support nothing.
 
     Raises:
@@ -141,20 +141,20 @@ def judge(table: pa.Table, requirement: Requirement) -> Judgement:
 
 
 def least_flights(requirement: Requirement) -> int:
-    """The smallest number of flights that can support a requirement, all of them as it wishes.
+    """The smallest number of flights that can support a requirement, all of them in its favour.
 
-    With n such flights the bound is (1 - confidence)^(1/n) from the far end, which asks for
+    With n such flights the bound is (1 - confidence)^(1/n) from the far end, which requires
     n = ln(1 - confidence) / ln(1 - share); at a tie, the bound itself as it is computed decides.
     """
-    kept = math.log1p(-requirement.share) if requirement.at_most else math.log(requirement.share)
-    n = max(1, math.ceil(math.log1p(-requirement.confidence) / kept))
+    per_flight = math.log1p(-requirement.share) if requirement.at_most else math.log(requirement.share)
+    n = max(1, math.ceil(math.log1p(-requirement.confidence) / per_flight))
     near = range(max(1, n - 1), n + 2)
     best = ((k, _bound(requirement, 0 if requirement.at_most else k, k)) for k in near)
     return next((k for k, bound in best if requirement.supported_by(bound)), n)
 
 
 def _bound(requirement: Requirement, count: int, flights: int) -> float:
-    """The one-sided bound on the probability that is to be on the side that is asked for."""
+    """The one-sided bound on the probability."""
     bounds = upper_bounds if requirement.at_most else lower_bounds
     return float(bounds(count, flights, requirement.confidence))
 

@@ -24,7 +24,7 @@ LOWEST_MARGIN: Final = -2.0
 """Margins below this are drawn at the foot, so that a lost flight does not flatten all others."""
 _LEAST_DEPTH: Final = 0.25  # share of the height above 0 that is shown below it, however far from it the margins are
 _FENCE: Final = 5.0  # quartile ranges beyond the quartiles up to which values are drawn where they are
-COURSE: Final = "half of the flights are above"  # what a curve through the flights of a scatter tells
+COURSE: Final = "half of the flights are above"  # the meaning of a curve through the flights of a scatter
 _GAP: Final = 0.06  # from the axis' end to what is drawn at the edge, as a share of the axis
 _MOST_POINTS: Final = 18_000
 """Points that all scatters of a page may have together: a page of 10 000 flights stays near 6 MB and quick to draw."""
@@ -160,7 +160,7 @@ def clipping(drawn: Margins, parameters: list[Cloud]) -> str:
         for edge, side, end in (("left", "below", np.min), ("right", "above", np.max)):
             beyond = cloud.edge == edge
             parts += _count_beyond(cloud.true, beyond, side, end(cloud.true[~beyond]), of=cloud.name)
-    return f"Triangles at the edges stand for flights beyond the axes: {'; '.join(parts)}." if parts else ""
+    return f"Triangles at the edges mark flights beyond the axes: {'; '.join(parts)}." if parts else ""
 
 
 def _count_beyond(
@@ -220,7 +220,7 @@ def paired_margins(a: pa.Table, b: pa.Table, failed: tuple[Flags, ...], names: S
         margins=drawn,
         true=true,
         edge=np.select(sides, ["down", "up", "left", "right"], default=""),
-        beyond=f"Triangles at the edges stand for pairs beyond the axes: {'; '.join(beyond)}." if beyond else "",
+        beyond=f"Triangles at the edges mark pairs beyond the axes: {'; '.join(beyond)}." if beyond else "",
         kind=np.array(kinds, object)[failed[0][rows] + 2 * failed[1][rows].astype(int)],
         colours=dict(zip(kinds, (LINES[0], LINES[2], LINES[1], BOUND), strict=True)),
         lowest=float(drawn.min()) - 0.6 * gap,

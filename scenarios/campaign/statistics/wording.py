@@ -14,7 +14,7 @@ _SHORTEST: Final = 5  # characters that a line of every name may have
 
 
 def percent(share: float | None, digits: int = 2) -> str:
-    """A share in percent, e.g. `3.7 %`: so many digits that its distance to 0 or 100 % shows, and at least tenths."""
+    """A share in percent, e.g. `3.7 %`: enough digits that its distance to 0 or 100 % shows, and at least tenths."""
     return ABSENT if share is None else f"{_percent(share, digits)} %"
 
 
@@ -40,7 +40,7 @@ def label(name: str, unit: str) -> str:
 
 
 def count_of(count: int, thing: str) -> str:
-    """So many things: `1 flight`, `12 flights`."""
+    """A count with its noun: `1 flight`, `12 flights`."""
     return f"{count} {thing}{'' if count == 1 else 's'}"
 
 
@@ -51,7 +51,7 @@ def listing(names: Sequence[str], most: int) -> str:
 
 
 def side_by_side(names: Sequence[str], room: int) -> list[str]:
-    """Names for ticks of an axis with room for so many characters, in two lines each; what is too long ends in `…`."""
+    """Names for ticks of an axis with room for `room` characters, in two lines each; what is too long ends in `…`."""
     each = max(_SHORTEST, room // max(len(names), 1) - 1)
     found = []
     for name in names:
@@ -88,5 +88,5 @@ def _percent(share: float, digits: int = 2) -> str:
 
 
 def _decimals(size: float, digits: int = 2) -> int:
-    """Decimals that show so many digits of a size, at least one."""
+    """Decimals that show this many digits of a size, at least one."""
     return max(1, digits - 1 - math.floor(math.log10(size))) if size > 0.0 else 1

@@ -33,7 +33,7 @@ def sentences(summary: Summary) -> list[str]:
     found = [
         f"{count_of(summary['trials'], 'candidate')} and the start flew {summary['search_flights']} flights, each the "
         f"first of the same {summary['draws']} draws; {feasible} of them "
-        f"kept {summary['counted']} there by the share of flights."
+        f"held {summary['counted']} there by the share of flights."
     ]
     for each in summary["objectives"] if summary["answer"] != START else ():
         if each["kept"] is None:
@@ -99,12 +99,12 @@ def objective_table(summary: Summary) -> Grid:
         title="The draws that chose it, and fresh ones",
         head=(
             *("objective", "of flights", "start, search", "best, search", "promised"),
-            *("start, fresh", "best, fresh", "kept", "optimism [points]"),
+            *("start, fresh", "best, fresh", "confirmed", "optimism [points]"),
         ),
         lines=tuple(lines),
         note="Search: over the draws that chose the answer, so that luck chose with them. Fresh: over draws that chose "
-        "nothing, of the pairs that both completed. Optimism: what was kept less what was promised, in percentage "
-        "points of the start; above 0, the search promised too much.",
+        "nothing, of the pairs that both completed. Optimism: promised improvement minus confirmed one, in "
+        "percentage points of the start; above 0, the search promised too much.",
     )
 
 
@@ -151,7 +151,7 @@ def importance_table(summary: Summary) -> Grid:
         lines=tuple(lines),
         note="PED-ANOVA (Watanabe, Bansal and Hutter, 2023): how far the best tenth of the feasible candidates differs "
         "from all of them, field by field, as shares of the sum. The search crowds where it is good, so that few "
-        "candidates say little.",
+        "candidates show little.",
     )
 
 
@@ -163,7 +163,7 @@ def _optimism(share: float | None) -> str:
     if share is None:
         return "a share of nothing"
     points = f"{abs(100.0 * share):.1f} points"
-    return f"the search was too optimistic by {points}" if share > 0.0 else f"it promised {points} less than was kept"
+    return f"the search was too optimistic by {points}" if share > 0.0 else f"it promised {points} less than confirmed"
 
 
 def _value(value: object) -> str:

@@ -37,7 +37,7 @@ FILES = {"bench.json", "solvers.md", "solvers.png", "solvers.svg"}
 
 
 class Answering:
-    """Takes note of what it is asked, and takes its time over it."""
+    """Records its queries, and takes time to answer them."""
 
     def __init__(self, name: str, diary: list[tuple[str, int]], seconds: float = 0.0) -> None:
         self.name, self.diary, self.seconds = name, diary, seconds
@@ -74,9 +74,9 @@ def test_turns_are_random_and_every_question_is_put_to_all() -> None:
     rounds = {tuple(turns[i : i + 3]) for i in range(0, len(turns), 3)}
     assert all(sorted(order) == ["a", "b", "c"] for order in rounds)
     assert len(rounds) > 3
-    asked = [period for name, period in diary if name == "a"]
-    assert asked[:22] == [0, *range(20), 19]  # then the next segment, from the period before it
-    assert len(asked) == 3 * 5 * 21
+    queried = [period for name, period in diary if name == "a"]
+    assert queried[:22] == [0, *range(20), 19]  # then the next segment, from the period before it
+    assert len(queried) == 3 * 5 * 21
 
 
 def test_stretches_cover_a_flight_or_an_even_part_of_it() -> None:
@@ -97,7 +97,7 @@ def test_slow_entrants_race_once_and_hopeless_ones_leave() -> None:
 
 
 def test_a_flight_goes_on_between_questions_and_is_not_timed() -> None:
-    """Each question is answered after the plant has flown a period, as in flight, and told by its median."""
+    """Each question is answered after the plant has flown a period, as in flight, and reported by its median."""
     diary: list[tuple[str, int]] = []
 
     class Noted(Answering):
@@ -133,7 +133,7 @@ def test_calls_are_watched_until_they_are_forgotten() -> None:
     assert len(watch.laps["answers"]) == 1
 
 
-def test_a_python_command_is_timed_or_says_what_is_wrong(tmp_path: Path) -> None:
+def test_a_python_command_is_timed_or_reports_what_is_wrong(tmp_path: Path) -> None:
     found = time_python("-c", "import time; time.sleep(0.05); print('done')", tree=tmp_path)
     assert (found.output, found.wall_s > 0.05) == ("done\n", True)
     assert found.processor_s > 0.0
@@ -151,7 +151,7 @@ def test_between_steps_the_plant_flies_a_period() -> None:
 
 
 def test_a_time_stands_in_all_tables_once(bench: SolverBench) -> None:
-    """Growth at the flight's own horizon is not measured again, nor are the steps that the study of cost tells of."""
+    """Growth at the flight's own horizon is not measured again, nor are the steps in the study of cost."""
     flown = bench_solvers(
         load_scenario("paper-constrained", SHORT), repeats=1, horizons=(10,), solvers=("piqp-multistage",)
     )
@@ -254,7 +254,7 @@ def test_targets_compare_with_other_solvers_only(bench: SolverBench) -> None:
     won = replace(bench, candidates=(default, bench.candidates[1], slow))
     verdicts = {target.what: target for target in solver_targets(won)}
     assert verdicts["default, p99 below every other solver's"].met
-    assert "daqp" in verdicts["default, p99 below every other solver's"].asked
+    assert "daqp" in verdicts["default, p99 below every other solver's"].required
     lost = replace(won, candidates=(replace(default, step_ms=np.full(60, 2e3), failures=1), *won.candidates[1:]))
     missed = {target.what for target in solver_targets(lost) if not target.met}
     assert missed >= {"default, p50", "default, p99", "default, max below every other solver's"}
@@ -274,10 +274,10 @@ def test_a_bench_is_written_whole_and_replaced_only_by_another(
     assert main(command) == EXIT_DONE
     assert "daqp + shortcut" in capsys.readouterr().out
     assert {path.name for path in target.iterdir()} == {*FILES, ".quadsim.json"}
-    kept = json.loads((target / "bench.json").read_text())
-    assert kept["asked"] == len(kept["contenders"][0]["step_ms_by_period"]) == 40
-    assert kept["machine"]["cores"] >= 1
-    assert "piqp" in kept["versions"]
+    saved = json.loads((target / "bench.json").read_text())
+    assert saved["asked"] == len(saved["contenders"][0]["step_ms_by_period"]) == 40
+    assert saved["machine"]["cores"] >= 1
+    assert "piqp" in saved["versions"]
     assert "| piqp-multistage + shortcut (default) |" in (target / "solvers.md").read_text()
     assert (target / "solvers.png").read_bytes().startswith(b"\x89PNG")
     assert main([*command, "--stride", "2", "--json"]) == EXIT_DONE
@@ -365,16 +365,16 @@ def test_a_minute_of_film_follows_from_a_short_one() -> None:
     assert [line[-1].text for line in render_tables(replace(profile, wall_s=5.0))[1].lines] == ["missed"]
 
 
-def test_bench_render_films_and_tells(capsys: pytest.CaptureFixture[str]) -> None:
+def test_bench_render_films_and_reports(capsys: pytest.CaptureFixture[str]) -> None:
     try:
         rendering_backend()
     except RenderingUnavailableError as error:
         pytest.skip(str(error))
     assert main(["bench", "render", "--seconds", "0.2", "--set", "controller.horizon=5", "--json"]) == EXIT_DONE
-    told = json.loads(capsys.readouterr().out)
-    assert (told["frames"], told["workers"], told["fps"]) == (worker_count(6) * 6, 1, 30)
-    assert 0.0 < told["start_s"] < told["wall_s"]
-    assert math.isfinite(told["film_of_60_s"])
+    reported = json.loads(capsys.readouterr().out)
+    assert (reported["frames"], reported["workers"], reported["fps"]) == (worker_count(6) * 6, 1, 30)
+    assert 0.0 < reported["start_s"] < reported["wall_s"]
+    assert math.isfinite(reported["film_of_60_s"])
 
 
 def test_bench_flight_prints_json_alone(capsys: pytest.CaptureFixture[str]) -> None:
@@ -390,9 +390,9 @@ def test_bench_flight_prints_json_alone(capsys: pytest.CaptureFixture[str]) -> N
         "--json",
     ]
     assert main(arguments) == EXIT_DONE
-    told = json.loads(capsys.readouterr().out)
-    assert told["duration"] == pytest.approx(1.0)
-    assert told["pieces"].keys() >= {"physics", "measurement", "log and loop"}
+    reported = json.loads(capsys.readouterr().out)
+    assert reported["duration"] == pytest.approx(1.0)
+    assert reported["pieces"].keys() >= {"physics", "measurement", "log and loop"}
 
 
 def test_every_solver_has_a_place_in_the_bench() -> None:
@@ -419,16 +419,16 @@ def test_what_cannot_be_timed_is_refused(
 # --- campaigns -----------------------------------------------------------------------------------------------------
 
 
-def test_what_a_campaign_costs_is_measured_and_told() -> None:
-    told: list[tuple[int, int]] = []
+def test_what_a_campaign_costs_is_measured_and_reported() -> None:
+    reported: list[tuple[int, int]] = []
     profile = bench_campaign(
         load_scenario("hover", ["duration=1.0", "controller.horizon=10"]),
         flights=6,
         rounds=1,
         sizes=(3, 12),
-        progress=lambda stage, done, total: told.append((done, total)),
+        progress=lambda stage, done, total: reported.append((done, total)),
     )
-    assert told == [(1, 4), (2, 4), (3, 4), (4, 4)]
+    assert reported == [(1, 4), (2, 4), (3, 4), (4, 4)]
     one, two = profile.rounds[0]
     assert (one.flights, one.workers, two.flights, two.workers) == (6, 1, 12, 2)
     for run in (one, two, *profile.growing):

@@ -78,7 +78,7 @@ def made_up() -> MismatchBench:
         ({"reason": "no plan", "flown": 0.0, "end_error": None, "peak_tilt": None}, False, "lost, 0 s"),
     ],
 )
-def test_survival_is_judged_as_told(changes: dict[str, object], survived: bool, fate: str) -> None:
+def test_survival_is_judged_by_its_rules(changes: dict[str, object], survived: bool, fate: str) -> None:
     flight = replace(WELL, **changes)  # type: ignore[arg-type]
     assert (flight.survived, flight.fate) == (survived, fate)
 
@@ -100,7 +100,7 @@ def test_tables_show_each_flight_where_it_belongs() -> None:
 
 @pytest.mark.parametrize("condition", CONDITIONS)
 def test_every_condition_flies_with_the_whole_controller(condition: str) -> None:
-    """As short a flight as has all of it: the settings are valid, and what is told can be built."""
+    """The shortest flight with all of it: the settings are valid, and the controllers can be built."""
     eventful = any("events" in setting for setting in CONDITIONS[condition].settings)
     duration = 12.1 if eventful else 0.1
     found = fly_cell(cell("+ tightening", condition, f"duration={duration}", "controller.horizon=10"))
@@ -143,14 +143,14 @@ def test_parts_are_switched_on_one_after_another() -> None:
 
 
 @pytest.mark.parametrize(("condition", "lag"), [("nominal", None), ("lag 80 ms", 0.05), ("delay 20 ms", 0.045)])
-def test_baselines_are_told_the_lag_that_gains_have_to_allow_for(condition: str, lag: float | None) -> None:
+def test_baselines_are_given_the_lag_that_gains_have_to_allow_for(condition: str, lag: float | None) -> None:
     scenario = load_scenario("paper-constrained")
     for name in ("PID", "geometric"):
         assert equip(scenario, name, CONDITIONS[condition]).controller.lag == pytest.approx(lag)  # type: ignore[union-attr]
 
 
 def test_what_the_paper_s_controller_loses_the_robust_one_flies() -> None:
-    """Eleven seconds with rotors slower than told, through the beginning of the step along x."""
+    """Eleven seconds with rotors slower than stated, through the beginning of the step along x."""
     lost = fly_cell(cell("paper", "lag 80 ms", "duration=14.0"))
     assert lost.reason is not None
     assert 10.0 < lost.flown < 14.0
@@ -192,15 +192,15 @@ def test_results_do_not_depend_on_processes(quick: MismatchBench) -> None:
 
 def test_steps_are_timed_of_the_full_controller_and_in_the_first_condition(monkeypatch: pytest.MonkeyPatch) -> None:
     """Each question is answered at once here, its answer marked with the number of processes that were to be used."""
-    asked: list[tuple[int | None, int]] = []
+    calls: list[tuple[int | None, int]] = []
 
-    def answer(ask: object, cells: list[Cell], *, workers: int | None, progress: object) -> list[Any]:
-        asked.append((workers, len(cells)))
-        return [float(workers or 0) for _ in cells] if ask is time_cell else [WELL for _ in cells]
+    def answer(function: object, cells: list[Cell], *, workers: int | None, progress: object) -> list[Any]:
+        calls.append((workers, len(cells)))
+        return [float(workers or 0) for _ in cells] if function is time_cell else [WELL for _ in cells]
 
     monkeypatch.setattr("scenarios.bench.mismatch.benchmark.answer_all", answer)
     measured = run_mismatch(workers=2)
-    assert asked == [(2, len(VARIANTS) * len(CONDITIONS)), (1, len(VARIANTS) + len(CONDITIONS) - 1)]
+    assert calls == [(2, len(VARIANTS) * len(CONDITIONS)), (1, len(VARIANTS) + len(CONDITIONS) - 1)]
     for (controller, condition), flight in measured.flights.items():
         assert flight.step_p99 == (1.0 if controller == FULL or condition == "nominal" else None)
 
@@ -221,19 +221,19 @@ def test_a_ladder_is_written_whole_and_the_same_each_time(quick: MismatchBench, 
     assert (tmp_path / "again" / "ladder.svg").read_text() == first
 
 
-def test_the_figure_of_a_made_up_ladder_tells_each_fate(tmp_path: Path) -> None:
+def test_the_figure_of_made_up_results_shows_each_outcome(tmp_path: Path) -> None:
     write_mismatch(made_up(), tmp_path)
     drawing = (tmp_path / "ladder.svg").read_text()
     for text in ("0.01", "0.80", "13 s", "diverged", "4.90", "5.30"):
         assert f">{text}<" in drawing
 
 
-def test_the_page_says_what_is_met_and_what_is_not() -> None:
+def test_the_page_states_what_is_met_and_what_is_not() -> None:
     measured = replace(made_up(), controllers={FULL: "full"}, conditions={"nominal": "", "wind 3 m/s": ""})
     tilted = replace(WELL, peak_tilt=5.2, violated=0.1, end_error=0.4, step_p99=7.0)
     measured = replace(measured, flights={(FULL, "nominal"): WELL, (FULL, "wind 3 m/s"): tilted})
-    told = [line[1].text for line in make_robustness.targets(measured).lines]
-    assert told == ["in all 2", "in all 1", "not in: wind 3 m/s", "not in: wind 3 m/s"]
+    reported = [line[1].text for line in make_robustness.targets(measured).lines]
+    assert reported == ["in all 2", "in all 1", "not in: wind 3 m/s", "not in: wind 3 m/s"]
     fault = fault_injection.faults()[0]
     injection = fault_injection.Injection(controller="paper", fault=fault, start=3.0)
     found = fault_injection.Consequence(

@@ -1,4 +1,4 @@
-"""The optimum in closed form: from a poor start it is found, and the KKT conditions say so."""
+"""The optimum in closed form: from a poor start it is found, by the KKT conditions."""
 
 from __future__ import annotations
 

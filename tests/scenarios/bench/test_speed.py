@@ -61,7 +61,7 @@ def test_quick_flies_two_controllers_at_two_speeds(monkeypatch: pytest.MonkeyPat
         assert linear.error is not None
         assert nonlinear.error is not None
         assert nonlinear.error < 0.3 * linear.error
-        # Level at constant speed, centripetal acceleration alone asks for this tilt; drag, and ramps, for more.
+        # Level at constant speed, centripetal acceleration alone requires this tilt; drag, and ramps, for more.
         assert (
             linear.bound == nonlinear.bound == pytest.approx(np.degrees(np.arctan(speed**2 / 5.0 / 9.81)) + 10, abs=3)
         )
@@ -108,7 +108,7 @@ def test_no_process_is_refused() -> None:
         run_speeds(workers=0)
 
 
-def test_tables_tell_loss_violation_and_the_nearest(measured: SpeedBench) -> None:
+def test_tables_show_loss_violation_and_the_nearest(measured: SpeedBench) -> None:
     reach, errors, violated, tilts, saturated = speed_tables(measured)
     assert texts(reach) == [["LQR", "6, 4, 6"], ["nonlinear", "8, 8, 4"]]
     assert texts(errors)[1:] == [["loop", "6", "40", "0.500", "0.050"], ["loop", "8", "40", "lost", "0.100"]]

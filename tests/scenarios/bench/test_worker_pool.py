@@ -1,4 +1,4 @@
-"""Work spread over processes.  They import this module to find what they are asked: it imports little."""
+"""Work spread over processes.  They import this module for their function: it imports little."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ def _slow_first(number: int) -> int:
 
 
 def test_answers_come_in_the_order_of_their_questions() -> None:
-    told: list[tuple[int, int]] = []
-    found = answer_all(_slow_first, [0, 1, 2, 3], workers=2, progress=lambda done, total: told.append((done, total)))
+    heard: list[tuple[int, int]] = []
+    found = answer_all(_slow_first, [0, 1, 2, 3], workers=2, progress=lambda done, total: heard.append((done, total)))
     assert found == [0, 1, 4, 9]
-    assert told == [(1, 4), (2, 4), (3, 4), (4, 4)]
+    assert heard == [(1, 4), (2, 4), (3, 4), (4, 4)]

@@ -56,21 +56,21 @@ def file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return path
 
 
-def test_a_campaign_says_how_often_and_how_sure(file: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_campaign_reports_rate_and_confidence(file: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["campaign", str(file), "--no-report"]) == EXIT_DONE
-    said = capsys.readouterr()
-    assert "of 6 flights failed" in said.out
-    assert "95 % interval" in said.out
-    assert "quadsim replay runs/campaigns/little --flight" in said.out
-    assert "6/6" in said.err
+    output = capsys.readouterr()
+    assert "of 6 flights failed" in output.out
+    assert "95 % interval" in output.out
+    assert "quadsim replay runs/campaigns/little --flight" in output.out
+    assert "6/6" in output.err
     assert (file.parent / "runs" / "campaigns" / "little" / "flights.parquet").is_file()
 
 
 def test_the_summary_alone_as_json(file: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["campaign", str(file), "--json", "--no-report", "--flights", "2", "--seed", "9"]) == EXIT_DONE
-    said = capsys.readouterr()
-    assert json.loads(said.out)["flights"] == 2
-    assert said.err == ""
+    output = capsys.readouterr()
+    assert json.loads(output.out)["flights"] == 2
+    assert output.err == ""
 
 
 def test_a_requirement_decides_the_exit_status(file: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -97,7 +97,7 @@ def test_a_replay_gives_the_same_numbers(
     assert json.loads((tmp_path / "runs" / "first-2" / "summary.json").read_text())["scenario"] == "first-2"
 
 
-def test_a_replay_by_other_code_says_so_first(
+def test_a_replay_by_other_code_starts_with_a_notice(
     flown: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -105,11 +105,11 @@ def test_a_replay_by_other_code_says_so_first(
     manifest = json.loads((other / "manifest.json").read_text())
     (other / "manifest.json").write_text(json.dumps({**manifest, "code": "sha256:0"}))
     assert main(["replay", str(other), "--flight", "2", *BARE]) == EXIT_DONE
-    said = "quadsim: other code flew that campaign, so numbers may differ"
-    assert capsys.readouterr().err.splitlines()[0] == said
+    notice = "quadsim: other code flew that campaign, so numbers may differ"
+    assert capsys.readouterr().err.splitlines()[0] == notice
 
 
-def test_a_replay_of_a_flight_that_met_a_limit_says_so_first(
+def test_a_replay_of_a_flight_that_met_a_limit_starts_with_a_notice(
     flown: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -121,8 +121,8 @@ def test_a_replay_of_a_flight_that_met_a_limit_says_so_first(
     manifest["files"]["flights.parquet"] = digest_of(other / "flights.parquet")
     (other / "manifest.json").write_text(json.dumps(manifest))
     assert main(["replay", str(other), "--flight", "2", *BARE]) == EXIT_FAILED
-    said = "quadsim: flight 2 was ended in the campaign (for ever); here nothing ends it but Ctrl-C"
-    assert capsys.readouterr().err.splitlines()[0] == said
+    notice = "quadsim: flight 2 was ended in the campaign (for ever); here nothing ends it but Ctrl-C"
+    assert capsys.readouterr().err.splitlines()[0] == notice
 
 
 def test_two_campaigns_are_compared_flight_by_flight(
@@ -130,9 +130,9 @@ def test_two_campaigns_are_compared_flight_by_flight(
 ) -> None:
     arguments = ["compare", str(flown / "first"), str(flown / "second"), "--out", str(tmp_path / "pairs")]
     assert main(arguments) == EXIT_DONE
-    said = " ".join(capsys.readouterr().out.split())
-    assert "of 6 paired flights" in said
-    assert "all of mass" in said
+    output = " ".join(capsys.readouterr().out.split())
+    assert "of 6 paired flights" in output
+    assert "all of mass" in output
     assert (tmp_path / "pairs" / "index.html").is_file()
 
 
@@ -165,10 +165,10 @@ def test_wrong_input_is_status_2_with_one_message_and_flies_nothing(
 ) -> None:
     before = {path.name for path in file.parent.iterdir()}
     assert main([each.replace("{flown}", str(flown)) for each in arguments]) == EXIT_WRONG_INPUT
-    said = capsys.readouterr()
-    assert said.out == ""
-    assert said.err.startswith("quadsim: ")
-    assert message in said.err
+    output = capsys.readouterr()
+    assert output.out == ""
+    assert output.err.startswith("quadsim: ")
+    assert message in output.err
     assert {path.name for path in file.parent.iterdir()} == before
 
 
@@ -180,10 +180,10 @@ def test_ctrl_c_keeps_what_was_flown(file: Path) -> None:
             assert campaign.poll() is None
             clock.sleep(0.1)
         campaign.send_signal(signal.SIGINT)
-        _, said = campaign.communicate(timeout=30.0)
+        _, output = campaign.communicate(timeout=30.0)
         assert campaign.returncode == EXIT_FAILED
-    assert "interrupted (Ctrl-C); c has what was flown, --resume goes on with it" in said
-    assert "Traceback" not in said
+    assert "interrupted (Ctrl-C); c has what was flown, --resume continues it" in output
+    assert "Traceback" not in output
     manifest = json.loads((file.parent / "c" / "manifest.json").read_text())
     assert manifest["status"] == "interrupted"
     assert 0 < manifest["flown"] < 2000

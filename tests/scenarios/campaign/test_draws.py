@@ -1,4 +1,4 @@
-"""What is drawn has the distribution that the file asks for, and hangs on seed and flight number alone."""
+"""What is drawn has the distribution that the file requires, and depends on seed and flight number alone."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def test_spread_draws_are_more_even_than_random_ones(sampling: str) -> None:
     assert counts.max() - counts.min() <= 2  # 16 each; random ones scatter by four
 
 
-def test_weights_say_how_often_a_value_is_chosen() -> None:
+def test_weights_set_how_often_a_value_is_chosen() -> None:
     choice = {"distribution": "choice", "values": ["a", "b", "c"], "weights": [1.0, 0.0, 3.0]}
     values = column(campaign(choice, flights=2000))
     assert values.count("b") == 0

@@ -82,7 +82,7 @@ def test_a_scenario_beside_the_campaign_is_found(tmp_path: Path) -> None:
     assert plan(tmp_path, scenario="mine.toml").scenario.duration == 1.0
 
 
-def test_a_campaign_says_only_how_it_differs_from_its_base(tmp_path: Path) -> None:
+def test_a_campaign_file_holds_only_what_differs_from_its_base(tmp_path: Path) -> None:
     write(tmp_path, BASE, "first.toml")
     heavier = {"base": "first.toml", "name": "heavier", "vary": [{"name": "mass", "high": 1.5}]}
     made = load_plan(str(write(tmp_path, heavier)))

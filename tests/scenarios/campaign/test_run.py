@@ -89,7 +89,7 @@ def by_two(tmp_path_factory: pytest.TempPathFactory) -> Result:
 
 @pytest.fixture
 def flown(whole: Result, tmp_path: Path) -> Path:
-    """A copy of its directory to go on with, or to tamper with."""
+    """A copy of its directory to continue, or to tamper with."""
     return Path(shutil.copytree(whole.directory, tmp_path / "c"))
 
 
@@ -97,7 +97,7 @@ def content(result: Result) -> tuple[bytes, bytes]:
     return (result.directory / "flights.parquet").read_bytes(), (result.directory / SUMMARY_FILE).read_bytes()
 
 
-def test_results_are_the_same_bytes_whoever_flies(plan: Plan, whole: Result, by_two: Result, tmp_path: Path) -> None:
+def test_results_are_the_same_bytes_with_any_worker(plan: Plan, whole: Result, by_two: Result, tmp_path: Path) -> None:
     engines = {"backwards": Alone(backwards=True), "one": LocalEngine(1)}
     results = [whole, by_two, *(fly_campaign(plan, tmp_path / name, engine) for name, engine in engines.items())]
     assert len({content(result) for result in results}) == 1
@@ -177,7 +177,7 @@ def test_a_width_that_is_no_share_is_refused(plan: Plan, tmp_path: Path, width: 
 
 
 @pytest.mark.usefixtures("sketched")
-def test_a_manifest_says_what_was_flown(plan: Plan, tmp_path: Path) -> None:
+def test_a_manifest_states_what_was_flown(plan: Plan, tmp_path: Path) -> None:
     result = module.fly_campaign(plan, tmp_path / "c", Alone())
     manifest = read_manifest(result.directory)
     assert manifest == result.manifest
@@ -191,8 +191,8 @@ def test_a_manifest_says_what_was_flown(plan: Plan, tmp_path: Path) -> None:
 # --- what is refused -----------------------------------------------------------------------------------------------
 
 
-def test_a_campaign_is_not_flown_over_without_asking(plan: Plan, flown: Path) -> None:
-    with pytest.raises(OutputError, match="a campaign is already there; go on with it by --resume"):
+def test_a_campaign_is_not_overwritten_without_a_request(plan: Plan, flown: Path) -> None:
+    with pytest.raises(OutputError, match="a campaign is already there; continue it with --resume"):
         fly_campaign(plan, flown, Alone())
 
 
@@ -235,11 +235,11 @@ def test_other_code_does_not_go_on_with_it(
     monkeypatch.setattr(records, "code_digest", lambda: "sha256:other")
     with pytest.raises(InputError, match=r"this one differs from what flew the first flights \(code\)"):
         fly_campaign(make_plan(tmp_path, flights=13), flown, Alone(), resume=True)
-    kept = fly_campaign(plan, flown, Alone(), resume=True)
-    assert kept.manifest["code"] != "sha256:other", "nothing is missing: what flew it stays there"
+    saved = fly_campaign(plan, flown, Alone(), resume=True)
+    assert saved.manifest["code"] != "sha256:other", "nothing is missing: what flew it stays there"
 
 
-def test_another_controller_of_ones_own_does_not_go_on_with_it(tmp_path: Path) -> None:
+def test_another_controller_of_the_user_does_not_go_on_with_it(tmp_path: Path) -> None:
     code = "class Hovers:\n    def __init__(self, vehicle, **numbers):\n        self.speeds = [{speed}] * 4\n"
     code += "    def step(self, now, state, reference):\n        return self.speeds\n"
     (tmp_path / "hovers.py").write_text(code.format(speed="vehicle.hover_speed"), encoding="utf-8")
@@ -284,7 +284,7 @@ def test_dying_while_it_grows_locks_nothing_out(
     assert fly_campaign(more, flown, Alone(), resume=True).table.num_rows == 15
 
 
-def test_files_of_ones_own_are_not_written_over(tmp_path: Path) -> None:
+def test_files_of_the_user_are_not_written_over(tmp_path: Path) -> None:
     (tmp_path / "mine").mkdir()
     path = tmp_path / "mine" / "campaign.toml"
     path.write_text("# by hand\n" + tomlkit.dumps(CAMPAIGN), encoding="utf-8")
@@ -331,7 +331,7 @@ def test_a_replayed_flight_gives_the_campaigns_numbers(by_two: Result, tmp_path:
         assert (tmp_path / "runs" / recorded.scenario.name / "summary.json").is_file()
 
 
-def test_a_replay_tells_when_numbers_differ(whole: Result, tmp_path: Path) -> None:
+def test_a_replay_reports_when_numbers_differ(whole: Result, tmp_path: Path) -> None:
     recorded = recorded_flight(whole.directory, 3)
     other = replace(recorded, row={**recorded.row, "rmse.z": 0.0, "draw.mass": 0.0, "gone": 1.0})
     differing = replay_flight(other, tmp_path / "run", Outputs(video=False, recording=False, figures=False)).differing

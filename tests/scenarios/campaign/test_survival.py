@@ -1,4 +1,4 @@
-"""A campaign survives its controllers: limits, forks, memory, whoever is killed or stopped, and nobody stays behind."""
+"""A campaign survives its controllers: limits, forks, memory, any process killed or stopped, and no process left."""
 
 from __future__ import annotations
 
@@ -47,8 +47,8 @@ FLIGHTS = range(12)
 ALL = [value_of(flight) for flight in FLIGHTS]
 
 
-def test_hostile_flights_change_no_other_flight_and_leave_nobody() -> None:
-    """The bar: hang, fork, memory, exits, whoever is killed, in one campaign; see `tests/hostile_controller.py`."""
+def test_hostile_flights_change_no_other_flight_and_leave_no_process() -> None:
+    """Hang, fork, memory, exits, killed processes, in one campaign; see `tests/hostile_controller.py`."""
     counts = measure(60, workers=3)  # most of its time is waiting for limits
     assert counts["hostile"] == len(KINDS) >= 40
     assert counts["calm"] == 60 - len(KINDS) >= 12
@@ -65,9 +65,9 @@ def test_flights_that_met_a_limit_stand_in_every_page_and_gate(
     file = write(tmp_path, ["hangs_in_python", "takes_memory_at_once", "calm"], armed=True)
     gate = ["--require", "P(timeout) < 0.01 @ 95%"]
     assert main(["campaign", str(file), "--out", "c", *gate]) == EXIT_FAILED
-    said = " ".join(capsys.readouterr().out.split())
-    assert "2 of 3 flights failed" in said  # violated is what counts where the file does not say
-    assert "1 was ended since it took too long, 1 was ended since it took too much memory" in said
+    output = " ".join(capsys.readouterr().out.split())
+    assert "2 of 3 flights failed" in output  # violated is what counts by default
+    assert "1 was ended since it took too long, 1 was ended since it took too much memory" in output
     summary = json.loads((tmp_path / "c" / "summary.json").read_text())
     assert [summary["verdicts"][name] for name in ("satisfied", "timeout", "memory")] == [1, 1, 1]
     assert [summary["events"][name]["count"] for name in ("failure", "timeout", "memory", "lost")] == [2, 1, 1, 0]
@@ -196,21 +196,21 @@ def take_memory() -> None:
 
 
 def share_memory() -> None:
-    kept = []
+    held = []
     while True:
-        kept.append(mmap.mmap(-1, 1 << 24))
-        kept[-1].write(bytes(1 << 24))
+        held.append(mmap.mmap(-1, 1 << 24))
+        held[-1].write(bytes(1 << 24))
 
 
 @pytest.mark.parametrize(
-    ("harm", "said"),
+    ("harm", "reason"),
     [(take_memory, "MemoryError"), (share_memory, "MB were held, and limits.memory is 200 MB")],
     ids=["its own", "shared"],
 )
-def test_too_much_memory_is_a_verdict(harm: Callable[[], object], said: str) -> None:
+def test_too_much_memory_is_a_verdict(harm: Callable[[], object], reason: str) -> None:
     row, others = fly(harm, memory=200.0)
     assert row["verdict"] == "memory"
-    assert said in row["reason"]
+    assert reason in row["reason"]
     assert others == OTHERS
 
 
@@ -278,7 +278,7 @@ class _Regicide(ToyPilot):
 
 
 def test_the_server_may_be_killed_by_every_flight() -> None:
-    """Whoever flies goes on; no flight is blamed."""
+    """The other workers go on; no flight is blamed."""
     assert known(list(LocalEngine(2).answers(_Regicide(asleep=0.01), FLIGHTS[:3]))) == ALL[:3]
 
 
@@ -309,7 +309,7 @@ def test_a_keeper_that_is_killed_or_stopped_is_replaced_with_its_worker(by: sign
 
 
 class _Talker(ToyPilot):
-    """In flight 5 it says things that nobody asked for."""
+    """In flight 5 it sends messages that nobody requested."""
 
     def fly(self, flight: int, progress: Progress = silent) -> Row:
         if flight == 5:
@@ -331,7 +331,7 @@ def _writable(number: int) -> bool:
     return int(flags, 8) & os.O_ACCMODE != os.O_RDONLY
 
 
-def test_what_nobody_asked_for_is_no_answer() -> None:
+def test_an_unrequested_message_is_no_answer() -> None:
     rows = known(list(LocalEngine(2).answers(_Talker(), FLIGHTS)))
     assert rows[5]["reason"].startswith(f"its process died {MOST_DEATHS} times, last since what it answered is no")
     assert [row for row in rows if row["flight"] != 5] == OTHERS
@@ -344,12 +344,12 @@ class _Wrong(ToyPilot):
 
 def test_an_answer_to_another_flight_is_none() -> None:
     rows = known(list(LocalEngine(1).answers(_Wrong(), FLIGHTS)))
-    assert "is no answer (nobody asked)" in rows[5]["reason"]
+    assert "is no answer (unrequested)" in rows[5]["reason"]
     assert [row for row in rows if row["flight"] != 5] == OTHERS
 
 
 class _Untidy(ToyPilot):
-    """Leaves the directory in flight 5; says where each flight was begun."""
+    """Leaves the directory in flight 5; reports where each flight began."""
 
     def fly(self, flight: int, progress: Progress = silent) -> Row:
         row = super().fly(flight) | {"folder": str(Path.cwd())}
@@ -381,7 +381,7 @@ def hold_the_interpreter() -> None:
     ctypes.PyDLL(None).sleep(1000)
 
 
-def test_nobody_outlives_a_parent_killed_while_a_controller_holds_the_interpreter(tmp_path: Path) -> None:
+def test_no_process_outlives_a_parent_killed_while_a_controller_holds_the_interpreter(tmp_path: Path) -> None:
     script, diary = tmp_path / "parent.py", tmp_path / "diary"
     script.write_text(PARENT)
     diary.touch()

@@ -57,9 +57,9 @@ def test_the_console_shows_every_string_as_it_is(nasty: str, capsys: pytest.Capt
     table.add_row(nasty)
     for shown in (nasty, styled((nasty, "bold"), nasty), table):
         stdout().print(shown, soft_wrap=True)
-    said = capsys.readouterr().out
-    assert said.replace("\n", "").count(printable(nasty)) >= 3
-    assert is_plain(said)
+    output = capsys.readouterr().out
+    assert output.replace("\n", "").count(printable(nasty)) >= 3
+    assert is_plain(output)
 
 
 @pytest.mark.parametrize("nasty", NASTY)
@@ -80,12 +80,12 @@ def test_a_foreign_summary_is_shown_as_text(nasty: str, short_run: Any, capsys: 
     console.print_grids([Grid(key="k", title=nasty, head=(nasty, nasty), lines=(cells,), note=nasty)], nasty)
     campaign_console.print_replay(3, {"a": 1}, [nasty])
     print(to_markdown([row], [nasty, nasty]))
-    said = capsys.readouterr()
-    assert is_plain(said.out + said.err)
-    assert said.out.count(printable(nasty)) > 20
+    output = capsys.readouterr()
+    assert is_plain(output.out + output.err)
+    assert output.out.count(printable(nasty)) > 20
 
 
-def test_a_path_with_markup_is_written_and_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_path_with_markup_is_written_and_reported(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for name in ("a[/b]c", "[bold]", "x[red]y"):
         out = tmp_path / name
         assert main(["run", "hover", "--set", "duration=0.1", *TABLES, "--out", str(out)]) == EXIT_DONE
@@ -103,14 +103,14 @@ def test_a_reason_in_a_run_of_others_is_shown_as_text(
     summary |= {"status": "aborted", "reason": nasty, "satisfied": False, "as_expected": False}
     (run / "summary.json").write_text(json.dumps(summary))
     status = main(["check", str(run), "--junit", str(tmp_path / "junit.xml")])
-    said = capsys.readouterr()
-    assert is_plain(said.out + said.err)
+    output = capsys.readouterr()
+    assert is_plain(output.out + output.err)
     if nasty == "\ud800":  # which no file may hold
         assert status == EXIT_WRONG_INPUT
-        assert "surrogates not allowed" in said.err
+        assert "surrogates not allowed" in output.err
     else:
         assert status == 1
-        assert f"aborted: {printable(nasty)}" in said.out.replace("\n", " ") + said.out
+        assert f"aborted: {printable(nasty)}" in output.out.replace("\n", " ") + output.out
         failure = ElementTree.parse(tmp_path / "junit.xml").getroot()[0][0]
         assert failure.get("message") == printable(nasty)
 
@@ -145,7 +145,7 @@ def test_arguments_are_shown_as_text(arguments: list[str], capsys: pytest.Captur
 
 
 @pytest.mark.parametrize("nasty", NASTY)
-def test_a_controller_of_ones_own_names_itself_as_text(nasty: str) -> None:
+def test_a_controller_of_the_user_names_itself_as_text(nasty: str) -> None:
     class Law:
         name = nasty
         solver = nasty
@@ -170,8 +170,8 @@ def test_folders_of_any_name_are_compared_and_checked(
     assert main(["compare", *map(str, runs), "--out", str(page), "--markdown"]) == EXIT_DONE
     for run in runs:
         assert main(["check", str(run)]) == 1  # its windows are not reached
-    said = capsys.readouterr()
-    for text in (said.out, said.err, (page / "comparison.md").read_text(), (page / "comparison.svg").read_text()):
+    output = capsys.readouterr()
+    for text in (output.out, output.err, (page / "comparison.md").read_text(), (page / "comparison.svg").read_text()):
         assert is_plain(text)
     for name in names:
         assert printable(name) in (page / "index.html").read_text()

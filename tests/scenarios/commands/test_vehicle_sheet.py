@@ -110,7 +110,7 @@ def test_the_linear_model_is_four_chains_of_integrators(vehicle: Vehicle) -> Non
     assert np.abs(np.linalg.matrix_power(shifted, 4)).max() < 1e-15
 
 
-def test_chains_are_told_apart_by_their_lengths() -> None:
+def test_chains_are_distinguished_by_their_lengths() -> None:
     chain = np.eye(6, k=1)
     chain[2, 3] = 0.0
     assert integrator_chains(chain) == (3, 3)
@@ -154,9 +154,9 @@ def test_the_command_prints_figures_and_sources(name: str, capsys: pytest.Captur
 )
 def test_wrong_input_is_named(arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["vehicle", *arguments]) == 2
-    said = capsys.readouterr()
-    assert said.err.startswith(f"quadsim: {message}")
-    assert said.out == ""
+    output = capsys.readouterr()
+    assert output.err.startswith(f"quadsim: {message}")
+    assert output.out == ""
 
 
 def test_the_portrait_shows_the_vehicle(tmp_path: Path) -> None:

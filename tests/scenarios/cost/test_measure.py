@@ -77,14 +77,14 @@ def test_the_study_is_the_same_however_many_processes_fly(study: CostStudy, monk
 
 def test_runs_can_be_compared_without_the_solver_that_flew_them(monkeypatch: pytest.MonkeyPatch) -> None:
     targets = ["paper-constrained", "paper-unconstrained"]
-    assert find_study(targets, asked=None)
+    assert find_study(targets, requested=None)
     monkeypatch.setattr(type(SOLVERS["daqp"]), "installed", False)
-    assert find_study(targets, asked=None) == []
+    assert find_study(targets, requested=None) == []
     with pytest.raises(MissingPackageError, match="needs the package 'piqp'"):
-        find_study(targets, asked=True)
+        find_study(targets, requested=True)
 
 
-def test_flights_of_one_name_are_told_apart() -> None:
+def test_flights_of_one_name_are_distinguished() -> None:
     slower = scenario("controller.horizon=12", name="paper-unconstrained")
     study = study_cost(scenario(), [scenario(name="paper-unconstrained"), slower], workers=1, **FLIGHTS_ALONE)
     assert list(study.others) == ["paper-unconstrained", "paper-unconstrained (2)"]
@@ -114,7 +114,7 @@ def test_the_counterpart_has_the_same_weights_and_no_constraints(study: CostStud
     assert study.others["paper-unconstrained"].numbers != study.unconstrained.numbers
 
 
-def test_a_compared_counterpart_is_not_told_twice() -> None:
+def test_a_compared_counterpart_is_not_reported_twice() -> None:
     own = scenario()
     free = without_constraints(own).model_copy(update={"name": "counterpart"})
     assert study_cost(own, [free], workers=1, **FLIGHTS_ALONE).others == {}
@@ -141,7 +141,7 @@ def test_variations_change_the_vehicle(study: CostStudy) -> None:
     assert fly_variations(scenario(), arm_lengths=(0.5,), drags=(0.024,), workers=1)[0].outcome == other
 
 
-def test_candidates_answer_what_was_asked_in_flight(study: CostStudy) -> None:
+def test_candidates_answer_the_queries_of_the_flight(study: CostStudy) -> None:
     gain, flown, dense = study.candidates
     assert [candidate.name for candidate in study.candidates] == [
         *("unconstrained gain", "constrained, as flown", "QP by piqp-dense")
@@ -164,11 +164,11 @@ def test_a_replay_gives_the_commands_of_the_flight() -> None:
         controller.reset(queries.speeds_before[k])
         command = controller.step(Moment(time=queries.t[k]), queries.state[k], queries.reference[k + 1 : k + 11])
         np.testing.assert_allclose(command.speeds, flight.log.control.speeds[k], atol=1e-6)
-    asked = QueriedController(controller, queries)
+    queried = QueriedController(controller, queries)
     for k in range(80):
-        asked.prepare(k)
-        asked.answer()
-    assert tuple(asked.statuses.values()) == flight.log.control.status
+        queried.prepare(k)
+        queried.answer()
+    assert tuple(queried.statuses.values()) == flight.log.control.status
 
 
 def test_a_time_stands_in_a_study_once(study: CostStudy) -> None:
@@ -202,7 +202,7 @@ def test_flights_that_are_lost_stay_in_the_study() -> None:
     assert {entry["settled"] for entry in found.constrained.settling} == {None}
 
 
-def test_progress_is_told_to_its_end() -> None:
+def test_progress_is_reported_to_its_end() -> None:
     seen: dict[str, tuple[int, int]] = {}
     few = {**FLIGHTS_ALONE, "tilts": (3.0,)}
     study_cost(scenario(), workers=1, progress=lambda stage, done, total: seen.update({stage: (done, total)}), **few)
@@ -225,29 +225,29 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
 
 def test_a_study_is_made_where_its_question_is_posed(runs: dict[str, str]) -> None:
     bounded, free, hover = runs["paper-constrained"], runs["paper-unconstrained"], runs["hover"]
-    found = find_study([free, bounded], asked=None)
+    found = find_study([free, bounded], requested=None)
     assert [each.name for each in found] == ["paper-constrained", "paper-unconstrained"]
-    assert find_study([free, bounded], asked=False) == []
-    assert find_study([free], asked=None) == []
-    assert find_study([bounded, bounded], asked=None) == []
-    assert find_study([hover, free], asked=None) == []  # not of one course
-    assert [each.name for each in find_study([hover, free], asked=True)] == ["hover"]
-    assert len(find_study(["paper-constrained", "paper-unconstrained"], asked=None)) == 2
+    assert find_study([free, bounded], requested=False) == []
+    assert find_study([free], requested=None) == []
+    assert find_study([bounded, bounded], requested=None) == []
+    assert find_study([hover, free], requested=None) == []  # not of one course
+    assert [each.name for each in find_study([hover, free], requested=True)] == ["hover"]
+    assert len(find_study(["paper-constrained", "paper-unconstrained"], requested=None)) == 2
 
 
-def test_a_long_course_is_studied_only_when_asked_for(runs: dict[str, str], monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("scenarios.cost.measure.LONGEST_UNASKED", 3.0)
+def test_a_long_course_is_studied_only_on_request(runs: dict[str, str], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("scenarios.cost.measure.LONGEST_UNREQUESTED", 3.0)
     both = [runs["paper-constrained"], runs["paper-unconstrained"]]
-    assert find_study(both, asked=None) == []
-    assert len(find_study(both, asked=True)) == 2
+    assert find_study(both, requested=None) == []
+    assert len(find_study(both, requested=True)) == 2
 
 
 def test_a_run_without_a_readable_scenario_is_compared_all_the_same(runs: dict[str, str], tmp_path: Path) -> None:
     (tmp_path / "run").mkdir()
     targets = [runs["paper-constrained"], str(tmp_path / "run")]
-    assert find_study(targets, asked=None) == []
+    assert find_study(targets, requested=None) == []
     with pytest.raises(InputError, match=r"scenario\.toml: no such scenario file"):
-        find_study(targets, asked=True)
+        find_study(targets, requested=True)
 
 
 @pytest.mark.usefixtures("sketched")

@@ -1,4 +1,4 @@
-"""What is told of a study of what constraints cost is what the study holds."""
+"""The section on the cost of constraints reports what the study holds."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def test_a_lost_flight_is_shown_as_such_and_its_numbers_are_not(cost_study: Cost
     assert texts(line(table(cost_study, "sensitivity"), "RMS error x [m]")) == ["6", "7.5", "-", "1.5"]
 
 
-def test_a_sweep_tells_statuses_held_plans_and_what_never_settles(cost_study: CostStudy) -> None:
+def test_a_sweep_shows_statuses_held_plans_and_what_never_settles(cost_study: CostStudy) -> None:
     grid = table(cost_study, "tilt-sweep")
     first, own = line(grid, "2"), line(grid, "5")
     assert texts(first)[:9] == ["completed", "3", "6", "1", "30", "9", "12", "15", "never (1 of 2 steps)"]
@@ -76,7 +76,7 @@ def test_a_sweep_tells_statuses_held_plans_and_what_never_settles(cost_study: Co
 
 
 def test_the_sentences_answer_in_numbers(cost_study: CostStudy) -> None:
-    told = "\n".join(cost_sentences(cost_study))
+    written = "\n".join(cost_sentences(cost_study))
     for part in (
         "with constraints a step takes 5.5 ms in the median, 9.9 ms at the 99th percentile and 10 ms at most",
         "That is 100 times and 100 times what the gain",
@@ -94,21 +94,21 @@ def test_the_sentences_answer_in_numbers(cost_study: CostStudy) -> None:
         "The vehicle is lost at L = 0.5 m, d/b = 0.048 m.",
         "RMS error x 6 to 7.5 m",
     ):
-        assert part in told, part
+        assert part in written, part
 
 
 def test_what_constraints_make_larger_is_not_bought(cost_study: CostStudy) -> None:
     turned = replace(cost_study, constrained=cost_study.unconstrained, unconstrained=cost_study.constrained)
-    told = "\n".join(cost_sentences(turned))
-    assert "What they buy" not in told
-    assert "What they do not make smaller: peak tilt at the physics rate 8 instead of 4 deg" in told
+    written = "\n".join(cost_sentences(turned))
+    assert "What they buy" not in written
+    assert "What they do not make smaller: peak tilt at the physics rate 8 instead of 4 deg" in written
 
 
-def test_flights_that_were_lost_or_never_flown_are_told_too(cost_study: CostStudy) -> None:
+def test_flights_that_were_lost_or_never_flown_are_reported_too(cost_study: CostStudy) -> None:
     nothing = replace(cost_study.constrained, reason="no plan", flown=0.0, statuses={}, numbers={}, active=0)
-    told = "\n".join(cost_sentences(replace(cost_study, constrained=nothing, candidates=())))
-    assert "bounded is lost at 0 s with its constraints: no plan." in told
-    assert "Tracking" not in told
+    written = "\n".join(cost_sentences(replace(cost_study, constrained=nothing, candidates=())))
+    assert "bounded is lost at 0 s with its constraints: no plan." in written
+    assert "Tracking" not in written
     grids = cost_tables(replace(cost_study, constrained=nothing, candidates=()))
     assert "computation" not in {grid.key for grid in grids}
 
@@ -142,7 +142,7 @@ def test_curves_are_the_studys_and_have_gaps_where_flights_were_lost(cost_study:
     assert lost_at(cost_study.horizons) == ([], [10])
 
 
-def test_figures_are_the_same_bytes_each_time_and_say_what_is_lost(cost_study: CostStudy, tmp_path: Path) -> None:
+def test_figures_are_the_same_bytes_each_time_and_show_what_is_lost(cost_study: CostStudy, tmp_path: Path) -> None:
     first, second = (write_cost_figures(cost_study, tmp_path / name) for name in ("one", "two"))
     names = [f"cost_{what}.{kind}" for what in ("steps", "tilt", "horizon") for kind in ("png", "svg")]
     assert [path.name for path in first] == names

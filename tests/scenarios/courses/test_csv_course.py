@@ -1,4 +1,4 @@
-"""Courses from CSV files: what is read, and what is said of every file that is wrong."""
+"""Courses from CSV files: what is read, and the messages for every file that is wrong."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def test_what_spreadsheets_write_is_read_as_well(tmp_path: Path) -> None:
 
 
 def test_it_is_known_to_how_many_decimals_a_column_is_rounded(tmp_path: Path) -> None:
-    """Whole numbers are meant as they stand, and of doubles written out nobody can tell."""
+    """Whole numbers are exact; of doubles in full nobody can know."""
     table = read_table(write(tmp_path, "t,x,y,z,yaw\n0,0.1234,1.5,3, 1e-3\n1,0.2,-2,4,0.30000000000000004\n"))
     assert table.resolution == (1e-4, 0.0, 0.0, 0.0)
     table = read_table(write(tmp_path, "t,x,y,z,yaw\n0,12.5e-3,1.25,0.123456789,0\n1,0,-2,4,0\n"))

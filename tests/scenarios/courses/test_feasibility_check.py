@@ -40,13 +40,13 @@ def test_the_papers_course_steps_and_what_its_filter_leaves_is_beyond_the_bound(
     )
 
 
-def test_hover_asks_for_nothing() -> None:
+def test_hover_requires_nothing() -> None:
     made = load_scenario("hover")
     finding = report(made, build_vehicle(made))
     assert (finding.tilt, finding.jumps, finding.problems) == (0.0, (), ())
 
 
-def test_a_circle_asks_for_the_tilt_of_the_closed_form(vehicle: Vehicle) -> None:
+def test_a_circle_requires_the_tilt_of_the_closed_form(vehicle: Vehicle) -> None:
     circle = {"type": "circle", "radius": 3.0, "speed": 1.0, "turns": 2.0, "ramp": 10.0}
     finding = found(circle, vehicle)
     assert finding.tilt == pytest.approx(math.degrees(math.atan(1.0 / (3.0 * vehicle.gravity))), rel=1e-3)
@@ -55,7 +55,7 @@ def test_a_circle_asks_for_the_tilt_of_the_closed_form(vehicle: Vehicle) -> None
     assert "roll up to" in found(circle | {"speed": 3.0, "turns": 9.0}, vehicle).problems[0]
 
 
-def test_a_filter_lowers_what_is_asked_for(vehicle: Vehicle) -> None:
+def test_a_filter_lowers_what_is_required(vehicle: Vehicle) -> None:
     legs = {"type": "waypoints", "speed": 0.5, "points": [{"position": [3.0, 0.0, 0.0]}]}
     corners = found(legs, vehicle)
     assert corners.tilt == pytest.approx(math.degrees(math.atan(0.5 / 0.05 / vehicle.gravity)), rel=1e-9)
@@ -84,7 +84,7 @@ def test_an_entry_at_full_speed_is_seen(vehicle: Vehicle) -> None:
     assert found(circle | {"ramp": 0.0}, vehicle).tilt > 60.0 > 5.0 > found(circle, vehicle).tilt
 
 
-def test_a_dense_table_of_a_smooth_course_asks_for_what_the_course_does(tmp_path: Path, vehicle: Vehicle) -> None:
+def test_a_dense_table_of_a_smooth_course_requires_what_the_course_does(tmp_path: Path, vehicle: Vehicle) -> None:
     """Rows as close as the control period are samples, not corners: their torques count."""
     eight = scenario({"type": "figure_eight", "length": 6.0, "period": 6.0, "turns": 2.0})
     smooth = report(eight, vehicle)
@@ -110,10 +110,10 @@ def rounded(path: Path, poses: Array, decimals: int) -> dict[str, str]:
 
 
 @pytest.mark.parametrize("decimals", [3, 4, 6])
-def test_a_rounded_table_of_a_smooth_course_asks_for_what_the_course_does(
+def test_a_rounded_table_of_a_smooth_course_requires_what_the_course_does(
     tmp_path: Path, vehicle: Vehicle, decimals: int
 ) -> None:
-    """Fourth differences of 0.1 mm of rounding are steps of tens of rad/s: no controller is asked for those."""
+    """Fourth differences of 0.1 mm of rounding are steps of tens of rad/s: no controller has to follow those."""
     eight = scenario({"type": "figure_eight", "length": 6.0, "period": 12.0, "turns": 1.5, "ramp": 4.0})
     smooth = report(eight, vehicle)
     found = report(scenario(rounded(tmp_path / "eight.csv", poses_of(eight), decimals)), vehicle)
@@ -160,7 +160,7 @@ TIGHT = {
 }
 
 
-def test_a_course_within_the_bounds_but_not_within_the_tightened_ones_is_said(vehicle: Vehicle) -> None:
+def test_a_course_within_the_bounds_but_not_within_the_tightened_ones_is_reported(vehicle: Vehicle) -> None:
     """A circle of 4.9 deg: within 5 deg, but tightening leaves 4.84 deg."""
     speed = math.sqrt(3.0 * vehicle.gravity * math.tan(math.radians(4.9)))
     circle = {"type": "circle", "radius": 3.0, "speed": speed, "turns": 3.0, "ramp": 10.0}
@@ -169,8 +169,8 @@ def test_a_course_within_the_bounds_but_not_within_the_tightened_ones_is_said(ve
     problems = found(circle, vehicle, controller=TIGHT).problems
     assert len(problems) == 4
     assert problems[0].startswith("roll up to 4.9 deg (bound 5, tightened to 4.83")
-    asked = scenario(circle, controller=TIGHT)
-    assert fitting(asked, vehicle) == "It would fit at 99 % of its speed, or at 98 % of its size."
+    tight = scenario(circle, controller=TIGHT)
+    assert fitting(tight, vehicle) == "It would fit at 99 % of its speed, or at 98 % of its size."
 
 
 def test_the_speed_at_which_a_course_fits_is_that_of_the_closed_form(vehicle: Vehicle) -> None:
@@ -188,7 +188,7 @@ def test_the_speed_at_which_a_course_fits_is_that_of_the_closed_form(vehicle: Ve
 def test_filtered_steps_would_fit_with_a_slower_filter_or_smaller(vehicle: Vehicle) -> None:
     """What the filter leaves is d (3 / tau_r)^2: at 5 deg and with 2 m in one axis tau_r = 4.58 s."""
     steps = {"response_time": 3.0, "y": [{"start": 1.0, "stop": 15.0, "value": 2.0}]}
-    said = fitting(scenario(steps), vehicle)
+    advice = fitting(scenario(steps), vehicle)
     time = 3.0 * math.sqrt(2.0 / (vehicle.gravity * math.tan(math.radians(5.0))))
-    assert said.startswith("It would fit at ")
-    assert float(said.removesuffix(" s.").rpartition(" ")[2]) == pytest.approx(time, rel=0.06)
+    assert advice.startswith("It would fit at ")
+    assert float(advice.removesuffix(" s.").rpartition(" ")[2]) == pytest.approx(time, rel=0.06)

@@ -1,4 +1,4 @@
-"""`[reference]` of every type: what it becomes, and what is said of one that is wrong."""
+"""`[reference]` of every type: what it becomes, and the messages for one that is wrong."""
 
 from __future__ import annotations
 
@@ -98,7 +98,7 @@ def test_waypoints_keep_a_yaw_that_is_not_given_and_take_their_own_speed() -> No
     np.testing.assert_allclose(np.degrees(poses[:, 3]), [30.0, -30.0, -90.0, -90.0])
 
 
-def test_minimum_snap_passes_its_points_when_its_speed_or_its_times_say() -> None:
+def test_minimum_snap_passes_its_points_when_its_speed_or_its_times_require() -> None:
     for fields in ({"speed": 0.5}, {"speed": None, "times": [10.0, 14.0]}):
         poses = sampled("minimum_snap", 10.0, 14.0, **fields)
         np.testing.assert_allclose(poses[:, :3], [[4, 2, 3], [4, 2, 5]], atol=1e-10)
@@ -127,7 +127,7 @@ def test_speed_is_that_at_full_speed_for_every_loop() -> None:
         assert fastest == pytest.approx(1.0, rel=1e-4), kind
 
 
-def test_a_helix_climbs_and_turns_the_way_its_sign_says() -> None:
+def test_a_helix_climbs_and_turns_in_the_direction_of_its_sign() -> None:
     end = sampled("helix", 1e3)[0]
     np.testing.assert_allclose(end[:3], [1.0, -2.0, 6.0], atol=1e-9)
     early = sampled("helix", 4.0)[0]
@@ -166,7 +166,7 @@ def beside(tmp_path: Path, table: str = TABLE, **fields: str) -> Path:
     return path
 
 
-def test_a_table_is_found_beside_its_scenario_and_kept_by_its_whole_path_and_hash(tmp_path: Path) -> None:
+def test_a_table_is_found_beside_its_scenario_and_stored_by_its_whole_path_and_hash(tmp_path: Path) -> None:
     made = load_scenario(str(beside(tmp_path)))
     assert made.reference.type == "csv"
     assert made.reference.file == str(tmp_path / "course.csv")

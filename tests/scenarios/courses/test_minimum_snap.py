@@ -94,7 +94,7 @@ def test_it_passes_its_points_at_rest_at_both_ends(order: int) -> None:
 
 @pytest.mark.parametrize("order", [ACCELERATION, SNAP])
 def test_its_derivatives_are_continuous_as_far_as_an_optimum_is(order: int) -> None:
-    """Up to 2 order - 2, though continuity was asked up to order - 1 alone; the next one jumps."""
+    """Up to 2 order - 2, though continuity was required only up to order - 1; the next one jumps."""
     curve = smoothest(TIMES, VALUES, order)
     for k in range(2 * order):
         size = np.abs(curve(np.linspace(0.0, TIMES[-1], 400), k)).max()

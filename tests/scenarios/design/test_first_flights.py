@@ -45,14 +45,14 @@ def test_baselines_fly_it_within_the_bounds(name: str, law: str) -> None:
 
 
 def test_the_figure_eight_comes_near_to_what_it_is_made_for() -> None:
-    """60 % of g tan(40 deg) is a tilt of 26.7 deg: a course that asks for less would prove nothing."""
+    """60 % of g tan(40 deg) is a tilt of 26.7 deg: a course that requires less would prove nothing."""
     flight = flown("hummingbird", "figure-eight", "robust")
     assert 25.0 < flight.tilt < 32.0
 
 
 @pytest.mark.parametrize("law", LAWS)
 @pytest.mark.parametrize("course", COURSES)
-def test_the_file_says_what_is_flown(course: str, law: str) -> None:
+def test_the_file_states_what_is_flown(course: str, law: str) -> None:
     made = first_scenario(ALL["hummingbird"], "hummingbird", course=course, law=law)
     text = made.to_toml()
     assert tomllib.loads(text) == made.to_data()
@@ -69,7 +69,7 @@ def test_the_file_says_what_is_flown(course: str, law: str) -> None:
         assert "x_error" not in bounds
 
 
-def test_every_number_of_the_controller_says_where_it_comes_from() -> None:
+def test_every_number_of_the_controller_states_its_source() -> None:
     made = first_scenario(ALL["hummingbird"], "hummingbird", course="figure-eight")
     numbers = [
         entry

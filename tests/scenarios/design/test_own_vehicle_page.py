@@ -21,19 +21,19 @@ def test_its_commands_end_with_a_good_flight(
     monkeypatch.chdir(tmp_path)
     commands = re.findall(r"^quadsim (.*)$", PAGE.partition("```sh\n")[2].partition("```")[0], flags=re.MULTILINE)
     assert 3 <= len(commands) <= 5
-    said = ""
+    output = ""
     for command in commands:
         line, _, file = command.partition(" > ")
         arguments = line.split()
         if arguments[0] == "run":
             arguments += ["--no-video", "--no-recording", "--no-figures", "--json"]
         assert main(arguments) == EXIT_DONE, command
-        said = capsys.readouterr().out
+        output = capsys.readouterr().out
         if file:
-            Path(file).write_text(said, encoding="utf-8")
+            Path(file).write_text(output, encoding="utf-8")
         if "--scenario" in arguments:
-            assert "hover is 495.2 rad/s, the scenario allows 250" in " ".join(said.split())
-    summary = json.loads(said)
+            assert "hover is 495.2 rad/s, the scenario allows 250" in " ".join(output.split())
+    summary = json.loads(output)
     assert summary["satisfied"] is True
     assert max(summary["tracking"]["rmse"][axis] for axis in "xyz") < 0.05
 

@@ -1,4 +1,4 @@
-"""Bounds of a scenario that a vehicle cannot meet, and what `quadsim vehicle` and `quadsim scenario` say of it."""
+"""Bounds of a scenario that a vehicle cannot meet, and what `quadsim vehicle` and `quadsim scenario` report."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from scenarios.loading import load_scenario, parse_scenario
 HUMMINGBIRD, LOPES = (load_vehicle(vehicle_path(name)) for name in ("hummingbird", "lopes2011"))
 
 
-def test_hover_beyond_what_the_scenario_allows_is_said_in_numbers() -> None:
+def test_hover_beyond_what_the_scenario_allows_is_reported_in_numbers() -> None:
     found = shortfalls(load_scenario("hover"), HUMMINGBIRD)
     assert found[0] == "controller.input_bounds.speed: hover is 453.2 rad/s, the scenario allows 250"
     assert "5 rad/s per period take 3.85 s" in found[1]
@@ -32,18 +32,18 @@ def test_each_other_bound_that_is_missed_has_a_line() -> None:
     found = shortfalls(scenario, LOPES)
     assert any(line.startswith("controller.output_bounds.roll: 60 deg, but from 53.5 deg") for line in found)
     assert any(line.startswith("controller.rotor_lag is the vehicle's") for line in found)
-    asks = load_scenario("hummingbird-figure-eight", ["controller.input_bounds.speed=[460.0, 900.0]"])
-    found = shortfalls(asks, HUMMINGBIRD)
-    assert "the scenario asks for at least 460" in found[0]
+    demanding = load_scenario("hummingbird-figure-eight", ["controller.input_bounds.speed=[460.0, 900.0]"])
+    found = shortfalls(demanding, HUMMINGBIRD)
+    assert "the scenario requires at least 460" in found[0]
     assert "the scenario counts on 900 rad/s, the rotors reach 838" in found[1]
     lqr = load_scenario("hover", ["controller={ type = 'lqr', tilt = 70.0 }"])
     assert [line.partition(":")[0] for line in shortfalls(lqr, LOPES)] == ["controller.tilt"]
 
 
-def test_a_course_that_is_too_fast_is_said_with_the_speed_at_which_it_fits() -> None:
+def test_a_course_that_is_too_fast_is_reported_with_the_speed_at_which_it_fits() -> None:
     fast = load_scenario("hummingbird-figure-eight", ["reference.period=6.0", "duration=12.0"])
     found = shortfalls(fast, HUMMINGBIRD)
-    assert "the course asks for roll up to" in found[0]
+    assert "the course requires roll up to" in found[0]
     assert found[-1].startswith("It would fit at ")
     assert shortfalls(load_scenario("hummingbird-figure-eight"), HUMMINGBIRD) == ()
 
@@ -55,7 +55,7 @@ def test_a_first_scenario_suits_its_vehicle(course: str, law: str) -> None:
     assert shortfalls(made, HUMMINGBIRD) == ()
 
 
-def test_the_template_says_all_of_every_parameter() -> None:
+def test_the_template_documents_every_parameter() -> None:
     tables = tomllib.loads(vehicle_template())
     assert [*tables] == ["name", "description", *VEHICLE_UNITS]
     text, meanings = " ".join(vehicle_template().replace("# ", "").split()), parameter_meanings()
@@ -73,9 +73,9 @@ def test_from_a_template_to_a_scenario_by_the_command_line(
     assert main(["vehicle", "--template"]) == EXIT_DONE
     Path("mine.toml").write_text(capsys.readouterr().out, encoding="utf-8")
     assert main(["vehicle", "mine.toml", "--scenario", "hover"]) == EXIT_DONE
-    said = capsys.readouterr().out
-    assert "hover is 495.2 rad/s, the scenario allows 250" in said
-    assert "time constant of x, y, limited by the rotors' lag" in said
+    output = capsys.readouterr().out
+    assert "hover is 495.2 rad/s, the scenario allows 250" in output
+    assert "time constant of x, y, limited by the rotors' lag" in output
     assert main(["vehicle", "mine.toml", "--scenario", "hover", "--json"]) == EXIT_DONE
     sheet = json.loads(capsys.readouterr().out)
     assert len(sheet["shortfalls"]) == 4
@@ -111,15 +111,15 @@ def test_wrong_requests_are_refused(arguments: list[str], message: str, capsys: 
     assert message in capsys.readouterr().err
 
 
-def test_the_speed_at_which_a_course_fits_is_said_before_the_flight(
+def test_the_speed_at_which_a_course_fits_is_reported_before_the_flight(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    said: list[str] = []
+    output: list[str] = []
     monkeypatch.setattr(console, "is_watched", lambda: True)
-    monkeypatch.setattr(console, "print_notice", said.append)
+    monkeypatch.setattr(console, "print_notice", output.append)
     settings = ["reference.period=6.0", "reference.start=0.0", "duration=4.0"]
     main(["check", "hummingbird-figure-eight", *(part for setting in settings for part in ("--set", setting))])
-    assert len(said) == 1
-    assert "It cannot be followed exactly: roll up to" in said[0]
-    assert said[0].endswith(" % of its size.")
-    assert " It would fit at " in said[0]
+    assert len(output) == 1
+    assert "It cannot be followed exactly: roll up to" in output[0]
+    assert output[0].endswith(" % of its size.")
+    assert " It would fit at " in output[0]

@@ -76,7 +76,7 @@ def test_weights_make_a_butterworth_pattern_of_the_stated_bandwidth() -> None:
         np.testing.assert_allclose(np.sort(-poles.real / radius), expected, rtol=0.03)
 
 
-def test_a_tilt_grows_in_the_air_as_munk_says() -> None:
+def test_a_tilt_grows_in_the_air_by_munks_moment() -> None:
     """In a level glide at 8 m/s, rotors at hover: the plant's own pitch, against exp(p t) + exp(-p t) over 2."""
     vehicle = next(each for each in ALL if each.name == "random-16")
     rate, tilt = 8.0 * authority(vehicle).munk, 1e-3

@@ -34,14 +34,14 @@ def short(name: str, duration: float = 1.0, **changes: Any) -> quadsim.Scenario:
 def flown(env: gymnasium.Env[Any, Any], seed: int | None = None) -> list[dict[str, Any]]:
     """An episode of the scenario's own controller: `info` of the start and of each step."""
     _, info = env.reset(seed=seed)
-    told, ended = [info], False
+    infos, ended = [info], False
     while not ended:
         observed, reward, terminated, truncated, info = env.step(env.unwrapped.controller_action())
         assert observed in env.observation_space
         assert 0.0 < reward <= 1.0
-        told.append(info)
+        infos.append(info)
         ended = terminated or truncated
-    return told
+    return infos
 
 
 def test_every_scenario_of_the_library_has_an_id_and_its_duration() -> None:
@@ -85,29 +85,29 @@ def test_an_episode_of_the_own_controller_has_the_bytes_of_a_run(name: str, acti
     flight = quadsim.fly(scenario.replace({"seed": 7}), progress=False)
     flight.save(tmp_path / "run", video=False, recording=False, figures=False)
     env = quadsim.gym.make_env(scenario, action=action)
-    told = flown(env, seed=7)
+    infos = flown(env, seed=7)
     env.unwrapped.flight().save(tmp_path / "episode", video=False, recording=False, figures=False)
     for file in ("flight.parquet", "plant.parquet"):
         assert (tmp_path / "run" / file).read_bytes() == (tmp_path / "episode" / file).read_bytes()
     for i, finding in enumerate(flight.audit):
-        worst = min(info["margins"][finding.limit.name] for info in told)
-        assert worst == -max(info["constraint_values"][i] for info in told)
+        worst = min(info["margins"][finding.limit.name] for info in infos)
+        assert worst == -max(info["constraint_values"][i] for info in infos)
         assert worst == pytest.approx(finding.worst_margin, abs=1e-9) or not finding.limit.holds_at(flight.time).any()
 
 
 def test_margins_see_a_violation_that_samples_miss() -> None:
     """The paper's controller bounds samples of a linear model, and is beyond 5 deg of roll between some of them."""
     env = quadsim.gym.make_env(short("paper-constrained", 27.0))
-    told = flown(env)
+    infos = flown(env)
     missed = [
         now["margins"]["roll"]
-        for before, now in itertools.pairwise(told)
+        for before, now in itertools.pairwise(infos)
         if now["margins"]["roll"] < 0.0 <= min(before["margins_sampled"]["roll"], now["margins_sampled"]["roll"])
     ]
     assert len(missed) >= 3
-    assert all(info["constraint_values"][0] == -info["margins"]["roll"] for info in told)
+    assert all(info["constraint_values"][0] == -info["margins"]["roll"] for info in infos)
     plant = env.unwrapped.flight().plant
-    assert np.degrees(np.abs(plant["roll"])).max() == pytest.approx(5.0 - min(i["margins"]["roll"] for i in told))
+    assert np.degrees(np.abs(plant["roll"])).max() == pytest.approx(5.0 - min(i["margins"]["roll"] for i in infos))
 
 
 def test_cost_counts_required_constraints_beyond_their_tolerance() -> None:
@@ -158,7 +158,7 @@ def test_an_action_that_is_no_number_ends_the_flight() -> None:
     assert "not finite" in info["reason"]
 
 
-def test_observations_are_what_the_layout_says() -> None:
+def test_observations_follow_the_layout() -> None:
     parts = ("command", "ahead", "preview", "state")
     env = quadsim.gym.QuadrotorEnv("paper-constrained", observation=parts, preview=2)
     observed, _ = env.reset()

@@ -23,29 +23,29 @@ from safety_filter import CONTROLLER, filtered_air  # noqa: E402
 def random_episode(env: gymnasium.Env[Any, Any], seed: int) -> tuple[list[dict[str, Any]], bool]:
     env.reset(seed=seed)
     env.action_space.seed(seed)
-    told, ended = [], False
+    infos, ended = [], False
     while not ended:
         _, _, terminated, truncated, info = env.step(env.action_space.sample())
-        told.append(info)
+        infos.append(info)
         ended = terminated or truncated
-    return told, terminated
+    return infos, terminated
 
 
 def test_a_random_agent_holds_five_degrees_of_tilt_behind_it_and_crashes_without() -> None:
     scenario = filtered_air("turbulence").replace({"duration": 5.0})
     env = quadsim.gym.MPCSafetyFilter(quadsim.gym.make_env(scenario))
-    told, terminated = random_episode(env, seed=0)
+    infos, terminated = random_episode(env, seed=0)
     assert not terminated
-    assert min(info["margins"]["tilt"] for info in told) >= 0.0
-    stepped_in = [info["filter"]["intervened"] for info in told]
-    assert 0 < sum(stepped_in) < len(told) == env.steps
+    assert min(info["margins"]["tilt"] for info in infos) >= 0.0
+    stepped_in = [info["filter"]["intervened"] for info in infos]
+    assert 0 < sum(stepped_in) < len(infos) == env.steps
     assert env.interventions == sum(stepped_in)
-    assert all((info["filter"]["correction"] > 0.0) == info["filter"]["intervened"] for info in told)
+    assert all((info["filter"]["correction"] > 0.0) == info["filter"]["intervened"] for info in infos)
     status = env.unwrapped.flight().log.control.status
     assert [each != "unconstrained" for each in status] == stepped_in
-    told, terminated = random_episode(quadsim.gym.make_env(scenario), seed=0)
+    infos, terminated = random_episode(quadsim.gym.make_env(scenario), seed=0)
     assert terminated
-    assert "tilted" in told[-1]["reason"]
+    assert "tilted" in infos[-1]["reason"]
 
 
 def test_what_is_safe_passes_to_the_bit() -> None:

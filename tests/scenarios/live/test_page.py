@@ -78,7 +78,7 @@ class Served:
 
 @pytest.fixture(scope="module")
 def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
-    target = tmp_path_factory.mktemp("live") / "kept"
+    target = tmp_path_factory.mktemp("live") / "saved"
 
     def save(session: Session) -> str:
         session.flight().save(target, video=False, recording=False, figures=False)
@@ -128,18 +128,18 @@ def test_a_closed_page_ends_its_push(browser: Any, served: Served) -> None:
 
 
 def test_an_interrupt_keeps_what_was_flown(tmp_path: Path) -> None:
-    kept = tmp_path / "kept"
-    line = ["live", "hover", "--no-browser", "--set", "controller.horizon=5", "--out", str(kept)]
+    saved = tmp_path / "saved"
+    line = ["live", "hover", "--no-browser", "--set", "controller.horizon=5", "--out", str(saved)]
     code = "import sys; from scenarios.cli import main; sys.exit(main(sys.argv[1:]))"
     process = subprocess.Popen([sys.executable, "-c", code, *line], stdout=subprocess.PIPE, text=True, cwd=ROOT)
     assert process.stdout is not None
     assert "token=" in process.stdout.readline()
     clock.sleep(1.0)
     process.send_signal(signal.SIGINT)
-    said, _ = process.communicate(timeout=2.0 * PATIENCE)
-    assert str(kept) in said
+    output, _ = process.communicate(timeout=2.0 * PATIENCE)
+    assert str(saved) in output
     assert process.returncode == 0
-    assert load_scenario(str(kept / "scenario.toml")).duration > 0.0
+    assert load_scenario(str(saved / "scenario.toml")).duration > 0.0
 
 
 @pytest.fixture(scope="module")

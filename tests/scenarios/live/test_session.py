@@ -1,4 +1,4 @@
-"""What a person does in a session is data: the scenario that is kept flies to the same bits."""
+"""What a person does in a session is data: the saved scenario flies to the same bits."""
 
 from __future__ import annotations
 
@@ -99,7 +99,7 @@ def same_bits(session: Session, which: int = 0) -> bool:
 
 @settings(max_examples=8, deadline=None)
 @given(st.lists(st.tuples(st.integers(0, 20), INPUTS), max_size=12))
-def test_a_kept_session_flies_to_the_same_bits(given: list[tuple[int, dict[str, Any]]]) -> None:
+def test_a_saved_session_flies_to_the_same_bits(given: list[tuple[int, dict[str, Any]]]) -> None:
     scenario = load_scenario("steady-wind", ["controller.horizon=10"])
     session = Session(scenario, load_scenario("robust").controller)
     try:
@@ -134,7 +134,7 @@ def test_of_one_subject_the_last_input_counts(session: Session) -> None:
     assert [event.x for event in points] == [3.0]
 
 
-def test_what_is_refused_is_said_and_changes_nothing(session: Session) -> None:
+def test_what_is_refused_is_reported_and_changes_nothing(session: Session) -> None:
     flown(session, 2)
     before = session.flight().scenario.events
     for table in (
@@ -147,19 +147,19 @@ def test_what_is_refused_is_said_and_changes_nothing(session: Session) -> None:
         {},
     ):
         session.submit(table)
-        (said,) = session.advance().refused
-        assert said
+        (refusal,) = session.advance().refused
+        assert refusal
     assert session.flight().scenario.events == before
 
 
-def test_what_cannot_be_held_any_more_is_let_go_and_said_once(
+def test_what_cannot_be_held_any_more_is_released_and_reported_once(
     session: Session, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(scenarios.parts.live, "MOST_EVENTS", 20)
     session.submit({"type": "pull", "to": [0.3, 0.0, 1.0]})
     session.submit({"type": "wear", "rotor": 2, "loss": 0.02})
-    (said,) = [said for frame in flown(session, 30) for said in frame.refused]
-    assert "20 or fewer" in said
+    (refusal,) = [refusal for frame in flown(session, 30) for refusal in frame.refused]
+    assert "20 or fewer" in refusal
     assert session.reason is None
     assert same_bits(session)
 
@@ -229,7 +229,7 @@ class Nobody:
         pass
 
 
-def test_a_slow_machine_flies_every_period_and_says_how_slow_it_is(session: Session) -> None:
+def test_a_slow_machine_flies_every_period_and_reports_its_speed(session: Session) -> None:
     pace, view = Pace(Clock(LATE)), Nobody()
     frames: list[int] = []
     pace.drive(session, view, until=lambda frame: frames.append(frame.k) or frame.k == 9)  # type: ignore[func-returns-value]
@@ -247,21 +247,21 @@ def test_paused_it_flies_single_periods(session: Session) -> None:
     assert session.k == 2
 
 
-def test_a_script_is_kept_as_a_run_that_flies_to_the_same_bytes(
+def test_a_script_is_saved_as_a_run_that_flies_to_the_same_bytes(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    script, kept, again = tmp_path / "script.toml", tmp_path / "kept", tmp_path / "again"
+    script, saved, again = tmp_path / "script.toml", tmp_path / "saved", tmp_path / "again"
     script.write_text(SCRIPT, encoding="utf-8")
-    line = ["live", "robust", "--script", str(script), "--out", str(kept), "--set", "controller.horizon=20"]
+    line = ["live", "robust", "--script", str(script), "--out", str(saved), "--set", "controller.horizon=20"]
     assert main(line) == 0
     assert "3.00 s" in capsys.readouterr().out
-    main(["run", str(kept / "scenario.toml"), "--out", str(again), "--no-video", "--no-recording", "--no-figures"])
+    main(["run", str(saved / "scenario.toml"), "--out", str(again), "--no-video", "--no-recording", "--no-figures"])
     for table in ("flight.parquet", "plant.parquet"):
-        assert (kept / table).read_bytes() == (again / table).read_bytes()
+        assert (saved / table).read_bytes() == (again / table).read_bytes()
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "refusal"),
     [
         ("duration = 0", "duration must be above 0"),
         ("duration = 1\ninputs = [{ at = 2.0 }]", "at must be from 0 to below duration"),
@@ -270,14 +270,14 @@ def test_a_script_is_kept_as_a_run_that_flies_to_the_same_bytes(
         ("duration = ", "no TOML"),
     ],
 )
-def test_a_script_that_is_none_is_refused(tmp_path: Path, text: str, said: str) -> None:
+def test_a_script_that_is_none_is_refused(tmp_path: Path, text: str, refusal: str) -> None:
     path = tmp_path / "script.toml"
     path.write_text(text, encoding="utf-8")
-    with pytest.raises(InputError, match=said):
+    with pytest.raises(InputError, match=refusal):
         read_script(path)
 
 
-def test_where_it_cannot_be_kept_nothing_is_flown(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_where_it_cannot_be_saved_nothing_is_flown(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "letter.txt").write_text("dear")
     script = tmp_path / "script.toml"
@@ -310,8 +310,8 @@ def test_the_script_on_the_page_plays() -> None:
         session.close()
 
 
-def test_a_script_says_what_was_refused(session: Session, tmp_path: Path) -> None:
+def test_a_script_reports_what_was_refused(session: Session, tmp_path: Path) -> None:
     path = tmp_path / "script.toml"
     path.write_text('duration = 0.2\ninputs = [{ at = 0.1, type = "nonsense" }]', encoding="utf-8")
-    (said,) = play(session, read_script(path))
-    assert "nonsense" in said
+    (refusal,) = play(session, read_script(path))
+    assert "nonsense" in refusal

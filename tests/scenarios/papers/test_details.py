@@ -1,4 +1,4 @@
-"""What details of Torrente et al. are worth that no field of a scenario says, flown with a test's own law or force.
+"""Effects of details of Torrente et al. that no field of a scenario holds, flown with a test's own law or force.
 
 The numbers are those of a separate implementation of the published simulation.
 """

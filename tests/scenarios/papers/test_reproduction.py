@@ -1,4 +1,4 @@
-"""Published numbers flown again: the short ones of every paper, and what is said of one that is off."""
+"""Published numbers flown again: the short ones of every paper, and the messages for one that is off."""
 
 from __future__ import annotations
 
@@ -110,7 +110,7 @@ def test_the_published_number_stands_in_each_scenarios_description() -> None:
         ("at least", 0.98, False),
     ],
 )
-def test_a_number_is_as_near_as_its_relation_and_tolerance_say(relation: Any, ours: float, within: bool) -> None:
+def test_a_number_is_judged_by_its_relation_and_tolerance(relation: Any, ours: float, within: bool) -> None:
     spec = NumberSpec(name="n", scenario="hover", published=1.0, relation=relation, absolute=0.01, source="s")
     assert Reproduced(spec=spec, ours=ours).within is within
 
@@ -148,9 +148,9 @@ def test_the_command_prints_and_fails_beyond_tolerance(tmp_path: Path, capsys: p
     assert ElementTree.parse(report).getroot().attrib["failures"] == "0"
     off = written(tmp_path, ("0.5", "absolute = 0.0"), ("0.6", "relative = 0.01"))
     assert main(["reproduce", off, "--json", "--junit", str(report)]) == EXIT_FAILED
-    told = json.loads(capsys.readouterr().out)
-    assert not told["reproduced"]
-    first, second = told["papers"][0]["numbers"]
+    result = json.loads(capsys.readouterr().out)
+    assert not result["reproduced"]
+    first, second = result["papers"][0]["numbers"]
     assert first["within"]
     assert not second["within"]
     assert (second["published"], second["ours"], second["tolerance"]) == (0.6, 0.5, pytest.approx(0.006))

@@ -483,8 +483,8 @@ WRONG = {
 def test_a_wrong_field_is_named(setting: str, message: str) -> None:
     with pytest.raises(ScenarioError) as caught:
         load_scenario("robust", [setting])
-    said, begins = str(caught.value).removeprefix("robust.toml: "), message.endswith("...")
-    assert said.startswith(message[:-3]) if begins else said == message
+    reported, begins = str(caught.value).removeprefix("robust.toml: "), message.endswith("...")
+    assert reported.startswith(message[:-3]) if begins else reported == message
 
 
 @pytest.mark.parametrize("name", ["lqr", "pid", "geometric"])
@@ -493,14 +493,14 @@ def test_a_baseline_has_no_optimisation(name: str) -> None:
         build_problem(scenario(name), build_vehicle(scenario(name)))
 
 
-def test_every_law_is_listed_and_told_apart_by_its_name() -> None:
+def test_every_law_is_listed_and_distinguished_by_its_name() -> None:
     tags = {note.tag for kind in get_args(get_args(_Table)[0]) for note in get_args(kind) if isinstance(note, Tag)}
     assert tags == {*LAWS, FORM}
     assert list(CONTROLLERS) == list(LAWS)
     assert {*LAW_NAMES} == tags - {FORM}  # and has a name to be shown by
 
 
-def test_a_law_that_the_bounds_leave_too_little_for_is_told_in_the_files_words() -> None:
+def test_a_law_with_too_narrow_bounds_is_refused_in_the_files_words() -> None:
     one = load_scenario("robust", ["controller.heading=false", "controller.output_bounds.vx=[-0.2, 0.2]"])
     message = (
         "controller.tightening.acceleration must be smaller, or the bounds on vx wider: these leave 0.2 m/s on either "

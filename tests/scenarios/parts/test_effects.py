@@ -205,7 +205,7 @@ def test_a_stalled_robust_controller_is_flown_by_its_last_plan() -> None:
 
 
 class Spy:
-    """A controller whose plans are kept."""
+    """A controller whose plans are recorded."""
 
     def __init__(self, law: Controller) -> None:
         self._law, self.plans = law, list[Array]()

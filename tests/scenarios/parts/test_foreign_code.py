@@ -29,7 +29,7 @@ class Hover:
         return self.speeds
 """
 BARE = ("--no-video", "--no-recording", "--no-figures")
-TELLS = "quadsim: runs code that is not quadsim's: controller theirs_7:Hover from "
+NOTICE = "quadsim: runs code that is not quadsim's: controller theirs_7:Hover from "
 
 
 @pytest.fixture
@@ -59,10 +59,10 @@ def digest_of(path: Path) -> str:
 @pytest.mark.parametrize(
     "command", [["run", "theirs.toml", *BARE], ["check", "theirs.toml"], ["check", "theirs.toml", "--json"]]
 )
-def test_it_is_said_before_it_is_imported(here: Path, command: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+def test_it_is_named_before_it_is_imported(here: Path, command: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     assert main(command) == EXIT_DONE
-    told, ran, *more = capsys.readouterr().err.splitlines()
-    assert told == f"{TELLS}{here}/theirs_7.py, {digest_of(here / 'theirs_7.py')}"
+    notice, ran, *more = capsys.readouterr().err.splitlines()
+    assert notice == f"{NOTICE}{here}/theirs_7.py, {digest_of(here / 'theirs_7.py')}"
     assert ran == "HERE IT RUNS"
     assert more == []
 
@@ -101,7 +101,7 @@ def campaign(here: Path, capsys: pytest.CaptureFixture[str]) -> Path:
     return here / "c"
 
 
-def test_replay_and_resume_say_what_runs_and_whether_it_flew_the_campaign(
+def test_replay_and_resume_report_what_runs_and_whether_it_flew_the_campaign(
     campaign: Path, here: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     for command in (
@@ -109,30 +109,30 @@ def test_replay_and_resume_say_what_runs_and_whether_it_flew_the_campaign(
         ["campaign", "campaign.toml", "--out", "c", "--resume", "--flights", "5", "--workers", "1", "--no-report"],
     ):
         assert main(command) == EXIT_DONE
-        told, known, ran, *_ = capsys.readouterr().err.splitlines()
-        assert told == f"{TELLS}{here}/theirs_7.py, {digest_of(here / 'theirs_7.py')}"
+        notice, known, ran, *_ = capsys.readouterr().err.splitlines()
+        assert notice == f"{NOTICE}{here}/theirs_7.py, {digest_of(here / 'theirs_7.py')}"
         assert known == "quadsim: that is the code which flew the campaign, by its digest"
         assert ran == "HERE IT RUNS"
         forget(set(sys.modules) - {"theirs_7"})
 
 
-def test_other_code_than_flew_a_campaign_is_said_before_it_runs(
+def test_other_code_than_flew_a_campaign_is_reported_before_it_runs(
     campaign: Path, here: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     recorded = digest_of(here / "theirs_7.py")
     (here / "theirs_7.py").write_text(LAW + "# another\n")
     assert main(["replay", "c", *BARE]) == EXIT_DONE
-    told, other, ran, *_ = capsys.readouterr().err.splitlines()
-    assert told == f"{TELLS}{here}/theirs_7.py, {digest_of(here / 'theirs_7.py')}"
+    notice, other, ran, *_ = capsys.readouterr().err.splitlines()
+    assert notice == f"{NOTICE}{here}/theirs_7.py, {digest_of(here / 'theirs_7.py')}"
     assert other == f"quadsim: that is NOT the code which flew the campaign: recorded was {recorded}"
     assert ran == "HERE IT RUNS"
 
 
-def test_what_is_missing_is_said_too(campaign: Path, here: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_what_is_missing_is_reported_too(campaign: Path, here: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (here / "theirs_7.py").unlink()
     shutil.rmtree(here / "__pycache__", ignore_errors=True)
     assert main(["replay", "c", *BARE]) == EXIT_WRONG_INPUT
-    assert capsys.readouterr().err.startswith(TELLS + "a module that is not found\n")
+    assert capsys.readouterr().err.startswith(NOTICE + "a module that is not found\n")
 
 
 def test_a_module_in_packages_is_found_and_none_of_them_imported(here: Path) -> None:

@@ -1,4 +1,4 @@
-"""`[sensors]` and `[estimator]`: their units, and what is said of wrong ones."""
+"""`[sensors]` and `[estimator]`: their units, and the messages for wrong ones."""
 
 from __future__ import annotations
 

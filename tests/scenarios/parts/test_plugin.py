@@ -1,4 +1,4 @@
-"""Controllers that are not ours: where they are looked for, how they are called, and what is said where they fail."""
+"""User-defined controllers: where they are looked for, how they are called, and the messages where they fail."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ import numpy as np
 
 class Hover:
     def __init__(self, vehicle, *, period, horizon, offset=0.0):
-        self.speeds, self.told = np.full(4, vehicle.hover_speed + offset), (period, horizon)
+        self.speeds, self.received = np.full(4, vehicle.hover_speed + offset), (period, horizon)
     def step(self, now, state, reference):
         return self.speeds
 """
@@ -45,7 +45,7 @@ def written(tmp_path: Path) -> Iterator[Write]:
     before, count = set(sys.modules), itertools.count()
 
     def write(code: str, controller: str = 'controller = "{module}:Hover"', *, module: str | None = None) -> str:
-        name = module or f"own_{abs(hash(str(tmp_path)))}_{next(count)}"
+        name = module or f"custom_{abs(hash(str(tmp_path)))}_{next(count)}"
         folder = tmp_path / "beside"
         folder.mkdir(exist_ok=True)
         (folder / f"{name}.py").write_text(code)
@@ -65,12 +65,12 @@ def build(path: str, *settings: str) -> PluginController:
 
 
 def message(path: str) -> str:
-    """What is said of a controller that cannot be made; the module's name and folder left out."""
+    """The message for a controller that cannot be made; the module's name and folder left out."""
     with pytest.raises(InputError) as caught:
         build(path)
     file = Path(path)
-    said = str(caught.value).replace(str(file.parent), "FOLDER").replace(str(Path.cwd()), "HERE")
-    return said.replace(file.stem, "mine")
+    reported = str(caught.value).replace(str(file.parent), "FOLDER").replace(str(Path.cwd()), "HERE")
+    return reported.replace(file.stem, "mine")
 
 
 # --- found and called ----------------------------------------------------------------------------------------------
@@ -82,7 +82,7 @@ def test_it_is_found_beside_the_scenario_and_called_with_what_is_documented(writ
     vehicle = build_vehicle(load_scenario("hover"))
     np.testing.assert_array_equal(command.speeds, np.full(4, vehicle.hover_speed + 2.0))
     np.testing.assert_array_equal(command.plan, np.tile(command.speeds, (7, 1)))
-    assert law._law.told == (0.05, 7)
+    assert law._law.received == (0.05, 7)
     assert (law.name, law.solver, law.horizon) == ("Hover", "", 7)
 
 
@@ -132,11 +132,11 @@ def test_a_resolved_file_flies_the_same_from_anywhere(written: Write, tmp_path: 
 
 def test_it_is_found_in_a_package_and_below_a_class(written: Write) -> None:
     path = written("")
-    package = Path(path).parent / "own_package"
+    package = Path(path).parent / "custom_package"
     package.mkdir()
     (package / "__init__.py").write_text("")
     (package / "laws.py").write_text(HOVER.replace("class Hover:", "class Laws:\n  class Hover:"))
-    Path(path).write_text(SCENARIO + 'controller = "own_package.laws:Laws.Hover"')
+    Path(path).write_text(SCENARIO + 'controller = "custom_package.laws:Laws.Hover"')
     assert build(path).name == "Hover"
 
 
@@ -190,7 +190,7 @@ class Hover:
 """
 
 
-def test_what_it_has_is_used_and_what_it_is_told_is_a_copy(written: Write) -> None:
+def test_what_it_has_is_used_and_what_it_is_given_is_a_copy(written: Write) -> None:
     flight = fly_scenario(load_scenario(written(FULL)))
     assert (flight.controller, flight.solver) == ("mine", "by-hand")
     assert set(flight.log.control.iterations.tolist()) == {3}
@@ -213,15 +213,15 @@ def test_speeds_that_are_no_numbers_never_reach_the_plant(written: Write) -> Non
 
 
 class Answers:
-    """A law that writes over what it is told and what it answered, and answers a command changed in one part."""
+    """A law that overwrites its input and its answer, and returns a command changed in one part."""
 
     def __init__(self, **changes: Any) -> None:
         self._speeds, self._plan, self._changes = np.full(4, 190.0), np.full((3, 4), 190.0), changes
 
     def step(self, now: Moment, state: Array, reference: Array) -> Command:
         assert now.acting is not None
-        for told in (now.acting, state, reference):
-            told[:] = 7.0
+        for received in (now.acting, state, reference):
+            received[:] = 7.0
         self._speeds += 1.0
         self._plan += 1.0
         return replace(Command(speeds=self._speeds, plan=self._plan), **self._changes)
@@ -382,18 +382,18 @@ def test_one_message_names_field_module_attribute_and_line(
     written: Write, code: str, controller: str | None, expected: str
 ) -> None:
     path = written(code) if controller is None else written(code, controller)
-    said = message(path).removeprefix("mine.toml: ")
+    reported = message(path).removeprefix("mine.toml: ")
     begins = expected.endswith("...")
-    assert said.startswith(expected[:-3]) if begins else said == expected
-    assert "\n" not in said
+    assert reported.startswith(expected[:-3]) if begins else reported == expected
+    assert "\n" not in reported
 
 
 def test_a_module_of_the_same_name_from_elsewhere_is_not_taken_for_it(written: Write) -> None:
-    said = message(written(HOVER, module="tomllib"))
+    reported = message(written(HOVER, module="tomllib"))
     assert re.fullmatch(
         r"controller\.type: FOLDER/mine\.py cannot be imported: a module 'mine' from .*__init__\.py is loaded already; "
         r"rename one of them",
-        said.replace("tomllib", "mine"),
+        reported.replace("tomllib", "mine"),
     )
 
 
@@ -402,9 +402,9 @@ def test_wrong_input_has_exit_status_two_and_no_traceback(
 ) -> None:
     out = tmp_path / "out"
     assert main(["run", written("class Hover\n"), "--no-video", "--out", str(out)]) == 2
-    told, said = capsys.readouterr().err.splitlines()
-    assert told.startswith("quadsim: runs code that is not quadsim's: controller own_")
-    assert said.startswith("quadsim: controller.type: module 'own_")
+    notice, reported = capsys.readouterr().err.splitlines()
+    assert notice.startswith("quadsim: runs code that is not quadsim's: controller custom_")
+    assert reported.startswith("quadsim: controller.type: module 'custom_")
     assert not out.exists()
 
 

@@ -1,4 +1,4 @@
-"""What happened on the way, in words."""
+"""What happened in flight, in words."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from scenarios.schema.base import fields_of
 from scenarios.schema.events import Event
 from scenarios.schema.scenario import Scenario
 
-TOLD = [
+TEXTS = [
     ({"type": "rotor_loss", "rotor": 2, "loss": 0.2, "duration": 3.0}, "rotor 2 loses 20 % for 3 s"),
     ({"type": "rotor_lag", "rise": 0.03}, "rotors lag by 0.03 s"),
     ({"type": "rotor_lag", "rise": 0.03, "fall": 0.05}, "rotors lag by 0.03 s, 0.05 s downwards"),
@@ -39,27 +39,27 @@ def scenario(events: list[dict[str, Any]]) -> Scenario:
     return data.replace({"events": [{"at": 1.0, **event} for event in events]})
 
 
-@pytest.mark.parametrize(("event", "text"), TOLD)
-def test_each_kind_is_told_in_its_words(event: dict[str, Any], text: str) -> None:
+@pytest.mark.parametrize(("event", "text"), TEXTS)
+def test_each_kind_is_reported_in_its_words(event: dict[str, Any], text: str) -> None:
     assert story(scenario([event]), 10.0) == [{"time": 1.0, "text": text}]
 
 
-def test_every_kind_of_event_is_told() -> None:
+def test_every_kind_of_event_is_reported() -> None:
     kinds = {get_args(fields_of(kind)["type"].annotation)[0] for kind in get_args(get_args(Event)[0])}
-    assert {event["type"] for event, _ in TOLD} == kinds
+    assert {event["type"] for event, _ in TEXTS} == kinds
 
 
-def test_many_of_a_kind_are_told_in_one() -> None:
+def test_many_of_a_kind_are_reported_in_one() -> None:
     pushes = [{"at": 1.0 + 0.1 * i, "type": "push", "force": [1.0 + i, 0.0, 0.0], "duration": 0.1} for i in range(9)]
-    told = story(scenario([*pushes, {"at": 1.35, "type": "stall", "duration": 0.1}]), 10.0)
-    assert [entry["text"] for entry in told] == [
+    entries = story(scenario([*pushes, {"at": 1.35, "type": "stall", "duration": 0.1}]), 10.0)
+    assert [entry["text"] for entry in entries] == [
         "4 times until 1.3 s: a push of 1 N for 0.1 s first, a push of 4 N for 0.1 s last",
         "the computer stalls for 0.1 s",
         "5 times until 1.8 s: a push of 5 N for 0.1 s first, a push of 9 N for 0.1 s last",
     ]
 
 
-def test_what_changes_nothing_or_comes_later_is_not_told() -> None:
+def test_what_changes_nothing_or_comes_later_is_not_reported() -> None:
     flown = scenario([{"type": "stall", "duration": 0.1}])
     live = prepared(flown, build_vehicle(flown))
     assert len(live.events) > 5

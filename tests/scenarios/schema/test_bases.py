@@ -1,4 +1,4 @@
-"""Scenario files that say only how they differ from another."""
+"""Scenario files that hold only their differences from another."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def write(directory: Path, name: str, text: str) -> str:
     return str(directory / name)
 
 
-def test_a_file_says_only_what_differs(tmp_path: Path) -> None:
+def test_a_file_holds_only_what_differs(tmp_path: Path) -> None:
     mine = write(
         tmp_path,
         "mine.toml",
@@ -74,7 +74,7 @@ def test_lists_without_names_are_replaced() -> None:
     assert merge({"events": [{"at": 1.0}, {"at": 2.0}]}, {"events": [{"at": 3.0}]}) == {"events": [{"at": 3.0}]}
 
 
-def test_a_circle_of_bases_is_told(tmp_path: Path) -> None:
+def test_circular_bases_are_reported(tmp_path: Path) -> None:
     write(tmp_path, "a.toml", 'base = "b.toml"\n')
     write(tmp_path, "b.toml", 'base = "a.toml"\n')
     with pytest.raises(FileError, match=r"is its own base: a\.toml -> b\.toml -> a\.toml"):
@@ -89,7 +89,7 @@ def test_a_circle_of_bases_is_told(tmp_path: Path) -> None:
         ('base = "gone.toml"', FileError, r"gone\.toml: no such scenario file"),
     ],
 )
-def test_a_wrong_base_is_told(tmp_path: Path, text: str, error: type[Exception], message: str) -> None:
+def test_a_wrong_base_is_reported(tmp_path: Path, text: str, error: type[Exception], message: str) -> None:
     with pytest.raises(error, match=message):
         load_scenario(write(tmp_path, "x.toml", text))
 
@@ -102,7 +102,7 @@ WHOLE = (
 
 
 @pytest.mark.parametrize("controller", ['controller = "robust"', '[controller]\ntype = "robust"'])
-def test_a_table_of_another_type_says_why_it_has_none_of_its_bases_fields(tmp_path: Path, controller: str) -> None:
+def test_a_table_of_another_type_reports_why_it_has_none_of_its_bases_fields(tmp_path: Path, controller: str) -> None:
     (tmp_path / "mine.toml").write_text(f'base = "hover"\n{controller}\n')
     (tmp_path / "above.toml").write_text('base = "mine.toml"\nduration = 3.0\n')
     for name in ("mine.toml", "above.toml"):
@@ -111,7 +111,7 @@ def test_a_table_of_another_type_says_why_it_has_none_of_its_bases_fields(tmp_pa
         assert caught.value.problems == (*MISSING, WHOLE)
 
 
-def test_a_type_that_is_set_says_where_the_other_fields_are_from(tmp_path: Path) -> None:
+def test_a_type_that_is_set_reports_where_the_other_fields_are_from(tmp_path: Path) -> None:
     (tmp_path / "mine.toml").write_text('base = "hover"\n')
     changed = "controller: --set changed its type from 'constrained' to 'robust', and all other fields stayed"
     for name, base in (("hover", "hover"), (str(tmp_path / "mine.toml"), "mine.toml")):
@@ -122,7 +122,7 @@ def test_a_type_that_is_set_says_where_the_other_fields_are_from(tmp_path: Path)
         assert reason == f'{changed}; a file with base = "{base}" and a whole [controller] replaces them'
 
 
-def test_where_no_type_was_changed_or_another_value_is_wrong_nothing_is_said_of_types(tmp_path: Path) -> None:
+def test_where_no_type_was_changed_or_another_value_is_wrong_no_type_is_mentioned(tmp_path: Path) -> None:
     for settings in (["controller.horizn=3"], ["reference.type=circle", "reference.radius=-1.0"]):
         with pytest.raises(ScenarioError) as caught:
             load_scenario("hover", settings)

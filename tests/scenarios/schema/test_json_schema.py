@@ -1,4 +1,4 @@
-"""The JSON Schema of scenario files: it says what the models say, and what no TOML file can hold is not in it."""
+"""The JSON Schema of scenario files: it follows the models, without what no TOML file can hold."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def test_fields_are_described_as_in_the_models(name: str) -> None:
     assert WHOLE["properties"][name]["description"] == Scenario.model_fields[name].description
 
 
-def test_ranges_and_choices_are_told() -> None:
+def test_ranges_and_choices_are_reported() -> None:
     properties, tables = WHOLE["properties"], SCHEMA["$defs"]
     assert (properties["duration"]["exclusiveMinimum"], properties["duration"]["type"]) == (0.0, "number")
     assert properties["group"]["enum"] == list(get_args(Group))

@@ -1,4 +1,4 @@
-"""What is said of wrong fields wherever they stand: in unions of tables, in lists of them, in optional ones."""
+"""The messages for wrong fields wherever they are: in unions of tables, in lists of them, in optional ones."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ class Root(Spec):
     events: list[Annotated[Gust | Loss | Switch, Field(discriminator="type")]] = Field(default=[], description="acts")
     wind: Annotated[Gust | Loss, Field(discriminator="type")] | None = Field(default=None, description="one or none")
     course: Annotated[Annotated[Gust, Tag("gust")] | Annotated[Loss, Tag("loss")], Discriminator(kind)] = Field(
-        default=Gust(type="gust"), description="one, told apart by a function"
+        default=Gust(type="gust"), description="one, distinguished by a function"
     )
     texts: Annotated[list[str], Len(2, 2)] = Field(default=["a", "b"], description="two")
     loose: Gust | float = Field(default=1.0, description="no tag")
@@ -64,7 +64,7 @@ class Root(Spec):
 Loss.model_rebuild()
 
 
-def said(data: dict[str, Any]) -> list[str]:
+def problems_of(data: dict[str, Any]) -> list[str]:
     with pytest.raises(ValidationError) as caught:
         Root.model_validate(data)
     return [describe(details, data, Root) for details in caught.value.errors(include_url=False)]
@@ -130,7 +130,7 @@ WRONG: list[tuple[dict[str, Any], list[str]]] = [
 
 @pytest.mark.parametrize(("data", "lines"), WRONG, ids=[lines[0].partition(";")[0] for _, lines in WRONG])
 def test_a_wrong_field_is_named_as_one_would_write_it(data: dict[str, Any], lines: list[str]) -> None:
-    assert said(data) == lines
+    assert problems_of(data) == lines
 
 
 def test_labels_of_pydantics_own_lead_to_the_kind_they_name() -> None:

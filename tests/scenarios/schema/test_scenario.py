@@ -1,4 +1,4 @@
-"""The scenario file: what may stand in it, and what is said of everything else."""
+"""The scenario file: what it may contain, and the messages for everything else."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ def test_absent_bounds_are_infinite() -> None:
     assert (limit.lower, limit.upper, limit.start, limit.stop) == (1.0, np.inf, 0.0, np.inf)
 
 
-def test_a_vehicle_file_beside_the_scenario_is_found_and_kept_by_its_whole_path(tmp_path: Path) -> None:
+def test_a_vehicle_file_beside_the_scenario_is_found_and_stored_by_its_whole_path(tmp_path: Path) -> None:
     (tmp_path / "mine.toml").write_text(vehicle_path("lopes2011").read_text().replace("value = 4.0", "value = 3.0"))
     text = (LIBRARY / "hover.toml").read_text().replace('"lopes2011"', '"mine.toml"')
     (tmp_path / "course.toml").write_text(text)
@@ -207,11 +207,11 @@ WRONG = {
 def test_a_wrong_field_is_named_with_what_was_given_and_what_is_allowed(setting: str, message: str) -> None:
     with pytest.raises(ScenarioError) as caught:
         load_scenario("paper-constrained", [setting])
-    said, source = str(caught.value), "paper-constrained.toml: "
+    reported, source = str(caught.value), "paper-constrained.toml: "
     if message.endswith("..."):
-        assert said.startswith(source + message[:-3])
+        assert reported.startswith(source + message[:-3])
     else:
-        assert said == source + message
+        assert reported == source + message
     assert caught.value.source == "paper-constrained.toml"
     assert caught.value.exit_status == 2
 

@@ -1,4 +1,4 @@
-"""Scenarios as commented TOML: nothing is lost, nothing is unsaid, equal scenarios give equal texts."""
+"""Scenarios as commented TOML: nothing is lost, everything is stated, equal scenarios give equal texts."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a tuning file may say: every wrong field refused by its name, in one message, with status 2."""
+"""Tuning files: every wrong field refused by its name, in one message, with status 2."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ def test_what_flights_are_held_against_is_not_searched(tmp_path: Path) -> None:
         load_tuning(str(write_tuning(tmp_path, search=search, campaign=held)))
 
 
-def test_the_command_says_it_in_one_line_with_status_2(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_command_reports_it_in_one_line_with_status_2(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = write_tuning(tmp_path, trials=7)
     assert main(["tune", str(path), "--out", str(tmp_path / "t")]) == 2
     assert capsys.readouterr().err == "quadsim: little.toml: trials must be a multiple of batch, 6; got 7\n"
@@ -96,7 +96,7 @@ def test_those_that_ship_can_be_flown(name: str) -> None:
     assert set(plan.start_values) == {each.name for each in plan.spec.search}
 
 
-def test_a_file_may_say_what_differs_alone(tmp_path: Path) -> None:
+def test_a_file_may_hold_only_what_differs(tmp_path: Path) -> None:
     write_tuning(tmp_path, campaign=campaign(base="held.toml"))
     (tmp_path / "held.toml").write_text('base = "paper-nominal"\nname = "held"\nfailure = ["lost"]\n', encoding="utf-8")
     (tmp_path / "shorter.toml").write_text('base = "little.toml"\ntrials = 12\n', encoding="utf-8")

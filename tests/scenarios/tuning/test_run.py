@@ -88,7 +88,7 @@ def test_few_flights_are_corrected_by_what_the_start_did_there(whole: TuningResu
         assert each["values"][0] == pytest.approx(expected, rel=1e-9)
 
 
-def test_fresh_draws_are_others_and_the_optimism_is_told(whole: TuningResult) -> None:
+def test_fresh_draws_are_others_and_the_optimism_is_reported(whole: TuningResult) -> None:
     assert whole.comparison is not None
     fresh = json.loads((whole.directory / SUMMARY_FILE).read_text())["objectives"][0]
     (gain,) = whole.summary["objectives"]
@@ -186,7 +186,7 @@ def test_candidates_that_fail_too_often_are_no_answer(tmp_path: Path) -> None:
     assert result.holds
 
 
-def test_where_all_fail_the_answer_says_so(tmp_path: Path) -> None:
+def test_where_all_fail_the_answer_reports_it(tmp_path: Path) -> None:
     plan = load_tuning(str(write_tuning(tmp_path, trials=6)))
     result = tune(plan, tmp_path / "t", Formula(violated=lambda scenario: True))
     assert not result.holds
@@ -225,8 +225,8 @@ def test_processes_fly_the_same_search(tmp_path: Path) -> None:
 # --- what is refused -----------------------------------------------------------------------------------------------
 
 
-def test_a_tuning_is_not_flown_over_without_asking(plan: TuningPlan, whole: TuningResult) -> None:
-    with pytest.raises(OutputError, match="a tuning is already there; go on with it by --resume"):
+def test_a_tuning_is_not_overwritten_without_a_request(plan: TuningPlan, whole: TuningResult) -> None:
+    with pytest.raises(OutputError, match="a tuning is already there; continue it with --resume"):
         tune(plan, whole.directory, Formula())
 
 
@@ -243,7 +243,7 @@ def test_a_tuning_is_not_flown_over_without_asking(plan: TuningPlan, whole: Tuni
 def test_another_tuning_is_not_gone_on_with(
     whole: TuningResult, tmp_path: Path, changes: dict[str, Any], named: str
 ) -> None:
-    with pytest.raises(InputError, match=f"goes on with the same tuning alone, and its {named} differs"):
+    with pytest.raises(InputError, match=f"--resume needs the same tuning, and its {named} differs"):
         tune(load_tuning(str(write_tuning(tmp_path, **changes))), whole.directory, Formula(), resume=True)
 
 

@@ -1,4 +1,4 @@
-"""Optuna's study of a tuning: its journal is Optuna's own form, and what is proposed does not hang on the process."""
+"""Optuna's study of a tuning: its journal is Optuna's own form, and what is proposed does not depend on the process."""
 
 from __future__ import annotations
 
@@ -32,23 +32,23 @@ def distance(values: Any) -> float:
 
 
 def carry_on(plan: TuningPlan, directory: Path, batches: int, *, again: bool) -> list[dict[int, Any]]:
-    """So many batches, each by a study of its own where `again`, as after a kill."""
+    """The batches, each by a new study where `again`, as after a kill."""
     found = []
     with growing(directory, KIND) as files:
         search = Search(plan, files)
         search.begin(scored(START, 5.0))
         for _ in range(batches):
-            asked = search.ask()
+            batch = search.ask()
             if again:
                 search = Search(plan, files)
                 assert search.unfinished
-                assert search.ask() == asked
-            found.append(asked)
-            search.tell([scored(number, distance(values)) for number, values in asked.items()])
+                assert search.ask() == batch
+            found.append(batch)
+            search.tell([scored(number, distance(values)) for number, values in batch.items()])
     return found
 
 
-def test_what_is_proposed_does_not_hang_on_the_process(plan: TuningPlan, tmp_path: Path) -> None:
+def test_what_is_proposed_does_not_depend_on_the_process(plan: TuningPlan, tmp_path: Path) -> None:
     whole, broken = (carry_on(plan, tmp_path / f"{again}", 4, again=again) for again in (False, True))
     assert whole == broken
     assert [sorted(batch) for batch in whole] == [list(range(1 + 6 * i, 7 + 6 * i)) for i in range(4)]
@@ -82,21 +82,21 @@ def test_a_start_outside_of_the_ranges_is_no_trial_of_the_search(tmp_path: Path)
         found = Search(plan, files)
         found.begin(scored(START, 5.0))
         assert found.candidates() == {START: {}}
-        asked = found.ask()
-    assert sorted(asked) == [1, 2, 3, 4, 5, 6]
-    assert {values["n"] for values in asked.values()} <= set(range(20, 31))
-    assert {values["s"] for values in asked.values()} <= set(choice["values"])
+        batch = found.ask()
+    assert sorted(batch) == [1, 2, 3, 4, 5, 6]
+    assert {values["n"] for values in batch.values()} <= set(range(20, 31))
+    assert {values["s"] for values in batch.values()} <= set(choice["values"])
 
 
-def test_a_field_that_matters_is_told_from_one_that_does_not(plan: TuningPlan, tmp_path: Path) -> None:
+def test_a_field_that_matters_is_distinguished_from_one_that_does_not(plan: TuningPlan, tmp_path: Path) -> None:
     with growing(tmp_path / "t", KIND) as files:
         search = Search(plan, files)
         search.begin(scored(START, 300.0))
         scores = [scored(START, 300.0)]
         assert search.importance(scores, 0) == {}
         for _ in range(8):
-            asked = search.ask()
-            batch = [scored(number, distance(values)) for number, values in asked.items()]
+            candidates = search.ask()
+            batch = [scored(number, distance(values)) for number, values in candidates.items()]
             search.tell(batch)
             scores += batch
         found = search.importance(scores, 0)

@@ -100,7 +100,7 @@ def test_the_answers_are_those_of_processes_on_this_machine(two_workers: str) ->
 
 
 class _Troubled(ToyPilot):
-    """Flight 11 never ends; every other says how seldom its process looks for cycles."""
+    """Flight 11 never ends; every other reports how seldom its process collects cycles."""
 
     def fly(self, flight: int, progress: Progress = silent) -> Row:
         if flight == 11:
@@ -136,7 +136,7 @@ def test_workers_seldom_look_for_cycles(troubled: list[Row]) -> None:
     assert {row["threshold"] for row in troubled if not row["reason"]} == {(100_000, 50, 100)}
 
 
-def test_nothing_to_fly_asks_nobody() -> None:
+def test_nothing_to_fly_calls_no_worker() -> None:
     assert list(DaskEngine("tcp://127.0.0.1:9").answers(ToyPilot(), [])) == []
 
 
@@ -248,15 +248,15 @@ def test_a_worker_of_several_threads_is_refused() -> None:
         fly(DaskEngine(cluster.scheduler_address), ToyPilot())
 
 
-def test_no_worker_for_too_long_is_said() -> None:
+def test_no_worker_for_too_long_is_reported() -> None:
     with start_cluster(workers=0) as cluster:
         engine = DaskEngine(cluster.scheduler_address, patience=0.5)
         assert engine.workers == 0
-        with pytest.raises(EngineError, match=r"no worker for 0.5 s; start some, and go on with --resume"):
+        with pytest.raises(EngineError, match=r"no worker for 0.5 s; start some, then use --resume"):
             fly(engine, ToyPilot())
 
 
-def test_an_address_where_nobody_answers_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_address_without_an_answer_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "_CONNECT_S", 0.3)
     with pytest.raises(EngineError, match=r"the scheduler at tcp://127\.0\.0\.1:9 does not answer"):
         fly(DaskEngine("tcp://127.0.0.1:9"), ToyPilot())
@@ -301,7 +301,7 @@ def test_a_killed_scheduler_ends_the_campaign_with_what_was_answered(
     rows = [next(answers) for _ in range(10)]
     scheduler.kill()
     killed = clock.monotonic()
-    with pytest.raises(EngineError, match=r"is gone; what was flown is kept: go on with --resume"):
+    with pytest.raises(EngineError, match=r"is gone; finished flights are saved: continue with --resume"):
         rows.extend(answers)
     assert clock.monotonic() - killed < 60.0
     flown = {row["flight"] for row in rows}
@@ -373,7 +373,7 @@ def test_what_is_neither_address_nor_file_is_refused(tmp_path: Path) -> None:
         DaskEngine("tcp://127.0.0.1:9", patience=0.0)
 
 
-def test_without_the_extra_it_is_said_how_to_get_it(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_without_the_extra_the_message_names_it(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setitem(sys.modules, "dask_jobqueue", None)
     with pytest.raises(
         MissingPackageError, match=r"needs the package 'dask-jobqueue': pip install 'quadsim\[cluster\]'"

@@ -60,11 +60,11 @@ def test_every_flight_is_answered_once_whatever_the_number_of_workers(workers: i
     assert os.getpid() not in processes
 
 
-def test_nothing_to_fly_starts_nobody() -> None:
+def test_nothing_to_fly_starts_no_worker() -> None:
     assert list(LocalEngine(2).answers(ToyPilot(), [])) == []
 
 
-def test_workers_are_the_usable_cores_unless_said_otherwise() -> None:
+def test_workers_are_the_usable_cores_by_default() -> None:
     assert LocalEngine().workers == usable_cores()
     assert LocalEngine(7).workers == 7
     assert LocalEngine.name == "local"
@@ -177,10 +177,10 @@ def test_a_script_is_not_run_again_by_its_workers(tmp_path: Path) -> None:
         "import sys\n"
         "print(sys.modules['__main__'].__file__)\n"
     )
-    places = os.pathsep.join([str(ROOT), str(ROOT / "tests"), str(Path(__file__).parent)])
+    path = os.pathsep.join([str(ROOT), str(ROOT / "tests"), str(Path(__file__).parent)])
     ran = subprocess.run(
         [sys.executable, str(script)],
-        env={**os.environ, "PYTHONPATH": places},
+        env={**os.environ, "PYTHONPATH": path},
         capture_output=True,
         text=True,
         check=True,
@@ -251,7 +251,7 @@ def start_parent(tmp_path: Path) -> Iterator[Callable[..., tuple[subprocess.Pope
 
 
 @pytest.mark.parametrize(("seconds", "asleep"), [(60.0, 0.0), (0.0, 60.0)], ids=["computing", "asleep"])
-def test_nobody_outlives_a_parent_that_is_killed_in_mid_flight(
+def test_no_process_outlives_a_parent_that_is_killed_in_mid_flight(
     seconds: float, asleep: float, start_parent: Callable[..., tuple[subprocess.Popen[str], set[int]]]
 ) -> None:
     parent, family = start_parent(seconds=seconds, asleep=asleep)
@@ -261,7 +261,7 @@ def test_nobody_outlives_a_parent_that_is_killed_in_mid_flight(
     assert parent.communicate()[1] == ""
 
 
-def test_ctrl_c_stops_everybody_and_only_the_parent_says_so(
+def test_ctrl_c_stops_everybody_and_only_the_parent_reports_it(
     start_parent: Callable[..., tuple[subprocess.Popen[str], set[int]]],
 ) -> None:
     parent, family = start_parent(seconds=60.0, asleep=0.0)

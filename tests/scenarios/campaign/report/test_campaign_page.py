@@ -81,7 +81,7 @@ def without_scripts(page: str) -> str:
     return re.sub(r"<script.*?</script>", "", page, flags=re.DOTALL)
 
 
-def test_the_page_tells_what_the_flights_show(estimated: Summary, reported: Path) -> None:
+def test_the_page_shows_what_the_flights_show(estimated: Summary, reported: Path) -> None:
     directory = reported
     text = without_scripts((directory / "index.html").read_text())
     assert '<p class="verdict bad">30 of 1000 flights failed: 3.0 % (95 %: 2.0 to 4.3 %)</p>' in text
@@ -188,8 +188,8 @@ def test_a_lost_flight_does_not_flatten_the_others(thousand: pa.Table) -> None:
     assert drawn.y[0] == drawn.y[1] == np.min(drawn.y)
     none = sum(value is None for value in values)
     assert np.count_nonzero(drawn.edge == "down") == 1 + none
-    told = f"{drawn.shown[0]:.3g}, down to -1e+06; {none} flights without a margin, at the foot."
-    assert clipping(drawn, []).endswith(f"1 flight with a margin below {told}")
+    expected = f"{drawn.shown[0]:.3g}, down to -1e+06; {none} flights without a margin, at the foot."
+    assert clipping(drawn, []).endswith(f"1 flight with a margin below {expected}")
     y = drawn.y[drawn.edge == ""]
     assert np.ptp(y) > 0.8 * (drawn.ends[1] - drawn.ends[0]), "the others fill the axis"
     assert next(one for one in histograms(table) if one.name == "worst_margin").label.endswith(
@@ -198,7 +198,7 @@ def test_a_lost_flight_does_not_flatten_the_others(thousand: pa.Table) -> None:
 
 
 @pytest.mark.usefixtures("sketched")
-def test_outliers_are_drawn_at_the_edge_and_told(thousand: pa.Table, tmp_path: Path) -> None:
+def test_outliers_are_drawn_at_the_edge_and_reported(thousand: pa.Table, tmp_path: Path) -> None:
     table = thousand.slice(0, 200)
     for name, far in (("draw.wind", {3: 400.0, 5: -90.0}), ("worst_margin", {7: 55.0})):
         values = [far.get(i, value) for i, value in enumerate(table[name].to_pylist())]
@@ -243,7 +243,7 @@ def test_no_tick_label_is_turned(plots: dict[str, Plot]) -> None:
     ]
 
 
-def test_names_have_places(thousand: pa.Table) -> None:
+def test_names_are_placed(thousand: pa.Table) -> None:
     drawn = margins(thousand)
     assert drawn is not None
     cloud = next(cloud for cloud in clouds(thousand, drawn) if cloud.name == "solver")
@@ -251,7 +251,7 @@ def test_names_have_places(thousand: pa.Table) -> None:
     assert [cloud.names[round(x)] for x in cloud.x] == thousand["draw.solver"].to_pylist()
 
 
-def test_shares_are_told_with_the_digits_they_need() -> None:
+def test_shares_are_reported_with_the_digits_they_need() -> None:
     assert [percent(share) for share in (0.0, 0.037, 0.5, 0.00372, 0.99973, 1.0, None)] == [
         *("0 %", "3.7 %", "50.0 %", "0.37 %", "99.973 %", "100 %", "-")
     ]
@@ -284,7 +284,7 @@ def test_a_browser_draws_the_page_and_has_no_complaint(make_campaign: MakeCampai
     assert "Chart Studio" not in report["buttons"]
 
 
-def test_a_place_that_cannot_be_is_told(thousand: pa.Table, estimated: Summary, tmp_path: Path) -> None:
+def test_a_place_that_cannot_be_is_reported(thousand: pa.Table, estimated: Summary, tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     with pytest.raises(OutputError, match="Not a directory"):
         write_report(tmp_path / "file" / "gone", table=thousand, summary=estimated, manifest={}, name="a")

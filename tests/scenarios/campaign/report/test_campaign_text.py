@@ -1,4 +1,4 @@
-"""What is said of a campaign's flights, against tables small enough to say it by hand."""
+"""The sentences on a campaign's flights, for tables small enough to derive them by hand."""
 
 from collections.abc import Callable
 from typing import Any
@@ -23,7 +23,7 @@ MakeCampaign = Callable[..., pa.Table]
 
 
 def flown(verdicts: dict[str, int], held: dict[str, int], margin: float | None = 1.0) -> dict[str, Any]:
-    """The summary of so many flights of each verdict, of which so many held each constraint."""
+    """The summary of given numbers of flights by verdict, and by constraint held."""
     verdict = [name for name, count in verdicts.items() for _ in range(count)]
     n = len(verdict)
     bad = [name != "satisfied" for name in verdict]
@@ -38,10 +38,10 @@ def flown(verdicts: dict[str, int], held: dict[str, int], margin: float | None =
 
 
 def test_outcomes_are_counted_in_words() -> None:
-    said = campaign_sentences(flown({"violated": 5, "lost": 35}, {}))
-    assert said[0] == "Of 40 flights, 5 violated a required constraint, 35 were lost."
-    said = campaign_sentences(flown({"satisfied": 1, "lost": 1, "error": 1}, {}))
-    assert said[0] == "Of 3 flights, 1 held every required constraint, 1 was lost, 1 raised an error."
+    sentences = campaign_sentences(flown({"violated": 5, "lost": 35}, {}))
+    assert sentences[0] == "Of 40 flights, 5 violated a required constraint, 35 were lost."
+    sentences = campaign_sentences(flown({"satisfied": 1, "lost": 1, "error": 1}, {}))
+    assert sentences[0] == "Of 3 flights, 1 held every required constraint, 1 was lost, 1 raised an error."
     assert campaign_sentences(flown({"lost": 1}, {}))[0] == "Of 1 flight, 1 was lost."
     assert campaign_sentences(flown({"lost": 4}, {}))[0] == "All 4 flights were lost."
 
@@ -54,19 +54,19 @@ def test_a_high_share_is_bounded_from_below() -> None:
 
 
 def test_constraints_that_fail_equally_often_are_named() -> None:
-    said = campaign_sentences(flown({"lost": 40}, {"x": 5, "y": 5, "roll": 30}))
-    assert any(one.startswith("What most often does not hold is x and y, each in 87.5 % (95 %: ") for one in said)
-    said = campaign_sentences(flown({"lost": 40}, {"x": 4, "y": 5, "roll": 30}))
-    assert any(one.startswith("What most often does not hold is x, in 90.0 % (95 %: ") for one in said)
+    sentences = campaign_sentences(flown({"lost": 40}, {"x": 5, "y": 5, "roll": 30}))
+    assert any(one.startswith("What most often does not hold is x and y, each in 87.5 % (95 %: ") for one in sentences)
+    sentences = campaign_sentences(flown({"lost": 40}, {"x": 4, "y": 5, "roll": 30}))
+    assert any(one.startswith("What most often does not hold is x, in 90.0 % (95 %: ") for one in sentences)
 
 
 def test_a_list_of_names_ends_in_a_count() -> None:
-    told = [listing("abcdef"[:n], most=4) for n in (1, 2, 4, 5)]
-    assert told == ["a", "a and b", "a, b, c and d", "a, b, c and 2 others"]
+    found = [listing("abcdef"[:n], most=4) for n in (1, 2, 4, 5)]
+    assert found == ["a", "a and b", "a, b, c and d", "a, b, c and 2 others"]
 
 
 @pytest.mark.parametrize(
-    ("verdict", "margin", "told"),
+    ("verdict", "margin", "text"),
     [
         ("lost", 1.0, "lost before any required constraint was violated."),
         ("lost", -1.0, "lost, with a worst margin of -1 (hold_x)."),
@@ -74,8 +74,8 @@ def test_a_list_of_names_ends_in_a_count() -> None:
         ("violated", 1.0, "violated, with a worst margin of 1 (hold_x)."),
     ],
 )
-def test_the_worst_flight_is_told(verdict: str, margin: float | None, told: str) -> None:
-    assert campaign_sentences(flown({verdict: 2}, {}, margin))[-1] == f"The worst flight is number 0: {told}"
+def test_the_worst_flight_is_reported(verdict: str, margin: float | None, text: str) -> None:
+    assert campaign_sentences(flown({verdict: 2}, {}, margin))[-1] == f"The worst flight is number 0: {text}"
 
 
 def test_failures_over_a_drawn_number_are_those_of_its_fifths(thousand: pa.Table) -> None:
@@ -118,7 +118,7 @@ def test_groups_are_shown_where_some_fail_and_some_do_not(make_campaign: MakeCam
     assert not group_table(estimate(make_campaign(60, severity=100.0).slice(0, 0))).lines
 
 
-def test_tables_tell_the_units_of_what_is_drawn(thousand: pa.Table) -> None:
+def test_tables_show_the_units_of_what_is_drawn(thousand: pa.Table) -> None:
     summary = estimate(thousand)
     for grid in (driver_table(summary), worst_draws_table(summary)):
         assert {"wind [m/s]", "lag [s]", "mass"} <= {line[0].text for line in grid.lines}

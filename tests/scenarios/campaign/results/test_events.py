@@ -34,7 +34,7 @@ KINDS = {"rmse.z": pa.float64(), "iterations.max": pa.int64(), "crashed": pa.boo
         ("violated > 0.5", "violated > 0.5", True),
     ],
 )
-def test_an_event_is_read_and_told(text: str, name: str, holds: bool) -> None:
+def test_an_event_is_read_and_reported(text: str, name: str, holds: bool) -> None:
     event = parse_event(text)
     assert event.text == name
     assert event.holds(ROW) is holds

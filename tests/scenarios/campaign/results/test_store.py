@@ -107,7 +107,7 @@ def test_dying_while_closing_loses_nothing(tmp_path: Path, monkeypatch: pytest.M
     assert read_table(tmp_path / TIMES_FILE)["flight"].to_pylist() == [0, 1, 2]
 
 
-def test_a_full_disk_is_said_and_leaves_what_was_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_full_disk_is_reported_and_leaves_what_was_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def full(_: int) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
 

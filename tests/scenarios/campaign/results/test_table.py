@@ -39,7 +39,7 @@ def finding(limit: Limit, margin: float, sampled: float | None = None) -> Findin
     )
 
 
-def test_a_row_has_what_the_schema_says(short_run: Run) -> None:
+def test_a_row_follows_the_schema(short_run: Run) -> None:
     schema = make_schema({"mass": (pa.float64(), "kg"), "kind": (pa.string(), "-")}, short_run.limits)
     row = flown_row(
         short_run.log, audit(short_run.log, short_run.limits), verdict="violated", wall_s=1.5, machine="x86"
@@ -54,7 +54,7 @@ def test_a_row_has_what_the_schema_says(short_run: Run) -> None:
     assert units == {"margin.roll": "deg", "rmse.x": "m", "verdict": "-", "draw.mass": "kg", "draw.kind": "-"}
 
 
-def test_a_row_tells_what_the_summary_tells(short_run: Run) -> None:
+def test_a_row_agrees_with_the_summary(short_run: Run) -> None:
     row = flown_row(
         short_run.log, audit(short_run.log, short_run.limits), verdict="satisfied", wall_s=0.0, machine="x86"
     )

@@ -51,8 +51,8 @@ def test_losses_are_compared_beside_failures(make_campaign: MakeCampaign) -> Non
     assert found.verdict == "not distinguishable"
     lost = next(event for event in found.events if event.event == "lost")
     assert (lost.counts, lost.p, lost.p_holm) == ((4, 0), 0.125, 0.125)
-    told = "Flights with robust and with paper differ in count, but not beyond chance, in lost (0 and 4, p = 0.12) ("
-    assert told in found.sentence
+    text = "Flights with robust and with paper differ in count, but not beyond chance, in lost (0 and 4, p = 0.12) ("
+    assert text in found.sentence
     many = ["lost"] * 12 + ["violated"] * 28
     found = compare(changed(one, "verdict", many), changed(other, "verdict", ["violated"] * 40), NAMES)
     assert "not distinguishable by their failures" in found.sentence
@@ -99,7 +99,7 @@ def test_flights_of_one_campaign_alone_are_left_out(thousand: pa.Table, better: 
     assert "400 flights that only one of them has are left out" in comparison_markdown(found)
 
 
-def test_campaigns_of_one_name_are_told_apart(thousand: pa.Table, better: pa.Table) -> None:
+def test_campaigns_of_one_name_are_distinguished(thousand: pa.Table, better: pa.Table) -> None:
     found = compare(thousand, better, ("paper", "paper"))
     assert found.sentence.startswith("paper (second) is better than paper (first): of 1000")
 
@@ -116,8 +116,8 @@ def test_other_draws_are_refused(thousand: pa.Table) -> None:
 def test_other_definitions_of_failure_are_refused(thousand: pa.Table, better: pa.Table) -> None:
     same = (["violated", "rmse.z>0.5"], ["rmse.z > 0.50", "violation"])
     assert compare(thousand, better, NAMES, failures=same) == compare(thousand, better, NAMES)
-    said = "'paper' counts violation as failure, and 'robust' lost, rmse.z > 0.5: only campaigns with the same failure"
-    with pytest.raises(InputError, match=said):
+    error = "'paper' counts violation as failure, and 'robust' lost, rmse.z > 0.5: only campaigns with the same failure"
+    with pytest.raises(InputError, match=error):
         compare(thousand, better, NAMES, failures=(["violated"], ["rmse.z > 0.5", "lost"]))
 
 
@@ -134,7 +134,7 @@ def test_flights_of_other_numbers_are_refused(thousand: pa.Table) -> None:
         compare(thousand.slice(0, 5), thousand.slice(5, 5), NAMES)
 
 
-def test_what_one_campaign_alone_draws_is_told(thousand: pa.Table, better: pa.Table) -> None:
+def test_what_one_campaign_alone_draws_is_reported(thousand: pa.Table, better: pa.Table) -> None:
     found = compare(thousand.drop_columns(["draw.lag"]), better, NAMES)
     assert found.own_draws == ("lag",)
     assert "lag" not in found.shared_draws

@@ -84,7 +84,7 @@ def test_xi_of_an_event_has_an_exact_p_value(ones: int, zeros: int) -> None:
         assert found.p == pytest.approx(np.mean(xis >= xi - 1e-9))
 
 
-def test_the_p_value_of_xi_is_as_often_small_as_it_says() -> None:
+def test_the_p_value_of_xi_has_its_nominal_level() -> None:
     """Of few and many pairs, of numbers, of rare events, and of a drawn number with few values."""
     rng = np.random.default_rng(3)
     for n, runs in ((15, 60), (60, 200), (300, 120)):

@@ -1,4 +1,4 @@
-"""What goes with the outcome: found where it was put in, and not where there is nothing, and said in words."""
+"""What goes with the outcome: found where it was put in, and not where there is nothing, and reported in words."""
 
 from collections.abc import Callable
 from typing import Any
@@ -37,17 +37,17 @@ def bowl(n: int, seed: int) -> pa.Table:
 
 
 @pytest.mark.parametrize("n", [40, 200, 1000])
-def test_harm_at_both_ends_is_said(n: int) -> None:
+def test_harm_at_both_ends_is_reported(n: int) -> None:
     """The margin falls with the distance of the mass from 1: a rank correlation alone found nothing."""
     summary = estimate(bowl(n, 4))
     found = summary["parameters"]["mass"]["worst_margin"]
     assert found["p_holm"] > 0.05
     assert found["p_xi_holm"] < 0.05
-    said = campaign_sentences(summary)
-    told = next(one for one in said if one.startswith("The worst margin depends on mass (xi 0."))
-    assert "highest near 1" in told or "highest near 0.9" in told
-    assert told.endswith("without rising or falling throughout: Chatterjee's xi, p-value after Holm's correction.")
-    assert not any("beyond chance" in one and one.startswith("The worst margin goes with no") for one in said)
+    sentences = campaign_sentences(summary)
+    expected = next(one for one in sentences if one.startswith("The worst margin depends on mass (xi 0."))
+    assert "highest near 1" in expected or "highest near 0.9" in expected
+    assert expected.endswith("without rising or falling throughout: Chatterjee's xi, p-value after Holm's correction.")
+    assert not any("beyond chance" in one and one.startswith("The worst margin goes with no") for one in sentences)
     line = driver_table(summary).lines[0]
     assert (line[0].text, line[1].mark, line[3].mark) == ("mass", "", "best")
 
@@ -89,7 +89,7 @@ def test_noise_is_taken_for_a_driver_in_one_campaign_of_twenty_at_most() -> None
 
 
 @pytest.mark.parametrize(("level", "noun", "verb"), [(0.5, "failures", "failed"), (-0.5, "losses", "were lost")])
-def test_losses_above_75_ms_of_lag_are_said(level: float, noun: str, verb: str) -> None:
+def test_losses_above_75_ms_of_lag_are_reported(level: float, noun: str, verb: str) -> None:
     """Where nothing else fails, and where all others fail too."""
     rng = np.random.default_rng(7)
     lag = np.append(rng.uniform(0.0, 0.0745, 36), [0.0756, 0.077, 0.078, 0.079])
@@ -98,28 +98,28 @@ def test_losses_above_75_ms_of_lag_are_said(level: float, noun: str, verb: str) 
     i = table.column_names.index("draw.lag")
     table = table.set_column(i, pa.field("draw.lag", pa.float64(), metadata={"unit": "s"}), table["draw.lag"])
     summary = estimate(table)
-    said = " ".join(campaign_sentences(summary))
+    sentences = " ".join(campaign_sentences(summary))
     assert (
         f"All 4 {noun} are above lag = 0.075 s: 4 of 4 flights {verb} there (100 %; 95 %: 39.8 to 100 %), and 0 of 36 "
         "up to it (0 %; 95 %: 0 to 9.7 %); p < 0.001, corrected for the choice of the threshold and for all tests."
-        in said
+        in sentences
     )
     lines = [[cell.text for cell in line] for line in split_table(summary).lines]
     assert lines[-1][1:4] == ["lag > 0.075 s", "0 of 36 (0 %)", "0 to 9.7 %"]
 
 
-def test_failures_below_a_threshold_are_said_so() -> None:
+def test_failures_below_a_threshold_are_reported() -> None:
     rng = np.random.default_rng(8)
     height = rng.uniform(size=300)
     table = flown({"height": height}, np.where(height < 0.2, -1.0, 1.0) * rng.uniform(0.1, 1.0, 300))
     failed = np.count_nonzero(height < 0.2)
-    said = " ".join(campaign_sentences(estimate(table)))
-    told = f"All {failed} failures are up to height = 0.2: {failed} of {failed} flights failed there"
-    assert told in said
-    assert f"and 0 of {300 - failed} above it (0 %;" in said
+    sentences = " ".join(campaign_sentences(estimate(table)))
+    expected = f"All {failed} failures are up to height = 0.2: {failed} of {failed} flights failed there"
+    assert expected in sentences
+    assert f"and 0 of {300 - failed} above it (0 %;" in sentences
 
 
-def test_one_flight_is_told_as_one() -> None:
+def test_one_flight_is_worded_in_the_singular() -> None:
     x = np.arange(9000.0)
     summary = estimate(flown({"mass": x}, np.ones(9000), lost=x == 8999))
     assert any(
@@ -135,15 +135,15 @@ def test_a_threshold_alone_is_no_nothing() -> None:
     summary = estimate(flown({"mass": x}, np.where(failed, -0.1, 1.0)))
     found = summary["parameters"]["mass"]["failed"]
     assert min(found["p_holm"], found["p_xi_holm"]) > 0.05
-    said = campaign_sentences(summary)
-    assert sum(one.startswith("Failures cluster above mass = 279") for one in said) == 1
-    assert not any(one.startswith("Failure goes with no drawn number") for one in said)
+    sentences = campaign_sentences(summary)
+    assert sum(one.startswith("Failures cluster above mass = 279") for one in sentences) == 1
+    assert not any(one.startswith("Failure goes with no drawn number") for one in sentences)
 
 
-def test_nothing_is_said_of_nothing(make_campaign: MakeCampaign) -> None:
-    said = campaign_sentences(estimate(make_campaign(40, severity=0.0)))
-    told = "The worst margin goes with no drawn number beyond chance (rank correlation, and Chatterjee's xi"
-    assert sum(one.startswith(told) for one in said) == 1
+def test_without_drivers_none_is_reported(make_campaign: MakeCampaign) -> None:
+    sentences = campaign_sentences(estimate(make_campaign(40, severity=0.0)))
+    expected = "The worst margin goes with no drawn number beyond chance (rank correlation, and Chatterjee's xi"
+    assert sum(one.startswith(expected) for one in sentences) == 1
     assert not split_table(estimate(make_campaign(40, severity=0.0))).lines
 
 

@@ -40,7 +40,7 @@ def test_bounds_in_closed_form() -> None:
 
 @pytest.mark.parametrize("p", [0.002, 0.03, 0.2, 0.5, 0.97])
 @pytest.mark.parametrize("n", [5, 40, 400])
-def test_bounds_cover_as_often_as_they_say(n: int, p: float) -> None:
+def test_bounds_have_their_nominal_coverage(n: int, p: float) -> None:
     """The coverage, summed over every possible count."""
     counts = np.arange(n + 1.0)
     chance = stats.binom.pmf(counts, n, p)

@@ -33,7 +33,7 @@ def test_another_form_is_refused(text: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "message"),
     [
         ("P(lost) < 0 @ 95%", "share must be a number from 1e-9 to 0.999999999; got '0'"),
         ("P(lost) < 1 @ 95%", "share must be a number from 1e-9 to 0.999999999; got '1'"),
@@ -50,10 +50,10 @@ def test_another_form_is_refused(text: str) -> None:
         ("P(lost) < 0.1 @ most%", "confidence must be"),
     ],
 )
-def test_numbers_out_of_range_are_refused(text: str, said: str) -> None:
+def test_numbers_out_of_range_are_refused(text: str, message: str) -> None:
     with pytest.raises(ParameterError, match="requirement 'P") as raised:
         parse_requirement(text)
-    assert said in str(raised.value)
+    assert message in str(raised.value)
 
 
 def test_an_unknown_event_is_refused() -> None:
@@ -64,10 +64,10 @@ def test_an_unknown_event_is_refused() -> None:
 
 
 def test_it_takes_299_clean_flights_for_one_percent() -> None:
-    asked = parse_requirement("P(violation) < 0.01 @ 95%")
-    assert least_flights(asked) == 299  # the rule of three says 300
-    assert not judge(flown(298, 0), asked).holds
-    found = judge(flown(299, 0), asked)
+    parsed = parse_requirement("P(violation) < 0.01 @ 95%")
+    assert least_flights(parsed) == 299  # the rule of three gives 300
+    assert not judge(flown(298, 0), parsed).holds
+    found = judge(flown(299, 0), parsed)
     assert found.holds
     assert found.bound == pytest.approx(0.00997, abs=1e-5)
     assert found.sentence == (
@@ -79,13 +79,13 @@ def test_it_takes_299_clean_flights_for_one_percent() -> None:
     "text", ["P(lost) < 0.5 @ 50%", "P(lost) <= 0.5 @ 50%", "P(lost) < 0.2 @ 90%", "P(lost) > 0.9 @ 99%"]
 )
 def test_the_least_number_is_the_least(text: str) -> None:
-    asked = parse_requirement(text)
-    found = least_flights(asked)
+    parsed = parse_requirement(text)
+    found = least_flights(parsed)
 
     def enough(n: int) -> bool:
-        side = "less" if asked.at_most else "greater"
-        interval = stats.binomtest(0 if asked.at_most else n, n, alternative=side).proportion_ci(asked.confidence)
-        return asked.supported_by(interval.high if asked.at_most else interval.low)
+        side = "less" if parsed.at_most else "greater"
+        interval = stats.binomtest(0 if parsed.at_most else n, n, alternative=side).proportion_ci(parsed.confidence)
+        return parsed.supported_by(interval.high if parsed.at_most else interval.low)
 
     assert enough(found)
     assert found == 1 or not enough(found - 1)
@@ -99,10 +99,10 @@ def test_the_least_number_is_the_least(text: str) -> None:
         "P(violated) >= 99.9999999% @ 99.9999%",
     ],
 )
-def test_the_most_that_can_be_asked_is_told(text: str) -> None:
-    asked = parse_requirement(text)
-    assert least_flights(asked) == pytest.approx(6.0 * np.log(10.0) * 1e9, rel=1e-6)
-    assert "It takes more than 1,000,000,000 flights, " in judge(flown(3, 0), asked).sentence
+def test_the_largest_requirement_is_reported(text: str) -> None:
+    parsed = parse_requirement(text)
+    assert least_flights(parsed) == pytest.approx(6.0 * np.log(10.0) * 1e9, rel=1e-6)
+    assert "It takes more than 1,000,000,000 flights, " in judge(flown(3, 0), parsed).sentence
 
 
 @given(
@@ -111,14 +111,14 @@ def test_the_most_that_can_be_asked_is_told(text: str) -> None:
     operation=st.sampled_from(["<", "<=", ">", ">="]),
 )
 def test_the_least_number_supports_and_one_less_does_not(share: float, confidence: float, operation: str) -> None:
-    asked = parse_requirement(f"P(violation) {operation} {share!r} @ {confidence!r}%")
-    n = least_flights(asked)
-    assert judge(flown(n, 0 if asked.at_most else n), asked).holds if n < 1000 else n > 1
-    exact = np.log1p(-asked.confidence) / (np.log1p(-share) if asked.at_most else np.log(share))
+    parsed = parse_requirement(f"P(violation) {operation} {share!r} @ {confidence!r}%")
+    n = least_flights(parsed)
+    assert judge(flown(n, 0 if parsed.at_most else n), parsed).holds if n < 1000 else n > 1
+    exact = np.log1p(-parsed.confidence) / (np.log1p(-share) if parsed.at_most else np.log(share))
     assert exact - 1e-6 * n <= n <= exact + 1.0 + 1e-6 * n
 
 
-def test_too_few_flights_are_told() -> None:
+def test_too_few_flights_are_reported() -> None:
     found = judge(flown(100, 0), parse_requirement("P(violation) < 0.01 @ 95%"))
     assert not found.holds
     assert found.sentence == (
@@ -129,7 +129,7 @@ def test_too_few_flights_are_told() -> None:
     assert found.sentence.endswith("at least 86.1 %. It takes at least 29 flights, all of them with that event.")
 
 
-def test_many_flights_with_too_many_events_are_not_told_to_be_too_few() -> None:
+def test_many_flights_with_too_many_events_are_not_reported_as_too_few() -> None:
     found = judge(flown(1000, 12), parse_requirement("P(violation) < 0.01 @ 95%"))
     assert not found.holds
     assert found.sentence.endswith("violation in 12 of 1000 flights (1.2 %), so with 95 % confidence at most 1.94 %.")
@@ -146,12 +146,12 @@ def test_the_bound_is_one_sided() -> None:
 
 
 def test_a_lower_limit_takes_the_lower_bound() -> None:
-    asked = parse_requirement("P(violation) > 0.9 @ 95%")
-    assert judge(flown(200, 190), asked).bound == pytest.approx(
+    parsed = parse_requirement("P(violation) > 0.9 @ 95%")
+    assert judge(flown(200, 190), parsed).bound == pytest.approx(
         stats.binomtest(190, 200, alternative="greater").proportion_ci(0.95).low
     )
-    assert judge(flown(200, 190), asked).holds
-    assert not judge(flown(200, 182), asked).holds
+    assert judge(flown(200, 190), parsed).holds
+    assert not judge(flown(200, 182), parsed).holds
 
 
 def test_a_flight_without_the_number_counts_against_it() -> None:

@@ -17,7 +17,7 @@ def best(values: np.ndarray, happened: np.ndarray) -> Split:
 
 
 def test_losses_above_a_lag_are_found_within_the_spacing() -> None:
-    """Four of forty, all above 75 ms: what a campaign was lost by, and did not say."""
+    """Four of forty, all above 75 ms: the cause of a campaign's losses, which it did not report."""
     rng = np.random.default_rng(0)
     lag = np.concatenate([rng.uniform(0.0, 0.075, 36), rng.uniform(0.0755, 0.08, 4)])
     draws = {"lag": lag, "mass": rng.uniform(0.8, 1.2, 40)}
@@ -74,7 +74,7 @@ def test_the_choice_of_the_threshold_is_paid_for_exactly(x: np.ndarray, count: i
         assert one.p == pytest.approx(np.mean(chances <= one.p_there * (1.0 + 1e-7)))
 
 
-def test_chance_is_taken_for_a_threshold_as_often_as_it_says() -> None:
+def test_false_thresholds_have_their_nominal_rate() -> None:
     rng = np.random.default_rng(3)
     for count in (3, 16, 56):
         draws = {str(i): rng.uniform(size=80) for i in range(600)}

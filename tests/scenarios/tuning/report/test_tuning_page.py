@@ -44,6 +44,6 @@ def test_tables_and_sentences_have_the_summary_s_numbers(result: TuningResult) -
     bold = {line[0].text for line in lines if line[1].mark is Mark.BEST}
     assert bold <= {"start", *map(str, summary["front"])}
     assert [line[0].text for line in objective_table(summary).lines] == ["error [m]", "calm"]
-    said = " ".join([verdict_sentence(summary), *sentences(summary)])
-    assert f"{summary['search_flights']} flights" in said
-    assert "Of the answer: P(violation) < 0.2 @ 50% holds: violation in 0 of 20 flights" in said
+    output = " ".join([verdict_sentence(summary), *sentences(summary)])
+    assert f"{summary['search_flights']} flights" in output
+    assert "Of the answer: P(violation) < 0.2 @ 50% holds: violation in 0 of 20 flights" in output
