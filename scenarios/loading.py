@@ -14,6 +14,7 @@ from quadsim.flight.ground import AIRBORNE, TOUCH, clearance
 from quadsim.sim.airframe import outline
 from quadsim.sim.effects.load import Load, mass_properties
 from quadsim.sim.rigid_body import check_free
+from quadsim.space import Region
 from quadsim.state import POSITION
 from quadsim.vehicle import Vehicle
 from scenarios.courses.make import build_course, build_motion, located
@@ -57,8 +58,9 @@ def check_parts(scenario: Scenario) -> None:
         for limit in limits:
             clear = float(limit.shape.clearance(np.zeros(1), start)[0]) - limit.radius
             if limit.start <= 0.0 and clear < -limit.tolerance:
+                side = "inside" if isinstance(limit.shape, Region) else "clear of"
                 ball = f"the radius of {limit.radius:.3g} m of the ball that represents the vehicle"
-                raise ParameterError("initial", "position", start[0].tolist(), f"clear of {limit.name}, by {ball}")
+                raise ParameterError("initial", "position", start[0].tolist(), f"{side} {limit.name}, by {ball}")
 
 
 def _check_start(scenario: Scenario, vehicle: Vehicle) -> None:

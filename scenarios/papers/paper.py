@@ -43,6 +43,8 @@ class NumberSpec(Spec):
     def _check(self) -> NumberSpec:
         if (self.absolute is None) == (self.relative is None):
             raise ValueError("absolute must be given, or relative, but not both")
+        if self.relative is not None and not any(self.span):
+            raise ValueError("absolute must be given where the published number is 0")
         if isinstance(self.published, list):
             low, high = self.published
             if self.relation != "equal" or not low < high:

@@ -34,7 +34,14 @@ FLIGHTS = (
     "robust",
     "yaw-180",
 )
-OTHERS = ("hummingbird-figure-eight", "paper-constrained-heavy", "robust-lag50", "robust-worn-rotor", "polytopes")
+OTHERS = (
+    "hummingbird-figure-eight",
+    "paper-constrained-heavy",
+    "robust-lag50",
+    "robust-worn-rotor",
+    "polytopes",
+    "waypoints",
+)
 TOLERANCE = {"double": 1e-8, "float": 2e-2}  # [rad/s]
 STRICT = (
     *("-std=c99", "-O3", "-Wall", "-Wextra", "-Wconversion", "-Wdouble-promotion", "-Wshadow", "-Wcast-qual"),
@@ -63,12 +70,17 @@ def test_all_recorded_periods_have_the_same_status_and_the_exact_command(name: s
     assert np.abs(commands - wanted.command)[optimal].max() <= TOLERANCE[precision]
 
 
+@pytest.mark.parametrize("precision", TOLERANCE)
 @pytest.mark.parametrize("name", OTHERS)
-def test_other_flights_too(name: str) -> None:
-    wanted, found = recording(name), replies(name, "double")
-    np.testing.assert_array_equal([min(reply.status, REFUSED) for reply in found], wanted.status)
-    optimal = wanted.status < REFUSED
-    assert np.abs(np.array([reply.command for reply in found]) - wanted.command)[optimal].max() <= 1e-8
+def test_other_flights_too(name: str, precision: str) -> None:
+    """In float rounding may make a bound active, which changes the status; the rows of `polytopes` are hard on it."""
+    wanted, found = recording(name), replies(name, precision)
+    status, optimal = np.array([min(reply.status, REFUSED) for reply in found]), wanted.status < REFUSED
+    np.testing.assert_array_equal(status < REFUSED, optimal)
+    if precision == "double":
+        np.testing.assert_array_equal(status, wanted.status)
+    allowed = 6e-2 if (name, precision) == ("polytopes", "float") else TOLERANCE[precision]
+    assert np.abs(np.array([reply.command for reply in found]) - wanted.command)[optimal].max() <= allowed
 
 
 def test_recorded_flights_have_every_way() -> None:

@@ -28,23 +28,30 @@ int main(void)
         const uint32_t started = target_ticks();
         char line[128], *end = line;
         quadsim_real command[4];
-        const int status = (int)quadsim_mpc_step(&mpc, recorded->state, quadsim_vectors_path[k], recorded->acting, command);
+        const int status =
+            (int)quadsim_mpc_step(&mpc, recorded->state, quadsim_vectors_path[k], recorded->acting, command);
         const uint32_t ticks = target_ticks() - started;
         /* From QUADSIM_CLIPPED on there is no optimum to compare with. */
         const int optimal = recorded->status < (int)QUADSIM_CLIPPED;
+        /* In float rounding alone may make a bound active: any status of an optimum will do. */
+        const int same = QUADSIM_VECTORS_ANY_OPTIMUM || status == recorded->status;
+        int wrong = optimal ? !same || status >= (int)QUADSIM_CLIPPED : status < (int)QUADSIM_CLIPPED;
         end = put(end, &k, sizeof k);
         end = put(end, &status, sizeof status);
         end = put(end, &mpc.changes, sizeof mpc.changes);
         for (j = 0; j < 4; j++) {
             const quadsim_real off = command[j] - recorded->command[j];
             end = put(end, &command[j], sizeof command[j]);
-            failed |= optimal && !(off <= QUADSIM_VECTORS_TOLERANCE && off >= -QUADSIM_VECTORS_TOLERANCE);
+            wrong |= optimal && !(off <= QUADSIM_VECTORS_TOLERANCE && off >= -QUADSIM_VECTORS_TOLERANCE);
         }
         end = put(end, &ticks, sizeof ticks);
         end[-1] = '\n';
         *end = '\0';
+        if (wrong) {
+            target_print("wrong: ");
+        }
         target_print(line);
-        failed |= optimal ? status != recorded->status : status < (int)QUADSIM_CLIPPED;
+        failed |= wrong;
     }
     target_print(failed ? "wrong: a status or a command is not the recorded one\n" : "right\n");
     return failed;

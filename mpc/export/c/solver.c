@@ -2,6 +2,10 @@
 
 #include <string.h>
 
+#if defined __FINITE_MATH_ONLY__ && __FINITE_MATH_ONLY__
+#error "compile without -ffast-math, which takes away the check that numbers are finite"
+#endif
+
 #ifdef QUADSIM_FLOAT
 #define R(number) number##F
 #else

@@ -12,8 +12,10 @@ extern "C" {
 #define QUADSIM_VECTORS_ROWS (QUADSIM_VECTORS + QUADSIM_HORIZON - 1)
 #ifdef QUADSIM_FLOAT
 #define QUADSIM_VECTORS_TOLERANCE 2e-2F /* [rad/s] of a command from the exact optimum */
+#define QUADSIM_VECTORS_ANY_OPTIMUM 1   /* whether the first three statuses count as one */
 #else
 #define QUADSIM_VECTORS_TOLERANCE 1e-8
+#define QUADSIM_VECTORS_ANY_OPTIMUM 0
 #endif
 
 struct quadsim_vector {

@@ -178,6 +178,11 @@ def test_a_scenario_beside_the_papers_file_is_found(tmp_path: Path) -> None:
     assert scenario_of(paper, paper.numbers[0]).name == "mine"
 
 
+def test_a_share_of_nothing_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(FileError, match="absolute must be given where the published number is 0"):
+        load_paper(written(tmp_path, ("0.0", "relative = 0.1")))
+
+
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
