@@ -54,9 +54,9 @@ def answers(exported: Export, run: Run, tmp_path_factory: pytest.TempPathFactory
     """What a target answers to all recorded periods, built with settings of its Makefile; each is run once."""
 
     @functools.cache
-    def check(target: str, precision: str, *make: str) -> list[Answer]:
+    def check(target: str, precision: str, *make: str, scenario: str = "paper-constrained") -> list[Answer]:
         directory = tmp_path_factory.mktemp("build") / "c"
-        shutil.copytree(exported(target, precision), directory)
+        shutil.copytree(exported(target, precision, scenario=scenario), directory)
         if TARGETS[target].board:
             run(TARGETS[target].compiler, "--version")
             run("qemu-system-arm", "--version")

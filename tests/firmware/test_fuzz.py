@@ -17,17 +17,21 @@ LONGEST = 7200
 """Seconds of those."""
 HANGS = 30
 """Seconds of one input that are taken for a hang; the hardest takes half a second on a busy machine."""
+SHORT = ("controller.horizon=10", "duration=5")
 CONTROLLERS = {
-    "short": ("double", "controller.horizon=10", "duration=5"),
-    "short, float": ("float", "controller.horizon=10", "duration=5"),
-    "whole": ("double",),
+    "short": ("paper-constrained", "double", *SHORT),
+    "short, float": ("paper-constrained", "float", *SHORT),
+    "whole": ("paper-constrained", "double"),
+    "robust": ("robust", "double", *SHORT),
+    "robust, float": ("robust", "float", *SHORT),
 }
 
 
 @pytest.mark.parametrize("name", CONTROLLERS)
 def test_arbitrary_bytes_lead_to_commands_within_bounds(name: str, exported: Export, run: Run, tmp_path: Path) -> None:
     """A short horizon makes many steps; the whole one has the paths that only many active rows take."""
-    directory, program = exported("posix", *CONTROLLERS[name]), tmp_path / "fuzz"
+    scenario, *settings = CONTROLLERS[name]
+    directory, program = exported("posix", *settings, scenario=scenario), tmp_path / "fuzz"
     compile = ["clang", "-g", "-O3", "-std=c99", "-ffp-contract=off", *SANITIZERS, "-I", directory]
     built = run(*compile, "-o", program, HERE / "fuzz.c", check=False)
     if "cannot find" in built.stderr:

@@ -60,6 +60,17 @@ def test_every_target_answers_the_same_bits(other: str, precision: str, answers:
     assert bits(found) == bits(host)
 
 
+@pytest.mark.parametrize(
+    ("other", "precision"), [("cortex-m7", "double"), ("cortex-m4f", "float"), ("aarch64", "float")]
+)
+def test_the_robust_controller_too(other: str, precision: str, answers: Answers) -> None:
+    """With its observer, its lagging rotors and its sines."""
+    target, *make = OTHERS[other]
+    host = answers("posix", precision, scenario="robust")
+    assert len(host) == 600
+    assert bits(answers(target, precision, *make, scenario="robust")) == bits(host)
+
+
 def test_contraction_is_what_would_change_bits(answers: Answers) -> None:
     """The flag is there for a reason: with it on, an aarch64 fuses products and sums."""
     assert bits(answers("posix", "double", *AARCH64, CONTRACTED)) != bits(answers("posix", "double"))

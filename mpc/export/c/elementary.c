@@ -6,7 +6,8 @@
 
 static const real HALF_PI = R(1.5707963267948966);
 
-/* sin and cos of a number of up to 1e5 [rad], as 1e-15 near; 1e-6 in single precision. */
+/* sin and cos of a number of up to 1e5 [rad], as 1e-15 near; 1e-6 in single precision.  Beyond, 0 and 1; not a number where
+ * the angle is not finite. */
 static void sin_cos(real angle, real *sine, real *cosine)
 {
     /* pi / 2 in three parts, the first two with so few bits that their products with quarters are exact. */
@@ -21,12 +22,18 @@ static void sin_cos(real angle, real *sine, real *cosine)
     static const real COSINE[6] = {R(4.16666666666666019037e-02), R(-1.38888888888741095749e-03),
                                    R(2.48015872894767294178e-05), R(-2.75573143513906633035e-07),
                                    R(2.08757232129817482790e-09), R(-1.13596475577881948265e-11)};
-    const real turns = angle / HALF_PI;
-    const int quarters = (int)(turns < R(0.0) ? turns - R(0.5) : turns + R(0.5));
+    const real turns = angle / HALF_PI, most = R(65536.0);
+    const int far = !(turns <= most && turns >= -most);
+    const int quarters = far ? 0 : (int)(turns < R(0.0) ? turns - R(0.5) : turns + R(0.5));
     const real count = (real)quarters;
     const real x = ((angle - count * PART[0]) - count * PART[1]) - count * PART[2], square = x * x;
     real s = SINE[5], c = COSINE[5];
     int i;
+    if (far) {
+        *sine = angle * R(0.0);
+        *cosine = R(1.0) + *sine;
+        return;
+    }
     for (i = 4; i >= 0; i--) {
         s = s * square + SINE[i];
         c = c * square + COSINE[i];
@@ -81,8 +88,8 @@ static real square_root(real number)
 {
     real scaled = number, factor = R(1.0), root;
     int i;
-    if (!(number > R(0.0))) {
-        return R(0.0);
+    if (!(number > R(0.0)) || !is_finite(&number, 1)) {
+        return number > R(0.0) ? number : R(0.0);
     }
     while (scaled > R(4.0)) {
         scaled *= R(0.25);

@@ -179,7 +179,7 @@ def test_a_scenario_beside_the_papers_file_is_found(tmp_path: Path) -> None:
 
 
 def test_a_share_of_nothing_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(FileError, match="absolute must be given where the published number is 0"):
+    with pytest.raises(ScenarioError, match="absolute must be given where the published number is 0"):
         load_paper(written(tmp_path, ("0.0", "relative = 0.1")))
 
 
