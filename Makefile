@@ -23,6 +23,7 @@ RENDERS := $(PY) -c 'from quadsim.report.film.video import rendering_backend; re
 FIRMWARE_TOOLS := gcc arm-none-eabi-gcc qemu-system-arm aarch64-linux-gnu-gcc qemu-aarch64 clang cppcheck clang-tidy
 HAS_FIRMWARE_TOOLS := (for tool in $(FIRMWARE_TOOLS); do command -v $$tool || exit; done && \
 	echo 'int LLVMFuzzerTestOneInput(void) { return 0; }' | clang -fsanitize=fuzzer -x c -o /dev/null -) >/dev/null 2>&1
+HAS_CXX := (for tool in g++ arm-none-eabi-g++; do $$tool -x c++ -include complex -fsyntax-only /dev/null || exit; done) 2>/dev/null
 HAS_BROWSER := { command -v chromium || command -v chromium-browser || command -v google-chrome; } >/dev/null
 
 # $(call quietly,COMMAND,ADVICE): runs a command silently; if it fails, shows its last errors, then the advice.
@@ -104,6 +105,7 @@ reproduce: setup  ## fly the numbers of every paper that ships and remake docs/p
 	@$(PY) docs/make_papers.py
 
 export-numbers: setup $(VENV)/.firmware  ## remake docs/export.md: exported controllers and peers on emulated targets; some ten minutes
+	@$(HAS_CXX) || { $(call apt,g++ libstdc++-arm-none-eabi-newlib); }
 	@$(PY) docs/make_export.py
 
 speed: setup  ## fly every controller ever faster and remake docs/speed.md: some two minutes

@@ -1,7 +1,8 @@
-"""DAQP's and OSQP's own C on the problem of an exported controller and its recorded periods."""
+"""DAQP's own C, OSQP's and TinyMPC's generated code on the problem of an exported controller and its periods."""
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
 import tarfile
@@ -14,6 +15,7 @@ import numpy as np
 import osqp
 import scipy.linalg
 import scipy.sparse
+from export_tinympc import vectors, write_tinympc
 from make_numbers import ROOT
 from numpy.typing import NDArray
 
@@ -27,6 +29,9 @@ from scenarios.export.record import Recording
 SOURCES: Final = ROOT / "tests" / "firmware" / "peers"
 OURS: Final = ROOT / "mpc" / "export" / "c"
 FLAGS: Final = ["-O3", "-std=gnu99", "-ffp-contract=off", "-ffunction-sections", "-fdata-sections", "-w"]
+PLUS: Final = ["-std=gnu++17", "-DNDEBUG", "-fno-exceptions", "-fno-rtti", "-fno-threadsafe-statics"]
+CONSTRUCTORS: Final = ". = ALIGN(4); constructors = .; KEEP(*(.init_array*)) constructors_end = .;"
+"""For C++: where the constructors of static objects are listed."""
 ASSIGNED: Final = {"double": [], "float": ["-DPEER_FLOAT", "-fsingle-precision-constant"]}
 
 
@@ -138,7 +143,8 @@ class Measured(NamedTuple):
     command: Array  # (K, 4) [rad/s]
     ticks: NDArray[np.int64]  # (K,) [instructions], of a POSIX system [ns]
     flash: int  # bytes of code and constants
-    memory: int  # bytes that change
+    memory: int  # bytes that change, the heap included
+    heap: int = 0  # bytes
 
 
 def answered(text: str, target: Target, flash: int = 0, memory: int = 0) -> Measured:
@@ -168,18 +174,29 @@ def run_peer(
     if name == "daqp":
         parts = write_daqp(directory, qp, recording)
         own = ["-DDAQP_NO_SOFT_WEIGHTS", *(["-DDAQP_SINGLE_PRECISION"] if precision == "float" else [])]
-    else:
+    elif name == "osqp":
         parts = write_osqp(directory, qp, recording, precision)
+    else:
+        assert (bool(target.board), precision) == (True, "double")
+        write_problem(directory, qp, recording, vectors(problem, recording))
+        parts = write_tinympc(directory, problem, recording, SOURCES)
     folders = [*(part for part in parts if part.is_dir()), directory, SOURCES, OURS]
     flags = [*target.machine.split(), *FLAGS, *ASSIGNED[precision], *own, *(f"-I{folder}" for folder in folders)]
-    theirs = [part for part in parts if not part.is_dir()] + [SOURCES / f"peer_{name}.c"]
+    theirs = [part for part in parts if not part.is_dir()] + list(SOURCES.glob(f"peer_{name}.c*"))
     objects = []
     for source in [*theirs, SOURCES / "peer.c", OURS / target.sources[0]]:
         objects.append(directory / f"{source.stem}.o")
-        subprocess.run([target.compiler, *flags, "-c", source, "-o", objects[-1]], check=True)
-    image, link = directory / "peer.elf", target.link.replace("mps2.ld", str(OURS / "mps2.ld")).split()
+        plus = source.suffix == ".cpp"
+        compiler = target.compiler.replace("gcc", "g++") if plus else target.compiler
+        subprocess.run([compiler, *flags, *(PLUS if plus else []), "-c", source, "-o", objects[-1]], check=True)
+    script = (OURS / "mps2.ld").read_text(encoding="utf-8").replace("*(.rodata*)", f"*(.rodata*) {CONSTRUCTORS}")
+    (directory / "mps2.ld").write_text(script, encoding="utf-8")
+    image, link = directory / "peer.elf", target.link.replace("mps2.ld", str(directory / "mps2.ld")).split()
     link += ["--specs=nosys.specs"] if target.board else []
     subprocess.run([target.compiler, *flags, "-o", image, *objects, *link, "-Wl,--gc-sections", "-lm"], check=True)
     command = [*target.emulation, "-serial", "none", "-kernel", image] if target.board else [image]
     done = subprocess.run(command, capture_output=True, text=True, check=True)
-    return answered(done.stdout + done.stderr, target, *size(TOOLS[bool(target.board)], objects[: len(theirs)]))
+    text = done.stdout + done.stderr
+    flash, memory = size(TOOLS[bool(target.board)], objects[: len(theirs)])
+    heap = max((int(word, 16) for word in re.findall(r"^heap (\w+)$", text, re.MULTILINE)), default=0)
+    return answered(text, target, flash, memory + heap)._replace(heap=heap)

@@ -1,22 +1,27 @@
 """Remake docs/export.md: `make export-numbers`, some ten minutes.
 
 Instructions, sizes and errors are decided by no clock; the times of this machine are the best of `REPEATS` passes.
+With names of peers, `python docs/make_export.py tinympc`, their rows are printed and nothing else is done.
 """
 
 from __future__ import annotations
 
 import re
 import subprocess
+import sys
 import tempfile
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from export_peers import TOOLS, Measured, answered, run_peer, size
+from export_tinympc import ITERATIONS, TOLERANCE, own_optima
 from make_numbers import Table, markdown, write_page
 
 from mpc.export.source import Precision
 from mpc.export.targets import TARGETS
+from mpc.ocp import Problem
 from quadsim.controller import ACCEPTED
 from quadsim.state import Array
 from scenarios.bench.campaigns import bench_campaign
@@ -39,6 +44,7 @@ OTHERS: Final = (
     "robust",
     "robust-lag50",
 )
+OURS, PEERS = "quadsim", ("daqp", "osqp", "tinympc")
 PRECISIONS: Final[tuple[Precision, ...]] = ("double", "float")
 OPTIMA: Final = 3
 """Statuses below are optima."""
@@ -89,17 +95,21 @@ controller.compiled=true`). Flights of 60 s per core-hour, by one worker:
 {campaigns}
 ## Peers on the same problem
 
-The same recorded periods on the emulated Cortex-M7. The peers are given the condensed QP ({inputs} inputs, {rows}
-rows); what it takes to find its vectors from state and reference is theirs neither in flash nor in instructions. DAQP
-begins from its last active set, in the least-distance form around the optimum without constraints; OSQP's generated
-code from its last point, with the step size that it chose itself and tolerances of 1e-4.
+The same recorded periods on the emulated Cortex-M7. DAQP and OSQP are given the condensed QP ({inputs} inputs, {rows}
+rows), TinyMPC a state with the last speeds in it, so that all bounds are boxes; what it takes to find their vectors
+from state and reference is theirs neither in flash nor in instructions. DAQP begins from its last active set, in the
+least-distance form around the optimum without constraints; OSQP's generated code from its last point, with the step
+size that it chose itself and tolerances of 1e-4; TinyMPC's from its last point, with its default tolerances of
+{tolerance:g} and {iterations} iterations at most, and the step size and units that took the fewest.
 
 {peers}
 - DAQP is as exact. It takes more memory, as its matrices are dense, and more instructions: they have no structure, and
   its active set is not shifted from period to period.
 - OSQP's answer is not the optimum, but within its tolerances; its matrices are in RAM.
-- TinyMPC is not in the table: it has a terminal weight of its own, which it cannot do without, so that its problem is
-  another one, and its generated code is C++ with Eigen.
+- TinyMPC solves another problem: its last state has the weight of its own Riccati equation, in which its step size
+  is a weight too. That problem's optimum, found by another solver, is up to {gap} rad/s from ours, {usual_gap} in the
+  median period. To it, TinyMPC's answers are within {converged} rad/s where they converged, {unconverged} where not.
+  Its code, C++ with Eigen, allocates: {heap} kB of its RAM are heap.
 
 ## In the loop
 
@@ -199,21 +209,38 @@ def others_table(scratch: Path) -> Table:
     return rows
 
 
-def peers_table(mine: Measured, recording: Recording, scratch: Path) -> Table:
-    """DAQP and OSQP beside ours."""
-    scenario, target = load_scenario(PAPER), TARGETS["cortex-m7"]
-    problem = build_problem(scenario, build_vehicle(scenario))
+def peers(names: Sequence[str], problem: Problem, recording: Recording, scratch: Path) -> dict[str, Measured]:
+    """Others' answers to the paper's recorded periods, each in a directory of its own."""
+    found = {}
+    for name in names:
+        (scratch / name).mkdir()
+        found[name] = run_peer(name, scratch / name, problem, recording, TARGETS["cortex-m7"], "double")
+    return found
+
+
+def peers_table(found: dict[str, Measured], recording: Recording) -> Table:
+    """Others beside ours."""
     rows: Table = [("", "flash [kB]", "RAM [kB]", *WORK, "error [rad/s]", "unsolved")]
-    found = {"quadsim": mine}
-    for name in ("daqp", "osqp"):
-        directory = scratch / name
-        directory.mkdir()
-        found[name] = run_peer(name, directory, problem, recording, target, "double")
     for name, each in found.items():
-        unsolved = (each.status >= OPTIMA if each is mine else each.status > 0).sum()
+        unsolved = (each.status >= OPTIMA if name == OURS else each.status > 0).sum()
         kilobytes = (f"{each.flash / 1e3:.0f}", f"{each.memory / 1e3:.0f}")
         rows.append((name, *kilobytes, *work(each), error(each, recording), f"{unsolved}"))
     return rows
+
+
+def tinympc_words(found: Measured, problem: Problem, recording: Recording, scratch: Path) -> dict[str, Any]:
+    """How far TinyMPC is from its own problem's optimum, and that from ours [rad/s]."""
+    optimum, missed = own_optima(problem, recording, scratch / "tinympc"), found.status > 0
+    gap, left = (np.abs(optimum - each).max(axis=1) for each in (recording.command, found.command))
+    return {
+        "tolerance": TOLERANCE,
+        "iterations": ITERATIONS,
+        "gap": f"{gap.max():.1f}",
+        "usual_gap": f"{np.median(gap):.1e}",
+        "converged": f"{left[~missed].max():.2f}",
+        "unconverged": f"{left[missed].max():.1f}",
+        "heap": f"{found.heap / 1e3:.0f}",
+    }
 
 
 def loop_table() -> Table:
@@ -275,10 +302,17 @@ def campaigns_table() -> Table:
 
 
 def main() -> None:
-    """Measure everything and write the page."""
+    """Measure everything and write the page; with names of peers, print their rows."""
     scenario = load_scenario(PAPER)
     recording = record(scenario)
     problem = build_problem(scenario, build_vehicle(scenario))
+    if sys.argv[1:]:
+        with tempfile.TemporaryDirectory() as directory:
+            found = peers(sys.argv[1:], problem, recording, Path(directory))
+            print(markdown(peers_table(found, recording)))
+            if "tinympc" in found:
+                print(tinympc_words(found["tinympc"], problem, recording, Path(directory)))
+        return
     ways = np.bincount(recording.status, minlength=OPTIMA)
     with tempfile.TemporaryDirectory() as directory:
         scratch = Path(directory)
@@ -286,7 +320,9 @@ def main() -> None:
         header = (scratch / "sizes" / f"{PAPER}-double-cortex-m7" / "quadsim_mpc.h").read_text(encoding="utf-8")
         ((room, changes),) = re.findall(r"QUADSIM_ROOM (\d+).*?QUADSIM_CHANGES (\d+)", header, re.DOTALL)
         mine = ours(PAPER, "double", "cortex-m7", scratch / "mine")
+        others = peers(PEERS, problem, recording, scratch)
         page = TEXT.format(
+            **tinympc_words(others["tinympc"], problem, recording, scratch),
             scenario=PAPER,
             horizon=problem.horizon,
             periods=len(recording.status),
@@ -301,7 +337,7 @@ def main() -> None:
             campaigns=markdown(campaigns_table()),
             inputs=problem.horizon * 4,
             rows=problem.horizon * problem.rows.l1.size,
-            peers=markdown(peers_table(mine, recording, scratch)),
+            peers=markdown(peers_table({OURS: mine, **others}, recording)),
             loop=markdown(loop_table()),
             room=room,
             changes=changes,
