@@ -158,6 +158,14 @@ def answered(text: str, target: Target, flash: int = 0, memory: int = 0) -> Meas
     return Measured(status, changes, command, ticks * (TICK if target.board else 1), flash, memory)
 
 
+def unwrapped(found: Measured) -> Measured:
+    """With the turns of the board's clock, which wraps after 2^24 ticks, in steps of so many iterations that it did."""
+    turn = 2**24 * TICK
+    each = float(np.median(found.ticks / np.maximum(found.changes, 1)))
+    turns = np.maximum(np.round((found.changes * each - found.ticks) / turn), 0).astype(np.int64)
+    return found._replace(ticks=found.ticks + turn * turns)
+
+
 def size(tool: str, files: Iterable[Path]) -> tuple[int, int]:
     """Bytes of object files: code and constants, and what changes."""
     lines = subprocess.run([tool, *files], capture_output=True, text=True, check=True).stdout.splitlines()[1:]
@@ -199,4 +207,5 @@ def run_peer(
     text = done.stdout + done.stderr
     flash, memory = size(TOOLS[bool(target.board)], objects[: len(theirs)])
     heap = max((int(word, 16) for word in re.findall(r"^heap (\w+)$", text, re.MULTILINE)), default=0)
-    return answered(text, target, flash, memory + heap)._replace(heap=heap)
+    found = answered(text, target, flash, memory + heap)._replace(heap=heap)
+    return unwrapped(found) if name == "osqp" and target.board else found
