@@ -22,7 +22,7 @@ from quadsim.outputs.manifest import (
     remove_empty,
     remove_lock,
 )
-from quadsim.outputs.paths import occupied, output_errors, parents_of, real_path
+from quadsim.outputs.paths import already, occupied, output_errors, parents_of, real_path
 from quadsim.outputs.staging import STAGING, Staging, staging_beside
 
 _CHANGED: Final = "it is not as quadsim wrote it; move it away first"
@@ -136,7 +136,7 @@ def growing(directory: Path | str, kind: str) -> Iterator[Growing]:
         if found is None and others:
             raise OutputError(directory, occupied(others))
         if found is not None and found.kind != kind:
-            raise OutputError(directory, f"a {found.kind} is already there; choose another --out")
+            raise OutputError(directory, f"{already(found.kind)}; choose another --out")
         try:
             with _held(directory), staging_beside(directory / MANIFEST_FILE) as staging:
                 yield Growing(directory, kind, staging)

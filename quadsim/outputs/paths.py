@@ -54,9 +54,14 @@ def problem_with_directory(path: Path, kind: str) -> str | None:
         there = sorted(entry.name for entry in path.iterdir())
         return occupied(there) if there else None
     if manifest.kind != kind:
-        return f"a {manifest.kind} is already there; choose another --out"
+        return f"{already(manifest.kind)}; choose another --out"
     others = foreign(path, manifest)
     return f"it holds {few(others)}, not as quadsim wrote it; choose another --out" if others else None
+
+
+def already(kind: str) -> str:
+    """What is there, for messages."""
+    return f"{'an' if kind[0] in 'aeiou' else 'a'} {kind} is already there"
 
 
 def problem_with_file(path: Path, form: str) -> str | None:

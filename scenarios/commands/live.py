@@ -15,7 +15,9 @@ from quadsim.outputs import real_path, require_directory
 from scenarios.api import load as load_scenario
 from scenarios.commands import EXIT_DONE, EXIT_FAILED, console
 from scenarios.commands.common import load
+from scenarios.live.guard import LOOPBACK
 from scenarios.live.pacing import Pace
+from scenarios.live.page import Page, require_server
 from scenarios.live.script import play, read_script
 from scenarios.live.session import Session
 from scenarios.reaudit import stored_scenario
@@ -33,6 +35,8 @@ def live(options: Namespace) -> int:
     scenario = stored_scenario(run) if finished else load(options.scenario, options)
     against = None if options.against is None else load(options.against, Namespace(settings=[], seed=None)).controller
     script = None if options.script is None else read_script(options.script)
+    if script is None:
+        require_server(options.host, options.port)
     target = real_path(Path("runs") / f"{scenario.name}-live" if options.out is None else options.out)
     _require_writable(target)
     session = Session(scenario, against)
@@ -42,14 +46,17 @@ def live(options: Namespace) -> int:
         return str(target)
 
     try:
-        if finished:  # to where it ended
-            while session.reason is None and session.k < scenario.periods:
-                session.advance()
-        if script is not None:
-            for reason in play(session, script):
-                console.say(f"refused: {reason}")
-        else:
-            _serve(session, options, save)
+        try:
+            if finished:  # to where it ended
+                while session.reason is None and session.k < scenario.periods:
+                    session.advance()
+            if script is not None:
+                for reason in play(session, script):
+                    console.say(f"refused: {reason}")
+            else:
+                _serve(session, options, save)
+        except KeyboardInterrupt:  # what was flown is saved
+            print(file=sys.stderr)
         if session.k:
             print(f"{save(session)}: {session.k * session.period:.2f} s, {session.flight().outcome}")
         return EXIT_DONE if session.reason is None else EXIT_FAILED
@@ -71,9 +78,7 @@ def _require_writable(target: Path) -> None:
 
 def _serve(session: Session, options: Namespace, save: Callable[[Session], str]) -> None:
     """Show the page and fly until Ctrl-C."""
-    from scenarios.live.page import Page
-
-    if options.host not in ("127.0.0.1", "localhost"):
+    if options.host not in LOOPBACK:
         console.say(
             f"listening on {options.host}: anyone on that network with the address below can fly this session; "
             "the connection is not encrypted"
@@ -85,8 +90,6 @@ def _serve(session: Session, options: Namespace, save: Callable[[Session], str])
         if options.browser:
             webbrowser.open(page.address)
         pace.drive(session, page)
-    except KeyboardInterrupt:
-        print(file=sys.stderr)
     finally:
         page.close()
 

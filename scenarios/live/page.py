@@ -9,8 +9,10 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import dataclasses
+import errno
 import io
 import math
+import socket
 import warnings
 from collections import deque
 from collections.abc import Awaitable, Callable, Iterator, Mapping
@@ -27,7 +29,7 @@ from quadsim.flight.audit import Limit
 from quadsim.report.palette import BOUND, LINES
 from quadsim.state import quaternion_to_euler
 from quadsim.vehicle import N_ROTORS
-from scenarios.live.guard import LOOPBACK, Guard
+from scenarios.live.guard import Guard
 from scenarios.live.knobs import Knob, Value, knobs
 from scenarios.live.pacing import Pace
 from scenarios.live.session import Frame, Session
@@ -59,6 +61,38 @@ STYLE: Final = """<style>
 </style>"""
 
 
+def require_server(host: str, port: int) -> None:
+    """Refuse, before anything is flown, where no page could be served.
+
+    Raises:
+        MissingPackageError: viser is not installed.
+        ParameterError: the host is no address of this machine, or the port is none, or in use.
+    """
+    if find_spec("viser") is None:
+        raise MissingPackageError("quadsim live", "viser", extra="live")
+    if not 0 <= port <= 65535:
+        raise ParameterError("", "--port", port, "from 1 to 65535, or 0 for any that is free")
+    try:
+        family, kind, protocol, _, address = socket.getaddrinfo(host or "?", port, type=socket.SOCK_STREAM)[0]
+        with socket.socket(family, kind, protocol) as probe:
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            probe.bind(address)
+    except (OSError, UnicodeError) as error:
+        if getattr(error, "errno", None) in (errno.EADDRINUSE, errno.EACCES):
+            raise ParameterError("", "--port", port, "a port that is free") from error
+        raise ParameterError("", "--host", host, "an address of this machine") from error
+
+
+def _reachable(host: str) -> str:
+    """How others call this machine: where it listens on all its addresses, one of them."""
+    if host not in ("0.0.0.0", "::"):
+        return f"[{host}]" if ":" in host else host
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as route, contextlib.suppress(OSError):
+        route.connect(("192.0.2.1", 9))  # of a network that is nowhere: nothing is sent
+        return str(route.getsockname()[0])
+    return "127.0.0.1"
+
+
 class Page:
     """A session's page.
 
@@ -88,8 +122,7 @@ class Page:
         port: int = 0,
         others: Mapping[str, ControllerSpec],
     ) -> None:
-        if find_spec("viser") is None:
-            raise MissingPackageError("quadsim live", "viser", extra="live")
+        require_server(host, port)
         import viser
         from viser import _messages
 
@@ -104,8 +137,7 @@ class Page:
             raise ParameterError("", "--port", port, "a port that is free")
         for message in (_messages.ShareUrlRequest, _messages.ShareUrlDisconnect):  # a tunnel that any client may open
             self._server._websock_server.unregister_handler(message)
-        shown = host if host in LOOPBACK or host not in ("0.0.0.0", "::") else "127.0.0.1"
-        self.address = f"http://{shown}:{found}/?token={self._guard.token}"
+        self.address = f"http://{_reachable(host)}:{found}/?token={self._guard.token}"
         self._driver: int | None = None
         self._takes: dict[int, Any] = {}  # the button of each client that takes the controls
         self._aims: dict[int, Any] = {}  # where each client looks, from the vehicle [m]
@@ -567,6 +599,11 @@ class Page:
             f"<span{mark}>{escape(command.status)}</span>{back}, {command.active} active, "
             f"step <b>{step:.2f}</b> of {deadline:g} ms"
             + (' <span class="bad">missed</span>' if sample.missed else ""),
+            *(
+                f'<span class="bad">{escape(other.controller.name)} was lost: {escape(other.reason)}</span>'
+                for other in (flight.loop for flight in self._session.flights[1:])
+                if other.reason is not None
+            ),
             f"tilt <b>{worst[4]:.1f}</b> deg, error <b>{np.linalg.norm(worst[1:4]):.2f}</b> m, pull "
             f"<b>{np.linalg.norm(frame.pull):.1f}</b> N",
         ]

@@ -33,6 +33,10 @@ FORCE_STEP: Final = 1e-3
 """To which pulls are rounded [N]."""
 
 
+_ENTRIES: Final = {"pull": {"type", "to"}, "wear": {"type", "rotor", "loss"}, "steer": {"type", "velocity"}}
+"""Of inputs that are no events of a scenario file."""
+
+
 class Pull(NamedTuple):
     """A spring from a point of the body to a point of the world, held until it is let go."""
 
@@ -210,7 +214,9 @@ class Session:
         """Let an input act; why it is refused, or None."""
         table = given.table
         try:
-            kind = table.get("type")
+            kind = str(table.get("type"))
+            if unknown := sorted(set(table) - _ENTRIES.get(kind, set(table))):
+                raise InputError(f"{kind}: unknown: {', '.join(unknown)}; it has {', '.join(sorted(_ENTRIES[kind]))}")
             if kind == "pull":
                 to = table.get("to")
                 self._held.pull = None if to is None else Pull(_vector(to, "pull", "to"))
@@ -226,9 +232,9 @@ class Session:
 
     def _wear(self, table: Mapping[str, Any]) -> None:
         rotor, loss = table.get("rotor"), table.get("loss")
-        if not isinstance(rotor, int) or rotor not in range(1, N_ROTORS + 1):
+        if not isinstance(rotor, int) or isinstance(rotor, bool) or rotor not in range(1, N_ROTORS + 1):
             raise ParameterError("wear", "rotor", rotor, f"1 to {N_ROTORS}")
-        if not isinstance(loss, int | float) or not 0.0 <= loss <= 1.0:
+        if not isinstance(loss, int | float) or isinstance(loss, bool) or not 0.0 <= loss <= 1.0:
             raise ParameterError("wear", "loss", loss, "from 0 to 1")
         self._held.wear[rotor] = float(loss)
 
@@ -283,13 +289,14 @@ class Session:
 
 def _vector(value: object, name: str, entry: str) -> tuple[float, float, float]:
     """Three finite numbers."""
-    try:
-        x, y, z = (float(each) for each in value)  # type: ignore[attr-defined]
-    except (TypeError, ValueError):
-        raise ParameterError(name, entry, value, "three finite numbers") from None
-    if not all(map(math.isfinite, (x, y, z))):
+    if not isinstance(value, list | tuple) or len(value) != 3 or not all(map(_is_finite, value)):
         raise ParameterError(name, entry, value, "three finite numbers")
+    x, y, z = map(float, value)
     return x, y, z
+
+
+def _is_finite(value: object) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
 
 
 def _horizon(flight: StartedFlight, sample: Sample) -> Array | None:

@@ -82,6 +82,7 @@ class Stage:
         self._ahead = scene.add_line_segments(
             "/reference", _course(session), grey, thickness=1.5, thickness_units="screen"
         )
+        self._events = 0  # that have been seen
         self._now = scene.add_icosphere("/goal", radius=0.25 * self.unit, color=grey, subdivisions=1, cast_shadow=False)
         self._hand = scene.add_line_segments("/hand", np.zeros((1, 2, 3)), red, thickness=4.0, thickness_units="screen")
         self.grab = scene.add_icosphere("/vehicle0/grab", radius=1.6 * self.unit, subdivisions=1, opacity=0.001)
@@ -101,9 +102,14 @@ class Stage:
                 self._trails[i].append(sample.segment.physics[-1, 1:4])
                 self._paths[i].points = _segments(np.array(self._trails[i]), TRAIL)
             length, line = self._horizons[i]
-            if horizon is not None:
-                line.points = _segments(horizon, length)
+            if horizon is not None:  # of another length than the first controller's, it is thinned
+                points = np.linspace(0.0, len(horizon) - 1.0, min(len(horizon), length + 1)).round().astype(int)
+                line.points = _segments(horizon[points], length)
             line.visible = horizon is not None
+        events = self._session.flights[0].scenario.events
+        if any(event.type == "setpoint" for event in events[self._events :]):
+            self._ahead.points = _course(self._session)
+        self._events = len(events)
         first = frame.samples[0]
         if first is not None:
             self._now.position = first.observation.reference[:3]
@@ -128,13 +134,10 @@ class Stage:
 
     def reset(self) -> None:
         """Nothing has been flown."""
+        self._events, self._ahead.points = 0, _course(self._session)
         for trail, path in zip(self._trails, self._paths, strict=True):
             trail.clear()
             path.points = np.zeros((TRAIL, 2, 3), np.float32)
-
-    def refresh_reference(self) -> None:
-        """Draw the reference as it is known now."""
-        self._ahead.points = _course(self._session)
 
     @property
     def _weight(self) -> float:

@@ -24,6 +24,8 @@ from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 from websockets.typing import Subprotocol
 
+from scenarios.cli import main
+from scenarios.commands import EXIT_DONE, EXIT_WRONG_INPUT
 from scenarios.live.guard import Guard
 from scenarios.live.pacing import Pace
 from scenarios.live.page import Page
@@ -125,6 +127,44 @@ def test_a_closed_page_ends_its_push(browser: Any, served: Served) -> None:
     served.wait(lambda: served.session._held.pull is not None)
     page.close()
     served.wait(lambda: served.session._held.pull is None)
+
+
+@pytest.mark.parametrize(
+    ("option", "value", "rule"),
+    [
+        ("--port", "99999", "--port must be from 1 to 65535, or 0 for any that is free; got 99999"),
+        ("--port", "-1", "--port must be from 1 to 65535"),
+        ("--host", "no.such.host.invalid", "--host must be an address of this machine"),
+        ("--host", "192.0.2.1", "--host must be an address of this machine"),
+        ("--host", "", "--host must be an address of this machine"),
+    ],
+)
+def test_where_no_page_can_be_served_is_refused(
+    option: str, value: str, rule: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert (
+        main(["live", "hover", "--no-browser", f"{option}={value}", "--out", str(tmp_path / "live")])
+        == EXIT_WRONG_INPUT
+    )
+    assert rule in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
+
+
+def test_an_interrupted_script_is_saved_up_to_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    script = tmp_path / "script.toml"
+    script.write_text("duration = 5.0\n")
+    advance = Session.advance
+
+    def interrupted(session: Session) -> object:
+        if session.k == 4:
+            raise KeyboardInterrupt
+        return advance(session)
+
+    monkeypatch.setattr(Session, "advance", interrupted)
+    out = tmp_path / "live"
+    line = ["live", "hover", "--script", str(script), "--set", "controller.horizon=5", "--out", str(out)]
+    assert main(line) == EXIT_DONE
+    assert load_scenario(str(out / "scenario.toml")).duration == pytest.approx(0.2)
 
 
 def test_an_interrupt_keeps_what_was_flown(tmp_path: Path) -> None:
@@ -245,7 +285,7 @@ def test_a_reset_puts_everything_back(tab: Any, served: Served) -> None:
     assert served.session.flights[0].loop.controller.horizon == 10
 
 
-def test_a_second_page_watches(browser: Any, served: Served, tab: Any, tmp_path: Path) -> None:
+def test_a_second_page_watches(browser: Any, served: Served, tab: Any) -> None:
     phone = browser.new_page(viewport={"width": 390, "height": 800})
     phone.set_default_timeout(1e3 * PATIENCE)
     phone.goto(served.page.address)
@@ -257,6 +297,10 @@ def test_a_second_page_watches(browser: Any, served: Served, tab: Any, tmp_path:
     for page in (phone, tab):  # from one to the other, and back
         page.get_by_role("button", name="Take the controls").click()
         page.get_by_role("button", name="Take the controls").wait_for(state="hidden")
-    picture = phone.screenshot(path=tmp_path / "phone.png")
-    assert len(picture) > 10_000
+    assert phone.evaluate("document.documentElement.scrollWidth") <= 390  # nothing is beyond the edge
+    scene = phone.locator("canvas").first.bounding_box()
+    assert scene["width"] == 390
+    bars = phone.get_by_text("roll", exact=True).bounding_box()
+    assert bars["x"] >= 0.0
+    assert bars["x"] + bars["width"] <= 390
     phone.close()

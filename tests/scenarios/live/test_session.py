@@ -316,3 +316,18 @@ def test_a_script_reports_what_was_refused(session: Session, tmp_path: Path) -> 
     path.write_text('duration = 0.2\ninputs = [{ at = 0.1, type = "nonsense" }]', encoding="utf-8")
     (refusal,) = play(session, read_script(path))
     assert "nonsense" in refusal
+
+
+@pytest.mark.parametrize(
+    ("table", "message"),
+    [
+        ({"type": "pull", "too": [0.0, 0.0, 1.0]}, "pull: unknown: too; it has to, type"),
+        ({"type": "pull", "to": "123"}, "pull.to must be three finite numbers"),
+        ({"type": "steer", "velocity": ["1", "2", "3"]}, "steer.velocity must be three finite numbers"),
+        ({"type": "wear", "rotor": True, "loss": 0.1}, "wear.rotor must be 1 to 4"),
+    ],
+)
+def test_a_wrong_input_is_refused_by_name(session: Session, table: dict[str, Any], message: str) -> None:
+    session.submit(table)
+    (refused,) = session.advance().refused
+    assert message in refused
