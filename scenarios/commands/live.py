@@ -17,7 +17,6 @@ from scenarios.commands import EXIT_DONE, EXIT_FAILED, console
 from scenarios.commands.common import load
 from scenarios.live.guard import LOOPBACK
 from scenarios.live.pacing import Pace
-from scenarios.live.page import Page, require_server
 from scenarios.live.script import play, read_script
 from scenarios.live.session import Session
 from scenarios.reaudit import stored_scenario
@@ -36,6 +35,8 @@ def live(options: Namespace) -> int:
     against = None if options.against is None else load(options.against, Namespace(settings=[], seed=None)).controller
     script = None if options.script is None else read_script(options.script)
     if script is None:
+        from scenarios.live.page import require_server
+
         require_server(options.host, options.port)
     target = real_path(Path("runs") / f"{scenario.name}-live" if options.out is None else options.out)
     _require_writable(target)
@@ -78,6 +79,8 @@ def _require_writable(target: Path) -> None:
 
 def _serve(session: Session, options: Namespace, save: Callable[[Session], str]) -> None:
     """Show the page and fly until Ctrl-C."""
+    from scenarios.live.page import Page
+
     if options.host not in LOOPBACK:
         console.say(
             f"listening on {options.host}: anyone on that network with the address below can fly this session; "
