@@ -12,9 +12,10 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from quadsim.controller import law_name
+from quadsim.controller import Phase, law_name
 from quadsim.errors import printable
 from quadsim.report.table import ABSENT, Cell, Mark, Row, format_number
+from quadsim.space import SHAPES, Obstacle
 
 if TYPE_CHECKING:
     from quadsim.flight.rundir import Run
@@ -115,6 +116,15 @@ def _all_held(summary: Summary) -> bool:
 def fallback_sentence(periods: int) -> str:
     """That a flight ended in fallback, after so many periods of it."""
     return f"{periods} periods in fallback, never recovered"
+
+
+def crash(summary: Summary) -> str | None:
+    """That the vehicle crashed, and the obstacles that it touched; None where it did not."""
+    if Phase.CRASHED not in summary["controller"].get("statuses", ()):
+        return None
+    violated = [entry for entry in summary["constraints"] if entry.get("shape") and not entry["satisfied"]]
+    touched = [entry["name"] for entry in violated if issubclass(SHAPES[entry["shape"]["type"]], Obstacle)]
+    return f"crashed, touched {', '.join(touched)}" if touched else "crashed"
 
 
 def failure_sentences(summary: Summary) -> list[str]:

@@ -16,7 +16,7 @@ from rich.text import Text
 
 from quadsim.controller import law_name
 from quadsim.errors import printable
-from quadsim.report.comparison import FOR_GOOD, failure_sentences, verdict_sentence
+from quadsim.report.comparison import FOR_GOOD, crash, failure_sentences, verdict_sentence
 from quadsim.report.table import Cell, Grid, Mark, Row
 from scenarios.progress import Progress, silent
 
@@ -124,7 +124,7 @@ def outcome(summary: Mapping[str, Any]) -> Text:
     verdict = "every required constraint holds" if summary["satisfied"] else "a required constraint does not hold"
     if verdict_sentence(summary) == FOR_GOOD:
         verdict = "but in fallback for good"
-    return styled((f"completed, {verdict}{remark}", colour))
+    return styled((f"{crash(summary) or 'completed'}, {verdict}{remark}", colour))
 
 
 def audit_table(constraints: Sequence[Mapping[str, Any]]) -> Table:

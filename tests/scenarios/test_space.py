@@ -22,6 +22,7 @@ from quadsim.sim.plant import Plant
 from quadsim.space import Cylinder, Fence, Sphere, Wall
 from quadsim.state import INDEX, POSITION
 from quadsim.vehicle import Vehicle
+from scenarios.commands.console import outcome
 from scenarios.flight import Flight, Outputs, write_run
 from scenarios.loading import load_scenario, parse_scenario
 from scenarios.reaudit import reaudit
@@ -82,6 +83,7 @@ def test_the_extent_is_the_vehicle_s_or_the_scenario_s() -> None:
 
 def test_a_touch_is_a_crash_at_the_distance_that_the_audit_measures(crashed: Flight) -> None:
     assert crashed.outcome == "violated"
+    assert outcome(crashed.summary).plain.startswith("crashed, touched pillar, a required constraint does not hold")
     assert not crashed.findings[0].satisfied
     log, limit = crashed.log, crashed.findings[0].limit
     clearance = limit.source.finest(log)[1]
