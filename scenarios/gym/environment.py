@@ -51,8 +51,8 @@ class QuadrotorEnv(gymnasium.Env):  # type: ignore[misc]
     """A scenario, one step per control period.
 
     Observations and actions are as chosen; see `scenarios.gym.observations` and `scenarios.gym.actions`.  An episode
-    is terminated when the vehicle is lost by a criterion of `[lost]`, has crashed, or has diverged; `make_env` and
-    `gymnasium.make` truncate it at the scenario's duration.
+    is terminated when the vehicle is lost by a criterion of `[lost]`, has crashed, or has diverged, and truncated at
+    the scenario's duration, which a campaign's `[set]` may change.
 
     `info` at each step, and at the start:
 
@@ -163,7 +163,7 @@ class QuadrotorEnv(gymnasium.Env):  # type: ignore[misc]
         Raises:
             InputError: the seed or an option is not possible.
         """
-        if seed is not None and not 0 <= seed <= LARGEST_SEED:
+        if seed is not None and not (isinstance(seed, int | np.integer) and 0 <= seed <= LARGEST_SEED):
             raise ParameterError("", "seed", seed, f"from 0 to {LARGEST_SEED}")
         first = not self._started
         super().reset(seed=self._base.seed if first and seed is None else seed)
@@ -192,11 +192,14 @@ class QuadrotorEnv(gymnasium.Env):  # type: ignore[misc]
         An action that is not finite ends the flight, as a controller's would.
 
         Raises:
+            ParameterError: the action has another shape than `action_space`.
             ResetNeeded: there is no episode, or it has ended.
         """
         flight = self.started
         if flight.done:
             raise ResetNeeded(f"the episode has ended ({flight.loop.reason or 'the scenario is over'}); call reset()")
+        if np.shape(action) != self.action_space.shape:
+            raise ParameterError("", "action", np.shape(action), f"of shape {self.action_space.shape}")
         queried, seen = self._queried, self._seen
         command = (
             queried.command
@@ -221,7 +224,8 @@ class QuadrotorEnv(gymnasium.Env):  # type: ignore[misc]
         if self.render_mode == "human":
             self._draw()
         reward = float(self._reward(state, self._seen.reference, sample.speeds))
-        return self._vector(self._seen), reward, terminated, False, self._info(*_margins(self.limits, period))
+        truncated = flight.done and not terminated
+        return self._vector(self._seen), reward, terminated, truncated, self._info(*_margins(self.limits, period))
 
     def controller_action(self) -> Action:
         """What the scenario's own controller would do now, computed once per period.
@@ -285,10 +289,10 @@ class QuadrotorEnv(gymnasium.Env):  # type: ignore[misc]
             raise InputError(f"options must not have {', '.join(sorted(unknown))}; they may have flight")
         if self._plan is not None:
             count = self._plan.spec.flights
-            flight = int(options["flight"]) if "flight" in options else int(self.np_random.integers(count))
-            if not 0 <= flight < count:
+            flight = options["flight"] if "flight" in options else int(self.np_random.integers(count))
+            if not (isinstance(flight, int | np.integer) and 0 <= flight < count):
                 raise ParameterError("options", "flight", flight, f"from 0 to {count - 1}")
-            return self._plan.of(flight)
+            return self._plan.of(int(flight))
         if "flight" in options:
             raise ParameterError("options", "flight", options["flight"], "absent where no campaign varies anything")
         if seed is None:

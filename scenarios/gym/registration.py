@@ -9,6 +9,7 @@ import gymnasium
 from gymnasium.envs.registration import EnvSpec
 from gymnasium.vector import VectorEnv
 
+from quadsim.errors import ParameterError
 from quadsim.sim.physics import steps_per_period
 from scenarios.api import load
 from scenarios.schema.bases import read_scenario
@@ -95,5 +96,7 @@ def make_vec(scenario: Scenario | str | Path, num_envs: int, **options: Any) -> 
     """
     from gymnasium.vector import AutoresetMode
 
+    if num_envs < 1:
+        raise ParameterError("", "num_envs", num_envs, "at least 1")
     modes = {"autoreset_mode": AutoresetMode.NEXT_STEP}
     return gymnasium.make_vec(_specification(scenario), num_envs, "async", vector_kwargs=modes, **options)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from quadsim.errors import FlightError
+from quadsim.errors import FlightError, ParameterError
 from quadsim.outputs import write_new
 from quadsim.state import Array
 from scenarios.gym.actions import Action
@@ -60,6 +60,8 @@ def expert(
     import pyarrow as pa
     import pyarrow.parquet as pq
 
+    if episodes < 1:
+        raise ParameterError("", "episodes", episodes, "at least 1")
     env = make_env(scenario, **options)
     base = env.unwrapped
     rows: dict[str, list[Any]] = {

@@ -202,6 +202,16 @@ def test_a_campaign_varies_each_episode() -> None:
     assert env.scenario == first
 
 
+def test_a_campaigns_duration_truncates(tmp_path: Path) -> None:
+    campaign = tmp_path / "brief.toml"
+    campaign.write_text('name = "brief"\nscenario = "hover"\nflights = 2\nset = { duration = 0.1, constraints = [] }\n')
+    env = quadsim.gym.make_env("hover", vary=str(campaign))
+    env.reset()
+    assert [env.step(HOVER)[2:4] for _ in range(2)] == [(False, False), (False, True)]
+    with pytest.raises(ResetNeeded, match="the scenario is over"):
+        env.step(HOVER)
+
+
 def test_wrong_options_are_named() -> None:
     make = quadsim.gym.QuadrotorEnv
     with pytest.raises(UnknownNameError, match="no action named 'torque'"):
@@ -222,6 +232,15 @@ def test_wrong_options_are_named() -> None:
     env = make("hover")
     with pytest.raises(ParameterError, match="seed must be from 0"):
         env.reset(seed=-1)
+    with pytest.raises(ParameterError, match="seed must be from 0"):
+        env.reset(seed="a")  # type: ignore[arg-type]
+    env.reset()
+    with pytest.raises(ParameterError, match=r"action must be of shape \(4,\); got \(3,\)"):
+        env.step(np.zeros(3))
+    with pytest.raises(ParameterError, match="episodes must be at least 1"):
+        quadsim.gym.expert("hover", episodes=0)
+    with pytest.raises(ParameterError, match="num_envs must be at least 1"):
+        quadsim.gym.make_vec("hover", 0)
     with pytest.raises(InputError, match="options must not have wind; they may have flight"):
         env.reset(options={"wind": 1})
     with pytest.raises(ParameterError, match=r"options.flight must be absent"):
@@ -229,6 +248,8 @@ def test_wrong_options_are_named() -> None:
     varied = make("paper-constrained", vary="paper-nominal")
     with pytest.raises(ParameterError, match=r"options.flight must be from 0 to"):
         varied.reset(options={"flight": -1})
+    with pytest.raises(ParameterError, match=r"options.flight must be from 0 to"):
+        varied.reset(options={"flight": 1.7})
 
 
 def test_no_display_no_window(monkeypatch: pytest.MonkeyPatch) -> None:
