@@ -230,6 +230,23 @@ def test_a_push_by_the_mouse_acts_and_ends(tab: Any, served: Served) -> None:
     served.wait(lambda: served.session._held.pull is None)
 
 
+def test_keys_and_clicks_give_set_points(tab: Any, served: Served) -> None:
+    def set_points() -> list[Any]:
+        return [event for event in served.session.flights[0].scenario.events if event.type == "setpoint"]
+
+    tab.keyboard.press("w")
+    served.wait(lambda: len(set_points()) > 3)
+    assert set_points()[-1].x > set_points()[0].x
+    tab.keyboard.press("x")
+    served.wait(lambda: not served.session._held.steer.any())
+    count = len(set_points())
+    box = tab.locator("canvas").first.bounding_box()
+    tab.keyboard.down("Shift")
+    tab.mouse.click(box["x"] + 0.2 * box["width"], box["y"] + 0.9 * box["height"])
+    tab.keyboard.up("Shift")
+    served.wait(lambda: len(set_points()) > count)
+
+
 def test_a_slider_turns(tab: Any, served: Served) -> None:
     row = tab.locator("label", has_text="Mass factor").locator("xpath=ancestor::div[.//*[@role='slider']][1]")
     row.get_by_role("slider").focus()
