@@ -111,7 +111,7 @@ class _Troubled(ToyPilot):
 TROUBLED = {
     3: "ValueError: no",
     7: "SystemExit: 4",
-    11: "limits.flight is 0.5 s",
+    11: "limits.flight is 1.5 s",
     20: f"its process died {MOST_DEATHS} times, last by signal 11",
 }
 
@@ -120,7 +120,7 @@ TROUBLED = {
 def troubled(two_workers: str) -> list[Row]:
     """Flights of which two raise, one never ends and one kills its process, each time it is tried."""
     harm: dict[str, Any] = {"raises": {3: ValueError("no"), 7: SystemExit(4)}, "kills": {20: signal.SIGSEGV}}
-    return known(fly(DaskEngine(two_workers), _Troubled(asleep=0.02, limits=LimitsSpec(flight=0.5), **harm)))
+    return known(fly(DaskEngine(two_workers), _Troubled(asleep=0.02, limits=LimitsSpec(flight=1.5), **harm)))
 
 
 def test_a_flight_that_raises_hangs_or_kills_its_process_is_lost_alone(troubled: list[Row]) -> None:
