@@ -65,6 +65,10 @@ _NUMERICAL_WARNINGS: Final = (
 _CALM: Final = Effects()
 _AS_IN_THE_FILE: Final = Load()
 
+if all(getattr(mujoco, name)() is None for name in dir(mujoco) if name.startswith("get_mjcb_")):
+    # Its Python bindings time each part of each step, which takes two fifths of a step's time.
+    mujoco.mj_resetCallbacks()
+
 
 class Plant:
     """A vehicle in MuJoCo: fourth-order Runge-Kutta at a fixed step, commands held in between.

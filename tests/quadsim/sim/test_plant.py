@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from pathlib import Path
 
+import mujoco
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
@@ -189,3 +192,18 @@ def test_equal_commands_give_equal_bits(vehicle: Vehicle) -> None:
             return np.concatenate([plant.advance(speeds, STEPS).physics for speeds in holds])
 
     np.testing.assert_array_equal(fly(), fly())
+
+
+def test_steps_are_not_timed(vehicle: Vehicle) -> None:
+    """Reading the clock in every step would take 40 % of its time."""
+    with Plant(vehicle) as plant:
+        plant.advance(np.full(4, vehicle.hover_speed), steps=50)
+        assert plant._data.timer[mujoco.mjtTimer.mjTIMER_STEP].duration == 0.0
+
+
+def test_callbacks_of_the_users_own_stay() -> None:
+    code = (
+        "import mujoco; mujoco.set_mjcb_control(print); import quadsim.sim.plant\n"
+        "assert mujoco.get_mjcb_control() is print; mujoco.set_mjcb_control(None)"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)
