@@ -32,6 +32,12 @@ def freeze_for_good() -> None:
     _PROCESS.lasting = True
 
 
+def thaw() -> None:
+    """Let passes look through everything again, but in a process that froze permanently."""
+    if not _PROCESS.lasting:
+        gc.unfreeze()
+
+
 def collect_rarely() -> None:
     """Collect less often in this process: flights leave few cycles, and looking for them takes time."""
     gc.set_threshold(100_000, 50, 100)
@@ -50,7 +56,6 @@ def frozen() -> Iterator[None]:
     try:
         yield
     finally:
-        if not _PROCESS.lasting:
-            gc.unfreeze()
-            if _PROCESS.flights % COLLECT_EVERY == 0:
-                gc.collect()
+        thaw()
+        if not _PROCESS.lasting and _PROCESS.flights % COLLECT_EVERY == 0:
+            gc.collect()

@@ -17,6 +17,7 @@ from types import ModuleType
 
 import numpy as np
 import pytest
+from support import Here
 
 import mpc
 import quadsim
@@ -62,6 +63,7 @@ RENDERS = {"film", "draw_vehicle", "bench_render"}
 """Whose examples need a machine that renders."""
 
 
+@pytest.mark.usefixtures("sketched")
 @pytest.mark.parametrize("name", [*quadsim.__all__, *(f"gym.{name}" for name in quadsim.gym.__all__)])
 def test_every_docstring_has_an_example_that_runs(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
@@ -72,6 +74,7 @@ def test_every_docstring_has_an_example_that_runs(
         except RenderingUnavailableError as error:
             pytest.skip(str(error))
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("scenarios.bench.worker_pool.ProcessPoolExecutor", Here)
     public = functools.reduce(getattr, name.split("."), quadsim)
     runner = doctest.DocTestRunner(verbose=False)
     for example in doctest.DocTestFinder().find(public, name, module=sys.modules[public.__module__]):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import gc
 import os
 import subprocess
@@ -50,24 +51,29 @@ def film(backend: str, short_run: Run, tmp_path_factory: pytest.TempPathFactory)
     return path, reports
 
 
-def decode(path: Path) -> np.ndarray:
-    """All frames of an MP4; imageio closes ffmpeg's pipes only when it is collected."""
+@contextlib.contextmanager
+def collecting() -> Iterator[None]:
+    """Ends what the block leaves in cycles, as imageio leaves ffmpeg's pipes, and looks through nothing older."""
+    gc.freeze()
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", ResourceWarning)
-        frames = iio.imread(path, plugin="FFMPEG")
+        yield
         gc.collect()
-    return frames
+
+
+def decode(path: Path) -> np.ndarray:
+    """All frames of an MP4."""
+    with collecting():
+        return iio.imread(path, plugin="FFMPEG")
 
 
 def metadata(path: Path) -> dict[str, Any]:
     """Metadata of an MP4, by ffmpeg."""
-    reader = imageio_ffmpeg.read_frames(path)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", ResourceWarning)
-        meta = next(reader)
+    with collecting():
+        reader = imageio_ffmpeg.read_frames(path)
+        meta: dict[str, Any] = next(reader)
         reader.close()
         del reader
-        gc.collect()
     return meta
 
 
