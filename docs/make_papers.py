@@ -38,7 +38,7 @@ HOW = """## How to add a paper
         name = "circle at 2 m/s"
         scenario = "my-circle.toml"          # a library name, or a path beside this file
         set = { reference.speed = 2.0 }      # merged over the scenario
-        measure = "tracking.position_error.mean"   # a dotted path into summary.json
+        measure = "tracking.position_error.mean"   # a dotted path into summary.json, checked before the first flight
         unit = "m"
         published = 0.12                     # or the lowest and the highest of several
         relation = "equal"                   # or "at most", "at least"
