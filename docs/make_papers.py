@@ -45,8 +45,8 @@ HOW = """## How to add a paper
         relative = 0.01                      # or absolute = 0.001
         source = "Table 2"
 
-Set `duration` with the speed of a ramped course, to 2 speed / acceleration + 2 ramp as in `torrente-loop4-ideal.toml`:
-a mean over a flight that goes on after its course counts the rest at the end as well.
+Leave out `duration` of a course of turns or ramps, as `torrente-loop4-ideal.toml` does: the flight then ends with its
+course at any speed. A mean over a longer flight counts the rest at the end as well.
 
 `quadsim reproduce` flies all that ship; exits with 1 where a number is beyond its tolerance (`--json`, `--junit FILE`).
 """
