@@ -158,7 +158,7 @@ class Scenario(Spec):
     expect: Verdict = Field(
         default="satisfied",
         description="its verdict, if all is right: satisfied (flown to its end, every required constraint holds), "
-        "violated (one does not, the vehicle crashes, or the controller ends in fallback for good), lost (the flight "
+        "violated (one does not, the vehicle crashes, or the controller ends in permanent fallback), lost (the flight "
         "ends early, by a criterion of [lost] or otherwise)",
     )
     duration: Annotated[float, Field(gt=0.0, le=LONGEST_FLIGHT)] = Field(
