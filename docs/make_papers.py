@@ -38,15 +38,15 @@ HOW = """## How to add a paper
         name = "circle at 2 m/s"
         scenario = "my-circle.toml"          # a library name, or a path beside this file
         set = { reference.speed = 2.0 }      # merged over the scenario
-        measure = "tracking.position_error.mean"   # a dotted path into summary.json
+        measure = "tracking.position_error.mean"   # a dotted path into summary.json, checked before the first flight
         unit = "m"
         published = 0.12                     # or the lowest and the highest of several
         relation = "equal"                   # or "at most", "at least"
         relative = 0.01                      # or absolute = 0.001
         source = "Table 2"
 
-Set `duration` with the speed of a ramped course, to 2 speed / acceleration + 2 ramp as in `torrente-loop4-ideal.toml`:
-a mean over a flight that goes on after its course counts the rest at the end as well.
+Leave out `duration` of a course of turns or ramps, as `torrente-loop4-ideal.toml` does: the flight then ends with its
+course at any speed. A mean over a longer flight counts the rest at the end as well.
 
 `quadsim reproduce` flies all that ship; exits with 1 where a number is beyond its tolerance (`--json`, `--junit FILE`).
 """

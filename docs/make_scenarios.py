@@ -81,7 +81,7 @@ def page(flights: dict[str, Flight]) -> str:
         "comments, to start your\nown from; comments in the files, in `scenarios/library`, state "
         "what each shows and with what numbers.\n",
         "The verdict is *satisfied* (flown to its end, every required constraint holds), *violated* (one does not, the "
-        "vehicle\ncrashes, or the controller ends in [fallback for good](controllers.md#fallback)) or *lost* (the "
+        "vehicle\ncrashes, or the controller ends in [permanent fallback](controllers.md#fallback)) or *lost* (the "
         "flight ends early). Each file states\nit, and a test flies them all; those that are not satisfied are meant "
         "not to be.\n",
         "A flight is lost when its controller gives up or answers with no command, when the simulation diverges, or "

@@ -49,7 +49,7 @@ class Pattern:
     """A sparse matrix assembled from blocks (..., rows, columns) that keep their positions.
 
     These are the rows (..., rows) and the columns (..., columns) of each block.  What is zero in the first blocks, or
-    below the share `rounding` of the largest of its block's row and of its block's column, is left out for good.
+    below the share `rounding` of the largest of its block's row and of its block's column, is left out permanently.
     """
 
     def __init__(

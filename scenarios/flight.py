@@ -104,9 +104,9 @@ class Flight:
 
     @property
     def satisfied(self) -> bool:
-        """Whether the flight was completed, without a crash or fallback for good, and every required constraint held.
+        """Whether the flight was completed, without a crash or permanent fallback, and every required constraint held.
 
-        What fallback for good is: `quadsim.flight.metrics.unrecovered`.
+        What permanent fallback is: `quadsim.flight.metrics.unrecovered`.
         """
         whole = self.log.reason is None and not self.log.control.crashed
         held = all(finding.satisfied for finding in self.findings if finding.limit.required)

@@ -29,7 +29,7 @@ def wanted_attitude(force: Sequence[Array], momentum: Sequence[Array], drag: Arr
 
     Args:
         force: A and its first two derivatives, (3,) each [N].
-        momentum: p, mass times the velocity that drag is reckoned with, and its first two derivatives, (3,) each.
+        momentum: p, mass times the velocity that drag is computed from, and its first two derivatives, (3,) each.
         drag: d (3,), body axes [1/s].
         heading: (3, 3) rows: the direction h and its first two derivatives.
     """

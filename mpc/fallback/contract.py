@@ -3,7 +3,7 @@
 Each period, the first of these that can be had:
 
 0. the inner controller's answer, if its status is one of `ACCEPTED` and it is finite and within the actuators' bounds;
-1. its last good plan, shifted by the periods since, with an LQR correction towards the states that the plan foresees,
+1. its last good plan, shifted by the periods since, with an LQR correction towards the states that the plan predicted,
    while it is not too old and the vehicle not too far from it;
 2. level hover by LQR: velocity to zero, then the place held; height and yaw held from the start;
 3. descent: the same, sinking at a steady speed, once level 2 has lasted too long.

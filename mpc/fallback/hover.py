@@ -99,7 +99,7 @@ class HoverLaw:
     def plan(
         self, state: Array, target: Array, before: Array, bounds: ActuatorBounds, horizon: int, trim: Trim
     ) -> Array:
-        """The speeds (N, 4) [rad/s] of the next periods, as the model foresees them, turned by the present yaw.
+        """The speeds (N, 4) [rad/s] of the next periods, as the model predicts them, turned by the present yaw.
 
         Args:
             state: (12,) now.

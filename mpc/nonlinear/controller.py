@@ -517,8 +517,8 @@ class NonlinearMPC:
                 if moved <= self.settings.tolerance:
                     break
                 # Full Gauss-Newton steps may oscillate: the share of them that is taken follows from how
-                # much of the last one each undoes (Aitken's relaxation; Irons and Tuck 1969), and falls for good where
-                # steps have not become shorter for long.
+                # much of the last one each undoes (Aitken's relaxation; Irons and Tuck 1969), and falls permanently
+                # where steps have not become shorter for long.
                 step = (plan - u).ravel()
                 undone = 1.0 - float(step @ last / (last @ last)) if last.size else 1.0
                 patience = PATIENCE if moved < 0.9 * least else patience - 1

@@ -28,6 +28,7 @@ _FLOWN: Final = {
     "tracking": {
         "unit": dict.fromkeys(REFERENCE_NAMES, str),
         **dict.fromkeys(("rmse", "max_error", "final_error", "overshoot"), _CHANNELS),
+        "position_error": Optional(dict.fromkeys(("mean", "rms", "max"), NUMBER)),
         "settling": Optional([{"channel": str, "time": NUMBER, "settled": MAYBE_NUMBER}]),
     },
     "control": {
@@ -128,6 +129,8 @@ FORM: Final = {
     "machine": Optional({"system": str, "processor": str, "cores": (int, type(None))}),
     "files": Each(str),
 }
+FLOWN_FORM: Final = FORM | _FLOWN
+"""Of a flight that came to its first period."""
 _TOGETHER: Final = {"worst_margin": ("worst_time", "peak_plant"), "worst_margin_sampled": ("peak_sampled",)}
 """Of a constraint: present wherever a margin is."""
 

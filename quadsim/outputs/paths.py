@@ -56,7 +56,9 @@ def problem_with_directory(path: Path, kind: str) -> str | None:
     if manifest.kind != kind:
         return f"{already(manifest.kind)}; choose another --out"
     others = foreign(path, manifest)
-    return f"it holds {few(others)}, not as quadsim wrote it; choose another --out" if others else None
+    built = kind == "export" and all(name.endswith((".elf", ".o", ".su")) for name in others)
+    remedy = "run `make clean` in it, or choose another --out" if built else "choose another --out"
+    return f"it holds {few(others)}, not as quadsim wrote it; {remedy}" if others else None
 
 
 def already(kind: str) -> str:

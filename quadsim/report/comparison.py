@@ -26,7 +26,7 @@ _VERDICTS: Final = {
     "violated": "does not hold every required constraint",
     "lost": "is lost",
 }
-FOR_GOOD: Final = "ends in fallback for good"
+FOR_GOOD: Final = "ends in permanent fallback"
 """Of a flight whose verdict rests on that alone; see `quadsim.flight.metrics.unrecovered`."""
 _Line = tuple[str, str, Callable[[Summary], Cell]]
 """A row's label, its unit, and the cell of a summary."""
@@ -128,7 +128,7 @@ def crash(summary: Summary) -> str | None:
 
 
 def failure_sentences(summary: Summary) -> list[str]:
-    """What prevented the optimum: fallback for good, and why the first QP without an answer had none."""
+    """What prevented the optimum: permanent fallback, and why the first QP without an answer had none."""
     periods, found = summary["controller"].get("unrecovered"), summary.get("diagnosis")
     sentences = [fallback_sentence(periods)] if periods else []
     return sentences + ([] if found is None else [found["sentence"], *filter(None, [found["advice"]])])
@@ -374,7 +374,7 @@ _COMMANDS: Final[tuple[_Line, ...]] = (
 _SOLVER: Final[tuple[_Line, ...]] = (
     ("statuses", "", _counts("statuses")),
     ("periods by fallback level", "", _counts("fallbacks")),
-    ("in fallback for good", "", _number("controller", "unrecovered")),
+    ("in permanent fallback", "", _number("controller", "unrecovered")),
     ("iterations, mean", "", _number("controller", "iterations", "mean")),
     ("iterations, most", "", _number("controller", "iterations", "max")),
     ("active constraints, most", "", _number("controller", "active_max")),

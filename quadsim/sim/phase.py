@@ -28,7 +28,7 @@ class PhaseMonitor:
     - On the ground it is `armed` while the previewed reference rises more than `TAKEOFF_RISE` above the resting height,
       else `landed`; from `armed` it is `flying` as soon as the clearance exceeds `AIRBORNE`.
     - From `flying` it is `landed` once the feet have touched for `REST` and the whole preview stays on the ground.
-    - From any phase, it has `crashed` for good when anything but the feet touches the ground, or when the feet do with
+    - From any phase, it has `crashed`, permanently, when anything but the feet touches the ground, or the feet do with
       the vehicle tilted beyond `CAPSIZED`, or when the vehicle's bounding ball touches an obstacle.
 
     Args:

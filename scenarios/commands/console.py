@@ -123,7 +123,7 @@ def outcome(summary: Mapping[str, Any]) -> Text:
         return styled((f"aborted{remark}", colour), f": {summary['reason']}")
     verdict = "every required constraint holds" if summary["satisfied"] else "a required constraint does not hold"
     if verdict_sentence(summary) == FOR_GOOD:
-        verdict = "but in fallback for good"
+        verdict = "but in permanent fallback"
     return styled((f"{crash(summary) or 'completed'}, {verdict}{remark}", colour))
 
 

@@ -36,7 +36,10 @@ def register_library() -> None:
     for name in scenario_names():
         if environment_id(name) not in gymnasium.registry:
             data = read_scenario(scenario_path(name), scenario_path)
-            periods = steps_per_period(data["duration"], data["control_period"])
+            if "duration" in data:
+                periods = steps_per_period(data["duration"], data["control_period"])
+            else:
+                periods = Scenario.read(data).periods
             gymnasium.register(**_description(name, name, periods))
 
 

@@ -5,18 +5,22 @@ from __future__ import annotations
 import copy
 import json
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
 from quadsim.errors import InputError
+from quadsim.flight.form import Each, Optional
+from quadsim.flight.summary import FLOWN_FORM
 from quadsim.report.table import ABSENT, Cell, Grid, Mark, line
+from scenarios.limits import build_limits
 from scenarios.papers.paper import NumberSpec, Paper, scenario_of
 from scenarios.progress import Progress, silent
 from scenarios.run import fly_scenario
 from scenarios.schema.settings import get_field
 
 HEAD: Final = ("number", "unit", "published", "ours", "difference", "tolerance", "reproduced")
+_RULE: Final = "measure must lead to a number of the flight's summary"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -137,6 +141,10 @@ def reproduce_paper(
     """
     specs = [spec for spec in paper.numbers if chosen(spec)]
     scenarios = [scenario_of(paper, spec) for spec in specs]
+    for spec, scenario in zip(specs, scenarios, strict=True):
+        _require_number(spec, [limit.name for limit in build_limits(scenario)])
+    for spec, scenario in zip(specs, scenarios, strict=True):
+        _require_number(spec, [limit.name for limit in build_limits(scenario)])
     flown: dict[str, dict[str, Any]] = {}
     found = []
     for done, (spec, scenario) in enumerate(zip(specs, scenarios, strict=True)):
@@ -149,10 +157,31 @@ def reproduce_paper(
     return Reproduction(paper=paper, numbers=tuple(found))
 
 
+def _require_number(spec: NumberSpec, constraints: Sequence[str]) -> None:
+    """Refuse a measure that cannot lead to a number of a flight's summary, by the summary's form."""
+    form: Any = FLOWN_FORM
+    path, allowed = "", dict[str, Any]()
+    for key in [*spec.measure.split("."), None]:
+        form = form.form if isinstance(form, Optional) else form
+        form = form[0] if isinstance(form, tuple) else form  # the other is None
+        if path == "constraints":
+            allowed = dict.fromkeys(constraints, form[0])
+        elif isinstance(form, Each) or (isinstance(form, list) and str(key).isdigit()):  # known after the flight
+            allowed = {str(key): form.form if isinstance(form, Each) else form[0]}
+        else:
+            allowed = form if isinstance(form, dict) else {}
+        if key not in allowed:
+            break
+        path, form = f"{path}.{key}".lstrip("."), allowed[key]
+    if path != spec.measure or form not in (int, float):
+        there = f" ({path or 'summary.json'} has: {', '.join(allowed)})" if allowed else ""
+        raise InputError(f"{spec.name}: {_RULE}; got {spec.measure!r}{there}")
+
+
 def _measured(spec: NumberSpec, summary: dict[str, Any]) -> Reproduced:
     if summary["status"] != "completed":
         return Reproduced(spec=spec, ours=None, reason=summary["reason"])
     value = get_field(copy.deepcopy(summary), spec.measure)
     if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-        raise InputError(f"{spec.name}: measure must lead to a number of the flight's summary; got {spec.measure!r}")
+        raise InputError(f"{spec.name}: {_RULE}; got {spec.measure!r}")
     return Reproduced(spec=spec, ours=float(value))

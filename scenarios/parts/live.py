@@ -1,4 +1,4 @@
-"""What happens in a flight besides the course and the controller that it starts with, foreseen or not."""
+"""What happens in a flight besides the course and the controller that it starts with, known in advance or not."""
 
 from __future__ import annotations
 

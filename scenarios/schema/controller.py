@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Mapping
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Final, Literal
 
 from pydantic import BeforeValidator, Discriminator, Field, Tag, ValidationError, model_validator
 from pydantic_core import PydanticCustomError
@@ -65,6 +65,9 @@ class NonlinearSpec(NonlinearPartsSpec):
         return self
 
 
+COMPILED: Final = ("unconstrained", "constrained", "robust")
+
+
 def _require_solver(name: str) -> None:
     if name not in SOLVERS:
         raise ValueError(f"solver: {UnknownNameError('solver', name, SOLVERS)}")
@@ -93,6 +96,11 @@ def _spelt_out(controller: Any) -> Any:
         controller, Mapping | WeightedSpec | NonlinearSpec | LQRSpec | PIDSpec | GeometricSpec | PluginSpec
     ):
         raise PydanticCustomError("controller", "a table or a controller's name")
+    if isinstance(controller, Mapping) and "compiled" in controller:
+        law, value = controller.get("type"), controller["compiled"]
+        if law in LAWS and law not in COMPILED:
+            rule = f"absent for {law}: only MPC with fixed matrices ({', '.join(COMPILED)}) can be compiled"
+            raise ValueError(f"compiled must be {rule}; got {value!r}")
     return controller
 
 

@@ -133,6 +133,11 @@ class _LoopSpec(_StartedSpec):
         """Of one turn at full speed [s]."""
         raise NotImplementedError
 
+    @property
+    def until(self) -> float:
+        """When it is over [s]."""
+        return self.start + abs(self.turns) * self.turn_time + self.ramp
+
     @model_validator(mode="after")
     def _check(self) -> _LoopSpec:
         _check_either(("period", self.period), ("speed", self.speed))
@@ -219,6 +224,13 @@ class _RampedSpec(_StartedSpec):
         default="free", description="free: no rate is left about body z, and the heading drifts; held: the initial yaw"
     )
     sampling: Time = Field(default=0.02, description="[s] step of the rectangle sums that make the phase")
+
+    @property
+    def until(self) -> float:
+        """When it is over [s]; see `scenarios.courses.ramped.ramped_phase`."""
+        parts = (self.ramp, self.speed / self.acceleration - self.ramp)
+        rising, constant, turning = (math.ceil(time / self.sampling - 1e-9) for time in (*parts, 2.0 * self.ramp))
+        return self.start + self.sampling * (2 * rising + 2 * constant + turning)
 
     @model_validator(mode="after")
     def _check(self) -> _RampedSpec:

@@ -158,11 +158,12 @@ class Scenario(Spec):
     expect: Verdict = Field(
         default="satisfied",
         description="its verdict, if all is right: satisfied (flown to its end, every required constraint holds), "
-        "violated (one does not, the vehicle crashes, or the controller ends in fallback for good), lost (the flight "
+        "violated (one does not, the vehicle crashes, or the controller ends in permanent fallback), lost (the flight "
         "ends early, by a criterion of [lost] or otherwise)",
     )
     duration: Annotated[float, Field(gt=0.0, le=LONGEST_FLIGHT)] = Field(
-        description="[s] simulated time, a whole number of control periods"
+        default=math.inf,
+        description="[s] whole control periods; absent: to the end of a course of turns or ramps",
     )
     control_period: Annotated[float, Field(gt=0.0, le=10.0)] = Field(
         description="[s] tau_s, time for which a command is held, a whole number of physics steps"
@@ -202,6 +203,14 @@ class Scenario(Spec):
 
     @model_validator(mode="after")
     def _check(self) -> Scenario:
+        if math.isinf(self.duration):  # absent, and it stays out of `model_fields_set`
+            until: float | None = getattr(self.reference, "until", None)
+            if until is None:
+                raise ValueError("duration is missing")
+            periods = math.ceil(until / self.control_period - 1e-6)
+            object.__setattr__(self, "duration", round(periods * self.control_period, 9))
+            if self.duration > LONGEST_FLIGHT:
+                raise ValueError(f"duration must be <= {LONGEST_FLIGHT}; the course takes {self.duration}")
         self.require_consistent()
         return self
 
@@ -354,6 +363,8 @@ class Scenario(Spec):
             (50, 30)
         """
         data = tomllib.loads(self.to_toml())
+        if "duration" not in self.model_fields_set:
+            del data["duration"]
         for path, value in changes.items():
             set_field(data, path, value.tolist() if hasattr(value, "tolist") else value, source="replace")
         return Scenario.parse(data, source=self.name)

@@ -89,8 +89,11 @@ def test_an_export_is_complete_and_replaces_an_earlier_one(tmp_path: Path) -> No
     names = {path.name for path in directory.iterdir()}
     assert {HEADER, SOURCE, DATA, "vectors.h", "vectors.c", "main.c", "Makefile", "README.md", "LICENSE"} <= names
     assert f"#define QUADSIM_VECTORS {scenario.periods}" in (directory / "vectors.h").read_text()
+    (directory / "main.o").write_text("built")
+    with pytest.raises(OutputError, match=r"holds main\.o, not .*; run `make clean` in it, or choose another --out$"):
+        quadsim.export(scenario, directory)
     (directory / "notes.txt").write_text("mine")
-    with pytest.raises(OutputError):
+    with pytest.raises(OutputError, match=r"as quadsim wrote it; choose another --out$"):
         quadsim.export(scenario, directory)
 
 

@@ -56,7 +56,7 @@ def _changes(t: Array, values: Sequence[Any]) -> list[tuple[float, Any]]:
 
 
 def _failures(run: Run) -> list[tuple[float, str, str]]:
-    """Time, text and level of why the first QP without an answer had none, and of fallback for good, from its begin."""
+    """Time, text and level of why the first QP without an answer had none, and of when permanent fallback begins."""
     found, periods = run.summary.get("diagnosis"), unrecovered(run.log.control)
     events = [] if found is None else [(found["time"], text) for text in (found["sentence"], found["advice"]) if text]
     if periods:

@@ -145,7 +145,7 @@ class SensorFault:
         sensor: which one.
         kind: what happens.
         start: [s].
-        stop: [s]; infinite for good.
+        stop: [s]; infinite where it is permanent.
         axes: which of the three numbers become NaN.
         offset: what is added, in the sensor's unit; a rotation vector in the body frame for attitude.
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import tracemalloc
 from dataclasses import replace
 
@@ -339,21 +340,25 @@ def test_steps_leak_no_memory_and_allocate_nothing_large(sideways: float, height
     reference[:, 0] = sideways * np.linspace(0.0, 1.0, 50) ** 4
     assert shortcut(problem).solve(np.zeros(12), reference, problem.model.u_bar).method is method
     state = np.zeros(12)
-    for _ in range(50):
-        controller.step(Moment(), state, reference)
-        controller.reset(problem.model.u_bar)
+
+    def take_50_steps() -> str:
+        for _ in range(50):
+            status = controller.step(Moment(), state, reference).status
+            controller.reset(problem.model.u_bar)
+        return status
+
+    gc.disable()  # a collection would empty the free list
+    list(map(tuple, np.zeros((3000, 4))))  # fills CPython's free list of such tuples, to which each step adds one
     tracemalloc.start()
     try:
-        status = controller.step(Moment(), state, reference).status
-        controller.reset(problem.model.u_bar)
+        status = take_50_steps()
         before, _ = tracemalloc.get_traced_memory()
         tracemalloc.reset_peak()
-        for _ in range(50):
-            controller.step(Moment(), state, reference)
-            controller.reset(problem.model.u_bar)
+        take_50_steps()
         after, peak = tracemalloc.get_traced_memory()
     finally:
         tracemalloc.stop()
+        gc.enable()
     assert status == (UNCONSTRAINED if method is Method.FREE else SOLVED)
     assert after - before < 2_000  # flat: less than 40 bytes a step
     # The condensed H alone has 320 kB; the whole QP's polish needs that for its active rows, twice.

@@ -146,7 +146,7 @@ def test_far_off_its_plan_the_vehicle_hovers(channel: str, value: float) -> None
     off[INDEX[channel]] = value
     assert call(guarded, 0.9 * off).fallback == 1
     assert call(guarded, off).fallback == 2
-    assert call(guarded).fallback == 2  # the plan is given up for good
+    assert call(guarded).fallback == 2  # the plan is given up permanently
 
 
 @pytest.mark.parametrize(("horizon", "held"), [(30, 20), (8, 7)])

@@ -176,16 +176,16 @@ def test_fallback_for_good_is_no_success_and_is_reported_with_its_reason(bare_ru
     )
     crashed = having(bare_run, "crashed", constraints=held, ground={**GROUND, "crashed": True})
     assert [verdict(run.summary) for run in (good, stuck, crashed)] == ["satisfied", "violated", "violated"]
-    assert verdict_sentence(stuck.summary) == "ends in fallback for good"
+    assert verdict_sentence(stuck.summary) == "ends in permanent fallback"
     assert verdict_sentence(crashed.summary) == "crashes"
     assert verdict_sentence(having(stuck, "both", constraints=bare_run.summary["constraints"]).summary).startswith(
         "does"
     )
     sentences = comparison_sentences([good, stuck])
-    assert "stuck ends in fallback for good; its scenario states the verdict satisfied." in sentences
+    assert "stuck ends in permanent fallback; its scenario states the verdict satisfied." in sentences
     reasons = ["318 periods in fallback, never recovered", DIAGNOSIS["sentence"], DIAGNOSIS["advice"]]
     assert failure_sentences(stuck.summary) == reasons
     assert f"stuck: {'; '.join(map(str, reasons))}." in sentences
     assert not [sentence for sentence in sentences if sentence.startswith("good:")]
-    assert cells(comparison_rows([good, stuck]), "Solver", "in fallback for good") == ["0", "318"]
+    assert cells(comparison_rows([good, stuck]), "Solver", "in permanent fallback") == ["0", "318"]
     assert failure_sentences(having(good, "solver", diagnosis={**DIAGNOSIS, "advice": ""}).summary) == [reasons[1]]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+import tomllib
 from typing import Any
 
 import numpy as np
@@ -53,6 +54,31 @@ def motion_of(scenario: Scenario) -> tuple[Motion, Vehicle]:
 def changed(**fields: Any) -> Scenario:
     base = load_scenario("torrente-loop8-ideal")
     return base.replace({f"reference.{name}": value for name, value in fields.items()})
+
+
+@pytest.mark.parametrize(
+    ("name", "duration"),
+    [("loop4-ideal", 12.0), ("loop8-ideal", 20.0), ("loop8-all", 20.0), ("lemniscate8-drag", 20.0)],
+)
+def test_the_published_flights_end_with_their_course(name: str, duration: float) -> None:
+    assert load_scenario(f"torrente-{name}").duration == duration
+
+
+@pytest.mark.parametrize("fields", [{"speed": 6.0}, {"speed": 6.005, "ramp": 1.99}, {"start": 1.5}, {"sampling": 0.03}])
+def test_a_flight_without_a_duration_ends_with_its_course(fields: dict[str, float]) -> None:
+    scenario = changed(**fields)
+    least = build_course(scenario).end + scenario.reference.sampling  # type: ignore[union-attr]
+    assert least - 1e-9 <= scenario.duration < least + scenario.control_period
+    again = Scenario.parse(tomllib.loads(scenario.to_toml()))
+    assert again == scenario
+    assert again.replace({"reference.speed": 5.0}).duration == scenario.duration  # it was given
+
+
+def test_turns_end_a_flight_too() -> None:
+    eight = load_scenario("hummingbird-figure-eight").replace({"duration": None, "reference.response_time": 0.0})
+    assert abs(eight.duration - build_course(eight).end) <= eight.control_period
+    with pytest.raises(ScenarioError, match=r"duration must be <= 86400\.0; the course takes"):
+        eight.replace({"duration": None, "reference.turns": 1e5, "control_period": 0.05, "plant.timestep": 0.01})
 
 
 @pytest.mark.parametrize("name", CHECKS)

@@ -170,6 +170,31 @@ def test_one_flight_serves_all_that_is_measured_of_it(tmp_path: Path, monkeypatc
     assert len(flights) == 1
 
 
+@pytest.mark.parametrize(
+    ("measure", "there"),
+    [
+        ("tracking.rmse.w", "tracking.rmse has: x, y, z, yaw"),
+        ("tracking.rmse", "tracking.rmse has: x, y, z, yaw"),
+        ("traking.rmse.x", "summary.json has: scenario, status, "),
+        ("constraints.role.worst_margin", "constraints has: roll, pitch"),
+        ("constraints.roll.worst", "constraints.roll has: name, signal, "),
+        ("vehicle.inertia.x", ""),
+        ("scenario", ""),
+    ],
+)
+def test_a_mistyped_measure_is_refused_before_the_first_flight(
+    measure: str, there: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("scenarios.papers.reproduction.fly_scenario", pytest.fail)
+    path = Path(written(tmp_path, ("0.5", "absolute = 0.0"), ("0.4", "absolute = 0.0")))
+    text = path.read_text().replace('"hover"', '"paper-constrained"').replace(', controller = { type = "pid" }', "")
+    before, _, after = text.rpartition('measure = "duration"')
+    path.write_text(f'{before}measure = "{measure}"{after}')
+    assert main(["reproduce", str(path)]) == EXIT_WRONG_INPUT
+    message = f"time flown: measure must lead to a number of the flight's summary; got {measure!r}"
+    assert (f"{message} ({there}" if there else f"{message}\n") in capsys.readouterr().err
+
+
 def test_a_scenario_beside_the_papers_file_is_found(tmp_path: Path) -> None:
     (tmp_path / "mine.toml").write_text('base = "hover"\nname = "mine"\ndescription = "mine"\n')
     path = Path(written(tmp_path, ("0.5", "absolute = 0.0")))
@@ -210,8 +235,8 @@ def test_what_cannot_be_flown_or_measured_is_refused(tmp_path: Path, capsys: pyt
     text = Path(written(tmp_path, ("0.5", "absolute = 0.0"))).read_text()
     path = tmp_path / "other.toml"
     for old, new, message in (
-        ('"duration"', '"tracking.rmse.w"', "time flown: measure must lead to a number of the flight's summary"),
-        ('"duration"', '"scenario"', "time flown: measure must lead to a number of the flight's summary"),
+        ('"duration"', '"ground.crashed"', "time flown: measure must lead to a number of the flight's summary"),
+        ('"duration"', '"controller.fallbacks.x"', "time flown: measure must lead to a number of the flight's summary"),
         ("duration = 0.5", "durations = 0.5", "durations is not a field of the scenario file"),
         ('"hover"', '"hovers"', "no scenario named 'hovers'"),
     ):

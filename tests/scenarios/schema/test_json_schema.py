@@ -85,6 +85,14 @@ def test_what_is_wrong_is_invalid(wrong: dict[str, Any]) -> None:
     assert VALIDATOR.is_valid({"base": "hover", "effects": {"rotors": {"rise": 0.1}}, "controller": {"horizon": 9}})
 
 
+def test_a_duration_is_required_where_the_course_has_no_end() -> None:
+    table = tomllib.loads(load_scenario("hover").to_toml())
+    circle = {"type": "circle", "radius": 1.0, "speed": 1.0}
+    del table["duration"]
+    assert not VALIDATOR.is_valid(table)
+    assert VALIDATOR.is_valid(table | {"reference": circle})
+
+
 def test_every_reference_is_to_a_table_that_is_there() -> None:
     references = {node["$ref"] for _, node in nodes(SCHEMA) if "$ref" in node}
     assert "#/$defs/Limit" in references

@@ -127,6 +127,10 @@ WRONG = {
     "reference.x=[3]": "reference.x.0 must be a table; got 3",
     "controller=3": "controller must be a table or a controller's name; got 3",
     "controller={horizon = 3}": "controller must be a table with a field type; got None",
+    "controller={type = 'nonlinear', compiled = true}": (
+        "controller.compiled must be absent for nonlinear: only MPC with fixed matrices "
+        "(unconstrained, constrained, robust) can be compiled; got True"
+    ),
     "controller.type=mpc": "controller must be one of 'unconstrained', 'constrained', 'robust', ...",
     "controller.horizon=0": "controller.horizon must be >= 1; got 0",
     "controller.horizon=1001": "controller.horizon must be <= 1000; got 1001",

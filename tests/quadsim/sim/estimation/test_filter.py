@@ -184,7 +184,7 @@ def test_a_velocity_far_off_is_found_again(gentle: Any, run_filter: SIMULATE) ->
 
 
 def test_a_gyro_that_comes_to_be_far_off_is_found_out(gentle: Any, run_filter: SIMULATE) -> None:
-    """20 times the bias reckoned with: it is the attitude that is refused, as the rates follow the gyro."""
+    """20 times the assumed bias: it is the attitude that is refused, as the rates follow the gyro."""
     shifted = SensorFault(
         sensor=SensorName.RATES, kind=FaultKind.BIAS, start=0.0, offset=tuple(np.radians([10.0, -10.0, 10.0]))
     )
