@@ -130,6 +130,20 @@ def write_json(path: Path, data: Mapping[str, Any]) -> None:
     write_text(path, to_json(data))
 
 
+def require_new(path: Path | str) -> None:
+    """Refuse a place where `write_new` would refuse, before any work is done for it.
+
+    Raises:
+        OutputError: see `write_new`.
+    """
+    path = real_path(path)
+    with output_errors(path):
+        if os.path.lexists(path):
+            raise OutputError(path, occupied(()))
+        with tempfile.TemporaryFile(dir=path.parent):
+            pass
+
+
 def write_new(path: Path, content: bytes) -> None:
     """Write a file where there is none; it appears complete or not at all.
 

@@ -7,6 +7,7 @@ from typing import Any
 
 import gymnasium
 import numpy as np
+from gymnasium.error import ResetNeeded
 
 from quadsim.controller import UNCONSTRAINED, Command
 from quadsim.errors import ParameterError
@@ -20,6 +21,8 @@ from scenarios.schema.robust import RobustSpec
 
 class MPCSafetyFilter(gymnasium.Wrapper):  # type: ignore[misc]
     """Passes an action, or else the nearest one after which the constraints can be held; see `mpc.robust.filter`.
+
+    An action that is not finite is never flown: the fallback's command is, until the next one.
 
     `info["filter"]` at each step: `intervened`, `correction` (by how much it changed any rotor's speed at most
     [rad/s]), and `fallback` (0 while its QP had an answer; see `quadsim.controller.Command`).  The episode's flight has
@@ -78,7 +81,14 @@ class MPCSafetyFilter(gymnasium.Wrapper):  # type: ignore[misc]
         return found
 
     def step(self, action: Action) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
-        """See `gymnasium.Env.step`."""
+        """See `gymnasium.Env.step`.
+
+        Raises:
+            ParameterError: the action has another shape than `action_space`.
+            ResetNeeded: there is no episode, or it has ended.
+        """
+        if self._vehicle is None:
+            raise ResetNeeded("call env.reset() first")
         wanted = self._base.actions.command(action, None, 1).speeds
         command = self.answer(wanted)
         correction = float(np.abs(command.speeds - wanted).max())

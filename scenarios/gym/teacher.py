@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from quadsim.errors import FlightError, ParameterError
-from quadsim.outputs import write_new
+from quadsim.outputs import require_new, write_new
 from quadsim.state import Array
 from scenarios.gym.actions import Action
 from scenarios.gym.registration import make_env
@@ -62,6 +62,8 @@ def expert(
 
     if episodes < 1:
         raise ParameterError("", "episodes", episodes, "at least 1")
+    if out is not None:
+        require_new(out)
     env = make_env(scenario, **options)
     base = env.unwrapped
     rows: dict[str, list[Any]] = {

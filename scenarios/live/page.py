@@ -410,6 +410,8 @@ class Page:
         return [gui.add_number(knob.path, value, min=knob.minimum, max=knob.maximum, step=step, hint=knob.about)]
 
     async def _turn(self, path: str, event: Any) -> None:
+        if path not in self._fields:  # of a controller that was replaced meanwhile
+            return
         knob, handles = self._fields[path]
         values = tuple(each.value for each in handles)
         value: Value = values[0] if len(handles) == 1 else values
@@ -439,7 +441,7 @@ class Page:
             )
             return False
         self._session.submit({"type": "controller", "fields": dict(fields)}, successor=successor)
-        self._answer.content = f'{STYLE}<div class="q">in force: {escape(what)}</div>'
+        self._answer.content = f'{STYLE}<div class="q">flies from the next period on: {escape(what)}</div>'
         return True
 
     # Buttons

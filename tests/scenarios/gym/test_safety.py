@@ -9,6 +9,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 import pytest
+from gymnasium.error import ResetNeeded
 
 import quadsim
 import quadsim.gym
@@ -55,6 +56,20 @@ def test_what_is_safe_passes_to_the_bit() -> None:
     info = env.step(wanted)[4]
     assert info["filter"] == {"intervened": False, "correction": 0.0, "fallback": 0}
     assert np.array_equal(env.unwrapped.flight().command[0], wanted)
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_an_action_that_is_not_finite_is_not_flown(value: float) -> None:
+    env = quadsim.gym.MPCSafetyFilter(quadsim.gym.make_env("robust", action="speeds"))
+    with pytest.raises(ResetNeeded, match="reset"):
+        env.step(np.zeros(4))
+    env.reset(seed=0)
+    for _ in range(10):
+        _, _, terminated, _, info = env.step(np.array([400.0, value, 400.0, 400.0]))
+        assert not terminated
+        assert info["filter"]["intervened"]
+        assert info["filter"]["fallback"] > 0
+    assert np.isfinite(env.unwrapped.flight().command).all()
 
 
 def test_what_cannot_be_filtered_is_refused() -> None:

@@ -13,9 +13,10 @@ import quadsim
 import quadsim.gym
 from quadsim.controller import Moment
 from quadsim.errors import OutputError
+from scenarios.gym import teacher
 
 
-def test_the_table_is_what_the_controller_answers(tmp_path: Path) -> None:
+def test_the_table_is_what_the_controller_answers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     scenario = quadsim.load("motion-capture").replace({"duration": 0.5})
     table = quadsim.gym.expert(scenario, episodes=2, seed=3, action="speeds", out=tmp_path / "a.parquet")
     assert pq.read_table(tmp_path / "a.parquet").equals(table)
@@ -27,8 +28,10 @@ def test_the_table_is_what_the_controller_answers(tmp_path: Path) -> None:
     seen = np.array(table["observation"].to_pylist())
     assert np.array_equal(seen[:10, names.index("vz")], flight.measured["vz"])
     assert set(table["status"].to_pylist()) <= {"solved", "unconstrained"}
-    with pytest.raises(OutputError, match="already there"):
-        quadsim.gym.expert(scenario, out=tmp_path / "a.parquet")
+    monkeypatch.setattr(teacher, "make_env", None)  # refused before anything flies
+    for place, message in (("a.parquet", "already there"), ("none/a.parquet", "no such directory|No such file")):
+        with pytest.raises(OutputError, match=message):
+            quadsim.gym.expert(scenario, out=tmp_path / place)
 
 
 def test_the_teacher_corrects_another_pilot() -> None:
