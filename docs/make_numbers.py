@@ -33,6 +33,7 @@ from scenarios.run import fly_scenario
 
 ROOT = Path(__file__).resolve().parent.parent
 PERIOD = 0.05
+FORMS = ("piqp-dense", "piqp-multistage")
 MUJOCO_ORDER = [0, 6, 1, 7, 2, 8, 3, 9, 4, 10, 5, 11]
 """Where the paper's states are among MuJoCo's tangent coordinates (positions, rotations, then their rates)."""
 
@@ -203,15 +204,13 @@ def copy_figure(drawn: Path, name: str, colours: int) -> None:
 
 @functools.cache
 def solver_difference() -> float:
-    """Largest difference in command between `piqp-dense` and `piqp-multistage` over the constrained flight [rad/s].
+    """Largest difference in command between `piqp-dense` and `piqp-multistage` over the take-off [rad/s].
 
     Both solve a QP in every period: the exact optimum without one is the same for both.
     """
-    solvers = ("piqp-dense", "piqp-multistage")
-    dense, staged = (
-        fly("paper-constrained", f"controller.solver={name}", "controller.shortcut=false") for name in solvers
-    )
-    return float(np.abs(dense.log.control.speeds - staged.log.control.speeds).max())
+    settings = ("duration=10.0", "controller.shortcut=false")
+    flights = [fly("paper-constrained", f"controller.solver={name}", *settings) for name in FORMS]
+    return float(np.abs(np.subtract(*(flight.log.control.speeds for flight in flights))).max())
 
 
 def main() -> None:
@@ -234,7 +233,7 @@ def main() -> None:
         f"## Linear prediction against MuJoCo near hover\n\n{markdown(prediction_errors(constrained.vehicle))}",
         "The error falls by four as the deviation halves: quadratically.\n",
         "## The two forms of the QP\n\nLargest difference between the commands of `piqp-dense` and `piqp-multistage`\n"
-        f"over the whole constrained flight, a QP in every period: {solver_difference():.1e} rad/s.\n",
+        f"over the take-off, the first 10 s, with a QP in every period: {solver_difference():.1e} rad/s.\n",
     )
     replace_in(ROOT / "README.md", "results", table)
 
