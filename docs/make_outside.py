@@ -41,8 +41,8 @@ turbulence and four sensors.
   steps of a control period at once.
 - Forces that follow from the motion cannot be: each depends on the step before it. They are plain numbers in one
   function, a microsecond a step, and reach MuJoCo through its memory.
-- MuJoCo's Python bindings read the clock before and after each part of a step, at every stage of Runge-Kutta, which took
-  two fifths of it. No part is timed now.
+- MuJoCo's Python bindings read the clock before and after each part of a step, at every stage of Runge-Kutta, which
+  took two fifths of it. No part is timed now.
 - None of this changes a bit of a flight's numbers, nor a pixel of figures and films. What the whole flight gains
   besides is the controller's: exact optima from the last period's active set.
 - No pass of Python's cycle collector over what was there before a flight falls into one of its steps, whatever is
