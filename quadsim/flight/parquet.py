@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, BinaryIO, Final
+from typing import Any, Final
 
 import numpy as np
 import pyarrow as pa
@@ -123,7 +123,7 @@ def add_metadata(path: Path, texts: Mapping[str, str]) -> None:
     Raises:
         FileError: it cannot be read.
     """
-    table = _read(path)
+    table = read_parquet(path)
     named = {**(table.schema.metadata or {}), **{key.encode(): text.encode() for key, text in texts.items()}}
     _write(table.replace_schema_metadata(named), path)
 
@@ -134,7 +134,7 @@ def read_metadata(path: Path) -> dict[str, str]:
     Raises:
         FileError: it cannot be read.
     """
-    metadata = _read(path, pq.read_schema).metadata or {}
+    metadata = _read(path, lambda file: file.schema_arrow).metadata or {}
     return {key.decode(errors="replace"): text.decode(errors="replace") for key, text in metadata.items()}
 
 
@@ -143,12 +143,24 @@ def _write(table: pa.Table, path: Path) -> None:
         pq.write_table(table, file, compression="zstd")
 
 
-def _read(path: Path, read: Callable[[BinaryIO], Any] = pq.read_table) -> Any:
+def read_parquet(path: Path) -> pa.Table:
+    """A Parquet file, read by the calling thread alone.
+
+    Arrow's own threads may still hold the file when Python ends, and a thread that takes Python's lock then aborts the
+    process (https://github.com/apache/arrow/issues/34314).
+
+    Raises:
+        FileError: it is missing, no file, or damaged.
+    """
+    return _read(path, lambda file: file.read(use_threads=False))
+
+
+def _read(path: Path, read: Callable[[pq.ParquetFile], Any]) -> Any:
     if not path.is_file():  # reading a pipe would not end
         raise FileError(path, "is not a readable Parquet file (it is missing or no file)")
     try:
-        with path.open("rb") as file:
-            return read(file)
+        with path.open("rb") as file:  # Arrow by itself takes no path that is no Unicode
+            return read(pq.ParquetFile(file, pre_buffer=False))
     except (OSError, ValueError, pa.ArrowException) as error:
         raise FileError(path, f"is not a readable Parquet file ({error})") from error
 
@@ -181,7 +193,7 @@ def read_log(directory: Path, *, reason: str | None = None) -> FlightLog:
     Raises:
         FileError: a file is missing or damaged.
     """
-    flight, timing, plant = (_read(directory / name) for name in (FLIGHT_FILE, TIMING_FILE, PLANT_FILE))
+    flight, timing, plant = (read_parquet(directory / name) for name in (FLIGHT_FILE, TIMING_FILE, PLANT_FILE))
     try:
         before = np.array([float(text) for text in (flight.schema.metadata or {})[b"speeds_before"].split(b",")])
         state = _stack(flight, STATE_NAMES)
@@ -235,7 +247,7 @@ def _read_predicted(directory: Path) -> np.ndarray[Any, np.dtype[np.float32]] | 
     path = directory / HORIZON_FILE
     if not path.exists():
         return None
-    table = _read(path)
+    table = read_parquet(path)
     columns = [table.column(f"predicted_{axis}").combine_chunks() for axis in "xyz"]
     shape = (table.num_rows, columns[0].type.list_size)  # also right for a flight of no period
     return np.stack([column.flatten().to_numpy().reshape(shape) for column in columns], axis=-1)

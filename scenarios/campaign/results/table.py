@@ -13,13 +13,13 @@ from typing import Any, Final
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.parquet as pq
 
 from quadsim.controller import ACCEPTED, Phase
 from quadsim.errors import FileError
 from quadsim.flight import metrics
 from quadsim.flight.audit import Finding, Limit
 from quadsim.flight.log import FlightLog, TimingLog
+from quadsim.flight.parquet import read_parquet
 from quadsim.state import REFERENCE_NAMES, REFERENCE_UNITS, Array
 from scenarios.campaign.results.events import Flags
 from scenarios.campaign.results.verdicts import ERROR, VERDICTS
@@ -173,13 +173,7 @@ def read_table(path: Path) -> pa.Table:
     Raises:
         FileError: the file is missing, damaged, or none of ours.
     """
-    if not path.is_file():  # a pipe would be read for ever
-        raise FileError(path, "is not a readable Parquet file (it is missing or no file)")
-    try:
-        with path.open("rb") as file:  # Arrow by itself takes no path that is no Unicode
-            table = pq.read_table(file)
-    except (OSError, ValueError, pa.ArrowException) as error:
-        raise FileError(path, f"is not a readable Parquet file ({error})") from error
+    table = read_parquet(path)
     if "flight" not in table.column_names:
         raise FileError(path, "is not a campaign's table: it has no column 'flight'")
     return table

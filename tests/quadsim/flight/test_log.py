@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import shutil
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -173,3 +175,17 @@ def test_a_column_of_texts_is_refused(tmp_path: Path, name: str, column: str) ->
     pq.write_table(table.set_column(table.schema.get_field_index(column), column, texts), tmp_path / name)
     with pytest.raises(FileError, match="lacks or misstates a column of the flight log"):
         read_log(tmp_path)
+
+
+def test_reading_leaves_no_thread_behind_to_abort_python_as_it_ends(tmp_path: Path) -> None:
+    write(tmp_path, small_log())
+    code = """
+import sys
+from pathlib import Path
+import psutil
+from quadsim.flight.parquet import read_log
+before = psutil.Process().num_threads()
+read_log(Path(sys.argv[1]))
+sys.exit(psutil.Process().num_threads() - before)
+"""
+    subprocess.run([sys.executable, "-c", code, str(tmp_path)], check=True)
