@@ -23,8 +23,8 @@ def real_path(path: Path | str) -> Path:
         if real.is_symlink():
             raise OutputError(path, "a symbolic link leads back to itself")
         return path if real == path.absolute() and ".." not in path.parts else real
-    except ValueError as error:  # a null byte
-        raise OutputError(ascii(str(path)), str(error)) from error
+    except ValueError as error:
+        raise OutputError(ascii(str(path)), "it has a null byte") from error
     except OSError as error:
         raise as_output_error(path, error) from error
 

@@ -287,7 +287,7 @@ WRONG: list[tuple[str, str | list[str], str]] = [
     ("no vehicle file", "vehicle.file=gone.toml", "gone.toml: no such vehicle file"),
     # courses
     ("no course file", "reference={type='csv', file='gone.csv'}", "gone.csv: cannot be read@"),
-    ("no file name", 'reference={type="csv", file="a\\u0000b"}', r"a\x00b: cannot be read (embedded null byte)"),
+    ("no file name", 'reference={type="csv", file="a\\u0000b"}', r"a\x00b: cannot be read (@embedded null @)"),
     ("a device", "reference={type='csv', file='/dev/null'}", "/dev/null: cannot be read (it is not a file)"),
     (
         "no way to go",

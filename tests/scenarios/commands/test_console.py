@@ -161,7 +161,7 @@ def test_a_controller_of_the_user_names_itself_as_text(nasty: str) -> None:
 def test_folders_of_any_name_are_compared_and_checked(
     tmp_path: Path, short_run_directory: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Runs of such names in such a folder; `\udcff` is how Python names a byte that is no UTF-8."""
+    r"""Runs of such names in such a folder; `\udcff` is how Python names a byte that is no UTF-8."""
     names = ["[bold]run", "a\nb", "run\udcff", "\x1b[31mred", "\u202eevil"]
     folder = tmp_path.joinpath(*names)
     runs = [shutil.copytree(short_run_directory, folder / each) for each in names]
