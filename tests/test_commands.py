@@ -48,7 +48,7 @@ LINES = [
     for block in re.findall(r"^```sh\n(.*?)^```", DOCUMENTS, re.DOTALL | re.MULTILINE)
     for line in block.splitlines()
 ]
-QUADSIM = [line.partition("#")[0].strip() for line in LINES if line.startswith("quadsim ")]
+QUADSIM = [*dict.fromkeys(line.partition("#")[0].strip() for line in LINES if line.startswith("quadsim "))]
 ELSEWHERE = ("quadsim view", "--cluster", "--fly")
 """`view` opens a window and stays; a cluster, and what takes an emulator, have tests of their own."""
 RUNNABLE = [line for line in QUADSIM if not any(word in line for word in ELSEWHERE)]

@@ -72,8 +72,8 @@ class RigidBody:
             wind: (3,) velocity of the air, world [m/s].
             held: (6,) force, world [N], and torque, body [N m], that stay the same over the step.
         """
-        h, push = self._step, sum(thrusts)
-        fixed = (push, [sum(c * f for c, f in zip(row, thrusts, strict=True)) for row in self._torques], held)
+        h, (f1, f2, f3, f4) = self._step, thrusts
+        fixed = f1 + f2 + f3 + f4, [a * f1 + b * f2 + c * f3 + d * f4 for a, b, c, d in self._torques], held
 
         def rates(x: Sequence[float]) -> Rates:
             wrench = self._forces.at(x[:7], x[7:], thrusts, of_rotors, wind)
@@ -84,8 +84,9 @@ class RigidBody:
         k3, w3 = rates([x + 0.5 * h * k for x, k in zip(state, k2, strict=True)])
         k4, w4 = rates([x + h * k for x, k in zip(state, k3, strict=True)])
         after = [x + h / 6.0 * (a + 2.0 * b + 2.0 * c + d) for x, a, b, c, d in zip(state, k1, k2, k3, k4, strict=True)]
-        norm = math.sqrt(sum(q * q for q in after[3:7]))
-        after[3:7] = [q / norm for q in after[3:7]]
+        w, x, y, z = after[3:7]
+        norm = math.sqrt(w * w + x * x + y * y + z * z)
+        after[3:7] = w / norm, x / norm, y / norm, z / norm
         acted = [e + (a + 2.0 * b + 2.0 * c + d) / 6.0 for e, a, b, c, d in zip(held, w1, w2, w3, w4, strict=True)]
         return after, acted
 
