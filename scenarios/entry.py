@@ -11,6 +11,7 @@ import os
 import signal
 import sys
 import time as clock
+from types import FrameType
 from typing import Final
 
 _STOPS: Final = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
@@ -21,15 +22,16 @@ _PATIENCE_S: Final = 1.0
 class _Stop:
     """Makes Ctrl-C of a signal; who goes away, or is impatient, sends several.
 
-    Python ignores an exception that comes up in a destructor or a callback, of which imports have many; such a
-    Ctrl-C is raised once more.  A compiled module that is being imported makes an ImportError of it.
+    Python ignores an exception that comes up in a destructor or a callback, of which imports have many; a compiled
+    module that is being imported makes an ImportError of it, which whoever can do without that module ignores.  Such a
+    Ctrl-C is raised once more, and none within an import, unless that does not end.
 
     Attributes:
         heard: whether there was one.
     """
 
     def __init__(self) -> None:
-        self._last = -math.inf
+        self._first = self._last = -math.inf  # of the present Ctrl-C
 
     @property
     def heard(self) -> bool:
@@ -38,17 +40,32 @@ class _Stop:
     def raise_again(self, ignored: sys.UnraisableHookArgs) -> None:
         """See `sys.unraisablehook`."""
         if issubclass(ignored.exc_type, KeyboardInterrupt):
-            self._last = -math.inf
-            signal.signal(signal.SIGALRM, self)
-            signal.setitimer(signal.ITIMER_REAL, 0.01)  # by then Python is out of there
+            self._raise_soon()
         else:
             sys.__unraisablehook__(ignored)
 
-    def __call__(self, number: int, frame: object) -> None:
+    def __call__(self, number: int, frame: FrameType | None) -> None:
         """See `signal.signal`."""
-        before, self._last = self._last, clock.monotonic()
-        if self._last - before > _PATIENCE_S:
+        now = clock.monotonic()
+        if number != signal.SIGALRM:
+            before, self._last = self._last, now
+            if now - before <= _PATIENCE_S:
+                return
+            self._first = now
+        if _is_importing(frame) and now - self._first < _PATIENCE_S:
+            self._raise_soon()
+        else:
             raise KeyboardInterrupt
+
+    def _raise_soon(self) -> None:
+        signal.signal(signal.SIGALRM, self)
+        signal.setitimer(signal.ITIMER_REAL, 0.01)
+
+
+def _is_importing(frame: FrameType | None) -> bool:
+    while frame is not None and not frame.f_code.co_filename.startswith("<frozen importlib"):
+        frame = frame.f_back
+    return frame is not None
 
 
 def main() -> int:
@@ -75,6 +92,7 @@ def main() -> int:
             print("quadsim: interrupted (Ctrl-C); nothing half written was left behind", file=sys.stderr)
         return 1
     finally:
+        signal.setitimer(signal.ITIMER_REAL, 0.0)
         for stop in heard:  # what is done is done, and the status reports how
             signal.signal(stop, signal.SIG_IGN)
 

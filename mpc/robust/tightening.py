@@ -120,14 +120,14 @@ def margins(
     basis = observed(A, C)
     A, B, C, E = basis.T @ A @ basis, basis.T @ B, C @ basis, basis.T @ E
     K = correction(*discretise(A, B, period), C / (ERROR_SHARE * room)[:, None], SPEED_SHARE * vehicle.hover_speed)
-    drawn_in = growth(A, B, C, E * largest, K, period=period, horizon=horizon, delay=delay)
+    margins = growth(A, B, C, E * largest, K, period=period, horizon=horizon, delay=delay)
     passed = between_samples(settings.turning, period)
-    drawn_in += passed
-    worst = int(np.argmax(drawn_in[-1] / room))
-    if drawn_in[-1, worst] > LARGEST_SHARE * room[worst]:
+    margins += passed
+    worst = int(np.argmax(np.round(margins[-1] / room, 9)))  # of equal ones, the first
+    if margins[-1, worst] > LARGEST_SHARE * room[worst]:
         turned = growth(A, B, C, E * largest * _TURNS, K, period=period, horizon=horizon, delay=delay)[-1, worst]
         shares = {
-            "acceleration": drawn_in[-1, worst] - turned - passed,
+            "acceleration": margins[-1, worst] - turned - passed,
             "angular_acceleration": turned,
             "turning": passed,
         }
@@ -135,11 +135,11 @@ def margins(
         name, scale, unit = bounds.output(worst)
         rule = (
             f"smaller, or the bounds on {name} wider: these leave {scale * room[worst]:.3g} {unit} on either side of "
-            f"their middle, of which {scale * drawn_in[-1, worst]:.3g} {unit} would be given up and at most "
+            f"their middle, of which {scale * margins[-1, worst]:.3g} {unit} would be given up and at most "
             f"{scale * LARGEST_SHARE * room[worst]:.3g} {unit} may be"
         )
         raise ParameterError("controller.tightening", most, getattr(settings, most), rule)
-    return read_only(drawn_in)
+    return read_only(margins)
 
 
 def position_margins(

@@ -121,6 +121,50 @@ def test_a_stop_that_python_ignores_is_heard(tmp_path: Path) -> None:
     assert done.stderr.startswith(b"quadsim: interrupted (Ctrl-C)")
 
 
+DISPENSABLE = """
+import os, signal, time
+try:
+    os.kill(os.getpid(), signal.SIGINT)
+    time.sleep(0.1)
+except KeyboardInterrupt:
+    raise ImportError("as of a compiled module") from None
+"""
+ENDLESS = """
+import os, signal
+os.kill(os.getpid(), signal.SIGINT)
+while True:
+    pass
+"""
+IMPORTING = """
+import sys, time
+from scenarios import cli, entry
+def run():
+    try:
+        import module
+    except ImportError:
+        pass
+    time.sleep(5)
+    return 0
+cli.main = run
+sys.exit(entry.main())
+"""
+
+
+@pytest.mark.parametrize("module", [DISPENSABLE, ENDLESS])
+def test_a_stop_within_an_import_is_heard(tmp_path: Path, module: str) -> None:
+    (tmp_path / "module.py").write_text(module)
+    done = subprocess.run(
+        [sys.executable, "-c", IMPORTING],
+        cwd=tmp_path,
+        env=environment(),
+        capture_output=True,
+        timeout=60,
+        preexec_fn=listening,
+    )
+    assert done.returncode == EXIT_FAILED
+    assert done.stderr.startswith(b"quadsim: interrupted (Ctrl-C)")
+
+
 def spent(process: subprocess.Popen[str]) -> float:
     """Processor time of a process until now [s]."""
     times = psutil.Process(process.pid).cpu_times()

@@ -5,7 +5,9 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import inspect
+import shlex
 import shutil
+import sys
 import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -156,7 +158,10 @@ def _checked(system: str, table: Mapping[str, Any], kind: Any) -> Jobs:
     for name in _OURS:
         if not isinstance(table[name], int) or isinstance(table[name], bool) or table[name] < 1:
             raise ParameterError(system, name, table[name], "a whole number of 1 or more")
-    options = {name: value for name, value in table.items() if name not in _OURS}
+    import dask
+
+    python = dask.config.get(f"jobqueue.{system}.python", None) or shlex.quote(sys.executable)  # unquoted else
+    options = {"python": python, **{name: value for name, value in table.items() if name not in _OURS}}
     return Jobs(system=system, jobs=table["jobs"], cores=table["cores"], options=options)
 
 

@@ -325,6 +325,13 @@ def test_a_slurm_file_becomes_a_job_script(tmp_path: Path) -> None:
     assert jobs.workers == DaskEngine(str(tmp_path / "slurm.toml")).workers == 8
 
 
+def test_a_job_starts_the_python_that_submits_it_or_another(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "executable", "/home/me/my code/.venv/bin/python")
+    assert "'/home/me/my code/.venv/bin/python' -m" in job_script(read_jobs(write(tmp_path / "a.toml", SLURM)))
+    there = read_jobs(write(tmp_path / "b.toml", SLURM + 'python = "python3"\n'))
+    assert "\npython3 -m" in job_script(there)
+
+
 @pytest.mark.parametrize("system", ["htcondor", "lsf", "moab", "oar", "pbs", "sge"])
 def test_every_batch_system_of_dask_jobqueue_is_there(system: str, tmp_path: Path) -> None:
     extra = {"htcondor": 'disk = "1GB"\n', "oar": 'memory_per_core_property_name = "memcore"\n'}.get(system, "")
