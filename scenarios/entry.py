@@ -17,6 +17,8 @@ from typing import Final
 _STOPS: Final = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 _PATIENCE_S: Final = 1.0
 """Within which another signal is the same one: what is cleared up meanwhile is not to be interrupted."""
+_LONGEST_IMPORT_S: Final = 5.0
+"""All of ours together take a fifth of that, on a busy machine more."""
 
 
 class _Stop:
@@ -31,7 +33,7 @@ class _Stop:
     """
 
     def __init__(self) -> None:
-        self._first = self._last = -math.inf  # of the present Ctrl-C
+        self._first = self._last = -math.inf
 
     @property
     def heard(self) -> bool:
@@ -51,8 +53,9 @@ class _Stop:
             before, self._last = self._last, now
             if now - before <= _PATIENCE_S:
                 return
-            self._first = now
-        if _is_importing(frame) and now - self._first < _PATIENCE_S:
+            if now - self._first > _LONGEST_IMPORT_S:
+                self._first = now
+        if _is_importing(frame) and now - self._first < _LONGEST_IMPORT_S:
             self._raise_soon()
         else:
             raise KeyboardInterrupt
