@@ -113,14 +113,15 @@ def _cache() -> Path:
     Raises:
         OutputError: it cannot be made, or is not the user's alone.
     """
-    base = os.environ.get("XDG_CACHE_HOME", "")
-    root = Path(base) if Path(base).is_absolute() else Path.home() / ".cache"
-    folder = root / "quadsim" / "compiled"
+    base = Path(os.environ.get("XDG_CACHE_HOME", ""))
+    folder = (base if base.is_absolute() else Path("~/.cache")) / "quadsim" / "compiled"
     try:
+        folder = folder.expanduser()
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         found = folder.lstat()
-    except OSError as error:
-        raise OutputError(folder, error.strerror or str(error)) from error
+    except (OSError, RuntimeError) as error:  # RuntimeError: there is no home
+        reason = error.strerror if isinstance(error, OSError) else error
+        raise OutputError(folder, f"{reason}; XDG_CACHE_HOME may name another place") from error
     if not stat.S_ISDIR(found.st_mode) or found.st_uid != os.getuid() or found.st_mode & 0o022:
         raise OutputError(folder, "it holds code that will be run, so it has to be yours and writable by you alone")
     return folder

@@ -74,6 +74,20 @@ def test_a_cache_that_others_can_write_is_refused(cache: Path) -> None:
         quadsim.fly(quadsim.load("hover", {**COMPILED, "duration": 0.2}), progress=False)
 
 
+def test_without_a_place_for_the_cache_the_variable_is_named(cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    scenario = quadsim.load("hover", {**COMPILED, "duration": 0.2})
+    cache.parent.parent.joinpath("file").write_text("")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(cache.parent.parent / "file"))
+    with pytest.raises(OutputError, match=r"file/quadsim/compiled: Not a directory; XDG_CACHE_HOME may name another"):
+        quadsim.fly(scenario, progress=False)
+    monkeypatch.delenv("XDG_CACHE_HOME")
+    monkeypatch.setattr("os.path.expanduser", lambda path: path)
+    with pytest.raises(
+        OutputError, match=r"~/\.cache/quadsim/compiled: .*home.*; XDG_CACHE_HOME may name another place"
+    ):
+        quadsim.fly(scenario, progress=False)
+
+
 def test_a_missing_compiler_is_named(cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("CC", "no-such-compiler")
     with pytest.raises(CompilerError, match=r"no C compiler found .*no-such-compiler.*install one"):
