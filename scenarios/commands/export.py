@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from argparse import Namespace
 from pathlib import Path
 
@@ -16,7 +17,7 @@ def export(options: Namespace) -> int:
     """`quadsim export`."""
     scenario = load(options.scenario, options)
     directory = write_export(scenario, Path(options.out), precision=options.precision, target=options.target)
-    print(f"Wrote {directory}: make -C {directory} check compiles it and runs its recorded periods")
+    print(f"Wrote {directory}: make -C {shlex.quote(str(directory))} check compiles it and runs its recorded periods")
     if not options.fly:
         return EXIT_DONE
     from scenarios.export.in_the_loop import fly_exported
