@@ -6,6 +6,7 @@ Ctrl-C, SIGTERM and SIGHUP all are `KeyboardInterrupt`, unless the process was s
 from __future__ import annotations
 
 import contextlib
+import io
 import math
 import os
 import signal
@@ -83,6 +84,8 @@ def main() -> int:
         if sys.stdout is None:
             print("quadsim: stdout is closed; to do without what is printed: >/dev/null", file=sys.stderr)
             return 2
+        if isinstance(sys.stdout, io.TextIOWrapper) and sys.stdout.errors == "strict":
+            sys.stdout.reconfigure(errors="backslashreplace")  # a terminal may lack characters
         from scenarios.cli import main as run
 
         if handler.heard:  # and swallowed by what was imported

@@ -209,6 +209,18 @@ def test_closed_streams_do_no_harm(tmp_path: Path, closed: tuple[int, ...]) -> N
         rundir.load_run(tmp_path / "run")
 
 
+def test_characters_that_a_terminal_lacks_are_spelt_out(tmp_path: Path) -> None:
+    done = subprocess.run(
+        [sys.executable, "-m", "scenarios.cli", "check", "hover", *SHORT],
+        cwd=tmp_path,
+        env=environment() | {"PYTHONIOENCODING": "ascii"},
+        capture_output=True,
+        timeout=60,
+    )
+    assert (done.returncode, done.stderr) == (EXIT_DONE, b"")
+    assert rb"\xb15" in done.stdout  # of the bounds on roll
+
+
 @pytest.mark.parametrize("stop", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_a_long_flight_that_is_stopped_is_saved_up_to_there(tmp_path: Path, stop: signal.Signals) -> None:
     process = subprocess.Popen(
