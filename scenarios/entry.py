@@ -84,7 +84,7 @@ def main() -> int:
         if sys.stdout is None:
             print("quadsim: stdout is closed; to do without what is printed: >/dev/null", file=sys.stderr)
             return 2
-        if isinstance(sys.stdout, io.TextIOWrapper) and sys.stdout.errors == "strict":
+        if isinstance(sys.stdout, io.TextIOWrapper) and sys.stdout.errors in ("strict", "surrogateescape"):
             sys.stdout.reconfigure(errors="backslashreplace")  # a terminal may lack characters
         from scenarios.cli import main as run
 
