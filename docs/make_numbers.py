@@ -203,12 +203,12 @@ def copy_figure(drawn: Path, name: str, colours: int) -> None:
 
 
 @functools.cache
-def solver_difference() -> float:
-    """Largest difference in command between `piqp-dense` and `piqp-multistage` over half of the flight [rad/s].
+def solver_difference(duration: float = 30.0) -> float:
+    """Largest difference in command between `piqp-dense` and `piqp-multistage` over this much of the flight [rad/s].
 
     Both solve a QP in every period: the exact optimum without one is the same for both.
     """
-    settings = ("duration=30.0", "controller.shortcut=false")
+    settings = (f"duration={duration}", "controller.shortcut=false")
     flights = [fly("paper-constrained", f"controller.solver={name}", *settings) for name in FORMS]
     return float(np.abs(np.subtract(*(flight.log.control.speeds for flight in flights))).max())
 
