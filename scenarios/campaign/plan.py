@@ -22,7 +22,7 @@ from scenarios.limits import build_limits
 from scenarios.loading import check_parts, parse_scenario
 from scenarios.parts.vehicle import build_vehicle, resolve_vehicle
 from scenarios.schema.bases import locate_files, merge, read_scenario
-from scenarios.schema.problems import ScenarioError, describe
+from scenarios.schema.problems import ScenarioError, describe_all
 from scenarios.schema.scenario import Scenario
 from scenarios.schema.settings import apply_setting
 from scenarios.shipped import campaign_path, scenario_path
@@ -170,8 +170,7 @@ def parse_campaign(data: Mapping[str, Any], *, source: str) -> CampaignSpec:
     try:
         return CampaignSpec.model_validate(dict(data))
     except ValidationError as error:
-        found = error.errors(include_url=False)
-        problems = [describe(details, data, CampaignSpec, file="campaign") for details in found]
+        problems = describe_all(error, data, CampaignSpec, file="campaign")
         raise ScenarioError(source, problems) from error
 
 

@@ -13,7 +13,7 @@ from quadsim.fields import NonNegative, Number, Positive
 from scenarios.loading import check_parts, parse_scenario
 from scenarios.schema.base import MOST_ENTRIES, Pair, Spec
 from scenarios.schema.bases import merge, read_scenario
-from scenarios.schema.problems import ScenarioError, describe
+from scenarios.schema.problems import ScenarioError, describe_all
 from scenarios.schema.scenario import Scenario
 from scenarios.shipped import paper_path, scenario_path
 
@@ -98,8 +98,7 @@ def load_paper(name: str) -> Paper:
     try:
         spec = PaperSpec.model_validate(data)
     except ValidationError as error:
-        found = error.errors(include_url=False)
-        problems = [describe(details, data, PaperSpec, file="paper") for details in found]
+        problems = describe_all(error, data, PaperSpec, file="paper")
         raise ScenarioError(path.name, problems) from error
     return Paper(path=path, **{field: getattr(spec, field) for field in PaperSpec.model_fields})
 

@@ -176,9 +176,14 @@ class ScenarioError(InputError):
         self.source, self.problems = source, tuple(problems)
 
 
-def describe_all(error: ValidationError, data: Mapping[str, Any], root: type[BaseModel]) -> list[str]:
-    """A line about each wrong field; of a list, that it is too long, or else which of its entries are wrong."""
-    found = error.errors(include_url=False)
+def describe_all(
+    error: ValidationError, data: Mapping[str, Any], root: type[BaseModel], *, file: str = "scenario"
+) -> list[str]:
+    """A line about each wrong field; of a list, that it is too long, or else which of its entries are wrong.
+
+    Fields that are missing come last: what is missing may only be misspelt.  Arguments as for `describe`.
+    """
+    found = sorted(error.errors(include_url=False), key=lambda details: details["type"] == "missing")
     unsaid: set[int] = set()
     for each in found:
         if each["type"] in ("too_short", "too_long"):
@@ -186,7 +191,7 @@ def describe_all(error: ValidationError, data: Mapping[str, Any], root: type[Bas
             bounds = each["ctx"]
             longer = len(each["input"]) > (bounds["max_length"] if "max_length" in bounds else bounds["min_length"])
             unsaid.update(entries if longer else [id(each)] if entries else [])
-    return [describe(details, data, root) for details in found if id(details) not in unsaid]
+    return [describe(details, data, root, file=file) for details in found if id(details) not in unsaid]
 
 
 def describe(details: ErrorDetails, data: Mapping[str, Any], root: type[BaseModel], *, file: str = "scenario") -> str:

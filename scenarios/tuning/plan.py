@@ -21,7 +21,7 @@ from scenarios.campaign.statistics.requirement import Requirement, parse_require
 from scenarios.limits import build_limits
 from scenarios.loading import check_parts, parse_scenario
 from scenarios.schema.bases import merge, read_scenario
-from scenarios.schema.problems import ScenarioError, describe
+from scenarios.schema.problems import ScenarioError, describe_all
 from scenarios.schema.scenario import Scenario
 from scenarios.schema.settings import get_field
 from scenarios.shipped import tuning_path
@@ -185,8 +185,7 @@ def make_tuning(data: Mapping[str, Any], path: Path) -> TuningPlan:
     try:
         spec = TuningSpec.model_validate(filled)
     except ValidationError as error:
-        found = error.errors(include_url=False)
-        problems = [describe(details, filled, TuningSpec, file="tuning") for details in found]
+        problems = describe_all(error, filled, TuningSpec, file="tuning")
         raise ScenarioError(path.name, problems) from error
     try:
         plan = TuningPlan(spec, flown_scenario(spec.campaign, path))

@@ -363,7 +363,7 @@ def test_a_misspelt_base_is_guessed(tmp_path: Path) -> None:
     (tmp_path / "x.toml").write_text('bas = "hover"')
     with pytest.raises(ScenarioError) as caught:
         load_scenario(str(tmp_path / "x.toml"))
-    assert_message(caught.value.problems[-1], "bas is not a field of the scenario file; did you mean 'base'? @")
+    assert_message(caught.value.problems[0], "bas is not a field of the scenario file; did you mean 'base'? @")
 
 
 def test_a_file_that_is_too_large_is_not_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -230,7 +230,7 @@ WRONG: list[tuple[str, dict[str, Any], str]] = [
     ("waypoints", {"points": []}, f"reference.points must have 1 to {MOST_POINTS} entries; got 0"),
     ("waypoints", {"points": POINTS * 101}, f"reference.points must have 1 to {MOST_POINTS} entries; got 202"),
     ("waypoints", {"points": [{"position": [1.0, 2.0]}]}, "reference.points.0.position must be a list of 3 numbers"),
-    ("waypoints", {"points": [*POINTS, {"positon": [1.0, 2.0, 3.0]}]}, "reference.points.2.position is missing"),
+    ("waypoints", {"points": [*POINTS, {"positon": [1.0, 2.0, 3.0]}]}, "reference.points.2.positon is not a field"),
     ("waypoints", {"speed": 0.0}, "reference.speed must be >= 0.001; got 0.0"),
     (
         "waypoints",

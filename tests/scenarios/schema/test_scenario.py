@@ -93,7 +93,7 @@ WRONG = {
         "vehicle.rotor_lag is not a field of the scenario file; did you mean 'rotor_rise' and 'rotor_fall'? ..."
     ),
     "plant.step=1": "plant.step is not a field of the scenario file; did you mean 'timestep'? ...",
-    "reference.x=[{start=0,stop=1,valu=2}]": "reference.x.0.value is missing\n  reference.x.0.valu is not a field ...",
+    "reference.x=[{start=0,stop=1,valu=2}]": "reference.x.0.valu is not a field of the scenario file; did you ...",
     "constraints.roll.upr=3": "constraints.roll.upr is not a field of the scenario file; did you mean 'upper'? ...",
     "name=3": "name must be a text; got 3",
     "name=A/B": "name must be of the form ^[a-z0-9][a-z0-9._-]*$; got 'A/B'",
