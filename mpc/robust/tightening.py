@@ -180,11 +180,12 @@ def growth(
     """
     A_d, B_d = discretise(A, B, period)
     closed = A_d - B_d @ K
-    unanswered = _absolute_integral(A, C, E, 0.0, delay)
+    unanswered = _absolute_integral(C, _transitions(A, 0.0, delay), E, delay)
+    transitions = _transitions(A, delay, delay + period)
     terms = np.empty((horizon, len(C)))
     seen = C
     for j in range(horizon):
-        terms[j] = _absolute_integral(A, seen, E, delay, delay + period)
+        terms[j] = _absolute_integral(seen, transitions, E, period)
         seen = seen @ closed
     return np.asarray(unanswered + np.cumsum(terms, axis=0))
 
@@ -218,9 +219,12 @@ def correction(A: Array, B: Array, C: Array, size: float) -> Array:
     return lqr(A, B, C.T @ C, np.eye(B.shape[1]) / size**2)
 
 
-def _absolute_integral(A: Array, C: Array, E: Array, start: float, stop: float) -> Array:
-    """(n_c,) of int |C e^(A s) E| ds, summed over the components of w; by Gauss and Legendre's rule."""
-    half = 0.5 * (stop - start)
-    instants = start + half * (_NODES + 1.0)
-    kernels = np.abs(C @ scipy.linalg.expm(A * instants[:, None, None]) @ E)
-    return np.asarray(half * np.einsum("q,qij->i", _WEIGHTS, kernels))
+def _transitions(A: Array, start: float, stop: float) -> Array:
+    """(q, n, n) e^(A s) at the nodes of Gauss and Legendre's rule between two instants [s]."""
+    instants = start + 0.5 * (stop - start) * (_NODES + 1.0)
+    return np.asarray(scipy.linalg.expm(A * instants[:, None, None]))
+
+
+def _absolute_integral(C: Array, transitions: Array, E: Array, duration: float) -> Array:
+    """(n_c,) of int |C e^(A s) E| ds, summed over the components of w, from e^(A s) at the nodes."""
+    return np.asarray(0.5 * duration * np.einsum("q,qij->i", _WEIGHTS, np.abs(C @ transitions @ E)))
