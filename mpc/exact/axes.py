@@ -16,6 +16,7 @@ are all of u and Q_d falls apart alike.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Final
 
 import numpy as np
@@ -25,6 +26,8 @@ from scipy.sparse.csgraph import connected_components
 
 from mpc.model import LinearModel
 from mpc.ocp import Objective, Problem
+from mpc.paper.condensed import CondensedCost, condensed_cost
+from mpc.paper.prediction import Prediction, prediction
 from quadsim.state import Array, Indices
 
 ROUNDING: Final = 1e-12
@@ -50,6 +53,16 @@ class Axis:
     outputs: Indices
     T: Array
     T_inverse: Array
+
+    @cached_property
+    def maps(self) -> Prediction:
+        """How its states follow from its inputs."""
+        return prediction(self.problem.model, self.problem.horizon)
+
+    @cached_property
+    def cost(self) -> CondensedCost:
+        """In its inputs alone."""
+        return condensed_cost(self.problem, self.maps)
 
 
 def axes(problem: Problem) -> list[Axis]:

@@ -9,8 +9,6 @@ import scipy.linalg
 
 from mpc.exact.axes import Axis
 from mpc.ocp import Problem
-from mpc.paper.condensed import condensed_cost
-from mpc.paper.prediction import prediction
 from quadsim.state import Array
 
 ROUNDING: Final = 1e-4
@@ -78,10 +76,8 @@ class FreeOptimum:
 
 def _maps(axis: Axis, C: Array) -> tuple[Array, Array]:
     """W of one axis, for its inputs (m N, columns) and outputs (n_c N, ...), each channel's N steps together."""
-    problem = axis.problem
+    problem, maps, terms = axis.problem, axis.maps, axis.cost
     N, model = problem.horizon, problem.model
-    maps = prediction(model, N)
-    terms = condensed_cost(problem, maps)
     factor = scipy.linalg.cho_factor(terms.H)
     hold = np.tile(np.eye(model.nu), (N, 1))
     if not np.abs(scipy.linalg.cho_solve(factor, terms.H @ hold) - hold).max() < ROUNDING:

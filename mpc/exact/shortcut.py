@@ -12,11 +12,10 @@ from numpy.typing import NDArray
 
 from mpc.constraints import Rows
 from mpc.exact.activeset import FEASIBLE, Active, ActiveSet, Side
-from mpc.exact.axes import axes
+from mpc.exact.axes import Axis, axes
 from mpc.exact.free import FreeOptimum
 from mpc.ocp import Problem, Rest
-from mpc.paper.condensed import Condensed, condensed_cost, row_maps
-from mpc.paper.prediction import prediction
+from mpc.paper.condensed import Condensed, row_maps
 from mpc.qp import Point, Solution
 from mpc.solvers import Answer, Method, QPSolver, Solver
 from quadsim.controller import SOLVED, UNCONSTRAINED
@@ -48,6 +47,7 @@ class Shortcut:
     Args:
         problem: with constraints.
         whole: solves the whole QP.
+        parts: the problem's axes, where they are at hand.
 
     Raises:
         numpy.linalg.LinAlgError: the Hessian is so ill-conditioned that the gains of Eq. (22) are not exact.
@@ -56,9 +56,9 @@ class Shortcut:
         formulation: the condensed QP.
     """
 
-    def __init__(self, problem: Problem, whole: Solver) -> None:
+    def __init__(self, problem: Problem, whole: Solver, parts: list[Axis] | None = None) -> None:
         rows, N, nu = problem.rows, problem.horizon, problem.model.nu
-        parts = axes(problem)
+        parts = axes(problem) if parts is None else parts
         self._rows, self._whole, self._rest = rows, whole, problem.rest
         self._free, self.formulation = FreeOptimum(problem, parts), Condensed(problem)
         self._T = np.ascontiguousarray(np.hstack([axis.T for axis in parts]).T)
@@ -85,11 +85,11 @@ class Shortcut:
         if rows.of_states[rows.C.any(axis=1)].all():
             groups = ((axis, axis.outputs) for axis in parts if axis.outputs.size)
             self._groups = [
-                _Group(axis.problem, rows.part(own, axis.states, axis.T.shape[1]), grid[:, own].ravel(), axis.T)
+                _Group(axis, rows.part(own, axis.states, axis.T.shape[1]), grid[:, own].ravel(), axis.T)
                 for axis, own in groups
                 if (N * max(own.size, axis.T.shape[1])) ** 2 <= LARGEST_MAP
             ]
-        self._all = _Group(problem, rows, grid.ravel(), np.eye(nu)) if grid.size**2 <= LARGEST_MAP else None
+        self._all = _Group(self.formulation, rows, grid.ravel(), np.eye(nu)) if grid.size**2 <= LARGEST_MAP else None
         self._first = True  # the next QP for the solver is the first one since `reset`
 
     @property
@@ -245,20 +245,19 @@ class _Group:
     """Rows whose multipliers are found together.
 
     Args:
-        problem: the part of the whole that they are on.
+        of: the part of the whole that they are on.
         part: these rows of the part.
         rows: where they are among all (N m,).
         T: (nu, m) what the part's inputs are among all.
     """
 
-    def __init__(self, problem: Problem, part: Rows, rows: Indices, T: Array) -> None:
-        maps = prediction(problem.model, problem.horizon)
-        G = row_maps(part, maps).of_inputs
-        factor = np.linalg.cholesky(condensed_cost(problem, maps).H)
+    def __init__(self, of: Axis | Condensed, part: Rows, rows: Indices, T: Array) -> None:
+        G = row_maps(part, of.maps).of_inputs
+        factor = np.linalg.cholesky(of.cost.H)
         half = scipy.linalg.solve_triangular(factor, G.reshape(rows.size, -1).T, lower=True)
         self.rows, self._T = rows, T.T
         self._R = np.ascontiguousarray(scipy.linalg.solve_triangular(factor, half, lower=True, trans="T").T)
-        l1, l2 = (np.tile(penalty, problem.horizon) for penalty in (part.l1, part.l2))
+        l1, l2 = (np.tile(penalty, len(G)) for penalty in (part.l1, part.l2))
         self._lower, self._upper = part.lower.ravel(), part.upper.ravel()
         self._set = ActiveSet(half.T @ half, l1, l2, part.l1.size)
 
@@ -287,14 +286,13 @@ def with_shortcut(problem: Problem, whole: Solver) -> Solver:
     """
     if problem.rows.C.ndim == 3 or problem.rows.slacks.size < problem.rows.soft.size:
         return whole
-    N = problem.horizon
+    N, parts = problem.horizon, axes(problem)
     entries = sum(
-        N * (axis.T.shape[1] + axis.outputs.size) * (axis.states.size + N * axis.regulated.size)
-        for axis in axes(problem)
+        N * (axis.T.shape[1] + axis.outputs.size) * (axis.states.size + N * axis.regulated.size) for axis in parts
     )
     if entries > LARGEST_MAP:
         return whole
     try:
-        return Shortcut(problem, whole)
+        return Shortcut(problem, whole, parts)
     except np.linalg.LinAlgError:
         return whole

@@ -82,6 +82,8 @@ class Condensed:
     """min 1/2 x' P x + c' x over x = [u(k); ...; u(k+N-1); e], e (N, m_s) the slacks of soft rows.
 
     Attributes:
+        maps: how states follow from the inputs.
+        cost: of the inputs alone.
         qp: H, the rows time by time, and the box; vectors for xi(k) and y_d zero and u(k-1) = u_bar.
 
     Raises:
@@ -91,8 +93,8 @@ class Condensed:
     def __init__(self, problem: Problem) -> None:
         self._problem, self._rows = problem, QPRows(problem)
         model, N, nu = problem.model, problem.horizon, problem.model.nu
-        self._maps = prediction(model, N)
-        self._cost, self._values = condensed_cost(problem, self._maps), row_maps(self._rows, self._maps)
+        self.maps = prediction(model, N)
+        self.cost, self._values = condensed_cost(problem, self.maps), row_maps(self._rows, self.maps)
         rows = self._rows
         self._inputs, m_s = N * nu, rows.slack.shape[1]
         soft = problem.rows.slacks
@@ -103,10 +105,10 @@ class Condensed:
         for i in range(N if m_s else 0):
             G[i, :, self._inputs + i * m_s : self._inputs + (i + 1) * m_s] = rows.slack
         self._of_rest = self._values.of_inputs.reshape(N, len(rows.C), N, nu).sum(axis=2)  # of u_s throughout
-        self._pull = self._cost.H.reshape(N * nu, N, nu).sum(axis=1)  # by u_s throughout
+        self._pull = self.cost.H.reshape(N * nu, N, nu).sum(axis=1)  # by u_s throughout
         size = self._inputs + N * m_s
         self._blank = QP(
-            P=np.asfortranarray(scipy.linalg.block_diag(self._cost.H, 2.0 * np.diag(l2)) if m_s else self._cost.H),
+            P=np.asfortranarray(scipy.linalg.block_diag(self.cost.H, 2.0 * np.diag(l2)) if m_s else self.cost.H),
             c=np.zeros(size),
             A=np.zeros((0, size)),
             b=np.zeros(0),
@@ -139,7 +141,7 @@ class Condensed:
 
     def vectors(self, state: Array, desired: Array, u_before: Array, rest: Rest | None = None) -> Vectors:
         """See `mpc.qp.Formulation.vectors`."""
-        terms, values, rows = self._cost, self._values, self._rows
+        terms, values, rows = self.cost, self._values, self._rows
         x_s, u_s = self._problem.rest if rest is None else rest
         dx, dy, du = state - x_s, desired - self._problem.objective.C_r @ x_s, u_before - u_s
         c = self._linear.copy()
