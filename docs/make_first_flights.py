@@ -62,7 +62,7 @@ def page(flown: list[Vehicle], flights: Flights, steeper: dict[str, FirstFlight]
         "**lost** or **violated** where it was. Lag is the longer of rise and fall, w the bandwidth of x and y.\n",
     ]
     for law in LAWS:
-        rows = [_row(vehicle, flights, law) for vehicle in flown]
+        rows = [row(vehicle, flights, law) for vehicle in flown]
         parts.append(f"## {law}\n\n{_summary(flights, law)}\n\n{markdown([_head(), *rows])}")
     parts.append(_failures(flights))
     return "\n".join(parts)
@@ -72,7 +72,8 @@ def _head() -> tuple[str, ...]:
     return ("vehicle", "kg", "layout", "thrust to weight", "lag [ms]", "w [rad/s]", *COURSES, "length of the eight [m]")
 
 
-def _row(vehicle: Vehicle, flights: Flights, law: str) -> tuple[str, ...]:
+def row(vehicle: Vehicle, flights: Flights, law: str) -> tuple[str, ...]:
+    """A vehicle's row in the table of a law."""
     tuning = tune(vehicle)
     cells = (_cell(flights[vehicle.name, course, law]) for course in COURSES)
     return (
