@@ -112,8 +112,8 @@ def whole_commands(flight: FlightProfile, film: RenderProfile) -> Table:
         filmed = f"`quadsim video`: the same 60 s, 1280x720 at 30 fps, {film.workers} cores"
         for label, target, repeats, *arguments in (
             ("`quadsim --help`", "<= 0.3 s", REPEATS, "--help"),
-            (f"`quadsim run {SCENARIO} --no-video`", "<= 4 s", REPEATS, "run", SCENARIO, "--no-video", "--out", run),
-            (filmed, "<= 60 s", 1, "video", run),
+            (f"`quadsim run {SCENARIO} --no-video`", "<= 3.5 s", REPEATS, "run", SCENARIO, "--no-video", "--out", run),
+            (filmed, "<= 50 s", 1, "video", run),
         ):
             times = [time_python("-m", "scenarios.cli", *arguments, tree=ROOT).wall_s for _ in range(repeats)]
             rows.append((label, target, f"{min(times):.2f}"))
