@@ -184,7 +184,7 @@ def test_responses_are_those_of_the_condensed_problem(name: str) -> None:
     N, m = problem.horizon, len(found.rows)
     inputs = N * problem.model.nu
     rows = form._values.of_inputs  # of the general rows; those of single inputs are a box
-    H_inverse = np.linalg.inv(np.asarray(form._cost.H))
+    H_inverse = np.linalg.inv(np.asarray(form.cost.H))
     general = {key: i for i, key in enumerate(zip(*_keys(form._rows), strict=True))}
     for r, row in enumerate(found.rows):
         if row.axis >= 0 and not row.terms:
