@@ -73,7 +73,7 @@ def test_flights_that_met_a_limit_stand_in_every_page_and_gate(
     assert [summary["events"][name]["count"] for name in ("failure", "timeout", "memory", "lost")] == [2, 1, 1, 0]
     assert [flight["verdict"] for flight in summary["worst"]] == ["timeout", "memory", "satisfied"]
     page = (tmp_path / "c" / "index.html").read_text(encoding="utf-8")
-    assert "limits.step is 1 s" in page
+    assert "limits.step is 3 s" in page
     assert "limits.memory is 300 MB" in page
     assert main(["compare", "c", "c", "--out", "pairs"]) == EXIT_DONE
 
