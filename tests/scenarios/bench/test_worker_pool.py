@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import os
+import signal
 import subprocess
 import sys
 import time as clock
-from collections.abc import Callable
 from pathlib import Path
+
+import psutil
 
 from scenarios.bench.worker_pool import answer_all
 
@@ -23,38 +26,27 @@ def test_answers_come_in_the_order_of_their_questions() -> None:
     assert heard == [(1, 4), (2, 4), (3, 4), (4, 4)]
 
 
-def wait_for(condition: Callable[[], bool]) -> bool:
-    """Whether it comes true within 30 s."""
-    deadline = clock.monotonic() + 30.0
-    while not condition() and clock.monotonic() < deadline:
-        clock.sleep(0.02)
-    return condition()
-
-
 def test_no_worker_outlives_a_parent_that_is_killed(tmp_path: Path) -> None:
     """A worker that waits for its next question would never hear that none comes."""
-    (tmp_path / "module.py").write_text(
-        "import os, pathlib, time\n"
-        "def answer(number):\n"
-        "    pathlib.Path(str(os.getpid())).touch()\n"
-        "    time.sleep(number)\n"
-    )
-    script = (
-        "import module\n"
+    from campaign_pilots import living, until  # here: see the module
+
+    (tmp_path / "script.py").write_text(
+        "import time\n"
         "from scenarios.bench.worker_pool import answer_all\n"
-        "if __name__ == '__main__': answer_all(module.answer, [0.5, 1000.0], workers=2)\n"
+        "if __name__ == '__main__':\n"
+        "    heard = lambda done, total: print(done, flush=True)\n"
+        "    answer_all(time.sleep, [0.0, 1000.0], workers=2, progress=heard)\n"
     )
-    (tmp_path / "script.py").write_text(script)
-    root = Path(__file__).resolve().parents[3]
-    parent = subprocess.Popen([sys.executable, "script.py"], cwd=tmp_path, env={"PYTHONPATH": f"{root}:{tmp_path}"})
-
-    def workers() -> list[int]:
-        return [int(entry.name) for entry in tmp_path.iterdir() if entry.name.isdigit()]
-
-    try:
-        assert wait_for(lambda: len(workers()) == 2)
-        clock.sleep(0.5)  # one of the two waits now
-    finally:
-        parent.kill()
-        parent.wait()
-    assert wait_for(lambda: not any(Path(f"/proc/{worker}").exists() for worker in workers()))
+    command, root = [sys.executable, str(tmp_path / "script.py")], Path(__file__).resolve().parents[3]
+    environment = {**os.environ, "PYTHONPATH": str(root)}
+    with subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True) as parent:
+        assert parent.stdout is not None
+        assert parent.stdout.readline() == "1\n"  # one works, one waits
+        family = {child.pid for child in psutil.Process(parent.pid).children(recursive=True)}
+        try:
+            assert len(living(family)) >= 2
+            parent.kill()
+            assert until(lambda: not living(family))
+        finally:
+            for pid in living(family):
+                os.kill(pid, signal.SIGKILL)
