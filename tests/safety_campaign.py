@@ -28,7 +28,7 @@ from scenarios.campaign.results.store import FLIGHTS_FILE
 from scenarios.campaign.results.table import Row
 
 ROOT = Path(__file__).resolve().parents[1]
-LIMITS = {"flight": 20.0, "step": 3.0, "memory": 300.0}  # forks by the dozen take a busy machine a second
+LIMITS = {"flight": 20.0, "step": 3.0, "memory": 300.0}  # a busy machine takes a second to fill the memory
 CAMPAIGN: dict[str, Any] = {
     "name": "hostile",
     "scenario": "hover",
@@ -135,8 +135,8 @@ def measure(flights: int = 60, *, workers: int = 2) -> dict[str, int]:
 
     Returns:
         `flights`; `hostile` ones, and those of each verdict (`hostile: error`); `calm` ones, and of these those whose
-        `rows differ` from the campaign without hostile ones; `unexpected verdicts` of hostile ones; `leftover
-        processes`.
+        `rows differ` from the campaign without hostile ones; `unexpected verdicts` of hostile ones, and each of these
+        by name; `leftover processes`.
     """
     kinds = planned(flights)
     with tempfile.TemporaryDirectory() as directory:
@@ -149,15 +149,19 @@ def measure(flights: int = 60, *, workers: int = 2) -> dict[str, int]:
         )
     flown = list(zip(kinds, calm.rows, hostile.rows, strict=True))
     verdicts = Counter(row["verdict"] for kind, _, row in flown if kind != "calm")
+    unexpected = [
+        f"unexpected: {kind} ended with {row['verdict']} ({row['reason']})"
+        for kind, _, row in flown
+        if kind != "calm" and row["verdict"] != ENDED.get(kind, "satisfied")
+    ]
     return {
         "flights": flights,
         "hostile": sum(kind != "calm" for kind in kinds),
         **{f"hostile: {verdict}": count for verdict, count in sorted(verdicts.items())},
         "calm": kinds.count("calm"),
         "rows differ": sum(kind == "calm" and repr(row) != repr(other) for kind, other, row in flown),
-        "unexpected verdicts": sum(
-            kind != "calm" and row["verdict"] != ENDED.get(kind, "satisfied") for kind, _, row in flown
-        ),
+        "unexpected verdicts": len(unexpected),
+        **dict.fromkeys(unexpected, 1),
         "leftover processes": calm.left + hostile.left,
     }
 

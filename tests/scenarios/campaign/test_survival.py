@@ -52,7 +52,7 @@ def test_hostile_flights_change_no_other_flight_and_leave_no_process() -> None:
     counts = measure(60, workers=3)  # most of its time is waiting for limits
     assert counts["hostile"] == len(KINDS) >= 40
     assert counts["calm"] == 60 - len(KINDS) >= 12
-    assert counts["rows differ"] == counts["unexpected verdicts"] == counts["leftover processes"] == 0
+    assert counts["rows differ"] == counts["unexpected verdicts"] == counts["leftover processes"] == 0, counts
     assert counts["hostile: timeout"] >= 5
     assert counts["hostile: memory"] == 4
 
