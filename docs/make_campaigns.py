@@ -40,7 +40,7 @@ def fly(name: str, *, there: bool) -> Result:
 
 
 def violations(results: list[Result]) -> Grid:
-    """A line for each campaign: how often a bound was left, and how often that is at most."""
+    """A line for each campaign: how often a bound was violated, and how often that is at most."""
     lines = []
     for result in results:
         events = result.summary["events"]
@@ -88,10 +88,10 @@ def part(result: Result) -> str:
 
 
 def first_to_break(result: Result) -> str:
-    """What the paper's controller bears least, from a campaign of small errors."""
+    """What the paper's controller fails from first, by a campaign of small errors."""
     summary = result.summary
     parts = [(name, unit, event, split["threshold"]) for event, name, unit, split in sure_splits(summary)]
-    found = "It is nothing that is drawn, beyond chance"
+    found = "No parameter explains it beyond chance"
     if parts:
         first, unit = parts[0][:2]
         steps = sorted((threshold, event) for name, _, event, threshold in parts if name == first)
@@ -115,11 +115,10 @@ def page(results: list[Result]) -> str:
     return "\n".join(
         [
             "# How often they fail: the paper's controller, and the robust one\n\nMade by `make campaigns` "
-            f"({machine['processor']}, {machine['cores']} cores), from the campaigns that ship. What is drawn, from "
-            "where, stands in\n`paper-robustness`;\n"
-            "`paper-robustness-robust` has the same draws for the "
-            "robust controller, and\n`paper-nominal` draws small errors "
-            "alone for the paper's controller. How campaigns work: [campaigns.md](campaigns.md).\n",
+            f"({machine['processor']}, {machine['cores']} cores), from the campaigns that ship. Their files "
+            "list the parameters\nand distributions: `paper-robustness-robust` flies the robust controller with the "
+            "samples of `paper-robustness`, and `paper-nominal`\nthe paper's controller with small errors alone. "
+            "How campaigns work: [campaigns.md](campaigns.md).\n",
             section(violations(results)),
             first_to_break(nominal),
             f"## The one against the other\n\n{comparison.sentence} {pairing(comparison)}\n",

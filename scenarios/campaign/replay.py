@@ -49,7 +49,7 @@ def recorded_flight(directory: Path, number: int | None) -> Recorded:
     """A flight of a campaign's directory; the worst one where no number is given.
 
     Raises:
-        InputError: there is no such flight, or what was drawn for it cannot be flown.
+        InputError: there is no such flight, or its parameters cannot be flown together.
         FileError: the directory is no campaign, or not a finished one.
     """
     plan = stored_plan(directory)

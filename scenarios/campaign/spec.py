@@ -34,7 +34,7 @@ class VaryBase(Spec):
         "its name or index"
     )
     unit: Annotated[str, Field(max_length=20)] = Field(default="-", description="of the values, for tables and plots")
-    relative: bool = Field(default=False, description="whether the drawn number multiplies what the scenario has")
+    relative: bool = Field(default=False, description="whether the sampled value multiplies the scenario's own")
 
 
 class UniformSpec(VaryBase):

@@ -39,7 +39,7 @@ class Histogram:
 
 @dataclass(frozen=True, kw_only=True)
 class Association:
-    """How a drawn number goes with an outcome; p-values are corrected for all tests of the campaign."""
+    """How an outcome depends on a varied parameter; p-values are corrected for all tests of the campaign."""
 
     rho: float  # Spearman's rank correlation
     p_rho: float
@@ -59,7 +59,7 @@ class Association:
 
 @dataclass(frozen=True, kw_only=True)
 class Driver:
-    """How a drawn number goes with the outcomes, None where there is none."""
+    """How the outcomes depend on a varied parameter, None where there is none."""
 
     name: str
     label: str
@@ -95,7 +95,7 @@ def histograms(table: pa.Table) -> list[Histogram]:
 
 
 def drivers(summary: Summary) -> list[Driver]:
-    """The drawn numbers that may go with an outcome at all, the strongest first."""
+    """The varied parameters on which an outcome may depend at all, the strongest first."""
     found = [
         Driver(
             name=name,
@@ -115,7 +115,7 @@ def _association(found: Mapping[str, Any] | None) -> Association | None:
 
 
 def sure_splits(summary: Summary) -> Iterator[tuple[str, str, str, Mapping[str, Any]]]:
-    """Event, drawn number, its unit and its threshold, of those beyond chance: by event, the surest first."""
+    """Event, varied parameter, its unit and its threshold, of those beyond chance: by event, the surest first."""
     found = summary["parameters"]
     events = dict.fromkeys(event for parameter in found.values() for event in parameter.get("splits", {}))
     for event in events:

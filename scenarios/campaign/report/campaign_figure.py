@@ -33,7 +33,7 @@ _FEW: Final = 50  # flights of a verdict that are drawn larger, so as to be seen
 
 
 def write_campaign_figure(name: str, table: pa.Table, summary: Summary, directory: Path) -> list[Path]:
-    """Draw `campaign.png` and `.svg`: how the estimate settles, worst margins, and what goes with them.
+    """Draw `campaign.png` and `.svg`: how the estimate settles, worst margins, and the parameters that matter.
 
     Raises:
         OutputError: the directory cannot be written.
@@ -64,7 +64,7 @@ def _draw(name: str, table: pa.Table, summary: Summary) -> Figure:
 
 
 def _strongest(found: list[scatters.Cloud], summary: Summary) -> list[scatters.Cloud]:
-    """The parameters that go most with the outcome, or the first ones where none of them can."""
+    """The parameters that correlate most with the outcome, or the first ones where none of them can."""
     rank = {driver.name: i for i, driver in enumerate(drivers(summary))}
     return sorted(found, key=lambda cloud: rank.get(cloud.name, len(rank)))[:_MOST_SCATTERS]
 
@@ -126,7 +126,7 @@ def _draw_drivers(axes: Axes, summary: Summary) -> None:
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
-    axes.set_title("what goes with the outcome", loc="left", fontsize=9.5)
+    axes.set_title("which parameters matter", loc="left", fontsize=9.5)
     strongest = drivers(summary)[:_MOST_DRIVERS]
     if not strongest:
         _note(axes, "nothing to correlate")

@@ -145,14 +145,14 @@ def _drivers(strongest: list[Driver]) -> Plot:
     ticks = {"tickmode": "array", "tickvals": list(range(len(names))), "ticktext": names}
     figure.update_yaxes(automargin=True, range=[len(names) - 0.4, -0.6], **ticks)
     figure.update_layout(margin={"l": 12, "r": 12, "t": 6, "b": BOTTOM}, barmode="overlay", hovermode="closest")
-    plot = finished(figure, "drivers", "What goes with it", height=70 + 36 * len(strongest), timed=False)
+    plot = finished(figure, "drivers", "Which parameters matter", height=70 + 36 * len(strongest), timed=False)
     return replace(plot, key_colours=tuple(keys))
 
 
 def _measures(
     names: list[str], found: Sequence[Association | None], outcome: str, colour: str, offset: float
 ) -> Iterator[Bar | Scatter]:
-    """Both measures of each drawn number with one outcome, its bars so far beside the middle of its line."""
+    """Both measures of each varied parameter with one outcome, its bars so far beside the middle of its line."""
     from plotly.graph_objects import Bar, Scatter
 
     rows = [i for i, one in enumerate(found) if one]
@@ -190,7 +190,7 @@ def verdict_keys(table: pa.Table) -> tuple[tuple[str, str], ...]:
 
 
 def scatter_plot(table: pa.Table, parameters: list[Cloud], drawn: Margins) -> Plot:
-    """The worst margin over each drawn parameter, with its course."""
+    """The worst margin over each varied parameter, with its course."""
     keys = verdict_keys(table)
     figure = panels([html.escape(cloud.label) for cloud in parameters], shared=False)
     shown = shown_flights(table)
@@ -207,7 +207,7 @@ def scatter_plot(table: pa.Table, parameters: list[Cloud], drawn: Margins) -> Pl
             figure.update_xaxes(tickvals=list(range(len(parts))), ticktext=parts, **place(panel))
     figure.update_yaxes(range=list(drawn.ends))
     figure.update_layout(hovermode="closest")
-    plot = finished_panels(figure, "scatter", "Worst margin over each drawn parameter", len(parameters))
+    plot = finished_panels(figure, "scatter", "Worst margin over each varied parameter", len(parameters))
     curved = any(cloud.course is not None for cloud in parameters)
     return replace(plot, key_colours=(*keys, (COURSE, COURSE_COLOUR)) if curved else keys)
 

@@ -116,7 +116,7 @@ def worst_table(summary: Summary, directory: str) -> Grid:
 
 
 def worst_draws_table(summary: Summary) -> Grid:
-    """What was drawn for the worst flights, a column for each."""
+    """Parameters of the worst flights, a column for each."""
     worst = summary["worst"]
     lines = tuple(
         line(label(name, found["unit"]), *(_value(flight["draws"][name]) for flight in worst))
@@ -124,7 +124,7 @@ def worst_draws_table(summary: Summary) -> Grid:
     )
     return Grid(
         key="worst-draws",
-        title="What was drawn for them",
+        title="Their parameters",
         head=("flight", *(str(flight["flight"]) for flight in worst)),
         lines=lines if worst else (),
     )
@@ -165,23 +165,23 @@ def _shares(found: Mapping[str, Any]) -> tuple[str, str]:
 
 
 def driver_table(summary: Summary) -> Grid:
-    """How each drawn number goes with the worst margin and with failure."""
+    """How the worst margin and failure depend on each varied parameter."""
     lines = (
         line(driver.label, *_association(driver.margin), *_association(driver.failure)) for driver in drivers(summary)
     )
     return Grid(
         key="drivers-table",
-        title="What goes with the outcome",
+        title="Which parameters matter",
         head=(
-            "drawn number",
+            "varied parameter",
             *("worst margin: rho", "after Holm", "xi", "after Holm"),
             *("failure: rho", "after Holm", "xi", "after Holm"),
         ),
         lines=tuple(lines),
         note=(
-            "rho: Spearman's rank correlation, which sees what rises or falls throughout and is blind to a number that "
-            "does harm at both of its ends. xi: Chatterjee's (2021), which sees any dependence: about 0 for none, 1 "
-            "where the drawn number alone decides. p-values are corrected by Holm's method for all tests of the "
+            "rho: Spearman's rank correlation, which sees what rises or falls throughout and is blind to a parameter "
+            "that does harm at both of its ends. xi: Chatterjee's (2021), which sees any dependence: about 0 for none, "
+            "1 where the varied parameter alone decides. p-values are corrected by Holm's method for all tests of the "
             f"campaign, those of thresholds included; bold: beyond chance at {100.0 * ALPHA:g} %. A flight that was "
             "lost before it had a margin ranks below all others."
         ),
@@ -189,7 +189,7 @@ def driver_table(summary: Summary) -> Grid:
 
 
 def split_table(summary: Summary) -> Grid:
-    """The thresholds on drawn numbers that separate flights with an event from those without, beyond chance."""
+    """The thresholds on varied parameters that separate flights with an event from those without, beyond chance."""
     listed = list(sure_splits(summary))
     sure = f"{100.0 * summary['confidence']:g} % interval"
     lines = tuple(
@@ -209,17 +209,17 @@ def split_table(summary: Summary) -> Grid:
         head=("event", "threshold", "up to it", sure, "above it", sure, "between flights at", "after Holm"),
         lines=lines,
         note=(
-            "Of each drawn number the threshold at which Fisher's exact test is surest. p: the chance that the best of "
-            "all thresholds is as sure where the event has nothing to do with the number, exact, then corrected by "
-            "Holm's method for all tests of the campaign. The intervals, Clopper-Pearson's, take the threshold as "
-            "given: it was chosen by these flights, so they look a little sharper than they are. Thresholds on numbers "
-            "beyond the first of an event may be the same flights seen again."
+            "Of each varied parameter the threshold at which Fisher's exact test is surest. p: the chance that the "
+            "best of all thresholds is as sure where the event does not depend on the parameter, exact, then corrected "
+            "by Holm's method for all tests of the campaign. The intervals, Clopper-Pearson's, take the threshold as "
+            "given: it was chosen by these flights, so they look a little sharper than they are. Thresholds on "
+            "parameters beyond the first of an event may be the same flights seen again."
         ),
     )
 
 
 def group_table(summary: Summary) -> Grid:
-    """How often flights failed over each drawn number, from its lowest values on; of none or all failed, no lines."""
+    """How often flights failed over each varied parameter, lowest values first; of none or all failed, no lines."""
     failure = summary["events"]["failure"]
     listed = {
         name: found
@@ -237,8 +237,8 @@ def group_table(summary: Summary) -> Grid:
     )
     return Grid(
         key="groups",
-        title="Failures over each drawn number",
-        head=("drawn number", *_GROUPS.get(size, [f"{k + 1}." for k in range(size)])),
+        title="Failures over each varied parameter",
+        head=("varied parameter", *_GROUPS.get(size, [f"{k + 1}." for k in range(size)])),
         lines=lines,
         note="Share of failed flights among those with such a value; flights are in groups of about equal size, or by "
         f"value where there are few values. Over all flights it is {percent(failure['share'])}.",

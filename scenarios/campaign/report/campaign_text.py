@@ -103,7 +103,7 @@ def driver_sentences(summary: Summary) -> Iterator[str]:
         strongest = sorted(rising.items(), key=lambda item: -abs(item[1]["rho"]))[:_MOST_DRIVERS]
         if strongest:
             listed = ", ".join(f"{name} ({found['rho']:+.2f}, {p_value(found['p_holm'])})" for name, found in strongest)
-            yield f"{noun} goes most with {listed}: rank correlation, p-value after Holm's correction."
+            yield f"{noun} correlates most with {listed}: rank correlation, p-value after Holm's correction."
         others = {name: found for name, found in tested.items() if found["p_xi_holm"] < ALPHA and name not in rising}
         surest = sorted(others.items(), key=lambda item: -item[1]["xi"])[:_MOST_DRIVERS]
         if surest:
@@ -118,13 +118,13 @@ def driver_sentences(summary: Summary) -> Iterator[str]:
         has_threshold = outcome == "failed" and any(event == "failure" for event, *_ in sure_splits(summary))
         if tested and not (strongest or surest or has_threshold):
             yield (
-                f"{noun} goes with no drawn number beyond chance (rank correlation, and Chatterjee's xi for any "
+                f"{noun} depends on no varied parameter beyond chance (rank correlation, and Chatterjee's xi for any "
                 "dependence; 5 % after Holm's correction for all tests)."
             )
 
 
 def _turn(summary: Summary, name: str, outcome: str) -> str:
-    """Where the worst margin turns over a drawn number."""
+    """Where the worst margin turns over a varied parameter."""
     turn = summary["parameters"][name]["turn"] if outcome == "worst_margin" else None
     return "" if turn is None else f", {turn['kind']} near {turn['at']:.3g}"
 

@@ -72,7 +72,7 @@ def make_schema(draws: Mapping[str, tuple[pa.DataType, str]], limits: Sequence[L
     """The columns of a campaign, clock times last.
 
     Args:
-        draws: type and unit, `-` for none, of each drawn parameter, by name.
+        draws: type and unit, `-` for none, of each varied parameter, by name.
         limits: what its flights are audited against.
     """
     tracked = [
@@ -251,7 +251,7 @@ def verdicts(table: pa.Table) -> dict[str, Flags]:
 
 
 def draw_names(table: pa.Table) -> list[str]:
-    """The drawn parameters, in order."""
+    """The varied parameters, in order."""
     return [name.removeprefix(DRAW) for name in table.column_names if name.startswith(DRAW)]
 
 

@@ -1,4 +1,4 @@
-"""Whether an outcome depends on a drawn number: in one direction, in any form, or from a threshold on.
+"""Whether an outcome depends on a varied parameter: in one direction, in any form, or from a threshold on.
 
 A rank correlation sees what rises or falls throughout, and is blind to what does harm at both ends.  Chatterjee's xi
 sees any dependence, and needs more flights.  Of an event, Fisher's exact test chooses the threshold.  Its p-value
@@ -127,9 +127,9 @@ def _log_binomial(n: int, k: Counts) -> Array:
 
 @dataclass(frozen=True, kw_only=True)
 class Trend:
-    """A smooth curve over a drawn number."""
+    """A smooth curve over a varied parameter."""
 
-    x: Array  # (G,) values of the drawn number, rising
+    x: Array  # (G,) values of the varied parameter, rising
     y: Array  # (G,) what half of the flights near there exceed
 
     @property
@@ -175,7 +175,7 @@ def trend(x: Array, y: Array) -> Trend | None:
 
 @dataclass(frozen=True, kw_only=True)
 class Split:
-    """A threshold on a drawn number."""
+    """A threshold on a varied parameter."""
 
     threshold: float  # a round number from `below` to `above`: flights up to it are on the low side
     below: float  # the largest value on the low side
@@ -187,7 +187,7 @@ class Split:
 
 
 def best_splits(columns: Mapping[str, Array], happened: Flags) -> dict[str, Split | None]:
-    """The best threshold on each of several drawn numbers, (K,) by name, for an event that happened (K,) or not.
+    """The best threshold on each of several varied parameters, (K,) by name, for an event that happened (K,) or not.
 
     None of a number that is always the same or not always there, and of an event that happened never or always.
     """

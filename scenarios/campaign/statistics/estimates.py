@@ -37,7 +37,7 @@ _CURVE_POINTS: Final = 80
 SPLIT_EVENTS: Final = ("failure", "violation", "lost")
 """Events for which a threshold is looked for, where they are not the same flights as an earlier one's."""
 _GROUPS: Final = ((50, 5), (12, 3))
-"""Flights from which a drawn number's values are looked at in this many groups of about equal size."""
+"""Flights from which a varied parameter's values are looked at in this many groups of about equal size."""
 
 
 def estimate(table: pa.Table) -> dict[str, Any]:
@@ -45,7 +45,7 @@ def estimate(table: pa.Table) -> dict[str, Any]:
 
     Keys: `flights`; `confidence` of every interval; `verdicts`, flights of each; `events` and `constraints`, by name,
     as proportions (`inference.Proportion`), a constraint's being that it did not hold or was not
-    reached; `metrics`, over the flights that have each; `parameters`, how the outcome goes with each drawn parameter
+    reached; `metrics`, over the flights that have each; `parameters`, how the outcome depends on each varied parameter
     (`parameters`); `worst`, the ten worst flights; `convergence` of the shares of failure and
     violation over the first n flights.
     """
@@ -152,7 +152,7 @@ def _convergence(table: pa.Table) -> dict[str, Any]:
 
 
 def parameters(table: pa.Table) -> dict[str, Any]:
-    """A campaign's summary of each drawn parameter, as plain data for JSON.
+    """A campaign's summary of each varied parameter, as plain data for JSON.
 
     Of a number: its `unit`; under `worst_margin` and `failed` Spearman's `rho` with that outcome and Chatterjee's `xi`
     of that outcome, with their p-values `p` and `p_xi`; under `splits`, by event, the threshold that best separates
@@ -202,7 +202,7 @@ def _events(table: pa.Table) -> Iterator[tuple[str, Flags]]:
 
 
 def _association(values: Array, outcome: Array) -> dict[str, Any] | None:
-    """Both measures of how an outcome goes with a drawn number; None where there is nothing to relate."""
+    """Both measures of how an outcome depends on a varied parameter; None where there is nothing to relate."""
     correlation = rank_correlation(values, outcome)
     dependence = any_dependence(values, outcome, np.random.default_rng(0))  # as every time
     if correlation is None or dependence is None:
@@ -240,7 +240,7 @@ def _levels(table: pa.Table, name: str, failed: Flags) -> dict[str, Any]:
 
 
 def _groups(values: Array, failed: Flags) -> list[dict[str, Any]]:
-    """Failures by thirds or fifths of a drawn number, or by its values where these are no more; none of few flights."""
+    """Failures by thirds or fifths of a varied parameter, or by its values if no more; none of few flights."""
     there = np.isfinite(values)
     values, failed = values[there], failed[there]
     size = next((groups for flights, groups in _GROUPS if values.size >= flights), 0)

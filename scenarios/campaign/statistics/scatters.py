@@ -1,4 +1,4 @@
-"""The flights of a campaign as points: the worst margin over each drawn parameter.
+"""The flights of a campaign as points: the worst margin over each varied parameter.
 
 Few flights far out would squash all others into a line.  They are drawn at the edge, as triangles that point to where
 they are; a caption has how many they are and how far out.
@@ -75,7 +75,7 @@ class Margins:
 
 @dataclass(frozen=True, kw_only=True)
 class Cloud:
-    """A drawn parameter of every flight, as horizontal positions."""
+    """A varied parameter of every flight, as horizontal positions."""
 
     name: str  # the parameter
     label: str  # its name, with its unit where it has one
@@ -101,7 +101,7 @@ def margins(table: pa.Table) -> Margins | None:
 
 
 def clouds(table: pa.Table, drawn: Margins) -> list[Cloud]:
-    """Every drawn parameter, in order, with the course of the worst margin over it."""
+    """Every varied parameter, in order, with the course of the worst margin over it."""
     found = []
     for name in draw_names(table):
         column = DRAW + name

@@ -86,12 +86,12 @@ def test_the_page_shows_what_the_flights_show(estimated: Summary, reported: Path
     text = without_scripts((directory / "index.html").read_text())
     assert '<p class="verdict bad">30 of 1000 flights failed: 3.0 % (95 %: 2.0 to 4.3 %)</p>' in text
     assert "(violated, rmse.z &gt; 0.5)" in text
-    assert "The worst margin goes most with wind (" in text
+    assert "The worst margin correlates most with wind (" in text
     worst = estimated["worst"][0]["flight"]
     assert f"quadsim replay &#39;{directory}&#39; --flight {worst}<" in text
     for heading in ("How often", "Constraints", "Distributions", "What drives failure", "Worst flights"):
         assert f"<h2>{heading}</h2>" in text
-    for table in ("Failures over each drawn number", "What was drawn for them"):
+    for table in ("Failures over each varied parameter", "Their parameters"):
         assert f"<span>{table}</span>" in text
     assert "<dt>versions.numpy</dt><dd>2</dd>" in text
     assert {path.name for path in directory.iterdir()} == {

@@ -85,7 +85,7 @@ def test_xi_of_an_event_has_an_exact_p_value(ones: int, zeros: int) -> None:
 
 
 def test_the_p_value_of_xi_has_its_nominal_level() -> None:
-    """Of few and many pairs, of numbers, of rare events, and of a drawn number with few values."""
+    """Of few and many pairs, of numbers, of rare events, and of a varied parameter with few values."""
     rng = np.random.default_rng(3)
     for n, runs in ((15, 60), (60, 200), (300, 120)):
         for y_of in (lambda size: rng.normal(size=size), lambda size: (rng.random(size) < 0.1) * 1.0):

@@ -1,4 +1,4 @@
-"""What goes with the outcome: found where it was put in, and not where there is nothing, and reported in words."""
+"""What the outcome depends on: found where it was put in, and not where there is nothing, and reported in words."""
 
 from collections.abc import Callable
 from typing import Any
@@ -47,7 +47,7 @@ def test_harm_at_both_ends_is_reported(n: int) -> None:
     expected = next(one for one in sentences if one.startswith("The worst margin depends on mass (xi 0."))
     assert "highest near 1" in expected or "highest near 0.9" in expected
     assert expected.endswith("without rising or falling throughout: Chatterjee's xi, p-value after Holm's correction.")
-    assert not any("beyond chance" in one and one.startswith("The worst margin goes with no") for one in sentences)
+    assert not any("beyond chance" in one and one.startswith("The worst margin depends on no") for one in sentences)
     line = driver_table(summary).lines[0]
     assert (line[0].text, line[1].mark, line[3].mark) == ("mass", "", "best")
 
@@ -67,7 +67,7 @@ def test_both_measures_and_thresholds_are_corrected_together() -> None:
 
 
 def test_noise_is_taken_for_a_driver_in_one_campaign_of_twenty_at_most() -> None:
-    """Over 60 campaigns in which nothing matters: any claim, of any measure, drawn number, outcome or threshold."""
+    """Over 60 campaigns in which nothing matters: any claim, of any measure, varied parameter, outcome or threshold."""
     rng = np.random.default_rng(6)
     claims = 0
     for _ in range(60):
@@ -137,12 +137,12 @@ def test_a_threshold_alone_is_no_nothing() -> None:
     assert min(found["p_holm"], found["p_xi_holm"]) > 0.05
     sentences = campaign_sentences(summary)
     assert sum(one.startswith("Failures cluster above mass = 279") for one in sentences) == 1
-    assert not any(one.startswith("Failure goes with no drawn number") for one in sentences)
+    assert not any(one.startswith("Failure depends on no varied parameter") for one in sentences)
 
 
 def test_without_drivers_none_is_reported(make_campaign: MakeCampaign) -> None:
     sentences = campaign_sentences(estimate(make_campaign(40, severity=0.0)))
-    expected = "The worst margin goes with no drawn number beyond chance (rank correlation, and Chatterjee's xi"
+    expected = "The worst margin depends on no varied parameter beyond chance (rank correlation, and Chatterjee's xi"
     assert sum(one.startswith(expected) for one in sentences) == 1
     assert not split_table(estimate(make_campaign(40, severity=0.0))).lines
 
