@@ -292,7 +292,7 @@ def _relaxed(
     z[above] -= found.ineqlin.marginals[: np.count_nonzero(above)]
     z[below] += found.ineqlin.marginals[np.count_nonzero(above) :]
     z_box = -found.upper.marginals - found.lower.marginals
-    multipliers = form.multipliers(replace(refusal(qp), z=z, z_box=z_box))
+    multipliers = form.multipliers(refusal(qp)._replace(z=z, z_box=z_box))
     return _Relaxed(
         total=float(found.fun),
         slacks=slacks,

@@ -55,7 +55,7 @@ class Objective:
 
     def desired(self, reference: Array) -> Array:
         """Desired outputs y_r^d (..., n_r) of a reference (..., 4) for x, y, z, yaw; other states are wanted at 0."""
-        return np.matmul(reference, self._of_reference)
+        return np.dot(reference, self._of_reference)
 
     @cached_property
     def _of_reference(self) -> Array:

@@ -129,8 +129,7 @@ class Point(NamedTuple):
     z_box: Array
 
 
-@dataclass(frozen=True, kw_only=True)
-class Solution:
+class Solution(NamedTuple):
     """What a back end answers, or a shortcut; arrays are no back end's own, and not to be written to."""
 
     x: Array  # primal point

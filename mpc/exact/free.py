@@ -31,8 +31,8 @@ class FreeOptimum:
         parts: its axes.
 
     Attributes:
-        inputs: for each axis, its rows of w.
-        outputs: likewise, of y.
+        inputs: (nu,) what of the answer are inputs, those of one axis after the other.
+        outputs: (n_c,) what of it are outputs, likewise.
 
     Raises:
         numpy.linalg.LinAlgError: a Hessian is so ill-conditioned that the gains are not exact.
@@ -41,29 +41,30 @@ class FreeOptimum:
     def __init__(self, problem: Problem, parts: list[Axis]) -> None:
         N, n, n_r, nu = problem.horizon, problem.model.n, problem.objective.C_r.shape[0], problem.model.nu
         self._moves = problem.objective.Q_d is not None
-        self.inputs = _blocks([axis.T.shape[1] for axis in parts])
-        self.outputs = _blocks([axis.outputs.size for axis in parts])
-        self._w, self._y = np.empty((self.inputs[-1].stop, N)), np.empty((self.outputs[-1].stop, N))
+        inputs = _blocks([axis.T.shape[1] for axis in parts])
+        blocks = _blocks([axis.T.shape[1] + axis.outputs.size for axis in parts])
+        ends = [block.start + axis.T.shape[1] for axis, block in zip(parts, blocks, strict=True)]
+        self._found = np.empty((blocks[-1].stop, N))
+        rows = np.arange(len(self._found))
+        self.inputs = np.concatenate([rows[block.start : end] for block, end in zip(blocks, ends, strict=True)])
+        self.outputs = np.concatenate([rows[end : block.stop] for block, end in zip(blocks, ends, strict=True)])
         columns = np.arange(n + N * n_r + (nu if self._moves else 0))
         wanted, before = columns[n : n + N * n_r].reshape(N, n_r), columns[n + N * n_r :]
         self._query = np.empty(columns.size)
         order = [
             np.concatenate([axis.states, wanted[:, axis.regulated].ravel(), before[own]])
-            for axis, own in zip(parts, self.inputs, strict=True)
+            for axis, own in zip(parts, inputs, strict=True)
         ]
         self._to_axes = np.concatenate([axis.T_inverse for axis in parts]) if self._moves else np.zeros((0, nu))
         self._order, self._given = np.concatenate(order), np.empty(sum(part.size for part in order))
         self._products: list[tuple[Array, Array, Array]] = []
         """Matrix, what it is multiplied with, where that goes: views."""
-        givens = zip(parts, _blocks([part.size for part in order]), self.inputs, self.outputs, strict=True)
-        for axis, given, inputs, outputs in givens:
-            of_inputs, of_outputs = _maps(axis, problem.rows.C[np.ix_(axis.outputs, axis.states)])
-            self._products.append((of_inputs, self._given[given], self._w[inputs].reshape(-1)))
-            if axis.outputs.size:
-                self._products.append((of_outputs, self._given[given], self._y[outputs].reshape(-1)))
+        for axis, given, block in zip(parts, _blocks([part.size for part in order]), blocks, strict=True):
+            W = _map(axis, problem.rows.C[np.ix_(axis.outputs, axis.states)])
+            self._products.append((W, self._given[given], self._found[block].reshape(-1)))
 
-    def at(self, dx: Array, dy: Array, du: Array) -> tuple[Array, Array]:
-        """Inputs (m, N) and rows' C x (n_c, N) of all axes, for deviations (n,), (N, n_r), (nu,); reused."""
+    def at(self, dx: Array, dy: Array, du: Array) -> Array:
+        """Inputs w and rows' C x of all axes (nu + n_c, N), for deviations (n,), (N, n_r), (nu,); reused."""
         if self._moves:
             np.concatenate((dx, dy, self._to_axes @ du), axis=None, out=self._query)
         else:
@@ -71,11 +72,11 @@ class FreeOptimum:
         self._query.take(self._order, out=self._given, mode="clip")  # a mode that takes no copy
         for matrix, given, found in self._products:
             np.dot(matrix, given, out=found)
-        return self._w, self._y
+        return self._found
 
 
-def _maps(axis: Axis, C: Array) -> tuple[Array, Array]:
-    """W of one axis, for its inputs (m N, columns) and outputs (n_c N, ...), each channel's N steps together."""
+def _map(axis: Axis, C: Array) -> Array:
+    """W of one axis (m N + n_c N, columns), each channel's N steps together."""
     problem, maps, terms = axis.problem, axis.maps, axis.cost
     N, model = problem.horizon, problem.model
     factor = scipy.linalg.cho_factor(terms.H)
@@ -86,7 +87,9 @@ def _maps(axis: Axis, C: Array) -> tuple[Array, Array]:
     inputs = -scipy.linalg.cho_solve(factor, np.hstack(slopes))
     states = maps.Psi @ inputs
     states[:, : model.n] += maps.Phi
-    return _by_channel(inputs.reshape(N, model.nu, -1)), _by_channel(C @ states.reshape(N, model.n, -1))
+    return np.concatenate(
+        [_by_channel(inputs.reshape(N, model.nu, -1)), _by_channel(C @ states.reshape(N, model.n, -1))]
+    )
 
 
 def _by_channel(steps: Array) -> Array:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time as clock
-from dataclasses import replace
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -61,18 +60,25 @@ class Shortcut:
         parts = axes(problem) if parts is None else parts
         self._rows, self._whole, self._rest = rows, whole, problem.rest
         self._free, self.formulation = FreeOptimum(problem, parts), Condensed(problem)
-        self._T = np.ascontiguousarray(np.hstack([axis.T for axis in parts]).T)
         self._C_r, self._C = problem.objective.C_r, rows.C
-        self._D, self._E = np.ascontiguousarray(rows.D.T), np.ascontiguousarray(rows.E.T)
-        channels = np.concatenate([axis.outputs for axis in parts])
-        of_states = rows.of_states[channels]
-        self._later = channels[of_states], np.flatnonzero(of_states)
-        self._now = channels[~of_states], np.flatnonzero(~of_states)
+        found, channels = self._free.outputs, np.concatenate([axis.outputs for axis in parts])
+        later = rows.of_states[channels]
+        self._now = channels[~later], found[~later]
+        # What the free optimum finds, as inputs (nu,) and as rows' values (m,); these are of inputs and steps as well.
+        self._T = np.zeros((nu + channels.size, nu))
+        self._T[self._free.inputs] = np.hstack([axis.T for axis in parts]).T
+        of_found = np.zeros((nu + channels.size, len(rows.C)))
+        of_found[found[later], channels[later]] = 1.0
+        self._to_values = np.concatenate([rows.D.T, rows.E.T, of_found])
+        terms = np.empty((N, len(self._to_values)))
+        self._terms, self._inputs, self._steps, self._found = terms, *np.split(terms, [nu, 2 * nu], axis=1)
         self._lower, self._upper = rows.lower.ravel(), rows.upper.ravel()
         endless = np.isinf(rows.lower) + 2 * np.isinf(rows.upper)
         self._uneven = bool((endless != endless[0]).any())  # some steps have bounds that others lack
-        self._steps, self._values = np.empty((N, nu)), np.empty(rows.lower.shape)
-        self._side: Side = np.zeros(rows.lower.size, np.int8)
+        self._values = np.empty(rows.lower.shape)
+        self._none_active: Side = np.zeros(rows.lower.size, np.int8)
+        self._none_active.setflags(write=False)
+        self._side = self._none_active
         self._no_slacks = read_only(np.zeros((N, rows.soft.size)))
         qp = self.formulation.qp
         nothing, no_rows = read_only(np.zeros(0)), read_only(np.zeros(qp.h_l.size))
@@ -99,7 +105,7 @@ class Shortcut:
 
     def reset(self) -> None:
         """See `mpc.solvers.Solver.reset`."""
-        self._side, self._first = np.zeros_like(self._side), True
+        self._side, self._first = self._none_active, True
         self._whole.reset()
 
     def solve(self, state: Array, desired: Array, u_before: Array, rest: Rest | None = None) -> Answer:
@@ -107,45 +113,42 @@ class Shortcut:
         started = clock.perf_counter()
         x_s, u_s = self._rest if rest is None else rest
         dx, dy = (state, desired) if rest is None else (state - x_s, desired - self._C_r @ x_s)
-        w, y = self._free.at(dx, dy, u_before - u_s)
-        plan = np.dot(w.T, self._T)
+        found = self._free.at(dx, dy, u_before - u_s).T
+        plan = np.dot(found, self._T)
         plan += u_s
-        values = self._values_of_inputs(plan, u_before)
-        rows, channels = self._later
-        values[:, rows] += y[channels].T
+        self._found[:] = found
+        values = self._values_of(plan, u_before)
         rows, channels = self._now
         if rows.size:
             values[0, rows] += self._C[rows] @ dx
-            values[1:, rows] += y[channels, :-1].T
+            values[1:, rows] += found[:-1, channels]
         if rest is not None:
             values += self._C @ x_s
         free = values.ravel()
         within = (self._lower <= free) & (free <= self._upper)
         if within.all():
-            self._side = np.zeros_like(self._side)
+            self._side = self._none_active
             x = np.concatenate((plan.ravel(), self._no_slacks.ravel())) if self._no_slacks.size else plan.ravel()
             solution = self._solution(self._no_multipliers._replace(x=x), self._nothing, started, UNCONSTRAINED)
             return Answer(plan=plan, slacks=self._no_slacks, solution=solution, method=Method.FREE)
         free = free.copy()  # the values' room is used again
         if np.isfinite(free).all():
             starts = self._starts()
-            found, settled = self._by_axes(plan, free, within, u_before, starts)
-            method = Method.WHOLE if found is None else Method.AXES
-            if found is None and settled and self._all is not None:
-                found = self._all.solve(plan, free, starts)
-            if found is not None:
-                self._side = found.active.side
-                return self._answer(found, method, started)
+            optimum, settled = self._by_axes(plan, free, within, u_before, starts)
+            method = Method.WHOLE if optimum is None else Method.AXES
+            if optimum is None and settled and self._all is not None:
+                optimum = self._all.solve(plan, free, starts)
+            if optimum is not None:
+                self._side = optimum.active.side
+                return self._answer(optimum, method, started)
         return self._by_solver(plan, free, (state, desired, u_before, rest), started)
 
-    def _values_of_inputs(self, plan: Array, u_before: Array) -> Array:
-        """(N, m) D u + E (u - u_before) of the rows; the next call's too."""
-        steps, values = self._steps, self._values
-        np.subtract(plan[0], u_before, out=steps[0])
-        np.subtract(plan[1:], plan[:-1], out=steps[1:])
-        np.dot(plan, self._D, out=values)
-        values += np.dot(steps, self._E)
-        return values
+    def _values_of(self, plan: Array, u_before: Array) -> Array:
+        """(N, m) values of the rows, of those of states at the free optimum; the next call's too."""
+        self._inputs[:] = plan
+        np.subtract(plan[0], u_before, out=self._steps[0])
+        np.subtract(plan[1:], plan[:-1], out=self._steps[1:])
+        return np.dot(self._terms, self._to_values, out=self._values)
 
     def _starts(self) -> list[Side]:
         """The last active set moved one step earlier, its last step's held, and as it was."""
@@ -169,7 +172,7 @@ class Shortcut:
                 return None, False
             plan, steps = found.plan, steps + found.active.steps
             z[own], side[own], values[own] = found.active.z, found.active.side, found.active.values
-        inputs = self._values_of_inputs(plan, u_before)
+        inputs = self._values_of(plan, u_before)
         np.copyto(values.reshape(inputs.shape), inputs, where=self._of_inputs_alone)
         beyond = np.maximum(values - self._upper, self._lower - values)
         if self._no_slacks.size:
@@ -211,7 +214,7 @@ class Shortcut:
         solves = [whole.solve]
         if self._first and self._all is not None and isinstance(whole, QPSolver) and whole.can_solve_roughly:
             solves.insert(0, whole.solve_roughly)
-        self._side, self._first = np.zeros_like(self._side), False
+        self._side, self._first = self._none_active, False
         for solve in solves:
             answer = solve(*query)
             started, given = clock.perf_counter(), answer.solution
@@ -228,10 +231,10 @@ class Shortcut:
                     spent_s += given.solve_s + answer.solution.solve_s
                     break
                 point = self.formulation.point(answer.plan, answer.slacks, multipliers)
-                solution = replace(given, x=point.x, y=point.y, z=point.z, z_box=point.z_box)
-                answer = replace(answer, solution=solution)
+                solution = given._replace(**point._asdict())
+                answer = answer._replace(solution=solution)
             spent_s += given.solve_s + clock.perf_counter() - started
-        return replace(answer, solution=replace(answer.solution, iterations=iterations, solve_s=spent_s))
+        return answer._replace(solution=answer.solution._replace(iterations=iterations, solve_s=spent_s))
 
 
 class _Found(NamedTuple):

@@ -10,7 +10,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from enum import StrEnum
 from functools import partial
-from typing import Final, Protocol
+from typing import Final, NamedTuple, Protocol
 
 import numpy as np
 
@@ -136,8 +136,7 @@ class Method(StrEnum):
     WHOLE = "the whole QP"
 
 
-@dataclass(frozen=True, kw_only=True)
-class Answer:
+class Answer(NamedTuple):
     """An optimum as a plan."""
 
     plan: Array  # (N, nu) inputs [rad/s]; to be used only when the solution's status is accepted

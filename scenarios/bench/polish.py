@@ -12,7 +12,6 @@ constraint at a time is learnt, the worst first.
 from __future__ import annotations
 
 import warnings
-from dataclasses import replace
 from typing import Any, Final
 
 import numpy as np
@@ -76,7 +75,7 @@ def polish(qp: QP, solution: Solution) -> Solution:
     multipliers = np.zeros_like(lower)
     multipliers[active] = held
     z_box, z, y = np.split(multipliers, [n, n + rows])
-    return replace(solution, x=x, y=y, z=z, z_box=z_box, active=int(np.count_nonzero(active < n + rows)))
+    return solution._replace(x=x, y=y, z=z, z_box=z_box, active=int(np.count_nonzero(active < n + rows)))
 
 
 def _worst(against: Array, among: Any) -> Any:

@@ -142,7 +142,7 @@ def _free_commands(law: UnconstrainedMPC, queries: list[tuple[Array, Array, Arra
     problem = with_constraints(law.problem)
     parts, u_bar = axes(problem), problem.model.u_bar
     T, optimum = np.hstack([part.T for part in parts]), FreeOptimum(problem, parts)
-    desired = problem.objective.desired
+    desired, first = problem.objective.desired, (optimum.inputs, 0)
     return np.array(
-        [u_bar + T @ optimum.at(state, desired(path), before - u_bar)[0][:, 0] for state, before, path in queries]
+        [u_bar + T @ optimum.at(state, desired(path), before - u_bar)[first] for state, before, path in queries]
     )

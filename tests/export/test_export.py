@@ -170,7 +170,8 @@ def test_dynamic_programming_finds_the_free_optimum(settings: list[str]) -> None
     problem = build_problem(scenario, build_vehicle(scenario))
     found, rng = tables(problem), np.random.default_rng(0)
     state, reference = rng.normal(size=12), rng.normal(size=(problem.horizon, 4))
-    wanted = FreeOptimum(problem, axes(problem)).at(state, problem.objective.desired(reference), np.zeros(4))[0]
+    free = FreeOptimum(problem, axes(problem))
+    wanted = free.at(state, problem.objective.desired(reference), np.zeros(4))[free.inputs]
     for axis in found.axes:
         w = optimum(axis, state[axis.states], reference)
         np.testing.assert_allclose(w[:, 0], wanted[axis.first], atol=1e-9)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from support import paper_problem, paper_reference
@@ -32,11 +30,11 @@ class FaultySolver(QPSolver):
         fault = self.faults.get(self.calls)
         self.calls += 1
         if fault == "not_finite":
-            return replace(answer, plan=answer.plan * np.nan)
+            return answer._replace(plan=answer.plan * np.nan)
         if fault == "out_of_bounds":
-            return replace(answer, plan=answer.plan + 100.0)
+            return answer._replace(plan=answer.plan + 100.0)
         if fault is not None:
-            return replace(answer, solution=replace(answer.solution, status=fault), plan=answer.plan * 0.0)
+            return answer._replace(solution=answer.solution._replace(status=fault), plan=answer.plan * 0.0)
         return answer
 
 

@@ -71,12 +71,12 @@ def test_kkt_residuals_see_every_kind_of_fault() -> None:
     query = (STATE, problem.objective.desired(paper_reference(60)[1:51]), problem.model.u_bar)
     qp, solution = solved(formulation, backend, query)
     assert kkt_residuals(qp, solution).worst < 1e-3
-    assert kkt_residuals(qp, replace(solution, x=solution.x + 1.0)).stationarity > 0.1
-    assert kkt_residuals(qp, replace(solution, x=solution.x * 3.0)).primal > 1.0
-    assert kkt_residuals(qp, replace(solution, z=solution.z + 1.0)).complementarity > 1.0
+    assert kkt_residuals(qp, solution._replace(x=solution.x + 1.0)).stationarity > 0.1
+    assert kkt_residuals(qp, solution._replace(x=solution.x * 3.0)).primal > 1.0
+    assert kkt_residuals(qp, solution._replace(z=solution.z + 1.0)).complementarity > 1.0
     assert np.isnan(kkt_residuals(replace(qp, h_l=qp.h_l * np.nan), solution).worst)  # never taken for optimal
     unbounded = replace(qp, x_u=np.full_like(qp.x_u, np.inf))
-    assert kkt_residuals(unbounded, replace(solution, z_box=solution.z_box + 1.0)).dual > 0.9
+    assert kkt_residuals(unbounded, solution._replace(z_box=solution.z_box + 1.0)).dual > 0.9
 
 
 def test_answers_are_copies_that_the_next_solve_leaves_alone() -> None:

@@ -320,7 +320,7 @@ def by_active_set(qp: QP, near: Solution) -> Solution | None:
         return None
     multipliers = np.zeros(len(rows))
     multipliers[bounded] = found.z
-    return replace(near, x=problem.free - problem.R @ found.z, z_box=multipliers[:n], z=multipliers[n:])
+    return near._replace(x=problem.free - problem.R @ found.z, z_box=multipliers[:n], z=multipliers[n:])
 
 
 def certified(qp: QP, solution: Solution) -> Array | None:
@@ -372,7 +372,7 @@ def test_the_certificate_is_of_the_optimum_alone() -> None:
     backend.setup(qp)
     solution = backend.solve(Vectors(c=qp.c, b=qp.b, h_l=qp.h_l, h_u=qp.h_u))
     for z, exact in (([-2.0, 0.0], True), ([0.0, 0.0], False), ([-2.0, -1.0], False)):
-        x = certified(qp, replace(solution, z=np.array(z), z_box=np.zeros(2)))
+        x = certified(qp, solution._replace(z=np.array(z), z_box=np.zeros(2)))
         assert (x is not None) is exact
         if x is not None:
             np.testing.assert_array_equal(x, [1.0, 0.0])

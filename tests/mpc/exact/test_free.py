@@ -85,7 +85,8 @@ def test_values_of_rows_are_those_of_the_plan() -> None:
     problem, (state, desired, before, rest) = drawn(np.random.default_rng(2), TERMS, size=0.5, room=1.0)
     parts = axes(problem)
     free = FreeOptimum(problem, parts)
-    w, y = free.at(state - rest.x, desired - problem.objective.C_r @ rest.x, before - rest.u)
+    answer = free.at(state - rest.x, desired - problem.objective.C_r @ rest.x, before - rest.u)
+    w, y = answer[free.inputs], answer[free.outputs]
     plan = rest.u + w.T @ np.hstack([axis.T for axis in parts]).T
     states = ocp_peer.trajectory(ocp_peer.period(problem, state, desired, before, rest), plan)[1:]
     channels = np.concatenate([axis.outputs for axis in parts])

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -59,7 +58,7 @@ class FaultySolver(QPSolver):
         answer = super().solve(state, desired, u_before, rest)
         if fault is None:
             return answer
-        return replace(answer, solution=replace(answer.solution, status=fault), plan=answer.plan * np.nan)
+        return answer._replace(solution=answer.solution._replace(status=fault), plan=answer.plan * np.nan)
 
 
 def fly_paper(

@@ -209,9 +209,9 @@ def test_wrong_answers_and_failures_are_seen(constrained_flight: Flight) -> None
     assert command is not None
     assert answer is not None
     candidate.answers[1] = (replace(command, speeds=command.speeds + 1.0), answer)
-    off = replace(answer, solution=replace(answer.solution, x=answer.solution.x + 1.0))
+    off = answer._replace(solution=answer.solution._replace(x=answer.solution.x + 1.0))
     candidate.answers[2] = (candidate.answers[2][0], off)
-    candidate.answers[3] = (None, replace(answer, solution=replace(answer.solution, status="numerics")))
+    candidate.answers[3] = (None, answer._replace(solution=answer.solution._replace(status="numerics")))
     verdict = judge(candidate, queries, periods, reference)
     assert verdict.input_error == pytest.approx(1.0, abs=1e-3)
     assert verdict.kkt is not None

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from support import paper_problem, paper_reference
@@ -45,6 +43,6 @@ def test_polish_adds_and_drops_constraints() -> None:
         many[np.argmin(np.abs(many))] = 1e3
         for z in (few, many):
             assert not np.array_equal(z, optimum.z)
-            again = polish(qp, replace(optimum, z=z))
+            again = polish(qp, optimum._replace(z=z))
             np.testing.assert_allclose(again.x, optimum.x, atol=1e-6)
             assert kkt_residuals(qp, again).worst < 1e-6
