@@ -117,7 +117,7 @@ gym: setup  ## remake the numbers and the figure of docs/gym.md: some ten minute
 soak: setup  ## one simulated hour on end: memory and step time have to stay as they were
 	@$(PY) tests/soak.py --minutes 60
 
-campaigns: setup  ## fly the campaigns that ship and remake docs/paper-robustness.md, an hour and a quarter; goes on with what is there
+campaigns: setup  ## fly the campaigns that ship and remake docs/paper-robustness.md, some forty minutes; goes on with what is there
 	@$(PY) docs/make_campaigns.py
 
 tuning: setup  ## carry out the tunings that ship and remake docs/tuning.md, up to half an hour each; goes on with what is there

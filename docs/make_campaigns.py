@@ -1,6 +1,6 @@
 """Fly the campaigns that ship, and remake docs/paper-robustness.md with its figures: `make campaigns`.
 
-The flights take an hour and a quarter on two quiet cores, most of it the robust controller's.  They are saved under
+The flights take some forty minutes on two quiet cores.  They are saved under
 runs/campaigns/, and resumed where they were stopped; remove that folder to fly them all anew.  What is flown is
 summed up again by the code as it is.  With --there nothing is flown, and the page is made of the campaigns as they are,
 which may have been flown with fewer --flights, or by an earlier version of their files.
