@@ -288,7 +288,7 @@ class _FailingSolver:
         if self.status == SOLVED:
             return answer
         spoilt = {name: np.full_like(getattr(answer, name), np.nan) for name in ("x", "y", "z", "z_box")}
-        return type(answer)(**{**vars(answer), **spoilt, "status": self.status})
+        return answer._replace(**spoilt, status=self.status)
 
 
 @contextlib.contextmanager
