@@ -3,19 +3,23 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
+from typing import Annotated
 
 import numpy as np
+from annotated_types import Len, doc
 
 from mpc.disturbance import RampSettings
 from mpc.nonlinear.rigidbody import Inputs
 from mpc.observer import ObserverSettings
 from quadsim.errors import ParameterError
+from quadsim.fields import NonNegative, Weight
 from quadsim.state import Array
 
-Weight = float | tuple[float, float, float]
-"""One number for three axes, or one each."""
+AxisWeights = Weight | Annotated[Sequence[Weight], Len(3, 3)]
+"""One weight for three axes, or one each."""
 
 
 class AttitudeError(StrEnum):
@@ -29,14 +33,14 @@ class AttitudeError(StrEnum):
 
 @dataclass(frozen=True, kw_only=True)
 class Weights:
-    """What squared distances from the reference cost; of three axes one number or one each."""
+    """What squared distances from the reference cost."""
 
-    position: Weight = 10.0  # [1/m^2]
-    attitude: Weight = 0.1  # [1/rad^2], or of the squared difference; then one number
-    velocity: Weight = 0.05  # [1/(m/s)^2]
-    body_rates: Weight = 0.05  # [1/(rad/s)^2]
-    input: float = 0.1  # of an input's distance from the reference's, as shares
-    move: float = 0.0  # of its change from one node to the next; 0 for none
+    position: Annotated[AxisWeights, doc("[1/m^2] one weight, or x, y, z")] = 10.0
+    attitude: Annotated[AxisWeights, doc("[1/rad^2] one weight, or about body x, y, z")] = 0.1
+    velocity: Annotated[AxisWeights, doc("[1/(m/s)^2] one weight, or x, y, z")] = 0.05
+    body_rates: Annotated[AxisWeights, doc("[1/(rad/s)^2] one weight, or about body x, y, z")] = 0.05
+    input: Annotated[Weight, doc("[-] of an input's distance from the reference's, as shares")] = 0.1
+    move: Annotated[NonNegative, doc("[-] of an input's change from one node to the next, as shares")] = 0.0
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
@@ -46,6 +50,8 @@ class Weights:
             if array.shape not in axes or not inside.all():
                 rule = "positive: one number, or three" if len(axes) == 2 else "one positive number"
                 raise ParameterError("controller.weights", name, value, rule)
+            if array.ndim:
+                object.__setattr__(self, name, tuple(array.tolist()))
 
 
 _USUAL = Weights()
@@ -118,5 +124,5 @@ class NonlinearSettings:
         return rows, np.concatenate(parts)
 
 
-def _three(weight: Weight) -> Array:
+def _three(weight: AxisWeights) -> Array:
     return np.broadcast_to(np.asarray(weight, float), 3)

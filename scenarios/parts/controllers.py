@@ -243,14 +243,14 @@ def _nonlinear(spec: NonlinearSpec, vehicle: Vehicle, period: float, shapes: Seq
     from mpc.indi import Incremental
     from mpc.nonlinear.controller import NonlinearMPC
     from mpc.nonlinear.rigidbody import Inputs
-    from mpc.nonlinear.settings import AttitudeError, NonlinearSettings, Weights
+    from mpc.nonlinear.settings import AttitudeError, NonlinearSettings
 
     stride = 1 if spec.node is None else round(spec.node / period)
     if spec.node is not None and (stride < 1 or not math.isclose(stride * period, spec.node, rel_tol=1e-9)):
         raise ParameterError("controller", "node", spec.node, f"a whole multiple of the control period of {period} s")
     if spec.horizon % stride:
         raise ParameterError("controller", "horizon", spec.horizon, f"a whole number of nodes, {stride} periods each")
-    held, axes = spec.input_bounds, spec.weights
+    held = spec.input_bounds
     bounds = ActuatorBounds.alike(
         (vehicle.speed_min, vehicle.speed_max) if held.speed is None else _pair(held.speed),
         (-math.inf, math.inf) if held.slew is None else _pair(held.slew),
@@ -266,14 +266,7 @@ def _nonlinear(spec: NonlinearSpec, vehicle: Vehicle, period: float, shapes: Seq
         drag=_three(spec.drag),
         quadratic_drag=_three(spec.quadratic_drag),
         attitude_error=AttitudeError(spec.attitude_error),
-        weights=Weights(
-            position=_three(axes.position),
-            attitude=_three(axes.attitude) if isinstance(axes.attitude, list) else axes.attitude,
-            velocity=_three(axes.velocity),
-            body_rates=_three(axes.body_rates),
-            input=axes.input,
-            move=axes.move,
-        ),
+        weights=spec.weights,
         terminal=0.0 if spec.terminal == "none" else spec.terminal,
         tilt=None if spec.tilt is None else math.radians(spec.tilt),
         largest_rates=_three(math.inf if spec.body_rate is None else np.radians(spec.body_rate).tolist()),

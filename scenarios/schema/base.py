@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from typing import Annotated, Any, Final, Literal, TypeGuard, get_type_hints
 
 from annotated_types import DocInfo, Len
-from pydantic import BaseModel, ConfigDict, Discriminator, Field, Tag
+from pydantic import BaseModel, ConfigDict, Field
 from pydantic.fields import FieldInfo
 
 from quadsim.fields import Number
@@ -31,13 +31,7 @@ LARGEST_SEED: Final = 2**63 - 1
 Seconds = Annotated[float, Field(ge=0.0, le=10.0)]
 
 
-def _number_or_text(value: object) -> str:
-    return "text" if isinstance(value, str) else "number"
-
-
-Lag = Annotated[
-    Annotated[Seconds, Tag("number")] | Annotated[Literal["vehicle"], Tag("text")], Discriminator(_number_or_text)
-]
+Lag = Seconds | Literal["vehicle"]
 """A time constant, or that of the vehicle file."""
 
 

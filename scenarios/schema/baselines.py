@@ -10,9 +10,9 @@ from pydantic import Field, model_validator
 from mpc.baselines.preview import PREVIEW_DEGREE, SMALLEST_PREVIEW
 from mpc.disturbance import RampSettings
 from mpc.indi import INDISettings
-from quadsim.fields import NonNegative, Positive
+from quadsim.fields import NonNegative, Positive, Weight
 from scenarios.schema.base import LARGEST_HORIZON, Spec
-from scenarios.schema.optimisation import InputBoundsSpec, InputWeightsSpec, Weight, require_states
+from scenarios.schema.optimisation import InputBoundsSpec, InputWeightsSpec, require_states
 
 Tilt = Annotated[float, Field(ge=0.1, le=80.0)]
 

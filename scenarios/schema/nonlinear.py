@@ -5,48 +5,23 @@ from __future__ import annotations
 from typing import Annotated, Final, Literal
 
 from annotated_types import Len, MaxLen
-from pydantic import Discriminator, Field, Tag, model_validator
+from pydantic import Field, model_validator
 
 from mpc.disturbance import RampSettings
 from mpc.fallback.settings import FallbackSettings
 from mpc.indi import INDISettings
+from mpc.nonlinear.settings import Weights
 from mpc.observer import ObserverSettings
 from mpc.robust.tightening import SHORTEST_LAG
 from quadsim.fields import NonNegative, Positive
 from scenarios.schema.base import MOST_ENTRIES, Horizon, Lag, Pair, Spec, require_ordered
-from scenarios.schema.optimisation import AvoidanceSpec, PolytopeSpec, SoftSpec, Weight
-
-
-def _number_or_list(value: object) -> str:
-    return "list" if isinstance(value, list) else "number"
-
-
-def _number_or_text(value: object) -> str:
-    return "text" if isinstance(value, str) else "number"
-
+from scenarios.schema.optimisation import AvoidanceSpec, PolytopeSpec, SoftSpec
 
 LINEAR: Final = ("x", "vx", "y", "vy", "z", "vz")
 """States that are so of the quaternion model too."""
-AxisWeights = Annotated[
-    Annotated[Weight, Tag("number")] | Annotated[list[Weight], Len(3, 3), Tag("list")], Discriminator(_number_or_list)
-]
-"""One weight for three axes, or one each."""
-Terminal = Annotated[
-    Annotated[NonNegative, Tag("number")] | Annotated[Literal["none", "lqr"], Tag("text")],
-    Discriminator(_number_or_text),
-]
+Terminal = NonNegative | Literal["none", "lqr"]
 NonNegativeTriple = Annotated[list[NonNegative], Len(3, 3)]
-
-
-class NonlinearWeightsSpec(Spec):
-    """What distances from the reference cost."""
-
-    position: AxisWeights = Field(default=10.0, description="[1/m^2] one weight, or x, y, z")
-    attitude: AxisWeights = Field(default=0.1, description="[1/rad^2] one weight, or about body x, y, z")
-    velocity: AxisWeights = Field(default=0.05, description="[1/(m/s)^2] one weight, or x, y, z")
-    body_rates: AxisWeights = Field(default=0.05, description="[1/(rad/s)^2] one weight, or about body x, y, z")
-    input: Weight = Field(default=0.1, description="[-] of an input's distance from the reference's, as shares")
-    move: NonNegative = Field(default=0.0, description="[-] of an input's change from one node to the next, as shares")
+PositiveTriple = Annotated[list[Positive], Len(3, 3)]
 
 
 class RotorBoundsSpec(Spec):
@@ -85,7 +60,7 @@ class NonlinearPartsSpec(Spec):
     inputs: Literal["thrust", "speed"] = Field(
         default="thrust", description="what the inputs are, as shares of the rotors' largest"
     )
-    weights: NonlinearWeightsSpec = NonlinearWeightsSpec()
+    weights: Weights = Weights()
     attitude_error: Literal["error-state", "difference"] = Field(
         default="error-state",
         description="error-state: twice the vector part of q_r* q, the angle to first order; difference: the four "
@@ -110,7 +85,7 @@ class NonlinearPartsSpec(Spec):
     tilt: Annotated[float, Field(gt=0.0, lt=90.0)] | None = Field(
         default=None, description="[deg] largest angle between thrust axis and vertical; absent: no bound"
     )
-    body_rate: AxisWeights | None = Field(
+    body_rate: Positive | PositiveTriple | None = Field(
         default=None, description="[deg/s] largest magnitude, one or about body x, y, z; absent: no bound"
     )
     soft: SoftSpec | None = Field(default=None, description="of the three above; absent: hard")
@@ -132,7 +107,7 @@ class NonlinearPartsSpec(Spec):
     def _check(self) -> NonlinearPartsSpec:
         if self.rotor_lag != "vehicle" and 0.0 < self.rotor_lag < SHORTEST_LAG:
             raise ValueError(f"rotor_lag must be 0, or at least {SHORTEST_LAG:g} s; got {self.rotor_lag:g}")
-        if self.attitude_error == "difference" and isinstance(self.weights.attitude, list):
+        if self.attitude_error == "difference" and not isinstance(self.weights.attitude, float):
             raise ValueError(
                 f'weights.attitude must be one number where attitude_error = "difference"; got {self.weights.attitude}'
             )

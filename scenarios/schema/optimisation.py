@@ -8,11 +8,11 @@ from dataclasses import dataclass
 from typing import Annotated, Final, Literal
 
 from annotated_types import Len, MaxLen, doc
-from pydantic import Discriminator, Field, Tag, model_validator
+from pydantic import Field, model_validator
 
 from mpc.space.settings import AvoidanceSettings
 from quadsim.errors import UnknownNameError
-from quadsim.fields import NonNegative, Number
+from quadsim.fields import NonNegative, Number, Weight
 from quadsim.flight.audit import TERMS
 from quadsim.state import STATE_NAMES, STATE_UNITS
 from scenarios.schema.base import MOST_ENTRIES, Horizon, Pair, Spec, require_ordered
@@ -20,16 +20,7 @@ from scenarios.schema.base import MOST_ENTRIES, Horizon, Pair, Spec, require_ord
 ANGLES: Final = frozenset(name for name, unit in zip(STATE_NAMES, STATE_UNITS, strict=True) if unit.startswith("rad"))
 """States that scenario files give in degrees (per second)."""
 
-Weight = Annotated[float, Field(gt=0.0, le=1e12)]
-
-
-def _number_or_list(value: object) -> str:
-    return "list" if isinstance(value, list) else "number"
-
-
-Weights = Annotated[
-    Annotated[Weight, Tag("number")] | Annotated[list[Weight], Len(4, 4), Tag("list")], Discriminator(_number_or_list)
-]
+Weights = Weight | Annotated[list[Weight], Len(4, 4)]
 """One weight for all rotors, or one each."""
 
 

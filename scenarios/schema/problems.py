@@ -18,6 +18,9 @@ from quadsim.errors import InputError, ParameterError, UnknownNameError
 from quadsim.vehicle import MEANT
 from scenarios.schema.base import fields_of, is_table
 
+_LISTS: Final = (list, tuple, Sequence)
+"""Types that are lists in a file."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class Kind:
@@ -39,7 +42,7 @@ class Kind:
     @property
     def is_list(self) -> bool:
         """Whether it is a list in a file."""
-        return (get_origin(self.type) or self.type) in (list, tuple)
+        return (get_origin(self.type) or self.type) in _LISTS
 
     @property
     def labels(self) -> set[str]:
@@ -123,7 +126,7 @@ def kinds_of(annotation: Any, metadata: tuple[Any, ...] = ()) -> tuple[Kind, ...
 def _entries(kind: Kind) -> tuple[Kind, ...]:
     """What a list, or a table with names of the writer's choice, holds."""
     origin, arguments = get_origin(kind.type), get_args(kind.type)
-    return kinds_of(arguments[0] if origin is tuple else arguments[-1]) if origin in (list, dict, tuple) else ()
+    return kinds_of(arguments[0] if origin is tuple else arguments[-1]) if origin in (*_LISTS, dict) else ()
 
 
 _RULES: Final = {
@@ -154,6 +157,8 @@ _RULES: Final = {
     "union_tag_not_found": "a table with a field {discriminator}",
 }
 """How pydantic's kinds of error end the sentence "must be ..."."""
+_OF_TYPE: Final = frozenset({"float_type", "list_type", "tuple_type", "is_instance_of", "sequence_str"})
+"""Those that say that a value is no number, or no list."""
 _MOST_LINES: Final = 20
 """Problems that one message names; it only counts the rest."""
 _MOST_ENTRIES: Final = 10
@@ -183,7 +188,8 @@ def describe_all(
 
     Fields that are missing come last: what is missing may only be misspelt.  Arguments as for `describe`.
     """
-    found = sorted(error.errors(include_url=False), key=lambda details: details["type"] == "missing")
+    found = _of_given_types(error.errors(include_url=False), data, root)
+    found.sort(key=lambda details: details["type"] == "missing")
     unsaid: set[int] = set()
     for each in found:
         if each["type"] in ("too_short", "too_long"):
@@ -192,6 +198,18 @@ def describe_all(
             longer = len(each["input"]) > (bounds["max_length"] if "max_length" in bounds else bounds["min_length"])
             unsaid.update(entries if longer else [id(each)] if entries else [])
     return [describe(details, data, root, file=file) for details in found if id(details) not in unsaid]
+
+
+def _of_given_types(found: list[ErrorDetails], data: Mapping[str, Any], root: type[BaseModel]) -> list[ErrorDetails]:
+    """Without the errors that say of a field of several types that its value is not of one of the others."""
+    kept = list(found)
+    for each in reversed(found):
+        field, kind = each["loc"][:-1], each["type"]
+        other_type = kind in _OF_TYPE or (kind == "literal_error" and not isinstance(each["input"], str))
+        if other_type and find(field, data, root).names == find(each["loc"], data, root).names:
+            rest = [error for error in kept if error is not each]
+            kept = rest if any(error["loc"][: len(field)] == field for error in rest) else kept
+    return kept
 
 
 def describe(details: ErrorDetails, data: Mapping[str, Any], root: type[BaseModel], *, file: str = "scenario") -> str:

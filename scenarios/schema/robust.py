@@ -9,8 +9,9 @@ from pydantic import Field, model_validator
 from mpc.fallback.settings import FallbackSettings
 from mpc.observer import ObserverSettings
 from mpc.robust.tightening import SHORTEST_LAG, TighteningSettings
+from quadsim.fields import Weight
 from scenarios.schema.base import Lag, Seconds
-from scenarios.schema.optimisation import BoundedSpec, SoftSpec, Weight
+from scenarios.schema.optimisation import BoundedSpec, SoftSpec
 
 TURNED: Final = frozenset({"x", "vx", "y", "vy", "yaw"})
 """States that have other values in axes turned by the yaw."""

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from typing import Annotated, Literal
 
 from annotated_types import Len, doc
-from pydantic import Discriminator, Field, Tag
+from pydantic import Field
 
 from quadsim.errors import ParameterError
 from quadsim.fields import NonNegative, Number, Vector
@@ -25,17 +25,9 @@ from quadsim.sim.estimation.settings import EstimatorSettings
 from quadsim.sim.sensing.sensor import Sampling, Sensor, SensorName
 from scenarios.schema.base import Spec
 
-
-def _number_or_list(value: object) -> str:
-    return "list" if isinstance(value, list | tuple) else "number"
-
-
-Deviations = Annotated[
-    Annotated[NonNegative, Tag("number")] | Annotated[tuple[NonNegative, ...], Len(3, 3), Tag("list")],
-    Discriminator(_number_or_list),
-]
+Deviations = NonNegative | Annotated[tuple[NonNegative, ...], Len(3, 3)]
 """One standard deviation for all three axes, or one each."""
-Offsets = Annotated[Annotated[Number, Tag("number")] | Annotated[Vector, Tag("list")], Discriminator(_number_or_list)]
+Offsets = Number | Vector
 """One offset for all three axes, or one each."""
 
 

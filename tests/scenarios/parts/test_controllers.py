@@ -344,9 +344,7 @@ def test_fields_of_nonlinear_mpc_arrive() -> None:
     made, x = law.settings, math.radians(1.0)
     assert (law.horizon, made.horizon, made.stride, law.solver) == (12, 4, 3, "daqp")
     assert (made.iterations, made.shift, made.substeps, made.inputs) == (3, True, 2, "speed")
-    weights = Weights(
-        position=(1.0, 2.0, 3.0), attitude=4.0, velocity=(5.0,) * 3, body_rates=(6.0,) * 3, input=7.0, move=8.0
-    )
+    weights = Weights(position=(1.0, 2.0, 3.0), attitude=4.0, velocity=5.0, body_rates=6.0, input=7.0, move=8.0)
     assert made.weights == weights
     assert (made.attitude_error, made.terminal, made.rotor_lag) == ("difference", 2.0, 0.03)
     assert (made.drag, made.quadratic_drag) == ((0.1, 0.2, 0.3), (0.4, 0.5, 0.6))
@@ -404,13 +402,20 @@ def test_nodes_that_do_not_fit_are_refused(fields: dict[str, Any], message: str)
             {"attitude_error": "difference", "weights": {"attitude": [1.0, 1.0, 1.0]}},
             'controller.weights.attitude must be one number where attitude_error = "difference"',
         ),
+        ({"weights": {"position": [1.0, -2.0, 3.0]}}, "controller.weights.position.1 must be > 0.0; got -2.0"),
+        ({"weights": {"position": "far"}}, "controller.weights.position must be a number; got 'far'"),
+        ({"weights": {"position": {}}}, "controller.weights.position must be a number; got {}"),
         ({"terminal": "lqg"}, "controller.terminal must be one of 'none' or 'lqr'; got 'lqg'"),
+        ({"terminal": -1.0}, "controller.terminal must be >= 0.0; got -1.0"),
+        ({"terminal": [1.0]}, "controller.terminal must be a number; got [1.0]"),
     ],
 )
 def test_wrong_fields_of_nonlinear_mpc_are_named(fields: dict[str, Any], message: str) -> None:
+    """Of a field of several types in one line, about the type that was given."""
     with pytest.raises(ScenarioError) as caught:
         scenario({"type": "nonlinear", **fields})
     assert message in str(caught.value)
+    assert len(caught.value.problems) == 1
 
 
 def test_fields_of_the_baselines_arrive() -> None:
