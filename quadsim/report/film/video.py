@@ -200,7 +200,9 @@ def worker_process(task: str, backend: str) -> subprocess.Popen[bytes]:
 def _environment(backend: str, workers: int = 1) -> dict[str, str]:
     # Side by side each worker keeps a core busy: threads of Mesa's software renderer would but take turns with them.
     threads = {"LP_NUM_THREADS": "0"} if workers > 1 else {}
-    return {**threads, **os.environ, **own_packages(), "MUJOCO_GL": backend, "PYOPENGL_PLATFORM": backend}
+    # It then takes the floor's texture from one mipmap instead of two: no eye sees that, and it is a tenth of the time.
+    texture = {"LP_PERF": "no_mip_linear"}
+    return {**threads, **texture, **os.environ, **own_packages(), "MUJOCO_GL": backend, "PYOPENGL_PLATFORM": backend}
 
 
 def _work(
