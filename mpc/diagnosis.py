@@ -26,8 +26,9 @@ from scipy import sparse
 
 from mpc.constraints import Constraint, Penalty
 from mpc.ocp import Problem, Query, Unanswered
+from mpc.qp import Point
 from mpc.relinearised import Relinearised
-from mpc.solvers import QPSolver, refusal
+from mpc.solvers import QPSolver
 from mpc.staged import Staged
 from quadsim.controller import SOLVED
 from quadsim.state import Array
@@ -292,7 +293,7 @@ def _relaxed(
     z[above] -= found.ineqlin.marginals[: np.count_nonzero(above)]
     z[below] += found.ineqlin.marginals[np.count_nonzero(above) :]
     z_box = -found.upper.marginals - found.lower.marginals
-    multipliers = form.multipliers(refusal(qp)._replace(z=z, z_box=z_box))
+    multipliers = form.multipliers(Point(x=found.x, y=np.zeros(0), z=z, z_box=z_box))
     return _Relaxed(
         total=float(found.fun),
         slacks=slacks,

@@ -121,27 +121,34 @@ class QPRows:
 
 
 class Point(NamedTuple):
-    """A primal point and the multipliers there; see `Solution`."""
+    """A primal point and the multipliers there."""
 
     x: Array
-    y: Array
-    z: Array
-    z_box: Array
+    y: Array  # multipliers of A x = b
+    z: Array  # multipliers of h_l <= G x <= h_u, positive at the upper side, negative at the lower
+    z_box: Array  # multipliers of x_l <= x <= x_u, signed likewise
 
 
 class Solution(NamedTuple):
     """What a back end answers, or a shortcut; arrays are no back end's own, and not to be written to."""
 
-    x: Array  # primal point
-    y: Array  # multipliers of A x = b
-    z: Array  # multipliers of h_l <= G x <= h_u, positive at the upper side, negative at the lower
-    z_box: Array  # multipliers of x_l <= x <= x_u, signed likewise
+    made: Point | Callable[[], Point]  # the point, or what makes it: a shortcut's is not wanted in flight
     status: str  # `solved`, or the back end's name for what went wrong; of a shortcut, see `mpc.exact.shortcut`
     iterations: int  # of the back end
     active: int  # inequality rows and box entries active at the point
     primal_residual: float  # as the back end reports it, before any polish; NaN where it reports none
     dual_residual: float  # likewise
     solve_s: float  # wall time inside the back end, updates included, and what shortcuts took before it [s]
+
+    @property
+    def point(self) -> Point:
+        """Where it is."""
+        return self.made if isinstance(self.made, Point) else self.made()
+
+    @property
+    def x(self) -> Array:
+        """The primal point."""
+        return self.point.x
 
 
 class Formulation(Protocol):
@@ -164,8 +171,8 @@ class Formulation(Protocol):
         """(N, m_s) the slacks in a primal point."""
         ...
 
-    def multipliers(self, solution: Solution) -> Array:
-        """(N, m) the multipliers of the problem's rows (`mpc.constraints.Rows`), signed as in `Solution`."""
+    def multipliers(self, point: Point) -> Array:
+        """(N, m) the multipliers of the problem's rows (`mpc.constraints.Rows`), signed as in `Point`."""
         ...
 
 
@@ -230,7 +237,7 @@ class KKTResiduals:
 
 def kkt_residuals(qp: QP, solution: Solution) -> KKTResiduals:
     """The KKT residuals of a solution, computed from the QP alone and believing no solver."""
-    x, y, z, z_box = solution.x, solution.y, solution.z, solution.z_box
+    x, y, z, z_box = solution.point
     gradient = qp.P @ x + qp.c + qp.A.T @ y + qp.G.T @ z + z_box
     values = np.concatenate([qp.G @ x, x])
     multipliers = np.concatenate([z, z_box])

@@ -10,7 +10,7 @@ from scipy.linalg import lapack
 
 from mpc.ocp import Problem, Rest
 from mpc.paper.condensed import Condensed
-from mpc.qp import QP, ChangingFormulation, Solution
+from mpc.qp import QP, ChangingFormulation, Point, Solution
 from mpc.solvers import SOLVERS, Answer, make_backend, refusal
 from mpc.staged import Staged
 from quadsim.controller import ACCEPTED, UNCONSTRAINED
@@ -88,10 +88,7 @@ class Relinearised:
             if (values < qp.h_l).any() or (values > qp.h_u).any():
                 return None
         return Solution(
-            x=x,
-            y=np.zeros(0),
-            z=np.zeros(qp.h_l.size),
-            z_box=np.concatenate([np.zeros(m), -qp.c[m:]]),
+            made=Point(x=x, y=np.zeros(0), z=np.zeros(qp.h_l.size), z_box=np.concatenate([np.zeros(m), -qp.c[m:]])),
             status=UNCONSTRAINED,
             iterations=0,
             active=0,

@@ -29,7 +29,7 @@ from scipy.sparse import csc_matrix
 
 from mpc.ocp import Problem, Rest
 from mpc.paper.prediction import condense_stages
-from mpc.qp import QP, QPRows, Solution, Vectors
+from mpc.qp import QP, Point, QPRows, Vectors
 from quadsim.errors import ParameterError
 from quadsim.state import Array, Indices
 
@@ -384,9 +384,9 @@ class Staged:
         later = (matrices.tail[:, :-1] @ x[at.tail][:, None, :, None])[..., 0] + tail[:, :-1]
         return np.concatenate([first, later.reshape(-1, at.n), x[at.starts[-1:]]])
 
-    def multipliers(self, solution: Solution) -> Array:
+    def multipliers(self, point: Point) -> Array:
         """See `mpc.qp.Formulation.multipliers`."""
-        return self._rows.multipliers(solution.z, solution.z_box[self._at.inputs].ravel())
+        return self._rows.multipliers(point.z, point.z_box[self._at.inputs].ravel())
 
     def _offsets(self, matrices: Matrices, c: Array, state: Array) -> tuple[Array, Array]:
         """(1, L + 1, n, 1) and (J - 1, M + 1, n, 1): the states of all stages where v_j and s_1 .. s_J are zero."""

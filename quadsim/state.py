@@ -178,6 +178,11 @@ def _entries(vectors: Array) -> tuple[Array, ...]:
     return tuple([array[..., i] for i in range(array.shape[-1])])
 
 
+def all_true(flags: NDArray[np.bool_]) -> bool:
+    """`flags.all()`, of few flags in a third of the time."""
+    return np.count_nonzero(flags) == flags.size
+
+
 def read_only(array: Array) -> Array:
     """The same array, marked read-only: what is stored is never changed afterwards."""
     array.flags.writeable = False

@@ -91,6 +91,7 @@ class _Trial(NamedTuple):
         over: (all rows,) violation of inactive rows.
         joining: (all rows,) which of them are violated.
         wrong: how many rows break the conditions.
+        violated: whether any row is taken to be violated.
         failed: the first active row that depends on those before it, counted from 1; 0 for none.
     """
 
@@ -105,6 +106,7 @@ class _Trial(NamedTuple):
     over: Array
     joining: NDArray[np.bool_]
     wrong: int
+    violated: bool
     failed: int
 
 
@@ -179,17 +181,17 @@ class ActiveSet:
         rows = self._S.take(active, 0, self._room[: active.size], "clip")  # a mode that takes no copy
         factor = rows.take(active, 1).T
         excess = z = bounds[taken, active]
+        entries = taken.tobytes() if self._soft else b""
+        violated = b"\x02" in entries or b"\xfe" in entries  # 2 or -2
         if active.size:
-            entries = taken.tobytes() if self._soft else b""
-            violated = b"\x02" in entries or b"\xfe" in entries  # 2 or -2
             if violated:
                 beyond = (np.abs(taken) == 2).nonzero()[0]
                 factor[beyond, beyond] += self._compliance[active[beyond]]
             factor, z, failed = lapack.dposv(factor, excess, lower=1, overwrite_a=1)
             if failed:
-                nothing = np.zeros(0)
+                none = np.zeros(0)
                 return _Trial(
-                    side, active, rows, factor, excess, z, nothing, taken, nothing, nothing > 0.0, side.size, failed
+                    side, active, rows, factor, excess, z, none, taken, none, none > 0.0, side.size, violated, failed
                 )
             pieces = self._pieces(active, taken, z, violated=violated)
         fall = np.dot(z, rows)
@@ -199,7 +201,7 @@ class ActiveSet:
         wrong = int(np.count_nonzero(joining))
         if pieces is not taken:
             wrong += int(np.count_nonzero(pieces != taken))
-        return _Trial(side, active, rows, factor, excess, z, fall, pieces, over, joining, wrong, 0)
+        return _Trial(side, active, rows, factor, excess, z, fall, pieces, over, joining, wrong, violated, 0)
 
     def _pieces(self, active: Indices, pieces: Side, z: Array, *, violated: bool) -> Side:
         """The pieces that multipliers (k,) of active rows would be on, next to those they were taken to be on."""
@@ -269,16 +271,18 @@ class ActiveSet:
         """The optimum of the right active set, refined once; None where rows are too nearly dependent."""
         active, z, fall = trial.active, np.zeros(free.size), trial.fall
         if active.size:
-            if (trial.factor.diagonal() ** 2 < self._smallest[active]).any():
+            if np.count_nonzero(trial.factor.diagonal() ** 2 < self._smallest[active]):
                 return None
             left = trial.excess - fall[active]
-            if self._soft:
+            if trial.violated:
                 violated = np.abs(trial.pieces) == 2
                 left -= violated * self._compliance[active] * trial.z
             refined = trial.z + lapack.dpotrs(trial.factor, left, lower=1)[0]
             fall = np.dot(refined, trial.rows)
             apart = np.abs(trial.excess - fall[active])
-            if not (apart[~violated] if self._soft else apart).max(initial=0.0) <= FEASIBLE:
+            if trial.violated:
+                apart[violated] = 0.0
+            if not apart[apart.argmax()] <= FEASIBLE:
                 return None
             z[active] = refined
         return Active(z=z, values=free - fall, side=trial.side, steps=steps)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time as clock
+from functools import partial
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -15,10 +16,10 @@ from mpc.exact.axes import Axis, axes
 from mpc.exact.free import FreeOptimum
 from mpc.ocp import Problem, Rest
 from mpc.paper.condensed import Condensed, row_maps
-from mpc.qp import Point, Solution
+from mpc.qp import Solution
 from mpc.solvers import Answer, Method, QPSolver, Solver
 from quadsim.controller import SOLVED, UNCONSTRAINED
-from quadsim.state import Array, Indices, read_only
+from quadsim.state import Array, Indices, all_true, read_only
 
 Flags = NDArray[np.bool_]
 
@@ -80,11 +81,7 @@ class Shortcut:
         self._none_active.setflags(write=False)
         self._side = self._none_active
         self._no_slacks = read_only(np.zeros((N, rows.soft.size)))
-        qp = self.formulation.qp
-        nothing, no_rows = read_only(np.zeros(0)), read_only(np.zeros(qp.h_l.size))
-        box = read_only(np.concatenate([np.zeros(N * nu), -np.tile(rows.l1[rows.soft], N)]))
-        self._no_multipliers = Point(nothing, nothing, no_rows, box)
-        self._nothing = Active(z=nothing, values=nothing, side=np.zeros(0, np.int8), steps=0)
+        self._no_multipliers = read_only(np.zeros(rows.lower.shape))
         grid = np.arange(rows.lower.size).reshape(rows.lower.shape)
         self._of_inputs_alone = ~np.broadcast_to(rows.C.any(axis=1), grid.shape)
         self._groups = []
@@ -126,13 +123,13 @@ class Shortcut:
             values += self._C @ x_s
         free = values.ravel()
         within = (self._lower <= free) & (free <= self._upper)
-        if within.all():
+        if all_true(within):
             self._side = self._none_active
-            x = np.concatenate((plan.ravel(), self._no_slacks.ravel())) if self._no_slacks.size else plan.ravel()
-            solution = self._solution(self._no_multipliers._replace(x=x), self._nothing, started, UNCONSTRAINED)
-            return Answer(plan=plan, slacks=self._no_slacks, solution=solution, method=Method.FREE)
+            made = partial(self.formulation.point, plan, self._no_slacks, self._no_multipliers)
+            spent_s = clock.perf_counter() - started
+            return Answer(plan, self._no_slacks, Solution(made, UNCONSTRAINED, 0, 0, 0.0, 0.0, spent_s), Method.FREE)
         free = free.copy()  # the values' room is used again
-        if np.isfinite(free).all():
+        if all_true(np.isfinite(free)):
             starts = self._starts()
             optimum, settled = self._by_axes(plan, free, within, u_before, starts)
             method = Method.WHOLE if optimum is None else Method.AXES
@@ -152,20 +149,22 @@ class Shortcut:
 
     def _starts(self) -> list[Side]:
         """The last active set moved one step earlier, its last step's held, and as it was."""
+        if not np.count_nonzero(self._side):
+            return [self._none_active]
         m = self._rows.l1.size
         moved = np.concatenate((self._side[m:], self._side[-m:]))
         if self._uneven:
             moved[np.isinf(np.where(moved > 0, self._upper, self._lower))] = 0
-        return [moved, self._side] if self._side.any() else [moved]
+        return [moved, self._side]
 
     def _by_axes(
         self, plan: Array, free: Array, within: Flags, u_before: Array, starts: list[Side]
     ) -> tuple[_Found | None, bool]:
         """The optimum with active rows of states alone, if it satisfies all others; and whether it was found at all."""
-        z, side, values, steps = np.zeros(free.size), np.zeros_like(self._side), free.copy(), 0
+        z, side, values, steps = np.zeros(free.size), np.zeros(free.size, np.int8), free.copy(), 0
         for group in self._groups:
             own = group.rows
-            if within[own].all():
+            if all_true(within[own]):
                 continue
             found = group.solve(plan, values, starts)
             if found is None:
@@ -183,27 +182,21 @@ class Shortcut:
 
     def _answer(self, found: _Found, method: Method, started: float) -> Answer:
         slacks = self._no_slacks
-        if slacks.size and (violated := np.abs(found.active.side) == 2).any():
+        if slacks.size and np.count_nonzero(violated := np.abs(found.active.side) == 2):
             values, shape = found.active.values, self._rows.lower.shape
             beyond = np.maximum(np.maximum(values - self._upper, self._lower - values), 0.0)
             slacks = (violated * beyond).reshape(shape)[:, self._rows.soft]
-        point = self.formulation.point(found.plan, slacks, found.active.z.reshape(self._rows.lower.shape))
-        solution = self._solution(point, found.active, started, SOLVED)
-        return Answer(plan=found.plan, slacks=slacks, solution=solution, method=method)
-
-    def _solution(self, point: Point, active: Active, started: float, status: str) -> Solution:
-        return Solution(
-            x=point.x,
-            y=point.y,
-            z=point.z,
-            z_box=point.z_box,
-            status=status,
+        active = found.active
+        solution = Solution(
+            made=partial(self.formulation.point, found.plan, slacks, active.z.reshape(self._rows.lower.shape)),
+            status=SOLVED,
             iterations=active.steps,
             active=int(np.count_nonzero(active.side)),
             primal_residual=0.0,
             dual_residual=0.0,
             solve_s=clock.perf_counter() - started,
         )
+        return Answer(found.plan, slacks, solution, method)
 
     def _by_solver(
         self, plan: Array, free: Array, query: tuple[Array, Array, Array, Rest | None], started: float
@@ -220,7 +213,7 @@ class Shortcut:
             started, given = clock.perf_counter(), answer.solution
             iterations += given.iterations
             if given.status == SOLVED:
-                multipliers = whole.formulation.multipliers(given)
+                multipliers = whole.formulation.multipliers(given.point)
                 found = None
                 if self._all is not None:
                     self._side = self._all.near(multipliers.ravel(), free)
@@ -231,8 +224,7 @@ class Shortcut:
                     spent_s += given.solve_s + answer.solution.solve_s
                     break
                 point = self.formulation.point(answer.plan, answer.slacks, multipliers)
-                solution = given._replace(**point._asdict())
-                answer = answer._replace(solution=solution)
+                answer = answer._replace(solution=given._replace(made=point))
             spent_s += given.solve_s + clock.perf_counter() - started
         return answer._replace(solution=answer.solution._replace(iterations=iterations, solve_s=spent_s))
 

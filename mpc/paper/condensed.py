@@ -17,7 +17,7 @@ from mpc.constraints import Rows
 from mpc.ocp import Problem, Rest
 from mpc.paper.cost import cost
 from mpc.paper.prediction import Prediction, prediction
-from mpc.qp import QP, Point, QPRows, Solution, Vectors
+from mpc.qp import QP, Point, QPRows, Vectors
 from quadsim.state import Array, Indices
 
 
@@ -210,9 +210,9 @@ class Condensed:
         """See `mpc.qp.Formulation.slacks`."""
         return x[self._inputs :].reshape(self._problem.horizon, -1)
 
-    def multipliers(self, solution: Solution) -> Array:
+    def multipliers(self, point: Point) -> Array:
         """See `mpc.qp.Formulation.multipliers`."""
-        return self._rows.multipliers(solution.z, solution.z_box[: self._inputs])
+        return self._rows.multipliers(point.z, point.z_box[: self._inputs])
 
     def point(self, plan: Array, slacks: Array, multipliers: Array) -> Point:
         """This QP's point of a plan (N, nu), slacks (N, m_s) and rows' multipliers (N, m).

@@ -16,7 +16,7 @@ import numpy as np
 
 from mpc.ocp import Problem, Rest
 from mpc.paper.condensed import Condensed
-from mpc.qp import QP, Backend, Formulation, RoughBackend, Solution, Vectors
+from mpc.qp import QP, Backend, Formulation, Point, RoughBackend, Solution, Vectors
 from mpc.staged import Staged
 from quadsim.errors import MissingPackageError, UnknownNameError
 from quadsim.state import Array
@@ -225,10 +225,7 @@ class QPSolver:
 def refusal(qp: QP) -> Solution:
     """What is answered without asking a back end."""
     return Solution(
-        x=np.full_like(qp.c, math.nan),
-        y=np.full_like(qp.b, math.nan),
-        z=np.full_like(qp.h_l, math.nan),
-        z_box=np.full_like(qp.c, math.nan),
+        made=Point(*(np.full_like(part, math.nan) for part in (qp.c, qp.b, qp.h_l, qp.c))),
         status=INVALID_DATA,
         iterations=0,
         active=0,

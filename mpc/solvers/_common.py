@@ -13,7 +13,7 @@ import numpy as np
 from scipy import sparse
 from scipy.sparse import csc_matrix
 
-from mpc.qp import QP, Matrix, Solution, Vectors
+from mpc.qp import QP, Matrix, Point, Solution, Vectors
 from quadsim.state import Array
 
 ACTIVE_MULTIPLIER: Final = 1e-5
@@ -86,10 +86,7 @@ def solution(
     z_box, z, y = np.split(multipliers, [qp.c.size, qp.c.size + qp.h_l.size])
     active = int(np.count_nonzero(np.abs(multipliers[: multipliers.size - y.size]) > ACTIVE_MULTIPLIER))
     return Solution(
-        x=x,
-        y=y,
-        z=z,
-        z_box=z_box,
+        made=Point(x=x, y=y, z=z, z_box=z_box),
         status=status,
         iterations=iterations,
         active=active,

@@ -8,7 +8,7 @@ from typing import Any, Final
 import numpy as np
 import piqp
 
-from mpc.qp import QP, Matrix, Solution, Vectors
+from mpc.qp import QP, Matrix, Point, Solution, Vectors
 from quadsim.controller import SOLVED
 
 MAX_ITERATIONS: Final = 100  # cap for hopeless data (NaN runs PIQP to its limit); the paper's QPs take 8 to 23
@@ -131,10 +131,7 @@ def solve(solver: Any, vectors: Vectors, **matrices: Matrix) -> Solution:
     # At an interior-point optimum a constraint is active where its multiplier exceeds its slack, and that is small.
     sides = ((result.z_l, result.s_l), (result.z_u, result.s_u), (result.z_bl, result.s_bl), (result.z_bu, result.s_bu))
     return Solution(
-        x=result.x.copy(),
-        y=result.y.copy(),
-        z=result.z_u - result.z_l,
-        z_box=result.z_bu - result.z_bl,
+        made=Point(x=result.x.copy(), y=result.y.copy(), z=result.z_u - result.z_l, z_box=result.z_bu - result.z_bl),
         status=STATUS[status],
         iterations=int(info.iter),
         active=sum(int(np.count_nonzero(np.minimum(z, ACTIVE_SLACK) > slack)) for z, slack in sides),

@@ -65,18 +65,22 @@ def solved(formulation: Formulation, backend: Backend, query: tuple[Array, Array
     return formulation.qp.with_vectors(vectors), backend.solve(vectors)
 
 
+def at(solution: Solution, **parts: Array) -> Solution:
+    return solution._replace(made=solution.point._replace(**parts))
+
+
 def test_kkt_residuals_see_every_kind_of_fault() -> None:
     problem = paper_problem()
     formulation, backend = condensed(problem), PiqpDense()
     query = (STATE, problem.objective.desired(paper_reference(60)[1:51]), problem.model.u_bar)
     qp, solution = solved(formulation, backend, query)
     assert kkt_residuals(qp, solution).worst < 1e-3
-    assert kkt_residuals(qp, solution._replace(x=solution.x + 1.0)).stationarity > 0.1
-    assert kkt_residuals(qp, solution._replace(x=solution.x * 3.0)).primal > 1.0
-    assert kkt_residuals(qp, solution._replace(z=solution.z + 1.0)).complementarity > 1.0
+    assert kkt_residuals(qp, at(solution, x=solution.x + 1.0)).stationarity > 0.1
+    assert kkt_residuals(qp, at(solution, x=solution.x * 3.0)).primal > 1.0
+    assert kkt_residuals(qp, at(solution, z=solution.point.z + 1.0)).complementarity > 1.0
     assert np.isnan(kkt_residuals(replace(qp, h_l=qp.h_l * np.nan), solution).worst)  # never taken for optimal
     unbounded = replace(qp, x_u=np.full_like(qp.x_u, np.inf))
-    assert kkt_residuals(unbounded, solution._replace(z_box=solution.z_box + 1.0)).dual > 0.9
+    assert kkt_residuals(unbounded, at(solution, z_box=solution.point.z_box + 1.0)).dual > 0.9
 
 
 def test_answers_are_copies_that_the_next_solve_leaves_alone() -> None:
@@ -84,9 +88,9 @@ def test_answers_are_copies_that_the_next_solve_leaves_alone() -> None:
     solver = QPSolver("piqp-multistage", problem)
     desired = problem.objective.desired(paper_reference(60)[1:51])
     first = solver.solve(STATE, desired, problem.model.u_bar)
-    before = first.plan.copy(), first.solution.x.copy(), first.solution.y.copy()
+    before = first.plan.copy(), first.solution.x.copy(), first.solution.point.y.copy()
     solver.solve(-STATE, -desired, problem.model.u_bar)
-    for now, then in zip((first.plan, first.solution.x, first.solution.y), before, strict=True):
+    for now, then in zip((first.plan, first.solution.x, first.solution.point.y), before, strict=True):
         np.testing.assert_array_equal(now, then)
 
 
@@ -118,14 +122,14 @@ def test_multipliers_of_rows_are_those_of_the_qp_and_back() -> None:
     qp, solution = solved(form, backend, (np.zeros(12), desired, problem.model.u_bar))
     optimum = polish(qp, solution)
     assert kkt_residuals(qp, optimum).worst < 1e-5
-    rows = form.multipliers(optimum)
+    rows = form.multipliers(optimum.point)
     active = {name for name, column in zip(problem.rows.names, rows.T, strict=True) if column.any()}
     assert {"slews", "inputs", "late"} <= active
     assert "again" not in active
     back = form.point(form.inputs(optimum.x), form.slacks(optimum.x), rows)
-    np.testing.assert_array_equal(back.z, optimum.z)
-    np.testing.assert_array_equal(back.z_box, optimum.z_box)
+    np.testing.assert_array_equal(back.z, optimum.point.z)
+    np.testing.assert_array_equal(back.z_box, optimum.point.z_box)
     answer = Shortcut(problem, QPSolver("piqp-multistage", problem)).solve(np.zeros(12), desired, problem.model.u_bar)
     np.testing.assert_allclose(answer.plan, form.inputs(optimum.x), atol=1e-3)
-    largest = float(np.abs(answer.solution.z).max())
+    largest = float(np.abs(answer.solution.point.z).max())
     assert kkt_residuals(qp, answer.solution).worst < 1e-4 * largest

@@ -88,7 +88,7 @@ def test_equality_rows_and_multipliers(kind: type[DaqpDense | OsqpSparse]) -> No
             if solution.status != SOLVED:
                 continue
             residuals = kkt_residuals(formulation.qp.with_vectors(vectors), solution)
-            assert residuals.worst < 1e-3 * max(1.0, float(np.abs(solution.z).max(initial=0.0)))
+            assert residuals.worst < 1e-3 * max(1.0, float(np.abs(solution.point.z).max(initial=0.0)))
             plans.append(formulation.inputs(solution.x))
         if plans:
             np.testing.assert_allclose(plans[0], plans[1], atol=1e-3)

@@ -81,7 +81,7 @@ def exact(form: Formulation, query: tuple[Array, Array, Array, Rest]) -> tuple[A
     qp, solution = form.qp.with_vectors(vectors), backend.solve(vectors)
     assert solution.status == SOLVED
     optimum = polish(qp, solution)
-    size = max(1.0, float(np.abs(np.concatenate([optimum.z, optimum.z_box])).max()))
+    size = max(1.0, float(np.abs(np.concatenate([optimum.point.z, optimum.point.z_box])).max()))
     return form.inputs(optimum.x), form.slacks(optimum.x), kkt_residuals(qp, optimum).worst / size
 
 
@@ -215,7 +215,7 @@ def test_systems_that_change_agree_with_a_peer(
         np.testing.assert_allclose(whole.slacks, peer.slacks, atol=2e-4)
         states = ocp_peer.trajectory(now, solver.plan(solution))[1:]
         np.testing.assert_allclose(solver.states(now, solution), states, atol=1e-6)
-        assert kkt_residuals(solver.qp(now), solution).worst < 1e-5 * max(1.0, float(np.abs(solution.z).max()))
+        assert kkt_residuals(solver.qp(now), solution).worst < 1e-5 * max(1.0, float(np.abs(solution.point.z).max()))
         if solved == 4:
             break
     assert solved >= 2
@@ -314,7 +314,7 @@ def test_slack_is_zero_where_hard_bounds_cost_less_than_its_price(constrained_fl
     for now in along_flight(constrained_flight, vehicle, problem, stride=40):
         strict, lenient = hard.solve(now), soft.solve(now)
         assert lenient.status == SOLVED
-        multiplier = np.abs(hard.form.multipliers(strict)[:, :2]).max()  # of the output bounds
+        multiplier = np.abs(hard.form.multipliers(strict.point)[:, :2]).max()  # of the output bounds
         if strict.status == SOLVED and multiplier < price:
             pressing += int(multiplier > 1.0)
             assert soft.slacks(lenient).max() < 1e-7

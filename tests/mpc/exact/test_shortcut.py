@@ -347,7 +347,8 @@ def test_steps_leak_no_memory_and_allocate_nothing_large(sideways: float, height
         return status
 
     gc.disable()  # a collection would empty the free list
-    list(map(tuple, np.zeros((3000, 4))))  # fills CPython's free list of such tuples, to which each step adds one
+    for size in range(1, 20):  # fills CPython's free lists of tuples, to which each step adds some
+        list(map(tuple, np.zeros((3000, size))))
     tracemalloc.start()
     try:
         status = take_50_steps()

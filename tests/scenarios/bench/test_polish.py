@@ -38,11 +38,11 @@ def test_polish_adds_and_drops_constraints() -> None:
         vectors = formulation.vectors(np.zeros(12), desired, problem.model.u_bar)
         qp = formulation.qp.with_vectors(vectors)
         optimum = polish(qp, backend.solve(vectors))
-        few, many = optimum.z.copy(), optimum.z.copy()
+        few, many = optimum.point.z.copy(), optimum.point.z.copy()
         few[np.argmax(np.abs(few))] = 0.0
         many[np.argmin(np.abs(many))] = 1e3
         for z in (few, many):
-            assert not np.array_equal(z, optimum.z)
-            again = polish(qp, optimum._replace(z=z))
+            assert not np.array_equal(z, optimum.point.z)
+            again = polish(qp, optimum._replace(made=optimum.point._replace(z=z)))
             np.testing.assert_allclose(again.x, optimum.x, atol=1e-6)
             assert kkt_residuals(qp, again).worst < 1e-6
