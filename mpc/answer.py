@@ -13,7 +13,7 @@ from mpc.ocp import Problem
 from mpc.solvers import Answer
 from quadsim.controller import ACCEPTED, Command
 from quadsim.errors import ParameterError
-from quadsim.state import Array
+from quadsim.state import Array, all_true
 from quadsim.vehicle import N_ROTORS, Vehicle
 
 BOUND_TOLERANCE: Final = 1e-6
@@ -99,7 +99,8 @@ class ActuatorBounds:
         Steps that are so but for rounding stay as they are.
         """
         steps = plan - np.concatenate((before[None], plan[:-1]))
-        if np.maximum(self.delta_min - steps, steps - self.delta_max).max() <= BOUND_TOLERANCE:
+        beyond = np.maximum(self.delta_min - steps, steps - self.delta_max)
+        if beyond.flat[beyond.argmax()] <= BOUND_TOLERANCE:
             return np.minimum(np.maximum(plan, self.u_min), self.u_max)
         clipped = np.empty_like(plan)
         for i, speeds in enumerate(plan):
@@ -114,10 +115,16 @@ def rejection(status: str, speeds: Array, plan: Array, bounds: ActuatorBounds, b
     """
     if status not in ACCEPTED:
         return status
-    if not (np.isfinite(speeds).all() and np.isfinite(plan).all()):
-        return "not_finite"
-    lower, upper = bounds.reach(before)
-    return "out_of_bounds" if np.maximum(lower - speeds, speeds - upper).max() > BOUND_TOLERANCE else None
+    beyond = np.abs(speeds - bounds.clip(speeds, before))
+    if beyond[beyond.argmax()] <= BOUND_TOLERANCE and all_true(np.isfinite(plan)):
+        return None
+    return "out_of_bounds" if np.isfinite(speeds).all() and np.isfinite(plan).all() else "not_finite"
+
+
+def free_command(answer: Answer) -> Command:
+    """The command of an optimum without constraints, which is within every bound or it would not be one."""
+    solution = answer.solution
+    return Command(speeds=answer.plan[0].copy(), plan=answer.plan, status=solution.status, solve_s=solution.solve_s)
 
 
 def command_of(speeds: Array, plan: Array, status: str, answer: Answer, *, fallback: int = 0) -> Command:
@@ -130,7 +137,7 @@ def command_of(speeds: Array, plan: Array, status: str, answer: Answer, *, fallb
         iterations=solution.iterations,
         active=solution.active if accepted else 0,
         fallback=fallback,
-        slack=float(np.max(answer.slacks, initial=0.0)) if accepted else 0.0,
+        slack=max(float(answer.slacks.max()), 0.0) if accepted and answer.slacks.size else 0.0,
         primal_residual=solution.primal_residual,
         dual_residual=solution.dual_residual,
         solve_s=solution.solve_s,

@@ -6,7 +6,7 @@ from typing import Final
 
 import numpy as np
 
-from mpc.answer import ActuatorBounds, command_of, rejection, shifted
+from mpc.answer import ActuatorBounds, command_of, free_command, rejection, shifted
 from mpc.exact.shortcut import with_shortcut
 from mpc.handover import resized, within
 from mpc.ocp import Problem, Query, Unanswered
@@ -81,7 +81,10 @@ class ConstrainedMPC:
         else:
             answer, problem, _ = self._clearing.solve(now.time, query)
         self.answer = answer
-        return self._take(answer) if answer.method is Method.FREE else self._follow(now.time, problem, query, answer)
+        if answer.method is not Method.FREE:
+            return self._follow(now.time, problem, query, answer)
+        self._plan, self._held, self._before = answer.plan, 0, answer.plan[0]
+        return free_command(answer)
 
     def predict(self, states: Array, plans: Array) -> Array:
         """See `quadsim.controller.Controller.predict`."""
@@ -91,12 +94,6 @@ class ConstrainedMPC:
         lower, _ = self._bounds.reach(self._before)
         self._before, self._plan, self._held = lower, None, 0
         return stopped(lower.copy(), self.horizon, phase)
-
-    def _take(self, answer: Answer) -> Command:
-        """The first action of a free optimum, which is within every bound or it would not be one."""
-        self._plan, self._held, self._before = answer.plan, 0, answer.plan[0]
-        solution = answer.solution
-        return Command(speeds=answer.plan[0].copy(), plan=answer.plan, status=solution.status, solve_s=solution.solve_s)
 
     def _follow(self, time: float, problem: Problem, query: Query, answer: Answer) -> Command:
         refused = rejection(answer.solution.status, answer.plan[0], answer.plan, self._bounds, self._before)

@@ -9,6 +9,7 @@ acceleration alpha:
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Final
 
@@ -37,11 +38,11 @@ class Trim:
     twist: Array = field(default_factory=lambda: np.zeros(3))
 
     def __post_init__(self) -> None:
-        if np.shape(self.speeds) != (N_ROTORS,) or not all(map(math.isfinite, self.speeds)):
+        if np.shape(self.speeds) != (N_ROTORS,) or not all(map(math.isfinite, self.speeds.tolist())):
             raise ParameterError("trim", "speeds", self.speeds, f"{N_ROTORS} finite numbers")
-        if np.shape(self.lift) != (3,) or not (all(map(math.isfinite, self.lift)) and self.lift[2] > 0.0):
+        if np.shape(self.lift) != (3,) or not (all(map(math.isfinite, self.lift.tolist())) and self.lift[2] > 0.0):
             raise ParameterError("trim", "lift", self.lift, "three finite numbers, the last one positive")
-        if np.shape(self.twist) != (3,) or not all(map(math.isfinite, self.twist)):
+        if np.shape(self.twist) != (3,) or not all(map(math.isfinite, self.twist.tolist())):
             raise ParameterError("trim", "twist", self.twist, "three finite numbers")
 
     def lean(self, yaw: float) -> tuple[float, float]:
@@ -66,7 +67,9 @@ def twisted(effectiveness: Array, twist: Array) -> Array:
     return found
 
 
-def equilibrium(model: NonlinearModel, *, acceleration: Array | None = None, twist: Array | None = None) -> Trim:
+def equilibrium(
+    model: NonlinearModel, *, acceleration: Sequence[float] | None = None, twist: Array | None = None
+) -> Trim:
     """What rest takes under a model's disturbance; a rotor that would have to pull stands still.
 
     Args:
@@ -74,11 +77,12 @@ def equilibrium(model: NonlinearModel, *, acceleration: Array | None = None, twi
         acceleration: (3,) of the disturbance, world frame [m/s^2]; None for the model's.
         twist: (3,) see `Trim.twist`; None for none.
     """
-    a_x, a_y, a_z = (model.acceleration if acceleration is None else acceleration).tolist()
+    a_x, a_y, a_z = model.acceleration.tolist() if acceleration is None else acceleration
     twist = np.zeros(3) if twist is None else twist
     up = max(model.gravity - a_z, LEAST_LIFT * model.gravity)
     thrust = math.hypot(a_x, a_y, up)
     drive = np.empty(N_ROTORS)
-    drive[0], drive[1:] = thrust, -model.angular_acceleration - thrust * twist
+    drive[0] = thrust
+    np.subtract(-thrust * twist, model.angular_acceleration, out=drive[1:])
     speeds = np.sqrt(np.maximum(np.dot(model.allocation, drive), 0.0))
     return Trim(speeds=speeds, lift=np.array([-a_x, -a_y, up]), twist=twist)

@@ -16,7 +16,7 @@ import numpy as np
 from mpc.equilibrium import Trim
 from mpc.model import LinearModel
 from mpc.paper.prediction import rollout
-from quadsim.state import INDEX, N_STATES, Array
+from quadsim.state import INDEX, N_STATES, REFERENCE_STATES, Array
 
 _YAW: Final = INDEX["yaw"]
 _ACCELERATED: Final = [INDEX[name] for name in ("vz", "roll_rate", "pitch_rate", "yaw_rate")]
@@ -29,6 +29,10 @@ def turn_horizontally(states: Array, angles: Array | float) -> Array:
     sine: Array | float
     if isinstance(angles, float):
         cosine, sine = math.cos(angles), math.sin(angles)
+        if states.ndim == 1:
+            x, vx, y, vy = states[:4].tolist()
+            turned[:4] = cosine * x - sine * y, cosine * vx - sine * vy, sine * x + cosine * y, sine * vx + cosine * vy
+            return turned
     else:
         cosine, sine = np.cos(angles)[..., None], np.sin(angles)[..., None]
     along, across = states[..., 0:2], states[..., 2:4]  # x and vx, y and vy
@@ -83,6 +87,8 @@ def with_nearest_yaw(reference: Array, yaw: float, largest: float) -> Array:
     yaws, steps = reference[:, 3], np.empty(len(reference))
     steps[0] = yaws[0] - yaw
     np.subtract(yaws[1:], yaws[:-1], out=steps[1:])
+    if -largest <= steps[steps.argmin()] and steps[steps.argmax()] <= largest:
+        return reference
     turned = reference.copy()
     turned[:, 3] = yaw + np.minimum(np.maximum(steps, -largest), largest).cumsum()
     return turned
@@ -90,9 +96,10 @@ def with_nearest_yaw(reference: Array, yaw: float, largest: float) -> Array:
 
 def seen_from(reference: Array, yaw: float) -> Array:
     """The reference (N, 4) in axes turned by a yaw [rad]."""
-    cosine, sine = math.cos(yaw), math.sin(yaw)
-    x, y = reference[:, 0], reference[:, 1]
-    seen = reference.copy()
-    seen[:, 0], seen[:, 1] = cosine * x + sine * y, cosine * y - sine * x
+    turned = np.eye(len(REFERENCE_STATES))
+    turned[0, 0] = turned[1, 1] = math.cos(yaw)
+    turned[1, 0] = sine = math.sin(yaw)
+    turned[0, 1] = -sine
+    seen = np.dot(reference, turned)
     seen[:, 3] -= yaw
     return seen

@@ -35,8 +35,10 @@ from quadsim.state import (
     INDEX,
     N_STATES,
     POSITION,
+    REFERENCE_STATES,
     VELOCITY,
     Array,
+    all_true,
     body_rates_of,
     read_only,
 )
@@ -51,6 +53,8 @@ _NO_RATES: Final = (math.nan, math.nan, math.nan)
 
 PLAUSIBLE: Final = by_group(1e5, 1e3, 1e5, 1e3)
 """Largest magnitudes taken for a measurement [m, m/s, rad, rad/s]; a yaw counts its turns."""
+PLAUSIBLE_REFERENCE: Final = float(PLAUSIBLE[list(REFERENCE_STATES)].min())
+"""The same of references x, y, z [m], yaw [rad]."""
 UNMOVED: Final = by_group(1e-3, 5e-3, 1e-3, 2e-2)
 """Distance of the prediction from repeated numbers beyond which these count as frozen [same]."""
 UPRIGHT: Final = 1.4
@@ -75,11 +79,11 @@ def completed_moment(now: Moment, acting: Array, unseen: Array, known: Array) ->
     Euler angles are implausibly large; those of the body are not.
     """
     found = {**vars(now), "acting": acting, "unseen": unseen}
-    upright = abs(float(known[INDEX["pitch"]])) < UPRIGHT
-    if unseen[ANGLES].any():
-        found["attitude"] = None
-    if unseen[ANGLE_RATES].any() and upright:
-        found["body_rates"] = None
+    if unseen.any():
+        if unseen[ANGLES].any():
+            found["attitude"] = None
+        if unseen[ANGLE_RATES].any() and abs(float(known[INDEX["pitch"]])) < UPRIGHT:
+            found["body_rates"] = None
     return CompletedMoment(**found)
 
 
@@ -126,7 +130,7 @@ class StateCompletion:
             measured = np.full(N_STATES, np.nan)
         seen = np.abs(measured) <= PLAUSIBLE  # as NaN is not
         repeated = self._repeats(measured, seen)
-        if seen.all() and not (free and repeated.any()):
+        if all_true(seen) and not (free and np.count_nonzero(repeated)):
             return self._take(measured)
         predicted = advance(self._model, self._state, acting, trim)
         if free:
@@ -151,7 +155,7 @@ class StateCompletion:
         Rates are compared as the body's too, which a gyro measures: Euler-angle rates change with the attitude.
         """
         repeated, last = np.asarray(measured == self._last), self._last_body_rates
-        body_rates = body_rates_of(measured.tolist()) if seen[_TURNING].all() else _NO_RATES
+        body_rates = body_rates_of(measured.tolist()) if all_true(seen) or seen[_TURNING].all() else _NO_RATES
         if all(abs(rate - old) <= 1e-12 + 1e-9 * abs(rate) for rate, old in zip(body_rates, last, strict=True)):
             repeated[_RATES] = True
         self._last, self._last_body_rates = np.array(measured, float), body_rates

@@ -27,7 +27,7 @@ import numpy as np
 
 from mpc.answer import ActuatorBounds, rejection, shifted
 from mpc.equilibrium import Trim
-from mpc.fallback.completion import PLAUSIBLE, CompletedMoment, StateCompletion, completed_moment
+from mpc.fallback.completion import PLAUSIBLE_REFERENCE, CompletedMoment, StateCompletion, completed_moment
 from mpc.fallback.hover import HoverLaw
 from mpc.fallback.settings import USUAL_TILT
 from mpc.fallback.settings import FallbackSettings as FallbackSettings
@@ -37,13 +37,12 @@ from mpc.model import LinearModel
 from mpc.ocp import Unanswered
 from quadsim.controller import ACCEPTED, GROUNDED, Command, Controller, Moment, Phase, check_command, stopped
 from quadsim.errors import FlightError
-from quadsim.state import INDEX, N_STATES, POSITION, REFERENCE_STATES, Array
+from quadsim.state import INDEX, N_STATES, POSITION, REFERENCE_STATES, Array, all_true
 from quadsim.vehicle import N_ROTORS
 
 FAILURES: Final[tuple[type[Exception], ...]] = (FlightError, np.linalg.LinAlgError, ArithmeticError, RuntimeError)
 """What numerics and compiled back ends raise.  A programmer's mistakes (`TypeError`, `KeyError`, ...) end the run."""
 _MISTAKES: Final = (NotImplementedError, RecursionError)  # kinds of `RuntimeError` that are a programmer's, too
-_PLAUSIBLE: Final = PLAUSIBLE[list(REFERENCE_STATES)]  # of references
 _USUAL: Final = FallbackSettings()
 
 
@@ -170,7 +169,7 @@ class Guarded:
         if self._model.period * float(self._completion.unseen.max()) > self._settings.unseen:
             return "state_unknown", None
         shape = (self.horizon, len(REFERENCE_STATES))
-        if np.shape(reference) != shape or not (np.abs(reference) <= _PLAUSIBLE).all():
+        if np.shape(reference) != shape or not all_true(np.abs(reference) <= PLAUSIBLE_REFERENCE):
             return "invalid_reference", None
         try:
             answer = self.inner.step(now, known.copy(), reference)

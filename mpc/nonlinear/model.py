@@ -16,7 +16,7 @@ integrated by the classical Runge-Kutta method of fourth order.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import cache, cached_property
 from typing import Any, Final, TypeAlias
@@ -108,22 +108,30 @@ def derivative(model: NonlinearModel, x: Array, u: Array) -> Array:
 
 def advance(model: NonlinearModel, x: Array, u: Array) -> Array:
     """The states (..., n) one period after states x (..., n) under inputs u (..., 4) [rad/s]."""
-    return _advance_one(model, x, u) if x.ndim == 1 else integrate(model, x, u).end
+    if x.ndim == 1:
+        return advance_disturbed(model, x, u, model.period, model.effectiveness, model.acceleration.tolist())
+    return integrate(model, x, u).end
 
 
-def _advance_one(model: NonlinearModel, x: Array, u: Array) -> Array:
-    """`integrate`'s end for one state (n,), in plain numbers: arrays of three take several times as long."""
-    speeds, _ = _rotor_speeds(model, x[N_STATES:], u)
-    drive = np.dot(np.square(speeds), model.effectiveness.T).tolist()
-    constants = model.gyration.tolist(), model.gravity, model.acceleration.tolist(), model.angular_acceleration.tolist()
-    step = model.period / model.substeps
+def advance_disturbed(
+    model: NonlinearModel, x: Array, u: Array, period: float, effectiveness: Array, acceleration: Sequence[float]
+) -> Array:
+    """`advance` for one state (n,), by a model with these numbers instead of its own.
+
+    It is `integrate`'s end in plain numbers: arrays of three take several times as long.
+    """
+    step = period / model.substeps
+    speeds, _ = _rotor_speeds(model, step, x[N_STATES:], u)
+    drive = np.dot(np.square(speeds), effectiveness.T).tolist()
+    constants = model.gyration.tolist(), model.gravity, acceleration, model.angular_acceleration.tolist()
     half, sixth = 0.5 * step, step / 6.0
     sin, cos = math.sin, math.cos
 
     def slopes(angles: Triple, rates: Triple, k: int) -> tuple[Triple, Triple]:
-        sines, cosines = [sin(angle) for angle in angles], [cos(angle) for angle in angles]
-        x, y, z, roll, pitch, yaw = _accelerations(sines, cosines, rates, drive[k], *constants)
-        return (x, y, z), (roll, pitch, yaw)
+        roll, pitch, yaw = angles
+        sines, cosines = (sin(roll), sin(pitch), sin(yaw)), (cos(roll), cos(pitch), cos(yaw))
+        found = _accelerations(sines, cosines, rates, drive[k], *constants)
+        return found[:3], found[3:]
 
     numbers = x.tolist()
     p, v, q, s = numbers[POSITIONS], numbers[VELOCITIES], numbers[ANGLES], numbers[ANGLE_RATES]
@@ -175,7 +183,7 @@ def integrate(model: NonlinearModel, x: Array, u: Array) -> Passage:
     """Integrate one period; arguments as for `advance`."""
     columns = np.moveaxis(x, -1, 0)
     step = model.period / model.substeps
-    speeds, decay = _rotor_speeds(model, columns[N_STATES:], np.moveaxis(u, -1, 0))
+    speeds, decay = _rotor_speeds(model, step, columns[N_STATES:], np.moveaxis(u, -1, 0))
     drive = np.einsum("ij,kj...->ki...", model.effectiveness, np.square(speeds))
     q, s = columns[0:N_STATES:2], columns[1:N_STATES:2]  # positions and angles, and their rates
     at_q, at_s = np.empty((2, decay.size, *q.shape), q.dtype)
@@ -203,12 +211,15 @@ def integrate(model: NonlinearModel, x: Array, u: Array) -> Passage:
     )
 
 
-def _rotor_speeds(model: NonlinearModel, rotors: Array, inputs: Array) -> tuple[Array, Array]:
-    """(K, 4, ...) speeds of rotors (4, ...) under inputs (4, ...) at the instants of a `Passage`, and its `decay`."""
+def _rotor_speeds(model: NonlinearModel, step: float, rotors: Array, inputs: Array) -> tuple[Array, Array]:
+    """(K, 4, ...) speeds of rotors (4, ...) under inputs (4, ...) at the instants of a `Passage`, and its `decay`.
+
+    `step` is of Runge and Kutta [s].
+    """
     instants = _instants(model.substeps)
     if model.rotor_lag is None:
         return np.broadcast_to(inputs, (instants.size, *inputs.shape)), np.zeros(instants.size)
-    decay = np.exp(-instants * (model.period / model.substeps) / model.rotor_lag)
+    decay = np.exp(-instants * step / model.rotor_lag)
     return inputs + decay.reshape(-1, *[1] * inputs.ndim) * (rotors - inputs), decay
 
 

@@ -13,17 +13,16 @@ whatever A and B are worth.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import replace
 from typing import Final
 
 import numpy as np
 
-from mpc.answer import ActuatorBounds, command_of, refused, rejection, shifted
+from mpc.answer import ActuatorBounds, command_of, free_command, refused, rejection, shifted
 from mpc.constraints import Bounds, Constraint
 from mpc.equilibrium import Trim, equilibrium, twisted
 from mpc.exact.shortcut import with_shortcut
-from mpc.fallback.completion import PLAUSIBLE, CompletedMoment
+from mpc.fallback.completion import PLAUSIBLE, PLAUSIBLE_REFERENCE, CompletedMoment
 from mpc.handover import observed, resized, within
 from mpc.heading import (
     anchored,
@@ -35,7 +34,7 @@ from mpc.heading import (
 )
 from mpc.model import LinearModel, continuous_model, discretise, hover_model
 from mpc.nonlinear.linearise import linearise
-from mpc.nonlinear.model import NonlinearModel, advance, nonlinear_model, spun
+from mpc.nonlinear.model import Triple, advance_disturbed, nonlinear_model, spun
 from mpc.observer import DisturbanceObserver, thrust_axis
 from mpc.observer import ObserverSettings as ObserverSettings
 from mpc.ocp import Objective, Problem, Query, Rest, Unanswered, lqr_terminal_weight
@@ -43,19 +42,18 @@ from mpc.relinearised import Relinearised
 from mpc.robust.settings import LONGEST_SPAN
 from mpc.robust.settings import Linearisation as Linearisation
 from mpc.robust.settings import RobustSettings as RobustSettings
-from mpc.solvers import INVALID_DATA, Answer, QPSolver
+from mpc.solvers import INVALID_DATA, Answer, Method, QPSolver
 from mpc.space.clearing import Clearing
 from mpc.space.halfspaces import Space
 from quadsim.controller import ACCEPTED, GROUNDED, Command, Moment, Phase, stopped
 from quadsim.errors import ParameterError
-from quadsim.state import EULER, EULER_RATE, INDEX, N_STATES, REFERENCE_STATES, VELOCITY, Array
+from quadsim.state import EULER, EULER_RATE, INDEX, N_STATES, VELOCITY, Array, all_true
 from quadsim.vehicle import N_ROTORS, Vehicle
 
 SOLVER: Final = "piqp-multistage"  # solves what the shortcuts leave
 _SAME_TIME: Final = 1e-6  # [s]
 _YAW: Final = INDEX["yaw"]
 _MOVING: Final = [*VELOCITY, *EULER, *EULER_RATE]
-_PLAUSIBLE: Final = PLAUSIBLE[list(REFERENCE_STATES)]  # of references
 
 
 def robust_problem(
@@ -127,7 +125,8 @@ class RobustMPC:
         self._vehicle, self.settings, self.horizon, self._period = vehicle, settings, horizon, period
         self._nominal = hover_model(vehicle, period)
         self._model = nonlinear_model(vehicle, period, rotor_lag=settings.rotor_lag or None)
-        self._inverse = np.linalg.inv(slope(self._nominal))
+        self._undisturbed: Triple = (0.0, 0.0, 0.0)
+        self._of_twist = np.ascontiguousarray(np.linalg.inv(slope(self._nominal))[:, 1:])
         self._objective = objective
         self.problem = problem = robust_problem(
             vehicle,
@@ -188,6 +187,9 @@ class RobustMPC:
             return query
         answer, problem = self._answer(now.time, query)
         self.answer = answer
+        if answer.method is Method.FREE:
+            self._acting = answer.plan[0]
+            return free_command(answer)
         refused = rejection(answer.solution.status, answer.plan[0], answer.plan, self._actuators, self._acting)
         if refused is not None:
             if refused != INVALID_DATA and self.unanswered is None:
@@ -217,18 +219,18 @@ class RobustMPC:
         self._ahead, self._called_at = None, now.time
         if now.phase in GROUNDED:
             return self._stop(now.phase)
-        if not ((np.abs(state) <= PLAUSIBLE).all() and (np.abs(reference) <= _PLAUSIBLE).all()):
+        if not (all_true(np.abs(state) <= PLAUSIBLE) and all_true(np.abs(reference) <= PLAUSIBLE_REFERENCE)):
             return self._refuse(INVALID_DATA)
         if ahead is None or abs(now.time - called_at - self._period) > _SAME_TIME:
             self._measured = -math.inf
         span = self._span(now)
         if self._observer is not None and ahead is not None and span <= LONGEST_SPAN and now.phase is Phase.FLYING:
             expected = self._after(rest, ahead, before)
-            if np.isfinite(expected).all():
+            if all_true(np.isfinite(expected)):
                 self._observer.update(state, expected)
                 self._believe()
         x0 = self._after(self.settings.delay, state, rotors)
-        if not np.isfinite(x0).all():
+        if not all_true(np.isfinite(x0)):
             return self._refuse(INVALID_DATA)
         self._yaw = float(x0[_YAW])
         if now.phase is Phase.FLYING:  # before, the ground holds the vehicle, which is nothing to learn from
@@ -268,7 +270,7 @@ class RobustMPC:
     def _believe(self) -> None:
         """Rest against the disturbance that is estimated now."""
         if self._observer is None:
-            self._effectiveness, self._resting = self._model.effectiveness, self._model.acceleration
+            self._effectiveness, self._resting = self._model.effectiveness, self._undisturbed
             self.trim: Trim = equilibrium(self._model)
             return
         x, y, _ = self._observer.estimate[:3].tolist()
@@ -278,17 +280,12 @@ class RobustMPC:
         self._resting = self._acceleration((-x / lift, -y / lift, gravity / lift))
         self.trim = equilibrium(self._model, acceleration=self._resting, twist=twist)
 
-    def _acceleration(self, axis: Sequence[float]) -> Array:
-        """(3,) that the estimated disturbance is, in the world frame [m/s^2], with thrust along an axis (3,) there."""
+    def _acceleration(self, axis: Triple) -> Triple:
+        """What the estimated disturbance is, in the world frame [m/s^2], with thrust along an axis there."""
         if self._observer is None:
-            return self._model.acceleration
+            return self._undisturbed
         x, y, along = self._observer.estimate[:3].tolist()
-        return np.array([along * axis[0] + x, along * axis[1] + y, along * axis[2]])
-
-    def _disturbed(self, state: Array, period: float) -> NonlinearModel:
-        """The model of a period [s], disturbed as is estimated, with thrust as in a state (12,)."""
-        acceleration = self._acceleration(thrust_axis(state.tolist()))
-        return replace(self._model, effectiveness=self._effectiveness, acceleration=acceleration, period=period)
+        return along * axis[0] + x, along * axis[1] + y, along * axis[2]
 
     def _span(self, now: Moment) -> float:
         """Time since the last measured state [s]; infinite after a pause, or where the present one is not measured."""
@@ -309,9 +306,9 @@ class RobustMPC:
         """State (12,) some time [s] after a state (12,) with such rotor speeds (4,), under the command in force."""
         if time <= 1e-9:
             return state
-        model = self._disturbed(state, time)
-        end = advance(model, np.concatenate([state, rotors])[: model.n], self._acting)
-        return end[:N_STATES]
+        start = np.concatenate((state, rotors))[: self._model.n]
+        acceleration = self._acceleration(thrust_axis(state.tolist()))
+        return advance_disturbed(self._model, start, self._acting, time, self._effectiveness, acceleration)[:N_STATES]
 
     def _later(self, reference: Array) -> Array:
         """The reference (N, 4) at the instants that the prediction is for, the delay later."""
@@ -357,11 +354,12 @@ class RobustMPC:
         """(4,) speeds at rest [rad/s] that also balance what thrust twists now, which the hover matrices leave out."""
         thrust = self._model.effectiveness[0]
         excess = np.dot(thrust, np.square(self._rotors) - np.square(self.trim.speeds))
-        return np.asarray(self.trim.speeds - self._inverse[:, 1:] @ (excess * self.trim.twist))
+        return np.asarray(self.trim.speeds - np.dot(self._of_twist, excess * self.trim.twist))
 
     def _along_plan(self, x0: Array) -> tuple[Array, Array, Array]:
         """A (N, n, n), B (N, n, 4), c (N, n) of the predicted steps."""
-        model = self._disturbed(x0, self._period)
+        acceleration = np.array(self._acceleration(thrust_axis(x0.tolist())))
+        model = replace(self._model, effectiveness=self._effectiveness, acceleration=acceleration)
         last = self._relinearised.last
         if self.settings.linearisation is Linearisation.STATE or last is None:
             A, B, c = linearise(model, x0[None], self._acting[None])
