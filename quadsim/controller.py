@@ -11,12 +11,10 @@ import numpy as np
 from quadsim.motion import Motion
 from quadsim.state import Array
 
-SOLVED: Final = "solved"
-"""Status of a period whose optimum a QP solver found."""
+SOLVED: Final = "solved"  # status of a period whose optimum a QP solver found
 UNCONSTRAINED: Final = "unconstrained"
 """Status of a period whose unconstrained optimum satisfies every constraint, and so is the constrained one too."""
-ACCEPTED: Final = frozenset({SOLVED, UNCONSTRAINED})
-"""The statuses whose command is the period's optimum."""
+ACCEPTED: Final = frozenset({SOLVED, UNCONSTRAINED})  # the statuses whose command is the period's optimum
 MISSED: Final = "missed"
 """Status of a period whose command came after the next period's begin: the one before it went on acting."""
 LAW_NAMES: Final = {
@@ -36,13 +34,10 @@ LARGEST_SPEED: Final = 1e5
 class Phase(StrEnum):
     """Where a flight stands with the ground; without a ground it is `flying` throughout."""
 
-    LANDED = "landed"
-    """On the ground, rotors off or on their way there."""
-    ARMED = "armed"
-    """On the ground, rotors spinning up for take-off."""
+    LANDED = "landed"  # on the ground, rotors off or on their way there
+    ARMED = "armed"  # on the ground, rotors spinning up for take-off
     FLYING = "flying"
-    CRASHED = "crashed"
-    """Something other than the feet touched the ground; what follows is recorded, not controlled."""
+    CRASHED = "crashed"  # something other than the feet touched the ground; what follows is recorded, not controlled
 
 
 @dataclass(frozen=True, kw_only=True)

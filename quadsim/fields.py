@@ -19,12 +19,9 @@ Number = Annotated[float, Ge(-1e6), Le(1e6)]
 NonNegative = Annotated[float, Ge(0.0), Le(1e6)]
 Positive = Annotated[float, Gt(0.0), Le(1e6)]
 Fraction = Annotated[float, Ge(0.0), Le(1.0)]
-Weight = Annotated[float, Gt(0.0), Le(1e12)]
-"""Of a cost function."""
-Vector = Annotated[tuple[Number, ...], Len(3, 3)]
-"""Of three numbers, x, y, z."""
-Instant = Annotated[float, Ge(0.0), Le(1e6), doc("[s] when it happens")]
-"""Of an event."""
+Weight = Annotated[float, Gt(0.0), Le(1e12)]  # of a cost function
+Vector = Annotated[tuple[Number, ...], Len(3, 3)]  # of three numbers, x, y, z
+Instant = Annotated[float, Ge(0.0), Le(1e6), doc("[s] when it happens")]  # of an event
 
 
 def filled(settings: Settings, **values: object) -> Settings:

@@ -9,23 +9,14 @@ from quadsim.state import Array
 
 @dataclass(frozen=True, kw_only=True)
 class Motion:
-    """A reference motion, K samples a control period apart, from one instant to the end of the course.
+    """A reference motion, K samples a control period apart, from one instant to the end of the course."""
 
-    Attributes:
-        position: (K, 3) world [m].
-        velocity: (K, 3) world [m/s].
-        acceleration: (K, 3) world [m/s^2].
-        attitude: (K, 4) unit quaternions wxyz, body to world, sign continuous from sample to sample.
-        body_rates: (K, 3) body frame [rad/s].
-        thrusts: (K, 4) of the rotors [N], not clipped to what they can give.
-    """
-
-    position: Array
-    velocity: Array
-    acceleration: Array
-    attitude: Array
-    body_rates: Array
-    thrusts: Array
+    position: Array  # (K, 3) world [m]
+    velocity: Array  # (K, 3) world [m/s]
+    acceleration: Array  # (K, 3) world [m/s^2]
+    attitude: Array  # (K, 4) unit quaternions wxyz, body to world, sign continuous from sample to sample
+    body_rates: Array  # (K, 3) body frame [rad/s]
+    thrusts: Array  # (K, 4) of the rotors [N], not clipped to what they can give
 
     def __len__(self) -> int:
         """K, the number of samples."""

@@ -21,19 +21,15 @@ from quadsim.errors import InputError, ParameterError, UnknownNameError
 from quadsim.fields import NonNegative, Number, Positive, Vector
 from quadsim.state import Array
 
-MAX_POSITIONS: Final = 1000
-"""Of one obstacle's path, or half-spaces of one polytope."""
+MAX_POSITIONS: Final = 1000  # of one obstacle's path, or half-spaces of one polytope
 _NAME: Final = {"pattern": "^[A-Za-z][A-Za-z0-9_-]*$"}
-_PARALLEL: Final = 1e-9
-"""Determinant of three unit normals below which their planes are taken to have no common point."""
+_PARALLEL: Final = 1e-9  # determinant of three unit normals below which their planes are taken to have no common point
 
-_ROUNDING: Final = 1e-9
-"""Of lengths along a path [m]."""
+_ROUNDING: Final = 1e-9  # of lengths along a path [m]
 
 Name = Annotated[str, doc("what reports call it")]
 Pair = Annotated[tuple[Number, ...], Len(2, 2)]
-Sizes = Annotated[tuple[Positive, ...], Len(3, 3)]
-"""Along x, y, z."""
+Sizes = Annotated[tuple[Positive, ...], Len(3, 3)]  # along x, y, z
 
 
 def _clearance(kind: str, size: Array, centre: Array, turn: Array, points: Array) -> tuple[Array, Array]:
@@ -68,19 +64,13 @@ def _excess(kind: str, size: Array, local: Array) -> tuple[Array, Array]:
 
 
 class Solid(NamedTuple):
-    """A convex part of an obstacle.
+    """A convex part of an obstacle."""
 
-    Attributes:
-        kind: as MuJoCo calls it.
-        size: as MuJoCo has it [m]: radius; radius and half length along z; half edges; radius and half height.
-        centre: (3,) from the obstacle's position, world [m].
-        turn: (3, 3) from its own axes to the world's.
-    """
-
-    kind: Literal["sphere", "capsule", "box", "cylinder"]
+    kind: Literal["sphere", "capsule", "box", "cylinder"]  # as MuJoCo calls it
     size: tuple[float, float, float]
-    centre: Array
-    turn: Array
+    """As MuJoCo has it [m]: radius; radius and half length along z; half edges; radius and half height."""
+    centre: Array  # (3,) from the obstacle's position, world [m]
+    turn: Array  # (3, 3) from its own axes to the world's
 
     def clearance(self, points: Array) -> tuple[Array, Array]:
         """Signed distance (K,) and outward normal (K, 3) of points (K, 3) relative to the obstacle's position [m].

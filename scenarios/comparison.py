@@ -30,21 +30,13 @@ Target = Flight | Scenario | str | Path
 
 @dataclass(frozen=True, kw_only=True)
 class Comparison:
-    """Flights side by side.
+    """Flights side by side."""
 
-    Attributes:
-        runs: the flights.
-        rows: the table, a row per quantity.
-        names: of its columns, one per flight.
-        page: `index.html`, where it was written.
-        notes: what a person should know of the runs that were read.
-    """
-
-    runs: tuple[rundir.Run, ...]
-    rows: list[Row]
-    names: tuple[str, ...]
-    page: Path | None
-    notes: tuple[str, ...] = ()
+    runs: tuple[rundir.Run, ...]  # the flights
+    rows: list[Row]  # the table, a row per quantity
+    names: tuple[str, ...]  # of its columns, one per flight
+    page: Path | None  # `index.html`, where it was written
+    notes: tuple[str, ...] = ()  # what a person should know of the runs that were read
 
     def to_markdown(self) -> str:
         """The table as Markdown."""

@@ -43,25 +43,15 @@ _ROTORS: Final = {1: "slew", 2: "speed"}
 
 @dataclass(frozen=True, kw_only=True)
 class _Bound:
-    """A side of a row, as the file has it.
+    """A side of a row, as the file has it."""
 
-    Attributes:
-        name: what reports call it, without its rotor.
-        rotor: 1 to 4, or 0.
-        side: `lower` or `upper`.
-        unit: of the bound in the file.
-        factor: from the row's unit to that.
-        field: of the file, a list of numbers.
-        entry: which of them.
-    """
-
-    name: str
-    rotor: int
-    side: str
-    unit: str
-    factor: float
-    field: str
-    entry: int
+    name: str  # what reports call it, without its rotor
+    rotor: int  # 1 to 4, or 0
+    side: str  # `lower` or `upper`
+    unit: str  # of the bound in the file
+    factor: float  # from the row's unit to that
+    field: str  # of the file, a list of numbers
+    entry: int  # which of them
 
 
 def diagnose(unanswered: Unanswered, scenario: Scenario, vehicle: Vehicle) -> dict[str, Any]:

@@ -18,8 +18,7 @@ from typing import Final
 _STOPS: Final = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 _PATIENCE_S: Final = 1.0
 """Within which another signal is the same one: what is cleared up meanwhile is not to be interrupted."""
-_LONGEST_IMPORT_S: Final = 5.0
-"""All of ours together take a fifth of that, on a busy machine more."""
+_LONGEST_IMPORT_S: Final = 5.0  # all of ours together take a fifth of that, on a busy machine more
 
 
 class _Stop:

@@ -5,8 +5,7 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Callable, Iterator
 
-Progress = Callable[[str, int, int], None]
-"""Called with (what, done, total) during long work."""
+Progress = Callable[[str, int, int], None]  # called with (what, done, total) during long work
 
 
 def silent(stage: str, done: int, total: int) -> None:

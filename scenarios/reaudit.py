@@ -32,29 +32,19 @@ OURS: Final = {*TABLES, HORIZON_FILE, rundir.SCENARIO_FILE, rundir.RECORDING_FIL
 """Files that only a run writes under these names."""
 ROUNDING: Final = 1e-9
 """By how much numbers may differ that another machine's arithmetic made, of 1 or of the larger number."""
-ROUNDING_TILT: Final = 1e-6
-"""The same for the tilt: near level an arc cosine has half of a number's digits."""
-MOST_REPORTED: Final = 6
-"""Differences that one message names."""
+ROUNDING_TILT: Final = 1e-6  # the same for the tilt: near level an arc cosine has half of a number's digits
+MOST_REPORTED: Final = 6  # differences that one message names
 
 
 @dataclass(frozen=True, kw_only=True)
 class Reaudit:
-    """The audit from a run's tables.
+    """The audit from a run's tables."""
 
-    Attributes:
-        summary: `summary.json`.
-        findings: the audit made again, at the control samples and at the log rate.
-        satisfied: the verdict on the flight that follows from the tables.
-        rate: rows per second of `plant.parquet` [Hz].
-        notes: what a person should know, and what is no error.
-    """
-
-    summary: dict[str, Any]
-    findings: tuple[Finding, ...]
-    satisfied: bool
-    rate: float
-    notes: tuple[str, ...]
+    summary: dict[str, Any]  # `summary.json`
+    findings: tuple[Finding, ...]  # the audit made again, at the control samples and at the log rate
+    satisfied: bool  # the verdict on the flight that follows from the tables
+    rate: float  # rows per second of `plant.parquet` [Hz]
+    notes: tuple[str, ...]  # what a person should know, and what is no error
 
     def to_json(self) -> dict[str, Any]:
         """The audit made again, for `quadsim check --json`."""

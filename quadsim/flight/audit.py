@@ -38,17 +38,12 @@ Mask = NDArray[np.bool_]
 
 @dataclass(frozen=True, kw_only=True)
 class Signal:
-    """Something that can be limited: its unit in limits, and how to take it from a log.
+    """Something that can be limited: its unit in limits, and how to take it from a log."""
 
-    Attributes:
-        unit: unit of the limit, e.g. `deg`.
-        sampled: log -> (K,) or (K, j) values at the control samples, in `unit`.
-        plant: log -> (M,) or (M, j) values at the physics rate, or None for what exists at samples only.
-    """
-
-    unit: str
-    sampled: Callable[[ControlLog], Array]
+    unit: str  # unit of the limit, e.g. `deg`
+    sampled: Callable[[ControlLog], Array]  # log -> (K,) or (K, j) values at the control samples, in `unit`
     plant: Callable[[PlantLog], Array] | None
+    """log -> (M,) or (M, j) values at the physics rate, or None for what exists at samples only."""
 
     def finest(self, log: FlightLog) -> tuple[Array, Array]:
         """Times [s] and values: of the plant's rows where it exists there, else at the control samples."""
@@ -94,10 +89,8 @@ TERMS: Final[dict[str, Signal]] = {
     **{f"speed_{i + 1}": _rotor_signal(i) for i in range(N_ROTORS)},
 }
 """What a sum may have as its terms."""
-SUM: Final = "sum"
-"""The signal of a limit on a sum of terms."""
-CLEARANCE: Final = "clearance"
-"""The signal of a limit in space: how far the vehicle's bounding ball stays clear [m]."""
+SUM: Final = "sum"  # the signal of a limit on a sum of terms
+CLEARANCE: Final = "clearance"  # the signal of a limit in space: how far the vehicle's bounding ball stays clear [m]
 
 
 def sum_signal(terms: tuple[tuple[str, float], ...]) -> Signal:
@@ -176,14 +169,10 @@ class Limit:
 
 @dataclass(frozen=True, kw_only=True)
 class SumLimit(Limit):
-    """Bounds on a sum of signals.
-
-    Attributes:
-        terms: the names in `TERMS` and their factors.
-    """
+    """Bounds on a sum of signals."""
 
     signal: str = SUM
-    terms: tuple[tuple[str, float], ...]
+    terms: tuple[tuple[str, float], ...]  # the names in `TERMS` and their factors
 
     def _check_signal(self) -> None:
         for name, _ in self.terms:
@@ -198,17 +187,12 @@ class SumLimit(Limit):
 
 @dataclass(frozen=True, kw_only=True)
 class SpaceLimit(Limit):
-    """An obstacle to keep clear of, or a region to stay in.
-
-    Attributes:
-        shape: the obstacle or region.
-        radius: of the vehicle's bounding ball [m].
-    """
+    """An obstacle to keep clear of, or a region to stay in."""
 
     signal: str = CLEARANCE
     lower: float = 0.0
-    shape: Constraining
-    radius: float
+    shape: Constraining  # the obstacle or region
+    radius: float  # of the vehicle's bounding ball [m]
 
     def _check_signal(self) -> None:
         if self.signal != CLEARANCE:
@@ -226,25 +210,15 @@ class SpaceLimit(Limit):
 
 @dataclass(frozen=True, kw_only=True)
 class Finding:
-    """What the audit found for one limit; margins and peaks in the limit's unit.
+    """What the audit found for one limit; margins and peaks in the limit's unit."""
 
-    Attributes:
-        limit: the limit audited.
-        peak_sampled: the value nearest to (or furthest beyond) a bound at the control samples.
-        peak_plant: the same at the physics rate; equal to `peak_sampled` for signals that exist at samples only.
-        worst_margin_sampled: smallest signed margin at the control samples.
-        worst_margin: smallest signed margin at the physics rate.
-        worst_time: when that was [s].
-        time_violated: time spent beyond bound plus tolerance [s].
-    """
-
-    limit: Limit
-    peak_sampled: float
-    peak_plant: float
-    worst_margin_sampled: float
-    worst_margin: float
-    worst_time: float
-    time_violated: float
+    limit: Limit  # the limit audited
+    peak_sampled: float  # the value nearest to (or furthest beyond) a bound at the control samples
+    peak_plant: float  # the same at the physics rate; equal to `peak_sampled` for signals that exist at samples only
+    worst_margin_sampled: float  # smallest signed margin at the control samples
+    worst_margin: float  # smallest signed margin at the physics rate
+    worst_time: float  # when that was [s]
+    time_violated: float  # time spent beyond bound plus tolerance [s]
 
     @property
     def satisfied(self) -> bool:

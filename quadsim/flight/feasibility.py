@@ -35,62 +35,39 @@ from quadsim.state import (
 )
 from quadsim.vehicle import Vehicle
 
-STENCIL: Final = 2
-"""Samples on either side that a torque depends on."""
+STENCIL: Final = 2  # samples on either side that a torque depends on
 TOLERANCE: Final = 1e-6
 """How far beyond a bound a demand may go, relative to the bound and absolute: rounding in the differences."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Demand:
-    """What flying a course exactly would take, at K samples.
+    """What flying a course exactly would take, at K samples."""
 
-    Attributes:
-        state: (K, 12) the states of `quadsim.state`, SI.
-        acceleration: (K, 3) world [m/s^2].
-        thrust: (K,) of all rotors together [N].
-        torque: (K, 3) body [N m]; 0 around kinks and jumps.
-        speeds: (K, 4) rotor speeds [rad/s]; negative where a rotor would have to push down, -sqrt(-w^2).
-        slews: (K - 1, 4) their steps from sample to sample, NaN where a torque is left out on either side [rad/s].
-    """
-
-    state: Array
-    acceleration: Array
-    thrust: Array
-    torque: Array
-    speeds: Array
-    slews: Array
+    state: Array  # (K, 12) the states of `quadsim.state`, SI
+    acceleration: Array  # (K, 3) world [m/s^2]
+    thrust: Array  # (K,) of all rotors together [N]
+    torque: Array  # (K, 3) body [N m]; 0 around kinks and jumps
+    speeds: Array  # (K, 4) rotor speeds [rad/s]; negative where a rotor would have to push down, -sqrt(-w^2)
+    slews: Array  # (K - 1, 4) their steps from sample to sample, NaN where a torque is left out on either side [rad/s]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Feasibility:
-    """A course held against a vehicle's limits and a controller's bounds; peaks over the whole course.
+    """A course held against a vehicle's limits and a controller's bounds; peaks over the whole course."""
 
-    Attributes:
-        tilt: largest [deg].
-        velocity: largest magnitude [m/s].
-        acceleration: largest magnitude [m/s^2].
-        yaw: largest magnitude [deg]; a model linearised at zero yaw holds near 0.
-        yaw_rate: largest magnitude [deg/s].
-        rotor_min: lowest rotor speed [rad/s]; negative where a rotor would have to push down.
-        rotor_max: highest rotor speed [rad/s].
-        thrust_to_weight: largest.
-        jumps: times at which the course itself jumps [s]; the peaks leave them out.
-        problems: what is beyond a limit or a bound, a line each; empty for a course that can be flown exactly.
-        sentence: all this for a person.
-    """
-
-    tilt: float
-    velocity: float
-    acceleration: float
-    yaw: float
-    yaw_rate: float
-    rotor_min: float
-    rotor_max: float
-    thrust_to_weight: float
-    jumps: tuple[float, ...]
+    tilt: float  # largest [deg]
+    velocity: float  # largest magnitude [m/s]
+    acceleration: float  # largest magnitude [m/s^2]
+    yaw: float  # largest magnitude [deg]; a model linearised at zero yaw holds near 0
+    yaw_rate: float  # largest magnitude [deg/s]
+    rotor_min: float  # lowest rotor speed [rad/s]; negative where a rotor would have to push down
+    rotor_max: float  # highest rotor speed [rad/s]
+    thrust_to_weight: float  # largest
+    jumps: tuple[float, ...]  # times at which the course itself jumps [s]; the peaks leave them out
     problems: tuple[str, ...]
-    sentence: str
+    """What is beyond a limit or a bound, a line each; empty for a course that can be flown exactly."""
+    sentence: str  # all this for a person
 
 
 def demand(

@@ -15,16 +15,12 @@ from typing import Any, Final
 
 from quadsim.errors import FileError, printable
 
-NUMBER: Final = float
-"""Whole numbers too."""
+NUMBER: Final = float  # whole numbers too
 MAYBE_NUMBER: Final = (float, NoneType)
 MAYBE_TEXT: Final = (str, NoneType)
-LARGEST_FILE: Final = 64_000_000
-"""Size [bytes] of the largest file that is read."""
-LARGEST_NUMBER: Final = 1e300
-"""Beyond, a unit's factor makes it infinite."""
-MOST_NAMED: Final = 10
-"""Entries that one message names."""
+LARGEST_FILE: Final = 64_000_000  # size [bytes] of the largest file that is read
+LARGEST_NUMBER: Final = 1e300  # beyond, a unit's factor makes it infinite
+MOST_NAMED: Final = 10  # entries that one message names
 
 
 @dataclass(frozen=True)

@@ -10,29 +10,19 @@ import numpy as np
 
 from quadsim.state import EULER, INDEX, Array, body_to_world, tilt
 
-AIRBORNE: Final = 0.05
-"""Clearance of the feet [m] above which a vehicle flies: no landing gear springs back that far."""
-TOUCH: Final = 2e-3
-"""Clearance [m] from which on a part touches: contacts are soft, and points stand for rounded parts."""
+AIRBORNE: Final = 0.05  # clearance of the feet [m] above which a vehicle flies: no landing gear springs back that far
+TOUCH: Final = 2e-3  # clearance [m] from which on a part touches: contacts are soft, and points stand for rounded parts
 
 
 @dataclass(frozen=True, kw_only=True)
 class Outline:
-    """Where an airframe can touch the ground, in the body frame; at rest on its feet its origin is at z = 0.
+    """Where an airframe can touch the ground, in the body frame; at rest on its feet its origin is at z = 0."""
 
-    Attributes:
-        feet: (4, 3) centres of the feet [m].
-        foot_radius: [m].
-        hull: (P, 3) points of what must not touch: the rims of the rotor discs and the underside [m].
-        floor: height of the floor [m].
-        disc: height of the rotor discs above the origin [m].
-    """
-
-    feet: Array
-    foot_radius: float
-    hull: Array
-    floor: float
-    disc: float
+    feet: Array  # (4, 3) centres of the feet [m]
+    foot_radius: float  # [m]
+    hull: Array  # (P, 3) points of what must not touch: the rims of the rotor discs and the underside [m]
+    floor: float  # height of the floor [m]
+    disc: float  # height of the rotor discs above the origin [m]
 
 
 def clearance(states: Array, points: Array, radius: float, floor: float) -> Array:

@@ -26,45 +26,26 @@ BODY_RATES: Final = {f"body_rate_{axis}": "rad/s" for axis in "xyz"}
 
 @dataclass(frozen=True, kw_only=True)
 class ControlLog:
-    """One row per control period k, taken at t_k; K rows.
+    """One row per control period k, taken at t_k; K rows."""
 
-    Attributes:
-        t: (K,) [s].
-        state: (K, 12) state as measured, which the controller received; units of `STATE_UNITS`.
-        truth: (K, 12) state as it was; the same where measurement is perfect.
-        reference: (K, 4) filtered reference x, y, z [m], yaw [rad] at t_k.
-        speeds: (K, 4) commanded rotor speeds in force at the period's end [rad/s].
-        speeds_before: (4,) u(-1), the command before the first [rad/s].
-        status: K texts, one of `quadsim.controller.ACCEPTED` or what was instead; see `quadsim.controller.Command`.
-        phase: K texts, where the flight stood with the ground; see `quadsim.controller.Phase`.
-        iterations: (K,) solver iterations.
-        active: (K,) constraints active at the optimum.
-        fallback: (K,) 0 none, higher = deeper.
-        slack: (K,) largest softening of an output bound [rad].
-        primal_residual: (K,) as reported by the back end; 0 where an active set answers exactly.
-        dual_residual: (K,) likewise.
-        delay: (K,) simulated time from the measurement to the command [s].
-        attitude: (K, 4) quaternion wxyz as measured, sign continuous; None where Euler angles do.
-        body_rates: (K, 3) as measured [rad/s]; None where Euler angles do.
-    """
-
-    t: Array
-    state: Array
-    truth: Array
-    reference: Array
-    speeds: Array
-    speeds_before: Array
+    t: Array  # (K,) [s]
+    state: Array  # (K, 12) state as measured, which the controller received; units of `STATE_UNITS`
+    truth: Array  # (K, 12) state as it was; the same where measurement is perfect
+    reference: Array  # (K, 4) filtered reference x, y, z [m], yaw [rad] at t_k
+    speeds: Array  # (K, 4) commanded rotor speeds in force at the period's end [rad/s]
+    speeds_before: Array  # (4,) u(-1), the command before the first [rad/s]
     status: tuple[str, ...]
-    phase: tuple[str, ...]
-    iterations: np.ndarray[Any, np.dtype[np.int64]]
-    active: np.ndarray[Any, np.dtype[np.int64]]
-    fallback: np.ndarray[Any, np.dtype[np.int64]]
-    slack: Array
-    primal_residual: Array
-    dual_residual: Array
-    delay: Array
-    attitude: Array | None = None
-    body_rates: Array | None = None
+    """K texts, one of `quadsim.controller.ACCEPTED` or what was instead; see `quadsim.controller.Command`."""
+    phase: tuple[str, ...]  # K texts, where the flight stood with the ground; see `quadsim.controller.Phase`
+    iterations: np.ndarray[Any, np.dtype[np.int64]]  # (K,) solver iterations
+    active: np.ndarray[Any, np.dtype[np.int64]]  # (K,) constraints active at the optimum
+    fallback: np.ndarray[Any, np.dtype[np.int64]]  # (K,) 0 none, higher = deeper
+    slack: Array  # (K,) largest softening of an output bound [rad]
+    primal_residual: Array  # (K,) as reported by the back end; 0 where an active set answers exactly
+    dual_residual: Array  # (K,) likewise
+    delay: Array  # (K,) simulated time from the measurement to the command [s]
+    attitude: Array | None = None  # (K, 4) quaternion wxyz as measured, sign continuous; None where Euler angles do
+    body_rates: Array | None = None  # (K, 3) as measured [rad/s]; None where Euler angles do
 
     @property
     def measured_perfectly(self) -> bool:
@@ -111,25 +92,16 @@ class TimingLog:
 
 @dataclass(frozen=True, kw_only=True)
 class PlantLog:
-    """The plant between commands; M rows, the first at t = 0 before the first command.
+    """The plant between commands; M rows, the first at t = 0 before the first command."""
 
-    Attributes:
-        t: (M,) [s].
-        state: (M, 12) true state, yaw unwrapped.
-        speeds: (M, 4) rotor speeds from t on [rad/s]; rotors that lag pass through them.
-        wrench: (M, 6) external force, world [N], and torque, body frame [N m], from t on; None where there is none.
-        wind: (M, 3) velocity of the air, world [m/s]; None without wind.
-        attitude: (M, 4) true quaternion wxyz; None where Euler angles do.
-        body_rates: (M, 3) true body rates [rad/s]; None where Euler angles do.
-    """
-
-    t: Array
-    state: Array
-    speeds: Array
+    t: Array  # (M,) [s]
+    state: Array  # (M, 12) true state, yaw unwrapped
+    speeds: Array  # (M, 4) rotor speeds from t on [rad/s]; rotors that lag pass through them
     wrench: Array | None = None
-    wind: Array | None = None
-    attitude: Array | None = None
-    body_rates: Array | None = None
+    """(M, 6) external force, world [N], and torque, body frame [N m], from t on; None where there is none."""
+    wind: Array | None = None  # (M, 3) velocity of the air, world [m/s]; None without wind
+    attitude: Array | None = None  # (M, 4) true quaternion wxyz; None where Euler angles do
+    body_rates: Array | None = None  # (M, 3) true body rates [rad/s]; None where Euler angles do
 
     def every(self, stride: int) -> PlantLog:
         """Each `stride`-th row, from the first on."""
@@ -139,26 +111,17 @@ class PlantLog:
 
 @dataclass(frozen=True, kw_only=True)
 class FlightLog:
-    """A whole flight, or as much of one as was flown.
+    """A whole flight, or as much of one as was flown."""
 
-    Attributes:
-        control: one row per control period.
-        timing: clock times, one row per control period.
-        plant: the plant, at the physics rate after a flight, at the log rate when read from a file.
-        predicted: (K, N, 3) float32 positions [m] predicted at each period for t_{k+1} .. t_{k+N}, N the shortest
-            horizon of its controllers; None where one of them has no model.
-        reason: why the flight ended early; None when it was completed.
-        interrupted: whether the person flying ended it.
-        lost: which of the loss criteria ended it, e.g. `tilt`; None where none did.
-    """
-
-    control: ControlLog
-    timing: TimingLog
-    plant: PlantLog
+    control: ControlLog  # one row per control period
+    timing: TimingLog  # clock times, one row per control period
+    plant: PlantLog  # the plant, at the physics rate after a flight, at the log rate when read from a file
     predicted: np.ndarray[Any, np.dtype[np.float32]] | None = None
-    reason: str | None = None
-    interrupted: bool = False
-    lost: str | None = None
+    """(K, N, 3) float32 positions [m] predicted at each period for t_{k+1} .. t_{k+N}, N the shortest horizon of its
+    controllers; None where one of them has no model."""
+    reason: str | None = None  # why the flight ended early; None when it was completed
+    interrupted: bool = False  # whether the person flying ended it
+    lost: str | None = None  # which of the loss criteria ended it, e.g. `tilt`; None where none did
 
     @property
     def status(self) -> str:

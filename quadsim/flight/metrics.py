@@ -15,8 +15,7 @@ from quadsim.flight.ground import AIRBORNE, Outline, clearance, takeoff_time, to
 from quadsim.flight.log import ControlLog, FlightLog, TimingLog
 from quadsim.state import INDEX, REFERENCE_NAMES, REFERENCE_STATES, REFERENCE_UNITS, STATE_NAMES, STATE_UNITS, Array
 
-SETTLING_BAND: Final = 0.05
-"""Half width of the band an output has to stay in to be settled, as a share of the step."""
+SETTLING_BAND: Final = 0.05  # half width of the band an output has to stay in to be settled, as a share of the step
 
 UNRECOVERED: Final = 1.0
 """Time that a flight has to be in fallback at its end for that to count as permanent [s]: the longest that one shifted
@@ -25,21 +24,14 @@ plan is held, unless a scenario sets another."""
 
 @dataclass(frozen=True, kw_only=True)
 class CourseStep:
-    """A step that the unfiltered course takes in one channel; angles in rad, lengths in m.
+    """A step that the unfiltered course takes in one channel; angles in rad, lengths in m."""
 
-    Attributes:
-        channel: `x`, `y`, `z` or `yaw`.
-        time: when the course steps [s].
-        before: the value before; at the start of a flight, where the vehicle is.
-        after: the value after.
-        until: when the controller first sees the channel's next step coming, or else the flight is planned to end [s].
-    """
-
-    channel: str
-    time: float
-    before: float
-    after: float
+    channel: str  # `x`, `y`, `z` or `yaw`
+    time: float  # when the course steps [s]
+    before: float  # the value before; at the start of a flight, where the vehicle is
+    after: float  # the value after
     until: float
+    """When the controller first sees the channel's next step coming, or else the flight is planned to end [s]."""
 
 
 def tracking(log: ControlLog) -> dict[str, Any]:

@@ -24,8 +24,7 @@ FLIGHT_FILE: Final = "flight.parquet"
 TIMING_FILE: Final = "timing.parquet"
 PLANT_FILE: Final = "plant.parquet"
 HORIZON_FILE: Final = "horizon.parquet"
-_TRUE: Final = "true_"
-"""How the columns of the true state begin, which are there where the measured one differs."""
+_TRUE: Final = "true_"  # how the columns of the true state begin, which are there where the measured one differs
 _REFERENCES: Final = tuple(f"ref_{name}" for name in REFERENCE_NAMES)
 _COMMANDED: Final = tuple(f"u{i}" for i in range(1, N_ROTORS + 1))
 _TURNING: Final = tuple(f"w{i}" for i in range(1, N_ROTORS + 1))

@@ -32,31 +32,20 @@ SCENARIO_FILE: Final = "scenario.toml"
 RECORDING_FILE: Final = "flight.rrd"
 VIDEO_FILE: Final = "flight.mp4"
 FIGURES_DIR: Final = "figures"
-KIND: Final = "run"
-"""What `quadsim.outputs` calls a run directory."""
-UNLISTED: Final = (SUMMARY_FILE, MANIFEST_FILE, LOCK_FILE)
-"""Files of quadsim's whose hashes the summary does not have."""
-SEAL: Final = "summary"
-"""Under which `timing.parquet` keeps the summary's digest."""
+KIND: Final = "run"  # what `quadsim.outputs` calls a run directory
+UNLISTED: Final = (SUMMARY_FILE, MANIFEST_FILE, LOCK_FILE)  # files of quadsim's whose hashes the summary does not have
+SEAL: Final = "summary"  # under which `timing.parquet` keeps the summary's digest
 
 
 @dataclass(frozen=True, kw_only=True)
 class Run:
-    """A finished run, read back from its directory.
+    """A finished run, read back from its directory."""
 
-    Attributes:
-        directory: where it is.
-        summary: `summary.json`.
-        log: the flight, its plant rows at the log rate.
-        vehicle: the vehicle flown.
-        limits: the constraints it was audited against.
-    """
-
-    directory: Path
-    summary: dict[str, Any]
-    log: FlightLog
-    vehicle: Vehicle
-    limits: tuple[Limit, ...]
+    directory: Path  # where it is
+    summary: dict[str, Any]  # `summary.json`
+    log: FlightLog  # the flight, its plant rows at the log rate
+    vehicle: Vehicle  # the vehicle flown
+    limits: tuple[Limit, ...]  # the constraints it was audited against
 
     @property
     def name(self) -> str:

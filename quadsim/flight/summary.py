@@ -129,8 +129,7 @@ FORM: Final = {
     "machine": Optional({"system": str, "processor": str, "cores": (int, type(None))}),
     "files": Each(str),
 }
-FLOWN_FORM: Final = FORM | _FLOWN
-"""Of a flight that came to its first period."""
+FLOWN_FORM: Final = FORM | _FLOWN  # of a flight that came to its first period
 _TOGETHER: Final = {"worst_margin": ("worst_time", "peak_plant"), "worst_margin_sampled": ("peak_sampled",)}
 """Of a constraint: present wherever a margin is."""
 

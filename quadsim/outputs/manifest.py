@@ -13,8 +13,7 @@ from pathlib import Path, PurePosixPath
 from typing import Any, Final
 
 MANIFEST_FILE: Final = ".quadsim.json"
-LOCK_FILE: Final = ".lock"
-"""Of a directory that grows: empty, and locked by the process that writes there."""
+LOCK_FILE: Final = ".lock"  # of a directory that grows: empty, and locked by the process that writes there
 
 _FORMAT: Final = "quadsim directory"
 _START: Final = b'{\n  "format": "quadsim directory",'
@@ -30,15 +29,10 @@ _LONGEST_SEAL: Final = 200
 
 @dataclass(frozen=True, kw_only=True)
 class Manifest:
-    """What we wrote into a directory.
+    """What we wrote into a directory."""
 
-    Attributes:
-        kind: of directory, for people, e.g. `run`.
-        files: SHA-256 by relative path; of a file that is about to change, before and after.
-    """
-
-    kind: str
-    files: Mapping[str, Sequence[str]]
+    kind: str  # of directory, for people, e.g. `run`
+    files: Mapping[str, Sequence[str]]  # SHA-256 by relative path; of a file that is about to change, before and after
 
     def encode(self) -> bytes:
         """As it is written."""

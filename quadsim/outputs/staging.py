@@ -33,8 +33,7 @@ from quadsim.outputs.manifest import (
     remove_listed,
 )
 
-STAGING: Final = re.compile(r"\.quadsim-\w+\.partial")
-"""Names of staging directories."""
+STAGING: Final = re.compile(r"\.quadsim-\w+\.partial")  # names of staging directories
 
 _HALF_MADE: Final = (
     "*.parquet", "*.rrd", "*.mp4", "*.gif", "*.png", "*.svg", "*.html", "*.log", "*.new", "new.*", "pieces.txt",
@@ -53,13 +52,9 @@ _log: Final = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Staging:
-    """A directory beside the outputs that are made in it; what they replace never enters the one where they are made.
+    """A directory beside the outputs that are made in it; what they replace never enters where they are made."""
 
-    Attributes:
-        path: its own.
-    """
-
-    path: Path
+    path: Path  # its own
 
     @property
     def work(self) -> Path:

@@ -28,8 +28,7 @@ _VERDICTS: Final = {
 }
 FOR_GOOD: Final = "ends in permanent fallback"
 """Of a flight whose verdict rests on that alone; see `quadsim.flight.metrics.unrecovered`."""
-_Line = tuple[str, str, Callable[[Summary], Cell]]
-"""A row's label, its unit, and the cell of a summary."""
+_Line = tuple[str, str, Callable[[Summary], Cell]]  # a row's label, its unit, and the cell of a summary
 
 
 def nested(data: Any, *keys: str) -> Any:
@@ -390,8 +389,7 @@ _TIMES: Final[tuple[_Line, ...]] = (
     ("simulated in", "s", _number("wall_s", "simulate")),
     ("with all files", "s", _number("wall_s", "total")),
 )
-_OWN: Final = "own"
-"""In place of a row's unit: the constraint's own."""
+_OWN: Final = "own"  # in place of a row's unit: the constraint's own
 _CONSTRAINT: Final[tuple[_Line, ...]] = (
     ("verdict", "", _verdict),
     ("bounds", _OWN, lambda entry: Cell(text=format_bounds(entry))),

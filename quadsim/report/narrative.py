@@ -23,8 +23,7 @@ from quadsim.report.comparison import (
 )
 from quadsim.report.table import format_number
 
-_MOST_EVENTS: Final = 12
-"""Of a flight that a sentence names."""
+_MOST_EVENTS: Final = 12  # of a flight that a sentence names
 _Named = Sequence[tuple[str, Summary]]
 
 

@@ -12,8 +12,7 @@ LINES: Final = ("#1b7fc4", "#e69f00", "#009e73", "#cc79a7", "#56b4e9", "#8c6d31"
 REFERENCE: Final = "#7a7f87"
 BOUND: Final = "#dc2f38"
 OBSTACLE: Final = "#b85c48"
-COURSE_COLOUR: Final = LINES[3]
-"""Of a curve through a cloud of points."""
+COURSE_COLOUR: Final = LINES[3]  # of a curve through a cloud of points
 
 
 def line_colour(i: int) -> str:

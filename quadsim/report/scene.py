@@ -11,10 +11,8 @@ from quadsim.flight.rundir import Run
 from quadsim.space import AnyObstacle, Obstacle, Region, footprint
 from quadsim.state import POSITION, Array
 
-_ROUND: float = 1.5
-"""How far beyond course and path regions without an end are drawn [m]."""
-_LONG: float = 40.0
-"""How far a path is followed from the middle of the course [m]: a lost vehicle leaves the picture."""
+_ROUND: float = 1.5  # how far beyond course and path regions without an end are drawn [m]
+_LONG: float = 40.0  # how far a path is followed from the middle of the course [m]: a lost vehicle leaves the picture
 
 
 def obstacles_in(limits: Iterable[Limit]) -> list[AnyObstacle]:

@@ -22,10 +22,8 @@ ROTOR_NAMES, ARM_NAMES, FOOT_NAMES, DISC_NAMES, PROPELLER_NAMES = (
     tuple(f"{part}{i}" for i in range(1, N_ROTORS + 1)) for part in ("rotor", "arm", "foot", "disc", "propeller")
 )
 
-DRAWN_ARM: Final = 0.3
-"""Arm length [m] for which `quadrotor.xml` is drawn."""
-_WIDEST_DISC: Final = 0.48
-"""Largest radius of a rotor disc, in distances between neighbouring rotors: discs never meet."""
+DRAWN_ARM: Final = 0.3  # arm length [m] for which `quadrotor.xml` is drawn
+_WIDEST_DISC: Final = 0.48  # largest radius of a rotor disc, in distances between neighbouring rotors: discs never meet
 _IDLE: Final = (mujoco.mjtDisableBit.mjDSBL_SPRING, mujoco.mjtDisableBit.mjDSBL_DAMPER)
 """Stages of MuJoCo's step with nothing to do for a free body; with those of contact a sixth of its time."""
 _CONTACT: Final = (mujoco.mjtDisableBit.mjDSBL_CONSTRAINT, mujoco.mjtDisableBit.mjDSBL_CONTACT)
@@ -35,8 +33,7 @@ _STIFFNESS: Final = (0.005, 1.0)
 _FRICTION: Final = (0.8, 0.005, 0.0001)
 """Sliding [-], torsional and rolling [m] friction between rubber feet and a hard floor; the first is a textbook value,
 the others MuJoCo's own."""
-_MEETS: Final = 1
-"""The bit of contype and conaffinity by which floor and airframe meet."""
+_MEETS: Final = 1  # the bit of contype and conaffinity by which floor and airframe meet
 _MEETS_OBSTACLES: Final = 2
 """The bit of contype and conaffinity by which obstacles and the vehicle's bounding ball meet."""
 OBSTACLE_COLOUR: Final = (0.72, 0.36, 0.28, 1.0)

@@ -55,12 +55,9 @@ class Computation(ComputationTime):
     its deadline and is dropped.  What acts until one comes is the command before it or, with `plan`, the next step of
     the last plan that came in time: where commands are due `delay` after their measurement, the actuators' side has
     that plan and continues it.
-
-    Attributes:
-        stalls: when the computer answers nothing.
     """
 
-    stalls: tuple[Stall, ...] = ()
+    stalls: tuple[Stall, ...] = ()  # when the computer answers nothing
 
     def taken(self, time: float, command: Command, rng: np.random.Generator) -> float:
         """From the measurement at `time` [s] to the command [s]."""

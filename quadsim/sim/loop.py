@@ -60,50 +60,29 @@ class Rows:
 
 @dataclass(frozen=True, kw_only=True)
 class Observation:
-    """What a control period begins with.
+    """What a control period begins with."""
 
-    Attributes:
-        k: which period.
-        state: (12,) as measured, or estimated.
-        truth: (12,) as it is.
-        reference: (4,) filtered x, y, z [m], yaw [rad] at t_k.
-        preview: (N, 4) the same at t_{k+1} .. t_{k+N}, as far as it is known.
-        moment: when it is, and what a controller may know besides; `moment.acting` is u(k-1).
-    """
-
-    k: int
-    state: Array
-    truth: Array
-    reference: Array
-    preview: Array
-    moment: Moment
+    k: int  # which period
+    state: Array  # (12,) as measured, or estimated
+    truth: Array  # (12,) as it is
+    reference: Array  # (4,) filtered x, y, z [m], yaw [rad] at t_k
+    preview: Array  # (N, 4) the same at t_{k+1} .. t_{k+N}, as far as it is known.
+    moment: Moment  # when it is, and what a controller may know besides; `moment.acting` is u(k-1)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Sample:
-    """One control period as it was flown.
+    """One control period as it was flown."""
 
-    Attributes:
-        observation: what it began with.
-        command: what the controller answered, or what was given instead.
-        speeds: (4,) the command in force at its end, an earlier one if `command` was missed [rad/s].
-        delay: simulated time from the measurement to the command [s].
-        missed: whether the command came too late to be used.
-        step_s: wall time of the controller's step [s]; 0 where the command was given.
-        before: (14,) MuJoCo's state at its begin; see `quadsim.sim.physics.physics_to_state`.
-        segment: its physics steps.
-        rotors: (4,) how fast the rotors turned at its end [rad/s].
-    """
-
-    observation: Observation
-    command: Command
-    speeds: Array
-    delay: float
-    missed: bool
-    step_s: float
-    before: Array
-    segment: Segment
-    rotors: Array
+    observation: Observation  # what it began with
+    command: Command  # what the controller answered, or what was given instead
+    speeds: Array  # (4,) the command in force at its end, an earlier one if `command` was missed [rad/s]
+    delay: float  # simulated time from the measurement to the command [s]
+    missed: bool  # whether the command came too late to be used
+    step_s: float  # wall time of the controller's step [s]; 0 where the command was given
+    before: Array  # (14,) MuJoCo's state at its begin; see `quadsim.sim.physics.physics_to_state`
+    segment: Segment  # its physics steps
+    rotors: Array  # (4,) how fast the rotors turned at its end [rad/s]
 
     @property
     def phase(self) -> Phase:

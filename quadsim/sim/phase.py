@@ -13,12 +13,9 @@ from quadsim.flight.ground import AIRBORNE, TOUCH, Outline, clearance
 from quadsim.space import Obstacle, Solids
 from quadsim.state import INDEX, POSITION, REFERENCE_NAMES, Array, tilt
 
-TAKEOFF_RISE: Final = 0.05
-"""How far above the resting height a reference has to rise to require flight [m]."""
-REST: Final = 0.2
-"""How long the feet have to touch the ground without a break for the vehicle to have landed [s]."""
-CAPSIZED: Final = 60.0
-"""Tilt [deg] beyond which a vehicle that touches the ground has crashed."""
+TAKEOFF_RISE: Final = 0.05  # how far above the resting height a reference has to rise to require flight [m]
+REST: Final = 0.2  # how long the feet have to touch the ground without a break for the vehicle to have landed [s]
+CAPSIZED: Final = 60.0  # tilt [deg] beyond which a vehicle that touches the ground has crashed
 
 
 class PhaseMonitor:

@@ -21,8 +21,7 @@ from quadsim.state import (
     quaternion_to_euler,
 )
 
-Integrator = Literal["mujoco", "rk4"]
-"""Who takes the physics steps: MuJoCo, or `quadsim.sim.rigid_body`."""
+Integrator = Literal["mujoco", "rk4"]  # who takes the physics steps: MuJoCo, or `quadsim.sim.rigid_body`
 
 
 def steps_per_period(control_period: float, timestep: float) -> int:
@@ -84,20 +83,14 @@ def physics_to_state(physics: Array, yaw: float = 0.0) -> Array:
 
 @dataclass(frozen=True, kw_only=True)
 class Segment:
-    """What happened over a number of physics steps; M rows, one per step.
+    """What happened over a number of physics steps; M rows, one per step."""
 
-    Attributes:
-        physics: (M, 14) MuJoCo's state after each step; see `physics_to_state`.
-        speeds: (M, 4) rotor speeds at the start of each step [rad/s].
-        wrench: (M, 6) force, world [N], and torque, body frame about its origin [N m], of all effects but contact, over
-            each step; None where no effect makes any.
-        wind: (M, 3) velocity of the air in the middle of each step, world [m/s]; None without wind.
-    """
-
-    physics: Array
-    speeds: Array
+    physics: Array  # (M, 14) MuJoCo's state after each step; see `physics_to_state`
+    speeds: Array  # (M, 4) rotor speeds at the start of each step [rad/s]
     wrench: Array | None
-    wind: Array | None
+    """(M, 6) force, world [N], and torque, body frame about its origin [N m], of all effects but contact, over each
+    step; None where no effect makes any."""
+    wind: Array | None  # (M, 3) velocity of the air in the middle of each step, world [m/s]; None without wind
 
     @staticmethod
     def join(parts: Sequence[Segment]) -> Segment:

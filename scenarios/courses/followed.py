@@ -11,8 +11,7 @@ from quadsim.state import REFERENCE_NAMES, Array
 from scenarios.courses.course import Course
 from scenarios.courses.smoothing import smooth
 
-_BLOCK: Final = 256
-"""Rows that the course is sampled for, and filtered, at a time."""
+_BLOCK: Final = 256  # rows that the course is sampled for, and filtered, at a time
 
 
 class FollowedCourse:

@@ -18,51 +18,32 @@ AXES: Final = ("x", "y", "z")
 
 @dataclass(frozen=True, kw_only=True)
 class TorqueRange:
-    """The torques about one body axis that hover leaves room for.
+    """The torques about one body axis that hover leaves room for."""
 
-    Attributes:
-        axis: x, y or z.
-        lowest: torque [N m].
-        highest: torque [N m].
-        lowest_pure: the same with no torque about the other two axes [N m].
-        highest_pure: the same with no torque about the other two axes [N m].
-        lowest_acceleration: what `lowest` gives from rest [rad/s^2].
-        highest_acceleration: what `highest` gives from rest [rad/s^2].
-    """
-
-    axis: str
-    lowest: float
-    highest: float
-    lowest_pure: float
-    highest_pure: float
-    lowest_acceleration: float
-    highest_acceleration: float
+    axis: str  # x, y or z
+    lowest: float  # torque [N m]
+    highest: float  # torque [N m]
+    lowest_pure: float  # the same with no torque about the other two axes [N m]
+    highest_pure: float  # the same with no torque about the other two axes [N m]
+    lowest_acceleration: float  # what `lowest` gives from rest [rad/s^2]
+    highest_acceleration: float  # what `highest` gives from rest [rad/s^2]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Authority:
-    """Figures at hover that a controller's design follows from.
+    """Figures at hover that a controller's design follows from."""
 
-    Attributes:
-        thrust_to_weight: all rotors at their highest speed, over the weight [-].
-        hover_share: where hover lies between the lowest speed, 0, and the highest, 1 [-].
-        steady_tilt: largest tilt at which the rotors still carry the weight, cos(tilt) = 1 / thrust_to_weight [rad].
-        climb: largest upward acceleration from hover, level [m/s^2].
-        sink: largest downward acceleration from hover, level [m/s^2].
-        turning: (3,) angular acceleration about body x, y, z that is to be had both ways, without torque about the
-            other axes, while thrust carries the weight [rad/s^2].
-        lag: the longer time constant of a rotor's speed [s]; 0 where the vehicle gives none.
-        munk: growth rate of a tilt by Munk's moment over the level air speed [1/m]; 0 without body drag.
-    """
-
-    thrust_to_weight: float
-    hover_share: float
+    thrust_to_weight: float  # all rotors at their highest speed, over the weight [-]
+    hover_share: float  # where hover lies between the lowest speed, 0, and the highest, 1 [-]
     steady_tilt: float
-    climb: float
-    sink: float
+    """Largest tilt at which the rotors still carry the weight, cos(tilt) = 1 / thrust_to_weight [rad]."""
+    climb: float  # largest upward acceleration from hover, level [m/s^2]
+    sink: float  # largest downward acceleration from hover, level [m/s^2]
     turning: tuple[float, float, float]
-    lag: float
-    munk: float
+    """(3,) angular acceleration about body x, y, z that is to be had both ways, without torque about the other axes,
+    while thrust carries the weight [rad/s^2]."""
+    lag: float  # the longer time constant of a rotor's speed [s]; 0 where the vehicle gives none
+    munk: float  # growth rate of a tilt by Munk's moment over the level air speed [1/m]; 0 without body drag
 
 
 def authority(vehicle: Vehicle) -> Authority:

@@ -40,10 +40,8 @@ SHARE: Final = 0.6
 of the fastest level speed where that is reached first."""
 EIGHT_RATIO: Final = 0.3
 """Turns of a figure eight per time [rad/s] over the loop's bandwidth: across it moves twice as fast."""
-STEP_RATIO: Final = 0.28
-"""Bandwidth of the filter of steps over the loop's."""
-STEP: Final = 1.0
-"""[m]"""
+STEP_RATIO: Final = 0.28  # bandwidth of the filter of steps over the loop's
+STEP: Final = 1.0  # [m]
 ROOM: Final = 0.15
 """Largest error allowed in flight, over the size of the course; the RMS error is a third of that or less."""
 SOFT: Final = (2e4, 1e3)
@@ -52,42 +50,28 @@ LQR_TILT: Final = 30.0
 BASELINE_SHARE: Final = 0.9
 """Tilt [deg] that an LQR is limited to, and share of the tilt bound that the other baselines are: they only limit what
 they require."""
-GRID: Final = 0.2
-"""Durations are multiples of it [s], and so of every control period."""
+GRID: Final = 0.2  # durations are multiples of it [s], and so of every control period
 _EIGHT_PEAK: Final = float(np.hypot(np.sin(angle := np.linspace(0.0, math.pi, 721)), 2.0 * np.sin(2.0 * angle)).max())
 """Largest |d2p/dt2| of the figure eight (a sin wt, a/2 sin 2wt), over a w^2."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Entry:
-    """A line of the file.
+    """A line of the file."""
 
-    Attributes:
-        table: its header, without brackets; empty for the top.
-        key: of the field; empty for an empty table, which switches a part on.
-        value: of TOML.
-        why: what it is, in its unit, and where it comes from.
-    """
-
-    table: str
-    key: str
-    value: Any
-    why: str
+    table: str  # its header, without brackets; empty for the top
+    key: str  # of the field; empty for an empty table, which switches a part on
+    value: Any  # of TOML
+    why: str  # what it is, in its unit, and where it comes from
 
 
 @dataclass(frozen=True, kw_only=True)
 class FirstScenario:
-    """A scenario for a vehicle, line by line.
+    """A scenario for a vehicle, line by line."""
 
-    Attributes:
-        notes: what it was made from, the comments above it.
-        entries: its lines, those of a table together.
-        size: of the course [m]: the step, or the figure's length; for hover a step's.
-    """
-
-    notes: tuple[str, ...]
-    entries: tuple[Entry, ...]
-    size: float
+    notes: tuple[str, ...]  # what it was made from, the comments above it
+    entries: tuple[Entry, ...]  # its lines, those of a table together
+    size: float  # of the course [m]: the step, or the figure's length; for hover a step's
 
     @property
     def scenario(self) -> Scenario:

@@ -12,8 +12,7 @@ from quadsim.state import INDEX, Array
 from quadsim.vehicle import N_ROTORS, Vehicle
 from scenarios.design.tuning import Tuning
 
-LONGEST: Final = 2.0
-"""Delays beyond are not looked for [s]."""
+LONGEST: Final = 2.0  # delays beyond are not looked for [s]
 _HALVINGS: Final = 14
 
 

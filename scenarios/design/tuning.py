@@ -38,67 +38,40 @@ from scenarios.design.authority import Authority, authority
 
 PERIODS: Final = (0.05, 0.04, 0.025, 0.02, 0.01)
 """Control periods to choose from [s], whole multiples of the physics step."""
-LAG_RATIO: Final = 2.5
-"""1 / w over the lag and half a period."""
-FASTEST: Final = 6.0
-"""Largest bandwidth [rad/s]."""
+LAG_RATIO: Final = 2.5  # 1 / w over the lag and half a period
+FASTEST: Final = 6.0  # largest bandwidth [rad/s]
 STEEPEST: Final = math.radians(40.0)
 """Largest tilt bound [rad]: at hover the model takes tan(tilt) for tilt, 20 % less at 40 deg."""
-THRUST_SHARE: Final = 0.85
-"""Share of the thrust that holds the vehicle at the tilt bound; the rest is for torques."""
-PERIOD_SHARE: Final = 0.16
-"""Largest w tau."""
-HORIZON_TIMES: Final = 5.0
-"""Horizon times w."""
-HEIGHT_RATIO: Final = 1.5
-"""Bandwidth of height over that of the place: two integrators less."""
-HEIGHT_STEP: Final = 0.25
-"""Deviation of the height that the whole reserve of thrust answers [m]."""
-HEADING_RATIO: Final = 0.7
-"""Bandwidth of the heading over that of the place."""
-HEADING_STEP: Final = 0.5
-"""Deviation of the heading that the whole torque in reserve answers [rad]."""
+THRUST_SHARE: Final = 0.85  # share of the thrust that holds the vehicle at the tilt bound; the rest is for torques
+PERIOD_SHARE: Final = 0.16  # largest w tau
+HORIZON_TIMES: Final = 5.0  # horizon times w
+HEIGHT_RATIO: Final = 1.5  # bandwidth of height over that of the place: two integrators less
+HEIGHT_STEP: Final = 0.25  # deviation of the height that the whole reserve of thrust answers [m]
+HEADING_RATIO: Final = 0.7  # bandwidth of the heading over that of the place
+HEADING_STEP: Final = 0.5  # deviation of the heading that the whole torque in reserve answers [rad]
 LEAST_RESERVE: Final = 1e-6
 """Acceleration [m/s^2] and angular acceleration [rad/s^2] in reserve below which there is nothing to design."""
-MOVE_RATIO: Final = 4.0
-"""Frequency at which changes of rotor speeds cost as much as these, over w."""
+MOVE_RATIO: Final = 4.0  # frequency at which changes of rotor speeds cost as much as these, over w
 
 
 @dataclass(frozen=True, kw_only=True)
 class Tuning:
-    """Numbers of `[controller] type = "robust"` for a vehicle.
+    """Numbers of `[controller] type = "robust"` for a vehicle."""
 
-    Attributes:
-        authority: what they follow from.
-        period: tau [s].
-        horizon: N [periods].
-        tilt: bound on roll and on pitch [rad].
-        bandwidth: w of x and y [rad/s].
-        limited_by: what w is the limit of.
-        height: bandwidth of z [rad/s].
-        heading: bandwidth of yaw [rad/s].
-        deviation: accepted of x and y [m].
-        weights: of x and y [1/m^2], z [1/m^2] and yaw [1/rad^2].
-        speed_weight: of a rotor's speed [s^2/rad^2].
-        move_weight: of its change from period to period [s^2/rad^2].
-        slew: largest changes of a command from one period to the next, down and up [rad/s].
-        fastest: level speed [m/s] at which Munk's moment outruns the loop; infinite without body drag.
-    """
-
-    authority: Authority
-    period: float
-    horizon: int
-    tilt: float
-    bandwidth: float
-    limited_by: Literal["lag", "torque", "period"]
-    height: float
-    heading: float
-    deviation: float
-    weights: tuple[float, float, float]
-    speed_weight: float
-    move_weight: float
-    slew: tuple[float, float]
-    fastest: float
+    authority: Authority  # what they follow from
+    period: float  # tau [s]
+    horizon: int  # N [periods]
+    tilt: float  # bound on roll and on pitch [rad]
+    bandwidth: float  # w of x and y [rad/s]
+    limited_by: Literal["lag", "torque", "period"]  # what w is the limit of
+    height: float  # bandwidth of z [rad/s]
+    heading: float  # bandwidth of yaw [rad/s]
+    deviation: float  # accepted of x and y [m]
+    weights: tuple[float, float, float]  # of x and y [1/m^2], z [1/m^2] and yaw [1/rad^2]
+    speed_weight: float  # of a rotor's speed [s^2/rad^2]
+    move_weight: float  # of its change from period to period [s^2/rad^2]
+    slew: tuple[float, float]  # largest changes of a command from one period to the next, down and up [rad/s]
+    fastest: float  # level speed [m/s] at which Munk's moment outruns the loop; infinite without body drag
 
     @property
     def acceleration(self) -> float:

@@ -66,21 +66,14 @@ class VehicleSheet:
 
 @dataclass(frozen=True, kw_only=True)
 class VehicleReport:
-    """What a vehicle can do.
+    """What a vehicle can do."""
 
-    Attributes:
-        vehicle: its numbers.
-        sources: of each parameter, as its file names them.
-        figures: what follows from the numbers.
-        scenario: that it was held against, or None.
-        shortfalls: which bounds of that scenario it cannot meet and why, a sentence each; None without a scenario.
-    """
-
-    vehicle: Vehicle
-    sources: Mapping[str, str]
-    figures: VehicleSheet
-    scenario: str | None = None
+    vehicle: Vehicle  # its numbers
+    sources: Mapping[str, str]  # of each parameter, as its file names them
+    figures: VehicleSheet  # what follows from the numbers
+    scenario: str | None = None  # that it was held against, or None
     shortfalls: tuple[str, ...] | None = None
+    """Which bounds of that scenario it cannot meet and why, a sentence each; None without a scenario."""
 
     @property
     def parameters(self) -> list[tuple[str, Any, str]]:

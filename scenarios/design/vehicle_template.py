@@ -19,17 +19,11 @@ WIDTH: Final = 118
 
 @dataclass(frozen=True, kw_only=True)
 class Advice:
-    """How to find a parameter.
+    """How to find a parameter."""
 
-    Attributes:
-        value: of the example.
-        how: to measure or to estimate it.
-        without: what is so where it is left out; empty for one that is needed.
-    """
-
-    value: float | list[float] | list[int]
-    how: str
-    without: str = ""
+    value: float | list[float] | list[int]  # of the example
+    how: str  # to measure or to estimate it
+    without: str = ""  # what is so where it is left out; empty for one that is needed
 
 
 ADVICE: Final[dict[str, Advice]] = {

@@ -16,8 +16,7 @@ from quadsim.errors import MissingProgramError, QuadsimError
 
 CROSS_PACKAGES: Final = "make gcc-arm-none-eabi libnewlib-arm-none-eabi qemu-system-arm"
 HOST_PACKAGES: Final = "make gcc libc6-dev"
-PATIENCE: Final = 120.0
-"""How long an answer of the emulated processor may take [s]; the longest step takes a second."""
+PATIENCE: Final = 120.0  # how long an answer of the emulated processor may take [s]; the longest step takes a second
 
 
 def require_programs(target: Target, what: str) -> None:

@@ -29,29 +29,19 @@ from scenarios.schema.scenario import Scenario
 
 MPC = ConstrainedMPC | RobustMPC | UnconstrainedMPC
 WAYS: Final = {Method.FREE: 0, Method.AXES: 1, Method.WHOLE: 2}
-REFUSED: Final = 3
-"""Least status of a period without an optimum."""
+REFUSED: Final = 3  # least status of a period without an optimum
 
 
 @dataclass(frozen=True, kw_only=True)
 class Recording:
-    """K periods of one flight, without a gap.
+    """K periods of one flight, without a gap."""
 
-    Attributes:
-        speeds: (4,) the command before the first [rad/s].
-        state: (K, 12) as the controller was given it.
-        acting: (K, 4) command in force before each [rad/s].
-        path: (K + N - 1, 4) references; period k is given N rows from row k on.
-        status: (K,) as of `enum quadsim_status`: `REFUSED` for all that are no optimum.
-        command: (K, 4) the optimum's first command; the one before where there is none [rad/s].
-    """
-
-    speeds: Array
-    state: Array
-    acting: Array
-    path: Array
-    status: NDArray[np.int64]
-    command: Array
+    speeds: Array  # (4,) the command before the first [rad/s]
+    state: Array  # (K, 12) as the controller was given it
+    acting: Array  # (K, 4) command in force before each [rad/s]
+    path: Array  # (K + N - 1, 4) references; period k is given N rows from row k on
+    status: NDArray[np.int64]  # (K,) as of `enum quadsim_status`: `REFUSED` for all that are no optimum
+    command: Array  # (K, 4) the optimum's first command; the one before where there is none [rad/s]
 
 
 class Recorder:

@@ -20,12 +20,9 @@ _LETTER: Final = {"double": "d", "float": "f"}
 class Kind(IntEnum):
     """The kind of a query."""
 
-    START = 0
-    """Begin anew after u(-1), the reference its one row throughout."""
-    ROW = 1
-    """Take one more row of the reference."""
-    STEP = 2
-    """Take one more row and solve."""
+    START = 0  # begin anew after u(-1), the reference its one row throughout
+    ROW = 1  # take one more row of the reference
+    STEP = 2  # take one more row and solve
 
 
 class Reply(NamedTuple):

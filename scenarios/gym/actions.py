@@ -21,12 +21,9 @@ from scenarios.schema.scenario import Scenario
 ActionKind = Literal["deviations", "speeds", "rates"]
 Action = NDArray[np.floating]
 
-LARGEST_RATES: Final = (6.0, 6.0, 2.0)
-"""Body rates at an action of 1 [rad/s]."""
-BANDWIDTH: Final = 20.0
-"""Of the body rate loop [1/s]."""
-INNER_PERIOD: Final = 0.002
-"""Longest time between two calls of the body rate loop [s]."""
+LARGEST_RATES: Final = (6.0, 6.0, 2.0)  # body rates at an action of 1 [rad/s]
+BANDWIDTH: Final = 20.0  # of the body rate loop [1/s]
+INNER_PERIOD: Final = 0.002  # longest time between two calls of the body rate loop [s]
 
 
 class Actions(Protocol):

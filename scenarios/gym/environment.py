@@ -34,8 +34,7 @@ from scenarios.schema.scenario import Scenario
 
 Reward = Callable[[Array, Array, Array], float]
 """From the true state (12,) after a step, the reference (4,) there, and the rotor speeds commanded (4,) [rad/s]."""
-RENDER_MODES: Final = ("rgb_array", "human") if has_display() else ("rgb_array",)
-"""`human` where there is a display."""
+RENDER_MODES: Final = ("rgb_array", "human") if has_display() else ("rgb_array",)  # `human` where there is a display
 
 
 def nearness(state: Array, reference: Array, speeds: Array) -> float:

@@ -16,8 +16,7 @@ from quadsim.vehicle import N_ROTORS
 Part = Literal["state", "preview", "ahead", "command"]
 
 USUAL: Final[tuple[Part, ...]] = ("state", "preview", "command")
-LARGEST: Final = 1e6
-"""Magnitude that the plant takes for divergence."""
+LARGEST: Final = 1e6  # magnitude that the plant takes for divergence
 _REFERENCE: Final = list(REFERENCE_STATES)
 
 

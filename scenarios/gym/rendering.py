@@ -19,8 +19,7 @@ from scenarios.schema.scenario import Scenario
 
 Picture = np.ndarray[Any, np.dtype[np.uint8]]
 DISPLAYS: Final = ("DISPLAY", "WAYLAND_DISPLAY")
-_CLOSING: Final = 5.0
-"""[s] that a window may take to close."""
+_CLOSING: Final = 5.0  # [s] that a window may take to close
 
 
 def has_display() -> bool:

@@ -9,31 +9,21 @@ from typing import Any, Final
 from scenarios.schema.controller import ControllerSpec
 from scenarios.schema.json_schema import scenario_schema
 
-LISTED: Final = 2
-"""Longest list of numbers that is shown: pairs of bounds."""
+LISTED: Final = 2  # longest list of numbers that is shown: pairs of bounds
 
 Value = float | int | bool | str | tuple[float, ...]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Knob:
-    """A field with its value.
+    """A field with its value."""
 
-    Attributes:
-        path: dotted, in `[controller]`.
-        value: as it is.
-        about: unit and meaning.
-        minimum: of a number, or each of a pair; None for none.
-        maximum: likewise.
-        choices: of a text.
-    """
-
-    path: str
-    value: Value
-    about: str
-    minimum: float | None = None
-    maximum: float | None = None
-    choices: tuple[str, ...] = ()
+    path: str  # dotted, in `[controller]`
+    value: Value  # as it is
+    about: str  # unit and meaning
+    minimum: float | None = None  # of a number, or each of a pair; None for none
+    maximum: float | None = None  # likewise
+    choices: tuple[str, ...] = ()  # of a text
 
 
 def knobs(spec: ControllerSpec) -> tuple[Knob, ...]:

@@ -11,12 +11,9 @@ from typing import Final, Protocol
 from quadsim.errors import QuadsimError
 from scenarios.live.session import Frame, Session
 
-LATE: Final = 0.25
-"""[s] beyond which lost time is given up: no period is dropped, the flight is behind real time."""
-POSES: Final = 2
-"""Drawn in each period."""
-_SPAN: Final = 2.0
-"""[s] over which the real-time factor is measured."""
+LATE: Final = 0.25  # [s] beyond which lost time is given up: no period is dropped, the flight is behind real time
+POSES: Final = 2  # drawn in each period
+_SPAN: Final = 2.0  # [s] over which the real-time factor is measured
 
 
 class View(Protocol):

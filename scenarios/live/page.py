@@ -36,19 +36,16 @@ from scenarios.live.session import Frame, Session
 from scenarios.live.stage import Stage
 from scenarios.schema.controller import ControllerSpec
 
-SECONDS: Final = 20.0
-"""Of the plots."""
+SECONDS: Final = 20.0  # of the plots
 _EVERY: Final = 4
 """Periods from one update of the panel to the next, a fifth of a second at 20 Hz; plots take two of these."""
 _SPEEDS: Final = ("0.1", "0.25", "0.5", "1", "2", "4")
 _STEER: Final = {"W": (1, 0, 0), "S": (-1, 0, 0), "A": (0, 1, 0), "D": (0, -1, 0), "R": (0, 0, 1), "F": (0, 0, -1)}
 """Keys, and the direction of the set-point's velocity that each adds to."""
-_STEER_STEP: Final = 0.5
-"""[m/s] by which a key changes it."""
+_STEER_STEP: Final = 0.5  # [m/s] by which a key changes it
 _STEER_MOST: Final = 5.0
 _NO_VELOCITY: Final = "0, 0, 0"
-_ACTIVE: Final = 0.1
-"""Share of a bound's scale within which a margin counts as active."""
+_ACTIVE: Final = 0.1  # share of a bound's scale within which a margin counts as active
 _FAULTS: Final = ("dropout", "freeze", "nan")
 
 STYLE: Final = """<style>

@@ -14,15 +14,11 @@ from scenarios.live.session import Session
 
 @dataclass(frozen=True, kw_only=True)
 class Script:
-    """What a user does.
+    """What a user does."""
 
-    Attributes:
-        duration: of the session [s].
-        inputs: in order of time [s], each a table as `Session.submit` takes it.
-    """
-
-    duration: float
+    duration: float  # of the session [s]
     inputs: tuple[tuple[float, Mapping[str, Any]], ...]
+    """In order of time [s], each a table as `Session.submit` takes it."""
 
 
 def read_script(path: str | Path) -> Script:

@@ -25,12 +25,9 @@ from scenarios.run import StartedFlight, start
 from scenarios.schema.controller import ControllerSpec
 from scenarios.schema.scenario import Scenario
 
-STIFFNESS: Final = 0.4
-"""Of the spring that a person pulls by, in weights of the vehicle per metre."""
-STRONGEST: Final = 0.3
-"""Largest pull in weights of the vehicle."""
-FORCE_STEP: Final = 1e-3
-"""To which pulls are rounded [N]."""
+STIFFNESS: Final = 0.4  # of the spring that a person pulls by, in weights of the vehicle per metre
+STRONGEST: Final = 0.3  # largest pull in weights of the vehicle
+FORCE_STEP: Final = 1e-3  # to which pulls are rounded [N]
 
 
 _ENTRIES: Final = {"pull": {"type", "to"}, "wear": {"type", "rotor", "loss"}, "steer": {"type", "velocity"}}
@@ -45,41 +42,28 @@ class Pull(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class Input:
-    """Something that a person did.
-
-    Attributes:
-        table: an event of a scenario file without its time; or of type `pull` (`to` [m] world, absent to let go),
-            `wear` (`rotor` 1 to 4, `loss` 0 to 1, held), `steer` (`velocity` of the set-point [m/s], held).
-        subject: an earlier input of the same subject that has not acted yet is dropped.
-        successor: of an event `controller`, the controller that was built for it.
-    """
+    """Something that a person did."""
 
     table: Mapping[str, Any]
-    subject: str | None = None
-    successor: Successor | None = None
+    """An event of a scenario file without its time; or of type `pull` (`to` [m] world, absent to let go), `wear`
+    (`rotor` 1 to 4, `loss` 0 to 1, held), `steer` (`velocity` of the set-point [m/s], held)."""
+    subject: str | None = None  # an earlier input of the same subject that has not acted yet is dropped
+    successor: Successor | None = None  # of an event `controller`, the controller that was built for it
 
 
 @dataclass(frozen=True, kw_only=True)
 class Frame:
-    """One control period as it was flown, for a view.
+    """One control period as it was flown, for a view."""
 
-    Attributes:
-        k: which period.
-        time: when it began [s].
-        samples: of each flight; None where it has ended.
-        margins: of each constraint at its worst within the period; see `StartedFlight.margins`.
-        horizons: (N + 1, 3) predicted positions [m] of each flight, from the present one on; None without a model.
-        pull: (3,) the force of the person's hand [N]; zero without one.
-        refused: why inputs were refused.
-    """
-
-    k: int
-    time: float
-    samples: tuple[Sample | None, ...]
+    k: int  # which period
+    time: float  # when it began [s]
+    samples: tuple[Sample | None, ...]  # of each flight; None where it has ended
     margins: tuple[Mapping[str, float], ...]
+    """Of each constraint at its worst within the period; see `StartedFlight.margins`."""
     horizons: tuple[Array | None, ...]
-    pull: Array
-    refused: tuple[str, ...]
+    """(N + 1, 3) predicted positions [m] of each flight, from the present one on; None without a model."""
+    pull: Array  # (3,) the force of the person's hand [N]; zero without one
+    refused: tuple[str, ...]  # why inputs were refused
 
 
 @dataclass

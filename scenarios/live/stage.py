@@ -19,18 +19,12 @@ from quadsim.state import Array
 from quadsim.vehicle import Vehicle
 from scenarios.live.session import Frame, Session
 
-TRAIL: Final = 200
-"""Points of the flown path that stay."""
-_EVERY: Final = 2
-"""Periods from one to the next; every point is sent anew with each."""
-_FACES: Final = 12
-"""Of what is round."""
-_WIDE: Final = 20.0
-"""[m] of ground, lines a metre apart."""
-_COURSE: Final = 600
-"""Points of the reference that are drawn."""
-_SHADES: Final = ((40, 44, 52), (140, 150, 165))
-"""Of the first vehicle and of the other one."""
+TRAIL: Final = 200  # points of the flown path that stay
+_EVERY: Final = 2  # periods from one to the next; every point is sent anew with each
+_FACES: Final = 12  # of what is round
+_WIDE: Final = 20.0  # [m] of ground, lines a metre apart
+_COURSE: Final = 600  # points of the reference that are drawn
+_SHADES: Final = ((40, 44, 52), (140, 150, 165))  # of the first vehicle and of the other one
 
 
 def rgb(colour: str) -> tuple[int, int, int]:

@@ -25,17 +25,11 @@ _RULE: Final = "measure must lead to a number of the flight's summary"
 
 @dataclass(frozen=True, kw_only=True)
 class Reproduced:
-    """One number.
+    """One number."""
 
-    Attributes:
-        spec: the published one.
-        ours: of our flight [unit]; None where it ended early.
-        reason: why it did.
-    """
-
-    spec: NumberSpec
-    ours: float | None
-    reason: str | None = None
+    spec: NumberSpec  # the published one
+    ours: float | None  # of our flight [unit]; None where it ended early
+    reason: str | None = None  # why it did
 
     @property
     def difference(self) -> float | None:

@@ -22,8 +22,7 @@ FLAGS: Final = ("-std=c99", "-O3", "-ffp-contract=off", "-fPIC", "-shared")
 ROOM_PER_STEP: Final = 5
 """Active rows that there is room for, per step of the horizon: all that are independent, and memory is no matter here.
 Rotors that spin up from standstill at their largest steps take more of both than an export has."""
-CHANGES: Final = 3000
-"""The same of the changes of the active set in a search."""
+CHANGES: Final = 3000  # the same of the changes of the active set in a search
 COMPILERS: Final = ("cc", "gcc", "clang")
 
 

@@ -38,8 +38,7 @@ if TYPE_CHECKING:
 
 FALLBACK_SHARE: Final = 0.8
 """Tilt of the fallback over the tightest bound on it: the controller finds a vehicle that it can take over."""
-SMALLEST_TILT: Final = 0.5
-"""With less the fallback cannot hold against anything, whatever the bounds are [deg]."""
+SMALLEST_TILT: Final = 0.5  # with less the fallback cannot hold against anything, whatever the bounds are [deg]
 
 
 def make_problem(spec: WeightedSpec, vehicle: Vehicle, period: float) -> Problem:

@@ -22,23 +22,14 @@ LOGGER: Final = logging.getLogger("quadsim.code")
 
 @dataclass(frozen=True, kw_only=True)
 class Code:
-    """The code that a scenario's `[controller]` or `[[forces]]` names.
+    """The code that a scenario's `[controller]` or `[[forces]]` names."""
 
-    Attributes:
-        what: `controller` or `force`.
-        type: what the scenario calls it.
-        module: that is imported, and with it the packages it is in.
-        attribute: what of it is called.
-        file: that the module is in; None where it is compiled into Python, or is not found.
-        root: the file, or the folder of the whole package that it is in; None without a file.
-    """
-
-    what: str
-    type: str
-    module: str
-    attribute: str
-    file: Path | None
-    root: Path | None
+    what: str  # `controller` or `force`
+    type: str  # what the scenario calls it
+    module: str  # that is imported, and with it the packages it is in
+    attribute: str  # what of it is called
+    file: Path | None  # that the module is in; None where it is compiled into Python, or is not found
+    root: Path | None  # the file, or the folder of the whole package that it is in; None without a file
 
     @property
     def digest(self) -> str | None:

@@ -28,8 +28,7 @@ _WHOLE, _REAL = ("iterations", "active", "fallback"), ("slack", "primal_residual
 """What else a command has: whole numbers, and numbers."""
 STEP = ("now", "state", "reference")
 """What the arguments of a controller's step are called, and of a function that is one."""
-_LONGEST = 200
-"""Characters of a name or status."""
+_LONGEST = 200  # characters of a name or status
 
 
 class PluginController:

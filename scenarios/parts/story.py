@@ -29,8 +29,7 @@ from scenarios.schema.events import (
 if TYPE_CHECKING:
     from scenarios.schema.scenario import Scenario
 
-_MOST: Final = 3
-"""Events of one kind in a row that are reported one by one; more of them in one entry."""
+_MOST: Final = 3  # events of one kind in a row that are reported one by one; more of them in one entry
 _LONGEST: Final = 200
 _FAULTS: Final = {"dropout": "gives no samples", "freeze": "is frozen", "nan": "gives no numbers", "bias": "is offset"}
 

@@ -16,23 +16,19 @@ from pydantic.fields import FieldInfo
 
 from quadsim.fields import Number
 
-MOST_ENTRIES: Final = 1000
-"""Of a list of tables."""
-DEEPEST: Final = 20
-"""Tables and lists within one another; a scenario has a third of them."""
+MOST_ENTRIES: Final = 1000  # of a list of tables
+DEEPEST: Final = 20  # tables and lists within one another; a scenario has a third of them
 Triple = Annotated[list[Number], Len(3, 3)]
 Pair = Annotated[list[Number], Len(2, 2)]
 LARGEST_HORIZON: Final = 1000
 Horizon = Annotated[int, Field(ge=1, le=LARGEST_HORIZON)]
-LARGEST_SEED: Final = 2**63 - 1
-"""The largest whole number that every reader of TOML takes."""
+LARGEST_SEED: Final = 2**63 - 1  # the largest whole number that every reader of TOML takes
 
 
 Seconds = Annotated[float, Field(ge=0.0, le=10.0)]
 
 
-Lag = Seconds | Literal["vehicle"]
-"""A time constant, or that of the vehicle file."""
+Lag = Seconds | Literal["vehicle"]  # A time constant, or that of the vehicle file
 
 
 _FIRST: Final = {"at": 0, "type": 1}

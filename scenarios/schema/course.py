@@ -13,15 +13,12 @@ from pydantic import Discriminator, Field, Tag, model_validator
 from quadsim.fields import NonNegative, Number, Positive
 from scenarios.schema.base import MOST_ENTRIES, Pair, Spec, Triple
 
-MOST_POINTS: Final = 200
-"""Points or turns of one course; a longer one is a table, `type = "csv"`."""
-MOST_SAMPLES: Final = 100_000
-"""Of the phase of a ramped course: 2000 s at 50 Hz."""
+MOST_POINTS: Final = 200  # points or turns of one course; a longer one is a table, `type = "csv"`
+MOST_SAMPLES: Final = 100_000  # of the phase of a ramped course: 2000 s at 50 Hz
 CLOSEST: Final = 1e-3
 """Least distance [m] between points that a speed leads from one to the other, and least time [s] between points."""
 
-Speed = Annotated[float, Field(ge=1e-3, le=1e4)]
-"""Of travel [m/s], or of turning [deg/s]."""
+Speed = Annotated[float, Field(ge=1e-3, le=1e4)]  # of travel [m/s], or of turning [deg/s]
 Time = Annotated[float, Field(ge=CLOSEST, le=1e6)]
 
 

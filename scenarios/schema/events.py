@@ -19,8 +19,7 @@ from quadsim.state import REFERENCE_NAMES
 from scenarios.schema.base import Spec, Triple
 from scenarios.schema.plugin import is_plain
 
-MOST_EVENTS: Final = 20_000
-"""Of one flight: a person's hand for a quarter of an hour, 20 times a second."""
+MOST_EVENTS: Final = 20_000  # of one flight: a person's hand for a quarter of an hour, 20 times a second
 
 
 class _Event(Spec):

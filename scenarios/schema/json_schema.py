@@ -21,8 +21,7 @@ BASE: Final = {
     "description": "a scenario's name, or a path ending in .toml, over which this file is merged field by field",
 }
 _TABLES: Final = "#/$defs/"
-_PARTIAL: Final = "Partial"
-"""How the names of tables begin of which a part may be given."""
+_PARTIAL: Final = "Partial"  # how the names of tables begin of which a part may be given
 
 
 class _SchemaOfToml(GenerateJsonSchema):

@@ -17,8 +17,7 @@ from quadsim.fields import NonNegative, Positive
 from scenarios.schema.base import MOST_ENTRIES, Horizon, Lag, Pair, Spec, require_ordered
 from scenarios.schema.optimisation import AvoidanceSpec, PolytopeSpec, SoftSpec
 
-LINEAR: Final = ("x", "vx", "y", "vy", "z", "vz")
-"""States that are so of the quaternion model too."""
+LINEAR: Final = ("x", "vx", "y", "vy", "z", "vz")  # states that are so of the quaternion model too
 Terminal = NonNegative | Literal["none", "lqr"]
 NonNegativeTriple = Annotated[list[NonNegative], Len(3, 3)]
 PositiveTriple = Annotated[list[Positive], Len(3, 3)]

@@ -20,8 +20,7 @@ from scenarios.schema.base import MOST_ENTRIES, Horizon, Pair, Spec, require_ord
 ANGLES: Final = frozenset(name for name, unit in zip(STATE_NAMES, STATE_UNITS, strict=True) if unit.startswith("rad"))
 """States that scenario files give in degrees (per second)."""
 
-Weights = Weight | Annotated[list[Weight], Len(4, 4)]
-"""One weight for all rotors, or one each."""
+Weights = Weight | Annotated[list[Weight], Len(4, 4)]  # one weight for all rotors, or one each
 
 
 class InputWeightsSpec(Spec):

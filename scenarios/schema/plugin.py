@@ -13,12 +13,10 @@ from pydantic import Field, model_validator
 
 from scenarios.schema.base import Horizon, Spec
 
-FORM: Final = "package.module:Class"
-"""What the text that names a controller looks like."""
+FORM: Final = "package.module:Class"  # what the text that names a controller looks like
 ENTRY_POINTS: Final = "quadsim.controllers"
 """The group under which installed packages announce controllers by short names."""
-GIVEN: Final = ("vehicle", "period", "horizon")
-"""Arguments that every controller is called with."""
+GIVEN: Final = ("vehicle", "period", "horizon")  # arguments that every controller is called with
 LAWS: Final = ("unconstrained", "constrained", "robust", "nonlinear", "lqr", "pid", "geometric")
 """The names of built-in controllers."""
 _NAME: Final = r"[^\W\d]\w*(?:\.[^\W\d]\w*)*"

@@ -18,21 +18,15 @@ from quadsim.errors import InputError, ParameterError, UnknownNameError
 from quadsim.vehicle import MEANT
 from scenarios.schema.base import fields_of, is_table
 
-_LISTS: Final = (list, tuple, Sequence)
-"""Types that are lists in a file."""
+_LISTS: Final = (list, tuple, Sequence)  # types that are lists in a file
 
 
 @dataclass(frozen=True, kw_only=True)
 class Kind:
-    """One of the types that a value may have.
+    """One of the types that a value may have."""
 
-    Attributes:
-        type: less its annotations.
-        metadata: these annotations.
-    """
-
-    type: Any
-    metadata: tuple[Any, ...] = ()
+    type: Any  # less its annotations
+    metadata: tuple[Any, ...] = ()  # these annotations
 
     @property
     def fields(self) -> tuple[str, ...]:
@@ -55,17 +49,11 @@ class Kind:
 
 @dataclass(frozen=True, kw_only=True)
 class Place:
-    """A place in the file.
+    """A place in the file."""
 
-    Attributes:
-        names: from the root; an entry of a list by its name, or else by its index.
-        kinds: what may stand there; none where nothing may.
-        given: what stands there.
-    """
-
-    names: tuple[str, ...]
-    kinds: tuple[Kind, ...]
-    given: Any
+    names: tuple[str, ...]  # from the root; an entry of a list by its name, or else by its index
+    kinds: tuple[Kind, ...]  # what may stand there; none where nothing may
+    given: Any  # what stands there
 
     @property
     def fields(self) -> tuple[str, ...]:
@@ -159,8 +147,7 @@ _RULES: Final = {
 """How pydantic's kinds of error end the sentence "must be ..."."""
 _OF_TYPE: Final = frozenset({"float_type", "list_type", "tuple_type", "is_instance_of", "sequence_str"})
 """Those that say that a value is no number, or no list."""
-_MOST_LINES: Final = 20
-"""Problems that one message names; it only counts the rest."""
+_MOST_LINES: Final = 20  # problems that one message names; it only counts the rest
 _MOST_ENTRIES: Final = 10
 _LONGEST: Final = 200
 """Entries, and characters, that a message shows of what was given."""

@@ -13,8 +13,7 @@ from quadsim.fields import Weight
 from scenarios.schema.base import Lag, Seconds
 from scenarios.schema.optimisation import BoundedSpec, SoftSpec
 
-TURNED: Final = frozenset({"x", "vx", "y", "vy", "yaw"})
-"""States that have other values in axes turned by the yaw."""
+TURNED: Final = frozenset({"x", "vx", "y", "vy", "yaw"})  # states that have other values in axes turned by the yaw
 
 
 class RobustSpec(BoundedSpec):

@@ -27,8 +27,7 @@ from scenarios.schema.base import Spec
 
 Deviations = NonNegative | Annotated[tuple[NonNegative, ...], Len(3, 3)]
 """One standard deviation for all three axes, or one each."""
-Offsets = Number | Vector
-"""One offset for all three axes, or one each."""
+Offsets = Number | Vector  # one offset for all three axes, or one each
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -41,30 +41,20 @@ WIDTH: Final = 120
 """No line is longer for its comment's sake: a comment that does not fit beside its field stands above it."""
 _NEAREST, _FARTHEST = 23, 44
 """Comments line up behind the widest field of their table, or behind the one or the other of these widths."""
-_LONG: Final = WIDTH - _FARTHEST
-"""A list that is longer takes a line per entry."""
+_LONG: Final = WIDTH - _FARTHEST  # A list that is longer takes a line per entry
 
-_Explained = set[tuple[type[Any], str]]
-"""Fields that an earlier entry of the same list explains."""
+_Explained = set[tuple[type[Any], str]]  # fields that an earlier entry of the same list explains
 
 
 @dataclass(frozen=True, kw_only=True)
 class _Line:
-    """A field to be written.
+    """A field to be written."""
 
-    Attributes:
-        key: its name.
-        text: what is written of it, less its comment.
-        value: what it is; None for one that is absent.
-        comment: its description, beside it where that fits.
-        above: comments before it, line by line.
-    """
-
-    key: str
-    text: str
-    value: Item | None
-    comment: str
-    above: tuple[str, ...] = ()
+    key: str  # its name
+    text: str  # what is written of it, less its comment
+    value: Item | None  # what it is; None for one that is absent
+    comment: str  # its description, beside it where that fits
+    above: tuple[str, ...] = ()  # comments before it, line by line
 
 
 def to_toml(model: Any) -> str:

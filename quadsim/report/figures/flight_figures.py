@@ -228,12 +228,9 @@ def _draw_bounds(axes: Axes, limits: Sequence[Limit], signal: str, end: float) -
     return shown
 
 
-_MOST_NAMED: Final = 9
-"""Obstacles and regions of which each is named in the legend."""
-_NEAR: Final = 3.0
-"""Clearance [m] below which a moving obstacle is drawn, and up to which curves are shown."""
-_EVERY: Final = 0.25
-"""How often it is drawn [s]."""
+_MOST_NAMED: Final = 9  # obstacles and regions of which each is named in the legend
+_NEAR: Final = 3.0  # clearance [m] below which a moving obstacle is drawn, and up to which curves are shown
+_EVERY: Final = 0.25  # how often it is drawn [s]
 
 
 def draw_space(run: Run) -> Figure:

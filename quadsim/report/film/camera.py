@@ -18,8 +18,7 @@ from quadsim.vehicle import Vehicle
 
 REQUEST: Final = Struct("15d")
 """Time [s], position [m] and quaternion wxyz of the vehicle, position of the reference [m], rotors' angles [rad]."""
-_FRAME: Final = 1.0 / 30.0
-"""How far rotors have turned from one picture to the next, as times their speed [s]."""
+_FRAME: Final = 1.0 / 30.0  # how far rotors have turned from one picture to the next, as times their speed [s]
 
 
 class Camera:

@@ -37,24 +37,19 @@ from quadsim.state import INDEX, REFERENCE_NAMES, REFERENCE_STATES, Array
 
 _Panel = Callable[[Painter, float, float, int], None]
 
-_STRIP: Final = 150
-"""Height of the bottom strip, in design pixels of a 1280 x 720 frame."""
+_STRIP: Final = 150  # height of the bottom strip, in design pixels of a 1280 x 720 frame
 _COMPACT_SCALE: Final = 1.6
-_MAP: Final = (236, 190)
-"""Width and height of the map, in design pixels."""
+_MAP: Final = (236, 190)  # width and height of the map, in design pixels
 _COMPACT_MAP: Final = (180, 150)
 _MOST_MARGINS: Final = 6
 
 
 _LAST: Final = 1.0
 """Time at a film's end [s] in which it states why a QP had no answer, or that the flight stayed in fallback."""
-_SHOWN: Final = 2.0
-"""Time [s] for which it shows what has happened."""
+_SHOWN: Final = 2.0  # time [s] for which it shows what has happened
 _MOST_EVENTS: Final = 3
-_MOST_LINES: Final = 10
-"""Of that: more would reach the strip at the bottom."""
-_WIDEST: Final = 140
-"""Letters of a line of that, between the frame's edge and the map."""
+_MOST_LINES: Final = 10  # of that: more would reach the strip at the bottom
+_WIDEST: Final = 140  # letters of a line of that, between the frame's edge and the map
 
 
 class Overlay:

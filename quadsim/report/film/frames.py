@@ -12,40 +12,25 @@ from quadsim.flight.audit import Limit
 from quadsim.flight.rundir import Run
 from quadsim.state import EULER, POSITION, Array, euler_to_quaternion, tilt
 
-_CAMERA_MEMORY: Final = 0.7
-"""Time constant [s] of the camera's smoothing, forward and backward."""
-_LEASH: Final = 0.6
-"""How far the camera's aim may be from the vehicle, in arm lengths per axis."""
+_CAMERA_MEMORY: Final = 0.7  # time constant [s] of the camera's smoothing, forward and backward
+_LEASH: Final = 0.6  # how far the camera's aim may be from the vehicle, in arm lengths per axis
 
-_TOLERANCE: Final = 0.03
-"""How far a drawn path may be from the real one, in arm lengths."""
+_TOLERANCE: Final = 0.03  # how far a drawn path may be from the real one, in arm lengths
 
 
 @dataclass(frozen=True, kw_only=True)
 class Shot:
-    """Which frames to film, and in which size.
+    """Which frames to film, and in which size."""
 
-    Attributes:
-        run: the run directory.
-        width: [pixels], even.
-        height: [pixels], even.
-        fps: frames per second of film.
-        start: simulated time of frame 0 [s].
-        speed: simulated seconds per second of film.
-        first: first frame to film.
-        count: how many.
-        compact: whether to leave out all but the largest captions, for small pictures.
-    """
-
-    run: str
-    width: int = 1280
-    height: int = 720
-    fps: int = 30
-    start: float = 0.0
-    speed: float = 1.0
-    first: int = 0
-    count: int
-    compact: bool = False
+    run: str  # the run directory
+    width: int = 1280  # [pixels], even
+    height: int = 720  # [pixels], even
+    fps: int = 30  # frames per second of film
+    start: float = 0.0  # simulated time of frame 0 [s]
+    speed: float = 1.0  # simulated seconds per second of film
+    first: int = 0  # first frame to film
+    count: int  # how many
+    compact: bool = False  # whether to leave out all but the largest captions, for small pictures
 
     def __post_init__(self) -> None:
         for name, smallest in (("width", 320), ("height", 180), ("fps", 1), ("count", 1)):
@@ -65,20 +50,14 @@ class Shot:
 
 @dataclass(frozen=True, kw_only=True)
 class MarginTrack:
-    """One limit's margins at frame times, in the limit's unit.
+    """One limit's margins at frame times, in the limit's unit."""
 
-    Attributes:
-        limit: the limit.
-        now: (F,) signed margin; NaN outside the limit's time window.
-        worst: (F,) smallest margin so far; NaN before the window.
-        share: the smallest of the whole flight, tolerance included, over half the limit's band: 1 in its middle,
-            negative where it is violated; infinite where the flight never reaches the window.
-    """
-
-    limit: Limit
-    now: Array
-    worst: Array
+    limit: Limit  # the limit
+    now: Array  # (F,) signed margin; NaN outside the limit's time window
+    worst: Array  # (F,) smallest margin so far; NaN before the window
     share: float
+    """The smallest of the whole flight, tolerance included, over half the limit's band: 1 in its middle, negative
+    where it is violated; infinite where the flight never reaches the window."""
 
     @property
     def rank(self) -> tuple[bool, bool, float]:
@@ -89,42 +68,25 @@ class MarginTrack:
 
 @dataclass(frozen=True, kw_only=True)
 class Footage:
-    """A flight at F frame times.
+    """A flight at F frame times."""
 
-    Attributes:
-        times: (F,) [s].
-        period: (F,) index of the control period each frame is in.
-        position: (F, 3) [m], world.
-        euler: (F, 3) roll, pitch, yaw [rad], of the plant row before the frame.
-        quaternion: (F, 4) attitude, scalar first.
-        tilt: (F,) angle between the thrust axis and the vertical [rad], of the plant row before the frame; None of
-            flights that Euler angles describe.
-        speeds: (F, 4) rotor speeds [rad/s].
-        turned: (F, 4) angle each rotor has turned since the start [rad].
-        aim: (F, 3) what the camera looks at [m].
-        margins: one track per limit.
-        path_times: (P,) times of the flown path's points [s], at most a second apart.
-        path: (P, 3) flown path of the whole flight [m], thinned where it is straight.
-        course: (Q, 3) reference path of the whole flight [m], thinned.
-        wind: (F, 3) velocity of the air, world [m/s]; None without wind.
-        force: (F, 3) external force, world [N]; None where there is none.
-    """
-
-    times: Array
-    period: np.ndarray[Any, np.dtype[np.intp]]
-    position: Array
-    euler: Array
-    quaternion: Array
+    times: Array  # (F,) [s]
+    period: np.ndarray[Any, np.dtype[np.intp]]  # (F,) index of the control period each frame is in
+    position: Array  # (F, 3) [m], world
+    euler: Array  # (F, 3) roll, pitch, yaw [rad], of the plant row before the frame
+    quaternion: Array  # (F, 4) attitude, scalar first
     tilt: Array | None
-    speeds: Array
-    turned: Array
-    aim: Array
-    margins: tuple[MarginTrack, ...]
-    path_times: Array
-    path: Array
-    course: Array
-    wind: Array | None
-    force: Array | None
+    """(F,) angle between the thrust axis and the vertical [rad], of the plant row before the frame; None of flights
+    that Euler angles describe."""
+    speeds: Array  # (F, 4) rotor speeds [rad/s]
+    turned: Array  # (F, 4) angle each rotor has turned since the start [rad]
+    aim: Array  # (F, 3) what the camera looks at [m]
+    margins: tuple[MarginTrack, ...]  # one track per limit
+    path_times: Array  # (P,) times of the flown path's points [s], at most a second apart
+    path: Array  # (P, 3) flown path of the whole flight [m], thinned where it is straight
+    course: Array  # (Q, 3) reference path of the whole flight [m], thinned
+    wind: Array | None  # (F, 3) velocity of the air, world [m/s]; None without wind
+    force: Array | None  # (F, 3) external force, world [N]; None where there is none
 
 
 def film_span(run: Run) -> tuple[float, float]:

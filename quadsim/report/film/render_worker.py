@@ -31,24 +31,18 @@ from quadsim.sim.airframe import FLOOR, PROPELLER_NAMES, compile_model, obstacle
 from quadsim.state import Array
 from quadsim.vehicle import Vehicle
 
-TRAIL_SECONDS: Final = 12.0
-"""How long the path flown stays in sight [s]."""
-CAMERA_DISTANCE: Final = 6.8
-"""From camera to aim, in arm lengths; its azimuth and elevation below in degrees."""
+TRAIL_SECONDS: Final = 12.0  # how long the path flown stays in sight [s]
+CAMERA_DISTANCE: Final = 6.8  # from camera to aim, in arm lengths; its azimuth and elevation below in degrees
 CAMERA_AZIMUTH: Final = 125.0
 CAMERA_ELEVATION: Final = -18.0
-BLADE_SLOWDOWN: Final = 20.0
-"""Blades are drawn turning this much slower than they do, so that an eye can follow."""
+BLADE_SLOWDOWN: Final = 20.0  # blades are drawn turning this much slower than they do, so that an eye can follow
 PORTRAIT_DISTANCE: Final = 3.3
 """From camera to vehicle in a portrait, in arm lengths; its azimuth and elevation below in degrees."""
 PORTRAIT_AZIMUTH: Final = -150.0
 PORTRAIT_ELEVATION: Final = -28.0
-PORTRAIT_SQUARE: Final = 0.1
-"""Side of a portrait's floor squares [m]."""
-_DEEPEST_FLOOR: Final = 30.0
-"""The floor lies below the whole flight, but no deeper than this [m]."""
-_LONGEST_ARROW: Final = 2.5
-"""Cap on a thrust arrow, in arrows at hover."""
+PORTRAIT_SQUARE: Final = 0.1  # side of a portrait's floor squares [m]
+_DEEPEST_FLOOR: Final = 30.0  # the floor lies below the whole flight, but no deeper than this [m]
+_LONGEST_ARROW: Final = 2.5  # cap on a thrust arrow, in arrows at hover
 _MOST_GEOMS: Final = 2000
 _COURSE_COLOUR: Final = (1.0, 0.72, 0.25, 0.75)
 _TRAIL_COLOUR: Final = (0.12, 0.56, 1.0, 1.0)

@@ -13,10 +13,8 @@ from quadsim.report.film.painter import AMBER, BLUE, BRICK, CYAN, FAINT, GREEN, 
 from quadsim.report.scene import has_space, obstacles_in, outlines, region_edges
 from quadsim.state import Array
 
-_LONGEST_ARROW: Final = 34.0
-"""How long the strongest level wind or force of a flight is drawn [design pixels]."""
-_AROUND: Final = 1.0
-"""How much more is shown around where there are obstacles or regions [m]."""
+_LONGEST_ARROW: Final = 34.0  # how long the strongest level wind or force of a flight is drawn [design pixels]
+_AROUND: Final = 1.0  # how much more is shown around where there are obstacles or regions [m]
 
 
 class TopView:

@@ -27,13 +27,11 @@ from quadsim.outputs import writing_file
 from quadsim.report.film.frames import Shot, film_span
 from quadsim.vehicle import Vehicle
 
-BACKENDS: Final = ("egl", "osmesa")
-"""What can render without a screen, in the order tried."""
+BACKENDS: Final = ("egl", "osmesa")  # what can render without a screen, in the order tried
 _WORKER: Final = (sys.executable, "-m", "quadsim.report.film.render_worker")
 _PROBE_SECONDS: Final = 60.0
 _LEAST_FREE_BYTES: Final = 1024 * 1024
-_FEWEST_FRAMES: Final = 30
-"""A further worker is not worth its start for fewer frames than these."""
+_FEWEST_FRAMES: Final = 30  # A further worker is not worth its start for fewer frames than these
 
 Progress = Callable[[int, int], None]
 

@@ -27,8 +27,7 @@ from quadsim.report.table import Grid, to_markdown
 
 TABLE_FILE: Final = "comparison.md"
 
-KIND: Final = "comparison"
-"""What `quadsim.outputs` calls such a directory."""
+KIND: Final = "comparison"  # what `quadsim.outputs` calls such a directory
 _FILES: Final = {
     SUMMARY_FILE: "summary (JSON)",
     SCENARIO_FILE: "scenario (TOML)",

@@ -31,11 +31,9 @@ from quadsim.vehicle import N_ROTORS
 if TYPE_CHECKING:
     from plotly.graph_objects import Figure
 
-_Named = tuple[int, str]
-"""Number and name of a run, which set its colour and toggle."""
+_Named = tuple[int, str]  # number and name of a run, which set its colour and toggle
 _MOST_POINTS: Final = 3000
-_WAYS: Final = 300
-"""In which the points of a solid are taken whose hull is drawn."""
+_WAYS: Final = 300  # in which the points of a solid are taken whose hull is drawn
 _POINTS_OF_ALL_RUNS: Final = 12_000
 """Points that one quantity may have over all runs: keeps a page of two runs near 6 MB, and of ten below 8 MB."""
 

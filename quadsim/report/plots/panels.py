@@ -16,30 +16,21 @@ if TYPE_CHECKING:
 
 PANEL_HEIGHT: Final = 210
 TOP, BOTTOM = 34, 46
-_OWN_HEIGHT: Final = 230
-"""Of a row of panels whose horizontal axes have each a scale of its own [pixels]."""
+_OWN_HEIGHT: Final = 230  # of a row of panels whose horizontal axes have each a scale of its own [pixels]
 _OWN_TICKS: Final = 5
 
 
 @dataclass(frozen=True, kw_only=True)
 class Plot:
-    """One figure of the page.
+    """One figure of the page."""
 
-    Attributes:
-        key: its identifier in the page.
-        title: its heading.
-        height: its height [pixels].
-        timed: whether its horizontal axes are time, linked with those of the other plots.
-        json: the figure as plotly's JSON, safe inside a script element.
-        key_colours: names of its lines and their colours, where the page shows them above it.
-    """
-
-    key: str
-    title: str
-    height: int
-    timed: bool
-    json: str
+    key: str  # its identifier in the page
+    title: str  # its heading
+    height: int  # its height [pixels]
+    timed: bool  # whether its horizontal axes are time, linked with those of the other plots
+    json: str  # the figure as plotly's JSON, safe inside a script element
     key_colours: tuple[tuple[str, str], ...] = ()
+    """Names of its lines and their colours, where the page shows them above it."""
 
 
 def plotly_script() -> str:

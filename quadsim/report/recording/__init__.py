@@ -43,8 +43,7 @@ from quadsim.report.recording.world import send_airframe, send_scene, send_space
 _CALL: Final = "import sys; from rerun_cli.__main__ import main; sys.exit(main())"
 _VIEWER: Final = (sys.executable, "-c", _CALL, "--bind=127.0.0.1", "--port=auto")
 """Starts a viewer of its own, which only this machine can reach."""
-_INTERRUPTED: Final = 130
-"""The viewer's exit status after Ctrl-C."""
+_INTERRUPTED: Final = 130  # the viewer's exit status after Ctrl-C
 
 
 def write_recording(run: Run, path: Path) -> None:

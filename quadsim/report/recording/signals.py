@@ -19,8 +19,7 @@ from quadsim.vehicle import N_ROTORS
 if TYPE_CHECKING:
     import rerun as rr
 
-_ACTIVE: Final = 0.002
-"""A limit is active where its margin is below this fraction of the allowed band."""
+_ACTIVE: Final = 0.002  # A limit is active where its margin is below this fraction of the allowed band
 
 
 def send_signals(recording: rr.RecordingStream, log: FlightLog) -> None:

@@ -35,8 +35,7 @@ _ANY_ATTITUDE: Final = {
     "Yaw and tilt": ("Roll, pitch and yaw", ("roll", "pitch", "yaw", "yaw_error")),
 }
 """What takes a plot's place where the vehicle may turn upside down: Euler angles jump there."""
-FRONT_PANELS: Final = 4
-"""How many of the plots are seen first."""
+FRONT_PANELS: Final = 4  # how many of the plots are seen first
 
 Colour = tuple[int, int, int, int]
 

@@ -20,10 +20,8 @@ if TYPE_CHECKING:
 
 _FORCE_SCALE: Final = 5.0
 """How many times longer an external force is drawn than a thrust of its size: it would vanish inside the hull."""
-_WIND_LENGTH: Final = 1.5
-"""How long a flight's strongest wind is drawn, in arm lengths."""
-_DRAWN_ARM: Final = 0.3
-"""Arm length [m] for which the airframe's parts are measured, as in `models/quadrotor.xml`."""
+_WIND_LENGTH: Final = 1.5  # how long a flight's strongest wind is drawn, in arm lengths
+_DRAWN_ARM: Final = 0.3  # arm length [m] for which the airframe's parts are measured, as in `models/quadrotor.xml`
 
 
 def send_airframe(recording: rr.RecordingStream, vehicle: Vehicle) -> None:

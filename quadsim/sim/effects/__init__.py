@@ -111,8 +111,7 @@ class PushChange:
     pushes: tuple[Push, ...]
 
 
-Change = RotorChange | PayloadChange | MassChange | LagChange | PushChange
-"""What happens to the vehicle on the way."""
+Change = RotorChange | PayloadChange | MassChange | LagChange | PushChange  # what happens to the vehicle on the way
 LOADING = (PayloadChange, MassChange)
 """The changes of what the vehicle weighs, for which its model is compiled another way."""
 

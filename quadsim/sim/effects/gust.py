@@ -14,8 +14,7 @@ from quadsim.errors import ParameterError
 from quadsim.fields import Instant, Positive, Vector
 from quadsim.state import Array
 
-Velocity = Vector
-"""A velocity in the world frame, z up [m/s]."""
+Velocity = Vector  # A velocity in the world frame, z up [m/s]
 
 
 @dataclass(frozen=True, kw_only=True)

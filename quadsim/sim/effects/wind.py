@@ -18,8 +18,7 @@ from quadsim.vehicle import Vehicle
 
 SEA_LEVEL_DENSITY: Final = 1.225
 """Density of air [kg/m^3] at sea level in the International Standard Atmosphere (ISO 2533)."""
-_BLOCK: Final = 4096
-"""Physics steps whose wind is computed at a time."""
+_BLOCK: Final = 4096  # physics steps whose wind is computed at a time
 
 
 _Drag = Annotated[tuple[NonNegative, ...], Len(3, 3)]

@@ -29,15 +29,10 @@ MEAN_GYRO_BIAS: Final = slice(13, 16)
 
 @dataclass(frozen=True, kw_only=True)
 class Estimate:
-    """The estimated state of the vehicle.
+    """The estimated state of the vehicle."""
 
-    Attributes:
-        mean: (16,) position [m], velocity [m/s] (world), quaternion wxyz, rates [rad/s] (body), gyro bias [rad/s].
-        covariance: (15, 15) of the error.
-    """
-
-    mean: Array
-    covariance: Array
+    mean: Array  # (16,) position [m], velocity [m/s] (world), quaternion wxyz, rates [rad/s] (body), gyro bias [rad/s]
+    covariance: Array  # (15, 15) of the error
 
 
 def retract(mean: Array, error: Array) -> Array:

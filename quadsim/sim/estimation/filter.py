@@ -26,30 +26,22 @@ from quadsim.sim.sensing.sensor import AXES, Sensor, SensorName
 from quadsim.state import Array
 from quadsim.vehicle import Vehicle
 
-LONGEST_STEP: Final = 0.01
-"""Longest prediction at once [s]."""
+LONGEST_STEP: Final = 0.01  # longest prediction at once [s]
 NEEDED: Final = (SensorName.POSITION, SensorName.ATTITUDE)
 """Sensors without which position or heading would drift without bound."""
 _NAMES: Final = list(SensorName)
-_LARGEST: Final = 1e6
-"""A mean or a sample beyond this in magnitude [SI units], or not a number, is no information."""
-_LARGEST_VARIANCE: Final = 1e15
-"""The same for the trace of a covariance."""
+_LARGEST: Final = 1e6  # A mean or a sample beyond this in magnitude [SI units], or not a number, is no information
+_LARGEST_VARIANCE: Final = 1e15  # the same for the trace of a covariance
 
 
 @dataclass(kw_only=True)
 class Tally:
-    """What became of one sensor's samples.
+    """What became of one sensor's samples."""
 
-    Attributes:
-        accepted: how many were used.
-        rejected: how many were refused: outside the gate, or not numbers.
-        nis: sum of the normalised innovations squared of those used; three each on average, where all is as stated.
-    """
-
-    accepted: int = 0
-    rejected: int = 0
+    accepted: int = 0  # how many were used
+    rejected: int = 0  # how many were refused: outside the gate, or not numbers
     nis: float = 0.0
+    """Sum of the normalised innovations squared of those used; three each on average, where all is as stated."""
 
 
 @dataclass(kw_only=True)

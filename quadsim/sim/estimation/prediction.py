@@ -45,12 +45,10 @@ STILL_VELOCITY: Final = 0.1
 lifted before the modelled thrust could."""
 STILL_RATE: Final = math.radians(0.5)
 """The same of its body rates [rad/s]: as much as a MEMS gyro's noise, so that standing is worth a sample of it."""
-STILL_TIME: Final = 0.01
-"""Time tau after which these velocities and rates are forgotten [s]."""
+STILL_TIME: Final = 0.01  # time tau after which these velocities and rates are forgotten [s]
 
 
-_CHAIN = np.zeros((N_ERRORS, N_ERRORS))
-"""The two double integrators, dp/dt = v and dtheta/dt = omega."""
+_CHAIN = np.zeros((N_ERRORS, N_ERRORS))  # the two double integrators, dp/dt = v and dtheta/dt = omega
 _CHAIN[POSITION, VELOCITY] = _CHAIN[ATTITUDE, RATES] = np.eye(3)
 read_only(_CHAIN)
 
@@ -65,21 +63,14 @@ class Drive:
 
 @dataclass(frozen=True, kw_only=True)
 class MotionModel:
-    """The modelled vehicle.
+    """The modelled vehicle."""
 
-    Attributes:
-        mass: m [kg].
-        gravity: g [m/s^2].
-        inertia: (Ixx, Iyy, Izz) [kg m^2].
-        allocation: (4, 4) from squared rotor speeds to thrust and torque.
-        noise: three (15, 15) coefficients of h, h^2, h^3 in the noise that gathers in a time h; see `_gathered`.
-    """
-
-    mass: float
-    gravity: float
-    inertia: Vector
-    allocation: Array
+    mass: float  # m [kg]
+    gravity: float  # g [m/s^2]
+    inertia: Vector  # (Ixx, Iyy, Izz) [kg m^2]
+    allocation: Array  # (4, 4) from squared rotor speeds to thrust and torque
     noise: tuple[Array, Array, Array]
+    """Three (15, 15) coefficients of h, h^2, h^3 in the noise that gathers in a time h; see `_gathered`."""
 
 
 def motion_model(vehicle: Vehicle, settings: EstimatorSettings) -> MotionModel:

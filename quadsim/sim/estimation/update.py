@@ -53,8 +53,7 @@ def _observation(name: SensorName) -> Array:
     return read_only(H)
 
 
-OBSERVATION: Final = {name: _observation(name) for name in SensorName}
-"""(3, 15) H of each sensor."""
+OBSERVATION: Final = {name: _observation(name) for name in SensorName}  # (3, 15) H of each sensor
 
 
 def innovation(name: SensorName, mean: Array, value: Array) -> Array:

@@ -22,27 +22,19 @@ _COLUMNS = {
 }
 """Where a sensor's quantity is in MuJoCo's state; see `quadsim.sim.physics.physics_to_state`."""
 
-_BLOCK: Final = 256
-"""Samples whose errors are drawn at a time."""
+_BLOCK: Final = 256  # samples whose errors are drawn at a time
 
 Flags = NDArray[np.bool_]
 Steps = NDArray[np.int64]
 
 
 class Sample(NamedTuple):
-    """One sample.
+    """One sample."""
 
-    Attributes:
-        sensor: whose.
-        taken: physics step at which it was taken, its time stamp.
-        arrival: physics step from which it is known.
-        value: (3,) in the unit of the sensor's name.
-    """
-
-    sensor: SensorName
-    taken: int
-    arrival: int
-    value: Array
+    sensor: SensorName  # whose
+    taken: int  # physics step at which it was taken, its time stamp
+    arrival: int  # physics step from which it is known
+    value: Array  # (3,) in the unit of the sensor's name
 
 
 def truth(name: SensorName, physics: Array) -> Array:

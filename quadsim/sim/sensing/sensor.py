@@ -20,14 +20,11 @@ AXES: Final = (0, 1, 2)
 class SensorName(StrEnum):
     """What can be measured, three numbers each."""
 
-    POSITION = "position"
-    """x, y, z [m], world."""
-    VELOCITY = "velocity"
-    """vx, vy, vz [m/s], world."""
+    POSITION = "position"  # x, y, z [m], world
+    VELOCITY = "velocity"  # vx, vy, vz [m/s], world
     ATTITUDE = "attitude"
     """Roll, pitch, yaw [rad]; errors are rotation vectors in the body frame, q_measured = q * exp(error)."""
-    RATES = "rates"
-    """p, q, r [rad/s], body: a rate gyro."""
+    RATES = "rates"  # p, q, r [rad/s], body: a rate gyro
 
 
 def _check(owner: str, name: str, value: float, lower: float, upper: float) -> None:
@@ -80,20 +77,15 @@ class Sensor(Sampling):
 
     A sample taken at t = j / rate is value + bias + walk(t) + noise.  It arrives `delay` later, or never.
 
-    Attributes:
-        name: what is measured.
-        noise: standard deviation per axis, white from sample to sample.
-        bias: constant offset per axis.
-        bias_walk: the bias's random walk per axis [unit/sqrt(s)]: its variance grows by bias_walk^2 t.
-
     Raises:
         ParameterError: a value is not finite or not possible.
     """
 
-    name: SensorName
-    noise: Vector = (0.0, 0.0, 0.0)
-    bias: Vector = (0.0, 0.0, 0.0)
+    name: SensorName  # what is measured
+    noise: Vector = (0.0, 0.0, 0.0)  # standard deviation per axis, white from sample to sample
+    bias: Vector = (0.0, 0.0, 0.0)  # constant offset per axis
     bias_walk: Vector = (0.0, 0.0, 0.0)
+    """The bias's random walk per axis [unit/sqrt(s)]: its variance grows by bias_walk^2 t."""
 
     def __post_init__(self) -> None:
         owner = f"sensors.{self.name}"
@@ -127,38 +119,27 @@ class Sensor(Sampling):
 class FaultKind(StrEnum):
     """What can befall a sensor for a while."""
 
-    DROPOUT = "dropout"
-    """No samples."""
-    FREEZE = "freeze"
-    """Every sample repeats the last one that got through before."""
-    NAN = "nan"
-    """Samples are not numbers."""
-    BIAS = "bias"
-    """An offset is added."""
+    DROPOUT = "dropout"  # no samples
+    FREEZE = "freeze"  # every sample repeats the last one that got through before
+    NAN = "nan"  # samples are not numbers
+    BIAS = "bias"  # an offset is added
 
 
 @dataclass(frozen=True, kw_only=True)
 class SensorFault:
     """A sensor's fault, for all samples taken at start <= t < stop; validated when made.
 
-    Attributes:
-        sensor: which one.
-        kind: what happens.
-        start: [s].
-        stop: [s]; infinite where it is permanent.
-        axes: which of the three numbers become NaN.
-        offset: what is added, in the sensor's unit; a rotation vector in the body frame for attitude.
-
     Raises:
         ParameterError: a value is not possible.
     """
 
-    sensor: SensorName
-    kind: FaultKind
-    start: float
-    stop: float = math.inf
-    axes: tuple[int, ...] = AXES
+    sensor: SensorName  # which one
+    kind: FaultKind  # what happens
+    start: float  # [s]
+    stop: float = math.inf  # [s]; infinite where it is permanent
+    axes: tuple[int, ...] = AXES  # which of the three numbers become NaN
     offset: Vector = (0.0, 0.0, 0.0)
+    """What is added, in the sensor's unit; a rotation vector in the body frame for attitude."""
 
     def __post_init__(self) -> None:
         _check("fault", "start", self.start, -math.inf, math.inf)
