@@ -452,16 +452,12 @@ def shape_from_json(entry: Mapping[str, Any]) -> Constraining:
     kind = SHAPES[entry["type"]]
     values = {name: _frozen(value) for name, value in entry.items() if name != "type"}
     if "path" in values and issubclass(kind, Obstacle):
-        values["path"] = tuple(Place(time=time, position=tuple(p)) for time, p in map(_place, entry["path"]))
+        values["path"] = tuple(Place(time=each["time"], position=tuple(each["position"])) for each in entry["path"])
     shape: Constraining = kind(**values)
     points = np.zeros((1, 3))
     if not np.isfinite(shape.clearance(np.zeros(1), points)).all():
         raise InputError(f"{entry['type']} must be of finite numbers; got {entry}")
     return shape
-
-
-def _place(entry: Mapping[str, Any]) -> tuple[float, Sequence[float]]:
-    return entry["time"], entry["position"]
 
 
 def _frozen(value: Any) -> Any:

@@ -64,6 +64,11 @@ def load(name: str | Path, changes: Setting = ()) -> Scenario:
     return scenario.replace(changes) if changes else scenario
 
 
+def as_scenario(given: Scenario | str | Path) -> Scenario:
+    """A scenario that is given itself, or by its name or file, as `load` takes it."""
+    return given if isinstance(given, Scenario) else load(given)
+
+
 def resolve(scenario: Scenario | str | Path) -> Scenario:
     """A scenario with every number that it leaves to its vehicle written out: a start for a file of one's own.
 
@@ -83,8 +88,7 @@ def resolve(scenario: Scenario | str | Path) -> Scenario:
         >>> 'name = "hover"' in scenario.to_toml()
         True
     """
-    if not isinstance(scenario, Scenario):
-        scenario = load(scenario)
+    scenario = as_scenario(scenario)
     found = write_out(scenario, build_vehicle(scenario))
     if isinstance(found.reference, CsvSpec):
         return found.model_copy(update={"reference": found.reference.model_copy(update={"sha256": None})})
@@ -114,8 +118,7 @@ def feasibility(scenario: Scenario | str | Path) -> Feasibility:
     """
     from scenarios.courses.feasibility_check import report
 
-    if not isinstance(scenario, Scenario):
-        scenario = load(scenario)
+    scenario = as_scenario(scenario)
     return report(scenario, build_vehicle(scenario))
 
 
@@ -139,8 +142,7 @@ def fitting(scenario: Scenario | str | Path) -> str:
     """
     from scenarios.courses.feasibility_check import fitting as find_fitting
 
-    if not isinstance(scenario, Scenario):
-        scenario = load(scenario)
+    scenario = as_scenario(scenario)
     return find_fitting(scenario, build_vehicle(scenario))
 
 
@@ -238,8 +240,7 @@ def _set_up(
     scenario: Scenario | str | Path, controller: object, forces: Sequence[object]
 ) -> tuple[Scenario, Controller | None, list[Force] | None]:
     """A scenario that refers to what was passed in, checked, and these parts as the closed loop takes them."""
-    if not isinstance(scenario, Scenario):
-        scenario = load(scenario)
+    scenario = as_scenario(scenario)
     referring, law, own = named_by(scenario, controller, forces), None, None
     if controller is not None and not isinstance(controller, str):
         spec = refer_to(controller, scenario.controller.horizon)
@@ -301,8 +302,7 @@ def make_controller(scenario: Scenario | str | Path) -> Controller:
         >>> command.speeds.shape, command.plan.shape
         ((4,), (50, 4))
     """
-    if not isinstance(scenario, Scenario):
-        scenario = load(scenario)
+    scenario = as_scenario(scenario)
     return build_controller(scenario, build_vehicle(scenario))
 
 

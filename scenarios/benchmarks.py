@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from mpc.solvers import SOLVERS
 from quadsim.outputs import real_path, writing
-from scenarios.api import load
+from scenarios.api import as_scenario
 from scenarios.progress import Progress, reporting
 from scenarios.schema.scenario import Scenario
 
@@ -17,6 +18,11 @@ if TYPE_CHECKING:
     from scenarios.bench.campaigns import CampaignProfile
     from scenarios.bench.mismatch.survival import MismatchBench
     from scenarios.bench.speed import SpeedBench
+
+
+def _beginning(out: str | Path | None, kind: str) -> AbstractContextManager[Path | None]:
+    """The directory of the results, refused before anything is measured where it cannot be; None for none."""
+    return nullcontext() if out is None else writing(real_path(out), kind)
 
 
 def bench_solvers(
@@ -56,24 +62,12 @@ def bench_solvers(
     """
     from scenarios.bench import solvers as bench
 
-    scenario = scenario if isinstance(scenario, Scenario) else load(scenario)
-
-    def measure() -> SolverBench:
-        with reporting(progress) as report:
-            return bench.bench_solvers(
-                scenario,
-                repeats=repeats,
-                horizons=horizons,
-                solvers=tuple(solvers or SOLVERS),
-                stride=stride,
-                progress=report,
-            )
-
-    if out is None:
-        return measure()
-    with writing(real_path(out), bench.KIND) as directory:
-        found = measure()
-        bench.write_bench(found, directory)
+    options: dict[str, Any] = {"solvers": tuple(solvers or SOLVERS), "repeats": repeats, "stride": stride}
+    scenario = as_scenario(scenario)
+    with _beginning(out, bench.KIND) as directory, reporting(progress) as report:
+        found = bench.bench_solvers(scenario, horizons=horizons, progress=report, **options)
+        if directory is not None:
+            bench.write_bench(found, directory)
     return found
 
 
@@ -102,7 +96,7 @@ def bench_flight(
     from scenarios.bench.flight import bench_flight as measure
 
     with reporting(progress) as report:
-        return measure(scenario if isinstance(scenario, Scenario) else load(scenario), repeats=repeats, progress=report)
+        return measure(as_scenario(scenario), repeats=repeats, progress=report)
 
 
 def bench_render(
@@ -134,7 +128,7 @@ def bench_render(
     """
     from scenarios.bench.film import bench_render as measure
 
-    scenario = scenario if isinstance(scenario, Scenario) else load(scenario)
+    scenario = as_scenario(scenario)
     with reporting(progress) as report:
         return measure(scenario, seconds=seconds, workers=workers, progress=report)
 
@@ -173,15 +167,10 @@ def bench_ladder(
     """
     from scenarios.bench.mismatch import benchmark
 
-    def measure() -> MismatchBench:
-        with reporting(progress) as report:
-            return benchmark.run_mismatch(str(scenario), changes, quick=quick, workers=workers, progress=report)
-
-    if out is None:
-        return measure()
-    with writing(real_path(out), benchmark.KIND) as directory:
-        found = measure()
-        benchmark.write_mismatch(found, directory)
+    with _beginning(out, benchmark.KIND) as directory, reporting(progress) as report:
+        found = benchmark.run_mismatch(str(scenario), changes, quick=quick, workers=workers, progress=report)
+        if directory is not None:
+            benchmark.write_mismatch(found, directory)
     return found
 
 
@@ -244,6 +233,6 @@ def bench_campaign(
     """
     from scenarios.bench.campaigns import bench_campaign as measure
 
-    scenario = scenario if isinstance(scenario, Scenario) else load(scenario)
+    scenario = as_scenario(scenario)
     with reporting(progress) as report:
         return measure(scenario, flights=flights, rounds=rounds, sizes=sizes, progress=report)

@@ -46,12 +46,12 @@ class _Bound:
     """A side of a row, as the file has it."""
 
     name: str  # what reports call it, without its rotor
-    rotor: int  # 1 to 4, or 0
     side: str  # `lower` or `upper`
-    unit: str  # of the bound in the file
-    factor: float  # from the row's unit to that
-    field: str  # of the file, a list of numbers
-    entry: int  # which of them
+    entry: int  # which number of its field
+    rotor: int = 0  # 1 to 4, or 0
+    unit: str = "-"  # of the bound in the file
+    factor: float = 1.0  # from the row's unit to that
+    field: str = ""  # of the file, a list of numbers
 
 
 def diagnose(unanswered: Unanswered, scenario: Scenario, vehicle: Vehicle) -> dict[str, Any]:
@@ -90,40 +90,24 @@ class _Case:
 
     def bound(self, side: Side) -> _Bound:
         """A side in the words of the file."""
-        which, table = ("lower", "upper")[side.upper], "controller.input_bounds."
+        which, entry = ("lower", "upper")[side.upper], int(side.upper)
         if side.place in _ROTORS:
-            name, rotor = _ROTORS[side.place], side.row + 1
-            return _Bound(
-                name=name, rotor=rotor, side=which, unit="rad/s", factor=1.0, field=table + name, entry=int(side.upper)
-            )
+            name = _ROTORS[side.place]
+            field, rotor = f"controller.input_bounds.{name}", side.row + 1
+            return _Bound(name=name, rotor=rotor, side=which, unit="rad/s", field=field, entry=entry)
         if side.place == 0:
             name = [each for each in STATE_NAMES if each in self._spec.output_bounds][side.row]
-            return _Bound(
-                name=name,
-                rotor=0,
-                side=which,
-                unit=TERMS[name].unit,
-                factor=math.degrees(1.0) if name in ANGLES else 1.0,
-                field=f"controller.output_bounds.{name}",
-                entry=int(side.upper),
-            )
-        polytope = self._polytope(side)
+            factor, field = math.degrees(1.0) if name in ANGLES else 1.0, f"controller.output_bounds.{name}"
+            return _Bound(name=name, side=which, unit=TERMS[name].unit, factor=factor, field=field, entry=entry)
+        polytope, name = self._polytope(side), self._unanswered.problem.every_constraint[side.place].name
         if self._is_space(side):
-            name = self._unanswered.problem.every_constraint[side.place].name
-            return _Bound(name=name, rotor=0, side=which, unit="m", factor=1.0, field="", entry=side.row)
+            return _Bound(name=name, side=which, unit="m", entry=side.row)
         if polytope is None:  # of a kind that this module has no words for
-            name = f"{self._unanswered.problem.every_constraint[side.place].name}, row {side.row + 1},"
-            return _Bound(name=name, rotor=0, side=which, unit="-", factor=1.0, field="", entry=side.row)
+            return _Bound(name=f"{name}, row {side.row + 1},", side=which, entry=side.row)
         row = zip(polytope.of, polytope.rows[side.row], strict=True)
-        return _Bound(
-            name=polytope.row_names[side.row],
-            rotor=0,
-            side=which,
-            unit=sum_signal(tuple((name, factor) for name, factor in row if factor)).unit,
-            factor=1.0,
-            field=f"controller.polytopes.{polytope.name}.{which}",
-            entry=side.row,
-        )
+        unit = sum_signal(tuple((of, factor) for of, factor in row if factor)).unit
+        name, field = polytope.row_names[side.row], f"controller.polytopes.{polytope.name}.{which}"
+        return _Bound(name=name, side=which, unit=unit, field=field, entry=side.row)
 
     def _polytope(self, side: Side) -> PolytopeSpec | None:
         name = self._unanswered.problem.every_constraint[side.place].name
@@ -260,7 +244,7 @@ class _OwnCase(_Case):
         elif len(problem.every_constraint[side.place].lower.T) > 1:
             name = f"{name}, row {side.row + 1},"
         which = ("lower", "upper")[side.upper]
-        return _Bound(name=name, rotor=rotor, side=which, unit=unit, factor=factor, field="", entry=side.row)
+        return _Bound(name=name, rotor=rotor, side=which, unit=unit, factor=factor, entry=side.row)
 
     def suggestions(self, conflict: Conflict) -> Iterator[dict[str, Any]]:
         """No changes of a file."""
@@ -285,13 +269,8 @@ class _OwnCase(_Case):
 
 
 def _named(bound: _Bound) -> dict[str, Any]:
-    return {
-        "name": bound.name,
-        "rotors": [bound.rotor] if bound.rotor else [],
-        "side": bound.side,
-        "unit": bound.unit,
-        "field": bound.field,
-    }
+    rotors = [bound.rotor] if bound.rotor else []
+    return {"name": bound.name, "rotors": rotors, "side": bound.side, "unit": bound.unit, "field": bound.field}
 
 
 def _merged(entries: list[dict[str, Any]]) -> list[dict[str, Any]]:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from quadsim.errors import InputError, ParameterError
 from quadsim.outputs import real_path
-from scenarios.api import load, named_by
+from scenarios.api import as_scenario, named_by
 from scenarios.flight import Outputs
 from scenarios.parts.user_code import require_importable
 from scenarios.progress import Progress, reporting
@@ -60,8 +60,7 @@ def sweep(
     """
     from scenarios.campaign.sweep import fly_sweep
 
-    if not isinstance(scenario, Scenario):
-        scenario = load(scenario)
+    scenario = as_scenario(scenario)
     with reporting(progress) as report:
         return fly_sweep(flown_by(scenario, controller, forces), values, make_engine(workers, None), report)
 

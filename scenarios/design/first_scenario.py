@@ -7,7 +7,7 @@ import math
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final, Literal
+from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple
 
 import numpy as np
 
@@ -55,14 +55,13 @@ _EIGHT_PEAK: Final = float(np.hypot(np.sin(angle := np.linspace(0.0, math.pi, 72
 """Largest |d2p/dt2| of the figure eight (a sin wt, a/2 sin 2wt), over a w^2."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Entry:
+class Entry(NamedTuple):
     """A line of the file."""
 
     table: str  # its header, without brackets; empty for the top
     key: str  # of the field; empty for an empty table, which switches a part on
     value: Any  # of TOML
-    why: str  # what it is, in its unit, and where it comes from
+    why: str = ""  # what it is, in its unit, and where it comes from
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -133,23 +132,19 @@ def first_scenario(
     tuning = tune(vehicle, steepest=steepest)
     flown, duration, size = _course(course, vehicle, tuning)
     name = re.sub(r"[^a-z0-9._-]+", "-", f"first-{vehicle.name}-{course}".lower())[:80]
+    why = f"s, tau: the longest of the usual ones with tau w <= {PERIOD_SHARE:g}"
     entries = (
-        Entry(table="", key="name", value=name, why=""),
-        Entry(table="", key="description", value=_description(course, vehicle, tuning), why=""),
-        Entry(table="", key="duration", value=duration, why="s"),
-        Entry(
-            table="",
-            key="control_period",
-            value=tuning.period,
-            why=f"s, tau: the longest of the usual ones with tau w <= {PERIOD_SHARE:g}",
-        ),
-        Entry(table="vehicle", key="file", value=file, why="made for its numbers: remake this file when they change"),
-        Entry(table="initial", key="position", value=[0.0, 0.0, 1.0], why="m, world; at rest"),
-        Entry(table="plant", key="limit_speeds", value=True, why="rotors saturate at their lowest and highest speed"),
+        Entry("", "name", name),
+        Entry("", "description", _description(course, vehicle, tuning)),
+        Entry("", "duration", duration, "s"),
+        Entry("", "control_period", tuning.period, why),
+        Entry("vehicle", "file", file, "made for its numbers: remake this file when they change"),
+        Entry("initial", "position", [0.0, 0.0, 1.0], "m, world; at rest"),
+        Entry("plant", "limit_speeds", True, "rotors saturate at their lowest and highest speed"),
         *flown,
         *(_robust(vehicle, tuning) if law == "robust" else _baseline(law, vehicle, tuning)),
-        Entry(table="effects.rotors", key="", value=None, why="lag and inertia of the vehicle file"),
-        Entry(table="effects.air", key="", value=None, why="drag of the vehicle file"),
+        Entry("effects.rotors", "", None, "lag and inertia of the vehicle file"),
+        Entry("effects.air", "", None, "drag of the vehicle file"),
         *_constraints(vehicle, tuning, size if law == "robust" else None),
     )
     return FirstScenario(notes=_notes(vehicle, tuning, course, law), entries=entries, size=size)
@@ -206,38 +201,30 @@ def _course(course: str, vehicle: Vehicle, tuning: Tuning) -> tuple[list[Entry],
     """The lines of `[reference]`, the flight's duration [s], and the course's size [m]."""
     if course == "hover":
         why = "no windows: every axis stays at its initial position, yaw at 0"
-        return [Entry(table="reference", key="", value=None, why=why)], 4.0, STEP
+        return [Entry("reference", "", None, why)], 4.0, STEP
     if course == "step":
         slowest = min(tuning.bandwidth, tuning.height)
         response = round(3.0 / (STEP_RATIO * slowest), 2)
         start = _later(max(1.0, 3.0 / tuning.bandwidth))
         hold = _later(max(1.5, 1.2 * response))
         why = f"s, 95 % of a step: 3 / ({STEP_RATIO:g} times {slowest:.3g} rad/s, the slower of w and that of z)"
-        found = [Entry(table="reference", key="response_time", value=response, why=why)]
+        found = [Entry("reference", "response_time", response, why)]
         for axis, begin, until, value in (("x", 0, 2, STEP), ("y", 1, 3, STEP), ("z", 0, 2, 1.0 + STEP)):
             window = {"start": round(start + begin * hold, 9), "stop": round(start + until * hold, 9), "value": value}
-            found.append(Entry(table="reference", key=axis, value=[window], why="s, s, m"))
+            found.append(Entry("reference", axis, [window], "s, s, m"))
         return found, round(start + 4.0 * hold, 9), STEP
     acceleration = SHARE * largest_eight(vehicle, tuning)[0]
     length = _rounded(2.0 * acceleration / (_EIGHT_PEAK * (EIGHT_RATIO * tuning.bandwidth) ** 2), 3)
     turn = round(math.tau * math.sqrt(0.5 * length * _EIGHT_PEAK / acceleration), 3)
     ramp = round(0.5 * turn, 3)
+    to_end = f"m, end to end: such that it turns with {EIGHT_RATIO:g} w; width half of it"
+    why = f"s: at most {acceleration:.3g} m/s^2, at {100.0 * SHARE:g} % of {_eight_limit(vehicle, tuning)}"
     found = [
-        Entry(table="reference", key="type", value="figure_eight", why=""),
-        Entry(table="reference", key="start", value=1.0, why="s"),
-        Entry(
-            table="reference",
-            key="length",
-            value=length,
-            why=f"m, end to end: such that it turns with {EIGHT_RATIO:g} w; width half of it",
-        ),
-        Entry(
-            table="reference",
-            key="period",
-            value=turn,
-            why=f"s: at most {acceleration:.3g} m/s^2, at {100.0 * SHARE:g} % of {_eight_limit(vehicle, tuning)}",
-        ),
-        Entry(table="reference", key="ramp", value=ramp, why="s, half a turn to gain its speed, and to lose it"),
+        Entry("reference", "type", "figure_eight"),
+        Entry("reference", "start", 1.0, "s"),
+        Entry("reference", "length", length, to_end),
+        Entry("reference", "period", turn, why),
+        Entry("reference", "ramp", ramp, "s, half a turn to gain its speed, and to lose it"),
     ]
     return found, _later(1.0 + turn + ramp + 1.0), length
 
@@ -248,7 +235,7 @@ def _robust(vehicle: Vehicle, tuning: Tuning) -> Iterator[Entry]:
     lag = vehicle.rotor_rise is not None and vehicle.rotor_rise >= SHORTEST_LAG
 
     def line(key: str, value: Any, why: str, table: str = "") -> Entry:
-        return Entry(table=f"controller{table}", key=key, value=value, why=why)
+        return Entry(f"controller{table}", key, value, why)
 
     yield line("type", "robust", "")
     yield line(
@@ -283,9 +270,9 @@ def _robust(vehicle: Vehicle, tuning: Tuning) -> Iterator[Entry]:
 
 def _baseline(law: str, vehicle: Vehicle, tuning: Tuning) -> Iterator[Entry]:
     tilt = min(LQR_TILT, BASELINE_SHARE * _tilt(tuning)) if law == "lqr" else BASELINE_SHARE * _tilt(tuning)
-    yield Entry(table="controller", key="type", value=law, why="its gains are its own defaults for the vehicle")
+    yield Entry("controller", "type", law, "its gains are its own defaults for the vehicle")
     why = "deg, largest that it commands; below the audit's, since it plans nothing"
-    yield Entry(table="controller", key="tilt", value=round(tilt, 3), why=why)
+    yield Entry("controller", "tilt", round(tilt, 3), why)
     yield from _inputs(vehicle, tuning)
 
 
@@ -293,9 +280,9 @@ def _inputs(vehicle: Vehicle, tuning: Tuning) -> Iterator[Entry]:
     down, up = _slew(tuning)
     table = "controller.input_bounds"
     why = f"rad/s, what the rotors hold; hover is {vehicle.hover_speed:.4g}"
-    yield Entry(table=table, key="speed", value=[vehicle.speed_min, vehicle.speed_max], why=why)
+    yield Entry(table, "speed", [vehicle.speed_min, vehicle.speed_max], why)
     why = "rad/s per period: what a rotor's own speed makes in one, from hover towards its limits"
-    yield Entry(table=table, key="slew", value=[down, up], why=why)
+    yield Entry(table, "slew", [down, up], why)
 
 
 def _constraints(vehicle: Vehicle, tuning: Tuning, size: float | None) -> Iterator[Entry]:
@@ -309,7 +296,7 @@ def _constraints(vehicle: Vehicle, tuning: Tuning, size: float | None) -> Iterat
             pairs |= {"tolerance": tolerance, "tolerance_sampled": tolerance}
         for key, value in pairs.items():
             comment = {"lower": why, "tolerance": "rounding"}.get(key, "")
-            yield Entry(table="[constraints]", key=key, value=value, why=comment)
+            yield Entry("[constraints]", key, value, comment)
 
     for name in ("roll", "pitch"):
         yield from entry(name, name, (-tilt, tilt), 0.0, "deg, the tilt bound, at every instant")

@@ -37,12 +37,8 @@ def shortfalls(scenario: Scenario, vehicle: Vehicle) -> tuple[str, ...]:
     if isinstance(spec, RobustSpec) and spec.rotor_lag == "vehicle" and vehicle.rotor_rise is None:
         found.append("controller.rotor_lag is the vehicle's, whose file gives no rotor_rise: give a number of seconds")
     for limit in scenario.constraints:
-        if limit.signal == "speed" and not (
-            (-math.inf if limit.lower is None else limit.lower)
-            <= vehicle.hover_speed
-            <= (math.inf if limit.upper is None else limit.upper)
-        ):
-            sides = f"{'...' if limit.lower is None else f'{limit.lower:g}'} to {limit.upper if limit.upper else 0:g}"
+        if limit.signal == "speed" and not limit.lower <= vehicle.hover_speed <= limit.upper:
+            sides = f"{limit.lower:g} to {limit.upper:g}"
             found.append(f"constraint {limit.name}: hover is {vehicle.hover_speed:.4g} rad/s, the audit allows {sides}")
     if any("hover is" in line for line in found):  # the course's rotor speeds would repeat it
         return tuple(found)
@@ -54,23 +50,15 @@ def shortfalls(scenario: Scenario, vehicle: Vehicle) -> tuple[str, ...]:
 
 def _inputs(bounds: InputBoundsSpec, vehicle: Vehicle, period: float) -> list[str]:
     lower, upper = bounds.speed
-    hover, found = vehicle.hover_speed, []
+    speed, hover, found = "controller.input_bounds.speed", vehicle.hover_speed, []
     if hover > upper:
-        found.append(f"controller.input_bounds.speed: hover is {hover:.4g} rad/s, the scenario allows {upper:g}")
+        found.append(f"{speed}: hover is {hover:.4g} rad/s, the scenario allows {upper:g}")
     elif hover < lower:
-        found.append(
-            f"controller.input_bounds.speed: hover is {hover:.4g} rad/s, the scenario requires at least {lower:g}"
-        )
+        found.append(f"{speed}: hover is {hover:.4g} rad/s, the scenario requires at least {lower:g}")
     if upper > vehicle.speed_max:
-        found.append(
-            f"controller.input_bounds.speed: the scenario counts on {upper:g} rad/s, the rotors reach "
-            f"{vehicle.speed_max:g}"
-        )
+        found.append(f"{speed}: the scenario counts on {upper:g} rad/s, the rotors reach {vehicle.speed_max:g}")
     if lower < vehicle.speed_min:
-        found.append(
-            f"controller.input_bounds.speed: the scenario counts on {lower:g} rad/s, the rotors hold at least "
-            f"{vehicle.speed_min:g}"
-        )
+        found.append(f"{speed}: the scenario counts on {lower:g} rad/s, the rotors hold at least {vehicle.speed_min:g}")
     up = bounds.slew[1]
     needed = vehicle.speed_max - hover
     if up * SLOWEST_ANSWER < needed * period:

@@ -13,7 +13,7 @@ from mpc.export.targets import TARGETS, Target
 from quadsim.errors import ParameterError
 from quadsim.outputs import real_path, require_directory, write_text, writing
 from quadsim.state import Array
-from scenarios.api import load
+from scenarios.api import as_scenario
 from scenarios.export.record import Recording, record
 from scenarios.parts.controllers import exportable
 from scenarios.parts.vehicle import build_vehicle
@@ -52,8 +52,7 @@ def export(
     for name, value, allowed in (("precision", precision, get_args(Precision)), ("target", target, tuple(TARGETS))):
         if value not in allowed:
             raise ParameterError("", f"--{name}", value, f"one of {', '.join(allowed)}")
-    if not isinstance(scenario, Scenario):
-        scenario = load(scenario)
+    scenario = as_scenario(scenario)
     directory = real_path(out)
     require_directory(directory, KIND)
     files = controller_files(scenario, precision) | vector_files(record(scenario))

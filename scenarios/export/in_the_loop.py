@@ -18,11 +18,11 @@ from quadsim.controller import GROUNDED, SOLVED, Command, Moment, stopped
 from quadsim.outputs import real_path, write_text
 from quadsim.state import Array
 from quadsim.vehicle import N_ROTORS
+from scenarios.api import as_scenario
 from scenarios.export.emulation import Program, build, require_programs
 from scenarios.export.exporter import controller_files, exported_law, programs
 from scenarios.export.serial_line import SerialMPC
 from scenarios.flight import Flight, Outputs
-from scenarios.loading import load_scenario
 from scenarios.progress import Progress, reporting
 from scenarios.run import fly_scenario, run_scenario
 from scenarios.schema.scenario import Scenario
@@ -101,8 +101,7 @@ def fly_exported(
         >>> import quadsim
         >>> flight = quadsim.fly_exported("hover", target="cortex-m4f", precision="float")  # doctest: +SKIP
     """
-    if not isinstance(scenario, Scenario):
-        scenario = load_scenario(str(scenario))
+    scenario = as_scenario(scenario)
     machine = TARGETS[target]
     files = controller_files(scenario, precision) | programs(machine)
     require_programs(machine, "to fly an exported controller")

@@ -18,7 +18,7 @@ from quadsim.flight.audit import Limit
 from quadsim.flight.log import FlightLog, PlantLog
 from quadsim.sim.loop import Observation, one_period
 from quadsim.state import REFERENCE_STATES, Array
-from scenarios.api import load
+from scenarios.api import as_scenario
 from scenarios.build import build_controller
 from scenarios.flight import Flight
 from scenarios.gym.actions import Action, make_actions
@@ -112,8 +112,7 @@ class QuadrotorEnv(gymnasium.Env):  # type: ignore[misc]
         Raises:
             InputError: one of these is not possible.
         """
-        if not isinstance(scenario, Scenario):
-            scenario = load(scenario)
+        scenario = as_scenario(scenario)
         self._plan = None if vary is None else make_plan(scenario, str(vary))
         self._base = scenario if self._plan is None else self._plan.scenario
         if render_mode not in (None, *RENDER_MODES):

@@ -11,7 +11,7 @@ from gymnasium.vector import VectorEnv
 
 from quadsim.errors import ParameterError
 from quadsim.sim.physics import steps_per_period
-from scenarios.api import load
+from scenarios.api import as_scenario
 from scenarios.schema.bases import read_scenario
 from scenarios.schema.scenario import Scenario
 from scenarios.shipped import scenario_names, scenario_path
@@ -53,8 +53,7 @@ def _description(name: str, scenario: Scenario | str, periods: int) -> dict[str,
 
 
 def _specification(scenario: Scenario | str | Path) -> EnvSpec:
-    if not isinstance(scenario, Scenario):
-        scenario = load(scenario)
+    scenario = as_scenario(scenario)
     return EnvSpec(**_description(scenario.name, scenario, scenario.periods))
 
 

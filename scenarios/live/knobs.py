@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Final
 
 from scenarios.schema.controller import ControllerSpec
@@ -42,7 +42,7 @@ def _walk(path: str, value: Any, schema: Mapping[str, Any], root: Mapping[str, A
             inner = properties.get(name, others)
             if isinstance(inner, Mapping):
                 for knob in _walk(f"{path}.{name}" if path else name, entry, inner, root):
-                    yield knob if knob.about else _about(knob, about)
+                    yield replace(knob, about=knob.about or about)
         return
     each = _plain(schema.get("items", {}), root, None)[0] if isinstance(value, list) else schema
     common: dict[str, Any] = {
@@ -57,10 +57,6 @@ def _walk(path: str, value: Any, schema: Mapping[str, Any], root: Mapping[str, A
         yield Knob(value=value, choices=tuple(each.get("enum", (value,))), **common)
     elif len(value) == LISTED and all(isinstance(entry, int | float) for entry in value):
         yield Knob(value=tuple(map(float, value)), **common)
-
-
-def _about(knob: Knob, about: str) -> Knob:
-    return Knob(**{**vars(knob), "about": about})
 
 
 def _plain(schema: Mapping[str, Any], root: Mapping[str, Any], value: Any) -> tuple[Mapping[str, Any], str]:

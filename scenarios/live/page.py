@@ -254,12 +254,7 @@ class Page:
 
         self.stage.grab.on_drag("left")(pulled)
         wind = gui.add_vector2("Wind x, y [m/s]", (0.0, 0.0), min=(-12.0, -12.0), max=(12.0, 12.0), step=0.5)
-        self._on(
-            wind.on_update,
-            lambda event: session.submit(
-                {"type": "wind", "velocity": [*map(float, event.target.value), 0.0]}, subject="wind"
-            ),
-        )
+        self._submits(wind, "wind", lambda value: {"type": "wind", "velocity": [*map(float, value), 0.0]})
         gust = gui.add_vector2("Gust x, y [m/s]", (6.0, 0.0), min=(-15.0, -15.0), max=(15.0, 15.0), step=0.5)
         self._button(
             "Gust",
@@ -274,19 +269,13 @@ class Page:
         )
         self._button("Drop payload", lambda event: session.submit({"type": "payload_drop"}))
         factor = gui.add_slider("Mass factor", 0.7, 1.5, 0.01, 1.0)
-        self._on(
-            factor.on_update,
-            lambda event: session.submit({"type": "mass", "factor": float(event.target.value)}, subject="mass"),
-        )
+        self._submits(factor, "mass", lambda value: {"type": "mass", "factor": float(value)})
         lag = gui.add_slider("Rotor lag [ms]", 0, 100, 5, 0)
-        self._on(
-            lag.on_update,
-            lambda event: session.submit({"type": "rotor_lag", "rise": float(event.target.value) / 1e3}, subject="lag"),
-        )
+        self._submits(lag, "lag", lambda value: {"type": "rotor_lag", "rise": float(value) / 1e3})
         for rotor in range(1, N_ROTORS + 1):
             wear = gui.add_slider(f"Rotor {rotor} loss", 0.0, 1.0, 0.05, 0.0)
             self._rest.append((wear, 0.0))
-            self._on(wear.on_update, partial(self._wear, rotor))
+            self._submits(wear, f"wear {rotor}", partial(_wear, rotor))
         self._rest += [(wind, (0.0, 0.0)), (factor, 1.0), (lag, 0)]
         sensor = gui.add_dropdown("Sensor", ("position", "velocity", "attitude", "rates"))
         fault = gui.add_dropdown("Fault", _FAULTS)
@@ -300,10 +289,6 @@ class Page:
         self._button(
             "Stall the computer", lambda event: session.submit({"type": "stall", "duration": float(late.value) / 1e3})
         )
-
-    def _wear(self, rotor: int, event: Any) -> None:
-        loss = float(event.target.value)
-        self._session.submit({"type": "wear", "rotor": rotor, "loss": loss}, subject=f"wear {rotor}")
 
     def _targets(self) -> None:
         gui, session = self._server.gui, self._session
@@ -345,10 +330,7 @@ class Page:
 
         self._on(self._server.scene.on_click(modifier="shift"), clicked)
         yaw = gui.add_slider("Yaw [deg]", -180, 180, 5, 0)
-        self._on(
-            yaw.on_update,
-            lambda event: session.submit({"type": "setpoint", "yaw": float(event.target.value)}, subject="yaw"),
-        )
+        self._submits(yaw, "yaw", lambda value: {"type": "setpoint", "yaw": float(value)})
         self._rest += [(place, place.value), (yaw, 0)]
         self._steered = gui.add_text("Set-point velocity [m/s]", _NO_VELOCITY, disabled=True)
         for key, direction in _STEER.items():
@@ -419,13 +401,10 @@ class Page:
         for handle, each in zip(handles, before, strict=True):
             handle.value = each
 
-    async def _take_over(self, spec: ControllerSpec, name: str) -> None:
+    async def _take(self, name: str) -> None:
+        spec = self._session.scenario.controller if name == "as started" else self._others[name]
         if await self._replace(spec.model_dump(mode="json", exclude_none=True), name):
             self._show_knobs(spec)
-
-    def _take(self, name: str) -> Any:
-        spec = self._session.scenario.controller if name == "as started" else self._others[name]
-        return self._take_over(spec, name)
 
     async def _replace(self, fields: Mapping[str, Any], what: str) -> bool:
         """Build a controller beside the flight and let it take over; where it cannot be built, report why."""
@@ -544,6 +523,10 @@ class Page:
 
         register(called)
 
+    def _submits(self, widget: Any, subject: str, table: Callable[[Any], Mapping[str, Any]]) -> None:
+        """Submit an input made of a widget's value whenever the driving client changes that."""
+        self._on(widget.on_update, lambda event: self._session.submit(table(event.target.value), subject=subject))
+
     def _on_later(self, register: Callable[[Any], Any], act: Callable[[Any], Awaitable[Any] | None]) -> None:
         """The same of what may take a while, and is awaited."""
 
@@ -617,6 +600,10 @@ def _unless_gone() -> Iterator[None]:
         yield
 
 
+def _wear(rotor: int, loss: Any) -> dict[str, Any]:
+    return {"type": "wear", "rotor": rotor, "loss": float(loss)}
+
+
 def _bars(limits: tuple[Limit, ...], frame: Frame, other: str) -> str:
     """Margins as bars: full is the middle of the bounds, empty is at the bound; amber is active, red is violated."""
     rows = []
@@ -625,13 +612,9 @@ def _bars(limits: tuple[Limit, ...], frame: Frame, other: str) -> str:
         for i, margin in enumerate(values):
             if math.isnan(margin):
                 continue
-            scale = 0.5 * (limit.upper - limit.lower)
-            if not math.isfinite(scale):
-                bound = limit.upper if math.isfinite(limit.upper) else limit.lower
-                scale = abs(bound) or 1.0
-            share = min(1.0, abs(margin) / scale)
+            share = min(1.0, abs(margin) / limit.half_band)
             red = margin < -limit.tolerance
-            active = not red and margin <= _ACTIVE * scale
+            active = not red and margin <= _ACTIVE * limit.half_band
             colour = BOUND if red else LINES[1] if active else LINES[2] if i == 0 else LINES[4]
             mark = "bad" if red else "act" if active else ""
             fill = f'<div class="f" style="width:{100.0 * share:.0f}%;background:{colour}"></div>'

@@ -137,8 +137,6 @@ def reproduce_paper(
     scenarios = [scenario_of(paper, spec) for spec in specs]
     for spec, scenario in zip(specs, scenarios, strict=True):
         _require_number(spec, [limit.name for limit in build_limits(scenario)])
-    for spec, scenario in zip(specs, scenarios, strict=True):
-        _require_number(spec, [limit.name for limit in build_limits(scenario)])
     flown: dict[str, dict[str, Any]] = {}
     found = []
     for done, (spec, scenario) in enumerate(zip(specs, scenarios, strict=True)):

@@ -139,10 +139,7 @@ def make_controller(spec: ControllerSpec, vehicle: Vehicle, period: float, shape
         case UnconstrainedSpec():
             return _compiled(spec, vehicle, period) or _unconstrained(make_problem(spec, vehicle, period))
         case ConstrainedSpec():
-            law = _compiled(spec, vehicle, period, shapes)
-            if law is None:
-                space = make_space(spec, vehicle, period, shapes)
-                law = _constrained(spec, make_problem(spec, vehicle, period), space)
+            law = _compiled(spec, vehicle, period, shapes) or _constrained(spec, vehicle, period, shapes)
             return law if spec.fallback is None else _bounded(law, spec, spec.fallback, vehicle, period)
         case RobustSpec():
             law = _compiled(spec, vehicle, period, shapes) or _robust(spec, vehicle, period, shapes)
@@ -178,7 +175,7 @@ def posed_problem(spec: BoundedSpec, vehicle: Vehicle, period: float) -> Problem
         InputError: it cannot be made from these numbers.
     """
     if isinstance(spec, RobustSpec):
-        return _robust_problem(spec, vehicle, period, _robust_settings(spec, vehicle, period))
+        return _robust_problem(spec, vehicle, period)
     return make_problem(spec, vehicle, period)
 
 
@@ -190,6 +187,7 @@ def exportable(spec: ControllerSpec, vehicle: Vehicle, period: float, shapes: Se
         InputError: it cannot be made from these numbers.
     """
     from mpc.export.source import Exportable
+    from mpc.robust.controller import robust_problem
 
     if not isinstance(spec, UnconstrainedSpec | ConstrainedSpec | RobustSpec):
         raise ExportError(f"it is {spec.type!r}; exported are unconstrained, constrained and robust")
@@ -197,12 +195,10 @@ def exportable(spec: ControllerSpec, vehicle: Vehicle, period: float, shapes: Se
         raise ExportError(f"its model is another in each period: linearisation = {spec.linearisation!r}, not 'hover'")
     if isinstance(spec, BoundedSpec) and spec.avoidance is not None and shapes:
         raise ExportError("its half-spaces around obstacles are others in each period: leave out controller.avoidance")
-    settings = _robust_settings(spec, vehicle, period) if isinstance(spec, RobustSpec) else None
-    if isinstance(spec, RobustSpec) and settings is not None:
-        problem = _robust_problem(spec, vehicle, period, settings)
-    else:
-        problem = make_problem(spec, vehicle, period)
-    return Exportable(name=spec.type, problem=problem, vehicle=vehicle, settings=settings)
+    if not isinstance(spec, RobustSpec):
+        return Exportable(name=spec.type, problem=make_problem(spec, vehicle, period), vehicle=vehicle, settings=None)
+    parts = _robust_parts(spec, vehicle, period)
+    return Exportable(name=spec.type, problem=robust_problem(**parts), vehicle=vehicle, settings=parts["settings"])
 
 
 def _compiled(
@@ -316,10 +312,11 @@ def make_space(
     )
 
 
-def _constrained(spec: ConstrainedSpec, problem: Problem, space: Space | None) -> Controller:
+def _constrained(spec: ConstrainedSpec, vehicle: Vehicle, period: float, shapes: Sequence[Shape]) -> Controller:
     from mpc.constrained import ConstrainedMPC
     from mpc.solvers import QPSolver
 
+    problem, space = make_problem(spec, vehicle, period), make_space(spec, vehicle, period, shapes)
     return ConstrainedMPC(problem, QPSolver(spec.solver, problem), shortcut=spec.shortcut, space=space)
 
 
@@ -352,51 +349,34 @@ def _robust_settings(spec: RobustSpec, vehicle: Vehicle, period: float) -> Robus
     )
 
 
-def _robust_problem(spec: RobustSpec, vehicle: Vehicle, period: float, settings: RobustSettings) -> Problem:
+def _robust_parts(spec: RobustSpec, vehicle: Vehicle, period: float) -> dict[str, Any]:
+    """What the robust MPC and its problem are made of."""
+    return {
+        "vehicle": vehicle,
+        "period": period,
+        "horizon": spec.horizon,
+        "objective": make_objective(spec.output_weights, spec.input_weights),
+        "bounds": make_bounds(spec),
+        "settings": _robust_settings(spec, vehicle, period),
+        "constraints": make_polytopes(spec),
+    }
+
+
+def _robust_problem(spec: RobustSpec, vehicle: Vehicle, period: float) -> Problem:
     from mpc.robust.controller import robust_problem
 
-    return robust_problem(
-        vehicle,
-        period=period,
-        horizon=spec.horizon,
-        objective=make_objective(spec.output_weights, spec.input_weights),
-        bounds=make_bounds(spec),
-        settings=settings,
-        constraints=make_polytopes(spec),
-    )
+    return robust_problem(**_robust_parts(spec, vehicle, period))
 
 
 def _robust(spec: RobustSpec, vehicle: Vehicle, period: float, shapes: Sequence[Shape] = ()) -> RobustMPC:
     from mpc.robust.controller import RobustMPC
-
-    return RobustMPC(
-        vehicle,
-        period=period,
-        horizon=spec.horizon,
-        objective=make_objective(spec.output_weights, spec.input_weights),
-        bounds=make_bounds(spec),
-        settings=_robust_settings(spec, vehicle, period),
-        constraints=make_polytopes(spec),
-        shortcut=spec.shortcut,
-        space=make_space(spec, vehicle, period, shapes, _position_margins(spec, vehicle, period)),
-    )
-
-
-def _position_margins(spec: RobustSpec, vehicle: Vehicle, period: float) -> Array | None:
-    """By how much half-spaces are tightened along x, y, z at each predicted state, (N, 3) [m]; None for not."""
-    if spec.tightening is None or spec.avoidance is None:
-        return None
     from mpc.robust.tightening import position_margins
 
-    return position_margins(
-        vehicle,
-        period=period,
-        horizon=spec.horizon,
-        settings=spec.tightening,
-        rotor_lag=_rotor_lag(spec, vehicle),
-        delay=spec.delay,
-        estimated=spec.offset_free is not None,
-    )
+    margins = None  # by which half-spaces are tightened along x, y, z at each predicted state, (N, 3) [m]
+    if spec.tightening is not None and spec.avoidance is not None:
+        margins = position_margins(**_tightened(spec, vehicle, period))
+    space = make_space(spec, vehicle, period, shapes, margins)
+    return RobustMPC(**_robust_parts(spec, vehicle, period), shortcut=spec.shortcut, space=space)
 
 
 def tightening_margins(spec: RobustSpec, vehicle: Vehicle, period: float) -> Array | None:
@@ -409,16 +389,20 @@ def tightening_margins(spec: RobustSpec, vehicle: Vehicle, period: float) -> Arr
         return None
     from mpc.robust.tightening import margins
 
-    return margins(
-        vehicle,
-        period=period,
-        horizon=spec.horizon,
-        bounds=make_bounds(spec),
-        settings=spec.tightening,
-        rotor_lag=_rotor_lag(spec, vehicle),
-        delay=spec.delay,
-        estimated=spec.offset_free is not None,
-    )
+    return margins(bounds=make_bounds(spec), **_tightened(spec, vehicle, period))
+
+
+def _tightened(spec: RobustSpec, vehicle: Vehicle, period: float) -> dict[str, Any]:
+    """What tightened bounds follow from."""
+    return {
+        "vehicle": vehicle,
+        "period": period,
+        "horizon": spec.horizon,
+        "settings": spec.tightening,
+        "rotor_lag": _rotor_lag(spec, vehicle),
+        "delay": spec.delay,
+        "estimated": spec.offset_free is not None,
+    }
 
 
 def _baseline(spec: LQRSpec | PIDSpec | GeometricSpec, vehicle: Vehicle, period: float) -> Controller:

@@ -88,13 +88,9 @@ def build_computation(scenario: Scenario) -> Computation | None:
     spec = scenario.computation
     if spec is None and not stalls:
         return None
-    return Computation(**vars(filled(spec or ComputationTime(), plan=_has_fallback(scenario))), stalls=stalls)
-
-
-def _has_fallback(scenario: Scenario) -> bool:
-    """Whether the controller is within the fallback contract."""
     fallback = getattr(scenario.controller, "fallback", None)
-    return isinstance(fallback, FallbackSettings) and fallback.enabled
+    guarded = isinstance(fallback, FallbackSettings) and fallback.enabled  # within the fallback contract
+    return Computation(**vars(filled(spec or ComputationTime(), plan=guarded)), stalls=stalls)
 
 
 def build_changes(scenario: Scenario, events: Sequence[Event] | None = None) -> tuple[Change, ...]:
@@ -105,7 +101,9 @@ def build_changes(scenario: Scenario, events: Sequence[Event] | None = None) -> 
         events: those that count, instead of all that the scenario has.
     """
     events = scenario.events if events is None else events
-    found: list[Change] = [*_losses(scenario, events), *_pushes(events)]
+    pushes = _in_force([event for event in events if isinstance(event, PushEvent)])
+    found: list[Change] = [*_losses(scenario, events)]
+    found += [PushChange(time=time, pushes=tuple(in_force)) for time, in_force in pushes]
     for event in events:
         if isinstance(event, PayloadPickupEvent):
             found.append(PayloadChange(time=event.at, payload=event))
@@ -139,11 +137,6 @@ def _losses(scenario: Scenario, events: Sequence[Event]) -> Iterator[RotorChange
         for time, in_force in _in_force([loss for loss in losses if loss.rotor == rotor]):
             left = math.prod(1.0 - loss.loss for loss in in_force)
             yield RotorChange(time=time, rotor=rotor, efficiency=worn * left)
-
-
-def _pushes(events: Sequence[Event]) -> Iterator[PushChange]:
-    for time, in_force in _in_force([event for event in events if isinstance(event, PushEvent)]):
-        yield PushChange(time=time, pushes=tuple(in_force))
 
 
 _Lasting = TypeVar("_Lasting", RotorLossEvent, PushEvent)

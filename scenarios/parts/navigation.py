@@ -11,7 +11,6 @@ from quadsim.sim.sensing.sensor import AXES, FaultKind, Sensor, SensorFault, Sen
 from quadsim.vehicle import Vehicle
 from scenarios.parts.randomness import generator
 from scenarios.schema.events import SensorFaultEvent
-from scenarios.schema.sensors import AnySensorSpec
 
 if TYPE_CHECKING:
     from scenarios.schema.scenario import Scenario
@@ -51,24 +50,19 @@ def build_navigation(scenario: Scenario, vehicle: Vehicle) -> Navigation | None:
 
 def build_faults(scenario: Scenario) -> tuple[SensorFault, ...]:
     """The faults of the sensors."""
+    events = (event for event in scenario.events if isinstance(event, SensorFaultEvent))
     return tuple(
-        build_fault(
-            event.sensor,
-            event.fault,
-            start=event.at,
-            duration=event.duration,
-            axes=event.axes,
-            offset=event.offset,
-        )
-        for event in scenario.events
-        if isinstance(event, SensorFaultEvent)
+        build_fault(e.sensor, e.fault, start=e.at, duration=e.duration, axes=e.axes, offset=e.offset) for e in events
     )
 
 
 def build_sensors(scenario: Scenario) -> tuple[Sensor, ...]:
     """The sensors that the scenario has, in SI units."""
-    present = {} if scenario.sensors is None else scenario.sensors.present()
-    return tuple(_sensor(name, spec) for name, spec in present.items())
+    found = []
+    for name, spec in ({} if scenario.sensors is None else scenario.sensors.present()).items():
+        of_axes = {field: _three(getattr(spec, field), _UNITS[name]) for field in ("noise", "bias", "bias_walk")}
+        found.append(Sensor(name=name, **{**vars(spec), **of_axes}))
+    return tuple(found)
 
 
 def build_fault(
@@ -96,11 +90,6 @@ def build_fault(
     return SensorFault(
         sensor=name, kind=FaultKind(kind), start=start, stop=start + duration, axes=affected, offset=added
     )
-
-
-def _sensor(name: SensorName, spec: AnySensorSpec) -> Sensor:
-    of_axes = {field: _three(getattr(spec, field), _UNITS[name]) for field in ("noise", "bias", "bias_walk")}
-    return Sensor(name=name, **{**vars(spec), **of_axes})
 
 
 def _three(value: float | Sequence[float], unit: float) -> tuple[float, float, float]:
