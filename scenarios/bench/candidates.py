@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from functools import partial
-from typing import Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 
@@ -32,8 +31,7 @@ Query = Callable[[int], tuple[Array, Array, Array]]
 STEPS_TRIED: Final = (1, 2, 3, 4, 5, 6, 8, 10, 13, 17, 20, 25)
 
 
-@dataclass(frozen=True, kw_only=True)
-class Entry:
+class Entry(NamedTuple):
     """One candidate: a solver, with or without the shortcuts of `mpc.exact.shortcut`."""
 
     solver: str
@@ -105,8 +103,7 @@ class StepCandidate:
         return tuple(self._queried.statuses[period] for period in periods)
 
 
-@dataclass(frozen=True, kw_only=True)
-class Reference:
+class Reference(NamedTuple):
     """The optimum of each period's QP, in closed form."""
 
     inputs: Mapping[int, Array]  # first input u(k) (4,) by period [rad/s]
@@ -127,19 +124,11 @@ def reference_optima(problem: Problem, queries: Queries, periods: Sequence[int])
     return Reference(inputs=inputs, kkt=worst)
 
 
-@dataclass(frozen=True, kw_only=True)
-class Verdict:
-    """What an entrant's answers were worth; see `scenarios.bench.bench_results.CandidateResult`."""
+def judge(candidate: StepCandidate, queries: Queries, periods: Sequence[int], reference: Reference) -> dict[str, Any]:
+    """Hold the answers of an entrant's first pass against the optimum, and against the KKT conditions of its own QP.
 
-    statuses: dict[str, int]
-    ways: dict[str, int]
-    failures: int
-    input_error: float | None
-    kkt: float | None
-
-
-def judge(candidate: StepCandidate, queries: Queries, periods: Sequence[int], reference: Reference) -> Verdict:
-    """Hold the answers of an entrant's first pass against the optimum, and against the KKT conditions of its own QP."""
+    Fields of `scenarios.bench.bench_results.CandidateResult`: `statuses`, `ways`, `failures`, `input_error` and `kkt`.
+    """
     candidate.keep()
     problem, form = candidate.problem, candidate.formulation
     statuses: Counter[str] = Counter()
@@ -147,24 +136,20 @@ def judge(candidate: StepCandidate, queries: Queries, periods: Sequence[int], re
     for period in periods:
         command, answer = candidate.answers[period]
         if command is None or command.status not in ACCEPTED:
-            statuses[_failure(answer)] += 1
+            # a point that is called solved is rejected where it breaks the hard input bounds
+            statuses["rejected" if answer.solution.status in ACCEPTED else answer.solution.status] += 1
             continue
         statuses[command.status] += 1
         errors.append(np.abs(command.speeds - reference.inputs[period]).max())
         qp = form.qp.with_vectors(form.vectors(*queries.of_qp(problem, period)))
         residuals.append(kkt_residuals(qp, answer.solution).worst)
-    return Verdict(
-        statuses=dict(sorted(statuses.items())),
-        ways=dict(Counter(map(str, candidate.ways(periods)))),
-        failures=len(periods) - len(errors),
-        input_error=float(np.max(errors)) if errors else None,
-        kkt=float(np.max(residuals)) if residuals else None,
-    )
-
-
-def _failure(answer: Answer) -> str:
-    """Why there was no command; a point that is called solved is rejected where it breaks the hard input bounds."""
-    return "rejected" if answer.solution.status in ACCEPTED else answer.solution.status
+    return {
+        "statuses": dict(sorted(statuses.items())),
+        "ways": dict(Counter(map(str, candidate.ways(periods)))),
+        "failures": len(periods) - len(errors),
+        "input_error": float(np.max(errors)) if errors else None,
+        "kkt": float(np.max(residuals)) if residuals else None,
+    }
 
 
 def time_stages(
@@ -176,20 +161,25 @@ def time_stages(
 ) -> tuple[StageLength, ...]:
     """The QP condensed and cut into stages of M steps, on the periods in which constraints are active."""
     default, query = usual_steps(problem.model.nu), partial(queries.of_qp, problem)
-
-    candidates: dict[int | None, _QPEntrant] = {None: _QPEntrant(condensed(problem), PiqpDense(), query)}
+    candidates = {"condensed": _QPEntrant(condensed(problem), PiqpDense(), query)}
     for length in sorted({*STEPS_TRIED, default}):
-        candidates[length] = _QPEntrant(Staged(problem, steps_per_stage=length), PiqpMultistage(), query)
-    named = {str(steps): candidate for steps, candidate in candidates.items()}
-    laps = race(named, timed, progress=partial(progress, "stages"))
-    found_active = candidates[default].active
+        candidates[str(length)] = _QPEntrant(Staged(problem, steps_per_stage=length), PiqpMultistage(), query)
+    laps = race(candidates, timed, progress=partial(progress, "stages"))
+    found_active = candidates[str(default)].active
     active = np.array([found_active[period] > 0 for segment in timed for period in segment])
     counted = active if active.any() else np.ones_like(active)
     found = []
-    for steps, candidate in candidates.items():
-        p50, p99 = np.percentile(laps[str(steps)].median[counted], [50, 99])
-        size = candidate.formulation.qp.c.size
-        found.append(StageLength(steps=steps, variables=size, p50=float(p50), p99=float(p99), default=steps == default))
+    for name, candidate in candidates.items():
+        p50, p99 = np.percentile(laps[name].median[counted], [50, 99])
+        found.append(
+            StageLength(
+                steps=int(name) if name.isdigit() else None,
+                variables=candidate.formulation.qp.c.size,
+                p50=float(p50),
+                p99=float(p99),
+                default=name == str(default),
+            )
+        )
     return tuple(found)
 
 

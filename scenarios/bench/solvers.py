@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 
@@ -21,8 +22,8 @@ from quadsim.state import Array
 from scenarios.bench.bench_results import CandidateResult, Growth, SolverBench
 from scenarios.bench.bench_tables import solver_tables
 from scenarios.bench.candidates import Entry, StepCandidate, entries, judge, reference_optima, time_stages
-from scenarios.bench.queries import QueriedController, Queries, flight_between, recorded
-from scenarios.bench.timing import StepTimes, segments, time_in_turns
+from scenarios.bench.queries import QueriedController, flight_between, recorded
+from scenarios.bench.timing import Candidate, StepTimes, segments, time_in_turns
 from scenarios.build import build_problem
 from scenarios.flight import Flight
 from scenarios.machine import machine, versions
@@ -48,18 +49,17 @@ PATIENCE: Final = 60.0  # a candidate that takes longer for the questions at one
 Race = Callable[..., dict[str, StepTimes]]  # `time_in_turns` with what all races of a bench have in common
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Timed:
+class _Timed(NamedTuple):
     """A candidate's steps (K,) [ms], the ways (K,) they were answered in, and the periods without their optimum."""
 
     step_ms: Array
     ways: np.ndarray[tuple[int], np.dtype[np.object_]]
     failures: int
 
-    @classmethod
-    def of(cls, candidate: StepCandidate, periods: Sequence[int], laps: StepTimes) -> _Timed:
-        failures = sum(status not in ACCEPTED for status in candidate.statuses(periods))
-        return cls(step_ms=laps.median, ways=candidate.ways(periods), failures=failures)
+
+def _timed(candidate: StepCandidate, periods: Sequence[int], laps: StepTimes) -> _Timed:
+    failures = sum(status not in ACCEPTED for status in candidate.statuses(periods))
+    return _Timed(laps.median, candidate.ways(periods), failures)
 
 
 def bench_solvers(
@@ -97,7 +97,7 @@ def bench_solvers(
     with flight_between(scenario, flight.vehicle) as between:
         race = partial(time_in_turns, between=between, repeats=repeats, rng=rng)
         candidates, own, gain, queried, reference_kkt = _time_candidates(
-            flight, problem, taking_part, race, stride=stride, progress=progress
+            flight, problem, taking_part, race, stride, progress
         )
         growth = _growth(flight, problem, taking_part, race, horizons, few, own, progress)
         queries = recorded(scenario, flight.log.control, problem.horizon)
@@ -155,13 +155,7 @@ def _check(
 
 
 def _time_candidates(
-    flight: Flight,
-    problem: Problem,
-    taking_part: Sequence[Entry],
-    race: Race,
-    *,
-    stride: int,
-    progress: Progress,
+    flight: Flight, problem: Problem, taking_part: Sequence[Entry], race: Race, stride: int, progress: Progress
 ) -> tuple[tuple[CandidateResult, ...], dict[str, _Timed], Array | None, int, float]:
     """Candidates, their steps, the gain's, the number of periods timed, and the reference's worst KKT residual."""
     queries = recorded(flight.scenario, flight.log.control, problem.horizon)
@@ -169,41 +163,27 @@ def _time_candidates(
     periods = [period for segment in chosen for period in segment]
     reference = reference_optima(problem, queries, periods)
     candidates = {entry.name: StepCandidate(entry, problem, queries) for entry in taking_part}
-    laps = race(
-        {**_gain(problem, queries), **candidates},
-        chosen,
-        longest_pass=LONGEST_PASS,
-        progress=partial(progress, "candidates"),
-    )
+    with_gain: dict[str, Candidate] = {**candidates}
+    with contextlib.suppress(np.linalg.LinAlgError):  # of weights so far apart that it cannot be computed
+        with_gain = {GAIN: QueriedController(UnconstrainedMPC(problem), queries), **candidates}
+    laps = race(with_gain, chosen, longest_pass=LONGEST_PASS, progress=partial(progress, "candidates"))
     results = tuple(
         CandidateResult(
             name=name,
             solver=candidate.entry.solver,
-            package=_package(candidate.entry.solver),
+            package=f"{SOLVERS[candidate.entry.solver].package} {SOLVERS[candidate.entry.solver].version}",
             shortcut=candidate.entry.shortcut,
             repeats=laps[name].ms.shape[0],
             step_ms=laps[name].median,
             answered=candidate.statuses(periods),
             raw_max_ms=float(laps[name].ms.max()),
-            **vars(judge(candidate, queries, periods, reference)),
+            **judge(candidate, queries, periods, reference),
         )
         for name, candidate in candidates.items()
     )
     gain = laps[GAIN].median if GAIN in laps else None
-    own = {name: _Timed.of(candidate, periods, laps[name]) for name, candidate in candidates.items()}
+    own = {name: _timed(candidate, periods, laps[name]) for name, candidate in candidates.items()}
     return results, own, gain, len(periods), reference.kkt
-
-
-def _gain(problem: Problem, queries: Queries) -> dict[str, QueriedController]:
-    """The gain, where weights are not so far apart that it cannot be computed."""
-    try:
-        return {GAIN: QueriedController(UnconstrainedMPC(problem), queries)}
-    except np.linalg.LinAlgError:
-        return {}
-
-
-def _package(solver: str) -> str:
-    return f"{SOLVERS[solver].package} {SOLVERS[solver].version}"
 
 
 def _growth(
@@ -235,7 +215,7 @@ def _growth(
             candidates = {entry.name: StepCandidate(entry, longer, queries) for entry in racing}
             report = partial(progress, f"N = {N}")
             laps = race(candidates, chosen, longest_pass=LONGEST_PASS, patience=PATIENCE, progress=report)
-            timed = {name: _Timed.of(candidates[name], periods, lap) for name, lap in laps.items()}
+            timed = {name: _timed(candidates[name], periods, lap) for name, lap in laps.items()}
         for entry in racing:
             if entry.name not in timed:
                 dropped[entry.name] = f"more than {PATIENCE:g} s for them at N = {N}"

@@ -363,42 +363,30 @@ def fly_cell(cell: tuple[str, float, str, int]) -> SpeedFlight:
     )
 
 
-_ERRORS: Final = "The smallest at each speed is bold. ±: half the 95 % interval of the mean over seeds."
-
-
 def speed_tables(measured: SpeedBench) -> list[Grid]:
     """How far each controller goes, then errors, violations, tilts and saturation."""
-    return [
-        _reach(measured),
-        _grid(
-            measured,
-            "error",
-            "Mean position error, m",
-            _error,
+    columns: tuple[tuple[str, str, Callable[[SpeedFlight, bool], Cell], str], ...] = (
+        (
+            *("error", "Mean position error, m", _error),
             "The smallest at each speed is bold. ±: half the 95 % interval of the mean over seeds.",
         ),
-        _grid(
-            measured,
-            "violated",
-            "Share of the time with roll or pitch beyond the bound, %",
+        (
+            *("violated", "Share of the time with roll or pitch beyond the bound, %"),
             lambda flight, _: _share(flight.violated),
             f"At the physics rate; by more than {TOLERANCE:g} deg, and before the vehicle was lost, where it was.",
         ),
-        _grid(
-            measured,
-            "tilt",
-            "Peak tilt, deg",
+        (
+            *("tilt", "Peak tilt, deg"),
             lambda flight, _: Cell(text=f"{flight.tilt:.0f}", mark=Mark.NONE if flight.reason is None else Mark.BAD),
             "At the physics rate. Lost flights end beyond 120 deg, or farther off than the course's size.",
         ),
-        _grid(
-            measured,
-            "saturated",
-            "Share of periods with a rotor at its lowest or highest speed, %",
+        (
+            *("saturated", "Share of periods with a rotor at its lowest or highest speed, %"),
             lambda flight, _: _share(flight.saturated),
             "No controller commands speeds beyond these.",
         ),
-    ]
+    )
+    return [_reach(measured), *(_grid(measured, *column) for column in columns)]
 
 
 def _reach(measured: SpeedBench) -> Grid:

@@ -2,21 +2,28 @@
 
 from __future__ import annotations
 
+import functools
+import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final
 
+from quadsim.assets import models_dir
 from quadsim.errors import FileError, InputError
 from quadsim.flight.form import MAYBE_TEXT, Each, Optional, read_json
 from quadsim.outputs import Growing, digest, digest_of, to_json
 from quadsim.outputs.paths import require_inside
-from scenarios.campaign.digests import code_digest, controller_digest
 from scenarios.campaign.plan import Plan, load_plan
 from scenarios.campaign.results.store import FLIGHTS_FILE, TIMES_FILE
 from scenarios.campaign.spec import CampaignSpec
 from scenarios.machine import machine, versions
+from scenarios.parts.controllers import make_controller
 from scenarios.parts.foreign_code import announce_recorded, find_code
+from scenarios.parts.foreign_code import digest as digest_of_code
+from scenarios.parts.plugin import PluginController
+from scenarios.parts.vehicle import build_vehicle
 from scenarios.schema.plugin import PluginSpec
+from scenarios.schema.scenario import Scenario
 
 MANIFEST_FILE: Final = "manifest.json"
 CAMPAIGN_FILE: Final = "campaign.toml"
@@ -31,6 +38,7 @@ _FORM: Final = {
     "sessions": [dict],
     **dict.fromkeys(("controller", "controller_code"), Optional(MAYBE_TEXT)),
 }
+_ROOT: Final = Path(__file__).resolve().parents[2]
 _FINISHED: Final = ("complete", "stopped")
 """Status of a campaign that nothing has written to since its manifest has the hashes of its tables."""
 
@@ -144,6 +152,28 @@ def flown_by(plan: Plan) -> dict[str, Any]:
         "versions": versions(),
         "machine": machine(),
     }
+
+
+@functools.cache
+def code_digest() -> str:
+    """SHA-256 of everything of ours that numbers come from: code, models, scenarios."""
+    return digest_of_code([*(_ROOT / package for package in ("quadsim", "mpc", "scenarios")), models_dir()])
+
+
+def controller_digest(scenario: Scenario) -> str | None:
+    """SHA-256 of the code of a plug-in controller: its module, or the whole package that it is in.
+
+    Raises:
+        InputError: the controller cannot be made.
+    """
+    controller = make_controller(scenario.controller, build_vehicle(scenario), scenario.control_period)
+    if not isinstance(controller, PluginController):
+        return None
+    package = controller.module.partition(".")[0]
+    file = getattr(sys.modules[package], "__file__", None)
+    if file is None:
+        return None
+    return digest_of_code([Path(file).parent if Path(file).name == "__init__.py" else Path(file)])
 
 
 def read_manifest(directory: Path) -> dict[str, Any]:

@@ -6,9 +6,10 @@ import math
 import tempfile
 import time as clock
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import closing
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
@@ -42,7 +43,6 @@ ALL_FILES: Final = (
     *REPORT_FILES,
 )
 """What a campaign's directory holds in the end."""
-FLUSH_S: Final = 5.0  # how long an answer may wait in memory before it is on the disk [s]
 CHECK_EVERY: Final = 10
 """Flights after which the interval is looked at again, where it decides when to stop; of grids, whole turns."""
 
@@ -155,8 +155,6 @@ class _Progress:
         self._plan, self._width, self._watch = plan, until_width, watch
         self._outcomes = np.full(plan.spec.flights, -1, np.int8)  # not flown, passed, failed
         self._checked = 0
-        self._waiting: list[Row] = []
-        self._flushed = clock.perf_counter()
         there = self.store.table().select(["flight", "failed"])
         self._counted = self.store.counted()
         within = there.filter(pc.less(there["flight"], plan.spec.flights))
@@ -190,23 +188,16 @@ class _Progress:
                     if self._is_sure():
                         return
         finally:
-            self._flush()
+            self.store.flush()
 
     def _keep(self, row: Row) -> None:
-        self._waiting.append(row)
+        self.store.add(row)
         self.flown += 1
         self._note(row["flight"], row["failed"])
-        if clock.perf_counter() - self._flushed > FLUSH_S:
-            self._flush()
         elapsed = clock.perf_counter() - self.started
         failed = int(np.count_nonzero(self._outcomes == 1))
         there = int(np.count_nonzero(self._outcomes >= 0))
         self._watch(Standing(flown=there, flights=self.wanted, failed=failed, rate=self.flown / elapsed))
-
-    def _flush(self) -> None:
-        self._flushed = clock.perf_counter()
-        self.store.append(self._waiting)
-        self._waiting = []  # not before: by Ctrl-C it is appended once more, to the same file
 
     def _note(self, flights: Any, failed: Any) -> None:
         self._outcomes[np.asarray(flights, int)] = np.asarray(failed, np.int8)
@@ -238,23 +229,21 @@ def _conclude(plan: Plan, files: Growing, progress: _Progress, manifest: dict[st
     table = progress.store.close(progress.wanted)
     summary = {"campaign": plan.spec.name, "scenario": plan.scenario.name, **estimate(table)}
     files.write({SUMMARY_FILE: to_json(summary).encode()})
-    if report:
-        with tempfile.TemporaryDirectory() as scratch:
-            write_report(
-                Path(scratch),
-                campaign=directory,
-                table=table,
-                summary=summary,
-                manifest=manifest,
-                name=plan.spec.name,
-                description=plan.spec.description,
-                failure=plan.spec.failure,
-            )
-            files.write({name: (Path(scratch) / name).read_bytes() for name in REPORT_FILES})
-    else:
-        files.remove(REPORT_FILES)
+    write = partial(
+        write_report,
+        campaign=directory,
+        table=table,
+        summary=summary,
+        manifest=manifest,
+        name=plan.spec.name,
+        description=plan.spec.description,
+        failure=plan.spec.failure,
+    )
+    put_report(files, REPORT_FILES, write if report else None)
     ours = [name for name in ALL_FILES if name != records.MANIFEST_FILE and (directory / name).is_file()]
-    manifest["machines"] = _machines(directory)
+    # flights by the processor that flew them; those that raised, or that no process came back from, have none
+    processors = read_table(directory / TIMES_FILE)["machine"].drop_null().to_pylist()
+    manifest["machines"] = dict(sorted(Counter(processors).items()))
     manifest["files"] = {name: digest_of(directory / name) for name in ours}
     manifest["status"] = "complete" if progress.wanted == plan.spec.flights else "stopped"
     records.write(manifest, files)
@@ -263,7 +252,15 @@ def _conclude(plan: Plan, files: Growing, progress: _Progress, manifest: dict[st
     )
 
 
-def _machines(directory: Path) -> dict[str, int]:
-    """Flights by the processor that flew them; those that raised, or that no process came back from, have none."""
-    machines = read_table(directory / TIMES_FILE)["machine"].drop_null().to_pylist()
-    return dict(sorted(Counter(machines).items()))
+def put_report(files: Growing, names: Sequence[str], write: Callable[[Path], object] | None) -> None:
+    """Put what a function writes into a directory there, file by file; without one, remove an earlier report.
+
+    Raises:
+        OutputError: they cannot be written.
+    """
+    if write is None:
+        files.remove(names)
+        return
+    with tempfile.TemporaryDirectory() as scratch:
+        write(Path(scratch))
+        files.write({name: (Path(scratch) / name).read_bytes() for name in names})

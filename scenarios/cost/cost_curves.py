@@ -10,7 +10,7 @@ import numpy as np
 from quadsim.controller import UNCONSTRAINED
 from quadsim.state import Array, read_only
 from scenarios.cost.cost_tables import slowest
-from scenarios.cost.study import CostStudy, Outcome, Sweep, SweepPoint
+from scenarios.cost.study import CostStudy, Outcome, Sweep
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -89,11 +89,8 @@ def sweep_panels(study: CostStudy, sweep: Sweep) -> list[Panel]:
 
 def lost_at(sweep: Sweep) -> tuple[list[float], list[float]]:
     """The values at which the vehicle is lost: with constraints, and without."""
-
-    def values(of: Callable[[SweepPoint], Outcome | None]) -> list[float]:
-        return [p.value for p in sweep.points if (outcome := of(p)) is not None and not outcome.completed]
-
-    return values(lambda point: point.constrained), values(lambda point: point.unconstrained)
+    with_them = [point.value for point in sweep.points if not point.constrained.completed]
+    return with_them, [p.value for p in sweep.points if p.unconstrained and not p.unconstrained.completed]
 
 
 def _values(values: Iterable[float | None]) -> Array:

@@ -7,13 +7,12 @@ from typing import TYPE_CHECKING
 
 from quadsim.report.figures.canvas import new_figure, write_drawings
 from quadsim.report.palette import BOUND, REFERENCE, line_colour
-from scenarios.cost.cost_curves import Curve, Panel, lost_at, step_curves, sweep_panels
+from scenarios.cost.cost_curves import Panel, lost_at, step_curves, sweep_panels
 from scenarios.cost.study import CostStudy, Sweep
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
-    from matplotlib.lines import Line2D
 
 
 def write_cost_figures(study: CostStudy, directory: Path) -> list[Path]:
@@ -38,8 +37,7 @@ def _draw_steps(study: CostStudy) -> Figure:
     axes.axvline(study.deadline_ms, color=BOUND, linestyle="--", linewidth=1.1, label="the control period")
     axes.set_xscale("log")
     axes.xaxis.set_major_formatter("{x:g}")
-    axes.set_xlabel("time of a whole controller step [ms]")
-    axes.set_ylabel("periods answered by then [%]")
+    axes.set(xlabel="time of a whole controller step [ms]", ylabel="periods answered by then [%]")
     axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5))
     return figure
 
@@ -66,25 +64,22 @@ def _draw_sweep(study: CostStudy, sweep: Sweep, over: str) -> Figure:
 def _draw_panel(axes: Axes, panel: Panel) -> None:
     from matplotlib.ticker import LogLocator, NullFormatter
 
-    solid = [_draw_curve(axes, curve) for curve in panel.curves]
+    named = []
+    for curve in panel.curves:
+        (line,) = axes.plot(curve.x, curve.y, color=line_colour(curve.colour), label=curve.label)
+        if curve.dashed:
+            line.set(linestyle="--", linewidth=1.0)
+        else:
+            line.set(marker="o", markersize=3.5)
+            named.append(line)
     if panel.logarithmic:
         axes.set_yscale("log")
         axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
         axes.yaxis.set_major_formatter("{x:g}")
         axes.yaxis.set_minor_formatter(NullFormatter())
     axes.set_ylabel(panel.label)
-    named = [line for line, curve in zip(solid, panel.curves, strict=True) if not curve.dashed]
     if len(named) > 1:
         axes.legend(handles=named, fontsize=8.2)
-
-
-def _draw_curve(axes: Axes, curve: Curve) -> Line2D:
-    (line,) = axes.plot(curve.x, curve.y, color=line_colour(curve.colour), label=curve.label)
-    if curve.dashed:
-        line.set(linestyle="--", linewidth=1.0)
-    else:
-        line.set(marker="o", markersize=3.5)
-    return line
 
 
 def _draw_marks(axes: Axes, sweep: Sweep, panel: Panel) -> None:

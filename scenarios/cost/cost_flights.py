@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 
@@ -30,15 +29,8 @@ from scenarios.schema.controller import ConstrainedSpec, UnconstrainedSpec
 from scenarios.schema.scenario import Scenario
 
 _NOT_THE_COURSE: Final = {
-    "name",
-    "description",
-    "group",
-    "expect",
-    "log_rate",
-    "vehicle",
-    "controller",
-    "lost",
-    "constraints",
+    *("name", "description", "group", "expect", "log_rate"),
+    *("vehicle", "controller", "lost", "constraints"),
 }
 """Fields in which flights that are compared by their controllers may differ; vehicles are compared by their numbers."""
 REPEATS: Final = 3
@@ -101,8 +93,7 @@ def is_counterpart(scenario: Scenario, constrained: Scenario) -> bool:
     return all(getattr(scenario, name) == getattr(free, name) for name in ("controller", "vehicle", "plant"))
 
 
-@dataclass(frozen=True, kw_only=True)
-class Flown:
+class Flown(NamedTuple):
     """A flight as a worker process hands it back."""
 
     outcome: Outcome

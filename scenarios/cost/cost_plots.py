@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import html
-from collections.abc import Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Final
 
@@ -83,33 +82,23 @@ def _marks(figure: Figure, i: int, sweep: Sweep, panel: Panel) -> None:
     """Crosses at the foot of a panel where the vehicle is lost, and what never settles at its head."""
     with_them, without = lost_at(sweep)
     free = without if any(curve.dashed for curve in panel.curves) else []
-    for colour, values in ((REFERENCE, free), (BOUND, with_them)):
-        for value in values:
-            _mark(figure, i, value, "x", 0.0, colour)
-    for value in panel.never:
-        _mark(figure, i, value, "▲", 1.0, BOUND)
-
-
-def _mark(figure: Figure, i: int, x: float, text: str, y: float, colour: str) -> None:
     number = "" if i == 0 else str(i + 1)
-    figure.add_annotation(
-        x=x,
-        y=y,
-        xref=f"x{number}",
-        yref=f"y{number} domain",
-        text=text,
-        showarrow=False,
-        yanchor="bottom" if y == 0.0 else "top",
-        font={"color": colour, "size": 12},
-    )
+    for colour, values, text, y, anchor in (
+        (REFERENCE, free, "x", 0.0, "bottom"),
+        (BOUND, with_them, "x", 0.0, "bottom"),
+        (BOUND, panel.never, "▲", 1.0, "top"),
+    ):
+        font = {"color": colour, "size": 12}
+        where = {"xref": f"x{number}", "yref": f"y{number} domain", "y": y, "yanchor": anchor}
+        for value in values:
+            figure.add_annotation(x=value, text=text, showarrow=False, font=font, **where)
 
 
 def _title(panel: Panel) -> str:
-    solid = [curve for curve in panel.curves if not curve.dashed]
-    return f"{panel.label}: {_names(solid)}" if len(solid) > 1 else panel.label
-
-
-def _names(curves: Sequence[Curve]) -> str:
-    return ", ".join(
-        f'<span style="color:{line_colour(curve.colour)}">{html.escape(curve.label)}</span>' for curve in curves
-    )
+    """The panel's label, and the names of its solid curves where there are several."""
+    names = [
+        f'<span style="color:{line_colour(curve.colour)}">{html.escape(curve.label)}</span>'
+        for curve in panel.curves
+        if not curve.dashed
+    ]
+    return f"{panel.label}: {', '.join(names)}" if len(names) > 1 else panel.label

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 
@@ -56,7 +56,8 @@ def find_study(targets: Sequence[str], *, requested: bool | None) -> list[Scenar
     if requested is False:
         return []
     try:
-        scenarios = [load_scenario(_scenario_of(target)) for target in targets]
+        files = [Path(target) / SCENARIO_FILE if Path(target).is_dir() else target for target in targets]
+        scenarios = [load_scenario(str(file)) for file in files]
     except InputError:
         if requested:
             raise
@@ -149,6 +150,7 @@ def study_cost(
             unconstrained=outcome(without_constraints(scenario)) if free else None,
         )
 
+    t = np.arange(constrained.periods, dtype=np.float64) * constrained.control_period
     return CostStudy(
         name=constrained.name,
         horizon=spec.horizon,
@@ -157,7 +159,7 @@ def study_cost(
         constrained=base.outcome,
         unconstrained=outcome(without_constraints(constrained)),
         others={name: outcome(scenario) for name, scenario in apart.items()},
-        reference=_reference_settling(constrained),
+        reference=metrics.settling(t, build_reference(constrained, t.size), build_course_steps(constrained)),
         candidates=candidates,
         left_out=left_out,
         tilt=Sweep(
@@ -194,13 +196,3 @@ def _variations(varied: Mapping[tuple[float, float], Scenario], flown: Mapping[s
         Variation(arm_length=arm, drag_to_thrust=drag, outcome=flown[key(scenario)].outcome)
         for (arm, drag), scenario in varied.items()
     )
-
-
-def _scenario_of(target: str) -> str:
-    return str(Path(target) / SCENARIO_FILE) if Path(target).is_dir() else target
-
-
-def _reference_settling(scenario: Scenario) -> list[dict[str, Any]]:
-    """Settling of the filtered reference itself."""
-    t = np.arange(scenario.periods, dtype=np.float64) * scenario.control_period
-    return metrics.settling(t, build_reference(scenario, t.size), build_course_steps(scenario))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Final
 
@@ -10,6 +10,7 @@ from quadsim.flight.metrics import percentiles
 from quadsim.outputs import write_json, write_text
 from quadsim.report.pages.comparison_page import CostSection
 from quadsim.report.table import format_number
+from scenarios.campaign.statistics.wording import listing
 from scenarios.cost.cost_figures import write_cost_figures
 from scenarios.cost.cost_plots import cost_plots
 from scenarios.cost.cost_tables import cost_markdown, cost_tables, format_outcome, format_slowest
@@ -53,8 +54,8 @@ def cost_sentences(study: CostStudy) -> list[str]:
         *_tracking(study),
         *_settling(study),
         *_bought(study),
-        *_sweep(study.tilt, _tilt_label),
-        *_sweep(study.horizons, _horizon_label),
+        *_sweep(study.tilt, "{:g} deg"),
+        *_sweep(study.horizons, "N = {:g}"),
         *_variations(study),
     ]
 
@@ -78,17 +79,14 @@ def _computation(study: CostStudy) -> Iterator[str]:
             f"In {shortcuts} of {flown.shortcut.size} periods the unconstrained optimum satisfies every constraint, "
             f"and is the answer after {_two(quick)} ms in the median; the others need QPs and {_two(slow)} ms."
         )
-    if others:
-        steps = "; ".join(_qp(study, candidate) for candidate in others)
-        yield f"With the QP solved in every period: {steps}."
-
-
-def _qp(study: CostStudy, candidate: CandidateTimes) -> str:
-    found = percentiles(candidate.step_ms)
-    late = int((candidate.step_ms > study.deadline_ms).sum())
-    times = f"{_two(found['p50'])} ms in the median and {_two(found['max'])} ms at most"
-    text = f"{candidate.name} {times}, {_rate(candidate)}"
-    return f"{text}, {late} of its steps too late" if late else text
+    phrases = []
+    for candidate in others:
+        found, late = percentiles(candidate.step_ms), int((candidate.step_ms > study.deadline_ms).sum())
+        times = f"{_two(found['p50'])} ms in the median and {_two(found['max'])} ms at most"
+        too_late = f", {late} of its steps too late" if late else ""
+        phrases.append(f"{candidate.name} {times}, {_rate(candidate)}{too_late}")
+    if phrases:
+        yield f"With the QP solved in every period: {'; '.join(phrases)}."
 
 
 def _rate(candidate: CandidateTimes) -> str:
@@ -117,11 +115,9 @@ def _tracking(study: CostStudy) -> Iterator[str]:
 def _settling(study: CostStudy) -> Iterator[str]:
     if not (study.constrained.completed and study.unconstrained.completed and study.constrained.settling):
         return
-    channels = dict.fromkeys(entry["channel"] for entry in study.constrained.settling)
     flights = (study.constrained, study.unconstrained)
-    parts = [
-        f"{channel} {' instead of '.join(_settling_of(flight, channel) for flight in flights)}" for channel in channels
-    ]
+    channels = dict.fromkeys(entry["channel"] for entry in study.constrained.settling)
+    parts = (f"{name} {' instead of '.join(_settling_of(flight, name) for flight in flights)}" for name in channels)
     yield f"Settling after the steps of the course: {', '.join(parts)}."
 
 
@@ -155,16 +151,12 @@ def _bought(study: CostStudy) -> Iterator[str]:
             )
 
 
-def _tilt_label(point: SweepPoint) -> str:
-    return f"{point.value:g} deg"
+def _sweep(sweep: Sweep, form: str) -> Iterator[str]:
+    """From one end of a sweep to the other, and where flights are lost or plans held; `form` is that of its values."""
 
+    def label(point: SweepPoint) -> str:
+        return form.format(point.value)
 
-def _horizon_label(point: SweepPoint) -> str:
-    return f"N = {point.value:g}"
-
-
-def _sweep(sweep: Sweep, label: Callable[[SweepPoint], str]) -> Iterator[str]:
-    """From one end of a sweep to the other, and where flights are lost or plans held."""
     flown = [point for point in sweep.points if point.constrained.completed]
     if len(flown) > 1:
         first, last = flown[0], flown[-1]
@@ -181,20 +173,16 @@ def _sweep(sweep: Sweep, label: Callable[[SweepPoint], str]) -> Iterator[str]:
         )
         yield f"From {sweep.name} {label(first)} to {label(last)}: {', '.join(parts)}."
     with_them = [label(point) for point in sweep.points if not point.constrained.completed]
-    without = [label(point) for point in sweep.points if _is_lost(point.unconstrained)]
+    without = [label(point) for point in sweep.points if point.unconstrained and not point.unconstrained.completed]
     if with_them:
-        yield f"With constraints the vehicle is lost at {_list(with_them)}."
+        yield f"With constraints the vehicle is lost at {listing(with_them)}."
     if without:
         nowhere = "" if with_them else "; with them, nowhere"
-        yield f"Without constraints the vehicle is lost at {_list(without)}{nowhere}."
+        yield f"Without constraints the vehicle is lost at {listing(without)}{nowhere}."
     held = [point for point in sweep.points if point.constrained.fallbacks]
     if held:
         phrases = [f"{label(point)} ({point.constrained.fallbacks} periods)" for point in held]
-        yield f"The QP has no solution, and an earlier plan is held, at {_list(phrases)}."
-
-
-def _is_lost(outcome: Outcome | None) -> bool:
-    return outcome is not None and not outcome.completed
+        yield f"The QP has no solution, and an earlier plan is held, at {listing(phrases)}."
 
 
 def _variations(study: CostStudy) -> Iterator[str]:
@@ -219,7 +207,3 @@ def _two(value: float) -> str:
 def _short(value: float) -> str:
     """Three significant digits, of a number of 1000 and more all before the point."""
     return f"{value:.0f}" if abs(value) >= 1e3 else f"{value:.3g}"
-
-
-def _list(names: Sequence[str]) -> str:
-    return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"

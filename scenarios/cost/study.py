@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 
@@ -13,8 +13,7 @@ from quadsim.flight import metrics
 from quadsim.state import Array
 
 
-@dataclass(frozen=True, kw_only=True)
-class Measure:
+class Measure(NamedTuple):
     """A number that each flight of a study gives: what it is called, and its unit."""
 
     label: str
@@ -22,16 +21,16 @@ class Measure:
 
 
 MEASURES: Final[dict[str, Measure]] = {
-    "tilt_sampled": Measure(label="peak tilt at the samples", unit="deg"),
-    "tilt_plant": Measure(label="peak tilt at the physics rate", unit="deg"),
-    "rmse_x": Measure(label="RMS error x", unit="m"),
-    "rmse_y": Measure(label="RMS error y", unit="m"),
-    "rmse_z": Measure(label="RMS error z", unit="m"),
-    "rmse_yaw": Measure(label="RMS error yaw", unit="deg"),
-    "end_error": Measure(label="largest error at the end", unit="m, rad"),
-    "speed_max": Measure(label="highest rotor speed", unit="rad/s"),
-    "step_max": Measure(label="largest step of a command", unit="rad/s"),
-    "total_variation": Measure(label="total variation of the commands", unit="rad/s"),
+    "tilt_sampled": Measure("peak tilt at the samples", "deg"),
+    "tilt_plant": Measure("peak tilt at the physics rate", "deg"),
+    "rmse_x": Measure("RMS error x", "m"),
+    "rmse_y": Measure("RMS error y", "m"),
+    "rmse_z": Measure("RMS error z", "m"),
+    "rmse_yaw": Measure("RMS error yaw", "deg"),
+    "end_error": Measure("largest error at the end", "m, rad"),
+    "speed_max": Measure("highest rotor speed", "rad/s"),
+    "step_max": Measure("largest step of a command", "rad/s"),
+    "total_variation": Measure("total variation of the commands", "rad/s"),
 }
 """The numbers of a flight, in order.  Tilt is the larger of |roll| and |pitch|, which are bounded one by one."""
 

@@ -11,7 +11,7 @@ import pyarrow as pa
 
 from quadsim.state import Array
 from scenarios.campaign.plan import cell
-from scenarios.campaign.statistics.comparison import EventComparison, compare_events
+from scenarios.campaign.statistics.comparison import compare_events
 from scenarios.campaign.statistics.inference import paired_difference
 from scenarios.campaign.statistics.requirement import judge
 from scenarios.schema.scenario import Scenario
@@ -50,6 +50,9 @@ def summarise(plan: TuningPlan, found: Found, start: pa.Table, best: pa.Table) -
     fresh = [objective_values(plan, table.to_pylist()) for table in (start, best)]
     event = plan.requirement.event
     compared = compare_events({event.text: (event.column(start), event.column(best))})[0]
+    count_start, count_best = compared.counts
+    sentence = f"{compared.event} in {count_best} of {compared.pairs} flights, and in {count_start} of the start's"
+    start_shown, best_shown = _shown(plan, {}), _shown(plan, found.candidates[found.answer.candidate])
     objectives = [
         {
             **objective.model_dump(),
@@ -69,13 +72,16 @@ def summarise(plan: TuningPlan, found: Found, start: pa.Table, best: pa.Table) -
         "trials": len(found.scores) - 1,
         "search_flights": sum(each.flights for each in found.scores),
         "draws": plan.most,
-        "search": [_searched(plan, found, entry.name) for entry in plan.spec.search],
+        "search": [
+            {**entry.model_dump(), "start": start_shown[entry.name], "best": best_shown[entry.name]}
+            for entry in plan.spec.search
+        ],
         "objectives": objectives,
         "fresh": {
             name: {"flights": table.num_rows, "requirement": judge(table, plan.requirement).to_json()}
             for name, table in zip(NAMES, (start, best), strict=True)
         },
-        "event": asdict(compared) | {"sentence": _event_sentence(compared)},
+        "event": asdict(compared) | {"sentence": sentence},
         "front": [each.candidate for each in found.front],
         "importance": {
             objective.name: dict(shares)
@@ -112,19 +118,6 @@ def _gain(search_start: float, search_best: float, start: Array, best: Array, st
         "kept": confirmed,
         "optimism": None if promised is None or confirmed is None else confirmed - promised,
     }
-
-
-def _event_sentence(found: EventComparison) -> str:
-    """How often the requirement's event happened to the start and to the answer."""
-    count_a, count_b = found.counts
-    return f"{found.event} in {count_b} of {found.pairs} flights, and in {count_a} of the start's"
-
-
-def _searched(plan: TuningPlan, found: Found, name: str) -> dict[str, Any]:
-    """A searched field: its range, and what the start and the answer have."""
-    entry = next(each for each in plan.spec.search if each.name == name)
-    best = _shown(plan, found.candidates[found.answer.candidate])
-    return {**entry.model_dump(), "start": _shown(plan, {})[name], "best": best[name]}
 
 
 def _shown(plan: TuningPlan, values: Values) -> dict[str, Any]:

@@ -13,8 +13,16 @@ import pyarrow as pa
 from pydantic import ValidationError
 
 from quadsim.errors import FileError, InputError, ParameterError, UnknownNameError
-from scenarios.campaign.changes import changed, check_ends
-from scenarios.campaign.plan import Plan, cell, column_type, flown_scenario, locate, read_campaign
+from scenarios.campaign.plan import (
+    Plan,
+    cell,
+    changed,
+    check_ends,
+    column_type,
+    flown_scenario,
+    locate,
+    read_campaign,
+)
 from scenarios.campaign.results.events import Event, parse_event
 from scenarios.campaign.spec import Value, VaryBase
 from scenarios.campaign.statistics.requirement import Requirement, parse_requirement

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import math
-import tempfile
 import time as clock
 from collections.abc import Iterable, Mapping
 from contextlib import closing
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
@@ -22,7 +22,7 @@ from scenarios.campaign.engine.protocol import Engine
 from scenarios.campaign.report.campaign_page import write_comparison_report
 from scenarios.campaign.results.store import FLIGHTS_FILE, TIMES_FILE, Store
 from scenarios.campaign.results.table import Row
-from scenarios.campaign.run import FLUSH_S, Standing, Watch, fly_campaign
+from scenarios.campaign.run import Standing, Watch, fly_campaign, put_report
 from scenarios.campaign.statistics.comparison import Comparison, compare
 from scenarios.schema.scenario import Scenario
 from scenarios.tuning.outcome import NAMES, Found, summarise
@@ -144,7 +144,7 @@ class _Flights:
         self._plan, self._engine, self._watch = plan, engine, watch
         self._store = Store(files, plan.schema)
         self._rows: dict[int, Row] = {row["flight"]: row for row in self._store.table().to_pylist()}
-        self._flushed = self._started = clock.perf_counter()
+        self._started = clock.perf_counter()
         self.flown = 0
         per_batch, before = 0, 0
         for flights, candidates in zip(plan.spec.flights, _halving(plan), strict=True):
@@ -158,18 +158,15 @@ class _Flights:
         missing = [number for number in numbers if number not in self._rows]
         if not missing:
             return
-        waiting: list[Row] = []
         try:
             with closing(self._engine.answers(TuningPilot(self._plan, candidates), missing)) as answers:
                 for row in answers:
-                    waiting.append(row)
+                    self._store.add(row)
                     self._rows[row["flight"]] = row
                     self.flown += 1
-                    if clock.perf_counter() - self._flushed > FLUSH_S:
-                        self._flush(waiting)
                     self._report()
         finally:
-            self._flush(waiting)
+            self._store.flush()
 
     def scores(self, candidates: Iterable[int]) -> list[Score]:
         """The scores of candidates that have flown."""
@@ -186,11 +183,6 @@ class _Flights:
     def _of(self, candidate: int) -> list[Row]:
         first = candidate * self._plan.most
         return [self._rows[i] for i in range(first, first + self._plan.most) if i in self._rows]
-
-    def _flush(self, waiting: list[Row]) -> None:
-        self._flushed = clock.perf_counter()
-        self._store.append(waiting)
-        waiting.clear()  # not before: by Ctrl-C it is appended once more, to the same file
 
     def _report(self) -> None:
         rate = self.flown / max(clock.perf_counter() - self._started, 1e-9)
@@ -266,12 +258,8 @@ def _validate(
         write_comparison_report(comparison, files.path / COMPARISON_DIR)
     summary = summarise(plan, found, tables[0], tables[-1])
     files.write({SUMMARY_FILE: to_json(summary).encode()})
-    if report:
-        with tempfile.TemporaryDirectory() as scratch:
-            write_report(Path(scratch), summary=summary, tables=tables, campaigns=folders)
-            files.write({name: (Path(scratch) / name).read_bytes() for name in REPORT_FILES})
-    else:
-        files.remove(REPORT_FILES)
+    write = partial(write_report, summary=summary, tables=tables, campaigns=folders)
+    put_report(files, REPORT_FILES, write if report else None)
     return TuningResult(directory=files.path, best=found.best, table=table, summary=summary, comparison=comparison)
 
 

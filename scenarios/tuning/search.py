@@ -161,7 +161,11 @@ class Search:
 
     def _values(self, trial: FrozenTrial) -> Values:
         """The values of a trial as a scenario has them."""
-        return {entry.name: _value(entry, trial.params[entry.name]) for entry in self._plan.spec.search}
+        values: dict[str, Value] = dict(trial.params)
+        for entry in self._plan.spec.search:
+            if isinstance(entry, ChoiceSpec):
+                values[entry.name] = next(each for each in entry.values if cell(each) == values[entry.name])
+        return {entry.name: values[entry.name] for entry in self._plan.spec.search}
 
     def _start_parameters(self) -> dict[str, Any]:
         """The start as a trial's parameters; none where it is outside of what is searched."""
@@ -184,20 +188,14 @@ class Search:
             self._written = len(self._logs)
 
 
-def _value(entry: SearchSpec, parameter: Any) -> Value:
-    found: Value = parameter
-    return next(value for value in entry.values if cell(value) == found) if isinstance(entry, ChoiceSpec) else found
-
-
 def _distribution(optuna: Any, entry: SearchSpec) -> BaseDistribution:
-    kinds, found = optuna.distributions, None
-    if isinstance(entry, ChoiceSpec):
-        found = kinds.CategoricalDistribution([cell(value) for value in entry.values])
-    elif isinstance(entry, IntegerSpec):
-        found = kinds.IntDistribution(entry.low, entry.high)
-    else:
-        found = kinds.FloatDistribution(entry.low, entry.high, log=isinstance(entry, LogUniformSpec))
-    return found
+    kinds = optuna.distributions
+    match entry:
+        case ChoiceSpec():
+            return kinds.CategoricalDistribution([cell(value) for value in entry.values])
+        case IntegerSpec():
+            return kinds.IntDistribution(entry.low, entry.high)
+    return kinds.FloatDistribution(entry.low, entry.high, log=isinstance(entry, LogUniformSpec))
 
 
 def _read(files: Growing) -> list[Mapping[str, Any]]:

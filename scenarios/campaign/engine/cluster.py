@@ -17,10 +17,10 @@ from typing import Any, Final
 
 from quadsim import __version__
 from quadsim.errors import MissingPackageError, ParameterError
-from scenarios.campaign.digests import code_digest
 from scenarios.campaign.engine.jobs import Jobs, read_jobs, submit
 from scenarios.campaign.engine.protocol import MOST_DEATHS, Answer, EngineError, Pace, Pilot, describe
 from scenarios.campaign.engine.supervisor import SupervisorProcess
+from scenarios.campaign.manifest import code_digest
 from scenarios.campaign.results.table import Row
 
 PATIENCE_S: Final = 60.0

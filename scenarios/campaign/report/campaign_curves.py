@@ -37,42 +37,6 @@ class Histogram:
     counts: dict[str, Array]  # flights in each bin, (B,), by verdict
 
 
-@dataclass(frozen=True, kw_only=True)
-class Association:
-    """How an outcome depends on a varied parameter; p-values are corrected for all tests of the campaign."""
-
-    rho: float  # Spearman's rank correlation
-    p_rho: float
-    xi: float  # Chatterjee's xi, of any dependence
-    p_xi: float
-
-    @property
-    def rho_is_sure(self) -> bool:
-        """Whether the rank correlation is beyond chance."""
-        return self.p_rho < ALPHA
-
-    @property
-    def xi_is_sure(self) -> bool:
-        """Whether the dependence is beyond chance."""
-        return self.p_xi < ALPHA
-
-
-@dataclass(frozen=True, kw_only=True)
-class Driver:
-    """How the outcomes depend on a varied parameter, None where there is none."""
-
-    name: str
-    label: str
-    margin: Association | None
-    failure: Association | None
-
-    @property
-    def weakness(self) -> tuple[float, float]:
-        """What drivers are ordered by, the strongest first: by the margin, or else by failure."""
-        found = self.margin or self.failure
-        return (min(found.p_rho, found.p_xi), -max(abs(found.rho), found.xi)) if found else (2.0, 0.0)
-
-
 def histograms(table: pa.Table) -> list[Histogram]:
     """The main metrics that differ between flights."""
     by_verdict = verdicts(table)
@@ -94,24 +58,20 @@ def histograms(table: pa.Table) -> list[Histogram]:
     return found
 
 
-def drivers(summary: Summary) -> list[Driver]:
-    """The varied parameters on which an outcome may depend at all, the strongest first."""
-    found = [
-        Driver(
-            name=name,
-            label=label(name, parameter["unit"]),
-            margin=_association(parameter.get("worst_margin")),
-            failure=_association(parameter.get("failed")),
-        )
-        for name, parameter in summary["parameters"].items()
-    ]
-    return sorted((one for one in found if one.margin or one.failure), key=lambda driver: driver.weakness)
+def drivers(summary: Summary) -> dict[str, Mapping[str, Any]]:
+    """The entries of the varied parameters on which an outcome may depend at all, the strongest first.
 
+    They are ordered by how `worst_margin` depends on them, or else `failed`.
+    """
+    related = {
+        name: found for name, found in summary["parameters"].items() if found.get("worst_margin") or found.get("failed")
+    }
 
-def _association(found: Mapping[str, Any] | None) -> Association | None:
-    if found is None:
-        return None
-    return Association(rho=found["rho"], p_rho=found["p_holm"], xi=found["xi"], p_xi=found["p_xi_holm"])
+    def weakness(parameter: tuple[str, Mapping[str, Any]]) -> tuple[float, float]:
+        found = parameter[1]["worst_margin"] or parameter[1]["failed"]
+        return min(found["p_holm"], found["p_xi_holm"]), -max(abs(found["rho"]), found["xi"])
+
+    return dict(sorted(related.items(), key=weakness))
 
 
 def sure_splits(summary: Summary) -> Iterator[tuple[str, str, str, Mapping[str, Any]]]:

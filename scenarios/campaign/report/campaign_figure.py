@@ -2,21 +2,23 @@
 
 from __future__ import annotations
 
+import itertools
 import textwrap
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 import pyarrow as pa
 
 from quadsim.report.figures.canvas import new_figure, write_drawings
 from quadsim.report.palette import BOUND, COURSE_COLOUR, LINES
-from scenarios.campaign.report.campaign_curves import Association, convergence_range, drivers, histograms, present
+from scenarios.campaign.report.campaign_curves import convergence_range, drivers, histograms, present
 from scenarios.campaign.report.campaign_text import verdict_sentence
 from scenarios.campaign.results.table import Summary
 from scenarios.campaign.results.verdicts import VERDICTS
 from scenarios.campaign.statistics import scatters
-from scenarios.campaign.statistics.wording import side_by_side
+from scenarios.campaign.statistics.inference import ALPHA
+from scenarios.campaign.statistics.wording import label, side_by_side
 
 if TYPE_CHECKING:
     from matplotlib.artist import Artist
@@ -65,7 +67,7 @@ def _draw(name: str, table: pa.Table, summary: Summary) -> Figure:
 
 def _strongest(found: list[scatters.Cloud], summary: Summary) -> list[scatters.Cloud]:
     """The parameters that correlate most with the outcome, or the first ones where none of them can."""
-    rank = {driver.name: i for i, driver in enumerate(drivers(summary))}
+    rank = {name: i for i, name in enumerate(drivers(summary))}
     return sorted(found, key=lambda cloud: rank.get(cloud.name, len(rank)))[:_MOST_SCATTERS]
 
 
@@ -85,9 +87,7 @@ def _draw_convergence(axes: Axes, summary: Summary) -> None:
     axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if n[-1] < 1000 else (1.0,)))
     axes.xaxis.set_major_formatter("{x:g}")
     axes.xaxis.set_minor_formatter(NullFormatter())
-    axes.set_ylim(*convergence_range(summary, ["failure"]))
-    axes.set_xlabel("flights")
-    axes.set_ylabel("failed [%]")
+    axes.set(ylim=convergence_range(summary, ["failure"]), xlabel="flights", ylabel="failed [%]")
 
 
 def _draw_margins(axes: Axes, table: pa.Table) -> None:
@@ -101,23 +101,15 @@ def _draw_margins(axes: Axes, table: pa.Table) -> None:
     below = np.zeros(drawn.edges.size - 1)
     for verdict in present(table):
         counts = drawn.counts[verdict]
-        axes.bar(
-            drawn.edges[:-1],
-            counts,
-            np.diff(drawn.edges),
-            below,
-            align="edge",
-            color=VERDICTS[verdict].colour,
-            label=verdict,
-        )
+        looks: Any = {"align": "edge", "color": VERDICTS[verdict].colour, "label": verdict}
+        axes.bar(drawn.edges[:-1], counts, np.diff(drawn.edges), below, **looks)
         below += counts
     if drawn.edges[0] <= 0.0 <= drawn.edges[-1]:
         axes.axvline(0.0, color=BOUND, linestyle="--", linewidth=1.1)
     axes.set_ylim(0.0, 1.08 * below.max())
     axes.xaxis.set_major_locator(MaxNLocator(_TICKS, steps=(1, 2, 2.5, 5, 10)))
     axes.yaxis.set_major_locator(MaxNLocator(integer=True))
-    axes.set_xlabel(drawn.label.replace("worst_margin", "worst margin"))
-    axes.set_ylabel("flights")
+    axes.set(xlabel=drawn.label.replace("worst_margin", "worst margin"), ylabel="flights")
     axes.legend(fontsize=8.0)
 
 
@@ -127,38 +119,31 @@ def _draw_drivers(axes: Axes, summary: Summary) -> None:
     from matplotlib.patches import Patch
 
     axes.set_title("which parameters matter", loc="left", fontsize=9.5)
-    strongest = drivers(summary)[:_MOST_DRIVERS]
+    strongest = dict(itertools.islice(drivers(summary).items(), _MOST_DRIVERS))
     if not strongest:
         _note(axes, "nothing to correlate")
         return
-    outcomes = (
-        ("worst margin", LINES[0], -0.2, [driver.margin for driver in strongest]),
-        ("failure", LINES[1], 0.2, [driver.failure for driver in strongest]),
-    )
     keys: list[Artist] = []
-    for outcome, colour, offset, found in outcomes:
-        if any(found):
-            keys.append(Patch(color=colour, label=outcome))
-        for row, one in enumerate(found):
-            if one is not None:
-                _draw_association(axes, row + offset, one, colour)
+    for text, outcome, colour, offset in (
+        ("worst margin", "worst_margin", LINES[0], -0.2),
+        ("failure", "failed", LINES[1], 0.2),
+    ):
+        found = {row: each[outcome] for row, each in enumerate(strongest.values()) if each[outcome]}
+        if found:
+            keys.append(Patch(color=colour, label=text))
+        for row, one in found.items():
+            axes.barh(row + offset, one["rho"], 0.38, color=colour, alpha=1.0 if one["p_holm"] < ALPHA else 0.35)
+            inside = colour if one["p_xi_holm"] < ALPHA else "white"
+            looks: Any = {"markeredgecolor": "#1c1e21", "markersize": 4.0, "markeredgewidth": 0.7, "zorder": 3}
+            axes.plot(one["xi"], row + offset, "D", color=inside, **looks)
     diamond = Line2D([], [], marker="D", color="#1c1e21", linestyle="none", markersize=4.0, label="xi: any dependence")
     keys += [Patch(color="#c9ccd1", label="rank correlation"), diamond]
     axes.axvline(0.0, color="#5b6067", linewidth=0.8)
-    axes.set_xlim(-1.04, 1.04)
-    axes.set_ylim(len(strongest) - 0.4, -0.6)
-    axes.set_yticks(range(len(strongest)), [driver.label for driver in strongest])
+    axes.set(xlim=(-1.04, 1.04), ylim=(len(strongest) - 0.4, -0.6))
+    axes.set_yticks(range(len(strongest)), [label(name, found["unit"]) for name, found in strongest.items()])
     axes.grid(axis="y", visible=False)
     axes.set_xlabel("pale, hollow: not beyond chance (5 %, Holm over all tests)")
     axes.legend(handles=keys, fontsize=8.0)
-
-
-def _draw_association(axes: Axes, row: float, found: Association, colour: str) -> None:
-    axes.barh(row, found.rho, 0.38, color=colour, alpha=1.0 if found.rho_is_sure else 0.35)
-    inside = colour if found.xi_is_sure else "white"
-    axes.plot(
-        *(found.xi, row, "D"), color=inside, markeredgecolor="#1c1e21", markersize=4.0, markeredgewidth=0.7, zorder=3
-    )
 
 
 def _draw_scatter(axes: Axes, table: pa.Table, cloud: scatters.Cloud, drawn: scatters.Margins) -> None:
@@ -187,13 +172,10 @@ def _draw_scatter(axes: Axes, table: pa.Table, cloud: scatters.Cloud, drawn: sca
     axes.xaxis.set_major_locator(MaxNLocator(_TICKS, steps=(1, 2, 2.5, 5, 10)))
     if cloud.names:
         axes.set_xticks(range(len(cloud.names)), side_by_side(cloud.names, _TICK_ROOM))
-    axes.set_ylim(*drawn.ends)
-    axes.set_ylabel("worst margin")
-    axes.set_xlabel(cloud.label)
+    axes.set(ylim=drawn.ends, ylabel="worst margin", xlabel=cloud.label)
 
 
 def _note(axes: Axes, what: str) -> None:
     """An empty panel, and why it is so."""
     axes.text(0.5, 0.5, what, transform=axes.transAxes, ha="center", va="center", color="#5b6067")
-    axes.set_xticks([])
-    axes.set_yticks([])
+    axes.set(xticks=[], yticks=[])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import html
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Final
 
@@ -12,10 +12,7 @@ import pyarrow as pa
 
 from quadsim.report.palette import BOUND, COURSE_COLOUR, LINES, REFERENCE
 from quadsim.report.plots.panels import BOTTOM, TOP, Plot, finished, finished_panels, panels, place
-from quadsim.state import Array
 from scenarios.campaign.report.campaign_curves import (
-    Association,
-    Driver,
     Histogram,
     convergence_range,
     converging,
@@ -26,11 +23,12 @@ from scenarios.campaign.report.campaign_curves import (
 from scenarios.campaign.results.table import Rows, Summary, numbers
 from scenarios.campaign.results.verdicts import VERDICTS
 from scenarios.campaign.statistics.comparison import Comparison
+from scenarios.campaign.statistics.inference import ALPHA
 from scenarios.campaign.statistics.scatters import COURSE, Cloud, Margins, clouds, edges, margins, shown_flights
-from scenarios.campaign.statistics.wording import side_by_side
+from scenarios.campaign.statistics.wording import label, side_by_side
 
 if TYPE_CHECKING:
-    from plotly.graph_objects import Bar, Scatter
+    from plotly.graph_objects import Scatter
 
 OUTCOMES: Final = {"with the worst margin": LINES[0], "with failure": LINES[1]}
 _LOG_TICKS: Final = [float(digit * 10**power) for power in range(7) for digit in (1, 2, 5)]
@@ -61,12 +59,13 @@ def _convergence(summary: Summary) -> Plot:
     figure = panels(list(events.values()), shared=False)
     curves = summary["convergence"]
     n = np.asarray(curves["flights"], float)
+    pale = f"rgba({','.join(str(int(LINES[0][i : i + 2], 16)) for i in (1, 3, 5))},0.22)"
     around = np.concatenate([n, n[::-1]])
     ends = convergence_range(summary, list(events))
     for panel, event in enumerate(events):
         share, lower, upper = (100.0 * np.asarray(curves[event][key]) for key in ("share", "lower", "upper"))
         band = np.concatenate([upper, lower[::-1]])
-        filled = {"fill": "toself", "fillcolor": _faded(LINES[0], 0.22), "line": {"width": 0}}
+        filled = {"fill": "toself", "fillcolor": pale, "line": {"width": 0}}
         figure.add_trace(Scatter(x=around, y=band, mode="lines", hoverinfo="skip", **filled), **place(panel))
         figure.add_trace(
             Scatter(
@@ -125,18 +124,43 @@ def _histograms(drawn: list[Histogram], keys: tuple[tuple[str, str], ...]) -> Pl
     return replace(plot, key_colours=keys)
 
 
-def _drivers(strongest: list[Driver]) -> Plot:
+def _drivers(strongest: Mapping[str, Mapping[str, Any]]) -> Plot:
     """Rank correlations as bars, and the measure of any dependence as diamonds over them."""
-    from plotly.graph_objects import Figure
+    from plotly.graph_objects import Bar, Figure, Scatter
 
-    names = [html.escape(driver.label) for driver in strongest]
+    names = [html.escape(label(name, found["unit"])) for name, found in strongest.items()]
     figure = Figure()
     keys = []
-    for (outcome, colour), offset in zip(OUTCOMES.items(), (-0.19, 0.19), strict=True):
-        found = [driver.margin if outcome == "with the worst margin" else driver.failure for driver in strongest]
-        if any(found):
-            keys.append((outcome, colour))
-            figure.add_traces([*_measures(names, found, outcome, colour, offset)])
+    for (text, colour), outcome, offset in zip(
+        OUTCOMES.items(), ("worst_margin", "failed"), (-0.19, 0.19), strict=True
+    ):
+        found = {row: each[outcome] for row, each in enumerate(strongest.values()) if each[outcome]}
+        if not found:
+            continue
+        keys.append((text, colour))
+        shared = {"customdata": [names[i] for i in found], "name": text, "y": [i + offset for i in found]}
+        figure.add_trace(
+            Bar(
+                x=[one["rho"] for one in found.values()],
+                orientation="h",
+                width=0.36,
+                marker={"color": colour, "opacity": [1.0 if one["p_holm"] < ALPHA else 0.35 for one in found.values()]},
+                hovertemplate="%{customdata}, %{fullData.name}: rank correlation %{x:.3f}<extra></extra>",
+                **shared,
+            )
+        )
+        figure.add_trace(
+            Scatter(
+                x=[one["xi"] for one in found.values()],
+                mode="markers",
+                marker={
+                    **{"color": colour, "size": 10, "line": {"color": "white", "width": 1}},
+                    "symbol": ["diamond" if one["p_xi_holm"] < ALPHA else "diamond-open" for one in found.values()],
+                },
+                hovertemplate="%{customdata}, %{fullData.name}: xi %{x:.3f}<extra></extra>",
+                **shared,
+            )
+        )
     figure.update_xaxes(
         range=[-1.04, 1.04],
         title={"text": "bars: rank correlation; diamonds: xi, of any dependence", "standoff": 6},
@@ -149,41 +173,6 @@ def _drivers(strongest: list[Driver]) -> Plot:
     return replace(plot, key_colours=tuple(keys))
 
 
-def _measures(
-    names: list[str], found: Sequence[Association | None], outcome: str, colour: str, offset: float
-) -> Iterator[Bar | Scatter]:
-    """Both measures of each varied parameter with one outcome, its bars so far beside the middle of its line."""
-    from plotly.graph_objects import Bar, Scatter
-
-    rows = [i for i, one in enumerate(found) if one]
-    there = [one for one in found if one]
-    shared = {"customdata": [names[i] for i in rows], "name": outcome, "y": [i + offset for i in rows]}
-    yield Bar(
-        x=[one.rho for one in there],
-        orientation="h",
-        width=0.36,
-        marker={"color": colour, "opacity": [1.0 if one.rho_is_sure else 0.35 for one in there]},
-        hovertemplate="%{customdata}, %{fullData.name}: rank correlation %{x:.3f}<extra></extra>",
-        **shared,
-    )
-    yield Scatter(
-        x=[one.xi for one in there],
-        mode="markers",
-        marker={
-            **{"color": colour, "size": 10, "line": {"color": "white", "width": 1}},
-            "symbol": ["diamond" if one.xi_is_sure else "diamond-open" for one in there],
-        },
-        hovertemplate="%{customdata}, %{fullData.name}: xi %{x:.3f}<extra></extra>",
-        **shared,
-    )
-
-
-def _faded(colour: str, opacity: float) -> str:
-    """A colour of the palette as rgba, as plotly needs to fill an area."""
-    red, green, blue = (int(colour[i : i + 2], 16) for i in (1, 3, 5))
-    return f"rgba({red},{green},{blue},{opacity})"
-
-
 def verdict_keys(table: pa.Table) -> tuple[tuple[str, str], ...]:
     """The verdicts that occur, with their colours."""
     return tuple((verdict, VERDICTS[verdict].colour) for verdict in present(table))
@@ -191,6 +180,8 @@ def verdict_keys(table: pa.Table) -> tuple[tuple[str, str], ...]:
 
 def scatter_plot(table: pa.Table, parameters: list[Cloud], drawn: Margins) -> Plot:
     """The worst margin over each varied parameter, with its course."""
+    from plotly.graph_objects import Scatter
+
     keys = verdict_keys(table)
     figure = panels([html.escape(cloud.label) for cloud in parameters], shared=False)
     shown = shown_flights(table)
@@ -201,7 +192,17 @@ def scatter_plot(table: pa.Table, parameters: list[Cloud], drawn: Margins) -> Pl
                 figure.add_trace(trace, **place(panel))
         figure.add_hline(0.0, line={"color": BOUND, "width": 1.2, "dash": "dash"}, **place(panel))
         if cloud.course is not None:
-            figure.add_trace(_course(cloud.course.x, cloud.course.y), **place(panel))
+            figure.add_trace(
+                Scatter(
+                    x=cloud.course.x.astype(np.float32),
+                    y=cloud.course.y.astype(np.float32),
+                    mode="lines",
+                    name=COURSE,
+                    line={"color": COURSE_COLOUR, "width": 2.5},
+                    hovertemplate=f"{COURSE} %{{y:.3g}}<extra></extra>",
+                ),
+                **place(panel),
+            )
         if cloud.names:
             parts = [html.escape(name).replace("\n", "<br>") for name in side_by_side(cloud.names, _TICK_ROOM)]
             figure.update_xaxes(tickvals=list(range(len(parts))), ticktext=parts, **place(panel))
@@ -247,19 +248,6 @@ def _points(
             },
             hovertemplate=f"flight %{{customdata[0]}}: %{{fullData.name}}<br>{over}margin %{{text}}<extra></extra>",
         )
-
-
-def _course(x: Array, y: Array) -> Scatter:
-    from plotly.graph_objects import Scatter
-
-    return Scatter(
-        x=x.astype(np.float32),
-        y=y.astype(np.float32),
-        mode="lines",
-        name=COURSE,
-        line={"color": COURSE_COLOUR, "width": 2.5},
-        hovertemplate=f"{COURSE} %{{y:.3g}}<extra></extra>",
-    )
 
 
 def comparison_margins_plot(comparison: Comparison) -> Plot | None:

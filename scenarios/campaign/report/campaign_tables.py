@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, Final
 
 from quadsim.report.table import ABSENT, Cell, Grid, Mark, format_number, line
-from scenarios.campaign.report.campaign_curves import Association, drivers, sure_splits
+from scenarios.campaign.report.campaign_curves import drivers, sure_splits
 from scenarios.campaign.results.table import Summary
 from scenarios.campaign.results.verdicts import HARMLESS
 from scenarios.campaign.statistics.inference import ALPHA
@@ -167,7 +167,8 @@ def _shares(found: Mapping[str, Any]) -> tuple[str, str]:
 def driver_table(summary: Summary) -> Grid:
     """How the worst margin and failure depend on each varied parameter."""
     lines = (
-        line(driver.label, *_association(driver.margin), *_association(driver.failure)) for driver in drivers(summary)
+        line(label(name, found["unit"]), *_association(found["worst_margin"]), *_association(found["failed"]))
+        for name, found in drivers(summary).items()
     )
     return Grid(
         key="drivers-table",
@@ -253,10 +254,7 @@ def level_tables(summary: Summary) -> list[Grid]:
         if found["kind"] == "number" or not found["levels"]:
             continue
         lines = tuple(
-            line(
-                *(level, f"{share['count']} of {share['flights']}"),
-                *(percent(share["share"]), interval(share["lower"], share["upper"])),
-            )
+            line(level, f"{share['count']} of {share['flights']}", *_shares(share))
             for level, share in found["levels"].items()
         )
         head = (name, "failed", "share", f"{100.0 * summary['confidence']:g} % interval")
@@ -264,14 +262,14 @@ def level_tables(summary: Summary) -> list[Grid]:
     return grids
 
 
-def _association(found: Association | None) -> tuple[Cell, ...]:
+def _association(found: Mapping[str, Any] | None) -> tuple[Cell, ...]:
     if found is None:
         return line(*[ABSENT] * 4)
     return line(
-        Cell(text=f"{found.rho:+.2f}", mark=Mark.BEST if found.rho_is_sure else Mark.NONE),
-        p_value(found.p_rho),
-        Cell(text=f"{found.xi:.2f}", mark=Mark.BEST if found.xi_is_sure else Mark.NONE),
-        p_value(found.p_xi),
+        Cell(text=f"{found['rho']:+.2f}", mark=Mark.BEST if found["p_holm"] < ALPHA else Mark.NONE),
+        p_value(found["p_holm"]),
+        Cell(text=f"{found['xi']:.2f}", mark=Mark.BEST if found["p_xi_holm"] < ALPHA else Mark.NONE),
+        p_value(found["p_xi_holm"]),
     )
 
 

@@ -7,6 +7,7 @@ Rows are appended as files of their own below `parts/`.  When all is flown the p
 from __future__ import annotations
 
 import io
+import time as clock
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
@@ -26,6 +27,7 @@ _FILLED: Final = _NEEDED[:6]
 LARGEST: Final = 1e100  # magnitude of the largest number that a flight has; sums of squares of larger ones are infinite
 FLIGHTS_FILE: Final = "flights.parquet"
 TIMES_FILE: Final = "timing.parquet"
+FLUSH_S: Final = 5.0  # how long an answer may wait in memory before it is on the disk [s]
 PARTS_DIR: Final = "parts"
 _PART: Final = "part-*.parquet"
 
@@ -80,6 +82,8 @@ class Store:
 
     def __init__(self, files: Growing, schema: pa.Schema) -> None:
         self._files, self._directory, self._schema = files, files.path, schema
+        self._waiting: list[Row] = []
+        self._flushed = clock.perf_counter()
 
     def table(self) -> pa.Table:
         """All flights that are there, each once, sorted.
@@ -102,6 +106,18 @@ class Store:
         """Flights of the final table that is there; 0 where there is none."""
         path = self._directory / FLIGHTS_FILE
         return read_table(path).num_rows if path.is_file() else 0
+
+    def add(self, row: Row) -> None:
+        """Add a row, which may wait in memory until `flush`, though not for long."""
+        self._waiting.append(row)
+        if clock.perf_counter() - self._flushed > FLUSH_S:
+            self.flush()
+
+    def flush(self) -> None:
+        """Append the rows that wait."""
+        self._flushed = clock.perf_counter()
+        self.append(self._waiting)
+        self._waiting = []  # not before: by Ctrl-C it is appended once more, to the same file
 
     def append(self, rows: Sequence[Row]) -> None:
         """Add rows in one step.

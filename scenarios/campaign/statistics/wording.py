@@ -44,9 +44,11 @@ def count_of(count: int, thing: str) -> str:
     return f"{count} {thing}{'' if count == 1 else 's'}"
 
 
-def listing(names: Sequence[str], most: int) -> str:
+def listing(names: Sequence[str], most: int | None = None) -> str:
     """Names in a sentence, `a, b and c`, the last of too many as a count: `a, b and 7 others`."""
-    shown = list(names) if len(names) <= most else [*names[: most - 1], f"{len(names) - most + 1} others"]
+    shown = (
+        list(names) if most is None or len(names) <= most else [*names[: most - 1], f"{len(names) - most + 1} others"]
+    )
     return " and ".join(filter(None, [", ".join(shown[:-1]), shown[-1]]))
 
 

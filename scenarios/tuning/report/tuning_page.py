@@ -48,6 +48,7 @@ def write_report(
     """
     write_tuning_figure(summary, tables, directory)
     plots = tuning_plots(summary, tables)
+    good = Mark.NONE if summary["answer"] == START else Mark.GOOD
     pages = {f"{folder}/index.html": f"fresh flights, {folder}" for folder in campaigns}
     if summary["answer"] != START:
         pages["comparison/index.html"] = "their comparison"
@@ -58,7 +59,7 @@ def write_report(
         title=summary["tuning"],
         description=summary["description"],
         verdict=tuning_tables.verdict_sentence(summary),
-        mark=_mark(summary),
+        mark=good if summary["fresh"]["best"]["requirement"]["holds"] else Mark.BAD,
         sentences=tuning_tables.sentences(summary),
         objectives=tuning_tables.objective_table(summary),
         values=tuning_tables.values_table(summary),
@@ -71,9 +72,3 @@ def write_report(
     )
     write_text(directory / PAGE_FILE, page)
     return directory / PAGE_FILE
-
-
-def _mark(summary: tuning_tables.Summary) -> Mark:
-    if not summary["fresh"]["best"]["requirement"]["holds"]:
-        return Mark.BAD
-    return Mark.NONE if summary["answer"] == START else Mark.GOOD

@@ -75,12 +75,8 @@ def values_table(summary: Summary) -> Grid:
             line(label(entry["name"], entry["unit"]), fields, f"{ends}{how} {times}".strip(), _value(entry["start"]),
                  _value(entry["best"]))
         )  # fmt: skip
-    return Grid(
-        key="values",
-        title="What was searched",
-        head=("name", "fields", "range", "start", "best"),
-        lines=tuple(lines),
-    )
+    head = ("name", "fields", "range", "start", "best")
+    return Grid(key="values", title="What was searched", head=head, lines=tuple(lines))
 
 
 def objective_table(summary: Summary) -> Grid:

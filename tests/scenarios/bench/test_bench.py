@@ -203,7 +203,7 @@ def test_wrong_answers_and_failures_are_seen(constrained_flight: Flight) -> None
     for period in periods:
         candidate.prepare(period)
         candidate.answer()
-    assert judge(candidate, queries, periods, reference).failures == 0
+    assert judge(candidate, queries, periods, reference)["failures"] == 0
 
     command, answer = candidate.answers[1]
     assert command is not None
@@ -214,11 +214,11 @@ def test_wrong_answers_and_failures_are_seen(constrained_flight: Flight) -> None
     candidate.answers[2] = (candidate.answers[2][0], off)
     candidate.answers[3] = (None, answer._replace(solution=answer.solution._replace(status="numerics")))
     verdict = judge(candidate, queries, periods, reference)
-    assert verdict.input_error == pytest.approx(1.0, abs=1e-3)
-    assert verdict.kkt is not None
-    assert verdict.kkt > 0.5
-    assert verdict.failures == 1
-    assert verdict.statuses == {"numerics": 1, "solved": 3}
+    assert verdict["input_error"] == pytest.approx(1.0, abs=1e-3)
+    assert verdict["kkt"] is not None
+    assert verdict["kkt"] > 0.5
+    assert verdict["failures"] == 1
+    assert verdict["statuses"] == {"numerics": 1, "solved": 3}
 
 
 def test_growth_is_fitted_over_the_long_horizons() -> None:
