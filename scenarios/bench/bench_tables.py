@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from typing import Final
 
 from quadsim.report.table import ABSENT, Cell, Grid, Mark, line
 from scenarios.bench.bench_results import (
     FITTED_FROM,
-    CandidateResult,
     FlightProfile,
-    Growth,
     RenderProfile,
     SolverBench,
     StageLength,
@@ -70,60 +68,64 @@ def render_tables(profile: RenderProfile) -> list[Grid]:
 
 
 def _candidates(bench: SolverBench) -> Grid:
-    quantiles = ("p50", "p95", "p99", "max")
-    fastest = {name: min(candidate.quantiles[name] for candidate in bench.candidates) for name in quantiles}
+    names = ("p50", "p95", "p99", "max")
+    fastest = {name: min(candidate.quantiles[name] for candidate in bench.candidates) for name in names}
+    lines = []
+    for each in bench.candidates:
+        quantiles = each.quantiles
+        marks = {name: Mark.BEST if value == fastest[name] else Mark.NONE for name, value in quantiles.items()}
+        lines.append(
+            line(
+                f"{each.name} (default)" if each is bench.default else each.name,
+                *(Cell(text=_milliseconds(value), mark=marks[name]) for name, value in quantiles.items()),
+                _milliseconds(each.raw_max_ms),
+                f"{quantiles['p99'] / bench.default.quantiles['p99']:.3g}",
+                Cell(text=str(each.failures), mark=Mark.BAD if each.failures else Mark.NONE),
+                *(ABSENT if value is None else f"{value:.0e}" for value in (each.input_error, each.kkt)),
+                f"{each.repeats}x",
+            )
+        )
     return Grid(
         key="candidates",
         title="The candidates",
-        head=("whole step [ms]", *quantiles, *("raw max", "p99 ratio", "failures", "u0 error", "KKT", "timed")),
-        lines=tuple(_candidate(candidate, bench, fastest) for candidate in bench.candidates),
+        head=("whole step [ms]", *names, *("raw max", "p99 ratio", "failures", "u0 error", "KKT", "timed")),
+        lines=tuple(lines),
         note=_how(bench),
-    )
-
-
-def _candidate(candidate: CandidateResult, bench: SolverBench, fastest: dict[str, float]) -> tuple[Cell, ...]:
-    quantiles, failures = candidate.quantiles, candidate.failures
-    marks = {name: Mark.BEST if value == fastest[name] else Mark.NONE for name, value in quantiles.items()}
-    return line(
-        f"{candidate.name} (default)" if candidate is bench.default else candidate.name,
-        *(Cell(text=_milliseconds(value), mark=marks[name]) for name, value in quantiles.items()),
-        _milliseconds(candidate.raw_max_ms),
-        f"{quantiles['p99'] / bench.default.quantiles['p99']:.3g}",
-        Cell(text=str(failures), mark=Mark.BAD if failures else Mark.NONE),
-        *map(_residual, (candidate.input_error, candidate.kkt)),
-        f"{candidate.repeats}x",
     )
 
 
 def _how(bench: SolverBench) -> str:
     which = "All" if bench.asked == bench.flown else f"{bench.asked} of the"
+    ways = sorted(bench.default.ways.items(), key=lambda pair: -pair[1])
+    shares = ", ".join(f"by {way} {count}" for way, count in ways)
     text = (
         f"{which} {bench.flown} control periods of `{bench.scenario}`, N = {bench.horizon}, timed as a flight "
         "sees them: between two steps the plant flies a period, and each is the median of its repeats; raw max is the "
         "longest of all steps, the machine's stalls included. One process, one thread; "
         "candidates take their turns in random order. Failures are periods without an optimum. Over the others, u0 "
         "error [rad/s] is the largest of the first input, from an optimum in closed form whose own KKT residual is at "
-        f"most {bench.reference_kkt:.0e}, and KKT the worst residual of the candidate's answer to its own QP. "
-        f"{_shares(bench.default)}"
-    ).rstrip()
-    return " ".join([text, *(f"Left out: {name}, {why}." for name, why in bench.left_out.items())])
-
-
-def _shares(candidate: CandidateResult) -> str:
-    """Which of its periods a candidate with shortcuts answered how."""
-    phrase = ", ".join(f"by {way} {count}" for way, count in sorted(candidate.ways.items(), key=lambda pair: -pair[1]))
-    return f"Periods that the default answered {phrase}. " if candidate.shortcut else ""
+        f"most {bench.reference_kkt:.0e}, and KKT the worst residual of the candidate's answer to its own QP."
+    )
+    answered = [f"Periods that the default answered {shares}."] if bench.default.shortcut else []
+    return " ".join([text, *answered, *(f"Left out: {name}, {why}." for name, why in bench.left_out.items())])
 
 
 def _growth(bench: SolverBench) -> Grid:
     horizons = sorted({N for growth in bench.growth for N in growth.horizons})
-    head = ("p50 / p99 of the whole step [ms]", *(f"N = {N}" for N in horizons), "growth")
-    dropped = dict.fromkeys(f"{growth.name}: {growth.dropped}" for growth in bench.growth if growth.dropped)
+    lines = []
+    for growth in bench.growth:
+        times = dict(zip(growth.horizons, zip(growth.p50, growth.p99, strict=True), strict=True))
+        pairs = [" / ".join(map(_milliseconds, times[N])) if N in times else ABSENT for N in horizons]
+        exponents = [growth.exponent(name) for name in ("p50", "p99")]
+        fitted = [f"{exponent:.2f}" for exponent in exponents if exponent is not None]
+        lines.append(line(growth.label, *pairs, " / ".join(fitted) or ABSENT))
     failed = dict.fromkeys(
         f"{growth.name}: " + ", ".join(f"{count} at N = {N}" for N, count in growth.failures.items())
         for growth in bench.growth
         if growth.failures
     )
+    dropped = dict.fromkeys(f"{growth.name}: {growth.dropped}" for growth in bench.growth if growth.dropped)
+    listed = {"Periods without an optimum": failed, "Dropped": dropped}
     note = (
         f"{bench.growth_asked} control periods at each N, the problem and its reference made anew; at N = "
         f"{bench.horizon} those of the candidates' table; growth: the exponents of N that fit p50 and p99 from N = "
@@ -132,23 +134,10 @@ def _growth(bench: SolverBench) -> Grid:
     return Grid(
         key="growth",
         title="Growth with the horizon",
-        head=head,
-        lines=tuple(_growth_line(growth, horizons) for growth in bench.growth),
-        note=" ".join([note, *_listed("Periods without an optimum", failed), *_listed("Dropped", dropped)]),
+        head=("p50 / p99 of the whole step [ms]", *(f"N = {N}" for N in horizons), "growth"),
+        lines=tuple(lines),
+        note=" ".join([note, *(f"{what}: {'; '.join(entries)}." for what, entries in listed.items() if entries)]),
     )
-
-
-def _listed(what: str, entries: Iterable[str]) -> list[str]:
-    phrase = "; ".join(entries)
-    return [f"{what}: {phrase}."] if phrase else []
-
-
-def _growth_line(growth: Growth, horizons: Sequence[int]) -> tuple[Cell, ...]:
-    times = dict(zip(growth.horizons, zip(growth.p50, growth.p99, strict=True), strict=True))
-    pairs = [" / ".join(map(_milliseconds, times[N])) if N in times else ABSENT for N in horizons]
-    exponents = [growth.exponent(name) for name in ("p50", "p99")]
-    fitted = [f"{exponent:.2f}" for exponent in exponents if exponent is not None]
-    return line(growth.label, *pairs, " / ".join(fitted) or ABSENT)
 
 
 def _stages(stages: Sequence[StageLength]) -> Grid:
@@ -184,10 +173,6 @@ def targets_table(title: str, targets: Sequence[Target]) -> Grid:
 def _milliseconds(value: float) -> str:
     """Three digits: a step takes from 20 microseconds to a second."""
     return f"{value:.3g}" if value < 100.0 else f"{value:.0f}"
-
-
-def _residual(value: float | None) -> str:
-    return ABSENT if value is None else f"{value:.0e}"
 
 
 def solver_targets(bench: SolverBench) -> list[Target]:

@@ -17,7 +17,7 @@ from quadsim.flight import metrics
 from quadsim.flight.log import ControlLog, FlightLog
 from quadsim.state import REFERENCE_STATES
 from scenarios.bench.queries import QueriedController, flight_between, recorded
-from scenarios.bench.timing import segments, time_in_turns
+from scenarios.bench.timing import StepTimes, segments, time_in_turns
 from scenarios.bench.worker_pool import answer_all
 from scenarios.build import build_controller, build_problem
 from scenarios.cost.study import CandidateTimes, Outcome
@@ -176,16 +176,8 @@ def time_candidates(
     requested = {
         name: QueriedController(each, recorded(scenario, log, problem.horizon)) for name, each in controllers.items()
     }
-    with flight_between(scenario, vehicle) as between:
-        laps = time_in_turns(
-            requested,
-            segments(log.t.size, 1),
-            between=between,
-            repeats=REPEATS,
-            rng=np.random.default_rng(scenario.seed),
-            longest_pass=LONGEST_PASS,
-            progress=lambda done, total: progress("steps", done, total),
-        )
+    report = functools.partial(progress, "steps")
+    laps = _timed(scenario, requested, segments(log.t.size, 1), longest_pass=LONGEST_PASS, progress=report)
     candidates = (
         CandidateTimes(
             name=name,
@@ -196,6 +188,14 @@ def time_candidates(
         for name, each in requested.items()
     )
     return tuple(candidates), left_out
+
+
+def _timed(
+    scenario: Scenario, candidates: Mapping[str, QueriedController], chosen: Sequence[range], **options: Any
+) -> dict[str, StepTimes]:
+    with flight_between(scenario, build_vehicle(scenario)) as between:
+        rng = np.random.default_rng(scenario.seed)
+        return time_in_turns(candidates, chosen, between=between, repeats=REPEATS, rng=rng, **options)
 
 
 def time_flights(
@@ -210,17 +210,9 @@ def time_flights(
     for done, (name, scenario) in enumerate(wanted.items()):
         log = flown[name].control
         if log.t.size:
-            vehicle = build_vehicle(scenario)
-            controller = build_controller(scenario, vehicle)
+            controller = build_controller(scenario, build_vehicle(scenario))
             candidate = QueriedController(controller, recorded(scenario, log, controller.horizon))
-            with flight_between(scenario, vehicle) as between:
-                laps = time_in_turns(
-                    {controller.name: candidate},
-                    segments(log.t.size, SWEEP_STRIDE),
-                    between=between,
-                    repeats=REPEATS,
-                    rng=np.random.default_rng(scenario.seed),
-                )
-            timed[name] = metrics.percentiles(laps[controller.name].median)
+            laps = _timed(scenario, {name: candidate}, segments(log.t.size, SWEEP_STRIDE))
+            timed[name] = metrics.percentiles(laps[name].median)
         progress("sweeps", done + 1, len(wanted))
     return timed

@@ -5,7 +5,7 @@ from __future__ import annotations
 import ast
 import math
 import operator
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
@@ -35,13 +35,9 @@ STATISTICS: Final[dict[str, Callable[[Array], float]]] = {
 class Expression:
     """Arithmetic on the columns of a flight's row; see `parse_expression`."""
 
-    def __init__(self, text: str, tree: ast.expr) -> None:
+    def __init__(self, text: str, tree: ast.expr, columns: set[str]) -> None:
         self.text, self._tree = text, tree
-
-    @property
-    def columns(self) -> set[str]:
-        """Those that it names."""
-        return set(_columns(self._tree))
+        self.columns = columns  # that it names
 
     def value(self, row: Mapping[str, Any]) -> float:
         """Its value in one flight; NaN where the flight has no such number, or the value is not finite."""
@@ -62,8 +58,7 @@ def parse_expression(text: str) -> Expression:
         tree = ast.parse(text.strip(), mode="eval").body
     except (SyntaxError, ValueError, RecursionError, MemoryError) as error:
         raise InputError(f"must be arithmetic on columns, such as 'rmse.x + rmse.y'; got {text!r}") from error
-    _check(tree, text)
-    return Expression(text, tree)
+    return Expression(text, tree, set(_columns(tree, text)))
 
 
 def require_columns(expression: Expression, columns: Mapping[str, pa.DataType]) -> None:
@@ -78,26 +73,27 @@ def require_columns(expression: Expression, columns: Mapping[str, pa.DataType]) 
             raise UnknownNameError("column of numbers", name, known)
 
 
-def _check(node: ast.AST, text: str) -> None:
-    """Refuse all that is no arithmetic."""
+def _columns(node: ast.AST, text: str) -> Iterator[str]:
+    """The columns that are named in what is arithmetic; all else is refused."""
     match node:
         case ast.Constant(value=bool() | str() | bytes() | None):
             pass
-        case ast.Constant(value=int() | float()) | ast.Name():
+        case ast.Constant(value=int() | float()):
             return
-        case ast.Attribute() if _dotted(node) is not None:
+        case ast.Name() | ast.Attribute() if (name := _dotted(node)) is not None:
+            yield name
             return
         case ast.BinOp(left, kind, right) if type(kind) in _OPERATIONS:
-            _check(left, text)
-            _check(right, text)
+            yield from _columns(left, text)
+            yield from _columns(right, text)
             return
         case ast.UnaryOp(ast.USub() | ast.UAdd(), operand):
-            _check(operand, text)
+            yield from _columns(operand, text)
             return
         case ast.Call(ast.Name(name), [_, *_] as arguments, []) if name in _FUNCTIONS:
             if (name in ("min", "max")) == (len(arguments) > 1):
                 for argument in arguments:
-                    _check(argument, text)
+                    yield from _columns(argument, text)
                 return
     rule = f"columns, numbers, + - * / ** and {', '.join(_FUNCTIONS)}"
     raise InputError(f"must be made of {rule}; got {ast.unparse(node)!r} in {text!r}")
@@ -115,13 +111,6 @@ def _evaluate(node: ast.AST, row: Mapping[str, Any]) -> Any:
         case ast.Call(ast.Name(name), arguments):
             return _FUNCTIONS[name](*(_evaluate(argument, row) for argument in arguments))
     return row[_dotted(node) or ""]
-
-
-def _columns(node: ast.AST) -> list[str]:
-    if isinstance(node, ast.Name | ast.Attribute):
-        return [_dotted(node) or ""]
-    inner = node.args if isinstance(node, ast.Call) else list(ast.iter_child_nodes(node))
-    return [name for each in inner for name in _columns(each)]
 
 
 def _dotted(node: ast.AST) -> str | None:

@@ -61,10 +61,6 @@ def tilt_bound(scenario: Scenario) -> float:
     return bound
 
 
-def _paper(spec: ConstrainedSpec, condition: Condition, period: float) -> ConstrainedSpec:
-    return spec
-
-
 def _robust(*, modelled: bool = True, **parts: Any) -> Callable[[ConstrainedSpec, Condition, float], RobustSpec]:
     """The robust controller with soft bounds, with or without a model of lag, delay and heading, and other parts."""
 
@@ -114,7 +110,9 @@ def _speeds_alone(spec: ConstrainedSpec) -> InputBoundsSpec:
 
 
 VARIANTS: Final = {
-    "paper": ControllerVariant("the paper's constrained MPC, hard bounds, no fallback", _paper),
+    "paper": ControllerVariant(
+        "the paper's constrained MPC, hard bounds, no fallback", lambda spec, condition, period: spec
+    ),
     "soft": ControllerVariant(
         f"soft bounds on tilt, input weight {INPUT_WEIGHT:g}, move weight {MOVE_WEIGHT:g}; guarded, as are those that "
         "build on it",

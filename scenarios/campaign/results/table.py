@@ -18,7 +18,7 @@ from quadsim.controller import ACCEPTED, Phase
 from quadsim.errors import FileError
 from quadsim.flight import metrics
 from quadsim.flight.audit import Finding, Limit
-from quadsim.flight.log import FlightLog, TimingLog
+from quadsim.flight.log import FlightLog
 from quadsim.flight.parquet import read_parquet
 from quadsim.state import REFERENCE_NAMES, REFERENCE_UNITS, Array
 from scenarios.campaign.results.events import Flags
@@ -125,7 +125,7 @@ def flown_row(log: FlightLog, findings: Sequence[Finding], *, verdict: str, wall
     }
     for finding in findings:
         name = finding.limit.name
-        row[MARGIN + name] = _finite(finding.worst_margin)
+        row[MARGIN + name] = finding.worst_margin if math.isfinite(finding.worst_margin) else None
         row[TIME_VIOLATED + name] = finding.time_violated
         row[SATISFIED + name] = finding.satisfied
     row["worst_margin"], row["worst_constraint"] = worst_margin(findings)
@@ -200,13 +200,8 @@ def _numbers(log: FlightLog) -> Row:
         "slack_max": float(control.slack.max()),
         "iterations.mean": float(control.iterations.mean()),
         "iterations.max": int(control.iterations.max()),
-        **_times(log.timing),
+        **dict(zip(("step_p50_ms", "step_p99_ms"), np.percentile(log.timing.step_ms, [50, 99]).tolist(), strict=True)),
     }
-
-
-def _times(timing: TimingLog) -> Row:
-    p50, p99 = np.percentile(timing.step_ms, [50, 99])
-    return {"step_p50_ms": float(p50), "step_p99_ms": float(p99)}
 
 
 def _share(finding: Finding) -> float:
@@ -220,10 +215,6 @@ def _share(finding: Finding) -> float:
 def _storable(value: object) -> object:
     """A text without lone surrogates, which no file holds; all else as it is."""
     return value.encode("utf-8", "backslashreplace").decode() if isinstance(value, str) else value
-
-
-def _finite(value: float) -> float | None:
-    return value if math.isfinite(value) else None
 
 
 def numbers(table: pa.Table, name: str) -> Array:

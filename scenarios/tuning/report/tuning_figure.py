@@ -5,7 +5,7 @@ from __future__ import annotations
 import textwrap
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 import pyarrow as pa
@@ -47,25 +47,16 @@ def _draw_candidates(axes: Axes, summary: curves.Summary) -> None:
     axes.set_title("candidates, on the draws of the search", loc="left", fontsize=9.5)
     for each in drawn:
         marked = each.kind in ("start", "best")
-        axes.scatter(
-            each.x,
-            each.y,
-            s=60.0 if marked else 14.0,
-            marker="*" if marked else "o",
-            color=curves.KINDS[each.kind],
-            label=each.kind,
-            zorder=3 if marked else 2,
-            linewidth=0.0,
-        )
+        size, marker, order = (60.0, "*", 3) if marked else (14.0, "o", 2)
+        looks: Any = {"s": size, "marker": marker, "zorder": order, "linewidth": 0.0}
+        axes.scatter(each.x, each.y, color=curves.KINDS[each.kind], label=each.kind, **looks)
     if len(summary["objectives"]) == 2 and summary["front"]:
         axes.plot(*curves.front(summary), color=LINES[0], linewidth=1.0, zorder=1)
     if drawn:
-        axes.set_xlim(*curves.ends(drawn, "x"))
-        axes.set_ylim(*curves.ends(drawn, "y"))
+        axes.set(xlim=curves.ends(drawn, "x"), ylim=curves.ends(drawn, "y"))
         axes.legend(fontsize=7.0, loc="upper right")
     across, up = curves.axis_labels(summary)
-    axes.set_xlabel(across)
-    axes.set_ylabel(up)
+    axes.set(xlabel=across, ylabel=up)
 
 
 def _draw_importance(axes: Axes, summary: curves.Summary) -> None:
@@ -97,5 +88,4 @@ def _draw_pairs(axes: Axes, summary: curves.Summary, tables: Sequence[pa.Table])
     both = np.concatenate([start, best])
     if both.size:
         axes.plot([both.min(), both.max()], [both.min(), both.max()], color=REFERENCE, linestyle="--", linewidth=1.0)
-    axes.set_xlabel("start")
-    axes.set_ylabel("best")
+    axes.set(xlabel="start", ylabel="best")

@@ -30,7 +30,8 @@ CAMPAIGN = {
     "vary": [MASS],
 }
 HASTY = (
-    "from scenarios.campaign.results import store; store.FLUSH_S = 0.3; from scenarios import entry; raise SystemExit(entry.main())"
+    "from scenarios import entry; from scenarios.campaign.results import store; "
+    "store.FLUSH_S = 0.3; raise SystemExit(entry.main())"
 )
 """A command line whose campaigns write what is flown as soon as it is there."""
 BARE = ("--no-video", "--no-recording", "--no-figures")
