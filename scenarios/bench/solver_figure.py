@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from quadsim.report.figures.canvas import new_figure, write_drawings
+from quadsim.report.figures.canvas import new_figure
 from quadsim.report.palette import BOUND, LINES
 from scenarios.bench.bench_results import CandidateResult, SolverBench
 from scenarios.bench.bench_tables import PAPER_SOLVER
@@ -19,16 +18,8 @@ if TYPE_CHECKING:
 _DASHES: Final = ("-", "--", ":")  # candidates beyond the colours there are take them again, with another line
 
 
-def write_solver_figure(bench: SolverBench, directory: Path) -> list[Path]:
-    """Draw the step times of all candidates, and their growth, as `solvers.png` and `solvers.svg`; the two files.
-
-    Raises:
-        OutputError: the directory cannot be written.
-    """
-    return write_drawings({"solvers": lambda: _draw(bench)}, directory)
-
-
-def _draw(bench: SolverBench) -> Figure:
+def draw_solvers(bench: SolverBench) -> Figure:
+    """The step times of all candidates, and their growth."""
     figure = new_figure(f"{bench.scenario}: time of a whole controller step", 9.6, 4.6)
     if not bench.growth:
         _draw_times(figure.subplots(), bench)

@@ -17,6 +17,7 @@ from mpc.unconstrained import UnconstrainedMPC
 from quadsim import outputs
 from quadsim.controller import ACCEPTED
 from quadsim.errors import InputError, ParameterError, UnknownNameError
+from quadsim.report.figures.canvas import write_drawings
 from quadsim.report.table import section
 from quadsim.state import Array
 from scenarios.bench.bench_results import CandidateResult, Growth, SolverBench
@@ -126,11 +127,11 @@ def write_bench(bench: SolverBench, directory: Path) -> None:
     Raises:
         OutputError: it cannot be written.
     """
-    from scenarios.bench.solver_figure import write_solver_figure
+    from scenarios.bench.solver_figure import draw_solvers
 
     outputs.write_json(directory / RESULTS_FILE, {"format": FORMAT, **bench.to_json()})
     outputs.write_text(directory / TABLES_FILE, bench_markdown(bench))
-    write_solver_figure(bench, directory)
+    write_drawings({"solvers": lambda: draw_solvers(bench)}, directory)
 
 
 def bench_markdown(bench: SolverBench) -> str:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import html
-from dataclasses import replace
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -40,8 +39,8 @@ def _steps(study: CostStudy) -> Plot:
     figure.update_yaxes(title={"text": "periods answered by then [%]"}, range=[-2, 102])
     figure.update_layout(margin={"l": 60, "r": 12, "t": TOP, "b": BOTTOM})
     title = "Time to compute a command, by what computes it"
-    plot = finished(figure, "cost-steps", title, height=380, timed=False)
-    return replace(plot, key_colours=tuple((curve.label, line_colour(curve.colour)) for curve in curves))
+    keys = tuple((curve.label, line_colour(curve.colour)) for curve in curves)
+    return finished(figure, "cost-steps", title, height=380, timed=False, keys=keys)
 
 
 def _sweep(study: CostStudy, sweep: Sweep, key: str, title: str) -> Plot:

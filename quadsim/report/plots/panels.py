@@ -18,6 +18,7 @@ PANEL_HEIGHT: Final = 210
 TOP, BOTTOM = 34, 46
 _OWN_HEIGHT: Final = 230  # of a row of panels whose horizontal axes have each a scale of its own [pixels]
 _OWN_TICKS: Final = 5
+Keys = tuple[tuple[str, str], ...]  # names of lines and their colours
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -29,8 +30,7 @@ class Plot:
     height: int  # its height [pixels]
     timed: bool  # whether its horizontal axes are time, linked with those of the other plots
     json: str  # the figure as plotly's JSON, safe inside a script element
-    key_colours: tuple[tuple[str, str], ...] = ()
-    """Names of its lines and their colours, where the page shows them above it."""
+    key_colours: Keys = ()  # those of its lines, where the page shows them above it
 
 
 def plotly_script() -> str:
@@ -83,16 +83,17 @@ def keep_least_span(figure: Figure, panel: int, unit: str) -> None:
         figure.update_yaxes(autorangeoptions={"include": ends}, **place(panel))
 
 
-def finished(figure: Figure, key: str, title: str, *, height: int, timed: bool) -> Plot:
+def finished(figure: Figure, key: str, title: str, *, height: int, timed: bool, keys: Keys = ()) -> Plot:
     """The figure without plotly's own template and legend: the page gives its colours and its toggles."""
     figure.update_layout(template="none", showlegend=False, height=height)
     text = str(figure.to_json()).replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
-    return Plot(key=key, title=title, height=height, timed=timed, json=text)
+    return Plot(key=key, title=title, height=height, timed=timed, json=text, key_colours=keys)
 
 
-def finished_panels(figure: Figure, key: str, title: str, count: int) -> Plot:
+def finished_panels(figure: Figure, key: str, title: str, count: int, keys: Keys = ()) -> Plot:
     """So many panels of `panels(..., shared=False)`."""
     figure.update_annotations(font={"size": 13})
     figure.update_xaxes(nticks=_OWN_TICKS)
     figure.update_layout(margin={"l": 52, "r": 12, "t": TOP, "b": BOTTOM})
-    return finished(figure, key, title, height=-(-count // 2) * _OWN_HEIGHT + TOP + BOTTOM, timed=False)
+    height = -(-count // 2) * _OWN_HEIGHT + TOP + BOTTOM
+    return finished(figure, key, title, height=height, timed=False, keys=keys)

@@ -16,6 +16,7 @@ from quadsim import outputs
 from quadsim.errors import ParameterError
 from quadsim.flight import metrics
 from quadsim.flight.log import FlightLog
+from quadsim.report.figures.canvas import write_drawings
 from quadsim.report.table import section
 from quadsim.state import INDEX, POSITION, Array
 from scenarios.bench.mismatch.conditions import CONDITIONS, QUICK_CONDITIONS
@@ -173,11 +174,11 @@ def write_mismatch(measured: MismatchBench, directory: Path) -> None:
     Raises:
         OutputError: it cannot be written.
     """
-    from scenarios.bench.mismatch.survival_figure import write_mismatch_figure
+    from scenarios.bench.mismatch.survival_figure import draw_mismatch
 
     outputs.write_json(directory / RESULTS_FILE, {"format": FORMAT, **measured.to_json()})
     outputs.write_text(directory / TABLES_FILE, mismatch_markdown(measured))
-    write_mismatch_figure(measured, directory)
+    write_drawings({"ladder": lambda: draw_mismatch(measured)}, directory)
 
 
 def mismatch_markdown(measured: MismatchBench) -> str:

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from pathlib import Path
 from typing import TYPE_CHECKING, Final, NamedTuple
 
-from quadsim.report.figures.canvas import new_figure, write_drawings
+from quadsim.report.figures.canvas import new_figure
 from quadsim.report.palette import BOUND
 from scenarios.bench.mismatch.survival import ARRIVED, FAR, MismatchBench, MismatchFlight
 
@@ -29,16 +28,8 @@ class _Panel(NamedTuple):
     unit: str
 
 
-def write_mismatch_figure(measured: MismatchBench, directory: Path) -> list[Path]:
-    """Draw the outcome of every controller in every condition as `ladder.png` and `ladder.svg`; the two files.
-
-    Raises:
-        OutputError: the directory cannot be written.
-    """
-    return write_drawings({"ladder": lambda: _draw(measured)}, directory)
-
-
-def _draw(measured: MismatchBench) -> Figure:
+def draw_mismatch(measured: MismatchBench) -> Figure:
+    """The outcome of every controller in every condition."""
     bound = measured.tilt_bound
     tilt = f"peak tilt between samples too [deg]; the bound is {bound:g} deg"
     panels = (

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import itertools
 import textwrap
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 import pyarrow as pa
 
-from quadsim.report.figures.canvas import new_figure, write_drawings
+from quadsim.report.figures.canvas import new_figure
 from quadsim.report.palette import BOUND, COURSE_COLOUR, LINES
 from scenarios.campaign.report.campaign_curves import convergence_range, drivers, histograms, present
 from scenarios.campaign.report.campaign_text import verdict_sentence
@@ -34,16 +33,8 @@ _TICKS: Final = 6
 _FEW: Final = 50  # flights of a verdict that are drawn larger, so as to be seen among the others
 
 
-def write_campaign_figure(name: str, table: pa.Table, summary: Summary, directory: Path) -> list[Path]:
-    """Draw `campaign.png` and `.svg`: how the estimate settles, worst margins, and the parameters that matter.
-
-    Raises:
-        OutputError: the directory cannot be written.
-    """
-    return write_drawings({"campaign": lambda: _draw(name, table, summary)}, directory)
-
-
-def _draw(name: str, table: pa.Table, summary: Summary) -> Figure:
+def draw_campaign(name: str, table: pa.Table, summary: Summary) -> Figure:
+    """How the estimate settles, worst margins, and the parameters that matter."""
     drawn = scatters.margins(table)
     parameters = _strongest(scatters.clouds(table, drawn), summary) if drawn is not None else []
     rows = 3 if len(parameters) > 1 else 2

@@ -10,11 +10,12 @@ from urllib.parse import quote
 import pyarrow as pa
 
 from quadsim.outputs import write_json, write_text, writing
+from quadsim.report.figures.canvas import write_drawings
 from quadsim.report.pages.page import PAGE_FILE, render_page
 from quadsim.report.plots.panels import plotly_script
 from quadsim.report.table import Mark
 from scenarios.campaign.report import campaign_tables
-from scenarios.campaign.report.campaign_figure import write_campaign_figure
+from scenarios.campaign.report.campaign_figure import draw_campaign
 from scenarios.campaign.report.campaign_plots import campaign_plots, comparison_margins_plot
 from scenarios.campaign.report.campaign_text import campaign_sentences, verdict_sentence
 from scenarios.campaign.report.comparison_tables import comparison_markdown, comparison_tables, pairing
@@ -57,7 +58,7 @@ def write_report(
         OutputError: the directory cannot be written.
     """
     campaign = directory if campaign is None else campaign
-    write_campaign_figure(name, table, summary, directory)
+    write_drawings({"campaign": lambda: draw_campaign(name, table, summary)}, directory)
     plots, drawn = campaign_plots(table, summary), margins(table)
     page = render_page(
         "campaign.html.j2",

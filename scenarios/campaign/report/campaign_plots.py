@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import html
 from collections.abc import Iterator, Mapping
-from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
@@ -120,8 +119,7 @@ def _histograms(drawn: list[Histogram], keys: tuple[tuple[str, str], ...]) -> Pl
         if histogram.name == "worst_margin" and edges[0] <= 0.0 <= edges[-1]:
             figure.add_vline(0.0, line={"color": BOUND, "width": 1.4, "dash": "dash"}, **place(panel))
     figure.update_layout(barmode="stack", bargap=0)
-    plot = finished_panels(figure, "metrics", "How flights are distributed", len(drawn))
-    return replace(plot, key_colours=keys)
+    return finished_panels(figure, "metrics", "How flights are distributed", len(drawn), keys=keys)
 
 
 def _drivers(strongest: Mapping[str, Mapping[str, Any]]) -> Plot:
@@ -169,8 +167,8 @@ def _drivers(strongest: Mapping[str, Mapping[str, Any]]) -> Plot:
     ticks = {"tickmode": "array", "tickvals": list(range(len(names))), "ticktext": names}
     figure.update_yaxes(automargin=True, range=[len(names) - 0.4, -0.6], **ticks)
     figure.update_layout(margin={"l": 12, "r": 12, "t": 6, "b": BOTTOM}, barmode="overlay", hovermode="closest")
-    plot = finished(figure, "drivers", "Which parameters matter", height=70 + 36 * len(strongest), timed=False)
-    return replace(plot, key_colours=tuple(keys))
+    height = 70 + 36 * len(strongest)
+    return finished(figure, "drivers", "Which parameters matter", height=height, timed=False, keys=tuple(keys))
 
 
 def verdict_keys(table: pa.Table) -> tuple[tuple[str, str], ...]:
@@ -208,9 +206,9 @@ def scatter_plot(table: pa.Table, parameters: list[Cloud], drawn: Margins) -> Pl
             figure.update_xaxes(tickvals=list(range(len(parts))), ticktext=parts, **place(panel))
     figure.update_yaxes(range=list(drawn.ends))
     figure.update_layout(hovermode="closest")
-    plot = finished_panels(figure, "scatter", "Worst margin over each varied parameter", len(parameters))
-    curved = any(cloud.course is not None for cloud in parameters)
-    return replace(plot, key_colours=(*keys, (COURSE, COURSE_COLOUR)) if curved else keys)
+    if any(cloud.course is not None for cloud in parameters):
+        keys = (*keys, (COURSE, COURSE_COLOUR))
+    return finished_panels(figure, "scatter", "Worst margin over each varied parameter", len(parameters), keys=keys)
 
 
 def _points(
@@ -283,6 +281,5 @@ def comparison_margins_plot(comparison: Comparison) -> Plot | None:
     figure.update_xaxes(title={"text": f"worst margin, {a}", "standoff": 6}, range=ends)
     figure.update_yaxes(title={"text": f"worst margin, {b}"}, range=ends)
     figure.update_layout(margin={"l": 60, "r": 12, "t": 12, "b": BOTTOM}, hovermode="closest")
-    plot = finished(figure, "margins", "Worst margin, flight by flight", height=480, timed=False)
     keys = tuple((kind, colour) for kind, colour in shown.colours.items() if (shown.kind == kind).any())
-    return replace(plot, key_colours=keys)
+    return finished(figure, "margins", "Worst margin, flight by flight", height=480, timed=False, keys=keys)

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import textwrap
 from collections.abc import Sequence
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 import pyarrow as pa
 
-from quadsim.report.figures.canvas import new_figure, write_drawings
+from quadsim.report.figures.canvas import new_figure
 from quadsim.report.palette import LINES, REFERENCE
 from scenarios.campaign.statistics.wording import label
 from scenarios.tuning.report import tuning_curves as curves
@@ -23,16 +22,8 @@ if TYPE_CHECKING:
 _LINE: Final = 96  # characters of a line of the title
 
 
-def write_tuning_figure(summary: curves.Summary, tables: Sequence[pa.Table], directory: Path) -> list[Path]:
-    """Draw `tuning.png` and `.svg`: the candidates, what matters, and the fresh flights pair by pair.
-
-    Raises:
-        OutputError: the directory cannot be written.
-    """
-    return write_drawings({"tuning": lambda: _draw(summary, tables)}, directory)
-
-
-def _draw(summary: curves.Summary, tables: Sequence[pa.Table]) -> Figure:
+def draw_tuning(summary: curves.Summary, tables: Sequence[pa.Table]) -> Figure:
+    """The candidates, what matters, and the fresh flights pair by pair."""
     title = textwrap.fill(f"{summary['tuning']}: {verdict_sentence(summary)}", _LINE)
     figure = new_figure(title, 9.6, 4.0)
     first, second, third = figure.subplots(1, 3, width_ratios=(1.25, 1.0, 1.0))

@@ -9,11 +9,12 @@ from typing import Final
 import pyarrow as pa
 
 from quadsim.outputs import write_text
+from quadsim.report.figures.canvas import write_drawings
 from quadsim.report.pages.page import PAGE_FILE, render_page
 from quadsim.report.plots.panels import plotly_script
 from quadsim.report.table import Mark
 from scenarios.tuning.report import tuning_tables
-from scenarios.tuning.report.tuning_figure import write_tuning_figure
+from scenarios.tuning.report.tuning_figure import draw_tuning
 from scenarios.tuning.report.tuning_plots import tuning_plots
 from scenarios.tuning.spec import START
 
@@ -46,7 +47,7 @@ def write_report(
     Raises:
         OutputError: the directory cannot be written.
     """
-    write_tuning_figure(summary, tables, directory)
+    write_drawings({"tuning": lambda: draw_tuning(summary, tables)}, directory)
     plots = tuning_plots(summary, tables)
     good = Mark.NONE if summary["answer"] == START else Mark.GOOD
     pages = {f"{folder}/index.html": f"fresh flights, {folder}" for folder in campaigns}

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import html
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 import pyarrow as pa
@@ -60,8 +59,8 @@ def _candidates(summary: curves.Summary) -> Plot:
     figure.update_yaxes(title={"text": up}, range=list(curves.ends(drawn, "y")))
     figure.update_layout(margin={"l": 64, "r": 12, "t": 12, "b": BOTTOM}, hovermode="closest")
     title = "Pareto front" if len(summary["objectives"]) == 2 else "Candidates"
-    plot = finished(figure, "candidates", title, height=430, timed=False)
-    return replace(plot, key_colours=tuple((each.kind, curves.KINDS[each.kind]) for each in drawn))
+    keys = tuple((each.kind, curves.KINDS[each.kind]) for each in drawn)
+    return finished(figure, "candidates", title, height=430, timed=False, keys=keys)
 
 
 def _importance(summary: curves.Summary) -> Plot:
@@ -84,8 +83,8 @@ def _importance(summary: curves.Summary) -> Plot:
     figure.update_xaxes(title={"text": "share [%]", "standoff": 6}, rangemode="tozero")
     figure.update_yaxes(automargin=True, autorange="reversed")
     figure.update_layout(margin={"l": 12, "r": 12, "t": 6, "b": BOTTOM}, hovermode="closest")
-    plot = finished(figure, "importance", "What matters", height=90 + 34 * len(names), timed=False)
-    return replace(plot, key_colours=tuple((name, LINES[i]) for i, name in enumerate(shown)))
+    keys, height = tuple((name, LINES[i]) for i, name in enumerate(shown)), 90 + 34 * len(names)
+    return finished(figure, "importance", "What matters", height=height, timed=False, keys=keys)
 
 
 def _pairs(summary: curves.Summary, tables: Sequence[pa.Table]) -> Plot:

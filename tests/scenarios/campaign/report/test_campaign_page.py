@@ -11,9 +11,10 @@ import pytest
 from browser import open_page
 
 from quadsim.errors import OutputError
+from quadsim.report.figures.canvas import write_drawings
 from quadsim.report.plots.panels import Plot
 from scenarios.campaign.report.campaign_curves import histograms
-from scenarios.campaign.report.campaign_figure import write_campaign_figure
+from scenarios.campaign.report.campaign_figure import draw_campaign
 from scenarios.campaign.report.campaign_page import write_report
 from scenarios.campaign.report.campaign_plots import campaign_plots
 from scenarios.campaign.results.table import Summary
@@ -265,7 +266,8 @@ def test_shares_are_reported_with_the_digits_they_need() -> None:
 def test_figures_are_the_same_every_time(
     thousand: pa.Table, estimated: Summary, reported: Path, tmp_path: Path
 ) -> None:
-    write_campaign_figure(NAME, thousand, json.loads(json.dumps(estimated)), tmp_path)
+    summary = json.loads(json.dumps(estimated))
+    write_drawings({"campaign": lambda: draw_campaign(NAME, thousand, summary)}, tmp_path)
     for file in ("campaign.png", "campaign.svg"):
         assert (tmp_path / file).read_bytes() == (reported / file).read_bytes()
 
