@@ -21,6 +21,7 @@ out: a quadrotor is much smaller than the scale lengths.
 from __future__ import annotations
 
 import copy
+import itertools
 import math
 from dataclasses import dataclass
 from typing import Annotated, Final
@@ -172,8 +173,7 @@ def discretise(ratio: float) -> tuple[Array, Array]:
 
 
 def _first_order(pole: float, drive: Array, before: float) -> Array:
-    """y(k) = pole y(k-1) + drive(k), from y = `before` on; the filter's package takes half a second to load."""
-    from scipy.signal import lfilter
-
-    filtered: Array = lfilter([1.0], [1.0, -pole], drive, zi=[pole * before])[0]
-    return filtered
+    """y(k) = pole y(k-1) + drive(k), from y = `before` on; in Python, as scipy.signal takes a second to load."""
+    pole = float(pole)  # as NumPy's numbers take twice the time
+    samples = itertools.accumulate(drive.tolist(), lambda last, driven: pole * last + driven, initial=float(before))
+    return np.fromiter(samples, float, len(drive) + 1)[1:]
