@@ -1,7 +1,7 @@
 """The optimum of an optimal control problem from its definition alone: rolled out, probed, and solved as a dense QP.
 
 Nothing of `mpc.qp`, `mpc.staged` or `mpc.paper` that builds matrices is used: states by recursion, and every matrix by
-what unit inputs do.
+what unit inputs do.  A plan may have axes in front of its own two: many plans are then rolled out at once.
 """
 
 from __future__ import annotations
@@ -62,10 +62,16 @@ def period(problem: Problem, state: Array, desired: Array, u_before: Array, rest
 
 def trajectory(given: Period, plan: Array) -> Array:
     """(N + 1, n) x(k) .. x(k+N) under a plan (N, nu)."""
-    states = [given.state]
-    for A, B, c, u in zip(given.A, given.B, given.c, plan, strict=True):
-        states.append(A @ states[-1] + B @ u + c)
-    return np.array(states)
+    states = [np.broadcast_to(given.state, (*plan.shape[:-2], given.state.size))]
+    for A, B, c, u in zip(given.A, given.B, given.c, np.moveaxis(plan, -2, 0), strict=True):
+        states.append(states[-1] @ A.T + u @ B.T + c)
+    return np.stack(states, axis=-2)
+
+
+def moves(given: Period, plan: Array) -> Array:
+    """(N, nu) the steps of the inputs of a plan (N, nu)."""
+    before = np.broadcast_to(given.u_before, (*plan.shape[:-2], 1, plan.shape[-1]))
+    return np.diff(plan, axis=-2, prepend=before)
 
 
 def constraints(problem: Problem) -> tuple[Constraint, ...]:
@@ -75,17 +81,17 @@ def constraints(problem: Problem) -> tuple[Constraint, ...]:
 
 def values(constraint: Constraint, given: Period, plan: Array) -> Array:
     """(N, m) the values of a constraint's rows along the rolled out plan."""
-    states, steps = trajectory(given, plan), np.diff(plan, axis=0, prepend=given.u_before[None])
-    found = np.zeros((len(plan), constraint.lower.shape[-1]))
-    for row in range(found.shape[1]):
+    states, steps = trajectory(given, plan), moves(given, plan)
+    found = np.zeros((*plan.shape[:-1], constraint.lower.shape[-1]))
+    for row in range(found.shape[-1]):
         of_inputs = [
-            matrix[row] @ part.T
+            part @ matrix[row]
             for matrix, part in ((constraint.D, plan), (constraint.E, steps))
             if matrix is not None and matrix[row].any()
         ]
-        found[:, row] = sum(of_inputs, np.zeros(len(plan)))
+        found[..., row] = sum(of_inputs, np.zeros(plan.shape[:-1]))
         if constraint.C is not None:
-            found[:, row] += (states[:-1] if of_inputs else states[1:]) @ constraint.C[row]
+            found[..., row] += (states[..., :-1, :] if of_inputs else states[..., 1:, :]) @ constraint.C[row]
     return found
 
 
@@ -98,15 +104,16 @@ def violation(constraint: Constraint, given: Period, plan: Array) -> Array:
 def residuals(problem: Problem, given: Period, plan: Array) -> Array:
     """What the cost is the sum of the squares of, but for slacks."""
     objective, states = problem.objective, trajectory(given, plan)
-    errors = states[1:] @ objective.C_r.T - given.desired
-    parts = [(errors[: len(plan) - (objective.P is not None)], objective.Q_y), (plan - given.rest.u, objective.Q_u)]
+    errors = states[..., 1:, :] @ objective.C_r.T - given.desired
+    summed = errors[..., : plan.shape[-2] - (objective.P is not None), :]
+    parts = [(summed, objective.Q_y), (plan - given.rest.u, objective.Q_u)]
     if objective.Q_d is not None:
-        parts.append((np.diff(plan, axis=0, prepend=given.u_before[None]), objective.Q_d))
+        parts.append((moves(given, plan), objective.Q_d))
     if objective.P is not None:
         x_s, inverse = given.rest.x, np.linalg.pinv(objective.C_r)
         wanted = x_s + inverse @ (given.desired[-1] - objective.C_r @ x_s)
-        parts.append((states[-1:] - wanted, objective.P))
-    return np.concatenate([(part @ _root(weight)).ravel() for part, weight in parts])
+        parts.append((states[..., -1:, :] - wanted, objective.P))
+    return np.concatenate([_flat(part @ _root(weight)) for part, weight in parts], axis=-1)
 
 
 def cost(problem: Problem, given: Period, plan: Array) -> float:
@@ -130,7 +137,7 @@ def dense_qp(problem: Problem, given: Period) -> QP:
     soft: list[tuple[Array, Array, Array]] = []
     l1, l2, shares = np.zeros((N, 0)), np.zeros((N, 0)), []
     for part in constraints(problem):
-        slopes, known = _probed(lambda plan, part=part: values(part, given, plan).ravel(), N, nu)  # type: ignore[misc]
+        slopes, known = _probed(lambda plan, part=part: _flat(values(part, given, plan)), N, nu)  # type: ignore[misc]
         m = part.lower.shape[-1]
         lower, upper = (np.broadcast_to(side, (N, m)) for side in (part.lower, part.upper))
         bounded = (np.isfinite(lower) | np.isfinite(upper)).any(axis=0)
@@ -178,7 +185,7 @@ def least_violation(
     for place, part in enumerate(constraints(problem)):
         if part.penalty is not None:
             continue
-        slopes, known = _probed(lambda plan, part=part: values(part, given, plan).ravel(), N, nu)  # type: ignore[misc]
+        slopes, known = _probed(lambda plan, part=part: _flat(values(part, given, plan)), N, nu)  # type: ignore[misc]
         m = part.lower.shape[-1]
         lower, upper = (np.broadcast_to(side, (N, m)) for side in (part.lower, part.upper))
         free = part.C is not None and bool(part.C.any())
@@ -191,14 +198,17 @@ def least_violation(
                     bounds.append(bound - sign * known[i * m + j])
                     weights.append((half if math.isfinite(half) else size) if free else 0.0)
     slack = np.diag(weights)[:, np.flatnonzero(weights)]
-    found = linprog(
-        np.concatenate([np.zeros(N * nu), np.ones(slack.shape[1])]),
-        A_ub=np.hstack([rows, -slack]),
-        b_ub=bounds,
-        bounds=[(None, None)] * (N * nu) + [(0.0, None)] * slack.shape[1],
-        method="highs-ipm",
-    )
-    return None if found.status else float(found.fun)
+    for method in ("highs-ipm", "highs-ds"):  # the first finds some that do have an answer infeasible
+        found = linprog(
+            np.concatenate([np.zeros(N * nu), np.ones(slack.shape[1])]),
+            A_ub=np.hstack([rows, -slack]),
+            b_ub=bounds,
+            bounds=[(None, None)] * (N * nu) + [(0.0, None)] * slack.shape[1],
+            method=method,
+        )
+        if found.status == 0:
+            return float(found.fun)
+    return None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -239,7 +249,12 @@ def optimum(problem: Problem, given: Period) -> Optimum:
 def _probed(function: Callable[[Array], Array], N: int, nu: int) -> tuple[Array, Array]:
     """Slopes and offset of a function that is affine in the plan."""
     offset = function(np.zeros((N, nu)))
-    return np.array([function(unit.reshape(N, nu)) - offset for unit in np.eye(N * nu)]).T, offset
+    return (function(np.eye(N * nu).reshape(-1, N, nu)) - offset).T, offset
+
+
+def _flat(numbers: Array) -> Array:
+    """The last two axes as one."""
+    return numbers.reshape(*numbers.shape[:-2], -1)
 
 
 def _stacked(parts: list[tuple[Array, Array, Array]], inputs: int) -> tuple[Array, Array, Array]:

@@ -183,15 +183,15 @@ def test_constant_matrices_make_the_papers_plan(constrained_flight: Flight, step
     assert pressing > 100
 
 
-@pytest.mark.parametrize("steps", [1, 2, 4])
 @pytest.mark.parametrize("horizon", [1, 3, 7, 10])
 @pytest.mark.parametrize("soft", [False, True, "largest"])
 @pytest.mark.parametrize("terms", [(), ("Q_d", "margins"), ("P", "constraints")])
-def test_systems_that_change_agree_with_a_peer(
-    horizon: int, steps: int, soft: bool | str, terms: tuple[str, ...]
-) -> None:
-    """Moves weighed, bounds tightened, a terminal weight and further rows: the peer rolls all of them out by itself."""
-    rng = np.random.default_rng(100 * horizon + steps)
+def test_systems_that_change_agree_with_a_peer(horizon: int, soft: bool | str, terms: tuple[str, ...]) -> None:
+    """Moves weighed, bounds tightened, a terminal weight and further rows: the peer rolls all of them out by itself.
+
+    In stages of one step, of two and of four.
+    """
+    rng = np.random.default_rng(100 * horizon + 1)
     solved = 0
     for _ in range(8):
         problem = random_problem(rng, horizon=horizon, n=3, nu=2, n_c=2)
@@ -202,21 +202,24 @@ def test_systems_that_change_agree_with_a_peer(
         problem = with_terms(rng, problem, terms)
         now = changing_period(rng, problem)
         peer = ocp_peer.optimum(problem, now)
-        solver = changing(problem, steps)
-        solution = solver.solve(now)
-        assert (solution.status == SOLVED) == (peer.solution.status == SOLVED)
+        for steps in (1, 2, 4):
+            solver = changing(problem, steps)
+            solution = solver.solve(now)
+            assert (solution.status == SOLVED) == (peer.solution.status == SOLVED)
+            if peer.solution.status != SOLVED:
+                continue
+            np.testing.assert_allclose(solver.plan(solution), peer.plan, atol=2e-4)
+            np.testing.assert_allclose(solver.slacks(solution), peer.slacks, atol=2e-4)
+            states = ocp_peer.trajectory(now, solver.plan(solution))[1:]
+            np.testing.assert_allclose(solver.states(now, solution), states, atol=1e-6)
+            assert kkt_residuals(solver.qp(now), solution).worst < 1e-5 * max(1.0, float(np.abs(solution.point.z).max()))
         if peer.solution.status != SOLVED:
             continue
         solved += 1
-        np.testing.assert_allclose(solver.plan(solution), peer.plan, atol=2e-4)
-        np.testing.assert_allclose(solver.slacks(solution), peer.slacks, atol=2e-4)
         whole = Relinearised(problem, "piqp-dense").solve(*vars(now).values())
         np.testing.assert_allclose(whole.plan, peer.plan, atol=2e-4)
         np.testing.assert_allclose(whole.slacks, peer.slacks, atol=2e-4)
-        states = ocp_peer.trajectory(now, solver.plan(solution))[1:]
-        np.testing.assert_allclose(solver.states(now, solution), states, atol=1e-6)
-        assert kkt_residuals(solver.qp(now), solution).worst < 1e-5 * max(1.0, float(np.abs(solution.point.z).max()))
-        if solved == 4:
+        if solved == 3:
             break
     assert solved >= 2
 

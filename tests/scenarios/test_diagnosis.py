@@ -64,6 +64,8 @@ class Case:
     field: str = ""
 
 
+HORIZON = 20
+"""Periods, of 0.05 s."""
 CASES = {
     "start beyond the tilt bound": Case(
         state=TILTED, violated=("roll upper",), blocking=("slew lower", "slew upper"), field="output_bounds.roll"
@@ -154,10 +156,12 @@ class Queried:
 
 @pytest.fixture(scope="session")
 def file(tmp_path_factory: pytest.TempPathFactory) -> str:
-    """A hover whose file names no solver, so that its law may be another."""
+    """A hover whose file names no solver, so that its law may be another, and with a short horizon."""
     text = scenario_path("hover").read_text(encoding="utf-8")
     path = tmp_path_factory.mktemp("diagnosis") / "hover.toml"
-    path.write_text(text.replace('solver = "piqp-multistage"\n', ""), encoding="utf-8")
+    short = text.replace('solver = "piqp-multistage"\n', "").replace("horizon = 50 ", f"horizon = {HORIZON} ")
+    assert short.count(f"horizon = {HORIZON}") == 1
+    path.write_text(short, encoding="utf-8")
     return str(path)
 
 
@@ -260,7 +264,7 @@ def entry_of(queried: Queried, name: str) -> dict[str, Any]:
 
 def test_amounts_in_closed_form(file: str) -> None:
     """By hand, from the model's matrices and the bounds on steps of -10 and 5 rad/s alone."""
-    tilted = query_case(file, CASES["start beyond the tilt bound"])
+    tilted = query_cached(file, "start beyond the tilt bound")
     assert tilted.unanswered is not None
     model = tilted.unanswered.problem.model
     row = model.B[INDEX["roll"]]
@@ -270,31 +274,38 @@ def test_amounts_in_closed_form(file: str) -> None:
     assert (entry["start"], entry["unit"]) == (0.05, "deg")
 
     lift = float(model.B[INDEX["vz"]].sum())  # of vz in a period, per rad/s of all rotors
-    falling = entry_of(query_case(file, CASES["falling too fast"]), "vz")
-    after = -2.0 + lift * np.cumsum(5.0 * np.arange(1, 51))
+    falling = entry_of(query_cached(file, "falling too fast"), "vz")
+    after = -2.0 + lift * np.cumsum(5.0 * np.arange(1, HORIZON + 1))
     assert falling["by"] == pytest.approx(-0.5 - after[0], abs=1e-6)
     assert (falling["start"], falling["stop"]) == (0.05, pytest.approx(0.05 * np.count_nonzero(after < -0.5)))
 
-    hovering = query_case(file, CASES["speeds too low to hover"])
-    entry, sinking = entry_of(hovering, "vz"), lift * (190.0 - float(model.u_bar[0])) * np.arange(1, 51)
+    hovering = query_cached(file, "speeds too low to hover")
+    entry, sinking = entry_of(hovering, "vz"), lift * (190.0 - float(model.u_bar[0])) * np.arange(1, HORIZON + 1)
     assert entry["by"] == pytest.approx(-0.1 - sinking[-1], abs=1e-6)
-    assert (entry["start"], entry["stop"]) == (pytest.approx(0.05 * (1 + np.count_nonzero(sinking >= -0.1))), 2.5)
+    assert (entry["start"], entry["stop"]) == (
+        pytest.approx(0.05 * (1 + np.count_nonzero(sinking >= -0.1))),
+        0.05 * HORIZON,
+    )
 
-    fenced = entry_of(query_case(file, CASES["outside the fence"]), "fence")
+    fenced = entry_of(query_cached(file, "outside the fence"), "fence")
     assert fenced["by"] == pytest.approx(3.2, abs=1e-3)
     assert (fenced["start"], fenced["unit"]) == (0.05, "m")
-    total = entry_of(query_case(file, CASES["two polytopes"]), "least")
-    assert (total["by"], total["start"], total["stop"]) == (pytest.approx(20.0), 0.0, 2.45)
-    climbing = entry_of(query_case(file, CASES["a polytope against a bound"]), "climb")
-    assert (climbing["by"], climbing["start"], climbing["stop"]) == (pytest.approx(0.3), 0.05, 2.5)
+    total = entry_of(query_cached(file, "two polytopes"), "least")
+    assert (total["by"], total["start"], total["stop"]) == (
+        pytest.approx(20.0),
+        0.0,
+        pytest.approx(0.05 * (HORIZON - 1)),
+    )
+    climbing = entry_of(query_cached(file, "a polytope against a bound"), "climb")
+    assert (climbing["by"], climbing["start"], climbing["stop"]) == (pytest.approx(0.3), 0.05, 0.05 * HORIZON)
 
-    fast = entry_of(query_case(file, CASES["the last command outside the bounds"]), "speed")
+    fast = entry_of(query_cached(file, "the last command outside the bounds"), "speed")
     assert (fast["by"], fast["start"], fast["stop"]) == (pytest.approx(30.0), 0.0, 0.1)
     assert fast["rotors"] == [1, 2, 3, 4]
 
 
 def test_a_tightened_bound_is_violated_by_what_is_beyond_it(file: str) -> None:
-    queried = query_case(file, CASES["tightened bounds"])
+    queried = query_cached(file, "tightened bounds")
     assert queried.unanswered is not None
     problem = queried.unanswered.problem
     assert problem.bounds is not None
@@ -308,7 +319,7 @@ def test_a_tightened_bound_is_violated_by_what_is_beyond_it(file: str) -> None:
 
 
 def test_times_are_those_of_the_prediction_behind_its_delay(file: str) -> None:
-    assert entry_of(query_case(file, CASES["rotors that lag, and a delay"]), "roll")["start"] == 0.07
+    assert entry_of(query_cached(file, "rotors that lag, and a delay"), "roll")["start"] == 0.07
 
 
 def test_the_fallback_is_suggested_with_the_time_after_which_it_helps(file: str) -> None:
@@ -321,7 +332,7 @@ def test_the_fallback_is_suggested_with_the_time_after_which_it_helps(file: str)
     state, acting = case.state, np.full(4, queried.vehicle.hover_speed)
     guarded.reset(acting)
     for k in range(50):
-        command = guarded.step(Moment(time=0.05 * k, acting=acting), state, np.zeros((50, 4)))
+        command = guarded.step(Moment(time=0.05 * k, acting=acting), state, np.zeros((HORIZON, 4)))
         if command.status in ACCEPTED:
             break
         state, acting = model.A @ state + model.B @ (command.speeds - model.u_bar), command.speeds
@@ -332,7 +343,7 @@ def test_the_fallback_is_suggested_with_the_time_after_which_it_helps(file: str)
 def test_a_solver_that_fails_where_all_constraints_can_hold_is_distinguished(file: str) -> None:
     queried = query_case(file, CASES["start beyond the tilt bound"], "controller.output_bounds.roll=[-90.0, 90.0]")
     assert queried.unanswered is None
-    controller = query_case(file, CASES["start beyond the tilt bound"]).unanswered
+    controller = query_cached(file, "start beyond the tilt bound").unanswered
     assert controller is not None
     level = controller.query._replace(state=make_state())
     failed = Unanswered(problem=controller.problem, query=level, status="max_iterations", time=1.0)
@@ -343,15 +354,15 @@ def test_a_solver_that_fails_where_all_constraints_can_hold_is_distinguished(fil
 
 
 def test_it_is_the_same_each_time_and_holds_copies(file: str) -> None:
-    queried = query_case(file, CASES["outside the fence"])
-    assert json.dumps(queried.found) == json.dumps(query_case(file, CASES["outside the fence"]).found)
+    queried = query_case(file, CASES["two polytopes"])
+    assert json.dumps(queried.found) == json.dumps(query_cached(file, "two polytopes").found)
     assert queried.unanswered is not None
     queried.controller.reset(np.full(4, queried.vehicle.hover_speed))
     assert getattr(queried.controller, "unanswered", 1) is None
 
 
 def test_the_words_of_the_file(file: str) -> None:
-    found = query_case(file, CASES["start beyond the tilt bound"]).found
+    found = query_cached(file, "start beyond the tilt bound").found
     assert found["sentence"].startswith(
         "no answer at t = 0.00 s (primal_infeasible); cannot hold together: roll upper at +0.05 s .. +0.15 s by 14 deg;"
     )

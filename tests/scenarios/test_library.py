@@ -6,6 +6,7 @@ import math
 import tomllib
 from collections.abc import Callable
 from dataclasses import fields
+from functools import cache
 from typing import get_args
 
 import numpy as np
@@ -23,29 +24,35 @@ from scenarios.schema.scenario import Group, LostSpec, Scenario
 from scenarios.shipped import LIBRARY, scenario_names
 
 SHARED = (
-    *("paper-constrained", "paper-unconstrained", "paper-unconstrained-clipped"),
-    *("gps-outage", "hard-landing", "lost-rotor", "nan-position"),
+    *("paper-constrained", "paper-constrained-lag20", "paper-unconstrained", "paper-unconstrained-clipped"),
+    *("gps-outage", "hard-landing", "lost-rotor", "nan-position", "power-loop"),
+    *("torrente-loop4-all", "torrente-loop4-drag", "torrente-loop4-ideal"),
 )
 """With other modules."""
 LONGEST_DESCRIPTION = 100
-COMPARED = 3.0
+COMPARED = 1.0
 """Of a flight and of the same one again, at least [s]."""
 SHORT = 12.0
 """Longest flight of another paper that is flown here [s]."""
-PREVIEW = 2.0
+PREVIEW = 0.5
 """Time in which another seed shows, where it counts [s]."""
+
+
+@cache
+def loaded() -> dict[str, Scenario]:
+    """Every scenario, read once."""
+    return {name: load_scenario(name) for name in scenario_names()}
 
 
 def flown_here() -> list[str]:
     """All but the long flights of other papers, which `quadsim reproduce` flies."""
-    scenarios = [load_scenario(name) for name in scenario_names()]
-    return [each.name for each in scenarios if each.group != "papers" or each.duration <= SHORT]
+    return [each.name for each in loaded().values() if each.group != "papers" or each.duration <= SHORT]
 
 
 @pytest.fixture(scope="module", params=flown_here())
 def flight(request: pytest.FixtureRequest, fly_once: Callable[..., Flight]) -> Flight:
     """Each scenario, flown once for all tests that use it."""
-    return fly_once(request.param) if request.param in SHARED else fly_scenario(load_scenario(request.param))
+    return fly_once(request.param) if request.param in SHARED else fly_scenario(loaded()[request.param])
 
 
 def flown_again(scenario: Scenario, periods: int, *, seed: int) -> FlightLog:
@@ -61,7 +68,7 @@ def flown_again(scenario: Scenario, periods: int, *, seed: int) -> FlightLog:
 def periods_compared(scenario: Scenario) -> int:
     """Of the first seconds, or as long as it takes for every event to have come and gone."""
     ends = [event.at + (getattr(event, "duration", None) or 0.0) for event in scenario.events]
-    return math.ceil(max([COMPARED, *(end + 1.0 for end in ends)]) / scenario.control_period)
+    return math.ceil(max([COMPARED, *(end + 0.5 for end in ends)]) / scenario.control_period)
 
 
 def numbers(log: FlightLog, periods: int, steps: int) -> tuple[list[bytes], list[bytes]]:
@@ -283,7 +290,7 @@ def test_its_line_in_the_documents_is_todays(flight: Flight) -> None:
 
 
 def test_there_are_scenarios_of_every_group() -> None:
-    groups = [load_scenario(name).group for name in scenario_names()]
+    groups = [each.group for each in loaded().values()]
     assert len(groups) >= 25
     for group in (group for group in get_args(Group) if group != "other"):
         assert groups.count(group) >= 3, group
@@ -292,9 +299,9 @@ def test_there_are_scenarios_of_every_group() -> None:
 
 
 def test_those_that_are_meant_to_defeat_the_papers_controller_are_there() -> None:
-    assert load_scenario("paper-constrained-lag20").expect == "lost"
-    assert load_scenario("paper-constrained-heavy").expect == "violated"
-    assert load_scenario("yaw-180").expect == "violated"
+    assert loaded()["paper-constrained-lag20"].expect == "lost"
+    assert loaded()["paper-constrained-heavy"].expect == "violated"
+    assert loaded()["yaw-180"].expect == "violated"
 
 
 def test_every_claim_is_of_a_scenario_that_there_is() -> None:
@@ -311,7 +318,7 @@ def test_a_file_is_named_for_its_scenario_and_described_in_a_line(name: str) -> 
 
 
 def test_no_two_scenarios_are_described_alike() -> None:
-    descriptions = [load_scenario(name).description for name in scenario_names()]
+    descriptions = [each.description for each in loaded().values()]
     assert len(set(descriptions)) == len(descriptions)
 
 

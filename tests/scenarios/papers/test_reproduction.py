@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -16,6 +17,7 @@ from quadsim.errors import FileError, UnknownNameError
 from quadsim.report.table import grid_to_markdown
 from scenarios.cli import main
 from scenarios.commands import EXIT_DONE, EXIT_FAILED, EXIT_WRONG_INPUT
+from scenarios.flight import Flight
 from scenarios.loading import load_scenario
 from scenarios.papers.paper import NumberSpec, load_paper, scenario_of
 from scenarios.papers.reproduction import Reproduced, Reproduction, reproduce_paper
@@ -45,11 +47,13 @@ def written(folder: Path, *numbers: tuple[str, str]) -> str:
 
 
 @pytest.fixture(scope="module")
-def loop4() -> Reproduction:
-    """The short flights of Torrente et al., as CI flies them."""
-    return reproduce_paper(
-        load_paper("torrente2021"), chosen=lambda spec: spec.scenario.startswith("torrente-loop4") and not spec.set
-    )
+def loop4(fly_once: Callable[..., Flight]) -> Reproduction:
+    """The short flights of Torrente et al., as CI flies them; `test_library` has them, too."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("scenarios.papers.reproduction.fly_scenario", lambda scenario: fly_once(scenario.name))
+        return reproduce_paper(
+            load_paper("torrente2021"), chosen=lambda spec: spec.scenario.startswith("torrente-loop4") and not spec.set
+        )
 
 
 def test_the_circle_at_4_m_s_is_reproduced(loop4: Reproduction) -> None:
