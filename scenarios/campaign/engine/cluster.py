@@ -18,8 +18,8 @@ from typing import Any, Final
 from quadsim import __version__
 from quadsim.errors import MissingPackageError, ParameterError
 from scenarios.campaign.engine.jobs import Jobs, read_jobs, submit
+from scenarios.campaign.engine.local import FlightByFlight
 from scenarios.campaign.engine.protocol import MOST_DEATHS, Answer, EngineError, Pace, Pilot, describe
-from scenarios.campaign.engine.supervisor import SupervisorProcess
 from scenarios.campaign.manifest import code_digest
 from scenarios.campaign.results.table import Row
 
@@ -32,7 +32,7 @@ _LOOK_S: Final = 1.0
 _CONNECT_S: Final = 10.0
 _FETCH_S: Final = 10.0
 _LOGGERS: Final = ("distributed", "distributed.client", "tornado.application", "asyncio")
-_supervisors: dict[bytes, SupervisorProcess] = {}  # of this worker: one at most, of the campaign that it flies
+_supervisors: dict[bytes, FlightByFlight] = {}  # of this worker: one at most, of the campaign that it flies
 
 
 class DaskEngine:
@@ -123,14 +123,14 @@ def fly_chunk(pickled: bytes, chunk: Sequence[int], expected: Mapping[str, str])
     return answers
 
 
-def _supervisor(pickled: bytes) -> SupervisorProcess:
+def _supervisor(pickled: bytes) -> FlightByFlight:
     """What a worker starts once for a campaign; an earlier one's is ended."""
     if pickled not in _supervisors:
         pilot: Pilot = pickle.loads(pickled)
         for other in _supervisors.values():
             other.stop()
         _supervisors.clear()
-        _supervisors[pickled] = SupervisorProcess(pilot, pickled)
+        _supervisors[pickled] = FlightByFlight(pilot, pickled)
     return _supervisors[pickled]
 
 

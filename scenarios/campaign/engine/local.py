@@ -116,8 +116,6 @@ class _Pool:
         self._deaths: Counter[int] = Counter()
         self._failed_starts = 0
         self._pace = Pace()
-        self._context = multiprocessing.get_context("forkserver")
-        self._context.set_forkserver_preload([__name__, type(pilot).__module__, _SETTLED])
 
     def answers(self) -> Generator[Row]:
         self._replenish()
@@ -141,29 +139,9 @@ class _Pool:
             supervisor.dismiss()
             supervisor.ending()
         while len(self._supervisors) < min(self._size, self._unanswered):
-            self._start_supervisor()
+            self._supervisors.append(_start_supervisor(self._pilot, self._pickled))
         for supervisor in self._supervisors:
             self._hand_out(supervisor)
-
-    def _start_supervisor(self) -> None:
-        for start in range(_MOST_STARTS):
-            ours, theirs = self._context.Pipe()
-            process = self._context.Process(target=serve, args=(theirs, str(Path.cwd())), daemon=True)
-            try:
-                with _undisturbed():
-                    process.start()
-                    self._supervisors.append(_Supervisor(process, ours, process.pid or 0))
-            except (OSError, EOFError) as error:  # the server was killed just now; the next start makes a new one
-                ours.close()
-                problem = error
-                clock.sleep(0.1 * start)
-                continue
-            finally:
-                theirs.close()
-            with contextlib.suppress(OSError):  # it is dead already, which its pipe will show
-                ours.send_bytes(self._pickled)
-            return
-        raise EngineError(f"no supervisor process can be started here ({type(problem).__name__}: {problem})")
 
     def _hear(self) -> list[Row]:
         """Wait until a message comes or a process dies; all messages there are then."""
@@ -237,12 +215,88 @@ class _Pool:
         return [self._pilot.lost(flight, f"its process died {MOST_DEATHS} times, last {ending}")]
 
 
+class FlightByFlight:
+    """Flies one flight at a time beside this process, which has no other use; a worker that dies is replaced."""
+
+    def __init__(self, pilot: Pilot, pickled: bytes) -> None:
+        self._pilot, self._pickled = pilot, pickled
+        self._supervisor: _Supervisor | None = None
+
+    def fly(self, flight: int) -> Answer:
+        """What became of a flight, after as many tries as its process may die.
+
+        Raises:
+            EngineError: no worker can fly here.
+        """
+        ending = ""
+        for _ in range(MOST_DEATHS):
+            try:
+                pipe = (self._supervisor or self._start()).pipe
+                pipe.send([flight])
+                match pipe.recv():
+                    case Answer() as answer:
+                        return answer
+                    case Unfit(reason):
+                        raise EngineError(f"a worker process cannot fly here: {reason}")
+                    case Died(ending):
+                        pass
+            except (EOFError, OSError):
+                ending = "for an unknown reason"
+                self.stop()
+        reason = f"its process died {MOST_DEATHS} times, last {ending}"
+        return Answer(self._pilot.lost(flight, reason), 0.0)
+
+    def stop(self) -> None:
+        """End the supervisor, which ends everybody whom it keeps."""
+        if self._supervisor is not None:
+            self._supervisor.dismiss()
+            self._supervisor.ending()
+            self._supervisor = None
+
+    def _start(self) -> _Supervisor:
+        self._supervisor = _start_supervisor(self._pilot, self._pickled)
+        match self._supervisor.pipe.recv():
+            case Unfit(reason):
+                raise EngineError(f"a worker process cannot fly here: {reason}")
+            case Ready():
+                return self._supervisor
+        raise EOFError
+
+
+def _start_supervisor(pilot: Pilot, pickled: bytes) -> _Supervisor:
+    """Start a supervisor for a pilot, and hand it the pilot.
+
+    Raises:
+        EngineError: none can be started.
+    """
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload([__name__, type(pilot).__module__, _SETTLED])
+    for start in range(_MOST_STARTS):
+        ours, theirs = context.Pipe()
+        process = context.Process(target=serve, args=(theirs, str(Path.cwd())), daemon=True)
+        try:
+            with _undisturbed():
+                process.start()
+        except (OSError, EOFError) as error:  # the server was killed just now; the next start makes a new one
+            ours.close()
+            problem = error
+            clock.sleep(0.1 * start)
+            continue
+        finally:
+            theirs.close()
+        with contextlib.suppress(OSError):  # it is dead already, which its pipe will show
+            ours.send_bytes(pickled)
+        return _Supervisor(process, ours, process.pid or 0)
+    raise EngineError(f"no supervisor process can be started here ({type(problem).__name__}: {problem})")
+
+
 @contextlib.contextmanager
 def _undisturbed() -> Iterator[None]:
     """What is started here keeps linear algebra to one thread, and never sees Ctrl-C, which waits here meanwhile.
 
     Nor does it run the parent's script again, as multiprocessing's children do, which takes longer than all the rest:
-    nothing that a worker is handed belongs to that.
+    nothing that a worker is handed belongs to that.  A daemon, such as Dask's workers, may start it too: it ends with
+    its parent without multiprocessing's help.
     """
     before = {name: os.environ.get(name) for name in ONE_THREAD}
     with warnings.catch_warnings():
@@ -251,9 +305,12 @@ def _undisturbed() -> Iterator[None]:
     mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     os.environ.update(ONE_THREAD)
     script, sys.modules["__main__"] = sys.modules["__main__"], ModuleType("__main__")
+    ours: dict[str, object] = multiprocessing.current_process()._config  # type: ignore[attr-defined]
+    daemon = ours.pop("daemon", False)
     try:
         yield
     finally:
+        ours["daemon"] = daemon
         sys.modules["__main__"] = script
         for name, value in before.items():
             if value is None:

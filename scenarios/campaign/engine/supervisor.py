@@ -7,25 +7,20 @@ it does to the worker, which the supervisor replaces.  It ends with its parent, 
 from __future__ import annotations
 
 import contextlib
-import json
 import os
 import pickle
 import signal
-import socket
-import subprocess
-import sys
 import time as clock
 from collections import deque
 from mmap import mmap
 from multiprocessing import connection, forkserver
 from multiprocessing.connection import Connection
-from pathlib import Path
 from typing import Final, NamedTuple
 
 from threadpoolctl import threadpool_limits
 
 from scenarios.campaign.engine.processes import adopt_orphans, end_children, has_strays, memory_above
-from scenarios.campaign.engine.protocol import MOST_DEATHS, ONE_THREAD, Answer, EngineError, Pilot, describe
+from scenarios.campaign.engine.protocol import Answer, Pilot, describe
 from scenarios.campaign.engine.worker import FLIGHT, PULSE_BYTES, SIZE, FlightReport, fly_for
 from scenarios.campaign.results.verdicts import MEMORY, TIMEOUT
 from scenarios.gc_tuning import collect_rarely, freeze_for_good
@@ -34,10 +29,6 @@ LOOK_S: Final = 0.2  # between two looks at a worker that flies [s]
 _TURN_S: Final = 1.0  # most that one look counts of the time since the last one [s]
 _LEAVING_S: Final = 1.0  # for a worker without output to end [s]
 _LARGEST: Final = 1 << 26  # largest message of a worker [bytes]
-_MAIN: Final = (
-    "import json, sys; sys.path[:] = json.loads(sys.argv[2]); import scenarios.campaign.preload; "
-    "from scenarios.campaign.engine.supervisor import main; main(int(sys.argv[1]))"
-)
 
 
 class Ready(NamedTuple):
@@ -263,65 +254,3 @@ class _Supervisor:
         self._dismiss()
         flight = self._flights.popleft()
         self._send(Answer(self._pilot.lost(flight, reason, verdict), self._spent))
-
-
-class SupervisorProcess:
-    """Flies one flight at a time beside this process; a worker that dies is replaced."""
-
-    def __init__(self, pilot: Pilot, pickled: bytes) -> None:
-        self._pilot, self._pickled = pilot, pickled
-        self._process: subprocess.Popen[bytes] | None = None
-        self._pipe: Connection | None = None
-
-    def fly(self, flight: int) -> Answer:
-        """What became of a flight, after as many tries as its process may die.
-
-        Raises:
-            EngineError: no worker can fly here.
-        """
-        ending = ""
-        for _ in range(MOST_DEATHS):
-            try:
-                pipe = self._pipe or self._start()
-                pipe.send([flight])
-                match pipe.recv():
-                    case Answer() as answer:
-                        return answer
-                    case Unfit(reason):
-                        raise EngineError(f"a worker process cannot fly here: {reason}")
-                    case Died(ending):
-                        pass
-            except (EOFError, OSError):
-                ending = "for an unknown reason"
-                self.stop()
-        reason = f"its process died {MOST_DEATHS} times, last {ending}"
-        return Answer(self._pilot.lost(flight, reason), 0.0)
-
-    def stop(self) -> None:
-        """End the supervisor, which ends everybody whom it keeps."""
-        if self._pipe is not None and self._process is not None:
-            self._pipe.close()
-            self._process.wait()
-            self._pipe = None
-
-    def _start(self) -> Connection:
-        ours, theirs = socket.socketpair()
-        with theirs:
-            command = [sys.executable, "-c", _MAIN, str(theirs.fileno()), json.dumps(sys.path)]
-            self._process = subprocess.Popen(
-                command, pass_fds=[theirs.fileno()], stdin=subprocess.DEVNULL, env={**os.environ, **ONE_THREAD}
-            )
-        self._pipe = Connection(ours.detach())
-        self._pipe.send_bytes(self._pickled)
-        match self._pipe.recv():
-            case Unfit(reason):
-                raise EngineError(f"a worker process cannot fly here: {reason}")
-            case Ready():
-                return self._pipe
-        raise EOFError
-
-
-def main(descriptor: int) -> None:
-    """What the process runs; `descriptor` is its end of the pipe."""
-    with contextlib.closing(Connection(descriptor)) as pipe:
-        serve(pipe, str(Path.cwd()))
