@@ -18,23 +18,35 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Final
+from typing import IO, Final
 from unittest import mock
 
 from hypothesis import HealthCheck, Phase, assume, given, seed, settings
 from hypothesis import strategies as st
+from matplotlib.figure import Figure
 from ordinary_user import counts_of
 
 from quadsim.errors import OutputError
 from quadsim.outputs import real_path, require_directory, require_file, staging
+from quadsim.report.film import video
+from quadsim.report.pages import comparison_page
+from scenarios.campaign.report import campaign_page
 from scenarios.cli import main
 
 ROOT: Final = Path(__file__).resolve().parent.parent
-SHORT: Final = ("--set", "duration=0.1", "--no-video", "--no-recording", "--no-figures")
+SHORT: Final = (
+    "--set",
+    "duration=0.1",
+    "--set",
+    "controller.horizon=4",
+    "--no-video",
+    "--no-recording",
+    "--no-figures",
+)
 CAMPAIGN: Final = """name = "small"
 scenario = "hover"
 flights = 2
-set = { duration = 0.1 }
+set = { duration = 0.1, controller = { horizon = 4 } }
 failure = ["lost"]
 [[vary]]
 name = "mass"
@@ -241,6 +253,28 @@ def saved_meanwhile(entry: Entry | None, target: Path, note: Callable[[], None])
         yield
 
 
+@contextlib.contextmanager
+def sketched() -> Iterator[None]:
+    """Pages have no plots; pictures and films are a few bytes each, written where and how the real ones are."""
+
+    def save(_: Figure, file: IO[bytes], **__: object) -> None:
+        file.write(b"picture")
+
+    def work(tasks: Sequence[Sequence[str]], *_: object) -> None:
+        for _, _, path, *_ in tasks:
+            Path(path).write_bytes(b"film")
+
+    with (
+        mock.patch.object(Figure, "savefig", save),
+        mock.patch.object(Figure, "get_layout_engine", return_value=None),
+        mock.patch.object(video, "_work", work),
+        mock.patch.object(video, "rendering_backend", return_value="none"),
+        mock.patch.object(campaign_page, "campaign_plots", return_value={}),
+        mock.patch.object(comparison_page, "comparison_plots", return_value=[]),
+    ):
+        yield
+
+
 def check_case(
     base: Path, inputs: Inputs, tree: Sequence[Entry], writer: str, out: str, meanwhile: Entry | None
 ) -> None:
@@ -291,7 +325,15 @@ def check_case(
 
 
 def attack(scratch: Path, count: int, number: int) -> dict[str, int]:
-    """Go through so many cases in a directory of one's own; how many were refused and done."""
+    """Go through so many cases in a directory of one's own; how many were refused and done.
+
+    Below `MANY` cases pictures are sketched: drawing them takes most of the time.
+    """
+    with sketched() if count < MANY else contextlib.nullcontext():
+        return _attack(scratch, count, number)
+
+
+def _attack(scratch: Path, count: int, number: int) -> dict[str, int]:
     inputs = Inputs(folder=scratch / "inputs", cases=count)
     inputs.make()
     before = state(inputs.folder)
