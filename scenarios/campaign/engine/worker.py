@@ -13,6 +13,7 @@ import sys
 import threading
 import warnings
 from mmap import mmap
+from operator import is_
 from pathlib import Path
 from types import ModuleType
 from typing import Any, Final, NamedTuple, NoReturn
@@ -53,11 +54,8 @@ class Traces:
     def found(self) -> bool:
         """Whether anything is not as it was."""
         try:
-            return _settings() != self._settings or any(
-                now.get(name) is not value
-                for owner, then in self._content
-                for now in (vars(owner),)
-                for name, value in then.items()
+            return _settings() != self._settings or not all(
+                all(map(is_, map(vars(owner).get, then), then.values())) for owner, then in self._content
             )
         except Exception:  # of something that was put in the place of what this uses
             return True
