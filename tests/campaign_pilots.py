@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import contextlib
+import multiprocessing.forkserver
 import os
+import sys
 import time as clock
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import psutil
 
+from scenarios.campaign.engine import local
 from scenarios.campaign.results.table import Row
 from scenarios.campaign.results.verdicts import ERROR
 from scenarios.campaign.spec import LimitsSpec
@@ -62,6 +67,17 @@ class ToyPilot:
 
     def lost(self, flight: int, reason: str, verdict: str = ERROR) -> Row:
         return {"flight": flight, "value": None, "reason": reason}
+
+
+@contextlib.contextmanager
+def light_server(module: str = __name__) -> Iterator[None]:
+    """Workers of toys are forked from a server that has loaded what these need, a module with others, and no more."""
+    server = multiprocessing.forkserver._forkserver
+    server._stop()  # who had it before wanted other modules
+    found = mock.patch.dict(os.environ, PYTHONPATH=os.pathsep.join(sys.path))  # it is not told where ours are
+    with found, mock.patch.object(local, "_SETTLED", module):
+        yield
+    server._stop()
 
 
 def value_of(flight: int) -> Row:

@@ -24,11 +24,19 @@ import pyarrow.parquet as pq
 import tomlkit
 from hostile_controller import ENDED, KINDS
 
+from scenarios.campaign.engine.protocol import MOST_DEATHS
 from scenarios.campaign.results.store import FLIGHTS_FILE
 from scenarios.campaign.results.table import Row
 
 ROOT = Path(__file__).resolve().parents[1]
 LIMITS = {"flight": 20.0, "step": 3.0, "memory": 300.0}  # a busy machine takes a second to fill the memory
+MAIN = """
+import sys
+from scenarios.campaign.engine import local
+from scenarios.entry import main
+local.MOST_DEATHS = {deaths}
+sys.exit(main())
+"""
 CAMPAIGN: dict[str, Any] = {
     "name": "hostile",
     "scenario": "hover",
@@ -81,7 +89,7 @@ def write(directory: Path, kinds: Sequence[str], *, armed: bool) -> Path:
     return file
 
 
-def fly(directory: Path, kinds: Sequence[str], *, armed: bool, workers: int = 2) -> Flown:
+def fly(directory: Path, kinds: Sequence[str], *, armed: bool, workers: int = 2, deaths: int = MOST_DEATHS) -> Flown:
     """Fly a campaign whose flights do harm, or would if they were armed, one after the other.
 
     Args:
@@ -89,9 +97,10 @@ def fly(directory: Path, kinds: Sequence[str], *, armed: bool, workers: int = 2)
         kinds: of each flight; see `hostile_controller.KINDS`.
         armed: whether they do.
         workers: how many.
+        deaths: processes that may die of a flight.
     """
     file = write(directory, kinds, armed=armed)
-    command = [sys.executable, "-m", "scenarios.cli", "campaign", str(file), "--out", str(directory / "out")]
+    command = [sys.executable, "-c", MAIN.format(deaths=deaths), "campaign", str(file), "--out", str(directory / "out")]
     mark = f"QUADSIM_MARK={uuid.uuid4()}"
     started = clock.perf_counter()
     ran = subprocess.run(
@@ -126,12 +135,13 @@ def planned(flights: int) -> list[str]:
     return [positions.get(flight, "calm") for flight in range(flights)]
 
 
-def measure(flights: int = 60, *, workers: int = 2) -> dict[str, int]:
+def measure(flights: int = 60, *, workers: int = 2, deaths: int = MOST_DEATHS) -> dict[str, int]:
     """Fly a campaign with hostile flights, and one in which they are calm.
 
     Args:
         flights: of each of the two.
         workers: how many fly them.
+        deaths: processes that may die of a flight.
 
     Returns:
         `flights`; `hostile` ones, and those of each verdict (`hostile: error`); `calm` ones, and of these those whose
@@ -144,7 +154,7 @@ def measure(flights: int = 60, *, workers: int = 2) -> dict[str, int]:
         for folder in folders:
             folder.mkdir()
         calm, hostile = (
-            fly(folder, kinds, armed=armed, workers=workers)
+            fly(folder, kinds, armed=armed, workers=workers, deaths=deaths)
             for folder, armed in zip(folders, (False, True), strict=True)
         )
     flown = list(zip(kinds, calm.rows, hostile.rows, strict=True))

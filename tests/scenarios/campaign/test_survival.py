@@ -25,7 +25,7 @@ import numpy as np
 import psutil
 import pytest
 import tomlkit
-from campaign_pilots import ToyPilot, known, living, until, value_of
+from campaign_pilots import ToyPilot, known, light_server, living, until, value_of
 from hostile_controller import KINDS
 from safety_campaign import measure, planned, write
 
@@ -43,13 +43,21 @@ from scenarios.progress import Progress, silent
 from scenarios.schema.problems import ScenarioError
 
 ROOT = Path(__file__).resolve().parents[3]
+
+
+@pytest.fixture(scope="module", autouse=True)
+def light() -> Iterator[None]:
+    with light_server(__name__):
+        yield
+
+
 FLIGHTS = range(12)
 ALL = [value_of(flight) for flight in FLIGHTS]
 
 
 def test_hostile_flights_change_no_other_flight_and_leave_no_process() -> None:
     """Hang, fork, memory, exits, killed processes, in one campaign; see `tests/hostile_controller.py`."""
-    counts = measure(60, workers=3)  # most of its time is waiting for limits
+    counts = measure(60, workers=3, deaths=2)  # most of its time is waiting for limits
     assert counts["hostile"] == len(KINDS) >= 40
     assert counts["calm"] == 60 - len(KINDS) >= 12
     assert counts["rows differ"] == counts["unexpected verdicts"] == counts["leftover processes"] == 0, counts
@@ -369,11 +377,13 @@ def test_a_worker_in_which_a_flight_left_something_flies_no_other() -> None:
 PARENT = """
 import sys
 from pathlib import Path
+from campaign_pilots import light_server
 from test_survival import Hostile, hold_the_interpreter
 from scenarios.campaign.engine.local import LocalEngine
 
-for _ in LocalEngine(2).answers(Hostile(harm=hold_the_interpreter, diary=Path(sys.argv[1])), [5]):
-    pass
+with light_server():
+    for _ in LocalEngine(2).answers(Hostile(harm=hold_the_interpreter, diary=Path(sys.argv[1])), [5]):
+        pass
 """
 
 

@@ -16,9 +16,10 @@ from pathlib import Path
 
 import psutil
 import pytest
-from campaign_pilots import ToyPilot, known, living, until, value_of
+from campaign_pilots import ToyPilot, known, light_server, living, until, value_of
 
 from quadsim.errors import ParameterError, QuadsimError
+from scenarios.campaign.engine import local as module
 from scenarios.campaign.engine.local import LocalEngine
 from scenarios.campaign.engine.protocol import CHUNK_S, MOST_DEATHS, Answer, EngineError, Pace, fair_share
 from scenarios.campaign.results.table import Row
@@ -26,6 +27,7 @@ from scenarios.machine import usable_cores
 from scenarios.progress import Progress, silent
 
 ROOT = Path(__file__).resolve().parents[4]
+SETTLED = module._SETTLED
 FLIGHTS = range(40)
 ALL = [value_of(flight) for flight in FLIGHTS]
 PARENT = """
@@ -33,18 +35,25 @@ import signal
 import sys
 import time as clock
 from pathlib import Path
-from campaign_pilots import ToyPilot
+from campaign_pilots import ToyPilot, light_server
 from scenarios.campaign.engine.local import LocalEngine
 
 if __name__ == "__main__":
     signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs inherit that it is ignored
     pilot = ToyPilot(seconds=float(sys.argv[2]), asleep=float(sys.argv[3]), diary=Path(sys.argv[1]))
     try:
-        for _ in LocalEngine(2).answers(pilot, range(1000)):
-            pass
+        with light_server():
+            for _ in LocalEngine(2).answers(pilot, range(1000)):
+                pass
     except KeyboardInterrupt:
         print("interrupted")
 """
+
+
+@pytest.fixture(scope="module", autouse=True)
+def light() -> Iterator[None]:
+    with light_server(__name__):
+        yield
 
 
 def fly(pilot: ToyPilot, flights: Sequence[int] = FLIGHTS, workers: int = 2) -> list[Row]:
@@ -159,11 +168,14 @@ class _Settled(ToyPilot):
         return super().fly(flight) | {"loaded": loaded}
 
 
-def test_the_server_of_workers_and_not_their_parent_has_settled() -> None:
+def test_the_server_of_workers_and_not_their_parent_has_settled(monkeypatch: pytest.MonkeyPatch) -> None:
     """It has what flies, and not the statistics, which take half a second to load."""
+    monkeypatch.setattr(module, "_SETTLED", SETTLED)
+    multiprocessing.forkserver._forkserver._stop()  # the light one
     expected = {"scenarios.campaign.preload": True, "scipy.stats": False}
     assert all(row["loaded"] == expected for row in fly(_Settled()))
     assert "scenarios.campaign.preload" not in sys.modules
+    multiprocessing.forkserver._forkserver._stop()
 
 
 def test_a_script_is_not_run_again_by_its_workers(tmp_path: Path) -> None:
