@@ -29,7 +29,7 @@ name = "killed"
 scenario = "paper-constrained"
 flights = {flights}
 failure = ["lost", "rmse.z > 0.36"]
-set = {{ duration = {duration}, constraints = [] }}
+set = {{ duration = {duration}, constraints = []{settings} }}
 
 [[vary]]
 name = "mass"
@@ -61,7 +61,9 @@ class Outcome:
     seconds: float
 
 
-def kill_and_resume(directory: Path, *, kills: int, flights: int, duration: float, pause: float, seed: int) -> Outcome:
+def kill_and_resume(
+    directory: Path, *, kills: int, flights: int, duration: float, pause: float, seed: int, settings: str = ""
+) -> Outcome:
     """Fly a campaign twice, once undisturbed.
 
     Args:
@@ -71,12 +73,13 @@ def kill_and_resume(directory: Path, *, kills: int, flights: int, duration: floa
         duration: of each [s].
         pause: mean time between kills [s].
         seed: of when and what to kill.
+        settings: further ones of the flown scenario, as they stand in a table of TOML.
 
     Raises:
         RuntimeError: the campaign ended with an error of its own.
     """
     file = directory / "killed.toml"
-    file.write_text(CAMPAIGN.format(flights=flights, duration=duration), encoding="utf-8")
+    file.write_text(CAMPAIGN.format(flights=flights, duration=duration, settings=settings), encoding="utf-8")
     command = [sys.executable, "-m", "scenarios.cli", "campaign", str(file), "--workers", "2", "--json", "--no-report"]
     subprocess.run([*command, "--out", str(directory / "calm")], check=True, stdout=subprocess.DEVNULL)
     rng = np.random.default_rng(seed)

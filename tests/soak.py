@@ -79,9 +79,10 @@ class Soak:
         return last / first - 1.0
 
 
-def soak(laps: int) -> Soak:
-    """Fly the paper's course, of one minute, so many times on end."""
-    paper = load_scenario("paper-constrained", ["initial.euler=[0.0, 0.0, 0.0]", *CONDITION.settings])
+def soak(laps: int, lap: float = 60.0) -> Soak:
+    """Fly the paper's course, of one minute or the start of it [s], so many times on end."""
+    still = (f"duration={lap}", "initial.euler=[0.0, 0.0, 0.0]")
+    paper = load_scenario("paper-constrained", [*still, *CONDITION.settings])
     scenario = equip(paper, FULL, CONDITION)
     vehicle = build_vehicle(scenario)
     controller = build_controller(scenario, vehicle)
@@ -137,13 +138,14 @@ def main() -> int:
     """Soak, print what was measured; 1 where it is not flat."""
     parser = argparse.ArgumentParser(description="One long flight: memory and step time have to stay as they were.")
     parser.add_argument("--minutes", type=int, default=60, help="laps of one simulated minute, at least 3")
+    parser.add_argument("--lap", type=float, default=60.0, help="simulated seconds of each lap (default: %(default)g)")
     parser.add_argument(
         "--drift", type=float, default=DRIFT, help="of the step time that passes (default: %(default)s)"
     )
     options = parser.parse_args()
     if options.minutes < 3:
         parser.error(f"argument --minutes: must be at least 3; got {options.minutes}")
-    found = soak(options.minutes)
+    found = soak(options.minutes, options.lap)
     first, last = found.medians
     print(f"{found.minutes:g} simulated minutes, {found.step_ms.size} steps, {found.failures} without an optimum")
     print(f"largest distance from the reference towards the end of a lap: {found.end_error:.4f} m")

@@ -59,6 +59,12 @@ def write(directory: Path, table: pa.Table, name: str = NAME, summary: Summary |
 
 
 @pytest.fixture(scope="module")
+def thousands(make_campaign: MakeCampaign) -> pa.Table:
+    """More flights than are drawn."""
+    return make_campaign(5000)
+
+
+@pytest.fixture(scope="module")
 def estimated(thousand: pa.Table) -> Summary:
     return estimate(thousand)
 
@@ -141,21 +147,19 @@ def test_hostile_names_are_text(thousand: pa.Table, tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("sketched")
-def test_ten_thousand_flights_stay_small(
-    make_campaign: MakeCampaign, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_thousands_of_flights_stay_small(
+    thousands: pa.Table, estimated: Summary, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    table = make_campaign(10_000)
-    summary = estimate(table)
-    drawn = campaign_plots(table, summary)
+    drawn = campaign_plots(thousands, estimated)
     monkeypatch.setattr("scenarios.campaign.report.campaign_page.campaign_plots", lambda *_: drawn)
-    text = write(tmp_path / "out", table, summary=summary)
+    text = write(tmp_path / "out", thousands, summary=estimated)
     assert len(text) < 15e6
     assert "Drawn are 500 of " in text
-    assert sum(len(plot.json) for plot in drawn.values()) < 1e6
+    assert sum(len(plot.json) for plot in drawn.values()) < 5e5
 
 
-def test_thinning_takes_flights_of_each_verdict_evenly(make_campaign: MakeCampaign) -> None:
-    table = make_campaign(5000)
+def test_thinning_takes_flights_of_each_verdict_evenly(thousands: pa.Table) -> None:
+    table = thousands
     shown, again = shown_flights(table), shown_flights(table)
     verdicts = np.array(table["verdict"].to_pylist())
     for verdict, rows in shown.items():
@@ -199,7 +203,9 @@ def test_a_lost_flight_does_not_flatten_the_others(thousand: pa.Table) -> None:
 
 
 @pytest.mark.usefixtures("sketched")
-def test_outliers_are_drawn_at_the_edge_and_reported(thousand: pa.Table, tmp_path: Path) -> None:
+def test_outliers_are_drawn_at_the_edge_and_reported(
+    thousand: pa.Table, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     table = thousand.slice(0, 200)
     for name, far in (("draw.wind", {3: 400.0, 5: -90.0}), ("worst_margin", {7: 55.0})):
         values = [far.get(i, value) for i, value in enumerate(table[name].to_pylist())]
@@ -213,11 +219,13 @@ def test_outliers_are_drawn_at_the_edge_and_reported(thousand: pa.Table, tmp_pat
     assert (wind.edge[3], wind.edge[5], drawn.edge[7]) == ("right", "left", "up")
     assert np.count_nonzero(wind.edge != "") == 2
     summary = estimate(table)
+    plots = campaign_plots(table, summary)
+    monkeypatch.setattr("scenarios.campaign.report.campaign_page.campaign_plots", lambda *_: plots)
     text = " ".join(without_scripts(write(tmp_path / "out", table, summary=summary)).split())
     assert re.search(r"1 flight with a margin above 0\.\d+, up to 55;", text)
     assert re.search(r"1 flight with wind below \S+, down to -90; 1 flight with wind above 5\.\d+, up to 400\.", text)
     assert "to 400" in (tmp_path / "out" / "campaign.svg").read_text()
-    figure = json.loads(campaign_plots(table, summary)["scatter"].json)
+    figure = json.loads(plots["scatter"].json)
     symbols = [trace["marker"]["symbol"] for trace in figure["data"] if trace["mode"] == "markers"]
     edges = [symbol for one in symbols if isinstance(one, list) for symbol in one]
     assert edges.count("triangle-right") == edges.count("triangle-left") == 1
