@@ -55,7 +55,7 @@ def upper_bounds(counts: ArrayLike, trials: ArrayLike, confidence: float = CONFI
     """
     counts, trials = np.asarray(counts, float), np.asarray(trials, float)
     some = counts < trials
-    bounds = scipy.stats.beta.ppf(confidence, counts + 1.0, np.where(some, trials - counts, 1.0))
+    bounds = scipy.special.betaincinv(counts + 1.0, np.where(some, trials - counts, 1.0), confidence)
     return np.where(some, bounds, 1.0)
 
 
