@@ -71,8 +71,9 @@ sys.exit(main())
 @pytest.mark.parametrize(
     ("stop", "delay"),
     [
-        *((signal.SIGINT, delay) for delay in (0.0, 0.03, 0.1, 0.3)),
-        *((stop, delay) for stop in (signal.SIGTERM, signal.SIGHUP) for delay in (0.0, 0.1)),
+        *((signal.SIGINT, delay) for delay in (0.0, 0.03, 0.3)),
+        (signal.SIGTERM, 0.1),
+        (signal.SIGHUP, 0.0),
     ],
 )
 def test_a_signal_in_the_first_moments_ends_it_in_order(tmp_path: Path, stop: signal.Signals, delay: float) -> None:
@@ -146,6 +147,7 @@ def run():
     time.sleep(5)
     return 0
 cli.main = run
+entry._LONGEST_IMPORT_S = 1.0
 sys.exit(entry.main())
 """
 
@@ -190,7 +192,7 @@ def test_who_was_started_by_nohup_goes_on(tmp_path: Path) -> None:
     assert (done.returncode, done.stderr) == (EXIT_DONE, b"")
 
 
-@pytest.mark.parametrize("closed", [(1,), (2,), (0, 1, 2), (0,)])
+@pytest.mark.parametrize("closed", [(1,), (0, 1, 2), (0, 2)])
 def test_closed_streams_do_no_harm(tmp_path: Path, closed: tuple[int, ...]) -> None:
     done = subprocess.run(
         [sys.executable, "-m", "scenarios.cli", "run", "hover", *TABLES, *SHORT, "--out", "run"],
@@ -221,8 +223,7 @@ def test_characters_that_a_terminal_lacks_are_spelt_out(tmp_path: Path) -> None:
     assert rb"\xb15" in done.stdout  # of the bounds on roll
 
 
-@pytest.mark.parametrize("stop", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
-def test_a_long_flight_that_is_stopped_is_saved_up_to_there(tmp_path: Path, stop: signal.Signals) -> None:
+def test_a_long_flight_that_is_stopped_is_saved_up_to_there(tmp_path: Path) -> None:
     process = subprocess.Popen(
         [sys.executable, "-m", "scenarios.cli", "run", "hover", *TABLES, "--set", "duration=1800", "--out", "run"],
         cwd=tmp_path,
@@ -237,10 +238,10 @@ def test_a_long_flight_that_is_stopped_is_saved_up_to_there(tmp_path: Path, stop
         assert clock.monotonic() < deadline, "the flight did not begin"
         clock.sleep(0.02)
     begun = spent(process)
-    while spent(process) < begun + 0.5:  # however busy the machine is: it is built in a tenth of that
+    while spent(process) < begun + 0.3:  # however busy the machine is: it is built in a fifth of that
         assert clock.monotonic() < deadline + 60.0, "the flight does not go on"
         clock.sleep(0.02)
-    process.send_signal(stop)
+    process.send_signal(signal.SIGTERM)
     out, err = process.communicate(timeout=60)
     assert (process.returncode, err) == (EXIT_FAILED, "")
     assert "interrupted (Ctrl-C)" in out
